@@ -1,1 +1,1 @@
-"""New edits and deliveries in the window: what its requests start, and what comes back."""
+"""New edits, previews, deliveries and the start page of the window."""

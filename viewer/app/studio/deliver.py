@@ -1,4 +1,4 @@
-"""Exports, pictures and films: the question where to, and the command that writes the file."""
+"""Exports, pictures and films: the dialog for the output path, and the command that writes the file."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ from viewer.state.view_state import Comparison, ViewState
 from viewer.state.workspace import Dialog
 
 SUFFIXES = {"export": ".ply", "export_page": ".html", "render_picture": ".png", "render_film": ".mp4"}
-"""Questions, and how the names of their files end."""
+"""Suffix of the output file, per dialog."""
 
 
 class DeliverActions:
-    """Asks where to, and queues the commands.
+    """Dialogs for exports, pictures and films, and their commands.
 
     Args:
         app: the window
-        queue: runs them
+        queue: runs the commands
     """
 
     def __init__(self, app: Application, queue: JobQueue) -> None:
         self._app = app
         self._queue = queue
-        self._options: dict[str, DeliverOptions] = {}  # the last of each kind, for the next
+        self._options: dict[str, DeliverOptions] = {}  # the last options of each dialog, preset in the next
 
     @property
     def requests(self) -> Requests:
-        """The questions of `SUFFIXES`; `deliver:QUESTION`; `rebind:EDIT`, `rebind_from:EDIT\\nSCENE`."""
+        """Requests: `SUFFIXES`, `deliver:QUESTION`, `rebind:EDIT`, `rebind_from:EDIT\\nSCENE` and `about`."""
         ask, version = self._app.main_view.ask, sys.version.split()[0]
         return {
             **{name: partial(self._ask, name) for name in SUFFIXES},
@@ -50,7 +50,7 @@ class DeliverActions:
         }
 
     def _deliver(self, kind: str) -> None:
-        """What is wrong stands in the question."""
+        """Queue the delivery; an error stays in the dialog."""
         main_view = self._app.main_view
         if (dialog := main_view.work.dialog) is not None:
             error = failure_line(lambda: self._start(kind, dialog))
@@ -84,7 +84,7 @@ class DeliverActions:
         main_view.ask(Dialog(name, str(free), options=options))
 
     def _rebind(self, file: str, source: str) -> None:
-        """Queue what carries an edit of the scene at `source` over to the one that is open."""
+        """Queue a rebind of an edit from the scene at `source` to the open scene."""
         edit = Path(file)
         scene = self._app.document.file.resolve()
         out = free_path(edit.parent, f"{edit.stem}-rebound", edit.suffix)
@@ -129,12 +129,12 @@ class DeliverActions:
         self._options[kind] = options
 
     def _written(self) -> set[Path]:
-        """What is being written just now."""
+        """Return the output paths of the busy jobs."""
         return {job.task.out for job in self._queue.jobs if job.busy}
 
 
 def _film(view: ViewState, options: DeliverOptions) -> ViewState:
-    """The view with a timeline on which sliders go there and back, or the camera once around its pivot."""
+    """Return the view with a timeline that moves sliders from 0 to 1 and back, or orbits the camera once."""
     if options.moves == TURNTABLE:
         return replace(view, timeline=timeline.turntable(view.camera, options.fps, options.seconds))
     gdfs = [layer.gdf for layer in view.layers if options.moves in (layer.name, ALL_SLIDERS)]

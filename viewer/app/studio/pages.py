@@ -1,4 +1,4 @@
-"""What is drawn over the window: the start page, a preview, the fields of a delivery."""
+"""Pages drawn over the window: the start page, a preview image, the fields of a delivery."""
 
 from __future__ import annotations
 
@@ -32,37 +32,38 @@ from viewer.ui.widgets import (
 )
 
 COMMANDS = ("open", "demo", "quit", "full_screen", "window_picture", "help", "palette", "unfocus", "about")
-"""Those that mean something here."""
+"""Requests that are available on the start page."""
 CARD_PX = 168.0
 GAP_PX = 16.0
 MARGIN_PX = 28.0
 SIDE_PX = 264.0
 WIDEST_PX = 1140.0
+"""Maximum width of the page, at 1×."""
 NARROW_PX = 760.0
-"""Of the whole page, at 1×; below the second its left part stands above the right one."""
-_TEXT_PX = 44.0  # two lines below a picture
-_HEADING_PX = 32.0  # a heading
-_TITLE_TALL_PX = 44.0  # the title
+"""Page width at 1× below which the left column stands above the right one."""
+_TEXT_PX = 44.0  # height of the two lines below a picture
+_HEADING_PX = 32.0  # height of a heading
+_TITLE_TALL_PX = 44.0  # height of the title
 _NO_NAV = imgui.ItemFlags_.no_nav.value
 DROP_TEXT = "Drop a scene or a session"
 
 
 @dataclass(frozen=True)
 class StartFile:
-    """What the start page opens: a scene or session that was open, or an example.
+    """File on the start page: a recently opened scene or session, or an example.
 
-    `texture`: the GL name of its picture, 0 for none; `missing`: the file is not there any more
+    `texture`: GL name of its picture, 0 for none; `missing`: the file no longer exists
     """
 
-    path: Path  # of an example its bundle
+    path: Path  # an example's bundle file
     texture: int = 0
-    title: str = ""  # "" for the file's name
-    line: str = ""  # below it
+    title: str = ""  # empty: the file's name
+    line: str = ""  # text below the title
     missing: bool = False
 
 
 def draw_start_page(recent: Sequence[StartFile], examples: Sequence[StartFile], ui: UiContext) -> list[str]:
-    """The page, over the whole window; the actions that were asked for."""
+    """Draw the start page over the whole window and return the requested actions."""
     display = imgui.get_io().display_size
     scale = ui.scale
     imgui.set_next_window_pos((0.0, 0.0))
@@ -97,13 +98,15 @@ def draw_start_page(recent: Sequence[StartFile], examples: Sequence[StartFile], 
 
 
 def _columns(room: float, count: int, ui: UiContext) -> float:
-    """How wide each of so many cards beside each other is."""
+    """Return the width of each of `count` cards in a row, in pixels."""
     return float(int((room - (count - 1) * GAP_PX * ui.scale) / count))
 
 
 def _head(wide: float, tall: float, ui: UiContext) -> list[str]:
-    """The program's name, and what opens a file of one's own: a field to drop it on, so tall, or for 0 a
-    line; and the demo."""
+    """Draw the program's name and the buttons that open a file or train the demo.
+
+    `tall` is the height of the drop field in pixels; 0 draws it as one line.
+    """
     scale = ui.scale
     actions = []
     flat = not tall
@@ -118,7 +121,7 @@ def _head(wide: float, tall: float, ui: UiContext) -> list[str]:
     y = begin.y + _TITLE_TALL_PX * scale
     button = imgui.ImVec2(136.0 * scale, 34.0 * scale)
     frame = imgui.ImVec2(wide, tall or 58.0 * scale)
-    # of a line: the margin around it
+    # one line: the margin around the button
     text = imgui.calc_text_size(DROP_TEXT)
     side = (frame.y - button.y) / 2
     middle = x + (frame.x - button.x) / 2, y + frame.y / 2
@@ -147,7 +150,7 @@ def _head(wide: float, tall: float, ui: UiContext) -> list[str]:
 
 
 def _grid(files: Sequence[StartFile], wide: float, room: float, own: bool, ui: UiContext) -> list[str]:
-    """Cards of so many pixels; what was asked for. `own`: they can be taken off the page"""
+    """Draw cards of `wide` pixels and return the requested actions. `own`: the user can remove the cards"""
     actions = list[str]()
     gap = GAP_PX * ui.scale
     across = max(int((room + gap + 1.0) // (wide + gap)), 1)
@@ -160,27 +163,28 @@ def _grid(files: Sequence[StartFile], wide: float, room: float, own: bool, ui: U
 
 
 def _card(file: StartFile, wide: float, own: bool, ui: UiContext) -> list[str]:
-    """A picture and two lines; a click, Enter or the cross in its corner ask for something."""
+    """Draw a picture with two lines of text and return the action requested by click, Enter or the close
+    button."""
     tall = 0.75 * wide
     rounding = 5.0 * ui.scale
     scale = ui.scale
     imgui.begin_group()
     at = imgui.get_cursor_screen_pos()
-    asked = list[str]()
+    requested = list[str]()
     storage = imgui.get_state_storage()
     known = int(imgui.internal.get_current_window().id_)
-    if not storage.get_bool(known):  # the first of all has the keyboard
+    if not storage.get_bool(known):  # the first card has the keyboard focus
         storage.set_bool(known, True)
         imgui.set_keyboard_focus_here()
         imgui.set_nav_cursor_visible(True)
     imgui.set_next_item_allow_overlap()
     if imgui.invisible_button("file", (wide, tall), imgui.ButtonFlags_.enable_nav.value):
-        asked = ["open"] if file.missing else [f"{'open_file' if own else 'example'}:{file.path}"]
+        requested = ["open"] if file.missing else [f"{'open_file' if own else 'example'}:{file.path}"]
     hovered = imgui.is_item_hovered(
         imgui.HoveredFlags_.no_nav_override.value
-    )  # imgui frames what has the keys
+    )  # imgui frames the item with the keyboard focus
     if own and imgui.is_item_focused() and imgui.is_key_pressed(imgui.Key.delete, False):
-        asked = [f"forget_file:{file.path}"]
+        requested = [f"forget_file:{file.path}"]
     path = escape_text(str(file.path))
     tip(f"{path} is not there any more: open it from where it is now" if file.missing else path)
     canvas = imgui.get_window_draw_list()
@@ -197,9 +201,9 @@ def _card(file: StartFile, wide: float, own: bool, ui: UiContext) -> list[str]:
         edge = (corner.x + side, corner.y + side)
         canvas.add_rect_filled(corner, edge, u32(PALETTE.scrim), rounding)
         imgui.set_cursor_screen_pos(corner)
-        imgui.push_item_flag(_NO_NAV, True)  # the arrows lead from card to card
+        imgui.push_item_flag(_NO_NAV, True)  # the arrow keys move from card to card
         if icon_button("forget", Icon.CLOSE, ui):
-            asked = [f"forget_file:{file.path}"]
+            requested = [f"forget_file:{file.path}"]
         imgui.pop_item_flag()
         tip("Remove from this page (Del); the file stays")
         imgui.set_cursor_screen_pos(below)
@@ -209,18 +213,18 @@ def _card(file: StartFile, wide: float, own: bool, ui: UiContext) -> list[str]:
     imgui.text_colored(PALETTE.dim if file.missing else PALETTE.text, elide(name, wide))
     small(file.line, PALETTE.dim, wide)
     imgui.end_group()
-    return asked
+    return requested
 
 
 def folder_name(path: Path) -> str:
-    """Where it lies, with ~ for the user's home, on one printable line."""
+    """Return the file's folder on one printable line, with ~ for the user's home."""
     with suppress(ValueError, RuntimeError):
         return escape_text(f"~/{path.parent.relative_to(Path.home())}")
     return escape_text(str(path.parent))
 
 
 def _dashed_frame(size: imgui.ImVec2, ui: UiContext) -> None:
-    """Files may be dropped anywhere, and this says so."""
+    """Draw the dashed frame that invites to drop files; the whole window accepts them."""
     scale = ui.scale
     dash = 7.0 * ui.scale
     x, y = imgui.get_cursor_screen_pos()
@@ -243,18 +247,18 @@ def _dashed_frame(size: imgui.ImVec2, ui: UiContext) -> None:
 
 @dataclass(frozen=True)
 class Cover:
-    """A picture that lies over the view, as long as one looks from where it was made."""
+    """Picture drawn over the view while the camera stays where the picture was rendered."""
 
-    texture: int  # its GL name
-    camera: ViewCamera  # where one looks from
-    size: tuple[int, int]  # of the view, pixels
-    name: str = ""  # the banner above it
+    texture: int  # GL name
+    camera: ViewCamera  # the picture's camera
+    size: tuple[int, int]  # size of the view, pixels
+    name: str = ""  # text of the banner above the picture
 
 
 def draw_cover(
     cover: Cover, view: ViewState, size: tuple[int, int], area: overlay.Area, ui: UiContext
 ) -> None:
-    """Draw it over the view, where it belongs there."""
+    """Draw the picture if camera and size match and no comparison is on."""
     if (cover.camera, cover.size) != (view.camera, size) or view.compare.mode != "off":
         return
     corners = (0.0, 0.0), (area.width, area.height)
@@ -266,7 +270,7 @@ _COLUMN_PX = 100.0
 
 
 def draw_fields(kind: str, path: str, options: DeliverOptions, ui: UiContext) -> tuple[str, DeliverOptions]:
-    """The path with the suffix that fits, and the options as they are now.
+    """Draw the fields and return the path with the suffix of its format, and the changed options.
 
     Args:
         kind: "picture" or "film"
@@ -300,7 +304,7 @@ def draw_fields(kind: str, path: str, options: DeliverOptions, ui: UiContext) ->
 
 
 def _size_fields(options: DeliverOptions, column: float, ui: UiContext) -> DeliverOptions:
-    """Width and height, typed, or one of the usual ones."""
+    """Draw the fields for width and height and the buttons for common sizes; return the changed options."""
     label("Size", column)
     gap = 6.0 * ui.scale
     room = imgui.get_content_region_avail().x
@@ -316,9 +320,9 @@ def _size_fields(options: DeliverOptions, column: float, ui: UiContext) -> Deliv
     shapes = tuple(SHAPES)
     side = min(size)
     shape = next((name for name in shapes if picture_size(side, name) == size), None)
-    high = choice("size", {side: f"{side}p" for side in SIDES}, side if shape else None, ui)
-    if high is not None:
-        size = picture_size(high, shape or shapes[0])
+    chosen_side = choice("size", {side: f"{side}p" for side in SIDES}, side if shape else None, ui)
+    if chosen_side is not None:
+        size = picture_size(chosen_side, shape or shapes[0])
     label("Shape", column)
     chosen = choice("shape", {name: name for name in shapes}, shape, ui)
     if chosen is not None:

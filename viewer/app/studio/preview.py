@@ -1,5 +1,7 @@
-"""What a new edit will be while its form is open, made by `progdf preview`: a live layer on top of the stack
-where one map of color carries it, else the editor's own picture over the view.
+"""Live preview of a new edit while its form is open, computed by a `progdf preview` process.
+
+A grade that one color map reproduces is a live layer on top of the stack. Other editors show their own
+picture over the view.
 """
 
 from __future__ import annotations
@@ -40,64 +42,65 @@ from viewer.ui.window import wake_window
 from .pages import Cover
 
 LONGEST_SIDE = 960
-"""Pixels of a picture; larger windows show it enlarged."""
+"""Longest side of a preview, in pixels; larger windows show it enlarged."""
 REST_S = 0.12
+"""Time without camera motion before a preview is requested, in seconds."""
 POLL_S = 0.04
-"""The camera rests so long before a picture is asked for; between two looks for it."""
+"""Interval at which the answer is polled, in seconds."""
 WATCH_S = 0.5
-"""Between two looks at a picture that another program changes."""
+"""Interval at which a picture open in another program is checked, in seconds."""
 PAINT_TEXT = "Paint in the program that opens, and save: what you saved is shown here"
 KEPT_S = 120.0
-"""So long the child waits for the form to be opened again."""
+"""Time without an open form after which the preview process ends, in seconds."""
 
 
 @dataclass(frozen=True)
 class _Request:
-    """What a picture depends on."""
+    """Inputs that determine a preview."""
 
     region: str
     editor: str
     strength: float
     camera: ViewCamera
-    size: tuple[int, int]  # of the view, pixels
+    size: tuple[int, int]  # size of the view, pixels
     background: Vec3
-    model: str = ""  # of a sentence
-    seed: int = 0  # the same; -1 asks what would paint, for no picture
+    model: str = ""  # diffusion model, for a sentence
+    seed: int = 0  # random seed, for a sentence; -1 asks only for the available models
 
     @property
     def of_all_views(self) -> tuple[str, str]:
-        """What a grade depends on."""
+        """Region and editor, which determine a grade in every view."""
         return self.region, self.editor
 
     @property
     def kind(self) -> tuple[str, str]:
-        """What a hand does not change by the way, as it does a slider or the camera."""
+        """Region and editor family. A change of either makes the running preview obsolete."""
         return self.region, self.editor.partition(":")[0]
 
 
 @dataclass(frozen=True)
 class Preview:
-    """What came of a request: a picture, the file of a grade, a palette or a note, or why there is none."""
+    """Answer to a request: a picture, a grade's file, a palette, a note or an error."""
 
-    number: int  # -1: the child has ended, or what it wrote cannot be read
+    number: int  # -1: the process has ended, or its output cannot be read
     pixels: Any = None  # the picture. [H,W,3] uint8
     grade: Path | None = None
     error: str = ""
     made: Literal["picture", "grade", "note", "palette"] = "picture"
-    note: str = ""  # what would paint a sentence
-    models: tuple[str, ...] = ()  # that are on this machine
-    follows: bool = False  # whether the edit of a sentence can follow this picture
-    palette: tuple[str, ...] = ()  # the region's main colors, #rrggbb
+    note: str = ""  # description of the model for a sentence
+    models: tuple[str, ...] = ()  # models on this machine
+    follows: bool = False  # the edit of a sentence can follow this picture
+    palette: tuple[str, ...] = ()  # main colors of the region, #rrggbb
 
 
 class PreviewChild:
-    """One child for one scene; the latest request wins. `close` it.
+    """Preview process of one scene, which answers the latest request. `close` it.
 
     Args:
-        scene: its file
+        scene: file of the scene
 
     Raises:
-        OSError: it cannot be started.
+        OSError: the process cannot be started.
     """
 
     def __init__(self, scene: Path) -> None:
@@ -109,11 +112,11 @@ class PreviewChild:
 
     @property
     def folder(self) -> Path:
-        """Where its pictures go, and files that its requests name."""
+        """Folder of the pictures and of the files that requests name."""
         return Path(self._folder.name)
 
     def ask(self, region: str, request: _Request, camera: Camera) -> int:
-        """Ask for a grade or a picture; its number."""
+        """Request a grade or a picture and return the request's number."""
         number = next(self._numbers)
         values = plain(request) | {"number": number, "out": str(self._picture(number)), "region": region}
         values |= {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist()}
@@ -122,7 +125,7 @@ class PreviewChild:
         return number
 
     def take(self) -> Preview | None:
-        """The last answer since the last call; a child that has ended says why. Does not wait."""
+        """Return the last answer since the previous call, or the error of an ended process. Does not wait."""
         line = None
         while self._answers:
             line = self._answers.popleft()
@@ -145,8 +148,8 @@ class PreviewChild:
             return Preview(-1, error=f"the preview cannot be read: {error}")
 
     def close(self) -> None:
-        """End it."""
-        self._child.kill()  # it keeps nothing
+        """End the process."""
+        self._child.kill()  # it has no state to save
         self._child.close()
         with contextlib.suppress(OSError):
             self._folder.cleanup()
@@ -163,16 +166,16 @@ class PreviewChild:
 
 @dataclass(frozen=True)
 class PaintedView:
-    """A picture of a view that another program changes."""
+    """Picture of a view that is open in another program."""
 
     path: Path
-    camera: ViewCamera  # of the view
+    camera: ViewCamera  # camera of the view
     size: tuple[int, int]  # pixels
-    state: tuple[int, int]  # of the file when it was last looked at, see `_file_state`
+    state: tuple[int, int]  # state of the file at the last check, see `_file_state`
 
 
 def _file_state(path: Path) -> tuple[int, int]:
-    """When it was written, and its size in bytes; (0, 0) where it is not there."""
+    """Return the file's modification time in ns and its size in bytes; (0, 0) if it does not exist."""
     try:
         state = path.stat()
     except OSError:
@@ -181,12 +184,13 @@ def _file_state(path: Path) -> tuple[int, int]:
 
 
 class PreviewActions:
-    """Asks the child for what the form says and shows it. `close` it with the window.
+    """Requests to the preview process for the form, and the display of its answers. `close` it with the
+    window.
 
     Args:
         app: the window
         context: the GL context
-        region: a form's region as `progdf train` has it; files that it needs go into the folder
+        region: returns a form's region as an option of `progdf train`; writes needed files into the folder
     """
 
     def __init__(
@@ -198,32 +202,31 @@ class PreviewActions:
         self._child: PreviewChild | None = None
         self._texture: moderngl.Texture | None = None
         self._sent: _Request | None = None
-        # of what was sent, and whether there is no answer yet
-        self._number = 0
-        self._outstanding = False
-        self._seen: _Request | None = None  # at the last look
+        self._number = 0  # number of the sent request
+        self._outstanding = False  # no answer to it yet
+        self._seen: _Request | None = None  # request at the last poll
         self._seen_at = self._used_at = 0.0
-        self._broken = False  # it cannot be started, or has ended by itself
-        self._grade: tuple[_Request, Gdf, Path] | None = None  # of the live layer, and what it was made for
-        self._pose: tuple[int, ViewCamera, tuple[int, int]] | None = None  # of which a sentence's picture is
-        self._painted: tuple[_Request, NDArray[np.uint8]] | None = None  # that picture
+        self._broken = False  # the process cannot be started, or has ended
+        self._grade: tuple[_Request, Gdf, Path] | None = None  # live grade: request, edit, file
+        self._pose: tuple[int, ViewCamera, tuple[int, int]] | None = None  # `asks`, camera, size
+        self._painted: tuple[_Request, NDArray[np.uint8]] | None = None  # a sentence's picture
         self._sent_at = 0.0
-        self._palette_of = ""  # the region whose colors the form has
-        self._sheet: moderngl.Texture | None = None  # of paintings
-        self._sheet_of: _Request | None = None  # the view that is painted
-        self._tiles: frozenset[int] = frozenset()  # styles that it was painted in already
-        self._drawn: frozenset[int] = frozenset()  # those in the sheet, also of another view
-        self._tile = -1  # the style that is asked for
-        self._region_sent = ""  # the region, as the child knows it
+        self._palette_of = ""  # region of the form's palette
+        self._sheet: moderngl.Texture | None = None  # thumbnails in every style
+        self._sheet_of: _Request | None = None  # the painted view
+        self._tiles: frozenset[int] = frozenset()  # styles painted in this view
+        self._drawn: frozenset[int] = frozenset()  # styles in the sheet, also of an earlier view
+        self._tile = -1  # the requested style
+        self._region_sent = ""  # region in the process's format
         self._painting: PaintedView | None = None
 
     @property
     def requests(self) -> Requests:
-        """What there is to ask of it."""
+        """Requests that this class handles."""
         return {"paint_view": self._paint_view}
 
     def poll(self) -> float | None:
-        """Ask for the preview and show what has come; seconds until the next look, None for ever."""
+        """Request the preview and show an answer; return the seconds until the next poll, None for never."""
         if self._painting is not None and self._is_painting(self._painting):
             self._end_live()
             return self._follow(self._painting)
@@ -251,16 +254,16 @@ class PreviewActions:
         self._show_live()
         if self._child is None or self._broken:
             return None
-        made = self._grade is not None and request.of_all_views == self._grade[0].of_all_views
-        if made and not self._outstanding:
-            self._sent = self._seen = request  # one grade is for every strength and view
+        grade_matches = self._grade is not None and request.of_all_views == self._grade[0].of_all_views
+        if grade_matches and not self._outstanding:
+            self._sent = self._seen = request  # one grade serves every strength and view
         if request != self._seen:
             moved = (
                 self._seen is None or request.camera != self._seen.camera or request.size != self._seen.size
             )
             self._seen = request
             self._seen_at = now if moved else now - REST_S
-        # one at a time: what moves on while it is made is asked for next, and each answer is shown
+        # One request at a time. Changes in the meantime are requested next, and every answer is shown.
         if request != self._sent and not self._outstanding and now - self._seen_at >= REST_S:
             self._send(request, self._child)
         elif request == self._sent and not self._outstanding and request.editor.startswith("style:"):
@@ -268,7 +271,7 @@ class PreviewActions:
         return POLL_S if self._outstanding or request != self._sent else None
 
     def _paint_view(self, _: str) -> None:
-        """A picture of this view of the original goes to another program, and into the form.
+        """Save a picture of this view of the original, open it in another program and add it to the form.
 
         Raises:
             ProgdfError: the scene has no file, or the picture cannot be written.
@@ -281,14 +284,14 @@ class PreviewActions:
         folder = training.edits_folder(scene)
         make_folder(folder)
         path = main_view.canvas.save_original(folder, scene.stem, main_view.work.view, size)
-        beside = path.with_name(f"{path.stem}.camera.json")  # a program may drop what the picture carries
+        beside = path.with_name(f"{path.stem}.camera.json")  # a program may drop the picture's metadata
         save_cameras(beside, [to_camera(camera, *size)], self._app.document.scene.origin)
         form = training.with_picture(main_view.work.form, path, further=False)
         main_view.work = replace(main_view.work, form=form, form_open=True)
         self._open_painter(path, camera, size, None)
 
     def follow_anchor(self, path: Path) -> None:
-        """A sentence's picture, written at `path`, goes to another program; what is saved of it is shown."""
+        """Open a sentence's picture, written at `path`, in another program and show the saved result."""
         if self._pose is not None and self._painted is not None:
             height, width = self._painted[1].shape[:2]
             self._open_painter(path, self._pose[1], (width, height), self._app.main_view.cover)
@@ -304,27 +307,27 @@ class PreviewActions:
             )
 
     def _is_painting(self, painted: PaintedView) -> bool:
-        """Whether the form is about the picture that is painted."""
+        """Return whether the form uses the picture that is being painted."""
         work = self._app.main_view.work
         path = str(painted.path)
-        of_form = path in work.form.pictures.split(", ") or path == work.form.anchor
-        return work.form_open and work.view.panel and of_form
+        is_in_form = path in work.form.pictures.split(", ") or path == work.form.anchor
+        return work.form_open and work.view.panel and is_in_form
 
     def _follow(self, painted: PaintedView) -> float:
-        """What was saved of it lies over the view; seconds until the next look."""
+        """Show the saved picture over the view; return the seconds until the next check."""
         state = _file_state(painted.path)
         if state == painted.state:
             return WATCH_S
         try:
             with Image.open(painted.path) as picture:
                 pixels = np.asarray(picture.convert("RGB"))
-        except (OSError, SyntaxError, ValueError):  # not whole yet
+        except (OSError, SyntaxError, ValueError):  # not completely written yet
             return WATCH_S
         self._painting = replace(painted, state=state)
         height, width = pixels.shape[:2]
         if (width, height) != painted.size:
-            what = "{} is {}×{} pixels now, and was {}×{}; keep its size"
-            self._show(what.format(painted.path.name, width, height, *painted.size), None, failed=True)
+            template = "{} is {}×{} pixels now, and was {}×{}; keep its size"
+            self._show(template.format(painted.path.name, width, height, *painted.size), None, failed=True)
         else:
             cover = Cover(self._upload(pixels), painted.camera, painted.size, "Painted")
             self._show("This is what you saved; Train makes it an edit", cover)
@@ -332,7 +335,8 @@ class PreviewActions:
         return WATCH_S
 
     def anchor(self, form: NewEdit) -> tuple[NDArray[np.uint8], Camera] | None:
-        """A sentence's picture of one view, and its camera, which the edit is to follow; None for none."""
+        """Return the picture of one view that the edit of a sentence should follow, and its camera; None if
+        missing."""
         request = self._request()
         if self._painted is None or request is None or request != self._painted[0] or not form.asks:
             return None
@@ -340,14 +344,14 @@ class PreviewActions:
         return pixels, to_camera(request.camera, pixels.shape[1], pixels.shape[0])
 
     def draft(self, form: NewEdit) -> Path | None:
-        """The file of the grade that shows what a form says; None where there is none."""
+        """Return the grade's file that previews the form; None if there is none."""
         request = self._request()
         if form != self._app.main_view.work.form or request is None or self._grade is None:
             return None
         return self._grade[2] if request.of_all_views == self._grade[0].of_all_views else None
 
     def leave_scene(self) -> None:
-        """The child is for a scene that is not open any more."""
+        """End the process of the closed scene."""
         self._end()
         self._grade = None
         self._painting = None
@@ -355,7 +359,7 @@ class PreviewActions:
         self._broken = False
 
     def close(self) -> None:
-        """End the child."""
+        """End the process and release the textures."""
         self._end()
         for texture in (self._texture, self._sheet):
             if texture is not None:
@@ -363,7 +367,7 @@ class PreviewActions:
         self._texture = self._sheet = None
 
     def _request(self) -> _Request | None:
-        """What the form and the view ask for; None for no picture."""
+        """Return the request for the form and the view; None for no preview."""
         work = self._app.main_view.work
         size = self._app.main_view.picture_size
         form = work.form
@@ -377,7 +381,7 @@ class PreviewActions:
             return _Request(region, "grade", 1.0, ViewCamera(), size, view.background)
         if form.obstacle:
             return None
-        if of_sentence:  # a picture takes its time: it is of the view in which it was asked for
+        if of_sentence:  # a diffusion model is slow: its picture keeps the view of the request
             if self._pose is None or self._pose[0] != form.asks:
                 self._pose = form.asks, view.camera, size
             _, camera, size = self._pose
@@ -404,7 +408,8 @@ class PreviewActions:
         self._show("" if in_place or self._grade else text, cover)
 
     def _ask_painting(self, request: _Request, child: PreviewChild) -> None:
-        """The next of the sheet's: this view in one style, small. What the form says goes first."""
+        """Request the next thumbnail of the sheet: this view in one style. The form's own preview has
+        priority."""
         view = replace(request, editor="", strength=1.0)
         if view != self._sheet_of:
             if self._sheet_of is None or view.region != self._sheet_of.region:
@@ -418,25 +423,25 @@ class PreviewActions:
             self._outstanding = True
 
     def _take_painting(self, pixels: NDArray[np.uint8] | None) -> None:
-        """A picture for the sheet; None where that style could not be painted."""
+        """Add a thumbnail to the sheet; None marks a style that failed."""
         style = self._tile
         self._tile = -1
         self._tiles |= {style}
         if pixels is None:
             return
-        (width, height), place = SHEET_PX, STYLE_ORDER.index(style)
+        (width, height), index = SHEET_PX, STYLE_ORDER.index(style)
         if self._sheet is None:
             rows = -(-len(STYLE_ORDER) // SHEET_COLUMNS)
             self._sheet = self._context.texture((SHEET_COLUMNS * width, rows * height), 3, alignment=1)
-        at = place % SHEET_COLUMNS * width, place // SHEET_COLUMNS * height
-        self._sheet.write(np.ascontiguousarray(pixels).tobytes(), (*at, width, height), alignment=1)
+        offset = index % SHEET_COLUMNS * width, index // SHEET_COLUMNS * height
+        self._sheet.write(np.ascontiguousarray(pixels).tobytes(), (*offset, width, height), alignment=1)
         self._drawn |= {style}
         main_view = self._app.main_view
         main_view.preview = main_view.preview._replace(sheet=int(self._sheet.glo), styles=self._drawn)
         main_view.wake()
 
     def _take(self, child: PreviewChild, now: _Request) -> None:
-        """What the child has answered: shown, unless region or kind of edit are others by now."""
+        """Show the answer of the process unless the region or the editor family has changed since."""
         answer = child.take()
         if answer is None:
             return
@@ -464,29 +469,29 @@ class PreviewActions:
         elif answer.grade is not None:
             gdf = load_gdf(answer.grade, self._app.document.original)
             self._grade = self._sent, gdf, answer.grade
-            self._app.main_view.live = ()  # of the last color
+            self._app.main_view.live = ()  # of the previous color
             self._show(f"Live: {answer.note}", None)
         elif answer.pixels is not None:
-            kind, _, what = self._sent.editor.partition(":")
+            kind, _, argument = self._sent.editor.partition(":")
             title = next(choice.title for choice in EDITORS if choice.kind == kind)
             self._end_live()
             name = f"Preview: {title} at {self._sent.strength:.2f}"
             text = ""
             self._painted = None
             if kind == "instruct":
-                name = f"Anchor: {what}"
+                name = f"Anchor: {argument}"
                 text = "The edit will follow this picture"
                 if answer.follows:
                     self._painted = self._sent, answer.pixels
                 else:
-                    name = f"Example: {what}"
+                    name = f"Example: {argument}"
                     text = "An example: this model cannot follow a picture"
             texture = self._upload(answer.pixels)
             self._show(text, Cover(texture, self._sent.camera, self._sent.size, name))
             self._app.main_view.wake()
 
     def _show_live(self) -> None:
-        """The grade as a layer on top, at the form's strength."""
+        """Show the grade as a layer on top, at the form's strength."""
         if self._grade is None:
             return
         main_view = self._app.main_view
@@ -520,12 +525,12 @@ class PreviewActions:
     def _show(
         self, text: str, cover: Cover | None, failed: bool = False, models: tuple[str, ...] | None = None
     ) -> None:
-        """The cover, and what the form says of it."""
+        """Set the picture over the view and the preview's state in the form."""
         main_view = self._app.main_view
-        known = main_view.preview.models if models is None else models
+        available_models = main_view.preview.models if models is None else models
         painted = self._painted is not None and self._painted[0] == self._request()
         sheet = 0 if self._sheet is None else int(self._sheet.glo)
-        state = PreviewState(text, failed, self._outstanding, painted, known, sheet, self._drawn)
+        state = PreviewState(text, failed, self._outstanding, painted, available_models, sheet, self._drawn)
         if (main_view.cover, main_view.preview) != (cover, state):
             main_view.cover = cover
             main_view.preview = state

@@ -1,4 +1,4 @@
-"""What opening begins with: recent files with their pictures, the demo, and which way is up in a scene."""
+"""Start page: recent files with thumbnails, the demo, and the up axis of a newly opened scene."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ EXAMPLE_TITLES = {
         "play": ("Shapes, and a film", "Head, twin, no scarf; Space plays"),
     }.items()
 }
-"""The examples that come with the program, what each is called, and what is in it."""
+"""Examples that come with the program, with title and content."""
 
 
 class StartActions:
-    """Recent files with their pictures, and the demo, whose edits come one by one.
+    """Recent files with thumbnails, and the demo, whose edits appear one by one.
 
     Args:
         app: the window
@@ -59,25 +59,25 @@ class StartActions:
         self._textures: dict[Path, moderngl.Texture | None] = {}
         self._demo: Path | None = None  # its folder while it is being made
         self._edits = EditActions(app)
-        self._added: dict[Path, tuple[Path, int]] = {}  # of the folders of its edits: which file is open
+        self._added: dict[Path, tuple[Path, int]] = {}  # per edit folder: the open file and its time in ns
 
     @property
     def requests(self) -> Requests:
-        """`example:BUNDLE`, `forget_file:PATH`"""
+        """Requests: `demo`, `example:BUNDLE`, `forget_file:PATH`."""
         return {"demo": self._start_demo, "example": self._open_example, "forget_file": self._forget}
 
     def _forget(self, path: str) -> None:
         self._app.main_view.recent = user_files.forget_recent(Path(path))
 
     def poll(self) -> float | None:
-        """Open what of the demo is ready; seconds until the next look, None for ever."""
+        """Open the finished parts of the demo; return the seconds until the next poll, None for never."""
         self._publish()
         if self._demo is None:
             return None
         scene = self._demo / "scene.ply"
         opened = self._app.document.path
         if opened is not None and opened.resolve() != scene:
-            self._demo = None  # the person went on to something else
+            self._demo = None  # the user has opened another scene
             return None
         if opened is None and scene.is_file():
             self._app.open(scene)
@@ -92,20 +92,22 @@ class StartActions:
         return POLL_S
 
     def keep_picture(self, engine: ViewEngine, view: ViewState, *paths: Path | None) -> None:
-        """A small picture of what is on screen, for the next time that the page shows these files."""
-        known = [path for path in paths if path is not None]
-        if not known:
+        """Save a thumbnail of the current view for these files on the start page."""
+        files = [path for path in paths if path is not None]
+        if not files:
             return
         try:
-            seen = ViewState(view.camera, view.layers, view.blend, view.background, compare=Comparison())
-            pixels = to_pixels(engine.image(seen, user_files.THUMBNAIL_SIZE))
+            thumbnail_view = ViewState(
+                view.camera, view.layers, view.blend, view.background, compare=Comparison()
+            )
+            pixels = to_pixels(engine.image(thumbnail_view, user_files.THUMBNAIL_SIZE))
         except ProgdfError:
             return
-        for path in known:
+        for path in files:
             user_files.keep_thumbnail(path, pixels)
 
     def close(self) -> None:
-        """Give back the pictures."""
+        """Release the textures."""
         for texture in self._textures.values():
             if texture is not None:
                 texture.release()
@@ -121,19 +123,19 @@ class StartActions:
         self._app.main_view.show_message("Making the demo's scene …")
 
     def _show_edit(self, folder: Path) -> None:
-        """An edit of the demo: its draft, in place of that what is packed, and at last the finished file."""
+        """Show an edit of the demo: its draft first, then the finished file."""
         draft = folder / "draft.gdf"
         result = folder / f"{folder.name}.gdf"
         path = result if result.is_file() else draft
-        before = self._added.get(folder)
-        now = path, path.stat().st_mtime_ns
-        if now != before:
-            self._added[folder] = now
-            if before is None or not self._edits.finish(before[0], path):
+        old_version = self._added.get(folder)
+        version = path, path.stat().st_mtime_ns
+        if version != old_version:
+            self._added[folder] = version
+            if old_version is None or not self._edits.finish(old_version[0], path):
                 self._edits.add(path, folder.name)
 
     def _open_example(self, bundle: str) -> None:
-        """Unpacked where the program keeps its state: what is saved in it stays there."""
+        """Copy the bundle into the program's state folder and open the copy, so that the user can save it."""
         folder = state_folder() / "examples" / sha256(Path(bundle))[:8]
         make_folder(folder)
         copy = folder / Path(bundle).name
@@ -142,7 +144,7 @@ class StartActions:
         self._app.open(copy)
 
     def _publish(self) -> None:
-        """The files of the page as they are, while it is shown."""
+        """Update the files of the start page while it is open."""
         main_view = self._app.main_view
         if not main_view.at_start:
             return
@@ -171,7 +173,7 @@ class StartActions:
 
 
 class UpActions:
-    """Says where it is a guess which way is up, and remembers what a person sets.
+    """Notice of a guessed up axis, and storage of the axis that the user sets.
 
     Args:
         app: the window
@@ -179,18 +181,18 @@ class UpActions:
 
     def __init__(self, app: Application) -> None:
         self._app = app
-        self._looked = False  # at the scene
-        self._up: Vec3 | None = None  # what a person had set as up at the last look
+        self._looked = False  # the scene has been checked
+        self._up: Vec3 | None = None  # the user's up axis at the last poll
 
     def poll(self, session: Path | None) -> None:
-        """Look at the scene that is open, and at the up axis.
+        """Check the open scene and its up axis.
 
         Args:
-            session: that is open, which knows
+            session: the open session, which stores the up axis
         """
         main_view = self._app.main_view
         document = self._app.document
-        # what a person sets, also by undo; not where a film, a picture or a snapshot leads the camera
+        # The axis set by the user, also by undo; a film, a picture or a snapshot may move the camera.
         up = main_view.work.past.present.look.up
         before = self._up
         self._up = up
@@ -206,5 +208,5 @@ class UpActions:
         self._looked = True
 
     def leave_scene(self) -> None:
-        """There is another scene to look at."""
+        """Check the next scene anew."""
         self._looked = False

@@ -1,4 +1,4 @@
-"""New edits in the window: the form queues a run, cards follow all jobs, the edit becomes a layer."""
+"""Training in the window: the form queues a run, cards show all jobs, the result becomes a layer."""
 
 from __future__ import annotations
 
@@ -33,31 +33,31 @@ from viewer.state.view_state import LayerState
 from viewer.state.workspace import Dialog
 
 LIVE_EVERY_S = 3.0
-"""Between two recordings that are shown while a run trains."""
+"""Minimum interval between the recordings shown during a run, in seconds."""
 LIVE_SHARE = 0.05
-"""Of the window's time, at most, that showing them may take."""
+"""Maximum share of the window's time spent on showing recordings."""
 
 
 def is_newer(file: Path, other: Path) -> bool:
-    """Whether both are there and the first was written later."""
+    """Return whether both files exist and the first is newer."""
     try:
         return file.stat().st_mtime_ns > other.stat().st_mtime_ns
     except OSError:
         return False
 
 
-_KINDS = ("masks", "photomasks", "text", "changed")
-"""Of regions, besides those that every command knows."""
+_REGION_KINDS = ("masks", "photomasks", "text", "changed")
+"""Kinds of regions, besides those that every command supports."""
 
 
 class JobActions:
-    """Trains what the form asks for, and follows all jobs. `close` it with the window.
+    """Training of the form's edit, and the state of all jobs. `close` it with the window.
 
     Args:
         app: the window
-        draft: gives the file of a grade that shows what the form says
-        anchor: gives the picture of one view that the form's sentence is to follow
-        follow: opens that picture's file in another program, and shows what is saved of it
+        draft: returns the file of a grade that previews the form
+        anchor: returns the picture of one view that the form's sentence should follow
+        follow: opens that picture's file in another program and shows the saved result
     """
 
     def __init__(
@@ -74,15 +74,15 @@ class JobActions:
         self._edits = EditActions(app)
         self.queue = JobQueue()
         self._scene: Path | None = None
-        self._followed = False  # its runs that were stopped are in the queue
+        self._followed = False  # the scene's stopped runs are in the queue
         self._live: Path | None = None  # the recording on screen
-        self._live_layers: tuple[LayerState, ...] = ()  # that show it
+        self._live_layers: tuple[LayerState, ...] = ()  # its layers
         self._live_due = 0.0
-        self._quits: type | None = None  # once no such task is busy
+        self._quits: type | None = None  # quit once no task of this class is busy
 
     @property
     def requests(self) -> Requests:
-        """What the form and the cards ask for; these name a job by its number."""
+        """Requests of the form and the cards; those of the cards name a job by its number."""
         queue = self.queue
         return {
             "train": self._train,
@@ -101,7 +101,7 @@ class JobActions:
         }
 
     def holds_window(self) -> bool:
-        """Whether a job runs, so that it is asked what becomes of it before the window closes."""
+        """Return whether a job runs; if so, ask the user what to do before the window closes."""
         job = None if self._quits else self.queue.busy(EditOrder) or self.queue.busy()
         if job is not None:
             kind = "training" if isinstance(job.task, EditOrder) else "delivery"
@@ -109,7 +109,7 @@ class JobActions:
         return job is not None
 
     def _quit(self, kind: type) -> None:
-        """Stop such jobs, and close the window once they have ended."""
+        """Stop all jobs of this class, and close the window once they have ended."""
         self._quits = kind
         for job in self.queue.jobs:
             if isinstance(job.task, kind):
@@ -121,7 +121,7 @@ class JobActions:
         self._app.main_view.ask(Dialog("log", str(self.queue.job(int(number)).task.log)))
 
     def poll(self) -> float | None:
-        """Look at the jobs; seconds until the next look, None for ever."""
+        """Poll the jobs; return the seconds until the next poll, None for never."""
         self._follow_document()
         for job in self.queue.poll():
             self._end(job)
@@ -133,11 +133,11 @@ class JobActions:
         return self.queue.next_poll()
 
     def close(self) -> None:
-        """Stop what runs."""
+        """Stop the running jobs."""
         self.queue.close()
 
     def _train(self, _: str) -> None:
-        """What the form asks for goes into the queue; what is wrong stands in the form."""
+        """Queue the form's edit; an error stays in the form."""
         main_view = self._app.main_view
         form = main_view.work.form
         error = form.obstacle or failure_line(lambda: self._enqueue(form))
@@ -168,7 +168,7 @@ class JobActions:
         self.queue.add(order)
         if (draft := self._draft(form)) is not None:
             attempt(self._app.main_view, partial(self._add_draft, order, draft, form.strength))
-        if form.region == SELECTION:  # it becomes a region: its highlight would hide what is trained
+        if form.region == SELECTION:  # its selection becomes a region: the highlight would hide the edit
             main_view = self._app.main_view
             view = main_view.work.view
             name = free_name(view.selection, out.name)
@@ -177,7 +177,7 @@ class JobActions:
             main_view.change(replace(view, selection=selection))
 
     def _lay_decal(self, _: str) -> None:
-        """The decal in the hand goes into the queue, as it lies in the picture."""
+        """Queue the placed decal with its camera and its position in the picture."""
         main_view = self._app.main_view
         scene = self._app.document.path
         placed = main_view.decal_place
@@ -204,7 +204,7 @@ class JobActions:
         self.queue.add(order)
 
     def _add_draft(self, order: EditOrder, draft: Path, strength: float = 1.0) -> None:
-        """A grade becomes the layer that the training will make better.
+        """Add a grade as the layer that the trained edit replaces later.
 
         Raises:
             ProgdfError: its file cannot be written or read.
@@ -213,12 +213,12 @@ class JobActions:
         self._edits.add(order.draft, order.name, strength)
 
     def _take_packed(self, order: EditOrder, packed: Path) -> None:
-        """What is trained and only measured yet takes the place of the draft's layer."""
+        """Replace the draft's layer by the trained edit, whose evaluation is still running."""
         write_file(order.packed_edit, read_file(packed))
         self._edits.finish(order.draft, order.packed_edit)
 
     def _write_anchor(self, form: NewEdit, run: Path) -> str:
-        """The file of the picture that a sentence is to follow, beside its run; "" for none.
+        """Return the file of the picture that a sentence should follow, saved beside its run; "" for none.
 
         Raises:
             ProgdfError: it cannot be written.
@@ -234,7 +234,7 @@ class JobActions:
         return str(path)
 
     def _paint_over(self, _: str) -> None:
-        """Write the picture where any program can change it, and follow that file from now on."""
+        """Save the picture for editing in another program, and follow that file from now on."""
         main_view = self._app.main_view
         scene = self._app.document.file
         form = main_view.work.form
@@ -244,9 +244,10 @@ class JobActions:
             self._follow(Path(path))
 
     def region_spec(self, form: NewEdit, folder: Path, name: str = "") -> str:
-        """The form's region as `progdf train --region` has it; one that has no file gets one in the folder.
+        """Return the form's region as a value of `progdf train --region`; write a file into the folder if
+        needed.
 
-        Without a name the file is called by what is in it: who has read it need not read it again.
+        Without a name, a hash of the region names the file, so that a reader can reuse what it has loaded.
 
         Raises:
             ProgdfError: it cannot be read or written.
@@ -255,7 +256,7 @@ class JobActions:
             return form.region
         if form.region == TYPED:
             spec = form.typed_region.strip()
-            check_region(spec, {kind: lambda _: None for kind in _KINDS})
+            check_region(spec, {kind: lambda _: None for kind in _REGION_KINDS})
             return spec
         selection = self._app.main_view.work.view.selection
         total = len(self._app.document.original)
@@ -269,7 +270,7 @@ class JobActions:
         return f"file:{path}"
 
     def _ask_discard(self, number: str) -> None:
-        """What was trained cannot be brought back: ask. What has not begun is no loss."""
+        """Ask before discarding a run that has begun; discard a waiting one directly."""
         job = self.queue.job(int(number))
         if job.task.is_begun:
             spent = job.task.read_progress(job.progress).seconds
@@ -278,12 +279,12 @@ class JobActions:
             self.queue.discard(job.number)
 
     def _end(self, job: QueuedTask) -> None:
-        """A job has ended: a new edit comes on top, else a line says what became of it."""
+        """Handle the end of a job: add or replace the layer, or show a message."""
         task = job.task
         main_view = self._app.main_view
         if job.status == "done" and not job.warning and isinstance(task, EditOrder):
             self.queue.dismiss(job.number)
-        if job.status == "failed" and not main_view.work.view.panel:  # else its card says so
+        if job.status == "failed" and not main_view.work.view.panel:  # otherwise its card shows the error
             main_view.show_message(f"{task.name}: {job.error}", error=True)
         if isinstance(task, Delivery):
             if job.status == "done" and task.words[0] == "rebind":
@@ -292,7 +293,7 @@ class JobActions:
             elif job.status == "done":
                 main_view.show_message(f"Wrote {task.out}")
             return
-        if job.status == "done" and self._scene == task.scene:  # it takes the place of its recordings
+        if job.status == "done" and self._scene == task.scene:  # the result replaces the recordings
             self._live = None
             if not any(self._edits.finish(path, task.result) for path in (task.draft, task.packed_edit)):
                 self._app.open(task.result)
@@ -305,12 +306,12 @@ class JobActions:
             main_view.show_message(f"{task.name} is trained: {task.result}")
 
     def leave_scene(self) -> None:
-        """There is another scene; what is trained for this one goes on, and its card says for which."""
+        """Reset the state of the old scene. Its runs continue, and their cards name that scene."""
         self._followed = False
         self._live = None
 
     def _follow_document(self) -> None:
-        """Runs of the scene that were stopped another day come back."""
+        """Add the scene's stopped runs of earlier sessions to the queue."""
         if self._followed:
             return
         path = self._app.document.path
@@ -323,7 +324,7 @@ class JobActions:
                 self.queue.add_stopped(order)
 
     def _show_live(self, now: float) -> None:
-        """The newest recording of the run, as far as showing it costs next to nothing."""
+        """Show the newest recording of the run, within the time budget `LIVE_SHARE`."""
         orders = (job.task for job in self.queue.jobs if job.status == "running")
         order = next((task for task in orders if isinstance(task, EditOrder)), None)
         if order is None or order.scene != self._scene or now < self._live_due:
@@ -334,7 +335,7 @@ class JobActions:
         if order.draft in layers and is_newer(packed, order.draft):
             attempt(self._app.main_view, partial(self._take_packed, order, packed))
         if layers or (live and live != self._live_layers):
-            return  # there is a layer of it, or of what the form says
+            return  # the edit has a layer already, or the form's preview is shown
         if packed.is_file() and not order.draft.exists():
             attempt(self._app.main_view, partial(self._add_draft, order, packed))
             return
@@ -352,7 +353,7 @@ class JobActions:
         self._live_due = now + max(LIVE_EVERY_S, cost / LIVE_SHARE)
 
     def _publish(self) -> None:
-        """The panel shows the jobs of this scene, and of others those that go on."""
+        """Publish the jobs of this scene and the busy jobs of others to the panel."""
         main_view = self._app.main_view
         jobs = tuple(
             replace(job, elsewhere="" if job.task.scene == self._scene else job.task.scene.name)
