@@ -1,1 +1,1 @@
-"""The run folder: what lies where, and what a stopped run needs."""
+"""The run folder: its files and the saved state of a stopped run."""

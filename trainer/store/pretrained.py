@@ -1,4 +1,4 @@
-"""Pretrained networks on this machine: where they lie, whether they are whole, what goes wrong with them."""
+"""Pretrained networks on this machine: their folders, checks for complete weights, and error messages."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from safetensors import SafetensorError, safe_open
 from progdf.errors import ProgdfError
 
 BROKEN = (OSError, ValueError, RuntimeError, KeyError, TypeError, SafetensorError)
-"""What transformers and diffusers raise for a model that is not there, not whole, or another's."""
+"""Exceptions of transformers and diffusers for a model that is missing, incomplete or of another type."""
 
 _T = TypeVar("_T")
 
 
 class Shared:
-    """What was made last in this process, one of each kind, for who asks for the same next."""
+    """Cache of the last object of each kind in this process."""
 
     def __init__(self) -> None:
         self._last: dict[str, tuple[object, Any]] = {}
 
     def get(self, what: str, key: object, make: Callable[[], _T]) -> _T:
-        """What `make` gives, or gave when it was last asked for `what` with an equal key."""
+        """Return the cached object of kind `what` if its key is equal, else make and cache a new one."""
         if what not in self._last or self._last[what][0] != key:
-            self._last.pop(what, None)  # first, so that two are never in memory
+            self._last.pop(what, None)  # before `make`, so that two objects are never in memory
             self._last[what] = key, make()
         value: _T = self._last[what][1]
         return value
@@ -40,25 +40,25 @@ _models: Shared | None = None
 
 
 def keep_models() -> None:
-    """From now on the last model of each kind stays in memory, for a process that trains many edits."""
+    """Keep the last model of each kind in memory from now on, for a process that trains many edits."""
     global _models
     _models = _models or Shared()
 
 
 def last_model(kind: str, key: object, load: Callable[[], _T]) -> _T:
-    """What `load` gives; after `keep_models`, what it gave last for this kind if the key is the same."""
+    """Return the result of `load`, or after `keep_models` the last one of this kind if its key is equal."""
     return load() if _models is None else _models.get(kind, key, load)
 
 
 def folder_of_model(model: str, file: str) -> Path:
-    """Where a model lies that has this file.
+    """Return the local folder of a model that contains this file.
 
     Args:
         model: a folder, or an id on the Hugging Face hub
         file: relative to the model
 
     Raises:
-        one of `BROKEN`: it is not on this machine.
+        one of `BROKEN`: the model is not on this machine.
     """
     if Path(model).is_dir():
         return Path(model)
@@ -71,12 +71,13 @@ def folder_of_model(model: str, file: str) -> Path:
 
 
 def missing_weights(model: str, kind: str, of_folder: str, download: str) -> ProgdfError:
-    """What to do where a model is not here, or not whole.
+    """Return the error for a missing or incomplete model, with the remedy.
 
     Args:
         model: a folder, or an id on the Hugging Face hub
-        kind: of model
-        of_folder, download: how the line ends for a folder; and for an id, after hf download ID
+        kind: type of the model, in words
+        of_folder: end of the message for a folder
+        download: end of the message for an id, after `hf download ID`
     """
     if Path(model).is_dir() or model.startswith((".", "/", "~")):
         return ProgdfError(f"{model} does not hold a complete {kind} with safetensors weights{of_folder}")
@@ -87,17 +88,17 @@ def missing_weights(model: str, kind: str, of_folder: str, download: str) -> Pro
 
 
 def keep_quiet(*speaks: Any) -> None:
-    """Errors alone from libraries, by their logging modules: they warn of every package that is optional."""
+    """Limit these logging modules to errors: the libraries warn about every missing optional package."""
     for module in speaks:
         module.set_verbosity(logging.ERROR)
         module.disable_progress_bar()
 
 
 def weights_here(folder: Path) -> int:
-    """How many numbers a network's weights hold, by the heads of its files.
+    """Return the number of weights of a network, from the headers of its files.
 
     Raises:
-        one of `BROKEN`: there are none, one of several files is missing, or one is truncated.
+        one of `BROKEN`: the folder holds no weights, a file is missing, or a file is truncated.
     """
     files = set(folder.glob("*.safetensors"))
     for index in folder.glob("*.safetensors.index.json"):
@@ -112,14 +113,14 @@ def weights_here(folder: Path) -> int:
 
 
 def gpu_memory() -> tuple[int, int] | None:
-    """Free and total bytes of the graphics card that torch uses; None where there is none."""
+    """Return the free and total bytes of the graphics card that torch uses; None without a card."""
     if not torch.cuda.is_available():
         return None
-    gc.collect()  # what a network before left is free too
+    gc.collect()  # memory of a previous network counts as free
     torch.cuda.empty_cache()
     return torch.cuda.mem_get_info()
 
 
 def model_device(choice: str = "auto") -> str:
-    """Where pretrained networks run: "cuda" where torch has a graphics card, unless "cpu" is asked for."""
+    """Return the device for pretrained networks: "cuda" if `choice` is "auto" and torch has a card."""
     return "cuda" if choice == "auto" and torch.cuda.is_available() else "cpu"

@@ -1,4 +1,4 @@
-"""How a run reports its progress: a bar with loss and time left on a terminal, plain lines elsewhere."""
+"""Progress reports of a run: a bar with loss and remaining time on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from progdf.terminal import escape_text
 from .state import Saved
 
 Advance = Callable[[int, str], None]
-"""Steps done so far, and a short word about them (the loss)."""
+"""Callback with the number of finished steps and a short status text (the loss)."""
 
 STAGES = {
     "views": "",
@@ -40,7 +40,7 @@ STAGES = {
     "measure the edit": "Measuring",
     "draw": "",
 }
-"""The long stages of a run in their order, with their labels in the window; those without tell no steps."""
+"""Long stages of a run in order, with their labels in the window; stages without a label report no steps."""
 
 LATER = {
     "time the slider": 0.15,
@@ -51,29 +51,28 @@ LATER = {
     "measure the edit": 1.7,
     "draw": 0.5,
 }
-"""Work for each view of the stages that follow the optimization, see `RunLog.expect`."""
+"""Work per view of the stages after the optimization, see `RunLog.expect`."""
 
 
-_EDITOR = ("try kinds", "edit")
+_EDITOR_STAGES = ("try kinds", "edit")  # the editor's own work, whose pace differs from the other stages
 
-_TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
+_MALLOC_TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
 
-_EVERY_S = 5.0
-_FILE_EVERY_S = 0.4
+_LINE_INTERVAL_S = 5.0  # between two lines of a stage without a terminal
+_FILE_INTERVAL_S = 0.4  # between two writes of the progress file
 
 
 class RunLog:
-    """Writes what happens to log.txt and, unless quiet, to stderr; measures each stage's seconds.
+    """Log of a run in log.txt and, unless quiet, on stderr, with the seconds of each stage.
 
-    The seconds are part of a run's saved state (`state.Resumable`): those of all its sessions add up.
+    The seconds are part of a run's saved state (`state.Resumable`), so that all its sessions add up.
 
     Args:
-        path: log.txt; what is in it stays
-        quiet: the file only
-        refits: a later command on a finished run, whose own time counts apart
-        progress: a file for programs that wait for the run: the share of its time that has passed, a label of
-            what it does, its loss, and its seconds so far, as JSON, rewritten a few times a second; None
-            writes none
+        path: log.txt; lines are appended
+        quiet: write to the file only
+        refits: a later command on a finished run, whose time is counted separately
+        progress: JSON file for programs that wait for the run, rewritten a few times a second: elapsed share
+            of the time, label of the stage, loss, and seconds so far; None writes no file
     """
 
     def __init__(
@@ -86,8 +85,8 @@ class RunLog:
         self._written = 0.0
         self._share = 0.0
         self._work: Mapping[str, float] = {"views": 1.0, "edit": 1.0, "optimize": 5.0, **LATER}
-        self._took: dict[str, float] = {}  # seconds of the stages that have ended
-        self._running: dict[str, float] = {}
+        self._ended_seconds: dict[str, float] = {}  # seconds of finished stages
+        self._begun_at: dict[str, float] = {}
         self._earlier_mb = 0
         self._start = time.perf_counter()
         self._file = path.open("a", encoding="utf-8", buffering=1)
@@ -95,67 +94,67 @@ class RunLog:
         self._bar = self._console.is_terminal and not quiet
 
     def rounded_seconds(self) -> dict[str, float]:
-        """Seconds by stage, and of all sessions of the run together: the total, or of a refit its own."""
-        all_of_it = {"refit" if self.refits else "total": self._total()}
-        return {name: round(seconds, 2) for name, seconds in {**self.seconds, **all_of_it}.items()}
+        """Return the seconds by stage, plus "total" over all sessions of the run or "refit" for a refit."""
+        whole = {"refit" if self.refits else "total": self._total()}
+        return {name: round(seconds, 2) for name, seconds in {**self.seconds, **whole}.items()}
 
     def capture_state(self) -> Saved:
-        """Seconds so far; those of the stages that have not ended too."""
+        """Return the seconds so far, including those of unfinished stages."""
         now = time.perf_counter()
-        running = {name: now - begun for name, begun in self._running.items()}
+        running = {name: now - begun for name, begun in self._begun_at.items()}
         seconds = {
             name: self.seconds.get(name, 0.0) + running.get(name, 0.0) for name in self.seconds | running
         }
         return Saved({}, {"seconds": seconds, "total": self._total(), "memory": self.peak_mb()})
 
     def restore(self, saved: Saved) -> None:
-        """Add the seconds of the sessions before, and remember their peaks of memory."""
+        """Add the seconds of earlier sessions and remember their peak memory."""
         for name, seconds in saved.values["seconds"].items():
             self.seconds[name] = self.seconds.get(name, 0.0) + seconds
         self._earlier = saved.values["total"]
         self._earlier_mb = saved.values["memory"] or 0
 
     def peak_mb(self) -> int | None:
-        """Of the process and of earlier sessions of the same run, see `peak_mb`; None where it is unknown."""
+        """Return the peak memory over all sessions of the run, MB, see `peak_mb`; None if unknown."""
         return max(round(peak_mb()), self._earlier_mb) or None
 
     def expect(self, work: Mapping[str, float]) -> None:
-        """How much work the stages of this run are, in any unit; how fast it goes is measured.
+        """Set the expected work of the stages in any common unit; the pace is measured.
 
         Args:
-            work: of `STAGES`, those that the run has
+            work: amount of work by stage, for those of `STAGES` that the run has
         """
         self._work = work
 
     def seconds_left(self, stage: str, share: float, elapsed: float) -> float:
-        """Until the run ends, as far as it can be told.
+        """Return the estimated seconds until the run ends.
 
-        What is to come is taken to go at the pace of all that was, but for the editor's work, which is of
-        another kind; a stage's own pace counts as far as it is.
+        Remaining work is estimated at the pace of all finished work. The editor's work is left out, as its
+        pace differs. The stage's own pace is weighted by its finished share.
 
         Args:
-            stage: that runs
-            share: of it that is done, 0..1
-            elapsed: seconds of it so far
+            stage: the running stage
+            share: finished share of the stage, 0 to 1
+            elapsed: seconds since the stage began
         """
-        own = self._work.get(stage, 0.0)
-        place = list(STAGES).index(stage)
-        ahead = sum(work for name, work in self._work.items() if list(STAGES).index(name) > place)
-        took = 0.0
+        stage_work = self._work.get(stage, 0.0)
+        position = list(STAGES).index(stage)
+        ahead = sum(work for name, work in self._work.items() if list(STAGES).index(name) > position)
+        spent_seconds = 0.0
         work = 0.0
-        for name, seconds in self._took.items() | {(stage, elapsed)}:
-            if name not in _EDITOR:
-                took += seconds
+        for name, seconds in self._ended_seconds.items() | {(stage, elapsed)}:
+            if name not in _EDITOR_STAGES:
+                spent_seconds += seconds
                 work += self._work.get(name, 0.0) * (share if name == stage else 1.0)
-        pace = took / work if work else elapsed / max(share * own, 1e-9)
-        return (1.0 - share) * ((1.0 - share) * pace * own + elapsed) + pace * ahead
+        pace = spent_seconds / work if work else elapsed / max(share * stage_work, 1e-9)
+        return (1.0 - share) * ((1.0 - share) * pace * stage_work + elapsed) + pace * ahead
 
     def note(self, text: str) -> None:
-        """A line for the file alone."""
+        """Write a line to the file only."""
         self._file.write(f"{time.perf_counter() - self._start:8.1f} s  {escape_text(text)}\n")
 
     def say(self, text: str) -> None:
-        """One line."""
+        """Write a line to the file and to stderr."""
         self.note(text)
         if self._bar:
             self._console.print(f"[dim]{time.perf_counter() - self._start:6.1f} s[/dim]  {_escape(text)}")
@@ -164,21 +163,23 @@ class RunLog:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Measure a part of the run under `name`; a name that comes again adds up."""
-        begun = self._running[name] = time.perf_counter()
+        """Measure the seconds of a stage; repeated stages of one name add up."""
+        begun = self._begun_at[name] = time.perf_counter()
         try:
             yield
         finally:
-            del self._running[name]
+            del self._begun_at[name]
             release_memory()
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begun
             if not STAGES.get(name, name):
-                self._took[name] = time.perf_counter() - begun
+                self._ended_seconds[name] = time.perf_counter() - begun
 
     @contextmanager
     def steps(self, what: str, total: int) -> Iterator[Advance]:
-        """One of `STAGES` in `total` steps: a bar on a terminal, a line every few seconds elsewhere, with the
-        seconds until the run ends."""
+        """Report one of `STAGES` in `total` steps, with the seconds until the run ends.
+
+        A terminal shows a bar; other outputs get a line every few seconds.
+        """
         release_memory()
         begun = last = time.perf_counter()
 
@@ -192,7 +193,7 @@ class RunLog:
             nonlocal last
             left = tell(done, word)
             now = time.perf_counter()
-            if now - last >= _EVERY_S and done < total:
+            if now - last >= _LINE_INTERVAL_S and done < total:
                 last = now
                 self.say(f"{what} {done}/{total}  {word}  {left:.0f} s left")
 
@@ -213,12 +214,12 @@ class RunLog:
                 yield move_bar
         else:
             yield advance
-        self._took[what] = time.perf_counter() - begun
+        self._ended_seconds[what] = time.perf_counter() - begun
 
     @contextmanager
     def looks(self, what: str, total: int) -> Iterator[Callable[[], None]]:
-        """The same for a stage whose work comes in about `total` equal parts: call it at each."""
-        done, lock = 0, threading.Lock()  # any thread may look
+        """Report a stage of about `total` equal parts; call the yielded function at each part."""
+        done, lock = 0, threading.Lock()  # any thread may call it
         with self.steps(what, total) as advance:
 
             def count_look() -> None:
@@ -230,14 +231,14 @@ class RunLog:
             yield count_look
 
     def close(self) -> None:
-        """End the file."""
-        with suppress(OSError):  # a full disk, which has been reported already
+        """Close the file."""
+        with suppress(OSError):  # a full disk, already reported
             self._file.close()
 
     def _write_progress(self, what: str, left: float, word: str, ends: bool) -> None:
-        """Rewrite the progress file, not too often; who cannot write it goes on all the same."""
+        """Rewrite the progress file at most every `_FILE_INTERVAL_S` seconds; ignore a failed write."""
         now = time.perf_counter()
-        if self._progress is None or (now - self._written < _FILE_EVERY_S and not ends):
+        if self._progress is None or (now - self._written < _FILE_INTERVAL_S and not ends):
             return
         self._written = now
         total = self._total()
@@ -245,7 +246,7 @@ class RunLog:
         state = {
             "share": self._share,
             "label": STAGES[what],
-            # that of a field is on another scale
+            # a field's loss is on another scale
             "loss": word.removeprefix("loss to the edit ") if what == "optimize" else "",
             "seconds": total,
         }
@@ -261,33 +262,35 @@ def _escape(text: str) -> str:
 
 
 def release_memory() -> None:
-    """Between two pieces of work: glibc keeps what was freed between what was not, .8 GB after the views of
-    200 000 members. Where the process has grown by less than a tenth since, nothing is done."""
+    """Return freed memory to the system if the process has grown by a tenth since the last call.
+
+    glibc keeps freed blocks that lie between used ones: 0.8 GB after the views of 200 000 members.
+    """
     global _resident
-    if _TRIM is not None and _resident_pages() > 1.1 * _resident:
-        _TRIM(0)
+    if _MALLOC_TRIM is not None and _resident_pages() > 1.1 * _resident:
+        _MALLOC_TRIM(0)
         _resident = _resident_pages()
 
 
-_resident = 0  # pages, after the last time
+_resident = 0  # pages after the last `release_memory`
 
 
 def _resident_pages() -> int:
     return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
 
 
-_STATUS = Path("/proc/self/status")
+_STATUS_FILE = Path("/proc/self/status")
 
 
 def peak_mb() -> float:
-    """Peak resident memory since the process began, MB (2²⁰ bytes), as VmHWM; 0 where it is unknown.
+    """Return the peak resident memory of the process (VmHWM), MB of 2²⁰ bytes; 0 if unknown.
 
-    On Linux not `getrusage`, whose figure begins with what the parent held when it started this process.
+    Linux does not use `getrusage`: its figure starts at the parent's memory when this process was started.
     """
     if sys.platform == "win32":
         return 0.0
     if sys.platform == "linux":
-        for line in _STATUS.read_text(encoding="ascii", errors="replace").splitlines():
+        for line in _STATUS_FILE.read_text(encoding="ascii", errors="replace").splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) / 1024
     import resource

@@ -1,13 +1,13 @@
-"""The run folder: what lies where, whose folder it is, and pictures of views out and in.
+"""The run folder: its layout, the check that a folder belongs to the edit, and pictures of views.
 
-RUN/draft.gdf  a grade alone, until NAME.gdf is there
+RUN/draft.gdf                                    a color grade only, until NAME.gdf exists
 RUN/NAME.gdf  trajectory.safetensors  cameras.json  report.json  report.png  log.txt
-RUN/views/original|mask|final/VIEW.png           the view before, where the region is, after
-RUN/views/edited/VIEW.png, edited/0.25/VIEW.png  what the editor made of it: finished, at other strengths
-RUN/views/painted/…                              what a learned editor painted, see editors/cache.py
-RUN/segmented/PROMPT/VIEW.png                    where text:"…" found it; a folder for masks:DIR
-RUN/state/…                                      what a stopped run needs to go on, see state.py
-RUN/run.lock                                     locked while it is trained
+RUN/views/original|mask|final/VIEW.png           the view before the edit, the region's mask, after the edit
+RUN/views/edited/VIEW.png, edited/0.25/VIEW.png  the editor's pictures at strength 1 and at other strengths
+RUN/views/painted/…                              pictures of a learned editor, see editors/cache.py
+RUN/segmented/PROMPT/VIEW.png                    masks of text:"…"; a folder for masks:DIR
+RUN/state/…                                      saved state of a stopped run, see state.py
+RUN/run.lock                                     locked during training
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ PICTURES_LIST = "pictures.txt"
 
 
 def read_pictures_list(folder: Path) -> list[str]:
-    """The lines of the folder's list."""
+    """Return the lines of the folder's list of pictures; none without a readable list."""
     try:
         return (folder / PICTURES_LIST).read_text(encoding="utf-8").splitlines()
     except (OSError, ValueError):
@@ -50,7 +50,7 @@ def read_pictures_list(folder: Path) -> list[str]:
 
 
 def add_pictures(folder: Path, paths: Iterable[Path]) -> None:
-    """Put files in the folder on its list."""
+    """Add files of the folder to its list."""
     lines = read_pictures_list(folder)
     new = dict.fromkeys(path.relative_to(folder).as_posix() for path in paths)
     if added := [line for line in new if line not in set(lines)]:
@@ -58,20 +58,20 @@ def add_pictures(folder: Path, paths: Iterable[Path]) -> None:
 
 
 def remove_pictures_but_of(folder: Path, views: Collection[str]) -> None:
-    """Delete the listed files that are not of one of these views; nothing behind a link is touched."""
+    """Delete the listed files that belong to none of these views; links are not followed."""
     entries = []
     for line in read_pictures_list(folder):
         path = folder / line
         if _is_of_view(line, views) or not _is_inside(folder, line):
             entries.append(line)
-        elif os.path.isfile(path):  # pathlib's raises where a name is too long
+        elif os.path.isfile(path):  # pathlib's is_file raises if a name is too long
             path.unlink()
     if read_pictures_list(folder) != entries:
         _write(folder, entries)
 
 
 def _is_of_view(line: str, views: Collection[str]) -> bool:
-    """Return whether a listed file is a view's: VIEW.png, KIND/VIEW.png or KIND/0.25/VIEW.png."""
+    """Return True if a listed file belongs to a view: VIEW.png, KIND/VIEW.png or KIND/0.25/VIEW.png."""
     path = PurePosixPath(line)
     parts = (*path.parent.parts, path.stem)
     folders = 1
@@ -81,12 +81,12 @@ def _is_of_view(line: str, views: Collection[str]) -> bool:
 
 
 def _is_inside(folder: Path, line: str) -> bool:
-    """Whether a line leads to a place in the folder, through no link."""
+    """Return True if a line names a path inside the folder that passes through no link."""
     parts = PurePosixPath(line)
     if parts.is_absolute() or ".." in parts.parts or not parts.parts:
         return False
-    places = [folder / part for part in (parts, *parts.parents)]  # the last is the folder itself
-    return not any(path.is_symlink() for path in places)
+    paths = [folder / part for part in (parts, *parts.parents)]  # the last is the folder itself
+    return not any(path.is_symlink() for path in paths)
 
 
 def _write(folder: Path, lines: Iterable[str]) -> None:
@@ -94,7 +94,7 @@ def _write(folder: Path, lines: Iterable[str]) -> None:
 
 
 _SIGNATURE = "progdf train"
-_LOOK_S = 1.0  # a window that asks whether a run is locked holds the lock for a moment
+_LOCK_WAIT_S = 1.0  # a window that checks whether a run is locked holds the lock briefly
 
 
 _T = TypeVar("_T")
@@ -108,78 +108,78 @@ class RunFolder:
 
     @property
     def trajectory(self) -> Path:
-        """The recorded trajectory."""
+        """Recorded trajectory."""
         return self.root / FILE_NAME
 
     @property
     def cameras(self) -> Path:
-        """All views' cameras, `progdf.load_cameras` reads them."""
+        """Cameras of all views, for `progdf.load_cameras`."""
         return self.root / "cameras.json"
 
     @property
     def report(self) -> Path:
-        """Figures, JSON."""
+        """Figures of the run, JSON."""
         return self.root / "report.json"
 
     @property
     def picture(self) -> Path:
-        """Figures, to look at."""
+        """Figures of the run as a picture."""
         return self.root / "report.png"
 
     @property
     def segment_masks(self) -> Path:
-        """Masks of text:"…", a folder a prompt; they are made before the run begins."""
+        """Masks of text:"…", one folder per prompt, made before the run begins."""
         return self.root / "segmented"
 
     @property
     def log(self) -> Path:
-        """What happened."""
+        """Log of the run."""
         return self.root / "log.txt"
 
     @property
     def progress(self) -> Path:
-        """How far a run has come, JSON, for programs that wait for it; gone with the state when it ends."""
+        """Progress of the run, JSON, for programs that wait for it; removed with the state at the end."""
         return self.root / "state" / "progress.json"
 
     @property
     def state(self) -> StateFolder:
-        """What a stopped run needs to go on."""
+        """Saved state for resuming a stopped run."""
         return StateFolder(self.root / "state")
 
     def gdf(self, name: str) -> Path:
-        """The edit."""
+        """Return the path of the edit."""
         return self.root / f"{name}.gdf"
 
     @property
     def draft(self) -> Path:
-        """A grade alone of the edit, while it is trained."""
+        """Color grade of the edit, for use during training."""
         return self.root / "draft.gdf"
 
     @property
     def views(self) -> Path:
-        """Pictures of the views, a folder a kind, and the list of those that the run has written."""
+        """Pictures of the views, one folder per kind, and the list of the pictures that the run wrote."""
         return self.root / "views"
 
     @property
     def paintings(self) -> Path:
-        """What a learned editor painted, with a list of its own."""
+        """Pictures of a learned editor, with their own list."""
         return self.views / "painted"
 
     def view(self, kind: str, name: str, strength: float = 1.0) -> Path:
-        """A view's picture; `kind` is original, edited, mask or final."""
+        """Return the path of a view's picture; `kind` is original, edited, mask or final."""
         folder = self.views / kind
         return (folder if strength == 1.0 else folder / f"{strength:g}") / f"{name}.png"
 
 
 def check_folder(root: Path, edit: Mapping[str, str]) -> RunFolder:
-    """The run's folder, if a run of this edit may be put there; nothing is made.
+    """Return the run's folder if a run of this edit may use it; nothing is created.
 
     Args:
         root: the folder
-        edit: what identifies the edit (scene, region, editor)
+        edit: values that identify the edit (scene, region, editor)
 
     Raises:
-        ProgdfError: it is a file, or holds no run, or the run of another edit.
+        ProgdfError: it is a file, is neither empty nor a run, or holds a run of another edit.
     """
     if root.exists() and not root.is_dir():
         raise ProgdfError(f"{root} is a file; give --out a folder")
@@ -198,37 +198,37 @@ def check_folder(root: Path, edit: Mapping[str, str]) -> RunFolder:
         earlier: dict[str, Any] = {}
         with contextlib.suppress(ValueError):
             earlier = convert_json(decode_json(first.removeprefix(_SIGNATURE)), dict[str, Any])
-        for what, value in edit.items():
-            if earlier.get(what) != value:
+        for key, value in edit.items():
+            if earlier.get(key) != value:
                 raise ProgdfError(
-                    f"{root} holds a run with another {what} ({earlier.get(what)}); "
+                    f"{root} holds a run with another {key} ({earlier.get(key)}); "
                     "give --out another folder, or delete this one"
                 )
     return folder
 
 
 def open_run_folder(root: Path, edit: Mapping[str, str]) -> RunFolder:
-    """Make the run's folder, or take over that of an earlier run of the same edit; see `check_folder`."""
+    """Create the run's folder, or reuse the one of an earlier run of the same edit; see `check_folder`."""
     folder = check_folder(root, edit)
     atomic.make_folder(root)
     return folder
 
 
 def begin_log(folder: RunFolder, edit: Mapping[str, str]) -> None:
-    """A new log.txt; its first line says that the folder is a run, and of which edit."""
+    """Start a new log.txt; its first line marks the folder as a run and identifies the edit."""
     atomic.write_file(folder.log, f"{_SIGNATURE} {json.dumps(dict(edit), ensure_ascii=False)}\n")
 
 
 @contextlib.contextmanager
 def lock_folder(folder: RunFolder) -> Iterator[None]:
-    """Nobody else trains in this folder meanwhile.
+    """Hold an exclusive lock on the run folder.
 
     Raises:
-        ProgdfError: somebody does, or the folder cannot be written to.
+        ProgdfError: another process trains in the folder, or the folder cannot be written to.
     """
     with contextlib.ExitStack() as held:
         try:
-            held.enter_context(atomic.hold_lock(folder.root / atomic.LOCK, _LOOK_S))
+            held.enter_context(atomic.hold_lock(folder.root / atomic.LOCK, _LOCK_WAIT_S))
         except atomic.LockedError:
             raise ProgdfError(
                 f"{folder.root} is being trained by another process; wait for it, or stop it first"
@@ -237,13 +237,13 @@ def lock_folder(folder: RunFolder) -> Iterator[None]:
 
 
 def remove_leftovers(folder: RunFolder) -> None:
-    """Delete what a run that was killed was just about to write."""
+    """Delete the temporary files of a killed run."""
     for directory, _, _ in os.walk(folder.root):
         atomic.remove_abandoned(Path(directory))
 
 
 def write_views(folder: RunFolder, kind: str, pictures: Mapping[str, Tensor], strength: float = 1.0) -> None:
-    """One PNG per view. Pictures by view name, [H,W,3] or [H,W]."""
+    """Write one PNG per view. `pictures`: by view name, [H,W,3] or [H,W]"""
     paths = [folder.view(kind, name, strength) for name in pictures]
     map_threads(lambda pair: write_image(*pair), list(zip(paths, pictures.values(), strict=True)))
     add_pictures(folder.views, paths)
@@ -276,12 +276,12 @@ def read_views(
 
 
 def read_run_cameras(folder: RunFolder, held_out: Iterable[str], origin: Origin) -> list[Camera]:
-    """Return the cameras of a run's views, after a comparison with the pictures that the run wrote.
+    """Return the cameras of a run's views, checked against the pictures that the run wrote.
 
     Args:
         folder: a finished run
         held_out: names of the views that the edit was not trained on
-        origin: of the scene, which the cameras are relative to
+        origin: the scene's, to which the cameras are relative
 
     Raises:
         ProgdfError: cameras.json is broken, or its views differ from the run's in names, number or size.
@@ -315,7 +315,7 @@ def read_run_cameras(folder: RunFolder, held_out: Iterable[str], origin: Origin)
 
 
 class LazySequence(Sequence[_T]):
-    """What `make` makes of each of some items, anew at each look: for what is too large to keep."""
+    """Sequence of values too large to keep, which `make` computes from the items at every access."""
 
     def __init__(self, items: Sequence[Any], make: Callable[[Any], _T]) -> None:
         self._items = items
@@ -335,26 +335,26 @@ class LazySequence(Sequence[_T]):
 
 
 def stored_pictures(pictures: Iterable[Tensor]) -> LazySequence[Tensor]:
-    """Pictures of 8-bit files, kept in a quarter of their memory. [H,W,3] float32 each, as they were"""
+    """Store pictures of 8-bit files in a quarter of their memory, without loss. [H,W,3] float32 each"""
     return LazySequence([to_bytes(picture) for picture in pictures], from_bytes)
 
 
 def to_bytes(image: Tensor) -> Tensor:
-    """What an 8-bit file keeps of an image. [H,W,3] 0..1 -> [H,W,3] uint8"""
+    """Quantize an image as an 8-bit file does. [H,W,3] 0 to 1 -> [H,W,3] uint8"""
     return (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
 
 
 def from_bytes(stored: Tensor) -> Tensor:
-    """The inverse of `to_bytes`, of what was kept."""
+    """Convert the result of `to_bytes` back. [H,W,3] uint8 -> [H,W,3] 0 to 1"""
     return stored.float() / 255.0
 
 
 def remove_stale_views(folder: RunFolder, names: Sequence[str]) -> None:
-    """Delete pictures of views that an earlier run of the same edit had and this one has not."""
+    """Delete pictures of views that only an earlier run of the same edit had."""
     for directory in (folder.views, folder.paintings):
         remove_pictures_but_of(directory, set(names))
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write JSON, whole or not at all."""
+    """Write a JSON file atomically."""
     atomic.write_file(path, json.dumps(content, indent=2, ensure_ascii=False) + "\n")

@@ -1,11 +1,11 @@
-"""RUN/state: what a run needs to go on after it was stopped at any moment, to the same bits.
+"""RUN/state: saved state of a run, which resumes bit for bit after a stop at any moment.
 
-    state/run.json                  which run it is: options, scene, region; from first moment to last
-    state/PART.safetensors          one part of it, such as what trains: tensors, JSON values in the header
-    state/PART/000012.safetensors   one entry of a list that only grows, such as the recordings
+    state/run.json                  identity of the run: options, scene, region; exists during the whole run
+    state/PART.safetensors          one part, such as the optimizer: tensors, and JSON values in the header
+    state/PART/000012.safetensors   one entry of a growing list, such as the recordings
 
-Every file is written beside its place, flushed to the disk and renamed, so that kill -9 leaves the last whole
-one. Nothing in them is ever executed. Without run.json there is nothing to resume, whatever else lies there.
+Every file is written under a temporary name, flushed to the disk and renamed, so that kill -9 leaves the last
+complete one. No file is ever executed. Without run.json there is nothing to resume, whatever else exists.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from progdf.terminal import ENDINGS, handle_signals
 
 @contextmanager
 def interrupt_on_signals() -> Iterator[None]:
-    """Raise KeyboardInterrupt at SIGTERM and SIGHUP too, so that all three end a run in the same way."""
+    """Raise KeyboardInterrupt at SIGTERM and SIGHUP too, so that they end a run like Ctrl-C."""
 
     def stop(number: int, frame: FrameType | None) -> NoReturn:
         raise KeyboardInterrupt
@@ -48,10 +48,10 @@ def interrupt_on_signals() -> Iterator[None]:
 
 @contextmanager
 def defer_signals() -> Iterator[Callable[[], bool]]:
-    """Hold Ctrl-C, SIGTERM and SIGHUP back; the yielded function says whether one came.
+    """Defer Ctrl-C, SIGTERM and SIGHUP; the yielded function returns True after one of them.
 
-    Ask it where the state is whole, save, and raise KeyboardInterrupt. A second signal does not wait, and
-    neither does one that nobody asked about.
+    Call it where the state is consistent. If it returns True, save and raise KeyboardInterrupt. A second
+    signal raises at once, and a deferred signal raises at the end of the block.
     """
     came = False
 
@@ -68,41 +68,43 @@ def defer_signals() -> Iterator[Callable[[], bool]]:
 
 
 SHARE = 0.01
-"""Of the time, at most, that saving the state may take."""
+"""Largest share of the time that saving the state may take."""
 SAVE_EVERY = 3.0
-"""Seconds between two saves, more where saving takes long; 0: after every step. A window that waits
-for the run shows the newest recording."""
+"""Seconds between two saves, more if saving takes long; 0 saves after every step. A window that waits for the
+run shows the newest recording."""
 
 
 @dataclass(frozen=True)
 class Saved:
-    """What was saved of a part."""
+    """Saved values of one part."""
 
     tensors: Mapping[str, Tensor]  # by name
     values: Mapping[str, Any]  # JSON values by name; floats come back bit for bit
 
 
 class Resumable(Protocol):
-    """Something that trains for many steps and can be stopped between any two.
+    """Training that can be stopped and resumed between any two steps.
 
-    The members' optimization is one (`PgsState`). Whatever trains with it, such as a field fitted
-    jointly, implements these two and is given to `PeriodicSave` under a name of its own: all members of
-    one `PeriodicSave` go into one file, so that they are always of the same step. What they hold must decide
-    every later bit: parameters, Adam moments and the step count, and the state of every random generator,
-    which is a uint8 tensor as `Generator.get_state()` gives it. What can be computed again from the run's
-    inputs and the recordings stays out. Dropout and the like must draw from a generator of their own.
+    One example is the members' optimization (`PgsState`). Everything that trains with it, such as a jointly
+    fitted field, implements both methods and is passed to `PeriodicSave` under its own name. All members of
+    one `PeriodicSave` are saved in one file, so that they are always of the same step.
+
+    The saved values must determine every later bit: parameters, Adam moments, the step count, and the state
+    of every random generator (a uint8 tensor, see `Generator.get_state()`). Values that can be computed again
+    from the run's inputs and the recordings are left out. Dropout and similar layers need their own
+    generator.
     """
 
     def capture_state(self) -> Saved:
-        """Everything that the next steps depend on; the tensors may be the live ones."""
+        """Return everything that the next steps depend on; the tensors may be the live ones."""
         ...
 
     def restore(self, saved: Saved) -> None:
-        """Take over what `capture_state` gave, of a run with the same options."""
+        """Restore the result of `capture_state` from a run with the same options."""
         ...
 
 
-_writing: dict[Path, Future[float]] = {}  # the last save of each folder that `wait` has not seen end
+_writing: dict[Path, Future[float]] = {}  # last save of each folder that `wait` has not waited for
 
 
 @cache
@@ -112,10 +114,10 @@ def _writer() -> ThreadPoolExecutor:
 
 @dataclass(frozen=True)
 class StateFolder:
-    """RUN/state.
+    """The folder RUN/state.
 
-    A part that is short and repeats bit for bit need not be saved while it runs: `save` its result when it is
-    done, and `load` it (None: not done yet) on the way back.
+    A short part that repeats bit for bit need not be saved while it runs: `save` its result at the end, and
+    `load` it when the run resumes (None: not finished yet).
     """
 
     path: Path
@@ -125,7 +127,7 @@ class StateFolder:
         return self.path / "run.json"
 
     def identity(self) -> dict[str, Any] | None:
-        """What `begin` was given; None where no run was stopped."""
+        """Return the identity passed to `begin`; None if there is no stopped run."""
         try:
             return convert_json(decode_json(self._run.read_bytes()), dict[str, Any])
         except (FileNotFoundError, NotADirectoryError):
@@ -134,10 +136,10 @@ class StateFolder:
             raise self.damage_error(self._run, error) from error
 
     def begin(self, identity: Mapping[str, Any]) -> None:
-        """Drop what is saved and start anew as the run that `identity`, JSON values, describes.
+        """Delete the saved state and start a new run described by `identity` (JSON values).
 
         Raises:
-            ProgdfError: the folder is a link, behind which nothing of the run's can be.
+            ProgdfError: the folder is a link; links are not followed.
         """
         if self.path.is_symlink():
             raise ProgdfError(f"{self.path} is a link, which is not followed; remove the link")
@@ -155,7 +157,7 @@ class StateFolder:
         """Save a part of the run, or one entry of a growing list.
 
         Raises:
-            OSError: the disk is full or the folder is gone; what was saved before is still whole.
+            OSError: the disk is full or the folder is gone; earlier saves remain intact.
         """
         self.save_later(part, tensors, values, index)
         self.wait()
@@ -163,14 +165,14 @@ class StateFolder:
     def save_later(
         self, part: str, tensors: Mapping[str, Tensor], values: Mapping[str, Any], index: int | None = None
     ) -> Future[float]:
-        """Have a thread save it, after all that it was given before: a disk can take seconds to flush a file.
+        """Save in a thread, after all earlier saves: a disk can take seconds to flush a file.
 
         Args:
             part, values, index: see `save`
-            tensors: that nobody changes meanwhile
+            tensors: must not change until the save ends
 
         Returns:
-            How long it took, seconds. What it raises, `wait` and all later saves raise too.
+            The seconds that the save took. `wait` and all later saves raise its exception too.
         """
         path, before = self._file(part, index), _writing.get(self.path)
         header = {"values": json.dumps(dict(values), ensure_ascii=False)}
@@ -191,20 +193,20 @@ class StateFolder:
         return _writing[self.path]
 
     def wait(self) -> None:
-        """Until all is saved. Raises OSError where something could not be, see `save`."""
+        """Wait until everything is saved. Raises OSError if a save failed, see `save`."""
         if (writing := _writing.pop(self.path, None)) is not None:
             writing.result()
 
     @contextmanager
     def writing(self) -> Iterator[None]:
-        """Whatever happens, all is saved in the end; see `wait`."""
+        """Wait for all saves at the end of the block, also after an exception; see `wait`."""
         try:
             yield
         finally:
             self.wait()
 
     def load(self, part: str, index: int | None = None) -> Saved | None:
-        """What was saved of a part; None where nothing was.
+        """Return the saved values of a part; None if there are none.
 
         Raises:
             ProgdfError: the file is damaged.
@@ -221,14 +223,14 @@ class StateFolder:
 
     @contextmanager
     def restore_part(self, part: str) -> Iterator[None]:
-        """Take over what was saved of a part; values that do not fit make one line, see `load`."""
+        """Turn exceptions of the block, which restores a part, into a one-line ProgdfError; see `load`."""
         try:
             yield
         except (LookupError, TypeError, ValueError, RuntimeError, AttributeError, OverflowError) as error:
             raise self.damage_error(self._file(part, None), type(error).__name__) from error
 
     def clear(self) -> None:
-        """Remove everything, run.json first: a rest of it is no run. Nothing behind a link is touched."""
+        """Remove everything, run.json first, so that leftovers are no run. Links are not followed."""
         if self.path.is_symlink():
             return
         self._run.unlink(missing_ok=True)
@@ -239,13 +241,13 @@ class StateFolder:
                 entry.unlink(missing_ok=True)
 
     def end(self) -> None:
-        """The run is finished: remove the folder."""
+        """Remove the folder of a finished run."""
         self.wait()
         self.clear()
         shutil.rmtree(self.path, ignore_errors=True)  # not if it is a link
 
     def damage_error(self, path: Path, reason: object) -> ProgdfError:
-        """The line for a file of the state that is not what was saved."""
+        """Return the error for a damaged file of the state."""
         return ProgdfError(f"{path} is damaged ({reason}); delete {self.path} and train again")
 
     def _file(self, part: str, index: int | None) -> Path:
@@ -253,14 +255,14 @@ class StateFolder:
 
 
 class PeriodicSave:
-    """Saves what trains together, in one file, every so often; training goes on while it is written.
+    """Periodic save of everything that trains together, in one file; training continues during the write.
 
     Args:
-        folder: where to
+        folder: destination
         part: name of the file
-        members: what trains, by name
-        every_s: seconds between two saves, longer where saving would take more than a hundredth of the time;
-            0 saves after every step; None: `SAVE_EVERY`
+        members: objects that train, by name
+        every_s: seconds between two saves, longer if saving would take more than a hundredth of the time; 0
+            saves after every step; None: `SAVE_EVERY`
     """
 
     def __init__(
@@ -270,7 +272,7 @@ class PeriodicSave:
         members: Mapping[str, Resumable],
         every_s: float | None = None,
     ) -> None:
-        self.seconds = 0.0  # for which training stood still
+        self.seconds = 0.0  # during which training was blocked
         self.saves = 0
         self._folder = folder
         self._part = part
@@ -278,10 +280,10 @@ class PeriodicSave:
         self._every_s = SAVE_EVERY if every_s is None else every_s
         self._last = time.perf_counter()
         self._writing: Future[float] | None = None
-        self._written = 0.0  # seconds that the thread has written
+        self._written = 0.0  # seconds of writing in the thread
 
     def restore(self) -> bool:
-        """Give every member what was saved of it; False where nothing was."""
+        """Restore every member from the file; return False if nothing was saved."""
         saved = self._folder.load(self._part)
         if saved is None:
             return False
@@ -296,16 +298,16 @@ class PeriodicSave:
         return True
 
     def step_done(self) -> None:
-        """Save if it is time to."""
+        """Save if a save is due."""
         if self._writing is not None and not self._writing.done():
             return
-        self._look()
+        self._finish_write()
         cost = (self.seconds + self._written) / max(1, self.saves)
         if not self._every_s or time.perf_counter() - self._last >= max(self._every_s, cost / SHARE):
             self.save(waits=not self._every_s)
 
     def save(self, waits: bool = True) -> None:
-        """Save now, and wait until it is on the disk. Raises OSError where it cannot; the last save stays."""
+        """Save now and wait for the disk. Raises OSError on failure; the last save remains intact."""
         begun = time.perf_counter()
         parts = {name: member.capture_state() for name, member in self._members.items()}
         tensors = {
@@ -314,27 +316,27 @@ class PeriodicSave:
         values = {name: part.values for name, part in parts.items()}
         self._writing = self._folder.save_later(self._part, tensors, values)
         if waits:
-            self._look()
+            self._finish_write()
         self._last = time.perf_counter()
         self.seconds += self._last - begun
         self.saves += 1
 
-    def _look(self) -> None:
-        """Wait for what is written now, and raise what became of it."""
+    def _finish_write(self) -> None:
+        """Wait for the current write and raise its exception."""
         if self._writing is not None:
             self._written += self._writing.result()
             self._writing = None
 
 
 def generator(state: Tensor) -> torch.Generator:
-    """A random generator that goes on where the one of this `get_state()` was. [n] uint8"""
-    made = torch.Generator()
-    made.set_state(state)
-    return made
+    """Return a random generator in the state of a `get_state()`. [n] uint8"""
+    restored = torch.Generator()
+    restored.set_state(state)
+    return restored
 
 
 def _flush(path: Path) -> None:
-    """What is renamed into place must be on the disk before its name is."""
+    """Flush a file to the disk, as must be done before it is renamed."""
     handle = os.open(path, os.O_RDONLY if sys.platform != "win32" else os.O_RDWR)
     try:
         os.fsync(handle)
