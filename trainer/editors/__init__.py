@@ -1,4 +1,7 @@
-"""Image editors: a view in, the edited view out. One file a family, one line in `EDITORS`, one test each."""
+"""Image editors: functions from a view to its edited view.
+
+Each family of editors has one module, one line in `EDITORS` and one test module.
+"""
 
 from __future__ import annotations
 
@@ -22,11 +25,11 @@ from .style import check_style, style
 
 
 class Family(NamedTuple):
-    """A kind of editor."""
+    """One kind of editor."""
 
     make: Callable[[EditorInput], ImageEditor]
-    example: str  # how it is written
-    check: Callable[[str], object] | None = None  # of the text after the colon, by itself
+    example: str  # an example of its option value
+    check: Callable[[str], object] | None = None  # checks the text after the colon without reading the scene
 
 
 EDITORS = {
@@ -44,26 +47,30 @@ EDITORS = {
     "instruct": Family(instruct, 'instruct:"turn him into Batman"'),
     "remove": Family(remove, "remove", lambda what: picture_paths(what) if what else ()),
 }
-"""Kind of editor → what makes it."""
+"""Editor families by kind."""
 
 PER_VIEW = ("folder", "photographs", "style", "instruct")
-"""Kinds whose views are edited one by one, so that nothing makes them agree."""
+"""Kinds that edit each view on its own. Nothing makes the views agree."""
 
 COLOR_FUNCTIONS = ("recolor", "tint", "darken", "night", "grade")
-"""Kinds that give each color another one, wherever it is."""
+"""Kinds that map each color to another color, independent of its position."""
 
 EXTERNAL = ("folder", "photographs", "pictures")
-"""Kinds whose pictures were made elsewhere, at the strengths that they were made at."""
+"""Kinds whose pictures are made elsewhere. They exist only at the strengths that the user supplies."""
 
 KIND_UNKNOWN = ("folder", "photographs", "instruct")
-"""Kinds that do not know what their pictures move."""
+"""Kinds that cannot tell which attributes their pictures change."""
 
 COSTLY_STRENGTHS = ("instruct",)
-"""Kinds that paint every strength anew: what a model takes its time for is not done to look around."""
+"""Kinds that run a model for every strength. Previews must not request their strengths."""
 
 
 def check_editor(spec: str) -> tuple[str, str]:
-    """Split `KIND:WHAT`; ProgdfError if there is no such kind. Cheap: nothing is read or rendered."""
+    """Split `KIND:WHAT` into its two parts. Nothing is read or rendered.
+
+    Raises:
+        ProgdfError: the kind is unknown.
+    """
     kind, _, what = spec.partition(":")
     if kind not in EDITORS:
         examples = ", ".join(family.example for family in EDITORS.values())
@@ -72,7 +79,13 @@ def check_editor(spec: str) -> tuple[str, str]:
 
 
 def check_new_editor(options: EditorOptions) -> None:
-    """ProgdfError if no run can begin so; one that has begun keeps its views, its folder may go."""
+    """Check that a new run can start with this editor.
+
+    A resumed run needs no check: it keeps its views, and the folder of its pictures may be gone.
+
+    Raises:
+        ProgdfError: the editor, its text or one of its options is invalid.
+    """
     kind, what = check_editor(options.editor)
     if kind == "instruct":
         check_instruct(what, options)
@@ -86,6 +99,10 @@ def make_editor(
     options: EditorOptions, scene: Gaussians, region: Region, views: Sequence[View],
     glances: Callable[[], Sequence[Glance]] = list,
 ) -> ImageEditor:  # fmt: skip
-    """The editor that the options name, see `EditorInput`; ProgdfError says what is wrong."""
+    """Return the editor that the options name (see `EditorInput`).
+
+    Raises:
+        ProgdfError: the editor cannot be made.
+    """
     kind, what = check_editor(options.editor)
     return EDITORS[kind].make(EditorInput(what, scene, region, views, options, glances))

@@ -1,6 +1,6 @@
-"""The pipelines of diffusers that edit pictures: how each is asked, loaded and made to fit a graphics card.
+"""Adapters for the diffusers pipelines that edit pictures: arguments, loading and placement in GPU memory.
 
-Weights are gigabytes: they are read from this machine and never fetched unasked.
+Weights are gigabytes. They are read from this machine and never downloaded without a request.
 """
 
 from __future__ import annotations
@@ -25,49 +25,54 @@ from trainer.store.pretrained import BROKEN, folder_of_model, gpu_memory, model_
 
 from .mixed_steps import MixedSteps, euler_scheduler
 
-_MULTIPLE = 32  # pixels: what every pipeline's autoencoder and patches divide
-_MINIMUM = 64  # its least side
-_LARGE = 2e9  # parameters from which painting on a CPU takes days
-# bytes beside the weights: FLUX.1-dev takes 36.2 GB at 1024² with its 31.4, klein 20 with its 16
-_WORKING = 1e9
-_WORKING_PER_MEGAPIXEL = 3e9
-_NF4 = 0.55  # bytes a parameter, with its scales
+_SIDE_MULTIPLE_PX = 32  # pixels; a multiple of every pipeline's autoencoder and patch size
+_MIN_SIDE_PX = 64  # pixels; smallest side of a painted picture
+_MAX_CPU_PARAMETERS = 2e9  # parameters; painting with a larger model on a CPU takes days
+# Bytes of activations beside the weights. FLUX.1-dev takes 36.2 GB at 1024² with 31.4 GB of weights, klein 20
+# GB with 16 GB.
+_WORKING_BYTES = 1e9
+_WORKING_BYTES_PER_MEGAPIXEL = 3e9
+_NF4_BYTES = 0.55  # bytes per parameter, scales included
 
 
 @dataclass(frozen=True)
 class Adapter:
-    """How one pipeline is asked."""
+    """Call signature and defaults of one diffusers pipeline."""
 
-    model: str  # the id of its weights on the Hugging Face hub
-    # steps, guidance (how closely the instruction is followed), image_guidance (how closely the picture is):
-    # the values it was made for; None: it has no such thing
+    model: str  # id of the weights on the Hugging Face hub
+    # Values that the model was made for: steps, guidance (how closely it follows the instruction) and
+    # image_guidance (how closely it follows the picture). None: the pipeline has no such argument.
     steps: int
     guidance: float | None
     image_guidance: float | None = None
-    guidance_word: str = "guidance_scale"  # its keyword
-    size: int = 1024  # it was made to paint pictures of the area of such a square, pixels
-    # of Stable Diffusion's family: weights in float16 (on a CPU in float32), not bfloat16; CLIP alone reads
+    guidance_word: str = "guidance_scale"  # keyword of the guidance argument
+    size: int = 1024  # side of a square of the area that the model was trained on, pixels
+    # Stable Diffusion family: weights in float16 (float32 on a CPU) instead of bfloat16; CLIP is the only
+    # text encoder.
     is_stable: bool = False
-    is_fixed: bool = False  # it paints at that area whatever is asked
-    encodes_alone: bool = True  # the sentence is encoded without the picture
-    passes: int = 1  # calls of its network in a step
-    references: int = 0  # pictures beside the view's own that one call can take
-    is_gated: bool = False  # its weights want a login and their license accepted
-    always: Mapping[str, object] = field(default_factory=dict)  # further arguments of a call
-    loading: Mapping[str, object] = field(default_factory=dict)  # further arguments of its from_pretrained
-    needs: tuple[str, ...] = ()  # packages that it needs besides the extra's
+    is_fixed: bool = False  # the pipeline always paints at that area
+    encodes_alone: bool = True  # the prompt is encoded without the picture
+    passes: int = 1  # network calls per step
+    references: int = 0  # number of reference pictures that one call accepts beside the view
+    is_gated: bool = False  # the weights need a login and an accepted license
+    always: Mapping[str, object] = field(default_factory=dict)  # further arguments of every call
+    loading: Mapping[str, object] = field(default_factory=dict)  # further arguments of `from_pretrained`
+    needs: tuple[str, ...] = ()  # required packages beyond the `diffusion` extra
 
     def paint_size(self, width: float, height: float, size: int) -> tuple[int, int]:
-        """Width and height at which it paints pictures of these proportions: multiples of 32 of that area.
-
-        Those that scale what they get to an area of their own would not change it again.
+        """Return the width and height at which to paint a picture of these proportions.
+         Both are multiples of 32, with about the area of `size`². Pipelines that rescale their input to
+        their own area leave this size unchanged.
         """
         ratio = width / height
         for _ in range(4):
-            wide = (size * size * ratio) ** 0.5
-            sides = [max(_MINIMUM, round(side / _MULTIPLE) * _MULTIPLE) for side in (wide, wide / ratio)]
-            while not self.is_fixed and sides[0] * sides[1] > size * size and max(sides) > _MINIMUM:
-                sides[sides.index(max(sides))] -= _MULTIPLE
+            width_px = (size * size * ratio) ** 0.5
+            sides = [
+                max(_MIN_SIDE_PX, round(side / _SIDE_MULTIPLE_PX) * _SIDE_MULTIPLE_PX)
+                for side in (width_px, width_px / ratio)
+            ]
+            while not self.is_fixed and sides[0] * sides[1] > size * size and max(sides) > _MIN_SIDE_PX:
+                sides[sides.index(max(sides))] -= _SIDE_MULTIPLE_PX
             ratio = sides[0] / sides[1]
         return sides[0], sides[1]
 
@@ -80,9 +85,9 @@ class Adapter:
         guidance: float | None,
         image_guidance: float | None,
     ) -> dict[str, object]:
-        """Keyword arguments of a call, all but its `generator`, of those that the pipeline knows."""
-        width, height = pictures[0].size  # the view's own
-        ours = {
+        """Return the keyword arguments of a call that are in `known`, all except `generator`."""
+        width, height = pictures[0].size  # of the view
+        values = {
             "num_inference_steps": steps,
             self.guidance_word: guidance,
             "image_guidance_scale": image_guidance,
@@ -90,12 +95,12 @@ class Adapter:
             "height": height,
             "max_area": width * height,
         }
-        theirs = {word: value for word, value in ours.items() if word in known and value is not None}
+        accepted = {word: value for word, value in values.items() if word in known and value is not None}
         image = list(pictures) if self.references else pictures[0]
-        return {"prompt": prompt, "image": image, **theirs, **self.always}
+        return {"prompt": prompt, "image": image, **accepted, **self.always}
 
 
-_PIX2PIX = Adapter(  # ProGDF's own; the result has the picture's size
+_PIX2PIX = Adapter(  # the model of the ProGDF paper; the result has the size of the picture
     "timbrooks/instruct-pix2pix", 20, 7.5, 1.5, size=512, is_stable=True,
     loading={"safety_checker": None, "requires_safety_checker": False},
 )  # fmt: skip
@@ -103,7 +108,7 @@ _KLEIN = Adapter("black-forest-labs/FLUX.2-klein-4B", 4, 1.0, references=3)
 _QWEN = Adapter(
     "Qwen/Qwen-Image-Edit-2509", 40, 4.0, guidance_word="true_cfg_scale", is_fixed=True, encodes_alone=False,
     passes=2, references=2, needs=("torchvision",),
-    always={"negative_prompt": " "},  # without one it has no guidance at all
+    always={"negative_prompt": " "},  # guidance has no effect without a negative prompt
 )  # fmt: skip
 
 ADAPTERS: dict[str, Adapter] = {
@@ -114,7 +119,7 @@ ADAPTERS: dict[str, Adapter] = {
     ),
     "FluxKontextPipeline": Adapter(
         "black-forest-labs/FLUX.1-Kontext-dev", 28, 2.5, is_gated=True,
-        # it would scale every picture to about a megapixel; ours comes at the size that was asked for
+        # the pipeline would scale every picture to about one megapixel; ours arrives at the requested size
         always={"_auto_resize": False},
     ),
     "Flux2KleinPipeline": _KLEIN,
@@ -131,26 +136,29 @@ ADAPTERS: dict[str, Adapter] = {
         guidance_word="guidance_scale", references=0, always={},
     ),
 }  # fmt: skip
-"""Class name in diffusers, as a saved pipeline's model_index.json has it → how it is asked."""
+"""Adapters by diffusers class name, as in `model_index.json` of a saved pipeline."""
 
 
 @dataclass(frozen=True)
 class PipelineRequest:
-    """One sentence for one model, nothing left open."""
+    """One prompt for one model, with every option resolved."""
 
     prompt: str
     model: str
-    pipeline: str  # class in diffusers
+    pipeline: str  # diffusers class name
     adapter: Adapter
     steps: int
     guidance: float | None
     image_guidance: float | None
-    size: int  # side of a square of the area that is painted, pixels
+    size: int  # side of a square of the painted area, pixels
     seed: int
     quantize: str
 
     def ask(self, pictures: Sequence[Tensor], seed: int) -> dict[str, object]:
-        """The arguments of a call. The same noise each time: what pictures leave open is decided alike."""
+        """Return the arguments of a call.
+         Every call with one seed starts from the same noise, so that details that the prompt leaves open
+        agree between views.
+        """
         import diffusers
 
         known = signature(getattr(diffusers, self.pipeline).__call__).parameters
@@ -165,9 +173,9 @@ SMALL_MODEL = ADAPTERS["StableDiffusionInstructPix2PixPipeline"].model
 
 
 def default_model() -> str:
-    """FLUX.2-klein-4B where it is on this machine and fits its card, else InstructPix2Pix."""
+    """Return FLUX.2-klein-4B if it is on this machine and fits its GPU, else InstructPix2Pix."""
     with suppress(ProgdfError):
-        total = (gpu_memory() or (0, 0))[1]  # of the card: what is free now may be less on the next day
+        total = (gpu_memory() or (0, 0))[1]  # total memory: free memory varies from day to day
         sizes = component_sizes(_KLEIN.model, _KLEIN) if total else {}
         if sizes and total >= memory_need(_KLEIN, sizes, "off", _KLEIN.size)[1]:
             return _KLEIN.model
@@ -175,7 +183,7 @@ def default_model() -> str:
 
 
 def models_here() -> list[str]:
-    """Models that are on this machine whole, by the ids of their weights."""
+    """Return the ids of the models that are complete on this machine."""
     models = []
     for adapter in ADAPTERS.values():
         with suppress(ProgdfError):
@@ -185,10 +193,13 @@ def models_here() -> list[str]:
 
 
 def adapter_of(model: str) -> tuple[str, Adapter]:
-    """Class of a saved pipeline, by its model_index.json, in a folder or as downloaded from the hub.
+    """Return the diffusers class name and the adapter of a model.
+
+    Args:
+        model: folder of a saved pipeline, or id of a downloaded model on the Hugging Face hub
 
     Raises:
-        ProgdfError: diffusers is not installed, the model not on this machine or no editor.
+        ProgdfError: diffusers is not installed, or the model is not on this machine or not an editor.
     """
     try:
         import diffusers  # noqa: F401
@@ -211,44 +222,55 @@ def adapter_of(model: str) -> tuple[str, Adapter]:
                 "'progdf-studio[qwen]' (by itself it would replace torch)"
             )
     if kind == "Flux2KleinPipeline" and not index.get("is_distilled", True):
-        adapter = replace(adapter, steps=50, guidance=4.0, passes=2)  # a base model
+        adapter = replace(adapter, steps=50, guidance=4.0, passes=2)  # a base model, not distilled
     return kind, adapter
 
 
 def pipeline_folder(model: str) -> Path:
-    """Where a pipeline lies; one of `BROKEN` where it is not on this machine."""
+    """Return the folder of a pipeline.
+
+    Raises:
+        one of `BROKEN`: the pipeline is not on this machine.
+    """
     return folder_of_model(model, "model_index.json")
 
 
 def memory_need(adapter: Adapter, sizes: Mapping[str, int], quantize: str, size: int) -> tuple[float, float]:
-    """Bytes that painting takes on a card, estimated: with all parts there, and with one at a time.
+    """Estimate the GPU memory that painting takes.
 
     Args:
         adapter: of the pipeline
-        sizes: parameters by component
+        sizes: number of parameters by component
         quantize: see `EditorOptions.quantize`
-        size: side of a square of the area that is painted, pixels
+        size: side of a square of the painted area, pixels
+
+    Returns:
+        bytes with all components on the GPU; bytes with one component at a time
     """
-    packed = quantize == "nf4"
-    parts = {name: n * (_NF4 if packed and name != "vae" else 2.0) for name, n in sizes.items()}
-    first = [name for name in parts if adapter.encodes_alone and name.startswith("text_encoder")]
-    # the encoder goes before the rest comes
-    encoder = _WORKING + max((parts.pop(name) for name in first), default=0.0)
-    working = _WORKING + _WORKING_PER_MEGAPIXEL * size * size / 1e6
-    return max(encoder, working + sum(parts.values())), max(encoder, working + max(parts.values()))
+    is_quantized = quantize == "nf4"
+    component_bytes = {
+        name: n * (_NF4_BYTES if is_quantized and name != "vae" else 2.0) for name, n in sizes.items()
+    }
+    encoders = [name for name in component_bytes if adapter.encodes_alone and name.startswith("text_encoder")]
+    # the encoder is unloaded before the other components are loaded
+    encoder_need = _WORKING_BYTES + max((component_bytes.pop(name) for name in encoders), default=0.0)
+    working = _WORKING_BYTES + _WORKING_BYTES_PER_MEGAPIXEL * size * size / 1e6
+    return max(encoder_need, working + sum(component_bytes.values())), max(
+        encoder_need, working + max(component_bytes.values())
+    )
 
 
 def component_sizes(model: str, adapter: Adapter) -> dict[str, int]:
-    """Parameters of each network of a pipeline on this machine, from the heads of its files.
+    """Return the number of parameters of each network of a pipeline, read from the headers of its files.
 
     Raises:
-        ProgdfError: a part or its weights are missing or truncated.
+        ProgdfError: a component or its weights are missing or truncated.
     """
     sizes = {}
     try:
         folder = pipeline_folder(model)
-        for name, made in json.loads((folder / "model_index.json").read_bytes()).items():
-            if not (isinstance(made, list) and made[0]) or name in adapter.loading:
+        for name, entry in json.loads((folder / "model_index.json").read_bytes()).items():
+            if not (isinstance(entry, list) and entry[0]) or name in adapter.loading:
                 continue
             if not (folder / name).is_dir():
                 raise OSError(f"{folder} has no {name}")
@@ -261,28 +283,29 @@ def component_sizes(model: str, adapter: Adapter) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class DevicePlan:
-    """Where a pipeline runs, and what that takes."""
+    """Device and precision of a pipeline, and the memory that it takes."""
 
     device: str
     dtype: torch.dtype
-    in_turn: bool = False  # one part at a time is on the card
-    need: float = 0.0  # bytes on the card, estimated
-    free: float = 0.0
+    in_turn: bool = False  # only one component at a time is on the GPU
+    need: float = 0.0  # estimated bytes on the GPU
+    free: float = 0.0  # free bytes on the GPU
 
     def line(self) -> str:
-        """For the log and for errors."""
+        """Return a description for the log and for errors."""
         dtype = str(self.dtype).removeprefix("torch.")
         if not self.need:
             return f"on the {self.device.upper()} in {dtype}"
-        how = "its parts there in turn" if self.in_turn else "all of it there"
-        return f"on {self.device} in {dtype}, {how}: about {_gb(self.need)} needed, {_gb(self.free)} free"
+        mode = "its parts there in turn" if self.in_turn else "all of it there"
+        return f"on {self.device} in {dtype}, {mode}: about {_gb(self.need)} needed, {_gb(self.free)} free"
 
 
 def place(request: PipelineRequest, device: Device) -> DevicePlan:
-    """Where and how its pipeline will run.
+    """Return the device and precision of the request's pipeline.
 
     Raises:
-        ProgdfError: weights or a package are not here, or it is too large for a CPU that nobody asked for.
+        ProgdfError: weights or a package are missing, or the model is too large for a CPU and `device` is
+            not "cpu".
     """
     model = request.model
     adapter = request.adapter
@@ -293,7 +316,7 @@ def place(request: PipelineRequest, device: Device) -> DevicePlan:
         )
     if model_device(device) == "cpu":
         count = sum(sizes.values())
-        if count > _LARGE and device != "cpu":
+        if count > _MAX_CPU_PARAMETERS and device != "cpu":
             raise ProgdfError(
                 f"{model} has {count / 1e9:.0f} billion parameters and torch has no graphics card here "
                 f"(torch {torch.__version__}): a picture takes hours; install torch for your card, use "
@@ -313,22 +336,22 @@ def place(request: PipelineRequest, device: Device) -> DevicePlan:
 
 @contextmanager
 def explain_memory(request: PipelineRequest, placement: DevicePlan) -> Iterator[None]:
-    """Say in one line that a card's memory ran out, and what to try."""
+    """Convert an out-of-memory error of the GPU to a `ProgdfError` that suggests remedies."""
     try:
         yield
     except torch.OutOfMemoryError as error:
-        quantized = "" if request.quantize == "nf4" else "add --quantize nf4, "
+        advice = "" if request.quantize == "nf4" else "add --quantize nf4, "
         raise ProgdfError(
-            f"out of memory: {request.model} {placement.line()}; {quantized}close what else uses the card, "
+            f"out of memory: {request.model} {placement.line()}; {advice}close what else uses the card, "
             f"give a smaller --edit-size, or use --model {_KLEIN.model} or {SMALL_MODEL}"
         ) from error
 
 
 def load_pipeline(request: PipelineRequest, placement: DevicePlan) -> MixedSteps:
-    """Its pipeline with its weights, from this machine only, where it runs.
+    """Load the pipeline with its weights from this machine and move it to its device.
 
     Raises:
-        ProgdfError: weights are missing or broken, or the card's memory runs out.
+        ProgdfError: weights are missing or broken, or the GPU runs out of memory.
     """
     import diffusers
     from diffusers.utils import logging as diffusers_logging
@@ -338,10 +361,16 @@ def load_pipeline(request: PipelineRequest, placement: DevicePlan) -> MixedSteps
     adapter = request.adapter
     loading = dict(request.adapter.loading)
     if request.quantize == "nf4":
-        bits = {"load_in_4bit": True, "bnb_4bit_quant_type": "nf4", "bnb_4bit_compute_dtype": placement.dtype}
-        large = [name for name in component_sizes(request.model, adapter) if name != "vae"]
+        quantization = {
+            "load_in_4bit": True,
+            "bnb_4bit_quant_type": "nf4",
+            "bnb_4bit_compute_dtype": placement.dtype,
+        }
+        quantized_components = [name for name in component_sizes(request.model, adapter) if name != "vae"]
         loading["quantization_config"] = diffusers.PipelineQuantizationConfig(
-            quant_backend="bitsandbytes_4bit", quant_kwargs=bits, components_to_quantize=large
+            quant_backend="bitsandbytes_4bit",
+            quant_kwargs=quantization,
+            components_to_quantize=quantized_components,
         )
     with explain_memory(request, placement):
         try:
@@ -349,7 +378,7 @@ def load_pipeline(request: PipelineRequest, placement: DevicePlan) -> MixedSteps
                 pipeline_folder(request.model),
                 dtype=placement.dtype,
                 local_files_only=True,
-                use_safetensors=True,  # the other kind of weights can run code
+                use_safetensors=True,  # pickled weights can run code
                 **loading,
             )
         except torch.OutOfMemoryError:
@@ -360,9 +389,9 @@ def load_pipeline(request: PipelineRequest, placement: DevicePlan) -> MixedSteps
         pipeline.scheduler = euler_scheduler(pipeline)
         mixed = MixedSteps(pipeline, adapter.encodes_alone)
         if adapter.encodes_alone:
-            if placement.device != "cpu":  # the encoder is on the card for the sentence alone
+            if placement.device != "cpu":  # the encoder is on the GPU only while it encodes the prompt
                 pipeline.enable_model_cpu_offload(device=placement.device)
-            mixed.encode(request.ask([torch.ones(_MINIMUM, _MINIMUM, 3)], request.seed))
+            mixed.encode(request.ask([torch.ones(_MIN_SIDE_PX, _MIN_SIDE_PX, 3)], request.seed))
             pipeline.remove_all_hooks()
             for name in [name for name in pipeline.components if name.startswith("text_encoder")]:
                 setattr(pipeline, name, None)
@@ -375,10 +404,12 @@ def load_pipeline(request: PipelineRequest, placement: DevicePlan) -> MixedSteps
 
 
 def missing_pipeline(model: str) -> ProgdfError:
-    """What to do where a pipeline is not here, or not whole."""
-    gated = any(adapter.is_gated and adapter.model == model for adapter in ADAPTERS.values())
+    """Return an error that explains how to get a pipeline that is missing or incomplete."""
+    is_gated = any(adapter.is_gated and adapter.model == model for adapter in ADAPTERS.values())
     login = (
-        f" after accepting its license at https://huggingface.co/{model} and 'hf auth login'" if gated else ""
+        f" after accepting its license at https://huggingface.co/{model} and 'hf auth login'"
+        if is_gated
+        else ""
     )
     download = (
         f' --include "*/*" --include model_index.json\'{login}, '

@@ -1,4 +1,4 @@
-"""What an image editor must do."""
+"""Interface of image editors."""
 
 from __future__ import annotations
 
@@ -16,38 +16,39 @@ from trainer.views.view import Glance, View
 
 @dataclass(frozen=True)
 class EditorInput:
-    """What an editor is made from."""
+    """Arguments from which an editor is made."""
 
     what: str  # the text after the colon
     scene: Gaussians  # the original
     region: Region
     views: Sequence[View]
     options: EditorOptions
-    # the region at a glance, the same whatever its views; where there are none its color is that of the views
+    # Small samples of the region, independent of the views. If there are none, the region's color is computed
+    # from the views.
     glances: Callable[[], Sequence[Glance]] = list
 
 
 class ImageEditor(Protocol):
-    """Edits pictures of one region.
+    """Editor of pictures of one region.
 
-    An editor with a strength control edits at any strength, one that only knows the finished edit only at 1.
+    An editor with a strength control edits at any strength. An editor without one edits only at strength 1.
     """
 
     @property
     def kind(self) -> EditKind:
-        """What the edit moves."""
+        """Kind of change: color, style or geometry."""
         ...
 
     @property
     def stages(self) -> tuple[float, ...]:
-        """The strengths that it can picture, ascending, the last 1; empty: any."""
+        """Strengths at which the editor can edit, ascending, the last one 1. Empty: any strength."""
         ...
 
     @property
     def is_confined(self) -> bool:
-        """Whether it leaves alone what is not the region; else its pictures may change anywhere."""
+        """True if the edit leaves pixels outside the region unchanged."""
         ...
 
     def edit(self, view: View, strength: float) -> Tensor:
-        """The edited view. Strength 0 gives `view.image` bit for bit. -> [H,W,3] 0..1"""
+        """Return the edited view. Strength 0 returns `view.image` bit for bit. -> [H,W,3] 0..1"""
         ...

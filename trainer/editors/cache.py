@@ -1,10 +1,10 @@
-"""Painted pictures kept on disk, so that a run that comes again, or goes on, paints nothing twice.
+"""Disk cache of painted pictures, so that a repeated or resumed run paints nothing twice.
 
-RUN/views/painted/VIEW.png              what a learned editor made of what it was shown, at its own size
-RUN/views/painted/VIEW.json             from what: a digest of that, the editor, all its options
-RUN/views/painted/0.25/VIEW.png         at another strength, where the editor has several
+RUN/views/painted/VIEW.png              output of a learned editor, at its own size
+RUN/views/painted/VIEW.json             note: digest of the source picture, the editor and all its options
+RUN/views/painted/0.25/VIEW.png         output at another strength, if the editor has several
 
-A picture is taken again while its note fits. So one that was touched up by hand stays as it is.
+A picture is reused while its note matches. A picture that the user has retouched is therefore kept.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from progdf.io.json_values import decode_json
 from trainer.store.run_folder import add_pictures, from_bytes, to_bytes, write_json
 
 Recipe = Mapping[str, str | int | float | None]
-"""All that a painted picture depends on besides the picture that it is painted from."""
+"""All inputs of a painted picture except its source picture."""
 
 
 @dataclass(frozen=True)
 class KeptPictures:
-    """Pictures in a folder; with no folder nothing is kept."""
+    """Cache of pictures in a folder. Without a folder nothing is cached."""
 
     folder: Path | None
 
@@ -41,11 +41,11 @@ class KeptPictures:
         paint: Callable[[Tensor], Tensor],
         place: str = "",
     ) -> Tensor:
-        """What `paint` makes of `source`, in 8 bits: read where the note fits, else painted and kept.
+        """Return `paint(source)` in 8 bits, from the cache if the note matches.
 
         Args:
-            name: of the view, a file name
-            source: the picture that is painted from. [H,W,3]
+            name: file name of the view
+            source: picture to paint from. [H,W,3]
             recipe: see `Recipe`
             paint: [H,W,3] -> [H,W,3]
             place: subfolder
@@ -55,11 +55,11 @@ class KeptPictures:
         path = self.folder / place / f"{name}.png"
         note = path.with_suffix(".json")
         expected = {"source": digest(source), "editor": dict(recipe)}
-        with suppress(OSError, ValueError, ProgdfError):  # what is deleted or broken is painted anew
+        with suppress(OSError, ValueError, ProgdfError):  # deleted or broken files are painted again
             if decode_json(note.read_bytes()) == expected:
                 return read_picture(path, size=(source.shape[1], source.shape[0]))
         painted = paint(source)
-        note.unlink(missing_ok=True)  # a new picture never lies beside an old note
+        note.unlink(missing_ok=True)  # an old note must never describe a new picture
         write_image(path, painted)
         write_json(note, expected)
         add_pictures(self.folder, [path, note])
@@ -67,6 +67,6 @@ class KeptPictures:
 
 
 def digest(image: Tensor) -> str:
-    """SHA-256 of a picture as an 8-bit file holds it. [H,W,3]"""
+    """Return the SHA-256 of a picture as stored in an 8-bit file. [H,W,3]"""
     pixels = np.asarray(to_picture(image))
     return hashlib.sha256(repr(pixels.shape).encode() + pixels.tobytes()).hexdigest()

@@ -1,4 +1,4 @@
-"""A picture with transparency laid on the surface, as one camera sees it: `decal:LOGO.png`."""
+"""Editor `decal:LOGO.png`: a picture with transparency placed on the surface that one camera sees."""
 
 from __future__ import annotations
 
@@ -24,24 +24,26 @@ from trainer.views.view import BACKGROUND, View, make_view, with_near_plane
 
 from .base import EditorInput
 
-_MAX_DECAL_SIDE_PX = 512  # pixels of a decal's longer side: of a larger one the view is shrunk
+_MAX_DECAL_SIDE_PX = 512  # longer side of a decal; the view of a larger decal is shrunk
 
 
 @dataclass(frozen=True)
 class DecalPlacement:
-    """Where a decal lies in a picture."""
+    """Position, size and rotation of a decal in a picture."""
 
-    x: float  # of its center, pixels
+    x: float  # center, pixels
     y: float
-    size: float  # of its longer side, pixels
+    size: float  # longer side, pixels
     angle: float  # degrees, counterclockwise
 
 
 def parse_place(text: str, camera: Camera) -> DecalPlacement:
-    """`x,y,size[,angle]` in pixels of the camera's picture, or x, y and size in shares of its sides, 0..1.
+    """Parse `x,y,size[,angle]`.
+     x, y and size are in pixels of the camera's picture. If none exceeds 1, they are shares: x of the
+    width, y of the height, size of the longer side. The angle is in degrees, counterclockwise.
 
     Raises:
-        ProgdfError: no such numbers.
+        ProgdfError: the text is not such numbers, or they lie outside the picture.
     """
     wanted = "--at needs x,y,size or x,y,size,angle in pixels of the camera's picture, or in shares of it"
     numbers = read_numbers(text)
@@ -65,10 +67,10 @@ def parse_place(text: str, camera: Camera) -> DecalPlacement:
 
 
 def decal_camera(path: Path | None, origin: Origin = ZERO) -> Camera:
-    """The camera from which a decal is laid on.
+    """Return the camera that places a decal.
 
     Raises:
-        ProgdfError: none is given, or several.
+        ProgdfError: no camera is given, or several.
     """
     if path is None:
         raise ProgdfError(
@@ -81,7 +83,11 @@ def decal_camera(path: Path | None, origin: Origin = ZERO) -> Camera:
 
 
 def check_decal(what: str, options: EditorOptions) -> None:
-    """ProgdfError if no run can begin so: the picture, the place or the camera will not do."""
+    """Check the picture, its placement and its camera.
+
+    Raises:
+        ProgdfError: one of them is invalid.
+    """
     if not what:
         raise ProgdfError("decal: needs a picture; write decal:logo.png")
     _open_decal(Path(what).expanduser())
@@ -96,7 +102,7 @@ def _open_decal(path: Path) -> Image.Image:
 
 
 def draw_decal(path: Path, place: DecalPlacement, camera: Camera) -> Tensor:
-    """The decal as it lies in the camera's picture, colors times alpha, and alpha. [H,W,4] 0..1"""
+    """Draw the decal into the camera's picture. -> premultiplied colors and alpha, [H,W,4] 0..1"""
     picture = _open_decal(path)
     scale = place.size / max(picture.size)
     width, height = (max(1, round(side * scale)) for side in picture.size)
@@ -115,18 +121,18 @@ def draw_decal(path: Path, place: DecalPlacement, camera: Camera) -> Tensor:
 
 @dataclass(frozen=True)
 class DecalEditor:
-    """A decal on the surface that its camera sees."""
+    """Editor that places a decal on the surface that its camera sees."""
 
     scene: Gaussians
-    view: View  # that of its camera
-    drawn: Tensor  # colors times alpha, and alpha, where they lie on the surface. [H,W,4]
+    view: View  # the camera's view
+    drawn: Tensor  # the decal where it lies on the surface: premultiplied colors and alpha. [H,W,4]
     kind: EditKind = "color"
     stages: tuple[float, ...] = ()
     is_confined: bool = False
 
     @property
     def paint(self) -> PaintedView:
-        """What its own view shall show."""
+        """Target of the camera's own view."""
         return PaintedView(self.view.camera, self.edit(self.view, 1.0), self.drawn)
 
     def edit(self, view: View, strength: float) -> Tensor:
@@ -138,20 +144,23 @@ class DecalEditor:
 
 
 def decal(given: EditorInput) -> DecalEditor:
-    """`decal:LOGO.png` with --at and --camera: on what that camera sees of the region, where it is opaque.
+    """Return the editor of `decal:LOGO.png` with `--at` and `--camera`.
+
+    The decal covers the region where the region is opaque in the camera's view.
 
     Raises:
-        ProgdfError: the picture, the place or the camera will not do, or nothing lies on the region.
+        ProgdfError: the picture, its placement or its camera is invalid, or the decal does not lie on the
+            region.
     """
     scene = given.scene
     region = given.region
     options = given.options
     camera = decal_camera(options.camera, scene.origin)
     place = parse_place(options.at, camera)
-    if (shrunk := _MAX_DECAL_SIDE_PX / place.size) < 1.0:
-        size = max(1, round(camera.width * shrunk)), max(1, round(camera.height * shrunk))
+    if (shrink := _MAX_DECAL_SIDE_PX / place.size) < 1.0:
+        size = max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink))
         camera = camera.resize(*size)
-        place = replace(place, x=place.x * shrunk, y=place.y * shrunk, size=_MAX_DECAL_SIDE_PX)
+        place = replace(place, x=place.x * shrink, y=place.y * shrink, size=_MAX_DECAL_SIDE_PX)
     (camera,) = with_near_plane([camera], scene)
     view = make_view(scene, region, camera, torch.tensor(BACKGROUND))
     drawn = draw_decal(Path(given.what).expanduser(), place, camera)

@@ -1,9 +1,8 @@
-"""`instruct:"turn him into Batman"`: pictures edited as a sentence says, at any degree.
-
-A view is rendered anew for the model: the box around the region with a margin, at the size that the model was
-made for. Its answer is kept at that size, and the training picture is shrunk from it. InstructPix2Pix is
-ProGDF's editor, the others are newer and larger (`adapters`); the degree is theirs no more than any other
-model's, but that of `mixed_steps`.
+"""Editor `instruct:"turn him into Batman"`: pictures edited by a text instruction, at any strength.
+ Every view is rendered again for the model: the region's box with a margin, at the size that the model was
+trained for. The output is cached at that size and shrunk into the training picture. InstructPix2Pix is the
+editor of the ProGDF paper. The other models are newer and larger (`adapters`). No model has a strength of
+its own: it comes from `mixed_steps`.
 """
 
 from __future__ import annotations
@@ -32,18 +31,18 @@ from .base import EditorInput
 from .cache import KeptPictures, Recipe
 from .mixed_steps import MixedSteps, network_steps
 
-_MARGIN = 0.4  # of the region's box: what is added to each of its sides in all
+_BOX_MARGIN = 0.4  # share of the box's width and height that is added, half on each side
 
 
 @dataclass(frozen=True)
 class InstructEditor:
-    """Edits pictures as a sentence says, and paints one as told: of a view, what is around the region."""
+    """Editor of views by a text instruction. It paints the surroundings of the region in each view."""
 
     scene: Gaussians
     request: PipelineRequest
     placement: DevicePlan
-    load: Callable[[], MixedSteps]  # the pipeline, when it is first needed
-    kept: KeptPictures  # where its answers are kept, at their own size
+    load: Callable[[], MixedSteps]  # loads the pipeline on first use
+    kept: KeptPictures  # cache of the outputs, at their own size
     stages: tuple[float, ...] = ()
     kind: EditKind = "style"
     is_confined: bool = False
@@ -51,45 +50,45 @@ class InstructEditor:
 
     @property
     def references(self) -> int:
-        """How many pictures beside the view's own one call can take."""
+        """Number of reference pictures that one call accepts beside the view."""
         return self.request.adapter.references
 
     @property
     def recipe(self) -> Recipe:
-        """What a picture depends on besides its source and strength."""
+        """All inputs of a picture except its source and strength."""
         values = {f.name: getattr(self.request, f.name) for f in fields(self.request)}
         return {"instruct": values.pop("prompt")} | {k: v for k, v in values.items() if k != "adapter"}
 
     @property
     def note(self) -> str:
-        """What will paint, where, and what that takes; for the log."""
+        """Model, device, memory and network calls per picture, for the log."""
         request = self.request
-        unread = unread_words(self.request)
+        ignored = unread_words(self.request)
         line = f"{request.model} {self.placement.line()}; {self.calls((1.0,))} calls of its network a picture"
-        return f"{line}; it does not read the end of the sentence: “{unread}”" if unread else line
+        return f"{line}; it does not read the end of the sentence: “{ignored}”" if ignored else line
 
     def calls(self, strengths: Sequence[float]) -> int:
-        """How often its network is asked for one view at these strengths."""
+        """Return the number of network calls for one view at these strengths."""
         request = self.request
         return request.adapter.passes * sum(network_steps(s, 1.0, request.steps) for s in strengths)
 
     def frame(self, view: View) -> tuple[Crop, Camera]:
-        """The box of a view that is painted, in its pixels, and the camera that pictures it for the model."""
+        """Return the painted box of a view, in pixels, and the camera that renders it for the model."""
         x0, y0, x1, y1 = region_box(view.mask, margin=0)
-        across = round(_MARGIN / 2 * (x1 - x0))
-        down = round(_MARGIN / 2 * (y1 - y0))
+        margin_x = round(_BOX_MARGIN / 2 * (x1 - x0))
+        margin_y = round(_BOX_MARGIN / 2 * (y1 - y0))
         camera = view.camera
-        x0 = max(0, x0 - across)
-        x1 = min(camera.width, x1 + across)
-        y0 = max(0, y0 - down)
-        y1 = min(camera.height, y1 + down)
+        x0 = max(0, x0 - margin_x)
+        x1 = min(camera.width, x1 + margin_x)
+        y0 = max(0, y0 - margin_y)
+        y1 = min(camera.height, y1 + margin_y)
         width, height = self.request.adapter.paint_size(x1 - x0, y1 - y0, self.request.size)
         shift = torch.tensor([[0.0, 0.0, x0], [0.0, 0.0, y0], [0.0, 0.0, 0.0]])
         box = replace(camera, K=camera.K - shift, width=x1 - x0, height=y1 - y0)
         return (x0, y0, x1, y1), box.resize(width, height)
 
     def original(self, view: View) -> Tensor:
-        """The picture of that frame, in 8 bits. [h,w,3]"""
+        """Return the render of the frame, in 8 bits. [h,w,3]"""
         name = view.camera.name
         if name not in self._renders:
             image = render_view(self.scene, self.frame(view)[1], torch.tensor(BACKGROUND))
@@ -110,9 +109,9 @@ class InstructEditor:
         return self.paste(view, painted)
 
     def paste(self, view: View, painted: Tensor) -> Tensor:
-        """The view with what was changed in its frame, shrunk by area. [h,w,3] -> [H,W,3]
-
-        The change, not the picture: a render shrunk is some 32 dB off the smaller render that is trained.
+        """Add the change of the frame, shrunk by area averaging, to the view. [h,w,3] -> [H,W,3]
+         The change is added because a shrunk large render has a PSNR of only about 32 dB to the small
+        training render.
         """
         x0, y0, x1, y1 = self.frame(view)[0]
         edited = view.image.clone()
@@ -129,18 +128,18 @@ class InstructEditor:
         source: Tensor | None = None,
         seed: int | None = None,
     ) -> Tensor:
-        """The picture painted anew, at the size that the model works at, in 8 bits. -> [H,W,3] 0..1
+        """Paint a picture at the model's size, in 8 bits. -> [H,W,3] 0..1
 
         Args:
-            picture: what is painted over, the condition. [H,W,3] 0..1
-            references: further pictures that the model looks at, at most `references`. [H,W,3] each
-            strength: 0 gives `source`, 1 what the model makes of its condition
-            softness: over which share of the steps the model's say grows from none to all of it
-            source: where strength 0 ends; None: `picture`. As large as it. [H,W,3]
+            picture: condition of the model. [H,W,3] 0..1
+            references: further pictures for the model, at most `references`. [H,W,3] each
+            strength: 0 returns `source`, 1 the model's output
+            softness: share of the steps over which the weight of the model's prediction rises from 0 to 1
+            source: result at strength 0, as large as `picture`; None: `picture`. [H,W,3]
             seed: of the noise; None: the editor's
 
         Raises:
-            ProgdfError: weights are missing or broken, or the card's memory runs out.
+            ProgdfError: weights are missing or broken, or the GPU runs out of memory.
         """
         if len(references) > self.references:
             raise ValueError(
@@ -160,12 +159,15 @@ class InstructEditor:
 
 
 def instruct(given: EditorInput) -> InstructEditor:
-    """`instruct:"…"`: the model and its options are checked now, its weights are loaded when first needed."""
+    """Return the editor of `instruct:"…"`.
+
+    The model and its options are checked now. Weights are loaded on first use.
+    """
     options, request = given.options, resolve_request(given.what, given.options)
 
     @cache
     def pipeline() -> MixedSteps:
-        # placed anew: what was there before has gone by then
+        # place it again: the previous model is unloaded by then
         return last_model(
             "pipeline",
             (request, options.device),
@@ -177,11 +179,12 @@ def instruct(given: EditorInput) -> InstructEditor:
 
 
 def check_instruct(what: str, options: EditorOptions) -> None:
-    """What `instruct` and its pipeline would raise, as far as it is to be known without loading a network.
+    """Check everything that `instruct` and its pipeline need, without loading a network.
 
     Raises:
-        ProgdfError: nothing is said, a package or weights are missing or truncated, an option is not known,
-            or the anchor is no picture, has no camera, or is for a model that takes one picture alone.
+        ProgdfError: the instruction is empty, a package or weights are missing or truncated, an option does
+            not apply, or the anchor is no picture, has no camera, or the model accepts no reference
+            pictures.
     """
     request = resolve_request(what, options)
     adapters.place(request, options.device)
@@ -196,7 +199,7 @@ def check_instruct(what: str, options: EditorOptions) -> None:
 
 
 def sentence(what: str) -> str:
-    """The instruction without the pair of quotes around it."""
+    """Return the instruction without the pair of quotes around it."""
     words = what.strip()
     if len(words) > 1 and words[0] == words[-1] and words[0] in "\"'":
         words = words[1:-1].strip()
@@ -204,7 +207,7 @@ def sentence(what: str) -> str:
 
 
 def resolve_request(what: str, options: EditorOptions) -> PipelineRequest:
-    """The options, with the model's own values where nothing was said.
+    """Return the request of the options, with the model's defaults for options that are not set.
 
     Raises:
         ProgdfError: see `check_instruct`.
@@ -241,7 +244,7 @@ def resolve_request(what: str, options: EditorOptions) -> PipelineRequest:
 
 
 def unread_words(request: PipelineRequest) -> str:
-    """The end of a sentence that is longer than CLIP's 77 tokens, where CLIP is all that reads it."""
+    """Return the end of a prompt that exceeds CLIP's 77 tokens if CLIP is the only text encoder, else ""."""
     if not request.adapter.is_stable:
         return ""
     from transformers import CLIPTokenizer
@@ -252,10 +255,10 @@ def unread_words(request: PipelineRequest) -> str:
 
 
 def parse_guidance(text: str) -> tuple[float | None, float | None]:
-    """What --guidance says of the sentence and of the picture; None where it says nothing.
+    """Return the guidance for the instruction and for the picture from `--guidance`; None if not given.
 
     Raises:
-        ProgdfError: it is neither one number nor two.
+        ProgdfError: the text is neither one nor two numbers between 1 and 100.
     """
     numbers = read_numbers(text)
     if text and (len(numbers) not in (1, 2) or not all(1 <= number <= 100 for number in numbers)):

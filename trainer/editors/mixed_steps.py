@@ -1,12 +1,13 @@
-"""The source-mixed step: an edit at any degree, by any pipeline of diffusers.
+"""Source-mixed sampling: an edit at any strength with any diffusers pipeline.
 
     p ← w p + (1 − w) p_src,     w_i(s) = clip((s (1 + soft) − (1 − i/n)) / soft, 0, 1),     i = 0..n − 1
+ p is the network's prediction at step i of n. p_src = (x − src) / σ is the prediction that leads straight
+to the source, both for a flow's velocity and for Euler's noise. At strength 0 all steps lead to the source.
+At strength 1 no step is changed, so the picture equals the stock pipeline's bit for bit. The source is
+captured among the pipeline's own latents, so one implementation serves all pipelines, whatever their
+packing. Steps with weight 0 skip the network.
 
-p is what the network predicts at step i of n, p_src what would lead straight to the source: (x − src) / σ,
-of a flow's velocity and of Euler's noise alike. At strength 0 all steps lead to the source; at 1 none is
-touched, so that the picture is the stock pipeline's to the bit. The source is caught among the pipeline's own
-latents: one implementation does for all pipelines, however they pack. Steps whose weight is 0 ask no network.
-Why softness 1: docs/experiments.md, The degree of a text edit.
+Reasons for softness 1: docs/experiments.md, The degree of a text edit.
 """
 
 from __future__ import annotations
@@ -23,37 +24,37 @@ _EULER = ("FlowMatchEulerDiscreteScheduler", "EulerAncestralDiscreteScheduler", 
 
 
 def step_weight(strength: float, softness: float, progress: float) -> float:
-    """The model's say in the step that begins at `progress` = i/n, 0..1."""
+    """Return the weight of the model's prediction in the step that begins at `progress` = i/n, 0..1."""
     return min(1.0, max(0.0, (strength * (1.0 + softness) - (1.0 - progress)) / softness))
 
 
 def network_steps(strength: float, softness: float, steps: int) -> int:
-    """In how many of the steps a network is asked."""
+    """Return the number of steps that run the network."""
     return sum(step_weight(strength, softness, i / steps) > 0.0 for i in range(steps))
 
 
 class _EncodedError(Exception):
-    """The sentence is encoded: nothing further is wanted of this call."""
+    """Signal that the prompt is encoded and the rest of the call can be skipped."""
 
 
 class MixedSteps:
-    """A pipeline whose steps can be mixed; made once, before anything else wraps the pipeline's network.
+    """A pipeline with mixed steps. Make it before anything else wraps the pipeline's network.
 
     Args:
-        pipeline: of diffusers, with a scheduler of Euler's (`euler_scheduler`)
-        encodes_alone: its sentence is encoded without the picture: once, see `encode`
+        pipeline: of diffusers, with an Euler scheduler (`euler_scheduler`)
+        encodes_alone: encode the prompt once, without the picture (see `encode`)
     """
 
     def __init__(self, pipeline: Any, encodes_alone: bool) -> None:
         self.pipeline = pipeline
-        self.calls = 0  # of the network, so far
+        self.calls = 0  # network calls so far
         self._strength = 1.0
         self._softness = 1.0
         self._step = 0
-        self._source: Tensor | None = None  # latents that strength 0 ends in, as the pipeline packs them
-        self.latents: Tensor | None = None  # of the pictures that the last call was given, as packed
+        self._source: Tensor | None = None  # latents of the result at strength 0, as the pipeline packs them
+        self.latents: Tensor | None = None  # latents of the last call's pictures, as packed
         self._encoding = False
-        self._has_own = hasattr(pipeline, "prepare_image_latents")
+        self._prepares_images_apart = hasattr(pipeline, "prepare_image_latents")
         network = pipeline.transformer if hasattr(pipeline, "transformer") else pipeline.unet
         for owner, name, wrap in (
             (network, "forward", self._skip),
@@ -67,7 +68,7 @@ class MixedSteps:
                 setattr(owner, name, functools.wraps(inner)(wrap(inner)))
 
     def encode(self, arguments: Mapping[str, object]) -> None:
-        """Encode the sentence of these arguments, and nothing else."""
+        """Encode the prompt of these arguments and stop the pipeline there."""
         self._encoding = True
         with suppress(_EncodedError):
             self.pipeline(**arguments)
@@ -81,14 +82,14 @@ class MixedSteps:
         strength: float,
         softness: float,
     ) -> Tensor:
-        """What the pipeline makes of its pictures, at a strength. [H,W,3] each -> [H,W,3] 0..1
-
-        What its autoencoder loses of the source is added in the source's share: nothing jumps at 0.
+        """Return the pipeline's result at a strength. [H,W,3] each -> [H,W,3] 0..1
+         The loss of the autoencoder on the source is added back in proportion to the source's weight, so
+        that the result is continuous at strength 0.
 
         Args:
-            ask: pictures -> the arguments of a call; the same noise each time
-            pictures: the view's own first
-            source: what strength 0 gives
+            ask: returns the arguments of a call for its pictures, with the same noise each time
+            pictures: the view's own first, then references
+            source: result at strength 0
             strength, softness: see `InstructEditor.paint`
         """
         if strength <= 0.0:
@@ -115,30 +116,33 @@ class MixedSteps:
         return step_weight(self._strength, self._softness, self._step / steps)
 
     def _catch(self, inner: Callable[..., Any]) -> Callable[..., Any]:
-        """Keep the latents of the pictures: a pipeline prepares them apart, or beside the noise."""
+        """Wrap a method that prepares latents, to store the latents of the pictures.
+
+        Pipelines prepare them in a method of their own or together with the noise.
+        """
         of_pictures = inner.__name__ == "prepare_image_latents"
 
         def prepare(*args: Any, **kwargs: Any) -> Any:
             if self._encoding:
                 raise _EncodedError
-            made = inner(*args, **kwargs)
+            prepared = inner(*args, **kwargs)
             if of_pictures:
-                self.latents = made if isinstance(made, Tensor) else made[0]
-            elif not self._has_own:
-                self.latents = made[1]
-            return made
+                self.latents = prepared if isinstance(prepared, Tensor) else prepared[0]
+            elif not self._prepares_images_apart:
+                self.latents = prepared[1]
+            return prepared
 
         return prepare
 
     def _skip(self, inner: Callable[..., Any]) -> Callable[..., Any]:
-        """Ask the network only where it has a say, or where later steps need what it remembers."""
+        """Wrap the network, to run it only if its weight is above 0 or later steps need its cache."""
 
         def forward(*args: Any, **kwargs: Any) -> Any:
             if self._weight() > 0.0 or kwargs.get("kv_cache_mode") == "extract":
                 self.calls += 1
                 return inner(*args, **kwargs)
             given: Tensor = args[0] if args else kwargs["hidden_states"]
-            return (given,)  # of the right shape, and never looked at
+            return (given,)  # has the right shape; the value is not used
 
         return forward
 
@@ -154,14 +158,15 @@ class MixedSteps:
         return step
 
     def _straight(self, sample: Tensor) -> Tensor:
-        """The prediction that leads from a sample straight to the source."""
+        """Return the prediction that leads from a sample straight to the source."""
         latents = self.latents if self._source is None else self._source
         assert latents is not None
-        if sample.ndim == 4:  # planes, of a UNet: the picture's come first, and as the autoencoder has them
+        # image planes of a UNet: the picture's come first, unscaled as in the autoencoder
+        if sample.ndim == 4:
             is_scaled = getattr(self.pipeline, "is_cosxl_edit", False)
             scale = 1.0 if is_scaled else self.pipeline.vae.config.scaling_factor
             source = latents[: len(sample)].float() * scale
-        else:  # tokens; those of further pictures follow
+        else:  # tokens; those of references follow
             source = latents[:, : sample.shape[1]].float()
         scheduler = self.pipeline.scheduler
         sigma: Tensor = scheduler.sigmas[self._step].to(sample.device)
@@ -173,15 +178,15 @@ class MixedSteps:
 
 
 def _once(inner: Callable[..., Any]) -> Callable[..., Any]:
-    """Encode each sentence once; then its encoder may go."""
-    made: dict[str, Any] = {}
+    """Wrap a text encoder, to encode each prompt once. Its weights can be unloaded afterwards."""
+    encodings: dict[str, Any] = {}
 
     def encode(*args: Any, **kwargs: Any) -> Any:
         device = next(value for value in (*args, *kwargs.values()) if isinstance(value, torch.device))
         words = [value for value in (*args, *kwargs.values()) if isinstance(value, str | bool | list)]
-        if repr(words) not in made:
-            made[repr(words)] = inner(*args, **kwargs)
-        encoded = made[repr(words)]
+        if repr(words) not in encodings:
+            encodings[repr(words)] = inner(*args, **kwargs)
+        encoded = encodings[repr(words)]
         if isinstance(encoded, Tensor):
             return encoded.to(device)
         return tuple(part.to(device) if isinstance(part, Tensor) else part for part in encoded)
@@ -190,7 +195,10 @@ def _once(inner: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def euler_scheduler(pipeline: Any) -> Any:
-    """The pipeline's scheduler, or Euler's of the same settings: mixed steps of DDIM's are not monotone."""
+    """Return the pipeline's scheduler if it is Euler's, else an Euler scheduler with the same settings.
+
+    Mixed steps of DDIM are not monotone in the strength.
+    """
     import diffusers
 
     if type(pipeline.scheduler).__name__ in _EULER:

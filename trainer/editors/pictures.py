@@ -1,11 +1,12 @@
-"""Pictures of the scene that any program has changed, each with the camera from which it was rendered.
+"""Editors that read edited pictures: `pictures`, `folder` and `photographs`.
 
-    pictures:A.png[,B.png…]     the finished edit, from a handful of cameras
-    0.5/A.png, 0.5/B.png, …     beside them: further strengths, a subfolder each
-
-The run's views are these pictures' own (see `trainer.setup`). What shows through the scene,
-its background, may be of any one color: it is found, and taken for the run's; a shift by a pixel or two is
-undone.
+    pictures:A.png[,B.png…]          the finished edit, rendered from a small number of cameras
+    0.5/A.png, 0.5/B.png, …          beside them: further strengths, one subfolder each
+    folder:DIR                       an edited copy of every view
+    photographs:EDITED,ORIGINALS     edited photographs and, optionally, the unedited ones
+ A picture of `pictures` needs the camera that rendered it (see `trainer.setup`). The run's views are then
+the views of these pictures. The background behind the scene can have any single color: it is detected and
+replaced by the run's background. A shift by one or two pixels is undone.
 """
 
 from __future__ import annotations
@@ -37,26 +38,27 @@ from trainer.views.view import BACKGROUND, View, seen_colors, shrink_image
 from .base import EditorInput
 
 MAX_PICTURES = 32
-"""More are a folder of views: what a handful needs would take long."""
+"""Maximum number of pictures. More belong in a folder of views: processing them here would be slow."""
 
-_MIN_STRENGTHS = 8  # where several are given, those between them counted
+_MIN_STRENGTHS = 8  # strengths to edit if several are given, interpolated ones included
 STEP = 1 / 255
-"""What 8 bits, rounded on another machine, may differ by."""
+"""Color difference that 8-bit rounding on another machine can cause."""
 
-_SHIFT = 2  # pixels by which a program may have moved the picture
-STILL = 0.4  # quantile of the difference that tells how well a shift fits: much of a picture is unchanged
-_EDGE = 0.02  # of color, from pixel to pixel: the rest fits anywhere
-_BETTER = 0.8  # of the misfit as it is: noise alone makes one shift a little better than another
-_SKEWED = 0.02  # by which a picture may differ in its proportions from its camera
+_MAX_SHIFT_PX = 2  # pixels; a program may have shifted the picture by this much
+STILL = 0.4  # quantile of the difference that rates a shift: much of a picture is unchanged
+_EDGE_CONTRAST = 0.02  # color difference of neighboring pixels at an edge; flat areas match at any shift
+# share of the unshifted error that a shift must beat: noise alone favors one shift a little
+_MAX_SHIFTED_ERROR = 0.8
+_MAX_ASPECT_ERROR = 0.02  # relative difference in proportions allowed between a picture and its camera
 
 
 @dataclass(frozen=True)
 class PicturesEditor:
-    """The changed pictures, and what lies between them: straight in OKLab, with a bow (`bend_of`)."""
+    """Editor of given pictures, interpolated between their strengths in OKLab along a path (`bend_of`)."""
 
-    given: Mapping[str, Mapping[float, Tensor]]  # view's name → strength, 0 among them → picture. [H,W,3]
-    bends: Mapping[float, Bend]  # of the way to each strength from the one before
-    stages: tuple[float, ...]  # ascending; empty where the finished edit alone is given
+    given: Mapping[str, Mapping[float, Tensor]]  # view name → strength (0 included) → picture. [H,W,3]
+    bends: Mapping[float, Bend]  # strength → bend of the color path from the strength before it
+    stages: tuple[float, ...]  # ascending; empty if only the finished edit is given
     kind: EditKind = "color"
     is_confined: bool = False
 
@@ -72,39 +74,45 @@ class PicturesEditor:
 
 
 def pictures(given: EditorInput) -> PicturesEditor:
-    """`pictures:A.png[,B.png…]`: see the module's head; the views are the pictures', in their order.
+    """Return the editor of `pictures:A.png[,B.png…]`.
+
+    The views must be those of the pictures, in their order.
 
     Raises:
         ProgdfError: a picture is missing or broken.
     """
-    found = [strengths_of(path) for path in picture_paths(given.what)]
-    stages = sorted({strength for strengths in found for strength in strengths})
-    for strengths in found:
+    paths_by_strength = [strengths_of(path) for path in picture_paths(given.what)]
+    stages = sorted({strength for strengths in paths_by_strength for strength in strengths})
+    for strengths in paths_by_strength:
         for strength in stages:
             if strength not in strengths:
                 path = strengths[1.0].parent / f"{strength:g}" / strengths[1.0].name
                 raise ProgdfError(f"{path} is missing; every picture needs one of each strength")
     images = {
         view.camera.name: {0.0: view.image}
-        | {s: read_edit(given.scene, view.camera, view.image, path) for s, path in some.items()}
-        for view, some in zip(given.views, found, strict=True)
+        | {s: read_edit(given.scene, view.camera, view.image, path) for s, path in by_strength.items()}
+        for view, by_strength in zip(given.views, paths_by_strength, strict=True)
     }
     bends = {}
-    ways = list(pairwise((0.0, *stages)))
-    for before, after in ways:
-        first, last = (torch.cat([some[s] for some in images.values()]) for s in (before, after))
+    intervals = list(pairwise((0.0, *stages)))
+    for before, after in intervals:
+        first, last = (
+            torch.cat([by_strength[s] for by_strength in images.values()]) for s in (before, after)
+        )
         weights = (last - first).norm(dim=2)
         bends[after] = bend_of(typical_color(first, weights), typical_color(last, weights))
     parts = -(-_MIN_STRENGTHS // len(stages))
-    between = [a + (b - a) * (k + 1) / parts for a, b in ways for k in range(parts - 1)]
+    between = [a + (b - a) * (k + 1) / parts for a, b in intervals for k in range(parts - 1)]
     return PicturesEditor(images, bends, tuple(sorted({*between, *stages})) if len(stages) > 1 else ())
 
 
 def read_edit(scene: Gaussians, camera: Camera, image: Tensor, path: Path) -> Tensor:
-    """The view `image` of a camera as a picture has changed it; ProgdfError where that is broken. [H,W,3]
+    """Return the view `image` of a camera with the change of a picture applied. [H,W,3]
+     The change is measured at the picture's own size and then shrunk. A shrunk picture differs from a small
+    render wherever the scene has fine detail.
 
-    What was changed is taken at the picture's own size, then shrunk: a picture that is shrunk differs
-    from a small render wherever the scene is fine.
+    Raises:
+        ProgdfError: the picture is broken.
     """
     original, picture = read_change(scene, path, camera.resize(*picture_size(path)))
     change = lay_over(original, picture) - original
@@ -112,7 +120,11 @@ def read_edit(scene: Gaussians, camera: Camera, image: Tensor, path: Path) -> Te
 
 
 def picture_paths(what: str) -> tuple[Path, ...]:
-    """The pictures of `pictures:A.png[,B.png…]`; ProgdfError where one is missing, or two have one name."""
+    """Return the paths of `pictures:A.png[,B.png…]`.
+
+    Raises:
+        ProgdfError: a picture is missing, two have the same name, or there are more than `MAX_PICTURES`.
+    """
     names = [what] if Path(what).expanduser().is_file() else [name.strip() for name in what.split(",")]
     paths = tuple(Path(name).expanduser() for name in names)
     for name, path in zip(names, paths, strict=True):
@@ -134,7 +146,13 @@ def picture_paths(what: str) -> tuple[Path, ...]:
 
 
 def strengths_of(path: Path) -> dict[float, Path]:
-    """Strength → picture: those of its name in subfolders that are named for one, and itself at 1."""
+    """Return the pictures of an edit by strength.
+     The picture itself has strength 1. Pictures of the same name in subfolders named by a number have that
+    strength.
+
+    Raises:
+        ProgdfError: such a subfolder is named by a number that is not between 0 and 1.
+    """
     paths = {1.0: path}
     for child in sorted(path.parent.iterdir()):
         strength = number_of(child.name)
@@ -152,10 +170,15 @@ def strengths_of(path: Path) -> dict[float, Path]:
 
 
 def picture_cameras(paths: Sequence[Path], given: Sequence[Camera], origin: Origin = ZERO) -> list[Camera]:
-    """The cameras of the pictures, at their size; `origin`: of the scene, which they are relative to.
+    """Return the cameras of the pictures, at the pictures' sizes.
+
+    Args:
+        paths: the pictures
+        given: cameras to choose from
+        origin: origin of the scene; the cameras are relative to it
 
     Raises:
-        ProgdfError: none is found for one, see `find_picture_camera`, or its proportions are another's.
+        ProgdfError: a picture has no camera (see `find_picture_camera`), or its proportions are different.
     """
     sizes = [picture_size(path) for path in paths]
     cameras = rendered_cameras(paths, given, origin)
@@ -163,12 +186,12 @@ def picture_cameras(paths: Sequence[Path], given: Sequence[Camera], origin: Orig
 
 
 def rendered_cameras(paths: Sequence[Path], given: Sequence[Camera], origin: Origin = ZERO) -> list[Camera]:
-    """`picture_cameras`, at the size at which each was rendered."""
+    """Return the cameras of the pictures at the sizes of their renders (see `picture_cameras`)."""
     cameras = []
     for path in paths:
         camera = find_picture_camera(path, given, origin)
         width, height = picture_size(path)
-        if abs(width * camera.height / (height * camera.width) - 1) > _SKEWED:
+        if abs(width * camera.height / (height * camera.width) - 1) > _MAX_ASPECT_ERROR:
             raise ProgdfError(
                 f"{path} is {width}x{height} pixels, it was rendered with {camera.width}x{camera.height}; "
                 "keep the proportions, and crop nothing"
@@ -178,18 +201,18 @@ def rendered_cameras(paths: Sequence[Path], given: Sequence[Camera], origin: Ori
 
 
 def read_change(scene: Gaussians, path: Path, camera: Camera) -> tuple[Tensor, Tensor]:
-    """A changed picture, and the render that it was before, over the picture's own background.
+    """Return a changed picture and the original render over the picture's own background.
 
     Args:
         scene: the original
         path: the picture
-        camera: from which it was rendered, at the size at which it was
+        camera: rendering camera of the picture, at the size of that render
 
     Returns:
         original; picture. [H,W,3] each, of the picture's own size
 
     Raises:
-        ProgdfError: it is missing or broken.
+        ProgdfError: the picture is missing or broken.
     """
     picture = read_picture(path)
     run = torch.tensor(BACKGROUND)
@@ -201,13 +224,13 @@ def read_change(scene: Gaussians, path: Path, camera: Camera) -> tuple[Tensor, T
 
 
 def picture_background(scene: Gaussians, path: Path, camera: Camera) -> Tensor:
-    """The color behind a picture, rgb [3], found at the camera's size; see `read_change`."""
+    """Return the background color of a picture, found at the camera's size (see `read_change`). rgb [3]"""
     picture = resize_image(read_picture(path), (camera.width, camera.height))
     return background_of(picture, *_draw(scene, camera), save_as(path))
 
 
 def _draw(scene: Gaussians, camera: Camera) -> tuple[Tensor, Tensor]:
-    """The scene over the run's background, not clamped [H,W,3], and its transmittance [H,W,1]."""
+    """Return the scene over the run's background, not clamped, and its transmittance. [H,W,3], [H,W,1]"""
     with torch.no_grad():
         drawn = render(scene, camera, BACKGROUND, colors=seen_colors(scene, camera))
     return drawn.image, drawn.transmittance[..., None]
@@ -216,47 +239,48 @@ def _draw(scene: Gaussians, camera: Camera) -> tuple[Tensor, Tensor]:
 def background_of(
     picture: Tensor, original: Tensor, clear: Tensor, save: Callable[[Tensor], Tensor]
 ) -> Tensor:
-    """The color behind a picture: the one that leaves least of what tells it from the render.
+    """Return the background color of a picture: the color that minimizes its difference to the render.
 
     Args:
         picture: [H,W,3]
         original: the render over the run's background, not clamped. [H,W,3]
         clear: transmittance of the scene. [H,W,1]
-        save: what saving makes of an image, see `save_as`
+        save: returns an image as saving changes it (see `save_as`)
 
     Returns:
-        rgb. [3]; the run's own background, unless another leaves half as much where the scene is clear
+        rgb. [3] The run's own background, unless another color halves the error where the scene is
+        transparent.
     """
     run, weight = torch.tensor(BACKGROUND), clear[..., 0].double()
-    apart = picture - original
-    shades = ((run + apart / clear.clamp_min(1e-6)) * 255.0).round().clamp(0, 255).long()
-    # least Σ clear·|apart − clear·(color − run)| is the median with weights clear²
+    difference = picture - original
+    candidates = ((run + difference / clear.clamp_min(1e-6)) * 255.0).round().clamp(0, 255).long()
+    # the minimum of Σ clear·|apart − clear·(color − run)| is the median with weights clear²
     colors = []
     for channel in range(3):
-        counts = torch.bincount(shades[..., channel].flatten(), weight.square().flatten(), 256).cumsum(0)
+        counts = torch.bincount(candidates[..., channel].flatten(), weight.square().flatten(), 256).cumsum(0)
         colors.append(int(torch.searchsorted(counts, 0.5 * counts[-1])) / 255.0)
     color = torch.tensor(colors)
 
     def misfit(background: Tensor) -> float:
-        left = (apart - clear * (background - run)).abs()
-        return float((weight[..., None] * left).sum())
+        remainder = (difference - clear * (background - run)).abs()
+        return float((weight[..., None] * remainder).sum())
 
     if misfit(color) >= 0.5 * misfit(run):
         return run
-    # a JPEG has another color by a step, and so may have several
-    near = [color + STEP * torch.tensor(step) for step in product((0, -1, 1), repeat=3)]
-    errors = [float((save(before.expand(16, 16, 3)) - color).abs().amax()) for before in near]
-    likely = [before for before, error in zip(near, errors, strict=True) if error <= min(errors)]
+    # JPEG can shift a color by one step, so several colors may become this one
+    neighbors = [color + STEP * torch.tensor(step) for step in product((0, -1, 1), repeat=3)]
+    errors = [float((save(before.expand(16, 16, 3)) - color).abs().amax()) for before in neighbors]
+    best = [before for before, error in zip(neighbors, errors, strict=True) if error <= min(errors)]
 
     def replay_error(before: Tensor) -> float:
-        over = (original + clear * (before - run)).clamp(0.0, 1.0)
-        return float((save(over) - picture).abs().mean())
+        replayed = (original + clear * (before - run)).clamp(0.0, 1.0)
+        return float((save(replayed) - picture).abs().mean())
 
-    return min(likely, key=replay_error) if len(likely) > 1 else likely[0]
+    return min(best, key=replay_error) if len(best) > 1 else best[0]
 
 
 def resize_image(image: Tensor, size: tuple[int, int]) -> Tensor:
-    """Scaled to width and height as painting programs do it, by Lanczos. [H,W,C] -> [h,w,C]"""
+    """Resize an image to a width and height by Lanczos, as painting programs do. [H,W,C] -> [h,w,C]"""
     if (image.shape[1], image.shape[0]) == size:
         return image
     channels = [Image.fromarray(channel.numpy()) for channel in image.float().unbind(2)]
@@ -265,33 +289,41 @@ def resize_image(image: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def lay_over(original: Tensor, picture: Tensor) -> Tensor:
-    """The picture moved back by the pixels, up to two, that a program has moved it by. [H,W,3] each"""
-    a, b = (ndimage.uniform_filter(image.numpy(), (3, 3, 1)) for image in (original, picture))
-    steps = [np.abs(move_image(a, shift) - a).max(axis=2) for shift in ((0, 1), (1, 0))]
-    edges = np.max(steps, axis=0) > _EDGE
+    """Return the picture with a shift of up to two pixels undone. [H,W,3] each"""
+    original_smooth, picture_smooth = (
+        ndimage.uniform_filter(image.numpy(), (3, 3, 1)) for image in (original, picture)
+    )
+    steps = [
+        np.abs(move_image(original_smooth, shift) - original_smooth).max(axis=2) for shift in ((0, 1), (1, 0))
+    ]
+    edges = np.max(steps, axis=0) > _EDGE_CONTRAST
     if not edges.any():
         return picture
-    reach = range(-_SHIFT, _SHIFT + 1)
-    shifts = sorted(((y, x) for y in reach for x in reach), key=lambda shift: abs(shift[0]) + abs(shift[1]))
+    offsets = range(-_MAX_SHIFT_PX, _MAX_SHIFT_PX + 1)
+    shifts = sorted(
+        ((y, x) for y in offsets for x in offsets), key=lambda shift: abs(shift[0]) + abs(shift[1])
+    )
 
     rows, columns = np.nonzero(edges)
-    expected, (height, width) = a[rows, columns], edges.shape
+    expected, (height, width) = original_smooth[rows, columns], edges.shape
 
     def misfit(shift: tuple[int, int]) -> float:
-        shifted = b[(rows - shift[0]).clip(0, height - 1), (columns - shift[1]).clip(0, width - 1)]
+        shifted = picture_smooth[
+            (rows - shift[0]).clip(0, height - 1), (columns - shift[1]).clip(0, width - 1)
+        ]
         return float(np.quantile(np.abs(shifted - expected).max(axis=1), STILL))
 
-    if misfit((0, 0)) <= STEP:  # it lies where it lay
+    if misfit((0, 0)) <= STEP:  # the picture is not shifted
         return picture
     errors = [misfit(shift) for shift in shifts]
     best = int(np.argmin(errors))
-    if errors[best] >= _BETTER * errors[0]:
+    if errors[best] >= _MAX_SHIFTED_ERROR * errors[0]:
         return picture
     return torch.from_numpy(move_image(picture.numpy(), shifts[best]))
 
 
 def move_image(image: np.ndarray, shift: tuple[int, int]) -> np.ndarray:
-    """The image moved by rows and columns, its rim repeated. [H,W,3]"""
+    """Return the image moved by (rows, columns), with its border repeated. [H,W,3]"""
     height, width = image.shape[:2]
     rows = (np.arange(height) - shift[0]).clip(0, height - 1)
     columns = (np.arange(width) - shift[1]).clip(0, width - 1)
@@ -299,26 +331,26 @@ def move_image(image: np.ndarray, shift: tuple[int, int]) -> np.ndarray:
     return moved
 
 
-_EDITED = "put the edited copies of RUN/views/original/*.png there, under the same names"
-_TAKEN = "put the photographs there, under the names that the cameras have"
+_EDITED_ADVICE = "put the edited copies of RUN/views/original/*.png there, under the same names"
+_PHOTOGRAPH_ADVICE = "put the photographs there, under the names that the cameras have"
 
 
 @dataclass(frozen=True)
 class FolderEditor:
-    """Reads edited views from one folder per strength."""
+    """Editor that reads edited views from one folder per strength."""
 
     folders: Mapping[float, PictureFolder]  # strength → folder
     stages: tuple[float, ...]  # the strengths, ascending
     kind: EditKind = "style"
     is_confined: bool = False
-    bent: bool = False  # the pictures were taken through the views' lenses and are to be straightened
-    # where the unedited photographs lie, if the views are to be changed as these were; else the pictures are
-    # taken as they are
+    bent: bool = False  # the pictures have the lens distortion of the views and must be undistorted
+    # Folder of the unedited photographs. The difference to them is added to the views. None: the pictures
+    # replace the views.
     originals: PictureFolder | None = None
 
     @property
     def note(self) -> str | None:
-        """What the person should know before training, if anything."""
+        """Warning to show before training, if any."""
         if not self.bent or self.originals is not None:
             return None
         return (
@@ -327,7 +359,11 @@ class FolderEditor:
         )
 
     def edit(self, view: View, strength: float) -> Tensor:
-        """See `ImageEditor.edit`; ProgdfError where the picture is missing, broken or of another shape."""
+        """See `ImageEditor.edit`.
+
+        Raises:
+            ProgdfError: the picture is missing, broken or of another shape.
+        """
         if strength == 0.0:
             return view.image
         picture, visible = self._read_undistorted(self.folders[strength], view)
@@ -336,7 +372,7 @@ class FolderEditor:
         return torch.where(visible[..., None], picture, view.image)
 
     def _read_undistorted(self, pictures: PictureFolder, view: View) -> tuple[Tensor, Tensor]:
-        """Return a picture at its view's size, straight, and the pixels it covers. [H,W,3], [H,W] bool"""
+        """Return an undistorted picture at its view's size and the pixels it covers. [H,W,3], [H,W] bool"""
         camera = view.camera
         path = pictures.require(camera.name, _advice(self.bent))
         picture = read_picture(path, (camera.width, camera.height), calibrated=self.bent)
@@ -346,17 +382,25 @@ class FolderEditor:
 
 
 def folder_of(what: str) -> Path:
-    """The DIR of `folder:DIR`; ProgdfError where there is no such folder."""
+    """Return the folder of `folder:DIR`.
+
+    Raises:
+        ProgdfError: the folder does not exist.
+    """
     if not what:
         raise ProgdfError("folder: needs a folder; write folder:DIR with the edited views in DIR")
     root = Path(what).expanduser()
     if not root.is_dir():
-        raise ProgdfError(f"{root} is not a folder; {_EDITED}")
+        raise ProgdfError(f"{root} is not a folder; {_EDITED_ADVICE}")
     return root
 
 
 def photograph_folders(what: str) -> tuple[Path, Path | None]:
-    """EDITED and ORIGINALS of `photographs:EDITED,ORIGINALS`; ProgdfError where one is no folder."""
+    """Return the folders of `photographs:EDITED,ORIGINALS`; None for ORIGINALS if it is not given.
+
+    Raises:
+        ProgdfError: one of them is not a folder.
+    """
     edited, comma, originals = what.rpartition(",")
     names = [edited, originals] if comma and not Path(what).expanduser().is_dir() else [what]
     roots = [Path(name).expanduser() for name in names]
@@ -364,19 +408,19 @@ def photograph_folders(what: str) -> tuple[Path, Path | None]:
         if not name:
             raise ProgdfError("photographs: needs a folder; write photographs:EDITED,ORIGINALS")
         if not root.is_dir():
-            raise ProgdfError(f"{root} is not a folder; {_TAKEN}")
+            raise ProgdfError(f"{root} is not a folder; {_PHOTOGRAPH_ADVICE}")
     return roots[0], roots[1] if len(roots) > 1 else None
 
 
 def folder(given: EditorInput) -> FolderEditor:
-    """`folder:DIR`: see the module's head. Every view's picture is looked for before training starts."""
+    """Return the editor of `folder:DIR`. Every view must have a picture."""
     return _make_editor(folder_of(given.what), given.views)
 
 
 def _make_editor(root: Path, views: Sequence[View], bent: bool = False) -> FolderEditor:
-    """Return the editor of a folder, after every view's picture was found.
+    """Return the editor of a folder after checking that every view has a picture.
 
-    A subfolder named by a number holds a strength, unless views are named after it: `1/IMG.png`.
+    A subfolder named by a number holds a strength, unless view names contain it, as in `1/IMG.png`.
     """
     names = [view.camera.name for view in views]
     view_folders = {name_key(split_path(name)[0]) for name in names if "/" in name}
@@ -394,7 +438,7 @@ def _make_editor(root: Path, views: Sequence[View], bent: bool = False) -> Folde
 
 
 def photographs(given: EditorInput) -> FolderEditor:
-    """`photographs:EDITED,ORIGINALS` or `photographs:EDITED`: see the module's head."""
+    """Return the editor of `photographs:EDITED,ORIGINALS` or `photographs:EDITED`."""
     edited, originals = photograph_folders(given.what)
     editor = _make_editor(edited, given.views, bent=True)
     if originals is None:
@@ -404,10 +448,10 @@ def photographs(given: EditorInput) -> FolderEditor:
 
 
 def _check_pictures(folder: Path, names: Sequence[str], bent: bool) -> PictureFolder:
-    """Return a folder that has a picture of every view.
+    """Return a folder after checking that it has a picture of every view.
 
     Raises:
-        ProgdfError: a picture is missing, or two have the name of one view.
+        ProgdfError: a picture is missing, or two pictures match one view.
     """
     pictures = PictureFolder(folder, names)
     for name in names:
@@ -416,4 +460,4 @@ def _check_pictures(folder: Path, names: Sequence[str], bent: bool) -> PictureFo
 
 
 def _advice(bent: bool) -> str:
-    return _TAKEN if bent else _EDITED
+    return _PHOTOGRAPH_ADVICE if bent else _EDITED_ADVICE

