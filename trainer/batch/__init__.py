@@ -1,1 +1,1 @@
-"""Many runs at once: a catalogue of jobs, on one machine or on a Ray cluster."""
+"""Batches of runs: a catalogue of jobs on one machine or on a Ray cluster."""

@@ -1,4 +1,4 @@
-"""What a batch is to do: jobs from a catalogue, what is wrong with them, and what they will take.
+"""Jobs of a batch: reading and checking the catalogue, and the expected cost of a run.
 
 A job is an ordinary run: `cd FOLDER; progdf train …` writes the same bytes (`BatchJob.command`).
 """
@@ -25,25 +25,25 @@ from trainer.options import MAX_STAGES, PRESETS, VIEWS, TrainOptions, apply_pres
 from trainer.resolve import BLANK, check_name, resolve
 
 THREADS = 1
-"""Threads of a run where the catalogue gives none: several jobs use the cores better than several threads."""
+"""Default threads of a run: several jobs use the cores better than several threads."""
 
-_MAX_BYTES = 1 << 24  # of a catalogue
+_MAX_BYTES = 1 << 24  # largest catalogue
 MAX_JOBS = 100_000
 _LIST_OF = {"scenes": "[[scenes]]", "edits": "[[scenes.edits]]"}
-_NO_OPTION = ("out", "resume", "scene", "name")  # a catalogue has other ways to say these
+_EXCLUDED_OPTIONS = ("out", "resume", "scene", "name")  # a catalogue sets these in other ways
 
 
 @dataclass(frozen=True)
 class BatchJob:
     """One run of a batch."""
 
-    key: str  # SCENE/NAME, by which reports and --only call it
+    key: str  # SCENE/NAME, used in reports and by --only
     options: TrainOptions  # as typed; `out` is absolute, other paths are relative to `folder`
-    folder: Path = Path()  # where the run works
+    folder: Path = Path()  # working directory of the run
 
     @property
     def command(self) -> str:
-        """The command that does the same alone, to be run in `folder`."""
+        """Equivalent command of this single run, to be run in `folder`."""
         options = self.options
         words = ["progdf", "train", str(self.options.scene)]
         default = apply_preset(BLANK, options.preset)
@@ -56,14 +56,14 @@ class BatchJob:
 
 
 def read_catalogue(path: Path, out: Path) -> tuple[list[BatchJob], list[str]]:
-    """The jobs of a catalogue, and what is wrong with it, a line each.
+    """Return the jobs of a catalogue and its faults, one line each.
 
     Args:
         path: TOML; docs/cli.md, batch
         out: folder of the batch; jobs are written to OUT/SCENE/NAME
 
     Raises:
-        ProgdfError: the file cannot be read, or is no TOML.
+        ProgdfError: the file cannot be read, or is not TOML.
     """
     try:
         content = read_file(path, _MAX_BYTES + 1)
@@ -83,10 +83,11 @@ def read_catalogue(path: Path, out: Path) -> tuple[list[BatchJob], list[str]]:
                 faults.append(f"{key}: {error}")
     except ProgdfError as error:
         return [], [f"{path}: {error}"]
-    counts = Counter(job.key.casefold() for job in jobs)  # some file systems take A and a for one
-    twice = dict.fromkeys(job.key for job in jobs if counts[job.key.casefold()] > 1)
+    counts = Counter(job.key.casefold() for job in jobs)  # some file systems ignore case
+    duplicates = dict.fromkeys(job.key for job in jobs if counts[job.key.casefold()] > 1)
     faults += [
-        f"{key}: {counts[key.casefold()]} jobs have this name; give scenes or edits a `name`" for key in twice
+        f"{key}: {counts[key.casefold()]} jobs have this name; give scenes or edits a `name`"
+        for key in duplicates
     ]
     if not jobs and not faults:
         faults.append(f"{path} holds no edit; add [[scenes]] with a path and [[scenes.edits]]")
@@ -94,7 +95,7 @@ def read_catalogue(path: Path, out: Path) -> tuple[list[BatchJob], list[str]]:
 
 
 def _entries(table: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Key and options of every job, with what the catalogue says for all, for a scene, and by the sweep."""
+    """Yield key and options of every job, merged from the defaults, the scene, the edit and the sweep."""
     _check_keys(table, ("defaults", "scenes", "sweep"), "the catalogue")
     defaults = _table(table, "defaults")
     sweep = _table(table, "sweep")
@@ -119,7 +120,7 @@ def _entries(table: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def _check_count(scenes: Sequence[Mapping[str, Any]], sweep: Mapping[str, Sequence[Any]]) -> None:
-    """Raise ProgdfError if the catalogue has more jobs than a batch takes; nothing is built yet."""
+    """Raise ProgdfError if the catalogue has more than `MAX_JOBS` jobs, before any is built."""
     edits = sum(len(_tables(scene, "edits")) for scene in scenes)
     values = {name: len(points) for name, points in sweep.items()}
     count = edits * math.prod(values.values())
@@ -158,29 +159,29 @@ def _closest(name: str, known: Sequence[str]) -> str:
 
 
 def _file_word(value: object) -> str:
-    """A swept value as a part of a file's name."""
+    """Return a swept value as a part of a file name."""
     return re.sub(r"[^\w.#=+@%-]+", "-", str(value)).strip("-")
 
 
 def make_options(values: Mapping[str, Any], out: Path) -> TrainOptions:
-    """Options of a run from their command-line names.
+    """Build the options of a run from their command-line names.
 
     Args:
-        values: names with hyphens or underscores; `scene`, `region` and `editor` are needed
+        values: names with hyphens or underscores; `scene`, `region` and `editor` are required
         out: folder of the run
 
     Raises:
-        ProgdfError: a name or a value that `progdf train` does not take.
+        ProgdfError: `progdf train` does not accept a name or a value.
     """
     values = {name.replace("-", "_"): value for name, value in values.items()}
     for name in ("region", "editor"):
         if not isinstance(values.get(name), str):
             raise ProgdfError(f"{name} is missing")
     options = replace(BLANK, out=out)
-    known = [name for name, typed, _ in flat_values(options) if typed and name not in _NO_OPTION]
+    known = [name for name, typed, _ in flat_values(options) if typed and name not in _EXCLUDED_OPTIONS]
     _check_keys({k: v for k, v in values.items() if k != "scene"}, known, "it")
     if (preset := values.get("preset", "default")) != "default":
-        if preset not in list(PRESETS):  # a list: what is no text has no hash
+        if preset not in list(PRESETS):  # a list: values of other types may have no hash
             raise ProgdfError(f"there is no preset {preset!r}")
         options = apply_preset(options, preset)
     options = with_values(options, **{"threads": THREADS, **values})
@@ -194,20 +195,20 @@ def make_options(values: Mapping[str, Any], out: Path) -> TrainOptions:
 
 @dataclass(frozen=True)
 class Cost:
-    """What a run takes, by a line through measured ones (docs/scale.md); what has ended corrects it."""
+    """Expected cost of a run, from a linear fit to measured runs (docs/scale.md)."""
 
     seconds: float  # on one thread
     memory: int  # peak, bytes
-    disk: int  # of its folder, bytes
+    disk: int  # size of its folder, bytes
 
 
 def estimate_cost(options: TrainOptions, gaussians: int, members: int) -> Cost:
-    """What a run takes.
+    """Estimate the cost of a run.
 
     Args:
         options: as typed
-        gaussians: of the scene
-        members: of the region
+        gaussians: number of Gaussians in the scene
+        members: number of Gaussians in the region
     """
     options = resolve(options)
     views = options.views.views or VIEWS

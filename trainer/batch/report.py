@@ -1,4 +1,4 @@
-"""What a batch tells: lines while it runs, batch.csv, and batch.html with pictures and curves."""
+"""Reports of a batch: lines while it runs, batch.csv, and batch.html with pictures and curves."""
 
 from __future__ import annotations
 
@@ -30,40 +30,40 @@ from .jobs import BatchJob
 Status = Literal["done", "failed", "stopped", "memory", "waiting"]
 
 SOME_FAILED = 3
-"""Exit status."""
+"""Exit status if some jobs failed."""
 
 CSV = "batch.csv"
 PAGE = "batch.html"
 PREVIEW = "preview.jpg"
-"""Of a run's folder: the edit at one half and at 1, side by side."""
-_LINES = 12  # of running jobs on a terminal
-_EVENT_S = 2.0  # between two progress events
-_SPARK_WIDTH = 96
-_SPARK_HEIGHT = 28
-_MAX_EMBEDDED = 1000  # pictures in the page itself, some 15 kB each; beyond, it shows those of its folder
+"""Picture in a run's folder: the edit at strengths 0.5 and 1, side by side."""
+_MAX_LIVE_LINES = 12  # running jobs listed on a terminal
+_EVENT_INTERVAL_S = 2.0  # between two progress events
+_SPARK_WIDTH = 96  # pixels
+_SPARK_HEIGHT = 28  # pixels
+_MAX_EMBEDDED = 1000  # more pictures, about 15 kB each, are linked instead of embedded in the page
 
 
 @dataclass(frozen=True)
 class JobRow:
-    """How a job ended: one line of batch.csv and batch.html."""
+    """Result of a job: one line of batch.csv and batch.html."""
 
-    job: str  # its key
-    status: Status  # stopped: by Ctrl-C; memory: it took more than there was, and is begun again
-    reason: str = ""  # why it is not done, in one line
-    psnr_end: float | None = None  # of the edit, to the editor's pictures on held-out views, dB
-    psnr_between: float | None = None  # the worst strength in between, dB
-    bytes: int | None = None  # of the .gdf
-    bytes_per_gaussian: float | None = None  # of the region
-    seconds: float | None = None  # of the run, over all its sessions
-    cpu_seconds: float | None = None  # of the session that ended it, all threads
-    memory_mb: int | None = None  # peak
-    folder_bytes: int | None = None  # of all that the run left
-    attempts: int = 1  # how often it was begun
-    host: str = ""  # the machine
+    job: str  # key of the job
+    status: Status  # stopped: by Ctrl-C; memory: ran out of memory and is restarted
+    reason: str = ""  # why the job is not done, in one line
+    psnr_end: float | None = None  # full edit against the editor's pictures on held-out views, dB
+    psnr_between: float | None = None  # worst strength below 1, dB
+    bytes: int | None = None  # size of the .gdf
+    bytes_per_gaussian: float | None = None  # size per Gaussian of the region
+    seconds: float | None = None  # duration over all sessions of the run
+    cpu_seconds: float | None = None  # CPU time of the last session, all threads
+    memory_mb: int | None = None  # peak memory
+    folder_bytes: int | None = None  # size of the run folder
+    attempts: int = 1  # number of starts
+    host: str = ""  # name of the machine
 
     @property
     def line(self) -> str:
-        """For a screen."""
+        """One-line summary for the terminal."""
         if self.status != "done":
             return f"{self.job}: {self.status}{': ' if self.reason else ''}{self.reason}"
         between = "" if self.psnr_between is None else f", {self.psnr_between:.1f} at worst in between"
@@ -73,17 +73,17 @@ class JobRow:
 
 @dataclass(frozen=True)
 class SliderCurve:
-    """Pictures along the slider, measured against the editor's."""
+    """PSNR along the slider against the editor's pictures."""
 
     s: tuple[float, ...] = ()  # slider values
-    psnr: tuple[float, ...] = ()  # dB, as many
+    psnr: tuple[float, ...] = ()  # dB, one per slider value
 
 
 @dataclass(frozen=True)
 class EditorCurves:
     """Curves against the editor's pictures."""
 
-    slider: SliderCurve = SliderCurve()  # of the shipped field
+    slider: SliderCurve = SliderCurve()  # the shipped field
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class Curves:
 class EditFigures:
     """Figures of the finished edit."""
 
-    psnr_to_views: float | None = None  # to the editor's pictures on held-out views, dB
+    psnr_to_views: float | None = None  # against the editor's pictures on held-out views, dB
 
 
 @dataclass(frozen=True)
@@ -134,12 +134,12 @@ class RunReport:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a run is; the trainer writes it to RUN/state/progress.json."""
+    """Progress of a run; the trainer writes it to RUN/state/progress.json."""
 
-    share: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.0  # of its whole time
+    share: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.0  # elapsed share of its whole time
     label: str = ""  # the present stage
     loss: str = ""
-    seconds: Annotated[float, msgspec.Meta(ge=0.0, le=1e9)] = 0.0  # spent on the run, in all its sessions
+    seconds: Annotated[float, msgspec.Meta(ge=0.0, le=1e9)] = 0.0  # over all sessions of the run
 
 
 def finished_row(job: BatchJob) -> JobRow:
@@ -181,7 +181,7 @@ def read_report(job: BatchJob) -> RunReport:
 
 
 def _read_progress(job: BatchJob) -> Progress:
-    """Return how far a job is; a file that is absent or damaged counts as the beginning."""
+    """Return the progress of a job; zero progress if the file is missing or damaged."""
     with suppress(OSError, ValueError):
         path = RunFolder(job.options.out).progress
         return convert_json(decode_json(path.read_bytes()), Progress)
@@ -189,7 +189,7 @@ def _read_progress(job: BatchJob) -> Progress:
 
 
 def read_rows(out: Path) -> dict[str, JobRow]:
-    """The rows of an earlier session by job; none where there was none.
+    """Return the rows of an earlier session by job; empty without one.
 
     Raises:
         ProgdfError: batch.csv is damaged.
@@ -199,15 +199,15 @@ def read_rows(out: Path) -> dict[str, JobRow]:
         return {}
     try:
         records = csv.DictReader(path.read_text(encoding="utf-8").splitlines())
-        given = [{key: value for key, value in record.items() if value} for record in records]
-        rows = [msgspec.convert(values, JobRow, strict=False) for values in given]
+        filled = [{key: value for key, value in record.items() if value} for record in records]
+        rows = [msgspec.convert(values, JobRow, strict=False) for values in filled]
     except (ValueError, TypeError, csv.Error) as error:
         raise ProgdfError(f"{path} is damaged ({error}); delete it, the runs are not lost") from None
     return {row.job: row for row in rows}
 
 
 def write_rows(out: Path, rows: Sequence[JobRow]) -> None:
-    """Write batch.csv, whole or not at all."""
+    """Write batch.csv atomically."""
     text = io.StringIO()
     writer = csv.DictWriter(text, [field.name for field in fields(JobRow)])
     writer.writeheader()
@@ -216,7 +216,7 @@ def write_rows(out: Path, rows: Sequence[JobRow]) -> None:
 
 
 def write_page(out: Path, rows: Sequence[JobRow], jobs: Sequence[BatchJob]) -> None:
-    """Write batch.html: one file that fetches nothing but, where jobs are many, its folder's pictures."""
+    """Write batch.html, a self-contained page; beyond 1000 rows it links the pictures in the run folders."""
     done = sum(row.status == "done" for row in rows)
     failed = sum(row.status == "failed" for row in rows)
     summary = f"{done} of {len(rows)} done" + (f", {failed} failed" if failed else "")
@@ -271,7 +271,7 @@ def _picture(row: JobRow, job: BatchJob | None, embed: bool) -> str:
 
 
 def _course_picture(row: JobRow, job: BatchJob | None) -> str:
-    """Return the curve of a finished job; nothing if its report is damaged or was removed meanwhile."""
+    """Return the curve of a finished job; "" if its report is damaged or was removed meanwhile."""
     if job is None or row.status != "done":
         return ""
     with suppress(ProgdfError):
@@ -280,7 +280,7 @@ def _course_picture(row: JobRow, job: BatchJob | None) -> str:
 
 
 def _sparkline(course: Sequence[tuple[float, float]]) -> str:
-    """PSNR over the slider as a small curve; its height is what this row spans, at least 3 dB."""
+    """Return PSNR over the slider as a small SVG curve; its height spans this row's range, at least 3 dB."""
     if len(course) < 2:
         return ""
     low = min(p for _, p in course)
@@ -297,13 +297,13 @@ def _sparkline(course: Sequence[tuple[float, float]]) -> str:
 
 
 class Screen:
-    """What a batch says while it runs: a live list on a terminal, lines elsewhere, or JSON events.
+    """Output of a running batch: a live list on a terminal, lines elsewhere, or JSON events.
 
     Args:
-        jobs: those that will run, by key
-        seconds: how long each is expected to take; what has ended corrects it
-        workers: how many run at once
-        events: where one JSON object a line goes instead
+        jobs: jobs that will run, by key
+        seconds: expected duration of each, corrected by those of finished jobs
+        workers: number of jobs that run at once
+        events: destination of JSON events, one object per line, instead of text
     """
 
     def __init__(
@@ -321,30 +321,30 @@ class Screen:
         self._live = Live(console=self._console, auto_refresh=False, transient=True)
         self._rows: list[JobRow] = []
         self._begun = time.monotonic()
-        self._told = 0.0
+        self._updated_at = 0.0
 
     def say(self, line: str) -> None:
-        """One line."""
+        """Print one line."""
         self._console.print(escape_text(line), soft_wrap=True, markup=False)
 
     def event(self, name: str, **values: object) -> None:
-        """One JSON line, where these are asked for."""
+        """Write one JSON line if events are requested."""
         if self._events is not None:
             print(json.dumps({"event": name, **values}, ensure_ascii=False), file=self._events, flush=True)
 
     def end(self, row: JobRow) -> None:
-        """A job ended."""
+        """Report the end of a job."""
         self._rows.append(row)
         self.event("end", **asdict(row))
         self.say(row.line)
 
     def tick(self, running: Sequence[str]) -> None:
-        """A few times a second, with the jobs that run."""
+        """Report progress; called a few times a second with the keys of the running jobs."""
         live = self._console.is_terminal and self._events is None
-        if not live and (self._events is None or time.monotonic() - self._told < _EVENT_S):
+        if not live and (self._events is None or time.monotonic() - self._updated_at < _EVENT_INTERVAL_S):
             return
-        self._told = time.monotonic()
-        states = {key: _read_progress(self._jobs[key]) for key in running[:_LINES]}
+        self._updated_at = time.monotonic()
+        states = {key: _read_progress(self._jobs[key]) for key in running[:_MAX_LIVE_LINES]}
         remaining = self._remaining(running)
         ended = len(self._rows)
         failed = sum(row.status == "failed" for row in self._rows)
@@ -357,7 +357,7 @@ class Screen:
             self._live.update(Text("\n".join(map(escape_text, lines))), refresh=True)
 
     def total(self, rows: Sequence[JobRow], out: Path) -> int:
-        """What became of all that was asked for; the exit status."""
+        """Report the totals of all selected jobs and return the exit status."""
         statuses = [row.status for row in rows]
         seconds = time.monotonic() - self._begun
         done = statuses.count("done")
@@ -370,17 +370,19 @@ class Screen:
         return SOME_FAILED if failed else 0
 
     def close(self) -> None:
-        """Leave the terminal as it was."""
+        """Remove the live list from the terminal."""
         self._live.stop()
 
     def _remaining(self, running: Sequence[str]) -> float | None:
-        """Seconds until all have ended, by those that have; None before the first."""
+        """Return the seconds until all jobs have ended, from the ended ones; None before the first."""
         ended = {row.job: row.seconds for row in self._rows if row.seconds and row.job in self._seconds}
         expected = sum(self._seconds[key] for key in ended)
         if not expected:
             return None
-        over = {row.job for row in self._rows}
-        ahead = sum(s * (0.5 if key in running else 1) for key, s in self._seconds.items() if key not in over)
+        ended_keys = {row.job for row in self._rows}
+        ahead = sum(
+            s * (0.5 if key in running else 1) for key, s in self._seconds.items() if key not in ended_keys
+        )
         return sum(ended.values()) / expected * ahead / self._workers
 
 

@@ -1,4 +1,4 @@
-"""Run jobs side by side on Ray, or one after another without it; what is lost is begun again elsewhere."""
+"""Run jobs in parallel on Ray, or one after another without it; lost jobs are restarted elsewhere."""
 
 from __future__ import annotations
 
@@ -39,46 +39,46 @@ from .worker import Finding, Lost, inspect_scene, run_job
 _log = logging.getLogger(__name__)
 
 MAX_ATTEMPTS = 4
-"""How often a job is begun whose worker, node or machine was lost."""
+"""Attempts at a job whose worker, node or machine was lost."""
 
-_PACE = 40.0  # times what writing a table took pass before it is written again
-_LOOK_S = 2.0  # between two looks at a cluster's cores
-_STOP_S = 20.0  # in which what runs saves its state when all is stopped
-_ANSWER_S = 10.0  # in which a cluster takes a connection; Ray itself retries for many minutes
-_STORE_BYTES = 80 * 2**20  # of Ray's object store, through which only words go
+_WRITE_INTERVAL_FACTOR = 40.0  # a table is rewritten after this many times its last write duration
+_CAPACITY_INTERVAL_S = 2.0  # between two queries of a cluster's cores
+_STOP_TIMEOUT_S = 20.0  # for running jobs to save their state when the batch is stopped
+_CONNECT_TIMEOUT_S = 10.0  # for a cluster to accept a connection; Ray itself retries for many minutes
+_STORE_BYTES = 80 * 2**20  # size of Ray's object store; it transports short texts only
 
 
 @dataclass(frozen=True)
 class Task:
-    """What a worker is given, and what it takes of a machine."""
+    """A call for a worker, with the resources it needs."""
 
     function: Callable[[Any], Any]
-    argument: Any  # pickled on the way
-    key: str = ""  # of the job, or of the scene that is looked at
+    argument: Any  # pickled for the worker
+    key: str = ""  # key of the job; "" for an inspection
     threads: int = 1
     memory: int = 0  # bytes; 0: unknown
     gpu: bool = False
     attempt: int = 1
-    alone: bool = False  # nothing runs beside it, as it ran out of memory
+    alone: bool = False  # run without other tasks, after it ran out of memory
 
 
 class Pool(Protocol):
-    """Workers."""
+    """A pool of workers."""
 
     name: str
 
     def capacity(self, threads: int) -> int:
-        """How many tasks of so many threads can run at once."""
+        """Return the number of tasks with `threads` threads each that can run at once."""
 
     def submit(self, task: Task) -> Future[Any]:
-        """Begin a task in a worker. Its result may be `Lost`; an exception is a worker that ended, too."""
+        """Start a task in a worker. A `Lost` result or an exception means that the worker ended."""
 
     def stop(self) -> None:
-        """End all that runs, as Ctrl-C does, and wait until it has saved its state."""
+        """Stop all running tasks as Ctrl-C does, and wait until they have saved their state."""
 
 
 class LocalPool:
-    """One worker process, and another one when it is lost."""
+    """One worker process, replaced if it is lost."""
 
     name = "one worker process"
 
@@ -102,7 +102,7 @@ class LocalPool:
                 [sys.executable, "-P", "-c", "from trainer.batch.worker import serve; serve()"],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
-                start_new_session=True,  # Ctrl-C reaches it once, by `stop`
+                start_new_session=True,  # so that Ctrl-C reaches it only through `stop`
             )
         try:
             pickle.dump((task.function, task.argument), cast(BinaryIO, self._worker.stdin))
@@ -118,18 +118,18 @@ class LocalPool:
         if (worker := self._worker) is not None:
             if self._future.running():
                 worker.send_signal(signal.SIGINT)
-                wait([self._future], _STOP_S)
+                wait([self._future], _STOP_TIMEOUT_S)
             worker.kill()
             worker.wait()
         self._thread.shutdown()
 
 
 class RayPool:
-    """Tasks on Ray: a cluster that runs, or one of this machine's cores that ends with the batch.
+    """Ray workers on a running cluster, or on a local one that ends with the batch.
 
     Args:
-        address: of a running cluster; "" starts one
-        cpus: cores of the one that is started
+        address: address of a running cluster; "" starts a local one
+        cpus: cores of the local cluster
     """
 
     def __init__(self, address: str, cpus: int) -> None:
@@ -142,12 +142,12 @@ class RayPool:
         where: dict[str, Any] = {"address": address} if address else {**own, "include_dashboard": False}
         try:
             ray.init(log_to_driver=False, logging_level="error", **where)
-        except Exception as error:  # Ray raises a bare Exception where its start takes too long
+        except Exception as error:  # Ray raises a bare Exception if its start takes too long
             shutil.rmtree(self._folder, ignore_errors=True)
             hint = "; where the cluster asks for a token, RAY_AUTH_MODE=token sends it" if address else ""
             reason = str(error).partition("\n")[0] or type(error).__name__
             raise ProgdfError(f"Ray cannot be used ({reason}){hint}") from error
-        self._looked = 0.0
+        self._checked_at = 0.0
         self._cpus = 0
         machines = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         self._memory = max(machine.get("memory", 0.0) for machine in machines)
@@ -155,9 +155,9 @@ class RayPool:
         self.name = f"Ray, {format_count(len(machines), 'machine')}"
 
     def capacity(self, threads: int) -> int:
-        """See `Pool`. Machines come and go."""
-        if time.monotonic() - self._looked > _LOOK_S:
-            self._looked, self._cpus = time.monotonic(), int(self._ray.cluster_resources().get("CPU", 0))
+        """See `Pool`. The number of machines can change."""
+        if time.monotonic() - self._checked_at > _CAPACITY_INTERVAL_S:
+            self._checked_at, self._cpus = time.monotonic(), int(self._ray.cluster_resources().get("CPU", 0))
         return max(1, self._cpus // threads)
 
     def submit(self, task: Task) -> Future[Any]:
@@ -165,7 +165,7 @@ class RayPool:
         remote = self._ray.remote(task.function).options(
             num_cpus=task.threads,
             num_gpus=int(task.gpu and self._has_gpu),
-            memory=int(min(task.memory, 0.9 * self._memory)),  # or it would wait for ever
+            memory=int(min(task.memory, 0.9 * self._memory)),  # a larger request would wait forever
             max_retries=0,
             name=task.key,
         )
@@ -182,20 +182,20 @@ class RayPool:
             with suppress(self._ray.exceptions.RayError):
                 self._ray.cancel(reference, force=False)
         if running:
-            self._ray.wait(running, num_returns=len(running), timeout=_STOP_S)
+            self._ray.wait(running, num_returns=len(running), timeout=_STOP_TIMEOUT_S)
         self._ray.shutdown()
         shutil.rmtree(self._folder, ignore_errors=True)
 
 
 def _check_address(address: str) -> None:
-    """Raise ProgdfError if HOST:PORT takes no connection; other forms of an address are left to Ray."""
+    """Raise ProgdfError if HOST:PORT accepts no connection; Ray checks other forms of an address."""
     parts = re.fullmatch(r"([^:/]+):(\d{1,5})", address)
     if parts is None:
         return
     host = parts[1]
     port = int(parts[2])
     try:
-        socket.create_connection((host, port), _ANSWER_S).close()
+        socket.create_connection((host, port), _CONNECT_TIMEOUT_S).close()
     except (OSError, OverflowError) as error:
         reason = getattr(error, "strerror", None) or error
         raise ProgdfError(
@@ -206,16 +206,16 @@ def _check_address(address: str) -> None:
 
 @contextmanager
 def open_pool(workers: int, address: str, threads: int, jobs: int) -> Iterator[Pool]:
-    """Workers for jobs of so many threads.
+    """Open a pool of workers for jobs with `threads` threads each.
 
     Args:
-        workers: how many at once; 0: as many as the cores allow
-        address: of a running Ray cluster; "": this machine
-        threads: of a job
-        jobs: how many there are
+        workers: number of workers; 0: as many as the cores allow
+        address: address of a running Ray cluster; "": this machine
+        threads: threads of one job
+        jobs: number of jobs
 
     Raises:
-        ProgdfError: Ray is needed and not installed, or cannot be reached.
+        ProgdfError: Ray is needed but not installed, or cannot be reached.
     """
     has_ray = find_spec("ray") is not None
     workers = min(jobs, workers or max(1, count_threads(0) // threads))
@@ -236,16 +236,16 @@ def run_tasks(
     tell: Callable[[str, Task, str], None] = lambda event, task, reason: None,
     tick: Callable[[Sequence[Task]], None] = lambda running: None,
 ) -> Iterator[tuple[Task, Any]]:
-    """Run tasks; what a lost worker had is begun again.
+    """Run tasks and restart those of lost workers.
 
     Args:
         tasks: in order
         pool: workers
-        tell: hears of "start" and "retry", with the reason of the latter
-        tick: called about twice a second with what runs
+        tell: called with "start" or "retry", the task, and the reason of a retry
+        tick: called about twice a second with the running tasks
 
     Yields:
-        task and result as they come, `Lost` where a task was given up.
+        Task and result in the order of completion; `Lost` after the last attempt at a task.
     """
     waiting = deque(tasks)
     running = dict[Future[Any], Task]()
@@ -260,7 +260,7 @@ def run_tasks(
             lost = isinstance(result, Lost) and not (task.alone and result.from_memory)
             if lost and task.attempt < MAX_ATTEMPTS:
                 tell("retry", task, result.reason)
-                # who dies a second time may have been ended by the system for its memory
+                # a worker that is lost twice may have been killed by the system for its memory
                 alone = result.from_memory or task.attempt > 1
                 again = replace(task, attempt=task.attempt + 1, alone=alone)
                 waiting.append(again) if alone else waiting.appendleft(again)
@@ -276,7 +276,7 @@ def _may_start(task: Task, running: Mapping[Future[Any], Task], pool: Pool) -> b
 
 
 def _result(future: Future[Any]) -> Any:
-    """A task's result; `Lost` for one of Ray's errors, and where memory ran out."""
+    """Return a task's result; `Lost` for an error of Ray and after running out of memory."""
     if (error := future.exception()) is not None:
         kind = type(error).__name__
         return Lost(f"its worker ended ({kind})", from_memory=kind == "OutOfMemoryError")
@@ -287,7 +287,7 @@ def _result(future: Future[Any]) -> Any:
 
 
 def inspect(jobs: Sequence[BatchJob], pool: Pool) -> dict[str, Finding]:
-    """Look at all jobs, scene by scene: what is wrong with each before anything starts, by key."""
+    """Check all jobs, scene by scene, before any starts; return the findings by key."""
     scenes: dict[tuple[Path, Path], list[BatchJob]] = {}
     for job in jobs:
         scenes.setdefault((job.folder, job.options.scene), []).append(job)
@@ -307,7 +307,7 @@ def run_jobs(
     tell: Callable[[str, Task, str], None] = lambda event, task, reason: None,
     tick: Callable[[Sequence[Task]], None] = lambda running: None,
 ) -> Iterator[JobRow]:
-    """`run_tasks` for tasks of `train_task`; every job's row as it ends."""
+    """Run tasks of `train_task`; yield each job's row when it ends. See `run_tasks`."""
     for task, result in run_tasks(tasks, pool, tell, tick):
         if isinstance(result, Lost):
             result = JobRow(task.key, "failed", result.reason)
@@ -315,21 +315,21 @@ def run_jobs(
 
 
 def train_task(job: BatchJob, memory: int = 0) -> Task:
-    """A job as a task; memory in bytes, 0: unknown."""
+    """Return a job as a task; memory in bytes, 0: unknown."""
     gpu = job.options.editor.family == "instruct" or "text:" in job.options.region.region
     return Task(run_job, job, job.key, count_threads(job.options.threads), memory, gpu)
 
 
 def run(jobs: Sequence[BatchJob], workers: int = 0, address: str = "") -> Iterator[JobRow]:
-    """Train jobs side by side; for Python programs. Nothing is looked at before the start, see `inspect`.
+    """Train jobs in parallel, for Python programs. The jobs are not checked first, see `inspect`.
 
     Args:
-        jobs: runs; finished ones are left as they are, stopped ones go on
-        workers: how many at once; 0: cores / threads
-        address: of a running Ray cluster; "": this machine
+        jobs: runs; finished runs stay unchanged, stopped runs resume
+        workers: number of workers; 0: cores / threads
+        address: address of a running Ray cluster; "": this machine
 
     Yields:
-        every job's row as it ends.
+        Every job's row when it ends.
     """
     tasks = [train_task(job) for job in jobs]
     threads = max((task.threads for task in tasks), default=1)
@@ -341,11 +341,12 @@ def batch(options: BatchOptions) -> int:
     """Run `progdf batch`.
 
     Returns:
-        0 all jobs are done; 2 some cannot be trained, a line each, and nothing was started; 3 some failed.
+        0 if all jobs are done, 2 if some cannot be trained (one line each; nothing was started), 3 if some
+        failed.
 
     Raises:
         ProgdfError: the catalogue or the folder cannot be used.
-        KeyboardInterrupt: interrupted; the message says how to go on.
+        KeyboardInterrupt: interrupted; the message names the command to continue.
     """
     check_ranges(("--workers", options.workers, 0, 4096))
     jobs, faults = read_catalogue(options.catalogue, options.out)
@@ -356,14 +357,14 @@ def batch(options: BatchOptions) -> int:
     if not selected and not faults:
         raise ProgdfError("no job matches; --dry-run lists them")
     finished = [job for job in jobs if _is_finished(job)]
-    kept = {job.key for job in finished}
+    finished_keys = {job.key for job in finished}
     found = _found_rows(finished, rows)
     faults += [f"{row.job}: {row.reason}" for row in found.values() if row.status == "failed"]
-    pending = [job for job in selected if job.key not in kept]
+    pending = [job for job in selected if job.key not in finished_keys]
     threads = max((count_threads(job.options.threads) for job in pending), default=1)
     stdout = sys.stdout
     with (
-        redirect_stdout(sys.stderr),  # Ray prints what it notices of machines
+        redirect_stdout(sys.stderr),  # Ray prints notices about machines
         open_pool(options.workers, options.address, threads, len(pending)) as pool,
     ):
         findings = inspect(pending, pool)
@@ -378,7 +379,7 @@ def batch(options: BatchOptions) -> int:
             print(f"progdf: {escape_text(fault)}", file=sys.stderr)
         if options.dry_run:
             with redirect_stdout(stdout):
-                _print_plan(selected, kept, costs, pool.capacity(threads))
+                _print_plan(selected, finished_keys, costs, pool.capacity(threads))
         if faults and not (options.keep_going and healthy and not options.dry_run):
             return 2
         if options.dry_run:
@@ -415,7 +416,7 @@ def _run_batch(
     pool: Pool,
     screen: Screen,
 ) -> None:
-    """Run the tasks; batch.csv and batch.html as they end, in a twentieth of the time at most."""
+    """Run the tasks and rewrite batch.csv and batch.html as they end, in at most a twentieth of the time."""
 
     def tell(event: str, task: Task, reason: str) -> None:
         screen.event(event, job=task.key, attempt=task.attempt, reason=reason)
@@ -423,7 +424,7 @@ def _run_batch(
             screen.say(f"{task.key}: {reason}; it is begun again and goes on where it was")
 
     writers: list[Callable[[Path, Sequence[JobRow]], None]] = [write_rows, partial(write_page, jobs=jobs)]
-    due = [0.0, 0.0]  # a row that is not written is found again in its run
+    due = [0.0, 0.0]  # a row not yet written is recovered from its run folder
 
     def write(now: float = math.inf) -> None:
         ordered = [rows[job.key] for job in jobs if job.key in rows]
@@ -431,12 +432,12 @@ def _run_batch(
             if now >= due[index]:
                 begun = time.monotonic()
                 writer(options.out, ordered)
-                due[index] = begun + _PACE * (time.monotonic() - begun)
+                due[index] = begun + _WRITE_INTERVAL_FACTOR * (time.monotonic() - begun)
 
     try:
         write()
         for row in run_jobs(tasks, pool, tell, lambda running: screen.tick([task.key for task in running])):
-            with defer_signals():  # an interrupted session has told of each row that it wrote
+            with defer_signals():  # so that an interrupted session has reported every row that it wrote
                 rows[row.job] = row
                 screen.end(row)
                 write(time.monotonic())
@@ -458,15 +459,15 @@ def _is_finished(job: BatchJob) -> bool:
     with chdir(job.folder):
         try:
             return find_run(job.options) == "finished"
-        except ProgdfError:  # a broken run: training it says what is wrong
+        except ProgdfError:  # a broken run: training it reports the fault
             return False
 
 
 def _found_rows(finished: Sequence[BatchJob], rows: Mapping[str, JobRow]) -> dict[str, JobRow]:
-    """Return the rows of finished runs that the table does not have, or not as done, by key.
+    """Return the rows of finished runs that the table lacks or does not list as done, by key.
 
-    They are runs of `progdf train`, or ended just when the earlier session was interrupted. The row of a run
-    whose report is damaged says so, whatever the table has.
+    They are runs of `progdf train`, or ended just when the earlier session was interrupted. A run with a
+    damaged report gets a failed row in any case.
     """
     found = {}
     for job in finished:
@@ -481,7 +482,7 @@ def _found_rows(finished: Sequence[BatchJob], rows: Mapping[str, JobRow]) -> dic
 
 
 def _disk_faults(out: Path, costs: Mapping[str, Cost]) -> list[str]:
-    """One line where the jobs will not fit on the disk."""
+    """Return one line if the jobs will not fit on the disk."""
     folder = out.absolute()
     while not folder.is_dir():
         folder = folder.parent
@@ -495,7 +496,7 @@ def _disk_faults(out: Path, costs: Mapping[str, Cost]) -> list[str]:
 def _print_plan(
     jobs: Sequence[BatchJob], kept: Collection[str], costs: Mapping[str, Cost], workers: int
 ) -> None:
-    """The jobs as commands, and what all of them will take."""
+    """Print the jobs as commands, and their total time, disk space and memory."""
     for job in jobs:
         state = "finished" if job.key in kept else "" if job.key in costs else "cannot be trained"
         print_line(f"{job.key}: {state or job.command}")

@@ -1,4 +1,4 @@
-"""What a worker process does: look at a scene's jobs before the start, and train one job after another."""
+"""Worker process: checks the jobs of a scene before the start, and trains one job after another."""
 
 from __future__ import annotations
 
@@ -39,29 +39,29 @@ from trainer.views.view import BACKGROUND
 from .jobs import BatchJob
 from .report import PREVIEW, JobRow, Status, finished_row
 
-_PREVIEW_SIDE = 144
+_PREVIEW_SIDE = 144  # longer side of one preview picture, pixels
 _LOCK_WAIT_S = 600.0  # a lost node's worker may still be writing
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What a look at a job's scene tells before the start."""
+    """Result of checking a job before the start."""
 
-    key: str  # of the job
+    key: str  # key of the job
     fault: str = ""  # why it cannot be trained, in one line
-    gaussians: int = 0  # of the scene
-    members: int = 0  # of the region; 0 where only a network can tell
+    gaussians: int = 0  # number in the scene
+    members: int = 0  # number in the region; 0 if a network has to find it
 
 
 @cache
 def _shared_parts() -> Shared:
-    """What this process's jobs have in common; models and weights stay loaded from here on."""
+    """Return the cache shared by this process's jobs; models and weights stay loaded from now on."""
     keep_models()
     return Shared()
 
 
 def inspect_scene(jobs: Sequence[BatchJob]) -> list[Finding]:
-    """Look at everything that jobs of one scene name, as far as it can be seen without training."""
+    """Check everything that the jobs of one scene refer to, without training."""
     findings = []
     for job in jobs:
         with chdir(job.folder):
@@ -87,7 +87,7 @@ def _scene(options: TrainOptions) -> Gaussians:
 
 
 def run_job(job: BatchJob) -> JobRow:
-    """Train a job in this process, or go on with it where it was stopped; a finished one is left as it is."""
+    """Train or resume a job in this process; a finished job stays unchanged."""
     begun = time.perf_counter()
     cpu_begun = time.process_time()
     try:
@@ -111,7 +111,7 @@ def run_job(job: BatchJob) -> JobRow:
 
 
 def _train(job: BatchJob) -> None:
-    with suppress(OSError):  # Linux: the peak that report.json tells is this job's, not that of those before
+    with suppress(OSError):  # Linux: report.json then has this job's peak memory, not an earlier job's
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
     options = job.options
     folder = RunFolder(job.options.out)
@@ -128,16 +128,16 @@ def _is_begun(folder: RunFolder) -> bool:
 
 
 def _write_preview(result: RunResult, scene: Gaussians) -> None:
-    """The edit at one half and at 1, from the held-out view that shows most of the region."""
+    """Draw the edit at strengths 0.5 and 1 in the held-out view that shows most of the region."""
     folder, gdf = result.folder, load_gdf(result.gdf, scene)
-    judging = result.report["views"]["edit"]
-    cameras = {camera.name: camera for camera in read_run_cameras(folder, judging, scene.origin)}
+    held_out = result.report["views"]["edit"]
+    cameras = {camera.name: camera for camera in read_run_cameras(folder, held_out, scene.origin)}
 
     def coverage(name: str) -> float:
         with Image.open(folder.view("mask", name)) as mask:
             return float(np.asarray(mask, dtype=np.float32).mean())
 
-    camera = cameras[max(judging, key=coverage)]
+    camera = cameras[max(held_out, key=coverage)]
     scale = _PREVIEW_SIDE / max(camera.width, camera.height)
     small = camera.resize(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
     with torch.no_grad():
@@ -150,14 +150,14 @@ def _write_preview(result: RunResult, scene: Gaussians) -> None:
 
 @dataclass(frozen=True)
 class Lost:
-    """What comes back instead of a result when a worker, its node or its machine ends."""
+    """Result of a task whose worker, node or machine ended."""
 
     reason: str
-    from_memory: bool = False  # it was ended as memory ran out
+    from_memory: bool = False  # it ended because memory ran out
 
 
 def serve() -> None:
-    """A worker without Ray: pickled tasks from stdin, results to what was stdout, until its input ends."""
+    """Serve as a worker without Ray: pickled tasks from stdin, results to the original stdout."""
     tasks, results = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     queue = SimpleQueue[Any]()
@@ -169,7 +169,7 @@ def serve() -> None:
                     queue.put(pickle.load(tasks))
         finally:  # the batch has ended, or sends tasks of another version: save the state of the running job
             signal_main_thread()
-            queue.put(None)  # where the signal is ignored
+            queue.put(None)  # if the signal is ignored
 
     with suppress(KeyboardInterrupt, BrokenPipeError):
         threading.Thread(target=read, daemon=True).start()
