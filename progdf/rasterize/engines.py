@@ -1,10 +1,10 @@
-"""Drawing a scene and its depth: the conventions, and the engines behind one signature.
+"""Rendering of images and depth: the conventions, and the engines behind one signature.
 
     depth = Σ w z / Σ w,  alpha = Σ w,  w = αT,  z: camera z of a Gaussian's center
 
-The expected depth, as gsplat's "ED": of a surface half covered by another it lies between the two. There is
-no kernel of its own: the scene is painted with (z, 1, 0) and drawn on black, so the depth has the picture's
-weights, whichever engine draws.
+The depth is the expected depth, gsplat's "ED". Where one surface covers half of another, it lies between the
+two. Depth has no kernel of its own: the scene gets the colors (z, 1, 0) and is drawn on black. So depth has
+the weights of the image, whichever engine draws.
 """
 
 from __future__ import annotations
@@ -26,71 +26,79 @@ from progdf.gaussians import Gaussians
 from progdf.sh import rgb_to_sh0
 
 DILATION = 0.3
-"""Added to the diagonal of the 2D covariance, px² (Kerbl 2023, gsplat)."""
+"""Blur added to the diagonal of the 2D covariance, px² (Kerbl 2023, gsplat)."""
 
 ALPHA_MAX = 0.99
-"""Alpha is clamped here; where it is, its gradient is zero (Kerbl 2023)."""
+"""Upper limit of alpha. The gradient of a clamped alpha is zero (Kerbl 2023)."""
 
 ALPHA_MIN = 1.0 / 255.0
-"""A Gaussian contributes to a pixel exactly where its alpha is at least this."""
+"""Lower limit of alpha. A Gaussian contributes to a pixel exactly if its alpha is at least this."""
 
 TRANSMITTANCE_MIN = 1e-4
-"""A Gaussian that would bring the transmittance to this or below is left out, and the pixel is done."""
+"""Lower limit of the transmittance.
+
+A Gaussian that would reduce the transmittance to this or less is omitted, and the pixel is done.
+"""
 
 FRUSTUM_MARGIN = 0.3
-"""x/z and y/z in the Jacobian are clamped to the frustum plus this share of tan(fov/2) on each side."""
+"""Margin of x/z and y/z in the Jacobian beyond the frustum on each side, as a share of tan(fov/2)."""
 
 ANTIALIAS_FLOOR = 0.005
-"""Least det(before dilation) / det(after) that the antialias option takes the root of."""
+"""Minimum of det(before dilation) / det(after) in the antialiasing factor, which is its square root."""
 
 Crop = tuple[int, int, int, int]
-"""A window x0, y0, x1, y1 in pixels of the full image; x1 and y1 are one past the last."""
+"""Window x0, y0, x1, y1 in pixels of the full image; x1 and y1 are one past the last."""
 
 ENGINES = {
     "reference": "progdf.rasterize.reference",
     "cpu": "progdf.rasterize.cpu.engine",
     "warp": "progdf.rasterize.warp_engine",
 }
-"""Engine name -> module that is a `RasterEngine`, imported when first used."""
+"""Name of an engine → module that implements `RasterEngine`, imported on first use."""
 
 MAX_INTERSECTIONS = 100_000_000
-"""(Gaussian, tile) pairs beyond which a view is refused: 1.2 GB forward, 3.6 GB more backward."""
+"""Maximum number of (Gaussian, tile) pairs in a view: 1.2 GB forward, 3.6 GB more backward."""
 
-_DRAWN_SH = 16  # coefficients that a picture shows; one that is not finite hides its Gaussian
+_RENDERED_SH = 16  # SH coefficients that are drawn; a non-finite one hides its Gaussian
 
 
 class ActivatedGaussians(NamedTuple):
-    """N Gaussians in activated units, as they are drawn."""
+    """N Gaussians in activated units, the input of the engines."""
 
     means: Tensor  # centers, world units. [N,3]
     quats: Tensor  # rotations wxyz, any nonzero length. [N,4]
     scales: Tensor  # standard deviations, world units, ≥ 0. [N,3]
     opacities: Tensor  # 0..1. [N]
-    colors: Tensor  # rgb [N,3], or spherical-harmonic coefficients [N,K,3], K = (degree+1)²
+    colors: Tensor  # rgb [N,3], or SH coefficients [N,K,3], K = (degree+1)²
     antialiased: bool = False  # scale opacities by sqrt(det/dilated det) of the 2D covariance (Mip-Splatting)
 
     @property
     def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """All but the flag."""
+        """Tensors without the flag."""
         return self[:5]
 
     @property
     def sh_degree(self) -> int | None:
-        """Degree of the harmonics that are shown, 0..3; None where the colors are rgb."""
+        """SH degree that is drawn, 0..3; None for rgb colors."""
         return None if self.colors.ndim == 2 else min(isqrt(self.colors.shape[1]) - 1, 3)
 
     def each(self, function: Callable[[Tensor], Tensor]) -> ActivatedGaussians:
-        """The same with every tensor passed through a function."""
+        """Return a copy with a function applied to every tensor."""
         means, quats, scales, opacities, colors = map(function, self.tensors)
         return ActivatedGaussians(means, quats, scales, opacities, colors, self.antialiased)
 
     def select(self, rows: Tensor) -> ActivatedGaussians:
-        """Some of them. [M] int64"""
+        """Return a selection of the Gaussians. rows: [M] int64"""
         return self.each(lambda tensor: tensor[rows])
 
 
 def activate(gaussians: Gaussians, colors: Tensor | None = None) -> ActivatedGaussians:
-    """Raw Gaussians in activated units, with their own spherical harmonics or, if given, other `colors`."""
+    """Return raw Gaussians in activated units.
+
+    Args:
+        gaussians: raw parameters
+        colors: replaces the Gaussians' own spherical harmonics
+    """
     colors = gaussians.sh if colors is None else colors
     return ActivatedGaussians(
         gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, colors, gaussians.antialiased
@@ -99,7 +107,7 @@ def activate(gaussians: Gaussians, colors: Tensor | None = None) -> ActivatedGau
 
 @dataclass(frozen=True)
 class RasterView:
-    """A camera and what is drawn of its image; see `progdf.rasterize.render`."""
+    """Camera and the window to draw of its image; see `progdf.rasterize.render`."""
 
     viewmat: Tensor
     K: Tensor
@@ -113,7 +121,7 @@ class RasterView:
 
     @classmethod
     def of(cls, camera: Camera, gaussians: ActivatedGaussians, crop: Crop | None = None) -> RasterView:
-        """What `camera` sees of `gaussians`; of its whole image where there is no crop."""
+        """Return the view of `gaussians` from `camera`. Without a crop it is the whole image."""
         width = camera.width
         height = camera.height
         viewmat, K = (matrix.to(gaussians.means.device) for matrix in (camera.viewmat, camera.K))
@@ -124,55 +132,59 @@ class RasterView:
 
 
 class ColorMap(Protocol):
-    """What each of M Gaussians weighs in each pixel of a window: αT, for as long as nothing moves.
+    """Blending weights αT of M Gaussians in the pixels of a window. They are valid while no Gaussian moves.
 
-    [h,w,3] of the whole window, [P,3] where it is of some pixels.
+    Images are [h,w,3] for a whole window, [P,3] for selected pixels.
     """
 
     def picture(self, colors: Tensor) -> Tensor:
-        """Σ αT·c of every pixel, on black, of any number of channels. [M,C] -> [h,w,C] or [P,C]"""
+        """Return Σ αT·c of every pixel, on black, for any number of channels. [M,C] -> [h,w,C] or [P,C]"""
         ...
 
     def gradient(self, image: Tensor) -> Tensor:
-        """The transpose: Σ αT·g of every Gaussian. [h,w,3] or [P,3] -> [M,3]"""
+        """Return the transpose, Σ αT·g of every Gaussian. [h,w,3] or [P,3] -> [M,3]"""
         ...
 
 
 class RasterEngine(Protocol):
-    """What draws; shapes have been checked."""
+    """Interface of an engine. The shapes of all arguments have been checked."""
 
     def rasterize(
         self, gaussians: ActivatedGaussians, view: RasterView, background: Tensor, grad_rows: Tensor | None
     ) -> tuple[Tensor, Tensor, RasterInfo]:
-        """See `progdf.rasterize.render`."""
+        """Draw an image, see `progdf.rasterize.render`."""
         ...
 
     def alpha_weights(self, gaussians: ActivatedGaussians, view: RasterView, mask: Tensor) -> Tensor:
-        """See `progdf.rasterize.alpha_weights`; colors are not read."""
+        """Sum blending weights, see `progdf.rasterize.alpha_weights`. Colors are not read."""
         ...
 
     def color_map(
         self, gaussians: ActivatedGaussians, view: RasterView, rows: Tensor, pixels: Tensor | None,
         lost: float,
     ) -> ColorMap:  # fmt: skip
-        """See `color_map`; colors are not read."""
+        """Compute a color map, see `color_map`. Colors are not read."""
         ...
 
 
 def choose_engine(name: str) -> str:
-    """The engine that "auto" is on this machine: warp where there is a card and it can draw, else cpu."""
-    card = torch.cuda.is_available() and find_spec("warp") is not None
-    return name if name != "auto" else "warp" if card else "cpu"
+    """Return the engine for a name. "auto" is warp if a CUDA device and Warp are available, else cpu."""
+    has_gpu = torch.cuda.is_available() and find_spec("warp") is not None
+    return name if name != "auto" else "warp" if has_gpu else "cpu"
 
 
 def engine_device(name: str) -> torch.device:
-    """Where an engine should have its Gaussians: on the card, if there is one and it draws there."""
+    """Return the device on which an engine needs its Gaussians: CUDA for warp if available, else the CPU."""
     return torch.device("cuda" if name == "warp" and torch.cuda.is_available() else "cpu")
 
 
 @cache
 def get_engine(name: str) -> RasterEngine:
-    """The engine of that name."""
+    """Return the engine with this name.
+
+    Raises:
+        ValueError: no engine has this name.
+    """
     if name not in ENGINES:
         raise ValueError(f"unknown rasterizer '{name}'; use one of {', '.join(ENGINES)}")
     return cast(RasterEngine, importlib.import_module(ENGINES[name]))
@@ -180,18 +192,18 @@ def get_engine(name: str) -> RasterEngine:
 
 @dataclass(frozen=True)
 class RasterInfo:
-    """What the projection yields, not differentiable."""
+    """Results of the projection, not differentiable."""
 
-    means2d: Tensor  # centers in pixels; 0 for a Gaussian not in front of the near plane or not finite. [N,2]
+    means2d: Tensor  # centers in pixels; 0 if not finite or not beyond the near plane. [N,2]
     depths: Tensor  # camera z, world units; 0 likewise. [N] float32
-    visible: Tensor  # the box around its {alpha ≥ 1/255} touches the window that was rendered. [N] bool
+    visible: Tensor  # true if the box around {alpha ≥ 1/255} touches the rendered window. [N] bool
 
 
 class Rendering(NamedTuple):
-    """A scene as a camera sees it. H and W are those of the window where there is a crop."""
+    """Rendered view of a scene. H and W are the window's if there is a crop."""
 
-    image: Tensor  # rgb, 0..1 as far as the colors are; not clamped. [H,W,3]
-    transmittance: Tensor  # share of the background that shines through, 0..1. [H,W]
+    image: Tensor  # rgb, not clamped; 0..1 if the colors are. [H,W,3]
+    transmittance: Tensor  # visible share of the background, 0..1. [H,W]
     info: RasterInfo
 
 
@@ -205,28 +217,29 @@ def render(
     grad_rows: Tensor | None = None,
     engine: str = "cpu",
 ) -> Rendering:
-    """Draw a scene (Kerbl et al. 2023), differentiable in every floating tensor it is given.
+    """Draw a scene (Kerbl et al. 2023), differentiable in every floating tensor argument.
 
     Args:
-        gaussians: raw parameters, or activated ones, which gradients then are to; of spherical harmonics the
-            bands 0 to 3 are drawn. A scene that was trained anti-aliased is drawn so
-        camera: the view, and the depth at and below which nothing is drawn
+        gaussians: raw parameters, or activated ones, which then receive the gradients. SH bands 0 to 3 are
+            drawn. A scene trained with antialiasing is drawn with it
+        camera: the view. Nothing is drawn at or below its near depth
         background: rgb behind everything. [3]
-        colors: in place of the Gaussians' own: rgb [N,3], or SH coefficients [N,K,3]
-        crop: draw only this window, with the full image's conventions; equals the slice of the full image
+        colors: replace the Gaussians' own: rgb [N,3], or SH coefficients [N,K,3]
+        crop: draw only this window, with the full image's conventions. It equals the slice of the full image
             bit for bit. Gaussians that do not touch it cost next to nothing
-        grad_rows: only these rows get gradients, all others zero; takes much less time where they are few.
-            [M] int64
-        engine: a key of `ENGINES`; all but "reference" compute in float32 (projection in float64) whatever
-            the inputs' type, "warp" on the device that they are on
+        grad_rows: rows that get gradients; all others get zeros. This takes much less time for a small number
+            of rows. [M] int64
+        engine: a key of `ENGINES`. All but "reference" compute in float32 (projection in float64) whatever
+            the type of the inputs. "warp" runs on the device of the inputs
 
     Returns:
-        Image, transmittance and what the projection yields: of "reference" the means' type, else float32.
+        Image, transmittance and results of the projection, in the type of the means for "reference", else
+        float32.
 
     Raises:
-        ValueError: a shape does not fit, the crop is empty or leaves the image, the engine is unknown,
-            `grad_rows` are given although the camera wants gradients, which need all rows.
-        ProgdfError: more (Gaussian, tile) pairs than memory should hold.
+        ValueError: a shape does not fit, the crop is empty or leaves the image, the engine is unknown, or
+            `grad_rows` are given although the camera needs gradients, which depend on all rows.
+        ProgdfError: there are more than `MAX_INTERSECTIONS` (Gaussian, tile) pairs.
     """
     check_first_argument("render(scene, camera)", gaussians, (Gaussians, ActivatedGaussians))
     activated = activate(gaussians, colors) if isinstance(gaussians, Gaussians) else gaussians
@@ -245,7 +258,7 @@ def render(
 
 
 def alpha_weights(gaussians: Gaussians, camera: Camera, mask: Tensor, engine: str = "cpu") -> Tensor:
-    """What each Gaussian contributes to a view, inside a mask and in all (docs/method.md 4).
+    """Return each Gaussian's blending weights in a view, inside a mask and in total (docs/method.md 4).
 
     Args:
         gaussians: raw parameters
@@ -254,7 +267,10 @@ def alpha_weights(gaussians: Gaussians, camera: Camera, mask: Tensor, engine: st
         engine: a key of `ENGINES`
 
     Returns:
-        Σ w·m, Σ m, Σ w and n over the pixels that the Gaussian contributes to; w = αT. [N,4]; no gradients
+        Σ w·m, Σ m, Σ w and n over the pixels to which the Gaussian contributes; w = αT. [N,4], no gradients
+
+    Raises:
+        ValueError: the mask has another size.
     """
     if tuple(mask.shape) != (camera.height, camera.width):
         raise ValueError(f"mask has shape {list(mask.shape)}, expected [{camera.height}, {camera.width}]")
@@ -272,23 +288,23 @@ def color_map(
     pixels: Tensor | None = None,
     lost: float = 0.0,
 ) -> ColorMap:
-    """What some Gaussians weigh in a window of a view, as `render` draws it.
+    """Return the blending weights of some Gaussians in a window of a view, as `render` draws it.
 
     Args:
-        gaussians: all N that are drawn; their colors are not read
+        gaussians: all N Gaussians of the scene; their colors are not read
         camera: the view
         crop: x0, y0, x1, y1 of the window
-        rows: which of the N Gaussians, distinct. [M] int64
+        rows: rows of the M Gaussians, distinct. [M] int64
         engine: a key of `ENGINES`
-        pixels: which of the window's alone, numbered row by row, ascending; None: all. [P] int64
-        lost: of each pixel's weights, in all, what may be left out where that is faster
+        pixels: pixels of the window, in row-major order, ascending; None selects all. [P] int64
+        lost: total weight per pixel that may be omitted if that is faster
     """
     black = gaussians._replace(colors=torch.zeros_like(gaussians.means))
     return get_engine(engine).color_map(black, RasterView.of(camera, black, crop), rows, pixels, lost)
 
 
 def check_intersections(splats: int, pairs: int) -> None:
-    """Refuse a view of more than `MAX_INTERSECTIONS` (Gaussian, tile) pairs.
+    """Refuse a view with more than `MAX_INTERSECTIONS` (Gaussian, tile) pairs.
 
     Raises:
         ProgdfError: it has more.
@@ -327,7 +343,7 @@ def _check_crop(crop: Crop | None, camera: Camera) -> None:
 
 
 class Depth(NamedTuple):
-    """What `render_depth` draws."""
+    """Result of `render_depth`."""
 
     depth: Tensor  # camera z, world units; 0 where nothing is drawn. [H,W]
     alpha: Tensor  # 1 − transmittance, 0..1. [H,W]
@@ -336,23 +352,23 @@ class Depth(NamedTuple):
 def render_depth(
     gaussians: Gaussians, camera: Camera, engine: str = "cpu", crop: Crop | None = None
 ) -> Depth:
-    """Draw the depth of a scene, differentiable as the picture is. Arguments as of `progdf.render`."""
+    """Draw the depth of a scene, differentiable like the image. Arguments as in `progdf.render`."""
     painted = paint_depth(gaussians, camera)
     return depth_of(render(painted, camera, (0.0, 0.0, 0.0), crop=crop, engine=engine).image)
 
 
 def paint_depth(gaussians: Gaussians, camera: Camera) -> Gaussians:
-    """The scene in the colors (camera z, 1, 0), to be drawn on black from this camera by any engine."""
+    """Return the scene in the colors (camera z, 1, 0). Draw it on black from this camera with any engine."""
     viewmat = camera.viewmat.to(gaussians.means.device).double()
     z = (gaussians.means.double() @ viewmat[2, :3] + viewmat[2, 3]).to(gaussians.means)
     colors = torch.stack([z, torch.ones_like(z), torch.zeros_like(z)], dim=1)
-    finite = gaussians.sh[:, :_DRAWN_SH].isfinite().flatten(1).all(1)
+    finite = gaussians.sh[:, :_RENDERED_SH].isfinite().flatten(1).all(1)
     sh0 = torch.where(finite[:, None], rgb_to_sh0(colors), torch.nan)
     return replace(gaussians, sh0=sh0, shN=gaussians.shN[:, :0])
 
 
 def depth_of(image: Tensor) -> Depth:
-    """What a picture of a scene painted by `paint_depth` shows. [H,W,≥2]"""
+    """Return the depth in an image of a scene painted by `paint_depth`. [H,W,≥2]"""
     weighted = image[..., 0]
     alpha = image[..., 1]
     drawn = alpha > 0

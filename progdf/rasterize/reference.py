@@ -1,7 +1,7 @@
-"""The rasterizer in plain torch: any floating type, differentiable in everything, the oracle of the tests.
+"""Reference rasterizer in plain torch: any floating type, fully differentiable, the oracle of the tests.
 
 Conventions: Kerbl et al. 2023 (3D Gaussian Splatting) with the choices listed in `progdf.rasterize`. Tiles of
-16x16 pixels bound the memory; within a tile every Gaussian meets every pixel.
+16x16 pixels bound the memory. Within a tile every Gaussian is evaluated at every pixel.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ TILE = 16
 
 @dataclass(frozen=True)
 class ReferenceSplats:
-    """The V Gaussians that a window shows, nearest first."""
+    """V Gaussians visible in a window, nearest first."""
 
-    rows: Tensor  # their indices. [V] int64
+    rows: Tensor  # indices of the Gaussians. [V] int64
     means2d: Tensor  # centers in pixels. [V,2]
     whitening: Tensor  # L with σ = ½|Lᵀd|² for a pixel offset d: l11, l21, l22. [V,3]
-    opacities: Tensor  # activated, antialias included. [V]
+    opacities: Tensor  # activated, with antialiasing. [V]
     colors: Tensor  # rgb. [V,3]
     extents: Tensor  # half sides of the box around {alpha ≥ 1/255}, pixels. [V,2]
 
@@ -46,14 +46,17 @@ class ReferenceSplats:
 def rasterize(
     gaussians: ActivatedGaussians, view: RasterView, background: Tensor, grad_rows: Tensor | None
 ) -> tuple[Tensor, Tensor, RasterInfo]:
-    """See `progdf.rasterize.render`; computed in the type of `means`, projection in float64."""
+    """Draw an image, see `progdf.rasterize.render`.
+
+    Computed in the type of `means`, projection in float64.
+    """
     splats, info = project(of_rows(gaussians, grad_rows), view)
     image, transmittance = blend(splats, view.crop, background)
     return image, transmittance, info
 
 
 def of_rows(gaussians: ActivatedGaussians, rows: Tensor | None) -> ActivatedGaussians:
-    """The same, of which only these rows get gradients; None: all."""
+    """Return the Gaussians with gradients for these rows only; None keeps all gradients."""
     if rows is None:
         return gaussians
     return gaussians.each(lambda tensor: tensor.detach().index_copy(0, rows, tensor[rows]))
@@ -62,7 +65,7 @@ def of_rows(gaussians: ActivatedGaussians, rows: Tensor | None) -> ActivatedGaus
 def color_map(
     gaussians: ActivatedGaussians, view: RasterView, rows: Tensor, pixels: Tensor | None, lost: float
 ) -> ColorMap:
-    """See `progdf.rasterize.engines.color_map`; nothing is left out."""
+    """Return a color map, see `progdf.rasterize.engines.color_map`. No weight is omitted."""
     with torch.no_grad():
         splats, _ = project(gaussians, view)
     black = splats.colors.new_zeros(3)
@@ -72,16 +75,16 @@ def color_map(
 
 @dataclass(frozen=True)
 class DrawnColors:
-    """A color map that draws its splats anew each time."""
+    """Color map that draws its splats again at each call."""
 
     splats: ReferenceSplats
-    rows: Tensor  # which of the N Gaussians have colors, the others are black. [M] int64
-    count: int  # N
-    pixels: Tensor | None  # which of the window's; None: all. [P] int64
+    rows: Tensor  # rows of the colored Gaussians, all others are black. [M] int64
+    count: int  # number of Gaussians N
+    pixels: Tensor | None  # selected pixels of the window; None selects all. [P] int64
     draw: Callable[[ReferenceSplats], Tensor]  # on black, differentiable in the splats' colors. -> [h,w,3]
 
     def picture(self, colors: Tensor) -> Tensor:
-        """See `ColorMap`."""
+        """Draw an image, see `ColorMap`."""
         channels = colors.shape[1]
         threes = torch.nn.functional.pad(colors, (0, -channels % 3))
         every = threes.new_zeros(self.count, threes.shape[1]).index_copy(0, self.rows, threes)
@@ -91,7 +94,7 @@ class DrawnColors:
         return image if self.pixels is None else image.flatten(0, 1)[self.pixels]
 
     def gradient(self, image: Tensor) -> Tensor:
-        """See `ColorMap`."""
+        """Return the gradient of the colors, see `ColorMap`."""
         colors = image.new_zeros(len(self.rows), 3, requires_grad=True)
         with torch.enable_grad():
             return torch.autograd.grad(self.picture(colors), colors, image)[0]
@@ -101,7 +104,7 @@ def blend(splats: ReferenceSplats, crop: Crop, background: Tensor) -> tuple[Tens
     """Blend projected Gaussians tile by tile, front to back.
 
     Returns:
-        image [h,w,3] and transmittance [h,w] of the window, of the splats' type
+        Image [h,w,3] and transmittance [h,w] of the window, in the splats' type.
     """
     x0, y0, x1, y1 = crop
     left = x0 // TILE * TILE
@@ -120,7 +123,7 @@ def blend(splats: ReferenceSplats, crop: Crop, background: Tensor) -> tuple[Tens
 
 
 def project(gaussians: ActivatedGaussians, view: RasterView) -> tuple[ReferenceSplats, RasterInfo]:
-    """Project, cull and sort."""
+    """Project, cull and sort the Gaussians of a view."""
     dtype = gaussians.means.dtype
     dilation = view.dilation
     sh_degree = view.sh_degree
@@ -162,7 +165,7 @@ def project(gaussians: ActivatedGaussians, view: RasterView) -> tuple[ReferenceS
     inside = (high[:, 0] >= x0) & (low[:, 0] <= x1) & (high[:, 1] >= y0) & (low[:, 1] <= y1)
     inside = inside & (opacity.detach() >= ALPHA_MIN) & colored[rows]
     depths = torch.zeros_like(opacities).index_copy(0, rows, z).detach().float()
-    # float32 depth, ties by index: what a viewer can sort by, and the same in every engine
+    # float32 depth, ties by index: sortable by viewers and the same in every engine
     order = z.detach().float().argsort(stable=True)
     order = order[inside[order]]
     if sh_degree is None:
@@ -185,11 +188,11 @@ def project(gaussians: ActivatedGaussians, view: RasterView) -> tuple[ReferenceS
 
 
 def tile_weights(splats: ReferenceSplats, x: int, y: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Alphas and blending weights of one 16x16 tile whose first pixel is (x, y).
+    """Return the alphas and blending weights of one 16x16 tile whose first pixel is (x, y).
 
     Returns:
-        alphas of the Gaussians that contribute, else 0 [256,n]; weights αT [256,n]; final transmittance
-        [256]; the n rows of `splats` that may touch the tile, nearest first [n] int64
+        Alphas, 0 for Gaussians that do not contribute [256,n]; weights αT [256,n]; final transmittance [256];
+        the n rows of `splats` that may touch the tile, nearest first [n] int64.
     """
     low = splats.means2d - splats.extents
     high = splats.means2d + splats.extents
@@ -203,19 +206,20 @@ def tile_weights(splats: ReferenceSplats, x: int, y: int) -> tuple[Tensor, Tenso
     raw = splats.opacities[members] * torch.exp(-0.5 * ((l11 * dx + l21 * dy).square() + (l22 * dy).square()))
     alphas = torch.where(raw >= ALPHA_MIN, raw.clamp_max(ALPHA_MAX), 0.0)
     after = torch.cumprod(1.0 - alphas, dim=1)
-    alphas = torch.where(after > TRANSMITTANCE_MIN, alphas, 0.0)  # and none after it: `after` only falls
+    # this omits all later Gaussians too: `after` only decreases
+    alphas = torch.where(after > TRANSMITTANCE_MIN, alphas, 0.0)
     after = torch.cumprod(1.0 - alphas, dim=1)
     before = torch.cat([after.new_ones(len(after), 1), after], dim=1)
     return alphas, alphas * before[:, :-1], before[:, -1], members
 
 
 def alpha_weights(gaussians: ActivatedGaussians, view: RasterView, mask: Tensor) -> Tensor:
-    """See `progdf.rasterize.alpha_weights`."""
+    """Sum blending weights, see `progdf.rasterize.alpha_weights`."""
     means = gaussians.means
     width = view.width
     height = view.height
     splats, _ = project(gaussians, view)
-    # two channels, zero beyond the image's edge: the mask, and what is image at all
+    # two channels, zero beyond the edge of the image: the mask, and 1 inside the image
     mask = mask.to(means)
     inside = torch.stack([mask, torch.ones_like(mask)])
     inside = torch.nn.functional.pad(inside, (0, -width % TILE, 0, -height % TILE))
@@ -235,7 +239,7 @@ def alpha_weights(gaussians: ActivatedGaussians, view: RasterView, mask: Tensor)
 def covariances(
     points: Tensor, unit_quats: Tensor, scales: Tensor, view: RasterView
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Covariances [[a, b], [b, c]] in pixels before the dilation, and their determinants. All float64.
+    """Return covariances [[a, b], [b, c]] in pixels before dilation, and their determinants. All float64.
 
     Args:
         points: centers, camera coordinates. [V,3]
@@ -247,7 +251,7 @@ def covariances(
     cx = K[0, 2]
     cy = K[1, 2]
     x, y, z = points.unbind(1)
-    # clamp as the original does (Kerbl 2023, computeCov2D): off-screen Gaussians would blow up the Jacobian
+    # clamp like the original (Kerbl 2023, computeCov2D): off-screen Gaussians would blow up the Jacobian
     margin_x = FRUSTUM_MARGIN * 0.5 * view.width / fx
     margin_y = FRUSTUM_MARGIN * 0.5 * view.height / fy
     tan_x = torch.clamp(x / z, -(cx / fx + margin_x), (view.width - cx) / fx + margin_x)

@@ -1,4 +1,4 @@
-"""A picture on the screen: as bytes, in its size or stretched smoothly; and lines behind what it shows."""
+"""Screen output on the CPU: convert a picture to bytes, scale it, and draw lines behind it."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ Array = NDArray[Any]
 _ZERO: Number = np.float32(0.0)
 _ONE: Number = np.float32(1.0)
 _WHITE: Number = np.float32(255.0)
-_CHUNK_ROWS = 64  # fewer are not worth a call
+_CHUNK_ROWS = 64  # rows per chunk; fewer are not worth a call
 
 
 def fill_screen(image: Array, screen: Array) -> None:
-    """Write a picture upside down into the bytes of a screen, as OpenGL has its rows.
+    """Write a picture into the bytes of a screen, upside down because OpenGL's first row is the lowest.
 
     Args:
-        image: rgb, upper row first; clamped to 0..1. [h,w,3] float32
-        screen: rgba, lower row first, opaque; filtered linearly where its size is another. [H,W,4] uint8
+        image: rgb, upper row first, clamped to 0..1. [h,w,3] float32
+        screen: rgba, lower row first, opaque. Filtered linearly if its size differs. [H,W,4] uint8
     """
     (height, width), (rows, columns) = screen.shape[:2], image.shape[:2]
     chunks = max(1, min(height // _CHUNK_ROWS, 2 * threads()))
@@ -54,7 +54,7 @@ def _byte(value: Number) -> Number:
 
 @kernel(fast=True, cache=True)
 def _copy(begin: int, end: int, image: Array, screen: Array) -> None:
-    """Rows begin … end − 1 of the picture."""
+    """Copy rows begin … end − 1 of the picture."""
     height = screen.shape[0]
     width = screen.shape[1]
     for row in range(begin, end):
@@ -70,13 +70,13 @@ def _copy(begin: int, end: int, image: Array, screen: Array) -> None:
 def _stretch(
     begin: int, end: int, image: Array, lefts: Array, shares: Array, screen: Array, mixed: Array, line: Array
 ) -> None:
-    """Rows begin … end − 1 of the stretched picture; plain runs over numbers, which LLVM makes vectors of.
+    """Draw rows begin … end − 1 of the scaled picture, in plain loops that LLVM can vectorize.
 
     Args:
-        lefts, shares: of each column: which of the picture's is to the left of it, and what it has of the
-            next one. [W] int32, float32
+        lefts, shares: for each column, the picture's column left of it and the weight of the next one. [W]
+            int32, float32
         mixed: scratch. [3w+3] float32
-        line: scratch, ones for the opaque channel. [4W] float32
+        line: scratch, initialized to ones for the opaque channel. [4W] float32
     """
     rows = image.shape[0]
     height = screen.shape[0]
@@ -103,18 +103,20 @@ def _stretch(
 
 @contextmanager
 def lines_behind(image: Array, transmittance: Array, lines: Array, clear: float) -> Iterator[None]:
-    """Have lines in a picture for a while, a pixel wide and smooth; then it is as before, bit for bit.
+    """Draw smooth lines, one pixel wide, into a picture for the duration of the context.
+
+    The picture is restored afterwards, bit for bit.
 
     Args:
         image: [H,W,3] float32
-        transmittance: share of the background that shines through it, 0..1. [H,W]
-        lines: of each both ends in pixels (4), their depths (2), both places in a disc of radius 1, beyond
-            which there is no line (4), and rgb with the share that it takes (4). [L,14] float32
-        clear: radius in that disc within which a line has not begun to fade, < 1
+        transmittance: visible share of the background, 0..1. [H,W]
+        lines: both ends in pixels (4), their depths (2), both positions in a disc of radius 1 outside which
+            no line is drawn (4), and rgb with opacity (4). [L,14] float32
+        clear: radius in that disc within which a line does not fade, < 1
     """
-    most = 2 * len(lines) * (max(transmittance.shape) + 1)
-    pixels = np.empty((most, 2), np.int32)
-    before = np.empty((most, 3), np.float32)
+    max_pixels = 2 * len(lines) * (max(transmittance.shape) + 1)
+    pixels = np.empty((max_pixels, 2), np.int32)
+    before = np.empty((max_pixels, 3), np.float32)
     count = _draw_lines(lines, clear, image, transmittance, pixels, before)
     try:
         yield
@@ -126,7 +128,7 @@ def lines_behind(image: Array, transmittance: Array, lines: Array, clear: float)
 def _draw_lines(
     lines: Array, clear: float, image: Array, through: Array, pixels: Array, before: Array
 ) -> int:
-    """Gives how many pixels were changed: which, and what they were."""
+    """Draw the lines. Write the changed pixels and their old colors, and return their number."""
     height, width = through.shape
     count = 0
     for i in range(len(lines)):
@@ -142,14 +144,13 @@ def _draw_lines(
         start, way, extent = (y0, dy, height) if steep else (x0, dx, width)
         if way == 0.0 or not first < last:
             continue
-        # pixel by pixel: the last bit would decide over the number of steps of about a pixel
+        # pixel by pixel, because rounding would decide the number of steps of about one pixel
         ends = start + first * way, start + last * way
         begin = int(max(np.ceil(min(ends[0], ends[1]) - 0.5), 0.0))
         for pixel in range(begin, int(min(np.ceil(max(ends[0], ends[1]) - 0.5), extent))):
             at = (pixel + 0.5 - start) / way
-            along = (
-                at * far / ((1.0 - at) * near + at * far)
-            )  # in the world, where it is not as in the picture
+            # position along the line in the world, which is not linear in the picture
+            along = at * far / ((1.0 - at) * near + at * far)
             u = lines[i, 6] + along * (lines[i, 8] - lines[i, 6])
             v = lines[i, 7] + along * (lines[i, 9] - lines[i, 7])
             strength = lines[i, 13] * min((1.0 - np.sqrt(u * u + v * v)) / (1.0 - clear), 1.0)
@@ -176,7 +177,7 @@ def _draw_lines(
 
 @kernel(inline=True)
 def _cut(start: float, way: float, size: float, first: float, last: float) -> tuple[float, float]:
-    """The part of first..last of a line in which it lies between 0 and `size`."""
+    """Return the part of first..last of a line in which it lies between 0 and `size`."""
     if way == 0.0:
         return (first, last) if 0.0 <= start < size else (0.0, 0.0)
     a = -start / way
@@ -186,7 +187,7 @@ def _cut(start: float, way: float, size: float, first: float, last: float) -> tu
 
 @kernel(cache=True)
 def _restore(image: Array, pixels: Array, before: Array) -> None:
-    """The last first, as lines cross."""
+    """Restore the pixels, the last one first because lines cross."""
     for k in range(len(pixels)):
         i = len(pixels) - 1 - k
         for c in range(3):

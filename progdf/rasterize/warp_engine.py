@@ -1,11 +1,12 @@
-"""The engine for graphics cards: kernels on Warp, which needs no compiler; on a CPU it is slow, for tests.
+"""Engine for CUDA devices: Warp kernels, which need no compiler. On a CPU it is slow and only used for tests.
 
-Projection is the reference's, tile lists are torch's, and three kernels blend, differentiate and add up.
+The projection is the reference's and tile lists are computed by torch. Three kernels blend, differentiate and
+sum.
 
-What decides (offsets from a center, alpha ≥ 1/255) is float64, pixels are float32. A tile is a block of
-threads: the backward pass adds up a splat's gradients within the block and writes one row for each (splat,
-tile) intersection, of the same moments as the cpu engine's. No two blocks add to one number, so the bits are
-the same in every run on the same device.
+Decisions (offsets from a center, alpha ≥ 1/255) use float64, pixels use float32. A tile is a block of
+threads. The backward pass sums a splat's gradients within the block and writes one row for each (splat, tile)
+intersection, with the same moments as the cpu engine. No two blocks add to one number, so the bits are the
+same in every run on the same device.
 """
 
 from __future__ import annotations
@@ -43,17 +44,19 @@ except ImportError as error:
     raise ProgdfError("the engine warp needs warp-lang; pip install 'progdf-studio[gpu]'") from error
 
 TILE = 16
-"""Pixels of a tile's side."""
+"""Side of a tile, pixels."""
 
 PIXELS = wp.constant(TILE * TILE)
 ALPHA_LIMIT = wp.constant(ALPHA_MAX)
 TRANSMITTANCE_LIMIT = wp.constant(TRANSMITTANCE_MIN)
 
 SUMS = 9
-"""Numbers of one intersection: gradient of the color (3); with g = alpha · dL/dalpha: Σg, Σg·u, Σg·v, Σg·u²,
-Σg·uv, Σg·v²."""
+"""Length of one intersection's row in the backward pass.
 
-_SLACK = 0.01  # pixels by which a box is larger than the support: beyond float32's error on any screen
+Gradient of the color (3), and with g = alpha · dL/dalpha: Σg, Σg·u, Σg·v, Σg·u², Σg·uv, Σg·v².
+"""
+
+_BOX_MARGIN_PX = 0.01  # margin of a box around the support, above float32's error on any screen
 _Sums = wp.types.vector(length=SUMS, dtype=wp.float32)
 _Shape = wp.types.vector(length=6, dtype=wp.float64)
 _launching = threading.Lock()
@@ -65,18 +68,18 @@ wp.set_module_options({"enable_backward": False})
 
 @cache
 def _start() -> None:
-    """Start Warp, without a word; compiled kernels lie beside the cpu engine's."""
+    """Start Warp without log output. Compiled kernels are stored beside the cpu engine's."""
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
-    named = wp.config.kernel_cache_dir or os.environ.get("WARP_CACHE_PATH")
-    wp.config.kernel_cache_dir = named or str(find_cache_folder() / "warp")
+    configured = wp.config.kernel_cache_dir or os.environ.get("WARP_CACHE_PATH")
+    wp.config.kernel_cache_dir = configured or str(find_cache_folder() / "warp")
     wp.init()
 
 
 @_function
 def pixel_of(thread: int, window: wp.vec4i) -> wp.vec3i:
-    """Column and row of a thread's pixel in the full image; its place in the window, row by row, −1: outside.
+    """Return a thread's pixel: column and row in the full image, and index in the window, −1 if outside.
 
-    Blocks of threads are the window's tiles, row by row.
+    Blocks of threads are the tiles of the window, in row-major order.
     """
     left = window[0] // TILE
     top = window[1] // TILE
@@ -92,10 +95,10 @@ def pixel_of(thread: int, window: wp.vec4i) -> wp.vec3i:
 
 @_function
 def alpha_at(pixel: wp.vec3i, box: wp.vec4, shape: Any, opacity: float) -> wp.vec3:
-    """Alpha before the clamp, 0 below 1/255; u and v, the whitened offset."""
+    """Return alpha before the clamp, 0 below 1/255, and u and v, the whitened offset."""
     x = float(pixel[0]) + 0.5
     y = float(pixel[1]) + 0.5
-    if x < box[0] or y < box[1] or x > box[2] or y > box[3]:  # in float32: most pairs end here
+    if x < box[0] or y < box[1] or x > box[2] or y > box[3]:  # in float32; most pairs end here
         return wp.vec3(0.0)
     dx = wp.float64(x) - shape[0]
     dy = wp.float64(y) - shape[1]
@@ -117,7 +120,7 @@ def blend_kernel(
 
     Args:
         last: out, index in `members` of a pixel's last contributor, −1 if none. [h·w]
-        deepest: out, of a tile's; −1 on entry. [T]
+        deepest: out, largest `last` of a tile, −1 on entry. [T]
     """
     thread = wp.tid()
     pixel = pixel_of(thread, window)
@@ -152,7 +155,11 @@ def blend_backward_kernel(
     last: wp.array[int], deepest: wp.array[int], slots: wp.array[int], by_image: wp.array[wp.vec3],
     by_transmittance: wp.array[float], sums: wp.array[_Sums],
 ) -> None:  # fmt: skip
-    """Gradients, back to front. slots: the row of `sums` for each of `members`, −1: no gradient is wanted."""
+    """Compute the gradients, back to front.
+
+    Args:
+        slots: row of `sums` for each of `members`, −1 if it needs no gradient
+    """
     thread = wp.tid()
     pixel = pixel_of(thread, window)
     p = pixel[2]
@@ -191,7 +198,7 @@ def blend_backward_kernel(
                     row[k] = weight * g[k]
                     row[3 + k] = by_alpha * first[k]
                     row[6 + k] = by_alpha * second[k]
-        if slot >= 0:  # the same for the whole block, which adds up together
+        if slot >= 0:  # uniform within the block, which sums cooperatively
             wp.tile_atomic_add(sums, wp.tile_sum(wp.tile(row, preserve_type=True)), offset=slot)
 
 
@@ -201,7 +208,7 @@ def add_weights_kernel(
     shapes: wp.array[_Shape], colors: wp.array[wp.vec4], last: wp.array[int], deepest: wp.array[int],
     slots: wp.array[int], mask: wp.array[float], sums: wp.array[wp.vec4],
 ) -> None:  # fmt: skip
-    """Σ w·m, Σ m, Σ w and n of every intersection; w = αT."""
+    """Sum w·m, m, w and 1 of every intersection; w = αT."""
     thread = wp.tid()
     pixel = pixel_of(thread, window)
     p = pixel[2]
@@ -226,16 +233,16 @@ def add_weights_kernel(
 
 @dataclass(frozen=True)
 class DeviceTileLists:
-    """The splats of a window's tiles, nearest first; tiles are aligned to the full image, row by row."""
+    """Splats of a window's tiles, nearest first. Tiles are aligned to the full image, in row-major order."""
 
-    starts: Tensor  # first of each tile in `members`, and how many there are. [T+1] int32
+    starts: Tensor  # first index of each tile in `members`, then their number. [T+1] int32
     members: Tensor  # rows of the splats. [I] int32
-    slots: Tensor  # number of each, counted splat by splat. [I] int64
-    counts: Tensor  # tiles of each splat. [V] int64
+    slots: Tensor  # index of each member in an order splat by splat. [I] int64
+    counts: Tensor  # number of tiles of each splat. [V] int64
 
 
 def list_tiles(splats: ReferenceSplats, crop: Crop) -> DeviceTileLists:
-    """Sort the splats into the tiles that their boxes meet."""
+    """Sort the splats into the tiles that their boxes touch."""
     x0, y0, x1, y1 = crop
     left = x0 // TILE
     top = y0 // TILE
@@ -244,7 +251,7 @@ def list_tiles(splats: ReferenceSplats, crop: Crop) -> DeviceTileLists:
     means2d = splats.means2d.detach()
     extents = splats.extents
     window = means2d.new_tensor([[x0, y0], [x1 - 1, y1 - 1]])
-    # pixels whose centers lie in the boxes
+    # pixels whose centers are inside the boxes
     first = (means2d - extents - 0.5 - 1e-6).ceil().maximum(window[0])
     final = (means2d + extents - 0.5 + 1e-6).floor().minimum(window[1])
     low, high = (edge.div(TILE, rounding_mode="floor").long() for edge in (first, final))
@@ -265,7 +272,7 @@ def list_tiles(splats: ReferenceSplats, crop: Crop) -> DeviceTileLists:
 def rasterize(
     gaussians: ActivatedGaussians, view: RasterView, background: Tensor, grad_rows: Tensor | None
 ) -> tuple[Tensor, Tensor, RasterInfo]:
-    """See `progdf.rasterize.render`."""
+    """Draw an image, see `progdf.rasterize.render`."""
     splats, info = project(of_rows(gaussians.each(Tensor.double), grad_rows), view)
     image, transmittance = blend(
         splats, list_tiles(splats, view.crop), view.crop, is_listed(splats, info, grad_rows)
@@ -276,7 +283,7 @@ def rasterize(
 def color_map(
     gaussians: ActivatedGaussians, view: RasterView, rows: Tensor, pixels: Tensor | None, lost: float
 ) -> ColorMap:
-    """See `progdf.rasterize.engines.color_map`; nothing is left out."""
+    """Return a color map, see `progdf.rasterize.engines.color_map`. No weight is omitted."""
     with torch.no_grad():
         splats, info = project(gaussians.each(Tensor.double), view)
     lists, wanted = list_tiles(splats, view.crop), is_listed(splats, info, rows)
@@ -286,7 +293,7 @@ def color_map(
 
 
 def alpha_weights(gaussians: ActivatedGaussians, view: RasterView, mask: Tensor) -> Tensor:
-    """See `progdf.rasterize.alpha_weights`."""
+    """Sum blending weights, see `progdf.rasterize.alpha_weights`."""
     splats, _ = project(gaussians.each(Tensor.double), view)
     lists = list_tiles(splats, view.crop)
     arrays = splat_arrays(splats)
@@ -298,17 +305,17 @@ def alpha_weights(gaussians: ActivatedGaussians, view: RasterView, mask: Tensor)
 
 
 def is_listed(splats: ReferenceSplats, info: RasterInfo, rows: Tensor | None) -> Tensor | None:
-    """Which splats are of these Gaussians, None: all. [V] bool"""
+    """Return the splats that belong to these Gaussians; None for all. [V] bool"""
     return None if rows is None else torch.zeros_like(info.visible).index_fill(0, rows, True)[splats.rows]
 
 
 def blend(
     splats: ReferenceSplats, lists: DeviceTileLists, crop: Crop, wanted: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """Blend projected Gaussians on black; differentiable in those that are wanted.
+    """Blend projected Gaussians on black, differentiable in the wanted splats.
 
     Returns:
-        image [h,w,3] and transmittance [h,w] of the window, float32
+        Image [h,w,3] and transmittance [h,w] of the window, float32.
     """
     leaves = splats.means2d, splats.whitening, splats.opacities, splats.colors
     drawn: tuple[Tensor, Tensor] = _Blend.apply(  # type: ignore[no-untyped-call]
@@ -324,37 +331,37 @@ class _Blend(torch.autograd.Function):
         *leaves: Tensor,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         arrays = splat_arrays(splats)
-        image, *made = _blend(arrays, lists, crop)
-        ctx.forward_pass = splats, lists, crop, wanted, arrays, made
+        image, *pixel_state = _blend(arrays, lists, crop)
+        ctx.forward_pass = splats, lists, crop, wanted, arrays, pixel_state
         size = crop[3] - crop[1], crop[2] - crop[0]
-        return image.view(*size, 3), made[0].view(size)
+        return image.view(*size, 3), pixel_state[0].view(size)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, by_image: Tensor, by_transmittance: Tensor) -> tuple[Tensor | None, ...]:
-        splats, lists, crop, wanted, arrays, made = ctx.forward_pass
+        splats, lists, crop, wanted, arrays, pixel_state = ctx.forward_pass
         slots = lists.slots.int()
         if wanted is not None:
             slots = slots.where(wanted[lists.members], -1)
         sums = by_image.new_zeros(len(lists.members), SUMS)
         gradients = by_image.flatten(0, 1).contiguous(), by_transmittance.flatten().contiguous()
-        _launch(blend_backward_kernel, lists, crop, (*arrays, *made, slots, *gradients, sums))
+        _launch(blend_backward_kernel, lists, crop, (*arrays, *pixel_state, slots, *gradients, sums))
         moments = _add_slots(sums, lists).double()
         g, gu, gv, guu, guv, gvv = moments[:, 3:].unbind(1)
         l11, l21, l22 = splats.whitening.unbind(1)
-        # −Σ g·u·dx, −Σ g·u·dy, −Σ g·v·dy, and their likes: offsets by what they are whitened
+        # −Σ g·u·dx, −Σ g·u·dy, −Σ g·v·dy and so on: offsets are expressed by their whitened form
         by_center = torch.stack([l11 * gu, l21 * gu + l22 * gv], dim=1)
         by_whitening = torch.stack([(l21 / l22 * guv - guu) / l11, -guv / l22, -gvv / l22], dim=1)
         return None, None, None, None, by_center, by_whitening, g / splats.opacities, moments[:, :3]
 
 
 def splat_arrays(splats: ReferenceSplats) -> tuple[Tensor, Tensor, Tensor]:
-    """Boxes [V,4], shapes [V,6] and colors with opacity [V,4], as the kernels have them."""
+    """Return boxes [V,4], shapes [V,6] and colors with opacity [V,4], in the kernels' form."""
     means2d, whitening, opacities, colors, extents = (
         tensor.detach()
         for tensor in (splats.means2d, splats.whitening, splats.opacities, splats.colors, splats.extents)
     )
-    boxes = torch.cat([means2d - extents - _SLACK, means2d + extents + _SLACK], dim=1).float()
+    boxes = torch.cat([means2d - extents - _BOX_MARGIN_PX, means2d + extents + _BOX_MARGIN_PX], dim=1).float()
     squared = 2.0 * (opacities / ALPHA_MIN).log()
     shapes = torch.cat([means2d, whitening, squared[:, None]], dim=1)
     return boxes, shapes, torch.cat([colors, opacities[:, None]], dim=1).float()
@@ -363,7 +370,7 @@ def splat_arrays(splats: ReferenceSplats) -> tuple[Tensor, Tensor, Tensor]:
 def _blend(
     arrays: Sequence[Tensor], lists: DeviceTileLists, crop: Crop
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Image on black [h·w,3], transmittance [h·w]; last [h·w] and deepest [T], see `blend_kernel`."""
+    """Return image on black [h·w,3], transmittance [h·w], last [h·w] and deepest [T], see `blend_kernel`."""
     pixels = (crop[3] - crop[1]) * (crop[2] - crop[0])
     image = arrays[0].new_empty(pixels, 3)
     transmittance = arrays[0].new_empty(pixels)
@@ -374,12 +381,12 @@ def _blend(
 
 
 def _add_slots(sums: Tensor, lists: DeviceTileLists) -> Tensor:
-    """What each splat's intersections add up to, in their fixed order. [I,C] -> [V,C]"""
+    """Sum each splat's intersections in their fixed order. [I,C] -> [V,C]"""
     return torch.segment_reduce(sums, "sum", lengths=lists.counts, unsafe=True)
 
 
 def _launch(kernel: Any, lists: DeviceTileLists, crop: Crop, tensors: Sequence[Tensor]) -> None:
-    """Run a kernel with a block for each tile of the window, on torch's stream."""
+    """Run a kernel on torch's stream, with one block per tile of the window."""
     device = lists.starts.device
     with _launching:
         _start()

@@ -1,1 +1,1 @@
-"""The fast engine: numba kernels, tile based, with an analytic backward pass."""
+"""Fast engine: tile-based numba kernels with an analytic backward pass."""

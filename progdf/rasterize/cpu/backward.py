@@ -1,9 +1,8 @@
-"""Kernel: from the sums of all intersections to gradients of the inputs, in float64, in one fixed order.
+"""Kernel: gradients of the inputs from the sums of all intersections, in float64 and in a fixed order.
 
-With σ = ½|Lᵀd|² and e = Lᵀd (that is u, v), a change δΣ of the 2D covariance changes σ by −½ eᵀ(Lᵀ δΣ L)e
-and a move δm of the center by −eᵀLᵀδm. So the moments Σg·e and Σg·eeᵀ are all that is needed, and Lᵀ meets
-the 2D axes M = J·W·R·S in the product LᵀM, which does not cancel for needles when it is written with a cross
-product.
+With σ = ½|Lᵀd|² and e = Lᵀd (that is u, v), a change δΣ of the 2D covariance changes σ by −½ eᵀ(Lᵀ δΣ L)e,
+and a move δm of the center by −eᵀLᵀδm. So the moments Σg·e and Σg·eeᵀ suffice. Lᵀ meets the 2D axes M =
+J·W·R·S in the product LᵀM, which does not cancel for needles if it is written with a cross product.
 """
 
 from __future__ import annotations
@@ -44,15 +43,21 @@ _PER_UNIT = 1.0 / UNIT
 _PER_UNIT2 = 1.0 / (UNIT * UNIT)
 
 CAMERA = 16
-"""Numbers of the camera's gradient: viewmat rows 0..2 (12), then fx, fy, cx, cy."""
+"""Length of the camera's gradient: viewmat rows 0..2 (12), then fx, fy, cx, cy."""
 
 BLOCK = 1024
-"""Gaussians whose parts of the camera's gradient are added up first: the same for every number of threads."""
+"""Gaussians whose shares of the camera's gradient are summed first.
+
+A fixed size keeps the bits equal for every number of threads.
+"""
 
 
 @kernel()
 def fill_basis_gradient(degree: int, x: float, y: float, z: float, slopes: Array) -> None:
-    """Derivatives of the basis functions by x, y and z. slopes: out, [16,3] float64, zero on entry"""
+    """Compute the derivatives of the basis functions by x, y and z.
+
+    slopes: out, [16,3] float64, zero on entry
+    """
     if degree >= 1:
         slopes[1, 1] = -_C1
         slopes[2, 2] = _C1
@@ -87,15 +92,16 @@ def shade_backward(
     i: int, colors: Array, degree: int, point: Vec, eye: Vec, gradient: Vec, basis: Array, slopes: Array,
     out: Array,
 ) -> Vec:  # fmt: skip
-    """Gradients of Gaussian i's color max(0, Σ basis·sh + 0.5).
+    """Compute the gradients of Gaussian i's color max(0, Σ basis·sh + 0.5).
 
     Args:
         i: row of `colors` and `out`
         colors: SH coefficients. [N,K,3] float32
         degree: 0..3
-        point, eye: its center and the camera's, world axes
+        point, eye: centers of the Gaussian and of the camera, world axes
         gradient: to the clamped color
-        basis, slopes: scratch. [16], [16,3] float64, `slopes` zero where no derivative is ever written
+        basis: scratch. [16] float64
+        slopes: scratch, zero where no derivative is ever written. [16,3] float64
         out: gradient to the coefficients. [N,K,3] float32
 
     Returns:
@@ -126,8 +132,11 @@ def shade_backward(
 
 @kernel(contract=True, inline=True)
 def _axes_gradient(seen: Footprint, g: tuple[float, ...], camera: Pinhole) -> tuple[float, float, Vec, Vec]:
-    """Gradients to the center in pixels (2) and to the 2D axes p0, p1, from Σg and its moments (6)."""
-    # g = −dL/dσ; u and v are in units of their own
+    """Return the gradients to the center in pixels (2) and to the 2D axes p0, p1.
+
+    g: Σg and its moments (6)
+    """
+    # g = −dL/dσ; u and v are in units of `UNIT`
     e0 = -g[1] * _PER_UNIT
     e1 = -g[2] * _PER_UNIT
     h00 = -g[3] * _PER_UNIT2
@@ -157,7 +166,7 @@ def _axes_gradient(seen: Footprint, g: tuple[float, ...], camera: Pinhole) -> tu
 
 @kernel(contract=True, inline=True)
 def _quat_gradient(seen: Footprint, d0: Vec, d1: Vec) -> tuple[float, float, float, float]:
-    """Gradient to the quaternion as given; d0, d1: gradients to the rows a0ᵀR, a1ᵀR."""
+    """Return the gradient to the unnormalized quaternion. d0, d1: gradients to the rows a0ᵀR, a1ᵀR"""
     q0, q1, q2, q3 = seen.quat
     v0 = blend2(seen.a0[0], d0, seen.a1[0], d1)
     v1 = blend2(seen.a0[1], d0, seen.a1[1], d1)
@@ -181,17 +190,17 @@ def _quat_gradient(seen: Footprint, d0: Vec, d1: Vec) -> tuple[float, float, flo
 def _point_gradient(
     camera: Pinhole, seen: Footprint, grad_px: float, grad_py: float, ga: Vec, gb: Vec
 ) -> tuple[Vec, tuple[float, float], tuple[float, float]]:
-    """Gradients to the points in camera axes, to fx and fy, and to cx and cy. ga, gb: gradients to a0, a1.
+    """Return the gradients to the points in camera axes, to fx and fy, and to cx and cy.
 
-    px = fx x/z + cx; a0 = fx/z (W0 − tan_x W2), where tan_x is x/z or a limit ((width − cx) + half)/fx,
-    −(cx + half)/fx; the same for y.
+    ga, gb are the gradients to a0, a1. px = fx x/z + cx and a0 = fx/z (W0 − tan_x W2). tan_x is x/z or a
+    limit: ((width − cx) + half)/fx or −(cx + half)/fx. The same holds for y.
     """
     inv_z = seen.inv_z
     down_a = dot(ga, camera.rows[2])
     down_b = dot(gb, camera.rows[2])
     grad_jx = dot(ga, camera.rows[0]) - seen.tan_x * down_a
     grad_jy = dot(gb, camera.rows[1]) - seen.tan_y * down_b
-    # over −fx, −fy
+    # divided by −fx, −fy
     by_tan_x = inv_z * down_a
     by_tan_y = inv_z * down_b
     slope_x = camera.fx * (grad_px - (by_tan_x if seen.free_x else 0.0))
@@ -209,12 +218,12 @@ def _point_gradient(
 
 @kernel(contract=True, inline=True)
 def _set(rows: Array, i: int, value: Vec) -> None:
-    """Row i of an [N,3] array."""
+    """Set row i of an [N,3] array."""
     rows[i, 0], rows[i, 1], rows[i, 2] = value
 
 
 class GradientScratch(NamedTuple):
-    """What a thread works in: see `shade_backward`; sums of a Gaussian's intersections, [9]."""
+    """Scratch arrays of one thread: see `shade_backward`; total: sums of a Gaussian's intersections. [9]"""
 
     basis: Array
     slopes: Array
@@ -222,7 +231,7 @@ class GradientScratch(NamedTuple):
 
 
 def new_scratch() -> GradientScratch:
-    """For one thread."""
+    """Allocate the scratch of one thread."""
     return GradientScratch(np.empty(16), np.zeros((16, 3)), np.empty(SUMS))
 
 
@@ -231,14 +240,14 @@ def project_backward(
     begin: int, end: int, scene: Scene, camera: Pinhole, offsets: Array, sums: Array, grad_mask: Array,
     gradients: Scene, by_camera: Array, scratch: GradientScratch,
 ) -> None:  # fmt: skip
-    """Gradients of `project`, which has the same first arguments.
+    """Compute the gradients of `project`, which has the same first arguments.
 
     Args:
         offsets: first row of `sums` of each Gaussian. [N+1] int32
         sums: see `blend_backward`. [I,9] float32
-        grad_mask: rows whose gradients are filled in, the others' are zero; [0]: all. [N] bool
+        grad_mask: rows whose gradients are computed, all others are zero; [0] selects all. [N] bool
         gradients: out
-        by_camera: out, each block's part of the camera's gradient; zero on entry. [blocks,CAMERA] float64
+        by_camera: out, each block's share of the camera's gradient, zero on entry. [blocks,CAMERA] float64
     """
     gradients.means[begin:end] = 0.0
     gradients.quats[begin:end] = 0.0
@@ -285,7 +294,7 @@ def project_backward(
         row0 = blend2(point[0], mean, jx, ga)
         row1 = blend2(point[1], mean, jy, gb)
         row2 = blend2(point[2], mean, -1.0, blend2(jx * seen.tan_x, ga, jy * seen.tan_y, gb))
-        # and the colors' by the eye, −RᵀT
+        # add the gradient through the colors, which depend on the camera center −RᵀT
         row0 = blend2(1.0, row0, camera.shift[0], by_ray)
         row1 = blend2(1.0, row1, camera.shift[1], by_ray)
         row2 = blend2(1.0, row2, camera.shift[2], by_ray)

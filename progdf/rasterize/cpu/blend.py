@@ -1,10 +1,10 @@
-"""Kernels: blend the splats of each tile front to back, and their gradients, back to front.
+"""Kernels: blend the splats of each tile front to back, and compute the gradients back to front.
 
-First the support of a splat is worked out, as spans of pixels, row by row: the loops over pixels are then
-plain runs of eight. The backward pass leaves one row of sums for each (splat, tile) intersection: the color's
-gradient (3), and for g = alpha · dL/dalpha the moments Σg, Σg·u, Σg·v, Σg·u², Σg·uv, Σg·v². In the
-whitened coordinates u, v they stay of the size of the result however thin the Gaussian is; in pixels they
-would cancel. Then what Gaussians weigh in the pixels (w = αT), summed up or as lists.
+The support of a splat is computed first, as one span of pixels per row. The loops over pixels then run in
+plain groups of eight. The backward pass writes one row of sums for each (splat, tile) intersection: the
+color's gradient (3), and for g = alpha · dL/dalpha the moments Σg, Σg·u, Σg·v, Σg·u², Σg·uv, Σg·v². In the
+whitened coordinates u, v these have the magnitude of the result however thin the Gaussian is; in pixels they
+would cancel. The last kernels compute the blending weights w = αT of the Gaussians, as sums or as lists.
 """
 
 from __future__ import annotations
@@ -52,57 +52,69 @@ from .jit import (
 Array = NDArray[Any]
 
 SUMS = 9
-"""Numbers of one intersection's row in the backward pass."""
+"""Length of one intersection's row in the backward pass."""
 
 PLANE = np.uint64(TILE_W * TILE_H + WIDTH)
-"""A tile's state is planes of this many float32 in one buffer. Pixels are worked on in groups of eight, from
-the first of a row that a splat covers; the surplus is masked, in a tile's last row it is padding."""
+"""Pixels per plane. The state of a tile is a number of float32 planes of this size in one buffer.
+
+Pixels are processed in groups of eight, from the first pixel of a row that a splat covers. The surplus is
+masked; in the last row of a tile it falls into padding.
+"""
 
 LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
 
-# 2^x on [-1, 0], exact at 0, largest relative error 2.0e-9 before rounding: reweighted least squares
+# 2^x on [-1, 0], exact at 0, largest relative error 2.0e-9 before rounding. By reweighted least squares.
 _E1, _E2, _E3, _E4, _E5, _E6 = map(np.float32, (
     0.6931470643273044, 0.240224367820186, 0.05549075707783424, 0.009579179674631904, 0.0012747482964304813,
     0.00010902322854050052,
 ))  # fmt: skip
 
 BATCH = 32
-"""Splats whose spans are found at once: the pixel loops branch on numbers that are long known."""
+"""Splats whose spans are computed at once.
+
+The pixel loops then branch on values that are known long before.
+"""
 
 BEGIN, START, STOP, U_PEAK, V, TOP = (np.uint64(TILE_H * field) for field in range(6))
-"""Fields of a splat's spans, one number a row of the tile: first column from the tile's left edge; that and
-one past the last, from the column nearest to the row's peak (none where the second is not the greater); u at
-that column, so that u = u_peak + l11 · (column − peak); v; log2 of alpha where u is 0."""
+"""Fields of a splat's spans, one number per row of the tile.
+
+- BEGIN: first column, from the tile's left edge
+- START, STOP: first column and one past the last, from the column nearest to the row's peak. The span is
+  empty unless STOP is greater than START
+- U_PEAK: u at that column, so that u = u_peak + l11 · (column − peak)
+- V: v
+- TOP: log2 of alpha where u is 0
+"""
 
 FIRST, END, STEP, RED, GREEN, BLUE = (np.uint64(6 * TILE_H + k) for k in range(6))
-"""Then one number each: first row and one past the last, from the tile's top; l11; color."""
+"""Fields of one number per splat: first row and one past the last, from the tile's top; l11; color."""
 
 SPLAT = np.uint64(64)
-"""float32 numbers from one splat's spans to the next one's."""
+"""Length of one splat's spans in the batch, float32 numbers."""
 
 ALPHA_LIMIT: Number = np.float32(ALPHA_MAX)
 TRANSMITTANCE_LIMIT: Number = np.float32(TRANSMITTANCE_MIN)
 ZERO: Number = np.float32(0.0)
 ONE: Number = np.float32(1.0)
 EIGHT: Number = np.float32(WIDTH)
-# planes of the forward pass's state: transmittance (negative: the pixel is done), rgb, index in the tile's
-# list of the last contributor (-1: none; float32 holds it exactly up to 2^24)
+# Planes of the forward pass: transmittance (negative: the pixel is done), rgb, and the index in the tile's
+# list of the last contributor (-1: none). float32 holds the index exactly up to 2^24.
 _R, _G, _B, _LAST = (PLANE * np.uint64(k) for k in (1, 2, 3, 4))
-# and of the backward pass's: transmittance after the current splat; what lies behind it, times the gradient;
-# the image's gradient (3); index of the last contributor
+# Planes of the backward pass: transmittance after the current splat; color behind it times the gradient; the
+# image's gradient (3); index of the last contributor.
 _BEHIND, _G0, _G1, _G2, _DEEPEST = (PLANE * np.uint64(k) for k in (1, 2, 3, 4, 5))
 
 
 class TileScratch(NamedTuple):
-    """What a thread works in, tile by tile."""
+    """Scratch arrays of one thread, reused for every tile."""
 
-    state: Array  # planes of pixels; what each holds is the kernel's. float32
-    batch: Array  # spans of a batch. float32
-    bounds: Array  # left, top, right, bottom of what is drawn of a tile, from its first pixel. [4] int64
+    state: Array  # planes of pixels; each kernel defines their meaning. float32
+    batch: Array  # spans of a batch of splats. float32
+    bounds: Array  # left, top, right, bottom of the drawn part of a tile, from its first pixel. [4] int64
 
 
 def new_scratch() -> TileScratch:
-    """Room for six planes and a batch."""
+    """Allocate six planes and a batch."""
     state = np.empty(6 * int(PLANE), np.float32)
     batch = np.empty(BATCH * int(SPLAT), np.float32)
     return TileScratch(state, batch, np.empty(4, np.int64))
@@ -110,7 +122,7 @@ def new_scratch() -> TileScratch:
 
 @kernel(fast=True, inline=True)
 def exp2(x: Vector) -> Vector:
-    """2^x for -126 ≤ x ≤ 0; anything for other lanes."""
+    """Return 2^x for -126 ≤ x ≤ 0. Other lanes are undefined."""
     n = truncate(x)
     f = x - n
     p = _E4 + f * (_E5 + f * _E6)
@@ -120,14 +132,14 @@ def exp2(x: Vector) -> Vector:
 
 @kernel(inline=True)
 def tile_corner(camera: Pinhole, tile: int) -> tuple[int, int]:
-    """A tile's first pixel in the full image."""
+    """Return a tile's first pixel in the full image."""
     x = (camera.grid[0] + tile % camera.grid[2]) * TILE_W
     return x, (camera.grid[1] + tile // camera.grid[2]) * TILE_H
 
 
 @kernel(inline=True)
 def tile_bounds(camera: Pinhole, x: int, y: int, bounds: Array) -> None:
-    """left, top, right, bottom of a tile's part in the window, from the tile's first pixel (x, y)."""
+    """Compute left, top, right, bottom of a tile's part in the window, from the tile's first pixel (x, y)."""
     bounds[0], bounds[1] = max(0, camera.window[0] - x), max(0, camera.window[1] - y)
     bounds[2], bounds[3] = min(TILE_W, camera.window[2] - x), min(TILE_H, camera.window[3] - y)
 
@@ -136,14 +148,14 @@ def tile_bounds(camera: Pinhole, x: int, y: int, bounds: Array) -> None:
 def find_spans(
     members: Array, begin: Number, end: Number, splats: Splats, x: int, y: int, bounds: Array, batch: Array
 ) -> None:
-    """Where some splats of a tile are at least 1/255, row by row, decided in float64.
+    """Compute the spans in which splats of a tile have alpha ≥ 1/255, row by row, decided in float64.
 
     Args:
         members: rows of the tile's splats. [I] int32
-        begin, end: which of them, at most BATCH
+        begin, end: range of members, at most BATCH
         splats: see `project`
         x, y: the tile's first pixel in the full image
-        bounds: left, top, right, bottom of what to look at, from (x, y). [4] int64
+        bounds: left, top, right, bottom of the pixels to consider, from (x, y). [4] int64
         batch: out
     """
     low = np.float64(bounds[0])
@@ -171,8 +183,8 @@ def find_spans(
             half = np.sqrt(max(remaining, 0.0)) * inv_l11
             start = max(np.ceil(center - half), low)
             stop = min(np.floor(center + half) + 1.0, high)
-            # counting from the peak keeps u = l11·(column − center) free of cancellation in float32; far
-            # peaks (needles, giants) lie where l11 is small
+            # Columns relative to the peak keep u = l11·(column − center) free of cancellation in float32. Far
+            # peaks (needles, giant Gaussians) occur where l11 is small.
             peak = min(max(np.floor(center + 0.5), -65536.0), 65536.0)
             start = min(start, high)
             stop = max(stop, low) if remaining >= 0.0 else low
@@ -190,7 +202,7 @@ def find_spans(
 
 @kernel(fast=True, inline=True)
 def row_span(batch: Array, splat: Number, row: Number) -> tuple[Number, Number, Number, Number, Number]:
-    """Where a row of a splat begins and ends, from its peak; its index in a tile's plane; u_peak and top."""
+    """Return start and stop of a splat's row, from its peak; its index in a tile's plane; u_peak; top."""
     begin = np.uint64(np.int32(batch[splat + BEGIN + row]))
     return (
         batch[splat + START + row], batch[splat + STOP + row], row * np.uint64(TILE_W) + begin,
@@ -200,17 +212,17 @@ def row_span(batch: Array, splat: Number, row: Number) -> tuple[Number, Number, 
 
 @kernel(fast=True, inline=True)
 def step_and_color(batch: Array, splat: Number) -> tuple[Number, Number, Number, Number]:
-    """l11; red, green, blue."""
+    """Return l11, red, green and blue."""
     return batch[splat + STEP], batch[splat + RED], batch[splat + GREEN], batch[splat + BLUE]
 
 
 class Picture(NamedTuple):
-    """The window as it is drawn."""
+    """Rendered window."""
 
     image: Array  # [h,w,3] float32
     transmittance: Array  # [h,w] float32
-    # index in the tile's list of each pixel's last contributor, -1 if none; None where no gradient is wanted:
-    # without it a picture takes a third less time. [h,w] float32
+    # index of each pixel's last contributor in the tile's list, -1 if none. None if no gradient is needed:
+    # the picture then takes a third less time. [h,w] float32
     last: Array | None
 
 
@@ -218,7 +230,7 @@ class Picture(NamedTuple):
 def _blend_row(
     state: Array, batch: Array, splat: Number, row: Number, index: Number, last: Array | None
 ) -> None:
-    """Blend one row of a splat into a tile's state; `splat` is where its spans begin."""
+    """Blend one row of a splat into a tile's state. splat: start of its spans in `batch`"""
     start, stop, p, u_peak, top = row_span(batch, splat, row)
     step, red, green, blue = step_and_color(batch, splat)
     offset = start + lane_indices()
@@ -235,7 +247,7 @@ def _blend_row(
         store(state, p + _R, load(state, p + _R) + weight * red)
         store(state, p + _G, load(state, p + _G) + weight * green)
         store(state, p + _B, load(state, p + _B) + weight * blue)
-        if last is not None:  # numba leaves out what its type rules out
+        if last is not None:  # numba compiles this branch only if the type of `last` allows it
             store(state, p + _LAST, select(weight > ZERO, index, load(state, p + _LAST)))
         p += np.uint64(WIDTH)
         offset += EIGHT
@@ -244,7 +256,7 @@ def _blend_row(
 
 @kernel(fast=True, inline=True)
 def _skip_done_rows(state: Array, bounds: Array) -> Number:
-    """Take rows whose pixels are all done off `bounds`, from above and below; whether any row is left."""
+    """Remove finished rows from the top and bottom of `bounds`. Return true if any row is left."""
     while bounds[1] < bounds[3] and _is_done(state, bounds[1], bounds):
         bounds[1] += 1
     while bounds[1] < bounds[3] and _is_done(state, bounds[3] - 1, bounds):
@@ -265,7 +277,10 @@ def _blend_tile(
     state: Array, x: int, y: int, members: Array, splats: Splats, bounds: Array, batch: Array,
     last: Array | None,
 ) -> None:  # fmt: skip
-    """Blend a tile; state, set up here, is [5·PLANE] float32; last as in `Picture`, else as `find_spans`."""
+    """Blend a tile.
+
+    state: initialized here, [5·PLANE] float32; last: see `Picture`; others: see `find_spans`
+    """
     plane = np.int64(PLANE)
     state[:plane] = ONE
     state[plane : 4 * plane] = ZERO
@@ -293,7 +308,7 @@ def blend(
         tile_bounds(camera, x, y, bounds)
         members = lists.members[lists.starts[tile] : lists.starts[tile + 1]]
         _blend_tile(state, x, y, members, splats, bounds, batch, last)
-        tile_bounds(camera, x, y, bounds)  # blending narrowed it
+        tile_bounds(camera, x, y, bounds)  # blending narrowed them
         left = np.uint64(x + bounds[0] - camera.window[0])
         width = np.uint64(bounds[2] - bounds[0])
         for row in range(np.uint64(bounds[1]), np.uint64(bounds[3])):
@@ -315,7 +330,10 @@ def blend(
 def _blend_splat_backward(
     state: Array, batch: Array, splat: Number, index: Number, sums: Array, slot: Number
 ) -> None:
-    """Take one splat off a tile's state and write its row of `sums`; `splat` is where its spans begin."""
+    """Remove one splat from a tile's state and write its row of `sums`.
+
+    splat: start of its spans in `batch`
+    """
     step, red, green, blue = step_and_color(batch, splat)
     s_r = s_g = s_b = s_0 = s_u = s_v = s_uu = s_uv = s_vv = broadcast(ZERO)
     for line in range(np.int32(batch[splat + FIRST]), np.int32(batch[splat + END])):
@@ -361,7 +379,7 @@ def _blend_splat_backward(
 
 @kernel(fast=True, inline=True)
 def _restore_behind(state: Array, batch: Array, splat: Number, index: Number) -> None:
-    """As `_blend_splat_backward` for a splat that gets no gradient."""
+    """Remove a splat that gets no gradient from a tile's state. Arguments as in `_blend_splat_backward`."""
     step, red, green, blue = step_and_color(batch, splat)
     for line in range(np.int32(batch[splat + FIRST]), np.int32(batch[splat + END])):
         row = np.uint64(line)
@@ -386,7 +404,7 @@ def _blend_tile_backward(
     state: Array, x: int, y: int, members: Array, slots: Array, splats: Splats, bounds: Array, batch: Array,
     sums: Array, grad_mask: Array,
 ) -> None:  # fmt: skip
-    """Take the splats off a tile, last contributor first; state: six planes, all else as in `find_spans`."""
+    """Remove the splats of a tile, last contributor first. state: six planes; others: see `find_spans`"""
     plane = np.int64(PLANE)
     deepest: Number = -ONE
     for p in range(5 * plane, 6 * plane):
@@ -412,13 +430,13 @@ def blend_backward(
     begin: int, end: int, scratch: TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
     background: Array, out: Picture, gradients: Picture, grad_mask: Array, sums: Array,
 ) -> None:  # fmt: skip
-    """Gradients of `blend`, which has the same first arguments.
+    """Compute the gradients of `blend`, which has the same first arguments.
 
     Args:
-        out: what `blend` made; the image is not read
-        gradients: of the loss to the image and the transmittance; no more of it is read
-        grad_mask: rows that get gradients; [0]: all. [N] bool
-        sums: out, a row for each slot; not set where `grad_mask` is not. [I,9] float32
+        out: result of `blend`; the image is not read
+        gradients: of the loss to the image and to the transmittance; its `last` is not read
+        grad_mask: rows that get gradients; [0] selects all. [N] bool
+        sums: out, one row per slot; not set for rows outside `grad_mask`. [I,9] float32
     """
     plane = np.int64(PLANE)
     state, batch, bounds = scratch
@@ -453,27 +471,27 @@ def blend_backward(
 
 
 WEIGHT_SUMS = 4
-"""Numbers of one intersection: Σ w·m, Σ m, Σ w, n."""
+"""Length of one intersection's row in `accumulate_weights`: Σ w·m, Σ m, Σ w, n."""
 
 _LOG2_ALPHA_MIN: Number = np.float32(LOG2_ALPHA_MIN)
 
 
 class Runs(NamedTuple):
-    """What each of M Gaussians weighs in each pixel of a window, run by run of one Gaussian in one tile."""
+    """Blending weights of M Gaussians in the pixels of a window. A run is one Gaussian in one tile."""
 
-    rows: Array  # the Gaussian of each run, 0..M−1. [R] int32
-    counts: Array  # entries of each run, one run's after another's. [R] uint16
-    firsts: Array  # pixel of each run's first entry, in the window, row by row. [R] int32
-    pixels: Array  # of each entry, from its run's first. [E] uint16, in windows too wide for it uint32
+    rows: Array  # Gaussian of each run, 0..M−1. [R] int32
+    counts: Array  # number of entries of each run, in run order. [R] uint16
+    firsts: Array  # pixel of each run's first entry, in row-major order of the window. [R] int32
+    pixels: Array  # pixel of each entry, from its run's first. [E] uint16, or uint32 in wide windows
     weights: Array  # αT of each entry. [E] float32
 
 
 class Listed(NamedTuple):
-    """What is listed of a view."""
+    """Selection of the Gaussians and pixels to list."""
 
-    rows: Array  # of each Gaussian in the lists, −1: none. [N] int32
-    places: Array  # of each of the window's pixels, likewise. [h·w] int32
-    lost: Number  # of a pixel's weights, in all, what may be left out. float32
+    rows: Array  # index of each Gaussian in the lists, −1: not listed. [N] int32
+    places: Array  # index of each pixel of the window, −1: not listed. [h·w] int32
+    lost: Number  # total weight of a pixel that may be omitted. float32
 
 
 @kernel(fast=True, inline=True)
@@ -482,7 +500,7 @@ def _add_weights(state: Array, batch: Array, splat: Number, out: Array) -> None:
 
     Args:
         state: transmittance (negative: the pixel is done) and mask. [2·PLANE] float32
-        batch, splat: the spans of a batch, and where the splat's begin
+        batch, splat: spans of a batch, and the start of the splat's spans
         out: [4] float64
     """
     inside = within = weights = pixels = broadcast(ZERO)
@@ -521,11 +539,11 @@ def accumulate_weights(
     begin: int, end: int, scratch: TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
     mask: Array, sums: Array,
 ) -> None:  # fmt: skip
-    """Add up the weights of every (splat, tile) intersection in tiles begin … end − 1.
+    """Sum the weights of every (splat, tile) intersection in tiles begin … end − 1.
 
     Args:
-        mask: of the full image. [H,W] float32
-        sums: out, a row for each slot, zero on entry. [I,4] float64
+        mask: mask of the full image. [H,W] float32
+        sums: out, one row per slot, zero on entry. [I,4] float64
     """
     plane = np.int64(PLANE)
     state, batch, bounds = scratch
@@ -548,7 +566,11 @@ def _list_tile(
     tile: int, splats: Splats, listed: Listed, camera: Pinhole, members: Array, state: Array,
     run: int, entry: int, out: Runs,
 ) -> tuple[int, int]:  # fmt: skip
-    """One tile's runs and entries, written from `run` and `entry` on, as far as there is room; how far."""
+    """Write one tile's runs and entries from `run` and `entry` on, as far as there is room.
+
+    Returns:
+        `run` and `entry` after this tile, including entries without room.
+    """
     x, y = tile_corner(camera, tile)
     left = max(0, camera.window[0] - x)
     right = min(TILE_W, camera.window[2] - x)
@@ -558,7 +580,7 @@ def _list_tile(
     corner = (y - camera.window[1]) * width + x - camera.window[0]
     through = state[: TILE_H * TILE_W]
     spare = state[TILE_H * TILE_W : 2 * TILE_H * TILE_W]
-    through[:], spare[:] = ZERO, listed.lost  # of what may still be left out
+    through[:], spare[:] = ZERO, listed.lost  # spare: weight that may still be omitted
     for i in range(top, bottom):
         for j in range(left, right):
             through[i * TILE_W + j] = ONE if listed.places[corner + i * width + j] >= 0 else ZERO
@@ -581,7 +603,8 @@ def _list_tile(
             stop = min(math.floor(center + half) + 1, right)
             for j in range(start, stop):
                 before = through[i * TILE_W + j]
-                if before <= spare[i * TILE_W + j]:  # the pixel is done, or nothing of it is needed
+                # the pixel is done, or the remaining weight may be omitted
+                if before <= spare[i * TILE_W + j]:
                     continue
                 u = shape[L11] * (j - center)
                 alpha = min(np.exp2(np.float32(remaining - u * u) + _LOG2_ALPHA_MIN), ALPHA_LIMIT)
@@ -591,7 +614,8 @@ def _list_tile(
                     continue
                 through[i * TILE_W + j] = after
                 if listed.rows[s] >= 0 and EIGHT * alpha * before <= spare[i * TILE_W + j]:
-                    spare[i * TILE_W + j] -= alpha * before  # little of what may be left out
+                    # the weight is at most an eighth of the remaining allowance
+                    spare[i * TILE_W + j] -= alpha * before
                 elif listed.rows[s] >= 0:
                     if entry < out.weights.size:
                         pixel = listed.places[corner + i * width + j]
@@ -612,7 +636,11 @@ def list_weights(
     begin: int, end: int, scratch: TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
     listed: Listed, out: Runs,
 ) -> tuple[int, int]:  # fmt: skip
-    """List what the splats weigh in tiles begin … end − 1: how many runs, and entries, as if all had room."""
+    """List the weights of the splats in tiles begin … end − 1.
+
+    Returns:
+        Number of runs, and number of entries including those without room.
+    """
     run = entry = 0
     for tile in range(begin, end):
         own = lists.members[lists.starts[tile] : lists.starts[tile + 1]]

@@ -1,7 +1,7 @@
-"""The fast engine: numba kernels behind one `torch.autograd.Function`, and color maps.
+"""Fast engine: numba kernels behind one `torch.autograd.Function`, and color maps.
 
-Projection is computed in float64, pixels in float32, whatever the type of the inputs; results are float32.
-The image and the gradients are the same bits in every run and for every number of threads.
+Projection is computed in float64 and pixels in float32, whatever the type of the inputs. Results are float32.
+Image and gradients have the same bits in every run and for every number of threads.
 """
 
 from __future__ import annotations
@@ -57,14 +57,14 @@ from .jit import kernel
 Array = NDArray[Any]
 _T = TypeVar("_T")
 
-_MIN_TILES = 4  # fewer are not worth a call
-_CHUNKS = 4  # for each thread: tiles take unequally long
-# of a chunk: a picture that is dropped stops between two
+_MIN_TILES = 4  # tiles per chunk; fewer are not worth a call
+_CHUNKS_PER_THREAD = 4  # more than 1, because tiles take unequal time
+# Upper limits per chunk: a render that is cancelled stops between two chunks.
 _MAX_TILES = 24
 _MAX_GAUSSIANS = 32 * BLOCK
-TILE_ROOM = 8  # tiles of a Gaussian that there is room for; where chunks have more, these are listed twice
-ENTRY_ROOM = 16  # and pixels that a Gaussian weighs in of a tile
-_ALL = np.empty(0, np.bool_)  # which rows get gradients, where all do
+TILE_ROOM = 8  # tiles reserved per Gaussian; chunks that need more are listed a second time
+ENTRY_ROOM = 16  # entries reserved per (Gaussian, tile) pair in a color map
+_ALL_ROWS = np.empty(0, np.bool_)  # gradient mask that selects all rows
 
 
 def rasterize(
@@ -80,14 +80,14 @@ def rasterize(
 
 
 def make_pinhole(view: RasterView) -> Pinhole:
-    """The view as kernels take it."""
+    """Convert a view to the kernels' form."""
     rotation = view.viewmat.tolist()
     (fx, _, cx), (_, fy, cy), _ = view.K.tolist()
     x0, y0, x1, y1 = view.crop
     column = x0 // TILE_W
     row = y0 // TILE_H
-    # clamp as the original does (Kerbl 2023, computeCov2D): off-screen Gaussians would blow up the Jacobian;
-    # limits as in gsplat
+    # Clamp like the original (Kerbl 2023, computeCov2D): off-screen Gaussians would blow up the Jacobian.
+    # The limits are gsplat's.
     margin_x = FRUSTUM_MARGIN * 0.5 * view.width / fx
     margin_y = FRUSTUM_MARGIN * 0.5 * view.height / fy
     return Pinhole(
@@ -106,43 +106,43 @@ def make_pinhole(view: RasterView) -> Pinhole:
 
 
 def to_float32(tensor: Tensor) -> Tensor:
-    """As the kernels want it."""
+    """Convert a tensor to contiguous float32 on the CPU, as the kernels require."""
     return tensor.to("cpu", torch.float32).contiguous()
 
 
 def bin_view(gaussians: ActivatedGaussians, camera: Pinhole) -> tuple[Splats, TileLists]:
-    """The splats and the tiles' lists of a view without an image; colors are not read."""
+    """Return the splats and tile lists of a view without drawing it. Colors are not read."""
     arrays = [to_float32(tensor).detach().numpy() for tensor in gaussians[:4]]
     arrays.append(np.zeros((len(gaussians.means), 1, 3), np.float32))
     return _project_and_bin(Scene(*arrays), camera._replace(degree=-1), with_slots=True)
 
 
 def share_tiles(kernel: Any, camera: Pinhole, *arguments: Any) -> None:
-    """Run `kernel(begin, end, scratch, *arguments)` so that every tile is one kernel's."""
+    """Run `kernel(begin, end, scratch, *arguments)` over ranges that contain every tile once."""
     tiles = camera.grid[2] * camera.grid[3]
     _share(lambda begin, end: kernel(begin, end, new_scratch(), *arguments), tiles, _MIN_TILES, _MAX_TILES)
 
 
 def share_gaussians(kernel: Callable[[int, int], _T], count: int) -> list[_T]:
-    """Run `kernel(begin, end)` so that each Gaussian is one kernel's; what they return, in order."""
+    """Run `kernel(begin, end)` over ranges that contain every Gaussian once; return the results in order."""
     return _share(kernel, count, BLOCK, _MAX_GAUSSIANS)
 
 
 def _share(kernel: Callable[[int, int], _T], count: int, block: int, most: int) -> list[_T]:
-    """Run `kernel(begin, end)` over `count` things in ranges of whole blocks, `most` in each at most."""
+    """Run `kernel(begin, end)` over `count` items in ranges of whole blocks, at most `most` items each."""
     blocks = max(1, -(-count // block))
-    least = _CHUNKS * threads() if threads() > 1 else 1
-    chunks = min(blocks, max(least, count // most))
+    min_chunks = _CHUNKS_PER_THREAD * threads() if threads() > 1 else 1
+    chunks = min(blocks, max(min_chunks, count // most))
     cuts = [min(count, blocks * chunk // chunks * block) for chunk in range(chunks + 1)]
     return run_chunks(lambda chunk: kernel(cuts[chunk], cuts[chunk + 1]), chunks)
 
 
 @cache
 def _keep_freed_memory() -> None:
-    """Free one large block: from then on glibc keeps blocks up to this size, the largest that it ever keeps.
+    """Free one large block once. glibc then retains blocks up to this size, the largest that it ever retains.
 
-    Otherwise every pass would return its memory to the system and take it again page by page, which was a
-    fifth of the time of 20 000 Gaussians. Nothing touches the block, so it costs nothing, there or elsewhere.
+    Otherwise every pass returns its memory to the system and takes it again page by page, a fifth of the time
+    at 20 000 Gaussians. The block is never touched, so it costs nothing on any platform.
     """
     np.empty((32 << 20) - (64 << 10), np.uint8)
 
@@ -167,7 +167,7 @@ def _project_and_bin(scene: Scene, camera: Pinhole, with_slots: bool) -> tuple[S
     tiles = np.concatenate(share_gaussians(project_and_find, n))
     total = int(counts.sum(dtype=np.int64))
     check_intersections(int(splats.visible.sum()), total)
-    if len(tiles) < total:  # no room for those of some chunk
+    if len(tiles) < total:  # some chunk had too little room
         again = share_gaussians(lambda begin, end: find(begin, end, int(counts[begin:end].sum())), n)
         tiles = np.concatenate(again)
     order = depth_order(splats.depths, splats.visible)
@@ -197,10 +197,10 @@ class _Rasterize(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         camera, grad_rows, scene, background, splats, lists, out = ctx.forward_pass
-        viewmat, K = ctx.saved_tensors[6:8]  # and that none of them has been changed since is checked
+        viewmat, K = ctx.saved_tensors[6:8]  # this also checks that none of them has been changed since
         by_image, by_transmittance = (np.ascontiguousarray(grad.numpy()) for grad in grads)
         by_out = Picture(by_image, by_transmittance, out.last)
-        grad_mask = _ALL
+        grad_mask = _ALL_ROWS
         if grad_rows is not None:
             grad_mask = np.bincount(grad_rows.numpy(force=True), minlength=len(scene.means)) > 0
         gradients = Scene(*(np.empty(array.shape, np.float32) for array in scene))
@@ -256,10 +256,10 @@ def alpha_weights(gaussians: ActivatedGaussians, view: RasterView, mask: Tensor)
 
 @dataclass(frozen=True)
 class ListedWeights:
-    """A color map as lists of weights."""
+    """Color map as lists of weights."""
 
-    count: int  # M
-    size: tuple[int, ...]  # height and width of the window, or how many of its pixels
+    count: int  # number of colored Gaussians M
+    size: tuple[int, ...]  # height and width of the window, or its number of selected pixels
     runs: Runs
 
     def picture(self, colors: Tensor) -> Tensor:
@@ -283,11 +283,11 @@ def color_map(
     pinhole, (x0, y0, x1, y1) = make_pinhole(view), view.crop
     window = (y1 - y0) * (x1 - x0)
     chosen = np.arange(window) if pixels is None else pixels.numpy()
-    places = np.full(window, -1, np.int32)
-    places[chosen] = np.arange(len(chosen), dtype=np.int32)
+    positions = np.full(window, -1, np.int32)
+    positions[chosen] = np.arange(len(chosen), dtype=np.int32)
     row_of = np.full(len(gaussians.means), -1, np.int32)
     row_of[rows.numpy()] = np.arange(len(rows), dtype=np.int32)
-    listed = Listed(row_of, places, np.float32(lost))
+    listed = Listed(row_of, positions, np.float32(lost))
     splats, lists = bin_view(gaussians, pinhole)
     index = np.dtype(np.uint16 if TILE_H * (x1 - x0) < 1 << 16 else np.uint32)
 
@@ -307,7 +307,7 @@ def color_map(
 
 
 def _new_runs(runs: int, entries: int, index: np.dtype[Any]) -> Runs:
-    """Room for them; `index`: of a pixel in its run."""
+    """Return uninitialized runs of this capacity. index: type of a pixel's offset in its run"""
     rows = np.empty(runs, np.int32)
     counts = np.empty(runs, np.uint16)
     firsts = np.empty(runs, np.int32)
@@ -316,7 +316,7 @@ def _new_runs(runs: int, entries: int, index: np.dtype[Any]) -> Runs:
 
 @kernel(fast=True, cache=True)
 def add_images(runs: Runs, colors: Array, image: Array) -> None:
-    """image += Σ w·c. colors: [M,3] float32; image: [h·w,3] float32"""
+    """Add Σ w·c to an image. colors: [M,3] float32; image: [h·w,3] float32"""
     end = np.uint64(0)
     for run in range(runs.rows.size):
         row = runs.rows[run]
@@ -325,7 +325,7 @@ def add_images(runs: Runs, colors: Array, image: Array) -> None:
         red = colors[row, 0]
         green = colors[row, 1]
         blue = colors[row, 2]
-        first = np.uint64(runs.firsts[run])  # unsigned: of signed ones numba asks if they count from the end
+        first = np.uint64(runs.firsts[run])  # unsigned: numba tests signed indices for negative values
         for k in range(begin, end):
             p = first + np.uint64(runs.pixels[k])
             w = runs.weights[k]
@@ -336,8 +336,11 @@ def add_images(runs: Runs, colors: Array, image: Array) -> None:
 
 @kernel(fast=True, cache=True)
 def add_channels(runs: Runs, values: Array, image: Array) -> None:
-    """`add_images` of any number of channels: 20 at once take a third of the time of 3 and 3 of them, 3 alone
-    half as long again."""
+    """Add Σ w·c to an image of any number of channels.
+
+    20 channels at once take a third of the time of repeated calls with 3. For 3 channels `add_images` is
+    faster: this function takes half as long again.
+    """
     end = np.uint64(0)
     for run in range(runs.rows.size):
         row = runs.rows[run]
@@ -353,7 +356,10 @@ def add_channels(runs: Runs, values: Array, image: Array) -> None:
 
 @kernel(fast=True, cache=True)
 def add_gradients(runs: Runs, gradient: Array, by_colors: Array) -> None:
-    """by_colors += Σ w·g. gradient: of the image, [h·w,3] float32; by_colors: [M,3] float32"""
+    """Add Σ w·g to the gradient of each color.
+
+    gradient: of the image, [h·w,3] float32; by_colors: [M,3] float32
+    """
     end = np.uint64(0)
     for run in range(runs.rows.size):
         red = green = blue = np.float32(0.0)
@@ -374,7 +380,7 @@ def add_gradients(runs: Runs, gradient: Array, by_colors: Array) -> None:
 
 @kernel(cache=True)
 def sum_slots(offsets: Array, sums: Array, totals: Array) -> None:
-    """Add up each Gaussian's intersections in their fixed order. totals: out, [N,4] float64, zero on entry"""
+    """Sum each Gaussian's intersections in their fixed order. totals: out, [N,4] float64, zero on entry"""
     for i in range(totals.shape[0]):
         for slot in range(offsets[i], offsets[i + 1]):
             for k in range(WEIGHT_SUMS):

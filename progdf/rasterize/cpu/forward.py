@@ -1,10 +1,10 @@
-"""Kernels: project and shade the Gaussians that the window shows, in float64, and sort them into its tiles.
+"""Kernels: project and shade the Gaussians visible in the window, in float64, and sort them into its tiles.
 
-A projected Gaussian ("splat") is eight float64, one cache line, in units in which alpha = 2^-(u² + v²) ·
-opacity: u = l11 · (dx + slope · dy) and v = l22 · dy for a pixel at offset (dx, dy) from the center. l is the
-Cholesky factor of the conic times sqrt(log2(e) / 2), so the exponent cannot become positive however thin the
-Gaussian is. Harmonics have the signs and the order of `progdf.sh`. The splats of a tile are in the order of
-depth, whatever the number of threads.
+A projected Gaussian ("splat") is eight float64, one cache line, in units in which
+alpha = 2^-(u² + v²) · opacity. For a pixel at offset (dx, dy) from the center, u = l11 · (dx + slope · dy)
+and v = l22 · dy. l is the Cholesky factor of the conic times sqrt(log2(e) / 2), so the exponent cannot become
+positive however thin the Gaussian is. SH have the signs and the order of `progdf.sh`. The splats of a tile
+are in depth order, whatever the number of threads.
 """
 
 from __future__ import annotations
@@ -25,25 +25,28 @@ Vec = tuple[float, float, float]
 Quat = tuple[float, float, float, float]
 
 TILE_W = 64
-TILE_H = 8
-"""Pixels of a tile. Wide: a row of a tile is what the pixel loops vectorize over."""
+"""Width of a tile, pixels. Wide, because the pixel loops are vectorized along a row of a tile."""
 
-_DIGIT = 8  # bits by which depths are sorted at a time; eleven take as long
-_AHEAD = 8  # splats whose tiles are fetched before it is their turn: they lie far apart
+TILE_H = 8
+"""Height of a tile, pixels."""
+
+_DIGIT_BITS = 8  # bits per pass of the depth sort; eleven take as long
+_PREFETCH_SPLATS = 8  # splats to prefetch ahead, because their tiles lie far apart in memory
 
 MX, MY, SLOPE, L11, INV_L11, L22, R2, EXTENT_Y = range(8)
 """Columns of a splat: center in pixels, shape, u² + v² at alpha = 1/255, half height in pixels."""
 
 UNIT = math.sqrt(0.5 * math.log2(math.e))
-"""u and v per standard deviation."""
+"""Value of u and v at one standard deviation."""
 
 _PER_UNIT = 1.0 / UNIT
 _PER_ALPHA_MIN = 1.0 / ALPHA_MIN
-_CUT_RADIUS2 = 2.0 * math.log(1.0 / ALPHA_MIN)  # squared Mahalanobis distance where an opaque one ends
+# squared Mahalanobis distance at which an opaque Gaussian ends
+_CUT_RADIUS2 = 2.0 * math.log(1.0 / ALPHA_MIN)
 
 
 class Scene(NamedTuple):
-    """Activated parameters of N Gaussians, or the gradients to them; C-contiguous float32."""
+    """Activated parameters of N Gaussians, or the gradients to them. C-contiguous float32."""
 
     means: Array  # [N,3]
     quats: Array  # wxyz. [N,4]
@@ -53,81 +56,81 @@ class Scene(NamedTuple):
 
 
 class Pinhole(NamedTuple):
-    """A camera and what is drawn of its image, as kernels take them."""
+    """Camera and window, in the kernels' form."""
 
-    rows: tuple[Vec, Vec, Vec]  # of the rotation, world → camera
+    rows: tuple[Vec, Vec, Vec]  # rows of the rotation, world → camera
     shift: Vec  # translation, world → camera
-    fx: float  # pixels, as the next three
+    fx: float  # pixels, like the next three
     fy: float
     cx: float
     cy: float
-    limits_x: tuple[float, float]  # least and largest x/z in the Jacobian
+    limits_x: tuple[float, float]  # smallest and largest x/z in the Jacobian
     limits_y: tuple[float, float]
-    near: float  # least camera z, world units
-    window: tuple[int, int, int, int]  # x0, y0, x1, y1 of what is drawn, pixels
-    grid: tuple[int, int, int, int]  # first tile column and row of the window, and how many there are
-    degree: int  # of spherical harmonics, -1 for rgb
+    near: float  # smallest camera z, world units
+    window: tuple[int, int, int, int]  # x0, y0, x1, y1 of the window, pixels
+    grid: tuple[int, int, int, int]  # first tile column and row of the window, and their numbers
+    degree: int  # SH degree, -1 for rgb
     antialiased: bool  # see `progdf.rasterize.render`
     dilation: float  # added to the diagonal of the 2D covariance, pixels²
 
 
 class Splats(NamedTuple):
-    """What projection yields, by the Gaussians' rows."""
+    """Results of the projection, by the Gaussians' rows."""
 
-    means2d: Array  # centers in pixels; 0 for what cannot be drawn. [N,2] float32
+    means2d: Array  # centers in pixels; 0 if the Gaussian cannot be drawn. [N,2] float32
     depths: Array  # camera z; 0 likewise. [N] float32
-    visible: Array  # whether one is a splat; where not, the next two are not set. [N] bool
+    visible: Array  # true for a splat; elsewhere the next two are not set. [N] bool
     shapes: Array  # the columns above. [N,8] float64
-    colors: Array  # rgb, opacity with antialias included. [N,4] float32
+    colors: Array  # rgb, and opacity with antialiasing. [N,4] float32
 
 
 class Footprint(NamedTuple):
-    """A Gaussian seen by a camera."""
+    """Projection of one Gaussian."""
 
     x: float  # camera coordinates
     y: float
     inv_z: float
     tan_x: float  # x/z, clamped
     tan_y: float
-    free_x: bool  # whether it was inside the limits
+    free_x: bool  # true if the ratio is inside the limits
     free_y: bool
     quat: Quat  # unit, wxyz
-    inv_length: float  # 1 / length of the quaternion as given; 0 where it is replaced by the identity
+    inv_length: float  # 1 / length of the given quaternion; 0 if it is replaced by the identity
     rotation: tuple[Vec, Vec, Vec]  # rows
-    a0: Vec  # rows of Jacobian · world → camera
+    a0: Vec  # rows of Jacobian times world → camera
     a1: Vec
     turned0: Vec  # a0 in the Gaussian's own axes
     turned1: Vec
     p0: Vec  # x components of its three axes in pixels
     p1: Vec  # y components
-    a: float  # 2D covariance before the dilation: p0·p0
+    a: float  # 2D covariance before dilation: p0·p0
     b: float  # p0·p1
     c: float  # p1·p1
     normal: Vec  # p0 × p1
-    det0: float  # determinant before the dilation
-    det: float  # after it
+    det0: float  # determinant before dilation
+    det: float  # determinant after dilation
 
 
 class TileLists(NamedTuple):
     """The splats of each tile, nearest first."""
 
-    starts: Array  # where each tile's list begins. [tiles+1] int64
+    starts: Array  # first index of each tile's list. [tiles+1] int64
     members: Array  # rows of the splats, tile after tile. [I] int32
-    # of each member, its index in an order by row, so that what belongs to one Gaussian can be added up in
-    # one fixed order. [I] int32, or [0] where it is not needed
+    # index of each member in an order by row, so that the sums of a Gaussian add up in a fixed order.
+    # [I] int32, or [0] if not needed
     slots: Array
     offsets: Array  # first slot of each Gaussian. [N+1] int32
 
 
 @kernel(contract=True, inline=True)
 def dot(a: Vec, b: Vec) -> float:
-    """a·b"""
+    """Return a·b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @kernel(contract=True, inline=True)
 def row_times(a: Vec, rows: tuple[Vec, Vec, Vec]) -> Vec:
-    """aᵀM for a matrix given by rows."""
+    """Return aᵀM for a matrix given by rows."""
     return (
         a[0] * rows[0][0] + a[1] * rows[1][0] + a[2] * rows[2][0],
         a[0] * rows[0][1] + a[1] * rows[1][1] + a[2] * rows[2][1],
@@ -137,7 +140,7 @@ def row_times(a: Vec, rows: tuple[Vec, Vec, Vec]) -> Vec:
 
 @kernel(inline=True)
 def view_direction(point: Vec, eye: Vec) -> tuple[float, float, float, float]:
-    """Unit vector from the eye to a point, world axes, and 1/distance (zeros at the eye itself)."""
+    """Return the unit vector from the eye to a point, world axes, and 1/distance; zeros at the eye itself."""
     x = point[0] - eye[0]
     y = point[1] - eye[1]
     z = point[2] - eye[2]
@@ -148,7 +151,7 @@ def view_direction(point: Vec, eye: Vec) -> tuple[float, float, float, float]:
 
 @kernel()
 def fill_basis(degree: int, x: float, y: float, z: float, basis: Array) -> None:
-    """Values of the (degree+1)² real basis functions in direction x, y, z. basis: out, [16] float64"""
+    """Compute the (degree+1)² real basis functions in direction x, y, z. basis: out, [16] float64"""
     basis[0] = C0
     if degree >= 1:
         basis[1] = -_C1 * y
@@ -175,44 +178,44 @@ def fill_basis(degree: int, x: float, y: float, z: float, basis: Array) -> None:
 
 @kernel(contract=True, inline=True)
 def cross(a: Vec, b: Vec) -> Vec:
-    """a × b"""
+    """Return a × b."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @kernel(contract=True, inline=True)
 def blend2(s: float, a: Vec, t: float, b: Vec) -> Vec:
-    """s·a + t·b"""
+    """Return s·a + t·b."""
     return s * a[0] + t * b[0], s * a[1] + t * b[1], s * a[2] + t * b[2]
 
 
 @kernel(contract=True, inline=True)
 def times(a: Vec, b: Vec) -> Vec:
-    """Product by components."""
+    """Return the product by components."""
     return a[0] * b[0], a[1] * b[1], a[2] * b[2]
 
 
 @kernel(inline=True)
 def vec(rows: Array, i: int) -> Vec:
-    """Row i of an [N,3] array."""
+    """Return row i of an [N,3] array."""
     return np.float64(rows[i, 0]), np.float64(rows[i, 1]), np.float64(rows[i, 2])
 
 
 @kernel(inline=True)
 def quat_of(rows: Array, i: int) -> Quat:
-    """Row i of an [N,4] array."""
+    """Return row i of an [N,4] array."""
     return np.float64(rows[i, 0]), np.float64(rows[i, 1]), np.float64(rows[i, 2]), np.float64(rows[i, 3])
 
 
 @kernel(inline=True)
 def camera_center(camera: Pinhole) -> Vec:
-    """−RᵀT"""
+    """Return −RᵀT."""
     turned = row_times(camera.shift, camera.rows)
     return -turned[0], -turned[1], -turned[2]
 
 
 @kernel(contract=True, inline=True)
 def unit_quat(w: float, x: float, y: float, z: float) -> tuple[float, float, float, float, float]:
-    """Unit quaternion and 1/length; the identity and 0 where it is zero or not finite."""
+    """Return the unit quaternion and 1/length, or the identity and 0 if it is zero or not finite."""
     total = abs(w) + abs(x) + abs(y) + abs(z)
     if not (total > 0.0 and total < np.inf):
         return 1.0, 0.0, 0.0, 0.0, 0.0
@@ -222,7 +225,7 @@ def unit_quat(w: float, x: float, y: float, z: float) -> tuple[float, float, flo
 
 @kernel(contract=True, inline=True)
 def rotation_rows(w: float, x: float, y: float, z: float) -> tuple[Vec, Vec, Vec]:
-    """Rows of the rotation by a unit quaternion."""
+    """Return the rows of a unit quaternion's rotation matrix."""
     return (
         (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
         (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
@@ -232,7 +235,7 @@ def rotation_rows(w: float, x: float, y: float, z: float) -> tuple[Vec, Vec, Vec
 
 @kernel(contract=True, inline=True)
 def footprint(camera: Pinhole, mean: Vec, scale: Vec, quat: Quat) -> Footprint:
-    """Project a Gaussian that is in front of the camera."""
+    """Project a Gaussian in front of the camera."""
     x = dot(camera.rows[0], mean) + camera.shift[0]
     y = dot(camera.rows[1], mean) + camera.shift[1]
     inv_z = 1.0 / (dot(camera.rows[2], mean) + camera.shift[2])
@@ -265,11 +268,11 @@ def footprint(camera: Pinhole, mean: Vec, scale: Vec, quat: Quat) -> Footprint:
 
 @kernel(contract=True, inline=True)
 def largest_extents(camera: Pinhole, scene: Scene, i: int) -> tuple[bool, float, float, float, float, float]:
-    """A bound of a Gaussian's support that needs no covariance.
+    """Return a bound of a Gaussian's support that needs no covariance.
 
     Returns:
-        whether it can be drawn at all; its center in pixels and camera z; the squares of half the sides of a
-        box around it in pixels
+        True if it can be drawn at all; its center in pixels and camera z; the squares of half the sides of a
+        box around it, in pixels
     """
     mean = vec(scene.means, i)
     scale = vec(scene.scales, i)
@@ -287,7 +290,11 @@ def largest_extents(camera: Pinhole, scene: Scene, i: int) -> tuple[bool, float,
 def extents(
     camera: Pinhole, mean: Vec, z: float, largest: float, opacity: float
 ) -> tuple[float, float, float, float]:
-    """Center and squares of half the sides of a box around the support, in pixels; largest: of the scales."""
+    """Return the center and the squares of half the sides of a box around the support, in pixels.
+
+    Args:
+        largest: largest of the scales, world units
+    """
     inv_z = 1.0 / z
     tan_x = (dot(camera.rows[0], mean) + camera.shift[0]) * inv_z
     tan_y = (dot(camera.rows[1], mean) + camera.shift[1]) * inv_z
@@ -295,7 +302,8 @@ def extents(
     py = camera.fy * tan_y + camera.cy
     tan_x = min(max(tan_x, camera.limits_x[0]), camera.limits_x[1])
     tan_y = min(max(tan_y, camera.limits_y[0]), camera.limits_y[1])
-    # ln x ≤ x − 1; 1.001: the viewmat's rotation is one only within rounding
+    # ln x ≤ x − 1. The factor 1.001 is there because the viewmat's rotation is orthogonal only up to
+    # rounding.
     radius2 = 1.001 * (_CUT_RADIUS2 + 2.0 * max(opacity - 1.0, 0.0))
     jx = camera.fx * largest * inv_z
     jy = camera.fy * largest * inv_z
@@ -306,7 +314,12 @@ def extents(
 
 @kernel(contract=True, inline=True)
 def shade_splat(mean: Vec, colors: Array, degree: int, eye: Vec, basis: Array) -> Vec:
-    """The color of a Gaussian; colors: its own, as `Scene` has them; basis: scratch, [16] float64"""
+    """Return the color of a Gaussian.
+
+    Args:
+        colors: its coefficients, as in `Scene`
+        basis: scratch. [16] float64
+    """
     if degree < 0:
         return vec(colors, 0)
     dx, dy, dz, _ = view_direction(mean, eye)
@@ -388,11 +401,11 @@ def project(begin: int, end: int, scene: Scene, camera: Pinhole, splats: Splats,
 def _tile_columns(
     shape: Array, side: float, top: float, bottom: float, left: float, right: float
 ) -> tuple[int, int]:
-    """First tile column and one past the last that a splat may touch in the pixel rows top..bottom.
+    """Return the first tile column, and one past the last, that a splat may touch in pixel rows top..bottom.
 
-    Columns count from the left edge of the full image; left, right: the window's. The bound is exact up to
-    1e-6 px: within a band of rows the support's left edge is farthest out where its leftmost point is, or at
-    the band's nearest row. side: dy of that point.
+    Columns count from the left edge of the full image. left and right are the window's. The bound is exact up
+    to 1e-6 px: within a band of rows the left edge of the support is farthest out at its leftmost point, or
+    at the row of the band nearest to it. side is dy of that point.
     """
     low = top + 0.5 - shape[MY]
     high = bottom + 0.5 - shape[MY]
@@ -411,14 +424,14 @@ def _tile_columns(
 
 @kernel(contract=True, cache=True)
 def find_tiles(begin: int, end: int, splats: Splats, camera: Pinhole, tiles: Array, counts: Array) -> int:
-    """The tiles that the splats of rows begin … end − 1 meet.
+    """List the tiles that the splats of rows begin … end − 1 touch.
 
     Args:
-        tiles: out, one splat's after the other's, as far as there is room. int32
-        counts: out, the number of each row's tiles. [N] int32
+        tiles: out, splat after splat, as far as there is room. int32
+        counts: out, number of tiles of each row. [N] int32
 
     Returns:
-        how many there are
+        Number of tiles, including those without room.
     """
     window = camera.window
     x0 = float(window[0])
@@ -438,7 +451,7 @@ def find_tiles(begin: int, end: int, splats: Splats, camera: Pinhole, tiles: Arr
         inclined = slope / (shape[L22] * shape[L22])
         variance = shape[INV_L11] * shape[INV_L11] + slope * inclined
         wide = math.sqrt(shape[R2] * variance)
-        # pixel rows and columns whose centers it may touch
+        # pixel rows and columns whose centers the splat may touch
         top = max(np.ceil(my - high - 0.5 - 1e-6), y0)
         bottom = min(np.floor(my + high - 0.5 + 1e-6), y1 - 1.0)
         first = max(np.ceil(mx - wide - 0.5 - 1e-6), x0)
@@ -466,13 +479,13 @@ def find_tiles(begin: int, end: int, splats: Splats, camera: Pinhole, tiles: Arr
 
 
 def bin_splats(order: Array, tiles: Array, counts: Array, tile_count: int, with_slots: bool) -> TileLists:
-    """List the splats of each tile. On one thread: shared by two it takes as long.
+    """List the splats of each tile. It runs on one thread, because two take as long.
 
     Args:
         order: rows of the splats, nearest first. [V] int32
         tiles, counts: of all rows, see `find_tiles`. [I], [N]
-        tile_count: of the window
-        with_slots: whether `TileLists.slots` is needed
+        tile_count: number of tiles in the window
+        with_slots: fill `TileLists.slots`
     """
     offsets = np.zeros(len(counts) + 1, np.int32)
     np.cumsum(counts, out=offsets[1:])
@@ -486,11 +499,11 @@ def bin_splats(order: Array, tiles: Array, counts: Array, tile_count: int, with_
 
 @kernel(cache=True)
 def _fill(order: Array, tiles: Array, offsets: Array, cursors: Array, members: Array, slots: Array) -> None:
-    """Put the splats into the lists of their tiles. cursors: where the next of each tile goes; used up."""
+    """Write the splats into the lists of their tiles. cursors: next position of each tile, modified"""
     last = order.size - 1
     for k in range(order.size):
-        prefetch(offsets, order[min(k + 2 * _AHEAD, last)])
-        prefetch(tiles, offsets[order[min(k + _AHEAD, last)]])
+        prefetch(offsets, order[min(k + 2 * _PREFETCH_SPLATS, last)])
+        prefetch(tiles, offsets[order[min(k + _PREFETCH_SPLATS, last)]])
         i = order[k]
         for slot in range(offsets[i], offsets[i + 1]):
             at = cursors[tiles[slot]]
@@ -501,13 +514,13 @@ def _fill(order: Array, tiles: Array, offsets: Array, cursors: Array, members: A
 
 
 def depth_order(depths: NDArray[np.float32], visible: NDArray[np.bool_]) -> NDArray[Any]:
-    """The rows of visible Gaussians, nearest first, ties by row. depths: > 0. [N], [N] -> [V] int32"""
+    """Return the rows of visible Gaussians, nearest first, ties by row. depths: > 0. [N], [N] -> [V] int32"""
     rows = np.flatnonzero(visible).astype(np.int32)
     keys = depths[rows].view(np.uint32)  # positive floats sort as their bits
-    for shift in range(0, 32, _DIGIT):
-        following = np.empty_like(keys), np.empty_like(rows)
-        _sort_digit(keys, rows, np.uint32(shift), np.zeros(1 << _DIGIT, np.int64), *following)
-        keys, rows = following
+    for shift in range(0, 32, _DIGIT_BITS):
+        sorted_arrays = np.empty_like(keys), np.empty_like(rows)
+        _sort_digit(keys, rows, np.uint32(shift), np.zeros(1 << _DIGIT_BITS, np.int64), *sorted_arrays)
+        keys, rows = sorted_arrays
     return rows
 
 
@@ -515,10 +528,10 @@ def depth_order(depths: NDArray[np.float32], visible: NDArray[np.bool_]) -> NDAr
 def _sort_digit(
     keys: Array, rows: Array, shift: Number, cursors: Array, sorted_keys: Array, sorted_rows: Array
 ) -> None:
-    """Sort by the bits from `shift` on, equal ones as they were; four times faster than numpy's sort.
+    """Sort stably by the bits from `shift` on. Four times faster than numpy's sort.
 
     Args:
-        cursors: scratch, zero
+        cursors: scratch, zero on entry
         sorted_keys, sorted_rows: out
     """
     mask = np.uint32(cursors.size - 1)

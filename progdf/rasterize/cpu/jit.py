@@ -1,10 +1,10 @@
-"""How the kernels are compiled: flags, the cache on disk; and eight float32 at once, as a type of numba's.
+"""Compilation of the kernels: float flags, the cache on disk, and a vector type of eight float32.
 
-numba has no vector type, and whether LLVM turns a loop into vector code, and in which order it adds up, is
-LLVM's choice: with plain loops a forward and backward pass takes 1.7 times as long, and its bits differ from
-processor to processor. A `Vector` is LLVM's <8 x float>: one AVX register, two of SSE's or NEON's. Arithmetic
-and comparisons are Python's own, lane by lane, with the float flags of the kernel around them; a float32
-beside a vector counts as eight equal ones.
+numba has no vector type. LLVM alone decides if a loop is vectorized and in which order it sums. With plain
+loops a forward and backward pass takes 1.7 times as long, and its bits differ between processors. A `Vector`
+is LLVM's <8 x float>: one AVX register, or two SSE or NEON registers. Arithmetic and comparisons use Python's
+operators, lane by lane, with the float flags of the surrounding kernel. A float32 next to a vector counts as
+eight equal lanes.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ try:
     from numba.core import cgutils
     from numba.core.typing.templates import AbstractTemplate, builtin_registry, signature
     from numba.extending import intrinsic, lower_builtin, models, register_model
-except Exception as error:  # it reads its settings on import, and raises whatever is wrong with them
+except Exception as error:  # numba reads its settings on import and raises any error that they cause
     if is_out_of_memory(error):
         raise
     raise ProgdfError(
@@ -48,10 +48,16 @@ if config.DISABLE_JIT:
 log = logging.getLogger("progdf")
 
 FAST = {"nnan", "ninf", "nsz", "contract", "reassoc", "afn"}
-"""Float flags of the pixel loops: all but `arcp`, which costs gradients a decimal and buys no time."""
+"""Float flags of the pixel loops.
+
+`arcp` is left out: it costs gradients one decimal digit and saves no time.
+"""
 
 Number = Any
-"""A number inside a kernel, of the type numba infers: python's int and float cannot say float32 or uint64."""
+"""Number inside a kernel, of the type that numba infers.
+
+Python's int and float cannot express float32 or uint64.
+"""
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 _first_call = threading.Lock()
@@ -61,16 +67,16 @@ def kernel(
     *, fast: bool = False, contract: bool = False, cache: bool = False, inline: bool = False,
     allocates: bool = False,
 ) -> Callable[[_F], _F]:  # fmt: skip
-    """Compile a function with numba; it releases the interpreter's lock.
+    """Compile a function with numba. It releases the interpreter lock.
 
     Args:
-        fast: with the flags of the pixel loops (`FAST`); otherwise strict IEEE
-        contract: strict but for fused multiply-adds
-        cache: for functions that Python calls, not other kernels: the machine code is kept on disk, and the
-            cache is looked for at the first call
+        fast: use the flags of the pixel loops (`FAST`); otherwise strict IEEE
+        contract: strict except for fused multiply-adds
+        cache: for functions that Python calls, not for kernels called by kernels. The machine code is kept on
+            disk, and the cache is read at the first call
         inline: always inline into the calling kernel
-        allocates: may make arrays; one that may not leaves out to count references to those that it gets,
-            for which threads that share them would wait at each call
+        allocates: allow the kernel to create arrays. Without it, numba skips reference counting of the array
+            arguments, which would make threads that share them wait at each call
     """
     flags = FAST if fast else {"contract"} if contract else False
 
@@ -87,19 +93,19 @@ def _compile_when_called(compile_now: Callable[[_F], _F]) -> Callable[[_F], _F]:
         compiled: _F | None = None
 
         def call_first(*arguments: Any) -> Any:
-            """Load or compile it: one process at a time, as two would write the same files."""
+            """Load or compile the kernel. One process at a time, because two would write the same files."""
             nonlocal compiled
             with _first_call, FileLock(kernel_cache() / f"{function.__name__}.lock"):
-                made = compiled or _with_cache_folder(compile_now, function)
+                loaded = compiled or _with_cache_folder(compile_now, function)
                 try:
-                    result = made(*arguments)
-                except Exception as error:  # whatever a file that was cut short raises
+                    result = loaded(*arguments)
+                except Exception as error:  # the type depends on how a cache file is truncated
                     log.warning("the kernels in %s are compiled anew (%s)", kernel_cache(), error)
                     for path in kernel_cache().rglob("*.nb[ic]"):
                         path.unlink(missing_ok=True)
-                    made = _with_cache_folder(compile_now, function)
-                    result = made(*arguments)
-            compiled = made
+                    loaded = _with_cache_folder(compile_now, function)
+                    result = loaded(*arguments)
+            compiled = loaded
             return result
 
         @wraps(function)
@@ -112,7 +118,7 @@ def _compile_when_called(compile_now: Callable[[_F], _F]) -> Callable[[_F], _F]:
 
 
 def _with_cache_folder(compile_now: Callable[[_F], _F], function: _F) -> _F:
-    before = config.CACHE_DIR  # read by the decorator; other packages' caches stay where they are
+    before = config.CACHE_DIR  # read by the decorator; the caches of other packages stay in place
     config.CACHE_DIR = str(kernel_cache())
     try:
         return compile_now(function)
@@ -122,7 +128,7 @@ def _with_cache_folder(compile_now: Callable[[_F], _F], function: _F) -> _F:
 
 @once
 def kernel_cache() -> Path:
-    """The folder of compiled kernels, made when the first kernel is needed."""
+    """The folder of compiled kernels, loaded when the first kernel is needed."""
     folder = find_cache_folder()
     if not any(folder.rglob("*.nbi")):
         log.warning("compiling the rasterizer's kernels (about 20 s, once per machine)")
@@ -130,16 +136,16 @@ def kernel_cache() -> Path:
 
 
 def find_cache_folder() -> Path:
-    """A folder that this user may write, for this version of the kernels; never in the source tree."""
-    named = os.environ.get("NUMBA_CACHE_DIR")
-    root = Path(named) if named else cache_folder() / "kernels"
+    """Return a folder that this user may write, for this version of the kernels. Never in the source tree."""
+    override = os.environ.get("NUMBA_CACHE_DIR")
+    root = Path(override) if override else cache_folder() / "kernels"
     temporary = temporary_folder()
     for base in (root, temporary / "kernels"):
         folder = base / _source_version()
         try:
             if base.parent == temporary:
                 temporary.mkdir(mode=0o700, exist_ok=True)
-                if not is_private(temporary):  # machine code of somebody else's is not run
+                if not is_private(temporary):  # do not run machine code of another user
                     continue
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):
@@ -153,8 +159,10 @@ def find_cache_folder() -> Path:
 
 
 def _source_version() -> str:
-    """Of all files that kernels are made of: numba's cache notices neither changed constants nor changed
-    imported functions."""
+    """Return a hash of all files that kernels depend on.
+
+    numba's cache notices neither changed constants nor changed imported functions.
+    """
     digest = hashlib.sha256(numba.__version__.encode())
     package = Path(__file__).parents[2]
     for path in sorted(
@@ -165,13 +173,13 @@ def _source_version() -> str:
 
 
 Vector = Any
-"""Inside a kernel: eight float32."""
+"""Eight float32 inside a kernel."""
 
 Mask = Any
-"""Inside a kernel: eight booleans."""
+"""Eight booleans inside a kernel."""
 
 WIDTH = 8
-"""Lanes of a vector."""
+"""Number of lanes of a vector."""
 
 _FLOATS = ir.VectorType(ir.FloatType(), WIDTH)
 _INTS = ir.VectorType(ir.IntType(32), WIDTH)
@@ -179,35 +187,35 @@ _BOOLS = ir.VectorType(ir.IntType(1), WIDTH)
 
 
 def select(mask: Mask, a: Vector, b: Vector) -> Vector:
-    """a where the mask holds, b elsewhere, lane by lane."""
+    """Return a where the mask is true and b elsewhere, lane by lane."""
 
 
 def broadcast(value: Any) -> Vector:
-    """Eight times a float32."""
+    """Return a vector with a float32 in all eight lanes."""
 
 
 def lane_indices() -> Vector:
-    """0, 1, …, 7"""
+    """Return 0, 1, …, 7."""
 
 
 def lane_sums(a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Vector:
-    """The sum of the lanes of each of eight vectors, as a vector; always added up in the same order."""
+    """Return the lane sums of eight vectors as one vector. The order of summation is fixed."""
 
 
 def lane_sum(value: Vector) -> Any:
-    """The sum of the lanes, as `lane_sums` adds them up."""
+    """Return the sum of the lanes, in the order of `lane_sums`."""
 
 
 def truncate(value: Vector) -> Vector:
-    """Each lane without what follows the point, |value| < 2³¹."""
+    """Return each lane rounded towards zero, |value| < 2³¹."""
 
 
 def ldexp(value: Vector, exponent: Vector) -> Vector:
-    """value · 2^exponent where the exponent is whole and the result a normal number."""
+    """Return value · 2^exponent for integer exponents and results that are normal numbers."""
 
 
 class _VectorType(types.Type):  # type: ignore[misc]
-    """numba's name for a vector of LLVM's."""
+    """Numba type of an LLVM vector."""
 
     def __init__(self, name: str, vector: ir.VectorType) -> None:
         super().__init__(name=name)
@@ -226,7 +234,7 @@ _single = types.float32
 
 
 def _broadcast(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
-    """Eight times the same where it is one number."""
+    """Return a vector: a vector as it is, a number in all lanes."""
     if isinstance(value.type, ir.VectorType):
         return value
     vector = ir.Constant(_FLOATS, ir.Undefined)
@@ -238,7 +246,10 @@ def _define(
     function: Callable[..., Any], arguments: tuple[types.Type, ...], result: types.Type,
     emit: Callable[..., ir.Value],
 ) -> None:  # fmt: skip
-    """Teach numba a function or an operator for arguments of exactly these types; `emit` gets vectors."""
+    """Register a function or operator with numba for arguments of exactly these types.
+
+    `emit` receives vectors.
+    """
 
     class _Template(AbstractTemplate):  # type: ignore[misc]
         key = function
@@ -254,13 +265,13 @@ def _define(
 
 
 def _add_shuffled(b: ir.IRBuilder, x: ir.Value, y: ir.Value, first: list[int], second: list[int]) -> ir.Value:
-    """Lanes `first` of x and y, laid end to end, plus lanes `second`."""
+    """Return lanes `first` plus lanes `second` of the concatenation of x and y."""
     kind = ir.VectorType(ir.IntType(32), len(first))
     return b.fadd(*(b.shuffle_vector(x, y, ir.Constant(kind, lanes)) for lanes in (first, second)))
 
 
 def _lane_sums(b: ir.IRBuilder, *vectors: ir.Value) -> ir.Value:
-    for part in (8, 4, 2):  # so many lanes belong to one sum; its halves are added up
+    for part in (8, 4, 2):  # lanes per sum; each step adds the two halves
         low = [k for k in range(2 * WIDTH) if k % part < part // 2]
         high = [k + part // 2 for k in low]
         pairs = zip(vectors[::2], vectors[1::2], strict=True)
@@ -306,7 +317,7 @@ def _pointer(context: Any, builder: ir.IRBuilder, sig: Any, array: ir.Value, at:
 
 @intrinsic  # type: ignore[untyped-decorator]
 def load(typingctx: Any, array: Any, at: Any) -> Any:
-    """array[at : at + 8] of a contiguous float32 array; nothing is checked. at: uint64"""
+    """Return array[at : at + 8] of a contiguous float32 array, without a bounds check. at: uint64"""
 
     def generate(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         return builder.load(_pointer(context, builder, sig, *args), align=4)
@@ -316,7 +327,7 @@ def load(typingctx: Any, array: Any, at: Any) -> Any:
 
 @intrinsic  # type: ignore[untyped-decorator]
 def store(typingctx: Any, array: Any, at: Any, value: Any) -> Any:
-    """array[at : at + 8] = value; as `load`."""
+    """Set array[at : at + 8] = value, without a bounds check. at: uint64"""
 
     def generate(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         builder.store(args[2], _pointer(context, builder, sig, *args[:2]), align=4)
@@ -327,7 +338,7 @@ def store(typingctx: Any, array: Any, at: Any, value: Any) -> Any:
 
 @intrinsic  # type: ignore[untyped-decorator]
 def prefetch(typingctx: Any, array: Any, row: Any) -> Any:
-    """Have the first 64 bytes of a row fetched before they are asked for; no harm where it does not exist."""
+    """Prefetch the first 64 bytes of a row. Safe for a row that does not exist."""
 
     def generate(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         fields = context.make_array(sig.args[0])(context, builder, args[0])
@@ -337,7 +348,8 @@ def prefetch(typingctx: Any, array: Any, row: Any) -> Any:
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
         offset = builder.mul(builder.extract_value(fields.strides, 0), args[1])
         address = builder.gep(builder.bitcast(fields.data, byte), [offset])
-        builder.call(function, [address, number(0), number(3), number(1)])  # to read, to be kept, data
+        # flags: read, keep in all cache levels, data
+        builder.call(function, [address, number(0), number(3), number(1)])
         return context.get_dummy_value()
 
     return types.void(array, types.int64), generate

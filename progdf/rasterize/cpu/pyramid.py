@@ -1,20 +1,25 @@
-"""Fewer Gaussians for a picture in motion: neighbors merged once, and of each part of the view as much detail
-as it shows.
+"""Level-of-detail pyramid for interactive rendering.
 
-- A binary tree over the scene, split at the median of the widest axis down to leaves of four to eight. Each
-  node is one Gaussian with the moments of those below it, weighed by opacity times area.
-- A view takes a node whose detail does not show, and else looks at its two halves, or at the Gaussians of a
-  leaf. What merging loses is estimated in pixels² as the spread of the centers, in pixels, times the root of
-  the visible area, as errors add up in squares, and more where colors differ or several cover each other;
-  and it shows as far as light reaches it, which a coarser cut of the same view tells, added up in a grid of
-  cells and slices of depth.
-- The limit is sought so that about as many are drawn as asked for, beginning at the last picture's.
-- A node that is dense has an opacity beyond 1, which engines cut off where they blend: flat in its middle.
-- Each Gaussian has a dilation of its own in the fine picture: a node of many small ones is as dense as these
-  are together. That of the coarse picture, which is wider, is taken off the size, and the remainder off the
-  opacity.
+A binary tree over the scene, split at the median of the widest axis down to leaves of 4 to 8 Gaussians. Every
+node is one Gaussian with the moments of its children, weighted by opacity times area.
 
-The plain version is in tests/helpers/plain_pyramid.py.
+Cut: a view draws a node if the estimated error of merging it is below a threshold. Otherwise it descends to
+the children, or to the Gaussians of a leaf. The error of a node, in pixels², is
+
+    spread of the centers (px) × sqrt(visible area (px²) × transmittance in front of it)
+
+and is scaled up where the colors vary or the children occlude each other. The root is there because errors
+add up in squares. The transmittance comes from a coarser cut of the same view, accumulated in a grid of tiles
+and depth slices. The threshold is searched so that about the requested number of Gaussians is drawn, starting
+from the previous frame's.
+
+Dense nodes have an opacity above 1, clamped when blending, which flattens their center.
+
+Dilation: at full resolution each Gaussian is dilated by itself, so a node of many small Gaussians is as dense
+as these are together. The dilation of the coarse picture is wider. The surplus is subtracted from the size of
+a Gaussian, and the remainder from its opacity.
+
+Reference implementation: tests/helpers/plain_pyramid.py.
 """
 
 from __future__ import annotations
@@ -59,72 +64,99 @@ from .forward import (
 from .jit import Number, kernel, prefetch
 
 LEAF = 4
-"""Gaussians of a leaf at least; fewer cost memory, more lose .7 dB (docs/experiments.md, The viewer)."""
+"""Minimum number of Gaussians per leaf.
+
+Fewer cost memory, more lose 0.7 dB (docs/experiments.md, The viewer).
+"""
 
 CELL = 8
+"""Side of a grid cell in which optical depth is accumulated, pixels."""
+
 SLICES = 224
-"""Side of a cell of the grid in which optical depth is added up, pixels; the slices of its depth from the
-near plane on, sixteen to a factor of two."""
+"""Depth slices of the grid from the near plane on, 16 per factor of two in depth."""
 
 DARKEST = 3.0
-"""Optical depth beyond which it makes no more difference: cells know nothing of gaps."""
+"""Limit of the optical depth that reduces a node's error.
+
+The grid does not resolve gaps, so more proves nothing.
+"""
 
 CROWD = 0.6
-"""Power of a node's density beyond 1 that is its opacity. With more than 1 its middle is opaque and its rim
-steep, as that of several which cover each other: a surface of nodes as soft as one Gaussian has holes."""
+"""Exponent that turns a node's density above 1 into its opacity.
+
+An opacity above 1 makes the center opaque and the edge steep, like several Gaussians that cover each other. A
+surface of nodes as soft as one Gaussian would have holes.
+"""
 
 COARSER = 4.0
-"""Times the limit, with which the cut is made that tells the light."""
+"""Factor of the threshold for the coarser cut that provides the transmittance."""
 
 FINEST = 1e-3
-"""Least limit, pixels²: what one loses below it no picture of eight bits shows."""
+"""Smallest threshold, pixels². An error below it is invisible in an 8-bit picture."""
 
 ENOUGH = 0.85
-"""Of what was asked for: with so many the limit is not sought any further."""
+"""Share of the budget at which the threshold search stops."""
 
 LONGEST, DENSITY, WEIGHT, POINTS, LOSS = range(3, 8)
-"""Columns of a node beside its mean: the largest scale; density, negative where something below cannot be
-drawn; Σ opacity · area of what is below, world units², 0 for nothing; Σ opacity; the spread of its centers,
-world units, times 1 and the summed variances of its colors, in coefficients of band 0."""
+"""Columns of a node after its mean.
+
+- LONGEST: largest scale, world units
+- DENSITY: opacity, negative if a Gaussian below the node cannot be drawn
+- WEIGHT: Σ opacity · area of the Gaussians below, world units², 0 if none can be drawn
+- POINTS: Σ opacity of the Gaussians below
+- LOSS: spread of the centers, world units, times (1 + summed variances of the colors, band-0 coefficients)
+"""
 
 SCALES = 4
-SPREAD = 7
-CONTRAST = 8
-COLORS = 9
-"""Columns of a node in 16 bits after its rotation, wxyz / 32767: its scales, of the largest / 65535; the
-spreads of centers and of colors (roots of summed variances); and colors, band by band. All but rotation and
-scales are upper halves of float32: errors of .2 %."""
+"""First of the three scales in a node's 16-bit columns, each as a share of the largest times 65535.
 
-_ONE = int(np.float32(1.0).view(np.int32))
-_PER_SLICE = 2.0**-19  # of a float's bits: sixteen slices for a factor of two
-_BEFORE = 2.0 ** (-1 / 32)  # of a depth: half a slice nearer, so that no surface is in its own shadow
-_TOP = 4  # levels of which each node is a chunk of its own
-_AHEAD = 8  # rows that are fetched before it is their turn: they lie far apart
-_DARK = math.exp(0.5 * DARKEST)  # times the limit, beyond which no darkness brings a loss below it
-# of a weight
-_MINIMUM = 1e-30
-_MOST = 1e30
-_TRIALS = 12  # for a limit
-_REACH = 3.0  # standard deviations of a node that are in front of the near plane, or it is not drawn
+Columns 0 to 3 are the rotation, wxyz times 32767.
+"""
+
+SPREAD = 7
+"""Column of the centers' spread, the root of their variance, world units.
+
+This column and all that follow are the upper halves of float32, with errors of 0.2 %.
+"""
+
+CONTRAST = 8
+"""Column of the colors' spread, the root of their summed variances, in coefficients of band 0."""
+
+COLORS = 9
+"""First column of the color coefficients, band by band."""
+
+_ONE_BITS = int(np.float32(1.0).view(np.int32))
+_SLICES_PER_BIT = 2.0**-19  # depth slices per unit in the last place of a float32: 16 per factor of two
+_SHADOW_DEPTH_RATIO = 2.0 ** (-1 / 32)  # depth factor, half a slice nearer: a surface must not shadow itself
+_CHUNK_LEVELS = 4  # upper levels of the tree whose nodes are chunks for the threads
+_PREFETCH_ROWS = 8  # rows to prefetch ahead, because they lie far apart in memory
+_MAX_DARKENING = math.exp(0.5 * DARKEST)  # multiple of the threshold above which no shadow helps a node
+_MIN_WEIGHT = 1e-30
+_MAX_WEIGHT = 1e30
+_MAX_TRIALS = 12  # cuts per threshold search
+_NEAR_SIGMAS = 3.0  # a node is dropped if it lies behind the near plane by this many standard deviations
 
 
 class Nodes(NamedTuple):
-    """The tree, level after level: node i has the halves 2i + 1 and 2i + 2, and leaf l of L = 2^levels the
-    rows order[l·N // L : (l + 1)·N // L]."""
+    """Tree in arrays, level after level.
 
-    # means with the columns above: all that a cut looks at
-    means: Array  # [2L-1,8] float32
-    shapes: Array  # the columns of 16 bits. [2L-1,9+3K] uint16
-    quats: Array  # the first of these, as numbers with a sign. [2L-1,4] int16
+    Node i has the children 2i + 1 and 2i + 2. Leaf l of L = 2^levels holds the rows
+    order[l·N // L : (l + 1)·N // L].
+    """
+
+    # means and the columns above: all that a cut reads. [2L-1,8] float32
+    means: Array
+    shapes: Array  # 16-bit columns. [2L-1,9+3K] uint16
+    quats: Array  # first four 16-bit columns, signed. [2L-1,4] int16
     order: Array  # rows of the scene. [N] int32
     levels: int
 
 
 class Pyramid:
-    """The tree over a scene, which is read where it lies: after a change of it, `refresh`.
+    """Tree over a scene. It reads the scene's arrays in place; call `refresh` after they change.
 
     Args:
-        gaussians: the scene, float32; colors are harmonics
+        gaussians: the scene, float32, with SH colors
     """
 
     def __init__(self, gaussians: ActivatedGaussians) -> None:
@@ -138,36 +170,39 @@ class Pyramid:
         means = np.zeros((total, LOSS + 1), np.float32)
         quats = shapes[:, :SCALES].view(np.int16)
         self.nodes = Nodes(means, shapes, quats, order, levels)
-        self.limit = 1.0  # of what a node may lose, pixels²: where the last search ended
-        self.finest = FINEST  # the least one that it ends at
-        self._places: Array | None = None  # of each row in the order, once one is asked for. [N] int32
+        self.limit = 1.0  # threshold for a node's error, pixels²; the last search ended here
+        self.finest = FINEST  # smallest threshold of the search, pixels²
+        self._places: Array | None = (
+            None  # position of each row in the order, computed on first use. [N] int32
+        )
         for level in range(levels, -1, -1):
             self._merge(level, np.arange(1 << level))
 
     def refresh(self, rows: Array, colors_only: bool) -> None:
-        """Merge anew what is above some rows of the scene. rows: [M] int64"""
+        """Merge the ancestors of changed rows of the scene again. rows: [M] int64"""
         count = len(self.nodes.order)
         levels = self.nodes.levels
         if self._places is None:
             self._places = np.empty(count, np.int32)
             self._places[self.nodes.order] = np.arange(count, dtype=np.int32)
         marks = np.zeros(1 << levels, np.bool_)
-        # the leaf whose first place is the last one that is not after it
+        # the first leaf whose rows end after this position
         marks[((self._places[rows].astype(np.int64) + 1 << levels) - 1) // max(count, 1)] = True
         for level in range(levels, -1, -1):
             self._merge(level, np.flatnonzero(marks), colors_only)
             marks = marks[0::2] | marks[1::2]
 
     def simplify(self, camera: Camera, budget: int, pixels: int = 1) -> ActivatedGaussians:
-        """What `render` draws in place of the scene while something moves.
+        """Return the Gaussians to draw in place of the scene while the view changes.
 
         Args:
-            camera: of the coarse picture
-            budget: about how many Gaussians are drawn; more only where no limit is found in time
-            pixels: of the fine picture that one of the coarse one covers, each way
+            camera: the camera of the coarse picture
+            budget: approximate number of Gaussians to draw. It is exceeded only if the threshold search runs
+                out of trials
+            pixels: size of a coarse pixel in pixels of the full resolution, per axis
 
         Returns:
-            Gaussians in the colors that this camera sees; rgb [M,3]
+            Gaussians with the colors seen by this camera; rgb [M,3]
         """
         view = make_pinhole(RasterView.of(camera, self._gaussians))
         dilation = DILATION / pixels**2
@@ -176,15 +211,15 @@ class Pyramid:
 
         def take(begin: int, end: int) -> None:
             scratch = np.empty(16), np.empty(self.scene.colors.shape[1:], np.float32)
-            _take(begin, end, picks, self.scene, self.nodes, view, dilation, out, *scratch)
+            _resolve_picks(begin, end, picks, self.scene, self.nodes, view, dilation, out, *scratch)
 
         share_gaussians(take, len(picks))
         means, quats, scales, opacities, rgb = map(torch.from_numpy, out)
         return ActivatedGaussians(means, quats, scales, opacities[:, 0], rgb)
 
     def cut(self, view: Pinhole, budget: int, dilation: float) -> Array:
-        """What a view takes: nodes, and rows of the scene as their complement (~row). [M] int32"""
-        for _ in range(_TRIALS):
+        """Return the picks of a view: nodes, and rows of the scene as their complement (~row). [M] int32"""
+        for _ in range(_MAX_TRIALS):
             self.limit = max(self.limit, self.finest)
             depths = np.zeros((-(-view.window[3] // CELL), -(-view.window[2] // CELL), SLICES), np.float32)
             coarse = self._cut(view, self.limit * COARSER, dilation, np.zeros(1, np.float32))
@@ -193,12 +228,12 @@ class Pyramid:
             picks = self._cut(view, self.limit, dilation, depths.reshape(-1))
             if len(picks) <= budget and (len(picks) >= ENOUGH * budget or self.limit <= self.finest):
                 break
-            # a limit twice as high leaves about half as many
+            # twice the threshold leaves about half as many
             self.limit *= (len(picks) + 1) / (0.5 * (1.0 + ENOUGH) * budget)
         return picks
 
     def _cut(self, view: Pinhole, limit: float, dilation: float, depths: Array) -> Array:
-        top = min(_TOP, self.nodes.levels)
+        top = min(_CHUNK_LEVELS, self.nodes.levels)
         room = -(-len(self.nodes.order) >> top) + 1
 
         def walk(chunk: int) -> Array:
@@ -210,7 +245,7 @@ class Pyramid:
         return np.concatenate(run_chunks(walk, 1 << top))
 
     def _merge(self, level: int, nodes: Array, colors_only: bool = False) -> None:
-        """Merge some nodes of a level, counted from its first one, of what is right below them."""
+        """Merge nodes of a level, counted from its first node, from the level below."""
 
         def merge(begin: int, end: int) -> None:
             scratch = np.empty((3, 3)), np.empty(4), np.empty(self.scene.colors.shape[1:])
@@ -220,7 +255,7 @@ class Pyramid:
 
 
 def _sort(means: Array, levels: int) -> Array:
-    """Rows in such an order that each node's are together. means: [N,3] -> [N] int32"""
+    """Return the rows in an order in which each node's rows are adjacent. means: [N,3] -> [N] int32"""
     points = np.nan_to_num(means, nan=0.0, posinf=0.0, neginf=0.0)
     order = np.arange(len(means), dtype=np.int32)
     top = min(2, levels)
@@ -231,7 +266,7 @@ def _sort(means: Array, levels: int) -> Array:
 
 @kernel(cache=True)
 def _split(points: Array, order: Array, level: int, first: int, levels: int) -> None:
-    """Split node `first` of a level at the medians, down to `levels`; changes points and order alike."""
+    """Split node `first` of a level at the medians, down to `levels`. Reorders points and order alike."""
     count = points.shape[0]
     for deeper in range(level, levels):
         for node in range(first << (deeper - level), (first + 1) << (deeper - level)):
@@ -296,13 +331,15 @@ def _roots(a: float, b: float, c: float) -> Vec:
 
 @kernel(contract=True, inline=True)
 def _weight(scene: Scene, i: int) -> float:
-    """Opacity times area; 0 for one that cannot be drawn."""
+    """Return opacity times area, or 0 if the Gaussian cannot be drawn."""
     mean = vec(scene.means, i)
     opacity = np.float64(scene.opacities[i])
     longest, middle = _two_largest(vec(scene.scales, i))
     weight = opacity * longest * middle
-    drawn = opacity >= ALPHA_MIN and abs(mean[0]) + abs(mean[1]) + abs(mean[2]) < np.inf and weight < _MOST
-    return max(weight, _MINIMUM) if drawn else 0.0
+    drawn = (
+        opacity >= ALPHA_MIN and abs(mean[0]) + abs(mean[1]) + abs(mean[2]) < np.inf and weight < _MAX_WEIGHT
+    )
+    return max(weight, _MIN_WEIGHT) if drawn else 0.0
 
 
 @kernel(contract=True, cache=True)
@@ -310,7 +347,7 @@ def _merge(
     begin: int, end: int, indices: Array, level: int, scene: Scene, nodes: Nodes, colors_only: bool,
     matrix: Array, quat: Array, colors: Array,
 ) -> None:  # fmt: skip
-    """Merge nodes indices[begin … end − 1] of a level of what is right below them; at last, scratch."""
+    """Merge nodes indices[begin … end − 1] of a level from the level below. matrix, quat, colors: scratch."""
     means = nodes.means
     shapes = nodes.shapes
     count = nodes.order.shape[0]
@@ -327,8 +364,8 @@ def _merge(
         colors[:] = 0.0
         for k in range(first, last):
             i = nodes.order[k] if leaf else k
-            if leaf:  # the rows of neighbors lie far apart, the leaves that change together do not
-                _fetch(~nodes.order[min(k + _AHEAD, count - 1)], scene, nodes, not colors_only)
+            if leaf:  # rows of neighbors lie far apart; adjacent leaves do not
+                _fetch(~nodes.order[min(k + _PREFETCH_ROWS, count - 1)], scene, nodes, not colors_only)
             weight = _weight(scene, i) if leaf else np.float64(means[i, WEIGHT])
             sound = sound and (weight > 0.0 if leaf else means[i, DENSITY] > 0.0)
             if weight > 0.0:
@@ -344,7 +381,7 @@ def _merge(
                         color = _color(i, leaf, band, c, scene, nodes)
                         colors[band, c] += weight * color
                         square += weight * color * color if band == 0 else 0.0
-        share = 1.0 / max(total, _MINIMUM)
+        share = 1.0 / max(total, _MIN_WEIGHT)
         mine = means[me]
         for band in range(colors.shape[0]):
             for c in range(3):
@@ -376,15 +413,17 @@ def _merge(
             sizes = _roots(matrix[0, 0], matrix[1, 1], matrix[2, 2])
             mine[LONGEST], middle = _two_largest(sizes)
             for k in range(3):
-                shapes[me, SCALES + k] = np.uint16(np.rint(65535.0 * sizes[k] / max(mine[LONGEST], _MINIMUM)))
-            density = total / max(mine[LONGEST] * middle, _MINIMUM)
+                shapes[me, SCALES + k] = np.uint16(
+                    np.rint(65535.0 * sizes[k] / max(mine[LONGEST], _MIN_WEIGHT))
+                )
+            density = total / max(mine[LONGEST] * middle, _MIN_WEIGHT)
             mine[DENSITY] = density if sound else -density
         mine[LOSS] = _unpack(shapes[me, SPREAD]) * (1.0 + _unpack(shapes[me, CONTRAST]) ** 2)
 
 
 @kernel(inline=True)
 def _pack(value: float) -> Number:
-    """The upper half of a float32, to the nearest."""
+    """Return the upper half of a float32, rounded to nearest."""
     return np.uint16((np.float32(value).view(np.uint32) + np.uint32(0x8000)) >> np.uint32(16))
 
 
@@ -395,7 +434,7 @@ def _unpack(half: Number) -> Number:
 
 @kernel(inline=True)
 def _fetch(pick: int, scene: Scene, nodes: Nodes, turned: bool) -> None:
-    """Have what is known of a pick fetched before it is its turn, its rotation too where it is `turned`."""
+    """Prefetch the data of a pick; its rotation only if `turned`."""
     if pick >= 0:
         prefetch(nodes.means, pick)
         prefetch(nodes.shapes, pick)
@@ -409,7 +448,7 @@ def _fetch(pick: int, scene: Scene, nodes: Nodes, turned: bool) -> None:
 
 @kernel(inline=True)
 def _part(i: int, is_row: bool, scene: Scene, nodes: Nodes) -> tuple[Vec, Vec, Quat]:
-    """Mean, scales and rotation of a row or a node."""
+    """Return the mean, scales and rotation of a row or a node."""
     if is_row:
         return vec(scene.means, i), vec(scene.scales, i), quat_of(scene.quats, i)
     shape = nodes.shapes[i]
@@ -436,7 +475,7 @@ def _add_moments(off: Vec, scale: Vec, quat: Quat, weight: float, matrix: Array)
 
 @kernel(contract=True)
 def _diagonalize(matrix: Array, quat: Array) -> None:
-    """Turn a symmetric matrix [3,3] into the diagonal one of its eigenvalues (Jacobi's rotations).
+    """Diagonalize a symmetric matrix [3,3] in place by Jacobi rotations.
 
     Args:
         quat: out, wxyz of the rotation whose columns are the eigenvectors. [4]
@@ -479,15 +518,22 @@ def _diagonalize(matrix: Array, quat: Array) -> None:
 
 @kernel(contract=True, inline=True)
 def _cell(x: float, y: float, z: float, corner: int, camera: Pinhole) -> tuple[int, float]:
-    """One of the eight cells about pixel (x, y) at depth z: its index in the flat grid, and the point's share
-    of it, so that neither jumps as the point moves. corner: 0..7"""
+    """Return one of the eight cells around pixel (x, y) at depth z.
+
+    Args:
+        corner: 0..7
+
+    Returns:
+        Index of the cell in the flat grid, and the point's share of it. Shares vary continuously with the
+        point.
+    """
     columns = -(-camera.window[2] // CELL)
     rows = -(-camera.window[3] // CELL)
-    # of the logarithm of the depth, nearly
-    bits: Number = np.float32(z / camera.near).view(np.int32) - _ONE
+    # approximates the logarithm of the depth
+    bits: Number = np.float32(z / camera.near).view(np.int32) - _ONE_BITS
     across = min(max(x / CELL - 0.5, 0.0), columns - 1.0)
     down = min(max(y / CELL - 0.5, 0.0), rows - 1.0)
-    along = min(max(bits * _PER_SLICE - 0.5, 0.0), SLICES - 2.0)
+    along = min(max(bits * _SLICES_PER_BIT - 0.5, 0.0), SLICES - 2.0)
     column = int(across)
     row = int(down)
     slice_index = int(along)
@@ -501,7 +547,10 @@ def _cell(x: float, y: float, z: float, corner: int, camera: Pinhole) -> tuple[i
 
 @kernel(contract=True, inline=True)
 def _is_outside(camera: Pinhole, x: float, y: float, wide2: float, high2: float) -> bool:
-    """Whether the window shows nothing of a box around pixel (x, y); squares of half its sides."""
+    """Return true if a box around pixel (x, y) lies outside the window.
+
+    wide2, high2: half its sides, squared
+    """
     out_x = max(max(-x, x - camera.window[2]), 0.0)
     out_y = max(max(-y, y - camera.window[3]), 0.0)
     return bool(out_x * out_x > wide2 or out_y * out_y > high2)
@@ -509,7 +558,7 @@ def _is_outside(camera: Pinhole, x: float, y: float, wide2: float, high2: float)
 
 @kernel(contract=True, inline=True)
 def _is_inside(camera: Pinhole, x: float, y: float, wide2: float, high2: float) -> bool:
-    """Whether the window shows all of such a box."""
+    """Return true if the box lies inside the window. Same arguments as `_is_outside`."""
     in_x = min(x, camera.window[2] - x)
     in_y = min(y, camera.window[3] - y)
     return bool(in_x > 0.0 and in_x * in_x >= wide2 and in_y > 0.0 and in_y * in_y >= high2)
@@ -523,10 +572,13 @@ def _walk(
     """Cut the tree below a node.
 
     Args:
-        limit: of what a node may lose, pixels²
-        depths: optical depth before each slice; [1]: all in the light, and leaves are not looked into
-        stack: scratch, more than the levels
-        picks: out, as in `Pyramid.cut`; how many is given back
+        limit: threshold for a node's error, pixels²
+        depths: optical depth in front of each slice. With [1], nothing is in shadow and leaves are not opened
+        stack: scratch, longer than the number of levels
+        picks: out, as in `Pyramid.cut`
+
+    Returns:
+        Number of picks.
     """
     means = nodes.means
     focal = math.sqrt(camera.fx * camera.fy)
@@ -540,13 +592,13 @@ def _walk(
         longest = np.float64(means[i, LONGEST])
         density = abs(np.float64(means[i, DENSITY]))
         z = dot(camera.rows[2], vec(means, i)) + camera.shift[2]
-        reach = _REACH * longest
+        reach = _NEAR_SIGMAS * longest
         if means[i, WEIGHT] <= 0.0 or z - camera.near + reach < 0.0:
             continue
         loss = np.inf
         inside = False
         wide = 0.0 if camera.antialiased else dilation * z * z / (focal * focal)
-        least = (means[i, WEIGHT] + wide * means[i, POINTS]) / max(longest * longest + wide, _MINIMUM)
+        least = (means[i, WEIGHT] + wide * means[i, POINTS]) / max(longest * longest + wide, _MIN_WEIGHT)
         if z - camera.near > reach and max(density, least) >= ALPHA_MIN:
             x, y, wide2, high2 = extents(camera, vec(means, i), z, longest, density)
             if _is_outside(camera, x, y, wide2, high2):
@@ -554,10 +606,10 @@ def _walk(
             inside = _is_inside(camera, x, y, wide2, high2) and means[i, DENSITY] > 0.0
             area = math.sqrt(max(density, 1.0)) * means[i, WEIGHT]
             loss = np.float64(means[i, LOSS]) * math.sqrt(area) * focal * focal / (z * z)
-            if depths.size > 1 and limit < loss < limit * _DARK:
+            if depths.size > 1 and limit < loss < limit * _MAX_DARKENING:
                 depth = 0.0
                 for corner in range(8):
-                    cell, share = _cell(x, y, (z - longest) * _BEFORE, corner, camera)
+                    cell, share = _cell(x, y, (z - longest) * _SHADOW_DEPTH_RATIO, corner, camera)
                     depth += share * depths[cell]
                 loss *= math.exp(-0.5 * min(depth, DARKEST))
         if loss <= limit or (i >= first_leaf and depths.size == 1):
@@ -585,7 +637,7 @@ def _walk(
 
 @kernel(contract=True, cache=True)
 def _add_depths(picks: Array, nodes: Nodes, camera: Pinhole, dilation: float, depths: Array) -> None:
-    """Add the optical depth of each node to its cell of the flat grid, in which it fills no more than all."""
+    """Add the optical depth of each node to its cells of the flat grid, at most once the area of a cell."""
     for i in picks:
         density = abs(np.float64(nodes.means[i, DENSITY]))
         mean = vec(nodes.means, i)
@@ -595,7 +647,7 @@ def _add_depths(picks: Array, nodes: Nodes, camera: Pinhole, dilation: float, de
         inside = 0.0 <= x <= camera.window[2] and 0.0 <= y <= camera.window[3]
         if z > camera.near and density >= ALPHA_MIN and inside:
             nearer = camera.fx * camera.fy / (z * z)
-            middle = nodes.means[i, WEIGHT] / max(density * longest, _MINIMUM)
+            middle = nodes.means[i, WEIGHT] / max(density * longest, _MIN_WEIGHT)
             area = math.sqrt((longest * longest * nearer + dilation) * (middle * middle * nearer + dilation))
             depth = -math.log(1.0 - min(density, ALPHA_MAX)) * min(2.0 * math.pi * area / (CELL * CELL), 1.0)
             for corner in range(8):
@@ -605,7 +657,7 @@ def _add_depths(picks: Array, nodes: Nodes, camera: Pinhole, dilation: float, de
 
 @kernel(cache=True)
 def _sum_depths(depths: Array) -> None:
-    """Of each slice what is before it instead of what is in it. [rows,columns,slices]"""
+    """Replace the value of each slice by the sum of all slices in front of it. [rows,columns,slices]"""
     for row in range(depths.shape[0]):
         for column in range(depths.shape[1]):
             total = np.float32(0.0)
@@ -614,31 +666,31 @@ def _sum_depths(depths: Array) -> None:
 
 
 @kernel(contract=True, cache=True)
-def _take(
+def _resolve_picks(
     begin: int, end: int, picks: Array, scene: Scene, nodes: Nodes, camera: Pinhole, dilation: float,
     out: Scene, basis: Array, bands: Array,
 ) -> None:  # fmt: skip
-    """Take picks begin … end − 1 as they are drawn; at last, scratch."""
+    """Write the Gaussians to draw for picks begin … end − 1. basis, bands: scratch."""
     eye = camera_center(camera)
     for at in range(begin, end):
-        _fetch(picks[min(at + _AHEAD, end - 1)], scene, nodes, True)
+        _fetch(picks[min(at + _PREFETCH_ROWS, end - 1)], scene, nodes, True)
         merged = picks[at] >= 0
         i = max(picks[at], ~picks[at])
         mean, scale, quat = _part(i, not merged, scene, nodes)
         seen = footprint(camera, mean, scale, quat)
-        unit = 1.0 / (camera.fx * camera.fy * seen.inv_z * seen.inv_z)  # world units² of a pixel
+        unit = 1.0 / (camera.fx * camera.fy * seen.inv_z * seen.inv_z)  # area of a pixel, world units²
         if merged:
             own = nodes.means[i]
-            opacity = abs(float(own[DENSITY]))  # more than 1 where several cover each other
+            opacity = abs(float(own[DENSITY]))  # above 1 where several Gaussians cover each other
             if not camera.antialiased:
                 longest, middle = _two_largest(scale)
                 wide = dilation * unit
                 dilated = math.sqrt((longest * longest + wide) * (middle * middle + wide))
-                opacity = max(opacity, (own[WEIGHT] + wide * own[POINTS]) / max(dilated, _MINIMUM))
+                opacity = max(opacity, (own[WEIGHT] + wide * own[POINTS]) / max(dilated, _MIN_WEIGHT))
             opacity = min(opacity, opacity**CROWD)
         else:
             opacity = float(scene.opacities[i])
-        # the coarse picture's dilation instead of the fine one's: off the size, as far as that goes
+        # replace the fine dilation by the coarse one: reduce the size as far as possible, then the opacity
         more = (dilation - DILATION) * unit
         a, b, c = scale
         size = _roots(a * a + more, b * b + more, c * c + more)
