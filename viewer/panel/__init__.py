@@ -1,1 +1,1 @@
-"""The panel: layers, sliders, snapshots, timeline."""
+"""Side panel with layers, sliders, snapshots and jobs, and the bars over the picture."""

@@ -1,4 +1,4 @@
-"""One layer in the panel: eye, name, strength, slider, and below it its gains."""
+"""Card of a layer in the panel: visibility, name, strength, slider, and the gains when unfolded."""
 
 from __future__ import annotations
 
@@ -50,12 +50,12 @@ GAINS = SLIDERS[1:]
 
 
 def draw_details(layer: LayerState, row: LayerRow, active_slider: str | None, ui: UiContext) -> LayerState:
-    """Draw the gains.
+    """Draw the gains and return the changed layer.
 
     Args:
-        layer: what they show
-        row: of its .gdf
-        active_slider: what the arrow keys move; None where they move another layer
+        layer: the layer to show and change
+        row: data of its .gdf
+        active_slider: slider that the arrow keys move; None if another layer is focused
         ui: fonts and scale
     """
     with inert(layer.locked):
@@ -65,7 +65,7 @@ def draw_details(layer: LayerState, row: LayerRow, active_slider: str | None, ui
 
 
 def _gain(layer: LayerState, kind: str, moves: bool, active: bool, ui: UiContext) -> LayerState:
-    """One gain: a slider as the others of the panel."""
+    """Draw one gain as a slider and return the changed layer."""
     if active:
         imgui.push_style_color(imgui.Col_.text_disabled, PALETTE.accent)
     label(kind.capitalize(), 84.0 * ui.scale)
@@ -83,29 +83,28 @@ def _gain(layer: LayerState, kind: str, moves: bool, active: bool, ui: UiContext
 
 TOGGLE_PX = 20.0
 THUMBNAIL_PX = 24.0
-CARD_PX = 66.0  # a whole card with what is between two, at 1×
-# a compact row: its padding, its slider's width and height
-COMPACT_PX = 7.0
-SLIDER_PX = 92.0
-SLIM_PX = 16.0
+CARD_PX = 66.0  # height of a card with the gap to the next one, at 1×
+COMPACT_PX = 7.0  # padding of a compact row, at 1×
+SLIDER_PX = 92.0  # width of its slider
+SLIM_PX = 16.0  # height of its slider
 _MENU = "menu of a layer"
 _MENU_ITEMS = (
     *("rename", "duplicate", "replace", "again", "", "remove", ""),
     *("limit_to_selection", "select_painted", "", "reset", ""),
     *("group", "select_layers", "reset_all"),
 )
-_OF_ONE = ("rename", "duplicate", "replace", "again", "remove", "limit_to_selection", "select_painted")
-"""Actions that are told which layer; the others are about all that are selected."""
+_LAYER_ACTIONS = ("rename", "duplicate", "replace", "again", "remove", "limit_to_selection", "select_painted")
+"""Actions that receive the layer's index. The others apply to all selected layers."""
 
 
 @dataclass(frozen=True)
 class CardTouch:
-    """What the hand does with one card."""
+    """User input on one card."""
 
-    touched: bool = False  # it becomes the focused layer, unless `press` says otherwise
-    drag: str = ""  # of its name, see `grip`
-    press: str = ""  # of `layer_selection.PRESSES`; "" where no button went down on it
-    named: bool = False  # the button is down on its name
+    touched: bool = False  # the layer becomes the focused one, unless `press` changes that
+    drag: str = ""  # drag of its name, see `grip`
+    press: str = ""  # one of `layer_selection.PRESSES`; "" if no button was pressed
+    named: bool = False  # the button is down on the name
 
 
 def draw_card(
@@ -117,12 +116,13 @@ def draw_card(
     ui: UiContext,
     actions: list[str],
 ) -> tuple[Workspace, CardTouch]:
-    """One card: eye, thumbnail, name and value, under the mouse toggles; the slider; unfolded, the details.
+    """Draw the card of a layer: visibility, thumbnail, name, value and slider. Return the changed state.
 
-    Where cards are compact, a row with the eye, the swatch, the name, a short slider and the value.
+    A hovered card has toggles, an unfolded one shows the details. A compact row has visibility, swatch, name,
+    a short slider and the value.
 
     Args:
-        active: the layer takes part in the picture
+        active: the layer is visible in the picture
         rows: one per .gdf, indexed by `LayerState.gdf`
         texture: GL name of the edit's thumbnail, 0 before it is drawn
     """
@@ -133,7 +133,7 @@ def draw_card(
     focused = work.focus == index
     selected = focused or layer.gdf in work.selected
     row = rows[layer.gdf]
-    most = largest_strength(work.view)
+    max_strength = largest_strength(work.view)
     imgui.push_id(index)
     canvas = imgui.get_window_draw_list()
     clip = canvas.get_clip_rect_min(), canvas.get_clip_rect_max()
@@ -160,12 +160,12 @@ def draw_card(
                 scale,
                 fill=p.accent if selected else p.faint,
                 active=active,
-                most=most,
+                most=max_strength,
                 height=SLIM_PX if compact else slider.HEIGHT_PX,
             )
             touched = touch.touched or imgui.is_item_active()
         _number(number_at, strength, active, compact)
-        if strength != layer.strength:  # a new state takes its time, and most cards rest
+        if strength != layer.strength:  # building a new state is slow, and most cards do not change
             work = _change_layer(work, index, lambda old: replace(old, strength=strength))
         if layer.gdf in work.view.unfolded:
             work = _about(work, index, row, ui)
@@ -178,12 +178,12 @@ def draw_card(
         press = _press(touch.named) if over and imgui.is_mouse_clicked(imgui.MouseButton_.left.value) else ""
         several = len(work.selected) if selected else 0
         alone = imgui.get_id("alone")
-        if press:  # one of several may be dragged with the others: a click makes it the only one as it ends
+        if press:  # a press starts a drag of all selected layers; a click selects this one on release
             imgui.get_state_storage().set_bool(alone, press == "one" and several > 1)
             press = "keep" if press == "one" and several > 1 else press
         if touch.drag == "clicked" and imgui.get_state_storage().get_bool(alone):
             press = "one"
-        down = imgui.is_mouse_down(imgui.MouseButton_.left.value)  # then the right button cancels its drag
+        down = imgui.is_mouse_down(imgui.MouseButton_.left.value)  # then the right button cancels the drag
         if over and not down and imgui.is_mouse_clicked(imgui.MouseButton_.right.value):
             press = "keep"
             imgui.open_popup(_MENU)
@@ -199,9 +199,9 @@ def _change_layer(work: Workspace, index: int, change: Callable[[LayerState], La
 
 
 def _press(named: bool) -> str:
-    """What the press on the card does to the selection, of `layer_selection.PRESSES`.
+    """Return the press's effect on the selection, one of `layer_selection.PRESSES`.
 
-    On a button or a slider the modifiers have their own sense.
+    On buttons and sliders the modifiers have their own meaning.
     """
     if imgui.is_any_item_active() and not named:
         return "keep"
@@ -212,11 +212,11 @@ def _press(named: bool) -> str:
 def _menu(
     state: ViewState, index: int, row: LayerRow, several: int, ui: UiContext, actions: list[str]
 ) -> None:
-    """What can be done with a layer as a whole.
+    """Draw the context menu of a layer.
 
     Args:
-        row: of its .gdf
-        several: how many layers are selected with it, 0 for it alone
+        row: data of its .gdf
+        several: number of layers selected with it, 0 for this one alone
     """
     with menu(_MENU, ui) as is_open:
         unknown = is_open and with_settings(NewEdit(), row.instruction) is None
@@ -228,8 +228,8 @@ def _menu(
                 imgui.separator()
             else:
                 name = f"Delete {several} layers" if action == "remove" and several > 1 else ""
-                asked = f"{action}:{index}" if action in _OF_ONE else action
-                actions += [asked] * menu_item(action, enabled=action not in off, name=name)
+                request = f"{action}:{index}" if action in _LAYER_ACTIONS else action
+                actions += [request] * menu_item(action, enabled=action not in off, name=name)
 
 
 def _group_menu(state: ViewState, layer: LayerState, ui: UiContext, actions: list[str]) -> None:
@@ -245,7 +245,7 @@ def _group_menu(state: ViewState, layer: LayerState, ui: UiContext, actions: lis
 
 
 def _focus_bar(clip: tuple[imgui.ImVec2, imgui.ImVec2], color: Rgba, scale: float) -> None:
-    """A stripe along the left edge of the card that is being drawn, in the panel's clip."""
+    """Draw a stripe along the left edge of the current card, within the panel's clip rectangle."""
     canvas = imgui.get_window_draw_list()
     corner = imgui.get_window_pos()
     edge = (corner.x + 3 * scale, corner.y + imgui.get_window_size().y)
@@ -257,8 +257,8 @@ def _focus_bar(clip: tuple[imgui.ImVec2, imgui.ImVec2], color: Rgba, scale: floa
 def _head(
     work: Workspace, index: int, row: LayerRow, active: bool, texture: int, ui: UiContext, actions: list[str]
 ) -> tuple[Workspace, CardTouch]:
-    """Eye, thumbnail, name, toggles, and last the place of the number, which is drawn when the slider has its
-    value."""
+    """Draw visibility, thumbnail, name and toggles. Reserve the number's place; it is drawn once the
+    slider has its value."""
     scale = ui.scale
     compact = is_compact(work)
     layer = work.view.layers[index]
@@ -281,10 +281,10 @@ def _head(
     over = imgui.is_window_hovered(imgui.HoveredFlags_.allow_when_blocked_by_active_item.value)
     over |= ui.keyboard == "panel" and work.focus == index
     toggles = 0 if compact else 5 if over else 2 if layer.locked else int(layer.solo)
-    taken = SLIDER_PX * scale if compact else toggles * TOGGLE_PX * scale
-    work, touch = _name(work, index, end - taken - 4.0 * scale - imgui.get_cursor_pos_x(), active, ui)
+    reserved = SLIDER_PX * scale if compact else toggles * TOGGLE_PX * scale
+    work, touch = _name(work, index, end - reserved - 4.0 * scale - imgui.get_cursor_pos_x(), active, ui)
     if toggles:
-        imgui.same_line(end - taken)
+        imgui.same_line(end - reserved)
         _toggles(work, index, over, ui, actions)
     imgui.same_line(right - number_width)
     imgui.dummy((number_width, imgui.get_frame_height()))
@@ -295,7 +295,8 @@ def _head(
 
 
 def _toggles(work: Workspace, index: int, over: bool, ui: UiContext, actions: list[str]) -> None:
-    """Menu, brush, details, lock and solo; of the last two what is on, where the mouse is elsewhere."""
+    """Draw the buttons for menu, brush, details, lock and solo. Without hover, show only lock and solo
+    that are on."""
     view = work.view
     layer = work.view.layers[index]
     side = TOGGLE_PX * ui.scale
@@ -325,21 +326,21 @@ def _toggles(work: Workspace, index: int, over: bool, ui: UiContext, actions: li
     if "menu" in pressed:
         imgui.open_popup(_MENU)
     else:
-        actions += pressed  # of the focused layer, which this one has become
+        actions += pressed  # they apply to the focused layer, which is now this one
 
 
 def _thumbnail(
     work: Workspace, index: int, row: LayerRow, texture: int, active: bool, ui: UiContext
 ) -> Workspace:
-    """The edit by itself, rendered; the mouse on it tells what it is, and shows what it shares."""
+    """Draw the rendered thumbnail of the edit. Hovering it shows the details and highlights the region."""
     side, (x, y) = THUMBNAIL_PX * ui.scale, imgui.get_cursor_screen_pos()
     imgui.dummy((side, side))
     picture(texture, (x, y), (x + side, y + side), 3.0 * ui.scale, 1.0 if active else 0.4)
-    return _tell(work, index, row)
+    return _region_tooltip(work, index, row)
 
 
-def _tell(work: Workspace, index: int, row: LayerRow) -> Workspace:
-    """The details as the tip of the last item, which shows the layer's region in the picture."""
+def _region_tooltip(work: Workspace, index: int, row: LayerRow) -> Workspace:
+    """Show the details as the tooltip of the last item, and highlight the layer's region in the picture."""
     if imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value):
         work = replace(work, pointed=("layer", index))
     tip(_details(work, index, row))
@@ -347,10 +348,10 @@ def _tell(work: Workspace, index: int, row: LayerRow) -> Workspace:
 
 
 def _details(work: Workspace, index: int, row: LayerRow) -> str:
-    """What the layer is, a line each: its size, what was asked for, what it shares."""
+    """Return the details of the layer, one per line: size, instruction, overlap with other layers."""
     about = f"{'Draft  ·  ' * row.draft}{with_added(row.count, row.added)} splats"
-    kind, _, rest = row.instruction.partition(":")
-    about += f"  ·  {kind.capitalize()} {rest}" if kind else ""
+    kind, _, argument = row.instruction.partition(":")
+    about += f"  ·  {kind.capitalize()} {argument}" if kind else ""
     shares = (
         f"Shares {'all' if count == row.count else group_digits(count)} with {layer.name}"
         for i, layer in enumerate(work.view.layers)
@@ -360,12 +361,12 @@ def _details(work: Workspace, index: int, row: LayerRow) -> str:
 
 
 def _about(work: Workspace, index: int, row: LayerRow, ui: UiContext) -> Workspace:
-    """The details in small text, and the mean color of the edit."""
+    """Draw the details in small text, and the mean color of the edit."""
     swatch(row.swatch, 1.0, True, ui)
     imgui.same_line()
     imgui.set_cursor_pos_y(imgui.get_cursor_pos_y() + 5.0 * ui.scale)
     wrapped_text(_details(work, index, row), PALETTE.dim)
-    return _tell(work, index, row)
+    return _region_tooltip(work, index, row)
 
 
 def _digits(strength: float, compact: bool) -> str:
@@ -377,17 +378,17 @@ def _number_width(layer: LayerState, compact: bool) -> float:
 
 
 def _number(corner: imgui.ImVec2, strength: float, active: bool, compact: bool) -> None:
-    """The strength in the card's upper right corner; every digit is equally wide."""
-    beyond = PALETTE.warning if strength > 1.0 else PALETTE.text
+    """Draw the strength in the card's upper right corner. All digits have the same width."""
+    color = PALETTE.warning if strength > 1.0 else PALETTE.text
     at = (corner.x, corner.y + imgui.get_style().frame_padding.y)
     text = _digits(strength, compact)
-    imgui.get_window_draw_list().add_text(at, u32(beyond if active else PALETTE.dim), text)
+    imgui.get_window_draw_list().add_text(at, u32(color if active else PALETTE.dim), text)
 
 
 def _name(
     work: Workspace, index: int, room: float, active: bool, ui: UiContext
 ) -> tuple[Workspace, CardTouch]:
-    """The name: dragged it moves the card, double-clicked it becomes a text field."""
+    """Draw the name. A drag moves the card, a double click opens a text field."""
     layer = work.view.layers[index]
     if work.renaming == index:
         text = typed_name(layer.name, room)
@@ -408,7 +409,7 @@ def _name(
     marks = f"{Icon.LOCKED} " * (layer.locked and compact) + f"{Icon.SOLO} " * (layer.solo and compact)
     imgui.get_window_draw_list().add_text(at, u32(color), elide(marks + layer.name, room))
     if imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value):
-        work = replace(work, pointed=("layer", index))  # the picture shows its region
+        work = replace(work, pointed=("layer", index))  # highlights its region in the picture
     tip(f"{layer.name}\nDrag to reorder, double-click to rename ({shortcut('rename')})")
     double = imgui.is_mouse_double_clicked(imgui.MouseButton_.left.value) and _press(named) == "one"
     if imgui.is_item_hovered() and double:

@@ -1,4 +1,4 @@
-"""The stack of edits in the panel: cards under the rows of their groups, the search, the selected layers."""
+"""Layer stack in the panel: cards under their group rows, the search field, the selected layers."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ from viewer.ui.widgets import (
 from . import slider
 from .card import COMPACT_PX, SLIDER_PX, SLIM_PX, draw_card
 
-MASTER_PX = 20.0  # of its slider, at 1×
+MASTER_PX = 20.0  # height of its slider, at 1×
 UNSEARCHED = 6
-"""Layers that one finds without a search."""
+"""Number of layers above which the search field is shown."""
 _BUTTONS = ("group", "reset")
 
 
 def draw_search(work: Workspace, ui: UiContext) -> str:
-    """The field of the search, where there are many layers; what is typed."""
+    """Draw the search field, if there are many layers, and return its text."""
     if not (len(work.view.layers) > UNSEARCHED or work.searching or work.search):
         return work.search
     side = imgui.get_frame_height()
@@ -80,7 +80,7 @@ def selection_height(chosen: Sequence[int], ui: UiContext) -> float:
 
 
 def draw_selection(state: ViewState, chosen: Sequence[int], ui: UiContext, actions: list[str]) -> None:
-    """The strength of several selected layers and what is done with all of them, under the cards."""
+    """Draw the strength of several selected layers and their actions, under the cards."""
     if len(chosen) < 2:
         return
     imgui.separator()
@@ -93,7 +93,7 @@ def draw_selection(state: ViewState, chosen: Sequence[int], ui: UiContext, actio
     tip("Group, reset")
     imgui.pop_style_var()
     value = master_strength(state, chosen)
-    most = largest_strength(state)
+    max_strength = largest_strength(state)
     number = imgui.calc_text_size(f"{value:.3f}").x
     with inert(all(state.layers[i].locked for i in chosen)):
         at = imgui.get_cursor_screen_pos()
@@ -102,7 +102,15 @@ def draw_selection(state: ViewState, chosen: Sequence[int], ui: UiContext, actio
             "Strength of all selected layers: that of the strongest; the others keep their proportion to it"
         )
         new = slider.draw(
-            "##master", value, (), room, ui.scale, PALETTE.accent, most=most, height=MASTER_PX, help_=help_
+            "##master",
+            value,
+            (),
+            room,
+            ui.scale,
+            PALETTE.accent,
+            most=max_strength,
+            height=MASTER_PX,
+            help_=help_,
         )
     corner = (at.x + room + 8.0 * ui.scale, at.y)
     imgui.get_window_draw_list().add_text(corner, u32(PALETTE.text), f"{new:.3f}")
@@ -117,9 +125,9 @@ _ITEMS = (("Rename…", "", ""), ("Select its layers", "select_layers", ""), ("U
 def draw_group(
     state: ViewState, group: LayerGroup, count: int, ui: UiContext, actions: list[str]
 ) -> tuple[ViewState, str]:
-    """The row of a group of `count` layers; the changed state, and what the hand does with it, see `grip`.
+    """Draw the row of a group of `count` layers; return the changed state and the gesture, see `grip`.
 
-    What was asked for goes into `actions`.
+    Requested actions are appended to `actions`.
     """
     scale = ui.scale
     folded = group.name in state.collapsed
@@ -165,9 +173,9 @@ def draw_group(
 def _group_name(
     state: ViewState, group: LayerGroup, count: int, room: float, ui: UiContext, actions: list[str]
 ) -> tuple[tuple[float, float], str]:
-    """The name and its menu; the corner of its text, and what the hand does with it.
+    """Draw the name and its menu; return the corner of its text, and the gesture.
 
-    A click selects the layers, a second one renames, a drag moves them.
+    A click selects the layers, a double click renames the group, a drag moves the layers.
     """
     x, y = imgui.get_cursor_screen_pos()
     corner = (x, y + imgui.get_style().frame_padding.y)
@@ -192,9 +200,9 @@ def _group_name(
     return corner, gesture
 
 
-HEADING_PX = 34.0  # at 1×: above the cards
+HEADING_PX = 34.0  # height above the cards, at 1×
 _DRAGS = ("dragged", "dropped")
-INSET_PX = 10.0  # of a group's layers, at 1×
+INSET_PX = 10.0  # indentation of a group's layers, at 1×
 BLEND_TITLES = {"normalized": "Average", "sum": "Add", "over": "Over", "adjust": "Adjust"}
 BLEND_HELP = {
     "normalized": "Overlapping edits are averaged by weight; never more than a full edit.",
@@ -206,17 +214,17 @@ BLEND_HELP = {
 
 @dataclass(frozen=True)
 class _Row:
-    """A card in the list, or the row over a group."""
+    """Card in the list, or row of a group."""
 
     top: float  # window pixels
     bottom: float
-    layers: tuple[int, ...]  # places of what is dragged with it, in `ViewState.layers`
-    group: str  # its own, or that of its layer
-    heads: bool = False  # it is the row over a group
+    layers: tuple[int, ...]  # indices in `ViewState.layers` that are dragged with it
+    group: str  # the group's name, or that of its layer's group
+    heads: bool = False  # the row is that of a group
 
 
 def draw_heading(work: Workspace, ui: UiContext, actions: list[str]) -> Workspace:
-    """The heading of the stack: a new edit, and the menu of what is about all layers."""
+    """Draw the heading of the stack, with the button for a new edit and the menu for all layers."""
     right = right_edge()
     work = replace(work, layout=section("Edits", work.layout, ui))
     side = imgui.get_frame_height()
@@ -237,7 +245,7 @@ def draw_heading(work: Workspace, ui: UiContext, actions: list[str]) -> Workspac
 
 
 def _choose_rules(work: Workspace, ui: UiContext, actions: list[str]) -> ViewState:
-    """What the menu is about: the blend rule, overshoot, compact rows."""
+    """Draw the menu for all layers: blend rule, overshoot, compact rows. Return the changed state."""
     state = work.view
     imgui.text_disabled(f"Where edits overlap ({shortcut('blend')})")
     for blend in BLENDS:
@@ -260,12 +268,12 @@ def draw(
     ui: UiContext,
     actions: list[str],
 ) -> Workspace:
-    """All cards, under the rows of their groups.
+    """Draw all cards, under their group rows, and return the changed workspace.
 
     Args:
         rows: one per .gdf, indexed by `LayerState.gdf`
         thumbnails: GL names of their pictures in the same order, 0 before one is drawn
-        reveal: scroll to the focused layer, and to what is cut of the selected ones
+        reveal: scroll to the focused layer, and to partly visible selected ones
     """
     if not (work.view.layers or work.jobs or work.form_open):
         with imgui_ctx.push_text_wrap_pos(0.0):
@@ -281,11 +289,11 @@ def draw(
     if "Edits" in work.layout.folded:
         return work
     texts = [f"{row.region} {row.instruction}" for row in rows]
-    # as seen: the top layer, which is the last one, first
+    # on-screen order: the top layer, which is the last one, comes first
     listed = filter_layers(work.view, texts, work.search)[::-1]
     focus = work.focus
     group = ""
-    # one of the lines, and what the hand does with it
+    # index in `lines` of the dragged row, and its gesture
     dragged = -1
     gesture = ""
     lines: list[_Row] = []
@@ -335,7 +343,7 @@ def draw(
 
 
 def _group(state: ViewState, name: str, ui: UiContext, actions: list[str]) -> tuple[ViewState, str]:
-    """The row of a group, see `draw_group`; one that only its layers know becomes as any other."""
+    """Draw the row of a group, see `draw_group`; add a group that only its layers name."""
     group = next((group for group in state.groups if group.name == name), LayerGroup(name))
     if group not in state.groups:
         state = replace(state, groups=(*state.groups, group))
@@ -343,7 +351,7 @@ def _group(state: ViewState, name: str, ui: UiContext, actions: list[str]) -> tu
 
 
 def _tighten(work: Workspace, ui: UiContext) -> None:
-    """Compact rows lie closer together."""
+    """Reduce the gap under compact rows."""
     if is_compact(work):
         imgui.set_cursor_pos_y(imgui.get_cursor_pos_y() - 3.0 * ui.scale)
 
@@ -351,14 +359,14 @@ def _tighten(work: Workspace, ui: UiContext) -> None:
 def _drag(
     work: Workspace, focus: int | None, rows: Sequence[_Row], dragged: int, gesture: str, ui: UiContext
 ) -> tuple[ViewState, int | None]:
-    """The state and the focused layer after a drag of a row: all selected layers go with one of them."""
+    """Return the state and the focused layer after a drag of a row. All selected layers move together."""
     state = work.view
     layers = rows[dragged].layers
     chosen = selected_layers(work)
     if not rows[dragged].heads and layers[0] in chosen:
         layers = chosen
-    y, at, group = _nearest_gap(state, rows, layers, rows[dragged].heads, imgui.get_mouse_pos().y)
-    moved = move_layers(state, layers, at, group)
+    y, index, group = _nearest_gap(state, rows, layers, rows[dragged].heads, imgui.get_mouse_pos().y)
+    moved = move_layers(state, layers, index, group)
     if gesture == "dragged":
         _show_place(y if moved.layers != state.layers else None, bool(group), layers, rows, ui)
         return state, focus
@@ -371,36 +379,36 @@ def _drag(
 def _nearest_gap(
     state: ViewState, rows: Sequence[_Row], layers: Sequence[int], whole: bool, mouse: float
 ) -> tuple[float, int, str]:
-    """Where what is dragged would lie: the line's height, how many layers there are below, the group joined.
+    """Return the nearest drop target: the line's height, the number of layers below, and the joined group.
 
     Args:
-        layers: that are dragged
-        whole: as a group, which lies in no other
-        mouse: the hand's height
+        layers: the dragged layers
+        whole: they are dragged as a group; groups do not nest
+        mouse: height of the pointer, window pixels
     """
     groups = {state.layers[i].group for i in layers}
     gap, gaps = imgui.get_style().item_spacing.y / 2, [(rows[0].top, max(rows[0].layers) + 1, "")]
-    for over, row in pairwise(rows):
-        inside = bool(row.group) and over.group == row.group
+    for above, row in pairwise(rows):
+        inside = bool(row.group) and above.group == row.group
         if inside and whole and {row.group} != groups:
             continue
-        group = row.group if inside else over.group if not over.heads and {over.group} == groups else ""
+        group = row.group if inside else above.group if not above.heads and {above.group} == groups else ""
         gaps.append((row.top, max(row.layers) + 1, "" if whole else group))
     last = rows[-1]
     stays = bool(last.group) and not (whole or last.heads) and {last.group} == groups
     gaps.append((last.bottom + 2 * gap, min(last.layers), last.group if stays else ""))
-    if stays:  # half a row further down it leaves the group
+    if stays:  # half a row below the end, the layer leaves the group
         gaps.append((last.bottom + 2 * gap + imgui.get_frame_height() / 2, min(last.layers), ""))
-    y, at, group = min(gaps, key=lambda candidate: abs(candidate[0] - gap - mouse))
-    return y - gap, at, group
+    y, index, group = min(gaps, key=lambda candidate: abs(candidate[0] - gap - mouse))
+    return y - gap, index, group
 
 
 def _show_place(
     y: float | None, joins: bool, layers: Collection[int], rows: Sequence[_Row], ui: UiContext
 ) -> None:
-    """A veil over what is dragged and a line where it would lie; near an edge the list scrolls."""
+    """Dim the dragged rows and draw a line at the drop target. Scroll the list near its edges."""
     imgui.set_mouse_cursor(imgui.MouseCursor_.resize_ns)
-    # that is over the cards
+    # drawn over the cards
     below = imgui.get_window_draw_list()
     canvas = imgui.get_foreground_draw_list()
     canvas.push_clip_rect(below.get_clip_rect_min(), below.get_clip_rect_max())

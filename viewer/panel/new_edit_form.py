@@ -1,4 +1,4 @@
-"""The form of a new edit: region, editor and its few settings, its picture's strength, and Train."""
+"""Form of a new edit: region, editor with its settings, preview, and the Train button."""
 
 from __future__ import annotations
 
@@ -64,25 +64,25 @@ _GRADES = {
 
 
 def draw(work: Workspace, count: int, preview: PreviewState, ui: UiContext, actions: list[str]) -> Workspace:
-    """The form, if it is open. Tab goes through it, Enter trains, Escape closes it.
+    """Draw the form if it is open. Tab moves through it, Enter trains, Escape closes it.
 
     Args:
-        count: Gaussians in the scene
-        preview: what the editor's picture is at
+        count: number of Gaussians in the scene
+        preview: state of the preview
     """
     if not work.form_open:
         return work
     with card(_NAME, PALETTE.card_focused, ui, nav=True):
         storage = imgui.get_state_storage()
         listed = imgui.get_id("a list is open")
-        # else Enter and Escape are the list's
+        # otherwise an open list handles Enter and Escape
         mine = imgui.is_window_focused() and not storage.get_bool(listed)
         closes = mine and imgui.is_key_pressed(imgui.Key.escape, False)
         trains = mine and any(imgui.is_key_pressed(key, False) for key in _ENTER)
         if mine and not imgui.get_io().want_text_input:
-            for key in _ENTER:  # presses no button and opens no list
+            for key in _ENTER:  # keep Enter from pressing buttons and opening lists
                 imgui.internal.set_key_owner(key, listed)
-        if closes:  # without the fields, which would take back what was typed
+        if closes:  # skip the fields, which would undo the typing
             actions.append("new_edit")
         else:
             form, action = _content(work, count, preview, ui)
@@ -97,14 +97,16 @@ _ENTER = (imgui.Key.enter, imgui.Key.keypad_enter)
 
 
 def has_keyboard() -> bool:
-    """Whether keys are the form's: it was opened, or clicked, last."""
+    """Return whether the form has the keyboard: it was opened or clicked last."""
     window = imgui.get_current_context().nav_window
     return window is not None and window.was_active and f"/{_NAME}_" in window.name
 
 
 def _content(work: Workspace, count: int, preview: PreviewState, ui: UiContext) -> tuple[NewEdit, str]:
-    """The form as the hand leaves it, and what was asked for: "train", "paint_over", "new_edit" to close it,
-    or ""."""
+    """Draw the form; return the changed form and the requested action.
+
+    The action is "train", "paint_over", "new_edit" to close the form, or "" for none.
+    """
     form = work.form
     selection = work.view.selection
     action = ""
@@ -122,9 +124,9 @@ def _content(work: Workspace, count: int, preview: PreviewState, ui: UiContext) 
     form = _settings(form, preview, column, ui)
     if form.choice.setting == "sentence":
         if replace(form, asks=0, anchor="") != replace(work.form, asks=0, anchor=""):
-            form = replace(form, asks=0, anchor="")  # a picture of something else
-        form, asked = _anchor(form, preview, column)
-        action = action or asked
+            form = replace(form, asks=0, anchor="")  # the picture belonged to other settings
+        form, requested = _anchor(form, preview, column)
+        action = action or requested
     if work.form_opening:
         imgui.set_keyboard_focus_here()
     form = replace(form, name=_text_row("Name", form.suggested_name, form.name, column))
@@ -144,7 +146,7 @@ def _content(work: Workspace, count: int, preview: PreviewState, ui: UiContext) 
 
 
 def _region_title(region: str, selection: SelectionState, count: int) -> str:
-    """A region in the list, with how much it holds."""
+    """Return a region's title in the list, with the number of its Gaussians."""
     sizes = {known.name: known.count for known in selection.regions}
     match region:
         case "all":
@@ -165,9 +167,9 @@ def _region(form: NewEdit, selection: SelectionState, count: int, column: float,
     offered = [SELECTION] * bool(selection.count) + [known.name for known in selection.regions] + [ALL, TYPED]
     offered = [CHANGED] * (form.choice.kind == "pictures") + offered
     titles = [_region_title(region, selection, count) for region in offered]
-    now = offered.index(form.region) if form.region in offered else None
+    current = offered.index(form.region) if form.region in offered else None
     title = elide(_region_title(form.region, selection, count), room)
-    pressed = drop_down("##region", title, titles, now, ui, "What may change")
+    pressed = drop_down("##region", title, titles, current, ui, "What may change")
     form = form if pressed is None else replace(form, region=offered[pressed], error="")
     if form.region == TYPED:
         form = replace(form, typed_region=_text_row("", "sphere:0,0,0,1", form.typed_region, column))
@@ -176,7 +178,7 @@ def _region(form: NewEdit, selection: SelectionState, count: int, column: float,
 
 
 def _editor(form: NewEdit, action: str, column: float, ui: UiContext) -> tuple[NewEdit, str]:
-    """The list of editors; first of all what takes this view to another program ("paint_view")."""
+    """Draw the list of editors. Its first entry opens this view in another program ("paint_view")."""
     label("Editor", column)
     imgui.set_next_item_width(-1.0)
     missing = ["", *map(missing_package, EDITORS)]
@@ -188,16 +190,16 @@ def _editor(form: NewEdit, action: str, column: float, ui: UiContext) -> tuple[N
         helps.append(editor.help)
     tips = [reason or help_ for reason, help_ in zip(missing, helps, strict=True)]
     faint = [i for i, reason in enumerate(missing) if reason]
-    now = form.editor + 1
+    current = form.editor + 1
     help_ = form.choice.help
-    pressed = drop_down("##editor", form.choice.title, titles, now, ui, help_, tips, faint)
+    pressed = drop_down("##editor", form.choice.title, titles, current, ui, help_, tips, faint)
     if pressed is None:
         return form, action
     return (with_editor(form, pressed - 1), action) if pressed else (form, "paint_view")
 
 
 def _settings(form: NewEdit, preview: PreviewState, column: float, ui: UiContext) -> NewEdit:
-    """What this editor is asked."""
+    """Draw the settings of the chosen editor and return the changed form."""
     match form.choice.setting:
         case "color":
             label("Color", column)
@@ -239,23 +241,27 @@ def _settings(form: NewEdit, preview: PreviewState, column: float, ui: UiContext
 
 
 def _palette(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
-    """The region's main colors; another one is chosen for any, also for one that is picked in the picture."""
+    """Draw the region's main colors. Each can be changed, and the user can pick one in the picture."""
     label("Palette", column)
     flags = imgui.ColorEditFlags_
     side = imgui.get_frame_height()
     pairs = list(form.palette)
     canvas = imgui.get_window_draw_list()
     room = right_edge() - side - imgui.get_cursor_pos_x()
-    wide = min(room / max(len(pairs), 1) - 2.0 * ui.scale, 34.0 * ui.scale)
+    button_width = min(room / max(len(pairs), 1) - 2.0 * ui.scale, 34.0 * ui.scale)
     for i, (source, target) in enumerate(pairs):
-        becomes, _, curve = target.partition("/")
-        (x, y), color = imgui.get_cursor_screen_pos(), (*parse_color(becomes).tolist(), 1.0)
-        if imgui.color_button(f"##color {i}", color, flags.no_tooltip.value, imgui.ImVec2(wide, side)):
+        new_color, _, curve = target.partition("/")
+        (x, y), color = imgui.get_cursor_screen_pos(), (*parse_color(new_color).tolist(), 1.0)
+        if imgui.color_button(
+            f"##color {i}", color, flags.no_tooltip.value, imgui.ImVec2(button_width, side)
+        ):
             form = replace(form, picked=i)
         if imgui.is_item_clicked(1):
             pairs[i] = source, source
-        tip(f"{source} becomes {becomes}; right-click: as it was" if source != target else f"{source} stays")
-        if source != target:  # what it was, in a corner
+        tip(
+            f"{source} becomes {new_color}; right-click: as it was" if source != target else f"{source} stays"
+        )
+        if source != target:  # original color, in a corner
             low = (x, y + side)
             corner = u32((*parse_color(source).tolist(), 1.0))
             canvas.add_triangle_filled((x, y + side / 2), low, (x + side / 2, y + side), corner)
@@ -263,9 +269,9 @@ def _palette(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
             imgui.open_popup(f"color {i}")
             form = replace(form, picked=-1)
         if imgui.begin_popup(f"color {i}"):
-            shown = flags.display_hex.value | flags.no_side_preview.value
-            changed, chosen = imgui.color_picker3("##picker", parse_color(becomes).tolist(), shown)
-            parts = hex_color(chosen) if changed else becomes, _curve(curve, column, ui)
+            picker_flags = flags.display_hex.value | flags.no_side_preview.value
+            changed, chosen = imgui.color_picker3("##picker", parse_color(new_color).tolist(), picker_flags)
+            parts = hex_color(chosen) if changed else new_color, _curve(curve, column, ui)
             pairs[i] = source, "/".join(filter(None, parts))
             imgui.end_popup()
         imgui.same_line(0.0, 2.0 * ui.scale)
@@ -276,9 +282,10 @@ def _palette(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
 
 
 def _curve(curve: str, column: float, ui: UiContext) -> str:
-    """Lightness after over lightness before: a press makes a point and drags it.
+    """Draw a curve from original to new lightness and return it. A press adds a point and drags it.
 
-    By keys Space goes to the next point, behind the last to a new one in the widest gap; arrows move it.
+    By keyboard, Space selects the next point, after the last one a new one in the widest gap. The arrow keys
+    move it.
     """
     label("Curve", column)
     tall = _CURVE_PX * ui.scale
@@ -300,7 +307,7 @@ def _curve(curve: str, column: float, ui: UiContext) -> str:
     near = min(range(len(points)), key=lambda i: apart(points[i]), default=-1)
     near = near if near >= 0 and apart(points[near]) <= reach else -1
     near = chosen if keyed else near
-    if goes_on := keyed and imgui.is_key_pressed(key.space, False):
+    if adds_point := keyed and imgui.is_key_pressed(key.space, False):
         ends = [0.0, *(across for across, _ in points), 1.0]
         widest = max(range(len(points) + 1), key=lambda i: ends[i + 1] - ends[i])
         middle = torch.tensor((ends[widest] + ends[widest + 1]) / 2)
@@ -309,7 +316,7 @@ def _curve(curve: str, column: float, ui: UiContext) -> str:
     if imgui.is_item_clicked(1) or (keyed and imgui.is_key_pressed(key.delete)):
         points = [point for i, point in enumerate(points) if i != near]
         storage.set_int(held, -1)
-    elif imgui.is_item_clicked(0) or goes_on:
+    elif imgui.is_item_clicked(0) or adds_point:
         if near < 0 and len(points) < _MAX_POINTS and all(abs(p[0] - at[0]) > _MIN_GAP for p in points):
             points = sorted([*points, (round(at[0], 2), round(at[1], 2))])
             near = min(range(len(points)), key=lambda i: apart(points[i]))
@@ -327,8 +334,8 @@ def _curve(curve: str, column: float, ui: UiContext) -> str:
     canvas.add_rect_filled(imgui.ImVec2(x, y), imgui.ImVec2(x + wide, y + tall), u32(p.field), 4.0 * ui.scale)
     canvas.add_line(imgui.ImVec2(x, y + tall), imgui.ImVec2(x + wide, y), u32(p.chosen), ui.scale)
     steps = [i / 48 for i in range(49)]
-    shown = bend_lightness(torch.tensor(steps), points).tolist()
-    line = [imgui.ImVec2(x + wide * s, y + tall * (1.0 - l)) for s, l in zip(steps, shown, strict=True)]
+    bent = bend_lightness(torch.tensor(steps), points).tolist()
+    line = [imgui.ImVec2(x + wide * s, y + tall * (1.0 - l)) for s, l in zip(steps, bent, strict=True)]
     canvas.add_polyline([*line], u32(p.handle), 1.5 * ui.scale, 0)
     for i, (across, up) in enumerate(points):
         center = imgui.ImVec2(x + wide * across, y + tall * (1.0 - up))
@@ -337,18 +344,18 @@ def _curve(curve: str, column: float, ui: UiContext) -> str:
 
 
 def _model(form: NewEdit, preview: PreviewState, column: float, ui: UiContext) -> NewEdit:
-    """Which model paints a sentence."""
+    """Draw the list of diffusion models."""
     label("Model", column)
     imgui.set_next_item_width(-1.0)
     models = ["", *preview.models]
     titles = [model.partition("/")[2] or model or "What fits this machine" for model in models]
-    at = models.index(form.model) if form.model in models else 0
-    pressed = drop_down("##model", titles[at], titles, at, ui, "Models on this machine")
+    index = models.index(form.model) if form.model in models else 0
+    pressed = drop_down("##model", titles[index], titles, index, ui, "Models on this machine")
     return form if pressed is None else replace(form, model=models[pressed], asks=0)
 
 
 def _anchor(form: NewEdit, preview: PreviewState, column: float) -> tuple[NewEdit, str]:
-    """The picture that all views follow: painted, painted again, or painted over by hand ("paint_over")."""
+    """Draw the anchor picture that all views follow: paint it, repaint it, or edit it ("paint_over")."""
     label("Anchor", column)
     half = 0.5 * (imgui.get_content_region_avail().x - imgui.get_style().item_spacing.x)
     with inert(bool(form.obstacle) or preview.busy):
@@ -365,15 +372,16 @@ def _anchor(form: NewEdit, preview: PreviewState, column: float) -> tuple[NewEdi
 
 
 def _style(form: NewEdit, preview: PreviewState, ui: UiContext) -> NewEdit:
-    """This view in every style, numbers until they are painted; what agrees best from all sides first."""
+    """Draw a button for every style, with a thumbnail of this view once it is painted. The styles that
+    look most alike from all sides come first."""
     small(f"Painting {form.style}", PALETTE.text)
     gap = 2.0 * ui.scale
     canvas = imgui.get_window_draw_list()
     wide = (imgui.get_content_region_avail().x - (SHEET_COLUMNS - 1) * gap) / SHEET_COLUMNS
     side = imgui.ImVec2(wide, wide * SHEET_PX[1] / SHEET_PX[0])
     rows = -(-len(STYLE_ORDER) // SHEET_COLUMNS)
-    for place, number in enumerate(STYLE_ORDER):
-        row, column = divmod(place, SHEET_COLUMNS)
+    for index, number in enumerate(STYLE_ORDER):
+        row, column = divmod(index, SHEET_COLUMNS)
         if column:
             imgui.same_line(0.0, gap)
         if imgui.button(f"{number}##style", side):
@@ -394,7 +402,7 @@ def _style(form: NewEdit, preview: PreviewState, ui: UiContext) -> NewEdit:
 
 
 def _preview(form: NewEdit, preview: PreviewState, column: float, ui: UiContext) -> NewEdit:
-    """The strength of the editor's own picture, and whether it is shown."""
+    """Draw the preview's visibility and strength, and its state."""
     if not form.choice.pictured:
         if form.choice.setting == "folder":
             small("No picture in advance: this editor takes its time", PALETTE.dim)
@@ -414,12 +422,12 @@ def _preview(form: NewEdit, preview: PreviewState, column: float, ui: UiContext)
     if form.preview and preview.failed:
         wrapped_text(preview.text, PALETTE.error)
     else:
-        small(preview.text or " ", PALETTE.dim)  # always a line, so that nothing below moves
+        small(preview.text or " ", PALETTE.dim)  # always one line, so that nothing below moves
     return form
 
 
 def _text_row(title: str, hint: str, text: str, column: float) -> str:
-    """A text field to the end of its line, with its name at the left."""
+    """Draw a text field to the end of its line, with its name at the left."""
     label(title, column)
     imgui.set_next_item_width(-1.0)
     return str(imgui.input_text_with_hint(f"##text of {title}", hint, text)[1])

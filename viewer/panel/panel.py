@@ -1,4 +1,4 @@
-"""The panel: draws a workspace, returns the changed one. imgui only: no scene, no GL, no files."""
+"""Side panel: draws a workspace and returns the changed one. Uses imgui only: no scene, no GL, no files."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _SHARES = ("export", "export_page", "render_picture", "render_film", "picture")
 
 
 def _menu_button(recent: Sequence[Path], side: float, ui: UiContext, actions: list[str]) -> None:
-    """The menu at the right of the present line; `recent`: files opened before, the last one first."""
+    """Draw the menu at the right of the current line; `recent`: recently opened files, the last one first."""
     room = MAX_PX * ui.scale
     files = [
         (widgets.elide(escape_text(path.name), room), f"open_file:{path}", escape_text(str(path)))
@@ -37,19 +37,19 @@ def _menu_button(recent: Sequence[Path], side: float, ui: UiContext, actions: li
     widgets.tip("Menu")
 
 
-WIDTH_PX = Layout.panel_px  # at 1×, before its edge is dragged
+WIDTH_PX = Layout.panel_px  # initial width, at 1×
 _EDGE_PX = 6.0
 
 
 class Pictures(NamedTuple):
-    """GL names of small pictures, 0 before one is drawn."""
+    """GL names of thumbnails, 0 before one is drawn."""
 
-    snapshots: Sequence[int] = ()  # that of the original first
+    snapshots: Sequence[int] = ()  # the original first
     edits: Sequence[int] = ()  # one per .gdf
 
 
 def width(layout: Layout, ui: UiContext) -> float:
-    """The panel's width in window pixels, at most a little more than half of the window."""
+    """Return the panel's width in window pixels, at most 60 % of the window."""
     return min(layout.panel_px, 0.6 * imgui.get_io().display_size.x / ui.scale) * ui.scale
 
 
@@ -66,14 +66,14 @@ def draw(
     """Draw the panel along the right edge of the display, between `imgui.new_frame` and `imgui.render`.
 
     Args:
-        work: what it shows and changes
-        facts: of the open scene
-        pictures: of snapshots and edits
-        preview: what is said of the picture of a new edit
-        recent: files opened before, the last one first
+        work: the state to show and change
+        facts: data of the open scene
+        pictures: thumbnails of snapshots and edits
+        preview: state of the preview of a new edit
+        recent: recently opened files, the last one first
         reveal: scroll to the focused layer
         ui: fonts and scale
-        actions: takes those that were asked for, see `perform`
+        actions: receives the requested actions, see `perform`
     """
     display = imgui.get_io().display_size
     wide = width(work.layout, ui)
@@ -107,7 +107,7 @@ def draw(
 
 
 def _drag_edge(layout: Layout, ui: UiContext) -> Layout:
-    """The panel's left edge, which is dragged; a double click takes it back to its first place."""
+    """Draw the panel's left edge, which can be dragged. A double click restores the initial width."""
     start, (x, y) = imgui.get_cursor_screen_pos(), imgui.get_window_pos()
     imgui.set_cursor_screen_pos((x, y))
     imgui.invisible_button("edge", (_EDGE_PX * ui.scale, imgui.get_window_height()))
@@ -124,7 +124,7 @@ def _drag_edge(layout: Layout, ui: UiContext) -> Layout:
 
 
 def _begin_body(footer: float, ui: UiContext) -> None:
-    """What scrolls; its scrollbar stands in the panel's margin, so that nothing moves when one is needed."""
+    """Begin the scrolling part. Its scrollbar lies in the panel's margin, so that the content never moves."""
     overflows = imgui.get_state_storage().get_bool(imgui.get_id("overflows"))
     clear = (0.0, 0.0, 0.0, 0.0)
     slots = (imgui.Col_.scrollbar_grab, imgui.Col_.scrollbar_grab_hovered, imgui.Col_.scrollbar_grab_active)
@@ -139,7 +139,7 @@ def _begin_body(footer: float, ui: UiContext) -> None:
 
 
 def _end_body() -> None:
-    # the content's own height: imgui's scroll range is a frame behind it
+    # height of the content: imgui's scroll range lags one frame behind
     overflows = imgui.get_cursor_pos_y() - imgui.get_style().item_spacing.y > imgui.get_window_height()
     imgui.end_child()
     imgui.get_state_storage().set_bool(imgui.get_id("overflows"), overflows)
@@ -148,8 +148,8 @@ def _end_body() -> None:
 def _title(
     work: Workspace, facts: SceneFacts, recent: Sequence[Path], ui: UiContext, actions: list[str]
 ) -> None:
-    """The session's name, after a dot where there are unsaved changes; the scene and its size; the icons."""
-    at = imgui.get_cursor_pos()
+    """Draw the session's name, with a dot for unsaved changes, the scene with its size, and the icons."""
+    corner = imgui.get_cursor_pos()
     side = 24.0 * ui.scale
     scale = ui.scale
     room = imgui.get_content_region_avail().x
@@ -160,7 +160,7 @@ def _title(
     widgets.small(f"{facts.title}  ·  {size}" if work.session else size, PALETTE.dim, text)
     widgets.tip(f"{facts.title}\n{size}")
     below = imgui.get_cursor_pos()
-    imgui.set_cursor_pos((at.x + room - 3 * side, at.y - 2.0 * scale))
+    imgui.set_cursor_pos((corner.x + room - 3 * side, corner.y - 2.0 * scale))
     actions += ["save"] * widgets.icon_button("save", Icon.SAVE, ui, side=side)
     widgets.hint("save")
     imgui.same_line(0.0, 0.0)
@@ -172,7 +172,7 @@ def _title(
     imgui.dummy((0.0, 2.0 * scale))
 
 
-_OF_REGION = "menu of a region"
+_REGION_MENU = "menu of a region"
 _ITEMS = (
     ("Select", "region:{}:new", ""),
     ("Add to selection", "region:{}:add", ""),
@@ -183,7 +183,7 @@ _ITEMS = (
 
 
 def _regions(work: Workspace, ui: UiContext, actions: list[str]) -> Workspace:
-    """The section "Regions", where there are some: a row for each."""
+    """Draw the section "Regions" with a row for each region, if there are any."""
     regions = work.view.selection.regions
     layout = work.layout
     if not regions:
@@ -197,7 +197,7 @@ def _regions(work: Workspace, ui: UiContext, actions: list[str]) -> Workspace:
 
 
 def _row(index: int, region: NamedRegion, ui: UiContext, actions: list[str]) -> bool:
-    """Eye, swatch, name and count; whether the mouse rests on it."""
+    """Draw visibility, swatch, name and count of a region; return whether the mouse hovers it."""
     right = widgets.right_edge()
     scale = ui.scale
     icon = Icon.SHOWN if region.visible else Icon.HIDDEN
@@ -223,19 +223,19 @@ def _row(index: int, region: NamedRegion, ui: UiContext, actions: list[str]) -> 
     if imgui.invisible_button("select", size, nav.value):
         mode = "add" if io.key_shift else "subtract" if io.key_ctrl else "new"
         actions.append(f"region:{index}:{mode}")
-    resting = imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value)
+    hovered = imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value)
     color = u32(PALETTE.text if imgui.is_item_hovered() else PALETTE.dim)
     widgets.tip(f"{region.path}\nClick to select; Shift adds, Ctrl subtracts. Right-click: rename, delete")
     if imgui.is_item_clicked(mouse.right.value):
-        imgui.open_popup(_OF_REGION)
+        imgui.open_popup(_REGION_MENU)
     above = imgui.get_style().frame_padding.y
     canvas.add_text((x, y + above), u32(PALETTE.text), widgets.elide(region.name, room))
     at = (imgui.get_item_rect_max().x - wide, y + above + 1.0 * scale)
     canvas.add_text(ui.fonts.regular, SMALL_PX * scale, at, color, count)
-    for action in widgets.menu_items(_OF_REGION, _ITEMS, ui):
+    for action in widgets.menu_items(_REGION_MENU, _ITEMS, ui):
         actions += [action.format(index)] if action else []
         widgets.start_naming(not action)
-    return bool(resting)
+    return bool(hovered)
 
 
 _FOOT = (("timeline", Icon.FILM), ("picture", Icon.PICTURE), ("help", Icon.HELP))

@@ -1,8 +1,8 @@
-"""The strength slider: 0 is the original, 1 the full edit; ticks where the trajectory was recorded.
+"""Strength slider: 0 is the original, 1 the full edit; ticks mark the recorded strengths.
 
-Press on the track jumps there, press on the handle grabs it, Shift drags ten times finer, Ctrl+click (or a
-click on the number) types a value, a double click goes back to 0. Where overshoot is on it goes beyond 1,
-on a ground that warns.
+A press on the track jumps there, a press on the handle grabs it, and Shift drags ten times finer. Ctrl+click,
+or a click on the number, opens a text field. A double click resets to 0. With overshoot the slider goes
+beyond 1, on a warning color.
 """
 
 from __future__ import annotations
@@ -14,16 +14,17 @@ from imgui_bundle import imgui
 from viewer.ui.context import PALETTE, Rgba, u32
 from viewer.ui.widgets import is_entered, is_released, key_step, tip
 
-HEIGHT_PX = 20.0  # at 1×, as its text field, so that nothing moves when one types
-RADIUS_PX = 7.0  # of the handle
+HEIGHT_PX = 20.0  # at 1×, same as its text field, so that typing moves nothing
+RADIUS_PX = 7.0  # of the handle, at 1×
 FINE = 0.1
 DEFAULT = 0.0
-"""The original; where a double click goes."""
+"""Strength of the original; a double click resets to it."""
 TIP = "Double-click: reset to 0. Ctrl+click: type a value. Shift+drag: fine adjustment."
 
 
 def parse_strength(text: str, most: float = 1.0) -> float | None:
-    """What a person types for a strength, "0.7", "70%", ",7", kept to 0..`most`; None: it is no number."""
+    """Parse a typed strength ("0.7", "70%", ",7") and clamp it to 0..`most`; return None if it is no
+    number."""
     cleaned = text.strip().replace(",", ".")
     percent = cleaned.endswith("%")
     try:
@@ -47,26 +48,26 @@ def draw(
     default: float = DEFAULT,
     help_: str = TIP,
 ) -> float:
-    """Draw the slider at the cursor and return the value it now has.
+    """Draw the slider at the cursor and return its new value.
 
     Args:
         label: imgui id
         value: strength, 0..`most`
         ticks: recorded strengths, 0..1
-        width: in window pixels
+        width: width in window pixels
         scale: window pixels per design pixel
         fill: color of the track up to the handle
-        active: False draws it muted (a hidden layer); it still works
-        most: upper end; beyond 1 the track lies on warning ground
-        height: at 1×; ticks are drawn where it has room for them
-        default: where a double click goes
-        help_: what it is for, shown when the mouse rests on it
+        active: False draws it muted, for a hidden layer; it still works
+        most: upper end; beyond 1 the track has a warning color
+        height: height at 1×; at less than `HEIGHT_PX` there are no ticks
+        default: value after a double click
+        help_: text of the tooltip
     """
     storage = imgui.get_state_storage()
     if storage.get_bool(_slot(label, "typing")):
         return _text_field(label, value, width, most)
     left, top = imgui.get_cursor_screen_pos()
-    if storage.get_bool(_slot(label, "entered")):  # what was typed by keys alone goes on by them
+    if storage.get_bool(_slot(label, "entered")):  # after typing, the keyboard focus returns to the slider
         storage.set_bool(_slot(label, "entered"), False)
         imgui.set_keyboard_focus_here()
         imgui.set_nav_cursor_visible(True)
@@ -86,17 +87,17 @@ def draw(
         if imgui.get_io().key_ctrl:
             start_typing(label)
             imgui.set_cursor_screen_pos((left, top))
-            return _text_field(label, value, width, most)  # at once: what is typed next is not lost
+            return _text_field(label, value, width, most)  # at once, so that no typed letter is lost
         on_handle = abs(mouse - (start + value * span)) <= radius + 2.0 * scale
         value = value if on_handle else min(most, max(0.0, (mouse - start) / span))
         value = default if imgui.is_mouse_double_clicked(imgui.MouseButton_.left.value) else value
         _anchor(label, mouse, value)
-    elif pressed or is_released():  # a slow frame may hold the last move and the release
+    elif pressed or is_released():  # a slow frame may contain the last move and the release
         was_fine = storage.get_bool(_slot(label, "fine"))
         moved = (mouse - storage.get_float(_slot(label, "x"))) / span * (FINE if was_fine else 1.0)
         value = min(most, max(0.0, storage.get_float(_slot(label, "value")) + moved))
         if was_fine != imgui.get_io().key_shift:
-            _anchor(label, mouse, value)  # after the move: a slow frame holds both
+            _anchor(label, mouse, value)  # after the move: a slow frame may contain both
     if not pressed:
         tip(help_)
     color = fill if active else PALETTE.faint
@@ -112,7 +113,7 @@ def start_typing(label: str) -> None:
 
 
 def _slot(label: str, name: str) -> int:
-    """Where imgui keeps one value of this slider between frames."""
+    """Return the id of a stored value of this slider in imgui's state storage."""
     return int(imgui.get_id(f"{label}/{name}"))
 
 
@@ -151,7 +152,7 @@ def _paint(
     lit: bool,
     most: float,
 ) -> None:
-    """Draw it; `track`: where 0 is, its top, and the length of a strength of 1, window pixels."""
+    """Draw the slider; `track`: x of strength 0, its top, and the length of strength 1, window pixels."""
     canvas, p, (start, top, span), radius = imgui.get_window_draw_list(), PALETTE, track, RADIUS_PX * scale
     middle = top + radius + 1.0 * scale
     half = 2.0 * scale

@@ -1,4 +1,4 @@
-"""The panel's part for snapshots: small pictures to go back to, and which two of them are compared."""
+"""Snapshots in the panel: thumbnails that restore a state, and the two that are compared."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ _ITEMS = (
 
 @dataclass(frozen=True)
 class _Cards:
-    """The snapshots as they are drawn, the original first."""
+    """Snapshots in the order drawn, the original first."""
 
     names: Sequence[str]
     textures: Sequence[int]  # GL names of their pictures, 0 before they are drawn
-    a: int  # places of the two that are compared
+    a: int  # indices of the compared snapshots
     b: int
 
 
 def draw(work: Workspace, textures: Sequence[int], ui: UiContext, actions: list[str]) -> Workspace:
-    """Draw the section; the workspace with it folded or not.
+    """Draw the section and return the workspace with its fold state.
 
     Args:
-        textures: GL names of the pictures, that of the original first
+        textures: GL names of the pictures, the original's first
     """
     right = widgets.right_edge()
     work = replace(work, layout=widgets.section("Snapshots", work.layout, ui))
@@ -63,7 +63,7 @@ def draw(work: Workspace, textures: Sequence[int], ui: UiContext, actions: list[
 
 
 def _pair(cards: _Cards, compared: bool, ui: UiContext, actions: list[str]) -> None:
-    """Which two, and whether they are compared."""
+    """Draw the choice of the two snapshots, and the button that compares them."""
     side = imgui.get_frame_height()
     gap = 4.0 * ui.scale
     wide = (imgui.get_content_region_avail().x - side - 2 * gap) / 2
@@ -85,7 +85,7 @@ def _pair(cards: _Cards, compared: bool, ui: UiContext, actions: list[str]) -> N
 
 
 def _card(index: int, cards: _Cards, wide: float, ui: UiContext, actions: list[str]) -> None:
-    """One picture with its name, and its menu."""
+    """Draw a picture with its name and its menu."""
     name = cards.names[index]
     badge = "A" * (index == cards.a) + "B" * (index == cards.b)
     with imgui_ctx.push_id(index), imgui_ctx.begin_group():
@@ -103,7 +103,7 @@ def _card(index: int, cards: _Cards, wide: float, ui: UiContext, actions: list[s
             imgui.open_popup(_MENU)
         last = len(cards.names) - 1
         off = {_ITEMS[3][1]: index > 1, _ITEMS[4][1]: index < last}
-        items = _ITEMS if index else _ITEMS[1:3]  # the original is neither renamed nor moved
+        items = _ITEMS if index else _ITEMS[1:3]  # the original cannot be renamed or moved
         for action in widgets.menu_items(
             _MENU, items, ui, [action for action, can in off.items() if not can]
         ):
@@ -127,7 +127,7 @@ def _card(index: int, cards: _Cards, wide: float, ui: UiContext, actions: list[s
 
 
 def _badge(text: str, at: imgui.ImVec2, ui: UiContext) -> None:
-    """The letter of a snapshot of the pair, over its picture."""
+    """Draw a snapshot's letter, A or B, over its picture."""
     canvas = imgui.get_window_draw_list()
     size = imgui.calc_text_size(text)
     pad = 4.0 * ui.scale

@@ -1,6 +1,6 @@
-"""The timeline along the lower edge of the picture: keys and playhead to drag, rows, and its few settings.
+"""Timeline along the lower edge of the picture: keyframes and playhead to drag, rows, and settings.
 
-It changes nothing itself: it returns actions of `timeline.ACTIONS`, as keys do.
+It changes no state: it returns actions of `timeline.ACTIONS`, like keyboard input.
 """
 
 from __future__ import annotations
@@ -31,35 +31,34 @@ from viewer.ui.context import PALETTE, ROW_COLORS, SMALL_PX, Icon, Rgba, UiConte
 from viewer.ui.overlay import Area
 from viewer.ui.widgets import elide, hint, icon_button, icon_row, inert, is_released, plate, tip
 
-# at 1×: of the bar, and of a second line
-HEIGHT_PX = 46.0
-ROW_PX = 33.0
-TRACK_PX = 20.0  # of a row of keys
-_MAX_SHARE = 0.35  # the rows take at most so much of the picture's height
+HEIGHT_PX = 46.0  # height of the bar, at 1×
+ROW_PX = 33.0  # height of its second line
+TRACK_PX = 20.0  # height of a row of keyframes
+_MAX_SHARE = 0.35  # maximum height of the rows, as a share of the picture's height
 ROOMY_PX = 640.0  # a narrower bar has its settings in a second line
 SETTINGS_PX = 293.0
 BUTTONS_PX = 143.0
-_KEY_PX = 5.0  # half a key's size
-_GRIP_PX = 8.0  # so near to a key the mouse takes it
-_CURVE_PX = 3.0  # from point to point
-_GAP_PX = 4.0  # under the rows
+_KEY_PX = 5.0  # half the size of a key
+_GRIP_PX = 8.0  # distance within which the mouse grabs a key
+_CURVE_PX = 3.0  # distance between two points of a curve
+_GAP_PX = 4.0  # gap under the rows
 _NICE = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 
 
 @dataclass(frozen=True)
 class _Ruler:
-    """A timeline on the screen."""
+    """Timeline on the screen."""
 
     timeline: Timeline
     player: Player
-    keys: Mapping[RowKey, Keyframe]  # of each row, see `split_keys`
-    start: float  # start, span: where frame 0 stands, and how far from there the last one, window pixels
-    span: float
+    keys: Mapping[RowKey, Keyframe]  # keys of each row, see `split_keys`
+    start: float  # x of frame 0, window pixels
+    span: float  # distance from there to the last frame
     ui: UiContext
 
     @property
     def frame(self) -> int:
-        """Of the playhead."""
+        """Frame of the playhead."""
         return min(self.player.frame, self.timeline.length)
 
     def x(self, frame: float) -> float:
@@ -71,7 +70,7 @@ class _Ruler:
 
 
 def height(work: Workspace, area: Area, ui: UiContext) -> float:
-    """How much of the picture it covers, window pixels."""
+    """Return the height of the picture that the bar covers, in window pixels."""
     return _bar_height(work, area, ui) if work.player.shown else 0.0
 
 
@@ -85,8 +84,8 @@ def _bar_height(work: Workspace, area: Area, ui: UiContext) -> float:
 
 
 def _rows_height(work: Workspace, area: Area, ui: UiContext) -> float:
-    most = max(2, int(_MAX_SHARE * area.height / (TRACK_PX * ui.scale)))
-    rows = min(len(work.view.layers) + 1, most) * TRACK_PX
+    max_rows = max(2, int(_MAX_SHARE * area.height / (TRACK_PX * ui.scale)))
+    rows = min(len(work.view.layers) + 1, max_rows) * TRACK_PX
     return (rows + _GAP_PX) * ui.scale if work.player.unfolded else 0.0
 
 
@@ -94,7 +93,7 @@ def draw(work: Workspace, area: Area, ui: UiContext) -> tuple[str, ...]:
     """Draw the bar over the lower edge of `area`, between `imgui.new_frame` and `imgui.render`.
 
     Returns:
-        What was asked for: actions of the workspace.
+        Requested actions of the workspace.
     """
     tall = _bar_height(work, area, ui)
     roomy = _is_wide(area, ui)
@@ -123,14 +122,14 @@ def draw(work: Workspace, area: Area, ui: UiContext) -> tuple[str, ...]:
 
 
 def place(timeline: Timeline, frame: float, start: float, span: float) -> float:
-    """Where a frame stands on a ruler that begins at `start`, window pixels."""
+    """Return the x of a frame on a ruler that begins at `start`, in window pixels."""
     return start + span * frame / timeline.length
 
 
 def label_step(timeline: Timeline, span: float, room: float) -> int:
-    """Every how many frames the ruler has a number, so that each has `room` pixels."""
-    least = timeline.length * room / max(span, 1.0)
-    return next((step for step in _NICE if step >= least), _NICE[-1])
+    """Return the number of frames between two numbers on the ruler that gives each `room` pixels."""
+    min_step = timeline.length * room / max(span, 1.0)
+    return next((step for step in _NICE if step >= min_step), _NICE[-1])
 
 
 def _buttons(timeline: Timeline, player: Player, actions: list[str], ui: UiContext) -> None:
@@ -198,7 +197,7 @@ def _settings(work: Workspace, ruler: _Ruler, actions: list[str]) -> None:
 
 
 def _draw_ruler(ruler: _Ruler, wide: float, actions: list[str]) -> None:
-    """Keys of all rows at once, numbers and the playhead."""
+    """Draw the keys of all rows, the frame numbers and the playhead."""
     frames: dict[int, list[RowKey]] = {}
     for key in ruler.keys:
         frames.setdefault(key[1], []).append(key)
@@ -215,51 +214,51 @@ def _drag(
     ruler: _Ruler,
     actions: list[str],
 ) -> int | None:
-    """What is pressed and dragged: the keys under the mouse, with Ctrl copies of them; else the playhead.
+    """Drag the keys under the mouse, with Ctrl copies of them, otherwise the playhead.
 
     Returns:
-        The frame of the keys under the mouse, if any are.
+        Frame of the keys under the mouse, None without any.
     """
     imgui.invisible_button(name, size)
     io = imgui.get_io()
     timeline = ruler.timeline
     player = ruler.player
     mouse = io.mouse_pos.x
-    under = None
+    hovered_frame = None
     if imgui.is_item_hovered() or imgui.is_item_active():
         distance, nearest = min(((abs(mouse - ruler.x(f)), f) for f in frames), default=(math.inf, 0))
-        under = nearest if distance <= _GRIP_PX * ruler.ui.scale else None
+        hovered_frame = nearest if distance <= _GRIP_PX * ruler.ui.scale else None
     storage = imgui.get_state_storage()
-    to = ruler.frame_at(mouse)
+    mouse_frame = ruler.frame_at(mouse)
     held = imgui.get_id(f"{name}/held")
     copies = imgui.get_id(f"{name}/copies")
     if imgui.is_item_activated():
-        storage.set_int(held, -1 if under is None else under)
+        storage.set_int(held, -1 if hovered_frame is None else hovered_frame)
         storage.set_int(copies, int(io.key_ctrl))
-        keys = () if under is None else frames[under]
+        keys = () if hovered_frame is None else frames[hovered_frame]
         if io.key_shift or not keys or not set(keys) <= player.chosen:
             names = ",".join(f"{row}@{frame}" for row, frame in keys)
             actions.append(f"choose_keys:{'+' * io.key_shift}{names}")
-        actions.append(f"seek:{to if under is None else under}")
-    elif imgui.is_item_active() or is_released():  # a slow frame may hold move and release
+        actions.append(f"seek:{mouse_frame if hovered_frame is None else hovered_frame}")
+    elif imgui.is_item_active() or is_released():  # a slow frame may contain move and release
         origin = storage.get_int(held, -1)
         moved = imgui.get_mouse_drag_delta(0, 3.0 * ruler.ui.scale).x != 0.0 or imgui.is_item_deactivated()
-        if origin < 0 and to != ruler.frame:
-            actions.append(f"seek:{to}")
-        elif origin >= 0 and moved and to != origin:
+        if origin < 0 and mouse_frame != ruler.frame:
+            actions.append(f"seek:{mouse_frame}")
+        elif origin >= 0 and moved and mouse_frame != origin:
             copy = bool(storage.get_int(copies, 0))
             chosen = chosen_keys(timeline, player)
-            if shift_keys(timeline, chosen, to - origin, copy) is not timeline:
-                actions.append(f"{'clone' if copy else 'move'}_keys:{to - origin}")
-                storage.set_int(held, to)
+            if shift_keys(timeline, chosen, mouse_frame - origin, copy) is not timeline:
+                actions.append(f"{'clone' if copy else 'move'}_keys:{mouse_frame - origin}")
+                storage.set_int(held, mouse_frame)
                 storage.set_int(copies, 0)
-    if under is not None:
+    if hovered_frame is not None:
         imgui.set_mouse_cursor(imgui.MouseCursor_.resize_ew.value)
-    return under
+    return hovered_frame
 
 
 def _rows(work: Workspace, ruler: _Ruler, left: float, tall: float, actions: list[str]) -> None:
-    """A row of keys for the camera and each layer, as the panel has them; they scroll where they are many."""
+    """Draw a row of keys for the camera and each layer, in the panel's order; many rows scroll."""
     layers = list(enumerate(reversed(work.view.layers), 1))
     curves = tracks(ruler.timeline)
     imgui.push_style_var(imgui.StyleVar_.item_spacing, (0.0, 0.0))
@@ -285,7 +284,8 @@ def _row(
     focused: bool,
     actions: list[str],
 ) -> bool:
-    """The name, a button for the key at the playhead, the keys and the curve; True if the name is pressed."""
+    """Draw the name, the button for a key at the playhead, the keys and the curve; return True if the name
+    is pressed."""
     canvas = imgui.get_window_draw_list()
     p = PALETTE
     scale = ruler.ui.scale
@@ -333,7 +333,7 @@ def _row(
 def _paint_keys(
     ruler: _Ruler, frames: Mapping[int, Sequence[RowKey]], y: float, under: int | None, color: Rgba
 ) -> None:
-    """The keys on a line: those chosen, or under the mouse, are white; of a row they are ringed too."""
+    """Draw the keys on a line. Chosen and hovered ones are white, and a key of a single row is smaller."""
     canvas = imgui.get_window_draw_list()
     scale = ruler.ui.scale
     for frame, keys in frames.items():
@@ -379,7 +379,7 @@ def _paint(
 def _paint_numbers(
     timeline: Timeline, frame: int, start: float, span: float, top: float, line: float, ui: UiContext
 ) -> None:
-    """Ticks and frame numbers; the playhead's own number in place of those near it."""
+    """Draw ticks and frame numbers. The playhead's number replaces those near it."""
     canvas = imgui.get_window_draw_list()
     p = PALETTE
     scale = ui.scale
@@ -398,7 +398,7 @@ def _paint_numbers(
         if number != frame and -16.0 * scale < x - here < 36.0 * scale:
             continue
         color = u32(p.accent if number == frame else p.dim)
-        # the playhead's number stands beside its handle, left of it at the end of the ruler
+        # the playhead's number is beside its handle, to its left near the end of the ruler
         after = x - 3.2 * scale * len(text)
         if number == frame:
             after = x + 7.0 * scale if x < start + span - 20.0 * scale else x - (7 + 6.4 * len(text)) * scale
@@ -407,7 +407,7 @@ def _paint_numbers(
 
 
 def _paint_key(canvas: imgui.ImDrawList, x: float, y: float, size: float, color: int, easing: str) -> None:
-    """Smooth is round, linear a diamond, hold a square."""
+    """Draw a key: smooth is round, linear a diamond, hold a square."""
     edge = u32(PALETTE.panel)
     if easing == "smooth":
         canvas.add_circle_filled((x, y), size + 1.5, edge)

@@ -1,4 +1,4 @@
-"""What lies over the picture's edges: the tools, the options of the one in hand, comparison and view."""
+"""Controls over the picture's edges: toolbar, tool options, comparison and view settings."""
 
 from __future__ import annotations
 
@@ -46,13 +46,12 @@ from viewer.ui.widgets import (
     value_slider,
 )
 
-TOOLBAR_PX = 40.0  # at 1×: its width
-EDGE_PX = 8.0  # between it and the picture's edges
-NARROW_PX = 560.0  # of a picture whose bar may lie over the axes
-# of a button, where the window is low; around the buttons
-_SIDE_PX = 32.0
-_MIN_PX = 22.0
-_PAD_PX = 4.0
+TOOLBAR_PX = 40.0  # width at 1×
+EDGE_PX = 8.0  # distance from the picture's edges
+NARROW_PX = 560.0  # below this picture width the options may cover the axes
+_SIDE_PX = 32.0  # size of a button
+_MIN_PX = 22.0  # minimum size of a button, in a low window
+_PAD_PX = 4.0  # padding around the buttons
 _TOOLS = (
     (("navigate:orbit", Icon.ORBIT), ("navigate:fly", Icon.FLY)),
     (
@@ -72,22 +71,22 @@ _OPERATIONS = (
     *("select_smooth", "select_largest", "invert", "select_none", "hide_selected", "isolate"),
     *("remove_selected", "move_selected", "duplicate_selected"),
 )
-COLUMN_PX = 88.0  # at 1×: where what a row chooses begins
+COLUMN_PX = 88.0  # at 1×: start of the control in a row
 _DEPTHS = {False: "Front", True: "Through"}
 _SIZE_KEYS = f"{shortcut('brush_radius:0.8')} and {shortcut('brush_radius:1.25')}"
 
 
 def _open_below(share: float, ui: UiContext) -> None:
-    """The menu that comes next opens under the plate, `share` of the way along its foot."""
+    """Place the next menu below the plate, at `share` of its width."""
     (x, y), size = imgui.get_window_pos(), imgui.get_window_size()
     at = (x + share * size.x, y + size.y + 4.0 * ui.scale)
     imgui.set_next_window_pos(at, 0, (share, 0.0))
 
 
 def draw_toolbar(view: ViewState, area: Area, ui: UiContext, actions: list[str]) -> None:
-    """The tools along the left edge of the picture; `area`: less what lies over its foot."""
+    """Draw the toolbar along the left edge of the picture; `area`: the picture without the timeline."""
     tool = f"select_tool:{view.select.tool}" if view.select.tool else "brush" * view.brush.active
-    held = tool or f"navigate:{view.camera.mode}"
+    active_tool = tool or f"navigate:{view.camera.mode}"
     off = {"brush": not view.layers, "move_selected": not view.selection.count}
     count = sum(map(len, _TOOLS))
     gap = 6.0 * ui.scale
@@ -100,7 +99,7 @@ def draw_toolbar(view: ViewState, area: Area, ui: UiContext, actions: list[str])
                 imgui.dummy((1.0, gap))
             for action, icon in group:
                 with inert(off.get(action, False)):
-                    if icon_button(action, icon, ui, lit=action == held, side=side):
+                    if icon_button(action, icon, ui, lit=action == active_tool, side=side):
                         actions.append(action)
                 hint(action, "Select something first" * (action == "move_selected" and off[action]))
     imgui.pop_style_var()
@@ -110,15 +109,14 @@ Value = TypeVar("Value")
 
 
 class _Bar:
-    """Lays items one beside the other and breaks the line where the next one would not fit."""
+    """Layout that places items beside each other and breaks the line at its end."""
 
     def __init__(self, limit: float, ui: UiContext) -> None:
-        # window pixels: where the line ends
-        self.limit = limit
+        self.limit = limit  # end of the line, window pixels
         self.ui = ui
 
     def follow(self, wide: float) -> None:
-        """What comes next is so wide."""
+        """Place the next item, of this width, on the same line if it fits."""
         gap = EDGE_PX * self.ui.scale
         if imgui.get_item_rect_max().x + gap + wide <= self.limit:
             imgui.same_line(0.0, gap)
@@ -126,7 +124,7 @@ class _Bar:
     def segments(
         self, name: str, options: dict[Value, str], current: Value, help_: str, action: str = ""
     ) -> Value:
-        """One of a few values; the one that was chosen."""
+        """Draw a choice of a few values and return the chosen one."""
         wide = sum(imgui.calc_text_size(text).x + 14.0 * self.ui.scale for text in options.values())
         self.follow(wide)
         pressed = choice(name, options, current, self.ui, wide)
@@ -145,7 +143,7 @@ class _Bar:
         help_: str,
         form: str = "%.2f",
     ) -> float:
-        """A number."""
+        """Draw a slider and return its value."""
         wide = imgui.calc_text_size(f"{title} 0.00").x + 14.0 * self.ui.scale
         self.follow(wide)
         value = value_slider(f"##{title}", value, ends, f"{title} {form}", default, self.ui, wide)
@@ -160,17 +158,17 @@ class _Bar:
 
 
 def draw_options(work: Workspace, area: Area, ui: UiContext, actions: list[str]) -> tuple[Workspace, float]:
-    """The bar above the picture: how the tool in hand works, and what is done with what is selected.
+    """Draw the bar above the picture with the options of the active tool and the actions for the selection.
 
     Returns:
-        The changed workspace; the height of the bar's foot, 0 where there is none.
+        The changed workspace; the y of the bar's lower edge, 0 if there is none.
     """
     view = work.view
     if not (view.select.tool or view.brush.active or view.selection.count or view.selection.hidden):
         return work, 0.0
     left = (TOOLBAR_PX + 2 * EDGE_PX) * ui.scale
     right = area.width - EDGE_PX * ui.scale
-    narrow = area.width < NARROW_PX * ui.scale  # else it leaves the axes free
+    narrow = area.width < NARROW_PX * ui.scale  # otherwise it leaves the axes free
     bar = _Bar(right - (0.0 if narrow else view_width(view, area, ui)) - EDGE_PX * ui.scale, ui)
     with plate("options", (left, EDGE_PX * ui.scale), ui):
         imgui.push_style_var(imgui.StyleVar_.item_spacing, (EDGE_PX * ui.scale, EDGE_PX * ui.scale))
@@ -190,7 +188,7 @@ def draw_options(work: Workspace, area: Area, ui: UiContext, actions: list[str])
 
 
 def _selection(view: ViewState, bar: _Bar, actions: list[str]) -> Pointed | None:
-    """How much is selected and hidden, and what is done with it; whether the mouse rests on the number."""
+    """Draw the number of selected Gaussians and the actions for them; return "selection" if it is hovered."""
     count = view.selection.count
     pointed = None
     if count or view.select.tool:
@@ -212,7 +210,7 @@ def _selection(view: ViewState, bar: _Bar, actions: list[str]) -> Pointed | None
 
 
 def _select_options(tool: SelectTool, bar: _Bar) -> SelectTool:
-    """How the tool selects."""
+    """Draw the options of the selection tool."""
     modes = dict(zip(SELECT_MODES, ("New", "Add", "Subtract", "Intersect"), strict=True))
     help_ = f"What becomes of the present selection.\n{MODES}"
     if tool.tool == "scribble":
@@ -235,7 +233,7 @@ def _select_options(tool: SelectTool, bar: _Bar) -> SelectTool:
 
 
 def _save(regions: int, bar: _Bar, actions: list[str]) -> None:
-    """The button that keeps the selection, in its place the field for the name."""
+    """Draw the button that saves the selection, or in its place the field for the name."""
     text = "Save as region…"
     wide = 128.0 * bar.ui.scale
     bar.follow(wide)
@@ -248,14 +246,14 @@ def _save(regions: int, bar: _Bar, actions: list[str]) -> None:
 
 
 PAINT_DRAG = "brush"
-"""What a left drag does while the brush is active, beside those of `keys.DRAGS`."""
+"""Name of the left drag while the brush is active, in addition to those of `keys.DRAGS`."""
 
 WHOLE = ("paint_clear", "paint_fill", "paint_invert", "paint_feather")
-"""Of the menu for all of a layer's paint."""
+"""Actions of the menu for all of a layer's paint."""
 
 
 def paint_obstacle(view: ViewState, focus: int | None) -> str:
-    """Why the brush cannot paint now, one line; empty where it can."""
+    """Return the reason why the brush cannot paint, in one line; "" if it can."""
     if focus is None or focus >= len(view.layers):
         return "no layer is selected; click one, or press 1–9"
     layer = view.layers[focus]
@@ -267,7 +265,7 @@ def paint_obstacle(view: ViewState, focus: int | None) -> str:
 
 
 def _brush_options(view: ViewState, focus: int | None, bar: _Bar, actions: list[str]) -> ViewState:
-    """How the brush paints."""
+    """Draw the options of the brush."""
     brush = view.brush
     modes = {"add": "Add", "erase": "Erase", "smooth": "Smooth"}
     help_ = "While painting, Ctrl inverts and Shift smooths"
@@ -299,7 +297,7 @@ def _brush_options(view: ViewState, focus: int | None, bar: _Bar, actions: list[
 
 
 def _legend(bar: _Bar) -> None:
-    """The ramp of the weights with its ends named."""
+    """Draw the color ramp of the weights with its end values."""
     wide = 96.0 * bar.ui.scale
     tall = imgui.get_frame_height()
     bar.follow(wide)
@@ -317,7 +315,7 @@ def _legend(bar: _Bar) -> None:
 
 
 def draw_ring(view: ViewState, ui: UiContext) -> None:
-    """The brush at the cursor: its edge, and inside which its touch is full."""
+    """Draw the brush at the cursor: its edge, and the circle within which it has full effect."""
     brush = view.brush
     mouse = imgui.get_mouse_pos()
     canvas = imgui.get_background_draw_list()
@@ -339,34 +337,34 @@ _AGAINST = (
 def draw_comparison(
     work: Workspace, words: Labels, original: bool, place: imgui.ImVec2Like, ui: UiContext
 ) -> tuple[Workspace, str]:
-    """The pill at the top of the picture: what is compared with what, and how.
+    """Draw the pill at the top of the picture that chooses the two sides and the kind of comparison.
 
     Args:
-        words: of the comparison on screen
+        words: labels of the comparison on screen
         original: the original is shown
         place: the middle of its upper edge, window pixels
 
     Returns:
-        The changed workspace, and the action that was asked for, "" for none.
+        The changed workspace, and the requested action, "" for none.
     """
     compare = work.view.compare
-    asked = ""
+    requested = ""
     on = compare.mode != "off" and not original
     right, _, figure = words.right.partition(" · ")
     figure = words.line if compare.mode == "difference" else figure
     imgui.push_style_var(imgui.StyleVar_.item_spacing, (0.0, 2.0 * ui.scale))
     with plate("comparison", place, ui, (0.5, 0.0), _PAD_PX):
         if _word("left", words.left.capitalize(), on or original, ui):
-            asked = "before"
+            requested = "before"
         hint("before")
         imgui.same_line()
         if icon_button("split", Icon.SPLIT, ui, lit=on):
-            asked = compare.mode if on else "split"
+            requested = compare.mode if on else "split"
         hint("split", figure)
         imgui.same_line()
         name = right.capitalize() + (f" × {compare.amplify:g}" if compare.mode == "difference" else "")
         if _word("right", name, not original, ui):
-            asked = "before" if work.before else compare.mode if on else ""
+            requested = "before" if work.before else compare.mode if on else ""
         tip(figure or "The scene with its edits")
         imgui.same_line()
         if icon_button("comparisons", Icon.UNFOLDED, ui):
@@ -376,11 +374,11 @@ def draw_comparison(
         _open_below(0.5, ui)
         with menu("comparisons", ui) as is_open:
             compare = _choose_comparison(compare, bool(work.snapshots), ui) if is_open else compare
-    return replace(work, view=replace(work.view, compare=compare)), asked
+    return replace(work, view=replace(work.view, compare=compare)), requested
 
 
 def _word(name: str, text: str, bright: bool, ui: UiContext) -> bool:
-    """One side of the comparison; True when it was pressed."""
+    """Draw one side of the comparison; return True if it was pressed."""
     imgui.push_style_color(imgui.Col_.text, PALETTE.handle if bright else PALETTE.dim)
     imgui.push_style_color(imgui.Col_.button, (0.0, 0.0, 0.0, 0.0))
     pressed = imgui.button(f"{elide(text, 200.0 * ui.scale)}##{name}")
@@ -396,17 +394,17 @@ def _choose_comparison(compare: Comparison, snapshots: bool, ui: UiContext) -> C
             compare = replace(compare, mode=mode)
     imgui.separator()
     for against, text, action in _AGAINST:
-        there = snapshots or against == "original"
-        if imgui.menu_item(text, shortcut(action), compare.against == against, there)[0]:
+        is_available = snapshots or against == "original"
+        if imgui.menu_item(text, shortcut(action), compare.against == against, is_available)[0]:
             compare = replace(
                 compare, against=against, mode="split" if compare.mode == "off" else compare.mode
             )
-        if not there:
+        if not is_available:
             tip("There is no snapshot")
     if compare.mode == "difference":
         ends = 1.0, MAX_AMPLIFIED
-        times = value_slider("##amplify", compare.amplify, ends, "Gain × %.0f", Comparison.amplify, ui)
-        compare = replace(compare, amplify=float(round(times)))
+        gain = value_slider("##amplify", compare.amplify, ends, "Gain × %.0f", Comparison.amplify, ui)
+        compare = replace(compare, amplify=float(round(gain)))
     return compare
 
 
@@ -420,23 +418,24 @@ UPS: dict[str, Vec3] = {
 }
 
 
-_LOOKS = (("frame", Icon.FRAME), ("home", Icon.HOME))
+_VIEW_BUTTONS = (("frame", Icon.FRAME), ("home", Icon.HOME))
 
 
 def view_width(view: ViewState, area: Area, ui: UiContext) -> float:
-    """How far the axes and the buttons under them reach into the picture, window pixels."""
+    """Return the width that the axes and the buttons below them take from the picture, in window pixels."""
     buttons = 3 * imgui.get_frame_height() + 2 * (_PAD_PX + EDGE_PX) * ui.scale
     return max(overlay.axes_height(view, area, ui), buttons)
 
 
 def draw_view(view: ViewState, area: Area, foot: float, ui: UiContext, actions: list[str]) -> ViewState:
-    """Under the axes: frame, home, and the popover of what one sets once; `foot`: of the bar."""
+    """Draw the buttons under the axes: frame, home, and the view settings. `foot`: lower edge of the
+    options bar"""
     top = max(overlay.axes_height(view, area, ui), EDGE_PX * ui.scale)
     if top < foot and area.width < NARROW_PX * ui.scale:
-        return view  # the bar lies over it
+        return view  # the options bar covers it
     imgui.push_style_var(imgui.StyleVar_.item_spacing, (0.0, 0.0))
     with plate("view", (area.width - EDGE_PX * ui.scale, top), ui, (1.0, 0.0), _PAD_PX):
-        icon_row(_LOOKS, ui, actions)
+        icon_row(_VIEW_BUTTONS, ui, actions)
         imgui.same_line()
         if icon_button("view", Icon.VIEW, ui):
             imgui.open_popup("view settings")

@@ -1,4 +1,4 @@
-"""Jobs at the foot of the panel, training and deliveries: a strip that opens to a card for each."""
+"""Jobs at the bottom of the panel, training and deliveries: a strip that unfolds to one card per job."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _UNWRITTEN = "Nothing is written"
 
 
 def height(jobs: Sequence[QueuedTask], ui: UiContext) -> float:
-    """Of the strip and, where it is open, the cards over it; window pixels."""
+    """Return the height of the strip and its unfolded cards, in window pixels."""
     if not _visible_jobs(jobs):
         return 0.0
     storage = imgui.get_state_storage()
@@ -29,7 +29,7 @@ def height(jobs: Sequence[QueuedTask], ui: UiContext) -> float:
 
 
 def draw(jobs: Sequence[QueuedTask], ui: UiContext, actions: list[str]) -> None:
-    """The strip, and over it one card a job while it is open; a failure opens it."""
+    """Draw the strip and its unfolded cards; a new failure unfolds it."""
     listed = _visible_jobs(jobs)
     storage = imgui.get_state_storage()
     if not listed:
@@ -44,9 +44,9 @@ def draw(jobs: Sequence[QueuedTask], ui: UiContext, actions: list[str]) -> None:
     imgui.separator()
     if storage.get_bool(is_open):
         room = 0.5 * imgui.get_window_height()
-        before = storage.get_float(tall)
-        bar = imgui.WindowFlags_.no_scrollbar.value * (before < room)  # not for a frame while cards grow
-        imgui.begin_child("jobs", (0.0, max(min(before, room), 1.0)), 0, bar)
+        old_height = storage.get_float(tall)
+        bar = imgui.WindowFlags_.no_scrollbar.value * (old_height < room)  # hidden while the cards grow
+        imgui.begin_child("jobs", (0.0, max(min(old_height, room), 1.0)), 0, bar)
         for job in listed:
             with imgui_ctx.push_id(str(job.number)):
                 actions += _card(job, ui)
@@ -55,7 +55,7 @@ def draw(jobs: Sequence[QueuedTask], ui: UiContext, actions: list[str]) -> None:
         needed = imgui.get_cursor_pos_y() - imgui.get_style().item_spacing.y
         imgui.end_child()
         storage.set_float(tall, min(needed, room))
-        if before == min(needed, room):  # the cards have their heights
+        if old_height == min(needed, room):  # the cards have their final heights
             storage.set_int(seen, failed)
     if _strip(listed, storage.get_bool(is_open), ui):
         storage.set_bool(is_open, not storage.get_bool(is_open))
@@ -66,7 +66,7 @@ _TALL = "height of the jobs"
 
 
 def _visible_jobs(jobs: Sequence[QueuedTask]) -> list[QueuedTask]:
-    """Those that have a card: a trained edit is a layer, and needs none."""
+    """Return the jobs that have a card. A trained edit is a layer and needs none."""
     return [job for job in jobs if job.status != "done" or job.warning or isinstance(job.task, Delivery)]
 
 
@@ -75,7 +75,7 @@ def _is_failed(job: QueuedTask) -> bool:
 
 
 def _strip(jobs: Sequence[QueuedTask], is_open: bool, ui: UiContext) -> bool:
-    """One line: the job that matters most, and how many more there are; True when it was pressed."""
+    """Draw one line with the most important job and the number of others; return True if it was pressed."""
     order = ("failed", "running", "stopping", "done")
     job = min(jobs, key=lambda job: order.index(job.status) if job.status in order else len(order))
     start = imgui.get_cursor_pos()
@@ -88,13 +88,13 @@ def _strip(jobs: Sequence[QueuedTask], is_open: bool, ui: UiContext) -> bool:
     imgui.get_window_draw_list().add_circle_filled((x + dot, y + tall / 2), dot, u32(color))
     end = (f"+{len(jobs) - 1}   " if len(jobs) > 1 else "") + (Icon.UNFOLDED if is_open else Icon.RAISED)
     left = job.seconds_left
-    words = f"{_status(job)}  ·  {format_duration(left)}" if left is not None else _status(job)
+    status = f"{_status(job)}  ·  {format_duration(left)}" if left is not None else _status(job)
     below = imgui.get_cursor_pos()
-    sizes = [imgui.calc_text_size(text).x for text in (words, end)]
+    sizes = [imgui.calc_text_size(text).x for text in (status, end)]
     top = start.y + (tall - imgui.get_text_line_height()) / 2
     imgui.set_cursor_pos((start.x + 4 * dot, top))
     imgui.text(elide(job.task.name, right - start.x - sum(sizes) - 8 * dot))
-    for text, at in ((words, 0.0), (end, right - sizes[1])):
+    for text, at in ((status, 0.0), (end, right - sizes[1])):
         imgui.same_line(at)
         imgui.text_disabled(text)
     imgui.set_cursor_pos(below)
@@ -102,7 +102,7 @@ def _strip(jobs: Sequence[QueuedTask], is_open: bool, ui: UiContext) -> bool:
 
 
 def _card(job: QueuedTask, ui: UiContext) -> list[str]:
-    """Name and status, how far it is, what it does, buttons; and a menu of what cannot be undone."""
+    """Draw name, status, progress and buttons of a job, and its menu; return the requested actions."""
     task = job.task
     failed = _is_failed(job)
     word = _status(job)
@@ -134,7 +134,7 @@ def _status(job: QueuedTask) -> str:
 
 
 def _bar(share: float, color: Rgba, ui: UiContext) -> None:
-    """How far it is."""
+    """Draw the progress bar."""
     x, y = imgui.get_cursor_screen_pos()
     wide = imgui.get_content_region_avail().x
     tall = BAR_PX * ui.scale
@@ -146,7 +146,7 @@ def _bar(share: float, color: Rgba, ui: UiContext) -> None:
 
 
 def _foot(job: QueuedTask, right: float, menu: bool, ui: UiContext) -> list[str]:
-    """What it does, or why it failed; at the right its buttons."""
+    """Draw the current step, or the error, and the buttons at the right."""
     offered = _BUTTONS.get((job.status, isinstance(job.task, EditOrder)), ())
     buttons = (*offered, *[(Icon.MENU, _MENU, "Log, discard (right-click)")] * menu)
     with imgui_ctx.push_font(None, SMALL_PX):
@@ -193,11 +193,11 @@ def _status_text(job: QueuedTask) -> str:
     return f"{100 * progress.share:.0f} % is done" if progress.share else "Can go on where it was"
 
 
-_RUNS = "Stop; it can be resumed, also another day"
+_STOP_HELP = "Stop; it can be resumed, also another day"
 _CANCEL = ("Cancel", "stop_run", "Take it off the queue")
 _CLOSE = ("Close", "close_run", "Take the card away; what was made stays")
 _BUTTONS = {
-    ("running", True): (("Stop", "stop_run", _RUNS),),
+    ("running", True): (("Stop", "stop_run", _STOP_HELP),),
     ("running", False): (("Stop", "stop_run", _UNWRITTEN),),
     ("queued", True): (_CANCEL,),
     ("queued", False): (_CANCEL,),
@@ -207,4 +207,4 @@ _BUTTONS = {
     ("done", True): (_CLOSE,),
     ("done", False): (("Show in folder", "show_file", ""), ("Copy path", "copy_path", ""), _CLOSE),
 }
-"""Text, action and help by status, of a training or of what is delivered."""
+"""Text, action and tooltip of the buttons, by status and by whether the job is a training."""
