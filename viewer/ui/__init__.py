@@ -1,1 +1,1 @@
-"""The small parts that every panel is made of."""
+"""Window, keys, imgui context and widgets shared by all panels."""

@@ -1,4 +1,4 @@
-"""The imgui context: fonts, colors, spacing, and one scale for high-density screens."""
+"""imgui context: fonts, colors, spacing, and one scale for high-density screens."""
 
 from __future__ import annotations
 
@@ -23,8 +23,11 @@ def _rgb(code: int, alpha: float = 1.0) -> Rgba:
 
 @dataclass(frozen=True)
 class Palette:
-    """Calm and neutral, so that the picture keeps its colors; one blue, for what is likely wanted, for values
-    and for what has the keyboard or the focus. tests/viewer/app/test_theme.py computes the contrasts."""
+    """Colors of the interface: neutral grays, so that the picture's colors stay unaffected.
+
+    The accent, the only blue, marks the likely action, values, and the item with the keyboard or the focus.
+    tests/viewer/app/test_theme.py checks the contrasts.
+    """
 
     panel: Rgba = _rgb(PANEL)
     card: Rgba = _rgb(0x282B30)
@@ -48,14 +51,14 @@ class Palette:
 
 PALETTE = Palette()
 ROW_COLORS = tuple(map(_rgb, (0x7FC08A, 0xD9A441, 0xC792D6, 0xE08C7A, 0x5DBDB5, 0xB9BE5C)))
-"""Of the timeline's rows, alike in lightness; none is the blue."""
+"""Colors of the timeline's rows: of similar lightness, and none close to the accent."""
 
 FIXED = (
     imgui.WindowFlags_.no_decoration.value
     | imgui.WindowFlags_.no_move.value
     | imgui.WindowFlags_.no_saved_settings.value
 )
-"""Flags of a part of the window that stays where it is, beside `UiContext.nav_flags`."""
+"""Flags of a fixed part of the window, in addition to `UiContext.nav_flags`."""
 
 BEHIND = imgui.WindowFlags_.no_bring_to_front_on_focus.value
 UNFOCUSED = imgui.WindowFlags_.no_focus_on_appearing.value
@@ -107,7 +110,7 @@ class Icon:
 
 @dataclass(frozen=True)
 class Fonts:
-    """Text with icons, and bold text."""
+    """Regular font with icons, and bold font."""
 
     regular: imgui.ImFont
     bold: imgui.ImFont
@@ -126,11 +129,11 @@ class UiContext:
         io = imgui.get_io()
         io.set_ini_filename("")  # no imgui.ini left in the user's folder
         io.set_log_filename("")
-        io.config_input_text_cursor_blink = False  # or an open text field has the window drawn all the time
+        io.config_input_text_cursor_blink = False  # a blinking cursor would redraw the window all the time
         io.config_flags |= imgui.ConfigFlags_.nav_enable_keyboard.value  # in lists, menus and the form
         self.context.config_nav_windowing_key_next = self.context.config_nav_windowing_key_prev = 0
-        self.keyboard = ""  # the part of the window that has the keyboard, "" for the picture
-        self.focused = ""  # the one that was given it last
+        self.keyboard = ""  # part of the window with the keyboard, "" for the picture
+        self.focused = ""  # part that received the keyboard last
         self.fonts = _load_fonts(io.fonts)
         self.scale = 0.0
         self.set_scale(scale)
@@ -139,15 +142,15 @@ class UiContext:
         imgui.set_current_context(self.context)
 
     def nav_flags(self, name: str) -> int:
-        """Flags for a part of the window, and for what scrolls in it: the keyboard goes through it or not."""
+        """Return window flags for a part of the window that let keyboard navigation in or keep it out."""
         return 0 if self.keyboard == name else imgui.WindowFlags_.no_nav.value
 
     def child_flags(self, name: str) -> int:
-        """Flags for what scrolls in a part of the window: the keyboard does not stop at its edge."""
+        """Return flags for a scrolling child that let keyboard navigation cross its edge."""
         return imgui.ChildFlags_.nav_flattened.value if self.keyboard == name else 0
 
     def take_keyboard(self, name: str) -> None:
-        """Within a part of the window: it gets the keyboard, where it was just given to it."""
+        """Focus the current window if its part has just received the keyboard."""
         if self.keyboard == name != self.focused:
             imgui.set_window_focus()
             imgui.internal.nav_init_window(imgui.internal.get_current_window(), True)
@@ -155,14 +158,14 @@ class UiContext:
             self.focused = name
 
     def set_scale(self, scale: float) -> None:
-        """Fonts and spacing for this many window pixels per design pixel."""
+        """Set fonts and spacing for this many window pixels per design pixel."""
         if scale != self.scale:
             self.scale = scale
             _apply_style(scale)
 
     @contextmanager
     def guard(self, report: Callable[[Exception], None]) -> Iterator[None]:
-        """A part of a frame: what it raises ends it alone, with imgui's stacks as before it."""
+        """Run a part of a frame. An exception ends only this part and restores imgui's stacks."""
         begun = imgui.internal.ErrorRecoveryState()
         drawing = imgui.get_current_context().within_frame_scope
         if drawing:
@@ -171,7 +174,7 @@ class UiContext:
             yield
         except Exception as error:
             if drawing:
-                _silence_imgui(True)  # what is not ended is known, and told by `report`
+                _silence_imgui(True)  # `report` shows the error, so imgui need not list the open items
                 imgui.internal.error_recovery_try_to_recover_state(begun)
                 _silence_imgui(False)
             report(error)
@@ -181,7 +184,7 @@ class UiContext:
 
 
 def _silence_imgui(silent: bool) -> None:
-    """Whether imgui says nothing of what it finds begun and not ended."""
+    """Turn off imgui's own reports about items that were begun and not ended."""
     io = imgui.get_io()
     io.config_error_recovery_enable_assert = not silent
     io.config_error_recovery_enable_debug_log = not silent
@@ -260,5 +263,5 @@ def _apply_style(scale: float) -> None:
 
 
 def u32(color: Rgba) -> int:
-    """A packed color for draw lists."""
+    """Return a color packed for draw lists."""
     return imgui.get_color_u32(color)

@@ -1,6 +1,6 @@
-"""The one table of commands with their keys, and of drags; what the person does, as actions of the table.
+"""Table of all commands with their keys, table of mouse drags, and translation of input into actions.
 
-Menus, tips, the list of keys and that of all commands are made from it.
+Menus, tooltips, the list of keys and the command palette are built from it.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from viewer.camera.view_camera import ViewCamera
 
 @dataclass(frozen=True)
 class Command:
-    """An action of `actions.perform` as a person meets it: in menus, tips, lists and, some day, speech."""
+    """Action of `actions.perform` with the texts and keys that the user sees."""
 
     action: str
-    name: str  # what it is called everywhere, also by who cannot see its icon
-    keys: str = ""  # chords with blanks between: modifiers in the order Ctrl, Shift, Alt, then the key's name
-    help: str = ""  # what a tip says beside the name
-    repeats: bool = False  # while a key is held
-    types: bool = False  # one types afterwards
-    row: str = ""  # in the list of keys, where it is about several commands; `JOINED` for the others of them
-    listed: str = ""  # its keys there, where they are too many
-    in_hand: bool = False  # of a tool or a decal in the hand, which then has these keys before others
+    name: str  # used everywhere, also as the accessible name of its icon
+    keys: str = ""  # chords separated by blanks: modifiers in the order Ctrl, Shift, Alt, then the key's name
+    help: str = ""  # text of the tooltip below the name
+    repeats: bool = False  # repeats while the key is held
+    types: bool = False  # opens a text field
+    row: str = ""  # text for several commands in the list of keys; `JOINED` for the rest of them
+    listed: str = ""  # its keys there, if they are too many
+    in_hand: bool = False  # for an active tool or decal, whose keys have priority
 
 
 DRAGS = {
@@ -40,21 +40,21 @@ DRAGS = {
     "Ctrl+middle": "dolly",
     "right": "pan",
 }
-"""What a mouse drag on the picture does; in fly, the bare right one looks around."""
+"""Action of a mouse drag on the picture. In fly mode, a right drag without modifier looks around."""
 
 
 FLY_KEYS = {"W": (0, 0, 1), "S": (0, 0, -1), "A": (-1, 0, 0), "D": (1, 0, 0), "Q": (0, -1, 0), "E": (0, 1, 0)}
-"""Physical keys (their places on a US keyboard) → right, up, ahead."""
+"""Physical keys (positions on a US keyboard) → right, up, ahead."""
 
 NUDGES = (("", 0.01), ("Shift+", 0.10), ("Ctrl+", 0.001))
 
 
 JOINED = "-"
-"""The row of a command that the one before it in the table shows too."""
+"""Row text of a command that shares the row of the previous command."""
 
 
 def _row(listed: str, does: str, commands: Iterable[Command]) -> Iterator[Command]:
-    """Commands that share a line of the list of keys."""
+    """Return commands that share a row of the list of keys."""
     return (replace(command, listed=listed, row=does) for command in commands)
 
 
@@ -76,7 +76,7 @@ def _points() -> Iterator[Command]:
             yield Command(f"point:{x * step},{y * step}", name, f"{modifier}{arrow}", in_hand=True)
 
 
-def _looks() -> Iterator[Command]:
+def _view_commands() -> Iterator[Command]:
     for key, side, other in (("Num1", "front", "back"), ("Num3", "right", "left"), ("Num7", "top", "bottom")):
         yield Command(f"look:{side}", f"View from the {side}", key)
         yield Command(f"look:{other}", f"View from the {other}", f"Ctrl+{key}")
@@ -103,7 +103,7 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("navigate:fly", "Fly", "", "W A S D, Q E; right drag looks around"),
         Command("frame", "Frame", "F Num.", "The selection, the selected layer, or the scene"),
         Command("home", "Reset the view", "Shift+F Num0"),
-        *_row("Numpad 1 3 7", "Front, right, top", _looks()),
+        *_row("Numpad 1 3 7", "Front, right, top", _view_commands()),
         Command("grid", "Ground grid", "Shift+G"),
         Command("axes", "Axes"),
         Command("before", "Original", "\\", "Until it is pressed again, or a slider moves"),
@@ -252,22 +252,24 @@ TOPICS: dict[str, tuple[Command, ...]] = {
 }
 COMMANDS = {command.action: command for commands in TOPICS.values() for command in commands}
 KEYS: dict[str, Command] = {}
+"""Command of each chord; filled by `bind`."""
 HAND_KEYS: dict[str, Command] = {}
-"""By its chord, what each key does, and what it does before that with a tool in the hand; see `bind`."""
+"""Command of each chord that has priority while a tool is active; filled by `bind`."""
 NAMES = (
     *"ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789\\[],.=-",
     *(f"F{i}" for i in range(1, 13)),
     *("Left", "Right", "Up", "Down", "Escape", "Tab", "Enter", "Backspace", "Space", "Delete"),
     *(f"Num{i}" for i in (*range(10), ".")),
 )
-"""Keys that the window tells apart."""
+"""Keys that the window distinguishes."""
 
 
 def bind(changes: Mapping[str, Any]) -> list[str]:
-    """The keys of the table, but for those of some actions; what is wrong with these, a line for each.
+    """Set the keys of all commands and return the errors, one line each.
 
     Args:
-        changes: by its action a chord, several or "" for none; a key that was another one's is no longer that
+        changes: by action, its chord, several chords, or "" for none; a chord is taken away from other
+            commands
     """
     problems = list[str]()
     changed = list[Command]()
@@ -280,12 +282,12 @@ def bind(changes: Mapping[str, Any]) -> list[str]:
             if not (isinstance(texts, list) and all(isinstance(text, str) for text in texts)):
                 raise ValueError('keys are written as "F6" or ["F6", "Ctrl+B"]')
             command = COMMANDS[action]
-            taken = {(parse_chord(text), command.in_hand): command for text in texts}
-            if twice := [key for key in taken if key in given]:
+            chosen = {(parse_chord(text), command.in_hand): command for text in texts}
+            if twice := [key for key in chosen if key in given]:
                 raise ValueError(f"{twice[0][0]} is that of {given[twice[0]].action} already")
-            if flies := [chord for chord, _ in taken if chord in FLY_KEYS]:
+            if flies := [chord for chord, _ in chosen if chord in FLY_KEYS]:
                 raise ValueError(f"{flies[0]} flies")
-            given.update(taken)
+            given.update(chosen)
             changed.append(COMMANDS[action])
         except ValueError as error:
             problems.append(f"{action}: {error}")
@@ -293,15 +295,17 @@ def bind(changes: Mapping[str, Any]) -> list[str]:
     HAND_KEYS.clear()
     chords.cache_clear()
     for command in COMMANDS.values():
-        mine = [chord for (chord, _), other in given.items() if other is command]
-        own = [] if command in changed else command.keys.split()
-        kept = [chord for chord in own if (chord, command.in_hand) not in given]
-        (HAND_KEYS if command.in_hand else KEYS).update(dict.fromkeys([*mine, *kept], command))
+        new_chords = [chord for (chord, _), other in given.items() if other is command]
+        table_chords = [] if command in changed else command.keys.split()
+        remaining_chords = [chord for chord in table_chords if (chord, command.in_hand) not in given]
+        (HAND_KEYS if command.in_hand else KEYS).update(
+            dict.fromkeys([*new_chords, *remaining_chords], command)
+        )
     return problems
 
 
 def parse_chord(text: str) -> str:
-    """A chord as a person writes it, as in `KEYS`.
+    """Parse a chord typed by a user into the form of `KEYS`.
 
     Raises:
         ValueError: there is no such key.
@@ -316,19 +320,19 @@ _MODIFIERS = ("Ctrl", "Shift", "Alt")
 
 
 def is_changed(command: Command) -> bool:
-    """Whether the person has given it other keys, or its own to another one."""
+    """Return whether the user changed the keys of a command, directly or by giving them to another."""
     return bound_chords(command) != command.keys.split()
 
 
 def bound_chords(command: Command) -> list[str]:
-    """The keys that a command has."""
+    """Return the chords of a command."""
     keys = HAND_KEYS if command.in_hand else KEYS
     return [chord for chord, other in keys.items() if other is command]
 
 
-@cache  # each frame's tips and menus ask for a hundred
+@cache  # tooltips and menus call this a hundred times per frame
 def chords(action: str) -> tuple[str, ...]:
-    """All keys of an action, in a person's words; none of what is no command."""
+    """Return all chords of an action in the user's words; none for an unknown action."""
     bound = bound_chords(COMMANDS[action]) if action in COMMANDS else []
     return tuple(
         chord.replace("Delete", "Del").replace("Num", "Numpad ").replace("Escape", "Esc") for chord in bound
@@ -339,12 +343,12 @@ bind({})
 
 
 def shortcut(action: str) -> str:
-    """The first key of an action, in a person's words; "" where there is none."""
+    """Return the first chord of an action in the user's words; "" if it has none."""
     return next(iter(chords(action)), "")
 
 
 def describe(action: str, more: str = "") -> str:
-    """A tip: the name with its key, what it does, and what there is to say beside."""
+    """Return a tooltip: the name with its chord, the help text, and `more`."""
     command = COMMANDS[action]
     chord = shortcut(action)
     first = command.name + (f" ({chord})" if chord else "")
@@ -352,27 +356,27 @@ def describe(action: str, more: str = "") -> str:
 
 
 def match(query: str, name: str, beside: str = "") -> int | None:
-    """How well a name answers to what is sought: 0 best, None not at all.
+    """Return how well a name matches a query: 0 is best, None is no match.
 
     Args:
-        beside: what is read where the name does not answer
+        beside: other text to search if the name does not match
     """
-    sought = query.casefold().strip()
+    needle = query.casefold().strip()
     text = name.casefold()
     letters = iter(name.casefold())
-    answers = (
-        text.startswith(sought),
-        f" {sought}" in text,
-        "".join(word[0] for word in text.split()).startswith(sought),
-        sought in text,
-        sought in beside.casefold(),
-        all(letter in letters for letter in sought.replace(" ", "")),  # in this order, with others between
+    matches = (
+        text.startswith(needle),
+        f" {needle}" in text,
+        "".join(word[0] for word in text.split()).startswith(needle),
+        needle in text,
+        needle in beside.casefold(),
+        all(letter in letters for letter in needle.replace(" ", "")),  # in this order, with gaps
     )
-    return next((i for i, answer in enumerate(answers) if answer), None)
+    return next((i for i, is_match in enumerate(matches) if is_match), None)
 
 
 def find_commands(query: str, offered: Collection[str]) -> list[Command]:
-    """Those of the actions offered that are called like that, the best first; all for ""."""
+    """Return the commands among `offered` that match the query, the best first; all for ""."""
     ranks = [
         (match(query, command.name, f"{command.help} {topic} {' '.join(chords(command.action))}"), command)
         for topic, commands in TOPICS.items()
@@ -384,7 +388,7 @@ def find_commands(query: str, offered: Collection[str]) -> list[Command]:
 
 
 def drag_for(button: str, modifier: str, mode: str) -> str | None:
-    """What a drag does, or None where nothing is bound. `modifier`: "", "Shift", "Ctrl" or "Alt"."""
+    """Return the action of a drag, None if unbound. `modifier`: "", "Shift", "Ctrl" or "Alt"."""
     if (button, modifier, mode) == ("right", "", "fly"):
         return "look"
     return DRAGS.get(f"{modifier}+{button}" if modifier else button)
@@ -395,62 +399,66 @@ _BUTTONS = (("left", 0), ("right", 1), ("middle", 2))
 
 @dataclass(frozen=True)
 class Press:
-    """A key that went down, with the modifiers that were held just then."""
+    """Key press with the modifiers held at that moment."""
 
-    chord: str  # as in `KEYS`
-    again: bool = False  # it went down before and is held
-    event_id: int = -1  # its place among imgui's input events (see `has_reached_imgui`); −1 is before all
+    chord: str  # in the form of `KEYS`
+    again: bool = False  # repeated while the key is held
+    event_id: int = -1  # index in imgui's input events (see `has_reached_imgui`); −1 precedes all
 
 
 @dataclass(frozen=True)
 class Keys:
-    """What the keyboard did since the last frame.
+    """Keyboard input since the last frame.
 
-    Not taken from imgui: it merges the events of a slow frame, and the Ctrl of a quick Ctrl+Z would be lost.
+    It does not come from imgui, which merges the events of a slow frame and would lose the Ctrl of a quick
+    Ctrl+Z.
     """
 
-    pressed: tuple[Press, ...] = ()  # in their order
-    held: frozenset[str] = frozenset()  # names of the keys that are down, as in the chords of `KEYS`
-    fly: frozenset[str] = frozenset()  # which of `FLY_KEYS` are down, by their physical place
+    pressed: tuple[Press, ...] = ()  # in the order of the presses
+    held: frozenset[str] = frozenset()  # names of the held keys, as in the chords of `KEYS`
+    fly: frozenset[str] = frozenset()  # held keys of `FLY_KEYS`, by their physical position
 
 
 NO_KEYS = Keys()
 
 
 def has_reached_imgui(press: Press) -> bool:
-    """Whether imgui, which takes text and keys in over several frames, has come to this key.
+    """Return whether imgui has processed the input before this key. It spreads text and keys over several
+    frames.
 
-    A key that comes before its time would overtake what was typed before it.
+    A key handled earlier would overtake text typed before it.
     """
     waiting = imgui.get_current_context().input_events_queue
     return waiting.empty() or waiting[0].event_id > press.event_id
 
 
 def opens_text(press: Press) -> bool:
-    """Whether a key asks for a text field: it needs some frames until it has the keyboard."""
+    """Return whether a key opens a text field, which receives the keyboard only some frames later."""
     command = KEYS.get(press.chord)
     return command is not None and command.types and not imgui.get_io().want_text_input
 
 
 def has_pending_input() -> bool:
-    """Whether imgui still holds input that its next frames take in."""
+    """Return whether imgui still queues input for its next frames."""
     return not imgui.get_current_context().input_events_queue.empty()
 
 
 def end_frame_here() -> None:
-    """What imgui hears from now on is of its next frame: else a slow frame, which hears at once that Tab went
-    down and Shift up, would take a quick Shift+Tab for Tab."""
-    for down in (True, False):  # the second event of a key waits for the next frame; no keyboard has this one
+    """Make imgui assign later input to its next frame.
+
+    Otherwise a slow frame receives Tab down and Shift up together and takes a quick Shift+Tab for Tab.
+    """
+    for down in (True, False):  # the key's second event waits for the next frame; no keyboard has F24
         imgui.get_io().add_key_event(imgui.Key.f24, down)
 
 
 def next_event_id() -> int:
-    """The place that the next event takes among imgui's input events."""
+    """Return the index that the next event gets in imgui's input events."""
     return int(imgui.get_current_context().input_events_next_event_id)
 
 
 def requested_actions(keys: Keys) -> list[str]:
-    """Actions of `KEYS` that were asked for; none while a text field is open."""
+    """Return the requested actions of `KEYS`; none while a text field is open."""
     if imgui.get_io().want_text_input:
         return []
     pressed = [(KEYS[press.chord], press.again) for press in keys.pressed if press.chord in KEYS]
@@ -458,19 +466,19 @@ def requested_actions(keys: Keys) -> list[str]:
 
 
 def is_repeating(keys: Keys) -> bool:
-    """Whether a key that repeats is held: what it does is not over yet."""
+    """Return whether a repeating key is held, so that its action is not over yet."""
     held = keys.held
     return bool(held) and any(key.repeats and chord.rpartition("+")[2] in held for chord, key in KEYS.items())
 
 
 def modifier() -> str:
-    """The one modifier that decides what a drag does."""
+    """Return the modifier that decides the action of a drag."""
     io = imgui.get_io()
     return "Shift" if io.key_shift else "Ctrl" if io.key_ctrl else "Alt" if io.key_alt else ""
 
 
 def started_drag(mode: str) -> str | None:
-    """What the button that went down over the picture in this frame does, or None."""
+    """Return the action of the button pressed over the picture in this frame, or None."""
     for name, button in _BUTTONS:
         if imgui.is_mouse_clicked(button):
             return drag_for(name, modifier(), mode)
@@ -482,11 +490,11 @@ def any_button_down() -> bool:
 
 
 def cancels_drag(keys: Keys, held: bool, drag: str | None) -> bool:
-    """Whether Escape or the right button takes back what the left button is dragging.
+    """Return whether Escape or the right button cancels the drag of the left button.
 
     Args:
-        held: something of the interface was held in the last frame: imgui lets go of it at Escape
-        drag: what is held on the picture, see `mouse.MouseTool`; the camera stays where it was turned
+        held: an item of the interface was active in the last frame; imgui releases it on Escape
+        drag: drag on the picture, see `mouse.MouseTool`; camera drags are not canceled
     """
     io = imgui.get_io()
     buttons = imgui.MouseButton_
@@ -498,13 +506,13 @@ def cancels_drag(keys: Keys, held: bool, drag: str | None) -> bool:
 
 
 def is_flying(keys: Keys) -> bool:
-    """Whether flight keys are held, and not as parts of a chord or of a text."""
+    """Return whether flight keys are held, outside of a chord and of a text field."""
     io = imgui.get_io()
     return bool(keys.fly) and not (io.want_text_input or io.key_ctrl or io.key_super)
 
 
 def fly_by_keys(camera: ViewCamera, keys: Keys, seconds: float, radius: float) -> ViewCamera:
-    """Flight by the keys that are down."""
+    """Return the camera after flying by the held keys."""
     io = imgui.get_io()
     right, up, ahead = (sum(FLY_KEYS[key][i] for key in keys.fly) for i in range(3))
     pace = 10.0 if io.key_shift else 0.1 if io.key_alt else 1.0
@@ -512,24 +520,24 @@ def fly_by_keys(camera: ViewCamera, keys: Keys, seconds: float, radius: float) -
 
 
 OPENING_FRAMES = 4
-"""From the wish for a text field until imgui gives it the keyboard."""
+"""Frames between the request for a text field and its keyboard focus."""
 
 
 class PendingKeys:
-    """Hands keys on in step with imgui; while a text field opens they wait for it."""
+    """Queue that passes keys on in step with imgui and holds them while a text field opens."""
 
     def __init__(self) -> None:
         self._waiting: tuple[Press, ...] = ()
         self._frames = 0
-        self._opened_at = -OPENING_FRAMES  # the frame in which a text field was last asked for
+        self._opened_at = -OPENING_FRAMES  # frame of the last request for a text field
 
     @property
     def opening(self) -> bool:
-        """Whether a text field was asked for and has no keyboard yet."""
+        """True while a requested text field does not have the keyboard yet."""
         return self._frames - self._opened_at < OPENING_FRAMES and not imgui.get_io().want_text_input
 
     def take(self, keys: Keys) -> Keys:
-        """The keys of one frame that imgui has come to; call once a frame."""
+        """Return the keys of this frame that imgui has reached; call once a frame."""
         pressed = (*self._waiting, *keys.pressed)
         count = 0 if self.opening else sum(1 for _ in itertools.takewhile(has_reached_imgui, pressed))
         opener = next((i for i, press in enumerate(pressed[:count]) if opens_text(press)), None)

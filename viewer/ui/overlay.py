@@ -1,4 +1,4 @@
-"""What is drawn over the picture: messages, a banner, the safe frame, the axes of the world."""
+"""Overlays on the picture: messages, a banner, the safe frame, the axes of the world."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from .widgets import plate
 
 @dataclass(frozen=True)
 class Area:
-    """The part of the window that shows the picture, window pixels."""
+    """Part of the window that shows the picture, in window pixels."""
 
     width: float
     height: float
 
 
 def banner(text: str, area: Area, ui: UiContext) -> None:
-    """A word at the top center of the picture."""
+    """Draw a text at the top center of the picture."""
     size = FONT_PX * ui.scale
     pad = 8.0 * ui.scale
     wide = _text_width(text, size, ui)
@@ -36,10 +36,10 @@ def banner(text: str, area: Area, ui: UiContext) -> None:
 
 
 def safe_frame(view: ViewState, area: Area, covered: float = 0.0) -> Area | None:
-    """The size of the safe frame, which lies in the middle of the picture; None where none is shown.
+    """Return the size of the safe frame, centered in the picture; None if it is hidden.
 
     Args:
-        covered: so much of the lower edge is under the timeline, window pixels
+        covered: height of the timeline over the lower edge, window pixels
     """
     if not view.safe_frame or not view.panel or view.compare.mode == "beside":
         return None
@@ -49,12 +49,12 @@ def safe_frame(view: ViewState, area: Area, covered: float = 0.0) -> Area | None
 
 
 def fit_to_frame(view: ViewState, frame: Area, area: Area) -> ViewState:
-    """`view` through a lens so wide that the frame has the height of the picture, as a film of it has."""
+    """Return `view` with a wider lens, so that the frame gets the vertical field of view of the film."""
     return replace(view, camera=widen(view.camera, frame.height / area.height))
 
 
 def draw_cross(at: tuple[float, float], ui: UiContext) -> None:
-    """The pointer that keys move."""
+    """Draw the pointer that keys move."""
     (x, y), canvas = at, imgui.get_background_draw_list()
     for color, thick in ((PALETTE.scrim, 4.0), (PALETTE.handle, 1.5)):
         for dx, dy in ((9.0 * ui.scale, 0.0), (0.0, 9.0 * ui.scale)):
@@ -63,7 +63,7 @@ def draw_cross(at: tuple[float, float], ui: UiContext) -> None:
 
 
 def draw_frame(name: str, frame: Area, area: Area, ui: UiContext) -> None:
-    """The safe frame as a thin line with its name, and a shade over all that the film leaves out."""
+    """Draw the safe frame as a thin line with its name, and a shade over the area outside the film."""
     canvas = imgui.get_background_draw_list()
     shade = u32((*PALETTE.scrim[:3], 0.55))
     left = round((area.width - frame.width) / 2)
@@ -82,7 +82,7 @@ def draw_frame(name: str, frame: Area, area: Area, ui: UiContext) -> None:
     canvas.add_rect(*at, line, thickness=ui.scale)
     size = SMALL_PX * ui.scale
     pad = 5.0 * ui.scale
-    # the tools lie at the left
+    # on the right, as the toolbar is on the left
     x = right - _text_width(name, size, ui) - 2 * pad
     y = bottom - size - pad
     canvas.add_rect_filled((x, y), at[1], u32(PALETTE.scrim))
@@ -90,11 +90,11 @@ def draw_frame(name: str, frame: Area, area: Area, ui: UiContext) -> None:
 
 
 def message(line: Message, area: Area, ui: UiContext) -> tuple[str, float]:
-    """One line at the bottom left, wrapped where the window is narrow.
+    """Draw a message at the bottom left, wrapped in a narrow window.
 
     Returns:
-        What was clicked: "close", "copy" for its details, "do" for its button, or ""; its upper edge in
-        window pixels.
+        The clicked button ("close", "copy" for the details, "do" for the message's button, or ""), and the
+        message's upper edge in window pixels.
     """
     pad = 12.0 * ui.scale
     widest = min(area.width - 2 * pad, 640.0 * ui.scale)
@@ -132,15 +132,15 @@ def _text(
 
 
 AXES_DRAG = "axes"
-"""The name of its drag, beside those of `keys.DRAGS`."""
+"""Name of the drag of the axes, in addition to those of `keys.DRAGS`."""
 
-# at 1×
+# sizes at 1×
 LENGTH_PX = 34.0
 BALL_PX = 9.5
 MARGIN_PX = 10.0
 LETTER_PX = 13.0
 MIN_PX = 240.0
-"""Width of the picture below which there is no room for it."""
+"""Picture width below which the axes are hidden."""
 
 _REACH_PX = LENGTH_PX + BALL_PX + 3.0
 _INKS: dict[str, Rgba] = {
@@ -152,12 +152,12 @@ _SHADE = (0.08, 0.09, 0.10, 0.62)
 _DISC = (0.5, 0.5, 0.5, 0.28)
 _DARK = (0.04, 0.04, 0.05, 1.0)
 _LIGHT = (1.0, 1.0, 1.0, 1.0)
-_AWAY = 0.35  # of an ink that an end has lost where it points away
+_AWAY_DIMMING = 0.35  # share of its color that an end loses when it points away
 
 
 @dataclass(frozen=True)
 class _End:
-    """An end of an axis on screen: window pixels, and how far it points towards the eye, −1..1."""
+    """End of an axis on screen, in window pixels, and its direction towards the camera, −1..1."""
 
     name: str
     x: float
@@ -166,7 +166,7 @@ class _End:
 
 
 def axis_under(view: ViewState, area: Area, ui: UiContext) -> str:
-    """What the mouse is on: an end of `AXES`, "disc" for the rest of it, "" where it is elsewhere."""
+    """Return the part of the axes under the mouse: an end of `AXES`, "disc" for the rest, "" for none."""
     if not _has_axes(view, area, ui):
         return ""
     mouse, (x, y) = imgui.get_io().mouse_pos, _center(area, ui)
@@ -177,17 +177,17 @@ def axis_under(view: ViewState, area: Area, ui: UiContext) -> str:
 
 
 def draw_axes(view: ViewState, area: Area, lit: bool, ui: UiContext) -> None:
-    """Draw it over the picture.
+    """Draw the axes over the picture.
 
     Args:
-        lit: the mouse is on it, or holds it
+        lit: the mouse hovers or drags them
     """
     if not _has_axes(view, area, ui):
         return
     canvas, (x, y), s = imgui.get_background_draw_list(), _center(area, ui), ui.scale
     if lit:
         canvas.add_circle_filled((x, y), _REACH_PX * s, u32(_DISC))
-    on = axis_under(view, area, ui) if lit else ""
+    hovered_end = axis_under(view, area, ui) if lit else ""
     for end in _ends(view.camera, area, ui):
         sign = end.name[0]
         letter = end.name[1]
@@ -198,21 +198,21 @@ def draw_axes(view: ViewState, area: Area, lit: bool, ui: UiContext) -> None:
             canvas.add_line((x, y), at, u32(ink), 2.0 * s)
             canvas.add_circle_filled(at, (BALL_PX + 0.75) * s, u32(_SHADE))
             canvas.add_circle_filled(at, BALL_PX * s, u32(ink))
-            _letter(canvas, end, letter, _LIGHT if end.name == on else _DARK, ui)
+            _letter(canvas, end, letter, _LIGHT if end.name == hovered_end else _DARK, ui)
         else:
             canvas.add_circle_filled(at, BALL_PX * s, u32(_SHADE))
             canvas.add_circle(at, (BALL_PX - 0.75) * s, u32(ink), 0, 1.75 * s)
-            if end.name == on:
+            if end.name == hovered_end:
                 _letter(canvas, end, f"−{letter}", _LIGHT, ui)
 
 
 def axes_height(view: ViewState, area: Area, ui: UiContext) -> float:
-    """How far down they reach, and from the right edge inwards, window pixels; 0 where there are none."""
+    """Return the height and width of the axes from the upper right corner, in window pixels; 0 if hidden."""
     return 2 * (_REACH_PX + MARGIN_PX) * ui.scale if _has_axes(view, area, ui) else 0.0
 
 
 def _has_axes(view: ViewState, area: Area, ui: UiContext) -> bool:
-    """It goes with the panel: F12 leaves nothing but the picture."""
+    """Return whether the axes are visible. Hiding the panel (F12) hides them too."""
     return view.axes and view.panel and area.width >= MIN_PX * ui.scale
 
 
@@ -222,23 +222,23 @@ def _center(area: Area, ui: UiContext) -> tuple[float, float]:
 
 
 def _ends(camera: ViewCamera, area: Area, ui: UiContext) -> list[_End]:
-    """The six ends, the farthest first."""
+    """Return the six ends of the axes, the farthest first."""
     picture, (x, y), length = axes(camera), _center(area, ui), LENGTH_PX * ui.scale
     ends = (
         _End(
             name,
-            x + length * dot(way, picture.right),
-            y - length * dot(way, picture.up),
-            dot(way, picture.back),
+            x + length * dot(direction, picture.right),
+            y - length * dot(direction, picture.up),
+            dot(direction, picture.back),
         )
-        for name, way in AXES.items()
+        for name, direction in AXES.items()
     )
     return sorted(ends, key=lambda end: end.nearness)
 
 
 def _dim(ink: Rgba, nearness: float) -> Rgba:
-    """An ink as it is on an end that points so far towards the eye."""
-    share = 1.0 - _AWAY * max(-nearness, 0.0)
+    """Return a color, darkened for an end that points away from the camera."""
+    share = 1.0 - _AWAY_DIMMING * max(-nearness, 0.0)
     return ink[0] * share, ink[1] * share, ink[2] * share, ink[3]
 
 

@@ -1,4 +1,4 @@
-"""The place of a window on the screen: whole, inside the work area of its monitor."""
+"""Position of a window on the screen: entirely inside the work area of its monitor."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .glfw_library import glfw
 
 @dataclass(frozen=True)
 class Box:
-    """A rectangle on the desktop in screen coordinates, which may be pixels or points."""
+    """Rectangle on the desktop in screen coordinates, which may be pixels or points."""
 
     x: int
     y: int
@@ -33,14 +33,14 @@ def keep_on_screen(handle: Any, least: tuple[int, int]) -> None:
     """Shrink and move a window that reaches beyond the work area of its monitor.
 
     Args:
-        handle: of glfw
-        least: smallest width and height that the window may be given later, less on a smaller screen
+        handle: glfw's handle of the window
+        least: minimum width and height of the window, less on a smaller screen
     """
     window = window_box(handle)
     fitted = fit_box(window, window_frame(handle), work_areas())
-    least_width = min(least[0], fitted.width)
-    least_height = min(least[1], fitted.height)
-    glfw.set_window_size_limits(handle, least_width, least_height, glfw.DONT_CARE, glfw.DONT_CARE)
+    min_width = min(least[0], fitted.width)
+    min_height = min(least[1], fitted.height)
+    glfw.set_window_size_limits(handle, min_width, min_height, glfw.DONT_CARE, glfw.DONT_CARE)
     if (fitted.width, fitted.height) != (window.width, window.height):
         glfw.set_window_size(handle, fitted.width, fitted.height)
     if (fitted.x, fitted.y) != (window.x, window.y):
@@ -51,26 +51,26 @@ def fit_box(window: Box, frame: Frame, areas: Sequence[Box]) -> Box:
     """Return the content of a window, shrunk and moved so that it lies in a work area with its frame.
 
     Args:
-        window: its content
-        frame: around it
-        areas: of the monitors, the primary one first; of none, the window stays as it is
+        window: content of the window
+        frame: its title bar and borders
+        areas: work areas of the monitors, the primary one first; without any, the window stays unchanged
     """
     if not areas:
         return window
-    area = max(areas, key=lambda other: _overlap(window, other))  # the first of equals
+    area = max(areas, key=lambda other: _overlap(window, other))  # the first one if several overlap equally
     width = max(min(window.width, area.width - frame.left - frame.right), 1)
     height = max(min(window.height, area.height - frame.top - frame.bottom), 1)
-    most_x = area.x + area.width - frame.right - width
-    most_y = area.y + area.height - frame.bottom - height
-    x = max(min(window.x, most_x), area.x + frame.left)
-    y = max(min(window.y, most_y), area.y + frame.top)
+    max_x = area.x + area.width - frame.right - width
+    max_y = area.y + area.height - frame.bottom - height
+    x = max(min(window.x, max_x), area.x + frame.left)
+    y = max(min(window.y, max_y), area.y + frame.top)
     return Box(x, y, width, height)
 
 
 def work_areas() -> list[Box]:
     """Return the work areas of the monitors, the primary one first.
 
-    A monitor whose system reports no work area counts as a whole; one without a size is left out.
+    A monitor without a reported work area counts as a whole; one without a size is omitted.
     """
     areas = []
     for monitor in glfw.get_monitors():
@@ -89,7 +89,7 @@ def window_box(handle: Any) -> Box:
 
 
 def window_frame(handle: Any) -> Frame:
-    """Return the frame around a window; of no width where the system reports none."""
+    """Return the frame around a window; all zero if the system reports none."""
     return Frame(*glfw.get_window_frame_size(handle))
 
 

@@ -1,4 +1,4 @@
-"""What lies under the mouse: the picture, and where in it the cursor is."""
+"""Pointer context: the picture under the mouse, and the cursor's position in it."""
 
 from __future__ import annotations
 
@@ -23,59 +23,59 @@ from .context import UiContext
 from .overlay import Area
 
 _SURFACE = ("means", "quats", "log_scales", "logit_opacities", "sh0")
-"""What `Surface` and picking read of a scene."""
+"""Attributes of a scene that `Surface` and picking read."""
 
 
 @dataclass(frozen=True)
 class PointerContext:
-    """What lies under the mouse in one frame."""
+    """Picture under the mouse in one frame."""
 
     engine: ViewEngine  # draws the picture
-    facts: SceneFacts  # of the open scene
-    shown: ViewState  # what the picture shows: the state, or the original while its key is held
-    area: Area  # the part of the window that shows it
+    facts: SceneFacts  # data of the open scene
+    shown: ViewState  # the displayed state: the current one, or the original while its key is held
+    area: Area  # the part of the window that shows the picture
     ui: UiContext  # fonts and scale
     now: float  # seconds on the main view's clock
-    surfaces: Surfaces  # what was looked at ahead
-    # side by side, the one that the mouse is in, or was in when its drag began: 0 left, 1 right
+    surfaces: Surfaces  # surfaces computed ahead
+    # side by side, the picture that contains the mouse, or did at the start of its drag: 0 left, 1 right
     half: int = 0
 
     @property
     def is_beside(self) -> bool:
-        """Whether the picture is two pictures of half the width."""
+        """True if the picture consists of two pictures of half the width."""
         return self.shown.compare.mode == "beside"
 
     @property
     def scale(self) -> float:
-        """How large things are in the picture, of what they are where it has all of the area."""
+        """Size of objects in the picture, relative to a picture that fills the area."""
         return half_scale(*self.size) if self.is_beside else 1.0
 
     @property
     def left(self) -> int:
-        """The column in framebuffer pixels at which the picture under the mouse begins."""
+        """Column at which the picture under the mouse begins, in framebuffer pixels."""
         return self.half * (self.size[0] // 2) if self.is_beside else 0
 
     @property
     def size(self) -> tuple[int, int]:
-        """The picture's width and height in framebuffer pixels."""
+        """Width and height of the picture in framebuffer pixels."""
         density = imgui.get_io().display_framebuffer_scale
         return max(round(self.area.width * density.x), 1), max(round(self.area.height * density.y), 1)
 
     @property
     def cursor(self) -> tuple[float, float]:
-        """Where the mouse is, in pixels of the picture."""
+        """Position of the mouse in pixels of the picture."""
         mouse = imgui.get_io().mouse_pos
         density = imgui.get_io().display_framebuffer_scale
         return mouse.x * density.x - self.left, mouse.y * density.y
 
     def camera(self, camera: ViewCamera) -> Camera:
-        """`camera` as it takes the picture."""
+        """Return `camera` with the size and intrinsics of the picture."""
         full = to_camera(camera, *self.size)
         return half_camera(full) if self.is_beside else full
 
     @property
     def scene(self) -> Gaussians:
-        """What the picture shows, without what is hidden; valid until another strength is drawn."""
+        """Gaussians of the picture without the hidden ones; valid until another strength is drawn."""
         scene = self.engine.gaussians(self.shown)
         hidden = self.shown.selection.hidden
         if hidden == NOBODY:
@@ -85,11 +85,11 @@ class PointerContext:
 
     @property
     def surface(self) -> Surface:
-        """What the picture shows, for tools; valid until another strength is drawn."""
+        """Surface of the picture for tools; valid until another strength is drawn."""
         return self.surfaces.at(self._surface_key) or Surface(self.scene, self.camera(self.shown.camera))
 
     def look_ahead(self) -> None:
-        """Work out in another thread what the tool in the hand will ask of a picture at rest."""
+        """Compute in another thread the data of a still picture that the active tool will need."""
         tool = self.shown.select.tool
         if self.facts.count < MANY or not (tool or self.shown.brush.active):
             return
@@ -105,7 +105,7 @@ class PointerContext:
         return self.engine, view.layers, view.blend, view.selection.hidden, key
 
     def _copy_surface(self) -> Surface:
-        """Of a scene that stays as it is, whatever strengths are drawn."""
+        """Return the surface of a copy of the scene, which later strengths do not change."""
         scene = self.scene
         if self.shown.layers:
             copies: dict[str, Any] = {name: getattr(scene, name).clone() for name in _SURFACE}

@@ -1,4 +1,4 @@
-"""The window and its first frames, by OpenGL alone: imgui, torch and numba take seconds to import."""
+"""Window and splash screen, drawn by OpenGL alone: imgui, torch and numba take seconds to import."""
 
 from __future__ import annotations
 
@@ -33,29 +33,31 @@ TEXT_PX = 15.0
 FONTS = BUNDLE / "assets" / "fonts"
 REGULAR = FONTS / "Roboto" / "Roboto-Regular.ttf"
 AFTER_S = 0.15
+"""Delay before the splash is shown, in seconds."""
 EVERY_S = 0.1
-"""How long one waits before a splash is shown, and between two frames of it."""
+"""Time between two frames of the splash, in seconds."""
 FIRST_S = 4.0
+"""Delay before `FIRST_TEXT` is added, in seconds."""
 FIRST_TEXT = "(the first time on a machine this takes half a minute)"
-"""What is said of waiting so long."""
+"""Explanation of a long wait."""
 _HINTS = (
     (glfw.CONTEXT_VERSION_MAJOR, 3),
     (glfw.CONTEXT_VERSION_MINOR, 3),
     (glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE),
     (glfw.OPENGL_FORWARD_COMPAT, True),
     (glfw.SCALE_TO_MONITOR, True),
-    (glfw.VISIBLE, False),  # until it lies on the screen
+    (glfw.VISIBLE, False),  # until it has its position on the screen
     (glfw.DEPTH_BITS, 0),
     (glfw.STENCIL_BITS, 0),
 )
 
 
 class Splash:
-    """A glfw window with OpenGL 3.3, its context current, that says what is waited for.
+    """glfw window with a current OpenGL 3.3 context that shows a progress text.
 
     Args:
-        title: in the title bar
-        size: width and height at 1×; less where the screen is smaller
+        title: text of the title bar
+        size: width and height at 1×; less on a smaller screen
 
     Raises:
         ProgdfError: there is no display, or no OpenGL 3.3 on it.
@@ -76,7 +78,7 @@ class Splash:
         glfw.show_window(self.handle)
         glfw.make_context_current(self.handle)
         glfw.swap_interval(1)
-        # through glfw's own loader, so that GLX, EGL, WGL and Cocoa all do
+        # glfw's own loader works with GLX, EGL, WGL and Cocoa
         moderngl.init_context(_GlfwLoader())
         self.context: moderngl.Context = moderngl.get_context()
         self._picture = SplashPicture(self.context)
@@ -86,7 +88,7 @@ class Splash:
         glfw.terminate()
 
     def draw(self, text: str, seconds: float) -> None:
-        """A frame: what is waited for, since how many seconds, and a bar that moves."""
+        """Draw a frame: the text, the elapsed seconds, and a moving bar."""
         size = glfw.get_framebuffer_size(self.handle)
         scale = glfw.get_window_content_scale(self.handle)[0]
         if 0 not in size:
@@ -94,7 +96,8 @@ class Splash:
             glfw.swap_buffers(self.handle)
 
     def wait(self, work: Future[_Made], text: str, listen: Callable[[], object] = glfw.poll_events) -> _Made:
-        """What another thread makes; meanwhile the window hears its events and soon shows a splash."""
+        """Wait for the result of another thread; handle window events meanwhile, and show a splash after a
+        delay."""
         begun = time.perf_counter()
         patience = AFTER_S
         while not wait([work], patience).done:
@@ -106,7 +109,7 @@ class Splash:
 
 
 class SplashPicture:
-    """Says in a framebuffer what is waited for; `release` it when done."""
+    """Progress text drawn into a framebuffer; `release` it when done."""
 
     def __init__(self, context: moderngl.Context) -> None:
         self._context = context
@@ -119,10 +122,10 @@ class SplashPicture:
         """Fill the framebuffer.
 
         Args:
-            size: its width and height, pixels
+            size: width and height of the framebuffer, pixels
             scale: pixels per design pixel
-            text: what is waited for
-            seconds: since when; a bar moves with it
+            text: the current work
+            seconds: elapsed time, which moves the bar
         """
         panel, field, ink, accent = _INKS
         words = f"{text}  ·  {seconds:.0f} s" if seconds >= 2.0 else text
@@ -159,13 +162,13 @@ class SplashPicture:
 
 
 class _GlfwLoader:
-    """What moderngl asks for the addresses of OpenGL's functions."""
+    """Loader of OpenGL functions for moderngl."""
 
     def load_opengl_function(self, name: str) -> int:
         return ctypes.cast(glfw.get_proc_address(name), ctypes.c_void_p).value or 0
 
     def release(self) -> None:
-        """Nothing is held."""
+        """Release nothing; moderngl requires this method."""
 
 
 def _no_window(what: str, errors: Sequence[str]) -> ProgdfError:

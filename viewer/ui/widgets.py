@@ -1,4 +1,4 @@
-"""The panel's small parts: headings, labels, tips, icon buttons, rows of choices, text that fits."""
+"""Widgets of the panel: headings, labels, tooltips, icon buttons, rows of choices, elided text."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ T = TypeVar("T")
 
 MenuItems = Sequence[str | tuple[str, str, str]]
 IconItems = Sequence[tuple[str, str] | tuple[str, str, str]]
-_GRIP_PX = 4.0  # what moves no further is a click, at 1×
+_GRIP_PX = 4.0  # a press that moves no further is a click, at 1×
 
 
 def section(name: str, layout: Layout, ui: UiContext) -> Layout:
-    """The heading of a part of the panel, with an arrow; the layout with it folded or not, as it was left."""
+    """Draw the heading of a section with an arrow; return the layout with the new fold state."""
     x, y = imgui.get_cursor_screen_pos()
     with imgui_ctx.push_font(ui.fonts.bold, SMALL_PX):
         text = name.upper()
@@ -45,26 +45,26 @@ def section(name: str, layout: Layout, ui: UiContext) -> Layout:
 
 
 def right_edge() -> float:
-    """Where the line ends, in the coordinates of `same_line`; ask at the line's start."""
+    """Return the end of the line in the coordinates of `same_line`; call it at the line's start."""
     return float(imgui.get_cursor_pos_x() + imgui.get_content_region_avail().x)
 
 
 def label(text: str, column: float) -> None:
-    """A name at the left; what follows begins at `column`."""
+    """Draw a name at the left; the next item begins at `column`."""
     imgui.align_text_to_frame_padding()
     imgui.text_disabled(text)
     imgui.same_line(column)
 
 
 def small(text: str, color: Rgba, room: float | None = None) -> None:
-    """Small text, shortened to `room` window pixels, or to the line."""
+    """Draw small text, elided to `room` window pixels, or to the line."""
     with imgui_ctx.push_font(None, SMALL_PX):
         room = imgui.get_content_region_avail().x if room is None else room
         imgui.text_colored(color, elide(text, room))
 
 
 def wrapped_text(text: str, color: Rgba) -> None:
-    """Small text in as many lines as it takes."""
+    """Draw small text, wrapped to the line."""
     with imgui_ctx.push_font(None, SMALL_PX), imgui_ctx.push_text_wrap_pos(0.0):
         imgui.text_colored(color, text)
 
@@ -72,7 +72,7 @@ def wrapped_text(text: str, color: Rgba) -> None:
 def picture(
     texture: int, at: imgui.ImVec2Like, end: imgui.ImVec2Like, rounding: float, opacity: float = 1.0
 ) -> None:
-    """A picture by its GL name; where there is none, 0, an empty card."""
+    """Draw a texture by its GL name, or an empty card for 0."""
     canvas = imgui.get_window_draw_list()
     if not texture:
         canvas.add_rect_filled(at, end, u32(PALETTE.card), rounding)
@@ -84,9 +84,9 @@ def picture(
 
 @contextmanager
 def inert(when: bool) -> Iterator[None]:
-    """What is drawn within is dim and takes no input, or is as always."""
+    """Disable the enclosed items if `when` is true: they are dim and take no input."""
     imgui.begin_disabled(when)
-    yield  # where this raises, the frame ends what is open
+    yield  # after an exception, `UiContext.guard` closes the open items
     imgui.end_disabled()
 
 
@@ -94,15 +94,15 @@ def inert(when: bool) -> Iterator[None]:
 def card(
     name: str, color: Rgba, ui: UiContext, nav: bool = False, padding: tuple[float, float] = (10.0, 8.0)
 ) -> Iterator[None]:
-    """What is drawn within lies on a card of its own height; `nav`: the keyboard goes through it."""
+    """Draw the enclosed items on a card of their height. `nav`: the keyboard navigates within it"""
     imgui.push_style_color(imgui.Col_.child_bg, color)
     imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(*padding) * ui.scale)
     child = imgui.ChildFlags_
     flags = child.auto_resize_y.value | child.always_use_window_padding.value
     flags |= 0 if nav else ui.child_flags("panel")
     imgui.begin_child(name, (0.0, 0.0), flags, 0 if nav else ui.nav_flags("panel"))
-    imgui.pop_style_var()  # here, as tips and menus have paddings of their own
-    yield  # where this raises, the frame ends what is open
+    imgui.pop_style_var()  # here, as tooltips and menus have their own padding
+    yield  # after an exception, `UiContext.guard` closes the open items
     imgui.end_child()
     imgui.pop_style_color()
 
@@ -116,7 +116,7 @@ def plate(
     pad: float = 8.0,
     size: imgui.ImVec2Like | None = None,
 ) -> Iterator[None]:
-    """What is drawn within lies on a plate over the picture; `size`: as large as what is on it if None."""
+    """Draw the enclosed items on a plate over the picture. `size` None fits the content"""
     imgui.set_next_window_pos(at, 0, pivot)
     imgui.set_next_window_size(size or (0.0, 0.0))
     imgui.push_style_color(imgui.Col_.window_bg, PALETTE.scrim)
@@ -127,12 +127,12 @@ def plate(
     imgui.pop_style_var(2)
     imgui.pop_style_color()
     ui.take_keyboard(name)
-    yield  # where this raises, the frame ends what is open
+    yield  # after an exception, `UiContext.guard` closes the open items
     imgui.end()
 
 
 def accent_button(text: str, size: imgui.ImVec2Like) -> bool:
-    """The button that one is most likely here for; True when it was pressed."""
+    """Draw the button of the most likely action; return True if it was pressed."""
     col = imgui.Col_
     colors = {col.button: PALETTE.accent, col.button_hovered: PALETTE.handle, col.text: PALETTE.ink}
     for slot, color in colors.items():
@@ -143,22 +143,22 @@ def accent_button(text: str, size: imgui.ImVec2Like) -> bool:
 
 
 def tip(text: str) -> None:
-    """What the last item does, shown when the mouse rests on it."""
+    """Show a tooltip of the last item on hover."""
     flags = imgui.HoveredFlags_
-    # no_nav_override: the tip of a field that merely has the keyboard would cover the next row
-    rests = flags.for_tooltip.value | flags.allow_when_disabled.value | flags.no_nav_override.value
-    if imgui.is_item_hovered(rests):
+    # no_nav_override: the tooltip of a field that only has the keyboard would cover the next row
+    hover_flags = flags.for_tooltip.value | flags.allow_when_disabled.value | flags.no_nav_override.value
+    if imgui.is_item_hovered(hover_flags):
         imgui.set_tooltip(text)
 
 
 def icon_button(
     name: str, icon: str, ui: UiContext, dim: bool = False, lit: bool = False, side: float = 0.0
 ) -> bool:
-    """A square button of an icon alone; True when it was pressed.
+    """Draw a square icon button; return True if it was pressed.
 
     Args:
-        dim: what it stands for is off
-        lit: it is in the hand, or on
+        dim: its setting is off
+        lit: its tool is active, or its setting is on
         side: window pixels; 0 for the height of a text field
     """
     side = side or imgui.get_frame_height()
@@ -168,8 +168,8 @@ def icon_button(
     canvas = imgui.get_window_draw_list()
     size = imgui.calc_text_size(icon)
     if hovered or lit:
-        ground = u32(PALETTE.chosen if lit else PALETTE.field)
-        canvas.add_rect_filled((x, y), (x + side, y + side), ground, 4.0 * ui.scale)
+        background = u32(PALETTE.chosen if lit else PALETTE.field)
+        canvas.add_rect_filled((x, y), (x + side, y + side), background, 4.0 * ui.scale)
     color = PALETTE.handle if hovered or lit else PALETTE.faint if dim else PALETTE.text
     at = (round(x + (side - size.x) / 2), round(y + (side - size.y) / 2))
     canvas.add_text(at, u32(color), icon)
@@ -177,14 +177,14 @@ def icon_button(
 
 
 def hint(action: str, more: str = "") -> None:
-    """The tip of a command that the last item asks for, and what there is to say beside."""
+    """Show the tooltip of the last item's command, followed by `more`."""
     tip(describe(action, more))
 
 
 def icon_row(
     items: IconItems, ui: UiContext, actions: list[str], gap: float = 0.0, off: Collection[str] = ()
 ) -> None:
-    """Buttons of commands on a line; those in `off` cannot be pressed."""
+    """Draw the buttons of commands on a line; those in `off` are disabled."""
     for i, (action, icon, *more) in enumerate(items):
         if i:
             imgui.same_line(0.0, gap)
@@ -196,41 +196,41 @@ def icon_row(
 def more_button(
     name: str, items: MenuItems, ui: UiContext, actions: list[str], icon: str = Icon.MENU, side: float = 0.0
 ) -> None:
-    """A button that opens a menu, see `menu_items`; what was chosen goes to `actions`."""
+    """Draw a button that opens a menu, see `menu_items`; append the chosen action to `actions`."""
     if icon_button(name, icon, ui, side=side):
         imgui.open_popup(name)
     actions += menu_items(name, items, ui)
 
 
 def menu_items(name: str, items: MenuItems, ui: UiContext, off: Collection[str] = ()) -> list[str]:
-    """The menu that `imgui.open_popup(name)` opens; the action that was chosen in it, if one was.
+    """Draw the menu that `imgui.open_popup(name)` opens; return the chosen action, if any.
 
     Args:
-        items: commands of the table, a line for ""; or text, action and tip of what is none
-        off: actions that cannot be chosen
+        items: commands of the table, "" for a line, or text, action and tooltip of another item
+        off: disabled actions
     """
-    asked: list[str] = []
+    requested: list[str] = []
     with menu(name, ui) as is_open:
         for item in items if is_open else ():
             if not item:
                 imgui.separator()
             elif isinstance(item, str):
-                asked += [item] * menu_item(item, enabled=item not in off)
+                requested += [item] * menu_item(item, enabled=item not in off)
             else:
                 text, action, help_ = item
                 if imgui.menu_item(f"{text}##{action}", "", False, action not in off)[0]:
-                    asked.append(action)
+                    requested.append(action)
                 if help_:
                     tip(help_)
-    return asked
+    return requested
 
 
 def menu_item(action: str, on: bool = False, enabled: bool = True, name: str = "") -> bool:
-    """A command in a menu that is open, with its key; True when it was chosen.
+    """Draw a command with its key in an open menu; return True if it was chosen.
 
     Args:
         on: it has a check mark
-        name: in place of that of the table
+        name: replaces the name in the table
     """
     command = COMMANDS[action]
     chosen = imgui.menu_item(f"{name or command.name}##{action}", shortcut(action), on, enabled)[0]
@@ -240,7 +240,7 @@ def menu_item(action: str, on: bool = False, enabled: bool = True, name: str = "
 
 
 def typed_name(name: str, room: float) -> str | None:
-    """The text field of a name; None while it is open, "" where it was left as it was."""
+    """Draw a text field for a name; return None while it is open, "" if the name is unchanged."""
     storage = imgui.get_state_storage()
     slot = int(imgui.get_id("name/focused"))
     if not storage.get_bool(slot):
@@ -256,13 +256,15 @@ def typed_name(name: str, room: float) -> str | None:
 
 
 def start_naming(starts: bool = True) -> None:
-    """In place of a name its text field from now on, or not."""
+    """Open the text field of a name, or close it."""
     imgui.get_state_storage().set_bool(imgui.get_id("naming"), starts)
 
 
 def name_field(name: str, room: float, action: str, actions: list[str]) -> bool:
-    """The text field of a name, where `start_naming` has asked for it, and whether it has; what was typed
-    follows `action`."""
+    """Draw the text field of a name if `start_naming` opened it, and return whether it did.
+
+    The typed name is requested as `action`:NAME.
+    """
     if not imgui.get_state_storage().get_bool(imgui.get_id("naming")):
         return False
     typed = typed_name(name, room)
@@ -272,7 +274,7 @@ def name_field(name: str, room: float, action: str, actions: list[str]) -> bool:
 
 
 def search_field(hint_: str, query: str) -> str:
-    """The text field over a list, which has the keyboard as it appears; what is sought."""
+    """Draw the search field above a list, focused when it appears; return its text."""
     if imgui.is_window_appearing():
         imgui.set_keyboard_focus_here()
     imgui.set_next_item_width(-1.0)
@@ -281,11 +283,11 @@ def search_field(hint_: str, query: str) -> str:
 
 @contextmanager
 def menu(name: str, ui: UiContext, flags: int = 0) -> Iterator[bool]:
-    """A context menu that `imgui.open_popup(name)` opens; whether it is open. `flags`: of its window"""
+    """Draw the context menu that `imgui.open_popup(name)` opens; yield whether it is open."""
     imgui.push_style_var(imgui.StyleVar_.window_padding, (8.0 * ui.scale, 8.0 * ui.scale))
     is_open = imgui.begin_popup(name, flags)
     imgui.pop_style_var()
-    yield bool(is_open)  # where this raises, the frame ends what is open
+    yield bool(is_open)  # after an exception, `UiContext.guard` closes the open items
     if is_open:
         imgui.end_popup()
 
@@ -300,17 +302,16 @@ def drop_down(
     tips: Sequence[str] = (),
     faint: Collection[int] = (),
 ) -> int | None:
-    """A list that opens below what it shows; the index that was chosen, or None.
+    """Draw a drop-down list; return the index of the chosen title, or None.
 
     Args:
-        name: for imgui, shown nowhere
-        shown: of the present choice
-        titles: to choose from
-        current: which of them is chosen
-        help_: the tip of the closed list
-        tips: one for each title, or none
-        faint: which titles are drawn so
-        flags: of `imgui.ComboFlags_`
+        name: imgui id
+        shown: text of the current choice
+        titles: the choices
+        current: index of the current choice
+        help_: tooltip of the closed list
+        tips: one tooltip per title, or none
+        faint: indices of titles drawn in a faint color
     """
     if not imgui.begin_combo(name, shown):
         tip(help_)
@@ -330,14 +331,14 @@ def drop_down(
 
 
 def is_released() -> bool:
-    """Whether the mouse let go of the last item in this frame; not where its drag was called off."""
+    """Return whether the mouse released the last item in this frame; False if its drag was canceled."""
     return bool(imgui.is_item_deactivated() and imgui.is_mouse_released(imgui.MouseButton_.left.value))
 
 
 def grip(ui: UiContext) -> str:
-    """What the hand does with the last item, a button: "clicked", or "dragged" and at the end "dropped".
+    """Return the gesture on the last item, a button: "clicked", or "dragged" and at the end "dropped".
 
-    "" for nothing, and where a drag was called off.
+    "" means no gesture, or a canceled drag.
     """
     moved = imgui.get_mouse_drag_delta(imgui.MouseButton_.left.value, _GRIP_PX * ui.scale)
     far = bool(moved.x or moved.y)
@@ -347,24 +348,25 @@ def grip(ui: UiContext) -> str:
 
 
 def is_entered() -> bool:
-    """Whether the keyboard has just pressed the last item."""
+    """Return whether the keyboard has just pressed the last item."""
     return bool(imgui.get_current_context().nav_activate_id == imgui.get_item_id() != 0)
 
 
 def key_step(less: imgui.Key, more: imgui.Key) -> float:
-    """How far two arrow keys move the last item, which has the keyboard: as those of the focused layer do."""
+    """Return the step by two arrow keys for the last item, which has the keyboard; the same step as for
+    the focused layer."""
     io = imgui.get_io()
     step = 0.0
     for key, sign in ((less, -1.0), (more, 1.0)):
-        imgui.internal.set_key_owner(key, imgui.get_item_id())  # else they would lead to another item
+        imgui.internal.set_key_owner(key, imgui.get_item_id())  # otherwise they would move to another item
         step += sign * bool(imgui.is_key_pressed(key))
     return step * dict(NUDGES)["Shift+" if io.key_shift else "Ctrl+" if io.key_ctrl else ""]
 
 
 def is_double_clicked() -> bool:
-    """Whether the last item, a slider, was double-clicked, which takes it back to its default.
+    """Return whether the last item, a slider, was double-clicked, which resets it to its default.
 
-    It lets go of the slider, which would follow the mouse again in the next frame.
+    It deactivates the slider, which would otherwise follow the mouse again in the next frame.
     """
     left = imgui.MouseButton_.left.value
     if not (imgui.is_item_hovered() and imgui.is_mouse_double_clicked(left)):
@@ -382,10 +384,10 @@ def value_slider(
     ui: UiContext,
     wide: float = 0.0,
 ) -> float:
-    """A field with its value in words, and along its foot how far that is from end to end.
+    """Draw a field with its value as text and a bar along its lower edge; return the value.
 
-    Ctrl+click types, a double click goes back to `default`, arrows move it where it has the keyboard. A range
-    over orders of magnitude is logarithmic. The value is as before, or what the field shows. `wide`: window
+    Ctrl+click opens a text field, a double click resets to `default`, and arrow keys move a focused field. A
+    range with a positive lower end is logarithmic. A new value is rounded to two decimals. `wide`: window
     pixels, 0 for the rest of the line
     """
     logarithmic = ends[0] > 0.0
@@ -393,7 +395,7 @@ def value_slider(
     tabbed = context.nav_activate_flags & imgui.internal.ActivateFlags_.from_tabbing.value
     flags = imgui.SliderFlags_.always_clamp.value
     flags |= imgui.SliderFlags_.logarithmic.value if logarithmic else 0
-    flags |= imgui.SliderFlags_.no_input.value if tabbed else 0  # else Tab would open a text field
+    flags |= imgui.SliderFlags_.no_input.value if tabbed else 0  # otherwise Tab would open a text field
     imgui.set_next_item_width(wide or -1.0)
     for slot in (imgui.Col_.slider_grab, imgui.Col_.slider_grab_active):
         imgui.push_style_color(slot, (0.0, 0.0, 0.0, 0.0))
@@ -404,16 +406,16 @@ def value_slider(
     if is_double_clicked():
         changed = True
         new = default
-    first, last, now = (math.log(x) if logarithmic else x for x in (*ends, new if changed else value))
-    share = (now - first) / (last - first)
+    first, last, current = (math.log(x) if logarithmic else x for x in (*ends, new if changed else value))
+    share = (current - first) / (last - first)
     if imgui.is_item_focused() and context.nav_cursor_visible and not imgui.is_item_active():
         step = key_step(imgui.Key.left_arrow, imgui.Key.right_arrow)
         if step:
             moved = first + (share + step) * (last - first)
             moved = math.exp(moved) if logarithmic else moved
-            least = value + math.copysign(0.01, step)  # that the field shows
+            min_step = value + math.copysign(0.01, step)  # one unit in the displayed digits
             changed = True
-            new = max(moved, least) if step > 0.0 else min(moved, least)
+            new = max(moved, min_step) if step > 0.0 else min(moved, min_step)
             new = min(max(new, ends[0]), ends[1])
     share = min(max(share, 0.0), 1.0)
     low = imgui.get_item_rect_min()
@@ -421,17 +423,19 @@ def value_slider(
     left = (low.x, high.y - 3.0 * ui.scale)
     end = (high.x, high.y)
     canvas = imgui.get_window_draw_list()
-    shut = (low.x + share * (high.x - low.x), high.y)
+    filled_end = (low.x + share * (high.x - low.x), high.y)
     canvas.add_rect_filled(left, end, u32(PALETTE.line), 2.0 * ui.scale)
-    canvas.add_rect_filled(left, shut, u32(PALETTE.accent), 2.0 * ui.scale)
-    return round(new, 2) if changed else value  # unchanged, imgui still rounds to float32
+    canvas.add_rect_filled(left, filled_end, u32(PALETTE.accent), 2.0 * ui.scale)
+    return round(new, 2) if changed else value  # imgui would round an unchanged value to float32
 
 
 def choice(
     name: str, options: Mapping[T, str], current: T | None, ui: UiContext, wide: float = 0.0
 ) -> T | None:
-    """A row of joined buttons, `wide` pixels or 0 for the rest of the line; the value that was chosen of
-    `options`, which give each its text, or None."""
+    """Draw a row of joined buttons; return the chosen value, or None.
+
+    `options` maps values to texts. `wide`: window pixels, 0 for the rest of the line
+    """
     gap = 2.0 * ui.scale
     room = (wide or imgui.get_content_region_avail().x) - gap * (len(options) - 1)
     widths = [room / len(options)] * len(options)
@@ -457,7 +461,7 @@ def choice(
 def choice_row(
     title: str, options: Mapping[T, str], current: T, column: float, ui: UiContext, help_: str = ""
 ) -> T:
-    """A named row of joined buttons, see `choice`; the value as it is now."""
+    """Draw a named row of joined buttons, see `choice`; return the current value."""
     label(title, column)
     pressed = choice(title, options, current, ui)
     if help_:
@@ -466,7 +470,7 @@ def choice_row(
 
 
 def swatch(color: tuple[float, float, float], alpha: float, edge: bool, ui: UiContext) -> None:
-    """A small square of a color on the present line; `edge`: with a line around it."""
+    """Draw a small square of a color on the current line; `edge`: with an outline."""
     side = 12.0 * ui.scale
     tall = imgui.get_frame_height()
     x, y = imgui.get_cursor_screen_pos()
@@ -483,18 +487,18 @@ _BUTTON_COLORS = (imgui.Col_.button, imgui.Col_.button_hovered, imgui.Col_.butto
 
 
 def group_digits(count: int) -> str:
-    """12345 as "12 345", with a thin space."""
+    """Return a count with its digits grouped by a thin space, as in "12 345"."""
     return f"{count:,}".replace(",", "\u2009")
 
 
 def with_added(total: int, added: int) -> str:
-    """So many Gaussians, as in "12 345 + 2 074" where edits have added some of them."""
+    """Return a number of Gaussians as text, as in "12 345 + 2 074" if edits have added some."""
     return group_digits(total - added) + (f" + {group_digits(added)}" if added else "")
 
 
 def elide(text: str, room: float) -> str:
-    """The text, shortened with "…" to fit `room` window pixels in the present font: after a whole word, where
-    one fits."""
+    """Return the text, elided with "…" to fit `room` window pixels in the current font, after a whole word
+    if possible."""
     if imgui.calc_text_size(text).x <= room:
         return text
     text_so_far = text

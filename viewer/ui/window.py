@@ -1,4 +1,4 @@
-"""The glfw window: listened to, scaled, renamed. Nothing is drawn here."""
+"""glfw window: events, scale, title, full screen. It draws nothing."""
 
 from __future__ import annotations
 
@@ -23,34 +23,34 @@ from .placement import Box, Frame, fit_box, window_box, window_frame, work_areas
 from .splash import MINIMUM_SIZE_PX, Splash
 
 LONGEST_S = 0.3
-"""Between the two presses of a double click, as imgui has it."""
+"""Maximum time between the two presses of a double click, as in imgui, in seconds."""
 _ALWAYS_S = 1e6
 
 
 class DoubleClicks:
-    """Tells imgui which presses of the left button follow closely on the one before.
+    """Detection of double clicks of the left button for imgui.
 
-    imgui takes one event of a button a frame and measures in frame time: where a frame takes 100 ms, a quick
-    double click is two clicks to it.
+    imgui handles one event of a button per frame and measures frame times. At 100 ms a frame, it would see a
+    quick double click as two clicks.
     """
 
     def __init__(self) -> None:
         self._last = -math.inf
-        self._waiting: deque[tuple[int, bool]] = deque()  # presses that no frame has taken in yet
+        self._waiting: deque[tuple[int, bool]] = deque()  # presses that no frame has handled yet
 
     def note_press(self, time: float, unheard: float, event_id: int) -> None:
-        """The button went down.
+        """Record a press of the button.
 
         Args:
-            time: when the window heard of it, seconds of any clock
-            unheard: seconds before the window listened in which it drew: the press may be so much older
-            event_id: the place of the press among imgui's input events
+            time: when the window received it, seconds of any clock
+            unheard: seconds of drawing before that; the press may be older by this much
+            event_id: index of the press in imgui's input events
         """
         self._waiting.append((event_id, time - self._last - unheard <= LONGEST_S))
         self._last = time
 
     def apply(self) -> None:
-        """Call before `imgui.new_frame`: the press that it takes in counts as noted."""
+        """Set imgui's double-click time for the next press; call before `imgui.new_frame`."""
         queue = imgui.get_current_context().input_events_queue
         while self._waiting and (queue.empty() or queue[0].event_id > self._waiting[0][0]):
             self._waiting.popleft()
@@ -87,10 +87,10 @@ KEY_NAMES = {
 
 
 class Window:
-    """The window that a splash opened, once there is an interface in it.
+    """Window with an interface, created by a splash.
 
     Args:
-        splash: goes on to be drawn while something is waited for
+        splash: drawn again during long waits
     """
 
     def __init__(self, splash: Splash) -> None:
@@ -99,22 +99,22 @@ class Window:
         self.context = splash.context
         self._pointed: tuple[float, float] | None = None
         self._pressed: list[Press] = []
-        self._down: dict[int, str] = {}  # names of the keys that are down
-        self._chorded: set[int] = set()  # those of them that went down with Ctrl, and do not fly without it
-        self._windowed: tuple[Box, Frame] | None = None  # of the window before it filled the screen
+        self._down: dict[int, str] = {}  # names of the held keys
+        self._chorded: set[int] = set()  # keys pressed with Ctrl, which do not fly after its release
+        self._windowed: tuple[Box, Frame] | None = None  # the window's box before full screen
         self._clicks = DoubleClicks()
-        self._heard_until = time.perf_counter()  # when it last stopped listening, to draw
-        self._unheard_s = 0.0  # how long it had not listened when it last began to
+        self._heard_until = time.perf_counter()  # end of the last event handling, before drawing
+        self._unheard_s = 0.0  # seconds without event handling before the last one
 
     def listen(
         self, wake: Callable[[], None], dropped: Callable[[Sequence[Path]], None], redraw: Callable[[], None]
     ) -> None:
-        """Hand on events, and let imgui listen too. Call with the imgui context current.
+        """Register the callbacks, also imgui's. Call with the imgui context current.
 
         Args:
-            wake: something happened
-            dropped: files were dropped on the window
-            redraw: draw at once (while a window is being resized, some systems run no event loop but this)
+            wake: called for every event
+            dropped: called with the dropped files
+            redraw: draws at once (some systems block the event loop while a window is resized)
         """
 
         def on_event(*_: object) -> None:
@@ -146,16 +146,16 @@ class Window:
             glfw.set_framebuffer_size_callback,
         ):
             listen(self.handle, on_event)
-        callback: Any = on_drop  # glfw's own annotation has the arguments of the C function
+        callback: Any = on_drop  # glfw's annotation has the arguments of the C function
         glfw.set_drop_callback(self.handle, callback)
         glfw.set_key_callback(self.handle, on_key)
         glfw.set_mouse_button_callback(self.handle, on_button)
         glfw.set_window_refresh_callback(self.handle, on_refresh)
-        # imgui's own callbacks call the ones that were there before
+        # imgui's callbacks call the ones installed before
         imgui.backends.glfw_init_for_opengl(ctypes.cast(self.handle, ctypes.c_void_p).value or 0, True)
 
     def wait(self, patience: float | None) -> None:
-        """Handle events: at once (0), for so many seconds at most, or when the next one comes (None)."""
+        """Handle events: at once (0), for this many seconds at most, or until the next one (None)."""
         self._unheard_s = time.perf_counter() - self._heard_until
         if patience is None:
             glfw.wait_events()
@@ -166,7 +166,7 @@ class Window:
         self._heard_until = time.perf_counter()
 
     def new_frame(self) -> None:
-        """Give imgui what the window has heard, for the frame that begins."""
+        """Begin an imgui frame with the received events."""
         imgui.backends.glfw_new_frame()
         self._clicks.apply()
 
@@ -174,7 +174,7 @@ class Window:
         glfw.set_window_should_close(self.handle, True)
 
     def stay_open(self) -> None:
-        """Take back a wish to close."""
+        """Withdraw a request to close."""
         glfw.set_window_should_close(self.handle, False)
 
     @property
@@ -191,8 +191,8 @@ class Window:
     def ui_scale(self) -> float:
         """Window coordinates per design pixel, at least 0.5.
 
-        It is the scale of the screen, except the part that the coordinates hide, and less where the window is
-        smaller than `MINIMUM_SIZE_PX` at that scale, so that all tools stay in reach.
+        It is the scale of the screen without the part that the window coordinates include already. It is
+        smaller in a window below `MINIMUM_SIZE_PX` at that scale, so that all tools stay in reach.
         """
         pixels = self.pixels[0]
         if not pixels:
@@ -203,7 +203,7 @@ class Window:
         return max(min(content * width / pixels, fitting), 0.5)
 
     def take_keys(self) -> Keys:
-        """What the keyboard did since the last call."""
+        """Return the keyboard input since the last call."""
         down = {n: key for n, key in _FLY_KEYS.items() if glfw.get_key(self.handle, key) == glfw.PRESS}
         fly = frozenset(n for n, key in down.items() if key not in self._chorded)
         keys = Keys(tuple(self._pressed), frozenset(self._down.values()), fly)
@@ -211,7 +211,7 @@ class Window:
         return keys
 
     def point(self, at: tuple[float, float] | None) -> None:
-        """The mouse goes where keys have moved the pointer, where the system lets it."""
+        """Move the mouse to the pointer moved by keys, if the system allows it."""
         if at not in (None, self._pointed):
             glfw.set_cursor_pos(self.handle, *at)
         self._pointed = at
@@ -238,7 +238,7 @@ class Window:
         glfw.set_window_title(self.handle, title)
 
     def toggle_full_screen(self) -> None:
-        """Fill the primary monitor, or go back to the earlier place, as far as it is still on a screen."""
+        """Fill the primary monitor, or restore the earlier position, moved onto a screen if needed."""
         if self._windowed is not None:
             no_monitor: Any = None
             box = fit_box(*self._windowed, work_areas())
@@ -256,22 +256,22 @@ class Window:
 
 
 def wake_window() -> None:
-    """Let `Window.wait` return; from any thread."""
+    """Make `Window.wait` return; callable from any thread."""
     glfw.post_empty_event()
 
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Let Ctrl+C in the terminal end a wait for events; Python alone would hear of it with the next event."""
+    """Let Ctrl+C in the terminal end a wait for events; Python alone would handle it after the next event."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    heard, sender = socket.socketpair()
+    receiver, sender = socket.socketpair()
     sender.setblocking(False)
     before = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
 
     def listen() -> None:
-        while heard.recv(1):
+        while receiver.recv(1):
             glfw.post_empty_event()
 
     listener = threading.Thread(target=listen, daemon=True)
@@ -282,11 +282,11 @@ def interruptible() -> Iterator[None]:
         signal.set_wakeup_fd(before)
         sender.close()
         listener.join()
-        heard.close()
+        receiver.close()
 
 
 def key_name(key: int, scancode: int) -> str:
-    """The name of a glfw key in `controls`: letters as the layout has them, others by their place."""
+    """Return the name of a glfw key in `controls`: letters by the keyboard layout, others by position."""
     name = KEY_NAMES.get(key, "")
     if len(name) == 1 and name.isalpha():
         label = glfw.get_key_name(key, scancode) or ""
@@ -295,7 +295,7 @@ def key_name(key: int, scancode: int) -> str:
 
 
 def chord(name: str, mods: int) -> str:
-    """A key with its modifiers, as in `keys.KEYS`; on a Mac, Command does what Ctrl does elsewhere."""
+    """Return a key with its modifiers, in the form of `keys.KEYS`; on a Mac, Command counts as Ctrl."""
     ctrl = glfw.MOD_CONTROL | (glfw.MOD_SUPER if sys.platform == "darwin" else 0)
     modifiers = (("Ctrl+", ctrl), ("Shift+", glfw.MOD_SHIFT), ("Alt+", glfw.MOD_ALT))
     return "".join(prefix for prefix, bit in modifiers if mods & bit) + name
