@@ -1,4 +1,4 @@
-"""The interactive viewer and its headless twin."""
+"""Interactive viewer and its headless counterpart."""
 
 from __future__ import annotations
 

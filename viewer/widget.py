@@ -1,4 +1,7 @@
-"""The page in a cell of a notebook: `viewer.Widget`, by anywidget (`pip install progdf-studio[jupyter]`)."""
+"""Notebook widget: the web page in a cell, `viewer.Widget`, built on anywidget.
+
+Needs the extra `jupyter` (`pip install progdf-studio[jupyter]`).
+"""
 
 from __future__ import annotations
 
@@ -33,15 +36,15 @@ try:
 except ImportError as error:
     raise ProgdfError("viewer.Widget needs anywidget; pip install 'progdf-studio[jupyter]'") from error
 
-_STILL = 720, 480
+_STILL_SIZE = 720, 480  # width and height of the still image, px
 
 
 class RefusedError(ProgdfError, traitlets.TraitError):
-    """A value that a trait of a widget cannot have; the earlier one stays."""
+    """Invalid value for a widget's trait. The trait keeps its earlier value."""
 
 
 class Values(dict[str, Any]):
-    """The strengths of a widget, or its camera; setting some of them moves what is drawn."""
+    """Strengths or camera of a widget. Setting an entry updates the drawn scene."""
 
     def __init__(self, values: Mapping[str, Any], widget: Widget, trait: str) -> None:
         super().__init__(values)
@@ -56,7 +59,7 @@ class Values(dict[str, Any]):
         return self
 
     def update(self, *values: Any, **more: Any) -> None:
-        """Set some, or raise RefusedError and leave all as they are."""
+        """Set the given entries, or raise RefusedError and leave all entries unchanged."""
         self._widget.set_trait(self._trait, dict(*values, **more))
         super().update(getattr(self._widget, self._trait))
 
@@ -67,10 +70,10 @@ class Values(dict[str, Any]):
 
 
 class Widget(anywidget.AnyWidget):
-    """A scene under its layers, with their sliders; what is moved here or there is moved on both sides.
+    """Scene with its layers and their sliders. Changes in Python and in the browser update each other.
 
-    Raises ProgdfError for a layer that was made for another scene, and for numbers, names and rules that are
-    none; TypeError for what is no scene or no layer.
+    Raises ProgdfError for a layer that was made for another scene and for invalid numbers, names and blend
+    rules. Raises TypeError for a scene that is not `Gaussians` and a layer that is neither `Layer` nor `Gdf`.
     """
 
     _esm = build_widget()
@@ -102,13 +105,13 @@ class Widget(anywidget.AnyWidget):
 
         Args:
             scene: the original
-            layers: the lowest first; an edit alone is a layer at strength 1
-            title: above the sliders
-            credit: below them; addresses become links
-            background: behind the scene, 0..1
-            blend: of `BLENDS`
-            quality: "exact", float32, or "compact", 8 and 16 bits, a third as large
-            height: px
+            layers: lowest layer first; a bare `Gdf` is a layer at strength 1
+            title: text above the sliders
+            credit: text below the sliders; addresses become links
+            background: rgb behind the scene, 0 to 1
+            blend: one of `BLENDS`
+            quality: "exact" (float32) or "compact" (8 and 16 bits, a third of the size)
+            height: height of the cell, 100 to 4000 px
         """
         stack = _stack(scene, layers, blend)
         original = _drawable(scene)
@@ -124,8 +127,8 @@ class Widget(anywidget.AnyWidget):
             background=background,
             overshoot=any(layer.strength > 1.0 for layer in stack),
         )
-        self._view = convert_json(plain(view), ViewState)  # a ValueError where a number is beyond its range
-        still = picture(self._document.scene, self._document.gdfs, self._view, _STILL)
+        self._view = convert_json(plain(view), ViewState)  # raises ValueError for numbers out of range
+        still = picture(self._document.scene, self._document.gdfs, self._view, _STILL_SIZE)
         state, _ = first_state(self._document, self._view)
         super().__init__(
             _markup=PageTexts(title, credit, background, still).markup,
@@ -138,7 +141,14 @@ class Widget(anywidget.AnyWidget):
         )
 
     def snapshot(self, width: int = 960, height: int = 640) -> Image:
-        """What the CPU engine draws at the present strengths, from the present camera, in so many pixels."""
+        """Render the current strengths and camera with the CPU engine.
+
+        Args:
+            width, height: size of the image, 1 to `LARGEST_SIDE` px
+
+        Raises:
+            ProgdfError: a side is out of range.
+        """
         if not all(1 <= side <= LARGEST_SIDE for side in (width, height)):
             raise ProgdfError(
                 f"{width} × {height} cannot be drawn; each side may be 1 to {LARGEST_SIDE} pixels"
@@ -154,11 +164,14 @@ class Widget(anywidget.AnyWidget):
         credit: str = "",
         quality: Literal["exact", "compact"] = "compact",
     ) -> str:
-        """Write the page as a file of its own, at the present strengths and camera; what it holds, in a line.
+        """Write a standalone web page with the current strengths and camera.
 
         Args:
-            path: a .html file
+            path: output file (.html)
             title, credit, quality: see `PageOptions`
+
+        Returns:
+            One line that describes the contents of the page.
 
         Raises:
             ProgdfError: see `write_page`.
@@ -189,11 +202,13 @@ class Widget(anywidget.AnyWidget):
 
     def _merge_strengths(self, given: Mapping[str, Any]) -> Values:
         values = {layer.name: layer.strength for layer in self._view.layers} | self.strengths
-        most = largest_strength(self._view)
+        max_strength = largest_strength(self._view)
         for name in self._check_names(list(given)):
-            strength = given[name]  # of numpy and torch as well
-            if not isinstance(strength, SupportsFloat) or not 0.0 <= float(strength) <= most:
-                raise ProgdfError(f"the strength of {name} is {strength!r:.40}; use a number, 0 to {most:g}")
+            strength = given[name]  # also a scalar of numpy or torch
+            if not isinstance(strength, SupportsFloat) or not 0.0 <= float(strength) <= max_strength:
+                raise ProgdfError(
+                    f"the strength of {name} is {strength!r:.40}; use a number, 0 to {max_strength:g}"
+                )
             values[name] = float(strength)
         return Values(values, self, "strengths")
 
@@ -209,10 +224,10 @@ class Widget(anywidget.AnyWidget):
         return names
 
     def _repr_mimebundle_(self, **kwargs: Any) -> Any:
-        """With a still, for what shows a notebook and runs no widgets."""
+        """Add a still image for notebook viewers that run no widgets."""
         data, about = super()._repr_mimebundle_(**kwargs)  # type: ignore[misc]
         file = io.BytesIO()
-        self.snapshot(*_STILL).save(file, "JPEG", quality=85)
+        self.snapshot(*_STILL_SIZE).save(file, "JPEG", quality=85)
         return {**data, "image/jpeg": base64.b64encode(file.getvalue()).decode()}, about
 
 
@@ -222,7 +237,7 @@ def _check_blend(blend: str) -> str:
 
 
 def _stack(scene: Gaussians, layers: Sequence[Layer | Gdf], blend: str) -> list[Layer]:
-    """The layers of a scene, once they are known to be that."""
+    """Return the validated layers of a scene. Raises TypeError or ProgdfError for invalid ones."""
     if not isinstance(scene, Gaussians):
         raise TypeError(f"the scene is {type(scene).__name__}, expected Gaussians, see progdf.load_scene")
     stack = []
@@ -236,7 +251,7 @@ def _stack(scene: Gaussians, layers: Sequence[Layer | Gdf], blend: str) -> list[
 
 
 def _drawable(scene: Gaussians) -> Gaussians:
-    """The scene as engines draw it: float32 on the CPU, without gradients. ProgdfError if not finite."""
+    """Return the scene as float32 on the CPU without gradients. Raises ProgdfError if it is not finite."""
     plain_scene = scene.to("cpu", torch.float32)
     tensors = {name: getattr(plain_scene, name).detach() for name in ATTRIBUTES}
     for name, tensor in tensors.items():

@@ -1,1 +1,1 @@
-"""What the window shows, as pure data and functions: no GL, no imgui."""
+"""State of the window as immutable data and pure functions, without GL or imgui."""

@@ -1,6 +1,6 @@
-"""Every action on the workspace as a pure function: keys, panel buttons and tests all go through `perform`.
+"""Actions on the workspace as pure functions. Keys, panel buttons and tests all call `perform`.
 
-What only the window can do (write a file, go full screen) is left in `requests` for it.
+Actions that only the window can perform (write a file, go full screen) are appended to `Workspace.requests`.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ from .workspace import (
 
 
 def toggle_mode(view: ViewState, mode: str) -> ViewState:
-    """`mode` on, or off where it was on."""
+    """Switch comparison mode `mode` on, or off if it is already on."""
     mode = "off" if view.compare.mode == mode else mode
     return replace(view, compare=replace(view.compare, mode=mode))
 
 
 def toggle_snapshots(view: ViewState) -> ViewState:
-    """One snapshot against the other, or what was on the screen before; where nothing is compared, split."""
+    """Toggle the comparison of two snapshots, as a split view if no comparison is active."""
     compare = view.compare
     if compare.against == "snapshots" and compare.mode != "off":
         return replace(view, compare=replace(compare, mode="off", against="original"))
@@ -61,32 +61,36 @@ def toggle_snapshots(view: ViewState) -> ViewState:
 
 
 def end_at_edit(before: Workspace, after: Workspace) -> Workspace:
-    """No comparison of snapshots any more where layers have changed: one shall see what one does."""
-    was = before.view
+    """End a comparison of snapshots if `after` changes layers, so that the change is visible."""
+    view_before = before.view
     view = after.view
-    edited = (view.layers, view.groups, view.blend) != (was.layers, was.groups, was.blend)
+    edited = (view.layers, view.groups, view.blend) != (
+        view_before.layers,
+        view_before.groups,
+        view_before.blend,
+    )
     if not edited or view.compare.mode == "off" or view.compare.against != "snapshots":
         return after
-    alone = replace(view, compare=replace(view.compare, mode="off", against="original"))
-    return replace(after, view=alone, past=history.follow_look(after.past, view, alone))
+    uncompared = replace(view, compare=replace(view.compare, mode="off", against="original"))
+    return replace(after, view=uncompared, past=history.follow_look(after.past, view, uncompared))
 
 
 FEATHER = 0.1
-"""How wide "feather" makes the edges of a layer's paint, share of the radius of its region."""
+"""Width of feathered paint edges, as a share of the radius of the layer's region."""
 
 
 def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float = 1.0) -> Workspace:
-    """The workspace after an action of `keys.COMMANDS`; what is none of ours is a request to the window.
+    """Return the workspace after an action of `keys.COMMANDS`. Unknown actions become requests to the window.
 
     Args:
-        action: its name, with an argument after a colon where it has one
-        facts: of the open scene
+        action: name of the action, followed by a colon and its argument if it takes one
+        facts: facts about the open scene
         aspect: width / height of the picture
     """
     name, _, argument = action.partition(":")
     if name == "invert":
         name = "paint_invert" if workspace.view.brush.active else "select_invert"
-    if name in ("focus", "press_layer", "unfocus"):  # a taken layer lets the keys go
+    if name in ("focus", "press_layer", "unfocus"):  # focusing a layer deselects the keys
         workspace = replace(workspace, player=replace(workspace.player, chosen=frozenset()))
     if name in ("frame", "home"):
         return (_frame if name == "frame" else _home)(workspace, facts, aspect)
@@ -106,24 +110,24 @@ def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float 
     return replace(workspace, requests=(*workspace.requests, action))
 
 
-def _again(workspace: Workspace, index: int, facts: SceneFacts) -> Workspace:
-    """The form with the settings of a layer's edit, where an editor of the form made it."""
+def _edit_again(workspace: Workspace, index: int, facts: SceneFacts) -> Workspace:
+    """Fill the form with the settings of a layer's edit, if one of the form's editors made it."""
     layer = workspace.view.layers[index]
     regions = workspace.view.selection.regions
     row = facts.rows[layer.gdf]
     form = with_settings(replace(workspace.form, name=layer.name, error=""), row.instruction)
     if form is None:
         return workspace
-    kept = [region.name for region in regions if row.region_spec == f"file:{region.path}"]
-    if kept or row.region_spec in (ALL, CHANGED):
-        form = replace(form, region=kept[0] if kept else row.region_spec)
+    matching_regions = [region.name for region in regions if row.region_spec == f"file:{region.path}"]
+    if matching_regions or row.region_spec in (ALL, CHANGED):
+        form = replace(form, region=matching_regions[0] if matching_regions else row.region_spec)
     elif row.region_spec:
         form = replace(form, region=TYPED, typed_region=row.region_spec)
     return replace(workspace, form=form, form_open=True, form_opening=True)
 
 
-def _limit(workspace: Workspace, index: int, facts: SceneFacts) -> Workspace:
-    """A layer's paint only where something is selected too."""
+def _limit_paint(workspace: Workspace, index: int, facts: SceneFacts) -> Workspace:
+    """Limit a layer's paint to the selection. Without a selection nothing changes."""
     view = workspace.view
     row = facts.rows[workspace.view.layers[index].gdf]
     if not view.selection.count:
@@ -135,7 +139,7 @@ def _limit(workspace: Workspace, index: int, facts: SceneFacts) -> Workspace:
 
 
 def _select_painted(workspace: Workspace, index: int, facts: SceneFacts) -> Workspace:
-    """What a layer's paint lets through at least half of, all of it where it is not painted."""
+    """Select the members of a layer whose paint is at least 0.5, or all members if it is not painted."""
     view = workspace.view
     row = facts.rows[workspace.view.layers[index].gdf]
     painted = paint.decode(view.layers[index].paint, row.count, row.from_others)
@@ -144,12 +148,12 @@ def _select_painted(workspace: Workspace, index: int, facts: SceneFacts) -> Work
     return replace(workspace, view=replace(view, selection=selection.select(view.selection, mask)))
 
 
-OF_EDITS = {"again": _again, "limit_to_selection": _limit, "select_painted": _select_painted}
-"""Actions on one layer, the focused one where none is named, that ask what is known of its edit."""
+OF_EDITS = {"again": _edit_again, "limit_to_selection": _limit_paint, "select_painted": _select_painted}
+"""Actions on one layer (default: the focused layer) that use `SceneFacts`."""
 
 
 def _frame(workspace: Workspace, facts: SceneFacts, aspect: float) -> Workspace:
-    """The selection, the focused layer, or the scene's subject fills the picture; the direction stays."""
+    """Frame the selection, the focused layer or the scene's subject. The view direction is unchanged."""
     fit = facts.fit
     selected = workspace.view.selection
     if selected.count:
@@ -161,7 +165,7 @@ def _frame(workspace: Workspace, facts: SceneFacts, aspect: float) -> Workspace:
 
 
 def _home(workspace: Workspace, facts: SceneFacts, aspect: float) -> Workspace:
-    """The first view; under another up axis than then, what would be the first view with that one."""
+    """Return to the first view. If the up axis has changed, compute the first view for the new axis."""
     camera = workspace.view.camera
     home = replace(workspace.home, up=camera.up, mode=camera.mode)
     if camera.up != workspace.home.up:
@@ -169,13 +173,13 @@ def _home(workspace: Workspace, facts: SceneFacts, aspect: float) -> Workspace:
     return with_camera(workspace, home)
 
 
-def _look(workspace: Workspace, name: str) -> Workspace:
+def _view_from(workspace: Workspace, name: str) -> Workspace:
     """Look from a named side or along an axis, see `viewer.camera.views.NAMED_VIEWS`."""
     return with_camera(workspace, look_at_view(workspace.view.camera, name))
 
 
 def _focus(workspace: Workspace, number: str) -> Workspace:
-    """By its number, counted from 1 at the top of the panel's list."""
+    """Focus a layer by its number, counted from 1 at the top of the panel's list."""
     return focus_layer(workspace, index_of(workspace.view, int(number) - 1))
 
 
@@ -186,7 +190,7 @@ def _toggle(workspace: Workspace, number: str) -> Workspace:
 
 
 def _select_slider(workspace: Workspace, by: int, facts: SceneFacts) -> Workspace:
-    """The next slider that the focused layer has; its gains unfold, so that one sees which."""
+    """Select the next slider of the focused layer. A gain's slider is unfolded so that it is visible."""
     if workspace.focus is None:
         return workspace
     view = workspace.view
@@ -200,7 +204,7 @@ def _select_slider(workspace: Workspace, by: int, facts: SceneFacts) -> Workspac
 
 
 def _rename(workspace: Workspace, index: str) -> Workspace:
-    """The name of a layer, or of the focused one, becomes a text field."""
+    """Edit the name of a layer in a text field (default: the focused layer)."""
     return replace(workspace, renaming=int(index) if index else workspace.focus)
 
 
@@ -210,8 +214,9 @@ def _change_brush(workspace: Workspace, **changes: Any) -> Workspace:
 
 
 def _repaint(workspace: Workspace, how: str, facts: SceneFacts) -> Workspace:
-    """The focused layer's paint, unless it is locked: even, swapped with what is not painted, or its edges
-    softened a little; again softens them more.
+    """Fill, clear, invert or feather the focused layer's paint, unless the layer is locked.
+
+    Each feathering softens the edges further.
     """
 
     def change(view: ViewState, index: int) -> ViewState:
@@ -222,14 +227,14 @@ def _repaint(workspace: Workspace, how: str, facts: SceneFacts) -> Workspace:
             return with_paint(view, index, paint.feather(layer.paint, row.points, width, row.from_others))
         if how == "paint_invert":
             return with_paint(view, index, paint.invert(layer.paint, row.count, row.from_others))
-        even = np.full(row.count, how == "paint_fill", np.float32)
-        return with_paint(view, index, paint.encode(even))
+        uniform = np.full(row.count, how == "paint_fill", np.float32)
+        return with_paint(view, index, paint.encode(uniform))
 
     return change_focused(workspace, change)
 
 
-def _take_tool(workspace: Workspace, tool: str) -> Workspace:
-    """A tool that selects; the brush is put down, and a tool that is held too."""
+def _toggle_tool(workspace: Workspace, tool: str) -> Workspace:
+    """Activate a selection tool, or deactivate it if it is active. The brush is deactivated."""
     view = workspace.view
     new_tool = "" if view.select.tool == tool else tool
     return replace(
@@ -241,7 +246,7 @@ def _take_tool(workspace: Workspace, tool: str) -> Workspace:
 
 
 def _navigate(workspace: Workspace, mode: str) -> Workspace:
-    """Orbit or fly, with no tool in the hand."""
+    """Switch to orbit or fly mode and deactivate the brush and the selection tool."""
     workspace = _change_brush(workspace, active=False)
     select = replace(workspace.view.select, tool="")
     camera = replace(workspace.view.camera, mode=mode)
@@ -249,18 +254,18 @@ def _navigate(workspace: Workspace, mode: str) -> Workspace:
 
 
 def _zoom(workspace: Workspace, times: str) -> Workspace:
-    """The interface so many times as large; 0 for its first size."""
+    """Multiply the zoom of the interface by `times`; 0 resets it to 1."""
     zoom = min(max(round(workspace.layout.zoom * float(times), 3), MIN_ZOOM), MAX_ZOOM)
     return replace(workspace, layout=replace(workspace.layout, zoom=zoom if float(times) else 1.0))
 
 
-def _take_brush(workspace: Workspace, _: str) -> Workspace:
+def _toggle_brush(workspace: Workspace, _: str) -> Workspace:
     view = replace(workspace.view, select=replace(workspace.view.select, tool=""))
     return _change_brush(replace(workspace, view=view), active=not view.brush.active)
 
 
 def _resize(workspace: Workspace, times: str) -> Workspace:
-    """The brush, or what the tool that selects has in its place."""
+    """Scale the radius of the brush or of the active selection tool, or the tool's color tolerance."""
     view = workspace.view
     if not view.select.tool:
         return _change_brush(workspace, radius=paint.radius(view.brush.radius * float(times)))
@@ -271,14 +276,14 @@ def _resize(workspace: Workspace, times: str) -> Workspace:
     return replace(workspace, view=replace(view, select=replace(view.select, radius=radius)))
 
 
-def _step_back(workspace: Workspace, _: str) -> Workspace:
-    """The list of keys goes, or the tool in the hand, the form, the other selected layers, the focus."""
+def _close_or_unfocus(workspace: Workspace, _: str) -> Workspace:
+    """Close or deactivate the first active item: key list, brush, tool, form, multi-selection, focus."""
     if workspace.help:
         return replace(workspace, help=False)
     if workspace.view.brush.active:
         return _change_brush(workspace, active=False)
     if tool := workspace.view.select.tool:
-        return _take_tool(workspace, tool)
+        return _toggle_tool(workspace, tool)
     if workspace.form_open:
         return replace(workspace, form_open=False)
     if len(layer_selection.selected_layers(workspace)) > 1:
@@ -292,7 +297,7 @@ def _show_all(workspace: Workspace, _: str) -> Workspace:
 
 
 def _rename_group(workspace: Workspace, argument: str) -> Workspace:
-    """`INDEX:NAME`, of `view.groups`"""
+    """Rename a group (`INDEX:NAME`, where INDEX is an index into `view.groups`)."""
     index, _, name = argument.partition(":")
     old = workspace.view.groups[int(index)].name
     view = workspace.view
@@ -300,19 +305,19 @@ def _rename_group(workspace: Workspace, argument: str) -> Workspace:
 
 
 def _toggle_cards(workspace: Workspace, _: str) -> Workspace:
-    """Rows of one line for cards, or back; by themselves where they would be so anyway."""
+    """Toggle compact layer rows. The mode becomes "auto" if that gives the requested result."""
     compact = not is_compact(workspace)
     cards = "auto" if compact != workspace.cards_fit else "compact" if compact else "full"
     return replace(workspace, view=replace(workspace.view, cards=cards))
 
 
 def _next_value(workspace: Workspace, name: str, values: Sequence[str]) -> Workspace:
-    """The value of the view after the present one."""
+    """Set an attribute of the view to the value that follows its current one."""
     changes: dict[str, Any] = {name: following(values, getattr(workspace.view, name))}
     return replace(workspace, view=replace(workspace.view, **changes))
 
 
-def _back(workspace: Workspace, past: History) -> Workspace:
+def _go_to_entry(workspace: Workspace, past: History) -> Workspace:
     if past is workspace.past:
         return workspace
     entry = past.present
@@ -321,12 +326,12 @@ def _back(workspace: Workspace, past: History) -> Workspace:
 
 
 def _timeline_action(name: str) -> Callable[[Workspace, str], Workspace]:
-    """An action of the timeline."""
+    """Return an action that applies a timeline action to the workspace."""
 
     def act(workspace: Workspace, argument: str) -> Workspace:
         view, player = timeline.perform(workspace.view, workspace.player, f"{name}:{argument}")
         past = history.follow_look(workspace.past, workspace.view, view)
-        if loses_strengths(workspace, view):  # an entry of its own, or part of what is done to the keys
+        if loses_strengths(workspace, view):  # a separate entry, or part of the edit of the keys
             past = (
                 past
                 if name in ("move_keys", "clone_keys")
@@ -340,7 +345,7 @@ def _timeline_action(name: str) -> Callable[[Workspace, str], Workspace]:
 
 
 def _restore(workspace: Workspace, index: str) -> Workspace:
-    """Back to a snapshot, counted as the panel shows them: 0 is the original."""
+    """Restore a snapshot by its index in the panel. Index 0 is the original."""
     listed = snapshots.with_original(workspace.snapshots, workspace.view)
     if not 0 <= int(index) < len(listed):
         return workspace
@@ -348,38 +353,43 @@ def _restore(workspace: Workspace, index: str) -> Workspace:
 
 
 def _name_snapshot(workspace: Workspace, argument: str) -> Workspace:
-    """`INDEX:NAME`; the pair that is compared follows."""
+    """Rename a snapshot (`INDEX:NAME`), also in the compared pair."""
     index, _, name = argument.partition(":")
     old = workspace.snapshots
     new = snapshots.rename(workspace.snapshots, int(index) - 1, name)
-    was = old[int(index) - 1].name
-    now = new[int(index) - 1].name
+    old_name = old[int(index) - 1].name
+    new_name = new[int(index) - 1].name
     pair = workspace.view.pair
-    pair = replace(pair, a=now if pair.a == was else pair.a, b=now if pair.b == was else pair.b)
+    pair = replace(
+        pair, a=new_name if pair.a == old_name else pair.a, b=new_name if pair.b == old_name else pair.b
+    )
     return replace(workspace, snapshots=new, view=replace(workspace.view, pair=pair))
 
 
 def _move_snapshot(workspace: Workspace, argument: str) -> Workspace:
-    """`INDEX:TO`"""
+    """Move a snapshot (`INDEX:TO`)."""
     index, to = (int(number) - 1 for number in argument.split(":"))
     return replace(workspace, snapshots=snapshots.move(workspace.snapshots, index, to))
 
 
 def _choose_snapshot(workspace: Workspace, argument: str) -> Workspace:
-    """`SLOT:NAME`, of which SLOT is a or b"""
+    """Put a snapshot into the compared pair (`SLOT:NAME`, where SLOT is a or b)."""
     slot, _, name = argument.partition(":")
     return replace(workspace, view=snapshots.choose(workspace.view, slot, name))
 
 
-def _give_keyboard(workspace: Workspace, by: str) -> Workspace:
-    """To the next part of the window, or back; after the last one to the picture."""
+def _move_keyboard_focus(workspace: Workspace, by: str) -> Workspace:
+    """Move the keyboard focus to the next or previous part of the window.
+
+    The picture follows the last part.
+    """
     places = ("", *PLACES)
     at = (places.index(workspace.keyboard) + int(by)) % len(places)
     return replace(workspace, keyboard=places[at], keyboard_by=int(by))
 
 
 def _new_edit(workspace: Workspace, _: str) -> Workspace:
-    """Open the form of a new edit, of what is selected where something is; or close it."""
+    """Open or close the form of a new edit. Its region defaults to the selection if there is one."""
     form = workspace.form
     selection = workspace.view.selection
     known = (ALL, TYPED, CHANGED, *(region.name for region in selection.regions))
@@ -392,10 +402,10 @@ def _new_edit(workspace: Workspace, _: str) -> Workspace:
 
 
 GLIDES = ("frame", "home", "look")
-"""Actions that take the camera elsewhere, which the window shows as a short way."""
+"""Actions that move the camera, which the window animates as a glide."""
 ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "focus": _focus,
-    "unfocus": _step_back,
+    "unfocus": _close_or_unfocus,
     "toggle": _toggle,
     "hide": lambda workspace, _: layer_selection.switch_selected(workspace, "enabled"),
     "nudge": lambda workspace, by: layer_selection.nudge(workspace, float(by)),
@@ -417,11 +427,11 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "search": lambda workspace, _: replace(workspace, searching=bool(workspace.view.layers)),
     "cards": _toggle_cards,
     "blend": lambda w, _: _next_value(w, "blend", BLENDS),
-    "select_tool": _take_tool,
+    "select_tool": _toggle_tool,
     "select_through": lambda w, _: replace(
         w, view=replace(w.view, select=replace(w.view.select, through=not w.view.select.through))
     ),
-    "brush": _take_brush,
+    "brush": _toggle_brush,
     "brush_mode": lambda w, _: _change_brush(w, mode=following(BRUSH_MODES, w.view.brush.mode)),
     "brush_weights": lambda w, _: _change_brush(w, weights=not w.view.brush.weights),
     "brush_through": lambda w, _: _change_brush(w, through=not w.view.brush.through),
@@ -436,10 +446,10 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "name_snapshot": _name_snapshot,
     "move_snapshot": _move_snapshot,
     "choose_snapshot": _choose_snapshot,
-    "undo": lambda w, _: _back(w, history.undo(w.past)),
-    "redo": lambda w, _: _back(w, history.redo(w.past)),
-    "go_to": lambda w, index: _back(w, history.go_to(w.past, int(index))),
-    "next_place": _give_keyboard,
+    "undo": lambda w, _: _go_to_entry(w, history.undo(w.past)),
+    "redo": lambda w, _: _go_to_entry(w, history.redo(w.past)),
+    "go_to": lambda w, index: _go_to_entry(w, history.go_to(w.past, int(index))),
+    "next_place": _move_keyboard_focus,
     "history": lambda w, _: replace(w, history=True),
     "navigate": _navigate,
     "zoom": _zoom,
@@ -447,7 +457,7 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
         w, layout=replace(w.layout, reduced_motion=not w.layout.reduced_motion)
     ),
     "fly": lambda w, _: with_camera(w, controls.toggle_fly(w.view.camera)),
-    "look": _look,
+    "look": _view_from,
     "grid": lambda w, _: replace(w, view=replace(w.view, grid=not w.view.grid)),
     "axes": lambda w, _: replace(w, view=replace(w.view, axes=not w.view.axes)),
     "safe_frame": lambda w, _: _next_value(w, "safe_frame", FRAMES),

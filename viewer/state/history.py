@@ -1,5 +1,7 @@
-"""Undo, redo and the list of both: one entry per gesture, of what is edited, of snapshots, and of what of the
-view a person sets, such as background and comparison; never of where one looks from.
+"""Undo history with one entry per gesture.
+
+An entry covers edits, snapshots and view settings such as background and comparison, but never the position
+of the camera.
 """
 
 from __future__ import annotations
@@ -13,12 +15,12 @@ from viewer.camera.view_camera import Vec3, ViewCamera, with_up
 from .selection import SelectionState
 from .view_state import Blend, Comparison, LayerGroup, LayerState, SnapshotPair, Timeline, ViewState
 
-LONGEST = 1000  # entries; each is a few hundred bytes, with a selection some kilobytes
+LONGEST = 1000  # most entries; each takes a few hundred bytes, or some kilobytes with a selection
 
 
 @dataclass(frozen=True)
 class Edit:
-    """The part of the state that undo brings back."""
+    """Part of the state that undo restores."""
 
     layers: tuple[LayerState, ...]
     blend: Blend
@@ -31,7 +33,7 @@ class Edit:
 
 @dataclass(frozen=True)
 class ViewSettings:
-    """How the scene is looked at, as a person sets it."""
+    """View settings that the user changes."""
 
     up: Vec3 = ViewCamera.up
     fov_y: float = ViewCamera.fov_y
@@ -45,17 +47,20 @@ class ViewSettings:
 
 @dataclass(frozen=True)
 class HistoryEntry:
-    """What one entry brings back."""
+    """State that one entry restores."""
 
-    edit: Edit  # the part of the state
-    look: ViewSettings = ViewSettings()  # as a person set it last
-    snapshots: tuple[Any, ...] = ()  # those there were, see snapshots.py, which is built on this module
+    edit: Edit
+    look: ViewSettings = ViewSettings()  # as last set by the user
+    snapshots: tuple[Any, ...] = ()  # `SliderSnapshot`s; untyped because snapshots.py imports this module
 
 
 @dataclass(frozen=True)
 class History:
-    """Entries before and after the present one; `seen`: the look of the state, also where the camera's way to
-    another view, a film or a file has changed it, which is no entry."""
+    """Entries before and after the present one.
+
+    `seen` holds the current view settings. It includes changes by a camera glide, the timeline or a file,
+    which make no entry.
+    """
 
     present: HistoryEntry
     past: tuple[HistoryEntry, ...] = ()
@@ -73,20 +78,21 @@ def _edit_values(part: ViewState | Edit) -> dict[str, Any]:
 
 def look_of(state: ViewState) -> ViewSettings:
     return ViewSettings(
-        state.camera.up, state.camera.fov_y, **{name: getattr(state, name) for name in _OF_VIEW}
+        state.camera.up, state.camera.fov_y, **{name: getattr(state, name) for name in _VIEW_LABELS}
     )
 
 
 def begin(state: ViewState, snapshots: tuple[Any, ...] = ()) -> History:
-    """A history whose present is `state` with these snapshots, and that has nothing to undo."""
+    """Return a history with `state` and these snapshots as its present and no entries to undo."""
     look = look_of(state)
     return History(HistoryEntry(edit_of(state), look, snapshots), seen=look)
 
 
 def record(history: History, state: ViewState, snapshots: tuple[Any, ...] = ()) -> History:
-    """Call whenever no gesture is under way: what a press, move and release changed becomes one entry.
+    """Record the changes of a finished gesture (press, move, release) as one entry.
 
-    A gesture that ends where it began leaves no entry.
+    Call it whenever no gesture is in progress. A gesture that ends where it began makes no entry, and
+    successive changes of the comparison share one entry.
     """
     seen = look_of(state)
     present = history.present
@@ -94,56 +100,65 @@ def record(history: History, state: ViewState, snapshots: tuple[Any, ...] = ()) 
     if step == present:
         return history if seen == history.seen else replace(history, seen=seen)
     if history.past and _only_compares(history.past[-1], present) and _only_compares(present, step):
-        *past, before = history.past  # one looks at this and at that: no trail of it
+        *past, before = history.past  # switching comparisons back and forth leaves no trail
         return History(step, tuple(past) if step == before else history.past, seen=seen)
     return History(step, (*history.past, present)[-LONGEST:], seen=seen)
 
 
 def _only_compares(before: HistoryEntry, after: HistoryEntry) -> bool:
-    """Whether nothing but the comparison is another one."""
+    """Return whether two entries differ in the comparison alone."""
     return before != after == replace(before, look=replace(before.look, compare=after.look.compare))
 
 
 def merge(history: History) -> History:
-    """What the last entry brings back is taken out: the last two changes are one."""
+    """Merge the last two changes into one by removing the latest past entry."""
     return replace(history, past=history.past[:-1])
 
 
 def follow_playhead(history: History, before: ViewState, after: ViewState) -> History:
-    """The playhead has moved strengths: no entry, as nobody edited them; gestures under way stay such."""
+    """Update the present entry with strengths that the playhead moved.
+
+    No entry is made, and gestures in progress stay unrecorded.
+    """
     if after.layers == before.layers:
         return history
-    was = {layer.gdf: layer.strength for layer in before.layers}
-    went = {layer.gdf: layer.strength for layer in after.layers if layer.strength != was.get(layer.gdf)}
+    old_strengths = {layer.gdf: layer.strength for layer in before.layers}
+    moved_strengths = {
+        layer.gdf: layer.strength for layer in after.layers if layer.strength != old_strengths.get(layer.gdf)
+    }
     edit = history.present.edit
-    layers = tuple(replace(layer, strength=went.get(layer.gdf, layer.strength)) for layer in edit.layers)
+    layers = tuple(
+        replace(layer, strength=moved_strengths.get(layer.gdf, layer.strength)) for layer in edit.layers
+    )
     return replace(history, present=replace(history.present, edit=replace(edit, layers=layers)))
 
 
 def follow_look(history: History, before: ViewState, after: ViewState) -> History:
-    """What is seen has changed by itself: no entry; what a person has just set and is not recorded yet stays
-    to be."""
+    """Update `seen` after an automatic change of view settings, without an entry.
+
+    Changes by the user that are not recorded yet remain pending.
+    """
     seen = _take_changes(history.seen, look_of(before), look_of(after))
     return history if seen == history.seen else replace(history, seen=seen)
 
 
 def undo(history: History) -> History:
-    """One entry back; unchanged where there is none."""
+    """Go back one entry. Without an earlier entry the history is unchanged."""
     return go_to(history, len(history.past) - 1)
 
 
 def redo(history: History) -> History:
-    """One entry forward; unchanged where there is none."""
+    """Go forward one entry. Without a later entry the history is unchanged."""
     return go_to(history, len(history.past) + 1)
 
 
 def entries(history: History) -> tuple[HistoryEntry, ...]:
-    """All there are, the first one first."""
+    """Return all entries, oldest first."""
     return *history.past, history.present, *history.future
 
 
 def go_to(history: History, index: int) -> History:
-    """That of the `entries` is the present one; unchanged where there is no such, or it is already."""
+    """Make the entry at `index` of `entries` the present one. An invalid index changes nothing."""
     steps = entries(history)
     if index == len(history.past) or not 0 <= index < len(steps):
         return history
@@ -152,7 +167,7 @@ def go_to(history: History, index: int) -> History:
 
 
 def _take_changes(look: ViewSettings, before: ViewSettings, after: ViewSettings) -> ViewSettings:
-    """The look with what is different after than before."""
+    """Return `look` with the settings that differ between `before` and `after`, taken from `after`."""
     names = [
         field.name
         for field in fields(ViewSettings)
@@ -163,23 +178,26 @@ def _take_changes(look: ViewSettings, before: ViewSettings, after: ViewSettings)
 
 
 def apply_edit(state: ViewState, edit: Edit) -> ViewState:
-    """`state` edited as in `edit`, seen from where it is."""
+    """Return `state` with the values of `edit`. The camera is unchanged."""
     return replace(state, **_edit_values(edit))
 
 
 def apply_present(state: ViewState, history: History) -> ViewState:
-    """`state` as the present entry has it, seen from where it is; another up axis only rolls it upright."""
+    """Return `state` as in the present entry.
+
+    The camera keeps its position and only rolls to a new up axis.
+    """
     look = history.seen
     camera = state.camera
     if camera.up != look.up:
         camera = replace(with_up(camera, look.up), up=look.up)
     if camera.fov_y != look.fov_y:
         camera = replace(camera, fov_y=look.fov_y)
-    looks: dict[str, Any] = {name: getattr(look, name) for name in _OF_VIEW}
-    return replace(apply_edit(state, history.present.edit), camera=camera, **looks)
+    settings: dict[str, Any] = {name: getattr(look, name) for name in _VIEW_LABELS}
+    return replace(apply_edit(state, history.present.edit), camera=camera, **settings)
 
 
-_OF_LAYERS = {
+_LAYER_LABELS = {
     "name": "name",
     "strength": "strength",
     "gains": "gains",
@@ -189,15 +207,15 @@ _OF_LAYERS = {
     "locked": "lock",
     "group": "group",
 }
-_OF_SELECTIONS = {"regions": "regions", "hidden": "hidden splats", "members": "selection"}
-_OF_EDITS = {
+_SELECTION_LABELS = {"regions": "regions", "hidden": "hidden splats", "members": "selection"}
+_EDIT_LABELS = {
     "timeline": "timeline",
     "groups": "groups",
     "blend": "blend rule",
     "overshoot": "overshoot",
     "pair": "snapshot pair",
 }
-_OF_VIEW = {
+_VIEW_LABELS = {
     "background": "background",
     "compare": "comparison",
     "grid": "ground grid",
@@ -205,51 +223,51 @@ _OF_VIEW = {
     "safe_frame": "safe frame",
     "dynamic_resolution": "dynamic resolution",
 }
-"""Of `ViewSettings`, what stands in the view itself."""
-_OF_LOOKS = {"up": "up axis", "fov_y": "field of view", **_OF_VIEW}
+"""Labels of the `ViewSettings` that are attributes of `ViewState`."""
+_LOOK_LABELS = {"up": "up axis", "fov_y": "field of view", **_VIEW_LABELS}
 
 
 def next_undo(history: History) -> str:
-    """What an undo takes back, in a few words; "" where there is nothing."""
+    """Return a short label of the change that undo reverts, or "" if there is none."""
     return describe_entry(history, len(history.past)) if history.past else ""
 
 
 def next_redo(history: History) -> str:
-    """What a redo brings back, in a few words; "" where there is nothing."""
+    """Return a short label of the change that redo restores, or "" if there is none."""
     return describe_entry(history, len(history.past) + 1) if history.future else ""
 
 
 def describe_entry(history: History, index: int) -> str:
-    """What that of the `entries` changed, in a few words."""
+    """Return a short label of the change that the entry at `index` of `entries` made."""
     steps = entries(history)
     return _describe_change(steps[index - 1], steps[index]) if index else "as opened"
 
 
 def _describe_change(before: HistoryEntry, after: HistoryEntry) -> str:
-    """The first that is different, of what matters most."""
+    """Return a label of the most important difference."""
     old, new = ({layer.gdf: layer for layer in entry.edit.layers} for entry in (before, after))
     if old.keys() != new.keys():
         added = new.keys() - old.keys()
         removed = old.keys() - new.keys()
         names = [new[gdf].name for gdf in added] or [old[gdf].name for gdf in removed]
         done = "replace" if added and removed else "add" if added else "delete"
-        return f"{done} {_one_or_many(names)}"
-    for attribute, word in _OF_LAYERS.items():
+        return f"{done} {_name_or_count(names)}"
+    for attribute, word in _LAYER_LABELS.items():
         names = [new[gdf].name for gdf in new if getattr(old[gdf], attribute) != getattr(new[gdf], attribute)]
         if names:
-            return f"{word} of {_one_or_many(names)}"
+            return f"{word} of {_name_or_count(names)}"
     if before.edit.layers != after.edit.layers:
         return "layer order"
-    for words, one, other in (
-        (_OF_SELECTIONS, before.edit.selection, after.edit.selection),
-        (_OF_EDITS, before.edit, after.edit),
-        (_OF_LOOKS, before.look, after.look),
+    for words, old_part, new_part in (
+        (_SELECTION_LABELS, before.edit.selection, after.edit.selection),
+        (_EDIT_LABELS, before.edit, after.edit),
+        (_LOOK_LABELS, before.look, after.look),
     ):
         for attribute, word in words.items():
-            if getattr(one, attribute) != getattr(other, attribute):
+            if getattr(old_part, attribute) != getattr(new_part, attribute):
                 return word
     return "snapshots"
 
 
-def _one_or_many(names: Sequence[str]) -> str:
+def _name_or_count(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{len(names)} layers"

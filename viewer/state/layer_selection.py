@@ -1,6 +1,6 @@
-"""Which layers are selected, and what is done to all of them at once: strength, values, order, groups.
+"""Selection of layers, and actions on all selected layers: strength, values, order, groups.
 
-The focused layer is always selected; `Workspace.selected` names the others beside it.
+The focused layer is always selected. `Workspace.selected` names the other selected layers.
 """
 
 from __future__ import annotations
@@ -25,11 +25,15 @@ from .view_state import LayerState, ViewState
 from .workspace import Workspace
 
 PRESSES = ("one", "keep", "toggle", "range")
-"""What a press does to the selection: this card alone; alone unless among several; with Ctrl; with Shift."""
+"""Effects of a press on a card.
+
+"one" selects it alone, "keep" selects it alone unless it is one of several, "toggle" (Ctrl) adds or removes
+it, "range" (Shift) selects all cards from the focus to it.
+"""
 
 
 def selected_layers(workspace: Workspace) -> tuple[int, ...]:
-    """Places of the selected layers in `view.layers`, the lowest first; none where none is focused."""
+    """Return the indices of the selected layers in `view.layers`, lowest first. Empty without a focus."""
     layers = workspace.view.layers
     focus = workspace.focus
     if focus is None:
@@ -38,26 +42,28 @@ def selected_layers(workspace: Workspace) -> tuple[int, ...]:
 
 
 def press(workspace: Workspace, argument: str) -> Workspace:
-    """The focus and the selection after a press on the card of a layer.
+    """Update the focus and the selection after a press on the card of a layer.
 
     Args:
-        argument: `HOW:INDEX:LISTED`, of `PRESSES`; LISTED are the places of the layers that the panel lists,
-            with commas, as a range is of what one sees
+        argument: `HOW:INDEX:LISTED`, where HOW is one of `PRESSES`; LISTED are the comma-separated indices of
+            the layers that the panel lists, so that a range covers listed layers only
     """
     how, at, listed = argument.split(":")
-    index, rows = int(at), [int(i) for i in listed.split(",") if i]
+    index, listed_indices = int(at), [int(i) for i in listed.split(",") if i]
     layers = workspace.view.layers
     focus = workspace.focus
     chosen = selected_layers(workspace)
     if how == "range" and focus is not None:
         low, high = sorted((focus, index))
-        return replace(workspace, selected=frozenset(layers[i].gdf for i in rows if low <= i <= high))
+        return replace(
+            workspace, selected=frozenset(layers[i].gdf for i in listed_indices if low <= i <= high)
+        )
     if how == "toggle" and index in chosen:
         remaining = [i for i in chosen if i != index]
         if not remaining:
             return workspace
-        near = min(remaining, key=lambda i: abs(i - index)) if focus == index else focus
-        return replace(workspace, focus=near, selected=frozenset(layers[i].gdf for i in remaining))
+        new_focus = min(remaining, key=lambda i: abs(i - index)) if focus == index else focus
+        return replace(workspace, focus=new_focus, selected=frozenset(layers[i].gdf for i in remaining))
     if how == "toggle":
         return replace(workspace, focus=index, selected=frozenset(layers[i].gdf for i in (*chosen, index)))
     if how == "keep" and index in chosen:
@@ -66,7 +72,7 @@ def press(workspace: Workspace, argument: str) -> Workspace:
 
 
 def select_layers(workspace: Workspace, group: str = "") -> Workspace:
-    """All layers of a group selected, or all there are; the topmost is focused where none of them was."""
+    """Select all layers of a group, or all layers. If the focus is not among them, focus the topmost one."""
     layers = workspace.view.layers
     chosen = [i for i, layer in enumerate(layers) if not group or layer.group == group]
     if not chosen:
@@ -76,16 +82,16 @@ def select_layers(workspace: Workspace, group: str = "") -> Workspace:
 
 
 def master_strength(view: ViewState, chosen: Sequence[int]) -> float:
-    """Where the slider over several layers stands: at the strongest of those that are not locked."""
+    """Return the value of the slider for several layers: the largest strength of the unlocked ones."""
     free = [view.layers[i].strength for i in chosen if not view.layers[i].locked]
     return max(free, default=0.0)
 
 
 def set_master(workspace: Workspace, strength: float) -> Workspace:
-    """The strongest of the selected layers at this strength, the others in proportion; locked ones stay.
+    """Set the strongest selected layer to this strength and scale the others in proportion.
 
-    Proportions are those before the gesture, so that a drag over 0 and back loses nothing. Layers that were
-    all at 0 rise together.
+    Locked layers are unchanged. The proportions are those before the gesture, so that a drag to 0 and back
+    loses nothing. Layers that were all at 0 get equal strengths.
     """
     chosen = selected_layers(workspace)
     view = workspace.view
@@ -93,16 +99,16 @@ def set_master(workspace: Workspace, strength: float) -> Workspace:
     strength = min(upper, max(0.0, strength))
     before = {layer.gdf: layer.strength for layer in workspace.past.present.edit.layers}
     base = {i: before.get(view.layers[i].gdf, view.layers[i].strength) for i in chosen}
-    most = max((s for i, s in base.items() if not view.layers[i].locked), default=0.0)
+    max_strength = max((s for i, s in base.items() if not view.layers[i].locked), default=0.0)
 
     def scale(index: int) -> float:
-        return strength if not most else min(upper, base[index] / most * strength)
+        return strength if not max_strength else min(upper, base[index] / max_strength * strength)
 
     return change_selected(workspace, lambda i, layer: with_slider_value(layer, "strength", scale(i), upper))
 
 
 def change_selected(workspace: Workspace, change: Callable[[int, LayerState], LayerState]) -> Workspace:
-    """Every selected layer changed."""
+    """Apply `change` to every selected layer; it receives the index and the layer."""
     layers = list(workspace.view.layers)
     for i in selected_layers(workspace):
         layers[i] = change(i, layers[i])
@@ -110,7 +116,7 @@ def change_selected(workspace: Workspace, change: Callable[[int, LayerState], La
 
 
 def switch_selected(workspace: Workspace, name: str) -> Workspace:
-    """A switch of the focused layer turned, and that of all selected ones with it."""
+    """Toggle a switch of the focused layer and set it to the same value on all selected layers."""
     if workspace.focus is None:
         return workspace
     on = not getattr(workspace.view.layers[workspace.focus], name)
@@ -119,7 +125,7 @@ def switch_selected(workspace: Workspace, name: str) -> Workspace:
 
 
 def nudge(workspace: Workspace, by: float) -> Workspace:
-    """The slider that the arrow keys move a step further; several strengths in proportion."""
+    """Move the active slider of the selected layers by `by`. Several strengths move in proportion."""
     chosen = selected_layers(workspace)
     slider = workspace.active_slider
     if len(chosen) > 1 and slider == "strength":
@@ -131,7 +137,10 @@ def nudge(workspace: Workspace, by: float) -> Workspace:
 
 
 def reset(workspace: Workspace, everything: bool) -> Workspace:
-    """Strengths to 0 and gains to 1, of the selected layers, or of all with their groups; no locked ones."""
+    """Reset strengths to 0 and gains to 1 of the selected layers, or of all layers and groups.
+
+    Locked layers are unchanged.
+    """
 
     def default(_: int, layer: LayerState) -> LayerState:
         return layer if layer.locked else replace(layer, strength=0.0, gains=Gains())
@@ -145,27 +154,27 @@ def reset(workspace: Workspace, everything: bool) -> Workspace:
 
 
 def move(workspace: Workspace, by: int) -> Workspace:
-    """The selected layers up (−1) or down in the panel's list; the focus goes with them."""
+    """Move the selected layers up (−1) or down (1) in the panel's list. The focus moves with them."""
     chosen = selected_layers(workspace)
     return _with_focus(workspace, step_layers(workspace.view, chosen, -by)) if chosen else workspace
 
 
 def remove(workspace: Workspace, index: str) -> Workspace:
-    """A layer, or all selected ones, taken out of the stack; the one below is focused."""
+    """Remove a layer, or all selected layers if it is selected, and focus the layer below."""
     chosen = selected_layers(workspace)
     at = int(index) if index else workspace.focus
     if at is None or not 0 <= at < len(workspace.view.layers):
         return workspace
     view = workspace.view
-    gone = chosen if at in chosen else (at,)
-    for i in reversed(gone):
+    removed = chosen if at in chosen else (at,)
+    for i in reversed(removed):
         view = remove_layer(view, i)
-    focus = max(gone[0] - 1, 0) if view.layers else None
+    focus = max(removed[0] - 1, 0) if view.layers else None
     return replace(workspace, view=view, focus=focus, selected=frozenset(), renaming=None)
 
 
 def group(workspace: Workspace, name: str) -> Workspace:
-    """The selected layers as a new group, or at the bottom of the one of this name."""
+    """Group the selected layers, or move them to the bottom of the group of this name."""
     view = workspace.view
     chosen = selected_layers(workspace)
     grouped = move_to_group(view, chosen, name) if name else group_layers(view, chosen)
@@ -173,14 +182,14 @@ def group(workspace: Workspace, name: str) -> Workspace:
 
 
 def ungroup(workspace: Workspace, name: str) -> Workspace:
-    """A group, or those of the selected layers, dissolved."""
+    """Dissolve a group, or the groups of the selected layers."""
     view = workspace.view
     names = {name} if name else {view.layers[i].group for i in selected_layers(workspace)}
     return replace(workspace, view=dissolve_groups(view, names - {""}))
 
 
 def _with_focus(workspace: Workspace, view: ViewState) -> Workspace:
-    """Other layers, or in another order; the focus stays on its layer."""
+    """Replace the view and keep the focus on the layer of the same name."""
     focus = workspace.focus
     if focus is not None:
         name = workspace.view.layers[focus].name
@@ -189,10 +198,10 @@ def _with_focus(workspace: Workspace, view: ViewState) -> Workspace:
 
 
 def filter_layers(view: ViewState, texts: Sequence[str], search: str) -> tuple[int, ...]:
-    """Places of the layers in which all words of a search are found.
+    """Return the indices of the layers that match all words of a search.
 
     Args:
-        texts: what is known of each edit besides, by `LayerState.gdf`: its region, what was asked for
+        texts: further searchable text of each edit (region, instruction), indexed by `LayerState.gdf`
     """
     words = search.casefold().split()
     return tuple(

@@ -1,6 +1,6 @@
-"""The stack of layers as pure functions: which of them show, order, names, groups, and what a lock keeps.
+"""Layer stack as pure functions: visibility, order, names, groups and locks.
 
-`ViewState.layers` begins with the lowest layer; the panel shows the last one, which lies on top, at the top.
+`ViewState.layers` begins with the lowest layer. The panel lists the last layer, the topmost, first.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from dataclasses import replace
 from .view_state import OVERSHOOT, LayerGroup, LayerState, ViewState
 
 SLIDERS = ("strength", "geometry", "opacity", "color")
-"""What the arrow keys move: the strength, or a gain."""
+"""Sliders that the arrow keys can move: the strength and the gains."""
 
-LONGEST_NAME = 60
+LONGEST_NAME = 60  # characters in the name of a layer, group or snapshot
 
 
 def visible_layers(view: ViewState) -> tuple[LayerState, ...]:
-    """The layers that take part, in their order, each at its strength times its group's.
+    """Return the visible layers in order, each at its strength times its group's strength.
 
-    They are the soloed ones where there are any, else the enabled of enabled groups.
+    These are the soloed layers if there are any, else the enabled layers outside disabled groups.
     """
     groups = {group.name: group for group in view.groups}
     alone = tuple(layer for layer in view.layers if layer.solo)
@@ -37,22 +37,22 @@ def visible_layers(view: ViewState) -> tuple[LayerState, ...]:
 
 
 def is_visible(view: ViewState, layer: LayerState) -> bool:
-    """Whether a layer of `view` takes part."""
+    """Return whether a layer of `view` is visible."""
     return any(visible.name == layer.name for visible in visible_layers(view))
 
 
 def visible_edits(view: ViewState) -> list[str]:
-    """The names of the layers that change the picture."""
+    """Return the names of the visible layers with a strength above 0."""
     return [layer.name for layer in visible_layers(view) if layer.strength > 0.0]
 
 
 def largest_strength(view: ViewState) -> float:
-    """The upper end of the sliders."""
+    """Return the upper end of the strength sliders: 1, or `OVERSHOOT` if overshoot is on."""
     return OVERSHOOT if view.overshoot else 1.0
 
 
 def change_layer(view: ViewState, index: int, change: Callable[[LayerState], LayerState]) -> ViewState:
-    """`view` with one layer changed; as it was where there is no such layer."""
+    """Return `view` with one layer changed. An invalid index changes nothing."""
     if not 0 <= index < len(view.layers):
         return view
     layers = list(view.layers)
@@ -61,9 +61,9 @@ def change_layer(view: ViewState, index: int, change: Callable[[LayerState], Lay
 
 
 def with_slider_value(layer: LayerState, slider: str, value: float, upper: float = 1.0) -> LayerState:
-    """The layer with its strength or a gain at `value`, held to 0..1 (a strength to 0..`upper`).
+    """Return the layer with its strength or a gain set to `value`, unless it is locked.
 
-    A locked layer stays as it is.
+    Gains are clamped to 0 to 1, a strength to 0 to `upper`.
     """
     if layer.locked:
         return layer
@@ -73,15 +73,15 @@ def with_slider_value(layer: LayerState, slider: str, value: float, upper: float
 
 
 def slider_value(layer: LayerState, slider: str) -> float:
-    """Where one of `SLIDERS` stands."""
+    """Return the value of one of `SLIDERS`."""
     return layer.strength if slider == "strength" else float(getattr(layer.gains, slider))
 
 
 def nudge_slider(view: ViewState, index: int, slider: str, by: float) -> ViewState:
-    """One layer's slider a step further."""
+    """Move one layer's slider by `by`."""
 
     def step(layer: LayerState) -> LayerState:
-        # rounded, so that steps forth and back end on the number they began with
+        # rounded, so that steps forward and back return to the initial number
         return with_slider_value(
             layer, slider, round(slider_value(layer, slider) + by, 6), largest_strength(view)
         )
@@ -90,15 +90,18 @@ def nudge_slider(view: ViewState, index: int, slider: str, by: float) -> ViewSta
 
 
 def move_layers(view: ViewState, indices: Collection[int], at: int, group: str = "") -> ViewState:
-    """These layers taken out and put in over what of the others is among the `at` lowest.
+    """Move layers to a position in the stack.
 
     Args:
-        group: which they join; "" for none, but a group all of whose layers move stays one
+        view: the state
+        indices: layers to move
+        at: insert them above those of the `at` lowest layers that do not move
+        group: group that they join, or "" for none; a group whose layers all move stays a group
     """
     remaining = [layer for i, layer in enumerate(view.layers) if i not in indices]
-    left = {layer.group for layer in remaining}
+    remaining_groups = {layer.group for layer in remaining}
     moved = [
-        replace(l, group=group or (l.group if l.group not in left else ""))
+        replace(l, group=group or (l.group if l.group not in remaining_groups else ""))
         for i, l in enumerate(view.layers)
         if i in indices
     ]
@@ -107,20 +110,20 @@ def move_layers(view: ViewState, indices: Collection[int], at: int, group: str =
 
 
 def step_layers(view: ViewState, indices: Collection[int], by: int) -> ViewState:
-    """These layers over the next one above (1) or under the next below (−1); the ends of the stack stop them.
+    """Move layers passed the next one above (1) or below (−1), up to the ends of the stack.
 
-    Between two layers of a group they join them, away from those of their own they leave them; groups go over
-    groups.
+    Layers that end up between two layers of a group join it. Layers that move away from their group leave it.
+    Whole groups move passed whole groups.
     """
-    past = max(indices) + 1 if by > 0 else min(indices) - 1
-    if not 0 <= past < len(view.layers):
+    passed = max(indices) + 1 if by > 0 else min(indices) - 1
+    if not 0 <= passed < len(view.layers):
         return view
     remaining = {i: layer.group for i, layer in enumerate(view.layers) if i not in indices}
     groups = {view.layers[i].group for i in indices}
     if "" not in groups and not groups & {*remaining.values()}:
-        while past + by in remaining and remaining[past + by] == remaining[past] != "":
-            past += by
-    at = past + 1 if by > 0 else past
+        while passed + by in remaining and remaining[passed + by] == remaining[passed] != "":
+            passed += by
+    at = passed + 1 if by > 0 else passed
     below = next((remaining[i] for i in range(at - 1, -1, -1) if i in remaining), "")
     above = next((remaining[i] for i in range(at, len(view.layers)) if i in remaining), "")
     joined = below if below == above or {below} == groups else above if {above} == groups else ""
@@ -128,7 +131,10 @@ def step_layers(view: ViewState, indices: Collection[int], by: int) -> ViewState
 
 
 def rename_layer(view: ViewState, index: int, text: str) -> ViewState:
-    """The layer under another name, on one line; a name that is taken gets a number; none changes nothing."""
+    """Rename a layer.
+
+    The name is put on one line and gets a number if taken. An empty name changes nothing.
+    """
     name = " ".join(text.split())[:LONGEST_NAME]
     if not name:
         return view
@@ -137,7 +143,7 @@ def rename_layer(view: ViewState, index: int, text: str) -> ViewState:
 
 
 def free_name(view: ViewState, name: str) -> str:
-    """A name for one more layer, with a number where a layer has it."""
+    """Return a name for a new layer, with a number if a layer already has it."""
     taken = {layer.name for layer in view.layers}
     free = name
     number = 2
@@ -148,26 +154,29 @@ def free_name(view: ViewState, name: str) -> str:
 
 
 def add_layer(view: ViewState, gdf: int, name: str, strength: float = 1.0) -> ViewState:
-    """An edit of its own on top of the others, at full strength unless said, so that one sees what came."""
+    """Add a layer for an edit on top, by default at full strength so that the result is visible."""
     return replace(view, layers=(*view.layers, LayerState(gdf, free_name(view, name), strength)))
 
 
 def remove_layer(view: ViewState, index: int) -> ViewState:
-    """Without one layer; as it was where there is no such layer."""
+    """Remove one layer. An invalid index changes nothing."""
     if not 0 <= index < len(view.layers):
         return view
     return tidy_groups(replace(view, layers=(*view.layers[:index], *view.layers[index + 1 :])))
 
 
 def duplicate_layer(view: ViewState, index: int, gdf: int) -> ViewState:
-    """A copy of one layer just above it, which shows `gdf`: the same edit under an index of its own."""
+    """Copy a layer and insert the copy above it, with edit index `gdf` (the same edit under a new index)."""
     layer = view.layers[index]
     copy = replace(layer, gdf=gdf, name=free_name(view, layer.name))
     return replace(view, layers=(*view.layers[: index + 1], copy, *view.layers[index + 1 :]))
 
 
 def replace_edit(view: ViewState, index: int, gdf: int, name: str) -> ViewState:
-    """One layer with another edit, on the timeline too: place, strength and gains stay, its paint goes."""
+    """Replace the edit of a layer, also on the timeline.
+
+    The position, strength and gains are unchanged. The paint is removed.
+    """
     old = view.layers[index].gdf
     keys = tuple(
         replace(key, strengths=tuple((gdf if g == old else g, s) for g, s in key.strengths))
@@ -179,28 +188,31 @@ def replace_edit(view: ViewState, index: int, gdf: int, name: str) -> ViewState:
 
 
 def index_of(view: ViewState, row: int) -> int:
-    """The layer in a row of the panel, counted from 0 at the top: the top one is the last of `layers`."""
+    """Return the index into `layers` of a row of the panel.
+
+    Row 0 is the topmost layer, the last of `layers`.
+    """
     return len(view.layers) - 1 - row
 
 
 def toggle_solo(view: ViewState, index: int) -> ViewState:
-    """One layer alone, or beside others that are alone; again lets it go."""
+    """Toggle solo on one layer. Other soloed layers stay soloed."""
     return change_layer(view, index, lambda layer: replace(layer, solo=not layer.solo))
 
 
 def with_paint(view: ViewState, index: int, paint: str) -> ViewState:
-    """One layer under other painted weights, unless it is locked."""
+    """Set the painted weights of one layer, unless it is locked."""
     return change_layer(view, index, lambda layer: layer if layer.locked else replace(layer, paint=paint))
 
 
 def show_all(view: ViewState) -> ViewState:
-    """Every eye open, no layer alone."""
+    """Enable all layers and groups and end all solos."""
     layers = tuple(replace(layer, enabled=True, solo=False) for layer in view.layers)
     return replace(view, layers=layers, groups=tuple(replace(g, enabled=True) for g in view.groups))
 
 
 def with_overshoot(view: ViewState, on: bool) -> ViewState:
-    """Sliders that go beyond 1, or that end there again; what stood beyond comes back to 1."""
+    """Switch overshoot on or off. Off clamps strengths to 1."""
     view = replace(view, overshoot=on)
     upper = largest_strength(view)
     return replace(
@@ -219,7 +231,7 @@ def toggle_details(view: ViewState, index: int) -> ViewState:
 
 
 def group_layers(view: ViewState, indices: Collection[int], name: str = "Group") -> ViewState:
-    """A group of these layers, at the place of the topmost; they leave the groups they were in."""
+    """Group layers at the position of the topmost. They leave their earlier groups."""
     if not indices:
         return view
     taken = {group.name for group in view.groups}
@@ -234,13 +246,13 @@ def group_layers(view: ViewState, indices: Collection[int], name: str = "Group")
     if 0 < at < len(remaining) and remaining[at - 1].group and remaining[at - 1].group == remaining[at].group:
         at = max(
             i + 1 for i, layer in enumerate(remaining) if layer.group == remaining[at].group
-        )  # not into a group
+        )  # never inside another group
     layers = (*remaining[:at], *members, *remaining[at:])
     return tidy_groups(replace(view, layers=layers, groups=(*view.groups, LayerGroup(free))))
 
 
 def move_to_group(view: ViewState, indices: Collection[int], name: str) -> ViewState:
-    """These layers at the bottom of a group there is."""
+    """Move layers to the bottom of an existing group. An unknown name changes nothing."""
     moved = [replace(view.layers[i], group=name) for i in sorted(indices) if view.layers[i].group != name]
     remaining = [layer for i, layer in enumerate(view.layers) if i not in indices or layer.group == name]
     at = next((i for i, layer in enumerate(remaining) if layer.group == name), None)
@@ -250,7 +262,10 @@ def move_to_group(view: ViewState, indices: Collection[int], name: str) -> ViewS
 
 
 def dissolve_groups(view: ViewState, names: Collection[str]) -> ViewState:
-    """The layers of these groups by themselves, as they showed within them."""
+    """Dissolve groups.
+
+    Each layer takes over the group's visibility and strength, so the picture is unchanged.
+    """
     groups = {group.name: group for group in view.groups if group.name in names}
 
     def alone(layer: LayerState) -> LayerState:
@@ -264,7 +279,10 @@ def dissolve_groups(view: ViewState, names: Collection[str]) -> ViewState:
 
 
 def change_group(view: ViewState, name: str, change: Callable[[LayerGroup], LayerGroup]) -> ViewState:
-    """`view` with one group changed; a changed name is one line, no other group's, and its layers follow."""
+    """Return `view` with one group changed.
+
+    A new name is put on one line and applied to the group's layers. A name that is empty or taken is ignored.
+    """
     old = next((group for group in view.groups if group.name == name), None)
     if old is None:
         return view
@@ -281,13 +299,13 @@ def change_group(view: ViewState, name: str, change: Callable[[LayerGroup], Laye
 
 
 def toggle_collapsed(view: ViewState, name: str) -> ViewState:
-    """The layers of a group listed, or not."""
+    """Expand or collapse a group in the panel's list."""
     remaining = tuple(collapsed for collapsed in view.collapsed if collapsed != name)
     return replace(view, collapsed=remaining if name in view.collapsed else (*remaining, name))
 
 
 def tidy_groups(view: ViewState) -> ViewState:
-    """Without the groups that have no layer."""
+    """Remove groups without layers."""
     names = {layer.group for layer in view.layers}
     return replace(
         view,

@@ -1,7 +1,7 @@
-"""Painted strength: a weight per member of a layer, and the strokes of a brush that change it.
+"""Painted strength: a weight per member of a layer, changed by brush strokes.
 
-A stroke keeps the weights it began with and how far the brush has reached each member; what it gives does not
-depend on how many events the hand's way was cut into.
+A stroke stores the initial weights and the largest brush influence on each member. Its result does not depend
+on the number of pointer events along the path.
 """
 
 from __future__ import annotations
@@ -25,60 +25,64 @@ from progdf.scene.selection import Surface
 from .view_state import LARGEST_PX, SMALLEST_PX, Brush
 
 FULL = ""
-"""The paint of a layer that was never painted: weight 1 everywhere."""
+"""Paint of an unpainted layer: weight 1 everywhere."""
 
 Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class Stroke:
-    """A stroke under way."""
+    """Brush stroke in progress."""
 
-    before: Floats  # weights when it began, 0..1. [M]
-    # where each member is in the picture, pixels, and f·log(depth), so that neighbors are as far apart as
-    # they look; NaN where the brush cannot reach it. [M,3]
+    before: Floats  # initial weights, 0 to 1. [M]
+    # x and y of each member in the picture, px, and f·log(depth), so that distances match the apparent ones;
+    # NaN for members that the brush cannot reach. [M,3]
     places: Floats
-    reached: Floats  # largest touch of the brush so far, 0..1. [M]
-    mode: str = "erase"  # of `BRUSH_MODES`
-    last: tuple[float, float] | None = None  # where the brush was last, pixels
+    reached: Floats  # largest brush influence so far, 0 to 1. [M]
+    mode: str = "erase"  # one of `BRUSH_MODES`
+    last: tuple[float, float] | None = None  # last position of the brush, px
 
 
 def mode_while(mode: str, modifier: str) -> str:
-    """What a stroke does that begins with a modifier held: Ctrl the opposite, Shift smooths, as elsewhere."""
+    """Return the mode of a stroke begun with a modifier: Ctrl swaps add and erase, Shift smooths."""
     if modifier == "Shift":
         return "smooth"
     return {"add": "erase", "erase": "add"}.get(mode, mode) if modifier == "Ctrl" else mode
 
 
 def radius(pixels: float) -> float:
-    """A radius that a hand can use."""
+    """Clamp a brush radius to `SMALLEST_PX` to `LARGEST_PX` and round it to 0.1 px."""
     return min(LARGEST_PX, max(SMALLEST_PX, round(pixels, 1)))
 
 
 def softness(share: float) -> float:
-    """A softness, 0..1."""
+    """Clamp a softness to 0 to 1 and round it to 0.001."""
     return min(1.0, max(0.0, round(share, 3)))
 
 
 def encode(weights: Floats) -> str:
-    """Weights 0..1 as the text that a state and a session keep; `FULL` where all are 1."""
+    """Encode weights (0 to 1) as the text stored in states and sessions; `FULL` if all are 1. [M]"""
     levels = np.round(np.clip(weights, 0.0, 1.0) * 255.0).astype(np.uint8)
     if (levels == 255).all():
         return FULL
     return base64.b64encode(zlib.compress(levels.tobytes(), 1)).decode()
 
 
-@lru_cache(maxsize=48)  # the composer knows weights by their identity
+@lru_cache(maxsize=48)  # the composer compares weights by identity
 def decode(paint: str, members: int, from_others: int = 0) -> Tensor | None:
-    """Weight of every member, None for `FULL`. [M] float32
+    """Decode the weight of every member.
 
     Args:
-        paint: as `encode` writes it
+        paint: text from `encode`
         members: M
-        from_others: how many of the last members other edits add; what came after it was painted has 1
+        from_others: number of members, at the end, that other edits add; those added after painting get
+            weight 1
+
+    Returns:
+        [M] float32, 0 to 1, or None for `FULL`.
 
     Raises:
-        ProgdfError: the text is damaged, or holds weights of more members, or of fewer than that.
+        ProgdfError: the text is damaged, or has more than M or fewer than M − `from_others` weights.
     """
     if paint == FULL:
         return None
@@ -95,7 +99,7 @@ def decode(paint: str, members: int, from_others: int = 0) -> Tensor | None:
 
 
 def layer_of(gdf: Gdf, strength: float, gains: Gains, paint: str) -> Layer:
-    """The layer that the composer takes, with the painted weights.
+    """Build the composer's layer, with the painted weights.
 
     Raises:
         ProgdfError: see `decode`.
@@ -104,14 +108,14 @@ def layer_of(gdf: Gdf, strength: float, gains: Gains, paint: str) -> Layer:
 
 
 def begin_stroke(paint: str, gdf: Gdf, surface: Surface, through: bool, mode: str = "erase") -> Stroke:
-    """A stroke that has touched nothing yet.
+    """Begin a stroke that has not affected any member yet.
 
     Args:
-        paint: of the layer
-        gdf: its edit
-        surface: of the scene on screen
-        through: also what lies behind the front surface
-        mode: of `BRUSH_MODES`
+        paint: paint of the layer
+        gdf: edit of the layer
+        surface: surface of the scene on screen
+        through: also affect members behind the front surface
+        mode: one of `BRUSH_MODES`
     """
     count = len(gdf.region)
     weights = decode(paint, count, gdf.from_others)
@@ -129,32 +133,34 @@ def begin_stroke(paint: str, gdf: Gdf, surface: Surface, through: bool, mode: st
 
 
 def extend_stroke(stroke: Stroke, x: float, y: float, brush: Brush, density: float = 1.0) -> Stroke:
-    """The stroke with the brush moved in a straight line to a pixel position.
+    """Extend a stroke in a straight line to a pixel position.
 
     Args:
-        stroke: under way
-        x, y: pixels of the picture
-        brush: its radius is in pixels at 1×
+        stroke: the stroke in progress
+        x, y: position in the picture, px
+        brush: the brush, with its radius in pixels at 1×
         density: pixels of the picture per pixel at 1×
     """
     here = np.array([x, y], np.float32)
     there = here if stroke.last is None else np.array(stroke.last, np.float32)
-    way = here - there
+    motion = here - there
     places = stroke.places[:, :2]
-    along = np.clip(((places - there) @ way) / max(float(way @ way), 1e-12), 0.0, 1.0)
-    away = np.linalg.norm(places - there - along[:, None] * way, axis=1) / (brush.radius * density)
+    along = np.clip(((places - there) @ motion) / max(float(motion @ motion), 1e-12), 0.0, 1.0)
+    away = np.linalg.norm(places - there - along[:, None] * motion, axis=1) / (brush.radius * density)
     fall = np.clip((1.0 - away) / max(brush.softness, 1e-3), 0.0, 1.0)
     touch = np.nan_to_num(fall * fall * (3.0 - 2.0 * fall)).astype(np.float32)
     return replace(stroke, reached=np.maximum(stroke.reached, touch), last=(x, y))
 
 
 def apply_stroke(stroke: Stroke, brush: Brush, density: float = 1.0) -> str:
-    """The paint that the stroke has made so far: to the brush's value, to 0, or to the mean of neighbors
-    under the brush, as far as its flow goes.
+    """Return the paint after the stroke so far.
+
+    Weights move by the brush's flow towards its value (add), 0 (erase), or the mean of neighbors under the
+    brush (smooth).
 
     Args:
-        stroke: under way
-        brush, density: as for `extend_stroke`; smoothing reaches as far as half the brush
+        stroke: the stroke in progress
+        brush, density: see `extend_stroke`; smoothing averages over half the brush radius
     """
     goal = np.full_like(stroke.before, brush.value if stroke.mode == "add" else 0.0)
     if stroke.mode == "smooth":
@@ -165,7 +171,7 @@ def apply_stroke(stroke: Stroke, brush: Brush, density: float = 1.0) -> str:
 
 
 def invert(paint: str, members: int, from_others: int = 0) -> str:
-    """The paint with each weight w replaced by 1 − w; arguments as of `decode`.
+    """Replace each weight w by 1 − w. The arguments are those of `decode`.
 
     Raises:
         ProgdfError: see `decode`.
@@ -175,12 +181,12 @@ def invert(paint: str, members: int, from_others: int = 0) -> str:
 
 
 def feather(paint: str, points: Floats, width: float, from_others: int = 0) -> str:
-    """The paint with its edges softened, wherever one looks from.
+    """Soften the edges of the paint in world space, independent of the view.
 
     Args:
-        paint: of a layer
-        points: the centers of its members, world units. [M,3]
-        width: see `near_mean`, world units, > 0
+        paint: paint of a layer
+        points: centers of its members, world units. [M,3]
+        width: cell size of `near_mean`, world units, > 0
         from_others: see `decode`
 
     Raises:
@@ -190,45 +196,46 @@ def feather(paint: str, points: Floats, width: float, from_others: int = 0) -> s
     if weights is None:
         return FULL
     soft = weights.numpy().copy()
-    somewhere = np.isfinite(points).all(1)
-    soft[somewhere] = near_mean(points[somewhere], soft[somewhere], width)
+    finite = np.isfinite(points).all(1)
+    soft[finite] = near_mean(points[finite], soft[finite], width)
     return encode(soft)
 
 
-_MINIMUM = float(np.finfo(np.float64).tiny)  # a corner without a share has no mean, and gives none
+_MIN_WEIGHT = float(np.finfo(np.float64).tiny)  # avoids a division by 0 at corners without weight
 
 
-_CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+# offsets of the eight corners of a cell, in cells. [8,3]
+_CELL_CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 
 
 def near_mean(points: Floats, values: Floats, width: float) -> Floats:
-    """Mean of the values around each point: continuous, and its cost grows with the points alone.
+    """Return a smooth local mean of the values around each point, at a cost linear in the points.
 
-    Each point gives its value to the eight corners of its cell and takes their means, by its place among
-    them: a kernel of about 0.6 `width` standard deviation.
+    Each point spreads its value to the eight corners of its grid cell and gathers their means, both with
+    trilinear weights. The kernel has a standard deviation of about 0.6 `width`.
 
     Args:
-        points: finite, in any unit. [M,3]
-        values: at the points. [M]
+        points: finite positions in any unit. [M,3]
+        values: values at the points. [M]
         width: side of a cell, in the unit of the points, > 0
 
     Returns:
-        Within the range of the values. [M]
+        Means within the range of the values. [M]
     """
     if not len(points):
         return values.copy()
     places = points / np.float32(width)
     low = np.floor(places)
-    ends = np.stack([1.0 - (places - low), places - low], 2)  # to the lower corner and to the upper one
+    ends = np.stack([1.0 - (places - low), places - low], 2)  # weights of the lower and the upper corner
     shares = (ends[:, 0, :, None, None] * ends[:, 1, None, :, None] * ends[:, 2, None, None, :]).reshape(
         -1, 8
     )
     low -= low.min(0)
     _, y_side, z_side = (low.max(0) + 2).tolist()
     steps = np.array([y_side * z_side, z_side, 1.0])
-    cells = (low @ steps)[:, None] + _CORNERS @ steps  # whole numbers, exact in float64 up to 2⁵³
+    cells = (low @ steps)[:, None] + _CELL_CORNERS @ steps  # integers, exact in float64 up to 2⁵³
     corners = np.unique(cells, return_inverse=True)[1].reshape(cells.shape)
-    given = np.bincount(corners.ravel(), shares.ravel())[corners]
+    weight_sums = np.bincount(corners.ravel(), shares.ravel())[corners]
     total = np.bincount(corners.ravel(), (shares * values[:, None]).ravel())[corners]
-    means: Floats = (shares * (total / np.maximum(given, _MINIMUM))).sum(1).astype(np.float32)
+    means: Floats = (shares * (total / np.maximum(weight_sums, _MIN_WEIGHT))).sum(1).astype(np.float32)
     return np.clip(means, values.min(), values.max())

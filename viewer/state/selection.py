@@ -1,7 +1,7 @@
-"""What is selected in the scene, what of it is hidden, and the regions kept from selections.
+"""Selected and hidden Gaussians, and the regions saved from selections.
 
-A set of Gaussians is a boolean mask over the scene, packed into a few kilobytes (`pack`), so that states
-compare, undo and are saved as values.
+A set of Gaussians is a boolean mask over the scene, packed into a few kilobytes (`pack`). States can
+therefore be compared, undone and saved as values.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from progdf.scene.neighbors import Neighborhood
 from progdf.scene.selection import Mask, combine
 
 SUFFIX = ".region.npy"
-"""How the file of a region is called after its name."""
-LONGEST_NAME = 60
+"""File name suffix of a region, after its name."""
+LONGEST_NAME = 60  # characters in the name of a region
 MAX_REGIONS = 1000
-"""Of a scene: more names than a person tells apart, few enough to draw and to save at once."""
+"""Largest number of regions of a scene, few enough to draw and save at once."""
 
 NOBODY = b""
-"""The packed mask without a member."""
+"""Packed mask without members."""
 
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 Color = tuple[Share, Share, Share]
@@ -42,44 +42,49 @@ COLORS: tuple[Color, ...] = (
     (0.95, 0.80, 0.20),
     (0.30, 0.80, 0.75),
 )
-"""Those that new regions take in turn."""
+"""Colors assigned to new regions in turn."""
 
 
 @dataclass(frozen=True)
 class NamedRegion:
-    """A selection that was kept."""
+    """Selection saved under a name."""
 
     name: str  # no two regions share one
-    path: Path  # its file, for `progdf train --region file:PATH`
+    path: Path  # file of its rows, for `progdf train --region file:PATH`
     members: bytes  # its packed mask
-    count: Annotated[int, Meta(ge=0)]  # of its members
-    color: Color = COLORS[0]  # of its swatch and its tint
-    visible: bool = False  # the picture shows it tinted
+    count: Annotated[int, Meta(ge=0)]  # number of its members
+    color: Color = COLORS[0]  # color of its swatch and tint
+    visible: bool = False  # whether the picture shows its tint
 
 
 @dataclass(frozen=True)
 class SelectionState:
-    """The present selection, what is hidden, and the regions; undo knows all of it."""
+    """Current selection, hidden Gaussians and regions. Undo covers all of it."""
 
-    members: bytes = NOBODY  # packed mask of what is selected
-    count: Annotated[int, Meta(ge=0)] = 0  # of these
-    hidden: bytes = NOBODY  # packed mask of what is not drawn and cannot be selected
+    members: bytes = NOBODY  # packed mask of the selection
+    count: Annotated[int, Meta(ge=0)] = 0  # number of selected Gaussians
+    hidden: bytes = NOBODY  # packed mask of Gaussians that are not drawn and cannot be selected
     # in the order of the panel's rows
     regions: Annotated[tuple[NamedRegion, ...], Meta(max_length=MAX_REGIONS)] = ()
 
 
 def pack(mask: Mask) -> bytes:
-    """A mask as states keep it; `NOBODY` where nothing is in it. [N]"""
+    """Pack a mask [N] for storage in a state; `NOBODY` if it is empty."""
     return zlib.compress(np.packbits(mask).tobytes(), 1) if mask.any() else NOBODY
 
 
 @lru_cache(maxsize=64)
 def unpack(members: bytes, total: int) -> Mask:
-    """The mask of a scene of `total` Gaussians, read-only; of fewer rows, those that edits add later are not
-    in it, of more, they are left out. [N]
+    """Unpack a mask for a scene of `total` Gaussians.
+
+    Rows beyond the end of the mask, which edits added later, are not members. Surplus rows of the mask are
+    dropped.
+
+    Returns:
+        Read-only mask. [N] bool
 
     Raises:
-        ProgdfError: it is damaged.
+        ProgdfError: the packed mask is damaged.
     """
     mask = np.zeros(total, bool)
     if members != NOBODY:
@@ -97,53 +102,55 @@ def unpack(members: bytes, total: int) -> Mask:
 
 
 def select(state: SelectionState, mask: Mask) -> SelectionState:
-    """With another selection; what is hidden is never in it. [N]"""
+    """Replace the selection by `mask` [N] without the hidden Gaussians."""
     if state.hidden != NOBODY:
         mask = mask & ~unpack(state.hidden, len(mask))
     return replace(state, members=pack(mask), count=int(np.count_nonzero(mask)))
 
 
 def select_none(state: SelectionState) -> SelectionState:
-    """With nothing selected."""
+    """Clear the selection."""
     return replace(state, members=NOBODY, count=0)
 
 
 def hide(state: SelectionState, mask: Mask) -> SelectionState:
-    """What is in the mask is not drawn any more, and no longer selected. [N]"""
+    """Hide and deselect the Gaussians of `mask` [N]."""
     hidden = unpack(state.hidden, len(mask)) | mask
     return select(replace(state, hidden=pack(hidden)), unpack(state.members, len(mask)))
 
 
 def isolate(state: SelectionState, total: int) -> SelectionState:
-    """Nothing but what is selected is drawn; as it was where nothing is."""
+    """Hide everything but the selection. An empty selection changes nothing."""
     return replace(state, hidden=pack(~unpack(state.members, total))) if state.count else state
 
 
 def show_all(state: SelectionState) -> SelectionState:
-    """Everything is drawn."""
+    """Show all hidden Gaussians."""
     return replace(state, hidden=NOBODY)
 
 
 def change(
     state: SelectionState, name: str, argument: str, total: int, neighborhood: Callable[[], Neighborhood]
 ) -> SelectionState:
-    """After one of `CHANGES`.
+    """Apply one of `CHANGES`.
 
     Args:
-        argument: of a region its index, and a mode of `combine` after a colon
-        total: Gaussians in the scene
-        neighborhood: of the scene, made when it is first asked for
+        state: the current state
+        name: name of the change
+        argument: for a region its index, and optionally a colon and a mode of `combine`
+        total: number of Gaussians in the scene
+        neighborhood: returns the neighborhood of the scene, computed on first use
     """
     mask = unpack(state.members, total)
     if name in _CHANGES:
         return _CHANGES[name](state, mask)
-    if name in _OF_REGIONS:
+    if name in _REGION_CHANGES:
         return _change_region(state, name, argument, mask)
     return select(state, CHANGES_BY_NEIGHBORS[name](neighborhood(), mask)) if state.count else state
 
 
 def _change_region(state: SelectionState, name: str, argument: str, mask: Mask) -> SelectionState:
-    """A region is selected, tinted or not, or forgotten; its file stays. As it was where there is none."""
+    """Select, tint, untint or remove a region. Its file is kept. An invalid index changes nothing."""
     index, _, mode = argument.partition(":")
     if not 0 <= int(index) < len(state.regions):
         return state
@@ -169,13 +176,19 @@ _CHANGES: dict[str, Callable[[SelectionState, Mask], SelectionState]] = {
     "isolate": lambda state, mask: isolate(state, len(mask)),
     "show_hidden": lambda state, _: show_all(state),
 }
-_OF_REGIONS = ("region", "show_region", "forget_region")
-CHANGES = (*_CHANGES, *_OF_REGIONS, *CHANGES_BY_NEIGHBORS)
-"""Actions on the selection, and `region:INDEX[:MODE]`, `show_region:INDEX`, `forget_region:INDEX`."""
+_REGION_CHANGES = ("region", "show_region", "forget_region")
+CHANGES = (*_CHANGES, *_REGION_CHANGES, *CHANGES_BY_NEIGHBORS)
+"""Actions on the selection.
+
+Those on regions are `region:INDEX[:MODE]`, `show_region:INDEX` and `forget_region:INDEX`.
+"""
 
 
 def free_name(state: SelectionState, text: str, is_taken: Callable[[str], bool] = lambda name: False) -> str:
-    """A name on one line, for a file too, with a number where a region has it already, or it is taken."""
+    """Return a valid region and file name made from `text`.
+
+    It gets a number if a region already has it (ignoring case) or `is_taken` returns true.
+    """
     cleaned = "".join(c if c.isalnum() or c in " -_." else "_" for c in " ".join(text.split()))
     name = cleaned.strip(" .")[:LONGEST_NAME].rstrip(" .") or "region"
     name = name if is_portable(name) else f"region {name}"
@@ -184,10 +197,10 @@ def free_name(state: SelectionState, text: str, is_taken: Callable[[str], bool] 
 
 
 def add_region(state: SelectionState, name: str, path: Path) -> SelectionState:
-    """With the selection kept as one more region; it stays selected.
+    """Add the selection as a region. It stays selected.
 
     Raises:
-        ProgdfError: there are `MAX_REGIONS`.
+        ProgdfError: there are already `MAX_REGIONS`.
     """
     if len(state.regions) >= MAX_REGIONS:
         raise ProgdfError(f"there are {MAX_REGIONS} regions, the most there can be; delete some first")
@@ -197,7 +210,7 @@ def add_region(state: SelectionState, name: str, path: Path) -> SelectionState:
 
 
 def change_region(state: SelectionState, index: int, region: NamedRegion | None) -> SelectionState:
-    """With a region in another's place, or None: without it; as it was where there is no such region."""
+    """Replace the region at `index`, or remove it if `region` is None. An invalid index changes nothing."""
     if not 0 <= index < len(state.regions):
         return state
     replacement: Sequence[NamedRegion] = () if region is None else (region,)
@@ -205,7 +218,7 @@ def change_region(state: SelectionState, index: int, region: NamedRegion | None)
 
 
 def check(state: SelectionState, total: int) -> None:
-    """ProgdfError where a mask does not fit a scene of `total` Gaussians."""
+    """Raise ProgdfError if a mask does not fit a scene of `total` Gaussians."""
     for members in (state.members, state.hidden, *(region.members for region in state.regions)):
         unpack(members, total)
         size = -(-total // 8)
@@ -214,7 +227,7 @@ def check(state: SelectionState, total: int) -> None:
 
 
 def take_rows(state: SelectionState, total: int, rows: NDArray[np.int64]) -> SelectionState:
-    """The same in a scene that has these of `total` rows alone. [R]"""
+    """Convert the state to a scene that has only the given rows [R] of `total`."""
 
     def take(members: bytes) -> tuple[bytes, int]:
         mask = unpack(members, total)[rows]

@@ -1,4 +1,4 @@
-"""Kept states of the sliders: what was edited and from where one looked; the original is always the first."""
+"""Snapshots: saved slider states with their camera. The original is always the first."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from .layers import LONGEST_NAME
 from .selection import SelectionState
 from .view_state import SnapshotPair, Timeline, ViewState
 
-MAX_SNAPSHOTS = 200
+MAX_SNAPSHOTS = 200  # without the original
 ORIGINAL = "original"
-"""The name of the first."""
+"""Name of the first snapshot."""
 
 
 @dataclass(frozen=True)
 class SliderSnapshot:
-    """One kept state."""
+    """Saved state of the sliders."""
 
-    name: str  # under its picture
-    edit: history.Edit  # what going back to it restores, as one undo entry
-    camera: ViewCamera = ViewCamera()  # where its small picture is taken from
+    name: str  # label under its thumbnail
+    edit: history.Edit  # restored as one undo entry
+    camera: ViewCamera = ViewCamera()  # camera of its thumbnail
 
 
 @dataclass(frozen=True)
 class SnapshotSides:
-    """Two snapshots that are compared: what each shows, seen from where one looks, and their names."""
+    """Two compared snapshots from the current camera, and their names."""
 
     left: ViewState
     right: ViewState
@@ -37,19 +37,22 @@ class SnapshotSides:
 
 
 def take(snapshots: Sequence[SliderSnapshot], view: ViewState) -> tuple[SliderSnapshot, ...]:
-    """One more, of `view`; as they were where the last one is the same, or there are `MAX_SNAPSHOTS`."""
-    new = SliderSnapshot(_name(snapshots), _sliders(view), view.camera)
+    """Append a snapshot of `view`, unless it equals the last one or there are `MAX_SNAPSHOTS`."""
+    new = SliderSnapshot(_next_name(snapshots), _snapshot_edit(view), view.camera)
     same = snapshots and replace(snapshots[-1], name=new.name) == new
     return tuple(snapshots) if same or len(snapshots) >= MAX_SNAPSHOTS else (*snapshots, new)
 
 
 def remove(snapshots: Sequence[SliderSnapshot], index: int) -> tuple[SliderSnapshot, ...]:
-    """All but one."""
+    """Remove the snapshot at `index`."""
     return (*snapshots[:index], *snapshots[index + 1 :])
 
 
 def rename(snapshots: Sequence[SliderSnapshot], index: int, name: str) -> tuple[SliderSnapshot, ...]:
-    """One under another name, on one line, with a number where it is taken; no name changes nothing."""
+    """Rename a snapshot.
+
+    The name is put on one line and gets a number if taken. An empty name changes nothing.
+    """
     name = " ".join(name.split())[:LONGEST_NAME] or snapshots[index].name
     taken = {ORIGINAL, *(other.name for i, other in enumerate(snapshots) if i != index)}
     free = next(n for n in (name, *(f"{name}-{i}" for i in range(2, MAX_SNAPSHOTS + 3))) if n not in taken)
@@ -57,36 +60,38 @@ def rename(snapshots: Sequence[SliderSnapshot], index: int, name: str) -> tuple[
 
 
 def move(snapshots: Sequence[SliderSnapshot], index: int, to: int) -> tuple[SliderSnapshot, ...]:
-    """One at another place; the ends stop it."""
+    """Move a snapshot to index `to`, clamped to the list."""
     moved = list(snapshots)
     moved.insert(max(0, min(to, len(moved) - 1)), moved.pop(index))
     return tuple(moved)
 
 
 def with_original(snapshots: Sequence[SliderSnapshot], view: ViewState) -> tuple[SliderSnapshot, ...]:
-    """What the panel shows: the original of `view`, then those kept."""
+    """Return the panel's list: the original of `view`, then the snapshots."""
     layers = tuple(replace(layer, strength=0.0) for layer in view.layers)
-    edit = _sliders(replace(view, layers=layers))
+    edit = _snapshot_edit(replace(view, layers=layers))
     first = snapshots[0].camera if snapshots else view.camera
     return SliderSnapshot(ORIGINAL, edit, first), *snapshots
 
 
 def restore(view: ViewState, snapshot: SliderSnapshot) -> ViewState:
-    """`view` edited as it was then; edits that were opened since stay in the stack, at 0."""
+    """Restore a snapshot in `view`. Edits opened since then stay in the stack at strength 0."""
     known = {layer.gdf for layer in snapshot.edit.layers}
     later = tuple(replace(layer, strength=0.0, group="") for layer in view.layers if layer.gdf not in known)
-    back = replace(history.apply_edit(view, snapshot.edit), pair=view.pair)
-    return replace(back, layers=(*back.layers, *later), timeline=view.timeline, selection=view.selection)
+    restored = replace(history.apply_edit(view, snapshot.edit), pair=view.pair)
+    return replace(
+        restored, layers=(*restored.layers, *later), timeline=view.timeline, selection=view.selection
+    )
 
 
 def pair_of(snapshots: Sequence[SliderSnapshot], pair: SnapshotPair) -> tuple[int, int]:
-    """The places of A and B in `snapshots` (the original first); the last two where none is named."""
+    """Return the indices of A and B in `snapshots` (the original first). Unnamed ones are the last two."""
     places = {snapshot.name: i for i, snapshot in reversed(list(enumerate(snapshots)))}
     return places.get(pair.a, max(len(snapshots) - 2, 0)), places.get(pair.b, len(snapshots) - 1)
 
 
 def compare_sides(snapshots: Sequence[SliderSnapshot], view: ViewState) -> SnapshotSides | None:
-    """What `view` shows where it compares two snapshots, else None."""
+    """Return both sides if `view` compares two snapshots, else None."""
     if view.compare.mode == "off" or view.compare.against != "snapshots" or not snapshots:
         return None
     listed = with_original(snapshots, view)
@@ -95,17 +100,17 @@ def compare_sides(snapshots: Sequence[SliderSnapshot], view: ViewState) -> Snaps
 
 
 def choose(view: ViewState, slot: str, name: str) -> ViewState:
-    """Another snapshot as A or B ("a" or "b") of the pair."""
+    """Set A or B (`slot` "a" or "b") of the compared pair to the named snapshot."""
     changes: dict[str, Any] = {slot: name}
     return replace(view, pair=replace(view.pair, **changes))
 
 
-def _sliders(view: ViewState) -> history.Edit:
-    """What a snapshot keeps: all that undo knows but the film, the selection and the pair of snapshots."""
+def _snapshot_edit(view: ViewState) -> history.Edit:
+    """Return the edit that a snapshot stores: all but the timeline, the selection and the compared pair."""
     edit = history.edit_of(view)
     return replace(edit, timeline=Timeline(), selection=SelectionState(), pair=SnapshotPair())
 
 
-def _name(snapshots: Sequence[SliderSnapshot]) -> str:
+def _next_name(snapshots: Sequence[SliderSnapshot]) -> str:
     taken_names = {snapshot.name for snapshot in snapshots}
     return next(str(n) for n in range(1, MAX_SNAPSHOTS + 2) if str(n) not in taken_names)

@@ -1,4 +1,4 @@
-"""Keys on a timeline and its playhead as pure functions: set, move, ease and play, the state at any frame."""
+"""Timeline keys and playhead as pure functions: set, move, ease, play, and the state at any frame."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ EASINGS = views.EASINGS
 
 
 CAMERA = -1
-"""The row of the camera; that of an edit is its `LayerState.gdf`."""
+"""Row of the camera. The row of an edit is its `LayerState.gdf`."""
 RowKey = tuple[int, int]
-"""A row's key: the row, and its frame."""
+"""Row and frame of a key."""
 
 
 def split_keys(timeline: Timeline) -> dict[RowKey, Keyframe]:
-    """What each row has at a frame, as a key of that row alone."""
+    """Split the keyframes into keys that each belong to one row."""
     found = {}
     for key in timeline.keys:
         if key.camera is not None:
@@ -31,27 +31,32 @@ def split_keys(timeline: Timeline) -> dict[RowKey, Keyframe]:
 
 
 def join_keys(timeline: Timeline, keys: Mapping[RowKey, Keyframe]) -> Timeline:
-    """A timeline of these keys; those of one frame that go on in the same way are one `Keyframe`."""
+    """Return a timeline of these keys. Those with the same frame and easing become one `Keyframe`."""
     joined: dict[tuple[int, str], Keyframe] = {}
     for (_, frame), key in sorted(keys.items(), key=lambda item: item[0]):
-        same = joined.get((frame, key.easing), Keyframe(frame, easing=key.easing))
-        strengths = (*same.strengths, *key.strengths)
-        camera = key.camera or same.camera
-        joined[frame, key.easing] = replace(same, strengths=strengths, camera=camera)
+        joined_key = joined.get((frame, key.easing), Keyframe(frame, easing=key.easing))
+        strengths = (*joined_key.strengths, *key.strengths)
+        camera = key.camera or joined_key.camera
+        joined[frame, key.easing] = replace(joined_key, strengths=strengths, camera=camera)
     ordered = tuple(sorted(joined.values(), key=lambda key: key.frame))
     return replace(timeline, keys=ordered, length=max((timeline.length, *(key.frame for key in ordered))))
 
 
 def keys_at(timeline: Timeline, frame: int) -> list[RowKey]:
-    """The keys of all rows that stand at a frame."""
+    """Return the keys of all rows at a frame."""
     return [key for key in split_keys(timeline) if key[1] == frame]
 
 
 def with_key(timeline: Timeline, frame: int, view: ViewState, rows: Sequence[int] | None = None) -> Timeline:
-    """What `view` shows becomes the key at a frame, in place of the one there, whose easing stays.
+    """Set a key at a frame from the camera and strengths of `view`.
+
+    A key that is already there is replaced and passes on its easing.
 
     Args:
-        rows: which rows it is set for; all if None
+        timeline: the timeline
+        frame: frame of the key
+        view: source of the values
+        rows: rows that get the key; None for all
     """
     keys = split_keys(timeline)
     for row in (CAMERA, *(layer.gdf for layer in view.layers)) if rows is None else rows:
@@ -66,23 +71,25 @@ def with_key(timeline: Timeline, frame: int, view: ViewState, rows: Sequence[int
 
 
 def without_keys(timeline: Timeline, chosen: Collection[RowKey]) -> Timeline:
-    """These keys taken away, as far as there are any."""
+    """Remove the given keys that exist."""
     return join_keys(timeline, {at: key for at, key in split_keys(timeline).items() if at not in chosen})
 
 
 def shift_keys(timeline: Timeline, chosen: Collection[RowKey], by: int, copy: bool = False) -> Timeline:
-    """These keys so many frames later, or copies of them; unchanged where one would stand on another key of
-    its row, or off the timeline."""
+    """Move or copy keys by `by` frames.
+
+    Nothing changes if a key would land on another key of its row or outside the timeline.
+    """
     keys = split_keys(timeline)
     moved = {(row, frame + by): replace(keys[row, frame], frame=frame + by) for row, frame in chosen}
-    rest = {at: key for at, key in keys.items() if copy or at not in chosen}
-    if rest.keys() & moved.keys() or not all(0 <= frame <= timeline.length for _, frame in moved):
+    others = {at: key for at, key in keys.items() if copy or at not in chosen}
+    if others.keys() & moved.keys() or not all(0 <= frame <= timeline.length for _, frame in moved):
         return timeline
-    return join_keys(timeline, rest | moved)
+    return join_keys(timeline, others | moved)
 
 
 def set_easing(timeline: Timeline, chosen: Collection[RowKey], easing: str) -> Timeline:
-    """Another way to go on from these keys."""
+    """Set the easing from these keys to the next."""
     keys = split_keys(timeline)
     return join_keys(
         timeline, {at: replace(k, easing=easing) if at in chosen else k for at, k in keys.items()}
@@ -90,23 +97,23 @@ def set_easing(timeline: Timeline, chosen: Collection[RowKey], easing: str) -> T
 
 
 def key_before(timeline: Timeline, frame: int) -> Keyframe:
-    """The key that decides how things move at a frame: the last one up to it, else the first."""
+    """Return the key whose easing applies at a frame: the last one up to it, else the first."""
     return next((key for key in reversed(timeline.keys) if key.frame <= frame), timeline.keys[0])
 
 
 def set_length(timeline: Timeline, length: int) -> Timeline:
-    """Another last frame; no key is lost, so it ends with the last key at the earliest."""
+    """Set the last frame, clamped to the last key (so that no key is lost) to `LONGEST`."""
     last = timeline.keys[-1].frame if timeline.keys else 0
     return replace(timeline, length=max(1, last, min(length, LONGEST)))
 
 
 def with_fps(timeline: Timeline, fps: int) -> Timeline:
-    """Another pace, 1 to `FASTEST` frames per second."""
+    """Set the frame rate, clamped to 1 to `FASTEST` frames per second."""
     return replace(timeline, fps=max(1, min(fps, FASTEST)))
 
 
 def neighbor(timeline: Timeline, frame: int, step: int) -> int:
-    """The frame of the next key (step 1) or of the one before (−1); an end of the timeline where none is."""
+    """Return the frame of the next (step 1) or previous (−1) key, or else the end of the timeline."""
     frames = [key.frame for key in timeline.keys]
     if step > 0:
         return min((f for f in frames if f > frame), default=timeline.length)
@@ -114,15 +121,20 @@ def neighbor(timeline: Timeline, frame: int, step: int) -> int:
 
 
 def turntable(camera: ViewCamera, fps: int, seconds: float) -> Timeline:
-    """Once around the pivot at an even pace: after the last frame comes the first."""
+    """Return a timeline that orbits the pivot once at constant speed and loops seamlessly."""
     count = min(max(2, round(fps * seconds)), LONGEST)
-    turns = [(camera.azimuth + 180.0 + 360.0 * frame / count) % 360.0 - 180.0 for frame in range(count)]
-    keys = tuple(Keyframe(frame, (), replace(camera, azimuth=turn)) for frame, turn in enumerate(turns))
+    azimuths = [(camera.azimuth + 180.0 + 360.0 * frame / count) % 360.0 - 180.0 for frame in range(count)]
+    keys = tuple(
+        Keyframe(frame, (), replace(camera, azimuth=azimuth)) for frame, azimuth in enumerate(azimuths)
+    )
     return Timeline(keys, count - 1, fps)
 
 
 def slider_film(view: ViewState, gdfs: Sequence[int], fps: int, seconds: float) -> Timeline:
-    """The sliders of these edits from 0 to 1, one after the other, and back again; the others stay."""
+    """Return a ping-pong timeline that moves the strengths of these edits from 0 to 1, one after the other.
+
+    The other strengths are unchanged.
+    """
     step = min(max(1, round(fps * seconds / 2)), LONGEST // len(gdfs))
     still = tuple((layer.gdf, layer.strength) for layer in view.layers if layer.gdf not in gdfs)
     keys = tuple(
@@ -133,16 +145,17 @@ def slider_film(view: ViewState, gdfs: Sequence[int], fps: int, seconds: float) 
 
 
 def film_frames(timeline: Timeline) -> Iterator[int]:
-    """The frames of one round, in the order they are shown: there, and back again where it is a ping-pong."""
+    """Yield the frames of one loop in playback order, including the way back of a ping-pong."""
     yield from range(timeline.length + 1)
     if timeline.ping_pong:
         yield from range(timeline.length - 1, 0, -1)
 
 
 def state_at(timeline: Timeline, frame: float, view: ViewState, least: int = 1) -> ViewState:
-    """`view` with the camera and strengths of a frame; what fewer than `least` keys mention stays as it is.
+    """Return `view` with the camera and strengths of a frame.
 
-    Before the first key and after the last everything rests.
+    Rows with fewer than `least` keys are unchanged. Before the first key and after the last key values are
+    constant.
     """
     camera = camera_at(timeline, frame, least)
     strengths = strengths_at(timeline, frame, least)
@@ -157,13 +170,13 @@ def state_at(timeline: Timeline, frame: float, view: ViewState, least: int = 1) 
 
 
 def camera_at(timeline: Timeline, frame: float, least: int = 1) -> ViewCamera | None:
-    """The camera of a frame, or None where fewer than `least` keys have one."""
+    """Return the camera at a frame, or None if fewer than `least` keys have one."""
     keys = [(key.frame, key.easing, key.camera) for key in timeline.keys if key.camera is not None]
     return views.camera_between(keys, frame) if len(keys) >= least else None
 
 
 def strengths_at(timeline: Timeline, frame: float, least: int = 1) -> dict[int, float]:
-    """The strength of each edit that at least `least` keys mention, by `LayerState.gdf`."""
+    """Return the strengths at a frame of all edits with at least `least` keys, by `LayerState.gdf`."""
     return {
         g: views.value_between(points, frame)
         for g, points in tracks(timeline).items()
@@ -172,7 +185,7 @@ def strengths_at(timeline: Timeline, frame: float, least: int = 1) -> dict[int, 
 
 
 def tracks(timeline: Timeline) -> dict[int, list[views.Point]]:
-    """The keys of each edit's strength, by `LayerState.gdf`."""
+    """Return the strength keys of each edit, by `LayerState.gdf`."""
     found: dict[int, list[views.Point]] = {}
     for key in timeline.keys:
         for gdf, strength in key.strengths:
@@ -181,60 +194,70 @@ def tracks(timeline: Timeline) -> dict[int, list[views.Point]]:
 
 
 MIN_KEYS = 2
-"""What fewer keys mention does not move, and the playhead leaves it to the hand."""
+"""Smallest number of keys for the playhead to move a row. Rows with fewer keys are left to the user."""
 
 
 @dataclass(frozen=True)
 class Player:
-    """Where the playhead stands, and what is done to the keys."""
+    """State of the playhead, and the selected and copied keys."""
 
     frame: int = 0  # 0 to the timeline's length
-    playing: bool = False  # it goes on by itself
-    backwards: bool = False  # on the way back of a ping-pong
-    part: float = 0.0  # how much of this frame's time is over, 0..1
-    shown: bool = False  # whether the bar is on screen
-    unfolded: bool = False  # with a row for the camera and one for each layer
-    chosen: frozenset[RowKey] = frozenset()  # what is moved, copied and deleted
-    copied: tuple[tuple[int, Keyframe], ...] = ()  # rows and their keys, to be pasted
-    # a row that the hand changes gets a key at the playhead: the camera as it was last seen, None for off
+    playing: bool = False  # whether playback is running
+    backwards: bool = False  # whether a ping-pong is on its way back
+    part: float = 0.0  # elapsed share of the current frame's time, 0 to 1
+    shown: bool = False  # whether the timeline bar is visible
+    unfolded: bool = False  # whether the bar has a row for the camera and each layer
+    chosen: frozenset[RowKey] = frozenset()  # selected keys, to be moved, copied and deleted
+    copied: tuple[tuple[int, Keyframe], ...] = ()  # rows and keys on the clipboard
+    # last known camera while auto key is on (changed rows get a key at the playhead), None for off
     auto_key: ViewCamera | None = None
 
 
 def auto_key(view: ViewState, player: Player, before: Sequence[LayerState]) -> tuple[ViewState, Player]:
-    """The state with keys for what a hand has changed: strengths that were others in `before`, and the camera
-    where it has a key already, as one may only have looked around."""
+    """Add keys for the values that the user has changed, if auto key is on.
+
+    These are the strengths that differ from `before`, and the camera if it already has a key. A camera
+    without keys gets none, as the user may only have looked around.
+    """
     if player.auto_key is None or player.playing:
         return view, player
-    was = {layer.gdf: layer.strength for layer in before}
-    rows = [layer.gdf for layer in view.layers if layer.strength != was.get(layer.gdf, layer.strength)]
-    there = camera_at(view.timeline, player.frame)
-    if there is not None and view.camera not in (player.auto_key, replace(there, mode=view.camera.mode)):
+    old_strengths = {layer.gdf: layer.strength for layer in before}
+    rows = [
+        layer.gdf for layer in view.layers if layer.strength != old_strengths.get(layer.gdf, layer.strength)
+    ]
+    keyed_camera = camera_at(view.timeline, player.frame)
+    if keyed_camera is not None and view.camera not in (
+        player.auto_key,
+        replace(keyed_camera, mode=view.camera.mode),
+    ):
         rows.append(CAMERA)
-    made = with_key(view.timeline, player.frame, view, rows) if rows else view.timeline
-    return replace(view, timeline=made), replace(player, auto_key=view.camera)
+    keyed = with_key(view.timeline, player.frame, view, rows) if rows else view.timeline
+    return replace(view, timeline=keyed), replace(player, auto_key=view.camera)
 
 
 def advance(player: Player, timeline: Timeline, seconds: float) -> Player:
-    """The playhead after so much time of playing; a slow frame skips frames and keeps the pace."""
-    over = player.part + max(0.0, seconds) * timeline.fps
-    steps = int(over)
+    """Advance the playhead by `seconds` of playback. Slow drawing skips frames and keeps the speed."""
+    elapsed = player.part + max(0.0, seconds) * timeline.fps
+    steps = int(elapsed)
     frame, backwards = _step_frames(timeline, player.frame, player.backwards, steps)
-    return replace(player, frame=frame, backwards=backwards, part=over - steps)
+    return replace(player, frame=frame, backwards=backwards, part=elapsed - steps)
 
 
 def next_frame_delay(player: Player, timeline: Timeline) -> float | None:
-    """Seconds until the next frame of the film is due; None while nothing plays."""
+    """Return the seconds until the next frame is due, or None if playback is paused."""
     return (1.0 - player.part) / timeline.fps if player.playing else None
 
 
 def perform(view: ViewState, player: Player, action: str) -> tuple[ViewState, Player]:
-    """The state and the playhead after an action; a playhead that moved takes the picture along.
+    """Apply an action. If the playhead moves, the view takes the values of its new frame.
 
     Args:
-        action: a name of `ACTIONS`, with an argument after a colon where it has one
+        view: the state
+        player: the playhead
+        action: a name of `ACTIONS`, followed by a colon and its argument if it takes one
 
     Raises:
-        KeyError: there is no such action.
+        KeyError: the action is unknown.
     """
     name, _, argument = action.partition(":")
     timeline, after = ACTIONS[name](view, player, argument)
@@ -254,25 +277,25 @@ def _step_frames(timeline: Timeline, frame: int, backwards: bool, steps: int) ->
 
 
 def _key(view: ViewState, player: Player, row: str) -> tuple[Timeline, Player]:
-    """Of the row that is named, or of all."""
+    """Set a key at the playhead for the named row, or for all rows."""
     rows = [int(row)] if row else None
     return with_key(view.timeline, player.frame, view, rows), replace(player, shown=True)
 
 
 def _drop_key(view: ViewState, player: Player, row: str) -> tuple[Timeline, Player]:
-    """The chosen keys; else those at the playhead, or the one of the row that is named."""
+    """Delete the chosen keys, else the keys at the playhead. With a row, delete its key at the playhead."""
     here = [key for key in keys_at(view.timeline, player.frame) if row in ("", str(key[0]))]
     chosen = () if row else chosen_keys(view.timeline, player)
     return without_keys(view.timeline, chosen or here), replace(player, chosen=frozenset())
 
 
 def chosen_keys(timeline: Timeline, player: Player) -> frozenset[RowKey]:
-    """The chosen keys that there still are."""
+    """Return the chosen keys that still exist."""
     return player.chosen & split_keys(timeline).keys()
 
 
 def _choose_keys(view: ViewState, player: Player, names: str) -> tuple[Timeline, Player]:
-    """`ROW@FRAME,ROW@FRAME`; "" for none, with a plus sign before it beside the others, or not any more."""
+    """Select keys (`ROW@FRAME,ROW@FRAME`, "" for none). A leading plus sign toggles them."""
     pairs = [name.split("@") for name in names.removeprefix("+").split(",") if name]
     keys = frozenset((int(row), int(frame)) for row, frame in pairs)
     if names.startswith("+"):
@@ -281,7 +304,7 @@ def _choose_keys(view: ViewState, player: Player, names: str) -> tuple[Timeline,
 
 
 def _move_keys(view: ViewState, player: Player, by: str, copy: bool = False) -> tuple[Timeline, Player]:
-    """The chosen ones; the playhead goes with the key at it."""
+    """Move or copy the chosen keys. The playhead follows a chosen key at its frame."""
     chosen = chosen_keys(view.timeline, player)
     step = int(by)
     moved = shift_keys(view.timeline, chosen, step, copy)
@@ -299,7 +322,7 @@ def _copy_keys(view: ViewState, player: Player, _: str) -> tuple[Timeline, Playe
 
 
 def _paste_keys(view: ViewState, player: Player, _: str) -> tuple[Timeline, Player]:
-    """The first at the playhead, in place of what stands there; beyond the end the timeline grows."""
+    """Paste the copied keys, the first at the playhead, over existing ones. The timeline grows if needed."""
     by = player.frame - min((key.frame for _, key in player.copied), default=0)
     pasted = {(row, key.frame + by): replace(key, frame=key.frame + by) for row, key in player.copied}
     pasted = {at: key for at, key in pasted.items() if at[1] <= LONGEST}
@@ -308,29 +331,29 @@ def _paste_keys(view: ViewState, player: Player, _: str) -> tuple[Timeline, Play
 
 
 def _play(view: ViewState, player: Player, _: str) -> tuple[Timeline, Player]:
-    """Play or pause; with fewer than two keys nothing could move, so only the bar appears."""
+    """Play or pause. With fewer than two keys nothing can move, so only the bar appears."""
     playing = not player.playing and len(view.timeline.keys) > 1
     return view.timeline, replace(player, playing=playing, part=0.0, shown=True)
 
 
 def _seek(view: ViewState, player: Player, frame: str) -> tuple[Timeline, Player]:
-    return view.timeline, _at(player, int(frame))
+    return view.timeline, _seek_to(player, int(frame))
 
 
 def _step(view: ViewState, player: Player, by: str) -> tuple[Timeline, Player]:
-    return view.timeline, replace(_at(player, player.frame + int(by)), shown=True)
+    return view.timeline, replace(_seek_to(player, player.frame + int(by)), shown=True)
 
 
 def _jump(view: ViewState, player: Player, way: str) -> tuple[Timeline, Player]:
-    return view.timeline, _at(player, neighbor(view.timeline, player.frame, int(way)))
+    return view.timeline, _seek_to(player, neighbor(view.timeline, player.frame, int(way)))
 
 
-def _at(player: Player, frame: int) -> Player:
+def _seek_to(player: Player, frame: int) -> Player:
     return replace(player, frame=frame, playing=False, backwards=False, part=0.0)
 
 
 def _easing(view: ViewState, player: Player, name: str) -> tuple[Timeline, Player]:
-    """Of the chosen keys, else of those that decide at the playhead; the next one where none is named."""
+    """Set an easing (default: the next one) on the chosen keys, else on those that apply at the playhead."""
     if not view.timeline.keys:
         return view.timeline, player
     chosen = chosen_keys(view.timeline, player)
@@ -345,12 +368,12 @@ def _auto_key(view: ViewState, player: Player, _: str) -> tuple[Timeline, Player
 
 
 def _ping_pong(view: ViewState, player: Player, _: str) -> tuple[Timeline, Player]:
-    turned = replace(view.timeline, ping_pong=not view.timeline.ping_pong)
-    return turned, replace(player, backwards=False)
+    toggled = replace(view.timeline, ping_pong=not view.timeline.ping_pong)
+    return toggled, replace(player, backwards=False)
 
 
-def _bar(view: ViewState, player: Player, _: str) -> tuple[Timeline, Player]:
-    """Show or hide the bar; nothing plays out of sight."""
+def _toggle_bar(view: ViewState, player: Player, _: str) -> tuple[Timeline, Player]:
+    """Show or hide the timeline bar and stop playback."""
     return view.timeline, replace(player, shown=not player.shown, playing=False)
 
 
@@ -375,5 +398,5 @@ ACTIONS: dict[str, Callable[[ViewState, Player, str], tuple[Timeline, Player]]] 
     "ping_pong": _ping_pong,
     "length": lambda view, player, frames: (set_length(view.timeline, int(frames)), player),
     "fps": lambda view, player, fps: (with_fps(view.timeline, int(fps)), player),
-    "timeline": _bar,
+    "timeline": _toggle_bar,
 }

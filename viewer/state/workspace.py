@@ -30,30 +30,29 @@ from .snapshots import SliderSnapshot
 from .timeline import Player
 from .view_state import Comparison, ViewState
 
-# how long a line stays, and one with details to copy
-MESSAGE_S = 6.0
-ERROR_S = 15.0
-DETAILS_S = 120.0
-MIN_ZOOM = 0.5
+MESSAGE_S = 6.0  # time that a message stays visible, s
+ERROR_S = 15.0  # the same for an error or a message with a button, s
+DETAILS_S = 120.0  # the same for an error with details to copy, s
+MIN_ZOOM = 0.5  # range of the interface's zoom
 MAX_ZOOM = 3.0
-NARROWEST_PX = 280.0
+NARROWEST_PX = 280.0  # range of the panel's width, pixels at 1×
 WIDEST_PX = 520.0
 UNSAVED = "• "
-"""Before the scene's name where there are unsaved changes."""
+"""Prefix of the scene's name while there are unsaved changes."""
 PLACES = ("panel", "tools", "options", "view", "comparison", "timeline")
-"""Parts of the window through which the keyboard goes, in its order; not all are always shown."""
+"""Parts of the window in the order of keyboard focus. Some may be hidden."""
 
 
 class PreviewState(NamedTuple):
-    """What the form of a new edit says of its picture."""
+    """State of the preview in the form of a new edit."""
 
-    text: str = ""  # a word such as "drawing", or why there is none
-    failed: bool = False  # whether it is that
-    busy: bool = False  # a model paints
-    painted: bool = False  # a sentence's picture is there
-    models: tuple[str, ...] = ()  # that are on this machine
-    sheet: int = 0  # GL name of the paintings of this view, see `SHEET_PX`
-    styles: frozenset[int] = frozenset()  # which of them are there
+    text: str = ""  # progress such as "drawing", or the reason of a failure
+    failed: bool = False  # whether `text` is that reason
+    busy: bool = False  # whether a model is generating
+    painted: bool = False  # whether the picture of a prompt is available
+    models: tuple[str, ...] = ()  # models installed on this machine
+    sheet: int = 0  # GL name of the texture with the style previews of this view, see `SHEET_PX`
+    styles: frozenset[int] = frozenset()  # styles available in it
 
 
 def _no_facts() -> Any:
@@ -62,131 +61,131 @@ def _no_facts() -> Any:
 
 @dataclass(frozen=True)
 class SceneFacts:
-    """What does not change while a scene is open."""
+    """Facts about a scene that do not change while it is open."""
 
     title: str  # the scene's name
-    count: int  # Gaussians in the scene and of its edits: the rows that are drawn
-    bounds: Bounds  # of the bulk of the scene
+    count: int  # number of drawn rows: Gaussians of the scene and of its edits
+    bounds: Bounds  # bounds of the bulk of the scene
     rows: Sequence[LayerRow]  # one per .gdf, indexed by `LayerState.gdf`
-    added: int = 0  # of these, how many edits have added
-    origin: Origin = ZERO  # where in the world the scene and its cameras begin, see `Gaussians.origin`
-    fit: Fit = keep_camera  # gives the camera that `frame` takes with nothing selected and no layer focused
-    # the same for what is selected
+    added: int = 0  # number of these that edits added
+    origin: Origin = ZERO  # world position of the scene's coordinate origin, see `Gaussians.origin`
+    fit: Fit = keep_camera  # camera of `frame` without a selection or focused layer
+    # camera of `frame` for a selection
     fit_members: Callable[[ViewCamera, float, Mask], ViewCamera] = lambda camera, *_: camera
-    home: Fit = keep_camera  # gives the first camera for another up axis, which is the given camera's
-    # of the scene's Gaussians, made when it is first asked for; and what strokes spread over
+    home: Fit = keep_camera  # first camera for the up axis of the given camera
+    # both are computed on first use; scribble strokes spread over `scribbles`
     neighborhood: Callable[[], Neighborhood] = _no_facts
     scribbles: Callable[[], Scribbles] = _no_facts
 
 
 @dataclass(frozen=True)
 class Message:
-    """One line for the person, shown until this time of the window's clock in seconds."""
+    """One-line message to the user, visible until a time of the window's clock, in seconds."""
 
     text: str
     until: float
     error: bool = False
-    details: str = ""  # of a mistake of ours, to be copied into a report
-    button: tuple[str, str] = ("", "")  # what can be done now: its name and its action
+    details: str = ""  # details of an internal error, to be copied into a report
+    button: tuple[str, str] = ("", "")  # label and action of its button
 
 
 @dataclass(frozen=True)
 class Dialog:
-    """A question that is being asked."""
+    """Open dialog."""
 
-    kind: str  # of `dialogs.TITLES`
-    text: str = ""  # what stands in the path field; where there is none, the file that the question is about
-    then: str = ""  # the request that was put off for this, "" for none; for "replace" the layer's index
-    notice: str = ""  # a line about the desktop's own dialog, "" for none
-    choosing: bool = False  # that dialog is on screen
-    chosen: str = ""  # the file that was chosen in it
-    error: str = ""  # why the path did not serve, one line, "" where it was not tried
-    options: DeliverOptions | None = None  # of a picture or film that is asked for
+    kind: str  # key of `dialogs.TITLES`
+    text: str = ""  # content of the path field; in a dialog without one, the file concerned
+    then: str = ""  # request to continue with afterwards, "" for none; for "replace" the layer's index
+    notice: str = ""  # one line about the desktop's file dialog, "" for none
+    choosing: bool = False  # whether the desktop's file dialog is open
+    chosen: str = ""  # file chosen in it
+    error: str = ""  # one line on why the path was rejected, "" if it was not tried
+    options: DeliverOptions | None = None  # options of the requested picture or film
 
 
 Pointed = tuple[str, int]
-"""What the mouse rests on in the panel: "layer" or "region" and which of them, or ("selection", 0)."""
+"""Panel item under the mouse: "layer" or "region" and its index, or ("selection", 0)."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """How the window is laid out, remembered from one day to the next."""
+    """Layout of the window, saved between sessions."""
 
-    zoom: Annotated[float, Meta(ge=MIN_ZOOM, le=MAX_ZOOM)] = 1.0  # of the interface
-    panel_px: Annotated[float, Meta(ge=NARROWEST_PX, le=WIDEST_PX)] = 300.0  # at 1×: the panel's width
-    folded: tuple[str, ...] = ()  # sections of the panel
-    reduced_motion: bool = False  # the camera jumps where it would glide
+    zoom: Annotated[float, Meta(ge=MIN_ZOOM, le=MAX_ZOOM)] = 1.0  # scale of the interface
+    panel_px: Annotated[float, Meta(ge=NARROWEST_PX, le=WIDEST_PX)] = 300.0  # panel width, pixels at 1×
+    folded: tuple[str, ...] = ()  # folded sections of the panel
+    reduced_motion: bool = False  # the camera jumps instead of gliding
 
     def with_panel(self, wide: float) -> Layout:
-        """With the panel so wide, as far as it may be."""
+        """Return the layout with this panel width, in pixels at 1×, clamped and rounded."""
         return replace(self, panel_px=min(max(float(round(wide)), NARROWEST_PX), WIDEST_PX))
 
 
 @dataclass(frozen=True)
 class Workspace:
-    """The state on screen, how it came about, and what is focused."""
+    """State of the window: the view, its history, focus, dialogs, jobs and layout."""
 
-    view: ViewState  # what decides the picture
+    view: ViewState
     past: History  # undo and redo
     home: ViewCamera  # the first camera
-    focus: int | None = None  # the focused layer, an index into `view.layers`, or None
-    # `LayerState.gdf` of the layers that are selected with it, empty where it is alone
+    focus: int | None = None  # index of the focused layer in `view.layers`
+    # `LayerState.gdf` of the selected layers, empty if only the focused layer is selected
     selected: frozenset[int] = frozenset()
-    search: str = ""  # what the panel's layers are filtered by, "" for all
-    searching: bool = False  # its field was asked for and has no keyboard yet
-    cards_fit: bool = True  # whether the panel has room for a whole card of each layer
-    active_slider: str = "strength"  # which of `layers.SLIDERS` of the focused layer the arrow keys move
-    renaming: int | None = None  # the layer whose name is being typed, or None
-    help: bool = False  # whether the list of keys is shown
-    keyboard: str = ""  # of `PLACES`: the part of the window that has the keyboard, "" for the picture
-    keyboard_by: int = 1  # which way it went there
-    palette: int | None = None  # the line of the list of commands that Enter takes, −1 as it opens; or None
-    query: str = ""  # what is sought in that list
-    history: bool | None = None  # whether the list of the history is open; True as it opens, then False
-    message: Message | None = None  # the line at the bottom, or None
-    snapshots: tuple[SliderSnapshot, ...] = ()  # kept states, without the original
-    # what a session file holds of this; None where there is none
+    search: str = ""  # filter of the panel's layers, "" for all
+    searching: bool = False  # the search field opens and has no keyboard focus yet
+    cards_fit: bool = True  # whether the panel has room for full cards
+    active_slider: str = "strength"  # slider that the arrow keys move, one of `layers.SLIDERS`
+    renaming: int | None = None  # index of the layer being renamed
+    help: bool = False  # whether the key list is open
+    keyboard: str = ""  # part of the window with keyboard focus, one of `PLACES`, "" for the picture
+    keyboard_by: int = 1  # direction of the last focus change, 1 or −1
+    palette: int | None = None  # active line of the command palette, −1 as it opens
+    query: str = ""  # search text of the palette
+    history: bool | None = None  # state of the history list: True as it opens, then False, None if closed
+    message: Message | None = None  # line at the bottom of the picture
+    snapshots: tuple[SliderSnapshot, ...] = ()  # without the original
+    # last saved state, see `worth_saving`; None before the first
     saved: tuple[Edit, tuple[SliderSnapshot, ...]] | None = None
-    dialog: Dialog | None = None  # the question being asked, or None
-    requests: tuple[str, ...] = ()  # what only the window can do, and has still to
+    dialog: Dialog | None = None  # the open dialog
+    requests: tuple[str, ...] = ()  # pending work that only the window can do
     player: Player = Player()  # the playhead of `view.timeline`
-    pointed: Pointed | None = None  # what the mouse rests on in the panel, to be seen in the picture
-    form: NewEdit = NewEdit()  # of a new edit, as it was last left
-    form_open: bool = False  # whether it is shown
-    form_opening: bool = False  # it was opened and has no keyboard yet
-    # what is being trained, exported and rendered, or waits for that, as the window last looked
+    pointed: Pointed | None = None  # panel item under the mouse, highlighted in the picture
+    form: NewEdit = NewEdit()  # form of a new edit, as last left
+    form_open: bool = False  # whether the form is open
+    form_opening: bool = False  # the form opens and has no keyboard focus yet
+    # running and waiting training, export and render jobs, as of the last poll
     jobs: tuple[QueuedTask, ...] = ()
-    before: bool = False  # the original is shown, until its key is pressed again or a slider moves
-    glide: Glide | None = None  # the camera on its way to a view that was asked for, or None
-    layout: Layout = Layout()  # of the window
-    session: str = ""  # the name of its file, "" before it has one
+    before: bool = False  # show the original until its key is pressed again or a slider moves
+    glide: Glide | None = None  # running animation of the camera
+    layout: Layout = Layout()
+    session: str = ""  # name of the session file, "" before there is one
 
 
 def new_workspace(view: ViewState, snapshots: tuple[SliderSnapshot, ...] = ()) -> Workspace:
-    """A workspace on a fresh state; the top layer is focused."""
+    """Return a workspace for a new view, with the top layer focused and nothing unsaved."""
     past = history.begin(view, snapshots)
     focus = len(view.layers) - 1 if view.layers else None
     return mark_saved(Workspace(view, past, view.camera, focus, snapshots=snapshots))
 
 
 def worth_saving(workspace: Workspace) -> tuple[Edit, tuple[SliderSnapshot, ...]]:
-    """What it would be a pity to lose; where one looked from, and what is selected, is not."""
+    """Return the saved part of the workspace: edits, regions and snapshots, without camera and selection."""
     edit = history.edit_of(workspace.view)
     return replace(edit, selection=SelectionState(regions=edit.selection.regions)), workspace.snapshots
 
 
 def mark_saved(workspace: Workspace) -> Workspace:
-    """The same, with nothing unsaved."""
+    """Mark the current state as saved."""
     return replace(workspace, saved=worth_saving(workspace))
 
 
 def has_unsaved(workspace: Workspace) -> bool:
-    """Whether closing now would lose something."""
+    """Return whether closing would lose unsaved work."""
     return workspace.saved != worth_saving(workspace)
 
 
 def original(view: ViewState) -> ViewState:
-    """The same view without any edit."""
+    """Return the view without any edit or comparison."""
     layers = tuple(replace(layer, enabled=False, solo=False) for layer in view.layers)
     return replace(view, layers=layers, compare=Comparison())
 
@@ -200,14 +199,27 @@ def with_message(
     seconds: float = MESSAGE_S,
     button: tuple[str, str] = ("", ""),
 ) -> Workspace:
-    """With one line at the bottom of the picture for a while; `now`: seconds of the window's clock."""
+    """Show a one-line message at the bottom of the picture.
+
+    Args:
+        workspace: the workspace
+        text: the message, put on one line and escaped
+        now: current time of the window's clock, s
+        error: mark it as an error
+        details: details to copy into a report
+        seconds: time that it stays visible, unless it is an error or has details or a button
+        button: label and action of its button
+    """
     until = now + (DETAILS_S if details else ERROR_S if error or button[0] else seconds)
     text = escape_text(" ".join(text.split()))
     return replace(workspace, message=Message(text, until, error, details, button))
 
 
 def record_undo(workspace: Workspace) -> Workspace:
-    """Call when no gesture is under way: what it changed becomes one undo entry, with its keys."""
+    """Record a finished gesture as one undo entry, with its auto keys.
+
+    Call it when no gesture is in progress.
+    """
     if workspace.glide is None:
         layers = workspace.past.present.edit.layers
         view, player = timeline.auto_key(workspace.view, workspace.player, layers)
@@ -218,12 +230,12 @@ def record_undo(workspace: Workspace) -> Workspace:
 
 
 def cancel_drag(workspace: Workspace) -> Workspace:
-    """As it was before the gesture under way."""
+    """Restore the state before the gesture in progress."""
     return replace(workspace, view=history.apply_present(workspace.view, workspace.past))
 
 
 def advance(workspace: Workspace, seconds: float) -> Workspace:
-    """After so much time; the film goes on where it is playing, and the camera where it is on its way."""
+    """Advance playback and the camera's glide by `seconds`."""
     if workspace.glide is not None:
         glide = glide_on(workspace.glide, workspace.view.camera, seconds)
         workspace = replace(workspace, glide=glide)
@@ -242,7 +254,7 @@ def advance(workspace: Workspace, seconds: float) -> Workspace:
 
 
 def loses_strengths(workspace: Workspace, after: ViewState) -> bool:
-    """Whether a playhead that leaves its frame takes strengths away that nobody set a key for."""
+    """Return whether moving the playhead to `after` discards strengths that are not stored in keys."""
     before = workspace.view
     frame = workspace.player.frame
     if after.layers == before.layers or history.edit_of(before) != workspace.past.present.edit:
@@ -251,41 +263,41 @@ def loses_strengths(workspace: Workspace, after: ViewState) -> bool:
 
 
 def with_camera(workspace: Workspace, camera: ViewCamera) -> Workspace:
-    """Looking from elsewhere; never an undo entry."""
+    """Set the camera, without an undo entry."""
     view = replace(workspace.view, camera=camera)
     return replace(workspace, view=view, past=history.follow_look(workspace.past, workspace.view, view))
 
 
 def glide_from(workspace: Workspace, start: ViewCamera) -> Workspace:
-    """From where one looked on to where the camera is now, in place of a jump."""
+    """Glide from the camera `start` to the current camera instead of jumping."""
     end = workspace.view.camera
     return replace(with_camera(workspace, start), glide=Glide(start, end)) if end != start else workspace
 
 
 def focus_layer(workspace: Workspace, index: int) -> Workspace:
-    """With another layer focused, and it alone selected; as it was where there is no such layer."""
+    """Focus a layer and select it alone. An invalid index changes nothing."""
     exists = 0 <= index < len(workspace.view.layers)
     return replace(workspace, focus=index, selected=frozenset()) if exists else workspace
 
 
 def is_compact(workspace: Workspace) -> bool:
-    """Whether the panel shows layers as rows of one line: where the person says so, or cards do not fit."""
+    """Return whether the panel shows compact layer rows, by the user's choice or because cards do not fit."""
     view = workspace.view
     return view.cards == "compact" or (view.cards == "auto" and not workspace.cards_fit)
 
 
 def change_focused(workspace: Workspace, change: Callable[[ViewState, int], ViewState]) -> Workspace:
-    """With the focused layer changed, if one is; `change` gets its index."""
+    """Apply `change` to the focused layer, if there is one; it receives the view and the layer's index."""
     if workspace.focus is None:
         return workspace
     return replace(workspace, view=change(workspace.view, workspace.focus))
 
 
 def with_layers_of(workspace: Workspace, view: ViewState) -> Workspace:
-    """Another state; the focus stays on its layer, wherever that has gone."""
+    """Replace the view and keep the focus on the same layer at its new position."""
     focus = workspace.focus
     before = workspace.view.layers
     if focus is not None and focus < len(before):
-        places = [i for i, layer in enumerate(view.layers) if layer.gdf == before[focus].gdf]
-        focus = focus if focus in places else next(iter(places), None)
+        positions = [i for i, layer in enumerate(view.layers) if layer.gdf == before[focus].gdf]
+        focus = focus if focus in positions else next(iter(positions), None)
     return replace(workspace, view=view, focus=focus)
