@@ -37,7 +37,10 @@ Resolved = tuple[OptimizeOptions, FieldOptions | None, tuple[tuple[str, object],
 
 _T = TypeVar("_T")
 
-_AFTERWARDS = ("optimize.slider", "trainer.fit.fit._PAYS")  # the optimization knows nothing of these
+_AFTERWARDS = (
+    "optimize.slider",
+    "trainer.fit.fit._MIN_ATTRIBUTE_GAIN_DB",
+)  # the optimization knows nothing of these
 
 
 @dataclass(frozen=True)
@@ -154,7 +157,9 @@ VARIANTS = (
     _other("no-sh", "view-dependent color left as it is", "sh", "off"),
     _other("with-sh", "view-dependent color trained in any case", "sh", "on"),
     Variant("plain-clamps", "clamps pass no gradient that leads back", patches=_PLAIN_CLAMPS),
-    _patched("no-pruning", "attributes kept that do not pay", "trainer.fit.fit._PAYS", -math.inf),
+    _patched(
+        "no-pruning", "attributes kept that do not pay", "trainer.fit.fit._MIN_ATTRIBUTE_GAIN_DB", -math.inf
+    ),
     _other("no-groups", "parts are not moved as wholes first", "group_steps", 0),
     _other(DESCENT, "view by view, where colors are solved for", "color_solver", False),
     _other("descent-one-target", "no stages", "stages", 1, DESCENT),

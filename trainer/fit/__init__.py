@@ -1,1 +1,1 @@
-"""From a recorded trajectory to the field that is shipped."""
+"""Fitting of the shipped field to a recorded trajectory."""

@@ -1,8 +1,8 @@
-"""A grade alone, before anything is trained: what one map of color makes of an edit, in a second.
+"""Draft of a color edit: a single color map, fitted in a second before training starts.
 
-An editor that gives every color another one, wherever it is, is nearly a map of color itself. So a few views
-and some thousand of their pixels are all that a slider needs until the training has found what single
-Gaussians need beside it. Whether the map carries the edit is measured on views that it was not fitted to.
+An editor that maps every color to another one, independent of position, is nearly a color map itself. A small
+number of views and some thousand of their pixels are then enough for a slider, until training has found the
+residuals of single Gaussians. Views that the map was not fitted to decide if it represents the edit.
 """
 
 from __future__ import annotations
@@ -29,53 +29,57 @@ from trainer.views.view import BACKGROUND, Glance, View, render_view
 from .slider_uniformity import equalized_strengths
 
 CARRIED = 0.1
-"""Of what an edit changes, mean square: a grade that leaves more does not carry it."""
+"""Largest share of an edit's squared change that a grade may leave unexplained."""
 
-_FITTED = 1500  # pixels that represent those of all views
-_JUDGED = 500  # a map has 60 numbers at most
+_FIT_PIXELS = 1500  # sampled from the fitting views
+_TEST_PIXELS = 500  # sampled from the test views; a map has at most 60 values
 
 
 @dataclass(frozen=True)
 class _Pixels:
-    """Pixels of some views."""
+    """Sampled pixels of some views."""
 
-    row: View  # as one row of a picture, which an editor edits as any
-    maps: MapFit  # what a map makes of that
+    row: View  # the pixels as one row of a picture, for the editor
+    maps: MapFit  # fits color maps to the pixels
     views: Sequence[ColorView]
-    places: Sequence[Tensor]  # which pixels of each view these are. [p] int64
-    seen: Tensor  # which of the region's members show in any of them. [m] int64
+    places: Sequence[Tensor]  # indices of the pixels in each view. [p] int64
+    seen: Tensor  # indices of the region's members that are visible in any view. [m] int64
 
 
 @dataclass(frozen=True)
 class DraftViews:
-    """What grades of a region are fitted to and judged by, whatever the color."""
+    """Pixels of a region for fitting and testing grades, independent of the edit's color."""
 
     scene: Gaussians
     region: Region
     glances: Sequence[Glance]
     fitted: _Pixels
-    judged: _Pixels  # of views that nothing is fitted to
+    judged: _Pixels  # from test views, to which nothing is fitted
 
 
 def draft_views(options: TrainingViewOptions, scene: Gaussians, region: Region) -> DraftViews | None:
-    """The region at a glance; None where fewer than two show it, or the scene is one to stand inside.
+    """Sample small views of the region; None if fewer than two show it.
+
+    A scene that surrounds the viewer and has no cameras gives None too.
 
     Args:
         options: see `TrainingViewOptions`
         scene: the original
-        region: what is edited
+        region: the edited region
     """
     glances = take_glances(options, scene, region)
-    looked = [_look(scene, region, one) for one in glances]
-    parts = [[look for i, look in enumerate(looked) if (i % 3 == 1) is aside] for aside in (False, True)]
-    samples = [_sample(part, most) for part, most in zip(parts, (_FITTED, _JUDGED), strict=True) if part]
+    views = [_glance_view(scene, region, glance) for glance in glances]
+    parts = [[view for i, view in enumerate(views) if (i % 3 == 1) is is_test] for is_test in (False, True)]
+    samples = [
+        _sample(part, count) for part, count in zip(parts, (_FIT_PIXELS, _TEST_PIXELS), strict=True) if part
+    ]
     if len(samples) < 2 or not all(len(sample.maps.design) for sample in samples):
         return None
     return DraftViews(scene, region, glances, *samples)
 
 
-def _look(scene: Gaussians, region: Region, glance: Glance) -> tuple[View, ColorView]:
-    """A glance as views of one row."""
+def _glance_view(scene: Gaussians, region: Region, glance: Glance) -> tuple[View, ColorView]:
+    """Return a glance as views of one pixel row."""
     background = torch.tensor(BACKGROUND)
     drawn = glance.map.picture(glance.colors.clamp_min(0.0))
     others = (1.0 - glance.mask[:, None]) * background
@@ -85,12 +89,12 @@ def _look(scene: Gaussians, region: Region, glance: Glance) -> tuple[View, Color
     count = len(drawn)
     view = View(glance.camera, image[None], glance.mask[None], glance.inside[None], (0, 0, count, 1))
     row = torch.arange(count)
-    counts = torch.ones_like(image[:, :1], dtype=torch.bool)
-    return view, ColorView(glance.map, others, glance.basis, glance.colors, (1, count), row, counts)
+    evaluated = torch.ones_like(image[:, :1], dtype=torch.bool)
+    return view, ColorView(glance.map, others, glance.basis, glance.colors, (1, count), row, evaluated)
 
 
 def _sample(looked: Sequence[tuple[View, ColorView]], most: int) -> _Pixels:
-    """Evenly spread pixels of views."""
+    """Sample about `most` evenly spread pixels of views."""
     views = [view for _, view in looked]
     maps = fit_maps(views, torch.ones(len(views[0].original)), most)
 
@@ -105,20 +109,22 @@ def _sample(looked: Sequence[tuple[View, ColorView]], most: int) -> _Pixels:
 
 
 def _error(picture: Tensor, expected: Tensor) -> float:
-    """Mean squared difference. [P,3], [1,P,3]"""
+    """Return the mean squared difference plus that of 8-bit rounding. [P,3], [1,P,3]"""
     return ROUNDING + float((picture - expected[0]).square().mean())
 
 
 def draft_grade(views: DraftViews, options: EditorOptions, name: str) -> Gdf | None:
-    """The grade that comes nearest to an edit at strengths that are evenly visible, its field not baked; None
-    where it leaves more than `CARRIED` of it, unless it is a grade by hand, or the editor is no function of
-    color.
+    """Fit the closest grade to an edit, at strengths with even visible change; its field is not baked.
 
-    `draft` in its report has the map's degree, and its dB at strength 1 to the editor's own pictures of the
-    views that it was not fitted to.
+    `draft` in its report has the map's degree and its PSNR at strength 1 against the editor's pictures of the
+    test views, dB.
+
+    Returns:
+        The grade; None if the editor is no function of color, or if the grade leaves more than `CARRIED` of
+        the edit. A manual grade is always returned.
 
     Raises:
-        ProgdfError: there is no such editor.
+        ProgdfError: the editor does not exist.
     """
     if options.family not in COLOR_FUNCTIONS:
         return None
@@ -133,8 +139,8 @@ def draft_grade(views: DraftViews, options: EditorOptions, name: str) -> Gdf | N
     errors = {degree: _error(judged.maps.picture(end), expected) for degree, end in ends.items()}
     degree = min(d for d in errors if MORE_PAYS * errors[d] <= min(errors.values()))
     error = _drawn_error(views, ends[degree], degree, expected)
-    carried = CARRIED * _error(judged.row.image[0], expected) + ROUNDING
-    if error > carried and options.family != "grade":  # by hand one judges what one sees
+    max_error = CARRIED * _error(judged.row.image[0], expected) + ROUNDING
+    if error > max_error and options.family != "grade":  # a manual grade is checked by eye
         return None
     maps = [fitted.maps.solve(degree, [target]) for target in targets]
     knots = torch.tensor((0.0, *plain))
@@ -142,12 +148,12 @@ def draft_grade(views: DraftViews, options: EditorOptions, name: str) -> Gdf | N
     form = map_form(knots, degree, table, len(views.region))
     channels = BASE_CHANNELS + 3 * views.scene.shN.shape[1]
     field = BakedField("grade", torch.tensor([0.0, 1.0]), {}, channels, tuple(knots.tolist()), form)
-    about = {"draft": {"degree": degree, "psnr": round(decibels(error), 2)}}
-    return Gdf(name, views.region, field, fingerprint(views.scene), options.editor, report=about)
+    report = {"draft": {"degree": degree, "psnr": round(decibels(error), 2)}}
+    return Gdf(name, views.region, field, fingerprint(views.scene), options.editor, report=report)
 
 
 def _drawn_error(views: DraftViews, table: Tensor, degree: int, expected: Tensor) -> float:
-    """What is left where the map is held as the members' own spherical harmonics, as a scene has it."""
+    """Return the error of the map stored in the members' spherical harmonics, as in a scene."""
     judged = views.judged
     seen = views.judged.seen
     scene = views.scene[views.region.members[seen]]
@@ -155,5 +161,5 @@ def _drawn_error(views: DraftViews, table: Tensor, degree: int, expected: Tensor
     offsets = sh.new_zeros(len(views.region), *sh.shape[1:])
     offsets[seen] = map_colors(sh, table, degree) - sh
     pictures = [view.picture(view.colors(offsets)).clamp(0.0, 1.0) for view in judged.views]
-    shown = [picture[places] for picture, places in zip(pictures, judged.places, strict=True)]
-    return _error(torch.cat(shown), expected)
+    sampled = [picture[places] for picture, places in zip(pictures, judged.places, strict=True)]
+    return _error(torch.cat(sampled), expected)

@@ -1,7 +1,7 @@
-"""What is measured of an edit, on views that training has not seen and on the region's own pixels.
+"""Evaluation of an edit on held-out views, over the region's own pixels.
 
-A whole picture of which the region is 3 % would flatter every figure; so errors are taken over the pixels
-that show the region or that the edit changes (docs/method.md 7).
+In a whole picture of which the region is 3 %, every figure would look too good. Errors are therefore measured
+over the pixels that show the region or that the edit changes (docs/method.md 7).
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from trainer.views.view import View, crop
 
 @dataclass(frozen=True)
 class Evaluator:
-    """Held-out views, ready to be compared."""
+    """Held-out views prepared for comparison."""
 
     original: Tensor  # raw member rows, packed. [M,C]
-    crops: Sequence[CropScene]  # the views' boxes with the scene around the region
-    pixels: Sequence[Tensor]  # which pixels count. [h,w] bool each
+    crops: Sequence[CropScene]  # boxes of the views, with the scene around the region
+    pixels: Sequence[Tensor]  # masks of the evaluated pixels. [h,w] bool each
     edited: Mapping[float, Sequence[Tensor]]  # strength → the editor's pictures of the boxes
-    names: Sequence[str]  # the views' names
-    looked: Callable[[], None] | None = None  # called at every look at all views, for a progress bar
+    names: Sequence[str]  # names of the views
+    looked: Callable[[], None] | None = None  # called at every render of all views, for a progress bar
 
     def pictures(self, offsets: Tensor) -> list[Tensor]:
-        """Every view with these offsets. [M,C] -> [h,w,3] each"""
-        if not len(offsets):  # a field that moves nothing does not know how many members it has
+        """Render every view with these offsets. [M,C] -> [h,w,3] each"""
+        if not len(offsets):  # a field that moves nothing stores no number of members
             offsets = torch.zeros_like(self.original)
         if self.looked is not None:
             self.looked()
@@ -44,19 +44,19 @@ class Evaluator:
         return render_all(self.crops, rows, moving_attributes(offsets))
 
     def course(self, field: BakedField) -> Pictures:
-        """Every view at a slider value of a field."""
+        """Return a function that renders every view at a slider value of a field."""
         return lambda s: self.pictures(field.offsets(s))
 
     def picture(self, offsets: Tensor, view: int) -> Tensor:
-        """One view with these offsets. [M,C] -> [h,w,3]"""
+        """Render one view with these offsets. [M,C] -> [h,w,3]"""
         return replace(self, crops=[self.crops[view]]).pictures(offsets)[0]
 
     def psnr(self, pictures: Sequence[Tensor], expected: Sequence[Tensor]) -> float:
-        """PSNR over the pixels that count, all views together, dB; 99 where nothing differs."""
+        """Return the PSNR over the evaluated pixels of all views, dB; 99 if nothing differs."""
         return decibels(self.mse(pictures, expected))
 
     def mse(self, pictures: Sequence[Tensor], expected: Sequence[Tensor]) -> float:
-        """Mean squared error over the pixels that count, all views together."""
+        """Return the mean squared error over the evaluated pixels of all views."""
         error = count = 0.0
         for a, b, pixels in zip(pictures, expected, self.pixels, strict=True):
             error += float((a[pixels] - b[pixels]).double().square().sum())
@@ -64,7 +64,7 @@ class Evaluator:
         return error / max(count, 1)
 
     def ssim(self, pictures: Sequence[Tensor], expected: Sequence[Tensor]) -> float:
-        """SSIM over the pixels that count, all views together, at most 1."""
+        """Return the SSIM over the evaluated pixels of all views, at most 1."""
         total = count = 0.0
         for a, b, pixels in zip(pictures, expected, self.pixels, strict=True):
             if here := int(pixels.sum()):
@@ -79,19 +79,22 @@ class Evaluator:
         measure: Perceptual,
         key: Hashable = None,
     ) -> float:
-        """Mean perceptual distance of the boxes. `key`: of the expected pictures, see `Perceptual`"""
+        """Return the mean perceptual distance of the boxes.
+
+        `key`: cache key of the expected pictures, see `Perceptual`
+        """
         keys = [None if key is None else (key, i) for i in range(len(expected))]
         with torch.no_grad():
             values = [float(measure(a, b, k)) for a, b, k in zip(pictures, expected, keys, strict=True)]
         return sum(values) / max(1, len(values))
 
     def halves(self) -> tuple[Evaluator, Evaluator]:
-        """The views that fields are chosen on, and those that their errors are reported on."""
+        """Split the views into those that fields are chosen on and those that errors are reported on."""
         choosing, reporting = (self.only(views) for views in split_held_out(range(len(self.crops))))
         return choosing, reporting
 
     def only(self, views: Sequence[int]) -> Evaluator:
-        """Some of the views."""
+        """Return an evaluator of the views with these indices."""
         return replace(
             self,
             crops=[self.crops[i] for i in views],
@@ -101,11 +104,11 @@ class Evaluator:
         )
 
     def counted_pixels(self, offsets: Tensor) -> Tensor:
-        """The pixels that count, of all views, with these offsets. [M,C] -> [P,3]"""
+        """Render the evaluated pixels of all views with these offsets. [M,C] -> [P,3]"""
         return self.count(self.pictures(offsets))
 
     def count(self, pictures: Sequence[Tensor]) -> Tensor:
-        """The pixels that count of pictures of all views. [h,w,3] each -> [P,3]"""
+        """Gather the evaluated pixels from pictures of all views. [h,w,3] each -> [P,3]"""
         return torch.cat([picture[pixels] for picture, pixels in zip(pictures, self.pixels, strict=True)])
 
 
@@ -122,22 +125,22 @@ def make_evaluator(
 
     Args:
         scene: the original
-        region: what is edited
+        region: the edited region
         views: held-out views
         edited: strength → the editor's whole pictures of these views. [H,W,3]
         background: rgb. [3]
         channels: width of a packed row
-        still: nothing but colors will move, see `crop_scene`
+        still: only colors will move, see `crop_scene`
     """
     if edited:
         views = [v.widen([pictures[i] for pictures in edited.values()]) for i, v in enumerate(views)]
     crops = [crop_scene(scene, region.members, v.camera, v.box, background, still) for v in views]
     pixels = []
     for i, view in enumerate(views):
-        counts = view.mask > 0.05
+        evaluated = view.mask > 0.05
         for pictures in edited.values():
-            counts = counts | ((pictures[i] - view.image).abs().amax(dim=2) > 2 / 255)
-        pixels.append(crop(counts, view.box))
+            evaluated = evaluated | ((pictures[i] - view.image).abs().amax(dim=2) > 2 / 255)
+        pixels.append(crop(evaluated, view.box))
     boxes = {s: [crop(p, v.box) for p, v in zip(ps, views, strict=True)] for s, ps in edited.items()}
     original = pack(scene[region.members], with_shN=channels > 14)
     return Evaluator(original, crops, pixels, boxes, [view.camera.name for view in views])

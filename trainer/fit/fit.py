@@ -1,4 +1,4 @@
-"""From a recorded trajectory to the field that is shipped, its errors beside those of honest baselines."""
+"""Fit the shipped field to a recorded trajectory, and measure its errors beside those of baselines."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ from trainer.views.view import View
 from .evaluate import Evaluator, make_evaluator
 
 THINNED = 0.025
-"""Of what a field may add, what is left to functions that single members do not have, see `thin_model`."""
+"""Part of `ADDED` that is reserved for leaving out functions of single members, see `thin_model`."""
 
-_VIEWS = 3
-_BETTER = 0.5  # dB by which the own way has to be nearer: it takes several times the bytes
-_HALFWAY = (0.3, 0.4, 0.5, 0.6, 0.7)  # a way is judged where it comes nearest to the half
+_PATH_VIEWS = 3  # views on which a path is chosen
+_PATH_GAIN_DB = 0.5  # a curved path must be better by this: it takes several times the bytes
+_HALF_STRENGTHS = (0.3, 0.4, 0.5, 0.6, 0.7)  # a path is compared at the best of these
 
 
 def choose_path(
@@ -54,14 +54,14 @@ def choose_path(
     in_parts: bool,
     retimed: Callable[[Trajectory], Trajectory],
 ) -> tuple[Trajectory, str]:
-    """The trajectory or its straight line, and why, in words.
+    """Choose the trajectory or its straight line; return it with the reason in words.
 
     Args:
-        trajectory: of one target, as recorded
-        setup: scene, region, and the held-out views, of which those that fields are chosen on judge
-        editor: what made the edited views; None where it pictures no half
-        in_parts: connected parts were moved as wholes
-        retimed: lays the slider over a trajectory; done only where its own way may be kept
+        trajectory: the recorded trajectory of one target
+        setup: scene, region, and held-out views; the views that fields are chosen on decide
+        editor: the editor of the views; None if it makes no picture of strength 0.5
+        in_parts: connected parts were moved rigidly
+        retimed: retimes the slider of a trajectory; called only if the recorded path may be kept
     """
     if in_parts:
         return retimed(trajectory), "as the parts move"
@@ -69,34 +69,41 @@ def choose_path(
     if editor is None or editor.stages:
         return line, "straight: the editor pictures the end alone"
     trajectory = retimed(trajectory)
-    views = split_held_out(setup.judging)[0][:_VIEWS]
-    halves = {0.5: [editor.edit(view, 0.5) for view in views]}
+    views = split_held_out(setup.judging)[0][:_PATH_VIEWS]
+    half_pictures = {0.5: [editor.edit(view, 0.5) for view in views]}
     evaluator = make_evaluator(
-        setup.scene, setup.region, views, halves, setup.background, trajectory.end.shape[1]
+        setup.scene, setup.region, views, half_pictures, setup.background, trajectory.end.shape[1]
     )
 
     def nearest(way: Trajectory) -> float:
-        return max(evaluator.psnr(evaluator.pictures(way.at(s)), evaluator.edited[0.5]) for s in _HALFWAY)
+        return max(
+            evaluator.psnr(evaluator.pictures(way.at(s)), evaluator.edited[0.5]) for s in _HALF_STRENGTHS
+        )
 
-    ours = nearest(trajectory)
-    direct = nearest(line)
+    recorded_psnr = nearest(trajectory)
+    straight_psnr = nearest(line)
     why = (
-        f"the editor's half is met to {ours:.1f} dB by the recorded way, to {direct:.1f} dB by a straight one"
+        f"the editor's half is met to {recorded_psnr:.1f} dB by the recorded way, "
+        f"to {straight_psnr:.1f} dB by a straight one"
     )
-    return (trajectory, f"as recorded: {why}") if ours >= direct + _BETTER else (line, f"straight: {why}")
+    return (
+        (trajectory, f"as recorded: {why}")
+        if recorded_psnr >= straight_psnr + _PATH_GAIN_DB
+        else (line, f"straight: {why}")
+    )
 
 
-BASELINES = (2, 4)
-_PAYS = 0.1  # dB that an attribute must be worth to be stored
+BASELINES = (2, 4)  # numbers of keyframes of the baseline fields
+_MIN_ATTRIBUTE_GAIN_DB = 0.1  # an attribute that improves the edit by less is not stored
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """The chosen field and what it was chosen against."""
+    """The chosen field, the candidates and the baselines."""
 
-    # the field with its errors against the trajectory, on views that the choice has not seen
+    # the field with its errors against the trajectory, on views not used for the choice
     chosen: Candidate
-    choice: FieldChoice  # with the errors on the views that it was made on
+    choice: FieldChoice  # with the errors on the views used for the choice
     baselines: Mapping[str, Candidate]  # keyframe fields by name, on the same views as `chosen`
 
 
@@ -108,15 +115,15 @@ def fit_field(
     weights: Tensor,
     options: FieldOptions,
 ) -> Fitted:
-    """The smallest field that serves, see `FieldEvaluator`, or where none does the best.
+    """Fit the smallest field that meets the target, see `FieldEvaluator`, or the best one if none does.
 
     Args:
-        trajectory: what was recorded
+        trajectory: the recorded trajectory
         seen: training views, on which ranks are chosen
-        choosing: held-out views, which have the last word on the choice
-        reporting: other held-out views, on which the chosen field's errors are taken
-        weights: how visible each member is. [M]
-        options: which field
+        choosing: held-out views, which decide the choice
+        reporting: other held-out views, on which the chosen field's errors are measured
+        weights: visibility of each member. [M]
+        options: kind and target of the field
     """
     assert options.field != "neural"
     choice = choose_field(
@@ -130,7 +137,7 @@ def fit_field(
     return _measure_choice(choice, trajectory, reporting)
 
 
-@one_thread()  # thousands of small pictures: torch's threads wait for each other longer than they work
+@one_thread()  # for thousands of small pictures, synchronizing torch's threads costs more than they save
 def fit_grades(
     trajectory: Trajectory,
     rows: Tensor,
@@ -139,11 +146,12 @@ def fit_grades(
     weights: Tensor,
     options: FieldOptions,
 ) -> Fitted:
-    """The grade of a recorded map with the smallest residual beside it that serves, see `fit_field`: the
-    fewest bases or one more, in levels as coarse as may be.
+    """Fit the grade of a recorded map with the smallest residual that meets the target, see `fit_field`.
+
+    The residual has the smallest sufficient number of bases or one more, quantized as coarsely as possible.
 
     Args:
-        trajectory: what was recorded, with its maps
+        trajectory: the recorded trajectory, with its maps
         rows: raw values of the members before the edit, packed. [M,14+3K]
         choosing, reporting, weights, options: see `fit_field`
     """
@@ -163,10 +171,10 @@ def fit_grades(
             return False
         release_memory()
         field = bake_grade(form, rows, mapped)
-        if index and evaluator.end_excess(field.offsets(1.0)) > 1.0:  # one look instead of twenty
+        if index and evaluator.end_excess(field.offsets(1.0)) > 1.0:  # one evaluation instead of twenty
             return True
         candidate = evaluator.candidate(field, form.label)
-        tried.append(replace(candidate, field=replace(field, attributes={})))  # which are large
+        tried.append(replace(candidate, field=replace(field, attributes={})))  # the attributes are large
         smallest = min(smallest, math.inf if tried[-1].excess > 1.0 else form.bytes_per_member)
         return tried[-1].excess > 1.0
 
@@ -187,8 +195,10 @@ def fit_grades(
 
 
 def field_evaluator(trajectory: Trajectory, views: Evaluator, target: float | None) -> FieldEvaluator:
-    """What decides whether a field serves: the editor's own pictures of these views, at the strengths of
-    which there are some; or a target in dB."""
+    """Return the test of a field against the editor's pictures of these views, or against a target in dB.
+
+    The editor's pictures are compared at every strength that has some.
+    """
     edited = {s: views.count(views.edited[e]) for s, e in trajectory.stage_strengths if e in views.edited}
     course = trajectory.s, trajectory.offsets, views.counted_pixels, trajectory.at
     if target is None:
@@ -198,7 +208,7 @@ def field_evaluator(trajectory: Trajectory, views: Evaluator, target: float | No
 
 
 def _measure_choice(choice: FieldChoice, trajectory: Trajectory, reporting: Evaluator) -> Fitted:
-    """The choice with its errors, and baselines with theirs, on views that it has not seen."""
+    """Measure the chosen field and the baselines on views not used for the choice."""
     release_memory()
     best = choice.best
     errors = FieldEvaluator(trajectory.s, trajectory.offsets, reporting.counted_pixels, trajectory.at)
@@ -214,17 +224,17 @@ def _measure_choice(choice: FieldChoice, trajectory: Trajectory, reporting: Eval
 
 
 def expected_looks(trajectory: Trajectory, kind: FieldKind) -> int:
-    """About how often `fit_field` looks at its views, for a progress bar."""
+    """Return about how often `fit_field` renders its views, for a progress bar."""
     snapshots = min(len(trajectory), MAX_FITTED_SNAPSHOTS)
     moving = len(moving_attributes(trajectory.offsets))
-    looks = SAMPLES if kind == "lossless" else (1 + moving) * snapshots + 6 * SAMPLES
-    return looks + SAMPLES * (3 + len(BASELINES))
+    fitting = SAMPLES if kind == "lossless" else (1 + moving) * snapshots + 6 * SAMPLES
+    return fitting + SAMPLES * (3 + len(BASELINES))
 
 
 def evaluate_field(
     trajectory: Trajectory, reporting: Evaluator, field: BakedField, target: float | None
 ) -> Fitted:
-    """A field that is there already, a network's, beside the same baselines."""
+    """Measure an existing field, a network's, beside the same baselines."""
     evaluator = field_evaluator(trajectory, reporting, target)
     network = evaluator.candidate(field, field.kind)
     why = f"a network was asked for{'; none' if network.excess > 1.0 else ' and'} {evaluator.wanted}"
@@ -233,7 +243,7 @@ def evaluate_field(
 
 
 def field_figures(candidate: Candidate) -> dict[str, Any]:
-    """A field's size and errors as report.json has them."""
+    """Return a field's size and errors for report.json."""
     field = candidate.field
     return {
         "kind": field.kind,
@@ -245,7 +255,7 @@ def field_figures(candidate: Candidate) -> dict[str, Any]:
 
 
 def choice_figures(fitted: Fitted) -> dict[str, Any]:
-    """What was tried and why the chosen field was, as report.json has it."""
+    """Return the tried fields and the reason of the choice for report.json."""
     tried = [
         {
             "field": candidate.label,
@@ -260,13 +270,17 @@ def choice_figures(fitted: Fitted) -> dict[str, Any]:
 def visibility(
     scene: Gaussians, members: Tensor, views: Sequence[View], looked: Callable[[], None] | None = None
 ) -> Tensor:
-    """Blended weight of each member over the views, mean 1, never 0 so that no row is left to chance. [M]
+    """Return the blending weight of each member, summed over the views and scaled to mean 1. [M]
 
-    `scene`: the original, where rows are added with these as they are at strength 1.
+    The weights are never 0, so that every row is determined. They weight members, not single values
+    (docs/experiments.md, Separable fields). Members not visible in any view stay in the region: leaving them
+    out saves 0 to 6 % of the bytes.
 
-    Members are weighted by it, numbers by nothing (docs/experiments.md, Separable fields).
-
-    Members that no picture shows stay in the region: leaving them out saves 0 to 6 % of the bytes.
+    Args:
+        scene: the original; if the edit adds rows, with these rows as they are at strength 1
+        members: rows of the region in `scene`. [M] int64
+        views: views to render
+        looked: called after each view, for a progress bar
     """
     total = torch.zeros(len(members))
     for view in views:
@@ -281,37 +295,38 @@ def visibility(
 def drop_idle_attributes(
     trajectory: Trajectory, evaluator: Evaluator, prunes: bool = True
 ) -> tuple[Trajectory, dict[str, float]]:
-    """Take out the attributes whose movement does not show: worth less than 0.1 dB against the edited views,
-    all that are taken out together.
+    """Remove attributes whose movement is not visible.
+
+    All removed attributes together cost less than 0.1 dB against the edited views.
 
     Args:
-        trajectory: as recorded
+        trajectory: the recorded trajectory
         evaluator: held-out views
-        prunes: whether anything is taken out that moves at all
+        prunes: False only measures the costs
 
     Returns:
-        The trajectory (without the higher SH bands' columns if these go; that of a grade as it is), and what
-        leaving out each attribute that moves would cost, dB.
+        The trajectory, without the columns of the higher SH bands if they do not move (a grade's stays
+        unchanged), and the cost of leaving out each moving attribute, dB.
     """
     offsets = trajectory.offsets
     end = trajectory.end
     costs: dict[str, float] = {}
     slices = attribute_slices(end.shape[1])
     target = evaluator.edited[1.0]
-    now = complete = evaluator.psnr(evaluator.pictures(end), target)
+    current_psnr = full_psnr = evaluator.psnr(evaluator.pictures(end), target)
     for name in ("shN", "quats", "log_scales", "means", "logit_opacities", "sh0"):
         if name not in slices or not bool(end[:, slices[name]].any()):
             continue
         tried = end.clone()
         tried[:, slices[name]] = 0.0
-        then = evaluator.psnr(evaluator.pictures(tried), target)
-        costs[name] = round(now - then, 3)
-        if prunes and trajectory.maps is None and complete - then < _PAYS:
-            now = then
+        psnr = evaluator.psnr(evaluator.pictures(tried), target)
+        costs[name] = round(current_psnr - psnr, 3)
+        if prunes and trajectory.maps is None and full_psnr - psnr < _MIN_ATTRIBUTE_GAIN_DB:
+            current_psnr = psnr
             offsets = offsets.clone()
             offsets[:, :, slices[name]] = 0.0
             end = tried
-    # a grade is of all bands that the scene has, whether or not its map moves them
+    # a grade covers all bands of the scene, even those that its map does not move
     if trajectory.maps is None and "shN" in slices and not bool(end[:, slices["shN"]].any()):
         offsets = offsets[:, :, :BASE_CHANNELS].clone()
         end = end[:, :BASE_CHANNELS].clone()
@@ -319,8 +334,10 @@ def drop_idle_attributes(
 
 
 def stored_numbers(field: BakedField) -> int:
-    """How many numbers the field holds for all members together, coefficients included; of a network, those
-    that are learned and the recorded end."""
+    """Return the count of values that a field stores for all members, coefficients included.
+
+    For a network, these are the learned parameters and the recorded endpoint.
+    """
     form = field.origin
     if isinstance(form, NeuralForm):
         return form.network.parameters + form.network.end.numel()

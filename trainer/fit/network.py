@@ -1,6 +1,6 @@
-"""A run's neural field: trained while PGS runs, on the recorded trajectory, or both, and baked.
+"""Neural field of a run: trained jointly with PGS, on the recorded trajectory, or both, then baked.
 
-`--field auto` does not try it: at the default target it does not arrive (docs/experiments.md, Networks).
+`--field auto` does not try it, as it misses the default target (docs/experiments.md, Networks).
 """
 
 from __future__ import annotations
@@ -35,57 +35,57 @@ from .evaluate import Evaluator
 from .fit import visibility
 
 MAX_SNAPSHOTS = 64
-"""Snapshots that a bank keeps; of more, those go that differ least in time from their neighbors."""
+"""Snapshots that a bank keeps; beyond that, the one closest to its neighbors on the slider is dropped."""
 
 
 class MemoryBank:
-    """Snapshots along the slider, in half precision; the original, at 0, is always among them.
+    """Snapshots along the slider in half precision, including the original at 0.
 
     Args:
         members, channels: M and C of the offsets
-        most: how many to keep, the original and the newest always, ≥ 3
+        most: largest number of snapshots, ≥ 3; the original and the newest are always kept
     """
 
     def __init__(self, members: int, channels: int, most: int = MAX_SNAPSHOTS) -> None:
         self._strengths = [0.0]
         self._offsets = [torch.zeros(members, channels, dtype=torch.float16)]
-        self._most = most
+        self._max_snapshots = most
 
     def __len__(self) -> int:
         return len(self._strengths)
 
     def add(self, strength: float, offsets: Tensor) -> None:
-        """Keep one more; its strength is above all others. [M,C]"""
+        """Add a snapshot. [M,C] Raises ValueError unless its strength is above all others."""
         if strength <= self._strengths[-1]:
             raise ValueError(f"a snapshot at {strength} after one at {self._strengths[-1]}")
         self._strengths.append(strength)
         self._offsets.append(offsets.detach().half())
-        if len(self) > self._most:
+        if len(self) > self._max_snapshots:
             s = self._strengths
             gaps = [s[i + 1] - s[i - 1] for i in range(1, len(self) - 1)]
-            least = 1 + gaps.index(min(gaps))
-            del self._strengths[least], self._offsets[least]
+            closest = 1 + gaps.index(min(gaps))
+            del self._strengths[closest], self._offsets[closest]
 
     @property
     def strengths(self) -> Tensor:
-        """Ascending from 0. [T] float32"""
+        """Strengths of the snapshots, ascending from 0. [T] float32"""
         return torch.tensor(self._strengths)
 
     @property
     def offsets(self) -> Tensor:
-        """[T,M,C] float16"""
+        """Offsets of the snapshots. [T,M,C] float16"""
         return torch.stack(self._offsets)
 
 
 class JointTraining:
-    """A network in joint training with PGS; a `state.Resumable`.
+    """Joint training of a network with PGS; a `state.Resumable`.
 
     Args:
         fit: the network, not yet trained
-        channels: of the recordings
-        strengths, steps: of the stages, in order
-        render: of a few small views, tells how much each attribute shows
-        pictures: the loss is of these instead of offsets
+        channels: channels of the recordings
+        strengths, steps: strength and number of steps of each stage, in order
+        render: renders a small number of small views, to weight the attributes by their visible effect
+        pictures: loss on pictures instead of offsets
     """
 
     def __init__(
@@ -108,19 +108,19 @@ class JointTraining:
         self._offsets = self.bank.offsets
 
     def strength(self, step: int) -> float:
-        """Where on the slider a step of PGS is for now: even in time within its stage."""
+        """Return the provisional slider value of a PGS step, linear in time within its stage."""
         return float(interpolate_at(self._after, self._at, step))
 
     def add(self, step: int, offsets: Tensor) -> None:
-        """A recording of PGS. [M,C]"""
+        """Add a recording of PGS. [M,C]"""
         self._keep(step, offsets)
         if moving_attributes(self._offsets):
-            pictures = self._pictures is not None  # which weigh the attributes themselves
+            pictures = self._pictures is not None  # a loss on pictures needs no weights per attribute
             importance = None if pictures else rendered_importance(self._offsets, self._render)
             self.fit.scale_to(self._offsets, importance)
 
     def step(self) -> None:
-        """One step of the field after one of PGS; none before the first recording.
+        """Train the field for one step, after a step of PGS; does nothing before the first recording.
 
         Raises:
             FloatingPointError: the field's loss is no longer finite.
@@ -129,15 +129,15 @@ class JointTraining:
             self.fit.step(self._strengths, self._offsets, pictures=self._pictures)
 
     def capture_state(self) -> Saved:
-        """The fit; the bank is made again from the recordings."""
+        """Return the state of the fit; the bank is rebuilt from the recordings."""
         return Saved(self.fit.capture_state(), {})
 
     def restore(self, saved: Saved) -> None:
-        """Take over the fit; `refill` comes after."""
+        """Restore the fit; call `refill` afterwards."""
         self.fit.restore(saved.tensors)
 
     def refill(self, recordings: Sequence[tuple[int, Tensor]]) -> None:
-        """Fill the bank with what was recorded before the run was stopped: step, offsets [M,C]."""
+        """Fill the bank with the recordings before the run was stopped: step, offsets [M,C]."""
         self.bank = MemoryBank(self.fit.members, self._channels)
         for step, offsets in recordings:
             self._keep(step, offsets)
@@ -149,24 +149,24 @@ class JointTraining:
 
 
 PART = "network"
-"""Of the saved state: a network that was trained jointly, once the trajectory is recorded."""
+"""Name of the saved part with a jointly trained network, after the trajectory is recorded."""
 
-_FINISHING = 0.5
-"""Of the steps of a network that was not trained jointly: to follow the re-timed trajectory. One that was
-trained on pictures is left as it is, as in the paper."""
+_FINISHING_SHARE = 0.5
+"""Share of the usual steps that adapts a jointly trained network to the retimed trajectory. A network trained
+on pictures stays unchanged, as in the paper."""
 PICTURE_STEPS = 1500
-"""Of a network that is trained on pictures after the recording: as many as the paper's take beside it."""
+"""Steps of a network trained on pictures after the recording, as many as the paper's joint training takes."""
 
 
 @dataclass(frozen=True)
 class NetworkFit:
-    """A neural field as a run ships it."""
+    """Neural field as shipped by a run."""
 
     field: BakedField  # baked, with the network as its origin
-    unbaked: tuple[float, ...]  # PSNR of the network's own answers over the slider, its ends not pinned, dB
+    unbaked: tuple[float, ...]  # PSNR of the network's output over the slider, without pinned ends, dB
 
     def figures(self) -> dict[str, Any]:
-        """For report.json."""
+        """Return the figures for report.json."""
         curve = self.unbaked
         form = self.field.origin
         assert isinstance(form, NeuralForm)
@@ -178,13 +178,14 @@ class NetworkFit:
 
 
 def network_settings(options: FieldOptions) -> NeuralSettings:
-    """What the options say of the network, as it is trained."""
+    """Return the network settings that the options describe."""
     steps = PICTURE_STEPS if options.field_loss == "pictures" else EFFORT[options.size][0]
     steps = steps // 3 if options.draft else steps
     if options.as_printed:
         return NeuralSettings(options.size, "position", 0, "hard", steps, seed=options.seed)
-    # What the Gaussian looks like and where it ends, beside its position: 38 dB instead of 34 at no cost; a
-    # byte each for eight learned numbers, for what its position does not tell; between hard bins edits jump.
+    # "own": the Gaussian's appearance and endpoint as inputs beside its position give 38 dB instead of 34 at
+    # no cost. 8: eight learned values, a byte each, for information that the position does not contain.
+    # "smooth": edits jump between hard bins.
     return NeuralSettings(options.size, "own", 8, "smooth", steps, seed=options.seed)
 
 
@@ -197,15 +198,15 @@ def begin_joint_training(
     crops: Sequence[CropScene],
     perceptual: Perceptual,
 ) -> JointTraining:
-    """The network that is trained jointly with PGS.
+    """Create the network that is trained jointly with PGS.
 
     Args:
         options, optimize: resolved
         setup: scene, region, views
-        rates: learning rates of PGS; what has none does not move. [C]
-        stages: of PGS
-        crops: the training views, for a loss of pictures
-        perceptual: for the same
+        rates: learning rates of PGS; channels with rate 0 do not move. [C]
+        stages: stages of PGS
+        crops: training views, for a loss on pictures
+        perceptual: perceptual distance, for a loss on pictures
     """
     channels = len(rates)
     slices = attribute_slices(channels)
@@ -232,7 +233,7 @@ def begin_joint_training(
 
 
 def save_network(joint: JointTraining, folder: StateFolder) -> None:
-    """Save the network for the end of the run, when the trajectory is whole."""
+    """Save the network for the end of the run, when the trajectory is complete."""
     folder.save(PART, joint.fit.capture_state(), {"shape": asdict(joint.fit.shape)})
 
 
@@ -250,18 +251,18 @@ def fit_network(
     """Train a network on a trajectory, or finish one that was trained jointly on offsets, and bake it.
 
     Args:
-        trajectory: what was recorded
+        trajectory: the recorded trajectory
         setup: scene, region, views
-        seen: training views, which tell how much each attribute shows
-        reporting: held-out views on which errors are taken
-        weights: how visible each member is. [M]
+        seen: training views, to weight the attributes by their visible effect
+        reporting: held-out views on which errors are measured
+        weights: visibility of each member. [M]
         options: resolved
-        perceptual: for the loss of pictures
-        log: of the run
-        begun: what `save_network` saved
+        perceptual: perceptual distance, for a loss on pictures
+        log: log of the run
+        begun: the state saved by `save_network`
 
     Raises:
-        ProgdfError: the edit moves nothing, or the training breaks down.
+        ProgdfError: the edit moves nothing, or the training diverges.
     """
     offsets = trajectory.nodes
     attributes = tuple(moving_attributes(offsets))
@@ -274,7 +275,7 @@ def fit_network(
     if begun is not None:
         layout = begun.values["shape"]
         fit.adopt(NeuralShape(**layout | {"attributes": tuple(layout["attributes"])}), begun.tensors)
-        steps = 0 if options.field_loss == "pictures" else round(_FINISHING * steps)
+        steps = 0 if options.field_loss == "pictures" else round(_FINISHING_SHARE * steps)
     fit.scale_to(offsets, rendered_importance(offsets, seen.counted_pixels))
     pictures = None
     if options.field_loss == "pictures" and steps:
@@ -295,7 +296,7 @@ def fit_network(
 
 
 def _rendered_loss(setup: TrainingSetup, trajectory: Trajectory, perceptual: Perceptual) -> RenderedLoss:
-    """The loss of pictures in all training views."""
+    """Return the loss on pictures of all training views."""
     members = setup.region.members
     crops = [crop_scene(setup.scene, members, v.camera, v.box, setup.background) for v in setup.train]
     rows = pack(setup.scene[members], with_shN=trajectory.end.shape[1] > BASE_CHANNELS)
@@ -304,18 +305,20 @@ def _rendered_loss(setup: TrainingSetup, trajectory: Trajectory, perceptual: Per
 
 @dataclass(frozen=True)
 class RenderedLoss:
-    """L_GDF = L_pred + L_render: L1 + LPIPS between the renders of Θ0 + GDF(s) and of the snapshot at s, and
-    −(∇²R)² of the former. A `PictureLoss`.
+    """The paper's loss L_GDF = L_pred + L_render; a `PictureLoss`.
+
+    L_pred is L1 + LPIPS between the renders of Θ0 + GDF(s) and of the snapshot at s. L_render is −(∇²R)² of
+    the former render.
     """
 
     crops: Sequence[CropScene]  # the training views
     rows: Tensor  # raw values of the members before the edit, packed. [M,C]
-    moving: Collection[str]  # attributes that differ from these
-    perceptual: Perceptual  # LPIPS, or what stands in for it
+    moving: Collection[str]  # attributes that the edit changes
+    perceptual: Perceptual  # LPIPS or its substitute
 
     @property
     def views(self) -> int:
-        """In how many views."""
+        """Number of views."""
         return len(self.crops)
 
     def __call__(self, found: Tensor, recorded: Tensor, view: int) -> Tensor:
@@ -329,11 +332,13 @@ class RenderedLoss:
 
 
 def rendered_importance(offsets: Tensor, render: Render) -> dict[str, float]:
-    """How much an error of one spread in each attribute shows in pictures, half way; these add up to 1.
+    """Return the visible effect of an error in each attribute at half strength; the values sum to 1.
+
+    The error is proportional to the attribute's spread (root mean square of its offsets).
 
     Args:
-        offsets: [T,M,C]
-        render: pixels of some views
+        offsets: offsets along the slider. [T,M,C]
+        render: renders the pixels of some views
     """
     draws = torch.Generator().manual_seed(0)
     middle = offsets[len(offsets) // 2].float()

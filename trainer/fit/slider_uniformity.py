@@ -1,11 +1,13 @@
-"""Equal steps of a slider that look equally large: of an editor's own pictures, and of a fitted field.
+"""Perceptually uniform sliders: equal slider steps make equal visible changes.
 
-The editor first: an edit that turns a hue shows little at some strengths and much at others. Asked at even
-strengths, its pictures are pins between which a slider has to creep and to leap; asked at strengths that are
-evenly visible, every stage is as far from the last as the others, and s = .5 is half of what there is to see.
-The field last: it is not its recording, whose small detours it leaves out, and these are not spread evenly
-over the slider. What each brings is in docs/experiments.md,
-The slider.
+First, the editor's strengths. An edit that rotates a hue changes the picture little at some strengths and
+much at others. Pictures at equal strengths would force the slider to slow down and to jump between them. At
+strengths with equal visible change, all stages are equally far apart, and s = 0.5 shows half of the change.
+
+Last, the fitted field. It leaves out small detours of its recording, which are not spread evenly over the
+slider.
+
+The gain of each is in docs/experiments.md, The slider.
 """
 
 from __future__ import annotations
@@ -36,51 +38,51 @@ from trainer.views.crops import GEOMETRY, render_all
 from trainer.views.view import View
 
 STEPS = 20
-"""Equal steps that a user makes over the whole slider."""
+"""Equal steps over the whole slider for which uniformity is measured."""
 
-_ASKED_VIEWS = 3
-_FIELD_VIEWS = 6
-_COSTLY_STEPS = 8  # of the anchor view, where each picture costs a model's work
-_FINE = 2  # a step may begin at so many places per step
-_PASSES = 3  # of spreading the strengths; the best of all wins
-_LOOKS = 2  # how often all places are looked at
-_JUMP = 0.7  # of the change in one step of an editor's strength: no strength between can be relied on
+_EDITOR_VIEWS = 3  # views of the editor's pictures
+_FIELD_VIEWS = 6  # views of the field
+_COSTLY_STEPS = 8  # steps in the anchor view if each picture runs a model
+_STARTS_PER_STEP = 2  # offsets at which a step may start
+_SPREAD_PASSES = 3  # passes that respace the strengths; the best one counts
+_RENDER_ROUNDS = 2  # renders of all strengths
+_JUMP_SHARE = 0.7  # with this share of the change in one step, strengths in between are unreliable
 
 
 def equalized_strengths(
     editor: ImageEditor, spec: str, views: Sequence[View], plain: tuple[float, ...]
 ) -> tuple[float, ...]:
-    """Strengths at which the editor's own pictures are as far along as `plain` says, the last 1.
+    """Return the strengths at which the editor's pictures reach the shares `plain` of the visible change.
 
-    Three decimals each, as they name folders. `plain` itself where the editor has strengths of its own,
-    or where the whole change is one jump. Where each picture costs a model's work, one view is looked at in
-    eight steps.
+    The strengths have three decimals, as they name folders; the last is 1. `plain` is returned unchanged if
+    the editor has its own strengths or if the whole change is one jump. If each picture runs a model, one
+    view is measured in eight steps.
 
     Args:
         editor: see `ImageEditor`
-        spec: what it was made of, `KIND:WHAT`
-        views: of which a few are looked at
+        spec: the editor's specification, `KIND:WHAT`
+        views: up to three evenly spaced ones are measured
         plain: shares of the visible change, ascending, the last 1
     """
     if editor.stages or len(plain) == 1:
         return plain
     costly = check_editor(spec)[0] in COSTLY_STRENGTHS
-    few = views[:1] if costly else views[:: max(1, len(views) // _ASKED_VIEWS)][:_ASKED_VIEWS]
-    courses = [edit_course(editor, view) for view in few]
+    measured_views = views[:1] if costly else views[:: max(1, len(views) // _EDITOR_VIEWS)][:_EDITOR_VIEWS]
+    view_edits = [edit_course(editor, view) for view in measured_views]
 
     def picture_at(s: float) -> Tensor:
-        pictures = [picture_at(s) for picture_at in courses]
-        if not editor.is_confined:  # what changes beside the region is put back
-            pictures = [view.confine(picture) for view, picture in zip(few, pictures, strict=True)]
+        pictures = [picture_at(s) for picture_at in view_edits]
+        if not editor.is_confined:  # undo changes outside the region
+            pictures = [view.confine(picture) for view, picture in zip(measured_views, pictures, strict=True)]
         return torch.cat([picture.flatten() for picture in pictures])
 
     even = torch.linspace(0, 1, (_COSTLY_STEPS if costly else STEPS) + 1, dtype=torch.float64)
     pictures = [picture_at(float(s)) for s in even]
     steps = [float((b - a).abs().mean()) for a, b in pairwise(pictures)]
-    if max(steps) > _JUMP * sum(steps):
+    if max(steps) > _JUMP_SHARE * sum(steps):
         return plain
-    _, due = _spread(even, pictures, 1)
-    at = interpolate(torch.tensor(plain, dtype=torch.float64), even, due)
+    _, respaced = _spread(even, pictures, 1)
+    at = interpolate(torch.tensor(plain, dtype=torch.float64), even, respaced)
     rounded = (*(round(float(s), 3) for s in at[:-1]), 1.0)
     rises = all(b - a > 5e-4 for a, b in zip((0.0, *rounded), rounded, strict=False))
     return rounded if rises else plain
@@ -89,7 +91,7 @@ def equalized_strengths(
 def equalize_slider(
     field: BakedField, setup: TrainingSetup, log: RunLog | None = None
 ) -> tuple[BakedField, SliderRemap]:
-    """The field with a slider whose equal steps look equally large in training views, and where it all went.
+    """Return the field with a uniform slider, measured in training views, and the remap to it.
 
     A network keeps its slider.
     """
@@ -105,49 +107,49 @@ def equalize_slider(
 
     counter: AbstractContextManager[Callable[[], None]] = nullcontext(lambda: None)
     if log is not None:
-        counter = log.looks("even the slider", _LOOKS * (STEPS * _FINE + 1))
+        counter = log.looks("even the slider", _RENDER_ROUNDS * (STEPS * _STARTS_PER_STEP + 1))
     with counter as looked:
         remap = equalizing_remap(picture_at)
     return remap_slider(field, remap), remap
 
 
 def equalizing_remap(seen: Callable[[float], Tensor]) -> SliderRemap:
-    """The remap under which equal steps change what is seen equally, wherever they begin.
+    """Return the remap under which equal steps change the pictures equally, wherever a step starts.
 
-    Steps that begin between those of a ruler count as well: without them only the ruler's own get even (of a
-    robot's .93, but .68 where they begin half a step later; with them .92 and .88).
+    Steps that start between the even slider values count too. Without them, a robot edit had a uniformity of
+    0.93 on the even values, but 0.68 on steps that start half a step later; with them 0.92 and 0.88.
 
     Args:
-        seen: strength -> what is seen, any fixed shape; asked at even strengths and those found, and taken
-            to go straight between two of them
+        seen: strength -> pixels of any fixed shape; called at even strengths and at the strengths found, and
+            interpolated linearly between them
     """
-    even = torch.linspace(0, 1, STEPS * _FINE + 1, dtype=torch.float64)
+    even = torch.linspace(0, 1, STEPS * _STARTS_PER_STEP + 1, dtype=torch.float64)
     places = even
-    for _ in range(_LOOKS):
+    for _ in range(_RENDER_ROUNDS):
         looked = places
         pictures = [seen(float(s)) for s in places]
         best = -1.0
         following = places
-        for _ in range(_PASSES + 1):
+        for _ in range(_SPREAD_PASSES + 1):
             current = following
             blended = [interpolate_at(looked, pictures, float(s)) for s in current]
-            uniformity, following = _spread(current, blended, _FINE)
+            uniformity, following = _spread(current, blended, _STARTS_PER_STEP)
             if uniformity > best:
                 best = uniformity
                 places = current
-    return SliderRemap(places[::_FINE].contiguous(), even[::_FINE].contiguous())
+    return SliderRemap(places[::_STARTS_PER_STEP].contiguous(), even[::_STARTS_PER_STEP].contiguous())
 
 
 def _spread(places: Tensor, pictures: Sequence[Tensor], reach: int) -> tuple[float, Tensor]:
-    """How even steps over `reach` intervals are, and as many places at which they should be more so.
+    """Measure the uniformity of steps over `reach` intervals and respace the strengths to increase it.
 
     Args:
         places: strengths, ascending from 0 to 1. [n+1] float64
-        pictures: what is seen there
+        pictures: pixels at these strengths
         reach: intervals in a step
 
     Returns:
-        Smallest over largest step, 0..1; the new places. [n+1]
+        Smallest over largest step, 0 to 1; the new strengths. [n+1]
     """
     count = len(places) - 1
     steps = [float((pictures[i + reach] - pictures[i]).abs().mean()) for i in range(count + 1 - reach)]
@@ -155,10 +157,10 @@ def _spread(places: Tensor, pictures: Sequence[Tensor], reach: int) -> tuple[flo
         return 1.0, places
     covering = [steps[max(0, i - reach + 1) : i + 1] for i in range(count)]
     pace = [sum(c) / len(c) for c in covering]
-    floor = 1e-3 * max(pace)  # so that the places stay apart
-    way = torch.tensor([0.0, *accumulate(max(p, floor) for p in pace)], dtype=torch.float64)
+    floor = 1e-3 * max(pace)  # keeps the strengths apart
+    path_length = torch.tensor([0.0, *accumulate(max(p, floor) for p in pace)], dtype=torch.float64)
     even = torch.linspace(0, 1, count + 1, dtype=torch.float64)
-    due = interpolate(even, way / way[-1], places)
-    due[0] = 0.0
-    due[-1] = 1.0
-    return min(steps) / max(steps), due
+    respaced = interpolate(even, path_length / path_length[-1], places)
+    respaced[0] = 0.0
+    respaced[-1] = 1.0
+    return min(steps) / max(steps), respaced
