@@ -1,1 +1,1 @@
-"""The whole job, from a scene to a .gdf and its report."""
+"""Training runs, from a scene to a .gdf file and its report."""

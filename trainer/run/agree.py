@@ -1,21 +1,26 @@
-"""Views that agree: what a sentence leaves open is decided once, in one picture, and all views follow it.
+"""Multi-view consistent editing with a generative model.
 
-A model that paints every view by itself decides anew in each (which mask, which stripes), and what the views
-show differently no scene can show. So one view is painted first, the anchor, then one from every other side,
-then all others, each with two references: what the anchors make of the scene as it is seen from there (the
-members' colors fitted to them), and the first anchor itself. A model that takes one picture alone sweeps:
-each next view starts from what the views so far make of the scene. Then comes consensus: colors are fitted to
-all views (`robust_colors`), and each is painted again away from their render, its own original being the
-condition: what it starts from decides what is painted, and the rest of the way is free.
+A model that paints every view on its own decides open details (which mask, which stripes) again in each view,
+and no scene can show contradicting views. Two strategies make the views agree:
 
-A model's answers are shifted and scaled by a little: `register` takes that back. What is moved farther is
+- A model that takes reference images paints one view first (the anchor), then one from every other side, then
+  all others. Each gets two references: the render of the scene with the members' colors fitted to the anchors
+  so far, and the first anchor itself.
+- A model that takes a single image sweeps. Each next view starts from the render of the scene as fitted to
+  the views so far.
+
+Consensus rounds follow. Colors are fitted to all views (`robust_colors`), and each view is painted again
+starting from their render, conditioned on its own original. The start determines the content; the remaining
+denoising is free.
+
+A model shifts and scales its answers slightly. `register` reverts that. An answer that moved farther is
 painted again with another seed, then left out.
 
-RUN/views/painted/anchor/VIEW.png   the first of them decides: painted over by hand, all follow it in a run
-                                    that is begun again
-RUN/views/painted/reference|sweep|round_1/VIEW.png   the others; the rounds of consensus
+RUN/views/painted/anchor/VIEW.png   the first one is the anchor; if it is painted over by hand, all
+                                    views follow it when the run is started again
+RUN/views/painted/reference|sweep|round_1/VIEW.png   the other views; the consensus rounds
 
-What it brings is in docs/experiments.md, Views that agree.
+Measured gains: docs/experiments.md, Views that agree.
 """
 
 from __future__ import annotations
@@ -45,38 +50,40 @@ from trainer.store.progress import Advance, RunLog
 from trainer.views.view import View, frame_sphere, make_view, region_sphere, render_view
 
 ANCHOR = "anchor"
-"""Folder of the pictures that decide."""
+"""Folder of the anchor pictures."""
 
-_FRONT = 0.8  # of a picture that the region fills where sides are compared
+_FRAME_FILL = 0.8  # share of the picture that the region fills when sides are compared
 
 SIDE = math.radians(60)
-"""Angle around the region from which on a view shows another side, which gets an anchor of its own."""
+"""Angle around the region, in radians, beyond which a view shows another side and gets its own anchor."""
 
 CONSENSUS = 0.4
+"""Denoising strength away from the render of the fit in consensus rounds, 0 to 1; 0.8 does not converge."""
+
 SWEEP = 0.6
-"""Strengths away from the render of the fit: at .8 views decide anew, and do not converge."""
+"""Denoising strength away from the render of the fit in a sweep, 0 to 1."""
 
 SOFTNESS = 0.25
-"""Share of the painting over which the render is let go of: a decision first, then a free finish."""
+"""Share of the denoising over which the render's influence fades out; the remainder is free."""
 
 MAX_MOVED = 0.05
-"""Shift, as a share of the longer side, or zoom, above which an answer is not laid over its view."""
+"""Maximum shift (share of the longer side) or zoom at which an answer is aligned with its view."""
 
 
 @dataclass(frozen=True)
 class Registration:
-    """How an answer lies over its view: a point at `p` from the middle is found at (1 + zoom) p + shift."""
+    """Alignment of an answer: a point at `p` from the view's center is found at (1 + zoom) p + shift."""
 
     shift: tuple[float, float] = (0.0, 0.0)  # x, y, shares of the longer side
     zoom: float = 0.0
 
     @property
     def size(self) -> float:
-        """The largest of the three."""
+        """The largest magnitude of the three parameters."""
         return max(abs(self.shift[0]), abs(self.shift[1]), abs(self.zoom))
 
     def lay(self, picture: Tensor) -> Tensor:
-        """The answer, moved back; bit for bit where that is less than a quarter of a pixel. [H,W,3]"""
+        """Return the answer, moved back; unchanged bit for bit if it moved less than 0.25 pixels. [H,W,3]"""
         longer = max(picture.shape[:2])
         if self.size * longer < 0.25:
             return picture
@@ -86,14 +93,14 @@ class Registration:
 
 
 def register(original: Tensor, picture: Tensor, beside: Tensor) -> Registration:
-    """Shift and zoom of a picture against the original, by robust Gauss-Newton from coarse to fine.
+    """Return the shift and zoom of a picture against the original, by robust coarse-to-fine Gauss-Newton.
 
-    Brightness and contrast may differ as a whole. Nothing is found where what is beside the region has no
-    texture, or was painted anew.
+    Global brightness and contrast may differ. The result is the identity if the surroundings of the region
+    have no texture or were repainted.
 
     Args:
         original, picture: [H,W,3]
-        beside: pixels that should show the same in both. [H,W] bool
+        beside: pixels that should be the same in both. [H,W] bool
     """
     levels = []
     planes = [image.permute(2, 0, 1)[None] for image in (original, picture)]
@@ -113,23 +120,23 @@ def register(original: Tensor, picture: Tensor, beside: Tensor) -> Registration:
             if float(step.abs().max()) * max(a.shape[2:]) < 0.01:
                 break
     a, b, weight = levels[0]
-    before, after = (_step(a, b, weight, some)[1] for some in (torch.zeros_like(parameters), parameters))
-    if not after < _BETTER * before:
+    before, after = (_step(a, b, weight, values)[1] for values in (torch.zeros_like(parameters), parameters))
+    if not after < _MAX_MISFIT_RATIO * before:
         return Registration()
     x, y, zoom = parameters.tolist()
     return Registration((x, y), zoom)
 
 
-_BETTER = 0.8  # of the misfit as it lies: noise alone makes one place a little better than another
-_TEXTURE = 0.01  # standard deviation of color; what has less fits anywhere
-_TUKEY = 4.685  # in standard deviations: 95 % as good as least squares where the noise is normal
+_MAX_MISFIT_RATIO = 0.8  # required misfit after/before registration; noise alone gains a little
+_MIN_TEXTURE = 0.01  # standard deviation of color; smoother areas match at any position
+_TUKEY = 4.685  # in standard deviations; 95 % of the efficiency of least squares under normal noise
 
 
 def _step(a: Tensor, b: Tensor, weight: Tensor, parameters: Tensor) -> tuple[Tensor, float]:
-    """One step of Gauss-Newton with Tukey's weights [3], and the robust misfit before it."""
-    moved, (x, y) = _sample(b, parameters), _places(b)
+    """Return one Gauss-Newton step with Tukey weights [3], and the robust misfit before it."""
+    moved, (x, y) = _sample(b, parameters), _pixel_positions(b)
     counts = (weight > 0)[0, 0]
-    if int(counts.sum()) < 16 or float(a[0][:, counts].std(dim=1).max()) < _TEXTURE:
+    if int(counts.sum()) < 16 or float(a[0][:, counts].std(dim=1).max()) < _MIN_TEXTURE:
         return torch.zeros(3, dtype=torch.float64), 0.0
     gradients = [
         torch.nn.functional.pad((moved[..., 2:] - moved[..., :-2]) / 2, (1, 1)),
@@ -152,8 +159,8 @@ def _step(a: Tensor, b: Tensor, weight: Tensor, parameters: Tensor) -> tuple[Ten
     return step.clamp(-0.05, 0.05), float(residual.abs().clamp_max(0.1).mean())
 
 
-def _places(planes: Tensor) -> tuple[Tensor, Tensor]:
-    """x and y of the pixels from the middle, shares of the longer side. [H,W] float64 each"""
+def _pixel_positions(planes: Tensor) -> tuple[Tensor, Tensor]:
+    """Return x and y of the pixels from the center, in shares of the longer side. [H,W] float64 each"""
     height, width = planes.shape[2:]
     longer = max(height, width)
     y = (torch.arange(height, dtype=torch.float64) + 0.5 - height / 2) / longer
@@ -163,8 +170,8 @@ def _places(planes: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _sample(planes: Tensor, parameters: Tensor, mode: str = "bilinear") -> Tensor:
-    """Planes read where `Registration` says. [1,C,H,W]"""
-    (x, y), (height, width) = _places(planes), planes.shape[2:]
+    """Return the planes sampled at the positions of `Registration`. [1,C,H,W]"""
+    (x, y), (height, width) = _pixel_positions(planes), planes.shape[2:]
     dx, dy, zoom = parameters.tolist()
     scale = 2 * max(height, width)
     grid = torch.stack([scale / width * ((1 + zoom) * x + dx), scale / height * ((1 + zoom) * y + dy)], dim=2)
@@ -173,18 +180,18 @@ def _sample(planes: Tensor, parameters: Tensor, mode: str = "bilinear") -> Tenso
 
 @dataclass(frozen=True)
 class Easel:
-    """Paints views, and keeps what is painted: a run that goes on, or comes again, paints nothing twice.
+    """Cache of painted views, so that a resumed or repeated run paints nothing twice.
 
-    The note beside a picture holds the digests of all that it was made from.
+    The sidecar file of a picture holds the digests of all its inputs.
     """
 
     painter: InstructEditor
-    recipe: Recipe  # what a picture depends on besides what `InstructEditor.paint` is given
+    recipe: Recipe  # inputs of a picture besides the arguments of `InstructEditor.paint`
     kept: KeptPictures
     seed: int
 
     def crop(self, view: View, picture: Tensor) -> Tensor:
-        """What a picture of a view shows in its frame, at the frame's size. [H,W,C] -> [h,w,C]"""
+        """Return the part of a view's picture inside its frame, at the frame's size. [H,W,C] -> [h,w,C]"""
         (x0, y0, x1, y1), camera = self.painter.frame(view)
         planes = picture[y0:y1, x0:x1].permute(2, 0, 1)[None]
         size = (camera.height, camera.width)
@@ -199,13 +206,13 @@ class Easel:
         strength: float = 1.0,
         softness: float = 1.0,
     ) -> tuple[Tensor | None, float]:
-        """The frame of a view as painted, laid over its original, and by how much it was moved, see
-        `Registration`. [h,w,3]
+        """Return the painted frame of a view, aligned with its original, and its motion, see `Registration`.
+        [h,w,3]
 
-        None where the answers to two seeds are moved too far to be laid over it.
+        The frame is None if the answers to two seeds moved too far to be aligned.
 
         Args:
-            view: what is painted
+            view: the view to paint
             place: folder of the picture
             references, source, strength, softness: see `InstructEditor.paint`
         """
@@ -227,8 +234,8 @@ class Easel:
                     picture, references, strength=strength, softness=softness, source=source, seed=seed
                 )
 
-            where = place if seed == self.seed else f"{place}/again"
-            picture = self.kept.picture(view.camera.name, original, recipe, paint, where)
+            folder_name = place if seed == self.seed else f"{place}/again"
+            picture = self.kept.picture(view.camera.name, original, recipe, paint, folder_name)
             registration = register(original, picture, beside)
             moved = registration.size
             if moved <= MAX_MOVED:
@@ -237,20 +244,20 @@ class Easel:
 
 
 def beside_region(mask: Tensor) -> Tensor:
-    """The pixels away from a region by a little, as what is painted reaches over its edge. [H,W] -> bool"""
+    """Return the pixels at some distance from a region, as paint extends over its edge. [H,W] -> bool"""
     reach = 2 * (max(mask.shape) // 128) + 3
     return max_pool2d(mask[None, None], reach, 1, reach // 2)[0, 0] < 0.01
 
 
 @dataclass(frozen=True)
 class Fit:
-    """What all views agree on best: changes of the members' colors."""
+    """Changes of the members' colors that agree best with all views."""
 
     setup: TrainingSetup
     colors: Tensor  # [M,3]
 
     def render(self, camera: Camera) -> Tensor:
-        """The scene with these changes. [H,W,3]"""
+        """Return a render of the scene with these changes. [H,W,3]"""
         scene = self.setup.scene
         members = self.setup.region.members
         rows = pack(scene[members], with_shN=scene.sh_degree > 0)
@@ -261,18 +268,18 @@ class Fit:
 
 @dataclass(frozen=True)
 class AgreedEditor:
-    """An editor whose views agree; its further strengths are painted when they are asked for."""
+    """Editor whose views agree. Further strengths are painted on demand."""
 
     easel: Easel
     pictures: Mapping[str, Tensor]  # view's name → the finished edit. [H,W,3]
     fit: Fit
     stages: tuple[float, ...]
     kind: EditKind
-    figures: Mapping[str, object]  # as report.json has them
+    figures: Mapping[str, object]  # for report.json
     is_confined: bool = False
 
     def edit(self, view: View, strength: float) -> Tensor:
-        """See `ImageEditor.edit`."""
+        """Return the view edited at a strength, see `ImageEditor.edit`."""
         if strength == 0.0:
             return view.image
         finished = self.pictures[view.camera.name]
@@ -280,7 +287,7 @@ class AgreedEditor:
             return finished
         painter = self.easel.painter
         fit = self.fit.render(painter.frame(view)[1])
-        # from the view at this degree of what all agree on, as free as that: 1 is the last round's picture
+        # source and freedom both scale with the strength, so that strength 1 equals the last round's picture
         source = torch.lerp(painter.original(view), fit, strength)
         freedom = CONSENSUS * strength
         painted, _ = self.easel.paint(view, f"{strength:g}", [fit], source, freedom, SOFTNESS)
@@ -290,42 +297,46 @@ class AgreedEditor:
 
 
 def painting_order(setup: TrainingSetup, side: float = SIDE) -> tuple[list[View], int]:
-    """All views in the order in which they are painted, and how many of them, the first, are anchors.
+    """Return all views in painting order, and the number of anchors, which come first.
 
-    The first shows most of the region and of detail, as fronts do; then come those farthest from all before,
-    until every view that is trained on is within `side` of one; then the others, nearest to an anchor first.
+    The first anchor shows most of the region and most detail, as fronts do. The next ones are the farthest
+    from all before, until every training view is within `side` of an anchor. The other views follow, nearest
+    to an anchor first.
     """
     views, train = setup.views, len(setup.train)
     center = scene_sphere(setup.scene[setup.region.members])[0]
     eyes = torch.stack([view.camera.position for view in views])
     toward = torch.nn.functional.normalize((eyes - center).double(), dim=1)
     angles = (toward @ toward.T).clamp(-1.0, 1.0).acos()
-    anchors = [max(range(train), key=lambda i: _front(setup, views[i].camera))]
+    anchors = [max(range(train), key=lambda i: _visible_detail(setup, views[i].camera))]
     while float((nearest := angles[:, anchors].amin(dim=1))[:train].max()) > side:
         anchors.append(int(nearest[:train].argmax()))
     others = sorted(set(range(len(views))) - set(anchors), key=lambda i: float(nearest[i]))
     return [views[i] for i in (*anchors, *others)], len(anchors)
 
 
-def _front(setup: TrainingSetup, camera: Camera) -> float:
-    """How much is to be seen from there, of the region and of detail around it, with all equally large: faces
-    have more than backs."""
+def _visible_detail(setup: TrainingSetup, camera: Camera) -> float:
+    """Return a score of the visible area and detail of the region from a camera, at equal framing.
+
+    Faces score higher than backs.
+    """
     sphere = region_sphere(setup.scene, setup.region)
-    framed = frame_sphere(camera, *sphere, _FRONT, -camera.viewmat[1, :3])
+    framed = frame_sphere(camera, *sphere, _FRAME_FILL, -camera.viewmat[1, :3])
     view = make_view(setup.scene, setup.region, framed, setup.background)
     image = view.image
     slope = (image[1:] - image[:-1]).abs().sum() + (image[:, 1:] - image[:, :-1]).abs().sum()
     return float(slope * view.mask.sum().sqrt())
 
 
-class _Loop:
-    """The pictures of all views so far.
+class _PaintingLoop:
+    """Pictures of all views so far.
 
     Args:
-        easel: paints
+        easel: paints and caches the views
         setup: scene, region and views
-        advance: progress, in pictures
-        approved: a view, and its picture that decides [H,W,3]; None: the first that is painted does
+        advance: reports progress, in pictures
+        approved: a view and its approved picture, the anchor [H,W,3]; None: the first painted view is the
+            anchor
     """
 
     def __init__(
@@ -341,7 +352,7 @@ class _Loop:
         self._calls = 0
 
     def paint(self, view: View, place: str, **how: Any) -> None:
-        """Paint a view; where the answer cannot be laid over it, what there was before stays."""
+        """Paint a view. If the answer cannot be aligned with it, the previous picture stays."""
         picture, moved = self._easel.paint(view, place, **how)
         self._calls += 1
         self._advance(self._calls, place)
@@ -351,7 +362,8 @@ class _Loop:
             self._first = self._first or [picture]
 
     def follow(self, views: Sequence[View], anchors: int) -> None:
-        """Paint each view with two references: what the anchors so far show of it, and the first of them."""
+        """Paint each view with two references: the render of the fit to the anchors so far, and the first
+        anchor."""
         members = len(self._setup.region.members)
         seen = [*self._approved]
         fit = Fit(self._setup, fit_colors(seen, members)) if seen else None
@@ -365,7 +377,7 @@ class _Loop:
                 fit = Fit(self._setup, fit_colors(seen, members))
 
     def sweep(self, views: Sequence[View]) -> None:
-        """Paint each view away from what the views so far, of those trained on, make of the scene."""
+        """Paint each view starting from the render of the fit to the training views so far."""
         train = {view.camera.name for view in self._setup.train}
         seen = [*self._approved]
         for view in views:
@@ -379,23 +391,23 @@ class _Loop:
                 seen.append(self._change(view, self.pictures[view.camera.name]))
 
     def consent(self, views: Sequence[View], place: str) -> None:
-        """Paint all views again, away from the render of what they agree on."""
+        """Paint all views again, starting from the render of their common fit."""
         fit = self.fit()
         for view in views:
             render = self._render(fit, view)
             self.paint(view, place, references=[render], source=render, strength=CONSENSUS, softness=SOFTNESS)
 
     def fit(self) -> Fit:
-        """The colors that the pictures of the training views agree on best."""
+        """Fit the colors that agree best with the pictures of the training views."""
         return Fit(self._setup, robust_colors(self.changes(), len(self._setup.region.members)))
 
     def fine_energy(self) -> float:
-        """Of the changes of the training views so far, a view."""
+        """Return the mean high-frequency energy per view of the training views' changes so far."""
         energies = [fine_energy(one.change) for one in self.changes()]
         return sum(energies) / len(energies)
 
     def changes(self) -> list[ViewChange]:
-        """What the pictures of the training views change so far, and the one that decides."""
+        """Return the changes in the training views' pictures so far, and in the approved one."""
         pictures = self.pictures
         train = [view for view in self._setup.train if view.camera.name in pictures]
         return [*self._approved, *(self._change(view, pictures[view.camera.name]) for view in train)]
@@ -404,7 +416,7 @@ class _Loop:
         return view_change(self._setup, view, view.confine(picture), shrink=1)
 
     def _render(self, fit: Fit, view: View) -> Tensor:
-        """A fit as a frame shows it."""
+        """Return a render of a fit in the frame of a view."""
         return fit.render(self._easel.painter.frame(view)[1])
 
 
@@ -415,30 +427,31 @@ def agree_views(
     log: RunLog,
     approved: tuple[View, Tensor] | None = None,
 ) -> AgreedEditor:
-    """Paint all views so that they agree; see the module's head.
+    """Paint all views so that they agree; see the module docstring.
 
     Args:
-        easel: paints
+        easel: paints and caches the views
         setup: scene, region and views
-        editor: whose strengths and kind of edit these are
-        log: of the run
-        approved: a view, and its picture that decides [H,W,3]; None: the first that is painted does
+        editor: defines the strengths and the kind of edit
+        log: log of the run
+        approved: a view and its approved picture, the anchor [H,W,3]; None: the first painted view is the
+            anchor
 
     Raises:
-        ProgdfError: no answer can be laid over its view.
+        ProgdfError: no answer can be aligned with its view.
     """
     follows = easel.painter.references > 0
     views, anchors = painting_order(setup, SIDE if follows else math.pi)
     rounds = 1 if follows else 2
-    how = f"{anchors} first, {len(views) - anchors} after these" if follows else "each after those before"
-    again = "once" if rounds == 1 else "twice"
+    order = f"{anchors} first, {len(views) - anchors} after these" if follows else "each after those before"
+    repeats = "once" if rounds == 1 else "twice"
     calls = len(views) * (1 + rounds)
-    log.say(f"{calls} pictures to paint: {how}, then all {again} more, away from what they share")
+    log.say(f"{calls} pictures to paint: {order}, then all {repeats} more, away from what they share")
     if easel.kept.folder is not None and approved is None:
         path = easel.kept.folder / ANCHOR / f"{views[0].camera.name}.png"
         log.say(f"{path} decides: paint over it and begin again, and all views follow it")
     with log.steps("edit", calls) as advance:
-        loop = _Loop(easel, setup, advance, approved)
+        loop = _PaintingLoop(easel, setup, advance, approved)
         if follows:
             loop.follow(views, anchors)
         else:

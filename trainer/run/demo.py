@@ -1,4 +1,4 @@
-"""`progdf demo`: a scene of our own, trained edits, pictures of what the sliders do, and the window."""
+"""`progdf demo`: make a scene, train edits, render pictures of the sliders, and open the window."""
 
 from __future__ import annotations
 
@@ -46,26 +46,26 @@ from trainer.store.state import StateFolder
 Paint = Callable[[Tensor, Camera, Callable[[tuple[str, ...]], Tensor]], Tensor]
 STRENGTHS = (0.0, 0.25, 0.5, 0.75, 1.0)
 MAX_GAUSSIANS = 5_000_000
-"""As many as large trained scenes have: what --size says at most."""
-_HERO_HEIGHT = 400
-_TURNS = (-4, 3, 6)  # cameras from the one of the picture, 11 degrees each
+"""Maximum of --size, the size of large trained scenes."""
+_HERO_HEIGHT = 400  # pixels
+_CAMERA_OFFSETS = (-4, 3, 6)  # side views, in cameras from the picture's camera; cameras are 11 degrees apart
 
 
 @dataclass(frozen=True)
 class DemoEdit:
-    """One edit of the demo: what it is called, which parts it may change, how."""
+    """Edit of the demo: its name, the parts that it may change, and its editor."""
 
     name: str
     parts: tuple[str, ...] = ()
     editor: str = ""
-    # makes a changed picture of the scene, of which the edit is then made: picture, its camera, how much of
-    # each pixel named parts are -> picture; its parts are found
+    # makes the changed picture that the edit is trained on, whose region is detected:
+    # picture, its camera, coverage of named parts per pixel -> picture
     paint: Paint | None = None
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How much training an edit gets, see `TrainOptions`."""
+    """Training effort of an edit, see `TrainOptions`."""
 
     views: int
     image_size: int
@@ -74,20 +74,19 @@ class Effort:
 
 @dataclass(frozen=True)
 class Show:
-    """What the demo does with one scene."""
+    """Scene of the demo and its edits."""
 
     make: Callable[[int, int], DemoScene]  # size and seed -> the scene
-    size: int  # Gaussians if nobody says how many
-    view: int  # which of the scene's cameras takes the pictures
-    # whether the edits are trained from the scene's own cameras, as one cannot see in from outside
-    inside: bool
-    draft: Effort  # the effort of --quick
-    full: Effort  # the effort otherwise
-    # two edits that share no Gaussian, one that meets one of them at least, and more
+    size: int  # default number of Gaussians
+    view: int  # index of the scene's camera for the pictures
+    inside: bool  # train from the scene's own cameras, as the interior is not visible from outside
+    draft: Effort  # with --quick
+    full: Effort  # without --quick
+    # two edits without common Gaussians, one that overlaps at least one of them, and optional others
     edits: tuple[DemoEdit, ...]
 
 
-_COAT = ("body", "head", "ears", "arms", "legs")
+_FUR_PARTS = ("body", "head", "ears", "arms", "legs")
 SHOWS = {
     "bear": Show(
         bear,
@@ -97,11 +96,12 @@ SHOWS = {
         draft=Effort(views=10, image_size=160, steps=160),
         full=Effort(views=24, image_size=256, steps=480),
         edits=(
-            # Few hues, warm against cold: fur and one red accent before a cold sky. Gold is the warm end,
-            # frost takes all warmth but the scarf's, and petrol, red's opposite, is reached by way of plum.
+            # A small palette of warm against cold: fur and a red accent in front of a cold sky. Gold is the
+            # warm extreme. Frost removes all warmth except the scarf's. Petrol is the complement of red,
+            # reached through plum.
             DemoEdit("scarf", ("scarf",), "recolor:#1b6972"),
-            DemoEdit("gold", _COAT, "recolor:#d0921a"),
-            DemoEdit("frost", (*_COAT, "grass"), "recolor:#e3eefa"),
+            DemoEdit("gold", _FUR_PARTS, "recolor:#d0921a"),
+            DemoEdit("frost", (*_FUR_PARTS, "grass"), "recolor:#e3eefa"),
             DemoEdit("panda", paint=paint_panda),
         ),
     ),
@@ -110,7 +110,7 @@ SHOWS = {
         size=40_000,
         view=0,
         inside=True,
-        # from inside each view shows a part only: more of them, and more steps to come round to each
+        # a view from inside shows only a part, so the room needs more views, and more steps to visit each
         draft=Effort(views=16, image_size=160, steps=200),
         full=Effort(views=30, image_size=256, steps=560),
         edits=(
@@ -128,7 +128,7 @@ SHOWS = {
 
 @dataclass(frozen=True)
 class DemoOptions:
-    """Make a scene, train edits of it, write pictures, open the window if there is a display."""
+    """Make a scene, train edits of it, write pictures, and open the window if there is a display."""
 
     scene: Literal["bear", "room"] = "bear"
     """A bear in the grass to look at from all around, or a room to stand in."""
@@ -147,7 +147,11 @@ class DemoOptions:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the demo. Raises ProgdfError for options that cannot be met."""
+    """Run the demo.
+
+    Raises:
+        ProgdfError: an option is out of range.
+    """
     options = parse_options(DemoOptions, argv, "progdf demo")
     _check(options)
     begun = time.perf_counter()
@@ -155,37 +159,46 @@ def main(argv: Sequence[str]) -> int:
     scene = show.make(show.size if options.size is None else options.size, options.seed)
     write_scene(options.out, scene)
     print_line(f"{options.scene}: {len(scene.gaussians)} Gaussians in {options.out / 'scene.ply'}")
-    gdfs = {name: load_gdf(path, scene.gaussians) for name, path in _train(options, show, scene).items()}
+    gdfs = {
+        name: load_gdf(path, scene.gaussians) for name, path in _train_edits(options, show, scene).items()
+    }
     print()
     for picture in write_pictures(options.out, scene, gdfs, show.view):
         print_line(f"look at {picture}")
-    command = ["view", str(options.out / "scene.ply"), *(str(_gdf(options.out, edit)) for edit in show.edits)]
+    command = [
+        "view",
+        str(options.out / "scene.ply"),
+        *(str(_gdf_path(options.out, edit)) for edit in show.edits),
+    ]
     command += ["--background", hex_color(scene.background)]
     print(f"\ndone in {time.perf_counter() - begun:.0f} s; drag the sliders:")
     print_line(f"  progdf {shlex.join(command)}")
     sys.stdout.flush()
-    if options.window and _has_display():
+    if options.window and _display_available():
         return _open_window(command)
     return 0
 
 
 def _open_window(command: Sequence[str]) -> int:
-    """Another process, as the trainer and the viewer share nothing but files; the exit status."""
+    """Open the window in another process and return its exit status.
+
+    The trainer and the viewer share nothing but files.
+    """
     return subprocess.run([sys.executable, "-P", "-m", "progdf", *command], check=False).returncode
 
 
 def _check(options: DemoOptions) -> None:
-    """Raises ProgdfError for a number that cannot be, before anything is made or written."""
+    """Raise a ProgdfError for a number out of range, before anything is made or written."""
     if options.size is not None and options.size > MAX_GAUSSIANS:
         raise ProgdfError(f"--size must be at most {MAX_GAUSSIANS}, got {options.size}")
     check_ranges(("--seed", options.seed, 0, LARGEST_SEED), ("--threads", options.threads, 0, MAX_THREADS))
 
 
 def write_scene(folder: Path, scene: DemoScene) -> None:
-    """Write scene.ply, labels.npy ([N] uint8) and cameras.json; the folder is made if need be.
+    """Write scene.ply, labels.npy ([N] uint8) and cameras.json. Create the folder if needed.
 
     Raises:
-        ProgdfError: the folder cannot be made or written to.
+        ProgdfError: the folder cannot be created or written to.
     """
     make_folder(folder)
     save_ply(folder / "scene.ply", scene.gaussians)
@@ -195,16 +208,16 @@ def write_scene(folder: Path, scene: DemoScene) -> None:
 
 
 def write_pictures(folder: Path, scene: DemoScene, gdfs: Mapping[str, Gdf], view: int) -> list[Path]:
-    """Write what sliders do: each alone, in large, and of one picture.
+    """Render the effect of the sliders: each slider alone, one in large, and the edit made from one picture.
 
     Args:
-        folder: where scene.ply lies and the pictures go
-        scene: its cameras and background
+        folder: contains scene.ply and receives the pictures
+        scene: provides cameras and background
         gdfs: the edits by name
-        view: which camera
+        view: index of the camera
 
     Returns:
-        sliders.png, hero.png, and for an edit made of a changed picture one-picture.png: the
+        Paths of sliders.png and hero.png, and for an edit made from a changed picture one-picture.png: the
         render, the picture, and the edit from three sides
     """
     gaussians = load_ply(folder / "scene.ply")
@@ -228,9 +241,9 @@ def write_pictures(folder: Path, scene: DemoScene, gdfs: Mapping[str, Gdf], view
     pictures = [("sliders", sliders), ("hero", hero)]
     for name in names:
         if (folder / f"{name}.png").is_file():
-            given = shot(_HERO_HEIGHT, {}), read_picture(folder / f"{name}.png", (_HERO_HEIGHT, _HERO_HEIGHT))
-            sides = [shot(_HERO_HEIGHT, {name: 1.0}, view + turn) for turn in _TURNS]
-            pictures.append(("one-picture", torch.cat([*given, *sides], dim=1)))
+            views = shot(_HERO_HEIGHT, {}), read_picture(folder / f"{name}.png", (_HERO_HEIGHT, _HERO_HEIGHT))
+            sides = [shot(_HERO_HEIGHT, {name: 1.0}, view + turn) for turn in _CAMERA_OFFSETS]
+            pictures.append(("one-picture", torch.cat([*views, *sides], dim=1)))
     written = []
     for name, image in pictures:
         written.append(folder / f"{name}.png")
@@ -238,34 +251,36 @@ def write_pictures(folder: Path, scene: DemoScene, gdfs: Mapping[str, Gdf], view
     return written
 
 
-def _train(options: DemoOptions, show: Show, scene: DemoScene) -> dict[str, Path]:
-    """Train the edits; their .gdf files by name. A demo that was stopped goes on where it was."""
-    from .resume import find_run  # only now: `--help` and the pictures need none of it
+def _train_edits(options: DemoOptions, show: Show, scene: DemoScene) -> dict[str, Path]:
+    """Train the edits, continue a stopped demo, and return their .gdf files by name."""
+    from .resume import find_run  # late import: `--help` and the pictures do not need it
     from .run import train
 
     for edit in show.edits:
         if edit.paint is not None:
             _paint_picture(options.out / f"{edit.name}.png", scene, scene.cameras[show.view], edit.paint)
     runs = {edit.name: _train_options(options, show, scene, edit) for edit in show.edits}
-    here = {name: find_run(run) for name, run in runs.items()}
+    found = {name: find_run(run) for name, run in runs.items()}
     for number, edit in enumerate(show.edits, 1):
-        how = f"{edit.editor} on {', '.join(edit.parts)}" if edit.paint is None else f"{edit.name}.png"
-        print(f"\n{number} of {len(show.edits)}: {edit.name}: {how}", flush=True)
+        description = (
+            f"{edit.editor} on {', '.join(edit.parts)}" if edit.paint is None else f"{edit.name}.png"
+        )
+        print(f"\n{number} of {len(show.edits)}: {edit.name}: {description}", flush=True)
         out = options.out / edit.name
-        goes_on = "stopped" in here.values() and here[edit.name] != "nothing"
-        if not goes_on:
-            StateFolder(out / "state").clear()  # of a demo with other options
+        resumes = "stopped" in found.values() and found[edit.name] != "nothing"
+        if not resumes:
+            StateFolder(out / "state").clear()  # left by a demo with other options
         try:
-            train(replace(runs[edit.name], resume=goes_on))
+            train(replace(runs[edit.name], resume=resumes))
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
                 f"what is done is kept in {options.out}; give the same command again to go on"
             ) from None
-    return {edit.name: _gdf(options.out, edit) for edit in show.edits}
+    return {edit.name: _gdf_path(options.out, edit) for edit in show.edits}
 
 
 def _train_options(options: DemoOptions, show: Show, scene: DemoScene, edit: DemoEdit) -> TrainOptions:
-    """How one edit is trained."""
+    """Return the training options of one edit."""
     ids = ",".join(str(scene.label_names.index(part)) for part in edit.parts)
     folder = options.out
     effort = show.draft if options.quick else show.full
@@ -287,7 +302,7 @@ def _train_options(options: DemoOptions, show: Show, scene: DemoScene, edit: Dem
 
 
 def _paint_picture(path: Path, scene: DemoScene, camera: Camera, paint: Paint) -> None:
-    """Write the scene as `camera` shows it, changed by hand; the .png carries the camera."""
+    """Write a render of the scene from `camera`, changed by `paint`. The .png file carries the camera."""
     gaussians = scene.gaussians
 
     def cover(parts: tuple[str, ...]) -> Tensor:
@@ -301,11 +316,11 @@ def _paint_picture(path: Path, scene: DemoScene, camera: Camera, paint: Paint) -
         painted.save(temporary_file, pnginfo=camera_chunk(camera, origin=scene.gaussians.origin))
 
 
-def _gdf(folder: Path, edit: DemoEdit) -> Path:
+def _gdf_path(folder: Path, edit: DemoEdit) -> Path:
     return folder / edit.name / f"{edit.name}.gdf"
 
 
-def _has_display() -> bool:
+def _display_available() -> bool:
     if sys.platform in ("win32", "darwin"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

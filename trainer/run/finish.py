@@ -1,4 +1,4 @@
-"""The end of every run: fit the field, measure it, write NAME.gdf, report.json and report.png."""
+"""Finish a run: fit the field, measure it, write NAME.gdf, report.json and report.png."""
 
 from __future__ import annotations
 
@@ -51,32 +51,32 @@ from trainer.views.view import View, render_view
 from .paint import sharpen
 from .record import RunRecord, render_edited_views, reopen_run
 
-_RANK_VIEWS = 4
-_WEIGHED_EVERY = 2  # of the training views one says how visible the members are
-_REPORT_ALONE = (
+_RANK_VIEWS = 4  # number of training views that the fit of a field is tested in
+_VISIBILITY_STRIDE = 2  # every second training view measures the visibility of the members
+_KEYS_OF_REPORT_ONLY = (
     *("plan", "time", "memory_mb", "curves", "views", "pictures"),
     *("losses", "trajectory", "effort", "choice", "baselines", "between"),
 )
 DEFAULTS = plain(BLANK)
 
-_LPIPS_OVER = (
+_LPIPS_AREA = (
     "each view's box around all that shows the region or that the editor changes, at least 64 pixels"
 )
 
 
 @dataclass(frozen=True)
 class RunResult:
-    """What a run leaves."""
+    """Output of a run."""
 
     folder: RunFolder
     gdf: Path
-    report: Mapping[str, Any]  # what report.json holds
-    # what was recorded, at the slider values where the field shows it; None of what is not trained
+    report: Mapping[str, Any]  # content of report.json
+    # the recordings, at the slider values at which the field reproduces them; None for edits without training
     trajectory: Trajectory | None = None
 
     @property
     def line(self) -> str:
-        """What was written, for the log."""
+        """Log line with the written file and its size."""
         return f"wrote {self.gdf}: {file_size(self.report['file']['bytes'])}"
 
 
@@ -89,15 +89,15 @@ def finish_run(
     log: RunLog,
     begun: Saved | None = None,
 ) -> RunResult:
-    """Fit, measure, and write NAME.gdf, report.json and report.png.
+    """Fit and measure the field, and write NAME.gdf, report.json and report.png.
 
     Args:
-        folder: of the run
+        folder: folder of the run
         setup: scene, region, views
-        trajectory: what was recorded
-        record: see `RunRecord`; its plan says which field is fitted, and the report repeats the rest
-        perceptual: distance of pictures
-        log: of the run
+        trajectory: the recordings
+        record: see `RunRecord`; its plan selects the field, and the report repeats the remainder
+        perceptual: image distance
+        log: log of the run
         begun: see `network.fit_network`
     """
     options = record.plan
@@ -106,7 +106,7 @@ def finish_run(
         grown = setup.extend(trajectory.added)
         evaluator = load_evaluator(folder, grown, setup.judging, trajectory)
         _, reporting = evaluator.halves()
-        fitted, network = _fit(
+        fitted, network = _fit_field(
             options.field, grown, evaluator, trajectory, perceptual, log, folder, begun=begun
         )
     with log.stage("even"):
@@ -115,7 +115,7 @@ def finish_run(
         remap = identity_remap()
         if slider == "even":
             field, remap = equalize_slider(field, grown, log)
-        if field.attributes:  # its end is what its file says, not what was recorded
+        if field.attributes:  # report the endpoint of the written field instead of the recorded one
             trajectory = replace(trajectory, end=field.offsets(1.0))
         shipped = replace(trajectory, s=remap(trajectory.s).float())
     log.say(_choice_line(fitted, field.bytes_per_member, len(trajectory), len(reporting.names)))
@@ -123,25 +123,28 @@ def finish_run(
         clip = clip_curve(evaluator, setup.judging, field, options.texts)
         if clip.reason and options.texts.asked:
             log.say(f"CLIP directional similarity is not measured: {clip.reason}")
-        gdf = _make_gdf(options, setup, field, grown.scene[len(scene) :])
+        gdf = _build_gdf(options, setup, field, grown.scene[len(scene) :])
         pairs = zip(options.views.pictures, setup.train, strict=False)
         pictures = {path: view.camera for path, view in pairs}
-        sharp = sharpen(scene, gdf, pictures, options.region.region != CHANGED, log)
-        save_gdf(folder.draft, gdf if sharp is None else sharp)  # a window shows it while it is measured
-        with log.looks("measure the edit", expected_measures(trajectory)) as looked:
-            judges = replace(evaluator, looked=looked), replace(reporting, looked=looked)
+        sharpened = sharpen(scene, gdf, pictures, options.region.region != CHANGED, log)
+        # the viewer displays the draft during the measurements
+        save_gdf(folder.draft, gdf if sharpened is None else sharpened)
+        with log.looks("measure the edit", expected_measures(trajectory)) as count_view:
+            judges = replace(evaluator, looked=count_view), replace(reporting, looked=count_view)
             measured = measure(judges, trajectory, fitted, field, remap, perceptual, clip)
         endpoint, outside = exactness(scene, gdf, end_rows(grown, trajectory))
         title = f"{options.name}: {options.editor.editor}"
-        shown = evaluator
-        if sharp is not None:
-            gdf = sharp
-            shown = load_evaluator(folder, setup, setup.judging, trajectory, gdf)
-            drawn = against_editor(shown, {"slider": gdf.field}, measured.asked, perceptual, most=1)
-            measured = replace(measured, shown=gdf.field, editor={**measured.editor, **drawn})
-        picture = report_picture(evaluator, shown, measured, record.losses, title, len(setup.held_out))
+        displayed = evaluator
+        if sharpened is not None:
+            gdf = sharpened
+            displayed = load_evaluator(folder, setup, setup.judging, trajectory, gdf)
+            slider_measures = against_editor(
+                displayed, {"slider": gdf.field}, measured.asked, perceptual, most=1
+            )
+            measured = replace(measured, shown=gdf.field, editor={**measured.editor, **slider_measures})
+        picture = report_picture(evaluator, displayed, measured, record.losses, title, len(setup.held_out))
     edited = edited_scene(scene, gdf)
-    if sharp is not None:
+    if sharpened is not None:
         write_finals(setup, edited, folder, log)
     paint = _measure_paint(folder, setup, options.views.pictures, edited)
     measures = figures(measured, endpoint, outside)
@@ -150,40 +153,40 @@ def finish_run(
     report = {
         **measures,
         "views": _view_figures(setup, evaluator),
-        "trajectory": _course_figures(shipped, slider, record),
+        "trajectory": _trajectory_figures(shipped, slider, record),
         **_record_figures(record),
         "paint": paint.figures() if paint is not None else None,
         "time": {**(_earlier_seconds(folder) if log.refits else {}), **log.rounded_seconds()},
         "memory_mb": log.peak_mb(),
         "plan": plain(options),
     }
-    return _write(folder, gdf, report, picture, shipped, setup, paint, log)
+    return _write_run(folder, gdf, report, picture, shipped, setup, paint, log)
 
 
-def _make_gdf(options: TrainOptions, setup: TrainingSetup, field: BakedField, added: Gaussians) -> Gdf:
-    """The edit as it is written, but for its report, and for what is painted finer than the Gaussians."""
+def _build_gdf(options: TrainOptions, setup: TrainingSetup, field: BakedField, added: Gaussians) -> Gdf:
+    """Return the edit without its report and without discs for paint finer than the Gaussians."""
     plan = plain(options if len(added) else with_values(options, grow=0.0))
-    given = differences(plan, DEFAULTS)
+    changed_options = differences(plan, DEFAULTS)
     scene_print = fingerprint(setup.scene)
     instruction = options.editor.editor
     rows = added if len(added) else None
-    return Gdf(options.name, setup.region, field, scene_print, instruction, given, added=rows)
+    return Gdf(options.name, setup.region, field, scene_print, instruction, changed_options, added=rows)
 
 
 def _view_figures(setup: TrainingSetup, evaluator: Evaluator) -> dict[str, Any]:
-    """As report.json has the views that measure the edit, choose its field and measure that."""
+    """Return the views that measure the edit, choose its field and measure the field, for report.json."""
     choosing, reporting = evaluator.halves()
     return {
         "held_out": bool(setup.held_out),
         "edit": list(evaluator.names),
         "field_chosen": list(choosing.names),
         "field": list(reporting.names),
-        "lpips_over": _LPIPS_OVER,
+        "lpips_over": _LPIPS_AREA,
     }
 
 
-def _course_figures(shipped: Trajectory, slider: str, record: RunRecord) -> dict[str, Any]:
-    """As report.json has the recordings, on the slider as it is shipped."""
+def _trajectory_figures(shipped: Trajectory, slider: str, record: RunRecord) -> dict[str, Any]:
+    """Return the figures of the recordings, on the final slider, for report.json."""
     return {
         "recordings": len(shipped),
         "slider": slider,
@@ -195,7 +198,10 @@ def _course_figures(shipped: Trajectory, slider: str, record: RunRecord) -> dict
 
 
 def _choice_line(fitted: Fitted, size: float, recordings: int, views: int) -> str:
-    """The field that was chosen, why, and how near it comes to the recordings; `size`: bytes per Gaussian"""
+    """Return the log line of the chosen field: the reason, its size, and its distance to the recordings.
+
+    `size`: bytes per Gaussian
+    """
     chosen = fitted.chosen
     return (
         f"{chosen.label}, {fitted.choice.why}: {size:.0f} bytes per Gaussian without "
@@ -204,7 +210,7 @@ def _choice_line(fitted: Fitted, size: float, recordings: int, views: int) -> st
     )
 
 
-def _fit(
+def _fit_field(
     options: FieldOptions,
     setup: TrainingSetup,
     evaluator: Evaluator,
@@ -214,45 +220,45 @@ def _fit(
     folder: RunFolder,
     begun: Saved | None,
 ) -> tuple[Fitted, NetworkFit | None]:
-    """The field that the options ask for, and where it is a network's, that."""
+    """Fit the requested field; also return the network fit if the field is a network."""
     choosing, reporting = evaluator.halves()
     if len(setup.held_out) == 1:
         log.say("one view alone is held out: the field is chosen and reported on it")
     if not setup.held_out:
         log.say("no view is held out: all figures are of the views that were trained on")
-    weighing = setup.train[::_WEIGHED_EVERY]
-    with log.looks("weigh the members", len(weighing)) as looked:
+    weighing = setup.train[::_VISIBILITY_STRIDE]
+    with log.looks("weigh the members", len(weighing)) as count_view:
         members = setup.region.members
         scene = setup.scene
         if trajectory.added is not None:
             count = len(trajectory.added)
             scene = scene.replace_rows(members[-count:], end_rows(setup, trajectory)[-count:])
-        weights = visibility(scene, members, weighing, looked)
-    few = setup.train[:: max(1, len(setup.train) // _RANK_VIEWS)][:_RANK_VIEWS]
+        weights = visibility(scene, members, weighing, count_view)
+    rank_views = setup.train[:: max(1, len(setup.train) // _RANK_VIEWS)][:_RANK_VIEWS]
     if options.field == "neural":
-        seen = load_evaluator(folder, setup, few, trajectory)
+        rank_evaluator = load_evaluator(folder, setup, rank_views, trajectory)
         network = fit_network(
-            trajectory, setup, seen, reporting, weights, options, perceptual, log, begun=begun
+            trajectory, setup, rank_evaluator, reporting, weights, options, perceptual, log, begun=begun
         )
         return evaluate_field(trajectory, reporting, network.field, options.target_psnr), network
-    with log.looks("fit the field", expected_looks(trajectory, options.field)) as looked:
-        choosing = replace(choosing, looked=looked)
-        reporting = replace(reporting, looked=looked)
+    with log.looks("fit the field", expected_looks(trajectory, options.field)) as count_view:
+        choosing = replace(choosing, looked=count_view)
+        reporting = replace(reporting, looked=count_view)
         if trajectory.maps is not None and options.field == "auto":
             scene = setup.scene[setup.region.members]
             rows = pack(scene, with_shN=scene.sh_degree > 0)
             return fit_grades(trajectory, rows, choosing, reporting, weights, options), None
-        seen = replace(load_evaluator(folder, setup, few, trajectory), looked=looked)
-        return fit_field(trajectory, seen, choosing, reporting, weights, options), None
+        rank_evaluator = replace(load_evaluator(folder, setup, rank_views, trajectory), looked=count_view)
+        return fit_field(trajectory, rank_evaluator, choosing, reporting, weights, options), None
 
 
 def write_finals(setup: TrainingSetup, edited: Gaussians, folder: RunFolder, log: RunLog) -> None:
-    """The finished edit's views."""
-    with log.looks("picture the edit", len(setup.views)) as looked:
+    """Render and write the views of the finished edit."""
+    with log.looks("picture the edit", len(setup.views)) as count_view:
 
         def draw(view: View) -> tuple[str, Tensor]:
             picture = render_view(edited, view.camera, setup.background)
-            looked()
+            count_view()
             return view.camera.name, picture
 
         finals = dict(map_threads(draw, setup.views))
@@ -262,11 +268,12 @@ def write_finals(setup: TrainingSetup, edited: Gaussians, folder: RunFolder, log
 def _measure_paint(
     folder: RunFolder, setup: TrainingSetup, files: Sequence[Path], edited: Gaussians
 ) -> PaintTaken | None:
-    """How much of changed pictures is in the edit; None where it was not made of such."""
+    """Return the share of the pictures' paint that the edit reproduces; None for edits not made from
+    pictures."""
     if not files:
         return None
     pictures = read_views(folder, "edited", [view.camera for view in setup.train], 1.0)
-    backgrounds = [  # a run may be fitted again when its pictures are gone
+    backgrounds = [  # a refit may come after the pictures were deleted
         picture_background(setup.scene, file, view.camera) if file.is_file() else setup.background
         for file, view in zip(files, setup.train, strict=True)
     ]
@@ -274,13 +281,13 @@ def _measure_paint(
 
 
 def _record_figures(record: RunRecord) -> dict[str, Any]:
-    """What the report repeats of the recording."""
+    """Return the part of the run's record that the report repeats."""
     names = ("objective", "losses", "kind", "kind_trial", "agreement", "up", "effort")
     return {**{name: getattr(record, name) for name in names}, "pictures": dict(record.pictures)}
 
 
 def differences(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
-    """The values that are none of the defaults."""
+    """Return the values that differ from the defaults."""
     return {
         name: differences(value, defaults[name]) if isinstance(value, dict) else value
         for name, value in values.items()
@@ -288,7 +295,7 @@ def differences(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[
     }
 
 
-def _write(
+def _write_run(
     folder: RunFolder,
     gdf: Gdf,
     report: dict[str, Any],
@@ -298,9 +305,9 @@ def _write(
     paint: PaintTaken | None,
     log: RunLog,
 ) -> RunResult:
-    """Write all files, and say what is in them."""
-    # the .gdf has the options beside it, is small, and the same training writes the same file
-    gdf = replace(gdf, report={k: v for k, v in report.items() if k not in _REPORT_ALONE})
+    """Write all files and log their content."""
+    # the .gdf holds the options separately, stays small, and is identical for identical training
+    gdf = replace(gdf, report={k: v for k, v in report.items() if k not in _KEYS_OF_REPORT_ONLY})
     result = replace(write_result(folder, gdf, report, picture), trajectory=trajectory)
     if result.gdf != folder.draft:
         folder.draft.unlink(missing_ok=True)
@@ -320,7 +327,7 @@ def _write(
 
 
 def write_result(folder: RunFolder, gdf: Gdf, report: dict[str, Any], picture: Tensor) -> RunResult:
-    """Write NAME.gdf, report.json, which gets the file's size, and report.png."""
+    """Write NAME.gdf, report.json including the size of the .gdf, and report.png."""
     path = folder.gdf(gdf.name)
     save_gdf(path, gdf)
     size = path.stat().st_size
@@ -337,7 +344,10 @@ def load_evaluator(
     trajectory: Trajectory,
     gdf: Gdf | None = None,
 ) -> Evaluator:
-    """Some views beside their edited pictures, as the run keeps them; `gdf`: an edit that may add rows."""
+    """Return an evaluator of some views with the edited pictures of the run.
+
+    `gdf`: an edit that may add rows
+    """
     cameras = [view.camera for view in views]
     edited = {s: read_views(folder, "edited", cameras, s) for s in trajectory.strengths}
     scene = setup.scene
@@ -353,13 +363,13 @@ def load_evaluator(
 
 
 def end_rows(setup: TrainingSetup, trajectory: Trajectory) -> Tensor:
-    """Raw member rows of the finished edit: original + end, in float32. [M,C]"""
+    """Return the raw member rows of the finished edit: original + end, in float32. [M,C]"""
     rows = pack(setup.scene[setup.region.members], with_shN=trajectory.end.shape[1] > BASE_CHANNELS)
     return rows + trajectory.end
 
 
 def exactness(scene: Gaussians, gdf: Gdf, end: Tensor) -> tuple[float, float]:
-    """Largest difference of a raw number: at s = 1 from the recorded end, and outside the region."""
+    """Return the largest raw differences: at s = 1 from the recorded end, and outside the region."""
     outside = ~gdf.region.mask
     finished = edited_scene(scene, gdf)
     members = torch.cat([gdf.region.members, torch.arange(len(scene), len(finished))])
@@ -377,7 +387,7 @@ def exactness(scene: Gaussians, gdf: Gdf, end: Tensor) -> tuple[float, float]:
 
 
 def _earlier_seconds(folder: RunFolder) -> dict[str, float]:
-    """Of the stages that a refit does not run again."""
+    """Return the seconds of the stages that a refit does not repeat."""
     try:
         stages = decode_json(folder.report.read_bytes())["time"]
         return {str(stage): figure for stage, figure in stages.items() if isinstance(figure, int | float)}
@@ -386,7 +396,7 @@ def _earlier_seconds(folder: RunFolder) -> dict[str, float]:
 
 
 def load_result(folder: RunFolder, name: str, scene: Gaussians, log: RunLog) -> RunResult:
-    """The result of a run that is finished."""
+    """Return the result of a finished run."""
     path = folder.gdf(name)
     gdf = load_gdf(path, scene)
     trajectory = None
@@ -402,10 +412,10 @@ def load_result(folder: RunFolder, name: str, scene: Gaussians, log: RunLog) -> 
 
 
 def refit(options: FitOptions, quiet: bool = False) -> RunResult:
-    """Fit the field of a finished run anew and rewrite its .gdf and report; nothing is optimized.
+    """Fit the field of a finished run again and rewrite its .gdf and report, without optimization.
 
     Raises:
-        ProgdfError: the folder is no finished run, or its scene is gone or another.
+        ProgdfError: the folder is not a finished run, or its scene is missing or different.
     """
     check_field_options(options.field)
     use_threads(options.threads)
@@ -417,12 +427,15 @@ def refit(options: FitOptions, quiet: bool = False) -> RunResult:
         perceptual, warning = perceptual_loss()
         if warning:
             log.say(warning)
-        own = run.record.plan
+        recorded_plan = run.record.plan
         field = replace(
-            options.field, as_printed=own.field.as_printed, draft=own.field.draft, seed=own.field.seed
+            options.field,
+            as_printed=recorded_plan.field.as_printed,
+            draft=recorded_plan.field.draft,
+            seed=recorded_plan.field.seed,
         )
-        texts = effective_texts(options.texts, own.texts)
-        plan = replace(own, field=field, texts=texts)
+        texts = effective_texts(options.texts, recorded_plan.texts)
+        plan = replace(recorded_plan, field=field, texts=texts)
         record = replace(run.record, plan=plan)
         return finish_run(run.folder, setup, run.trajectory, record, perceptual, log)
     finally:
@@ -430,7 +443,7 @@ def refit(options: FitOptions, quiet: bool = False) -> RunResult:
 
 
 def effective_texts(typed: TextOptions, recorded: TextOptions) -> TextOptions:
-    """What CLIP is asked: the command's own texts, or the run's."""
+    """Return the texts for CLIP: the command's own, or the run's."""
     return TextOptions(
         typed.text_before or recorded.text_before,
         typed.text_after or recorded.text_after,

@@ -1,8 +1,9 @@
-"""How to train towards pictures edited elsewhere: the ways to do it are tried on a few small views.
+"""Trial runs that choose what to train for pictures edited elsewhere.
 
-A picture does not say whether its edit recolors, paints, bends or moves, and the wrong way tears what should
-bend and freezes what should be painted. So all are tried for a moment, on views of 128 pixels with L1 alone,
-and judged by views that they did not see (docs/experiments.md, The trial that finds the kind of an edit).
+A picture does not tell whether its edit recolors, paints, bends or moves. The wrong choice tears parts that
+should bend, or freezes parts that should be painted. Therefore all kinds are tried for a few steps, on views
+of 128 pixels with L1 only, and evaluated on held-out views (docs/experiments.md, The trial that finds the
+kind of an edit).
 """
 
 from __future__ import annotations
@@ -31,27 +32,28 @@ from trainer.store.progress import Advance, RunLog
 from trainer.views.crops import CropScene
 from trainer.views.view import View, fit_size
 
-_SIZE = 128  # longer side of the small views, pixels
-_VIEWS = 12  # of those that change most; every third judges
-# of a trial; share of the run's own
-_MAX_STEPS = 60
-_MIN_STEPS = 24
-_SHARE = 1 / 6
-_AS_GOOD = 0.2  # dB by which training colors alone may be worse than training all: it takes fewer bytes
-_MOVED = 0.8
-"""Share of the gain of painting, in dB, from which moving is taken: what moved and is painted looks torn at a
-PSNR that is no worse. Moving gains .2-.4 of it where paint was meant, .85-1.2 where a mouth was pulled.
+_SMALL_SIDE_PX = 128  # longer side of the small views
+_MAX_VIEWS = 12  # views with the largest change; every third one is held out
+_MAX_STEPS = 60  # per trial
+_MIN_STEPS = 24  # per trial
+_STEP_SHARE = 1 / 6  # steps of a trial per step of the run
+_COLOR_ALLOWANCE_DB = 0.2  # colors alone may be worse by this than all attributes, as they take fewer bytes
+_MIN_GEOMETRY_GAIN = 0.8
+"""Minimum gain of moving, as a share of the gain of painting in dB, to choose moving.
+
+A moved part that is painted instead looks torn at a similar PSNR. Moving gains 0.2 to 0.4 of it on painted
+edits, and 0.85 to 1.2 on a pulled mouth.
 """
-_GROWS = 0.1  # of the error, which growth must take away
-_REPAINTED = 0.3  # share of the pixels beside the region that change where a tool repaints the whole picture
+_MIN_GROWTH_GAIN = 0.1  # share of the error that growth must remove
+_REPAINTED_SHARE = 0.3  # share of changed pixels outside the region if a tool repainted the whole picture
 
 
 @dataclass(frozen=True)
 class Approach:
-    """A way to train."""
+    """Training variant: the attributes that move, and how."""
 
     kind: EditKind  # what moves
-    group_steps: int = 0  # of the stage in which connected parts move as wholes; 0 leaves it out
+    group_steps: int = 0  # steps of the stage in which connected parts move rigidly; 0 omits it
     grow: float = 0.0  # see `OptimizeOptions.grow`
 
     def __str__(self) -> str:
@@ -60,66 +62,82 @@ class Approach:
 
     @property
     def said(self) -> str:
-        """The options that ask for it."""
+        """Command-line options that select this approach."""
         moved = f" --group-steps {self.group_steps}" if self.kind == "geometry" else ""
         return f"--kind {self.kind}{moved}"
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What came of it."""
+    """Result of a trial run."""
 
-    steps: int  # of each approach
-    psnrs: Mapping[Approach, float]  # of each approach on the judging views, dB
-    unedited: float  # the original's, dB
+    steps: int  # per approach
+    psnrs: Mapping[Approach, float]  # of each approach in the held-out views, dB
+    unedited: float  # PSNR of the original in these views, dB
 
     @property
     def chosen(self) -> Approach:
-        """The best, with the allowances of `_MOVED` and `_AS_GOOD`."""
-        grown = max((way for way in self.psnrs if way.grow), key=self._gain, default=None)
+        """The best approach within the allowances of `_MIN_GEOMETRY_GAIN` and `_COLOR_ALLOWANCE_DB`."""
+        best_growing = max(
+            (approach for approach in self.psnrs if approach.grow), key=self._gain, default=None
+        )
         plain = self._plain
-        moves = plain.kind == "geometry" and self._gain(plain) > max(0.0, _MOVED * self._gain(grown or plain))
-        if grown is None or moves:
+        prefers_geometry = plain.kind == "geometry" and self._gain(plain) > max(
+            0.0, _MIN_GEOMETRY_GAIN * self._gain(best_growing or plain)
+        )
+        if best_growing is None or prefers_geometry:
             return plain
-        before, after = (ROUNDING + 10 ** (-self.psnrs[way] / 10) for way in (plain, grown))
-        return grown if after < (1 - _GROWS) * before else plain
+        error, grown_error = (
+            ROUNDING + 10 ** (-self.psnrs[approach] / 10) for approach in (plain, best_growing)
+        )
+        return best_growing if grown_error < (1 - _MIN_GROWTH_GAIN) * error else plain
 
     @property
     def _plain(self) -> Approach:
-        """The best that adds nothing."""
-        moving = [way for way in self.psnrs if way.kind == "geometry" and not way.grow]
-        painting = [way for way in self.psnrs if way.kind != "geometry" and not way.grow]
-        moved = max(moving, key=self._gain, default=None)
-        painted = max(painting, key=self._gain, default=None)
-        if moved is not None and (
-            painted is None or self._gain(moved) > max(0.0, _MOVED * self._gain(painted))
+        """The best approach without growth."""
+        moving = [approach for approach in self.psnrs if approach.kind == "geometry" and not approach.grow]
+        painting = [approach for approach in self.psnrs if approach.kind != "geometry" and not approach.grow]
+        best_moving = max(moving, key=self._gain, default=None)
+        best_painting = max(painting, key=self._gain, default=None)
+        if best_moving is not None and (
+            best_painting is None
+            or self._gain(best_moving) > max(0.0, _MIN_GEOMETRY_GAIN * self._gain(best_painting))
         ):
-            return moved
-        assert painted is not None
-        return next(way for way in painting if self._gain(way) >= self._gain(painted) - _AS_GOOD)
+            return best_moving
+        assert best_painting is not None
+        return next(
+            approach
+            for approach in painting
+            if self._gain(approach) >= self._gain(best_painting) - _COLOR_ALLOWANCE_DB
+        )
 
     def _gain(self, way: Approach) -> float:
         return self.psnrs[way] - self.unedited
 
     def line(self) -> str:
-        """For the log."""
+        """Return the log line."""
         tried = ", ".join(f"{approach} {psnr:.1f}" for approach, psnr in self.psnrs.items())
-        skips = "" if self.chosen.grow else f" ({self.chosen.said} skips the trial)"
-        if not self.chosen.grow and any(way.grow for way in self.psnrs):
-            skips = ": growth would not take a tenth of the error away, or takes the place of what moves"
+        note = "" if self.chosen.grow else f" ({self.chosen.said} skips the trial)"
+        if not self.chosen.grow and any(candidate.grow for candidate in self.psnrs):
+            note = ": growth would not take a tenth of the error away, or takes the place of what moves"
         return (
             f"tried for {self.steps} steps with L1 on small views, PSNR in other views: unedited "
-            f"{self.unedited:.1f}, {tried} dB; taken: {self.chosen}{skips}"
+            f"{self.unedited:.1f}, {tried} dB; taken: {self.chosen}{note}"
         )
 
     def figures(self) -> dict[str, Any]:
-        """As report.json has it: growth only where it was taken, as a run without it writes the same."""
-        reported = [way for way in self.psnrs if not way.grow or way == self.chosen]
+        """Return the figures for report.json.
+
+        Growth is included only if chosen, so that a run without growth writes the same report.
+        """
+        reported = [approach for approach in self.psnrs if not approach.grow or approach == self.chosen]
         return {
             "steps": self.steps,
             "loss": "L1",
             "unedited_psnr": round(self.unedited, 2),
-            "psnr": {str(way): round(psnr, 2) for way, psnr in self.psnrs.items() if way in reported},
+            "psnr": {
+                str(approach): round(psnr, 2) for approach, psnr in self.psnrs.items() if approach in reported
+            },
             "chosen": str(self.chosen),
         }
 
@@ -127,13 +145,13 @@ class Trial:
 def choose_approach(
     options: TrainOptions, setup: TrainingSetup, editor: ImageEditor, log: RunLog
 ) -> tuple[Approach, dict[str, Any] | None]:
-    """What plan and editor say, or a trial finds where they leave it open; and the trial's figures.
+    """Return the approach set by plan and editor, or found by a trial run, and the trial's figures.
 
     Args:
-        options: resolved
+        options: resolved options
         setup: the training views
-        editor: pictures the finished edit
-        log: of the run
+        editor: makes the finished edit of each view
+        log: log of the run
 
     Raises:
         ProgdfError: an edited view is missing or broken.
@@ -146,26 +164,26 @@ def choose_approach(
     if kind == "geometry" and optimize.group_steps is not None and not optimize.grow:
         return Approach(kind, optimize.group_steps), None
     edited = [editor.edit(view, 1.0) for view in setup.train]
-    ways = approaches(with_values(options, kind=kind), setup, edited)
-    if ways[-1] == Approach("style", grow=optimize.grow) and confines_edit(editor, "style"):
+    candidates = approaches(with_values(options, kind=kind), setup, edited)
+    if candidates[-1] == Approach("style", grow=optimize.grow) and confines_edit(editor, "style"):
         edited = [view.confine(picture) for view, picture in zip(setup.train, edited, strict=True)]
     if all(torch.equal(picture, view.image) for picture, view in zip(edited, setup.train, strict=True)):
-        return ways[0], None
-    with log.steps("try kinds", len(ways)) as advance:
-        trial = try_approaches(options, setup, edited, ways, advance)
+        return candidates[0], None
+    with log.steps("try kinds", len(candidates)) as advance:
+        trial = try_approaches(options, setup, edited, candidates, advance)
     log.say(trial.line())
-    is_open = len(ways) > 2 or trial.chosen.grow or not optimize.grow
+    is_open = len(candidates) > 2 or trial.chosen.grow or not optimize.grow
     return trial.chosen, trial.figures() if is_open else None
 
 
 def approaches(options: TrainOptions, setup: TrainingSetup, edited: Sequence[Tensor]) -> list[Approach]:
-    """The ways that the plan leaves open, those that move least first.
+    """Return the approaches that the plan leaves open, those that change least first.
 
-    Where a tool repaints the whole picture nothing tells what moved from what was painted anew beside it, and
-    moving the region over that is no edit of it: geometry is then not tried unless it is asked for.
+    If a tool repaints the whole picture, motion cannot be distinguished from new paint outside the region,
+    and moving the region over it is not an edit of the region. Geometry is then tried only on request.
 
     Args:
-        options: resolved
+        options: resolved options
         setup: the training views
         edited: the full edit of each view, not confined to the region. [H,W,3]
     """
@@ -176,7 +194,7 @@ def approaches(options: TrainOptions, setup: TrainingSetup, edited: Sequence[Ten
     grow = [Approach("geometry", grow=optimize.grow)] if optimize.grow else []
     if optimize.kind == "geometry":
         return geometry + grow
-    grow = [replace(way, kind="style") for way in grow]
+    grow = [replace(approach, kind="style") for approach in grow]
     if optimize.kind != "auto":
         return [Approach(optimize.kind), *grow]
     changed = beside = 0.0
@@ -184,9 +202,14 @@ def approaches(options: TrainOptions, setup: TrainingSetup, edited: Sequence[Ten
         outside = view.mask < 0.05
         changed += float(((picture - view.image).abs().amax(dim=2) > 0.05)[outside].sum())
         beside += float(outside.sum())
-    if changed > _REPAINTED * beside:
+    if changed > _REPAINTED_SHARE * beside:
         return [Approach("color"), Approach("style"), *grow]
-    return [Approach("color"), Approach("style"), *geometry, *(replace(way, kind="geometry") for way in grow)]
+    return [
+        Approach("color"),
+        Approach("style"),
+        *geometry,
+        *(replace(approach, kind="geometry") for approach in grow),
+    ]
 
 
 def try_approaches(
@@ -196,37 +219,39 @@ def try_approaches(
     ways: Sequence[Approach],
     advance: Advance | None = None,
 ) -> Trial:
-    """Try some ways; the same inputs give the same figures.
+    """Try some approaches. The same inputs give the same figures.
 
     Args:
-        options: of the run
+        options: options of the run
         setup: scene, region and training views
         edited: the full edit of each training view, not confined to the region. [H,W,3]
         ways: see `approaches`
-        advance: progress: ways tried
+        advance: reports the number of approaches tried
 
     Raises:
         FloatingPointError: a loss is not finite.
     """
-    most = sorted(zip(setup.train, edited, strict=True), key=lambda pair: -_change(*pair))[:_VIEWS]
-    trained = [pair for i, pair in enumerate(most) if i % 3 != 1]
-    plain = _small_views(setup, most)
+    changed = sorted(zip(setup.train, edited, strict=True), key=lambda pair: -_change(*pair))[:_MAX_VIEWS]
+    trained = [pair for i, pair in enumerate(changed) if i % 3 != 1]
+    plain = _small_views(setup, changed)
     unedited = _psnr(plain, torch.zeros_like(plain.original))
-    steps = max(_MIN_STEPS, min(_MAX_STEPS, round(_SHARE * options.optimize.steps)))
+    steps = max(_MIN_STEPS, min(_MAX_STEPS, round(_STEP_SHARE * options.optimize.steps)))
     psnrs: dict[Approach, float] = {}
-    for way in ways:
-        grown = setup
+    for approach in ways:
+        extended = setup
         small = plain
         seeds = 0
-        if way.grow:
+        if approach.grow:
             views, pictures = zip(*trained, strict=True)
-            rows = seed_rows(setup, views, pictures, int(way.grow * len(setup.region)), options.optimize.seed)
-            grown = setup.extend(rows)
+            rows = seed_rows(
+                setup, views, pictures, int(approach.grow * len(setup.region)), options.optimize.seed
+            )
+            extended = setup.extend(rows)
             seeds = len(rows)
-            small = _small_views(grown, most)
-        psnrs[way] = _try_approach(options, way, grown, seeds, small, steps)
+            small = _small_views(extended, changed)
+        psnrs[approach] = _try_approach(options, approach, extended, seeds, small, steps)
         if advance is not None:
-            advance(len(psnrs), f"{way} {psnrs[way]:.1f} dB")
+            advance(len(psnrs), f"{approach} {psnrs[approach]:.1f} dB")
     return Trial(steps, psnrs, unedited)
 
 
@@ -238,14 +263,14 @@ def _try_approach(
     small: Evaluator,
     steps: int,
 ) -> float:
-    """PSNR in the judging views, dB. `seeds`: how many members, the last, are none of the scene's"""
-    taught = small.only([i for i in range(len(small.crops)) if i % 3 != 1])
+    """Return the PSNR in the held-out views, dB. `seeds`: number of added members, which come last"""
+    training = small.only([i for i in range(len(small.crops)) if i % 3 != 1])
     original = small.original
-    crops = taught.crops
-    targets = taught.edited[1.0]
+    crops = training.crops
+    targets = training.edited[1.0]
     stage = TargetStage(1.0, targets, steps)
     if way.group_steps:
-        # how far parts get as wholes; what the members add to that takes longer than a trial
+        # only the rigid motion of parts; optimizing single members takes longer than a trial
         groups = group_stage(original, crops, [targets], steps, options.optimize.seed)
         end = groups.to_stages(original, crops, [stage])[0].place(torch.zeros_like(original))
     else:
@@ -263,29 +288,29 @@ def _try_approach(
 
 
 def resolve_approach(options: TrainOptions, way: Approach) -> OptimizeOptions:
-    """See `resolve_kind`."""
+    """Return the optimization options of an approach, see `resolve_kind`."""
     return resolve_kind(options, way.kind, way.group_steps, way.grow)
 
 
 def _small_views(setup: TrainingSetup, pairs: Sequence[tuple[View, Tensor]]) -> Evaluator:
-    """Views and their edited pictures, small."""
-    small = [_small(setup, view.widen([picture]), picture) for view, picture in pairs]
+    """Return an evaluator of the views and their edited pictures at small size."""
+    small = [_small_view(setup, view.widen([picture]), picture) for view, picture in pairs]
     crops, targets, pixels = zip(*small, strict=True)
     original = pack(setup.scene[setup.region.members], with_shN=setup.scene.sh_degree > 0)
     return Evaluator(original, crops, pixels, {1.0: targets}, [view.camera.name for view, _ in pairs])
 
 
-def _small(setup: TrainingSetup, view: View, picture: Tensor) -> tuple[CropScene, Tensor, Tensor]:
-    """What is rendered, what it should be, and which pixels count."""
-    scene, shrink, counting = shrink_view(setup, view, picture, fit_size(view.camera, _SIZE))
+def _small_view(setup: TrainingSetup, view: View, picture: Tensor) -> tuple[CropScene, Tensor, Tensor]:
+    """Return the small scene to render, its target picture, and the mask of the counted pixels."""
+    scene, shrink, counting = shrink_view(setup, view, picture, fit_size(view.camera, _SMALL_SIDE_PX))
     return scene, shrink(picture), counting[..., 0] > 0.5
 
 
 def _psnr(small: Evaluator, offsets: Tensor) -> float:
-    """In the views that judge, or all where there is one alone, dB."""
+    """Return the PSNR in the held-out views, or in the only view, dB."""
     count = len(small.crops)
-    judges = small.only(range(1, count, 3) or range(count))
-    return judges.psnr(judges.pictures(offsets), judges.edited[1.0])
+    held_out = small.only(range(1, count, 3) or range(count))
+    return held_out.psnr(held_out.pictures(offsets), held_out.edited[1.0])
 
 
 def _change(view: View, picture: Tensor) -> float:

@@ -1,4 +1,4 @@
-"""A finished run, opened again: its scene, region and views as they were, and what was recorded."""
+"""Reopen a finished run: its scene, region, views and recordings."""
 
 from __future__ import annotations
 
@@ -25,26 +25,26 @@ from trainer.views.view import make_view, with_near_plane
 
 @dataclass(frozen=True)
 class RunRecord:
-    """What the recording's file tells of the run.
+    """Metadata of a run in its trajectory file.
 
     Raises:
-        ValueError: the losses do not fit each other, or the name is none.
+        ValueError: the losses differ in length, or the name is invalid.
     """
 
-    plan: TrainOptions  # what was to be done, see `recorded_options`
-    scene: Path  # where the scene was
+    plan: TrainOptions  # the run's options, see `recorded_options`
+    scene: Path  # path of the scene during the run
     held_out: Sequence[str]  # names of the views that the edit was not trained on
     background: tuple[float, float, float]  # color behind the scene
-    kind: EditKind  # what the edit moves
-    group_steps: int  # of the stage in which parts move as wholes; 0: there was none
-    kind_trial: Mapping[str, Any] | None  # figures of the trial that found these two, if there was one
-    objective: str  # what was minimized, in words
+    kind: EditKind  # attributes that move
+    group_steps: int  # steps of the stage in which parts move rigidly; 0: there was none
+    kind_trial: Mapping[str, Any] | None  # figures of the trial run that chose these two, if there was one
+    objective: str  # description of the minimized loss
     losses: Mapping[str, Sequence[float | None]]  # see `Losses`
-    attribute_worth_db: Mapping[str, float]  # what the edit would lose without each attribute, dB
-    agreement: Mapping[str, Any] | None  # whether the edited views agree, where that was measured
-    up: Mapping[str, Any] | None  # the axis that is up, and why
-    effort: Mapping[str, Any] = field(default_factory=dict)  # what was decided: strengths, steps, model
-    pictures: Mapping[str, str] = field(default_factory=dict)  # changed pictures, and their hashes
+    attribute_worth_db: Mapping[str, float]  # loss of quality without each attribute, dB
+    agreement: Mapping[str, Any] | None  # agreement of the edited views, if measured
+    up: Mapping[str, Any] | None  # the up axis, and the reason for it
+    effort: Mapping[str, Any] = field(default_factory=dict)  # chosen strengths, steps, model
+    pictures: Mapping[str, str] = field(default_factory=dict)  # paths of changed pictures -> their hashes
 
     def __post_init__(self) -> None:
         columns = [self.losses.get(name, []) for name in ("step", "left")]
@@ -54,22 +54,22 @@ class RunRecord:
 
 
 def read_record(about: Mapping[str, Any]) -> RunRecord:
-    """What a recording's file tells of its run.
+    """Return the run record in the metadata of a trajectory file.
 
     Raises:
-        ValueError: it is no record, or damaged.
+        ValueError: it is not a record, or damaged.
     """
     return convert_json(about, RunRecord)
 
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """What a finished run left."""
+    """Content of a finished run's folder."""
 
     folder: RunFolder
     scene: Gaussians  # the original
-    region: Region  # what was edited
-    trajectory: Trajectory  # what was recorded
+    region: Region  # the edited region
+    trajectory: Trajectory  # the recordings
     record: RunRecord
 
 
@@ -78,10 +78,10 @@ def reopen_run(root: Path, scene: Path | None = None) -> FinishedRun:
 
     Args:
         root: the folder
-        scene: where the scene is now, if it has moved
+        scene: current path of the scene, if it has moved
 
     Raises:
-        ProgdfError: the folder is no finished run, or its scene is gone or another.
+        ProgdfError: the folder is not a finished run, or its scene is missing or different.
     """
     folder = RunFolder(root)
     if not folder.trajectory.is_file():
@@ -115,10 +115,10 @@ def reopen_run(root: Path, scene: Path | None = None) -> FinishedRun:
 
 
 def render_run_views(run: FinishedRun) -> TrainingSetup:
-    """Render the run's views; their boxes hold the region, not what an edit may show beside it.
+    """Render the run's views. Their boxes hold the region, without changes that an edit may cause beside it.
 
     Raises:
-        ProgdfError: cameras.json is not of the run's pictures, see `read_run_cameras`.
+        ProgdfError: cameras.json does not match the run's pictures, see `read_run_cameras`.
     """
     background = torch.tensor(run.record.background)
     held_out = set(run.record.held_out)
@@ -135,7 +135,10 @@ def render_run_views(run: FinishedRun) -> TrainingSetup:
 
 
 def render_edited_views(run: FinishedRun) -> TrainingSetup:
-    """`render_run_views`; the boxes of those trained on hold all that the edit changes, as in training."""
+    """Render the run's views, with training views whose boxes hold all changes of the edit, as in training.
+
+    See `render_run_views`.
+    """
     setup = render_run_views(run)
     if run.record.plan.optimize.as_printed:
         return whole_views(setup)

@@ -1,4 +1,5 @@
-"""A run that takes its region away: nothing is optimized; the course is known, and holes are closed."""
+"""Remove a region. The path over strengths is known in closed form, so nothing is optimized; holes are
+filled."""
 
 from __future__ import annotations
 
@@ -33,22 +34,24 @@ from trainer.views.view import View, render_view
 from .finish import DEFAULTS, RunResult, differences, write_result
 
 BACKGROUNDS = ("white", "black", "checker")
-_ALIKE = 0.05  # of color, as what was painted is told from what was not
-_PAINTED = 2 / 255
-_TILES = 16  # across a picture
-_STEPS = 20
+_TOLERANCE = 0.05  # color tolerance of equal pixels; also the mask value from which a pixel counts as region
+_MIN_PAINT = 2 / 255  # smallest color change that counts as paint
+_CHECKER_TILES = 16  # tiles of the checker along the longer side of a picture
+_STRENGTH_STEPS = 20  # steps between strengths 0 and 1 in which the opacities are compared
 
 
 def is_removal(options: TrainOptions, setup: TrainingSetup, log: RunLog) -> bool:
-    """Whether the run takes its region away; of changed pictures, what they show decides. Says so in a line.
+    """Return True if the run removes its region. For changed pictures, their content decides. Logs the
+    decision.
 
-    Recoloring can meet any paint, also what shows behind the region: that it does says nothing. That most of
-    what was painted is what the scene shows without the region would be a coincidence.
+    Recoloring can reproduce any paint, also the background behind the region, so its success is no evidence
+    against removal. But if most of the paint equals the scene without the region, the pictures intend a
+    removal.
 
     Args:
-        options: resolved
-        setup: of changed pictures, with their views
-        log: of the run
+        options: resolved options
+        setup: changed pictures and their views
+        log: log of the run
     """
     editor = options.editor
     if editor.family == "remove":
@@ -75,70 +78,74 @@ def is_removal(options: TrainOptions, setup: TrainingSetup, log: RunLog) -> bool
 
 
 def vanished_share(setup: TrainingSetup, options: TrainOptions) -> float:
-    """How much of the painted change, of its energy, is what the scene shows without the region. 0..1
+    """Return the share of the painted energy that equals the scene without the region, 0 to 1.
 
     Args:
-        setup: of the changed pictures, in their order
-        options: which these are
+        setup: the changed pictures, in their order
+        options: names the pictures
     """
     scene = setup.scene
-    rest = setup.scene[~setup.region.mask]
+    remaining = setup.scene[~setup.region.mask]
     change = behind = 0.0
     for view, path in zip(setup.train, options.views.pictures, strict=True):
         target = read_edit(scene, view.camera, view.image, path)
         background = picture_background(scene, path, view.camera)
-        original, gone = (render_view(some, view.camera, background).clamp(0, 1) for some in (scene, rest))
-        apart = target - view.image
-        energy = apart.square().sum(dim=2) * (apart.abs().amax(dim=2) > _PAINTED)
-        alike = (original + apart - gone).abs().amax(dim=2) < _ALIKE
+        original, without_region = (
+            render_view(gaussians, view.camera, background).clamp(0, 1) for gaussians in (scene, remaining)
+        )
+        change_of_view = target - view.image
+        energy = change_of_view.square().sum(dim=2) * (change_of_view.abs().amax(dim=2) > _MIN_PAINT)
+        matches = (original + change_of_view - without_region).abs().amax(dim=2) < _TOLERANCE
         change += float(energy.sum())
-        behind += float(energy[alike].sum())
+        behind += float(energy[matches].sum())
     return behind / change if change else 0.0
 
 
 def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder, log: RunLog) -> RunResult:
-    """Take the region away, close the holes, measure, and write NAME.gdf, report.json and report.png.
+    """Remove the region, fill the holes, measure, and write NAME.gdf, report.json and report.png.
 
     Args:
-        options: resolved
-        setup: scene, region, and views: of a rig or of given cameras, or those of changed pictures
-        folder: of the run
-        log: of the run
+        options: resolved options
+        setup: scene, region, and views: of a rig, of given cameras, or of changed pictures
+        folder: folder of the run
+        log: log of the run
     """
     scene = setup.scene
-    chosen = len(setup.region)
+    selected = len(setup.region)
     setup = replace(setup, region=with_crumbs(scene, setup.region))
     region = setup.region
-    rest = scene[~setup.region.mask]
-    if len(region) > chosen:
-        log.say(f"{format_count(len(region) - chosen, 'Gaussian')} that would float alone without it go too")
+    remaining = scene[~setup.region.mask]
+    if len(region) > selected:
+        log.say(
+            f"{format_count(len(region) - selected, 'Gaussian')} that would float alone without it go too"
+        )
     with log.stage("fill"):
         painted, pictures = _painted_views(options, setup)
         around = setup if not options.views.pictures else _views_around(options, setup)
         kind = options.editor.fill or ("picture" if pictures else "surface")
         views = [*painted, *(view for view in around.train if view.camera.name not in pictures)]
         fill = Fill(None, 0, 0, 0)
-        if kind != "none" and len(rest):
-            fill = fill_holes(scene, rest, views, pictures if kind == "picture" else None)
-    rows = 0 if fill.rows is None else len(fill.rows)
+        if kind != "none" and len(remaining):
+            fill = fill_holes(scene, remaining, views, pictures if kind == "picture" else None)
+    rows_added = 0 if fill.rows is None else len(fill.rows)
     log.say(
         f"holes: none is filled, as asked ({kind})"
         if kind == "none"
         else f"holes: {fill.before} pixels in {format_count(len(views), 'view')}, {fill.after} after "
-        f"{format_count(rows)} from {format_count(fill.views, 'view')} ({kind})"
+        f"{format_count(rows_added)} from {format_count(fill.views, 'view')} ({kind})"
     )
     with log.stage("report"):
         gdf = tidy(scene, [Step("remove", region)], options.name, options.editor.editor, fill.rows)
-        removed = rest if fill.rows is None else concatenate([rest, fill.rows])
+        removed = remaining if fill.rows is None else concatenate([remaining, fill.rows])
         judging = around.judging
         errors = _measure(edited_scene(scene, gdf), removed, judging)
         report = {
             "edit": {"psnr_to_views": min(errors.values()), "psnr_by_background": errors},
             "removal": {
                 "members": len(region),
-                "opacity_off_linear": round(_off_linear(scene, gdf), 4),
+                "opacity_off_linear": round(_max_deviation_from_linear(scene, gdf), 4),
                 "fill": kind,
-                "rows_added": rows,
+                "rows_added": rows_added,
                 "filled_from_views": fill.views,
                 "hole_pixels": fill.before,
                 "hole_pixels_after": fill.after,
@@ -149,21 +156,21 @@ def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder
             "memory_mb": log.peak_mb(),
             "plan": plain(recorded_options(options)),
         }
-        picture = _sheet(scene, gdf, judging, f"{options.name}: {options.editor.editor}")
+        picture = _contact_sheet(scene, gdf, judging, f"{options.name}: {options.editor.editor}")
     finals = {view.camera.name: render_view(removed, view.camera, setup.background) for view in setup.views}
     write_views(folder, "final", finals)
-    folder.trajectory.unlink(missing_ok=True)  # of an earlier run that recolored
+    folder.trajectory.unlink(missing_ok=True)  # left by an earlier run that recolored
     about = {name: report[name] for name in ("edit", "removal")}
     gdf = replace(gdf, options=differences(report["plan"], DEFAULTS), report=about)
     result = write_result(folder, gdf, report, picture)
-    said = ", ".join(f"{psnr:.1f} dB on {name}" for name, psnr in errors.items())
-    log.say(f"to a render without the region, at its pixels in views not filled from: {said}")
+    psnr_list = ", ".join(f"{psnr:.1f} dB on {name}" for name, psnr in errors.items())
+    log.say(f"to a render without the region, at its pixels in views not filled from: {psnr_list}")
     log.say(f"{result.line}; shadows and reflections stay")
     return result
 
 
 def with_crumbs(scene: Gaussians, region: Region) -> Region:
-    """The region, and the floaters that taking it away leaves of its surroundings; see `find_strays`."""
+    """Return the region with the floaters that its removal would leave behind, see `find_strays`."""
     mask = ~region.mask
     alone = mask.nonzero()[:, 0][find_strays(scene[mask]).floaters]
     mask[alone[~torch.isin(alone, torch.from_numpy(find_strays(scene).floaters))]] = False
@@ -171,11 +178,11 @@ def with_crumbs(scene: Gaussians, region: Region) -> Region:
 
 
 def _painted_views(options: TrainOptions, setup: TrainingSetup) -> tuple[list[View], Mapping[str, Tensor]]:
-    """Views of the pictures that show what was behind, and these by name, as the views would be. [H,W,3]"""
-    what = options.editor.editor.partition(":")[2]
-    if not what:
+    """Return the views of the pictures that show the background, and these pictures by view name. [H,W,3]"""
+    editor_paths = options.editor.editor.partition(":")[2]
+    if not editor_paths:
         return [], {}
-    paths = options.views.pictures or picture_paths(what)
+    paths = options.views.pictures or picture_paths(editor_paths)
     if not options.views.pictures:
         setup = make_training_setup(replace(options.views, pictures=paths), setup.scene, setup.region)
     pairs = list(zip(setup.train, paths, strict=True))
@@ -185,7 +192,7 @@ def _painted_views(options: TrainOptions, setup: TrainingSetup) -> tuple[list[Vi
 
 
 def _views_around(options: TrainOptions, setup: TrainingSetup) -> TrainingSetup:
-    """Views from all around beside those of the pictures; these alone where there are none to be had."""
+    """Return views from all sides besides those of the pictures; only the latter if there are no others."""
     try:
         return make_training_setup(replace(options.views, pictures=()), setup.scene, setup.region)
     except ProgdfError:
@@ -193,11 +200,11 @@ def _views_around(options: TrainOptions, setup: TrainingSetup) -> TrainingSetup:
 
 
 def _measure(edited: Gaussians, reference: Gaussians, views: Sequence[View]) -> dict[str, float]:
-    """PSNR at the region's pixels of all views together, by background, dB."""
+    """Return the PSNR at the region's pixels over all views, by background, dB."""
     errors = dict.fromkeys(BACKGROUNDS, 0.0)
     count = 0
     for view in views:
-        pixels = view.mask > _ALIKE
+        pixels = view.mask > _TOLERANCE
         count += 3 * int(pixels.sum())
         pairs = zip(on_backgrounds(edited, view.camera), on_backgrounds(reference, view.camera), strict=True)
         for name, (a, b) in zip(BACKGROUNDS, pairs, strict=True):
@@ -206,45 +213,46 @@ def _measure(edited: Gaussians, reference: Gaussians, views: Sequence[View]) -> 
 
 
 def on_backgrounds(scene: Gaussians, camera: Camera) -> list[Tensor]:
-    """The scene on each of `BACKGROUNDS`. [H,W,3] each"""
+    """Return the scene rendered on each of `BACKGROUNDS`. [H,W,3] each"""
     with torch.no_grad():
-        drawn = render(scene, camera, (0.0, 0.0, 0.0))
-    side = max(1, max(camera.width, camera.height) // _TILES)
+        output = render(scene, camera, (0.0, 0.0, 0.0))
+    side = max(1, max(camera.width, camera.height) // _CHECKER_TILES)
     rows = torch.arange(camera.height)[:, None] // side
     columns = torch.arange(camera.width) // side
     checker = ((rows + columns) % 2).float()
     shades = (torch.ones_like(checker), torch.zeros_like(checker), checker)
-    return [(drawn.image + (drawn.transmittance * shade)[..., None]).clamp(0.0, 1.0) for shade in shades]
+    return [(output.image + (output.transmittance * shade)[..., None]).clamp(0.0, 1.0) for shade in shades]
 
 
-def _off_linear(scene: Gaussians, gdf: Gdf) -> float:
-    """By how much the sum of the region's opacities is off a straight line, as a share of it, at worst."""
+def _max_deviation_from_linear(scene: Gaussians, gdf: Gdf) -> float:
+    """Return the largest deviation of the region's summed opacity from a straight line, as a share of the
+    sum."""
     members = gdf.region.members
-    whole = float(scene.opacities[members].sum())
-    off = [0.0]
-    for i in range(1, _STEPS + 1):
-        s = i / _STEPS
-        now = edited_scene(scene, gdf, s).opacities[members].sum()
-        off.append(abs(float(now) / whole - (1.0 - s)))
-    return max(off)
+    total = float(scene.opacities[members].sum())
+    deviations = [0.0]
+    for i in range(1, _STRENGTH_STEPS + 1):
+        s = i / _STRENGTH_STEPS
+        current = edited_scene(scene, gdf, s).opacities[members].sum()
+        deviations.append(abs(float(current) / total - (1.0 - s)))
+    return max(deviations)
 
 
 def _picture_error(
     setup: TrainingSetup, removed: Gaussians, views: Sequence[View], pictures: Mapping[str, Tensor]
 ) -> float | None:
-    """PSNR to the pictures at what was painted, dB; None where there are none."""
+    """Return the PSNR to the pictures in the painted pixels, dB; None if there are none."""
     error = count = 0.0
     for view in views:
         target = pictures[view.camera.name]
-        painted = (target - view.image).abs().amax(dim=2) > _PAINTED
-        made = render_view(removed, view.camera, setup.background).clamp(0.0, 1.0)
-        error += float((made - target)[painted].square().sum())
+        painted = (target - view.image).abs().amax(dim=2) > _MIN_PAINT
+        image = render_view(removed, view.camera, setup.background).clamp(0.0, 1.0)
+        error += float((image - target)[painted].square().sum())
         count += 3 * int(painted.sum())
     return round(decibels(error / count), 2) if count else None
 
 
-def _sheet(scene: Gaussians, gdf: Gdf, views: Sequence[View], title: str) -> Tensor:
-    """The view that shows most of the region, at five strengths on three backgrounds."""
+def _contact_sheet(scene: Gaussians, gdf: Gdf, views: Sequence[View], title: str) -> Tensor:
+    """Return the view that shows most of the region, at five strengths on three backgrounds."""
     view = max(views, key=lambda one: float(one.mask.sum()))
     strengths = (0.0, 0.25, 0.5, 0.75, 1.0)
     columns = [on_backgrounds(edited_scene(scene, gdf, s), view.camera) for s in strengths]

@@ -1,4 +1,5 @@
-"""What a training command finds in its folder: nothing, a stopped run to go on with, or a finished one."""
+"""Decide how a training command continues in its folder: start, resume a stopped run, or reuse a finished
+one."""
 
 from __future__ import annotations
 
@@ -25,28 +26,29 @@ from trainer.options import MAX_THREADS, TrainOptions, flat_values
 from trainer.resolve import count_threads, recorded_options, resolve
 from trainer.store.run_folder import RunFolder, begin_log, remove_leftovers
 
-_VERSION = 7  # of how a run goes on from what it has saved; 7: few pictures choose how their mask is held
+_VERSION = 7  # of the saved state; 7: with few pictures, training chooses how to constrain their mask
 _SWITCHES = (
     "NUMBA_CPU_FEATURES", "MKL_ENABLE_INSTRUCTIONS", "MKL_CBWR", "OPENBLAS_CORETYPE", "ONEDNN_MAX_CPU_ISA",
 )  # fmt: skip
 _SOG_SUFFIXES = (".json", ".webp")  # of the files of an unpacked .sog
 
 REGION = "region"
-"""Of the saved state: members and score."""
+"""Part of the saved state with the region's members and score."""
 
 
 @dataclass(frozen=True)
 class ResumeDecision:
-    """What is to be done in a run folder."""
+    """Next action in a run folder."""
 
-    # "start" from nothing, "go on" from the saved state; "nothing", as the run is finished
+    # "start" from nothing, "go on" from the saved state; "nothing": the run is finished
     does: Literal["start", "go on", "nothing"]
-    threads: int  # with how many; a run keeps to those it began with, as sums depend on them
+    threads: int  # a resumed run keeps the number it began with, as sums depend on it
     notes: tuple[str, ...] = ()  # lines for the log
 
 
 def load_region(out: Path) -> Region | None:
-    """The region of a stopped run that is to go on: what it was made from need not be looked at again."""
+    """Return the region of a stopped run, so that a resumed run need not read its sources again; None if not
+    saved."""
     state = RunFolder(out).state
     saved = state.load(REGION) if state.identity() is not None else None
     if saved is None:
@@ -62,48 +64,48 @@ def load_region(out: Path) -> Region | None:
 
 
 def decide_resume(folder: RunFolder, options: TrainOptions, region: Region, count: int) -> ResumeDecision:
-    """Find out what is to be done, and make the folder ready for it.
+    """Decide the next action and prepare the folder for it.
 
     Args:
         folder: opened and locked
-        options: of the run that is asked for, resolved
-        region: what may change
-        count: Gaussians in the scene
+        options: resolved options of the requested run
+        region: Gaussians that may change
+        count: number of Gaussians in the scene
 
     Raises:
-        ProgdfError: a stopped run that would be lost without --resume; with it, another plan than the run's.
+        ProgdfError: without --resume, a stopped run would be lost; with it, the plan differs from the run's.
     """
     saved = _saved_identity(folder)
     plan = recorded_options(options)
     threads = count_threads(options.threads)
     resume = options.resume
     if resume and saved is None and folder.report.is_file():
-        was, pictures = _finished_run(folder)
-        again = "leave out --resume to train again"
-        _check_plan(folder, was, plan, again)
-        _check_pictures(folder, pictures, picture_digests(plan), again)
+        recorded_plan, pictures = _finished_run(folder)
+        remedy_if_finished = "leave out --resume to train again"
+        _check_plan(folder, recorded_plan, plan, remedy_if_finished)
+        _check_pictures(folder, pictures, picture_digests(plan), remedy_if_finished)
         return ResumeDecision("nothing", threads)
     remove_leftovers(folder)
-    now = _identity(plan, threads)
+    requested = _identity(plan, threads)
     if resume and saved is not None:
-        if saved.version != now.version:
+        if saved.version != requested.version:
             raise ProgdfError(f"another version of progdf began {folder.root}; train again in another folder")
         remedy = "give --resume the run's own options, or train again in another folder"
         _check_plan(folder, saved.plan, plan, remedy)
         remedy = "restore it and continue with --resume, or train again in another folder"
-        if saved.scene != now.scene:
+        if saved.scene != requested.scene:
             raise ProgdfError(f"the scene has changed since {folder.root} was started; {remedy}")
-        if saved.cameras != now.cameras:
+        if saved.cameras != requested.cameras:
             raise ProgdfError(f"{plan.views.cameras} has changed since {folder.root} was started; {remedy}")
-        _check_pictures(folder, saved.pictures, now.pictures, remedy)
+        _check_pictures(folder, saved.pictures, requested.pictures, remedy)
         with folder.state.restore_part(REGION):
             if len(region.score) != count:
                 raise ValueError("the region is another scene's")
         notes = []
-        if saved.torch != now.torch:
-            notes.append(f"torch was {saved.torch} and is {now.torch}: the last bits may differ")
-        if saved.processor != now.processor:
-            change = f"the processor was {saved.processor} and is {now.processor}"
+        if saved.torch != requested.torch:
+            notes.append(f"torch was {saved.torch} and is {requested.torch}: the last bits may differ")
+        if saved.processor != requested.processor:
+            change = f"the processor was {saved.processor} and is {requested.processor}"
             notes.append(f"{change}: the last bits may differ, the quality does not")
         if saved.threads != threads:
             notes.append(f"{saved.threads} threads, as the run began with, for the same bits")
@@ -114,14 +116,14 @@ def decide_resume(folder: RunFolder, options: TrainOptions, region: Region, coun
             f"add --resume to continue it, or delete {folder.state.path} to start over"
         )
     begin_log(folder, plan.edit)
-    folder.state.begin(plain(now))
+    folder.state.begin(plain(requested))
     folder.state.save(REGION, {"members": region.members, "score": region.score}, {"name": region.name})
     notes = ["nothing to resume was saved yet, so the run starts from the beginning"] if resume else []
     return ResumeDecision("start", threads, tuple(notes))
 
 
 def find_run(options: TrainOptions) -> Literal["nothing", "stopped", "finished"]:
-    """What a run that resumes would find in the folder, of a run with these very options."""
+    """Return the state of the folder for a run with the same options."""
     folder = RunFolder(options.out)
     plan = recorded_options(resolve(options))
     saved = _saved_identity(folder)
@@ -136,7 +138,7 @@ def find_run(options: TrainOptions) -> Literal["nothing", "stopped", "finished"]
 
 @contextmanager
 def explain_stop(folder: RunFolder) -> Iterator[None]:
-    """Raise errors that stop a run again, in one line that names the file at fault and how to go on."""
+    """Raise errors that stop a run again, as one line with the affected file and how to resume."""
     try:
         yield
     except KeyboardInterrupt:
@@ -156,13 +158,13 @@ def explain_stop(folder: RunFolder) -> Iterator[None]:
 
 
 def _file_of(error: OSError) -> str:
-    """Return the file that a system error names; "" if it names none, as after a write to an open file."""
+    """Return the file named by a system error; "" if none is named, as after a write to an open file."""
     return os.fsdecode(error.filename) if isinstance(error.filename, (str, bytes, os.PathLike)) else ""
 
 
 @contextmanager
 def check_exists(folder: RunFolder) -> Iterator[None]:
-    """Say so where the run's folder was removed meanwhile."""
+    """Report if the run's folder was removed during the run."""
     try:
         yield
     except (OSError, ProgdfError) as error:
@@ -172,7 +174,7 @@ def check_exists(folder: RunFolder) -> Iterator[None]:
 
 
 class _Identity(msgspec.Struct):
-    """All that decides the bits of a run's result, as run.json has it; of files their hashes."""
+    """Everything that determines a run's result bit for bit, as stored in run.json; hashes for files."""
 
     plan: TrainOptions
     scene: str
@@ -199,10 +201,10 @@ def _identity(plan: TrainOptions, threads: int) -> _Identity:
 
 
 def processor_kind() -> str:
-    """The kind of processor, as far as the last bits of a result depend on it.
+    """Return the kind of processor, as far as the last bits of a result depend on it.
 
-    What numba compiles for, and what torch and the libraries of linear algebra choose their kernels by: the
-    instructions, and the switches that are set.
+    It consists of the target of numba, the instruction set for which torch and the linear algebra libraries
+    choose their kernels, and the environment switches that are set.
     """
     switches = [f"{name}={os.environ[name]}" for name in _SWITCHES if os.environ.get(name)]
     name = numba.config.CPU_NAME or llvmlite.binding.get_host_cpu_name()
@@ -210,12 +212,12 @@ def processor_kind() -> str:
 
 
 def picture_digests(plan: TrainOptions) -> dict[str, str]:
-    """The changed pictures that a plan names, those of further strengths among them, and their hashes."""
+    """Return the hashes of the changed pictures that a plan names, including those of further strengths."""
     paths = [path for given in plan.views.pictures for path in strengths_of(given).values()]
     paths += [plan.editor.anchor] if plan.editor.anchor is not None else []
-    what = plan.editor.editor.partition(":")[2]
-    paths += [Path(what)] if plan.editor.family == "decal" else []
-    paths += picture_paths(what) if plan.editor.family == "remove" and what else []
+    editor_paths = plan.editor.editor.partition(":")[2]
+    paths += [Path(editor_paths)] if plan.editor.family == "decal" else []
+    paths += picture_paths(editor_paths) if plan.editor.family == "remove" and editor_paths else []
     return {str(path.resolve()): _digest(path) for path in paths}
 
 
@@ -230,7 +232,10 @@ def _saved_identity(folder: RunFolder) -> _Identity | None:
 
 
 def plan_difference(was: TrainOptions, now: TrainOptions) -> str:
-    """A value that differs, in words, "--steps 24, not 40"; "" where none does. What was typed goes first."""
+    """Return a description of one differing value, as in "--steps 24, not 40"; "" if none differs.
+
+    Options given on the command line come first.
+    """
     pairs = zip(flat_values(was), flat_values(now), strict=True)
     compared = ((name, typed, _plain(name, a), _plain(name, b)) for (name, typed, a), (*_, b) in pairs)
     differing = [value for value in compared if value[2] != value[3]]
@@ -242,7 +247,7 @@ def plan_difference(was: TrainOptions, now: TrainOptions) -> str:
 
 
 def _plain(name: str, value: Any) -> Any:
-    """A value as it is compared: paths absolute, and None where 0 stands for the default."""
+    """Return a value in comparable form: absolute paths, and None if 0 stands for the default."""
     if name in ("views", "image_size", "stages"):
         value = value or None
     return value.resolve() if isinstance(value, Path) else value
@@ -264,7 +269,7 @@ def _check_pictures(folder: RunFolder, was: Mapping[str, str], now: Mapping[str,
 
 
 def _finished_run(folder: RunFolder) -> tuple[TrainOptions, dict[str, str]]:
-    """A finished run's plan, and the hashes of its changed pictures."""
+    """Return a finished run's plan, and the hashes of its changed pictures."""
     try:
         report = decode_json(folder.report.read_bytes())
         pictures = convert_json(report.get("pictures", {}), dict[str, str])
@@ -274,7 +279,7 @@ def _finished_run(folder: RunFolder) -> tuple[TrainOptions, dict[str, str]]:
 
 
 def _saved_step(folder: RunFolder) -> int:
-    """How far the optimization was when it was saved; 0: not begun."""
+    """Return the step at which the optimization was last saved; 0: not begun."""
     saved = folder.state.load("training")
     if saved is None:
         return 0
@@ -283,14 +288,14 @@ def _saved_step(folder: RunFolder) -> int:
 
 
 def _scene_digest(path: Path) -> str:
-    """Return the hash of a scene file; of an unpacked .sog it covers the names and bytes of all its files."""
+    """Return the hash of a scene file. For an unpacked .sog it covers the names and bytes of all files."""
     if not path.is_dir():
         return _digest(path)
     return _joint_digest(file for file in path.iterdir() if file.suffix in _SOG_SUFFIXES)
 
 
 def _camera_digest(path: Path) -> str:
-    """Return the hash of a camera file; of a folder it covers the names and bytes of the files read."""
+    """Return the hash of a camera file. For a folder it covers the names and bytes of the files read."""
     files = camera_files(path)
     return _digest(path) if files == (path,) else _joint_digest(files)
 

@@ -1,4 +1,4 @@
-"""The whole job: scene → views → edited views → trajectory → field → .gdf and report, each on disk."""
+"""Training run: scene → views → edited views → trajectory → field → .gdf and report, each saved to disk."""
 
 from __future__ import annotations
 
@@ -88,22 +88,20 @@ from .removal import is_removal, remove_region
 from .resume import check_exists, decide_resume, explain_stop, load_region, picture_digests
 from .training import Strengths, optimize_members, retime_trajectory
 
-_KEPT = (
-    1_000_000  # pixels, and painted members, of which what no strength changes is kept: up to 80 bytes each
-)
+_MAX_CACHED_PIXELS = 1_000_000  # pixels and painted members whose editor state is cached, up to 80 bytes each
 
 
 def check_command(options: TrainOptions) -> None:
-    """Look at everything that the command names, as far as it can be seen without the scene.
+    """Check everything that the command names, as far as possible without the scene.
 
-    A run that goes on needs no longer what it began with: its region and its edited views are kept.
+    A resumed run no longer needs its sources, as its region and its edited views are saved.
 
     Args:
-        options: resolved
+        options: resolved options
 
     Raises:
-        ProgdfError: the folder is taken, the editor or the segmenter cannot run, a file is not there, or a
-            text that the run records is not UTF-8.
+        ProgdfError: the folder is occupied, the editor or the segmenter cannot run, a file is missing, or a
+            text for the run's record is not UTF-8.
     """
     for name, _, value in flat_values(recorded_options(options)):
         for part in value if isinstance(value, tuple) else (value,):
@@ -129,15 +127,15 @@ def check_command(options: TrainOptions) -> None:
 def region_request(
     options: TrainOptions, quiet: bool, say: Callable[[str], None] | None = None
 ) -> RegionRequest:
-    """How the region is made of pictures; those that are segmented are kept in the run's folder.
+    """Return the request for a region made from pictures. Segmentation masks are saved in the run's folder.
 
     Args:
-        options: resolved
+        options: resolved options
         quiet, say: see `RegionRequest`
     """
 
     def cache() -> Path:
-        # nothing is written into a folder that is no run of ours
+        # never write into a folder that is not a run folder
         return open_run_folder(options.out, options.edit).segment_masks
 
     return RegionRequest(options.region, options.views, cache, quiet, say)
@@ -147,13 +145,13 @@ def train(options: TrainOptions, quiet: bool = False, shared: Shared | None = No
     """Edit a region of a scene and write its .gdf file.
 
     Args:
-        options: as typed
-        quiet: nothing on the screen; log.txt is written all the same
-        shared: of runs that follow each other in this process, whose files do not change meanwhile
+        options: unresolved options
+        quiet: no output on the screen; log.txt is always written
+        shared: cache for consecutive runs in this process, while the files do not change
 
     Raises:
-        ProgdfError: scene, region, cameras or edited views that do not work; no .gdf is touched.
-        KeyboardInterrupt: interrupted; the message says how to go on. No .gdf is touched.
+        ProgdfError: invalid scene, region, cameras or edited views. No .gdf file is changed.
+        KeyboardInterrupt: interrupted; the message explains how to resume. No .gdf file is changed.
     """
     options, shared = resolve(options), shared or Shared()
     check_command(options)
@@ -171,8 +169,8 @@ def train(options: TrainOptions, quiet: bool = False, shared: Shared | None = No
         try:
             for note in (*session.notes, *notes):
                 log.say(note)
-            if options.editor.family == "decal":  # takes seconds: what was stopped or is there is done again
-                result = _paint(options, scene, region, folder, log)
+            if options.editor.family == "decal":  # takes seconds, so it is redone instead of resumed
+                result = _run_decal(options, scene, region, folder, log)
                 folder.state.end()
                 return result
             if session.does == "nothing":
@@ -202,7 +200,7 @@ def select_region(
 
     def select() -> tuple[Region, list[str]]:
         notes = list[str]()
-        check_given_cameras(options.views, scene)  # refused before a folder is made
+        check_given_cameras(options.views, scene)  # fail before a folder is created
         kinds = region_kinds(region_request(options, quiet, notes.append))
         return parse_region(options.region.region, scene, options.name, kinds, notes.append), notes
 
@@ -217,7 +215,7 @@ def _run_training(
     shared: Shared,
     log: RunLog,
 ) -> RunResult:
-    """Everything; what the saved state says is done is not done again, or is repeated to the same bits."""
+    """Run all stages. Skip finished stages of the saved state, or repeat them with the same bits."""
     perceptual, warning = perceptual_loss()
     if warning:
         log.say(warning)
@@ -232,11 +230,11 @@ def _run_training(
     with log.stage("edit"):
         edited, approach, trial, between = _edit_views(options, setup, editor, folder, log)
         optimization = resolve_approach(options, approach)
-        # where more may be asked for, whether they are there already must not matter
-        strengths = (1.0,) if _asks_for_more(options, optimization) else edited
+        # if more strengths may be requested, the boxes must not depend on which of them exist already
+        strengths = (1.0,) if _requests_more_strengths(options, optimization) else edited
         train_edits = {s: edited[s][: len(setup.train)] for s in strengths}
         setup = whole_views(setup) if options.optimize.as_printed else widen_views(setup, train_edits)
-    if optimization.solver == "colors":  # its sums are small: torch's threads spun for 100 s on 16 cores
+    if optimization.solver == "colors":  # small sums, over which torch's threads spun for 100 s on 16 cores
         torch.set_num_threads(1)
     recorded = folder.state.load("recorded")
     if recorded is None:
@@ -270,22 +268,22 @@ def _run_training(
     else:
         log.restore(recorded)
         log.say("the trajectory is recorded")
-    del edited, train_edits, between  # what is needed of all this is read anew, as it is on disk
+    del edited, train_edits, between  # the needed parts are read again from disk
     trajectory, _, about = load_trajectory(folder.trajectory)
     record = read_record(about)
     begun = folder.state.load(NETWORK)
     setup = setup.keep_solved(record.effort)
     result = finish_run(folder, setup, trajectory, record, perceptual, log, begun)
-    # not before: a run that is stopped needs all views to go on
+    # only at the end, as a stopped run needs all views to resume
     save_cameras(folder.cameras, [view.camera for view in setup.views], scene.origin)
     remove_stale_views(folder, [view.camera.name for view in setup.views])
     return result
 
 
-def _paint(
+def _run_decal(
     options: TrainOptions, scene: Gaussians, region: Region, folder: RunFolder, log: RunLog
 ) -> RunResult:
-    """A decal: laid on, measured, and written as any run is, but for a trajectory."""
+    """Place a decal, measure it, and write the files of a run, except for a trajectory."""
     with log.stage("edit"):
         editor = make_editor(options.editor, scene, region, ())
     if not isinstance(editor, DecalEditor):
@@ -296,18 +294,18 @@ def _paint(
     decal = f"decal:{Path(options.editor.editor.partition(':')[2]).name}"
     figures = painted.figures
     name = view.camera.name
-    own = figures["own"]
-    turned = figures["turned"]
-    about = {"edit": {"psnr_to_views": own}, "paint": figures}
+    view_psnr = figures["own"]
+    side_psnrs = figures["turned"]
+    about = {"edit": {"psnr_to_views": view_psnr}, "paint": figures}
     save_cameras(folder.cameras, [view.camera], scene.origin)
-    middle = TURNS.index(0)
+    front_index = TURNS.index(0)
     mask = view.mask[..., None].expand(-1, -1, 3)
-    pictures = {"original": view.image, "mask": mask, "edited": painted.expected[middle]}
-    for kind, picture in (pictures | {"final": painted.shown[middle]}).items():
-        write_views(folder, kind, {name: picture})
+    pictures = {"original": view.image, "mask": mask, "edited": painted.expected[front_index]}
+    for folder_name, picture in (pictures | {"final": painted.shown[front_index]}).items():
+        write_views(folder, folder_name, {name: picture})
     labels = [f"{degrees:+d}°" if degrees else "0°" for degrees in TURNS]
     title = f"{options.name}: {options.editor.editor}"
-    notes = [[], [f"{error} dB" if error is not None else "" for error in turned.values()]]
+    notes = [[], [f"{error} dB" if error is not None else "" for error in side_psnrs.values()]]
     report = {
         **about,
         "views": {"held_out": False, "edit": [name]},
@@ -322,8 +320,8 @@ def _paint(
     added, pixels, moved = (group_digits(figures[name]) for name in ("added", "pixels", "moved"))
     log.say(
         f"{added} Gaussians added for {pixels} painted pixels, {moved} of the scene moved behind them; "
-        f"{own} dB in the decal's own view, {figures['ring']} dB in the {RING} pixels around it, "
-        f"{turned['-30']} and {turned['+30']} dB from 30° to its sides"
+        f"{view_psnr} dB in the decal's own view, {figures['ring']} dB in the {RING} pixels around it, "
+        f"{side_psnrs['-30']} and {side_psnrs['+30']} dB from 30° to its sides"
     )
     log.say(result.line)
     return result
@@ -332,11 +330,11 @@ def _paint(
 def _write_draft(
     options: TrainOptions, scene: Gaussians, region: Region, folder: RunFolder, log: RunLog
 ) -> None:
-    """A grade alone, where one carries the edit: a slider to begin with."""
+    """Write a first slider with only a grade, if a grade can represent the edit."""
     if folder.draft == folder.gdf(options.name) or options.editor.family not in COLOR_FUNCTIONS:
         return
     folder.draft.unlink(missing_ok=True)
-    began = time.perf_counter()
+    start_time = time.perf_counter()
     views = draft_views(options.views, scene, region)
     draft = draft_grade(views, options.editor, options.name) if views is not None else None
     if draft is None:
@@ -345,23 +343,23 @@ def _write_draft(
     save_gdf(folder.draft, draft)
     log.say(
         "{} after {:.1f} s: a grade of degree {degree}, {psnr:.1f} dB in views that it was not fitted to; "
-        "training goes on".format(folder.draft, time.perf_counter() - began, **draft.report["draft"])
+        "training goes on".format(folder.draft, time.perf_counter() - start_time, **draft.report["draft"])
     )
 
 
 def _describe_views(setup: TrainingSetup) -> str:
-    """How many views there are, for what, and of how many pixels."""
+    """Return a description of the number, use and size of the views."""
     cameras = [view.camera for view in setup.views]
     sizes = dict.fromkeys(f"{camera.width}x{camera.height}" for camera in cameras)
-    others = f" and {len(setup.held_out)} to measure with"
-    aside = others if setup.held_out else ", by which the edit is measured too"
-    return f"{len(setup.train)} views to train on{aside}, {', '.join(sizes)} pixels"
+    held_out_part = f" and {len(setup.held_out)} to measure with"
+    use_of_others = held_out_part if setup.held_out else ", by which the edit is measured too"
+    return f"{len(setup.train)} views to train on{use_of_others}, {', '.join(sizes)} pixels"
 
 
 def _render_originals(
     options: TrainOptions, scene: Gaussians, region: Region, folder: RunFolder, shared: Shared
 ) -> TrainingSetup:
-    """The views, rendered and on disk."""
+    """Render the views and write them to disk."""
     key = options.views, region.members.numpy().tobytes(), region.score.numpy().tobytes()
     setup = shared.get("views", key, lambda: make_training_setup(options.views, scene, region))
     setup = replace(setup, region=region)
@@ -375,7 +373,7 @@ def _render_originals(
 
 
 def _make_editor(options: TrainOptions, setup: TrainingSetup, folder: RunFolder, log: RunLog) -> ImageEditor:
-    """The run's one editor; where a model paints, with views that agree."""
+    """Return the run's editor. A generative editor is wrapped so that its views agree."""
     settings = replace(options.editor, cache=folder.paintings)
     glances = partial(take_glances, options.views, setup.scene, setup.region)
     editor = make_editor(settings, setup.scene, setup.region, setup.views, glances)
@@ -403,35 +401,38 @@ def _edit_views(
     folder: RunFolder,
     log: RunLog,
 ) -> tuple[Pictures, Approach, dict[str, Any] | None, Strengths | None]:
-    """What the editor makes of all views, by strength, read where it is on disk; how to train towards it;
-    what a trial found of that; and what makes more strengths, where a course may call for them.
+    """Edit all views and choose how to train.
+
+    Returns: the edited views by strength, read lazily from disk; the training approach; the figures of the
+    trial run that chose it; and a source of further strengths, if training may request them.
     """
     views = setup.views
     spec = options.editor.editor
     names = [view.camera.name for view in views]
-    made: dict[float, Sequence[Tensor]] = {}
-    on_the_way, known = names, list[float]()  # views of strengths other than 1; strengths that were edited
+    edits: dict[float, Sequence[Tensor]] = {}
+    # names of the views with strengths other than 1; strengths edited by the stopped run
+    on_the_way, known = names, list[float]()
     approach = Approach("color")
     trial = None
 
     def edit(strengths: Sequence[float], views: Sequence[View] = views) -> Pictures:
         nonlocal on_the_way
-        new = [s for s in strengths if s not in made]
+        new = [s for s in strengths if s not in edits]
         is_confined = confines_edit(editor(), approach.kind)
-        way = course if _keeps_courses(editor(), setup) else partial(edit_course, editor())
+        way = course if _fits_cache(editor(), setup) else partial(edit_course, editor())
         with log.steps("edit", len(views) * len(new)) as advance:
             within = views
-            if options.region.region == CHANGED:  # of paint finer than the Gaussians few are found
+            if options.region.region == CHANGED:  # few members are found for paint finer than the Gaussians
                 within = [view.with_painted([editor().edit(view, 1.0)]) for view in views]
-            made.update(edit_views(editor(), within, new, folder, is_confined, advance, way))
+            edits.update(edit_views(editor(), within, new, folder, is_confined, advance, way))
         log.say(f"{spec}: a {approach.kind} edit at strength {', '.join(f'{s:g}' for s in strengths)}")
         if min(strengths) < 1.0:
             on_the_way = [view.camera.name for view in views]
-        edited = [*dict.fromkeys((*known, *made))]
+        edited = [*dict.fromkeys((*known, *edits))]
         saved = {"strengths": edited, "on_the_way": on_the_way, **asdict(approach)}
         shared = painter.figures if isinstance(painter := editor(), AgreedEditor) else {}
         folder.state.save("edited", {}, saved | {"trial": trial, "shared": shared})
-        return made
+        return edits
 
     @cache
     def course(view: View) -> Callable[[float], Tensor]:
@@ -444,7 +445,7 @@ def _edit_views(
         return [quantize_image(picture) for picture in pictures]
 
     def between() -> Strengths | None:
-        more = _asks_for_more(options, resolve_approach(options, approach))
+        more = _requests_more_strengths(options, resolve_approach(options, approach))
         return Strengths(edit, look) if more else None
 
     done = folder.state.load("edited")
@@ -454,14 +455,14 @@ def _edit_views(
             for s in done.values["strengths"]:
                 wanted = set(names if s == 1.0 else on_the_way)
                 cameras = [view.camera for view in views if view.camera.name in wanted]
-                made[s] = read_views(folder, "edited", cameras, s)
+                edits[s] = read_views(folder, "edited", cameras, s)
             approach = Approach(*(done.values[name] for name in ("kind", "group_steps", "grow")))
             trial = done.values["trial"]
             log.say("the edited views are on disk")
-            log.expect(expected_work(setup, resolve_approach(options, approach), len(made)))
-            return made, approach, trial, between()
+            log.expect(expected_work(setup, resolve_approach(options, approach), len(edits)))
+            return edits, approach, trial, between()
         except ProgdfError as error:
-            made.clear()
+            edits.clear()
             known = done.values["strengths"]
             log.say(f"the views are edited again: {str(error).partition(';')[0]}")
     painter = editor()
@@ -471,7 +472,7 @@ def _edit_views(
     optimization = resolve_approach(options, approach)
     strengths = editor_strengths(editor(), optimization.stages)
     log.expect(expected_work(setup, optimization, len(strengths)))
-    if _asks_for_more(options, optimization):
+    if _requests_more_strengths(options, optimization):
         strengths = (1.0,)
     elif not optimization.as_printed and resolve_slider(optimization.slider, strengths) == "even":
         strengths = equalized_strengths(editor(), spec, views, strengths)
@@ -482,34 +483,34 @@ def _edit_views(
     return edited, approach, trial, between()
 
 
-def _keeps_courses(editor: ImageEditor, setup: TrainingSetup) -> bool:
-    """Whether there is room for what no strength changes, of all views."""
+def _fits_cache(editor: ImageEditor, setup: TrainingSetup) -> bool:
+    """Return True if the strength-independent editor state of all views fits the cache."""
     painted = len(setup.region) if isinstance(editor, StripesEditor) else 0
-    return sum(int((view.mask > 0.0).sum()) + painted for view in setup.views) <= _KEPT
+    return sum(int((view.mask > 0.0).sum()) + painted for view in setup.views) <= _MAX_CACHED_PIXELS
 
 
 def _check_change(edited: Pictures, setup: TrainingSetup, spec: str) -> None:
-    """ProgdfError if no view shows an edit."""
+    """Raise a ProgdfError if no view shows an edit."""
     originals = [quantize_image(view.image) for view in setup.views]
-    if all(torch.equal(*pair) for made in edited.values() for pair in zip(made, originals, strict=True)):
+    if all(torch.equal(*pair) for views in edited.values() for pair in zip(views, originals, strict=True)):
         raise ProgdfError(
             f"{spec} changes none of the views; check the region and what the editor is asked for"
         )
 
 
-def _asks_for_more(options: TrainOptions, optimization: OptimizeOptions) -> bool:
-    """Whether strengths between are chosen when it is known what others miss."""
-    known = options.optimize.stages or options.editor.family in (*EXTERNAL, *COSTLY_STRENGTHS)
-    return optimization.solver == "colors" and not known
+def _requests_more_strengths(options: TrainOptions, optimization: OptimizeOptions) -> bool:
+    """Return True if training requests further strengths once the error of the first ones is known."""
+    is_fixed = options.optimize.stages or options.editor.family in (*EXTERNAL, *COSTLY_STRENGTHS)
+    return optimization.solver == "colors" and not is_fixed
 
 
 def expected_work(setup: TrainingSetup, optimization: OptimizeOptions, strengths: int) -> dict[str, float]:
-    """For `RunLog.expect`, in that of preparing a view.
+    """Return the expected work per stage for `RunLog.expect`, in units of preparing one view.
 
     Args:
         setup: scene, region, views
-        optimization: its options with nothing left open
-        strengths: of how many there will be pictures
+        optimization: fully resolved options
+        strengths: number of edited strengths
     """
     views = len(setup.views)
     train = len(setup.train)
@@ -519,8 +520,8 @@ def expected_work(setup: TrainingSetup, optimization: OptimizeOptions, strengths
     }
     if optimization.solver == "colors":
         return work | {"weights": 0.5 * train, "model": 1.5 * train, "optimize": 0.45 * train * strengths}
-    moves = optimization.group_steps or 0
-    return work | {"move parts": 0.2 * moves * strengths, "optimize": 0.25 * optimization.steps}
+    group_steps = optimization.group_steps or 0
+    return work | {"move parts": 0.2 * group_steps * strengths, "optimize": 0.25 * optimization.steps}
 
 
 def _agreement(
@@ -531,7 +532,7 @@ def _agreement(
     folder: RunFolder,
     log: RunLog,
 ) -> Mapping[str, Any] | None:
-    """Whether the edited views agree, and which were left out; None where an editor edits all alike."""
+    """Measure how well the edited views agree; None for editors that edit all views alike."""
     saved = folder.state.load("edited")
     shared = saved.values.get("shared", {}) if saved is not None else {}
     if kind == "geometry" or options.editor.family not in PER_VIEW:
@@ -554,7 +555,7 @@ def _record(
     folder: RunFolder,
     log: RunLog,
 ) -> tuple[Trajectory, dict[str, Any]]:
-    """Optimize; the trajectory on its slider, and what the run's record says of it."""
+    """Optimize, and return the trajectory on its slider and the figures for the run's record."""
     objective = describe_loss(optimization, perceptual.name)
     log.say(f"loss: {objective}")
     if options.optimize.group_steps and optimization.kind != "geometry":
@@ -568,27 +569,25 @@ def _record(
         trajectory = smooth_course(trajectory)
         costs: dict[str, float] = {}
         recolors = only_recolors(trajectory.offsets)
-        # of a grade nothing is dropped
+        # a grade has no attributes to drop
         if trajectory.maps is None and (not recolors or trajectory.end.shape[1] > BASE_CHANNELS):
             choosing, _ = load_evaluator(folder, setup, setup.judging, trajectory).halves()
             prunes = not optimization.as_printed
             trajectory, costs = drop_idle_attributes(trajectory, choosing, prunes)
-        recorded = len(trajectory)
+        count = len(trajectory)
         reason = ""
-        one_end = len(trajectory.strengths) == 1
-        if one_end and not optimization.as_printed and options.field.field != "neural":
-            # of pictures made elsewhere the folder may be gone by now, and there is no half; a model was
-            # asked for the end alone
+        has_one_target = len(trajectory.strengths) == 1
+        if has_one_target and not optimization.as_printed and options.field.field != "neural":
+            # external pictures may be gone by now and have no intermediate strengths; generative models
+            # edited only strength 1
             painter = None if options.editor.family in (*EXTERNAL, *COSTLY_STRENGTHS) else editor()
             retimed = partial(retime_trajectory, setup=setup, optimization=optimization, log=log)
-            moves = bool(optimization.group_steps)
-            trajectory, reason = choose_path(trajectory, setup, painter, moves, retimed)
+            moves_groups = bool(optimization.group_steps)
+            trajectory, reason = choose_path(trajectory, setup, painter, moves_groups, retimed)
         else:
             trajectory = retime_trajectory(trajectory, setup, optimization, log)
         trajectory = fade_in(trajectory)
-    log.say(
-        f"{recorded} recordings, {len(trajectory)} kept; without an attribute, dB: {costs or 'none moves'}"
-    )
+    log.say(f"{count} recordings, {len(trajectory)} kept; without an attribute, dB: {costs or 'none moves'}")
     if reason:
         log.say(f"between original and edit: {reason}")
     return trajectory, {

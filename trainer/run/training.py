@@ -1,4 +1,4 @@
-"""PGS over a run's training views, saved as it goes: recordings in, a trajectory out."""
+"""Optimize the members over a run's training views, save the state regularly, and return a trajectory."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ from trainer.views.view import View, crop
 
 
 class _RecordingValues(TypedDict):
-    """What is saved of a recording beside its tensors."""
+    """Saved values of a recording besides its tensors."""
 
     step: int
     ends_stage: bool
@@ -58,12 +58,12 @@ class _RecordingValues(TypedDict):
 
 
 class Recordings:
-    """All recordings so far, in half precision, a `state.Resumable`: each is written once, to its own file.
+    """Recordings so far, in half precision: a `state.Resumable` that writes each to its own file once.
 
     Args:
-        folder: where
-        shape: of the offsets
-        model: of an edit of colors, whose recordings have the map with them
+        folder: folder for the files
+        shape: shape of the offsets
+        model: model of a color edit, whose recordings include the map
     """
 
     def __init__(self, folder: StateFolder, shape: torch.Size, model: Model | None) -> None:
@@ -74,12 +74,12 @@ class Recordings:
         self._written = 0
 
     def add(self, snapshot: ParameterSnapshot) -> None:
-        """Keep one."""
+        """Append a recording."""
         release_memory()
         self.made.append(replace(snapshot, offsets=snapshot.offsets.half().cpu()))
 
     def capture_state(self) -> Saved:
-        """How many there are; those that came since the last time are saved first."""
+        """Save the recordings added since the last call, and return their total number."""
         for index in range(self._written, len(self.made)):
             snapshot = self.made[index]
             values = {name: getattr(snapshot, name) for name in _RecordingValues.__annotations__}
@@ -90,7 +90,7 @@ class Recordings:
         return Saved({}, {"count": self._written})
 
     def restore(self, saved: Saved) -> None:
-        """Read as many as there were; what a killed run wrote beyond them will be written again."""
+        """Read the saved number of recordings. Later files of a killed run are written again."""
         self._written = saved.values["count"]
         recordings = [self._folder.load("recordings", index) for index in range(self._written)]
         if None in recordings:
@@ -108,27 +108,26 @@ class Recordings:
 
 
 PART = "training"
-"""Of the saved state: all that changes while the members are optimized."""
+"""Part of the saved state with everything that changes during the optimization of the members."""
 
-_TIMED_VIEWS = 4  # in which the slider is timed; 8 or all at full size time it no better
+_TIMED_VIEWS = 4  # views that time the slider; 8, or all at full size, are no better
 
 
-# pixels for each number that is solved for: q of these add 1/q to the error if all else is noise, and of more
-# than 9 twice as many take less than a twentieth of it away (docs/experiments.md, Pixels)
-_ENOUGH = (MORE_PAYS - 0.5) / (1.0 - MORE_PAYS)
+# Sufficient number of pixels per unknown. With q pixels, noise adds 1/q to the error. Above 9, doubling q
+# reduces the error by less than 5 % (docs/experiments.md, Pixels).
+_PIXELS_PER_UNKNOWN = (MORE_PAYS - 0.5) / (1.0 - MORE_PAYS)
 
 
 Optimized = tuple[Trajectory, Losses, Mapping[str, Any]]
-"""The trajectory, even in time; mean of every loss term, and what is left to the edit, per recording; the
-effort that was decided on, as report.json has it."""
+"""Trajectory, even in time; loss terms and distance to the edit per recording; effort for report.json."""
 
 
 @dataclass(frozen=True)
 class Strengths:
-    """Strengths that are edited when it is known that they are called for."""
+    """Callbacks that edit further strengths on demand."""
 
-    edit: Callable[[Sequence[float], Sequence[View]], Pictures]  # some views, which stay on disk
-    look: Callable[[float, Sequence[View]], Sequence[Tensor]]  # some views, as they would be
+    edit: Callable[[Sequence[float], Sequence[View]], Pictures]  # edits the given views, keeps them on disk
+    look: Callable[[float, Sequence[View]], Sequence[Tensor]]  # edits the given views in memory only
 
 
 def optimize_members(
@@ -144,14 +143,14 @@ def optimize_members(
     """Optimize the members, from the beginning or from the saved state.
 
     Args:
-        options: resolved
-        optimization: its part with nothing left open, see `resolve_kind`
-        setup: scene, region, views with boxes that hold the edit
-        edited: strength → the edited training views, whole
-        perceptual: distance of pictures
-        folder: where the state is saved
-        log: of the run
-        between: of colors that are solved for, what more strengths there may be; None: those of `edited`
+        options: resolved options
+        optimization: fully resolved optimization options, see `resolve_kind`
+        setup: scene, region, and views whose boxes hold the edit
+        edited: strength → the whole edited training views
+        perceptual: image distance
+        folder: folder of the saved state
+        log: log of the run
+        between: source of further strengths for the color solver; None: only those of `edited`
 
     Raises:
         ProgdfError: the loss is not finite.
@@ -179,8 +178,8 @@ def optimize_members(
         stages = groups.to_stages(original, crops, stages)
     extent = 2.0 * scene_sphere(scene[members])[1] if groups is None else groups.extent
     settings = pgs_settings(optimization, optimization.sh != "off", original.shape[1], extent, len(stages))
-    own = len(members)
-    seeds = _seeds(setup, optimization, edited, folder) if optimization.grow else None
+    member_count = len(members)
+    seeds = _make_or_load_seeds(setup, optimization, edited, folder) if optimization.grow else None
     if seeds is not None:
         setup = setup.extend(seeds)
         settings = replace(settings, ramp=0.0)
@@ -192,29 +191,33 @@ def optimize_members(
     inside = [erode(crop(view.mask, view.box)).to(device) for view in setup.train]
     objective = Objective(perceptual, optimization, inside)
     probes = probe_views(setup, engine=engine)
-    way = partial(optimize, original, crops, probes, stages, objective, settings, state=state)
+    descend = partial(optimize, original, crops, probes, stages, objective, settings, state=state)
     joint = None
     if optimization.as_printed and options.field.field == "neural":
         joint = begin_joint_training(
             options.field, optimization, setup, settings.rates, stages, crops, perceptual
         )
-    made = _record_way(way, sum(stage.steps for stage in stages), state, recordings, joint, folder, log)
+    all_snapshots = _record_snapshots(
+        descend, sum(stage.steps for stage in stages), state, recordings, joint, folder, log
+    )
     end = stages[-1].place(state.average).cpu().clone()
-    snapshots = [replace(one, offsets=one.offsets[:own]) for one in made]
+    snapshots = [replace(snapshot, offsets=snapshot.offsets[:member_count]) for snapshot in all_snapshots]
     if groups is not None:
-        ends = [one for one in made if one.ends_stage]
-        offsets = [*(one.offsets.float() for one in ends[:-1]), end]
-        snapshots = group_path(original, groups, offsets, [one.step for one in ends], settings.snapshots)
-    trajectory = record(snapshots, end[:own], list(edited))
+        stage_ends = [snapshot for snapshot in all_snapshots if snapshot.ends_stage]
+        offsets = [*(snapshot.offsets.float() for snapshot in stage_ends[:-1]), end]
+        snapshots = group_path(
+            original, groups, offsets, [snapshot.step for snapshot in stage_ends], settings.snapshots
+        )
+    trajectory = record(snapshots, end[:member_count], list(edited))
     effort: dict[str, Any] = {"strengths": list(edited)}
     if seeds is not None:
         finished = original + end.to(device)
-        costs = removal_costs(crops, finished, stages[-1].targets, optimization.seed)[own:].cpu()
+        costs = removal_costs(crops, finished, stages[-1].targets, optimization.seed)[member_count:].cpu()
         trained = setup.scene.replace_rows(setup.region.members, finished.cpu())[len(scene) :]
         trajectory = add_rows(trajectory, trained[costs > 0.0])
         effort["added"] = 0 if trajectory.added is None else len(trajectory.added)
         log.say(f"growth: {effort['added']} Gaussians added, of {len(seeds)}; the others contribute nothing")
-    return trajectory, loss_table([(one.step, one.means) for one in made]), effort
+    return trajectory, loss_table([(snapshot.step, snapshot.means) for snapshot in all_snapshots]), effort
 
 
 def plan_colors(
@@ -226,28 +229,28 @@ def plan_colors(
     log: RunLog,
     target_psnr: float | None = None,
 ) -> tuple[Solver, Model, Course]:
-    """Solve for the finished edit, and decide by that how much is modelled and which strengths come next.
+    """Solve for the finished edit, then choose the model size and the strengths to solve for next.
 
     Args:
-        optimization: nothing left open, see `resolve_kind`
-        setup: scene, region, views with boxes that hold the edit
-        edited: strength → the edited views, whole
-        between: what more strengths there may be; None: those of `edited`
-        options: whether the views are a handful of pictures, see `surface_ties`, or their number is open:
-            then every other one is solved for where nothing that this leaves shows
-        log: of the run
+        optimization: fully resolved options, see `resolve_kind`
+        setup: scene, region, and views whose boxes hold the edit
+        edited: strength → the whole edited views
+        between: source of further strengths; None: only those of `edited`
+        options: view options. A small number of pictures calls for ties, see `surface_ties`. If the number of
+            views is open, every other view is solved for, provided the remaining error is not visible
+        log: log of the run
         target_psnr: see `FieldOptions`
     """
     scene, members, count = setup.scene, setup.region.members, len(setup.train)
     original, few = pack(scene[members], with_shN=scene.sh_degree > 0), bool(options.pictures)
-    every, most = 1 if few else pixel_stride(setup), iterations(optimization.steps)
+    stride, max_iterations = 1 if few else pixel_stride(setup), iterations(optimization.steps)
     held_out = split_held_out(setup.held_out)[0] if len(edited[1.0]) > count else []
     train = setup.train
     judging = held_out or setup.train
 
     def draw(views: Sequence[View]) -> list[ColorView]:
         make = partial(crop_scene, scene, members, background=setup.background)
-        return color_views(LazySequence(views, lambda v: make(v.camera, v.box)), original, every)
+        return color_views(LazySequence(views, lambda v: make(v.camera, v.box)), original, stride)
 
     def judge(pictures: Sequence[Tensor]) -> Judge:
         return Judge(aside, boxed_pictures(pictures, judging))
@@ -257,8 +260,8 @@ def plan_colors(
         return stage, judge(split_held_out(pictures[len(train) :])[0] if held_out else pictures)
 
     def ask(strengths: Sequence[float]) -> list[Target]:
-        made = between.edit(strengths, [*train, *setup.held_out]) if between is not None else edited
-        return [target(s, made[s]) for s in strengths]
+        edits = between.edit(strengths, [*train, *setup.held_out]) if between is not None else edited
+        return [target(s, edits[s]) for s in strengths]
 
     with log.stage("weights"):
         drawn = draw(train)
@@ -269,62 +272,77 @@ def plan_colors(
         solver = make_solver(drawn, original, ties)
         targets = finished[0].targets
         trial = (solver, finished[1]) if ties is None else split_solver(solver, targets)
-        solver, model = choose_model(solver, trial, targets, most, 1 if optimization.sh == "off" else 9)
+        solver, model = choose_model(
+            solver, trial, targets, max_iterations, 1 if optimization.sh == "off" else 9
+        )
         if model.error <= LEVEL and held_out and between is not None and not options.views:
-            half = replace(finished[0], targets=targets[::2]), finished[1]
-            fewer = solve_again(model, make_solver(drawn[::2], original), targets[::2], half[1])
+            half_target = replace(finished[0], targets=targets[::2]), finished[1]
+            fewer = solve_again(model, make_solver(drawn[::2], original), targets[::2], half_target[1])
             if fewer[1].error <= LEVEL:
-                (solver, model), finished, train = fewer, half, train[::2]
+                (solver, model), finished, train = fewer, half_target, train[::2]
     strengths = [s for s in edited if s < 1.0] or [0.5] * (between is not None)
     look = None if between is None else cache(lambda s: judge(between.look(s, judging)))
     course = Course(ask(strengths), finished, look, ask)
     with log.stage("model"):
         middle = len(course.targets) // 2 if between is None else 0
-        spare = 0.0 if target_psnr is None else 10 ** (-target_psnr / 10)
-        model = thin_model(model, solver, [*course.targets[middle : middle + 1], finished], most, spare)
-    on = "views that are held out" if held_out else "all views, as none is held out"
+        allowed_error = 0.0 if target_psnr is None else 10 ** (-target_psnr / 10)
+        model = thin_model(
+            model, solver, [*course.targets[middle : middle + 1], finished], max_iterations, allowed_error
+        )
+    evaluated_on = "views that are held out" if held_out else "all views, as none is held out"
     if len(train) < count:
         log.say(f"{len(train)} of {count} views are solved for: all would change nothing that shows")
-    log.say(f"{model.line}, on {on if ties is None else 'squares of the pictures that are held out'}")
+    log.say(
+        f"{model.line}, on {evaluated_on if ties is None else 'squares of the pictures that are held out'}"
+    )
     if ties is not None:
-        unseen = len(original) - int(solver.asked[:, 0].sum())
-        log.say(f"{unseen} members that no picture shows follow the map and their own surface")
+        unseen_count = len(original) - int(solver.asked[:, 0].sum())
+        log.say(f"{unseen_count} members that no picture shows follow the map and their own surface")
     return solver.only(model.residual), model, course
 
 
 def pixel_stride(setup: TrainingSetup) -> int:
-    """Of how many of the views' pixels one is solved for, see `color_views`: as few as leave enough."""
-    degree = min(2, setup.scene.sh_degree)  # of a residual
-    numbers = (degree + 1) * (degree + 2) // 2 * len(setup.region)  # that half of the sphere tells apart
-    shown = sum(int((view.mask > 0.0).sum()) for view in setup.train)
-    return next((every for every in (4, 2) if shown >= every * _ENOUGH * numbers), 1)
+    """Return the stride over the views' pixels for the solver, see `color_views`: the largest with enough
+    pixels."""
+    degree = min(2, setup.scene.sh_degree)  # of the residual
+    unknowns = (
+        (degree + 1) * (degree + 2) // 2 * len(setup.region)
+    )  # unknowns that half a sphere can determine
+    region_pixels = sum(int((view.mask > 0.0).sum()) for view in setup.train)
+    return next((stride for stride in (4, 2) if region_pixels >= stride * _PIXELS_PER_UNKNOWN * unknowns), 1)
 
 
 def _solve(
     solver: Solver, model: Model, course: Course, most_steps: int, folder: StateFolder, log: RunLog
 ) -> Optimized:
-    """All views at once, for colors alone."""
+    """Solve for colors over all views at once."""
     state = PgsState(solver.original)
     recordings = Recordings(folder, solver.original.shape, model)
-    way = partial(solve, solver, model, course, recordings.made, state, steps=most_steps)
-    most = len(course.targets) + 1 if course.look is None else MAX_STAGES
-    made = _record_way(way, most, state, recordings, None, folder, log)
-    strengths, made = course.sort_recordings(made)
-    trajectory = record(made, state.average, strengths)
-    maps = torch.stack([one.table for one in made if one.table is not None])
-    taken = [int(one.means[STEPS]) for one in made if STEPS in one.means]
-    rows = [(one.step, {name: mean for name, mean in one.means.items() if name != STEPS}) for one in made]
-    steps = f"in {', '.join(map(str, taken))} steps, of {most_steps} each at most"
-    log.say(f"{len(strengths)} strengths {steps if taken else 'by maps alone'}")
-    effort = {"strengths": strengths, STEPS: taken, "most_steps": most_steps, "views": len(solver.views)}
+    solve_course = partial(solve, solver, model, course, recordings.made, state, steps=most_steps)
+    max_stages = len(course.targets) + 1 if course.look is None else MAX_STAGES
+    snapshots = _record_snapshots(solve_course, max_stages, state, recordings, None, folder, log)
+    strengths, snapshots = course.sort_recordings(snapshots)
+    trajectory = record(snapshots, state.average, strengths)
+    maps = torch.stack([one.table for one in snapshots if one.table is not None])
+    step_counts = [int(one.means[STEPS]) for one in snapshots if STEPS in one.means]
+    rows = [
+        (one.step, {name: mean for name, mean in one.means.items() if name != STEPS}) for one in snapshots
+    ]
+    steps = f"in {', '.join(map(str, step_counts))} steps, of {most_steps} each at most"
+    log.say(f"{len(strengths)} strengths {steps if step_counts else 'by maps alone'}")
+    effort = {
+        "strengths": strengths,
+        STEPS: step_counts,
+        "most_steps": most_steps,
+        "views": len(solver.views),
+    }
     trajectory = replace(trajectory, maps=maps, bands=model.bands, mask=model.mask)
     return trajectory, loss_table(rows), effort | model.figures()
 
 
 def _stages(optimization: OptimizeOptions, setup: TrainingSetup, edited: Pictures) -> list[TargetStage]:
-    """The strengths to optimize towards, and the steps that each gets: the last, which is looked at most,
-    twice as many."""
-    steps = max(optimization.steps, len(edited) + 1)  # each stage is to have one
+    """Return the stages, one per strength, with their steps: twice as many for the last, at strength 1."""
+    steps = max(optimization.steps, len(edited) + 1)  # at least one step per stage
     marks = [*(steps * i // (len(edited) + 1) for i in range(len(edited))), steps]
     return [
         TargetStage(s, boxed_pictures(pictures, setup.train, optimization.engine), end - begin)
@@ -339,7 +357,7 @@ def _crops(setup: TrainingSetup, still: bool, engine: str) -> list[CropScene]:
     return [make(view.camera, view.box) for view in setup.train]
 
 
-def _record_way(
+def _record_snapshots(
     way: Callable[[OnStep], Iterator[ParameterSnapshot]],
     steps: int,
     state: PgsState,
@@ -348,9 +366,9 @@ def _record_way(
     folder: StateFolder,
     log: RunLog,
 ) -> Sequence[ParameterSnapshot]:
-    """Go the way to its end, from the saved state on, and a jointly trained network with it.
+    """Run the optimization from the saved state to its end, together with a jointly trained network.
 
-    `way`: optimizes from the state on, and yields recordings
+    `way`: optimizes from the saved state, and yields recordings
 
     Returns:
         All recordings.
@@ -372,11 +390,11 @@ def _record_way(
             if stopped():
                 saver.save()
                 raise KeyboardInterrupt
-            if step > saved_at:  # within a step there is nothing new to save
+            if step > saved_at:  # nothing new to save within a step
                 saver.step_done()
                 saved_at = step
 
-        advance(state.step, "")  # of a handful of pictures nearly all is done before the first step
+        advance(state.step, "")  # for a small number of pictures most work comes before the first step
         try:
             for snapshot in way(step_done):
                 recordings.add(snapshot)
@@ -405,10 +423,10 @@ def _groups(
     folder: StateFolder,
     log: RunLog,
 ) -> Groups:
-    """The group stage, or what was saved of it."""
-    done = folder.load("groups")
-    if done is not None:
-        return restore_groups(original, done.tensors)
+    """Run the group stage, or restore it from the saved state."""
+    saved = folder.load("groups")
+    if saved is not None:
+        return restore_groups(original, saved.tensors)
     steps = optimization.group_steps or 0
     try:
         with log.steps("move parts", steps * len(stages)) as advance:
@@ -431,10 +449,10 @@ def _groups(
     return groups
 
 
-def _seeds(
+def _make_or_load_seeds(
     setup: TrainingSetup, optimization: OptimizeOptions, edited: Pictures, folder: StateFolder
 ) -> Gaussians | None:
-    """The rows that are added, or what was saved of them; None where there are none."""
+    """Return the rows to add, or restore them from the saved state; None if there are none."""
     saved = folder.load("seeds")
     finished = edited[max(edited)]
     if saved is None:
@@ -449,21 +467,21 @@ def _seeds(
 def retime_trajectory(
     trajectory: Trajectory, setup: TrainingSetup, optimization: OptimizeOptions, log: RunLog
 ) -> Trajectory:
-    """Without jitter, and at the slider values where its change is due; every recording is rendered once.
+    """Remove jitter and assign slider values by the visible change. Every recording is rendered once.
 
     Args:
-        trajectory: as recorded
+        trajectory: the recordings
         setup: scene, region, views
-        optimization: what slider values mean, and whether jitter is kept
-        log: of the run
+        optimization: determines the meaning of slider values, and whether jitter is retained
+        log: log of the run
     """
     moving = moving_attributes(trajectory.end)
-    small = probe_views(setup, _TIMED_VIEWS, still=only_recolors(trajectory.offsets))
+    probes = probe_views(setup, _TIMED_VIEWS, still=only_recolors(trajectory.offsets))
     original = pack(setup.scene[setup.region.members], with_shN=trajectory.end.shape[1] > BASE_CHANNELS)
     pictures: list[Tensor] = []
     with log.steps("time the slider", len(trajectory)) as advance:
         for i in range(len(trajectory)):
-            images = render_all(small, original + trajectory.node(i), moving)
+            images = render_all(probes, original + trajectory.node(i), moving)
             pictures.append(torch.cat([image.flatten() for image in images]))
             advance(i + 1, "recordings")
     if not optimization.as_printed and trajectory.maps is None:
