@@ -1,1 +1,1 @@
-"""Scenes in every format that people have."""
+"""Readers and writers of scenes in all supported file formats."""

@@ -1,7 +1,7 @@
-"""Axes of glTF files, and half turns between them.
+"""Coordinate axes of scene formats, and half turns between them.
 
 Three letters name the directions of x, y and z, as in the SPZ library: right or left, up or down, forward or
-back. Any two of these axes differ by half a turn, which only permutes numbers and changes signs.
+back. Any two of these systems differ by half a turn, which only permutes numbers and changes signs.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from progdf import sh
 from progdf.gaussians import Gaussians
 
 Axes = Literal["RDF", "RUB", "LUF"]
-"""RDF: 3DGS .ply and this program. RUB: OpenGL and .spz. LUF: glTF."""
+"""Axis systems. RDF: 3DGS .ply and this program. RUB: OpenGL and .spz. LUF: glTF."""
 
 GlbAxes = Literal["LUF", "RUB"]
-"""Axes of a .glb that is written: those of y up."""
+"""Axis systems for writing a .glb: the two with y up."""
 
 AXES: tuple[Axes, ...] = get_args(Axes)
 
@@ -33,15 +33,15 @@ _HALF_TURNS: dict[sh.Signs, tuple[list[int], list[float]]] = {
     (-1.0, 1.0, -1.0): ([2, 3, 0, 1], [-1.0, 1.0, 1.0, -1.0]),
     (-1.0, -1.0, 1.0): ([3, 2, 1, 0], [-1.0, -1.0, 1.0, 1.0]),
 }
-"""Half turns about x, y and z times a quaternion wxyz: order and signs of its components."""
+"""Order and signs of the components of a quaternion wxyz after half a turn about x, y or z."""
 
 
 def convert_axes(scene: Gaussians, start: Axes, end: Axes) -> Gaussians:
-    """Return the scene turned from one set of axes to another; there and back gives the same bits.
+    """Convert a scene from one axis system to another. Converting back gives the same bits.
 
     Args:
         scene: N Gaussians in the axes `start`
-        start, end: the present and the requested axes
+        start, end: the current and the requested axes
     """
     if start == end:
         return scene

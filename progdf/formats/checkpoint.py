@@ -1,9 +1,9 @@
-"""Checkpoints of trainings with gsplat (.pt) and nerfstudio's splatfacto (.ckpt).
+"""Reader of training checkpoints of gsplat (.pt) and nerfstudio's splatfacto (.ckpt).
 
 A checkpoint is a zip archive of torch: a pickle with names and shapes, and a file of raw numbers per tensor.
-Torch's reader of weights loads it. That reader runs nothing from the file, and maps the numbers instead of
+`torch.load` with `weights_only` reads it. It executes nothing from the file, and maps the numbers instead of
 copying them. Two checks come first: the archive is not compressed, and the pickle names only plain tensors.
-A tensor is copied once its numbers are known to fit into the file.
+A tensor is only copied after a check that its numbers fit into the file.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from progdf.io.file_rules import check_fields, damage_error, unsupported_error, 
 
 from .containers import START_BYTES, check_foreign
 
-LARGEST_PICKLE = 16 << 20  # bytes; the pickle of a training has some 100 kB
-LEGACY_MAGIC = b"\x80\x02"  # a pickle of protocol 2, where newer files begin with a zip archive
+LARGEST_PICKLE = 16 << 20  # bytes; the pickle of a checkpoint has about 100 kB
+LEGACY_MAGIC = b"\x80\x02"  # start of a protocol 2 pickle; files since torch 1.6 are zip archives
 DEEPEST_TABLE = 4  # levels of nested tables that are searched for tensors
 RESAVE = "load it with torch and save dense float tensors with torch.save"
 EXPORT = (
@@ -49,13 +49,13 @@ _ALIASES = {
     "shN": "shN",
     "features_rest": "shN",
 }
-"""Names of the Gaussians' tensors: gsplat's and splatfacto's → ours."""
+"""Tensor names of gsplat and splatfacto → attributes."""
 
 _WRAPPERS = {"splats", "pipeline", "state_dict", "module", "_model", "gauss_params"}
-"""Parts of a tensor's name that only say where a program keeps its Gaussians; `module` is DDP's."""
+"""Name components of containers around the Gaussians, which are skipped; `module` comes from DDP."""
 
 _TRAINING_STATE = {"optimizers", "optimizer", "schedulers", "scalers", "strategy_state"}
-"""Tables that only going on with the training needs."""
+"""Tables that are only needed to resume training."""
 
 _PLAIN_GLOBALS = {
     "collections.OrderedDict",
@@ -64,7 +64,7 @@ _PLAIN_GLOBALS = {
     "torch._utils._rebuild_tensor_v2",
     "torch._utils._rebuild_parameter",
 }
-"""Everything that a pickle of plain tensors names, besides storages and dtypes."""
+"""Globals in a pickle of plain tensors, besides storages and dtypes."""
 
 _SPECIAL_TENSORS = {
     "torch._utils._rebuild_sparse_tensor": "sparse tensors",
@@ -76,20 +76,20 @@ _SPECIAL_TENSORS = {
 _COLOR_MODULE = re.compile(
     r"app_|appearance|embed|bil_?grid|bilateral|post_processing|ppisp|exposure|color_nn|color_net|mlp|bg_model"
 )
-"""Networks and tables that a training applies to the colors, by words of their names."""
+"""Pattern for the names of modules that change colors, such as appearance networks."""
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """The Gaussians of one checkpoint file, as stored."""
+    """Gaussians of one checkpoint file, as stored."""
 
     scene: Gaussians
-    step: object  # training step, None where the file has none
+    step: object  # training step; None if the file states none
     ignored: tuple[str, ...]  # tensors and modules that do not change the scene
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
-    """Read the Gaussians of a gsplat or nerfstudio training. Nothing in the file is run.
+    """Read the Gaussians of a gsplat or nerfstudio checkpoint. Nothing in the file is executed.
 
     Raises:
         ProgdfError: the file is damaged, holds no Gaussians, or has a feature that is not supported.
@@ -145,7 +145,7 @@ def _gaussians(path: Path, columns: Mapping[str, Tensor], has_logit_colors: bool
     Args:
         path: the checkpoint
         columns: means, quats, scales, opacities, sh0 and, above degree 0, shN
-        has_logit_colors: of degree 0, sh0 is the logit of RGB, as in splatfacto
+        has_logit_colors: at SH degree 0, sh0 is the logit of RGB, as in splatfacto
     """
     count = len(columns["means"]) if columns["means"].ndim else 0
     rest = columns.get("shN")
@@ -183,7 +183,7 @@ def _gaussians(path: Path, columns: Mapping[str, Tensor], has_logit_colors: bool
 
 
 def _check_tensor(path: Path, name: str, tensor: Tensor) -> None:
-    """Refuse a tensor that is not plain floats, or that repeats the numbers of its storage."""
+    """Refuse a tensor that has no plain floats, or that is an expanded view of a smaller storage."""
     kind = str(tensor.dtype).removeprefix("torch.")
     if tensor.layout != torch.strided or tensor.is_meta or tensor.is_quantized:
         raise unsupported_error(path, f"'{name}' as a special tensor ({kind}, {tensor.layout})", RESAVE)
@@ -197,24 +197,24 @@ def _check_tensor(path: Path, name: str, tensor: Tensor) -> None:
 
 
 def _load_weights(path: Path) -> Any:
-    """Load the content of a checkpoint, its tensors mapped from the file.
+    """Load the content of a checkpoint with its tensors memory-mapped.
 
     Raises:
         ProgdfError: the archive or its pickle is damaged, or holds more than plain tensors.
     """
     _check_pickle(path, _read_pickle(path))
     try:
-        with warnings.catch_warnings(action="ignore"):  # torch warns of pickles that it then refuses
+        with warnings.catch_warnings(action="ignore"):  # torch warns about pickles that it then refuses
             return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except OSError as error:
         raise open_error(path, error) from None
-    except Exception as error:  # torch raises errors of many types for a pickle that does not add up
+    except Exception as error:  # torch raises errors of many types for an inconsistent pickle
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise damage_error(path, f"its table of tensors does not add up ({reason})") from None
 
 
 def _read_pickle(path: Path) -> bytes:
-    """Return the pickle of torch's archive, once its entries are uncompressed and fit into the file."""
+    """Return the pickle of torch's archive, after a check that its entries are uncompressed and fit."""
     start = read_file(path, START_BYTES)
     if start.startswith(LEGACY_MAGIC):
         raise unsupported_error(path, "the archive format of torch before 1.6", RESAVE)
@@ -233,7 +233,7 @@ def _read_pickle(path: Path) -> bytes:
     except ProgdfError:
         raise
     except (zipfile.BadZipFile, ValueError, RuntimeError, NotImplementedError, EOFError, OSError) as error:
-        if isinstance(error, OSError) and error.errno != errno.EINVAL:  # EINVAL: an offset before the file
+        if isinstance(error, OSError) and error.errno != errno.EINVAL:  # EINVAL: negative offset
             raise open_error(path, error) from None
         raise damage_error(path, f"its archive cannot be read ({str(error)[:80]})") from None
     if contents.get("byteorder", b"little") != b"little":
@@ -242,7 +242,7 @@ def _read_pickle(path: Path) -> bytes:
 
 
 def _check_entries(path: Path, entries: Sequence[zipfile.ZipInfo]) -> None:
-    """Refuse an archive that torch does not write, or whose entries are larger than the file."""
+    """Refuse an archive that was not written by torch, or whose entries are larger than the file."""
     pickles = [entry for entry in entries if entry.filename.endswith("/data.pkl")]
     if any(entry.filename.endswith("/constants.pkl") for entry in entries):
         raise unsupported_error(path, "a compiled program of torch (TorchScript)", EXPORT)
@@ -258,7 +258,7 @@ def _check_entries(path: Path, entries: Sequence[zipfile.ZipInfo]) -> None:
 
 
 def _check_pickle(path: Path, pickled: bytes) -> None:
-    """Refuse a pickle that names anything but plain tensors, before anything is built from it."""
+    """Refuse a pickle that names anything but plain tensors, before any object is built from it."""
     names = []
     protocol: object = 2
     last = ""

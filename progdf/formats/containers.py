@@ -1,7 +1,7 @@
-"""Archives with one scene inside, and files that are no scene, recognized by their first bytes.
+"""Archives that hold one scene, and recognition of other file types by their first bytes.
 
-A .zip (as Luma exports them) and a .gz of any scene are unpacked into a temporary folder. The size of the
-archive bounds the unpacked size. Other files are named in an error with a remedy.
+A .zip (as exported by Luma) or .gz with any scene is unpacked into a temporary folder. The size of the
+archive bounds the unpacked size. The error for any other file names its type and a remedy.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from progdf.io.file_rules import damage_error, unsupported_error
 from progdf.terminal import file_size
 
 START_BYTES = 512
-"""Bytes of a file's start by which it is recognized."""
+"""Number of bytes at the start of a file that are enough to recognize its type."""
 
 ZIP = b"PK\x03\x04"
 GZIP = b"\x1f\x8b"
 _EMPTY_ZIP = b"PK\x05\x06"
-_ENDINGS = (".ply", ".spz", ".splat", ".ksplat", ".sog", ".glb", ".ckpt", ".pt", ".pth")
+_SCENE_ENDINGS = (".ply", ".spz", ".splat", ".ksplat", ".sog", ".glb", ".ckpt", ".pt", ".pth")
 _SESSION_ENDING = ".session.json"
-_MAX_UNPACKED = (64 << 20, 64)  # bytes: a base, and more for each byte of the archive
+_MAX_UNPACKED = (64 << 20, 64)  # unpacked bytes: a base, and an increment per byte of the archive
 _CHUNK_BYTES = 1 << 20
-_MAX_LISTED = 20  # names in an error
+_MAX_LISTED = 20  # file names listed in an error
 
 _DOWNLOAD = "download the file itself"
 _TRAIN = "train a scene from it with a 3DGS trainer and give the scene's .ply"
 _UNPACK = "unpack it and give the scene inside"
-_FOREIGN = (
+_OTHER_FILE_TYPES = (
     (
         b"version https://git-lfs",
         "is a Git LFS pointer, not the file itself",
@@ -66,21 +66,21 @@ _FOREIGN = (
     (b"BLENDER", "is a Blender file, not a scene", "export the Gaussians from it as .ply"),
 )
 _MAX_SAFETENSORS_HEADER = 100_000_000  # bytes, the limit of the format
-_HTML = (b"<!doctype", b"<html", b"<head", b"<body", b"<!--")
-_TEXT = frozenset(b"\t\n\r\f" + bytes(range(32, 127)))
-_MIN_TEXT = 4  # a shorter file is called by no kind
-_SCENE_MAGIC = (b"ply", b"glTF", b"NGSP")
+_HTML_STARTS = (b"<!doctype", b"<html", b"<head", b"<body", b"<!--")
+_TEXT_BYTES = frozenset(b"\t\n\r\f" + bytes(range(32, 127)))
+_MIN_TEXT_LENGTH = 4  # bytes; the type of a shorter text is not guessed
+_SCENE_MAGICS = (b"ply", b"glTF", b"NGSP")
 
 
 def check_foreign(path: str | os.PathLike[str], start: bytes) -> None:
-    """Refuse a file whose start is that of another kind of file, under any name.
+    """Refuse a file that starts like a known file type that is no scene, whatever its name.
 
     Args:
         path: the file
         start: its first `START_BYTES` bytes
 
     Raises:
-        ProgdfError: it is empty, or of a kind that is not read: a Git LFS pointer, a web page, a picture.
+        ProgdfError: the file is empty, or of a type that is not read, such as a Git LFS pointer or a picture.
     """
     if not start:
         raise ProgdfError(f"{os.fspath(path)} is empty (0 bytes); copy or download it again")
@@ -89,8 +89,8 @@ def check_foreign(path: str | os.PathLike[str], start: bytes) -> None:
 
 
 def _foreign_kind(start: bytes) -> str:
-    """Return the kind of a file that is no scene and the remedy, or an empty text."""
-    for magic, kind, remedy in _FOREIGN:
+    """Return the type of a file that is no scene and a remedy, or an empty text."""
+    for magic, kind, remedy in _OTHER_FILE_TYPES:
         if start.startswith(magic) and not (magic == b"BM" and start[6:10] != b"\0\0\0\0"):
             return f"{kind}; {remedy}"
     if start[:4] == b"RIFF" and start[8:12] in (b"WEBP", b"AVI "):
@@ -107,11 +107,11 @@ def _foreign_kind(start: bytes) -> str:
     if start[257:262] == b"ustar":
         return f"is a tar archive; {_UNPACK}"
     text = start.removeprefix(b"\xef\xbb\xbf").lstrip()
-    if text[:16].lower().startswith(_HTML):
+    if text[:16].lower().startswith(_HTML_STARTS):
         return f"is a web page, not a scene; {_DOWNLOAD}"
     if text.startswith(b"<?xml"):
         return f"is XML, not a scene; {_DOWNLOAD}"
-    if len(text) < _MIN_TEXT or text.startswith(_SCENE_MAGIC) or not _TEXT.issuperset(text):
+    if len(text) < _MIN_TEXT_LENGTH or text.startswith(_SCENE_MAGICS) or not _TEXT_BYTES.issuperset(text):
         return ""
     if text[:1] in (b"{", b"["):
         if b'"lodLevels"' in text:
@@ -121,7 +121,7 @@ def _foreign_kind(start: bytes) -> str:
 
 
 def inflate_start(start: bytes, length: int) -> bytes:
-    """Return the first bytes inside a gzip file, at most `length`; none where it is damaged."""
+    """Return the first bytes inside a gzip file, at most `length`; no bytes if it is damaged."""
     try:
         return zlib.decompressobj(wbits=31).decompress(start, length)
     except zlib.error:
@@ -130,10 +130,13 @@ def inflate_start(start: bytes, length: int) -> bytes:
 
 @contextmanager
 def unpacked_scene(path: Path) -> Iterator[Path]:
-    """The one scene in a .zip or .gz, as a file of a temporary folder that is removed afterwards.
+    """Unpack the only scene in a .zip or .gz into a temporary folder, and yield its file.
+
+    The folder is removed when the block ends.
 
     Raises:
-        ProgdfError: it holds no scene or several, is encrypted, damaged, or unpacks to more than a scene can.
+        ProgdfError: the archive holds no scene or several, is encrypted or damaged, or unpacks to more than
+            a scene can.
     """
     with tempfile.TemporaryDirectory(prefix="progdf-") as folder:
         try:
@@ -150,7 +153,7 @@ def unpacked_scene(path: Path) -> Iterator[Path]:
 
 
 def _unpack_zip(path: Path, folder: Path) -> Path:
-    """Unpack the scene of a zip archive; return its file in the folder."""
+    """Unpack the scene of a zip archive and return its file in the folder."""
     try:
         with zipfile.ZipFile(path) as archive:
             entry = _scene_entry(path, archive.infolist())
@@ -176,7 +179,7 @@ def _scene_entry(path: Path, entries: list[zipfile.ZipInfo]) -> zipfile.ZipInfo:
     names = [entry.filename for entry in files]
     if any(name.lower().endswith(_SESSION_ENDING) for name in names):
         raise ProgdfError(f"{path} holds a session; open it with `progdf view`, as NAME.progdf.zip")
-    scenes = [entry for entry in files if entry.filename.lower().endswith(_ENDINGS)]
+    scenes = [entry for entry in files if entry.filename.lower().endswith(_SCENE_ENDINGS)]
     if not scenes:
         raise ProgdfError(
             f"{path} holds no scene, only {_join_names(names)}; give the archive of a .ply or another scene"
@@ -193,22 +196,22 @@ def _scene_entry(path: Path, entries: list[zipfile.ZipInfo]) -> zipfile.ZipInfo:
 
 
 def _is_visible(name: str) -> bool:
-    """Return whether a file of an archive is a person's own: neither hidden nor one of macOS' copies."""
+    """Return whether an archive entry is a regular user file: neither hidden nor a copy that macOS adds."""
     parts = PurePosixPath(name.replace("\\", "/")).parts
     return bool(parts) and "__MACOSX" not in parts and not parts[-1].startswith(".")
 
 
 def _join_names(names: list[str]) -> str:
-    """Return names for an error, the first ones where there are many."""
+    """Return a list of names for an error, at most the first `_MAX_LISTED`."""
     if not names:
         return "nothing"
     listed = ", ".join(name[:80] for name in names[:_MAX_LISTED])
-    rest = len(names) - _MAX_LISTED
-    return f"{listed} and {rest} more" if rest > 0 else listed
+    omitted_count = len(names) - _MAX_LISTED
+    return f"{listed} and {omitted_count} more" if omitted_count > 0 else listed
 
 
 def _unpack_gzip(path: Path, folder: Path) -> Path:
-    """Unpack a gzip file; return the file inside, whose name is that of the archive without .gz."""
+    """Unpack a gzip file and return the file inside, named like the archive without .gz."""
     name = path.name[:-3] if path.name.lower().endswith(".gz") else f"{path.name}.unpacked"
     target = folder / name
     written = 0
@@ -228,7 +231,7 @@ def _check_size(path: Path, unpacked: int) -> None:
 
     Args:
         path: the archive
-        unpacked: bytes, as the archive declares them or as they were counted
+        unpacked: bytes, as declared by the archive or as counted so far
     """
     base, each = _MAX_UNPACKED
     packed = path.stat().st_size

@@ -1,11 +1,11 @@
 """Gaussians in glTF files, by the ratified extension KHR_gaussian_splatting.
 
-A primitive of points has linear scales and opacities, quaternions xyzw and a column for each SH coefficient.
+A point primitive stores linear scales and opacities, quaternions xyzw and one attribute per SH coefficient.
 Programs that do not know the extension show a cloud of colored points.
 https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting
 
 Axes: the extension only requires y up. Files are written and read in glTF's own axes LUF (x left, y up, z
-forward), as splat-transform, PlayCanvas and Cesium do. A file in other axes names them in `asset.extras`.
+forward), as in splat-transform, PlayCanvas and Cesium. A file in other axes names them in `asset.extras`.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ MAX_DEGREE = 3
 
 SRGB = "srgb_rec709_display"
 LINEAR = "lin_rec709_display"
-_SPZ = ("KHR_gaussian_splatting_compression_spz_2", "KHR_gaussian_splatting_compression_spz")
-_HONORED = (EXTENSION, *_SPZ, VISIBILITY, "KHR_mesh_quantization")
-_IRRELEVANT = (
+_SPZ_EXTENSIONS = ("KHR_gaussian_splatting_compression_spz_2", "KHR_gaussian_splatting_compression_spz")
+_SUPPORTED_EXTENSIONS = (EXTENSION, *_SPZ_EXTENSIONS, VISIBILITY, "KHR_mesh_quantization")
+_IRRELEVANT_EXTENSIONS = (
     "KHR_materials_",
     "EXT_materials_",
     "KHR_texture_",
@@ -62,24 +62,26 @@ _IRRELEVANT = (
 )
 """Extensions of materials and lights: Gaussians have neither."""
 
-_KINDS = {
+_ATTRIBUTE_TYPES = {
     "POSITION": "VEC3",
     f"{EXTENSION}:ROTATION": "VEC4",
     f"{EXTENSION}:SCALE": "VEC3",
     f"{EXTENSION}:OPACITY": "SCALAR",
 }
-"""Types of the attributes beside the SH coefficients."""
+"""Accessor types of all attributes except the SH coefficients."""
 
 _EXPORT_AGAIN = "export it without that extension"
 
 GENERATOR_AXES: tuple[tuple[str, Axes], ...] = (("splat-transform 1.", "RDF"), ("progdf", "RUB"))
-"""Axes of files that do not name them, by the beginning of `asset.generator`: splat-transform wrote those of
-the .ply before version 2, this program at first OpenGL's."""
+"""Axes of files that do not name them, by the start of `asset.generator`.
 
-LOG_SCALE_LIMIT = -1e-6  # linear scales are not negative; splat-transform wrote logarithms before June 2026
+splat-transform used the axes of the .ply before version 2, and early versions of this program used OpenGL's.
+"""
+
+LOG_SCALE_LIMIT = -1e-6  # a scale below it is a logarithm, as splat-transform wrote before June 2026
 
 ReadSpz = Callable[[bytes], Gaussians]
-"""Reads the bytes of an .spz in its own axes (RUB)."""
+"""Function that reads the bytes of an .spz, in its own axes (RUB)."""
 
 
 @dataclass(frozen=True)
@@ -88,9 +90,9 @@ class GltfScene:
 
     scene: Gaussians  # in the axes of the .ply, means in float64 and in the world
     storage: tuple[str, ...]  # axes and compression, a phrase each
-    conversions: tuple[str, ...]  # numbers of other conventions that were converted, a phrase each
-    ignored: tuple[str, ...]  # parts of the file that were not used
-    file_bytes: int  # of the file and its buffers
+    conversions: tuple[str, ...]  # conversions from other conventions, a phrase each
+    ignored: tuple[str, ...]  # unused parts of the file
+    file_bytes: int  # size of the file and its buffers
 
 
 def write_glb(path: Path, scene: Gaussians, axes: Axes = "LUF") -> None:
@@ -122,8 +124,8 @@ def write_glb(path: Path, scene: Gaussians, axes: Axes = "LUF") -> None:
         accessors.append(accessor)
         parts.append(content)
         start += len(content)
-    look = {"kernel": "ellipse", "colorSpace": SRGB, "projection": "perspective"}
-    look["sortingMethod"] = "cameraDistance"
+    properties = {"kernel": "ellipse", "colorSpace": SRGB, "projection": "perspective"}
+    properties["sortingMethod"] = "cameraDistance"
     node: dict[str, Any] = {"mesh": 0}
     if scene.origin != ZERO:
         node["translation"] = list(scene.origin)
@@ -133,7 +135,9 @@ def write_glb(path: Path, scene: Gaussians, axes: Axes = "LUF") -> None:
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [node],
-        "meshes": [{"primitives": [{"attributes": attributes, "mode": 0, "extensions": {EXTENSION: look}}]}],
+        "meshes": [
+            {"primitives": [{"attributes": attributes, "mode": 0, "extensions": {EXTENSION: properties}}]}
+        ],
         "accessors": accessors,
         "bufferViews": views,
         "buffers": [{"byteLength": start}],
@@ -148,7 +152,7 @@ def write_glb(path: Path, scene: Gaussians, axes: Axes = "LUF") -> None:
 
 
 def _columns(scene: Gaussians) -> dict[str, NDArray[Any]]:
-    """The attributes of a primitive by name, float32, or bytes for the colors of points. [N,size]"""
+    """Return the attributes of a primitive by name: float32, or bytes for the point colors. [N,size]"""
     points = linear_from_srgb(sh.sh0_to_rgb(scene.sh0).clamp(0, 1))  # glTF's vertex colors are linear light
     tables: dict[str, Tensor] = {
         "POSITION": scene.means,
@@ -173,11 +177,11 @@ def _coefficient_names(degree: int) -> list[str]:
 
 
 def read_gltf(path: Path, read_spz: ReadSpz) -> GltfScene:
-    """Read the Gaussians that the scene of a .glb or .gltf shows, every instance of a mesh once.
+    """Read the Gaussians in the scene of a .glb or .gltf, one copy per instance of a mesh.
 
     Args:
-        path: the file; a .gltf names the files of its numbers, inside its folder
-        read_spz: reads parts that are compressed as .spz
+        path: the file; a .gltf refers to buffer files inside its folder
+        read_spz: reader for parts that are compressed as .spz
 
     Raises:
         ProgdfError: the file is damaged, holds no Gaussians, or has a feature that is not supported.
@@ -207,16 +211,16 @@ def read_gltf(path: Path, read_spz: ReadSpz) -> GltfScene:
     if axes != "RDF":
         storage.append(f"turned from axes {axes} to RDF")
     ignored = (*reader.ignored, *_ignored_parts(file, placements))
-    turned = convert_axes(scene, axes, "RDF")
-    return GltfScene(turned, tuple(storage), tuple(reader.conversions), ignored, file.stored_bytes)
+    converted = convert_axes(scene, axes, "RDF")
+    return GltfScene(converted, tuple(storage), tuple(reader.conversions), ignored, file.stored_bytes)
 
 
 def stored_axes(file: GltfFile) -> Axes:
-    """Return the axes of a file: as it says, else as its generator wrote them, else glTF's LUF."""
+    """Return the axes of a file: as declared, otherwise by its generator, otherwise glTF's LUF."""
     asset = file.tables.asset
-    named = asset.extras.get("axes") if isinstance(asset.extras, dict) else None
+    declared = asset.extras.get("axes") if isinstance(asset.extras, dict) else None
     for axes in AXES:
-        if named == axes:
+        if declared == axes:
             return axes
     for beginning, axes in GENERATOR_AXES:
         if asset.generator.startswith(beginning):
@@ -225,52 +229,57 @@ def stored_axes(file: GltfFile) -> Axes:
 
 
 def _check_required(file: GltfFile) -> None:
-    """Raise ProgdfError: the file requires an extension that is not supported."""
+    """Raise ProgdfError if the file requires an extension that is not supported."""
     for name in file.tables.extensionsRequired:
-        if name not in _HONORED and not name.startswith(_IRRELEVANT):
+        if name not in _SUPPORTED_EXTENSIONS and not name.startswith(_IRRELEVANT_EXTENSIONS):
             feature = f"the required extension {escape_text(name)[:80]}"
             raise unsupported_error(file.path, feature, REFUSED.get(name, _EXPORT_AGAIN))
 
 
 def _is_splats(primitive: Primitive) -> bool:
-    """Return whether points are Gaussians: by the extension, or by its attributes if a converter drops it."""
+    """Return whether a primitive holds Gaussians: by the extension, or by its attributes without it.
+
+    Some converters drop the extension and leave the attributes.
+    """
     return EXTENSION in primitive.extensions or f"{EXTENSION}:SCALE" in primitive.attributes
 
 
 def _ignored_parts(file: GltfFile, placements: list[Placement]) -> Iterator[str]:
-    """Parts of the file that may matter to a person and are not read."""
+    """Yield the parts of the file that are not read and may matter to the user."""
     tables = file.tables
-    shown = {placement.mesh for placement in placements}
-    hidden = [
+    used_meshes = {placement.mesh for placement in placements}
+    unused_splats = [
         index
         for index, mesh in enumerate(tables.meshes)
-        if index not in shown and any(map(_is_splats, mesh.primitives))
+        if index not in used_meshes and any(map(_is_splats, mesh.primitives))
     ]
-    others = [
+    mixed_meshes = [
         index
         for index, mesh in enumerate(tables.meshes)
-        if index in shown and not all(map(_is_splats, mesh.primitives))
+        if index in used_meshes and not all(map(_is_splats, mesh.primitives))
     ]
-    if hidden:
-        yield f"meshes[{hidden[0]}] outside the scene" + (
-            f" and {len(hidden) - 1} more" if hidden[1:] else ""
+    if unused_splats:
+        yield f"meshes[{unused_splats[0]}] outside the scene" + (
+            f" and {len(unused_splats) - 1} more" if unused_splats[1:] else ""
         )
-    if others:
-        yield f"triangles of meshes[{others[0]}]" + (f" and {len(others) - 1} more" if others[1:] else "")
+    if mixed_meshes:
+        yield f"triangles of meshes[{mixed_meshes[0]}]" + (
+            f" and {len(mixed_meshes) - 1} more" if mixed_meshes[1:] else ""
+        )
     if tables.animations:
         yield "animations (the scene at rest is read)"
     for name in tables.extensionsUsed:
-        if name not in _HONORED:
+        if name not in _SUPPORTED_EXTENSIONS:
             yield escape_text(name)[:80]
 
 
 def _place(part: Gaussians, matrix: NDArray[np.float64], turn: Tensor, factor: float) -> Gaussians:
-    """The Gaussians of a mesh in the world.
+    """Transform the Gaussians of a mesh to the world.
 
     Args:
         part: N Gaussians in the axes of the mesh, means in float64
         matrix: mesh to world, a similarity. [4,4]
-        turn, factor: its rotation (unit quaternion [1,4]) and its scale
+        turn, factor: the rotation (unit quaternion [1,4]) and the scale of the matrix
     """
     linear = torch.from_numpy(matrix[:3, :3])
     placed = replace(part, means=part.means @ linear.T + torch.from_numpy(matrix[:3, 3]))
@@ -284,7 +293,7 @@ def _place(part: Gaussians, matrix: NDArray[np.float64], turn: Tensor, factor: f
 
 
 def _join(file: GltfFile, parts: list[Gaussians]) -> Gaussians:
-    """All parts as one scene; parts of a lower SH degree get bands of zeros."""
+    """Join all parts to one scene, and pad parts of a lower SH degree with zeros."""
     if len({part.antialiased for part in parts}) > 1:
         raise unsupported_error(
             file.path, "parts with and without antialiasing (SPZ)", "export them as separate scenes"
@@ -301,24 +310,24 @@ def _join(file: GltfFile, parts: list[Gaussians]) -> Gaussians:
 
 @dataclass(frozen=True)
 class _Plan:
-    """A checked primitive of N Gaussians, before its numbers are read."""
+    """Checked primitive of N Gaussians whose data is not read yet."""
 
     name: str  # for errors
     color_space: str
-    spz: int | None  # buffer view of an .spz, which holds everything
-    columns: dict[str, str]  # attributes to read and their types; SH coefficients last, in their order
+    spz: int | None  # buffer view of an .spz with all attributes
+    columns: dict[str, str]  # attributes to read and their types; SH coefficients last, in order
     attributes: dict[str, int]  # accessors by name
-    rows: int  # N; 0 where an .spz knows
-    indices: int | None  # accessor of the rows that are points; None: all
+    rows: int  # N; 0 if only the .spz states it
+    indices: int | None  # accessor of the row indices to use; None: all rows
 
     @property
     def width(self) -> int:
-        """Numbers of a Gaussian."""
-        return 11 + 3 * (len(self.columns) - len(_KINDS))
+        """Count of numbers per Gaussian."""
+        return 11 + 3 * (len(self.columns) - len(_ATTRIBUTE_TYPES))
 
 
 class _Reader:
-    """Reads each primitive once, however many nodes show it."""
+    """Reader that decodes each primitive once, however many nodes refer to it."""
 
     def __init__(self, file: GltfFile, read_spz: ReadSpz) -> None:
         self.file = file
@@ -330,7 +339,7 @@ class _Reader:
         self._parts: dict[tuple[int, int], Gaussians] = {}
 
     def measure(self, mesh: int, index: int) -> None:
-        """Count the memory of a primitive that is about to be read once more.
+        """Add the memory for one more copy of a primitive to the total before it is read.
 
         Raises:
             ProgdfError: the primitive is damaged or not supported, or the file repeats it too often.
@@ -348,34 +357,34 @@ class _Reader:
         """Return the Gaussians of a measured primitive as stored, means in float64.
 
         Raises:
-            ProgdfError: numbers lie outside the file, or its .spz cannot be read.
+            ProgdfError: data lies outside the file, or its .spz cannot be read.
         """
         key = (mesh, index)
         plan = self._plans[key]
         if key not in self._parts:
             self._parts[key] = self._read_part(plan)
         part = self._parts[key]
-        if plan.spz is not None:  # of which nothing was known before
+        if plan.spz is not None:  # its size is only known once it is decoded
             self.file.take(len(part), 14 + 3 * part.shN.shape[1])
         return part
 
     def _plan(self, mesh: int, index: int) -> _Plan:
-        """Check a primitive, and find its columns."""
+        """Check a primitive and find its columns."""
         file = self.file
         primitive = file.tables.meshes[mesh].primitives[index]
         name = f"meshes[{mesh}].primitives[{index}]"
         attributes = primitive.attributes
-        color_space, spz = self._check_look(primitive, name)
+        color_space, spz = self._check_extension(primitive, name)
         if spz is not None:
             rows = 0
             if "POSITION" in attributes:
                 rows = file.accessor(attributes["POSITION"], "VEC3").count
-            return _Plan(name, color_space, spz, _KINDS, attributes, rows, primitive.indices)
+            return _Plan(name, color_space, spz, _ATTRIBUTE_TYPES, attributes, rows, primitive.indices)
         degree = 0
         while degree < MAX_DEGREE and any(n in attributes for n in _coefficient_names(degree + 1)):
             degree += 1
         bands = [column for l in range(degree + 1) for column in _coefficient_names(l)]
-        columns = _KINDS | dict.fromkeys(bands, "VEC3")
+        columns = _ATTRIBUTE_TYPES | dict.fromkeys(bands, "VEC3")
         absent = next((column for column in columns if column not in attributes), None)
         if absent is not None:
             raise damage_error(file.path, f"{name} lacks {absent}")
@@ -395,7 +404,7 @@ class _Reader:
         return _Plan(name, color_space, None, columns, attributes, positions.count, primitive.indices)
 
     def _read_part(self, plan: _Plan) -> Gaussians:
-        """The Gaussians of a primitive in sRGB, its indices applied."""
+        """Return the Gaussians of a primitive in sRGB, with its indices applied."""
         part = self._read_columns(plan) if plan.spz is None else self._read_compressed(plan, plan.spz)
         if plan.indices is not None:
             part = part[torch.from_numpy(self.file.read_indices(plan.indices, len(part)))]
@@ -405,11 +414,11 @@ class _Reader:
             part = replace(part, sh0=coefficients[:, 0], shN=coefficients[:, 1:])
         return part
 
-    def _check_look(self, primitive: Primitive, name: str) -> tuple[str, int | None]:
-        """The color space, and the buffer view of an .spz.
+    def _check_extension(self, primitive: Primitive, name: str) -> tuple[str, int | None]:
+        """Return the color space, and the buffer view of the .spz if there is one.
 
         Raises:
-            ProgdfError: the Gaussians are to be drawn in a way that is not supported.
+            ProgdfError: the primitive uses a rendering feature that is not supported.
         """
         path = self.file.path
         if primitive.targets:
@@ -418,11 +427,11 @@ class _Reader:
         for extension, remedy in REFUSED.items():
             if extension in primitive.extensions:
                 raise unsupported_error(path, f"{extension} in {name}", remedy)
-        look = primitive.extensions.get(EXTENSION)
-        if look is None:
+        properties = primitive.extensions.get(EXTENSION)
+        if properties is None:
             self.conversions[f"colors taken as sRGB, as {EXTENSION} is absent"] = None
             return SRGB, None
-        if not isinstance(look, dict):
+        if not isinstance(properties, dict):
             raise damage_error(path, f"{EXTENSION} of {name} is not an object")
         known = {
             "kernel": ("ellipse",),
@@ -431,35 +440,37 @@ class _Reader:
             "sortingMethod": ("cameraDistance",),
         }
         for field, values in known.items():
-            value = look.get(field, values[0])
+            value = properties.get(field, values[0])
             if value not in values:
                 feature = f"{field} '{escape_text(str(value))[:40]}' in {name}"
                 raise unsupported_error(path, feature, f"export it with {' or '.join(values)}")
-        if "colorSpace" not in look:
+        if "colorSpace" not in properties:
             self.conversions["colors taken as sRGB, as colorSpace is absent"] = None
-        unknown = check_fields(path, look, (*known, "extensions", "extras"), {}, _EXPORT_AGAIN)
+        unknown = check_fields(path, properties, (*known, "extensions", "extras"), {}, _EXPORT_AGAIN)
         self.ignored.update(dict.fromkeys(escape_text(field)[:40] for field in unknown))
-        extensions = look.get("extensions", {})
+        extensions = properties.get("extensions", {})
         if not isinstance(extensions, dict):
             raise damage_error(path, f"{EXTENSION}.extensions of {name} is not an object")
-        spz = None
+        spz_view = None
         for extension, content in extensions.items():
-            if extension not in _SPZ:
+            if extension not in _SPZ_EXTENSIONS:
                 feature = f"{escape_text(extension)[:80]} in {name}"
                 raise unsupported_error(path, feature, _EXPORT_AGAIN)
-            spz = content.get("bufferView") if isinstance(content, dict) else None
-            if type(spz) is not int or spz < 0:
+            spz_view = content.get("bufferView") if isinstance(content, dict) else None
+            if type(spz_view) is not int or spz_view < 0:
                 raise damage_error(path, f"{extension} of {name} has no bufferView")
-        return str(look.get("colorSpace", SRGB)), spz
+        return str(properties.get("colorSpace", SRGB)), spz_view
 
     def _read_columns(self, plan: _Plan) -> Gaussians:
-        """The Gaussians whose columns are accessors."""
+        """Return the Gaussians of a primitive whose columns are accessors."""
         tables = {
             name: self.file.read_accessor(plan.attributes[name], kind) for name, kind in plan.columns.items()
         }
-        coefficients = np.stack([tables[name] for name in plan.columns if name not in _KINDS], axis=1)
+        coefficients = np.stack(
+            [tables[name] for name in plan.columns if name not in _ATTRIBUTE_TYPES], axis=1
+        )
         opacities = tables[f"{EXTENSION}:OPACITY"][:, 0].astype(np.float64)
-        with np.errstate(divide="ignore", invalid="ignore"):  # 0 and 1 become infinite, and are repaired
+        with np.errstate(divide="ignore", invalid="ignore"):  # 0 and 1 become infinite and are repaired later
             logits = np.log(opacities) - np.log1p(-opacities)
         return from_arrays(
             {
@@ -473,15 +484,15 @@ class _Reader:
         )
 
     def _log_scales(self, scales: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Logarithms of stored scales, which are logarithms already if any is negative. [N,3]"""
+        """Return log-scales. Stored scales are logarithms already if any is negative. [N,3]"""
         if bool((scales < LOG_SCALE_LIMIT).any()):
             self.conversions["negative scales taken as logarithms (splat-transform before June 2026)"] = None
             return scales
-        with np.errstate(divide="ignore"):  # a flat Gaussian becomes infinite, and is repaired
+        with np.errstate(divide="ignore"):  # a flat Gaussian becomes infinite and is repaired later
             return np.log(np.maximum(scales, np.float32(0.0)))
 
     def _read_compressed(self, plan: _Plan, view: int) -> Gaussians:
-        """The Gaussians of an .spz inside the file; its extension requires glTF's axes LUF of a decoder."""
+        """Return the Gaussians of an .spz inside the file, in glTF's axes LUF as its extension requires."""
         content = bytes(self.file.view_bytes(view))
         self.has_spz = True
         part = convert_axes(self._read_spz(content), "RUB", "LUF")

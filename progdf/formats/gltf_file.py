@@ -1,6 +1,6 @@
-"""glTF 2.0 files (.glb, .gltf): the JSON, its buffers and its accessors.
+"""Container of glTF 2.0 files (.glb, .gltf): the JSON, its buffers and its accessors.
 
-Buffers are in the .glb, beside the file, or in data: URIs. Whatever is read is bounded by the file's size
+Buffers are in the .glb, beside the file, or in data: URIs. All sizes are checked against the size of the file
 before memory is allocated. https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html
 """
 
@@ -38,16 +38,16 @@ _INDEX_TYPES = (BYTE, _SHORT_INDEX, _INT_INDEX)
 SIZES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 MAX_JSON_VALUES = 2_000_000
-"""Bound on the JSON: a parsed value takes up to 100 bytes."""
+"""Largest number of values in the JSON. A parsed value takes up to 100 bytes of memory."""
 
 MAX_EXPANSION = 16
-"""Bytes of decoded numbers for each byte of the file: repeated meshes, and bytes that become floats."""
+"""Largest ratio of decoded bytes to file size. Repeated meshes and byte-to-float decoding need some."""
 
 MIN_DECODED_BYTES = 64 << 20
-"""Decoded numbers that a small file may have all the same."""
+"""Decoded bytes that are always allowed, however small the file is."""
 
 BYTES_PER_DRAW = 16 << 10
-"""Memory that stands for the time that one more part takes, however few rows it has."""
+"""Bytes that each additional part counts, on top of its rows. They bound the time for many tiny parts."""
 
 _MESHOPT = ("EXT_meshopt_compression", "KHR_meshopt_compression")
 DECOMPRESS = "decompress it with `gltf-transform copy in.glb out.glb`"
@@ -59,21 +59,21 @@ REFUSED = {
     "KHR_draco_mesh_compression": DECOMPRESS,
     "EXT_mesh_gpu_instancing": "export it with a node for each instance",
 }
-"""Extensions that change Gaussians and are not supported, and the way around them."""
+"""Unsupported extensions that change Gaussians → the remedy."""
 
 Count = Annotated[int, msgspec.Meta(ge=0)]
 Vector = tuple[float, float, float]
 
 
 class Buffer(msgspec.Struct, frozen=True):
-    """Bytes inside or outside the file."""
+    """Block of bytes inside or outside the file."""
 
     byteLength: Count
     uri: str | None = None
 
 
 class View(msgspec.Struct, frozen=True):
-    """A part of a buffer."""
+    """Part of a buffer (`bufferView` in glTF)."""
 
     buffer: Count
     byteLength: Count
@@ -83,7 +83,7 @@ class View(msgspec.Struct, frozen=True):
 
 
 class SparseIndices(msgspec.Struct, frozen=True):
-    """Rows that a sparse accessor replaces."""
+    """Indices of the rows that a sparse accessor replaces."""
 
     bufferView: Count
     componentType: int
@@ -98,7 +98,7 @@ class SparseValues(msgspec.Struct, frozen=True):
 
 
 class Sparse(msgspec.Struct, frozen=True):
-    """Rows of an accessor that differ from its base."""
+    """Rows of an accessor that replace those of its buffer view."""
 
     count: Count
     indices: SparseIndices
@@ -106,7 +106,7 @@ class Sparse(msgspec.Struct, frozen=True):
 
 
 class Accessor(msgspec.Struct, frozen=True):
-    """Typed rows of a view; zeros without one."""
+    """Typed rows of a buffer view; zeros if there is no view."""
 
     componentType: int
     count: Count
@@ -118,7 +118,7 @@ class Accessor(msgspec.Struct, frozen=True):
 
 
 class Primitive(msgspec.Struct, frozen=True):
-    """A part of a mesh, here a set of points."""
+    """Part of a mesh, here a set of points."""
 
     attributes: dict[str, Count] = {}
     indices: Count | None = None
@@ -133,7 +133,7 @@ class Mesh(msgspec.Struct, frozen=True):
 
 
 class Node(msgspec.Struct, frozen=True):
-    """A transform with children, which may draw a mesh."""
+    """Transform with children and an optional mesh."""
 
     name: str = ""
     mesh: Count | None = None
@@ -147,7 +147,7 @@ class Node(msgspec.Struct, frozen=True):
 
 
 class Scene(msgspec.Struct, frozen=True):
-    """The root nodes that are drawn together."""
+    """Root nodes that are drawn together."""
 
     nodes: list[Count] = []
 
@@ -162,7 +162,7 @@ class Asset(msgspec.Struct, frozen=True):
 
 
 class Tables(msgspec.Struct, frozen=True):
-    """The parts of glTF's JSON that decide where Gaussians are."""
+    """Parts of the glTF JSON that are needed to read Gaussians."""
 
     asset: Asset
     buffers: list[Buffer] = []
@@ -178,11 +178,11 @@ class Tables(msgspec.Struct, frozen=True):
 
 
 class GltfFile:
-    """An opened file; buffers outside it are read when they are first used."""
+    """Opened glTF file. External buffers are read on first use."""
 
     path: Path
     tables: Tables
-    stored_bytes: int  # of the file and of the buffers outside it that were read
+    stored_bytes: int  # size of the file and of the external buffers read so far
 
     def __init__(self, path: Path) -> None:
         """Read the JSON.
@@ -219,30 +219,30 @@ class GltfFile:
         data = self._buffers[view.buffer]
         end = view.byteOffset + view.byteLength
         if end > len(data):
-            place = f"byte {end} of buffers[{view.buffer}], which has {len(data)}"
-            raise damage_error(self.path, f"bufferViews[{index}] ends at {place}")
+            limit = f"byte {end} of buffers[{view.buffer}], which has {len(data)}"
+            raise damage_error(self.path, f"bufferViews[{index}] ends at {limit}")
         return data[view.byteOffset : end]
 
     def read_accessor(self, index: int, kind: str) -> NDArray[np.float32]:
-        """Return the rows of an accessor as numbers; normalized integers as −1 to 1 or 0 to 1. [count,size]
+        """Return the rows of an accessor; normalized integers become −1 to 1 or 0 to 1. [count,size]
 
         Args:
-            index: place in the list of accessors
+            index: position in the list of accessors
             kind: the expected type, one of `SIZES`
 
         Raises:
-            ProgdfError: the type is another, or rows lie outside the file.
+            ProgdfError: the type differs, or rows lie outside the file.
         """
         accessor = self.accessor(index, kind)
         values = self._rows(accessor, f"accessors[{index}]").astype(np.float32)
-        kept = accessor.normalized and accessor.componentType != FLOAT
-        if kept:
+        is_normalized = accessor.normalized and accessor.componentType != FLOAT
+        if is_normalized:
             largest = np.iinfo(_NUMBER_TYPES[accessor.componentType]).max
             values = np.maximum(values / np.float32(largest), np.float32(-1.0))
         return values
 
     def read_indices(self, index: int, rows: int) -> NDArray[np.int64]:
-        """Return row numbers below `rows`, as an accessor lists them. [count]"""
+        """Return the row indices that an accessor lists, each checked to be below `rows`. [count]"""
         accessor = self.accessor(index, "SCALAR")
         name = f"accessors[{index}]"
         if accessor.componentType not in _INDEX_TYPES:
@@ -252,7 +252,11 @@ class GltfFile:
         return indices
 
     def accessor(self, index: int, kind: str) -> Accessor:
-        """Return an accessor of the given type. Raises ProgdfError: there is no such accessor."""
+        """Return an accessor of the given type.
+
+        Raises:
+            ProgdfError: the accessor does not exist, has another type or has no rows.
+        """
         accessor = entry(self, self.tables.accessors, index, "accessors")
         if accessor.type != kind or accessor.componentType not in _NUMBER_TYPES:
             found = f"{escape_text(accessor.type)[:20]} of {accessor.componentType}"
@@ -262,14 +266,14 @@ class GltfFile:
         return accessor
 
     def take(self, rows: int, width: int) -> None:
-        """Count rows of numbers that are about to be allocated.
+        """Add rows that are about to be allocated to the total of decoded bytes.
 
         Args:
-            rows: how many more
-            width: numbers in each
+            rows: number of further rows
+            width: numbers per row
 
         Raises:
-            ProgdfError: together they are more than such a file can hold.
+            ProgdfError: the total exceeds `MAX_EXPANSION` times the size of the file.
         """
         self._decoded_bytes += BYTES_PER_DRAW + 4 * rows * width
         limit = max(MIN_DECODED_BYTES, MAX_EXPANSION * self.stored_bytes)
@@ -281,7 +285,7 @@ class GltfFile:
             )
 
     def _rows(self, accessor: Accessor, name: str) -> NDArray[Any]:
-        """The stored numbers, sparse rows applied. [count,size]"""
+        """Return the stored numbers of an accessor, with sparse rows applied. [count,size]"""
         dtype = np.dtype(_NUMBER_TYPES[accessor.componentType])
         size = SIZES[accessor.type]
         if accessor.bufferView is None:
@@ -323,7 +327,7 @@ class GltfFile:
         stride: int,
         name: str,
     ) -> NDArray[Any]:
-        """Rows of numbers inside `data`. [count,size]"""
+        """Return a view of rows of numbers inside `data`. [count,size]"""
         width = size * dtype.itemsize
         stride = stride or width
         end = start + (count - 1) * stride + width
@@ -342,7 +346,11 @@ class GltfFile:
         return buffer.uri is not None or (index == 0 and self._binary is not None)
 
     def _read_buffer(self, index: int) -> memoryview:
-        """The bytes of a buffer, of which there are at least as many as it says."""
+        """Return the bytes of a buffer, exactly as many as it declares.
+
+        Raises:
+            ProgdfError: the buffer is missing or too short.
+        """
         buffer = entry(self, self.tables.buffers, index, "buffers")
         if buffer.uri is None:
             if index or self._binary is None:
@@ -359,9 +367,11 @@ class GltfFile:
                     raise ProgdfError(
                         f"{source} does not exist, which holds numbers of {self.path}; put both in one folder"
                     )
-                wanted = max(other.byteLength for other in self.tables.buffers if other.uri == buffer.uri)
-                size = os.path.getsize(source)  # reading allocates all that is asked for
-                self._files[source] = memoryview(read_file(source, min(wanted, size)))
+                needed_bytes = max(
+                    other.byteLength for other in self.tables.buffers if other.uri == buffer.uri
+                )
+                size = os.path.getsize(source)  # `read_file` allocates as many bytes as requested
+                self._files[source] = memoryview(read_file(source, min(needed_bytes, size)))
                 self.stored_bytes += len(self._files[source])
             data = self._files[source]
         if len(data) < buffer.byteLength:
@@ -380,12 +390,12 @@ class GltfFile:
             raise damage_error(self.path, f"the data: URI of buffers[{index}] is not base64") from None
 
     def _resolve(self, uri: str, index: int) -> Path:
-        """The file that a buffer names, inside the folder of the .gltf."""
-        shown = escape_text(uri)[:80]
+        """Return the file that a buffer refers to, inside the folder of the .gltf."""
+        label = escape_text(uri)[:80]
         scheme = re.match(r"[A-Za-z][A-Za-z0-9+.-]*:", uri)
         if scheme is not None:
             remedy = "put the file into the folder of the scene and name it there"
-            raise unsupported_error(self.path, f"the address {shown} for buffers[{index}]", remedy)
+            raise unsupported_error(self.path, f"the address {label} for buffers[{index}]", remedy)
         try:
             name = unquote_to_bytes(uri).decode()
         except UnicodeDecodeError:
@@ -395,21 +405,21 @@ class GltfFile:
         outside = posix.is_absolute() or bool(windows.anchor) or ".." in (*posix.parts, *windows.parts)
         if outside or not posix.parts or "\0" in name:
             raise ProgdfError(
-                f"{self.path} keeps buffers[{index}] outside its folder ({shown}); move that file into the "
+                f"{self.path} keeps buffers[{index}] outside its folder ({label}); move that file into the "
                 "folder and name it there"
             )
         return self.path.parent / posix
 
 
 def entry(file: GltfFile, entries: list[T], index: int, name: str) -> T:
-    """Return an entry of one of the file's lists. Raises ProgdfError: the list is too short."""
+    """Return an entry of one of the file's lists; raise ProgdfError if the list is too short."""
     if index >= len(entries):
         raise damage_error(file.path, f"it refers to {name}[{index}], of {len(entries)}")
     return entries[index]
 
 
 def _split_chunks(path: Path, content: bytes) -> tuple[bytes, memoryview | None]:
-    """The JSON and the binary part of a .glb."""
+    """Return the JSON and the binary chunk of a .glb."""
     if len(content) < 20:
         raise damage_error(path, f"it has {len(content)} bytes, fewer than a header")
     version, length, text_size, kind = struct.unpack_from("<IIII", content, 4)
@@ -430,7 +440,7 @@ def _split_chunks(path: Path, content: bytes) -> tuple[bytes, memoryview | None]
 
 
 def _read_tables(path: Path, text: bytes) -> Tables:
-    """The checked tables of the JSON."""
+    """Parse and check the tables of the JSON."""
     values = text.count(b",") + text.count(b"{") + text.count(b"[")
     if values > MAX_JSON_VALUES:
         raise ProgdfError(
@@ -456,7 +466,7 @@ def _read_tables(path: Path, text: bytes) -> Tables:
 
 
 def _explain(text: str) -> str:
-    """Return an error of `convert_json` in words of the file, without those of Python or of JSON schemas."""
+    """Return an error of `convert_json` in terms of glTF, without those of Python or JSON schemas."""
     missing = re.fullmatch(r"(.*): object missing required field (\w+)", text)
     if missing is not None:
         return f"{missing[1]} has no {missing[2]}"

@@ -1,4 +1,4 @@
-"""The node hierarchy of a glTF file: which meshes its scene shows, and where."""
+"""Node hierarchy of a glTF file: the visible meshes of its scene and their transforms."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from .gltf_file import REFUSED, GltfFile, Node, entry
 
 VISIBILITY = "KHR_node_visibility"
 
-SIMILARITY_TOLERANCE = 1e-4  # of a node's three scales to each other, and of its right angles
+SIMILARITY_TOLERANCE = 1e-4  # relative deviation of a node's three scales, and of its axes from right angles
 
 
 @dataclass(frozen=True)
 class Placement:
-    """A mesh that the scene shows."""
+    """Visible instance of a mesh."""
 
     mesh: int
     node: int | None  # None: the file has no nodes
@@ -31,10 +31,10 @@ class Placement:
 
 
 def find_placements(file: GltfFile) -> list[Placement]:
-    """Return the meshes that the file's scene shows, in the order of its nodes.
+    """Return the visible meshes of the file's scene, in the order of its nodes.
 
     Raises:
-        ProgdfError: a node is its own ancestor or has two parents, or its transform is no matrix.
+        ProgdfError: a node is its own ancestor or has two parents, or its transform is invalid.
     """
     tables = file.tables
     if not tables.nodes:
@@ -45,26 +45,26 @@ def find_placements(file: GltfFile) -> list[Placement]:
         children = {child for node in tables.nodes for child in node.children}
         roots = [index for index in range(len(tables.nodes)) if index not in children]
     found: list[Placement] = []
-    seen: set[int] = set()
-    waiting = [(root, np.eye(4)) for root in reversed(roots)]
-    while waiting:
-        index, parent = waiting.pop()
+    visited: set[int] = set()
+    pending = [(root, np.eye(4)) for root in reversed(roots)]
+    while pending:
+        index, parent = pending.pop()
         node = entry(file, tables.nodes, index, "nodes")
-        if index in seen:
+        if index in visited:
             raise damage_error(file.path, f"{_node_name(file, index)} has two parents")
-        seen.add(index)
+        visited.add(index)
         visibility = node.extensions.get(VISIBILITY)
         if isinstance(visibility, dict) and visibility.get("visible") is False:
             continue
         matrix = parent @ _local_matrix(file, index, node)
         if node.mesh is not None:
             found.append(Placement(node.mesh, index, matrix))
-        waiting += [(child, matrix) for child in reversed(node.children)]
+        pending += [(child, matrix) for child in reversed(node.children)]
     return found
 
 
 def _local_matrix(file: GltfFile, index: int, node: Node) -> NDArray[np.float64]:
-    """The matrix of a node relative to its parent. [4,4]"""
+    """Return the transform of a node relative to its parent. [4,4]"""
     parts = (node.translation, node.rotation, node.scale)
     if node.matrix is not None:
         if any(part is not None for part in parts):
@@ -89,15 +89,15 @@ def _local_matrix(file: GltfFile, index: int, node: Node) -> NDArray[np.float64]
 
 
 def _rotation_matrix(quat: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The matrix of a unit quaternion wxyz. [4] -> [3,3]"""
+    """Return the rotation matrix of a unit quaternion wxyz. [4] -> [3,3]"""
     return rotation_matrices(torch.from_numpy(quat)[None])[0].numpy()
 
 
 def placement_similarity(file: GltfFile, placement: Placement) -> tuple[Tensor, float]:
-    """Return the rotation (unit quaternion wxyz [1,4]) and the scale of a mesh that shows Gaussians.
+    """Return the rotation (unit quaternion wxyz [1,4]) and the scale of a mesh with Gaussians.
 
     Raises:
-        ProgdfError: its nodes mirror, shear or scale it unevenly, or move it by more than their transforms.
+        ProgdfError: its nodes mirror, shear or scale it unevenly, or have a skin or an unsupported extension.
     """
     if placement.node is not None:
         _check_node(file, placement.node)
@@ -108,7 +108,7 @@ def placement_similarity(file: GltfFile, placement: Placement) -> tuple[Tensor, 
 
 
 def _similarity(matrix: NDArray[np.float64]) -> tuple[Tensor, float] | None:
-    """The rotation (unit quaternion wxyz [1,4]) and the factor of a similarity; None: the matrix is none."""
+    """Return the rotation (unit quaternion wxyz [1,4]) and the scale of a matrix; None if no similarity."""
     axes = matrix[:3, :3]
     with np.errstate(all="ignore"):
         lengths = np.linalg.norm(axes, axis=0)
@@ -123,7 +123,7 @@ def _similarity(matrix: NDArray[np.float64]) -> tuple[Tensor, float] | None:
 
 
 def _shape_error(file: GltfFile, placement: Placement) -> ProgdfError:
-    """The error for a mesh that its nodes shear, mirror or scale unevenly; names the node to change."""
+    """Return the error for a sheared, mirrored or unevenly scaled mesh. It names the node at fault."""
     tables = file.tables
     parents = {child: index for index, node in enumerate(tables.nodes) for child in node.children}
     chain: list[int] = []
@@ -131,27 +131,27 @@ def _shape_error(file: GltfFile, placement: Placement) -> ProgdfError:
     while index is not None:
         chain.append(index)
         index = parents.get(index)
-    guilty = chain[0]
+    faulty_node = chain[0]
     matrix = placement.matrix
     for index in reversed(chain):
         local = _local_matrix(file, index, tables.nodes[index])
         if _similarity(local) is None:
-            guilty = index
+            faulty_node = index
             matrix = local
             break
     with np.errstate(all="ignore"):
         lengths = np.linalg.norm(matrix[:3, :3], axis=0)
-        even = np.isfinite(lengths).all() and lengths.min() > 0 and np.ptp(lengths) <= 1e-3 * lengths.max()
-    does = "mirrors or shears" if even else "scales unevenly"
+        is_even = np.isfinite(lengths).all() and lengths.min() > 0 and np.ptp(lengths) <= 1e-3 * lengths.max()
+    fault = "mirrors or shears" if is_even else "scales unevenly"
     return unsupported_error(
         file.path,
-        f"{_node_name(file, guilty)}, which {does} Gaussians",
+        f"{_node_name(file, faulty_node)}, which {fault} Gaussians",
         "apply that transform to the Gaussians, or give the node one scale for x, y and z",
     )
 
 
 def _check_node(file: GltfFile, index: int) -> None:
-    """Raise ProgdfError: a node moves its mesh by more than its transform."""
+    """Raise ProgdfError if a node has a skin or an unsupported extension that moves its mesh."""
     node = file.tables.nodes[index]
     if node.skin is not None:
         remedy = "export it without the skeleton"

@@ -1,9 +1,9 @@
-"""3DGS .ply <-> Gaussians.
+"""Reader and writer of the 3DGS .ply format.
 
-The file's own words: x y z, f_dc_0..2, f_rest_* (channel-major), opacity (logit), scale_0..2 (log), rot_0..3
-(wxyz). Some variants are converted (see `read_ply`), some are refused (see `variant_fields`), and the rest is
-reported and not used. Rows are never dropped, as labels and .gdf files count on their indices: an unusable
-row becomes an invisible Gaussian (see `progdf.formats.repair`).
+Properties: x y z, f_dc_0..2, f_rest_* (channel-major), opacity (logit), scale_0..2 (log), rot_0..3 (wxyz).
+Some variants are converted (see `read_ply`) and some refused (see `variant_fields`). All other properties are
+ignored and reported. Rows are never dropped, as labels and .gdf files rely on row indices. An unusable row
+becomes an invisible Gaussian (see `progdf.formats.repair`).
 """
 
 from __future__ import annotations
@@ -41,23 +41,23 @@ GEOMETRY = {
     "log_scales": ("scale_0", "scale_1", "scale_2"),
     "quats": ("rot_0", "rot_1", "rot_2", "rot_3"),
 }
-"""The columns of each attribute that every 3DGS .ply has."""
+"""Columns of each attribute in every 3DGS .ply."""
 _NORMALS = ("nx", "ny", "nz")
 _RGB_NAMES = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
-"""Colors of a .ply without f_dc, such as nerfstudio's `--ply-color-mode rgb`; the first that is there."""
+"""Color columns of a .ply without f_dc, as by nerfstudio's `--ply-color-mode rgb`. The first match counts."""
 _RGB_TYPES = {"u1", "u2", "f4", "f8"}
-RGB_MARGIN = 0.5  # floats this far outside 0 to 1 are of another range
+RGB_MARGIN = 0.5  # float colors farther outside 0 to 1 are refused, as their range is unknown
 FILTER_3D = "filter_3D"  # property of Mip-Splatting and Gaussian Opacity Fields
 _BLOCK_ROWS = 4096
-"""1 MB of SH3 rows: taken apart while they are in the second-level cache."""
-_SH_REST = (0, 9, 24, 45, 72)
+"""Rows per block when columns are split: 1 MB at SH degree 3, which fits into the second-level cache."""
+_SH_REST = (0, 9, 24, 45, 72)  # number of f_rest properties for SH degree 0 to 4
 
 
 def load_ply(path: str | os.PathLike[str]) -> Gaussians:
-    """The scene in a 3DGS .ply file, float32; what had to be repaired or was lost is logged as a warning.
+    """Load a scene from a 3DGS .ply file as float32; log repairs and losses as warnings.
 
-    Positions are read as doubles where they are, and kept relative to `Gaussians.origin`. Quaternions come
-    out with unit length, wxyz. Rows keep their order and number.
+    Positions stored as doubles are read as doubles, and become relative to `Gaussians.origin`. Quaternions
+    are normalized, wxyz. Rows keep their order and number.
 
     Raises:
         ProgdfError: the file is missing, broken, holds no Gaussians, or is no 3DGS .ply.
@@ -69,7 +69,7 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def load_ply_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, LoadReport]:
-    """Return what `load_ply` returns, and the report of the file's content and of its repairs."""
+    """Load a scene as `load_ply` does, and return it with the report on its content and repairs."""
     ply = read_header(path)
     stored, content = read_ply(ply)
     scene, counts = repair(stored, path)
@@ -90,10 +90,10 @@ def load_ply_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, LoadR
 def read_ply(ply: PlyFile) -> tuple[Gaussians, dict[str, Any]]:
     """Return the Gaussians of a 3DGS .ply as stored, before repairs, and fields of their `LoadReport`.
 
-    Colors are those of `f_dc`, or RGB of a .ply without it. Mip-Splatting's `filter_3D` is fused.
+    Colors come from `f_dc`, or from RGB columns without it. Mip-Splatting's `filter_3D` is fused.
 
     Raises:
-        ProgdfError: no 3DGS .ply, or a property or element that is not supported.
+        ProgdfError: the file is no 3DGS .ply, or has an unsupported property or element.
     """
     ignored = _check_variants(ply)
     columns = _find_columns(ply)
@@ -127,7 +127,7 @@ def read_ply(ply: PlyFile) -> tuple[Gaussians, dict[str, Any]]:
 
 
 def _check_variants(ply: PlyFile) -> tuple[str, ...]:
-    """Return the vertex properties, once none of them belongs to a variant of 3DGS that is not supported."""
+    """Return the vertex properties; raise ProgdfError if one belongs to an unsupported variant of 3DGS."""
     present = ply.columns("vertex")
     is_scene = bool({"opacity", "scale_0", "rot_0"} & set(present))
     refused = variant_fields(present) if is_scene else {}
@@ -135,10 +135,10 @@ def _check_variants(ply: PlyFile) -> tuple[str, ...]:
 
 
 def _rgb_to_sh0(ply: PlyFile, names: tuple[str, ...], values: Tensor) -> Tensor:
-    """Return SH band 0 of RGB: bytes, 16-bit integers or floats from 0 to 1. [N,3] -> [N,3]
+    """Convert RGB (bytes, 16-bit integers or floats from 0 to 1) to SH band 0. [N,3] -> [N,3]
 
     Raises:
-        ProgdfError: floats far outside 0 to 1, whose range is unknown.
+        ProgdfError: floats lie outside 0 to 1 by more than `RGB_MARGIN`, so their range is unknown.
     """
     dtype = np.dtype(ply.columns("vertex")[names[0]])
     if dtype.kind == "f":
@@ -153,10 +153,10 @@ def _rgb_to_sh0(ply: PlyFile, names: tuple[str, ...], values: Tensor) -> Tensor:
 
 
 def _fuse_filter(scene: Gaussians, sizes: Tensor) -> Gaussians:
-    """Return the scene with Mip-Splatting's 3D smoothing filter applied (Yu et al. 2024, eq. 7).
+    """Apply Mip-Splatting's 3D smoothing filter to a scene (Yu et al. 2024, eq. 7).
 
-    Convolution with a Gaussian of standard deviation f gives the variances s² + f². It multiplies the opacity
-    by the root of the ratio of the determinants.
+    Convolution with a Gaussian of standard deviation f gives the variances s² + f². The opacity is multiplied
+    by the square root of the ratio of the determinants.
 
     Args:
         scene: N Gaussians as stored
@@ -179,8 +179,8 @@ def _fuse_filter(scene: Gaussians, sizes: Tensor) -> Gaussians:
 def save_ply(path: str | os.PathLike[str], scene: Gaussians) -> None:
     """Write a 3DGS .ply: binary little-endian float32, properties in the order of the original 3DGS code.
 
-    Of a scene with an origin x, y and z are doubles. The file appears whole or not at all, and says if the
-    scene is anti-aliased. If the quaternions have unit length it loads to the same bits.
+    If the scene has an origin, x, y and z are doubles. The file appears complete or not at all. A comment
+    marks an antialiased scene. If the quaternions have unit length, loading gives the same bits.
 
     Raises:
         ProgdfError: the scene is empty or holds a NaN or an infinity, or the folder does not exist.
@@ -219,10 +219,10 @@ def save_ply(path: str | os.PathLike[str], scene: Gaussians) -> None:
 
 
 def save_ply_checked(path: str | os.PathLike[str], scene: Gaussians) -> None:
-    """`save_ply` that reads the file back before it takes the place of `path`.
+    """Write a .ply as `save_ply` does, and read it back before it replaces `path`.
 
     Raises:
-        ProgdfError: the file gives back anything but what was written into it; `path` is as it was.
+        ProgdfError: the file read back differs from the scene; `path` is unchanged.
     """
     with atomic_write(Path(path)) as temporary_file:
         save_ply(temporary_file, scene)
@@ -231,7 +231,7 @@ def save_ply_checked(path: str | os.PathLike[str], scene: Gaussians) -> None:
             written = getattr(scene, name)
             loaded = getattr(read, name)
             if name == "means" and (scene.origin, read.origin) != (ZERO, ZERO):
-                # what moved may have moved the origin, about which each is rounded
+                # an edit that moves Gaussians may move the origin, and means are rounded relative to it
                 off = (read.world_means - scene.world_means).abs()
                 same = bool((off <= 2.0**-23 * (loaded.abs() + written.abs())).all())
             elif name == "quats":
@@ -245,14 +245,14 @@ def save_ply_checked(path: str | os.PathLike[str], scene: Gaussians) -> None:
 
 
 def _find_columns(ply: PlyFile) -> dict[str, tuple[str, ...]]:
-    """Return the columns of each attribute, once every property that 3DGS needs is known to be there.
+    """Return the columns of each attribute, after a check that all properties of 3DGS are present.
 
     Raises:
         ProgdfError: a property is missing, or the file holds no Gaussians.
     """
     if "vertex" not in ply.counts:
-        known = "" if "chunk" in ply.counts else "; it is not a 3DGS .ply"
-        raise ProgdfError(f"{ply.path} has no element 'vertex'{known}")
+        hint = "" if "chunk" in ply.counts else "; it is not a 3DGS .ply"
+        raise ProgdfError(f"{ply.path} has no element 'vertex'{hint}")
     present = ply.columns("vertex")
     columns = dict(GEOMETRY)
     if not any(name in present for name in GEOMETRY["sh0"]):
@@ -275,7 +275,7 @@ def _find_columns(ply: PlyFile) -> dict[str, tuple[str, ...]]:
 
 
 def _are_colors(present: Mapping[str, str], names: tuple[str, ...]) -> bool:
-    """Return whether three properties are there and of one type that RGB is stored in."""
+    """Return whether all three properties are present and share one of the RGB types."""
     types = {np.dtype(present[name]).str[1:] for name in names if name in present}
     return all(name in present for name in names) and len(types) == 1 and types <= _RGB_TYPES
 
@@ -294,12 +294,15 @@ def _describe(ply: PlyFile, missing: list[str]) -> str:
 
 
 def _gaussians(rows: npt.NDArray[np.void], columns: dict[str, tuple[str, ...]]) -> Gaussians:
-    """The rows taken apart, in blocks that stay in the cache; those of a plain file are a matrix."""
+    """Split rows into attributes, in blocks that stay in the cache.
+
+    If all columns are float32, each block is viewed as a matrix; otherwise the needed columns are stacked.
+    """
     rows, names = np.asarray(rows), rows.dtype.names or ()
-    plain = all(rows.dtype[name] == np.dtype("<f4") for name in names)
-    if not plain:
+    is_plain = all(rows.dtype[name] == np.dtype("<f4") for name in names)
+    if not is_plain:
         names = tuple(name for part in columns.values() for name in part)
-    index = {key: _run([names.index(name) for name in part]) for key, part in columns.items()}
+    index = {key: _as_slice([names.index(name) for name in part]) for key, part in columns.items()}
     arrays: dict[str, npt.NDArray[Any]] = {
         key: np.empty((len(rows), len(part)), np.float32) for key, part in columns.items()
     }
@@ -307,25 +310,24 @@ def _gaussians(rows: npt.NDArray[np.void], columns: dict[str, tuple[str, ...]]) 
     arrays["shN"] = arrays["shN"].reshape(len(rows), bands, 3)
     for first in range(0, len(rows), _BLOCK_ROWS):
         block = rows[first : first + _BLOCK_ROWS]
-        if plain:
+        if is_plain:
             table: Floats = block.view("<f4").reshape(len(block), -1)
         else:
-            with np.errstate(
-                over="ignore", invalid="ignore"
-            ):  # what is beyond float32 becomes ±inf: repaired
+            # numbers beyond float32 become ±inf and are repaired later
+            with np.errstate(over="ignore", invalid="ignore"):
                 table = np.stack([block[name].astype(np.float32) for name in names], axis=1)
         for key, array in arrays.items():
             values: npt.NDArray[Any] = table[:, index[key]]
-            if key == "shN":  # channel-major in the file, rgb innermost here
+            if key == "shN":  # channel-major in the file, RGB innermost here
                 values = values.reshape(len(block), 3, bands).transpose(0, 2, 1)
             array[first : first + _BLOCK_ROWS] = values
-    places = [rows[name] for name in columns["means"]]
-    if np.result_type(np.float32, *places) == np.float64:
-        arrays["means"] = np.stack(places, axis=1).astype(np.float64)
+    coordinates = [rows[name] for name in columns["means"]]
+    if np.result_type(np.float32, *coordinates) == np.float64:
+        arrays["means"] = np.stack(coordinates, axis=1).astype(np.float64)
     return from_arrays(arrays | {"logit_opacities": arrays["logit_opacities"][:, 0]})
 
 
-def _run(index: list[int]) -> slice | list[int]:
-    """Neighbouring columns as a slice, which numpy does not copy."""
-    run = slice(index[0], index[-1] + 1) if index else slice(0)
-    return run if index == list(range(run.start or 0, run.stop)) else index
+def _as_slice(index: list[int]) -> slice | list[int]:
+    """Return consecutive column indices as a slice, which numpy does not copy; other indices unchanged."""
+    columns = slice(index[0], index[-1] + 1) if index else slice(0)
+    return columns if index == list(range(columns.start or 0, columns.stop)) else index

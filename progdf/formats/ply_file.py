@@ -1,4 +1,4 @@
-"""The container of .ply files: header, elements and rows, whatever they mean.
+"""Container of .ply files: header, elements and rows, independent of their meaning.
 
 Every count in a header is checked against the size of the file before a row is read.
 """
@@ -24,56 +24,56 @@ from progdf.io.file_rules import unsupported_error
 from .containers import GZIP, START_BYTES, ZIP, check_foreign
 
 ANTIALIASED_COMMENT = "SplatRenderMode: mip"
-"""What the header of a scene says that was trained with Mip-Splatting's 2D filter (Brush's words)."""
+"""Header comment of a scene trained with Mip-Splatting's 2D filter, in the form that Brush uses."""
 
-_RENDERING = {
+_ANTIALIASED_COMMENTS = {
     "splatrendermode: mip": True,
     "splatrendermode: default": False,
     "antialiased 1": True,
     "antialiased 0": False,
 }
-"""The comments that tell it, Brush's and Postshot's, in lower case; the last one counts."""
+"""Antialiasing comments of Brush and Postshot, in lower case. The last one in a header counts."""
 
 _MAX_HEADER_BYTES = 1 << 20
-"""A header that has not ended by then is no header."""
+"""Largest size of a header."""
 
-_MAX_LISTS = 200_000
-"""Values of list rows before the vertices, which plyfile reads one by one in about two seconds."""
+_MAX_LIST_VALUES = 200_000
+"""Largest number of list values before the vertices. plyfile reads that many one by one in about 2 s."""
 
-_LONGEST_COMMENT = 200  # characters that are kept
+_MAX_COMMENT_LENGTH = 200  # characters; longer comments are cut
 
-_SKIPPED = ("comment", "obj_info")
+_COMMENT_KEYWORDS = ("comment", "obj_info")
 _ELEMENT = re.compile(r"(element\s+\S+\s+)(\d{1,19})")
 _END = re.compile(rb"^end_header[ \t]*\r?\n", re.MULTILINE)
 
 
 @dataclass(frozen=True)
 class PlyFile:
-    """A .ply file of which the header is read and checked."""
+    """Opened .ply file with a checked header."""
 
     path: Path  # the file
-    layout: PlyData  # its format and elements, without rows
+    layout: PlyData  # format and elements, without rows
     counts: dict[str, int]  # rows of each element, by name; they fit into the file
-    header: tuple[str, ...]  # its lines before end_header, comments empty
+    header: tuple[str, ...]  # header lines before end_header; comments are emptied
     length: int  # bytes of the header
     size: int  # bytes of the file
-    antialiased: bool  # a comment says that the scene was trained with Mip-Splatting's 2D filter
-    comments: tuple[
-        str, ...
-    ] = ()  # of its comment and obj_info lines, in order; printable ASCII, single spaces
+    antialiased: bool  # a comment states that the scene was trained with Mip-Splatting's 2D filter
+    # texts of the comment and obj_info lines, in order; printable ASCII, single spaces
+    comments: tuple[str, ...] = ()
 
     def columns(self, element: str) -> dict[str, str]:
-        """numpy's type of each property that is no list, by name; of an element that is not there nothing."""
+        """Return the numpy type of each property that is no list; empty if the element is missing."""
         properties = self.layout[element].properties if element in self.layout else ()
         return {p.name: p.val_dtype for p in properties if not isinstance(p, PlyListProperty)}
 
     def rows(self, *names: str) -> tuple[list[npt.NDArray[np.void]], int]:
-        """The rows of elements, of a binary file memory-mapped, and the bytes behind the file's last row.
+        """Return the rows of elements, and the number of bytes after the last row of the file.
 
-        The latter are 0 where lists follow, whose length nobody knows.
+        Rows of a binary file are memory-mapped. The number of bytes is 0 if elements with lists follow, whose
+        length is unknown.
 
         Raises:
-            ProgdfError: a row up to the last of the elements is not what the header says.
+            ProgdfError: a row up to the last requested element does not match the header.
         """
         elements = self.layout.elements
         last = 1 + max(i for i, element in enumerate(elements) if element.name in names)
@@ -86,11 +86,11 @@ class PlyFile:
             raise open_error(self.path, error) from None
         except (PlyElementParseError, ValueError, OverflowError, MemoryError) as error:
             row = re.search(r"at row \d+", str(error))
-            what = f"has too many or too few numbers, or no number, {row[0] if row else 'in a row'}"
+            problem = f"has too many or too few numbers, or no number, {row[0] if row else 'in a row'}"
             if isinstance(error, PlyElementParseError):
-                what = f"ends within element '{error.element.name}'"
+                problem = f"ends within element '{error.element.name}'"
             raise ProgdfError(
-                f"{self.path} {what}; it is truncated or damaged: copy or export it again"
+                f"{self.path} {problem}; it is truncated or damaged: copy or export it again"
             ) from None
         lists_follow = any(_has_lists(element) for element in elements[last:])
         return [rows[name] for name in names], 0 if lists_follow else after
@@ -101,7 +101,7 @@ class PlyFile:
         if lists and is_needed:
             feature = f"a list among its {name} properties"
             raise unsupported_error(self.path, feature, "export it as a plain 3DGS .ply")
-        if lists and self.counts[name] * len(element.properties) > _MAX_LISTS:
+        if lists and self.counts[name] * len(element.properties) > _MAX_LIST_VALUES:
             raise ProgdfError(
                 f"{self.path} has {self.counts[name]} rows of lists, '{name}', before its vertices; "
                 "export it with the vertices first"
@@ -115,7 +115,7 @@ class PlyFile:
             return rows, self.size - stream.tell() - bytes_after
 
     def _text_rows(self, last: int, names: Collection[str]) -> tuple[dict[str, npt.NDArray[np.void]], int]:
-        """Parse the named elements by numpy, which reads text many times as fast as plyfile."""
+        """Parse the named elements with numpy, which reads text many times faster than plyfile."""
         rows = {}
         with self.path.open("rb") as file:
             file.seek(self.length)
@@ -133,7 +133,7 @@ class PlyFile:
 
 
 class _Stream(io.FileIO):
-    """The file as plyfile is given it: a header of its first elements alone, then what is behind its own."""
+    """Stream for plyfile: a header with the first elements only, then the data of the file."""
 
     def __init__(self, ply: PlyFile, elements: int) -> None:
         super().__init__(ply.path)
@@ -147,10 +147,10 @@ class _Stream(io.FileIO):
 
 
 def read_header(path: str | os.PathLike[str]) -> PlyFile:
-    """A .ply file, its header read and every element's count checked: its rows must fit into the file.
+    """Read the header of a .ply file, and check that the declared rows fit into the file.
 
     Raises:
-        ProgdfError: not a .ply, a broken header, or one that declares more than the file holds.
+        ProgdfError: the file is no .ply, its header is broken, or it declares more rows than the file holds.
     """
     check_regular(path)
     try:
@@ -170,8 +170,10 @@ def read_header(path: str | os.PathLike[str]) -> PlyFile:
         raise ProgdfError(f"{path} has a header without 'end_header'; the file is truncated or not a .ply")
     text = start[: end.start()].decode("ascii", "replace").encode("ascii", "replace").decode()
     lines = [" ".join(line.split()) for line in text.split("\n")[:-1]]
-    renderings = [_RENDERING.get(line[8:].lower()) for line in lines if line.startswith("comment ")]
-    header = ["comment" if line.startswith(_SKIPPED) or not line else line for line in lines]
+    antialiased_flags = [
+        _ANTIALIASED_COMMENTS.get(line[8:].lower()) for line in lines if line.startswith("comment ")
+    ]
+    header = ["comment" if line.startswith(_COMMENT_KEYWORDS) or not line else line for line in lines]
     counts = [match for line in header if (match := _ELEMENT.fullmatch(line))]
     empty = [_ELEMENT.sub(r"\g<1>0", line) for line in header]
     try:
@@ -181,9 +183,9 @@ def read_header(path: str | os.PathLike[str]) -> PlyFile:
     rows = {element.name: int(match[2]) for element, match in zip(layout, counts, strict=False)}
     if len(rows) < len(layout.elements):
         raise ProgdfError(f"{path} has a broken header: counts are digits; export it again")
-    antialiased = next((known for known in reversed(renderings) if known is not None), False)
-    texts = [line.partition(" ")[2] for line in lines if line.startswith(_SKIPPED)]
-    comments = tuple(re.sub(r"[^ -~]", "?", text[:_LONGEST_COMMENT]) for text in texts)
+    antialiased = next((known for known in reversed(antialiased_flags) if known is not None), False)
+    texts = [line.partition(" ")[2] for line in lines if line.startswith(_COMMENT_KEYWORDS)]
+    comments = tuple(re.sub(r"[^ -~]", "?", text[:_MAX_COMMENT_LENGTH]) for text in texts)
     ply = PlyFile(Path(path), layout, rows, tuple(header), end.end(), size, antialiased, comments)
     _check_counts(ply)
     return ply
@@ -195,15 +197,15 @@ def _check_counts(ply: PlyFile) -> None:
         # an ascii value takes at least a digit and a separator; the file's last separator may be missing
         text = ply.layout.text
         count = ply.counts[element.name]
-        least = 2 * len(element.properties) if text else _row_bytes(element)
-        if count * least > remaining + text:
-            what = "Gaussians" if element.name == "vertex" else f"rows of '{element.name}'"
+        needed = 2 * len(element.properties) if text else _row_bytes(element)
+        if count * needed > remaining + text:
+            row_kind = "Gaussians" if element.name == "vertex" else f"rows of '{element.name}'"
             raise ProgdfError(
-                f"{ply.path} declares {count} {what} of {'at least ' if text else ''}{least} bytes but "
-                f"has room for {max(remaining, 0) // least}, so it is truncated or its header is wrong; "
+                f"{ply.path} declares {count} {row_kind} of {'at least ' if text else ''}{needed} bytes but "
+                f"has room for {max(remaining, 0) // needed}, so it is truncated or its header is wrong; "
                 f"copy or export it again"
             )
-        remaining -= count * least
+        remaining -= count * needed
 
 
 def _has_lists(element: PlyElement) -> bool:
@@ -211,5 +213,5 @@ def _has_lists(element: PlyElement) -> bool:
 
 
 def _row_bytes(element: PlyElement) -> int:
-    """Bytes of a binary row, or of one with empty lists."""
+    """Return the bytes of a binary row, with all lists empty."""
     return sum(np.dtype(getattr(p, "len_dtype", p.val_dtype)).itemsize for p in element.properties)

@@ -1,14 +1,14 @@
-"""The up axis and the camera that a .ply stores next to its Gaussians.
+"""Up axis and camera that a .ply stores next to its Gaussians.
 
 Up axis, from a comment in the header:
 
     comment Vertical Axis: z          nerfstudio: the positive axis
-    comment Vertical axis: y          Brush: −y, as Brush reads its own letters (x is +x, y is −y, z is −z)
+    comment Vertical axis: y          Brush: −y (in its convention, x is +x, y is −y, z is −z)
     comment Vertical axis: 0 -1 0     Brush: a vector
 
 Camera, from the elements of Apple's SHARP, which makes a scene from one photo: `extrinsic` (world to camera,
-OpenCV axes, 16 numbers by rows), `intrinsic` (9 numbers by rows) and `image_size` (width, height). Two more
-elements change the picture: `color_space` (0 sRGB, 1 linear RGB) and `frame` (frames in the file).
+OpenCV axes, 16 numbers row by row), `intrinsic` (9 numbers row by row) and `image_size` (width, height). Two
+more elements change the rendering: `color_space` (0 sRGB, 1 linear RGB) and `frame` (frames in the file).
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from progdf.io.file_rules import unsupported_error
 from .ply_file import PlyFile, read_header
 
 CAMERA_ELEMENTS = {"extrinsic": 16, "intrinsic": 9, "image_size": 2}
-"""Elements that together are a camera, and their rows. Each has one property of the same name."""
+"""Elements that together form a camera, and their row counts. Each has one property of the same name."""
 
-LARGEST_SIDE = 1_000_000  # pixels
-ROTATION_TOLERANCE = 1e-2  # of R Rᵀ from the identity
+LARGEST_SIDE = 1_000_000  # largest width or height, pixels
+ROTATION_TOLERANCE = 1e-2  # largest deviation of R Rᵀ from the identity
 
 _UP_COMMENT = re.compile(r"(?:vertical|up)[ _-]?axis(?P<mark> *[:=]| +) *(?P<value>.*)", re.I)
 _AXIS = re.compile(r"(?P<sign>[+-]?) ?(?P<axis>[xyz])(?:[ -]?up)?", re.I)
@@ -44,20 +44,20 @@ _BRUSH = "exported from brush"
 
 @dataclass(frozen=True)
 class PlyView:
-    """The up axis and the camera that a .ply stores."""
+    """Up axis and camera that a .ply stores."""
 
     up: Tensor | None = None  # in the world, unit length. [3] float32
-    up_comment: str = ""  # the comment that says so
+    up_comment: str = ""  # the comment that states the up axis
     unknown_comments: tuple[str, ...] = ()  # comments about the up axis that name no axis
     camera: Camera | None = None  # the stored camera, relative to the requested origin
 
 
 def stored_view(path: Path, origin: Origin = ZERO) -> PlyView:
-    """Return the up axis and the camera in a scene's file; neither for files other than .ply.
+    """Return the up axis and the camera in a scene's file; an empty `PlyView` for files other than .ply.
 
     Args:
         path: the scene's file
-        origin: of the scene, which the camera is relative to
+        origin: origin of the scene; the camera is relative to it
     """
     try:
         return read_view(read_header(path), origin)
@@ -81,7 +81,7 @@ def read_view(ply: PlyFile, origin: Origin = ZERO) -> PlyView:
         direction = _parse_direction(match["value"], is_brush)
         if direction is not None:
             directions[comment] = direction
-        elif match["mark"].strip():  # else it is a sentence
+        elif match["mark"].strip():  # without a mark it is prose
             unknown.append(comment)
     first = next(iter(directions.values()), None)
     if first is None or any(float(first @ other) < 0.999 for other in directions.values()):
@@ -90,7 +90,7 @@ def read_view(ply: PlyFile, origin: Origin = ZERO) -> PlyView:
 
 
 def _parse_direction(text: str, is_brush: bool) -> Tensor | None:
-    """Return the direction of "z", "-y", "y-up" or "0 -1 0"; None for anything else. [3] unit length"""
+    """Parse a direction such as "z", "-y", "y-up" or "0 -1 0"; None for other text. [3] unit length"""
     text = text.strip()
     if axis := _AXIS.fullmatch(text):
         is_negative = axis["sign"] == "-" or (is_brush and not axis["sign"] and axis["axis"] in "yYzZ")
@@ -109,7 +109,7 @@ def _parse_direction(text: str, is_brush: bool) -> Tensor | None:
 
 
 def _stored_camera(ply: PlyFile) -> Camera | None:
-    """Return the camera of SHARP's elements in float64, in the world; None where they are no camera."""
+    """Return the camera of SHARP's elements in float64, in the world; None if they form no camera."""
     numbers = {name: _numbers(ply, name, rows) for name, rows in CAMERA_ELEMENTS.items()}
     extrinsic, intrinsic, size = (numbers[name] for name in CAMERA_ELEMENTS)
     if extrinsic is None or intrinsic is None or size is None:
@@ -133,7 +133,7 @@ def _stored_camera(ply: PlyFile) -> Camera | None:
 
 
 def _numbers(ply: PlyFile, name: str, rows: int) -> Sequence[float] | None:
-    """Return the numbers of an element with one property of its own name; None where it is not so."""
+    """Return the numbers of an element whose only property has the same name; None for any other element."""
     if ply.counts.get(name) != rows or list(ply.columns(name)) != [name]:
         return None
     try:
@@ -145,10 +145,10 @@ def _numbers(ply: PlyFile, name: str, rows: int) -> Sequence[float] | None:
 
 
 def has_linear_colors(ply: PlyFile) -> bool:
-    """Return whether SHARP's `color_space` says that the colors are linear RGB.
+    """Return whether SHARP's `color_space` declares linear RGB colors.
 
     Raises:
-        ProgdfError: it says something else than sRGB (0) or linear RGB (1).
+        ProgdfError: the value is neither sRGB (0) nor linear RGB (1).
     """
     if "color_space" not in ply.counts:
         return False

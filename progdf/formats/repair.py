@@ -1,6 +1,6 @@
-"""Scenes made drawable, every number finite and near the origin, and the report of what that took.
+"""Repair of loaded scenes: all numbers become finite, means relative to an origin; and the load report.
 
-What cannot be used is made invisible rather than dropped, because labels and .gdf files count on row indices.
+An unusable row is made invisible rather than dropped, because labels and .gdf files rely on row indices.
 """
 
 from __future__ import annotations
@@ -20,31 +20,33 @@ from progdf.quaternions import normalize_quats
 from progdf.terminal import file_size, format_count, group_digits
 
 LARGEST_MEAN = 1e18
+"""Largest usable coordinate. The square of a larger one overflows float32."""
+
 LARGEST_LOG_SCALE = 40.0
-"""Beyond these a squared distance or a variance overflows float32."""
+"""Largest usable log-scale. The variance of a larger one overflows float32."""
 
 FLAT_LOG_SCALE = -20.0
-"""In place of −inf: 2e-9, as thin as the thinnest seen in real files."""
+"""Replacement for a log-scale of −inf. The scale is 2e-9, like the thinnest Gaussians in real files."""
 
 OPAQUE_LOGIT = 15.0
-"""In place of +inf: opacity 1 − 3e-7, which no renderer shows differently, yet an edit can still lower it."""
+"""Replacement for a logit of +inf. Opacity 1 − 3e-7 renders the same, and an edit can still lower it."""
 
 INVISIBLE_LOGIT = -30.0
-"""In place of −inf: opacity 1e-13, far under the 1/255 that every rasterizer skips."""
+"""Replacement for a logit of −inf. Opacity 1e-13 is far below 1/255, the cutoff of every rasterizer."""
 
-MIN_QUAT = 1e-6
-_SAMPLE = 10_000
-"""Rows that the origin is found from, an even sample: its median is off by 1 % of the extent."""
+MIN_QUAT = 1e-6  # length; a shorter quaternion counts as no rotation
+_MAX_SAMPLE_ROWS = 10_000
+"""Rows in the even sample for finding the origin. The median of such a sample is off by 1 % of the extent."""
 
 UNIT_TOLERANCE = 1e-6
-"""A quaternion this close to unit length is left alone, so that a saved scene loads bit for bit."""
+"""Deviation from unit length up to which a quaternion stays unchanged, so saved scenes reload exactly."""
 
 
 def repair(scene: Gaussians, path: str | os.PathLike[str]) -> tuple[Gaussians, dict[str, Any]]:
-    """Return a scene that can be drawn, and the counts of repairs by fields of `LoadReport`.
+    """Return the repaired scene, and the counts of repairs by fields of `LoadReport`.
 
-    Means in the world, of either floating type, become float32 relative to an origin. Unusable numbers are
-    replaced, quaternions get unit length. Tensors that need nothing are passed on, not copied.
+    World means (float32 or float64) become float32 relative to an origin. Unusable numbers are replaced, and
+    quaternions are normalized. Tensors without repairs are not copied.
 
     Args:
         scene: N Gaussians as stored
@@ -90,22 +92,23 @@ def _unusable_reasons(scene: Gaussians) -> list[str]:
 
 
 def find_origin(means: Tensor, log_scales: Tensor) -> Origin:
-    """What point of the world a scene's means are kept relative to; 0 on an axis along which it is near.
+    """Return the origin that the means of a scene are stored relative to; 0 on each axis that is near 0.
 
-    Near is where float32 shows in no picture. It keeps a mean to 2^-24 of its distance, and with the camera's
-    rounding a Gaussian is off by three times that; as exp(-x²/2) is nowhere steeper than .61, one of standard
-    deviation s changes by less than 1/255 up to a distance of 2^15 s, however near one looks. An eighth of
-    that is near: the order of Gaussians in depth, and where they end, change by steps, which no bound holds.
+    An axis is near 0 if float32 rounding is invisible there. Rounding moves a mean by 2^-24 of its distance,
+    and together with the camera's rounding by three times that. The slope of exp(-x²/2) is at most 0.61.
+    A Gaussian of standard deviation s therefore changes by less than 1/255 up to a distance of 2^15 s, at any
+    zoom. The limit is an eighth of that, because depth order and cutoffs change in steps, which the estimate
+    does not bound.
 
-    Here s is the median of the middle axes, or 2^-9 of the scene's own extent where that is more, rounded
-    down to a power of two. Farther off, the origin is a multiple of 2^8 s: taking it away from what float32
-    held is exact, and a scene that was moved by such a multiple gets back the bits that it had.
+    Here s is the median of the middle axes, or 2^-9 of the scene's extent if that is larger, rounded down to
+    a power of two. Beyond the limit, the origin is a multiple of 2^8 s. Subtracting it from float32 values is
+    exact, and a scene that was moved by such a multiple gets its original bits back.
 
     Args:
-        means: in the world, float32 or float64; NaN and infinities do not count. [N,3]
+        means: world means, float32 or float64; NaN and infinities are ignored. [N,3]
         log_scales: [N,3]
     """
-    rows = slice(None, None, max(1, -(-len(means) // _SAMPLE)))
+    rows = slice(None, None, max(1, -(-len(means) // _MAX_SAMPLE_ROWS)))
     means = means[rows].double()
     middle = means.nanmedian(dim=0).values
     extent = float((means - middle).abs().amax(dim=1).nanmedian())
@@ -121,7 +124,7 @@ def find_origin(means: Tensor, log_scales: Tensor) -> Origin:
 
 
 def _move_to_origin(scene: Gaussians) -> tuple[Gaussians, dict[str, Any]]:
-    """The scene relative to its origin; that, and what float32 had lost there."""
+    """Return the scene relative to its origin, and the report fields `origin` and `distinct`."""
     world = scene.means
     origin = find_origin(world, scene.log_scales)
     if origin == ZERO:
@@ -137,7 +140,7 @@ def _move_to_origin(scene: Gaussians) -> tuple[Gaussians, dict[str, Any]]:
 
 
 def _replace_unusable(scene: Gaussians) -> tuple[Gaussians, dict[str, int]]:
-    """Every number in range, and how many rows needed it."""
+    """Replace all unusable numbers, and count the affected rows by fields of `LoadReport`."""
     quats, lengths = _unit(scene.quats)
     counts = {"scaled_quats": int((lengths != 1).sum())}
     if _is_clean(scene, lengths):
@@ -147,16 +150,16 @@ def _replace_unusable(scene: Gaussians) -> tuple[Gaussians, dict[str, int]]:
     zero_quats = scene.quats.abs().amax(dim=1) < MIN_QUAT
     opaque = scene.logit_opacities == torch.inf
     transparent = scene.logit_opacities == -torch.inf
-    bad = {
+    unusable = {
         "bad_means": ~(scene.means.abs() <= LARGEST_MEAN).all(dim=1),
         "bad_scales": ~((scene.log_scales <= LARGEST_LOG_SCALE) | flat).all(dim=1),
         "bad_quats": ~scene.quats.isfinite().all(dim=1),
         "bad_opacities": scene.logit_opacities.isnan(),
         "bad_colors": ~scene.sh0.isfinite().all(dim=1),
     }
-    hidden = torch.stack([*bad.values()]).any(dim=0)
-    rows = bad | {
-        "scaled_quats": (lengths != 1) & ~zero_quats & ~bad["bad_quats"],
+    hidden = torch.stack([*unusable.values()]).any(dim=0)
+    rows = unusable | {
+        "scaled_quats": (lengths != 1) & ~zero_quats & ~unusable["bad_quats"],
         "hidden": hidden,
         "bad_sh": ~scene.shN.flatten(1).isfinite().all(dim=1),
         "flat_scales": flat.any(dim=1) & ~hidden,
@@ -165,9 +168,9 @@ def _replace_unusable(scene: Gaussians) -> tuple[Gaussians, dict[str, int]]:
         "zero_quats": zero_quats,
     }
     counts = {name: int(mask.sum()) for name, mask in rows.items()}
-    good = scene.means[~hidden]
-    # in the middle of the scene, where it changes neither its bounds nor the rig
-    middle = good.median(dim=0).values if len(good) else torch.zeros(3)
+    usable_means = scene.means[~hidden]
+    # hidden rows move to the median, where they change neither the bounds nor the camera rig
+    middle = usable_means.median(dim=0).values if len(usable_means) else torch.zeros(3)
     identity = torch.tensor([1.0, 0.0, 0.0, 0.0])
     row = hidden[:, None]
     logits = scene.logit_opacities.clamp(INVISIBLE_LOGIT, OPAQUE_LOGIT)
@@ -185,18 +188,18 @@ def _replace_unusable(scene: Gaussians) -> tuple[Gaussians, dict[str, int]]:
 
 
 def _unit(quats: Tensor) -> tuple[Tensor, Tensor]:
-    """Quaternions of unit length, and the length each was divided by: exactly 1 if left alone. [N]"""
+    """Return normalized quaternions [N,4], and the length each was divided by: exactly 1 if unchanged. [N]"""
     lengths = quats.norm(dim=1)
     lengths = torch.where((lengths - 1).abs() <= UNIT_TOLERANCE, 1.0, lengths)
-    ordinary = (lengths > MIN_QUAT) & lengths.isfinite()
+    is_regular = (lengths > MIN_QUAT) & lengths.isfinite()
     unit = quats / lengths[:, None]
-    if not bool(ordinary.all()):
-        unit[~ordinary] = normalize_quats(quats[~ordinary])
+    if not bool(is_regular.all()):
+        unit[~is_regular] = normalize_quats(quats[~is_regular])
     return unit, lengths
 
 
 def _is_clean(scene: Gaussians, lengths: Tensor) -> bool:
-    """Whether nothing at all needs repair; one pass over the data without temporaries."""
+    """Return whether no row needs repair, in one pass over the data without temporaries."""
     return (
         _within(scene.means, -LARGEST_MEAN, LARGEST_MEAN)
         and _within(scene.log_scales, -torch.inf, LARGEST_LOG_SCALE)
@@ -206,7 +209,7 @@ def _is_clean(scene: Gaussians, lengths: Tensor) -> bool:
 
 
 def _within(tensor: Tensor, least: float, most: float) -> bool:
-    """Whether every number is finite and in [least, most]; NaN passes through aminmax and fails."""
+    """Return whether every number is finite and in [least, most]; `aminmax` propagates NaN, which fails."""
     if not tensor.numel():
         return True
     low, high = (float(edge) for edge in tensor.aminmax())
@@ -218,39 +221,39 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class LoadReport:
-    """What a .ply held, what was repaired, what was left out. Counts are rows (Gaussians)."""
+    """Contents of a scene file, its repairs and its unused parts. Counts are rows (Gaussians)."""
 
-    file: str  # the file's name
-    file_bytes: int  # its size
-    format: str  # "binary little-endian", "binary big-endian" or "ascii"
-    count: int  # Gaussians N; loading never drops or adds a row
-    sh_degree: int  # 0..4
-    antialiased: bool = False  # it says that it was trained with Mip-Splatting's 2D filter
-    origin: Origin = ZERO  # what the means are kept relative to, see `repair.find_origin`
-    # how many different x, y and z there are, of positions that were float32 far from 0; 0 on an axis that is
-    # near 0, () where nothing was lost
+    file: str  # file name
+    file_bytes: int  # file size
+    format: str  # description of the format, such as "binary little-endian", "ascii" or ".splat"
+    count: int  # number of Gaussians N; loading never drops or adds a row
+    sh_degree: int  # 0 to 4
+    antialiased: bool = False  # the file states that it was trained with Mip-Splatting's 2D filter
+    origin: Origin = ZERO  # origin that the means are relative to, see `repair.find_origin`
+    # numbers of distinct x, y and z values if positions far from 0 were stored as float32; 0 on an axis that
+    # is near 0, () if no precision was lost
     distinct: tuple[int, ...] = ()
-    hidden: int = 0  # rows made invisible because a number was unusable; the next five say which number
+    hidden: int = 0  # rows made invisible due to an unusable number; the next five fields count the causes
     bad_means: int = 0  # NaN, infinite or beyond ±1e18
     bad_scales: int = 0  # NaN, infinite or beyond e^40
     bad_quats: int = 0  # NaN or infinite
     bad_opacities: int = 0  # NaN
     bad_colors: int = 0  # NaN or infinite f_dc
-    bad_sh: int = 0  # NaN or infinite f_rest; only the broken coefficients become 0, the row stays visible
-    flat_scales: int = 0  # −inf log-scale (an exactly flat Gaussian), made a very thin one
-    opaque: int = 0  # +inf opacity, made a finite one that looks the same
-    transparent: int = 0  # −inf opacity, made a finite one that looks the same
-    zero_quats: int = 0  # |q| < 1e-6, taken as no rotation
-    scaled_quats: int = 0  # quaternions that were not of unit length and were divided by it
+    bad_sh: int = 0  # NaN or infinite f_rest; only the bad coefficients become 0, and the row stays visible
+    flat_scales: int = 0  # −inf log-scale (exactly flat), replaced by `FLAT_LOG_SCALE`
+    opaque: int = 0  # +inf opacity logit, replaced by `OPAQUE_LOGIT`
+    transparent: int = 0  # −inf opacity logit, replaced by `INVISIBLE_LOGIT`
+    zero_quats: int = 0  # |q| < 1e-6, treated as no rotation
+    scaled_quats: int = 0  # quaternions of another length than 1, normalized
     ignored_properties: tuple[str, ...] = ()  # vertex properties that 3DGS does not have
-    ignored_elements: tuple[tuple[str, int], ...] = ()  # tables other than vertex, with their row counts
-    ignored_comments: tuple[str, ...] = ()  # comments about the up axis: no axis, or several
+    ignored_elements: tuple[tuple[str, int], ...] = ()  # unused elements with their row counts
+    ignored_comments: tuple[str, ...] = ()  # comments about the up axis that name no axis, or different ones
     trailing_bytes: int = 0  # bytes after the last row
-    conversions: tuple[str, ...] = ()  # fields of other conventions that were converted, a phrase each
+    conversions: tuple[str, ...] = ()  # conversions from other conventions, a phrase each
 
     @property
     def repairs(self) -> tuple[str, ...]:
-        """One phrase for each kind of repair that changed what is shown or could be noticed."""
+        """Phrases for the repairs, one per kind; normalized quaternions are left out."""
         reasons = (
             (self.bad_means, "NaN, infinite or absurd position"),
             (self.bad_scales, "NaN, infinite or absurd scale"),
@@ -271,7 +274,7 @@ class LoadReport:
 
     @property
     def lost(self) -> str:
-        """What cannot be repaired, "" for nothing: positions that float32 has rounded."""
+        """Description of a loss that cannot be repaired (positions rounded to float32), or ""."""
         if not self.distinct:
             return ""
         step = max(2.0 ** (math.frexp(at)[1] - 24) for at in self.origin if at)
@@ -287,7 +290,7 @@ class LoadReport:
 
     @property
     def ignored_parts(self) -> tuple[str, ...]:
-        """One phrase for each part of the file that was not used."""
+        """Phrases for the unused parts of the file, one each."""
         phrases = []
         if self.ignored_properties:
             phrases.append(f"properties {', '.join(self.ignored_properties)}")
@@ -299,14 +302,14 @@ class LoadReport:
         return tuple(phrases)
 
     def log(self) -> None:
-        """Warn of what was repaired, and of what was lost."""
+        """Log repairs and losses as warnings."""
         for phrase in self.repairs:
             _log.warning("%s: repaired: %s", self.file, phrase)
         if self.lost:
             _log.warning("%s: %s", self.file, self.lost)
 
     def lines(self) -> list[str]:
-        """The report for a person, a line per fact."""
+        """Return the report for the user, one line per fact."""
         sh = f"SH degree {self.sh_degree}"
         if self.sh_degree == 4:
             sh += " (band 4 is kept, and not shown)"

@@ -1,8 +1,8 @@
-"""Scenes in every format that people have: .ply, .spz, .splat, .ksplat, .sog, .glb, .gltf, .ckpt.
+"""Load and save scenes: .ply, .spz, .splat, .ksplat, .sog, .glb, .gltf, .ckpt.
 
-A scene is recognized by its content, else by its name, also inside a .zip or .gz. The library gaussforge
-reads .spz, and writes .spz, .splat and .sog. It runs in a process of its own (see `native_child`),
-because native code may crash on a broken file.
+The format is recognized by content, otherwise by name, also inside a .zip or .gz. The library gaussforge
+reads .spz and writes .spz, .splat and .sog. It runs in a separate process (see `native_child`) because
+native code may crash on a broken file.
 """
 
 from __future__ import annotations
@@ -54,10 +54,10 @@ from .ply_file import read_header
 from .repair import LoadReport, repair
 
 CONTAINERS = ("zip", "gz")
-"""Archives that are read if they hold one scene."""
+"""Archive formats. An archive is read if it holds exactly one scene."""
 
 FORMATS = ("ply", "spz", "splat", "ksplat", "sog", "glb", "gltf", "ckpt", *CONTAINERS)
-"""Formats of a scene, by the ending of its name; a compressed .ply is a .ply."""
+"""Formats that are read, by the ending of the name. A compressed .ply counts as a .ply."""
 
 WRITTEN = (".ply", ".compressed.ply", ".spz", ".sog", ".splat", ".glb", usd.SUFFIX)
 """Formats that `save_scene` writes, by the ending of the name."""
@@ -66,35 +66,37 @@ MAX_FRAMES = 1000
 """Largest number of scenes for `save_frames`, which numbers files with three digits."""
 
 SPZ_BITS = 12
-"""Fractional bits of a position in an .spz, where the scene reaches no farther than ±2048."""
+"""Fractional bits of a position in an .spz, for scenes that stay within ±2048."""
 
-CHECKPOINT_SUFFIXES = ("ckpt", "pt", "pth")
+CHECKPOINT_SUFFIXES = ("ckpt", "pt", "pth")  # name endings of checkpoints, without the dot
 
 CHECKPOINT = "checkpoint of a training"
-"""The format of .pt, .pth and .ckpt in a report."""
+"""Format name of .pt, .pth and .ckpt in a report."""
 
-_SPZ_MAX = 2**23 - 1  # of a position in steps of 2^-bits
+_SPZ_MAX_STEPS = 2**23 - 1  # largest coordinate in an .spz, in steps of 2^-bits
 _SPZ_VERSIONS = (1, 2, 3, 4)
-_SPZ_LAST_GZIP = b"\3"  # the last version that is gzip data
-# flags
-_SPZ_ANTIALIASED = 1
-_SPZ_EXTENDED = 2
-_SPZ_MAX_DEGREE = 4
-_MEMORY = (1 << 30, 64)
-_OUTPUT = (64 << 20, 64)
-SECONDS = (60, 2e-6)
-"""Limits of the process that reads a foreign file: a base, and more for each byte of the file."""
-_PATIENCE = 30
-"""Times as long for writing our own scenes: clustering the bands of a million for an .sog takes minutes."""
+_SPZ_LAST_GZIP = b"\3"  # last version that is stored as gzip data
+_SPZ_ANTIALIASED = 1  # flag: trained with antialiasing
+_SPZ_EXTENDED = 2  # flag: the file has extensions
+_SPZ_MAX_DEGREE = 4  # largest SH degree
+# limits of the gaussforge process: a base, and an increment per byte of the file
+_MEMORY_LIMIT = (1 << 30, 64)  # bytes of memory
+_OUTPUT_LIMIT = (64 << 20, 64)  # bytes of output
+SECONDS = (60, 2e-6)  # seconds of processor time
+_WRITE_TIME_FACTOR = 30
+"""Factor on `SECONDS` for writing. Clustering the SH bands of a million Gaussians takes minutes (.sog)."""
 
 _log = logging.getLogger(__name__)
 
 
 def scene_format(path: str | os.PathLike[str]) -> str | None:
-    """Return one of `FORMATS` by content, or by name where the content does not tell; None for no scene.
+    """Return the format of a file, by content or otherwise by name; None if it is no scene.
+
+    Returns:
+        One of `FORMATS`, or None.
 
     Raises:
-        ProgdfError: it cannot be read.
+        ProgdfError: the file cannot be read.
     """
     path = scene_file(path)
     start = read_file(path, START_BYTES)
@@ -106,7 +108,7 @@ def scene_format(path: str | os.PathLike[str]) -> str | None:
     if start[:4] == b"NGSP":
         return "spz"
     if start[:2] == GZIP:
-        header = inflate_start(start, 8)  # of an .spz up to version 3; a later one is plain
+        header = inflate_start(start, 8)  # an .spz up to version 3 is gzip data; later versions are plain
         return "spz" if header[:4] == b"NGSP" and header[4:5] <= _SPZ_LAST_GZIP else "gz"
     if suffix in CHECKPOINT_SUFFIXES:
         return "ckpt"
@@ -116,26 +118,27 @@ def scene_format(path: str | os.PathLike[str]) -> str | None:
         return "sog" if read_table(path) is not None else None
     if suffix == "gltf":
         return suffix
-    if suffix in ("splat", "ksplat"):  # which begin with whatever comes first in the scene
+    if suffix in ("splat", "ksplat"):  # no magic number: any first byte is valid
         return suffix
     return suffix if suffix in FORMATS and start.lstrip()[:1] not in (b"{", b"[") else None
 
 
 def scene_file(path: str | os.PathLike[str]) -> Path:
-    """Return the file that a scene is read from: of an unpacked .sog's folder its meta.json."""
+    """Return the file that a scene is read from: the path itself, or meta.json in an unpacked .sog folder."""
     path = Path(path)
     return path / SOG_META if os.path.isfile(path / SOG_META) else path
 
 
 def scene_name(path: Path) -> str:
-    """Return the name of a scene: its file's name, of an unpacked .sog its folder's."""
+    """Return the name of a scene: the name of its file, or of the folder of an unpacked .sog."""
     return path.parent.name if path.name.lower() == SOG_META else path.name
 
 
 def load_scene(path: str | os.PathLike[str]) -> Gaussians:
-    """The scene in a file of any known format; what had to be repaired or was lost is logged as a warning.
+    """Load a scene from a file of any known format; log repairs and losses as warnings.
 
-    Axes are those of the 3DGS .ply: an .spz, which has y up and z towards the viewer, is turned about x.
+    Axes are those of the 3DGS .ply (y down, z forward). An .spz, which has y up and z towards the viewer, is
+    rotated by half a turn about x.
 
     Raises:
         ProgdfError: the file is missing, broken or no scene, or its reader is not installed.
@@ -147,7 +150,7 @@ def load_scene(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def load_scene_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, LoadReport]:
-    """Return the scene as `load_scene` does, with the report of the file's content and its repairs."""
+    """Load a scene as `load_scene` does, and return it with the report on its content and repairs."""
     path = scene_file(path)
     parts = part_files(path)
     if len(parts) > 1:
@@ -169,7 +172,7 @@ def _load(path: Path, kind: str | None) -> tuple[Gaussians, LoadReport]:
 
     Args:
         path: the file
-        kind: one of `FORMATS`; None lets the reader of .ply tell the reason
+        kind: one of `FORMATS`; None if unknown, so that the .ply reader raises the error
     """
     start = read_file(path, START_BYTES)
     is_table = kind == "gltf" or path.name.lower() == SOG_META
@@ -190,25 +193,25 @@ def _load(path: Path, kind: str | None) -> tuple[Gaussians, LoadReport]:
         scene, level = read_ksplat(path)
         return _repair(path, scene, f".ksplat, level {level}")
     if kind in ("glb", "gltf"):
-        found = gltf.read_gltf(path, partial(_read_spz_part, path))
+        glb = gltf.read_gltf(path, partial(_read_spz_part, path))
         content = {
-            "file_bytes": found.file_bytes,
-            "conversions": found.conversions,
-            "ignored_properties": found.ignored,
+            "file_bytes": glb.file_bytes,
+            "conversions": glb.conversions,
+            "ignored_properties": glb.ignored,
         }
-        return _repair(path, found.scene, ", ".join([f".{kind}", *found.storage]), content)
+        return _repair(path, glb.scene, ", ".join([f".{kind}", *glb.storage]), content)
     if kind == "ckpt":
         checkpoint = read_checkpoint(path)
         return _repair(path, checkpoint.scene, CHECKPOINT, {"ignored_properties": checkpoint.ignored})
     version, flags = _check_spz(path)
     antialiased = bool(flags & _SPZ_ANTIALIASED)
     content = {"ignored_properties": ("extensions",) if flags & _SPZ_EXTENDED else ()}
-    scene = rotate_about_x(replace(_through_gaussforge(path, "spz"), antialiased=antialiased))
+    scene = rotate_about_x(replace(_read_with_gaussforge(path, "spz"), antialiased=antialiased))
     return _repair(path, scene, f".spz {version}, turned from y up to y down", content)
 
 
 def rotate_about_x(scene: Gaussians) -> Gaussians:
-    """Return the scene after half a turn about x: y up and z back become y down and z forward."""
+    """Rotate a scene by half a turn about x: y up and z back become y down and z forward."""
     turn = torch.tensor([1.0, -1.0, -1.0])
     x, y, z = scene.origin
     return replace(
@@ -221,14 +224,15 @@ def rotate_about_x(scene: Gaussians) -> Gaussians:
 
 
 def _load_parts(path: Path, parts: Sequence[Path]) -> tuple[Gaussians, LoadReport]:
-    """Join the files of a training on several GPUs, in the order of the GPUs.
+    """Join the files of a multi-GPU training, in the order of the GPUs.
 
     Args:
         path: one of the parts
         parts: all of them
 
     Raises:
-        ProgdfError: a part cannot be read, or is of another training step or SH degree than the first.
+        ProgdfError: a part cannot be read, or its training step, SH degree or antialiasing differs from the
+            first part's.
     """
     is_checkpoint = scene_format(path) == "ckpt"
     scenes: list[Gaussians] = []
@@ -260,12 +264,12 @@ def _load_parts(path: Path, parts: Sequence[Path]) -> tuple[Gaussians, LoadRepor
 def _repair(
     path: Path, stored: Gaussians, kind: str, content: Mapping[str, Any] = MappingProxyType({})
 ) -> tuple[Gaussians, LoadReport]:
-    """Return a scene that can be drawn, and the report.
+    """Return the repaired scene, ready to render, and the report.
 
     Args:
         path: the scene's file
         stored: N Gaussians as stored, means in the world
-        kind: the format, for a person
+        kind: the format as shown to the user
         content: further fields of the report
 
     Raises:
@@ -284,8 +288,8 @@ def _repair(
     return scene, report
 
 
-def _through_gaussforge(path: Path, kind: str) -> Gaussians:
-    """Return the scene as gaussforge reads it, as stored, in the axes of the file.
+def _read_with_gaussforge(path: Path, kind: str) -> Gaussians:
+    """Read a scene with gaussforge, as stored, in the axes of the file.
 
     Raises:
         ProgdfError: gaussforge is not installed, cannot read the file, crashes on it or takes too long.
@@ -313,7 +317,7 @@ def _read_spz_part(path: Path, content: bytes) -> Gaussians:
         part.write_bytes(content)
         try:
             _, flags = _check_spz(part)
-            scene = _through_gaussforge(part, "spz")
+            scene = _read_with_gaussforge(part, "spz")
         except ProgdfError as error:
             raise ProgdfError(str(error).replace(str(part), f"{path}: its .spz part")) from None
     return replace(scene, antialiased=bool(flags & _SPZ_ANTIALIASED))
@@ -322,38 +326,42 @@ def _read_spz_part(path: Path, content: bytes) -> Gaussians:
 def _convert(source: Path, kind: str, target: Path, to: str) -> str:
     """Convert a scene file with gaussforge; return the reason for a failure, or an empty text."""
     size = scene_bytes(source)
-    patience = 1 if to == "ply" else _PATIENCE
-    memory, output, seconds = (int(base + each * size) for base, each in (_MEMORY, _OUTPUT, SECONDS))
+    factor = 1 if to == "ply" else _WRITE_TIME_FACTOR
+    memory, output, seconds = (
+        int(base + each * size) for base, each in (_MEMORY_LIMIT, _OUTPUT_LIMIT, SECONDS)
+    )
     words = "convert", kind, str(source.resolve()), to, str(target)
     try:
-        ended = native_child.run((memory, output, patience * seconds), 2 * patience * seconds, *words)
+        result = native_child.run((memory, output, factor * seconds), 2 * factor * seconds, *words)
     except subprocess.TimeoutExpired:
-        return f"did not answer within {2 * patience * seconds} s"
-    return _reason(ended.returncode, ended.stderr) if ended.returncode or not target.is_file() else ""
+        return f"did not answer within {2 * factor * seconds} s"
+    return (
+        _failure_reason(result.returncode, result.stderr) if result.returncode or not target.is_file() else ""
+    )
 
 
 def save_scene(path: Path, scene: Gaussians, glb_axes: Axes = "LUF") -> ReadBack | None:
-    """Write a scene in the format of the name's ending; the file appears whole or not at all.
+    """Write a scene in the format given by the name's ending; the file appears complete or not at all.
 
-    The file is read back and compared before it appears. A .ply is exact. The others are smaller, or serve
-    other programs:
+    The file is read back and compared before it appears. A .ply is exact. The other formats are smaller, or
+    serve other programs:
 
-        .compressed.ply   16 bytes per Gaussian, 1 per coefficient; in Morton order, as chunks share a range
-        .spz, .sog        8 bits and less; .spz and .usdc are turned to y up, as readers expect
+        .compressed.ply   16 bytes per Gaussian, 1 per SH coefficient; in Morton order: chunks share a range
+        .spz, .sog        8 bits and less; .spz and .usdc are rotated to y up, as readers expect
         .splat            32 bytes, without SH bands
         .glb, .usdc       float32, KHR_gaussian_splatting and ParticleField3DGaussianSplat
 
     Args:
         path: ends in one of `WRITTEN`
-        scene: N Gaussians, finite; bands above degree 3 are left out of all but the .ply
+        scene: N Gaussians, finite; SH bands above degree 3 are written to a .ply only
         glb_axes: axes of a .glb, LUF (glTF's own) or RUB (OpenGL's)
 
     Returns:
-        The scene as a reader gets it, and the differences. None for .ply, which is exact, and for .usdc,
-        which is not read.
+        The scene as read back, and the differences. None for .ply, which is exact, and for .usdc, which
+        cannot be read back.
 
     Raises:
-        ProgdfError: another ending, an absent package, or a position that the format cannot hold.
+        ProgdfError: the ending is none of `WRITTEN`, a package is missing, or a position is out of range.
     """
     check_first_argument("save_scene(path, scene)", path, (str, os.PathLike))
     ending = written_format(path)
@@ -361,32 +369,32 @@ def save_scene(path: Path, scene: Gaussians, glb_axes: Axes = "LUF") -> ReadBack
         save_ply_checked(path, scene)
         return None
     check_finite(path, scene)
-    kept = replace(scene, shN=scene.shN[:, : (gltf.MAX_DEGREE + 1) ** 2 - 1])
+    stored = replace(scene, shN=scene.shN[:, : (gltf.MAX_DEGREE + 1) ** 2 - 1])
     if ending == ".compressed.ply":
-        kept = kept[morton_order(kept.means)]
+        stored = stored[morton_order(stored.means)]
     with atomic_write(path) as written:
         if ending == ".compressed.ply":
-            write_compressed_ply(written, kept)
+            write_compressed_ply(written, stored)
         elif ending == ".glb":
-            gltf.write_glb(written, kept, glb_axes)
+            gltf.write_glb(written, stored, glb_axes)
         elif ending == usd.SUFFIX:
-            usd.write_usd(written, [rotate_about_x(kept)])
+            usd.write_usd(written, [rotate_about_x(stored)])
             return None
         else:
-            _write_with_gaussforge(path, written, kept, ending[1:])
+            _write_with_gaussforge(path, written, stored, ending[1:])
         try:
             read = load_scene_with_report(written)[0]
         except ProgdfError as error:
             reason = str(error).replace(str(written), "the new file")
             raise ProgdfError(f"{path} was not written: {reason}") from None
-        return compare(path, kept, read, _position_bounds(ending, kept), ending != ".sog")
+        return compare(path, stored, read, _position_bounds(ending, stored), ending != ".sog")
 
 
 def _write_with_gaussforge(path: Path, written: Path, scene: Gaussians, kind: str) -> None:
     """Write a scene as .spz, .sog or .splat.
 
-    The library reads no doubles, so positions are float32. It always uses 12 fractional bits for an .spz. A
-    scene that reaches farther is scaled by a power of two, and the header gets the number of bits afterwards.
+    gaussforge reads no doubles, so positions are float32. It always uses 12 fractional bits for an .spz. A
+    larger scene is scaled down by a power of two, and the number of bits is written to the header afterwards.
 
     Args:
         path: the file's name, for errors
@@ -418,30 +426,30 @@ def _write_with_gaussforge(path: Path, written: Path, scene: Gaussians, kind: st
 
 
 def _spz_bits(scene: Gaussians) -> int:
-    """Return the fractional bits with which all positions fit into 24 bits; negative where none do."""
+    """Return the number of fractional bits with which all positions fit into 24 bits; negative if none."""
     farthest = float(scene.world_means.abs().max())
     bits = SPZ_BITS
-    while bits >= 0 and farthest * 2.0**bits > _SPZ_MAX:
+    while bits >= 0 and farthest * 2.0**bits > _SPZ_MAX_STEPS:
         bits -= 1
     return bits
 
 
 def _range_error(path: Path, scene: Gaussians) -> ProgdfError:
-    """Return the error for a scene that reaches farther than an .spz."""
+    """Return the error for a scene that exceeds the range of an .spz."""
     means = scene.world_means
     row, axis = divmod(int(means.abs().argmax()), 3)
     return ProgdfError(
         f"{path} was not written: {'xyz'[axis]} of Gaussian {row} is {float(means[row, axis]):.7g}, "
-        f"and an .spz holds ±{_SPZ_MAX}; write a .ply, or a scene nearer to 0"
+        f"and an .spz holds ±{_SPZ_MAX_STEPS}; write a .ply, or a scene nearer to 0"
     )
 
 
 def _position_bounds(ending: str, scene: Gaussians) -> torch.Tensor:
-    """Return the largest rounding of each coordinate in a format, world units. [N,3] float64
+    """Return the largest rounding error of each coordinate in a format, world units. [N,3] float64
 
     Args:
-        ending: one of `WRITTEN` that is read back
-        scene: the scene in the order of the file, or of any order for .sog
+        ending: an entry of `WRITTEN` whose format can be read back
+        scene: the scene in the order of the file; any order for .sog
     """
     means = scene.world_means
     rounding = means.abs() * FLOAT_ROUNDING + torch.finfo(torch.float32).tiny
@@ -459,14 +467,14 @@ def _position_bounds(ending: str, scene: Gaussians) -> torch.Tensor:
 def save_frames(
     path: Path, scenes: Iterable[Gaussians], rate: float = 24.0, glb_axes: Axes = "LUF"
 ) -> list[Path]:
-    """Write scenes one after the other, see `frame_path`; all appear or none.
+    """Write a sequence of scenes as numbered files (see `frame_path`), all or none.
 
-    Earlier frames of the same names are replaced when all are written, see `write_files_together`. Attributes
-    that the format does not hold are logged as a warning, for the first scene that loses them.
+    Existing frames of the same names are replaced once all are written, see `write_files_together`. A warning
+    names attributes that the format cannot store, for the first scene that loses any.
 
     Args:
         path: ends in one of `WRITTEN`
-        scenes: N Gaussians each; those of a .usdc have the same rows
+        scenes: N Gaussians each; a .usdc needs the same rows in all scenes
         rate: samples per second of a .usdc
         glb_axes: as `save_scene`
 
@@ -487,26 +495,26 @@ def save_frames(
     with write_files_together(path.parent) as folder:
         for number, scene in enumerate(scenes):
             frame = frame_path(path, number)
-            found = save_scene(folder / frame.name, scene, glb_axes)
+            read_back = save_scene(folder / frame.name, scene, glb_axes)
             paths.append(frame)
-            if found is not None and found.notes and not has_warned:
-                _log.warning("%s: %s", frame, "; ".join(found.notes))
+            if read_back is not None and read_back.notes and not has_warned:
+                _log.warning("%s: %s", frame, "; ".join(read_back.notes))
                 has_warned = True
     return paths
 
 
 def frame_path(path: Path, number: int) -> Path:
-    """The file of one of several scenes: NAME_000.ply and so on; a .usdc has all of them."""
+    """Return the file name of one frame: NAME_000.ply and so on. A .usdc holds all frames in one file."""
     ending = written_format(path)
     stem = path.name[: -len(ending)]
     return path if ending == usd.SUFFIX else path.with_name(f"{stem}_{number:03d}{path.name[len(stem) :]}")
 
 
 def written_format(path: Path) -> str:
-    """Which of `WRITTEN` a name asks for.
+    """Return the entry of `WRITTEN` that a file name ends in.
 
     Raises:
-        ProgdfError: none of them.
+        ProgdfError: the name ends in none of them.
     """
     for ending in sorted(WRITTEN, key=len, reverse=True):
         if path.name.lower().endswith(ending):
@@ -521,8 +529,13 @@ def _require_gaussforge(path: Path, kind: str) -> None:
         raise ProgdfError(f"{path}: .{kind} needs the package gaussforge; pip install progdf-studio[formats]")
 
 
-def _reason(status: int, stderr: bytes) -> str:
-    """Why the reader gave nothing."""
+def _failure_reason(status: int, stderr: bytes) -> str:
+    """Return why the gaussforge process failed.
+
+    Args:
+        status: exit status, or the negative number of the signal that ended the process
+        stderr: its error output
+    """
     if status < 0:
         name = signal.Signals(-status).name if -status in set(signal.Signals) else str(-status)
         return "ran out of its time" if name in ("SIGXCPU", "SIGKILL") else f"crashed ({name})"
@@ -539,7 +552,7 @@ def _read_error(path: Path, kind: str, why: str) -> ProgdfError:
     Args:
         path: the file
         kind: its format
-        why: "said: …" of its own error, or the way in which its process ended
+        why: see `_failure_reason`
     """
     if why.startswith(("said", "returned")):
         return damage_error(path, f"the reader of .{kind} {why}")

@@ -1,7 +1,7 @@
-"""Gaussians in a USD file, as UsdVol.ParticleField3DGaussianSplat has them: still, or an edit over time.
+"""USD writer for Gaussians (UsdVol.ParticleField3DGaussianSplat), as a still or as an edit over time.
 
-Values are as drawn: linear scales, opacities 0 to 1; y is up and z towards the viewer. Attributes that do not
-change are stored once; every sample has the same rows, also those that draw nothing.
+Values are activated: linear scales, opacities 0 to 1. The y axis points up and z towards the viewer.
+Attributes that do not change are stored once. Every sample has the same rows, including invisible ones.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ _PATH = "/Gaussians"
 
 
 def write_usd(path: Path, scenes: Iterable[Gaussians], rate: float = 24.0) -> None:
-    """Write one scene, or several with the same rows as the samples 0, 1, … of one prim.
+    """Write one scene, or several scenes as the samples 0, 1, … of one prim.
 
     Args:
-        path: the file, which is written over; ends in .usdc
-        scenes: N Gaussians each, whose y is up
-        rate: samples a second
+        path: the file, which is overwritten; ends in .usdc
+        scenes: N Gaussians each, with y up and the same rows in all scenes
+        rate: samples per second
 
     Raises:
         ProgdfError: the package usd-core is not installed.
@@ -45,7 +45,7 @@ def write_usd(path: Path, scenes: Iterable[Gaussians], rate: float = 24.0) -> No
 
 
 def _system_error(message: str) -> OSError:
-    """Return the system's error behind one of the USD library's, which keeps its text alone."""
+    """Return the system error behind an error of the USD library, which only keeps its text."""
     for code in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EACCES, errno.EROFS, errno.ENOENT):
         if os.strerror(code) in message:
             return OSError(code, os.strerror(code))
@@ -58,7 +58,7 @@ def _write_stage(path: Path, scenes: Iterable[Gaussians], rate: float) -> None:
 
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-    UsdGeom.SetStageMetersPerUnit(stage, 1.0)  # else centimeters: Blender would shrink it a hundredfold
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)  # the default is centimeters: Blender would shrink it 100×
     stage.SetTimeCodesPerSecond(rate)
     prim = UsdVol.ParticleField3DGaussianSplat.Define(stage, _PATH)
     stage.SetDefaultPrim(prim.GetPrim())
@@ -69,26 +69,26 @@ def _write_stage(path: Path, scenes: Iterable[Gaussians], rate: float) -> None:
         "opacities": (prim.CreateOpacitiesAttr(), Vt.FloatArray),
         "coefficients": (prim.CreateRadianceSphericalHarmonicsCoefficientsAttr(), Vt.Vec3fArray),
     }
-    before: dict[str, NDArray[np.float32]] = {}
+    previous: dict[str, NDArray[np.float32]] = {}
     for time, scene in enumerate(scenes):
         for name, values in drawn_values(scene).items():
             attribute, kind = create[name]
-            if time and np.array_equal(values, before[name]):
+            if time and np.array_equal(values, previous[name]):
                 continue
-            if time and attribute.GetNumTimeSamples() == 0:  # it was still until here
+            if time and attribute.GetNumTimeSamples() == 0:  # constant until now
                 attribute.Clear()
-                attribute.Set(kind.FromNumpy(before[name]), 0)
+                attribute.Set(kind.FromNumpy(previous[name]), 0)
             if time and attribute.GetNumTimeSamples() and attribute.GetTimeSamples()[-1] != time - 1:
-                attribute.Set(kind.FromNumpy(before[name]), time - 1)
+                attribute.Set(kind.FromNumpy(previous[name]), time - 1)
             attribute.Set(kind.FromNumpy(values), *([time] if time else []))
-            before[name] = values
+            previous[name] = values
         if time == 0:
             prim.CreateRadianceSphericalHarmonicsDegreeAttr(scene.sh_degree)
             UsdGeom.Primvar(prim.GetRadianceSphericalHarmonicsCoefficientsAttr()).SetElementSize(
                 1 + scene.shN.shape[1]
             )
-            corners = scene.means.amin(dim=0).tolist(), scene.means.amax(dim=0).tolist()
-            prim.CreateExtentAttr(Vt.Vec3fArray([Gf.Vec3f(*corner) for corner in corners]))
+            extent = scene.means.amin(dim=0).tolist(), scene.means.amax(dim=0).tolist()
+            prim.CreateExtentAttr(Vt.Vec3fArray([Gf.Vec3f(*corner) for corner in extent]))
             if any(scene.origin):
                 prim.AddTranslateOp().Set(Gf.Vec3d(*scene.origin))
         stage.SetEndTimeCode(time)
@@ -97,7 +97,7 @@ def _write_stage(path: Path, scenes: Iterable[Gaussians], rate: float) -> None:
 
 
 def drawn_values(scene: Gaussians) -> dict[str, NDArray[np.float32]]:
-    """What the file stores of a scene: positions, orientations (imaginary first), scales, opacities, SH."""
+    """Return the stored attributes of a scene: positions, orientations (xyzw), scales, opacities and SH."""
     columns = {
         "positions": scene.means,
         "orientations": scene.unit_quats[:, [1, 2, 3, 0]],

@@ -1,1 +1,1 @@
-"""Scenes in quantized formats: compressed .ply, .splat, .ksplat and SOG."""
+"""Readers and writers of quantized scene formats: compressed .ply, .splat, .ksplat and SOG."""

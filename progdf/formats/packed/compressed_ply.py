@@ -1,7 +1,8 @@
-"""Compressed .ply (SuperSplat, splat-transform): 16 bytes a Gaussian in chunks of 256, SH bytes beside.
+"""Compressed .ply (SuperSplat, splat-transform): 16 bytes per Gaussian in chunks of 256, plus SH bytes.
 
-Positions, log-scales and, in newer files, colors are shares of their chunk's range; rotations are the three
-smaller components of a quaternion; opacities are bytes; f_rest bytes cover −4 to 4.
+Positions, log-scales and, in newer files, colors are stored as shares of the range of their chunk. A rotation
+is stored as the three smaller components of its quaternion. Opacities are bytes. The bytes of f_rest cover
+−4 to 4.
 """
 
 from __future__ import annotations
@@ -20,30 +21,30 @@ from progdf.gaussians import ATTRIBUTES, Gaussians, from_arrays
 from progdf.io.file_rules import damage_error, unsupported_error
 from progdf.sh import C0
 
-_CHUNK = 256
+_CHUNK_ROWS = 256
 _CONVERT = "convert it with `splat-transform in.ply out.compressed.ply`"
-_MORTON_BITS = 21  # of each axis: three fit a word
+_MORTON_BITS = 21  # per axis: three axes fit into 63 bits
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _XYZ = ("x", "y", "z")
 _SCALES = ("scale_x", "scale_y", "scale_z")
 _RGB = ("r", "g", "b")
-_SH_REST = (0, 9, 24, 45)
+_SH_REST = (0, 9, 24, 45)  # number of f_rest properties for SH degree 0 to 3
 
 Floats = npt.NDArray[np.float32]
 
 
 def is_compressed(ply: PlyFile) -> bool:
-    """Whether a .ply keeps its Gaussians packed."""
+    """Return whether the Gaussians of a .ply are packed."""
     return "packed_position" in ply.columns("vertex")
 
 
 def read_compressed_ply(ply: PlyFile) -> tuple[Gaussians, tuple[str, ...]]:
-    """Return the scene as stored, and the properties of its Gaussians that are not used.
+    """Return the scene as stored, and the names of unused vertex properties.
 
-    Opacities of 0 and 1 give infinite logits, which are to be repaired.
+    Opacities of 0 and 1 give infinite logits; the caller repairs them.
 
     Raises:
-        ProgdfError: a table is missing or does not fit the others, or a feature is not supported.
+        ProgdfError: an element is missing or does not match the others, or a feature is not supported.
     """
     name = ply.path
     count = ply.counts["vertex"]
@@ -52,7 +53,7 @@ def read_compressed_ply(ply: PlyFile) -> tuple[Gaussians, tuple[str, ...]]:
         raise unsupported_error(name, "packed Gaussians as text (format ascii)", _CONVERT)
     if not count:
         raise ProgdfError(f"{name} holds 0 Gaussians; a scene needs at least one: export it again")
-    chunks = -(-count // _CHUNK)
+    chunks = -(-count // _CHUNK_ROWS)
     if counts.get("chunk") != chunks:
         found = counts.get("chunk", 0)
         raise damage_error(name, f"{count} packed Gaussians need {chunks} chunks, and it has {found}")
@@ -71,19 +72,21 @@ def read_compressed_ply(ply: PlyFile) -> tuple[Gaussians, tuple[str, ...]]:
     if other := next((column for column in _PACKED if vertex[column] != "u4"), None):
         raise unsupported_error(name, f"'{other}' of another type than uint", _CONVERT)
     (ranges, packed, *bands), _ = ply.rows("chunk", "vertex", *(["sh"] if sh else []))
-    at = np.arange(count) // _CHUNK
+    chunk_of_row = np.arange(count) // _CHUNK_ROWS
     position, rotation, scale, color = (packed[column].astype(np.uint32) for column in _PACKED)
-    rgba = _unorm(color, (24, 16, 8, 0), (8, 8, 8, 8))
-    rgb = rgba[:, :3] if "min_r" not in chunk else _dequantize(ranges, at, rgba, _RGB)
-    with np.errstate(divide="ignore"):  # 0 and 1 are infinite
+    rgba = _unpack_shares(color, (24, 16, 8, 0), (8, 8, 8, 8))
+    rgb = rgba[:, :3] if "min_r" not in chunk else _dequantize(ranges, chunk_of_row, rgba, _RGB)
+    with np.errstate(divide="ignore"):  # opacities of 0 and 1 become infinite
         logits = -np.log(1.0 / rgba[:, 3].astype(np.float64) - 1.0)
     higher = np.zeros((count, 0, 3), np.float32)
     if bands:
         higher = _higher_bands(name, bands[0], len(sh))
     arrays = {
-        "means": _dequantize(ranges, at, _unorm(position, (21, 11, 0), (11, 10, 11)), _XYZ),
+        "means": _dequantize(ranges, chunk_of_row, _unpack_shares(position, (21, 11, 0), (11, 10, 11)), _XYZ),
         "quats": _quats(rotation),
-        "log_scales": _dequantize(ranges, at, _unorm(scale, (21, 11, 0), (11, 10, 11)), _SCALES),
+        "log_scales": _dequantize(
+            ranges, chunk_of_row, _unpack_shares(scale, (21, 11, 0), (11, 10, 11)), _SCALES
+        ),
         "logit_opacities": logits.astype(np.float32),
         "sh0": (rgb - 0.5) / C0,
         "shN": higher,
@@ -93,16 +96,18 @@ def read_compressed_ply(ply: PlyFile) -> tuple[Gaussians, tuple[str, ...]]:
 
 
 def write_compressed_ply(path: Path, scene: Gaussians) -> None:
-    """Write the rows in their order; nearest values of each word, so a scene in `morton_order` loses least.
+    """Write the rows in their order, each value rounded to the nearest level of its chunk's range.
+
+    A scene in `morton_order` loses least, as neighbors share a chunk.
 
     Args:
-        path: the file, which is written over
-        scene: N Gaussians of degree 3 at most, finite
+        path: the file, which is overwritten
+        scene: N Gaussians of SH degree 3 at most, finite
     """
     arrays: dict[str, Floats] = {name: getattr(scene, name).cpu().numpy() for name in ATTRIBUTES}
     count = len(scene)
-    at = np.arange(len(scene)) // _CHUNK
-    starts = np.arange(0, count, _CHUNK)
+    chunk_of_row = np.arange(len(scene)) // _CHUNK_ROWS
+    starts = np.arange(0, count, _CHUNK_ROWS)
     values = {
         _XYZ: scene.world_means.cpu().numpy().astype(np.float32),
         _SCALES: arrays["log_scales"].clip(-20.0, 20.0),
@@ -118,26 +123,26 @@ def write_compressed_ply(path: Path, scene: Gaussians) -> None:
         for i, name in enumerate(names):
             ranges[f"min_{name}"], ranges[f"max_{name}"] = low[:, i], high[:, i]
         span = np.where(high > low, high - low, 1.0)
-        shares[names] = ((table - low[at]) / span[at]).astype(np.float32)
+        shares[names] = ((table - low[chunk_of_row]) / span[chunk_of_row]).astype(np.float32)
     quats = scene.unit_quats.cpu().numpy()
-    which = np.abs(quats).argmax(axis=1)
-    quats = quats * np.where(np.take_along_axis(quats, which[:, None], axis=1) < 0, -1.0, 1.0)
-    others = quats[np.arange(4) != which[:, None]].reshape(count, 3)
-    rotation = _words(others / np.float32(np.sqrt(2.0)) + 0.5, (20, 10, 0), (10, 10, 10))
+    largest_index = np.abs(quats).argmax(axis=1)
+    quats = quats * np.where(np.take_along_axis(quats, largest_index[:, None], axis=1) < 0, -1.0, 1.0)
+    others = quats[np.arange(4) != largest_index[:, None]].reshape(count, 3)
+    rotation = _pack_shares(others / np.float32(np.sqrt(2.0)) + 0.5, (20, 10, 0), (10, 10, 10))
     rgba = np.concatenate([shares[_RGB], scene.opacities.cpu().numpy()[:, None]], axis=1)
     words = (
-        _words(shares[_XYZ], (21, 11, 0), (11, 10, 11)),
-        rotation | (which.astype(np.uint32) << 30),
-        _words(shares[_SCALES], (21, 11, 0), (11, 10, 11)),
-        _words(rgba, (24, 16, 8, 0), (8, 8, 8, 8)),
+        _pack_shares(shares[_XYZ], (21, 11, 0), (11, 10, 11)),
+        rotation | (largest_index.astype(np.uint32) << 30),
+        _pack_shares(shares[_SCALES], (21, 11, 0), (11, 10, 11)),
+        _pack_shares(rgba, (24, 16, 8, 0), (8, 8, 8, 8)),
     )
     packed = np.zeros(count, [(name, "<u4") for name in _PACKED])
     for name, column in zip(_PACKED, words, strict=True):
         packed[name] = column
     elements = [PlyElement.describe(ranges, "chunk"), PlyElement.describe(packed, "vertex")]
     if bands := arrays["shN"].shape[1]:
-        rest = arrays["shN"].transpose(0, 2, 1).reshape(count, 3 * bands)
-        table = ((rest / 8.0 + 0.5) * 256.0).clip(0, 255).astype("u1")
+        coefficients = arrays["shN"].transpose(0, 2, 1).reshape(count, 3 * bands)
+        table = ((coefficients / 8.0 + 0.5) * 256.0).clip(0, 255).astype("u1")
         rows = np.ascontiguousarray(table).view([(f"f_rest_{i}", "u1") for i in range(3 * bands)])[:, 0]
         elements.append(PlyElement.describe(rows, "sh"))
     comments = [ANTIALIASED_COMMENT] if scene.antialiased else []
@@ -145,27 +150,27 @@ def write_compressed_ply(path: Path, scene: Gaussians) -> None:
 
 
 def position_steps(scene: Gaussians) -> Tensor:
-    """Return the distance of neighboring values of each coordinate in a file. [N,3] float64
+    """Return the quantization step of each coordinate in a file, world units. [N,3] float64
 
     Args:
         scene: N Gaussians in the order of the file
     """
     means = scene.world_means.float().double()
     steps = torch.tensor([2.0**11 - 1, 2.0**10 - 1, 2.0**11 - 1], dtype=torch.float64)
-    parts = [means[start : start + _CHUNK] for start in range(0, len(scene), _CHUNK)]
+    parts = [means[start : start + _CHUNK_ROWS] for start in range(0, len(scene), _CHUNK_ROWS)]
     spans = [part.amax(dim=0) - part.amin(dim=0) for part in parts]
-    rows: Tensor = torch.stack(spans).repeat_interleave(_CHUNK, dim=0)[: len(scene)] / steps
+    rows: Tensor = torch.stack(spans).repeat_interleave(_CHUNK_ROWS, dim=0)[: len(scene)] / steps
     return rows
 
 
 def morton_order(means: Tensor) -> Tensor:
-    """Rows along a Z-order curve through their bounding box, of which neighbors are near each other.
+    """Return the rows in Z-order (Morton order) of their bounding box, so that neighbors are close in space.
 
     Args:
         means: [N,3]
 
     Returns:
-        [N] int64
+        Permutation of the rows. [N] int64
     """
     low = means.amin(dim=0)
     span = (means.amax(dim=0) - means.amin(dim=0)).clamp_min(1e-30)
@@ -177,16 +182,16 @@ def morton_order(means: Tensor) -> Tensor:
     return code.argsort(stable=True)
 
 
-def _words(shares: Floats, shifts: tuple[int, ...], bits: tuple[int, ...]) -> npt.NDArray[np.uint32]:
-    """Shares 0..1 as the parts of words, to the nearest. [N,parts] -> [N]"""
-    most = np.array([2**b - 1 for b in bits])
-    parts = (shares.clip(0.0, 1.0) * most).round().astype(np.uint32)
+def _pack_shares(shares: Floats, shifts: tuple[int, ...], bits: tuple[int, ...]) -> npt.NDArray[np.uint32]:
+    """Pack shares 0 to 1 into bit fields of 32-bit words, rounded to the nearest level. [N,parts] -> [N]"""
+    max_levels = np.array([2**b - 1 for b in bits])
+    parts = (shares.clip(0.0, 1.0) * max_levels).round().astype(np.uint32)
     words: npt.NDArray[np.uint32] = np.bitwise_or.reduce(parts << np.array(shifts, np.uint32), axis=1)
     return words
 
 
-def _unorm(words: npt.NDArray[np.uint32], shifts: tuple[int, ...], bits: tuple[int, ...]) -> Floats:
-    """The parts of packed words as shares 0..1. [N] -> [N,parts]"""
+def _unpack_shares(words: npt.NDArray[np.uint32], shifts: tuple[int, ...], bits: tuple[int, ...]) -> Floats:
+    """Unpack bit fields of 32-bit words to shares 0 to 1. [N] -> [N,parts]"""
     parts = [((words >> s) & (2**b - 1)) / np.float32(2**b - 1) for s, b in zip(shifts, bits, strict=True)]
     return np.stack(parts, axis=1).astype(np.float32)
 
@@ -194,29 +199,36 @@ def _unorm(words: npt.NDArray[np.uint32], shifts: tuple[int, ...], bits: tuple[i
 def _dequantize(
     ranges: npt.NDArray[np.void], at: npt.NDArray[np.int64], share: Floats, names: tuple[str, ...]
 ) -> Floats:
-    """Shares of each chunk's range. [N,3]"""
+    """Return values from shares of the range of their chunk. [N,3]
+
+    Args:
+        ranges: rows of the element `chunk`
+        at: chunk of each Gaussian. [N]
+        share: position in the range, 0 to 1. [N,3]
+        names: channels of the range
+    """
     columns = []
     for i, name in enumerate(names):
         low, high = (ranges[f"{edge}_{name}"].astype(np.float32)[at] for edge in ("min", "max"))
-        with np.errstate(over="ignore", invalid="ignore"):  # what a damaged range gives is repaired
+        with np.errstate(over="ignore", invalid="ignore"):  # damaged ranges are repaired later
             columns.append(low * (1 - share[:, i]) + high * share[:, i])
     return np.stack(columns, axis=1)
 
 
 def _quats(packed: npt.NDArray[np.uint32]) -> Floats:
-    """Quaternions wxyz from the index of the largest component and the three others. [N] -> [N,4]"""
-    others = (_unorm(packed, (20, 10, 0), (10, 10, 10)) - 0.5) * np.float32(np.sqrt(2.0))
+    """Decode quaternions wxyz from the index of the largest component and the three others. [N] -> [N,4]"""
+    others = (_unpack_shares(packed, (20, 10, 0), (10, 10, 10)) - 0.5) * np.float32(np.sqrt(2.0))
     largest = np.sqrt(np.maximum(0.0, 1.0 - (others**2).sum(axis=1)))
-    which = (packed >> 30).astype(np.int64)
+    largest_index = (packed >> 30).astype(np.int64)
     quats = np.empty((len(packed), 4), np.float32)
-    places = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[which]
-    np.put_along_axis(quats, places, others, axis=1)
-    np.put_along_axis(quats, which[:, None], largest[:, None].astype(np.float32), axis=1)
+    other_indices = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest_index]
+    np.put_along_axis(quats, other_indices, others, axis=1)
+    np.put_along_axis(quats, largest_index[:, None], largest[:, None].astype(np.float32), axis=1)
     return quats
 
 
 def _higher_bands(name: Path, rows: npt.NDArray[np.void], count: int) -> Floats:
-    """f_rest_0 …, channel-major, as bytes of −4 to 4. -> [N,K,3]"""
+    """Decode f_rest_0 … (channel-major bytes for −4 to 4) to SH bands above 0. [N,K,3]"""
     names = [f"f_rest_{i}" for i in range(count)]
     absent = next((column for column in names if column not in (rows.dtype.names or ())), None)
     if absent:

@@ -1,11 +1,12 @@
-""".splat (antimatter15's viewer) and .ksplat (GaussianSplats3D) → Gaussians.
+"""Readers of .splat (antimatter15's viewer) and .ksplat (GaussianSplats3D).
 
-A .splat is rows of 32 bytes without a header: float32 positions and linear scales, then bytes of color,
+A .splat has rows of 32 bytes without a header: float32 positions and linear scales, then bytes of color,
 opacity and rotation.
 
-A .ksplat is a header of 4096 bytes, one of 1024 for each section, then the sections: the centers of buckets,
-and rows. Level 0 keeps float32. Levels 1 and 2 keep positions as shares of their bucket, and half floats. SH
-of level 2 are bytes. Colors and opacities are bytes. SH stands band by band, channel-major within a band.
+A .ksplat has a header of 4096 bytes, a header of 1024 bytes per section, then the sections: the centers of
+buckets, and rows. Level 0 stores float32. Levels 1 and 2 store positions as shares of their bucket, and half
+floats. SH coefficients of level 2 are bytes. Colors and opacities are bytes. SH coefficients are stored band
+by band, channel-major within a band.
 """
 
 from __future__ import annotations
@@ -23,14 +24,14 @@ from progdf.io.atomic import read_file
 from progdf.io.file_rules import damage_error, unsupported_error
 from progdf.sh import C0
 
-_HEADER = 4096
-_SECTION = 1024
+_HEADER_BYTES = 4096
+_SECTION_HEADER_BYTES = 1024
 _CONVERT = "convert it with `splat-transform in.ksplat out.ply`"
-_SH_REST = (0, 9, 24, 45)
-_SH_TYPES = ("<f4", "<f2", "u1")
-_SPLAT_ROW = np.dtype([("xyz", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
+_SH_REST = (0, 9, 24, 45)  # SH coefficients per Gaussian above band 0, by SH degree
+_SH_TYPES = ("<f4", "<f2", "u1")  # type of SH coefficients, by compression level
+_SPLAT_DTYPE = np.dtype([("xyz", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 _MIN_SCALE = 2e-9
-"""In place of a scale of 0, whose logarithm is not finite; see `repair.FLAT_LOG_SCALE`."""
+"""Replacement for a scale of 0, whose logarithm is not finite; see `repair.FLAT_LOG_SCALE`."""
 
 Floats = npt.NDArray[np.float32]
 
@@ -47,21 +48,21 @@ _SECTION_FIELDS = {
     "partial_buckets": ("<u4", 36),
     "degree": ("<u2", 40),
 }
-"""Types and places in a section's header."""
+"""Type and byte offset of each field in a section's header."""
 
 
 def read_splat(path: str | os.PathLike[str]) -> Gaussians:
     """Return the scene as stored in a .splat file.
 
-    Opacities of 0 and 1 give infinite logits, which are to be repaired.
+    Opacities of 0 and 1 give infinite logits; the caller repairs them.
 
     Raises:
-        ProgdfError: its size is no multiple of 32 bytes.
+        ProgdfError: the size of the file is no multiple of 32 bytes.
     """
     content = read_file(path)
-    if len(content) % _SPLAT_ROW.itemsize:
+    if len(content) % _SPLAT_DTYPE.itemsize:
         raise damage_error(path, f"a .splat has rows of 32 bytes, the file has {len(content)} bytes")
-    rows = np.frombuffer(content, _SPLAT_ROW)
+    rows = np.frombuffer(content, _SPLAT_DTYPE)
     sh0, logits = _decode_colors(rows["rgba"])
     arrays = {
         "means": rows["xyz"].astype(np.float32),
@@ -75,27 +76,29 @@ def read_splat(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def read_ksplat(path: str | os.PathLike[str]) -> tuple[Gaussians, int]:
-    """Return the scene as stored in the file, and its compression level, 0 to 2.
+    """Return the scene as stored in a .ksplat file, and its compression level, 0 to 2.
 
     Raises:
         ProgdfError: the version, the level or the SH degree is not supported, or the file is damaged.
     """
     content = read_file(path)
-    if len(content) < _HEADER:
-        raise damage_error(path, f"the header of a .ksplat has {_HEADER} bytes, the file {len(content)}")
+    if len(content) < _HEADER_BYTES:
+        raise damage_error(
+            path, f"the header of a .ksplat has {_HEADER_BYTES} bytes, the file {len(content)}"
+        )
     if content[0] != 0 or content[1] < 1:
         raise unsupported_error(path, f".ksplat version {content[0]}.{content[1]}", _CONVERT)
     level = _number(content, 20, "<u2")
     sections = _number(content, 4, "<u4")
     if level > 2:
         raise unsupported_error(path, f"compression level {level} (0, 1 and 2 are)", _CONVERT)
-    if _HEADER + sections * _SECTION > len(content):
+    if _HEADER_BYTES + sections * _SECTION_HEADER_BYTES > len(content):
         raise damage_error(path, f"it ends within the headers of its {sections} sections")
     low, high = (float(np.frombuffer(content, "<f4", 1, at)[0]) for at in (36, 40))
     sh_range = (low or -1.5, high or 1.5)
-    at = _HEADER + sections * _SECTION
+    at = _HEADER_BYTES + sections * _SECTION_HEADER_BYTES
     parts = []
-    for head in range(_HEADER, _HEADER + sections * _SECTION, _SECTION):
+    for head in range(_HEADER_BYTES, _HEADER_BYTES + sections * _SECTION_HEADER_BYTES, _SECTION_HEADER_BYTES):
         fields = _SECTION_FIELDS.items()
         section = {name: np.frombuffer(content, t, 1, head + o).item() for name, (t, o) in fields}
         if not section["rows"] and not section["most_rows"]:
@@ -120,9 +123,9 @@ def read_ksplat(path: str | os.PathLike[str]) -> tuple[Gaussians, int]:
         raise damage_error(path, f"it declares {declared} Gaussians, its sections hold {count}")
     if not count:
         raise ProgdfError(f"{path} holds 0 Gaussians; a scene needs at least one: export it again")
-    most = max(part["shN"].shape[1] for part in parts)
+    max_bands = max(part["shN"].shape[1] for part in parts)
     for part in parts:
-        part["shN"] = np.pad(part["shN"], ((0, 0), (0, most - part["shN"].shape[1]), (0, 0)))
+        part["shN"] = np.pad(part["shN"], ((0, 0), (0, max_bands - part["shN"].shape[1]), (0, 0)))
     arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     return from_arrays(arrays), level
 
@@ -161,7 +164,7 @@ def _unpack(
 
 
 def _decode_colors(rgba: npt.NDArray[np.uint8]) -> tuple[Floats, Floats]:
-    """Return SH band 0 and the logits of opacity from bytes. [N,4] -> [N,3] and [N]"""
+    """Decode RGBA bytes to SH band 0 and opacity logits. [N,4] -> [N,3] and [N]"""
     shares = rgba.astype(np.float32) / 255
     with np.errstate(divide="ignore"):
         logits = np.log(shares[:, 3]) - np.log1p(-shares[:, 3])
@@ -170,7 +173,7 @@ def _decode_colors(rgba: npt.NDArray[np.uint8]) -> tuple[Floats, Floats]:
 
 
 def _logs(scales: Floats) -> Floats:
-    """Return log-scales; a scale of 0 becomes a very thin one, a negative one NaN."""
+    """Return log-scales. A scale of 0 becomes very small, a negative one NaN."""
     with np.errstate(invalid="ignore"):
         logs: Floats = np.log(np.where(scales == 0, np.float32(_MIN_SCALE), scales))
     return logs
@@ -179,7 +182,10 @@ def _logs(scales: Floats) -> Floats:
 def _centers(
     path: str | os.PathLike[str], content: bytes, section: Mapping[str, Any], sizes_at: int, centers_at: int
 ) -> Floats:
-    """The center of each row's bucket: full buckets first, then those whose sizes are in the file. [N,3]"""
+    """Return the center of each row's bucket. [N,3]
+
+    Full buckets come first, then the partial ones, whose sizes are in the file.
+    """
     sizes = np.frombuffer(content, "<u4", section["partial_buckets"], sizes_at).astype(np.int64)
     full_rows = section["full_buckets"] * section["bucket_size"]
     ends = np.concatenate([[full_rows], full_rows + np.cumsum(sizes)])

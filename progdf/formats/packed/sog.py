@@ -1,14 +1,15 @@
-"""SOG scenes (PlayCanvas) → Gaussians, versions 1 and 2.
+"""Reader of SOG scenes (PlayCanvas), versions 1 and 2.
 
-A table, meta.json, and images of one pixel per Gaussian, in a folder or in a zip archive (.sog, .zip):
+A scene has a table, meta.json, and images with one pixel per Gaussian, in a folder or a zip archive (.sog,
+.zip):
 
     means_l, means_u    low and high byte of a share of the range of sign(x) · log(1 + |x|), per axis
     quats               the three smaller components; alpha − 252 is the index of the largest one
     scales, sh0         log-scales, color and opacity
     shN                 a palette of SH rows, 64 in each image row, and the index of each Gaussian's row
 
-Version 1 has no version number. Its bytes are shares of the range of their channel, and its opacities logits.
-The bytes of version 2 are indices into a codebook, and its opacities shares of 255.
+Version 1 has no version number. Its bytes are shares of the range of their channel, and its opacities are
+logits. In version 2, bytes are indices into a codebook, and opacities are shares of 255.
 """
 
 from __future__ import annotations
@@ -34,19 +35,19 @@ from progdf.io.file_rules import check_fields, damage_error, unsupported_error
 from progdf.io.json_values import convert_json, decode_json
 
 META = "meta.json"
-"""The table of a scene; it stands for the scene where the images lie beside it in a folder."""
+"""File name of the table. In a folder, the path of this file stands for the scene."""
 
 CONVERT = "convert it with `splat-transform in.sog out.ply`"
-"""The way out for a version or a feature that is not read."""
+"""Remedy in errors about a version or a feature that is not supported."""
 
-_MAX_META_BYTES = 1 << 20  # a table has about 20 kB; parsed, JSON takes thirty times its size
-_MAX_PIXELS = (1 << 20, 16)  # of an image: a base, and more for each byte of the scene's files
+_MAX_META_BYTES = 1 << 20  # a table has about 20 kB; parsed JSON takes 30 times its size
+_MAX_PIXELS = (1 << 20, 16)  # pixels of an image: a base, and an increment per byte of the scene's files
 _IMAGE_FORMATS = ("WEBP", "PNG")
-_PALETTE_COLUMNS = 64  # SH rows of the palette in one row of its image
+_PALETTE_COLUMNS = 64  # palette entries (SH rows) per row of the palette image
 _PALETTE_WIDTHS = (192, 512, 960)  # 3, 8 or 15 SH functions
-_PALETTE_INDEX = 5  # its place among the images
-_LARGEST_TAG = 252  # alpha of a rotation whose first component (w) is the largest
-_FIELDS = ("version", "count", "antialias", "model", "means", "scales", "quats", "sh0", "shN", "asset")
+_PALETTE_INDEX = 5  # position of the palette among the images
+_W_LARGEST_ALPHA = 252  # alpha of a rotation whose first component (w) is the largest
+_KNOWN_FIELDS = ("version", "count", "antialias", "model", "means", "scales", "quats", "sh0", "shN", "asset")
 _MODELS = (None, "default", "3dgs", "antialiased")
 
 Floats = npt.NDArray[np.float32]
@@ -54,19 +55,19 @@ Bytes = npt.NDArray[np.uint8]
 
 
 class _Part(msgspec.Struct):
-    """One attribute in meta.json."""
+    """Entry of one attribute in meta.json."""
 
-    files: list[str]  # names of its images, in the order of the format
+    files: list[str]  # image names, in the order of the format
     shape: list[int] = []  # version 1: rows first
-    mins: list[float] | float | None = None  # one number per channel; of shN in version 1 a single one
+    mins: list[float] | float | None = None  # one number per channel; a single number for shN in version 1
     maxs: list[float] | float | None = None
     codebook: list[float | None] | None = None  # version 2: 256 values
-    encoding: str = "quaternion_packed"  # version 1, of quats
-    quantization: int = 8  # version 1, of shN: bits
+    encoding: str = "quaternion_packed"  # version 1, quats only
+    quantization: int = 8  # version 1, shN only; bits
 
 
 class _Meta(msgspec.Struct):
-    """The table as far as it is read."""
+    """Fields of meta.json that are read."""
 
     means: _Part
     scales: _Part
@@ -81,21 +82,21 @@ class _Meta(msgspec.Struct):
 
 @dataclass(frozen=True)
 class SogScene:
-    """A scene as stored, with the facts that a report names."""
+    """Scene as stored, with the facts for its report."""
 
     gaussians: Gaussians
     version: int  # 1 or 2
-    ignored: tuple[str, ...]  # fields of the table that are not used
+    ignored: tuple[str, ...]  # unused fields of the table
 
 
 def read_table(path: Path) -> dict[str, Any] | None:
-    """Return the table of a SOG scene, or None if the file is none.
+    """Return the table of a SOG scene, or None if the file is no SOG scene.
 
     Args:
         path: a zip archive, or the meta.json of a folder
 
     Raises:
-        ProgdfError: the table is larger than any.
+        ProgdfError: the table is larger than `_MAX_META_BYTES`.
     """
     try:
         if path.name.lower() == META:
@@ -104,7 +105,7 @@ def read_table(path: Path) -> dict[str, Any] | None:
             with zipfile.ZipFile(path) as archive:
                 entry = archive.getinfo(_table_name(archive))
                 if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                    return None  # zipfile inflates other kinds whole, however little of them is read
+                    return None  # with other methods zipfile inflates the whole entry, even for a short read
                 with archive.open(entry) as file:
                     content = file.read(_MAX_META_BYTES + 1)
         table = decode_json(content) if len(content) <= _MAX_META_BYTES else None
@@ -121,7 +122,7 @@ def read_table(path: Path) -> dict[str, Any] | None:
 def read_sog(path: Path) -> SogScene:
     """Return the scene in a zip archive, or in the folder of a meta.json.
 
-    Opacities of 0 and 1 give infinite logits, which are to be repaired. Axes are those of the original .ply.
+    Opacities of 0 and 1 give infinite logits; the caller repairs them. Axes are those of the original .ply.
 
     Raises:
         ProgdfError: the version or a feature is not supported, or the file is damaged.
@@ -130,12 +131,12 @@ def read_sog(path: Path) -> SogScene:
     if table is None:
         raise damage_error(path, f"it has no readable {META} of a SOG scene")
     meta = _check_table(path, table)
-    ignored = check_fields(path, table, _FIELDS, {}, CONVERT)
+    ignored = check_fields(path, table, _KNOWN_FIELDS, {}, CONVERT)
     count = _count(path, meta)
     low, high, scales, quats, colors, *bands = _load_images(path, meta, count)
     shares = (low[:, :3] + high[:, :3] * 256.0) / 65535.0
     logs = _lerp(path, meta.means, "means", shares)
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # unusable numbers are repaired
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # repaired later
         means = np.sign(logs) * np.expm1(np.abs(logs))
         if meta.version == 1:
             log_scales = _lerp(path, meta.scales, "scales", scales[:, :3] / 255.0)
@@ -160,7 +161,7 @@ def read_sog(path: Path) -> SogScene:
 
 
 def _check_table(path: Path, table: dict[str, Any]) -> _Meta:
-    """Return the table, checked: its version, its model and its encodings are supported."""
+    """Parse the table, and check that its version, model and encodings are supported."""
     version = table.get("version", 1)
     if version not in (1, 2) or isinstance(version, bool):
         raise unsupported_error(path, f"SOG version {str(version)[:20]}", CONVERT)
@@ -188,9 +189,9 @@ def _count(path: Path, meta: _Meta) -> int:
 
 
 def _load_images(path: Path, meta: _Meta, count: int) -> list[Bytes]:
-    """Return the rows of the images in the order of the module's table; those of the palette all. [N,4] each
+    """Return the pixels of each image as rows, in the order of the module docstring. [N,4] each
 
-    All images are checked by their size before the first one is decoded.
+    The palette is returned whole, as [P,K,4]. All image sizes are checked before the first is decoded.
     """
     parts = {"means": 2, "scales": 1, "quats": 1, "sh0": 1}
     if meta.shN is not None:
@@ -212,7 +213,7 @@ def _load_images(path: Path, meta: _Meta, count: int) -> list[Bytes]:
     for index, (file, image) in enumerate(images):
         try:
             decoded = np.asarray(image.convert("RGBA"))
-        except Exception as error:  # a damaged image raises errors of its format's reader
+        except Exception as error:  # each format's reader raises its own errors
             raise damage_error(path, f"{file} is no readable image ({type(error).__name__})") from None
         if index == _PALETTE_INDEX:
             rows.append(decoded.reshape(-1, image.width // _PALETTE_COLUMNS, 4))
@@ -222,7 +223,7 @@ def _load_images(path: Path, meta: _Meta, count: int) -> list[Bytes]:
 
 
 def _lerp(path: Path, part: _Part, name: str, shares: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
-    """Return shares of each channel's range as values. [N,C] -> [N,C]"""
+    """Convert shares of each channel's range to values. [N,C] -> [N,C]"""
     channels = shares.shape[1]
     edges = []
     for key, numbers in (("mins", part.mins), ("maxs", part.maxs)):
@@ -235,9 +236,9 @@ def _lerp(path: Path, part: _Part, name: str, shares: npt.NDArray[np.floating]) 
 
 
 def _codebook(path: Path, part: _Part, name: str) -> npt.NDArray[np.float64]:
-    """Return the 256 values that bytes stand for.
+    """Return the 256 values of a codebook, one per byte value.
 
-    A writer once left the first one empty; it continues the spacing of the others.
+    Some files have no first value. It is extrapolated with the mean spacing of the others.
     """
     values = part.codebook
     if values is None or len(values) != 256 or any(value is None for value in values[1:]):
@@ -249,14 +250,14 @@ def _codebook(path: Path, part: _Part, name: str) -> npt.NDArray[np.float64]:
 
 
 def _quats(pixels: Bytes) -> Floats:
-    """Return quaternions wxyz from pixels; unknown tags give 0, which is to be repaired. [N,4] -> [N,4]"""
+    """Decode quaternions wxyz from pixels. Unknown tags give 0, repaired by the caller. [N,4] -> [N,4]"""
     others = (pixels[:, :3] / 255.0 - 0.5) * np.sqrt(2.0)
     largest = np.sqrt(np.maximum(0.0, 1.0 - (others**2).sum(axis=1)))
-    tags = pixels[:, 3].astype(np.int64) - _LARGEST_TAG
+    tags = pixels[:, 3].astype(np.int64) - _W_LARGEST_ALPHA
     index = tags.clip(min=0)
     quats = np.zeros((len(pixels), 4), np.float32)
-    places = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[index]
-    np.put_along_axis(quats, places, others.astype(np.float32), axis=1)
+    other_indices = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[index]
+    np.put_along_axis(quats, other_indices, others.astype(np.float32), axis=1)
     np.put_along_axis(quats, index[:, None], largest[:, None].astype(np.float32), axis=1)
     quats[tags < 0] = 0.0
     return quats
@@ -268,8 +269,8 @@ def _higher_bands(path: Path, meta: _Meta, images: list[Bytes], count: int) -> F
     Args:
         path: the scene
         meta: its table
-        images: none, or the palette [P,K,4] and the labels [N,4]
-        count: Gaussians N
+        images: empty, or the palette [P,K,4] and the labels [N,4]
+        count: number of Gaussians N
     """
     part = meta.shN
     if part is None:
@@ -285,21 +286,21 @@ def _higher_bands(path: Path, meta: _Meta, images: list[Bytes], count: int) -> F
     else:
         values = _codebook(path, part, "shN")[colors]
     index = labels[:, 0] + 256 * labels[:, 1].astype(np.int64)
-    most = int(index.max())
-    if most >= len(palette):
-        raise damage_error(path, f"{part.files[1]} names row {most} of a palette of {len(palette)}")
+    max_index = int(index.max())
+    if max_index >= len(palette):
+        raise damage_error(path, f"{part.files[1]} names row {max_index} of a palette of {len(palette)}")
     bands: Floats = values.astype(np.float32)[index]
     return bands
 
 
 def _open_image(path: Path, name: str) -> Image.Image:
-    """Return an image whose size is known and bounded; its pixels are not decoded yet."""
+    """Open an image and check its size. Its pixels are not decoded yet."""
     content = _read_image(path, name)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the bound below is lower
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limit below is lower
             image = Image.open(io.BytesIO(content), formats=_IMAGE_FORMATS)
-    except Exception as error:  # a damaged image raises errors of its format's reader
+    except Exception as error:  # each format's reader raises its own errors
         raise damage_error(path, f"{name[:80]} is no image ({type(error).__name__})") from None
     base, each = _MAX_PIXELS
     if image.width * image.height > base + each * scene_bytes(path):
@@ -310,7 +311,7 @@ def _open_image(path: Path, name: str) -> Image.Image:
 def _read_image(path: Path, name: str) -> bytes:
     """Return the bytes of an image of the scene.
 
-    A pipe would be waited for, and a link may lead out of the folder: both are refused.
+    Pipes and links are refused: reading a pipe blocks, and a link may lead out of the folder.
     """
     if not name or PurePosixPath(name).name != name or "\\" in name or "\0" in name:
         raise damage_error(path, f"{META} names images outside its folder ({name[:80]!r})")
@@ -344,10 +345,10 @@ def _read_image(path: Path, name: str) -> bytes:
 
 
 def _table_name(archive: zipfile.ZipFile) -> str:
-    """Return the name of the table in an archive: at its root, or in its only folder that has one.
+    """Return the name of the table in an archive: at the root, otherwise in the only folder with a table.
 
     Raises:
-        KeyError: there is none, or there are several.
+        KeyError: no folder or several folders have a table.
     """
     names = [name for name in archive.namelist() if PurePosixPath(name).name.lower() == META]
     if META in names:
@@ -359,7 +360,7 @@ def _table_name(archive: zipfile.ZipFile) -> str:
 
 
 def scene_bytes(path: Path) -> int:
-    """Return the size of a scene's file in bytes; of a meta.json, of all regular files of its folder."""
+    """Return the size of a scene in bytes. A meta.json counts all regular files of its folder."""
     if path.name.lower() != META:
         return path.stat().st_size
     with os.scandir(path.parent) as entries:
