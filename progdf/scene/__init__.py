@@ -1,9 +1,10 @@
-"""What is in a scene, and where?"""
+"""Scene analysis: bounds, neighbors, selections, regions, strays, subject, up axis and cameras."""
 
 from __future__ import annotations
 
 from typing import Literal
 
 Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
+"""Direction of a coordinate axis."""
 UpChoice = Literal["auto", "+x", "-x", "+y", "-y", "+z", "-z"]
-"""An axis of a scene, and what an option says of which is up: without torch, for command lines."""
+"""Values of an up axis option. Defined here so that command lines need not import torch."""

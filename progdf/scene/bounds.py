@@ -1,4 +1,4 @@
-"""How a scene lies in space: where its bulk and its front are, whether it can be seen from outside."""
+"""Shape of a scene: its bulk, its front, and whether cameras around it can frame it."""
 
 from __future__ import annotations
 
@@ -11,28 +11,25 @@ from progdf.camera import NEAR
 from progdf.gaussians import Gaussians
 from progdf.quaternions import rotate_vectors
 
-_SAMPLE = 100_000
-"""Rows that are looked at; a scene with more is sampled evenly."""
+_MAX_SAMPLED_ROWS = 100_000  # rows; a larger scene is sampled evenly
 
+_LONG_TAIL_RATIO = 5.0  # ratio of the 97th percentile to the median of the distances from the middle
+_CEILING_COVER = 0.8  # smallest share of the plan's occupied cells under a ceiling
 
-_LONG_TAIL = 5.0
-_CEILING_COVER = 0.8
-_DENSER = 2.0
-"""Times as many Gaussians as under it has a ceiling: five where a room's walls go on below, one in a head."""
-_MIN_CELLS = 16
-_ENOUGH = 64
-"""Fewer Gaussians tell nothing about the shape of a scene."""
+# Gaussians in a ceiling, relative to the slab below it: 5 in a room whose walls continue below, 1 in a head
+_CEILING_DENSITY_RATIO = 2.0
+_MIN_CELLS = 16  # smallest number of occupied plan cells for a ceiling
+_MIN_GAUSSIANS = 64  # Gaussians; fewer do not define a shape
 
-_SOLID = 0.1
-_CORE = 2.5
-"""Haze is less opaque; background lies farther, in median distances from the middle."""
+_MIN_SOLID_OPACITY = 0.1  # opacity; less opaque Gaussians are haze
+_CORE_RADIUS = 2.5  # median distances from the middle; Gaussians farther away are background
 
 
 def scene_sphere(scene: Gaussians) -> tuple[Tensor, float]:
-    """Center [3] and radius (> 0) of the bulk of a scene, world units.
+    """Return the center [3] and radius (> 0) of the bulk of a scene, world units.
 
-    The median of the means, and the distance within which 97 % of them lie: far strays do not count. A scene
-    of one or a few Gaussians is as large as these are: twice the median of their longest axes at least.
+    The center is the median of the means. The radius is the distance within which 97 % of them lie, so far
+    floaters do not count. It is at least twice the median of the longest axes, for scenes of a few Gaussians.
     """
     scene = _sample(scene)
     means = scene.means
@@ -44,48 +41,47 @@ def scene_sphere(scene: Gaussians) -> tuple[Tensor, float]:
 
 
 def near_plane(radius: float) -> float:
-    """Least depth at which a scene is drawn whose bulk has this radius, both in world units.
+    """Return the near plane of a scene whose bulk has this radius, both in world units.
 
-    `NEAR` down to a radius of 1, as trainings draw; smaller scenes would vanish before it.
+    It is `NEAR` for a radius of at least 1, as in training. It shrinks with smaller scenes, which would
+    otherwise lie in front of it.
     """
     return NEAR * min(1.0, radius)
 
 
 def front_direction(up: Tensor) -> Tensor:
-    """The level direction from a scene to someone who looks at its front. [3] -> [3], unit length
+    """Return the horizontal direction from a scene to a camera at its front. [3] -> [3], unit length
 
-    +z for y up, −z for y down (the side the cameras of a COLMAP scene mostly look from), −y for z up; the
-    same as azimuth 0 in the viewer.
+    It is azimuth 0 in the viewer: +z for y up, −y for z up, and −z for y down. Most cameras of a COLMAP scene
+    are on the −z side.
     """
     largest = int(up.abs().argmax())
-    towards = torch.zeros_like(up)
-    towards[1 if largest == 2 else 2] = math.copysign(1.0, float(up[largest])) * (
-        -1.0 if largest == 2 else 1.0
-    )
-    level = towards - (towards @ up) * up
+    front = torch.zeros_like(up)
+    front[1 if largest == 2 else 2] = math.copysign(1.0, float(up[largest])) * (-1.0 if largest == 2 else 1.0)
+    level = front - (front @ up) * up
     return torch.nn.functional.normalize(level, dim=0)
 
 
 def is_surrounding(scene: Gaussians, up: Tensor) -> bool:
-    """Whether the scene is probably one to stand inside, which no ring of cameras around it can show.
+    """Return whether a scene probably surrounds its cameras, so that cameras around it cannot frame it.
 
-    Two signs: a ceiling (a slab at the top that covers most of the ground plan), or a long tail (the
-    far 3 % begin more than five times as far out as the middle, as in outdoor captures with a background).
+    It does if it has a ceiling (see `has_ceiling`) or a long tail (see `has_long_tail`), as outdoor captures
+    with a background have.
     """
     sample = _sample(scene)
-    return len(sample) >= _ENOUGH and (has_long_tail(sample.means) or has_ceiling(sample, up))
+    return len(sample) >= _MIN_GAUSSIANS and (has_long_tail(sample.means) or has_ceiling(sample, up))
 
 
 def has_long_tail(means: Tensor) -> bool:
-    """Whether the far 3 % begin more than five times as far out as the middle. [N,3], N ≥ 1"""
+    """Return whether the farthest 3 % of the means begin beyond 5 median distances. [N,3], N ≥ 1"""
     distances = (means - means.median(dim=0).values).norm(dim=1)
-    return float(quantile(distances, 0.97)) > _LONG_TAIL * float(distances.median())
+    return float(quantile(distances, 0.97)) > _LONG_TAIL_RATIO * float(distances.median())
 
 
 def has_ceiling(scene: Gaussians, up: Tensor) -> bool:
-    """Whether a slab at the top covers most of the ground plan, so that all is hidden from above."""
+    """Return whether a slab at the top covers most of the ground plan and hides the scene from above."""
     sample = _sample(scene)
-    if len(sample) < _ENOUGH:
+    if len(sample) < _MIN_GAUSSIANS:
         return False
     height = sample.means @ up
     low, high = (quantile(height, q) for q in (0.02, 0.98))
@@ -94,14 +90,14 @@ def has_ceiling(scene: Gaussians, up: Tensor) -> bool:
     slab = 0.06 * (high - low)
     top = height > high - slab
     next_to_top = (height <= high - slab) & (height > high - 2 * slab)
-    # thin and dense, as the top of a head is not
-    dense = int(top.sum()) >= _DENSER * int(next_to_top.sum())
+    # a ceiling is thin and dense, unlike the top of a head
+    dense = int(top.sum()) >= _CEILING_DENSITY_RATIO * int(next_to_top.sum())
     ceiling = len(torch.unique(cells[top]))
     return dense and covered >= _MIN_CELLS and ceiling >= _CEILING_COVER * covered
 
 
 def plan_cells(scene: Gaussians, up: Tensor, per_side: int = 8) -> Tensor:
-    """The cell of a square grid over the ground plan that each Gaussian's mean falls in. [N] int64"""
+    """Return each mean's cell in a square grid over the ground plan, 0 to per_side² − 1. [N] int64"""
     ahead = front_direction(up)
     plan = scene.means @ torch.stack([ahead, torch.linalg.cross(up, ahead)], dim=1)
     low, high = (torch.stack([quantile(c, q) for c in plan.unbind(1)]) for q in (0.02, 0.98))
@@ -110,33 +106,33 @@ def plan_cells(scene: Gaussians, up: Tensor, per_side: int = 8) -> Tensor:
 
 
 def drop_background(scene: Gaussians) -> Gaussians | None:
-    """An even sample of what is visible and near the middle; None where that tells nothing of a shape."""
+    """Return an even sample of the solid Gaussians near the middle; None if too few are solid."""
     sample = _sample(scene)
-    sample = sample[(sample.opacities > _SOLID).nonzero()[:, 0]]
-    if len(sample) < _ENOUGH:
+    sample = sample[(sample.opacities > _MIN_SOLID_OPACITY).nonzero()[:, 0]]
+    if len(sample) < _MIN_GAUSSIANS:
         return None
     distances = (sample.means - sample.means.median(dim=0).values).norm(dim=1)
-    return sample[(distances <= _CORE * distances.median()).nonzero()[:, 0]]
+    return sample[(distances <= _CORE_RADIUS * distances.median()).nonzero()[:, 0]]
 
 
 def quantile(values: Tensor, share: float) -> Tensor:
-    """The value that so large a share of them, 0..1, does not exceed. [N] -> []"""
+    """Return the quantile of the values at a share, 0 to 1, without interpolation. [N] -> []"""
     return values.kthvalue(min(max(round(share * len(values)), 1), len(values))).values
 
 
 def _sample(scene: Gaussians) -> Gaussians:
-    return scene[:: -(-len(scene) // _SAMPLE)] if len(scene) > _SAMPLE else scene
+    return scene[:: -(-len(scene) // _MAX_SAMPLED_ROWS)] if len(scene) > _MAX_SAMPLED_ROWS else scene
 
 
 def normals_of(scene: Gaussians) -> Tensor:
-    """The shortest axis of each Gaussian in the world, of either sign. [N,3], unit length"""
-    return _turned_axes(scene, scene.log_scales.argmin(dim=1))
+    """Return each Gaussian's shortest axis in the world, with arbitrary sign. [N,3], unit length"""
+    return _world_axes(scene, scene.log_scales.argmin(dim=1))
 
 
 def long_axes(scene: Gaussians) -> Tensor:
-    """The longest axis of each Gaussian in the world, of either sign. [N,3], unit length"""
-    return _turned_axes(scene, scene.log_scales.argmax(dim=1))
+    """Return each Gaussian's longest axis in the world, with arbitrary sign. [N,3], unit length"""
+    return _world_axes(scene, scene.log_scales.argmax(dim=1))
 
 
-def _turned_axes(scene: Gaussians, which: Tensor) -> Tensor:
+def _world_axes(scene: Gaussians, which: Tensor) -> Tensor:
     return rotate_vectors(torch.eye(3)[which], scene.unit_quats)

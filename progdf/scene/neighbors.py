@@ -1,4 +1,4 @@
-"""Selections that change by the nearest neighbors of their Gaussians."""
+"""Selection tools based on nearest neighbors: grow, shrink, smooth, refine, and connected parts."""
 
 from __future__ import annotations
 
@@ -17,55 +17,59 @@ from .point_tree import PointTree
 from .scribbles import Scribbles
 from .selection import Floats, Mask, alike_in_color, base_colors
 
-# neighbors: of a step, of a vote, of a connection
-_RING = 8
-_AROUND = 24
-_LINKS = 8
-_REACH = 3.0  # times how far neighbors commonly are; what is farther is none, also where none is nearer
-_TOUCH = 1.0
-RIM_PERCENT = 35
-# what is held lies as deep as this share of the rim, or of what a thin part has
-_MIDDLE = 0.6
-_DEEP = 0.95
+_STEP_NEIGHBORS = 8  # neighbors that one grow or shrink step looks at
+_VOTING_NEIGHBORS = 24  # neighbors that vote when smoothing
+_LINKED_NEIGHBORS = 8  # neighbors that a Gaussian may be connected with
+_MAX_NEIGHBOR_DISTANCE = (
+    3.0  # median distances of the k-th neighbor; a Gaussian farther away is never a neighbor
+)
+_TOUCH_FACTOR = 1.0  # two Gaussians touch within this many times the sum of their longest standard deviations
+RIM_PERCENT = 35  # default width of the uncertain band outside a selection, % of its radius
+_CORE_DEPTH_SHARE = 0.6  # share of the depth at `_DEPTH_QUANTILE`; members that lie deeper stay selected
+_DEPTH_QUANTILE = 0.95  # quantile of the members' depths, at most the width of the band; small in thin parts
 
 
 class Neighborhood:
-    """The centers of a scene's Gaussians in a k-d tree; make it once for a scene (1M: about a second).
+    """k-d tree over the centers of a scene. Building it takes about 1 s for a million Gaussians.
 
     Args:
-        scene: its centers; those that are not finite count as at the origin
+        scene: Gaussians; centers that are not finite count as at the origin
     """
 
     def __init__(self, scene: Gaussians) -> None:
         self._scene = scene
         self._points = np.nan_to_num(scene.means.numpy().astype(np.float64))
         self._sizes = np.exp(scene.log_scales.numpy().max(axis=1))
-        self._tree = PointTree(self._points, _AROUND + 1)
+        self._tree = PointTree(self._points, _VOTING_NEIGHBORS + 1)
 
     def grow(self, mask: Mask) -> Mask:
         """Return the mask with the nearest neighbors of its Gaussians. [N]"""
-        near, reached = self._near(np.flatnonzero(mask), _RING)
+        near, reached = self._near(np.flatnonzero(mask), _STEP_NEIGHBORS)
         grown = mask.copy()
         grown[near[reached]] = True
         return self._tree.with_copies(grown)
 
     def shrink(self, mask: Mask) -> Mask:
-        """Without what has a nearest neighbor that is not selected. [N]"""
+        """Return the mask without the Gaussians that have an unselected nearest neighbor. [N]"""
         rows = np.flatnonzero(mask)
-        near, reached = self._near(rows, _RING)
+        near, reached = self._near(rows, _STEP_NEIGHBORS)
         shrunk = mask.copy()
         shrunk[rows[(reached & ~mask[near]).any(axis=1)]] = False
         return shrunk
 
     def smooth(self, mask: Mask) -> Mask:
-        """At its border what most neighbors are: strays and holes go, edges get straighter. [N]"""
-        near, reached = self._near(np.flatnonzero(mask), _RING)
+        """Return the mask after a majority vote at its border. [N]
+
+        Each border Gaussian follows most of its neighbors, which removes strays and holes and
+        straightens edges.
+        """
+        near, reached = self._near(np.flatnonzero(mask), _STEP_NEIGHBORS)
         across = reached & ~mask[near]
         border = np.zeros_like(mask)
         border[near[across]] = True
         border[np.flatnonzero(mask)[across.any(axis=1)]] = True
         rows = np.flatnonzero(border)
-        near, reached = self._near(rows, _AROUND)
+        near, reached = self._near(rows, _VOTING_NEIGHBORS)
         votes = (reached & mask[near]).sum(axis=1) + mask[rows]
         voters = reached.sum(axis=1) + 1
         smoothed = mask.copy()
@@ -74,17 +78,18 @@ class Neighborhood:
 
     @cached_property
     def scribbles(self) -> Scribbles:
-        """What strokes spread over, made when it is first asked for."""
+        """Random walker over the scene, built on first use."""
         return Scribbles(self._points, base_colors(self._scene))
 
     def refine(self, mask: Mask, percent: int = RIM_PERCENT) -> Mask:
-        """With its rim where color and gaps have it, for a lasso that was drawn roughly. [N]
+        """Return the mask with its edge snapped to color edges and gaps, for a rough lasso. [N]
 
-        What lies well inside and well outside stays, and a random walk from there decides on what lies
-        between (see `Scribbles`). A part that is thin for the rim is held along its middle.
+        Gaussians well inside and well outside are unchanged. A random walk from them decides the band between
+        (see `Scribbles`). Parts thinner than the band stay selected along their middle.
 
         Args:
-            percent: width of the rim outside, of the selection's radius; inside it is `_MIDDLE` of that
+            percent: width of the band outside, % of the selection's radius.
+                Inside it is `_CORE_DEPTH_SHARE` times as wide
         """
         inside = np.flatnonzero(mask)
         outside = np.flatnonzero(~mask)
@@ -93,17 +98,17 @@ class Neighborhood:
         radius = float(np.sqrt(self._points[inside].var(axis=0).sum()))
         width = max(percent / 100.0 * radius, 1e-30)
         depths = np.minimum(_distances(self._points, outside, inside, width), width)
-        held = inside[depths >= _MIDDLE * float(np.quantile(depths, _DEEP))]
-        far = outside[np.isinf(_distances(self._points, inside, outside, width))]
-        return self.scribbles.select(held, far)
+        fixed_inside = inside[depths >= _CORE_DEPTH_SHARE * float(np.quantile(depths, _DEPTH_QUANTILE))]
+        fixed_outside = outside[np.isinf(_distances(self._points, inside, outside, width))]
+        return self.scribbles.select(fixed_inside, fixed_outside)
 
     def largest_part(self, mask: Mask) -> Mask:
-        """Only the connected part that has most members; nothing of nothing. [N]"""
+        """Return the connected part with the most members; an empty mask stays empty. [N]"""
         rows = np.flatnonzero(mask)
         largest = np.zeros_like(mask)
         if not len(rows):
             return largest
-        tree = PointTree(self._points[rows], _LINKS + 1)
+        tree = PointTree(self._points[rows], _LINKED_NEIGHBORS + 1)
         start, end = self._links(tree, rows, np.arange(len(rows)))
         part = join_pairs(start, end, len(rows))
         largest[rows[part == np.bincount(part).argmax()]] = True
@@ -117,7 +122,7 @@ class Neighborhood:
         part = np.zeros_like(mask)
         if not len(frontier):
             return part
-        tree = PointTree(self._points[rows], _LINKS + 1)
+        tree = PointTree(self._points[rows], _LINKED_NEIGHBORS + 1)
         while len(frontier):
             reached[frontier] = True
             linked = np.zeros(len(rows), bool)
@@ -132,14 +137,14 @@ class Neighborhood:
         return int(rows[0, 0])
 
     def _near(self, rows: NDArray[np.int64], k: int) -> tuple[NDArray[np.int64], Mask]:
-        """Return the k nearest others of some Gaussians [M,k], and which of them are within reach [M,k]."""
+        """Return the k nearest others of some Gaussians [M,k], and a mask of those within reach [M,k]."""
         k = min(k, len(self._points) - 1)
         if not len(rows) or k < 1:
             return np.zeros((len(rows), 0), np.int64), np.zeros((len(rows), 0), bool)
         distances, near = self._tree.query(self._points[rows], k + 1)
         distances = distances[:, 1:]
         near = near[:, 1:]
-        return near, distances <= _REACH * np.median(distances[:, -1])
+        return near, distances <= _MAX_NEIGHBOR_DISTANCE * np.median(distances[:, -1])
 
     def _links(
         self, tree: PointTree, rows: NDArray[np.int64], some: NDArray[np.int64]
@@ -148,10 +153,10 @@ class Neighborhood:
 
         Both ends of a pair are indices into `rows`, as `some` is.
         """
-        k = min(_LINKS + 1, len(rows))
+        k = min(_LINKED_NEIGHBORS + 1, len(rows))
         distances, near = tree.query(self._points[rows[some]], k)
         sizes = self._sizes[rows]
-        touch = distances <= _TOUCH * (sizes[some][:, None] + sizes[near])
+        touch = distances <= _TOUCH_FACTOR * (sizes[some][:, None] + sizes[near])
         return np.broadcast_to(some[:, None], near.shape)[touch], near[touch]
 
 
@@ -166,14 +171,14 @@ def _distances(
 def grow_along_surface(
     neighborhood: Neighborhood, colors: Floats, seeds: NDArray[np.int64], color: Floats, tolerance: float
 ) -> Mask:
-    """What is connected with the seeds and alike in color.
+    """Return the Gaussians of like color that are connected with the seeds. [N]
 
     Args:
-        neighborhood: of the scene
-        colors: of its Gaussians, OKLab. [N,3]
-        seeds: rows to begin at, also where they are not alike themselves. [M]
-        color: what others are compared with, OKLab. [3]
-        tolerance: how far a color may be from it
+        neighborhood: the scene's neighborhood
+        colors: colors of the scene's Gaussians, OKLab. [N,3]
+        seeds: start rows, selected whatever their color. [M]
+        color: reference color, OKLab. [3]
+        tolerance: largest accepted distance from `color`, OKLab
     """
     alike = alike_in_color(colors, color, tolerance)
     alike[seeds] = True
@@ -181,7 +186,7 @@ def grow_along_surface(
 
 
 def join_pairs(start: NDArray[np.integer], end: NDArray[np.integer], count: int) -> NDArray[np.int64]:
-    """Which group each of so many things is in, where a chain of pairs joins those of one. [P], [P] -> [N]"""
+    """Return the connected component of each of `count` nodes joined by pairs. [P], [P] -> [count]"""
     pairs = coo_array((np.ones(len(start), bool), (start, end)), shape=(count, count))
     groups: NDArray[np.int64] = connected_components(pairs, directed=False)[1].astype(np.int64)
     return groups
@@ -192,18 +197,18 @@ def nearest_rows(points: Tensor, rows: Tensor, k: int, workers: int = 1) -> tupl
 
     Args:
         points: all points, finite. [N,3]
-        rows: those whose neighbors are wanted. [Q] int64
-        k: how many, 1..N−1; fewer where there are not as many points
+        rows: rows of the points whose neighbors are searched. [Q] int64
+        k: number of neighbors, at least 1; limited to N − 1
         workers: threads; the result does not depend on them
 
     Returns:
-        Their rows, nearest first, [Q,k] int64; their distances [Q,k] float64.
+        Rows of the neighbors, nearest first, [Q,k] int64, and their distances [Q,k] float64.
     """
     k = min(k, len(points) - 1)
-    places = points.double().numpy()
-    distances, neighbors = PointTree(places, k + 1).query(places[rows.numpy()], k + 1, workers=workers)
+    positions = points.double().numpy()
+    distances, neighbors = PointTree(positions, k + 1).query(positions[rows.numpy()], k + 1, workers=workers)
     dropped = neighbors == rows.numpy()[:, None]
-    dropped[~dropped.any(axis=1), -1] = True  # more points than k in its own place, and it is not among them
+    dropped[~dropped.any(axis=1), -1] = True  # over k equal points, not including the point itself
     others = ~dropped
     return (
         torch.from_numpy(neighbors[others].reshape(len(rows), k)),

@@ -1,4 +1,4 @@
-"""Cameras all around a scene that has none."""
+"""Cameras around a scene that has none."""
 
 from __future__ import annotations
 
@@ -22,11 +22,12 @@ _GOLDEN = (math.sqrt(5) - 1) / 2
 
 
 ELEVATIONS = (5.0, 60.0)
+"""Usual range of camera elevations, degrees above the horizon."""
 HALF_SPHERE = (0.0, 89.0)
-"""Degrees above the horizon: where one mostly looks from, and all over that half of the sphere."""
+"""Elevations of the whole upper half of the sphere, degrees above the horizon."""
 
 _RIG_FOV = math.radians(60)
-"""Field of view at which a distance of 2.2 radii leaves a margin of a tenth: sin 30° is 1.1 / 2.2."""
+"""Field of view at which a distance of 2.2 radii leaves a margin of 10 %: sin 30° = 1.1 / 2.2."""
 
 
 def orbit_rig(
@@ -39,23 +40,23 @@ def orbit_rig(
     elevations: tuple[float, float] = ELEVATIONS,
     distance: float = 2.2,
 ) -> list[Camera]:
-    """Cameras all around a scene that has none, in order of azimuth.
+    """Return cameras on a sphere around a scene, in order of azimuth.
 
-    Azimuths are even and begin at `bounds.front_direction`; elevations follow the golden ratio over the band,
-    even in area: every n-th camera of the list is spread as evenly as the whole.
+    Azimuths are evenly spaced and begin at `bounds.front_direction`. Elevations follow the golden ratio over
+    the band, evenly by area, so every n-th camera of the list is spread as evenly as the whole list.
 
     Args:
-        scene: framed by its median center and 97th-percentile radius, see `scene_sphere`
+        scene: the scene to frame, by its median center and 97th-percentile radius, see `scene_sphere`
         count: number of cameras, ≥ 1
         width, height: image size in pixels
         fov_y: vertical field of view, radians
         up: world direction that is up, [3]; None guesses it, see `guess_up`
-        elevations: lowest and highest, degrees above the horizon, −89..89; below 0 is under the ground
-        distance: from the center, in radii at a field of view of 60° along the shorter side of the image; a
-            narrower or wider field moves the cameras so that the scene keeps its size in the picture
+        elevations: lowest and highest, −89 to 89 degrees above the horizon; negative ones are below it
+        distance: distance from the center in radii, for a field of view of 60° along the image's shorter
+            side. Other fields of view move the cameras so that the scene keeps its size in the image
 
     Raises:
-        ProgdfError: no camera asked for, or elevations that are no band.
+        ProgdfError: `count` is below 1, or the elevations do not ascend within ±89 degrees.
     """
     lowest, highest = elevations
     if count < 1:
@@ -73,7 +74,7 @@ def orbit_rig(
     center, radius = scene_sphere(scene)
     K = intrinsics(fov_y, width, height)
     half = math.atan(0.5 * min(width, height) / float(K[1, 1]))
-    away = distance * radius * math.sin(_RIG_FOV / 2) / math.sin(half)
+    eye_distance = distance * radius * math.sin(_RIG_FOV / 2) / math.sin(half)
     ahead = front_direction(up)
     side = torch.linalg.cross(up, ahead)
     low = math.sin(math.radians(lowest))
@@ -81,9 +82,9 @@ def orbit_rig(
     cameras = []
     for i in range(count):
         azimuth = 2 * math.pi * i / count
-        rise = low + (high - low) * ((0.5 + i * _GOLDEN) % 1.0)
-        level = math.sqrt(1 - rise * rise)
-        back = level * (math.cos(azimuth) * ahead + math.sin(azimuth) * side) + rise * up
-        viewmat = look_at(center + away * back, center, up)
+        sine = low + (high - low) * ((0.5 + i * _GOLDEN) % 1.0)
+        cosine = math.sqrt(1 - sine * sine)
+        back = cosine * (math.cos(azimuth) * ahead + math.sin(azimuth) * side) + sine * up
+        viewmat = look_at(center + eye_distance * back, center, up)
         cameras.append(Camera(viewmat, K, width, height, name=f"orbit_{i:03d}"))
     return cameras

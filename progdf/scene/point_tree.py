@@ -1,8 +1,8 @@
-"""k-d tree whose searches stay bounded where many points share one place.
+"""k-d tree with bounded searches where many points share one position.
 
 A k-d tree cannot split equal points: it keeps them in one leaf, and each search near them visits them all.
-100 000 rows at one place take 10^10 steps. This tree holds only as many points of a place as a search can
-return. Distances stay exact; which of the equal points is returned is arbitrary.
+100 000 equal points take 10^10 steps. This tree holds only as many points per position as a search can
+return. Distances stay exact. A search returns an arbitrary choice of equal points.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ WORTH_THREADS = 2000  # searches; fewer run faster on one thread
 
 
 class PointTree:
-    """The nearest of N points, for searches of up to `most` neighbors (1 000 000 points: 0.2 s to build).
+    """Nearest-neighbor search among N points (1 000 000 points: 0.2 s to build).
 
     Args:
         points: finite, of any dimension D. [N,D]
@@ -45,13 +45,13 @@ class PointTree:
     def query(
         self, places: NDArray[np.floating], k: int, within: float = np.inf, workers: int | None = None
     ) -> tuple[Floats, Rows]:
-        """Return the k nearest points of some places, the nearest first.
+        """Return the k nearest points of some positions, nearest first.
 
         Args:
             places: [M,D]
-            k: at most `most`; where there are fewer points, the remaining distances are infinite and rows N
-            within: distance beyond which points do not count
-            workers: threads; None: all, if there are enough places. The result does not depend on them
+            k: at most `most`. If there are fewer points, the remaining distances are infinite and the rows N
+            within: largest distance of a point that counts
+            workers: threads; None uses all for enough positions. The result does not depend on the number
 
         Returns:
             Distances and rows, [M,k] each.
@@ -64,9 +64,9 @@ class PointTree:
         return distances, rows
 
     def kth_distances(self, places: NDArray[np.floating], k: int, within: float = np.inf) -> Floats:
-        """Return the distance from some places [M,D] to the k-th nearest point, k at most `most`. [M]
+        """Return the distance from some positions [M,D] to the k-th nearest point, k at most `most`. [M]
 
-        It is infinite beyond `within`.
+        Distances beyond `within` are infinite.
         """
         workers = _workers(len(places))
         distances: Floats = self._tree.query(places, [k], distance_upper_bound=within, workers=workers)[0]
@@ -74,7 +74,7 @@ class PointTree:
 
     @property
     def order(self) -> Rows:
-        """The rows in an order in which most neighbors are near each other. [N]"""
+        """Rows in tree order, which puts most neighbors close to each other. [N]"""
         order: Rows = self._tree.indices
         if self._rows is None:
             return order
@@ -94,30 +94,30 @@ class PointTree:
         return largest
 
     def with_copies(self, mask: Mask) -> Mask:
-        """Return the mask with all points of each crowded place that it selects a point of. [N]
+        """Return the mask extended to all copies of its points at crowded positions. [N]
 
-        A search returns some of the points of a crowded place, so a selection that spreads by searches would
-        never reach the others.
+        A search returns only some of the points at a crowded position. A selection that spreads by searches
+        would never reach the others.
         """
         if not len(self._surplus):
             return mask
-        selected = np.zeros(self._crowds.max() + 2, bool)  # the last is for the rows in no crowd
+        selected = np.zeros(self._crowds.max() + 2, bool)  # the last entry is for rows at no crowded position
         selected[self._crowds[mask]] = True
         selected[-1] = False
         return np.asarray(mask | selected[self._crowds])
 
     @cached_property
     def _crowds(self) -> Rows:
-        """The crowded place that each point is in; -1: in none. [N]"""
+        """Index of the crowded position of each point; -1 for other points. [N]"""
         places = np.unique(self._points[self._surplus], axis=0)
         distances, crowds = _build(places).query(self._points)
         crowds[distances > 0.0] = -1
         return np.asarray(crowds, np.int64)
 
     def _find_surplus(self, copies: int) -> Rows:
-        """Return the points beyond the first `copies` of their place. [S]
+        """Return the points beyond the first `copies` at their position. [S]
 
-        Equal points are one run in the order of the tree's leaves, if there are more than a leaf holds.
+        Equal points are consecutive in the order of the tree's leaves if there are more than a leaf holds.
         """
         order = self._tree.indices
         column = self._points[order, 0]

@@ -1,18 +1,24 @@
-"""The language in which a region is written: `labels:bear.npy:3,4-box:0,0,0,1,2,1`.
+"""Text form of a region, such as `labels:bear.npy:3,4-box:0,0,0,1,2,1`.
 
     REGION  = PART (SIGN PART | '|' STEP)*      from left to right
-    SIGN    = '+' adds | '-' takes away | '&' keeps what is in both
+    SIGN    = '+' union | '-' difference | '&' intersection
     PART    = 'all'
             | 'labels:' FILE '.npy:' ID (',' ID)*
             | 'box:' x0,y0,z0,x1,y1,z1           two opposite corners, world units
             | 'sphere:' x,y,z,r                  center and radius, world units
             | 'file:' FILE.npy                   rows (integers), or a bool for each Gaussian
-            | rectangle, lasso, brush, front, color, flood: and STEP, see region_parts.py
-            | KIND ':' …                         other kinds that the caller knows, e.g. masks:, text:
-            | 'changed'                          where the caller knows changed pictures
+            | 'rectangle:' CAMERA ':' x0,y0,x1,y1   two opposite corners, pixels
+            | 'lasso:' CAMERA ':' x,y,x,y,x,y,…     corners of a polygon, pixels
+            | 'brush:' CAMERA ':' radius,x,y,…      points of a stroke, pixels
+            | 'front:' CAMERA                    Gaussians on the surface that the camera sees
+            | 'color:' #rrggbb[,tolerance]       Gaussians of like color
+            | 'flood:' x,y,z[,tolerance]         like color, connected with the Gaussian nearest to a point
+            | KIND ':' …                         further kinds that the caller supports, e.g. masks:, text:
+            | 'changed'                          if the caller supports edited pictures
+    STEP    = ('grow' | 'shrink' | 'smooth') [':' TIMES] | 'largest' | 'refine' [':' PERCENT]
 
-Numbers and file names hold '-' and '+' themselves, so a sign joins two parts only where a kind and its colon
-(or a whole 'all', or a step) follow. Blanks around parts do not count.
+Numbers and file names may contain '-' and '+'. A sign therefore joins two parts only before a kind with its
+colon, a whole 'all', or a step. Blanks around parts do not count.
 """
 
 from __future__ import annotations
@@ -53,23 +59,24 @@ from .neighbors import RIM_PERCENT, Neighborhood, grow_along_surface
 from .selection import Mask
 
 TOLERANCE = 0.08
-"""How far colors may be from the one that is named where the spec does not say. A click on a black jacket
-takes the leather, and at .1 the hair too."""
+"""Default tolerance of a color, as a distance in OKLab. On a black jacket 0.08 selects the leather, and 0.1
+also the hair."""
 
 MAX_TIMES = 100
+"""Largest number of repetitions of a step."""
 
 LARGEST = 1e18
-"""Of numbers in a region, on either side of 0: the squares of a few of them still are float32."""
+"""Largest magnitude of a number in a region. The sum of a few squares still fits float32."""
 
 Selecting = Callable[[Gaussians], Mask]
-"""What a checked part does with a scene."""
+"""Function from a scene to the mask that a part selects."""
 
 
 def read_part(kind: str, argument: str) -> Selecting:
-    """What a part of one of `PARTS` selects.
+    """Return the selection function of a part whose kind is one of `PARTS`.
 
     Raises:
-        ProgdfError: no scene can have it: its numbers or its camera cannot be read.
+        ProgdfError: the numbers or the camera cannot be read.
     """
     if kind == "color":
         code, tolerance = _with_tolerance(kind, argument, 1, "#rrggbb[,tolerance]")
@@ -77,20 +84,24 @@ def read_part(kind: str, argument: str) -> Selecting:
         return lambda scene: selection.alike_in_color(selection.base_colors(scene), lab, tolerance)
     if kind == "flood":
         words, tolerance = _with_tolerance(kind, argument, 3, "x,y,z[,tolerance]")
-        x, y, z = _described_numbers(kind, argument, ",".join(words), "x,y,z[,tolerance]")
+        x, y, z = _final_numbers(kind, argument, ",".join(words), "x,y,z[,tolerance]")
         return lambda scene: _flood(scene, (x, y, z), tolerance)
     if kind == "front":
         camera_of = _camera(kind, argument, "CAMERA")
         return lambda scene: _front(scene, camera_of(scene))
-    form, least, odd = _FORMS[kind]
-    where, _, text = argument.rpartition(":")
-    camera_of = _camera(kind, where, f"CAMERA:{form}")
-    numbers = _described_numbers(kind, argument, text, f"CAMERA:{form}")
-    if len(numbers) < least or len(numbers) % 2 != odd or (kind == "rectangle" and len(numbers) > least):
+    form, min_count, parity = _SHAPE_FORMS[kind]
+    camera_text, _, text = argument.rpartition(":")
+    camera_of = _camera(kind, camera_text, f"CAMERA:{form}")
+    numbers = _final_numbers(kind, argument, text, f"CAMERA:{form}")
+    if (
+        len(numbers) < min_count
+        or len(numbers) % 2 != parity
+        or (kind == "rectangle" and len(numbers) > min_count)
+    ):
         raise ProgdfError(
             f"region '{kind}:{shorten(argument)}' has {len(numbers)} numbers; write {kind}:CAMERA:{form}"
         )
-    if odd and numbers[0] <= 0:
+    if parity and numbers[0] <= 0:
         raise ProgdfError(
             f"the radius in region '{kind}:{shorten(argument)}' is {numbers[0]:g}; it must be positive"
         )
@@ -98,10 +109,10 @@ def read_part(kind: str, argument: str) -> Selecting:
 
 
 def read_step(text: str) -> Callable[[Neighborhood, Mask], Mask]:
-    """What `grow:3` or another of `STEPS` does with a selection.
+    """Return the function of a step such as `grow:3`, see `STEPS`.
 
     Raises:
-        ProgdfError: it is none of them, or not so many times.
+        ProgdfError: the step is unknown, or its number is out of range.
     """
     name, _, times = text.partition(":")
     count = int(times) if re.fullmatch(r"[0-9]{1,9}", times) else 1 if not times else 0
@@ -144,7 +155,7 @@ def _flood(scene: Gaussians, point: tuple[float, float, float], tolerance: float
 
 
 def _camera(kind: str, text: str, form: str) -> Callable[[Gaussians], Camera]:
-    """Gives the camera for a scene, which it is relative to; that it can be read is checked at once."""
+    """Check that a camera can be read; return a function that gives it relative to a scene."""
     if not text:
         raise ProgdfError(f"{kind}: needs a camera; write {kind}:{form}, CAMERA as --camera has it")
     read_camera(text, ZERO)
@@ -155,7 +166,7 @@ def _with_tolerance(kind: str, text: str, count: int, form: str) -> tuple[list[s
     words = text.split(",")
     if not count <= len(words) <= count + 1:
         raise ProgdfError(f"region '{kind}:{shorten(text)}' cannot be read; write {kind}:{form}")
-    tolerance = _described_numbers(kind, text, words[count], form)[0] if len(words) > count else TOLERANCE
+    tolerance = _final_numbers(kind, text, words[count], form)[0] if len(words) > count else TOLERANCE
     if not 0 < tolerance <= 1:
         raise ProgdfError(
             f"the tolerance in region '{kind}:{shorten(text)}' is {tolerance:g}; write above 0, up to 1"
@@ -163,7 +174,7 @@ def _with_tolerance(kind: str, text: str, count: int, form: str) -> tuple[list[s
     return words[:count], tolerance
 
 
-def _described_numbers(kind: str, typed: str, text: str, form: str) -> list[float]:
+def _final_numbers(kind: str, typed: str, text: str, form: str) -> list[float]:
     numbers = read_numbers(text)
     if not numbers:
         raise ProgdfError(
@@ -173,7 +184,7 @@ def _described_numbers(kind: str, typed: str, text: str, form: str) -> list[floa
 
 
 def read_numbers(text: str) -> list[float]:
-    """Numbers between commas, none beyond `LARGEST`; [] where it is anything else."""
+    """Return the numbers between commas; [] if one cannot be read or exceeds `LARGEST`."""
     try:
         numbers = [float(word) for word in text.split(",")]
     except ValueError:
@@ -191,13 +202,15 @@ def _oklab(text: str, code: str) -> list[float]:
     return lab
 
 
-_FORMS = {
+# form of the numbers after CAMERA:, their smallest count, and the count modulo 2
+_SHAPE_FORMS = {
     "rectangle": ("x0,y0,x1,y1", 4, 0),
     "lasso": ("x,y,x,y,x,y,…", 6, 0),
     "brush": ("radius,x,y,…", 3, 1),
 }
 
-PARTS = (*_FORMS, "front", "color", "flood")
+PARTS = (*_SHAPE_FORMS, "front", "color", "flood")
+"""Kinds of parts that are drawn or picked in the window."""
 STEPS: dict[str, Callable[[Neighborhood, Mask], Mask]] = {
     "grow": Neighborhood.grow,
     "shrink": Neighborhood.shrink,
@@ -208,44 +221,43 @@ STEPS: dict[str, Callable[[Neighborhood, Mask], Mask]] = {
 
 
 Kind = Callable[[str, Gaussians], Region]
-"""Makes a region from the text after `KIND:`."""
+"""Function that makes a region from the text after `KIND:`."""
 
 Check = Callable[[str], object]
-"""Raises ProgdfError where the text after `KIND:` cannot be, whatever the scene."""
+"""Function that raises ProgdfError if the text after `KIND:` is invalid for every scene."""
 
 _log = logging.getLogger(__name__)
 
-_FEW = 10
-"""Gaussians: fewer in a flood are a stray and its neighbors."""
+_MIN_FLOOD_GAUSSIANS = 10  # Gaussians; a smaller flood is a stray and its neighbors
 
 _SIGNS = {"+": union, "-": difference, "&": intersection}
-_NOTHING: Mapping[str, Kind] = {}
-_UNCHECKED: Mapping[str, Check] = {}
+_NO_KINDS: Mapping[str, Kind] = {}
+_NO_CHECKS: Mapping[str, Check] = {}
 
 BARE = ("changed",)
-"""Kinds that may stand without a colon and a text."""
+"""Kinds without a colon and a text."""
 
 
 def parse_region(
     spec: str,
     scene: Gaussians,
     name: str = "",
-    kinds: Mapping[str, Kind] = _NOTHING,
+    kinds: Mapping[str, Kind] = _NO_KINDS,
     say: Callable[[str], None] = _log.warning,
 ) -> Region:
-    """The region that `spec` describes in `scene`.
+    """Return the region that `spec` describes in `scene`.
 
     Args:
         spec: see the head of this file
         name: the region's name; the spec itself if empty
         kinds: further kinds by name, e.g. {"masks": lift_from_folder}
-        say: hears in a line each which parts select nothing, or what is likely not meant
+        say: receives one line for each part that selects nothing or probably not the intended Gaussians
 
     Raises:
-        ProgdfError: the spec cannot be read, a file does not fit the scene, or nothing is in the region.
+        ProgdfError: the spec cannot be read, a file does not fit the scene, or the region is empty.
     """
     known: dict[str, Kind] = {"labels": _labels, "box": _box, "sphere": _sphere, "file": _file}
-    known |= {kind: partial(_by_hand, kind) for kind in PARTS} | dict(kinds)
+    known |= {kind: partial(_drawn, kind) for kind in PARTS} | dict(kinds)
     region = from_mask("", torch.zeros(len(scene), dtype=torch.bool))
     neighborhood: Neighborhood | None = None
     for sign, part in split_spec(spec, tuple(known)):
@@ -273,22 +285,25 @@ def parse_region(
 
 
 def _doubt(kind: str, count: int, total: int) -> str:
-    """Why a part that selects so many of a scene's Gaussians is hardly what was meant; "" where it may be."""
+    """Return why a part that selects `count` of `total` Gaussians is probably not intended, or ""."""
     if not count:
         return "selects no Gaussian"
-    if kind == "flood" and count < _FEW:
+    if kind == "flood" and count < _MIN_FLOOD_GAUSSIANS:
         return f"selects {format_count(count)} alone; raise its tolerance, or name a point on a surface"
     if kind == "color" and 2 * count > total:
         return f"selects {100 * count / total:.0f} % of the scene; lower its tolerance, or add &box:…"
     return ""
 
 
-def check_region(spec: str, checks: Mapping[str, Check] = _UNCHECKED) -> None:
-    """ProgdfError if no scene can have this region: all that is to be known before one is loaded.
+def check_region(spec: str, checks: Mapping[str, Check] = _NO_CHECKS) -> None:
+    """Check a region as far as possible before a scene is loaded.
 
     Args:
         spec: see the head of this file
-        checks: of further kinds by name
+        checks: checks of further kinds by name
+
+    Raises:
+        ProgdfError: no scene can have this region.
     """
     known: dict[str, Check] = {
         "labels": _check_labels,
@@ -314,12 +329,12 @@ def _unknown_region(part: str, known: Iterable[str]) -> ProgdfError:
 
 
 def split_spec(spec: str, kinds: tuple[str, ...]) -> list[tuple[str, str]]:
-    """(sign, part) for each part of a spec, the first one with '+'; a step's sign is '|'."""
+    """Return the (sign, part) pairs of a spec. The first sign is '+', and a step's sign is '|'."""
     words, steps = ("|".join(re.escape(word) for word in some) for some in (kinds, STEPS))
     bare = "|".join(("all", *BARE))
     part = rf"(?:{words}):|(?:{bare})\s*(?:$|[+&|-])"
     step = rf"(?:{steps})(?::-?[^\s+&|-]*)?\s*(?:$|[+&|-])"
-    # no blanks before the sign: a pattern that begins with them goes through a run of them from each of them
+    # no blanks before the sign: a pattern that begins with blanks takes quadratic time on a run of them
     pieces = [piece.strip() for piece in re.split(rf"([+&-](?=\s*(?:{part}))|\|(?=\s*{step}))", spec)]
     if not all(pieces[0::2]):
         raise ProgdfError(
@@ -328,15 +343,15 @@ def split_spec(spec: str, kinds: tuple[str, ...]) -> list[tuple[str, str]]:
     return list(zip(["+", *pieces[1::2]], pieces[0::2], strict=True))
 
 
-def _by_hand(kind: str, text: str, scene: Gaussians) -> Region:
+def _drawn(kind: str, text: str, scene: Gaussians) -> Region:
     return from_mask(f"{kind}:{text}", torch.from_numpy(read_part(kind, text)(scene)))
 
 
 def read_labels(path: str, count: int) -> Tensor:
-    """One integer label per Gaussian from a .npy file. [count] int64
+    """Read one integer label per Gaussian from a .npy file. [count] int64
 
     Raises:
-        ProgdfError: no such file, no .npy, not integers, or not one per Gaussian.
+        ProgdfError: the file is missing, is no .npy, or does not hold one integer per Gaussian.
     """
     labels = _open_labels(path)
     if labels.shape not in ((count,), (count, 1)):
@@ -346,10 +361,10 @@ def read_labels(path: str, count: int) -> Tensor:
 
 
 def read_members(path: str, count: int) -> Tensor:
-    """The rows that a .npy file names, sorted and each once: integers, or a bool per Gaussian. [M] int64
+    """Read rows from a .npy file of integers or of one bool per Gaussian. Sorted and unique, [M] int64
 
     Raises:
-        ProgdfError: no such file, no .npy, of another kind, or rows that the scene does not have.
+        ProgdfError: the file is missing, is no .npy, has another type, or names rows outside the scene.
     """
     stored = _open_members(path)
     if stored.dtype.kind == "b":
@@ -399,7 +414,7 @@ def _check_labels(text: str) -> None:
 
 
 def _parse_labels(text: str) -> tuple[str, list[int]]:
-    """The file and the labels of FILE.npy:ID[,ID…]."""
+    """Return the file and the labels of FILE.npy:ID[,ID…]."""
     path, colon, ids = text.rpartition(":")
     if not colon or not path:
         raise ProgdfError(f"region 'labels:{shorten(text)}' has no label; write labels:FILE.npy:ID[,ID…]")

@@ -1,13 +1,13 @@
-"""Cameras of a scene: brought into its frame, and checked against it.
+"""Cameras converted to a scene's frame and checked against it.
 
-nerfstudio trains in a frame of its own. `dataparser_transforms.json` has the way there, for a point of the
-dataset's world: x' = scale · (R x + t). Camera poses are turned by R, and their centers go the way of points.
-A transforms.json may be in a third frame (`applied_transform`). nerfstudio writes the way from the dataset's
-world; older files have the one from transforms.json. Its frame has z up, which tells the two apart.
+nerfstudio trains in its own frame. `dataparser_transforms.json` holds the transform of a point from the
+dataset's world: x' = scale · (R x + t). R rotates the camera poses, and camera centers transform like points.
+A transforms.json may be in a third frame (`applied_transform`). nerfstudio writes the transform from the
+dataset's world; older files hold the one from transforms.json. Its frame has z up, which tells the two apart.
 
-The check renders the scene small through some cameras. A camera shows the scene if it covers at least as much
-of the picture as a square of a 16th of its sides. At least half of the cameras must show the scene; or, where
-cameras look at other parts of a larger capture, three must show it large.
+The check renders the scene at a small size through some cameras. A camera sees the scene if it covers at
+least 1/256 of the picture, a square of 1/16 of its sides. At least half of the cameras must see the scene. If
+cameras look at other parts of a larger capture, it suffices that three see it large.
 """
 
 from __future__ import annotations
@@ -47,12 +47,12 @@ _log = logging.getLogger(__name__)
 TRANSFORMS_FILE = "dataparser_transforms.json"
 _CHECKPOINTS = "nerfstudio_models"  # nerfstudio's folder of checkpoints; the file lies beside it
 
-_LOOK_PX = 96  # longer side of the pictures of the check
-_FIRST_COUNT = 8  # cameras to look through
-_MAX_COUNT = 48  # the others only if the first do not decide
-_SHOWS_SHARE = 1 / 256  # of the picture: 16 x 16 of 256 x 256 pixels, which a view of a training has
-_LARGE_SHARE = 0.1  # of the picture: the scene is what the camera looks at
-_LARGE_COUNT = 3  # cameras: the least that a training takes
+_CHECK_SIZE_PX = 96  # longer side of the renders of the check, pixels
+_FIRST_COUNT = 8  # cameras that are checked first
+_MAX_COUNT = 48  # cameras that are checked if the first ones do not decide
+_MIN_SHARE = 1 / 256  # smallest share of the picture: 16 x 16 of the 256 x 256 pixels of a training view
+_LARGE_SHARE = 0.1  # share of the picture from which the camera is aimed at the scene
+_LARGE_COUNT = 3  # cameras that must see the scene large: the smallest number for a training
 
 _Number = Annotated[float, msgspec.Meta(gt=-3e38, lt=3e38)]
 _Row = tuple[_Number, _Number, _Number, _Number]
@@ -70,23 +70,23 @@ class SceneCameras:
     """Cameras in a scene's frame."""
 
     cameras: list[Camera]
-    notes: tuple[str, ...] = ()  # one line each: the frame that was chosen
+    notes: tuple[str, ...] = ()  # lines that name the chosen frame
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """The shares of their pictures, 0 to 1, in which some of the cameras show a scene."""
+    """Share of the picture that a scene covers, for some of the cameras."""
 
-    shares: tuple[float, ...]
+    shares: tuple[float, ...]  # 0 to 1, one per checked camera
 
     @property
     def showing(self) -> int:
-        """The number of cameras that show the scene."""
-        return sum(share >= _SHOWS_SHARE for share in self.shares)
+        """Number of cameras that see the scene."""
+        return sum(share >= _MIN_SHARE for share in self.shares)
 
     @property
     def fits(self) -> bool:
-        """Whether the cameras are probably of the scene's frame."""
+        """True if the cameras are probably in the scene's frame."""
         count = len(self.shares)
         large = sum(share >= _LARGE_SHARE for share in self.shares)
         return self.showing > 0 and (2 * self.showing >= count or large >= _LARGE_COUNT)
@@ -97,19 +97,23 @@ def load_scene_cameras(
 ) -> SceneCameras:
     """Return the cameras of a file or folder in the frame of a scene.
 
-    Frames are tried in this order: nerfstudio's, where a dataparser_transforms.json lies beside the scene or
-    the cameras; the file's; and, of a transforms.json with an applied_transform, the dataset's before it. The
-    first one counts in which the cameras show the scene. Cameras that this program saved are in the scene's.
+    The result is in the first of these frames in which the cameras see the scene:
+
+    1. nerfstudio's, if a dataparser_transforms.json is beside the scene or the cameras
+    2. the file's
+    3. the dataset's frame before the applied_transform of a transforms.json
+
+    Cameras that this program saved are in the scene's frame.
 
     Args:
         path: see `progdf.io.cameras.load_cameras`
         scene: the scene; the cameras are relative to its origin
         scene_file: the scene's file, if there is one
-        anyway: take the first frame without a check
+        anyway: use the first frame without a check
 
     Raises:
-        ProgdfError: as `load_cameras`; a broken dataparser_transforms.json; or the scene is visible from no
-            frame.
+        ProgdfError: `load_cameras` fails, dataparser_transforms.json is broken, or the cameras see the scene
+            in no frame.
     """
     cameras, report = load_cameras_with_report(path, scene.origin)
     log_cameras(path, cameras, report)
@@ -130,7 +134,8 @@ def load_scene_cameras(
 def scene_cameras_beside(path: Path, scene: Gaussians) -> list[Camera]:
     """Return the cameras beside a scene's file that have its middle in their picture, in its frame.
 
-    Cameras that all look past it are logged. They cost no render, as they only tell the axis that is up.
+    A log line reports cameras that all look past it. The check renders nothing, because the cameras are only
+    used to find the up axis.
     """
     try:
         cameras = load_scene_cameras(beside_folder(path), scene, path, anyway=True).cameras
@@ -155,13 +160,13 @@ def _warn_once(line: str) -> None:
 
 
 def measure_coverage(scene: Gaussians, cameras: Sequence[Camera]) -> Coverage:
-    """Return the shares of their pictures in which cameras show a scene, of up to 48 spread over the list."""
+    """Return the picture shares that a scene covers, for up to 48 cameras spread over the list."""
     spread = sorted(range(len(cameras)), key=lambda i: math.sqrt(2.0) * i % 1.0)[:_MAX_COUNT]
     near = near_plane(scene_sphere(scene)[1])
 
     def look(index: int) -> float:
         camera = cameras[index]
-        scale = min(1.0, _LOOK_PX / max(camera.width, camera.height))
+        scale = min(1.0, _CHECK_SIZE_PX / max(camera.width, camera.height))
         width = max(1, round(camera.width * scale))
         height = max(1, round(camera.height * scale))
         small = replace(camera.resize(width, height), near=near, lens=None)
@@ -183,8 +188,8 @@ def _candidates(
 
     Args:
         path: the cameras' file or folder
-        cameras: as the file has them, relative to `origin`
-        origin: of the scene
+        cameras: cameras in the file's frame, relative to `origin`
+        origin: origin of the scene
         dataset: see `CameraReport.dataset`
         file: the dataparser_transforms.json, if there is one
     """
@@ -213,7 +218,7 @@ def _candidates(
 
 
 def _upright(cameras: Sequence[Camera], way: Tensor) -> float:
-    """Return how far the cameras' mean up is +z after a turn, -1 to 1; 0.1 % of difference is none."""
+    """Return the z component of the cameras' mean up after a rotation, -1 to 1, rounded to 0.001."""
     up = torch.stack([-camera.viewmat[1, :3] for camera in cameras]).double().mean(dim=0)
     return round(float((way[:3, :3] @ torch.nn.functional.normalize(up, dim=0))[2]), 3)
 
@@ -232,7 +237,7 @@ def _find_transforms(path: Path, scene_file: Path | None) -> Path | None:
 
 
 def _read_transforms(file: Path) -> tuple[Tensor, float]:
-    """Return a turn and a move, [4,4] float64, and the scale that follows them.
+    """Return a rigid transform, [4,4] float64, and the scale that follows it.
 
     Raises:
         ProgdfError: the file is damaged, or its transform is no rotation and translation.
@@ -246,7 +251,7 @@ def _read_transforms(file: Path) -> tuple[Tensor, float]:
 
 
 def _move(camera: Camera, way: Tensor, origin: Origin) -> Camera:
-    """Return a camera after a similarity of the world. The camera is relative to an origin. [4,4] float64"""
+    """Return a camera, relative to `origin`, after a similarity transform of the world. [4,4] float64"""
     x, y, z = origin
     pose = way @ torch.linalg.inv(relative_viewmat(camera.viewmat, (-x, -y, -z)))
     pose[:3, :3] /= way[:3, :3].det() ** (1 / 3)

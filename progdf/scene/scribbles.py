@@ -1,12 +1,13 @@
-"""A thing selected by a few strokes on it and a few beside it: a random walk from neighbor to neighbor.
+"""Selection of an object from strokes on it and strokes beside it, by a random walker.
 
-A Gaussian belongs to the strokes that a walk begun at it more likely meets first (Grady, Random Walks for
-Image Segmentation, 2006). A step to a near neighbor of like color is likely; what counts as near and alike is
-what neighbors commonly are in this scene. (A scale chosen by foretelling strokes that are left out does no
-better: docs/experiments.md, Regions from strokes.)
+A Gaussian belongs to the strokes that a random walk from it more probably reaches first (Grady, Random Walks
+for Image Segmentation, 2006). Steps to near neighbors of like color are more probable. Distances and color
+differences are measured in those usual between neighbors of this scene. (Scales chosen by cross-validation
+over strokes are no better: docs/experiments.md, Regions from strokes.)
 
-The chances solve a linear system as large as the scene: conjugate gradients, each step behind one cycle of
-multigrid over groups of neighbors (Notay, An Aggregation-Based Algebraic Multigrid Method, 2010).
+The probabilities solve a linear system with one unknown per Gaussian, by conjugate gradients. The
+preconditioner is one multigrid cycle over groups of neighbors (Notay, An Aggregation-Based Algebraic
+Multigrid Method, 2010).
 """
 
 from __future__ import annotations
@@ -23,25 +24,29 @@ from .selection import Floats, Mask, Surface
 
 Rows = NDArray[np.int64]
 
-_NEAREST = 10  # steps that a walk may take
-_UNLIKE = 2.0  # in e⁻²: how likely a step is over the difference in color that neighbors commonly have
-_WALL = 1e-6  # of a likely step: behind what no walk passes there would be no chances at all
-_HELD = 1e3  # of its steps: how firmly a stroke holds its Gaussians
-_LOOSE = 1e-6  # of its steps: how firmly what no stroke is connected with is held outside
-_ERROR = 1e-3  # of the system's error at the start: less changes no selection
-_SMALLEST = 500  # rows that are solved at once
-_SHRINKS = 0.7  # a level that has more of its finer one is none
-_DAMPED = 0.7  # Jacobi
-_OVER = 1.6  # what a coarse correction is too small by (Braess, 1995)
-_MAX_STEPS = 200
+_WALK_NEIGHBORS = 10  # neighbors that a walk may step to
+_COLOR_EXPONENT = 2.0  # a step over the median color difference of neighbors has its weight scaled by e⁻²
+_MIN_STEP_WEIGHT = (
+    1e-6  # smallest weight of a step; the walk would never reach areas behind steps of weight 0
+)
+_STROKE_WEIGHT = 1e3  # weight that fixes a stroked Gaussian, in sums of its steps' weights
+_OUTSIDE_WEIGHT = 1e-6  # weight that pulls every Gaussian outside; decides those connected with no stroke
+_RESIDUAL_SHARE = 1e-3  # share of the initial residual; smaller residuals change no selection
+_MIN_COARSENED_ROWS = (
+    500  # rows; smaller levels are not coarsened, and up to four times as many are solved directly
+)
+_MAX_COARSENING_RATIO = 0.7  # coarsening stops if a level keeps more than this share of the rows
+_JACOBI_DAMPING = 0.7  # damping of Jacobi smoothing
+_OVERCORRECTION = 1.6  # scale of a coarse correction, which is too small by this factor (Braess, 1995)
+_MAX_STEPS = 200  # conjugate gradient steps per level
 
 
 class Scribbles:
-    """What strokes spread over; make it once for a scene (125 000 Gaussians: half a second).
+    """Random walker over a scene. Building it takes about 0.5 s for 125 000 Gaussians.
 
     Args:
-        points: the centers of its Gaussians, finite. [N,3]
-        colors: theirs, OKLab. [N,3]
+        points: finite centers of the Gaussians. [N,3]
+        colors: their colors, OKLab. [N,3]
     """
 
     def __init__(self, points: NDArray[np.floating], colors: Floats) -> None:
@@ -49,14 +54,15 @@ class Scribbles:
         self._count = len(points)
 
     def select(self, inside: Rows, outside: Rows) -> Mask:
-        """What belongs to the strokes on a thing rather than to those beside it.
+        """Select the Gaussians that belong to the strokes on an object.
 
         Args:
-            inside: rows under strokes on it
-            outside: rows under strokes beside it; a row under both kinds counts for neither
+            inside: rows under strokes on the object
+            outside: rows under strokes beside it; rows under both kinds count for neither
 
         Returns:
-            [N]; nothing without a stroke on the thing, what is connected with it without one beside it
+            Mask [N]. It is empty without strokes on the object. Without strokes beside it, it holds all
+            Gaussians connected with the object.
         """
         on = np.zeros(self._count, bool)
         beside = np.zeros(self._count, bool)
@@ -67,7 +73,7 @@ class Scribbles:
 
 
 def rows_under(painted: Mask, seen: Surface) -> Rows:
-    """The Gaussians on the front surface whose centers lie under painted pixels [H,W]."""
+    """Return the Gaussians on the front surface whose centers lie under painted pixels [H,W]."""
     points, (height, width) = seen.centers.points, painted.shape
     within = (points >= 0) & (points < (width, height))  # also false where a point is not a number
     rows = np.flatnonzero(within.all(axis=1))
@@ -77,9 +83,9 @@ def rows_under(painted: Mask, seen: Surface) -> Rows:
 
 
 def likely_steps(points: NDArray[np.floating], colors: Floats) -> csr_array:
-    """Return how likely each step between neighbors is, the same both ways. [N,N]"""
+    """Return the symmetric weight of each step between neighbors. [N,N]"""
     count = len(points)
-    k = min(_NEAREST, count - 1)
+    k = min(_WALK_NEIGHBORS, count - 1)
     if k < 1:
         return csr_array((count, count), dtype=np.float32)
     apart, near = PointTree(points, k + 1).query(points, k + 1)
@@ -88,7 +94,7 @@ def likely_steps(points: NDArray[np.floating], colors: Floats) -> csr_array:
     spacing = np.maximum(np.median(apart, axis=1), 1e-30)
     far = apart * apart / (spacing[:, None] * spacing[near])
     unlike = np.linalg.norm(colors[:, None] - colors[near], axis=2)
-    likely = np.exp(-far - _UNLIKE * unlike / max(float(np.median(unlike)), 1e-6)) + _WALL
+    likely = np.exp(-far - _COLOR_EXPONENT * unlike / max(float(np.median(unlike)), 1e-6)) + _MIN_STEP_WEIGHT
     start = np.arange(0, count * k + 1, k, dtype=np.int32)
     steps = csr_array((likely.astype(np.float32).ravel(), near.ravel(), start), shape=(count, count))
     both: csr_array = (steps + steps.T).tocsr()
@@ -96,23 +102,26 @@ def likely_steps(points: NDArray[np.floating], colors: Floats) -> csr_array:
 
 
 class _Multigrid:
-    """A graph, and ever coarser ones of groups of its nodes."""
+    """Hierarchy of graphs; each level groups the nodes of the finer one."""
 
     def __init__(self, weights: csr_array) -> None:
         self._weights = [weights]
         self._groups: list[NDArray[np.int32]] = []
-        while len(self._groups) < 20 and self._weights[-1].shape[0] > _SMALLEST:
+        while len(self._groups) < 20 and self._weights[-1].shape[0] > _MIN_COARSENED_ROWS:
             coarse, groups = _coarsen(*_coarsen(self._weights[-1], None))
-            if coarse.shape[0] > _SHRINKS * self._weights[-1].shape[0]:
+            if coarse.shape[0] > _MAX_COARSENING_RATIO * self._weights[-1].shape[0]:
                 break
             self._weights.append(coarse)
             self._groups.append(groups)
         self._steps = [np.asarray(level.sum(axis=1), np.float32).ravel() for level in self._weights]
 
     def chances(self, on: Mask, beside: Mask) -> Floats:
-        """How likely a walk from each node ends on the thing, found on coarse graphs first. [N] 0..1"""
-        held: Floats = (_HELD * (on | beside) + _LOOSE).astype(np.float32) * self._steps[0]
-        target: Floats = np.float32(_HELD) * on * self._steps[0]
+        """Return the probability that a walk from each node ends on the object, 0 to 1. [N]
+
+        The solution of each coarse level starts the next finer one.
+        """
+        held: Floats = (_STROKE_WEIGHT * (on | beside) + _OUTSIDE_WEIGHT).astype(np.float32) * self._steps[0]
+        target: Floats = np.float32(_STROKE_WEIGHT) * on * self._steps[0]
         targets = [target]
         self._diagonals = [self._steps[0] + held]
         for level in range(len(self._groups)):
@@ -120,11 +129,11 @@ class _Multigrid:
             target = self._gather(level, target)
             self._diagonals.append(self._steps[level + 1] + held)
             targets.append(target)
-        rest = self._weights[-1]
-        small = rest.shape[0] <= 4 * _SMALLEST
-        matrix = np.diag(self._diagonals[-1].astype(np.float64)) - rest.toarray() if small else None
+        coarsest = self._weights[-1]
+        is_small = coarsest.shape[0] <= 4 * _MIN_COARSENED_ROWS
+        matrix = np.diag(self._diagonals[-1].astype(np.float64)) - coarsest.toarray() if is_small else None
         self._factors = None if matrix is None else cho_factor(matrix)
-        x = np.zeros(rest.shape[0], np.float32)
+        x = np.zeros(coarsest.shape[0], np.float32)
         for level in reversed(range(len(targets))):
             x = self._solve(
                 level, targets[level], x if level == len(self._groups) else x[self._groups[level]]
@@ -132,15 +141,17 @@ class _Multigrid:
         return x
 
     def _solve(self, level: int, target: Floats, x: Floats) -> Floats:
-        """Conjugate gradients on a level. [N]"""
+        """Solve a level by preconditioned conjugate gradients from the start value x. [N]"""
         spread = np.sqrt(self._diagonals[level])
-        held = target / self._diagonals[level]
-        least = _ERROR * float(np.linalg.norm((target - self._apply(level, held)) / spread))
+        jacobi_guess = target / self._diagonals[level]
+        min_residual = _RESIDUAL_SHARE * float(
+            np.linalg.norm((target - self._apply(level, jacobi_guess)) / spread)
+        )
         residual: Floats = target - self._apply(level, x)
         direction = np.zeros_like(x)
         before = np.inf
         for _ in range(_MAX_STEPS):
-            if float(np.linalg.norm(residual / spread)) <= least:
+            if float(np.linalg.norm(residual / spread)) <= min_residual:
                 break
             correction = self._cycle(level, residual)
             along = float(residual @ correction)
@@ -162,8 +173,8 @@ class _Multigrid:
         return product
 
     def _cycle(self, level: int, residual: Floats) -> Floats:
-        """About what takes a residual away."""
-        damped = np.float32(_DAMPED) / self._diagonals[level]
+        """Return the correction of a residual by one multigrid cycle. [N]"""
+        damped = np.float32(_JACOBI_DAMPING) / self._diagonals[level]
         if level == len(self._groups):
             if self._factors is None:
                 return damped * residual
@@ -171,12 +182,16 @@ class _Multigrid:
             return solved
         x = damped * residual
         coarse = self._cycle(level + 1, self._gather(level, residual - self._apply(level, x)))
-        x += np.float32(_OVER) * coarse[self._groups[level]]
+        x += np.float32(_OVERCORRECTION) * coarse[self._groups[level]]
         return x + damped * (residual - self._apply(level, x))
 
 
 def _coarsen(weights: csr_array, groups: NDArray[np.int32] | None) -> tuple[csr_array, NDArray[np.int32]]:
-    """A graph of pairs of nodes, each with its most likely neighbor, and which pair each node is in."""
+    """Return the graph of pairs of strongly connected nodes, and the index of each node's pair.
+
+    `groups` holds the node of `weights` for each node of a finer graph, whose pairs are then returned
+    instead.
+    """
     pairs, count = _pair(weights.indptr, weights.indices, weights.data)
     edges = weights.tocoo()
     row = pairs[edges.row]
@@ -188,7 +203,7 @@ def _coarsen(weights: csr_array, groups: NDArray[np.int32] | None) -> tuple[csr_
 
 @kernel(cache=True, allocates=True)
 def _pair(start: Number, neighbors: Number, weights: Number) -> Number:
-    """Pairs of a node and its most likely free neighbor; which each is in [N] int32, and their count."""
+    """Pair each node with its most likely free neighbor; return each pair index [N] int32 and the count."""
     count = len(start) - 1
     groups = np.full(count, -1, np.int32)
     used = 0

@@ -1,7 +1,7 @@
-"""Selecting Gaussians by hand: shapes drawn over a picture, a ball, a color; and how selections go together.
+"""Selection tools of the window: shapes drawn over a picture, a ball, a color, and set operations.
 
-A selection is a boolean mask over the scene. Shapes go by the centers of Gaussians as a camera sees them
-(`project_centers`); what lies behind the front surface is left out by `front_surface`.
+A selection is a boolean mask over the scene. Shapes are tested against the projected centers of Gaussians
+(`project_centers`). `front_surface` tells the Gaussians on the visible surface from those behind it.
 """
 
 from __future__ import annotations
@@ -27,26 +27,28 @@ Mask = NDArray[np.bool_]
 Floats = NDArray[np.float32]
 
 MODES = ("new", "add", "subtract", "intersect")
+"""Ways to combine a new selection with the current one."""
 
-_COARSE = 4  # the front surface is looked up in a picture so many times smaller
-# Of the depth, and of its own longest axis: what is no further behind the surface still belongs to it. Gloss
-# is made of Gaussians beneath it: with one axis a jacket's lasso has .85 of what one sees, with three .94.
-_BEHIND = 0.01
-_OWN = 3.0
-_COVERED = 0.05  # less than this in all counts as background
-_MAX_CELLS = 1024  # a side, of the grid into which a polygon is filled
+_DEPTH_DOWNSCALE = 4  # factor by which the depth render of the front surface is smaller than the picture
+# A Gaussian belongs to the surface up to a distance behind it: this share of the depth, plus this multiple of
+# its longest standard deviation. Gaussians beneath a surface make its gloss: a lasso around a jacket covers
+# 0.85 of the visible part with a multiple of 1, and 0.94 with 3.
+_DEPTH_TOLERANCE = 0.01
+_EXTENT_TOLERANCE = 3.0
+_MIN_COVERAGE = 0.05  # cells with less opacity in all are background
+_MAX_CELLS = 1024  # cells per side of the grid in which a polygon is filled
 
 
 class Centers(NamedTuple):
-    """Where the centers of Gaussians are in a picture."""
+    """Projected centers of Gaussians."""
 
-    # pixels from the upper left corner; NaN where a center is not in front of the camera. [N,2]
+    # pixels from the upper left corner; NaN for centers that are not in front of the camera. [N,2]
     points: Floats
     depths: Floats  # camera z, world units. [N]
 
 
 def combine(mask: Mask, selection: Mask, mode: str) -> Mask:
-    """A selection after `selection` was selected as well, by one of `MODES`. [N]"""
+    """Combine the current mask with a new selection by one of `MODES`. [N]"""
     match mode:
         case "new":
             return selection
@@ -60,11 +62,11 @@ def combine(mask: Mask, selection: Mask, mode: str) -> Mask:
 
 
 def project_centers(scene: Gaussians, camera: Camera) -> Centers:
-    """Where `camera` sees the centers of a scene's Gaussians."""
+    """Project the centers of a scene into the picture of a camera."""
     viewmat = camera.viewmat.float().numpy()
     K = camera.K.float().numpy()
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        # by columns: a row at a time takes many times as long
+        # by columns, which is many times faster than by rows
         across, down, depths = viewmat[:3, :3] @ scene.means.numpy().T + viewmat[:3, 3:]
         inverse = np.where(depths > 0.0, 1.0 / depths, np.nan).astype(np.float32)
         points = np.stack([across * inverse * K[0, 0] + K[0, 2], down * inverse * K[1, 1] + K[1, 2]], axis=1)
@@ -72,7 +74,7 @@ def project_centers(scene: Gaussians, camera: Camera) -> Centers:
 
 
 def inside_rectangle(points: Floats, corner: ArrayLike, opposite: ArrayLike) -> Mask:
-    """The points [N,2] between two opposite corners [2], edges included. [N]"""
+    """Select the points [N,2] between two opposite corners [2], edges included. [N]"""
     low = np.minimum(corner, opposite)
     high = np.maximum(corner, opposite)
     x = points[:, 0]
@@ -81,13 +83,13 @@ def inside_rectangle(points: Floats, corner: ArrayLike, opposite: ArrayLike) -> 
 
 
 def inside_polygon(points: Floats, corners: ArrayLike) -> Mask:
-    """The points inside a polygon, also one that crosses itself (even-odd).
+    """Select the points inside a polygon by the even-odd rule. [N]
 
-    The polygon is filled into a grid; only points in cells near its edge are compared with each of its sides.
+    The polygon is filled into a grid. Only points in cells near its edge are tested against its sides.
 
     Args:
-        points: not finite ones are outside. [N,2]
-        corners: in order, closed by itself; fewer than three hold nothing. [K,2]
+        points: points; those that are not finite are outside. [N,2]
+        corners: corners in order, closed automatically; fewer than three select nothing. [K,2]
     """
     outline = np.asarray(corners, np.float64).reshape(-1, 2)
     mask = np.zeros(len(points), bool)
@@ -110,16 +112,16 @@ def inside_polygon(points: Floats, corners: ArrayLike) -> Mask:
 
 
 def inside_stroke(points: Floats, path: ArrayLike, radius: float) -> Mask:
-    """The points that a round brush touches.
+    """Select the points that a round brush touches. [N]
 
     Args:
-        points: not finite ones are outside. [N,2]
-        path: where the brush goes in straight lines, or stays where it is a single point. [K,2]
-        radius: of the brush, in the unit of the points
+        points: points; those that are not finite are outside. [N,2]
+        path: corners of the brush's path, or a single point. [K,2]
+        radius: radius of the brush, in the unit of the points
     """
-    way = np.asarray(path, np.float32).reshape(-1, 2)
+    corners = np.asarray(path, np.float32).reshape(-1, 2)
     mask = np.zeros(len(points), bool)
-    for start, end in pairwise(way if len(way) > 1 else [*way, *way]):
+    for start, end in pairwise(corners if len(corners) > 1 else [*corners, *corners]):
         box = inside_rectangle(points, np.minimum(start, end) - radius, np.maximum(start, end) + radius)
         rows = np.flatnonzero(box)
         x = points[rows, 0] - start[0]
@@ -131,20 +133,23 @@ def inside_stroke(points: Floats, path: ArrayLike, radius: float) -> Mask:
 
 
 def inside_ball(scene: Gaussians, center: ArrayLike, radius: float) -> Mask:
-    """The Gaussians whose center is at most `radius` world units from `center` [3]. [N]"""
+    """Select the Gaussians whose center is at most `radius` world units from `center` [3]. [N]"""
     away = scene.means.numpy() - np.asarray(center, np.float32)
     return np.asarray(np.einsum("ij,ij->i", away, away) <= radius * radius)
 
 
 def base_colors(scene: Gaussians) -> Floats:
-    """What color Gaussians have from no side in particular, OKLab. [N,3]"""
+    """Return the view-independent colors of Gaussians (SH band 0), OKLab. [N,3]"""
     with torch.no_grad():
         colors: Floats = srgb_to_oklab(sh0_to_rgb(scene.sh0).clamp(0.0, 1.0)).numpy()
     return colors
 
 
 def alike_in_color(colors: Floats, color: ArrayLike, tolerance: float) -> Mask:
-    """The colors [N,3] no farther than `tolerance` from one [3], all OKLab: .02 is hardly told apart. [N]"""
+    """Select the colors [N,3] within `tolerance` of a color [3], in OKLab. [N]
+
+    A distance of 0.02 is hardly visible.
+    """
     away = colors - np.asarray(color, np.float32)
     return np.asarray(np.einsum("ij,ij->i", away, away) <= tolerance * tolerance)
 
@@ -152,24 +157,25 @@ def alike_in_color(colors: Floats, color: ArrayLike, tolerance: float) -> Mask:
 def front_surface(
     scene: Gaussians, camera: Camera, centers: Centers, rows: NDArray[np.int64] | None = None
 ) -> Mask:
-    """Which Gaussians lie on what one sees, and not behind it.
+    """Select the Gaussians on the visible surface, not those behind it. [M]
 
-    A Gaussian belongs to the surface as far behind the depth that the picture has there as it reaches itself.
+    A Gaussian belongs to the surface if its center is not much farther behind the rendered depth than its own
+    extent.
 
     Args:
-        scene: as it is on screen
-        camera: of the picture
-        centers: of all its Gaussians, from `project_centers`
-        rows: those that are asked about, all if None; the fewer of the picture they take, the less it costs
+        scene: the scene on screen
+        camera: the viewing camera
+        centers: centers of all its Gaussians, from `project_centers`
+        rows: rows to test, all if None. The cost grows with the part of the picture that they cover. [M]
 
     Returns:
-        False also for what is not in front of the camera. [M]
+        Mask, False also for Gaussians that are not in front of the camera. [M]
     """
     part = slice(None) if rows is None else rows
     points = centers.points[part]
     depths = centers.depths[part]
-    width = max(camera.width // _COARSE, 1)
-    height = max(camera.height // _COARSE, 1)
+    width = max(camera.width // _DEPTH_DOWNSCALE, 1)
+    height = max(camera.height // _DEPTH_DOWNSCALE, 1)
     uv = points / np.array([camera.width / width, camera.height / height], np.float32)
     visible = np.asarray(np.isfinite(uv).all(axis=1))
     if not visible.any():
@@ -179,22 +185,24 @@ def front_surface(
     with torch.no_grad():
         z = torch.from_numpy(centers.depths)[:, None].nan_to_num().expand(-1, 3).contiguous()
         crop = (x0, y0, x1 + 1, y1 + 1)
-        image, clear, _ = render(scene, camera.resize(width, height), (0.0, 0.0, 0.0), colors=z, crop=crop)
-    covered = 1.0 - clear.numpy().reshape(y1 + 1 - y0, x1 + 1 - x0)
-    depth = np.where(covered > _COVERED, image[..., 0].numpy() / np.maximum(covered, 1e-6), np.inf)
+        image, transmittance, _ = render(
+            scene, camera.resize(width, height), (0.0, 0.0, 0.0), colors=z, crop=crop
+        )
+    covered = 1.0 - transmittance.numpy().reshape(y1 + 1 - y0, x1 + 1 - x0)
+    depth = np.where(covered > _MIN_COVERAGE, image[..., 0].numpy() / np.maximum(covered, 1e-6), np.inf)
     surface = depth[cells[:, 1] - y0, cells[:, 0] - x0]
     size = np.exp(scene.log_scales.numpy()[part].max(axis=1))
-    return np.asarray(visible & (depths <= surface * (1.0 + _BEHIND) + _OWN * size))
+    return np.asarray(visible & (depths <= surface * (1.0 + _DEPTH_TOLERANCE) + _EXTENT_TOLERANCE * size))
 
 
 class Surface:
-    """What a camera sees of a scene, for tools that ask more than once.
+    """Cache of projected centers, front surface and colors for one scene and camera.
 
-    Each thing is worked out when it is first asked for, by whichever thread; the scene must not change.
+    Each is computed on first use, from any thread. The scene must not change.
 
     Args:
-        scene: as it is on screen
-        camera: of the picture
+        scene: the scene on screen
+        camera: the viewing camera
     """
 
     def __init__(self, scene: Gaussians, camera: Camera) -> None:
@@ -207,34 +215,34 @@ class Surface:
 
     @property
     def centers(self) -> Centers:
-        """See `project_centers`."""
+        """Projected centers, see `project_centers`."""
         with self._lock:
             self._centers = self._centers or project_centers(self.scene, self.camera)
             return self._centers
 
     @property
     def colors(self) -> Floats:
-        """See `base_colors`. [N,3]"""
+        """View-independent colors, OKLab, see `base_colors`. [N,3]"""
         with self._lock:
             self._colors = base_colors(self.scene) if self._colors is None else self._colors
             return self._colors
 
     def front(self, rows: NDArray[np.int64]) -> Mask:
-        """See `front_surface`. [M]"""
+        """Select the rows on the front surface, see `front_surface`. [M]"""
         with self._lock:
             if self._front is not None:
                 return self._front[rows]
             return front_surface(self.scene, self.camera, self.centers, rows)
 
     def in_front(self, mask: Mask) -> Mask:
-        """What of a mask lies on what one sees. [N]"""
+        """Return the part of a mask that lies on the front surface. [N]"""
         rows = np.flatnonzero(mask)
         seen = np.zeros_like(mask)
         seen[rows] = self.front(rows)
         return seen
 
     def prepare(self, colors: bool = False) -> None:
-        """Work out the whole front, and the colors, ahead; until `drop`."""
+        """Compute the whole front surface, and optionally the colors, in advance. `drop` cancels it."""
         with self._lock, stopped_by(self._stop), suppress(StoppedError):
             if self._front is None:
                 self._front = front_surface(self.scene, self.camera, self.centers)
@@ -242,7 +250,7 @@ class Surface:
                 _ = self.colors
 
     def drop(self) -> None:
-        """Nobody will ask any more."""
+        """Cancel a running `prepare`; the cache is no longer needed."""
         self._stop.set()
 
 
@@ -252,7 +260,7 @@ _EDGE = 2
 
 
 def _fill(outline: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Which cells of a grid are outside or inside, or so near the edge that it takes a closer look."""
+    """Classify the cells of a grid as outside, inside or near the edge of a polygon in cell units. [H,W]"""
     width, height = (int(side) + 4 for side in outline.max(0))
     image = Image.new("L", (width, height), _OUTSIDE)
     draw = ImageDraw.Draw(image)
@@ -265,7 +273,7 @@ def _fill(outline: NDArray[np.float64]) -> NDArray[np.uint8]:
 
 
 def _crossings(points: NDArray[np.float64], outline: NDArray[np.float64]) -> NDArray[np.intp]:
-    """How many sides of a closed outline the ray from each point to the right crosses. [N]"""
+    """Count the sides of a closed outline that the ray from each point to the right crosses. [N]"""
     count = np.zeros(len(points), np.intp)
     order = np.argsort(points[:, 1])
     x, y = points[order].T

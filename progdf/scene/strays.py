@@ -1,10 +1,11 @@
-"""Strays of a capture: Gaussians that no picture draws, and those that stick out into empty space.
+"""Strays of a capture: Gaussians too faint to be drawn, and Gaussians that stick out into empty space.
 
-No size or distance is given: an outlier lies beyond Tukey's fence (Q3 + 1.5 IQR) of the scene's own
-logarithms, and only ratios of neighbors are compared, so moving or scaling a scene changes nothing.
+The search has no absolute size or distance. An outlier lies beyond Tukey's fence (Q3 + 1.5 IQR) of the
+logarithms of the scene, and distances are compared only with those of neighbors. So the result does not
+change if the scene is moved or scaled.
 
-The search takes about 5 s of processor for a million Gaussians: a neighborhood is measured only where a test
-needs it, and kept from round to round (see `_Body`).
+The search takes about 5 s of CPU time for a million Gaussians. Neighborhoods are measured only where a test
+needs them, and are cached between rounds (see `_Neighborhoods`).
 """
 
 from __future__ import annotations
@@ -31,39 +32,39 @@ Rows = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 INVISIBLE = 1 / 255
-"""Opacity under which no rasterizer draws a Gaussian: to leave these out changes no pixel."""
+"""Opacity below which no rasterizer draws a Gaussian. Removing such Gaussians changes no pixel."""
 
-_NEIGHBORS = 16
-_REACH = 2.0  # standard deviations along an axis: 95 % of a Gaussian lies within
-_FAR = 2.0  # times as far from others as these are from their own neighbors
-_ENOUGH = 64  # Gaussians; fewer have no distribution
-_SAMPLE = 20_000  # Gaussians whose ends tell the usual emptiness
-_EXACT = 200_000  # Gaussians; of more, a sample tells the usual loneliness
-_LONELY_SAMPLE = 5_000
-_WINDOW = 16  # rows before and after, in the order of the tree, that are compared at first
-_BLOCK = 20_000  # rows whose windows are compared at once, in the processor's cache
+_NEIGHBORS = 16  # nearest neighbors that make a neighborhood
+_EXTENT_SIGMAS = 2.0  # standard deviations along an axis, which hold 95 % of a Gaussian
+_ISOLATION_RATIO = 2.0  # smallest ratio of a stray's distance to the spacing of its neighbors
+_MIN_GAUSSIANS = 64  # Gaussians; fewer have no meaningful quartiles
+_EMPTINESS_SAMPLE = 20_000  # Gaussians whose ends define the usual emptiness
+_MAX_EXACT_GAUSSIANS = 200_000  # Gaussians; larger scenes define the usual loneliness by a sample
+_LONELINESS_SAMPLE = 5_000  # Gaussians in that sample
+_WINDOW = 16  # rows before and after in tree order that are compared first
+_BLOCK = 20_000  # rows compared at once, which fit the processor's cache
 _CHUNK = 200_000  # searches at once, which take 55 MB
-_VIEWS = 8
-_VIEW_PX = 384
-_GRAY = (0.5, 0.5, 0.5)  # a background on which neither black nor white fog is lost
+_VIEWS = 8  # views of `picture_difference`
+_VIEW_PX = 384  # their width and height, pixels
+_BACKGROUND = (0.5, 0.5, 0.5)  # background that shows both black and white fog
 
 
 @dataclass(frozen=True)
 class Strays:
-    """Rows of a scene by what is wrong with them; no row is in two. [M] int64 each, ascending"""
+    """Rows of the strays of a scene by kind, disjoint. [M] int64 each, ascending"""
 
     faint: Rows  # too transparent to be drawn, see `INVISIBLE`
-    giants: Rows  # unusually long, and the ends stick out into empty space
-    needles: Rows  # unusually thin for their length, likewise
-    floaters: Rows  # alone or a few together, far from all others
+    giants: Rows  # unusually long, with ends in empty space
+    needles: Rows  # unusually thin for their length, with ends in empty space
+    floaters: Rows  # isolated Gaussians and small groups, far from all others
 
     @property
     def rows(self) -> Rows:
-        """All of them, ascending. [M] int64"""
+        """Rows of all strays, ascending. [M] int64"""
         return np.sort(np.concatenate([self.faint, self.giants, self.needles, self.floaters]))
 
     def describe(self) -> str:
-        """Each kind there is with its count, for a person."""
+        """Return the kinds that occur and their counts as text."""
         kinds = ((self.giants, "giant"), (self.needles, "needle"), (self.floaters, "floater"))
         parts = [format_count(len(rows), kind) for rows, kind in kinds if len(rows)]
         if len(self.faint):
@@ -72,31 +73,36 @@ class Strays:
 
 
 def find_strays(scene: Gaussians) -> Strays:
-    """Find the strays of a scene whose numbers are finite, as `load_scene` makes them.
+    """Find the strays of a scene.
 
-    A giant or needle is two things: an outlier in the length of its longest axis, or in how much longer that
-    is than the middle one; and at an end of an axis (two standard deviations out) more than twice as far from
-    the nearest other Gaussian as that one or its 16 neighbors reach, and farther than is usual. A floater is
-    alone, or one of at most eight: its 16th neighbor is more than twice as far as its neighbors' are from
-    them, farther than is usual, and does not touch it. Sought until there are none: what stays has none.
+    A giant is an outlier in the length of its longest axis. A needle is an outlier in the ratio of the
+    longest axis to the middle one. For both, an end of an axis (two standard deviations out) must lie in
+    empty space. Its distance to the nearest other Gaussian must be more than twice the reach of that Gaussian
+    and of its 16 neighbors, and unusually large for the scene.
+
+    A floater is isolated or in a group of at most eight. Its 16th neighbor is more than twice as far away as
+    its neighbors' own 16th neighbors, unusually far for the scene, and does not touch it.
+
+    The search repeats until it finds no more strays.
 
     Args:
-        scene: N Gaussians; of fewer than 64 that are drawn, only faint ones are found
+        scene: N Gaussians with finite numbers, as from `load_scene`. With fewer than 64 drawn Gaussians, only
+            faint ones are found
     """
     drawn = (scene.opacities >= INVISIBLE).numpy()
     rows = np.flatnonzero(drawn)
     index = torch.from_numpy(rows)
     sizes = scene.log_scales[index].sort(dim=1).values.double().numpy()
-    body = _Body(scene.means[index].numpy(), _REACH * np.exp(sizes[:, 2]))
+    body = _Neighborhoods(scene.means[index].numpy(), _EXTENT_SIGMAS * np.exp(sizes[:, 2]))
     remaining = np.ones(len(rows), bool)
     strays_by_kind: dict[str, list[Rows]] = {"giants": [], "needles": [], "floaters": []}
-    while np.count_nonzero(remaining) >= _ENOUGH:
+    while np.count_nonzero(remaining) >= _MIN_GAUSSIANS:
         kinds = _find_once(scene, rows, sizes, body, remaining)
         strays = np.concatenate([*kinds.values()])
         if not len(strays):
             break
-        for kind, those in kinds.items():
-            strays_by_kind[kind].append(rows[those])
+        for kind, kind_rows in kinds.items():
+            strays_by_kind[kind].append(rows[kind_rows])
         remaining[strays] = False
     empty = np.zeros(0, np.int64)
     return Strays(
@@ -111,12 +117,12 @@ def clean(scene: Gaussians, strays: Strays) -> Gaussians:
 
 
 def picture_difference(before: Gaussians, after: Gaussians) -> tuple[float, float]:
-    """PSNR of `after` to `before` over views from all around, and of the view that differs most, dB.
+    """Return the PSNR of `after` to `before` over views from all sides, and that of the worst view, dB.
 
-    `NO_DIFFERENCE` where no pixel differs.
+    Both are `NO_DIFFERENCE` if no pixel differs.
 
     Args:
-        before: frames the views, by its bulk
+        before: the original; its bulk frames the views
         after: the same scene without some Gaussians
     """
     cameras = orbit_rig(before, _VIEWS, _VIEW_PX, _VIEW_PX)
@@ -126,19 +132,23 @@ def picture_difference(before: Gaussians, after: Gaussians) -> tuple[float, floa
 
 def _squared_error(a: Gaussians, b: Gaussians, camera: Camera) -> float:
     with torch.no_grad():
-        images = [render(scene, camera, _GRAY).image.clamp(0.0, 1.0).double() for scene in (a, b)]
+        images = [render(scene, camera, _BACKGROUND).image.clamp(0.0, 1.0).double() for scene in (a, b)]
     return float((images[0] - images[1]).square().mean())
 
 
-def _find_once(scene: Gaussians, drawn: Rows, sizes: Floats, body: _Body, remaining: Mask) -> dict[str, Rows]:
-    """Find the Gaussians that stick out of the rest, see `find_strays`; a suspect holds no other one up.
+def _find_once(
+    scene: Gaussians, drawn: Rows, sizes: Floats, body: _Neighborhoods, remaining: Mask
+) -> dict[str, Rows]:
+    """Find giants, needles and floaters once, see `find_strays`.
+
+    Suspected giants and needles do not count as neighbors of others.
 
     Args:
         scene: all Gaussians
-        drawn: rows of the N that are drawn; all other rows here count among these. [N]
+        drawn: rows of the N drawn Gaussians; the other arguments and the result index into these. [N]
         sizes: their log scales, ascending. [N,3]
         body: their neighborhoods
-        remaining: those that are no strays yet. [N]
+        remaining: drawn Gaussians that are not known as strays. [N]
     """
     longest = sizes[:, 2]
     thinness = sizes[:, 2] - sizes[:, 1]
@@ -146,12 +156,14 @@ def _find_once(scene: Gaussians, drawn: Rows, sizes: Floats, body: _Body, remain
     needle = remaining & (thinness > _fence(thinness[remaining])) & (longest > np.median(longest[remaining]))
     suspects = np.flatnonzero(giant | needle)
     body.set_members(remaining & ~giant & ~needle)
-    usual = body.emptiness(_ends(scene, drawn[body.sample(_SAMPLE)]))
-    outside = suspects[body.emptiness(_ends(scene, drawn[suspects])) > max(_fence(usual), np.log(_FAR))]
-    every = body.members if len(body.members) <= _EXACT else body.sample(_LONELY_SAMPLE)
-    least = max(_fence(body.loneliness(every)), np.log(_FAR))
+    usual = body.emptiness(_ends(scene, drawn[body.sample(_EMPTINESS_SAMPLE)]))
+    outside = suspects[
+        body.emptiness(_ends(scene, drawn[suspects])) > max(_fence(usual), np.log(_ISOLATION_RATIO))
+    ]
+    reference = body.members if len(body.members) <= _MAX_EXACT_GAUSSIANS else body.sample(_LONELINESS_SAMPLE)
+    min_loneliness = max(_fence(body.loneliness(reference)), np.log(_ISOLATION_RATIO))
     apart = body.find_isolated()
-    floaters = apart[body.loneliness(apart) > least]
+    floaters = apart[body.loneliness(apart) > min_loneliness]
     return {"giants": outside[giant[outside]], "needles": outside[~giant[outside]], "floaters": floaters}
 
 
@@ -159,7 +171,7 @@ def _ends(scene: Gaussians, rows: Rows) -> Floats:
     """Return the four ends of the two longer axes of some rows. [M] -> [M,4,3]"""
     some = scene[torch.from_numpy(rows)]
     order = some.log_scales.argsort(dim=1)[:, 1:]
-    lengths = _REACH * some.log_scales.gather(1, order).double().exp()
+    lengths = _EXTENT_SIGMAS * some.log_scales.gather(1, order).double().exp()
     axes = rotation_matrices(some.unit_quats.double())
     longer = axes.gather(2, order[:, None].expand(-1, 3, -1)).transpose(1, 2)
     tips = lengths[:, :, None] * longer
@@ -173,11 +185,11 @@ def _fence(values: Floats) -> float:
     return float(high + 1.5 * (high - low))
 
 
-class _Body:
-    """The neighborhoods of the Gaussians that hold others up.
+class _Neighborhoods:
+    """Cached neighborhoods of the Gaussians that are not suspected strays (the members).
 
-    The 16 nearest neighbors of a row are searched when they are first needed. Their distance is kept until a
-    member joins or leaves within it.
+    The 16 nearest neighbors of a row are searched when they are first needed. Their distance is cached until
+    a member joins or leaves within it.
 
     Args:
         points: means of N Gaussians. [N,3] float32
@@ -188,8 +200,8 @@ class _Body:
         self._points = points
         self._extents = extents
         self._is_member = np.zeros(len(points), bool)
-        self._spacing = np.full(len(points), np.nan)  # distance of the last of the 16 neighbors; NaN: unknown
-        self._touches = np.zeros(len(points), bool)  # one of the farther half of them; where that is known
+        self._spacing = np.full(len(points), np.nan)  # distance of the 16th neighbor; NaN: unknown
+        self._touches = np.zeros(len(points), bool)  # any of the farther 8 neighbors; valid where spacing is
         self.members: Rows = np.zeros(0, np.int64)
 
     def set_members(self, is_member: Mask) -> None:
@@ -209,7 +221,7 @@ class _Body:
         self._tree = PointTree(self._points[self.members], self._neighbors + 1)
 
     def sample(self, count: int) -> Rows:
-        """Return about so many members, or all of fewer; nearly the same ones after a change of members."""
+        """Return about `count` evenly spread members, nearly the same ones after a change of members."""
         rows = np.arange(0, len(self._points), -(-len(self._points) // count))
         return rows[self._is_member[rows]]
 
@@ -220,7 +232,7 @@ class _Body:
             ends: [M,4,3]
 
         Returns:
-            The most of the four. [M]
+            The largest of the four. [M]
         """
         distances, nearest = self._tree.query(ends.reshape(-1, 3), 1)
         near = self.members[nearest[:, 0]]
@@ -230,7 +242,7 @@ class _Body:
         return largest
 
     def loneliness(self, rows: Rows) -> Floats:
-        """Return the log of how much farther the neighbors of some members are than theirs. [M] -> [M]"""
+        """Return the log ratio of the spacing of members to the median of their neighbors'. [M] -> [M]"""
         lonely = [np.zeros(0)]
         for start in range(0, len(rows), _CHUNK):
             some = rows[start : start + _CHUNK]
@@ -246,9 +258,9 @@ class _Body:
         return rows[~self._touches[rows]]
 
     def _is_enclosed(self) -> Mask:
-        """Return the members that reach half of their neighbors, of rows near them in the tree. [M]
+        """Return a mask of members that reach over half of their neighbors, by rows near in tree order. [M]
 
-        This misses some: it finds 3 of 4 in a twentieth of the time that all searches take.
+        It finds 3 of 4 such members, in a twentieth of the time of all searches.
         """
         order = self._tree.order
         enclosed = np.zeros(len(order), bool)
@@ -272,7 +284,7 @@ class _Body:
         return enclosed
 
     def _spacing_of(self, rows: Rows) -> Floats:
-        """Return the distance to the last neighbor of some members, at least 1e-30. [M] -> [M]"""
+        """Return the distance to the 16th neighbor of some members, at least 1e-30. [M] -> [M]"""
         needed = np.zeros(len(self._points), bool)
         needed[rows] = np.isnan(self._spacing[rows])
         unknown = np.flatnonzero(needed)

@@ -1,8 +1,8 @@
-"""What a picture of a scene is about, and where to stand to see it.
+"""Subject of a scene and the camera that frames it.
 
-The subject is what stands on the ground: neither the ground nor what floats far off. A ground is a smooth
-surface under most of the scene, wider than what stands on it. Things are measured in cells of space, so that
-neither a lawn's many blades nor a sky's few giants decide.
+The subject is the group of objects that stand on the ground, without the ground and without far floaters. A
+ground is a smooth surface under most of the scene, wider than the objects on it. Objects are measured in
+cells of space, so that neither a lawn's many blades nor a sky's few giants decide.
 """
 
 from __future__ import annotations
@@ -19,54 +19,44 @@ from progdf.gaussians import Gaussians
 from .bounds import front_direction, has_ceiling, has_long_tail, quantile
 from .neighbors import join_pairs
 
-_SAMPLE = 60_000
-_ENOUGH = 64
-_SOLID = 0.1
-"""Opacity below which a Gaussian is haze."""
+_MAX_SAMPLED_ROWS = 60_000  # Gaussians; larger scenes are sampled evenly
+_MIN_GAUSSIANS = 64  # Gaussians; fewer do not define a shape
+_MIN_SOLID_OPACITY = 0.1  # opacity; less opaque Gaussians are haze
+_CORE_RADIUS = 2.5  # median distances from the middle; Gaussians farther away are background
 
-_CORE = 2.5
-"""Of the median distance: what lies farther is background, where a scene has any."""
+_PLAN_CELLS = 24  # cells along each side of the ground plan
+_STANDING_HEIGHT = 0.05  # half diagonals of the plan; Gaussians higher above the ground stand on it
 
-_PLAN = 24
-_ABOVE = 0.05
-"""Of the plan's half diagonal: so far above the ground begins what stands on it."""
+_MAX_SHARE_BELOW = 0.03  # largest share of the scene below a ground
+_MIN_GROUND_CELLS = 0.5  # smallest share of the plan's cells in which the lowest Gaussians lie on the ground
+_MAX_COVERED_CELLS = 0.6  # largest share of the plan's cells covered by Gaussians that stand on the ground
 
-_UNDER = 0.03
-_SHOWN = 0.5
-_COVERED = 0.6
-"""A ground has no more of the scene under it, shows in no fewer cells of the plan, and what stands on it
-covers no more of them."""
+_GROUND_QUANTILE = 0.01  # share of a scene below its ground: strays, and the far side of soft surfaces
 
-_FEET = 0.01
-"""Share of a scene that lies under its ground: strays, and the far side of what is soft."""
+_OCCLUSION_SAMPLE = 8_000  # Gaussians that are tested for occlusion
 
-_LOOKED_AT = 8_000
-"""Gaussians of which is asked what hides them."""
+_MIN_CLEARANCE = 0.2  # smallest distance of the eye to any Gaussian in a room, in half widths of the room
+_MIN_VISIBILITY_RATIO = 1.5  # a first picture leaves the front if another side shows this many times as much
 
-_FREE = 0.2
-_RICHER = 1.5
-"""One stands no nearer to anything than a fifth of the room's half width; and a first picture leaves the
-front where another side shows half as much again."""
-
-_ACROSS = 32
-_MINIMUM = 0.06
-"""Of the cells of the largest thing: what fills fewer is a tuft or a stray. The toy robot's hands fill .11 of
-its body's, the largest tuft of its ground .03."""
+_CELLS_ACROSS = 32  # cells of space along the longest side of the scene
+# Share of the largest object's cells; smaller objects are tufts or strays. The toy robot's hands fill 0.11 of
+# its body's, the largest tuft of its ground 0.03.
+_MIN_OBJECT_SHARE = 0.06
 
 
 def subject_rows(scene: Gaussians, up: Tensor) -> Tensor:
-    """The Gaussians that the first picture of a scene should be filled by.
+    """Return the Gaussians of the subject, which the first picture of a scene should frame.
 
     Args:
-        scene: N Gaussians, finite; of many an even sample is looked at
+        scene: N finite Gaussians; large scenes are sampled evenly
         up: see `up_axis.guess_up`. [3]
 
     Returns:
-        Sorted rows, at least one where there is one at all. [M] int64
+        Sorted rows, at least one unless the scene is empty. [M] int64
     """
     rows = _sample(scene)
-    solid = rows[scene.opacities[rows] > _SOLID]
-    if len(solid) < _ENOUGH:
+    solid = rows[scene.opacities[rows] > _MIN_SOLID_OPACITY]
+    if len(solid) < _MIN_GAUSSIANS:
         return rows
     rows = _without_background(scene, solid)
     height, plan = _heights_and_plan(scene.means[rows], up)
@@ -76,25 +66,25 @@ def subject_rows(scene: Gaussians, up: Tensor) -> Tensor:
         height = height[standing]
         plan = plan[standing]
     elif len(rows) < len(solid) and not has_long_tail(scene.means[solid]):
-        rows = solid  # what is far out is no background, but a guitar's neck
+        rows = solid  # far Gaussians without a long tail are a part of the object, such as a guitar's neck
         height, plan = _heights_and_plan(scene.means[rows], up)
-    return rows[_rows_of_large_things(torch.cat([plan, height[:, None]], dim=1))]
+    return rows[_rows_of_large_objects(torch.cat([plan, height[:, None]], dim=1))]
 
 
 def fit_eye(points: Tensor, radius: float, axes: Tensor, tangents: tuple[float, float]) -> Tensor:
-    """Where the eye stands that looks along −back and has the points in its picture, as near as can be. [3]
+    """Return the nearest eye position that looks along −back and has the points in its picture. [3]
 
     Args:
-        points: to be seen, world units; all but a half per cent on each side are. [P,3], P ≥ 1
-        radius: of a ball about each point, world units
-        axes: rows right, up and back (from the scene to the eye) of the picture, unit vectors. [3,3]
-        tangents: of half the angle that is to be filled, along the width and along the height
+        points: points to frame, world units; 0.5 % on each side may lie outside. [P,3], P ≥ 1
+        radius: radius of a ball around each point, world units
+        axes: unit vectors right, up and back (from the scene to the eye) of the picture, as rows. [3,3]
+        tangents: tangents of half the angle to fill, along the width and along the height
     """
     right, up, back = (points.double() @ axes.double().T).unbind(1)
     best = []
     away = -math.inf
     for along, tangent in ((right, tangents[0]), (up, tangents[1])):
-        # |along − place| ≤ tangent · (away − back) for every point: two planes, which meet at the eye
+        # |along − eye| ≤ tangent · (away − back) for every point: two planes that meet at the eye
         margin = radius * math.sqrt(1 + tangent**2)
         high = float(quantile(along + tangent * back, 0.995)) + margin
         low = float(quantile(tangent * back - along, 0.995)) + margin
@@ -111,15 +101,15 @@ def fit_camera(
     fov: float,
     filled: float,
 ) -> Camera:
-    """A camera that what the scene is about fills; as `progdf render --orbit`.
+    """Return a camera that frames the subject of a scene, as for `progdf render --orbit`.
 
     Args:
-        scene: what the picture is of
-        up: [3]
+        scene: the scene to frame
+        up: world direction that is up. [3]
         turn: azimuth and elevation of the eye, degrees, see `front_direction`
         size: width and height, pixels
-        fov: vertical, radians
-        filled: share of the picture, 0..1
+        fov: vertical field of view, radians
+        filled: share of the picture's width or height that the subject fills, 0 to 1
     """
     ahead, (around, above) = front_direction(up), map(math.radians, turn)
     level = math.cos(around) * ahead + math.sin(around) * torch.linalg.cross(up, ahead)
@@ -133,15 +123,15 @@ def fit_camera(
 
 
 def is_room(scene: Gaussians, up: Tensor) -> bool:
-    """Whether a ceiling, which a sky far above is not, covers most of it: it can be seen from inside only."""
+    """Return whether a ceiling hides the scene from outside. A far sky is background and no ceiling."""
     return has_ceiling(scene[_without_background(scene, _sample(scene))], up)
 
 
 def standpoint(scene: Gaussians, up: Tensor) -> tuple[Tensor, Tensor]:
-    """Where to stand inside a room, and what to look at: from free space, at the height of eyes, at the most.
+    """Return the eye and target inside a room that show the most, from free space at eye height.
 
     Returns:
-        eye [3], target [3]
+        Eye [3] and target [3], world units.
     """
     means = scene.means[_sample(scene)]
     ahead = front_direction(up)
@@ -151,56 +141,58 @@ def standpoint(scene: Gaussians, up: Tensor) -> tuple[Tensor, Tensor]:
     low, high = (torch.stack([quantile(c, q) for c in inside.unbind(1)]) for q in (0.02, 0.98))
     center = 0.5 * (low + high)
     half = 0.5 * (high - low)
-    some = inside[:: -(-len(inside) // _LOOKED_AT)]
-    near = _FREE * float(half[:2].min())
-    most = -1.0
+    sampled = inside[:: -(-len(inside) // _OCCLUSION_SAMPLE)]
+    near = _MIN_CLEARANCE * float(half[:2].min())
+    best_score = -1.0
     view = (center, center + torch.tensor([float(half[0]), 0.0, 0.0]))
     for offset in torch.cartesian_prod(*[torch.linspace(-0.75, 0.75, 5)] * 2):
         candidate = center + half * torch.cat([offset, torch.tensor([0.2])])
-        free = float((some - candidate).norm(dim=1).min()) > near
+        free = float((sampled - candidate).norm(dim=1).min()) > near
         for turn in range(12):
             angle = math.radians(30 * turn)
             back = torch.tensor([math.cos(angle), math.sin(angle), 0.0])
-            seen = _visible(some - candidate, back, wide=1.0).sum() / len(some) + float(free)
-            if float(seen) > most:
-                most = float(seen)
+            seen = _unoccluded(sampled - candidate, back, wide=1.0).sum() / len(sampled) + float(free)
+            if float(seen) > best_score:
+                best_score = float(seen)
                 view = (candidate, candidate - float(half[:2].min()) * back)
     eye, target = view
     return middle + eye @ axes, middle + (target - torch.tensor([0.0, 0.0, 0.1 * float(half[2])])) @ axes
 
 
 def richest_turn(scene: Gaussians, up: Tensor, azimuth: float, elevation: float) -> float:
-    """By how many degrees to turn from an azimuth to where much more of the subject is seen: of what is open
-    or solid on one side only, as an alcove or a face; 0 where no side shows half as much again.
+    """Return the angle from an azimuth to the side that shows most of the subject, degrees.
+
+    It finds the side of subjects such as an alcove or a face, which are open or solid on one side only. It is
+    0 unless that side shows at least 1.5 times as much.
 
     Args:
-        scene: what the picture is to be filled by
-        up: [3]
-        azimuth, elevation: of the eye, degrees, see `front_direction`
+        scene: Gaussians of the subject
+        up: world direction that is up. [3]
+        azimuth, elevation: direction of the eye, degrees, see `front_direction`
     """
-    if len(scene) < _ENOUGH:
+    if len(scene) < _MIN_GAUSSIANS:
         return 0.0
-    means = scene.means[:: -(-len(scene) // _LOOKED_AT)]
+    means = scene.means[:: -(-len(scene) // _OCCLUSION_SAMPLE)]
     ahead = front_direction(up)
-    places = (means - means.median(dim=0).values) @ torch.stack([ahead, torch.linalg.cross(up, ahead), up]).T
+    points = (means - means.median(dim=0).values) @ torch.stack([ahead, torch.linalg.cross(up, ahead), up]).T
     above = math.radians(elevation)
     shares = []
     for turn in range(8):
         around = math.radians(azimuth + 45 * turn)
         level = math.cos(above)
         back = torch.tensor([level * math.cos(around), level * math.sin(around), math.sin(above)])
-        shares.append(float(_visible(places, back).float().mean()))
+        shares.append(float(_unoccluded(points, back).float().mean()))
     best = max(range(8), key=lambda turn: shares[turn])
-    return 45.0 * ((best + 4) % 8 - 4) if shares[best] >= _RICHER * shares[0] else 0.0
+    return 45.0 * ((best + 4) % 8 - 4) if shares[best] >= _MIN_VISIBILITY_RATIO * shares[0] else 0.0
 
 
-def _visible(places: Tensor, back: Tensor, wide: float = 0.0) -> Tensor:
-    """Which places nothing hides in a picture of 24 x 24 cells. [P,3] -> [P] bool
+def _unoccluded(places: Tensor, back: Tensor, wide: float = 0.0) -> Tensor:
+    """Return the points that are not occluded in a picture of 24 x 24 cells. [P,3] -> [P] bool
 
     Args:
-        places: about the eye, or of a picture from infinitely far about the middle; z up
-        back: from what is seen to the eye, unit length, not straight up. [3]
-        wide: tangent of half the angle that is seen; 0 of a picture from infinitely far
+        places: points with z up, relative to the eye, or to the middle for an orthographic picture
+        back: unit vector from the scene to the eye, not straight up. [3]
+        wide: tangent of half the field of view; 0 for an orthographic picture
     """
     right = torch.nn.functional.normalize(torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0]), back), dim=0)
     x, y, depth = (places @ torch.stack([right, torch.linalg.cross(back, right), -back]).T).unbind(1)
@@ -217,29 +209,29 @@ def _visible(places: Tensor, back: Tensor, wide: float = 0.0) -> Tensor:
 
 
 def ground_height(scene: Gaussians, up: Tensor) -> float:
-    """How high along `up` a scene's ground lies, or the feet of what stands in it; world units.
+    """Return the height of a scene's ground, or of its lowest objects, along `up`; world units.
 
-    Strays below do not count; of a scene without anything solid, 0.
+    Strays below do not count. The height of a scene without solid Gaussians is 0.
     """
     rows = _sample(scene)
-    solid = rows[scene.opacities[rows] > _SOLID]
+    solid = rows[scene.opacities[rows] > _MIN_SOLID_OPACITY]
     if not len(solid):
         return 0.0
     visible = scene[_without_background(scene, solid)]
-    height = float(quantile(visible.means @ up, _FEET))
+    height = float(quantile(visible.means @ up, _GROUND_QUANTILE))
     return height if math.isfinite(height) else 0.0
 
 
 def _sample(scene: Gaussians) -> Tensor:
-    return torch.arange(0, len(scene), max(1, -(-len(scene) // _SAMPLE)))
+    return torch.arange(0, len(scene), max(1, -(-len(scene) // _MAX_SAMPLED_ROWS)))
 
 
 def _without_background(scene: Gaussians, rows: Tensor) -> Tensor:
-    """Without shells of sky, mountains, strays; a scene that has none stays whole."""
+    """Return the rows without background such as sky, mountains and strays, if there is any."""
     for _ in range(3):
         means = scene.means[rows]
         distances = (means - means.median(dim=0).values).norm(dim=1)
-        core = distances <= _CORE * distances.median()
+        core = distances <= _CORE_RADIUS * distances.median()
         if bool(core.all()):
             break
         rows = rows[core]
@@ -247,7 +239,7 @@ def _without_background(scene: Gaussians, rows: Tensor) -> Tensor:
 
 
 def _heights_and_plan(means: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
-    """Heights [R] and places in plan [R,2], both over the plan's half diagonal, the plan about its middle."""
+    """Return heights [R] and positions in plan [R,2], centered, in units of the plan's half diagonal."""
     ahead = front_direction(up)
     plan = means @ torch.stack([ahead, torch.linalg.cross(up, ahead)], dim=1)
     low, high = (torch.stack([quantile(c, q) for c in plan.unbind(1)]) for q in (0.01, 0.99))
@@ -257,66 +249,71 @@ def _heights_and_plan(means: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _rows_above_ground(height: Tensor, plan: Tensor) -> Tensor | None:
-    """Which rows stand above a ground. [R], [R,2] -> [R] bool; None where there is no ground to speak of."""
-    cells = ((plan + 1.0) * 0.5 * _PLAN).long().clamp(0, _PLAN - 1)
+    """Return the rows that stand above a ground. [R], [R,2] -> [R] bool; None if there is no ground."""
+    cells = ((plan + 1.0) * 0.5 * _PLAN_CELLS).long().clamp(0, _PLAN_CELLS - 1)
     taken, cell, counts = torch.unique(
-        cells[:, 0] * _PLAN + cells[:, 1], return_inverse=True, return_counts=True
+        cells[:, 0] * _PLAN_CELLS + cells[:, 1], return_inverse=True, return_counts=True
     )
-    form = _powers(plan)
+    form = _monomials(plan)
     if len(taken) < form.shape[1]:
         return None
     order = torch.argsort(height, stable=True)
-    order = order[torch.argsort(cell[order], stable=True)]  # by cell, from low to high in each
+    order = order[torch.argsort(cell[order], stable=True)]  # by cell, ascending in each
     lowest = order[counts.cumsum(0) - counts + counts // 10]
-    ground = form @ _ground(height[lowest], form[lowest])
+    ground = form @ _fit_ground(height[lowest], form[lowest])
     above = height - ground
-    standing = above > _ABOVE
+    standing = above > _STANDING_HEIGHT
     covered = torch.zeros(len(taken)).index_add(0, cell, standing.float()) > 0.1 * counts
     on_ground = (
-        int(standing.sum()) >= _ENOUGH
-        and float((above < -_ABOVE).float().mean()) <= _UNDER
-        and float((above[lowest].abs() < _ABOVE).float().mean()) >= _SHOWN
-        and float(covered.float().mean()) <= _COVERED
+        int(standing.sum()) >= _MIN_GAUSSIANS
+        and float((above < -_STANDING_HEIGHT).float().mean()) <= _MAX_SHARE_BELOW
+        and float((above[lowest].abs() < _STANDING_HEIGHT).float().mean()) >= _MIN_GROUND_CELLS
+        and float(covered.float().mean()) <= _MAX_COVERED_CELLS
     )
     return standing if on_ground else None
 
 
-def _ground(low: Tensor, form: Tensor) -> Tensor:
-    """The surface through the low points of most cells of the plan. [Q], [Q,6] -> coefficients [6]
+def _fit_ground(low: Tensor, form: Tensor) -> Tensor:
+    """Fit the surface through the low points of most cells of the plan. [Q], [Q,6] -> coefficients [6]
 
-    Robust regression (Cauchy weights), in which what lies above the surface counts for less: under what
-    stands no ground shows.
+    A robust regression (Cauchy weights) gives points above the surface less weight, because objects hide the
+    ground under them.
     """
     weights = torch.ones_like(low)
     for _ in range(20):
-        # numpy's own: torch's threads spin over a few hundred rows, and this is in the way of a first picture
+        # numpy: torch's threads spin over a few hundred rows, and the first picture waits for this
         fit = np.linalg.lstsq((form * weights[:, None]).numpy(), (low * weights).numpy(), rcond=None)
         surface = torch.from_numpy(fit[0])
         residual = low - form @ surface
-        weights = 1.0 / (1.0 + (residual / torch.where(residual > 0, 0.5 * _ABOVE, _ABOVE)) ** 2)
+        weights = 1.0 / (
+            1.0 + (residual / torch.where(residual > 0, 0.5 * _STANDING_HEIGHT, _STANDING_HEIGHT)) ** 2
+        )
     return surface
 
 
-def _powers(plan: Tensor) -> Tensor:
-    """Of the second order: level, slope (up is known to an axis only), hill or hollow. [R,2] -> [R,6]"""
+def _monomials(plan: Tensor) -> Tensor:
+    """Return the monomials of degree 0 to 2. [R,2] -> [R,6]
+
+    They model the level, the slope (up is known only to an axis), and a hill or hollow.
+    """
     x, y = plan.unbind(1)
     return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], dim=1)
 
 
-def _rows_of_large_things(places: Tensor) -> Tensor:
-    """Which rows belong to large connected things. [R,3] -> [R] bool, at least one"""
+def _rows_of_large_objects(places: Tensor) -> Tensor:
+    """Return the rows of large connected objects. [R,3] -> [R] bool, at least one"""
     low, high = (torch.stack([quantile(c, q) for c in places.unbind(1)]) for q in (0.01, 0.99))
-    side = float((high - low).amax().clamp_min(1e-9)) / _ACROSS
-    span = 2 * _ACROSS + 2
-    keys = ((places - low) / side + 0.5 * _ACROSS).clamp(0, span - 3).long() + 1
+    side = float((high - low).amax().clamp_min(1e-9)) / _CELLS_ACROSS
+    span = 2 * _CELLS_ACROSS + 2
+    keys = ((places - low) / side + 0.5 * _CELLS_ACROSS).clamp(0, span - 3).long() + 1
     boxes, box = torch.unique((keys[:, 0] * span + keys[:, 1]) * span + keys[:, 2], return_inverse=True)
-    thing = _connected_cells(boxes, span)
-    size = torch.zeros(len(boxes)).index_add(0, thing, torch.ones(len(boxes)))
-    return (size[thing] >= _MINIMUM * size.max())[box]
+    objects = _connected_cells(boxes, span)
+    size = torch.zeros(len(boxes)).index_add(0, objects, torch.ones(len(boxes)))
+    return (size[objects] >= _MIN_OBJECT_SHARE * size.max())[box]
 
 
 def _connected_cells(boxes: Tensor, span: int) -> Tensor:
-    """Which thing each cell belongs to; cells that touch, corners included, are one. [B] ascending -> [B]"""
+    """Return each cell's object; cells that touch, corners included, are one. [B] ascending -> [B]"""
     steps = torch.tensor([-1, 0, 1])
     around = boxes[:, None] + ((steps[:, None, None] * span + steps[:, None]) * span + steps).flatten()
     box = torch.searchsorted(boxes, around).clamp_max(len(boxes) - 1)

@@ -1,4 +1,8 @@
-"""Which way is up in a scene: as a person says, cameras are held, or the scene's own shape tells."""
+"""Up axis of a scene, from the user's choice, the cameras or the scene's shape.
+
+The shape is evaluated for each axis, and for the normal of a tilted ground plane. Several kinds of evidence
+and the usual conventions add up to a likelihood per direction, in nats.
+"""
 
 from __future__ import annotations
 
@@ -26,12 +30,12 @@ from .bounds import drop_background, front_direction, long_axes, normals_of
 from .scene_cameras import scene_cameras_beside
 
 MAX_REMEMBERED = 200
-"""Scenes that are remembered; the oldest go."""
+"""Number of scenes whose up axis is remembered; older entries are dropped."""
 
 
 def find_chosen_up(scene: Gaussians) -> Tensor | None:
-    """What was chosen for a scene, [3] unit length; None where nothing was."""
-    known = _read()
+    """Return the up axis that the user chose for a scene earlier, or None. [3] unit length"""
+    known = _read_choices()
     numbers = known.get(fingerprint(scene).means_sha256) if known else None
     try:
         up = torch.tensor(numbers, dtype=torch.float32)
@@ -42,40 +46,41 @@ def find_chosen_up(scene: Gaussians) -> Tensor | None:
 
 
 def remember_chosen_up(scene: Gaussians, up: tuple[float, float, float]) -> None:
-    """Keep what was chosen for a scene; what cannot be written is not remembered."""
+    """Remember the up axis chosen for a scene. A file that cannot be written is ignored."""
     key = fingerprint(scene).means_sha256
-    remembered = {name: known for name, known in _read().items() if name != key} | {key: list(up)}
+    remembered = {name: known for name, known in _read_choices().items() if name != key} | {key: list(up)}
     with contextlib.suppress(OSError):
-        _place().parent.mkdir(parents=True, exist_ok=True)
-        write_file(_place(), json.dumps(dict([*remembered.items()][-MAX_REMEMBERED:])))
+        _choices_file().parent.mkdir(parents=True, exist_ok=True)
+        write_file(_choices_file(), json.dumps(dict([*remembered.items()][-MAX_REMEMBERED:])))
 
 
-def _read() -> dict[str, object]:
+def _read_choices() -> dict[str, object]:
     try:
-        known = decode_json(_place().read_bytes())
+        known = decode_json(_choices_file().read_bytes())
     except (OSError, ValueError):
         return {}
     return known if isinstance(known, dict) else {}
 
 
-def _place() -> Path:
+def _choices_file() -> Path:
     return state_folder() / "up_axes.json"
 
 
 AXES: tuple[Axis, ...] = get_args(Axis)
 
-_LEVEL = math.cos(math.radians(2.0))
-"""Cameras' up within two degrees of an axis is that axis: nobody holds a camera straighter."""
+_LEVEL_COSINE = math.cos(math.radians(2.0))
+"""Cosine of 2°. A mean camera up this close to an axis becomes that axis, as hand-held cameras are no
+straighter."""
 
-_SHARES = {"-y": 0.66, "+y": 0.12, "+z": 0.10}
-"""Of 43 public captures, how many have which axis up; the other three have a fortieth each."""
+_AXIS_SHARES = {"-y": 0.66, "+y": 0.12, "+z": 0.10}
+"""Share of 43 public captures with each axis up. The other three axes have 0.04 each."""
 
-_ODDS = 6.0
-"""Times as likely as the next direction (45° or more away) has to be what is taken without a question: more
-than the convention makes it alone."""
+_MIN_ODDS = 6.0
+"""Odds against the next direction, at least 45° away, from which the result is certain. They are more
+than the convention alone can give."""
 
-_TOLD = 0.3
-"""Nats from which a reason is said: a third likelier."""
+_MIN_REASON_NATS = 0.3
+"""Smallest evidence in nats that is reported as a reason: a factor of 1.35."""
 
 _WEIGHTS = {
     "vertical edges": 2.6,
@@ -85,48 +90,49 @@ _WEIGHTS = {
     "faint strays below": 0.7,
     "ground plane": 20.0,
 }
-"""Of each kind of evidence in `_Shape.evidence`, in nats: a logistic regression over 21 public captures
-and the two demo scenes, in which a direction is told from the five others."""
+"""Weight in nats of each kind of evidence in `_Shape.evidence`. They come from a logistic regression over 21
+public captures and the two demo scenes, which separates the up direction from the other five."""
 
-_WALLED = 0.04
-"""Ground planes of at least so much across all six directions are a room: what edges, foot and underside tell
-of a thing seen from outside says nothing there."""
+_ROOM_EVIDENCE = 0.04
+"""Ground plane evidence that, in all six directions, indicates a room. The other evidence assumes an object
+seen from outside and is ignored there."""
 
-_ROWS = 20_000
-"""Gaussians that are looked at: an even sample, the same each time."""
+_MAX_SAMPLED_ROWS = 20_000
+"""Number of Gaussians in the even, deterministic sample."""
 
-_SNAP = math.cos(math.radians(5.0))
-"""A ground within five degrees of an axis is level: a captured floor is bent by as much."""
+_SNAP_COSINE = math.cos(math.radians(5.0))
+"""Cosine of 5°. A ground normal this close to an axis counts as that axis, as captured floors are bent by as
+much."""
 
 
 @dataclass(frozen=True)
 class UpAxis:
-    """Which way is up, and how that was decided."""
+    """Up direction of a scene and the reason for it."""
 
     direction: Tensor  # in the world, unit length. [3] float32
-    reason: str  # for a person, as "as the cameras are held"
-    certain: bool = True  # a person or cameras said, or the shape tells clearly
-    candidates: tuple[Tensor, ...] = ()  # where the shape decided: all directions, the likeliest first
+    reason: str  # text for the user, such as "as the cameras are held"
+    certain: bool = True  # set by the user or cameras, or clear from the shape
+    candidates: tuple[Tensor, ...] = ()  # all directions, likeliest first; only if the shape decided
 
     @property
     def name(self) -> str:
-        """The axis, as "-y"; of another direction its three numbers."""
+        """Name of the axis, such as "-y", or the three numbers of another direction."""
         return direction_name(self.direction)
 
     def to_json(self) -> dict[str, object]:
-        """As JSON values, for reports and .gdf files."""
+        """Return JSON values for reports and .gdf files."""
         return {"direction": [float(x) for x in self.direction], "reason": self.reason}
 
 
 def axis_direction(axis: str) -> Tensor:
-    """The unit vector of "+x" … "-z". [3] float32"""
+    """Return the unit vector of "+x" … "-z". [3] float32"""
     direction = torch.zeros(3)
     direction["xyz".index(axis[1])] = 1.0 if axis[0] == "+" else -1.0
     return direction
 
 
 def direction_name(direction: Tensor) -> str:
-    """The axis that a unit vector lies along, as "-y"; else its three numbers. [3]"""
+    """Return the axis along a unit vector, such as "-y", or else its three numbers. [3]"""
     axis = int(direction.abs().argmax())
     if float(direction.abs()[axis]) > 0.99999:
         return ("-" if float(direction[axis]) < 0 else "+") + "xyz"[axis]
@@ -153,110 +159,111 @@ def find_up(
     """
     if choice != "auto":
         return UpAxis(axis_direction(choice), "as --up says")
-    if (up := _held_up(cameras)) is not None:
+    if (up := _mean_camera_up(cameras)) is not None:
         return UpAxis(up, "as the cameras are held")
     if (chosen := find_chosen_up(scene)) is not None:
         return UpAxis(chosen, "as was chosen for this scene before")
     view = PlyView() if path is None else stored_view(path, scene.origin)
     if view.up is not None:
-        return UpAxis(_snap(view.up, _LEVEL), f"as the comment '{view.up_comment}' in the file says")
-    if view.camera is not None and (up := _held_up([view.camera])) is not None:
+        return UpAxis(_snap(view.up, _LEVEL_COSINE), f"as the comment '{view.up_comment}' in the file says")
+    if view.camera is not None and (up := _mean_camera_up([view.camera])) is not None:
         return UpAxis(up, "as the camera stored in the file is held")
     beside = [] if path is None or not len(scene) else scene_cameras_beside(path, scene)
-    if (up := _held_up(beside)) is not None:
+    if (up := _mean_camera_up(beside)) is not None:
         return UpAxis(up, f"as the {len(beside)} cameras beside the scene's file are held")
-    return _weigh(scene)
+    return _up_by_shape(scene)
 
 
 def guess_up(scene: Gaussians, cameras: Sequence[Camera] = ()) -> Tensor:
-    """The direction of `find_up`. [3] float32, unit length"""
+    """Return the direction of `find_up`. [3] float32, unit length"""
     return find_up(scene, cameras).direction
 
 
-def _held_up(cameras: Sequence[Camera]) -> Tensor | None:
-    """The mean up of cameras; None where there are none, or they disagree. [3]"""
+def _mean_camera_up(cameras: Sequence[Camera]) -> Tensor | None:
+    """Return the mean up of cameras; None if there are none or they disagree. [3]"""
     if not cameras:
         return None
     mean = torch.stack([-camera.viewmat[1, :3] for camera in cameras]).mean(dim=0)
-    return _snap(torch.nn.functional.normalize(mean, dim=0), _LEVEL) if float(mean.norm()) > 0.5 else None
+    return (
+        _snap(torch.nn.functional.normalize(mean, dim=0), _LEVEL_COSINE) if float(mean.norm()) > 0.5 else None
+    )
 
 
 def _snap(direction: Tensor, cosine: float) -> Tensor:
-    """The axis that is as near as this; else the direction itself. [3]"""
+    """Return the axis within an angle, given by its cosine, of a direction; else the direction itself. [3]"""
     axis = direction.abs().argmax()
     if float(direction.abs()[axis]) <= cosine:
         return direction
     return torch.zeros(3).index_fill(0, axis, math.copysign(1.0, float(direction[axis])))
 
 
-def _weigh(scene: Gaussians) -> UpAxis:
-    """What the shape and the convention together make likeliest."""
+def _up_by_shape(scene: Gaussians) -> UpAxis:
+    """Return the likeliest up direction by the scene's shape and by convention."""
     shape = _shape_of(scene)
     if shape is None:
-        why = "by convention, as too little is there to tell; --up says otherwise"
-        usual = sorted((axis_direction(axis) for axis in AXES), key=_convention, reverse=True)
-        return UpAxis(usual[0], why, certain=False, candidates=tuple(usual))
+        reason = "by convention, as too little is there to tell; --up says otherwise"
+        axes_by_prior = sorted((axis_direction(axis) for axis in AXES), key=_log_prior, reverse=True)
+        return UpAxis(axes_by_prior[0], reason, certain=False, candidates=tuple(axes_by_prior))
     directions = [axis_direction(axis) for axis in AXES]
     shape_signs = [shape.evidence(direction) for direction in directions]
-    walled = min(evidence["ground plane"] for evidence in shape_signs) >= _WALLED
+    is_room = min(evidence["ground plane"] for evidence in shape_signs) >= _ROOM_EVIDENCE
     if (normal := _ground_normal(shape.places)) is not None:
         both = [shape.evidence(normal), shape.evidence(-normal)]
         planes = [evidence["ground plane"] for evidence in [*shape_signs, *both]]
         if planes[6] - planes[7] > max(abs(planes[i] - planes[i + 1]) for i in (0, 2, 4)):
             directions = [*directions, normal, -normal]
             shape_signs = [*shape_signs, *both]
-    counted = ["ground plane"] if walled else [*_WEIGHTS]
+    counted = ["ground plane"] if is_room else [*_WEIGHTS]
     terms = []
     for i, direction in enumerate(directions):
         signs = shape_signs[i] | {
             "ground plane": shape_signs[i]["ground plane"] - shape_signs[i ^ 1]["ground plane"]
         }
         term = {name: _WEIGHTS[name] * signs[name] for name in counted}
-        terms.append(term | {"convention": _convention(direction)})
+        terms.append(term | {"convention": _log_prior(direction)})
     totals = torch.tensor([sum(term.values()) for term in terms])
     likely = torch.softmax(totals, 0)
     order = likely.argsort(descending=True, stable=True).tolist()
     best = order[0]
     rival = next(i for i in order if float(directions[i] @ directions[best]) < math.sqrt(0.5))
-    against = {name: value - terms[rival][name] for name, value in terms[best].items()}
+    advantage = {name: value - terms[rival][name] for name, value in terms[best].items()}
     decisive = sorted(
-        (name for name in against if abs(against[name]) >= _TOLD), key=lambda n: -abs(against[n])
+        (name for name in advantage if abs(advantage[name]) >= _MIN_REASON_NATS),
+        key=lambda n: -abs(advantage[n]),
     )
-    reasons = ", ".join(f"{name} {against[name]:+.1f}" for name in decisive)
+    reasons = ", ".join(f"{name} {advantage[name]:+.1f}" for name in decisive)
     other = direction_name(directions[rival])
     odds = float(likely[best] / likely[rival])
-    why = f"{100 * float(likely[best]):.0f} % likely; against {other}: {reasons}"
-    # the convention decides nothing alone: what is there has to speak for it too, by what is worth a word
-    certain = odds >= _ODDS and sum(against.values()) - against["convention"] >= _TOLD
+    reason = f"{100 * float(likely[best]):.0f} % likely; against {other}: {reasons}"
+    # the convention alone never makes a direction certain: the shape must support it too
+    certain = odds >= _MIN_ODDS and sum(advantage.values()) - advantage["convention"] >= _MIN_REASON_NATS
     if not certain:
-        why += f"; not certain, {other} is {100 * float(likely[rival]):.0f} %: look, and choose with --up"
+        reason += f"; not certain, {other} is {100 * float(likely[rival]):.0f} %: look, and choose with --up"
     candidates = tuple(directions[i] for i in order)
-    return UpAxis(directions[best], why, certain, candidates)
+    return UpAxis(directions[best], reason, certain, candidates)
 
 
-def _convention(direction: Tensor) -> float:
-    """How usual a direction is, in nats: as its nearest axis, but few scenes are slanted. [3]"""
+def _log_prior(direction: Tensor) -> float:
+    """Return the log prior of a direction, that of its nearest axis, less 1 nat if it is slanted. [3]"""
     nearest = direction_name(_snap(direction, 0.0))
-    return math.log(_SHARES.get(nearest, 0.04)) - (float(direction.abs().max()) < _SNAP)
+    return math.log(_AXIS_SHARES.get(nearest, 0.04)) - (float(direction.abs().max()) < _SNAP_COSINE)
 
 
 @dataclass(frozen=True)
 class _Shape:
-    """The solid bulk of a scene about its middle, in units of its radius."""
+    """Solid bulk of a scene, relative to its middle, in units of its radius."""
 
     places: Tensor  # [Q,3]
     normals: Tensor  # shortest axes. [Q,3], unit length
-    flatness: Tensor  # 1 of a disk, 0 of a ball and of a needle. [Q]
+    flatness: Tensor  # 1 for a disk, 0 for a ball or a needle. [Q]
     edges: Tensor  # longest axes. [Q,3], unit length
-    edge_weights: Tensor  # visible elongated area, together 1. [Q]
+    edge_weights: Tensor  # visible elongated area, with sum 1. [Q]
     sizes: Tensor  # log of the longest axes. [Q]
-    strays: (
-        Tensor  # where the big and faint Gaussians of the whole scene lie, at most 5 from the middle. [S,3]
-    )
-    stray_weights: Tensor  # visible area, together 1 or, of few, less. [S]
+    strays: Tensor  # positions of the large, faint Gaussians of the whole scene, clamped to ±5. [S,3]
+    stray_weights: Tensor  # visible area, with sum S / (S + 100). [S]
 
     def evidence(self, up: Tensor) -> dict[str, float]:
-        """What speaks for a direction, by the names of `_WEIGHTS`. [3]"""
+        """Return the evidence for a direction, by the names of `_WEIGHTS`. [3]"""
         ahead = front_direction(up)
         side = torch.linalg.cross(up, ahead)
         height = self.places @ up
@@ -279,7 +286,7 @@ class _Shape:
             "wider foot": foot / float(wide.prod().sqrt()),
             "blurred underside": min(max(blur, -1.5), 1.5),
             "faint strays below": -float((self.strays @ up) @ self.stray_weights),
-            # on a ground something stands; a sheet is none
+            # a ground carries objects; a flat sheet is no ground
             "ground plane": _ground_plane(
                 height,
                 (plan - _quantiles(plan, 0.02)) / wide,
@@ -289,7 +296,7 @@ class _Shape:
         }
 
     def _symmetry(self, normal: Tensor) -> float:
-        """How much of the bulk lies where its mirror image across the middle plane does, 0..1."""
+        """Return the overlap of the bulk with its mirror image across the middle plane, 0 to 1."""
         along = self.places @ normal
         ordered = along.sort().values
         middle = 0.5 * (ordered[len(along) // 50] + ordered[-1 - len(along) // 50])
@@ -301,11 +308,11 @@ class _Shape:
 
 
 def _shape_of(scene: Gaussians) -> _Shape | None:
-    """None where too few are solid."""
+    """Return the shape of a scene; None if too few Gaussians are solid."""
     solid = drop_background(scene)
     if solid is None:
         return None
-    solid = solid[:: -(-len(solid) // _ROWS)]
+    solid = solid[:: -(-len(solid) // _MAX_SAMPLED_ROWS)]
     middle = solid.means.median(dim=0).values
     places = solid.means - middle
     distances = places.norm(dim=1)
@@ -314,7 +321,7 @@ def _shape_of(scene: Gaussians) -> _Shape | None:
     areas = axes[:, 1:].sum(dim=1).exp()
     areas = areas.clamp_max(float(areas.sort().values[int(0.9 * len(areas))]))
     elongated = solid.opacities * areas * (1 - (axes[:, 1] - axes[:, 2]).exp())
-    every = scene[:: -(-len(scene) // (3 * _ROWS))]
+    every = scene[:: -(-len(scene) // (3 * _MAX_SAMPLED_ROWS))]
     sizes = every.log_scales.amax(dim=1).exp()
     stray = (sizes > 8 * sizes.median()) & (every.opacities < 0.5)
     weights = (every.opacities * sizes**2)[stray]
@@ -331,8 +338,15 @@ def _shape_of(scene: Gaussians) -> _Shape | None:
 
 
 def _ground_plane(height: Tensor, plan: Tensor, facing: Tensor) -> float:
-    """The best slab across a direction: its share of the bulk, of the plan's cells, and how much more of the
-    rest lies above it than below, multiplied. [Q], [Q,2] 0..1 -> 0..1
+    """Return the score of the best slab across a direction, 0 to 1.
+
+    The score is a product of three factors: the slab's share of the bulk, its share of the plan's cells, and
+    the excess of the remainder above the slab over the remainder below it.
+
+    Args:
+        height: heights along the direction, in radii. [Q]
+        plan: positions in the ground plan, 0 to 1. [Q,2]
+        facing: weight of each Gaussian as a part of the slab. [Q]
     """
     slabs = 60
     cells = 10
@@ -352,24 +366,25 @@ def _ground_plane(height: Tensor, plan: Tensor, facing: Tensor) -> float:
 
 
 def _ground_normal(places: Tensor) -> Tensor | None:
-    """The upper side of the plane that has most of the bulk in it and the rest on one side; None where that
-    is across an axis already. [Q,3] -> [3]
+    """Return the upward normal of the plane that holds most of the bulk, with the remainder on one side.
+
+    None if the normal is an axis already. [Q,3] -> [3]
     """
-    some = places[:: max(1, len(places) // 2000)].double()
-    draws = torch.from_numpy(np.random.default_rng(0).integers(0, len(some), (400, 3)))
-    a, b, c = some[draws].unbind(1)
+    sampled = places[:: max(1, len(places) // 2000)].double()
+    draws = torch.from_numpy(np.random.default_rng(0).integers(0, len(sampled), (400, 3)))
+    a, b, c = sampled[draws].unbind(1)
     normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=1)
     for _ in range(2):
-        distances = some @ normals.T - (a * normals).sum(dim=1)
+        distances = sampled @ normals.T - (a * normals).sum(dim=1)
         within = (distances.abs() < 0.04).double().mean(dim=0)
         above, below = ((side > 0.08).double().mean(dim=0) for side in (distances, -distances))
         worth = within * (above - below).abs() / (above + below).clamp_min(0.02)
         best = int(worth.argmax())
-        inside = some[distances[:, best].abs() < 0.04]
+        inside = sampled[distances[:, best].abs() < 0.04]
         a = inside.mean(dim=0)[None]
         normals = torch.linalg.svd(inside - a, full_matrices=False).Vh[2][None]
     up = normals[0].float() * (1.0 if float(above[best]) > float(below[best]) else -1.0)
-    return None if float(up.abs().max()) > _SNAP else up
+    return None if float(up.abs().max()) > _SNAP_COSINE else up
 
 
 def _quantiles(columns: Tensor, share: float) -> Tensor:
@@ -378,20 +393,20 @@ def _quantiles(columns: Tensor, share: float) -> Tensor:
 
 
 def _extent(plan: Tensor) -> float:
-    """The side of a square as large as what these fill but for strays. [P,2]"""
+    """Return the square root of the area that points fill, without strays. [P,2]"""
     if len(plan) < 6:
         return 0.0
     return float((_quantiles(plan, 0.95) - _quantiles(plan, 0.05)).prod().sqrt())
 
 
 def _cell_counts(places: Tensor) -> Tensor:
-    """How many lie in each cell of a cube of 20 a side about the middle. [Q,3] -> [8000]"""
+    """Return the number of points in each cell of a centered grid of 20³ cells. [Q,3] -> [8000]"""
     cell = ((places + 2.5) * 4).long().clamp(0, 19)
     return torch.bincount((cell[:, 0] * 20 + cell[:, 1]) * 20 + cell[:, 2], minlength=8000).float()
 
 
 def up_from_json(saved: object) -> Tensor | None:
-    """The direction that `UpAxis.to_json` wrote. [3] unit length; None for anything else."""
+    """Return the direction that `UpAxis.to_json` wrote, [3] unit length; None for anything else."""
     numbers = saved.get("direction") if isinstance(saved, dict) else None
     if not isinstance(numbers, list) or len(numbers) != 3:
         return None

@@ -129,12 +129,12 @@ def crowded() -> Gaussians:
     return replace(scene, means=means)
 
 
-@pytest.mark.parametrize("exact", [strays._EXACT, 0])
+@pytest.mark.parametrize("exact", [strays._MAX_EXACT_GAUSSIANS, 0])
 @pytest.mark.parametrize("make", [lambda: littered()[0], crowded, bear, lambda: random_gaussians(3000, 1)])
 def test_shortcuts_find_the_strays_of_a_whole_search(
     make: Callable[[], Gaussians], exact: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(strays, "_EXACT", exact)
+    monkeypatch.setattr(strays, "_MAX_EXACT_GAUSSIANS", exact)
     scene = make()
     found = find_strays(scene)
     assert {kind: getattr(found, kind).tolist() for kind in plain_strays.KINDS} == plain_strays.find_strays(
@@ -144,14 +144,14 @@ def test_shortcuts_find_the_strays_of_a_whole_search(
 
 def test_a_large_scene_searches_few_neighborhoods(monkeypatch: pytest.MonkeyPatch) -> None:
     searched = []
-    search = strays._Body._search
+    search = strays._Neighborhoods._search
 
-    def counted(body: strays._Body, rows: strays.Rows) -> tuple[strays.Floats, strays.Rows]:
+    def counted(body: strays._Neighborhoods, rows: strays.Rows) -> tuple[strays.Floats, strays.Rows]:
         searched.append(len(rows))
         return search(body, rows)
 
-    monkeypatch.setattr(strays._Body, "_search", counted)
-    for limit in ("_EXACT", "_SAMPLE", "_LONELY_SAMPLE"):
+    monkeypatch.setattr(strays._Neighborhoods, "_search", counted)
+    for limit in ("_MAX_EXACT_GAUSSIANS", "_EMPTINESS_SAMPLE", "_LONELINESS_SAMPLE"):
         monkeypatch.setattr(strays, limit, 100)
     scene = concatenate(*[replace(littered()[0], means=littered()[0].means + 50.0 * i) for i in range(5)])
     assert len(find_strays(scene).rows) == 5 * 23
