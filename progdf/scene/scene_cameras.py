@@ -71,6 +71,7 @@ class SceneCameras:
 
     cameras: list[Camera]
     notes: tuple[str, ...] = ()  # lines that name the chosen frame
+    lacks_transforms: bool = False  # from a nerfstudio dataset whose dataparser_transforms.json was not found
 
 
 @dataclass(frozen=True)
@@ -83,6 +84,11 @@ class Coverage:
     def showing(self) -> int:
         """Number of cameras that see the scene."""
         return sum(share >= _MIN_SHARE for share in self.shares)
+
+    @property
+    def median(self) -> float:
+        """Median share, 0 to 1."""
+        return sorted(self.shares)[len(self.shares) // 2]
 
     @property
     def fits(self) -> bool:
@@ -119,15 +125,15 @@ def load_scene_cameras(
     log_cameras(path, cameras, report)
     file = None if report.dataset is None else _find_transforms(path, scene_file)
     candidates = _candidates(path, cameras, scene.origin, report.dataset, file)
+    is_foreign = report.dataset is not None and file is None
     if anyway or not len(scene):
         return candidates[0]
     coverages = []
     for candidate in candidates:
         coverage = measure_coverage(scene, candidate.cameras)
         if coverage.fits:
-            return candidate
+            return replace(candidate, lacks_transforms=is_foreign)
         coverages.append(coverage)
-    is_foreign = report.dataset is not None and file is None
     raise _mismatch_error(path, scene, candidates[0].cameras, scene_file, coverages[0], is_foreign)
 
 

@@ -9,6 +9,7 @@ whatever the list's order. The same measure decides which views represent the ot
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
@@ -21,7 +22,12 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.rasterize import alpha_weights
 from progdf.region import Region
-from progdf.scene.scene_cameras import TRANSFORMS_FILE, SceneCameras, load_scene_cameras
+from progdf.scene.scene_cameras import (
+    TRANSFORMS_FILE,
+    SceneCameras,
+    load_scene_cameras,
+    measure_coverage,
+)
 from progdf.scene.up_axis import find_up
 from progdf.threads import map_threads
 from trainer.options import TrainingViewOptions
@@ -41,6 +47,8 @@ _MAX_LOOKED_THROUGH = 4
 
 _MAX_TILT = 45.0  # degrees between the up of cameras and of their scene: people hold cameras level
 
+_SMALL_SHARE = 0.25  # of a picture: people frame a scene so that it fills more in the median view
+
 _MIN_COVER = 0.25
 """Of what the median view shows of the region; a view that shows less is left out."""
 
@@ -49,9 +57,12 @@ def load_given_cameras(options: TrainingViewOptions, scene: Gaussians) -> SceneC
     """Return the cameras of --cameras in the scene's frame, none if it is not given.
 
     A note tells where their mean up is more than 45° off the scene's, if its shape leaves no doubt.
+    Cameras of a nerfstudio dataset without its dataparser_transforms.json are refused if they are tilted like
+    this, even against a doubtful up, and the median camera shows the scene in less than a quarter of its
+    picture. Both together are the marks of nerfstudio's frame, which is turned and scaled.
 
     Raises:
-        ProgdfError: see `load_scene_cameras`.
+        ProgdfError: see `load_scene_cameras`; or the cameras are probably of another frame.
     """
     if options.cameras is None:
         return SceneCameras([])
@@ -59,7 +70,19 @@ def load_given_cameras(options: TrainingViewOptions, scene: Gaussians) -> SceneC
     held = find_up(scene, found.cameras)
     shape = find_up(scene)
     tilt = math.degrees(math.acos(max(-1.0, min(1.0, float(held.direction @ shape.direction)))))
-    if options.cameras_anyway or not shape.certain or tilt <= _MAX_TILT:
+    if options.cameras_anyway or tilt <= _MAX_TILT:
+        return found
+    if found.lacks_transforms:
+        median = measure_coverage(scene, found.cameras).median
+        if median < _SMALL_SHARE:
+            name = "the scene" if options.scene is None else os.fspath(options.scene)
+            raise ProgdfError(
+                f"{options.cameras} is probably not of the frame of {name}: the cameras are tilted by "
+                f"{tilt:.0f}° and show the scene in {100 * median:.2g} % of a picture (median); put "
+                f"nerfstudio's {TRANSFORMS_FILE} beside the scene, give cameras of its frame, or add "
+                "--cameras-anyway"
+            )
+    if not shape.certain:
         return found
     note = (
         f"warning: the cameras are tilted by {tilt:.0f}° "

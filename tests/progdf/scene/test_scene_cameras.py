@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -21,6 +19,7 @@ from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.scene_cameras import load_scene_cameras
 from progdf.scene.up_axis import find_up
 from tests.helpers.demo_scenes import bear, room
+from tests.helpers.nerfstudio import move_scene, write_frames, write_transforms
 
 UP_Y = torch.tensor([0.0, 1.0, 0.0])
 APPLIED = torch.tensor([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]], dtype=torch.float64)
@@ -45,30 +44,6 @@ def to_nerfstudio(cameras: Sequence[Camera]) -> Tensor:
     return way
 
 
-def write_frames(path: Path, cameras: Sequence[Camera], **fields: Any) -> Path:
-    """A transforms.json of these cameras."""
-    frames = []
-    for camera in cameras:
-        pose = torch.linalg.inv(camera.viewmat.double())
-        pose[:, 1:3] *= -1
-        frames.append({"file_path": f"images/{camera.name}.png", "transform_matrix": pose.tolist()})
-    first = cameras[0]
-    shared = {"w": first.width, "h": first.height, "fl_x": float(first.K[0, 0]), "frames": frames}
-    path.write_text(json.dumps(shared | fields))
-    return path
-
-
-def write_transforms(folder: Path, way: Tensor, scale: float = SCALE) -> None:
-    content = {"transform": way[:3].tolist(), "scale": scale}
-    (folder / "dataparser_transforms.json").write_text(json.dumps(content))
-
-
-def moved(scene: Gaussians, way: Tensor, scale: float) -> Gaussians:
-    """The scene after a turn, a move, and then a scale."""
-    centers = scene.means.double() @ way[:3, :3].T + way[:3, 3]
-    return replace(scene, means=(scale * centers).float(), log_scales=scene.log_scales + math.log(scale))
-
-
 def assert_same_views(found: Sequence[Camera], given: Sequence[Camera], way: Tensor, scale: float) -> None:
     """Cameras see after the similarity as the given ones did before."""
     point = torch.tensor([0.3, -0.2, 0.5])
@@ -89,9 +64,9 @@ def test_nerfstudio_frames_are_applied(tmp_path: Path, beside: str, kind: str) -
         (tmp_path / name).mkdir()
     file = write_frames(tmp_path / "c" / "transforms.json", cameras, **fields)
     stated = way @ APPLIED if kind == "applied" else way
-    write_transforms(tmp_path / ("c" if beside == "cameras" else "s"), stated)
+    write_transforms(tmp_path / ("c" if beside == "cameras" else "s"), stated, SCALE)
     path = tmp_path / ("s/nerfstudio_models/step.ckpt" if beside == "checkpoint" else "s/scene.ply")
-    found = load_scene_cameras(file, moved(scene(), way, SCALE), path)
+    found = load_scene_cameras(file, move_scene(scene(), way, SCALE), path)
     assert_same_views(found.cameras, cameras, way, SCALE)
     (note,) = found.notes
     assert note.startswith("cameras: moved into nerfstudio's frame by")
@@ -103,7 +78,7 @@ def test_applied_scale_is_counted_in(tmp_path: Path) -> None:
     fields = {"applied_transform": APPLIED[:3].tolist(), "applied_scale": 2.0}
     file = write_frames(tmp_path / "transforms.json", cameras, **fields)
     write_transforms(tmp_path, way @ APPLIED, 2.0 * SCALE)
-    found = load_scene_cameras(file, moved(scene(), way, SCALE))
+    found = load_scene_cameras(file, move_scene(scene(), way, SCALE))
     assert_same_views(found.cameras, cameras, way, SCALE)
 
 
@@ -119,7 +94,7 @@ def test_a_scene_of_the_datasets_frame_keeps_its_cameras(tmp_path: Path) -> None
 def test_a_scene_made_before_applied_transform_gets_its_cameras(tmp_path: Path) -> None:
     away = torch.eye(4, dtype=torch.float64)
     away[:3, 3] = torch.tensor([0.0, 30.0, 0.0])
-    world = moved(scene(), away, 1.0)
+    world = move_scene(scene(), away, 1.0)
     cameras = rig(to=world)
     file = write_frames(
         tmp_path / "transforms.json",
@@ -134,7 +109,7 @@ def test_a_scene_made_before_applied_transform_gets_its_cameras(tmp_path: Path) 
 def test_cameras_that_this_program_saved_are_never_moved(tmp_path: Path) -> None:
     cameras = rig()
     save_cameras(tmp_path / "cameras.json", cameras)
-    write_transforms(tmp_path, to_nerfstudio(cameras))
+    write_transforms(tmp_path, to_nerfstudio(cameras), SCALE)
     found = load_scene_cameras(tmp_path / "cameras.json", scene())
     assert not found.notes
     assert torch.equal(found.cameras[0].viewmat, cameras[0].viewmat)
@@ -219,8 +194,8 @@ def test_up_comes_from_cameras_beside_the_scene_in_its_frame(tmp_path: Path) -> 
     level = orbit_rig(scene(), 6, 64, 64, up=UP_Y, elevations=(0.0, 0.0))
     way = to_nerfstudio(level)
     write_frames(tmp_path / "transforms.json", level)
-    write_transforms(tmp_path, way)
-    up = find_up(moved(scene(), way, SCALE), path=tmp_path / "s.ply")
+    write_transforms(tmp_path, way, SCALE)
+    up = find_up(move_scene(scene(), way, SCALE), path=tmp_path / "s.ply")
     assert (up.name, up.reason) == ("+z", "as the 6 cameras beside the scene's file are held")
 
 

@@ -19,6 +19,7 @@ from progdf.io.cameras import save_cameras
 from progdf.region import from_mask
 from progdf.scene.orbit_rig import orbit_rig
 from tests.helpers.demo_scenes import bear, room
+from tests.helpers.nerfstudio import move_scene, write_frames, write_transforms
 from tests.helpers.scenes import concatenate, front_camera, one_gaussian, orbit_camera, random_gaussians
 from tests.helpers.trained import WHITE, Small, small
 from trainer.options import TrainingViewOptions
@@ -318,3 +319,37 @@ def test_cameras_tilted_against_the_scene_are_told(tmp_path: Path) -> None:
         save_cameras(tmp_path / "c.json", orbit_rig(scene, 8, 48, 48, up=direction))
         found = load_given_cameras(TrainingViewOptions(tmp_path / "c.json"), scene)
         assert any("cameras are tilted by 9" in note for note in found.notes) == told
+
+
+def test_dataset_cameras_of_another_frame_are_refused(tmp_path: Path) -> None:
+    scene = bear(3000).gaussians
+    up = torch.tensor([0.0, 1.0, 0.0])
+    cameras = write_frames(tmp_path / "transforms.json", orbit_rig(scene, 8, 48, 48, up=up))
+    to_z_up = look_at(
+        torch.tensor([0.3, 0.2, 0.1]), torch.tensor([0.3, 3.0, 0.1]), torch.tensor([0.0, 0.0, 1.0])
+    )
+    trained = move_scene(scene, to_z_up.double(), 0.23)
+    options = TrainingViewOptions(cameras, scene=tmp_path / "point_cloud.ply")
+    with pytest.raises(ProgdfError, match=r"not of the frame of .*point_cloud\.ply.*dataparser"):
+        load_given_cameras(options, trained)
+    assert len(load_given_cameras(replace(options, cameras_anyway=True), trained).cameras) == 8
+    assert len(load_given_cameras(options, scene).cameras) == 8
+    write_transforms(tmp_path, to_z_up.double(), 0.23)
+    assert "nerfstudio's frame" in load_given_cameras(options, trained).notes[0]
+
+
+def test_dataset_cameras_that_look_straight_down_pass(tmp_path: Path) -> None:
+    scene = room(3000).gaussians
+    above = [
+        Camera(
+            look_at(torch.tensor([x, 1.5, 0.0]), torch.tensor([x, 0.0, 0.0]), up),
+            intrinsics(1.0, 48, 48),
+            48,
+            48,
+        )
+        for x in (-0.5, 0.0, 0.5)
+        for up in (torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.9, 0.0, 0.1]))
+    ]
+    cameras = write_frames(tmp_path / "transforms.json", above)
+    options = TrainingViewOptions(cameras, scene=tmp_path / "s.ply")
+    assert len(load_given_cameras(options, scene).cameras) == 6
