@@ -1,1 +1,1 @@
-"""`progdf view`, `render` and `export`."""
+"""Commands `progdf view`, `render` and `export`."""

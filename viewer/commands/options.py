@@ -1,4 +1,4 @@
-"""The options of `progdf render` and `export`, and what all options name: a scene under its edits."""
+"""Options of `progdf render` and `export`, and the scene with its edits that they open."""
 
 from __future__ import annotations
 
@@ -35,21 +35,21 @@ from .stack_options import NO_SCENE, DrawingOptions, StackOptions, Switch, is_nu
 
 _log = logging.getLogger(__name__)
 
-_SAID_BY_SESSION = ("gdfs", "region", "gain", "solo", "overshoot", "background")
+_SET_BY_SESSION = ("gdfs", "region", "gain", "solo", "overshoot", "background")
 
 
 @dataclass(frozen=True, kw_only=True)
 class ViewpointOptions:
-    """From where a picture is taken."""
+    """Camera and size of a picture."""
 
     camera: Annotated[str | None, word("FILE[:INDEX]", "the session's, else chosen from the scene")] = None
-    """A camera of cameras.json or transforms.json, the first where no INDEX is given."""
+    """Camera of cameras.json or transforms.json; without INDEX the first."""
     orbit: Annotated[str | None, word("AZ,EL[,DISTANCE]", "the session's, else chosen from the scene")] = None
-    """A camera that circles the scene: degrees around it, degrees above it, world units away (fitting)."""
+    """Orbit camera: azimuth and elevation in degrees, distance in world units (fits the scene)."""
     frame: Annotated[str | None, word("NAME|all", "what stands in the scene")] = None
-    """What fills the picture: an edit's region, or the whole scene."""
+    """Fill the picture with an edit's region or the whole scene."""
     size: Annotated[str | None, word("WIDTHxHEIGHT", "the camera's own, or 640x480")] = None
-    """Pixels."""
+    """Width and height in pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,76 +58,72 @@ class RenderOptions:
 
     stack: OmitArgPrefixes[StackOptions]
     out: Annotated[Path, word("FILE", aliases=["-o"])]
-    """The picture to write: .png; of what moves .gif, .webp or .mp4, of a film also a folder."""
+    """Output: .png; animations .gif, .webp or .mp4; a film also as a folder of frames."""
     viewpoint: OmitArgPrefixes[ViewpointOptions] = ViewpointOptions()
     drawing: OmitArgPrefixes[DrawingOptions] = DrawingOptions()
     alpha: Switch = False
-    """A transparent background, in a .png; of a film in a .webp or a folder."""
+    """Make the background transparent: a .png, or a film as .webp or folder."""
     sweep: Annotated[str | None, word("NAME|all", "a still picture")] = None
-    """Move this edit's slider from 0 to 1 and back, or of all in turn: an animation."""
+    """Animate this edit's slider from 0 to 1 and back, or all sliders in turn."""
     turntable: Annotated[str | None, word("SECONDS", "a still picture")] = None
-    """A film that circles the scene once, at the strengths that are set."""
+    """Film of one orbit around the scene at the given strengths."""
     sheet: Annotated[str | None, word("NAME[,NAME2]", "one picture")] = None
-    """A contact sheet over this edit's slider, or a grid over two sliders."""
+    """Contact sheet over this edit's slider, or a grid over two sliders."""
     split: Annotated[str | None, word("[X]", "the session's comparison, else none")] = None
-    """The original beside the edited picture, which begins at this share of the width (0.5)."""
+    """Split with the original; the edited side begins at this share of the width (0.5)."""
     difference: Annotated[str | None, word("[AMPLIFY]", "the session's comparison, else none")] = None
-    """What differs from the original, amplified (4), with the PSNR."""
+    """Show the difference to the original, amplified (4), and its PSNR."""
     timeline: Switch = False
-    """A film of the session's timeline: .gif, .webp, .mp4, or a folder for .png frames."""
+    """Film of the session's timeline: .gif, .webp, .mp4, or a folder of .png frames."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions:
-    """Write a scene under its edits for other programs, or as a web page with their sliders; or a grade as a
-    .cube file."""
+    """Write a scene under its edits for other programs or as a web page, or a grade as a .cube file."""
 
     stack: OmitArgPrefixes[StackOptions]
     out: Annotated[Path, word("FILE", aliases=["-o"])]
-    """The file to write: a 3DGS .ply, .compressed.ply, .spz, .sog, .splat, .glb or .usdc; a .html page, one
-    file that any browser opens, with a slider for each edit; a .progdf.zip with the scene and its edits, to
-    hand on; or a .cube file, for color programs, of what one grade does."""
+    """Output: a 3DGS scene, a .html page, a .progdf.zip or a .cube; formats: see docs/cli.md."""
     frames: Annotated[int | None, word("N", "one file")] = None
-    """As many steps from the original to the strengths, or of the --timeline: numbered files, of a .usdc its
-    time samples."""
+    """Number of steps from the original to the strengths, or of --timeline frames; a .usdc: time samples."""
     timeline: Switch = False
-    """A scene for each frame of the session's timeline; its camera is left out."""
+    """Write one scene per frame of the session's timeline, without its camera."""
     glb_axes: GlbAxes = "LUF"
-    """Axes of a .glb: LUF, glTF's own, as splat-transform writes; or RUB, OpenGL's, as in .spz and .usdc."""
+    """Axes of a .glb: LUF (glTF, splat-transform) or RUB (OpenGL, .spz, .usdc)."""
     page: OmitArgPrefixes[PageOptions] = PageOptions()
     up: UpChoice = "auto"
-    """The axis of the scene that is up in a page; auto: as the edits were trained, else from the ground."""
+    """Up axis of a page; auto: as in the edits' training, else estimated from the ground."""
     background: Annotated[str, word("COLOR")] = "white"
-    """Of a page: #rrggbb, white or black."""
+    """Background of a page: #rrggbb, white or black."""
 
     @property
     def drawing(self) -> DrawingOptions:
-        """How a page is drawn."""
+        """Drawing options of a page."""
         return DrawingOptions(up=self.up, background=self.background)
 
 
 class Named(Protocol):
-    """An edit, or the layer that shows one."""
+    """Edit, or layer of an edit."""
 
     @property
     def name(self) -> str:
-        """No two of a stack share one."""
+        """Name, unique in a stack."""
 
 
 @dataclass(frozen=True)
 class OpenStack:
-    """The opened scene and edits, and how to draw them."""
+    """Opened scene and edits, and their drawing state."""
 
     document: Document
-    view: ViewState  # of a scene without the camera, which is for the command to choose
-    session: Path | None = None  # the file that holds all this; None for a scene
+    view: ViewState  # for a scene without a camera, which the command chooses
+    session: Path | None = None  # the session's file; None for a scene
     snapshots: tuple[SliderSnapshot, ...] = ()
     up_option: str = "auto"  # an axis, or "auto"
-    warning: str = ""  # what of the session was not taken as it is
+    warning: str = ""  # parts of the session that were not restored as saved
 
     @property
     def up(self) -> Vec3:
-        """The direction that is up in the scene."""
+        """Up direction of the scene."""
         opened = self.document
         if self.up_option == "auto":
             return opened.detected_up.direction
@@ -135,27 +131,27 @@ class OpenStack:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """All that was read."""
+        """Files that were read."""
         files = (self.document.path, self.session)
         return (*(path for path in files if path is not None), *self.document.gdf_paths)
 
     def layer(self, name: str) -> str:
-        """The layer of that name; else of the edit of that name, as a session's layers may be renamed."""
+        """Return the layer of this name, or of the edit of this name, as a session may rename layers."""
         named = {self.document.gdfs[layer.gdf].name: layer.name for layer in self.view.layers}
         return name if name in named.values() else named.get(name, name)
 
 
 def open_stack(stack: StackOptions, drawing: DrawingOptions | None = None, unset: float = 0.0) -> OpenStack:
-    """Open what the options name.
+    """Open the scene, or the session, with its edits.
 
     Args:
         stack: the scene, or a session, and its edits
         drawing: up axis and background, of commands that draw
-        unset: the strength of a scene's edits that no --set names
+        unset: strength of a scene's edits without a --set
 
     Raises:
-        ProgdfError: a file is missing or broken, an edit was made for another scene or given twice, options
-            name no edit; or they say what a session says already.
+        ProgdfError: a file is missing or broken, an edit was made for another scene or given twice, an option
+            names no edit, or it contradicts the session.
     """
     if stack.scene.name.endswith(BUNDLE):
         stack = replace(stack, scene=unpack_bundle(stack.scene))
@@ -183,7 +179,7 @@ def open_stack(stack: StackOptions, drawing: DrawingOptions | None = None, unset
 
 
 def open_view(stack: StackOptions, drawing: DrawingOptions) -> tuple[session.WindowSession, Path | None]:
-    """What `progdf view` shows first, and the session's file."""
+    """Return the initial state of `progdf view`, and the session's file."""
     if stack.scene == NO_SCENE:
         return session.WindowSession(document.empty(), ViewState(grid=True)), None
     opened = open_stack(stack, drawing)
@@ -196,7 +192,7 @@ def open_view(stack: StackOptions, drawing: DrawingOptions) -> tuple[session.Win
 
 
 def _placing(texts: Sequence[str]) -> document.Place:
-    """Where `--region NAME=REGION` options apply edits; what can be told without a scene is refused here."""
+    """Return the function that gives an edit its region from `--region NAME=REGION`; check the syntax now."""
     specs: dict[str, str] = {}
     for text in texts:
         name, equals, spec = text.partition("=")
@@ -215,13 +211,13 @@ def _placing(texts: Sequence[str]) -> document.Place:
 
 
 def _open_session(stack: StackOptions, drawing: DrawingOptions | None) -> OpenStack:
-    """The session with the strengths and the blend rule that were given beside it."""
+    """Open a session with the strengths and the blend rule of the options."""
     for part in (stack, drawing) if drawing is not None else (stack,):
         for field in fields(part):
-            if field.name in _SAID_BY_SESSION and getattr(part, field.name) != field.default:
-                what = "an edit was given" if field.name == "gdfs" else f"--{field.name} was given"
+            if field.name in _SET_BY_SESSION and getattr(part, field.name) != field.default:
+                given = "an edit was given" if field.name == "gdfs" else f"--{field.name} was given"
                 raise ProgdfError(
-                    f"{what} with the session {stack.scene.name}, which already sets it; leave it out"
+                    f"{given} with the session {stack.scene.name}, which already sets it; leave it out"
                 )
     saved = session.open_session(stack.scene)
     up = drawing.up if drawing else "auto"
@@ -232,13 +228,13 @@ def _open_session(stack: StackOptions, drawing: DrawingOptions | None) -> OpenSt
     strengths = parse_strengths(saved.view.layers, settings, stacks.largest_strength(saved.view))
     layers = tuple(replace(l, strength=strengths.get(l.name, l.strength)) for l in saved.view.layers)
     view = replace(saved.view, layers=layers, blend=stack.blend or saved.view.blend)
-    if up != "auto":  # else the session's own
+    if up != "auto":  # otherwise the session's own
         view = replace(view, camera=with_up(view.camera, opened.up))
     return replace(opened, view=view)
 
 
 def stack_layers(gdfs: Sequence[Gdf], stack: StackOptions, unset: float = 0.0) -> tuple[LayerState, ...]:
-    """One layer per edit, the lowest first, at `unset` unless a `--set` says otherwise.
+    """Return one layer per edit, the lowest first, at `unset` or the strength of its `--set`.
 
     Raises:
         ProgdfError: there is no such edit or kind of gain, or a number is outside its range.
@@ -255,10 +251,10 @@ def stack_layers(gdfs: Sequence[Gdf], stack: StackOptions, unset: float = 0.0) -
 
 
 def parse_strengths(edits: Sequence[Named], settings: Sequence[str], most: float) -> dict[str, float]:
-    """The strengths that settings `NAME=S` name, from 0 to `most`.
+    """Return the strengths of settings `NAME=S`, from 0 to `most`.
 
     Raises:
-        ProgdfError: there is no edit NAME, or S is no such number.
+        ProgdfError: there is no edit NAME, or S is not a number in this range.
     """
     strengths = {}
     for setting in settings:
@@ -272,10 +268,10 @@ def parse_strengths(edits: Sequence[Named], settings: Sequence[str], most: float
 
 
 def check_edit(name: str, edits: Sequence[Named], option: str) -> str:
-    """`name`, when an edit has it.
+    """Return `name` if an edit has it.
 
     Raises:
-        ProgdfError: none has; the message lists those there are.
+        ProgdfError: none has; the message lists the edits.
     """
     if name in {edit.name for edit in edits}:
         return name
@@ -286,7 +282,7 @@ def check_edit(name: str, edits: Sequence[Named], option: str) -> str:
 
 
 def _parse_gain(text: str, gdfs: Sequence[Gdf]) -> tuple[str, str, float]:
-    """Name, kind and number of `NAME:KIND=G`."""
+    """Return name, kind and number of `NAME:KIND=G`."""
     kinds = stacks.SLIDERS[1:]
     layer, equals, number = text.rpartition("=")
     name, colon, kind = layer.rpartition(":")
@@ -301,7 +297,7 @@ def _parse_gain(text: str, gdfs: Sequence[Gdf]) -> tuple[str, str, float]:
 
 
 def parse_number(text: str, low: float, high: float, problem: str) -> float:
-    """A number from `low` to `high`; ProgdfError says `problem` where it is none."""
+    """Return a number from `low` to `high`; raise ProgdfError with `problem` for other text."""
     number = float(text) if is_number(text) else math.nan
     if not low <= number <= high:
         raise ProgdfError(problem)
@@ -309,7 +305,7 @@ def parse_number(text: str, low: float, high: float, problem: str) -> float:
 
 
 def parse_background(text: str) -> Vec3:
-    """The color of `#rrggbb`, "white" or "black", 0..1.
+    """Return the color of `#rrggbb`, "white" or "black", 0..1.
 
     Raises:
         ProgdfError: it is no color.

@@ -1,4 +1,4 @@
-"""The commands `progdf render` and `export`: pictures, comparisons, sheets and films; scenes and pages."""
+"""Commands `progdf render` and `export`: pictures, comparisons, sheets and films; scenes and pages."""
 
 from __future__ import annotations
 
@@ -61,15 +61,16 @@ from .options import (
 from .stack_options import parse
 
 DEFAULT_SIZE = (640, 480)
-_SAY_EVERY_S = 0.5
-_LONGEST_S = 120.0  # of a turntable
-_SWEEP_S = 2.0  # of a slider there and back
+_PROGRESS_INTERVAL_S = 0.5
+_LONGEST_S = 120.0  # maximum duration of a turntable
+_SWEEP_S = 2.0  # duration of a slider's way there and back
 ONE_OF = ("sweep", "sheet", "split", "difference", "timeline", "turntable")
-"""Options that each say what the picture is."""
+"""Options that choose the kind of picture; only one may be given."""
 
 
 def export(argv: Sequence[str]) -> int:
-    """`progdf export`: the edited scene for other programs, with its sliders for a browser or a colleague."""
+    """Run `progdf export`: the edited scene for other programs, or with its sliders for a browser or a
+    colleague."""
     options: ExportOptions = parse(ExportOptions, argv, "progdf export")
     out = options.out
     endings = (end for end in (CUBE, BUNDLE, PAGE) if out.name.lower().endswith(end))
@@ -116,7 +117,8 @@ def export(argv: Sequence[str]) -> int:
 
 
 def _export_frames(options: ExportOptions, opened: OpenStack) -> int:
-    """Numbered files, or the time samples of one: steps up to the strengths, or frames of a timeline."""
+    """Write numbered files, or time samples of one file: steps up to the strengths, or frames of a
+    timeline."""
     out = options.out
     document = opened.document
     rate = float(Timeline().fps)
@@ -133,7 +135,7 @@ def _export_frames(options: ExportOptions, opened: OpenStack) -> int:
         rate = float(keys.fps)
         if options.frames is not None:
             steps = film.sheet_frames(keys, options.frames)
-            rate *= (len(steps) - 1) / keys.length  # it lasts as long
+            rate *= (len(steps) - 1) / keys.length  # same duration
         if len(steps) > scene_file.MAX_FRAMES:
             raise ProgdfError(f"--timeline: it has {len(steps)} frames; say how many with --frames N")
         states = (timeline.state_at(keys, frame, opened.view) for frame in steps)
@@ -148,7 +150,7 @@ def _export_frames(options: ExportOptions, opened: OpenStack) -> int:
 
 
 def _compose(document: Document, view: ViewState, share: float = 1.0, whole: bool = False) -> Gaussians:
-    """The scene at a share of the strengths; without the rows that draw nothing, unless `whole`."""
+    """Return the scene at a share of the strengths, without rows that draw nothing, unless `whole`."""
     edited = compose_view(document.scene, document.gdfs, view, share)
     return edited if whole else edited[remaining_rows(document.original, edited)]
 
@@ -175,7 +177,7 @@ def _describe_loss(out: Path, edited: Gaussians, read_back: ReadBack | None) -> 
 
 
 def _export_bundle(out: Path, opened: OpenStack) -> int:
-    """The scene, its edits and the session in one file."""
+    """Write the scene, its edits and the session in one file."""
     with tempfile.TemporaryDirectory(prefix="progdf-") as folder:
         source = Path(folder) / "stack.session.json"
         session.save(source, WindowSession(opened.document, opened.view, opened.snapshots))
@@ -185,7 +187,7 @@ def _export_bundle(out: Path, opened: OpenStack) -> int:
 
 
 def _export_cube(out: Path, opened: OpenStack) -> int:
-    """What one grade does to colors as a .cube file, at its strength and its gain of color."""
+    """Write the color map of one grade as a .cube file, at its strength and its color gain."""
     states = visible_layers(opened.view)
     forms = [opened.document.gdfs[state.gdf].field.origin for state in states]
     form = forms[0] if forms else None
@@ -204,12 +206,12 @@ def _export_cube(out: Path, opened: OpenStack) -> int:
 
 @one_thread()
 def render(argv: Sequence[str]) -> int:
-    """`progdf render`: one picture, a comparison, a contact sheet, a sweep or a film."""
+    """Run `progdf render`: one picture, a comparison, a contact sheet, a sweep or a film."""
     options: RenderOptions = parse(RenderOptions, argv, "progdf render")
     _check_output(options)
     films = options.sweep is not None or options.timeline or options.turntable is not None
-    one_moves = options.sweep is not None or options.sheet is not None
-    opened = open_stack(options.stack, options.drawing, 0.0 if one_moves else 1.0)
+    one_slider_moves = options.sweep is not None or options.sheet is not None
+    opened = open_stack(options.stack, options.drawing, 0.0 if one_slider_moves else 1.0)
     check_not_an_input(options.out, opened.files)
     scene = opened.document.scene
     gdfs = opened.document.gdfs
@@ -222,11 +224,11 @@ def render(argv: Sequence[str]) -> int:
     camera = choose_camera(options.viewpoint, scene, gdfs, saved, opened.up, stored)
     swept = _swept_layers(options, opened)
     if films:
-        seen = options.viewpoint
+        viewpoint = options.viewpoint
         view = film.with_strengths(view, dict.fromkeys(swept, 0.0))
         keys = _keys(opened) if options.timeline else _film(options, opened, view, swept, camera)
         moves = options.timeline and timeline.camera_at(keys, 0) is not None
-        if moves and (seen.camera or seen.orbit or seen.frame):
+        if moves and (viewpoint.camera or viewpoint.orbit or viewpoint.frame):
             raise ProgdfError("--timeline moves the camera; leave out --camera, --orbit and --frame")
         with _engine(scene, gdfs, options) as engine:
             print_line(film.write(options.out, keys, view, camera, engine, _say_frames(), options.alpha))
@@ -262,7 +264,7 @@ def render(argv: Sequence[str]) -> int:
 def _render_still(
     options: RenderOptions, opened: OpenStack, view: ViewState, camera: Camera, engine: ViewEngine
 ) -> str:
-    """One picture, compared as `view` asks; gives what to say about the comparison."""
+    """Write one picture with the comparison of `view`; return a line about the comparison."""
     origin = opened.document.scene.origin
     if options.alpha:
         picture = Image.fromarray(film.transparent_image(engine, view, camera))
@@ -274,7 +276,7 @@ def _render_still(
     view = comparer.sides.right if comparer.sides else view
     try:
         image = comparer.image(view, camera=camera)
-        # a comparison is no view that could be edited and trained on
+        # a comparison cannot be edited and trained on
         single = view.compare.mode == "off"
         carried = camera_chunk(camera, visible_edits(view), origin, opened.up) if single else None
         labelled = Image.fromarray(draw_labels(image, view.compare, comparer.labels(view)))
@@ -290,7 +292,7 @@ def _render_still(
 
 
 def _comparison(options: RenderOptions, saved: Comparison) -> Comparison:
-    """What was asked for; else what the session shows."""
+    """Return the requested comparison, or the session's."""
     if options.split is not None:
         problem = f"--split must be between 0 and 1, got {options.split}"
         return Comparison("split", divider=parse_number(options.split, 0.0, 1.0, problem))
@@ -302,7 +304,7 @@ def _comparison(options: RenderOptions, saved: Comparison) -> Comparison:
 
 
 def _keys(opened: OpenStack) -> Timeline:
-    """The timeline of the session."""
+    """Return the session's timeline."""
     if not opened.view.timeline.keys:
         raise ProgdfError(
             "--timeline: there is no key on it; set some with K in the window, and save a session"
@@ -313,7 +315,8 @@ def _keys(opened: OpenStack) -> Timeline:
 def _film(
     options: RenderOptions, opened: OpenStack, view: ViewState, swept: Sequence[str], camera: Camera
 ) -> Timeline:
-    """Sliders there and back; or once around what stands in the scene, from the camera that was chosen."""
+    """Return a film of sliders from 0 to 1 and back, or of one orbit around the scene from the given
+    camera."""
     if options.turntable is None:
         gdfs = [layer.gdf for layer in view.layers if layer.name in swept]
         return timeline.slider_film(view, gdfs, Timeline().fps, _SWEEP_S)
@@ -325,7 +328,7 @@ def _film(
 
 
 def _swept_layers(options: RenderOptions, opened: OpenStack) -> list[str]:
-    """Names of the layers whose sliders move in the picture: none, one or two."""
+    """Return the names of the layers whose sliders move in the picture: none, one or two."""
     if options.sweep == "all" and opened.view.layers and "all" not in [l.name for l in opened.view.layers]:
         return [_check_visible(layer.name, opened.view, "--sweep") for layer in opened.view.layers]
     if options.sweep is not None:
@@ -339,20 +342,22 @@ def _swept_layers(options: RenderOptions, opened: OpenStack) -> list[str]:
 
 
 def _check_visible(name: str, view: ViewState, option: str) -> str:
-    """`name`, when there is such an edit, and neither another that is alone nor its group at 0 hides it."""
+    """Return `name` if such an edit exists and is hidden neither by a solo layer nor by its group at 0."""
     check_edit(name, view.layers, option)
     group = next(layer.group for layer in view.layers if layer.name == name)
     if any(known.name == group and not known.strength for known in view.groups):
         raise ProgdfError(f"{option} {name}: its group {group} is at 0, so nothing would change; raise that")
-    alone = [layer.name for layer in view.layers if layer.solo]
-    if alone and name not in alone:
-        raise ProgdfError(f"{option} {name}: {alone[0]} is shown alone and hides it; show {name} alone too")
+    solo_layers = [layer.name for layer in view.layers if layer.solo]
+    if solo_layers and name not in solo_layers:
+        raise ProgdfError(
+            f"{option} {name}: {solo_layers[0]} is shown alone and hides it; show {name} alone too"
+        )
     return name
 
 
 @contextmanager
 def _engine(scene: Gaussians, gdfs: Sequence[Gdf], options: RenderOptions) -> Iterator[ViewEngine]:
-    """An engine for pictures without a window; "auto" does without OpenGL where there is none."""
+    """Create an engine for pictures without a window; "auto" works without OpenGL if there is none."""
     ctx = None
     if options.drawing.engine != "cpu":
         try:
@@ -370,12 +375,12 @@ def _engine(scene: Gaussians, gdfs: Sequence[Gdf], options: RenderOptions) -> It
 
 
 def _say_frames() -> film.Advance:
-    """Tells a log, now and then, how far a film is; terminals see the result soon enough."""
+    """Return a progress callback that prints to logs; a terminal gets no lines."""
     last = time.monotonic()
 
     def say(done: int, total: int) -> None:
         nonlocal last
-        if not sys.stderr.isatty() and time.monotonic() - last >= _SAY_EVERY_S:
+        if not sys.stderr.isatty() and time.monotonic() - last >= _PROGRESS_INTERVAL_S:
             last = time.monotonic()
             print(f"frame {done}/{total}", file=sys.stderr, flush=True)
 
@@ -398,7 +403,7 @@ def _check_output(options: RenderOptions) -> None:
 
 
 def describe_strengths(view: ViewState) -> str:
-    """The layers that take part, each with its strength."""
+    """Return the visible layers with their strengths as text."""
     return ", ".join(f"{layer.name} {layer.strength:g}" for layer in visible_layers(view)) or "no edits"
 
 
@@ -410,15 +415,16 @@ def choose_camera(
     up: Vec3 | None = None,
     stored: Camera | None = None,
 ) -> Camera:
-    """Return the requested camera, or the session's, or the one stored in the scene's file, or a frame of it.
+    """Return the requested camera, the session's, the one stored in the scene's file, or a frame of the
+    scene.
 
     Args:
-        viewpoint: what was asked for
+        viewpoint: the requested viewpoint
         scene: the original
         gdfs: its edits, which --frame may name
-        saved: of a session
-        up: unit vector that is up in the scene; None finds it
-        stored: in the scene's file
+        saved: camera of a session
+        up: unit vector that is up in the scene; None estimates it
+        stored: camera stored in the scene's file
 
     Raises:
         ProgdfError: options that contradict each other or name nothing.
@@ -438,7 +444,7 @@ def choose_camera(
         view = parse_orbit(viewpoint.orbit, view)
     if viewpoint.frame is not None or (viewpoint.orbit is not None and saved is None):
         view = _frame_on(view, viewpoint.frame, scene, gdfs, aspect)
-        if viewpoint.orbit is not None:  # a distance that was said holds
+        if viewpoint.orbit is not None:  # an explicit distance overrides the fit
             view = parse_orbit(viewpoint.orbit, view)
     return view_camera.to_camera(view, width, height)
 
@@ -446,7 +452,7 @@ def choose_camera(
 def _frame_on(
     view: ViewCamera, name: str | None, scene: Gaussians, gdfs: Sequence[Gdf], aspect: float
 ) -> ViewCamera:
-    """The same direction, filled by what --frame names."""
+    """Return a camera with the same direction, fitted to the subject of --frame."""
     if name is None:
         return view_camera.fit_subject(view, scene, aspect)
     if name == "all" and name not in [gdf.name for gdf in gdfs]:
@@ -457,10 +463,10 @@ def _frame_on(
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """Width and height of `WxH`, pixels.
+    """Return width and height of `WxH` in pixels.
 
     Raises:
-        ProgdfError: it is no size, or one that no picture should have.
+        ProgdfError: it is no size, or a side is not 1 to `LARGEST_SIDE`.
     """
     width, cross, height = text.lower().partition("x")
     if not cross or not all(re.fullmatch(r"[0-9]{1,9}", side) for side in (width, height)):
@@ -472,14 +478,14 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def parse_orbit(text: str, framed: ViewCamera) -> ViewCamera:
-    """The camera of `AZIMUTH,ELEVATION[,DISTANCE]`: degrees, degrees above the horizon, world units.
+    """Return the camera of `AZIMUTH,ELEVATION[,DISTANCE]`: degrees, degrees above the horizon, world units.
 
     Args:
-        text: what was typed
-        framed: shows the scene; gives the pivot, the up axis, and the distance where none is said
+        text: the option's value
+        framed: shows the scene; gives the pivot, the up axis, and the default distance
 
     Raises:
-        ProgdfError: it is not two or three finite numbers, or the camera cannot stand there.
+        ProgdfError: it is not two or three finite numbers, or a number is outside its range.
     """
     right = "write AZIMUTH,ELEVATION or AZIMUTH,ELEVATION,DISTANCE, for example --orbit 30,15"
     try:
@@ -501,7 +507,7 @@ def parse_orbit(text: str, framed: ViewCamera) -> ViewCamera:
 
 
 def fit_camera(camera: Camera, size: tuple[int, int]) -> Camera:
-    """The same view in another size, undistorted: the same height of the scene, the sides cut or widened."""
+    """Return the same view in another size, undistorted: same height of the scene, sides cut or widened."""
     width, height = size
     scale = height / camera.height
     K = camera.K * scale

@@ -1,4 +1,4 @@
-"""The options of a scene under its edits and of how it is drawn, and the parser: imported in a moment."""
+"""Options of a scene under its edits and of its drawing, and the parser. Fast to import."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from progdf.scene import UpChoice
 
 Blend = Literal["normalized", "sum", "over", "adjust"]
 NO_SCENE = Path()
-"""What stands for the scene where none is given."""
+"""Placeholder for a missing scene."""
 SESSION = "--session"
-_BARE = {"--split": "0.5", "--difference": "4"}  # what an option without a value means
+_BARE = {"--split": "0.5", "--difference": "4"}  # value of an option given without one
 
 
 def word(metavar: str | None = None, absent: str | Callable[[str], str] | None = None, **more: Any) -> Any:
-    """How help shows an option: what stands for its value, and what happens without it."""
+    """Return tyro settings of an option: the placeholder of its value, and its default in the help text."""
     hint = f"(default: {absent})" if isinstance(absent, str) else absent
     return tyro.conf.arg(metavar=metavar, help_behavior_hint=hint, **more)
 
@@ -44,40 +44,39 @@ class StackOptions:
     """A scene under a stack of edits."""
 
     scene: Annotated[Path, Positional, word("SCENE", _scene)]
-    """The scene: a .ply, .spz, .splat, .ksplat, .sog, .glb or .gltf; or a session, also as --session FILE."""
+    """Scene: .ply, .spz, .splat, .ksplat, .sog, .glb or .gltf; or a session, also as --session FILE."""
     gdfs: Annotated[tuple[Path, ...], Positional, word("EDIT.gdf", "the scene alone")] = ()
     """Edits of this scene, the lowest layer first; also .cube files, which change colors everywhere."""
     region: Annotated[tuple[str, ...], UseAppendAction, word("NAME=REGION")] = ()
-    """Apply the grade of an edit, of whatever scene, or a .cube file to a region of this scene: all, or as
-    `progdf train` has it."""
+    """Apply a grade, of any scene, or a .cube file to this region: all, or as for `progdf train`."""
     set: Annotated[tuple[str, ...], UseAppendAction, word("NAME=S")] = ()
-    """Strength of an edit, 0 to 1; repeat it for several edits. An edit that is not named is at 1 in `render`
-    and `export`, at 0 in `view`, --sweep and --sheet, and as a session has it."""
+    """Strength of an edit, 0 to 1; repeatable. Defaults: see docs/cli.md."""
     gain: Annotated[tuple[str, ...], UseAppendAction, word("NAME:KIND=G")] = ()
-    """How much of one kind of change an edit lets through, 0 to 1: geometry, opacity or color."""
+    """Gain of one kind of change, 0 to 1: geometry, opacity or color."""
     solo: Annotated[tuple[str, ...], UseAppendAction, word("NAME")] = ()
-    """Show this edit alone. Repeat it for several edits."""
+    """Show this edit alone; repeatable."""
     overshoot: Switch = False
-    """Overshoot to 1.2: extrapolates past the trained range."""
+    """Allow strengths up to 1.2, which extrapolate past the trained range."""
     blend: Annotated[Blend | None, word("{normalized,sum,over,adjust}", "the session's, else adjust")] = None
-    """How edits that share Gaussians add up."""
+    """Blend rule for edits that share Gaussians."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DrawingOptions:
-    """How the stack is drawn."""
+    """Drawing settings of a scene."""
 
     up: UpChoice = "auto"
-    """The axis of the scene that is up; auto: as the edits were trained, else from the ground, else −y."""
+    """Up axis of the scene; auto: as in the edits' training, else from the ground, else −y."""
     background: Annotated[str, word("COLOR")] = "white"
-    """#rrggbb, white or black."""
+    """Background: #rrggbb, white or black."""
     engine: Annotated[Literal["auto", "gl", "cpu"], word(aliases=["--draw"])] = "auto"
-    """What draws: OpenGL or the CPU rasterizer; auto takes OpenGL where a graphics card does the work."""
+    """Renderer: OpenGL or the CPU rasterizer; auto uses OpenGL if a graphics card accelerates it."""
 
 
 def parse(kind: type[Any], argv: Sequence[str], command: str) -> Any:
-    """The options of a command. `--session FILE` is FILE in the scene's place; `--split` and `--difference`
-    without a number get theirs.
+    """Parse the options of a command.
+
+    `--session FILE` is FILE as the scene; `--split` and `--difference` without a number get their defaults.
 
     Raises:
         ProgdfError: an option is missing, unknown or of the wrong kind.

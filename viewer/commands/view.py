@@ -1,4 +1,4 @@
-"""The command `progdf view`: a window at once, which says so while what it needs is imported."""
+"""Command `progdf view`: opens a window at once and shows a splash during slow imports."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ STARTING = "Starting …"
 
 @dataclass(frozen=True, kw_only=True)
 class ViewOptions:
-    """Open the window: the splats, one slider per edit. Without a scene it opens on a start page."""
+    """Open the window with the scene and one slider per edit. Without a scene it shows a start page."""
 
     stack: OmitArgPrefixes[StackOptions] = StackOptions(scene=NO_SCENE)
     drawing: OmitArgPrefixes[DrawingOptions] = DrawingOptions()
 
 
 def main(argv: Sequence[str]) -> int:
-    """`progdf view`: open the window and stay until it is closed."""
+    """Run `progdf view`: open the window and stay until it is closed."""
     options: ViewOptions = parse(ViewOptions, argv, "progdf view")
 
     def opens() -> Any:
@@ -39,8 +39,8 @@ def main(argv: Sequence[str]) -> int:
         return run
 
     if not all(path.exists() for path in (options.stack.scene, *options.stack.gdfs)):
-        opens()  # what is wrong is told before there is a window
-    from viewer.ui.splash import Splash  # glfw, which the other commands do without
+        opens()  # report errors before the window opens
+    from viewer.ui.splash import Splash  # glfw, which the other commands do not need
 
     try:
         splash = Splash()
