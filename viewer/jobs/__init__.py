@@ -1,1 +1,1 @@
-"""What the window has done by child processes: training, pictures of an editor, films and exports."""
+"""Child processes of the window: training, previews of an editor, films and exports."""

@@ -1,8 +1,9 @@
-"""A `progdf` command as a child process: at low priority, in its own group, stopped with the window.
+"""Child process for a `progdf` command: low priority, its own process group, stopped with the window.
 
-As a program of its own, python -P -m viewer.jobs.child [--talks] COMMAND …, this runs a command with a parent
-watchdog: it is interrupted when its standard input closes, and so never outlives the window that holds the
-other end, however that ended. One that talks reads its input itself, and ends with it.
+As a program, python -P -m viewer.jobs.child [--talks] COMMAND …, this module runs a command with a parent
+watchdog. The command is interrupted when its standard input closes. The window holds the other end, so the
+command never outlives the window, however that ended. A command with --talks reads its input itself and ends
+with it.
 """
 
 from __future__ import annotations
@@ -24,36 +25,39 @@ from msgspec import Meta
 from progdf.terminal import signal_main_thread
 
 GRACE_S = 8.0
-"""After which a child that was asked to stop is killed: it may be saving its state."""
+"""Seconds between a stop request and the kill; the child may be saving its state."""
 
 NICE = 10
-"""As by nice(1): a child gets a tenth of a core that the window, or another program, keeps busy. SCHED_IDLE
-would give it nothing, and a process without privileges cannot leave that again."""
+"""Niceness added to a child, as by nice(1): it gets a tenth of a core that the window or another program
+keeps busy.
+
+SCHED_IDLE would give it nothing, and an unprivileged process cannot leave that policy again.
+"""
 
 _TALKS = "--talks"
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a command is; the trainer writes it to RUN/state/progress.json."""
+    """Progress of a command; the trainer writes it to RUN/state/progress.json."""
 
-    share: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0  # of its whole time
-    label: str = ""  # what it does, "" while it starts
-    loss: str = ""  # of the training, "" where there is none
-    seconds: Annotated[float, Meta(ge=0.0, le=1e9)] = 0.0  # that were spent on a run, in all its sessions
+    share: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0  # share of the whole run
+    label: str = ""  # current step, "" while it starts
+    loss: str = ""  # loss of the training, "" without one
+    seconds: Annotated[float, Meta(ge=0.0, le=1e9)] = 0.0  # time spent on a run in all its sessions
 
 
 class Child:
-    """One running command.
+    """Running command.
 
     Args:
         arguments: words after `progdf`
-        log: file that takes what it prints
-        talks: it reads its standard input, and what it prints is read here, by `output`; it has to end by
-            itself when its input does. Somebody waits for it: it keeps the window's priority
+        log: file for its output
+        talks: the command reads its standard input, and `output` returns what it prints; it must end by
+            itself when its input ends. The user waits for it, so it keeps the window's priority
 
     Raises:
-        OSError: it cannot be started, or the log not written.
+        OSError: it cannot be started, or the log cannot be written.
     """
 
     def __init__(self, arguments: Sequence[str], log: Path, talks: bool = False) -> None:
@@ -64,7 +68,7 @@ class Child:
             options = {"creationflags": flags | subprocess.CREATE_NEW_PROCESS_GROUP}
         with log.open("wb") as sink:
             self._process = subprocess.Popen(
-                # -P: a module in the current folder, which may be a stranger's scene, is not run
+                # -P: do not run a module in the current folder, which may be a third-party scene
                 [sys.executable, "-P", "-m", "viewer.jobs.child", *[_TALKS] * talks, *arguments],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE if talks else sink,
@@ -81,7 +85,7 @@ class Child:
 
     @property
     def status(self) -> int | None:
-        """The exit status; None while it runs. One that will not stop is killed."""
+        """Exit status; None while it runs. A command that ignores a stop request is killed."""
         status = self._process.poll()
         if status is None and self._stopped_at is not None and time.monotonic() - self._stopped_at > GRACE_S:
             self.kill()
@@ -89,24 +93,24 @@ class Child:
 
     @property
     def pid(self) -> int:
-        """Of its process, and of its group where there are such."""
+        """Id of its process, and of its process group on systems that have one."""
         return self._process.pid
 
     @property
     def output(self) -> IO[bytes]:
-        """What it writes to standard output."""
+        """Its standard output."""
         assert self._process.stdout is not None
         return self._process.stdout
 
     def send(self, line: str) -> None:
-        """A line for its standard input; what does not take it any more has ended."""
+        """Write a line to its standard input; ignore a command that has ended."""
         assert self._process.stdin is not None
         with contextlib.suppress(OSError, ValueError):
             self._process.stdin.write(line.encode() + b"\n")
             self._process.stdin.flush()
 
     def stop(self) -> None:
-        """Ask it to stop: it saves what it has done."""
+        """Request a stop: the command saves its state."""
         if self._stopped_at is None:
             self._stopped_at = time.monotonic()
             if self._process.stdin is not None:
@@ -114,7 +118,7 @@ class Child:
                     self._process.stdin.close()
 
     def kill(self) -> None:
-        """End it and all that it started, at once."""
+        """Kill the command and all its child processes at once."""
         with contextlib.suppress(OSError):
             if sys.platform != "win32" and hasattr(os, "killpg"):
                 os.killpg(self._process.pid, signal.SIGKILL)
@@ -122,7 +126,7 @@ class Child:
                 self._process.kill()
 
     def close(self) -> None:
-        """Stop it and wait until it is gone."""
+        """Stop the command and wait until it has ended."""
         self.stop()
         try:
             self._process.wait(GRACE_S)
@@ -133,12 +137,12 @@ class Child:
             self._process.stdout.close()
 
     def error(self) -> str:
-        """The line with which it ended, without the program's name."""
+        """Return the last line of its log, without the program's name."""
         return last_line(self.log)
 
 
 def last_line(log: Path) -> str:
-    """The last line of a file, "" where there is none."""
+    """Return the last line of a file, "" if there is none."""
     try:
         lines = log.read_text("utf-8", "replace").strip().splitlines()
     except OSError:
@@ -147,10 +151,10 @@ def last_line(log: Path) -> str:
 
 
 def main() -> int:
-    """The child: the exit status of its command."""
+    """Run the child and return the exit status of its command."""
     talks = sys.argv[1:2] == [_TALKS]
     if not talks:
-        # ignored where the window was started by `&` in a script, and then nothing would stop this
+        # a window started by `&` in a script ignores SIGINT, and its child could not be stopped
         signal.signal(signal.SIGINT, signal.default_int_handler)
         threading.Thread(target=_watch_parent, daemon=True).start()
     from progdf.__main__ import main as run
@@ -159,7 +163,7 @@ def main() -> int:
 
 
 def _watch_parent() -> None:
-    """Wait until the other end is closed; then stop as by Ctrl+C."""
+    """Wait until the other end of the standard input closes, then stop as by Ctrl+C."""
     with contextlib.suppress(OSError):
         while os.read(0, 4096):
             pass

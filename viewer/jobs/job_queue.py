@@ -1,6 +1,6 @@
-"""The queue of child processes: one training run at a time, and deliveries (exports, pictures, films).
+"""Queue of child processes: one training run at a time, and deliveries (exports, pictures, films).
 
-Children are looked at now and then, never waited for.
+Children are polled and never waited for.
 """
 
 from __future__ import annotations
@@ -21,79 +21,80 @@ from .child import Child, Progress, last_line
 from .training import EditOrder
 
 POLL_S = 0.3
-"""Between two looks at whether a child has ended."""
+"""Seconds between two checks for ended children."""
 
 LOOK_S = 1.0
-"""Between two at how far it is: the window draws its card at each."""
+"""Seconds between two reads of their progress; the window redraws their cards at each."""
 
 Status = Literal["queued", "running", "stopping", "stopped", "failed", "done"]
 
 
 FORMATS = {".mp4": "MP4", ".gif": "GIF", ".webp": "WebP", "": "PNG frames"}
-"""Of films: three kinds of files, and a folder of frames."""
+"""Formats of films: three file types, and a folder of frames."""
 SIDES = (720, 1080, 1440, 2160)
-"""Of pictures and films: the shorter one, pixels."""
+"""Shorter sides of pictures and films, pixels."""
 FPS = (12, 24, 25, 30, 60)
 
 
 ALL_SLIDERS = "\0sliders"
+"""Value of `DeliverOptions.moves` for a film of all sliders."""
 TURNTABLE = "\0turntable"
-"""Films of no layer's own, in `DeliverOptions.moves`."""
+"""Value of `DeliverOptions.moves` for a film of one orbit."""
 
 
 def picture_size(side: int, shape: str) -> tuple[int, int]:
-    """Width and height of a picture of one of `SHAPES` whose shorter side has so many pixels."""
+    """Return width and height of a picture whose shorter side has `side` pixels, for one of `SHAPES`."""
     return round(side * max(SHAPES[shape], 1.0)), round(side / min(SHAPES[shape], 1.0))
 
 
 def film_title(moves: str) -> str:
-    """What a film shows, for a person."""
+    """Return the title of a film for the user."""
     whole = {"timeline": "The timeline", ALL_SLIDERS: "All sliders in turn", TURNTABLE: "Once around"}
     return whole.get(moves, f"The slider of {moves}, there and back")
 
 
 @dataclass(frozen=True)
 class DeliverOptions:
-    """What a picture or a film is asked for."""
+    """Options of a picture or a film."""
 
     width: int = 1920  # pixels
     height: int = 1080
     alpha: bool = False  # the background is transparent
-    fps: int = 24  # frames a second
-    seconds: float = 4.0  # of a film that moves a slider there and back
-    format: str = ".mp4"  # of `FORMATS`
-    moves: str = ""  # "timeline", the name of the layer whose slider moves, or one of these two
-    can_move: tuple[str, ...] = ()  # what there is to choose from
+    fps: int = 24  # frames per second
+    seconds: float = 4.0  # duration of a film of sliders or of an orbit
+    format: str = ".mp4"  # one of `FORMATS`
+    moves: str = ""  # "timeline", the name of a layer, `ALL_SLIDERS` or `TURNTABLE`
+    can_move: tuple[str, ...] = ()  # available values of `moves`
 
 
 _COUNT = re.compile(r"^((?:frame )?(\d+)(?:/| of )(\d+)(?:: [^:\n]+)?)", re.MULTILINE)
-"""What a line begins with that says which frame is drawn, or edit of the demo trained, and of how many."""
+"""Start of a progress line: the current frame, or edit of the demo, and the total."""
 
 
 @dataclass(frozen=True)
 class Delivery:
-    """A command that writes a file or a folder; stopped, it leaves nothing."""
+    """Command that writes a file or a folder; stopped, it leaves nothing."""
 
-    name: str  # of its card
+    name: str  # title of its card
     out: Path
-    words: tuple[str, ...]  # after `progdf`
-    log: Path  # what it prints
-    scene: Path  # the file that it is made from
+    words: tuple[str, ...]  # words after `progdf`
+    log: Path  # file for its output
+    scene: Path  # the source file
 
     is_begun: ClassVar[bool] = False
     is_locked: ClassVar[bool] = False
 
     @property
     def result(self) -> Path:
-        """What is there once it is done."""
+        """File or folder that exists once it is done."""
         return self.out
 
     def arguments(self, resumes: bool) -> tuple[str, ...]:
-        """Words after `progdf`."""
+        """Return the words after `progdf`."""
         return self.words
 
     def read_progress(self, before: Progress) -> Progress:
-        """How far it is, by the line with a count that it printed last."""
+        """Return the progress by the last printed line with a count."""
         with suppress(OSError):
             if counts := _COUNT.findall(self.log.read_text("utf-8", "replace")):
                 label, number, count = counts[-1]
@@ -101,43 +102,43 @@ class Delivery:
         return Progress(before.share, last_line(self.log))
 
     def lock(self) -> AbstractContextManager[None]:
-        """Nothing: each is one window's own."""
+        """Return a context that locks nothing: a delivery belongs to one window."""
         return nullcontext()
 
     def save(self) -> None:
-        """Nothing: it does not go on another day."""
+        """Save nothing: a delivery cannot be resumed."""
 
     def discard(self) -> None:
-        """Nothing: the command writes all or none."""
+        """Remove nothing: the command writes all or nothing."""
 
     def warning(self) -> str:
-        """No warning."""
+        """Return no warning."""
         return ""
 
 
 @dataclass(frozen=True)
 class QueuedTask:
-    """A task in the queue, as its card shows it."""
+    """Task in the queue, in the state shown on its card."""
 
-    number: int  # what requests call it by
+    number: int  # id in requests
     task: EditOrder | Delivery
     status: Status = "queued"
     progress: Progress = Progress()
-    seconds: float = 0.0  # that it has run, in this session of it
-    error: str = ""  # the one line of a failure
-    warning: str = ""  # the one line of a run that came out poor
-    resumes: bool = False  # it goes on with what was stopped
-    began_at: float = 0.0  # the share that was done when this session of it began
-    elsewhere: str = ""  # the name of its scene where another one is open
+    seconds: float = 0.0  # running time of this session
+    error: str = ""  # one line about a failure
+    warning: str = ""  # one line about a poor result
+    resumes: bool = False  # it continues a stopped run
+    began_at: float = 0.0  # share done at the start of this session
+    elsewhere: str = ""  # name of its scene while another one is open
 
     @property
     def busy(self) -> bool:
-        """Whether it runs, or waits to."""
+        """True if it runs or is queued."""
         return self.status in ("queued", "running", "stopping")
 
     @property
     def seconds_left(self) -> float | None:
-        """By how long it should still take at this pace; None before anything is known."""
+        """Estimated remaining time at the current pace; None before there is an estimate."""
         done = self.progress.share - self.began_at
         if self.status != "running" or done < 0.05 or self.seconds < 2.0:
             return None
@@ -145,31 +146,31 @@ class QueuedTask:
 
 
 class JobQueue:
-    """Does what is asked for. `close` it: what runs then is stopped, and training can be resumed."""
+    """Queue of tasks. `close` it: running tasks are stopped, and training can be resumed."""
 
     def __init__(self) -> None:
         self.jobs: tuple[QueuedTask, ...] = ()
         self._numbers = itertools.count(1)
         self._children: dict[int, Child] = {}
         self._began: dict[int, float] = {}
-        self._locks: dict[int, ExitStack] = {}  # of jobs that no other window may touch
+        self._locks: dict[int, ExitStack] = {}  # locks of jobs that no other window may change
         self._look_at = 0.0
         self._folder = tempfile.TemporaryDirectory(prefix="progdf-jobs-")
 
     @property
     def folder(self) -> Path:
-        """For files that commands read and write; gone with the window."""
+        """Folder for files that commands read and write; deleted with the window."""
         return Path(self._folder.name)
 
     def busy(self, kind: type = object) -> QueuedTask | None:
-        """The first job of this kind of task that runs, or waits to."""
+        """Return the first running or queued job of this kind of task."""
         return next((job for job in self.jobs if job.busy and isinstance(job.task, kind)), None)
 
     def job(self, number: int) -> QueuedTask:
-        """The job of that number.
+        """Return the job of this number.
 
         Raises:
-            ProgdfError: it is not in the queue any more.
+            ProgdfError: it is no longer in the queue.
         """
         for job in self.jobs:
             if job.number == number:
@@ -177,7 +178,7 @@ class JobQueue:
         raise ProgdfError("this job is not in the queue any more")
 
     def add(self, task: EditOrder | Delivery) -> int:
-        """Queue a task; its number.
+        """Queue a task and return its number.
 
         Raises:
             ProgdfError: its folder cannot be written to.
@@ -193,7 +194,7 @@ class JobQueue:
         return job.number
 
     def add_stopped(self, order: EditOrder) -> None:
-        """Show a run that was stopped another day, unless it is there, or another process has it."""
+        """Add a run that was stopped in an earlier session, unless it is listed or another process has it."""
         if not order.is_locked and all(job.task.out != order.out for job in self.jobs):
             job = QueuedTask(
                 next(self._numbers), order, "stopped", order.read_progress(Progress()), resumes=True
@@ -201,7 +202,7 @@ class JobQueue:
             self.jobs = (*self.jobs, job)
 
     def resume(self, number: int) -> None:
-        """Go on with a run that was stopped, or try again one that failed.
+        """Resume a stopped run, or retry a failed one.
 
         Raises:
             ProgdfError: another window trains it, or has discarded it.
@@ -217,7 +218,7 @@ class JobQueue:
             self._change(replace(job, status="queued", resumes=resumes, error="", seconds=0.0))
 
     def stop(self, number: int) -> None:
-        """Stop a job; what is done of a run is kept. One that waits is taken out."""
+        """Stop a job; a run keeps its progress. A queued job is removed."""
         job = self.job(number)
         if job.status == "queued" and job.resumes:
             self._unlock(job)
@@ -229,7 +230,7 @@ class JobQueue:
             self._change(replace(job, status="stopping"))
 
     def discard(self, number: int) -> None:
-        """Forget a job that does not run; what a run wrote is removed, unless it is finished.
+        """Remove a job that does not run, and the files of a run unless it is finished.
 
         Raises:
             ProgdfError: another window trains it, or it cannot be removed.
@@ -243,20 +244,20 @@ class JobQueue:
                 self._unlock(job)
 
     def dismiss(self, number: int) -> None:
-        """Take a job that has ended off the list; its files stay."""
+        """Remove an ended job from the list; its files stay."""
         self.jobs = tuple(job for job in self.jobs if job.number != number)
 
     def poll(self) -> list[QueuedTask]:
-        """Look at the jobs and start those whose turn it is; those that have just ended, well or not."""
+        """Poll the children and start the next jobs; return the jobs that have just ended or failed."""
         ended: list[QueuedTask | None] = []
-        looks = time.monotonic() >= self._look_at
-        if looks:
+        reads_progress = time.monotonic() >= self._look_at
+        if reads_progress:
             self._look_at = time.monotonic() + LOOK_S
         for job in self.jobs:
             child = self._children.get(job.number)
             if child is not None and (status := child.status) is not None:
                 ended.append(self._end(job, child, status))
-            elif child is not None and looks:
+            elif child is not None and reads_progress:
                 self._follow(job)
         for job in self.jobs:
             trains = any(isinstance(j.task, EditOrder) and j.number in self._children for j in self.jobs)
@@ -265,11 +266,11 @@ class JobQueue:
         return [job for job in ended if job is not None]
 
     def next_poll(self) -> float | None:
-        """Seconds until the next look; None while there is nothing to see."""
+        """Return the seconds until the next poll; None if no job is busy."""
         return POLL_S if self.busy() else None
 
     def close(self) -> None:
-        """Stop what runs, and wait until it has saved its state and gone; what waits is forgotten."""
+        """Stop the running jobs and wait until they have saved their state; discard queued ones."""
         for job in self.jobs:
             if job.status == "queued" and not job.resumes:
                 with suppress(ProgdfError):
@@ -286,16 +287,16 @@ class JobQueue:
     def _follow(self, job: QueuedTask) -> None:
         progress = job.task.read_progress(job.progress)
         now = time.monotonic()
-        if progress.share == job.began_at:  # it is still starting, which takes as long as it takes
+        if progress.share == job.began_at:  # the estimate starts after the startup
             self._began[job.number] = now
         seconds = now - self._began[job.number]
         self._change(replace(job, progress=progress, seconds=seconds))
 
     def _start(self, job: QueuedTask) -> QueuedTask | None:
-        """Start a job; what became of it where that cannot be."""
+        """Start a job; return it if it failed to start."""
         try:
             self._children[job.number] = Child(job.task.arguments(job.resumes), job.task.log)
-        except (OSError, ValueError) as error:  # the latter of a word that no command line can have
+        except (OSError, ValueError) as error:  # ValueError: a word that no command line can contain
             self._unlock(job)
             line = f"the command cannot start: {getattr(error, 'strerror', None) or error}"
             return self._change(replace(job, status="failed", error=line))
@@ -307,7 +308,7 @@ class JobQueue:
     def _end(self, job: QueuedTask, child: Child, status: int) -> QueuedTask:
         self._children.pop(job.number).close()
         begun = job.task.is_begun
-        if begun or job.status != "stopping":  # else it is discarded first
+        if begun or job.status != "stopping":  # otherwise `_drop` unlocks it after discarding it
             self._unlock(job)
         if status == 0 and job.task.result.exists():
             warning = without_commands(job.task.warning())
@@ -326,13 +327,13 @@ class JobQueue:
         return job
 
     def _drop(self, job: QueuedTask) -> None:
-        """Raises ProgdfError where it cannot be removed."""
+        """Discard a job. Raises ProgdfError if it cannot be removed."""
         job.task.discard()
         self._unlock(job)
         self.dismiss(job.number)
 
     def _lock(self, job: QueuedTask) -> None:
-        """Keep other windows from the run. Raises ProgdfError where one has it."""
+        """Lock the run against other windows. Raises ProgdfError if one has it."""
         with ExitStack() as locks:
             locks.enter_context(job.task.lock())
             self._locks[job.number] = locks.pop_all()

@@ -1,14 +1,14 @@
-"""Training as the window starts it: the form of a new edit, its command line, and the files of a run.
+"""Training from the window: the form of a new edit, its command line, and the files of a run.
 
-The trainer is another program (`progdf train`): only its words and files are known here.
+The trainer is another program (`progdf train`). This module knows only its command line and its files:
 
-SCENE.edits/NAME/              the run's folder, see `progdf train --out`
-SCENE.edits/NAME.train.json    what was asked for, so that a stopped run can go on another day
-SCENE.edits/NAME.train.log     what it printed
-SCENE.edits/NAME.train.lock    locked by the window that has it in its queue: it alone writes these files
-SCENE.edits/NAME.region.npy    the selection that it was made for
-SCENE.edits/NAME.draft.gdf     a grade alone, its layer until it is packed; sessions may name it: it stays
-SCENE.edits/NAME.packed.gdf    what is trained, its layer until it is measured; so too
+    SCENE.edits/NAME/              the run's folder, see `progdf train --out`
+    SCENE.edits/NAME.train.json    the order, so that a stopped run can be resumed in a later session
+    SCENE.edits/NAME.train.log     its output
+    SCENE.edits/NAME.train.lock    locked by the window that has it in its queue: it alone writes these files
+    SCENE.edits/NAME.region.npy    the selection that it edits
+    SCENE.edits/NAME.draft.gdf     a grade alone, its layer until it is packed; kept, as sessions may name it
+    SCENE.edits/NAME.packed.gdf    the trained edit, its layer until it is evaluated; kept as well
 """
 
 from __future__ import annotations
@@ -47,34 +47,38 @@ DRAFT = ".draft.gdf"
 PACKED = ".packed.gdf"
 
 Setting = Literal["color", "amount", "grade", "style", "sentence", "folder", "pictures"]
-"""What an editor is asked besides its kind."""
+"""Setting of an editor besides its kind."""
 
 ALL = "all"
+"""Region: the whole scene."""
 SELECTION = "selection"
+"""Region: the selection."""
 TYPED = "typed"
+"""Region: a specification that the user types."""
 CHANGED = "changed"
-"""Regions without a name: the whole scene, what is selected, what is typed, where pictures were changed."""
+"""Region: the Gaussians where edited pictures differ."""
 
 STYLES = 26
 BEST_STYLES = (14, 23, 20, 7, 12, 0)
-"""Of `style:N`, those that are most alike from all sides; they are offered first."""
+"""Styles of `style:N` that look most alike from all sides; they are offered first."""
 STYLE_ORDER = (*BEST_STYLES, *(i for i in range(STYLES) if i not in BEST_STYLES))
 SHEET_PX = (96, 72)
+"""Width and height of a thumbnail in the style sheet, in pixels."""
 SHEET_COLUMNS = 6
-"""Of the sheet of all paintings: pixels of one, and how many lie side by side; in their order."""
+"""Thumbnails in a row of the style sheet, in the order of `STYLE_ORDER`."""
 
 
 @dataclass(frozen=True)
 class EditorChoice:
-    """An editor as the form offers it."""
+    """Editor offered in the form."""
 
-    kind: str  # as `progdf train --editor` calls it
-    title: str  # in the list
+    kind: str  # name in `progdf train --editor`
+    title: str  # title in the list
     setting: Setting
     help: str  # one line
-    package: str = ""  # what has to be installed for it, "" for nothing
-    extra: str = ""  # how that is installed
-    pictured: bool = True  # its picture of the present view is shown before anything is trained
+    package: str = ""  # required package, "" for none
+    extra: str = ""  # extra that installs the package
+    pictured: bool = True  # its picture of the current view is shown before training
 
 
 EDITORS = (
@@ -95,50 +99,50 @@ EDITORS = (
 
 Point = tuple[float, float]
 NEUTRAL = tuple(neutral for _, _, neutral in GRADE_RANGES.values())
-"""A grade that changes nothing."""
+"""Values of a grade that changes nothing."""
 STILL = "Change a color, the curve or a slider of the grade"
-"""An obstacle."""
+"""Obstacle: the grade changes nothing."""
 MAX_PAIRS = 8
 
 
 @dataclass(frozen=True)
 class NewEdit:
-    """What stands in the form."""
+    """State of the form."""
 
     region: str = ALL  # `SELECTION`, `TYPED`, `CHANGED`, or the name of a region
-    typed_region: str = ""  # as `progdf train --region` has it, for `TYPED`
+    typed_region: str = ""  # value of `progdf train --region`, for `TYPED`
     editor: int = 0  # index into `EDITORS`
     color: tuple[float, float, float] = (0.19, 0.38, 0.82)  # sRGB, 0..1
-    through_hues: bool = False  # the way to the color goes around the color wheel, not through gray
-    amount: float = 0.7  # of light that is taken away, 0..1
+    through_hues: bool = False  # the path to the color follows the color wheel, not through gray
+    amount: float = 0.7  # share of light that is removed, 0..1
     grade: tuple[float, ...] = NEUTRAL  # in the order of `GRADE_RANGES`
-    # of a grade: colors #rrggbb of the region and what becomes of them, see `find_palette`; with a curve of
-    # the lightness near one #rrggbb/0.30:0.20+0.70:0.80
+    # for a grade: colors #rrggbb of the region and their new colors, see `find_palette`; with a curve of the
+    # lightness near one #rrggbb/0.30:0.20+0.70:0.80
     palette: tuple[tuple[str, str], ...] = ()
-    curve: str = ""  # of a grade: lightness, see `parse_curve`
-    picks: bool = False  # the next click on the picture takes a color into the palette
-    picked: int = -1  # which of it was just taken, and is to be chosen another color for
+    curve: str = ""  # for a grade: lightness, see `parse_curve`
+    picks: bool = False  # the next click on the picture adds a color to the palette
+    picked: int = -1  # index of the color just picked, whose color picker opens
     style: int = BEST_STYLES[0]  # number of a painting
-    sentence: str = ""  # for the model
-    model: str = ""  # that paints the sentence; "" takes what fits
-    asks: int = 0  # how often it was asked to paint the view: the finished edit follows the last picture
-    anchor: str = ""  # the file of that picture where it is painted over by hand
-    folder: str = ""  # of edited views
-    pictures: str = ""  # that were rendered and changed, joined by commas
-    name: str = ""  # of the layer; "" takes the editor's
+    sentence: str = ""  # text for the model
+    model: str = ""  # diffusion model for the sentence; "" selects one that fits
+    asks: int = 0  # number of pictures requested; the edit follows the last one
+    anchor: str = ""  # file of that picture if it is edited by hand
+    folder: str = ""  # folder of edited views
+    pictures: str = ""  # edited renders, joined by commas
+    name: str = ""  # name of the layer; "" for the editor's
     quick: bool = True  # a draft in a third of the time
-    preview: bool = True  # show the editor's own picture of the present view
-    strength: float = 1.0  # of that picture, 0..1
-    error: str = ""  # why it cannot begin, one line, "" where it was not tried
+    preview: bool = True  # show the editor's own picture of the current view
+    strength: float = 1.0  # strength of that picture, 0..1
+    error: str = ""  # one line why training cannot begin, "" if it was not tried
 
     @property
     def choice(self) -> EditorChoice:
-        """The editor that is chosen."""
+        """The chosen editor."""
         return EDITORS[self.editor]
 
     @property
     def spec(self) -> str:
-        """As `progdf train --editor` has it."""
+        """Value of `progdf train --editor`."""
         kind = self.choice.kind
         match self.choice.setting:
             case "color":
@@ -165,25 +169,27 @@ class NewEdit:
 
     @property
     def layer_name(self) -> str:
-        """The name that the layer and its file will have."""
+        """Name of the layer and its file."""
         words = self.name.strip() or self.suggested_name
         name = re.sub(r"[<>:\"/\\|?*\x00-\x1f]", "-", words).lstrip(".")[:80].rstrip(" .") or "edit"
         return name if atomic.is_portable(name) else f"edit {name}"
 
     @property
     def suggested_name(self) -> str:
-        """The name where none is typed: the region's with the editor's, or the editor's alone."""
+        """Default name: the region's with the editor's, or the editor's alone."""
         kind = self.choice.kind
-        what = f"{kind} {self.style}" if kind == "style" else kind
+        description = f"{kind} {self.style}" if kind == "style" else kind
         if self.choice.setting == "sentence" and self.sentence.strip():
-            what = " ".join(self.sentence.split()[:4])
+            description = " ".join(self.sentence.split()[:4])
         if self.choice.setting == "pictures" and self.pictures.strip():
-            what = Path(self.pictures.split(",")[0].strip()).stem
-        return what if self.region in (ALL, SELECTION, TYPED, CHANGED) else f"{self.region} {what}"
+            description = Path(self.pictures.split(",")[0].strip()).stem
+        return (
+            description if self.region in (ALL, SELECTION, TYPED, CHANGED) else f"{self.region} {description}"
+        )
 
     @property
     def obstacle(self) -> str:
-        """What is missing before it can be trained, one line; "" for nothing."""
+        """One line about what is missing before training, "" for nothing."""
         if missing := missing_package(self.choice):
             return missing
         if self.choice.setting == "sentence" and not self.sentence.strip():
@@ -198,12 +204,12 @@ class NewEdit:
 
 
 def parse_curve(text: str) -> list[Point]:
-    """The points of 0.30:0.20+0.70:0.80, for `bend_lightness`; a ValueError where they are none."""
+    """Parse the points of 0.30:0.20+0.70:0.80, for `bend_lightness`; raise ValueError for other text."""
     return [(float(x), float(y)) for x, y in (point.split(":") for point in text.split("+") if point)]
 
 
 def with_editor(form: NewEdit, editor: int) -> NewEdit:
-    """The form with another editor; a few changed pictures know their own region."""
+    """Return the form with another editor. Edited pictures find their own region."""
     region = form.region
     finds = EDITORS[editor].kind == "pictures"
     if finds and region == ALL:
@@ -214,12 +220,12 @@ def with_editor(form: NewEdit, editor: int) -> NewEdit:
 
 
 def with_settings(form: NewEdit, instruction: str) -> NewEdit | None:
-    """The form with the editor and the settings of an edit; None where no editor of the form makes such.
+    """Return the form with the editor and the settings of an edit; None if the form has no such editor.
 
     Args:
-        instruction: of the edit, as `progdf train --editor` has it
+        instruction: the edit's value of `progdf train --editor`
     """
-    kind, _, rest = instruction.partition(":")
+    kind, _, argument = instruction.partition(":")
     editor = next((i for i, choice in enumerate(EDITORS) if choice.kind == kind), None)
     if editor is None:
         return None
@@ -227,87 +233,89 @@ def with_settings(form: NewEdit, instruction: str) -> NewEdit | None:
     try:
         match form.choice.setting:
             case "color":
-                color, *words = rest.split(",")
+                color, *words = argument.split(",")
                 red, green, blue = parse_color(color).tolist()
                 return replace(form, color=(red, green, blue), through_hues="path=hue" in words)
             case "amount":
-                amount = float(rest)
+                amount = float(argument)
                 return replace(form, amount=amount) if 0.0 <= amount <= 1.0 else None
             case "grade":
-                values = parse_grade(rest).values
+                values = parse_grade(argument).values
                 grade = tuple(values.get(name, neutral) for name, (*_, neutral) in GRADE_RANGES.items())
-                pairs = [[word.strip() for word in part.partition("=")] for part in rest.split(",")]
+                pairs = [[word.strip() for word in part.partition("=")] for part in argument.split(",")]
                 palette = tuple((name, text or name) for name, _, text in pairs if name.startswith("#"))
                 curve = next((text for name, _, text in pairs if name == "curve"), "")
                 return replace(form, grade=grade, palette=palette, curve=curve)
             case "style":
-                return replace(form, style=int(rest)) if int(rest) in range(STYLES) else None
+                return replace(form, style=int(argument)) if int(argument) in range(STYLES) else None
             case "sentence":
-                return replace(form, sentence=rest)
+                return replace(form, sentence=argument)
             case "pictures":
-                return replace(form, pictures=", ".join(rest.split(",")))
+                return replace(form, pictures=", ".join(argument.split(",")))
             case "folder":
-                return replace(form, folder=rest)
-    except ValueError:  # of another version
+                return replace(form, folder=argument)
+    except ValueError:  # written by another version
         return None
 
 
 def with_color(form: NewEdit, color: str) -> NewEdit:
-    """The form with a color of the picture in its palette, in place of one that is like it; it is chosen
-    another one for next."""
-    known = [parse_color(source) for source, _ in form.palette]
-    alike = [i for i, source in enumerate(known) if are_alike(source, parse_color(color))]
-    at = alike[0] if alike else min(len(known), MAX_PAIRS - 1)
-    target = form.palette[at][1] if alike and form.palette[at][0] != form.palette[at][1] else color
-    rest = tuple(pair for i, pair in enumerate(form.palette) if i not in alike)[: MAX_PAIRS - 1]
-    return replace(form, palette=(*rest[:at], (color, target), *rest[at:]), picks=False, picked=at)
+    """Return the form with a picked color in its palette, replacing a similar one. Its color picker opens
+    next."""
+    sources = [parse_color(source) for source, _ in form.palette]
+    alike = [i for i, source in enumerate(sources) if are_alike(source, parse_color(color))]
+    index = alike[0] if alike else min(len(sources), MAX_PAIRS - 1)
+    target = form.palette[index][1] if alike and form.palette[index][0] != form.palette[index][1] else color
+    others = tuple(pair for i, pair in enumerate(form.palette) if i not in alike)[: MAX_PAIRS - 1]
+    return replace(
+        form, palette=(*others[:index], (color, target), *others[index:]), picks=False, picked=index
+    )
 
 
 def with_picture(form: NewEdit, path: Path, further: bool) -> NewEdit:
-    """The form with a picture that was changed; beside those that it has where this is a further one."""
+    """Return the form with an edited picture, after those that it has if this is a `further` one."""
     names = [name.strip() for name in form.pictures.split(",") if name.strip()]
-    known = names if further and form.choice.kind == "pictures" else []
-    names = [*(name for name in known if name != str(path)), str(path)]
+    earlier_names = names if further and form.choice.kind == "pictures" else []
+    names = [*(name for name in earlier_names if name != str(path)), str(path)]
     pictures = next(i for i, choice in enumerate(EDITORS) if choice.kind == "pictures")
-    region = form.region if known else CHANGED
+    region = form.region if earlier_names else CHANGED
     return replace(form, editor=pictures, pictures=", ".join(names), region=region, error="")
 
 
 def missing_package(choice: EditorChoice) -> str:
-    """How to install what an editor needs; "" where it is there."""
+    """Return a line about the missing package of an editor; "" if it is installed."""
     if not choice.package or find_spec(choice.package) is not None:
         return ""
     return f"{choice.title} needs the extra '{choice.extra}' of ProGDF Studio, which is not installed"
 
 
 class _Paint(msgspec.Struct):
-    warning: str = ""  # why little of the paint is in the edit, "" if enough is
+    warning: str = ""  # reason why little of the paint was reproduced, "" if enough was
 
 
 class _Report(msgspec.Struct):
-    """Of RUN/report.json: what a finished run on painted pictures warns of."""
+    """Part of RUN/report.json: the warnings of a finished run on painted pictures."""
 
     paint: _Paint | None = None
 
 
 @dataclass(frozen=True)
 class EditOrder:
-    """A run of the trainer: what is asked for, and its files."""
+    """Training run: its options and its files."""
 
-    scene: Path  # its file
+    scene: Path  # file of the scene
     out: Path  # the run's folder
-    name: str  # of the layer
-    region: str  # as `progdf train --region` has it
-    editor: str  # as `progdf train --editor` has it
+    name: str  # name of the layer
+    region: str  # value of `progdf train --region`
+    editor: str  # value of `progdf train --editor`
     quick: bool = True  # a draft
-    threads: int = 0  # CPU threads; 0 takes all
-    model: str = ""  # of a sentence; "" takes what fits
-    anchor: str = ""  # file of a painted picture that decides, "" for none
-    at: str = ""  # of a decal: where in the picture of the camera
-    camera: str = ""  # file of that one
+    threads: int = 0  # CPU threads; 0 for all
+    model: str = ""  # diffusion model for a sentence; "" selects one that fits
+    anchor: str = ""  # file of a painted picture that all views follow, "" for none
+    at: str = ""  # for a decal: its position in the camera's picture
+    camera: str = ""  # file of that camera
 
     def arguments(self, resumes: bool = False) -> list[str]:
-        """Words after `progdf`."""
+        """Return the words after `progdf`."""
         words = ["train", str(self.scene), f"--out={self.out}", f"--region={self.region}"]
         words += [f"--editor={self.editor}", f"--name={self.name}", f"--threads={self.threads}"]
         given = {"model": self.model, "anchor": self.anchor, "at": self.at, "camera": self.camera}
@@ -316,37 +324,37 @@ class EditOrder:
 
     @property
     def result(self) -> Path:
-        """The edit, once it is trained."""
+        """File of the trained edit."""
         return self.out / f"{self.name}.gdf"
 
     @property
     def draft(self) -> Path:
-        """The edit before it is trained, where a grade alone carries it; may be absent."""
+        """File of the edit before training, if a grade alone represents it; may be absent."""
         return self._beside(DRAFT)
 
     @property
     def packed_edit(self) -> Path:
-        """The edit once it is packed, while it is measured; may be absent."""
+        """File of the packed edit, while it is evaluated; may be absent."""
         return self._beside(PACKED)
 
     @property
     def log(self) -> Path:
-        """What the run printed."""
+        """Output of the run."""
         return self._beside(LOG)
 
     @property
     def is_begun(self) -> bool:
-        """Whether the run has saved something that it can go on with."""
-        return os.path.isfile(self.out / "state" / "run.json")  # False where it may not be looked at
+        """True if the run has saved a state that it can resume from."""
+        return os.path.isfile(self.out / "state" / "run.json")  # False if it may not be read
 
     @property
     def is_locked(self) -> bool:
-        """Whether another window, or a process, has the run; this one must not hold it itself."""
+        """True if another window, or a process, has the run; this window must not hold it itself."""
         return atomic.is_locked(self._beside(WINDOW_LOCK)) or atomic.is_locked(self.out / atomic.LOCK)
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
-        """This window alone resumes, trains or discards the run meanwhile.
+        """Lock the run, so that only this window resumes, trains or discards it.
 
         Raises:
             LockedError: another window has it in its queue, or a process trains it.
@@ -356,7 +364,7 @@ class EditOrder:
         lock = self._beside(WINDOW_LOCK)
         try:
             with atomic.hold_lock(lock):
-                # by a command, or by the child of a window that was killed
+                # locked by a command, or by the child of a killed window
                 if atomic.is_locked(self.out / atomic.LOCK):
                     raise atomic.LockedError(str(lock))
                 yield
@@ -367,21 +375,21 @@ class EditOrder:
                 lock.unlink(missing_ok=True)
 
     def save(self) -> None:
-        """Write down what is asked for.
+        """Save the order.
 
         Raises:
-            ProgdfError: the folder cannot be made or written to.
+            ProgdfError: the folder cannot be created or written to.
         """
         atomic.make_folder(self.out.parent)
         values = plain(self) | {"scene": str(self.scene)}
-        del values["out"]  # it is where the file is
+        del values["out"]  # it is implied by the file's location
         atomic.write_file(self._beside(ORDER), msgspec.json.format(msgspec.json.encode(values)))
 
     def discard(self) -> None:
-        """Remove a run that was not finished, and what was written down of it.
+        """Remove an unfinished run and its order.
 
         Raises:
-            ProgdfError: it cannot be removed, and is whole.
+            ProgdfError: it cannot be removed, and is unchanged.
         """
         if self.result.exists():
             return
@@ -389,7 +397,7 @@ class EditOrder:
         if self.out.is_symlink() or run.parent.is_symlink():
             raise ProgdfError(f"{self.out} is behind a link, which is not followed; remove the link")
         try:
-            run.unlink(missing_ok=True)  # first: a rest without it is no run
+            run.unlink(missing_ok=True)  # first: the remaining files alone are not a run
         except OSError as error:
             reason = error.strerror or error
             raise ProgdfError(f"{self.out} cannot be removed ({reason}); check its permissions") from error
@@ -399,7 +407,8 @@ class EditOrder:
                 self._beside(suffix).unlink(missing_ok=True)
 
     def read_progress(self, before: Progress) -> Progress:
-        """How far the run is; its share and seconds begin at 0 again until it has read its state."""
+        """Return the run's progress. Share and seconds never fall, although a resumed run reports 0 until
+        it has read its state."""
         try:
             now = read_json(self.out / "state" / "progress.json", Progress)
         except ProgdfError:
@@ -407,7 +416,7 @@ class EditOrder:
         return replace(now, share=max(now.share, before.share), seconds=max(now.seconds, before.seconds))
 
     def warning(self) -> str:
-        """What the finished run warns of, "" if of nothing."""
+        """Return the warning of the finished run, "" for none."""
         try:
             report = read_json(self.out / "report.json", _Report)
         except ProgdfError:
@@ -415,7 +424,7 @@ class EditOrder:
         return report.paint.warning if report.paint is not None else ""
 
     def newest_recording(self) -> Path | None:
-        """The file of the last recording that the run has saved; None where there is none."""
+        """Return the file of the last saved recording; None if there is none."""
         folder = self.out / "state" / "recordings"
         with contextlib.suppress(OSError):
             names = [entry.name for entry in os.scandir(folder) if entry.name[:1].isdigit()]
@@ -423,7 +432,8 @@ class EditOrder:
         return None
 
     def recorded_edit(self, recording: Path, scene: Gaussians) -> Gdf | None:
-        """A recording as an edit of the scene, at 1 what is trained so far; None while it changes."""
+        """Return a recording as an edit of the scene, at strength 1 the current state; None while it is
+        written."""
         try:
             tensors, _ = read_tensors(self.out / "state" / "region.safetensors")
             offsets = read_tensors(recording)[0]["offsets"].float()
@@ -441,7 +451,7 @@ class EditOrder:
 
 
 def edits_folder(scene: Path) -> Path:
-    """Where new edits of a scene are trained: beside it, or in the user's own folder if that is read-only."""
+    """Return the folder for new edits of a scene: beside it, or in the user's folder if that is read-only."""
     scene = scene.resolve()
     beside = scene.with_name(f"{scene.stem}.edits")
     if takes_files(beside if beside.is_dir() else scene.parent):
@@ -451,7 +461,7 @@ def edits_folder(scene: Path) -> Path:
 
 
 def free_run(folder: Path, name: str) -> Path:
-    """A folder for a run of this name: NAME, or NAME-2 where something has that."""
+    """Return a free folder for a run of this name: NAME, or NAME-2 if something has that name."""
 
     def is_taken(run: Path) -> bool:
         return any(run.with_name(run.name + suffix).exists() for suffix in ("", ORDER, DRAFT, PACKED))
@@ -462,19 +472,20 @@ def free_run(folder: Path, name: str) -> Path:
 def free_path(
     folder: Path, name: str, suffix: str = "", is_taken: Callable[[Path], bool] = Path.exists
 ) -> Path:
-    """NAME with a suffix, or NAME-2, NAME-3 … where that is taken."""
+    """Return NAME with a suffix, or NAME-2, NAME-3 … if that is taken."""
     return next(p for n in atomic.numbered_names(name, suffix) if not is_taken(p := folder / n))
 
 
 def finished_edit(draft: Path) -> Path | None:
-    """What was trained of a draft since a session was saved with it."""
+    """Return the edit trained from a draft after a session was saved with the draft; None if there is
+    none."""
     name = draft.name.removesuffix(DRAFT).removesuffix(PACKED)
     result = draft.with_name(name) / f"{name}.gdf"
     return result if name != draft.name and os.path.isfile(result) else None
 
 
 def stopped_orders(folder: Path, scene: Path) -> Iterator[EditOrder]:
-    """Runs of this scene that were stopped and can go on."""
+    """Return the stopped runs of this scene that can be resumed."""
     for path in sorted(folder.glob(f"*{ORDER}")):
         name = path.name.removesuffix(ORDER)
         if not name.strip("."):  # "..", whose run would be the scene's own folder
@@ -487,7 +498,7 @@ def stopped_orders(folder: Path, scene: Path) -> Iterator[EditOrder]:
 
 
 def takes_files(folder: Path) -> bool:
-    """Whether a folder is meant to be written to: root may write into folders that are read-only for all."""
+    """Return whether a folder is writable. Root could also write into folders that are read-only for all."""
     try:
         return bool(folder.stat().st_mode & 0o222) and os.access(folder, os.W_OK)
     except OSError:
@@ -495,5 +506,5 @@ def takes_files(folder: Path) -> bool:
 
 
 def spare_threads() -> int:
-    """How many threads a child shall use: all but the one that the window needs."""
+    """Return the number of threads for a child: all but one, which the window needs."""
     return max(1, (os.cpu_count() or 2) - 1)
