@@ -1,1 +1,1 @@
-"""Pictures made of pictures: comparisons, sheets, films, thumbnails."""
+"""Composed pictures: comparisons, contact sheets, films."""

@@ -1,8 +1,8 @@
-"""Two pictures in one: each in a half, or split at a divider, or their difference amplified, with PSNR.
+"""Comparison of two pictures: side by side, split at a divider, or their amplified difference, with PSNR.
 
-Beside the edited picture stands the original, or one snapshot beside another. That side is drawn by a second
-engine, made when it is first asked for: against the original a slider then moves only one of the two
-pictures, the divider neither.
+The edited picture is compared with the original, or one snapshot with another. A second engine draws the
+other side; it is created on first use. Against the original, a slider then redraws only one of the two
+pictures, and the divider none.
 """
 
 from __future__ import annotations
@@ -32,25 +32,25 @@ ORIGINAL = "original"
 EDITED = "edited"
 _SHADE = (22, 24, 27)
 _INK = (222, 225, 230)
-_PLAIN = str.maketrans({"×": "x", "–": "-"})  # Pillow's own font has no others
+_PLAIN = str.maketrans({"×": "x", "–": "-"})  # Pillow's default font lacks these characters
 
 
 @dataclass(frozen=True)
 class Labels:
-    """The words of one comparison."""
+    """Labels of a comparison."""
 
-    left: str = ORIGINAL  # left, right: the two sides
-    right: str = EDITED
-    line: str = ""  # over a difference
+    left: str = ORIGINAL  # left side
+    right: str = EDITED  # right side
+    line: str = ""  # label of a difference
 
 
 def labels(compare: Comparison, decibels: float, names: tuple[str, str] | None = None) -> Labels:
-    """What to say over a comparison.
+    """Return the labels of a comparison.
 
     Args:
-        compare: what is compared, and how
-        decibels: PSNR of the two pictures; NaN where it was not taken
-        names: of the snapshots on the two sides; None for the original and the edited
+        compare: kind and settings of the comparison
+        decibels: PSNR of the two pictures; NaN if it was not measured
+        names: names of the snapshots on the two sides; None for the original and the edited
     """
     if math.isinf(decibels):
         line = "difference: none"
@@ -64,7 +64,7 @@ def labels(compare: Comparison, decibels: float, names: tuple[str, str] | None =
 
 
 def draw_labels(image: Image, compare: Comparison, words: Labels) -> Pixels:
-    """A picture of `Comparer.image` for a file: with the divider and what is on which side."""
+    """Return a picture of `Comparer.image` with the divider and the labels of its sides."""
     pixels = to_pixels(image)
     if compare.mode == "off":
         return pixels
@@ -82,14 +82,15 @@ def draw_labels(image: Image, compare: Comparison, words: Labels) -> Pixels:
 
 
 def column(compare: Comparison, width: int) -> int:
-    """Where in a picture of this width the edited side begins, pixels."""
+    """Return the column where the edited side begins in a picture of this width, in pixels."""
     if compare.mode == "beside":
         return width // 2
     return max(0, min(width, round(compare.divider * width)))
 
 
 def _tag(draw: ImageDraw.ImageDraw, x: float, side: str, text: str, size: tuple[int, int]) -> None:
-    """A word at the top: left of x ("r" as it ends there), right of it ("l"), or around it; where it fits."""
+    """Draw a label at the top if it fits: ending left of x ("r"), beginning right of it ("l"), or
+    centered."""
     text = text.translate(_PLAIN)
     letters = max(11, round(size[1] / 28))
     font = ImageFont.load_default(size=letters)
@@ -105,28 +106,28 @@ def _tag(draw: ImageDraw.ImageDraw, x: float, side: str, text: str, size: tuple[
 
 
 class Comparer:
-    """Draws a view as its `compare` asks, in place of the engine.
+    """Drawing of a view with its comparison, in place of the engine.
 
     Args:
-        engine: draws the edited scene; stays the caller's
-        ctx: the engine's context; None for `image` only
+        engine: draws the edited scene; owned by the caller
+        ctx: context of the engine; None for `image` only
     """
 
     def __init__(self, engine: ViewEngine, ctx: moderngl.Context | None) -> None:
         self.engine = engine
         self.psnr = math.nan
-        """Of the last comparison, dB; infinite where nothing differs, NaN where it was not taken."""
+        """PSNR of the last comparison, dB; infinite without a difference, NaN if it was not measured."""
         self.sides: SnapshotSides | None = None
-        """The snapshots that the next view compares; that view is then `sides.right`."""
+        """Snapshots that the next view compares; that view is then `sides.right`."""
         self._ctx = ctx
         self._other: ViewEngine | None = None
-        self._of_snapshots = False  # whether `_other` draws one of them
+        self._of_snapshots = False  # `_other` draws a snapshot
         self._presenter: Presenter | None = None
         self._texture: moderngl.Texture | None = None
-        self._amplified: float | None = None  # how much the difference in the texture is amplified
+        self._amplified: float | None = None  # amplification of the difference in the texture
 
     def needs_draw(self, view: ViewState, size: tuple[int, int], pixels: int = 1) -> bool:
-        """Whether splats have to be drawn for `view`, or a difference taken; arguments as for `draw`."""
+        """Return whether `view` needs Gaussians drawn or a difference computed; arguments as for `draw`."""
         drawn = size if view.compare.mode == "difference" else drawn_size(size, pixels)
         camera = half_camera(to_camera(view.camera, *drawn)) if view.compare.mode == "beside" else None
         if self.engine.needs_draw(view, drawn, camera):
@@ -146,20 +147,20 @@ class Comparer:
         """Show `view` in the lower left `size` pixels of `framebuffer`.
 
         Args:
-            pixels: of the framebuffer that one drawn pixel fills, each way; a difference is drawn in full
+            pixels: width and height in framebuffer pixels of one drawn pixel; a difference is drawn in full
 
         Raises:
-            ProgdfError: a layer of `view` means nothing.
+            ProgdfError: `view` has an invalid layer.
         """
         if view.compare.mode == "difference":
             return self._draw_difference(view, framebuffer, size)
-        self._amplified = None  # the engines go on, and the next difference is another
+        self._amplified = None  # the engines draw new pictures, so the texture is outdated
         if view.compare.mode in ("beside", "split"):
             return self._draw_sides(view, framebuffer, size, pixels)
         return self.engine.draw(view, framebuffer, size, pixels)
 
     def prepare(self, view: ViewState, size: tuple[int, int]) -> bool:
-        """Begin in full what was drawn coarsely; whether `draw` now shows it at once."""
+        """Begin the full resolution of a coarsely drawn view; return whether `draw` can show it at once."""
         camera = to_camera(view.camera, *size)
         mode = view.compare.mode
         camera = half_camera(camera) if mode == "beside" else camera
@@ -168,7 +169,7 @@ class Comparer:
         return mode == "off" or self._second().prepare(self._other_view(view), camera)
 
     def image(self, view: ViewState, size: tuple[int, int] = (0, 0), camera: Camera | None = None) -> Image:
-        """The same as an array, without labels. [H,W,3] float32, see `ViewEngine.image`"""
+        """Return the view as an array, without labels. [H,W,3] float32, see `ViewEngine.image`"""
         if view.compare.mode == "off":
             return self.engine.image(view, size, camera)
         if view.compare.mode == "beside":
@@ -186,17 +187,17 @@ class Comparer:
         return difference(other, edited, view.compare.amplify)
 
     def labels(self, view: ViewState) -> Labels:
-        """What to say over the last comparison, of `view`."""
+        """Return the labels of the last comparison, of `view`."""
         return labels(view.compare, self.psnr, self.sides.names if self.sides else None)
 
     def release(self) -> None:
-        """Give back all but the engine."""
+        """Release all resources except the engine."""
         for resource in (self._other, self._presenter, self._texture):
             if resource is not None:
                 resource.release()
 
     def _second(self) -> ViewEngine:
-        """What draws the other side."""
+        """Return the engine of the other side."""
         if self._other is None or self._of_snapshots != bool(self.sides):
             if self._other is not None:
                 self._other.release()
@@ -206,7 +207,7 @@ class Comparer:
         return self._other
 
     def _other_view(self, view: ViewState) -> ViewState:
-        """What the other side of `view` shows."""
+        """Return the view of the other side."""
         if self.sides is None:
             return replace(view, layers=())
         left = self.sides.left
@@ -217,7 +218,7 @@ class Comparer:
     ) -> FrameTimings:
         other = self._second()
         its_view = self._other_view(view)
-        self.psnr = math.nan  # of no use: an edit shall differ
+        self.psnr = math.nan  # not needed: an edit is meant to differ
         if view.compare.mode == "beside":
             edited = self.engine.draw(view, framebuffer, size, pixels, half=1)
             original = other.draw(its_view, framebuffer, size, pixels, half=0)
@@ -227,7 +228,7 @@ class Comparer:
             try:
                 original = other.draw(its_view, framebuffer, size, pixels)
             finally:
-                framebuffer.scissor = None  # type: ignore[assignment]  # its annotation forgets None
+                framebuffer.scissor = None  # its annotation lacks None
         return _add_timings(edited, original)
 
     def _draw_difference(
@@ -251,19 +252,20 @@ class Comparer:
 
 
 def difference(other: Image, edited: Image, amplify: float) -> Image:
-    """amplify · |edited − other| of what is seen (0..1) of each; black where nothing differs. [H,W,3]"""
+    """Return amplify · |edited − other| of the clipped (0..1) pictures; black without a difference.
+    [H,W,3]"""
     image: Image = np.abs(np.clip(edited, 0.0, 1.0) - np.clip(other, 0.0, 1.0)) * np.float32(amplify)
     return image
 
 
 def _psnr(other: Image, edited: Image) -> float:
-    """Of what is seen (0..1) of two pictures, dB."""
-    seen = (torch.from_numpy(np.clip(image, 0.0, 1.0)) for image in (edited, other))
-    return psnr(*seen)
+    """Return the PSNR of two clipped (0..1) pictures, dB."""
+    clipped = (torch.from_numpy(np.clip(image, 0.0, 1.0)) for image in (edited, other))
+    return psnr(*clipped)
 
 
 def _add_timings(edited: FrameTimings, original: FrameTimings) -> FrameTimings:
-    """The time that both took, the figures of the edited one."""
+    """Return the sum of both times, with the other figures of the edited picture."""
     return replace(
         edited,
         compose_ms=edited.compose_ms + original.compose_ms,

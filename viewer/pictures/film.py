@@ -1,4 +1,4 @@
-"""Pictures of moving sliders: animations, films of a timeline, contact sheets of one slider or two."""
+"""Pictures of moving sliders: animations, films of a timeline, contact sheets of one or two sliders."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ _VIDEO_COLORS = {
     "color_trc": "iec61966-2-1",
     "color_range": "tv",
 }
-"""Tags that tell a player how colors are encoded: matrix and primaries of HD video, the curve of sRGB."""
+"""Color tags for players: matrix and primaries of HD video, the curve of sRGB."""
 _VIDEO_FILTER = (
     "scale=out_color_matrix=bt709:out_range=tv:flags=accurate_rnd+full_chroma_int,format=yuv420p,"
     "setparams=colorspace=bt709:color_primaries=bt709:color_trc=iec61966-2-1:range=tv"
 )
-"""Converts to these colors. Newer encoders take the tags from the frames, older ones from their options."""
+"""Filter that converts to these colors. Newer encoders read the tags from frames, older ones from options."""
 
-_WEBP_QUALITY = 85  # of 100: no block is seen in a still
-_PALETTE_REACH = 8  # levels: Pillow looks up the nearest color of a palette in steps of 4
+_WEBP_QUALITY = 85  # of 100: no visible blocks in a still
+_PALETTE_REACH = 8  # levels: Pillow finds the nearest palette color in steps of 4
 ANIMATIONS = (".gif", ".webp", VIDEO)
 _OPAQUE = (".gif", VIDEO)  # a .gif has no partial transparency
 SHEET_STRENGTHS = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -70,7 +70,7 @@ def unmix(black: NDArray[np.float32], white: NDArray[np.float32]) -> Pixels:
 
 
 def with_strengths(view: ViewState, strengths: dict[str, float]) -> ViewState:
-    """`view` with the named layers at these strengths, and shown, in groups that are shown."""
+    """Return `view` with the named layers and their groups enabled, at these strengths."""
     moved = tuple(
         replace(l, strength=strengths[l.name], enabled=True) if l.name in strengths else l
         for l in view.layers
@@ -81,7 +81,8 @@ def with_strengths(view: ViewState, strengths: dict[str, float]) -> ViewState:
 
 
 def contact_sheet(names: Sequence[str], draw: Draw, view: ViewState) -> Pixels:
-    """`view` with a layer at five strengths, in a row; of a second one too, from row to row the first."""
+    """Return `view` with a layer at five strengths in a row; with two layers, the first changes between
+    rows."""
     *down, across = names
     rows: list[dict[str, float]] = [dict.fromkeys(down, s) for s in (SHEET_STRENGTHS if down else (0.0,))]
     drawn = [
@@ -94,10 +95,11 @@ def contact_sheet(names: Sequence[str], draw: Draw, view: ViewState) -> Pixels:
 
 
 def write_film(path: Path, frames: Iterable[Pixels], frames_per_second: int) -> None:
-    """Write frames as they come, each for the same time: .gif or .webp, endless, or .mp4.
+    """Write frames of equal duration as they arrive: .gif or .webp, endless, or .mp4.
 
-    Frames are [H,W,3], of a .webp also [H,W,4]. A .gif counts in hundredths of a second, so its frames take
-    turns in being a little longer and shorter. No frame is shorter than 2, as programs slow such down.
+    Frames are [H,W,3], for a .webp also [H,W,4]. A .gif has durations in hundredths of a second, so its
+    frames alternate between slightly longer and shorter ones. No frame is shorter than 2 hundredths, as
+    programs slow such frames down.
     """
     if path.suffix.lower() == VIDEO:
         _encode_video(path, frames, frames_per_second)
@@ -109,10 +111,10 @@ def write_film(path: Path, frames: Iterable[Pixels], frames_per_second: int) -> 
 
 
 def write_sequence(folder: Path, frames: Iterable[Pixels]) -> None:
-    """Write frames as frame_0000.png, frame_0001.png, …: all appear or none, see `write_files_together`.
+    """Write frames as frame_0000.png, frame_0001.png, …: all or none appear, see `write_files_together`.
 
     Raises:
-        ProgdfError: see `check_sequence`; or the place cannot be written, or is full.
+        ProgdfError: see `check_sequence`; or the folder cannot be written, or the disk is full.
     """
     check_sequence(folder)
     with write_files_together(folder) as temporary:
@@ -121,7 +123,7 @@ def write_sequence(folder: Path, frames: Iterable[Pixels]) -> None:
 
 
 def check_sequence(folder: Path) -> None:
-    """Raise ProgdfError if no folder of frames can be made: its place is taken, or its parent is missing."""
+    """Raise ProgdfError if no folder of frames can be made: its path is taken, or its parent is missing."""
     remove_abandoned(folder)
     try:
         taken = os.path.lexists(folder) and (
@@ -136,24 +138,24 @@ def check_sequence(folder: Path) -> None:
 
 
 def _prepare(path: Path, frames: Iterable[Pixels]) -> list[Image.Image]:
-    """Frames as pictures; for a .gif in one palette."""
-    there = [Image.fromarray(frame) for frame in frames]
+    """Return frames as Pillow images; for a .gif in one palette."""
+    pictures = [Image.fromarray(frame) for frame in frames]
     if path.suffix.lower() != ".gif":
-        return there
-    few = there[:: max(1, len(there) // 4)]
-    mosaic = Image.fromarray(np.concatenate([np.asarray(frame) for frame in few]))
+        return pictures
+    sample = pictures[:: max(1, len(pictures) // 4)]
+    mosaic = Image.fromarray(np.concatenate([np.asarray(frame) for frame in sample]))
     palette = _with_exact_background(mosaic, mosaic.quantize(256, method=Image.Quantize.MEDIANCUT))
-    return [frame.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for frame in there]
+    return [frame.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for frame in pictures]
 
 
 def _save(path: Path, prepared: Sequence[Image.Image], durations: Sequence[int]) -> None:
     kind: dict[str, Any] = {"disposal": 1} if path.suffix.lower() == ".gif" else {"quality": _WEBP_QUALITY}
-    more = list(prepared[1:])
-    prepared[0].save(path, save_all=True, append_images=more, duration=list(durations), loop=0, **kind)
+    remaining = list(prepared[1:])
+    prepared[0].save(path, save_all=True, append_images=remaining, duration=list(durations), loop=0, **kind)
 
 
 def _with_exact_background(picture: Image.Image, indexed: Image.Image) -> Image.Image:
-    """The same palette, but what is nearly the commonest color becomes that color: white stays white."""
+    """Replace palette colors close to the most common color by that color, so that white stays white."""
     counts = picture.getcolors(picture.width * picture.height) or []
     commonest = np.array(max(counts)[1])
     colors = np.array(indexed.getpalette(), np.int64).reshape(-1, 3)
@@ -203,7 +205,7 @@ Advance = Callable[[int, int], None]
 
 
 def check_output(out: Path, alpha: bool = False) -> None:
-    """Raise ProgdfError if `out` is no film, holds no transparency, or is no place for a folder of frames."""
+    """Raise ProgdfError if `out` is no film, cannot hold transparency, or cannot be a folder of frames."""
     suffix = out.suffix.lower()
     if suffix not in (*ANIMATIONS, ""):
         raise ProgdfError(f"{out} cannot hold a film; write a .gif, a .webp, an .mp4 or a folder of frames")
@@ -224,14 +226,14 @@ def frames(
     numbers: Iterable[int],
     alpha: bool = False,
 ) -> Iterator[Pixels]:
-    """Draw some frames. [H,W,3] each, [H,W,4] with alpha
+    """Draw some frames and yield them. [H,W,3] each, [H,W,4] with alpha
 
     Args:
-        keys: the keys
-        view: what no key says: background, blend, edits that do not move
-        still: gives the size, and the camera where no key has one
-        engine: draws
-        numbers: of the frames
+        keys: the timeline
+        view: the state that no key sets: background, blend, edits that do not move
+        still: size of the frames, and the camera if no key has one
+        engine: draws the frames
+        numbers: numbers of the frames
         alpha: a transparent background
     """
     for frame in numbers:
@@ -245,7 +247,7 @@ def frames(
 
 
 def sheet_frames(keys: Timeline, count: int) -> list[int]:
-    """At most `count` frames from the first to the last, evenly; a way back shows none that are new."""
+    """Return at most `count` evenly spaced frames from first to last. A ping-pong's way back adds none."""
     steps = max(count - 1, 1)
     return sorted({round(i * keys.length / steps) for i in range(count)})
 
@@ -264,11 +266,11 @@ def write(
     Args:
         out: the file or folder
         keys, view, still, engine: see `frames`
-        advance: receives how many frames of how many are drawn
+        advance: receives the number of drawn frames and the total
         alpha: a transparent background
 
     Returns:
-        A line for the person that names the film, its frames and their size.
+        A line for the user with the film's path, frames and size.
 
     Raises:
         ProgdfError: see `check_output`.
