@@ -1,1 +1,1 @@
-"""What carries the sliders out of the house: a scene under its edits as one web page."""
+"""Export of a scene under its edits as one web page with sliders."""

@@ -1,10 +1,12 @@
-"""A scene and its edits as one HTML file that shows them and moves their sliders, and that fetches nothing.
+"""Web page: a scene and its edits in one HTML file with working sliders, which loads nothing else.
 
-The page reads a container (src/data.js): the length of its header, the header (JSON), and its arrays, channel
-after channel, the bytes of one weight together, so that gzip finds what is alike. Members of edits come
-first, those of the same edits together, so that a slider sends few runs of rows, and near ones lie together.
-The script is src/*.js put one after another, the shaders are the viewer's own, and the policy in the page's
-head lets nothing else run: a .gdf's names are a stranger's text.
+The page reads a container (src/data.js): the length of its header, the header (JSON), and its arrays. An
+array is stored channel by channel, split into planes of equal-weight bytes, which gzip compresses better.
+Members of edits come first. Members of the same edits are adjacent, so that a slider uploads few runs of
+rows, and neighbors in space are close together.
+
+The script is the concatenation of src/*.js, and the shaders are the viewer's own. The content security policy
+in the page's head blocks everything else, as the names in a .gdf are third-party text.
 """
 
 from __future__ import annotations
@@ -41,12 +43,12 @@ from progdf.io.images import to_picture
 from shaders import load_source
 
 DRAWN_SH = (0, 3, 8, 15)
-"""SH coefficients above the first, by degree."""
+"""Number of SH coefficients above the first, by degree."""
 LEVELS = {"i1": 127, "i2": 32767}
-_SEGMENT = 1 << 12  # members that are composed at once, which bounds the memory for that
-_SMALLEST = 1e-4  # of the scene's spread: a smaller axis is less than a pixel of any picture of it
-_UNSEEN = -1e3  # a logit
-_OPAQUE = 1 - 1 / 512  # and its opposite: opacities that 8 bits end at
+_SEGMENT = 1 << 12  # members composed at once, which limits memory
+_SMALLEST = 1e-4  # share of the scene's spread: a smaller axis is below a pixel in any picture
+_UNSEEN = -1e3  # logit of a Gaussian that is not drawn
+_OPAQUE = 1 - 1 / 512  # 8-bit opacities are clipped to 1 − _OPAQUE … _OPAQUE
 
 
 @dataclass
@@ -57,7 +59,7 @@ class Arrays:
     size: int = 0
 
     def add(self, values: NDArray[Any], **more: Any) -> dict[str, Any]:
-        """Append an array [n] or [n,c]; what the header says of it."""
+        """Append an array [n] or [n,c]; return its header entry."""
         table = np.ascontiguousarray(_table(values).T)
         table = table.astype(table.dtype.newbyteorder("<"))
         planes = table.reshape(-1, 1).view(np.uint8).T.tobytes()
@@ -70,14 +72,14 @@ class Arrays:
     def add_levels(
         self, values: NDArray[Any], kind: str, curve: str = ""
     ) -> tuple[dict[str, Any], NDArray[Any]]:
-        """Append numbers as levels between the least and the largest of each channel. [n,c] float
+        """Append numbers quantized between the minimum and maximum of each channel. [n,c] float
 
         Args:
-            kind: of `LEVELS`
+            kind: key of `LEVELS`
             curve: "log" for signed logarithms (1 + |x|), "logit" for opacities
 
         Returns:
-            What the header says of it, and what the page makes of it.
+            Its header entry, and the values that the page decodes.
         """
         table = _table(values).astype(np.float64)
         if curve == "log":
@@ -86,28 +88,28 @@ class Arrays:
         low = some.min(axis=0)
         high = some.max(axis=0)
         zero = (low + high) / 2
-        most = LEVELS[kind]
-        step = np.where(high > low, (high - low) / (2 * most), 1.0)
+        max_level = LEVELS[kind]
+        step = np.where(high > low, (high - low) / (2 * max_level), 1.0)
         levels = np.round((table - zero) / step).astype(f"<{kind}")
-        made = zero + step * levels
+        decoded = zero + step * levels
         if curve == "log":
-            made = np.sign(made) * np.expm1(np.abs(made))
+            decoded = np.sign(decoded) * np.expm1(np.abs(decoded))
         elif curve == "logit":
-            made = np.log(made / (1 - made))
-        return self.add(levels, scale=step.tolist(), zero=zero.tolist(), curve=curve), made
+            decoded = np.log(decoded / (1 - decoded))
+        return self.add(levels, scale=step.tolist(), zero=zero.tolist(), curve=curve), decoded
 
 
 def _table(values: NDArray[Any]) -> NDArray[Any]:
-    """[n] or [n,…] -> [n,c]"""
+    """Reshape [n] or [n,…] to [n,c]."""
     return values.reshape(len(values), math.prod(values.shape[1:]))
 
 
 @dataclass(frozen=True)
 class Packed:
-    """What a page holds."""
+    """Content of a page."""
 
     data: bytes  # the container
-    scene: Gaussians  # the original as the page has it, in its own order; what was left out is unseen
+    scene: Gaussians  # the original as decoded by the page, in the scene's order; omitted rows are unseen
 
 
 def pack(
@@ -117,14 +119,14 @@ def pack(
     degree: int,
     more: Mapping[str, Any],
 ) -> Packed:
-    """The container of a scene and edits of it that add nothing any more.
+    """Return the container of a scene and of edits that add no more Gaussians to it.
 
     Args:
         scene: the original with the rows that edits add
         gdfs: its edits
         quality: "exact", float32 and the numbers of the edits' files, or "compact", 8 and 16 bits
-        degree: of the spherical harmonics that stay, 0 to 3
-        more: what else the header holds; in "paints" pairs of an edit and the weights of its members [M]
+        degree: retained degree of the spherical harmonics, 0 to 3
+        more: other header entries; "paints" holds pairs of an edit and the weights of its members [M]
 
     Raises:
         ProgdfError: there is no such quality.
@@ -142,7 +144,7 @@ def pack(
     inside = [_ascending(place[gdf.region.members.numpy()]) for gdf in gdfs]
     arrays = Arrays()
     exact = quality == "exact"
-    attributes, made = _scene(arrays, scene, gdfs, order, count, kept, exact)
+    attributes, decoded_scene = _scene(arrays, scene, gdfs, order, count, kept, exact)
     overlaps = len(gdfs) > 1 and sum(map(len, inside)) > count
     paints = []
     for edit, weights in more["paints"]:
@@ -166,7 +168,7 @@ def pack(
         ],
     }
     text = json.dumps(header, ensure_ascii=True, allow_nan=False, separators=(",", ":")).encode()
-    return Packed(len(text).to_bytes(4, "little") + text + b"".join(arrays.parts), made)
+    return Packed(len(text).to_bytes(4, "little") + text + b"".join(arrays.parts), decoded_scene)
 
 
 def _scene(
@@ -178,7 +180,8 @@ def _scene(
     kept: int,
     exact: bool,
 ) -> tuple[dict[str, Any], Gaussians]:
-    """The attributes in the header, the first `count` rows apart, and the scene as they have it."""
+    """Append the attributes, the first `count` rows separately; return their entries and the decoded
+    scene."""
     moved = {name for gdf in gdfs for name in gdf.field.attributes}
     attributes: dict[str, Any] = {}
     changed: dict[str, Any] = {"shN": torch.zeros_like(scene.shN)}
@@ -205,7 +208,7 @@ def _scene(
 
 
 def _finite(scene: Gaussians) -> Gaussians:
-    """The scene with finite numbers; rows that no engine draws for theirs are unseen."""
+    """Return the scene with finite numbers. Rows with others, which no engine draws, become unseen."""
     flat = {name: torch.from_numpy(_table(getattr(scene, name).detach().numpy())) for name in ATTRIBUTES}
     flat["log_scales"] = flat["log_scales"].clamp(min=-1e4)
     unseen = ~torch.cat(list(flat.values()), dim=1).isfinite().all(dim=1)
@@ -215,8 +218,8 @@ def _finite(scene: Gaussians) -> Gaussians:
 
 
 def _groups(count: int, regions: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
-    """A number for each row, alike where the same edits have it, 0 where none. [N]"""
-    groups = np.zeros(count + 1, np.int64)  # one more row, which is nobody's
+    """Return a number per row that is equal for rows of the same edits, 0 without any. [N]"""
+    groups = np.zeros(count + 1, np.int64)  # one extra row, dropped below
     for members in regions:
         groups *= 2
         groups[members] += 1
@@ -225,8 +228,7 @@ def _groups(count: int, regions: Sequence[NDArray[np.int64]]) -> NDArray[np.int6
 
 
 def _order(scene: Gaussians, groups: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Rows in the page's order: members first, those of the same edits and near ones together (by Morton's
-    code)."""
+    """Return the rows in the page's order: members first, grouped by their edits, then by Morton code."""
     if not len(scene):
         return np.zeros(0, np.int64)
     order = morton_order(scene.means.sign() * scene.means.abs().log1p()).numpy()
@@ -236,7 +238,7 @@ def _order(scene: Gaussians, groups: NDArray[np.int64]) -> NDArray[np.int64]:
 def _segments(
     groups: NDArray[np.int64], order: NDArray[np.int64], gdfs: Sequence[Gdf]
 ) -> list[tuple[int, list[int]]]:
-    """How many members in turn belong to the same edits, at most `_SEGMENT`, and to which."""
+    """Return the lengths of runs of members with the same edits, at most `_SEGMENT`, with these edits."""
     starts = np.flatnonzero((np.diff(groups, prepend=-1) != 0) | (np.arange(len(groups)) % _SEGMENT == 0))
     inside = [np.isin(order[starts], gdf.region.members.numpy()) for gdf in gdfs]
     edits = [[i for i, there in enumerate(inside) if there[k]] for k in range(len(starts))]
@@ -244,15 +246,16 @@ def _segments(
 
 
 def _ascending(places: NDArray[np.int64]) -> Tensor:
-    """Which members are on the page, in its order; those that are not have the place −1."""
-    there = np.flatnonzero(places >= 0)
-    return torch.from_numpy(there[np.argsort(places[there])])
+    """Return the members on the page, in its order; the others have the place −1."""
+    present = np.flatnonzero(places >= 0)
+    return torch.from_numpy(present[np.argsort(places[present])])
 
 
 def _scene_part(
     arrays: Arrays, name: str, values: NDArray[Any], exact: bool, moves: bool
 ) -> tuple[dict[str, Any], NDArray[Any]]:
-    """Rows of an attribute: float32; or 16 bits where an edit moves what is no color, else 8."""
+    """Append rows of an attribute: float32, or 16 bits if an edit changes it and it is no color, else 8
+    bits."""
     if exact:
         return arrays.add(values.astype(np.float32)), values
     if name == "means":
@@ -280,7 +283,7 @@ def _edit(
     exact: bool,
     overlaps: bool,
 ) -> dict[str, Any]:
-    """An edit in the header, and its members in this order."""
+    """Append the arrays of an edit, with its members in this order; return its header entry."""
     form = gdf.field.origin
     widths = {"shN": 3 * kept}
     record: dict[str, Any] = {
@@ -306,7 +309,7 @@ def _edit(
 def _bases(
     arrays: Arrays, name: str, bases: AttributeBases, order: Tensor, width: int, exact: bool
 ) -> dict[str, Any]:
-    """One attribute of an edit, its first `width` channels."""
+    """Append one attribute of an edit, its first `width` channels; return its header entry."""
     end = bases.end_offset[order, :width]
     scale = bases.scale[:, :width].clone()
     residual = bases.residual_basis[:, order, :width].float()
@@ -328,7 +331,7 @@ def _bases(
 
 
 def _grade(arrays: Arrays, form: GradeForm, order: Tensor, kept: int) -> dict[str, Any]:
-    """The map of a grade, for colors that others have changed."""
+    """Append the map of a grade, for colors that lower layers have changed; return its header entry."""
     width = min(form.residual.shape[2], 3 + 3 * kept)
     return {
         "degree": form.degree,
@@ -344,52 +347,53 @@ def _grade(arrays: Arrays, form: GradeForm, order: Tensor, kept: int) -> dict[st
 
 
 def _numbers(tensor: Tensor) -> Any:
-    """float32 numbers as few digits as tell them apart, nested as the tensor is."""
+    """Return float32 numbers with the fewest digits that identify them, nested like the tensor."""
     values = tensor.numpy()
     return [_numbers(row) for row in tensor] if values.ndim > 1 else [float(str(x)) for x in values]
 
 
 MODULES = ("camera", "data", "grade", "compose", "sort", "renderer", "state", "panel", "input", "main")
-"""Of `src`, each after those that it imports when it is read; then comes what the page is shown in."""
+"""Modules of `src`, each after its imports; then follows the module for the page's host."""
 STAGES = ("web.vert", "splat.frag", "present.vert", "present.frag", "stretch.frag")
 MAIL = 25e6
+"""Size limit of attachments in mail, bytes."""
 HOST = 100e6
-"""Bytes: what mail takes, and common hosts."""
+"""Size limit of common hosts, bytes."""
 
 _IMPORT = re.compile(r"^import .*?;\n", re.MULTILINE | re.DOTALL)
 _LINK = re.compile(r"https?://[^\s<>\"']+[^\s<>\"'.,;:)]")
 
 
 def join(modules: Sequence[str] = (*MODULES, "start"), then: str = "") -> str:
-    """Modules of `src` one after another, and what follows them, in a function of their own."""
+    """Concatenate modules of `src`, followed by `then`, inside a function."""
     parts = [_source(f"{name}.js") for name in modules]
     joined = "\n".join(re.sub(r"^export ", "", _IMPORT.sub("", part), flags=re.MULTILINE) for part in parts)
     return f'(() => {{\n"use strict";\n{joined}{then}}})();\n'
 
 
 def build_widget() -> str:
-    """The module with which anywidget shows the page in a cell, see viewer/web/src/widget.js."""
-    made = join((*MODULES, "widget"), f"return (view) => render(view, {in_script(_shaders())});\n")
-    return f"const render = {made}export default {{ render }};\n"
+    """Return the anywidget module that shows the page in a notebook cell, see viewer/web/src/widget.js."""
+    script = join((*MODULES, "widget"), f"return (view) => render(view, {in_script(_shaders())});\n")
+    return f"const render = {script}export default {{ render }};\n"
 
 
 @dataclass(frozen=True)
 class PageTexts:
-    """What a page shows besides its scene."""
+    """Texts and colors of a page besides its scene."""
 
-    title: str  # above the sliders and of the browser's tab
-    credit: str  # below them, with addresses as links
+    title: str  # above the sliders, and in the browser's tab
+    credit: str  # below the sliders, with addresses as links
     background: tuple[float, float, float]  # behind the scene, 0..1
-    still: Tensor  # what shows until the scene is there, and where WebGL2 is not, 0..1. [H,W,3]
+    still: Tensor  # shown until the scene is loaded, and without WebGL2, 0..1. [H,W,3]
 
     @property
     def style(self) -> str:
-        """The style sheet."""
+        """Style sheet."""
         return f":root, :host {{ --behind: {hex_color(self.background)}; }}\n{_source('page.css')}"
 
     @property
     def body(self) -> str:
-        """The elements that the script fills."""
+        """Elements that the script fills."""
         picture = io.BytesIO()
         to_picture(self.still).save(picture, "WEBP", quality=82)
         still = "data:image/webp;base64," + base64.b64encode(picture.getvalue()).decode()
@@ -398,12 +402,12 @@ class PageTexts:
 
     @property
     def markup(self) -> str:
-        """The page in an element of its own, with its style, for a shadow root."""
+        """Page inside its own element, with its style, for a shadow root."""
         return f'<style>{self.style}</style>\n<div class="page">\n{self.body}</div>'
 
 
 def build_page(container: bytes, texts: PageTexts) -> str:
-    """The page of a container, see `pack`, as a file of its own."""
+    """Return the page of a container, see `pack`, as a file."""
     style = texts.style
     code = join()
     parts = {
@@ -433,12 +437,12 @@ def _fill(template: str, texts: Mapping[str, str]) -> str:
 
 
 def in_script(value: Mapping[str, Any]) -> str:
-    """JSON that ends no script element, whatever its texts are."""
+    """Return JSON that cannot end a script element, whatever its texts are."""
     return json.dumps(value, separators=(",", ":")).replace("<", "\\u003c")
 
 
 def _body(source: str) -> str:
-    """A stage without its version, which the page puts in front, and without comments."""
+    """Return a shader stage without its version, which the page adds, and without comments."""
     text = re.sub(r"//[^\n]*", "", source.removeprefix("#version 330 core"))
     return "\n" + "\n".join(line.rstrip() for line in text.splitlines() if line.strip())
 
