@@ -106,10 +106,10 @@ def film(title: str, scene: Gaussians, views: Sequence[ViewCamera], size: tuple[
     small = drawn_size(size, COARSE)
     for _ in range(RESTS):
         live._budget = BUDGETS[2]
-        live._finest = live._enough
+        live._finest = live._max_finest
         draw(to_camera(views[0], *small), COARSE)
         draw(to_camera(views[0], *size), 1)
-    limit = live._enough
+    limit = live._max_finest
     last = list[NDArray[np.float32]]()
     means = []
     blocks = []

@@ -1,4 +1,4 @@
-"""Fewer pixels and Gaussians while something moves and a whole picture takes long; all once it rests."""
+"""Dynamic resolution: fewer pixels and Gaussians during motion, a full picture once input stops."""
 
 from __future__ import annotations
 
@@ -31,86 +31,95 @@ T = TypeVar("T")
 SH = ("sh0", "shN")
 
 BUDGETS = 20_000, 50_000, 500_000
-"""How many Gaussians a picture in motion has at most: on a slow machine, at first, on a quick one."""
+"""Limits on the number of Gaussians in a picture during motion: smallest, initial, largest."""
 
 MOVING_MS = 20.0, 27.0
-"""What such a picture shall take, some ms less than its frame; with more or less time, the next one has fewer
-or more Gaussians."""
+"""Target range for the time of a picture during motion, in ms, slightly less than its frame.
+
+Outside the range, the next picture has fewer or more Gaussians.
+"""
 
 FINE = (0.25, 4.0, 64.0)
+"""Smallest, initial and largest limit of the pyramid's merging error of a node, pixels²."""
+
 FINE_ERROR = 9e-4
-"""Least, first and largest limit of what a node may lose, pixels². A picture in motion is fine enough with a
-mean squared error like this, 30.5 dB, so that those which follow it have 30; the limit for it is measured
-where the picture in full follows one."""
+"""Target mean squared error of a picture during motion (30.5 dB), so that the following ones have 30 dB.
+
+The error limit that achieves it is measured whenever a full picture follows one drawn during motion.
+"""
 
 FINE_MS = 6.0, 7.5
-"""It is finer than that only as far as it takes no longer: with the window's own time a frame has 12 ms."""
+"""Times of a picture during motion, in ms: below the first it gets finer, above the second coarser again.
+
+With the window's own time a frame has 12 ms.
+"""
 
 SLOW_MS = 40.0
-"""What a picture may take before "auto" halves its sides: 25 pictures a second."""
+"""Longest time of a picture before "auto" halves its sides, in ms: 25 pictures per second."""
 
 REST_S = 0.06
-"""How long nothing moves before the picture in full is begun. What is begun keeps nobody waiting."""
+"""Time without input before the full picture is begun, in seconds. Drawing it does not block the window."""
 
 POLL_S = 0.01
-"""Between two looks whether it is done."""
+"""Interval for polling whether it is done, in seconds."""
 
 MANY = 150_000
-"""Gaussians of which the CPU's pictures are taken for slow before the first one is known."""
+"""Number of Gaussians from which CPU pictures are assumed to be slow before the first one is measured."""
 
 JUMP_MS = 100.0
-"""What one may take that comes alone, after a click or a key, before the window goes on without it."""
+"""Longest time of a single picture after a click or a key, in ms, before it is drawn in the background."""
 
 COARSE = 2
-"""How many pixels of the window one pixel of a coarse picture covers, each way."""
+"""Number of window pixels per pixel of a coarse picture, along each axis."""
 
 
 def drawn_size(size: tuple[int, int], pixels: int) -> tuple[int, int]:
-    """Width and height of a picture of which each pixel fills `pixels` of `size`, each way."""
+    """Return the width and height of a picture whose pixels each cover `pixels` of `size` along each axis."""
     return -(-size[0] // pixels), -(-size[1] // pixels)
 
 
 @dataclass(frozen=True)
 class DynamicResolution:
-    """How pictures are drawn while the hand is on something, and what is known of their cost."""
+    """Resolution during interaction, and the measured times of recent pictures."""
 
-    pixels: int = 1  # of the window that one pixel drawn covers, each way: 1 or `COARSE`
-    # when to draw in full, seconds on the main view's clock; None while the picture is in full
+    pixels: int = 1  # window pixels per drawn pixel along each axis: 1 or `COARSE`
+    # time of the next full picture, seconds on the main view's clock; None while the picture is full
     rest_at: float | None = None
-    # what the last two whole pictures in full took; one alone may have waited for something
+    # times of the last two full pictures, as a single one may have been delayed
     camera_ms: tuple[float, ...] = ()
-    slider_ms: tuple[float, ...] = ()  # the same of the last two steps of a slider, within this grip
-    # what the last coarse picture took; a slider's step in full that takes no longer stays so
+    slider_ms: tuple[float, ...] = ()  # the same for the last two slider steps of this drag
+    # time of the last coarse picture; slider steps that take no longer at full resolution stay full
     coarse_ms: float = 0.0
 
 
 def first_known(count: int, draws_with: str) -> DynamicResolution:
-    """What is known of a scene of which nothing was drawn yet."""
+    """Return the initial state for a scene of `count` Gaussians that was not drawn yet."""
     slow = draws_with == "cpu" and count >= MANY
     return DynamicResolution(camera_ms=(math.inf, math.inf) if slow else ())
 
 
 def takes_long(before: DynamicResolution, known: DynamicResolution) -> bool:
-    """Whether the picture, which shall be in full now, should be made beside the window's work."""
+    """Return whether the full picture that is due should be drawn in the background."""
     least = SLOW_MS if before.pixels > 1 else JUMP_MS
     return known.pixels == 1 and _slow(known.camera_ms, least)
 
 
 def wait(known: DynamicResolution, now: float, coarsely: bool) -> DynamicResolution:
-    """The picture in full is not done yet: a coarse one takes its place, or the last one stays."""
+    """Wait for an unfinished full picture, and meanwhile draw coarsely or keep the last picture."""
     return replace(known, pixels=COARSE if coarsely else 1, rest_at=now + POLL_S)
 
 
 def before_draw(
     known: DynamicResolution, mode: str, held: bool, turned: bool, slid: bool, now: float
 ) -> DynamicResolution:
-    """Before a picture is drawn: how it shall be drawn.
+    """Choose the resolution of the next picture.
 
     Args:
-        mode: of `RESOLUTION_MODES`
-        held: whether a hand is on something, so that more will follow
-        turned: whether the camera or the picture's size is another than in the last frame
-        slid: whether what is drawn is another
+        known: the current state
+        mode: one of `RESOLUTION_MODES`
+        held: whether an input is held down, so that more changes will follow
+        turned: whether the camera or the picture's size has changed since the last frame
+        slid: whether the drawn scene has changed
         now: seconds on the main view's clock
     """
     known = known if held else replace(known, slider_ms=())
@@ -125,7 +134,7 @@ def before_draw(
 
 
 def after_draw(known: DynamicResolution, timings: FrameTimings, turned: bool) -> DynamicResolution:
-    """After a picture was drawn: what it took. A coarse one tells nothing of a full one."""
+    """Record the time of a drawn picture. Coarse and full pictures are recorded separately."""
     if known.pixels > 1:
         return replace(known, coarse_ms=timings.total_ms)
     known = replace(known, camera_ms=(*known.camera_ms[-1:], timings.total_ms))
@@ -137,20 +146,20 @@ def _slow(pictures_ms: tuple[float, ...], least: float = SLOW_MS) -> bool:
 
 
 def next_frame_delay(known: DynamicResolution, now: float) -> float | None:
-    """Seconds until the picture has to be drawn in full; None where it is."""
+    """Return the seconds until the full picture is due, or None if the picture is already full."""
     return None if known.rest_at is None else max(known.rest_at - now, 0.0)
 
 
 @dataclass(frozen=True)
 class FrameTimings:
-    """Where the time of one picture went: wall clock, milliseconds, the GPU's work waited for."""
+    """Time breakdown of one picture: wall-clock milliseconds, including the wait for the GPU."""
 
-    compose_ms: float = 0.0  # strengths → attributes, by the CPU
-    upload_ms: float = 0.0  # attributes → where they are drawn from
-    sort_ms: float = 0.0  # depth order (the CPU rasterizer sorts within `draw_ms`)
-    draw_ms: float = 0.0  # the picture
-    changed: int = 0  # Gaussians whose attributes were composed anew
-    drawn: int = 0  # Gaussians in front of the camera; all of them where the CPU rasterizer draws
+    compose_ms: float = 0.0  # composing attributes from strengths, on the CPU
+    upload_ms: float = 0.0  # uploading attributes to the renderer
+    sort_ms: float = 0.0  # depth sort (part of `draw_ms` with the CPU rasterizer)
+    draw_ms: float = 0.0  # drawing
+    changed: int = 0  # number of recomposed Gaussians
+    drawn: int = 0  # number of Gaussians in front of the camera; all with the CPU rasterizer
 
     @property
     def total_ms(self) -> float:
@@ -159,35 +168,35 @@ class FrameTimings:
 
 @dataclass(frozen=True, eq=False)
 class DrawnView:
-    """What a picture shows of a scene."""
+    """Camera, background and resolution of a picture."""
 
     camera: Camera
     background: Vec3
-    pixels: int = 1  # of the picture in full that one of its pixels covers, each way
+    pixels: int = 1  # pixels of the full picture per pixel, along each axis
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, DrawnView) and self.pixels == other.pixels and self._has(other)
+        return isinstance(other, DrawnView) and self.pixels == other.pixels and self._matches(other)
 
     def is_coarse(self, full: DrawnView) -> bool:
-        """Whether it is `full`, in fewer pixels."""
-        return self.pixels > full.pixels and self._has(full)
+        """Return whether it is `full` at a lower resolution."""
+        return self.pixels > full.pixels and self._matches(full)
 
-    def _has(self, full: DrawnView) -> bool:
-        mine = self.camera.resize(full.camera.width, full.camera.height)
+    def _matches(self, full: DrawnView) -> bool:
+        scaled = self.camera.resize(full.camera.width, full.camera.height)
         pixels = self.pixels // full.pixels
         return (
             (self.background, self.camera.width, self.camera.height)
-            == (full.background, *drawn_size((mine.width, mine.height), pixels))
-            and torch.equal(full.camera.viewmat, mine.viewmat)
-            and torch.allclose(full.camera.K, mine.K, rtol=0.01 * (pixels - 1), atol=0.0)
+            == (full.background, *drawn_size((scaled.width, scaled.height), pixels))
+            and torch.equal(full.camera.viewmat, scaled.viewmat)
+            and torch.allclose(full.camera.K, scaled.K, rtol=0.01 * (pixels - 1), atol=0.0)
         )
 
 
 class LiveScene:
-    """The scene as it is drawn, activated, under its highlights; and a pyramid over it for what moves.
+    """Activated copy of the scene with its highlights, and a level-of-detail pyramid for motion.
 
     Args:
-        scene: what is copied; later changes come by `update`
+        scene: scene to copy; pass later changes to `update`
     """
 
     def __init__(self, scene: Gaussians) -> None:
@@ -200,26 +209,26 @@ class LiveScene:
             antialiased=scene.antialiased,
         )
         self._scene = scene
-        self._highlights: Array | None = None  # rgb and its share, 0..1; None is no highlight. [N,4]
-        self._budget, self._finest, self._enough = BUDGETS[1], FINE[1], FINE[1]
-        self._limit = 0.0  # of the last picture in motion; 0 while these have all Gaussians
+        self._highlights: Array | None = None  # rgb and share, 0 to 1; None for no highlights. [N,4]
+        self._budget, self._finest, self._max_finest = BUDGETS[1], FINE[1], FINE[1]
+        self._limit = 0.0  # error limit of the last picture in motion, pixels²; 0 if it had all Gaussians
         self._pyramid: Future[Pyramid] | None = None
-        # what the pyramid lacks of each row: nothing, its colors, or more. [N] uint8
-        self._behind = np.zeros(len(scene), np.uint8)
+        # outdated rows of the pyramid: 0 up to date, 1 colors only, 2 more. [N] uint8
+        self._outdated = np.zeros(len(scene), np.uint8)
 
     def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> None:
         """See `GlRenderer.update`."""
         self._scene, names = scene, tuple(attributes)
         highlighted = self._highlights is not None and any(name in SH for name in names)
         names = tuple(dict.fromkeys((*names, *SH))) if highlighted else names
-        for first, last in row_runs(rows):  # whole runs, as slices are many times faster than indices
+        for first, last in row_runs(rows):  # slices are many times faster than indices
             part = slice(first * SPLATS_PER_ROW, last * SPLATS_PER_ROW)
             for name in names:
                 self._write(scene, name, part)
             if highlighted:
                 self._apply_highlight(part)
         lacks = 1 if all(name in SH for name in names) else 2
-        self._behind[rows] = np.maximum(self._behind[rows], lacks)
+        self._outdated[rows] = np.maximum(self._outdated[rows], lacks)
 
     def highlight(self, rows: NDArray[np.int64], highlights: NDArray[np.uint8]) -> None:
         """See `GlRenderer.highlight`."""
@@ -233,46 +242,55 @@ class LiveScene:
             self._highlights = None
 
     def begin_pyramid(self) -> Future[Pyramid]:
-        """Build it beside everything else; what is written meanwhile is merged anew afterwards."""
-        self._behind[:] = 0
+        """Build the pyramid in another thread. Rows changed meanwhile are merged again afterwards."""
+        self._outdated[:] = 0
         self._pyramid = _worker().submit(_build, self.drawn)
         return self._pyramid
 
     def draw_fewer(self, draw: Callable[[ActivatedGaussians], T], camera: Camera, pixels: int) -> T | None:
-        """Draw as many as there is time for; None until there is a pyramid.
+        """Draw as many Gaussians as the frame's time permits, and adapt the budget to the time taken_ms.
 
         Args:
-            camera: of the coarse picture
-            pixels: of the window that one of its pixels covers, each way
+            draw: draws the given Gaussians
+            camera: camera of the coarse picture
+            pixels: window pixels per pixel of the picture, along each axis
+
+        Returns:
+            Result of `draw`, or None until the pyramid is built.
         """
-        pyramid = self._pyramid or self.begin_pyramid()
-        if not pyramid.done():
+        future = self._pyramid or self.begin_pyramid()
+        if not future.done():
             return None
         started = time.perf_counter()
-        merged = pyramid.result()
+        pyramid = future.result()
         for lacks in (2, 1):
-            if len(rows := np.flatnonzero(self._behind == lacks)):
-                merged.refresh(rows, colors_only=lacks == 1)
-        self._behind[:], merged.finest = 0, self._finest
-        fewer = merged.simplify(camera, self._budget, pixels)
-        self._limit = merged.limit
+            if len(rows := np.flatnonzero(self._outdated == lacks)):
+                pyramid.refresh(rows, colors_only=lacks == 1)
+        self._outdated[:], pyramid.finest = 0, self._finest
+        fewer = pyramid.simplify(camera, self._budget, pixels)
+        self._limit = pyramid.limit
         picture = draw(fewer)
-        taken, (low, high) = 1e3 * (time.perf_counter() - started), MOVING_MS
-        if taken > high or (taken < low and len(fewer.means) > 0.8 * self._budget):
-            budget = int(self._budget * (0.85 if taken > high else 1.15))
+        taken_ms, (low, high) = 1e3 * (time.perf_counter() - started), MOVING_MS
+        if taken_ms > high or (taken_ms < low and len(fewer.means) > 0.8 * self._budget):
+            budget = int(self._budget * (0.85 if taken_ms > high else 1.15))
             self._budget = min(max(budget, BUDGETS[0]), BUDGETS[2])
-        finest = self._finest * (1.15 if taken > FINE_MS[1] else 0.85 if taken < FINE_MS[0] else 1.0)
-        self._finest = min(max(finest, FINE[0]), self._enough)
+        finest = self._finest * (1.15 if taken_ms > FINE_MS[1] else 0.85 if taken_ms < FINE_MS[0] else 1.0)
+        self._finest = min(max(finest, FINE[0]), self._max_finest)
         return picture
 
     def measure(self, moving: Array, full: Array) -> None:
-        """Learn what a node may lose here, of the last picture in motion and of the same in full. [H,W,3]"""
+        """Measure the error limit that gives `FINE_ERROR`.
+
+        Args:
+            moving: the last picture during motion. [H,W,3]
+            full: the full picture of the same view. [H,W,3]
+        """
         screen = np.empty((*full.shape[:2], 4), np.uint8)
         fill_screen(moving, screen)
-        off = screen[::-8, :, :3] / np.float32(255.0) - full[::8].clip(0.0, 1.0)
-        # it grows with the limit's power of .6 to 1.5 (docs/experiments.md, The viewer)
-        enough = self._limit * (FINE_ERROR / max(float(np.square(off).mean()), 1e-9)) ** (1 / 1.5)
-        self._enough = min(max(enough, FINE[0]), FINE[2]) if self._limit else self._enough
+        difference = screen[::-8, :, :3] / np.float32(255.0) - full[::8].clip(0.0, 1.0)
+        # the error grows with the limit's power of 0.6 to 1.5 (docs/experiments.md, The viewer)
+        limit = self._limit * (FINE_ERROR / max(float(np.square(difference).mean()), 1e-9)) ** (1 / 1.5)
+        self._max_finest = min(max(limit, FINE[0]), FINE[2]) if self._limit else self._max_finest
 
     def _write(self, scene: Gaussians, name: str, part: slice) -> None:
         means, quats, scales, opacities, sh = (tensor.numpy() for tensor in self.drawn.tensors)
@@ -289,7 +307,7 @@ class LiveScene:
             opacities[part] *= self._highlights[part, 3] < 1.0
 
     def _apply_highlight(self, part: slice) -> None:
-        """Mix the highlights into colors that were just written: all bands, as color is linear in them."""
+        """Blend the highlights into newly written colors, in all SH bands, as color is linear in them."""
         assert self._highlights is not None, "nothing to highlight with"
         sh = self.drawn.colors.numpy()[part]
         share = self._highlights[part, 3:]
@@ -298,8 +316,8 @@ class LiveScene:
 
 
 def _build(gaussians: ActivatedGaussians) -> Pyramid:
-    few = Pyramid(gaussians.select(torch.arange(min(len(gaussians.means), 2))))
-    few.simplify(Camera(torch.eye(4), torch.eye(3), 1, 1), 1)  # compiles now what else the first touch would
+    sample = Pyramid(gaussians.select(torch.arange(min(len(gaussians.means), 2))))
+    sample.simplify(Camera(torch.eye(4), torch.eye(3), 1, 1), 1)  # compile now, not at the first interaction
     return Pyramid(gaussians)
 
 
@@ -313,7 +331,7 @@ def _copy(values: torch.Tensor) -> Array:
 
 
 def _exp(values: torch.Tensor) -> Array:
-    """With numpy, on one thread: torch's threads would spin against the rasterizer's."""
+    """Return exp(values), by numpy on one thread, as torch's threads would compete with the rasterizer's."""
     with np.errstate(over="ignore", invalid="ignore"):
         return np.exp(_copy(values))
 

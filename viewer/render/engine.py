@@ -1,7 +1,7 @@
-"""One engine, on screen and headless: state → compose → upload → sort → draw, published together.
+"""Render engine for the window and headless use: compose, upload, sort, draw.
 
-It compares the state with the one it last drew and does only the work between them: a camera move composes
-nothing, a change of color sorts nothing, the same state draws nothing.
+The engine compares the state with the last drawn one and does only the necessary work. A camera move composes
+nothing, a change of color sorts nothing, and the same state draws nothing.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ DRAWS = ("auto", "gl", "cpu")
 
 @dataclass(frozen=True)
 class _Edits:
-    """What decides the attributes: the layers that do something, and how they go together."""
+    """Inputs of the composed attributes: the effective layers and the blend rule."""
 
     layers: tuple[tuple[int, float, Gains, str], ...] = ()
     blend: str = ""
@@ -45,7 +45,7 @@ class _Edits:
 
 @dataclass(frozen=True)
 class _Picture:
-    """What decides the picture."""
+    """Inputs of the picture."""
 
     edits: _Edits
     shown: DrawnView
@@ -53,13 +53,13 @@ class _Picture:
 
 
 class ViewEngine:
-    """Draws one scene under its edits.
+    """Engine that draws one scene with its edits.
 
     Args:
-        ctx: the GL context that pictures are drawn or shown in; None draws on the CPU, for `image` only
+        ctx: GL context to draw or show pictures in; None draws on the CPU, for `image` only
         scene: the original
-        gdfs: the edits that `LayerState.gdf` counts
-        draw: "gl", "cpu", or "auto": "gl" where OpenGL has hardware behind it
+        gdfs: the edits, indexed by `LayerState.gdf`
+        draw: "gl", "cpu", or "auto" ("gl" if OpenGL is hardware-accelerated)
 
     Raises:
         ProgdfError: an edit was made for another scene.
@@ -82,19 +82,19 @@ class ViewEngine:
         self.gdfs = tuple(gdfs)
         self.draws_with = draws_with(ctx, draw)
         self.timings = FrameTimings()
-        """Of the last picture."""
+        """Times of the last picture."""
         self.near = near_plane(bounds_of(scene).radius)
-        """Depth at and below which nothing is drawn, world units."""
+        """Near plane, world units: nothing is drawn at or below this depth."""
         self._edits = _Edits()
         self.order: NDArray[np.uint32] = np.zeros(0, np.uint32)
-        """Rows from back to front, where the renderer wants them so."""
+        """Rows from back to front, if the renderer needs them."""
         self._ordered_for: bytes | None = None
         self._picture: _Picture | None = None
         self.highlight: Highlight | None = None
-        """What `draw` shows over the scene; `image` never does, but for what is hidden."""
-        self._grid: tuple[object, Lines] | None = None  # what decides the lines, and they
-        self._ground: tuple[Vec3, GroundPlane] | None = None  # the plane that is the ground where this is up
-        self._highlighted: tuple[Highlight, NDArray[np.uint8]] | None = None  # and its colors. [N,4]
+        """Highlight that `draw` shows over the scene. `image` applies only hidden Gaussians."""
+        self._grid: tuple[object, Lines] | None = None  # inputs of the grid lines, and the lines
+        self._ground: tuple[Vec3, GroundPlane] | None = None  # up axis and its ground plane
+        self._highlighted: tuple[Highlight, NDArray[np.uint8]] | None = None  # with its colors. [N,4]
         self.composer = Composer(scene, self.gdfs)
         self.renderer: CpuRenderer | GlRenderer = (
             CpuRenderer(ctx) if ctx is None or self.draws_with == "cpu" else GlRenderer(ctx)
@@ -102,7 +102,7 @@ class ViewEngine:
         self.renderer.upload(self.composer.gaussians)
 
     def needs_draw(self, view: ViewState, size: tuple[int, int], camera: Camera | None = None) -> bool:
-        """Whether `view` at `size` (width, height in pixels) is another picture than the last one."""
+        """Return whether `view` at `size` (width, height, px) differs from the last picture."""
         shown = DrawnView(camera or to_camera(view.camera, *size), view.background)
         return _Picture(_edits(view), shown, _with_hidden(self.highlight, view)) != self._picture
 
@@ -114,14 +114,17 @@ class ViewEngine:
         pixels: int = 1,
         half: int | None = None,
     ) -> FrameTimings:
-        """Bring the picture up to date and show it in the lower left `size` pixels of `framebuffer`.
+        """Update the picture and show it in the lower left `size` pixels of `framebuffer`.
 
         Args:
-            pixels: of the framebuffer that one pixel of the picture fills, each way
-            half: fill only the left half (0) or the right one (1) of these, see `half_camera`
+            view: state to draw
+            framebuffer: target
+            size: width and height, px
+            pixels: framebuffer pixels per pixel of the picture, along each axis
+            half: fill only the left (0) or right (1) half, see `half_camera`
 
         Raises:
-            ProgdfError: a layer of `view` means nothing; the last picture stays.
+            ProgdfError: a layer of `view` is invalid; the last picture is kept.
         """
         camera = to_camera(view.camera, *drawn_size(size, pixels))
         left = 0
@@ -134,15 +137,18 @@ class ViewEngine:
         return self.timings
 
     def follow(self, last: ViewEngine) -> bool:
-        """Take over another engine's picture, to be shown until there is one of this; whether it could."""
+        """Take over the picture of another engine until this one has drawn.
+
+        Return whether that was possible.
+        """
         return last.scene is self.scene and self.renderer.follow(last.renderer)
 
     def show_last(self, view: ViewState, framebuffer: moderngl.Framebuffer, size: tuple[int, int]) -> None:
-        """Show the last picture once more, whatever `view` asks for."""
+        """Show the last picture again, with the grid of `view`."""
         self.renderer.show(framebuffer, size, 0, self._grid_lines(view, to_camera(view.camera, *size)))
 
     def prepare(self, view: ViewState, camera: Camera) -> bool:
-        """Begin a picture of `view` without waiting for it; whether `draw` now shows it at once."""
+        """Begin a picture of `view` in the background. Return whether `draw` can show it at once."""
         if not self.needs_draw(view, (camera.width, camera.height), camera):
             return True
         self._compose(_edits(view))
@@ -156,49 +162,49 @@ class ViewEngine:
         camera: Camera | None = None,
         pixels: int = 1,
     ) -> Image:
-        """The picture as an array: upper row first, linear as drawn, 0..1 as far as the colors are.
+        """Render the picture as an array: upper row first, linear as drawn, not clamped.
 
         Args:
-            view: what to draw
-            size: width, height in pixels
-            camera: takes the place of the view's own camera and of `size`
-            pixels: of the picture at rest that one of this one stands for, see `GlRenderer.draw`
+            view: state to draw
+            size: width and height, px
+            camera: replaces the view's camera and `size`
+            pixels: full-resolution pixels per pixel, see `GlRenderer.draw`
 
         Returns:
             [H,W,3] float32
 
         Raises:
-            ProgdfError: a layer of `view` means nothing.
+            ProgdfError: a layer of `view` is invalid.
         """
         self.timings = self._update_picture(view, camera or to_camera(view.camera, *size), pixels=pixels)
-        self._picture = self._picture if pixels == 1 else None  # a picture in full is another one
+        self._picture = self._picture if pixels == 1 else None  # a full picture will differ
         return self.renderer.pixels()
 
     def gaussians(self, view: ViewState) -> Gaussians:
-        """The scene as `view` shows it. Valid until the engine draws another strength; copy it to keep it."""
+        """Return the edited scene. Valid until the engine draws other strengths; copy it to keep it."""
         self._compose(_edits(view))
         return self.composer.gaussians
 
     def release(self) -> None:
-        """Give back what lives in the context; the context is the caller's."""
+        """Release the GL objects. The context belongs to the caller."""
         self.renderer.release()
 
     def _grid_lines(self, view: ViewState, camera: Camera) -> Lines | None:
-        """The grid on the ground in the picture, the same object as long as it is the same."""
+        """Return the lines of the ground grid, the same object while they are unchanged."""
         if not view.grid:
             return None
         up = view.camera.up
         if self._ground is None or self._ground[0] != up:
             self._ground = up, ground_plane(self.scene, up)
-        seen = up, DrawnView(camera, view.background)
-        if self._grid is None or self._grid[0] != seen:
-            self._grid = seen, grid_lines(self._ground[1], camera, view.background)
+        grid_inputs = up, DrawnView(camera, view.background)
+        if self._grid is None or self._grid[0] != grid_inputs:
+            self._grid = grid_inputs, grid_lines(self._ground[1], camera, view.background)
         return self._grid[1]
 
     def _update_picture(
         self, view: ViewState, camera: Camera, highlight: Highlight | None = None, pixels: int = 1
     ) -> FrameTimings:
-        """Do what lies between the last picture and this one."""
+        """Do the work between the last picture and this one."""
         highlight = _with_hidden(highlight, view)
         target = _Picture(_edits(view), DrawnView(camera, view.background), highlight)
         if target == self._picture:
@@ -224,7 +230,7 @@ class ViewEngine:
         )
 
     def _compose(self, edits: _Edits) -> tuple[float, float, int]:
-        """Bring attributes up to date; gives ms for composing and uploading, and how many rows changed."""
+        """Update the attributes. Return the ms of composing and uploading, and the number of changed rows."""
         if edits == self._edits:
             return 0.0, 0.0, 0
         started = time.perf_counter()
@@ -238,14 +244,14 @@ class ViewEngine:
         return 1e3 * (composed - started), 1e3 * (time.perf_counter() - composed), len(change.rows)
 
     def _apply_highlight(self, highlight: Highlight | None) -> float:
-        """Bring the highlights up to date, those alone that are others than before; gives the ms it took."""
+        """Update the changed highlights and return the time taken, ms."""
         if highlight == (self._highlighted and self._highlighted[0]):
             return 0.0
         started = time.perf_counter()
         total = len(self.scene)
-        nothing = Highlight(), np.zeros((total, 4), np.uint8)
-        last = (self._highlighted or nothing)[1]
-        new = nothing[1] if highlight is None else highlight_colors(highlight, self.gdfs, total)
+        empty = Highlight(), np.zeros((total, 4), np.uint8)
+        last = (self._highlighted or empty)[1]
+        new = empty[1] if highlight is None else highlight_colors(highlight, self.gdfs, total)
         rows = np.flatnonzero(new.view(np.uint32) != last.view(np.uint32))
         self._highlighted = None if highlight is None else (highlight, new)
         if len(rows):
@@ -253,7 +259,7 @@ class ViewEngine:
         return 1e3 * (time.perf_counter() - started)
 
     def _stack(self, edits: _Edits) -> list[Layer]:
-        """The layers of what was asked for, the lowest first."""
+        """Return the composer's layers of `edits`, lowest first."""
         return [layer_of(self._gdf(layer[0]), *layer[1:]) for layer in edits.layers]
 
     def _gdf(self, index: int) -> Gdf:
@@ -265,17 +271,17 @@ class ViewEngine:
 
 
 def draws_with(ctx: moderngl.Context | None, draw: str) -> str:
-    """What "auto" is in a context: "gl" where OpenGL has hardware behind it, else "cpu"."""
+    """Resolve "auto" in a context: "gl" if OpenGL is hardware-accelerated, else "cpu"."""
     return draw if draw != "auto" else "cpu" if ctx is None or is_software(ctx) else "gl"
 
 
 def _with_hidden(highlight: Highlight | None, view: ViewState) -> Highlight | None:
-    """With what `view` does not draw; None for nothing at all."""
+    """Add the hidden Gaussians of `view` to the highlight. Return None if it is empty."""
     full = replace(highlight or Highlight(), hidden=view.selection.hidden)
     return None if full == Highlight() else full
 
 
 def _edits(view: ViewState) -> _Edits:
-    """Layers that are not shown or at strength 0 do not count, so that touching them does no work."""
+    """Return the effective layers. Changes of invisible layers and layers at strength 0 cause no work."""
     layers = tuple((l.gdf, l.strength, l.gains, l.paint) for l in visible_layers(view) if l.strength != 0.0)
     return _Edits(layers, view.blend) if layers else _Edits()

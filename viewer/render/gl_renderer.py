@@ -1,4 +1,4 @@
-"""Drawing with OpenGL: a context without a window, and the depth sort."""
+"""OpenGL renderer, headless context and depth sort."""
 
 from __future__ import annotations
 
@@ -26,35 +26,35 @@ from .ground_grid import Lines
 Image = NDArray[np.float32]
 Size = tuple[int, int]  # width and height, pixels
 
-_ROOM = 1 << 14  # Gaussians that textures grow by
-_MINIMUM = 1e-30  # of a scale, which has a logarithm
+_TEXTURE_STEP = 1 << 14  # number of Gaussians by which textures grow
+_MIN_SCALE = 1e-30  # smallest scale, so that it has a logarithm
 
 T = TypeVar("T")
 
 
 class GlRenderer:
-    """Keeps a scene ready for drawing and the last picture of it, with OpenGL (see `SplatRenderer`)."""
+    """OpenGL renderer of a scene that keeps the last picture (see `SplatRenderer`)."""
 
     wants_order = True
-    """Whether `draw` uses the order it is given."""
+    """True if `draw` uses the given order."""
 
     begun_ms = 0.0
-    """What the last picture took before `draw` was called for it, milliseconds."""
+    """Background time spent on the last picture before `draw` was called, ms."""
 
     has_parts = False
-    """Whether `show` would show more of the picture that was begun."""
+    """True if `show` would show further bands of the pending picture."""
 
     def __init__(self, ctx: moderngl.Context) -> None:
         self._ctx = ctx
         self._renderer = SplatRenderer(ctx)
-        self._moving: tuple[LiveScene, SplatRenderer] | None = None  # what is drawn while something moves
+        self._moving: tuple[LiveScene, SplatRenderer] | None = None  # scene and renderer during motion
         self._presenter = Presenter(ctx)
         self._picture: moderngl.Texture | None = None
-        self._shown: DrawnView | None = None  # by it, unless Gaussians have changed since
+        self._shown: DrawnView | None = None  # view of the picture, None after a change of Gaussians
         self._grid: GridPass | None = None
 
     def upload(self, scene: Gaussians) -> None:
-        """Take a whole scene."""
+        """Load a whole scene."""
         self._scene = scene
         self._shown = None
         self._release_moving()
@@ -62,7 +62,7 @@ class GlRenderer:
         self._ctx.finish()
 
     def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> None:
-        """Take the changed attributes of the changed rows (sorted)."""
+        """Update the given attributes of the given sorted rows [R]."""
         self._scene, self._shown, names = scene, None, tuple(attributes)
         self._renderer.update(scene, names, rows)
         if self._moving is not None:
@@ -70,11 +70,12 @@ class GlRenderer:
         self._ctx.finish()
 
     def highlight(self, rows: NDArray[np.int64], highlights: NDArray[np.uint8]) -> None:
-        """Draw Gaussians (sorted) in other colors from now on, whatever becomes of their own.
+        """Override the colors of Gaussians until the next call, also when their own colors change.
 
         Args:
-            highlights: rgb and the share that it takes of a Gaussian's color, 0..255; 0 takes none, 255
-                hides the Gaussian. [R,4]
+            rows: sorted indices. [R]
+            highlights: rgb and its share of the color, 0 to 255. A share of 0 is none, 255 hides the
+                Gaussian. [R,4]
         """
         self._shown = None
         self._renderer.highlight(rows, highlights)
@@ -82,11 +83,13 @@ class GlRenderer:
             self._moving[0].highlight(rows, highlights)
 
     def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32], pixels: int = 1) -> None:
-        """Make the picture and wait until it is done.
+        """Draw the picture and wait until it is finished.
 
         Args:
-            order: farthest first, from `back_to_front`
-            pixels: of the picture at rest that one of this one stands for, each way
+            camera: its size is the picture's
+            background: rgb behind the scene
+            order: rows, farthest first, from `back_to_front`
+            pixels: full-resolution pixels per pixel of this picture, along each axis
         """
         last = self._shown
         self._shown = DrawnView(camera, background, pixels)
@@ -118,16 +121,18 @@ class GlRenderer:
         return live.draw_fewer(draw, camera, pixels)
 
     def prepare(self, camera: Camera, background: Vec3) -> bool:
-        """Begin the picture, if making it may take long, without waiting for it; whether `draw` now has it at
-        once. Any other call drops what was begun."""
+        """Begin a slow picture in the background. Return whether `draw` can return it at once.
+
+        Any other call cancels the pending picture.
+        """
         return True
 
     def follow(self, last: object) -> bool:
-        """Take over another's picture, to be shown until there is a new one; whether there was one."""
+        """Take over another renderer's picture until there is a new one. Return whether there was one."""
         return False
 
     def pixels(self) -> Image:
-        """The picture, upper row first, not clamped. [H,W,3]"""
+        """Return the picture, upper row first, not clamped. [H,W,3]"""
         picture = require_picture(self._picture)
         rgba = np.frombuffer(picture.read(), np.float32).reshape(picture.height, picture.width, 4)
         return np.ascontiguousarray(rgba[..., :3])
@@ -135,10 +140,13 @@ class GlRenderer:
     def show(
         self, screen: moderngl.Framebuffer, size: Size, left: int = 0, grid: Lines | None = None
     ) -> None:
-        """Fill the framebuffer's lower `size` pixels from `left` on with the picture.
+        """Fill the framebuffer's lower `size` pixels, from column `left`, with the picture.
 
         Args:
-            grid: lines behind the splats, in pixels of the picture
+            screen: target
+            size: width and height, px
+            left: first column, px
+            grid: grid lines behind the splats, in pixels of the picture
         """
         picture = require_picture(self._picture)
         self._presenter.show(picture, screen, size, left)
@@ -147,7 +155,7 @@ class GlRenderer:
             self._grid.draw(grid, picture, screen, size, left)
 
     def release(self) -> None:
-        """Give back what it holds."""
+        """Release all GL objects."""
         self._presenter.release()
         self._renderer.release()
         self._release_moving()
@@ -161,13 +169,16 @@ class GlRenderer:
 
 
 def _to_raw(fewer: ActivatedGaussians) -> Gaussians:
-    """As textures hold them, but for opacities, with empty ones behind them up to one of few sizes."""
-    room = -(-max(len(fewer.means), 1) // _ROOM) * _ROOM - len(fewer.means)
+    """Convert to the parameters of textures, with activated opacities.
+
+    Empty Gaussians pad them to a multiple of `_TEXTURE_STEP`, so that texture sizes rarely change.
+    """
+    padding = -(-max(len(fewer.means), 1) // _TEXTURE_STEP) * _TEXTURE_STEP - len(fewer.means)
     means, quats, scales, opacities, rgb = (
-        torch.nn.functional.pad(tensor, (0, 0) * (tensor.ndim - 1) + (0, room)) for tensor in fewer.tensors
+        torch.nn.functional.pad(tensor, (0, 0) * (tensor.ndim - 1) + (0, padding)) for tensor in fewer.tensors
     )
     return Gaussians(
-        means, quats, scales.clamp_min(_MINIMUM).log(), opacities,
+        means, quats, scales.clamp_min(_MIN_SCALE).log(), opacities,
         (rgb - 0.5) / C0, rgb.new_zeros(len(rgb), 0, 3),
     )  # fmt: skip
 
@@ -179,21 +190,21 @@ def require_picture(thing: T | None) -> T:
 
 
 SOFTWARE = ("llvmpipe", "softpipe", "swiftshader", "microsoft basic render", "swrast")
-"""Parts of GL_RENDERER, in lower case, of renderers that run on the processor."""
+"""Lower-case substrings of GL_RENDERER that identify software renderers."""
 
 
 def headless_context() -> moderngl.Context:
-    """A GL 3.3 core context of its own, through EGL where there is one. The caller releases it.
+    """Create a standalone GL 3.3 core context, through EGL if available. The caller releases it.
 
     Raises:
         ProgdfError: this machine has no OpenGL 3.3.
     """
     reasons = []
-    for backend in ("egl", None):  # no EGL on Windows and macOS: their own way
-        named = {} if backend is None else {"backend": backend}
+    for backend in ("egl", None):  # Windows and macOS have no EGL
+        options = {} if backend is None else {"backend": backend}
         try:
-            return moderngl.create_context(standalone=True, require=330, **named)  # type: ignore[arg-type]
-        except Exception as error:  # each platform's loader raises its own kind
+            return moderngl.create_context(standalone=True, require=330, **options)  # type: ignore[arg-type]
+        except Exception as error:  # each platform's loader raises its own type
             reasons.append(" ".join(str(error).split()))
     raise ProgdfError(
         f"there is no OpenGL 3.3 here ({reasons[0]}); install libegl1 and libgl1, or use --engine cpu"
@@ -201,23 +212,25 @@ def headless_context() -> moderngl.Context:
 
 
 def is_software(ctx: moderngl.Context) -> bool:
-    """Whether the context draws on the processor; then the CPU rasterizer is several times faster."""
+    """Return whether the context renders in software. The CPU rasterizer is then several times faster."""
     renderer = str(ctx.info["GL_RENDERER"]).lower()
     return any(name in renderer for name in SOFTWARE)
 
 
 def back_to_front(means: NDArray[np.float32], camera: Camera) -> NDArray[np.uint32]:
-    """Rows in front of the near plane, farthest first; the exact reverse of (float32 depth, index) ascending.
+    """Sort the rows in front of the near plane, farthest first.
+
+    The order is the exact reverse of ascending (float32 depth, index).
 
     Args:
-        means: centers, world units; a row that is not finite is left out. [N,3]
-        camera: only its `viewmat` and `near` count
+        means: centers, world units; rows that are not finite are left out. [N,3]
+        camera: only its `viewmat` and `near` are used
 
     Returns:
         [V] uint32, V ≤ N
     """
     row = camera.viewmat[2].double().numpy()
-    # float64 as the CPU engine does: another rounding would swap neighbors
+    # float64 as in the CPU engine, as other rounding would swap neighbors
     with np.errstate(invalid="ignore", over="ignore"):
         depths = means.astype(np.float64) @ row[:3] + row[3]
         visible = (depths > camera.near) & (depths < np.inf)

@@ -1,6 +1,4 @@
-"""Colors over the splats: the selection and regions, painted weights from blue (none of the edit) to yellow;
-and what is hidden.
-"""
+"""Highlight colors over the splats: selection, regions, painted weights (blue 0 to yellow 1), hiding."""
 
 from __future__ import annotations
 
@@ -18,36 +16,34 @@ from viewer.state.view_state import ViewState
 from viewer.state.workspace import Pointed
 
 SHARE = 0.75
-"""Of a member's color that the ramp takes, so that the rest still tells its shape."""
+"""Share of the color ramp in a member's color. The remainder keeps its shape recognizable."""
 
 THIN = 0.2
-"""The same of a member without the edit, where the result is what one looks at; 0 where it has all of it."""
+"""Share of the thin tint at weight 0, falling to 0 at weight 1, so that the result stays visible."""
 
 RAMP = ((0.0, 0x2B3FA8), (0.25, 0x7A35B5), (0.5, 0xC8407A), (0.75, 0xF08A3C), (1.0, 0xF9E558))
-"""Weights and their colors, rgb; lightness rises with the weight, so that also gray tells them apart."""
+"""Color ramp: weights and 0xRRGGBB. Lightness rises with the weight, so it also reads in gray."""
 
-SELECTED: Color = (1.0, 0.72, 0.05)
-TINT = 140
-TRACE = 45
-HIDDEN = 255
-"""Shares of 255 that a tint takes, and that of a selection while no tool selects; and the one that means that
-a Gaussian is not drawn at all."""
+SELECTED: Color = (1.0, 0.72, 0.05)  # tint of the selection
+TINT = 140  # share of a tint, of 255
+TRACE = 45  # share of the selection's tint while no selection tool is active, of 255
+HIDDEN = 255  # share that marks a Gaussian as not drawn
 
 Bytes = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
 class Highlight:
-    """What to show over the scene."""
+    """Highlight drawn over the scene."""
 
-    # an edit whose members show their weights, as `LayerState.gdf` counts; None for none
+    # edit whose members are colored by weight (a `LayerState.gdf`), or None
     gdf: int | None = None
-    paint: str = paint.FULL  # its weights, as `paint.encode` writes them
-    thin: bool = False  # only a tint over what has less than all of the edit
-    # packed masks, their colors and shares of 255, later ones over earlier ones
+    paint: str = paint.FULL  # its weights, from `paint.encode`
+    thin: bool = False  # only a thin tint over weights below 1
+    # packed masks, their colors and shares of 255; later ones cover earlier ones
     tinted: tuple[tuple[bytes, Color, int], ...] = ()
-    region: int | None = None  # an edit whose members are tinted as one, or None
-    hidden: bytes = NOBODY  # packed mask of what is not drawn
+    region: int | None = None  # edit whose members are all tinted (a `LayerState.gdf`), or None
+    hidden: bytes = NOBODY  # packed mask of hidden Gaussians
 
 
 def requested_highlight(
@@ -56,16 +52,19 @@ def requested_highlight(
     pointed: Pointed | None = None,
     looks: bool = False,
 ) -> Highlight | None:
-    """What `view` shows: what the panel is asked about, weights while the brush is out, or the selection,
-    with the regions that are shown.
+    """Return the highlight for a view, or None.
 
-    Not in a comparison, and no weights of a hidden layer. A selection is a trace while no tool selects, and
-    none where the panel is hidden or one looks at the edits. What is hidden is the engine's to know.
+    It shows the layer under the mouse in the panel, else painted weights while the brush is active, else the
+    selection and the visible regions. Comparisons have no highlight, and invisible layers show no weights.
+
+    The selection is faint while no selection tool is active. It is invisible while the panel is hidden or
+    edits are being changed. The engine adds hidden Gaussians itself.
 
     Args:
-        focus: the focused layer, an index into `view.layers`, or None
-        pointed: what the mouse rests on in the panel
-        looks: edits are being moved or made, and are what one looks at
+        view: the state
+        focus: index of the focused layer in `view.layers`, or None
+        pointed: panel item under the mouse
+        looks: edits are being changed, so the selection is not shown
     """
     if view.compare.mode != "off":
         return None
@@ -89,7 +88,7 @@ def requested_highlight(
 
 
 def ramp_colors(weights: NDArray[np.float32]) -> Bytes:
-    """The ramp at weights 0..1: rgb, 0..255. [M] -> [M,3]"""
+    """Return the ramp colors of weights (0 to 1) as rgb, 0 to 255. [M] -> [M,3]"""
     at = [weight for weight, _ in RAMP]
     channels = zip(*(rgba(rgb) for _, rgb in RAMP), strict=True)
     mixed = [np.round(255.0 * np.interp(weights, at, channel)) for channel in channels]
@@ -97,16 +96,17 @@ def ramp_colors(weights: NDArray[np.float32]) -> Bytes:
 
 
 def rgba(color: int) -> tuple[float, float, float, float]:
-    """0xRRGGBB as numbers 0..1, opaque."""
+    """Convert 0xRRGGBB to an opaque color with channels from 0 to 1."""
     red, green, blue = (color >> shift & 255 for shift in (16, 8, 0))
     return red / 255, green / 255, blue / 255, 1.0
 
 
 def highlight_colors(highlight: Highlight, gdfs: Sequence[Gdf], total: int) -> Bytes:
-    """What is drawn over each Gaussian of the scene: rgb and its share, 0..255, or `HIDDEN`. [N,4]
+    """Compute the highlight color of each Gaussian: rgb and its share, 0 to 255, or `HIDDEN`. [N,4]
 
     Args:
-        gdfs: the edits that `highlight` counts
+        highlight: the highlight
+        gdfs: the edits that its indices refer to
         total: N
 
     Raises:
@@ -116,7 +116,9 @@ def highlight_colors(highlight: Highlight, gdfs: Sequence[Gdf], total: int) -> B
     hidden = unpack(highlight.hidden, total)
     for packed, color, share in highlight.tinted:
         mask = unpack(packed, total)
-        if share != TRACE or not hidden.any() or not (mask | hidden).all():  # isolated, it is all one sees
+        if (
+            share != TRACE or not hidden.any() or not (mask | hidden).all()
+        ):  # an isolated selection needs no faint tint
             colors[mask] = _tint(color, share)
     if highlight.region is not None:
         colors[gdfs[highlight.region].region.members.numpy()] = _tint(SELECTED, TINT)

@@ -1,4 +1,4 @@
-"""What lies under the cursor: which Gaussians with which shares, which point of the surface, which layer."""
+"""Picking at the cursor: visible Gaussians with their shares, surface point, layer."""
 
 from __future__ import annotations
 
@@ -23,33 +23,35 @@ from viewer.camera.view_camera import Vec3
 from viewer.state.layers import is_visible
 from viewer.state.view_state import ViewState
 
-HALF = 0.5
-FAINT = 0.05  # less than this in all counts as background
-MIN_SHARE = 0.25  # of what one sees at a pixel must be a layer's own before a click there means it
+HALF = 0.5  # accumulated opacity that defines the surface
+FAINT = 0.05  # accumulated opacity below which a pixel is background
+MIN_SHARE = 0.25  # share of a pixel's color that a layer needs to be picked
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What one sees at a pixel, nearest first."""
+    """Visible Gaussians at a pixel, nearest first."""
 
     rows: NDArray[np.int64]  # indices of the Gaussians. [M] int64
-    # the part of the pixel's color that each gives; with the background's share they make 1. [M]
+    # share of each in the pixel's color; with the background's share they sum to 1. [M]
     shares: NDArray[np.float64]
-    depths: NDArray[np.float64]  # in front of the camera, world units. [M]
+    depths: NDArray[np.float64]  # depths in front of the camera, world units. [M]
 
 
 def surface_point(scene: Gaussians, camera: Camera, x: float, y: float, near: float = 1e-4) -> Vec3 | None:
-    """The point under a pixel position, on its ray at the depth of the Gaussian that makes it half opaque.
+    """Return the surface point under a pixel position.
+
+    The point is on the pixel's ray, at the depth of the Gaussian at which the accumulated opacity reaches
+    `HALF`, or else of the Gaussian with the largest share.
 
     Args:
-        scene: what is on screen, so with its edits
+        scene: the edited scene on screen
         camera: the picture's camera
         x, y: pixels from the upper left corner, pixel centers at +0.5
-        near: least depth, world units
+        near: smallest depth, world units
 
     Returns:
-        World position; the strongest Gaussian's depth where the pixel never gets half opaque; None on the
-        background.
+        World position, or None on the background.
     """
     seen = seen_at(scene, camera, x, y, near)
     if seen is None:
@@ -67,16 +69,17 @@ def surface_point(scene: Gaussians, camera: Camera, x: float, y: float, near: fl
 
 
 def layer_at(view: ViewState, gdfs: Sequence[Gdf], seen: Seen) -> int | None:
-    """The layer that most of what one sees belongs to, an index into `view.layers`.
+    """Return the layer with the largest share of a pixel.
+
+    Visible layers take precedence over hidden ones, and later layers over earlier ones with an equal share.
 
     Args:
-        view: what is on screen
-        gdfs: the edits that `LayerState.gdf` counts
-        seen: at the pixel
+        view: the state on screen
+        gdfs: the edits, indexed by `LayerState.gdf`
+        seen: the visible Gaussians at the pixel
 
     Returns:
-        A shown layer goes before a hidden one, of equal ones the later; None where no layer has
-        `MIN_SHARE` of the pixel.
+        Index into `view.layers`, or None if no layer has `MIN_SHARE` of the pixel.
     """
     best = (False, 0.0)
     chosen = None
@@ -86,20 +89,20 @@ def layer_at(view: ViewState, gdfs: Sequence[Gdf], seen: Seen) -> int | None:
             continue
         inside = members[np.searchsorted(members, seen.rows).clip(max=len(members) - 1)] == seen.rows
         share = float(seen.shares[inside].sum())
-        ranked = is_visible(view, layer), share
-        if share >= MIN_SHARE and ranked >= best:
-            best = ranked
+        rank = is_visible(view, layer), share
+        if share >= MIN_SHARE and rank >= best:
+            best = rank
             chosen = i
     return chosen
 
 
 def seen_at(scene: Gaussians, camera: Camera, x: float, y: float, near: float = 1e-4) -> Seen | None:
-    """The Gaussians that one sees at a pixel position, None on the background; as `surface_point`."""
+    """Return the visible Gaussians at a pixel position, or None on the background. See `surface_point`."""
     rotation = camera.viewmat[:3, :3].numpy()
     translation = camera.viewmat[:3, 3].numpy()
     fx, fy, cx, cy = _lens(camera)
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        # by columns: a row at a time takes many times as long
+        # column by column, as row by row takes many times as long
         across, down, depth = rotation @ scene.means.numpy().T + translation[:, None]
         dx = across / depth
         dy = down / depth
@@ -107,7 +110,7 @@ def seen_at(scene: Gaussians, camera: Camera, x: float, y: float, near: float = 
         dy += np.float32((cy - y) / fy)
         off = dx * dx + dy * dy
         widest = np.exp(functools.reduce(np.maximum, scene.log_scales.numpy().T))
-        # √(1 + off) ≤ 1 + off / 2: what is taken too many here, `_alphas` leaves out
+        # √(1 + off) ≤ 1 + off / 2; `_alphas` drops the surplus candidates
         reach = widest / depth * (max(fx, fy) / min(fx, fy) * (1.0 + 0.5 * off)) + np.float32(1 / min(fx, fy))
         sized = np.isfinite(widest) & np.isfinite(scene.logit_opacities.numpy())
         near_ray = np.flatnonzero(sized & (depth > near) & (off < 3.5**2 * reach * reach))
@@ -122,7 +125,7 @@ def seen_at(scene: Gaussians, camera: Camera, x: float, y: float, near: float = 
 
 
 def _lens(camera: Camera) -> tuple[float, float, float, float]:
-    """Focal lengths and principal point, pixels."""
+    """Return the focal lengths and the principal point, px."""
     fx, fy, cx, cy = (float(v) for v in (camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]))
     return fx, fy, cx, cy
 
@@ -130,10 +133,10 @@ def _lens(camera: Camera) -> tuple[float, float, float, float]:
 def _alphas(
     scene: Gaussians, rows: NDArray[np.int64], camera: Camera, x: float, y: float, near: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Which of some Gaussians the rasterizer draws at a position, nearest first, and their alphas there."""
-    some = scene[torch.from_numpy(rows)]
+    """Return the given Gaussians that the rasterizer draws at a position, nearest first, and their alphas."""
+    candidates = scene[torch.from_numpy(rows)]
     pixel = (math.floor(x), math.floor(y), math.floor(x) + 1, math.floor(y) + 1)
-    activated = activate(replace(some, means=some.means.double()), torch.zeros(len(rows), 3))
+    activated = activate(replace(candidates, means=candidates.means.double()), torch.zeros(len(rows), 3))
     splats, _ = reference.project(activated, RasterView.of(replace(camera, near=near), activated, pixel))
     l11, l21, l22 = splats.whitening.unbind(1)
     dx, dy = (torch.tensor([x, y], dtype=torch.float64) - splats.means2d).unbind(1)
@@ -143,11 +146,11 @@ def _alphas(
 
 
 MANY = 100_000
-"""Gaussians below which nothing is worked out ahead: it takes a hand's tenth of a second at once."""
+"""Number of Gaussians below which nothing is prepared ahead, as on demand it takes about 0.1 s."""
 
 
 class Surfaces:
-    """The surface of the picture at rest."""
+    """Cache of the surface of the picture at rest."""
 
     def __init__(self) -> None:
         self._key: object = None
@@ -155,16 +158,19 @@ class Surfaces:
         self._colors = False
 
     def at(self, key: object) -> Surface | None:
-        """That of a picture if it was looked at ahead, or is just being."""
+        """Return the surface of a picture if it is prepared or in preparation, else None."""
         return self._surface if key == self._key else None
 
     def look(self, key: object, make: Callable[[], Surface], colors: bool) -> bool:
-        """Look at the surface of another picture, unless it is the last one's; whether it is another.
+        """Prepare the surface of a picture in another thread, unless it is already prepared.
 
         Args:
-            key: what decides it
-            make: gives it; it must stay as it is
-            colors: whether colors will be asked for as well
+            key: identifies the picture
+            make: creates the surface, which must not change afterwards
+            colors: whether colors will also be requested
+
+        Returns:
+            Whether it is a new surface.
         """
         if (key, colors) == (self._key, self._colors):
             return False
@@ -174,14 +180,14 @@ class Surfaces:
         return True
 
     def drop(self) -> None:
-        """Forget it."""
+        """Discard the surface."""
         if self._surface is not None:
             self._surface.drop()
         self._key = self._surface = None
 
 
 def beside(work: Callable[..., object], *arguments: object) -> None:
-    """Do it in another thread, after what was to be done there before."""
+    """Run `work` in another thread, after the work submitted earlier."""
     _worker().submit(work, *arguments)
 
 

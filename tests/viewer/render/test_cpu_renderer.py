@@ -204,14 +204,14 @@ def test_what_is_enough_is_measured_where_a_picture_in_full_follows_one_in_motio
         live.measure(full[::2, ::2] + error, full)
 
     measure(10.0)
-    assert live._enough == dynamic_resolution.FINE[1], "there is no pyramid yet"
+    assert live._max_finest == dynamic_resolution.FINE[1], "there is no pyramid yet"
     live.begin_pyramid().result()
     live.draw_fewer(lambda fewer: None, camera, 2)
     for share in (8.0, 0.5):
         measure(share)
-        assert live._enough == pytest.approx(live._limit / share ** (1 / 1.5), rel=0.1), "of bytes"
+        assert live._max_finest == pytest.approx(live._limit / share ** (1 / 1.5), rel=0.1), "of bytes"
     measure(0.0)
-    assert live._enough == dynamic_resolution.FINE[2]
+    assert live._max_finest == dynamic_resolution.FINE[2]
 
 
 @pytest.mark.gl
@@ -235,7 +235,7 @@ def test_only_the_same_view_in_full_tells_how_good_a_moving_picture_was(
         live = (
             engine.renderer._scene if isinstance(engine.renderer, CpuRenderer) else engine.renderer._moving[0]
         )
-        return live._enough
+        return live._max_finest
 
     for other in (turned, slid, black):
         assert rest(view, other) == first
@@ -265,8 +265,8 @@ def test_what_is_done_of_a_picture_shows_before_the_rest(
     while not engine.prepare(view, to_camera(view.camera, *SIZE)):
         pass
     assert isinstance(engine.renderer, CpuRenderer)
-    assert engine.renderer._begun is not None
-    bands = engine.renderer._begun.bands
+    assert engine.renderer._pending is not None
+    bands = engine.renderer._pending.bands
     assert bands == [(40, 80), (0, 40), (80, 120)], "the middle first"
     del bands[done:]
     assert engine.renderer.has_parts
