@@ -75,12 +75,13 @@ def _shrink_training(patch: pytest.MonkeyPatch) -> None:
 
 
 def _shrink_viewer(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(scenes, "SIZES", (600, 800))
+    patch.setattr(scenes, "SIZES", (600,))
     patch.setattr(slider, "CASES", (SliderCase(100, True),))
     patch.setattr(slider, "rows", partial(slider.rows, steps=2, size=PICTURE))
     patch.setattr(frames, "measure_turning", partial(frames.measure_turning, steps=2, size=PICTURE))
     patch.setattr(frames, "measure_starts", _measure_one_start(frames.measure_starts))
-    patch.setattr(moving, "MILLION", 3000)
+    patch.setattr(moving, "MILLION", 600)
+    patch.setattr(frames, "MAX_COPIED", 0)
     patch.setattr(moving, "TRAINED", 600)
     patch.setattr(moving, "begin_training", lambda scene: begin_training(scene, *SMALL_TRAINING))
     patch.setattr(moving, "_SETTLE_S", 0.05)
