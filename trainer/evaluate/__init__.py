@@ -1,1 +1,1 @@
-"""What papers report of an edit: `progdf evaluate` measures a finished run."""
+"""Measures of a finished run as papers report them: `progdf evaluate`."""

@@ -1,4 +1,4 @@
-"""`progdf evaluate`: a finished run's figures in one table and one picture."""
+"""The command `progdf evaluate`: figures of a finished run in one table and one picture."""
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ from .consistency import EDITED, UNEDITED, WarpedPair
 from .measures import Evaluation, evaluate_run, evaluation_json, evaluation_table, summary_table
 from .opened import OpenedRun, open_run
 
-_THUMBNAIL = 240
-_AMPLIFIED = 4
-_SPAN = (0.0, 1.0)
+_THUMBNAIL_WIDTH = 240  # pixels
+_DIFFERENCE_GAIN = 4  # factor of the difference pictures
+_SPAN = (0.0, 1.0)  # range of the slider axis
 
 
 def evaluation_picture(opened: OpenedRun, evaluation: Evaluation) -> Tensor:
-    """Thumbnails over curves. -> [H,W,3]"""
+    """Draw thumbnails above curves. -> [H,W,3]"""
     evaluator = opened.evaluator
     columns = columns_of(opened.trajectory.stage_strengths)
     best = best_view(evaluator)
     strips = {
-        name: [thumbnail(pictures(s)[best], _THUMBNAIL) for s, _ in columns]
+        name: [thumbnail(pictures(s)[best], _THUMBNAIL_WIDTH) for s, _ in columns]
         for name, pictures in opened.contenders().items()
     }
-    strips["the editor"] = editor_strip(evaluator, columns, _THUMBNAIL)
+    strips["the editor"] = editor_strip(evaluator, columns, _THUMBNAIL_WIDTH)
     sheets = [
         contact_sheet(
             list(strips.values()),
@@ -63,7 +63,7 @@ def evaluation_picture(opened: OpenedRun, evaluation: Evaluation) -> Tensor:
 
 
 def _warp_sheet(pair: WarpedPair) -> Tensor:
-    """A view, another warped onto it, and what differs: of the edited scene and of the original."""
+    """Draw a view, another one warped onto it, and their difference, for the edited and original scenes."""
     depth = pair.depth
     visible = depth > 0
     near, far = (float(depth[visible].quantile(q)) if bool(visible.any()) else q for q in (0.02, 0.98))
@@ -71,13 +71,19 @@ def _warp_sheet(pair: WarpedPair) -> Tensor:
     rows = []
     for whose in (EDITED, UNEDITED):
         view, warped = pair.pictures[whose]
-        difference = 1 - (_AMPLIFIED * (warped - view).abs()).clamp(0, 1)
+        difference = 1 - (_DIFFERENCE_GAIN * (warped - view).abs()).clamp(0, 1)
         both = torch.where(pair.both[..., None], view, 0.35 * view + 0.65)
         rows.append([view, both, warped, difference, gray[..., None].expand(-1, -1, 3)])
     return contact_sheet(
-        [[thumbnail(image, _THUMBNAIL) for image in row] for row in rows],
+        [[thumbnail(image, _THUMBNAIL_WIDTH) for image in row] for row in rows],
         [EDITED, UNEDITED],
-        [pair.target, "what both see", f"{pair.source} warped", f"difference, {_AMPLIFIED} times", "depth"],
+        [
+            pair.target,
+            "what both see",
+            f"{pair.source} warped",
+            f"difference, {_DIFFERENCE_GAIN} times",
+            "depth",
+        ],
         "One held-out view warped onto another by rendered depth",
     )
 
@@ -103,7 +109,7 @@ def _plots(evaluation: Evaluation) -> list[list[Plot]]:
 
 
 def _join_sheets(sheets: Sequence[Image.Image]) -> Image.Image:
-    """Sheets below each other on one page."""
+    """Stack sheets on one page."""
     page = Image.new("RGB", (max(s.width for s in sheets), sum(s.height for s in sheets)), PAPER)
     top = 0
     for sheet in sheets:
@@ -113,10 +119,11 @@ def _join_sheets(sheets: Sequence[Image.Image]) -> Image.Image:
 
 
 def evaluate(options: EvaluateOptions) -> list[Evaluation]:
-    """Measure a finished run, or all of a batch, and print the table.
+    """Measure a finished run, or all runs of a batch, and print the table.
 
     Raises:
-        ProgdfError: the folder is no finished run, a file of it is damaged, or its scene is gone or another.
+        ProgdfError: the folder is no finished run, one of its files is damaged, or its scene is missing or
+            differs.
     """
     use_threads(options.threads)
     perceptual, warning = perceptual_loss()
@@ -139,7 +146,7 @@ def evaluate(options: EvaluateOptions) -> list[Evaluation]:
 
 
 def _evaluate_run(options: EvaluateOptions, perceptual: Perceptual) -> Evaluation:
-    """Measure one run; RUN/evaluation.json and .png."""
+    """Measure one run and write RUN/evaluation.json and evaluation.png."""
     opened = open_run(options.run, options.scene)
     texts = effective_texts(options.texts, opened.run.record.plan.texts)
     evaluation = evaluate_run(opened, perceptual, texts)

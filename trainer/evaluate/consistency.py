@@ -1,4 +1,4 @@
-"""Consistency of held-out views with others, and what changed beside the region, of a finished edit."""
+"""Consistency between views of a finished edit, and its changes outside the region."""
 
 from __future__ import annotations
 
@@ -26,45 +26,43 @@ from trainer.views.view import View, crop, make_view, render_view
 
 from .opened import OpenedRun
 
-EDITED = "slider"
-EDITOR = "the editor"
-UNEDITED = "unedited"
-"""Whose pictures are warped: the finished edit's, the editor's own, the original's, which is the floor."""
+# sources of the warped pictures
+EDITED = "slider"  # the finished edit
+EDITOR = "the editor"  # the editor's pictures
+UNEDITED = "unedited"  # the original, whose difference is the lower bound
 
-_MIN_SHARED = 0.1  # of a view's counted pixels that another must see, or the two are not compared
-_SHOWS = 0.05  # a pixel shows the region where the members' weight is above this
+_MIN_SHARED = 0.1  # two views are compared if they share at least this part of the evaluated pixels
+_REGION_WEIGHT = 0.05  # a pixel shows the region if the members' weight is above this
 
 
 @dataclass(frozen=True)
 class WarpedPair:
     """A view warped onto a held-out one."""
 
-    # source, target: the views' names
-    source: str
-    target: str
-    shared: float  # share of the target's counted pixels that the source sees too, 0..1
-    # whose -> target's box, and the source warped onto it where both see. [h,w,3] each
+    source: str  # name of the warped view
+    target: str  # name of the held-out view
+    shared: float  # share of the target's evaluated pixels that the source sees too, 0 to 1
+    # by source of the pictures: target's box, and the source warped onto it where both see. [h,w,3] each
     pictures: dict[str, tuple[Tensor, Tensor]]
-    both: Tensor  # the pixels that are compared. [h,w] bool
+    both: Tensor  # mask of the compared pixels. [h,w] bool
     depth: Tensor  # of the edited scene in the target's box, world units; 0 where it is not opaque. [h,w]
 
 
 @dataclass(frozen=True)
 class Consistency:
-    """How alike views of the same thing are."""
+    """Similarity of views of the same surface, by source of the pictures."""
 
-    # lpips, psnr: whose -> mean over the pairs, LPIPS in the targets' boxes, PSNR over what both see, dB
-    lpips: dict[str, float]
-    psnr: dict[str, float]
-    # what was compared; none where no other view sees enough of the same
+    lpips: dict[str, float]  # mean over the pairs, in the targets' boxes
+    psnr: dict[str, float]  # mean over the pairs, over the shared pixels, dB
+    # compared views; empty if no other view sees enough of the same surface
     pairs: tuple[WarpedPair, ...]
 
 
 def view_consistency(opened: OpenedRun, perceptual: Perceptual) -> Consistency:
-    """Each held-out view beside the view of the run that sees most of the same, warped onto it.
+    """Compare each held-out view with the view of the run that shares most with it, warped onto it.
 
-    Compared are the pixels that count (see `Evaluator`) and whose surface both views see, before the edit and
-    after it; the others are taken from the target, so that they differ in nothing.
+    The comparison covers the evaluated pixels (see `Evaluator`) whose surface both views see, before and
+    after the edit. The other pixels are copied from the target, so that they do not differ.
     """
     scene = opened.run.scene
     background = opened.setup.background
@@ -81,7 +79,7 @@ def view_consistency(opened: OpenedRun, perceptual: Perceptual) -> Consistency:
         EDITED: [see_depth(edited, view.camera) for view in views],
         UNEDITED: [see_depth(scene, view.camera) for view in views],
     }
-    seen[EDITOR] = seen[EDITED]  # what it shows has no depth of its own
+    seen[EDITOR] = seen[EDITED]  # the editor's pictures have no depth
     pairs = []
     for target in range(len(targets)):
         best = None
@@ -106,15 +104,18 @@ def view_consistency(opened: OpenedRun, perceptual: Perceptual) -> Consistency:
 
 
 def outside_change(opened: OpenedRun) -> dict[str, float]:
-    """Mean absolute change of the pixels in the held-out boxes that show the region neither before the edit
-    nor after it, 0..1: of the finished edit, and of what the editor made."""
+    """Return the mean absolute change outside the region, 0 to 1, of the finished edit and of the editor's
+    pictures.
+
+    It covers the pixels of the held-out boxes that show the region neither before nor after the edit.
+    """
     views = opened.setup.judging
     evaluator = opened.evaluator
     edited = edited_scene(opened.setup.scene, opened.gdf)
     after = [make_view(edited, opened.setup.region, view.camera, opened.setup.background) for view in views]
     boxes = [scene.box for scene in evaluator.crops]
     outside = [
-        crop((a.mask <= _SHOWS) & (b.mask <= _SHOWS), box)
+        crop((a.mask <= _REGION_WEIGHT) & (b.mask <= _REGION_WEIGHT), box)
         for a, b, box in zip(views, after, boxes, strict=True)
     ]
     original = [crop(view.image, box) for view, box in zip(views, boxes, strict=True)]
@@ -155,55 +156,59 @@ def _warp(
     )
 
 
-_OPAQUE = 0.9  # less shows the background through, which has no depth
+_MIN_OPACITY = 0.9  # below this the background, which has no depth, is visible
 
 
-_SAME_PLACE = 0.02  # of the depth: further off is another surface
+_SAME_SURFACE_DEPTH = 0.02  # relative depth difference; a larger one is another surface
 
 
 @dataclass(frozen=True)
 class SeenDepth:
-    """A camera and the depth that it sees."""
+    """A camera and its rendered depth."""
 
     camera: Camera
     depth: Depth
 
 
 def see_depth(scene: Gaussians, camera: Camera) -> SeenDepth:
-    """The depth of a scene from a camera, without gradients."""
+    """Render the depth of a scene from a camera, without gradients."""
     with torch.no_grad():
         return SeenDepth(camera, render_depth(scene, camera))
 
 
 def warp_view(image: Tensor, source: SeenDepth, target: SeenDepth) -> tuple[Tensor, Tensor]:
-    """What the source's picture shows where the target's pixels are.
+    """Warp the source's picture to the target's camera.
 
     Args:
         image: the source's picture. [H,W,3]
         source, target: cameras, with the depth of the same scene
 
     Returns:
-        The picture as the target sees it, sampled bilinearly [h,w,3]; the pixels whose surface the source
-        sees too: both opaque, and the same depth to 2 % [h,w] bool
+        The warped picture, sampled bilinearly [h,w,3]; the mask of pixels whose surface the source sees too,
+        with both opaque and depths equal to 2 % [h,w] bool
     """
-    here = target.camera
-    there = source.camera
+    target_camera = target.camera
+    source_camera = source.camera
     rows, columns = torch.meshgrid(
-        torch.arange(here.height) + 0.5, torch.arange(here.width) + 0.5, indexing="ij"
+        torch.arange(target_camera.height) + 0.5, torch.arange(target_camera.width) + 0.5, indexing="ij"
     )
     pixels = torch.stack([columns, rows, torch.ones_like(rows)], dim=2)
-    rays = pixels @ torch.linalg.inv(here.K).T
+    rays = pixels @ torch.linalg.inv(target_camera.K).T
     points = rays * target.depth.depth[..., None]
-    relative = there.viewmat @ here.c2w
+    relative = source_camera.viewmat @ target_camera.c2w
     moved = points @ relative[:3, :3].T + relative[:3, 3]
     z = moved[..., 2]
-    front = z > there.near
-    projected = moved @ there.K.T / torch.where(front, z, 1.0)[..., None]
+    front = z > source_camera.near
+    projected = moved @ source_camera.K.T / torch.where(front, z, 1.0)[..., None]
     u = projected[..., 0]
     v = projected[..., 1]
-    inside = front & (u >= 0.5) & (v >= 0.5) & (u <= there.width - 0.5) & (v <= there.height - 0.5)
+    inside = (
+        front & (u >= 0.5) & (v >= 0.5) & (u <= source_camera.width - 0.5) & (v <= source_camera.height - 0.5)
+    )
     # pixel centers lie at +0.5, as those of `grid_sample` without align_corners do
-    grid = torch.stack([2 * u / there.width - 1, 2 * v / there.height - 1], dim=2).clamp(-2, 2)
+    grid = torch.stack([2 * u / source_camera.width - 1, 2 * v / source_camera.height - 1], dim=2).clamp(
+        -2, 2
+    )
     planes = torch.cat([image, source.depth.depth[..., None], source.depth.alpha[..., None]], dim=2)
     sampled = grid_sample(
         planes.permute(2, 0, 1)[None], grid[None], align_corners=False, padding_mode="border"
@@ -211,27 +216,28 @@ def warp_view(image: Tensor, source: SeenDepth, target: SeenDepth) -> tuple[Tens
     warped = sampled[0, :3].permute(1, 2, 0)
     depth = sampled[0, 3]
     alpha = sampled[0, 4]
-    both = inside & (target.depth.alpha > _OPAQUE) & (alpha > _OPAQUE)
-    return warped, both & ((depth - z).abs() <= _SAME_PLACE * z)
+    both = inside & (target.depth.alpha > _MIN_OPACITY) & (alpha > _MIN_OPACITY)
+    return warped, both & ((depth - z).abs() <= _SAME_SURFACE_DEPTH * z)
 
 
 FRAMES = 5
-"""From one view to the next on the path."""
+"""Frames from one view to the next on the path."""
 
-_STOPS = 6  # of the run's views on the path, at most: straight from one side to the other it leads through
+_MAX_PATH_VIEWS = 6  # of the run's views on the path; straight lines between distant ones cross the object
 
 
 def camera_path(cameras: Sequence[Camera]) -> list[Camera]:
-    """From each camera to the nearest that has not been passed, positions straight, rotations on the sphere.
+    """Return a path from each camera to the nearest unvisited one, with linear positions and slerped
+    rotations.
 
     `cameras`: at least one; the path begins at the first
     """
-    left = list(cameras[1:])
+    remaining = list(cameras[1:])
     route = [cameras[0]]
-    while left:
-        here = route[-1].position
-        nearest = min(range(len(left)), key=lambda i: float((left[i].position - here).norm()))
-        route.append(left.pop(nearest))
+    while remaining:
+        current = route[-1].position
+        nearest = min(range(len(remaining)), key=lambda i: float((remaining[i].position - current).norm()))
+        route.append(remaining.pop(nearest))
     path = []
     for a, b in pairwise(route):
         turns = Slerp([0.0, 1.0], Rotation.from_matrix([c.viewmat[:3, :3].double().numpy() for c in (a, b)]))
@@ -240,7 +246,7 @@ def camera_path(cameras: Sequence[Camera]) -> list[Camera]:
 
 
 def clip_consistency(opened: OpenedRun) -> tuple[float | None, str]:
-    """Consistency of CLIP's direction along the path, −1..1, at strength 1; or None and why not."""
+    """Return the consistency of CLIP's direction along a path at strength 1, −1 to 1; or None and why not."""
     try:
         clip = load_clip(CLIP_MODEL)
     except ProgdfError as error:
@@ -248,7 +254,7 @@ def clip_consistency(opened: OpenedRun) -> tuple[float | None, str]:
     views = opened.setup.views
     if len(views) < 2:
         return None, "there is one view alone, which is no path"
-    path = camera_path([view.camera for view in views[:: -(-len(views) // _STOPS)]])
+    path = camera_path([view.camera for view in views[:: -(-len(views) // _MAX_PATH_VIEWS)]])
     before, after = (
         clip.pictures([render_view(scene, camera, opened.setup.background) for camera in path])
         for scene in (opened.run.scene, edited_scene(opened.setup.scene, opened.gdf))
@@ -258,7 +264,7 @@ def clip_consistency(opened: OpenedRun) -> tuple[float | None, str]:
 
 
 def neighbor_similarity(before: Tensor, after: Tensor) -> float | None:
-    """Mean cosine of the changes of neighboring frames; None where fewer than two change.
+    """Return the mean cosine of the changes of neighboring frames; None if no two neighbors change.
 
     Args:
         before, after: features of the frames, of unit length. [n,D]

@@ -1,4 +1,4 @@
-"""Everything that `progdf evaluate` tells of a run; what each line means is in docs/benchmarks.md."""
+"""All measures of `progdf evaluate`; docs/benchmarks.md explains each line."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from .opened import FADE, KEYFRAMES, SLIDER, OpenedRun
 class MeasureRow:
     """One line of the table."""
 
-    name: str  # in evaluation.json
-    text: str  # in the table, with the unit
-    cells: Mapping[str, float | None]  # by column: figures, None where one is not defined
-    digits: int = 3  # behind the point
-    missing: str = ""  # why nothing was measured, "" where it was
+    name: str  # name in evaluation.json
+    text: str  # label in the table, with the unit
+    cells: Mapping[str, float | None]  # figures by column, None if undefined
+    digits: int = 3  # decimal places
+    missing: str = ""  # reason if not measured, else ""
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What was measured."""
+    """Result of an evaluation."""
 
     rows: tuple[MeasureRow, ...]  # the table
-    # against the editor's own pictures at the slider values that it was asked for, by what is shown
+    # errors against the editor's pictures at their slider values, by contender
     curves: Mapping[str, ErrorCurve]
-    paths: Mapping[str, SliderPath]  # the slider in equal steps, by what is shown
+    paths: Mapping[str, SliderPath]  # the slider in equal steps, by contender
     consistency: Consistency  # between held-out views
     perceptual: str  # name of the perceptual distance
 
@@ -47,8 +47,8 @@ def evaluate_run(opened: OpenedRun, perceptual: Perceptual, texts: TextOptions) 
 
     Args:
         opened: see `open_run`
-        perceptual: LPIPS, or its stand-in
-        texts: what CLIP is asked
+        perceptual: LPIPS or its substitute
+        texts: texts for CLIP
     """
     evaluator = opened.evaluator
     contenders = opened.contenders()
@@ -129,11 +129,13 @@ def _consistency_rows(consistency: Consistency, lpips: str) -> list[MeasureRow]:
 
 
 def _clip_rows(opened: OpenedRun, texts: TextOptions) -> list[MeasureRow]:
-    course = clip_curve(opened.evaluator, opened.setup.judging, opened.gdf.field, texts)
+    clip_direction = clip_curve(opened.evaluator, opened.setup.judging, opened.gdf.field, texts)
     along, missing = clip_consistency(opened)
-    direction = course.similarity[-1] if course.similarity else None
+    direction = clip_direction.similarity[-1] if clip_direction.similarity else None
     return [
-        MeasureRow("clip_direction", "CLIP direction similarity at 1", {SLIDER: direction}, 3, course.reason),
+        MeasureRow(
+            "clip_direction", "CLIP direction similarity at 1", {SLIDER: direction}, 3, clip_direction.reason
+        ),
         MeasureRow(
             "clip_consistency", "CLIP direction consistency along a path", {SLIDER: along}, 3, missing
         ),
@@ -159,16 +161,18 @@ def _cost_rows(opened: OpenedRun) -> list[MeasureRow]:
 
 @dataclass(frozen=True)
 class SliderPath:
-    """A slider in 20 equal steps."""
+    """Measures of a slider in 20 equal steps."""
 
-    evenness: float  # smallest over largest visible change of a step, as report.json's `uniformity`, 0..1
-    monotone: float  # share of the steps that lead away from the original, by visible change, 0..1
+    evenness: (
+        float  # smallest over largest visible change of a step, like `uniformity` in report.json, 0 to 1
+    )
+    monotone: float  # share of the steps that move away from the original, by visible change, 0 to 1
     steps: tuple[float, ...]  # LPIPS between neighboring slider values. [20]
     from_original: tuple[float, ...]  # LPIPS from slider value 0, at the 21 values
 
     @property
     def ends(self) -> float:
-        """LPIPS between both ends."""
+        """LPIPS between slider values 0 and 1."""
         return self.from_original[-1]
 
     @property
@@ -183,24 +187,29 @@ class SliderPath:
 
     @property
     def sum_over_ends(self) -> float:
-        """Σ LPIPS of neighbors over LPIPS of the ends; 1/20 for a straight way in equal steps, as LPIPS is a
-        squared distance."""
+        """Sum of the neighbors' LPIPS over the LPIPS of the ends.
+
+        It is 1/20 for a straight path in equal steps, as LPIPS is a squared distance.
+        """
         return sum(self.steps) / self.ends if self.ends > 0 else math.nan
 
     @property
     def triangle_excess(self) -> float:
-        """The same of the roots, which are distances: at least 1, and 1 for a straight way."""
+        """Like `sum_over_ends`, of square roots, which are distances: 1 on a straight path, else more."""
         return sum(math.sqrt(d) for d in self.steps) / math.sqrt(self.ends) if self.ends > 0 else math.nan
 
 
 def slider_path(evaluator: Evaluator, pictures: Pictures, perceptual: Perceptual) -> SliderPath:
-    """Walk a slider. `pictures`: slider value -> the held-out views' boxes"""
-    shown = {i / STEPS: pictures(i / STEPS) for i in range(STEPS + 1)}
+    """Measure a slider in `STEPS` equal steps. `pictures`: slider value -> the held-out views' boxes"""
+    pictures_by_s = {i / STEPS: pictures(i / STEPS) for i in range(STEPS + 1)}
     statistics = slider_statistics(
-        lambda s: shown[s] if s in shown else pictures(s), STEPS, masks=evaluator.pixels
+        lambda s: pictures_by_s[s] if s in pictures_by_s else pictures(s), STEPS, masks=evaluator.pixels
     )
-    steps = [evaluator.perceptual(b, a, perceptual) for a, b in pairwise(shown.values())]
-    from_original = [evaluator.perceptual(now, shown[0.0], perceptual, "original") for now in shown.values()]
+    steps = [evaluator.perceptual(b, a, perceptual) for a, b in pairwise(pictures_by_s.values())]
+    from_original = [
+        evaluator.perceptual(current, pictures_by_s[0.0], perceptual, "original")
+        for current in pictures_by_s.values()
+    ]
     perceptual.forget()
     rises = [b > a for a, b in pairwise(statistics.distances)]
     return SliderPath(statistics.uniformity, sum(rises) / len(rises), tuple(steps), tuple(from_original))
@@ -210,18 +219,18 @@ COLUMNS = (SLIDER, KEYFRAMES, FADE, EDITOR, UNEDITED)
 
 
 def evaluation_table(evaluation: Evaluation) -> str:
-    """The whole table; what could not be measured says why below it."""
+    """Return the whole table, with the reasons for missing measures below it."""
     rows = [(row.text, *(_cell(row, column) for column in COLUMNS)) for row in evaluation.rows]
     notes = [f"{row.text}: not measured, {row.missing}" for row in evaluation.rows if row.missing]
     return "\n".join([markdown_table(("", *COLUMNS), rows), *(["", *notes] if notes else [])])
 
 
 SUMMARY = ("psnr_end", "psnr_between", "lpips_end", "evenness", "bytes_per_member", "seconds")
-"""Rows of which the table of a batch has a column."""
+"""Rows that are columns in the table of a batch."""
 
 
 def summary_table(names: Sequence[str], evaluations: Sequence[Evaluation]) -> str:
-    """A line a run: what its slider reaches in `SUMMARY`."""
+    """Return a table with one line per run: its slider's figures of `SUMMARY`."""
     lines = []
     for name, evaluation in zip(names, evaluations, strict=True):
         rows = {row.name: row for row in evaluation.rows}
@@ -230,7 +239,7 @@ def summary_table(names: Sequence[str], evaluations: Sequence[Evaluation]) -> st
 
 
 def evaluation_json(evaluation: Evaluation) -> dict[str, Any]:
-    """As evaluation.json has it: rows by name, their figures by column, or why there are none."""
+    """Return evaluation.json: rows by name, with their figures by column or the reason if missing."""
     rows = {row.name: {"missing": row.missing} if row.missing else _round_row(row) for row in evaluation.rows}
     curves = {name: curve.to_json() for name, curve in evaluation.curves.items()}
     pairs = [
@@ -241,7 +250,7 @@ def evaluation_json(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Rows of cells as GitHub Markdown."""
+    """Format rows of cells as a GitHub Markdown table."""
     lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
     return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
 

@@ -1,4 +1,4 @@
-"""A finished run, opened to be measured: its shipped field, its held-out views, what is compared with it."""
+"""A finished run opened for measuring: its shipped field, its held-out views and the compared contenders."""
 
 from __future__ import annotations
 
@@ -24,10 +24,11 @@ from trainer.run.record import FinishedRun, render_edited_views, reopen_run
 from trainer.setup import TrainingSetup
 
 SLIDER = "slider"
+"""Contender: the shipped field."""
 KEYFRAMES = "2 keyframes"
+"""Contender: a straight line to the full edit, with a uniform slider if the run's is uniform."""
 FADE = "cross-fade"
-"""What is compared: the shipped field; the original and the end with a straight line between, its slider made
-even as ours; the pictures of both ends, blended in sRGB."""
+"""Contender: a cross-fade in sRGB between the pictures of both ends."""
 
 
 @dataclass(frozen=True)
@@ -55,19 +56,19 @@ class RunFigures:
 
 @dataclass(frozen=True)
 class OpenedRun:
-    """What is measured."""
+    """A finished run with everything needed to measure it."""
 
     run: FinishedRun  # see `FinishedRun`
     report: Mapping[str, Any]  # its report.json
-    figures: RunFigures  # the checked parts of it
-    setup: TrainingSetup  # its views; the boxes of the training views hold what the edit changes
-    evaluator: Evaluator  # its judging views, beside what the editor made of them
-    gdf: Gdf  # the edit as it is shipped
-    trajectory: Trajectory  # what was recorded, on the shipped slider
-    keyframes: BakedField  # the end alone, see `KEYFRAMES`
+    figures: RunFigures  # the checked parts of report.json
+    setup: TrainingSetup  # its views; the boxes of the training views contain the changes of the edit
+    evaluator: Evaluator  # its held-out views, with the editor's pictures of them
+    gdf: Gdf  # the shipped edit
+    trajectory: Trajectory  # the recording, on the shipped slider
+    keyframes: BakedField  # the baseline `KEYFRAMES`
 
     def contenders(self) -> dict[str, Pictures]:
-        """Slider value -> the held-out views' boxes, of everything that is compared."""
+        """Return for each contender a function from slider value to the held-out views' boxes."""
         field = self.gdf.field
         keyframes = self.keyframes
         first, last = (self.evaluator.pictures(field.offsets(s)) for s in (0.0, 1.0))
@@ -75,8 +76,8 @@ class OpenedRun:
         def fade(s: float) -> list[Tensor]:
             return [torch.lerp(a, b, s) for a, b in zip(first, last, strict=True)]
 
-        course = self.evaluator.course
-        return {SLIDER: course(field), KEYFRAMES: course(keyframes), FADE: fade}
+        pictures_of = self.evaluator.course
+        return {SLIDER: pictures_of(field), KEYFRAMES: pictures_of(keyframes), FADE: fade}
 
 
 def open_run(root: Path, scene: Path | None = None) -> OpenedRun:
@@ -84,10 +85,10 @@ def open_run(root: Path, scene: Path | None = None) -> OpenedRun:
 
     Args:
         root: the folder
-        scene: where the scene is now, if it has moved
+        scene: new path of the scene, if it has moved
 
     Raises:
-        ProgdfError: the folder is no finished run, a file of it is gone or damaged, or the scene is.
+        ProgdfError: the folder is no finished run, or one of its files or the scene is missing or damaged.
     """
     run = reopen_run(root, scene)
     try:
@@ -113,7 +114,7 @@ def open_run(root: Path, scene: Path | None = None) -> OpenedRun:
 
 
 def _two_keyframes(gdf: Gdf, setup: TrainingSetup, figures: RunFigures) -> BakedField:
-    """Return the field of the end alone, its slider made even if the run's is."""
+    """Return the straight line to the full edit as a field, with a uniform slider if the run's is uniform."""
     end = gdf.field.offsets(1.0)
     straight = fit_keyframes(torch.tensor([0.0, 1.0]), torch.stack([torch.zeros_like(end), end]), 2)
     if figures.trajectory.slider == "even":

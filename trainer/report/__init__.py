@@ -1,1 +1,1 @@
-"""What a run reached, measured and shown."""
+"""Quality report of a run: measurements and pictures."""

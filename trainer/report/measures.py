@@ -1,4 +1,4 @@
-"""What a run reached: errors over the slider on held-out views, how the slider feels, what CLIP says."""
+"""Quality measures of a run: errors over the slider on held-out views, slider uniformity, CLIP similarity."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ class ErrorCurve:
     """Errors of pictures along the slider, over all held-out views."""
 
     s: tuple[float, ...]  # slider values, ascending
-    psnr: tuple[float, ...]  # over the pixels that count, dB, at most 99
-    seen_s: tuple[float, ...]  # those of them at which the others are taken, the last among them
+    psnr: tuple[float, ...]  # over the evaluated pixels, dB, at most 99
+    seen_s: tuple[float, ...]  # slider values of `ssim` and `lpips`, a subset of `s` with the last one
     ssim: tuple[float, ...]  # over the same pixels, at most 1
-    # of the views' boxes, ≥ 0 (or what stands in for LPIPS, see `Evaluator.perceptual`)
+    # over the views' boxes, ≥ 0 (LPIPS or its substitute, see `Evaluator.perceptual`)
     lpips: tuple[float, ...]
 
     def to_json(self) -> dict[str, list[float]]:
-        """As report.json and evaluation.json have it."""
+        """Return the curve for report.json and evaluation.json."""
         return {name: [round(x, 2 if name == "psnr" else 4) for x in xs] for name, xs in asdict(self).items()}
 
 
@@ -54,15 +54,15 @@ def picture_courses(
     perceptual: Perceptual,
     most: int | None = None,
 ) -> dict[str, ErrorCurve]:
-    """The errors of whatever shows the held-out views, over the slider.
+    """Measure errors of several sources of held-out pictures over the slider.
 
     Args:
         evaluator: the views
-        pictures: by name: what is shown at a slider value. -> [h,w,3] each
+        pictures: by name, a function from slider value to pictures. -> [h,w,3] each
         strengths: slider values, ascending
-        truth: what the pictures should be at one of them. -> [h,w,3] each
-        perceptual: LPIPS, or its stand-in
-        most: about how many strengths SSIM and LPIPS are taken at, which cost far more; None: all
+        truth: function from slider value to the expected pictures. -> [h,w,3] each
+        perceptual: LPIPS or its substitute
+        most: approximate number of slider values for SSIM and LPIPS, which cost far more; None: all
     """
     every = 1 if most is None else max(1, round(len(strengths) / most))
     seen = tuple(strengths[::-1][::every][::-1])
@@ -89,13 +89,13 @@ def against_editor(
     perceptual: Perceptual,
     most: int | None = None,
 ) -> dict[str, ErrorCurve]:
-    """Each field's errors against the editor's own pictures.
+    """Measure each field's errors against the editor's pictures.
 
     Args:
         evaluator: held-out views with these pictures
         fields: by name
-        stages: slider value and the strength that the editor was asked at, ascending
-        perceptual: LPIPS, or its stand-in
+        stages: slider value and the editor strength that belongs to it, ascending
+        perceptual: LPIPS or its substitute
         most: see `picture_courses`
     """
     pictures = {name: evaluator.course(field) for name, field in fields.items()}
@@ -104,40 +104,40 @@ def against_editor(
 
 
 COMPARED = "keyframes2"
-"""The baseline whose courses stand beside the field's: what anyone would do first."""
+"""Baseline whose curves are shown beside the field's: the most obvious alternative."""
 
-_ROUNDED = 1.5 / 255  # two images in 8 bits differ by as much
-_ALIKE = 0.05  # of color, by which `changed` tells a painted pixel where it knows nothing of how it was saved
-_NODES = 6  # recordings at which the field is looked at
-CLIP_STRENGTHS = tuple(i / 10 for i in range(11))
+_ROUNDING_DIFFERENCE = 1.5 / 255  # color difference of two images due to rounding to 8 bits
+_PAINT_DIFFERENCE = 0.05  # color difference of a painted pixel if the file format is unknown, as in `changed`
+_RECORDING_SAMPLES = 6  # recordings at which the field is compared
+CLIP_STRENGTHS = tuple(i / 10 for i in range(11))  # slider values of the CLIP curve
 
 
 @dataclass(frozen=True)
 class Direction:
     """CLIP directional similarity along the slider."""
 
-    s: tuple[float, ...] = ()  # slider values; none where nothing was measured
-    # mean over held-out views, −1..1; None where it is undefined, as at 0
+    s: tuple[float, ...] = ()  # slider values; empty if not measured
+    # mean over held-out views, −1 to 1; None if undefined, as at 0
     similarity: tuple[float | None, ...] = ()
-    model: str = ""  # the CLIP model, "" where nothing was measured
-    reason: str = ""  # why nothing was measured, "" where it was
+    model: str = ""  # name of the CLIP model, "" if not measured
+    reason: str = ""  # reason if not measured, else ""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """Everything about the fitted field that the report tells, measured on held-out views.
+    """Measurements of the fitted field for the report, on held-out views.
 
-    What concerns the edit is measured on all of them, the field's errors on those that it was not chosen on.
+    Figures of the edit use all held-out views; errors of the field use those that it was not chosen on.
     """
 
     fitted: Fitted  # the field and its baselines, on the trajectory's slider
-    shown: BakedField  # the field as it is shipped, on a slider of its own
-    remap: SliderRemap  # from the trajectory's slider to that
-    # slider value of what the editor was asked for, and the strength that it was asked at
+    shown: BakedField  # the shipped field, on its own slider
+    remap: SliderRemap  # from the trajectory's slider to the shipped one
+    # slider value and strength of each set of editor pictures
     asked: Sequence[tuple[float, float]]
-    slider: SliderStatistics  # how the slider feels
-    at_recordings: float  # worst PSNR of the field at the recordings themselves, dB
-    # "slider" and the compared baseline against the editor's own pictures, at the strengths it was asked for
+    slider: SliderStatistics  # uniformity and monotonicity of the slider
+    at_recordings: float  # worst PSNR of the field at the recordings, dB
+    # "slider" and the compared baseline against the editor's pictures, at the editor's strengths
     editor: Mapping[str, ErrorCurve]
     perceptual: str  # name of the perceptual distance
     clip: Direction  # see `Direction`
@@ -155,20 +155,20 @@ def measure(
     """Measure the chosen field beside the compared baseline.
 
     Args:
-        judges: all held-out views, and those of them on which the field was not chosen
-        trajectory: what was recorded
+        judges: evaluators of all held-out views, and of those on which the field was not chosen
+        trajectory: the recorded trajectory
         fitted: the field and its baselines
-        shipped: the field as it is shipped
+        shipped: the shipped field
         remap: from the trajectory's slider to the shipped field's
-        perceptual: LPIPS, or its stand-in
-        clip: measured already, or the reason why not
+        perceptual: LPIPS or its substitute
+        clip: finished CLIP measurement, or the reason if there is none
     """
     (evaluator, reporting), field = judges, fitted.chosen.field
     linear = fitted.baselines[COMPARED].field
     slider = slider_statistics(evaluator.course(shipped), masks=evaluator.pixels)
     stages = tuple((remap.at(s), strength) for s, strength in trajectory.stage_strengths)
     drawn = against_editor(evaluator, {"slider": shipped, COMPARED: linear}, stages, perceptual, most=1)
-    nodes = trajectory.s[1:-1][:: max(1, -(-(len(trajectory) - 2) // _NODES))].tolist()
+    nodes = trajectory.s[1:-1][:: max(1, -(-(len(trajectory) - 2) // _RECORDING_SAMPLES))].tolist()
     worst = min(
         (
             reporting.psnr(reporting.pictures(field.offsets(s)), reporting.pictures(trajectory.at(s)))
@@ -190,19 +190,19 @@ def measure(
 
 
 def expected_measures(trajectory: Trajectory) -> int:
-    """About how often `measure` looks at its views, for a progress bar."""
-    return 30 + 2 * len(trajectory.stage_strengths) + 2 * _NODES
+    """Return about how often `measure` renders its views, for a progress bar."""
+    return 30 + 2 * len(trajectory.stage_strengths) + 2 * _RECORDING_SAMPLES
 
 
 def clip_curve(
     evaluator: Evaluator, views: Sequence[View], field: BakedField, texts: TextOptions
 ) -> Direction:
-    """CLIP directional similarity of the whole held-out views, or the reason why it is not measured.
+    """Measure the CLIP directional similarity of the whole held-out views, or return the reason why not.
 
     Args:
         evaluator: held-out views
-        views: the same, whole
-        field: what the slider shows
+        views: the same views, uncropped
+        field: the field of the slider
         texts: see `TextOptions`
     """
     for text, option in ((texts.text_before, "--text-before"), (texts.text_after, "--text-after")):
@@ -216,17 +216,17 @@ def clip_curve(
     if bool(same_features(before, after)):
         return Direction(reason="--text-before and --text-after say the same to CLIP")
     original = clip.pictures([view.image for view in views])
-    course = [
+    similarity = [
         _mean(direction(original, _clip_features(clip, evaluator, views, field.offsets(s)), before, after))
         if s
         else None
         for s in CLIP_STRENGTHS
     ]
-    return Direction(CLIP_STRENGTHS, tuple(course), clip.name)
+    return Direction(CLIP_STRENGTHS, tuple(similarity), clip.name)
 
 
 def figures(measured: Measured, endpoint_error: float, outside_change: float) -> dict[str, Any]:
-    """The part of report.json that depends on the field (see docs of the command line)."""
+    """Return the part of report.json that depends on the field (docs/cli.md)."""
     fitted = measured.fitted
     slider = measured.slider
     drawn = measured.editor["slider"]
@@ -257,22 +257,22 @@ def figures(measured: Measured, endpoint_error: float, outside_change: float) ->
         },
         "edit": {
             "psnr_to_views": round(drawn.psnr[-1], 2),
-            "ssim_to_views": _four(drawn.ssim[-1]),
-            "lpips_to_views": _four(drawn.lpips[-1]),
+            "ssim_to_views": _round4(drawn.ssim[-1]),
+            "lpips_to_views": _round4(drawn.lpips[-1]),
             "perceptual": measured.perceptual,
             "clip_direction": similarity[-1] if similarity else None,
             **({"clip_model": measured.clip.model} if similarity else {"clip_reason": measured.clip.reason}),
         },
         "curves": {
             "against_trajectory": {
-                "s": [_four(measured.remap.at(s)) for s in sample_strengths()],
+                "s": [_round4(measured.remap.at(s)) for s in sample_strengths()],
                 "slider": [round(psnr, 2) for psnr in fitted.chosen.curve],
                 COMPARED: [round(psnr, 2) for psnr in fitted.baselines[COMPARED].curve],
             },
             "against_editor": {name: found.to_json() for name, found in measured.editor.items()},
             "change": {
-                "from_original": [_four(distance) for distance in slider.distances],
-                "per_step": [_four(step) for step in slider.steps],
+                "from_original": [_round4(distance) for distance in slider.distances],
+                "per_step": [_round4(step) for step in slider.steps],
             },
             "clip_direction": {"s": measured.clip.s, "similarity": similarity} if similarity else None,
         },
@@ -280,7 +280,7 @@ def figures(measured: Measured, endpoint_error: float, outside_change: float) ->
 
 
 def _clip_features(clip: Clip, evaluator: Evaluator, views: Sequence[View], offsets: Tensor) -> Tensor:
-    """CLIP's features of the whole views with these offsets. [n,D]"""
+    """Compute CLIP features of the whole views with these offsets. [n,D]"""
     pictures = []
     for view, scene, picture in zip(views, evaluator.crops, evaluator.pictures(offsets), strict=True):
         x0, y0, x1, y1 = scene.box
@@ -292,37 +292,37 @@ def _clip_features(clip: Clip, evaluator: Evaluator, views: Sequence[View], offs
 
 def _mean(values: Sequence[float | None]) -> float | None:
     known = [value for value in values if value is not None]
-    return _four(sum(known) / len(known)) if known else None
+    return _round4(sum(known) / len(known)) if known else None
 
 
-def _four(value: float) -> float:
+def _round4(value: float) -> float:
     return round(value, 4)
 
 
 @dataclass(frozen=True)
 class PaintTaken:
-    """How much of what was painted on pictures is in the edit."""
+    """Share of the painting on pictures that the edit reproduces."""
 
-    reached: float  # share of the painted change's energy, 0..1
-    missing: float  # what of it is not there, of color, root of the mean square over the painted pixels
-    pixels: int  # that were painted
-    members: int  # that mostly show in these
-    removes: bool  # whether most of the change's energy shows what lies behind the members
+    reached: float  # reproduced share of the painted change's energy, 0 to 1
+    missing: float  # RMS color difference between painting and edit over the painted pixels
+    pixels: int  # number of painted pixels
+    members: int  # number of members visible mostly in these pixels
+    removes: bool  # True if most of the change's energy shows the scene behind the members
 
     @property
     def share(self) -> str:
-        """How much it is, in a line."""
+        """One-line summary of the reproduced share."""
         return f"{100 * self.reached:.0f} % of what was painted is in the edit"
 
     @property
     def warning(self) -> str:
-        """One line that says how little it is, and why; "" where it does not show, and nothing was removed.
+        """One-line warning with the share and the reasons; "" if no loss is visible and nothing was removed.
 
-        What is missing shows where it is as strong as a change that would be told from none, or, of a
-        fainter one, the larger part of it.
+        A loss is visible if it is as strong as the smallest detectable change, or larger than half of a
+        fainter change.
         """
-        shows = self.missing > _ALIKE or self.reached < 0.5
-        if not self.pixels or not (shows or self.removes):
+        is_visible = self.missing > _PAINT_DIFFERENCE or self.reached < 0.5
+        if not self.pixels or not (is_visible or self.removes):
             return ""
         reasons = []
         if self.removes:
@@ -330,27 +330,27 @@ class PaintTaken:
                 "the painting covers things with what lies behind them: nothing is removed by painting "
                 "(--removal always takes it away)"
             )
-        if shows and self.members < self.pixels:
-            stand = f"{format_count(self.members)} stand for {group_digits(self.pixels)} painted pixels"
-            reasons.append(f"{stand}; the detail is finer than they are")
+        if is_visible and self.members < self.pixels:
+            counts = f"{format_count(self.members)} stand for {group_digits(self.pixels)} painted pixels"
+            reasons.append(f"{counts}; the detail is finer than they are")
         return f"{self.share}: {'; '.join(reasons)}" if reasons else self.share
 
     def figures(self) -> dict[str, Any]:
-        """What report.json says of it."""
-        rounded = {"reached": _four(self.reached), "missing": _four(self.missing)}
+        """Return the figures for report.json."""
+        rounded = {"reached": _round4(self.reached), "missing": _round4(self.missing)}
         return {**asdict(self), **rounded, "warning": self.warning}
 
 
 def measure_paint(
     setup: TrainingSetup, painted: Sequence[Tensor], backgrounds: Sequence[Tensor], edited: Gaussians
 ) -> PaintTaken:
-    """Compare the edit with the pictures that it was made of.
+    """Compare the edit with the painted pictures that it was made from.
 
     Args:
         setup: scene, region, and the pictures' views
-        painted: the views as they were painted. [H,W,3] each
-        backgrounds: what shows through the scene in each picture, rgb. [3] each
-        edited: the scene with the edit, rows that it adds last
+        painted: painted pictures of the views. [H,W,3] each
+        backgrounds: background color of each picture, rgb. [3] each
+        edited: the scene with the edit; added rows come last
     """
     scene = setup.scene
     members = setup.region.members
@@ -360,33 +360,37 @@ def measure_paint(
     weights = torch.zeros(len(scene), 2, dtype=torch.float64)
     for view, target, background in zip(setup.train, painted, backgrounds, strict=True):
         energy = (target - view.image).square().sum(dim=2)
-        # a JPEG is off by a little all over: elsewhere only what is painted for certain
-        least = torch.where(view.mask > 0.5, _ROUNDED, _ALIKE)
-        changed = (target - view.image).abs().amax(dim=2) > least
-        made = render_view(edited, view.camera, setup.background).clamp(0.0, 1.0)
+        # JPEG changes every pixel a little, so outside the region only clearly painted pixels count
+        min_difference = torch.where(view.mask > 0.5, _ROUNDING_DIFFERENCE, _PAINT_DIFFERENCE)
+        changed = (target - view.image).abs().amax(dim=2) > min_difference
+        rendered = render_view(edited, view.camera, setup.background).clamp(0.0, 1.0)
         change += float(energy[changed].sum())
-        missing += float((target - made)[changed].square().sum())
+        missing += float((target - rendered)[changed].square().sum())
         behind += float(energy[changed & _shows_behind(scene, without, view, target, background)].sum())
         pixels += int(changed.sum())
         weights += alpha_weights(scene, view.camera, changed)[:, (0, 2)]
     inside, weight = weights[members].unbind(1)
-    visible = int((inside > 0.5 * weight).sum()) + len(edited) - len(scene)
-    strength = (missing / max(1, 3 * pixels)) ** 0.5
+    visible_count = int((inside > 0.5 * weight).sum()) + len(edited) - len(scene)
+    rms = (missing / max(1, 3 * pixels)) ** 0.5
     reached = max(0.0, 1.0 - missing / max(change, 1e-12))
-    return PaintTaken(reached, strength, pixels, visible, behind > 0.5 * change)
+    return PaintTaken(reached, rms, pixels, visible_count, behind > 0.5 * change)
 
 
 def _shows_behind(
     scene: Gaussians, without: Gaussians, view: View, target: Tensor, background: Tensor
 ) -> Tensor:
-    """Where a picture shows what lies behind the members, or its background in one piece with where nothing
-    else was: what the members hid was painted away with them. [H,W] bool"""
-    original, gone = (render_view(some, view.camera, background).clamp(0, 1) for some in (scene, without))
+    """Return the pixels in which a picture shows the scene behind the members. [H,W] bool
+
+    Background pixels count only if they are connected to pixels that were background before.
+    """
+    original, removed = (render_view(some, view.camera, background).clamp(0, 1) for some in (scene, without))
     picture = target + original - view.image  # over its own background
-    bare = (picture - background).abs().amax(dim=2) < _ALIKE
+    bare = (picture - background).abs().amax(dim=2) < _PAINT_DIFFERENCE
     clear = render(scene, view.camera, (0.0, 0.0, 0.0)).transmittance > 0.5
-    # a soft rim is a pixel wide on either side
+    # a soft boundary is a pixel wide on either side
     pieces, count = ndimage.label(ndimage.binary_dilation(bare.numpy(), np.ones((3, 3))))
     open_ = np.zeros(count + 1, dtype=bool)
     open_[pieces[(bare & clear).numpy()]] = True
-    return bare & torch.from_numpy(open_[pieces]) | ((picture - gone).abs().amax(dim=2) < _ALIKE)
+    return bare & torch.from_numpy(open_[pieces]) | (
+        (picture - removed).abs().amax(dim=2) < _PAINT_DIFFERENCE
+    )

@@ -17,37 +17,37 @@ INK = (38, 36, 34)
 PALE = (118, 113, 107)
 GRID = (228, 225, 219)
 LINES = ((34, 84, 180), (214, 96, 36), (60, 150, 90), (150, 70, 160), (196, 158, 28), (70, 160, 180))
-_DASHES = ("-", "--", ":")  # of lines beyond as many as there are colors
+_DASHES = ("-", "--", ":")  # the next style is used after each pass through the colors
 
 _DPI = 100
-# pixels around the axes; a legend's line is below
+# margins around the axes and height of one legend line, pixels
 _LEFT = 56
 _RIGHT = 16
 _TOP = 30
 _BOTTOM = 44
 _LEGEND = 20
-_MARKED = 20  # lines of at most so many points show them
-_DECADES = 4  # a logarithmic axis shows no more of any line, the least values lie below its floor
+_MAX_MARKERS = 20  # lines with more points have no markers
+_MAX_DECADES = 4  # a logarithmic axis shows at most this much of any line and cuts off lower values
 
 Points = tuple[Sequence[float], Sequence[float]]
-"""xs and ys; what is not finite is left out."""
+"""x and y values; points with non-finite y are left out."""
 
 
 @dataclass(frozen=True)
 class Plot:
     """Curves over one axis."""
 
-    title: str  # what is shown, with its unit
+    title: str  # quantity and unit
     lines: Mapping[str, Points]  # name → points, in the order of the colors
     across: str = ""  # name of the axis below, "" for none
-    # of the axis at the left; "log" needs values above 0, others are left out
+    # scale of the left axis; "log" leaves out values of 0 and below
     scale: Literal["linear", "log"] = "linear"
-    low: float | None = None  # what the axis at the left shows at least; None is as the values are
-    span: tuple[float, float] | None = None  # what the axis below shows at least
+    low: float | None = None  # value that the left axis includes; None fits the values
+    span: tuple[float, float] | None = None  # range that the axis below includes
 
 
 def draw_plot(plot: Plot, width: int, height: int) -> Image.Image:
-    """The plot as a picture. `width` × `height` in pixels, at least 200 × 150."""
+    """Draw the plot as a picture. `width` × `height` in pixels, at least 200 × 150."""
     paper, ink, pale, grid = (_shade(color) for color in (PAPER, INK, PALE, GRID))
     figure = Figure((width / _DPI, height / _DPI), _DPI, facecolor=paper)
     axes = figure.add_subplot(facecolor=paper)
@@ -64,7 +64,7 @@ def draw_plot(plot: Plot, width: int, height: int) -> Image.Image:
     for i, (name, (xs, ys)) in enumerate(lines.items()):
         color = _shade(LINES[i % len(LINES)])
         dash = _DASHES[i // len(LINES) % len(_DASHES)]
-        marker = "o" if len(xs) <= _MARKED else ""
+        marker = "o" if len(xs) <= _MAX_MARKERS else ""
         axes.plot(xs, ys, dash, color=color, linewidth=1.5, marker=marker, markersize=3.5, label=name)
     if all(float(x).is_integer() for xs, _ in lines.values() for x in xs):
         axes.locator_params("x", integer=True)
@@ -73,8 +73,8 @@ def draw_plot(plot: Plot, width: int, height: int) -> Image.Image:
     if plot.scale == "log":
         lowest = min(max(ys) for _, ys in lines.values())
         axes.set_yscale("log")
-        axes.set_ylim(bottom=max(axes.get_ylim()[0], lowest * 10.0**-_DECADES))
-    # the axes show at least this: points that nobody sees stretch them
+        axes.set_ylim(bottom=max(axes.get_ylim()[0], lowest * 10.0**-_MAX_DECADES))
+    # invisible points extend the axes to the required range
     axes.update_datalim([(x, 0.0) for x in plot.span or ()], updatey=False)
     axes.update_datalim([] if plot.low is None else [(0.0, plot.low)], updatex=False)
     if plot.scale == "linear":

@@ -1,4 +1,4 @@
-"""report.png: what a run reached, to look at; its figures come from `measures`."""
+"""The picture report.png of a run; its figures come from `measures`."""
 
 from __future__ import annotations
 
@@ -18,30 +18,31 @@ from trainer.report.measures import COMPARED, Direction, Measured
 
 from .plots import PAPER, Plot, Points, draw_plot
 
-SHOWN = (0.0, 0.25, 0.5, 0.75, 1.0)
+SHOWN = (0.0, 0.25, 0.5, 0.75, 1.0)  # slider values of the columns
 
 Columns = Sequence[tuple[float, float | None]]
-"""Slider value of each picture, and the strength at which the editor was asked there; None: it was not."""
+"""Slider value of each picture and the strength of the editor's picture there; None without one."""
 
-_CLOSE = 1 / 16  # a picture is shown where the editor was asked if that is so near
-_SPAN = (0.0, 1.0)
-_THUMBNAIL = 240
-_PLOT_HEIGHT = 270
+_SNAP_DISTANCE = 1 / 16  # a column moves to an editor picture within this distance on the slider
+_SPAN = (0.0, 1.0)  # range of the slider axis
+_THUMBNAIL_WIDTH = 240  # pixels
+_PLOT_HEIGHT = 270  # pixels
 _TERMS = {"left": "L1 to the finished edit", "l1": "L1", "perceptual": "LPIPS"}
 
 
 def report_picture(
     evaluator: Evaluator, shown: Evaluator, measured: Measured, losses: Losses, title: str, held_out: int
 ) -> Tensor:
-    """Thumbnails over curves: ours, the editor's own and two keyframes at five strengths; then the errors.
+    """Draw thumbnails of the slider, the editor and two keyframes at five strengths, above plots of the
+    errors.
 
     Args:
-        evaluator: the views that judge; the one that shows most of the region is shown
+        evaluator: the evaluated views; the one that shows most of the region is drawn
         shown: the same with the Gaussians that the edit adds
         measured: see `Measured`
         losses: mean of every loss term per recording
         title: one line
-        held_out: how many of these views training did not see
+        held_out: number of held-out views among the evaluated ones
     """
     chosen = measured.shown
     linear = measured.fitted.baselines[COMPARED].field
@@ -64,42 +65,44 @@ def report_picture(
 
 
 def view_caption(evaluator: Evaluator, held_out: int) -> str:
-    """Which view is shown, in words: the best one, and whether all figures are of it alone.
+    """Return a caption that names the best view and states if all figures are of one view.
 
     Args:
-        evaluator: the views that judge
-        held_out: how many of them training did not see
+        evaluator: the evaluated views
+        held_out: number of held-out views among them
     """
     kind = ("view trained on,", "all figures are of one held-out view,", "held-out view")[min(held_out, 2)]
     return f"{kind} {evaluator.names[best_view(evaluator)]}"
 
 
 def best_view(evaluator: Evaluator) -> int:
-    """The view that shows most of the region."""
+    """Return the index of the view that shows most of the region."""
     return max(range(len(evaluator.pixels)), key=lambda i: int(evaluator.pixels[i].sum()))
 
 
 def columns_of(stages: Sequence[tuple[float, float]]) -> Columns:
-    """Five slider values to show: `SHOWN`, or close by where the editor was asked.
+    """Choose five slider values to draw: `SHOWN`, each moved to a close editor picture.
 
     Args:
-        stages: slider value and the strength that the editor was asked at, ascending, the last (1, 1)
+        stages: slider value and strength of the editor's pictures, ascending, the last (1, 1)
     """
     columns: list[tuple[float, float | None]] = [(0.0, 0.0)]
     for s in SHOWN[1:]:
         at, strength = min(stages, key=lambda pair: abs(pair[0] - s))
-        columns.append((at, strength) if abs(at - s) <= _CLOSE else (s, None))
+        columns.append((at, strength) if abs(at - s) <= _SNAP_DISTANCE else (s, None))
     return columns
 
 
-def strip(evaluator: Evaluator, field: BakedField, columns: Columns, width: int = _THUMBNAIL) -> list[Tensor]:
-    """The best view at five strengths, as thumbnails of one size."""
+def strip(
+    evaluator: Evaluator, field: BakedField, columns: Columns, width: int = _THUMBNAIL_WIDTH
+) -> list[Tensor]:
+    """Draw the best view at the columns' slider values, as thumbnails of one size."""
     best = best_view(evaluator)
     return [thumbnail(evaluator.picture(field.offsets(s), best), width) for s, _ in columns]
 
 
-def editor_strip(evaluator: Evaluator, columns: Columns, width: int = _THUMBNAIL) -> list[Tensor]:
-    """What the editor makes of the best view; gray where it was not asked."""
+def editor_strip(evaluator: Evaluator, columns: Columns, width: int = _THUMBNAIL_WIDTH) -> list[Tensor]:
+    """Draw the editor's pictures of the best view; gray in columns without one."""
     best = best_view(evaluator)
     blank = torch.full((*evaluator.crops[best].size, 3), 0.94)
     original = evaluator.crops[best].original.clamp(0, 1)
@@ -108,7 +111,7 @@ def editor_strip(evaluator: Evaluator, columns: Columns, width: int = _THUMBNAIL
 
 
 def thumbnail(image: Tensor, width: int) -> Tensor:
-    """Scaled to a width, or less where that would make it tall, on paper. [H,W,3] -> [h,width,3]"""
+    """Scale an image to a width, or less if it is tall, on a paper background. [H,W,3] -> [h,width,3]"""
     picture = to_picture(image)
     scale = min(width / picture.width, 1.25 * width / picture.height)
     size = (max(1, round(picture.width * scale)), max(1, round(picture.height * scale)))
@@ -118,7 +121,7 @@ def thumbnail(image: Tensor, width: int) -> Tensor:
 
 
 def _error_plots(measured: Measured) -> list[Plot]:
-    """Of all fields that were measured against what was recorded; of two against the editor."""
+    """Plot errors of all measured fields against the recording, and of two fields against the editor."""
     fitted = measured.fitted
     s = [measured.remap.at(s) for s in sample_strengths()]
     fields = {fitted.chosen.field.kind: fitted.chosen, **fitted.baselines}
@@ -155,14 +158,14 @@ def _uniformity_plots(measured: Measured, losses: Losses) -> list[Plot]:
 
 
 def _training(losses: Losses, perceptual: str) -> Plot:
-    """Every term over the steps that paid for it, weighted as it was."""
+    """Plot every loss term, as weighted, over the steps in which it was part of the loss."""
     names = {**_TERMS, "perceptual": "LPIPS" if perceptual.startswith("lpips") else "gradient L1"}
     lines: dict[str, Points] = {}
     for term, column in losses.items():
         rows = zip(losses["step"], column, strict=True)
-        paid = [(step, value) for step, value in rows if step is not None and value is not None]
+        points = [(step, value) for step, value in rows if step is not None and value is not None]
         if term != "step":
-            lines[names.get(term, term)] = ([step for step, _ in paid], [value for _, value in paid])
+            lines[names.get(term, term)] = ([step for step, _ in points], [value for _, value in points])
     return Plot("loss terms as weighted", lines, "steps", "log")
 
 
@@ -173,7 +176,7 @@ def _clip(direction: Direction) -> Plot:
 
 
 def column_heading(s: float, strength: float | None) -> str:
-    """What stands above a column; the editor's strength where it is another number."""
+    """Return the heading of a column, with the editor's strength if it differs from the slider value."""
     suffix = "" if strength is None or abs(strength - s) < 5e-3 else f", editor {strength:.2g}"
     return f"s = {round(s, 2):g}{suffix}"
 
@@ -183,17 +186,17 @@ def _label(name: str) -> str:
 
 
 def even(count: int) -> list[float]:
-    """So many slider values from end to end."""
+    """Return `count` evenly spaced slider values from 0 to 1."""
     return [i / max(1, count - 1) for i in range(count)]
 
 
 def middles(count: int) -> list[float]:
-    """Slider values in the middle of so many steps."""
+    """Return the centers of `count` equal slider steps."""
     return [(i + 0.5) / count for i in range(count)]
 
 
 def stack_plots(sheet: Image.Image, rows: Sequence[Sequence[Plot]]) -> Tensor:
-    """The sheet with rows of plots below it. -> [H,W,3]"""
+    """Draw rows of plots below a sheet. -> [H,W,3]"""
     page = Image.new("RGB", (sheet.width, sheet.height + len(rows) * _PLOT_HEIGHT), PAPER)
     page.paste(sheet, (0, 0))
     for i, plots in enumerate(rows):
