@@ -179,10 +179,10 @@ class App:
         )
         frame = self.main_view.frames
         now = time.perf_counter()
-        before, told_at = self._failures.get(where, (-2, 0.0))
-        goes_on = frame - before <= 1 and now - told_at < SAY_AGAIN_S
-        self._failures[where] = frame, told_at if goes_on else now
-        if goes_on:
+        before, shown_at = self._failures.get(where, (-2, 0.0))
+        repeats = frame - before <= 1 and now - shown_at < SAY_AGAIN_S
+        self._failures[where] = frame, shown_at if repeats else now
+        if repeats:
             return  # an error that repeats in every frame requests no further frame
         line = error_line(error)
         details = ""
@@ -190,8 +190,8 @@ class App:
             details = error_details(error)
             if before < 0:
                 log_error(details)
-            what = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-            line = f"Internal error ({what[:200]}); {self.file_actions.keep_work()}"
+            summary = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+            line = f"Internal error ({summary[:200]}); {self.file_actions.keep_work()}"
         self.main_view.show_message(line, True, details)
 
     @contextmanager

@@ -1,8 +1,7 @@
 """Dialogs over the picture: where to save, which file to open, how to handle unsaved changes.
 
-All dialogs work by keys: Enter presses the marked button, Escape changes nothing. The save dialog stays until
-the
-file is saved; then the file actions close it.
+All dialogs work by keys: Enter presses the marked button, Escape changes nothing. The save dialog stays open
+until the file is saved; then the file actions close it.
 """
 
 from __future__ import annotations
@@ -279,9 +278,8 @@ def _buttons(names: Sequence[str], ui: UiContext) -> str | None:
 PROGRAMS = ("zenity", "kdialog", "qarma", "matedialog")
 """Programs that show a file dialog on Linux; one is enough.
 
-Without one the dialog library answers as if the user had canceled, so it is looked for here. The path field
-is
-always available.
+Without one, the dialog library answers as if the user had canceled, so this module checks for them. The path
+field is always available.
 """
 
 POLL_S = 0.05

@@ -1,5 +1,4 @@
-"""File actions of the window: open and dropped files by their content, the session, its autosave, recent
-files.
+"""File actions of the window: opening by content, the session, its autosave, recent files.
 
 Every failure becomes one line in the window, and the work stays unchanged.
 """
@@ -70,8 +69,8 @@ def edit_picture(main_view: MainView, path: Path) -> None:
 
 
 def _take_camera(main_view: MainView, camera: Camera) -> None:
-    seen = from_camera(main_view.work.view.camera, camera, main_view.facts.bounds)
-    main_view.work = with_camera(main_view.work, seen)
+    view_camera = from_camera(main_view.work.view.camera, camera, main_view.facts.bounds)
+    main_view.work = with_camera(main_view.work, view_camera)
 
 
 def keep_camera(app: Application, session: Path | None) -> None:
@@ -194,8 +193,8 @@ class EditActions:
         """Open one more edit and return its index."""
         document = self._app.document
         renamed = replace(gdf, name=document.free_name(gdf.name))
-        known = path is not None and len(document.gdf_paths) == len(document.edits)
-        paths = (*document.gdf_paths, path) if known and path is not None else ()
+        has_paths = path is not None and len(document.gdf_paths) == len(document.edits)
+        paths = (*document.gdf_paths, path) if has_paths and path is not None else ()
         self._app.show(replace(document, edits=(*document.edits, renamed), gdf_paths=paths))
         return len(document.edits)
 
@@ -230,8 +229,7 @@ class FileActions:
 
         `save:THEN` and `save_as:THEN` request THEN afterwards. `save_to`, `overwrite`, `open_file`,
         `restore_autosave` and `discard_autosave` name a file. `duplicate` and `replace` take a layer's index,
-        or use the
-        focused layer. `browse` shows the system file dialog next to the open dialog.
+        or use the focused layer. `browse` shows the system file dialog next to the open dialog.
         """
         ask = self._app.main_view.ask
         edits = self._edits
@@ -284,8 +282,7 @@ class FileActions:
         """Open a file according to its content.
 
         Scenes and sessions replace everything, an edit becomes the top layer, a camera moves the view, and an
-        edited
-        picture goes into the form of a new edit.
+        edited picture goes into the form of a new edit.
         """
 
         def open_kind() -> None:

@@ -48,16 +48,16 @@ class Gizmo:
         moved = np.linalg.inv(place) @ np.array(model.values, np.float64).reshape(4, 4).T
         using = bool(im_guizmo.is_using())
         matrix = moved if using or self.using else self.matrix
-        asked = "place" if self.using and not using else _buttons(self, pointer)
-        return replace(self, matrix=matrix, using=using), asked
+        request = "place" if self.using and not using else _buttons(self, pointer)
+        return replace(self, matrix=matrix, using=using), request
 
     @property
     def step(self) -> tuple[list[float], list[float], float]:
         """Translation, rotation (axis times radians) and scale of the selection."""
         linear = self.matrix[:3, :3]
-        grown = max(abs(float(np.linalg.det(linear))) ** (1 / 3), 1e-6)
-        turn = Rotation.from_matrix(linear / grown).as_rotvec()
-        return self.matrix[:3, 3].tolist(), turn.tolist(), grown
+        scale = max(abs(float(np.linalg.det(linear))) ** (1 / 3), 1e-6)
+        rotation = Rotation.from_matrix(linear / scale).as_rotvec()
+        return self.matrix[:3, 3].tolist(), rotation.tolist(), scale
 
     @property
     def is_moved(self) -> bool:
@@ -94,6 +94,6 @@ def _buttons(gizmo: Gizmo, pointer: PointerContext) -> str:
         imgui.align_text_to_frame_padding()
         imgui.text("Copy" if gizmo.does == "duplicate" else "Move")
         imgui.same_line()
-        asked = "keep_placed" if accent_button("Keep", (72.0 * scale, 0.0)) else ""
+        request = "keep_placed" if accent_button("Keep", (72.0 * scale, 0.0)) else ""
         imgui.same_line()
-        return "put_back" if imgui.button("Cancel", (72.0 * scale, 0.0)) else asked
+        return "put_back" if imgui.button("Cancel", (72.0 * scale, 0.0)) else request

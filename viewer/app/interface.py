@@ -74,18 +74,18 @@ def topics() -> tuple[Topic, ...]:
 def _lines(commands: Sequence[Command]) -> Iterator[tuple[str, str]]:
     """Yield the keys and text of each row. A key with Shift next to the same plain key is only named in the
     text."""
-    shown = False  # the row before this one includes the command
+    is_joined = False  # the row before this one includes the command
     for command, following in zip_longest(commands, commands[1:]):
         keys = chords(command.action)
         joins = following is not None and following.row == JOINED
         changed = is_changed(command) or (joins and is_changed(following))
         if joins and not changed:
             keys += tuple(k for k in chords(following.action) if k.replace("Shift+", "") not in keys)
-        if keys and not shown:
+        if keys and not is_joined:
             plain = changed or command.row == JOINED
             listed, text = ("", "") if plain else (command.listed, command.row)
             yield listed or ", ".join(keys), text or command.name
-        shown = joins and not changed
+        is_joined = joins and not changed
 
 
 def columns(topics: Sequence[Topic], count: int) -> list[list[Topic]]:
@@ -137,9 +137,9 @@ def draw_lists(
     if work.palette is None:
         return work
     numbered = [f"{name}:{i}" for name in ("focus", "toggle") for i in range(len(work.view.layers) + 1, 10)]
-    there = [action for action in offered if action not in numbered]
-    work, asked = draw_palette(work, there, pressed, pointer.ui, pointer.area)
-    return perform_actions(work, [asked] * bool(asked), pointer)
+    listed = [action for action in offered if action not in numbered]
+    work, requested = draw_palette(work, listed, pressed, pointer.ui, pointer.area)
+    return perform_actions(work, [requested] * bool(requested), pointer)
 
 
 PALETTE_PX = 460.0
@@ -162,7 +162,7 @@ def draw_palette(
     place = (area.width / 2, max(0.12 * area.height, 8.0 * ui.scale))
     imgui.set_next_window_pos(place, 0, (0.5, 0.0))
     imgui.set_next_window_size((wide, 0.0))
-    asked = ""
+    requested = ""
     at = work.palette or 0
     with menu("commands", ui, imgui.WindowFlags_.no_nav.value) as is_open:
         if not is_open:
@@ -179,17 +179,17 @@ def draw_palette(
             imgui.text_disabled("No command is called like that")
         for i, command in enumerate(found):
             if _command_row(command, i == at, ui):
-                asked = command.action
+                requested = command.action
             if i == at and (moved or fresh):
                 imgui.set_scroll_here_y(0.5)
         imgui.end_child()
         imgui.pop_style_var()
         if work.palette != -1 and "Enter" in pressed and found:
-            asked = found[at].action
-        closes = asked or (work.palette != -1 and "Escape" in pressed)
+            requested = found[at].action
+        closes = requested or (work.palette != -1 and "Escape" in pressed)
         if closes:
             imgui.close_current_popup()
-    return replace(work, query=query, palette=None if closes else at), asked
+    return replace(work, query=query, palette=None if closes else at), requested
 
 
 def _command_row(command: Command, chosen: bool, ui: UiContext) -> bool:
@@ -303,8 +303,8 @@ def draw_pill(
     free = wide - (0.0 if foot else tools.view_width(work.view, pointer.area, pointer.ui))
     middle = min((wide + tools.TOOLBAR_PX * scale) / 2, free - 85.0 * scale)  # half of its usual width
     place = (middle, foot + tools.EDGE_PX * scale)
-    work, asked = tools.draw_comparison(work, words, original, place, pointer.ui)
-    return work, [asked] * bool(asked)
+    work, requested = tools.draw_comparison(work, words, original, place, pointer.ui)
+    return work, [requested] * bool(requested)
 
 
 def over_picture(
@@ -372,11 +372,11 @@ def perform_actions(work: Workspace, actions: Sequence[str], pointer: PointerCon
         if action.partition(":")[0] in GLIDES and not work.layout.reduced_motion:
             work = workspace.glide_from(work, before.view.camera)
         elif action == "reduced_motion":
-            said = f"Reduced motion is {'on' if work.layout.reduced_motion else 'off'}"
-            work = workspace.with_message(work, said, pointer.now)
+            text = f"Reduced motion is {'on' if work.layout.reduced_motion else 'off'}"
+            work = workspace.with_message(work, text, pointer.now)
         elif action == "compare_snapshots" and not work.snapshots:
-            said = f"There is no snapshot to compare; {shortcut('snapshot')} adds one"
-            work = workspace.with_message(work, said, pointer.now)
+            text = f"There is no snapshot to compare; {shortcut('snapshot')} adds one"
+            work = workspace.with_message(work, text, pointer.now)
         elif action in _UNDOES and work.past is not before.past:
             did, describe = _UNDOES[action]
             work = workspace.with_message(
@@ -405,7 +405,7 @@ def draw_history(work: Workspace, ui: UiContext) -> tuple[Workspace, list[str]]:
         imgui.open_popup("history")
     display = imgui.get_io().display_size
     row = imgui.get_text_line_height_with_spacing()
-    asked = list[str]()
+    requests = list[str]()
     at = (display.x - 12.0 * ui.scale, display.y - 44.0 * ui.scale)
     imgui.set_next_window_pos(at, 0, (1.0, 1.0))
     with menu("history", ui) as is_open:
@@ -420,10 +420,10 @@ def draw_history(work: Workspace, ui: UiContext) -> tuple[Workspace, list[str]]:
             clipper.include_item_by_index(now)
             while clipper.step():
                 for i in range(clipper.display_start, clipper.display_end):
-                    asked += [f"go_to:{i}"] * _history_row(work.past, i, ui)
+                    requests += [f"go_to:{i}"] * _history_row(work.past, i, ui)
         if is_open:
             imgui.end_child()
-    return replace(work, history=False if is_open else None), asked
+    return replace(work, history=False if is_open else None), requests
 
 
 def _history_row(past: history.History, index: int, ui: UiContext) -> bool:

@@ -1,8 +1,7 @@
 """Main view of a window: input → workspace → picture → screen. Uses imgui and GL, but no windowing system.
 
 The window (app.py) and the tests fill imgui's io and call `frame`, so scripted input takes the same path as
-real
-input.
+real input.
 """
 
 from __future__ import annotations
@@ -212,9 +211,8 @@ class MainView:
     def is_due(self) -> bool:
         """Return True if a frame would show anything new.
 
-        A frame that could only poll an unfinished picture does not count: where the processor also draws the
-        window,
-        it would slow that picture down.
+        A frame that could only poll an unfinished picture does not count. With a software renderer it would
+        slow that picture down.
         """
         return self.next_frame_delay() == 0.0 or not self.canvas.awaits_picture()
 

@@ -61,11 +61,11 @@ def _knob(x: float, y: float, held: bool, ui: UiContext) -> None:
     ink = u32(PALETTE.accent if held else PALETTE.handle)
     canvas.add_circle_filled((x, y), 12.0 * s, u32(PALETTE.scrim))
     canvas.add_circle((x, y), 12.0 * s, ink, 0, 1.5 * s)
-    for way in (-1.0, 1.0):
+    for side in (-1.0, 1.0):
         canvas.add_triangle_filled(
-            (x + way * 7.5 * s, y),
-            (x + way * 3.0 * s, y - way * 4.0 * s),
-            (x + way * 3.0 * s, y + way * 4.0 * s),
+            (x + side * 7.5 * s, y),
+            (x + side * 3.0 * s, y - side * 4.0 * s),
+            (x + side * 3.0 * s, y + side * 4.0 * s),
             ink,
         )
 
@@ -125,11 +125,11 @@ def point_by_keys(
         at = at or (area.width / 2, area.height / 2)
         if command.action == "point_press" and press.again:
             continue
-        if way := command.action.partition(":")[2]:
-            x, y = (a + float(step) * pointer.ui.scale for a, step in zip(at, way.split(","), strict=True))
+        if steps := command.action.partition(":")[2]:
+            x, y = (a + float(step) * pointer.ui.scale for a, step in zip(at, steps.split(","), strict=True))
             at = round(min(max(x, 0.0), area.width - 1.0)), round(min(max(y, 0.0), area.height - 1.0))
         io.add_mouse_pos_event(*at)
-        if not way:
+        if not steps:
             for pressed in (True, False) if clicks else (not down,):
                 io.add_mouse_button_event(0, pressed)
             down = not (clicks or down)
@@ -196,8 +196,7 @@ def cancel_drag(tool: MouseTool, work: Workspace) -> Workspace:
     """Restore the state from before the drag.
 
     Edits come back from the undo history. Settings of the tools and the divider are no edits and come back
-    from
-    `tool`.
+    from `tool`.
     """
     work = workspace.cancel_drag(work)
     if tool.settings is not None:
@@ -275,8 +274,8 @@ def _paint(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[M
 
 def _has_traveled(ui: UiContext) -> bool:
     """Return True if the left button moved further than `CLICK_PX` since its press."""
-    way = imgui.get_mouse_drag_delta(0, CLICK_PX * ui.scale)
-    return bool(way.x or way.y)
+    delta = imgui.get_mouse_drag_delta(0, CLICK_PX * ui.scale)
+    return bool(delta.x or delta.y)
 
 
 def _look_along(work: Workspace, axis: str) -> Workspace:

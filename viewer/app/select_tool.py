@@ -224,11 +224,11 @@ def click(work: Workspace, pointer: PointerContext) -> tuple[Click, Workspace]:
     """Select similar Gaussians at a click of the left button over the picture."""
     tool = work.view.select
     before = work.view.selection.members
-    made = Click(
+    new_click = Click(
         tool.tool, mode(tool.mode), before, pointer.cursor, pointer.surface, (0.0, False), before, before
     )
-    made, work = _click(made, work, pointer)
-    return replace(made, recorded=made.after), work
+    new_click, work = _click(new_click, work, pointer)
+    return replace(new_click, recorded=new_click.after), work
 
 
 def adjust(click: Click | None, work: Workspace, pointer: PointerContext) -> tuple[Click | None, Workspace]:
