@@ -1,7 +1,7 @@
 // The turntable camera of viewer/camera/view_camera.py and controls.py: { pivot, distance, azimuth, elevation, fov_y, up }.
 
 const DEGREES_PER_PIXEL = 0.3;
-const CLOSEST = 1e-4, WIDEST = 1e4;  // of the scene's radius
+const CLOSEST = 1e-4, WIDEST = 1e4;  // distances, as a factor of the scene's radius
 const FARTHEST = 1e9;
 const radians = (degrees) => (degrees * Math.PI) / 180;
 export const wrap = (degrees) => ((((degrees + 180) % 360) + 360) % 360) - 180;
@@ -21,7 +21,7 @@ function front(up) {
   return unit(addScaled(facing, [-dot(facing, up), up]), [1, 0, 0]);
 }
 
-// Unit vectors of the picture in the world: right, up, and back (from the pivot to the eye).
+// Unit vectors of the picture in world space: right, up, and back (from the pivot to the eye).
 export function axes(camera) {
   const up = unit(camera.up, [0, 1, 0]), ahead = front(up), side = cross(up, ahead);
   const azimuth = radians(camera.azimuth), elevation = radians(camera.elevation);
@@ -36,8 +36,8 @@ export function axes(camera) {
 
 export const eyeOf = (camera) => addScaled(camera.pivot, [camera.distance, axes(camera).back]);
 
-// The pinhole of a picture [width, height] whose middle part `view` { x, y, width, height } is what one looks at.
-// A part that is narrower than high shows as much across as a square would.
+// The pinhole camera of a picture [width, height] centered on its part `view` { x, y, width, height }.
+// A part narrower than high has the horizontal field of view of a square.
 export function pinhole(camera, width, height, view) {
   const picture = axes(camera), eye = eyeOf(camera);
   const side = Math.min(view.height, view.width);
@@ -61,7 +61,7 @@ export function orbit(camera, dx, dy) {
   return keepFinite({ ...camera, azimuth, elevation }, camera);
 }
 
-// What lies at the pivot's depth stays under the pointer; focal: px, as `pinhole` has it.
+// Points at the pivot's depth stay under the pointer; focal: px, from `pinhole`.
 export function pan(camera, dx, dy, focal) {
   const perPixel = camera.distance / focal, picture = axes(camera);
   const pivot = addScaled(camera.pivot, [-dx * perPixel, picture.right], [dy * perPixel, picture.up]);
@@ -71,7 +71,7 @@ export function pan(camera, dx, dy, focal) {
 export const zoom = (camera, factor, radius) =>
   keepFinite({ ...camera, distance: held(camera.distance * factor, radius) }, camera);
 
-// The same pivot and distance, seen along -back.
+// The camera with the same pivot and distance that looks along -back.
 export function lookAlong(camera, back) {
   const up = unit(camera.up, [0, 1, 0]), ahead = front(up), way = unit(back, axes(camera).back);
   const height = Math.min(Math.max(dot(way, up), -1), 1), level = addScaled(way, [-height, up]);
@@ -84,7 +84,7 @@ export function lookAlong(camera, back) {
   };
 }
 
-// The eye stays, the view turns to `point`, which becomes the pivot.
+// The camera with the same eye that looks at `point`, its new pivot.
 export function pivotOn(camera, point, radius) {
   const eye = eyeOf(camera), back = addScaled(eye, [-1, point]);
   return keepFinite({ ...lookAlong({ ...camera, pivot: point }, back), distance: held(Math.hypot(...back), radius) }, camera);

@@ -1,5 +1,5 @@
-// The scene under a stack of edits, members only: the numbers of progdf/compose/reference.py. Rows of the same
-// edits lie together, and are composed together: a segment.
+// The scene under a stack of edits, members only; same results as progdf/compose/reference.py. Rows of the same
+// edits are adjacent and composed together, as a segment.
 
 import { GradedColors, findSegment } from "./grade.js";
 
@@ -8,7 +8,7 @@ export const KINDS = {
   means: "geometry", log_scales: "geometry", quats: "geometry",
   logit_opacities: "opacity", sh0: "color", shN: "color",
 };
-const PARTNERS = { means: "logit_opacities", logit_opacities: "means" };  // share a texture
+const PARTNERS = { means: "logit_opacities", logit_opacities: "means" };  // attributes that share a texture
 const { fround } = Math;
 
 class Edit {
@@ -36,7 +36,7 @@ class Edit {
     };
   }
 
-  // What it adds to the numbers of an attribute from `first` on. `levels`: as many more, for its bases.
+  // Computes the edit's offsets for an attribute from `first` on. `levels`: scratch of the same size, for its bases.
   offsets(name, strength, first, out, levels) {
     const { stored, scale, coefficients } = this.attributes[name];
     const [right, share] = findSegment(this.knots, strength);
@@ -45,7 +45,7 @@ class Edit {
     stored.forEach((numbers, k) => {
       const a = share === 1 ? high[k] : fround(low[k] + fround(share) * (high[k] - low[k]));
       if (a === 0) return;
-      levels.set(numbers.subarray(first, first + out.length));  // one type for the loop, which is fast then
+      levels.set(numbers.subarray(first, first + out.length));  // a single type keeps the loop fast
       const factors = Float64Array.from(scale[k], (unit) => a * unit), width = factors.length;
       for (let j = 0; j < out.length;) for (let c = 0; c < width; c++, j++) out[j] += fround(factors[c] * levels[j]);
     });
@@ -71,7 +71,7 @@ export class Composer {
         this.after[each] = this.moving.has(each) ? numbers.slice() : numbers;
       }
     }
-    const known = this.edits.map(() => 0);  // members of the segments so far
+    const known = this.edits.map(() => 0);  // members of the previous segments
     let first = 0, most = 0;
     this.segments = header.segments.map(([rows, edits]) => {
       const names = [...this.moving].filter((name) => edits.some((edit) => this.edits[edit].attributes[name]));
@@ -88,8 +88,8 @@ export class Composer {
     this.blend = "";
   }
 
-  // Makes `after` the scene under layers { edit, strength, gains, weights, paint }, lowest first.
-  // Gives what changed, { ranges [first, last], names }, or null.
+  // Updates `after` to the scene under layers { edit, strength, gains, weights, paint }, lowest first.
+  // Returns the change { ranges [first, last], names }, or null.
   update(layers, blend) {
     const active = layers.filter((layer) => layer.strength !== 0).map((layer) =>
       ({ ...layer, effect: JSON.stringify([layer.edit, layer.strength, layer.gains, layer.paint]) }));
@@ -109,7 +109,7 @@ export class Composer {
     return ranges.length ? { ranges, names: [...names] } : null;
   }
 
-  // The layers below the lowest that changed, `same` of them, are kept for the next time.
+  // Caches the sum of the `same` layers below the lowest changed one for the next call.
   #compose(segment, stack, same) {
     const { first, rows, names } = segment, totals = {};
     const kept = segment.below?.at === same ? segment.below : null;
@@ -165,7 +165,7 @@ export class Composer {
     if (map) this.#adjust(layer, edit, member, colors, totals, map);
   }
 
-  // A grade above others: rows of the segment that they have changed, the sums of their bands, what it adds.
+  // Prepares a grade above other layers: the rows that they changed, their summed bands, and the graded colors.
   #graded(segment, stack, at, colors, totals) {
     const layer = stack[at], edit = this.edits[layer.edit], below = stack.slice(0, at), { first } = segment;
     const key = [...below.map((each) => each.effect), JSON.stringify(layer.paint), ...colors].join();
@@ -207,7 +207,7 @@ export class Composer {
     }
   }
 
-  // max(1, Σ m s) over the layers that make a kind of change; null where it is 1 everywhere.
+  // Returns max(1, Σ m s) over the layers with this kind of change; null if it is 1 everywhere.
   #divisors({ rows, members }, all, kind) {
     const stack = all.filter((layer) => this.edits[layer.edit].kinds.has(kind));
     if (stack.reduce((sum, layer) => sum + Math.min(layer.strength, 1), 0) <= 1 - 1e-6) return null;

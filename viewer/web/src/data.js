@@ -1,10 +1,10 @@
-// The container that viewer/web/page.py writes: a header, and arrays of numbers.
+// Reader of the container written by viewer/web/page.py: a header, and arrays of numbers.
 
 const BYTES = { f4: 4, i4: 4, i2: 2, i1: 1 };
 const TYPED = { f4: Float32Array, i4: Int32Array, i2: Int16Array, i1: Int8Array };
 const word = new Uint32Array(1), real = new Float32Array(word.buffer);
 
-// The bytes of base64 text of a gzip stream.
+// Decodes and decompresses the base64 text of a gzip stream.
 export async function inflate(text) {
   let packed;
   if (Uint8Array.fromBase64) packed = Uint8Array.fromBase64(text);
@@ -24,21 +24,21 @@ export class Container {
     this.bytes = bytes.subarray(4 + length);
   }
 
-  // A whole array as it is stored, row after row.
+  // Returns a whole array as stored, row by row.
   stored(record) {
     const out = new TYPED[record.type](record.rows * record.width);
     this.#read(record, 0, record.rows, out, record.width, 0);
     return out;
   }
 
-  // A whole array in its real units.
+  // Returns a whole array in its real units.
   real(record) {
     const out = new Float32Array(record.rows * record.width);
     this.#read(record, 0, record.rows, out, record.width, 0);
     return out;
   }
 
-  // Rows `first` on of an attribute of the scene, `stride` numbers apart from `offset` on.
+  // Writes rows of a scene attribute from `first` on into `out`, from `offset` on, `stride` numbers apart.
   attribute(name, first, count, out, stride, offset = 0) {
     for (const record of this.header.attributes[name] ?? []) {
       const rows = Math.min(count, record.rows - first);

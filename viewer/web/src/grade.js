@@ -1,10 +1,10 @@
-// What a grade makes of colors that others have changed: progdf/field/grade.py, adjust_colors.
+// A grade applied to colors that other layers have changed: progdf/field/grade.py, adjust_colors.
 
 const C0 = 0.28209479177387814;
 const MOST_COLOR = 1.5;
-const clamp = (x, low, high) => (x > low ? (x < high ? x : high) : low);  // faster than Math.min and max
+const clamp = (x, low, high) => (x > low ? (x < high ? x : high) : low);  // faster than Math.min and Math.max
 
-// The segment of ascending knots that holds x: the index of its right one, and the share of the way to that.
+// Returns the segment of ascending knots that contains x: the index of its right knot, and the share of x in it.
 export function findSegment(knots, x) {
   const at = Math.fround(x);
   let right = 1;
@@ -21,7 +21,7 @@ function interpolate(x, knots, values) {
 
 const lerpAll = (low, high, share) => high.map((x, k) => (share === 1 ? x : low[k] + share * (x - low[k])));
 
-// Maps colors [D,3].
+// Maps colors [D,3] by a polynomial.
 function polynomial(colors, out, t, degree) {
   for (let d = 0; d < out.length; d += 3) {
     const red = colors[d], green = colors[d + 1], blue = colors[d + 2];
@@ -59,8 +59,8 @@ function lattice(colors, out, table) {
   }
 }
 
-// What a grade adds to the bands sh [m,B,3] of some of its members. The map is linear in its table, so between
-// two knots a member goes the straight way, but for those that are black somewhere.
+// The change that a grade makes to the bands sh [m,B,3] of some of its members. The map is linear in its table, so
+// between two knots it interpolates linearly, except for members that are black from some direction.
 export class GradedColors {
   constructor(grade, [values, inverse], sh, members) {
     const bands = sh.length / 3 / members.length, directions = bands > 1 ? values.length / bands : 1;
@@ -72,7 +72,8 @@ export class GradedColors {
     this.change = new Float32Array(sh.length);
   }
 
-  // At a strength; the first time without knots, as it may be what lies below that moves. [m,B,3], until the next
+  // Returns the change at a strength, [m,B,3], valid until the next call. The first call caches no knots, as the
+  // layers below may be moving.
   at(strength) {
     const { grade, change, sh, members } = this, straight = grade.degree === 0;
     const at = strength < 1 ? interpolate(strength, grade.new, grade.old) : strength;
@@ -115,7 +116,7 @@ export class GradedColors {
     return this.knots[k];
   }
 
-  // What the map adds to a member; `once`: without a second look where that is black. Gives which channels are.
+  // Computes the change of a member and returns its black channels as a mask; `once`: skip the correction of black.
   #map(table, member, change, once = false) {
     const { sh, bands, directions, made, color, target, inverse } = this, first = 3 * bands * member;
     for (let j = 0; j < made.length; j++) made[j] = sh[first + j];
@@ -148,7 +149,7 @@ export class GradedColors {
     return black;
   }
 
-  // The colors that `made` shows from everywhere.
+  // Evaluates the colors of `made` in all directions.
   #show() {
     const { bands, made, color, values } = this;
     for (let at = 0, to = 0; to < color.length; to += 3) {
@@ -165,7 +166,7 @@ export class GradedColors {
     }
   }
 
-  // Adds to `made`, in the channels of a mask, what is missing in `color`, by least squares.
+  // Adds the residual `color` to `made` by least squares, in the channels of a mask.
   #project(channels) {
     const { made, color, inverse } = this, red = channels & 1, green = (channels >> 1) & 1, blue = channels >> 2;
     for (let at = 0, to = 0; to < made.length; to += 3) {

@@ -1,11 +1,11 @@
-// Mouse, touch and wheel on the picture: turn, slide, zoom; a double click sets the pivot.
+// Mouse, touch and wheel on the picture: orbit, pan, zoom; a double click sets the pivot.
 
 import { orbit, pan, zoom } from "./camera.js";
 
-const ZOOM_PER_PIXEL = 0.0012;  // of a wheel: a step of 100 px is .12 of the distance, as in the window
+const ZOOM_PER_PIXEL = 0.0012;  // of the wheel: a step of 100 px changes the distance by 12 %, as in the window
 const TAP_MS = 300, TAP_PX = 24;
 
-// `page` gives { camera, look(camera), focal, radius, pivotAt(x, y) }.
+// `page` has { camera, look(camera), focal, radius, pivotAt(x, y) }.
 export function listen(canvas, page) {
   const pointers = new Map();
   let tap = { time: -Infinity, x: 0, y: 0 };

@@ -1,4 +1,4 @@
-// A page in its root element: draws again whenever the view or the camera is another one.
+// A page in its root element: redraws whenever the view or the camera changes.
 
 import { addScaled, pinhole, pivotOn } from "./camera.js";
 import { Composer } from "./compose.js";
@@ -10,7 +10,7 @@ import { Sorter } from "./sort.js";
 import { mixCameras, restore, stateAt, visibleLayers } from "./state.js";
 
 const MOST_PIXELS = 4e6;
-const SLOW_MS = 45;  // between frames while something moves: half the pixels each way then
+const SLOW_MS = 45;  // slower frames in motion are drawn at half the width and height
 const REST_MS = 180;
 const GLIDE_MS = 250;
 
@@ -27,7 +27,7 @@ class Page {
     this.composer = new Composer(container);
     this.means = new Float32Array(3 * header.count);
     container.attribute("means", 0, header.count, this.means, 3);
-    this.paints = header.paints.map(container.real, container);  // a closure would keep the container alive
+    this.paints = header.paints.map(container.real, container);  // a closure would keep the container in memory
     this.sorter = new Sorter(this.means, header.near, (order, seen) => {
       this.renderer.setOrder(order, seen);
       this.request();
@@ -38,7 +38,7 @@ class Page {
     const original = { name: "original", ...this.view };
     original.layers = original.layers.map((layer) => ({ ...layer, strength: 0 }));
     this.snapshots = [original, ...header.snapshots];
-    this.chosen = null;  // the index of a snapshot, as long as it is shown
+    this.chosen = null;  // index of the snapshot on screen, null after a change
     this.frame = 0;
     this.playing = false;
     this.comparing = false;
@@ -54,7 +54,7 @@ class Page {
     this.change(this.view);
   }
 
-  // Shows another view.
+  // Sets another view.
   change(view, chosen = null) {
     this.view = view;
     this.chosen = chosen;
@@ -121,7 +121,7 @@ class Page {
     return this.#pinhole().intrinsics[0] * (this.canvas.clientWidth / this.canvas.width);
   }
 
-  // In a notebook the wheel goes on scrolling until somebody has clicked here.
+  // In a notebook the wheel scrolls the notebook until the user clicks the page.
   get takesWheel() {
     return this.root === document.body || this.root.matches(":focus-within");
   }
@@ -141,7 +141,7 @@ class Page {
     });
   }
 
-  // The picture as a PNG, as a data address.
+  // Returns the picture as a data URL of a PNG.
   picture() {
     this.#draw(performance.now());
     return this.canvas.toDataURL();
@@ -154,7 +154,7 @@ class Page {
     this.update();
   }
 
-  // What one looks at lies beside the panel.
+  // The camera is centered on the free area beside the panel.
   #pinhole() {
     const { canvas } = this, scale = canvas.width / Math.max(canvas.clientWidth, 1);
     const free = { x: 0, y: 0, width: canvas.width, height: canvas.height };
@@ -168,7 +168,7 @@ class Page {
   }
 
   #draw(now) {
-    if (!this.canvas.clientWidth) {  // hidden, as all is while a notebook changes its theme
+    if (!this.canvas.clientWidth) {  // hidden, for example while a notebook changes its theme
       this.resting = setTimeout(() => this.request(), REST_MS);
       return;
     }
@@ -270,7 +270,7 @@ class Page {
     }, until);
   }
 
-  // Lets go of everything; nothing is drawn any more.
+  // Releases all resources and stops drawing.
   close() {
     this.gone.abort();
     this.sizes.disconnect();
@@ -281,7 +281,7 @@ class Page {
   }
 }
 
-// The page of a container's bytes, or of a promise of them, in `root`; null where that says why there is none.
+// Shows the page of a container's bytes (or a promise of them) in `root`; returns null after showing an error.
 export async function show(root, bytes, shaders) {
   try {
     return new Page(root, new Container(await bytes), shaders);

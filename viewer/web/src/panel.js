@@ -1,4 +1,4 @@
-// The panel: a row with a slider for each layer and group, snapshots, timeline. All texts are a stranger's.
+// The panel: a row with a slider for each layer and group, snapshots, timeline. All texts are untrusted.
 
 function make(kind, options = {}, ...children) {
   const element = document.createElement(kind);
@@ -12,11 +12,11 @@ function make(kind, options = {}, ...children) {
   return element;
 }
 
-const RULES = { normalized: "Average", sum: "Add", over: "Over", adjust: "Adjust" };  // in the window's words
+const RULES = { normalized: "Average", sum: "Add", over: "Over", adjust: "Adjust" };  // same names as in the window
 
 const percent = (x) => `${Math.round(100 * x)}`;
 
-// A labelled range input 0..most; `ticks`: where recordings lie.
+// Creates a labeled range input 0..most; `ticks`: recorded strengths.
 function slider(label, most, ticks, moved, step = 0.01) {
   const value = make("output");
   const input = make("input", { type: "range", min: 0, max: most, step, "aria-label": label });
@@ -51,7 +51,7 @@ function row(name, kind, { most = 1, ticks = [], toggled, moved }) {
   };
 }
 
-// Fills `root`; `page` gives { view, header, change(view), … }. Returns what shows another state.
+// Fills `root`; `page` has { view, header, change(view), … }. Returns a function that shows the page's new state.
 export function buildPanel(root, page) {
   const { header } = page, rows = new Map();
   const change = (list, name, changes) => page.change({
@@ -71,7 +71,7 @@ export function buildPanel(root, page) {
   };
   const layers = make("section", { class: "layers" });
   let group = null, box = layers;
-  for (const layer of [...page.view.layers].reverse()) {  // the top one first
+  for (const layer of [...page.view.layers].reverse()) {  // the top layer first
     if (layer.fixed) continue;
     if (layer.group !== group) {
       group = layer.group;
@@ -92,7 +92,7 @@ export function buildPanel(root, page) {
   };
 }
 
-// How layers go together where they meet.
+// Creates the choice of the blend rule.
 function rule(root, page) {
   if (page.view.layers.length < 2) return null;
   const options = Object.entries(RULES).map(([value, text]) => make("option", { value, textContent: text }));

@@ -1,10 +1,10 @@
-// Drawing with WebGL2 by the viewer's own shaders: one pass over all Gaussians, farthest first, then the picture.
+// WebGL2 renderer with the viewer's own shaders: one pass over all Gaussians, farthest first, then the picture.
 
 import { dot } from "./camera.js";
 
-const ROW = 512;        // Gaussians in a row of the scene's textures, as viewer/gl/scene_textures.py
+const ROW = 512;        // Gaussians in a row of the scene's textures, as in viewer/gl/scene_textures.py
 const ORDER_ROW = 2048;
-const CHUNK = 64;       // texture rows that are unpacked at once
+const CHUNK = 64;       // texture rows unpacked at once
 const HEAD = "#version 300 es\nprecision highp float;\nprecision highp int;\nprecision highp sampler2D;";
 const LAYOUT = {
   mean_logit: [["means", 0], ["logit_opacities", 3]],
@@ -46,7 +46,7 @@ export class Renderer {
     gl.bindVertexArray(gl.createVertexArray());
   }
 
-  // Sends ranges of rows of the attributes `names` of a composer.
+  // Uploads ranges of rows of a composer's attributes `names`.
   update(composer, { ranges, names }) {
     for (const texture of new Set(names.map((name) => TEXTURE_OF[name]))) {
       for (const [first, last] of ranges) {
@@ -78,7 +78,7 @@ export class Renderer {
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ORDER_ROW, rows, gl.RED_INTEGER, gl.UNSIGNED_INT, this.staged);
   }
 
-  // Draws a pinhole on the canvas; a share below 1 draws fewer pixels, stretched.
+  // Draws a pinhole camera's picture on the canvas; a share below 1 draws fewer pixels and enlarges them.
   draw(pinhole, background, share = 1) {
     const { gl } = this, { canvas } = this;
     const width = Math.max(1, Math.round(canvas.width * share)), height = Math.max(1, Math.round(canvas.height * share));
@@ -96,7 +96,7 @@ export class Renderer {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  // The depth of what one sees at a pixel of the canvas, world units; null where nothing is.
+  // Returns the depth of the surface at a pixel of the canvas, world units; null in empty space.
   depthAt(pinhole, x, y) {
     const { gl } = this, pixel = new Float32Array(4);
     if (this.format[0] === gl.RGBA8) return null;
@@ -174,7 +174,7 @@ export class Renderer {
     }
   }
 
-  // Rows of Gaussians from the first of a texture row on: whole texture rows, then what is left of the last one.
+  // Uploads Gaussians from the start of a texture row: whole texture rows, then the remainder of the last one.
   #send(name, first, count, numbers, channels) {
     const { gl } = this, texels = name === "shN" ? this.sh : 1, format = name === "shN" ? gl.RGB : gl.RGBA;
     const whole = Math.floor(count / ROW), left = count - whole * ROW, top = first / ROW;
@@ -201,5 +201,5 @@ export class Renderer {
   }
 }
 
-// The row of the view matrix that gives depths.
+// The row of the view matrix that yields depths.
 export const depthRow = ({ rows, eye }) => [...rows[2], -dot(rows[2], eye)];

@@ -1,8 +1,9 @@
-// Depth order, exact in float32: a radix sort of two passes, in a worker where a scene is large.
+// Depth order, exact in float32: a two-pass radix sort, in a worker for large scenes.
 
-const LARGE = 150_000;  // Gaussians whose sorting would be felt
+const LARGE = 150_000;  // Gaussians above which sorting would delay frames
 
-// Rows in front of the near plane, farthest first, into `order`; how many. row: of the view matrix, 4 numbers.
+// Writes the rows in front of the near plane into `order`, farthest first; returns their number.
+// row: 4 numbers of the view matrix.
 function backToFront(means, row, near, order, scratch) {
   const [a, b, c, d] = row, count = means.length / 3;
   const { depths, bits, rows, between, low, high } = scratch;
@@ -19,7 +20,7 @@ function backToFront(means, row, near, order, scratch) {
     high[key >>> 16]++;
     seen++;
   }
-  for (let key = 0xffff, l = 0, h = 0; key >= 0; key--) {  // where each key's first goes, the largest in front
+  for (let key = 0xffff, l = 0, h = 0; key >= 0; key--) {  // start index of each key, the largest key first
     const [ofLow, ofHigh] = [low[key], high[key]];
     low[key] = l;
     high[key] = h;
@@ -39,7 +40,7 @@ function makeScratch(count) {
   };
 }
 
-// What the worker runs.
+// The worker's program.
 function serve() {
   let means, scratch;
   self.onmessage = ({ data }) => {
@@ -66,7 +67,7 @@ function startWorker() {
   }
 }
 
-// Orders rows of `means`; `done(order, seen)` is called with what is to be drawn, at once or later.
+// Sorts rows of `means`; calls `done(order, seen)` with the rows to draw, at once or later.
 export class Sorter {
   constructor(means, near, done) {
     this.means = means;
@@ -75,7 +76,7 @@ export class Sorter {
     this.order = new Uint32Array(means.length / 3);
     this.worker = this.order.length > LARGE ? startWorker() : null;
     if (!this.worker) return void (this.scratch = makeScratch(this.order.length));
-    this.worker.onerror = (event) => {  // refused after all
+    this.worker.onerror = (event) => {  // blocked after its creation
       event.preventDefault();
       this.worker = null;
       this.order = new Uint32Array(means.length / 3);
@@ -92,7 +93,7 @@ export class Sorter {
     this.worker.postMessage({ all: means });
   }
 
-  // Rows whose centers are others now.
+  // Receives rows whose centers have changed.
   moved(first, last) {
     this.worker?.postMessage({ moved: this.means.slice(3 * first, 3 * last), at: 3 * first });
   }

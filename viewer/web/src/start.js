@@ -1,4 +1,4 @@
-// The page as a file of its own: all of the document shows the data that it holds.
+// The page as a file: shows the data that the document holds.
 
 import { inflate } from "./data.js";
 import { show } from "./main.js";

@@ -1,9 +1,9 @@
-// What the page shows, as data: { layers, groups, blend } and how snapshots and a timeline change it; see
+// State of the page as data: { layers, groups, blend }, and its changes by snapshots and a timeline; see
 // viewer/state/layers.py, snapshots.py.
 
 import { axes, lookAlong, unit, wrap } from "./camera.js";
 
-// The layers that take part, each at its strength times its group's.
+// Returns the visible layers, each at its strength times its group's.
 export function visibleLayers({ layers, groups }) {
   const group = new Map(groups.map((each) => [each.name, each]));
   const alone = layers.filter((layer) => layer.solo);
@@ -11,7 +11,7 @@ export function visibleLayers({ layers, groups }) {
   return shown.map((layer) => ({ ...layer, strength: layer.strength * (group.get(layer.group)?.strength ?? 1) }));
 }
 
-// The view edited as a snapshot has it; layers that it does not know stay, at 0.
+// Returns the view with the edits of a snapshot; layers that it lacks stay, at 0.
 export function restore(view, snapshot) {
   const known = new Set(snapshot.layers.map((layer) => layer.edit));
   const later = view.layers.filter((l) => !known.has(l.edit)).map((l) => ({ ...l, strength: 0, group: "" }));
@@ -20,7 +20,7 @@ export function restore(view, snapshot) {
 
 const lerp = (a, b, share) => a + share * (b - a);
 
-// A camera between two others, the shortest way around.
+// Interpolates two cameras along the shortest rotation.
 export function mixCameras(a, b, share) {
   if (share <= 0 || share >= 1) return share <= 0 ? a : b;
   const camera = {
@@ -37,7 +37,7 @@ export function mixCameras(a, b, share) {
   return lookAlong({ ...camera, up: mixed("up") }, mixed("back"));
 }
 
-// The view and the camera at a moment of a film, whose frames are given one by one.
+// Returns view and camera at a (fractional) frame of a film.
 export function stateAt({ frames }, frame, view, camera) {
   const before = Math.min(Math.floor(frame), frames.length - 1), share = frame - before;
   const here = frames[before], next = frames[Math.min(before + 1, frames.length - 1)];

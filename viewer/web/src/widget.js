@@ -1,4 +1,4 @@
-// The page in a cell of a notebook, by anywidget: strengths and camera go both ways, see viewer/widget.py.
+// The page in a notebook cell, by anywidget. Strengths and camera are synchronized both ways, see viewer/widget.py.
 
 import { show } from "./main.js";
 
@@ -12,7 +12,7 @@ export async function render({ model, el }, shaders) {
   el.append(host);
   size();
   model.on("change:height", size);
-  host.addEventListener("keydown", (event) => {  // no key that is meant for a slider acts on the notebook's cells
+  host.addEventListener("keydown", (event) => {  // keys for a slider must not reach the notebook's cells
     const { ctrlKey, metaKey, altKey, shiftKey, key } = event;
     if (!(ctrlKey || metaKey || altKey || key === "Escape" || (shiftKey && key === "Enter"))) event.stopPropagation();
   });
@@ -22,7 +22,7 @@ export async function render({ model, el }, shaders) {
     const { layers, blend } = page.view, hidden = layers.filter((l) => !l.enabled).map((l) => l.name);
     return { blend, hidden, camera: page.camera, strengths: Object.fromEntries(layers.map((l) => [l.name, l.strength])) };
   };
-  const take = (name) => {  // one at a time, as the others may be on their way out
+  const take = (name) => {  // one at a time, as others may not have been sent yet
     const given = model.get(name), { view } = page;
     const change = (part) => page.change({ ...view, layers: view.layers.map((l) => ({ ...l, ...part(l) })) });
     if (alike(given, state()[name])) return;
@@ -31,7 +31,7 @@ export async function render({ model, el }, shaders) {
     else if (name === "hidden") change((l) => ({ enabled: !given?.includes(l.name) }));
     else change((l) => ({ strength: Number.isFinite(given?.[l.name]) ? given[l.name] : l.strength }));
   };
-  page.shown = () => {  // once a frame
+  page.shown = () => {  // called once per frame
     const now = state(), changed = NAMES.filter((name) => !alike(now[name], model.get(name)));
     for (const name of changed) model.set(name, now[name]);
     if (changed.length) model.save_changes();
