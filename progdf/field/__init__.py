@@ -1,4 +1,4 @@
-"""The Gaussian differential field: (member, slider value) → offset of every raw parameter."""
+"""Gaussian differential field: (member, slider value) → offset of every raw parameter."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Baking: a network becomes the separable field that the viewer runs (docs/method.md 5).
+"""Baking of a network into the separable field that the viewer evaluates (docs/method.md 5).
 
-The field is evaluated at nodes, both ends are pinned to what they must be, and the trajectory between them is
-factored. Nodes and factors are chosen when the edit is made and kept in its file, with the error of both.
+The field is evaluated at nodes, both ends are pinned to their exact values, and the trajectory between them
+is factored. Nodes and ranks are chosen when the edit is made and stored in its file, with the error of both.
 """
 
 from __future__ import annotations
@@ -22,19 +22,23 @@ from .neural import NeuralField
 from .separable import fit_amplitude, fit_separable, moving_attributes, principal_modes
 
 TOLERANCE = 0.01
-"""Root mean square error of the factoring, as a share of the trajectory's own root mean square."""
+"""RMS error of the factoring, as a share of the trajectory's own RMS."""
 
-_PER_BIN = 4
-_FEW_PER_BIN = 2
-_LARGE = 100_000  # numbers in a network beyond which fewer nodes are asked for, as loading waits for them
-_JUMP = 1e-5  # width of the edge between two hard bins
+_NODES_PER_BIN = 4
+_NODES_PER_BIN_LARGE = 2  # of a large network
+_LARGE_NETWORK = 100_000  # numbers of a network; above this, fewer nodes keep loading fast
+_EDGE_WIDTH = 1e-5  # strength between the two nodes at the edge of hard bins
 
 
 def bake_form(form: NeuralForm, rows: Tensor) -> BakedField:
-    """The field that runs. `rows`: raw values of the members before the edit, packed. [M,≥14]
+    """Return the baked field of a stored network.
+
+    Args:
+        form: the network and its bake plan
+        rows: raw values of the members before the edit, packed. [M,≥14]
 
     Raises:
-        ValueError: not as many Gaussians, or a number of the network is not usable.
+        ValueError: the number of Gaussians differs, or a number of the network is not usable.
     """
     network = form.network
     plan = form.plan
@@ -44,13 +48,13 @@ def bake_form(form: NeuralForm, rows: Tensor) -> BakedField:
 
 
 def rows_hash(rows: Tensor) -> str:
-    """SHA-256 of what a network sees of its members (float32 bytes). [M,≥14]"""
+    """Return the SHA-256 of the members' values that a network reads (float32 bytes). [M,≥14]"""
     seen = rows[:, :BASE_CHANNELS].detach().to("cpu", torch.float32).contiguous()
     return hashlib.sha256(seen.numpy().tobytes()).hexdigest()
 
 
 def full_end(network: NeuralField) -> Tensor:
-    """The recorded end, packed. [M,C]"""
+    """Return the recorded end, packed. [M,C]"""
     end = torch.zeros(network.members, network.shape.channels)
     end[:, network.shape.columns] = network.end
     return end
@@ -63,41 +67,47 @@ def bake_network(
     render: Render | None = None,
     tolerance: float = TOLERANCE,
 ) -> BakedField:
-    """Choose how a network is baked, bake it, and measure what that costs.
+    """Choose the bake plan of a network, bake it, and measure the error.
 
     Args:
-        network: trained
+        network: trained network
         rows: raw values of the members before the edit, packed. [M,≥14]
-        truth: the recorded offsets at any strength; tells how the network's error at the end goes with that
-            on the way. None: as its trajectory goes
-        render: of some views; None leaves the error in decibels out
+        truth: recorded offsets at any strength. They show how much of the network's error at the end occurs
+            at smaller strengths. None: in proportion to its trajectory
+        render: renders some views; None omits the error in decibels
         tolerance: see `TOLERANCE`
     """
     field = network.bind(rows)
     end = full_end(network)
-    large = network.parameters - network.codes.numel() > _LARGE
-    nodes = bake_nodes(network.shape.bins, network.shape.hard, _FEW_PER_BIN if large else _PER_BIN)
+    large = network.parameters - network.codes.numel() > _LARGE_NETWORK
+    nodes = bake_nodes(
+        network.shape.bins, network.shape.hard, _NODES_PER_BIN_LARGE if large else _NODES_PER_BIN
+    )
     plan = BakePlan(nodes, {}, _end_corrections(field, end, nodes, truth))
     trajectory = pinned_trajectory(field, end, plan)
-    plan = replace(plan, ranks=_ranks(trajectory, tolerance))
+    plan = replace(plan, ranks=_choose_ranks(trajectory, tolerance))
     form = NeuralForm(network, plan, rows_hash(rows) if network.shape.inputs == "own" else "")
     baked = bake_form(form, rows)
     return replace(baked, origin=replace(form, error=bake_error(field, baked, plan, render)))
 
 
-def bake_nodes(bins: int, hard: bool, per_bin: int = _PER_BIN) -> Tensor:
-    """Strengths to bake at: `per_bin` to a smooth bin; both sides of every edge of hard ones. [S] float32"""
+def bake_nodes(bins: int, hard: bool, per_bin: int = _NODES_PER_BIN) -> Tensor:
+    """Return the strengths at which to bake, ascending. [S] float32
+
+    Smooth bins have `per_bin` nodes each, hard bins one on each side of every edge.
+    """
     if not hard:
         return torch.linspace(0, 1, per_bin * bins + 1)
-    edges = torch.arange(2, bins) / bins  # see `neural.hard_bin`; the last edge is the end itself
-    inner = torch.stack([edges - _JUMP, edges], dim=1).flatten()
-    return torch.cat([torch.tensor([0.0, _JUMP]), inner, torch.tensor([1.0 - _JUMP, 1.0])])
+    edges = torch.arange(2, bins) / bins  # see `neural.hard_bin`; the last edge is at strength 1
+    inner = torch.stack([edges - _EDGE_WIDTH, edges], dim=1).flatten()
+    return torch.cat([torch.tensor([0.0, _EDGE_WIDTH]), inner, torch.tensor([1.0 - _EDGE_WIDTH, 1.0])])
 
 
 def pinned_trajectory(field: Field, end: Tensor, plan: BakePlan) -> Tensor:
-    """The field at the nodes, zero at the first and the recorded end at the last. [S,M,C] float32
+    """Return the field at the nodes, zero at the first and the recorded end at the last. [S,M,C] float32
 
-    What the field misses of the end is spread over the way, so that nothing jumps where the slider arrives.
+    The field's error at the end is distributed over the nodes, so that nothing jumps when the slider reaches
+    1.
     """
     offsets = torch.stack([field.offsets(float(s)) for s in plan.knots])
     offsets[0] = 0.0
@@ -110,7 +120,7 @@ def pinned_trajectory(field: Field, end: Tensor, plan: BakePlan) -> Tensor:
 
 
 def bake_error(field: Field, baked: BakedField, plan: BakePlan, render: Render | None) -> dict[str, float]:
-    """What the nodes and the factoring cost, at strengths between the nodes too; see `NeuralForm`."""
+    """Measure the error of nodes and factoring, at strengths between the nodes too; see `NeuralForm`."""
     end = baked.offsets(1.0)
     missing = end - field.offsets(1.0)
     error_power = power = 0.0
@@ -137,13 +147,13 @@ def bake_error(field: Field, baked: BakedField, plan: BakePlan, render: Render |
 def _end_corrections(
     field: Field, end: Tensor, nodes: Tensor, truth: Callable[[float], Tensor] | None
 ) -> dict[str, Tensor]:
-    """How much of what is missing at the end is missing at each node, by attribute; see `BakePlan`."""
+    """Return the share of the end's error to correct at each node, by attribute; see `BakePlan`."""
     offsets = torch.stack([field.offsets(float(s)) for s in nodes])
     missing = end - offsets[-1]
     corrections = {}
     for name, columns in moving_attributes(torch.stack([end, offsets[-1]])).items():
-        least = missing[:, columns].double()
-        power = float(least.square().sum())
+        end_error = missing[:, columns].double()
+        power = float(end_error.square().sum())
         if power == 0.0:
             continue
         if truth is None:
@@ -152,15 +162,15 @@ def _end_corrections(
             errors = [
                 truth(float(s))[:, columns] - a[:, columns] for s, a in zip(nodes, offsets, strict=True)
             ]
-            share = torch.tensor([float((e.double() * least).sum()) / power for e in errors])
+            share = torch.tensor([float((e.double() * end_error).sum()) / power for e in errors])
         share[0] = 0.0
         share[-1] = 1.0
         corrections[name] = share.float()
     return corrections
 
 
-def _ranks(trajectory: Tensor, tolerance: float) -> dict[str, int]:
-    """The fewest bases with which each attribute's trajectory is met to `tolerance`. [S,M,C]"""
+def _choose_ranks(trajectory: Tensor, tolerance: float) -> dict[str, int]:
+    """Return the fewest bases that reproduce each attribute's trajectory within `tolerance`. [S,M,C]"""
     ranks = {}
     for name, columns in moving_attributes(trajectory).items():
         fitted = fit_amplitude(trajectory[:, :, columns], torch.ones_like(trajectory[0, :, columns]))

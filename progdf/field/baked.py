@@ -1,8 +1,9 @@
-"""The only field that the viewer and `export` run: Δ_i(s) = Σ_k B_ik a_k(s), per attribute.
+"""Baked field, the only form that the viewer and `export` evaluate: Δ_i(s) = Σ_k B_ik a_k(s), per attribute.
 
-Every kind of field (separable, keyframes, neural) becomes one of these when it is loaded. Basis 0 is the full
-offset with a_0(0) = 0 and a_0(1) = 1, all others vanish at both ends, so s = 0 is the original and s = 1 what
-basis 0 decodes to, without any rounding: in float32 the recorded end, in integers by definition the end.
+Every kind of field (separable, keyframes, neural, grade) is converted to this form when it is loaded. Basis 0
+is the full offset with a_0(0) = 0 and a_0(1) = 1. All others vanish at both ends. So s = 0 is the original,
+and s = 1 the decoded basis 0 without any rounding: in float32 the recorded end, in integers by definition the
+end.
 """
 
 from __future__ import annotations
@@ -23,59 +24,62 @@ from .neural import NeuralField
 
 
 class Segment(NamedTuple):
-    """A place between two knots."""
+    """Position between two knots."""
 
-    right: int  # index of the right one, 1..S−1; the left one is that before it
-    share: float  # of the way from the left one, 1 exactly at the right one; beyond 0..1 outside all knots
+    right: int  # index of the right knot, 1..S−1; the left knot precedes it
+    share: float  # position from the left knot, 0, to the right one, exactly 1; outside all knots beyond 0..1
 
 
 def find_segment(knots: Tensor, x: float) -> Segment:
-    """The segment that holds `x`, at a knot the one left of it; the outer ones go on for ever.
+    """Return the segment that contains `x`, at a knot the one left of it. The outer segments are unbounded.
 
     Args:
         knots: ascending, at least 2. [S]
-        x: in their unit; which segment it is is told in their precision
+        x: position in the knots' unit. It is compared in their precision
     """
-    places = knots.numpy()  # for one place a tenth of the time that torch takes
-    right = min(max(int(places.searchsorted(places.dtype.type(x))), 1), len(places) - 1)
-    low = float(places[right - 1])
-    high = float(places[right])
+    values = knots.numpy()  # numpy, because torch takes ten times as long for one position
+    right = min(max(int(values.searchsorted(values.dtype.type(x))), 1), len(values) - 1)
+    low = float(values[right - 1])
+    high = float(values[right])
     return Segment(right, (x - low) / (high - low))
 
 
 def interpolate_at(knots: Tensor, values: Sequence[Tensor] | Tensor, x: float) -> Tensor:
-    """Linear between the values at knots [S], the outermost ones beyond them. S × [...] -> [...]"""
+    """Interpolate linearly between values at knots [S], constant outside them. S × [...] -> [...]"""
     right, share = find_segment(knots, x)
     return torch.lerp(values[right - 1], values[right], min(max(share, 0.0), 1.0))
 
 
 def interpolate(x: Tensor, knots: Tensor, values: Tensor) -> Tensor:
-    """`interpolate_at` for many places and one number a knot. [n], [S], [S] -> [n]"""
+    """Interpolate like `interpolate_at` at many positions, with one number per knot. [n], [S], [S] -> [n]"""
     right = torch.searchsorted(knots, x).clamp(1, len(knots) - 1)
     share = (x - knots[right - 1]) / (knots[right] - knots[right - 1])
     return torch.lerp(values[right - 1], values[right], share.clamp(0, 1))
 
 
 BASIS_TYPES = (torch.int8, torch.float16, torch.float32)
-"""How bases 1..R may be stored."""
+"""Storage types of bases 1..R."""
+
 END_TYPES = (torch.int8, torch.int16, torch.float32)
-"""How basis 0 may be stored, from the smallest."""
+"""Storage types of basis 0, smallest first."""
 
 MAX_KNOTS = 257
-MAX_RANK = 16
-"""Of a network that is baked."""
+"""Maximum number of knots of a baked network."""
 
-_NEAR = 1 / 80
-"""A knot of a remap so close to a field's is not worth a row of coefficients."""
+MAX_RANK = 16
+"""Maximum number of bases, beside the full offset, of a baked network, and of a grade's residual."""
+
+_MIN_KNOT_DISTANCE = 1 / 80
+"""Distance to a field's knot below which a remap's knot is not worth a row of coefficients."""
 
 
 @dataclass(frozen=True)
 class AttributeBases:
-    """One attribute's bases for M members of c channels each."""
+    """Bases of one attribute with c channels, for M members."""
 
-    end_offset: Tensor  # basis 0, the offset at s = 1, as stored. [M,c] int8, int16 or float32
-    residual_basis: Tensor  # bases 1..R as stored. [R,M,c] int8, float16 or float32
-    scale: Tensor  # what one unit is worth in raw space, per basis, from 0, and channel. [1+R,c] float32
+    end_offset: Tensor  # basis 0, the offset at s = 1, in stored form. [M,c] int8, int16 or float32
+    residual_basis: Tensor  # bases 1..R in stored form. [R,M,c] int8, float16 or float32
+    scale: Tensor  # raw-space value of one unit, per basis, from 0, and channel. [1+R,c] float32
     coefficients: Tensor  # a_k at the knots; row 0 all 0, the last row 1, 0, …, 0. [S,1+R] float32
 
     def __post_init__(self) -> None:
@@ -92,29 +96,29 @@ class AttributeBases:
 
     @property
     def end(self) -> Tensor:
-        """The offset at s = 1, raw space. [M,c] float32"""
+        """Offset at s = 1, raw space. [M,c] float32"""
         return self.end_offset.float() * self.scale[0]
 
     @property
     def label(self) -> str:
-        """How it is stored, as in "int8 + 2": the type of the end, and the number of the other bases."""
+        """Storage form, as in "int8 + 2": the type of the end, and the number of further bases."""
         ranks = len(self.residual_basis)
         return str(self.end_offset.dtype).removeprefix("torch.") + (f" + {ranks}" if ranks else "")
 
     @property
     def bytes_per_member(self) -> float:
-        """Stored bytes for one member of the region."""
+        """Stored bytes per member of the region."""
         stored = self.end_offset[None], self.residual_basis
         return sum(len(part) * part.shape[2] * part.element_size() for part in stored)
 
 
 @dataclass(frozen=True)
 class BakePlan:
-    """How a field is baked, so that every load gives the same."""
+    """Parameters of baking a field, so that every load gives the same result."""
 
     knots: Tensor  # strengths at which the field is evaluated, ascending from 0 to 1. [S] float32
-    ranks: Mapping[str, int]  # bases beside the full offset, by attribute
-    # share of the error at the end that is added at each knot, by attribute, 0 first, 1 last. [S] float32
+    ranks: Mapping[str, int]  # bases in addition to the full offset, by attribute
+    # share of the end's error to add at each knot, by attribute, 0 first, 1 last. [S] float32
     end_correction: Mapping[str, Tensor]
 
     def __post_init__(self) -> None:
@@ -129,14 +133,14 @@ class BakePlan:
 
 @dataclass(frozen=True)
 class NeuralForm:
-    """What a file keeps of a neural field."""
+    """Stored form of a neural field."""
 
     network: NeuralField  # the trained network
-    plan: BakePlan  # how it is baked
-    # of the members' raw values that the network looks at; "" where it sees places alone
+    plan: BakePlan  # parameters of baking it
+    # hash of the members' raw values that the network reads; "" if it reads positions only
     rows_sha256: str = ""
-    # what baking costs: "rms", relative, and with pictures "psnr_mean", "psnr_worst", dB, between the
-    # network, pinned, and what was baked of it
+    # error of baking, between the pinned network and the baked field: "rms", relative, and with pictures
+    # "psnr_mean" and "psnr_worst", dB
     error: Mapping[str, float] | None = None
 
     @property
@@ -146,13 +150,13 @@ class NeuralForm:
 
     @property
     def bytes_per_member(self) -> float:
-        """Stored bytes for one member, the network's share."""
+        """Stored bytes per member, including its share of the network."""
         return self.network.bytes_per_member
 
 
 @dataclass(frozen=True)
 class SliderRemap:
-    """Where on a new slider the strengths of the old one lie, linear between knots."""
+    """Piecewise linear map from strengths on an old slider to positions on a new one."""
 
     old: Tensor  # ascending from 0 to 1. [K] float64
     new: Tensor  # the same strengths on the new slider, ascending from 0 to 1. [K] float64
@@ -164,43 +168,48 @@ class SliderRemap:
             check_ascent("the knots of a remap", knots)
 
     def __call__(self, s: Tensor) -> Tensor:
-        """New strengths of old ones, 0..1; both ends exact. [n] -> [n] float64"""
+        """Return new strengths for old ones, 0..1, exact at both ends. [n] -> [n] float64"""
         return interpolate(s.double(), self.old, self.new)
 
     @property
     def is_identity(self) -> bool:
-        """Whether it changes nothing."""
+        """True if the remap changes nothing."""
         return torch.equal(self.old, self.new)
 
     def at(self, s: float) -> float:
-        """The same of one strength."""
+        """Return the new strength for one old strength."""
         return float(self(torch.tensor([s], dtype=torch.float64)))
 
 
 def identity_remap() -> SliderRemap:
-    """The slider remap that changes nothing."""
+    """Return the slider remap that changes nothing."""
     ends = torch.tensor([0.0, 1.0], dtype=torch.float64)
     return SliderRemap(ends, ends)
 
 
 MONOMIALS = {1: 4, 2: 10, 3: 20}
-"""Monomials of three channels up to a degree."""
+"""Degree → number of monomials of three channels up to that degree."""
 
 LATTICE = 0
-"""In place of a degree: the map is given at the points of a cube of colors, as a .cube file has it."""
+"""Value of `degree` for a map given at the points of a color cube, like a .cube file."""
+
 MAX_SIDE = 129
-"""Points along an edge of a lattice; the largest that color programs write has 65."""
+"""Maximum number of points along an edge of a lattice. The largest that color programs write has 65."""
 
 
 def lattice_colors(side: int) -> Tensor:
-    """The colors at the points of a lattice over 0..1, red fastest. [side³,3]"""
+    """Return the colors at the points of a lattice over 0..1, red fastest. [side³,3]"""
     at = torch.linspace(0.0, 1.0, side)
     blue, green, red = torch.meshgrid(at, at, at, indexing="ij")
     return torch.stack([red, green, blue], dim=-1).reshape(-1, 3)
 
 
 def lattice_side(points: int) -> int:
-    """Points along an edge of a lattice of so many. Raises ValueError: no cube of 2 to `MAX_SIDE`."""
+    """Return the number of points along an edge of a lattice.
+
+    Raises:
+        ValueError: the number of points is no cube of 2 to `MAX_SIDE`.
+    """
     side: int = round(points ** (1 / 3))
     if side**3 != points or not 2 <= side <= MAX_SIDE:
         raise ValueError(f"a lattice of {points} colors, expected a cube of 2 to {MAX_SIDE}")
@@ -208,7 +217,7 @@ def lattice_side(points: int) -> int:
 
 
 def identity_map(degree: int, points: int = 0) -> Tensor:
-    """The map that changes no color; of a lattice, with so many points. [K,3]"""
+    """Return the map that changes no color. points: size of a lattice; [K,3]"""
     if degree == LATTICE:
         return lattice_colors(lattice_side(points))
     table = torch.zeros(MONOMIALS[degree], 3)
@@ -218,16 +227,20 @@ def identity_map(degree: int, points: int = 0) -> Tensor:
 
 @dataclass(frozen=True)
 class GradeForm:
-    """What a file keeps of a grade field. Raises ValueError where its parts do not fit each other."""
+    """Stored form of a grade field.
 
-    degree: int  # of the map, 1 to 3, or `LATTICE`
+    Raises:
+        ValueError: its parts do not fit each other.
+    """
+
+    degree: int  # degree of the map, 1 to 3, or `LATTICE`
     knots: Tensor  # strengths at which the map is given, ascending from 0 to 1. [S] float32
     table: Tensor  # the map at each knot; the identity at the first. [S,K,3] float32
-    residual: Tensor  # bases of the lowest B bands, as stored. [R,M,3B] int8
-    scale: Tensor  # what one unit of them is worth. [R,3B] float32
-    coefficients: Tensor  # of the bases at each knot; 0 at the first. [S,R] float32
+    residual: Tensor  # bases of the lowest B bands, in stored form. [R,M,3B] int8
+    scale: Tensor  # value of one unit of the bases. [R,3B] float32
+    coefficients: Tensor  # coefficients of the bases at each knot; 0 at the first. [S,R] float32
     remap: SliderRemap = field(default_factory=identity_remap)  # from these knots to the slider
-    mask: Tensor | None = None  # how much of the map each member takes, in 255ths; None: all. [M] uint8
+    mask: Tensor | None = None  # share of the map per member, in 255ths; None: all. [M] uint8
 
     def __post_init__(self) -> None:
         if self.degree not in (LATTICE, *MONOMIALS) or self.table.ndim != 3:
@@ -258,24 +271,26 @@ class GradeForm:
 
     @property
     def share(self) -> Tensor:
-        """How much of the map each member takes, 0..1. [M] float32"""
+        """Share of the map per member, 0..1. [M] float32"""
         return torch.ones(self.members) if self.mask is None else self.mask.float() / 255.0
 
     @property
     def label(self) -> str:
-        """What it is, as in "grade of degree 2, a mask, 2 bases of DC"."""
+        """Description, as in "grade of degree 2, a mask, 2 bases of DC"."""
         bases = len(self.residual)
         parts = {12: "two bands", 27: "three bands"}
-        of = parts.get(self.residual.shape[2], "DC")
-        beside = f"{bases} bas{'is' if bases == 1 else 'es'} of {of}" if bases else "no residual"
-        beside = beside if self.mask is None else f"a mask, {beside}"
+        bands = parts.get(self.residual.shape[2], "DC")
+        additions = f"{bases} bas{'is' if bases == 1 else 'es'} of {bands}" if bases else "no residual"
+        additions = additions if self.mask is None else f"a mask, {additions}"
         side = 0 if self.degree else lattice_side(self.table.shape[1])
-        return f"grade of {f'degree {self.degree}' if self.degree else f'{side}³ colors'}, {beside}"
+        return f"grade of {f'degree {self.degree}' if self.degree else f'{side}³ colors'}, {additions}"
 
     @cached_property
     def packed_levels(self) -> dict[str, Tensor]:
-        """What there is by member, as a file keeps it, see `deflate`: which of its functions have levels, and
-        these. [B] uint8 each"""
+        """Data per member in stored form, see `deflate`. [B] uint8 each
+
+        It holds the levels, a bit mask of the functions that have levels, and the mask.
+        """
         packed = dict[str, Tensor]()
         if len(self.residual):
             bases, members, channels = self.residual.shape
@@ -287,34 +302,34 @@ class GradeForm:
 
     @property
     def bytes_per_member(self) -> float:
-        """Stored bytes for one member; the map is the region's."""
+        """Stored bytes per member. The map belongs to the region and is not included."""
         return sum(map(len, self.packed_levels.values())) / max(1, self.members)
 
 
 def unpack_levels(functions: Tensor, levels: Tensor, bases: int, members: int, channels: int) -> Tensor:
-    """The inverse of `GradeForm.packed_levels`. [B] uint8 each -> [R,M,3b] int8
+    """Decode `GradeForm.packed_levels`. [B] uint8 each -> [R,M,3b] int8
 
     Raises:
-        ValueError: they do not fit each other.
+        ValueError: the two arrays do not fit each other.
     """
     check_levels((bases, members, channels))
     bits = inflate(functions, (-(-channels // 3 * members // 8),), torch.uint8)
-    there = torch.from_numpy(np.unpackbits(bits.numpy(), count=channels // 3 * members)).bool()
-    residual = torch.zeros(bases, 3, len(there), dtype=torch.int8)
-    residual[:, :, there] = inflate(levels, (bases, 3, int(there.sum())), torch.int8)
+    present = torch.from_numpy(np.unpackbits(bits.numpy(), count=channels // 3 * members)).bool()
+    residual = torch.zeros(bases, 3, len(present), dtype=torch.int8)
+    residual[:, :, present] = inflate(levels, (bases, 3, int(present.sum())), torch.int8)
     return residual.view(bases, 3, channels // 3, members).permute(0, 3, 2, 1).flatten(2)
 
 
 @dataclass(frozen=True)
 class BakedField:
-    """A field ready to run, for the members it was made for."""
+    """Field in its final form, for the members it was made for."""
 
     kind: str  # "grade", "separable", "keyframes" or "neural"
     knots: Tensor  # strengths at which the coefficients are given, ascending, first 0, last 1. [S] float32
-    attributes: Mapping[str, AttributeBases]  # by name, see `ATTRIBUTES`; one that does not move is absent
-    channels: int  # of a packed row: 14, or 14 + 3K when shN moves
+    attributes: Mapping[str, AttributeBases]  # by name, see `ATTRIBUTES`; absent if it does not change
+    channels: int  # width of a packed row: 14, or 14 + 3K when shN changes
     recorded: tuple[float, ...] = ()  # strengths of the recorded snapshots, for the slider's ticks
-    origin: NeuralForm | GradeForm | None = None  # what it was baked from and a file stores instead
+    origin: NeuralForm | GradeForm | None = None  # source it was baked from, which a file stores instead
 
     def __post_init__(self) -> None:
         check_tensor("knots", self.knots, (None,), torch.float32)
@@ -340,18 +355,18 @@ class BakedField:
 
     @property
     def bytes_per_member(self) -> float:
-        """Bytes on disk for one member of the region."""
+        """Bytes on disk per member of the region."""
         return self.baked_bytes_per_member if self.origin is None else self.origin.bytes_per_member
 
     @property
     def baked_bytes_per_member(self) -> float:
-        """Bytes in memory for one member, which a slider step has to read."""
+        """Bytes in memory per member, which a slider step reads."""
         return sum(bases.bytes_per_member for bases in self.attributes.values())
 
     def coefficients(self, name: str, s: float) -> Tensor:
-        """a_0(s) … a_R(s) of one attribute, piecewise linear between the knots. [1+R] float32
+        """Return a_0(s) … a_R(s) of one attribute, piecewise linear between the knots. [1+R] float32
 
-        Outside 0..1 (overshoot) the last segment is continued: that is extrapolation, not a recorded edit.
+        Outside 0..1 (overshoot) the last segment continues. That is an extrapolation, not a recorded edit.
         """
         table = self.attributes[name].coefficients
         right, share = find_segment(self.knots, s)
@@ -360,11 +375,11 @@ class BakedField:
         return table[right - 1] + share * (table[right] - table[right - 1])
 
     def factors(self, name: str, s: float) -> Tensor:
-        """What each base of one attribute, as it is stored, is multiplied with at `s`. [1+R,c] float32"""
+        """Return the factor of each stored basis of one attribute at `s`. [1+R,c] float32"""
         return self.coefficients(name, s)[:, None] * self.attributes[name].scale
 
     def attribute_offsets(self, name: str, s: float) -> Tensor:
-        """Raw offsets of one attribute at strength `s`; exactly 0 at 0, `end` at 1. [M,c] float32"""
+        """Return raw offsets of one attribute at strength `s`; exactly 0 at 0, `end` at 1. [M,c] float32"""
         bases = self.attributes[name]
         weights = self.coefficients(name, s).tolist()
         factors = self.factors(name, s)
@@ -377,9 +392,9 @@ class BakedField:
         return total
 
     def offsets(self, s: float) -> Tensor:
-        """Offsets of the raw parameters at strength `s`, packed as in `gaussians.pack`. [M,C] float32
+        """Return offsets of the raw parameters at strength `s`, packed as in `gaussians.pack`. [M,C] float32
 
-        This is the plain form; `compose_layers` runs the same sum without building the packed rows.
+        This is the plain form. `compose_layers` computes the same sum without building the packed rows.
         """
         packed = torch.zeros(self.members, self.channels)
         slices = attribute_slices(self.channels)
@@ -389,13 +404,14 @@ class BakedField:
 
 
 def remap_slider(field: BakedField, remap: SliderRemap) -> BakedField:
-    """The field under another slider: its knots move, and where the remap bends far from any, one is added.
+    """Return the field under another slider.
 
-    No base is touched: the bytes per member are the same, and so are both ends, bit for bit.
+    Its knots move, and one is added where the remap bends far from any. No basis changes, so the bytes per
+    member and both ends stay the same, bit for bit.
 
     Args:
-        field: no network, whose slider is learned; of a grade, one that has not got another slider yet
-        remap: from the field's strengths to the wanted ones
+        field: any field but a network, whose slider is learned. A grade must not have a remap yet
+        remap: from the field's strengths to the new ones
 
     Raises:
         ValueError: the field is a network's.
@@ -404,7 +420,7 @@ def remap_slider(field: BakedField, remap: SliderRemap) -> BakedField:
         raise ValueError("a network's slider is its own; the other fields take another")
     origin = None if field.origin is None else replace(field.origin, remap=remap)
     old = field.knots.double()
-    far = (remap.old[:, None] - old).abs().amin(dim=1) > _NEAR
+    far = (remap.old[:, None] - old).abs().amin(dim=1) > _MIN_KNOT_DISTANCE
     knots = torch.cat([old, remap.old[far]]).sort().values
     moved = remap(knots).float()
     distinct = torch.ones(len(knots), dtype=torch.bool)

@@ -1,11 +1,13 @@
-"""Which field to ship: the smallest that adds at most a tenth of the error which the edit itself has.
+"""Choice of the field to ship: the smallest that adds at most a tenth of the edit's own error.
 
-Ends are stored in the smallest integers that serve, then ranks grow by rendered error per byte. For that the
-trajectory is rendered once (docs/method.md 5). Numbers of different attributes cannot be compared, and an
-error that no picture shows is none: so every attribute is straightened (its offset replaced by a_0(s) times
-the full one), one at a time, at every snapshot, and the change in the pictures is one row of pixels per
-attribute and snapshot. The inner products of these rows predict the error of any ranks; errors of several
-attributes may add up or cancel. Ranks are grown on that prediction, and the pictures have the last word.
+The full offsets are stored in the smallest integers that are precise enough. Then ranks grow by rendered
+error per byte. For that the trajectory is rendered once (docs/method.md 5).
+
+Numbers of different attributes cannot be compared, and an error that is invisible in every picture does not
+count. So every attribute is straightened (its offset replaced by a_0(s) times the full one), one at a time,
+at every snapshot. The change in the pictures is one row of pixels per attribute and snapshot. The inner
+products of these rows predict the error of any ranks. Errors of several attributes may add up or cancel. The
+ranks grow by this prediction, and renders of the field decide.
 """
 
 from __future__ import annotations
@@ -40,60 +42,66 @@ from .separable import (
 )
 
 ADDED = 0.1
-"""Share of the error that an edit has against its editor which its field may add."""
+"""Share of an edit's error against its editor that its field may add."""
 
 
 def allowed_error(own: float, added: float = ADDED) -> float:
-    """What may be added to an edit's own error, mean square: this share of it, where it is less than 8 bits
-    show as much as brings both there."""
+    """Return the mean squared error that a field may add to an edit's own error.
+
+    An own error of at least `LEVEL` may grow by the share `added`. A smaller one may grow to (1 + added) times
+    `LEVEL`, because 8 bits hardly show it.
+    """
     return (1.0 + added) * max(own, LEVEL) - own
 
 
 SAMPLES = 13
-"""Strengths at which errors are taken."""
+"""Number of strengths at which errors are measured."""
 
 Render = Callable[[Tensor], Tensor]
-"""Offsets of the members -> the pixels that count, of some views side by side. [M,C] -> [P,3]"""
+"""Function from offsets of the members to the relevant pixels of some views, concatenated. [M,C] -> [P,3]"""
 
 MAX_PIXELS = 40_000
-"""Pixels kept of each render; of more, evenly spread ones."""
+"""Maximum number of pixels of each render that are used, evenly spaced."""
 
 MAX_FITTED_SNAPSHOTS = 40
-"""Snapshots that are rendered; between two of them changes are taken to go straight."""
+"""Maximum number of snapshots to render. Between two of them, changes are interpolated linearly."""
 
 UNSEEN = 0.1
-"""Say of the bare numbers beside the pictures, for members that these views do not show."""
+"""Weight of the parameter error relative to the rendered error, for members not visible in these views."""
 
 Ends = Mapping[str, tuple[Tensor, Tensor]]
-"""By attribute, as `separable.quantize_bases` gives them; one that is not named is in float32."""
+"""Attribute → stored full offset, see `separable.quantize_bases`.
+
+An absent attribute is stored in float32.
+"""
 
 
 class Field(Protocol):
-    """Anything that gives the offsets of its members at any strength, baked or not."""
+    """Source of the members' offsets at any strength, baked or not."""
 
     @property
     def attributes(self) -> Collection[str]:
-        """Names of the attributes that move."""
+        """Names of the attributes that change."""
         ...
 
     def offsets(self, s: float) -> Tensor:
-        """Packed raw-space offsets. [M,C] float32"""
+        """Return packed raw-space offsets. [M,C] float32"""
         ...
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A field and its error against the trajectory."""
+    """Field and its error against the trajectory."""
 
-    field: BakedField  # the field
+    field: BakedField
     curve: tuple[float, ...]  # PSNR at `sample_strengths()`, dB
-    label: str  # what it is, e.g. "separable (means int16 + 2, sh0 int8)"
-    excess: float = 0.0  # its error as a multiple of what is allowed: up to 1 it serves
-    to_editor: float | None = None  # PSNR to the editor's own pictures, all strengths together, dB
+    label: str  # description, e.g. "separable (means int16 + 2, sh0 int8)"
+    excess: float = 0.0  # error as a multiple of the allowed error; accepted up to 1
+    to_editor: float | None = None  # PSNR to the editor's own pictures, over all strengths, dB
 
     @property
     def worst(self) -> float:
-        """Least PSNR over the slider, dB."""
+        """Smallest PSNR over the slider, dB."""
         return min(self.curve)
 
     @property
@@ -103,24 +111,28 @@ class Candidate:
 
 
 def sample_strengths() -> tuple[float, ...]:
-    """Strengths at which errors are taken: even, the ends left out where the error is 0 by construction."""
+    """Return the strengths at which errors are measured.
+
+    They are evenly spaced, without the ends, where the error is 0 by construction.
+    """
     return tuple((i + 1) / (SAMPLES + 1) for i in range(SAMPLES))
 
 
 class FieldEvaluator:
-    """Renders fields and says whether they serve.
+    """Renders fields and decides if they are accepted.
 
-    Beside the editor's own pictures a field serves that adds at most `allowed_error` of what the trajectory
-    has against them: where there are such pictures, all together, and at the finished edit alone; and on the
-    way, against the trajectory, on the mean. Without them its worst PSNR against the trajectory decides.
+    With the editor's own pictures, a field may add at most `allowed_error` to the trajectory's error against
+    them. This limit applies to all pictures together and to the finished edit alone. The mean error against
+    the trajectory over the slider must stay below it too. Without such pictures, the worst PSNR against the
+    trajectory decides.
 
     Args:
-        strengths: of the snapshots. [T]
-        offsets: [T,M,C]
-        render: the pixels that count; held-out views are the honest choice
-        truth: the offsets at any strength, [M,C]; None is straight from snapshot to snapshot
-        edited: the same pixels of the editor's own pictures, by the strength on the slider, 1 the last
-        target: least PSNR over the slider where there are no such pictures, dB
+        strengths: strengths of the snapshots. [T]
+        offsets: offsets of the snapshots. [T,M,C]
+        render: renders the relevant pixels; held-out views give an unbiased result
+        truth: offsets at any strength, [M,C]; None interpolates linearly between snapshots
+        edited: the same pixels in the editor's own pictures, by slider value, 1 last
+        target: smallest PSNR over the slider if there are no such pictures, dB
         added: share of the edit's error that may be added
     """
 
@@ -134,51 +146,54 @@ class FieldEvaluator:
         target: float = 40.0,
         added: float = ADDED,
     ) -> None:
-        course = truth or (lambda s: interpolate_at(strengths, offsets, s))
-        self._render, self._rule, self._added = render, bool(edited), added
-        self._nothing = torch.zeros(offsets.shape[1:])
-        self._expected = self._pictures(course, sample_strengths())
-        self._edited = edited or {1.0: self._pictures(course, [1.0])[0]}
-        self._own = self._errors(course)
-        self._allowed = allowed_error(fmean(self._own), added) if edited else 10 ** (-target / 10)
-        own = decibels(fmean(self._own))
+        truth_at = truth or (lambda s: interpolate_at(strengths, offsets, s))
+        self._render, self._has_edited, self._added = render, bool(edited), added
+        self._zero_offsets = torch.zeros(offsets.shape[1:])
+        self._expected = self._render_all(truth_at, sample_strengths())
+        self._edited = edited or {1.0: self._render_all(truth_at, [1.0])[0]}
+        self._own_errors = self._editor_errors(truth_at)
+        self._allowed = allowed_error(fmean(self._own_errors), added) if edited else 10 ** (-target / 10)
+        own = decibels(fmean(self._own_errors))
         tenth = f"adds at most a tenth to the edit's own error ({own:.1f} dB to the editor)"
         self.wanted = tenth if edited else f"reaches {target:g} dB"
-        """What a field that serves does, in words."""
+        """Condition that accepted fields meet, in words."""
 
     def end_excess(self, end: Tensor) -> float:
-        """The error of these offsets at strength 1 as a multiple of what is allowed there. [M,C]"""
-        allowed = allowed_error(self._own[-1], self._added) if self._rule else self._allowed
+        """Return the error of offsets at strength 1, as a multiple of the allowed error there. [M,C]"""
+        allowed = allowed_error(self._own_errors[-1], self._added) if self._has_edited else self._allowed
         with torch.no_grad():
-            added = _difference(self._render(end), self._edited[max(self._edited)]) + ROUNDING - self._own[-1]
+            added = _mse(self._render(end), self._edited[max(self._edited)]) + ROUNDING - self._own_errors[-1]
         return added / allowed
 
     def candidate(self, field: Field, label: str) -> Candidate:
-        """The field with its error."""
+        """Return the field with its error."""
         assert isinstance(field, BakedField)
-        curve = self._deviations(field)
-        found = self._errors(lambda s: self._offsets(field, s))
-        on_the_way = fmean(curve) if self._rule else max(curve)
-        excess = max(fmean(found) - fmean(self._own), on_the_way) / self._allowed
-        if self._rule:
-            excess = max(excess, (found[-1] - self._own[-1]) / allowed_error(self._own[-1], self._added))
-        to_editor = decibels(fmean(found)) if self._rule else None
+        curve = self._trajectory_errors(field)
+        editor_errors = self._editor_errors(lambda s: self._offsets(field, s))
+        path_error = fmean(curve) if self._has_edited else max(curve)
+        excess = max(fmean(editor_errors) - fmean(self._own_errors), path_error) / self._allowed
+        if self._has_edited:
+            excess = max(
+                excess,
+                (editor_errors[-1] - self._own_errors[-1]) / allowed_error(self._own_errors[-1], self._added),
+            )
+        to_editor = decibels(fmean(editor_errors)) if self._has_edited else None
         return Candidate(field, tuple(decibels(e) for e in curve), label, excess, to_editor)
 
     def curve(self, field: Field) -> tuple[float, ...]:
-        """PSNR at `sample_strengths()`, dB."""
-        return tuple(decibels(e) for e in self._deviations(field))
+        """Return the PSNR at `sample_strengths()`, dB."""
+        return tuple(decibels(e) for e in self._trajectory_errors(field))
 
-    def _deviations(self, field: Field) -> list[float]:
-        pictures = self._pictures(partial(self._offsets, field), sample_strengths())
-        return list(map(_difference, pictures, self._expected))
+    def _trajectory_errors(self, field: Field) -> list[float]:
+        pictures = self._render_all(partial(self._offsets, field), sample_strengths())
+        return list(map(_mse, pictures, self._expected))
 
-    def _errors(self, course: Callable[[float], Tensor]) -> list[float]:
-        pictures = self._pictures(course, [*self._edited])
-        return [ROUNDING + _difference(*pair) for pair in zip(pictures, self._edited.values(), strict=True)]
+    def _editor_errors(self, course: Callable[[float], Tensor]) -> list[float]:
+        pictures = self._render_all(course, [*self._edited])
+        return [ROUNDING + _mse(*pair) for pair in zip(pictures, self._edited.values(), strict=True)]
 
-    def _pictures(self, course: Callable[[float], Tensor], strengths: Sequence[float]) -> list[Tensor]:
-        """The pixels that count, each strength's on one thread."""
+    def _render_all(self, course: Callable[[float], Tensor], strengths: Sequence[float]) -> list[Tensor]:
+        """Render the relevant pixels, each strength on one thread."""
 
         @torch.no_grad()
         def render(s: float) -> Tensor:
@@ -187,22 +202,22 @@ class FieldEvaluator:
         return map_threads(render, strengths)
 
     def _offsets(self, field: Field, s: float) -> Tensor:
-        # a field that moves nothing does not know how many members it has
-        return field.offsets(s) if field.attributes else self._nothing
+        # a field without attributes does not know its number of members
+        return field.offsets(s) if field.attributes else self._zero_offsets
 
 
-def _difference(a: Tensor, b: Tensor) -> float:
+def _mse(a: Tensor, b: Tensor) -> float:
     return float((a - b).double().square().mean()) if len(a) else 0.0
 
 
 @dataclass(frozen=True)
 class FieldChoice:
-    """What was chosen and why."""
+    """Chosen field and the reason for the choice."""
 
-    best: Candidate  # the field
-    met: bool  # whether it serves
-    tried: tuple[Candidate, ...]  # everything that was looked at
-    why: str = ""  # in words, as "the smallest of 6 that reach 40 dB"
+    best: Candidate  # the chosen field
+    met: bool  # true if the field is accepted
+    tried: tuple[Candidate, ...]  # all evaluated fields
+    why: str = ""  # reason in words, as in "the smallest of 6 that reach 40 dB"
 
 
 def choose_field(
@@ -213,21 +228,21 @@ def choose_field(
     kind: Literal["separable", "lossless"] = "separable",
     evaluator: FieldEvaluator | None = None,
 ) -> FieldChoice:
-    """The smallest field that serves.
+    """Return the smallest accepted field.
 
     Args:
-        strengths: of the snapshots, ascending from 0 to 1. [T]
-        offsets: raw offsets of the members; the first row is 0, the last the recorded end. [T,M,C] float32
-        render: of a few views and their interesting pixels; the ranks are chosen on it
-        weights: how much an error of each number shows: visibility [M] or [M,C]; None is evenly
-        kind: "lossless" is every snapshot, whatever it takes
-        evaluator: decides in the end, best on views that `render` does not show; None decides by `render`
+        strengths: strengths of the snapshots, ascending from 0 to 1. [T]
+        offsets: raw offsets of the members. The first row is 0, the last the recorded end. [T,M,C] float32
+        render: renders the relevant pixels of a small number of views; ranks are chosen by it
+        weights: importance of an error: visibility [M] or sensitivity [M,C]; None: uniform
+        kind: "lossless" keeps every snapshot, whatever the size
+        evaluator: makes the final decision, best on views that `render` does not include; None uses `render`
 
     Returns:
-        The choice; where nothing serves, the best there is, with `met` false.
+        The choice. If no field is accepted, the best one, with `met` false.
 
     Raises:
-        ValueError: no trajectory, or weights that do not fit.
+        ValueError: the trajectory is invalid, or the weights do not fit it.
     """
     check_trajectory(strengths, offsets)
     evaluator = evaluator or FieldEvaluator(strengths, offsets, render)
@@ -241,7 +256,7 @@ def choose_field(
 
 
 def pick_candidate(tried: Sequence[Candidate], wanted: str) -> FieldChoice:
-    """The smallest that serves, else the best."""
+    """Return the smallest accepted field, or else the best."""
     looked = f"{len(tried)} field{'s'[: len(tried) != 1]}"
     if good := [c for c in tried if c.excess <= 1.0]:
         best = min(good, key=lambda c: (c.field.bytes_per_member, c.excess))
@@ -251,8 +266,10 @@ def pick_candidate(tried: Sequence[Candidate], wanted: str) -> FieldChoice:
 
 
 def store_ends(offsets: Tensor, evaluator: FieldEvaluator) -> Ends:
-    """Each attribute's end in integers: all in the smallest, then the one that shows most per byte in larger
-    ones, until what they decode to serves. [T,M,C]
+    """Quantize each attribute's full offset to integers. offsets: [T,M,C]
+
+    All start in the smallest type. The attribute that gains most per byte gets the next larger type, until
+    the decoded end is accepted.
     """
     moving = moving_attributes(offsets)
     end = offsets[-1]
@@ -272,24 +289,26 @@ def store_ends(offsets: Tensor, evaluator: FieldEvaluator) -> Ends:
     def size(chosen: Mapping[str, int]) -> int:
         return sum(END_TYPES[k].itemsize * (moving[n].stop - moving[n].start) for n, k in chosen.items())
 
-    now = excess(chosen)
-    while now > 1.0 and (
+    current = excess(chosen)
+    while current > 1.0 and (
         larger := [{**chosen, name: k + 1} for name, k in chosen.items() if k + 1 < len(END_TYPES)]
     ):
-        gains = [(now - excess(c)) / (size(c) - size(chosen)) for c in larger]
+        gains = [(current - excess(c)) / (size(c) - size(chosen)) for c in larger]
         chosen = larger[gains.index(max(gains))]
-        now = excess(chosen)
+        current = excess(chosen)
     return {name: kinds[name][k] for name, k in chosen.items() if k < len(kinds[name])}
 
 
 def _grow_fields(seen: RenderedTrajectories, strengths: Tensor, evaluator: FieldEvaluator) -> list[Candidate]:
-    """Separable fields along the path of growing ranks, in ever longer steps until one serves and back by
-    halves."""
+    """Return separable fields along the path of growing ranks.
+
+    The steps double until a field is accepted. A bisection then finds the smallest accepted one.
+    """
     path, tried = grow_ranks(seen), dict[int, Candidate]()
 
     def serves(i: int) -> bool:
         if i not in tried:
-            tried[i] = _separable(seen, strengths, path[i], evaluator)
+            tried[i] = _fit_ranks(seen, strengths, path[i], evaluator)
         return tried[i].excess <= 1.0
 
     reach = 0
@@ -300,13 +319,14 @@ def _grow_fields(seen: RenderedTrajectories, strengths: Tensor, evaluator: Field
     return list(tried.values())
 
 
-def _separable(
+def _fit_ranks(
     seen: RenderedTrajectories, strengths: Tensor, ranks: Mapping[str, int], evaluator: FieldEvaluator
 ) -> Candidate:
-    """The field of these ranks: pictures choose the bases or, where these do not serve, numbers if better.
+    """Return the field with these ranks.
 
-    Pictures are the better guide but for parts that move far, where straightening an attribute changes more
-    than a sum of effects can say.
+    Rendered errors choose the bases. If that field is not accepted, parameter errors choose them instead if
+    better. Rendered errors are the better guide, except for parts that move far: there, straightening an
+    attribute changes more than a sum of effects can express.
     """
     candidates = []
     ticks = tuple(strengths.tolist())
@@ -324,7 +344,7 @@ def _separable(
 
 
 def grow_ranks(seen: RenderedTrajectories) -> list[dict[str, int]]:
-    """Ranks from none upwards; each step adds the basis that takes most rendered error per byte."""
+    """Return ranks from 0 upwards. Each step adds the basis that removes the most rendered error per byte."""
     widths = {name: trajectory.offsets.shape[2] for name, trajectory in seen.trajectories.items()}
     ranks = dict.fromkeys(seen.trajectories, 0)
     path = [dict(ranks)]
@@ -339,16 +359,16 @@ def grow_ranks(seen: RenderedTrajectories) -> list[dict[str, int]]:
 
 @dataclass(frozen=True)
 class RenderedTrajectories:
-    """What straightening each attribute changes in the pictures."""
+    """Rendered effect of straightening each attribute."""
 
     trajectories: Mapping[str, AttributeTrajectory]  # by attribute
-    gram: Tensor  # inner products of these changes over pixels and colors. [A,T,A,T] float64
-    values: int  # numbers that each inner product sums over
+    gram: Tensor  # inner products of these changes over pixels and channels. [A,T,A,T] float64
+    values: int  # number of values summed by each inner product
     channels: int  # width of a packed row
 
     @cached_property
     def modes(self) -> Mapping[str, Tensor]:
-        """Each attribute's best bases, as `separable.principal_modes` gives them."""
+        """Best bases of each attribute, see `separable.principal_modes`."""
         modes = {}
         for i, (name, trajectory) in enumerate(self.trajectories.items()):
             seen = self.gram[i, :, i]
@@ -358,12 +378,12 @@ class RenderedTrajectories:
         return modes
 
     def mse(self, ranks: Mapping[str, int]) -> Tensor:
-        """Expected mean squared error of the pictures at each snapshot. [T] float64"""
+        """Return the expected mean squared error of the renders at each snapshot. [T] float64"""
         snapshots = self.gram.shape[1]
         remaining = torch.eye(snapshots, dtype=torch.float64).repeat(len(self.trajectories), 1, 1)
         for i, name in enumerate(self.trajectories):
             mix = self.modes[name][:, : ranks.get(name, 0)]
-            remaining[i] -= mix @ mix.T  # row t: what remains there, as a sum of the rows of pixels
+            remaining[i] -= mix @ mix.T  # row t: the remainder at snapshot t, as a sum of the rows of pixels
         half = torch.einsum("ats,asbu->atbu", remaining, self.gram)
         return torch.einsum("atbu,btu->t", half, remaining).clamp(min=0) / self.values
 
@@ -371,13 +391,13 @@ class RenderedTrajectories:
 def render_trajectories(
     offsets: Tensor, weights: Tensor, render: Render, ends: Ends | None = None
 ) -> RenderedTrajectories:
-    """Straighten every attribute at every snapshot, and look.
+    """Straighten every attribute at every snapshot and render the change.
 
     Args:
         offsets: [T,M,C] float32, the first row 0
-        weights: how much an error of each number shows, ≥ 0. [M,C]
-        render: called (1 + A)·(T − 2) times at most, where T counts no more than `MAX_FITTED_SNAPSHOTS`
-        ends: as they are stored; the last row of the offsets becomes what they decode to
+        weights: importance of an error in each number, ≥ 0. [M,C]
+        render: called at most (1 + A)·(T − 2) times, where T is at most `MAX_FITTED_SNAPSHOTS`
+        ends: stored full offsets; their decoded form replaces the last row of the offsets
     """
     attributes = moving_attributes(offsets)
     ends = ends or {}
@@ -394,26 +414,27 @@ def render_trajectories(
         gram = torch.zeros(len(attributes), snapshots, len(attributes), snapshots, dtype=torch.float64)
         return RenderedTrajectories(trajectories, gram, 1, offsets.shape[2])
     count = min(snapshots, MAX_FITTED_SNAPSHOTS)
-    looked = [round(i * (snapshots - 1) / (count - 1)) for i in range(count)]  # even, both ends among them
+    # evenly spaced, both ends included
+    looked = [round(i * (snapshots - 1) / (count - 1)) for i in range(count)]
     changes: list[list[Tensor]] = [[] for _ in attributes]
     with torch.no_grad():
         for t in looked[1:-1]:
             pixels = render(offsets[t])
             stride = max(1, -(-len(pixels) // MAX_PIXELS))
             for i, (name, columns) in enumerate(attributes.items()):
-                straight = offsets[t].clone()
-                straight[:, columns] = trajectories[name].amplitude[t] * offsets[-1, :, columns]
-                changes[i].append((pixels - render(straight))[::stride].flatten())
-    still = torch.zeros_like(changes[0][0])
+                straightened = offsets[t].clone()
+                straightened[:, columns] = trajectories[name].amplitude[t] * offsets[-1, :, columns]
+                changes[i].append((pixels - render(straightened))[::stride].flatten())
+    no_change = torch.zeros_like(changes[0][0])
     spread = _interpolation_weights(looked, snapshots)
-    rows = torch.cat([torch.stack([still, *pixel_rows, still]) for pixel_rows in changes])
+    rows = torch.cat([torch.stack([no_change, *pixel_rows, no_change]) for pixel_rows in changes])
     products = (rows @ rows.T).double().reshape(len(attributes), len(looked), len(attributes), len(looked))
     gram = torch.einsum("ts,asbu,vu->atbv", spread, products, spread)
     return RenderedTrajectories(trajectories, gram, max(1, rows.shape[1]), offsets.shape[2])
 
 
 def _interpolation_weights(looked: Sequence[int], snapshots: int) -> Tensor:
-    """How much of each snapshot that is looked at every one holds. [T,L] float64"""
+    """Return the weight of each rendered snapshot in every snapshot. [T,L] float64"""
     shares = torch.zeros(snapshots, len(looked), dtype=torch.float64)
     shares[looked, range(len(looked))] = 1.0
     for column, (a, b) in enumerate(pairwise(looked)):

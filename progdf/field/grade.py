@@ -1,12 +1,13 @@
-"""The grade field: one map of color for the whole region, and a small residual by Gaussian.
+"""Grade field: one color map for the whole region, and a small residual per Gaussian.
 
-For each knot of the slider the map is a polynomial of the drawn color q = clamp(SH color, 0, 1.5):
-color' = Σ_k c_k m_k(q), with m_k the monomials up to the degree; that of a .cube file is linear between the
-points of its lattice, on q = clamp(SH color, 0, 1). It is held as spherical harmonics of the
-members, which are computed from the scene's own when the field is loaded, so that a file keeps some hundred
-numbers and whatever draws Gaussians draws it. A pattern takes a mask beside it: a byte by Gaussian, how much
-of the map it takes. What both cannot say of single Gaussians is a residual of their lowest bands, of a few
-int8 bases.
+At each knot of the slider the map is a polynomial of the drawn color q = clamp(SH color, 0, 1.5):
+color' = Σ_k c_k m_k(q), with m_k the monomials up to the degree. The map of a .cube file is linear between
+the points of its lattice, on q = clamp(SH color, 0, 1).
+
+The mapped colors are spherical harmonics of the members. They are computed from the scene's own when the
+field is loaded. So a file stores only some hundred numbers, and any renderer of Gaussians draws the result. A
+pattern adds a mask: one byte per Gaussian, the share of the map that it takes. The remainder of single
+Gaussians is a residual of their lowest bands, stored in a small number of int8 bases.
 """
 
 from __future__ import annotations
@@ -38,20 +39,22 @@ from .baked import (
 from .separable import fit_course
 
 MAX_COLOR = 1.5
-"""Colors above this, which no screen shows, are mapped as this."""
+"""Upper limit of the map's input. No screen shows brighter colors."""
 
 _FIRST_BAND = BASE_CHANNELS - 3  # column of a packed row, see `attribute_slices`; the others follow
-_DIRECTIONS = 32  # in which a member's color is mapped; twice the functions of three bands
-_CHUNK = 1 << 11  # members at once
+_DIRECTIONS = 32  # directions in which a member's color is mapped; twice the functions of three bands
+_CHUNK_MEMBERS = 1 << 11  # members at once
 MAX_RESIDUALS = MAX_RANK // 2
-"""Bases of a residual that are tried, each in up to two."""
+"""Maximum number of residual bases to try. Each may be stored as two."""
+
 COARSER = tuple(2.0 ** (i / 8) for i in range(-8, 25))
-"""Steps of a residual's levels that are tried; with 1 nearly all members take 8 bits."""
-_WITHIN = 0.999  # share of the members that do: few must not take the levels of all
+"""Step sizes of a residual's levels to try. At 1, nearly all members fit into 8 bits."""
+
+_FITTING_SHARE = 0.999  # share of the members that fit into 8 bits: outliers must not coarsen all levels
 
 
 def monomials(colors: Tensor, degree: int) -> Tensor:
-    """The monomials of colors up to a degree, 1 first. [3,...] -> [K,...]"""
+    """Return the monomials of colors up to a degree, 1 first. [3,...] -> [K,...]"""
     red, green, blue = colors
     terms = [torch.ones_like(red), red, green, blue]
     if degree >= 2:
@@ -66,7 +69,7 @@ def monomials(colors: Tensor, degree: int) -> Tensor:
 
 @cache
 def sphere(degree: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Values of the bands in even directions of the sphere, and their least squares. [D,B], [B,D] float32"""
+    """Return SH functions in even directions of the sphere, and their pseudoinverse. [D,B], [B,D] float32"""
     index = torch.arange(_DIRECTIONS, dtype=torch.float64) + 0.5
     z = 1 - 2 * index / _DIRECTIONS
     angle = math.pi * (1 + math.sqrt(5)) * index
@@ -76,16 +79,16 @@ def sphere(degree: int, device: torch.device) -> tuple[Tensor, Tensor]:
 
 
 def map_colors(sh: Tensor, table: Tensor, degree: int) -> Tensor:
-    """Spherical harmonics that show, from everywhere, what a map makes of the colors that they showed.
+    """Return spherical harmonics that show, from all directions, the mapped colors of the given ones.
 
-    What is drawn is clamped at 0, so a color that is to be black may be anything below: members whose colors
-    go below 0 are projected once more, but for the directions where they are black and are to be. (More such
-    rounds, and 48 directions, give .01 dB.) With the identity all stay as they are, bit for bit.
+    Drawn colors are clamped at 0, so any negative value represents black. Members with negative colors are
+    therefore projected a second time, without the directions in which they are black before and after. (More
+    rounds, and 48 directions, gain 0.01 dB.) The identity returns all coefficients unchanged, bit for bit.
 
     Args:
-        sh: of M members, B bands. [M,B,3]
+        sh: coefficients of M members, B bands. [M,B,3]
         table: the map. [K,3]
-        degree: of the map
+        degree: degree of the map
 
     Returns:
         [M,B,3]
@@ -98,12 +101,12 @@ def map_colors(sh: Tensor, table: Tensor, degree: int) -> Tensor:
         mapped = map_drawn(colors, table, degree)
         hidden = ((mapped <= 0.0) & (colors <= 0.0)).T
         return torch.where(hidden, sh[:, 0], (mapped.T - 0.5) / C0)[:, None]
-    chunks: tuple[Tensor, ...] = torch.split(sh.movedim(2, 0), _CHUNK, dim=1)
+    chunks: tuple[Tensor, ...] = torch.split(sh.movedim(2, 0), _CHUNK_MEMBERS, dim=1)
     return torch.cat([_map_chunk(chunk, table, degree) for chunk in chunks], dim=1).movedim(0, 2).contiguous()
 
 
 def map_drawn(colors: Tensor, table: Tensor, degree: int) -> Tensor:
-    """What the map makes of colors; of a polynomial, what is above `MAX_COLOR` stays. [3,...] -> [3,...]"""
+    """Return the mapped colors. A polynomial keeps the excess above `MAX_COLOR`. [3,...] -> [3,...]"""
     if degree == LATTICE:
         return look_up(colors.clamp(0.0, 1.0), table)
     terms = monomials(colors.clamp(0.0, MAX_COLOR), degree).flatten(1)
@@ -111,39 +114,39 @@ def map_drawn(colors: Tensor, table: Tensor, degree: int) -> Tensor:
 
 
 def look_up(colors: Tensor, table: Tensor) -> Tensor:
-    """Linear between the eight points of a lattice around each color, 0..1. [3,...], [K,3] -> [3,...]"""
+    """Interpolate linearly between the 8 lattice points around a color, 0..1. [3,...], [K,3] -> [3,...]"""
     side = lattice_side(len(table))
     lattice = table.T.reshape(1, 3, side, side, side)  # blue, green, red
-    places = (2.0 * colors.flatten(1).T - 1.0)[None, None, None]
-    return grid_sample(lattice, places, align_corners=True)[0, :, 0, 0].reshape(colors.shape)
+    positions = (2.0 * colors.flatten(1).T - 1.0)[None, None, None]
+    return grid_sample(lattice, positions, align_corners=True)[0, :, 0, 0].reshape(colors.shape)
 
 
 def _map_chunk(sh: Tensor, table: Tensor, degree: int) -> Tensor:
-    """`map_colors` of the channels of some members. [3,m,B] -> [3,m,B]"""
+    """Apply `map_colors` to some members, channels first. [3,m,B] -> [3,m,B]"""
     values, inverse = sphere(math.isqrt(sh.shape[2]) - 1, sh.device)
     colors = sh @ values.T + 0.5
     mapped = map_drawn(colors, table, degree)
-    made = sh + (mapped - colors.clamp_min(0.0)) @ inverse.T
+    new_sh = sh + (mapped - colors.clamp_min(0.0)) @ inverse.T
     clamped = (colors.amin(dim=2) < 0.0) | (mapped.amin(dim=2) < 0.0)
-    some = made[clamped]
+    clamped_sh = new_sh[clamped]
     target = mapped[clamped]
-    now = some @ values.T + 0.5
-    made[clamped] += (target - now).masked_fill_((target <= 0.0) & (now <= 0.0), 0.0) @ inverse.T
-    return made
+    drawn = clamped_sh @ values.T + 0.5
+    new_sh[clamped] += (target - drawn).masked_fill_((target <= 0.0) & (drawn <= 0.0), 0.0) @ inverse.T
+    return new_sh
 
 
 def member_bands(rows: Tensor) -> Tensor:
-    """The bands of packed rows that are drawn. [M,14+3K] -> [M,B,3]"""
+    """Return the bands of packed rows that are drawn. [M,14+3K] -> [M,B,3]"""
     return rows[:, _FIRST_BAND:].reshape(len(rows), -1, 3)[:, :16].contiguous()
 
 
 def band_offsets(change: Tensor, channels: int) -> Tensor:
-    """A change of the lowest bands as packed offsets. [M,B,3] -> [M,channels]"""
+    """Return a change of the lowest bands as packed offsets. [M,B,3] -> [M,channels]"""
     return pad(change.flatten(1), (_FIRST_BAND, channels - _FIRST_BAND - 3 * change.shape[1]))
 
 
 def mapped_bands(form: GradeForm, rows: Tensor) -> Tensor:
-    """What the map adds to the members' bands at each knot. [M,14+3K] -> [S,M,3B]"""
+    """Return the map's change of the members' bands at each knot. [M,14+3K] -> [S,M,3B]"""
     sh = member_bands(rows)
     share = form.share[:, None]
     changes = [share * (map_colors(sh, at_knot, form.degree) - sh).flatten(1) for at_knot in form.table]
@@ -151,26 +154,26 @@ def mapped_bands(form: GradeForm, rows: Tensor) -> Tensor:
 
 
 def bake_grade(form: GradeForm, rows: Tensor, mapped: Tensor | None = None) -> BakedField:
-    """The field that runs.
+    """Return the baked field of a grade.
 
     Args:
-        form: what a file keeps
+        form: stored form
         rows: raw values of the members before the edit, packed. [M,14+3K]
-        mapped: see `mapped_bands`, where that is known
+        mapped: result of `mapped_bands`, if already known
 
     Raises:
-        ValueError: not as many Gaussians, or fewer bands than the residual has.
+        ValueError: the number of Gaussians differs, or they have fewer bands than the residual.
     """
     width = form.residual.shape[2]
     if len(rows) != form.members or width // 3 > member_bands(rows).shape[1]:
         raise ValueError(f"a grade of {form.members} members for {len(rows)} of {rows.shape[1]} numbers")
-    course = mapped_bands(form, rows) if mapped is None else mapped.clone()
+    changes = mapped_bands(form, rows) if mapped is None else mapped.clone()
     if len(form.residual):
-        course[:, :, :width] += torch.einsum(
+        changes[:, :, :width] += torch.einsum(
             "sr,rmc->smc", form.coefficients, form.residual * form.scale[:, None]
         )
     higher = rows.shape[1] - BASE_CHANNELS
-    parts = {"sh0": course[:, :, :3], "shN": pad(course[:, :, 3:], (0, higher - course.shape[2] + 3))}
+    parts = {"sh0": changes[:, :, :3], "shN": pad(changes[:, :, 3:], (0, higher - changes.shape[2] + 3))}
     attributes = {name: fit_course(part) for name, part in parts.items() if bool(part.any())}
     knots = form.knots.tolist()
     baked = BakedField("grade", form.knots, attributes, rows.shape[1], tuple(knots), form)
@@ -178,19 +181,19 @@ def bake_grade(form: GradeForm, rows: Tensor, mapped: Tensor | None = None) -> B
 
 
 def adjust_colors(form: GradeForm, sh: Tensor, members: Tensor | slice, s: float) -> Tensor:
-    """What a grade adds at strength `s` to colors that others have changed already.
+    """Return the change by a grade at strength `s`, applied to colors that other layers have changed.
 
     Args:
         form: the grade
-        sh: of these members, as it lies below. [m,B,3]
-        members: which of the grade's members these are
-        s: of the slider; beyond 1 the last segment goes on
+        sh: coefficients of these members in the layers below. [m,B,3]
+        members: indices of these members in the grade
+        s: slider value; beyond 1 the last segment continues
 
     Returns:
         [m,B,3]; exactly 0 at 0, and the map and residual of the file at 1
     """
     right, share = _segment(form, s)
-    if form.degree == LATTICE:  # colors above 1 go the straight way too
+    if form.degree == LATTICE:  # colors above 1 change linearly too
         change = share * (map_colors(sh, form.table[right], LATTICE) - sh)
     else:
         change = map_colors(sh, map_at(form, s), form.degree) - sh
@@ -203,9 +206,9 @@ def adjust_colors(form: GradeForm, sh: Tensor, members: Tensor | slice, s: float
 
 
 def map_share(field: BakedField) -> Tensor:
-    """How much of each member's change at strength 1 is its map's: 1 − |residual|² / |map|², 0..1. [M]
+    """Return the map's share of each member's change at strength 1: 1 − |residual|² / |map|², 0..1. [M]
 
-    Where the residual undoes the map, as between stripes, or does as much again, it is 0.
+    It is 0 where the residual undoes the map, as between stripes, or is as large as the map's change.
     """
     form = field.origin
     moved = field.attributes
@@ -221,7 +224,7 @@ def map_share(field: BakedField) -> Tensor:
 
 
 def map_at(form: GradeForm, s: float) -> Tensor:
-    """The map of a grade at strength `s` of the slider. [K,3]"""
+    """Return the map of a grade at slider value `s`. [K,3]"""
     right, share = _segment(form, s)
     return torch.lerp(form.table[right - 1], form.table[right], share)
 
@@ -232,25 +235,25 @@ def _segment(form: GradeForm, s: float) -> Segment:
 
 
 def mapped_lattice(form: GradeForm, s: float, side: int) -> Tensor:
-    """What the map at strength `s` makes of the colors of a lattice, see `lattice_colors`. [side³,3]"""
+    """Return the mapped colors of a lattice at strength `s`, see `lattice_colors`. [side³,3]"""
     return map_drawn(lattice_colors(side).T, map_at(form, s), form.degree).T
 
 
 def lattice_form(table: Tensor) -> GradeForm:
-    """The grade of a lattice, for no members: the straight way to the colors of the table. [K,3]"""
+    """Return the grade of a lattice without members: a linear change to the colors of the table. [K,3]"""
     ends = torch.stack([lattice_colors(lattice_side(len(table))), table])
     return map_form(torch.tensor([0.0, 1.0]), LATTICE, ends, 0)
 
 
 def map_alone(form: GradeForm, members: int) -> GradeForm:
-    """The map of a grade alone, for so many members of any scene."""
+    """Return the map of a grade without residual, for this number of members of any scene."""
     return replace(map_form(form.knots, form.degree, form.table, members), remap=form.remap)
 
 
 def map_form(knots: Tensor, degree: int, table: Tensor, members: int) -> GradeForm:
-    """A grade that is a map alone. [S], [S,K,3]"""
-    none = torch.zeros(0, members, 0, dtype=torch.int8)
-    return GradeForm(degree, knots, table, none, torch.zeros(0, 0), torch.zeros(len(knots), 0))
+    """Return a grade without residual. [S], [S,K,3]"""
+    no_residual = torch.zeros(0, members, 0, dtype=torch.int8)
+    return GradeForm(degree, knots, table, no_residual, torch.zeros(0, 0), torch.zeros(len(knots), 0))
 
 
 def fit_grade(
@@ -263,30 +266,30 @@ def fit_grade(
     mask: Tensor | None = None,
     coarser: float = 1.0,
 ) -> GradeForm:
-    """A grade whose residual has so many bases.
+    """Fit a grade whose residual has a given number of bases.
 
     Args:
         knots: strengths, ascending from 0 to 1. [S]
-        degree: of the map
-        table: the map at each knot, the identity at the first. [S,K,3]
-        course: what the members' lowest bands need beside the map at each knot; 0 at the first. [S,M,3b]
+        degree: degree of the map
+        table: map at each knot, the identity at the first. [S,K,3]
+        course: residual of the members' lowest bands at each knot; 0 at the first. [S,M,3b]
         rank: number of bases, at most `rank_limit`
-        weights: how much an error of each member shows, ≥ 0. [M]
+        weights: visibility of an error in each member, ≥ 0. [M]
         mask: see `GradeForm`
-        coarser: how many of the steps that 8 bits have one of its steps is; they compress the better
+        coarser: step size in units of the 8-bit step; larger steps compress better
     """
     root = weights.sqrt()[:, None]
     rows = (course * root).flatten(1)
     _, vectors = torch.linalg.eigh((rows @ rows.T).double())
     mix = vectors.flip(1)[:, :rank].T.float()
     exact = (mix @ course.flatten(1)).reshape(rank, *course.shape[1:])
-    # one step for all, as all are of colors: channels that hardly move take few levels, and compress
-    nearly_all = max(1, math.ceil(_WITHIN * exact.shape[1]))
-    step = coarser / 127.0 * (float(exact.abs().kthvalue(nearly_all, dim=1).values.max()) if rank else 0.0)
-    whole = (exact / (step or 1.0)).round().clamp(-254.0, 254.0)
-    levels = whole.clamp(-127.0, 127.0).to(torch.int8)
-    beyond = (whole - levels).to(torch.int8)  # of few members, in bases of their own
-    levels = torch.cat([levels, beyond[beyond.flatten(1).any(dim=1)]])
+    # one step for all, as all are colors: channels with small changes get few levels and compress well
+    fitting_count = max(1, math.ceil(_FITTING_SHARE * exact.shape[1]))
+    step = coarser / 127.0 * (float(exact.abs().kthvalue(fitting_count, dim=1).values.max()) if rank else 0.0)
+    rounded = (exact / (step or 1.0)).round().clamp(-254.0, 254.0)
+    levels = rounded.clamp(-127.0, 127.0).to(torch.int8)
+    overflow = (rounded - levels).to(torch.int8)  # overflow of outliers, stored in bases of their own
+    levels = torch.cat([levels, overflow[overflow.flatten(1).any(dim=1)]])
     scale = torch.full((len(levels), exact.shape[2]), step or 1.0)
     columns = (levels * scale[:, None] * root).flatten(1)
     normal = (columns @ columns.T).double()
@@ -296,5 +299,5 @@ def fit_grade(
 
 
 def rank_limit(course: Tensor) -> int:
-    """The most bases that say anything of a residual's course. [S,M,3b]"""
+    """Return the largest useful number of bases for a residual. course: [S,M,3b]"""
     return min(len(course) - 1, MAX_RESIDUALS) if bool(course.any()) else 0

@@ -1,8 +1,8 @@
-"""Fitting a neural field to a trajectory: Adam on what is drawn from its snapshots (ProGDF, AAAI 2025).
+"""Fit of a neural field to a trajectory: Adam on random samples of its snapshots (ProGDF, AAAI 2025).
 
-The direct loss compares offsets, in spreads of their attribute, weighted by how visible the Gaussian is and
-by how much the attribute shows in pictures; it needs no rendering. The paper's loss compares pictures, of a
-snapshot drawn at random. Weighting by what shows is worth 3.5 dB (robot recolored, 33 after 29).
+The direct loss compares offsets, in units of their attribute's spread. It is weighted by the visibility of
+the Gaussian and by the attribute's effect on pictures, and needs no rendering. The paper's loss compares
+renders of a random snapshot. Weighting by the effect on pictures gains 3.5 dB (robot recolored, 33 after 29).
 """
 
 from __future__ import annotations
@@ -22,15 +22,18 @@ from .separable import channel_weights, quantize_bases
 
 
 class PictureLoss(Protocol):
-    """How far pictures of the field are from those of the recording."""
+    """Difference between renders of the field and of the recording."""
 
     @property
     def views(self) -> int:
-        """In how many views."""
+        """Number of views."""
         ...
 
     def __call__(self, offsets: Tensor, recorded: Tensor, view: int, /) -> Tensor:
-        """Packed offsets of the field and those recorded at the same strength. [M,C], [M,C] -> []"""
+        """Return the loss of the field's packed offsets against the recording, at one strength in one view.
+
+        [M,C], [M,C] -> []
+        """
         ...
 
 
@@ -39,38 +42,38 @@ EFFORT: Mapping[Size, tuple[int, int, float]] = {
     "small": (1200, 2048, 2e-3),
     "paper": (2000, 1024, 5e-4),
 }
-"""Steps, members drawn in each, largest learning rate."""
+"""Size → steps, members per step, largest learning rate."""
 
-_WARMUP = 50  # steps
+_WARMUP_STEPS = 50
 
 
 @dataclass(frozen=True)
 class NeuralSettings:
-    """What to train and for how long."""
+    """Network and length of its training."""
 
-    size: Size = "tiny"  # "tiny" and "small" take up to a minute on two cores, "paper" a quarter of an hour
+    size: Size = "tiny"  # "tiny" and "small" take up to a minute on two cores, "paper" 15 minutes
     inputs: Inputs = "own"  # see `NeuralShape`
-    code: int = 0  # numbers in each Gaussian's learned code; a byte each in the file
-    bins: Bins = "smooth"  # "smooth", or "hard" as the paper's
-    steps: int = 0  # 0 is what the size needs
-    batch: int = 0  # members drawn in each step; 0 is what the size needs
-    seed: int = 0  # of the first weights and of what is drawn
+    code: int = 0  # length of each Gaussian's learned code; one byte per number in the file
+    bins: Bins = "smooth"  # "smooth", or "hard" as in the paper
+    steps: int = 0  # 0: the size's own value
+    batch: int = 0  # members per step; 0: the size's own value
+    seed: int = 0  # seed of the initial weights and of the samples
 
     def resolve(self) -> NeuralSettings:
-        """The same with every 0 replaced by the size's own value."""
+        """Return the settings with every 0 replaced by the size's own value."""
         steps, batch, _ = EFFORT[self.size]
         return replace(self, steps=self.steps or steps, batch=self.batch or batch)
 
 
 class NeuralFit:
-    """A network in training. Its state is a table of named tensors, so that a run can be continued.
+    """Network in training. Its state is a set of named tensors, so that a run can be continued.
 
     Args:
         rows: raw values of the members before the edit, packed. [M,≥14]
         channels: width of a packed row, 14 or 14 + 3K
-        attributes: those that move
-        settings: see there
-        visibility: how much each member shows. [M]; None is evenly
+        attributes: attributes that change
+        settings: network and length of its training
+        visibility: visibility of each member. [M]; None: uniform
     """
 
     def __init__(
@@ -88,19 +91,19 @@ class NeuralFit:
         )
         self.steps = 0
         self._rows = rows
-        self._draws = torch.Generator().manual_seed(settings.seed)
-        self._frame = _place_frame(self.shape, rows)
-        self._learned = _initial_weights(self.shape, self._draws)
+        self._generator = torch.Generator().manual_seed(settings.seed)
+        self._frame = _initial_frame(self.shape, rows)
+        self._learned = _initial_weights(self.shape, self._generator)
         if self.shape.code:
-            self._learned["codes"] = 0.1 * torch.randn(len(rows), self.shape.code, generator=self._draws)
+            self._learned["codes"] = 0.1 * torch.randn(len(rows), self.shape.code, generator=self._generator)
         for tensor in self._learned.values():
             tensor.requires_grad_()
         self._adam = torch.optim.Adam(list(self._learned.values()), lr=self._rate, fused=True)
         visible = channel_weights(visibility, len(rows), 1)[:, 0]
-        self._shown = visible / visible.mean().clamp_min(1e-12)
+        self._visibility = visible / visible.mean().clamp_min(1e-12)
         self._importance = torch.full((len(self.shape.columns),), 1.0 / len(self.shape.columns))
         self._end = torch.zeros(len(rows), len(self.shape.columns))
-        self._told = torch.zeros(0)
+        self._inputs = torch.zeros(0)
 
     @property
     def members(self) -> int:
@@ -108,11 +111,11 @@ class NeuralFit:
         return len(self._rows)
 
     def scale_to(self, offsets: Tensor, importance: Mapping[str, float] | None = None) -> None:
-        """Learn of the trajectory's size, or of how it has grown; what the network answers stays the same.
+        """Adapt the scales to a trajectory, or to its growth. The network's offsets stay the same.
 
         Args:
-            offsets: of the snapshots so far. [T,M,C]
-            importance: how much an error of each attribute shows, in all 1; None is the same for every number
+            offsets: offsets of the snapshots so far. [T,M,C]
+            importance: visibility of an error in each attribute, with sum 1; None: the same for every number
         """
         columns = self.shape.columns
         self._end = offsets[-1][:, columns].float()
@@ -120,7 +123,7 @@ class NeuralFit:
         after = before.clone()
         for name, outputs in self.shape.outputs.items():
             trajectory = offsets[1:][:, :, columns[outputs]].float()
-            power = (trajectory.square().mean(dim=(0, 2)) * self._shown).mean()
+            power = (trajectory.square().mean(dim=(0, 2)) * self._visibility).mean()
             after[outputs] = float(power.sqrt().clamp_min(1e-12))
             if importance is not None:
                 self._importance[outputs] = importance.get(name, 0.0) / (outputs.stop - outputs.start)
@@ -132,11 +135,11 @@ class NeuralFit:
                     self._learned[name].mul_(factor[:, None] if name == "heads.weight" else factor)
         self._frame["spread"] = after
         if self.shape.inputs == "own" and len(self._rows):
-            look = neural.appearance(self._rows, self._end)
-            spread = look.std(dim=0, correction=0)
-            self._frame["look_mean"] = look.mean(dim=0)
+            appearances = neural.appearance(self._rows, self._end)
+            spread = appearances.std(dim=0, correction=0)
+            self._frame["look_mean"] = appearances.mean(dim=0)
             self._frame["look_spread"] = torch.where(spread > 1e-6, spread, torch.ones_like(spread))
-        self._told = neural.encode(self.shape, self._frame, self._rows, self._end)
+        self._inputs = neural.encode(self.shape, self._frame, self._rows, self._end)
 
     def step(
         self,
@@ -145,20 +148,20 @@ class NeuralFit:
         factor: float = 1.0,
         pictures: PictureLoss | None = None,
     ) -> float:
-        """One step of Adam on what is drawn from the snapshots; `scale_to` comes first.
+        """Take one step of Adam on random samples of the snapshots. Call `scale_to` first.
 
         Args:
-            strengths: of the snapshots, ascending from 0. [T]
-            offsets: [T,M,C], any floating type
-            factor: of the learning rate
-            pictures: compare pictures instead of offsets: of one snapshot (not between two) in one view,
-                both drawn at random
+            strengths: strengths of the snapshots, ascending from 0. [T]
+            offsets: offsets of the snapshots. [T,M,C], any floating type
+            factor: factor of the learning rate
+            pictures: compare renders instead of offsets: of one snapshot (not between two) in one view, both
+                chosen at random
 
         Returns:
             The loss.
 
         Raises:
-            FloatingPointError: it is no longer finite.
+            FloatingPointError: the loss is not finite.
         """
         self.steps += 1
         if not len(self._rows):
@@ -171,38 +174,38 @@ class NeuralFit:
         if not math.isfinite(value):
             raise FloatingPointError(f"the field's loss is {value} at step {self.steps}")
         for group in self._adam.param_groups:
-            group["lr"] = self._rate * factor * min(1.0, self.steps / _WARMUP)
+            group["lr"] = self._rate * factor * min(1.0, self.steps / _WARMUP_STEPS)
         self._adam.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         self._adam.step()
         return value
 
     def _offset_loss(self, strengths: Tensor, offsets: Tensor) -> Tensor:
-        """Of some members, each anywhere on the slider. []"""
-        rows = torch.randint(len(self._rows), (self.settings.batch,), generator=self._draws)
-        right = torch.randint(1, len(strengths), rows.shape, generator=self._draws)
-        share = torch.rand(rows.shape, generator=self._draws)
+        """Return the loss of random members, each at a random strength. []"""
+        rows = torch.randint(len(self._rows), (self.settings.batch,), generator=self._generator)
+        right = torch.randint(1, len(strengths), rows.shape, generator=self._generator)
+        share = torch.rand(rows.shape, generator=self._generator)
         s = torch.lerp(strengths[right - 1], strengths[right], share)
         low = offsets[right - 1, rows].float()
         high = offsets[right, rows].float()
         recorded = torch.lerp(low, high, share[:, None])
-        errors = (self._answer(rows, s) - recorded[:, self.shape.columns]) / self._frame["spread"]
-        return (self._shown[rows, None] * self._importance * errors.square()).sum(dim=1).mean()
+        errors = (self._predict(rows, s) - recorded[:, self.shape.columns]) / self._frame["spread"]
+        return (self._visibility[rows, None] * self._importance * errors.square()).sum(dim=1).mean()
 
     def _picture_loss(self, strengths: Tensor, offsets: Tensor, pictures: PictureLoss) -> Tensor:
-        """Of all members, at one snapshot but the original, in one view. []"""
-        snapshot = int(torch.randint(1, len(strengths), (1,), generator=self._draws))
-        view = int(torch.randint(pictures.views, (1,), generator=self._draws))
+        """Return the loss of all members, at one random snapshot except the original, in one view. []"""
+        snapshot = int(torch.randint(1, len(strengths), (1,), generator=self._generator))
+        view = int(torch.randint(pictures.views, (1,), generator=self._generator))
         rows = torch.arange(len(self._rows))
-        moved_columns = self._answer(rows, strengths[snapshot].expand(len(rows)))
+        moved_columns = self._predict(rows, strengths[snapshot].expand(len(rows)))
         recorded = offsets[snapshot].float()
         moved = torch.zeros_like(recorded).index_copy(1, self.shape.columns, moved_columns)
         return pictures(moved, recorded, view)
 
-    def _answer(self, rows: Tensor, s: Tensor) -> Tensor:
-        """The field's offsets for drawn members and strengths. [B], [B] -> [B,c]"""
+    def _predict(self, rows: Tensor, s: Tensor) -> Tensor:
+        """Return the field's offsets for sampled members and strengths. [B], [B] -> [B,c]"""
         signal = neural.control_signal(self.shape, self._learned["control"], s)
-        parts = [self._told[rows], signal]
+        parts = [self._inputs[rows], signal]
         if self.shape.code:
             parts.insert(1, self._learned["codes"].index_select(0, rows))
         hidden = linear(
@@ -214,17 +217,17 @@ class NeuralFit:
         return neural.offsets_of_answer(self.shape, s, answer, self._end[rows])
 
     def capture_state(self) -> dict[str, Tensor]:
-        """Everything that the next steps depend on, by name; the snapshots aside."""
+        """Return everything that the next steps depend on, by name, except the snapshots."""
         state = {f"learned.{name}": tensor.detach() for name, tensor in self._learned.items()}
         state |= {f"frame.{name}": tensor for name, tensor in self._frame.items()}
         state |= {"end": self._end, "importance": self._importance, "steps": torch.tensor(self.steps)}
         for name, tensor in self._learned.items():
-            for what, moment in self._adam.state[tensor].items():
-                state[f"adam.{name}.{what}"] = moment
-        return state | {"draws": self._draws.get_state()}
+            for key, moment in self._adam.state[tensor].items():
+                state[f"adam.{name}.{key}"] = moment
+        return state | {"draws": self._generator.get_state()}
 
     def restore(self, saved: Mapping[str, Tensor]) -> None:
-        """Take over what `capture_state` gave, of a fit made with the same arguments."""
+        """Restore the result of `capture_state` from a fit made with the same arguments."""
         for name, tensor in self._learned.items():
             tensor.data.copy_(saved[f"learned.{name}"])
             begin = f"adam.{name}."
@@ -234,15 +237,15 @@ class NeuralFit:
         self._frame = {name: saved[f"frame.{name}"].clone() for name in self._frame}
         self._end, self._importance = saved["end"].clone(), saved["importance"].clone()
         self.steps = int(saved["steps"])
-        self._draws.set_state(saved["draws"])
-        self._told = neural.encode(self.shape, self._frame, self._rows, self._end)
+        self._generator.set_state(saved["draws"])
+        self._inputs = neural.encode(self.shape, self._frame, self._rows, self._end)
 
     def adopt(self, shape: NeuralShape, saved: Mapping[str, Tensor]) -> None:
-        """Begin with the weights of another fit of the same members, whose outputs may be more than ours.
+        """Start from the weights of another fit of the same members, which may have more outputs.
 
         Args:
-            shape: of the other
-            saved: what its `capture_state` gave
+            shape: layout of the other fit
+            saved: result of its `capture_state`
         """
         rows = torch.cat(
             [torch.arange(p.start, p.stop) for n, p in shape.outputs.items() if n in self.shape.outputs]
@@ -251,18 +254,18 @@ class NeuralFit:
             source = saved[f"learned.{name}"]
             tensor.data.copy_(source[rows] if name.startswith("heads.") else source)
         self._frame["spread"] = saved["frame.spread"][rows].clone()
-        self.steps = 1  # from here on, `scale_to` keeps what the network answers
+        self.steps = 1  # from here on, `scale_to` preserves the network's offsets
 
     def field(self, recorded: tuple[float, ...] = ()) -> NeuralField:
-        """The network as it is stored: weights in float16, codes in int8."""
+        """Return the network in stored form: weights in float16, codes in int8."""
         learned = {name: tensor.detach().half() for name, tensor in self._learned.items() if name != "codes"}
         codes = self._learned.get("codes", torch.zeros(len(self._rows), 0)).detach()
         stored, step = quantize_bases(codes[None], torch.int8)
         return NeuralField(self.shape, {**learned, **self._frame}, self._end, stored[0], step[0], recorded)
 
 
-def _place_frame(shape: NeuralShape, rows: Tensor) -> dict[str, Tensor]:
-    """The box of the region, and scales that `scale_to` will set."""
+def _initial_frame(shape: NeuralShape, rows: Tensor) -> dict[str, Tensor]:
+    """Return the box of the region, and initial scales that `scale_to` replaces."""
     frame = {name: torch.zeros(size) for name, size in shape.frame().items()}
     extent = torch.tensor(1.0)
     if len(rows):
@@ -277,7 +280,10 @@ def _place_frame(shape: NeuralShape, rows: Tensor) -> dict[str, Tensor]:
 
 
 def _initial_weights(shape: NeuralShape, draws: torch.Generator) -> dict[str, Tensor]:
-    """Weights to begin with (He et al. 2015); the heads are 0, so the field begins at its simplest course."""
+    """Return initial weights (He et al.
+
+    2015). The heads are 0, so the field starts as its simplest trajectory.
+    """
     weights = {}
     for name, size in shape.weights().items():
         if name == "control":
@@ -297,7 +303,7 @@ def train_network(
     pictures: PictureLoss | None = None,
     on_step: Callable[[int, float], None] | None = None,
 ) -> None:
-    """Take `steps` steps with a rate that falls to 0 along half a cosine."""
+    """Take `steps` steps with a learning rate that falls to 0 along half a cosine."""
     for done in range(steps):
         factor = 0.5 * (1.0 + math.cos(math.pi * done / steps))
         loss = fit.step(strengths, offsets, factor, pictures)

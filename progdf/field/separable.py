@@ -1,15 +1,14 @@
-"""The separable field: Δ_i(s) = Σ_k B_ik a_k(s), one small sum per attribute, fitted by weighted SVD
-(docs/method.md 5).
+"""Separable field: Δ_i(s) = Σ_k B_ik a_k(s), a short sum per attribute, fitted by weighted SVD.
 
-Basis 0 is the end, in integers where that is enough: s = 1 is what they decode to. What it leaves is a matrix
-of snapshots × numbers whose leading singular vectors are bases 1..R; those are kept as int8, and the
-coefficients are solved again for the bases as stored.
+See docs/method.md 5. Basis 0 is the full offset, stored in integers if these are precise enough. s = 1 is by
+definition their decoded value. The residual is a matrix of snapshots × numbers. Its leading singular vectors
+are bases 1..R, stored as int8. The coefficients are then solved for the bases as stored.
 
-a_k(s) is linear between the snapshots; a cubic gains nothing with as many as a run records
+a_k(s) is linear between the snapshots. A cubic gains nothing at the number of snapshots that a run records
 (docs/experiments.md, Separable fields).
 
-`course_field` writes down an edit whose whole course is known, with nothing to train. The baseline is
-snapshots and lines between them; all of them are the recording bit for bit.
+`course_field` stores an edit whose trajectory is known in full, without training. The baseline is snapshots
+with linear interpolation between them; with all snapshots it equals the recording bit for bit.
 """
 
 from __future__ import annotations
@@ -25,31 +24,35 @@ from progdf.io.tensors import check_ascent
 
 from .baked import AttributeBases, BakedField
 
-_LEVELS = {torch.int8: 127, torch.int16: 32767}
-"""Largest level that is used; the lowest is left out to keep the levels symmetric."""
+_MAX_LEVELS = {torch.int8: 127, torch.int16: 32767}
+"""Largest level in use by integer type. The lowest is unused, so that the levels are symmetric."""
 
 
 @dataclass(frozen=True)
 class AttributeTrajectory:
-    """One attribute's trajectory beside its full offset."""
+    """Trajectory of one attribute, split into full offset and residual."""
 
     offsets: Tensor  # recorded offsets. [T,M,c] float32
-    weights: Tensor  # how much an error of each number shows, ≥ 0. [M,c] float32
-    amplitude: Tensor  # a_0 at the snapshots, the best share of the full offset; 0 first, 1 last. [T] float32
-    # weighted inner products of what a_0 times the full offset leaves at the snapshots. [T,T] float64
+    weights: Tensor  # visibility of an error in each number, ≥ 0. [M,c] float32
+    amplitude: Tensor  # a_0 at the snapshots: best share of the full offset; 0 first, 1 last. [T] float32
+    # weighted inner products of the residual between snapshots. [T,T] float64
     gram: Tensor
-    # the last row as stored, which that row is decoded from; None: in float32. [1,M,c], [1,c]
+    # stored form of the last row, which was decoded from it; None: float32. [1,M,c], [1,c]
     end: tuple[Tensor, Tensor] | None = None
 
     @property
     def residual(self) -> Tensor:
-        """What a_0 times the full offset leaves; 0 at both ends. [T,M,c]"""
+        """Difference between the offsets and a_0 times the full offset; 0 at both ends. [T,M,c]"""
         residual = torch.addcmul(self.offsets, self.amplitude[:, None, None], self.offsets[-1], value=-1)
         residual[[0, -1]] = 0.0
         return residual
 
     def needed_rank(self, tolerance: float) -> int:
-        """The fewest bases that leave at most this share of the trajectory's own root mean square."""
+        """Return the smallest number of bases within the tolerance.
+
+        Args:
+            tolerance: root mean square of the remainder, as a share of the trajectory's own
+        """
         allowed = tolerance**2 * float(self.offsets.double().square().sum())
         power = torch.linalg.eigvalsh(self.gram).flip(0).clamp(min=0)
         remaining = float(power.sum()) - power.cumsum(0)
@@ -57,11 +60,11 @@ class AttributeTrajectory:
 
 
 def check_trajectory(strengths: Tensor, offsets: Tensor) -> None:
-    """Refuse what is no trajectory.
+    """Refuse invalid trajectories.
 
     Raises:
-        ValueError: strengths do not ascend from 0 to 1, offsets are not [T,M,C], do not start at 0, or have a
-            number that is not finite.
+        ValueError: strengths do not ascend from 0 to 1, or offsets are not [T,M,C], do not start at 0 or are
+            not finite.
     """
     count = len(strengths)
     if offsets.ndim != 3 or offsets.shape[0] != count or strengths.ndim != 1:
@@ -74,7 +77,7 @@ def check_trajectory(strengths: Tensor, offsets: Tensor) -> None:
 
 
 def channel_weights(weights: Tensor | None, members: int, channels: int) -> Tensor:
-    """Weights as [M,C] float32, from None (all 1), [M] (visibility) or [M,C] (sensitivity)."""
+    """Return weights as [M,C] float32, from None (all 1), [M] (visibility) or [M,C] (sensitivity)."""
     if weights is None:
         return torch.ones(members, channels)
     spread = weights.float() if weights.ndim == 2 else weights.float()[:, None].expand(members, channels)
@@ -86,7 +89,7 @@ def channel_weights(weights: Tensor | None, members: int, channels: int) -> Tens
 
 
 def moving_attributes(offsets: Tensor) -> dict[str, slice]:
-    """The attributes that move at all in [T,M,C] offsets, and their columns."""
+    """Return the attributes that change in [T,M,C] offsets, and their columns."""
     return {
         name: columns
         for name, columns in attribute_slices(offsets.shape[2]).items()
@@ -97,7 +100,13 @@ def moving_attributes(offsets: Tensor) -> dict[str, slice]:
 def fit_amplitude(
     offsets: Tensor, weights: Tensor, stored: tuple[Tensor, Tensor] | None = None
 ) -> AttributeTrajectory:
-    """One attribute's trajectory, and what its last row was decoded from. [T,M,c] float32, [M,c] ≥ 0"""
+    """Fit one attribute's amplitude a_0 to its snapshots.
+
+    Args:
+        offsets: recorded offsets. [T,M,c] float32
+        weights: visibility of an error in each number, ≥ 0. [M,c]
+        stored: stored form of the last row, see `AttributeTrajectory`
+    """
     root = weights.sqrt()
     end = (offsets[-1] * root).flatten()
     power = float(end.double() @ end.double())
@@ -112,16 +121,16 @@ def fit_amplitude(
 
 
 def principal_modes(gram: Tensor) -> Tensor:
-    """The best bases of any number, by the inner products of the rows they shall explain (a weighted SVD).
+    """Return the best bases for every rank, by a weighted SVD of the rows to explain.
 
     Args:
-        gram: of the T rows, row 0 and the last are 0. [T,T] float64
+        gram: weighted inner products of the T rows; row 0 and the last are 0. [T,T] float64
 
     Returns:
-        How each basis is mixed from the rows, strongest first, and what the bases are multiplied with to give
-        the rows again. [T,R] float64; R is as large as there is anything to explain, at most T − 2
+        Weights of the rows in each basis, strongest first. The same weights give the rows back from the
+        bases. [T,R] float64; R is the numerical rank, at most T − 2
     """
-    # T is small: the T×T Gram matrix holds all there is to know of the left singular vectors
+    # T is small, and the T×T Gram matrix determines all left singular vectors
     values, vectors = torch.linalg.eigh(gram)
     values = values.flip(0)
     vectors = vectors.flip(1)
@@ -133,11 +142,11 @@ def principal_modes(gram: Tensor) -> Tensor:
 def store_attribute(
     trajectory: AttributeTrajectory, mix: Tensor, basis_type: torch.dtype = torch.int8
 ) -> AttributeBases:
-    """Bases as stored, with coefficients solved for them as they are stored.
+    """Return the bases in stored form, with coefficients solved for the stored bases.
 
     Args:
-        trajectory: the attribute's trajectory
-        mix: how each basis beside the full offset is mixed from what that leaves. [T,R]
+        trajectory: trajectory of the attribute
+        mix: weights of the residual's rows in each basis. [T,R]
         basis_type: int8, float16 or float32
     """
     full = trajectory.offsets[-1].clone()  # a view would keep all rows
@@ -149,34 +158,34 @@ def store_attribute(
 
 
 def quantize_bases(exact: Tensor, basis_type: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Bases in their stored type, and what one unit is worth. [R,M,c] -> [R,M,c], [R,c] float32"""
+    """Return bases in their stored type, and the value of one unit. [R,M,c] -> [R,M,c], [R,c] float32"""
     largest = exact.abs().amax(dim=1) if exact.shape[1] else exact.new_zeros(exact.shape[0], exact.shape[2])
-    if most := _LEVELS.get(basis_type):
-        step = largest / most
+    if max_level := _MAX_LEVELS.get(basis_type):
+        step = largest / max_level
         step = torch.where(step > 0, step, torch.ones_like(step))
-        return (exact / step[:, None]).round().clamp(-most, most).to(basis_type), step
-    step = torch.where(largest > 0, largest, torch.ones_like(largest))  # keeps float16 away from its limits
+        return (exact / step[:, None]).round().clamp(-max_level, max_level).to(basis_type), step
+    step = torch.where(largest > 0, largest, torch.ones_like(largest))  # keeps float16 far from its limits
     return (exact / step[:, None]).to(basis_type), step
 
 
 def decode_bases(levels: Tensor, step: Tensor) -> Tensor:
-    """The inverse of `quantize_bases`. [R,M,c], [R,c] -> [R,M,c] float32"""
+    """Decode bases, the inverse of `quantize_bases`. [R,M,c], [R,c] -> [R,M,c] float32"""
     return levels.float() * step[:, None]
 
 
 def fit_bands(tensor: Tensor, width: int) -> Tensor:
-    """Numbers of higher SH bands, cut or filled up with 0 to another scene's. [...,c] -> [...,width]"""
+    """Truncate higher SH bands to another scene's width, or fill up with 0. [...,c] -> [...,width]"""
     return torch.nn.functional.pad(tensor[..., :width], (0, max(0, width - tensor.shape[-1])))
 
 
 def solve_coefficients(offsets: Tensor, full: Tensor, residual_basis: Tensor, weights: Tensor) -> Tensor:
-    """Least squares for a_0 … a_R at every snapshot; both ends are given, not solved. [T,1+R] float32
+    """Solve least squares for a_0 … a_R at every snapshot. Both ends are fixed. [T,1+R] float32
 
     Args:
-        offsets: [T,M,c]
+        offsets: recorded offsets. [T,M,c]
         full: basis 0. [M,c]
-        residual_basis: bases 1..R in real units. [R,M,c]
-        weights: [M,c]
+        residual_basis: bases 1..R, decoded. [R,M,c]
+        weights: visibility of an error in each number. [M,c]
     """
     root = weights.sqrt().flatten()
     columns = torch.cat([full[None], residual_basis]).flatten(1) * root
@@ -187,7 +196,7 @@ def solve_coefficients(offsets: Tensor, full: Tensor, residual_basis: Tensor, we
     table: Tensor = (rows @ columns.T).double() @ torch.linalg.pinv(normal, rtol=1e-7, hermitian=True)
     table = (table / scale).float()
     if not bool(full.any()):
-        table[:, 0] = 0.0  # nothing to scale; the end is still a_0 = 1
+        table[:, 0] = 0.0  # nothing to scale; a_0 is still 1 at the end
     table[0] = 0.0
     table[-1] = 0.0
     table[-1, 0] = 1.0
@@ -202,21 +211,21 @@ def fit_separable(
     recorded: Sequence[float] | None = None,
     basis_type: torch.dtype = torch.int8,
 ) -> BakedField:
-    """The separable field of a trajectory with given ranks.
+    """Fit the separable field of a trajectory with given ranks.
 
     Args:
-        strengths: of the snapshots, ascending from 0 to 1. [T]
-        offsets: raw offsets of the members; the first row is 0, the last the recorded end. [T,M,C] float32
-        ranks: number of bases beside the full offset, by attribute; 0 where not named
-        weights: how much an error shows: visibility [M] or sensitivity [M,C]; None is evenly
-        recorded: strengths for the slider's ticks; `strengths` when None
-        basis_type: how bases 1..R are stored: int8, float16 or float32
+        strengths: strengths of the snapshots, ascending from 0 to 1. [T]
+        offsets: raw offsets of the members. The first row is 0, the last the recorded end. [T,M,C] float32
+        ranks: number of bases in addition to the full offset, by attribute; 0 if absent
+        weights: importance of an error: visibility [M] or sensitivity [M,C]; None: uniform
+        recorded: strengths for the slider's ticks; None: `strengths`
+        basis_type: storage type of bases 1..R: int8, float16 or float32
 
     Returns:
-        A field with the snapshots as nodes; attributes that never move are absent.
+        A field with the snapshots as knots. Attributes that do not change are absent.
 
     Raises:
-        ValueError: no trajectory, or weights that do not fit.
+        ValueError: the trajectory is invalid, or the weights do not fit it.
     """
     check_trajectory(strengths, offsets)
     spread = channel_weights(weights, offsets.shape[1], offsets.shape[2])
@@ -233,50 +242,52 @@ def _fit_attribute(offsets: Tensor, weights: Tensor, rank: int, basis_type: torc
     return store_attribute(trajectory, principal_modes(trajectory.gram)[:, :rank], basis_type)
 
 
-_COURSE_TOLERANCE = 0.003  # root mean square that factoring may cost, as a share of the course's own
-_MAX_COURSE_RANK = 8
+_TRAJECTORY_TOLERANCE = 0.003  # RMS error of the factoring, as a share of the trajectory's own RMS
+_MAX_TRAJECTORY_RANK = 8
 _OPACITY_KNOTS = (0.0, 0.002, 0.005, 0.01, 0.02, 0.04, 0.07, 0.11, 0.17, 0.25, 0.35)
-"""Where a logit bends most when an opacity rises from nothing; mirrored for one that falls to it."""
+"""Strengths at which a logit bends most if opacity rises from 0. Mirrored for an opacity that falls to 0."""
 
 
 def course_field(knots: Tensor, offsets: Tensor) -> BakedField:
-    """The field of a course: at its last knot exactly what int16 makes of the end.
+    """Return the field of a known trajectory. At its last knot it equals the int16 form of the end.
 
     Args:
         knots: strengths, ascending from 0 to 1. [S]
-        offsets: packed, 0 at the first knot. [S,M,C]
+        offsets: packed offsets, 0 at the first knot. [S,M,C]
 
     Raises:
-        ValueError: no course.
+        ValueError: the trajectory is invalid.
     """
     check_trajectory(knots, offsets)
     attributes = {}
     for name, columns in moving_attributes(offsets).items():
-        course = offsets[:, :, columns].clone()
-        stored = quantize_bases(course[-1:], torch.int16)
-        course[-1] = decode_bases(*stored)[0]
-        attributes[name] = fit_course(course, stored)
+        values = offsets[:, :, columns].clone()
+        stored = quantize_bases(values[-1:], torch.int16)
+        values[-1] = decode_bases(*stored)[0]
+        attributes[name] = fit_course(values, stored)
     return BakedField("separable", knots.float(), attributes, offsets.shape[2], ())
 
 
 def fit_course(offsets: Tensor, stored: tuple[Tensor, Tensor] | None = None) -> AttributeBases:
-    """The fewest bases by which an attribute's course is met to a three-hundredth. [S,M,c]
+    """Fit the fewest bases that reproduce an attribute's trajectory with at most 0.3 % RMS error.
 
-    `stored`: what its last row was decoded from, see `quantize_bases`.
+    Args:
+        offsets: offsets at the knots. [S,M,c]
+        stored: stored form of the last row, see `quantize_bases`
     """
     fitted = fit_amplitude(offsets, torch.ones_like(offsets[0]), stored)
-    rank = min(fitted.needed_rank(_COURSE_TOLERANCE), _MAX_COURSE_RANK)
+    rank = min(fitted.needed_rank(_TRAJECTORY_TOLERANCE), _MAX_TRAJECTORY_RANK)
     return store_attribute(fitted, principal_modes(fitted.gram)[:, :rank])
 
 
 def opacity_course(start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
-    """Logits of opacities that go linearly from one to another.
+    """Return the logits of opacities that change linearly from start to end.
 
     Args:
         start, end: logits at strengths 0 and 1. [M]
 
     Returns:
-        Knots [S] and the offset of each logit from `start` at them [S,M], exact at both ends
+        Knots [S], and the offset of each logit from `start` at them [S,M], exact at both ends.
     """
     rise = torch.tensor(_OPACITY_KNOTS, dtype=torch.float64)
     knots = torch.cat([rise, torch.tensor([0.5], dtype=torch.float64), 1.0 - rise.flip(0)])
@@ -287,7 +298,7 @@ def opacity_course(start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def keyframe_rows(strengths: Tensor, count: int) -> list[int]:
-    """The snapshots that `fit_keyframes` keeps, ascending. [T]"""
+    """Return the snapshots that `fit_keyframes` keeps, ascending. [T]"""
     even = torch.linspace(0, 1, count, dtype=strengths.dtype)
     nearest = (strengths[:, None] - even).abs().argmin(dim=0)
     return sorted({*(nearest if count < len(strengths) else torch.arange(len(strengths))).tolist()})
@@ -296,20 +307,22 @@ def keyframe_rows(strengths: Tensor, count: int) -> list[int]:
 def fit_keyframes(
     strengths: Tensor, offsets: Tensor, count: int, recorded: Sequence[float] | None = None
 ) -> BakedField:
-    """Keep the `count` snapshots nearest to even strengths (even visible change in a re-timed trajectory)
-    bit for bit: in half precision where that holds them, as it does recordings.
+    """Keep the `count` snapshots nearest to evenly spaced strengths, bit for bit.
+
+    In a re-timed trajectory these strengths are evenly spaced in visible change. Snapshots are stored in half
+    precision if that is exact, as for recordings.
 
     Args:
-        strengths: of the snapshots, ascending from 0 to 1. [T]
-        offsets: raw offsets of the members; the first row is 0, the last the recorded end. [T,M,C] float32
-        count: snapshots kept, both ends among them, ≥ 2; as many as there are or more keeps all
-        recorded: strengths for the slider's ticks; `strengths` when None
+        strengths: strengths of the snapshots, ascending from 0 to 1. [T]
+        offsets: raw offsets of the members. The first row is 0, the last the recorded end. [T,M,C] float32
+        count: number of snapshots to keep, both ends included, ≥ 2. The number of snapshots or more keeps all
+        recorded: strengths for the slider's ticks; None: `strengths`
 
     Returns:
-        A field with those snapshots as knots; attributes that never move are absent.
+        A field with those snapshots as knots. Attributes that do not change are absent.
 
     Raises:
-        ValueError: no trajectory, or fewer than 2 snapshots asked for.
+        ValueError: the trajectory is invalid, or `count` is below 2.
     """
     check_trajectory(strengths, offsets)
     if count < 2:
@@ -317,11 +330,11 @@ def fit_keyframes(
     rows = keyframe_rows(strengths, count)
     table = torch.eye(len(rows))[:, [-1, *range(1, len(rows) - 1)]]
     attributes = {}
-    kept = offsets[rows[1:-1]]
-    inner = kept.half() if torch.equal(kept.half().float(), kept) else kept
+    selected = offsets[rows[1:-1]]
+    inner = selected.half() if torch.equal(selected.half().float(), selected) else selected
     for name, columns in moving_attributes(offsets).items():
         full = offsets[-1, :, columns].contiguous()
-        units = torch.ones(1 + len(inner), full.shape[1])  # of another size they would round it
+        units = torch.ones(1 + len(inner), full.shape[1])  # any other size would round the halves
         attributes[name] = AttributeBases(full, inner[:, :, columns], units, table.clone())
     ticks = strengths.tolist() if recorded is None else recorded
     return BakedField("keyframes", strengths[rows].float(), attributes, offsets.shape[2], tuple(ticks))

@@ -1,6 +1,6 @@
-"""The recorded trajectory of an edit: how every member moved, and at which slider value it was where.
+"""Recorded trajectory of an edit: the offsets of every member, and the slider value of each recording.
 
-Training leaves it in the run folder as trajectory.safetensors; `progdf fit` makes new fields of it.
+Training writes it to the run folder as trajectory.safetensors. `progdf fit` makes new fields from it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from progdf.io.tensors import check_ascent, check_tensor, read_tensors, write_te
 from .baked import MONOMIALS, find_segment, identity_map
 
 FILE_NAME = "trajectory.safetensors"
-"""Its name in a run folder, beside the .gdf."""
+"""File name in a run folder, beside the .gdf."""
 
 _FORMAT = "progdf-trajectory-1"
 
@@ -33,42 +33,42 @@ class Trajectory:
     """S recordings of the members' offsets along the slider."""
 
     s: Tensor  # slider value of each recording, ascending, first 0, last 1. [S] float32
-    # raw-space offsets; row 0 is zero, the last equals `end` in half precision. [S,M,C] float16
+    # raw-space offsets; row 0 is zero, the last is `end` in half precision. [S,M,C] float16
     offsets: Tensor
     end: Tensor  # the offset at s = 1, exact; the edited scene is original + end in float32. [M,C] float32
-    steps: Tensor  # optimizer steps done at each recording. [S] int64
-    stage_ends: tuple[int, ...]  # recording at which each stage ends, ascending, the last S − 1
-    # what the editor was asked for, of each stage; `s[stage_ends]` is where that is
+    steps: Tensor  # optimizer steps at each recording. [S] int64
+    stage_ends: tuple[int, ...]  # index of the recording at each stage's end, ascending, the last S − 1
+    # strength requested from the editor for each stage; its slider value is `s[stage_ends]`
     strengths: tuple[float, ...]
-    # of an edit of colors that is a map of the region and a residual of its members' lowest bands: the map of
-    # each recording but the first [S-1,K,3], and how many bands that are
+    # for an edit of colors by a map of the region and a residual of the lowest bands: the map of each
+    # recording but the first [S-1,K,3], and the number of bands
     maps: Tensor | None = None
     bands: int = 0
-    mask: Tensor | None = None  # how much of the maps each member takes, see `GradeForm.mask`. [M] uint8
-    added: Gaussians | None = None  # rows that the scene does not have, the last members, see `Gdf.added`
+    mask: Tensor | None = None  # share of the maps per member, see `GradeForm.mask`. [M] uint8
+    added: Gaussians | None = None  # rows that the scene does not contain, the last members, see `Gdf.added`
 
     def __len__(self) -> int:
         return int(self.s.shape[0])
 
     @property
     def stage_strengths(self) -> tuple[tuple[float, float], ...]:
-        """Slider value of each stage's end, and the strength that the editor was asked for there."""
+        """Slider value of each stage's end, and the strength requested from the editor there."""
         return tuple((float(self.s[e]), s) for e, s in zip(self.stage_ends, self.strengths, strict=True))
 
     def at(self, s: float) -> Tensor:
-        """Offsets at slider value `s`, linear between recordings, exact at both ends. [M,C] float32"""
+        """Return offsets at slider value `s`, linear between recordings, exact at both ends. [M,C] float32"""
         right, share = find_segment(self.s, s)
         return torch.lerp(self.node(right - 1), self.node(right), min(max(share, 0.0), 1.0))
 
     @property
     def map_course(self) -> tuple[int, Tensor]:
-        """The degree of the maps, and the map of each recording, the identity first. [S,K,3]"""
+        """Degree of the maps, and the map of each recording, the identity first. [S,K,3]"""
         assert self.maps is not None
         degree = next(d for d, count in MONOMIALS.items() if count == self.maps.shape[1])
         return degree, torch.cat([identity_map(degree)[None], self.maps])
 
     def node(self, index: int) -> Tensor:
-        """Offsets of one recording. [M,C] float32"""
+        """Return the offsets of one recording. [M,C] float32"""
         return self.end if index == len(self) - 1 else self.offsets[index].float()
 
     @property
@@ -80,11 +80,11 @@ class Trajectory:
 def save_trajectory(
     path: Path, trajectory: Trajectory, extra: Mapping[str, Tensor], about: Mapping[str, Any]
 ) -> None:
-    """Write a trajectory with what a refit needs.
+    """Write a trajectory with the data that a refit needs.
 
     Args:
         path: trajectory.safetensors
-        trajectory: what to save
+        trajectory: the trajectory to save
         extra: further tensors by name (members, score, cameras)
         about: JSON values (scene, options, …)
     """
@@ -109,10 +109,10 @@ def save_trajectory(
 
 
 def load_trajectory(path: Path) -> tuple[Trajectory, dict[str, Tensor], dict[str, Any]]:
-    """Read what `save_trajectory` wrote: trajectory, extra tensors, about.
+    """Read a file of `save_trajectory`: trajectory, extra tensors, about.
 
     Raises:
-        ProgdfError: the file is absent, damaged or something else.
+        ProgdfError: the file is absent, damaged or of another kind.
     """
     try:
         tensors, header = read_tensors(path)
@@ -128,7 +128,11 @@ def load_trajectory(path: Path) -> tuple[Trajectory, dict[str, Tensor], dict[str
 
 
 def _unpack(tensors: dict[str, Tensor]) -> Trajectory:
-    """The trajectory, whose tensors are taken out. Raises ValueError and the like: they do not fit."""
+    """Remove the trajectory's tensors from `tensors` and return the trajectory.
+
+    Raises:
+        KeyError, ValueError: a tensor is absent or does not fit.
+    """
     added: dict[str, Any] = {
         name: tensors.pop(f"added.{name}") for name in ATTRIBUTES if f"added.{name}" in tensors
     }

@@ -70,7 +70,7 @@ _ALL_ROWS = np.empty(0, np.bool_)  # gradient mask that selects all rows
 def rasterize(
     gaussians: ActivatedGaussians, view: RasterView, background: Tensor, grad_rows: Tensor | None
 ) -> tuple[Tensor, Tensor, RasterInfo]:
-    """See `progdf.rasterize.render`."""
+    """Draw an image, see `progdf.rasterize.render`."""
     inputs = [to_float32(tensor) for tensor in (*gaussians.tensors, background)]
     projected: list[Array] = []
     image, transmittance = _Rasterize.apply(  # type: ignore[no-untyped-call]
@@ -243,7 +243,7 @@ def _camera_gradients(parts: Array, viewmat: Tensor, K: Tensor) -> tuple[Tensor,
 
 
 def alpha_weights(gaussians: ActivatedGaussians, view: RasterView, mask: Tensor) -> Tensor:
-    """See `progdf.rasterize.alpha_weights`."""
+    """Sum blending weights, see `progdf.rasterize.alpha_weights`."""
     camera = make_pinhole(view)
     splats, lists = bin_view(gaussians, camera)
     sums = np.zeros((len(lists.members), WEIGHT_SUMS))
@@ -263,14 +263,14 @@ class ListedWeights:
     runs: Runs
 
     def picture(self, colors: Tensor) -> Tensor:
-        """See `ColorMap`."""
+        """Draw an image, see `ColorMap`."""
         image = np.zeros((math.prod(self.size), colors.shape[1]), np.float32)
         add = add_images if colors.shape[1] == 3 else add_channels
         add(self.runs, to_float32(colors).numpy(), image)
         return torch.from_numpy(image).view(*self.size, -1)
 
     def gradient(self, image: Tensor) -> Tensor:
-        """See `ColorMap`."""
+        """Return the gradient of the colors, see `ColorMap`."""
         colors = np.zeros((self.count, 3), np.float32)
         add_gradients(self.runs, to_float32(image).numpy().reshape(-1, 3), colors)
         return torch.from_numpy(colors)
@@ -279,7 +279,7 @@ class ListedWeights:
 def color_map(
     gaussians: ActivatedGaussians, view: RasterView, rows: Tensor, pixels: Tensor | None, lost: float
 ) -> ListedWeights:
-    """See `progdf.rasterize.engines.color_map`."""
+    """Return a color map, see `progdf.rasterize.engines.color_map`."""
     pinhole, (x0, y0, x1, y1) = make_pinhole(view), view.crop
     window = (y1 - y0) * (x1 - x0)
     chosen = np.arange(window) if pixels is None else pixels.numpy()

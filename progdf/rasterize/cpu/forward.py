@@ -112,7 +112,7 @@ class Footprint(NamedTuple):
 
 
 class TileLists(NamedTuple):
-    """The splats of each tile, nearest first."""
+    """Splats of each tile, nearest first."""
 
     starts: Array  # first index of each tile's list. [tiles+1] int64
     members: Array  # rows of the splats, tile after tile. [I] int32

@@ -128,7 +128,7 @@ def _with_cache_folder(compile_now: Callable[[_F], _F], function: _F) -> _F:
 
 @once
 def kernel_cache() -> Path:
-    """The folder of compiled kernels, loaded when the first kernel is needed."""
+    """Return the folder of compiled kernels. It is created when the first kernel is needed."""
     folder = find_cache_folder()
     if not any(folder.rglob("*.nbi")):
         log.warning("compiling the rasterizer's kernels (about 20 s, once per machine)")
