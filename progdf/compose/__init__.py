@@ -1,1 +1,1 @@
-"""How do layers of edits add up?"""
+"""Composition of a scene with a stack of edits."""

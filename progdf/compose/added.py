@@ -1,7 +1,7 @@
-"""Gaussians that an edit adds: rows after the scene's own, of which nothing is drawn at strength 0.
+"""Gaussians that edits add: rows after the scene's own, invisible at strength 0.
 
-A scene is extended once by the rows of all its edits; what composes, draws or selects then needs to know
-nothing of where a row came from.
+A scene is extended once by the rows of all its edits. Code that composes, draws or selects then treats all
+rows alike.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from progdf.region import Region, whole_scene
 
 
 def extend(scene: Gaussians, gdfs: Sequence[Gdf]) -> tuple[Gaussians, tuple[Gdf, ...]]:
-    """The scene with the added rows of all edits after its own, and the edits of that scene.
+    """Append the added rows of all edits to a scene, and convert the edits to the extended scene.
 
     Args:
         scene: N Gaussians
-        gdfs: edits of it
+        gdfs: edits of the scene
 
     Returns:
-        N + ΣB Gaussians, the added rows in the order of the edits; and for each edit one of M + B members
-        that adds nothing any more; a grade of the whole scene is one of all N + ΣB. Both as they were given
-        where no edit adds a row.
+        The extended scene, N + ΣB Gaussians with the added rows in the order of the edits, and the converted
+        edits. A converted edit has M + B members and adds no rows. A grade of the whole scene has all N + ΣB
+        members. If no edit adds a row, scene and edits are returned unchanged.
 
     Raises:
         ProgdfError: an edit was made for another scene.
@@ -49,7 +49,7 @@ def extend(scene: Gaussians, gdfs: Sequence[Gdf]) -> tuple[Gaussians, tuple[Gdf,
     moved = []
     for gdf in gdfs:
         form = gdf.field.origin
-        # on all that is there, whoever brings it
+        # a grade of the whole scene also covers rows that other edits add
         if isinstance(form, GradeForm) and gdf.members == len(scene):
             moved.append(_grade_all(gdf, form, extended))
             continue
@@ -64,21 +64,21 @@ def extend(scene: Gaussians, gdfs: Sequence[Gdf]) -> tuple[Gaussians, tuple[Gdf,
 
 
 def _grade_all(gdf: Gdf, form: GradeForm, extended: Gaussians) -> Gdf:
-    """A grade of the whole scene on what other edits add as well: no residual there, and the mean mask."""
-    more = len(extended) - form.members
+    """Extend a grade of the whole scene to added rows, with the mean mask and without residual there."""
+    added_count = len(extended) - form.members
     mask = form.mask
     if mask is not None:
-        mask = pad(mask, (0, more), value=round(float(mask.float().mean())))
-    form = replace(form, residual=pad(form.residual, (0, 0, 0, more)), mask=mask)
+        mask = pad(mask, (0, added_count), value=round(float(mask.float().mean())))
+    form = replace(form, residual=pad(form.residual, (0, 0, 0, added_count)), mask=mask)
     field = bake_grade(form, pack(extended, with_shN=extended.sh_degree > 0))
     region = replace(whole_scene(extended), name=gdf.region.name)
     field = replace(field, recorded=gdf.field.recorded)
-    return replace(gdf, region=region, field=field, scene=fingerprint(extended), from_others=more)
+    return replace(gdf, region=region, field=field, scene=fingerprint(extended), from_others=added_count)
 
 
-@lru_cache(maxsize=1)  # the same object for the same edits, so that what is known of it stays known
+@lru_cache(maxsize=1)  # returns the same object for the same edits, so that caches keyed by it stay valid
 def _append_rows(scene: Gaussians, added: tuple[Gaussians, ...]) -> Gaussians:
-    """The scene and rows that have origins and bands of their own."""
+    """Append rows, converted to the origin and SH bands of the scene."""
     parts = [scene]
     shape = scene.shN.shape[1:]
     origin = torch.tensor(scene.origin, dtype=torch.float64)
@@ -91,15 +91,16 @@ def _append_rows(scene: Gaussians, added: tuple[Gaussians, ...]) -> Gaussians:
 
 
 def remaining_rows(scene: Gaussians, composed: Gaussians) -> Tensor:
-    """Which rows of a composed scene a file keeps: not what an edit took away or has not added yet.
+    """Return the rows of a composed scene to save, without removed Gaussians and invisible added ones.
 
     Args:
-        scene: the original. N Gaussians
-        composed: it under its edits, with N + B rows
+        scene: the original, N Gaussians
+        composed: the scene under its edits, N + B Gaussians
 
     Returns:
-        Sorted row indices; at strength 0 the N rows of the original, the faint ones too. [R] int64
+        Sorted row indices. At strength 0 these are the N rows of the original, including faint ones. [R]
+        int64
     """
-    unseen = composed.logit_opacities < UNSEEN_LOGIT
-    unseen[: len(scene)] &= scene.logit_opacities >= UNSEEN_LOGIT
-    return (~unseen).nonzero()[:, 0]
+    is_invisible = composed.logit_opacities < UNSEEN_LOGIT
+    is_invisible[: len(scene)] &= scene.logit_opacities >= UNSEEN_LOGIT
+    return (~is_invisible).nonzero()[:, 0]

@@ -1,7 +1,8 @@
-"""`compose_layers` while a slider is dragged: the same numbers, written in place, members only.
+"""Fast, in-place version of `compose_layers` for dragging sliders, with the same results.
 
-Bases are kept as they are stored (int8): a new slider value reads about 84 bytes a member, writes its
-14 numbers, and allocates nothing that grows with the scene but a buffer of one attribute's sums.
+It rewrites members only. Bases stay in their stored type (int8): a new slider value reads about 84 bytes per
+member and writes its 14 numbers. The only allocation that grows with the scene is a buffer for the sums of
+one attribute.
 """
 
 from __future__ import annotations
@@ -30,29 +31,29 @@ Floats = NDArray[np.float32]
 Rows = NDArray[np.int64]
 
 CHUNK = 16_384
-"""Rows that a thread works on at once: few enough for the second cache, enough to be worth a thread."""
+"""Rows per task of a thread: few enough for the L2 cache, and enough to be worth a thread."""
 
-_BLOCK = 512  # members whose offsets are summed at once
+_BLOCK_MEMBERS = 512  # members whose offsets are summed at once
 
-_NOTHING = np.zeros(0, np.float32)  # in place of weights that are all 1, or of a coverage that hides nothing
+_NO_VALUES = np.zeros(0, np.float32)  # stands for weights that are all 1, and for coverage that is all 0
 
 
 @dataclass(frozen=True)
 class Change:
-    """What an update touched."""
+    """Rows and attributes that an update changed."""
 
     rows: Rows  # sorted indices of all Gaussians that may differ from before. [M]
-    attributes: tuple[str, ...]  # names of `gaussians.ATTRIBUTES` that may differ in these rows
-    largest_move: float  # largest distance that a center has moved since the last update, world units
+    attributes: tuple[str, ...]  # names from `gaussians.ATTRIBUTES` that may differ in these rows
+    largest_move: float  # largest movement of a center since the last update, world units
 
     @property
     def means_moved(self) -> bool:
-        """Whether the depth order may have changed."""
+        """True if the depth order may have changed."""
         return self.largest_move > 0
 
 
 class _Bases(NamedTuple):
-    """One attribute of an edit, see `AttributeBases`."""
+    """Bases of one attribute of an edit, see `AttributeBases`."""
 
     end: NDArray[Any]  # int8 or float32. [M,c]
     residual: NDArray[Any]  # int8 or float32. [R,M,c]
@@ -67,8 +68,12 @@ class _Bases(NamedTuple):
         return _Bases(*(tensor.contiguous().numpy() for tensor in tensors))
 
     def factors(self, at: Segment) -> tuple[Rows, Floats]:
-        """Which residual bases count in a segment of the knots, and what basis 0 and each of them is
-        multiplied with, [1+U,c]; no factors where the attribute is as it was."""
+        """Return the residual bases used in a segment of the knots, and the factors of all used bases.
+
+        Returns:
+            Indices of the residual bases with nonzero coefficients [U], and factors of basis 0 and of each of
+            them [1+U,c]. There are no factors if the attribute is unchanged.
+        """
         right, share = at
         row = self.coefficients[right]
         if share != 1.0:
@@ -82,10 +87,10 @@ class _Bases(NamedTuple):
 
 
 class _Plan(NamedTuple):
-    """What to rewrite when some edits change."""
+    """Rows and members to rewrite when some edits change."""
 
     rows: Rows  # ascending. [U]
-    parts: Mapping[int, tuple[Rows, Rows]]  # by edit: members among the rows, and where they are. [m] each
+    parts: Mapping[int, tuple[Rows, Rows]]  # by edit: its members among the rows, and their positions. [m]
 
 
 class _LayerSlice(NamedTuple):
@@ -93,18 +98,18 @@ class _LayerSlice(NamedTuple):
 
     layer: Layer
     edit: int
-    segment: Segment  # of the knots, where its strength lies
-    members: Rows  # [m]
-    at: Rows  # where they are in the range. [m]
-    weights: Floats  # of all members of the edit, empty: all 1
+    segment: Segment  # segment of the knots that holds the strength
+    members: Rows  # member indices of the edit. [m]
+    at: Rows  # positions of the members in the range. [m]
+    weights: Floats  # weights of all members of the edit; empty if all are 1. [M] or [0]
 
 
 class Composer:
-    """Keeps one scene under a changing stack of edits.
+    """One scene under a changing stack of edits.
 
     Args:
-        scene: the original, float32; it is never written to
-        gdfs: every edit that may appear in the stack; rows that they add come after the scene's own
+        scene: the original, float32, which is never modified
+        gdfs: every edit that may appear in the stack; their added rows come after the scene's own
 
     Raises:
         ProgdfError: an edit was made for another scene.
@@ -114,7 +119,7 @@ class Composer:
         scene, extended = extend(scene, gdfs)
         self._scene = scene
         self._gdfs = extended
-        self._given = tuple(gdfs)  # alive, so that no other edit gets the id of one
+        self._given = tuple(gdfs)  # kept alive, so that no other edit gets the same id
         self._index = {id(gdf): i for edits in (gdfs, extended) for i, gdf in enumerate(edits)}
         self._members = [gdf.region.members.numpy() for gdf in extended]
         self._bases = [
@@ -124,7 +129,7 @@ class Composer:
         before = {name: getattr(scene, name).detach().float() for name in ATTRIBUTES if name in moving}
         after: dict[str, Any] = {name: values.clone() for name, values in before.items()}
         self.gaussians = replace(scene, **after)
-        """The scene under the layers of the last update; its tensors are written in place by the next."""
+        """Scene under the layers of the last update. The next update writes to its tensors in place."""
         width = {name: math.prod(values.shape[1:]) for name, values in before.items()}
         self._before = {name: values.reshape(-1, width[name]).numpy() for name, values in before.items()}
         self._after = {name: values.view(-1, width[name]).numpy() for name, values in after.items()}
@@ -135,19 +140,19 @@ class Composer:
         self._checked: list[tuple[torch.Tensor, int]] = []  # weights and their versions
 
     def update(self, layers: Sequence[Layer], blend: str = "normalized") -> Change:
-        """Make `gaussians` the scene under `layers`: what `compose_layers(scene, layers, blend)` gives.
+        """Set `gaussians` to the scene under `layers`, equal to `compose_layers(scene, layers, blend)`.
 
         Args:
-            layers: the stack, lowest first; every gdf is one of those given at the start (the same object).
-                Weights are compared as tensors are: a new one, or one written to in place by torch, is seen
+            layers: the stack, lowest first. Every gdf is an object that was given to the constructor. Changed
+                weights are detected if they are a new tensor or were written in place by torch
             blend: one of `BLENDS`
 
         Returns:
-            What may differ from before; no rows where nothing does.
+            Rows and attributes that may have changed; no rows if nothing has.
 
         Raises:
             ProgdfError: a strength is not a number, the blend rule is unknown.
-            ValueError: weights do not fit, or an edit is not one of the composer's.
+            ValueError: weights do not fit, or an edit was not given to the constructor.
         """
         check_numbers(layers, blend)
         edits = [(self._edit_of(layer.gdf), layer) for layer in layers if layer.active]
@@ -173,7 +178,7 @@ class Composer:
         return Change(plan.rows, names, math.sqrt(max(moves)))
 
     def _maps_others(self, stack: Sequence[tuple[int, Layer]]) -> bool:
-        """Whether a grade lies over Gaussians of another layer, whose colors it maps."""
+        """Return whether a grade lies over Gaussians of a lower layer and maps their colors."""
         return any(
             self._meet(edit, below)
             for index, (edit, layer) in enumerate(stack)
@@ -182,7 +187,7 @@ class Composer:
         )
 
     def _meet(self, edit: int, other: int) -> bool:
-        """Whether two edits share a Gaussian."""
+        """Return whether two edits share a Gaussian."""
         pair = min(edit, other), max(edit, other)
         if pair not in self._meets:
             members = self._members[edit], self._members[other]
@@ -190,7 +195,7 @@ class Composer:
         return self._meets[pair]
 
     def _write_adjusted(self, layers: Sequence[Layer], rows: Rows, names: Sequence[str]) -> float:
-        """Write these rows as the plain form has them; the largest step of a center."""
+        """Write rows with the reference implementation; return the largest movement of a center."""
         covers = {id(gdf): self._coverage_of(edit) for edit, gdf in enumerate(self._gdfs)}
         at, new = changed_rows(self._scene, layers, "adjust", lambda _, gdf: covers[id(gdf)])
         largest = 0.0
@@ -213,7 +218,7 @@ class Composer:
         first: int,
         last: int,
     ) -> float:
-        """Write these attributes of rows first to last; the largest squared step of a center."""
+        """Write attributes of `rows[first:last]`; return the largest squared movement of a center."""
         rows = rows[first:last]
         parts = [_between(part, first, last) for part in parts]
         kinds = {KINDS[name] for name in names} if blend == "normalized" else ()
@@ -228,26 +233,28 @@ class Composer:
                 if bases is None or gain == 0:
                     continue
                 used, factors = bases.factors(part.segment)
-                covered = self._coverage_of(part.edit)[KINDS[name]].numpy() if blend in ORDERED else _NOTHING
+                covered = (
+                    self._coverage_of(part.edit)[KINDS[name]].numpy() if blend in ORDERED else _NO_VALUES
+                )
                 hidden = np.float32(part.layer.clamped_strength) * np.float32(min(abs(gain), 1.0))
                 selection = part.at, part.members, part.weights
                 stored = (bases.end, bases.residual)
                 scale = np.float32(gain)
                 _add_offsets(total, selection, stored, used, factors, scale, hidden, covered)
-            weight_sum = weight_sums.get(KINDS[name], _NOTHING)
+            weight_sum = weight_sums.get(KINDS[name], _NO_VALUES)
             moved = _finish(after, self._before[name], rows, total, weight_sum, name == "means")
             largest = max(largest, moved)
         return largest
 
     def _part(self, plan: _Plan, edit: int, layer: Layer) -> _LayerSlice:
-        weights = _NOTHING if layer.weights is None else layer.weights.detach().float().numpy()
+        weights = _NO_VALUES if layer.weights is None else layer.weights.detach().float().numpy()
         segment = find_segment(layer.gdf.field.knots, layer.strength)
         return _LayerSlice(layer, edit, segment, *plan.parts[edit], weights)
 
     def _plan(self, changed: frozenset[int]) -> _Plan:
-        """All members of these edits, and what others share rows with them."""
+        """Return the members of the changed edits, and the members of other edits in the same rows."""
         if changed not in self._plans:
-            if len(self._plans) >= 32:  # a handful is in use while one drags
+            if len(self._plans) >= 32:  # only a few are in use during a drag
                 self._plans.clear()
             chosen = [self._members[edit] for edit in changed]
             rows = chosen[0] if len(chosen) == 1 else np.unique(np.concatenate(chosen))
@@ -265,7 +272,7 @@ class Composer:
         return self._coverage[edit]
 
     def _check_weights(self, layers: Sequence[Layer]) -> None:
-        """`check_weights` of those that are new or were written to."""
+        """Check weights that are new or were modified, see `check_weights`."""
         given = [(layer.weights, layer.weights._version) for layer in layers if layer.weights is not None]
         for layer in layers:
             known = any(w is layer.weights and version == w._version for w, version in self._checked)
@@ -283,7 +290,7 @@ class Composer:
 
 
 def _between(part: _LayerSlice, first: int, last: int) -> _LayerSlice:
-    """What of a part lies in rows first to last, counted from the first."""
+    """Return a part restricted to the rows from `first` to `last`, with positions relative to `first`."""
     begin, end = np.searchsorted(part.at, (first, last))
     if (first, begin, end) == (0, 0, len(part.at)):
         return part
@@ -291,11 +298,11 @@ def _between(part: _LayerSlice, first: int, last: int) -> _LayerSlice:
 
 
 def _weight_sum(parts: Sequence[_LayerSlice], kind: str, count: int) -> Floats:
-    """max(1, Σ m s) over the layers that make a kind of change; empty where it is 1 everywhere. [U]"""
+    """Return max(1, Σ m s) over the layers with a kind of change; empty if it is 1 everywhere. [U]"""
     parts = [part for part in parts if kind in part.layer.kinds]
-    # a little below 1: sums in float32 may round up to where they count
+    # slightly below 1, because float32 sums may round up to more than 1
     if sum(part.layer.clamped_strength for part in parts) <= 1 - 1e-6:
-        return _NOTHING
+        return _NO_VALUES
     sums = np.zeros(count, np.float32)
     for part in parts:
         weights = part.weights[part.members] if len(part.weights) else np.float32(1.0)
@@ -314,32 +321,35 @@ def _add_offsets(
     hidden: np.float32,
     covered: Floats,
 ) -> None:
-    """total ← total · (1 − m hidden c) + m gain Δ, for one layer and attribute: see `compose_layers`.
+    """Compute total ← total · (1 − m hidden c) + m gain Δ for one layer and attribute, see `compose_layers`.
 
     Args:
-        total: sums so far, written. [U,c]
-        part: where the layer's members are in `total` [m], which they are [m], and the weights of all members
-            [M], empty: all 1
-        stored: end and residual. [M,c], [R,M,c]
+        total: sums so far, updated in place. [U,c]
+        part: positions of the layer's members in `total` [m], their member indices [m], and the weights of
+            all members [M], or [0] if all are 1
+        stored: end and residual bases. [M,c], [R,M,c]
         used, factors: see `_Bases.factors`. [U], [1+U,c] or none
-        hidden, covered: the share of lower layers that is hidden at c = 1, and c [M], empty: 0
+        hidden, covered: share of lower layers that is hidden at coverage 1, and the coverage c [M], or [0] if
+            it is 0 everywhere
     """
     (at, members, weights), (end, residual_levels) = part, stored
     one = np.float32(1.0)
     width = total.shape[1]
-    offsets = np.zeros(_BLOCK * width, np.float32)  # of a block of members: they stay in the first cache
-    tiles = np.empty((len(factors), _BLOCK * width), np.float32)
+    offsets = np.zeros(
+        _BLOCK_MEMBERS * width, np.float32
+    )  # of a block of members, which stay in the L1 cache
+    tiles = np.empty((len(factors), _BLOCK_MEMBERS * width), np.float32)
     for k in range(len(factors)):
-        for i in range(min(_BLOCK, len(at))):
+        for i in range(min(_BLOCK_MEMBERS, len(at))):
             for c in range(width):
                 tiles[k, i * width + c] = factors[k, c]
     ends = end.reshape(-1)
     sums = total.reshape(-1)
-    for first in range(0, len(at), _BLOCK):
-        count = min(_BLOCK, len(at) - first)
+    for first in range(0, len(at), _BLOCK_MEMBERS):
+        count = min(_BLOCK_MEMBERS, len(at) - first)
         low = members[first]
         row = at[first]
-        if members[first + count - 1] - low == count - 1:  # one run: along memory
+        if members[first + count - 1] - low == count - 1:  # consecutive members: contiguous in memory
             for k in range(len(factors)):
                 tile = tiles[k]
                 if k == 0:
@@ -383,18 +393,19 @@ def _add_offsets(
 def _finish(
     after: Floats, before: Floats, rows: Rows, total: Floats, weight_sum: Floats, measure: bool
 ) -> float:
-    """after ← before + total / weight_sum in these rows; the largest squared step of one, if asked for.
+    """Compute after ← before + total / weight_sum in some rows; return the largest squared movement.
 
     Args:
-        after, before: [N,c]
-        rows: [U]
-        total: the sums; overwritten. [U,c]
-        weight_sum: at least 1, empty: all 1. [U]
+        after, before: attribute values, `after` is updated in place. [N,c]
+        rows: rows to write. [U]
+        total: sums, overwritten. [U,c]
+        weight_sum: at least 1; [0] if all are 1. [U]
+        measure: compute the movement of a center; otherwise the result is 0
     """
     largest = np.float32(0.0)
     width = total.shape[1]
-    for first in range(0, len(rows), _BLOCK):
-        count = min(_BLOCK, len(rows) - first)
+    for first in range(0, len(rows), _BLOCK_MEMBERS):
+        count = min(_BLOCK_MEMBERS, len(rows) - first)
         if len(weight_sum):
             for i in range(first, first + count):
                 for c in range(width):

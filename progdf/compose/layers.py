@@ -1,5 +1,4 @@
-"""What a person stacks on a scene: edits, each with a strength, gains and weights; and what a change of the
-stack makes another of."""
+"""Layer stack: edits with a strength, gains and weights, and detection of the edits that a change affects."""
 
 from __future__ import annotations
 
@@ -15,10 +14,10 @@ from progdf.errors import ProgdfError
 from progdf.gdf.file import Gdf
 
 BLENDS = ("normalized", "sum", "over", "adjust")
-"""How layers that share a Gaussian go together; see `progdf.compose.reference.compose_layers`."""
+"""Blend rules for layers that share a Gaussian, see `progdf.compose.reference.compose_layers`."""
 
 ORDERED = ("over", "adjust")
-"""Those where it counts which layer lies on top."""
+"""Blend rules for which the order of the layers matters."""
 
 KINDS = {
     "means": "geometry",
@@ -28,7 +27,7 @@ KINDS = {
     "sh0": "color",
     "shN": "color",
 }
-"""Attribute name -> the gain that scales its change."""
+"""Kind of change for each attribute, which is the name of its gain."""
 
 
 _Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
@@ -36,7 +35,7 @@ _Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 
 @dataclass(frozen=True)
 class Gains:
-    """How much of each kind of change a layer lets through; 1 is the edit as trained, 0 none."""
+    """Factors on each kind of change of a layer, 0 to 1; 1 is the edit as trained."""
 
     geometry: _Share = 1.0
     opacity: _Share = 1.0
@@ -48,38 +47,38 @@ class Layer:
     """One edit in the stack."""
 
     gdf: Gdf  # the edit
-    strength: float = 1.0  # slider value s, 0..1; above 1 is extrapolation
-    enabled: bool = True  # a disabled layer does nothing at all
-    gains: Gains = Gains()  # per-attribute gains
-    # soft membership times painted weight per member, 0..1; None is 1 everywhere. [M] float32
+    strength: float = 1.0  # slider value s, 0 to 1; values above 1 extrapolate
+    enabled: bool = True  # a disabled layer has no effect
+    gains: Gains = Gains()  # factors per kind of change
+    # soft membership times painted weight per member, 0 to 1; None is 1 everywhere. [M] float32
     weights: Tensor | None = None
 
     @property
     def active(self) -> bool:
-        """Whether the layer can change anything: enabled, and its slider off the stop at 0."""
+        """True if the layer can have an effect: it is enabled and its strength is not 0."""
         return self.enabled and self.strength != 0.0
 
     @property
     def clamped_strength(self) -> float:
-        """The strength without its overshoot, 0..1."""
+        """Strength clamped to 0 to 1."""
         return min(max(self.strength, 0.0), 1.0)
 
     @property
     def kinds(self) -> frozenset[str]:
-        """The kinds of change that the edit makes, see `KINDS`."""
+        """Kinds of change that the edit makes, see `KINDS`."""
         return frozenset(KINDS[name] for name in self.gdf.field.attributes)
 
     def gain(self, attribute: str) -> float:
-        """The gain for an attribute, by its kind."""
+        """Return the gain of an attribute."""
         return float(getattr(self.gains, KINDS[attribute]))
 
 
 def check_layers(layers: Sequence[Layer], blend: str) -> None:
-    """Refuse what has no meaning.
+    """Check strengths, gains, weights and the blend rule.
 
     Raises:
         ProgdfError: a strength or gain is not finite, or the blend rule is unknown.
-        ValueError: weights do not fit the members, or one is not in 0..1.
+        ValueError: weights do not fit the members, or a weight is outside 0 to 1.
     """
     check_numbers(layers, blend)
     for layer in layers:
@@ -87,7 +86,7 @@ def check_layers(layers: Sequence[Layer], blend: str) -> None:
 
 
 def check_numbers(layers: Sequence[Layer], blend: str) -> None:
-    """`check_layers` without a look at the weights, which takes no time."""
+    """Check strengths, gains and the blend rule, like `check_layers` without the slow check of weights."""
     if blend not in BLENDS:
         raise ProgdfError(f"unknown blend rule '{blend}'; use one of {', '.join(BLENDS)}")
     for layer in layers:
@@ -99,7 +98,7 @@ def check_numbers(layers: Sequence[Layer], blend: str) -> None:
 
 
 def check_weights(layer: Layer) -> None:
-    """The part of `check_layers` that looks at one layer's weights."""
+    """Check the weights of one layer, see `check_layers`."""
     if layer.weights is None:
         return
     shape = list(layer.weights.shape)
@@ -111,19 +110,22 @@ def check_weights(layer: Layer) -> None:
 
 
 Effect = tuple[tuple[float, Gains, Tensor | None, int, int], ...]
-"""An edit's part, per layer: strength, gains, weights, their version, place in the stack where it counts."""
+"""Effect of an edit, per layer: strength, gains, weights, their version, and position in the stack.
+
+The position is 0 under blend rules without an order.
+"""
 
 
 @dataclass(frozen=True)
 class Effects:
-    """The parts of all edits under one blend rule; an edit that does nothing is absent."""
+    """Effects of all edits under one blend rule. An edit without effect is absent."""
 
     blend: str = "normalized"
     of: Mapping[int, Effect] = field(default_factory=dict)
 
 
 def effects_of(stack: Sequence[tuple[int, Layer]], blend: str) -> Effects:
-    """The effects of active layers, lowest first, each with the index of its edit."""
+    """Return the effects of active layers, which are given lowest first with the index of their edit."""
     effects: dict[int, Effect] = {}
     for index, (edit, layer) in enumerate(stack):
         version = -1 if layer.weights is None else layer.weights._version
@@ -134,7 +136,7 @@ def effects_of(stack: Sequence[tuple[int, Layer]], blend: str) -> Effects:
 
 
 def changed_edits(before: Effects, now: Effects) -> frozenset[int]:
-    """Indices of the edits whose members may differ; weights are compared by identity and version."""
+    """Return the indices of edits whose members may differ. Weights are compared by identity and version."""
     return frozenset(
         edit
         for edit in {*before.of, *now.of}

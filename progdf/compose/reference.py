@@ -1,7 +1,7 @@
-"""Several edits on one scene: Θ = Θ0 + blend over the enabled layers of m · gain · Δ(s) (docs/method.md 6).
+"""Composition of several edits: Θ = Θ0 + blend over the enabled layers of m · gain · Δ(s) (docs/method.md 6).
 
-`compose_layers` is the plain form that states the rules. `progdf.compose.composer.Composer` gives the same
-numbers while a slider is dragged, in buffers that are made once.
+`compose_layers` is the reference implementation. `progdf.compose.composer.Composer` computes the same numbers
+in preallocated buffers while a slider is dragged.
 """
 
 from __future__ import annotations
@@ -24,50 +24,54 @@ from progdf.sh import C0
 from .added import extend
 from .layers import BLENDS, KINDS, ORDERED, Gains, Layer, check_layers
 
-_COLOR = 0.1  # of sRGB's 0..1: a change that is plain to see
-_OPACITY = 0.2  # of 0..1
-_MOVE = 0.05  # of the region's size
-_GROWTH = 0.4  # of a log-scale
-_TURN = 0.4  # of a quaternion's length
-_SHARE_OF_LARGEST = 0.5
-_MOST = 100_000  # members by which the largest change is judged
+# changes that are clearly visible
+_VISIBLE_COLOR = 0.1  # sRGB, 0 to 1
+_VISIBLE_OPACITY = 0.2  # opacity, 0 to 1
+_VISIBLE_MOVE = 0.05  # movement, in sizes of the region
+_VISIBLE_GROWTH = 0.4  # log-scale
+_VISIBLE_ROTATION = 0.4  # change of a quaternion, as a share of its length
+_SHARE_OF_LARGEST = 0.5  # share of an edit's own large changes from which a change hides all below
+_MAX_SAMPLED_MEMBERS = 100_000  # members that are sampled to find an edit's large changes
 
 
 def coverage(scene: Gaussians, gdf: Gdf) -> Mapping[str, Tensor]:
-    """For each kind of change that an edit makes, how much of a lower edit's is hidden by it at strength 1.
+    """Return how much an edit at strength 1 hides of lower edits, per member and kind of change.
 
-    With z the size of a member's finished change, c = smoothstep(z / max(floor, z₉₀ / 2)), where z₉₀ is
-    exceeded by a tenth of the members: what the edit leaves alone hides nothing, half of its own large
-    changes hide all. z is what one sees:
+    With z the visible size of a member's change at strength 1, c = smoothstep(z / max(floor, z₉₀ / 2)). z₉₀
+    is the 90th percentile over the members. So an unchanged member hides nothing, and one with half of the
+    edit's large changes hides everything below. z is, per kind:
 
-    - "color": the largest channel of the change in sRGB, root mean square over all directions of view
+    - "color": the largest channel of the sRGB change, as root mean square over all viewing directions
       (C0 · √Σ Δ² over the SH coefficients); floor 0.1
     - "opacity": the change of σ(logit); floor 0.2
-    - "geometry": the largest of the way / 0.05 of the region's size, the growth of a log-scale / 0.4, and the
-      turn |Δq| / 0.4 |q|; floor 1
+    - "geometry": the largest of the movement / 0.05 of the region's size, the change of a log-scale / 0.4,
+    and
+      the rotation |Δq| / 0.4 |q|; floor 1
 
-    Nothing of it is stored: it follows from the offsets at strength 1, and so holds for every .gdf.
+    Coverage is not stored. It follows from the offsets at strength 1, and so is defined for every .gdf.
 
     Returns:
-        Kind, see `layers.KINDS` -> c, 0..1; of a grade also "map" -> see `map_share`. [M] float32
+        Kind (see `layers.KINDS`) -> c, 0 to 1. A grade also has "map", see `map_share`. [M] float32
     """
     members = gdf.region.members
     field = gdf.field
     sizes = {
-        "color": (_color_change(field), _COLOR),
-        "opacity": (_opacity_change(scene, members, field), _OPACITY),
+        "color": (_color_change(field), _VISIBLE_COLOR),
+        "opacity": (_opacity_change(scene, members, field), _VISIBLE_OPACITY),
         "geometry": (_shape_change(scene, members, field), 1.0),
     }
     moved = {KINDS[name] for name in field.attributes}
-    covered = {kind: _rise(size, floor) for kind, (size, floor) in sizes.items() if kind in moved}
+    covered = {
+        kind: _coverage_of_sizes(size, floor) for kind, (size, floor) in sizes.items() if kind in moved
+    }
     return covered | {"map": map_share(field)} if isinstance(field.origin, GradeForm) else covered
 
 
-def _rise(size: Tensor, floor: float) -> Tensor:
+def _coverage_of_sizes(size: Tensor, floor: float) -> Tensor:
     if not len(size):
         return size
-    few = size[:: 1 + len(size) // _MOST]
-    largest = float(few.kthvalue(1 + int(0.9 * (len(few) - 1))).values)
+    sample = size[:: 1 + len(size) // _MAX_SAMPLED_MEMBERS]
+    largest = float(sample.kthvalue(1 + int(0.9 * (len(sample) - 1))).values)
     return smoothstep(size / max(floor, _SHARE_OF_LARGEST * largest)).float()
 
 
@@ -93,63 +97,64 @@ def _shape_change(scene: Gaussians, members: Tensor, field: BakedField) -> Tenso
     if "means" in field.attributes and len(members):
         means = scene.means[members].float()
         extent = (means - means.mean(dim=0)).norm(dim=1).median().clamp_min(1e-12) * 2
-        size = field.attributes["means"].end.norm(dim=1) / (_MOVE * extent)
+        size = field.attributes["means"].end.norm(dim=1) / (_VISIBLE_MOVE * extent)
     if "log_scales" in field.attributes:
-        size = size.maximum(field.attributes["log_scales"].end.abs().amax(dim=1) / _GROWTH)
+        size = size.maximum(field.attributes["log_scales"].end.abs().amax(dim=1) / _VISIBLE_GROWTH)
     if "quats" in field.attributes:
         length = scene.quats[members].float().norm(dim=1).clamp_min(1e-6)
-        size = size.maximum(field.attributes["quats"].end.norm(dim=1) / (_TURN * length))
+        size = size.maximum(field.attributes["quats"].end.norm(dim=1) / (_VISIBLE_ROTATION * length))
     return size
 
 
 __all__ = ["BLENDS", "Gains", "Layer", "compose_layers"]
 
 NEGATIVE_ZERO = -0.0
-"""The number that added to any other, −0.0 included, leaves every bit as it was."""
+"""Number that leaves every bit unchanged when added to any number, including −0.0."""
 Coverage = Callable[[Gaussians, Gdf], Mapping[str, Tensor]]
-"""See `coverage`."""
+"""Function with the signature of `coverage`."""
 
-_ALL = slice(None)
+_ALL_ROWS = slice(None)
 _COLORS = ("sh0", "shN")
-_DRAWN = 16  # bands that are drawn
+_DRAWN_COEFFICIENTS = 16  # SH coefficients that are drawn (degree 3)
 
 
 def edited_scene(scene: Gaussians, gdf: Gdf, strength: float = 1.0) -> Gaussians:
-    """The scene under one edit, the rows that it adds after its own."""
+    """Return the scene under one edit, with the rows that it adds after its own."""
     return compose_layers(scene, [Layer(gdf, strength)])
 
 
 def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "normalized") -> Gaussians:
-    """The scene under a stack of edits.
+    """Return the scene under a stack of edits.
 
     With m the layer's weights, g its gain for the kind of attribute, and Δ(s) its field at strength s:
 
-    - "normalized": Σ m g Δ(s) / max(1, Σ m s), the lower sum over the layers that make this kind of change.
-      One layer alone is untouched, order does not matter, and it is the plain sum while the strengths on a
-      Gaussian add up to no more than 1.
+    - "normalized": Σ m g Δ(s) / max(1, Σ m s). The lower sum is over the layers that make this kind of
+    change.
+      A single layer is unchanged, and the order does not matter. It equals "sum" while the strengths on a
+      Gaussian add up to at most 1.
     - "sum": Σ m g Δ(s).
-    - "over": in the order given, Δ ← Δ · (1 − m s c min(1, |g|)) + m g Δ(s), where c is how much the layer
-      itself changes of that kind, 0 to 1 (`coverage`); the last layer lies on top, and what it
-      leaves alone shows the layers below.
+    - "over": in the given order, Δ ← Δ · (1 − m s c min(1, |g|)) + m g Δ(s). The last layer lies on top. Its
+      `coverage` c, 0 to 1, is how much it changes of that kind. Lower layers are visible where it changes
+      nothing.
+    - "adjust": as "over", but a grade (see `progdf.field.grade`) hides nothing. It maps the colors that
+    result
+      from the layers below, Δ ← Δ + m g (grade(Θ0 + Δ, s) − Θ0 − Δ). On unchanged Gaussians it is the edit as
+      trained, and darkened stripes stay stripes. A member whose change comes more from the residual than from
+      the map lies over the lower layers to that extent, see `map_share`. So dark gaps between stripes stay
+      dark.
 
-    - "adjust": as "over", but a grade (see `progdf.field.grade`) hides nothing: it maps the colors that the
-      layers below have left, Δ ← Δ + m g (grade(Θ0 + Δ, s) − Θ0 − Δ). Over what nobody changed it is the edit
-      as trained; darkened stripes stay stripes. Where a member's change is more its residual's than the map's
-      it lies over the others that far, see `map_share`: between stripes on what is dark it stays dark.
-
-    In Σ m s and 1 − m s c, s is held to 0..1: an overshoot exaggerates its own edit and does not dim the
-    others.
+    In Σ m s and 1 − m s c, s is clamped to 0 to 1. A strength above 1 exaggerates its own edit without
+    dimming the others.
 
     Args:
         scene: the original
-        layers: edits of this scene, the lowest first
+        layers: edits of this scene, lowest first
         blend: one of `BLENDS`
 
     Returns:
-        New Gaussians, with the rows that the edits add after the scene's own (see `progdf.compose.added`);
-        attributes that no layer moves are the scene's own tensors. Rows outside all members,
-        rows of weight 0, and everything at strength 0 keep their bytes. One layer at strength 1 gives Θ0 +
-        full exactly.
+        New Gaussians, with the rows that the edits add after the scene's own (see `progdf.compose.added`).
+        Attributes that no layer changes are the scene's own tensors. Rows outside all members, rows of weight
+        0, and all rows at strength 0 keep their bytes. One layer at strength 1 gives exactly Θ0 + Δ(1).
 
     Raises:
         ProgdfError: an edit belongs to another scene, a strength is not a number, the blend rule is unknown.
@@ -173,16 +178,16 @@ def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "norm
 def changed_rows(
     scene: Gaussians, layers: Sequence[Layer], blend: str, covers: Coverage = coverage
 ) -> tuple[Tensor, dict[str, Any]]:
-    """What `compose_layers` changes, without a copy of the scene.
+    """Return the rows that `compose_layers` changes and their new values, without a copy of the scene.
 
     Args:
         scene: the original
-        layers: active ones, at least one, checked
+        layers: active layers, at least one, checked
         blend: one of `BLENDS`
-        covers: `coverage`, or where that is kept
+        covers: `coverage`, or a cached version of it
 
     Returns:
-        Sorted rows [U] int64, and by attribute that a layer moves what they become [U,...]
+        Sorted rows [U] int64, and the new values of each changed attribute [U,...].
     """
     rows, parts = _parts(scene, layers, blend, covers)
     weight_sums = {kind: torch.zeros(len(rows)) for kind in KINDS.values()}  # Σ m s
@@ -208,17 +213,17 @@ def changed_rows(
 
 @dataclass(frozen=True)
 class _LayerMembers:
-    """A layer's members of weight ≠ 0, m in number."""
+    """The m members of a layer with nonzero weight."""
 
     layer: Layer  # the layer
-    members: Tensor | slice  # which of its members these are, all of them as a slice. [m] int64
-    rows: Tensor | slice  # where they are among the rows that change, all of them as a slice. [m] int64
-    weights: Tensor  # theirs. [m] float32
-    # how far it hides the layers below, by kind of attribute; empty but for "over". [M] float32
+    members: Tensor | slice  # member indices; a slice if all members are included. [m] int64
+    rows: Tensor | slice  # positions among the changed rows; a slice if these are all of them. [m] int64
+    weights: Tensor  # weights of these members. [m] float32
+    # coverage of the layers below, by kind of change; empty for blend rules without an order. [M] float32
     coverage: Mapping[str, Tensor]
 
     def add(self, total: Tensor, name: str, hides: bool) -> None:
-        """Add its offsets of one attribute to the sums. [U,c]"""
+        """Add the layer's offsets of one attribute to the sums. [U,c]"""
         weight = self.weights[:, None]
         gain = self.layer.gain(name)
         below = total[self.rows]
@@ -229,12 +234,12 @@ class _LayerMembers:
         total[self.rows] = below + weight * gain * offsets
 
     def moves(self, attribute: str) -> bool:
-        """Whether it changes an attribute at all."""
+        """Return whether the layer changes an attribute."""
         return attribute in self.layer.gdf.field.attributes and self.layer.gain(attribute) != 0
 
 
 def _adjusted_colors(scene: Gaussians, rows: Tensor, parts: Sequence[_LayerMembers]) -> dict[str, Tensor]:
-    """The sums of the color attributes under "adjust". [U,c] each"""
+    """Return the sums of the color attributes under "adjust". [U,c] each"""
     moved = {name for part in parts for name in _COLORS if part.moves(name)}
     old = {name: getattr(scene, name)[rows].float().flatten(1) for name in _COLORS if name in moved}
     total = {name: torch.full_like(values, NEGATIVE_ZERO) for name, values in old.items()}
@@ -249,7 +254,9 @@ def _adjusted_colors(scene: Gaussians, rows: Tensor, parts: Sequence[_LayerMembe
         if isinstance(form, GradeForm) and names and bool(here.any()):
             sh = [(old[n][part.rows] + before[n])[here].reshape(int(here.sum()), -1, 3) for n in names]
             members = torch.arange(len(part.layer.gdf.region))[part.members][here]
-            change = adjust_colors(form, torch.cat(sh, dim=1)[:, :_DRAWN], members, part.layer.strength)
+            change = adjust_colors(
+                form, torch.cat(sh, dim=1)[:, :_DRAWN_COEFFICIENTS], members, part.layer.strength
+            )
             factor = part.weights[here, None, None] * part.layer.gain("sh0")
             share = part.coverage["map"][members, None]
             for name, bands in zip(names, (change[:, :1], change[:, 1:]), strict=False):
@@ -265,12 +272,14 @@ def _adjusted_colors(scene: Gaussians, rows: Tensor, parts: Sequence[_LayerMembe
 def _parts(
     scene: Gaussians, layers: Sequence[Layer], blend: str, covers: Coverage
 ) -> tuple[Tensor, list[_LayerMembers]]:
-    """The sorted rows of the scene that change, [U] int64, and each layer's part in them."""
+    """Return the sorted rows of the scene that change, [U] int64, and each layer's members in them."""
     chosen: list[tuple[Tensor | slice, Tensor]] = []  # members and their weights
     for layer in layers:
         weights = torch.ones(len(layer.gdf.region)) if layer.weights is None else layer.weights.float()
         selected = weights.nonzero()[:, 0]
-        chosen.append((_ALL, weights) if len(selected) == len(weights) else (selected, weights[selected]))
+        chosen.append(
+            (_ALL_ROWS, weights) if len(selected) == len(weights) else (selected, weights[selected])
+        )
     reached = [layer.gdf.region.members[members] for layer, (members, _) in zip(layers, chosen, strict=True)]
     rows = reached[0] if len(reached) == 1 else torch.unique(torch.cat(reached))
     position = torch.empty(len(scene) if len(reached) > 1 else 0, dtype=torch.int64)
@@ -280,7 +289,7 @@ def _parts(
         _LayerMembers(
             layer,
             members,
-            _ALL if len(layer_rows) == len(rows) else position[layer_rows],
+            _ALL_ROWS if len(layer_rows) == len(rows) else position[layer_rows],
             weights,
             covers(scene, layer.gdf) if blend in ORDERED else {},
         )
