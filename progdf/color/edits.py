@@ -1,9 +1,9 @@
-"""Color edits as pure functions of colors and strength, the same for pixels and for Gaussians.
+"""Color edits as pure functions of colors and strength, for pixels and Gaussians alike.
 
-Every function takes sRGB as it is stored (0..1, not linear) in any shape [...,3], returns the same shape,
-gives the input back bit for bit where the strength is 0, and moves continuously with it. Hue, chroma and
-lightness are those of `progdf.color.oklab`; what lies between the original and the finished edit is said in
-`progdf.color.oklab`.
+Every function maps encoded (not linear) sRGB colors, 0 to 1, of any shape [...,3] to the same shape. At
+strength 0 it returns the input bit for bit, and the result is continuous in the strength.
+`progdf.color.oklab` defines hue, chroma and lightness, and the path of a color from the original to the full
+edit.
 """
 
 from __future__ import annotations
@@ -34,16 +34,20 @@ from .oklab import (
 from .palette import Curve, are_alike, bend_lightness, less_light, shift_palette
 
 Course = Callable[[Strength], Tensor]
-"""Some colors [...,3] at a strength."""
+"""Function from a strength to colors [...,3]: the path of an edit."""
 
-_MIN_CHROMA = 0.015  # of a target that has a hue
-_CAST = 0.1  # of lightness: the chroma of white under the bluest and the most amber light
-_MIDDLE = 0.5646  # lightness of 18 % gray, which contrast leaves where it is
-_LARGEST_GAIN = 3.0  # a dark part that becomes bright is lifted instead of amplifying its noise further
+_MIN_CHROMA = 0.015  # smallest chroma of a target with a hue
+_CAST_CHROMA = 0.1  # chroma of white under the bluest and the most amber light, as a share of its lightness
+_MIDDLE_GRAY = 0.5646  # lightness of 18 % gray, the fixed point of contrast
+_MAX_GAIN = 3.0  # brighter targets lift a dark part instead of amplifying its noise further
 
 
 def parse_color(text: str) -> Tensor:
-    """The color of `#rrggbb` or `#rgb`, the `#` optional, as sRGB. [3] float32; else a ProgdfError."""
+    """Return the sRGB color of `#rrggbb` or `#rgb`, the `#` optional. [3] float32
+
+    Raises:
+        ProgdfError: the text is not a color.
+    """
     digits = text.strip().removeprefix("#")
     if len(digits) == 3:
         digits = "".join(2 * digit for digit in digits)
@@ -53,16 +57,16 @@ def parse_color(text: str) -> Tensor:
 
 
 def hex_color(color: Sequence[float]) -> str:
-    """`#rrggbb` of a color 0..1."""
+    """Return `#rrggbb` for a color, 0 to 1."""
     return "#" + "".join(f"{round(255 * min(max(channel, 0.0), 1.0)):02x}" for channel in color)
 
 
-@one_thread()  # sums of many are added in an order that depends on the number of threads
+@one_thread()  # the order of a large sum, and so its rounding, depends on the number of threads
 def typical_color(rgb: Tensor, weights: Tensor | None = None) -> Tensor:
-    """The weighted mean color, averaged in OKLab. [...,3], [...] or None -> [3]
+    """Return the weighted mean color, averaged in OKLab. [...,3], [...] or None -> [3]
 
-    Take it once over the whole region (all views, all members) and pass it to every `recolor_course` there:
-    the edit is then the same function of color in each view.
+    Compute it once over the whole region (all views, all members) and pass it to every `recolor_course`
+    there. The edit is then the same function of color in each view.
     """
     lab = srgb_to_oklab(rgb.clamp(0, 1)).reshape(-1, 3)
     w = torch.ones_like(lab[:, 0]) if weights is None else weights.reshape(-1).to(lab.dtype)
@@ -72,45 +76,46 @@ def typical_color(rgb: Tensor, weights: Tensor | None = None) -> Tensor:
 
 
 def recolor_course(rgb: Tensor, target: Tensor, reference: Tensor, path: ColorPath = "bowed") -> Course:
-    """Give a thing another color and keep its shading: all of `recolor_fully`, or a part of the way there.
+    """Return the path from colors to those of `recolor_fully`, which keeps the shading.
 
     Args:
-        rgb: sRGB colors, 0..1; what lies outside (SH colors may) fades with the strength. [...,3]
-        target: the color that `reference` has at strength 1, sRGB 0..1. [3]
-        reference: the region's own color, see `typical_color`. [3]
-        path: see `bend_of`
+        rgb: sRGB colors, 0 to 1. A part outside, possible for SH colors, fades with the strength. [...,3]
+        target: color of `reference` at strength 1, sRGB 0 to 1. [3]
+        reference: typical color of the region, see `typical_color`. [3]
+        path: shape of the path, see `bend_of`
     """
     bend = bend_of(_as_tensor(reference, rgb), _as_tensor(target, rgb), path)
     return color_course(rgb, recolor_fully(rgb, target, reference), bend)
 
 
 def recolor_fully(rgb: Tensor, target: Tensor, reference: Tensor) -> Tensor:
-    """The end of a `recolor_course`. [...,3] -> [...,3] 0..1
+    """Recolor at full strength. [...,3] -> [...,3], 0 to 1
 
-    Lightness is scaled so that `reference` becomes `target`; chroma follows the lightness; the hue is the
-    target's, or stays where the target is too gray to have one. A dark source is lifted.
+    The lightness is scaled so that `reference` becomes `target`, and the chroma follows the lightness. The
+    hue is the target's, or unchanged if the target is gray. A dark source is lifted.
     """
     lab, (new_l, new_a, new_b) = srgb_to_oklab(rgb.clamp(0, 1)), srgb_to_oklab(_as_tensor(target, rgb))
     new_c = torch.hypot(new_a, new_b)
     ref_l = srgb_to_oklab(_as_tensor(reference, rgb))[0]
     lightness = _relight(lab[..., 0], ref_l.clamp(0.02, 0.98), new_l.clamp(0.02, 0.98))
-    # chroma in proportion to lightness is the same surface in less light; towards white the gamut narrows it
+    # chroma in proportion to lightness is the same surface in less light; near white the gamut limits it
     chroma = new_c * (lightness / new_l.clamp_min(0.02)).clamp(0, 1)
     hue = torch.atan2(new_b, new_a) if new_c >= _MIN_CHROMA else hue_of(lab)
     return fit_gamut(torch.stack([lightness, chroma * torch.cos(hue), chroma * torch.sin(hue)], dim=-1))
 
 
 def tint_course(rgb: Tensor, target: Tensor, reference: Tensor, path: ColorPath = "bowed") -> Course:
-    """Wash with a color: lightness stays, hue and chroma go most of the way to the target's.
+    """Return the path from colors to those of `tint_fully`, a wash with a color.
 
-    See `recolor_course` for the arguments; here `reference` decides nothing but the bend.
+    The lightness is unchanged, and hue and chroma move most of the way to the target's. For the arguments see
+    `recolor_course`. `reference` only determines the bend of the path.
     """
     bend = bend_of(_as_tensor(reference, rgb), _as_tensor(target, rgb), path)
     return color_course(rgb, tint_fully(rgb, target), bend)
 
 
 def tint_fully(rgb: Tensor, target: Tensor, share: float = 0.7) -> Tensor:
-    """The end of a `tint_course`; `share`: how far hue and chroma go. [...,3] -> [...,3] 0..1"""
+    """Tint at full strength: move hue and chroma by `share` to the target. [...,3] -> [...,3], 0 to 1"""
     lab = srgb_to_oklab(rgb.clamp(0, 1))
     goal = srgb_to_oklab(_as_tensor(target, rgb))
     lightness = lab[..., :1]
@@ -121,7 +126,7 @@ def tint_fully(rgb: Tensor, target: Tensor, share: float = 0.7) -> Tensor:
 
 
 def darken(rgb: Tensor, strength: Strength = 1.0, stops: float = 3.0) -> Tensor:
-    """Take light away: 2^(−stops·strength) of the light is left, hue and contrast stay. [...,3] -> [...,3]"""
+    """Scale the light by 2^(−stops·strength), with unchanged hue and contrast. [...,3] -> [...,3]"""
     inside = rgb.clamp(0, 1)
     s = torch.as_tensor(strength, dtype=rgb.dtype, device=rgb.device).expand(rgb.shape[:-1]).clamp(0, 1)
     # OKLab is homogeneous of degree 1/3 in linear light
@@ -130,7 +135,7 @@ def darken(rgb: Tensor, strength: Strength = 1.0, stops: float = 3.0) -> Tensor:
 
 
 def night_course(rgb: Tensor, stops: float = 3.0) -> Course:
-    """Moonlight: `darken`, with colors fading to a cool blue as they do in scarce light."""
+    """Return the path to moonlight: `darken`, with colors that fade to a cool blue as in dim light."""
     bluer = color_course(rgb, tint_fully(rgb, rgb.new_tensor([0.35, 0.50, 0.85]), share=0.75), STRAIGHT)
     return lambda strength: darken(bluer(strength), strength, stops)
 
@@ -144,23 +149,27 @@ GRADE_RANGES: dict[str, tuple[float, float, float]] = {
     "black": (0.0, 0.5, 0.0),
     "white": (0.5, 1.0, 1.0),
 }
-"""What a grade takes: the least, the largest, and what changes nothing. Exposure is in stops; temperature
-goes from blue to amber, tint from green to magenta, saturation from gray to twice; black and white are the
-sRGB values that become 0 and 1."""
+"""Smallest, largest and neutral value of each setting of a grade.
+
+Exposure is in stops. Temperature goes from blue to amber, tint from green to magenta, and saturation from
+gray to twice the chroma. Black and white are the sRGB values that become 0 and 1.
+"""
 
 
 @dataclass(frozen=True)
 class ColorGrade:
-    """What a person asks of colors."""
+    """Settings of a color grade."""
 
-    values: Mapping[str, float] = field(default_factory=dict)  # of some of `GRADE_RANGES`
-    palette: tuple[tuple[Tensor, Tensor], ...] = ()  # sources and targets, sRGB [3]; see `shift_palette`
-    palette_curves: tuple[Curve, ...] = ()  # of the lightness near each source; none at all, or one of each
-    curve: Curve = ()  # of lightness
+    values: Mapping[str, float] = field(
+        default_factory=dict
+    )  # by names of `GRADE_RANGES`; others are neutral
+    palette: tuple[tuple[Tensor, Tensor], ...] = ()  # source and target colors, sRGB [3], see `shift_palette`
+    palette_curves: tuple[Curve, ...] = ()  # lightness curves near each source; empty, or one per source
+    curve: Curve = ()  # lightness curve for all colors
 
     @property
     def is_neutral(self) -> bool:
-        """Whether it changes nothing."""
+        """True if the grade changes nothing."""
         still = all(self.values.get(name, neutral) == neutral for name, (*_, neutral) in GRADE_RANGES.items())
         stays = all(torch.equal(source, target) for source, target in self.palette)
         curves = (*self.palette_curves, self.curve)
@@ -168,12 +177,15 @@ class ColorGrade:
 
 
 def parse_grade(what: str) -> ColorGrade:
-    """The grade that a text says: values of `GRADE_RANGES` as NAME=NUMBER; colors that become others as
-    #rrggbb=#rrggbb, or one alone that stays; a curve of lightness as curve=FROM:TO+FROM:TO, of what is near a
-    color as #rrggbb=#rrggbb/FROM:TO+FROM:TO.
+    """Parse a grade from a text of parts between commas.
+
+    - NAME=NUMBER sets a value of `GRADE_RANGES`.
+    - #rrggbb=#rrggbb changes a color into another, and #rrggbb holds one.
+    - curve=FROM:TO+FROM:TO sets the lightness curve.
+    - #rrggbb=#rrggbb/FROM:TO+FROM:TO sets the lightness curve near a color.
 
     Raises:
-        ProgdfError: it says something else, or nothing.
+        ProgdfError: a part cannot be read, or the grade changes nothing.
     """
     values: dict[str, float] = {}
     pairs: list[tuple[Tensor, Tensor]] = []
@@ -203,18 +215,18 @@ def parse_grade(what: str) -> ColorGrade:
                 raise ProgdfError(f"in grade:{what:.80} {name} is '{number:.40}'; write {low:g} to {high:g}")
     if len(pairs) > MAX_PAIRS:
         raise ProgdfError(f"grade:{what:.80} has {len(pairs)} colors; the most are {MAX_PAIRS}")
-    asked = ColorGrade(values, tuple(pairs), tuple(curves), curve)
-    if asked.is_neutral:
+    grade = ColorGrade(values, tuple(pairs), tuple(curves), curve)
+    if grade.is_neutral:
         raise ProgdfError(f"grade:{what:.80} changes nothing; write, for example, grade:exposure=0.7")
-    return asked
+    return grade
 
 
 MAX_PAIRS = 16
-"""Colors that a grade moves or holds."""
+"""Largest number of colors that a grade changes or holds."""
 
 
 def _curve_of(what: str, text: str) -> Curve:
-    """The points of `0.3:0.2+0.7:0.8`."""
+    """Return the points of a curve such as `0.3:0.2+0.7:0.8`."""
     points = [tuple(number_of(n) for n in point.split(":")) for point in text.split("+")]
     curve = tuple((p[0], p[1]) for p in points if len(p) == 2 and all(0.0 <= x <= 1.0 for x in p))
     rises = all(a[0] < b[0] for a, b in pairwise(curve))
@@ -226,7 +238,7 @@ def _curve_of(what: str, text: str) -> Curve:
 
 
 def number_of(text: str) -> float:
-    """NaN where it is none."""
+    """Return the number in a text, or NaN if there is none."""
     try:
         return float(text)
     except ValueError:
@@ -234,47 +246,47 @@ def number_of(text: str) -> float:
 
 
 def grade_course(rgb: Tensor, grade: ColorGrade) -> Course:
-    """`grade_fully` at many strengths, straight in OKLab."""
+    """Return the path from colors to those of `grade_fully`, straight in OKLab."""
     return color_course(rgb, grade_fully(rgb, grade), STRAIGHT)
 
 
 def grade_fully(rgb: Tensor, grade: ColorGrade) -> Tensor:
-    """Palette, levels, exposure, white balance, contrast, curve and saturation, in this order.
+    """Apply palette, levels, exposure, white balance, contrast, curve and saturation, in this order.
 
     Args:
-        rgb: sRGB colors, 0..1. [...,3]
-        grade: what is asked
+        rgb: sRGB colors, 0 to 1. [...,3]
+        grade: settings
 
     Returns:
-        [...,3] 0..1
+        Graded sRGB colors, 0 to 1. [...,3]
     """
-    of = {name: grade.values.get(name, neutral) for name, (_, _, neutral) in GRADE_RANGES.items()}
+    value = {name: grade.values.get(name, neutral) for name, (_, _, neutral) in GRADE_RANGES.items()}
     if grade.palette:
         sources, targets = (srgb_to_oklab(torch.stack(colors)) for colors in zip(*grade.palette, strict=True))
         lab = srgb_to_oklab(rgb.clamp(0, 1))
         rgb = fit_gamut(shift_palette(lab, sources, targets, grade.palette_curves))
-    levels = ((rgb.clamp(0, 1) - of["black"]) / (of["white"] - of["black"])).clamp(0, 1)
-    lab = srgb_to_oklab(levels) * 2.0 ** (of["exposure"] / 3)  # homogeneous of degree 1/3 in linear light
+    levels = ((rgb.clamp(0, 1) - value["black"]) / (value["white"] - value["black"])).clamp(0, 1)
+    lab = srgb_to_oklab(levels) * 2.0 ** (value["exposure"] / 3)  # homogeneous of degree 1/3 in linear light
     lightness = lab[..., 0].clamp(0, 1)
-    cast = _CAST * lightness[..., None] * lab.new_tensor([of["tint"], of["temperature"]])
-    power = 2.0 ** of["contrast"]
-    low = _MIDDLE * (lightness / _MIDDLE).clamp_max(1).pow(power)
-    high = (1 - _MIDDLE) * ((1 - lightness) / (1 - _MIDDLE)).clamp_max(1).pow(power)
-    steeper = torch.where(lightness < _MIDDLE, low, 1 - high)
+    cast = _CAST_CHROMA * lightness[..., None] * lab.new_tensor([value["tint"], value["temperature"]])
+    power = 2.0 ** value["contrast"]
+    low = _MIDDLE_GRAY * (lightness / _MIDDLE_GRAY).clamp_max(1).pow(power)
+    high = (1 - _MIDDLE_GRAY) * ((1 - lightness) / (1 - _MIDDLE_GRAY)).clamp_max(1).pow(power)
+    steeper = torch.where(lightness < _MIDDLE_GRAY, low, 1 - high)
     if grade.curve:
         steeper = bend_lightness(steeper, grade.curve)
-    chroma = (lab[..., 1:] + cast) * (1 + of["saturation"]) * less_light(lightness, steeper)[..., None]
+    chroma = (lab[..., 1:] + cast) * (1 + value["saturation"]) * less_light(lightness, steeper)[..., None]
     return fit_gamut(torch.cat([steeper[..., None], chroma], dim=-1))
 
 
 def stripe_pattern(points: Tensor, axis: Tensor, period: float, phase: float = 0.0) -> Tensor:
-    """How much each 3D point lies in a stripe; a function of place, so every view sees the same stripes.
+    """Return how much each 3D point lies in a stripe. Stripes depend on position, so all views agree.
 
     Args:
         points: world positions. [...,3]
-        axis: direction across the stripes, any length but 0. [3]
-        period: distance from stripe to stripe, world units, > 0
-        phase: shift in periods
+        axis: direction across the stripes, of any nonzero length. [3]
+        period: distance between stripes, world units, > 0
+        phase: shift, in periods
 
     Returns:
         0 (between) to 1 (in a stripe). [...]
@@ -283,9 +295,12 @@ def stripe_pattern(points: Tensor, axis: Tensor, period: float, phase: float = 0
 
 
 def stripe_profile(turns: Tensor, width: float = 0.5, softness: float = 0.08) -> Tensor:
-    """Stripes along any coordinate counted in periods, centered on whole numbers. [...] -> [...] in 0..1
+    """Return the profile of stripes centered on whole numbers of periods. [...] -> [...], 0 to 1
 
-    `width`: share of the period that is stripe, 0..1; `softness`: width of the edge in periods
+    Args:
+        turns: coordinate, in periods. [...]
+        width: width of a stripe as a share of the period, 0 to 1
+        softness: width of the soft edge, in periods
     """
     distance = (turns - turns.round()).abs()
     return smoothstep((0.5 * width - distance) / max(softness, 1e-6) + 0.5)
@@ -296,11 +311,11 @@ def _as_tensor(color: Tensor, rgb: Tensor) -> Tensor:
 
 
 def _relight(lightness: Tensor, reference: Tensor, goal: Tensor) -> Tensor:
-    """Scale lightness so that `reference` becomes `goal`; brightening bends towards white, never clips."""
+    """Scale lightness so that `reference` becomes `goal`. Brightening bends towards white and never clips."""
     gain = goal / reference
-    below = (goal + (lightness - reference) * gain.clamp_max(_LARGEST_GAIN)).clamp_min(0)
-    slope = gain.clamp(1.0, _LARGEST_GAIN) * (1 - reference) / (1 - goal)
+    below = (goal + (lightness - reference) * gain.clamp_max(_MAX_GAIN)).clamp_min(0)
+    slope = gain.clamp(1.0, _MAX_GAIN) * (1 - reference) / (1 - goal)
     x = ((lightness - reference) / (1 - reference)).clamp(0, 1)
-    # a hyperbola that leaves (reference, goal) with the gain as slope and ends at (1, 1)
+    # hyperbola from (reference, goal), with the gain as its slope there, to (1, 1)
     above = goal + (1 - goal) * slope * x / (1 + (slope - 1) * x)
     return torch.where((lightness > reference) & (gain > 1), above, below).clamp(0, 1)

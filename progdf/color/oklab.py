@@ -1,6 +1,6 @@
-"""OKLab, in which equal steps look equal (Ottosson 2020, https://bottosson.github.io/posts/oklab/).
+"""OKLab, a perceptually uniform color space (Ottosson 2020, https://bottosson.github.io/posts/oklab/).
 
-Its polar form, OKLCh, has hue, chroma and lightness: scaling the lightness there is scaling the light.
+Its polar form OKLCh has lightness, chroma and hue. Scaling OKLab colors scales the light.
 """
 
 from __future__ import annotations
@@ -31,37 +31,37 @@ _GAMUT_SLACK = 1e-3  # less than a third of an 8-bit step
 
 @cache
 def _matrices(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Linear to LMS, LMS to Lab, and the inverses of both, transposed: for colors in rows."""
+    """Return the matrices linear to LMS and LMS to Lab, and their inverses, transposed for colors in rows."""
     to_lms, to_lab = (torch.tensor(m, dtype=dtype, device=device) for m in (_LMS_FROM_LINEAR, _LAB_FROM_LMS))
     return to_lms.T, to_lab.T, torch.linalg.inv(to_lms).T, torch.linalg.inv(to_lab).T
 
 
 def srgb_to_oklab(rgb: Tensor) -> Tensor:
-    """Lightness 0..1 and the two opponent axes a, b of sRGB colors. [...,3] -> [...,3]"""
+    """Convert sRGB to OKLab: lightness, 0 to 1, and the opponent axes a and b. [...,3] -> [...,3]"""
     to_lms, to_lab, *_ = _matrices(rgb.dtype, rgb.device)
     lms = linear_from_srgb(rgb) @ to_lms
     return (lms.sign() * lms.abs() ** (1 / 3)) @ to_lab
 
 
 def oklab_to_srgb(lab: Tensor) -> Tensor:
-    """The inverse of `srgb_to_oklab`; colors that sRGB cannot show leave 0..1. [...,3] -> [...,3]"""
+    """Convert OKLab to sRGB; colors outside the sRGB gamut exceed 0 to 1. [...,3] -> [...,3]"""
     *_, to_linear, to_lms = _matrices(lab.dtype, lab.device)
     return srgb_from_linear((lab @ to_lms) ** 3 @ to_linear)
 
 
 def linear_from_srgb(rgb: Tensor) -> Tensor:
-    """sRGB 0..1 as linear light. [...,3] -> [...,3]"""
+    """Convert sRGB, 0 to 1, to linear light. [...,3] -> [...,3]"""
     return torch.where(rgb <= 0.04045, rgb / 12.92, ((rgb.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4)
 
 
 def srgb_from_linear(linear: Tensor) -> Tensor:
-    """The inverse of `linear_from_srgb`. [...,3] -> [...,3]"""
+    """Convert linear light to sRGB. [...,3] -> [...,3]"""
     curved = 1.055 * linear.clamp_min(0.0031308) ** (1 / 2.4) - 0.055
     return torch.where(linear <= 0.0031308, linear * 12.92, curved)
 
 
 def fit_gamut(lab: Tensor) -> Tensor:
-    """sRGB of OKLab colors; chroma that sRGB cannot show is reduced, lightness and hue stay. [...,3]"""
+    """Convert OKLab to sRGB, reducing chroma at constant lightness and hue. [...,3] -> [...,3]"""
     rgb = oklab_to_srgb(lab)
     outside = (rgb - 0.5).abs().amax(dim=-1) > 0.5 + _GAMUT_SLACK
     if bool(outside.any()):
@@ -70,8 +70,8 @@ def fit_gamut(lab: Tensor) -> Tensor:
         high = torch.ones_like(beyond[:, :1])
         for _ in range(10):  # to a thousandth of the chroma
             middle = 0.5 * (low + high)
-            tried = oklab_to_srgb(torch.cat([beyond[:, :1], middle * beyond[:, 1:]], dim=1))
-            fits = (tried - 0.5).abs().amax(dim=1, keepdim=True) <= 0.5 + _GAMUT_SLACK
+            candidate = oklab_to_srgb(torch.cat([beyond[:, :1], middle * beyond[:, 1:]], dim=1))
+            fits = (candidate - 0.5).abs().amax(dim=1, keepdim=True) <= 0.5 + _GAMUT_SLACK
             low = torch.where(fits, middle, low)
             high = torch.where(fits, high, middle)
         rgb[outside] = oklab_to_srgb(torch.cat([beyond[:, :1], low * beyond[:, 1:]], dim=1))
@@ -79,43 +79,44 @@ def fit_gamut(lab: Tensor) -> Tensor:
 
 
 def hue_of(lab: Tensor) -> Tensor:
-    """Radians, −pi..pi. [...,3] -> [...]"""
+    """Return the hue of OKLab colors in radians, −π to π. [...,3] -> [...]"""
     return torch.atan2(lab[..., 2], lab[..., 1])
 
 
 Strength = float | Tensor
-"""How far the edit has gone, 0..1: one number, or a tensor with the colors' shape less the last axis."""
+"""Strength of an edit, 0 to 1: one number, or a tensor with the colors' shape without the last axis."""
 
-_GREEN = math.radians(142.5)  # hue of sRGB's
+_GREEN = math.radians(142.5)  # hue of sRGB's green
 
 ColorPath = Literal["bowed", "hue", "straight", "srgb"]
-"""The way of colors from the original to the finished edit, see `bend_of`."""
+"""Shape of the path of colors from the original to the full edit, see `bend_of`."""
 
 
 @dataclass(frozen=True)
 class Bend:
-    """How the way between two colors bends from the straight line in OKLab towards the hue circle."""
+    """Bend of the path between two colors from the straight line in OKLab towards the hue circle."""
 
-    bow: float  # share of the way along the hue circle in the mixture, 0 (straight) to 1
-    direction: float  # 1 or −1: the sense in which nearly opposite hues turn, the same all over a region
-    # whole, none: hues that lie so near to opposite (angle missing, radians) that they turn in this sense
-    # altogether, and those from which on each takes its own shorter way; in between the two ways mix
+    bow: float  # weight of the path along the hue circle, 0 (straight) to 1
+    direction: float  # 1 or −1: sense of rotation of nearly opposite hues, the same for the whole region
+    # Angles between a hue and the opposite of the other, radians. Up to `whole` a color rotates in
+    # `direction`. From `none` on it takes its own shorter path. Between them the two paths mix.
     whole: float
     none: float
-    fade: bool = False  # straight in sRGB instead, as pictures are cross-faded
+    fade: bool = False  # straight in sRGB instead, like a cross-fade of pictures
 
 
 STRAIGHT = Bend(0.0, 1.0, 0.0, 1.0)
-"""No bend at all."""
+"""Straight line in OKLab."""
 
 
 def bend_of(reference: Tensor, target: Tensor, path: ColorPath = "bowed") -> Bend:
-    """The bend for a region whose typical color `reference` becomes `target`; sRGB, [3] each.
+    """Return the bend for a region whose typical color `reference` becomes `target`; sRGB, [3] each.
 
-    - "bowed": mostly straight, bowed by 0.4 towards the shorter hue, so that half of blue is half way to blue
-      and not gray. Hues that are opposite within 10° keep off green, which nobody expects.
-    - "hue": along the hue circle, the shorter way; between nearly opposite hues the way over green.
-    - "straight": straight in OKLab; "srgb": straight in sRGB. Both go through gray between opposite hues.
+    - "bowed": mostly straight, with a bow of 0.4 along the shorter hue arc. So strength 0.5 towards blue
+    looks
+      half blue, not gray. Hues within 10° of opposite avoid green, which would be unexpected.
+    - "hue": along the shorter hue arc, or over green between nearly opposite hues.
+    - "straight": straight in OKLab. "srgb": straight in sRGB. Both pass through gray between opposite hues.
     """
     if path in ("straight", "srgb"):
         return replace(STRAIGHT, fade=path == "srgb")
@@ -133,7 +134,11 @@ def bend_of(reference: Tensor, target: Tensor, path: ColorPath = "bowed") -> Ben
 
 
 def path_of(name: str) -> ColorPath:
-    """The path of that name; else a ProgdfError."""
+    """Return the color path of a name.
+
+    Raises:
+        ProgdfError: the name is unknown.
+    """
     for path in get_args(ColorPath):
         if path == name:
             return path  # type: ignore[no-any-return]
@@ -141,38 +146,39 @@ def path_of(name: str) -> ColorPath:
 
 
 def interpolate_colors(rgb: Tensor, end: Tensor, strength: Strength, bend: Bend) -> Tensor:
-    """Colors on their way to others: straight in OKLab, bowed towards the hue circle.
+    """Interpolate between colors on a path in OKLab that is bowed towards the hue circle.
 
-    The bow grows with what both colors have of chroma: a gray's hue is noise, and turned it would shine in
-    all colors of the rainbow half way. Neighbors keep together all around the circle, see `Bend`.
+    The bow grows with the chroma of both colors. The hue of a gray is noise, and rotating it would give
+    rainbow colors half way. Similar colors stay similar on their paths, see `Bend`.
 
     Args:
-        rgb: at strength 0, sRGB; what lies outside 0..1 (SH colors may) fades with the strength. [...,3]
-        end: at strength 1, bit for bit, 0..1. [...,3]
-        strength: 0..1
-        bend: of the region
+        rgb: sRGB colors at strength 0. A part outside 0 to 1, possible for SH colors, fades with the
+            strength. [...,3]
+        end: sRGB colors at strength 1, 0 to 1, returned bit for bit. [...,3]
+        strength: 0 to 1
+        bend: bend of the region
     """
     return color_course(rgb, end, bend)(strength)
 
 
 def color_course(rgb: Tensor, end: Tensor, bend: Bend) -> Callable[[Strength], Tensor]:
-    """`interpolate_colors` for many strengths: what they share is computed once."""
+    """Return `interpolate_colors` as a function of the strength; shared values are computed once."""
     inside = rgb.clamp(0, 1)
     mix = None if bend.fade else _oklab_course(srgb_to_oklab(inside), srgb_to_oklab(end), bend)
 
     def colors_at(strength: Strength) -> Tensor:
         s = torch.as_tensor(strength, dtype=rgb.dtype, device=rgb.device).expand(rgb.shape[:-1]).clamp(0, 1)
-        way = torch.lerp(inside, end, s[..., None]) if mix is None else mix(s)
-        edited = way + (1 - s)[..., None] * (rgb - inside)
+        interpolated = torch.lerp(inside, end, s[..., None]) if mix is None else mix(s)
+        edited = interpolated + (1 - s)[..., None] * (rgb - inside)
         return torch.where((s == 0)[..., None], rgb, torch.where((s == 1)[..., None], end, edited))
 
     return colors_at
 
 
 def _oklab_course(a: Tensor, b: Tensor, bend: Bend) -> Callable[[Tensor], Tensor]:
-    """From OKLab to OKLab; sRGB at strengths [...]. [...,3], [...,3]"""
+    """Return the path between OKLab colors as a function from strengths [...] to sRGB. [...,3], [...,3]"""
     chroma_a, chroma_b, hue = a[..., 1:].norm(dim=-1), b[..., 1:].norm(dim=-1), hue_of(a)
-    turn = bend.direction * _wrap(hue_of(b) - hue)  # -pi..pi, the region's sense being positive
+    turn = bend.direction * _wrap(hue_of(b) - hue)  # −π to π, positive in the region's sense
     alone = smoothstep(turn + math.pi, bend.whole, bend.none)
     bow = bend.bow * 4 * chroma_a * chroma_b / (chroma_a + chroma_b).clamp_min(1e-6).square()
 
@@ -196,6 +202,6 @@ def _wrap(angle: Tensor) -> Tensor:
 
 
 def smoothstep(values: Tensor, low: float = 0.0, high: float = 1.0) -> Tensor:
-    """0 up to `low`, 1 from `high`, smooth between. [...] -> [...]"""
+    """Return a smooth step: 0 up to `low`, 1 from `high`. [...] -> [...]"""
     x = ((values - low) / (high - low)).clamp(0, 1)
     return x * x * (3 - 2 * x)

@@ -1,11 +1,13 @@
-"""The main colors of a region, and the map of color that takes some of them elsewhere.
+"""Main colors of a region, and a color map that moves source colors to target colors.
 
 The map moves a color x by Σ_i w_i(x) f_i(x) (t_i − p_i), in OKLab, for sources p_i and targets t_i. The
-weights are a Gaussian kernel's interpolation (Chang et al., Palette-based Photo Recoloring, SIGGRAPH 2015):
-1 at their own source and 0 at the others, so every source becomes its target exactly, and one whose target is
-itself stays. Of several they are a partition: each color goes with those that are near. What is far from a
-single one stays. f_i fades what is darker than its source, as in less light, and what is nearly white. By the
-same weights each source's curve bends the lightness.
+weights w_i are an interpolation by Gaussian kernels (Chang et al., Palette-based Photo Recoloring, SIGGRAPH
+2015). A weight is 1 at its own source and 0 at the others. So every source becomes its target exactly, and a
+source whose target is itself is unchanged. The weights of several sources sum to 1, so each color follows the
+sources near it. With a single source, colors far from it are unchanged.
+
+f_i reduces the shift of colors darker than the source, as in less light, and of nearly white colors. The
+curve of each source bends the lightness by the same weights.
 """
 
 from __future__ import annotations
@@ -20,96 +22,105 @@ from torch import Tensor
 from .oklab import oklab_to_srgb, srgb_to_oklab
 
 COLORS = 5
+"""Default number of main colors."""
 CLOSEST = 0.02
-"""Two sources that are nearer than this, in the distance of the kernel, are one color."""
+"""Smallest kernel distance of two sources; closer sources count as one color."""
 
-_LIGHTNESS = 0.5  # how much a difference of lightness counts: shading is not another color
-_WHITE = 0.15  # of lightness below white: where a color begins to stay
-# width of the kernel: share of the distance of the sources, the least, and with one source
-_WIDTH = 0.5
-_NARROWEST = 0.04
-_ALONE = 0.08
-_ROUNDS = 20  # of k-means
-_CELL = 0.04  # side of the cells in which colors are counted
-_MIN_SHARE = 0.003  # of what is seen, for a color to be a main one
-_STEPS = 1024  # of a curve, linear between
+_LIGHTNESS_FACTOR = 0.5  # factor on lightness differences, because shading is not another color
+_WHITE_MARGIN = 0.15  # distance from white, in lightness, at which the shift of a color begins to fade
+_KERNEL_WIDTH_SHARE = (
+    0.5  # standard deviation of the kernel, as a share of the mean distance to the nearest source
+)
+_MIN_KERNEL_WIDTH = 0.04  # smallest standard deviation of the kernel
+_SINGLE_KERNEL_WIDTH = 0.08  # standard deviation of the kernel of a single source
+_ITERATIONS = 20  # iterations of k-means
+_CELL_SIDE = 0.04  # side of the cells in which colors are counted
+_MIN_SHARE = 0.003  # smallest share of the visible area for a main color
+_CURVE_STEPS = 1024  # linear pieces of a tabulated curve
 
 Curve = tuple[tuple[float, float], ...]
-"""Lightness from and to, 0..1, by rising from; see `bend_lightness`. An empty one bends nothing."""
+"""Points (input, output) of a lightness curve, 0 to 1, in ascending order of input; see `bend_lightness`.
+
+An empty curve changes nothing.
+"""
 
 
 def find_palette(rgb: Tensor, weights: Tensor, count: int = COLORS) -> Tensor:
-    """The main colors by k-means in OKLab, the one that covers most first; fewer where fewer are there.
+    """Return the main colors by k-means in OKLab, in descending order of area.
 
     Args:
-        rgb: sRGB colors, 0..1. [N,3]
-        weights: how much each is seen, ≥ 0. [N]
+        rgb: sRGB colors, 0 to 1. [N,3]
+        weights: visible area of each color, ≥ 0. [N]
+        count: largest number of colors
 
     Returns:
-        [k,3] sRGB, k ≤ `count`; [0,3] where nothing is seen.
+        sRGB colors [k,3], k ≤ `count`; [0,3] if all weights are 0.
     """
-    seen = weights > 0
-    colors = _kernel_space(srgb_to_oklab(rgb[seen].clamp(0, 1)).double())
-    weights = weights[seen].double()
+    is_visible = weights > 0
+    colors = _kernel_space(srgb_to_oklab(rgb[is_visible].clamp(0, 1)).double())
+    weights = weights[is_visible].double()
     if not len(colors):
         return rgb.new_zeros(0, 3)
-    cells, own = torch.unique((colors / _CELL).round(), dim=0, return_inverse=True)
+    cells, own = torch.unique((colors / _CELL_SIDE).round(), dim=0, return_inverse=True)
     shares = weights.new_zeros(len(cells)).index_add_(0, own, weights)
     colors = torch.zeros_like(cells).index_add_(0, own, weights[:, None] * colors) / shares[:, None]
-    roots = (
-        shares.sqrt()
-    )  # a color of its own counts for more than its area, or a scarf is none beside a lawn
+    roots = shares.sqrt()  # distinct colors count for more than their area, such as a scarf beside a lawn
     centers = colors[int(shares.argmax())][None]
-    while len(centers) < min(count, len(colors)):  # the next one is where most is farthest from all
+    while len(centers) < min(count, len(colors)):  # add the cell with the largest weighted error
         missed = roots * torch.cdist(colors, centers).amin(dim=1).square()
         centers = torch.cat([centers, colors[int(missed.argmax())][None]])
-    for _ in range(_ROUNDS):
+    for _ in range(_ITERATIONS):
         nearest = torch.cdist(colors, centers).argmin(dim=1)
         sums = torch.zeros_like(centers).index_add_(0, nearest, roots[:, None] * colors)
         totals = roots.new_zeros(len(centers)).index_add_(0, nearest, roots)[:, None]
         centers = torch.where(totals > 0, sums / totals.clamp_min(1e-12), centers)
     covered = shares.new_zeros(len(centers)).index_add_(0, nearest, shares)
-    kept: list[int] = []
+    main: list[int] = []
     for i in covered.argsort(descending=True).tolist():
-        apart = all(float((centers[i] - centers[j]).norm()) >= 2 * CLOSEST for j in kept)
-        if apart and float(covered[i]) >= _MIN_SHARE * float(shares.sum()):
-            kept.append(i)
-    return oklab_to_srgb(centers[kept] / _kernel_space(centers.new_ones(3))).clamp(0, 1).to(rgb)
+        is_distinct = all(float((centers[i] - centers[j]).norm()) >= 2 * CLOSEST for j in main)
+        if is_distinct and float(covered[i]) >= _MIN_SHARE * float(shares.sum()):
+            main.append(i)
+    return oklab_to_srgb(centers[main] / _kernel_space(centers.new_ones(3))).clamp(0, 1).to(rgb)
 
 
 def are_alike(a: Tensor, b: Tensor) -> bool:
-    """Whether two sRGB colors [3] are too near to go different ways."""
+    """Return whether two sRGB colors [3] are too close to be separate sources."""
     return float((_kernel_space(srgb_to_oklab(a)) - _kernel_space(srgb_to_oklab(b))).norm()) < CLOSEST
 
 
 def shift_palette(lab: Tensor, sources: Tensor, targets: Tensor, curves: Sequence[Curve] = ()) -> Tensor:
-    """What becomes of colors where sources become targets, all OKLab. [...,3], [k,3], [k,3] -> [...,3]
+    """Map colors so that sources become targets, all in OKLab. [...,3], [k,3], [k,3] -> [...,3]
 
-    The sources are at least `CLOSEST` apart. What comes out may lie outside of the gamut.
+    The result may lie outside the gamut.
 
     Args:
-        curves: of the lightness of what has become of each source; none at all, or k
+        lab: colors. [...,3]
+        sources: source colors, at least `CLOSEST` apart. [k,3]
+        targets: target colors. [k,3]
+        curves: lightness curve near each source, applied after the shift; empty, or k
     """
-    places = _kernel_space(sources.double())
+    kernel_sources = _kernel_space(sources.double())
     colors = _kernel_space(lab.reshape(-1, 3).double())
-    apart = torch.cdist(places, places)
-    away = torch.cdist(colors, places)
-    width = _ALONE
-    if len(places) > 1:
-        nearest = (apart + torch.eye(len(places)) * apart.max()).amin(dim=1)
-        width = max(_NARROWEST, _WIDTH * float(nearest.mean()))
-        away = (away.square() - away.square().amin(dim=1, keepdim=True)).sqrt()  # a factor, which cancels
+    source_distances = torch.cdist(kernel_sources, kernel_sources)
+    color_distances = torch.cdist(colors, kernel_sources)
+    width = _SINGLE_KERNEL_WIDTH
+    if len(kernel_sources) > 1:
+        nearest = (source_distances + torch.eye(len(kernel_sources)) * source_distances.max()).amin(dim=1)
+        width = max(_MIN_KERNEL_WIDTH, _KERNEL_WIDTH_SHARE * float(nearest.mean()))
+        color_distances = (
+            color_distances.square() - color_distances.square().amin(dim=1, keepdim=True)
+        ).sqrt()  # a common factor, which cancels
 
     def kernel(distances: Tensor) -> Tensor:
         return torch.exp(-0.5 * (distances / width).square())
 
-    weights = (kernel(away) @ torch.linalg.inv(kernel(apart))).clamp_min(0.0)
-    if len(places) > 1:
+    weights = (kernel(color_distances) @ torch.linalg.inv(kernel(source_distances))).clamp_min(0.0)
+    if len(kernel_sources) > 1:
         weights = weights / weights.sum(dim=1, keepdim=True)
     lightness = lab.reshape(-1, 3)[:, :1].double()
     own = sources[:, 0].double()
     dark = lightness / own.clamp_min(1e-3)
-    bright = (1 - lightness) / (1 - own).clamp(1e-3, _WHITE)
+    bright = (1 - lightness) / (1 - own).clamp(1e-3, _WHITE_MARGIN)
     fade = torch.minimum(dark, bright)
     moved = (weights * fade.clamp(0, 1)) @ (targets - sources).double()
     shifted: Tensor = lab + moved.to(lab).reshape(lab.shape)
@@ -122,29 +133,31 @@ def shift_palette(lab: Tensor, sources: Tensor, targets: Tensor, curves: Sequenc
 
 
 def less_light(before: Tensor, after: Tensor) -> Tensor:
-    """What is left of the chroma where lightness changes: all where it rises, else as in less light on the
-    same surface. [...] -> [...]"""
+    """Return the factor on chroma for a change of lightness. [...] -> [...]
+
+    It is 1 if the lightness rises, and otherwise that of less light on the same surface.
+    """
     return (after / before.clamp_min(1e-6)).clamp_max(1)
 
 
 def bend_lightness(lightness: Tensor, curve: Sequence[tuple[float, float]]) -> Tensor:
-    """Lightness through a curve that passes its points, and (0, 0) and (1, 1) where it has none there.
+    """Apply a curve through the given points, and through (0, 0) and (1, 1) unless it has points there.
 
-    It is the monotone cubic of Fritsch and Carlson: between two points it never leaves their range.
+    The curve is the monotone cubic of Fritsch and Carlson. Between two points it never leaves their range.
 
     Args:
-        lightness: 0..1. [...]
-        curve: from and to, 0..1, by rising from
+        lightness: 0 to 1. [...]
+        curve: points (input, output), 0 to 1, in ascending order of input
     """
     points = dict([(0.0, 0.0), (1.0, 1.0), *curve])
     at = sorted(points)
-    table = PchipInterpolator(at, [points[x] for x in at])(np.linspace(0.0, 1.0, _STEPS + 1))
+    table = PchipInterpolator(at, [points[x] for x in at])(np.linspace(0.0, 1.0, _CURVE_STEPS + 1))
     steps = torch.from_numpy(table).to(lightness).clamp(0, 1)
-    place = lightness.clamp(0, 1) * _STEPS
-    below = place.floor().long().clamp_max(_STEPS - 1)
+    place = lightness.clamp(0, 1) * _CURVE_STEPS
+    below = place.floor().long().clamp_max(_CURVE_STEPS - 1)
     return torch.lerp(steps[below], steps[below + 1], place - below)
 
 
 def _kernel_space(lab: Tensor) -> Tensor:
-    """OKLab in which distances are the kernel's."""
-    return lab * lab.new_tensor([_LIGHTNESS, 1.0, 1.0])
+    """Convert OKLab to the space of kernel distances, with scaled lightness. [...,3] -> [...,3]"""
+    return lab * lab.new_tensor([_LIGHTNESS_FACTOR, 1.0, 1.0])
