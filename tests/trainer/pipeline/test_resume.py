@@ -30,7 +30,7 @@ from tests.helpers.growth import write_growth
 from tests.helpers.stopped import OUT, bits, small_run
 from tests.helpers.stopped_runs import NEVER, at_step, gone_on, killed, saved_step, words
 from tests.helpers.trained import quick_options, train
-from trainer.options import EditorOptions
+from trainer.options import EditorOptions, TrainOptions
 from trainer.run import training
 from trainer.run.resume import decide_resume, explain_stop, find_run, picture_digests, processor_kind
 from trainer.store.run_folder import RunFolder, open_run_folder
@@ -305,6 +305,7 @@ def test_a_switch_that_changes_the_last_bits_makes_another_kind_of_processor(
     assert len(set(kinds)) == 4
 
 
+@pytest.mark.slow  # the fast tests stop a run of colors; parts and their rows are saved by the same code
 def test_a_run_that_moves_parts_goes_on_to_the_same_bits(
     bear_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -390,53 +391,58 @@ def test_a_run_killed_while_it_grows_goes_on_to_the_same_bits(tmp_path: Path) ->
     assert bits(tmp_path / "cut" / OUT) == bits(tmp_path / "whole" / OUT)
 
 
-def test_an_edit_that_needs_half_of_the_views_keeps_no_others_and_goes_on_with_these(
-    bear_folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def _striped(bear_folder: Path) -> TrainOptions:
+    """Return options of a run that decides on its views and strengths, and needs half of the views."""
     options = quick_options(bear_folder, views=0, stages=0, image_size=48)
-    options = replace(options, out=OUT, editor=EditorOptions("stripes:#20a040"))
-    whole = train(options)
-    effort = whole.report["effort"]
-    names = {path.stem for path in (OUT / "views/original").glob("*.png")}
-    solved = effort["views"]
-    assert len(effort["strengths"]) > 2
-    assert len(names) == solved + len(whole.report["views"]["edit"])
-    assert f"{solved} of {2 * solved} views are solved for" in (OUT / "log.txt").read_text(encoding="utf-8")
-    assert {camera.name for camera in load_cameras(OUT / "cameras.json", ZERO)} == names
-    for s in effort["strengths"][:-1]:
-        assert {path.stem for path in (OUT / "views/edited" / f"{s:g}").glob("*.png")} == names
-    expected = bits(OUT)
-    shutil.rmtree(OUT)
-
-    at_step(monkeypatch, 2, lambda: os.kill(os.getpid(), signal.SIGINT))
-    with pytest.raises(KeyboardInterrupt):
-        train(options)
-    train(replace(options, resume=True))
-    assert bits(OUT) == expected
+    return replace(options, out=OUT, editor=EditorOptions("stripes:#20a040"))
 
 
-@pytest.mark.parametrize("where", ["write_finals", "finish_run", "a lost view"])
-def test_such_a_run_stopped_later_or_that_lost_a_picture_goes_on_to_the_same_bits(
-    bear_folder: Path, monkeypatch: pytest.MonkeyPatch, where: str
+@pytest.fixture(scope="session")
+def striped_bits(bear_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The bits of such a run that was not stopped, after a check of the views that it kept."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("striped"))
+        whole = train(_striped(bear_folder))
+        effort = whole.report["effort"]
+        names = {path.stem for path in (OUT / "views/original").glob("*.png")}
+        solved = effort["views"]
+        assert len(effort["strengths"]) > 2
+        assert len(names) == solved + len(whole.report["views"]["edit"])
+        assert f"{solved} of {2 * solved} views are solved for" in (OUT / "log.txt").read_text(
+            encoding="utf-8"
+        )
+        assert {camera.name for camera in load_cameras(OUT / "cameras.json", ZERO)} == names
+        for s in effort["strengths"][:-1]:
+            assert {path.stem for path in (OUT / "views/edited" / f"{s:g}").glob("*.png")} == names
+        return bits(OUT)
+
+
+@pytest.mark.parametrize(
+    "where",
+    [
+        "a lost view",
+        pytest.param("step 2", marks=pytest.mark.slow),
+        pytest.param("write_finals", marks=pytest.mark.slow),
+        pytest.param("finish_run", marks=pytest.mark.slow),
+    ],
+)
+def test_a_run_that_keeps_half_of_its_views_resumes_to_the_same_bits(
+    bear_folder: Path, striped_bits: dict[str, str], monkeypatch: pytest.MonkeyPatch, where: str
 ) -> None:
-    options = quick_options(bear_folder, views=0, stages=0, image_size=48)
-    options = replace(options, out=OUT, editor=EditorOptions("stripes:#20a040"))
-    train(options)
-    expected = bits(OUT)
-    shutil.rmtree(OUT)
-
     def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
+    loses_a_view = where == "a lost view"
+    options = _striped(bear_folder)
     with monkeypatch.context() as patch:
-        if where == "a lost view":
-            at_step(patch, 3, lambda: os.kill(os.getpid(), signal.SIGINT))
+        if loses_a_view or where == "step 2":
+            at_step(patch, 2, lambda: os.kill(os.getpid(), signal.SIGINT))
         else:
             patch.setattr(trainer.run.run, where, stop)
         with pytest.raises(KeyboardInterrupt):
             train(options)
-    if where == "a lost view":
+    if loses_a_view:
         next((OUT / "views/edited").glob("*/orbit_*.png")).unlink()
     train(replace(options, resume=True))
-    assert bits(OUT) == expected
-    assert ("edited again" in (OUT / "log.txt").read_text(encoding="utf-8")) == (where == "a lost view")
+    assert bits(OUT) == striped_bits
+    assert ("edited again" in (OUT / "log.txt").read_text(encoding="utf-8")) == loses_a_view
