@@ -1,1 +1,1 @@
-"""The edit optimization that records a trajectory."""
+"""Edit optimization that records a trajectory."""

@@ -1,4 +1,4 @@
-"""The course of an edit of colors: the strengths that are solved for, as many as it calls for."""
+"""Trajectory of a color edit: the strengths to solve for, added until their interpolation is accurate."""
 
 from __future__ import annotations
 
@@ -21,70 +21,73 @@ from .pgs import OnStep, ParameterSnapshot, PgsState, TargetStage
 from .retime import smooth_weights
 
 STEPS = "steps"
-"""Of a recording's means: the steps that it took."""
+"""Key in a recording's means: number of conjugate gradient steps."""
 
-_FINEST = 1 / 16  # of the way between two strengths: there are none in between
+_MIN_INTERVAL = 1 / 16  # smallest interval between strengths; it is not subdivided further
 
 Target = tuple[TargetStage, Judge]
-"""A strength's pictures, and views not solved for that say when these are met."""
+"""Pictures at one strength, and an evaluator on held-out views that decides when they are matched."""
 
 
 @dataclass
 class Course:
-    """The strengths that are solved for."""
+    """Strengths to solve for."""
 
-    targets: list[Target]  # in this order, the finished edit after them
+    targets: list[Target]  # in solving order, without the finished edit
     finished: Target
-    look: Callable[[float], Judge] | None = None  # any other; None: there are none
-    ask: Callable[[Sequence[float]], Sequence[Target]] | None = None
+    # evaluator at any other strength; None: no strength can be added
+    look: Callable[[float], Judge] | None = None
+    ask: Callable[[Sequence[float]], Sequence[Target]] | None = None  # makes targets at further strengths
 
     def extend(self, known: Mapping[float, tuple[Tensor, float]]) -> bool:
-        """Ask for those that would each take a twentieth from the error of the whole way (its geometric mean
-        over what is to be seen): in the middle of what is asked for, `smooth_course` misses by so much more
-        than a solution would, whose differences lie half way between those of its neighbors. False: none.
+        """Add a strength in the middle of every interval where it pays. Return False if none is added.
+         A strength pays if it reduces the error of the whole trajectory (geometric mean over the strengths)
+        by at least 5 %. The error now is that of `smooth_course` in the middle. The expected error of a
+        solution there follows from the errors at both ends of the interval, as the difference of a solution
+        lies half way between those of its neighbors.
 
         Args:
-            known: strength → what is solved for there, its offset [M,B,3], and what that misses; 0 and 1 too
+            known: strength → solution [M,B,3] and its error; includes strengths 0 and 1
         """
         if self.look is None or self.ask is None:
             return False
-        at = sorted(known)
-        offsets = torch.stack([known[s][0] for s in at])
-        asked = list[float]()
-        missed = [max(known[s][1], LEVEL) for s in at]
-        places, weights = smooth_weights(at, offsets)
-        for i, (begin, end) in enumerate(pairwise(at)):
-            if end - begin <= _FINEST:
+        strengths = sorted(known)
+        offsets = torch.stack([known[s][0] for s in strengths])
+        added = list[float]()
+        errors = [max(known[s][1], LEVEL) for s in strengths]
+        places, weights = smooth_weights(strengths, offsets)
+        for i, (begin, end) in enumerate(pairwise(strengths)):
+            if end - begin <= _MIN_INTERVAL:
                 continue
             smooth = torch.tensordot(weights[2 * i + 1].float(), offsets, 1)
             error = max(self.look(float(places[2 * i + 1])).error(smooth), LEVEL)
-            expected = (0.5 * math.sqrt(missed[i]) * (i > 0) + 0.5 * math.sqrt(missed[i + 1])) ** 2
+            expected = (0.5 * math.sqrt(errors[i]) * (i > 0) + 0.5 * math.sqrt(errors[i + 1])) ** 2
             if (end - begin) * math.log(error / max(expected, LEVEL)) > -math.log(MORE_PAYS):
-                asked.append((begin + end) / 2)
-        self.targets += self.ask(asked) if asked else ()
-        return bool(asked)
+                added.append((begin + end) / 2)
+        self.targets += self.ask(added) if added else ()
+        return bool(added)
 
     def sort_recordings(
         self, made: Sequence[ParameterSnapshot]
     ) -> tuple[list[float], list[ParameterSnapshot]]:
-        """All strengths, ascending, and what `solve` yielded of each, counted anew."""
+        """Return all strengths, ascending, and the snapshots of `solve` in that order, renumbered."""
         pairs = zip([*(stage.strength for stage, _ in self.targets), 1.0], made, strict=True)
         strengths, recordings = zip(*sorted(pairs, key=lambda pair: pair[0]), strict=True)
-        return list(strengths), [replace(one, step=i + 1) for i, one in enumerate(recordings)]
+        return list(strengths), [replace(snapshot, step=i + 1) for i, snapshot in enumerate(recordings)]
 
 
 def thin_model(model: Model, solver: Solver, targets: Sequence[Target], steps: int, spare: float) -> Model:
-    """The model with the functions beyond DC that members need at these strengths, and only those.
-
-    Where the end shows no error, another band is tried for the way. Then each time the half goes that adds
-    least to the pictures, and what is left is solved for anew.
+    """Return the model with only those functions beyond DC that members need at the given strengths.
+     If the finished edit has no visible error, the next larger number of bands is tried first, for the
+    other strengths. Then the half that contributes least to the pictures is removed, and the remainder is
+    solved again. This repeats while the error grows by at most 5 %.
 
     Args:
-        model: what the finished edit called for
-        solver: the views
-        targets: some strengths, the finished edit the last, each with views not solved for
-        steps: most steps of conjugate gradients
-        spare: mean squared error that fewer functions may add beside a twentieth
+        model: model of the finished edit
+        solver: training views
+        targets: some strengths with held-out evaluators, the finished edit last
+        steps: maximum number of conjugate gradient steps
+        spare: mean squared error that fewer functions may add beyond 5 %
     """
     more = (count for count in BANDS if model.bands < count <= model.most_bands)
     richer = next(more, 0) if model.error <= LEVEL else 0
@@ -93,37 +96,43 @@ def thin_model(model: Model, solver: Solver, targets: Sequence[Target], steps: i
     mapped = [solver.fit_map(model.degree, stage.targets)[1] for stage, _ in targets]
 
     def refine(starts: Sequence[Tensor], most: int) -> tuple[list[Tensor], float]:
-        """The residuals after so many steps, as long as these help where that is all, and what they leave."""
-        by = solver if most == steps else solver.only(starts[-1])
-        found = list[Tensor]()
-        left = 0.0
-        for (stage, judge), made, start in zip(targets, mapped, starts, strict=True):
-            if start.shape[1] > model.bands or most < steps or stage.strength < 1.0:  # else it is solved for
-                asked = None if most < steps else judge
-                start, _ = by.residual(made, start, stage.targets, most, asked, model.error, model.hold)
-            found.append(start)
-            left += max(judge.error(add_bands(made, start)), LEVEL)
-        return found, left
+        """Return the residuals and the sum of their errors after at most `most` steps.
 
-    best, least = refine([stage.strength * model.residual for stage, _ in targets], steps)
+        With `most` equal to `steps`, steps end as soon as they stop helping on the held-out views.
+        """
+        restricted = solver if most == steps else solver.only(starts[-1])
+        refined = list[Tensor]()
+        total = 0.0
+        for (stage, judge), map_change, start in zip(targets, mapped, starts, strict=True):
+            # otherwise it is solved already
+            if start.shape[1] > model.bands or most < steps or stage.strength < 1.0:
+                evaluator = None if most < steps else judge
+                start, _ = restricted.residual(
+                    map_change, start, stage.targets, most, evaluator, model.error, model.hold
+                )
+            refined.append(start)
+            total += max(judge.error(add_bands(map_change, start)), LEVEL)
+        return refined, total
+
+    best, min_error = refine([stage.strength * model.residual for stage, _ in targets], steps)
     tried = list(model.tried)
-    on_the_way = ", on the way too" if len(targets) > 1 else ""
+    suffix = ", on the way too" if len(targets) > 1 else ""
     if richer:
-        found, error = refine([pad(one, (0, 0, 0, richer - model.bands)) for one in best], steps)
-        tried.append((f"with a residual of {richer}{on_the_way}", decibels(error / len(targets))))
-        best, least = (found, error) if error < MORE_PAYS * least else (best, least)
+        refined, error = refine([pad(one, (0, 0, 0, richer - model.bands)) for one in best], steps)
+        tried.append((f"with a residual of {richer}{suffix}", decibels(error / len(targets))))
+        best, min_error = (refined, error) if error < MORE_PAYS * min_error else (best, min_error)
     thinner = best
-    error = least
-    while error * MORE_PAYS <= least + len(targets) * spare:
+    error = min_error
+    while error * MORE_PAYS <= min_error + len(targets) * spare:
         best = thinner
-        least = min(least, error)
+        min_error = min(min_error, error)
         if not bool((halved := solver.halve(best))[-1][:, 1:].any()):
             break
         thinner, error = refine(halved, min(LOOKS, steps - 1))
-        left = float(thinner[-1].any(dim=2).float().sum(dim=1).mean())
-        tried.append((f"{left:.1f} of these a Gaussian{on_the_way}", decibels(error / len(targets))))
-    begun = {stage.strength: one for (stage, _), one in zip(targets, best, strict=True)}
-    return replace(model, residual=best[-1], begun=begun, tried=tried)
+        total = float(thinner[-1].any(dim=2).float().sum(dim=1).mean())
+        tried.append((f"{total:.1f} of these a Gaussian{suffix}", decibels(error / len(targets))))
+    starts_by_strength = {stage.strength: one for (stage, _), one in zip(targets, best, strict=True)}
+    return replace(model, residual=best[-1], begun=starts_by_strength, tried=tried)
 
 
 def solve(
@@ -135,21 +144,22 @@ def solve(
     on_step: OnStep,
     steps: int,
 ) -> Iterator[ParameterSnapshot]:
-    """Solve for the strengths of a course, which grows as is needed, and yield each one's end, with its map.
+    """Solve for the strengths of a course and yield a snapshot with its map for each.
 
-    Each begins between the solutions of its neighbors.
+    The course is extended as needed. Every solution starts from the interpolation of its neighbors.
 
     Args:
-        solver: the views
-        model: how much is modelled
+        solver: training views
+        model: size of the model
         course: strengths, changed in place
-        made: what was yielded, one for each target up to `state.stage`; kept by who calls, in any precision
-        state: where to go on from, changed in place; a step is a stage
-        on_step: progress; here, and only here, the state is whole and may be saved
-        steps: most steps of conjugate gradients of a stage
+        made: snapshots yielded so far, one per target up to `state.stage`, in any precision; the caller
+            appends
+        state: state to continue from, changed in place; one step is one stage
+        on_step: progress callback; the state is consistent, and may be saved, only during this call
+        steps: maximum number of conjugate gradient steps per stage
 
     Raises:
-        FloatingPointError: the loss or where it leads is not finite; the state is that of the stage before.
+        FloatingPointError: the loss or the solution is not finite; the state is that of the previous stage.
     """
     finished = Judge(solver.views, course.finished[0].targets)
     judge = course.finished[1]
@@ -159,7 +169,7 @@ def solve(
     known = {0.0: (torch.zeros_like(end), 0.0), 1.0: (end, judge.error(end))}
 
     def learn(index: int) -> None:
-        """What was yielded of a target is known."""
+        """Store the solution and the error of a target."""
         (stage, judge), table = course.targets[index], made[index].table
         assert table is not None
         offsets = member_bands(made[index].offsets.float())
@@ -172,33 +182,33 @@ def solve(
         offsets = mapped
         means = dict[str, float]()
         if model.bands:
-            left = max(s for s in residuals if s < stage.strength)
-            right = min(s for s in residuals if s >= stage.strength)
-            share = (stage.strength - left) / (right - left)
-            start = torch.lerp(residuals[left], residuals[right], share)
-            told = partial(on_step, state.step, state.running)
+            below = max(s for s in residuals if s < stage.strength)
+            above = min(s for s in residuals if s >= stage.strength)
+            share = (stage.strength - below) / (above - below)
+            start = torch.lerp(residuals[below], residuals[above], share)
+            report = partial(on_step, state.step, state.running)
             residual, taken = solver.residual(
-                mapped, start, stage.targets, steps, judge, model.error, model.hold, told
+                mapped, start, stage.targets, steps, judge, model.error, model.hold, report
             )
             offsets = add_bands(mapped, residual)
             means[STEPS] = taken
-        left_over = finished.mean(offsets, 1.0)
-        if not math.isfinite(left_over) or not bool(offsets.isfinite().all()):
-            raise FloatingPointError(f"the loss is {left_over} at step {state.step}")
+        remaining = finished.mean(offsets, 1.0)
+        if not math.isfinite(remaining) or not bool(offsets.isfinite().all()):
+            raise FloatingPointError(f"the loss is {remaining} at step {state.step}")
         moved = band_offsets(offsets, solver.original.shape[1])
         for rows in (state.moved, state.average):
             rows.detach().copy_(moved)
         state.step = state.step + 1
         state.stage = state.stage + 1
-        state.running = left_over
-        means |= {"l2": Judge(solver.views, stage.targets).error(offsets), "left": left_over}
+        state.running = remaining
+        means |= {"l2": Judge(solver.views, stage.targets).error(offsets), "left": remaining}
         return ParameterSnapshot(state.step, True, moved, means, table)
 
     for index in range(min(state.stage, len(course.targets))):
         learn(index)
     while state.stage <= len(course.targets):
-        ends = state.stage == len(course.targets) and not course.extend(known)
-        yield solve_target(course.finished if ends else course.targets[state.stage])
-        if not ends:
+        is_finished = state.stage == len(course.targets) and not course.extend(known)
+        yield solve_target(course.finished if is_finished else course.targets[state.stage])
+        if not is_finished:
             learn(state.stage - 1)
         on_step(state.step, state.running)

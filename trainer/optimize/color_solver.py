@@ -1,18 +1,19 @@
-"""Edits of colors alone: one map of color for the region, and what single members need beside it.
+"""Solver for edits that change only colors: one color map for the region, and a residual for single members.
+ The map is a least-squares fit over all views (`trainer.optimize.color_views`). The remainder is a residual
+of the members' lowest SH bands, found by conjugate gradients that respect the clamps. The preconditioner is
+block-Jacobi: each member has its own block of bands and weights, as in tomography. A member that covers a
+hundredth of a pixel, or is visible from one side only, therefore converges as fast as any other. A member
+that is not visible in any view follows the map.
+ The size of the model (degree of the map; no residual, or one of DC, of two bands or of three) is chosen at
+full strength on held-out views: the smallest model that no larger one improves by at least 5 %. The
+held-out views also decide when a strength has had enough steps.
 
-The map is a least squares over all views (`trainer.optimize.color_views`). What it cannot say is a residual
-of the members' lowest bands, by conjugate gradients that know the clamps, each member preconditioned by its
-own block of bands and weights, as in tomography: one that is a hundredth of a pixel, or seen from one side,
-gets its answer as another does. A member that no view shows follows the map.
+A small number of pictures (`trainer.optimize.ties`) leaves most members undetermined. Then:
 
-How much of this a region gets (degree of the map; no residual, one of DC, of two bands or of three) is
-decided on views that are not solved for, at the full strength: the least of which more would take away less
-than a twentieth of the error. They also say when a strength has had enough steps.
-
-A handful of pictures (`trainer.optimize.ties`) leaves most members undecided. There neighbors on one surface
-have residuals alike, what hardly shines through others is not asked where one picture alone shows it, and how
-far a residual travels before it fades into the map is decided on squares of the pictures that are not solved
-for.
+- neighbors on one surface have similar residuals;
+- members that hardly shine through others are not solved for if only one picture shows them;
+- the distance over which a residual spreads before it fades into the map is chosen on held-out tiles of the
+  pictures.
 """
 
 from __future__ import annotations
@@ -50,51 +51,56 @@ from .color_views import (
 from .ties import Ties
 
 STEPS_OF_OTHERS = 8
-"""Steps of an optimizer that looks at one view at a time which one iteration over all views stands for."""
+"""Number of single-view optimizer steps that one iteration over all views replaces."""
 
 SETTLED = 0.01
-"""Share of the error in views not solved for that `LOOKS` steps take away at least, for another to follow."""
+"""Minimum share of the held-out error that `LOOKS` steps must remove for another step to follow."""
 
 BANDS = (1, 4, 9)
-"""SH functions of a residual that are tried, each where the one before it was better than less."""
+"""Numbers of SH functions to try for the residual.
 
-_RIDGE = 0.002  # of a typical member's weight: holds the residual of what hardly shows at 0
-_TIES = 0.001  # of a typical member's weight: ties neighbors, where views are few
-_TRUSTED = 0.1  # of the same: a member of less is rather as its neighbors are
-_HOLDS = (1e-8, 1e-5, 1e-3)  # ridges tried there: a residual goes around all, some way, to its neighbors
-_SHOWS = 0.5  # pixels of a member in each of two pictures, from which on these say what it is
-_SHARES = (1.0, 0.5, 0.2)  # of a step, where the whole of it would run into clamps
+Each is tried only if the one before it was an improvement.
+"""
+
+# share of a typical member's weight; pulls the residual of hardly visible members to 0
+_RESIDUAL_RIDGE = 0.002
+_TIE_WEIGHT = 0.001  # share of a typical member's weight; ties neighbors if there are few views
+_TRUSTED_WEIGHT = 0.1  # share of the same weight; a member with less follows its neighbors
+# ridges to try with ties: spread the residual everywhere, some way, or to neighbors only
+_TIED_RIDGES = (1e-8, 1e-5, 1e-3)
+_DETERMINED_PX = 0.5  # pixels; a member this large in two pictures is determined by them
+_STEP_FRACTIONS = (1.0, 0.5, 0.2)  # fractions of a step to try if the full step runs into clamps
 
 LOOKS = 3
-"""Steps over which that is taken: a single one may gain nothing in other views."""
+"""Number of steps over which the gain is measured. A single step may gain nothing in held-out views."""
 
 
 @dataclass(frozen=True)
 class Model:
-    """How much of an edit of colors is modelled."""
+    """Size of the model of a color edit, and its solution for the finished edit."""
 
-    degree: int  # of the map; 0: none
-    hold: float  # of the residual at 0, as a share of a typical member's weight
-    residual: Tensor  # of the finished edit: b of 0, 1, 4 or 9 functions. [M,b,3]
+    degree: int  # degree of the map; 0: no map
+    hold: float  # ridge of the residual, as a share of a typical member's weight
+    residual: Tensor  # residual of the finished edit with b = 0, 1, 4 or 9 functions. [M,b,3]
     mask: Tensor | None  # see `GradeForm.mask`
-    error: float  # mean square, of the finished edit in views not solved for: what is finer is not chased
-    tried: Sequence[tuple[str, float]]  # what was tried, and its error on views not solved for, dB
-    steps: int  # that all of this took
-    most_bands: int  # see `choose_model`; of few pictures 1
-    begun: Mapping[float, Tensor] = field(default_factory=dict)  # strength → a residual to begin with there
+    error: float  # mean squared error of the finished edit in held-out views; smaller errors are not pursued
+    tried: Sequence[tuple[str, float]]  # candidates and their errors on held-out views, dB
+    steps: int  # steps of all candidates
+    most_bands: int  # see `choose_model`; 1 if there are few pictures
+    begun: Mapping[float, Tensor] = field(default_factory=dict)  # initial residual at that strength
 
     @property
     def bands(self) -> int:
-        """How many bands the residual has."""
+        """Number of SH functions of the residual."""
         return self.residual.shape[1]
 
     @property
     def functions(self) -> float:
-        """How many of these a member has, on average."""
+        """Mean number of nonzero SH functions per member."""
         return float(self.residual.any(dim=2).float().sum(dim=1).mean()) if self.bands else 0.0
 
     def figures(self) -> dict[str, Any]:
-        """As report.json has it."""
+        """Return the model's figures for report.json."""
         return {
             "degree": self.degree,
             "mask": self.mask is not None,
@@ -105,30 +111,30 @@ class Model:
 
     @property
     def line(self) -> str:
-        """What was chosen and over what, for the log."""
+        """Description of the choice and its candidates, for the log."""
         functions = f"{self.bands} SH function{'s' * (self.bands > 1)}"
         if self.bands > 1 and self.functions < self.bands:
             functions += f", {self.functions:.1f} of them a Gaussian"
         residual = f"and a residual of {functions}" if self.bands else "alone"
-        over = ", ".join(f"{name} {error:.1f}" for name, error in self.tried)
-        of_color = f"a map of color of degree {self.degree}" if self.degree else "no map"
-        of_color += "" if self.mask is None else ", a mask of it"
-        rule = "what leaves least" if self.hold in _HOLDS else "the least within a twentieth"
-        return f"{of_color} {residual}, {rule}; dB: {over}"
+        candidates = ", ".join(f"{name} {error:.1f}" for name, error in self.tried)
+        color_map = f"a map of color of degree {self.degree}" if self.degree else "no map"
+        color_map += "" if self.mask is None else ", a mask of it"
+        rule = "what leaves least" if self.hold in _TIED_RIDGES else "the least within a twentieth"
+        return f"{color_map} {residual}, {rule}; dB: {candidates}"
 
 
 @dataclass(frozen=True)
-class _Attempt:
-    """What a model leaves in what was not solved for."""
+class _Candidate:
+    """One candidate model with its error on held-out views or pixels."""
 
     name: str
     error: float
-    solver: Solver  # with the mask
+    solver: Solver  # solver, with the mask if any
     degree: int
-    offsets: Tensor  # what its map adds. [M,B,3]
+    offsets: Tensor  # change by the map. [M,B,3]
     residual: Tensor  # [M,b,3]
     hold: float  # see `Model.hold`
-    mask_hold: float = 0.0  # how strongly what no picture shows of its mask is held; 0: no mask
+    mask_hold: float = 0.0  # ridge of the mask for members not visible in any picture; 0: no mask
 
     @property
     def bands(self) -> int:
@@ -137,88 +143,96 @@ class _Attempt:
 
     @property
     def change(self) -> Tensor:
-        """What map and residual add. [M,B,3]"""
+        """Change by map and residual. [M,B,3]"""
         return add_bands(self.offsets, self.residual)
 
 
 @dataclass(frozen=True)
-class _Pull:
-    """What the views say at some residual."""
+class _Gradient:
+    """Gradient and error of the training views at one residual."""
 
-    descent: Tensor  # against the gradient of half the error. [M,b,3]
-    error: float  # squared, with what holds the residual
-    drawn: Tensor  # members' channels that a clamp lets through, of each view. [V,M,3] bool
-    passed: Sequence[Tensor]  # pixels' of which it does, of each view. [P,3] bool
+    descent: Tensor  # negative gradient of half the squared error. [M,b,3]
+    error: float  # squared error, including the ridge and the ties
+    drawn: Tensor  # members' channels that the clamps let through, per view. [V,M,3] bool
+    passed: Sequence[Tensor]  # pixels' channels that the clamps let through, per view. [P,3] bool
 
 
 @dataclass(frozen=True)
 class Solver:
-    """All training views of a run."""
+    """Least-squares solver over all training views of a run."""
 
-    views: Sequence[ColorView]  # see `ColorView`
+    views: Sequence[ColorView]  # training views
     original: Tensor  # raw member rows, packed. [M,C]
-    # bound of the curvature among each member's lowest bands: Σ w·m over the pixels, m its own weight, times
-    # the products of the basis. [M,b,b]
+    # Bound of the curvature among each member's lowest bands: the sum over pixels of w·m, with m the member's
+    # own weight, times the products of the basis. [M,b,b]
     weights: Tensor
     maps: MapFit
-    share: Tensor  # how much of a map each member takes, 0..1. [M]
-    ties: Ties | None  # None where views are many
-    asked: Tensor  # which members' functions are solved for. [M,b] bool
-    held: csr_matrix  # ties among these, as strong as they are to be. [M,M]
+    share: Tensor  # each member's share of the map (the mask), 0..1. [M]
+    ties: Ties | None  # None if there are many views
+    asked: Tensor  # functions of the members to solve for. [M,b] bool
+    held: csr_matrix  # ties among these members, scaled to their final strength. [M,M]
 
     @cached_property
     def sh(self) -> Tensor:
-        """The members' own. [M,B,3]"""
+        """SH coefficients of the original members. [M,B,3]"""
         return member_bands(self.original)
 
     def fit_map(self, degree: int, targets: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-        """The map that comes nearest to these pictures, of degree 0 the identity, and what the members take
-        of it. [K,3], [M,B,3]"""
+        """Return the map of a degree that fits these pictures best, and its change of the members.
+
+        [K,3], [M,B,3]
+
+        Degree 0 is the identity.
+        """
         table = self.maps.solve(degree, targets) if degree else identity_map(1)
         return table, self.map_offsets(degree, table)
 
     def map_offsets(self, degree: int, table: Tensor) -> Tensor:
-        """What the members take of a map. [K,3] -> [M,B,3]"""
+        """Return the change of the members by a map, scaled by the mask. [K,3] -> [M,B,3]"""
         return self.share[:, None, None] * (map_colors(self.sh, table, max(1, degree)) - self.sh)
 
     def with_mask(self, share: Tensor) -> Solver:
-        """The same with a mask. [M] 0..1"""
+        """Return the solver with a mask. [M] 0..1"""
         return replace(self, maps=fit_maps(self.views, share), share=share)
 
     def guess_mask(self, change: Tensor, spreads: bool, hold: float) -> Solver:
-        """The same with the mask that the members' changes ask for.
+        """Return the solver with a mask estimated from the members' changes.
 
         Args:
-            change: a guess. [M,B,3]
-            spreads: whether what no picture shows takes as much of the map as most, else none
-            hold: how strongly it is held to that, see `_HOLDS`
+            change: estimated change. [M,B,3]
+            spreads: members not visible in any picture take the mean share of the map (True) or none
+                (False)
+            hold: ridge towards that share, see `_TIED_RIDGES`
         """
         weights = self.weights[:, 0, 0]
         share = mask_of_members(self.sh[:, 0] * C0 + 0.5, change[:, 0] * C0, weights)
         if self.ties is not None:
             mean = weights @ share / weights.sum() * spreads
-            say = self.asked[:, 0] * weights / (_TRUSTED * self.typical)
-            share = mean + self.ties.spread((share - mean)[:, None, None], say, hold / _TIES)[:, 0, 0]
+            confidence = self.asked[:, 0] * weights / (_TRUSTED_WEIGHT * self.typical)
+            share = (
+                mean
+                + self.ties.spread((share - mean)[:, None, None], confidence, hold / _TIE_WEIGHT)[:, 0, 0]
+            )
         return self.with_mask(share.clamp(0.0, 1.0))
 
     def improve_mask(self, targets: Sequence[Tensor]) -> Solver:
-        """The same with the mask that these pictures of the views ask for, in 255ths."""
+        """Return the solver with the mask that fits these pictures of the views best, in steps of 1/255."""
         full = map_colors(self.sh, self.maps.solve(1, targets), 1) - self.sh
         share = torch.where(self.asked[:, 0], improve_mask(self.views, full, self.share, targets), self.share)
         return self.with_mask((share * 255.0).round() / 255.0)
 
     def only(self, residual: Tensor) -> Solver:
-        """The same for residuals that are 0 beyond DC where this one is. [M,b,3]"""
-        asked = self.asked.clone()
-        asked[:, 1 : residual.shape[1]] &= residual[:, 1:].any(dim=2)
-        return replace(self, asked=asked)
+        """Return the solver for residuals that stay 0 beyond DC where this one is 0. [M,b,3]"""
+        free = self.asked.clone()
+        free[:, 1 : residual.shape[1]] &= residual[:, 1:].any(dim=2)
+        return replace(self, asked=free)
 
     def halve(self, residuals: Sequence[Tensor]) -> list[Tensor]:
-        """Residuals without the half of what they have beyond DC that adds least to the pictures. [M,b,3]"""
-        size = torch.stack([one[:, 1:].square().sum(dim=2) for one in residuals]).sum(dim=0)
-        adds = size * self.weights.diagonal(dim1=1, dim2=2)[:, 1 : 1 + size.shape[1]]
-        kept = adds > adds[adds > 0.0].median()
-        return [torch.cat([one[:, :1], one[:, 1:] * kept[..., None]], dim=1) for one in residuals]
+        """Return residuals without the half of the functions beyond DC that contributes least. [M,b,3]"""
+        power = torch.stack([one[:, 1:].square().sum(dim=2) for one in residuals]).sum(dim=0)
+        contribution = power * self.weights.diagonal(dim1=1, dim2=2)[:, 1 : 1 + power.shape[1]]
+        retained = contribution > contribution[contribution > 0.0].median()
+        return [torch.cat([one[:, :1], one[:, 1:] * retained[..., None]], dim=1) for one in residuals]
 
     @one_thread()  # sums of members are added in an order that depends on the number of threads
     def residual(
@@ -229,34 +243,39 @@ class Solver:
         steps: int,
         judge: Judge | None = None,
         floor: float = 0.0,
-        hold: float = _RIDGE,
+        hold: float = _RESIDUAL_RIDGE,
         tell: Callable[[], None] = lambda: None,
     ) -> tuple[Tensor, int]:
-        """What the members' lowest bands need beside the map: preconditioned conjugate gradients (Polak and
-        Ribière) that look at every step anew what the clamps pass; and the steps that were taken.
+        """Solve for the residual of the members' lowest bands. Return it and the number of steps.
+         The method is preconditioned conjugate gradients (Polak and Ribière). Every step evaluates the
+        clamps anew.
 
         Args:
-            mapped: what the map adds. [M,B,3]
-            start: a guess. [M,b,3]
+            mapped: change by the map. [M,B,3]
+            start: initial residual. [M,b,3]
             targets: pictures of the views
-            steps: most steps
-            judge: the best in its views is kept, and steps end when they gain little there, see `SETTLED`, or
-                what is left does not show; None takes all
-            floor: error in these views that counts as none, see `Model.error`; one of `LEVEL` always does
+            steps: maximum number of steps
+            judge: evaluator on held-out views; the best residual there is returned, and steps end when they
+                gain little there (see `SETTLED`) or the remaining error is invisible. None: take all steps
+            floor: held-out error that counts as 0, see `Model.error`; `LEVEL` always does
             hold: see `Model.hold`
             tell: called after each step
         """
         ridge = hold * self.typical
         targets = [view.pick(target) for view, target in zip(self.views, targets, strict=True)]
-        look = None if judge is None else lambda now: judge.error(add_bands(mapped, now))
-        asked = self.asked[:, : start.shape[1], None]
-        residual, first = self._descend(mapped, start * asked, targets, ridge, steps, tell, look, floor)
+        held_out_error = None if judge is None else lambda now: judge.error(add_bands(mapped, now))
+        free = self.asked[:, : start.shape[1], None]
+        residual, taken = self._descend(
+            mapped, start * free, targets, ridge, steps, tell, held_out_error, floor
+        )
         if self.ties is None:
-            return residual, first
-        weights = self.asked[:, 0] * self.weights[:, 0, 0] / (_TRUSTED * self.typical)
-        around = self.ties.spread(residual, weights, hold / _TIES)
-        residual, more = self._descend(mapped, around * asked, targets, ridge, steps, tell, look, floor)
-        return torch.where(asked, residual, around), first + more
+            return residual, taken
+        weights = self.asked[:, 0] * self.weights[:, 0, 0] / (_TRUSTED_WEIGHT * self.typical)
+        spread = self.ties.spread(residual, weights, hold / _TIE_WEIGHT)
+        residual, further = self._descend(
+            mapped, spread * free, targets, ridge, steps, tell, held_out_error, floor
+        )
+        return torch.where(free, residual, spread), taken + further
 
     def _descend(
         self,
@@ -269,80 +288,84 @@ class Solver:
         look: Callable[[Tensor], float] | None,
         floor: float,
     ) -> tuple[Tensor, int]:
-        """See `residual`; `look`: the judge's error."""
+        """Run conjugate gradients (see `residual`). `look` returns the held-out error of a residual."""
         count = start.shape[1]
-        held = torch.from_numpy(self.held.diagonal()) + max(ridge, 1e-30)
-        asked = self.asked[:, :count, None] & self.asked[:, None, :count]
-        curvature = self.weights[:, :count, :count] * asked + held[:, None, None] * torch.eye(count)
-        inverse = torch.linalg.inv(curvature.double()).float() * asked
-        now = start
-        pull = self._pull(mapped, start, targets, ridge)
-        conditioned = along = inverse @ pull.descent
-        best = now
+        regularization = torch.from_numpy(self.held.diagonal()) + max(ridge, 1e-30)
+        free = self.asked[:, :count, None] & self.asked[:, None, :count]
+        curvature = self.weights[:, :count, :count] * free + regularization[:, None, None] * torch.eye(count)
+        inverse = torch.linalg.inv(curvature.double()).float() * free
+        current = start
+        gradient = self._gradient(mapped, start, targets, ridge)
+        preconditioned = direction = inverse @ gradient.descent
+        best = current
         taken = 0
-        looks = [math.inf] * (LOOKS - 1) + [math.inf if look is None else look(now)]
+        errors = [math.inf] * (LOOKS - 1) + [math.inf if look is None else look(current)]
         while taken < steps:
-            length = _inner(pull.descent, along) / max(self._curvature(pull, along, ridge), 1e-30)
-            for share in _SHARES:
-                ahead = now + share * length * along
-                next_pull = self._pull(mapped, ahead, targets, ridge)
-                if next_pull.error < pull.error:
+            step_length = _inner(gradient.descent, direction) / max(
+                self._curvature(gradient, direction, ridge), 1e-30
+            )
+            for fraction in _STEP_FRACTIONS:
+                candidate = current + fraction * step_length * direction
+                next_gradient = self._gradient(mapped, candidate, targets, ridge)
+                if next_gradient.error < gradient.error:
                     break
             else:
-                if along is conditioned:
+                if direction is preconditioned:
                     break
-                along = conditioned  # the direction was of other clamps: begin again
+                direction = preconditioned  # the direction belongs to other clamps: restart
                 continue
-            last = conditioned
-            power = _inner(pull.descent, conditioned)
-            now = ahead
-            pull = next_pull
+            previous = preconditioned
+            power = _inner(gradient.descent, preconditioned)
+            current = candidate
+            gradient = next_gradient
             taken = taken + 1
             if look is not None:
-                error = look(now)
-                best = now if error < min(looks) else best
-                looks.append(error)
-                settled = looks[-1 - LOOKS] - error <= SETTLED * max(error, floor, LEVEL)
+                error = look(current)
+                best = current if error < min(errors) else best
+                errors.append(error)
+                settled = errors[-1 - LOOKS] - error <= SETTLED * max(error, floor, LEVEL)
                 if settled or error <= LEVEL:
                     break
-            conditioned = inverse @ pull.descent
-            turn = (_inner(pull.descent, conditioned) - _inner(pull.descent, last)) / power
-            along = conditioned + max(0.0, turn) * along
+            preconditioned = inverse @ gradient.descent
+            beta = (_inner(gradient.descent, preconditioned) - _inner(gradient.descent, previous)) / power
+            direction = preconditioned + max(0.0, beta) * direction
             tell()
-        return (now if look is None else best), taken
+        return (current if look is None else best), taken
 
     @property
     def typical(self) -> float:
-        """The mean weight of the members that are asked."""
+        """Mean weight of the members that are solved for."""
         return float(self.weights[self.asked[:, 0], 0, 0].mean())
 
-    def _hold(self, x: Tensor, ridge: float) -> Tensor:
-        """The gradient of half of what a residual costs beside the pixels. [M,b,3] -> [M,b,3]"""
+    def _regularize(self, x: Tensor, ridge: float) -> Tensor:
+        """Return the gradient of half the cost of a residual beside the pixels. [M,b,3] -> [M,b,3]"""
         return ridge * x + torch.from_numpy(self.held @ x.flatten(1).numpy()).view_as(x)
 
-    def _pull(self, mapped: Tensor, residual: Tensor, targets: Sequence[Tensor], ridge: float) -> _Pull:
-        """See `_Pull`."""
+    def _gradient(
+        self, mapped: Tensor, residual: Tensor, targets: Sequence[Tensor], ridge: float
+    ) -> _Gradient:
+        """Return the gradient and the error at a residual."""
         offsets = add_bands(mapped, residual)
         drawn = torch.empty(len(self.views), len(residual), 3, dtype=torch.bool)
 
         def look(index: int) -> tuple[Tensor, Tensor, float]:
             colors = self.views[index].colors(offsets)
-            pull, passed, squared = self.views[index].pull(colors, targets[index])
-            np.logical_or(colors.numpy() > 0.0, pull.numpy() > 0.0, out=drawn[index].numpy())
-            return passed, pull.mul_(drawn[index]), squared
+            negative, passed, squared = self.views[index].pull(colors, targets[index])
+            np.logical_or(colors.numpy() > 0.0, negative.numpy() > 0.0, out=drawn[index].numpy())
+            return passed, negative.mul_(drawn[index]), squared
 
-        descent = -self._hold(residual, ridge)
+        descent = -self._regularize(residual, ridge)
         all_passed = list[Tensor]()
-        error = _inner(residual, self._hold(residual, ridge))
-        looks = iterate_views(look, range(len(self.views)))
-        for view, (passed, pull, squared) in zip(self.views, looks, strict=True):
-            add_pulls(view.basis.numpy(), pull.numpy(), descent.numpy())
+        error = _inner(residual, self._regularize(residual, ridge))
+        results = iterate_views(look, range(len(self.views)))
+        for view, (passed, negative, squared) in zip(self.views, results, strict=True):
+            add_pulls(view.basis.numpy(), negative.numpy(), descent.numpy())
             error += squared
             all_passed.append(passed)
-        return _Pull(descent, error, drawn, all_passed)
+        return _Gradient(descent, error, drawn, all_passed)
 
-    def _curvature(self, pull: _Pull, along: Tensor, ridge: float) -> float:
-        """Of half the squared error in a direction, where the clamps stay as they are. [M,b,3]"""
+    def _curvature(self, pull: _Gradient, along: Tensor, ridge: float) -> float:
+        """Return the curvature of half the squared error along a direction [M,b,3], with fixed clamps."""
 
         def look(index: int) -> float:
             view = self.views[index]
@@ -351,96 +374,106 @@ class Solver:
             picture = view.map.picture(torch.from_numpy(colors * pull.drawn[index].numpy()))
             return float((picture * pull.passed[index]).square().sum())
 
-        return sum(map_threads(look, range(len(self.views)))) + _inner(along, self._hold(along, ridge))
+        return sum(map_threads(look, range(len(self.views)))) + _inner(along, self._regularize(along, ridge))
 
 
 def make_solver(views: Sequence[ColorView], original: Tensor, ties: Ties | None = None) -> Solver:
-    """The views, prepared. `original`: raw member rows [M,14+]; `ties`: where the views are few."""
+    """Prepare a solver for the views.
+
+    Args:
+        views: training views
+        original: raw member rows. [M,14+]
+        ties: ties between neighbors, if there are few views
+    """
     ones, weights = original.new_ones(len(original), 3), torch.zeros(())
     weighed = iterate_views(lambda view: view.map.gradient(view.map.picture(ones) * view.counts)[:, 0], views)
     for view, weight in zip(views, weighed, strict=True):
         bands = view.basis[:, : BANDS[-1]]
         weights = weights + (weight[:, None] * bands)[:, :, None] * bands[:, None]
-    asked = torch.ones(len(original), weights.shape[1], dtype=torch.bool)
-    held = csr_matrix((len(original), len(original)), dtype=np.float32)
+    free = torch.ones(len(original), weights.shape[1], dtype=torch.bool)
+    scaled_ties = csr_matrix((len(original), len(original)), dtype=np.float32)
     if ties is not None:
-        shown = torch.stack(map_threads(lambda view: view.map.gradient(view.counts * ones[:1])[:, 0], views))
-        twice = (shown > _SHOWS).sum(dim=0) > 1
-        some = (ties.clear | twice) & (weights[:, 0, 0] > 0.0)
-        held = ties.of(some) * np.float32(_TIES * float(weights[some, 0, 0].mean()))
-        asked = some[:, None].expand_as(asked)
+        visible_px = torch.stack(
+            map_threads(lambda view: view.map.gradient(view.counts * ones[:1])[:, 0], views)
+        )
+        is_determined = (visible_px > _DETERMINED_PX).sum(dim=0) > 1
+        solved = (ties.clear | is_determined) & (weights[:, 0, 0] > 0.0)
+        scaled_ties = ties.of(solved) * np.float32(_TIE_WEIGHT * float(weights[solved, 0, 0].mean()))
+        free = solved[:, None].expand_as(free)
     share = original.new_ones(len(original))
-    return Solver(views, original, weights, fit_maps(views, share), share, ties, asked, held)
+    return Solver(views, original, weights, fit_maps(views, share), share, ties, free, scaled_ties)
 
 
 def split_solver(solver: Solver, targets: Sequence[Tensor]) -> tuple[Solver, Judge]:
-    """A trial for `choose_model` where no view is held out: some squares of all views, and the others."""
-    some, others = zip(*(view.halves() for view in solver.views), strict=True)
-    return make_solver(some, solver.original, solver.ties), Judge(others, targets)
+    """Return a trial for `choose_model` that holds out half of the tiles of every view."""
+    fitted, held_out = zip(*(view.halves() for view in solver.views), strict=True)
+    return make_solver(fitted, solver.original, solver.ties), Judge(held_out, targets)
 
 
 @dataclass
-class _Trials:
-    """What is tried, on views or pixels that the solver does not know."""
+class _ModelSearch:
+    """Search for the best model, evaluated on views or pixels that the solver does not use."""
 
     solver: Solver
     judge: Judge
-    targets: Sequence[Tensor]  # the finished edit in the solver's views
-    most_steps: int  # of conjugate gradients for a residual
-    few: bool  # whether views are few
-    residuals: Sequence[tuple[str, int, float]]  # that are tried: name, functions and hold
-    tried: list[_Attempt] = field(default_factory=list)
-    steps: int = 0  # that all of these took
+    targets: Sequence[Tensor]  # finished edit in the solver's views
+    most_steps: int  # maximum number of conjugate gradient steps per residual
+    few: bool  # True if there are few views
+    residuals: Sequence[tuple[str, int, float]]  # residuals to try: name, number of functions and ridge
+    tried: list[_Candidate] = field(default_factory=list)
+    steps: int = 0  # steps of all candidates
 
-    def start(self, degree: int, solver: Solver) -> _Attempt:
-        """A map alone, not judged."""
+    def start(self, degree: int, solver: Solver) -> _Candidate:
+        """Return a candidate with a map alone, not evaluated."""
         offsets = solver.fit_map(degree, self.targets)[1]
         name = f"map of degree {degree}" if degree else "no map"
-        return _Attempt(name, math.inf, solver, degree, offsets, offsets[:, :0], _RIDGE)
+        return _Candidate(name, math.inf, solver, degree, offsets, offsets[:, :0], _RESIDUAL_RIDGE)
 
-    def attempt(self, base: _Attempt, name: str, bands: int, hold: float) -> _Attempt:
-        """With a residual that begins where that of `base` ended."""
+    def attempt(self, base: _Candidate, name: str, bands: int, hold: float) -> _Candidate:
+        """Return a candidate with a residual that starts from the residual of `base`."""
         residual = pad(base.residual[:, :bands], (0, 0, 0, max(0, bands - base.bands)))
         if bands:
             residual, taken = base.solver.residual(
                 base.offsets, residual, self.targets, self.most_steps, self.judge, hold=hold
             )
             self.steps += taken
-        made = replace(base, name=name, residual=residual, hold=hold)
-        self.tried.append(replace(made, error=self.judge.error(made.change)))
+        candidate = replace(base, name=name, residual=residual, hold=hold)
+        self.tried.append(replace(candidate, error=self.judge.error(candidate.change)))
         return self.tried[-1]
 
-    def try_masks(self, best: _Attempt, alone: float) -> _Attempt:
-        """The best with a mask, where one pays: residual for residual beside what there is without.
+    def try_masks(self, best: _Candidate, alone: float) -> _Candidate:
+        """Return the best candidate, with a mask if one pays against the same residual without a mask.
+         With few pictures, the mask is spread to all members that are not visible, or to neighbors only,
+        independent of the spread of the residual.
 
-        Of a few pictures a mask goes all around what they do not show, or to its neighbors, whatever its
-        residual does there.
-
-        `alone`: what maps alone leave
+        Args:
+            best: best candidate without a mask
+            alone: error of the best map alone
         """
-        without = {one.bands: one.error for one in sorted(self.tried, key=lambda one: -one.error)}
-        enough = alone * (without.get(1, alone) / alone) ** (1 / 3)  # what one of the three bytes of DC does
-        # a mask asks what a residual that goes all around says of each member
+        errors_without_mask = {one.bands: one.error for one in sorted(self.tried, key=lambda one: -one.error)}
+        # a mask costs one byte, DC three: expect a third of its gain
+        max_error = alone * (errors_without_mask.get(1, alone) / alone) ** (1 / 3)
+        # the mask is estimated from the residual that spreads everywhere
         tried = [best]
-        guess = (self.tried[-len(_HOLDS)] if self.few else best).change
-        for hold in (_HOLDS[0], _HOLDS[-1]) if self.few else (_RIDGE,):
+        guess = (self.tried[-len(_TIED_RIDGES)] if self.few else best).change
+        for hold in (_TIED_RIDGES[0], _TIED_RIDGES[-1]) if self.few else (_RESIDUAL_RIDGE,):
             solver = best.solver.guess_mask(guess, best.degree > 0, hold)
-            if min(self.judge.error(self.start(degree, solver).offsets) for degree in MONOMIALS) >= enough:
+            if min(self.judge.error(self.start(degree, solver).offsets) for degree in MONOMIALS) >= max_error:
                 continue
             solver = solver.improve_mask(self.targets)
             bases = [replace(self.start(degree, solver), mask_hold=hold) for degree in MONOMIALS]
             masked = [self.attempt(base, f"a mask of degree {base.degree}", 0, best.hold) for base in bases]
-            base = bases[_least(masked, lambda one: one.degree).degree - 1]
+            base = bases[_smallest(masked, lambda one: one.degree).degree - 1]
             base = replace(base, residual=(guess - base.offsets)[:, :1])
-            tried += [] if self.few else masked  # of a few pictures no mask alone
+            tried += [] if self.few else masked  # with few pictures a mask needs a residual
             for name, bands, held in self.residuals:
                 base = self.attempt(base, f"with a mask and {name}", bands, held)
                 tried.append(base)
-                if not self.few and not LEVEL < base.error < MORE_PAYS * without.get(bands, 0.0):
+                if not self.few and not LEVEL < base.error < MORE_PAYS * errors_without_mask.get(bands, 0.0):
                     break
-        # by the bytes of a member, of one basis: degrees take none
+        # size in bytes of a member, with one basis; the degree of the map costs none
         size = (lambda one: one.error) if self.few else (lambda one: 3 * one.bands + (one.mask_hold > 0.0))
-        return _least(tried, size, LEVEL)
+        return _smallest(tried, size, LEVEL)
 
 
 def choose_model(
@@ -450,61 +483,60 @@ def choose_model(
     steps: int,
     most_bands: int,
 ) -> tuple[Solver, Model]:
-    """The smallest model of which a larger one would take away less than a twentieth of the error that shows;
-    and the solver with its mask.
-
-    Of a few pictures there is always a residual, or what single members got would not be in the edit; how far
-    it travels, with a mask and without, is what leaves least; if all leave as much, to its neighbors.
+    """Return the solver and the smallest model that no larger one improves by 5 % of the visible error.
+     With few pictures there is always a residual, because changes of single members would otherwise be
+    lost. The spread of the residual, with a mask and without, is the one with the smallest error. If all
+    are equal, the residual spreads to neighbors only.
 
     Args:
-        solver: the views
-        trial: a solver to try it with, and views or pixels that it does not know; see `split_solver`
-        targets: the finished edit in the solver's views
-        steps: most steps of conjugate gradients for a residual
-        most_bands: SH functions that a residual may have: 1, 4 or 9
+        solver: training views
+        trial: solver to try models with, and held-out views or pixels; see `split_solver`
+        targets: finished edit in the solver's views
+        steps: maximum number of conjugate gradient steps per residual
+        most_bands: maximum number of SH functions of a residual: 1, 4 or 9
     """
     few = solver.ties is not None
     most_bands = min(most_bands, 1 if few else solver.sh.shape[1])
-    sizes = [(f"a residual of {bands}", bands, _RIDGE) for bands in BANDS if bands <= most_bands]
-    held = [(f"a residual held by {hold:g}", 1, hold) for hold in _HOLDS]
-    tries = _Trials(*trial, targets, steps, few, held if few else sizes)
-    bases = {degree: tries.start(degree, tries.solver) for degree in (0, *MONOMIALS)}
-    missed = {degree: tries.judge.mean(base.offsets, 1.0) for degree, base in bases.items()}
-    # of what no picture shows a map is a guess: where it is the worse one for most that is shown, for less
-    # than about half of that is painted, there is none
-    degrees = (0,) if few and missed[0] <= min(missed.values()) else MONOMIALS
-    by_degree = [tries.attempt(bases[degree], bases[degree].name, 0, _RIDGE) for degree in degrees]
-    best = last = _least(by_degree, lambda one: one.degree)
-    for name, bands, hold in tries.residuals:
-        last = tries.attempt(last, f"with {name}", bands, hold)
+    sizes = [(f"a residual of {bands}", bands, _RESIDUAL_RIDGE) for bands in BANDS if bands <= most_bands]
+    tied_residuals = [(f"a residual held by {hold:g}", 1, hold) for hold in _TIED_RIDGES]
+    search = _ModelSearch(*trial, targets, steps, few, tied_residuals if few else sizes)
+    bases = {degree: search.start(degree, search.solver) for degree in (0, *MONOMIALS)}
+    mean_errors = {degree: search.judge.mean(base.offsets, 1.0) for degree, base in bases.items()}
+    # A map is a guess for members that no picture shows. There is no map if it makes most visible members
+    # worse, which happens if less than about half of the region is painted.
+    degrees = (0,) if few and mean_errors[0] <= min(mean_errors.values()) else MONOMIALS
+    by_degree = [search.attempt(bases[degree], bases[degree].name, 0, _RESIDUAL_RIDGE) for degree in degrees]
+    best = last = _smallest(by_degree, lambda one: one.degree)
+    for name, bands, hold in search.residuals:
+        last = search.attempt(last, f"with {name}", bands, hold)
         if last.error >= best.error and not few:
             break
         if max(last.error, LEVEL) < MORE_PAYS * best.error:
             best = last
     if few:
-        best = min(tries.tried[-len(held) :], key=lambda one: (one.error, -one.hold))
+        best = min(search.tried[-len(tied_residuals) :], key=lambda one: (one.error, -one.hold))
     if best.bands and (few or best.bands > 1 or best.error > LEVEL):
-        alone = min(tries.judge.error(bases[degree].offsets) for degree in MONOMIALS)
-        best = tries.try_masks(best, alone)
+        alone = min(search.judge.error(bases[degree].offsets) for degree in MONOMIALS)
+        best = search.try_masks(best, alone)
     chosen = best.solver
     residual = best.residual
-    if few:  # what no picture shows follows the map, masked or not
+    if few:  # members that no picture shows follow the map, masked or not
         chosen, residual = _solve_whole(solver, best, targets, steps, degrees != (0,))
     mask = (chosen.share * 255.0).round().to(torch.uint8) if best.mask_hold else None
-    tried = [(one.name, decibels(one.error)) for one in tries.tried]
-    return chosen, Model(best.degree, best.hold, residual, mask, best.error, tried, tries.steps, most_bands)
+    tried = [(one.name, decibels(one.error)) for one in search.tried]
+    return chosen, Model(best.degree, best.hold, residual, mask, best.error, tried, search.steps, most_bands)
 
 
 def solve_again(
     model: Model, solver: Solver, targets: Sequence[Tensor], judge: Judge
 ) -> tuple[Solver, Model]:
-    """The model, solved for from other views, in as many steps: these, with its mask, and what comes of it.
+    """Solve for a chosen model on other views with the same number of steps. Return the solver and the model.
 
     Args:
-        model: what the finished edit called for
-        solver: the views
-        targets: the finished edit in these
-        judge: views not solved for
+        model: model of the finished edit
+        solver: training views
+        targets: finished edit in these
+        judge: evaluator on held-out views
     """
     solver = solver if model.mask is None else solver.with_mask(model.mask.float() / 255.0)
     mapped = solver.fit_map(model.degree, targets)[1]
@@ -515,22 +547,28 @@ def solve_again(
 
 
 def _solve_whole(
-    solver: Solver, best: _Attempt, targets: Sequence[Tensor], steps: int, spreads: bool
+    solver: Solver, best: _Candidate, targets: Sequence[Tensor], steps: int, spreads: bool
 ) -> tuple[Solver, Tensor]:
-    """What the trial solved for a part of the pixels, with all of them: the solver with its mask, and the
-    residual. [M,1,3]"""
+    """Solve for a candidate with all pixels instead of the trial's part.
+
+    Return the solver with its mask and the residual.
+
+    [M,1,3]
+    """
     if best.mask_hold:
         solver = solver.guess_mask(best.change, spreads, best.mask_hold).improve_mask(targets)
-    made = solver.fit_map(best.degree, targets)[1]
-    begin = (best.change - made)[:, :1] if best.mask_hold else torch.zeros_like(best.residual)
+    map_change = solver.fit_map(best.degree, targets)[1]
+    start = (best.change - map_change)[:, :1] if best.mask_hold else torch.zeros_like(best.residual)
     judge = Judge(solver.views, targets)
-    return solver, solver.residual(made, begin, targets, steps, judge, best.error, best.hold)[0]
+    return solver, solver.residual(map_change, start, targets, steps, judge, best.error, best.hold)[0]
 
 
-def _least(attempts: Sequence[_Attempt], size: Callable[[_Attempt], float], floor: float = 0.0) -> _Attempt:
-    """The smallest within a twentieth of the least error, or of an error that does not show."""
-    least = max(floor, min(one.error for one in attempts))
-    return min((one for one in attempts if MORE_PAYS * one.error <= least), key=size)
+def _smallest(
+    attempts: Sequence[_Candidate], size: Callable[[_Candidate], float], floor: float = 0.0
+) -> _Candidate:
+    """Return the smallest candidate within 5 % of the smallest error, or of an invisible error."""
+    min_error = max(floor, min(one.error for one in attempts))
+    return min((one for one in attempts if MORE_PAYS * one.error <= min_error), key=size)
 
 
 def _inner(a: Tensor, b: Tensor) -> float:
@@ -538,12 +576,12 @@ def _inner(a: Tensor, b: Tensor) -> float:
 
 
 def add_bands(offsets: Tensor, residual: Tensor) -> Tensor:
-    """Offsets with a residual of their lowest bands added. [M,B,3], [M,b,3] -> [M,B,3]"""
+    """Return offsets with a residual added to their lowest bands. [M,B,3], [M,b,3] -> [M,B,3]"""
     total = offsets.clone()
     total[:, : residual.shape[1]] += residual
     return total
 
 
 def iterations(steps: int) -> int:
-    """Most steps of conjugate gradients for `--steps` of one view each."""
+    """Return the maximum number of conjugate gradient steps for `--steps` of one view each."""
     return max(1, round(steps / STEPS_OF_OTHERS))

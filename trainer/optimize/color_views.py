@@ -1,8 +1,7 @@
-"""Views as functions of the members' colors, and maps of color fitted to them.
-
-While nothing moves, every view is linear in the members' colors (`progdf.rasterize.cpu.engine`), but for the
-clamps at black and white. A map of color, a polynomial of what is drawn (`progdf.field.grade`), is linear in
-its coefficients too: its least squares over all views take a tenth of a second.
+"""Views as linear functions of the members' colors, and color maps fitted to them.
+ While geometry is fixed, every view is linear in the members' colors (`progdf.rasterize.cpu.engine`) except
+for clamping at black and white. A color map is a polynomial of the drawn colors (`progdf.field.grade`) and
+linear in its coefficients. Its least-squares fit over all views therefore takes 0.1 s.
 """
 
 from __future__ import annotations
@@ -28,25 +27,28 @@ from progdf.sh import basis
 from progdf.threads import map_threads, one_thread
 from trainer.views.crops import CropScene
 
-_AT_ONCE = 8  # views, whose results are there at the same time
-_SQUARES = 6  # of a view's longer side, every other one of which is in one of its halves
-_COVERED = 0.05  # the region's weight in a pixel that shows it
-_MAX_FIT_PIXELS = 60_000  # that a map is fitted to, of more evenly spread ones (docs/experiments.md, Pixels)
-_CLAMP_ROUNDS = 3  # of the map's least squares, for pixels that are white or black anyway
-_MAP_RIDGE = 1e-6  # of the diagonal of a map's normal equations, for regions of few colors
-_MAP_HELD = 1e-2  # say of the members' own colors beside the pixels: there a map is held to the affine one
-_SHIFT_HELD = 1e-2  # of that: the affine map is held to the same change of all
-_MASK_WITHIN = 0.98  # of what says what a share is: the largest there is 1, few beyond do not scale it
-_MASK_STEPS = 16  # at most, of gradients by pixels
-_MASK_SETTLED = 0.01  # of the error, that a step gains
-_MASK_LENGTHS = (4.0, 2.0, 1.0, 0.5, 0.25)  # of a step, in units of a bound of the curvature
-_MASK_RIDGE = 0.01  # of a typical curvature, for members that hardly show
+_VIEW_BATCH = 8  # views processed at once; limits the memory for results
+_TILES_PER_SIDE = 6  # tiles along a view's longer side; half of the tiles are held out, as on a checkerboard
+_MIN_REGION_WEIGHT = 0.05  # minimum weight of the region in a pixel that shows it
+_MAX_FIT_PIXELS = 60_000  # pixels per fit, evenly spread (docs/experiments.md, Pixels)
+_CLAMP_ROUNDS = 3  # least-squares rounds, to treat pixels that stay white or black
+_MAP_RIDGE = 1e-6  # share of the diagonal of a map's normal equations, for regions with few colors
+# weight, relative to the pixels, of the prior that holds a map to the affine map at members' colors
+_MAP_PRIOR_WEIGHT = 1e-2
+_SHIFT_PRIOR_SHARE = 1e-2  # share of that weight; holds the affine map to a constant shift
+# share of the evidence; shares are scaled so that this much of it lies at or below 1
+_MASK_EVIDENCE_SHARE = 0.98
+_MAX_MASK_STEPS = 16  # maximum number of gradient steps
+_MIN_MASK_GAIN = 0.01  # minimum share of the error that a step must remove
+# step lengths to try, in units of the inverse curvature bound
+_MASK_STEP_LENGTHS = (4.0, 2.0, 1.0, 0.5, 0.25)
+_MASK_RIDGE = 0.01  # share of a typical curvature, for hardly visible members
 
 LOST = 0.5 / 255.0
-"""Of a pixel's weights, in all, what is left out: no color that this has would show in 8 bits."""
+"""Total weight per pixel that may be omitted. No color with this weight is visible in 8 bits."""
 
 MORE_PAYS = 0.95
-"""Share of the error that a larger model must leave at most, to be worth its bytes."""
+"""Maximum share of the error that a larger model may leave to be worth its bytes."""
 
 _A = TypeVar("_A")
 _B = TypeVar("_B")
@@ -56,39 +58,44 @@ _B = TypeVar("_B")
 class ColorView:
     """Pixels of one training view's box as a function of the members' colors."""
 
-    map: ColorMap  # what each member weighs in each of the pixels
-    others: Tensor  # what all but the members show there, unclamped. [P,3]
-    basis: Tensor  # weight of each band in each member's color from here. [M,B]
-    original: Tensor  # the members' unclamped colors as they were. [M,3]
+    map: ColorMap  # weight of each member in each pixel
+    others: Tensor  # color of everything except the members, unclamped. [P,3]
+    basis: Tensor  # weight of each band in each member's color from this camera. [M,B]
+    original: Tensor  # unclamped original colors of the members. [M,3]
     size: tuple[int, int]  # height and width of the box
-    pixels: Tensor  # which of the box's, row by row. [P] int64
-    counts: Tensor  # which of these count. [P,1] bool
+    pixels: Tensor  # indices into the box, row by row. [P] int64
+    counts: Tensor  # pixels that count. [P,1] bool
 
     def colors(self, offsets: Tensor) -> Tensor:
-        """What is drawn, not below 0. Offsets of the lowest bands [M,b,3] -> [M,3]"""
+        """Return the drawn colors, at least 0. Offsets of the lowest bands [M,b,3] -> [M,3]"""
         colors = self.original.numpy().copy()
         add_colors(self.basis.numpy(), offsets.numpy(), colors)
         return torch.from_numpy(np.maximum(colors, 0.0, out=colors))
 
     def picture(self, colors: Tensor) -> Tensor:
-        """Unclamped. Colors not below 0 [M,3] -> [P,3]"""
+        """Return the unclamped pixels. Colors at least 0 [M,3] -> [P,3]"""
         return self.others + self.map.picture(colors)
 
     @cached_property
     def share(self) -> Tensor:
-        """How much of each pixel the members are, 0 where it does not count. [P,1] 0..1"""
+        """Weight of the members in each pixel, 0 in pixels that do not count. [P,1] 0..1"""
         return self.map.picture(torch.ones_like(self.original))[:, :1] * self.counts
 
     def pick(self, image: Tensor) -> Tensor:
-        """The pixels of the box. [h,w,3] -> [P,3]"""
+        """Return this view's pixels of a box. [h,w,3] -> [P,3]"""
         return image.flatten(0, 1)[self.pixels]
 
     def pull(self, colors: Tensor, target: Tensor) -> tuple[Tensor, Tensor, float]:
-        """Against the gradient of half the squared error to a picture, of what the clamps pass: they do what
-        would bring a value back into the range. Colors not below 0 [M,3], [P,3]
+        """Return the negative gradient of half the squared error to a picture.
+
+        Clamped channels count only if the gradient moves them back into the range.
+
+        Args:
+            colors: at least 0. [M,3]
+            target: the picture. [P,3]
 
         Returns:
-            By color [M,3]; channels of the pixels that are passed [P,3] bool; the squared error
+            gradient by color [M,3]; channels of the pixels that are not clamped [P,3] bool; squared error
         """
         missing = self.map.picture(colors)
         passed = torch.empty_like(missing, dtype=torch.bool)
@@ -96,13 +103,16 @@ class ColorView:
         return self.map.gradient(missing), passed, squared
 
     def error(self, offsets: Tensor, target: Tensor, power: float) -> float:
-        """Sum of differences to some power, of colors 0..1, as far as the members show. [M,b,3], [P,3]"""
+        """Return the sum of differences to a power, weighted by the members' share. [M,b,3], [P,3]
+
+        Colors are in the range 0..1.
+        """
         image = self.picture(self.colors(offsets)).clamp(0.0, 1.0)
         return float(((image - target).abs().pow(power) * self.share).sum())
 
     def halves(self) -> tuple[ColorView, ColorView]:
-        """The view with every other square of its pixels, and with the others."""
-        side = max(1, max(self.size) // _SQUARES)
+        """Return two views with the two colors of a checkerboard of tiles."""
+        side = max(1, max(self.size) // _TILES_PER_SIDE)
         rows = self.pixels // self.size[1] // side
         columns = self.pixels % self.size[1] // side
         even = ((rows + columns) % 2 == 0)[:, None]
@@ -111,8 +121,10 @@ class ColorView:
 
 @kernel(contract=True, cache=True)
 def _compare(shown: Array, others: Array, target: Array, counts: Array, passed: Array) -> Number:
-    """See `ColorView.pull`. shown: in, what the members show; out, what is missing where it is passed.
-    [P,3] float32, [P] and [P,3] bool -> float64"""
+    """Compute residuals for `ColorView.pull`. [P,3] float32, [P] and [P,3] bool -> squared error, float64
+
+    `shown` contains the members' pixels on input and the residuals of unclamped channels on output.
+    """
     squared = 0.0
     for p in range(len(shown)):
         for c in range(3):
@@ -128,8 +140,10 @@ def _compare(shown: Array, others: Array, target: Array, counts: Array, passed: 
 
 @kernel(cache=True)
 def add_colors(basis: Array, offsets: Array, colors: Array) -> None:
-    """colors += Σ basis · offset. Torch's own sums leave holes between what stays, .2 GB of 200 000 members:
-    glibc before 2.38 puts aligned memory into no hole of its size. [M,B], [M,b,3], [M,3] float32"""
+    """Add Σ basis · offset to the colors. [M,B], [M,b,3], [M,3] float32
+     Torch's sums fragment the heap by 0.2 GB for 200 000 members: glibc before 2.38 does not reuse holes of
+    the exact size for aligned memory.
+    """
     for m in range(len(colors)):
         for c in range(3):
             for b in range(offsets.shape[1]):
@@ -138,7 +152,7 @@ def add_colors(basis: Array, offsets: Array, colors: Array) -> None:
 
 @kernel(contract=True, cache=True)
 def add_pulls(basis: Array, pull: Array, offsets: Array) -> None:
-    """offsets += basis · pull, `add_colors` the other way round. [M,B], [M,3], [M,b,3] float32"""
+    """Add Σ basis · pull to the offsets, the transpose of `add_colors`. [M,B], [M,3], [M,b,3] float32"""
     for m in range(len(pull)):
         for b in range(offsets.shape[1]):
             for c in range(3):
@@ -146,7 +160,7 @@ def add_pulls(basis: Array, pull: Array, offsets: Array) -> None:
 
 
 def color_view(crop: CropScene, original: Tensor, every: int, index: int) -> ColorView:
-    """One of `color_views`, of which it is the `index`th."""
+    """Return the `index`th of `color_views`."""
     camera, (height, width) = crop.camera, crop.size
     place = torch.arange(width) + every // 2 * torch.arange(height)[:, None] + index
     pixels = (place % every == 0).flatten().nonzero()[:, 0]
@@ -162,52 +176,60 @@ def color_view(crop: CropScene, original: Tensor, every: int, index: int) -> Col
 
 
 def color_views(crops: Sequence[CropScene], original: Tensor, every: int = 1) -> list[ColorView]:
-    """All views, with all bands that are drawn. Each crop is looked at once, and not needed any more.
+    """Return all views with all bands that are drawn. Every crop is read once and not needed afterwards.
 
     Args:
-        crops: their boxes
-        original: raw member rows [M,14+]
-        every: of so many pixels one is looked at, in each view others: 1, 2 or 4
+        crops: boxes of the views
+        original: raw member rows. [M,14+]
+        every: use one of this many pixels, different ones in each view: 1, 2 or 4
     """
     views = map_threads(lambda i: color_view(crops[i], original, every, i), range(len(crops)))
-    alike = views[0].basis.shape[1] == 1  # from everywhere
-    return [replace(v, basis=views[0].basis, original=views[0].original) for v in views] if alike else views
+    is_shared = views[0].basis.shape[1] == 1  # colors are independent of the view
+    return (
+        [replace(v, basis=views[0].basis, original=views[0].original) for v in views] if is_shared else views
+    )
 
 
 @dataclass(frozen=True)
 class MapFit:
-    """The views' pixels as monomials of the region's drawn colors: a map's picture is linear in them."""
+    """Pixels of the views as monomials of the region's drawn colors.
 
-    design: Tensor  # what each pixel shows of every monomial. [P,20] float64
-    original: Tensor  # what it showed before the edit, unclamped. [P,3] float64
-    pixels: Sequence[Tensor]  # which of each view's box these are, one view after another. [p] int64
-    normal: Tensor  # products of all pixels' monomials. [20,20] float64
-    held: Tensor  # the same of the members', hidden or not, as far as they count. [20,20] float64
+    The picture of a map is linear in them.
+    """
+
+    design: Tensor  # weight of every monomial in each pixel. [P,20] float64
+    original: Tensor  # pixels before the edit, unclamped. [P,3] float64
+    pixels: Sequence[Tensor]  # indices into each view's box, one view after another. [p] int64
+    normal: Tensor  # normal matrix of the pixels. [20,20] float64
+    # normal matrix of all members' colors, hidden ones included, scaled to its weight. [20,20] float64
+    held: Tensor
 
     def picture(self, table: Tensor) -> Tensor:
-        """What the pixels show under a map. [K,3] -> [P,3] 0..1"""
+        """Return the pixels under a map. [K,3] -> [P,3] 0..1"""
         change = (table - pad(identity_map(1), (0, 0, 0, len(table) - MONOMIALS[1]))).double()
         return (self.original + self.design[:, : len(table)] @ change).clamp(0.0, 1.0).float()
 
     @one_thread()
     def solve(self, degree: int, targets: Sequence[Tensor]) -> Tensor:
-        """The map of least squares. [h,w,3] each -> [K,3]
-
-        A polynomial goes astray beyond the colors that it was fitted to, and members that no picture shows
-        may have such: at all members' colors it is held to the affine map, and
-        that one to the same change of all.
+        """Return the least-squares map. [h,w,3] each -> [K,3]
+         A polynomial extrapolates badly beyond the colors that it was fitted to, and members that no
+        picture shows can have such colors. Therefore it is held to the affine map at all members' colors,
+        and the affine map to a constant shift.
         """
         pixels = [image.reshape(-1, 3)[p] for image, p in zip(targets, self.pixels, strict=True)]
         return identity_map(degree) + self._change(MONOMIALS[degree], torch.cat(pixels)).float()
 
     def _change(self, count: int, target: Tensor) -> Tensor:
-        """What is added to the identity's first coefficients: 1, 4, 10 or 20. [P,3] -> [count,3]"""
+        """Return the change of the identity's first `count` coefficients: 1, 4, 10 or 20.
+
+        [P,3] -> [count,3]
+        """
         design = self.design[:, :count]
         normal = self.normal[:count, :count]
         change = pull = design.new_zeros(count, 3)
         if count > 1:
             coarse = self._change(4 if count > 4 else 1, target)
-            held = self.held[:count, :count] * (1.0 if count > 4 else _SHIFT_HELD)
+            held = self.held[:count, :count] * (1.0 if count > 4 else _SHIFT_PRIOR_SHARE)
             normal = normal + held
             pull = held[:, : len(coarse)] @ coarse
         normal = normal + _MAP_RIDGE * (normal.diagonal() + 1e-12).diag()
@@ -224,9 +246,9 @@ def fit_maps(views: Sequence[ColorView], share: Tensor, most: int = _MAX_FIT_PIX
     """Prepare the views for maps of any degree.
 
     Args:
-        views: see `ColorView`
-        share: how much of a map each member takes, 0..1. [M]
-        most: pixels that the maps are fitted to
+        views: training views
+        share: each member's share of the map, 0..1. [M]
+        most: maximum number of pixels to fit to
     """
 
     @lru_cache(maxsize=1)
@@ -241,29 +263,29 @@ def fit_maps(views: Sequence[ColorView], share: Tensor, most: int = _MAX_FIT_PIX
         original = view.picture(view.original.clamp_min(0.0))[some]
         return view.map.picture(terms)[some], original, members
 
-    covered = map_threads(lambda view: (view.share[:, 0] > _COVERED).nonzero()[:, 0], views)
+    covered = map_threads(lambda view: (view.share[:, 0] > _MIN_REGION_WEIGHT).nonzero()[:, 0], views)
     stride = max(1, -(-sum(map(len, covered)) // most))
     pixels = [some[::stride].clone() for some in covered]
-    laid = map_threads(lay_out, range(len(views)))
-    design, original = (torch.cat([one[i] for one in laid]).double() for i in (0, 1))
-    members = torch.stack([one[2] for one in laid]).sum(dim=0)
-    say = _MAP_HELD * len(design) / max(1, len(views) * len(views[0].original))
+    layouts = map_threads(lay_out, range(len(views)))
+    design, original = (torch.cat([one[i] for one in layouts]).double() for i in (0, 1))
+    members = torch.stack([one[2] for one in layouts]).sum(dim=0)
+    prior_weight = _MAP_PRIOR_WEIGHT * len(design) / max(1, len(views) * len(views[0].original))
     pixels = [view.pixels[some] for view, some in zip(views, pixels, strict=True)]
-    return MapFit(design, original, pixels, design.T @ design, say * members)
+    return MapFit(design, original, pixels, design.T @ design, prior_weight * members)
 
 
 def mask_of_members(colors: Tensor, change: Tensor, weights: Tensor) -> Tensor:
-    """How much of one affine map each member takes, if its change is to be that, as between stripes: a guess.
+    """Estimate each member's share of one affine map from its change, for example for stripes.
 
-    The map is that of shares as large as the members' changes; the largest share of it is 1.
+    The map is fitted with shares proportional to the size of the members' changes. The largest share is 1.
 
     Args:
-        colors: as they were. [M,3]
-        change: of each member's color. [M,3]
-        weights: how much each shows, ≥ 0. [M]
+        colors: original colors. [M,3]
+        change: change of each member's color. [M,3]
+        weights: visibility of each member, ≥ 0. [M]
 
     Returns:
-        The shares, 0..1. [M]
+        shares, 0..1. [M]
     """
     weights = weights.double()
     change = change.double()
@@ -275,11 +297,11 @@ def mask_of_members(colors: Tensor, change: Tensor, weights: Tensor) -> Tensor:
     normal += _MAP_RIDGE * (normal.diagonal() + 1e-12).diag()
     full: Tensor = terms.T @ torch.linalg.solve(normal, (design * weights) @ change)
     power = full.square().sum(dim=1).clamp_min(1e-12)
-    along = (change * full).sum(dim=1) / power
+    projection = (change * full).sum(dim=1) / power
     evidence = weights * power
-    order = along.argsort()
-    reached = evidence[order].cumsum(0) >= _MASK_WITHIN * evidence.sum()
-    share: Tensor = (along / along[order][reached][0].clamp_min(1e-6)).clamp(0.0, 1.0)
+    order = projection.argsort()
+    is_above = evidence[order].cumsum(0) >= _MASK_EVIDENCE_SHARE * evidence.sum()
+    share: Tensor = (projection / projection[order][is_above][0].clamp_min(1e-6)).clamp(0.0, 1.0)
     return share.float()
 
 
@@ -287,12 +309,14 @@ def mask_of_members(colors: Tensor, change: Tensor, weights: Tensor) -> Tensor:
 def improve_mask(
     views: Sequence[ColorView], full: Tensor, share: Tensor, targets: Sequence[Tensor]
 ) -> Tensor:
-    """The shares of a map by the pictures: projected gradients, each member's by its own weight. [M] -> [M]
+    """Return the members' shares of a map that fit the pictures better. [M] -> [M]
+
+    The method is projected gradient descent with a step size per member, from its own weight.
 
     Args:
-        views: see `ColorView`
-        full: what the whole of the map adds. [M,B,3]
-        share: a guess
+        views: training views
+        full: change by the whole map. [M,B,3]
+        share: initial shares. [M]
         targets: pictures of the views
     """
     changes = [torch.einsum("mb,mbc->mc", view.basis, full) for view in views]
@@ -316,24 +340,24 @@ def improve_mask(
     curvature = torch.stack(map_threads(weigh, pairs)).sum(dim=0)
     curvature = curvature + _MASK_RIDGE * curvature.mean() + 1e-12
     descent, error = look(share)
-    for _ in range(_MASK_STEPS):
-        before = error
-        for length in _MASK_LENGTHS:
-            ahead = (share + length * descent / curvature).clamp(0.0, 1.0)
-            next_descent, next_error = look(ahead)
+    for _ in range(_MAX_MASK_STEPS):
+        previous_error = error
+        for length in _MASK_STEP_LENGTHS:
+            candidate = (share + length * descent / curvature).clamp(0.0, 1.0)
+            next_descent, next_error = look(candidate)
             if next_error < error:
-                share = ahead
+                share = candidate
                 descent = next_descent
                 error = next_error
                 break
-        if before - error < _MASK_SETTLED * before:
+        if previous_error - error < _MIN_MASK_GAIN * previous_error:
             break
     return share
 
 
 @dataclass(frozen=True)
 class Judge:
-    """Views that are not solved for, and an edit in them."""
+    """Evaluator of an edit in held-out views."""
 
     views: Sequence[ColorView]
     targets: Sequence[Tensor]  # [h,w,3] each
@@ -343,16 +367,16 @@ class Judge:
         return [(view, view.pick(target)) for view, target in zip(self.views, self.targets, strict=True)]
 
     def error(self, offsets: Tensor) -> float:
-        """Mean squared difference, with that of the pictures' own rounding. [M,B,3]"""
+        """Return the mean squared error, including the rounding error of 8-bit pictures. [M,B,3]"""
         return ROUNDING + self.mean(offsets, 2.0)
 
     def mean(self, offsets: Tensor, power: float) -> float:
-        """Mean difference to some power, of the pixels as far as they show the members. [M,B,3]"""
+        """Return the mean difference to a power, weighted by the members' share of the pixels. [M,B,3]"""
         total = sum(map_threads(lambda pair: pair[0].error(offsets, pair[1], power), self._pairs))
         return total / max(1.0, 3.0 * sum(float(view.share.sum()) for view in self.views))
 
 
 def iterate_views(work: Callable[[_A], _B], items: Sequence[_A]) -> Iterator[_B]:
-    """The same some at a time, for what need not be kept."""
-    for begin in range(0, len(items), _AT_ONCE):
-        yield from map_threads(work, items[begin : begin + _AT_ONCE])
+    """Yield the results of `work` in order. Only a batch of results is in memory at once."""
+    for begin in range(0, len(items), _VIEW_BATCH):
+        yield from map_threads(work, items[begin : begin + _VIEW_BATCH])

@@ -1,10 +1,10 @@
-"""The group stage: before members descend on their own, the region is moved to where the edit shows it.
-
-Free descent smears a part that has to travel half its own size: every Gaussian fades towards whatever color
-it lies on. So the parts' motions are found first, each a whole. Where those leave much of the way, as of an
-ear that is bent or an arm that is stretched, control points bend the region. The members' own offsets live in
-the moved frames from then on: what is learnt of a hand moves, turns and grows with it (docs/method.md 3).
-The way between two strengths is theirs too, not the optimizer's: a slider shows the hand in motion.
+"""Group stage: before members descend on their own, the region moves to where the edit shows it.
+ Free descent smears a part that has to travel half its own size: every Gaussian fades to the color behind
+it. The motions of the parts are therefore found first, each part as a whole. If parts leave much of the
+error, for example for an ear that is bent or an arm that is stretched, control points bend the region. The
+members' own offsets then live in the moved frames: the offsets of a hand move, rotate and scale with it
+(docs/method.md 3). Between two strengths the region follows the interpolated motion, not the optimizer's
+path, so a slider shows the hand in motion.
 """
 
 from __future__ import annotations
@@ -34,41 +34,42 @@ from trainer.views.crops import CropScene, render_all
 from .pgs import ParameterSnapshot, TargetStage, visible_way
 
 GROUP_STEPS = 120
-"""Steps of the group stage per strength, where parts are moved as wholes."""
+"""Steps of the group stage per strength if parts move as wholes."""
 
-# The members' own learning rate is a share of so many part sizes; shorter steps where the parts' motion has
-# left less than `_LEFT` to do, a mean over the pixels that still change, and less than `_REST` of what there
-# was (docs/experiments.md, Parts that move).
-_EXTENT = 7.0
-_LEFT = 0.065
-_REST = 0.28
+# The members' own learning rate is a share of this many part sizes. Steps are shorter if the motion of the
+# parts has left less than `_FULL_STEP_CHANGE` (a mean over the pixels that still change) and less than the
+# share `_FULL_STEP_REMAINDER` of the change (docs/experiments.md, Parts that move).
+_EXTENT_IN_PART_SIZES = 7.0
+_FULL_STEP_CHANGE = 0.065
+_FULL_STEP_REMAINDER = 0.28
 
-_WHOLE = 0.1  # share of the distance that parts may leave and still count as moved as wholes
-_BETTER = 0.9  # share of what parts leave that control points may leave: they cost more and hold less
+_MAX_PARTS_ERROR = 0.1  # share of the distance that may remain for a motion by whole parts to be accepted
+# share of the parts' distance that control points may leave: they cost more and are less stable
+_MAX_WARP_ERROR = 0.9
 
 
 @dataclass(frozen=True)
 class Groups:
-    """The parts of a region and where each is at the end of every stage."""
+    """Parts of a region and their motion at the end of every stage."""
 
-    parts: Parts  # the region taken apart
-    motions: tuple[Motion, ...]  # of the parts, one per stage
-    # of control points, one per stage; none where parts moved as wholes
+    parts: Parts  # parts of the region
+    motions: tuple[Motion, ...]  # motions of the parts, one per stage
+    # motions of control points, one per stage; empty if parts move as wholes
     warps: tuple[WarpPlacement, ...] = ()
 
     @property
     def extent(self) -> float:
-        """Size of what the members still have to move within their frames, world units."""
-        return _EXTENT * float(self.parts.sizes.mean())
+        """Length scale of the members' own motion within their frames, world units."""
+        return _EXTENT_IN_PART_SIZES * float(self.parts.sizes.mean())
 
     @property
     def placements(self) -> tuple[RegionMotion, ...]:
-        """Where each stage ends."""
+        """Motion at the end of each stage."""
         return self.warps or tuple(PartsPlacement(self.parts, motion) for motion in self.motions)
 
     @property
     def rest(self) -> RegionMotion:
-        """Where the first stage begins."""
+        """Motion at the start of the first stage."""
         if self.warps:
             return WarpPlacement(self.warps[0].control, rest_warp(self.warps[0].control))
         return PartsPlacement(self.parts, self.parts.rest_motion())
@@ -76,7 +77,10 @@ class Groups:
     def to_stages(
         self, original: Tensor, crops: Sequence[CropScene], stages: Sequence[TargetStage]
     ) -> list[TargetStage]:
-        """The stages, their members' offsets now in the moved frames. `original`: raw member rows [M,C]"""
+        """Return the stages with the members' offsets in the moved frames.
+
+        `original`: raw member rows. [M,C]
+        """
         before: Sequence[Tensor] = render_all(crops, original)
         staged = []
         for stage, placement in zip(stages, self.placements, strict=True):
@@ -84,17 +88,17 @@ class Groups:
             moved = render_all(crops, original + carried(torch.zeros_like(original)))
             total, _ = visible_way(stage.targets, before)
             remaining, left = visible_way(stage.targets, moved)
-            length = min(1.0, left / _LEFT, remaining / (_REST * max(total, 1e-9)))
+            length = min(1.0, left / _FULL_STEP_CHANGE, remaining / (_FULL_STEP_REMAINDER * max(total, 1e-9)))
             staged.append(replace(stage, place=carried, length=max(0.02, length)))
             before = stage.targets
         return staged
 
     def lines(self) -> list[str]:
-        """What the log says of the finished edit."""
+        """Return the log lines about the finished edit."""
         return self.placements[-1].lines()
 
     def capture_state(self) -> dict[str, Tensor]:
-        """Part of each member [M], motions [T,P,7] and warps [T,C,12]; `restore_groups` takes them."""
+        """Return the part of each member [M], motions [T,P,7] and warps [T,C,12], for `restore_groups`."""
         motions = [torch.cat([m.shift, m.log_scale[:, None], m.turn], dim=1) for m in self.motions]
         state = {"part": self.parts.part, "motions": torch.stack(motions)}
         if self.warps:
@@ -112,16 +116,19 @@ def group_stage(
     on_step: OnStep | None = None,
     strengths: Sequence[float] = (),
 ) -> Groups:
-    """Find the parts and their motions, and bend what those leave; the same inputs give the same bits.
+    """Find the parts and their motions, and bend the region if they do not suffice.
+
+    The result is deterministic.
 
     Args:
         original: raw member rows. [M,C]
-        crops: the training views
-        targets: of each stage, the edited box of each view. [h,w,3] each
-        steps: of a search; a stage takes one or two, and one a level of control points where it is bent
-        seed: order of the views
-        on_step: progress: steps done in all, each stage counting as `steps` however many it takes; loss
-        strengths: of the stages; even where not given
+        crops: training views
+        targets: per stage, the edited box of each view. [h,w,3] each
+        steps: per search; a stage takes one or two searches, and one per level of control points if it is
+            bent
+        seed: of the view order
+        on_step: progress: steps done in all, with `steps` per stage however many it takes; loss
+        strengths: of the stages; evenly spaced if not given
 
     Raises:
         FloatingPointError: the loss is not finite.
@@ -140,13 +147,13 @@ def group_stage(
         motions.append(search.find(pictures, start, partial(step_done, stage)))
     groups = Groups(parts, tuple(motions))
     left = search.distance(targets[-1], motions[-1])
-    if left <= _WHOLE * search.distance(targets[-1], parts.rest_motion()):
+    if left <= _MAX_PARTS_ERROR * search.distance(targets[-1], parts.rest_motion()):
         return groups
     return bend_groups(groups, search, targets, strengths or range(1, len(targets) + 1), step_done)
 
 
 def restore_groups(original: Tensor, saved: Mapping[str, Tensor]) -> Groups:
-    """What `Groups.capture_state` gave, of the same members."""
+    """Return the groups saved by `Groups.capture_state`, for the same members."""
     saved = {name: tensor.to(original.device) for name, tensor in saved.items()}
     motions = tuple(Motion(m[:, :3], m[:, 3], m[:, 4:]) for m in saved["motions"])
     warps: tuple[WarpPlacement, ...] = ()
@@ -165,16 +172,16 @@ def bend_groups(
     strengths: Sequence[float],
     on_step: Callable[[int, int, float], None],
 ) -> Groups:
-    """The same region bent by control points, each stage from where the last one ended.
+    """Bend the region by control points. Each stage starts where the previous one ended.
 
     Args:
         groups: parts moved as wholes
-        search: that found their motions
+        search: search that found their motions
         targets, strengths: of the stages
         on_step: progress: stage, steps done in it, loss
 
     Returns:
-        `groups` as they are where control points do not come clearly nearer to the finished edit.
+        The bent groups, or `groups` if control points are not clearly closer to the finished edit.
     """
     parts = groups.parts
     bending = WarpSearch(search.original, parts.part, search.crops, search.steps, search.seed)
@@ -189,7 +196,7 @@ def bend_groups(
             coarse = warp_of_parts(bending.levels[0], parts, groups.motions[0])
             motions.append(bending.find_first(pictures, coarse, done))
     left = bending.distance(targets[-1], motions[-1])
-    if left > _BETTER * search.distance(targets[-1], groups.motions[-1]):
+    if left > _MAX_WARP_ERROR * search.distance(targets[-1], groups.motions[-1]):
         return groups
     return replace(groups, warps=tuple(WarpPlacement(control, motion) for motion in motions))
 
@@ -197,21 +204,21 @@ def bend_groups(
 def group_path(
     original: Tensor, groups: Groups, ends: Sequence[Tensor], steps: Sequence[int], count: int
 ) -> list[ParameterSnapshot]:
-    """Recordings through the stages' ends: parts move as wholes, what bends within them bends evenly.
+    """Return snapshots through the ends of the stages, with interpolated motions of parts or control points.
 
     Args:
         original: raw member rows. [M,C]
         groups: see `group_stage`
-        ends: the members' offsets at the end of each stage. [M,C] each
-        steps: optimizer steps done then
-        count: recordings over all stages, about
+        ends: offsets of the members at the end of each stage. [M,C] each
+        steps: optimizer steps done at these ends
+        count: approximate number of snapshots over all stages
 
     Returns:
-        In order, in half precision, without means
+        snapshots in order, in half precision, without means
     """
     placement = groups.rest
     own = torch.zeros_like(original)
-    begun = 0
+    start_step = 0
     ends = [end.to(original.device) for end in ends]
     each = max(2, count // len(ends))
     placements = []
@@ -221,10 +228,10 @@ def group_path(
             share = i / each
             halfway = between(placement, after, share)
             offsets = halfway.carry(original, torch.lerp(own, next_own, share))
-            done = begun + round(share * (step - begun))
+            done = start_step + round(share * (step - start_step))
             placements.append(ParameterSnapshot(done, False, offsets.half().cpu(), {}))
         placements.append(ParameterSnapshot(step, True, end.half().cpu(), {}))
         placement = after
         own = next_own
-        begun = step
+        start_step = step
     return placements

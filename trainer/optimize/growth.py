@@ -1,9 +1,10 @@
-"""Growth: Gaussians that an edit adds where no member is that could show it, such as a hat on a head.
-
-Members that are cloned where the gradient is large have to travel to what is new, and smear on the way. So
-rows are seeded where the pictures say that they are: at pixels that are drawn by how wrong they are, each at
-the nearest depth of its ray at which the other views show its color too. They are trained with the members,
-from the original on, and fade in at their last place: their opacity rises linearly along the slider.
+"""Growth: Gaussians that an edit adds where no member can show it, such as a hat on a head.
+ Cloned members would have to travel to the new object and smear on the way. Rows are therefore seeded where
+the
+pictures need them: at pixels sampled in proportion to their error, each at the nearest depth of its ray at
+which the other views have its color too. Seeded rows are trained with the members from the original on, and
+fade in at
+their final position: their opacity rises linearly with the slider.
 """
 
 from __future__ import annotations
@@ -31,33 +32,33 @@ from trainer.views.view import View
 from .pgs import TargetStage
 
 SEED_LOGIT = 2.0
-"""Of what is seeded, at strength 1: nearly opaque, and free to fade."""
+"""Opacity logit of seeded rows at strength 1: nearly opaque, and free to fade."""
 
-_SIZE = 0.5  # standard deviation of a seed, of the distance to its three neighbors
-_DEPTHS = 256  # along a ray, at most; one for two pixels
-_CLIP = 0.3  # of color: views disagree by no more
-_ALIKE = 0.03  # a nearer depth is as good as the best
-_MIN_VIEWS = 3  # that can see a place, beside its own
-_FAINT = 2 / 255  # of color; below, a pixel is as it should be
+_SEED_SIZE = 0.5  # standard deviation of a seed, as a share of the distance to its three neighbors
+_MAX_DEPTHS = 256  # maximum number of depths per ray; one per two pixels
+_MAX_VIEW_DIFFERENCE = 0.3  # maximum color difference that one view contributes
+_COLOR_TOLERANCE = 0.03  # color difference within which a nearer depth counts as equal to the best
+_MIN_VIEWS = 3  # minimum number of other views that see a position
+_MIN_COLOR_ERROR = 2 / 255  # color difference below which a pixel counts as correct
 
 
 def seed_rows(
     setup: TrainingSetup, views: Sequence[View], targets: Sequence[Tensor], count: int, seed: int
 ) -> Gaussians:
-    """Rows for what the scene is farthest from showing, as they are at strength 0.
+    """Return rows seeded where the scene differs most from the edit, as they are at strength 0.
 
     Args:
         setup: scene and region
         views: some views of it
-        targets: the edited pictures of these. [H,W,3] each
-        count: rows, at most
-        seed: of the draw
+        targets: edited pictures of these. [H,W,3] each
+        count: maximum number of rows
+        seed: of the random sampling
     """
     scene = setup.scene
     cameras = [view.camera for view in views]
     targets = list(targets)
     errors = [(a - view.image).square().mean(dim=2) for a, view in zip(targets, views, strict=True)]
-    errors = [torch.where(error > _FAINT**2, error, 0.0) for error in errors]
+    errors = [torch.where(error > _MIN_COLOR_ERROR**2, error, 0.0) for error in errors]
     center, radius = scene_sphere(scene[setup.region.members])
     depths = [render_depth(scene, camera) for camera in cameras]
     total = float(sum(error.sum() for error in errors))
@@ -72,17 +73,17 @@ def seed_rows(
             places.append(points[known])
             colors.append(targets[i].flatten(0, 1)[pixels[known]])
     means = torch.cat(places)
-    rows = len(means) if len(means) > 3 else 0  # fewer have no neighbors to be sized by
+    rows = len(means) if len(means) > 3 else 0  # fewer rows have no neighbors to derive their size from
     spread = torch.ones(0)
     if rows:
-        near = torch.from_numpy(PointTree(means.numpy(), 4).query(means.numpy(), 4)[0]).float()
-        spread = near[:, 1:].square().mean(dim=1).sqrt()
+        distances = torch.from_numpy(PointTree(means.numpy(), 4).query(means.numpy(), 4)[0]).float()
+        spread = distances[:, 1:].square().mean(dim=1).sqrt()
         spread = spread.clamp(spread.quantile(0.1), spread.quantile(0.9)).clamp_min(1e-3 * radius)
     return replace(
         scene[torch.zeros(rows, dtype=torch.int64)],
         means=means[:rows],
         quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(rows, 1),
-        log_scales=(_SIZE * spread).log()[:, None].repeat(1, 3),
+        log_scales=(_SEED_SIZE * spread).log()[:, None].repeat(1, 3),
         logit_opacities=torch.full((rows,), ADDED_LOGIT),
         sh0=rgb_to_sh0(torch.cat(colors))[:rows],
         shN=torch.zeros(rows, *scene.shN.shape[1:]),
@@ -97,17 +98,17 @@ def _place_pixels(
     depths: Sequence[Depth],
     center: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """The place of each pixel of a view: the nearest at which the views that can see it show its color.
+    """Return the nearest position of each pixel at which the views that can see it show its color.
 
     Args:
-        index: which view
+        index: of the view
         pixels: row by row. [n]
         cameras, targets: of all views
-        depths: of the original in all views, behind which nothing is seen
-        center: of the region, around which as far is looked as the view is wide there
+        depths: of the original in all views; positions behind them are hidden
+        center: of the region; the search range around it is as deep as the view is wide there
 
     Returns:
-        [n,3], and which of them enough views can see. [n] bool
+        positions [n,3]; True for positions that enough views can see [n] bool
     """
     camera = cameras[index]
     v = pixels // camera.width
@@ -116,12 +117,15 @@ def _place_pixels(
     rays = torch.stack([x, (v + 0.5 - camera.K[1, 2]) / camera.K[1, 1], torch.ones_like(x)], dim=1)
     middle = float(camera.viewmat[2, :3] @ center + camera.viewmat[2, 3])
     reach = middle * max(camera.width, camera.height) / (2 * float(camera.K[0, 0]))
-    count = min(_DEPTHS, max(camera.width, camera.height) // 2)
-    along = torch.linspace(max(camera.near, middle - reach), max(2 * camera.near, middle + reach), count)
-    behind = 2 * float(along[1] - along[0])  # of a surface: what is nearer is on it
-    points = (rays[:, None] * along[:, None] - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+    count = min(_MAX_DEPTHS, max(camera.width, camera.height) // 2)
+    depths_along_ray = torch.linspace(
+        max(camera.near, middle - reach), max(2 * camera.near, middle + reach), count
+    )
+    # depth tolerance within which a position counts as on a surface
+    behind = 2 * float(depths_along_ray[1] - depths_along_ray[0])
+    points = (rays[:, None] * depths_along_ray[:, None] - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
     colors = targets[index].flatten(0, 1)[pixels, None]
-    apart = torch.zeros(len(pixels), count)
+    difference = torch.zeros(len(pixels), count)
     seen = torch.zeros(len(pixels), count)
     for other, target, depth in zip(cameras, targets, depths, strict=True):
         if other is camera:
@@ -133,22 +137,30 @@ def _place_pixels(
         planes = torch.cat([target, _surface(depth)[..., None]], dim=2).permute(2, 0, 1)[None]
         *drawn, surface = grid_sample(planes, grid[None].clamp(-2, 2), "nearest", align_corners=False)[0]
         sees = (z > other.near) & (grid.abs() < 1).all(dim=2) & (z < surface + behind)
-        apart += sees * (torch.stack(drawn, dim=2) - colors).abs().mean(dim=2).clamp_max(_CLIP)
+        difference += sees * (torch.stack(drawn, dim=2) - colors).abs().mean(dim=2).clamp_max(
+            _MAX_VIEW_DIFFERENCE
+        )
         seen += sees
-    off = apart / seen.clamp_min(1.0)
-    allowed = (seen >= _MIN_VIEWS) & (along < _surface(depths[index]).flatten()[pixels, None] + behind)
-    off = torch.where(allowed, off, 1.0)
-    first = (off <= off.amin(dim=1, keepdim=True) + _ALIKE).float().argmax(dim=1)
+    mean_difference = difference / seen.clamp_min(1.0)
+    allowed = (seen >= _MIN_VIEWS) & (
+        depths_along_ray < _surface(depths[index]).flatten()[pixels, None] + behind
+    )
+    mean_difference = torch.where(allowed, mean_difference, 1.0)
+    first = (
+        (mean_difference <= mean_difference.amin(dim=1, keepdim=True) + _COLOR_TOLERANCE)
+        .float()
+        .argmax(dim=1)
+    )
     return points[torch.arange(len(pixels)), first], allowed.any(dim=1)
 
 
 def _surface(depth: Depth) -> Tensor:
-    """Camera z behind which a view shows nothing; far away where it is mostly clear. [H,W]"""
+    """Return the camera z of the visible surface; 1e9 in pixels that are mostly transparent. [H,W]"""
     return torch.where(depth.alpha > 0.5, depth.depth, 1e9)
 
 
 def place_seeds(stage: TargetStage, count: int) -> TargetStage:
-    """The stage with its last `count` members, which are seeded, as opaque as its strength says."""
+    """Return the stage with its last `count` members (the seeds) at the opacity of its strength."""
     opacity = stage.strength * torch.tensor(SEED_LOGIT).sigmoid()
 
     def place(offsets: Tensor) -> Tensor:
@@ -160,7 +172,7 @@ def place_seeds(stage: TargetStage, count: int) -> TargetStage:
 
 
 def add_rows(trajectory: Trajectory, rows: Gaussians) -> Trajectory:
-    """A recording of the region's members with others, given as they are at strength 1."""
+    """Add rows, given as they are at strength 1, to a trajectory of the region's members."""
     if not len(rows):
         return trajectory
     below = (0, 0, 0, len(rows))
@@ -173,15 +185,14 @@ def add_rows(trajectory: Trajectory, rows: Gaussians) -> Trajectory:
 
 
 def removal_costs(crops: Sequence[CropScene], rows: Tensor, targets: Sequence[Tensor], seed: int) -> Tensor:
-    """By how much half the squared error over all views would rise without each member. [M]
-
-    To second order in its opacity o: -g o + h o² / 2. The curvature h, Σ (dI/do)², is the mean square of the
-    gradient of a picture of random signs (Hutchinson), of which one a view is enough.
+    """Return the increase of half the squared error over all views if each member were removed. [M]
+     To second order in its opacity o it is -g o + h o² / 2. The curvature h, Σ (dI/do)², is the mean square
+    of the gradient of a picture of random signs (Hutchinson). One such picture per view is enough.
 
     Args:
-        crops: the training views
+        crops: training views
         rows: raw member rows. [M,C]
-        targets: what these views are to show. [h,w,3] each
+        targets: target pictures of these views. [h,w,3] each
         seed: of the signs
     """
     draw = torch.Generator().manual_seed(seed)
@@ -196,20 +207,20 @@ def removal_costs(crops: Sequence[CropScene], rows: Tensor, targets: Sequence[Te
         (drawn,) = torch.autograd.grad(image, leaf, signs)
         slope += along[:, logit][:, 0]
         curvature += drawn[:, logit][:, 0].square()
-    clear = 1.0 - rows[:, logit][:, 0].sigmoid()  # of logits x, do/dx = o (1 - o)
+    clear = 1.0 - rows[:, logit][:, 0].sigmoid()  # for a logit x: do/dx = o (1 - o)
     return curvature / (2 * clear.square()) - slope / clear
 
 
 def fade_in(trajectory: Trajectory) -> Trajectory:
-    """The opacities of the added rows linear along the slider, with recordings where logits bend."""
+    """Make the opacities of added rows linear in the slider value, with extra recordings as needed."""
     added = trajectory.added
     if added is None:
         return trajectory
     logit = attribute_slices(trajectory.end.shape[1])["logit_opacities"]
-    last = added.logit_opacities + trajectory.end[-len(added) :, logit][:, 0]
-    s = torch.unique(torch.cat([trajectory.s, opacity_course(added.logit_opacities, last)[0]]))
+    final_logits = added.logit_opacities + trajectory.end[-len(added) :, logit][:, 0]
+    s = torch.unique(torch.cat([trajectory.s, opacity_course(added.logit_opacities, final_logits)[0]]))
     offsets = torch.stack([trajectory.at(float(at)).half() for at in s])
-    opacity = torch.lerp(added.opacities.double(), last.double().sigmoid(), s[:, None].double())
+    opacity = torch.lerp(added.opacities.double(), final_logits.double().sigmoid(), s[:, None].double())
     offsets[:, -len(added) :, logit] = (opacity.logit() - ADDED_LOGIT).half()[..., None]
     offsets[0, -len(added) :] = 0.0
     ends = torch.searchsorted(s, trajectory.s[list(trajectory.stage_ends)])

@@ -1,6 +1,6 @@
-"""What the optimizer minimizes: L1, a perceptual term, and the clamp whose gradient is not lost.
-
-L_edit of ProGDF (AAAI 2025, eq. 4) is L1 + LPIPS between render and edited view (weights: docs/method.md 3).
+"""Loss terms of the optimizer: L1, a perceptual term, a progressive term and sharpness.
+ L_edit of ProGDF (AAAI 2025, eq. 4) is L1 + LPIPS between render and edited view (weights: docs/method.md
+3).
 """
 
 from __future__ import annotations
@@ -22,34 +22,37 @@ _LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601
 
 
 def l1(image: Tensor, target: Tensor) -> Tensor:
-    """Mean absolute difference. [h,w,3], [h,w,3] -> []"""
+    """Return the mean absolute difference. [h,w,3], [h,w,3] -> []"""
     return (image - target).abs().mean()
 
 
 class Perceptual(Protocol):
-    """A perceptual distance of images of range 0..1 that are at least 31 pixels each way."""
+    """Perceptual distance of images of range 0..1 with at least 31 pixels on each side."""
 
     @property
     def name(self) -> str:
-        """As report.json names it."""
+        """Name in report.json."""
         ...
 
     def __call__(self, image: Tensor, target: Tensor, key: Hashable = None) -> Tensor:
-        """[h,w,3], [h,w,3] -> []; what is computed of the target is kept under `key`, None keeps nothing."""
+        """Return the distance. [h,w,3], [h,w,3] -> []
+
+        Features of the target are cached under `key`; None caches nothing.
+        """
         ...
 
     def forget(self) -> None:
-        """Drop what is kept of targets."""
+        """Clear the cache of targets."""
         ...
 
 
 class LpipsLoss:
-    """LPIPS (Zhang et al. 2018); the targets' features are computed once per key, while they fit in memory.
+    """LPIPS (Zhang et al. 2018). Features of targets are cached per key while they fit in memory.
 
     Args:
         network: see `Lpips.load`
-        name: as report.json names it
-        room: bytes that may be kept; a target of 256 pixels takes 2.5 MB
+        name: name in report.json
+        room: size of the cache in bytes; a target of 256 pixels takes 2.5 MB
     """
 
     def __init__(self, network: Lpips, name: str = "lpips-alex", room: int = 1 << 30) -> None:
@@ -60,31 +63,31 @@ class LpipsLoss:
         self._kept: dict[Hashable, Features] = {}
 
     def __call__(self, image: Tensor, target: Tensor, key: Hashable = None) -> Tensor:
-        """See `Perceptual`."""
+        """See `Perceptual.__call__`."""
         self._network = self._network.to(image.device)
-        seen = self._kept.get(key) if key is not None else None
-        if seen is None:
+        features = self._kept.get(key) if key is not None else None
+        if features is None:
             with torch.no_grad():
-                seen = self._network.features(target)
-            size = sum(layer.numel() * layer.element_size() for layer in seen)
+                features = self._network.features(target)
+            size = sum(layer.numel() * layer.element_size() for layer in features)
             if key is not None and size <= self._free:
-                self._kept[key] = seen
+                self._kept[key] = features
                 self._free -= size
-        return self._network.distance(self._network.features(image), seen)
+        return self._network.distance(self._network.features(image), features)
 
     def forget(self) -> None:
-        """See `Perceptual`."""
+        """See `Perceptual.forget`."""
         self._kept.clear()
         self._free = self._room
 
 
 class GradientL1:
-    """The stand-in where LPIPS weights are absent: L1 of the image gradients at full and half resolution."""
+    """Substitute for missing LPIPS weights: L1 of the image gradients at full and half resolution."""
 
     name = "gradient-l1"
 
     def __call__(self, image: Tensor, target: Tensor, key: Hashable = None) -> Tensor:
-        """See `Perceptual`."""
+        """See `Perceptual.__call__`."""
         a = image.permute(2, 0, 1)[None]
         b = target.permute(2, 0, 1)[None]
         total = image.new_zeros(())
@@ -96,11 +99,11 @@ class GradientL1:
         return total
 
     def forget(self) -> None:
-        """Nothing is kept."""
+        """Do nothing; there is no cache."""
 
 
 def perceptual_loss() -> tuple[Perceptual, str]:
-    """LPIPS, or its stand-in and one line that says why and how to get the real one; "" where all is well."""
+    """Return LPIPS and "", or its substitute and one line with the reason and the remedy."""
     try:
         return LpipsLoss(Lpips.load()), ""
     except ProgdfError as error:
@@ -116,17 +119,18 @@ def progressive_change(
     alpha: float = 0.05,
     beta: float = 1.1,
 ) -> Tensor:
-    """The paper's progressive constraint (eq. 5): L_prog = α·β^(±t/50)·Σ‖ΔΘ‖², without its λ2. []
-
-    ΔΘ is what the last step changed of a member's raw parameters. The paper does not say of which norm and of
-    how many members: docs/experiments.md, The progressive constraint.
+    """Return the paper's progressive constraint (eq. 5): L_prog = α·β^(±t/50)·Σ‖ΔΘ‖², without its λ2. []
+     ΔΘ is the change of a member's raw parameters by the last step. The paper does not state the norm or
+    the number of
+    members: docs/experiments.md, The progressive constraint.
 
     Args:
         moved: offsets of the members. [M,C]
         previous: one step earlier. [M,C]
         step: t
-        grows: the printed exponent +t/50, which allows ever shorter steps; else −t/50, which lets go of them
-        over: the members: their mean, or their sum
+        grows: True for the printed exponent +t/50, which forces shorter and shorter steps; False for −t/50,
+            which relaxes the constraint
+        over: mean or sum over the members
         alpha, beta: of the paper
     """
     period = 50.0
@@ -138,17 +142,16 @@ def progressive_change(
 def sharpness(
     image: Tensor, target: Tensor, form: Literal["hinge", "paper"], inside: Tensor | None = None
 ) -> Tensor:
-    """The paper's L_render. []
-
-    "paper" is −(∇²R)², the mean over the whole picture; of the printed −∇²R, signed, nothing is left but the
-    rim. "hinge" asks for no more than the target has: max(0, S(target) − S(image)), S the mean of |∇²Y|
-    inside the region, Y the luma.
+    """Return the paper's L_render. []
+     "paper" is −(∇²R)², the mean over the whole picture. The printed −∇²R is signed, and its sum cancels
+    except at the border of the picture. "hinge" stops at the target's sharpness: max(0, S(target) −
+    S(image)), with S the mean of |∇²Y| inside the region and Y the luma.
 
     Args:
         image: the render. [h,w,3]
-        target: what it should be. [h,w,3]
+        target: its target. [h,w,3]
         form: see above
-        inside: the pixels that count under "hinge"; None: all. [h,w] bool
+        inside: pixels that count for "hinge"; None: all. [h,w] bool
     """
     if form == "paper":
         return -laplacian(image.mean(dim=2)).square().mean()
@@ -162,40 +165,46 @@ def sharpness(
 
 
 def laplacian(luma: Tensor) -> Tensor:
-    """Sum of the four neighbors minus four times the pixel, where all four exist. [h,w] -> [h-2,w-2]"""
+    """Return the 4-neighbor Laplacian without the border pixels. [h,w] -> [h-2,w-2]"""
     around = luma[:-2, 1:-1] + luma[2:, 1:-1] + luma[1:-1, :-2] + luma[1:-1, 2:]
     return around - 4.0 * luma[1:-1, 1:-1]
 
 
 def erode(mask: Tensor, by: int = 2) -> Tensor:
-    """The mask without its rim of `by` pixels, beyond the picture counting as inside. [h,w] -> [h,w] bool"""
+    """Return the mask without a border of `by` pixels.
+
+    Pixels beyond the picture count as inside. [h,w] -> [h,w] bool
+    """
     outside = (mask <= 0.5).float()
     return max_pool2d(outside[None, None], 2 * by + 1, 1, by)[0, 0] < 0.5
 
 
 Losses = Mapping[str, Sequence[float | None]]
-"""Columns of equal length, a row per recording: "step", "left", and each term's mean; None where unpaid."""
+"""Columns of equal length with one row per recording: "step", "left" and the mean of each term, or None.
+
+A term is None in recordings whose steps did not compute it.
+"""
 
 
 PROGRESSIVE_WEIGHT = 5.0
-"""λ2 of the paper."""
+"""λ2 of the paper: weight of the progressive constraint."""
 SHARPNESS_WEIGHT: Mapping[Sharpness, float] = {"hinge": 0.1, "paper": 1.0}
-"""λ3."""
+"""λ3 of the paper: weight of the sharpness term, by its form."""
 
 
 def describe_loss(options: OptimizeOptions, perceptual: str) -> str:
-    """What is minimized, in one line for log and report.
+    """Return a one-line description of the loss for log and report.
 
     Args:
-        options: with nothing left open, see `trainer.resolve.resolve_kind`
-        perceptual: the name of the distance that is really used
+        options: fully resolved, see `trainer.resolve.resolve_kind`
+        perceptual: name of the distance in use
     """
     if options.solver == "colors":
         return "squared error, all views at once"
     terms = ["L1"]
     if options.perceptual_weight:
-        often = f" every {options.perceptual_every} steps" if options.perceptual_every > 1 else ""
-        terms.append(f"{options.perceptual_weight:g} {perceptual}{often}")
+        frequency = f" every {options.perceptual_every} steps" if options.perceptual_every > 1 else ""
+        terms.append(f"{options.perceptual_weight:g} {perceptual}{frequency}")
     if options.progressive in ("decay", "growth"):
         terms.append(
             f"{PROGRESSIVE_WEIGHT:g} progressive ({options.progressive}, {options.progressive_over})"
@@ -207,26 +216,26 @@ def describe_loss(options: OptimizeOptions, perceptual: str) -> str:
 
 @dataclass(frozen=True)
 class Moment:
-    """What one optimizer step looks at."""
+    """Inputs of the loss at one optimizer step."""
 
-    image: Tensor  # the render, differentiable. [h,w,3]
-    target: Tensor  # what it should be. [h,w,3]
+    image: Tensor  # render, differentiable. [h,w,3]
+    target: Tensor  # target picture. [h,w,3]
     view: int  # index of the training view
     step: int  # steps done before this one, over all stages
     local: int  # steps done before this one in its stage
-    arrived: bool  # the target is the stage's own picture, no longer on the way to it
-    moved: Tensor  # offsets of the members, differentiable. [M,C]
-    previous: Tensor  # the offsets one step earlier, or the same tensor at the first step. [M,C]
+    arrived: bool  # True once the target is the stage's own picture, no longer a blend
+    moved: Tensor  # member offsets, differentiable. [M,C]
+    previous: Tensor  # member offsets one step earlier, or the same tensor at the first step. [M,C]
 
 
 class Objective:
-    """The weighted terms of a step; their sum is the loss.
+    """Weighted terms of a step. Their sum is the loss.
 
     Args:
-        perceptual: distance whose targets are kept until the stage ends
-        options: which terms there are, and what they weigh beside an L1 of 1; nothing is left open
-        inside: where each training view's box shows the region without its rim; sharpness is measured
-            there. Not needed where sharpness is off. [h,w] bool each
+        perceptual: distance whose targets are cached until the stage ends
+        options: terms and their weights relative to an L1 of 1, fully resolved
+        inside: per training view, the region in its box without its border; sharpness is measured there.
+            Not needed if sharpness is off. [h,w] bool each
     """
 
     def __init__(
@@ -237,11 +246,11 @@ class Objective:
         self._inside = inside
 
     def begin_stage(self) -> None:
-        """The targets change now; what is kept of the old ones goes."""
+        """Clear the cache, because the targets change."""
         self._perceptual.forget()
 
     def terms(self, moment: Moment) -> dict[str, Tensor]:
-        """The terms that this step pays for, weighted. [] each"""
+        """Return the weighted terms of this step. [] each"""
         options = self._options
         terms = {"l1": l1(moment.image, moment.target)}
         if options.perceptual_weight and moment.arrived and moment.local % options.perceptual_every == 0:
@@ -261,26 +270,26 @@ class Objective:
 
 
 class TermMeans:
-    """Mean of every term over the steps that paid for it, since the last reading."""
+    """Mean of every term over the steps that computed it, since the last read."""
 
     def __init__(self) -> None:
         self.sums: dict[str, tuple[float, int]] = {}
 
     def add(self, terms: Mapping[str, float]) -> None:
-        """One step."""
+        """Add the terms of one step."""
         for name, value in terms.items():
             total, count = self.sums.get(name, (0.0, 0))
             self.sums[name] = (total + value, count + 1)
 
     def read(self) -> dict[str, float]:
-        """The means; what was added is forgotten."""
+        """Return the means and reset."""
         means = {name: total / count for name, (total, count) in self.sums.items()}
         self.sums = {}
         return means
 
 
 def loss_table(rows: Sequence[tuple[int, Mapping[str, float]]]) -> dict[str, list[float | None]]:
-    """The recordings' means as columns, for report.json.
+    """Return the recordings' means as columns, for report.json.
 
     Args:
         rows: (step, term → mean) of each recording
@@ -293,10 +302,10 @@ def loss_table(rows: Sequence[tuple[int, Mapping[str, float]]]) -> dict[str, lis
 
 
 def total_loss(terms: Mapping[str, Tensor]) -> Tensor:
-    """The loss. []"""
+    """Return the sum of the terms. []"""
     return torch.stack(list(terms.values())).sum()
 
 
 def _five_digits(value: float | None) -> float | None:
-    """As report.json has it; what is not finite is no JSON."""
+    """Round to five digits for report.json; None if not finite, as JSON has no such number."""
     return float(f"{value:.5g}") if value is not None and math.isfinite(value) else None

@@ -1,14 +1,12 @@
-"""PGS, progressive Gaussian splatting (ProGDF, AAAI 2025): the edit optimization that records its own way.
+"""Progressive Gaussian splatting (PGS; ProGDF, AAAI 2025): the edit optimization that records its trajectory.
+ The paper runs one optimization towards the edited views and records its path. The states between look
+worse than a straight line (docs/method.md 3). The targets are therefore staged: the editor paints the edit
+at several strengths, and the members are optimized towards each in turn. Within a stage the target is
+blended from the previous stage's pictures to its own, so that the path between them is short and straight.
+ Edits that change only colors are solved with all views at once instead (`color_solver`), unless an option
+needs descent view by view (`trainer.resolve.resolve_kind`).
 
-The paper lets one optimization run towards the edited views and keeps its path. Its own in-betweens look
-worse than a straight line (docs/method.md 3), so the targets are staged here: the editor pictures the edit at
-several strengths and the members are optimized towards each in turn. Within a stage the target moves too,
-from the last stage's pictures to its own, so that the way between them is short and straight.
-
-Edits of colors alone are solved for instead, all views at once (`color_solver`), unless something is asked
-for that only a descent view by view has (`trainer.resolve.resolve_kind`).
-
-What stages bring is in docs/experiments.md, Stages.
+Effect of stages: docs/experiments.md, Stages.
 """
 
 from __future__ import annotations
@@ -30,14 +28,14 @@ from trainer.views.crops import CropScene, render_all
 from .losses import Moment, Objective, TermMeans, l1, total_loss
 
 EPSILON = 0.1
-"""Of the root mean square of an attribute's gradient: Adam's ε where it is raised."""
+"""Raised ε of Adam, as a share of the root mean square of an attribute's gradient."""
 
-_COUNTS = ("step", "stage", "local")
-_ROWS = ("moved", "previous", "average", "first", "second")
+_COUNT_FIELDS = ("step", "stage", "local")
+_ROW_FIELDS = ("moved", "previous", "average", "first", "second")
 
 
 class _StateValues(msgspec.Struct):
-    """What `PgsState.capture_state` gives beside tensors."""
+    """Values of `PgsState.capture_state` that are not tensors."""
 
     step: int
     stage: int
@@ -48,16 +46,16 @@ class _StateValues(msgspec.Struct):
 
 
 class PgsState:
-    """The state of one optimization, changed in place by its steps.
+    """State of one optimization, changed in place by its steps.
 
     Args:
-        rows: the members' packed raw rows; the state starts exactly at these. [M,C]
-        seed: order of the views
+        rows: packed raw rows of the members; the state starts exactly at these. [M,C]
+        seed: of the view order
 
     Attributes:
         moved: offsets of the members, a leaf that takes gradients. [M,C]
         previous: the offsets one step earlier. [M,C]
-        average: their running mean, which is what is recorded. [M,C]
+        average: their running mean, which is recorded. [M,C]
         first, second: Adam's moments. [M,C]
         pictures: the probes at the last recording. [h,w,3] each; empty before the first step
         step: steps done
@@ -79,7 +77,10 @@ class PgsState:
         self._queue: list[int] = []
 
     def view(self, count: int) -> int:
-        """Index of the view whose turn it is: all of them in random order, again and again."""
+        """Return the index of the current view.
+
+        Views are drawn in random order without replacement, then again.
+        """
         if not self._queue:
             self._queue = torch.randperm(count, generator=self._order).tolist()
         return self._queue[-1]
@@ -93,19 +94,18 @@ class PgsState:
         smoothing: float,
         growth: float = math.inf,
     ) -> None:
-        """One step of Adam (Kingma and Ba 2015), with a rate per column; the next view is due.
-
-        Adam does not know how large a gradient is, so a member that hardly shows would wander as far as one
-        in plain sight. A tenth of the attribute's typical gradient, added to ε, keeps it still.
+        """Take one step of Adam (Kingma and Ba 2015) with a rate per column, and advance to the next view.
+         Adam ignores the magnitude of gradients, so a hardly visible member would wander as far as a fully
+        visible one. A tenth of the attribute's typical gradient, added to ε, keeps it in place
         (docs/experiments.md, Rates and steps).
 
         Args:
-            gradient: of the loss in `moved`. [M,C]
+            gradient: of the loss by `moved`. [M,C]
             rates: learning rate of each column. [C]
-            length: factor to them all
-            raised: see above; False is Adam as printed
-            smoothing: share that the running mean keeps of itself; it starts exactly at the original
-            growth: how many times as large as it was a member may become
+            length: factor to all rates
+            raised: raise ε as above; False is Adam as published
+            smoothing: weight of the running mean's previous value; the mean starts exactly at the original
+            growth: maximum factor by which a member may grow
         """
         done = self.step + 1
         self.first.lerp_(gradient, 0.1)
@@ -127,10 +127,12 @@ class PgsState:
         self._queue.pop()
 
     def capture_state(self) -> Saved:
-        """See `state.Resumable`."""
-        # of an edit that is solved for the moments are 0, and the mean is where it is
-        tensors = {name: rows for name in _ROWS if bool(_bits(rows := getattr(self, name)).any())}
-        if torch.equal(_bits(self.average), _bits(self.moved)):
+        """Return the state for saving (see `state.Resumable`)."""
+        # For a solved edit the moments are 0 and the mean equals the offsets.
+        tensors = {
+            name: rows for name in _ROW_FIELDS if bool(_bit_patterns(rows := getattr(self, name)).any())
+        }
+        if torch.equal(_bit_patterns(self.average), _bit_patterns(self.moved)):
             tensors.pop("average", None)
         else:
             tensors["average"] = self.average
@@ -138,35 +140,35 @@ class PgsState:
         tensors["order"] = self._order.get_state()
         running = self.running if self.step else None
         sums = self.means.sums
-        counts = {name: getattr(self, name) for name in _COUNTS}
+        counts = {name: getattr(self, name) for name in _COUNT_FIELDS}
         return Saved(tensors, plain(_StateValues(**counts, running=running, means=sums, queue=self._queue)))
 
     def restore(self, saved: Saved) -> None:
-        """See `state.Resumable`."""
+        """Restore a saved state (see `state.Resumable`)."""
         tensors = saved.tensors
         values = convert_json(saved.values, _StateValues)
         with torch.no_grad():
-            for name in _ROWS:
-                same = tensors.get("moved" if name == "average" else name, torch.zeros_like(self.first))
-                getattr(self, name).copy_(tensors.get(name, same))
+            for name in _ROW_FIELDS:
+                default = tensors.get("moved" if name == "average" else name, torch.zeros_like(self.first))
+                getattr(self, name).copy_(tensors.get(name, default))
         self.pictures = [
             tensors[f"picture{i}"].to(self.first)
             for i in range(sum(k.startswith("picture") for k in tensors))
         ]
-        for name in _COUNTS:
+        for name in _COUNT_FIELDS:
             setattr(self, name, getattr(values, name))
         self.running = math.nan if values.running is None else values.running
         self.means.sums = dict(values.means)
         self._order, self._queue = generator(tensors["order"]), list(values.queue)
 
 
-def _bits(rows: Tensor) -> Tensor:
-    """In which −0 is not 0."""
+def _bit_patterns(rows: Tensor) -> Tensor:
+    """Return the bit patterns, which distinguish −0 from 0."""
     return rows.detach().view(torch.int32)
 
 
 LEARNING_RATES: Mapping[str, Mapping[str, float]] = {
-    # of 3DGS (Kerbl 2023) for a scene of extent 1
+    # 3DGS (Kerbl 2023) for a scene of extent 1
     "3dgs": {
         "means": 1.6e-4,
         "log_scales": 5e-3,
@@ -175,7 +177,7 @@ LEARNING_RATES: Mapping[str, Mapping[str, float]] = {
         "sh0": 2.5e-3,
         "shN": 1.25e-4,
     },
-    # the same as GaussianEditor's scripts of 1500 steps multiply them (Chen 2024)
+    # the same rates as multiplied by GaussianEditor's scripts of 1500 steps (Chen 2024)
     "gaussian-editor": {
         "means": 8e-4,
         "log_scales": 1e-2,
@@ -184,8 +186,8 @@ LEARNING_RATES: Mapping[str, Mapping[str, float]] = {
         "sh0": 1.25e-2,
         "shN": 6.25e-4,
     },
-    # By kind of edit: what it needs to arrive within a few hundred steps (docs/method.md 3). A color edit
-    # leaves the geometry alone, which is 1.4 dB better and 11 floats a Gaussian smaller.
+    # By kind of edit: rates that converge within a few hundred steps (docs/method.md 3). A color edit leaves
+    # the geometry unchanged, which is 1.4 dB better and saves 11 floats per Gaussian.
     "color": {"sh0": 7.5e-2, "shN": 3.75e-3},
     "style": {
         "means": 3.2e-4,
@@ -206,45 +208,49 @@ LEARNING_RATES: Mapping[str, Mapping[str, float]] = {
 }
 
 GROWTH = 2.0
-"""How many times a Gaussian may grow beyond its part; larger ones are fog that hides an error."""
+"""Maximum growth factor of a Gaussian beyond that of its part.
+
+Larger Gaussians are fog that hides an error.
+"""
 REACH = 0.16
-"""Change of a channel in a stage for which the rates are right, see `PgsSettings.reach`."""
+"""Change of a channel within a stage for which the rates are tuned (see `PgsSettings.reach`)."""
 FALL = 0.35
-"""Share of a stage's steps, its last, in which the learning rate falls; see `PgsSettings.fall`."""
+"""Final share of a stage's steps over which the learning rate falls (see `PgsSettings.fall`)."""
 SNAPSHOTS = 32
-"""Recordings over all stages, about."""
+"""Approximate number of recordings over all stages."""
 
 
 @dataclass(frozen=True)
 class PgsSettings:
-    """How the members descend."""
+    """Settings of the members' descent."""
 
     rates: Tensor  # learning rate of each column of a packed row, raw units. [C]
-    raised: bool = True  # Adam's ε holds members still that hardly show, see `PgsState.descend`
-    ramp: float = 0.6  # share of a stage's steps in which its target moves from the last stage's to its own
-    fall: float = FALL  # share of a stage's steps, its last, in which the rate falls to a tenth; 0: flat
-    # That change which 95 % of the changing pixels stay below; a shorter way gets smaller steps, down to a
-    # quarter, a longer one larger, up to 1.5 times; 0: the same for all. Steps larger than the way needs walk
-    # at random where the views do not resolve single Gaussians: close by, speckles of all colors.
+    raised: bool = True  # raise Adam's ε to keep hardly visible members in place, see `PgsState.descend`
+    ramp: float = 0.6  # share of a stage's steps over which its target is blended from the last stage's
+    fall: float = FALL  # final share of a stage's steps over which the rate falls to a tenth; 0: constant
+    # Change that 95 % of the changing pixels stay below. Smaller changes get smaller steps, down to a
+    # quarter, larger ones larger steps, up to 1.5 times; 0: the same for all. Steps larger than the change
+    # needs become random walks where the views do not resolve single Gaussians: close up, these are speckles
+    # of all colors.
     reach: float = REACH
-    smoothing: float = 0.9  # share that the recorded running mean keeps of itself; 0: the bare iterates
-    growth: float = math.inf  # how many times a Gaussian may grow, beyond what its stage places it at
-    snapshots: int = SNAPSHOTS  # recordings over all stages, about
-    every: int = 0  # record every so many steps; 0: by visible change
-    seed: int = 0  # order of the views
+    smoothing: float = 0.9  # weight of the recorded running mean's previous value; 0: raw iterates
+    growth: float = math.inf  # maximum growth of a Gaussian beyond its stage's placement
+    snapshots: int = SNAPSHOTS  # approximate number of recordings over all stages
+    every: int = 0  # record at this interval of steps; 0: by visible change
+    seed: int = 0  # of the view order
 
 
 def pgs_settings(
     options: OptimizeOptions, bands: bool, channels: int, extent: float, stages: int
 ) -> PgsSettings:
-    """How a run descends.
+    """Return the settings of a run's descent.
 
     Args:
-        options: with nothing left open, see `trainer.resolve.resolve_kind`
-        bands: whether the SH bands beyond DC are trained
+        options: fully resolved, see `trainer.resolve.resolve_kind`
+        bands: train the SH bands beyond DC
         channels: columns of a packed row
-        extent: size of what moves, world units
-        stages: how many strengths there are to optimize towards
+        extent: size of the moving object, world units
+        stages: number of strengths to optimize towards
     """
     recolors = options.kind != "geometry"
     printed = options.as_printed
@@ -254,12 +260,12 @@ def pgs_settings(
     return PgsSettings(
         rates,
         raised=not printed,
-        # one target alone is approached slowly: quick steps towards it shine in all colors half way
+        # A single target is approached slowly: fast steps cause speckles of all colors half way.
         ramp=(0.9 if stages == 1 else 0.6) if recolors and options.target_ramp else 0.0,
         fall=0.0 if printed else 1.0 if stages == 1 else FALL,
         reach=REACH if recolors and not printed else 0.0,
         smoothing=0.9 if options.ema else 0.0,
-        # a run too short for the paper's snapshots still has four
+        # a run too short for the paper's interval still records four times
         every=min(100, max(1, options.steps // 4)) if printed else 0,
         growth=GROWTH if options.group_steps else math.inf,
         seed=options.seed,
@@ -270,13 +276,13 @@ def pgs_settings(
 class TargetStage:
     """One strength to optimize towards."""
 
-    strength: float  # the slider value it belongs to, 0..1
-    targets: Sequence[Tensor]  # the edited box of each training view. [h,w,3] each
-    steps: int  # how many steps
-    # turns the members' own offsets, which are optimized, into those that are seen and recorded: a part that
-    # moves as a whole takes them along; differentiable. [M,C] -> [M,C]
+    strength: float  # slider value, 0..1
+    targets: Sequence[Tensor]  # edited box of each training view. [h,w,3] each
+    steps: int  # number of steps
+    # Converts the optimized offsets of the members to the rendered and recorded ones: a part that moves as a
+    # whole carries its members. Differentiable. [M,C] -> [M,C]
     place: Callable[[Tensor], Tensor] = lambda offsets: offsets
-    # factor to the learning rates; None: by the way that the pictures have to go, see `PgsSettings.reach`
+    # Factor to the learning rates; None: by the change of the pictures, see `PgsSettings.reach`.
     length: float | None = None
 
 
@@ -284,26 +290,26 @@ class TargetStage:
 class ParameterSnapshot:
     """One recording: the running mean of the parameters, as offsets from the original."""
 
-    step: int  # steps done, over all stages
-    ends_stage: bool  # whether it is the last of its stage
-    offsets: Tensor  # raw-space offsets of the members as placed. [M,C] float32
-    # since the last recording: each loss term, weighted, over the steps that paid for it, and "left", the L1
-    # distance from the finished edit
+    step: int  # optimizer steps done, over all stages
+    ends_stage: bool  # last recording of its stage
+    offsets: Tensor  # raw-space offsets of the members after placement. [M,C] float32
+    # Means since the last recording: each weighted loss term, over the steps that computed it, and "left",
+    # the L1 distance from the finished edit.
     means: Mapping[str, float]
-    table: Tensor | None = None  # the map of color at a stage's end, where there is one. [K,3]
+    table: Tensor | None = None  # color map at the end of a stage, if any. [K,3]
 
 
 OnStep = Callable[[int, float], None]
-"""Called after every step: steps done, running mean of the L1 distance from the finished edit."""
+"""Callback after every step: steps done, running mean of the L1 distance from the finished edit."""
 
 
 def learning_rates(kind: str, channels: int, extent: float) -> Tensor:
-    """Learning rate of every column of a packed row, [C].
+    """Return the learning rate of every column of a packed row, [C].
 
     Args:
-        kind: what the edit moves, or whose they are, with all attributes free; see `LEARNING_RATES`
+        kind: kind of edit, or source of rates for all attributes; see `LEARNING_RATES`
         channels: columns of a packed row
-        extent: size of what moves, world units
+        extent: size of the moving object, world units
     """
     rates = torch.zeros(channels)
     for name, columns in attribute_slices(channels).items():
@@ -322,22 +328,21 @@ def optimize(
     state: PgsState | None = None,
 ) -> Iterator[ParameterSnapshot]:
     """Optimize the member rows towards each stage in turn, and yield recordings.
-
-    A recording is made whenever the probes' pictures have moved by a share of what the stage has to move
-    them, and at every stage's end. Only the members exist here, so nothing else can drift.
+     A recording is made when the probes' pictures have changed by a share of the stage's total change, and
+    at the end of every stage. Only the members are optimized, so nothing else can drift.
 
     Args:
         original: raw member rows, packed. [M,14] or [M,14+3K]
-        crops: the training views, in the order of the stages' targets
-        probes: a few small views in which movement is measured
+        crops: training views, in the order of the stages' targets
+        probes: a few small views to measure change in
         stages: strengths ascending
-        objective: what each step is charged with
-        settings: see PgsSettings
-        on_step: progress; here, and only here, the state is whole and may be saved
-        state: where to go on from, changed in place; None: from the original
+        objective: loss of each step
+        settings: see `PgsSettings`
+        on_step: progress callback; the state is consistent, and may be saved, only during this call
+        state: state to continue from, changed in place; None: start at the original
 
     Raises:
-        FloatingPointError: the loss or its gradient is not finite; the state is that of the step before.
+        FloatingPointError: the loss or its gradient is not finite; the state is that of the previous step.
     """
     slices = attribute_slices(original.shape[1])
     rates = settings.rates.to(original.device)
@@ -378,14 +383,17 @@ def optimize(
 
 
 def _step_size(stage: TargetStage, before: Sequence[Tensor], reach: float) -> float:
-    """Factor to the learning rates of a stage, see `TargetStage.length` and `PgsSettings.reach`."""
+    """Return the rate factor of a stage, see `TargetStage.length` and `PgsSettings.reach`."""
     if stage.length is not None:
         return stage.length
     return min(1.5, max(0.25, most_change(stage.targets, before) / reach)) if reach > 0 else 1.0
 
 
 def _gradient(objective: Objective, moment: Moment, state: PgsState, finished: Tensor) -> Tensor:
-    """Of the loss in the members' offsets [M,C]; its terms and what is left to `finished` are noted."""
+    """Return the gradient of the loss by the members' offsets [M,C].
+
+    Record its terms and the distance to `finished`.
+    """
     terms = objective.terms(moment)
     loss = total_loss(terms)
     if not math.isfinite(float(loss.detach())):
@@ -403,7 +411,7 @@ def _gradient(objective: Objective, moment: Moment, state: PgsState, finished: T
 
 
 def visible_way(targets: Sequence[Tensor], before: Sequence[Tensor]) -> tuple[float, float]:
-    """Mean change of the pictures, over all pixels and over those that change at all."""
+    """Return the mean change of the pictures, over all pixels and over the changing ones."""
     total = 0.0
     every = 0
     changing = 0
@@ -416,10 +424,9 @@ def visible_way(targets: Sequence[Tensor], before: Sequence[Tensor]) -> tuple[fl
 
 
 def most_change(targets: Sequence[Tensor], before: Sequence[Tensor]) -> float:
-    """The change of a channel that 95 % of the pixels that change at all stay below; 0 where none does.
-
-    By this, not by the mean, steps are sized: a few saturated pixels need long ones, a wide even change does
-    not, and long ones make it noisy (docs/experiments.md, Rates and steps).
+    """Return the 95th percentile of the change of a channel over the changing pixels; 0 if none changes.
+     Steps are sized by this instead of the mean: a few saturated pixels need long steps, a wide even change
+    does not, and long steps make it noisy (docs/experiments.md, Rates and steps).
     """
     changes = [(target - start).abs().amax(dim=2) for target, start in zip(targets, before, strict=True)]
     changing = torch.cat([change[change > 1 / 255] for change in changes])
@@ -427,7 +434,7 @@ def most_change(targets: Sequence[Tensor], before: Sequence[Tensor]) -> float:
 
 
 def _decay(fall: float, local: int, steps: int) -> float:
-    """Factor to the rates: falls where a stage ends, so that it ends near its target."""
+    """Return the rate factor, which falls towards the end of a stage so that it ends near its target."""
     return min(1.0, 0.1 + 0.9 * (steps - local) / (steps * fall)) if fall > 0 else 1.0
 
 

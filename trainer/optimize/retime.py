@@ -1,7 +1,6 @@
-"""Recording a trajectory: which snapshots stay, and at which slider value each of them lies.
-
-The slider is visible change, not time (docs/method.md 3): equal steps of it change the pictures
-equally, over the whole slider or between two stages that are pinned.
+"""Recording of a trajectory: the choice of snapshots and their slider values.
+ The slider measures visible change, not time (docs/method.md 3). Equal slider steps change the pictures
+equally, over the whole slider or between two pinned stages.
 """
 
 from __future__ import annotations
@@ -20,23 +19,23 @@ from trainer.options import Slider
 
 from .pgs import ParameterSnapshot
 
-_MIN_GAP = 1e-4  # slider values of neighboring recordings stay apart by this
+_MIN_GAP = 1e-4  # minimum distance of neighboring slider values
 
 
 def resolve_slider(slider: Slider, strengths: Sequence[float]) -> Slider:
-    """What slider values mean, given the strengths of the stages."""
+    """Return the meaning of slider values for these stage strengths."""
     if slider != "auto":
         return slider
     return "stages" if len(strengths) > 1 else "even"
 
 
 def record(snapshots: Sequence[ParameterSnapshot], end: Tensor, strengths: Sequence[float]) -> Trajectory:
-    """Build a trajectory, its slider values still even in time.
+    """Build a trajectory with slider values even in time.
 
     Args:
         snapshots: in order, in half precision; the original is added before them
         end: the last offsets in full precision. [M,C] float32
-        strengths: what the editor was asked for, of each stage
+        strengths: strengths requested from the editor, one per stage
     """
     offsets = torch.stack([torch.zeros_like(snapshots[0].offsets), *(one.offsets for one in snapshots)])
     steps = torch.tensor([0, *(one.step for one in snapshots)])
@@ -46,17 +45,17 @@ def record(snapshots: Sequence[ParameterSnapshot], end: Tensor, strengths: Seque
 
 
 def smooth_weights(strengths: Sequence[float], known: Tensor) -> tuple[Tensor, Tensor]:
-    """The way through what is known at some strengths: these and the middles between them, and of which
-    weights of the known each consists. A middle lies on the cubic through all; but on the straight line where
-    the cubic is off that by more than a quarter of the interval's change, as no parabola is that only rises:
-    there it rings, as beside a jump.
+    """Return the given strengths with the middles between them, and the weights that interpolate each.
+     A middle lies on the cubic spline through all values. If the spline deviates from the straight line by
+    more than a quarter of the interval's change, the middle lies on the straight line: no monotone parabola
+    deviates that far, so the spline is ringing, as beside a jump.
 
     Args:
         strengths: ascending. [n]
-        known: the values there. [n,...]
+        known: values at these. [n,...]
 
     Returns:
-        Strengths [2n-1], and weights [2n-1,n] with rows of one 1 at the given strengths; float64
+        strengths [2n-1]; weights [2n-1,n], with a single 1 per row at the given strengths; float64
     """
     nodes = torch.tensor(strengths, dtype=torch.float64)
     unit = torch.eye(len(strengths), dtype=torch.float64)
@@ -72,8 +71,10 @@ def smooth_weights(strengths: Sequence[float], known: Tensor) -> tuple[Tensor, T
 
 
 def smooth_course(trajectory: Trajectory) -> Trajectory:
-    """A recording more between each two stages of an edit of colors, map and residual on the cubic through
-    them, so that half as many are solved for; any other as it is. Each lies at its strength."""
+    """Add a recording in the middle of every two stages of a color edit; return other trajectories unchanged.
+     Map and residual are interpolated by a cubic spline, so only half as many strengths are solved for.
+    Every recording lies at its strength.
+    """
     if trajectory.maps is None or len(trajectory.strengths) == 1:
         return trajectory
     known = trajectory.nodes
@@ -97,20 +98,20 @@ def retime(
     passes: int = 3,
     samples: int = 20,
 ) -> Trajectory:
-    """Give every recording the slider value at which its visible change is due.
-
-    The chord length between pictures is what counts: arc length summed over recordings would count jitter.
+    """Give every recording the slider value of its visible change.
+     Change is measured by the chord between pictures. Arc length summed over recordings would count jitter.
     Each pass samples the trajectory at even slider values, measures the chords between the samples and
-    stretches the slider accordingly. Chords are as long as the steps that a user makes: shorter ones count
-    jitter that no step shows (a recolored robot's 20 steps: least over largest .71 instead of .66; a bear's
-    scarf .93 instead of .76, its hands .85).
+    stretches the slider accordingly. Chords are as long as a user's steps. Shorter ones count jitter that
+    no step shows (a recolored robot's
+    20 steps: smallest over largest 0.71 instead of 0.66; a bear's scarf 0.93 instead of 0.76, its hands
+    0.85).
 
     Args:
         trajectory: recordings with any slider values
-        pictures: what is seen of each, any fixed shape; between two recordings it is taken to go straight
-        slider: "stages": even change between the stages' pinned strengths; "even": over the whole slider,
-            nothing pinned; "time": the optimizer's steps; "auto": see `resolve_slider`
-        passes: how often to repeat
+        pictures: pictures of each recording, any fixed shape; interpolated linearly between recordings
+        slider: "stages": even change between the stages' pinned strengths; "even": even change over the
+            whole slider, nothing pinned; "time": the optimizer's steps; "auto": see `resolve_slider`
+        passes: number of passes
         samples: chords over the whole slider; a pinned segment has its share, at least 3
     """
     slider = resolve_slider(slider, trajectory.strengths)
@@ -141,16 +142,15 @@ def retime(
 def straight_recordings(
     trajectory: Trajectory, pictures: Sequence[Tensor], detour: float = 0.15
 ) -> list[int]:
-    """All but those that are jitter: by which the way is longer than past them by more than `detour`.
-
-    The worst goes first and its neighbors are looked at anew; the stages' ends always stay. A gentle curve
-    keeps its recordings. On a recolored robot this is worth 0.7 dB in the mean against the editor's own
-    pictures between the stages, and a third of the recordings suffice.
+    """Return the recordings without jitter: those that lengthen the path by at most `detour`.
+     The worst recording is removed first, then its neighbors are measured again. The ends of the stages
+    always stay. A gentle curve keeps its recordings. On a recolored robot this gains 0.7 dB on average
+    against the editor's own pictures between the stages, with a third of the recordings.
 
     Args:
         trajectory: as recorded
-        pictures: what is seen of each recording, any fixed shape
-        detour: share of the direct way that a recording may cost, ≥ 0
+        pictures: pictures of each recording, any fixed shape
+        detour: maximum lengthening of the direct path by a recording, as a share, ≥ 0
     """
     nodes = list(range(len(trajectory)))
     fixed = {0, *trajectory.stage_ends}
@@ -173,7 +173,10 @@ def straight_recordings(
 
 
 def select_recordings(trajectory: Trajectory, nodes: Sequence[int]) -> Trajectory:
-    """These recordings alone; ascending, both ends and the stages' ends among them."""
+    """Return the trajectory with these recordings only.
+
+    They must be ascending and contain both ends and all stage ends.
+    """
     rows = torch.tensor(nodes)
     return replace(
         trajectory,
@@ -185,20 +188,23 @@ def select_recordings(trajectory: Trajectory, nodes: Sequence[int]) -> Trajector
 
 
 def _chords(pictures: Sequence[Tensor]) -> Tensor:
-    """Mean absolute difference of neighbors. [n-1] float64"""
+    """Return the mean absolute difference of neighbors. [n-1] float64"""
     pairs = pairwise(pictures)
     return torch.tensor([float((b - a).abs().mean()) for a, b in pairs], dtype=torch.float64)
 
 
 def _cumulative(lengths: Tensor) -> Tensor:
-    """0 … 1 along the lengths; even where all are 0. [n] -> [n+1]"""
+    """Return the normalized cumulative lengths, 0 to 1; evenly spaced if all lengths are 0. [n] -> [n+1]"""
     total = float(lengths.sum())
     lengths = lengths if total > 0 else torch.ones_like(lengths)
     return torch.cat([lengths.new_zeros(1), lengths.cumsum(0) / lengths.sum()])
 
 
 def _place_between(low: float, high: float, progress: Tensor) -> Tensor:
-    """Slider values from `low` to `high`, both exact, strictly ascending as `progress` does. [n] -> [n]"""
+    """Return strictly ascending slider values from `low` to exactly `high`, spaced as `progress`.
+
+    [n] -> [n]
+    """
     gaps = progress.diff()
     gaps = gaps / float(gaps.sum()) * (high - low)
     gaps = gaps.clamp_min(min(_MIN_GAP, 0.5 * (high - low) / len(gaps)))

@@ -1,4 +1,4 @@
-"""Neighbors on one surface, tied: what stands in for views where a handful of pictures is all there is."""
+"""Ties between neighbors on one surface, which replace missing views if there are few pictures."""
 
 from __future__ import annotations
 
@@ -16,62 +16,63 @@ from progdf.gaussians import Gaussians
 from trainer.regions.lift import HIDDEN, gather
 from trainer.regions.surface import covered_rows, surface_likeness
 
-_WEAKEST = 5e-3  # of all of a member's ties: most of its neighbors are hardly alike
-_STEPS = 300  # of conjugate gradients from member to member
-_EXACT = 1e-6  # what they leave
+_MIN_LIKENESS = 5e-3  # minimum share of a member's total likeness: most of its neighbors are hardly alike
+_MAX_CG_STEPS = 300  # maximum number of conjugate gradient steps; each propagates by one member
+_CG_TOLERANCE = 1e-6  # relative tolerance of the solution
 
 
 @dataclass(frozen=True)
 class Ties:
-    """What stands in for views where these are few: neighbors on one surface, whose residuals are alike."""
+    """Ties between neighbors on one surface, whose residuals should be similar."""
 
     graph: csr_matrix  # Laplacian. [M,M]
-    clear: Tensor  # members that a view shows clearly; the others follow their surface alone. [M] bool
+    clear: Tensor  # members clearly visible in some view; others follow only their surface. [M] bool
 
     def of(self, rows: Tensor) -> csr_matrix:
-        """The Laplacian with the ties among some members alone. [M] bool -> [M,M] float32"""
+        """Return the Laplacian of the ties among some members. [M] bool -> [M,M] float32"""
         among = diags(rows.double().numpy())
         links = among @ (diags(self.graph.diagonal()) - self.graph) @ among
         return csr_matrix(diags(np.asarray(links.sum(axis=1)).ravel()) - links, dtype=np.float32)
 
     def spread(self, residual: Tensor, weights: Tensor, ridge: float) -> Tensor:
-        """The residual where its members weigh enough, spread over those around them that do not.
+        """Return the residual, spread from members with enough weight to those around them.
 
-        In a descent over the views it would take far too many steps to travel around a body.
+        Descent over the views would take far too many steps to propagate around a body.
 
         Args:
             residual: [M,b,3]
-            weights: of the members, in units of a member's ties together; 0: the residual means nothing. [M]
-            ridge: the pull to 0 in the same unit
+            weights: of the members, in units of the sum of a member's ties; 0: the residual is meaningless.
+                [M]
+            ridge: pull to 0 in the same unit
         """
         weight = weights.double().numpy()[:, None]
         system = csr_matrix(self.graph + diags(weight[:, 0] + ridge))
-        known = residual.flatten(1).double().numpy()
+        values = residual.flatten(1).double().numpy()
         scale = diags(1.0 / system.diagonal())
         columns = [
-            cg(system, weight[:, 0] * column, column, rtol=_EXACT, maxiter=_STEPS, M=scale)[0]
-            for column in known.T
+            cg(system, weight[:, 0] * column, column, rtol=_CG_TOLERANCE, maxiter=_MAX_CG_STEPS, M=scale)[0]
+            for column in values.T
         ]
         return torch.from_numpy(np.stack(columns, axis=1)).to(residual).view_as(residual)
 
 
 def surface_ties(scene: Gaussians, members: Tensor, cameras: Sequence[Camera]) -> Ties:
-    """The ties of a region's members, and which of them some camera sees clearly."""
+    """Return the ties of a region's members, with the members that some camera sees clearly."""
     masks = [torch.ones(camera.height, camera.width) for camera in cameras]
     clear = gather(scene, cameras, masks).clearness[members] >= HIDDEN
     return Ties(surface_graph(scene[members], covered_rows(scene, cameras)[members]), clear)
 
 
 def surface_graph(scene: Gaussians, covered: Tensor) -> csr_matrix:
-    """The Laplacian of the graph of neighbors on one surface, each with ties of 1 on the mean. [N,N]
+    """Return the Laplacian of the ties between neighbors on one surface, with a mean sum of about 1. [N,N]
 
-    `covered`: see `covered_rows`; there are no ties through what covers these. [N] bool
+    `covered`: see `covered_rows`; ties do not pass through their covering Gaussians. [N] bool
     """
     count = len(scene)
     if count < 3:
         return csr_matrix((count, count))
     near, likeness = surface_likeness(scene, torch.arange(count), covered)
-    alike = (likeness >= _WEAKEST).numpy()
+    alike = (likeness >= _MIN_LIKENESS).numpy()
     rows = np.repeat(np.arange(count), alike.sum(axis=1))
     ties = csr_matrix((likeness.double().numpy()[alike], (rows, near.numpy()[alike])), (count, count))
     ties = 0.5 * (ties + ties.T)
