@@ -28,10 +28,10 @@ from .mixed_steps import MixedSteps, euler_scheduler
 _SIDE_MULTIPLE_PX = 32  # pixels; a multiple of every pipeline's autoencoder and patch size
 _MIN_SIDE_PX = 64  # pixels; smallest side of a painted picture
 _MAX_CPU_PARAMETERS = 2e9  # parameters; painting with a larger model on a CPU takes days
-# Bytes of activations beside the weights. FLUX.1-dev takes 36.2 GB at 1024² with 31.4 GB of weights, klein 20
-# GB with 16 GB.
-_WORKING_BYTES = 1e9
-_WORKING_BYTES_PER_MEGAPIXEL = 3e9
+# Memory beside the weights, in bytes. FLUX.1-dev takes 36.2 GB at 1024² with 31.4 GB of weights, klein 20 GB
+# with 16 GB.
+_WORKING_BYTES = 1e9  # at any size
+_WORKING_BYTES_PER_MEGAPIXEL = 3e9  # added per megapixel of the painted area
 _NF4_BYTES = 0.55  # bytes per parameter, scales included
 
 
@@ -170,6 +170,7 @@ class PipelineRequest:
 
 
 SMALL_MODEL = ADAPTERS["StableDiffusionInstructPix2PixPipeline"].model
+"""Model for machines without a large GPU."""
 
 
 def default_model() -> str:

@@ -25,6 +25,8 @@ from .base import EditorInput
 from .cache import KeptPictures, Recipe
 
 STYLES = 26
+"""Number of styles."""
+
 CALM = (14, 23, 20, 7, 12, 0)
 """Styles with the most consistent results across views, best first."""
 

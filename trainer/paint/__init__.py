@@ -1,1 +1,1 @@
-"""Paint that is finer than the Gaussians: discs on the surface, with the colors that show it."""
+"""Paint that is finer than the Gaussians: surface discs and their colors."""

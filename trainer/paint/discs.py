@@ -1,9 +1,7 @@
-"""Painted pixels as thin discs on the surface, and what lies before that surface moved behind them; and where
-other cameras see what is painted there.
-
-Splats are drawn in the order of their centers: a large Gaussian whose center is nearer than a disc covers it,
-although its own surface lies behind. Such a Gaussian is moved back along its ray and grows with the distance,
-which leaves its outline in the painted view as it is; see docs/method.md 3.
+"""Conversion of painted pixels to thin discs on the surface, and projection of paint to other cameras.
+ Splats are drawn in the order of their centers. A large Gaussian whose center is nearer than a disc covers
+it, although its own surface lies behind. Such a Gaussian is moved back along its ray and grows with the
+distance, which preserves its outline in the painted view (docs/method.md 3).
 """
 
 from __future__ import annotations
@@ -33,70 +31,77 @@ from progdf.sh import rgb_to_sh0
 Array = NDArray[np.float64]
 
 OPAQUE = 0.97
-"""What a pixel must cover of the background to have a surface."""
+"""Minimum opacity of a pixel that has a surface."""
 DISC_LOGIT = 4.0
-"""The opacity of a disc at strength 1."""
+"""Opacity logit of a disc at strength 1."""
 MIN_ALPHA = 1 / 255
-"""Below it nothing is painted."""
+"""Minimum alpha of a painted pixel."""
 GROWN = 2
-"""Pixels around the paint that discs show as they are: what is drawn behind them was moved."""
+"""Pixels; width of the border around the paint that discs reproduce unchanged.
 
-_SIDES = (16, 8, 4, 2, 1)  # of the rectangles of pixels that share a disc
-# standard deviation of a disc in its sides: of a pixel, of more
-_SPREAD = 0.28
-_MERGED_SPREAD = 0.6
-_BLUR = 0.1  # pixels²: what of the engine's blur of .3 counts as a disc's error; colors undo the rest
-_BACK = 0.5  # pixels by which discs lie deeper, as nearer neighbors cover them
-_RELIEF = 1.25  # pixels for 1 of color by which discs lie deeper than darker neighbors, see `_rise_beside`
-_THIN = 0.1  # pixels: the standard deviation across
-_STEEP = 0.3  # cosine below which a disc is turned no further, and one surface ends before another
-# pixels, of depths; how far both may be apart on one surface
-_MEDIAN = 9
-_SMOOTH = 3.0
-_SAME = 4.0
-_MIN_LIGHT = 0.005  # of a pixel, below which what a Gaussian takes before a disc does not matter
-_REACH = 4.0  # standard deviations of the light's depths, within which a Gaussian is of the surface
-_SETTLED = 1e-3  # of the reach: nearer, a row that was moved is behind but for rounding
-_CLEARED = 12  # times, at most, that what lies before the discs is moved behind them
-_MARGIN = 16  # pixels around the paint in which its surface is looked at
-_KNOTS = 20_000  # points of the surface, between which it is taken for flat where views are painted
-_IN_FRONT = 0.02  # of the depth, by which something may lie before the surface and be of it
-_NEWTON = 8  # steps of finding what a pixel shows
+The border is needed because Gaussians drawn there were moved.
+"""
+
+_CELL_SIDES_PX = (16, 8, 4, 2, 1)  # pixels; sides of the rectangles that share a disc
+_PIXEL_SPREAD = 0.28  # standard deviation of a single pixel's disc, in pixels
+_MERGED_SPREAD = 0.6  # standard deviation of a merged rectangle's disc, as a share of its sides
+# pixels²; share of the engine's blur of 0.3 that counts as a disc's error; solved colors undo the rest
+_BLUR_PX2 = 0.1
+_DEPTH_OFFSET_PX = 0.5  # pixels; discs lie deeper by this, as nearer neighbors cover them
+_RELIEF_PX = 1.25  # pixels per unit of color; discs lie deeper than darker neighbors, see `_rise_beside`
+_THICKNESS_PX = 0.1  # pixels; standard deviation across the disc
+# cosine between normal and ray; steeper discs face the camera, and steeper depth steps separate surfaces
+_MIN_COSINE = 0.3
+_MEDIAN_PX = 9  # pixels; window of the median filter of depths
+_SMOOTHING_PX = 3.0  # pixels; standard deviation of the Gaussian filter of depths
+# pixels of median slope; a smoothed depth that differs more from the median crosses an edge
+_SAME_SURFACE_PX = 4.0
+_MIN_LIGHT = 0.005  # share of a pixel; a Gaussian that takes less light from a disc is ignored
+# standard deviations of the light's depths within which a Gaussian belongs to the surface
+_REACH_DEVIATIONS = 4.0
+# share of the reach; a moved row nearer than this counts as behind, apart from rounding
+_SETTLED_SHARE = 1e-3
+_MAX_CLEARING_ROUNDS = 12  # maximum number of rounds that move occluding Gaussians behind the discs
+_MARGIN_PX = 16  # pixels; margin around the paint in which the surface is evaluated
+_MAX_GRID_POINTS = 20_000  # maximum number of surface points for projection; the surface is flat between them
+_DEPTH_TOLERANCE = 0.02  # share of the depth; points this far in front of the surface belong to it
+_NEWTON_STEPS = 8  # Newton steps per pixel of the projection
 
 
 @dataclass(frozen=True)
 class PaintedView:
-    """What one view shall show."""
+    """Target of one painted view."""
 
     camera: Camera
-    picture: Tensor  # the view as it was painted, over the run's background. [H,W,3] 0..1
-    drawn: Tensor  # what lies on the surface: colors times alpha, and alpha. [H,W,4]
+    picture: Tensor  # painted view over the run's background. [H,W,3] 0..1
+    drawn: Tensor  # paint on the surface: premultiplied colors and alpha. [H,W,4]
 
     @property
     def mask(self) -> Tensor:
-        """The pixels that were changed. [H,W] bool"""
+        """Changed pixels. [H,W] bool"""
         return self.drawn[..., 3] > MIN_ALPHA
 
 
 @dataclass(frozen=True)
 class Discs:
-    """Gaussians to add, and rows that make way."""
+    """Gaussians to add, and the rows that are moved behind them."""
 
-    added: Gaussians  # as they are at strength 1
-    moved: Tensor  # rows of the scene that lie before them, ascending. [M] int64
-    scene: Gaussians  # with these rows moved
+    added: Gaussians  # state at strength 1
+    moved: Tensor  # rows of the scene that lie in front of the discs, ascending. [M] int64
+    scene: Gaussians  # scene with these rows moved
 
 
 def place_discs(
     scene: Gaussians, paint: PaintedView, flat: float, gap: float, cleared: Gaussians | None = None
 ) -> Discs:
-    """Discs for what is painted where the picture is opaque, and a little around it.
+    """Return discs for the painted pixels of the opaque surface and a narrow border around them.
 
     Args:
         scene: the original
         paint: see `PaintedView`
-        flat: root mean square of color, 0..1, that one disc may be off in its pixels
-        gap: pixels between a disc and what is moved behind it, which is wide and seen from the sides too
+        flat: maximum root mean square color error of one disc over its pixels, 0..1
+        gap: distance in pixels between a disc and the Gaussians moved behind it, which are wide and visible
+            from the sides too
         cleared: the scene as other paint has moved it
     """
     camera = paint.camera
@@ -115,10 +120,10 @@ def place_discs(
         antialiased=scene.antialiased,
         origin=scene.origin,
     )
-    behind = surface + (_BACK + gap) * float(np.median(depths)) / float(camera.K[0, 0])
-    reach = float((behind - surface).max()) + _REACH * _thickness(scene, camera, mask)
+    behind = surface + (_DEPTH_OFFSET_PX + gap) * float(np.median(depths)) / float(camera.K[0, 0])
+    reach = float((behind - surface).max()) + _REACH_DEVIATIONS * _thickness(scene, camera, mask)
     moved = torch.zeros(len(scene), dtype=torch.bool)
-    for _ in range(_CLEARED):  # what stood before others hid them
+    for _ in range(_MAX_CLEARING_ROUNDS):  # Gaussians behind the moved ones become visible
         rows, factors = _rows_before(cleared, camera, behind, mask, reach, pieces)
         if not len(rows):
             break
@@ -128,51 +133,53 @@ def place_discs(
 
 
 def _paint_surface(seen: Depth, camera: Camera) -> tuple[Array, NDArray[np.bool_], NDArray[np.int32]]:
-    """Depths on which paint lies, where the surface goes on to its neighbors, and its pieces. [H,W] each
-
-    It goes on where its depth changes less from pixel to pixel than a disc is turned. What is blended over a
-    rim lies on one side of it, not between.
+    """Return depths for paint, True where the surface is continuous, and the index of its pieces. [H,W] each
+     The surface is continuous where its depth changes less from pixel to pixel than that of the steepest
+    disc. Depths blended across an edge are replaced by those of one side.
     """
     surface = smooth_depth(seen.depth.numpy(), (seen.alpha > OPAQUE).numpy())
-    steepest = surface / float(camera.K[0, 0]) * (1 - _STEEP**2) ** 0.5 / _STEEP
+    steepest = surface / float(camera.K[0, 0]) * (1 - _MIN_COSINE**2) ** 0.5 / _MIN_COSINE
     down, right = (np.abs(np.diff(surface, axis=axis, append=surface.take([-1], axis))) for axis in (0, 1))
-    even = np.maximum(down, right) < steepest
-    away, nearest = ndimage.distance_transform_edt(~even, return_indices=True)
-    surface = np.where(away <= _MEDIAN, surface[tuple(nearest)], surface)
-    return surface, even, ndimage.label(even)[0][tuple(nearest)]
+    is_continuous = np.maximum(down, right) < steepest
+    distance, nearest = ndimage.distance_transform_edt(~is_continuous, return_indices=True)
+    surface = np.where(distance <= _MEDIAN_PX, surface[tuple(nearest)], surface)
+    return surface, is_continuous, ndimage.label(is_continuous)[0][tuple(nearest)]
 
 
 def smooth_depth(depth: NDArray[np.float32], opaque: NDArray[np.bool_]) -> Array:
-    """Depths without noise, edges kept; where there is no surface, those of the nearest. [H,W] each"""
+    """Return denoised depths with edges preserved.
+
+    Pixels without a surface take the nearest depth. [H,W] each
+    """
     if not opaque.any():
         return depth.astype(np.float64)
     nearest = ndimage.distance_transform_edt(~opaque, return_distances=False, return_indices=True)
     filled = depth.astype(np.float64)[tuple(nearest)]
-    median = ndimage.median_filter(filled, _MEDIAN)
-    smooth = ndimage.gaussian_filter(median, _SMOOTH)
+    median = ndimage.median_filter(filled, _MEDIAN_PX)
+    smooth = ndimage.gaussian_filter(median, _SMOOTHING_PX)
     slope = np.hypot(*np.gradient(median))
-    near = np.abs(smooth - median) <= _SAME * np.median(slope[opaque]) + 1e-9
-    return cast(Array, np.where(near, smooth, median))
+    is_flat = np.abs(smooth - median) <= _SAME_SURFACE_PX * np.median(slope[opaque]) + 1e-9
+    return cast(Array, np.where(is_flat, smooth, median))
 
 
 def merge_pixels(
     picture: NDArray[np.float32], mask: NDArray[np.bool_], flat: float, even: NDArray[np.bool_]
 ) -> Array:
-    """Pixels by rectangles that one disc shows well enough, the largest first.
+    """Merge pixels into rectangles that one disc reproduces well enough, the largest first.
 
-    A disc is round and reaches over its rectangle: what it would be off is counted as far as it reaches.
+    A disc is round and reaches beyond its rectangle. Its error is counted over that whole area.
 
     Args:
         picture: [H,W,3]
-        mask: the pixels to be covered, each once. [H,W]
-        flat: root mean square of color that it may be off, over the rectangle's pixels
+        mask: pixels to cover, each once. [H,W]
+        flat: maximum root mean square color error over the rectangle's pixels
         even: pixels that may share a disc with neighbors. [H,W]
 
     Returns:
-        Column and row of the centers, and both sides, in pixels. [B,4]
+        column and row of the centers and both sides, in pixels. [B,4]
     """
     rows, columns = np.nonzero(mask)
-    reach = 3 * _SIDES[0]
+    reach = 3 * _CELL_SIDES_PX[0]
     top = max(0, rows.min() - reach)
     left = max(0, columns.min() - reach)
     window = slice(top, rows.max() + reach + 1), slice(left, columns.max() + reach + 1)
@@ -195,13 +202,13 @@ def merge_pixels(
 
 
 def _shapes() -> Iterator[tuple[int, int]]:
-    """Height and width of rectangles, the largest and squarest first."""
-    shapes = ((a, b) for a in _SIDES for b in _SIDES)
+    """Yield height and width of rectangles, the largest and squarest first."""
+    shapes = ((a, b) for a in _CELL_SIDES_PX for b in _CELL_SIDES_PX)
     yield from sorted(shapes, key=lambda s: (-s[0] * s[1], abs(s[0] - s[1]), s))
 
 
 def _box_means(values: Array, height: int, width: int) -> Array:
-    """Means of the rectangles that begin at each pixel; 0 beyond the rim. [H,W,C] -> [H,W,C]"""
+    """Return the means of the rectangles that begin at each pixel; 0 beyond the border. [H,W,C] -> [H,W,C]"""
     rows, columns = values.shape[:2]
     sums = np.pad(values, ((1, height), (1, width), (0, 0))).cumsum(axis=0).cumsum(axis=1)
     low = sums[:rows]
@@ -212,10 +219,12 @@ def _box_means(values: Array, height: int, width: int) -> Array:
 
 
 def _disc_error(image: Array, height: int, width: int) -> Array:
-    """Mean square of what discs of the mean colors of the rectangles that begin at each pixel are off there.
-    [H,W,3] -> [H,W]"""
+    """Return the mean squared error of discs with the mean color of the rectangles that begin at each pixel.
+
+    [H,W,3] -> [H,W]
+    """
     spread = [
-        ((_MERGED_SPREAD * side if side > 1 else _SPREAD) ** 2 + _BLUR) ** 0.5 / 2**0.5
+        ((_MERGED_SPREAD * side if side > 1 else _PIXEL_SPREAD) ** 2 + _BLUR_PX2) ** 0.5 / 2**0.5
         for side in (height, width)
     ]
     rows, columns = image.shape[:2]
@@ -232,13 +241,13 @@ def _disc_error(image: Array, height: int, width: int) -> Array:
         slice((side - 1) // 2, (side - 1) // 2 + size) for side, size in ((height, rows), (width, columns))
     )
     seen = 0.25 * (weighed[y, x] + weighed[above, x] + weighed[y, before] + weighed[above, before])
-    # the blur's weights add up to 1, a disc's to 2π times both standard deviations
+    # the weights of the blur add up to 1, those of a disc to 2π times both standard deviations
     area = 2 * np.pi * spread[0] * spread[1] / (height * width)
     return cast(Array, area * (seen[..., 3] + (color * (color - 2 * seen[..., :3])).sum(axis=2)) / 3)
 
 
 def _discs(camera: Camera, cells: Array, surface: Array, picture: Tensor) -> tuple[Gaussians, Array]:
-    """Discs that fill cells of the picture, on its surface, and their depths. [B,4], [H,W], [H,W,3]"""
+    """Return discs that fill cells of the picture on its surface, and their depths. [B,4], [H,W], [H,W,3]"""
     x, y, width, height = cells.T
     K = camera.K.double().numpy()
     c2w = camera.c2w.double().numpy()
@@ -252,19 +261,19 @@ def _discs(camera: Camera, cells: Array, surface: Array, picture: Tensor) -> tup
     rays = np.stack([*((np.stack([x, y], 1) - middle) / focal).T, np.ones_like(x)], axis=1)
     depth = sample(surface)
     pixel = depth / focal[0]
-    placed = depth + (_BACK + _RELIEF * _rise_beside(cells, picture)) * pixel
+    placed = depth + (_DEPTH_OFFSET_PX + _RELIEF_PX * _rise_beside(cells, picture)) * pixel
     right, down = (_step(rays, depth, slope, axis, focal) for axis, slope in enumerate(slopes))
     normal = np.cross(right, down)
     length = np.linalg.norm(rays, axis=1, keepdims=True)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    steep = np.abs((normal * rays).sum(axis=1, keepdims=True)) < _STEEP * length
-    normal = np.where(steep, rays / length, normal)
-    sides = []  # the steps in the disc's plane that are one cell in the picture
+    is_steep = np.abs((normal * rays).sum(axis=1, keepdims=True)) < _MIN_COSINE * length
+    normal = np.where(is_steep, rays / length, normal)
+    sides = []  # steps in the disc's plane that span one cell in the picture
     for axis, side in enumerate((width, height)):
         step = np.zeros_like(rays)
         step[:, axis] = placed / focal[axis]
         step -= rays * ((normal * step).sum(axis=1) / (normal * rays).sum(axis=1))[:, None]
-        sides.append(step * (side * np.where(side > 1, _MERGED_SPREAD, _SPREAD))[:, None])
+        sides.append(step * (side * np.where(side > 1, _MERGED_SPREAD, _PIXEL_SPREAD))[:, None])
     axes, scales, _ = np.linalg.svd(np.stack(sides, axis=2), full_matrices=True)
     axes[:, :, 2] *= np.linalg.det(axes)[:, None]
     means = (rays * placed[:, None]) @ c2w[:3, :3].T + c2w[:3, 3]
@@ -272,7 +281,7 @@ def _discs(camera: Camera, cells: Array, surface: Array, picture: Tensor) -> tup
     discs = Gaussians(
         torch.from_numpy(means).float(),
         matrix_quats(torch.from_numpy(c2w[:3, :3] @ axes)).float(),
-        torch.from_numpy(np.log(np.concatenate([scales, _THIN * pixel[:, None]], axis=1))).float(),
+        torch.from_numpy(np.log(np.concatenate([scales, _THICKNESS_PX * pixel[:, None]], axis=1))).float(),
         torch.full((len(x),), DISC_LOGIT),
         rgb_to_sh0(color),
         torch.zeros(len(x), 0, 3),
@@ -281,10 +290,12 @@ def _discs(camera: Camera, cells: Array, surface: Array, picture: Tensor) -> tup
 
 
 def _rise_beside(cells: Array, picture: Tensor) -> Array:
-    """By how much cells are brighter than the darkest pixel beside them, at most over their own. [B] 0..1
+    """Return the brightness of cells above the darkest adjacent pixel, the maximum over their pixels.
 
-    The engine draws no disc smaller than about a pixel. Where one color ends, what the nearer disc adds to
-    its neighbor can be taken out of that one's own color only if it is the darker: none is below black.
+    [B] 0..1
+     The engine draws no disc smaller than about one pixel. At a color edge, light that the nearer disc adds
+    to its neighbor can be subtracted from the neighbor's own color only if the nearer disc is the darker
+    one, as no color is below black.
     """
     brightness = picture.mean(dim=2).double().numpy()
     rise = brightness - ndimage.minimum_filter(brightness, 3)
@@ -294,7 +305,7 @@ def _rise_beside(cells: Array, picture: Tensor) -> Array:
 
 
 def _step(rays: Array, depth: Array, slope: Array, axis: int, focal: Array) -> Array:
-    """What a step of one pixel is on the surface. [B,3]"""
+    """Return the step of one pixel on the surface. [B,3]"""
     step = rays * slope[:, None]
     step[:, axis] += depth / focal[axis]
     return step
@@ -308,20 +319,20 @@ def _rows_before(
     reach: float,
     pieces: NDArray[np.int32],
 ) -> tuple[Tensor, Tensor]:
-    """Rows of the surface whose centers lie before the depths `behind` [H,W] of some pixels.
-
-    What lies more than `reach` before them, world units, hides the paint as it hides the surface; so does
-    what shows most in another of the `pieces` of the surface, [H,W], though it reaches over a rim.
+    """Return surface rows with centers in front of the depths `behind` [H,W], and their depth factors.
+     Gaussians more than `reach` in front, world units, occlude the paint as they occlude the surface, and
+    stay. So do Gaussians with most of their weight in another of the `pieces` [H,W] of the surface,
+    although they extend across an edge.
 
     Returns:
-        Their indices, and by what their depth grows. [M] int64, [M]
+        indices [M] int64; factors by which their depths grow [M]
     """
     rows, columns = np.nonzero(mask)
     box = (
-        max(0, int(columns.min()) - _MARGIN),
-        max(0, int(rows.min()) - _MARGIN),
-        min(camera.width, int(columns.max()) + _MARGIN + 1),
-        min(camera.height, int(rows.max()) + _MARGIN + 1),
+        max(0, int(columns.min()) - _MARGIN_PX),
+        max(0, int(rows.min()) - _MARGIN_PX),
+        min(camera.width, int(columns.max()) + _MARGIN_PX + 1),
+        min(camera.height, int(rows.max()) + _MARGIN_PX + 1),
     )
     listed = color_map(activate(scene), camera, box, torch.arange(len(scene)))
     if not isinstance(listed, ListedWeights):
@@ -333,11 +344,13 @@ def _rows_before(
     pixel = np.repeat(runs.firsts.astype(np.int64), runs.counts) + runs.pixels
     window = slice(box[1], box[3]), slice(box[0], box[2])
     piece = pieces[window].reshape(-1)[pixel]
-    short = behind[window].reshape(-1)[pixel] - depths[owner]
-    before = mask[window].reshape(-1)[pixel] & (short > _SETTLED * reach) & (runs.weights > _MIN_LIGHT)
-    before &= (short <= reach) & (piece == _main_pieces(owner, piece, runs.weights, len(scene))[owner])
+    missing = behind[window].reshape(-1)[pixel] - depths[owner]
+    is_before = (
+        mask[window].reshape(-1)[pixel] & (missing > _SETTLED_SHARE * reach) & (runs.weights > _MIN_LIGHT)
+    )
+    is_before &= (missing <= reach) & (piece == _main_pieces(owner, piece, runs.weights, len(scene))[owner])
     needed = np.zeros(len(scene))
-    np.maximum.at(needed, owner[before], short[before])
+    np.maximum.at(needed, owner[is_before], missing[is_before])
     moved = np.nonzero(needed)[0]
     return torch.from_numpy(moved), torch.from_numpy(1.0 + needed[moved] / depths[moved])
 
@@ -345,13 +358,13 @@ def _rows_before(
 def _main_pieces(
     owner: NDArray[np.int32], piece: NDArray[np.int32], weights: NDArray[np.float32], count: int
 ) -> NDArray[np.int64]:
-    """The piece of the surface in which each row shows most. -> [N]"""
+    """Return the piece of the surface in which each row has most weight. -> [N]"""
     size = (count, int(piece.max()) + 1)
     return cast(NDArray[np.int64], csr_array((weights, (owner, piece)), shape=size).argmax(axis=1))
 
 
 def _thickness(scene: Gaussians, camera: Camera, mask: NDArray[np.bool_]) -> float:
-    """Typical standard deviation of the depths at which light is taken, world units, a pixel at least."""
+    """Return the typical standard deviation of the depths of the light, world units, at least one pixel."""
     axis = camera.viewmat[2].double()
     depths = scene.means.double() @ axis[:3] + axis[3]
     z = (depths - depths.median()).float()
@@ -363,7 +376,7 @@ def _thickness(scene: Gaussians, camera: Camera, mask: NDArray[np.bool_]) -> flo
 
 
 def _move_back(scene: Gaussians, camera: Camera, rows: Tensor, factors: Tensor) -> Gaussians:
-    """The scene with rows scaled about the camera's center, which leaves their outlines as they are."""
+    """Return the scene with rows scaled about the camera's center, which preserves their outlines."""
     position = camera.position.double()
     means = position + factors[:, None] * (scene.means[rows].double() - position)
     log_scales = scene.log_scales[rows].double() + factors.log()[:, None]
@@ -375,57 +388,62 @@ def _move_back(scene: Gaussians, camera: Camera, rows: Tensor, factors: Tensor) 
 
 
 def faint(added: Gaussians) -> Gaussians:
-    """Added rows as they are at strength 0."""
+    """Return added rows as they are at strength 0."""
     return replace(added, logit_opacities=torch.full((len(added),), ADDED_LOGIT))
 
 
 def sample_image(image: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """Bilinear; 0 outside. [H,W,C], pixels [h,w] each -> [h,w,C]"""
+    """Sample an image bilinearly, 0 outside. [H,W,C], pixels [h,w] each -> [h,w,C]"""
     grid = torch.stack([2 * x / image.shape[1] - 1, 2 * y / image.shape[0] - 1], dim=-1)[None].float()
     return grid_sample(image.permute(2, 0, 1)[None], grid, align_corners=False)[0].permute(1, 2, 0)
 
 
 def lay_on(image: Tensor, drawn: Tensor) -> Tensor:
-    """Colors times alpha, and alpha, over a picture. [H,W,3], [H,W,4] -> [H,W,3]"""
+    """Composite premultiplied colors and alpha over a picture. [H,W,3], [H,W,4] -> [H,W,3]"""
     return image * (1.0 - drawn[..., 3:]) + drawn[..., :3]
 
 
 def project_paint(scene: Gaussians, own: Camera, drawn: Tensor, camera: Camera) -> Tensor:
-    """What is drawn on the surface that one camera sees, as another sees it.
+    """Project paint from the surface that one camera sees to another camera.
 
     Args:
-        scene: whose surface
-        own: the camera in whose picture it was drawn
-        drawn: colors times alpha, and alpha. [H,W,4]
-        camera: the other
+        scene: scene with the surface
+        own: camera of the painted picture
+        drawn: premultiplied colors and alpha. [H,W,4]
+        camera: the other camera
 
     Returns:
-        Colors times alpha, and alpha, of the other camera's size. [h,w,4]
+        premultiplied colors and alpha at the other camera's size. [h,w,4]
     """
     result = torch.zeros(camera.height, camera.width, 4)
     rows, columns = (drawn[..., 3] > 0).nonzero().T.numpy()
     if not len(rows):
         return result
-    left = max(0, columns.min() - _MARGIN)
-    top = max(0, rows.min() - _MARGIN)
-    window = left, top, min(own.width, columns.max() + _MARGIN + 1), min(own.height, rows.max() + _MARGIN + 1)
+    left = max(0, columns.min() - _MARGIN_PX)
+    top = max(0, rows.min() - _MARGIN_PX)
+    window = (
+        left,
+        top,
+        min(own.width, columns.max() + _MARGIN_PX + 1),
+        min(own.height, rows.max() + _MARGIN_PX + 1),
+    )
     seen = render_depth(scene, own, crop=window)
     surface, _, _ = _paint_surface(seen, own)
-    step = max(1, round(math.sqrt(surface.size / _KNOTS)))
+    step = max(1, round(math.sqrt(surface.size / _MAX_GRID_POINTS)))
     y, x = np.mgrid[: surface.shape[0] : step, : surface.shape[1] : step]
     K = own.K.double().numpy()
-    there = camera.K.double().numpy()
+    other_K = camera.K.double().numpy()
     y, x, z = y + top + 0.5, x + left + 0.5, surface[y, x]
     rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1)
-    turn = (camera.viewmat.double() @ torch.linalg.inv(own.viewmat.double())).numpy()
-    points = (rays * z[..., None]) @ turn[:3, :3].T + turn[:3, 3]
+    to_other = (camera.viewmat.double() @ torch.linalg.inv(own.viewmat.double())).numpy()
+    points = (rays * z[..., None]) @ to_other[:3, :3].T + to_other[:3, 3]
     front = points[..., 2] > camera.near
     depth = np.where(front, points[..., 2], 1.0)
-    u, v = (points[..., i] / depth * there[i, i] + there[i, 2] for i in (0, 1))
+    u, v = (points[..., i] / depth * other_K[i, i] + other_K[i, 2] for i in (0, 1))
     if min(surface[::step, ::step].shape) < 2:
         return result
     (uy, ux), (vy, vx) = np.gradient(u), np.gradient(v)
-    front &= ux * vy - uy * vx > 0  # what turns away is hidden by what does not
+    front &= ux * vy - uy * vx > 0  # surfaces that face away are hidden by those that face the camera
     if front.sum() < 3 or np.ptp(u[front]) < 1e-6 or np.ptp(v[front]) < 1e-6:
         return result
     box = [int(max(0.0, edge.min() - 1)) for edge in (u[front], v[front])]
@@ -436,44 +454,46 @@ def project_paint(scene: Gaussians, own: Camera, drawn: Tensor, camera: Camera) 
         return result
     rows, columns = np.mgrid[box[1] : box[3], box[0] : box[2]] + 0.5
     maps = np.stack([u, v, ux, uy, vx, vy, x, y, depth, front.astype(float)])
-    found = torch.from_numpy(_invert(maps, columns, rows))
+    positions = torch.from_numpy(_invert(maps, columns, rows))
     front_depth = render_depth(scene, camera, crop=(box[0], box[1], box[2], box[3])).depth
-    visible = found[..., 2] <= front_depth * (1.0 + _IN_FRONT)
-    laid = sample_image(drawn, found[..., 0], found[..., 1])
-    result[box[1] : box[3], box[0] : box[2]] = laid * visible[..., None]
+    visible = positions[..., 2] <= front_depth * (1.0 + _DEPTH_TOLERANCE)
+    projected = sample_image(drawn, positions[..., 0], positions[..., 1])
+    result[box[1] : box[3], box[0] : box[2]] = projected * visible[..., None]
     return result
 
 
 def _invert(maps: Array, columns: Array, rows: Array) -> Array:
-    """What a grid of points shows at some pixels, by Newton's steps over the grid; far away where nothing is.
+    """Invert a grid of projected points at some pixels by Newton steps; −1e6 in pixels without a point.
 
     Args:
-        maps: where each point is seen, u and v; by how much these grow to the right and down: ux, uy, vx, vy;
-            three values and whether it counts. [10,I,J]
-        columns, rows: the pixels. [h,w] each
+        maps: projection u and v of each point; their derivatives to the right and down, ux, uy, vx, vy;
+            three values; and a flag for valid points. [10,I,J]
+        columns, rows: pixels. [h,w] each
 
     Returns:
-        [h,w,3]
+        the three values at the pixels. [h,w,3]
     """
     u = maps[0]
     v = maps[1]
     front = maps[-1] > 0
     size = np.array(u.shape)[:, None, None]
-    known = np.stack([u[front], v[front], np.ones(front.sum())], axis=1)
-    start = np.linalg.lstsq(known, np.stack(np.nonzero(front), axis=1).astype(float), rcond=None)[0]
-    at = np.moveaxis(np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ start, -1, 0)
-    for _ in range(_NEWTON):
-        at = at.clip(-0.5, size - 0.5)
-        u, v, ux, uy, vx, vy = (ndimage.map_coordinates(one, at, order=1, mode="nearest") for one in maps[:6])
+    projected = np.stack([u[front], v[front], np.ones(front.sum())], axis=1)
+    start = np.linalg.lstsq(projected, np.stack(np.nonzero(front), axis=1).astype(float), rcond=None)[0]
+    position = np.moveaxis(np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ start, -1, 0)
+    for _ in range(_NEWTON_STEPS):
+        position = position.clip(-0.5, size - 0.5)
+        u, v, ux, uy, vx, vy = (
+            ndimage.map_coordinates(one, position, order=1, mode="nearest") for one in maps[:6]
+        )
         right = columns - u
         down = rows - v
         area = ux * vy - uy * vx
         area = np.where(np.abs(area) > 1e-9, area, 1e-9)
         step = np.stack([ux * down - vx * right, vy * right - uy * down]) / area
-        at = at + step.clip(-0.1 * size, 0.1 * size)
-    at = at.clip(-0.5, size - 0.5)
-    values = np.stack([ndimage.map_coordinates(one, at, order=1, mode="nearest") for one in maps])
-    missed = np.hypot(values[0] - columns, values[1] - rows) > 0.5
+        position = position + step.clip(-0.1 * size, 0.1 * size)
+    position = position.clip(-0.5, size - 0.5)
+    values = np.stack([ndimage.map_coordinates(one, position, order=1, mode="nearest") for one in maps])
+    is_outside = np.hypot(values[0] - columns, values[1] - rows) > 0.5
     return cast(
-        Array, np.where((missed | (values[-1] < 0.5))[..., None], -1e6, np.moveaxis(values[6:9], 0, -1))
+        Array, np.where((is_outside | (values[-1] < 0.5))[..., None], -1e6, np.moveaxis(values[6:9], 0, -1))
     )

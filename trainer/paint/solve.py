@@ -1,7 +1,7 @@
-"""The colors by which discs, and the rows that made way for them, show painted pictures.
-
-Least squares: a view is linear in the colors that are drawn in it (`trainer.optimize.color_views`). What lies
-before a disc takes light, what shines through it adds some; both are in the weights.
+"""Solver for the colors of discs, and of the rows moved behind them, that reproduce painted pictures.
+ A view is linear in the colors that are drawn in it (`trainer.optimize.color_views`), so the colors are a
+least-squares solution. Gaussians in front of a disc take light and those behind it add light. The weights
+account for both.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from trainer.views.view import BACKGROUND, crop, seen_colors
 
 from .discs import PaintedView
 
-_STEPS = 40  # of conjugate gradients
-_ROUNDS = 3  # between them, colors below black are set to it
-_HELD = 0.05  # of a pixel: how much a row of the scene holds on to its own color
-_RIDGE = 0.02  # the same of a disc, on what was painted there
-_MIN_BOX = 32  # pixels around the paint in which its colors are solved for
+_CG_STEPS = 40  # conjugate gradient steps per round
+_CLAMP_ROUNDS = 3  # rounds; between them, colors below black are set to black
+_SCENE_RIDGE = 0.05  # in units of a pixel; ridge that holds a row of the scene to its own color
+_DISC_RIDGE = 0.02  # in units of a pixel; ridge that holds a disc to the painted color
+_MIN_MARGIN_PX = 32  # pixels; minimum margin around the paint in which colors are solved for
 
 
 def box_of(painted: Tensor, camera: Camera) -> Crop:
-    """The window around the paint in which moved rows may show: half as large again on each side."""
+    """Return the paint's window with half its size added on each side, where moved rows may be visible."""
     rows, columns = painted.nonzero().T
     (top, bottom), (left, right) = ((int(axis.min()), int(axis.max()) + 1) for axis in (rows, columns))
-    margin = _MIN_BOX + max(bottom - top, right - left) // 2
+    margin = _MIN_MARGIN_PX + max(bottom - top, right - left) // 2
     return (
         max(0, left - margin),
         max(0, top - margin),
@@ -45,13 +45,13 @@ def box_of(painted: Tensor, camera: Camera) -> Crop:
 def solve_colors(
     scene: Gaussians, rows: Tensor, added: Gaussians, paints: Sequence[PaintedView]
 ) -> tuple[Gaussians, Gaussians]:
-    """Scene and added rows with the colors whose pictures come closest to what was painted, all together.
+    """Return the scene and the added rows with the colors that reproduce all painted pictures best.
 
     Args:
-        scene: with the moved rows where they go
-        rows: of the scene, which may change beside the added ones. [M] int64
+        scene: with the moved rows at their new positions
+        rows: rows of the scene that may change beside the added ones. [M] int64
         added: see `Discs`
-        paints: of one thing
+        paints: painted views of one object
     """
     joined = concatenate([scene, added])
     count = len(rows)
@@ -63,13 +63,13 @@ def solve_colors(
     for paint in paints:
         box = box_of(paint.mask, paint.camera)
         colors = seen_colors(joined, paint.camera)
-        shown = render(joined, paint.camera, BACKGROUND, colors=colors, crop=box).image
+        rendered = render(joined, paint.camera, BACKGROUND, colors=colors, crop=box).image
         maps.append(color_map(activated, paint.camera, box, free))
-        missing.append(crop(paint.picture, box) - shown)
+        missing.append(crop(paint.picture, box) - rendered)
         lowest = torch.maximum(lowest, -colors[free])
-    held = torch.full((len(free), 1), _RIDGE)
-    held[:count] = _HELD
-    change = _least_squares(maps, missing, lowest, held) / C0
+    ridge = torch.full((len(free), 1), _DISC_RIDGE)
+    ridge[:count] = _SCENE_RIDGE
+    change = _least_squares(maps, missing, lowest, ridge) / C0
     return (
         replace(scene, sh0=scene.sh0.index_add(0, rows, change[:count])),
         replace(added, sh0=added.sh0 + change[count:]),
@@ -80,7 +80,10 @@ def solve_colors(
 def _least_squares(
     maps: Sequence[ColorMap], targets: Sequence[Tensor], lowest: Tensor, held: Tensor
 ) -> Tensor:
-    """Changes of color, not below `lowest`, by conjugate gradients. [h,w,3] each, [M,3], [M,1] -> [M,3]"""
+    """Solve for color changes, at least `lowest`, by conjugate gradients.
+
+    [h,w,3] each, [M,3], [M,1] -> [M,3]
+    """
 
     def gradient(images: Sequence[Tensor]) -> Tensor:
         parts = (weights.gradient(image) for weights, image in zip(maps, images, strict=True))
@@ -89,23 +92,23 @@ def _least_squares(
     def normal(colors: Tensor) -> Tensor:
         return gradient([weights.picture(colors) for weights in maps]) + held * colors
 
-    right = gradient(targets)
+    gradient_of_targets = gradient(targets)
     diagonal = normal(torch.ones_like(lowest))
     colors = torch.zeros_like(lowest)
-    for _ in range(_ROUNDS):
-        residual = right - normal(colors)
+    for _ in range(_CLAMP_ROUNDS):
+        residual = gradient_of_targets - normal(colors)
         free = ~((colors <= lowest) & (residual < 0))
         residual = residual * free
         direction = residual / diagonal
         power = (residual * direction).sum(dim=0)
-        for _ in range(_STEPS):
+        for _ in range(_CG_STEPS):
             image = normal(direction) * free
-            length = power / (direction * image).sum(dim=0).clamp_min(1e-20)
-            colors = colors + length * direction
-            residual = residual - length * image
+            step_length = power / (direction * image).sum(dim=0).clamp_min(1e-20)
+            colors = colors + step_length * direction
+            residual = residual - step_length * image
             scaled = residual / diagonal
-            now = (residual * scaled).sum(dim=0)
-            direction = scaled + now / power.clamp_min(1e-30) * direction
-            power = now
+            next_power = (residual * scaled).sum(dim=0)
+            direction = scaled + next_power / power.clamp_min(1e-30) * direction
+            power = next_power
         colors = colors.maximum(lowest)
     return colors
