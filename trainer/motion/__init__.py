@@ -1,1 +1,1 @@
-"""How an edit has moved a region, found from its views: parts as wholes, or bent by control points."""
+"""Motion of a region by an edit, found from its views: by whole parts, or bent by control points."""

@@ -1,8 +1,7 @@
-"""The parts of a region: which of its Gaussians hang together, and the search for where an edit takes them.
-
-Gaussians that lie within a few spacings of each other are neighbors, and whatever a chain of neighbors joins
-is one part. Seven numbers each are fitted to the edited views, coarse to fine: a part that does not overlap
-its new place at all is drawn there by what both are blurred to.
+"""Connected parts of a region, and the search for their motion.
+ Gaussians within a few spacings of each other are neighbors, and each chain of neighbors is one part. Seven
+numbers per part are fitted to the edited views, coarse to fine. Blurred pictures attract a part that does
+not overlap its new position at all.
 """
 
 from __future__ import annotations
@@ -21,43 +20,45 @@ from progdf.scene.point_tree import PointTree
 from progdf.similarity import Motion, Parts, move_rows
 from trainer.views.crops import CropScene
 
-_NEIGHBOR = 8  # a Gaussian's spacing is the distance to its eighth neighbor: the first can be a twin
-_SAMPLES = 512  # Gaussians whose spacing is measured
-_REACH = 2.5  # spacings that a gap must have to part what it parts
-_CELLS = 2.0  # cells per reach; then any two Gaussians of a cell are neighbors (√3 / 2 < 1)
-_BLURS = (9, 21)  # pixels
-_WIDE_BLURS = (0.4, 0.2, 0.1)  # of the box's longer side: a part feels a place three times its size away
-_WIDE = 0.4  # share of a wide search's steps that see no more than those, shift thrice as fast, never turn
-_RATES = (0.06, 0.03, 0.03)  # a step of shift in part sizes, of log-scale, of turn in radians
-_MISSED = 0.25  # share of the distance that is left where the near search is taken to have lost its way
-_MOVING = ("means", "log_scales", "quats")
-_SETTLED = 0.25  # share of the steps, the last, over which the numbers are averaged
+_NEIGHBOR_RANK = 8  # neighbor whose distance is a Gaussian's spacing: the first neighbor can be a duplicate
+_MAX_SAMPLES = 512  # maximum number of Gaussians whose spacing is measured
+_REACH_IN_SPACINGS = 2.5  # spacings; wider gaps separate parts
+_CELLS_PER_REACH = 2.0  # cells per reach, so that any two Gaussians of a cell are neighbors (√3 / 2 < 1)
+_BLURS_PX = (9, 21)  # pixels; box blurs of the near search
+# shares of the box's longer side; attract a part over three times its size
+_WIDE_BLUR_SHARES = (0.4, 0.2, 0.1)
+# share of a wide search's steps with wide blurs only, shifts three times as fast and no rotation
+_WIDE_STEP_SHARE = 0.4
+_RATES = (0.06, 0.03, 0.03)  # step of shift in part sizes, of log-scale, of rotation in radians
+# share of the initial distance that may remain before the near search counts as failed
+_FAILED_SEARCH_SHARE = 0.25
+_MOVING_ATTRIBUTES = ("means", "log_scales", "quats")
+_AVERAGED_STEP_SHARE = 0.25  # final share of the steps over which the numbers are averaged
 
 OnStep = Callable[[int, float], None]
-"""Called after every step: steps done, loss."""
+"""Callback after every step: steps done, loss."""
 
 
 def connected_parts(means: Tensor, least: float = 0.02) -> Tensor:
-    """Which part each Gaussian belongs to.
-
-    Time and memory grow with the number of Gaussians: they are gathered in cells first, and cells are
-    neighbors where their centroids are within reach, so a gap counts exactly to within half its width.
+    """Return the part of each Gaussian.
+     Time and memory grow with the number of Gaussians, so these are grouped into cells first. Cells are
+    neighbors if their centroids are within reach, so the width of a gap is exact only to half a reach.
 
     Args:
         means: centers of the region's members. [M,3]
-        least: a part with a smaller share of the members, or fewer than 8, is not a part of its own: stray
-            Gaussians go with the nearest part that is
+        least: minimum share of the members, and at least 8 of them, for a part of its own; strays join the
+            nearest such part
 
     Returns:
-        Part of each, 0 the one with most members. [M] int64; the same for the same means
+        part of each, 0 the one with most members. [M] int64; deterministic
     """
     if len(means) == 0:
         return torch.zeros(0, dtype=torch.int64)
     points = means.detach().double()
-    reach = _REACH * _spacing(points)
+    reach = _REACH_IN_SPACINGS * _spacing(points)
     if reach <= 0:
         return torch.zeros(len(points), dtype=torch.int64)
-    cells = ((points - points.amin(dim=0)) / (reach / _CELLS)).floor().long()
+    cells = ((points - points.amin(dim=0)) / (reach / _CELLS_PER_REACH)).floor().long()
     occupied, cell_of = torch.unique(cells, dim=0, return_inverse=True)
     counts = torch.bincount(cell_of, minlength=len(occupied))
     sums = torch.zeros(len(occupied), 3, dtype=torch.float64)
@@ -68,9 +69,12 @@ def connected_parts(means: Tensor, least: float = 0.02) -> Tensor:
 
 
 def _spacing(points: Tensor) -> float:
-    """Median distance to the eighth neighbor (of few points a nearer one), of up to 512 of the points."""
-    rows = torch.arange(len(points))[:: max(1, len(points) // _SAMPLES)][:_SAMPLES]
-    nearest = min(_NEIGHBOR, max(2, len(points) // 8), len(points) - 1)
+    """Return the median distance to the eighth neighbor of up to 512 of the points.
+
+    With few points, a nearer neighbor is used.
+    """
+    rows = torch.arange(len(points))[:: max(1, len(points) // _MAX_SAMPLES)][:_MAX_SAMPLES]
+    nearest = min(_NEIGHBOR_RANK, max(2, len(points) // 8), len(points) - 1)
     if not nearest:
         return 0.0
     return float(nearest_rows(points, rows, nearest)[1][:, -1].median())
@@ -79,14 +83,17 @@ def _spacing(points: Tensor) -> float:
 def _join_cells(centroids: Tensor, reach: float) -> Tensor:
     """Return the group of each cell: cells within reach of each other share one. [C,3] -> [C]
 
-    No two cells share a place, so the pairs of a cell are bounded by the cells within reach.
+    No two cells share a position, so the pairs of a cell are bounded by the cells within reach.
     """
     first, second = cKDTree(centroids.numpy()).query_pairs(reach, output_type="ndarray").T
     return torch.from_numpy(join_pairs(first, second, len(centroids)))
 
 
 def _join_strays(labels: Tensor, centroids: Tensor, counts: Tensor, least: float) -> Tensor:
-    """Parts numbered by size, the largest 0; cells of those below `least` go with the nearest other cell."""
+    """Return parts numbered by size, the largest 0.
+
+    Cells of parts below `least` join the nearest other cell.
+    """
     roots, part = torch.unique(labels, return_inverse=True)
     sizes = torch.zeros(len(roots), dtype=torch.int64).index_add(0, part, counts)
     order = sizes.argsort(descending=True, stable=True)
@@ -95,56 +102,55 @@ def _join_strays(labels: Tensor, centroids: Tensor, counts: Tensor, least: float
     number[order] = torch.arange(len(order))
     part = number[part]
     stray = (part >= count).nonzero()[:, 0]
-    firm = (part < count).nonzero()[:, 0]
+    large = (part < count).nonzero()[:, 0]
     if len(stray):
-        nearest = PointTree(centroids[firm].numpy(), 1).query(centroids[stray].numpy(), 1)[1]
-        part[stray] = part[firm[torch.from_numpy(nearest[:, 0])]]
+        nearest = PointTree(centroids[large].numpy(), 1).query(centroids[stray].numpy(), 1)[1]
+        part[stray] = part[large[torch.from_numpy(nearest[:, 0])]]
     return part
 
 
 @dataclass(frozen=True)
 class GroupSearch:
-    """What the parts are fitted to, and how long."""
+    """Search for the motion of the parts that fits the training views."""
 
     original: Tensor  # raw member rows. [M,C]
     parts: Parts
     crops: Sequence[CropScene]  # the training views
-    steps: int = 120  # of a search, each in one view
-    seed: int = 0  # of the order of the views
+    steps: int = 120  # steps per search, each in one view
+    seed: int = 0  # of the view order
 
     def find(self, targets: Sequence[Tensor], start: Motion, on_step: OnStep | None = None) -> Motion:
-        """The motion of the parts that brings the views closest to their targets.
-
-        A near search starts at full sharpness. Where it leaves a quarter of the distance, a wide one is tried
-        too. The wide one arrives from farther away, but it can overlook what is close
-        (docs/experiments.md, Parts that move).
+        """Return the motion of the parts that brings the views closest to their targets.
+         A near search starts at full sharpness. If a quarter of the distance remains, a wide search runs
+        too. The wide search finds positions farther away, but can miss close ones (docs/experiments.md,
+        Parts that move).
 
         Args:
-            targets: the edited box of each view. [h,w,3] each
-            start: where to look first
-            on_step: progress: steps done in this search; a wide one counts from 1 again
+            targets: edited box of each view. [h,w,3] each
+            start: initial motion
+            on_step: progress: steps done in this search; a wide search counts from 1 again
 
         Returns:
-            The best motion found; `start` where none is better in the mean of all views.
+            the best motion found; `start` if none is better in the mean over all views
 
         Raises:
             FloatingPointError: the loss is no longer finite.
         """
         best = start
-        least = self.distance(targets, start)
-        missed = _MISSED * least
+        min_distance = self.distance(targets, start)
+        max_distance = _FAILED_SEARCH_SHARE * min_distance
         for wide in (False, True):
             motion = self._search(targets, start, wide, on_step)
             distance = self.distance(targets, motion)
-            if distance < least:
+            if distance < min_distance:
                 best = motion
-                least = distance
-            if least < missed:
+                min_distance = distance
+            if min_distance < max_distance:
                 break
         return best
 
     def distance(self, targets: Sequence[Tensor], motion: Motion) -> float:
-        """Mean distance of all views from their targets, at full sharpness and blurred."""
+        """Return the mean distance of all views from their targets, at full sharpness and blurred."""
         return mean_distance(self.crops, move_rows(self.original, self.parts, motion), targets)
 
     def _search(self, targets: Sequence[Tensor], start: Motion, wide: bool, on_step: OnStep | None) -> Motion:
@@ -154,7 +160,7 @@ class GroupSearch:
         shift, size, turn = _RATES
         rates = values.new_tensor([shift] * 3 + [size] + [turn] * 3)
         wide_rates = values.new_tensor([3 * shift] * 3 + [size] + [0.0] * 3)
-        widening = round(_WIDE * self.steps) if wide else 0
+        widening = round(_WIDE_STEP_SHARE * self.steps) if wide else 0
 
         def loss_in(values: Tensor, view: int, step: int) -> Tensor:
             rows = move_rows(self.original, self.parts, _motion(values, self.parts))
@@ -172,20 +178,26 @@ def _motion(values: Tensor, parts: Parts) -> Motion:
 
 
 def mean_distance(crops: Sequence[CropScene], rows: Tensor, targets: Sequence[Tensor]) -> float:
-    """Mean distance of all views from their targets, at full sharpness and blurred. `rows`: members' [M,C]"""
+    """Return the mean distance of all views from their targets, at full sharpness and blurred.
+
+    `rows`: raw member rows. [M,C]
+    """
     with torch.no_grad():
         pairs = zip(crops, targets, strict=True)
         return sum(float(view_distance(crop, rows, target)) for crop, target in pairs) / len(targets)
 
 
 def view_distance(scene: CropScene, rows: Tensor, target: Tensor, wide: bool = False) -> Tensor:
-    """L1 at full sharpness and blurred, or blurred widely only: so a part feels where it does not lie yet."""
-    image = scene.render(rows, _MOVING)
+    """Return the L1 distance at full sharpness and blurred, or widely blurred only (`wide`).
+
+    Blurred pictures attract a part to a position that it does not overlap yet.
+    """
+    image = scene.render(rows, _MOVING_ATTRIBUTES)
     difference = image - target
     loss = difference.new_zeros(()) if wide else difference.abs().mean()
     longer = max(scene.size)
     planes = difference.permute(2, 0, 1)[None]
-    for blur in [round(longer * share) for share in _WIDE_BLURS] if wide else _BLURS:
+    for blur in [round(longer * share) for share in _WIDE_BLUR_SHARES] if wide else _BLURS_PX:
         width = max(1, min(blur, *scene.size))
         loss = loss + avg_pool2d(planes, width, max(1, width // 3)).abs().mean()
     return loss
@@ -201,18 +213,19 @@ def descend(
     damping: float = 0.0,
     on_step: OnStep | None = None,
 ) -> Tensor:
-    """The numbers that lower a loss, averaged over the last quarter of the steps: Adam with short memories.
-
-    It is not torch's: where `damping` is given, Adam's ε is a share of the column's root mean square.
+    """Return the numbers that minimize a loss, averaged over the last quarter of the steps.
+     The optimizer is Adam with short memories. It differs from torch's if `damping` is given: ε is then a
+    share of the column's root mean square.
 
     Args:
-        start: where to begin. [P,C]
+        start: initial numbers. [P,C]
         loss_in: numbers, index of a view, steps done -> the loss in this view
-        rates_at: steps done -> length of a step, of each column. [C]
-        steps: in all
-        views: all are taken in random order, again and again
+        rates_at: steps done -> step length of each column. [C]
+        steps: total
+        views: number of views; drawn in random order without replacement, then again
         seed: of the order
-        damping: share of a column's typical gradient below Adam's fraction: rows that hardly show stay put
+        damping: share of a column's typical gradient added to Adam's denominator: hardly visible rows stay
+            in place
         on_step: progress
 
     Raises:
@@ -222,7 +235,7 @@ def descend(
     first = torch.zeros_like(values)
     second = torch.zeros_like(values)
     settled = torch.zeros_like(values)
-    averaged = max(1, round(_SETTLED * steps))
+    averaged = max(1, round(_AVERAGED_STEP_SHARE * steps))
     order = torch.Generator().manual_seed(seed)
     queue: list[int] = []
     for step in range(steps):
@@ -248,5 +261,5 @@ def descend(
 
 
 def falling(step: int, steps: int) -> float:
-    """Factor to a rate, from 1 to a twentieth along half a wave."""
+    """Return the factor to a rate, which falls from 1 to 0.05 along half a cosine wave."""
     return 0.05 + 0.95 * (0.5 + 0.5 * math.cos(math.pi * step / steps))

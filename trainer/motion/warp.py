@@ -1,13 +1,11 @@
-"""Warps of a region: control points that shift, turn and stretch, members that follow, and their search.
-
-Embedded deformation (Sumner, Schmid and Pauly 2007). Control point k takes what lies at x to
-A_k (x − c_k) + c_k + t_k with A_k = R_k exp(S_k); a member blends its nearest control points' maps by smooth
-weights, which do not change while it moves. So each member has one affine map of its own, x → J x + b, and
-what it learns besides is carried along and can be carried back.
-
-The search begins where parts that move as wholes have come, with few control points, then more. Neighboring
-ones are held to each other's motion, as rigidly as the views allow, so that what no view shows follows what
-they show.
+"""Warps of a region: control points that shift, rotate and stretch, and the members that follow.
+ The method is embedded deformation (Sumner, Schmid and Pauly 2007). Control point k maps x to A_k (x − c_k)
++ c_k + t_k with A_k = R_k exp(S_k). A member blends the maps of its nearest control points by smooth
+weights, which stay constant while it moves. Each member thus has one affine map, x → J x + b. Its own
+offsets are carried along and can be carried back.
+ The search starts from the motion of whole parts, with a small number of control points, then more.
+Neighboring control points are held to each other's motion, as rigidly as the views allow, so that hidden
+areas follow visible ones.
 """
 
 from __future__ import annotations
@@ -46,30 +44,30 @@ from trainer.views.crops import CropScene
 from .parts import OnStep, descend, falling, mean_distance, view_distance
 
 LEVELS = (6, 18, 54)
-"""Control points of each level, coarse to fine."""
+"""Number of control points per level, coarse to fine."""
 
-_FOLLOWERS = 8  # members a control point has at least, in the mean
-_RATES = (0.04, 0.02, 0.015)  # a step of shift in spacings of the level, of turn in radians, of stretch
-_WIDE = 0.4  # share of the coarsest level's steps that see the pictures blurred only
-_RIGID = 0.05  # weight of what neighbors disagree by, squared, in squares of their spacing
-_STIFF = 0.002  # weight of the stretch, squared
+_MIN_FOLLOWERS = 8  # minimum mean number of members per control point
+_RATES = (0.04, 0.02, 0.015)  # step of shift in spacings of the level, of rotation in radians, of stretch
+_WIDE_STEP_SHARE = 0.4  # share of the coarsest level's steps with blurred pictures only
+_RIGIDITY_WEIGHT = 0.05  # weight of the squared disagreement of neighbors, in squares of their spacing
+_STRETCH_WEIGHT = 0.002  # weight of the squared stretch
 _DAMPING = 0.1  # see `descend`
-_NEAREST = 4  # control points that a member follows
-_LINKS = 6  # neighbors that a control point is held to
+_CONTROLS_PER_MEMBER = 4  # control points per member
+_LINKS_PER_CONTROL = 6  # neighbors per control point
 _QUATS = attribute_slices(BASE_CHANNELS)["quats"]
-_SYMMETRIC = (0, 3, 4, 3, 1, 5, 4, 5, 2)  # where a stretch's numbers stand in its matrix, row by row
+_SYMMETRIC_INDICES = (0, 3, 4, 3, 1, 5, 4, 5, 2)  # indices of a stretch's numbers in its matrix, row by row
 
 
 @dataclass(frozen=True)
 class ControlPoints:
-    """Where a region is held, and who follows whom."""
+    """Control points of a region, and the members that follow them."""
 
-    rows: Tensor  # the members that lie there. [P] int64
-    points: Tensor  # their places. [P,3]
-    part: Tensor  # connected part each lies in. [P] int64
-    nearest: Tensor  # those that each member follows, of its own part. [M,K] int64
-    weights: Tensor  # how much, adding up to 1. [M,K]
-    links: Tensor  # pairs of neighbors, which are to move alike. [L,2] int64
+    rows: Tensor  # members at the control points. [P] int64
+    points: Tensor  # positions. [P,3]
+    part: Tensor  # connected part of each. [P] int64
+    nearest: Tensor  # control points that each member follows, of its own part. [M,K] int64
+    weights: Tensor  # their weights, with sum 1. [M,K]
+    links: Tensor  # pairs of neighbors that should move alike. [L,2] int64
     spacing: float  # median distance of neighbors, world units, > 0
 
     def __len__(self) -> int:
@@ -77,49 +75,53 @@ class ControlPoints:
 
 
 def make_control_points(means: Tensor, part: Tensor, count: int) -> ControlPoints:
-    """Spread control points over a region, farthest first; the same for the same means.
+    """Spread control points over a region by farthest-point sampling. The result is deterministic.
 
     Args:
         means: centers of the members. [M,3]
         part: connected part of each, see `connected_parts`. [M] int64
-        count: control points in all, at most one a member; parts share them by size, at least one each
+        count: total number of control points, at most one per member; parts share them by size, at least
+            one each
     """
     rows = []
     part_of = []
     links = []
-    begun = 0
-    nearest = part.new_zeros(len(means), _NEAREST)
-    weights = means.new_zeros(len(means), _NEAREST)
+    first = 0
+    nearest = part.new_zeros(len(means), _CONTROLS_PER_MEMBER)
+    weights = means.new_zeros(len(means), _CONTROLS_PER_MEMBER)
     for index, size in enumerate(torch.bincount(part).tolist()):
-        mine = (part == index).nonzero()[:, 0]
+        members = (part == index).nonzero()[:, 0]
         points = min(size, max(1, round(count * size / len(means))))
-        chosen = mine[farthest_points(means[mine], points)]
-        near = min(_NEAREST, points)
-        distances = torch.cdist(means[mine], means[chosen])
+        chosen = members[farthest_points(means[members], points)]
+        near = min(_CONTROLS_PER_MEMBER, points)
+        distances = torch.cdist(means[members], means[chosen])
         neighbors = distances.topk(min(near + 1, points), dim=1, largest=False)
-        # down to zero at the next farther one, so that nothing jumps where one takes the place of another
+        # weights fall to 0 at the next farther control point, so they are continuous where it takes over
         reach = 1.01 * neighbors.values[:, -1:].clamp_min(1e-9)
         share = (1 - neighbors.values[:, :near] / reach).clamp_min(1e-6).square()
-        nearest[mine, :near] = begun + neighbors.indices[:, :near]
-        weights[mine, :near] = share / share.sum(dim=1, keepdim=True)
-        around = min(_LINKS, points - 1)
+        nearest[members, :near] = first + neighbors.indices[:, :near]
+        weights[members, :near] = share / share.sum(dim=1, keepdim=True)
+        link_count = min(_LINKS_PER_CONTROL, points - 1)
         spacings = torch.cdist(means[chosen], means[chosen])
-        others = spacings.topk(around + 1, dim=1, largest=False).indices[:, 1:]
-        ones = torch.arange(points).to(others)[:, None].expand_as(others)
-        links.append(begun + torch.stack([ones, others], dim=2).reshape(-1, 2))
+        others = spacings.topk(link_count + 1, dim=1, largest=False).indices[:, 1:]
+        selves = torch.arange(points).to(others)[:, None].expand_as(others)
+        links.append(first + torch.stack([selves, others], dim=2).reshape(-1, 2))
         rows.append(chosen)
         part_of.append(part.new_full((points,), index))
-        begun += points
+        first += points
     at = torch.cat(rows)
     pairs = torch.cat(links)
     gaps = (means[at[pairs[:, 0]]] - means[at[pairs[:, 1]]]).norm(dim=1)
-    alone = (means - means.mean(dim=0)).norm(dim=1)
-    spacing = float((gaps if len(gaps) else alone).median())
+    radii = (means - means.mean(dim=0)).norm(dim=1)
+    spacing = float((gaps if len(gaps) else radii).median())
     return ControlPoints(at, means[at], torch.cat(part_of), nearest, weights, pairs, max(spacing, 1e-9))
 
 
 def farthest_points(means: Tensor, count: int) -> Tensor:
-    """Rows that lie far from each other: first the one farthest from the middle. [M,3] -> [count] int64"""
+    """Return rows far from each other, starting with the one farthest from the mean.
+
+    [M,3] -> [count] int64
+    """
     distance = (means - means.mean(dim=0)).square().sum(dim=1)
     chosen = [int(distance.argmax())]
     distance = (means - means[chosen[0]]).square().sum(dim=1)
@@ -131,7 +133,7 @@ def farthest_points(means: Tensor, count: int) -> Tensor:
 
 @dataclass(frozen=True)
 class WarpMotion:
-    """What each of P control points does."""
+    """Motion of P control points."""
 
     shift: Tensor  # world units. [P,3]
     turn: Tensor  # rotation vector, axis times angle in radians. [P,3]
@@ -140,22 +142,22 @@ class WarpMotion:
 
 @dataclass(frozen=True)
 class MemberMaps:
-    """Each member's own map x → J x + b, and how it turns and grows."""
+    """Affine map x → J x + b of each member, with its rotation and growth."""
 
     matrix: Tensor  # J. [M,3,3]
     shift: Tensor  # b. [M,3]
     turn: Tensor  # unit quaternion. [M,4]
-    growth: Tensor  # of its log-scales, along its axes. [M,3]
+    growth: Tensor  # growth of the log-scales, along the member's axes. [M,3]
 
     def carry(self, original: Tensor, offsets: Tensor) -> Tensor:
-        """Offsets within the moved frames -> offsets from the original; differentiable.
+        """Convert offsets within the moved frames to offsets from the original. Differentiable.
 
         Args:
             original: raw member rows. [M,C]
-            offsets: what each member does besides following. [M,C]
+            offsets: each member's own offsets beside the map. [M,C]
 
         Returns:
-            Raw-space offsets; opacity's and color's are the given ones. [M,C]
+            raw offsets; those of opacity and color are unchanged. [M,C]
         """
         means, log_scales, quats = split_geometry(original[:, GEOMETRY] + offsets[:, GEOMETRY])
         moved = [
@@ -166,7 +168,7 @@ class MemberMaps:
         return offsets_to(torch.cat(moved, dim=1), original, offsets, self.turn)
 
     def carry_back(self, original: Tensor, offsets: Tensor) -> Tensor:
-        """The inverse of `carry`. [M,C] -> [M,C]"""
+        """Invert `carry`. [M,C] -> [M,C]"""
         means, log_scales, quats = split_geometry(original[:, GEOMETRY] + offsets[:, GEOMETRY])
         back = self.turn * self.turn.new_tensor([1.0, -1.0, -1.0, -1.0])
         local = [
@@ -178,13 +180,13 @@ class MemberMaps:
 
 
 def rest_warp(control: ControlPoints) -> WarpMotion:
-    """Nothing has moved."""
+    """Return the warp that moves nothing."""
     nothing = torch.zeros_like(control.points)
     return WarpMotion(nothing, nothing, nothing.new_zeros(len(nothing), 6))
 
 
 def warp_of_parts(control: ControlPoints, parts: Parts, motion: Motion) -> WarpMotion:
-    """Every control point does what its part does: exactly the motion of the parts."""
+    """Return the warp in which every control point follows its part: exactly the motion of the parts."""
     part = control.part
     size = motion.log_scale[part, None]
     turn = motion.turn[part]
@@ -195,7 +197,7 @@ def warp_of_parts(control: ControlPoints, parts: Parts, motion: Motion) -> WarpM
 
 
 def transfer_warp(control: ControlPoints, motion: WarpMotion, other: ControlPoints) -> WarpMotion:
-    """A motion of the same region, held at other control points: what it does there."""
+    """Return a motion of the region at other control points: the blended map at each of them."""
     affine, shift = affine_maps(control, motion)
     maps = torch.cat([affine.flatten(1), shift], dim=1)
     blended = (control.weights[other.rows, :, None] * maps[control.nearest[other.rows]]).sum(dim=1)
@@ -208,18 +210,18 @@ def transfer_warp(control: ControlPoints, motion: WarpMotion, other: ControlPoin
 
 
 def affine_maps(control: ControlPoints, motion: WarpMotion) -> tuple[Tensor, Tensor]:
-    """Each control point's own map x → A x + b: A [P,3,3], b [P,3]; differentiable."""
+    """Return each control point's map x → A x + b: A [P,3,3], b [P,3]. Differentiable."""
     affine = rotation_matrices(turn_quats(motion.turn)) @ _stretches(motion)
     return affine, motion.shift + control.points - (affine @ control.points[..., None])[..., 0]
 
 
 def map_members(original: Tensor, control: ControlPoints, motion: WarpMotion) -> MemberMaps:
-    """How the members follow; differentiable in the motion. `original`: raw rows [M,C]"""
+    """Return the maps of the members, differentiable in the motion. `original`: raw rows [M,C]"""
     affine, shift = affine_maps(control, motion)
     numbers = torch.cat(
         [affine.flatten(1), shift, _stretches(motion).flatten(1), turn_quats(motion.turn)], dim=1
     )
-    # not numbers[nearest], whose gradient is summed up by threads in any order
+    # not numbers[nearest]: threads sum its gradient in any order
     followed = numbers.index_select(0, control.nearest.flatten()).view(*control.nearest.shape, -1)
     blended = (control.weights[..., None] * followed).sum(dim=1)
     axes = rotation_matrices(normalize_quats(original[:, _QUATS]))
@@ -229,13 +231,13 @@ def map_members(original: Tensor, control: ControlPoints, motion: WarpMotion) ->
 
 
 def warp_rows(original: Tensor, control: ControlPoints, motion: WarpMotion) -> Tensor:
-    """Raw rows where the motion takes them; differentiable in the motion. [M,C] -> [M,C]"""
+    """Return raw rows moved by the motion; differentiable in the motion. [M,C] -> [M,C]"""
     maps = map_members(original, control, motion)
     return original + maps.carry(original, torch.zeros_like(original))
 
 
 def interpolate_warp(a: WarpMotion, b: WarpMotion, share: float) -> WarpMotion:
-    """The way from one motion to another: shift and stretch straight, turns along the great circle."""
+    """Interpolate two motions: shift and stretch linearly, rotations along the great circle."""
     remaining = quat_turns(multiply_quats(turn_quats(-a.turn), turn_quats(b.turn)))
     return WarpMotion(
         torch.lerp(a.shift, b.shift, share),
@@ -245,42 +247,42 @@ def interpolate_warp(a: WarpMotion, b: WarpMotion, share: float) -> WarpMotion:
 
 
 def extrapolate_warp(motion: WarpMotion, further: float) -> WarpMotion:
-    """The same motion, so many times as far."""
+    """Return the motion scaled by a factor."""
     return WarpMotion(further * motion.shift, further * motion.turn, further * motion.stretch)
 
 
 def _stretches(motion: WarpMotion) -> Tensor:
-    """exp(S) of each control point. [P,3,3]"""
-    stretches: Tensor = torch.linalg.matrix_exp(motion.stretch[:, _SYMMETRIC].reshape(-1, 3, 3))
+    """Return exp(S) of each control point. [P,3,3]"""
+    stretches: Tensor = torch.linalg.matrix_exp(motion.stretch[:, _SYMMETRIC_INDICES].reshape(-1, 3, 3))
     return stretches
 
 
 @dataclass(frozen=True)
 class WarpSearch:
-    """What control points are fitted to, and how long."""
+    """Search for the motion of control points that fits the training views."""
 
     original: Tensor  # raw member rows. [M,C]
     part: Tensor  # connected part of each member. [M] int64
     crops: Sequence[CropScene]  # the training views
-    steps: int = 120  # of each level, each in one view
-    seed: int = 0  # of the order of the views
+    steps: int = 120  # steps per level, each in one view
+    seed: int = 0  # of the view order
 
     @cached_property
     def levels(self) -> tuple[ControlPoints, ...]:
-        """Coarse to fine; the last are those of the motions that are found."""
+        """Control points, coarse to fine. Found motions belong to the last level."""
         means = self.original[:, attribute_slices(self.original.shape[1])["means"]]
-        counts = sorted({min(count, max(1, len(means) // _FOLLOWERS)) for count in LEVELS})
+        counts = sorted({min(count, max(1, len(means) // _MIN_FOLLOWERS)) for count in LEVELS})
         return tuple(make_control_points(means, self.part, count) for count in counts)
 
     def find_first(
         self, targets: Sequence[Tensor], start: WarpMotion, on_step: OnStep | None = None
     ) -> WarpMotion:
-        """The motion that brings the views close to their targets, from a coarse one to a fine one.
+        """Return the motion that brings the views close to their targets, from coarse to fine.
 
         Args:
-            targets: the edited box of each view. [h,w,3] each
-            start: of the coarsest control points
-            on_step: progress: steps done of one level; each counts from 1 again
+            targets: edited box of each view. [h,w,3] each
+            start: motion of the coarsest control points
+            on_step: progress: steps done in one level; each level counts from 1 again
 
         Raises:
             FloatingPointError: the loss is no longer finite.
@@ -289,7 +291,7 @@ class WarpSearch:
         for level, control in enumerate(self.levels):
             if level:
                 motion = transfer_warp(self.levels[level - 1], motion, control)
-            motion = self._descend(control, targets, motion, 0.0 if level else _WIDE, on_step)
+            motion = self._descend(control, targets, motion, 0.0 if level else _WIDE_STEP_SHARE, on_step)
         return motion
 
     def find_next(
@@ -299,7 +301,7 @@ class WarpSearch:
         further: float,
         on_step: OnStep | None = None,
     ) -> WarpMotion:
-        """The same for a strength `further` times as large as that of the motion `before`."""
+        """Return the motion for a strength `further` times that of the motion `before`."""
         control = self.levels[-1]
         start = min(
             (before, extrapolate_warp(before, further)),
@@ -308,7 +310,7 @@ class WarpSearch:
         return self._descend(control, targets, start, 0.0, on_step)
 
     def distance(self, targets: Sequence[Tensor], motion: WarpMotion) -> float:
-        """Mean distance of all views from their targets, at full sharpness and blurred."""
+        """Return the mean distance of all views from their targets, at full sharpness and blurred."""
         return mean_distance(self.crops, warp_rows(self.original, self.levels[-1], motion), targets)
 
     def _descend(
@@ -331,7 +333,8 @@ class WarpSearch:
             motion = motion_of(values)
             rows = warp_rows(self.original, control, motion)
             penalty = (
-                _RIGID * disagreement(control, motion) + _STIFF * motion.stretch.square().sum(dim=1).mean()
+                _RIGIDITY_WEIGHT * disagreement(control, motion)
+                + _STRETCH_WEIGHT * motion.stretch.square().sum(dim=1).mean()
             )
             return view_distance(self.crops[view], rows, targets[view], wide=step < widening) + penalty
 
@@ -346,7 +349,7 @@ class WarpSearch:
 
 
 def disagreement(control: ControlPoints, motion: WarpMotion) -> Tensor:
-    """How far from each other neighbors would take one another, mean square, in squares of their spacing."""
+    """Return the mean squared error of neighbors' predicted positions of each other, in squared spacings."""
     if not len(control.links):
         return motion.shift.new_zeros(())
     a, b = control.links.unbind(1)
@@ -357,24 +360,27 @@ def disagreement(control: ControlPoints, motion: WarpMotion) -> Tensor:
 
 
 class RegionMotion(Protocol):
-    """A motion of all members of a region."""
+    """Motion of all members of a region."""
 
     def carry(self, original: Tensor, offsets: Tensor) -> Tensor:
-        """Offsets within the moved frames -> offsets from the original; differentiable. [M,C] -> [M,C]"""
+        """Convert offsets within the moved frames to offsets from the original.
+
+        Differentiable. [M,C] -> [M,C]
+        """
         ...
 
     def carry_back(self, original: Tensor, offsets: Tensor) -> Tensor:
-        """The inverse of `carry`. [M,C] -> [M,C]"""
+        """Invert `carry`. [M,C] -> [M,C]"""
         ...
 
     def lines(self) -> list[str]:
-        """What the log says of it."""
+        """Return the log lines about the motion."""
         ...
 
 
 @dataclass(frozen=True)
 class PartsPlacement:
-    """Parts that have moved as wholes."""
+    """Motion of parts as wholes."""
 
     parts: Parts
     motion: Motion
@@ -388,7 +394,7 @@ class PartsPlacement:
         return local_offsets(original, offsets, self.parts, self.motion)
 
     def lines(self) -> list[str]:
-        """Where each part went, in its own sizes."""
+        """Return the motion of each part, in units of its size."""
         motion = self.motion
         sizes = self.parts.sizes
         return [
@@ -402,7 +408,7 @@ class PartsPlacement:
 
 @dataclass(frozen=True)
 class WarpPlacement:
-    """A region that was bent by control points."""
+    """Motion of a region that is bent by control points."""
 
     control: ControlPoints
     motion: WarpMotion
@@ -416,7 +422,7 @@ class WarpPlacement:
         return map_members(original, self.control, self.motion).carry_back(original, offsets)
 
     def lines(self) -> list[str]:
-        """How far the control points went, in their spacings."""
+        """Return the motion of the control points, in units of their spacing."""
         shift = self.motion.shift.norm(dim=1) / self.control.spacing
         turn = self.motion.turn.norm(dim=1)
         stretch = self.motion.stretch[:, :3]
@@ -428,7 +434,7 @@ class WarpPlacement:
 
 
 def between(a: RegionMotion, b: RegionMotion, share: float) -> RegionMotion:
-    """On the way from one placement to another of the same kind."""
+    """Interpolate two placements of the same kind."""
     if isinstance(a, PartsPlacement) and isinstance(b, PartsPlacement):
         return PartsPlacement(a.parts, interpolate_motion(a.motion, b.motion, share))
     assert isinstance(a, WarpPlacement)
