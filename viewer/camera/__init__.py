@@ -1,1 +1,1 @@
-"""Where one looks from."""
+"""Viewing camera: geometry, controls and named views."""

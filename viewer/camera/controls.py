@@ -1,7 +1,7 @@
-"""What the mouse and the keys do to the camera, as pure functions, and the table of bindings, as data.
+"""Camera controls for mouse and keys as pure functions.
 
-Pixels are window coordinates at 1× (the caller divides by the UI scale), angles degrees, lengths world units.
-No function ever returns a camera that is not finite: a move that would leave the numbers is not made.
+Pixels are window coordinates at 1× (the caller divides by the UI scale), angles are in degrees, lengths in
+world units. Every returned camera is finite. A move beyond the numeric range returns the old camera.
 """
 
 from __future__ import annotations
@@ -12,23 +12,22 @@ from dataclasses import replace
 from .view_camera import FARTHEST, Vec3, ViewCamera, add_scaled, axes, eye, look_from, unit
 
 DEGREES_PER_PIXEL = 0.3
-ZOOM_PER_STEP = 0.12  # of the distance, per wheel step
-DOLLY_PER_PIXEL = 0.005
-FLY_RADII_PER_SECOND = 0.6
-# of the scene's radius: how near to and far from the pivot the eye goes
-CLOSEST = 1e-4
-WIDEST = 1e4
+ZOOM_PER_STEP = 0.12  # relative change of the distance per wheel step
+DOLLY_PER_PIXEL = 0.005  # relative change of the distance per pixel
+FLY_RADII_PER_SECOND = 0.6  # speed, scene radii per second
+CLOSEST = 1e-4  # smallest distance of the eye to the pivot, scene radii
+WIDEST = 1e4  # largest distance of the eye to the pivot, scene radii
 
 
 def orbit(camera: ViewCamera, dx: float, dy: float) -> ViewCamera:
-    """Turn around the pivot so that the scene follows the mouse; stops at the poles."""
+    """Orbit around the pivot so that the scene follows the mouse. The elevation stops at the poles."""
     elevation = max(-90.0, min(90.0, camera.elevation + DEGREES_PER_PIXEL * dy))
     azimuth = _wrap_degrees(camera.azimuth - DEGREES_PER_PIXEL * dx)
     return _keep_finite(replace(camera, azimuth=azimuth, elevation=elevation), camera)
 
 
 def look(camera: ViewCamera, dx: float, dy: float) -> ViewCamera:
-    """Turn the view with the eye fixed (fly mode): right looks right, down looks down."""
+    """Rotate the view around the fixed eye (fly mode): right looks right, down looks down."""
     turned = orbit(camera, dx, dy)
     position = eye(camera)
     return _keep_finite(
@@ -37,10 +36,12 @@ def look(camera: ViewCamera, dx: float, dy: float) -> ViewCamera:
 
 
 def pan(camera: ViewCamera, dx: float, dy: float, height: float) -> ViewCamera:
-    """Slide the view so that what lies at the pivot's depth stays under the cursor.
+    """Pan the view so that points at the pivot's depth follow the cursor.
 
     Args:
-        height: of the picture in the same pixels as dx and dy
+        camera: the camera
+        dx, dy: movement of the cursor, px
+        height: height of the picture, px
     """
     per_pixel = 2.0 * camera.distance * math.tan(math.radians(camera.fov_y) / 2) / max(height, 1.0)
     picture = axes(camera)
@@ -49,22 +50,24 @@ def pan(camera: ViewCamera, dx: float, dy: float, height: float) -> ViewCamera:
 
 
 def zoom(camera: ViewCamera, steps: float, radius: float) -> ViewCamera:
-    """Wheel: steps > 0 goes nearer, in proportion to the distance.
+    """Zoom by wheel steps in proportion to the distance.
 
     Args:
-        radius: of the scene, world units; bounds the distance
+        camera: the camera
+        steps: wheel steps, > 0 to move nearer
+        radius: radius of the scene, world units, which limits the distance
     """
     factor = math.exp(max(-50.0, min(50.0, -ZOOM_PER_STEP * steps))) if math.isfinite(steps) else 1.0
     return _keep_finite(replace(camera, distance=_clamp_distance(camera.distance * factor, radius)), camera)
 
 
 def dolly(camera: ViewCamera, dy: float, radius: float) -> ViewCamera:
-    """Drag: down goes away, up goes nearer, in proportion to the distance."""
+    """Dolly by dragging, in proportion to the distance: down moves away, up moves nearer."""
     return zoom(camera, -dy * DOLLY_PER_PIXEL / ZOOM_PER_STEP, radius)
 
 
 def drag(camera: ViewCamera, does: str, dx: float, dy: float, height: float, radius: float) -> ViewCamera:
-    """One step of a drag of `DRAGS`; see the function that it names."""
+    """Apply one step of a drag: "orbit", "look", "pan" or "dolly". Raises KeyError for another name."""
     match does:
         case "orbit":
             return orbit(camera, dx, dy)
@@ -89,30 +92,31 @@ def fly(
     """Move eye and pivot together, at a speed in proportion to the scene.
 
     Args:
-        right, up, ahead: −1, 0 or 1 from the keys; up is the scene's up, ahead is where one looks
-        seconds: since the last step; a stall counts as a tenth of a second at most
-        radius: of the scene, world units
-        pace: 10 with Shift, 0.1 with Alt
+        camera: the camera
+        right, up, ahead: −1, 0 or 1 from the keys; up is the scene's up axis, ahead is the view direction
+        seconds: time since the last step, clamped to 0.1 s so that a stall causes no jump
+        radius: radius of the scene, world units
+        pace: factor on the speed, 10 with Shift, 0.1 with Alt
     """
-    wish = unit((right, up, ahead), (0.0, 0.0, 0.0))
+    direction = unit((right, up, ahead), (0.0, 0.0, 0.0))
     length = FLY_RADII_PER_SECOND * radius * pace * max(0.0, min(seconds, 0.1))
     picture = axes(camera)
     steps = (
-        (length * wish[0], picture.right),
-        (length * wish[1], unit(camera.up, (0.0, 1.0, 0.0))),
-        (-length * wish[2], picture.back),
+        (length * direction[0], picture.right),
+        (length * direction[1], unit(camera.up, (0.0, 1.0, 0.0))),
+        (-length * direction[2], picture.back),
     )
     return _keep_finite(replace(camera, pivot=add_scaled(camera.pivot, *steps)), camera)
 
 
 def pivot_on(camera: ViewCamera, point: Vec3, radius: float) -> ViewCamera:
-    """Double click: the eye stays, the view turns to `point`, which becomes the pivot."""
+    """Rotate the view to `point` with the eye fixed, and make it the pivot (double click)."""
     turned = look_from(camera, eye(camera), point)
     return _keep_finite(replace(turned, distance=_clamp_distance(turned.distance, radius)), camera)
 
 
 def toggle_fly(camera: ViewCamera) -> ViewCamera:
-    """Orbit ↔ fly; the picture does not move."""
+    """Switch between orbit and fly mode. The picture is unchanged."""
     return replace(camera, mode="orbit" if camera.mode == "fly" else "fly")
 
 

@@ -1,7 +1,7 @@
-"""The geometry of a `ViewCamera`: where the eye is, where right and up are, what frames a scene.
+"""Geometry of the viewing camera: eye position, picture axes, framing.
 
-Plain float64 arithmetic on tuples, exact at the poles: the right axis of the picture comes from the azimuth,
-not from a cross product with the view direction.
+Plain float64 arithmetic on tuples. It is exact at the poles, as the right axis of the picture comes from the
+azimuth and not from a cross product with the view direction.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from progdf.scene.up_axis import find_up, up_from_json
 Vec3 = tuple[float, float, float]
 
 LARGEST_SIDE = 16_384
-"""Of a picture that can be asked for, in pixels."""
+"""Largest width and height of a requested picture, px."""
 
 
 @dataclass(frozen=True)
 class SceneUp:
-    """The world direction that is up, unit length, and whether that is certain."""
+    """Up axis of a scene in world coordinates, unit length, and its certainty."""
 
     direction: Vec3
     certain: bool
-    reason: str = ""  # for a person; "" of an edit that knew
+    reason: str = ""  # text for the user; "" if the axis comes from an edit
 
 
 def find_scene_up(
@@ -47,17 +47,17 @@ def find_scene_up(
     cameras: Sequence[Camera] = (),
     path: Path | None = None,
 ) -> SceneUp:
-    """Which way is up.
+    """Find the up axis of a scene. It comes from the training of an edit if possible, else from `find_up`.
 
     Args:
         scene: the original
-        gdfs: its edits, whose training may have known
+        gdfs: its edits, whose training may have stored the up axis
         axis: an axis, or "auto"
-        cameras: given with the scene
-        path: its file
+        cameras: cameras of the scene
+        path: file of the scene
     """
-    trained = (up_from_json(gdf.report.get("up")) for gdf in gdfs) if axis == "auto" else ()
-    known = next((up for up in trained if up is not None), None)
+    stored_axes = (up_from_json(gdf.report.get("up")) for gdf in gdfs) if axis == "auto" else ()
+    known = next((up for up in stored_axes if up is not None), None)
     guess = find_up(scene, cameras, axis, path) if known is None and len(scene) else None
     if guess is not None:
         known = guess.direction
@@ -66,19 +66,19 @@ def find_scene_up(
     return SceneUp((x, y, z), guess is None or guess.certain, reason)
 
 
-FARTHEST = 1e9  # world units: float32 matrices stay finite with plenty to spare
+FARTHEST = 1e9  # largest coordinate, world units, well within the finite range of float32 matrices
 
 _Number = Annotated[float, Meta(ge=-FARTHEST, le=FARTHEST)]
 
 
 @dataclass(frozen=True)
 class ViewCamera:
-    """Where one looks from: a turntable around `pivot`, or a free flight with the same numbers."""
+    """Viewing camera: a turntable around `pivot`, or a free camera (fly mode) with the same parameters."""
 
-    pivot: tuple[_Number, _Number, _Number] = (0.0, 0.0, 0.0)  # what the camera turns around, world units
+    pivot: tuple[_Number, _Number, _Number] = (0.0, 0.0, 0.0)  # center of orbits, world units
     distance: Annotated[float, Meta(gt=0.0, le=FARTHEST)] = 5.0  # from the pivot to the eye, world units, > 0
     azimuth: _Number = 0.0  # degrees around `up`
-    # degrees above the plane normal to `up`, −90..90
+    # degrees above the plane normal to `up`, −90 to 90
     elevation: Annotated[float, Meta(ge=-90.0, le=90.0)] = 15.0
     fov_y: Annotated[float, Meta(ge=1.0, le=179.0)] = 45.0  # vertical field of view, degrees
     up: tuple[_Number, _Number, _Number] = (0.0, 1.0, 0.0)  # unit vector that is up in the picture
@@ -86,15 +86,15 @@ class ViewCamera:
 
 
 FILL = 0.72
-"""Share of the picture's tighter side that what one looks at takes at first."""
+"""Share of the picture's tighter side that the framed object fills."""
 
 INSIDE_FOV = 60.0
-"""Degrees: as much as one has to see of a room to know where one stands."""
+"""Smallest vertical field of view inside a room, in degrees, wide enough for orientation."""
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """What the camera frames: a center and the radius of the bulk around it, world units, radius > 0."""
+    """Bounding sphere of the bulk that the camera frames, world units, radius > 0."""
 
     center: Vec3 = (0.0, 0.0, 0.0)
     radius: float = 1.0
@@ -102,7 +102,7 @@ class Bounds:
 
 @dataclass(frozen=True)
 class Axes:
-    """Unit vectors of the picture in the world: right, up, and back (from the pivot to the eye)."""
+    """Picture axes as unit vectors in world coordinates: right, up, and back (from the pivot to the eye)."""
 
     right: Vec3
     up: Vec3
@@ -110,11 +110,14 @@ class Axes:
 
 
 Fit = Callable[[ViewCamera, float], ViewCamera]
-"""Gives the camera of the same direction whose picture, of this width / height, something fills."""
+"""Function from a camera and an aspect (width / height) to the camera that frames a subject.
+
+The direction is unchanged.
+"""
 
 
 def keep_camera(camera: ViewCamera, aspect: float) -> ViewCamera:
-    """The fit of something of which nothing is known."""
+    """Return the camera unchanged: the fit of an unknown subject."""
     return camera
 
 
@@ -127,7 +130,7 @@ def cross(a: Vec3, b: Vec3) -> Vec3:
 
 
 def add_scaled(origin: Vec3, *steps: tuple[float, Vec3]) -> Vec3:
-    """origin + Σ length · direction"""
+    """Return origin + Σ length · direction."""
     x, y, z = origin
     for length, direction in steps:
         x = x + length * direction[0]
@@ -137,7 +140,7 @@ def add_scaled(origin: Vec3, *steps: tuple[float, Vec3]) -> Vec3:
 
 
 def unit(v: Vec3, otherwise: Vec3) -> Vec3:
-    """`v` made one long; `otherwise` where it has no direction."""
+    """Normalize `v`. Return `otherwise` if it is zero or not finite."""
     largest = max(abs(c) for c in v)
     if not (0.0 < largest < math.inf) or any(math.isnan(c) for c in v):
         return otherwise
@@ -148,13 +151,13 @@ def unit(v: Vec3, otherwise: Vec3) -> Vec3:
 
 @cache
 def front(up: Vec3) -> Vec3:
-    """Where the eye stands at azimuth 0, elevation 0, see `front_direction`."""
+    """Return the direction of the eye at azimuth 0 and elevation 0, see `front_direction`."""
     x, y, z = front_direction(torch.tensor(up, dtype=torch.float64)).tolist()
     return x, y, z
 
 
 def axes(camera: ViewCamera) -> Axes:
-    """The picture's axes; an unusable `up` counts as +Y."""
+    """Return the picture's axes. An invalid `up` counts as +Y."""
     up = unit(camera.up, (0.0, 1.0, 0.0))
     ahead = front(up)
     side = cross(up, ahead)
@@ -174,12 +177,12 @@ def axes(camera: ViewCamera) -> Axes:
 
 
 def eye(camera: ViewCamera) -> Vec3:
-    """The eye's position in world units."""
+    """Return the position of the eye, world units."""
     return add_scaled(camera.pivot, (camera.distance, axes(camera).back))
 
 
 def to_camera(camera: ViewCamera, width: int, height: int) -> Camera:
-    """The pinhole camera of a picture of this size in pixels (a zero-sized window counts as one pixel)."""
+    """Convert to a pinhole camera for a picture of this size in pixels (at least 1 × 1)."""
     width = max(width, 1)
     height = max(height, 1)
     picture = axes(camera)
@@ -198,17 +201,17 @@ def to_camera(camera: ViewCamera, width: int, height: int) -> Camera:
 
 
 SHAPES = {"16:9": 16 / 9, "1:1": 1.0, "9:16": 9 / 16}
-"""Of films and of the safe frame in the window: width / height."""
+"""Aspect ratios (width / height) of films and of the window's safe frame."""
 
 
 def widen(camera: ViewCamera, scale: float) -> ViewCamera:
-    """The same place with a wider lens: what filled the height of the picture fills `scale` of it, 0..1."""
+    """Widen the field of view: the former picture height fills the share `scale` (0 to 1) of the new one."""
     half = math.atan(math.tan(math.radians(camera.fov_y) / 2) / scale)
     return camera if scale == 1.0 else replace(camera, fov_y=2 * math.degrees(half))
 
 
 def half_camera(camera: Camera) -> Camera:
-    """The same view in a picture of half the width: the square in its middle stays in sight."""
+    """Return the camera of a picture of half the width in which the central square stays visible."""
     width = max(camera.width // 2, 1)
     shrink = half_scale(camera.width, camera.height)
     K = camera.K.clone()
@@ -219,45 +222,45 @@ def half_camera(camera: Camera) -> Camera:
 
 
 def half_scale(width: int, height: int) -> float:
-    """How large things are in the picture of `half_camera`, of what they are in the whole one."""
+    """Return the scale of objects in the picture of `half_camera` relative to the full picture."""
     return min(max(width // 2, 1) / max(min(width, height), 1), 1.0)
 
 
 def look_along(camera: ViewCamera, back: Vec3) -> ViewCamera:
-    """The same pivot and distance, seen along −`back` (any length): azimuth and elevation that give it."""
+    """Set azimuth and elevation to look along −`back` (any length). Pivot and distance are unchanged."""
     up = unit(camera.up, (0.0, 1.0, 0.0))
     direction = unit(back, axes(camera).back)
     ahead = front(up)
     height = max(-1.0, min(1.0, dot(direction, up)))
     level = add_scaled(direction, (-height, up))
-    azimuth = camera.azimuth  # straight up or down: the azimuth is free, so it stays
+    azimuth = camera.azimuth  # the azimuth is arbitrary for a vertical direction, so it stays
     if dot(level, level) > 1e-18:
         azimuth = math.degrees(math.atan2(dot(level, cross(up, ahead)), dot(level, ahead)))
-    # atan2 keeps the accuracy near the poles that asin would lose
+    # atan2 is accurate near the poles, asin is not
     elevation = math.degrees(math.atan2(height, math.sqrt(dot(level, level))))
     return replace(camera, azimuth=azimuth, elevation=elevation)
 
 
 def with_up(camera: ViewCamera, up: Vec3) -> ViewCamera:
-    """Another up axis, the eye and the pivot where they are (the picture only rolls upright)."""
+    """Set the up axis. Eye and pivot are unchanged, so the picture only rolls upright."""
     back = axes(camera).back
     return look_along(replace(camera, up=unit(up, camera.up)), back)
 
 
 def move_camera(camera: ViewCamera, by: Vec3) -> ViewCamera:
-    """The same view of a scene that lies elsewhere; files have cameras in the world (`Gaussians.origin`)."""
+    """Translate the camera, to convert between scene and world coordinates of files (`Gaussians.origin`)."""
     return replace(camera, pivot=add_scaled(camera.pivot, (1.0, by)))
 
 
 def look_from(camera: ViewCamera, position: Vec3, pivot: Vec3) -> ViewCamera:
-    """The eye at `position`, looking at `pivot`; the direction stays where the two coincide."""
+    """Move the eye to `position` and look at `pivot`. If they coincide, the direction is unchanged."""
     back = (position[0] - pivot[0], position[1] - pivot[1], position[2] - pivot[2])
     turned = look_along(replace(camera, pivot=pivot), back)
     return replace(turned, distance=max(math.dist(position, pivot), 1e-9))
 
 
 def bounds_of(scene: Gaussians) -> Bounds:
-    """What frames the bulk of a scene, or of one layer's members; far strays do not count."""
+    """Return the bounding sphere of the bulk of a scene, without distant floaters."""
     if not len(scene):
         return Bounds()
     center, radius = scene_sphere(scene)
@@ -266,9 +269,11 @@ def bounds_of(scene: Gaussians) -> Bounds:
 
 
 def frame(camera: ViewCamera, bounds: Bounds, aspect: float = 1.0) -> ViewCamera:
-    """The same direction, with the sphere `bounds` filling the smaller side of the picture.
+    """Frame the sphere `bounds` in the smaller side of the picture. The direction is unchanged.
 
     Args:
+        camera: the camera
+        bounds: sphere to frame, world units
         aspect: width / height of the picture
     """
     half = math.radians(camera.fov_y) / 2
@@ -278,34 +283,38 @@ def frame(camera: ViewCamera, bounds: Bounds, aspect: float = 1.0) -> ViewCamera
 
 
 def fit(camera: ViewCamera, scene: Gaussians, aspect: float = 1.0) -> ViewCamera:
-    """The same direction, with these Gaussians filling `FILL` of the tighter side of the picture.
+    """Frame these Gaussians in the share `FILL` of the picture's tighter side. The direction is unchanged.
 
     Args:
-        scene: of none at all, the surroundings of the origin are framed
-        aspect: width / height of the picture
+        camera: the camera
+        scene: Gaussians to frame; if empty, the unit sphere at the origin is framed
+        aspect: width / height of the picture_axes
     """
     if not len(scene):
         return frame(camera, bounds_of(scene), aspect)
-    picture = axes(camera)
+    picture_axes = axes(camera)
     tangent = math.tan(math.radians(camera.fov_y) / 2)
-    frame_axes = torch.tensor([picture.right, picture.up, picture.back], dtype=torch.float64)
+    frame_axes = torch.tensor([picture_axes.right, picture_axes.up, picture_axes.back], dtype=torch.float64)
     radius = 2 * float(scene.log_scales.amax(dim=1).median().exp())
     position = fit_eye(scene.means, radius, frame_axes, (FILL * tangent * aspect, FILL * tangent))
     x, y, z = (float(c) for c in position)
-    depth = dot((x, y, z), picture.back) - float((scene.means.double() @ frame_axes[2]).median())
+    depth = dot((x, y, z), picture_axes.back) - float((scene.means.double() @ frame_axes[2]).median())
     if not (math.isfinite(x + y + z) and 0.0 < depth < FARTHEST):
         return frame(camera, bounds_of(scene), aspect)
-    return replace(camera, pivot=add_scaled((x, y, z), (-depth, picture.back)), distance=depth)
+    return replace(camera, pivot=add_scaled((x, y, z), (-depth, picture_axes.back)), distance=depth)
 
 
 def fit_subject(camera: ViewCamera, scene: Gaussians, aspect: float = 1.0) -> ViewCamera:
-    """The same direction, filled by what the scene is about (`subject_rows`); in a room the same view."""
+    """Frame the scene's subject (`subject_rows`) from the same direction.
+
+    In a room the camera is unchanged.
+    """
     up = torch.tensor(camera.up)
     return camera if is_room(scene, up) else fit(camera, scene[subject_rows(scene, up)], aspect)
 
 
 def fit_all(camera: ViewCamera, scene: Gaussians, aspect: float = 1.0) -> ViewCamera:
-    """The same direction, filled by what the scene is about; a room is seen from outside, all of it."""
+    """Frame the scene's subject from the same direction, or a whole room from outside."""
     up = torch.tensor(camera.up)
     if not len(scene) or is_room(scene, up):
         return frame(camera, bounds_of(scene), aspect)
@@ -320,17 +329,17 @@ def first_camera(
     up: Vec3 | None = None,
     stored: Camera | None = None,
 ) -> ViewCamera:
-    """Return the first view: the view of the camera stored in the file, or of the scene's subject.
+    """Return the first view: the view of the camera stored in the file, or a view of the scene's subject.
 
     The subject is upright, seen from the front and a little above. The camera of a room is inside, at a wall
     or a corner, with a field of view of at least `INSIDE_FOV` degrees.
 
     Args:
         scene: the original
-        cameras: given with it
+        cameras: cameras of the scene
         aspect: width / height of the picture
         fov_y: vertical field of view, degrees
-        up: unit vector; None asks the cameras and the scene
+        up: unit vector; None estimates it from the cameras and the scene
         stored: the camera in the scene's file (`progdf.formats.ply_view`), whose picture fits into the view
     """
     up = find_scene_up(scene, cameras=cameras).direction if up is None else up
@@ -352,12 +361,13 @@ def first_camera(
 
 
 def from_camera(camera: ViewCamera, seen: Camera, bounds: Bounds) -> ViewCamera:
-    """Where a pinhole camera stands and looks, upright, with its field of view; the pivot is in front of it.
+    """Convert a pinhole camera to an upright viewing camera with the same eye, direction and field of view.
 
     Args:
-        camera: gives the up axis and the mode
+        camera: source of the up axis and the mode
         seen: the pinhole camera
-        bounds: of the scene; the pivot is at the depth of its center, where that is in front
+        bounds: bounds of the scene; the pivot is at the depth of their center, or at their radius if it is
+            behind
     """
     world = torch.linalg.inv(seen.viewmat.double()).tolist()
     position: Vec3 = (world[0][3], world[1][3], world[2][3])

@@ -1,4 +1,4 @@
-"""Views that have a name, and what lies between two views: glides, and numbers and cameras of keys."""
+"""Named views, glides between cameras, and interpolation of keyed numbers and cameras."""
 
 from __future__ import annotations
 
@@ -14,19 +14,23 @@ from pyrr import matrix33, quaternion
 from .view_camera import Vec3, ViewCamera, axes, dot, look_along
 
 EASINGS = ("smooth", "linear", "hold")
-"""Between keys. "smooth" is the monotone cubic of Fritsch and Carlson (SIAM J. Numer. Anal. 17, 1980): it
-leaves the first key and comes to the last gently, passes through the others without a halt, rests at every
-turning point, and never leaves the range of its neighbors, so a strength of 0..1 stays in 0..1.
+"""Interpolations between keys.
+
+"smooth" is the monotone cubic of Fritsch and Carlson (SIAM J. Numer. Anal. 17, 1980). It starts and ends
+gently, passes through the other keys without stopping, and has zero slope at turning points. It never leaves
+the range of the two neighboring keys, so a strength stays within 0 to 1.
 """
 Point = tuple[int, str, float]
-"""Frame, how it goes on from there (of `EASINGS`), and the value."""
+"""Key of a number: frame, easing to the next key (one of `EASINGS`), value."""
 
 
 def value_between(points: Sequence[Point], frame: float) -> float:
-    """A track's value at a frame, exact at its points; it rests before the first and after the last.
+    """Interpolate a track at a frame. It is exact at its points and constant before the first and after the
+    last.
 
     Args:
-        points: at least one, by rising frames
+        points: at least one point, by ascending frame
+        frame: the frame, which may lie between whole frames
     """
     i, share = _find_segment([point[0] for point in points], frame)
     _, easing, start = points[i]
@@ -36,21 +40,23 @@ def value_between(points: Sequence[Point], frame: float) -> float:
     if easing == "linear":
         return start + share * (end - start)
     span = points[i + 1][0] - points[i][0]
-    leave = _slope(points, i) * span
-    come = _slope(points, i + 1) * span
+    start_slope = _slope(points, i) * span
+    end_slope = _slope(points, i + 1) * span
     eased = share * share * (3.0 - 2.0 * share)
-    bend = share * (1.0 - share) * ((1.0 - share) * leave - share * come)
-    reached = start + eased * (end - start) + bend
-    return min(max(reached, min(start, end)), max(start, end))  # the last bits of a sum
+    bend = share * (1.0 - share) * ((1.0 - share) * start_slope - share * end_slope)
+    value = start + eased * (end - start) + bend
+    return min(max(value, min(start, end)), max(start, end))  # clamps rounding errors
 
 
 def camera_between(keys: Sequence[tuple[int, str, ViewCamera]], frame: float) -> ViewCamera:
-    """The camera at a frame: a path of pivots, distances in proportion, the shortest way around.
+    """Interpolate the camera at a frame.
 
-    Where two keys have different up axes the whole orientation turns along the shortest arc instead.
+    `value_between` interpolates the pivot, the angles and the logarithm of the distance. The azimuth takes the
+    shorter way around. Between keys with different up axes, slerp interpolates the whole orientation.
 
     Args:
-        keys: frame, easing, camera; at least one, by rising frames
+        keys: frame, easing and camera; at least one, by ascending frame
+        frame: the frame, which may lie between whole frames
     """
     frames = [key[0] for key in keys]
     i, share = _find_segment(frames, frame)
@@ -83,7 +89,7 @@ def camera_between(keys: Sequence[tuple[int, str, ViewCamera]], frame: float) ->
 
 
 def unwrap(degrees: Sequence[float]) -> list[float]:
-    """The same angles, each within half a turn of the one before it."""
+    """Unwrap angles so that each is within 180° of the previous one."""
     angles = list(degrees[:1])
     for angle in degrees[1:]:
         angles.append(angles[-1] + (angle - angles[-1] + 180.0) % 360.0 - 180.0)
@@ -91,18 +97,18 @@ def unwrap(degrees: Sequence[float]) -> list[float]:
 
 
 def _slerp(placed: ViewCamera, here: ViewCamera, there: ViewCamera, share: float) -> ViewCamera:
-    """`placed` with an orientation between two others; its up axis is what is up in the picture then."""
+    """Return `placed` with the interpolated orientation of two cameras. Its up axis is the picture's up."""
     between = quaternion.normalize(quaternion.slerp(_orientation(here), _orientation(there), share))
     _, up, back = matrix33.create_from_quaternion(between)
     return look_along(replace(placed, up=_vec3(up)), _vec3(back))
 
 
 def _orientation(camera: ViewCamera) -> NDArray[np.float64]:
-    """The picture's axes as a unit quaternion, xyzw as pyrr has them. [4]"""
+    """Return the picture's axes as a unit quaternion, xyzw as in pyrr. [4]"""
     picture = axes(camera)
     rows = np.array([picture.right, picture.up, picture.back], dtype=np.float64)
-    turned: NDArray[np.float64] = quaternion.create_from_matrix(rows)
-    return turned
+    orientation: NDArray[np.float64] = quaternion.create_from_matrix(rows)
+    return orientation
 
 
 def _vec3(row: NDArray[np.float64]) -> Vec3:
@@ -110,7 +116,7 @@ def _vec3(row: NDArray[np.float64]) -> Vec3:
 
 
 def _find_segment(frames: Sequence[int], frame: float) -> tuple[int, float]:
-    """Which point comes before a frame, and how much of the way to the next one lies behind, 0..1."""
+    """Return the index of the last point up to a frame, and the share of the interval covered, 0 to 1."""
     if frame <= frames[0]:
         return 0, 0.0
     for i, (start, end) in enumerate(pairwise(frames)):
@@ -120,17 +126,19 @@ def _find_segment(frames: Sequence[int], frame: float) -> tuple[int, float]:
 
 
 def _slope(points: Sequence[Point], i: int) -> float:
-    """Change per frame at a point: none at the ends, at turning points, and beside what is not smooth."""
+    """Return the slope per frame at a point: 0 at the ends, at turning points and beside other easings."""
     if not 0 < i < len(points) - 1 or points[i - 1][1] != "smooth" or points[i][1] != "smooth":
         return 0.0
     (a, _, x), (b, _, y), (c, _, z) = points[i - 1 : i + 2]
-    into = (y - x) / (b - a)
-    out = (z - y) / (c - b)
-    if into * out <= 0.0:
+    slope_before = (y - x) / (b - a)
+    slope_after = (z - y) / (c - b)
+    if slope_before * slope_after <= 0.0:
         return 0.0
     left = 2 * (c - b) + (b - a)
     right = (c - b) + 2 * (b - a)
-    return (left + right) / (left / into + right / out)  # Fritsch and Butland's mean: never overshoots
+    return (left + right) / (
+        left / slope_before + right / slope_after
+    )  # Fritsch and Butland's mean: never overshoots
 
 
 NAMED_VIEWS = {
@@ -141,7 +149,7 @@ NAMED_VIEWS = {
     "top": (0.0, 90.0),
     "bottom": (0.0, -90.0),
 }
-"""Azimuth and elevation, degrees, in the scene's own frame: whatever axis is up in its file."""
+"""Azimuth and elevation in degrees, relative to the scene's up axis."""
 
 AXES: dict[str, Vec3] = {
     "+X": (1.0, 0.0, 0.0),
@@ -151,39 +159,39 @@ AXES: dict[str, Vec3] = {
     "-Y": (0.0, -1.0, 0.0),
     "-Z": (0.0, 0.0, -1.0),
 }
-"""Directions of the world, as the scene's file has them."""
+"""World directions in the coordinates of the scene's file."""
 
-GLIDE_S = 0.25
-_STEPS = 1000  # of a glide, between which nothing is rounded away
-_ALONG = 1.0 - 1e-6
+GLIDE_S = 0.25  # duration of a glide, s
+_GLIDE_STEPS = 1000  # time steps of a glide, fine enough for smooth motion
+_PARALLEL_COSINE = 1.0 - 1e-6  # cosine above which an axis counts as the up axis
 
 
 def look_at_view(camera: ViewCamera, name: str) -> ViewCamera:
-    """The same pivot and distance from a side of `NAMED_VIEWS`, or from an end of `AXES`."""
+    """Look from a side of `NAMED_VIEWS` or an axis of `AXES`. Pivot and distance are unchanged."""
     if name in NAMED_VIEWS:
         azimuth, elevation = NAMED_VIEWS[name]
         return replace(camera, azimuth=azimuth, elevation=elevation)
     upright = dot(AXES[name], camera.up)
-    if abs(upright) > _ALONG:
+    if abs(upright) > _PARALLEL_COSINE:
         return look_at_view(camera, "top" if upright > 0.0 else "bottom")
     return look_along(camera, AXES[name])
 
 
 @dataclass(frozen=True)
 class Glide:
-    """A camera on its way."""
+    """Animation from one camera to another."""
 
-    start: ViewCamera  # start, end: where from and where to
+    start: ViewCamera
     end: ViewCamera
-    seconds: float = 0.0  # under way so far
+    seconds: float = 0.0  # elapsed time
 
     @property
     def camera(self) -> ViewCamera:
-        """Where it is; exact at its ends."""
+        """Current camera, exact at both ends."""
         if self.is_over:
             return self.end
-        step = round(_STEPS * self.seconds / GLIDE_S)
-        return camera_between([(0, "smooth", self.start), (_STEPS, "smooth", self.end)], step)
+        step = round(_GLIDE_STEPS * self.seconds / GLIDE_S)
+        return camera_between([(0, "smooth", self.start), (_GLIDE_STEPS, "smooth", self.end)], step)
 
     @property
     def is_over(self) -> bool:
@@ -191,10 +199,12 @@ class Glide:
 
 
 def glide_on(glide: Glide, current: ViewCamera, seconds: float) -> Glide | None:
-    """So much later; None where it is over, or the hand has taken the camera elsewhere.
+    """Advance a glide. Return None if it has ended or the user has moved the camera.
 
     Args:
+        glide: the glide
         current: the camera on screen
+        seconds: time since the last call
     """
     if glide.is_over or current != glide.camera:
         return None
