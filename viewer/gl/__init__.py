@@ -1,1 +1,1 @@
-"""Everything that owns a GL object."""
+"""OpenGL resources: programs, textures, buffers and passes."""

@@ -1,4 +1,4 @@
-"""A finished picture on its way into a window's framebuffer."""
+"""Copying of finished pictures into a window's framebuffer."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from .programs import load_program
 
 
 class Presenter:
-    """Copies a picture whose row 0 is on top into a framebuffer whose row 0 is at the bottom."""
+    """Pass that copies a picture with row 0 on top into a framebuffer with row 0 at the bottom."""
 
     def __init__(self, ctx: moderngl.Context) -> None:
         self.ctx = ctx
-        # two programs: software GL would pay for both ways in every pixel of one
+        # two programs, as software GL would execute both branches of one in every pixel
         self._program = load_program(ctx, "present.vert", "present.frag")
         self._stretch = load_program(ctx, "present.vert", "stretch.frag")
         self._vao = ctx.vertex_array(self._program, [])
@@ -29,8 +29,14 @@ class Presenter:
         size: tuple[int, int] | None = None,
         left: int = 0,
     ) -> None:
-        """Fill the lower `size` pixels of `framebuffer`, from the column `left` on, with `picture`: pixel by
-        pixel where it has as many (which is what None means), else smoothly."""
+        """Fill the lower `size` pixels of `framebuffer`, from column `left`, with `picture`.
+
+        Args:
+            picture: the picture
+            framebuffer: target
+            size: width and height, px; None for the picture's own size, another size scales it smoothly
+            left: first column, px
+        """
         size = size or picture.size
         framebuffer.use()
         self.ctx.viewport = (left, 0, *size)
@@ -53,12 +59,14 @@ class Presenter:
 
 
 class ScreenCopy:
-    """A picture that the processor has, as bytes beside a framebuffer: software GL copies these ten times
-    faster than it draws them.
+    """Byte copy of a picture in CPU memory, beside a framebuffer.
+
+    Software GL copies it ten times faster than it draws it.
 
     Args:
-        size: width and height that the picture fills, pixels; stretched smoothly if these are not its own
-        left: the column of the framebuffer at which it begins
+        ctx: GL context
+        size: width and height that the picture fills, px; a picture of another size is scaled smoothly
+        left: first column in the framebuffer, px
     """
 
     def __init__(self, ctx: moderngl.Context, size: tuple[int, int], left: int) -> None:
@@ -70,13 +78,13 @@ class ScreenCopy:
         self._screen = np.empty((size[1], size[0], 4), np.uint8)
 
     def write(self, image: NDArray[np.float32], top: int | None = None) -> None:
-        """Take a whole picture, or, as it is, the rows from `top` on. [H,W,3]"""
+        """Write a whole picture, or unscaled rows from row `top` on. [H,W,3]"""
         last = self.size[1] - (top or 0)
         fill_screen(image, self._screen if top is None else self._screen[last - len(image) : last])
         self._texture.write(self._screen, viewport=(self.left, 0, *self.size))
 
     def show(self, framebuffer: moderngl.Framebuffer) -> None:
-        """Lay the picture into the lower left of a framebuffer, as far as its scissor goes."""
+        """Copy the picture to the lower left of a framebuffer, within its scissor rectangle."""
         framebuffer.use()
         if self.left:
             framebuffer.scissor = (self.left, 0, *self.size)
@@ -90,7 +98,7 @@ class ScreenCopy:
 
 
 def picture_texture(ctx: moderngl.Context, pixels: NDArray[np.uint8]) -> moderngl.Texture:
-    """A small picture [H,W,3] for the panel."""
+    """Create a texture of a small picture [H,W,3] for the panel."""
     height, width, _ = pixels.shape
     texture = ctx.texture((width, height), 3, np.ascontiguousarray(pixels).tobytes(), alignment=1)
     texture.filter = moderngl.LINEAR, moderngl.LINEAR
@@ -98,9 +106,9 @@ def picture_texture(ctx: moderngl.Context, pixels: NDArray[np.uint8]) -> moderng
 
 
 def read_rgb(framebuffer: moderngl.Framebuffer, size: tuple[int, int]) -> NDArray[np.uint8]:
-    """Its lower left `size` pixels (width, height), upper row first. [H,W,3] uint8
+    """Read the lower left `size` pixels (width, height), upper row first. [H,W,3] uint8
 
-    The size is asked for since a window's framebuffer does not know its own after a resize.
+    The size is a parameter because a window's framebuffer does not know its own size after a resize.
     """
     width, height = size
     packed = framebuffer.read((0, 0, width, height), components=3, alignment=1)

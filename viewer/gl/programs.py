@@ -1,4 +1,4 @@
-"""GLSL programs from the package `shaders`: includes resolved, errors told as file:line."""
+"""GLSL programs from the package `shaders`, with resolved includes and errors reported as file:line."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def load_program(
     """Compile and link `shaders/VERTEX` and, unless only `varyings` are captured, `shaders/FRAGMENT`.
 
     Raises:
-        ShaderError: the driver refuses it; the message gives file:line of each complaint.
+        ShaderError: the driver rejects it; the message gives file:line of each error.
     """
     sources = [load_source(name) for name in (vertex, fragment) if name is not None]
     try:
@@ -35,7 +35,7 @@ def load_program(
 
 
 def _first_line(log: str, vertex: str, fragment: str | None, sources: list[Source]) -> str:
-    """The driver's log with its file numbers replaced by names."""
+    """Return the driver's log with its file numbers replaced by names."""
     stage = sources[-1] if "fragment_shader" in log else sources[0]
     complaints = []
     for line in log.splitlines():

@@ -1,4 +1,4 @@
-"""The scene on the GPU: raw attributes in textures, of which only what changed is sent again."""
+"""Scene on the GPU: raw attributes in textures, with partial uploads of changed rows."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from progdf.gaussians import ATTRIBUTES, Gaussians
 
 SPLATS_PER_ROW = 512
-"""Gaussians in a row of the scene's textures: with 15 SH texels each a row fits the 8192 of small GPUs."""
+"""Number of Gaussians per texture row. With 15 SH texels each, a row fits the 8192 texels of small GPUs."""
 
 MEAN_LOGIT = np.dtype([("mean", "<f4", 3), ("logit_opacity", "<f4")])
 LOG_SCALE = np.dtype([("log_scale", "<f4", 3), ("unused", "<f4")])
@@ -21,21 +21,21 @@ QUAT = np.dtype([("quat", "<f4", 4)])
 SH0 = np.dtype([("sh0", "<f4", 3), ("unused", "<f4")])
 
 SPLAT_TEXTURES = {"mean_logit": MEAN_LOGIT, "log_scale": LOG_SCALE, "quat": QUAT, "sh0": SH0}
-"""Sampler in shaders/include/raw_splats.glsl -> one texel of it; raw parameters, 16 bytes each.
+"""Samplers in shaders/include/raw_splats.glsl and their texels: raw parameters, 16 bytes each.
 
-Bands 1 to 3 lie in `shN`: rgb32f, K texels a Gaussian.
+SH bands 1 to 3 are in `shN`: rgb32f, K texels per Gaussian.
 """
 
 HIGHLIGHT = np.dtype([("rgb", "u1", 3), ("share", "u1")])
-"""What is drawn over a Gaussian's color; a texel of `highlight` in shaders/project.vert, 0..255 as 0..1."""
+"""Highlight of a Gaussian: a texel of `highlight` in shaders/project.vert, 0 to 255 read as 0 to 1."""
 
 SHOWN_SH = 15
-"""Largest K: coefficients above degree 3 ride along in the scene and are not shown."""
+"""Largest K. SH coefficients above degree 3 stay in the scene but are not drawn."""
 
 
 @dataclass(frozen=True)
 class TextureSlot:
-    """Where an attribute lies: the texture, its first component there, and how many."""
+    """Location of an attribute: texture, first component, number of components."""
 
     texture: str
     component: int
@@ -50,29 +50,32 @@ PLACES = {
     "sh0": TextureSlot("sh0", 0, 3),
     "shN": TextureSlot("shN", 0, 3),
 }
-"""Attribute -> its place in each of its texels."""
+"""Location of each attribute."""
 
 PROJECTED = np.dtype([("center", "<f4", 2), ("shape", "<f4", 3), ("r2", "<f4"), ("rgb_opacity", "<f4", 4)])
-"""One projected Gaussian, written by shaders/project.vert and read by shaders/splat.vert. 40 bytes."""
+"""Projected Gaussian, written by shaders/project.vert and read by shaders/splat.vert. 40 bytes."""
 
 ORDER = np.dtype("<u4")
-"""One row index of the scene, in drawing order; `splat` in shaders/project.vert."""
+"""Row index of the scene, in drawing order; `splat` in shaders/project.vert."""
 
 GRID_LINE = np.dtype([("ends", "<f4", 4), ("depths", "<f4", 2), ("cells", "<f4", 4), ("color", "<f4", 4)])
-"""A line of the grid on the ground: both ends in pixels of the picture, their depths, where they lie in the
-grid (at 1 it has faded), and its color with the share that it takes; read by shaders/grid.vert."""
+"""Line of the ground grid, read by shaders/grid.vert.
+
+It holds both ends in picture pixels, their depths, their grid positions (1 is fully faded), and rgb with
+alpha.
+"""
 
 
-_GAP = 4  # texture rows: uploading so many untouched ones costs less than another call
+_MAX_GAP_ROWS = 4  # unchanged texture rows to upload rather than start another call
 
 
 class SplatTextures:
-    """The raw attributes of a scene in textures, with a copy in memory that partial uploads are taken from.
+    """Textures of a scene's raw attributes, with a copy in memory as the source of partial uploads.
 
     Args:
-        ctx: where they live
+        ctx: GL context
         count: N
-        sh_coefficients: K of shN that are shown: 0, 3, 8 or 15
+        sh_coefficients: number K of drawn shN coefficients: 0, 3, 8 or 15
     """
 
     def __init__(self, ctx: moderngl.Context, count: int, sh_coefficients: int) -> None:
@@ -100,15 +103,15 @@ class SplatTextures:
     def write(
         self, scene: Gaussians, attributes: Iterable[str] = ATTRIBUTES, rows: NDArray[np.int64] | None = None
     ) -> int:
-        """Upload what changed.
+        """Upload the changed attributes of the changed rows.
 
         Args:
-            scene: the present values, N rows
-            attributes: names of `ATTRIBUTES` that changed
-            rows: sorted indices of the Gaussians that changed; None is all
+            scene: the current values, N rows
+            attributes: changed attributes, names of `ATTRIBUTES`
+            rows: sorted indices of the changed Gaussians; None for all
 
         Returns:
-            Bytes sent.
+            Number of uploaded bytes.
         """
         runs = [(0, self.rows)] if rows is None else list(row_runs(rows))
         dirty = []
@@ -123,7 +126,7 @@ class SplatTextures:
             numbers = values.reshape(self.count, width, texel.components).numpy()
             memory = self._memory[texel.texture].reshape(self.rows * SPLATS_PER_ROW, width, -1)
             memory = memory[..., texel.component : texel.component + texel.components]
-            # whole runs: gathering the changed rows alone takes several times longer
+            # whole runs, as gathering only the changed rows takes several times longer
             for first, last in runs:
                 begin = first * SPLATS_PER_ROW
                 end = min(last * SPLATS_PER_ROW, self.count)
@@ -133,7 +136,7 @@ class SplatTextures:
         return sum(_send(self._memory[name], self.textures[name], runs) for name in dirty)
 
     def bind(self, program: moderngl.Program) -> None:
-        """Make them what the samplers of `include/raw_splats.glsl` read."""
+        """Bind the textures to the samplers of `include/raw_splats.glsl`."""
         for unit, (name, texture) in enumerate(self.textures.items()):
             texture.use(unit)
             program[name] = unit
@@ -145,7 +148,7 @@ class SplatTextures:
 
 
 def _send(memory: np.ndarray, texture: moderngl.Texture, runs: Iterable[tuple[int, int]]) -> int:
-    """Upload texture rows [first, last); the bytes sent."""
+    """Upload texture rows [first, last) of each run. Return the number of bytes."""
     sent = 0
     for first, last in runs:
         part = memory[first * SPLATS_PER_ROW : last * SPLATS_PER_ROW]
@@ -155,11 +158,11 @@ def _send(memory: np.ndarray, texture: moderngl.Texture, runs: Iterable[tuple[in
 
 
 def row_runs(rows: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
-    """Texture rows [first, last) that hold the Gaussians `rows` (sorted), near ones joined."""
+    """Yield the texture rows [first, last) that hold the sorted Gaussians `rows`, with small gaps closed."""
     if not len(rows):
         return
     texture_rows = rows // SPLATS_PER_ROW
-    breaks = np.flatnonzero(np.diff(texture_rows) > _GAP)
+    breaks = np.flatnonzero(np.diff(texture_rows) > _MAX_GAP_ROWS)
     firsts = texture_rows[np.concatenate([[0], breaks + 1])]
     lasts = texture_rows[np.concatenate([breaks, [len(texture_rows) - 1]])]
     for first, last in zip(firsts, lasts, strict=True):
@@ -167,11 +170,12 @@ def row_runs(rows: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
 
 
 class HighlightTexture:
-    """rgb and the share of it, laid out as the scene's textures are; 0 leaves a Gaussian its own color,
-    255 hides it.
+    """Texture of highlights (rgb and share) in the layout of the scene's textures.
+
+    A share of 0 keeps a Gaussian's own color, 255 hides it.
 
     Args:
-        ctx: where it lives
+        ctx: GL context
         count: N
     """
 
@@ -182,22 +186,22 @@ class HighlightTexture:
         self._texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
 
     def write(self, rows: NDArray[np.int64], highlights: NDArray[np.uint8]) -> None:
-        """Take other highlights [R,4] for Gaussians (sorted)."""
+        """Set the highlights [R,4] of the sorted Gaussians `rows` [R]."""
         self._memory[rows] = highlights
         _send(self._memory, self._texture, row_runs(rows))
 
     def read(self) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-        """Which Gaussians are not in their own colors, and in which. [R] and [R,4]"""
+        """Return the highlighted rows and their highlights. [R] and [R,4]"""
         rows = np.flatnonzero(self._memory[:, 3])
         return rows, self._memory[rows]
 
     @property
     def empty(self) -> bool:
-        """Whether it leaves every Gaussian its own color."""
+        """True if no Gaussian is highlighted."""
         return not self._memory[:, 3].any()
 
     def bind(self, program: moderngl.Program, unit: int) -> None:
-        """Make it what the sampler `highlight` of `program` reads."""
+        """Bind the texture to the sampler `highlight` of `program`."""
         self._texture.use(unit)
         program["highlight"] = unit
 

@@ -1,4 +1,4 @@
-"""The pass that draws a scene: project every Gaussian once, then blend triangles back to front."""
+"""Splat pass: project every Gaussian once, then blend triangles back to front."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Rgb = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class _Buffers:
-    """What is as long as the scene: drawing order, projected Gaussians, and how the programs read them."""
+    """Buffers with one entry per Gaussian (drawing order, projections) and their vertex arrays."""
 
     order: moderngl.Buffer
     projected: moderngl.Buffer
@@ -35,7 +35,7 @@ class _Buffers:
 
 @dataclass(frozen=True)
 class _Target:
-    """The picture: premultiplied rgb over the background, and 1 − transmittance. RGBA32F"""
+    """Target picture: premultiplied rgb over the background, and 1 − transmittance. RGBA32F"""
 
     texture: moderngl.Texture
     framebuffer: moderngl.Framebuffer
@@ -46,11 +46,13 @@ class _Target:
 
 
 class SplatRenderer:
-    """Draws a scene into an RGBA32F texture; row 0 of it is the first row of the picture.
+    """Renderer of a scene into an RGBA32F texture. Row 0 of the texture is the top row of the picture.
 
-    The CPU engine (as 3DGS) leaves out a Gaussian that would bring a pixel's transmittance to 1e-4 or below,
-    and all behind it. Blending from the back cannot know what will cover a pixel, so here they count: at most
-    0.01 of a color, 76 to 80 dB in a picture. Without that rule the two agree to 120 dB and more.
+    The CPU engine, like 3DGS, skips a Gaussian that would reduce a pixel's transmittance to 1e-4 or below,
+    and all Gaussians behind it. Back-to-front blending draws them, as it does not know the later Gaussians in
+    front. The difference is at most 0.01 of a color, 76 to 80 dB in a picture. Without that rule the engines
+    agree
+    to 120 dB and more.
     """
 
     def __init__(self, ctx: moderngl.Context) -> None:
@@ -62,27 +64,28 @@ class SplatRenderer:
         self._buffers: _Buffers | None = None
         self._target: _Target | None = None
         self._drawn = 0
-        # antialiased: whether the scene is drawn so; activated: whether it has opacities for logits
+        # activated: the scene has opacities in place of logits
         self._antialiased = self._activated = False
 
     @property
     def textures(self) -> SplatTextures:
-        """The scene as it is drawn."""
+        """Textures of the drawn scene."""
         assert self._scene is not None, "upload comes first"
         return self._scene
 
     @property
     def highlights(self) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-        """Which Gaussians are highlighted and how, as `highlight` takes them."""
+        """Highlighted rows and their highlights, in the format of `highlight`."""
         if self._highlights is None:
             return np.zeros(0, np.int64), np.zeros((0, 4), np.uint8)
         return self._highlights.read()
 
     def upload(self, scene: Gaussians, activated: bool = False) -> int:
-        """Take a whole scene; gives the bytes sent. The order has to be set anew.
+        """Upload a whole scene and return the number of bytes. Afterwards the order must be set again.
 
         Args:
-            activated: its logits are opacities, which may be more than 1
+            scene: the scene
+            activated: its logits are opacities, which may be above 1
         """
         count = len(scene)
         coefficients = min(int(scene.shN.shape[1]), SHOWN_SH)
@@ -98,11 +101,11 @@ class SplatRenderer:
         return self.textures.write(scene)
 
     def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> int:
-        """Take the changed attributes of the changed rows (sorted); gives the bytes sent."""
+        """Upload the changed attributes of the changed sorted rows and return the number of bytes."""
         return self.textures.write(scene, attributes, rows)
 
     def highlight(self, rows: NDArray[np.int64], highlights: NDArray[np.uint8]) -> None:
-        """Draw Gaussians (sorted) in other colors: rgb and its share, 0..255. [R,4]"""
+        """Override the colors of the sorted Gaussians `rows` by highlights: rgb and share, 0 to 255. [R,4]"""
         self._highlights = self._highlights or HighlightTexture(self.ctx, self.textures.count)
         self._highlights.write(rows, highlights)
         if self._highlights.empty:
@@ -110,7 +113,7 @@ class SplatRenderer:
             self._highlights = None
 
     def set_order(self, order: NDArray[np.uint32]) -> None:
-        """Which Gaussians are drawn, farthest first; see `viewer.render.gl_renderer`."""
+        """Set the rows to draw, farthest first; see `viewer.render.gl_renderer`."""
         assert self._buffers is not None, "upload comes first"
         self._drawn = len(order)
         if self._drawn:
@@ -131,7 +134,7 @@ class SplatRenderer:
             self._release_target()
             self._target = self._make_target(size)
         target = self._target
-        target.framebuffer.use()  # also for the transform feedback: without a framebuffer it writes zeros
+        target.framebuffer.use()  # also for transform feedback, which writes zeros without one
         target.framebuffer.clear(*background, 0.0)
         if self._drawn and self._scene is not None and self._buffers is not None:
             self._scene.bind(self._project)
@@ -150,7 +153,7 @@ class SplatRenderer:
         return target.texture
 
     def release(self) -> None:
-        """Give everything back; the renderer is of no use afterwards."""
+        """Release all GL objects. The renderer is unusable afterwards."""
         self._release_target()
         self._release_scene()
         self._project.release()
@@ -174,7 +177,7 @@ class SplatRenderer:
 
     def _release_target(self) -> None:
         if self._target is not None:
-            # moderngl will bind the present one again, which then must not be a deleted one
+            # moderngl binds the current framebuffer again later, so it must not be a deleted one
             self.ctx.detect_framebuffer(0).use()
             self._target.release()
             self._target = None
@@ -187,19 +190,19 @@ class SplatRenderer:
 
 
 def vertex_format(dtype: np.dtype[Any]) -> str:
-    """moderngl's words for a dtype of float32 fields, e.g. "2f 3f 1f 4f"."""
+    """Return moderngl's format string for a dtype of float32 fields, e.g. "2f 3f 1f 4f"."""
     widths = (int(np.prod(dtype[name].shape, dtype=int)) for name in dtype.names or ())
     return " ".join(f"{width}f" for width in widths)
 
 
 def _set_camera(program: moderngl.Program, camera: Camera) -> None:
-    """The uniforms of project.vert; see there."""
+    """Set the camera uniforms of project.vert."""
     viewmat = camera.viewmat.double().numpy()
-    # not −Rᵀt: a viewmat's rotation is one only within rounding, and coordinates may be large
+    # not −Rᵀt: the rotation is orthonormal only up to rounding, and coordinates may be large
     eye = np.linalg.solve(viewmat[:3, :3], -viewmat[:3, 3])
     high = eye.astype(np.float32)
     K = camera.K.double().numpy()
-    program["rotation"] = tuple(viewmat[:3, :3].T.ravel())  # GL wants columns
+    program["rotation"] = tuple(viewmat[:3, :3].T.ravel())  # column-major for GL
     program["eye_high"] = tuple(high)
     program["eye_low"] = tuple(eye - high)
     program["intrinsics"] = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
@@ -207,10 +210,10 @@ def _set_camera(program: moderngl.Program, camera: Camera) -> None:
 
 
 class GridPass:
-    """Draws lines behind the splats of a picture that is already in a framebuffer.
+    """Pass that draws grid lines behind the splats of a picture in a framebuffer.
 
     Args:
-        ctx: to draw in
+        ctx: GL context
     """
 
     def __init__(self, ctx: moderngl.Context) -> None:
@@ -228,11 +231,14 @@ class GridPass:
         size: tuple[int, int],
         left: int = 0,
     ) -> None:
-        """Draw into the lower `size` pixels of `framebuffer` from the column `left` on.
+        """Draw into the lower `size` pixels of `framebuffer`, from column `left`.
 
         Args:
-            lines: of `GRID_LINE`, in pixels of the picture. [L]
-            picture: what is there; its alpha is what the scene covers of a pixel
+            lines: lines in pixels of the picture. [L] `GRID_LINE`
+            picture: the picture in the framebuffer; its alpha is the scene's coverage of a pixel
+            framebuffer: target
+            size: width and height, px
+            left: first column, px
         """
         if not len(lines):
             return
@@ -242,8 +248,8 @@ class GridPass:
         self._ctx.viewport = (left, 0, *size)
         self._ctx.enable_only(moderngl.BLEND)
         self._ctx.blend_equation = moderngl.FUNC_ADD, moderngl.FUNC_ADD
-        ways = (moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ZERO, moderngl.ONE)
-        self._ctx.blend_func = ways  # type: ignore[assignment]  # its annotation forgets that alpha has its own
+        blend_factors = (moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ZERO, moderngl.ONE)
+        self._ctx.blend_func = blend_factors  # type: ignore[assignment]  # its annotation lacks separate factors for alpha
         picture.use(0)
         self._program["picture"] = 0
         self._program["shown_size"] = size
