@@ -51,8 +51,8 @@ def value_between(points: Sequence[Point], frame: float) -> float:
 def camera_between(keys: Sequence[tuple[int, str, ViewCamera]], frame: float) -> ViewCamera:
     """Interpolate the camera at a frame.
 
-    `value_between` interpolates the pivot, the angles and the logarithm of the distance. The azimuth takes the
-    shorter way around. Between keys with different up axes, slerp interpolates the whole orientation.
+    `value_between` interpolates the pivot, the angles and the logarithm of the distance. The azimuth takes
+    the shorter way around. Between keys with different up axes, slerp interpolates the whole orientation.
 
     Args:
         keys: frame, easing and camera; at least one, by ascending frame
