@@ -61,8 +61,9 @@ class Adapter:
 
     def paint_size(self, width: float, height: float, size: int) -> tuple[int, int]:
         """Return the width and height at which to paint a picture of these proportions.
-         Both are multiples of 32, with about the area of `size`². Pipelines that rescale their input to
-        their own area leave this size unchanged.
+
+        Both are multiples of 32, with about the area of `size`². Pipelines that rescale their input to their
+        own area leave this size unchanged.
         """
         ratio = width / height
         for _ in range(4):
@@ -156,8 +157,9 @@ class PipelineRequest:
 
     def ask(self, pictures: Sequence[Tensor], seed: int) -> dict[str, object]:
         """Return the arguments of a call.
-         Every call with one seed starts from the same noise, so that details that the prompt leaves open
-        agree between views.
+
+        Every call with one seed starts from the same noise, so that details that the prompt leaves open agree
+        between views.
         """
         import diffusers
 

@@ -39,8 +39,9 @@ class DecalPlacement:
 
 def parse_place(text: str, camera: Camera) -> DecalPlacement:
     """Parse `x,y,size[,angle]`.
-     x, y and size are in pixels of the camera's picture. If none exceeds 1, they are shares: x of the
-    width, y of the height, size of the longer side. The angle is in degrees, counterclockwise.
+
+    x, y and size are in pixels of the camera's picture. If none exceeds 1, they are shares: x of the width, y
+    of the height, size of the longer side. The angle is in degrees, counterclockwise.
 
     Raises:
         ProgdfError: the text is not such numbers, or they lie outside the picture.

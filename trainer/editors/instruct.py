@@ -1,8 +1,9 @@
 """Editor `instruct:"turn him into Batman"`: pictures edited by a text instruction, at any strength.
- Every view is rendered again for the model: the region's box with a margin, at the size that the model was
+
+Every view is rendered again for the model: the region's box with a margin, at the size that the model was
 trained for. The output is cached at that size and shrunk into the training picture. InstructPix2Pix is the
-editor of the ProGDF paper. The other models are newer and larger (`adapters`). No model has a strength of
-its own: it comes from `mixed_steps`.
+editor of the ProGDF paper. The other models are newer and larger (`adapters`). No model has a strength of its
+own: it comes from `mixed_steps`.
 """
 
 from __future__ import annotations
@@ -110,8 +111,9 @@ class InstructEditor:
 
     def paste(self, view: View, painted: Tensor) -> Tensor:
         """Add the change of the frame, shrunk by area averaging, to the view. [h,w,3] -> [H,W,3]
-         The change is added because a shrunk large render has a PSNR of only about 32 dB to the small
-        training render.
+
+        The change is added because a shrunk large render has a PSNR of only about 32 dB to the small training
+        render.
         """
         x0, y0, x1, y1 = self.frame(view)[0]
         edited = view.image.clone()

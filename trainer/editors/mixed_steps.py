@@ -1,11 +1,12 @@
 """Source-mixed sampling: an edit at any strength with any diffusers pipeline.
 
     p ← w p + (1 − w) p_src,     w_i(s) = clip((s (1 + soft) − (1 − i/n)) / soft, 0, 1),     i = 0..n − 1
- p is the network's prediction at step i of n. p_src = (x − src) / σ is the prediction that leads straight
-to the source, both for a flow's velocity and for Euler's noise. At strength 0 all steps lead to the source.
-At strength 1 no step is changed, so the picture equals the stock pipeline's bit for bit. The source is
-captured among the pipeline's own latents, so one implementation serves all pipelines, whatever their
-packing. Steps with weight 0 skip the network.
+
+p is the network's prediction at step i of n. p_src = (x − src) / σ is the prediction that leads straight to
+the source, both for a flow's velocity and for Euler's noise. At strength 0 all steps lead to the source. At
+strength 1 no step is changed, so the picture equals the stock pipeline's bit for bit. The source is captured
+among the pipeline's own latents, so one implementation serves all pipelines, whatever their packing. Steps
+with weight 0 skip the network.
 
 Reasons for softness 1: docs/experiments.md, The degree of a text edit.
 """
@@ -83,8 +84,9 @@ class MixedSteps:
         softness: float,
     ) -> Tensor:
         """Return the pipeline's result at a strength. [H,W,3] each -> [H,W,3] 0..1
-         The loss of the autoencoder on the source is added back in proportion to the source's weight, so
-        that the result is continuous at strength 0.
+
+        The loss of the autoencoder on the source is added back in proportion to the source's weight, so that
+        the result is continuous at strength 0.
 
         Args:
             ask: returns the arguments of a call for its pictures, with the same noise each time

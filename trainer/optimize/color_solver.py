@@ -1,12 +1,14 @@
 """Solver for edits that change only colors: one color map for the region, and a residual for single members.
- The map is a least-squares fit over all views (`trainer.optimize.color_views`). The remainder is a residual
-of the members' lowest SH bands, found by conjugate gradients that respect the clamps. The preconditioner is
+
+The map is a least-squares fit over all views (`trainer.optimize.color_views`). The remainder is a residual of
+the members' lowest SH bands, found by conjugate gradients that respect the clamps. The preconditioner is
 block-Jacobi: each member has its own block of bands and weights, as in tomography. A member that covers a
 hundredth of a pixel, or is visible from one side only, therefore converges as fast as any other. A member
 that is not visible in any view follows the map.
- The size of the model (degree of the map; no residual, or one of DC, of two bands or of three) is chosen at
-full strength on held-out views: the smallest model that no larger one improves by at least 5 %. The
-held-out views also decide when a strength has had enough steps.
+
+The size of the model (degree of the map; no residual, or one of DC, of two bands or of three) is chosen at
+full strength on held-out views: the smallest model that no larger one improves by at least 5 %. The held-out
+views also decide when a strength has had enough steps.
 
 A small number of pictures (`trainer.optimize.ties`) leaves most members undetermined. Then:
 
@@ -247,8 +249,9 @@ class Solver:
         tell: Callable[[], None] = lambda: None,
     ) -> tuple[Tensor, int]:
         """Solve for the residual of the members' lowest bands. Return it and the number of steps.
-         The method is preconditioned conjugate gradients (Polak and Ribière). Every step evaluates the
-        clamps anew.
+
+        The method is preconditioned conjugate gradients (Polak and Ribière). Every step evaluates the clamps
+        anew.
 
         Args:
             mapped: change by the map. [M,B,3]
@@ -443,7 +446,8 @@ class _ModelSearch:
 
     def try_masks(self, best: _Candidate, alone: float) -> _Candidate:
         """Return the best candidate, with a mask if one pays against the same residual without a mask.
-         With few pictures, the mask is spread to all members that are not visible, or to neighbors only,
+
+        With few pictures, the mask is spread to all members that are not visible, or to neighbors only,
         independent of the spread of the residual.
 
         Args:
@@ -484,9 +488,10 @@ def choose_model(
     most_bands: int,
 ) -> tuple[Solver, Model]:
     """Return the solver and the smallest model that no larger one improves by 5 % of the visible error.
-     With few pictures there is always a residual, because changes of single members would otherwise be
-    lost. The spread of the residual, with a mask and without, is the one with the smallest error. If all
-    are equal, the residual spreads to neighbors only.
+
+    With few pictures there is always a residual, because changes of single members would otherwise be lost.
+    The spread of the residual, with a mask and without, is the one with the smallest error. If all are equal,
+    the residual spreads to neighbors only.
 
     Args:
         solver: training views

@@ -1,5 +1,6 @@
 """Views as linear functions of the members' colors, and color maps fitted to them.
- While geometry is fixed, every view is linear in the members' colors (`progdf.rasterize.cpu.engine`) except
+
+While geometry is fixed, every view is linear in the members' colors (`progdf.rasterize.cpu.engine`) except
 for clamping at black and white. A color map is a polynomial of the drawn colors (`progdf.field.grade`) and
 linear in its coefficients. Its least-squares fit over all views therefore takes 0.1 s.
 """
@@ -141,7 +142,8 @@ def _compare(shown: Array, others: Array, target: Array, counts: Array, passed: 
 @kernel(cache=True)
 def add_colors(basis: Array, offsets: Array, colors: Array) -> None:
     """Add Σ basis · offset to the colors. [M,B], [M,b,3], [M,3] float32
-     Torch's sums fragment the heap by 0.2 GB for 200 000 members: glibc before 2.38 does not reuse holes of
+
+    Torch's sums fragment the heap by 0.2 GB for 200 000 members: glibc before 2.38 does not reuse holes of
     the exact size for aligned memory.
     """
     for m in range(len(colors)):
@@ -212,9 +214,10 @@ class MapFit:
     @one_thread()
     def solve(self, degree: int, targets: Sequence[Tensor]) -> Tensor:
         """Return the least-squares map. [h,w,3] each -> [K,3]
-         A polynomial extrapolates badly beyond the colors that it was fitted to, and members that no
-        picture shows can have such colors. Therefore it is held to the affine map at all members' colors,
-        and the affine map to a constant shift.
+
+        A polynomial extrapolates badly beyond the colors that it was fitted to, and members that no picture
+        shows can have such colors. Therefore it is held to the affine map at all members' colors, and the
+        affine map to a constant shift.
         """
         pixels = [image.reshape(-1, 3)[p] for image, p in zip(targets, self.pixels, strict=True)]
         return identity_map(degree) + self._change(MONOMIALS[degree], torch.cat(pixels)).float()

@@ -1,8 +1,9 @@
 """Group stage: before members descend on their own, the region moves to where the edit shows it.
- Free descent smears a part that has to travel half its own size: every Gaussian fades to the color behind
-it. The motions of the parts are therefore found first, each part as a whole. If parts leave much of the
-error, for example for an ear that is bent or an arm that is stretched, control points bend the region. The
-members' own offsets then live in the moved frames: the offsets of a hand move, rotate and scale with it
+
+Free descent smears a part that has to travel half its own size: every Gaussian fades to the color behind it.
+The motions of the parts are therefore found first, each part as a whole. If parts leave much of the error,
+for example for an ear that is bent or an arm that is stretched, control points bend the region. The members'
+own offsets then live in the moved frames: the offsets of a hand move, rotate and scale with it
 (docs/method.md 3). Between two strengths the region follows the interpolated motion, not the optimizer's
 path, so a slider shows the hand in motion.
 """

@@ -1,10 +1,9 @@
 """Growth: Gaussians that an edit adds where no member can show it, such as a hat on a head.
- Cloned members would have to travel to the new object and smear on the way. Rows are therefore seeded where
-the
-pictures need them: at pixels sampled in proportion to their error, each at the nearest depth of its ray at
-which the other views have its color too. Seeded rows are trained with the members from the original on, and
-fade in at
-their final position: their opacity rises linearly with the slider.
+
+Cloned members would have to travel to the new object and smear on the way. Rows are therefore seeded where
+the pictures need them: at pixels sampled in proportion to their error, each at the nearest depth of its ray
+at which the other views have its color too. Seeded rows are trained with the members from the original on,
+and fade in at their final position: their opacity rises linearly with the slider.
 """
 
 from __future__ import annotations
@@ -186,8 +185,9 @@ def add_rows(trajectory: Trajectory, rows: Gaussians) -> Trajectory:
 
 def removal_costs(crops: Sequence[CropScene], rows: Tensor, targets: Sequence[Tensor], seed: int) -> Tensor:
     """Return the increase of half the squared error over all views if each member were removed. [M]
-     To second order in its opacity o it is -g o + h o² / 2. The curvature h, Σ (dI/do)², is the mean square
-    of the gradient of a picture of random signs (Hutchinson). One such picture per view is enough.
+
+    To second order in its opacity o it is -g o + h o² / 2. The curvature h, Σ (dI/do)², is the mean square of
+    the gradient of a picture of random signs (Hutchinson). One such picture per view is enough.
 
     Args:
         crops: training views

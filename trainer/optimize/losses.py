@@ -1,6 +1,6 @@
 """Loss terms of the optimizer: L1, a perceptual term, a progressive term and sharpness.
- L_edit of ProGDF (AAAI 2025, eq. 4) is L1 + LPIPS between render and edited view (weights: docs/method.md
-3).
+
+L_edit of ProGDF (AAAI 2025, eq. 4) is L1 + LPIPS between render and edited view (weights: docs/method.md 3).
 """
 
 from __future__ import annotations
@@ -120,9 +120,9 @@ def progressive_change(
     beta: float = 1.1,
 ) -> Tensor:
     """Return the paper's progressive constraint (eq. 5): L_prog = α·β^(±t/50)·Σ‖ΔΘ‖², without its λ2. []
-     ΔΘ is the change of a member's raw parameters by the last step. The paper does not state the norm or
-    the number of
-    members: docs/experiments.md, The progressive constraint.
+
+    ΔΘ is the change of a member's raw parameters by the last step. The paper does not state the norm or the
+    number of members: docs/experiments.md, The progressive constraint.
 
     Args:
         moved: offsets of the members. [M,C]
@@ -143,7 +143,8 @@ def sharpness(
     image: Tensor, target: Tensor, form: Literal["hinge", "paper"], inside: Tensor | None = None
 ) -> Tensor:
     """Return the paper's L_render. []
-     "paper" is −(∇²R)², the mean over the whole picture. The printed −∇²R is signed, and its sum cancels
+
+    "paper" is −(∇²R)², the mean over the whole picture. The printed −∇²R is signed, and its sum cancels
     except at the border of the picture. "hinge" stops at the target's sharpness: max(0, S(target) −
     S(image)), with S the mean of |∇²Y| inside the region and Y the luma.
 

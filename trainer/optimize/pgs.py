@@ -1,9 +1,11 @@
 """Progressive Gaussian splatting (PGS; ProGDF, AAAI 2025): the edit optimization that records its trajectory.
- The paper runs one optimization towards the edited views and records its path. The states between look
-worse than a straight line (docs/method.md 3). The targets are therefore staged: the editor paints the edit
-at several strengths, and the members are optimized towards each in turn. Within a stage the target is
-blended from the previous stage's pictures to its own, so that the path between them is short and straight.
- Edits that change only colors are solved with all views at once instead (`color_solver`), unless an option
+
+The paper runs one optimization towards the edited views and records its path. The states between look worse
+than a straight line (docs/method.md 3). The targets are therefore staged: the editor paints the edit at
+several strengths, and the members are optimized towards each in turn. Within a stage the target is blended
+from the previous stage's pictures to its own, so that the path between them is short and straight.
+
+Edits that change only colors are solved with all views at once instead (`color_solver`), unless an option
 needs descent view by view (`trainer.resolve.resolve_kind`).
 
 Effect of stages: docs/experiments.md, Stages.
@@ -95,7 +97,8 @@ class PgsState:
         growth: float = math.inf,
     ) -> None:
         """Take one step of Adam (Kingma and Ba 2015) with a rate per column, and advance to the next view.
-         Adam ignores the magnitude of gradients, so a hardly visible member would wander as far as a fully
+
+        Adam ignores the magnitude of gradients, so a hardly visible member would wander as far as a fully
         visible one. A tenth of the attribute's typical gradient, added to ε, keeps it in place
         (docs/experiments.md, Rates and steps).
 
@@ -328,8 +331,9 @@ def optimize(
     state: PgsState | None = None,
 ) -> Iterator[ParameterSnapshot]:
     """Optimize the member rows towards each stage in turn, and yield recordings.
-     A recording is made when the probes' pictures have changed by a share of the stage's total change, and
-    at the end of every stage. Only the members are optimized, so nothing else can drift.
+
+    A recording is made when the probes' pictures have changed by a share of the stage's total change, and at
+    the end of every stage. Only the members are optimized, so nothing else can drift.
 
     Args:
         original: raw member rows, packed. [M,14] or [M,14+3K]
@@ -425,7 +429,8 @@ def visible_way(targets: Sequence[Tensor], before: Sequence[Tensor]) -> tuple[fl
 
 def most_change(targets: Sequence[Tensor], before: Sequence[Tensor]) -> float:
     """Return the 95th percentile of the change of a channel over the changing pixels; 0 if none changes.
-     Steps are sized by this instead of the mean: a few saturated pixels need long steps, a wide even change
+
+    Steps are sized by this instead of the mean: a few saturated pixels need long steps, a wide even change
     does not, and long steps make it noisy (docs/experiments.md, Rates and steps).
     """
     changes = [(target - start).abs().amax(dim=2) for target, start in zip(targets, before, strict=True)]

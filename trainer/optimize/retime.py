@@ -1,5 +1,6 @@
 """Recording of a trajectory: the choice of snapshots and their slider values.
- The slider measures visible change, not time (docs/method.md 3). Equal slider steps change the pictures
+
+The slider measures visible change, not time (docs/method.md 3). Equal slider steps change the pictures
 equally, over the whole slider or between two pinned stages.
 """
 
@@ -46,7 +47,8 @@ def record(snapshots: Sequence[ParameterSnapshot], end: Tensor, strengths: Seque
 
 def smooth_weights(strengths: Sequence[float], known: Tensor) -> tuple[Tensor, Tensor]:
     """Return the given strengths with the middles between them, and the weights that interpolate each.
-     A middle lies on the cubic spline through all values. If the spline deviates from the straight line by
+
+    A middle lies on the cubic spline through all values. If the spline deviates from the straight line by
     more than a quarter of the interval's change, the middle lies on the straight line: no monotone parabola
     deviates that far, so the spline is ringing, as beside a jump.
 
@@ -72,8 +74,9 @@ def smooth_weights(strengths: Sequence[float], known: Tensor) -> tuple[Tensor, T
 
 def smooth_course(trajectory: Trajectory) -> Trajectory:
     """Add a recording in the middle of every two stages of a color edit; return other trajectories unchanged.
-     Map and residual are interpolated by a cubic spline, so only half as many strengths are solved for.
-    Every recording lies at its strength.
+
+    Map and residual are interpolated by a cubic spline, so only half as many strengths are solved for. Every
+    recording lies at its strength.
     """
     if trajectory.maps is None or len(trajectory.strengths) == 1:
         return trajectory
@@ -99,12 +102,12 @@ def retime(
     samples: int = 20,
 ) -> Trajectory:
     """Give every recording the slider value of its visible change.
-     Change is measured by the chord between pictures. Arc length summed over recordings would count jitter.
+
+    Change is measured by the chord between pictures. Arc length summed over recordings would count jitter.
     Each pass samples the trajectory at even slider values, measures the chords between the samples and
-    stretches the slider accordingly. Chords are as long as a user's steps. Shorter ones count jitter that
-    no step shows (a recolored robot's
-    20 steps: smallest over largest 0.71 instead of 0.66; a bear's scarf 0.93 instead of 0.76, its hands
-    0.85).
+    stretches the slider accordingly. Chords are as long as a user's steps. Shorter ones count jitter that no
+    step shows (a recolored robot's 20 steps: smallest over largest 0.71 instead of 0.66; a bear's scarf 0.93
+    instead of 0.76, its hands 0.85).
 
     Args:
         trajectory: recordings with any slider values
@@ -143,9 +146,10 @@ def straight_recordings(
     trajectory: Trajectory, pictures: Sequence[Tensor], detour: float = 0.15
 ) -> list[int]:
     """Return the recordings without jitter: those that lengthen the path by at most `detour`.
-     The worst recording is removed first, then its neighbors are measured again. The ends of the stages
-    always stay. A gentle curve keeps its recordings. On a recolored robot this gains 0.7 dB on average
-    against the editor's own pictures between the stages, with a third of the recordings.
+
+    The worst recording is removed first, then its neighbors are measured again. The ends of the stages always
+    stay. A gentle curve keeps its recordings. On a recolored robot this gains 0.7 dB on average against the
+    editor's own pictures between the stages, with a third of the recordings.
 
     Args:
         trajectory: as recorded

@@ -1,7 +1,8 @@
 """Conversion of painted pixels to thin discs on the surface, and projection of paint to other cameras.
- Splats are drawn in the order of their centers. A large Gaussian whose center is nearer than a disc covers
-it, although its own surface lies behind. Such a Gaussian is moved back along its ray and grows with the
-distance, which preserves its outline in the painted view (docs/method.md 3).
+
+Splats are drawn in the order of their centers. A large Gaussian whose center is nearer than a disc covers it,
+although its own surface lies behind. Such a Gaussian is moved back along its ray and grows with the distance,
+which preserves its outline in the painted view (docs/method.md 3).
 """
 
 from __future__ import annotations
@@ -134,8 +135,9 @@ def place_discs(
 
 def _paint_surface(seen: Depth, camera: Camera) -> tuple[Array, NDArray[np.bool_], NDArray[np.int32]]:
     """Return depths for paint, True where the surface is continuous, and the index of its pieces. [H,W] each
-     The surface is continuous where its depth changes less from pixel to pixel than that of the steepest
-    disc. Depths blended across an edge are replaced by those of one side.
+
+    The surface is continuous where its depth changes less from pixel to pixel than that of the steepest disc.
+    Depths blended across an edge are replaced by those of one side.
     """
     surface = smooth_depth(seen.depth.numpy(), (seen.alpha > OPAQUE).numpy())
     steepest = surface / float(camera.K[0, 0]) * (1 - _MIN_COSINE**2) ** 0.5 / _MIN_COSINE
@@ -293,9 +295,10 @@ def _rise_beside(cells: Array, picture: Tensor) -> Array:
     """Return the brightness of cells above the darkest adjacent pixel, the maximum over their pixels.
 
     [B] 0..1
-     The engine draws no disc smaller than about one pixel. At a color edge, light that the nearer disc adds
-    to its neighbor can be subtracted from the neighbor's own color only if the nearer disc is the darker
-    one, as no color is below black.
+
+    The engine draws no disc smaller than about one pixel. At a color edge, light that the nearer disc adds to
+    its neighbor can be subtracted from the neighbor's own color only if the nearer disc is the darker one, as
+    no color is below black.
     """
     brightness = picture.mean(dim=2).double().numpy()
     rise = brightness - ndimage.minimum_filter(brightness, 3)
@@ -320,9 +323,10 @@ def _rows_before(
     pieces: NDArray[np.int32],
 ) -> tuple[Tensor, Tensor]:
     """Return surface rows with centers in front of the depths `behind` [H,W], and their depth factors.
-     Gaussians more than `reach` in front, world units, occlude the paint as they occlude the surface, and
-    stay. So do Gaussians with most of their weight in another of the `pieces` [H,W] of the surface,
-    although they extend across an edge.
+
+    Gaussians more than `reach` in front, world units, occlude the paint as they occlude the surface, and
+    stay. So do Gaussians with most of their weight in another of the `pieces` [H,W] of the surface, although
+    they extend across an edge.
 
     Returns:
         indices [M] int64; factors by which their depths grow [M]

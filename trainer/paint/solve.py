@@ -1,5 +1,6 @@
 """Solver for the colors of discs, and of the rows moved behind them, that reproduce painted pictures.
- A view is linear in the colors that are drawn in it (`trainer.optimize.color_views`), so the colors are a
+
+A view is linear in the colors that are drawn in it (`trainer.optimize.color_views`), so the colors are a
 least-squares solution. Gaussians in front of a disc take light and those behind it add light. The weights
 account for both.
 """
