@@ -1,4 +1,4 @@
-"""Makes the examples of the start page: our own scenes as compressed .ply files, and edits trained on these.
+"""Build the examples of the start page: our own scenes as compressed .ply files, with edits trained on them.
 
 usage: python assets/examples.py FOLDER      (trains in FOLDER, then writes viewer/examples/)
 """
@@ -34,11 +34,15 @@ from viewer.state.view_state import LayerState, ViewState
 EXAMPLES = Path(__file__).parents[1] / "viewer" / "examples"
 SIZES = {"bear": 24_000, "room": 30_000}
 STRENGTHS = {"frost": 0.55, "scarf": 1.0, "dusk": 0.6, "rug": 1.0, "big head": 0.7, "twin": 1.0}
-"""What an example opens with; of other edits 0."""
+"""Initial strengths in an example, by name of the edit. Other edits start at 0."""
 
 
 def light(make: Callable[[int, int], DemoScene], file: Path) -> Callable[[int, int], DemoScene]:
-    """Makes the scene as a compressed .ply gives it back, in that order, and writes that file."""
+    """Return a scene maker whose scene went through a compressed .ply.
+
+    The new maker writes the scene to `file` and returns it with the rounded values and row order of that
+    file.
+    """
 
     def make_light(size: int, seed: int) -> DemoScene:
         scene = make(size, seed)
@@ -51,7 +55,7 @@ def light(make: Callable[[int, int], DemoScene], file: Path) -> Callable[[int, i
 
 
 def train(name: str, folder: Path) -> list[Path]:
-    """The edits of one demo scene; trained before, they are taken as they are."""
+    """Train the edits of one demo scene and return their files. Edits that exist already are reused."""
     show = demo.SHOWS[name]
     edits = [folder / edit.name / f"{edit.name}.gdf" for edit in show.edits]
     if not all(edit.is_file() for edit in edits):
@@ -61,7 +65,7 @@ def train(name: str, folder: Path) -> list[Path]:
 
 
 def tidy(folder: Path) -> list[Path]:
-    """Edits of the bear's shape, by `progdf edit`; nothing of them is trained."""
+    """Make edits of the bear's shape with `progdf edit`, without training."""
     names = demo.SHOWS["bear"].make(2000, 0).label_names
     head, bear, scarf = (
         f"labels:{folder / 'labels.npy'}:" + ",".join(str(names.index(part)) for part in parts)
@@ -79,7 +83,7 @@ def tidy(folder: Path) -> list[Path]:
 
 
 def without_folder(file: Path, folder: Path) -> Path:
-    """A copy of an edit beside the scene that does not say in which folder it was made."""
+    """Copy an edit beside the scene, without the path of the folder in which it was made."""
     header, tensors = unpack_file(file.read_bytes(), file.name)
     text = msgspec.json.encode(msgspec.structs.replace(header, sha256="")).replace(f"{folder}/".encode(), b"")
     (folder / "plain").mkdir(exist_ok=True)
@@ -89,7 +93,11 @@ def without_folder(file: Path, folder: Path) -> Path:
 
 
 def write(name: str, scene: Path, edits: Sequence[Path], background: Vec3, film: bool = False) -> None:
-    """NAME.progdf.zip and NAME.jpg from a compressed scene and its edits; `film`: of all sliders in turn."""
+    """Write NAME.progdf.zip and NAME.jpg from a compressed scene and its edits.
+
+    Args:
+        film: add a timeline that moves all sliders in turn
+    """
     opened = document.load(scene, [without_folder(file, scene.parent) for file in edits])
     layers = tuple(LayerState(i, gdf.name, STRENGTHS.get(gdf.name, 0.0)) for i, gdf in enumerate(opened.gdfs))
     camera = first_camera(opened.scene, up=opened.detected_up.direction)
@@ -108,7 +116,7 @@ def write(name: str, scene: Path, edits: Sequence[Path], background: Vec3, film:
 
 
 def main(folder: Path) -> None:
-    """All examples."""
+    """Build all examples."""
     for name in SIZES:
         edits = train(name, folder / name)
         scene = folder / name / f"{name}.compressed.ply"

@@ -1,8 +1,8 @@
-"""Makes the page of layers, assets/layers.jpg: how edits of colors go together.
+"""Draw the picture of layers, assets/layers.jpg: combinations of color edits.
 
 usage: python assets/layers.py -o OUT.jpg [--work FOLDER]
 
-Everything is made here: the bear, three edits of its coat, the room and its dusk, a table of colors. FOLDER
+All inputs are made here: the bear, three edits of its coat, the room and its dusk, a color table. FOLDER
 keeps scenes and edits, so that a second run only draws.
 """
 
@@ -47,13 +47,17 @@ STACKS = {
 
 
 def run(*words: str | Path) -> None:
-    """One command line of progdf. Raises ProgdfError where it does not end well."""
+    """Run one command line of progdf.
+
+    Raises:
+        ProgdfError: the command fails.
+    """
     if progdf([str(word) for word in words]):
         raise ProgdfError(f"progdf {words[0]} failed")
 
 
 def train(folder: Path, scene: str, name: str, editor: str) -> None:
-    """An edit of SCENE.ply in the rows of SCENE.npy, unless it is there."""
+    """Train an edit of SCENE.ply in the rows of SCENE.npy, unless it exists."""
     if not (folder / f"{name}.gdf").exists():
         region = f"file:{folder / scene}.npy"
         out = folder / "runs" / name
@@ -63,7 +67,7 @@ def train(folder: Path, scene: str, name: str, editor: str) -> None:
 
 
 def prepare(folder: Path) -> None:
-    """Scenes, edits and the table."""
+    """Write the scenes, the edits and the color table."""
     for name, made, parts in (("bear", bear(24_000, 0), COAT), ("room", room(12_000, 0), None)):
         save_ply(folder / f"{name}.ply", made.gaussians)
         save_cameras(folder / f"{name}.json", made.cameras, made.gaussians.origin)
@@ -78,7 +82,7 @@ def prepare(folder: Path) -> None:
 
 
 def draw(folder: Path, words: Sequence[str]) -> Tensor:
-    """The bear under a stack. [H,W,3]"""
+    """Draw the bear with a stack of layers. [H,W,3]"""
     files = [str(folder / word) if word.endswith((".gdf", ".cube")) else word for word in words]
     stack = [word.replace("file:", f"file:{folder}/") for word in files]
     run("render", folder / "bear.ply", *stack, *VIEW, "-o", folder / "picture.png")
@@ -89,9 +93,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(usage=__doc__)
     parser.add_argument("-o", "--out", type=Path, required=True)
     parser.add_argument("--work", type=Path)
-    asked = parser.parse_args()
+    options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
-        folder = asked.work or Path(temporary)
+        folder = options.work or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
         prepare(folder)
         pictures = [draw(folder, words) for words in STACKS.values()]
@@ -100,7 +104,7 @@ def main() -> int:
         sheet = contact_sheet(
             [pictures[i : i + COLUMNS] for i in rows], notes=[names[i : i + COLUMNS] for i in rows]
         )
-        to_picture(sheet).save(asked.out, quality=88)
+        to_picture(sheet).save(options.out, quality=88)
     return 0
 
 

@@ -1,4 +1,4 @@
-"""Takes the README's picture of a page with sliders: in a browser, on a desk and on a phone.
+"""Take the README's picture of a page with sliders: in a browser, at desktop and phone size.
 
 usage: python assets/page.py DEMO_FOLDER OUT.jpg
 """
@@ -25,13 +25,13 @@ SOFTWARE = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftsha
 
 
 def main(demo: Path, out: Path) -> None:
-    """Export a page, open it twice, move its sliders as a hand would, and lay both pictures side by side."""
+    """Export a page, open it twice, move its sliders through input events, and join both pictures."""
     chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))))
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as started:
         page = Path(folder) / "page.html"
         edits = [str(demo / name / f"{name}.gdf") for name in EDITS]
-        asked = ["export", str(demo / "scene.ply"), *edits, "-o", str(page), "--title", "The bear"]
-        if progdf([*asked, "--background", "#82a3c2"]):
+        command = ["export", str(demo / "scene.ply"), *edits, "-o", str(page), "--title", "The bear"]
+        if progdf([*command, "--background", "#82a3c2"]):
             sys.exit("the page could not be written")
         browser = started.chromium.launch(executable_path=chromium, args=SOFTWARE)
         pictures = [
@@ -39,16 +39,16 @@ def main(demo: Path, out: Path) -> None:
             for strengths, screen in zip(STRENGTHS, SCREENS, strict=True)
         ]
         browser.close()
-    whole = Image.new("RGB", (sum(one.width for one in pictures) + 16, SCREENS[0][1]), "white")
-    for left, one in zip((0, pictures[0].width + 16), pictures, strict=True):
-        whole.paste(one, (left, 0))
+    whole = Image.new("RGB", (sum(picture.width for picture in pictures) + 16, SCREENS[0][1]), "white")
+    for left, picture in zip((0, pictures[0].width + 16), pictures, strict=True):
+        whole.paste(picture, (left, 0))
     whole.save(out, quality=88)
 
 
 def take(
     browser: Any, page: Path, strengths: dict[str, float], to: Path, width: int, height: int, touch: bool
 ) -> Image.Image:
-    """A window of the browser with the sliders set, light on the desk and dark on the phone."""
+    """Take a screenshot with the sliders set, light at desktop size and dark at phone size."""
     tab = browser.new_page(
         viewport={"width": width, "height": height},
         has_touch=touch,

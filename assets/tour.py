@@ -1,4 +1,4 @@
-"""Takes the README's tour: the real interface on a real scene, drawn without a window.
+"""Take the README's tour: the real interface on a real scene, drawn without a window.
 
 usage: python assets/tour.py NAME SCENE.ply EDIT.gdf... -o OUT.png
 """
@@ -25,13 +25,13 @@ from viewer.state import selection
 from viewer.state.view_state import LayerState, ViewState
 
 SIZE = (1280, 800)
-# so that a file stays below 250 kB
+# palette sizes that keep a file below 250 kB
 COLORS = 144
 PANEL_COLORS = 96
 
 
 def layers(hand: Rig) -> None:
-    """Two edits, gains and curve of the first unfolded, its color held back."""
+    """Show two edits, with the gains and curve of the first unfolded and its color gain reduced."""
     hand.key("G")
     hand.key("Tab")
     for _ in range(2):
@@ -39,17 +39,17 @@ def layers(hand: Rig) -> None:
 
 
 def compare(hand: Rig) -> None:
-    """The original beside the edited scene, the divider in the hand."""
-    _at(hand, (1.0,) * len(hand.strengths))
+    """Show the original beside the edited scene, with the pointer on the divider."""
+    _set_strengths(hand, (1.0,) * len(hand.strengths))
     hand.key("Shift+Y")
     hand.move(490.0, 300.0)
     hand.frame(3)
 
 
 def session(hand: Rig) -> None:
-    """Snapshots of two mixtures in the panel, and one against the other."""
+    """Show snapshots of two mixtures in the panel, one compared with the other."""
     for strengths in ((1.0, 0.2), (0.3, 1.0)):
-        _at(hand, strengths)
+        _set_strengths(hand, strengths)
         hand.key("F5")
     hand.key("Shift+F5")
     hand.key("Alt+G")
@@ -57,7 +57,7 @@ def session(hand: Rig) -> None:
 
 
 def timeline(hand: Rig) -> None:
-    """A film of three keys: the edits come while the camera goes around; the playhead on the way."""
+    """Show a film of three keys: the edits fade in while the camera orbits. The playhead is between keys."""
     start = hand.main_view.work.view
     bare = tuple(replace(layer, strength=0.0) for layer in start.layers)
     hand.main_view.change(replace(start, layers=bare))
@@ -78,8 +78,8 @@ def timeline(hand: Rig) -> None:
     hand.frame(3)
 
 
-def _at(hand: Rig, strengths: Sequence[float]) -> None:
-    """The edits at these strengths, as far as there are some."""
+def _set_strengths(hand: Rig, strengths: Sequence[float]) -> None:
+    """Set the first edits to these strengths."""
     view = hand.main_view.work.view
     layers = (replace(layer, strength=s) for layer, s in zip(view.layers, strengths, strict=False))
     hand.main_view.change(replace(view, layers=tuple(layers)))
@@ -87,7 +87,7 @@ def _at(hand: Rig, strengths: Sequence[float]) -> None:
 
 
 def painted(hand: Rig) -> None:
-    """The first edit painted on one side, the brush still there."""
+    """Paint the first edit on one side, with the brush still visible."""
     hand.key("B")
     hand.key("Backspace")
     hand.key("X")
@@ -99,7 +99,7 @@ def painted(hand: Rig) -> None:
 
 
 def selected(hand: Rig) -> None:
-    """The head in a lasso and kept as a region, a second lasso under way that takes some of it back."""
+    """Select the head with a lasso and save it as a region, then start a second lasso that subtracts."""
     hand.key("L")
     for corners in (((330, 90), (640, 60), (680, 330), (330, 340)), ((480, 180), (600, 190), (560, 280))):
         hand.move(*corners[0])
@@ -123,11 +123,11 @@ SHOTS: dict[str, Callable[[Rig], None]] = {
     "session": session,
     "timeline": timeline,
 }
-"""What a hand does before the picture is taken."""
+"""Name of a shot → function that brings the interface into its state."""
 
 
 def first_state(gdfs: tuple[Gdf, ...], strengths: tuple[float, ...] = (0.8, 0.6, 0.5, 0.4)) -> ViewState:
-    """Every edit part of the way; never coarse."""
+    """Return a view with every edit at a partial strength, never at reduced resolution."""
     stack = tuple(LayerState(i, gdf.name, strengths[i % 4]) for i, gdf in enumerate(gdfs))
     return ViewState(layers=stack, background=(0.75, 0.82, 0.88), dynamic_resolution="off")
 
@@ -138,35 +138,40 @@ def main() -> None:
     parser.add_argument("scene", type=Path)
     parser.add_argument("gdfs", type=Path, nargs="+")
     parser.add_argument("-o", "--out", type=Path, required=True)
-    asked = parser.parse_args()
-    scene = load_ply(asked.scene)
-    gdfs = load_edits(asked.gdfs, scene, asked.scene)
+    options = parser.parse_args()
+    scene = load_ply(options.scene)
+    gdfs = load_edits(options.gdfs, scene, options.scene)
     view = replace(first_state(gdfs), camera=first_camera(scene, aspect=(SIZE[0] - panel.WIDTH_PX) / SIZE[1]))
-    with rig(view, SIZE, stack=_Opened(scene, gdfs)) as hand:
-        hand.main_view.facts = replace(hand.main_view.facts, title=asked.scene.name)
-        SHOTS[asked.name](hand)
+    with rig(view, SIZE, stack=_OpenedScene(scene, gdfs)) as hand:
+        hand.main_view.facts = replace(hand.main_view.facts, title=options.scene.name)
+        SHOTS[options.name](hand)
         hand.frame(3)
         picture = Image.fromarray(hand.image())
-    _in_few_colors(picture, SIZE[0] - round(panel.WIDTH_PX)).save(asked.out, optimize=True)
+    _quantize(picture, SIZE[0] - round(panel.WIDTH_PX)).save(options.out, optimize=True)
 
 
-def _in_few_colors(window: Image.Image, panel_at: int) -> Image.Image:
-    """A palette for the picture, dithered, and one for the panel, whose flat colors that would grain."""
+def _quantize(window: Image.Image, panel_at: int) -> Image.Image:
+    """Quantize the picture with dithering, and the panel without.
+
+    Each gets a palette of its own, because dithering would add grain to the panel's flat colors.
+    """
     picture = window.crop((0, 0, panel_at, window.height))
-    few = picture.quantize(COLORS, kmeans=3, dither=Image.Dither.NONE)
-    picture = picture.quantize(palette=few, dither=Image.Dither.FLOYDSTEINBERG)
+    palette = picture.quantize(COLORS, kmeans=3, dither=Image.Dither.NONE)
+    picture = picture.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG)
     right = window.crop((panel_at, 0, *window.size)).quantize(
         PANEL_COLORS, kmeans=3, dither=Image.Dither.NONE
     )
     both = Image.new("P", window.size)
-    both.putpalette((few.getpalette() or [])[: 3 * COLORS] + (right.getpalette() or [])[: 3 * PANEL_COLORS])
+    both.putpalette(
+        (palette.getpalette() or [])[: 3 * COLORS] + (right.getpalette() or [])[: 3 * PANEL_COLORS]
+    )
     both.paste(picture, (0, 0))
     both.paste(right.point([(i + COLORS) % 256 for i in range(256)]), (panel_at, 0))
     return both
 
 
-class _Opened:
-    """What the rig needs of a scene and its edits."""
+class _OpenedScene:
+    """Scene and edits in the form that the rig expects."""
 
     def __init__(self, scene: object, gdfs: tuple[Gdf, ...]) -> None:
         self.scene = scene

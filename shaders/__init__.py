@@ -1,4 +1,4 @@
-"""GLSL sources, one file a stage, and how they are read: includes resolved."""
+"""GLSL sources, one file per stage, and a loader that resolves includes."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ _INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
 
 
 class ShaderError(RuntimeError):
-    """A shader of ours that this driver refuses: a bug, with the place where it is."""
+    """Shader of this package that the driver rejects. It is a bug; the message contains the location."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """One stage's GLSL."""
+    """GLSL of one stage."""
 
-    text: str  # everything included, with #line directives that keep file and line
-    files: tuple[str, ...]  # file names by the number that the driver's messages use
+    text: str  # source with all includes, and #line directives that keep file and line
+    files: tuple[str, ...]  # file names by their number in the driver's messages
 
 
 def load_source(name: str) -> Source:
-    """The stage `shaders/NAME` with its includes, each taken once, paths relative to `shaders`.
+    """Load the stage `shaders/NAME`. Each include is inserted once; paths are relative to `shaders`.
 
     Raises:
-        ShaderError: a file is missing; the message says which file wanted it.
+        ShaderError: a file is missing; the message names the file that includes it.
     """
     files: list[str] = []
     lines: list[str] = []

@@ -1,9 +1,9 @@
 #version 330 core
-// A line of the grid on the ground, behind the splats of a picture that is already there.
+// Draws a line of the ground grid behind the splats of a picture that is already drawn.
 //
-// Reads   from grid.vert; picture: its alpha is what the scene covers of each pixel, row 0 on top;
-//         shown_size, left: width and height of the part of the framebuffer that is drawn in, and its first column.
-// Writes  rgb, and the share of the pixel that it takes.
+// Reads   from grid.vert; picture: its alpha is the scene's opacity coverage of each pixel, row 0 on top;
+//         shown_size, left: width and height of the drawn part of the framebuffer, and its first column, pixels.
+// Writes  rgb, and the line's share of the pixel.
 
 uniform sampler2D picture;
 uniform vec2 shown_size;
@@ -15,7 +15,7 @@ flat in vec4 ink;
 
 out vec4 shown;
 
-const float CLEAR = 0.3;   // within which the lines have not begun to fade; as viewer/render/ground_grid.py
+const float CLEAR = 0.3;   // radius within which lines do not fade; same as viewer/render/ground_grid.py
 
 void main() {
     float line = clamp(1.0 - abs(from_line), 0.0, 1.0);

@@ -1,9 +1,9 @@
 #version 330 core
-// A line of the grid on the ground: a strip of two triangles in the plane of the picture, as wide everywhere.
+// Draws a line of the ground grid: a strip of two triangles in the picture plane, of constant width.
 //
 // Reads   per line GRID_LINE of viewer/gl/scene_textures.py; gl_VertexID: its corner; picture: for its size.
-// Writes  gl_Position; from_line: distance from the middle of the line, pixels; cell: place in the grid, where the
-//         lines have faded at 1; ink: color of the line, and its share.
+// Writes  gl_Position; from_line: distance from the middle of the line, pixels; cell: position in the grid, where
+//         lines are invisible from 1 on; ink: color of the line, and its opacity.
 
 in vec4 ends;
 in vec2 depths;

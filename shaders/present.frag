@@ -1,8 +1,8 @@
 #version 330 core
-// Shows a picture, texel by pixel, upright: its row 0 is the upper row, the framebuffer's is the lower.
+// Draws a picture, one texel per pixel, upright: its row 0 is the upper row, the framebuffer's is the lower.
 //
-// Reads   picture: rgb as it shall be shown (background already behind it), row 0 on top;
-//         left: the column of the framebuffer at which it begins.
+// Reads   picture: final rgb (with background), row 0 on top;
+//         left: first column of the picture in the framebuffer, pixels.
 // Writes  rgb clamped to 0..1, opaque.
 
 uniform sampler2D picture;

@@ -1,8 +1,9 @@
 #version 330 core
-// Projects one Gaussian, once a frame; the results go to a buffer (transform feedback).
+// Projects one Gaussian, once per frame. The results go to a buffer (transform feedback).
 //
-// Reads   splat: which Gaussian, in drawing order (farthest first); the scene and the camera, see include/project.glsl.
-// Writes  viewer/gl/scene_textures.py: PROJECTED, as include/project.glsl has it.
+// Reads   splat: index of the Gaussian, in drawing order (farthest first); the scene and the camera, see
+//         include/project.glsl.
+// Writes  viewer/gl/scene_textures.py: PROJECTED, as in include/project.glsl.
 
 in uint splat;
 

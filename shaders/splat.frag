@@ -14,7 +14,7 @@ flat in vec4 splat_rgb_opacity;
 out vec4 premultiplied;
 
 void main() {
-    // from gl_FragCoord and not from interpolated corners: these lose 11 dB
+    // from gl_FragCoord, because interpolated corners lose 11 dB
     vec2 d = gl_FragCoord.xy - splat_center;
     float u = splat_shape.y * (d.x + splat_shape.x * d.y);
     float v = splat_shape.z * d.y;

@@ -2,7 +2,7 @@
 // One triangle around one projected Gaussian: an instance is a Gaussian, a vertex one of three corners.
 //
 // Reads   viewer/gl/scene_textures.py: PROJECTED (see project.vert), in pixels of the picture, y down.
-// Writes  gl_Position and what splat.frag reads, see include/corner.glsl.
+// Writes  gl_Position and the inputs of splat.frag, see include/corner.glsl.
 
 in vec2 center;
 in vec3 shape;

@@ -1,9 +1,9 @@
 #version 330 core
-// Shows a picture upright in another size than its own, smoothly: while something moves, few pixels fill many.
+// Draws a picture upright and scaled with linear filtering, for reduced resolution while the view changes.
 //
-// Reads   picture: rgb as it shall be shown (background already behind it), row 0 on top, filtered linearly;
-//         shown_size: width and height of the part of the framebuffer that it fills, pixels;
-//         left: the column at which that begins.
+// Reads   picture: final rgb (with background), row 0 on top, filtered linearly;
+//         shown_size: width and height of the covered part of the framebuffer, pixels;
+//         left: first column of that part, pixels.
 // Writes  rgb clamped to 0..1, opaque.
 
 uniform sampler2D picture;

@@ -1,9 +1,9 @@
 #version 330 core
-// project.vert and splat.vert in one, for WebGL: three vertices in a row are the triangle of one Gaussian.
+// Combines project.vert and splat.vert for WebGL: three consecutive vertices are the triangle of one Gaussian.
 //
-// Reads   order: which Gaussians, in drawing order (farthest first), row after row; the scene and the camera, see
-//         include/project.glsl; depths: whether the depth is drawn in place of the color.
-// Writes  gl_Position and what splat.frag reads, see include/corner.glsl.
+// Reads   order: indices of the Gaussians in drawing order (farthest first), in row-major order; the scene and the
+//         camera, see include/project.glsl; depths: true to draw the depth in place of the color.
+// Writes  gl_Position and the inputs of splat.frag, see include/corner.glsl.
 
 vec2 center;
 vec3 shape;                  // slope, l11, l22

@@ -48,8 +48,8 @@ ADDED = 0.1
 def allowed_error(own: float, added: float = ADDED) -> float:
     """Return the mean squared error that a field may add to an edit's own error.
 
-    An own error of at least `LEVEL` may grow by the share `added`. A smaller one may grow to (1 + added)
-    times `LEVEL`, because 8 bits hardly show it.
+    An own error of at least `LEVEL` may grow by the share `added`. A smaller one may grow to (1 + added) ·
+    `LEVEL`, because 8 bits hardly show it.
     """
     return (1.0 + added) * max(own, LEVEL) - own
 

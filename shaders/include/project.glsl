@@ -1,14 +1,14 @@
 // Projects one Gaussian and evaluates its color, from the raw scene.
 //
 // Reads   the uniforms below: OpenCV axes (x right, y down, z forward), lengths in world units, intrinsics in pixels.
-// Gives   `project(splat)`, which writes the stage's own `center`, `shape`, `r2` and `rgb_opacity`, in pixels of the
+// Defines `project(splat)`, which writes the stage's own `center`, `shape`, `r2` and `rgb_opacity`, in pixels of the
 //         picture, x right and y down from the upper left corner:
 //         alpha(d) = opacity · 2^−(u² + v²), u = l11 · (d.x + slope · d.y), v = l22 · d.y, d = pixel − center.
-//         r2 is u² + v² at alpha = 1/255, and negative where nothing is to be drawn.
+//         r2 is u² + v² at alpha = 1/255, and negative if nothing is to be drawn.
 //
-// float32 all through, so nothing may cancel: the camera's center comes in two parts, and the determinant of the 2D
-// covariance is a sum of squares. Relative to the size of the Gaussian, neither needles of 1e6:1 nor scales of 1e18
-// over- or underflow.
+// All values are float32, so nothing may cancel. The camera's center comes in two parts, and the determinant of the
+// 2D covariance is a sum of squares. All lengths are relative to the size of the Gaussian, so neither needles of
+// 1e6:1 nor scales of 1e18 overflow or underflow.
 
 #include "include/conventions.glsl"
 #include "include/raw_splats.glsl"
@@ -16,20 +16,20 @@
 
 uniform mat3 rotation;       // world → camera, column vectors
 uniform vec3 eye_high;       // the camera's center, world units, rounded to float32 …
-uniform vec3 eye_low;        // … and what the rounding left over
+uniform vec3 eye_low;        // … and the remainder of the rounding
 uniform vec4 intrinsics;     // fx, fy, cx, cy
 uniform vec2 size;           // width, height
 uniform bool antialiased;    // opacity × sqrt(det before dilation / det after)
-uniform bool activated;      // what stands for logits are opacities, which may be more than 1
-uniform bool highlighted;         // whether `highlight` is there
-uniform sampler2D highlight;      // rgb, and how much of it takes the place of the Gaussian's own color; 1 hides it
+uniform bool activated;      // the logits are opacities, which may exceed 1
+uniform bool highlighted;         // true if `highlight` is set
+uniform sampler2D highlight;      // rgb, and its share in the Gaussian's color; 1 hides the Gaussian
 
 const float UNIT = 0.8493218002880191;   // sqrt(log2(e) / 2): u and v per standard deviation
 
 mat3 rotation_of(vec4 wxyz) {
     float largest = max(max(abs(wxyz.x), abs(wxyz.y)), max(abs(wxyz.z), abs(wxyz.w)));
     if (largest == 0.0 || not_finite(wxyz.x) || not_finite(wxyz.yzw)) return mat3(1.0);
-    vec4 q = wxyz / largest;             // squares of 1e-30 and 1e30 stay in range
+    vec4 q = wxyz / largest;             // keeps squares of 1e-30 and 1e30 in range
     q /= length(q);
     float w = q.x, x = q.y, y = q.z, z = q.w;
     return mat3(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y),
@@ -57,15 +57,15 @@ void project(uint splat) {
     vec3 p = rotation * offset;
     if (opacity < ALPHA_MIN || p.z <= 0.0) return;
 
-    // clamp as the original does (Kerbl 2023, computeCov2D): off-screen Gaussians would blow up the Jacobian
+    // clamp like the original (Kerbl 2023, computeCov2D): off-screen Gaussians would blow up the Jacobian
     vec2 focal = intrinsics.xy, principal = intrinsics.zw;
     vec2 margin = FRUSTUM_MARGIN * 0.5 * size / focal;
     vec2 tangent = clamp(p.xy / p.z, -(principal / focal + margin), (size - principal) / focal + margin);
 
-    // the Gaussian's axes seen along the image's x and y: unit lengths first, then scales in units of `unit_px`
+    // axes of the Gaussian along the image's x and y: first unit lengths, then scales in units of `unit_px`
     mat3 to_gaussian = transpose(rotation_of(texelFetch(quat, texel, 0))) * transpose(rotation);
     vec2 px_per_unit = focal / p.z;
-    // beyond 1e18 px nothing changes on any screen, and squares stay in range
+    // larger scales change nothing on any screen, and squares stay in range
     vec3 scales_px = min(exp(max(log_scales, vec3(-1e4))) * max(px_per_unit.x, px_per_unit.y), vec3(1e18));
     float unit_px = max(1.0, max(scales_px.x, max(scales_px.y, scales_px.z)));
     vec3 s = scales_px / unit_px;

@@ -1,8 +1,8 @@
-// Color from real spherical harmonics; signs and order of the 3DGS .ply file, as progdf/sh.py.
+// Color from real spherical harmonics, with the signs and order of the 3DGS .ply file, as in progdf/sh.py.
 //
 // Needs include/raw_splats.glsl.
-// Gives `shade(texel, direction)`: rgb before the clamp at 0, seen along `direction`, a unit vector from the camera's
-// center to the Gaussian in world axes.
+// Defines `shade(texel, direction)`: rgb before the clamp at 0, seen along `direction`, a unit vector from the
+// camera's center to the Gaussian in world axes.
 
 const float SH_C0 = 0.28209479177387814;
 const float SH_C1 = 0.4886025119029199;
