@@ -1,1 +1,1 @@
-"""Regions that pictures tell of."""
+"""Regions from masks, strokes, prompts and changed pictures."""

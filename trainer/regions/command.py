@@ -1,4 +1,5 @@
-"""`progdf region`: what a region selects, as a picture or as a file of rows."""
+"""`progdf region` writes a region as a picture or a file of rows; `progdf views` writes views to draw masks
+on."""
 
 from __future__ import annotations
 
@@ -48,21 +49,22 @@ from trainer.views.view import (
 
 from .from_pictures import RegionRequest, region_kinds
 
-_TINT = torch.tensor([1.0, 0.32, 0.05])
-_TINTED = 0.55
-_PALE = 0.72
-"""The region keeps less than half of its own color; the rest goes so far towards white, without its hue."""
+_TINT = torch.tensor([1.0, 0.32, 0.05])  # rgb of the region
+_TINT_SHARE = 0.55
+"""Share of the tint in the region's color, which leaves less than half of its own."""
+_WHITE_SHARE = 0.72
+"""Share of white in the gray of the remaining scene."""
 
 _FOV = math.radians(45.0)
-_FILLED = 0.9
-_SIDES = ((20.0, 15.0), (110.0, 15.0), (200.0, 15.0), (290.0, 15.0))
+_FRAME_FILL = 0.9  # share of the picture that the scene fills
+_SIDES = ((20.0, 15.0), (110.0, 15.0), (200.0, 15.0), (290.0, 15.0))  # azimuth and elevation, degrees
 
 
 def show(options: ShowRegionOptions) -> list[str]:
-    """Write what the options ask for; lines on what was found, the last with the region's count.
+    """Write the requested output; return log lines, the last with the region's count.
 
     Raises:
-        ProgdfError: scene, region or camera that do not work, or an output that is neither .png nor .npy.
+        ProgdfError: invalid scene, region or camera, or an output that is neither .png nor .npy.
     """
     suffix = options.out.suffix.lower()
     if suffix not in (".png", ".npy"):
@@ -94,24 +96,24 @@ def show(options: ShowRegionOptions) -> list[str]:
 
 
 def picture(scene: Gaussians, region: Region, camera: Camera) -> Tensor:
-    """The scene in pale gray with the region tinted; what hides the region hides it here too. [H,W,3] 0..1"""
+    """Return the scene in pale gray with the region tinted, with the usual occlusion. [H,W,3], 0 to 1"""
     colors = seen_colors(scene, camera)
     gray = (colors @ torch.tensor([0.299, 0.587, 0.114]))[:, None].clamp(0.0, 1.0)
-    image = (gray + _PALE * (1 - gray)).expand(-1, 3).clone()
+    image = (gray + _WHITE_SHARE * (1 - gray)).expand(-1, 3).clone()
     rows = region.members
-    # a light tint of its own brightness, so that shape and shading stay readable
-    image[rows] = torch.lerp(colors[rows].clamp(0.0, 1.0), _TINT * (0.35 + 0.65 * gray[rows]), _TINTED)
+    # the tint follows the original brightness, so that shape and shading stay readable
+    image[rows] = torch.lerp(colors[rows].clamp(0.0, 1.0), _TINT * (0.35 + 0.65 * gray[rows]), _TINT_SHARE)
     return render_colors(scene, image, camera, torch.ones(3)).clamp(0.0, 1.0)
 
 
 def _cameras(options: ShowRegionOptions, scene: Gaussians, up: Tensor, size: tuple[int, int]) -> list[Camera]:
     if options.camera is not None:
         return [replace(read_camera(options.camera, scene.origin), lens=None)]
-    return [fit_camera(scene, up, turn, size, _FOV, _FILLED) for turn in _SIDES]
+    return [fit_camera(scene, up, turn, size, _FOV, _FRAME_FILL) for turn in _SIDES]
 
 
 def _sheet(pictures: Sequence[Tensor]) -> Tensor:
-    """One picture as it is, four in two rows. [H,W,3]"""
+    """Return a single picture unchanged, and four in two rows. [H,W,3]"""
     if len(pictures) == 1:
         return pictures[0]
     half = len(pictures) // 2
@@ -130,10 +132,10 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def write(options: WriteViewsOptions) -> list[str]:
-    """Write OUT/original/NAME.png and OUT/cameras.json; return lines that say so and name the next step.
+    """Write OUT/original/NAME.png and OUT/cameras.json; return log lines with the files and the next step.
 
     Raises:
-        ProgdfError: scene, cameras or region that do not work, or a folder that has such cameras already.
+        ProgdfError: invalid scene, cameras or region, or a folder that already has cameras.
     """
     check_ranges(("--views", options.views, 1, 96), ("--image-size", options.image_size, 32, 4096))
     out, background = options.out, torch.tensor(BACKGROUND)
@@ -151,7 +153,7 @@ def write(options: WriteViewsOptions) -> list[str]:
         request = RegionRequest(RegionOptions(options.region), views, lambda: out / "segmented")
         region = parse_region(options.region, scene, kinds=region_kinds(request))
     if given:
-        # what is drawn is straight, and so are the masks: no lens
+        # renders and the masks over them have no distortion, so drop the lens
         cameras = [replace(fit_size(camera, options.image_size), lens=None) for camera in given]
     elif is_surrounding(scene, up):
         raise ProgdfError(f"{options.scene} {INSIDE}")

@@ -1,7 +1,7 @@
-"""What a handful of rough masks leaves wrong in a region, and puts right: strays, loose pieces, holes.
+"""Clean a region lifted from a small number of rough masks: remove strays and loose pieces, fill holes.
 
-Many masks outvote each other's mistakes. With a few, what stands behind the region and is seen past its
-border by one view alone would be taken whole: a tree behind a bear.
+Many masks outvote each other's mistakes. With a small number, background that a single view shows inside its
+mask would be selected, such as a tree behind a bear.
 """
 
 from __future__ import annotations
@@ -17,21 +17,24 @@ from progdf.scene.neighbors import join_pairs, nearest_rows
 from progdf.terminal import format_count
 
 FEW = 8
-"""Masks up to which a region is cleaned; exact ones from 12 views would lose a thin scarf's edge to it."""
+"""Maximum number of masks for cleaning; with exact masks from 12 views, it would cost a thin scarf's edge."""
 
-_LINKS = 8
-_REACH = 2.5
-_WIDE = 2.0
-"""A member is linked to those of its 8 nearest that are nearer than 2.5 times what is usual for the eighth,
-or whose 2 σ touch its own: flat surfaces are of few, large Gaussians."""
+_LINK_NEIGHBORS = 8
+"""Nearest neighbors of a member that it may be linked to."""
+_LINK_REACH = 2.5
+"""Maximum distance of linked members, in median distances to the eighth neighbor."""
+_LINK_SIGMAS = 2.0
+"""Members are also linked if their ellipsoids of this many σ touch, as flat surfaces have large Gaussians."""
 
-_PIECE = 0.1
-"""Of the largest connected surface: smaller ones are strays."""
+_MIN_PIECE = 0.1
+"""Minimum size of a connected surface, as a share of the largest; smaller ones are strays."""
 
-_AROUND = 12
-_FILLED = 0.75
-_ROUNDS = 3
-"""A hole is what has three quarters members among its 12 nearest, in up to three rounds."""
+_HOLE_NEIGHBORS = 12
+"""Nearest neighbors that decide on a hole."""
+_HOLE_SHARE = 0.75
+"""Minimum share of members among the neighbors of a hole."""
+_HOLE_ROUNDS = 3
+"""Maximum number of rounds that fill holes."""
 
 
 def drop_strays(
@@ -41,37 +44,37 @@ def drop_strays(
     views_inside: Tensor,
     say: Callable[[str], None] | None = None,
 ) -> Tensor:
-    """The members that two masks hold where two views see them, in large connected surfaces.
+    """Return the members inside two masks, if two views see them, in large connected surfaces.
 
     Args:
         scene: N Gaussians
-        member: by their score alone. [N] bool
-        views: how many views with a mask show each. [N]
-        views_inside: in how many of these it lies inside the mask. [N]
-        say: hears in a line each what was taken away
+        member: members by score alone. [N] bool
+        views: number of views with a mask that show each Gaussian. [N]
+        views_inside: number of these in which it lies inside the mask. [N]
+        say: receives a log line per kind of removed Gaussian
 
     Returns:
         [N] bool
     """
-    twice = member & ((views < 2) | (views_inside >= 2))
+    confirmed = member & ((views < 2) | (views_inside >= 2))
     _report(
         say,
-        int(member.sum()) - int(twice.sum()),
+        int(member.sum()) - int(confirmed.sum()),
         "inside one mask only, where two views see it, left to what surrounds them",
     )
-    if not bool(twice.any()):
-        return twice
-    rows = twice.nonzero()[:, 0]
+    if not bool(confirmed.any()):
+        return confirmed
+    rows = confirmed.nonzero()[:, 0]
     piece = connected_pieces(scene[rows])
     sizes = np.bincount(piece)
-    # what two masks hold counts, not what one view alone shows: a tree may be larger than the bear
-    sure = np.bincount(piece, weights=(views_inside[rows] >= 2).double().numpy())
-    weight = sure if sure.any() else sizes
-    large = torch.from_numpy((weight >= _PIECE * weight.max())[piece])
+    # size counts members inside two masks, as a tree seen by one view may be larger than the bear
+    confirmed_sizes = np.bincount(piece, weights=(views_inside[rows] >= 2).double().numpy())
+    weight = confirmed_sizes if confirmed_sizes.any() else sizes
+    large = torch.from_numpy((weight >= _MIN_PIECE * weight.max())[piece])
     result = torch.zeros_like(member)
     result[rows[large]] = True
     dropped = int((~large).sum())
-    pieces = int((weight >= _PIECE * weight.max()).sum())
+    pieces = int((weight >= _MIN_PIECE * weight.max()).sum())
     _report(say, dropped, f"apart from the {format_count(pieces, 'largest connected surface')}, left out")
     return result
 
@@ -79,13 +82,13 @@ def drop_strays(
 def find_holes(
     scene: Gaussians, member: Tensor, views_outside: Tensor, say: Callable[[str], None] | None = None
 ) -> Tensor:
-    """The Gaussians to add, as members surround them and no two views see them outside the masks.
+    """Return the Gaussians to add: surrounded by members, and not seen outside the masks by two views.
 
     Args:
         scene: N Gaussians
         member: the region so far. [N] bool
-        views_outside: how many views show each outside their mask. [N]
-        say: hears how many they are
+        views_outside: number of views that show each Gaussian outside their mask. [N]
+        say: receives a log line with their number
 
     Returns:
         Sorted rows. [H] int64
@@ -100,24 +103,24 @@ def find_holes(
     rows = (inside & ~member & (views_outside < 2)).nonzero()[:, 0]
     if not len(rows):
         return rows
-    near, _ = nearest_rows(means, rows, _AROUND)
+    near, _ = nearest_rows(means, rows, _HOLE_NEIGHBORS)
     filled = member.clone()
-    for _ in range(_ROUNDS):
-        filled[rows[filled[near].double().mean(dim=1) >= _FILLED]] = True
+    for _ in range(_HOLE_ROUNDS):
+        filled[rows[filled[near].double().mean(dim=1) >= _HOLE_SHARE]] = True
     holes = (filled & ~member).nonzero()[:, 0]
     _report(say, len(holes), "in holes of it, added")
     return holes
 
 
 def connected_pieces(gaussians: Gaussians) -> np.ndarray:
-    """Which connected piece each of P Gaussians belongs to. [P] int"""
+    """Return the number of the connected piece of each of P Gaussians. [P] int"""
     count = len(gaussians)
     if count < 2:
         return np.zeros(count, np.int64)
-    near, apart = nearest_rows(gaussians.means, torch.arange(count), _LINKS)
+    near, distances = nearest_rows(gaussians.means, torch.arange(count), _LINK_NEIGHBORS)
     width = gaussians.scales.median(dim=1).values
-    linked = apart <= _REACH * max(float(np.median(apart[:, -1])), 1e-12)
-    linked |= apart <= _WIDE * (width[:, None] + width[near])
+    linked = distances <= _LINK_REACH * max(float(np.median(distances[:, -1])), 1e-12)
+    linked |= distances <= _LINK_SIGMAS * (width[:, None] + width[near])
     first = torch.arange(count)[:, None].expand_as(near)[linked]
     second = near[linked]
     return join_pairs(first.numpy(), second.numpy(), count)

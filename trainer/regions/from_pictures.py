@@ -1,4 +1,4 @@
-"""Regions that pictures tell of: masks:DIR, photomasks:DIR, scribbles:A.png and text:"…"."""
+"""Regions from pictures: masks:DIR, photomasks:DIR, scribbles:A.png, text:"…" and changed."""
 
 from __future__ import annotations
 
@@ -49,15 +49,15 @@ from .segment import SEGMENTER_CHECKS, SEGMENTERS, Segmenter
 
 
 def read_masks(folder: Path, cameras: Sequence[Camera], bent: bool = False) -> list[Tensor | None]:
-    """Return the mask of every camera, scaled to its size; None where there is none. [H,W] float32 0..1
+    """Return the mask of every camera, scaled to its size; None if it has none. [H,W] float32, 0 to 1
 
     Args:
-        folder: holds the masks, see `PictureFolder`
-        cameras: with the names of their views
-        bent: the masks were drawn over photographs, which the cameras' lenses have bent: straighten them
+        folder: folder of the masks, see `PictureFolder`
+        cameras: cameras with the names of their views
+        bent: the masks were drawn over photographs with lens distortion, so undistort them
 
     Raises:
-        ProgdfError: the folder has no mask, or two of one view, or one is broken or of other proportions.
+        ProgdfError: the folder has no mask, two of one view, a broken one, or one with other proportions.
     """
     pictures = PictureFolder(folder, [camera.name for camera in cameras])
     files = [pictures.find(camera.name) for camera in cameras]
@@ -73,7 +73,7 @@ def read_masks(folder: Path, cameras: Sequence[Camera], bent: bool = False) -> l
 
 
 def _mask(path: Path, camera: Camera, bent: bool) -> Tensor:
-    """Return the mask of a camera at its size, straight. [H,W] float32 0..1"""
+    """Return the undistorted mask of a camera at its size. [H,W] float32, 0 to 1"""
     mask = read_mask(path, (camera.width, camera.height), calibrated=bent)
     if bent and camera.lens:
         return undistort(mask[..., None].expand(-1, -1, 3), camera.K, camera.lens)[0][..., 0]
@@ -81,37 +81,38 @@ def _mask(path: Path, camera: Camera, bent: bool) -> Tensor:
 
 
 CHANGED = "changed"
-"""The region that changed pictures show."""
+"""Name of the region found in changed pictures."""
 
-_STROKE = 0.25  # of color: by so much a stroke differs from the render, and its hue from gray
+_STROKE_COLOR = 0.25  # minimum color difference of a stroke from the render, and of its hue from gray
 
 
 @dataclass(frozen=True)
 class RegionRequest:
-    """What pictures are to tell of a region, and where those that are made for it go."""
+    """Request for a region from pictures."""
 
     options: RegionOptions
     views: TrainingViewOptions  # limits the segmented images; without cameras, as many closer views are added
-    cache: Callable[[], Path]  # makes, and names, the folder in which segmented pictures are kept
+    cache: Callable[[], Path]  # creates and returns the folder for segmentation masks
     quiet: bool = False  # no progress on the screen
-    say: Callable[[str], None] | None = None  # hears in a line each what became of the masks
+    say: Callable[[str], None] | None = None  # receives log lines about the masks
 
     @property
     def count(self) -> int:
-        """How many pictures are segmented."""
+        """Number of views to segment."""
         return self.views.views or VIEWS
 
     def up_of(self, scene: Gaussians) -> Tensor:
-        """The direction that is up in a scene without cameras. [3]"""
+        """Return the up direction of a scene without cameras. [3]"""
         return find_up(scene, (), self.views.up, self.views.scene).direction
 
 
 def region_kinds(request: RegionRequest) -> dict[str, Kind]:
-    """The kinds of region that pictures tell of, for `parse_region`.
+    """Return the kinds of region from pictures, for `parse_region`.
 
-    masks:DIR are drawn over straight pictures, as RUN/views/original are; photomasks:DIR over photographs,
-    which are straightened where the cameras have lenses; scribbles:A.png are green strokes on a thing and red
-    ones beside it, painted on rendered views; `changed` is where pictures differ from the scene.
+    masks:DIR are drawn over undistorted pictures, such as RUN/views/original. photomasks:DIR are drawn over
+    photographs, and are undistorted if the cameras have lenses. scribbles:A.png has green strokes on an
+    object and red ones beside it, painted on rendered views. `changed` is the area where pictures differ from
+    the scene.
     """
 
     def from_folder(text: str, scene: Gaussians, bent: bool) -> Region:
@@ -135,13 +136,14 @@ def region_kinds(request: RegionRequest) -> dict[str, Kind]:
         masks = _segment(scene, cameras, prompt, folder, request)
         nonempty = _masks_with_pixels(masks, prompt, request)
         if request.views.cameras is None:
-            # Around the scene a thing may be a few pixels wide: look again from where it fills the picture;
-            # with masks of the bear's body a pixel too wide or too narrow, IoU .93 for .61-.68.
+            # In views of the whole scene an object may be only a few pixels wide, so segment again in views
+            # that it fills. With masks of the bear's body one pixel too wide or too narrow, IoU is 0.93
+            # instead of 0.61 to 0.68.
             nearer = _near_cameras(scene, _lift(scene, cameras, nonempty, prompt, request), request)
             masks = [*masks, *_segment(scene, nearer, prompt, folder, request)]
             cameras = [*cameras, *nearer]
             nonempty = _masks_with_pixels(masks, prompt, request)
-        # with these the folder is one for masks:DIR, of the same region
+        # with the cameras, the folder can be used as masks:DIR for the same region
         telling = [camera for camera, mask in zip(cameras, nonempty, strict=True) if mask is not None]
         save_cameras(folder / "cameras.json", telling, scene.origin)
         return _lift(scene, cameras, nonempty, f"text:{prompt}", request)
@@ -161,7 +163,7 @@ def region_kinds(request: RegionRequest) -> dict[str, Kind]:
 
 
 def region_checks(request: RegionRequest) -> dict[str, Check]:
-    """What is to be known of these kinds before the scene is loaded, for `check_region`."""
+    """Return the checks of these kinds before the scene is loaded, for `check_region`."""
 
     def of_text(text: str) -> None:
         _prompt(text)
@@ -179,7 +181,7 @@ def region_checks(request: RegionRequest) -> dict[str, Check]:
 def _changed_pictures(
     text: str, request: RegionRequest, scene: Gaussians | None = None
 ) -> tuple[Sequence[Path], Sequence[Camera]]:
-    """The pictures of `changed:A.png,B.png`, by default those of the editor, and their cameras."""
+    """Return the pictures of `changed:A.png,B.png`, by default those of the editor, and their cameras."""
     paths = picture_paths(text) if text else request.views.pictures
     if not paths:
         raise ProgdfError(
@@ -195,7 +197,7 @@ def _changed_pictures(
 
 
 def _taken_from(paths: Sequence[Path], request: RegionRequest, scene: Gaussians | None) -> list[Camera]:
-    """Return the cameras of rendered pictures; without a scene they are not brought into its frame."""
+    """Return the cameras of rendered pictures. Without a scene they are not converted to its frame."""
     if scene is not None:
         return rendered_cameras(paths, load_given_cameras(request.views, scene).cameras, scene.origin)
     given = [] if request.views.cameras is None else load_cameras(request.views.cameras, ZERO)
@@ -205,7 +207,7 @@ def _taken_from(paths: Sequence[Path], request: RegionRequest, scene: Gaussians 
 def _scribble_pictures(
     text: str, request: RegionRequest, scene: Gaussians | None = None
 ) -> tuple[list[Path], list[Camera]]:
-    """The pictures of `scribbles:A.png,B.png`, and their cameras."""
+    """Return the pictures of `scribbles:A.png,B.png`, and their cameras."""
     if not text:
         raise ProgdfError(
             "scribbles: needs rendered views with green strokes on the thing and red ones beside it; "
@@ -216,16 +218,16 @@ def _scribble_pictures(
 
 
 def _scribbles_region(text: str, scene: Gaussians, request: RegionRequest) -> Region:
-    """The thing under green strokes, and not under red ones."""
+    """Return the region of the object under green strokes, without the parts under red ones."""
     rows: dict[str, list[Rows]] = {"green": [], "red": []}
     for path, camera in zip(*_scribble_pictures(text, request, scene), strict=True):
         original, picture = read_change(scene, path, camera)
-        seen = Surface(scene, replace(camera.resize(picture.shape[1], picture.shape[0]), lens=None))
-        stroke = (picture - original).abs().amax(dim=-1) > _STROKE
+        surface = Surface(scene, replace(camera.resize(picture.shape[1], picture.shape[0]), lens=None))
+        stroke = (picture - original).abs().amax(dim=-1) > _STROKE_COLOR
         red, green, blue = picture.unbind(dim=-1)
-        for color, own, other in (("green", green, red), ("red", red, green)):
-            painted = stroke & (own - torch.maximum(other, blue) > _STROKE)
-            rows[color].append(rows_under(painted.numpy(), seen))
+        for color, primary, other in (("green", green, red), ("red", red, green)):
+            painted = stroke & (primary - torch.maximum(other, blue) > _STROKE_COLOR)
+            rows[color].append(rows_under(painted.numpy(), surface))
     inside, outside = (np.concatenate(parts) for parts in rows.values())
     for color, found, where in (("green", inside, "on"), ("red", outside, "beside")):
         if not len(found):
@@ -235,7 +237,7 @@ def _scribbles_region(text: str, scene: Gaussians, request: RegionRequest) -> Re
 
 
 def _mask_folder(kind: str, text: str, request: RegionRequest) -> tuple[Path, Path]:
-    """The folder of masks, and the file of their cameras."""
+    """Return the folder of masks, and the file of their cameras."""
     if not text:
         raise ProgdfError(f"{kind}: needs a folder; write {kind}:DIR with a mask for each camera in DIR")
     folder = Path(text).expanduser()
@@ -265,14 +267,20 @@ def _lift(
     name: str,
     request: RegionRequest,
 ) -> Region:
-    """The region that the masks select; a view without a mask adds nothing."""
-    given = [
+    """Return the region that the masks select. A view without a mask adds nothing."""
+    available = [
         (fit_size(c, LIFTED_AT), mask) for c, mask in zip(cameras, masks, strict=True) if mask is not None
     ]
-    small = with_near_plane([camera for camera, _ in given], scene)
-    scaled = [_scale_mask(mask, camera) for camera, mask in given]
+    lift_cameras = with_near_plane([camera for camera, _ in available], scene)
+    scaled = [_scale_mask(mask, camera) for camera, mask in available]
     region = lift_masks(
-        scene, small, scaled, name, request.options.lift_rule, request.options.lift_threshold, request.say
+        scene,
+        lift_cameras,
+        scaled,
+        name,
+        request.options.lift_rule,
+        request.options.lift_threshold,
+        request.say,
     )
     if not len(region):
         raise ProgdfError(
@@ -283,13 +291,14 @@ def _lift(
 
 
 def _scale_mask(mask: Tensor, camera: Camera) -> Tensor:
-    """The mask in the camera's size, averaged. [H,W] -> [h,w]"""
+    """Return the mask at the camera's size, averaged. [H,W] -> [h,w]"""
     size = (camera.height, camera.width)
     return mask.float() if tuple(mask.shape) == size else shrink_image(mask.float()[..., None], size)[..., 0]
 
 
 def _masks_with_pixels(masks: Sequence[Tensor], prompt: str, request: RegionRequest) -> list[Tensor | None]:
-    """The masks in which the prompt was found: where it was not, it may still be."""
+    """Return the masks in which the prompt was found, and None for the others, as the object may still be
+    there."""
     nonempty = [mask if bool(mask.any()) else None for mask in masks]
     if all(mask is None for mask in nonempty):
         raise ProgdfError(
@@ -302,15 +311,16 @@ def _masks_with_pixels(masks: Sequence[Tensor], prompt: str, request: RegionRequ
 def _segment(
     scene: Gaussians, cameras: Sequence[Camera], prompt: str, folder: Path, request: RegionRequest
 ) -> list[Tensor]:
-    """The prompt's mask in every view; read where it is kept, of the same picture by the same networks."""
-    chosen = request.options
+    """Return the prompt's mask in every view, from the cache if made from the same picture by the same
+    networks."""
+    options = request.options
     recipe: Recipe = {
         "prompt": prompt,
-        "detector": chosen.detector,
-        "sam_model": chosen.sam_model,
-        "box_threshold": chosen.box_threshold,
+        "detector": options.detector,
+        "sam_model": options.sam_model,
+        "box_threshold": options.box_threshold,
     }
-    networks = replace(chosen, region="")
+    networks = replace(options, region="")
     loaded: Callable[[], Segmenter] = cache(
         lambda: last_model("segmenter", networks, lambda: SEGMENTERS["text"](networks))
     )
@@ -328,12 +338,12 @@ def _segment(
 
 
 def _segmented_cameras(scene: Gaussians, request: RegionRequest) -> list[Camera]:
-    """The given cameras, evenly thinned out, or a rig around the scene."""
+    """Return the given cameras, evenly thinned out, or a rig around the scene."""
     if request.views.cameras is not None:
         offered = _cameras(request.views.cameras, scene, request)
         count = min(request.count, len(offered))
-        taken = [offered[(2 * i + 1) * len(offered) // (2 * count)] for i in range(count)]
-        return [replace(fit_size(camera, LIFTED_AT), lens=None) for camera in taken]
+        selected = [offered[(2 * i + 1) * len(offered) // (2 * count)] for i in range(count)]
+        return [replace(fit_size(camera, LIFTED_AT), lens=None) for camera in selected]
     up = request.up_of(scene)
     if is_surrounding(scene, up):
         raise ProgdfError(f"the scene {INSIDE}")
@@ -341,7 +351,7 @@ def _segmented_cameras(scene: Gaussians, request: RegionRequest) -> list[Camera]
 
 
 def _near_cameras(scene: Gaussians, region: Region, request: RegionRequest) -> list[Camera]:
-    """A rig that looks at what was found."""
+    """Return a rig that looks at the found region."""
     rig = region_rig(scene, region, request.count, LIFTED_AT, request.up_of(scene))
     return [replace(camera, name=f"near_{i:03d}") for i, camera in enumerate(rig)]
 

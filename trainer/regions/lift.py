@@ -1,4 +1,4 @@
-"""From 2D masks to Gaussians: which of them the masks of several views mean (docs/method.md 4)."""
+"""Lift 2D masks of several views to a region of Gaussians (docs/method.md 4)."""
 
 from __future__ import annotations
 
@@ -19,33 +19,37 @@ from .few_masks import FEW, drop_strays, find_holes
 from .surface import SurfaceVote
 
 THRESHOLDS: dict[LiftRule, float] = {"share": 0.7, "paper": 0.8}
-"""Least score of a member under each rule."""
+"""Minimum score of a member under each rule."""
 
 HIDDEN = 0.06
-"""Below this clearness a Gaussian counts as never seen: what shines through tells of what covers it."""
+"""Clearness below which a Gaussian counts as never seen, as its pixels show its occluders."""
 
 _HALF_HIDDEN = 0.3
-_DOUBTFUL = (0.3, 0.7)
-"""Below this clearness and with a share between these, what was seen decides nothing either."""
+"""Clearness below which a mixed share does not decide."""
+_MIXED_SHARES = (0.3, 0.7)
+"""Range of mixed shares, in which a half-hidden Gaussian stays undecided."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the views say of each Gaussian; w = αT, sums run over the pixels it contributes to, and views."""
+    """Evidence of the views on each Gaussian.
 
-    inside: Tensor  # Σ w·m, its contribution inside the masks. [N]
+    Here w = αT, and sums run over the pixels that it contributes to, and over views.
+    """
+
+    inside: Tensor  # Σ w·m, contribution inside the masks. [N]
     pixels_inside: Tensor  # Σ m. [N]
-    weight: Tensor  # Σ w, its contribution in all. [N]
-    pixels: Tensor  # n. [N]
-    # mean transmittance in front of it in the view that shows it best, 0 hidden .. 1 bare. [N]
+    weight: Tensor  # Σ w, total contribution. [N]
+    pixels: Tensor  # n, number of pixels. [N]
+    # mean transmittance in front of it in the view that shows it best, 0 (hidden) to 1 (unoccluded). [N]
     clearness: Tensor
-    views: Tensor  # how many views show it: clearer than `HIDDEN`. [N]
-    views_inside: Tensor  # in how many of these more than half of its contribution falls inside the mask. [N]
+    views: Tensor  # number of views that show it with a clearness above `HIDDEN`. [N]
+    views_inside: Tensor  # number of these with more than half of its contribution inside the mask. [N]
     opacities: Tensor  # σ. [N]
 
 
 def bare_weight(opacities: Tensor) -> Tensor:
-    """The mean α of Gaussians over the ellipse {α ≥ 1/255}, where nothing covers them. [N] -> [N]"""
+    """Return the mean α of unoccluded Gaussians over the ellipse {α ≥ 1/255}. [N] -> [N]"""
     bare = (opacities - ALPHA_MIN) / (opacities / ALPHA_MIN).clamp_min(1.001).log()
     return bare.clamp_min(1e-6)
 
@@ -55,8 +59,8 @@ def gather(scene: Gaussians, cameras: Sequence[Camera], masks: Sequence[Tensor])
 
     Args:
         scene: N Gaussians
-        cameras: one a view
-        masks: 0..1 or bool, of its camera's size. [H,W] each
+        cameras: one per view
+        masks: 0 to 1 or bool, at the size of the camera. [H,W] each
     """
     sums = torch.zeros(len(scene), 4, dtype=torch.float64)
     mean_weight = torch.zeros(len(scene))
@@ -77,11 +81,11 @@ def gather(scene: Gaussians, cameras: Sequence[Camera], masks: Sequence[Tensor])
 
 
 def score(evidence: Evidence, rule: LiftRule = "share") -> Tensor:
-    """How surely the masks mean each Gaussian. [N] 0..1; 0 where no view shows it.
+    """Return the score of each Gaussian under the masks, 0 to 1; 0 if no view shows it. [N]
 
-    share: Σ w·m / Σ w, the part of its visible contribution that falls inside the masks. paper: Σ m / n, as
-    the kernel of GaussianEditor counts that the paper refers to. The sum that is printed, Σ σ·α·T·m / n, has
-    σ twice and comes to a fifth at most, far below the printed threshold of .8.
+    share: Σ w·m / Σ w, the share of its visible contribution inside the masks. paper: Σ m / n, as in the
+    kernel of GaussianEditor that the paper refers to. The printed sum, Σ σ·α·T·m / n, has σ twice and is at
+    most a fifth, far below the printed threshold of 0.8.
     """
     if rule == "share":
         return evidence.inside / evidence.weight.clamp_min(1e-12)
@@ -97,29 +101,31 @@ def lift_masks(
     threshold: float | None = None,
     say: Callable[[str], None] | None = None,
 ) -> Region:
-    """The Gaussians that the masks select (ProGDF appendix, region extraction; see docs/method.md 4).
+    """Return the Gaussians that the masks select (ProGDF appendix, region extraction; see docs/method.md 4).
 
     Args:
         scene: N Gaussians
-        cameras: one a view
-        masks: 0..1 or bool, of its camera's size. [H,W] each
+        cameras: one per view
+        masks: 0 to 1 or bool, at the size of the camera. [H,W] each
         name: the region's name
         rule: see `score`
-        threshold: least score of a member, 0..1; None is the rule's own, see `THRESHOLDS`
-        say: hears what few masks were cleaned of, see `few_masks`
+        threshold: minimum score of a member, 0 to 1; None is the rule's own, see `THRESHOLDS`
+        say: receives log lines on the cleaning of a small number of masks, see `few_masks`
 
     Returns:
-        The members, and the score of every Gaussian, by which these are the members: `score` ≥ threshold. It
-        is the rule's for Gaussians that the views decide; for the others it tells how much of the surface
-        around them belongs to the members (see `surface.SurfaceVote`), half of it being the threshold.
-        Where the views decide on no member there is none. Under the rule `paper` the score alone decides:
-        there is no surface, and no cleaning.
+        The members, and the score of every Gaussian. Members are those with `score` ≥ threshold. The score is
+        the rule's for Gaussians that the views decide. For the others it is the share of the surrounding
+        surface that belongs to members (see `surface.SurfaceVote`), scaled so that half of it is the
+        threshold. If the views decide on no member, there is none. Under the rule `paper` the score alone
+        decides, without surface and cleaning.
 
-    How the rules and thresholds do against exact labels is in docs/experiments.md, Regions from masks.
+    The accuracy of rules and thresholds against exact labels is in docs/experiments.md, Regions from masks.
     """
-    least = THRESHOLDS[rule] if threshold is None else threshold
+    min_score = THRESHOLDS[rule] if threshold is None else threshold
     evidence = gather(scene, cameras, masks)
-    return lift_evidence(scene, evidence, SurfaceVote(scene), name, rule, least, 2 <= len(masks) <= FEW, say)
+    return lift_evidence(
+        scene, evidence, SurfaceVote(scene), name, rule, min_score, 2 <= len(masks) <= FEW, say
+    )
 
 
 def lift_evidence(
@@ -132,25 +138,28 @@ def lift_evidence(
     few: bool,
     say: Callable[[str], None] | None = None,
 ) -> Region:
-    """`lift_masks` of gathered evidence; `few`: whether the region is cleaned as that of few masks."""
+    """Return the region of gathered evidence, see `lift_masks`.
+
+    `few`: clean the region, for a small number of masks
+    """
     scores = score(evidence, rule)
     if rule == "paper":
         return Region(name, (scores >= least).nonzero()[:, 0], scores)
     rows = undecided_rows(evidence, least).nonzero()[:, 0]
     member = (scores >= least).index_fill(0, rows, False)
     if few:
-        # what rough borders cut through, and what one of two masks holds, is as its surroundings are
-        mixed = (scores > min(_DOUBTFUL[0], least)) & (scores < least)
+        # surroundings decide Gaussians that a rough mask edge cuts, and those inside only one of two masks
+        mixed = (scores > min(_MIXED_SHARES[0], least)) & (scores < least)
         single = member & (evidence.views >= 2) & (evidence.views_inside < 2)
         member = drop_strays(scene, member, evidence.views, evidence.views_inside, say)
-        scores = torch.where(member, scores, scores.clamp_max(_below(least)))
-        open_ = (mixed | single).index_fill(0, rows, True)
-        rows = open_.nonzero()[:, 0]
+        scores = torch.where(member, scores, scores.clamp_max(_largest_score_below(least)))
+        is_open = (mixed | single).index_fill(0, rows, True)
+        rows = is_open.nonzero()[:, 0]
     scores[rows] = 0.0
     if bool(member.any()):
         vote = surface_vote(member, rows)
-        below = (least * (1 + vote)).clamp_max(_below(least))
-        scores[rows] = torch.where(vote > 0, least + (1 - least) * vote, below)
+        lower_scores = (least * (1 + vote)).clamp_max(_largest_score_below(least))
+        scores[rows] = torch.where(vote > 0, least + (1 - least) * vote, lower_scores)
         member[rows] = vote > 0
     if few:
         holes = find_holes(scene, member, evidence.views - evidence.views_inside, say)
@@ -159,13 +168,13 @@ def lift_evidence(
     return Region(name, member.nonzero()[:, 0], scores.clamp(0.0, 1.0))
 
 
-def _below(least: float) -> float:
-    """The largest score of no member."""
+def _largest_score_below(least: float) -> float:
+    """Return the largest score below the minimum of a member."""
     return float(torch.nextafter(torch.tensor(least), torch.tensor(0.0)))
 
 
 def undecided_rows(evidence: Evidence, least: float) -> Tensor:
-    """Which Gaussians the views tell nothing sure of: hidden, or half hidden and of mixed share. [N] bool"""
+    """Return the Gaussians that the views leave open: hidden, or half hidden with a mixed share. [N] bool"""
     share = score(evidence, "share")
-    mixed = (share > min(_DOUBTFUL[0], 1 - least)) & (share < max(_DOUBTFUL[1], least))
+    mixed = (share > min(_MIXED_SHARES[0], 1 - least)) & (share < max(_MIXED_SHARES[1], least))
     return (evidence.clearness < HIDDEN) | (mixed & (evidence.clearness < _HALF_HIDDEN))

@@ -1,6 +1,8 @@
-"""What a sentence names: GroundingDINO (Liu et al. 2023) finds boxes, SAM (Kirillov et al. 2023) outlines.
+"""Segment the object that a prompt names: GroundingDINO (Liu et al. 2023) finds boxes, SAM (Kirillov et al.
+2023) masks.
 
-Together they are what the paper calls LangSAM. Weights are read from this machine, never fetched unasked.
+Together they are the LangSAM of the paper. Weights are read from this machine and never downloaded
+implicitly.
 """
 
 from __future__ import annotations
@@ -20,16 +22,16 @@ from trainer.store.pretrained import BROKEN, folder_of_model, model_device, weig
 
 
 class Segmenter(Protocol):
-    """Finds what a prompt names."""
+    """Segmenter of the objects that a prompt names."""
 
     def __call__(self, image: Tensor, prompt: str) -> Tensor:
-        """The mask of it, empty where there is none. [H,W,3] 0..1 -> [H,W] bool"""
+        """Return the mask of the objects, empty if there are none. [H,W,3], 0 to 1 -> [H,W] bool"""
         ...
 
 
 @dataclass(frozen=True)
 class GroundedSam:
-    """Both networks with their processors; make it with `grounded_sam`."""
+    """Detector and segmentation network with their processors; create it with `grounded_sam`."""
 
     # detector, detector_processor: `GroundingDinoForObjectDetection`, `GroundingDinoProcessor`
     detector: Any
@@ -37,10 +39,10 @@ class GroundedSam:
     # sam_model, sam_processor: `SamModel`, `SamProcessor`
     sam_model: Any
     sam_processor: Any
-    box_threshold: float  # confidence of a find, 0..1
+    box_threshold: float  # minimum confidence of a detection, 0 to 1
 
     def __call__(self, image: Tensor, prompt: str) -> Tensor:
-        """See `Segmenter`: the union of the outlines of all that is found."""
+        """Return the union of the masks of all detections, see `Segmenter`."""
         picture = to_picture(image)
         boxes = self.boxes(picture, prompt)
         if not len(boxes):
@@ -58,13 +60,13 @@ class GroundedSam:
         return masks.bool().flatten(0, 1).any(dim=0)
 
     def boxes(self, picture: Any, prompt: str) -> Tensor:
-        """x0, y0, x1, y1 in pixels of all that is found in a PIL image. [B,4]"""
+        """Return x0, y0, x1, y1 in pixels of all detections in a PIL image. [B,4]"""
         inputs = self.detector_processor(images=picture, text=normalize_prompt(prompt), return_tensors="pt")
         inputs = inputs.to(self.detector.device)
         with torch.no_grad():
-            answer = self.detector(**inputs)
+            outputs = self.detector(**inputs)
         detections = self.detector_processor.post_process_grounded_object_detection(
-            answer,
+            outputs,
             inputs["input_ids"],
             threshold=self.box_threshold,
             text_threshold=self.box_threshold,
@@ -75,7 +77,7 @@ class GroundedSam:
 
 
 def normalize_prompt(prompt: str) -> str:
-    """A prompt as GroundingDINO was trained on: lower case, ending in a full stop."""
+    """Return a prompt in the format of GroundingDINO's training: lower case, ending in a full stop."""
     words = " ".join(prompt.lower().split()).rstrip(". ")
     return f"{words}."
 
@@ -84,7 +86,8 @@ def grounded_sam(options: RegionOptions) -> GroundedSam:
     """Load both networks from this machine.
 
     Raises:
-        ProgdfError: transformers is not installed, weights are missing or broken, or a model is another kind.
+        ProgdfError: transformers is not installed, weights are missing or broken, or a model has the wrong
+            type.
     """
     try:
         from transformers import (
@@ -94,10 +97,10 @@ def grounded_sam(options: RegionOptions) -> GroundedSam:
             SamModel,
             SamProcessor,
         )
-        from transformers.utils import logging as speaks
+        from transformers.utils import logging as transformers_logging
     except ImportError as error:
         raise _import_failure(error) from error
-    pretrained.keep_quiet(speaks)
+    pretrained.keep_quiet(transformers_logging)
 
     def load(model: str, kind: str, option: str, usual: str, network: Any, processor: Any) -> tuple[Any, Any]:
         try:
@@ -112,7 +115,7 @@ def grounded_sam(options: RegionOptions) -> GroundedSam:
         except BROKEN as error:
             raise _missing(model, option) from error
 
-    finder = load(
+    detector = load(
         options.detector,
         "grounding-dino",
         "--detector",
@@ -121,11 +124,11 @@ def grounded_sam(options: RegionOptions) -> GroundedSam:
         GroundingDinoProcessor,
     )
     sam_model = load(options.sam_model, "sam", "--sam-model", SAM_MODEL, SamModel, SamProcessor)
-    return GroundedSam(*finder, *sam_model, options.box_threshold)
+    return GroundedSam(*detector, *sam_model, options.box_threshold)
 
 
 def check_grounded_sam(options: RegionOptions) -> None:
-    """What `grounded_sam` would raise, as far as it is to be known without loading a network.
+    """Raise the errors of `grounded_sam` that can be found without loading a network.
 
     Raises:
         ProgdfError: see `grounded_sam`.
@@ -160,7 +163,7 @@ def _missing(model: str, option: str) -> ProgdfError:
 
 
 SEGMENTERS: Mapping[str, Callable[[RegionOptions], Segmenter]] = {"text": grounded_sam}
-"""Kind of region → the segmenter behind it, loaded when it is made."""
+"""Kind of region → constructor of its segmenter, which loads the networks."""
 
 SEGMENTER_CHECKS: Mapping[str, Callable[[RegionOptions], None]] = {"text": check_grounded_sam}
-"""Kind of region → what raises a ProgdfError where that segmenter cannot be made; it loads no weights."""
+"""Kind of region → check that raises a ProgdfError if the segmenter cannot be made; loads no weights."""

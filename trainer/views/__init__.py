@@ -1,1 +1,1 @@
-"""The views an edit is trained on."""
+"""Views for training and measuring an edit."""

@@ -1,9 +1,9 @@
-"""Which cameras an edit is trained from, and which it is measured with.
+"""Choose the cameras for training and measuring an edit.
 
-A scene comes with hundreds of cameras, in the order in which someone walked; 96 is the most that ProGDF
-(AAAI 2025) edits. The first 96 would show one side. So a camera is worth what it shows of the region that no
-camera taken before shows from near the same direction: every part of the region is seen, and from all around,
-whatever the list's order. The same measure decides which views represent the others, to be held out.
+A scene comes with hundreds of cameras in capture order, and ProGDF (AAAI 2025) edits at most 96. The first 96
+would cover one side only. The value of a camera is the visible part of the region that no chosen camera shows
+from a similar direction. The choice therefore covers every part of the region from all sides, in any list
+order. The same measure chooses representative views to hold out.
 """
 
 from __future__ import annotations
@@ -37,32 +37,36 @@ from .view import View, fit_size, make_view
 T = TypeVar("T")
 
 _SAMPLES = 256
-"""Members that represent the region when views are compared."""
+"""Number of members that represent the region when views are compared."""
 
-_LOOK = 96
-"""Longer side in pixels at which cameras are compared."""
+_COMPARED_SIDE_PX = 96
+"""Longer side at which cameras are compared."""
 
-_MAX_LOOKED_THROUGH = 4
-"""Times as many cameras as are wanted are looked through; of more, the best spread ones are taken unseen."""
+_MAX_RENDERED = 4
+"""Maximum number of cameras rendered for comparison per requested view.
 
-_MAX_TILT = 45.0  # degrees between the up of cameras and of their scene: people hold cameras level
+From more cameras, the best spread ones are selected without rendering.
+"""
 
-_SMALL_SHARE = 0.25  # of a picture: people frame a scene so that it fills more in the median view
+_MAX_TILT = 45.0  # degrees between the up axes of cameras and scene, as cameras are usually held level
+
+_SMALL_SHARE = 0.25  # of a picture; the median view of a scene usually fills more
 
 _MIN_COVER = 0.25
-"""Of what the median view shows of the region; a view that shows less is left out."""
+"""Minimum visible area of the region, as a share of the median view's; views with less are dropped."""
 
 
 def load_given_cameras(options: TrainingViewOptions, scene: Gaussians) -> SceneCameras:
-    """Return the cameras of --cameras in the scene's frame, none if it is not given.
+    """Return the cameras of --cameras in the scene's frame; none if the option is not given.
 
-    A note tells where their mean up is more than 45° off the scene's, if its shape leaves no doubt.
+    Adds a note if their mean up axis is more than 45° off the scene's and the scene's shape leaves no doubt.
+
     Cameras of a nerfstudio dataset without its dataparser_transforms.json are refused if they are tilted like
-    this, even against a doubtful up, and the median camera shows the scene in less than a quarter of its
-    picture. Both together are the marks of nerfstudio's frame, which is turned and scaled.
+    this, even against a doubtful up axis, and the median camera shows the scene in less than a quarter of its
+    picture. Both together indicate nerfstudio's frame, which is rotated and scaled.
 
     Raises:
-        ProgdfError: see `load_scene_cameras`; or the cameras are probably of another frame.
+        ProgdfError: see `load_scene_cameras`; or the cameras are probably in another frame.
     """
     if options.cameras is None:
         return SceneCameras([])
@@ -94,15 +98,14 @@ def load_given_cameras(options: TrainingViewOptions, scene: Gaussians) -> SceneC
 
 @dataclass(frozen=True)
 class Visibility:
-    """What each of V cameras shows of S members: how well [V,S] 0..1, and from where (unit vectors from the
-    member to the eye) [V,S,3]; `reach` is the angle in radians at which another direction is another side."""
+    """Visibility of S members in V cameras."""
 
-    visible: Tensor
-    toward: Tensor
-    reach: float
+    visible: Tensor  # 0 to 1. [V,S]
+    toward: Tensor  # unit vectors from the members to the cameras. [V,S,3]
+    reach: float  # angle in radians beyond which another direction counts as another side
 
     def coverage_by(self, camera: int) -> Tensor:
-        """How far one camera serves what each shows of each member. [V,S] 0..1"""
+        """Return the degree to which one camera covers each camera's view of each member, 0 to 1. [V,S]"""
         cosine = (self.toward * self.toward[camera]).sum(dim=2)
         near = torch.exp(-(1 - cosine) / (1 - math.cos(self.reach)))
         return self.visible[camera] * near
@@ -110,16 +113,16 @@ class Visibility:
 
 @dataclass(frozen=True)
 class ViewChoice:
-    """The views an edit works on."""
+    """Chosen views of an edit."""
 
     views: tuple[View, ...]  # in the order of the cameras' list
-    shown: Visibility  # what each of them shows
-    offered: int  # how many cameras there were
-    unseeing: int  # how many of them do not see the region
-    scant: int  # how many show less than a quarter of what the median view shows
+    shown: Visibility  # of the members in these views
+    offered: int  # number of cameras to choose from
+    unseeing: int  # number of cameras that do not see the region
+    scant: int  # number of cameras that show less than a quarter of the median view's area
 
     def line(self) -> str:
-        """What became of the cameras, for the log."""
+        """Return the log line on the use of the cameras."""
         parts = [f"{len(self.views)} of {self.offered} cameras"]
         if self.unseeing:
             parts.append(f"{self.unseeing} do not see the region")
@@ -134,85 +137,94 @@ class ViewChoice:
 def choose_views(
     scene: Gaussians, region: Region, cameras: Sequence[Camera], count: int, background: Tensor
 ) -> ViewChoice:
-    """Up to `count` views that show all of the region from as many sides as the cameras do.
+    """Return up to `count` views that cover the region from as many sides as the cameras do.
 
     Args:
-        scene: what the cameras look at
-        region: what the views are to show
+        scene: the scene in front of the cameras
+        region: the region to cover
         cameras: any number in any order; the choice hardly depends on the order
-        count: how many views at most, ≥ 1
+        count: maximum number of views, ≥ 1
         background: rgb. [3]
 
     Raises:
         ProgdfError: no camera sees the region.
     """
     rows = sample_members(scene, region)
-    places = scene.means[rows]
-    framed = torch.stack([in_frame(places, camera) for camera in cameras])
-    looked = framed.any(dim=1).nonzero()[:, 0].tolist()
-    most = _MAX_LOOKED_THROUGH * count
-    if len(looked) > most:
-        toward = _toward(places, [cameras[i] for i in looked])
-        looked = [looked[k] for k in _greedy(Visibility(framed[looked].float(), toward, _reach(most)), most)]
-    cover, weights = _measure_visibility(scene, region, rows, [cameras[i] for i in looked])
+    positions = scene.means[rows]
+    framed = torch.stack([in_frame(positions, camera) for camera in cameras])
+    candidates = framed.any(dim=1).nonzero()[:, 0].tolist()
+    max_candidates = _MAX_RENDERED * count
+    if len(candidates) > max_candidates:
+        toward = _toward(positions, [cameras[i] for i in candidates])
+        candidates = [
+            candidates[k]
+            for k in _greedy(
+                Visibility(framed[candidates].float(), toward, _mean_spacing(max_candidates)), max_candidates
+            )
+        ]
+    cover, weights = _measure_visibility(scene, region, rows, [cameras[i] for i in candidates])
     seeing = cover > 0
     if not bool(seeing.any()):
         raise ProgdfError(
             f"none of the {len(cameras)} cameras sees the region '{region.name}'; "
             "give cameras that look at it with --cameras"
         )
-    enough = cover >= _MIN_COVER * cover[seeing].median()
-    good = enough.nonzero()[:, 0].tolist()
-    toward = _toward(places, [cameras[looked[k]] for k in good])
-    visibility = Visibility(_relative_visibility(weights[good]), toward, _reach(count))
-    taken = _greedy(visibility, count) if len(good) > count else list(range(len(good)))
+    is_sufficient = cover >= _MIN_COVER * cover[seeing].median()
+    sufficient = is_sufficient.nonzero()[:, 0].tolist()
+    toward = _toward(positions, [cameras[candidates[k]] for k in sufficient])
+    visibility = Visibility(_relative_visibility(weights[sufficient]), toward, _mean_spacing(count))
+    chosen = _greedy(visibility, count) if len(sufficient) > count else list(range(len(sufficient)))
     return ViewChoice(
-        tuple(map_threads(lambda k: make_view(scene, region, cameras[looked[good[k]]], background), taken)),
-        Visibility(visibility.visible[taken], visibility.toward[taken], visibility.reach),
+        tuple(
+            map_threads(
+                lambda k: make_view(scene, region, cameras[candidates[sufficient[k]]], background), chosen
+            )
+        ),
+        Visibility(visibility.visible[chosen], visibility.toward[chosen], visibility.reach),
         len(cameras),
         int((~framed.any(dim=1)).sum()) + int((~seeing).sum()),
-        int((seeing & ~enough).sum()),
+        int((seeing & ~is_sufficient).sum()),
     )
 
 
 def split_held_out(held_out: Sequence[T]) -> tuple[Sequence[T], Sequence[T]]:
-    """Held-out views to choose a field on, every other one, and those to report its errors on, the others.
+    """Return the held-out views to choose a field on (every other one), and those to report its errors on.
 
-    One view alone serves for both.
+    A single view serves for both.
     """
     return held_out[::2], held_out[1::2] or held_out
 
 
 def split_views(choice: ViewChoice, held_out: int) -> tuple[list[View], list[View]]:
-    """Views to train with, and up to `held_out` that show most of what all show, from as many sides.
+    """Return the views to train on, and up to `held_out` representative views from as many sides.
 
-    At most a third is held out, which of two is none.
+    At most a third is held out, so none of two views.
     """
     views = choice.views
     count = min(held_out, len(choice.views) // 3)
-    chosen = _greedy(replace(choice.shown, reach=_reach(count)), count) if count > 0 else []
+    chosen = _greedy(replace(choice.shown, reach=_mean_spacing(count)), count) if count > 0 else []
     return [view for i, view in enumerate(views) if i not in chosen], [views[i] for i in chosen]
 
 
 def _greedy(visibility: Visibility, count: int) -> list[int]:
-    """The cameras that add most, one after the other, in the order of the list; ties by that order."""
-    served = torch.zeros_like(visibility.visible)
-    left = torch.ones(len(served), dtype=torch.bool)
+    """Return the cameras with the largest gains, chosen greedily, in list order. Ties go to the first."""
+    covered = torch.zeros_like(visibility.visible)
+    remaining = torch.ones(len(covered), dtype=torch.bool)
     for _ in range(count):
-        gain = (visibility.visible * (1 - served)).sum(dim=1)
-        best = int(torch.where(left, gain, -1.0).argmax())
-        left[best] = False
-        served = torch.maximum(served, visibility.coverage_by(best))
-    return (~left).nonzero()[:, 0].tolist()
+        gain = (visibility.visible * (1 - covered)).sum(dim=1)
+        best = int(torch.where(remaining, gain, -1.0).argmax())
+        remaining[best] = False
+        covered = torch.maximum(covered, visibility.coverage_by(best))
+    return (~remaining).nonzero()[:, 0].tolist()
 
 
-def _reach(count: int) -> float:
-    """The mean angle between neighbors of `count` directions spread over a half sphere."""
+def _mean_spacing(count: int) -> float:
+    """Return the mean angle in radians between neighbors of `count` directions spread over a half sphere."""
     return min(1.0, math.sqrt(2 * math.pi / count))
 
 
 def sample_members(scene: Gaussians, region: Region) -> Tensor:
-    """Rows that represent the region, evenly by the area they can cover. -> [S] int64"""
+    """Return rows that represent the region, evenly spaced by the area that they can cover. [S] int64"""
     total = visible_area(scene[region.members]).cumsum(dim=0)
     ticks = (torch.arange(_SAMPLES, dtype=torch.float64) + 0.5) / _SAMPLES * total[-1]
     picked = torch.searchsorted(total, ticks).clamp_max(len(total) - 1)
@@ -220,15 +232,15 @@ def sample_members(scene: Gaussians, region: Region) -> Tensor:
 
 
 def in_frame(places: Tensor, camera: Camera) -> Tensor:
-    """Which places fall into the picture or near it, whatever stands before them. [S,3] -> [S] bool
+    """Return the positions inside the picture or near it, regardless of occlusion. [S,3] -> [S] bool
 
-    Near: within half the picture's size, as what is large reaches in.
+    Near is within half the picture's size, as large Gaussians extend into it.
     """
-    seen = places @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    pixels = seen @ camera.K.T
+    camera_positions = places @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    pixels = camera_positions @ camera.K.T
     size = torch.tensor([camera.width, camera.height])
-    aside = (pixels[:, :2] / pixels[:, 2:] / size - 0.5).abs().amax(dim=1)
-    return (aside <= 1.0) & (seen[:, 2] > 0)
+    offset = (pixels[:, :2] / pixels[:, 2:] / size - 0.5).abs().amax(dim=1)
+    return (offset <= 1.0) & (camera_positions[:, 2] > 0)
 
 
 def _toward(places: Tensor, cameras: Sequence[Camera]) -> Tensor:
@@ -239,32 +251,34 @@ def _toward(places: Tensor, cameras: Sequence[Camera]) -> Tensor:
 def _measure_visibility(
     scene: Gaussians, region: Region, rows: Tensor, cameras: Sequence[Camera]
 ) -> tuple[Tensor, Tensor]:
-    """The region's share of each picture [V], and each sample's blended weight in it [V,S]."""
+    """Return the region's share of each picture [V], and each sample's blended weight in it [V,S]."""
     cover = torch.zeros(len(cameras))
     weights = torch.zeros(len(cameras), len(rows))
 
     def look(i: int) -> None:
-        small = fit_size(cameras[i], _LOOK)
-        found = alpha_weights(scene, small, torch.ones(small.height, small.width))[:, 2]
-        cover[i] = found[region.members].sum() / (small.width * small.height)
-        weights[i] = found[rows]
+        small_camera = fit_size(cameras[i], _COMPARED_SIDE_PX)
+        visible = alpha_weights(scene, small_camera, torch.ones(small_camera.height, small_camera.width))[
+            :, 2
+        ]
+        cover[i] = visible[region.members].sum() / (small_camera.width * small_camera.height)
+        weights[i] = visible[rows]
 
     map_threads(look, range(len(cameras)))
     return cover, weights
 
 
 def _relative_visibility(weights: Tensor) -> Tensor:
-    """How well each sample shows, 1 where it shows as in the median view that shows it. [V,S] -> 0..1"""
+    """Return each sample's visibility, 1 from that of the median view that shows it. [V,S] -> 0 to 1"""
     typical = torch.where(weights > 0, weights, torch.nan).nanmedian(dim=0).values.nan_to_num(1.0)
     return (weights / typical.clamp_min(1e-9)).clamp_max(1.0)
 
 
-_GIANT = 20.0
-"""Times the mean area at which one Gaussian counts no more."""
+_MAX_AREA = 20.0
+"""Limit of the area that counts for a Gaussian, in mean areas."""
 
 
 def visible_area(gaussians: Gaussians) -> Tensor:
-    """Opacity times the two longer axes, cut off so that no giant speaks for all. [N] float64"""
+    """Return opacity times the two longer axes, clamped so that no huge Gaussian dominates. [N] float64"""
     _, middle, long = gaussians.scales.sort(dim=1).values.double().unbind(1)
     areas = gaussians.opacities.double() * middle * long
-    return areas.clamp_max(_GIANT * float(areas.mean()))
+    return areas.clamp_max(_MAX_AREA * float(areas.mean()))

@@ -1,8 +1,8 @@
-"""Rendering one view's box of the scene with other values in the region's rows, and nothing more than that.
+"""Fast rendering of one view's box with changed member rows.
 
-An edit changes the members of a region only, so a view is prepared once: the Gaussians that its box can
-show, their activated values, the colors seen from there. What a training step pays for is the members and
-the box.
+An edit changes only the members of a region. Each view is prepared once: the Gaussians visible in its box,
+their activated values, and their colors from this camera. A training step then costs only the members and the
+box.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from progdf.threads import map_threads, threads
 from .view import seen_colors
 
 _SUPPORT = 2 * 5.55
-"""Largest squared Mahalanobis distance at which alpha ≥ 1/255: 2 ln 255, rounded up."""
+"""Largest squared Mahalanobis distance with alpha ≥ 1/255: 2 ln 255, rounded up."""
 
 
 def live_tiles(contributes: Tensor, box: Crop) -> Tensor:
-    """The tiles in which some pixel of a box is set, on the tile grid of the full image.
+    """Return the tiles in which some pixel of a box is set, on the tile grid of the full image.
 
     Args:
         contributes: pixels of the box. [h,w] bool
         box: x0, y0, x1, y1 in the full image
 
     Returns:
-        [rows, columns] bool; tiles from the image's left top to the box's right bottom
+        Tiles from the image's top left to the box's bottom right. [rows, columns] bool
     """
     x0, y0, x1, y1 = box
     rows = -(-y1 // TILE_H)
@@ -48,16 +48,16 @@ def live_tiles(contributes: Tensor, box: Crop) -> Tensor:
 
 
 def live_pixels(live: Tensor, box: Crop) -> Tensor:
-    """The pixels of a box that lie in live tiles. [rows, columns] bool -> [h,w] bool"""
+    """Return the pixels of a box that lie in live tiles. [rows, columns] bool -> [h,w] bool"""
     x0, y0, x1, y1 = box
     return live.repeat_interleave(TILE_H, dim=0).repeat_interleave(TILE_W, dim=1)[y0:y1, x0:x1]
 
 
 def may_reach(means: Tensor, scales: Tensor, camera: Camera, live: Tensor) -> Tensor:
-    """Which Gaussians may reach into a live tile; too many rather than too few.
+    """Return the Gaussians that may reach into a live tile; a conservative superset.
 
-    The bound: the largest axis, through the Jacobian of the projection at the place where the rasterizer
-    takes it (Kerbl 2023 clamps it to 1.3 times the field of view), is the largest a projected axis can be.
+    The bound on a projected axis is the largest axis times the Jacobian of the projection, taken where the
+    rasterizer takes it (Kerbl 2023 clamps the position to 1.3 times the field of view).
 
     Args:
         means, scales: activated. [n,3], [n,3]
@@ -67,20 +67,20 @@ def may_reach(means: Tensor, scales: Tensor, camera: Camera, live: Tensor) -> Te
     Returns:
         [n] bool
     """
-    seen = means.double() @ camera.viewmat[:3, :3].T.double() + camera.viewmat[:3, 3].double()
-    z = seen[:, 2].clamp_min(camera.near)
+    camera_means = means.double() @ camera.viewmat[:3, :3].T.double() + camera.viewmat[:3, 3].double()
+    z = camera_means[:, 2].clamp_min(camera.near)
     K = camera.K.double()
     focal = torch.stack([K[0, 0], K[1, 1]])
     size = K.new_tensor([camera.width, camera.height])
-    slope = seen[:, :2] / z[:, None]
+    slope = camera_means[:, :2] / z[:, None]
     center = slope * focal + K[:2, 2]
-    # at least as far out as the rasterizer's clamp, which leaves 0.15 of the picture beyond each edge
-    most = torch.maximum(K[:2, 2], size - K[:2, 2]) / focal + 0.2 * size / focal
-    widened = 1 + slope.abs().minimum(most).square().sum(dim=1)
-    spread = (
+    # at least as far out as the rasterizer's clamp, at 0.15 of the picture beyond each edge
+    max_slope = torch.maximum(K[:2, 2], size - K[:2, 2]) / focal + 0.2 * size / focal
+    stretch = 1 + slope.abs().minimum(max_slope).square().sum(dim=1)
+    variance = (
         scales.double().amax(dim=1) * focal.max() / z
-    ).square() * widened + DILATION / camera.sampling**2
-    radius = (_SUPPORT * spread).sqrt() + 1.0
+    ).square() * stretch + DILATION / camera.sampling**2
+    radius = (_SUPPORT * variance).sqrt() + 1.0
     rows, columns = live.shape
     step = K.new_tensor([TILE_W, TILE_H])
     last = K.new_tensor([columns, rows])
@@ -97,20 +97,19 @@ def may_reach(means: Tensor, scales: Tensor, camera: Camera, live: Tensor) -> Te
 
 @dataclass(frozen=True)
 class CropScene:
-    """What one view's box can show, ready to be rendered with other member rows."""
+    """Content of one view's box, prepared for rendering with other member rows."""
 
     camera: Camera  # the whole view
     box: Crop  # the pixels that are rendered
-    # the n Gaussians of the box with their colors as seen from this camera; members hold the original's
-    # values
+    # the n Gaussians of the box with their colors from this camera; members have the original's values
     gaussians: ActivatedGaussians
-    rows: Tensor  # where the members are among them, in the region's order. [M] int64
+    rows: Tensor  # indices of the members among them, in the region's order. [M] int64
     member_shN: Tensor  # higher SH bands of the members in the original. [M,K,3]
-    background: Tensor  # what shows through. [3]
+    background: Tensor  # rgb. [3]
     original: Tensor  # the unedited picture, not clamped. [h,w,3]
-    live: Tensor | None = None  # pixels that are drawn, others are the original's; None: all. [h,w,1] bool
-    still: bool = False  # nothing but the members' colors ever differs
-    engine: str = "cpu"  # that draws, on the device of the Gaussians
+    live: Tensor | None = None  # pixels to draw, others are the original's; None: all. [h,w,1] bool
+    still: bool = False  # only the members' colors ever differ
+    engine: str = "cpu"  # rasterizer, on the device of the Gaussians
 
     @property
     def size(self) -> tuple[int, int]:
@@ -118,21 +117,21 @@ class CropScene:
         return self.box[3] - self.box[1], self.box[2] - self.box[0]
 
     def render(self, packed: Tensor, moving: Collection[str] = ATTRIBUTES) -> Tensor:
-        """The box with these raw values in the region's rows, differentiable in them.
+        """Render the box with these raw values in the region's rows, differentiable in them.
 
         Args:
-            packed: member rows as `gaussians.pack` gives them, on any device. [M,14] or [M,14+3K]
-            moving: attributes whose values differ from the original's; the others are not looked at
+            packed: member rows from `gaussians.pack`, on any device. [M,14] or [M,14+3K]
+            moving: attributes whose values differ from the original's; the others are ignored
 
         Returns:
-            The image, 0..1 (see `clamp_towards`). [h,w,3]
+            The image, 0 to 1 (see `clamp_towards`). [h,w,3]
         """
         members = unpack(packed.to(self.background.device), self.member_shN)
         weights = self._still_weights if self.still else self._weights(members.means)
         colors = clamp_towards((weights * members.sh[:, : weights.shape[1]]).sum(dim=1) + 0.5, 0.0, math.inf)
         if self.still and not colors.requires_grad:
-            weighed, others = self._linear
-            image = others + weighed.picture(colors)
+            weight_map, remainder = self._linear
+            image = remainder + weight_map.picture(colors)
         else:
             new = {"colors": colors}
             if "means" in moving:
@@ -143,20 +142,20 @@ class CropScene:
                 new["scales"] = members.scales
             if "logit_opacities" in moving:
                 new["opacities"] = members.opacities
-            shown = self.with_members(new)
+            gaussians = self.with_members(new)
             rows = self.rows
-            drawn = render(
-                shown, self.camera, self.background, crop=self.box, grad_rows=rows, engine=self.engine
+            output = render(
+                gaussians, self.camera, self.background, crop=self.box, grad_rows=rows, engine=self.engine
             )
-            image = drawn.image
+            image = output.image
         if self.live is not None:
             image = torch.where(self.live, image, self.original)
         return clamp_towards(image, 0.0, 1.0)
 
     def _weights(self, means: Tensor) -> Tensor:
-        """What each band weighs in the members' colors from here. [M,3] -> [M,B,1]
+        """Return the weight of each SH band in the members' colors from this camera. [M,3] -> [M,B,1]
 
-        Directions are constants: their share of the means' gradient is small and mostly noise.
+        Directions are constants, as their share of the means' gradient is small and mostly noise.
         """
         directions = torch.nn.functional.normalize(means.detach() - self.camera.position, dim=1)
         return basis(min(math.isqrt(self.member_shN.shape[1] + 1) - 1, 3), directions)[..., None]
@@ -167,12 +166,13 @@ class CropScene:
 
     @cached_property
     def _linear(self) -> tuple[ColorMap, Tensor]:
-        """While nothing moves: what each member weighs in each pixel, and what all others show."""
-        weighed = color_map(self.gaussians, self.camera, self.box, self.rows, self.engine)
-        return weighed, self.original - weighed.picture(self.gaussians.colors[self.rows])
+        """Linear model for constant geometry: each member's weight in each pixel, and the image of all
+        others."""
+        weight_map = color_map(self.gaussians, self.camera, self.box, self.rows, self.engine)
+        return weight_map, self.original - weight_map.picture(self.gaussians.colors[self.rows])
 
     def with_members(self, new: Mapping[str, Tensor]) -> ActivatedGaussians:
-        """The box's Gaussians with other activated values of the members, by name. [M,...] each"""
+        """Return the box's Gaussians with other activated values of the members, by name. [M,...] each"""
         old = self.gaussians._asdict()
         return self.gaussians._replace(
             **{name: old[name].index_copy(0, self.rows, values) for name, values in new.items()}
@@ -180,7 +180,7 @@ class CropScene:
 
 
 GEOMETRY = ("means", "quats", "log_scales", "logit_opacities")
-"""Attributes that decide which pixels a Gaussian contributes to."""
+"""Attributes that determine the pixels of a Gaussian."""
 
 
 def crop_scene(
@@ -198,11 +198,11 @@ def crop_scene(
         scene: the original
         members: rows of the region. [M] int64
         camera: the whole view
-        box: the pixels that are rendered
+        box: the pixels to render
         background: rgb. [3]
-        still: nothing but colors will move, so only tiles that show a member are drawn (`live_tiles`), and
-            without gradients a linear map of the members' colors
-        engine: that draws
+        still: only colors will change. Then only tiles with members are drawn (`live_tiles`), without
+            gradients by a linear map of the members' colors
+        engine: rasterizer
     """
     device = scene.means.device
     members = members.to(device)
@@ -210,21 +210,23 @@ def crop_scene(
     background = background.to(device)
     activated = activate(scene, seen_colors(scene, camera))
     member = torch.zeros_like(activated.opacities, dtype=torch.bool).index_fill(0, members, True)
-    drawn = render(activated, camera, background, crop=box, engine=engine)
-    # one out of sight may come into it
-    index = (drawn.info.visible | member).nonzero()[:, 0]
+    output = render(activated, camera, background, crop=box, engine=engine)
+    # members outside the box may move into it
+    index = (output.info.visible | member).nonzero()[:, 0]
     live = None
     gaussians = activated.select(index)
     if still:
         white = member[index, None].to(gaussians.colors).expand(-1, 3).contiguous()
-        share = render(gaussians, camera, torch.zeros_like(background), colors=white, crop=box, engine=engine)
-        tiles = live_tiles(share.image[..., 0] > 0.0, box)
+        member_share = render(
+            gaussians, camera, torch.zeros_like(background), colors=white, crop=box, engine=engine
+        )
+        tiles = live_tiles(member_share.image[..., 0] > 0.0, box)
         if not bool((pixels := live_pixels(tiles, box)).all()):
             reachable = may_reach(gaussians.means, gaussians.scales, camera, tiles)
-            kept = (reachable | member[index]).nonzero()[:, 0]
+            reachable_rows = (reachable | member[index]).nonzero()[:, 0]
             live = pixels[..., None]
-            index = index[kept]
-            gaussians = gaussians.select(kept)
+            index = index[reachable_rows]
+            gaussians = gaussians.select(reachable_rows)
     return CropScene(
         camera,
         box,
@@ -232,7 +234,7 @@ def crop_scene(
         rows=torch.searchsorted(index, members),
         member_shN=scene.shN[members],
         background=background,
-        original=drawn.image,
+        original=output.image,
         live=live,
         still=still,
         engine=engine,
@@ -242,22 +244,22 @@ def crop_scene(
 def render_all(
     crops: Sequence[CropScene], packed: Tensor, moving: Collection[str] = ATTRIBUTES
 ) -> list[Tensor]:
-    """Every prepared view with these member rows, without gradients. [M,C] -> images [h,w,3]"""
+    """Render every prepared view with these member rows, without gradients. [M,C] -> images [h,w,3]"""
     with torch.no_grad():
         if len(crops) > 1 and threads() > 1 and all(crop.still for crop in crops):
-            # a thread of the pool has gradients of its own to forget
+            # detach, as no_grad does not extend to the threads of the pool
             return map_threads(lambda crop: crop.render(packed, moving).detach(), crops)
         return [crop.render(packed, moving) for crop in crops]
 
 
 def only_recolors(offsets: Tensor) -> bool:
-    """Whether nothing but colors ever moves. [...,14] or [...,14+3K]"""
+    """Return True if only colors change. [...,14] or [...,14+3K]"""
     slices = attribute_slices(offsets.shape[-1])
     return not any(bool(offsets[..., slices[name]].any()) for name in GEOMETRY)
 
 
 def moving_attributes(offsets: Tensor) -> list[str]:
-    """The attributes that these offsets [M,14] or [M,14+3K] move at all."""
+    """Return the attributes that these offsets [M,14] or [M,14+3K] change."""
     slices = attribute_slices(offsets.shape[1])
     return [name for name, columns in slices.items() if bool(offsets[:, columns].any())]
 
@@ -273,15 +275,16 @@ class _ClampTowards(torch.autograd.Function):
     def backward(ctx: torch.autograd.function.FunctionCtx, gradient: Tensor) -> tuple[Tensor, None, None]:
         (x,) = ctx.saved_tensors  # type: ignore[attr-defined]
         low, high = ctx.bounds  # type: ignore[attr-defined]
-        # descent moves x against the gradient: below the range a negative one brings it back
-        useful = ((x >= low) | (gradient < 0)) & ((x <= high) | (gradient > 0))
-        return gradient * useful, None, None
+        # descent moves x against the gradient, so below the range a negative gradient moves it back
+        inward = ((x >= low) | (gradient < 0)) & ((x <= high) | (gradient > 0))
+        return gradient * inward, None, None
 
 
 def clamp_towards(x: Tensor, low: float, high: float) -> Tensor:
-    """`x.clamp(low, high)` whose gradient also passes where descent would bring x back into the range.
+    """Return `x.clamp(low, high)` with a gradient that also passes if descent would move x back into the
+    range.
 
-    A sixth of a trained scene's colors have a channel below 0; with the plain clamp they could never change
+    A sixth of a trained scene's colors have a channel below 0. With the plain clamp they could never change
     (docs/experiments.md, Rates and steps).
     """
     clamped: Tensor = _ClampTowards.apply(x, low, high)  # type: ignore[no-untyped-call]

@@ -1,4 +1,4 @@
-"""The views an edit is trained on and evaluated in: their cameras, and the region in each."""
+"""Views for training and evaluating an edit: their cameras, and the region in each."""
 
 from __future__ import annotations
 
@@ -30,61 +30,61 @@ INSIDE = (
     "(cameras.json, transforms.json or a COLMAP folder), or make some: progdf view, look around, F4 keeps "
     "each view"
 )
-"""What is said of such a scene without cameras, after its name."""
+"""Message for such a scene without cameras, after its name."""
 
 
-_MIN_BOX = 64  # LPIPS needs that many pixels on each side
-_SEEN = 0.05  # a pixel shows the region where the members' weight is above this
-_EVERY = 23  # one of so many pixels is looked at, along the rows
-_CHANGED = 0.05  # a pixel is changed where a channel differs by more than this
+_MIN_BOX = 64  # pixels per side that LPIPS needs
+_SEEN = 0.05  # member weight above which a pixel shows the region
+_PIXEL_STRIDE = 23  # along the rows, for glances
+_CHANGED = 0.05  # difference of a channel above which a pixel counts as changed
 
 
 @dataclass(frozen=True)
 class View:
-    """One camera's picture of the original scene, and the region in it."""
+    """Render of the original scene from one camera, with the region in it."""
 
     camera: Camera  # the whole view; its name is the file name of its pictures
-    image: Tensor  # the original. [H,W,3] 0..1
-    mask: Tensor  # the members' blended weight Σ αT; soft at edges, less behind others. [H,W] 0..1
-    # the color of the members alone, unmixed from what shares a pixel with them; meaningless where `mask` is
-    # 0. [H,W,3]
+    image: Tensor  # the original, 0 to 1. [H,W,3]
+    mask: Tensor  # blended weight of the members, Σ αT: soft at edges, lower if occluded. [H,W] 0 to 1
+    # color of the members alone, unmixed from other Gaussians in the pixel; undefined if `mask` is 0. [H,W,3]
     inside: Tensor
-    box: Crop  # the pixels that an edit can change, at least 64 each way where the image is that large
+    box: Crop  # the pixels that an edit can change, at least 64 per side if the image is that large
 
     def blend(self, edited_inside: Tensor) -> Tensor:
-        """The view with another color in place of `inside`, mixed as the original was. [H,W,3] -> [H,W,3]
+        """Return the view with another color in place of `inside`, mixed as in the original. [H,W,3] ->
+        [H,W,3]
 
-        Exact at soft edges: what shines through from behind or past the region stays what it was, so a border
-        neither bleeds nor keeps a rim.
+        This is exact at soft edges. Other Gaussians in a pixel keep their color, so edges neither bleed nor
+        leave a fringe.
         """
         change = torch.where(self.mask[..., None] > 1e-4, edited_inside - self.inside, 0.0)
         return (self.image + self.mask[..., None] * change).clamp(0.0, 1.0)
 
     def confine(self, edited: Tensor) -> Tensor:
-        """An edited view with everything but the region put back as it was. [H,W,3] -> [H,W,3]
+        """Return an edited view with everything outside the region restored. [H,W,3] -> [H,W,3]
 
-        A pixel that shows the region to a fifth is taken as its editor left it: it is mixed already.
+        A pixel with at least 20 % of the region keeps the editor's color, which is a mixture already.
         """
         return torch.lerp(self.image, edited, (self.mask[..., None] / 0.2).clamp(0.0, 1.0))
 
     def with_painted(self, edited: Sequence[Tensor]) -> View:
-        """The view whose mask has all that these pictures of it change visibly."""
+        """Return the view with a mask extended to all visible changes in these pictures of it."""
         changed = torch.stack([(picture - self.image).abs().amax(dim=2) for picture in edited]).amax(dim=0)
         return replace(self, mask=torch.maximum(self.mask, (changed > _CHANGED).float()))
 
     def widen(self, edited: Sequence[Tensor]) -> View:
-        """The view with its box grown to all that these pictures of it change visibly."""
+        """Return the view with a box extended to all visible changes in these pictures of it."""
         return replace(self, box=region_box(self.with_painted(edited).mask))
 
 
 def crop(image: Tensor, box: Crop) -> Tensor:
-    """The pixels of a box. [H,W,...] -> [h,w,...]"""
+    """Return the pixels of a box. [H,W,...] -> [h,w,...]"""
     x0, y0, x1, y1 = box
     return image[y0:y1, x0:x1]
 
 
 def shrink_image(image: Tensor, size: tuple[int, int]) -> Tensor:
-    """The image in another height and width, averaged over areas. [H,W,C] -> [h,w,C]"""
+    """Return the image at another height and width, averaged over areas. [H,W,C] -> [h,w,C]"""
     return interpolate(image.permute(2, 0, 1)[None], size, mode="area")[0].permute(1, 2, 0)
 
 
@@ -101,7 +101,7 @@ def make_view(scene: Gaussians, region: Region, camera: Camera, background: Tens
 
 
 def seen_colors(scene: Gaussians, camera: Camera) -> Tensor:
-    """Each Gaussian's color from where the camera stands. [N,3], not below 0"""
+    """Return each Gaussian's color from this camera, at least 0. [N,3]"""
     directions = torch.nn.functional.normalize(scene.means - camera.position, dim=1)
     return shade(min(scene.sh_degree, 3), directions, scene.sh)
 
@@ -109,33 +109,33 @@ def seen_colors(scene: Gaussians, camera: Camera) -> Tensor:
 def render_colors(
     scene: Gaussians, colors: Tensor, camera: Camera, background: Tensor, crop: Crop | None = None
 ) -> Tensor:
-    """The scene in these colors instead of its own, without gradients. [N,3] -> [H,W,3]"""
+    """Render the scene in these colors instead of its own, without gradients. [N,3] -> [H,W,3]"""
     with torch.no_grad():
         return render(scene, camera, background, colors=colors, crop=crop).image
 
 
 def render_view(scene: Gaussians, camera: Camera, background: Tensor) -> Tensor:
-    """The scene as it is seen from there, without gradients. [H,W,3]"""
+    """Render the scene, without gradients. [H,W,3]"""
     return render_colors(scene, seen_colors(scene, camera), camera, background)
 
 
 class Glance(NamedTuple):
-    """Some pixels of a small picture of the region."""
+    """Subset of the pixels of a small picture of the region."""
 
     camera: Camera
-    pixels: Tensor  # which these are, row by row. [P] int64
-    map: ColorMap  # colors of the members not below 0 -> what these pixels show of them
-    basis: Tensor  # weight of each band in each member's color from there. [M,B]
+    pixels: Tensor  # indices of the pixels, in row-major order. [P] int64
+    map: ColorMap  # nonnegative colors of the members -> their contribution to these pixels
+    basis: Tensor  # weight of each SH band in each member's color from this camera. [M,B]
     colors: Tensor  # the members', unclamped. [M,3]
     mask: Tensor  # see `View`. [P]
     inside: Tensor  # see `View`. [P,3]
 
 
 def make_glances(scene: Gaussians, region: Region, cameras: Sequence[Camera], count: int) -> list[Glance]:
-    """What the first `count` cameras that show the region see of it, in one pixel of so many."""
+    """Return glances from the first `count` cameras that show the region."""
     activated = activate(scene, torch.zeros_like(scene.means))
     members = scene[region.members]
-    degree, sh, seen = min(scene.sh_degree, 3), members.sh, list[Glance]()
+    degree, sh, glances = min(scene.sh_degree, 3), members.sh, list[Glance]()
 
     def color_from(camera: Camera) -> tuple[Tensor, Tensor]:
         weights = basis(degree, torch.nn.functional.normalize(members.means - camera.position))
@@ -144,22 +144,22 @@ def make_glances(scene: Gaussians, region: Region, cameras: Sequence[Camera], co
     def look(camera: Camera) -> Glance:
         box = (0, 0, camera.width, camera.height)
         pixels = torch.arange(camera.width * camera.height)
-        weighed = color_map(activated, camera, box, region.members, pixels=pixels[::_EVERY])
+        weight_map = color_map(activated, camera, box, region.members, pixels=pixels[::_PIXEL_STRIDE])
         weights, colors = color_from(camera) if degree else plain
-        mask = weighed.picture(torch.ones_like(colors))[:, 0].clamp(0.0, 1.0)
-        inside = (weighed.picture(colors.clamp_min(0.0)) / mask.clamp_min(1e-4)[:, None]).clamp(0.0, 1.0)
-        return Glance(camera, pixels[::_EVERY], weighed, weights, colors, mask, inside)
+        mask = weight_map.picture(torch.ones_like(colors))[:, 0].clamp(0.0, 1.0)
+        inside = (weight_map.picture(colors.clamp_min(0.0)) / mask.clamp_min(1e-4)[:, None]).clamp(0.0, 1.0)
+        return Glance(camera, pixels[::_PIXEL_STRIDE], weight_map, weights, colors, mask, inside)
 
     plain = color_from(cameras[0])
-    while cameras and len(seen) < count:
-        some = cameras[: count - len(seen)]
-        cameras = cameras[count - len(seen) :]
-        seen += [one for one in map_threads(look, some) if bool(one.mask.any())]
-    return seen
+    while cameras and len(glances) < count:
+        batch = cameras[: count - len(glances)]
+        cameras = cameras[count - len(glances) :]
+        glances += [glance for glance in map_threads(look, batch) if bool(glance.mask.any())]
+    return glances
 
 
 def region_box(mask: Tensor, margin: int = 6, least: float = 0.5 * _SEEN) -> Crop:
-    """The smallest box around pixels that show more than `least`, with a margin, grown to 64 pixels. [H,W]"""
+    """Return the smallest box around pixels above `least`, with a margin, extended to 64 pixels. [H,W]"""
     height, width = mask.shape
     visible = mask > least
     if not bool(visible.any()):
@@ -181,25 +181,28 @@ def region_box(mask: Tensor, margin: int = 6, least: float = 0.5 * _SEEN) -> Cro
 
 
 _PLASTIC = 1.324718
-"""Root of x³ = x + 1: with the rig's azimuths and elevations, its multiples fill three dimensions evenly."""
+"""Plastic number, the root of x³ = x + 1.
+
+Its multiples, with the rig's azimuths and elevations, fill three dimensions evenly.
+"""
 
 
 def region_rig(
     scene: Gaussians, region: Region, count: int, image_size: int, up: Tensor | None = None,
     elevations: tuple[float, float] = (5.0, 60.0),
 ) -> list[Camera]:  # fmt: skip
-    """The orbit rig of the scene, aimed at the region and zoomed in on it.
+    """Return the orbit rig of the scene, aimed at the region and zoomed in on it.
 
-    The cameras stand where those of the whole scene would, so nothing new comes between them and the region.
-    It fills about 80 to 50 % of their pictures, in an order that leaves no gap among the near ones either: a
+    The cameras stand where those of the whole scene would, so nothing new occludes the region. The region
+    fills about 80 to 50 % of their pictures, in an order that leaves no gap among the near ones either. A
     hand that is 3 % of the scene is trained on as many pixels as the whole body.
 
     Args:
         scene: see `orbit_rig`
-        region: what they look at
-        count: how many, ≥ 1
+        region: the region to look at
+        count: number of cameras, ≥ 1
         image_size: both sides in pixels
-        up: world direction that is up, [3]; None guesses it
+        up: world up direction, [3]; None guesses it
         elevations: see `orbit_rig`
     """
     up = guess_up(scene) if up is None else up
@@ -210,13 +213,13 @@ def region_rig(
 
 
 def region_sphere(scene: Gaussians, region: Region) -> tuple[Tensor, float]:
-    """Center [3] and radius of what a region shows."""
+    """Return center [3] and radius of a region's visible extent."""
     center, radius = scene_sphere(scene[region.members])
     return center, radius + float(scene.scales[region.members].amax(dim=1).median())
 
 
 def frame_sphere(camera: Camera, center: Tensor, radius: float, share: float, up: Tensor) -> Camera:
-    """A camera with a square picture, from the same place, that a sphere fills to some share, 0..1.
+    """Return a camera at the same position with a square picture that a sphere fills to a share from 0 to 1.
 
     `up`: world direction, [3]
     """
@@ -228,13 +231,13 @@ def frame_sphere(camera: Camera, center: Tensor, radius: float, share: float, up
 
 
 def with_near_plane(cameras: Sequence[Camera], scene: Gaussians) -> list[Camera]:
-    """The cameras with a near plane for the size of the scene: a tiny one would vanish before a fixed one."""
+    """Return the cameras with a near plane scaled to the scene; a fixed one would clip a tiny scene."""
     near = near_plane(scene_sphere(scene)[1])
     return [replace(camera, near=near) for camera in cameras]
 
 
 def fit_size(camera: Camera, image_size: int) -> Camera:
-    """The camera with its longer side at `image_size` pixels, never enlarged."""
+    """Return the camera with its longer side at `image_size` pixels, never enlarged."""
     scale = image_size / max(camera.width, camera.height)
     if scale >= 1.0:
         return camera
@@ -242,9 +245,9 @@ def fit_size(camera: Camera, image_size: int) -> Camera:
 
 
 def name_cameras(cameras: Sequence[Camera]) -> list[Camera]:
-    """Return the cameras with names that are relative paths and safe on every system (`view_name`).
+    """Return the cameras with names that are relative paths and valid on every system (`view_name`).
 
-    Names differ in more than case. A name that is taken or not safe becomes view_000, view_001, ….
+    Names differ in more than case. A duplicate or invalid name becomes view_000, view_001, ….
     """
     taken: set[str] = set()
     result = []
