@@ -1,1 +1,1 @@
-"""Timings beside errors, and ablations: `python -m benchmarks`."""
+"""Benchmarks of speed and error, and ablations: `python -m benchmarks`."""

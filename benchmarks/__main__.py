@@ -1,8 +1,8 @@
-"""`python -m benchmarks`: run the benchmarks and print their tables, each speed beside its error.
+"""The command `python -m benchmarks`: run the benchmarks and print their tables, each speed beside its error.
 
-`python -m benchmarks ablate RUN …` trains finished runs again without each part of the method, `python -m
-benchmarks sliders FOLDER` trains edits whose pictures are known at every strength, and `python -m benchmarks
-page` fills docs/speed-and-error.md. Wall times are left out where others use the cores.
+`python -m benchmarks ablate RUN …` trains finished runs again without each part of the method. `python -m
+benchmarks sliders FOLDER` trains edits whose pictures are known at every strength. `python -m benchmarks
+page` fills docs/speed-and-error.md. Wall times are left out if other processes use the cores.
 """
 
 from __future__ import annotations
@@ -46,35 +46,37 @@ BENCHES: dict[str, str] = {
 }
 
 PAGE = ("training", "field", "viewer", "rasterize", "warp", "moving", "popping", "frames", "hard")
-"""What docs/speed-and-error.md is made of."""
+"""Benchmarks of docs/speed-and-error.md."""
 
 ROOT = Path(__file__).parents[1]
 
 
 @dataclass(frozen=True)
 class BenchOptions:
-    """Measure speed against error; each benchmark interleaves what it compares in one process."""
+    """Measure speed against error; each benchmark interleaves its contenders in one process."""
 
     what: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """page (all of docs/speed-and-error.md), training, rasterize, warp, hard, field, edits, networks,
-    viewer, select, frames, moving, popping, window, warps, pictures; none named is all."""
+    """Benchmarks to run by name (docs/benchmarks.md); page for docs/speed-and-error.md; none for all."""
     json: Path | None = None
-    """also write the tables to this JSON file."""
+    """Also write the tables to this JSON file."""
     markdown: tuple[Path, ...] = ()
-    """also put the tables between their markers in these Markdown files."""
+    """Also put the tables between their markers in these Markdown files."""
     runs: tuple[Path, ...] = ()
-    """finished run folders: `edits` and `networks` measure them, `field` beside the bear's edits."""
+    """Finished run folders for `edits` and `networks`."""
     plots: Path | None = None
-    """`training` and `field` also draw their errors into PNG files of their names in this folder."""
+    """Folder in which `training` and `field` also draw their errors as training.png and field.png."""
     scenes: tuple[Path, ...] = ()
-    """scene files that viewer, select, frames, moving, popping and window take in place of the bears,
-    training, field and warps beside them, and pictures alone; those of `page` are for training and fields."""
+    """Scene files to measure, in place of the demo scenes or beside them (docs/benchmarks.md)."""
     seconds: float | None = None
-    """how long `window` drags its slider; 60 where not said."""
+    """Seconds for which `window` drags its slider (default 60)."""
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the named benchmarks, the ablation or the sliders; ProgdfError for a name that does not exist."""
+    """Run the named benchmarks, the ablation, the sliders or the sweep.
+
+    Raises:
+        ProgdfError: a name, file or folder does not exist, or an option does not fit the named benchmarks.
+    """
     if list(argv[:1]) == ["ablate"]:
         return ablate(argv[1:])
     if list(argv[:1]) == ["sliders"]:
@@ -102,10 +104,8 @@ def main(argv: Sequence[str]) -> int:
         raise ProgdfError(f"--scenes are for {', '.join(drawing)}; use python -m benchmarks viewer")
     if options.seconds is not None and options.what and "window" not in options.what:
         raise ProgdfError("--seconds is how long the window is dragged; use python -m benchmarks window")
-    for folder in (
-        options.json and options.json.parent,
-        options.plots,
-    ):  # told before an hour has been measured
+    # before an hour of measuring
+    for folder in (options.json and options.json.parent, options.plots):
         if folder is not None and not folder.is_dir():
             raise ProgdfError(f"the folder {folder} does not exist; create it first")
     for path in options.scenes:
@@ -113,20 +113,20 @@ def main(argv: Sequence[str]) -> int:
     for page in options.markdown:
         if not page.is_file():
             raise ProgdfError(f"{page} does not exist; check the name and the folder")
-    given: dict[str, dict[str, object]] = {name: {"runs": options.runs} for name in trained}
-    shown = plotted if options.what[: len(PAGE)] == PAGE else drawing
-    given |= {name: {"scenes": options.scenes} for name in shown}
+    arguments: dict[str, dict[str, object]] = {name: {"runs": options.runs} for name in trained}
+    with_scenes = plotted if options.what[: len(PAGE)] == PAGE else drawing
+    arguments |= {name: {"scenes": options.scenes} for name in with_scenes}
     if options.plots:
         for name in plotted:
-            given[name]["plot"] = options.plots / f"{name}.png"
+            arguments[name]["plot"] = options.plots / f"{name}.png"
     if options.seconds is not None:
-        given["window"]["seconds"] = options.seconds
+        arguments["window"]["seconds"] = options.seconds
     tables: list[Table] = []
     print(f"{machine()}\n")
     busy = busy_share()
     for name in options.what or tuple(BENCHES):
         try:
-            bare = _function(BENCHES[name])(**given.get(name, {}))
+            unstated = _function(BENCHES[name])(**arguments.get(name, {}))
         except ProgdfError as error:
             if options.what:
                 raise
@@ -134,14 +134,14 @@ def main(argv: Sequence[str]) -> int:
             continue
         before = busy
         busy = busy_share()
-        taken = [options.scenes] if options.scenes and name in shown else []
-        words = " ".join([name, *(f"--scenes {' '.join(path.name for path in paths)}" for paths in taken)])
-        made = [_stated(table, f"`{COMMAND} {words}`", max(before, busy)) for table in bare]
-        for table in made:
+        scenes = [options.scenes] if options.scenes and name in with_scenes else []
+        words = " ".join([name, *(f"--scenes {' '.join(path.name for path in paths)}" for paths in scenes)])
+        finished = [_stated(table, f"`{COMMAND} {words}`", max(before, busy)) for table in unstated]
+        for table in finished:
             print(table.markdown() + "\n", flush=True)
-        tables += made
-        for page in options.markdown if made else ():  # at once: the next may take long
-            filled = put_tables(page.read_text(encoding="utf-8"), made)
+        tables += finished
+        for page in options.markdown if finished else ():  # now, as the next benchmark may take long
+            filled = put_tables(page.read_text(encoding="utf-8"), finished)
             with atomic_write(page) as temporary_file:
                 temporary_file.write_text(filled, encoding="utf-8")
     if options.json:
@@ -154,7 +154,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _stated(table: Table, command: str, busy: float) -> Table:
-    """With what made it; and without wall times where others used the cores."""
+    """Return the table with its command and date; drop wall times if other processes used the cores."""
     bare = table.without_wall()
     if busy > BUSY and bare != table:
         table = bare
@@ -164,14 +164,14 @@ def _stated(table: Table, command: str, busy: float) -> Table:
 
 
 def _function(path: str) -> Callable[..., Any]:
-    """The function that "module:name" names; each benchmark is imported only when it runs."""
+    """Return the function named by "module:name"; each benchmark is imported only when it runs."""
     module, function = path.split(":")
     found: Callable[..., Any] = getattr(importlib.import_module(module), function)
     return found
 
 
 def ablate(argv: Sequence[str]) -> int:
-    """Run the ablation; 0 when the table is written. Raises ProgdfError for what the user can mend."""
+    """Run the ablation and return 0. Raises ProgdfError for errors that the user can fix."""
     from .ablation.ablate import ablate as run
     from .ablation.options import AblateOptions
     from .ablation.table import print_table
@@ -182,7 +182,7 @@ def ablate(argv: Sequence[str]) -> int:
 
 
 def sliders(argv: Sequence[str]) -> int:
-    """Compare sliders with known courses; 0 when done. Raises ProgdfError for what the user can mend."""
+    """Compare sliders with known pictures and return 0. Raises ProgdfError for errors the user can fix."""
     from .sliders import SliderOptions, run_sliders
 
     run_sliders(parse_options(SliderOptions, argv, f"{COMMAND} sliders"))
@@ -190,7 +190,7 @@ def sliders(argv: Sequence[str]) -> int:
 
 
 def regret(argv: Sequence[str]) -> int:
-    """Sweep an edit's effort; 0 when the table is printed. Raises ProgdfError for what the user can mend."""
+    """Sweep an edit's effort and return 0. Raises ProgdfError for errors that the user can fix."""
     from .ablation.regret import RegretOptions, run_regret
 
     print(run_regret(parse_options(RegretOptions, argv, f"{COMMAND} regret")).markdown())

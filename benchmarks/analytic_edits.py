@@ -1,4 +1,4 @@
-"""Edits whose true course is known: what every Gaussian is at every strength, with nothing to optimize."""
+"""Analytic edits: the exact value of every Gaussian at every strength, given by a formula."""
 
 from __future__ import annotations
 
@@ -18,26 +18,27 @@ from progdf.quaternions import multiply_quats, rotate_vectors, turn_quats
 from progdf.sh import rgb_to_sh0, rotation_change, sh0_to_rgb
 
 Change = Callable[[Gaussians, float], Gaussians]
-"""The members before the edit and a strength in (0, 1] -> the members at that strength."""
+"""Function from the original members and a strength in (0, 1] to the members at that strength."""
 
 Warp = Callable[[Tensor, float], Tensor]
-"""Points [M,3] float64 and a strength in (0, 1] -> where they are then. [M,3]"""
+"""Function from points [M,3] float64 and a strength in (0, 1] to their positions at that strength. [M,3]"""
 
 
 @dataclass(frozen=True)
 class AnalyticEdit:
     """An edit given by a formula."""
 
-    name: str  # what it does
+    name: str  # name of the change
     change: Change  # the formula
 
     def apply(self, scene: Gaussians, members: Tensor, strength: float) -> Gaussians:
-        """The scene with `members` ([M] int64) edited to `strength` (0..1); other rows keep their bytes.
+        """Return the scene with `members` ([M] int64) edited to `strength` (0 to 1); other rows are
+        unchanged.
 
         Strength 0 gives the scene bit for bit.
 
         Raises:
-            ProgdfError: the strength is not within 0..1.
+            ProgdfError: the strength is not between 0 and 1.
         """
         if not 0 <= strength <= 1:
             raise ProgdfError(f"the strength must be between 0 and 1, got {strength:g}")
@@ -54,7 +55,10 @@ class AnalyticEdit:
 
 
 def recolor_edit(target: Tensor) -> AnalyticEdit:
-    """`edits.recolor_course` of every Gaussian, seen from the members' own color; `target` [3] sRGB."""
+    """Make a recolor edit: `edits.recolor_course` per Gaussian, relative to the members' typical color.
+
+    `target`: color at strength 1, sRGB. [3]
+    """
 
     def change(part: Gaussians, strength: float) -> Gaussians:
         course = color.recolor_course(sh0_to_rgb(part.sh0), target, _own_color(part))
@@ -64,7 +68,7 @@ def recolor_edit(target: Tensor) -> AnalyticEdit:
 
 
 def stripes_edit(target: Tensor, axis: Tensor, period: float) -> AnalyticEdit:
-    """Stripes across `axis` [3], `period` world units apart, in the color `target` [3] sRGB."""
+    """Make a stripes edit across `axis` [3] with `period` in world units and the color `target` [3] sRGB."""
 
     def change(part: Gaussians, strength: float) -> Gaussians:
         course = color.recolor_course(sh0_to_rgb(part.sh0), target, _own_color(part))
@@ -75,23 +79,23 @@ def stripes_edit(target: Tensor, axis: Tensor, period: float) -> AnalyticEdit:
 
 
 def darken_edit(stops: float = 3.0) -> AnalyticEdit:
-    """Night falls: `edits.night_course`, view-dependent light fading with the rest."""
+    """Make a night edit by `edits.night_course`; view-dependent light fades with the rest."""
 
     def change(part: Gaussians, strength: float) -> Gaussians:
         dark = color.night_course(sh0_to_rgb(part.sh0), stops)(strength)
-        # sRGB values fall about as the light to the power 1/2.2
+        # sRGB values fall about as the light to the power of 1/2.2
         return replace(part, sh0=rgb_to_sh0(dark), shN=part.shN * 2 ** (-stops * strength / 2.2))
 
     return AnalyticEdit("night", change)
 
 
 def scale_edit(factor: float, pivots: Tensor, shift: Tensor | None = None) -> AnalyticEdit:
-    """Scale about the nearest of `pivots` [P,3]: centers move straight, log-scales by log of the size.
+    """Make an edit that scales about the nearest pivot; centers move on straight lines.
 
     Args:
         factor: size at strength 1
-        pivots: points that stay where they are, but for the shift. [P,3]
-        shift: what all is moved by besides, world units; None: nothing. [3]
+        pivots: fixed points, apart from the shift. [P,3]
+        shift: additional translation at strength 1, world units; None: none. [3]
     """
 
     def change(part: Gaussians, strength: float) -> Gaussians:
@@ -106,8 +110,10 @@ def scale_edit(factor: float, pivots: Tensor, shift: Tensor | None = None) -> An
 
 
 def swing_edit(degrees: float, axis: Tensor, pivots: Tensor) -> AnalyticEdit:
-    """Turn by `degrees` about `axis` [3] through the nearest of `pivots` [P,3]: centers run on circles, and
-    what is seen of a member turns with it."""
+    """Make an edit that rotates by `degrees` about `axis` [3] through the nearest of `pivots` [P,3].
+
+    Centers move on circles, and the view-dependent color of a member rotates with it.
+    """
 
     def change(part: Gaussians, strength: float) -> Gaussians:
         turn = math.radians(degrees * strength) * axis.to(part.means) / axis.norm()
@@ -124,8 +130,11 @@ def swing_edit(degrees: float, axis: Tensor, pivots: Tensor) -> AnalyticEdit:
 
 
 def warp_edit(name: str, warp: Warp) -> AnalyticEdit:
-    """A bent space: centers go where the warp takes them, covariances follow its Jacobian, Σ' = J Σ Jᵀ, and
-    what is seen of a member follows the Jacobian's rotation."""
+    """Make an edit that warps space.
+
+    Centers follow the warp, covariances its Jacobian, Σ' = J Σ Jᵀ, and view-dependent color the rotation of
+    the Jacobian.
+    """
 
     def change(part: Gaussians, strength: float) -> Gaussians:
         points = part.means.double()
@@ -137,9 +146,9 @@ def warp_edit(name: str, warp: Warp) -> AnalyticEdit:
         jacobian = torch.stack(columns, dim=2)
         shape = jacobian @ (torch.from_numpy(axes) * part.scales.double()[:, None, :])
         # the covariance is shape · shapeᵀ, whose axes are the left singular vectors
-        turned, scales, _ = torch.linalg.svd(shape)
-        turned = turned * torch.where(torch.linalg.det(turned) < 0, -1.0, 1.0)[:, None, None]
-        quats = Rotation.from_matrix(turned.numpy()).as_quat(scalar_first=True)
+        rotations, scales, _ = torch.linalg.svd(shape)
+        rotations = rotations * torch.where(torch.linalg.det(rotations) < 0, -1.0, 1.0)[:, None, None]
+        quats = Rotation.from_matrix(rotations.numpy()).as_quat(scalar_first=True)
         left, _, right = torch.linalg.svd(jacobian)
         polar = Rotation.from_matrix((left @ right).numpy())
         return replace(
@@ -154,7 +163,7 @@ def warp_edit(name: str, warp: Warp) -> AnalyticEdit:
 
 
 def stretch_edit(factor: float, axis: Tensor, pivot: Tensor) -> AnalyticEdit:
-    """Longer by `factor` along `axis` [3], all beyond the plane through `pivot` [3] moving away from it."""
+    """Make an edit that stretches by `factor` along `axis` [3], away from the plane through `pivot` [3]."""
     unit, root = (axis / axis.norm()).double(), pivot.double()
 
     def warp(points: Tensor, strength: float) -> Tensor:
@@ -165,11 +174,13 @@ def stretch_edit(factor: float, axis: Tensor, pivot: Tensor) -> AnalyticEdit:
 
 
 def bend_edit(degrees: float, axis: Tensor, along: Tensor, pivot: Tensor, length: float) -> AnalyticEdit:
-    """Turned about `axis` [3] through `pivot` [3], the more the further out along `along` [3].
+    """Make an edit that bends about `axis` through `pivot`, by an angle that grows along `along`.
 
     Args:
-        degrees: at strength 1, `length` world units out
-        axis, along, pivot: see above; what lies on the other side of the pivot stays
+        degrees: angle at strength 1 at the distance `length`
+        axis: rotation axis. [3]
+        along: direction in which the angle grows; points on the other side of the pivot stay fixed. [3]
+        pivot: a point of the axis. [3]
         length: world units
     """
     turn, out, root = (axis / axis.norm()).double(), (along / along.norm()).double(), pivot.double()
@@ -178,15 +189,15 @@ def bend_edit(degrees: float, axis: Tensor, along: Tensor, pivot: Tensor, length
         arm = points - root
         angle = strength * math.radians(degrees) * ((arm @ out) / length).clamp_min(0)[:, None]
         across = torch.linalg.cross(turn.expand_as(arm), arm)
-        kept = turn * (arm @ turn)[:, None] * (1 - angle.cos())
-        moved: Tensor = root + arm * angle.cos() + across * angle.sin() + kept
+        axial = turn * (arm @ turn)[:, None] * (1 - angle.cos())
+        moved: Tensor = root + arm * angle.cos() + across * angle.sin() + axial
         return moved
 
     return warp_edit("bend", warp)
 
 
 def bear_edits(scene: DemoScene) -> dict[str, tuple[AnalyticEdit, Tensor]]:
-    """One edit of each kind for `bear()`, with its members: name -> (edit, members)."""
+    """Return one edit of each kind for `bear()`: name -> (edit, members)."""
     ears = scene.members("ears")
     roots = _ear_roots(scene.gaussians.means[ears])
     return {
@@ -208,7 +219,7 @@ def bear_edits(scene: DemoScene) -> dict[str, tuple[AnalyticEdit, Tensor]]:
 
 
 def _ear_roots(means: Tensor) -> Tensor:
-    """Where the ears meet the head: below and inside of each one's middle. [M,3] -> [2,3]"""
+    """Return the points where the ears meet the head, below and inside each ear's center. [M,3] -> [2,3]"""
     roots = []
     for side in (1.0, -1.0):
         ear = means[means[:, 0] * side > 0]
@@ -217,7 +228,7 @@ def _ear_roots(means: Tensor) -> Tensor:
 
 
 def _own_color(part: Gaussians) -> Tensor:
-    """The typical color, each Gaussian counted as much as it can cover. [3]"""
+    """Return the typical color, with Gaussians weighted by opacity and area. [3]"""
     _, middle, long = part.scales.sort(dim=1).values.unbind(1)
     return color.typical_color(sh0_to_rgb(part.sh0), part.opacities * middle * long)
 
@@ -227,18 +238,18 @@ def _nearest(means: Tensor, pivots: Tensor) -> Tensor:
 
 
 def _with_color(part: Gaussians, rgb: Tensor, share: float | Tensor) -> Gaussians:
-    """Set the color, and let view-dependent light take its hue: the highlight on gold is golden."""
+    """Set the color, and tint view-dependent light with its hue: the highlight on gold is golden."""
     hue = rgb.clamp_min(0) / rgb.clamp_min(0).mean(dim=1, keepdim=True).clamp_min(1e-3)
     highlight = part.shN.mean(dim=2, keepdim=True) * (0.35 + 0.65 * hue)[:, None, :]
     return replace(part, sh0=rgb_to_sh0(rgb), shN=part.shN + share * (highlight - part.shN))
 
 
-_FACTOR = 1.35
-_DEGREES = 40.0
+_COLUMN_STRETCH = 1.35  # factor of the column's length
+_COLUMN_BEND_DEGREES = 40.0
 
 
 def stretch_warp(base: Tensor, up: Tensor, factor: float) -> Warp:
-    """Lengths along `up` ([3], of length 1) grow by `factor` from `base` [3]; widths shrink, volume stays."""
+    """Make a volume-preserving warp that stretches by `factor` from `base` [3] along unit vector `up` [3]."""
 
     def warp(points: Tensor, strength: float) -> Tensor:
         size = 1 + strength * (factor - 1)
@@ -251,9 +262,9 @@ def stretch_warp(base: Tensor, up: Tensor, factor: float) -> Warp:
 
 
 def bend_warp(base: Tensor, up: Tensor, towards: Tensor, length: float, degrees: float) -> Warp:
-    """A column of this `length` that stands at `base` along `up` becomes an arc of so many degrees.
+    """Make a warp that bends a column of `length` at `base` along `up` into an arc of `degrees`.
 
-    What lies below the base stays. `up` and `towards`: of length 1, at right angles. [3]
+    Points below the base stay fixed. `up` and `towards`: orthogonal unit vectors. [3]
     """
 
     def warp(points: Tensor, strength: float) -> Tensor:
@@ -274,7 +285,7 @@ def bend_warp(base: Tensor, up: Tensor, towards: Tensor, length: float, degrees:
 
 
 def pull_warp(handles: Tensor, pulls: Tensor, radius: float) -> Warp:
-    """What lies around `handles` [P,3] is pulled by `pulls` [P,3], less and less over a `radius`."""
+    """Make a warp that moves `handles` [P,3] by `pulls` [P,3], with a Gaussian falloff of sigma `radius`."""
 
     def warp(points: Tensor, strength: float) -> Tensor:
         weights = (-0.5 * (points[:, None] - handles.to(points)).square().sum(dim=2) / radius**2).exp()
@@ -284,16 +295,16 @@ def pull_warp(handles: Tensor, pulls: Tensor, radius: float) -> Warp:
 
 
 def chain_warps(first: Warp, second: Warp) -> Warp:
-    """One after the other."""
+    """Compose two warps."""
     return lambda points, strength: second(first(points, strength), strength)
 
 
 def column_warps(means: Tensor, up: Tensor) -> dict[str, AnalyticEdit]:
-    """Stretch, bend, and both, of what stands on its base.
+    """Make a stretch, a bend, and both, of a standing object.
 
     Args:
         means: centers of the members. [M,3]
-        up: a coordinate axis, up or down it. [3]
+        up: positive or negative coordinate axis. [3]
     """
     axis = int(up.abs().argmax())
     side = torch.zeros(3)
@@ -301,15 +312,15 @@ def column_warps(means: Tensor, up: Tensor) -> dict[str, AnalyticEdit]:
     along = means @ up
     base = means.median(dim=0).values * (1 - up.abs()) + float(along.min()) * up
     length = float(along.max() - along.min())
-    stretch = stretch_warp(base, up, _FACTOR)
-    bend = bend_warp(base, up, side, length, _DEGREES)
-    both = chain_warps(stretch, bend_warp(base, up, side, _FACTOR * length, _DEGREES))
+    stretch = stretch_warp(base, up, _COLUMN_STRETCH)
+    bend = bend_warp(base, up, side, length, _COLUMN_BEND_DEGREES)
+    both = chain_warps(stretch, bend_warp(base, up, side, _COLUMN_STRETCH * length, _COLUMN_BEND_DEGREES))
     warps = {"stretch": stretch, "bend": bend, "stretch and bend": both}
     return {name: warp_edit(name, warp) for name, warp in warps.items()}
 
 
 def smile_warp(corners: Tensor, up: Tensor, pull: float, radius: float) -> AnalyticEdit:
-    """The two corners of a mouth [2,3] are drawn up and apart by `pull`."""
+    """Make an edit that moves the two corners of a mouth [2,3] up and apart by `pull` world units."""
     apart = corners - corners.mean(dim=0)
     directions = torch.nn.functional.normalize(apart, dim=1) + up
     return warp_edit("smile", pull_warp(corners, pull * directions, radius))

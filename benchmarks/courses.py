@@ -1,4 +1,4 @@
-"""Edits whose course is known, by formula or as recorded, for fields to be fitted, judged and timed."""
+"""Edits with a known trajectory, by formula or recorded, to fit, evaluate and time fields."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from .analytic_edits import AnalyticEdit
 
 @dataclass(frozen=True)
 class KnownEdit:
-    """An edit's true course."""
+    """An edit with its true trajectory."""
 
-    name: str  # of the edit
+    name: str  # name of the edit
     scene: Gaussians  # the original
-    members: Tensor  # that the edit changes, ascending. [M] int64
+    members: Tensor  # rows that the edit changes, ascending. [M] int64
     strengths: Tensor  # of the snapshots that fields are fitted to. [T]
-    offsets: Tensor  # [T,M,C]
+    offsets: Tensor  # offsets at these strengths. [T,M,C]
     truth: Callable[[float], Tensor]  # the offsets at any strength. [M,C]
-    # errors against the truth, in views that no choice has seen, over the pixels that change
+    # errors against the truth in views not used for any choice, over the pixels that change
     judge: FieldEvaluator
-    # the same in other views that `look` does not show, which have the last word on a choice
+    # the same in other views, apart from those of `look`, for the final choice
     chooser: FieldEvaluator
-    look: Render  # pixels on which ranks are grown
+    look: Render  # renders the pixels on which ranks are chosen
     weights: Tensor  # visibility of the members. [M]
-    unseen: Render  # the judge's pixels
+    unseen: Render  # renders the pixels of `judge`
 
 
 def known_edit(
@@ -48,7 +48,16 @@ def known_edit(
     cameras: Sequence[Camera],
     snapshots: int,
 ) -> KnownEdit:
-    """Everything of an edit that a benchmark of fields needs."""
+    """Prepare an analytic edit for benchmarks of fields.
+
+    Args:
+        name: name of the edit
+        scene: the original
+        edit: its formula
+        members: rows that it changes, ascending. [M] int64
+        cameras: views, split for ranks, choice and evaluation
+        snapshots: number of strengths that fields are fitted to
+    """
     with_sh = bool((edit.apply(scene, members, 1.0).shN != scene.shN).any())
     start = pack(scene[members], with_sh)
 
@@ -60,8 +69,12 @@ def known_edit(
     seen = cameras[::11][:3]
     choosing = cameras[8::10][:2]
     unseen = cameras[5::10][:2]
-    shown, decides = (_changed_pixels(scene, members, offsets, views) for views in (unseen, choosing))
-    judge, chooser = (FieldEvaluator(strengths, offsets, render, truth) for render in (shown, decides))
+    judge_pixels, chooser_pixels = (
+        _changed_pixels(scene, members, offsets, views) for views in (unseen, choosing)
+    )
+    judge, chooser = (
+        FieldEvaluator(strengths, offsets, render, truth) for render in (judge_pixels, chooser_pixels)
+    )
     visible = sum(
         (
             alpha_weights(scene, camera, torch.ones(camera.height, camera.width))[members, 2].float()
@@ -82,7 +95,7 @@ def known_edit(
         chooser=chooser,
         look=look,
         weights=weights,
-        unseen=shown,
+        unseen=judge_pixels,
     )
 
 
@@ -99,18 +112,18 @@ def _changed_pixels(scene: Gaussians, members: Tensor, offsets: Tensor, cameras:
 
 
 def milliseconds(work: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:
-    """How long something takes."""
+    """Measure the duration of `work`, ms."""
     begin = clock()
     work()
     return 1e3 * (clock() - begin)
 
 
 processor_milliseconds = partial(milliseconds, clock=time.process_time)
-"""How much processor time something takes, which a busy machine leaves alone."""
+"""Processor time of a function, ms, which load on the machine does not change."""
 
 
 def edit_of(scene: Gaussians, members: Tensor, field: BakedField) -> Gdf:
-    """An edit of these rows."""
+    """Wrap a field of these rows as an edit."""
     mask = torch.zeros(len(scene), dtype=torch.bool)
     mask[members] = True
     return Gdf("edit", from_mask("edit", mask), field, fingerprint(scene))

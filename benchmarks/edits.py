@@ -1,7 +1,10 @@
-"""`python -m benchmarks edits --runs RUN …`: finished runs beside what is simpler, from afar and all along.
+"""The benchmark `edits`: finished runs beside simpler methods, at many slider values and from far views.
 
-Beside the slider stand two keyframes, re-timed as ours are, and a cross-fade of the rendered ends. What takes
-too long for every run's own report is measured here: 101 slider values, and views from elsewhere.
+The slider is compared with two keyframes, retimed like it, and with a cross-fade of the rendered ends. The
+benchmark takes measurements too slow for the report of each run: 101 slider values, and views far from the
+training views.
+
+    python -m benchmarks edits --runs RUN …
 """
 
 from __future__ import annotations
@@ -31,13 +34,11 @@ from trainer.views.view import View, crop, make_view
 from .ablation.setup import editor_pictures
 from .table import Table, mean_worst
 
-RAISED = (30.0, -15.0)
-ZOOM = 3.0
-"""Degrees of elevation that far views stand above and below a held-out one; how near the third comes."""
+RAISED = (30.0, -15.0)  # elevation of far views relative to a held-out one, degrees
+ZOOM = 3.0  # magnification of the third far view
 
-VALUES = 101
-ASKED = 20
-"""Strengths, evenly apart, at which the worst of the slider is looked for."""
+VALUES = 101  # slider values compared with the recording
+ASKED = 20  # evenly spaced strengths at which the worst picture of the slider is searched
 
 EDIT_NOTE = (
     "PSNR on all held-out views, over the pixels that show the region or that the editor changes; LPIPS over "
@@ -68,9 +69,9 @@ def tables(runs: Sequence[Path] = ()) -> list[Table]:
 
 
 def edit_table(opened: Sequence[OpenedRun]) -> Table:
-    """Each edit against the editor's own pictures."""
+    """Compare each edit with the editor's pictures."""
     perceptual, _ = perceptual_loss()
-    courses = {
+    contenders = {
         "slider, about s = ¼ / ½ / ¾, dB": SLIDER,
         "2 keyframes, re-timed": KEYFRAMES,
         "cross-fade": FADE,
@@ -96,7 +97,7 @@ def edit_table(opened: Sequence[OpenedRun]) -> Table:
                 "edit": _title(run),
                 **{
                     heading: " / ".join(f"{curves[name].psnr[i]:.1f}" for i in quarters) if between else "-"
-                    for heading, name in courses.items()
+                    for heading, name in contenders.items()
                 },
                 **worst_places(run),
                 "all at 1": f"{curves[SLIDER].psnr[-1]:.1f}",
@@ -110,22 +111,22 @@ def edit_table(opened: Sequence[OpenedRun]) -> Table:
 
 
 def slider_table(opened: Sequence[OpenedRun]) -> Table:
-    """Each field against what was recorded, at 101 slider values and in views from elsewhere."""
+    """Compare each field with its recording, at 101 slider values and in far views."""
     rows = []
     for run in opened:
         _, reporting = run.evaluator.halves()
         inner = [i / (VALUES - 1) for i in range(1, VALUES - 1)]
-        few = sample_strengths()
+        samples = sample_strengths()
         ours = run.report["field"]
-        plain = run.report["baselines"][COMPARED]
+        baseline = run.report["baselines"][COMPARED]
         far = far_evaluator(run)
         rows.append(
             {
                 "edit": _title(run),
                 "field, mean / worst of 13 values, dB": f"{ours['psnr_mean']:.1f} / {ours['psnr_worst']:.1f}",
-                "2 keyframes": f"{plain['psnr_mean']:.1f} / {plain['psnr_worst']:.1f}",
+                "2 keyframes": f"{baseline['psnr_mean']:.1f} / {baseline['psnr_worst']:.1f}",
                 f"worst of {VALUES} values": f"{min(_against_recording(run, reporting, inner)):.1f}",
-                "far views, mean / worst of 13": mean_worst(_against_recording(run, far, few)),
+                "far views, mean / worst of 13": mean_worst(_against_recording(run, far, samples)),
                 **_from_elsewhere(run, far),
             }
         )
@@ -134,36 +135,36 @@ def slider_table(opened: Sequence[OpenedRun]) -> Table:
 
 
 def worst_places(run: OpenedRun) -> dict[str, str]:
-    """The lowest PSNR of the slider and of what is simpler, and the slider value that has it."""
+    """Find the lowest PSNR of the slider and of each simpler method, with its slider value."""
     headings = "worst of the slider, at s", "of 2 keyframes", "of the cross-fade"
     strengths = [(i + 1) / ASKED for i in range(ASKED)]
     pictures = _editor_pictures(run, run.setup.judging, strengths)
     if not pictures:
         return dict.fromkeys(headings, "-")
-    at, asked = zip((0.0, 0.0), *run.trajectory.stage_strengths, strict=True)
-    knots, values = (torch.tensor(some, dtype=torch.float64) for some in (asked, at))
-    found = []
-    for shown in run.contenders().values():
+    slider_values, stage_strengths = zip((0.0, 0.0), *run.trajectory.stage_strengths, strict=True)
+    knots, values = (torch.tensor(some, dtype=torch.float64) for some in (stage_strengths, slider_values))
+    cells = []
+    for pictures_at in run.contenders().values():
         errors = []
         for strength, edited in pictures.items():
             s = float(interpolate_at(knots, values, strength))
             boxes = [
                 crop(picture, scene.box) for picture, scene in zip(edited, run.evaluator.crops, strict=True)
             ]
-            errors.append((run.evaluator.psnr(shown(s), boxes), s))
-        found.append("{:.1f} at {:.2f}".format(*min(errors)))
-    return dict(zip(headings, found, strict=True))
+            errors.append((run.evaluator.psnr(pictures_at(s), boxes), s))
+        cells.append("{:.1f} at {:.2f}".format(*min(errors)))
+    return dict(zip(headings, cells, strict=True))
 
 
 def _editor_pictures(run: OpenedRun, views: Sequence[View], strengths: Sequence[float]) -> Pictures:
-    """See `editor_pictures`; none where it paints the views one by one."""
+    """Return the editor's pictures, see `editor_pictures`; none if it edits views one by one."""
     if run.run.record.plan.editor.family in PER_VIEW:
         return {}
     return editor_pictures(run.run, run.setup.views, views, strengths)
 
 
 def far_evaluator(run: OpenedRun) -> Evaluator:
-    """Views from elsewhere, beside the editor's pictures of them where it can make any."""
+    """Prepare far views, with the editor's pictures of them if it can make any."""
     scene = run.setup.scene
     region = run.setup.region
     setup = run.setup
@@ -179,7 +180,7 @@ def far_evaluator(run: OpenedRun) -> Evaluator:
 
 
 def far_cameras(camera: Camera, center: Tensor, up: Tensor) -> list[Camera]:
-    """The camera raised, lowered and zoomed in, all looking at `center`. [3], [3]"""
+    """Return the camera raised, lowered and zoomed in, all aimed at `center`. [3], [3]"""
     unit = up / up.norm()
     arm = camera.position - center
     side = torch.linalg.cross(unit, arm)
@@ -190,13 +191,13 @@ def far_cameras(camera: Camera, center: Tensor, up: Tensor) -> list[Camera]:
         K[:2, :2] *= zoom
         return replace(camera, viewmat=look_at(place, center, unit), K=K)
 
-    found = []
+    cameras = []
     for degrees in RAISED:
-        # about the side, by which a positive turn lowers
+        # a positive rotation about `side` lowers the camera
         angle = -math.radians(degrees)
-        turned = arm * math.cos(angle) + torch.linalg.cross(side, arm) * math.sin(angle)
-        found.append(stand(center + turned))
-    return [*found, stand(camera.position, ZOOM)]
+        rotated = arm * math.cos(angle) + torch.linalg.cross(side, arm) * math.sin(angle)
+        cameras.append(stand(center + rotated))
+    return [*cameras, stand(camera.position, ZOOM)]
 
 
 def _against_recording(run: OpenedRun, views: Evaluator, values: Sequence[float]) -> list[float]:
@@ -207,18 +208,18 @@ def _against_recording(run: OpenedRun, views: Evaluator, values: Sequence[float]
 
 
 def _from_elsewhere(run: OpenedRun, far: Evaluator) -> dict[str, str]:
-    """The shipped field at 1 and between, and two keyframes between, against the editor's pictures."""
+    """Compare the shipped field at 1 and between, and two keyframes between, with the editor's pictures."""
     headings = "far views: to the editor's pictures at 1", "between, mean / worst", "2 keyframes, between"
     if not far.edited:
         return dict.fromkeys(headings, "-")
 
     def errors(field: BakedField) -> list[float]:
-        asked = run.trajectory.stage_strengths
-        return [far.psnr(far.pictures(field.offsets(s)), far.edited[strength]) for s, strength in asked]
+        stages = run.trajectory.stage_strengths
+        return [far.psnr(far.pictures(field.offsets(s)), far.edited[strength]) for s, strength in stages]
 
-    ours = errors(run.gdf.field)
-    plain = errors(run.keyframes)
-    figures = f"{ours[-1]:.1f}", mean_worst(ours[:-1]), mean_worst(plain[:-1])
+    shipped = errors(run.gdf.field)
+    baseline = errors(run.keyframes)
+    figures = f"{shipped[-1]:.1f}", mean_worst(shipped[:-1]), mean_worst(baseline[:-1])
     return dict(zip(headings, figures, strict=True))
 
 

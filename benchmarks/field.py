@@ -1,7 +1,9 @@
-"""`python -m benchmarks field`: how near every form of field comes to an edit, and how many bytes it takes.
+"""The benchmark `field`: error and bytes of every form of field.
 
-Fields of edits of colors are judged by the editor's own pictures, of views in which nobody trains or chooses,
-at strengths that are nobody's own; those of a motion by its true course.
+Fields of color edits are compared with the editor's pictures, in views and at strengths not used for training
+or choice. Fields of a motion are compared with its true trajectory.
+
+    python -m benchmarks field
 """
 
 from __future__ import annotations
@@ -50,25 +52,22 @@ from .courses import edit_of, known_edit, milliseconds, processor_milliseconds
 from .table import Table, Wall
 from .training import Point, edit_of_task, save_plot, tasks
 
-STEPS = 12
-RANKS = (0, 1, 2)
-"""Even strengths at most; steps of conjugate gradients of a residual at each; its ranks."""
+STEPS = 12  # of conjugate gradients for a residual at each strength
+RANKS = (0, 1, 2)  # of the residual
 
 TARGETS = (40.0, 50.0, 60.0)
-"""What separable fields are to reach, worst PSNR to the recording, dB."""
+"""Targets of separable fields, worst PSNR to the recording, dB."""
 
 MAX_MEMBERS = 10_000
-"""Members; the forms of more would take ten minutes."""
+"""Largest region that is measured; the forms of a larger one would take ten minutes."""
 
-NETWORK = NeuralSettings("tiny", steps=1000)
-PAPERS = NeuralSettings("paper", "position")
-"""One that is trained, and the paper's, which is timed untrained."""
+NETWORK = NeuralSettings("tiny", steps=1000)  # the trained network
+PAPERS = NeuralSettings("paper", "position")  # the paper's network, timed untrained
 
-MOVED = "big ears"
-MOVING = 12_000
-SIDE = 160
-SNAPSHOTS = 33
-"""The motion, of a bear of so many Gaussians; in views of so many pixels; recordings."""
+MOVED = "big ears"  # the motion
+MOVING = 12_000  # Gaussians of its bear
+SIDE = 160  # pixels of its views
+SNAPSHOTS = 33  # of its recording
 
 CLOUDS = ((3_000, 30_000), (30_000, 100_000), (100_000, 100_000))
 """Members and Gaussians of the scenes on which a slider step is timed."""
@@ -76,46 +75,46 @@ CLOUDS = ((3_000, 30_000), (30_000, 100_000), (100_000, 100_000))
 
 @dataclass(frozen=True)
 class Form:
-    """One field of one edit, measured."""
+    """Measurements of one field of one edit."""
 
     edit: str
-    kind: str  # a line of the plot
+    kind: str  # name of the kind in the plot
     label: str
-    bytes: float  # by member, without the header
+    bytes: float  # per member, without the header
     psnrs: tuple[float, ...]  # at `MEASURED`, dB
-    seconds: float  # of the processor, to fit it
-    chosen: bool = False  # whether a run ships it
+    seconds: float  # processor time of the fit
+    chosen: bool = False  # True for the field that a run ships
 
 
 @dataclass(frozen=True)
 class InOklab:
-    """Two keyframes between which the colors of band 0 go straight in OKLab; all else as numbers."""
+    """Two keyframes; colors of band 0 are interpolated in OKLab and all other values linearly."""
 
-    start: Tensor  # packed rows. [M,C]
-    end: Tensor  # offsets. [M,C]
+    start: Tensor  # packed rows of the original. [M,C]
+    end: Tensor  # offsets at strength 1. [M,C]
     attributes: tuple[str, ...]
 
     def offsets(self, s: float) -> Tensor:
-        """As `Field` has it."""
+        """Return the offsets at a slider value, see `Field`. [M,C]"""
         columns = attribute_slices(self.end.shape[1])["sh0"]
         before = self.start[:, columns] * C0 + 0.5
         after = before + self.end[:, columns] * C0
-        shown = before.clamp(0.0, 1.0)
-        finished = after.clamp(0.0, 1.0)
-        lab = torch.lerp(srgb_to_oklab(shown), srgb_to_oklab(finished), s)
-        # what no screen shows lies beside, on its own straight line
-        beyond = torch.lerp(before - shown, after - finished, s)
+        before_rgb = before.clamp(0.0, 1.0)
+        after_rgb = after.clamp(0.0, 1.0)
+        lab = torch.lerp(srgb_to_oklab(before_rgb), srgb_to_oklab(after_rgb), s)
+        # the part outside the range of a screen is interpolated linearly
+        beyond = torch.lerp(before - before_rgb, after - after_rgb, s)
         moved = s * self.end
         moved[:, columns] = (oklab_to_srgb(lab) + beyond - before) / C0
         return moved
 
 
 def tables(scenes: Sequence[Path] = (), plot: Path | None = None) -> list[Table]:
-    """Error against bytes; a slider step against copying as many bytes, and against a network that is asked.
+    """Measure error against bytes, and the time of a slider step against a memory copy and a network.
 
     Args:
-        scenes: edited as `python -m benchmarks training` does, after its bear, but for those of more than
-            `MAX_MEMBERS` members
+        scenes: further scenes, edited like those of `python -m benchmarks training`; regions of more than
+            `MAX_MEMBERS` members are left out
         plot: also draw the errors into this PNG file
     """
     forms = list[Form]()
@@ -135,7 +134,7 @@ def tables(scenes: Sequence[Path] = (), plot: Path | None = None) -> list[Table]
 
 
 def color_forms(name: str, edit: RegretEdit) -> list[Form]:
-    """Every form of field of an edit of colors."""
+    """Fit and measure every form of field of a color edit."""
     judge, forms = edit.judge(), list[Form]()
 
     def measure(kind: str, label: str, size: float, field: Field, began: float) -> None:
@@ -211,7 +210,7 @@ def color_forms(name: str, edit: RegretEdit) -> list[Form]:
 
 
 def moved_forms() -> list[Form]:
-    """Keyframes and separable fields of a motion, against its true course."""
+    """Fit keyframes and separable fields to a motion, and measure them against its true trajectory."""
     scene = bear(MOVING)
     cameras = [camera.resize(SIDE, SIDE) for camera in scene.cameras]
     course = known_edit(MOVED, scene.gaussians, *bear_edits(scene)[MOVED], cameras, SNAPSHOTS)
@@ -259,7 +258,7 @@ def moved_forms() -> list[Form]:
 def trained_network(
     rows: Tensor, knots: Tensor, recording: Tensor, weights: Tensor, settings: NeuralSettings, steps: int
 ) -> NeuralField:
-    """A network of the recorded numbers after so many steps."""
+    """Train a network on recorded offsets for a number of steps."""
     settings = settings.resolve()
     settings = replace(settings, batch=min(settings.batch, len(rows)))
     fit = NeuralFit(rows, recording.shape[2], tuple(moving_attributes(recording)), settings, weights)
@@ -269,7 +268,7 @@ def trained_network(
 
 
 def field_table(forms: Sequence[Form]) -> Table:
-    """The table of all fields of all edits, in their order."""
+    """Make the table of all fields of all edits, in order."""
     strengths = ", ".join(f"{s:g}" for s in MEASURED)
     rows = [
         {
@@ -326,7 +325,7 @@ def _compose_row(scene: Gaussians, edit: Gdf, single: Gdf) -> dict[str, str]:
     knots = torch.tensor([0.0, 1.0])
     ends = torch.stack([edit.field.offsets(s) for s in (0.0, 1.0)])
     asked = trained_network(rows, knots, ends, torch.ones(len(rows)), PAPERS, 0).bind(rows)
-    # bases, the original and the last centers are read, row numbers too, 14 numbers written
+    # reads bases, the original, the last centers and row indices; writes 14 values per member
     traffic = len(edit.region) * (edit.field.bytes_per_member + 56 + 12 + 12 + 56)
     source = np.ones(int(traffic) // 8, np.float32)
     target = source.copy()

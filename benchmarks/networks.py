@@ -1,8 +1,10 @@
-"""`python -m benchmarks networks --runs RUN …`: networks trained to the end, judged beside what is shipped.
+"""The benchmark `networks`: fully trained networks beside the shipped field.
 
-A network is trained as `progdf fit --field neural` trains one of its size, on the numbers of the recording,
-judged as it answers itself and as it is baked, and timed both ways. Trained networks are kept in
-RUN/networks, so that an interrupted benchmark goes on.
+A network is trained on the recorded offsets like a network of its size in `progdf fit --field neural`. Its
+own output and its baked field are both evaluated and timed. Trained networks are saved in RUN/networks, so
+that an interrupted benchmark resumes.
+
+    python -m benchmarks networks --runs RUN …
 """
 
 from __future__ import annotations
@@ -50,10 +52,10 @@ NETWORKS: Mapping[str, NeuralSettings] = {
 }
 
 LONGEST = 600.0
-"""Seconds of processor time that a network may take to train; others are timed untrained."""
+"""Largest processor time for training a network, seconds; others are timed untrained."""
 
 ROUNDS = 15
-"""Slider steps that are timed."""
+"""Timed slider steps."""
 
 
 NOTE = (
@@ -77,7 +79,7 @@ class TrainedNetwork:
 
 
 def tables(runs: Sequence[Path] = ()) -> list[Table]:
-    """Judge networks on the recorded edits of finished runs.
+    """Evaluate networks on the recorded edits of finished runs.
 
     Raises:
         ProgdfError: no run is named, or one is not finished.
@@ -149,7 +151,7 @@ def _rows(run: Path, course: KnownEdit) -> list[dict[str, str]]:
 
 
 def _trained(run: Path, name: str, settings: NeuralSettings, course: KnownEdit) -> TrainedNetwork:
-    """The network of that name, from the run's folder or trained now."""
+    """Return the network of that name from the run's folder, or train it."""
     path = run / "networks" / f"{name.replace(', ', '-').replace(' ', '-')}.gdf"
     before = pack(course.scene[course.members])
     members = len(course.members)
@@ -181,7 +183,7 @@ def _begin(course: KnownEdit, settings: NeuralSettings) -> NeuralFit:
 
 
 def _step_seconds(course: KnownEdit, settings: NeuralSettings) -> float:
-    """Processor time of one training step."""
+    """Measure the processor time of one training step, seconds."""
     fit = _begin(course, settings)
     fit.step(course.strengths, course.offsets)
     begin = time.process_time()
@@ -190,13 +192,13 @@ def _step_seconds(course: KnownEdit, settings: NeuralSettings) -> float:
 
 
 def _composed(scene: Gaussians, edit: Gdf) -> Callable[[float], object]:
-    """A slider step of the viewer, as far as attributes go: strength -> all of them, anew."""
+    """Return a function that composes all attributes at a strength, like a slider step of the viewer."""
     composer = Composer(scene, [edit])
     return lambda s: composer.update([Layer(edit, s)])
 
 
 def turns_ms(works: Mapping[str, Callable[[float], object]]) -> dict[str, float]:
-    """Median processor time of each at ever other strengths, all in turns, ms."""
+    """Measure the median processor time of each function over changing strengths, in turns, ms."""
     times: dict[str, list[float]] = {name: [] for name in works}
     for i in range(ROUNDS + 1):
         s = 0.03 + 0.9 * i / ROUNDS

@@ -1,7 +1,10 @@
-"""`python -m benchmarks pictures --scenes SCENE.ply`: a region from one picture, two and four; others judge.
+"""The benchmark `pictures`: color edits solved from one, two and four pictures, evaluated in the other views.
 
-The truth is painted in 3D: an edit of which every picture is known. A few of a rig's pictures are given, all
-the others are compared. Labels beside the scene (SCENE_labels.npy, label 1) are the region; without, all is.
+The truth is painted in 3D, so that every picture of the edit is known. A small number of a rig's pictures are
+given and all others are compared. The region is label 1 of SCENE_labels.npy beside the scene, or the whole
+scene.
+
+    python -m benchmarks pictures --scenes SCENE.ply
 """
 
 from __future__ import annotations
@@ -48,16 +51,16 @@ EDITS = (
     ("recolor:#3060d0", "right half"),
     ("recolor:#3060d0", "upper half"),
 )
-"""And the part of the region that is painted."""
+"""Editor and painted part of the region."""
 
-RIG = 36
-SIZE = 256
-LARGE = 512
-STEPS = 100
+RIG = 36  # cameras
+SIZE = 256  # pixels of the compared pictures
+LARGE = 512  # pixels of the given pictures
+STEPS = 100  # of conjugate gradients
 GIVEN = ((0,), (9,), (0, 18), (0, 9, 18, 27))
-"""Numbers of the rig's pictures: the front is 0."""
+"""Sets of given pictures, by their index in the rig; 0 is the front."""
 
-DEGREES = (0, 30, 75, 120, 180)
+DEGREES = (0, 30, 75, 120, 180)  # limits of the angle to the nearest given picture
 
 NOTE = (
     f"A rig of {RIG} cameras around the region; the pictures given are of {LARGE} pixels, the others, of "
@@ -99,10 +102,10 @@ def _rows(path: Path, edit: str, part: str) -> list[tuple[str, ...]]:
     truth = [editor.edit(view, 1.0) for view in canvases]
     rows = []
     for given in GIVEN:
-        lenses = [cameras[i].resize(LARGE, LARGE) for i in given]
-        large = [make_view(scene, painted, lens, background) for lens in lenses]
+        large_cameras = [cameras[i].resize(LARGE, LARGE) for i in given]
+        large = [make_view(scene, painted, large_camera, background) for large_camera in large_cameras]
         edited = [quantize_image(editor.edit(view, 1.0)) for view in large]
-        large = [make_view(scene, region, lens, background) for lens in lenses]
+        large = [make_view(scene, region, large_camera, background) for large_camera in large_cameras]
         large = [view.widen([picture]) for view, picture in zip(large, edited, strict=True)]
         began = time.process_time()
         crops = [crop_scene(scene, region.members, v.camera, v.box, background, True) for v in large]
@@ -113,18 +116,20 @@ def _rows(path: Path, edit: str, part: str) -> list[tuple[str, ...]]:
         solver, model = choose_model(solver, trial, targets, STEPS, 1)
         change = add_bands(solver.fit_map(model.degree, targets)[1], model.residual)
         offsets = band_offsets(change, original.shape[1])
-        took = time.process_time() - began
-        found = scene.replace_rows(region.members, original + offsets)
-        found_by: dict[int, list[float]] = {end: [] for end in DEGREES[1:]}
+        seconds = time.process_time() - began
+        solved = scene.replace_rows(region.members, original + offsets)
+        psnrs: dict[int, list[float]] = {end: [] for end in DEGREES[1:]}
         for i, view in enumerate(views):
-            counts = view.mask > 0.05
-            if i in given or not bool(counts.any()):
+            evaluated = view.mask > 0.05
+            if i in given or not bool(evaluated.any()):
                 continue
-            shown = render_view(found, view.camera, background).clamp(0.0, 1.0)
-            error = decibels(float((shown - truth[i])[counts].square().mean()))
-            off = math.degrees(math.acos(min(1.0, max(float(toward[i] @ toward[k]) for k in given))))
-            found_by[next(end for end in DEGREES[1:] if off <= end)].append(error)
+            rendered = render_view(solved, view.camera, background).clamp(0.0, 1.0)
+            error = decibels(float((rendered - truth[i])[evaluated].square().mean()))
+            angle = math.degrees(math.acos(min(1.0, max(float(toward[i] @ toward[k]) for k in given))))
+            psnrs[next(end for end in DEGREES[1:] if angle <= end)].append(error)
         numbers = ", ".join(str(i) for i in given)
-        what = edit if part == "all" else f"{edit}, {part}"
-        rows.append((f"{path.stem}, {what}", numbers, *map(mean_worst, found_by.values()), f"{took:.1f}"))
+        edit_name = edit if part == "all" else f"{edit}, {part}"
+        rows.append(
+            (f"{path.stem}, {edit_name}", numbers, *map(mean_worst, psnrs.values()), f"{seconds:.1f}")
+        )
     return rows

@@ -1,13 +1,11 @@
-"""`python -m benchmarks rasterize` and `warp`: an engine's speed beside its error.
+"""The benchmarks `rasterize`, `warp` and `hard`: speed and error of the rasterizers.
 
-First the cpu engine, against tiles in plain torch.
+The cpu engine is compared with a plain tiled renderer in torch, float32, differentiated by autograd. Its
+tiles have 16x16 pixels, and every Gaussian listed for a tile is evaluated at every pixel. A tile lists the
+Gaussians whose square of three standard deviations of the longer axis touches it, as published (Kerbl 2023).
+Both take turns in one process, on one thread each and on two.
 
-What it is compared with is a plain tiled renderer in float32, differentiated by autograd: tiles of 16x16
-pixels, within which every listed Gaussian meets every pixel; listed is what the square of three standard
-deviations of the longer axis touches, as published (Kerbl 2023). Both take turns in one process, on one
-thread each and on two.
-
-Then the engine warp: on a card, if there is one, on the CPU device for its errors.
+The warp engine is measured on a CUDA card if there is one, else on the CPU device for its errors.
 """
 
 from __future__ import annotations
@@ -47,8 +45,8 @@ class RasterCase:
 
     count: int  # Gaussians
     size: int  # width of the image, pixels
-    baseline: bool = True  # whether torch can do it in the memory of a small machine
-    height: int = 0  # of the image, pixels; 0: as its width
+    baseline: bool = True  # False if torch needs more memory than a small machine has
+    height: int = 0  # height of the image, pixels; 0: equal to its width
 
 
 CASES = (RasterCase(2_000, 128), RasterCase(20_000, 256), RasterCase(100_000, 512, baseline=False))
@@ -62,18 +60,18 @@ THREADS = (1, 2)
 
 @dataclass(frozen=True)
 class Duel:
-    """Times on so many threads, ms, by round; of torch forward + backward."""
+    """Times of the cpu engine and of torch by round, ms."""
 
-    threads: int
-    forward: list[float]  # the cpu engine's
-    both: list[float]  # and with the backward pass
-    processor: list[float]  # that this takes of all cores
-    ours: list[float]  # medians of `both` beside torch, none where torch is not run
-    torch: list[float]
+    threads: int  # number of threads
+    forward: list[float]  # cpu engine, forward
+    both: list[float]  # cpu engine, forward and backward
+    processor: list[float]  # the same, processor time of all cores
+    ours: list[float]  # median of `both` per round of torch; empty if torch is not run
+    torch: list[float]  # torch, forward and backward
 
     @property
     def ratio(self) -> float:
-        """How many times faster than torch; the median over the rounds of each round's ratio."""
+        """Speedup over torch: the median over the rounds of each round's ratio."""
         return statistics.median(b / a for a, b in zip(self.ours, self.torch, strict=True))
 
 
@@ -82,17 +80,17 @@ class RasterTimes:
     """Times of one case, and errors against float64."""
 
     case: RasterCase
-    duels: list[Duel]  # on each of `THREADS`, against the tiled torch renderer where that is run
-    plain: float  # processor ms of the plain version, which is the float64
+    duels: list[Duel]  # one for each of `THREADS`, with the tiled torch renderer if it is run
+    plain: float  # processor time of the plain version in float64, ms
     image_error: float  # largest difference of a color
     gradient_errors: dict[str, float]  # largest difference over the largest gradient, by input
 
 
 def cloud(case: RasterCase) -> tuple[ActivatedGaussians, Camera]:
-    """Activated means, quats, scales, opacities, rgb, seeded, and a camera that sees most of them.
+    """Make a seeded cloud of activated Gaussians and a camera that sees most of them.
 
-    A Gaussian's standard deviation is about 1.4 pixels, axes differ by a factor of about 2: what a trained
-    scene looks like from where its pictures were taken.
+    A Gaussian's standard deviation is about 1.4 pixels and its axes differ by a factor of about 2, as in a
+    trained scene seen from its training cameras.
     """
     rng = torch.Generator().manual_seed(case.count)
     means = torch.randn(case.count, 3, generator=rng) * 0.7 + torch.tensor([0.0, 0.0, 4.0])
@@ -110,7 +108,7 @@ def cloud(case: RasterCase) -> tuple[ActivatedGaussians, Camera]:
 def draw(
     inputs: ActivatedGaussians, camera: Camera, engine: str, dtype: torch.dtype, backward: bool
 ) -> tuple[float, Tensor, list[Tensor]]:
-    """Milliseconds of one pass, the image, and the gradients that a fixed gradient of the image leads to."""
+    """Run one pass; return its milliseconds, the image, and the gradients for a fixed image gradient."""
     leaves = inputs.each(lambda tensor: tensor.clone().to(dtype).requires_grad_(backward))
     across, down = (
         torch.linspace(0.0, pi, side, dtype=dtype, device=leaves.means.device).sin()
@@ -128,7 +126,7 @@ def draw(
 
 
 def _settle(tensor: Tensor) -> None:
-    """Wait for what a card has been given."""
+    """Wait for the queued work of a CUDA card."""
     if tensor.is_cuda:
         torch.cuda.synchronize()
 
@@ -144,9 +142,9 @@ def _image(engine: str, gaussians: ActivatedGaussians, camera: Camera) -> Tensor
 
 
 def three_sigma(splats: reference.ReferenceSplats) -> reference.ReferenceSplats:
-    """With the published extents: a square of three standard deviations along the longer axis, whole pixels.
+    """Return the splats with the published extents: a square of three standard deviations of the longer axis.
 
-    They leave out what a Gaussian still adds between there and alpha = 1/255.
+    The extents are whole pixels. They cut off the part of a Gaussian between there and alpha = 1/255.
     """
     l11, l21, l22 = splats.whitening.detach().double().unbind(1)
     c = l22.square().reciprocal()
@@ -163,9 +161,9 @@ def measure(case: RasterCase, rounds: int = 9, torch_rounds: int = 3) -> RasterT
     """Measure one case; engines take turns, and the first round of each is not counted.
 
     Args:
-        case: what to draw
-        rounds: of the cpu engine, within each round of torch
-        torch_rounds: of torch
+        case: the cloud and the image size
+        rounds: rounds of the cpu engine within each round of torch
+        torch_rounds: rounds of torch
     """
     inputs, camera = cloud(case)
     _, image, gradients = draw(inputs, camera, "cpu", torch.float32, backward=True)
@@ -176,7 +174,7 @@ def measure(case: RasterCase, rounds: int = 9, torch_rounds: int = 3) -> RasterT
             with _threads(threads):
                 draw(inputs, camera, "tiled", torch.float32, backward=True)
         for _ in range(torch_rounds):
-            # the kernels have their own threads; torch's would only spin beside them
+            # the kernels have their own threads; torch's would only busy-wait
             with _threads(1, threads):
                 duel.forward.extend(
                     draw(inputs, camera, "cpu", torch.float32, False)[0] for _ in range(rounds)
@@ -199,7 +197,7 @@ def measure(case: RasterCase, rounds: int = 9, torch_rounds: int = 3) -> RasterT
 def _errors(
     image: Tensor, gradients: list[Tensor], exact: Tensor, exact_gradients: list[Tensor]
 ) -> tuple[float, dict[str, float]]:
-    """Largest difference of a color; of each input's gradient, over the largest."""
+    """Return the largest color difference, and each input's largest gradient difference over its maximum."""
     errors = {
         name: float((gradient.cpu() - expected).abs().max() / expected.abs().max())
         for name, gradient, expected in zip(INPUTS, gradients, exact_gradients, strict=False)
@@ -220,7 +218,7 @@ def _threads(of_torch: int, of_kernels: int | None = None) -> Iterator[None]:
 
 
 def tables() -> list[Table]:
-    """The benchmark's table."""
+    """Measure the cpu engine and make its tables."""
     results = [measure(case) for case in CASES]
     rows = []
     for result in results:
@@ -257,11 +255,11 @@ def tables() -> list[Table]:
 
 
 def list_table(cases: Sequence[RasterCase], rounds: int = 9) -> Table:
-    """What edits of colors are solved with: a view as lists of weights, with and without what hardly shows.
+    """Measure views as weight lists, which color edits are solved with, with and without negligible weights.
 
     Args:
-        cases: what is looked at, every Gaussian with its weights
-        rounds: of which medians are taken; the two take turns
+        cases: clouds and image sizes; every Gaussian has a weight list
+        rounds: measured rounds, whose median is reported; both variants take turns
     """
     rows = []
     for case in cases:
@@ -273,22 +271,22 @@ def list_table(cases: Sequence[RasterCase], rounds: int = 9) -> Table:
         entries = dict[float, int]()
         with _threads(1, 1):
             for _ in range(rounds + 1):
-                for lost, some in times.items():
+                for lost, durations in times.items():
                     begin = time.process_time()
-                    weighed = color_map(inputs, camera, window, every, lost=lost)
+                    weights = color_map(inputs, camera, window, every, lost=lost)
                     listed = time.process_time()
-                    weighed.gradient(picture := weighed.picture(inputs.colors))
-                    some.append((1e3 * (listed - begin), 1e3 * (time.process_time() - listed)))
-                    assert isinstance(weighed, ListedWeights)
-                    pictures[lost], entries[lost] = picture, len(weighed.runs.weights)
-        listing, looking = (
-            [f"{statistics.median(taken[k] for taken in some[1:]):.1f}" for some in times.values()]
+                    weights.gradient(picture := weights.picture(inputs.colors))
+                    durations.append((1e3 * (listed - begin), 1e3 * (time.process_time() - listed)))
+                    assert isinstance(weights, ListedWeights)
+                    pictures[lost], entries[lost] = picture, len(weights.runs.weights)
+        listing, rendering = (
+            [f"{statistics.median(pair[k] for pair in durations[1:]):.1f}" for durations in times.values()]
             for k in (0, 1)
         )
-        away = float((pictures[LOST] - pictures[0.0]).abs().max())
+        difference = float((pictures[LOST] - pictures[0.0]).abs().max())
         left_out = f"{1.0 - entries[LOST] / entries[0.0]:.0%}"
         size = group_digits(case.count), f"{case.size}²"
-        rows.append((*size, left_out, *listing, *looking, f"{away:.4f}", f"{LOST:.4f}"))
+        rows.append((*size, left_out, *listing, *rendering, f"{difference:.4f}", f"{LOST:.4f}"))
     columns = (
         "Gaussians",
         "pixels",
@@ -309,31 +307,31 @@ def list_table(cases: Sequence[RasterCase], rounds: int = 9) -> Table:
 
 
 def warp_tables(cases: Sequence[RasterCase] | None = None, rounds: int = 5) -> list[Table]:
-    """The engine warp on this machine's card; without one on a CPU, where only its errors count.
+    """Measure the warp engine on this machine's card, or on the CPU, where only its errors are meaningful.
 
     Args:
-        cases: what to draw; None: `CARD_CASES` or `WARP_CASES`
-        rounds: of which medians are taken, after one that is not counted
+        cases: clouds and image sizes; None: `CARD_CASES` with a card, else `WARP_CASES`
+        rounds: measured rounds, after one that is not counted; the median is reported
     """
     device = engine_device("warp")
     card = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU device, for tests"
     rows = []
     for case in cases or (CARD_CASES if device.type == "cuda" else WARP_CASES):
         inputs, camera = cloud(case)
-        there = inputs.each(lambda tensor: tensor.to(device))
+        on_device = inputs.each(lambda tensor: tensor.to(device))
         oracle, dtype = ("reference", torch.float64) if case.baseline else ("cpu", torch.float32)
         _, exact, exact_gradients = draw(inputs, camera, oracle, dtype, backward=True)
         times = [
-            [draw(there, camera, "warp", torch.float32, backward)[0] for _ in range(rounds + 1)][1:]
+            [draw(on_device, camera, "warp", torch.float32, backward)[0] for _ in range(rounds + 1)][1:]
             for backward in (False, True)
         ]
         figures = []
-        for engine, given in (("warp", there), ("cpu", inputs)):
+        for engine, gaussians in (("warp", on_device), ("cpu", inputs)):
             used = []
             with _threads(1, 1):
                 for _ in range(rounds + 1):
                     used.append(-time.process_time())
-                    _, image, gradients = draw(given, camera, engine, torch.float32, backward=True)
+                    _, image, gradients = draw(gaussians, camera, engine, torch.float32, backward=True)
                     used[-1] += time.process_time()
             figures.append(f"{1e3 * statistics.median(used[1:]):.0f}")
             error, errors = _errors(image, gradients, exact, exact_gradients)
@@ -374,7 +372,7 @@ def warp_tables(cases: Sequence[RasterCase] | None = None, rounds: int = 5) -> l
 
 
 def _step_time(case: RasterCase, steps: int) -> float:
-    """Milliseconds of a step of `optimize`, half of the steps not counted, every Gaussian a member."""
+    """Measure the milliseconds per step of `optimize` in the second half of the steps, all rows members."""
     inputs, camera = cloud(case)
     rgb = (inputs.colors - 0.5) / C0
     raw = Gaussians(
@@ -404,7 +402,7 @@ def _step_time(case: RasterCase, steps: int) -> float:
 
 
 def hard_tables() -> list[Table]:
-    """Draw every hard case: the largest differences of the fast engines from the reference."""
+    """Draw every hard case and report the largest differences of the fast engines from the reference."""
     from tests.helpers.camera_tables import REFUSED_VIEWMATS
     from tests.helpers.drawn import CASES as HARD
     from tests.helpers.drawn import drawn_case, image_error, relative_errors
@@ -419,8 +417,8 @@ def hard_tables() -> list[Table]:
             fast = drawn_case(name, engine)
             errors = relative_errors(fast, plain)
             worst = max(errors, key=lambda name: errors[name])
-            where = f" ({worst})" if errors[worst] else ""
-            row += [f"{image_error(fast, plain):.1e}", f"{errors[worst]:.1e}{where}"]
+            suffix = f" ({worst})" if errors[worst] else ""
+            row += [f"{image_error(fast, plain):.1e}", f"{errors[worst]:.1e}{suffix}"]
         rows.append(tuple(row))
     for name, (change, _) in REFUSED_VIEWMATS.items():
         outcome = _camera_outcome(front_camera(), change)
@@ -440,7 +438,7 @@ def hard_tables() -> list[Table]:
 
 
 def _camera_outcome(camera: Camera, change: Tensor) -> str:
-    """Return what happens to a camera whose viewmat is changed: drawn, or refused and why."""
+    """Return the outcome for a camera with a changed viewmat: drawn, or refused with the reason."""
     try:
         replace(camera, viewmat=change @ camera.viewmat)
     except ValueError as error:

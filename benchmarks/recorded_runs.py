@@ -1,4 +1,4 @@
-"""Recorded edits for `python -m benchmarks field --runs`: what a finished run left, as a course to follow."""
+"""Recorded edits of finished runs as known trajectories, for `python -m benchmarks networks --runs`."""
 
 from __future__ import annotations
 
@@ -12,25 +12,24 @@ from trainer.views.choose import split_held_out
 
 from .courses import KnownEdit
 
-LOOKED = 3
-JUDGED = 2
-"""Training views that ranks are grown on; held-out views that choose, and as many others that judge."""
+LOOKED = 3  # training views on which ranks are chosen
+JUDGED = 2  # held-out views for the choice, and as many others for the evaluation
 
 
 def recorded_edit(root: Path) -> KnownEdit:
-    """The edit of a run folder; its truth is the recording, straight from one snapshot to the next.
+    """Load the edit of a run folder; its truth is the recording, interpolated linearly between snapshots.
 
     Raises:
-        ProgdfError: the folder is no finished run, or its scene is gone or another.
+        ProgdfError: the folder is no finished run, or its scene is missing or differs.
     """
     run = reopen_run(root)
     setup = render_run_views(run)
     trajectory = run.trajectory
-    few = setup.train[:: max(1, len(setup.train) // LOOKED)][:LOOKED]
+    rank_views = setup.train[:: max(1, len(setup.train) // LOOKED)][:LOOKED]
     choosing, reporting = split_held_out(setup.judging)
     look, chooser, judge = (
         load_evaluator(run.folder, setup, views, trajectory).counted_pixels
-        for views in (few, choosing[:JUDGED], reporting[:JUDGED])
+        for views in (rank_views, choosing[:JUDGED], reporting[:JUDGED])
     )
     offsets = trajectory.nodes
     return KnownEdit(

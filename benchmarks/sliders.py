@@ -1,7 +1,7 @@
-"""`python -m benchmarks sliders FOLDER`: edits of the demo scenes whose picture is known at every strength.
+"""The command `python -m benchmarks sliders FOLDER`: edits of the demo scenes with known pictures.
 
-An editor of colors says what a view shows at any strength, an analytic edit what every Gaussian is. The
-trainer sees pictures of its training views at 8 strengths; compared are held-out views at 11.
+A color editor defines every view at any strength, and an analytic edit every Gaussian. The trainer gets
+pictures of its training views at 8 strengths. The comparison uses held-out views at 11 strengths.
 """
 
 from __future__ import annotations
@@ -46,36 +46,36 @@ from .analytic_edits import AnalyticEdit, bear_edits
 from .table import mean_worst
 
 STRENGTHS = tuple(i / 10 for i in range(11))
-"""At which sliders are compared with the truth; 0 is exact for all."""
+"""Strengths at which sliders are compared with the truth; 0 is exact for all."""
 
 ASKED = 8
-"""Strengths at which the trainer is given pictures, evenly."""
+"""Number of evenly spaced strengths at which the trainer gets pictures."""
 
 SIZES = {"bear": 12_000, "room": 20_000}
-"""Gaussians of the scenes."""
+"""Number of Gaussians by scene."""
 
-_SHOWN = (SLIDER, KEYFRAMES, FADE)
-_THUMBNAIL = 170
-_PLOTS_A_ROW = 5
+_COMPARED = (SLIDER, KEYFRAMES, FADE)
+_THUMBNAIL_WIDTH = 170  # pixels
+_PLOTS_PER_ROW = 5
 
 EFFORT = Effort(views=20, image_size=192, steps=480)
 
 
 @dataclass(frozen=True)
 class SliderOptions:
-    """Train edits of the demo scenes whose pictures are known at every strength, and compare the sliders.
+    """Train edits of the demo scenes with known pictures, and compare the sliders with them at 11 strengths.
 
-    They are compared with these at 11 strengths. Runs that are finished are not trained again.
+    Finished runs are not trained again.
     """
 
     folder: tyro.conf.Positional[Path]
-    """For scenes, pictures, runs and the table; made if need be."""
+    """Folder for scenes, pictures, runs and the table; created if missing."""
     threads: int = 1
-    """CPU threads of a run; as many runs at once as the cores allow."""
+    """CPU threads per run; as many runs as the cores allow are trained at once."""
 
 
 def run_sliders(options: SliderOptions) -> list[CaseResult]:
-    """Train and compare; FOLDER/sliders.json and .png, and a table on the screen.
+    """Train and compare the edits, write FOLDER/sliders.json and sliders.png, and print a table.
 
     Raises:
         ProgdfError: the folder cannot be written to, or holds other runs.
@@ -96,16 +96,16 @@ def run_sliders(options: SliderOptions) -> list[CaseResult]:
 
 @dataclass(frozen=True)
 class KnownEdit:
-    """One edit."""
+    """An edit of a demo scene with known pictures."""
 
-    name: str  # of the edit; of an analytic one as `bear_edits` names it
+    name: str  # name of the edit; for an analytic one, its name in `bear_edits`
     scene: Literal["bear", "room"]  # the demo scene
-    parts: tuple[str, ...]  # what may change
-    editor: str = ""  # `KIND:WHAT` of an editor of colors; "" for an analytic edit
+    parts: tuple[str, ...]  # labels of the region
+    editor: str = ""  # `KIND:WHAT` of a color editor; "" for an analytic edit
 
     @property
     def folder(self) -> str:
-        """Its run's name."""
+        """Name of its run folder."""
         return self.name.replace(" ", "-")
 
 
@@ -126,14 +126,14 @@ CASES = (
 
 @dataclass(frozen=True)
 class CaseResult:
-    """One edit's figures."""
+    """Figures of one edit."""
 
     case: KnownEdit  # the edit
-    members: int  # how many Gaussians it may change
+    members: int  # number of Gaussians in its region
     bytes_per_member: float  # of the shipped field
-    seconds: float | None  # of the run, as its report tells
-    curves: Mapping[str, ErrorCurve]  # against the truth at `STRENGTHS`, by what is shown
-    # the best held-out view half way and at the end: the truth, and what is shown. [h,w,3] each
+    seconds: float | None  # duration of the run, from its report
+    curves: Mapping[str, ErrorCurve]  # against the truth at `STRENGTHS`, by contender
+    # the best held-out view at strengths 0.5 and 1, of the truth and each contender. [h,w,3] each
     strips: Mapping[str, tuple[Tensor, Tensor]]
 
 
@@ -146,14 +146,16 @@ def run_suite(
     sizes: Mapping[str, int] = SIZES,
     effort: Effort = EFFORT,
 ) -> list[CaseResult]:
-    """Train and judge every edit; runs that are finished are not trained again.
+    """Train and evaluate every edit; finished runs are not trained again.
 
     Args:
-        folder: for scenes, pictures and runs; made if need be
-        perceptual: LPIPS, or its stand-in
+        folder: folder for scenes, pictures and runs; created if missing
+        perceptual: LPIPS or its substitute
         threads: CPU threads of a run
-        told: called with a line for each edit that is trained
-        cases, sizes, effort: edits, Gaussians of the scenes, training
+        told: called with a line for each trained edit
+        cases: the edits
+        sizes: number of Gaussians by scene
+        effort: views, image size and steps of the training
 
     Raises:
         ProgdfError: the folder cannot be written to, or holds other runs.
@@ -165,7 +167,7 @@ def run_suite(
         if case.scene not in scenes:
             scene = makers[case.scene](sizes[case.scene])
             write_scene(folder / case.scene, scene)
-            # as it is read again, half a step of its file's rounding away
+            # as the trainer reads it: the file rounds by up to half a step
             scenes[case.scene] = replace(scene, gaussians=load_ply(folder / case.scene / "scene.ply"))
         options = replace(_train_options(folder, case, scenes[case.scene], effort), threads=threads)
         _prepare_truth(folder, case, scenes[case.scene], options)
@@ -178,7 +180,7 @@ def run_suite(
 
 
 def _prepare_truth(folder: Path, case: KnownEdit, scene: DemoScene, options: TrainOptions) -> None:
-    """Pictures of an analytic edit, unless a run has had them."""
+    """Write the pictures of an analytic edit, unless its run exists already."""
     truth_folder = folder / "truth" / case.folder
     if not case.editor:
         make_folder(truth_folder)
@@ -192,24 +194,24 @@ def _judge_case(folder: Path, case: KnownEdit, scene: DemoScene, perceptual: Per
     contenders = opened.contenders()
     curves = picture_courses(opened.evaluator, contenders, STRENGTHS, truth, perceptual)
     best = max(range(len(opened.evaluator.pixels)), key=lambda k: int(opened.evaluator.pixels[k].sum()))
-    shown = {"truth": truth, **contenders}
-    strips = {name: (pictures(0.5)[best], pictures(1.0)[best]) for name, pictures in shown.items()}
+    sources = {"truth": truth, **contenders}
+    strips = {name: (pictures(0.5)[best], pictures(1.0)[best]) for name, pictures in sources.items()}
     seconds = opened.report.get("time", {}).get("total")
     field = opened.gdf.field
     return CaseResult(case, len(opened.gdf.region), field.bytes_per_member, seconds, curves, strips)
 
 
 def _train_options(folder: Path, case: KnownEdit, scene: DemoScene, effort: Effort) -> TrainOptions:
-    at = folder / case.scene
+    scene_folder = folder / case.scene
     ids = ",".join(str(scene.label_names.index(part)) for part in case.parts)
-    cameras = at / "cameras.json" if case.scene == "room" else None  # one stands inside it
+    cameras = scene_folder / "cameras.json" if case.scene == "room" else None  # its cameras are inside
     return TrainOptions(
-        scene=at / "scene.ply",
+        scene=scene_folder / "scene.ply",
         out=folder / case.folder,
-        region=RegionOptions(f"labels:{at / 'labels.npy'}:{ids}"),
+        region=RegionOptions(f"labels:{scene_folder / 'labels.npy'}:{ids}"),
         editor=EditorOptions(case.editor or f"folder:{folder / 'truth' / case.folder}"),
         views=TrainingViewOptions(cameras, views=effort.views, image_size=effort.image_size),
-        # of a folder as many stages as it holds; the slider's value is the editor's strength
+        # stages 0: one per strength in the folder; the slider value is the editor's strength
         optimize=OptimizeOptions(effort.steps, stages=ASKED if case.editor else 0, slider="stages"),
     )
 
@@ -219,7 +221,7 @@ def _analytic(case: KnownEdit, scene: DemoScene) -> AnalyticEdit:
 
 
 def _write_truth(folder: Path, options: TrainOptions, scene: Gaussians, edit: AnalyticEdit) -> None:
-    """Picture the edit in the views that the run will have, DIR/STRENGTH/NAME.png."""
+    """Draw the edit in the views that the run will have, as DIR/STRENGTH/NAME.png."""
     region = parse_region(options.region.region, scene, options.name)
     setup = make_training_setup(options.views, scene, region)
     for strength in ((i + 1) / ASKED for i in range(ASKED)):
@@ -230,9 +232,9 @@ def _write_truth(folder: Path, options: TrainOptions, scene: Gaussians, edit: An
 
 
 def _truth(case: KnownEdit, opened: OpenedRun, scene: DemoScene) -> Pictures:
-    """The held-out views' boxes as they should be at any strength."""
+    """Return a function from strength to the true boxes of the held-out views."""
     setup = opened.setup
-    boxes = [shown.box for shown in opened.evaluator.crops]
+    boxes = [crop_scene.box for crop_scene in opened.evaluator.crops]
     if case.editor:
         options = EditorOptions(case.editor)
         glances = partial(take_glances, opened.run.record.plan.views, setup.scene, setup.region)
@@ -253,12 +255,12 @@ def _truth(case: KnownEdit, opened: OpenedRun, scene: DemoScene) -> Pictures:
 
 
 def suite_rows(results: Sequence[CaseResult]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Headings, and a row an edit: mean and worst PSNR over strengths .1 to 1, mean LPIPS over the same."""
+    """Return headings and a row per edit: mean and worst PSNR and mean LPIPS over strengths 0.1 to 1."""
     head = (
         "edit",
         "members",
-        *(f"{name}, PSNR mean / worst, dB" for name in _SHOWN),
-        *(f"{name}, LPIPS" for name in _SHOWN),
+        *(f"{name}, PSNR mean / worst, dB" for name in _COMPARED),
+        *(f"{name}, LPIPS" for name in _COMPARED),
         "PSNR at 1, dB",
         "bytes a member",
     )
@@ -266,8 +268,8 @@ def suite_rows(results: Sequence[CaseResult]) -> tuple[tuple[str, ...], list[tup
         (
             result.case.name,
             str(result.members),
-            *(mean_worst(result.curves[name].psnr[1:]) for name in _SHOWN),
-            *(f"{fmean(result.curves[name].lpips[1:]):.4f}" for name in _SHOWN),
+            *(mean_worst(result.curves[name].psnr[1:]) for name in _COMPARED),
+            *(f"{fmean(result.curves[name].lpips[1:]):.4f}" for name in _COMPARED),
             f"{result.curves[SLIDER].psnr[-1]:.1f}",
             f"{result.bytes_per_member:.0f}",
         )
@@ -277,12 +279,12 @@ def suite_rows(results: Sequence[CaseResult]) -> tuple[tuple[str, ...], list[tup
 
 
 def suite_table(results: Sequence[CaseResult]) -> str:
-    """The same in Markdown."""
+    """Format `suite_rows` as a Markdown table."""
     return markdown_table(*suite_rows(results))
 
 
 def suite_json(results: Sequence[CaseResult], perceptual: str) -> dict[str, Any]:
-    """As sliders.json has it."""
+    """Return the content of sliders.json."""
     edits = {
         result.case.name: {
             "scene": result.case.scene,
@@ -301,10 +303,10 @@ def suite_json(results: Sequence[CaseResult], perceptual: str) -> dict[str, Any]
 
 
 def suite_picture(results: Sequence[CaseResult]) -> Tensor:
-    """A row an edit, half way and at the end; then PSNR over the slider. -> [H,W,3]"""
-    names = ("truth", *_SHOWN)
+    """Draw each edit at strengths 0.5 and 1, and PSNR over the slider below. -> [H,W,3]"""
+    names = ("truth", *_COMPARED)
     rows = [
-        [thumbnail(_square(result.strips[name][end]), _THUMBNAIL) for end in (0, 1) for name in names]
+        [thumbnail(_square(result.strips[name][end]), _THUMBNAIL_WIDTH) for end in (0, 1) for name in names]
         for result in results
     ]
     heads = [f"{name}, {s}" for s in (".5", "1") for name in names]
@@ -312,18 +314,18 @@ def suite_picture(results: Sequence[CaseResult]) -> Tensor:
     plots = [
         Plot(
             f"{result.case.name}: PSNR, dB",
-            {name: (STRENGTHS[1:], result.curves[name].psnr[1:]) for name in _SHOWN},
+            {name: (STRENGTHS[1:], result.curves[name].psnr[1:]) for name in _COMPARED},
             "slider",
             span=(0.0, 1.0),
         )
         for result in results
     ]
-    lines = [plots[i : i + _PLOTS_A_ROW] for i in range(0, len(plots), _PLOTS_A_ROW)]
+    lines = [plots[i : i + _PLOTS_PER_ROW] for i in range(0, len(plots), _PLOTS_PER_ROW)]
     return stack_plots(to_picture(sheet), lines)
 
 
 def _square(image: Tensor) -> Tensor:
-    """On white, as wide as high, so that all thumbnails are of one size. [h,w,3] -> [n,n,3]"""
+    """Center an image on a white square, so that all thumbnails have one size. [h,w,3] -> [n,n,3]"""
     height, width = image.shape[:2]
     side = max(height, width)
     page = image.new_ones(side, side, 3)

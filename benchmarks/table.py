@@ -1,4 +1,4 @@
-"""A benchmark's result as a table, on the terminal and between the markers of a Markdown file."""
+"""Tables of benchmark results, for the terminal and for marked sections of Markdown files."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ BEGIN = "<!-- bench {name} -->"
 END = "<!-- end {name} -->"
 
 BUSY = 0.05
-"""Share of the cores above which others make wall times worthless."""
+"""Share of the cores used by other processes above which wall times are meaningless."""
 
-_SPIN_S = 0.3
-_LOOKS = 3
+_SPIN_S = 0.3  # seconds of one load measurement
+_LOAD_MEASUREMENTS = 3  # the lowest counts
 
 
 class Wall(str):
-    """The heading of a column of wall times, or of what depends on them."""
+    """Heading of a column of wall times or of values that depend on them."""
 
 
 @dataclass(frozen=True)
@@ -35,16 +35,16 @@ class Table:
     name: str  # short, for the markers and the JSON file
     title: str  # one line
     columns: tuple[str, ...]  # headings, with units
-    rows: tuple[tuple[str, ...], ...]  # one text a column
-    note: str = ""  # what was measured and how, one or two lines
+    rows: tuple[tuple[str, ...], ...]  # one text per column
+    note: str = ""  # description of the measurement, one or two lines
 
     @classmethod
     def of(cls, name: str, title: str, rows: Sequence[Mapping[str, str]], note: str) -> Table:
-        """A table of at least one row, which has its texts by their headings."""
+        """Make a table of one or more rows, which map headings to texts."""
         return cls(name, title, tuple(rows[0]), tuple(tuple(row.values()) for row in rows), note)
 
     def markdown(self) -> str:
-        """The table as GitHub Markdown, with its title and note."""
+        """Format the table as GitHub Markdown, with its title and note."""
         lines = [f"**{self.title}**", "", "| " + " | ".join(self.columns) + " |"]
         lines.append("|" + " --- |" * len(self.columns))
         lines += ["| " + " | ".join(row) + " |" for row in self.rows]
@@ -53,7 +53,7 @@ class Table:
         return "\n".join(lines)
 
     def without_wall(self) -> Table:
-        """With a dash for everything below a `Wall`."""
+        """Return the table with dashes in the columns headed by a `Wall`."""
         walls = [isinstance(column, Wall) for column in self.columns]
         rows = tuple(
             tuple("–" if w else cell for w, cell in zip(walls, row, strict=True)) for row in self.rows
@@ -62,16 +62,17 @@ class Table:
 
 
 def mean_worst(values: Sequence[float]) -> str:
-    """The cell of some dB; a dash where there are none."""
+    """Format the mean and the lowest of values in dB; a dash without values."""
     return f"{fmean(values):.1f} / {min(values):.1f}" if values else "-"
 
 
 def busy_share() -> float:
-    """Share of the cores that others use, 0..1: what a loop on every core for a moment does not get.
+    """Return the share of the cores that other processes use, 0 to 1.
 
-    The least of some moments: every machine has its own work now and then.
+    A loop on every core measures the time that it does not get. The lowest of several measurements counts, as
+    every machine has short background work.
     """
-    block = bytes(1 << 20)  # hashed without Python's lock
+    block = bytes(1 << 20)  # hashing releases Python's global lock
 
     def spin(_: int) -> float:
         began = time.perf_counter()
@@ -82,11 +83,13 @@ def busy_share() -> float:
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     with ThreadPoolExecutor(cores) as pool:
-        return max(0.0, 1.0 - max(sum(pool.map(spin, range(cores))) / cores for _ in range(_LOOKS)))
+        return max(
+            0.0, 1.0 - max(sum(pool.map(spin, range(cores))) / cores for _ in range(_LOAD_MEASUREMENTS))
+        )
 
 
 def machine() -> str:
-    """One line that names the machine and the day, for the tables."""
+    """Return one line that names the machine, its software and the day."""
     model = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
@@ -102,14 +105,13 @@ def machine() -> str:
 
 
 def today() -> str:
-    """The day, in words."""
+    """Return today's date, such as "3 May 2025"."""
     day = datetime.date.today()
     return f"{day.day} {day:%B %Y}"
 
 
 def put_tables(text: str, tables: Sequence[Table]) -> str:
-    """`text` with every table placed between its markers, and the machine's line; a table without markers is
-    left out."""
+    """Replace the text between each table's markers, and the machine's line; skip tables without markers."""
     for name, filled in [("machine", machine()), *((table.name, table.markdown()) for table in tables)]:
         begin = BEGIN.format(name=name)
         end = END.format(name=name)

@@ -1,7 +1,9 @@
-"""`python -m benchmarks training`: how good an edit of colors is by how long its training takes.
+"""The benchmark `training`: error of a color edit against the time of its training.
 
-Each run is a process of its own. All runs of a scene are judged alike: by the editor's own pictures of views
-in which nobody trains or chooses, at strengths that are nobody's own.
+Each run is a separate process. All runs of a scene are compared with the editor's pictures, in views and at
+strengths not used for training or choice.
+
+    python -m benchmarks training
 """
 
 from __future__ import annotations
@@ -36,22 +38,21 @@ from .ablation.regret import MEASURED, REPORTING, RegretEdit, begin_edit
 from .table import Table, Wall
 
 WAYS = ("", "--quick", "--steps 40", "--views 12", "--stages 4", "--preset paper --field auto --quick")
-"""What `progdf train` is given beside what is edited."""
+"""Options of `progdf train` for each run."""
 
 BEAR = 12_000
-"""Gaussians of the bear, whose scarf is striped."""
+"""Number of Gaussians of the bear, whose scarf is striped."""
 
-_MARKS = "os^DvPX*<>"  # of a plot's kinds
+_MARKERS = "os^DvPX*<>"  # one per kind in a plot
 
-STRIPES = "stripes:#20a040"
-BLUE = "recolor:#3060d0"
-TINT = "tint:#c08040"
-"""What is done to the scarf, to what is labeled 1 in a given scene, and to all of one without labels."""
+STRIPES = "stripes:#20a040"  # for the scarf
+BLUE = "recolor:#3060d0"  # for label 1 of a given scene
+TINT = "tint:#c08040"  # for the whole of a scene without labels
 
 
 @dataclass(frozen=True)
 class TrainingTask:
-    """What is edited, as `progdf train` has it."""
+    """Scene, region and editor, as arguments of `progdf train`."""
 
     scene: Path
     region: str
@@ -60,41 +61,46 @@ class TrainingTask:
 
 @dataclass(frozen=True)
 class TimedEdit:
-    """One run."""
+    """Figures of one run."""
 
     way: str  # one of `WAYS`
-    seconds: float  # of the wall
-    processor: float  # seconds of all cores together
-    psnrs: tuple[float, ...]  # to the editor's pictures at `MEASURED`, dB
-    bytes: float  # of the field by member
+    seconds: float  # wall time
+    processor: float  # processor seconds of all cores together
+    psnrs: tuple[float, ...]  # against the editor's pictures at `MEASURED`, dB
+    bytes: float  # of the field, per member
 
 
 def tasks(folder: Path, scenes: Sequence[Path] = ()) -> list[TrainingTask]:
-    """The bear, made in a folder, and each given scene, whose labels are in NAME_labels.npy beside it."""
+    """Return the tasks of the bear, which is written to a folder, and of each given scene.
+
+    The labels of a given scene are in NAME_labels.npy beside it.
+    """
     scene = bear(BEAR)
     labels = folder / "bear_labels.npy"
     save_ply(folder / "bear.ply", scene.gaussians)
     np.save(labels, scene.labels.numpy())
-    made = [TrainingTask(folder / "bear.ply", f"labels:{labels}:{scene.label_names.index('scarf')}", STRIPES)]
+    found = [
+        TrainingTask(folder / "bear.ply", f"labels:{labels}:{scene.label_names.index('scarf')}", STRIPES)
+    ]
     for path in scenes:
         labels = path.with_name(f"{path.stem}_labels.npy")
-        made.append(
+        found.append(
             TrainingTask(path, f"labels:{labels}:1", BLUE)
             if labels.is_file()
             else TrainingTask(path, "all", TINT)
         )
-    return made
+    return found
 
 
 def edit_of_task(task: TrainingTask) -> RegretEdit:
-    """With the views, the pictures and the judge that it takes."""
+    """Prepare a task's edit, with its views and pictures."""
     scene = load_scene(task.scene)
     region = parse_region(task.region, scene)
     return begin_edit(scene, region, task.editor)
 
 
 def train(task: TrainingTask, scene: Gaussians, judge: Evaluator, way: str, out: Path) -> TimedEdit:
-    """Train one way, and judge what was written.
+    """Train a task with the options `way`, and evaluate the written edit.
 
     Raises:
         ProgdfError: the training fails.
@@ -115,10 +121,10 @@ def train(task: TrainingTask, scene: Gaussians, judge: Evaluator, way: str, out:
 
 
 def tables(scenes: Sequence[Path] = (), plot: Path | None = None) -> list[Table]:
-    """Train each scene every way.
+    """Train each scene with all of `WAYS`.
 
     Args:
-        scenes: trained beside the bear and the room
+        scenes: trained in addition to the bear
         plot: also draw the errors over the processor's time into this PNG file
     """
     with tempfile.TemporaryDirectory() as name:
@@ -140,7 +146,7 @@ def tables(scenes: Sequence[Path] = (), plot: Path | None = None) -> list[Table]
 
 
 def table(found: Mapping[TrainingTask, Sequence[TimedEdit]]) -> Table:
-    """A row a run."""
+    """Make a table with one row per run."""
     rows = []
     strengths = ", ".join(f"{s:g}" for s in MEASURED[:-1])
     for task, runs in found.items():
@@ -173,16 +179,19 @@ def table(found: Mapping[TrainingTask, Sequence[TimedEdit]]) -> Table:
 
 @dataclass(frozen=True)
 class Point:
-    """Something that is measured, in a plot."""
+    """One measurement in a plot."""
 
-    kind: str  # in the legend
+    kind: str  # name in the legend
     x: float  # ≥ 0
     psnrs: Sequence[float]  # at `MEASURED`, dB
     chosen: bool = False
 
 
 def save_plot(panels: Mapping[str, Sequence[Point]], across: str, path: Path) -> None:
-    """Panels side by side in one small PNG file; a point at its error at 1, a stroke to its worst between."""
+    """Draw panels side by side in one small PNG file.
+
+    Each point marks the PSNR at strength 1; a line leads to the worst PSNR at the other strengths.
+    """
     kinds = list(dict.fromkeys(point.kind for points in panels.values() for point in points))
     drawing = Drawing((3.8 * len(panels), 3.6), 100, facecolor=_shade(PAPER), layout="constrained")
     for axes, (title, points) in zip(
@@ -195,16 +204,16 @@ def save_plot(panels: Mapping[str, Sequence[Point]], across: str, path: Path) ->
         axes.tick_params(labelsize=8, length=0)
         axes.grid(color=_shade(GRID))
         axes.spines[:].set_visible(False)
-        most = max(point.x for point in points)
-        axes.set_xlim(-0.03 * most, 1.08 * most)
-        if min(point.x for point in points) == 0.0:  # bytes, of 0 to some hundred
+        max_x = max(point.x for point in points)
+        axes.set_xlim(-0.03 * max_x, 1.08 * max_x)
+        if min(point.x for point in points) == 0.0:  # bytes, from 0 to some hundred
             axes.set_xscale("symlog", linthresh=1.0)
             axes.xaxis.set_major_formatter(lambda x, _: f"{x:g}")
-            axes.set_xlim(-0.2, 1.5 * most)
+            axes.set_xlim(-0.2, 1.5 * max_x)
         for point in points:
             index = kinds.index(point.kind)
             color = _shade(LINES[index % len(LINES)])
-            mark = _MARKS[index % len(_MARKS)]
+            mark = _MARKERS[index % len(_MARKERS)]
             axes.plot([point.x] * 2, [point.psnrs[-1], min(point.psnrs[:-1])], color=color, linewidth=1)
             axes.plot(point.x, point.psnrs[-1], mark, color=color, markersize=5, zorder=3)
             if point.chosen:
@@ -212,7 +221,7 @@ def save_plot(panels: Mapping[str, Sequence[Point]], across: str, path: Path) ->
     handles = []
     for index, kind in enumerate(kinds):
         color = _shade(LINES[index % len(LINES)])
-        mark = _MARKS[index % len(_MARKS)]
+        mark = _MARKERS[index % len(_MARKERS)]
         handles.append(Line2D([], [], color=color, marker=mark, linewidth=0, label=kind))
     if any(point.chosen for points in panels.values() for point in points):
         handles.append(Line2D([], [], mfc="none", mec=_shade(INK), marker="o", linewidth=0, label="chosen"))
@@ -231,6 +240,6 @@ def _shade(color: tuple[int, int, int]) -> tuple[float, ...]:
 
 
 def _short(region: str) -> str:
-    """A region's labels without their folder."""
+    """Return a region's labels without their folder."""
     kind, colon, rest = region.partition(":")
     return kind + colon + rest.rpartition("/")[2]

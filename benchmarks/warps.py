@@ -1,6 +1,8 @@
-"""`python -m benchmarks warps`: edits that no motion of whole parts explains, bent and not.
+"""The benchmark `warps`: edits that rigid motions of parts cannot explain, with and without control points.
 
-Their truth is known, so pictures of it are what is trained towards and, in other views, what judges.
+Their truth is known, so its pictures are the training targets and, in other views, the reference.
+
+    python -m benchmarks warps
 """
 
 from __future__ import annotations
@@ -38,10 +40,10 @@ from .table import Table
 
 STEPS = 240
 VIEWS = 15
-SIZE = 160
-_BEAR = 6000
+SIZE = 160  # pixels
+_BEAR_GAUSSIANS = 6000
 _STYLE = "style:14"
-_ROBOT = 1, 2, 3  # labels of the robot and its hands
+_ROBOT_LABELS = 1, 2, 3  # the robot and its hands
 
 Picture = Callable[[View], Tensor]
 
@@ -50,16 +52,16 @@ Picture = Callable[[View], Tensor]
 class WarpCase:
     """One edit of one region."""
 
-    name: str  # of both
+    name: str  # names of edit and region
     setup: TrainingSetup  # scene, region, views
-    picture: Picture  # the finished edit in a view
+    picture: Picture  # renders the finished edit in a view
 
 
 def tables(scenes: Sequence[Path] = ()) -> list[Table]:
-    """The bear's edits, and those of robots whose parts lie in NAME_labels.npy beside NAME.ply.
+    """Measure the bear's edits and those of robots whose parts are in NAME_labels.npy beside NAME.ply.
 
     Raises:
-        ProgdfError: a scene has no labels beside it.
+        ProgdfError: a scene has no labels file.
     """
     options = resolve(
         TrainOptions(
@@ -129,18 +131,18 @@ def _row(options: TrainOptions, case: WarpCase) -> tuple[str, ...]:
         found, seconds = trained(trial.chosen, None)
         return case.name, str(len(original)), unedited, found, "", "", "", str(trial.chosen), f"{seconds:.0f}"
     free, free_seconds = trained(Approach("geometry"), None)
-    ways = Approach("geometry", GROUP_STEPS)
+    grouped = Approach("geometry", GROUP_STEPS)
     begun = time.process_time()
     groups = group_stage(original, crops, [targets], GROUP_STEPS)
     searched = time.process_time() - begun
-    parts, _ = trained(ways, replace(groups, warps=()))
+    parts, _ = trained(grouped, replace(groups, warps=()))
     if not groups.warps:
-        said = f"{free_seconds:.0f}"
-        return case.name, str(len(original)), unedited, free, parts, "", "", str(trial.chosen), said
+        seconds_text = f"{free_seconds:.0f}"
+        return case.name, str(len(original)), unedited, free, parts, "", "", str(trial.chosen), seconds_text
     bent = _psnr(judge, groups.warps[0].carry(original, nothing))
-    both, both_seconds = trained(ways, groups)
-    said = f"{free_seconds:.0f}, {searched + both_seconds:.0f}"
-    return case.name, str(len(original)), unedited, free, parts, bent, both, str(trial.chosen), said
+    both, both_seconds = trained(grouped, groups)
+    seconds_text = f"{free_seconds:.0f}, {searched + both_seconds:.0f}"
+    return case.name, str(len(original)), unedited, free, parts, bent, both, str(trial.chosen), seconds_text
 
 
 def _train(
@@ -152,7 +154,7 @@ def _train(
     approach: Approach,
     groups: Groups | None,
 ) -> Tensor:
-    """The members' offsets at the end."""
+    """Train the members and return their final offsets. [M,C]"""
     optimization = resolve_kind(options, approach.kind, approach.group_steps)
     stages = [TargetStage(1.0, targets, STEPS)]
     extent = 2.0 * scene_sphere(setup.scene[setup.region.members])[1]
@@ -171,7 +173,7 @@ def _psnr(judge: Evaluator, offsets: Tensor) -> str:
 
 
 def _bear_cases(options: TrainOptions) -> list[WarpCase]:
-    demo = bear(_BEAR)
+    demo = bear(_BEAR_GAUSSIANS)
     scene = demo.gaussians
     head = demo.members("head")
     body = demo.members("body")
@@ -182,7 +184,7 @@ def _bear_cases(options: TrainOptions) -> list[WarpCase]:
     setup = _setup(options, scene, body)
     try:
         editor = make_editor(EditorOptions(_STYLE), scene, setup.region, setup.views)
-    except ProgdfError:  # its weights are an extra
+    except ProgdfError:  # its weights need an optional package
         return found
     return [*found, WarpCase(f"bear's body: {_STYLE}", setup, lambda v: quantize_image(editor.edit(v, 1.0)))]
 
@@ -192,7 +194,7 @@ def _robot_cases(options: TrainOptions, path: Path) -> list[WarpCase]:
     if not labels.is_file():
         raise ProgdfError(f"{labels} does not exist; put the labels of the robot beside {path.name}")
     scene = load_ply(path)
-    members = torch.from_numpy(np.isin(np.load(labels), _ROBOT)).nonzero()[:, 0]
+    members = torch.from_numpy(np.isin(np.load(labels), _ROBOT_LABELS)).nonzero()[:, 0]
     columns = column_warps(scene.means[members], torch.tensor([0.0, -1.0, 0.0]))
     return [_case(options, f"{path.stem}: {name}", scene, members, edit) for name, edit in columns.items()]
 

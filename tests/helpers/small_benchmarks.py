@@ -53,7 +53,7 @@ def _shrink_training(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(warps, "STEPS", 32)
     patch.setattr(warps, "VIEWS", 5)
     patch.setattr(warps, "SIZE", 48)
-    patch.setattr(warps, "_BEAR", 700)
+    patch.setattr(warps, "_BEAR_GAUSSIANS", 700)
     patch.setattr(warps, "_STYLE", "tint:#c08040")
     patch.setattr(warps, "GROUP_STEPS", 10)
     patch.setattr(warps, "column_warps", lambda *given: dict([*column_warps(*given).items()][:1]))
