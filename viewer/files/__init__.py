@@ -1,1 +1,1 @@
-"""What the viewer reads and writes."""
+"""Files that the viewer reads and writes."""

@@ -1,4 +1,4 @@
-"""What is open: a scene and its edits, with the files they came from."""
+"""Document: the open scene and its edits, with their files."""
 
 from __future__ import annotations
 
@@ -30,23 +30,25 @@ from viewer.state.workspace import SceneFacts
 _Made = TypeVar("_Made")
 
 Place = Callable[[Gaussians, int, str], Region | None]
-"""Gives the region of a scene that an edit's grade is applied to, by its number and its name; None where the
-edit has its own."""
+"""Function from a scene, an edit's index and its name to the region that the edit's grade is applied to.
+
+It returns None if the edit keeps its own region.
+"""
 
 
-def _where_trained(_: Gaussians, index: int, name: str) -> Region | None:
+def _own_region(_: Gaussians, index: int, name: str) -> Region | None:
     return None
 
 
 @dataclass(frozen=True)
 class Document:
-    """The scene and its edits, in the order of `LayerState.gdf`."""
+    """Scene and its edits, indexed by `LayerState.gdf`."""
 
-    title: str  # the scene's name; "" where nothing is open
-    original: Gaussians  # as its file has it
-    edits: tuple[Gdf, ...] = ()  # of the original, as their files have them
-    path: Path | None = None  # the scene's file; None where there is none, and so no session can be saved
-    gdf_paths: tuple[Path, ...] = ()  # the edits' files, one for each where there are any
+    title: str  # name of the scene; "" if none is open
+    original: Gaussians  # scene as in its file
+    edits: tuple[Gdf, ...] = ()  # edits of the original, as in their files
+    path: Path | None = None  # file of the scene; without one, no session can be saved
+    gdf_paths: tuple[Path, ...] = ()  # files of the edits, either none or one per edit
 
     @cached_property
     def _extension(self) -> tuple[Gaussians, tuple[Gdf, ...]]:
@@ -54,26 +56,26 @@ class Document:
 
     @property
     def scene(self) -> Gaussians:
-        """The original with the rows that edits add, as it is drawn with every slider at 0."""
+        """Original with the rows added by edits, as drawn with all sliders at 0."""
         return self._extension[0]
 
     @property
     def gdfs(self) -> tuple[Gdf, ...]:
-        """The edits of that scene."""
+        """Edits, extended to that scene."""
         return self._extension[1]
 
     @cached_property
     def detected_up(self) -> SceneUp:
-        """Which way is up, as the scene and its edits tell."""
+        """Up axis found from the scene and its edits."""
         return find_scene_up(self.original, self.edits, path=self.path)
 
     @cached_property
     def stored_camera(self) -> Camera | None:
-        """The camera stored in the scene's file, which gives the first view."""
+        """Camera stored in the scene's file, which defines the first view."""
         return None if self.path is None else stored_view(self.path, self.original.origin).camera
 
     def facts(self) -> SceneFacts:
-        """What the panel and the camera need to know of it."""
+        """Compute the facts for the panel and the camera."""
         scene, added = self.scene, [gdf.members - len(gdf.region) for gdf in self.edits]
         neighborhood = _once(lambda: Neighborhood(scene))
         return SceneFacts(
@@ -95,40 +97,45 @@ class Document:
 
     @property
     def file(self) -> Path:
-        """The scene's file. Raises ProgdfError where it has none."""
+        """File of the scene. Raises ProgdfError if there is none."""
         if self.path is None:
             raise ProgdfError("the scene has no file yet; open one first")
         return self.path
 
     def free_name(self, name: str) -> str:
-        """An edit's name, with a number where another edit has it."""
+        """Return `name`, with a number if another edit has it."""
         return _free_name(name, self.edits)
 
 
 def _once(make: Callable[[], _Made]) -> Callable[[], _Made]:
-    """Made when it is first asked for, by whichever thread; another one that asks meanwhile waits."""
-    lock, made = threading.Lock(), cache(make)
+    """Return a thread-safe function that calls `make` once, on first use. Concurrent callers wait."""
+    lock, cached = threading.Lock(), cache(make)
 
     def ask() -> _Made:
         with lock:
-            return made()
+            return cached()
 
     return ask
 
 
 def empty() -> Document:
-    """No document yet: one splat that nothing shows, and no title."""
+    """Return an empty document: one invisible Gaussian and no title."""
     row = torch.zeros(1, 3)
-    none = row[:, None, :][:, :0]
+    no_sh = row[:, None, :][:, :0]
     logit = torch.tensor([-20.0])
-    return Document("", Gaussians(row, torch.eye(4)[:1], row - 5.0, logit, row, none))
+    return Document("", Gaussians(row, torch.eye(4)[:1], row - 5.0, logit, row, no_sh))
 
 
-def load(scene: Path, gdfs: Sequence[Path] = (), place: Place = _where_trained) -> Document:
-    """Read a scene and its edits.
+def load(scene: Path, gdfs: Sequence[Path] = (), place: Place = _own_region) -> Document:
+    """Load a scene and its edits.
+
+    Args:
+        scene: file or folder of the scene
+        gdfs: files of its edits
+        place: chooses the region of each edit's grade
 
     Raises:
-        ProgdfError: a file is missing or broken, or an edit was made for another scene.
+        ProgdfError: a file is missing or damaged, or an edit was made for another scene.
     """
     scene = scene_file(scene)
     gaussians = load_scene(scene)
@@ -137,12 +144,12 @@ def load(scene: Path, gdfs: Sequence[Path] = (), place: Place = _where_trained) 
 
 
 def load_edits(
-    paths: Sequence[Path], scene: Gaussians, scene_path: Path, place: Place = _where_trained
+    paths: Sequence[Path], scene: Gaussians, scene_path: Path, place: Place = _own_region
 ) -> tuple[Gdf, ...]:
-    """The edits of a scene; a second one of the same name becomes NAME-2, so that --set can tell them apart.
+    """Load the edits of a scene. A second edit of the same name becomes NAME-2, so that --set is unambiguous.
 
     Raises:
-        ProgdfError: a file is missing, broken, or was made for another scene.
+        ProgdfError: a file is missing, damaged, or was made for another scene.
     """
     gdfs: list[Gdf] = []
     for index, path in enumerate(paths):

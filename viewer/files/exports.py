@@ -1,7 +1,7 @@
-"""Files that the window makes of its work: pictures, cameras, and regions for `progdf train`.
+"""Files that the window exports: pictures, cameras, and regions for `progdf train`.
 
-A region is NAME.region.npy, the rows of a selection. A session may be a stranger's: of what it names, nothing
-but regular files of that ending in the folders of `region_folders` is ever written or removed.
+A region is NAME.region.npy, the rows of a selection. Sessions may come from untrusted sources. Therefore only
+regular files with that suffix in the folders of `region_folders` are ever written or removed.
 """
 
 from __future__ import annotations
@@ -31,28 +31,33 @@ from viewer.jobs.training import edits_folder, takes_files
 from viewer.state import selection
 from viewer.state.selection import NamedRegion, SelectionState, unpack
 
-CAMERAS = ".cameras.json"
+CAMERAS = ".cameras.json"  # suffix of a file of cameras
 
 REQUESTS = ("picture", "take_view", "window_picture")
-"""Those that the main view serves."""
+"""Requests that the main view handles."""
 
 
 def folder_of(scene: Path | None) -> Path:
-    """Where files made of a scene go: beside it, or where that is read-only to the user's pictures."""
+    """Return the export folder of a scene: its own folder, or the user's pictures folder if that is
+    read-only."""
     beside = scene.resolve().parent if scene is not None else None
     return beside if beside is not None and takes_files(beside) else pictures_folder()
 
 
 def picture(folder: Path, title: str, image: NDArray[np.uint8], info: PngInfo | None = None) -> Path:
-    """Save `image` [H,W,3] under the scene's name as NAME_001.png, or the next free number; its file.
+    """Save a picture as NAME_001.png, or with the next free number.
 
     Args:
-        folder, title: where, and the scene's name
-        image: pixels
-        info: what the file carries, see `camera_chunk`; with a camera it can be changed and trained on
+        folder: target folder
+        title: name of the scene
+        image: pixels. [H,W,3]
+        info: PNG metadata, see `camera_chunk`; a picture with its camera can be edited and trained on
+
+    Returns:
+        Path of the file.
 
     Raises:
-        ProgdfError: it cannot be written.
+        ProgdfError: the file cannot be written.
     """
     with _writable(folder, "picture"):
         path = free_path(folder, Path(title).stem, ".png")
@@ -62,15 +67,18 @@ def picture(folder: Path, title: str, image: NDArray[np.uint8], info: PngInfo | 
 
 
 def camera(source: Path, viewpoint: Camera, origin: Origin = ZERO) -> tuple[Path, int]:
-    """Add a camera to NAME.cameras.json beside a scene or session NAME; where that is, and how many it holds.
+    """Add a camera to NAME.cameras.json beside a scene or session NAME.
 
     Args:
-        source: the scene or session
+        source: file of the scene or session
         viewpoint: the camera
-        origin: of the scene, which it is relative to
+        origin: origin of the scene that the camera is relative to
+
+    Returns:
+        Path of the file, and the number of cameras in it.
 
     Raises:
-        ProgdfError: it cannot be written, or holds something else.
+        ProgdfError: the file cannot be written, or was not made by this function.
     """
     name = source.name.removesuffix(SUFFIX) if source.name.endswith(SUFFIX) else source.stem
     path = source.with_name(f"{name}{CAMERAS}")
@@ -84,16 +92,16 @@ def camera(source: Path, viewpoint: Camera, origin: Origin = ZERO) -> tuple[Path
 
 @contextmanager
 def _writable(folder: Path, what: str) -> Iterator[None]:
-    """The folder is there; what cannot be written is one line."""
+    """Create the folder, and convert write errors to a one-line ProgdfError."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)  # a user may have had no pictures so far
+        folder.mkdir(parents=True, exist_ok=True)  # the user's pictures folder may not exist yet
         yield
     except OSError as error:
         raise ProgdfError(f"no {what} was saved in {folder.resolve()}: {error.strerror}") from None
 
 
 def free_path(folder: Path, stem: str, suffix: str) -> Path:
-    """STEM_001 with `suffix`, or the next number that no file has."""
+    """Return the path STEM_001 with `suffix`, or with the next free number."""
     number = 1
     while (path := folder / f"{stem}_{number:03d}{suffix}").exists():
         number += 1
@@ -101,11 +109,13 @@ def free_path(folder: Path, stem: str, suffix: str) -> Path:
 
 
 def keep_region(state: SelectionState, name: str, folder: Path, total: int) -> SelectionState:
-    """The selection written into a folder, and kept as one more region.
+    """Save the selection as a region, with a file in a folder.
 
     Args:
-        name: its own, or with a number where a region or a file has it already
-        total: Gaussians in the scene
+        state: the selection and the regions
+        name: name of the region; it gets a number if a region or a file already has it
+        folder: folder of the file
+        total: number of Gaussians in the scene
 
     Raises:
         ProgdfError: nothing is selected, there are too many regions, or the folder cannot be written to.
@@ -119,7 +129,7 @@ def keep_region(state: SelectionState, name: str, folder: Path, total: int) -> S
 
 
 def rename_region(state: SelectionState, index: int, name: str, total: int) -> SelectionState:
-    """A region and its file under another name; as it was where there is no such region.
+    """Rename a region and its file. An invalid index changes nothing.
 
     Raises:
         ProgdfError: the file cannot be written.
@@ -132,7 +142,7 @@ def rename_region(state: SelectionState, index: int, name: str, total: int) -> S
     )
     write_region(replace(region, path=path), total)
     removes = path != region.path and _is_region_file(region.path) and region.path.exists()
-    # a file that holds other rows is not this region's, whatever the session says
+    # a file with other rows does not belong to this region, even if the session names it
     if removes and filecmp.cmp(region.path, path, shallow=False):
         region.path.unlink()
     return selection.change_region(
@@ -141,10 +151,10 @@ def rename_region(state: SelectionState, index: int, name: str, total: int) -> S
 
 
 def region_file(region: NamedRegion, total: int) -> Path:
-    """Where the region is as a file, written again where it was taken away.
+    """Return the path of the region's file, written again if it is missing.
 
     Raises:
-        ProgdfError: it cannot be written.
+        ProgdfError: the file cannot be written.
     """
     if not region.path.exists():
         write_region(region, total)
@@ -155,8 +165,7 @@ def write_region(region: NamedRegion, total: int) -> None:
     """Write the rows of a region. [M] int64
 
     Raises:
-        ProgdfError: the folder does not exist or cannot be written to, or the path is not that of a region's
-            file.
+        ProgdfError: the folder does not exist or cannot be written to, or the path is not valid for a region.
     """
     if not _is_region_file(region.path):
         raise ProgdfError(
@@ -167,18 +176,19 @@ def write_region(region: NamedRegion, total: int) -> None:
 
 
 def region_folders(session: Path, scene: Path) -> tuple[Path, ...]:
-    """Where a session's regions have their files: its own folder, and those of new edits of its scene."""
+    """Return the folders that may hold a session's region files: its own, and those of edits of its scene."""
     scene, edits = scene.resolve(), edits_folder(scene)
-    # the folder of edits itself may be a link out, and is not followed
+    # not resolved, as the folder of edits itself may be a symbolic link to elsewhere
     beside = scene.with_name(f"{scene.stem}.edits")
     return session.resolve().parent, beside, edits.parent.resolve() / edits.name
 
 
 def claim_regions(state: SelectionState, folders: Sequence[Path]) -> SelectionState:
-    """Regions whose files may not be written get another place, in the first folder, and are unsaved.
+    """Move regions with disallowed paths to new paths in the first folder. Their files are not written yet.
 
     Args:
-        folders: where files may be, at any depth; symbolic links do not lead out of them
+        state: the selection and the regions
+        folders: allowed folders, at any depth; symbolic links that lead out of them are not allowed
     """
     for i, region in enumerate(state.regions):
         if not _is_inside(region.path, folders):
@@ -189,7 +199,7 @@ def claim_regions(state: SelectionState, folders: Sequence[Path]) -> SelectionSt
 
 
 def _is_inside(path: Path, folders: Sequence[Path]) -> bool:
-    """Whether a region's file may be there: in a folder that exists, below one of `folders`."""
+    """Return whether a region's path is allowed: in an existing folder below one of `folders`."""
     try:
         parent = Path(os.path.realpath(path.parent))
         return (
@@ -202,17 +212,20 @@ def _is_inside(path: Path, folders: Sequence[Path]) -> bool:
 
 
 def _is_region_file(path: Path) -> bool:
-    """Whether it is a regular file that is called as a region's, or nothing yet; a link is neither."""
+    """Return whether the path has a region's suffix and is a regular file, or does not exist.
+
+    Links are neither.
+    """
     try:
         return path.name.endswith(selection.SUFFIX) and stat.S_ISREG(os.lstat(path).st_mode)
     except FileNotFoundError:
         return True
-    except (OSError, ValueError):  # a name that no file can have
+    except (OSError, ValueError):  # not a valid file name
         return False
 
 
 def _free_region_path(state: SelectionState, name: str, folder: Path, current: Path | None = None) -> Path:
-    """A file in `folder` that no region and no other file has."""
+    """Return a path in `folder` that no region and no other file uses."""
 
     def path(free: str) -> Path:
         return folder / f"{free}{selection.SUFFIX}"

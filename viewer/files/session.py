@@ -1,8 +1,8 @@
-"""Sessions: the window's state in a file, and back from it; beside it the autosave of unsaved work.
+"""Sessions: saving and opening the state of the window, and autosaves of unsaved work beside the session.
 
-- bear.session.json: the session, a `WindowFile`; for a scene that never had one, the name it would get
-- bear.autosave.session.json: its unsaved work; -2, -3 … where others wait for somebody to decide about them
-- bear.discarded.session.json: work that was discarded, the last `MAX_DISCARDED`
+- bear.session.json: the session, a `WindowFile`; also the default name for a scene without a session
+- bear.autosave.session.json: its unsaved work; -2, -3 … if earlier autosaves still await a decision
+- bear.discarded.session.json: the last `MAX_DISCARDED` pieces of discarded work
 """
 
 from __future__ import annotations
@@ -50,30 +50,30 @@ _log = logging.getLogger(__name__)
 
 
 AUTOSAVE_S = 20.0
-"""Seconds from a change to its autosave."""
+"""Time from a change to its autosave, in seconds."""
 
-MAX_DISCARDED = 3
-_KINDS = "autosave", "discarded"
+MAX_DISCARDED = 3  # files of discarded work per session
+_KINDS = "autosave", "discarded"  # name parts of files that belong to a session
 
 
 @dataclass(frozen=True)
 class WindowSession:
-    """What a session brings back."""
+    """Content of a session."""
 
     document: Document
     view: ViewState
     snapshots: tuple[SliderSnapshot, ...] = ()
-    warning: str = ""  # what of the file was not taken as it is, in one line
+    warning: str = ""  # one line about values that were changed on opening
 
 
 class WindowFile(SessionFile, frozen=True, forbid_unknown_fields=True):
-    """The file's schema: the scene and the edits as references, and the state of the window as it is."""
+    """Schema of the file: references to the scene and the edits, and the state of the window."""
 
     view: ViewState = ViewState()  # type: ignore[assignment]
     snapshots: tuple[SliderSnapshot, ...] = ()  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        """Every value is one that the window could have made."""
+        """Validate the state. Raises ValueError for values that the window cannot produce."""
         _check_keys(self.view.timeline, "view.timeline.keys")
         stacks = {"view": self.view.layers}
         stacks |= {f"snapshots[{i}].edit": snapshot.edit.layers for i, snapshot in enumerate(self.snapshots)}
@@ -84,7 +84,7 @@ class WindowFile(SessionFile, frozen=True, forbid_unknown_fields=True):
 
 
 def save(path: Path, session: WindowSession) -> None:
-    """Write the session, whole or not at all.
+    """Write the session atomically.
 
     Raises:
         ProgdfError: the scene or an edit has no file, a file cannot be read, or the folder does not exist.
@@ -115,11 +115,11 @@ def _edit_ref(gdf: Gdf, path: Path, folder: Path) -> EditRef:
 
 
 def open_session(path: Path) -> WindowSession:
-    """Read a session with its scene and edits; what is to be said about it is logged as a warning.
+    """Open a session with its scene and edits, and log its warning.
 
     Raises:
-        ProgdfError: it is no session, damaged or of a newer version; or a file it names is missing, broken or
-            not the one it was saved with.
+        ProgdfError: the file is not a session, damaged or of a newer version, or a file that it refers to is
+            missing, damaged or not the one it was saved with.
     """
     file = read_session(path, WindowFile)
     scene, gdfs = verify_files(path, file)
@@ -139,14 +139,14 @@ def open_session(path: Path) -> WindowSession:
     view = _with_region_paths(view, lambda region: Path(os.path.normpath(folder / region)))
     for layer in (*view.layers, *(layer for s in snapshots for layer in s.edit.layers)):
         gdf = opened.gdfs[layer.gdf]
-        paint.decode(layer.paint, len(gdf.region), gdf.from_others)  # raises where they do not fit
+        paint.decode(layer.paint, len(gdf.region), gdf.from_others)  # raises if the weights do not fit
     claimed = exports.claim_regions(view.selection, exports.region_folders(path, scene))
-    foreign = [
+    moved = [
         f"{old.name:.60} ({str(old.path)[:80]})"
         for old, resolved, new in zip(named, view.selection.regions, claimed.regions, strict=True)
         if new.path != resolved.path
     ]
-    # no tool is in the hand when a scene is opened
+    # no tool is active after opening
     view = replace(
         view,
         selection=claimed,
@@ -154,10 +154,10 @@ def open_session(path: Path) -> WindowSession:
         select=replace(view.select, tool=""),
     )
     warning = ""
-    if foreign:
-        more = f" and {len(foreign) - 1} more" * (len(foreign) > 1)
+    if moved:
+        more = f" and {len(moved) - 1} more" * (len(moved) > 1)
         warning = escape_text(
-            f"{path.name}: region {foreign[0]}{more} named no {REGION_SUFFIX} file in the session's folder: "
+            f"{path.name}: region {moved[0]}{more} named no {REGION_SUFFIX} file in the session's folder: "
             "unsaved until the session is saved"
         )
         _log.warning(warning)
@@ -167,14 +167,14 @@ def open_session(path: Path) -> WindowSession:
 def _move(
     view: ViewState, snapshots: tuple[SliderSnapshot, ...], by: Vec3
 ) -> tuple[ViewState, tuple[SliderSnapshot, ...]]:
-    """The same for a scene that lies elsewhere: a session has its cameras in the world."""
+    """Translate all cameras, as sessions store them in world coordinates."""
     moved = tuple(replace(snapshot, camera=move_camera(snapshot.camera, by)) for snapshot in snapshots)
     timeline = _move_keys(view.timeline, by)
     return replace(view, camera=move_camera(view.camera, by), timeline=timeline), moved
 
 
 def _move_keys(timeline: Timeline, by: Vec3) -> Timeline:
-    """The same film of a scene that lies elsewhere; see `move_camera`."""
+    """Translate the cameras of a timeline, see `move_camera`."""
     return replace(
         timeline,
         keys=tuple(
@@ -185,10 +185,10 @@ def _move_keys(timeline: Timeline, by: Vec3) -> Timeline:
 
 
 def _check_keys(timeline: Timeline, where: str) -> None:
-    """Whether the keys fit each other and the length.
+    """Validate the keys of a timeline.
 
     Raises:
-        ValueError: they do not; the message names the key.
+        ValueError: keys contradict each other or exceed the length; the message names the key.
     """
     for i, key in enumerate(timeline.keys):
         if key.frame > timeline.length:
@@ -206,33 +206,33 @@ def _with_region_paths(view: ViewState, change: Callable[[Path], Path]) -> ViewS
 
 
 def default_path(opened: Document) -> Path:
-    """What a session of it is called if nobody says otherwise: as the scene, and beside it."""
+    """Return the default path of a session: the scene's name, beside the scene."""
     scene = opened.path or Path(opened.title)
     return scene.with_name(scene.stem + SUFFIX)
 
 
 def prune(session: WindowSession) -> WindowSession:
-    """Without the edits that no layer shows any more, in the view or in a snapshot."""
+    """Remove the edits that no layer of the view or of a snapshot uses."""
     view = session.view
     snapshots = session.snapshots
     stacks = (view.layers, *(s.edit.layers for s in snapshots))
     used = sorted({layer.gdf for layers in stacks for layer in layers})
-    places = {gdf: i for i, gdf in enumerate(used)}
+    new_index = {gdf: i for i, gdf in enumerate(used)}
 
     opened = session.document
     rows = np.arange(len(opened.scene))
 
     def renumber(layers: tuple[LayerState, ...]) -> tuple[LayerState, ...]:
-        return tuple(replace(layer, gdf=places[layer.gdf], paint=paint_left(layer)) for layer in layers)
+        return tuple(replace(layer, gdf=new_index[layer.gdf], paint=paint_left(layer)) for layer in layers)
 
     def paint_left(layer: LayerState) -> str:
-        """Of an edit of all that is there, the paint of the rows that are left."""
+        """Return the paint, limited to the remaining rows if the edit covers the whole scene."""
         gdf = opened.gdfs[layer.gdf]
         weights = paint.decode(layer.paint, len(gdf.region), gdf.from_others)
         whole = weights is not None and len(weights) == len(opened.scene) > len(rows)
         return paint.encode(weights[rows].numpy()) if whole and weights is not None else layer.paint
 
-    if opened.scene is not opened.original:  # masks of the rows that the file's own edits bring
+    if opened.scene is not opened.original:  # convert masks to the rows of the remaining edits
         added = [opened.gdfs[gdf] for gdf in used if opened.edits[gdf].added is not None]
         count = len(opened.original)
         members = [gdf.region.members.numpy() for gdf in added]
@@ -242,7 +242,7 @@ def prune(session: WindowSession) -> WindowSession:
     if len(used) == len(opened.edits):
         return session
     keys = tuple(
-        replace(key, strengths=tuple((places[gdf], s) for gdf, s in key.strengths if gdf in places))
+        replace(key, strengths=tuple((new_index[gdf], s) for gdf, s in key.strengths if gdf in new_index))
         for key in view.timeline.keys
     )
     return WindowSession(
@@ -255,17 +255,17 @@ def prune(session: WindowSession) -> WindowSession:
             view,
             layers=renumber(view.layers),
             timeline=replace(view.timeline, keys=keys),
-            unfolded=tuple(places[gdf] for gdf in view.unfolded if gdf in places),
+            unfolded=tuple(new_index[gdf] for gdf in view.unfolded if gdf in new_index),
         ),
         tuple(replace(s, edit=replace(s.edit, layers=renumber(s.edit.layers))) for s in snapshots),
     )
 
 
 def session_file(path: Path) -> Path:
-    """A path as a session's file is called.
+    """Return the path with the suffix of a session, unless it ends in .json.
 
     Raises:
-        ProgdfError: it has no name.
+        ProgdfError: the path has no name.
     """
     if not path.name:
         raise ProgdfError(f"{path} is a folder; add the name of the session")
@@ -273,27 +273,27 @@ def session_file(path: Path) -> Path:
 
 
 class SessionAutosave:
-    """The autosave of one window, which never writes over another's."""
+    """Autosave of one window. It never overwrites the autosave of another window."""
 
     def __init__(self) -> None:
         self.path: Path | None = None
-        """Its file; None before there is one."""
-        self._due: float | None = None
-        self._work: object = None  # what the file holds
+        """Path of its file, None before the first autosave."""
+        self._due: float | None = None  # time of the next autosave
+        self._work: object = None  # content of the file
 
     def wait(
         self, now: float, work: object, beside: Callable[[], Path], save: Callable[[Path], None]
     ) -> float:
-        """Write unsaved work once it is old enough; 0 where it was written, or is already.
+        """Write unsaved work `AUTOSAVE_S` seconds after it changed.
 
         Args:
-            now: seconds of any clock that does not go back
-            work: the work
-            beside: gives the session's file
-            save: writes the work into a file; what it raises is the caller's
+            now: seconds of a monotonic clock
+            work: the current work
+            beside: returns the session's path
+            save: writes the work to a file; its errors propagate
 
         Returns:
-            Seconds until it is time.
+            Seconds until the next write, or 0 if the work is written.
         """
         if work == self._work:
             self._due = None
@@ -306,7 +306,7 @@ class SessionAutosave:
         return 0.0
 
     def write(self, work: object, beside: Callable[[], Path], save: Callable[[Path], None]) -> Path:
-        """Write it at once; the file. Arguments as of `wait`."""
+        """Write the work at once and return the path. The arguments are those of `wait`."""
         self._due = None
         self._work = work
         if self.path is None:
@@ -315,17 +315,17 @@ class SessionAutosave:
         return self.path
 
     def stop(self) -> None:
-        """There is nothing unsaved."""
+        """Cancel the pending autosave, as nothing is unsaved."""
         self._due = None
 
     def continue_from(self, path: Path) -> None:
-        """The work of an autosave was opened: the file is this window's from now on."""
+        """Take over the file of an opened autosave."""
         self.path = path
         self._due = None
         self._work = None
 
     def drop(self) -> None:
-        """Delete the file: its work is saved."""
+        """Delete the file, as its work is saved."""
         if self.path is not None:
             self.path.unlink(missing_ok=True)
         self.path = None
@@ -333,7 +333,7 @@ class SessionAutosave:
         self._work = None
 
     def discard(self) -> Path | None:
-        """Put the file aside; where it went, None where there is none."""
+        """Move the file to discarded work. Return its new path, or None if there is no file."""
         path = self.path
         self.path = None
         self._due = None
@@ -342,22 +342,22 @@ class SessionAutosave:
 
 
 def session_of(path: Path) -> Path | None:
-    """The session whose work an autosave, or discarded work, holds; None where `path` is neither."""
+    """Return the session that an autosave or discarded work belongs to, or None if `path` is neither."""
     match = re.fullmatch(rf"(.+)\.({'|'.join(_KINDS)})(-\d+)?{re.escape(SUFFIX)}", path.name)
     return path.with_name(match[1] + SUFFIX) if match else None
 
 
 def is_discarded(path: Path) -> bool:
-    """Whether it is work that was discarded, by its name."""
+    """Return whether the name is that of discarded work."""
     return ".discarded" in path.name and session_of(path) is not None
 
 
 def find_autosaves(session: Path, numbered: bool = False) -> tuple[Path, ...]:
-    """Autosaves that lie beside a session, the latest first.
+    """Find the autosaves beside a session, the latest first.
 
     Args:
-        session: its file, which need not exist
-        numbered: also those of NAME-2, NAME-3 …, as sessions of one scene are called
+        session: path of the session, which need not exist
+        numbered: also find autosaves of NAME-2, NAME-3 …, further sessions of the same scene
     """
     pattern = re.escape(stem(session)) + (r"(-\d+)?" if numbered else "")
     pattern += rf"\.autosave(-\d+)?{re.escape(SUFFIX)}"
@@ -369,10 +369,10 @@ def find_autosaves(session: Path, numbered: bool = False) -> tuple[Path, ...]:
 
 
 def put_aside(path: Path) -> Path:
-    """An autosave as discarded work, in the place of the oldest where there are `MAX_DISCARDED`.
+    """Move an autosave to discarded work. The oldest is replaced if there are `MAX_DISCARDED`.
 
     Raises:
-        OSError: it cannot be moved.
+        OSError: the file cannot be moved.
     """
     session = session_of(path) or path
     names = [
@@ -381,12 +381,12 @@ def put_aside(path: Path) -> Path:
     free = [name for name in names if not name.exists()]
     to = free[0] if free else min(names, key=lambda name: name.stat().st_mtime)
     replace_file(path, to)
-    os.utime(to)  # the age that counts is since when it is discarded
+    os.utime(to)  # its age counts from the time of discarding
     return to
 
 
 def free_session(path: Path, autosave: Path | None) -> Path:
-    """`path`, with a number where such a session exists, or unsaved work of it that is not `autosave`."""
+    """Return `path`, with a number if that session exists or has an autosave other than `autosave`."""
 
     def taken(session: Path) -> bool:
         return session.exists() or any(other != autosave for other in find_autosaves(session))
@@ -395,11 +395,11 @@ def free_session(path: Path, autosave: Path | None) -> Path:
 
 
 def stem(session: Path) -> str:
-    """A session's name without its endings."""
+    """Return the name of a session without its suffixes."""
     return session.name.removesuffix(SUFFIX) if session.name.endswith(SUFFIX) else session.stem
 
 
 def _numbered_paths(session: Path, kind: str = "") -> Iterator[Path]:
-    """NAME, NAME-2, NAME-3 …; with a kind NAME.kind, NAME.kind-2 …"""
+    """Yield NAME, NAME-2, NAME-3 …; with a kind NAME.kind, NAME.kind-2 …"""
     names = numbered_names(stem(session) + f".{kind}" * bool(kind), SUFFIX)
     return map(session.with_name, names)

@@ -1,4 +1,4 @@
-"""What is remembered for the user, recent files and their thumbnails; and paths as a user types them."""
+"""User state: recent files and their thumbnails, layout, key bindings; and parsing of typed paths."""
 
 from __future__ import annotations
 
@@ -24,20 +24,18 @@ from viewer.state.workspace import Layout
 
 from .session import session_of
 
-MAX_RECENT = 12
-THUMBNAIL_SIZE = (336, 252)
-"""Pixels."""
-MAX_THUMBNAILS = 64
-"""Files in the folder; the oldest go."""
+MAX_RECENT = 12  # number of recent files
+THUMBNAIL_SIZE = (336, 252)  # width and height, px
+MAX_THUMBNAILS = 64  # files in the folder; the oldest are deleted
 
 
 def is_listed(path: Path) -> bool:
-    """Whether it may be a scene or a session: no edit, and no work that was saved or put aside by itself."""
+    """Return whether the path may be a scene or session, and not an edit, autosave or discarded work."""
     return path.suffix.lower() not in (".gdf", ".cube") and session_of(path) is None and "\n" not in str(path)
 
 
 def read_recent(missing: bool = False) -> tuple[Path, ...]:
-    """Those that are still there, and with `missing` the others; none where nothing can be read."""
+    """Return the recent files that exist, with `missing` also the others. Empty if the list is unreadable."""
     try:
         lines = (state_folder() / "recent.txt").read_text("utf-8", "surrogateescape").splitlines()
         known = [path for path in map(Path, lines) if is_listed(path)]
@@ -47,14 +45,16 @@ def read_recent(missing: bool = False) -> tuple[Path, ...]:
 
 
 def remember_recent(paths: Sequence[Path]) -> tuple[Path, ...]:
-    """Put scenes and sessions in front, the last one first; what cannot be written is not remembered. Those
-    that are there."""
+    """Put scenes and sessions at the top of the recent files, the last one first.
+
+    Write errors are ignored. Returns the recent files that exist.
+    """
     known = dict.fromkeys([*(path.resolve() for path in reversed(paths)), *read_recent(missing=True)])
     return _write_recent([path for path in known if is_listed(path)])
 
 
 def forget_recent(path: Path) -> tuple[Path, ...]:
-    """Take one off the list; those that are left and there."""
+    """Remove a file from the recent files. Return the remaining ones that exist."""
     return _write_recent([other for other in read_recent(missing=True) if other != path])
 
 
@@ -65,7 +65,7 @@ def _write_recent(files: Sequence[Path]) -> tuple[Path, ...]:
 
 
 def _remember(name: str, text: str) -> None:
-    """Write a file of the program's state; what cannot be written is not remembered."""
+    """Write a file in the program's state folder. Write errors are ignored."""
     with contextlib.suppress(OSError):
         state_folder().mkdir(parents=True, exist_ok=True)
         with atomic_write(state_folder() / name) as temporary_file:
@@ -73,7 +73,7 @@ def _remember(name: str, text: str) -> None:
 
 
 def describe_age(seconds: float) -> str:
-    """ "just now", "5 min ago", "3 h ago", "yesterday", "12 days ago", "4 months ago"."""
+    """Describe an age: "just now", "5 min ago", "3 h ago", "yesterday", "12 days ago" or "4 months ago"."""
     minutes = int(seconds / 60.0)
     days = int(seconds / 86_400.0)
     if days:
@@ -82,7 +82,7 @@ def describe_age(seconds: float) -> str:
 
 
 def read_layout() -> Layout:
-    """How the window was laid out last; as at first where nothing can be read."""
+    """Read the saved layout of the window, or return the default one if it is unreadable."""
     try:
         return read_json(state_folder() / "layout.json", Layout)
     except ProgdfError:
@@ -90,30 +90,30 @@ def read_layout() -> Layout:
 
 
 def keep_layout(layout: Layout) -> None:
-    """Remember it; what cannot be written is not remembered."""
+    """Save the layout of the window. Write errors are ignored."""
     _remember("layout.json", json.dumps(plain(layout)))
 
 
 def read_keys() -> dict[str, Any]:
-    """The keys that the person gave to actions, see `keys.bind`; none where there is no such file.
+    """Read the user's key bindings, see `keys.bind`. Empty if there is no file.
 
     Raises:
-        ProgdfError: it cannot be read; one line.
+        ProgdfError: the file cannot be read; one line.
     """
     path = keys_file()
     return read_json(path, dict[str, Any]) if path.is_file() else {}
 
 
 def keys_file() -> Path:
-    """Where they are."""
+    """Return the path of the key bindings."""
     return state_folder() / "keys.json"
 
 
 def write_keys(keys: Mapping[str, Sequence[str]]) -> Path:
-    """Begin that file with all there are, where there is none; its path.
+    """Write the file of key bindings with all current keys, unless it exists. Return its path.
 
     Raises:
-        ProgdfError: it cannot be written; one line.
+        ProgdfError: the file cannot be written; one line.
     """
     path = keys_file()
     if not path.exists():
@@ -127,7 +127,7 @@ def write_keys(keys: Mapping[str, Sequence[str]]) -> Path:
 
 
 def keep_thumbnail(path: Path, pixels: NDArray[np.uint8]) -> None:
-    """Keep the picture [H,W,3] of a file; where that cannot be, there is none."""
+    """Save the thumbnail [H,W,3] of a file. Write errors are ignored."""
     file = _thumbnail(path)
     with contextlib.suppress(OSError, ProgdfError):
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -139,19 +139,19 @@ def keep_thumbnail(path: Path, pixels: NDArray[np.uint8]) -> None:
 
 
 def thumbnail_time(path: Path) -> float:
-    """When the picture of a file was kept, as it was left; seconds since 1970, 0 where there is none."""
+    """Return the time at which a file's thumbnail was saved, seconds since 1970, or 0 if there is none."""
     with contextlib.suppress(OSError):
         return _thumbnail(path).stat().st_mtime
     return 0.0
 
 
 def load_thumbnail(path: Path) -> NDArray[np.uint8] | None:
-    """The picture of a file, None where there is none or it is damaged: it is made again. [H,W,3]"""
+    """Load the thumbnail of a file, or None if it is missing or damaged and must be made again. [H,W,3]"""
     return read_thumbnail(_thumbnail(path))
 
 
 def read_thumbnail(file: Path) -> NDArray[np.uint8] | None:
-    """A picture at the size of one, None where there is none or it is damaged. [H,W,3]"""
+    """Read a picture at thumbnail size, or None if it is missing or damaged. [H,W,3]"""
     try:
         return np.asarray(flatten_onto(open_picture(file), "white", THUMBNAIL_SIZE))
     except ProgdfError:
@@ -164,7 +164,7 @@ def _thumbnail(path: Path) -> Path:
 
 
 def open_in_program(path: Path) -> bool:
-    """Open a file in the program that the desktop has for it; whether there is one to ask."""
+    """Open a file in the desktop's default program. Return False if the desktop provides no launcher."""
     try:
         if sys.platform == "win32":
             os.startfile(path, "edit")
@@ -177,10 +177,10 @@ def open_in_program(path: Path) -> bool:
 
 
 def parse_path(text: str) -> Path:
-    """The path; the home of an unknown user is a name like any other, and missing.
+    """Parse a typed path and expand `~`. The home of an unknown user is taken literally.
 
     Raises:
-        ProgdfError: no file can be called so.
+        ProgdfError: the text is not a valid file name.
     """
     try:
         possible = b"\0" not in os.fsencode(text)
@@ -188,4 +188,4 @@ def parse_path(text: str) -> Path:
         possible = False
     if not possible:
         raise ProgdfError(f"{text} cannot be a file name; type another name")
-    return Path(os.path.expanduser(text))  # pathlib's raises for an unknown user
+    return Path(os.path.expanduser(text))  # Path.expanduser raises for an unknown user

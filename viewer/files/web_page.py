@@ -1,4 +1,4 @@
-"""The open scene and its layers as a web page: what the page starts with, and how large it may be."""
+"""Export of the open scene and its layers as a web page: initial state, still image, size limits."""
 
 from __future__ import annotations
 
@@ -26,26 +26,26 @@ from viewer.web.page import DRAWN_SH, HOST, MAIL, PageTexts, build_page, pack
 
 from .document import Document
 
-PAGE = ".html"
+PAGE = ".html"  # suffix of a page
 STILL = 1200, 800
-"""Width and height of what a page shows first, px."""
-_EXACT_DB = 99.0
+"""Width and height of a page's still image, px."""
+_EXACT_DB = 99.0  # PSNR from which the error is not reported
 
 
 @dataclass(frozen=True, kw_only=True)
 class PageOptions:
-    """What a web page holds (.html)."""
+    """Options of a web page (.html)."""
 
     quality: Literal["exact", "compact"] = "compact"
-    """Of a .html page: float32, or 8 and 16 bits, a third as large."""
+    """Precision of a .html page: float32, or 8 and 16 bits at a third of the size."""
     sh: Literal[0, 1, 2, 3] = 3
-    """Degree of the spherical harmonics that stay in a page."""
+    """Largest SH degree in a .html page."""
     layers: Annotated[str | None, absent_option("NAME[,NAME2]", "all")] = None
-    """Layers that get a slider; the others stay as they are."""
+    """Layers that get a slider in a .html page; the others are fixed."""
     title: Annotated[str | None, absent_option("TEXT", "the scene's name")] = None
-    """Above the sliders."""
+    """Text above the sliders of a .html page."""
     credit: Annotated[str, absent_option("TEXT", "none")] = ""
-    """Below them: whose scene it is, and its license; addresses become links."""
+    """Text below the sliders: author and license of the scene; addresses become links."""
 
 
 def write_page(
@@ -55,10 +55,20 @@ def write_page(
     kept: Sequence[snapshots.SliderSnapshot] = (),
     options: PageOptions = PageOptions(),
 ) -> str:
-    """Write the page; the line that says what it holds.
+    """Write a web page.
+
+    Args:
+        out: output file
+        document: the scene and its edits
+        view: initial state
+        kept: snapshots to include
+        options: options of the page
+
+    Returns:
+        One line that describes the contents of the page.
 
     Raises:
-        ProgdfError: an option names a layer that is not there, or the page cannot be written.
+        ProgdfError: an option names an unknown layer, or the page cannot be written.
     """
     stage, edits = first_state(document, view, kept, options)
     gdfs = [document.gdfs[i] for i in edits]
@@ -87,25 +97,28 @@ def picture(
     size: tuple[int, int],
     bands: int = DRAWN_SH[-1],
 ) -> torch.Tensor:
-    """What the CPU engine makes of a view with so many higher SH coefficients, 0..1. [H,W,3]
+    """Render a view with the CPU engine.
 
     Args:
-        scene: the scene, or what a page has of it
+        scene: the scene, or its quantized copy from a page
         gdfs: its edits
-        view: which of them show, and from where
+        view: layers and camera
         size: width and height, px
-        bands: coefficients above the first that are drawn
+        bands: number of drawn SH coefficients above degree 0
+
+    Returns:
+        [H,W,3], 0 to 1
     """
     with torch.no_grad():
-        same = fingerprint(scene)  # also of what a page has of it
-        edited = compose_view(scene, [replace(gdf, scene=same) for gdf in gdfs], view)
+        scene_fingerprint = fingerprint(scene)  # `scene` may be a page's copy
+        edited = compose_view(scene, [replace(gdf, scene=scene_fingerprint) for gdf in gdfs], view)
         edited = replace(edited, shN=edited.shN * (torch.arange(edited.shN.shape[1]) < bands)[:, None])
         camera = to_camera(view.camera, *size)
         return render(edited, camera, background=view.background, engine="cpu").image.clamp(0.0, 1.0)
 
 
 def compose_view(scene: Gaussians, gdfs: Sequence[Gdf], view: ViewState, share: float = 1.0) -> Gaussians:
-    """The scene under the layers of a view, at a share of their strengths."""
+    """Compose the scene with the layers of a view, at a share of their strengths."""
     states = visible_layers(view)
     layers = [layer_of(gdfs[s.gdf], share * s.strength, s.gains, s.paint) for s in states]
     return compose_layers(scene, layers, view.blend)
@@ -117,10 +130,14 @@ def first_state(
     kept: Sequence[snapshots.SliderSnapshot] = (),
     options: PageOptions = PageOptions(),
 ) -> tuple[dict[str, Any], list[int]]:
-    """What the page begins with, as viewer/web/src/main.js reads it, and the edits that it needs."""
+    """Build the initial state of a page, as read by viewer/web/src/main.js.
+
+    Returns:
+        The state, and the sorted indices of the edits that the page needs.
+    """
     paints: list[tuple[int, Any]] = []
     known: dict[tuple[int, str], int] = {}
-    sliders = _sliders(view, options.layers)
+    sliders = _slider_layers(view, options.layers)
     stacks = [view.layers, *(each.edit.layers for each in kept)]
     needed = {l.gdf for stack in stacks for l in stack if l.strength > 0.0 or l.name in sliders}
     edits = sorted(needed | {gdf for key in view.timeline.keys for gdf, s in key.strengths if s > 0.0})
@@ -165,7 +182,7 @@ def first_state(
 
 
 def _film(film: Timeline, edits: Sequence[int]) -> dict[str, Any] | None:
-    """A timeline frame by frame; the strengths that it moves, and the camera where it moves that."""
+    """Sample a timeline frame by frame: the keyed strengths, and the camera if it is keyed."""
     if not film.keys:
         return None
     frames = []
@@ -182,18 +199,18 @@ def _film(film: Timeline, edits: Sequence[int]) -> dict[str, Any] | None:
     }
 
 
-def _sliders(view: ViewState, names: str | None) -> set[str]:
-    """The layers that get a slider."""
-    there = {layer.name for layer in view.layers}
+def _slider_layers(view: ViewState, names: str | None) -> set[str]:
+    """Return the names of the layers that get a slider. Raises ProgdfError for an unknown layer."""
+    known = {layer.name for layer in view.layers}
     if names is None:
-        return there
+        return known
     chosen = {name.strip() for name in names.split(",") if name.strip()}
-    for name in sorted(chosen - there):
-        names = f"are {', '.join(sorted(there))}" if there else "is none"
+    for name in sorted(chosen - known):
+        names = f"are {', '.join(sorted(known))}" if known else "is none"
         raise ProgdfError(f"--layers {name}: there is no layer of that name; there {names}")
     return chosen
 
 
 def camera_json(camera: ViewCamera) -> dict[str, Any]:
-    """A camera as the page has it."""
+    """Convert a camera to the page's format."""
     return {name: value for name, value in asdict(camera).items() if name != "mode"}
