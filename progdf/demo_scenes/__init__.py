@@ -1,4 +1,4 @@
-"""Scenes the product makes itself, with exact labels."""
+"""Procedural demo scenes with exact labels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From parts and paint to a scene: how many Gaussians where, which show, how they lie, how they are lit."""
+"""Conversion of painted parts to a scene: distribution, visibility, shape and lighting of the Gaussians."""
 
 from __future__ import annotations
 
@@ -21,32 +21,32 @@ from progdf.threads import one_thread
 from .light import OUTDOORS, Daylight, develop, irradiance, view_dependent_light
 from .surface import Part, Samples, sample
 
-_SIDE = 64  # the lattice repeats after this many cells; a power of two
+_LATTICE_CELLS = 64  # cells after which the lattice repeats; a power of two
 
 
 def lattice(seed: int) -> Tensor:
-    """Random numbers in −1..1 on a lattice of 64³ nodes, for `noise`. [64³] float32"""
+    """Return random numbers from −1 to 1 on a lattice of 64³ nodes, for `noise`. [64³] float32"""
     generator = torch.Generator().manual_seed(seed)
-    return torch.rand(_SIDE**3, generator=generator) * 2 - 1
+    return torch.rand(_LATTICE_CELLS**3, generator=generator) * 2 - 1
 
 
 def noise(points: Tensor, table: Tensor, frequency: float, octaves: int = 1) -> Tensor:
-    """Value noise, −1..1, mean about 0; each octave doubles the frequency and halves the height.
+    """Return value noise, −1 to 1, with a mean of about 0.
 
     Args:
-        points: where. [N,3]
-        table: what `lattice` made
+        points: positions. [N,3]
+        table: numbers from `lattice`
         frequency: cells per world unit
-        octaves: how many layers of detail, ≥ 1
+        octaves: number of layers, ≥ 1; each doubles the frequency and halves the height
 
     Returns:
-        [N]
+        Noise values. [N]
     """
     total = torch.zeros(points.shape[0])
     height = 1.0
     span = 0.0
     for octave in range(octaves):
-        # the shift keeps the lattice planes of the octaves, and the part's planes of symmetry, apart
+        # the shift separates the lattice planes of the octaves and the planes of symmetry of the part
         total += height * _value_noise(points * frequency + 17.31 * (octave + 1), table)
         span += height
         height = height / 2
@@ -57,10 +57,10 @@ def noise(points: Tensor, table: Tensor, frequency: float, octaves: int = 1) -> 
 def _value_noise(places: Tensor, table: Tensor) -> Tensor:
     cell = places.floor()
     f = smoothstep(places - cell)
-    low = cell.long() & (_SIDE - 1)
-    high = (low + 1) & (_SIDE - 1)
-    x = (low[:, 0] * _SIDE * _SIDE, high[:, 0] * _SIDE * _SIDE)
-    y = (low[:, 1] * _SIDE, high[:, 1] * _SIDE)
+    low = cell.long() & (_LATTICE_CELLS - 1)
+    high = (low + 1) & (_LATTICE_CELLS - 1)
+    x = (low[:, 0] * _LATTICE_CELLS * _LATTICE_CELLS, high[:, 0] * _LATTICE_CELLS * _LATTICE_CELLS)
+    y = (low[:, 1] * _LATTICE_CELLS, high[:, 1] * _LATTICE_CELLS)
     z = (low[:, 2], high[:, 2])
     planes = []
     for i in range(2):
@@ -71,84 +71,87 @@ def _value_noise(places: Tensor, table: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Pelt:
-    """How the Gaussians of a surface lie: most of them flat on it, some standing out as hairs or blades."""
+    """Shape and orientation of a surface's Gaussians. Most lie flat, some stand out as hairs or blades."""
 
-    standing: float = 0.0  # share of those that stand out, 0..1
+    standing: float = 0.0  # share of Gaussians that stand out, 0 to 1
     # standard deviations along the flow, across it and through the surface, in sample spacings
     flat: tuple[float, float, float] = (0.64, 0.64, 0.14)
-    hair: tuple[float, float, float] = (0.70, 0.24, 0.16)  # the same of those that stand out
-    # what is added to a hair's first, world units: fur keeps some length however fine the sampling
+    hair: tuple[float, float, float] = (0.70, 0.24, 0.16)  # the same for hairs
+    # added to a hair's first standard deviation, world units: a minimum length for any sample spacing
     length: float = 0.0
-    rise: float = 0.45  # how steeply a hair leaves the surface; 0 lies, 1 is 45 degrees
-    lift: float = 0.35  # how far a hair's middle is above the surface, in its first standard deviation
-    unruly: float = 0.35  # how much directions differ from neighbor to neighbor
+    rise: float = 0.45  # slope of a hair; 0 lies flat, 1 is 45 degrees
+    lift: float = 0.35  # height of a hair's middle above the surface, in its first standard deviation
+    unruly: float = 0.35  # random variation of directions between neighbors
 
 
 BARE = Pelt()
+"""Surface without hairs."""
 
 
 @dataclass(frozen=True)
 class SurfacePaint:
-    """What a surface looks like before light falls on it."""
+    """Appearance of a surface before lighting."""
 
-    color: Tensor  # sRGB 0..1. [N,3]
-    relief: Tensor  # how far the normals lean, for light only. [N,3]
+    color: Tensor  # sRGB, 0 to 1. [N,3]
+    relief: Tensor  # offset of the normals, for lighting only. [N,3]
     velvet: float = 0.0  # brightening where the surface turns away from the eye, sRGB units
-    gloss: float = 0.0  # mirror highlight, sRGB units
-    # where hairs and flat Gaussians point; only its part along the surface counts. [N,3]
+    gloss: float = 0.0  # specular highlight, sRGB units
+    # direction of hairs and flat Gaussians; only its component along the surface counts. [N,3]
     flow: Tensor | None = None
-    pelt: Pelt = BARE  # how the Gaussians lie
-    glows: bool = False  # whether `color` is what is seen, whatever light there is
+    pelt: Pelt = BARE  # shape and orientation of the Gaussians
+    glows: bool = False  # emissive: `color` is visible without lighting
 
 
 Painter = Callable[[Part, Samples, Tensor], SurfacePaint]
-"""The paint of a part at its samples; the tensor is the noise's table."""
+"""Function from a part, its samples and the noise table to their paint."""
 
 
 def bumps(points: Tensor, table: Tensor, frequency: float, height: float) -> Tensor:
-    """A relief of noise, see `SurfacePaint.relief`. [N,3] -> [N,3]"""
+    """Return a relief of noise, see `SurfacePaint.relief`. [N,3] -> [N,3]"""
     offsets = torch.tensor([[0.0, 0.0, 0.0], [5.2, 1.3, 8.1], [2.7, 9.4, 4.6]])
     return height * torch.stack([noise(points + offset, table, frequency, 2) for offset in offsets], dim=1)
 
 
 def swirl(points: Tensor, table: Tensor, main: tuple[float, float, float], height: float = 0.7) -> Tensor:
-    """A flow along `main` that noise bends. [N,3] -> [N,3]"""
+    """Return a flow along `main`, bent by noise. [N,3] -> [N,3]"""
     bend = torch.stack([noise(points + 3.1 * k, table, 2.5) for k in range(3)], dim=1)
     return torch.tensor(main) + height * bend
 
 
 def mix_colors(dark: str, light: str, share: Tensor) -> Tensor:
-    """From one `#rrggbb` to another; what lies outside 0..1 is cut. [N] -> [N,3]"""
+    """Interpolate from one `#rrggbb` to another by a share, clamped to 0 to 1. [N] -> [N,3]"""
     return torch.lerp(parse_color(dark), parse_color(light), share.clamp(0, 1)[:, None])
 
 
 def flat(color: str, points: Tensor) -> Tensor:
-    """One `#rrggbb` everywhere. [N,3] -> [N,3]"""
+    """Return the color `#rrggbb` for each point. [N,3] -> [N,3]"""
     return parse_color(color).expand(len(points), 3)
 
 
 def mix(under: Tensor, over: Tensor, share: Tensor) -> Tensor:
-    """`over` where `share` is 1. [N,3], [N,3], [N] -> [N,3]"""
+    """Interpolate from `under` to `over` by a share, clamped to 0 to 1. [N,3], [N,3], [N] -> [N,3]"""
     return torch.lerp(under, over, share.clamp(0, 1)[:, None])
 
 
-_PROBES = 600
-_MAX_DRAWN = 10_000  # per Gaussian kept; a part of which less shows is misplaced
+_PROBES = 600  # samples that estimate the visible share of a part
+_MAX_SAMPLES_PER_GAUSSIAN = (
+    10_000  # samples per visible Gaussian; a part with fewer visible ones is misplaced
+)
 
 
 @dataclass(frozen=True)
 class DemoScene:
-    """A scene of which everything is known."""
+    """Scene with labels and cameras."""
 
     gaussians: Gaussians  # the scene
-    labels: Tensor  # which part each Gaussian belongs to, an index into `label_names`. [N] uint8
-    label_names: tuple[str, ...]  # what the labels mean
-    cameras: tuple[Camera, ...]  # around the scene, framing it, even in azimuth
+    labels: Tensor  # label of each Gaussian, an index into `label_names`. [N] uint8
+    label_names: tuple[str, ...]  # names of the labels
+    cameras: tuple[Camera, ...]  # cameras that view the scene, evenly spaced in azimuth
     up: Tensor  # world direction that is up. [3]
-    background: tuple[float, float, float]  # what stands behind it in pictures, sRGB
+    background: tuple[float, float, float]  # background color of pictures, sRGB
 
     def members(self, *names: str) -> Tensor:
-        """Sorted indices of the Gaussians of the named parts. [M] int64"""
+        """Return the sorted indices of the Gaussians with the given labels. [M] int64"""
         unknown = [name for name in names if name not in self.label_names]
         if unknown:
             raise ProgdfError(f"the scene has no part '{unknown[0]}'; it has {', '.join(self.label_names)}")
@@ -164,7 +167,7 @@ def assemble(
     seed: int,
     daylight: Daylight = OUTDOORS,
 ) -> tuple[Gaussians, Tensor]:
-    """Exactly `size` Gaussians on the visible surfaces of `parts`, and their labels [N] uint8; seeded."""
+    """Return exactly `size` Gaussians on the visible surfaces of parts, and their labels [N] uint8."""
     random = torch.Generator().manual_seed(seed)
     table = lattice(seed)
     pieces = list[Gaussians]()
@@ -179,16 +182,16 @@ def assemble(
 
 
 def _budget(parts: Sequence[Part], size: int) -> tuple[list[int], list[float]]:
-    """How many Gaussians each part gets, adding up to `size`, and the share of its surface that shows."""
-    wishes = []
+    """Return each part's number of Gaussians, with sum `size`, and the visible share of its surface."""
+    weights = []
     shares = []
     for part in parts:
         probes = sample(part, _PROBES)
         share = float(_is_outside(parts, part, probes).float().mean())
-        # five digits: what equal parts get must not hang on the last bits, which depend on the processor
-        wishes.append(float(f"{float((probes.spacing**2).sum()) * share * part.weight:.5g}"))
+        # five digits, so that rounding, which depends on the processor, does not decide between equal parts
+        weights.append(float(f"{float((probes.spacing**2).sum()) * share * part.weight:.5g}"))
         shares.append(max(share, 1 / _PROBES))
-    quotas = [max(1.0, size * wish / sum(wishes)) for wish in wishes]
+    quotas = [max(1.0, size * weight / sum(weights)) for weight in weights]
     quotas = [quota * size / sum(quotas) for quota in quotas]
     counts = [math.floor(quota) for quota in quotas]
     by_surplus = sorted(range(len(parts)), key=lambda i: (counts[i] - quotas[i], -i))
@@ -198,7 +201,7 @@ def _budget(parts: Sequence[Part], size: int) -> tuple[list[int], list[float]]:
 
 
 def _is_outside(parts: Sequence[Part], outer: Part, at: Samples) -> Tensor:
-    """Which samples lie on the outside of all other parts, or just below their skin. [N] bool"""
+    """Return a mask of samples outside all other parts, or just below their surface. [N] bool"""
     visible = torch.ones(len(at), dtype=torch.bool)
     for part in parts:
         if part is not outer and part.touches(outer):
@@ -211,14 +214,14 @@ def _is_outside(parts: Sequence[Part], outer: Part, at: Samples) -> Tensor:
 def _sample_visible(
     parts: Sequence[Part], part: Part, count: int, share: float, random: torch.Generator
 ) -> Samples:
-    """Exactly `count` shown samples of a part: enough are drawn, the few too many are dropped at random."""
+    """Return exactly `count` visible samples of a part; surplus samples are dropped at random."""
     drawn = math.ceil(count / share)
     while True:
         at = sample(part, drawn)
         rows = _is_outside(parts, part, at).nonzero()[:, 0]
         if len(rows) >= count:
             break
-        if drawn > _MAX_DRAWN * count:
+        if drawn > _MAX_SAMPLES_PER_GAUSSIAN * count:
             raise ValueError(f"{part.name} at {part.center.tolist()} lies inside other parts; move it")
         drawn = max(drawn + 1, math.ceil(1.01 * drawn * count / max(len(rows), 1)))
     chosen = torch.randperm(len(rows), generator=random)[:count].sort().values
@@ -233,7 +236,7 @@ def _make_gaussians(
     daylight: Daylight,
     random: torch.Generator,
 ) -> Gaussians:
-    """Light and shape the painted Gaussians of one part."""
+    """Make the Gaussians of one part from its samples, paint and lighting."""
     n = len(at)
     grain = torch.randn(n, generator=random)
     leaning = at.normals + coat.relief - (coat.relief * at.normals).sum(1, keepdim=True) * at.normals
@@ -252,7 +255,7 @@ def _make_gaussians(
 def _place_gaussians(
     at: Samples, coat: SurfacePaint, stands: Tensor, random: torch.Generator
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Flat Gaussians on the surface, hairs and blades standing out of it. -> means, quats, log_scales"""
+    """Return means, quats and log_scales of flat Gaussians on a surface and of hairs that stand out."""
     n = len(at)
     pelt = coat.pelt
     h = at.spacing[:, None]
@@ -266,7 +269,7 @@ def _place_gaussians(
     across = across / across.norm(dim=1, keepdim=True).clamp_min(1e-6)
     frame = torch.stack([along, across, torch.linalg.cross(along, across)], dim=2)
 
-    # those that lie cover for those that stand
+    # flat Gaussians are larger to cover the area of those that stand
     flat = torch.tensor(pelt.flat) * h / (1 - pelt.standing) ** 0.5
     hair = torch.tensor(pelt.hair) * h + torch.tensor([pelt.length, 0.0, 0.0])
     scales = torch.where(up > 0, hair, flat) * torch.exp(0.12 * torch.randn(n, 3, generator=random))

@@ -1,4 +1,4 @@
-"""The demo's bear: seated on a stone plinth in the grass, as Gaussians with exact labels."""
+"""Demo scene of a teddy bear that sits on a stone plinth in the grass."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _TURF = Pelt(
 
 
 def paint_bear(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
-    """The paint of a part at its samples; `table` is the noise's."""
+    """Return the paint of a part at its samples; `table` is the noise table."""
     if part.name in FUR:
         return _fur(part, at, table)
     if part.name in WOOL:
@@ -91,7 +91,7 @@ def _wool(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
     knit = (ribs * 2 * math.pi).sin() * smoothstep(0.013 - at.spacing, 0.0, 0.006)
     fuzz = 1 + 0.07 * noise(p, table, 40.0) + 0.10 * knit
     color = (color * fuzz[:, None]).clamp(0, 1)
-    # along the stripes, which keeps their edges crisp
+    # along the stripes, for crisp edges
     forth = torch.stack([at.local[:, 2], torch.zeros(len(p)), -at.local[:, 0]], dim=1) @ part.matrix.T
     around = torch.linalg.cross(at.normals, forth) if part.name == "scarf" else part.matrix[:, 0].expand_as(p)
     return SurfacePaint(color, bumps(p, table, 22.0, 0.22), 0.09, 0.02, around, _KNIT)
@@ -121,7 +121,7 @@ def _lawn(at: Samples, table: Tensor) -> SurfacePaint:
 
 
 def _glass(part: Part, at: Samples) -> SurfacePaint:
-    """Eyes and nose: nearly black; the nose mirrors the sky a little."""
+    """Paint eyes and nose nearly black, with a faint reflection of the sky on the nose."""
     p = at.points
     color = flat("#17100d" if part.name == "eye" else "#1d1412", p)
     if part.name == "nose":
@@ -136,18 +136,18 @@ Triple = tuple[float, float, float]
 
 
 def rotation_matrix(degrees: Triple) -> Tensor:
-    """Rotation about x, then y, then z, in degrees. [3,3]"""
+    """Return the matrix of a rotation about x, then y, then z, in degrees. [3,3]"""
     matrix = torch.eye(3)
     for axis, angle in enumerate(degrees):
         c = math.cos(math.radians(angle))
         s = math.sin(math.radians(angle))
-        one = torch.eye(3)
+        rotation = torch.eye(3)
         i, j = [(1, 2), (2, 0), (0, 1)][axis]
-        one[i, i] = c
-        one[j, j] = c
-        one[i, j] = -s
-        one[j, i] = s
-        matrix = one @ matrix
+        rotation[i, i] = c
+        rotation[j, j] = c
+        rotation[i, j] = -s
+        rotation[j, i] = s
+        matrix = rotation @ matrix
     return matrix
 
 
@@ -162,7 +162,7 @@ def ellipsoid(
     casts_shadow: bool = True,
     clears: float = 0.0,
 ) -> Part:
-    """An ellipsoid of these radii, turned by degrees about x, then y, then z; see `Part` for the rest."""
+    """Return an ellipsoid, rotated by `turn` degrees about x, then y, then z; see `Part` for the others."""
     matrix = rotation_matrix(turn) @ torch.diag(torch.tensor(radii))
     return Part(
         name,
@@ -177,11 +177,11 @@ def ellipsoid(
 
 
 _detail = partial(ellipsoid, weight=7.0, casts_shadow=False, clears=0.16)
-"""A small part drawn finely, with no fur over it and no shadow of its own."""
+"""Ellipsoid for a small, finely sampled part, without fur over it and without a shadow."""
 
 
 def _eye(x: float) -> list[Part]:
-    """An eye and the window it mirrors, up on the side that the lamp is on."""
+    """Return an eye with the reflection of a window, on the upper side towards the lamp."""
     return [
         _detail("eye", "head", (x, 1.545, 0.432), (0.052, 0.060, 0.042)),
         _detail("glint", "head", (x - 0.017, 1.567, 0.468), (0.015, 0.016, 0.006), weight=30.0, clears=0.3),
@@ -189,16 +189,16 @@ def _eye(x: float) -> list[Part]:
 
 
 def _pads(foot: Part) -> list[Part]:
-    """The sole's big pad and four toes, set into the side of the foot that faces the viewer."""
+    """Return the pads of a sole and four toes, set into the front of the foot."""
     sizes = foot.matrix.norm(dim=0)
     turn = foot.matrix / sizes
-    places = [((0.0, -0.055), (0.095, 0.085))]
-    places += [
+    positions = [((0.0, -0.055), (0.095, 0.085))]
+    positions += [
         ((0.132 * math.cos(angle), 0.012 + 0.135 * math.sin(angle)), (0.036, 0.036))
         for angle in (math.radians(28 + 124 / 3 * i) for i in range(4))
     ]
     pads = []
-    for (x, y), (wide, tall) in places:
+    for (x, y), (wide, tall) in positions:
         z = float(sizes[2]) * math.sqrt(1 - (x / float(sizes[0])) ** 2 - (y / float(sizes[1])) ** 2)
         outward = torch.tensor([x, y, z]) / sizes**2
         outward = outward / outward.norm()
@@ -214,7 +214,7 @@ def _pads(foot: Part) -> list[Part]:
 def _pair(
     name: str, label: str, center: Triple, radii: Triple, turn: Triple = (0, 0, 0), weight: float = 1.0
 ) -> list[Part]:
-    """The part on the +x side and its mirror image; `turn` is that of the +x side."""
+    """Return a part on the +x side and its mirror image; `turn` is for the +x side."""
     x, y, z = center
     mirrored = (turn[0], -turn[1], -turn[2])
     return [
@@ -224,7 +224,7 @@ def _pair(
 
 
 def bear_parts() -> list[Part]:
-    """Every part of the scene, the bear first, the lawn last."""
+    """Return all parts of the scene, from the bear to the lawn."""
     feet = _pair("foot", "legs", (0.355, 0.235, 0.80), (0.195, 0.235, 0.115), (-12, 16, 0), weight=1.3)
     return [
         ellipsoid("body", "body", (0.0, 0.57, 0.0), (0.50, 0.60, 0.45)),
@@ -270,23 +270,23 @@ def bear_parts() -> list[Part]:
 
 _CREAM = "#ece6dc"
 _CHARCOAL = "#3a3638"
-_DARK = 0.36  # fur is brighter; nose and mouth are not
+_MAX_DARK_VALUE = 0.36  # mean sRGB value; fur is brighter, nose and mouth are darker
 
-# Where in space, how wide and tall in world units, and how far it leans, in radians.
+# ellipses: position in space, half width and half height in world units, and tilt in radians
 _PATCHES = (((0.185, 1.53, 0.44), (0.125, 0.165), 0.5), ((-0.185, 1.53, 0.44), (0.085, 0.157), -0.35))
 _EYES = (((0.17, 1.545, 0.46), (0.051, 0.058), 0.0), ((-0.17, 1.545, 0.46), (0.045, 0.058), 0.0))
 _NOSE_AND_MOUTH = (((0.0, 1.44, 0.60), (0.118, 0.095), 0.0), ((0.02, 1.31, 0.59), (0.118, 0.092), 0.0))
 
 
 def paint_panda(picture: Tensor, camera: Camera, cover: Callable[[tuple[str, ...]], Tensor]) -> Tensor:
-    """The picture with the head and body cream, the limbs, the ears and around the eyes charcoal.
+    """Paint a picture of the bear as a panda: head and body cream; limbs, ears and eye patches charcoal.
 
-    The fur's shading stays, as under a layer that a paint program multiplies.
+    The fur's shading is unchanged, as under a multiply layer of a paint program.
 
     Args:
-        picture: the bear. [H,W,3] sRGB
-        camera: that it was rendered from
-        cover: names of parts -> their share of each pixel, 0..1. [H,W]
+        picture: render of the bear, sRGB. [H,W,3]
+        camera: camera of the render
+        cover: function from part names to their share of each pixel, 0 to 1. [H,W]
     """
     head = cover(("head",))
     patches = torch.maximum(*(_ellipse(camera, *patch) for patch in _PATCHES)) * head
@@ -295,14 +295,14 @@ def paint_panda(picture: Tensor, camera: Camera, cover: Callable[[tuple[str, ...
     painted = _wash(picture, cover(("head", "body")), _CREAM)
     painted = _wash(painted, cover(("ears", "arms", "legs")), _CHARCOAL)
     painted = _wash(painted, patches, _CHARCOAL)
-    dark = 1 - smoothstep(picture.mean(dim=2), _DARK - 0.12, _DARK)
+    dark = 1 - smoothstep(picture.mean(dim=2), _MAX_DARK_VALUE - 0.12, _MAX_DARK_VALUE)
     mask = torch.maximum(eyes, features * dark) * head
     return torch.lerp(painted, picture, mask[..., None])
 
 
 def _wash(picture: Tensor, share: Tensor, color: str) -> Tensor:
-    """Another color where the share is 1. [H,W,3], [H,W] 0..1 -> [H,W,3]"""
-    share = (1.5 * share).clamp(0, 1)  # else the old color would shine out at soft edges
+    """Recolor by a share, 0 to 1, per pixel. [H,W,3], [H,W] -> [H,W,3]"""
+    share = (1.5 * share).clamp(0, 1)  # otherwise the old color would remain at soft edges
     washed = recolor_fully(picture, parse_color(color), typical_color(picture, share))
     return torch.lerp(picture, washed, share[..., None])
 
@@ -310,7 +310,7 @@ def _wash(picture: Tensor, share: Tensor, color: str) -> Tensor:
 def _ellipse(
     camera: Camera, center: tuple[float, float, float], radii: tuple[float, float], turn: float
 ) -> Tensor:
-    """A leaning ellipse with a soft edge about where a point in space shows. [H,W] 0..1"""
+    """Return a tilted ellipse with a soft edge around the projection of a point, 0 to 1. [H,W]"""
     x, y, depth = camera.viewmat[:3, :3] @ torch.tensor(center) + camera.viewmat[:3, 3]
     at = camera.K @ torch.stack([x / depth, y / depth, torch.ones(())])
     rows, columns = torch.meshgrid(
@@ -324,15 +324,16 @@ def _ellipse(
 
 
 SMALLEST = 400
-"""Fewer Gaussians than this are no bear."""
+"""Smallest number of Gaussians for the bear."""
 
 SKY = (0.510, 0.639, 0.761)
-"""Darker than snow and lighter than fur, and cold, so that the bear stands out before it in any coat."""
+"""Background color, sRGB. It is cold, lighter than fur and darker than snow, so that any coat stands out."""
 
 
 def bear(size: int = 24_000, seed: int = 0) -> DemoScene:
-    """A teddy bear of exactly `size` Gaussians; the same seed gives the same bear, bit for bit
-    on the same kind of processor.
+    """Return a teddy bear of exactly `size` Gaussians.
+
+    The same seed gives the same bits on the same kind of processor.
 
     Raises:
         ProgdfError: fewer than `SMALLEST` Gaussians.
@@ -344,7 +345,7 @@ def bear(size: int = 24_000, seed: int = 0) -> DemoScene:
 
 
 def _rig(count: int = 32, width: int = 512, height: int = 512) -> tuple[Camera, ...]:
-    """Cameras around the bear, the first in front, 4 to 42 degrees above the horizon."""
+    """Return cameras around the bear, the first in front, 4 to 42 degrees above the horizon."""
     center = torch.tensor([0.0, 0.78, 0.12])
     K = intrinsics(math.radians(40), width, height)
     cameras = []

@@ -1,4 +1,4 @@
-"""Light baked into colors: a warm lamp with soft shadows, sky, ground, darkening where parts touch."""
+"""Baked lighting: a warm key light with soft shadows, sky, ground, and ambient occlusion between parts."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _SH_C1 = math.sqrt(3 / (4 * math.pi))
 
 @dataclass(frozen=True)
 class Daylight:
-    """How much light there is."""
+    """Amount of light in a scene."""
 
-    # [N,3] points -> [N], the share of the key light that comes in, 0..1; None is all of it
+    # function from points [N,3] to the incoming share of the key light, 0 to 1 [N]; None: all of it
     sun: Callable[[Tensor], Tensor] | None = None
-    fill: float = 1.0  # strength of the light from all around
+    fill: float = 1.0  # strength of the ambient light
 
 
 OUTDOORS = Daylight()
@@ -30,10 +30,10 @@ OUTDOORS = Daylight()
 
 @dataclass(frozen=True)
 class Lamp:
-    """A light from infinitely far: direction towards it (unit, [3]) and linear rgb ([3])."""
+    """Directional light."""
 
-    direction: Tensor
-    color: Tensor
+    direction: Tensor  # unit vector towards the light. [3]
+    color: Tensor  # linear RGB. [3]
 
 
 def _lamp(direction: tuple[float, float, float], color: tuple[float, float, float]) -> Lamp:
@@ -50,7 +50,7 @@ GROUND = torch.tensor([0.20, 0.24, 0.12])
 def irradiance(
     points: Tensor, normals: Tensor, parts: Sequence[Part], receiver: Part, daylight: Daylight = OUTDOORS
 ) -> Tensor:
-    """Linear light that falls on each point of the part `receiver`. [N,3], [N,3] -> [N,3]"""
+    """Return the linear light that reaches each point of the part `receiver`. [N,3], [N,3] -> [N,3]"""
     others = [part for part in parts if part is not receiver]
     open_sky = torch.ones(len(points))
     lit = torch.ones(len(points)) if daylight.sun is None else daylight.sun(points)
@@ -70,25 +70,26 @@ def irradiance(
 
 
 def develop(linear: Tensor) -> Tensor:
-    """Linear light as sRGB with a soft shoulder: highlights bend towards white. [...,3] -> [...,3] in 0..1"""
+    """Convert linear light to sRGB, 0 to 1. Highlights bend softly towards white. [...,3] -> [...,3]"""
     return srgb_from_linear(1 - torch.exp(-linear.clamp_min(0)))
 
 
 def view_dependent_light(
     normals: Tensor, velvet: float, gloss: float, color: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """View-dependent light that one SH band can hold.
+    """Return view-dependent light that fits in one SH band.
 
-    With d the direction from the eye: velvet adds velvet·(1 + n·d), brighter where the surface turns away, as
-    short hair does; gloss adds −gloss·(r·d), brighter where the eye meets the key light's mirror direction r.
+    With d the direction from the eye, velvet adds velvet·(1 + n·d). It brightens surfaces that turn away,
+    like short hair. Gloss adds −gloss·(r·d), which is brighter towards the mirror direction r of the key
+    light.
 
     Args:
-        normals: unit. [N,3]
-        velvet, gloss: how much, in sRGB units
+        normals: unit vectors. [N,3]
+        velvet, gloss: strengths, sRGB units
         color: color of both. [N,3]
 
     Returns:
-        what to add to the color [N,3], and the coefficients of band 1 [N,3,3].
+        Offset of the color [N,3], and coefficients of SH band 1 [N,3,3].
     """
     mirror = 2 * (normals @ KEY.direction)[:, None] * normals - KEY.direction
     slope = velvet * normals - gloss * mirror
@@ -101,7 +102,7 @@ def _wrap_light(cosine: Tensor, softness: float) -> Tensor:
 
 
 def _occlusion(points: Tensor, normals: Tensor, local: Tensor, part: Part) -> Tensor:
-    """Share of the sky that a part hides, as a sphere of its size at its distance would. [N] in 0..1"""
+    """Return the share of the sky that a part hides, approximated by a sphere, 0 to 1. [N]"""
     away = part.shape.nearest(local) @ part.matrix.T + part.center - points
     gap = away.norm(dim=1)
     size = float(torch.linalg.svdvals(part.matrix)[1]) * part.shape.girth
@@ -114,7 +115,7 @@ def _occlusion(points: Tensor, normals: Tensor, local: Tensor, part: Part) -> Te
 
 
 def _key_light_share(local: Tensor, part: Part) -> Tensor:
-    """How much of the key light passes a part: the ray's closest approach to it, blurred. [N] in 0..1"""
+    """Return the share of the key light that passes a part, by the ray's closest approach, 0 to 1. [N]"""
     towards: Tensor = torch.linalg.inv(part.matrix) @ KEY.direction
     reach = float(towards.norm())
     towards = towards / reach

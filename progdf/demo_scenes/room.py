@@ -1,4 +1,4 @@
-"""A small room to stand inside: walls, table, vase, lamp; for near planes, depth order and cameras within."""
+"""Demo scene of a small furnished room, to test near planes, depth order and cameras inside a scene."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ _PETALS = ("#e8537a", "#f2b632", "#f4f0e6", "#c04a8c", "#f07f4f")
 
 
 def paint(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
-    """The paint of a part at its samples; `table` is the noise's."""
+    """Return the paint of a part at its samples; `table` is the noise table."""
     coat = _PAINTERS[part.name](part, at, table)
-    if part.shape.profile is None:  # along the edges, which keeps them straight
+    if part.shape.profile is None:  # along the edges, for straight edges
         return replace(coat, flow=part.matrix[:, 0].expand_as(at.points), pelt=_BOARD)
     return coat
 
@@ -172,7 +172,7 @@ def _ball(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
 
 
 def _edge(turns: Tensor) -> Tensor:
-    """Distance to the nearest whole number. [N] -> [N] in 0..0.5"""
+    """Return the distance to the nearest whole number, 0 to 0.5. [N] -> [N]"""
     return (turns - turns.round()).abs()
 
 
@@ -196,16 +196,17 @@ _PAINTERS = {
 
 LABELS = ("floor", "walls", "ceiling", "rug", "table", "vase", "lamp", "stool", "picture", "ball")
 SMALLEST_ROOM = 1000
-"""Fewer Gaussians than this are no room."""
+"""Smallest number of Gaussians for the room."""
 
-_HALF = 2.0
-_HEIGHT = 2.5
-_WINDOW = ((1.45, 0.72), (0.75, 0.62))  # middle and half size along y and along z, in the wall at −x
+_HALF_SIDE = 2.0  # half width and half length, world units
+_HEIGHT = 2.5  # world units
+_WINDOW = ((1.45, 0.72), (0.75, 0.62))  # middle (y, z) and half size (y, z), in the wall at −x
 
 
 def room(size: int = 40_000, seed: int = 0) -> DemoScene:
-    """A room of exactly `size` Gaussians with cameras inside; the same seed gives the same room, bit for bit
-    on the same kind of processor.
+    """Return a room of exactly `size` Gaussians with cameras inside.
+
+    The same seed gives the same bits on the same kind of processor.
 
     Raises:
         ProgdfError: fewer than `SMALLEST_ROOM` Gaussians.
@@ -217,7 +218,7 @@ def room(size: int = 40_000, seed: int = 0) -> DemoScene:
 
 
 def room_parts() -> list[Part]:
-    """Every part of the room; y is up, the floor at 0."""
+    """Return all parts of the room; y is up, with the floor at 0."""
     toy = ellipsoid("ball", "ball", (-1.05, 0.195, -0.75), (0.18, 0.18, 0.18), (30, 0, 25), 2.5)
     return [
         *_shell(),
@@ -229,21 +230,29 @@ def room_parts() -> list[Part]:
 
 
 def _shell() -> list[Part]:
-    """Floor, ceiling and walls, and what hangs on them and lies there."""
+    """Return the floor, ceiling and walls, with the window, the picture and the rug."""
     (window_y, window_z), (tall, wide) = _WINDOW
-    x = (_HALF, 0.0, 0.0)
+    x = (_HALF_SIDE, 0.0, 0.0)
     y = (0.0, _HEIGHT / 2, 0.0)
-    z = (0.0, 0.0, _HALF)
-    pane = (-_HALF + 0.015, window_y, window_z)
+    z = (0.0, 0.0, _HALF_SIDE)
+    pane = (-_HALF_SIDE + 0.015, window_y, window_z)
     return [
         _flat("floor", "floor", (0, 0, 0), x, z, (0, 1, 0), 0.8),
         _flat("ceiling", "ceiling", (0, _HEIGHT, 0), x, z, (0, -1, 0), 0.3),
-        _flat("wall", "walls", (-_HALF, _HEIGHT / 2, 0), z, y, (1, 0, 0), 0.5),
-        _flat("wall", "walls", (_HALF, _HEIGHT / 2, 0), z, y, (-1, 0, 0), 0.5),
-        _flat("wall", "walls", (0, _HEIGHT / 2, -_HALF), x, y, (0, 0, 1), 0.5),
-        _flat("wall", "walls", (0, _HEIGHT / 2, _HALF), x, y, (0, 0, -1), 0.5),
+        _flat("wall", "walls", (-_HALF_SIDE, _HEIGHT / 2, 0), z, y, (1, 0, 0), 0.5),
+        _flat("wall", "walls", (_HALF_SIDE, _HEIGHT / 2, 0), z, y, (-1, 0, 0), 0.5),
+        _flat("wall", "walls", (0, _HEIGHT / 2, -_HALF_SIDE), x, y, (0, 0, 1), 0.5),
+        _flat("wall", "walls", (0, _HEIGHT / 2, _HALF_SIDE), x, y, (0, 0, -1), 0.5),
         _flat("window", "walls", pane, (0, tall, 0), (0, 0, wide), (1, 0, 0), 1.5),
-        _flat("picture", "picture", (-0.35, 1.5, -_HALF + 0.015), (0.62, 0, 0), (0, 0.45, 0), (0, 0, 1), 4.0),
+        _flat(
+            "picture",
+            "picture",
+            (-0.35, 1.5, -_HALF_SIDE + 0.015),
+            (0.62, 0, 0),
+            (0, 0.45, 0),
+            (0, 0, 1),
+            4.0,
+        ),
         ellipsoid(
             "rug", "rug", (-0.15, 0.012, 0.1), (1.15, 0.014, 1.15), (0, 0, 0), 1.5, 10, casts_shadow=False
         ),
@@ -251,7 +260,7 @@ def _shell() -> list[Part]:
 
 
 def _table_with_flowers(at: tuple[float, float]) -> list[Part]:
-    """A round table at (x, z), a vase on it and five flowers in that."""
+    """Return a round table at (x, z) with a vase of five flowers."""
     x, z = at
     flowers = (
         (0.0, 0.0, 0.0),
@@ -316,7 +325,7 @@ def _stool(at: tuple[float, float]) -> list[Part]:
 def _flat(
     name: str, label: str, center: Triple, across: Triple, up: Triple, facing: Triple, weight: float
 ) -> Part:
-    """A rectangle of half sides `across` and `up`, seen from the side that `facing` points to."""
+    """Return a rectangle of half sides `across` and `up`, visible from the side `facing`."""
     x, y, z = (torch.tensor(axis, dtype=torch.float32) for axis in (across, facing, up))
     z = z if float(torch.linalg.cross(z, x) @ y) > 0 else -z
     matrix = torch.stack([x, y, z], dim=1)
@@ -330,19 +339,19 @@ def _lathe_body(
 
 
 def _sun(points: Tensor) -> Tensor:
-    """The share of the key light that the window lets in: where its ray came through the wall at −x. [N]"""
+    """Return the share of the key light through the window in the wall at −x, 0 to 1. [N]"""
     ray = KEY.direction
-    way = (points[:, 0] + _HALF).clamp_min(0) / -ray[0]
+    distance = (points[:, 0] + _HALF_SIDE).clamp_min(0) / -ray[0]
     inside = torch.ones(len(points))
     for axis, middle, half in zip((1, 2), *_WINDOW, strict=True):
-        off = (points[:, axis] + way * ray[axis] - middle).abs()
-        pane = ((off - 0.03) / 0.03).clamp(0, 1)  # the bars of the cross
-        inside = inside * ((half - off) / (0.02 + 0.03 * way) + 0.5).clamp(0, 1) * pane
+        off = (points[:, axis] + distance * ray[axis] - middle).abs()
+        pane = ((off - 0.03) / 0.03).clamp(0, 1)  # bars of the window
+        inside = inside * ((half - off) / (0.02 + 0.03 * distance) + 0.5).clamp(0, 1) * pane
     return inside
 
 
 def _rig(count: int = 32, width: int = 512, height: int = 384) -> tuple[Camera, ...]:
-    """Cameras along the walls at eye height, each looking across the room."""
+    """Return cameras along the walls at eye height that look across the room."""
     K = intrinsics(math.radians(62), width, height)
     up = torch.tensor([0.0, 1.0, 0.0])
     cameras = []

@@ -1,4 +1,4 @@
-"""Surfaces of revolution, stretched and turned, with points spread over them evenly by area."""
+"""Transformed surfaces of revolution, with samples spread evenly by area."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ import torch
 from torch import Tensor
 
 _GOLDEN = (math.sqrt(5) - 1) / 2
-_STEPS = 513
-_TURNS = 64
+_PROFILE_POINTS = 513  # points along a profile
+_ANGLE_STEPS = 64  # steps around the axis
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A surface of revolution about the local y axis."""
+    """Surface of revolution about the local y axis, or a flat square."""
 
-    # radius and height along the curve that turns, the outside on the left hand; None is the flat square x, z
-    # in −1..1 that faces up. [P,2]
+    # radius and height along the profile, with the outside on the left; None is the flat square with x and z
+    # from −1 to 1 that faces up. [P,2]
     profile: Tensor | None
-    # [N,3] local points -> [N]: below 1 inside, 1 on the surface, above 1 outside
+    # function from local points [N,3] to a level [N]: below 1 inside, 1 on the surface, above 1 outside
     level: Callable[[Tensor], Tensor]
-    nearest: Callable[[Tensor], Tensor]  # [N,3] local points -> [N,3] a point of the surface close to each
-    girth: float = 1.0  # how thick the body is, as a share of its radius
+    nearest: Callable[[Tensor], Tensor]  # function from local points [N,3] to close surface points [N,3]
+    girth: float = 1.0  # thickness of the body, as a share of its radius
 
 
 def ball(exponent: float = 2.0) -> Shape:
-    """The unit sphere; a higher exponent makes it a rounded tin (the curve is a superellipse)."""
-    angle = torch.linspace(0, math.pi, _STEPS)
+    """Return the unit sphere, or with a higher exponent a rounded cylinder (a superellipse as profile)."""
+    angle = torch.linspace(0, math.pi, _PROFILE_POINTS)
     curve = torch.stack([angle.sin(), angle.cos()], dim=1)
     curve = curve / (curve.abs() ** exponent).sum(1, keepdim=True) ** (1 / exponent)
 
@@ -46,8 +46,8 @@ def ball(exponent: float = 2.0) -> Shape:
 
 
 def ring(tube: float) -> Shape:
-    """A torus: the circle of radius 1 about y, with a tube of radius `tube`."""
-    angle = torch.linspace(0, 2 * math.pi, _STEPS)
+    """Return a torus about y of radius 1, with a tube of radius `tube`."""
+    angle = torch.linspace(0, 2 * math.pi, _PROFILE_POINTS)
     curve = torch.stack([1 + tube * angle.cos(), -tube * angle.sin()], dim=1)
 
     def level(local: Tensor) -> Tensor:
@@ -63,8 +63,8 @@ def ring(tube: float) -> Shape:
 
 
 def dome(drop: float) -> Shape:
-    """A round lawn of radius 1 that falls by `drop` towards its edge; everything below it is inside."""
-    radius = torch.linspace(0, 1, _STEPS)
+    """Return a round lawn of radius 1 that falls by `drop` to its edge. Points below it are inside."""
+    radius = torch.linspace(0, 1, _PROFILE_POINTS)
     curve = torch.stack([radius, -drop * radius**2], dim=1)
 
     def level(local: Tensor) -> Tensor:
@@ -78,11 +78,11 @@ def dome(drop: float) -> Shape:
 
 
 def lathe(radii: Sequence[float], heights: Sequence[float]) -> Shape:
-    """A turned body: radii at descending heights, straight between them, closed at both ends."""
+    """Return a closed body with radii at descending heights and straight lines between them."""
     outline = torch.tensor([[0.0, heights[0]], *zip(radii, heights, strict=True), [0.0, heights[-1]]])
     lengths = (outline[1:] - outline[:-1]).norm(dim=1)
     at = torch.cat([lengths.new_zeros(1), lengths.cumsum(0)])
-    places = torch.linspace(0, float(at[-1]), _STEPS)
+    places = torch.linspace(0, float(at[-1]), _PROFILE_POINTS)
     index = (torch.searchsorted(at, places) - 1).clamp(0, len(lengths) - 1)
     curve = torch.lerp(outline[index], outline[index + 1], ((places - at[index]) / lengths[index])[:, None])
     rising, radius = torch.tensor(heights).flip(0), torch.tensor(radii).flip(0)
@@ -109,7 +109,7 @@ def lathe(radii: Sequence[float], heights: Sequence[float]) -> Shape:
 
 
 def panel() -> Shape:
-    """A flat square, x and z in −1..1, that faces up; what lies behind it is inside."""
+    """Return a flat square, x and z from −1 to 1, that faces up. Points behind it are inside."""
 
     def level(local: Tensor) -> Tensor:
         beside = (local[:, 0].abs() >= 1) | (local[:, 2].abs() >= 1)
@@ -123,27 +123,27 @@ def panel() -> Shape:
 
 @dataclass(frozen=True)
 class Part:
-    """A shape placed in the world."""
+    """Shape with a transform and its sampling settings."""
 
-    name: str  # which part it is; paint goes by it
-    label: str  # name of the label its Gaussians carry
+    name: str  # name of the part, which selects its paint
+    label: str  # name of the label of its Gaussians
     shape: Shape  # the surface
-    center: Tensor  # where the shape's origin lies, world units. [3]
-    matrix: Tensor  # local -> world directions, stretch and rotation in one. [3,3]
-    weight: float = 1.0  # Gaussians per area against other parts
-    # relative Gaussians per area along the profile, by local radius; None is even
+    center: Tensor  # position of the shape's origin, world units. [3]
+    matrix: Tensor  # local to world directions: rotation times stretch. [3,3]
+    weight: float = 1.0  # Gaussians per area, relative to other parts
+    # Gaussians per area by local radius along the profile, relative; None is uniform
     density: Callable[[Tensor], Tensor] | None = None
-    # whether the key light stops at it; a part that does is shadowed as an ellipsoid
+    # blocks the key light, with the shadow of an ellipsoid
     casts_shadow: bool = True
-    clears: float = 0.0  # no other part's Gaussians within this share of its size: nothing grows over an eye
+    clears: float = 0.0  # margin without other parts' Gaussians, as a share of its size; keeps fur off an eye
 
     def to_local(self, points: Tensor) -> Tensor:
-        """World points in the shape's coordinates. [N,3] -> [N,3]"""
+        """Convert world points to the shape's coordinates. [N,3] -> [N,3]"""
         inverse: Tensor = torch.linalg.inv(self.matrix)
         return (points - self.center) @ inverse.T
 
     def depth(self, points: Tensor) -> Tensor:
-        """About how far below the surface points lie, world units, 0 outside. [N,3] world -> [N]"""
+        """Return the approximate depth of points below the surface, 0 outside; world units. [N,3] -> [N]"""
         depth = torch.zeros(len(points))
         local = self.to_local(points)
         inside = (self.shape.level(local) < 1).nonzero()[:, 0]
@@ -153,12 +153,12 @@ class Part:
         return depth
 
     def touches(self, other: Part) -> bool:
-        """Whether the spheres around the two parts meet."""
+        """Return whether the bounding spheres of two parts overlap."""
         return float((self.center - other.center).norm()) < self.reach + other.reach
 
     @property
     def reach(self) -> float:
-        """Radius of a sphere about the center that holds the part, world units."""
+        """Radius of the bounding sphere about the center, world units."""
         profile = self.shape.profile
         farthest = math.sqrt(2) if profile is None else float(profile.norm(dim=1).max())
         return farthest * float(self.matrix.norm(dim=0).max())
@@ -166,11 +166,11 @@ class Part:
 
 @dataclass(frozen=True)
 class Samples:
-    """Points on one part's surface."""
+    """Samples on the surface of one part."""
 
     points: Tensor  # world positions. [N,3]
-    local: Tensor  # the same in the shape's coordinates. [N,3]
-    normals: Tensor  # unit, outwards. [N,3]
+    local: Tensor  # the same positions in the shape's coordinates. [N,3]
+    normals: Tensor  # outward unit vectors. [N,3]
     spacing: Tensor  # distance to the neighbors, world units. [N]
 
     def __getitem__(self, index: Tensor) -> Samples:
@@ -181,13 +181,13 @@ class Samples:
 
 
 def sample(part: Part, count: int) -> Samples:
-    """`count` points on the part, a Fibonacci spiral spaced evenly by (weighted) world area."""
+    """Return `count` points on a part: a Fibonacci spiral, spaced evenly by (weighted) world area."""
     profile = part.shape.profile
     if profile is None:
         return _sample_panel(part, count)
     step = profile[1:] - profile[:-1]
     middle = 0.5 * (profile[1:] + profile[:-1])
-    turns = torch.arange(_TURNS) * (2 * math.pi / _TURNS)
+    turns = torch.arange(_ANGLE_STEPS) * (2 * math.pi / _ANGLE_STEPS)
     along_area = _area_element(part.matrix, middle, step, turns[::8, None]).mean(0)
     if part.density is not None:
         along_area = along_area * part.density(middle[:, 0])
@@ -199,7 +199,7 @@ def sample(part: Part, count: int) -> Samples:
     turn, turn_share = _spread(around_area, (index * _GOLDEN) % 1.0)
     whole = t.floor().long().clamp(0, len(step) - 1)
     spot = torch.lerp(profile[whole], profile[whole + 1], (t - whole).float()[:, None])
-    angle = (turn * (2 * math.pi / _TURNS)).float()
+    angle = (turn * (2 * math.pi / _ANGLE_STEPS)).float()
     local = torch.stack([spot[:, 0] * angle.cos(), spot[:, 1], spot[:, 0] * angle.sin()], dim=1)
 
     tangent = step[whole]
@@ -208,7 +208,7 @@ def sample(part: Part, count: int) -> Samples:
     )
     normals = local_normals @ torch.linalg.inv(part.matrix)
     element = _area_element(part.matrix, spot, tangent, angle)
-    cell = element * (2 * math.pi / _TURNS) / (count * t_share * turn_share).float()
+    cell = element * (2 * math.pi / _ANGLE_STEPS) / (count * t_share * turn_share).float()
     return Samples(
         local @ part.matrix.T + part.center,
         local,
@@ -218,7 +218,7 @@ def sample(part: Part, count: int) -> Samples:
 
 
 def _sample_panel(part: Part, count: int) -> Samples:
-    """`sample` of a flat square: a lattice of two irrational steps (Roberts 2018, the R2 sequence)."""
+    """Sample a flat square on a lattice of two irrational steps (Roberts 2018, the R2 sequence)."""
     index = torch.arange(1, count + 1, dtype=torch.float64)[:, None]
     shares = (0.5 + index * torch.tensor([0.7548776662466927, 0.5698402909980532], dtype=torch.float64)) % 1.0
     spot = (2 * shares - 1).float()
@@ -234,7 +234,7 @@ def _sample_panel(part: Part, count: int) -> Samples:
 
 
 def _area_element(matrix: Tensor, spot: Tensor, step: Tensor, angle: Tensor) -> Tensor:
-    """World area of a profile step turned by one radian about y. [...,2], [...,2], [...] -> [...]"""
+    """Return the world area of a profile step rotated by 1 rad about y. [...,2], [...,2], [...] -> [...]"""
     cos = angle.cos()
     sin = angle.sin()
     across = step[..., 0]
@@ -246,7 +246,7 @@ def _area_element(matrix: Tensor, spot: Tensor, step: Tensor, angle: Tensor) -> 
 
 
 def _spread(density: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
-    """Where shares 0..1 of the whole lie along a histogram, in bins, and each one's bin as a share."""
+    """Return the positions of quantiles of a histogram, in bins, and the share of each one's bin."""
     portions = density.double() / density.double().sum()
     edges = torch.cat([portions.new_zeros(1), portions.cumsum(0)])
     bins = (torch.searchsorted(edges, shares, right=True) - 1).clamp(0, len(portions) - 1)
