@@ -1,4 +1,4 @@
-"""Cameras: OpenCV axes (x right, y down, z forward), pixel centers at +0.5, column vectors."""
+"""Cameras with OpenCV axes (x right, y down, z forward), pixel centers at +0.5 and column vectors."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-_WIDEST = 4.0
-_RADII = 4096
-"""Up to which r (76°) and at how many places the lens is checked for folding back."""
+_MAX_LENS_RADIUS = 4.0  # largest radius at which a lens is checked for folding back, at a distance of 1 (76°)
+_LENS_SAMPLES = 4096  # radii that are checked
 
 
 @dataclass(frozen=True)
@@ -37,11 +36,11 @@ class Lens:
             raise ValueError(f"the lens has a number that is not finite: {self}")
 
     def __bool__(self) -> bool:
-        """Whether it bends anything."""
+        """Return whether the lens distorts."""
         return any(astuple(self))
 
     def distort(self, rays: Tensor) -> Tensor:
-        """Where rays through (x, y) at z = 1 meet the sensor, in the same units. [...,2] -> [...,2]"""
+        """Return the sensor positions of rays through (x, y, 1), in the same units. [...,2] -> [...,2]"""
         x = rays[..., 0]
         y = rays[..., 1]
         square = x * x + y * y
@@ -55,24 +54,24 @@ class Lens:
         )
 
     def valid_radius(self) -> float:
-        """The r up to which what is farther out stays farther out; beyond it the formula folds back."""
-        r = torch.linspace(0.0, _WIDEST, _RADII, dtype=torch.float64)
+        """Return the radius up to which the distortion is monotone. Beyond it the formula folds back."""
+        r = torch.linspace(0.0, _MAX_LENS_RADIUS, _LENS_SAMPLES, dtype=torch.float64)
         slope = 1 + r**2 * (3 * self.k1 + r**2 * (5 * self.k2 + r**2 * 7 * self.k3))
         folded = (slope <= 0).nonzero()
         return math.inf if not len(folded) else float(r[max(0, int(folded[0]) - 1)])
 
 
 def undistort(photograph: Tensor, K: Tensor, lens: Lens) -> tuple[Tensor, Tensor]:
-    """A photograph as a pinhole with the same intrinsics would have taken it, sampled bilinearly.
+    """Undistort a photograph to a pinhole camera with the same intrinsics, with bilinear sampling.
 
     Args:
-        photograph: taken through `lens`. [H,W,3] 0..1
-        K: intrinsics of both, pixels of the photograph; pixel centers at +0.5. [3,3]
-        lens: what bent it
+        photograph: distorted image, 0 to 1. [H,W,3]
+        K: intrinsics of both images, in pixels of the photograph; pixel centers at +0.5. [3,3]
+        lens: distortion of the photograph
 
     Returns:
-        the straight picture [H,W,3], and which of its pixels the photograph shows at all [H,W] bool (the
-        others are 0)
+        Undistorted image [H,W,3], and a mask of its pixels that are in the photograph [H,W] bool. Other
+        pixels are 0.
     """
     height, width = photograph.shape[:2]
     focal = torch.stack([K[0, 0], K[1, 1]]).double()
@@ -94,21 +93,21 @@ def undistort(photograph: Tensor, K: Tensor, lens: Lens) -> tuple[Tensor, Tensor
 
 
 MAX_SAMPLING = 16.0
-"""Of `Camera.sampling`: Gaussians without any extent are still drawn."""
+"""Largest `Camera.sampling` for which Gaussians without extent are still drawn."""
 
 NEAR = 0.01
-"""Camera z at and below which nothing is drawn, world units; as `progdf.rasterize`."""
+"""Camera z at and below which nothing is drawn, world units, as in `progdf.rasterize`."""
 
 
 RIGID_TOLERANCE = 4e-4
-"""Largest entry of R Rᵀ − I, R the rotation of a viewmat: the margin of `rasterize.cpu.forward.extents`."""
+"""Largest entry of R Rᵀ − I of a viewmat with rotation R: the margin of `rasterize.cpu.forward.extents`."""
 
-_OBLIQUE_TOLERANCE = 1e-6  # of intrinsics that are not read, as a share of the focal length
+_OBLIQUE_TOLERANCE = 1e-6  # largest skew, as a share of the focal length; no engine reads it
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera.
+    """Pinhole camera.
 
     Raises:
         ValueError: a shape is wrong, a size or focal length is not positive, a number is not finite, the
@@ -119,17 +118,17 @@ class Camera:
     K: Tensor  # intrinsics in pixels, [[fx,0,cx],[0,fy,cy],[0,0,1]]. [3,3] float32
     width: int  # image width in pixels, ≥ 1
     height: int  # image height in pixels, ≥ 1
-    name: str = ""  # where it came from, for messages and file names
-    # what bends photographs that this camera took; a render is straight, so nothing that draws asks
+    name: str = ""  # source of the camera, for messages and file names
+    # distortion of this camera's photographs; rasterizers ignore it, because renders are undistorted
     lens: Lens | None = None
-    # depth at and below which a training draws nothing, world units, see `bounds.near_plane`
+    # near plane of a training, world units, see `bounds.near_plane`
     near: float = NEAR
-    # its pixels are samples of a picture so many times as large, whose finer pixels blur Gaussians less; of
-    # trainings: OpenGL draws pictures
+    # the pixels are samples of an image this many times as large, whose smaller pixels blur Gaussians less;
+    # for trainings only, ignored by OpenGL
     sampling: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check every field; the engines rely on it."""
+        """Check every field, because the engines do not."""
         for name, side in (("viewmat", 4), ("K", 3)):
             shape = list(getattr(self, name).shape)
             if shape != [side, side]:
@@ -147,21 +146,21 @@ class Camera:
 
     @property
     def c2w(self) -> Tensor:
-        """Camera → world. [4,4]"""
+        """Camera to world matrix. [4,4]"""
         inverse: Tensor = torch.linalg.inv(self.viewmat)
         return inverse
 
     @property
     def position(self) -> Tensor:
-        """The camera's center in world units. [3]"""
+        """Position of the camera, world units. [3]"""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
     def to(self, device: torch.device) -> Camera:
-        """The same camera with its matrices on another device."""
+        """Return the camera with its matrices on another device."""
         return replace(self, viewmat=self.viewmat.to(device), K=self.K.to(device))
 
     def resize(self, width: int, height: int) -> Camera:
-        """The same view in another image size; the intrinsics scale with each axis."""
+        """Return the camera with another image size; the intrinsics scale with each axis."""
         scale = torch.tensor([[width / self.width], [height / self.height], [1.0]], dtype=self.K.dtype)
         return replace(self, K=self.K * scale, width=width, height=height)
 
@@ -173,7 +172,7 @@ def rigid_fault(matrix: Tensor, tolerance: float = RIGID_TOLERANCE) -> str:
         matrix: column vectors, every number finite. [4,4]
         tolerance: largest accepted entry of R Rᵀ − I
     """
-    rows = matrix.tolist()  # plain numbers: a window makes a camera for every frame
+    rows = matrix.tolist()  # plain numbers are faster, and the viewer makes a camera for every frame
     if rows[3] != [0.0, 0.0, 0.0, 1.0]:
         last = ", ".join(f"{entry:g}" for entry in rows[3])
         return f"has the last row [{last}]"
@@ -214,10 +213,13 @@ def _check_intrinsics(K: list[list[float]]) -> None:
 
 
 def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
-    """World → camera matrix of a camera at `eye` that looks at `target`. [3], [3], [3] -> [4,4] float32.
+    """Return the world to camera matrix of a camera at `eye` that looks at `target`. [4,4] float32
 
-    `up` is the world direction that shall point up in the image; if it is parallel to the view direction,
-    the nearest other axis is taken.
+    Args:
+        eye: position of the camera, world units. [3]
+        target: point in the middle of the image, world units. [3]
+        up: world direction that points up in the image. If it is parallel to the viewing direction, the axis
+            most perpendicular to that is used. [3]
     """
     eye, target, up = (v.to(torch.float64) for v in (eye, target, up))
     forward = target - eye
@@ -238,6 +240,6 @@ def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
 
 
 def intrinsics(fov_y: float, width: int, height: int) -> Tensor:
-    """Intrinsics of a centered camera with square pixels; `fov_y` in radians. [3,3] float32"""
+    """Return the intrinsics of a centered camera with square pixels; `fov_y` in radians. [3,3] float32"""
     focal = 0.5 * height / float(torch.tan(torch.tensor(0.5 * fov_y, dtype=torch.float64)))
     return torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])

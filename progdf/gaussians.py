@@ -1,4 +1,4 @@
-"""The scene: raw (pre-activation) Gaussian parameters, with the meaning of the 3DGS .ply file."""
+"""Scene as raw (pre-activation) Gaussian parameters, with the meaning of the 3DGS .ply file."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BASE_CHANNELS = sum(_WIDTHS.values())
 _SH_BANDS = {0: 0, 3: 1, 8: 2, 15: 3, 24: 4}
 
 Origin = tuple[float, float, float]
-"""A point of the world in float64, which float32 coordinates are relative to."""
+"""Point of the world in float64; float32 coordinates are relative to it."""
 
 ZERO: Origin = (0.0, 0.0, 0.0)
 
@@ -42,10 +42,10 @@ class Gaussians:
     logit_opacities: Tensor  # opacities before the sigmoid. [N]
     sh0: Tensor  # color, band 0 of the spherical harmonics. [N,3]
     shN: Tensor  # color, bands 1 to d. [N,K,3] with K = (d+1)² − 1, so 0, 3, 8, 15 or 24
-    # trained with Mip-Splatting's 2D filter and to be drawn with it, see `rasterize`
+    # trained and drawn with Mip-Splatting's 2D filter, see `rasterize`
     antialiased: bool = False
-    # where in the world the means begin, see `progdf.formats.repair.find_origin`. Everything inside the
-    # program, cameras too, is relative to it; files, options and messages are in the world
+    # world position of the origin of the means, see `progdf.formats.repair.find_origin`. Coordinates inside
+    # the program, including cameras, are relative to it. Files, options and messages use world coordinates
     origin: Origin = ZERO
 
     def __post_init__(self) -> None:
@@ -67,17 +67,17 @@ class Gaussians:
         return int(self.means.shape[0])
 
     def __getitem__(self, index: Tensor | slice) -> Gaussians:
-        """The selected rows. `index`: int64 indices [M], a bool mask [N] or a slice."""
+        """Return the selected rows. `index`: int64 indices [M], a bool mask [N] or a slice."""
         return replace(self, **{name: getattr(self, name)[index] for name in ATTRIBUTES})
 
     @property
     def world_means(self) -> Tensor:
-        """Centers in the world. [N,3] float64"""
+        """Centers in world coordinates. [N,3] float64"""
         return self.means.detach().double() + torch.tensor(self.origin, dtype=torch.float64)
 
     @property
     def sh_degree(self) -> int:
-        """Degree of the spherical harmonics, 0..4."""
+        """Degree of the spherical harmonics, 0 to 4."""
         return _SH_BANDS[int(self.shN.shape[1])]
 
     @property
@@ -87,7 +87,7 @@ class Gaussians:
 
     @property
     def opacities(self) -> Tensor:
-        """Opacities in (0,1). [N]"""
+        """Opacities, 0 to 1. [N]"""
         return self.logit_opacities.sigmoid()
 
     @property
@@ -101,17 +101,17 @@ class Gaussians:
         return torch.cat([self.sh0[:, None], self.shN], dim=1)
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Gaussians:
-        """The same Gaussians on another device or in another floating type."""
+        """Return the Gaussians on another device or with another floating-point type."""
         return replace(
             self, **{name: getattr(self, name).to(device=device, dtype=dtype) for name in ATTRIBUTES}
         )
 
     def replace_rows(self, rows: Tensor, packed: Tensor) -> Gaussians:
-        """A copy with the given rows set from packed values; every other row keeps its bytes.
+        """Return a copy with the given rows set from packed values; every other row keeps its bytes.
 
         Args:
             rows: row indices, unique. [M] int64
-            packed: new raw values, as `pack` gives them. [M,C]. With C = 14 shN is left alone.
+            packed: new raw values, as `pack` gives them; with C = 14 shN is unchanged. [M,C]
         """
         changed: dict[str, Any] = {}
         for name, channels in attribute_slices(packed.shape[1]).items():
@@ -122,19 +122,19 @@ class Gaussians:
 
 
 def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
-    """The rows of all parts in order; origin and antialiasing are the first one's, bands must be alike."""
+    """Concatenate the rows of parts with equal SH degree; origin and `antialiased` are those of the first."""
     joined: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in parts]) for name in ATTRIBUTES}
     return replace(parts[0], **joined)
 
 
 def from_arrays(arrays: Mapping[str, NDArray[np.floating]], antialiased: bool = False) -> Gaussians:
-    """Gaussians of numpy's arrays by attribute, in their types."""
+    """Return Gaussians from numpy arrays by attribute name; the dtypes are unchanged."""
     tensors: dict[str, Any] = {n: torch.from_numpy(np.ascontiguousarray(a)) for n, a in arrays.items()}
     return Gaussians(**tensors, antialiased=antialiased)
 
 
 def attribute_slices(channels: int) -> dict[str, slice]:
-    """Where each attribute lies in a packed row of `channels` numbers (14, or 14 + 3K with shN).
+    """Return the slice of each attribute in a packed row of `channels` numbers (14, or 14 + 3K with shN).
 
     Order: means 3, log_scales 3, quats 4, logit_opacities 1, sh0 3, then shN as K·3, rgb innermost.
     """
@@ -151,13 +151,13 @@ def attribute_slices(channels: int) -> dict[str, slice]:
 
 
 def pack(gaussians: Gaussians, with_shN: bool = False) -> Tensor:
-    """Raw parameters side by side, in the order of `attribute_slices`. [N,14] or [N,14+3K]"""
+    """Return the raw parameters in one tensor, in the order of `attribute_slices`. [N,14] or [N,14+3K]"""
     parts = [getattr(gaussians, name) for name in (ATTRIBUTES if with_shN else _WIDTHS)]
     return torch.cat([part.flatten(1) if part.ndim > 1 else part[:, None] for part in parts], dim=1)
 
 
 def unpack(packed: Tensor, shN: Tensor) -> Gaussians:
-    """The inverse of `pack`; `shN` [N,K,3] is used where the packed rows hold no higher bands."""
+    """Invert `pack`; `shN` [N,K,3] is used if the packed rows hold no higher bands."""
     parts: dict[str, Any] = {
         name: packed[:, channels] for name, channels in attribute_slices(packed.shape[1]).items()
     }

@@ -1,4 +1,4 @@
-"""Region: the Gaussians that an edit may change, with a soft score each; set operations and simple shapes.
+"""Region, the Gaussians that an edit may change, with soft scores; set operations and simple shapes.
 
 `progdf.scene.regions` parses the text form of a region.
 """
@@ -16,7 +16,7 @@ from .gaussians import Gaussians
 
 @dataclass(frozen=True)
 class Region:
-    """A named set of Gaussians with a soft score."""
+    """Named set of Gaussians with a soft score."""
 
     name: str
     members: Tensor  # sorted, unique row indices into the scene. [M] int64

@@ -28,29 +28,29 @@ _C3 = (
 )
 
 _SAMPLES = 20  # directions, at least as many as basis functions
-_FIT_DIRECTIONS = 96  # directions over which `map_colors` fits
-_CHUNK = 1 << 14  # Gaussians that are turned at once
+_FIT_DIRECTIONS = 96  # directions of the fit in `map_colors`
+_CHUNK = 1 << 14  # Gaussians that are processed at once
 
 
 def sh0_to_rgb(sh0: Tensor) -> Tensor:
-    """Color of band 0 alone, before the clamp at 0. [...,3] -> [...,3]"""
+    """Convert band 0 to a color, without the clamp at 0. [...,3] -> [...,3]"""
     return sh0 * C0 + 0.5
 
 
 def rgb_to_sh0(rgb: Tensor) -> Tensor:
-    """Band 0 that shows `rgb` (0..1). [...,3] -> [...,3]"""
+    """Convert a color, 0 to 1, to band 0. [...,3] -> [...,3]"""
     return (rgb - 0.5) / C0
 
 
 def basis(degree: int, directions: Tensor) -> Tensor:
-    """Values of the (degree+1)² real basis functions.
+    """Return the values of the (degree+1)² real basis functions. [N,(degree+1)²]
 
     Args:
-        degree: 0..3 (band 4, where a file has it, is carried along and not shown)
+        degree: 0 to 3; band 4 of a file is preserved but never drawn
         directions: unit vectors from the camera center to the Gaussian, world axes. [N,3]
 
-    Returns:
-        [N,(degree+1)²]
+    Raises:
+        ValueError: the degree is out of range.
     """
     if not 0 <= degree <= 3:
         raise ValueError(f"SH degree {degree} is not supported, expected 0 to 3")
@@ -83,23 +83,23 @@ def basis(degree: int, directions: Tensor) -> Tensor:
 
 
 def shade(degree: int, directions: Tensor, sh: Tensor) -> Tensor:
-    """Color seen along `directions`: max(0, Σ basis·sh + 0.5). [N,3], [N,≥(degree+1)²,3] -> [N,3]"""
+    """Return the color along `directions`: max(0, Σ basis·sh + 0.5). [N,3], [N,≥(degree+1)²,3] -> [N,3]"""
     weights = basis(degree, directions)
     return ((weights[..., None] * sh[:, : weights.shape[-1]]).sum(dim=1) + 0.5).clamp_min(0.0)
 
 
 def rotation_change(shN: Tensor, quats: Tensor, part: Tensor | None = None) -> Tensor:
-    """What a turn adds to higher bands: what was seen along d is then seen along the turned d.
+    """Return the change of higher bands by a rotation, so that the color along d moves to the rotated d.
 
-    Exactly 0 where nothing turns; no gradient of the turn.
+    The change is exactly 0 for the identity. It has no gradient with respect to the rotation.
 
     Args:
-        shN: bands 1 to d; band 4, which is not shown, stays. [N,K,3]
-        quats: unit quaternions, [N,4], or [P,4] of parts
-        part: which part each Gaussian belongs to. [N] int64
+        shN: bands 1 to d; band 4, which is never drawn, is unchanged. [N,K,3]
+        quats: unit quaternions wxyz, one per Gaussian [N,4] or one per part [P,4]
+        part: index of each Gaussian's part. [N] int64
 
     Returns:
-        [N,K,3]
+        Offset of shN. [N,K,3]
     """
     degree = min(3, math.isqrt(shN.shape[1] + 1) - 1)
     change = torch.zeros_like(shN)
@@ -114,11 +114,11 @@ def rotation_change(shN: Tensor, quats: Tensor, part: Tensor | None = None) -> T
 
 
 def half_turn(shN: Tensor, signs: Signs) -> Tensor:
-    """Return the higher bands after half a turn about an axis, bit for bit but for signs.
+    """Return the higher bands after a half turn about an axis, by exact sign changes.
 
     Args:
         shN: bands 1 to d. [N,K,3]
-        signs: factors of x, y and z; (1, −1, −1) is half a turn about x
+        signs: factors of x, y and z; (1, −1, −1) is a half turn about x
     """
     degree = math.isqrt(shN.shape[1] + 1) - 1
     x, y, z = signs
@@ -137,8 +137,8 @@ def half_turn(shN: Tensor, signs: Signs) -> Tensor:
 def map_colors(sh: Tensor, function: Callable[[Tensor], Tensor]) -> Tensor:
     """Return the SH whose colors are a function of the colors of other SH.
 
-    Exact for band 0 alone. Otherwise the least-squares fit over evenly spread directions, as a function of a
-    band-limited color is not band-limited.
+    The result is exact for band 0 alone. Otherwise it is a least-squares fit over evenly spread directions,
+    because a function of a band-limited color is not band-limited.
 
     Args:
         sh: all bands. [N,K+1,3]
@@ -165,7 +165,7 @@ def spread_directions(count: int) -> Tensor:
 
 
 def _wigner_change(degree: int, quats: Tensor) -> Tensor:
-    """The Wigner matrices of bands 1 to `degree`, less the identity. [N,4] -> [N,K,K] float64"""
+    """Return the Wigner matrices of bands 1 to `degree` minus the identity. [N,4] -> [N,K,K] float64"""
     directions, inverse = _samples(degree, quats.device)
     back = quats.double() * quats.new_tensor([1.0, -1.0, -1.0, -1.0], dtype=torch.float64)
     turned = rotate_vectors(directions[None], back[:, None])
@@ -175,6 +175,6 @@ def _wigner_change(degree: int, quats: Tensor) -> Tensor:
 
 @cache
 def _samples(degree: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Directions, and the bands from the colors seen along them. [J,3], [K,J] float64"""
+    """Return directions [J,3], and the matrix from their colors to bands 1 to `degree` [K,J]; float64."""
     directions = spread_directions(_SAMPLES)
     return directions.to(device), torch.linalg.pinv(basis(degree, directions))[1:].to(device)

@@ -1,7 +1,7 @@
-"""Similarity motions of a region's parts: each is shifted, turned and scaled about its own center.
+"""Similarity motions of a region's parts: each is translated, rotated and scaled about its own center.
 
-Members' raw rows follow: centers move, log-scales gain the part's, quaternions and higher SH bands are
-turned. Opacity and the color of band 0 stay.
+The members' raw rows follow. Centers move, the part's log-scale is added to log-scales, and quaternions and
+higher SH bands are rotated. Opacity and the color of band 0 are unchanged.
 """
 
 from __future__ import annotations
@@ -17,72 +17,72 @@ from progdf.sh import rotation_change
 
 _COLUMNS = attribute_slices(BASE_CHANNELS)
 GEOMETRY = slice(0, _COLUMNS["quats"].stop)  # means, log-scales and quaternions come first in a packed row
-LOOK = slice(GEOMETRY.stop, BASE_CHANNELS)
+LOOK = slice(GEOMETRY.stop, BASE_CHANNELS)  # opacity and color of band 0
 _BANDS = slice(BASE_CHANNELS, None)
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Where each of P parts has gone."""
+    """Motion of each of P parts."""
 
-    shift: Tensor  # of the part's center, world units. [P,3]
-    log_scale: Tensor  # log of the part's growth. [P]
+    shift: Tensor  # translation of the part's center, world units. [P,3]
+    log_scale: Tensor  # log of the part's scale factor. [P]
     turn: Tensor  # rotation vector, axis times angle in radians. [P,3]
 
 
 @dataclass(frozen=True)
 class Parts:
-    """A region taken apart."""
+    """Decomposition of a region into P parts."""
 
-    part: Tensor  # which part each member belongs to. [M] int64
-    centers: Tensor  # mean of each part's centers, about which it turns and grows. [P,3]
-    sizes: Tensor  # root mean square distance from it, world units, > 0. [P]
+    part: Tensor  # index of each member's part. [M] int64
+    centers: Tensor  # mean of each part's centers, the pivot of rotation and scale. [P,3]
+    sizes: Tensor  # root mean square distance from that center, world units, > 0. [P]
 
     def __len__(self) -> int:
         return len(self.centers)
 
     def rest_motion(self) -> Motion:
-        """No part has moved."""
+        """Return the motion that moves no part."""
         nothing = torch.zeros_like(self.centers)
         return Motion(nothing, nothing[:, 0], nothing)
 
 
 def make_parts(rows: Tensor, part: Tensor) -> Parts:
-    """Centers and sizes of the parts. `rows`: packed members [M,C]; `part`: [M] int64, each below P used"""
+    """Return the parts of packed members [M,C]; `part` [M] int64 uses every index below P."""
     means, log_scales, _ = split_geometry(rows)
     counts = torch.bincount(part).to(means)
     nothing = means.new_zeros(len(counts), 3)
     centers = nothing.index_add(0, part, means) / counts[:, None]
     squares = (means - centers[part]).square().sum(dim=1)
     sizes = (nothing[:, 0].index_add(0, part, squares) / counts).sqrt()
-    largest = log_scales.exp().amax(dim=1).mean()  # a part of one Gaussian has its size
+    largest = log_scales.exp().amax(dim=1).mean()  # a part of one Gaussian has that Gaussian's size
     return Parts(part, centers, torch.maximum(sizes, 1e-3 * largest).clamp_min(1e-9))
 
 
 def move_rows(rows: Tensor, parts: Parts, motion: Motion) -> Tensor:
-    """Raw rows where the motion takes them; differentiable. [M,C] -> [M,C]"""
+    """Return raw rows after the motion; differentiable. [M,C] -> [M,C]"""
     bands = rows[:, _BANDS]
     turned = bands + band_change(bands, turn_quats(motion.turn), parts.part)
     return torch.cat([_move_geometry(rows, parts, motion), rows[:, LOOK], turned], dim=1)
 
 
 def carry_offsets(original: Tensor, offsets: Tensor, parts: Parts, motion: Motion) -> Tensor:
-    """Offsets within the parts' frames -> offsets from the original, once the parts have moved.
+    """Convert offsets within the parts' frames to offsets from the original after a motion.
 
     Args:
         original: raw member rows. [M,C]
-        offsets: what each member does besides going with its part. [M,C]
-        parts, motion: see there
+        offsets: offsets of each member relative to its part. [M,C]
+        parts, motion: parts and their motion
 
     Returns:
-        Raw-space offsets, differentiable. [M,C]; opacity's and color's are the given ones
+        Raw-space offsets, differentiable. Those of opacity and color are unchanged. [M,C]
     """
     moved = _move_geometry(original[:, GEOMETRY] + offsets[:, GEOMETRY], parts, motion)
     return offsets_to(moved, original, offsets, turn_quats(motion.turn), parts.part)
 
 
 def local_offsets(original: Tensor, offsets: Tensor, parts: Parts, motion: Motion) -> Tensor:
-    """The inverse of `carry_offsets`. [M,C] -> [M,C]"""
+    """Invert `carry_offsets`. [M,C] -> [M,C]"""
     part = parts.part
     means, log_scales, quats = split_geometry(original[:, GEOMETRY] + offsets[:, GEOMETRY])
     turns = turn_quats(-motion.turn)
@@ -100,15 +100,15 @@ def local_offsets(original: Tensor, offsets: Tensor, parts: Parts, motion: Motio
 def offsets_to(
     geometry: Tensor, original: Tensor, offsets: Tensor, turns: Tensor, part: Tensor | None = None
 ) -> Tensor:
-    """Offsets to moved geometry, of opacity and color as they are, of higher SH bands turned. [M,C]
+    """Return the offsets from the original to moved geometry, with rotated higher SH bands. [M,C]
 
-    See `sh.rotation_change`.
+    Offsets of opacity and color are unchanged. See also `sh.rotation_change`.
 
     Args:
-        geometry: where means, log-scales and quaternions have come. [M,10]
+        geometry: moved means, log-scales and quaternions. [M,10]
         original, offsets: raw member rows, and offsets within their frames. [M,C]
-        turns: unit quaternions, of the members, or of parts. [M,4] or [P,4]
-        part: of each member. [M] int64
+        turns: unit quaternions of the members [M,4] or of parts [P,4]
+        part: index of each member's part. [M] int64
     """
     bands = offsets[:, _BANDS]
     turned = bands + band_change(original[:, _BANDS] + bands, turns, part)
@@ -116,12 +116,12 @@ def offsets_to(
 
 
 def band_change(bands: Tensor, turns: Tensor, part: Tensor | None = None) -> Tensor:
-    """What turns add to packed higher bands. [M,3K] -> [M,3K]"""
+    """Return the change of packed higher bands by rotations. [M,3K] -> [M,3K]"""
     return rotation_change(bands.reshape(len(bands), bands.shape[1] // 3, 3), turns, part).flatten(1)
 
 
 def _move_geometry(rows: Tensor, parts: Parts, motion: Motion) -> Tensor:
-    """Means, log-scales and quaternions where the motion takes them. [M,≥10] -> [M,10]"""
+    """Return means, log-scales and quaternions after the motion. [M,≥10] -> [M,10]"""
     part = parts.part
     means, log_scales, quats = split_geometry(rows)
     turn = turn_quats(motion.turn)[part]
@@ -132,7 +132,7 @@ def _move_geometry(rows: Tensor, parts: Parts, motion: Motion) -> Tensor:
 
 
 def interpolate_motion(a: Motion, b: Motion, share: float) -> Motion:
-    """The way from one motion to another: shift and log-scale straight, the turn along the great circle."""
+    """Interpolate motions: shift and log-scale linearly, the rotation along the great circle."""
     start = turn_quats(a.turn)
     remaining = quat_turns(multiply_quats(turn_quats(-a.turn), turn_quats(b.turn)))
     return Motion(
@@ -143,5 +143,5 @@ def interpolate_motion(a: Motion, b: Motion, share: float) -> Motion:
 
 
 def split_geometry(rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Means [M,3], log-scales [M,3] and quaternions [M,4] of packed rows."""
+    """Return means [M,3], log-scales [M,3] and quaternions [M,4] of packed rows."""
     return rows[:, _COLUMNS["means"]], rows[:, _COLUMNS["log_scales"]], rows[:, _COLUMNS["quats"]]

@@ -1,4 +1,4 @@
-"""What a notebook shows of a scene, a field or an edit: a picture and a few lines, as HTML."""
+"""HTML card of a scene, field or edit for notebooks: a picture and a few lines of text."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from progdf.scene.subject import fit_camera, is_room, richest_turn, standpoint, 
 from progdf.scene.up_axis import guess_up
 from progdf.terminal import escape_text, file_size, format_count
 
-_SIZE = 300, 200
-_SAMPLED = 2000  # Gaussians that the camera is chosen by, and members whose course is drawn
-_LONGEST = 60  # characters of a name
+_SIZE = 300, 200  # width and height of the picture, pixels
+_MAX_SAMPLED_ROWS = 2000  # Gaussians used to choose the camera, and members used for the chart
+_MAX_LINE_LENGTH = 60  # characters of a line; longer lines are cut
 _COLORS = {"geometry": "#2f7ed8", "opacity": "#8a8f98", "color": "#e0652b"}
 
 
 def to_html(shown: Gaussians | BakedField | Gdf) -> str:
-    """A card for a notebook; without its picture where there is none to be had. Texts are a stranger's."""
+    """Return a card for a notebook, without a picture if drawing fails. Untrusted texts are escaped."""
     picture = ""
-    with suppress(Exception):  # of numbers that no engine draws, on a machine that draws nothing
+    with suppress(Exception):  # invalid numbers, or a machine that cannot draw
         picture = _still(shown) if isinstance(shown, Gaussians) else _chart(shown)
     title, *lines = (_plain(line) for line in _lines(shown))
     text = "".join(f"<div style='opacity:.7'>{line}</div>" for line in lines)
@@ -42,11 +42,13 @@ def to_html(shown: Gaussians | BakedField | Gdf) -> str:
 
 
 def _plain(text: str) -> str:
-    return html.escape(escape_text(text if len(text) <= _LONGEST else text[: _LONGEST - 1] + "…"))
+    return html.escape(
+        escape_text(text if len(text) <= _MAX_LINE_LENGTH else text[: _MAX_LINE_LENGTH - 1] + "…")
+    )
 
 
 def _lines(shown: Gaussians | BakedField | Gdf) -> list[str]:
-    """A heading, and what is known of it."""
+    """Return a heading and lines of facts."""
     if isinstance(shown, Gaussians):
         stored = (getattr(shown, name) for name in ATTRIBUTES)
         size = sum(part.numel() * part.element_size() for part in stored)
@@ -65,12 +67,12 @@ def _lines(shown: Gaussians | BakedField | Gdf) -> list[str]:
 
 
 def _still(scene: Gaussians) -> str:
-    """A scene from the front on nothing, as a WebP image; "" of an empty one."""
+    """Return a view of a scene from the front as a transparent WebP image; "" for an empty scene."""
     if not len(scene):
         return ""
     with torch.no_grad():
         scene = scene.to("cpu", torch.float32)
-        camera = _first_camera(scene[:: -(-len(scene) // _SAMPLED)])
+        camera = _first_camera(scene[:: -(-len(scene) // _MAX_SAMPLED_ROWS)])
         drawn = render(scene, camera, (0.0, 0.0, 0.0), engine="cpu")
     alpha = 1 - drawn.transmittance[..., None]
     pixels = torch.cat([drawn.image / alpha.clamp_min(1e-6), alpha], dim=2).clamp(0, 1) * 255
@@ -82,7 +84,7 @@ def _still(scene: Gaussians) -> str:
 
 
 def _first_camera(scene: Gaussians) -> Camera:
-    """As the window meets a scene: its subject from the front and a little above, a room from inside."""
+    """Return the first camera of the viewer: slightly above the subject's front, or inside a room."""
     up = guess_up(scene)
     if is_room(scene, up):
         return Camera(look_at(*standpoint(scene, up), up), intrinsics(math.radians(60.0), *_SIZE), *_SIZE)
@@ -91,28 +93,31 @@ def _first_camera(scene: Gaussians) -> Camera:
 
 
 def _chart(shown: BakedField | Gdf) -> str:
-    """How far each kind of change is on its way at each strength, recordings as ticks; "" where none is."""
+    """Return a chart of the progress of each kind of change over the strength; "" if nothing changes.
+
+    Ticks mark the recorded strengths.
+    """
     field = shown if isinstance(shown, BakedField) else shown.field
-    rows = slice(None, None, max(1, -(-field.members // _SAMPLED)))
-    some = {
+    rows = slice(None, None, max(1, -(-field.members // _MAX_SAMPLED_ROWS)))
+    sampled = {
         name: replace(each, end_offset=each.end_offset[rows], residual_basis=each.residual_basis[:, rows])
         for name, each in field.attributes.items()
     }
-    field = replace(field, attributes=some, origin=None)
+    field = replace(field, attributes=sampled, origin=None)
     strengths = [i / 20 for i in range(21)]
     lines = []
     for kind, color in _COLORS.items():
-        names = [name for name in some if KINDS[name] == kind]
+        names = [name for name in sampled if KINDS[name] == kind]
         ends = {name: float(field.attribute_offsets(name, 1.0).norm()) for name in names}
         names = [name for name in names if ends[name] > 0]
         if not names:
             continue
-        way = [
+        progress = [
             sum(float(field.attribute_offsets(n, s).norm()) / ends[n] for n in names) / len(names)
             for s in strengths
         ]
         points = " ".join(
-            f"{190 * s + 5:.1f},{115 - 100 * y:.1f}" for s, y in zip(strengths, way, strict=True)
+            f"{190 * s + 5:.1f},{115 - 100 * y:.1f}" for s, y in zip(strengths, progress, strict=True)
         )
         lines += [f"<polyline points='{points}' fill='none' stroke='{color}' stroke-width='2'/>"]
         lines += [f"<text x='9' y='{5 + 13 * len(lines) // 2}' fill='{color}' font-size='11'>{kind}</text>"]

@@ -1,5 +1,4 @@
-"""Text for a person at a terminal: numbers and sizes in words, names without control characters; and what a
-terminal sends to end a program."""
+"""Terminal output and signals: formatted numbers, text without control characters, and interruption."""
 
 from __future__ import annotations
 
@@ -19,7 +18,7 @@ from queue import SimpleQueue
 from types import FrameType
 
 ENDINGS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
-"""Sent by who wants a process to end, and by a terminal that is closed; Windows has no SIGHUP."""
+"""Signals that request the end of the process, or report a closed terminal. Windows has no SIGHUP."""
 
 
 REDELIVERY_DELAY_S = 0.02  # long enough for the callback that lost a signal to return
@@ -43,12 +42,12 @@ _delivery = _Delivery()
 def handle_signals(
     signals: tuple[signal.Signals, ...], handler: Callable[[int, FrameType | None], None]
 ) -> Iterator[None]:
-    """Handle signals meanwhile; ignored ones stay ignored, as under nohup.
+    """Handle signals inside the block. Ignored signals stay ignored, as under nohup.
 
     Python ignores an exception that leaves a weakref callback, a `__del__` or a ctypes callback. A
-    KeyboardInterrupt that is lost in this way is noted by `sys.unraisablehook`, and its signal is sent again.
+    KeyboardInterrupt lost in this way is detected by `sys.unraisablehook`, and its signal is sent again.
 
-    Python lets only the main thread handle signals; in other threads nothing is changed.
+    Python lets only the main thread handle signals. In other threads the block changes nothing.
 
     Args:
         signals: the signals to handle
@@ -77,14 +76,14 @@ def handle_signals(
     earlier_hook = sys.unraisablehook
     sys.unraisablehook = note_lost_interrupt
     _delivery.depth += 1
-    heeded = [number for number in signals if signal.getsignal(number) != signal.SIG_IGN]
-    earlier = {number: signal.signal(number, handle) for number in heeded}
+    handled = [number for number in signals if signal.getsignal(number) != signal.SIG_IGN]
+    earlier = {number: signal.signal(number, handle) for number in handled}
     try:
         yield
     finally:
         _delivery.depth -= 1
-        for number, was in earlier.items():
-            signal.signal(number, was)
+        for number, earlier_handler in earlier.items():
+            signal.signal(number, earlier_handler)
         sys.unraisablehook = earlier_hook
 
 
@@ -106,12 +105,12 @@ def signal_main_thread(number: int = signal.SIGINT) -> None:
 
 
 def escape_text(text: str) -> str:
-    """The text on one line, with its escape (\\x1b, \\n) for what is nothing to look at."""
+    """Return the text on one line, with escapes (\\x1b, \\n) for characters that are not printable."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def shorten(text: str, length: int = 80) -> str:
-    """Return a text as a message repeats it, its middle left out if it is longer than `length`."""
+    """Return a text for a message, without its middle if it is longer than `length` characters."""
     if len(text) <= length:
         return text
     head = length * 5 // 8
@@ -122,7 +121,7 @@ def shorten(text: str, length: int = 80) -> str:
 def elide(message: str) -> str:
     """Return a message without the middle of very long values.
 
-    Paths that exist, or whose folder exists, stay whole, so that they can be found.
+    Paths that exist, or whose folder exists, stay whole so that the user can find them.
     """
     clauses = _LONG_WORD.sub(_shorten_word, message).split("; ")
     return "; ".join(
@@ -152,7 +151,7 @@ def print_line(line: str) -> None:
 
 
 class PrintableFormatter(logging.Formatter):
-    """Log records as lines with `escape_text`."""
+    """Formatter that writes each log record on one line, see `escape_text`."""
 
     def format(self, record: logging.LogRecord) -> str:
         return escape_text(super().format(record))
@@ -160,7 +159,7 @@ class PrintableFormatter(logging.Formatter):
 
 @contextmanager
 def notice_when_slow(text: str, seconds: float = 1.0) -> Iterator[None]:
-    """Print a line to stderr, if that is a terminal, once the block has taken so many seconds."""
+    """Print a line to stderr, if that is a terminal, when the block takes longer than `seconds`."""
     if not sys.stderr.isatty():
         yield
         return
@@ -174,17 +173,17 @@ def notice_when_slow(text: str, seconds: float = 1.0) -> Iterator[None]:
 
 
 def format_count(count: int, noun: str = "Gaussian") -> str:
-    """1 as "1 Gaussian", 12345 as "12 345 Gaussians"."""
+    """Return a count with its noun: "1 Gaussian", "12 345 Gaussians"."""
     return f"{group_digits(count)} {noun}{'' if count == 1 else 's'}"
 
 
 def file_size(count: int) -> str:
-    """Bytes for a person: "4.7 MB", "1.8 kB"."""
+    """Return a number of bytes as text: "4.7 MB", "1.8 kB"."""
     return f"{count / 1e6:.1f} MB" if count >= 1e6 else f"{count / 1e3:.1f} kB"
 
 
 def format_duration(seconds: float) -> str:
-    """ "12 s", "3 min", "1 h 20 min"."""
+    """Return a duration as text: "12 s", "3 min", "1 h 20 min"."""
     if seconds < 90:
         return f"{max(round(seconds), 1)} s"
     minutes = round(seconds / 60)
@@ -192,11 +191,14 @@ def format_duration(seconds: float) -> str:
 
 
 def format_place(at: float, size: float, digits: int) -> str:
-    """A coordinate of something of this size: so many digits, and those by which it is farther off."""
+    """Return a coordinate in an object of a given size as text.
+
+    It has `digits` significant digits, plus one for each power of ten by which it exceeds the size.
+    """
     beyond = math.log10(abs(at) / size) if at and size > 0 else 0.0
     return f"{at:.{digits + max(0, math.floor(beyond))}g}"
 
 
 def group_digits(number: int) -> str:
-    """12345 as "12 345"."""
+    """Return a number with groups of three digits: "12 345"."""
     return f"{number:,}".replace(",", " ")

@@ -1,8 +1,8 @@
-"""On how many threads torch and the kernels work, and the thread pool that the kernels share.
+"""Thread counts of torch and the kernels, and the thread pool that the kernels share.
 
-Where torch is asked for hundreds of small things a second, its threads wait for each other at every one, and
-spin against the rasterizer's: an edit of one picture was solved in 5.2 s on two threads and in 2.6 on one.
-So it works on one, but where it has much to do at once.
+In code with hundreds of small torch operations per second, torch's threads wait for each other at every
+operation and spin against the rasterizer's threads. Solving an edit of one picture took 5.2 s on two threads
+and 2.6 s on one. So torch uses one thread, except for large operations.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ _A = TypeVar("_A")
 _T = TypeVar("_T")
 
 MAX_THREADS = torch.get_num_threads()
+"""Initial number of threads of torch."""
 
 _thread_count: int | None = None
 _local = threading.local()
@@ -37,16 +38,19 @@ def _torch_threads(count: int) -> Iterator[None]:
 
 
 one_thread = partial(_torch_threads, 1)
-"""Let torch work on one thread meanwhile; also as a decorator."""
+"""Context manager and decorator that limits torch to one thread."""
 
 all_threads = partial(_torch_threads, 0)
-"""Let torch work on as many threads as when the program began: for networks that are baked."""
+"""Context manager and decorator that lets torch use its initial number of threads, for baked networks."""
 
 
 def set_threads(count: int | None) -> None:
-    """Let the cpu engine use `count` threads (≥ 1); None: all cores that this process may use.
+    """Set the number of threads of the cpu engine, ≥ 1; None: all cores available to the process.
 
-    The image and its gradients are the same bits for every count.
+    Images and gradients are bit-identical for every count.
+
+    Raises:
+        ValueError: the count is below 1.
     """
     global _thread_count
     if count is not None and count < 1:
@@ -55,17 +59,17 @@ def set_threads(count: int | None) -> None:
 
 
 def threads() -> int:
-    """How many threads the next call of the cpu engine uses."""
+    """Return the number of threads of the next call of the cpu engine."""
     return _cores() if _thread_count is None else _thread_count
 
 
 class StoppedError(Exception):
-    """Raised when the result was cancelled."""
+    """Error raised in a cancelled computation."""
 
 
 @contextmanager
 def stopped_by(event: threading.Event) -> Iterator[None]:
-    """Cancel what this thread does, between two chunks, once the event is set: StoppedError."""
+    """Raise StoppedError in `run_chunks` of this thread, between two chunks, once the event is set."""
     _local.stop = event
     try:
         yield
@@ -74,43 +78,48 @@ def stopped_by(event: threading.Event) -> Iterator[None]:
 
 
 def run_chunks(kernel: Callable[[int], _T], chunks: int) -> list[_T]:
-    """Call `kernel(chunk)` for chunks 0, 1, …, each once, on this thread and those of the pool.
+    """Call `kernel(chunk)` once for each chunk 0, 1, …, on this thread and those of the pool.
 
-    A pool thread that has not begun when this one has run out of chunks is not waited for: waking one takes
-    50 µs, as long as a small kernel. Kernels release the interpreter's lock. numba's own parallel loops are
-    no replacement: see docs/experiments.md, The rasterizer's threads. What a kernel calls this for stays on
-    its thread: the pool is busy with the others, and would keep what it is asked for until they are done.
+    When this thread finds no more chunks, it cancels pool threads that have not started. Waking one takes 50
+    µs, as long as a small kernel. Kernels release the interpreter lock. numba's own parallel loops are no
+    replacement, see docs/experiments.md, The rasterizer's threads.
+
+    Nested calls run on the thread of the outer kernel. The pool is busy with the other chunks and would delay
+    the nested ones until these are finished.
 
     Returns:
-        what the calls returned, by chunk
+        Results by chunk.
+
+    Raises:
+        StoppedError: the event of `stopped_by` is set.
     """
     stop: threading.Event | None = getattr(_local, "stop", None)
-    following, results, is_inner = iter(range(chunks)), {}, getattr(_local, "is_inner", False)
+    remaining, results, is_inner = iter(range(chunks)), {}, getattr(_local, "is_inner", False)
 
     def work() -> None:
         _local.is_inner = is_inner or chunks > 1
         try:
-            for chunk in following:  # each is one thread's
+            for chunk in remaining:  # a shared iterator, so that each chunk goes to one thread
                 if stop is not None and stop.is_set():
                     raise StoppedError
                 results[chunk] = kernel(chunk)
         finally:
             _local.is_inner = is_inner
 
-    others = [_pool().submit(work) for _ in range(0 if is_inner else min(threads(), chunks) - 1)]
+    helpers = [_pool().submit(work) for _ in range(0 if is_inner else min(threads(), chunks) - 1)]
     try:
         work()
     finally:
-        started = [other for other in others if not other.cancel()]
+        started = [helper for helper in helpers if not helper.cancel()]
         wait(started)
-    for other in started:
-        other.result()  # raises what was raised there
+    for helper in started:
+        helper.result()  # raises exceptions of the pool thread
     return [results[chunk] for chunk in range(chunks)]
 
 
-@one_thread()  # as those of the pool have: else who gets an item would decide on its last bits
+@one_thread()  # as in the pool's threads; otherwise rounding would depend on the thread of an item
 def map_threads(work: Callable[[_A], _T], items: Sequence[_A]) -> list[_T]:
-    """`work` of every item, on as many threads as the cpu engine has; the same bits on any number."""
+    """Return `work(item)` of every item, on the threads of the cpu engine; bit-identical for any number."""
     return run_chunks(lambda index: work(items[index]), len(items))
 
 
@@ -119,7 +128,7 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max(1, _cores() - 1), "kernels", torch.set_num_threads, (1,))
 
 
-if hasattr(os, "register_at_fork"):  # a forked process has its parent's pool without the threads
+if hasattr(os, "register_at_fork"):  # a forked process inherits the pool without its threads
     os.register_at_fork(after_in_child=_pool.cache_clear)
 
 

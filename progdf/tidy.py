@@ -1,10 +1,10 @@
-"""Removing, moving and copying regions: edits whose whole course is known, so that nothing is trained.
+"""Edits that remove, move or copy regions. Their path over strengths is known, so nothing is trained.
 
-    remove      opacity falls to nothing, linear in opacity
-    transform   a region is shifted, turned and scaled about the mean of its centers, along an arc
-    duplicate   a copy of it, so placed, appears as added rows
+    remove      opacity falls to 0, linearly in opacity
+    transform   a region is translated, rotated and scaled about the mean of its centers, along an arc
+    duplicate   a transformed copy of a region fades in as added rows
 
-Each is an edit with a slider, a `Gdf`, and `bake` writes the same steps into a scene for good.
+Each is an edit with a slider, a `Gdf`. `bake` applies the same steps to a scene permanently.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from progdf.gdf.file import ADDED_LOGIT, Gdf, fingerprint
 from progdf.region import Region, from_mask
 from progdf.similarity import Motion, make_parts, move_rows
 
-_KNOT = 1 / 8
-"""Radians, and log of a scale, between knots: the chord of such an arc is off it by 1/500 of its radius, half
-a pixel of a thing that fills 512."""
-_OPACITY = attribute_slices(14)["logit_opacities"].start
+# Rotation (radians) or log-scale between two knots. The chord of such an arc deviates by 1/500 of its radius,
+# or 0.5 pixels for an object of 512 pixels.
+_KNOT_SPACING = 1 / 8
+_OPACITY_COLUMN = attribute_slices(14)["logit_opacities"].start
 
 
 Deed = Literal["remove", "transform", "duplicate"]
@@ -35,14 +35,14 @@ Deed = Literal["remove", "transform", "duplicate"]
 
 @dataclass(frozen=True)
 class Step:
-    """One thing that is done to a region of a scene."""
+    """One operation on a region of a scene."""
 
     does: Deed
     region: Region
-    motion: Motion | None = None  # of the region as one part; None: it stays where it is
+    motion: Motion | None = None  # motion of the region as one part; None: no motion
 
     def move(self, rows: Tensor, share: float) -> Tensor:
-        """Packed raw rows a share of the way along the motion. [M,C] float64 -> [M,C]"""
+        """Return packed raw rows after a share, 0 to 1, of the motion. [M,C] float64 -> [M,C]"""
         if self.motion is None or not len(rows):
             return rows
         motion = Motion(*(share * part.double() for part in vars(self.motion).values()))
@@ -52,12 +52,12 @@ class Step:
 def similarity(
     shift: Sequence[float] = (0.0, 0.0, 0.0), turn: Sequence[float] = (0.0, 0.0, 0.0), scale: float = 1.0
 ) -> Motion:
-    """The motion of a region as a whole.
+    """Return the motion of a whole region.
 
     Args:
-        shift: of its center, world units. [3]
-        turn: axis times angle in radians, more than a turn too. [3]
-        scale: > 0
+        shift: translation of its center, world units. [3]
+        turn: axis times angle in radians, which may exceed a full turn. [3]
+        scale: scale factor, > 0
     """
     parts = [shift], [math.log(scale)], [turn]
     moved, size, turned = (torch.tensor(part, dtype=torch.float64) for part in parts)
@@ -71,17 +71,18 @@ def tidy(
     instruction: str = "",
     added: Gaussians | None = None,
 ) -> Gdf:
-    """The steps as one edit with a slider: 0 the scene, 1 all of them done.
+    """Return the steps as one edit: strength 0 is the scene, strength 1 the result of all steps.
 
     Args:
-        scene: the original; all regions are of it
-        steps: later ones move what earlier ones have moved; copies are of what the scene has
-        name: of the layer
-        instruction: as the .gdf repeats it
-        added: rows that appear beside the copies, as they are at 1
+        scene: the original, which all regions refer to
+        steps: operations in order; later ones move the results of earlier ones, but copies are of the
+            original
+        name: name of the layer
+        instruction: text stored in the .gdf
+        added: further rows to add, as they are at strength 1
 
     Returns:
-        An edit of all Gaussians that are removed or moved; copies are its added rows.
+        Edit of all removed or moved Gaussians. Copies are its added rows.
 
     Raises:
         ValueError: a number is not finite.
@@ -92,10 +93,10 @@ def tidy(
             mask |= step.region.mask
     region = from_mask(name, mask)
     members = region.members
-    bands = scene.sh_degree > 0 and any(_turns(step) for step in steps)
+    bands = scene.sh_degree > 0 and any(_rotates(step) for step in steps)
     rows = pack(scene[members], with_shN=bands)
     added = _copies(scene, steps, added)
-    start = rows[:, _OPACITY]
+    start = rows[:, _OPACITY_COLUMN]
     end = _end_logits(scene, steps)[members]
     if added is not None:
         end = torch.cat([end, added.logit_opacities])
@@ -103,22 +104,22 @@ def tidy(
         start = torch.cat([start, added.logit_opacities])
     opacity_knots, logits = opacity_course(start, end)
     motions = [step.motion for step in steps if step.does == "transform" and step.motion is not None]
-    count = max(1, *(math.ceil(_reach(motion) / _KNOT) for motion in motions)) if motions else 1
+    count = max(1, *(math.ceil(_motion_size(motion) / _KNOT_SPACING) for motion in motions)) if motions else 1
     knots = torch.linspace(0.0, 1.0, 1 + count)
     if bool(logits.any()):
         knots = torch.cat([knots, opacity_knots]).unique()  # type: ignore[no-untyped-call]
     offsets = rows.new_zeros(len(knots), len(end), rows.shape[1])
     for i, s in enumerate(knots.tolist()):
         offsets[i, : len(members)] = _rows_at(scene, members, steps, bands, s) - rows if s else 0.0
-        offsets[i, :, _OPACITY] = interpolate_at(opacity_knots, logits, s)
+        offsets[i, :, _OPACITY_COLUMN] = interpolate_at(opacity_knots, logits, s)
     field = course_field(knots, offsets)
     return Gdf(name, region, field, fingerprint(scene), instruction, added=added)
 
 
 def bake(scene: Gaussians, steps: Sequence[Step]) -> Gaussians:
-    """The scene with the steps done for good: what is removed has no rows, copies come last."""
+    """Return the scene after all steps, without removed rows, and with copies at the end."""
     everything = torch.arange(len(scene))
-    bands = scene.sh_degree > 0 and any(_turns(step) for step in steps)
+    bands = scene.sh_degree > 0 and any(_rotates(step) for step in steps)
     rows = _rows_at(scene, everything, steps, bands, 1.0)
     mask = torch.ones(len(scene), dtype=torch.bool)
     for step in steps:
@@ -129,17 +130,17 @@ def bake(scene: Gaussians, steps: Sequence[Step]) -> Gaussians:
     return remaining if added is None else concatenate([remaining, added])
 
 
-def _turns(step: Step) -> bool:
+def _rotates(step: Step) -> bool:
     return step.motion is not None and bool(step.motion.turn.any())
 
 
-def _reach(motion: Motion) -> float:
-    """The larger of the angle, in radians, and the log of the scale."""
+def _motion_size(motion: Motion) -> float:
+    """Return the larger of the angle, in radians, and the magnitude of the log-scale."""
     return max(float(motion.turn.norm()), float(motion.log_scale.abs()))
 
 
 def _rows_at(scene: Gaussians, members: Tensor, steps: Sequence[Step], bands: bool, share: float) -> Tensor:
-    """Raw rows of members, sorted, where the steps have moved them; what none moves keeps its bits. [M,C]"""
+    """Return raw rows of sorted members after the steps; rows that no step moves keep their bits. [M,C]"""
     rows = pack(scene[members], with_shN=bands)
     moved = rows.double()
     for step in steps:
@@ -150,7 +151,7 @@ def _rows_at(scene: Gaussians, members: Tensor, steps: Sequence[Step], bands: bo
 
 
 def _copies(scene: Gaussians, steps: Sequence[Step], added: Gaussians | None = None) -> Gaussians | None:
-    """All copies, in order, after what is added; None where there is neither."""
+    """Return the added rows and then all copies in order; None if there are neither."""
     parts = [] if added is None else [added]
     for step in steps:
         if step.does == "duplicate":

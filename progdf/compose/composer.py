@@ -94,7 +94,7 @@ class _Plan(NamedTuple):
 
 
 class _LayerSlice(NamedTuple):
-    """A layer's members among a range of rows."""
+    """Members of a layer in a range of rows."""
 
     layer: Layer
     edit: int

@@ -213,7 +213,7 @@ def changed_rows(
 
 @dataclass(frozen=True)
 class _LayerMembers:
-    """The m members of a layer with nonzero weight."""
+    """Members of a layer with nonzero weight, m in number."""
 
     layer: Layer  # the layer
     members: Tensor | slice  # member indices; a slice if all members are included. [m] int64

@@ -9,8 +9,9 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 WINDOW = 11
+"""Side of SSIM's Gaussian window, pixels (Wang et al. 2004)."""
 SIGMA = 1.5
-"""Side and standard deviation of SSIM's Gaussian window in pixels (Wang et al. 2004)."""
+"""Standard deviation of SSIM's Gaussian window, pixels (Wang et al. 2004)."""
 
 NO_DIFFERENCE = 99.0
 """PSNR in dB reported for equal images, instead of infinity."""

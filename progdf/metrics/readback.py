@@ -29,7 +29,7 @@ FLOAT_ROUNDING = 2.0**-22
 
 @dataclass(frozen=True)
 class ReadBack:
-    """A written scene as a reader gets it, and its differences."""
+    """Written scene as a reader gets it, and its differences."""
 
     scene: Gaussians  # rows in the order of the file
     position_error: float  # largest difference of a coordinate, world units

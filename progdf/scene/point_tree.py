@@ -82,7 +82,7 @@ class PointTree:
 
     @property
     def largest_leaf(self) -> int:
-        """The largest number of points that a search visits at once."""
+        """Largest number of points that a search visits at once."""
         leaves = [self._tree.tree]
         largest = 0
         while leaves:
