@@ -131,19 +131,19 @@ class DemoOptions:
     """Make a scene, train edits of it, write pictures, and open the window if there is a display."""
 
     scene: Literal["bear", "room"] = "bear"
-    """A bear in the grass to look at from all around, or a room to stand in."""
+    """Bear in the grass to look at from all sides, or room to stand in."""
     size: Annotated[int | None, absent_option("COUNT", "24000 for the bear, 40000 for the room")] = None
     """Number of Gaussians."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("demo")
     """Folder for the scene, the edits and the pictures; created if needed."""
     quick: bool = False
-    """A draft in a third of the time: fewer views, smaller, fewer steps."""
+    """Draft in a third of the time: fewer and smaller views, fewer steps."""
     seed: int = 0
     """Random seed of the scene and of the training."""
     threads: int = 0
-    """CPU threads; 0 takes all cores."""
+    """CPU threads (0: all cores)."""
     window: bool = True
-    """Open the window at the end, where there is a display."""
+    """Open the window at the end, if there is a display."""
 
 
 def main(argv: Sequence[str]) -> int:
