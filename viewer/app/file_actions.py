@@ -490,7 +490,8 @@ class FileActions:
         """
         main_view = self._app.main_view
         dialog = self._app.main_view.work.dialog
-        then = (dialog.then if dialog else "") if then is None else then
+        if then is None:
+            then = dialog.then if dialog else ""
 
         def save() -> None:
             file = session_file(parse_path(path))

@@ -139,7 +139,7 @@ def draw_lists(
     numbered = [f"{name}:{i}" for name in ("focus", "toggle") for i in range(len(work.view.layers) + 1, 10)]
     listed = [action for action in offered if action not in numbered]
     work, requested = draw_palette(work, listed, pressed, pointer.ui, pointer.area)
-    return perform_actions(work, [requested] * bool(requested), pointer)
+    return perform_actions(work, [requested] if requested else [], pointer)
 
 
 PALETTE_PX = 460.0
@@ -304,7 +304,7 @@ def draw_pill(
     middle = min((wide + tools.TOOLBAR_PX * scale) / 2, free - 85.0 * scale)  # half of its usual width
     place = (middle, foot + tools.EDGE_PX * scale)
     work, requested = tools.draw_comparison(work, words, original, place, pointer.ui)
-    return work, [requested] * bool(requested)
+    return work, [requested] if requested else []
 
 
 def over_picture(
@@ -350,7 +350,7 @@ def over_picture(
             work = workspace.with_message(work, "Copied; paste it into a report of what you did", pointer.now)
         elif clicked or pointer.now >= line.until:
             work = replace(work, message=None)
-            work = perform_actions(work, [line.button[1]] * (clicked == "do"), pointer)
+            work = perform_actions(work, [line.button[1]] if clicked == "do" else [], pointer)
     if work.help:
         draw_keys(free, ui)
     return work
@@ -420,7 +420,8 @@ def draw_history(work: Workspace, ui: UiContext) -> tuple[Workspace, list[str]]:
             clipper.include_item_by_index(now)
             while clipper.step():
                 for i in range(clipper.display_start, clipper.display_end):
-                    requests += [f"go_to:{i}"] * _history_row(work.past, i, ui)
+                    if _history_row(work.past, i, ui):
+                        requests.append(f"go_to:{i}")
         if is_open:
             imgui.end_child()
     return replace(work, history=False if is_open else None), requests

@@ -66,10 +66,12 @@ class Child:
         if sys.platform == "win32":
             flags = 0 if talks else subprocess.BELOW_NORMAL_PRIORITY_CLASS
             options = {"creationflags": flags | subprocess.CREATE_NEW_PROCESS_GROUP}
+        if talks:
+            arguments = [_TALKS, *arguments]
         with log.open("wb") as sink:
             self._process = subprocess.Popen(
                 # -P: do not run a module in the current folder, which may be a third-party scene
-                [sys.executable, "-P", "-m", "viewer.jobs.child", *[_TALKS] * talks, *arguments],
+                [sys.executable, "-P", "-m", "viewer.jobs.child", *arguments],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE if talks else sink,
                 stderr=sink if talks else subprocess.STDOUT,

@@ -146,7 +146,8 @@ class NewEdit:
         kind = self.choice.kind
         match self.choice.setting:
             case "color":
-                return f"{kind}:{hex_color(self.color)}" + ",path=hue" * self.through_hues
+                path = ",path=hue" if self.through_hues else ""
+                return f"{kind}:{hex_color(self.color)}{path}"
             case "amount":
                 return f"{kind}:{self.amount:.2f}"
             case "grade":
@@ -320,7 +321,11 @@ class EditOrder:
         words += [f"--editor={self.editor}", f"--name={self.name}", f"--threads={self.threads}"]
         given = {"model": self.model, "anchor": self.anchor, "at": self.at, "camera": self.camera}
         words += [f"--{name}={value}" for name, value in given.items() if value]
-        return words + ["--quick"] * self.quick + ["--resume"] * resumes
+        if self.quick:
+            words.append("--quick")
+        if resumes:
+            words.append("--resume")
+        return words
 
     @property
     def result(self) -> Path:

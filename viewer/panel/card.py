@@ -206,7 +206,9 @@ def _press(named: bool) -> str:
     if imgui.is_any_item_active() and not named:
         return "keep"
     io = imgui.get_io()
-    return "toggle" if io.key_ctrl else "range" if io.key_shift else "one"
+    if io.key_ctrl:
+        return "toggle"
+    return "range" if io.key_shift else "one"
 
 
 def _menu(
@@ -219,8 +221,11 @@ def _menu(
         several: number of layers selected with it, 0 for this one alone
     """
     with menu(_MENU, ui) as is_open:
-        unknown = is_open and with_settings(NewEdit(), row.instruction) is None
-        off = ["again"] * unknown + ["limit_to_selection"] * (not state.selection.count)
+        off = []
+        if is_open and with_settings(NewEdit(), row.instruction) is None:
+            off.append("again")
+        if not state.selection.count:
+            off.append("limit_to_selection")
         for action in _MENU_ITEMS if is_open else ():
             if action == "group":
                 _group_menu(state, state.layers[index], ui, actions)
@@ -229,18 +234,20 @@ def _menu(
             else:
                 name = f"Delete {several} layers" if action == "remove" and several > 1 else ""
                 request = f"{action}:{index}" if action in _LAYER_ACTIONS else action
-                actions += [request] * menu_item(action, enabled=action not in off, name=name)
+                if menu_item(action, enabled=action not in off, name=name):
+                    actions.append(request)
 
 
 def _group_menu(state: ViewState, layer: LayerState, ui: UiContext, actions: list[str]) -> None:
     if imgui.begin_menu("Group"):
-        actions += ["group"] * menu_item("group")
+        if menu_item("group"):
+            actions.append("group")
         for group in state.groups:
             name = elide(group.name, 200.0 * ui.scale)
             if imgui.menu_item(f"{name}##{group.name}", "", group.name == layer.group)[0]:
                 actions.append(f"group:{group.name}")
-        if layer.group:
-            actions += ["ungroup"] * menu_item("ungroup")
+        if layer.group and menu_item("ungroup"):
+            actions.append("ungroup")
         imgui.end_menu()
 
 
@@ -280,7 +287,12 @@ def _head(
     end = right - number_width - 6.0 * scale
     over = imgui.is_window_hovered(imgui.HoveredFlags_.allow_when_blocked_by_active_item.value)
     over |= ui.keyboard == "panel" and work.focus == index
-    toggles = 0 if compact else 5 if over else 2 if layer.locked else int(layer.solo)
+    if compact:
+        toggles = 0
+    elif over:
+        toggles = 5
+    else:
+        toggles = 2 if layer.locked else int(layer.solo)
     reserved = SLIDER_PX * scale if compact else toggles * TOGGLE_PX * scale
     work, touch = _name(work, index, end - reserved - 4.0 * scale - imgui.get_cursor_pos_x(), active, ui)
     if toggles:
@@ -317,7 +329,8 @@ def _toggles(work: Workspace, index: int, over: bool, ui: UiContext, actions: li
             imgui.set_cursor_pos_y(top)
             if not over and not on:
                 continue
-            pressed += [action] * icon_button(action, icon, ui, dim=not on, side=side)
+            if icon_button(action, icon, ui, dim=not on, side=side):
+                pressed.append(action)
             if action == "menu":
                 tip("Rename, duplicate, replace or delete (right-click)")
             else:
@@ -349,7 +362,9 @@ def _region_tooltip(work: Workspace, index: int, row: LayerRow) -> Workspace:
 
 def _details(work: Workspace, index: int, row: LayerRow) -> str:
     """Return the details of the layer, one per line: size, instruction, overlap with other layers."""
-    about = f"{'Draft  ·  ' * row.draft}{with_added(row.count, row.added)} splats"
+    about = f"{with_added(row.count, row.added)} splats"
+    if row.draft:
+        about = f"Draft  ·  {about}"
     kind, _, argument = row.instruction.partition(":")
     about += f"  ·  {kind.capitalize()} {argument}" if kind else ""
     shares = (
@@ -406,7 +421,11 @@ def _name(
     at = (x, y + imgui.get_style().frame_padding.y)
     color = PALETTE.text if active else PALETTE.dim
     compact = is_compact(work)
-    marks = f"{Icon.LOCKED} " * (layer.locked and compact) + f"{Icon.SOLO} " * (layer.solo and compact)
+    marks = ""
+    if compact and layer.locked:
+        marks += f"{Icon.LOCKED} "
+    if compact and layer.solo:
+        marks += f"{Icon.SOLO} "
     imgui.get_window_draw_list().add_text(at, u32(color), elide(marks + layer.name, room))
     if imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value):
         work = replace(work, pointed=("layer", index))  # highlights its region in the picture

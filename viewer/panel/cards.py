@@ -57,7 +57,8 @@ def draw_search(work: Workspace, ui: UiContext) -> str:
         return work.search
     side = imgui.get_frame_height()
     gap = 4.0 * ui.scale
-    imgui.set_next_item_width(imgui.get_content_region_avail().x - bool(work.search) * (side + gap))
+    clear_button = side + gap if work.search else 0.0
+    imgui.set_next_item_width(imgui.get_content_region_avail().x - clear_button)
     if work.searching:
         imgui.set_keyboard_focus_here()
     flags = imgui.InputTextFlags_.escape_clears_all.value | imgui.InputTextFlags_.auto_select_all.value
@@ -192,7 +193,9 @@ def _group_name(
     if imgui.is_item_clicked(imgui.MouseButton_.right.value):
         imgui.open_popup(_MENU)
     with imgui_ctx.push_font(ui.fonts.bold, 0.0):
-        color = PALETTE.handle if hovered else PALETTE.text if group.enabled else PALETTE.dim
+        color = PALETTE.text if group.enabled else PALETTE.dim
+        if hovered:
+            color = PALETTE.handle
         imgui.get_window_draw_list().add_text(corner, u32(color), elide(group.name, room))
     for action in menu_items(_MENU, _ITEMS, ui):
         start_naming(not action)
@@ -230,7 +233,8 @@ def draw_heading(work: Workspace, ui: UiContext, actions: list[str]) -> Workspac
     side = imgui.get_frame_height()
     text = "+ New edit"
     wide = imgui.calc_text_size(text).x + 2 * imgui.get_style().frame_padding.x
-    imgui.same_line(right - wide - (side + 4.0 * ui.scale) * bool(work.view.layers))
+    menu_button = side + 4.0 * ui.scale if work.view.layers else 0.0
+    imgui.same_line(right - wide - menu_button)
     if (imgui.button if work.view.layers else accent_button)(text, (wide, 0.0)):
         actions.append("new_edit")
     hint("new_edit")
@@ -313,7 +317,8 @@ def draw(
             continue
         top = imgui.get_cursor_screen_pos().y
         left = imgui.get_cursor_pos_x()
-        imgui.set_cursor_pos_x(left + INSET_PX * ui.scale * bool(group))
+        inset = INSET_PX * ui.scale if group else 0.0
+        imgui.set_cursor_pos_x(left + inset)
         work, touch = draw_card(
             work,
             i,
@@ -387,12 +392,17 @@ def _nearest_gap(
         mouse: height of the pointer, window pixels
     """
     groups = {state.layers[i].group for i in layers}
-    gap, gaps = imgui.get_style().item_spacing.y / 2, [(rows[0].top, max(rows[0].layers) + 1, "")]
+    gap = imgui.get_style().item_spacing.y / 2
+    gaps = [(rows[0].top, max(rows[0].layers) + 1, "")]
     for above, row in pairwise(rows):
         inside = bool(row.group) and above.group == row.group
         if inside and whole and {row.group} != groups:
             continue
-        group = row.group if inside else above.group if not above.heads and {above.group} == groups else ""
+        group = ""
+        if inside:
+            group = row.group
+        elif not above.heads and {above.group} == groups:
+            group = above.group
         gaps.append((row.top, max(row.layers) + 1, "" if whole else group))
     last = rows[-1]
     stays = bool(last.group) and not (whole or last.heads) and {last.group} == groups

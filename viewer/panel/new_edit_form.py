@@ -86,7 +86,10 @@ def draw(work: Workspace, count: int, preview: PreviewState, ui: UiContext, acti
             actions.append("new_edit")
         else:
             form, action = _content(work, count, preview, ui)
-            actions += ["train"] if trains else [action] if action else []
+            if trains:
+                action = "train"
+            if action:
+                actions.append(action)
             work = replace(work, form=form, form_opening=False)
         storage.set_bool(listed, imgui.is_popup_open("", imgui.PopupFlags_.any_popup.value))
     return work
@@ -164,8 +167,12 @@ def _region(form: NewEdit, selection: SelectionState, count: int, column: float,
     label("Region", column)
     imgui.set_next_item_width(-1.0)
     room = imgui.get_content_region_avail().x - 2 * imgui.get_frame_height()
-    offered = [SELECTION] * bool(selection.count) + [known.name for known in selection.regions] + [ALL, TYPED]
-    offered = [CHANGED] * (form.choice.kind == "pictures") + offered
+    offered = []
+    if form.choice.kind == "pictures":
+        offered.append(CHANGED)
+    if selection.count:
+        offered.append(SELECTION)
+    offered += [*(region.name for region in selection.regions), ALL, TYPED]
     titles = [_region_title(region, selection, count) for region in offered]
     current = offered.index(form.region) if form.region in offered else None
     title = elide(_region_title(form.region, selection, count), room)
@@ -303,7 +310,9 @@ def _curve(curve: str, column: float, ui: UiContext) -> str:
     def apart(point: Point) -> float:
         return math.hypot((point[0] - at[0]) * wide, (point[1] - at[1]) * tall)
 
-    points, chosen, key = parse_curve(curve), storage.get_int(held, -1), imgui.Key
+    points = parse_curve(curve)
+    chosen = storage.get_int(held, -1)
+    key = imgui.Key
     near = min(range(len(points)), key=lambda i: apart(points[i]), default=-1)
     near = near if near >= 0 and apart(points[near]) <= reach else -1
     near = chosen if keyed else near

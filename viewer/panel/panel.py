@@ -89,7 +89,8 @@ def draw(
     footer = imgui.get_frame_height() + imgui.get_style().item_spacing.y * 2
     footer += training_cards.height(work.jobs, ui)
     room = imgui.get_content_region_avail().y - footer - cards.HEADING_PX * ui.scale
-    room -= (len(work.view.layers) > cards.UNSEARCHED) * imgui.get_frame_height_with_spacing()
+    if len(work.view.layers) > cards.UNSEARCHED:
+        room -= imgui.get_frame_height_with_spacing()
     work = replace(work, cards_fit=len(work.view.layers) * card.CARD_PX * ui.scale <= room)
     selected = selected_layers(work)
     _begin_body(footer + cards.selection_height(selected, ui), ui)
@@ -155,13 +156,17 @@ def _title(
     room = imgui.get_content_region_avail().x
     text = room - 3 * side - 8.0 * scale
     with imgui_ctx.push_font(ui.fonts.bold, 0.0):
-        imgui.text(widgets.elide(UNSAVED * has_unsaved(work) + (work.session or facts.title), text))
+        name = work.session or facts.title
+        if has_unsaved(work):
+            name = UNSAVED + name
+        imgui.text(widgets.elide(name, text))
     size = f"{widgets.with_added(facts.count, facts.added)} splats"
     widgets.small(f"{facts.title}  ·  {size}" if work.session else size, PALETTE.dim, text)
     widgets.tip(f"{facts.title}\n{size}")
     below = imgui.get_cursor_pos()
     imgui.set_cursor_pos((corner.x + room - 3 * side, corner.y - 2.0 * scale))
-    actions += ["save"] * widgets.icon_button("save", Icon.SAVE, ui, side=side)
+    if widgets.icon_button("save", Icon.SAVE, ui, side=side):
+        actions.append("save")
     widgets.hint("save")
     imgui.same_line(0.0, 0.0)
     widgets.more_button("share", _SHARES, ui, actions, Icon.SHARE, side)
@@ -221,7 +226,9 @@ def _row(index: int, region: NamedRegion, ui: UiContext, actions: list[str]) -> 
     size = (max(right - imgui.get_cursor_pos_x(), 1.0), tall)
     nav = imgui.ButtonFlags_.enable_nav
     if imgui.invisible_button("select", size, nav.value):
-        mode = "add" if io.key_shift else "subtract" if io.key_ctrl else "new"
+        mode = "subtract" if io.key_ctrl else "new"
+        if io.key_shift:
+            mode = "add"
         actions.append(f"region:{index}:{mode}")
     hovered = imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value)
     color = u32(PALETTE.text if imgui.is_item_hovered() else PALETTE.dim)
@@ -246,8 +253,8 @@ def _footer(work: Workspace, ui: UiContext, actions: list[str]) -> None:
     right = widgets.right_edge()
     changes = {"undo": history.next_undo(work.past), "redo": history.next_redo(work.past)}
     named = zip(changes.items(), (Icon.UNDO, Icon.REDO), strict=True)
-    steps = [*((name, icon, what) for (name, what), icon in named), ("history", Icon.HISTORY, "")]
-    off = [name for name, what in changes.items() if not what]
+    steps = [*((name, icon, change) for (name, change), icon in named), ("history", Icon.HISTORY, "")]
+    off = [name for name, change in changes.items() if not change]
     widgets.icon_row(steps, ui, actions, 8.0 * ui.scale, off=off)
     side = imgui.get_frame_height()
     gap = 6.0 * ui.scale

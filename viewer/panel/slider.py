@@ -153,7 +153,10 @@ def _paint(
     most: float,
 ) -> None:
     """Draw the slider; `track`: x of strength 0, its top, and the length of strength 1, window pixels."""
-    canvas, p, (start, top, span), radius = imgui.get_window_draw_list(), PALETTE, track, RADIUS_PX * scale
+    canvas = imgui.get_window_draw_list()
+    p = PALETTE
+    start, top, span = track
+    radius = RADIUS_PX * scale
     middle = top + radius + 1.0 * scale
     half = 2.0 * scale
     at = start + value * span

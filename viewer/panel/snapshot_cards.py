@@ -87,7 +87,11 @@ def _pair(cards: _Cards, compared: bool, ui: UiContext, actions: list[str]) -> N
 def _card(index: int, cards: _Cards, wide: float, ui: UiContext, actions: list[str]) -> None:
     """Draw a picture with its name and its menu."""
     name = cards.names[index]
-    badge = "A" * (index == cards.a) + "B" * (index == cards.b)
+    badge = ""
+    if index == cards.a:
+        badge += "A"
+    if index == cards.b:
+        badge += "B"
     with imgui_ctx.push_id(index), imgui_ctx.begin_group():
         at = imgui.get_cursor_screen_pos()
         tall = 0.75 * wide

@@ -147,7 +147,11 @@ def _buttons(timeline: Timeline, player: Player, actions: list[str], ui: UiConte
         ("key", icons.ICON_FA_DIAMOND, "In place of the present one" if here else ""),
         ("drop_key", icons.ICON_FA_TRASH_CAN, "Those chosen" if chosen else ""),
     )
-    off = [*["play"] * (not can_play), *["drop_key"] * (not (here or chosen))]
+    off = []
+    if not can_play:
+        off.append("play")
+    if not (here or chosen):
+        off.append("drop_key")
     icon_row(items, ui, actions, gap, off=off)
     imgui.same_line(0.0, gap)
     imgui.push_style_color(imgui.Col_.text, PALETTE.error if auto else PALETTE.faint)
@@ -175,7 +179,7 @@ def _settings(work: Workspace, ruler: _Ruler, actions: list[str]) -> None:
     hint("ping_pong", "Now " + ("on" if timeline.ping_pong else "off"))
     imgui.same_line(0.0, gap)
     count = timeline.length + 1
-    for name, now, ends, unit, what in (
+    for name, now, ends, unit, help_text in (
         ("length", count, (2, LONGEST + 1), "f", f"0 to {timeline.length}: {count / timeline.fps:.2f} s"),
         ("fps", timeline.fps, (1, FASTEST), "fps", "Frames per second"),
     ):
@@ -184,7 +188,7 @@ def _settings(work: Workspace, ruler: _Ruler, actions: list[str]) -> None:
         changed, value = imgui.drag_int(f"##{name}", now, 0.25, *ends, f"%d {unit}", clamp)
         if changed and value != now:
             actions.append(f"{name}:{value - (name == 'length')}")
-        tip(f"{what}; drag, or Ctrl+click to type")
+        tip(f"{help_text}; drag, or Ctrl+click to type")
         imgui.same_line(0.0, gap)
     if imgui.button("Film…"):
         actions.append("render_film")
@@ -238,7 +242,8 @@ def _drag(
         keys = () if hovered_frame is None else frames[hovered_frame]
         if io.key_shift or not keys or not set(keys) <= player.chosen:
             names = ",".join(f"{row}@{frame}" for row, frame in keys)
-            actions.append(f"choose_keys:{'+' * io.key_shift}{names}")
+            sign = "+" if io.key_shift else ""
+            actions.append(f"choose_keys:{sign}{names}")
         actions.append(f"seek:{mouse_frame if hovered_frame is None else hovered_frame}")
     elif imgui.is_item_active() or is_released():  # a slow frame may contain move and release
         origin = storage.get_int(held, -1)
@@ -307,7 +312,9 @@ def _row(
             here = (row, ruler.frame) in ruler.keys
             if imgui.invisible_button("key", (tall, tall)):
                 actions.append(f"{'drop_key' if here else 'key'}:{row}")
-            ink = u32(p.handle if imgui.is_item_hovered() else color if here else p.faint)
+            ink = u32(color if here else p.faint)
+            if imgui.is_item_hovered():
+                ink = u32(p.handle)
             middle = (left + names + tall / 2, top + tall / 2)
             (canvas.add_ngon_filled if here else canvas.add_ngon)(middle, 4.5 * scale, ink, 4)
             tip(f"{'Delete' if here else 'Insert'} a keyframe of {name} at the playhead")
@@ -337,10 +344,14 @@ def _paint_keys(
     canvas = imgui.get_window_draw_list()
     scale = ruler.ui.scale
     for frame, keys in frames.items():
-        size = (_KEY_PX - 0.5 * (len(frames[frame]) == 1) + (frame == under)) * scale
+        size = _KEY_PX
+        if len(keys) == 1:
+            size -= 0.5
+        if frame == under:
+            size += 1.0
         chosen = not ruler.player.chosen.isdisjoint(keys)
         ink = u32(PALETTE.handle if chosen or frame == under else color)
-        _paint_key(canvas, ruler.x(frame), y, size, ink, ruler.keys[keys[0]].easing)
+        _paint_key(canvas, ruler.x(frame), y, size * scale, ink, ruler.keys[keys[0]].easing)
 
 
 def _paint(

@@ -85,8 +85,11 @@ def _open_below(share: float, ui: UiContext) -> None:
 
 def draw_toolbar(view: ViewState, area: Area, ui: UiContext, actions: list[str]) -> None:
     """Draw the toolbar along the left edge of the picture; `area`: the picture without the timeline."""
-    tool = f"select_tool:{view.select.tool}" if view.select.tool else "brush" * view.brush.active
-    active_tool = tool or f"navigate:{view.camera.mode}"
+    active_tool = f"navigate:{view.camera.mode}"
+    if view.select.tool:
+        active_tool = f"select_tool:{view.select.tool}"
+    elif view.brush.active:
+        active_tool = "brush"
     off = {"brush": not view.layers, "move_selected": not view.selection.count}
     count = sum(map(len, _TOOLS))
     gap = 6.0 * ui.scale
@@ -101,7 +104,8 @@ def draw_toolbar(view: ViewState, area: Area, ui: UiContext, actions: list[str])
                 with inert(off.get(action, False)):
                     if icon_button(action, icon, ui, lit=action == active_tool, side=side):
                         actions.append(action)
-                hint(action, "Select something first" * (action == "move_selected" and off[action]))
+                needs_selection = action == "move_selected" and off[action]
+                hint(action, "Select something first" if needs_selection else "")
     imgui.pop_style_var()
 
 
@@ -153,7 +157,8 @@ class _Bar:
     def button(self, action: str, actions: list[str], icon: str = "") -> None:
         text = icon + COMMANDS[action].name
         self.follow(imgui.calc_text_size(text).x + 2 * imgui.get_style().frame_padding.x)
-        actions += [action] * imgui.button(f"{text}##{action}")
+        if imgui.button(f"{text}##{action}"):
+            actions.append(action)
         hint(action)
 
 
@@ -364,7 +369,9 @@ def draw_comparison(
         imgui.same_line()
         name = right.capitalize() + (f" × {compare.amplify:g}" if compare.mode == "difference" else "")
         if _word("right", name, not original, ui):
-            requested = "before" if work.before else compare.mode if on else ""
+            requested = compare.mode if on else ""
+            if work.before:
+                requested = "before"
         tip(figure or "The scene with its edits")
         imgui.same_line()
         if icon_button("comparisons", Icon.UNFOLDED, ui):
@@ -467,5 +474,6 @@ def _view_rows(view: ViewState, ui: UiContext, actions: list[str]) -> ViewState:
     changed, (red, green, blue) = imgui.color_edit3("##background", list(view.background), picker)
     background = (red, green, blue) if changed else view.background
     for action, on in (("grid", view.grid), ("axes", view.axes)):
-        actions += [action] * menu_item(action, on)
+        if menu_item(action, on):
+            actions.append(action)
     return replace(view, camera=camera, background=background)

@@ -45,7 +45,9 @@ def draw(jobs: Sequence[QueuedTask], ui: UiContext, actions: list[str]) -> None:
     if storage.get_bool(is_open):
         room = 0.5 * imgui.get_window_height()
         old_height = storage.get_float(tall)
-        bar = imgui.WindowFlags_.no_scrollbar.value * (old_height < room)  # hidden while the cards grow
+        bar = 0
+        if old_height < room:
+            bar = imgui.WindowFlags_.no_scrollbar.value  # hidden while the cards grow
         imgui.begin_child("jobs", (0.0, max(min(old_height, room), 1.0)), 0, bar)
         for job in listed:
             with imgui_ctx.push_id(str(job.number)):
@@ -84,7 +86,9 @@ def _strip(jobs: Sequence[QueuedTask], is_open: bool, ui: UiContext) -> bool:
     (x, y), dot = imgui.get_cursor_screen_pos(), 4.0 * ui.scale
     pressed = imgui.invisible_button("strip", (imgui.get_content_region_avail().x, tall))
     tip("Show or hide the cards of all jobs")
-    color = PALETTE.error if _is_failed(job) else PALETTE.accent if job.status == "running" else PALETTE.dim
+    color = PALETTE.accent if job.status == "running" else PALETTE.dim
+    if _is_failed(job):
+        color = PALETTE.error
     imgui.get_window_draw_list().add_circle_filled((x + dot, y + tall / 2), dot, u32(color))
     end = (f"+{len(jobs) - 1}   " if len(jobs) > 1 else "") + (Icon.UNFOLDED if is_open else Icon.RAISED)
     left = job.seconds_left
@@ -147,8 +151,9 @@ def _bar(share: float, color: Rgba, ui: UiContext) -> None:
 
 def _foot(job: QueuedTask, right: float, menu: bool, ui: UiContext) -> list[str]:
     """Draw the current step, or the error, and the buttons at the right."""
-    offered = _BUTTONS.get((job.status, isinstance(job.task, EditOrder)), ())
-    buttons = (*offered, *[(Icon.MENU, _MENU, "Log, discard (right-click)")] * menu)
+    buttons = list(_BUTTONS.get((job.status, isinstance(job.task, EditOrder)), ()))
+    if menu:
+        buttons.append((Icon.MENU, _MENU, "Log, discard (right-click)"))
     with imgui_ctx.push_font(None, SMALL_PX):
         around = 2 * imgui.get_style().frame_padding.x
         widths = [imgui.calc_text_size(text).x + around for text, _, _ in buttons]
@@ -156,7 +161,9 @@ def _foot(job: QueuedTask, right: float, menu: bool, ui: UiContext) -> list[str]
         wrapped_text(job.error or job.warning, PALETTE.error)
         small(" ", PALETTE.dim)
     else:
-        line = f"For {job.elsewhere}  ·  " * bool(job.elsewhere) + _status_text(job)
+        line = _status_text(job)
+        if job.elsewhere:
+            line = f"For {job.elsewhere}  ·  {line}"
         small(line, PALETTE.dim, right - imgui.get_cursor_pos_x() - sum(widths) - 6.0 * ui.scale)
         tip(line)
     actions = []
@@ -165,7 +172,8 @@ def _foot(job: QueuedTask, right: float, menu: bool, ui: UiContext) -> list[str]
     for (text, action, help_), wide in zip(buttons, widths, strict=True):
         imgui.same_line(x)
         with imgui_ctx.push_font(None, SMALL_PX):
-            actions += [action] * bool(imgui.small_button(f"{text}##{action}"))
+            if imgui.small_button(f"{text}##{action}"):
+                actions.append(action)
         if help_:
             tip(help_)
         x += wide

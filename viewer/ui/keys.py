@@ -275,7 +275,9 @@ def bind(changes: Mapping[str, Any]) -> list[str]:
     changed = list[Command]()
     given: dict[tuple[str, bool], Command] = {}
     for action, value in changes.items():
-        texts = [value] * bool(value) if isinstance(value, str) else value
+        texts = value
+        if isinstance(value, str):
+            texts = [value] if value else []
         try:
             if action not in COMMANDS:
                 raise ValueError("there is no such command")
@@ -474,7 +476,11 @@ def is_repeating(keys: Keys) -> bool:
 def modifier() -> str:
     """Return the modifier that decides the action of a drag."""
     io = imgui.get_io()
-    return "Shift" if io.key_shift else "Ctrl" if io.key_ctrl else "Alt" if io.key_alt else ""
+    if io.key_shift:
+        return "Shift"
+    if io.key_ctrl:
+        return "Ctrl"
+    return "Alt" if io.key_alt else ""
 
 
 def started_drag(mode: str) -> str | None:
@@ -515,7 +521,9 @@ def fly_by_keys(camera: ViewCamera, keys: Keys, seconds: float, radius: float) -
     """Return the camera after flying by the held keys."""
     io = imgui.get_io()
     right, up, ahead = (sum(FLY_KEYS[key][i] for key in keys.fly) for i in range(3))
-    pace = 10.0 if io.key_shift else 0.1 if io.key_alt else 1.0
+    pace = 0.1 if io.key_alt else 1.0
+    if io.key_shift:
+        pace = 10.0
     return controls.fly(camera, right, up, ahead, seconds, radius, pace)
 
 

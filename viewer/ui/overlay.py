@@ -100,9 +100,11 @@ def message(line: Message, area: Area, ui: UiContext) -> tuple[str, float]:
     widest = min(area.width - 2 * pad, 640.0 * ui.scale)
     imgui.set_next_window_size_constraints((0.0, 0.0), (widest, area.height))
     with plate("message", (pad, area.height - pad), ui, (0.0, 1.0), 12.0):
-        buttons = (
-            {"Copy details": "copy"} if line.details else {line.button[0]: "do"} if line.button[0] else {}
-        )
+        buttons = {}
+        if line.details:
+            buttons["Copy details"] = "copy"
+        elif line.button[0]:
+            buttons[line.button[0]] = "do"
         buttons["×"] = "close"
         around = 2 * imgui.get_style().frame_padding.x + imgui.get_style().item_spacing.x
         room = widest - 2 * pad - sum(imgui.calc_text_size(text).x + around for text in buttons)

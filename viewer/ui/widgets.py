@@ -170,7 +170,9 @@ def icon_button(
     if hovered or lit:
         background = u32(PALETTE.chosen if lit else PALETTE.field)
         canvas.add_rect_filled((x, y), (x + side, y + side), background, 4.0 * ui.scale)
-    color = PALETTE.handle if hovered or lit else PALETTE.faint if dim else PALETTE.text
+    color = PALETTE.faint if dim else PALETTE.text
+    if hovered or lit:
+        color = PALETTE.handle
     at = (round(x + (side - size.x) / 2), round(y + (side - size.y) / 2))
     canvas.add_text(at, u32(color), icon)
     return pressed
@@ -189,7 +191,8 @@ def icon_row(
         if i:
             imgui.same_line(0.0, gap)
         with inert(action in off):
-            actions += [action] * icon_button(action, icon, ui)
+            if icon_button(action, icon, ui):
+                actions.append(action)
         hint(action, *more)
 
 
@@ -215,7 +218,8 @@ def menu_items(name: str, items: MenuItems, ui: UiContext, off: Collection[str] 
             if not item:
                 imgui.separator()
             elif isinstance(item, str):
-                requested += [item] * menu_item(item, enabled=item not in off)
+                if menu_item(item, enabled=item not in off):
+                    requested.append(item)
             else:
                 text, action, help_ = item
                 if imgui.menu_item(f"{text}##{action}", "", False, action not in off)[0]:
@@ -344,7 +348,9 @@ def grip(ui: UiContext) -> str:
     far = bool(moved.x or moved.y)
     if far and imgui.is_item_active():
         return "dragged"
-    return "" if not is_released() else "dropped" if far else "clicked"
+    if not is_released():
+        return ""
+    return "dropped" if far else "clicked"
 
 
 def is_entered() -> bool:
@@ -359,8 +365,12 @@ def key_step(less: imgui.Key, more: imgui.Key) -> float:
     step = 0.0
     for key, sign in ((less, -1.0), (more, 1.0)):
         imgui.internal.set_key_owner(key, imgui.get_item_id())  # otherwise they would move to another item
-        step += sign * bool(imgui.is_key_pressed(key))
-    return step * dict(NUDGES)["Shift+" if io.key_shift else "Ctrl+" if io.key_ctrl else ""]
+        if imgui.is_key_pressed(key):
+            step += sign
+    modifier = "Ctrl+" if io.key_ctrl else ""
+    if io.key_shift:
+        modifier = "Shift+"
+    return step * dict(NUDGES)[modifier]
 
 
 def is_double_clicked() -> bool:

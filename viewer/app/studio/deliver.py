@@ -65,10 +65,9 @@ class DeliverActions:
         options = self._options.get(name, DeliverOptions())
         if name == "render_film":
             keys = ("timeline",) if len(view.timeline.keys) > 1 else ()
-            sliders = (
-                *(layer.name for layer in reversed(view.layers)),
-                *[ALL_SLIDERS] * (len(view.layers) > 1),
-            )
+            sliders = [layer.name for layer in reversed(view.layers)]
+            if len(view.layers) > 1:
+                sliders.append(ALL_SLIDERS)
             moving = (*keys, *sliders, TURNTABLE)
             moves = moving[0] if keys or focus is None or not view.layers else view.layers[focus].name
             options = self._options.get(name, DeliverOptions(width=1280, height=720))
@@ -116,10 +115,11 @@ class DeliverActions:
         stack = self._queue.folder / f"stack{number}.session.json"
         session.save(stack, session.WindowSession(document, view, self._app.main_view.work.snapshots))
         size = f"--size={options.width}x{options.height}"
+        background = ["--alpha"] if options.alpha else []
         words = {
             "export": ["export", f"--out={out}"],
             "export_page": ["export", f"--out={out}", f"--title={Path(document.title).stem}"],
-            "render_picture": ["render", f"--out={out}", size, *["--alpha"] * options.alpha],
+            "render_picture": ["render", f"--out={out}", size, *background],
             "render_film": ["render", f"--out={out}", size, "--timeline"],
         }[kind]
         title = f"{'Exporting' if kind.startswith('export') else 'Rendering'} {out.name}"

@@ -78,8 +78,8 @@ def draw_start_page(recent: Sequence[StartFile], examples: Sequence[StartFile], 
     thirds = _columns(room, 3, ui)
     small_card = _columns(room, max(int(room // (CARD_PX * scale)), 1), ui)
     rows = -(-len(recent) // max(int(room // (CARD_PX * scale)), 1))
-    shown = (0.75 * thirds + (_TEXT_PX + _HEADING_PX) * scale) * bool(examples)
-    tall = shown + rows * (0.75 * small_card + (_TEXT_PX + GAP_PX) * scale)
+    examples_height = 0.75 * thirds + (_TEXT_PX + _HEADING_PX) * scale if examples else 0.0
+    tall = examples_height + rows * (0.75 * small_card + (_TEXT_PX + GAP_PX) * scale)
     top = max((display.y - tall - 2 * _HEADING_PX * scale) / 2.6, MARGIN_PX * scale)
     imgui.set_cursor_pos((left, top))
     with imgui_ctx.begin_group():
