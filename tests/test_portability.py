@@ -70,7 +70,7 @@ def test_a_file_that_somebody_has_open_is_replaced_once_he_closes_it(
 
     path.write_text("old", encoding="utf-8")
     monkeypatch.setattr(os, "replace", replace)
-    monkeypatch.setattr("progdf.io.atomic._WAITS_S", (0.0,) * 5)
+    monkeypatch.setattr("progdf.io.atomic._RETRY_DELAYS_S", (0.0,) * 5)
     try:
         with atomic_write(path) as temporary_file:
             temporary_file.write_text("new", encoding="utf-8")

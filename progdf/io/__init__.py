@@ -1,1 +1,1 @@
-"""How is it read and written, whole or not at all?"""
+"""File input and output: atomic writing, images, cameras, JSON, tensors, sessions and bundles."""

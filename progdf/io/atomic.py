@@ -1,4 +1,4 @@
-"""Files that are whole or absent, locks between processes, and the folders of the user."""
+"""Atomic file writing, locks between processes, and the standard folders of the user."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ from platformdirs import user_cache_path, user_pictures_path, user_state_path
 
 from progdf.errors import ProgdfError
 
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_DISK_FULL_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
-_HOST = f"{zlib.crc32(platform.node().encode()):08x}"
-_TEMPORARY = re.compile(r"\.progdf-(?P<host>[0-9a-f]{8})-(?P<process>\d{1,9})-\w{8}(\..*)?", re.DOTALL)
-_COMPLETE = ".complete"  # ending of a folder of `write_files_together` whose files only have to be moved
-_A_DAY = 86400.0
-_DEVICE = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9¹²³]) *(\..*)?", re.I | re.S)
-_IN_USE = (5, 32)  # ERROR_ACCESS_DENIED, ERROR_SHARING_VIOLATION
-_WAITS_S = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
+_HOST_HASH = f"{zlib.crc32(platform.node().encode()):08x}"
+_TEMPORARY_NAME = re.compile(r"\.progdf-(?P<host>[0-9a-f]{8})-(?P<process>\d{1,9})-\w{8}(\..*)?", re.DOTALL)
+_COMPLETE_SUFFIX = ".complete"  # ending of a `write_files_together` folder that is ready to move
+_ABANDONED_AFTER_S = 86400.0
+_DEVICE_NAME = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9¹²³]) *(\..*)?", re.I | re.S)
+_IN_USE_ERRORS = (5, 32)  # Windows: ERROR_ACCESS_DENIED, ERROR_SHARING_VIOLATION
+_RETRY_DELAYS_S = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 
 
 @contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A temporary file beside `path`, renamed to it when the block ends well and removed when it does not.
+    """Yield a temporary file beside `path` that is renamed to it if the block succeeds, otherwise removed.
 
         with atomic_write("scene.ply") as temporary:
             temporary.write_bytes(…)
 
-    A link stays and the file it leads to is replaced. A pipe or a device gets the bytes when all are there.
-    What processes that were killed have left in the folder goes too.
+    If `path` is a link, the file it points to is replaced. A pipe or a device receives all bytes at the end.
+    Temporary files of killed processes in the folder are removed.
 
     Raises:
         ProgdfError: the folder does not exist or cannot be written to, the disk is full, or `path` is a
@@ -58,7 +58,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         target = Path(os.path.realpath(target))
     if not target.parent.is_dir():
         raise ProgdfError(f"the folder {target.parent} does not exist; create it first")
-    # the suffix stays, as some writers (Pillow, numpy) choose the format by it
+    # same suffix as the target, as some writers (Pillow, numpy) choose the format by it
     temporary_file = _temporary_path(target.parent, target.suffix)
     try:
         _create(temporary_file, target.stat().st_mode & 0o777 if target.exists() else None)
@@ -67,7 +67,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     try:
         yield temporary_file
         replace_file(temporary_file, target)
-    except (OSError, ProgdfError) as error:  # the latter of one within, which knows `temporary_file` alone
+    except (OSError, ProgdfError) as error:  # of a nested write, which only knows `temporary_file`
         full = disk_full(error)
         if full is None:
             raise
@@ -77,48 +77,48 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def write_file(path: str | os.PathLike[str], content: str | bytes) -> None:
-    """Write a file, text as UTF-8, whole or not at all; see `atomic_write`."""
+    """Write a file, complete or not at all, text as UTF-8; see `atomic_write`."""
     with atomic_write(path) as temporary_file:
         temporary_file.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
 def temporary_subfolder(folder: Path) -> Path:
-    """A new empty folder in `folder`, for what is moved out of it when it is whole; the caller removes it.
+    """Create a temporary folder in `folder`, for files to move out once complete. The caller removes it.
 
-    What processes that were killed have left there goes.
+    Temporary files of killed processes in `folder` are removed.
 
     Raises:
-        OSError: it cannot be made.
+        OSError: it cannot be created.
     """
-    made = _temporary_path(folder)
-    made.mkdir()
-    return made
+    subfolder = _temporary_path(folder)
+    subfolder.mkdir()
+    return subfolder
 
 
 @contextmanager
 def write_files_together(folder: Path) -> Iterator[Path]:
-    """Yield an empty temporary folder; at a good end its files move to the same places in `folder`.
+    """Yield an empty temporary folder whose files move to the same paths in `folder` if the block succeeds.
 
-    Files of the same names are replaced, others stay. A link is replaced, not followed.
+    Files of the same names are replaced, and other files stay. A link is replaced, not followed.
 
-    Guarantee: if the block raises, or the process ends within it, `folder` is as before; after the block all
-    files are new. A folder that did not exist appears by one rename. In an existing folder one rename marks
-    the set as complete, and from there on it only moves forward. One interrupt does not stop the moves. If
-    the process is killed between two of them, single files are old or new, each of them whole, until the next
-    write of this program in `folder` moves the rest.
+    Guarantee: if the block raises, or the process ends within it, `folder` is unchanged. After the block all
+    files are new. A new folder appears by one rename. In an existing folder, one rename marks the set as
+    complete, and from then on it is only moved forward. A single interrupt does not stop the moves. If the
+    process is killed between two moves, each file is complete, either old or new. The next write of this
+    program in `folder` moves the remaining files.
 
     Raises:
-        ProgdfError: the folder cannot be made or written, or a folder has the place of a file.
+        ProgdfError: the folder cannot be created or written, or a folder has the name of a file.
     """
     is_new = not folder.is_dir()
-    home = folder.absolute().parent if is_new else folder
-    if not home.is_dir():
-        raise ProgdfError(f"the folder {home} does not exist; create it first")
+    parent = folder.absolute().parent if is_new else folder
+    if not parent.is_dir():
+        raise ProgdfError(f"the folder {parent} does not exist; create it first")
     try:
-        temporary = temporary_subfolder(home)
+        temporary = temporary_subfolder(parent)
     except OSError as error:
         raise write_error(folder, error) from error
-    complete = temporary.with_name(temporary.name + _COMPLETE)
+    complete = temporary.with_name(temporary.name + _COMPLETE_SUFFIX)
     try:
         yield temporary
         if is_new:
@@ -141,7 +141,7 @@ def write_files_together(folder: Path) -> Iterator[Path]:
 
 
 def _finish_moves(complete: Path) -> None:
-    """Move a complete set to its places, also if an interrupt comes meanwhile.
+    """Move a complete set to its destination, even if an interrupt arrives meanwhile.
 
     Raises:
         ProgdfError: a file cannot be replaced.
@@ -163,7 +163,7 @@ def _match_target(path: Path, target: Path) -> None:
     """Give a new file the permissions of the file that it will replace.
 
     Raises:
-        ProgdfError: the target is no file.
+        ProgdfError: the target is no regular file.
     """
     if target.is_symlink() or not target.exists():
         return
@@ -174,7 +174,7 @@ def _match_target(path: Path, target: Path) -> None:
 
 
 def _move_complete(complete: Path) -> None:
-    """Move the files of a complete set to their places beside it, as far as they are not there yet."""
+    """Move the remaining files of a complete set to the folder that contains it."""
     for path in _files_below(complete):
         target = complete.parent / path.relative_to(complete)
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -184,30 +184,32 @@ def _move_complete(complete: Path) -> None:
 
 def _temporary_path(folder: Path, suffix: str = "") -> Path:
     remove_abandoned(folder)
-    return folder / f".progdf-{_HOST}-{os.getpid()}-{secrets.token_hex(4)}{suffix}"
+    return folder / f".progdf-{_HOST_HASH}-{os.getpid()}-{secrets.token_hex(4)}{suffix}"
 
 
 def replace_file(path: Path, target: Path) -> None:
-    """`os.replace`, which Windows refuses while anybody has the target open, if only to read or to scan it.
+    """Replace a file as `os.replace` does, with retries on Windows.
+
+    Windows refuses to replace a file that a process has open, even for reading or a virus scan.
 
     Raises:
-        OSError: it still does after two seconds, or the file cannot be moved at all.
+        OSError: the target is still in use after two seconds, or the file cannot be moved.
     """
-    for wait in _WAITS_S:
+    for wait in _RETRY_DELAYS_S:
         try:
             os.replace(path, target)
             return
         except PermissionError as error:
-            if getattr(error, "winerror", None) not in _IN_USE:
+            if getattr(error, "winerror", None) not in _IN_USE_ERRORS:
                 raise
         time.sleep(wait)
     os.replace(path, target)
 
 
 def _create(path: Path, mode: int | None) -> None:
-    """A new empty file with these permissions; None: those of an ordinary file.
+    """Create an empty file with the given permissions; None for the default ones.
 
-    The system itself takes the umask off: to ask for the umask is to change it, for all threads.
+    The system applies the umask. Reading the umask would require changing it for all threads.
     """
     handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666 if mode is None else 0o600)
     os.close(handle)
@@ -218,7 +220,7 @@ def _create(path: Path, mode: int | None) -> None:
 
 @contextmanager
 def _copy_into(target: Path) -> Iterator[Path]:
-    """A temporary file whose bytes go into a pipe or a device in the end."""
+    """Yield a temporary file whose bytes are written to a pipe or a device at the end."""
     with tempfile.TemporaryDirectory(prefix="progdf-") as folder:
         buffer = Path(folder) / f"whole{target.suffix}"
         buffer.touch()
@@ -228,32 +230,32 @@ def _copy_into(target: Path) -> Iterator[Path]:
 
 
 def is_portable(name: str) -> bool:
-    """Whether every system can have a file of this name, also with an ending: Windows is the strictest."""
-    return not (_DEVICE.fullmatch(name) or set('<>:"/\\|?*') & set(name) or name.endswith((".", " ")))
+    """Return whether a file name is valid on every system, also with an ending. Windows is the strictest."""
+    return not (_DEVICE_NAME.fullmatch(name) or set('<>:"/\\|?*') & set(name) or name.endswith((".", " ")))
 
 
 def numbered_names(stem: str, suffix: str = "") -> Iterator[str]:
-    """STEM, STEM-2, STEM-3 …, each with the suffix."""
+    """Iterate over STEM, STEM-2, STEM-3 …, each with the suffix."""
     return (f"{stem}-{number}{suffix}" if number > 1 else f"{stem}{suffix}" for number in count(1))
 
 
 def is_temporary(name: str) -> bool:
-    """Whether a name is one that `atomic_write` or `temporary_subfolder` gives while something is written."""
-    return _TEMPORARY.fullmatch(name) is not None
+    """Return whether a name is a temporary name of `atomic_write` or `temporary_subfolder`."""
+    return _TEMPORARY_NAME.fullmatch(name) is not None
 
 
 def remove_abandoned(folder: Path) -> None:
-    """Remove temporary files of killed processes from a folder, and finish their complete sets.
+    """Remove temporary files of killed processes from a folder, and finish moving their complete sets.
 
-    Those of other machines, and all on Windows, have to be a day old.
+    Files of other machines, and all files on Windows, must be a day old.
     """
     with suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:
-            name = _TEMPORARY.fullmatch(entry.name)
+            name = _TEMPORARY_NAME.fullmatch(entry.name)
             with suppress(OSError):
                 if name is None or entry.is_symlink() or _is_in_use(name, entry):
                     continue
-                if entry.is_dir() and entry.name.endswith(_COMPLETE):
+                if entry.is_dir() and entry.name.endswith(_COMPLETE_SUFFIX):
                     if is_owned(Path(entry.path)):
                         _move_complete(Path(entry.path))
                 elif entry.is_dir():
@@ -263,8 +265,8 @@ def remove_abandoned(folder: Path) -> None:
 
 
 def _is_in_use(name: re.Match[str], entry: os.DirEntry[str]) -> bool:
-    if name["host"] != _HOST or sys.platform == "win32":
-        return time.time() - entry.stat().st_mtime <= _A_DAY
+    if name["host"] != _HOST_HASH or sys.platform == "win32":
+        return time.time() - entry.stat().st_mtime <= _ABANDONED_AFTER_S
     try:
         os.kill(int(name["process"]), 0)
     except ProcessLookupError:
@@ -275,17 +277,17 @@ def _is_in_use(name: re.Match[str], entry: os.DirEntry[str]) -> bool:
 
 
 def check_not_an_input(out: Path, inputs: Sequence[Path]) -> None:
-    """Raises ProgdfError where the result would take the place of what it is made from."""
+    """Raise ProgdfError if the output file is one of the input files."""
     for path in inputs:
         if out.exists() and path.exists() and os.path.samefile(out, path):
             raise ProgdfError(f"{out} is one of the files to read; choose another name for the result")
 
 
 def make_folder(path: str | os.PathLike[str]) -> None:
-    """Make a folder, and those above it, where there is none yet.
+    """Create a folder and its parents if they do not exist.
 
     Raises:
-        ProgdfError: a file has its place, or it cannot be made.
+        ProgdfError: a file has that name, or the folder cannot be created.
     """
     if Path(path).exists() and not Path(path).is_dir():
         raise ProgdfError(f"{path} is a file; give the name of a folder")
@@ -298,32 +300,32 @@ def make_folder(path: str | os.PathLike[str]) -> None:
 
 
 def write_error(path: str | os.PathLike[str], error: OSError) -> ProgdfError:
-    """The one line for a file or a folder that cannot be written."""
+    """Return the error for a file or a folder that cannot be written."""
     reason = error.strerror or error
     return ProgdfError(f"{path} cannot be written ({reason}); choose a place that can be written to")
 
 
 def disk_full(error: BaseException) -> OSError | None:
-    """What the system said of a disk that takes no more, if that is behind `error`."""
+    """Return the system error for a full disk if `error` is one or is caused by one, otherwise None."""
     cause = error if isinstance(error, OSError) else error.__cause__
-    return cause if isinstance(cause, OSError) and cause.errno in _FULL else None
+    return cause if isinstance(cause, OSError) and cause.errno in _DISK_FULL_ERRORS else None
 
 
 def check_regular(path: str | os.PathLike[str]) -> None:
-    """Refuse what can be opened but not read like a file.
+    """Refuse pipes and devices. Reading a pipe blocks, and a device may never end.
 
     Raises:
-        ProgdfError: it is a pipe, which is waited for, or a device, which may never end.
+        ProgdfError: the path is a pipe or a device.
     """
     if os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path):
         raise ProgdfError(f"{path} is a pipe or a device; give a file")
 
 
 def read_file(path: str | os.PathLike[str], most: int = -1) -> bytes:
-    """What a file holds, or its first `most` bytes.
+    """Return the content of a file, or its first `most` bytes.
 
     Raises:
-        ProgdfError: it is not there, no file, or cannot be read.
+        ProgdfError: the file does not exist, is no regular file, or cannot be read.
     """
     check_regular(path)
     try:
@@ -334,7 +336,7 @@ def read_file(path: str | os.PathLike[str], most: int = -1) -> bytes:
 
 
 def open_error(path: str | os.PathLike[str], error: OSError | ValueError) -> ProgdfError:
-    """The one line for a file that cannot be opened; a ValueError is of a name with a NUL."""
+    """Return the error for a file that cannot be opened. A ValueError comes from a name with a NUL."""
     if isinstance(error, ValueError):
         return ProgdfError(f"{path} cannot be the name of a file; check the name")
     if isinstance(error, FileNotFoundError):
@@ -345,36 +347,37 @@ def open_error(path: str | os.PathLike[str], error: OSError | ValueError) -> Pro
 
 
 LOCK = "run.lock"
-"""Of the folder of a training, locked while it is trained."""
+"""Name of the lock file in a run folder, locked during training."""
 
-_NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP)
-"""Said by file systems that have none."""
+_NO_LOCK_ERRORS = (errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP)
+"""Errors of file systems without locks."""
 
 
 class LockedError(ProgdfError):
-    """Another process holds the lock."""
+    """Error for a lock that another process holds."""
 
 
 @contextmanager
 def hold_lock(path: Path, wait_s: float = 0.0) -> Iterator[None]:
-    """Hold the lock of this file meanwhile. The file alone means nothing: it stays, and a copy is not locked.
+    """Hold the lock of a file during the block. The file stays afterwards, and a copy of it is not locked.
+
+    On a file system without locks, no lock is held and no error is raised.
 
     Args:
-        path: the file; made where there is none, in a folder that exists
-        wait_s: how long to wait for another process
+        path: the lock file, in an existing folder; created if missing
+        wait_s: time to wait for another process, seconds
 
     Raises:
-        LockedError: another process holds it.
-        ProgdfError: it cannot be made or written. A file system without locks is none of this: nothing is
-            held then.
+        LockedError: another process holds the lock.
+        ProgdfError: the file cannot be created or written.
     """
-    from filelock import FileLock, Timeout  # asyncio, which most commands do without
+    from filelock import FileLock, Timeout  # imports asyncio, which most commands do not need
 
     if path.is_symlink():
         raise ProgdfError(f"{path} is a link, which is not followed; remove the link")
     if os.path.isfile(path) and not os.access(path, os.W_OK):
         with suppress(OSError):
-            path.chmod(0o644)  # a copy of one from a read-only place
+            path.chmod(0o644)  # it may be a copy from a read-only folder
     lock = FileLock(path)
     try:
         lock.acquire(timeout=wait_s)
@@ -383,7 +386,7 @@ def hold_lock(path: Path, wait_s: float = 0.0) -> Iterator[None]:
     except NotImplementedError:  # filelock before 4, for ENOSYS
         pass
     except OSError as error:
-        if error.errno not in _NO_LOCKS:
+        if error.errno not in _NO_LOCK_ERRORS:
             raise write_error(path, error) from error
     try:
         yield
@@ -392,53 +395,53 @@ def hold_lock(path: Path, wait_s: float = 0.0) -> Iterator[None]:
 
 
 def is_locked(path: Path) -> bool:
-    """Whether a process holds the lock of this file; nothing is written where there is none."""
-    if not os.path.isfile(path):  # nor where it may not be looked at
+    """Return whether a process holds the lock of a file. A missing file is not created."""
+    if not os.path.isfile(path):  # also False without permission to look
         return False
     try:
         with hold_lock(path):
             return False
     except LockedError:
         return True
-    except ProgdfError:  # who cannot write here cannot hold it either
+    except ProgdfError:  # not writable, so it cannot be locked either
         return False
 
 
 def cache_folder() -> Path:
-    """For what can be made again: %LOCALAPPDATA%, ~/Library/Caches or $XDG_CACHE_HOME."""
-    return _folder(user_cache_path("progdf", appauthor=False, opinion=False))
+    """Return the folder for reproducible files: %LOCALAPPDATA%, ~/Library/Caches or $XDG_CACHE_HOME."""
+    return _or_temporary(user_cache_path("progdf", appauthor=False, opinion=False))
 
 
 def state_folder() -> Path:
-    """For what is remembered from one time to the next: %LOCALAPPDATA%, ~/Library or $XDG_STATE_HOME."""
-    return _folder(user_state_path("progdf", appauthor=False))
+    """Return the folder for persistent state: %LOCALAPPDATA%, ~/Library or $XDG_STATE_HOME."""
+    return _or_temporary(user_state_path("progdf", appauthor=False))
 
 
 def pictures_folder() -> Path:
-    """The user's own pictures, as the desktop calls the folder."""
-    return _folder(user_pictures_path())
+    """Return the user's pictures folder, as configured on the desktop."""
+    return _or_temporary(user_pictures_path())
 
 
 def temporary_folder() -> Path:
-    """One of the user's own where temporary files are, for who has no home or may not write there."""
-    who = str(os.getuid()) if hasattr(os, "getuid") else getpass.getuser()
-    return Path(tempfile.gettempdir()) / f"progdf-{who}"
+    """Return a per-user folder for temporary files, used if the home folder is missing or read-only."""
+    user = str(os.getuid()) if hasattr(os, "getuid") else getpass.getuser()
+    return Path(tempfile.gettempdir()) / f"progdf-{user}"
 
 
 def is_owned(path: Path) -> bool:
-    """Return True if a file or folder, not followed if it is a link, belongs to the user."""
+    """Return whether a file, folder or link itself belongs to the user (always True on Windows)."""
     return sys.platform == "win32" or path.lstat().st_uid == os.getuid()
 
 
 def is_private(folder: Path) -> bool:
-    """Whether nobody but the user could have put something into a folder."""
+    """Return whether only the user can write to a folder that is no link (always True on Windows)."""
     if sys.platform == "win32":
         return True
     status = folder.lstat()
     return status.st_uid == os.getuid() and not folder.is_symlink() and not status.st_mode & 0o022
 
 
-def _folder(path: Path) -> Path:
+def _or_temporary(path: Path) -> Path:
     try:
         Path.home()
     except RuntimeError:  # no HOME, and the system does not know the user

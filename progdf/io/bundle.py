@@ -1,7 +1,8 @@
-"""Bundles: NAME.progdf.zip, a session and the files that it names, side by side, to hand to somebody else.
+"""Bundles for sharing: NAME.progdf.zip with a session and all files that it refers to.
 
-A bundle unpacks into the folder NAME.progdf beside it, once. Its members are stored or deflated. Encryption
-and other compression methods are refused by name, as their size cannot be bounded before they are unpacked.
+A bundle is unpacked once, into the folder NAME.progdf beside it. Its members are stored or deflated.
+Encryption and other compression methods are refused, as their size cannot be bounded before unpacking. The
+error names the method.
 """
 
 from __future__ import annotations
@@ -26,9 +27,9 @@ from .part_files import part_files
 from .session import SUFFIX, SessionFile, is_session, read_session, sha256, verify_files, write_session
 
 BUNDLE = ".progdf.zip"
-MAX_FILES = 1000  # members of a bundle
-MAX_EXPANSION = 200  # unpacked size / size of the bundle; a bundle below 1 MB counts as 1 MB
-_HASH_FILE = ".bundle.sha256"  # in the unpacked folder: the hash of its bundle, hexadecimal
+MAX_FILES = 1000  # largest number of members in a bundle
+MAX_EXPANSION = 200  # largest ratio of unpacked size to bundle size; a bundle below 1 MB counts as 1 MB
+_HASH_FILE = ".bundle.sha256"  # file in the unpacked folder with the hash of its bundle, hexadecimal
 _REMEDY = "zip its files again, without a password and with deflate"
 _READ_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _METHODS = {
@@ -57,17 +58,17 @@ _ZIP_ERRORS = (
 
 
 def write_bundle(path: Path, source: Path) -> int:
-    """Put a session and all files that it needs into one file.
+    """Write a session and all files that it needs into one bundle.
 
     Args:
         path: NAME.progdf.zip
-        source: the session, saved
+        source: the saved session
 
     Returns:
         The number of files in the bundle.
 
     Raises:
-        ProgdfError: see `verify_files`; or the scene is many files, as an unpacked .sog or a .gltf is.
+        ProgdfError: as `verify_files`, or the scene has several files, such as an unpacked .sog or a .gltf.
     """
     session = read_session(source, SessionFile)
     scene, edits = verify_files(source, session)
@@ -99,7 +100,7 @@ def write_bundle(path: Path, source: Path) -> int:
 
 
 def _member_names(files: Sequence[Path]) -> dict[Path, str]:
-    """Return a different name for each different file, alike in upper and lower case."""
+    """Return a unique member name for each file. Names that differ only in case count as equal."""
     names: dict[Path, str] = {}
     for file in files:
         taken = {name.lower() for name in names.values()}
@@ -109,24 +110,24 @@ def _member_names(files: Sequence[Path]) -> dict[Path, str]:
 
 
 def _plain_name(name: str) -> str:
-    """Return a name that a bundle may hold: some systems have names that others cannot have."""
+    """Return a similar name that is valid on every system."""
     plain = "".join("-" if c in '<>:"/\\|?*' or not c.isprintable() else c for c in name)
     plain = plain.lstrip(".").rstrip(". ")
     return plain if plain and atomic.is_portable(plain) else f"file-{plain}"
 
 
 def unpack_bundle(path: Path) -> Path:
-    """Return the session of a bundle, unpacked into the folder NAME.progdf beside it.
+    """Unpack a bundle into the folder NAME.progdf beside it, and return its session.
 
-    A bundle that is already unpacked is not unpacked again. The session is always the bundle's own: autosaves
-    and other sessions in the folder are never opened instead. A session that was renamed but not changed is
-    found. If the session is gone, it is written again.
+    A bundle that is already unpacked is not unpacked again. The returned session is always the bundle's own,
+    never an autosave or another session in the folder. A renamed session with unchanged content is found. A
+    deleted session is written again.
 
-    Nothing is written outside that folder, which appears whole or not at all.
+    Nothing is written outside that folder, which appears complete or not at all.
 
     Raises:
-        ProgdfError: the file is damaged, no bundle or uses an unsupported feature of .zip; or the folder
-            holds something else or cannot be written.
+        ProgdfError: the file is damaged, no bundle, or uses an unsupported feature of .zip. Or the folder
+            was not unpacked from this bundle, or cannot be written.
     """
     folder = path.resolve().with_name(path.name.removesuffix(".zip"))
     with _open_archive(path) as archive:
@@ -173,10 +174,10 @@ def _open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
 
 
 def _check_members(path: Path, archive: zipfile.ZipFile) -> list[zipfile.ZipInfo]:
-    """Return the members of a bundle, each a plain file that can be unpacked within the limits.
+    """Return the members of a bundle, after a check that each is a plain file within the limits.
 
     Raises:
-        ProgdfError: a name is no plain file's or appears twice, a member is encrypted or compressed by
+        ProgdfError: a name is no plain file name or appears twice, a member is encrypted or compressed with
             another method than deflate, or the members are too many or too large.
     """
     members = archive.infolist()
@@ -208,10 +209,10 @@ def _check_members(path: Path, archive: zipfile.ZipFile) -> list[zipfile.ZipInfo
 def _find_session(
     path: Path, archive: zipfile.ZipFile, members: Sequence[zipfile.ZipInfo]
 ) -> zipfile.ZipInfo:
-    """Return the only session among the members: by its name, or by its content if no name fits.
+    """Return the only session among the members, by its name, or by its content if no name matches.
 
     Raises:
-        ProgdfError: there is none, or more than one.
+        ProgdfError: there is no session, or more than one.
     """
     sessions = [member for member in members if member.filename.lower().endswith(SUFFIX)]
     if not sessions:
@@ -228,13 +229,13 @@ def _find_session(
 
 
 def _is_unpacked(path: Path, folder: Path) -> bool:
-    """Return True if a folder was unpacked from exactly this bundle."""
+    """Return whether a folder was unpacked from exactly this bundle."""
     hash_file = folder / _HASH_FILE
     return hash_file.is_file() and atomic.read_file(hash_file, 65) == sha256(path).encode()
 
 
 def _find_copy(folder: Path, session: zipfile.ZipInfo) -> Path | None:
-    """Return a file of the folder with the content of a bundle's session, under another name."""
+    """Return a file in the folder with the content of the bundle's session under another name, or None."""
     for file in sorted(folder.glob("*.json")):
         if not file.is_file() or file.stat().st_size != session.file_size:
             continue
@@ -244,7 +245,7 @@ def _find_copy(folder: Path, session: zipfile.ZipInfo) -> Path | None:
 
 
 def _unpack(path: Path, archive: zipfile.ZipFile, members: Sequence[zipfile.ZipInfo], folder: Path) -> None:
-    """Write the members into a folder, which appears when all are written.
+    """Write the members into a folder, which appears once all are written.
 
     Raises:
         ProgdfError: a member is damaged, or the folder cannot be written.

@@ -1,7 +1,7 @@
-"""Cameras as entries of a JSON file: our own, Inria's cameras.json, nerfstudio's transforms.json.
+"""Cameras from entries of a JSON file: our own format, Inria's cameras.json, nerfstudio's transforms.json.
 
-Each reader returns a float64 camera of the world and the fields that it ignores. Fields that change the
-camera are honored or refused by name; `_REFUSED` lists the refused ones.
+Each reader returns a float64 camera in the world and the fields that it ignores. Fields that change the
+camera are used or refused; `_REFUSED_FIELDS` lists the refused ones.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ PINHOLE_MODELS = (
     "FULL_OPENCV",
     "PERSPECTIVE",
 )
-"""Names of camera models that are a pinhole behind a lens with k1, k2, k3, p1 and p2."""
+"""Names of camera models that are pinholes with lens distortion k1, k2, k3, p1 and p2."""
 
-_REFUSED = {
+_REFUSED_FIELDS = {
     "is_fisheye": "a fisheye lens",
     "fisheye": "a fisheye lens",
     "ftheta_p0": "an f-theta lens",
@@ -68,10 +68,10 @@ _REFUSED = {
     "transform_matrix_start": "a pose that moves during the exposure",
     "transform_matrix_end": "a pose that moves during the exposure",
 }
-"""Fields that change a camera and are not supported → their meaning. Zero or false switches them off."""
+"""Unsupported fields that change a camera → their meaning. Zero or false switches them off."""
 
 _NERFSTUDIO_REFUSED = {
-    **_REFUSED,
+    **_REFUSED_FIELDS,
     "intrinsic_matrix": "intrinsics of NeuS2; fl_x, fl_y, cx and cy are read",
     "from_na": "the axes of NeuS2",
 }
@@ -82,7 +82,7 @@ _NERFSTUDIO_HONORED = frozenset(
 )  # fmt: skip
 
 _INRIA_REFUSED = {
-    **_REFUSED,
+    **_REFUSED_FIELDS,
     "trans": "a translation of the world",
     "scale": "a scale of the world",
 }
@@ -91,7 +91,7 @@ _INRIA_HONORED = frozenset(
      "k1", "k2", "k3", "p1", "p2", "camera_model", "camera_type")
 )  # fmt: skip
 
-_MAX_REPAIR = 1e-2  # a matrix whose R Rᵀ is this close to I has rounded numbers and is made a rotation
+_MAX_REPAIR = 1e-2  # largest deviation of R Rᵀ from I that counts as rounding and is repaired
 
 _Number = Annotated[float, msgspec.Meta(gt=-3e38, lt=3e38)]  # finite in float32
 _Pixels = Annotated[float, msgspec.Meta(ge=1, le=1_000_000, multiple_of=1)]
@@ -102,8 +102,8 @@ _Row4 = tuple[_Number, _Number, _Number, _Number]
 _Matrix3 = tuple[_Row3, _Row3, _Row3]
 
 
-class _Own(msgspec.Struct):
-    """A camera that `save_cameras` wrote."""
+class _SavedCamera(msgspec.Struct):
+    """Camera entry written by `save_cameras`."""
 
     viewmat: tuple[_Row4, _Row4, _Row4, _Row4]
     K: _Matrix3
@@ -114,8 +114,8 @@ class _Own(msgspec.Struct):
     sampling: _Number = 1.0
 
 
-class _Inria(msgspec.Struct):
-    """A camera of Inria's cameras.json, and the fields that other writers add."""
+class _InriaCamera(msgspec.Struct):
+    """Camera entry of Inria's cameras.json, with fields that other writers add."""
 
     rotation: _Matrix3
     position: _Row3
@@ -132,8 +132,8 @@ class _Inria(msgspec.Struct):
     img_name: Any = ""
 
 
-class _Focal(msgspec.Struct):
-    """The focal length as transforms.json states it, of a frame or of the file."""
+class _FocalLength(msgspec.Struct):
+    """Focal length fields of transforms.json, of a frame or of the file."""
 
     fl_x: _Number | None = None
     fl_y: _Number | None = None
@@ -144,7 +144,7 @@ class _Focal(msgspec.Struct):
 
 
 class _Frame(msgspec.Struct):
-    """A frame of transforms.json, with the fields that it takes from the file."""
+    """Frame of transforms.json, with the fields that it inherits from the file."""
 
     transform_matrix: Annotated[list[_Row4], msgspec.Meta(min_length=3, max_length=4)]
     w: _Pixels | None = None
@@ -157,9 +157,9 @@ class _Frame(msgspec.Struct):
 
 
 def read_own_camera(file: str, index: int, entry: object) -> Camera:
-    """Return an entry that `save_cameras` wrote."""
+    """Return the camera of an entry written by `save_cameras`."""
     where = f"camera {index} of {file}"
-    camera = _read(where, entry, _Own)
+    camera = _read(where, entry, _SavedCamera)
     viewmat = make_rigid(where, torch.tensor(camera.viewmat, dtype=torch.float64))
     K = torch.tensor(camera.K, dtype=torch.float64)
     size = camera.width, camera.height
@@ -167,14 +167,14 @@ def read_own_camera(file: str, index: int, entry: object) -> Camera:
 
 
 def read_inria_camera(file: str, index: int, entry: object) -> tuple[Camera, tuple[str, ...]]:
-    """Return an entry of Inria's cameras.json and its ignored fields.
+    """Return the camera of an entry in Inria's cameras.json, and its ignored fields.
 
     `rotation` and `position` are camera to world, OpenCV axes. Without cx and cy the principal point is the
-    center.
+    image center.
     """
     where = f"camera {index} of {file}"
     ignored = _check_fields(where, entry, _INRIA_HONORED, _INRIA_REFUSED, switched_off={"scale": 1})
-    camera = _read(where, entry, _Inria)
+    camera = _read(where, entry, _InriaCamera)
     lens = _read(where, entry, Lens)
     _check_model(where, camera.camera_model, camera.camera_type)
     size = camera.width, camera.height
@@ -194,16 +194,16 @@ def read_inria_camera(file: str, index: int, entry: object) -> tuple[Camera, tup
 def read_nerfstudio_camera(
     file: str, index: int, shared: Mapping[str, Any], entry: object, path: Path
 ) -> tuple[Camera, tuple[str, ...]]:
-    """Return a frame of transforms.json and its ignored fields, those of the file among them.
+    """Return the camera of a frame in transforms.json, and the ignored fields of the frame and the file.
 
-    Fields of the frame go before those of the file. The axes are OpenGL's (y up, z backwards).
+    Fields of the frame override those of the file. The axes are OpenGL's (y up, z backwards).
 
     Args:
-        file: the file's name for messages
+        file: name of the file for messages
         index: number of the frame
-        shared: the file
+        shared: fields of the file
         entry: the frame
-        path: the file, whose folder `file_path` starts from
+        path: path of the file; `file_path` is relative to its folder
     """
     where = f"frame {index} of {file}"
     table = {**shared, **entry} if isinstance(entry, dict) else entry
@@ -223,16 +223,16 @@ def read_nerfstudio_camera(
     return make_camera(where, viewmat, K, size, name, lens or None), ignored
 
 
-class _Applied(msgspec.Struct):
-    """The way from the dataset's world to the frame of a transforms.json."""
+class _AppliedTransform(msgspec.Struct):
+    """Transform from the dataset's world to the coordinate frame of a transforms.json."""
 
     applied_transform: Annotated[list[_Row4], msgspec.Meta(min_length=3, max_length=4)] | None = None
     applied_scale: Annotated[float, msgspec.Meta(gt=0, lt=3e38)] = 1.0
 
 
 def read_applied_transform(file: str, content: object) -> Tensor:
-    """Return the similarity from the dataset's world to the frame of a transforms.json. [4,4] float64"""
-    applied = _read(file, content, _Applied)
+    """Return the similarity from the dataset's world to the world of a transforms.json. [4,4] float64"""
+    applied = _read(file, content, _AppliedTransform)
     matrix = torch.eye(4, dtype=torch.float64)
     if applied.applied_transform is not None:
         matrix[:3] = torch.tensor(applied.applied_transform[:3], dtype=torch.float64)
@@ -255,7 +255,15 @@ def _check_fields(
     refused: Mapping[str, str],
     switched_off: Mapping[str, object] | None = None,
 ) -> tuple[str, ...]:
-    """Return the ignored fields; raise ProgdfError for a refused one that is not switched off."""
+    """Return the ignored fields; raise ProgdfError for a refused field that is not switched off.
+
+    Args:
+        where: the entry, for errors
+        entry: decoded JSON
+        honored: fields that the reader uses
+        refused: see `check_fields`
+        switched_off: values that make a refused field harmless, besides zero, false and empty values
+    """
     if not isinstance(entry, dict):
         return ()
     off = switched_off or {}
@@ -268,7 +276,7 @@ def _check_fields(
 
 
 def _is_off(value: object) -> bool:
-    """Return whether a field has no effect: zero, false, empty, or a list of such values."""
+    """Return whether a field has no effect: it is zero, false, empty, or a list of such values."""
     return all(map(_is_off, value)) if isinstance(value, list) else not value
 
 
@@ -279,13 +287,13 @@ def _check_model(where: str, *models: object) -> None:
 
 
 def portable_name(name: object) -> str:
-    """Return a picture's name with forward slashes; Windows programs write backward ones."""
+    """Return a picture's name with forward slashes. Windows programs write backslashes."""
     return str(name).replace("\\", "/")
 
 
 def _stated_focal(where: str, size: tuple[float, float], entry: object) -> tuple[float, float] | None:
-    """Return the focal lengths that a frame or the file states by itself; None if it states none."""
-    stated = _read(where, entry, _Focal)
+    """Return the focal lengths stated in a frame or in the file, pixels; None if it states none."""
+    stated = _read(where, entry, _FocalLength)
     degrees = [None if angle is None else math.radians(angle) for angle in (stated.x_fov, stated.y_fov)]
     angles = [stated.camera_angle_x, stated.camera_angle_y]
     lengths = [stated.fl_x, stated.fl_y]
@@ -295,12 +303,12 @@ def _stated_focal(where: str, size: tuple[float, float], entry: object) -> tuple
 def _focal_lengths(
     size: tuple[float, float], lengths: list[float | None], angles: list[float | None]
 ) -> tuple[float, float] | None:
-    """Return both focal lengths in pixels; one that is missing is like the other (square pixels).
+    """Return both focal lengths in pixels. A missing one equals the other (square pixels).
 
     Args:
         size: image width and height, pixels
-        lengths: along x and y, pixels
-        angles: fields of view along x and y, radians; they count where no length is given
+        lengths: focal lengths along x and y, pixels
+        angles: fields of view along x and y, radians; used if no length is given
     """
     known = [length for length in lengths if length is not None]
     if not known:
@@ -317,14 +325,14 @@ def _principal_point(size: tuple[float, float], cx: float | None, cy: float | No
 
 
 def _image_size(where: str, frame: _Frame, folder: Path, name: str) -> tuple[float, float]:
-    """Return the size that the file states, or the picture's (synthetic NeRF scenes have no w and h)."""
+    """Return the stated image size, otherwise the picture's (synthetic NeRF scenes have no w and h)."""
     if frame.w is not None and frame.h is not None:
         return frame.w, frame.h
-    from .images import picture_size  # Pillow, which files with sizes do without
+    from .images import picture_size  # imports Pillow, which is not needed if the size is stated
 
     picture: Path | None = folder / name
     try:
-        if not os.path.isfile(folder / name):  # pathlib's raises where a name is too long
+        if not os.path.isfile(folder / name):  # Path.is_file raises for a name that is too long
             picture = find_picture(folder, name)
         if picture is not None:
             return picture_size(picture, calibrated=True)
@@ -334,10 +342,10 @@ def _image_size(where: str, frame: _Frame, folder: Path, name: str) -> tuple[flo
 
 
 def make_rigid(where: str, matrix: Tensor) -> Tensor:
-    """Return a matrix that a file states as a rotation and a translation; rounded numbers are mended. [4,4]
+    """Check that a matrix is a rotation and a translation, and repair rounding errors. [4,4] -> [4,4]
 
     Raises:
-        ProgdfError: it scales, shears or mirrors.
+        ProgdfError: the matrix scales, shears or mirrors.
     """
     if not rigid_fault(matrix):
         return matrix
@@ -348,9 +356,9 @@ def make_rigid(where: str, matrix: Tensor) -> Tensor:
             "export the cameras again"
         )
     left, _, right = torch.linalg.svd(matrix[:3, :3])
-    mended = matrix.clone()
-    mended[:3, :3] = left @ right  # the nearest rotation
-    return mended
+    repaired = matrix.clone()
+    repaired[:3, :3] = left @ right  # the nearest rotation
+    return repaired
 
 
 def make_camera(
@@ -362,7 +370,7 @@ def make_camera(
     lens: Lens | None = None,
     sampling: float = 1.0,
 ) -> Camera:
-    """Return a float64 camera of the world; raise ProgdfError for numbers that make none."""
+    """Return a float64 camera in the world; raise ProgdfError for invalid numbers."""
     width, height = map(int, size)
     try:
         return Camera(viewmat, K.float(), width, height, name, lens, sampling=sampling)
@@ -371,5 +379,5 @@ def make_camera(
 
 
 def make_intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
-    """Return K. [3,3] float64"""
+    """Return the intrinsic matrix K. [3,3] float64"""
     return torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float64)

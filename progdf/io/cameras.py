@@ -1,8 +1,10 @@
-"""Cameras as files: Inria cameras.json, nerfstudio transforms.json, our own JSON, also in a picture, known by
-their content; and folders: a COLMAP sparse model, or a folder with one of these files in it.
+"""Load and save cameras, from files and folders.
 
-Files have cameras in the world; in the program they are relative to the origin of their scene, as its means
-are (`Gaussians.origin`). All of them pass here on their way in and out.
+Files are recognized by content: Inria cameras.json, nerfstudio transforms.json, our own JSON, also embedded
+in a rendered picture. A folder is a COLMAP sparse model, or contains one of these files.
+
+Files store cameras in the world. In the program, cameras are relative to the origin of their scene, as its
+means are (`Gaussians.origin`). This module converts between the two.
 """
 
 from __future__ import annotations
@@ -39,50 +41,51 @@ _log = logging.getLogger(__name__)
 
 _FORMAT = "progdf cameras 1"
 PICTURE_KEY = "progdf:camera"
-"""Of the text in a .png that holds the camera from which it was rendered."""
-_LONGEST_TEXT = 1 << 16  # characters of one camera: a picture may claim megabytes
+"""Key of the .png text chunk with the camera of the rendering."""
+_MAX_CAMERA_TEXT = 1 << 16  # characters of an embedded camera; longer texts are refused
 _PNG = b"\x89PNG\r\n"
-_FILES = ("cameras.json", "transforms.json")
+_CAMERA_FILES = ("cameras.json", "transforms.json")
 _MODEL_FILES = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
 
 
 @dataclass(frozen=True)
 class CameraReport:
-    """Remarks on how a camera file was read."""
+    """Notes on the reading of a camera file."""
 
     notes: tuple[str, ...]  # one line each, such as the choice among several COLMAP models
     ignored: tuple[str, ...]  # fields of the file that are not read
-    # way from the world of the dataset to the file's, which `applied_transform` of a transforms.json tells;
+    # transform from the world of the dataset to that of the file (`applied_transform` in transforms.json);
     # None: the cameras were saved by this program, in the frame of a scene. [4,4] float64
     dataset: Tensor | None = None
 
 
 @dataclass(frozen=True)
 class _Source:
-    """The one thing that a name stands for: a file or a COLMAP model."""
+    """Source of cameras: a file or a COLMAP model."""
 
     file: Path
     model: ColmapModel | None = None
 
 
 def load_cameras(path: str | os.PathLike[str], origin: Origin = ZERO) -> list[Camera]:
-    """Return the cameras of a JSON file in its order, or of a COLMAP model in the order of their names.
+    """Load the cameras of a JSON file in its order, or of a COLMAP model in the order of their names.
 
-    Three kinds of files are known: Inria `cameras.json` (a list with rotation, position, fx, fy), nerfstudio
-    `transforms.json` (frames with an OpenGL camera-to-world matrix; intrinsics per file or per frame) and
-    the format of `save_cameras`, also a single such camera, or one in a rendered picture. A folder is a
-    sparse model (see `progdf.io.colmap`) or holds one, or a cameras.json or transforms.json.
+    Three file formats are supported. Inria `cameras.json` is a list with rotation, position, fx, fy.
+    nerfstudio `transforms.json` has frames with an OpenGL camera-to-world matrix, and intrinsics per file or
+    per frame. The third is the format of `save_cameras`, also for a single camera or inside a rendered
+    picture. A folder is or contains a sparse model (see `progdf.io.colmap`), or contains a cameras.json or
+    transforms.json.
 
-    The views are those of pinholes. A lens that bends photographs is kept as `Camera.lens` and logged. A
-    choice among several COLMAP models is logged as a warning.
+    Cameras are pinholes. Lens distortion is stored in `Camera.lens` and logged. A choice among several COLMAP
+    models is logged as a warning.
 
     Args:
         path: file or folder
-        origin: of the scene, which the cameras are relative to; by default they are in the world
+        origin: origin of the scene; cameras are relative to it. By default they are in the world.
 
     Raises:
-        ProgdfError: nothing of that name, none of these kinds, several of them in one folder, a broken
-            camera, or one that is no pinhole behind a lens with k1, k2, k3, p1, p2 (fisheye, k4 and more).
+        ProgdfError: the path does not exist, has none of these formats, or is a folder with several of them.
+            Or a camera is broken, or has a lens with more than k1, k2, k3, p1, p2 (fisheye, k4 and more).
     """
     check_first_argument("load_cameras(path)", path, (str, os.PathLike))
     cameras, report = load_cameras_with_report(path, origin)
@@ -91,39 +94,39 @@ def load_cameras(path: str | os.PathLike[str], origin: Origin = ZERO) -> list[Ca
 
 
 def log_cameras(path: str | os.PathLike[str], cameras: Sequence[Camera], report: CameraReport) -> None:
-    """Log the remarks on how cameras were read."""
+    """Log the notes of a report as warnings, once per process, and the number of distorted cameras."""
     for note in report.notes:
         _warn_once(note)
-    bent = sum(camera.lens is not None for camera in cameras)
-    if bent:
+    distorted_count = sum(camera.lens is not None for camera in cameras)
+    if distorted_count:
         _log.info(
             "%s: %d of %d cameras have a lens that bends photographs; what is drawn is straight",
-            path, bent, len(cameras),
+            path, distorted_count, len(cameras),
         )  # fmt: skip
 
 
 def load_cameras_with_report(
     path: str | os.PathLike[str], origin: Origin = ZERO
 ) -> tuple[list[Camera], CameraReport]:
-    """Do as `load_cameras` without a log, and also return the report."""
+    """Load cameras as `load_cameras` does without logging, and return them with the report."""
     cameras, report = _read_source(_find_source(path))
     if not cameras:
         raise ProgdfError(f"{os.fspath(path)} holds no cameras; it needs at least one")
-    return [_enter(camera, origin, os.fspath(path)) for camera in cameras], report
+    return [_to_scene_frame(camera, origin, os.fspath(path)) for camera in cameras], report
 
 
 def camera_files(path: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Return the files that `load_cameras` reads cameras from, in a fixed order; pictures are not among them.
+    """Return the files that `load_cameras` reads cameras from, in a fixed order. Pictures are not included.
 
     Raises:
-        ProgdfError: a folder without cameras or with several kinds of them.
+        ProgdfError: the folder has no cameras, or several kinds of them.
     """
     source = _find_source(path)
     return (source.file,) if source.model is None else source.model.files
 
 
 def holds_cameras(path: str | os.PathLike[str]) -> bool:
-    """Return whether a folder has cameras, or a file is of a COLMAP model; other files are not looked at."""
+    """Return whether a folder has cameras or a file belongs to a COLMAP model. Other files are not opened."""
     file = Path(path)
     if os.path.isdir(file):
         return bool(_sources_in(file))
@@ -132,12 +135,12 @@ def holds_cameras(path: str | os.PathLike[str]) -> bool:
 
 @cache
 def _warn_once(line: str) -> None:
-    """Log a warning, the first time that this process has it: a training reads its cameras several times."""
+    """Log a warning once per process: a training reads its cameras several times."""
     _log.warning("%s", line)
 
 
-def _enter(camera: Camera, origin: Origin, where: str) -> Camera:
-    """A float64 camera of the world as the program has it: float32, relative to an origin."""
+def _to_scene_frame(camera: Camera, origin: Origin, where: str) -> Camera:
+    """Convert a float64 world camera to float32, relative to the origin of a scene."""
     viewmat = relative_viewmat(camera.viewmat, origin).float()
     if not bool(viewmat.isfinite().all()):
         raise ProgdfError(f"{where} has a camera too far away to be used; export the cameras again")
@@ -145,24 +148,24 @@ def _enter(camera: Camera, origin: Origin, where: str) -> Camera:
 
 
 def relative_viewmat(viewmat: Tensor, origin: Origin) -> Tensor:
-    """World → camera as origin → camera: of coordinates that are `origin` less. [4,4] -> [4,4] float64"""
-    moved = viewmat.double().clone()
-    if origin != ZERO:  # -0.0 stays what it is
-        moved[:3, 3] += moved[:3, :3] @ torch.tensor(origin, dtype=torch.float64)
-    return moved
+    """Convert a world → camera matrix to one for coordinates relative to `origin`. [4,4] -> [4,4] float64"""
+    relative = viewmat.double().clone()
+    if origin != ZERO:  # adding zero would change −0.0
+        relative[:3, 3] += relative[:3, :3] @ torch.tensor(origin, dtype=torch.float64)
+    return relative
 
 
 def read_camera(text: str, origin: Origin = ZERO) -> Camera:
-    """The camera of `FILE[:INDEX]`, the first one where no index is given; −1 is the last.
+    """Load one camera from `FILE[:INDEX]`: the first one without an index; −1 is the last.
 
-    It is relative to `origin`, as of `load_cameras`, and sees pictures, whatever a training sampled there.
+    The camera is relative to `origin`, as in `load_cameras`. Its `sampling` is reset to 1, for full pictures.
 
     Raises:
-        ProgdfError: the file is missing or holds no cameras, or not that many.
+        ProgdfError: the file is missing, has no cameras, or has no camera of that index.
     """
     name, colon, index = text.rpartition(":")
-    numbered = re.fullmatch(r"-?[0-9]{1,18}", index) is not None and bool(colon) and not os.path.exists(text)
-    path, number = (name, int(index)) if numbered else (text, 0)
+    has_index = re.fullmatch(r"-?[0-9]{1,18}", index) is not None and bool(colon) and not os.path.exists(text)
+    path, number = (name, int(index)) if has_index else (text, 0)
     cameras = load_cameras(path, origin)
     if not -len(cameras) <= number < len(cameras):
         last = len(cameras) - 1
@@ -171,7 +174,7 @@ def read_camera(text: str, origin: Origin = ZERO) -> Camera:
 
 
 def beside_folder(path: Path) -> Path:
-    """Return the folder that may have a scene's cameras: its own, or an Inria model's of iteration_N."""
+    """Return the folder that may hold a scene's cameras: its own, or the model folder of an Inria run."""
     folder = path.resolve().parent
     if folder.name.startswith("iteration_") and folder.parent.name == "point_cloud":
         return folder.parent.parent
@@ -179,7 +182,7 @@ def beside_folder(path: Path) -> Path:
 
 
 def _find_source(path: str | os.PathLike[str]) -> _Source:
-    """Return the file or model that a path stands for; a file of a model stands for the model of its form."""
+    """Return the file or model of a path. A file of a model stands for the model in the same form."""
     file = Path(path)
     if os.path.isdir(file):
         return _search_folder(file)
@@ -189,7 +192,7 @@ def _find_source(path: str | os.PathLike[str]) -> _Source:
 
 
 def _search_folder(folder: Path) -> _Source:
-    """Return the one thing in a folder that holds cameras."""
+    """Return the only source of cameras in a folder; raise ProgdfError for none or several."""
     sources = _sources_in(folder)
     if not sources:
         raise ProgdfError(
@@ -205,13 +208,13 @@ def _search_folder(folder: Path) -> _Source:
 
 
 def _sources_in(folder: Path) -> list[_Source]:
-    sources = [_Source(folder / name) for name in _FILES if (folder / name).is_file()]
+    sources = [_Source(folder / name) for name in _CAMERA_FILES if (folder / name).is_file()]
     model = find_model(folder)
     return sources if model is None else [*sources, _Source(model.folder, model)]
 
 
 def _read_source(source: _Source) -> tuple[list[Camera], CameraReport]:
-    """Return the cameras in the world, in float64, and the report."""
+    """Read the float64 world cameras of a source, and the report."""
     if source.model is not None:
         notes = (source.model.note,) if source.model.note else ()
         return load_model(source.model), CameraReport(notes, (), torch.eye(4, dtype=torch.float64))
@@ -219,7 +222,7 @@ def _read_source(source: _Source) -> tuple[list[Camera], CameraReport]:
     name = os.fspath(path)
     data = read_file(path)
     if data.startswith(_PNG):
-        camera = _carried_camera(path)
+        camera = _embedded_camera(path)
         if camera is None:
             raise ProgdfError(f"{name} carries no camera; give a picture that progdf render wrote")
         return [camera], CameraReport((), ())
@@ -244,25 +247,25 @@ def _dataset_frame(name: str, content: Any) -> Tensor | None:
 
 
 def camera_in_picture(path: str | os.PathLike[str], origin: Origin = ZERO) -> Camera | None:
-    """The camera that a rendered picture carries, relative to `origin`; None for one that carries none.
+    """Return the camera embedded in a rendered picture, relative to `origin`; None if there is none.
 
     Raises:
-        ProgdfError: no picture, or what it carries is no camera.
+        ProgdfError: the file is no picture, or the embedded text is no camera.
     """
-    camera = _carried_camera(path)
-    return None if camera is None else _enter(camera, origin, os.fspath(path))
+    camera = _embedded_camera(path)
+    return None if camera is None else _to_scene_frame(camera, origin, os.fspath(path))
 
 
-def _carried_camera(path: str | os.PathLike[str]) -> Camera | None:
-    """It in the world, in float64."""
-    from .images import picture_text  # Pillow, which camera files do without
+def _embedded_camera(path: str | os.PathLike[str]) -> Camera | None:
+    """Return the camera embedded in a picture, in the world and in float64; None if there is none."""
+    from .images import picture_text  # imports Pillow, which camera files do not need
 
     text = picture_text(path, PICTURE_KEY)
     if text is None:
         return None
     where = f"the text {PICTURE_KEY} in {os.fspath(path)}"
     try:
-        content = decode_json(text) if len(text) <= _LONGEST_TEXT else None
+        content = decode_json(text) if len(text) <= _MAX_CAMERA_TEXT else None
     except ValueError as error:
         raise ProgdfError(f"{where} is not JSON ({error}); render the picture again") from None
     match content:
@@ -272,7 +275,7 @@ def _carried_camera(path: str | os.PathLike[str]) -> Camera | None:
 
 
 def _from_content(name: str, content: Any, path: Path) -> tuple[list[Camera], tuple[str, ...]]:
-    """Return the cameras of a JSON value and the fields that are ignored."""
+    """Return the cameras of a JSON value and the ignored fields."""
     match content:
         case {"frames": list() as frames}:
             entries = [
@@ -302,7 +305,7 @@ def _from_content(name: str, content: Any, path: Path) -> tuple[list[Camera], tu
 
 
 def kind_of_cameras(path: str | os.PathLike[str]) -> str:
-    """ "own" for a file that `save_cameras` wrote, "other" for anything else."""
+    """Return "own" for a file written by `save_cameras`, otherwise "other"."""
     data = read_file(path)
     try:
         content = json.loads(data)
@@ -312,15 +315,18 @@ def kind_of_cameras(path: str | os.PathLike[str]) -> str:
 
 
 def save_cameras(path: str | os.PathLike[str], cameras: Sequence[Camera], origin: Origin = ZERO) -> None:
-    """Write cameras as JSON, whole or not at all; `load_cameras` gives the same bits back.
+    """Write cameras as JSON, complete or not at all. `load_cameras` restores the same bits.
 
-    `origin`: of the scene, which the cameras are relative to; the file has them in the world.
+    Args:
+        path: the file
+        cameras: cameras relative to `origin`
+        origin: origin of the scene; the file stores world cameras
     """
     write_file(path, cameras_to_json(cameras, 1, origin))
 
 
 def cameras_to_json(cameras: Sequence[Camera], indent: int | None = None, origin: Origin = ZERO) -> str:
-    """What a file of saved cameras holds, ASCII; see `save_cameras`."""
+    """Return the JSON text of saved cameras, ASCII; see `save_cameras`."""
     x, y, z = origin
     entries = [
         {

@@ -1,8 +1,8 @@
 """Cameras of a COLMAP sparse model.
 
-The text form is read here, as its image names may contain blanks, which pycolmap cuts off. The binary form
-is read by pycolmap (`pip install progdf-studio[colmap]`). Only cameras are read: the 3D points, which are
-most of a model and are often left out when one is passed on, are not. pycolmap gets an empty list of them.
+The text form is parsed here, as image names may contain blanks, which pycolmap cuts off. The binary form is
+read by pycolmap (`pip install progdf-studio[colmap]`). Only cameras are read. The 3D points make up most of a
+model and are often missing from shared models, so pycolmap gets an empty list of them.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from .camera_json import make_camera, make_intrinsics, make_rigid, portable_name
 from .file_rules import damage_error, unsupported_error
 from .json_values import convert_json, decode_json
 
-_NEEDED = ("cameras", "images")
-_OPTIONAL = ("rigs", "frames")
-"""Binary files since COLMAP 3.12; without them each image has a rig of its own. images.txt has all poses."""
+_REQUIRED_FILES = ("cameras", "images")
+_OPTIONAL_FILES = ("rigs", "frames")
+"""Binary files since COLMAP 3.12. Without them each image has its own rig. images.txt has all poses."""
 
-_PLACES = ("sparse", "", "colmap/sparse")
-"""Folders in a project that hold a model, or several in subfolders 0, 1, …"""
+_MODEL_FOLDERS = ("sparse", "", "colmap/sparse")
+"""Folders in a project that may hold a model, or several models in subfolders 0, 1, …"""
 
 _PARAMETERS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -46,24 +46,24 @@ _PARAMETERS = {
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
-"""Camera models that are a pinhole behind a lens → their parameters."""
+"""Supported camera models (pinhole with lens distortion) → their parameters."""
 
-_LENS = ("k1", "k2", "p1", "p2", "k3")
-_UNKNOWN_LENS = ("k4", "k5", "k6")
+_LENS_PARAMETERS = ("k1", "k2", "p1", "p2", "k3")
+_UNSUPPORTED_LENS = ("k4", "k5", "k6")
 
 _REMEDY = "run `colmap image_undistorter` and give its sparse folder"
 
 _IMAGE_FIELDS = 10  # IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME; the name is the rest of the line
 _CAMERA_FIELDS = 4  # CAMERA_ID MODEL WIDTH HEIGHT, then the parameters
 _MAX_SIDE = 1_000_000  # pixels
-_MAX_NORM_ERROR = 1e-2  # of a quaternion's squared length
+_MAX_NORM_ERROR = 1e-2  # largest deviation of a quaternion's squared length from 1
 _IMAGE_COUNT = re.compile(rb"#\s*Number of images:\s*(\d{1,18})\b")
 _NUMERIC = b"0123456789+-.eE \t"
 
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """A sparse model in one of its two forms."""
+    """COLMAP sparse model in binary or text form."""
 
     folder: Path
     suffix: str  # .bin or .txt
@@ -71,17 +71,17 @@ class ColmapModel:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """All files that are read."""
-        names = (*_NEEDED, *_OPTIONAL) if self.suffix == ".bin" else _NEEDED
+        """Files that are read."""
+        names = (*_REQUIRED_FILES, *_OPTIONAL_FILES) if self.suffix == ".bin" else _REQUIRED_FILES
         paths = [self.folder / f"{name}{self.suffix}" for name in names]
-        return tuple(path for path in paths if path.stem in _NEEDED or path.is_file())
+        return tuple(path for path in paths if path.stem in _REQUIRED_FILES or path.is_file())
 
 
 class _Image(msgspec.Struct):
-    """A registered image."""
+    """Registered image."""
 
     name: str
-    pose: list[list[float]]  # world → camera, OpenCV axes, pixel centers at +0.5, as ours. [3,4]
+    pose: list[list[float]]  # world → camera, OpenCV axes, pixel centers at +0.5. [3,4]
     width: int
     height: int
     model: str
@@ -90,7 +90,7 @@ class _Image(msgspec.Struct):
 
 @dataclass(frozen=True)
 class _TextCamera:
-    """A line of cameras.txt."""
+    """Line of cameras.txt."""
 
     model: str
     width: int
@@ -99,23 +99,24 @@ class _TextCamera:
 
 
 def open_model(folder: Path, suffix: str = "") -> ColmapModel | None:
-    """Return the model that lies in a folder itself, binary if both forms are there; None without one.
+    """Return the model in a folder itself, or None. The binary form is preferred.
 
     Args:
-        suffix: .bin or .txt to look for one form alone
+        folder: the folder
+        suffix: .bin or .txt to accept only one form
     """
     for kind in (suffix,) if suffix else (".bin", ".txt"):
-        if all((folder / f"{name}{kind}").is_file() for name in _NEEDED):
+        if all((folder / f"{name}{kind}").is_file() for name in _REQUIRED_FILES):
             return ColmapModel(folder, kind)
     return None
 
 
 def find_model(folder: Path) -> ColmapModel | None:
-    """Return the model of a folder: itself, or the largest in sparse, in the folder or in colmap/sparse."""
+    """Return the model of a folder: its own, or the largest in sparse, in subfolders, or in colmap/sparse."""
     model = open_model(folder)
     if model is not None:
         return _with_larger_sibling(model)
-    for name in _PLACES:
+    for name in _MODEL_FOLDERS:
         models = _models_in(folder / name)
         if models:
             return _choose_largest(models)
@@ -123,7 +124,7 @@ def find_model(folder: Path) -> ColmapModel | None:
 
 
 def _models_in(folder: Path) -> list[ColmapModel]:
-    """Return the models in subfolders 0, 1, …, or else the one in the folder itself."""
+    """Return the models in subfolders 0, 1, …, otherwise the model in the folder itself."""
     try:
         numbers = sorted(
             (int(path.name), path.name) for path in folder.iterdir() if re.fullmatch(r"[0-9]{1,9}", path.name)
@@ -137,7 +138,7 @@ def _models_in(folder: Path) -> list[ColmapModel]:
 
 
 def _with_larger_sibling(model: ColmapModel) -> ColmapModel:
-    """Return a model that was named by its number, with a note if another one beside it has more images."""
+    """Return a model, with a note if its folder is a number and a model beside it has more images."""
     if re.fullmatch(r"[0-9]{1,9}", model.folder.name) is None:
         return model
     count = _count_images(model)
@@ -151,12 +152,12 @@ def _with_larger_sibling(model: ColmapModel) -> ColmapModel:
 
 
 def _choose_largest(models: list[ColmapModel]) -> ColmapModel:
-    """Return the model with the most images, the first of equal ones."""
+    """Return the model with the most images; the first one if several are equal."""
     if len(models) == 1:
         return models[0]
     counts = [_count_images(model) for model in models]
     largest = counts.index(max(counts))
-    others = [
+    other_counts = [
         f"{model.folder.name} has {count}"
         for i, (model, count) in enumerate(zip(models, counts, strict=True))
         if i != largest
@@ -165,24 +166,24 @@ def _choose_largest(models: list[ColmapModel]) -> ColmapModel:
     note = (
         f"{chosen.folder} is used, the largest of {len(models)} COLMAP models: "
         f"{format_count(counts[largest], 'image')}, "
-        f"{', '.join(others)}"
+        f"{', '.join(other_counts)}"
     )
     return replace(chosen, note=note)
 
 
 def _count_images(model: ColmapModel) -> int:
-    """Return how many images a model states, without a check of them."""
+    """Return the number of images that a model states, without checking them."""
     if model.suffix == ".bin":
         return int.from_bytes(read_file(model.folder / "images.bin", 8), "little")
     return sum(1 for _ in _image_lines(read_file(model.folder / "images.txt")))
 
 
 def load_model(model: ColmapModel) -> list[Camera]:
-    """Return the registered images of a model as float64 cameras of the world, in the order of their names.
+    """Return the registered images of a model as float64 world cameras, in the order of their names.
 
     Raises:
-        ProgdfError: a file is damaged, a camera is no pinhole behind a lens that we know, no image is
-            registered, or pycolmap, which the binary form needs, is not installed.
+        ProgdfError: a file is damaged, a camera model or lens is not supported, no image is registered, or
+            pycolmap, which the binary form needs, is not installed.
     """
     images = _read_binary(model) if model.suffix == ".bin" else _read_text(model)
     if not images:
@@ -201,12 +202,12 @@ def _make_camera(folder: Path, image: _Image) -> Camera:
     if not (1 <= image.width <= _MAX_SIDE and 1 <= image.height <= _MAX_SIDE):
         raise ProgdfError(f"{where} has {image.width}x{image.height} pixels; export the model again")
     values = dict(zip(names, image.params, strict=True))
-    for name in _UNKNOWN_LENS:
+    for name in _UNSUPPORTED_LENS:
         if values.get(name):
             raise unsupported_error(where, f"{name} of the camera model {image.model}", _REMEDY)
     fx = values.get("fx", values.get("f", 0.0))
     K = make_intrinsics(fx, values.get("fy", fx), values["cx"], values["cy"])
-    lens = Lens(**{name: values[name] for name in _LENS if name in values})
+    lens = Lens(**{name: values[name] for name in _LENS_PARAMETERS if name in values})
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[:3] = torch.tensor(image.pose, dtype=torch.float64)
     if not bool(viewmat.isfinite().all()):
@@ -218,7 +219,7 @@ def _make_camera(folder: Path, image: _Image) -> Camera:
 
 
 def _read_binary(model: ColmapModel) -> list[_Image]:
-    """Return the images as pycolmap reads them, in a process of its own (see `native_child`)."""
+    """Read the images with pycolmap in a separate process (see `native_child`)."""
     if importlib.util.find_spec("pycolmap") is None:
         raise ProgdfError(
             f"{model.folder} is a binary COLMAP model, which needs pycolmap; pip install "
@@ -235,9 +236,9 @@ def _read_binary(model: ColmapModel) -> list[_Image]:
         memory = (1 << 30) + 64 * size
         seconds = 10 + int(2e-6 * size)
         try:
-            ended = native_child.run((memory, 0, seconds), 6 * seconds, "cameras", folder)
-            if ended.returncode == 0:
-                return convert_json(decode_json(ended.stdout), list[_Image])
+            result = native_child.run((memory, 0, seconds), 6 * seconds, "cameras", folder)
+            if result.returncode == 0:
+                return convert_json(decode_json(result.stdout), list[_Image])
         except (subprocess.TimeoutExpired, ValueError):
             pass
     raise ProgdfError(
@@ -247,17 +248,17 @@ def _read_binary(model: ColmapModel) -> list[_Image]:
 
 
 def _read_text(model: ColmapModel) -> list[_Image]:
-    """Return the images of cameras.txt and images.txt."""
+    """Read the images from cameras.txt and images.txt."""
     cameras = _read_text_cameras(model.folder / "cameras.txt")
     path = model.folder / "images.txt"
     content = read_file(path)
     images: dict[int, _Image] = {}
     for number, line in _image_lines(content):
-        fields = _decode(path, number, line).split(None, _IMAGE_FIELDS - 1)
+        fields = _decode_line(path, number, line).split(None, _IMAGE_FIELDS - 1)
         if len(fields) < _IMAGE_FIELDS:
             raise damage_error(path, f"line {number} has {len(fields)} of {_IMAGE_FIELDS} fields of an image")
-        image_id = _whole(path, number, fields[0])
-        camera_id = _whole(path, number, fields[8])
+        image_id = _parse_whole(path, number, fields[0])
+        camera_id = _parse_whole(path, number, fields[8])
         if image_id in images:
             raise damage_error(path, f"line {number} repeats the image {image_id}")
         if camera_id not in cameras:
@@ -265,7 +266,7 @@ def _read_text(model: ColmapModel) -> list[_Image]:
                 path, f"line {number} names the camera {camera_id}, which is not in cameras.txt"
             )
         camera = cameras[camera_id]
-        pose = _pose(path, number, [_finite(path, number, field) for field in fields[1:8]])
+        pose = _pose(path, number, [_parse_finite(path, number, field) for field in fields[1:8]])
         name = fields[9].rstrip()
         images[image_id] = _Image(name, pose, camera.width, camera.height, camera.model, camera.params)
     _check_header(path, content, len(images))
@@ -274,31 +275,31 @@ def _read_text(model: ColmapModel) -> list[_Image]:
 
 def _read_text_cameras(path: Path) -> dict[int, _TextCamera]:
     cameras = {}
-    for number, line in enumerate(_lines(read_file(path)), 1):
+    for number, line in enumerate(_split_lines(read_file(path)), 1):
         if not line.strip() or line.lstrip().startswith(b"#"):
             continue
-        fields = _decode(path, number, line).split()
+        fields = _decode_line(path, number, line).split()
         if len(fields) < _CAMERA_FIELDS:
             raise damage_error(
                 path, f"line {number} has {len(fields)} of {_CAMERA_FIELDS} fields of a camera"
             )
-        camera_id = _whole(path, number, fields[0])
+        camera_id = _parse_whole(path, number, fields[0])
         if camera_id in cameras:
             raise damage_error(path, f"line {number} repeats the camera {camera_id}")
-        width = _whole(path, number, fields[2])
-        height = _whole(path, number, fields[3])
-        params = [_finite(path, number, field) for field in fields[_CAMERA_FIELDS:]]
+        width = _parse_whole(path, number, fields[2])
+        height = _parse_whole(path, number, fields[3])
+        params = [_parse_finite(path, number, field) for field in fields[_CAMERA_FIELDS:]]
         cameras[camera_id] = _TextCamera(fields[1], width, height, params)
     return cameras
 
 
 def _image_lines(content: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield line number and line of every image in images.txt.
+    """Yield the line number and the line of every image in images.txt.
 
-    A line of 2D points follows each image; it may be blank, and some writers leave it out.
+    A line of 2D points follows each image. It may be blank, and some writers leave it out.
     """
     points_may_follow = False
-    for number, line in enumerate(_lines(content), 1):
+    for number, line in enumerate(_split_lines(content), 1):
         bare = line.strip()
         if bare.startswith(b"#"):
             continue
@@ -309,19 +310,19 @@ def _image_lines(content: bytes) -> Iterator[tuple[int, bytes]]:
         points_may_follow = True
 
 
-def _lines(content: bytes) -> list[bytes]:
+def _split_lines(content: bytes) -> list[bytes]:
     return content.removeprefix(b"\xef\xbb\xbf").splitlines()
 
 
 def _is_points(line: bytes) -> bool:
-    """Return whether a line is a list of 2D points, X Y POINT3D_ID each: no image line has such a form."""
+    """Return whether a line is a list of 2D points (X Y POINT3D_ID each). No image line has this form."""
     return not line.translate(None, _NUMERIC) and len(line.split()) % 3 == 0
 
 
 def _check_header(path: Path, content: bytes, count: int) -> None:
-    """Raise ProgdfError if the header counts more images than the file lists.
+    """Raise ProgdfError if the header states more images than the file lists.
 
-    A header that counts fewer is a template that the writer copied.
+    Fewer are accepted: some writers copy a template header.
     """
     stated = _IMAGE_COUNT.search(content)
     if stated is not None and int(stated[1]) > count:
@@ -331,7 +332,7 @@ def _check_header(path: Path, content: bytes, count: int) -> None:
         )
 
 
-def _decode(path: Path, number: int, line: bytes) -> str:
+def _decode_line(path: Path, number: int, line: bytes) -> str:
     try:
         return line.decode("utf-8")
     except UnicodeDecodeError:
@@ -340,13 +341,13 @@ def _decode(path: Path, number: int, line: bytes) -> str:
         ) from None
 
 
-def _whole(path: Path, number: int, field: str) -> int:
+def _parse_whole(path: Path, number: int, field: str) -> int:
     if re.fullmatch(r"[0-9]{1,18}", field, re.ASCII) is None:
         raise damage_error(path, f"line {number} has {field!r:.40} in place of a whole number")
     return int(field)
 
 
-def _finite(path: Path, number: int, field: str) -> float:
+def _parse_finite(path: Path, number: int, field: str) -> float:
     try:
         value = float(field)
     except ValueError:
@@ -357,7 +358,7 @@ def _finite(path: Path, number: int, field: str) -> float:
 
 
 def _pose(path: Path, number: int, values: list[float]) -> list[list[float]]:
-    """Return world → camera from a quaternion wxyz and a translation. [7] -> [3,4]"""
+    """Return the world → camera matrix of a quaternion wxyz and a translation. [7] -> [3,4]"""
     quat = torch.tensor([values[:4]], dtype=torch.float64)
     if not abs(float(quat.square().sum()) - 1.0) < _MAX_NORM_ERROR:
         raise damage_error(path, f"line {number} has a quaternion of length {float(quat.norm()):.4g}, not 1")

@@ -1,10 +1,10 @@
-"""Rules for reading files that other programs wrote.
+"""Rules for reading third-party files.
 
-1. A field that changes the result is honored, or the file is refused by naming that field. Harmless unknown
-   fields are listed by `progdf info`.
-2. "Damaged" is only said of a file that breaks its own format. A format, version or feature that is not
-   supported is named, with a way to convert the file.
-3. An error names the file that is at fault.
+1. A field that changes the result is either used, or the file is refused and the error names the field.
+   `progdf info` lists harmless unknown fields.
+2. An error calls a file damaged only if it breaks its own format. For an unsupported format, version or
+   feature, the error names it and gives a way to convert the file.
+3. An error names the file at fault.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def check_fields(
     Args:
         path: the file that holds the fields
         present: names of the fields in the file
-        honored: fields that the reader uses, or whose value it has checked
+        honored: fields that the reader uses or has checked
         refused: fields that change geometry, color or cameras and are not supported → their meaning
         remedy: an imperative phrase for the error of a refused field
 
@@ -76,16 +76,16 @@ _VARIANTS = {
     r"f_asg_\d+|roughness|metallic|(base_color|albedo|specular|brdf|incidents)_\w+": "reflectance",
     r"appearance_\w+|features|colors": "colors that depend on an appearance network, as gsplat's `app_opt`",
 }
-"""Fields of 3DGS variants that change geometry, color or time: pattern of a whole name → meaning.
+"""Fields of 3DGS variants that change geometry, color or time: pattern of the whole name → meaning.
 
-.ply files and checkpoints share the table, as trainers export tensors under their own names.
+.ply files and checkpoints share the table, as trainers export tensors under their internal names.
 """
 
 PLAIN_GAUSSIANS = "export plain 3D Gaussians from the program that trained it"
 
 
 def variant_fields(names: Iterable[str]) -> dict[str, str]:
-    """Return the names that belong to a 3DGS variant that is not supported, with their meanings."""
+    """Return the names that belong to an unsupported 3DGS variant, with their meanings."""
     meanings = {}
     for name in names:
         for pattern, meaning in _VARIANTS.items():

@@ -1,4 +1,4 @@
-"""Pictures as files: read upright in 8 bits, written whole; and contact sheets of them."""
+"""Picture files: read upright in 8 bits, written atomically; and contact sheets."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from progdf.errors import ProgdfError
 
 from .atomic import atomic_write, check_regular, make_folder
 
-_PAPER = (250, 249, 246)
-_INK = (38, 36, 34)
-_PALE_INK = (118, 113, 107)
+_SHEET_COLOR = (250, 249, 246)
+_TEXT_COLOR = (38, 36, 34)
+_NOTE_COLOR = (118, 113, 107)
 _Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
 
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "GIF")
-"""Pictures that are read; others of Pillow's many formats are programs, or need one."""
+"""Pillow formats that are read. Some of Pillow's other formats are programs, or need an external one."""
 
 MAX_PIXELS = 1 << 26
-"""67 million, more than cameras have: a picture of a few kilobytes can claim billions."""
+"""Largest number of pixels: 67 million, above any camera. A file of a few kilobytes can claim billions."""
 
 
-_TURNS = {
+_TRANSPOSES = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
     4: Image.Transpose.FLIP_TOP_BOTTOM,
@@ -41,14 +41,14 @@ _TURNS = {
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }
-"""What puts a picture upright, by its EXIF orientation; from 5 on width and height change places."""
+"""Transpose operation that makes a picture upright, by EXIF orientation. From 5 on, the sides are swapped."""
 
-_BYTES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "RGBa", "CMYK", "YCbCr", "HSV")
-"""Pillow's modes of 8 bits a channel, or less."""
+_BYTE_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "RGBa", "CMYK", "YCbCr", "HSV")
+"""Pillow modes with at most 8 bits per channel."""
 
-# tags of TIFF
-_BITS = 258
-_INTERPRETATION = 262
+# TIFF tags
+_BITS_TAG = 258
+_INTERPRETATION_TAG = 262
 _WHITE_IS_ZERO = 0
 
 
@@ -58,51 +58,57 @@ def open_picture(
     calibrated: bool = False,
     two_values: bool = False,
 ) -> Image.Image:
-    """A picture from a file, upright, in any mode of 8 bits a channel, any size up to `MAX_PIXELS`.
+    """Open a picture upright, in any mode of 8 bits per channel and any size up to `MAX_PIXELS`.
 
     Args:
         path: the file
-        proportions: width and height of which it must be a multiple (to 2 %); found out before it is unpacked
-        calibrated: it is a photograph of a camera whose pixels are known: what is stored turned is refused
-        two_values: numbers of more than 8 bits that are 0 or one other value become black and white
+        proportions: required aspect ratio as width and height, within 2 %; checked before decoding
+        calibrated: refuse a rotated photograph, as the camera calibration refers to one of its orientations
+        two_values: map pixels of more than 8 bits to black and white if they are 0 or one other value
 
     Raises:
-        ProgdfError: it is missing, no picture, too large, of other proportions, or its numbers have no white.
+        ProgdfError: the file is missing, no picture, too large, of another aspect ratio, or of a number type
+            without a defined white.
     """
     with _open(path) as picture:
-        stored = _orientation(picture)
-        _check_proportions(path, _upright_size(picture, stored), proportions)
+        stored_orientation = _orientation(picture)
+        _check_proportions(path, _upright_size(picture, stored_orientation), proportions)
         picture.load()
-        # Pillow turns a .tiff itself; a .png may say how it is stored behind its pixels
-        turn = _orientation(picture, loaded=True)
-        if calibrated and (stored > 1 or turn > 1):
-            raise _orientation_error(path, max(stored, turn))
+        # Pillow rotates a .tiff itself; a .png may state its orientation after its pixels
+        orientation = _orientation(picture, loaded=True)
+        if calibrated and (stored_orientation > 1 or orientation > 1):
+            raise _orientation_error(path, max(stored_orientation, orientation))
         upright = _to_bytes(path, picture, two_values)
-        upright = upright.transpose(_TURNS[turn]) if turn in _TURNS else upright.copy()
+        upright = (
+            upright.transpose(_TRANSPOSES[orientation]) if orientation in _TRANSPOSES else upright.copy()
+        )
         _check_proportions(path, upright.size, proportions)
         return upright
 
 
 def picture_size(path: str | os.PathLike[str], calibrated: bool = False) -> tuple[int, int]:
-    """Width and height of a picture that is upright. Arguments and errors are those of `open_picture`."""
+    """Return the width and height of a picture when upright. Arguments and errors as in `open_picture`."""
     with _open(path) as picture:
-        stored = _orientation(picture)
-        if calibrated and stored >= 5:
-            raise _orientation_error(path, stored)
-        return _upright_size(picture, stored)
+        orientation = _orientation(picture)
+        if calibrated and orientation >= 5:
+            raise _orientation_error(path, orientation)
+        return _upright_size(picture, orientation)
 
 
 def _orientation(picture: Image.Image, loaded: bool = False) -> int:
-    """The EXIF orientation, 1 (upright) to 8; of a .png that is not loaded only where it stands first."""
+    """Return the EXIF orientation, 1 (upright) to 8.
+
+    Before a .png is loaded, only an orientation stored ahead of its pixels is found.
+    """
     if isinstance(picture, PngImageFile) and not loaded and "exif" not in picture.info:
-        return 1  # Pillow would unpack it to look
+        return 1  # Pillow would decode the whole picture to find it
     orientation = picture.getexif().get(ExifTags.Base.Orientation)
-    return orientation if orientation in _TURNS else 1
+    return orientation if orientation in _TRANSPOSES else 1
 
 
 def _upright_size(picture: Image.Image, orientation: int) -> tuple[int, int]:
-    """Width and height once it is upright."""
-    # Pillow's own size of a .tiff is that of one version as stored, of another upright
+    """Return the width and height of a picture when upright."""
+    # for a .tiff, some Pillow versions report the stored size and others the upright size
     tags = getattr(picture, "tag_v2", {})
     width = int(tags.get(256, picture.width))
     height = int(tags.get(257, picture.height))
@@ -127,17 +133,20 @@ def _orientation_error(path: str | os.PathLike[str], orientation: int) -> Progdf
 
 
 def _to_bytes(path: str | os.PathLike[str], picture: Image.Image, two_values: bool) -> Image.Image:
-    """Return the picture in 8 bits a channel; Pillow's own conversion of 16 cuts all above 255.
+    """Convert a picture to 8 bits per channel. Pillow's own conversion of 16 bits clips values above 255.
 
-    `two_values`: see `open_picture`
+    Args:
+        path: the file, for errors
+        picture: the decoded picture
+        two_values: see `open_picture`
     """
-    if picture.mode in _BYTES:
+    if picture.mode in _BYTE_MODES:
         return picture
     if two_values and picture.mode.startswith(("I", "F")):
-        numbers = np.asarray(picture)
-        if set(np.unique(numbers).tolist()) <= {0, numbers.max()}:
-            return Image.fromarray(np.where(numbers > 0, 255, 0).astype(np.uint8))
-    # Pillow had a mode of 32 bits for .png files of 16
+        values = np.asarray(picture)
+        if set(np.unique(values).tolist()) <= {0, values.max()}:
+            return Image.fromarray(np.where(values > 0, 255, 0).astype(np.uint8))
+    # older Pillow versions open 16-bit .png files in a 32-bit mode
     if not picture.mode.startswith("I;16") and (picture.mode, picture.format) != ("I", "PNG"):
         kind = f"{picture.mode} colors"
         if picture.mode in ("I", "F"):
@@ -145,19 +154,20 @@ def _to_bytes(path: str | os.PathLike[str], picture: Image.Image, two_values: bo
         raise ProgdfError(f"{path} holds {kind}; save it in gray or RGB with 8 or 16 bits per channel")
     stored = np.asarray(picture)
     tags = getattr(picture, "tag_v2", {})
-    shades = np.arange(1 << 16) / ((1 << tags.get(_BITS, (16,))[0]) - 1)
-    if tags.get(_INTERPRETATION) == _WHITE_IS_ZERO:
+    shades = np.arange(1 << 16) / ((1 << tags.get(_BITS_TAG, (16,))[0]) - 1)
+    if tags.get(_INTERPRETATION_TAG) == _WHITE_IS_ZERO:
         shades = 1.0 - shades
     gray = Image.fromarray((shades.clip(0.0, 1.0) * 255.0).round().astype(np.uint8)[stored])
-    if isinstance(clear := picture.info.get("transparency"), int):
-        gray.putalpha(Image.fromarray(np.where(stored == clear, 0, 255).astype(np.uint8)))
+    if isinstance(transparent_value := picture.info.get("transparency"), int):
+        gray.putalpha(Image.fromarray(np.where(stored == transparent_value, 0, 255).astype(np.uint8)))
     return gray
 
 
 def picture_text(path: str | os.PathLike[str], key: str) -> str | None:
-    """A text that a .png carries under `key`, before its pixels or behind them; None where there is none.
+    """Return the text chunk of a .png with the given key, before or after its pixels; None if missing.
 
-    Raises ProgdfError as `open_picture` does.
+    Raises:
+        ProgdfError: as `open_picture`.
     """
     with _open(path) as picture:
         if not isinstance(picture, PngImageFile):
@@ -167,8 +177,14 @@ def picture_text(path: str | os.PathLike[str], key: str) -> str | None:
 
 
 def save_as(path: str | os.PathLike[str]) -> Callable[[Tensor], Tensor]:
-    """What saving leaves of an image [H,W,3] 0..1, in the way in which a file was saved: by a JPEG's tables
-    and subsampling, else in 8 bits. Raises ProgdfError as `open_picture` does."""
+    """Return a function that applies the losses of saving an image in the format of a file.
+
+    A JPEG is imitated with its quantization tables and subsampling, other formats with rounding to 8 bits.
+    The function maps [H,W,3] to [H,W,3], 0 to 1.
+
+    Raises:
+        ProgdfError: as `open_picture`.
+    """
     with _open(path) as picture:
         lossy = isinstance(picture, JpegImageFile) and picture.mode == "RGB"
         tables = dict(picture.quantization) if lossy else {}  # type: ignore[attr-defined]
@@ -190,7 +206,7 @@ def _open(path: str | os.PathLike[str]) -> Iterator[Image.Image]:
     check_regular(path)
     try:
         with warnings.catch_warnings():
-            # the limit here is lower than Pillow's; what is damaged is read or refused, not both
+            # the limit here is lower than Pillow's; a damaged file is read or refused, without a warning
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             warnings.simplefilter("ignore", UserWarning)
             with Image.open(path, formats=FORMATS) as opened:
@@ -200,72 +216,71 @@ def _open(path: str | os.PathLike[str]) -> Iterator[Image.Image]:
                 yield opened
     except ProgdfError:
         raise
-    except Exception as error:  # every format's reader raises its own when a file is damaged
+    except Exception as error:  # each format's reader raises its own errors
         reason = "it does not exist" if isinstance(error, FileNotFoundError) else type(error).__name__
         raise ProgdfError(f"{path} cannot be read as a picture ({reason}); save it as PNG") from error
 
 
 def flatten_onto(picture: Image.Image, color: str, size: tuple[int, int] | None = None) -> Image.Image:
-    """The picture without transparency, on a paper of one color, scaled to `size`. RGB"""
+    """Composite a picture on a background color and scale it to `size`. Returns an RGB picture."""
     if not picture.has_transparency_data:
-        plain = picture.convert("RGB")
-        return plain if size in (None, plain.size) else plain.resize(size, Image.Resampling.LANCZOS)
-    paper = Image.new("RGBA", picture.size, color)
-    paper.alpha_composite(picture.convert("RGBA"))
-    return flatten_onto(paper.convert("RGB"), color, size)
+        opaque = picture.convert("RGB")
+        return opaque if size in (None, opaque.size) else opaque.resize(size, Image.Resampling.LANCZOS)
+    background = Image.new("RGBA", picture.size, color)
+    background.alpha_composite(picture.convert("RGBA"))
+    return flatten_onto(background.convert("RGB"), color, size)
 
 
 def to_picture(image: Tensor) -> Image.Image:
-    """[H,W,3], 0..1 (what lies outside is cut) -> 8-bit picture, rounded."""
+    """Convert an image [H,W,3], clamped to 0 to 1, to an 8-bit picture, rounded."""
     return Image.fromarray((image.detach().clamp(0, 1) * 255.0).round().to(torch.uint8).cpu().numpy())
 
 
 def write_image(path: str | os.PathLike[str], image: Tensor) -> None:
-    """Write an image [H,W,3], 0..1, in the format of the file's ending; the folder is made if need be."""
+    """Write an image [H,W,3], 0 to 1, in the format of the file's ending. Missing folders are created."""
     make_folder(Path(path).parent)
     with atomic_write(path) as temporary_file:
-        # zlib's level 2 takes half the time of Pillow's own 6 for files 5 % larger
+        # zlib level 2 takes half the time of Pillow's default 6, and files are 5 % larger
         to_picture(image).save(temporary_file, compress_level=2)
 
 
 def read_picture(path: Path, size: tuple[int, int] | None = None, calibrated: bool = False) -> Tensor:
-    """Read a picture as [H,W,3] float32 0..1; transparency counts as white.
+    """Read a picture as [H,W,3] float32, 0 to 1. Transparent areas become white.
 
     Args:
         path: the file
-        size: width and height to scale to
+        size: width and height to scale to; the picture must have this aspect ratio
         calibrated: see `open_picture`
 
     Raises:
-        ProgdfError: as `open_picture`, whose proportions are those of `size`.
+        ProgdfError: as `open_picture`.
     """
     picture = flatten_onto(open_picture(path, size, calibrated), "white", size)
     return torch.from_numpy(np.asarray(picture, dtype=np.float32) / 255.0)
 
 
-_OPAQUE = 128  # of 255
-# of 255: within a tenth of black and of white
-_BLACK = 26
-_WHITE = 229
-_DRAWN_SHARE = 0.001  # of the opaque pixels: fewer black or white ones are no drawing
-_LABEL_BRIGHTNESS = 32  # of 255: the hue of darker pixels is noise
-_MAX_LABEL_COLORS = 256  # a picture with more colors is no map of labels
+_MIN_OPAQUE = 128  # of 255; alpha of an opaque pixel
+_MAX_BLACK = 26  # of 255; within a tenth of black
+_MIN_WHITE = 229  # of 255; within a tenth of white
+_MIN_DRAWN_SHARE = 0.001  # of the opaque pixels; with fewer black or white ones a picture is no drawing
+_MIN_LABEL_BRIGHTNESS = 32  # of 255; the hue of darker pixels is noise
+_MAX_LABEL_COLORS = 256  # a picture with more colors is no label map
 
 
 def read_mask(path: Path, size: tuple[int, int], calibrated: bool = False) -> Tensor:
-    """Return a mask, bright inside and black outside, scaled by area. [H,W] float32 0..1
+    """Read a mask, bright inside and black outside, scaled by area. [H,W] float32, 0 to 1
 
-    The brightest channel of a pixel counts, so that a mask may be red on black. Of two values, 0 and another,
-    the other one is inside, whatever its number. Where transparency varies it is the mask, unless the opaque
-    pixels are drawn in black and white themselves; then both count. Masks are never inverted.
+    The brightest channel of a pixel counts, so a mask may be red on black. If a mask only has 0 and one other
+    value, the other value is inside. If the alpha channel varies, it is the mask. If the opaque pixels are
+    also a black and white drawing, the mask is the minimum of both. Masks are never inverted.
 
     Args:
         path: the file
-        size: width and height to scale to
+        size: width and height to scale to; the picture must have this aspect ratio
         calibrated: see `open_picture`
 
     Raises:
-        ProgdfError: as `open_picture`, or the picture is a map of labels in several colors.
+        ProgdfError: as `open_picture`, or the picture is a label map in several colors.
     """
     picture = open_picture(path, size, calibrated, two_values=True)
     alpha = _varying_alpha(picture)
@@ -276,7 +291,7 @@ def read_mask(path: Path, size: tuple[int, int], calibrated: bool = False) -> Te
     channels = np.asarray(picture.convert("RGB"))
     gray: np.ndarray = channels.max(axis=2)
     if alpha is not None:
-        opaque = gray[alpha >= _OPAQUE]
+        opaque = gray[alpha >= _MIN_OPAQUE]
         gray = alpha if not _is_drawn(opaque) else np.minimum(gray, alpha)
     else:
         _check_labels(path, picture.convert("RGB"))
@@ -290,7 +305,7 @@ def read_mask(path: Path, size: tuple[int, int], calibrated: bool = False) -> Te
 
 
 def _varying_alpha(picture: Image.Image) -> np.ndarray | None:
-    """Return a picture's transparency, [H,W] uint8; None where it is the same everywhere."""
+    """Return the alpha channel of a picture, [H,W] uint8; None if it is constant."""
     if not picture.has_transparency_data:
         return None
     alpha = np.asarray(picture.convert("RGBA").getchannel("A"))
@@ -298,19 +313,19 @@ def _varying_alpha(picture: Image.Image) -> np.ndarray | None:
 
 
 def _is_drawn(opaque: np.ndarray) -> bool:
-    """Return whether pixels are a drawing in black and white, with hardly anything else. [P] uint8"""
-    black = float((opaque <= _BLACK).mean()) if len(opaque) else 0.0
-    white = float((opaque >= _WHITE).mean()) if len(opaque) else 0.0
-    return min(black, white) >= _DRAWN_SHARE and black + white >= 0.9
+    """Return whether at least 90 % of the pixels are black or white, and both occur. [P] uint8"""
+    black = float((opaque <= _MAX_BLACK).mean()) if len(opaque) else 0.0
+    white = float((opaque >= _MIN_WHITE).mean()) if len(opaque) else 0.0
+    return min(black, white) >= _MIN_DRAWN_SHARE and black + white >= 0.9
 
 
 def _check_labels(path: Path, picture: Image.Image) -> None:
-    """Raise ProgdfError where an RGB picture has few colors, and among them two hues: a map of labels."""
+    """Raise ProgdfError if an RGB picture has few colors and at least two hues, as label maps do."""
     colors = picture.getcolors(_MAX_LABEL_COLORS) or []
     hues = set()
     for _, color in colors:
         brightest = max(color)  # type: ignore[arg-type]
-        if brightest < _LABEL_BRIGHTNESS:
+        if brightest < _MIN_LABEL_BRIGHTNESS:
             continue
         hues.add(tuple(round(4 * channel / brightest) for channel in color))  # type: ignore[union-attr]
     hues.discard((4, 4, 4))
@@ -332,18 +347,18 @@ def contact_sheet(
     """Lay pictures out in a grid.
 
     Args:
-        rows: the pictures, row by row, all of one size; rows may have different lengths. [H,W,3] in 0..1 each
-        row_labels: a word to the left of each row, or none; further lines are smaller and paler
-        column_labels: a word above each column, or none
-        title: a line at the top
-        caption: a smaller line at the bottom
-        notes: a word under each picture, row by row, or none
+        rows: pictures of one size, row by row; rows may have different lengths. [H,W,3] each, 0 to 1
+        row_labels: text to the left of each row; lines after the first are smaller and paler
+        column_labels: text above each column
+        title: line at the top
+        caption: smaller line at the bottom
+        notes: text under each picture, row by row
 
     Returns:
-        The sheet. [H',W',3] in 0..1
+        The sheet. [H',W',3], 0 to 1
 
     Raises:
-        ValueError: no picture, pictures of different sizes, more labels than rows or columns.
+        ValueError: there are no pictures, their sizes differ, or labels outnumber rows or columns.
     """
     sizes = {tuple(image.shape) for row in rows for image in row}
     if len(sizes) != 1:
@@ -363,38 +378,38 @@ def contact_sheet(
     left = gap
     if row_labels:
         parts = [part for label in row_labels for part in enumerate(label.split("\n"))]
-        left += 4 * gap + max(_width(line, small if k else font) for k, line in parts)
+        left += 4 * gap + max(_text_width(line, small if k else font) for k, line in parts)
     top = gap + (round(2.2 * text) if title else 0)
     grid_top = top + (round(1.6 * text) if column_labels else 0)
     full_width = max(
         left + columns * (width + gap),
-        *(_width(line, f) + 4 * gap for line, f in ((title, large), (caption, small))),
+        *(_text_width(line, f) + 4 * gap for line, f in ((title, large), (caption, small))),
     )
     step = height + gap + (round(1.4 * text) if notes else 0)
     full_height = grid_top + len(rows) * step + (round(1.8 * text) if caption else 0)
 
-    page = Image.new("RGB", (full_width, full_height), _PAPER)
+    page = Image.new("RGB", (full_width, full_height), _SHEET_COLOR)
     draw = ImageDraw.Draw(page)
     if title:
-        draw.text((left, gap + 0.8 * text), title, _INK, large, anchor="lm")
+        draw.text((left, gap + 0.8 * text), title, _TEXT_COLOR, large, anchor="lm")
     for j, label in enumerate(column_labels):
         middle = left + j * (width + gap) + width / 2
-        draw.text((middle, top + 0.75 * text), label, _INK, font, anchor="mm")
+        draw.text((middle, top + 0.75 * text), label, _TEXT_COLOR, font, anchor="mm")
     for i, row in enumerate(rows):
         y = grid_top + i * step
         if i < len(row_labels):
             lines = row_labels[i].split("\n")
             for k, line in enumerate(lines):
                 middle = y + height / 2 + (k - (len(lines) - 1) / 2) * 1.35 * text
-                ink, letters = (_PALE_INK, small) if k else (_INK, font)
-                draw.text((left - 2 * gap, middle), line, ink, letters, anchor="rm")
+                color, line_font = (_NOTE_COLOR, small) if k else (_TEXT_COLOR, font)
+                draw.text((left - 2 * gap, middle), line, color, line_font, anchor="rm")
         for j, image in enumerate(row):
             page.paste(to_picture(image), (left + j * (width + gap), y))
         for j, note in enumerate(notes[i] if i < len(notes) else ()):
             below = (left + j * (width + gap) + width / 2, y + height + 0.75 * text)
-            draw.text(below, note, _PALE_INK, small, anchor="mm")
+            draw.text(below, note, _NOTE_COLOR, small, anchor="mm")
     if caption:
-        draw.text((left, full_height - 0.9 * text), caption, _PALE_INK, small, anchor="lm")
+        draw.text((left, full_height - 0.9 * text), caption, _NOTE_COLOR, small, anchor="lm")
     return torch.from_numpy(np.asarray(page, dtype=np.float32) / 255.0)
 
 
@@ -402,5 +417,5 @@ def _font(size: int) -> _Font:
     return ImageFont.load_default(size=size)
 
 
-def _width(line: str, font: _Font) -> int:
+def _text_width(line: str, font: _Font) -> int:
     return round(font.getlength(line))

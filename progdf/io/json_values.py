@@ -1,4 +1,4 @@
-"""JSON from files, checked by the types and ranges that dataclasses and Structs declare."""
+"""JSON parsing with validation against the types and ranges of dataclasses and Structs."""
 
 from __future__ import annotations
 
@@ -16,47 +16,47 @@ from progdf.errors import ProgdfError
 from .atomic import read_file
 
 DEEPEST = 64
-"""Lists and tables in one another that a file may have: what walks through them never runs out of stack."""
+"""Largest nesting depth of lists and tables. It keeps recursive functions within the stack."""
 
-_MAX_BYTES = 1 << 20  # of the files that programs keep for themselves
-_LONGEST_INT = 18  # digits; what is longer is a float, as in most languages
+_MAX_BYTES = 1 << 20  # largest size of the program's own small files
+_MAX_INT_DIGITS = 18  # longer integers become floats, as in most languages
 
 _T = TypeVar("_T")
 
 
 def decode_json(content: bytes | str) -> Any:
-    """The value that a JSON text holds: every number finite, every text encodable, nothing nested too deeply.
+    """Parse a JSON text. All numbers are finite, all texts encodable, and the nesting is bounded.
 
     Raises:
-        ValueError: it is no JSON, or holds what no file of ours does; one line.
+        ValueError: the text is no JSON, repeats a key, or breaks one of these rules; one line.
     """
     try:
         value = json.loads(
             content,
-            parse_int=lambda digits: int(digits) if len(digits) <= _LONGEST_INT else _parse_finite(digits),
+            parse_int=lambda digits: int(digits) if len(digits) <= _MAX_INT_DIGITS else _parse_finite(digits),
             parse_float=_parse_finite,
             parse_constant=_parse_finite,
             object_pairs_hook=_refuse_repeats,
         )
     except RecursionError:
         raise ValueError(f"it is nested more than {DEEPEST} deep") from None
-    _check(value, 0)
+    _check_value(value, 0)
     return value
 
 
 def convert_json(value: object, kind: type[_T], closed: bool = False) -> _T:
-    """A JSON value as a dataclass, a `msgspec.Struct`, or what else declares its types and ranges.
+    """Convert a JSON value to a dataclass, a `msgspec.Struct` or another type, and check types and ranges.
 
     Args:
-        value: JSON values
-        kind: what it is to be
+        value: decoded JSON
+        kind: the target type
         closed: refuse keys that `kind` does not have
 
     Raises:
-        ValueError: it is something else; the message says where, what was found and what was expected.
+        ValueError: the value does not match; the message names the position, the value and the expectation.
     """
     try:
-        converted = msgspec.convert(value, kind, dec_hook=_path)
+        converted = msgspec.convert(value, kind, dec_hook=_decode_path)
     except msgspec.ValidationError as error:
         raise ValueError(_explain(str(error), value)) from None
     if closed:
@@ -65,10 +65,10 @@ def convert_json(value: object, kind: type[_T], closed: bool = False) -> _T:
 
 
 def read_json(path: Path, kind: type[_T]) -> _T:
-    """A small file of the program's own as `kind`, see `convert_json`.
+    """Read a small JSON file of this program as `kind`, see `convert_json`.
 
     Raises:
-        ProgdfError: it is missing, no file, damaged or larger than any of them; one line.
+        ProgdfError: the file is missing, no regular file, damaged or larger than 1 MB; one line.
     """
     content = read_file(path, _MAX_BYTES + 1)
     try:
@@ -80,11 +80,11 @@ def read_json(path: Path, kind: type[_T]) -> _T:
 
 
 def check_text(text: str, holder: str) -> str:
-    """Return a text that JSON can hold; names of files and arguments may be other bytes.
+    """Return a text unchanged, after a check that JSON can store it.
 
     Args:
-        text: a text, in which bytes that are not UTF-8 are surrogate escapes
-        holder: the thing that is to hold it, such as "a session"
+        text: a file name or an argument; bytes that are not UTF-8 are surrogate escapes in it
+        holder: the document that will store it, such as "a session"
 
     Raises:
         ProgdfError: the text is not UTF-8.
@@ -97,20 +97,20 @@ def check_text(text: str, holder: str) -> str:
 
 
 def one_of(names: Sequence[str]) -> msgspec.Meta:
-    """What the type of a text declares that is one of a few names."""
+    """Return the `Annotated` constraint for a text that must be one of several names."""
     return msgspec.Meta(pattern=rf"^({'|'.join(names)})\Z")
 
 
 def plain(value: object) -> Any:
-    """The JSON value that `convert_json` reads back; paths are text, with forward slashes on any system."""
-    return msgspec.to_builtins(value, enc_hook=_text)
+    """Convert a value to JSON types that `convert_json` reads back; paths get forward slashes."""
+    return msgspec.to_builtins(value, enc_hook=_encode_path)
 
 
-def _text(value: object) -> str:
+def _encode_path(value: object) -> str:
     return value.as_posix() if isinstance(value, PurePath) else str(value)
 
 
-def _path(kind: type, value: object) -> object:
+def _decode_path(kind: type, value: object) -> object:
     if kind is Path and isinstance(value, str):
         return Path(value)
     raise ValueError(f"expected {kind.__name__}, got {value!r:.40}")
@@ -130,22 +130,22 @@ def _refuse_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return table
 
 
-def _check(value: object, depth: int) -> None:
+def _check_value(value: object, depth: int) -> None:
     if depth > DEEPEST:
         raise ValueError(f"it is nested more than {DEEPEST} deep")
     if isinstance(value, str):
-        value.encode()  # half a surrogate pair raises, a ValueError too
+        value.encode()  # half a surrogate pair raises UnicodeEncodeError, a ValueError
     elif isinstance(value, list):
         for entry in value:
-            _check(entry, depth + 1)
+            _check_value(entry, depth + 1)
     elif isinstance(value, dict):
         for key, entry in value.items():
             key.encode()
-            _check(entry, depth + 1)
+            _check_value(entry, depth + 1)
 
 
 def _explain(text: str, value: Any) -> str:
-    """An error of msgspec's that begins with the place's name and what is there."""
+    """Rewrite an error of msgspec so that it begins with the position and the value found."""
     text, _, where = text.replace("`", "").partition(" - at $")
     for name, index in re.findall(r"\.([^.\[]+)|\[(\d+)\]", where.partition("[...")[0]):
         value = value[name or int(index)]

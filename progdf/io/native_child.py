@@ -1,12 +1,12 @@
-"""Run as a script of its own, within bounds: what native code of others makes of a stranger's files.
+"""Script that runs third-party native code on untrusted files, with resource limits.
 
-    python -P native_child.py MEMORY OUTPUT SECONDS convert FORMAT IN FORMAT OUT   a scene by gaussforge
-    python -P native_child.py MEMORY OUTPUT SECONDS cameras FOLDER                 a COLMAP model by pycolmap
+    python -P native_child.py MEMORY OUTPUT SECONDS convert FORMAT IN FORMAT OUT   scene, by gaussforge
+    python -P native_child.py MEMORY OUTPUT SECONDS cameras FOLDER                 COLMAP model, by pycolmap
 
-Such code may crash on a broken file, or believe what it says of its own length: a few hundred bytes keep it
-busy for hours, where no Ctrl-C reaches. So it works in a process with so much memory (bytes, beyond what it
-has when it begins), output (bytes) and processor time (seconds). Nothing of progdf is imported, as that would
-take seconds. What is wrong is one line on stderr, exit 3.
+Native code may crash on a broken file, or trust a wrong length in it. A file of a few hundred bytes can keep
+it busy for hours, and Ctrl-C does not interrupt it. The script therefore limits memory (bytes, on top of the
+memory at the start), output (bytes) and processor time (seconds). It imports nothing from progdf, which would
+take seconds. An error is one line on stderr, with exit status 3.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from contextlib import suppress
 from pathlib import Path
 
 
-def _convert(kind: str, source: str, to: str, target: str) -> None:
-    """Write a scene in another format."""
+def _convert_scene(kind: str, source: str, to: str, target: str) -> None:
+    """Convert a scene file to another format with gaussforge."""
     import gaussforge
 
     path = Path(source)
@@ -29,8 +29,8 @@ def _convert(kind: str, source: str, to: str, target: str) -> None:
     Path(target).write_bytes(converted["data"])
 
 
-def _cameras(folder: str) -> None:
-    """Write the cameras of a COLMAP model as JSON to stdout."""
+def _print_cameras(folder: str) -> None:
+    """Print the cameras of a COLMAP model as JSON to stdout."""
     import pycolmap
 
     model = pycolmap.Reconstruction(folder)
@@ -49,25 +49,30 @@ def _cameras(folder: str) -> None:
     sys.stdout.write(json.dumps(table))
 
 
-def _limit(memory: int, output: int, seconds: int) -> None:
-    if sys.platform == "win32":  # which has no such limits: the time limit of the caller has to do there
+def _set_limits(memory: int, output: int, seconds: int) -> None:
+    if sys.platform == "win32":  # has no such limits; only the timeout of the caller applies
         return
     import resource
 
     limits = {resource.RLIMIT_FSIZE: output, resource.RLIMIT_CPU: seconds, resource.RLIMIT_CORE: 0}
-    with suppress(OSError):  # macOS has no /proc, and takes no RLIMIT_AS
+    with suppress(OSError):  # macOS has no /proc, and does not support RLIMIT_AS
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
         limits[resource.RLIMIT_AS] = pages * resource.getpagesize() + memory
-    for limit, most in limits.items():
+    for limit, maximum in limits.items():
         with suppress(ValueError, OSError):
-            resource.setrlimit(limit, (most, most))
+            resource.setrlimit(limit, (maximum, maximum))
 
 
 def run(limits: tuple[int, int, int], timeout: int, *words: str) -> subprocess.CompletedProcess[bytes]:
-    """Run this script: memory, output and seconds of processor time, how long to wait, what it shall do.
+    """Run this script in a new process.
+
+    Args:
+        limits: memory in bytes, output in bytes, processor time in seconds
+        timeout: wall-clock limit, seconds
+        words: further arguments of the script, such as "cameras" and a folder
 
     Raises:
-        TimeoutExpired: it did not end.
+        TimeoutExpired: the process did not end in time.
     """
     command = [sys.executable, "-P", __file__, *map(str, limits), *words]
     return subprocess.run(
@@ -78,9 +83,10 @@ def run(limits: tuple[int, int, int], timeout: int, *words: str) -> subprocess.C
 if __name__ == "__main__":
     converts = sys.argv[4] == "convert"
     try:
-        __import__("gaussforge" if converts else "pycolmap")  # its own memory does not count
-        _limit(*map(int, sys.argv[1:4]))
-        _convert(*sys.argv[5:]) if converts else _cameras(*sys.argv[5:])
-    except Exception as error:  # reported by the caller
+        # imported before the limits, so that its own memory does not count
+        __import__("gaussforge" if converts else "pycolmap")
+        _set_limits(*map(int, sys.argv[1:4]))
+        _convert_scene(*sys.argv[5:]) if converts else _print_cameras(*sys.argv[5:])
+    except Exception as error:  # the caller reports it
         print(f"{type(error).__name__}: {error}", file=sys.stderr)
         sys.exit(3)

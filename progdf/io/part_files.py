@@ -1,4 +1,4 @@
-"""Scenes that a training on several GPUs divides into one file per GPU."""
+"""Scenes in several files: multi-GPU trainings write one file per GPU."""
 
 from __future__ import annotations
 
@@ -9,29 +9,31 @@ from progdf.errors import ProgdfError
 
 from .file_rules import unsupported_error
 
-_RANK = re.compile(r"(?P<head>.*[_-]rank)(?P<part>\d{1,4})(?P<tail>\.(?:pt|pth|ckpt))", re.I | re.S)
-"""gsplat: ckpt_29999_rank0.pt. The name does not tell how many ranks there are."""
+_GSPLAT_PART = re.compile(r"(?P<head>.*[_-]rank)(?P<part>\d{1,4})(?P<tail>\.(?:pt|pth|ckpt))", re.I | re.S)
+"""File names of gsplat, such as ckpt_29999_rank0.pt. They do not state the number of ranks."""
 
-_RANK_OF = re.compile(r"(?P<head>.*_rk)(?P<part>\d{1,4})(?P<tail>_ws(?P<count>\d{1,4})\.ply)", re.I | re.S)
-"""Grendel-GS: point_cloud_rk0_ws4.ply. `ws` is the world size."""
+_GRENDEL_PART = re.compile(
+    r"(?P<head>.*_rk)(?P<part>\d{1,4})(?P<tail>_ws(?P<count>\d{1,4})\.ply)", re.I | re.S
+)
+"""File names of Grendel-GS, such as point_cloud_rk0_ws4.ply. `ws` is the world size."""
 
-_PART_OF = re.compile(
+_NUMBERED_PART = re.compile(
     r"(?:.*[_\-. ])?(?:part|shard|chunk|rank)[_\-. ]?(\d{1,5})[_\-. ]?of[_\-. ]?(\d{1,5})(?:[_\-. ].*)?"
     r"|.*[_\-. ](\d{5})-of-(\d{5})(?:[_\-. ].*)?",
     re.I | re.S,
 )
-"""room_part_1_of_3.ply and room-00001-of-00003.ply: divided by a user or an unknown program."""
+"""Names such as room_part_1_of_3.ply or room-00001-of-00003.ply, split by a user or an unknown program."""
 
-_GSPLAT_STEP = re.compile(r"ckpt_(\d{1,9})_rank", re.I)
+_GSPLAT_STEP = re.compile(r"ckpt_(\d{1,9})_rank", re.I)  # name of a gsplat checkpoint, with its training step
 
 
 def part_files(path: Path) -> list[Path]:
-    """Return the files that together hold the scene of a file, in the order of their numbers.
+    """Return all files of the scene that a file belongs to, in the order of their numbers.
 
     Raises:
-        ProgdfError: one of the files is missing, or the name says that it is a part but not by whose rule.
+        ProgdfError: one of the files is missing, or the name is that of a part in an unknown scheme.
     """
-    match = _RANK.fullmatch(path.name) or _RANK_OF.fullmatch(path.name)
+    match = _GSPLAT_PART.fullmatch(path.name) or _GRENDEL_PART.fullmatch(path.name)
     if match is None:
         _refuse_numbered_part(path)
         return [path]
@@ -56,7 +58,7 @@ def part_files(path: Path) -> list[Path]:
 
 
 def _numbers_between(folder: Path, head: str, tail: str) -> set[int]:
-    """Return the numbers in the names HEAD<number>TAIL of a folder; none where there is no such folder."""
+    """Return the numbers in the names HEAD<number>TAIL of a folder; empty if there is no such folder."""
     pattern = re.compile(re.escape(head) + r"(0|[1-9]\d{0,3})" + re.escape(tail))
     try:
         matches = [pattern.fullmatch(file.name) for file in folder.iterdir()]
@@ -66,7 +68,7 @@ def _numbers_between(folder: Path, head: str, tail: str) -> set[int]:
 
 
 def _refuse_numbered_part(path: Path) -> None:
-    match = _PART_OF.fullmatch(path.stem)
+    match = _NUMBERED_PART.fullmatch(path.stem)
     if match is None:
         return
     part, count = (int(number) for number in match.groups() if number is not None)

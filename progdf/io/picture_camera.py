@@ -1,7 +1,7 @@
-"""The camera of a picture: written into the .png that is rendered, found again for one that was changed.
+"""Cameras of rendered pictures: embedded in the .png when rendering, recovered after external editing.
 
-Any program may change the picture in between. Many keep the text in which the camera stands; for one that
-drops it, or writes another format, a file beside the picture or the camera of that name tells.
+Many programs keep the text chunk with the camera when they save a picture. If a program drops it, or writes
+another format, the camera comes from a file beside the picture, or from a given camera of the same name.
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ from .json_values import decode_json
 from .picture_files import name_key, split_path
 
 UP_KEY = "progdf:up"
+"""Key of the .png text chunk with the up axis of the scene."""
 EDITS_KEY = "progdf:edits"
-"""Of the text in a .png that names the edits which it shows."""
+"""Key of the .png text chunk with the names of the visible edits."""
 
 
 def camera_chunk(
@@ -35,9 +36,14 @@ def camera_chunk(
     origin: Origin = ZERO,
     up: tuple[float, float, float] | None = None,
 ) -> PngInfo:
-    """What `Image.save(…, pnginfo=)` takes for a .png to carry the camera from which it was rendered, the
-    names of the edits that it shows, and which direction counted as up. `origin`: of the scene, which the
-    camera is relative to."""
+    """Return the .png metadata of a rendering, for `Image.save(…, pnginfo=)`.
+
+    Args:
+        camera: camera of the rendering, relative to `origin`
+        edits: names of the visible edits
+        origin: origin of the scene
+        up: up axis of the scene
+    """
     info = PngInfo()
     info.add_text(PICTURE_KEY, cameras_to_json([camera], origin=origin))
     if up is not None:
@@ -48,14 +54,15 @@ def camera_chunk(
 
 
 def edits_in_picture(path: str | os.PathLike[str]) -> str:
-    """The edits that a .png says it shows, "" for none. Raises ProgdfError: it is no picture."""
+    """Return the names of the edits stored in a .png, or ""; raise ProgdfError if it is no picture."""
     return picture_text(path, EDITS_KEY) or ""
 
 
 def up_in_picture(path: str | os.PathLike[str]) -> object:
-    """What a picture says was up when it was rendered, for `up_from_json`; None where it says nothing.
+    """Return the up axis stored in a picture as decoded JSON, for `up_from_json`; None if there is none.
 
-    Raises ProgdfError: it is no picture.
+    Raises:
+        ProgdfError: the file is no picture.
     """
     text = picture_text(path, UP_KEY)
     with contextlib.suppress(ValueError):
@@ -66,19 +73,21 @@ def up_in_picture(path: str | os.PathLike[str]) -> object:
 def find_picture_camera(
     path: str | os.PathLike[str], given: Sequence[Camera] = (), origin: Origin = ZERO
 ) -> Camera:
-    """The camera of a picture: the one that it carries; else of A.camera.json beside A.png; else of the given
-    ones the one that is named as the picture is.
+    """Return the camera of a picture.
+
+    The first of these is used: the camera embedded in the picture, the camera in A.camera.json beside A.png,
+    or the given camera with the name of the picture.
 
     Args:
         path: the picture, of any format
-        given: as of --cameras
-        origin: of the scene, which the camera is relative to, and the given ones are
+        given: cameras from --cameras, relative to `origin`
+        origin: origin of the scene; the result is relative to it
 
     Returns:
-        The camera, named as the picture is, of the size at which the picture was rendered.
+        The camera, named like the picture, with the size of the rendering and without a lens.
 
     Raises:
-        ProgdfError: no picture, a camera that cannot be used, or none is found.
+        ProgdfError: the file is no picture, the camera is invalid, or no camera or several are found.
     """
     path = Path(path)
     camera = camera_in_picture(path, origin)
@@ -98,11 +107,11 @@ def find_picture_camera(
                 f"camera named {path.stem} with --cameras (the .png that progdf render wrote is one)"
             )
         camera = named[0]
-    return replace(camera, name=path.stem, lens=None)  # what was rendered is straight
+    return replace(camera, name=path.stem, lens=None)  # renderings are undistorted
 
 
 def _named_cameras(path: Path, cameras: Sequence[Camera]) -> list[Camera]:
-    """Return the cameras named as a picture; of several those whose folders are the picture's too."""
+    """Return the cameras named like a picture, of these the ones with the most folders in common with it."""
     parts = [name_key(part) for part in split_path(path.absolute().as_posix())]
     named: list[Camera] = []
     longest = 1

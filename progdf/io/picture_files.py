@@ -1,8 +1,9 @@
 """Names of views, and the search for their pictures in a folder.
 
-A view is named by the path of its photograph, without ending: cam0/IMG. Its pictures may have any case and
-any ending in `ENDINGS`. They lie at the same path below the given folder, or without the first folders where
-the rest of the path names one view only: IMG.JPG. COLMAP's masks keep the photograph's ending: IMG.JPG.png.
+The name of a view is the path of its photograph without ending, such as cam0/IMG. Its pictures may have any
+case and any ending in `ENDINGS`. They have the same path below the given folder. Leading folders may be
+missing (IMG.JPG) if the remaining path belongs to one view only. COLMAP's masks keep the photograph's ending:
+IMG.JPG.png.
 """
 
 from __future__ import annotations
@@ -29,14 +30,14 @@ _UNREAD_ENDINGS = (
     ".heic", ".heif", ".avif", ".jp2", ".jxl", ".exr", ".hdr", ".tga", ".psd", ".dib", ".ppm", ".pgm", ".svg",
     ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2",
 )  # fmt: skip
-"""Endings of pictures that are not read. An error names such a file where it lies in place of a picture."""
+"""Endings of unsupported picture formats. If a view only has such a file, the error names it."""
 
-_MAX_PART = 60  # characters of four bytes at most: file systems allow 255 bytes with an ending
-_MAX_PATH = 120  # characters of a whole view name: Windows allows 260 with the folder
+_MAX_PART_LENGTH = 60  # characters of up to 4 bytes; file systems allow 255 bytes with the ending
+_MAX_NAME_LENGTH = 120  # characters of a whole view name; Windows allows 260 with the folder
 
 
 def without_ending(name: str) -> str:
-    """Return a file name without its picture ending, also of a.jpg.png, as COLMAP names masks."""
+    """Return a file name without its picture ending or endings (COLMAP names masks a.jpg.png)."""
     for _ in range(2):
         stem, dot, ending = name.rpartition(".")
         if not stem or f"{dot}{ending}".lower() not in ENDINGS:
@@ -46,7 +47,7 @@ def without_ending(name: str) -> str:
 
 
 def split_path(name: str) -> tuple[str, ...]:
-    """Return the parts of a picture's path, with / or \\, without its root, drive, `.` and ending."""
+    """Return the parts of a picture's path, split at / or \\, without root, drive, `.` and ending."""
     parts = [part for part in re.split(r"[/\\]", name) if part not in ("", ".")]
     if parts and re.fullmatch("[A-Za-z]:", parts[0]):
         parts = parts[1:]
@@ -56,7 +57,7 @@ def split_path(name: str) -> tuple[str, ...]:
 
 
 def without_common_folder(names: Sequence[str]) -> list[str]:
-    """Return paths relative to the folder that all of them share, as nerfstudio writes its renders."""
+    """Return paths relative to their common folder, as nerfstudio names its renders."""
     parts = [name.replace("\\", "/").split("/") for name in names]
     shared = 0
     for level in zip(*(path[:-1] for path in parts), strict=False):
@@ -67,10 +68,13 @@ def without_common_folder(names: Sequence[str]) -> list[str]:
 
 
 def view_name(name: str) -> str | None:
-    """Return a relative path with / that is a safe file name on every system, without its ending.
+    """Return the view name of a picture: a relative path with / that is safe on every system, no ending.
 
-    Parts `..` are left out. Letters, digits, `-`, `_` and `.` stay; all else becomes `_`, also the dots of
-    folders, which would be taken for strengths (`0.5`). None: no such name is left.
+    Parts `..` are left out. Letters, digits, `-`, `_` and `.` stay, and other characters become `_`. Dots in
+    folder names become `_` too, as such folders would be taken for strengths (`0.5`).
+
+    Returns:
+        The name, or None if no usable name remains.
     """
     parts = [part for part in split_path(name) if part != ".."]
     if not parts:
@@ -78,43 +82,43 @@ def view_name(name: str) -> str | None:
     folders = [_clean(part).replace(".", "_") for part in parts[:-1]]
     cleaned = [*folders, _clean(parts[-1])]
     path = "/".join(cleaned)
-    if len(path) > _MAX_PATH or any(not part.strip("._") or not is_portable(part) for part in cleaned):
+    if len(path) > _MAX_NAME_LENGTH or any(not part.strip("._") or not is_portable(part) for part in cleaned):
         return None
     return path
 
 
 def is_view_name(name: str) -> bool:
-    """Return whether a view's files stay in their folder under this name, on every system."""
+    """Return whether files of a view with this name stay in their folder, on every system."""
     parts = name.split("/")
     return all(part not in ("", ".", "..") and is_portable(part) for part in parts)
 
 
 def _clean(part: str) -> str:
-    composed = unicodedata.normalize("NFC", part)  # macOS takes letters and their accents apart
-    return "".join(c if c.isalnum() or c in "-_." else "_" for c in composed)[:_MAX_PART]
+    composed = unicodedata.normalize("NFC", part)  # macOS stores letters and accents separately
+    return "".join(c if c.isalnum() or c in "-_." else "_" for c in composed)[:_MAX_PART_LENGTH]
 
 
 def name_twin(name: str) -> str:
-    """Return a form that is equal for names that Windows or macOS take for one."""
+    """Return a normal form that is equal for names that Windows or macOS treat as the same."""
     return unicodedata.normalize("NFC", name).casefold()
 
 
 def name_key(part: str) -> str:
-    """Return a form that is equal for a file or folder and for the view that is named after it."""
+    """Return a normal form that is equal for a file or folder and for the view named after it."""
     return name_twin(_clean(part)).replace(".", "_")
 
 
 @dataclass
 class PictureFolder:
-    """The pictures of some views in a folder. Each subfolder is listed once, when it is first needed."""
+    """Pictures of views in a folder. Each subfolder is listed once, on first use."""
 
     root: Path
-    names: Sequence[str] = ()  # of all views; a flat picture must be of one of them only
+    names: Sequence[str] = ()  # names of all views; a picture without folders must match only one of them
     _listings: dict[Path, list[os.DirEntry[str]]] = field(default_factory=dict, repr=False)
     _shares: Counter[tuple[str, ...]] | None = field(default=None, repr=False)
 
     def find(self, name: str) -> Path | None:
-        """Return the picture of a view; None where there is none.
+        """Return the picture of a view, or None.
 
         Raises:
             ProgdfError: two pictures have that name.
@@ -129,7 +133,7 @@ class PictureFolder:
             advice: the last part of the error, an imperative phrase
 
         Raises:
-            ProgdfError: there is none, two pictures have that name, or its format is not read.
+            ProgdfError: no picture or two pictures have that name, or its format is not supported.
         """
         found = self.find(name)
         if found is not None:
@@ -138,7 +142,7 @@ class PictureFolder:
         raise ProgdfError(f"{self.root} has no picture {name}.png; {advice}")
 
     def check_unread(self, name: str) -> None:
-        """Raise ProgdfError where the view has a picture in a format that is not read."""
+        """Raise ProgdfError if the view has a picture in an unsupported format."""
         unread = self._search(name, _UNREAD_ENDINGS)
         if unread is not None:
             kind = unread.suffix[1:].upper()
@@ -171,7 +175,7 @@ class PictureFolder:
         folder = self.root
         for part in parts:
             direct = folder / part
-            if os.path.isdir(direct):  # also for `..`; pathlib's raises where a name is too long
+            if os.path.isdir(direct):  # also for `..`; Path.is_dir raises for a name that is too long
                 folder = direct
                 continue
             folders = [entry for entry in self._list(folder) if entry.is_dir()]
@@ -189,9 +193,9 @@ class PictureFolder:
     def _picture(self, folder: Path, stem: str, view: str, endings: Sequence[str]) -> Path | None:
         stems = {}
         for entry in self._list(folder):
-            own, dot, ending = entry.name.rpartition(".")
-            if own and f"{dot}{ending}".lower() in endings and entry.is_file():
-                stems[entry.name] = without_ending(own)
+            base, dot, ending = entry.name.rpartition(".")
+            if base and f"{dot}{ending}".lower() in endings and entry.is_file():
+                stems[entry.name] = without_ending(base)
         chosen = _nearest(stems, stem)
         if len(chosen) > 1:
             raise ProgdfError(
@@ -204,20 +208,20 @@ class PictureFolder:
         if folder not in self._listings:
             try:
                 with os.scandir(folder) as entries:
-                    listed = sorted(entries, key=lambda entry: entry.name)
-            except (OSError, ValueError):  # a name may be too long, or hold a zero
-                listed = []
-            self._listings[folder] = listed
+                    found = sorted(entries, key=lambda entry: entry.name)
+            except (OSError, ValueError):  # a name may be too long, or contain a NUL
+                found = []
+            self._listings[folder] = found
         return self._listings[folder]
 
 
 def find_picture(folder: Path, name: str) -> Path | None:
-    """Return the picture with a name in a folder, of any ending and case; see `PictureFolder.find`."""
+    """Return the picture with a name in a folder, with any ending and case; see `PictureFolder.find`."""
     return PictureFolder(folder).find(name)
 
 
 def _nearest(names: dict[str, str], wanted: str) -> list[str]:
-    """Return the files whose name fits best: letter by letter, in another case, or as a view is named.
+    """Return the files with the closest name: exact, otherwise in another case, otherwise by `name_key`.
 
     Args:
         names: file name → the name to compare

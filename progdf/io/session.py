@@ -1,4 +1,4 @@
-"""The session file: which scene and edits were open, and the state of the window, as JSON one can read.
+"""Session file: the open scene and edits, and the state of the window, as readable JSON.
 
     {
       "progdf_session": 1,
@@ -8,9 +8,9 @@
       "snapshots": […]
     }
 
-Paths are relative to the session's folder (absolute where they share no folder with it, as on another
-Windows drive), hashes are of whole files. What `view` and `snapshots` hold is the viewer's. Nothing in the
-file is ever executed; a file that changed since, a newer version and an unknown key are refused in one line.
+Paths are relative to the session's folder, or absolute on another Windows drive. Hashes cover whole files.
+The viewer defines the contents of `view` and `snapshots`. Nothing in the file is executed. A changed file, a
+newer version and an unknown key are each refused with a one-line error.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from .json_values import check_text, convert_json, decode_json, plain
 
 VERSION = 1
 MARK = "progdf_session"
-"""The first key of every session file, which identifies its kind."""
+"""First key of every session file, which identifies the file type."""
 SUFFIX = ".session.json"
-_LARGEST = 64 << 20  # bytes; a session is a few kilobytes, painted strengths a few megabytes
+_MAX_BYTES = 64 << 20  # a session takes a few kB, painted strengths a few MB
 
 
 class FileRef(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A file that a session needs."""
+    """Reference to a file that a session needs."""
 
     file: str  # as written, with forward slashes; relative to the session's folder
     sha256: str  # of the file's bytes, lower-case hexadecimal
@@ -49,31 +49,31 @@ class FileRef(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError("a file has no name")
 
     def path(self, folder: Path) -> Path:
-        """Where it is, for a session in `folder`."""
+        """Return the path of the file for a session in `folder`."""
         return Path(os.path.normpath(folder / self.file))
 
 
 class EditRef(FileRef, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """An edit that a session needs."""
+    """Reference to an edit that a session needs."""
 
     region: str = ""  # name of the region that its grade is applied to
-    members: bytes = b""  # which Gaussians that is, as a selection is stored; empty: the edit's own
+    members: bytes = b""  # Gaussians of that region, stored like a selection; empty: the edit's own
 
 
 class SessionFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a session file holds, its state as plain JSON values."""
+    """Contents of a session file, with the state as plain JSON values."""
 
-    scene: FileRef  # the .ply
-    edits: tuple[EditRef, ...] = ()  # the .gdf files, in the order in which layers count them
-    view: dict[str, Any] = {}  # the state on screen
-    snapshots: tuple[dict[str, Any], ...] = ()  # states that were kept
+    scene: FileRef  # the scene file
+    edits: tuple[EditRef, ...] = ()  # the .gdf files, in the order of the layers' indices
+    view: dict[str, Any] = {}  # state of the window
+    snapshots: tuple[dict[str, Any], ...] = ()  # saved states
 
 
 File = TypeVar("File", bound=SessionFile)
 
 
 def is_session(start: bytes) -> bool:
-    """Return True if a file that starts with these bytes claims to be a session.
+    """Return whether a file that starts with these bytes claims to be a session.
 
     Args:
         start: the first 64 bytes, or more
@@ -82,10 +82,10 @@ def is_session(start: bytes) -> bool:
 
 
 def relative_name(path: Path, folder: Path) -> str:
-    """A file as a session in `folder` names it: with forward slashes, absolute where the two share no drive.
+    """Return the name of a file in a session in `folder`: forward slashes, absolute on another drive.
 
     Raises:
-        ProgdfError: its name is not UTF-8, which JSON cannot hold.
+        ProgdfError: the name is not UTF-8, so JSON cannot store it.
     """
     resolved = path.resolve()
     try:
@@ -97,37 +97,38 @@ def relative_name(path: Path, folder: Path) -> str:
 
 
 def reference(path: Path, folder: Path) -> FileRef:
-    """A file of a session in `folder`, with its hash.
+    """Return the reference to a file for a session in `folder`, with its hash.
 
     Raises:
-        ProgdfError: it cannot be read; or as `relative_name`.
+        ProgdfError: the file cannot be read; or as `relative_name`.
     """
     return FileRef(relative_name(path, folder), sha256(path.resolve()))
 
 
 def write_session(path: Path, session: SessionFile) -> None:
-    """Write it whole or not at all.
+    """Write a session file, complete or not at all.
 
     Raises:
         ProgdfError: the folder does not exist.
     """
     text = json.dumps({MARK: VERSION} | plain(session), indent=2, ensure_ascii=False, allow_nan=False)
-    # short lists of numbers on one line; a text holds no line break of its own, so none is hit
+    # put lists of numbers on one line; JSON strings contain no line breaks, so the pattern matches none
     text = re.sub(r"\[\n\s+([^\[\]{}\"]*?)\n\s+\]", lambda match: f"[{' '.join(match[1].split())}]", text)
     atomic.write_file(path, text + "\n")
 
 
 def read_session(path: str | os.PathLike[str], kind: type[File]) -> File:
-    """Read it, its state as `kind` has it; the files it names are not touched, see `verify_files`.
+    """Read a session file as `kind`. The files that it names are not opened, see `verify_files`.
 
     Raises:
-        ProgdfError: it cannot be read, is no session, of a newer version, or holds what no session holds.
+        ProgdfError: the file cannot be read, is no session, has a newer version, or has invalid contents.
     """
     name = Path(path).name
-    content = read_file(path, _LARGEST + 1)
-    if len(content) > _LARGEST:
+    content = read_file(path, _MAX_BYTES + 1)
+    if len(content) > _MAX_BYTES:
         raise ProgdfError(
-            f"{name} is larger than {_LARGEST >> 20} MB, too large for a session; give one saved with Ctrl+S"
+            f"{name} is larger than {_MAX_BYTES >> 20} MB, too large for a session; "
+            "give one saved with Ctrl+S"
         )
     try:
         table = decode_json(content)
@@ -147,12 +148,15 @@ def read_session(path: str | os.PathLike[str], kind: type[File]) -> File:
 
 
 def verify_files(path: Path, session: SessionFile) -> tuple[Path, tuple[Path, ...]]:
-    """The scene and the edits of the session at `path`, each found and with the content it had then.
+    """Find the scene and the edits of the session at `path`, and verify that they have not changed.
 
-    A file that is not where it was, as on another computer or system, is taken from beside the session.
+    A file that is missing at its path, as on another computer, is looked up beside the session.
+
+    Returns:
+        The scene's file and the edits' files.
 
     Raises:
-        ProgdfError: one is missing or has changed.
+        ProgdfError: a file is missing or has changed.
     """
     files = []
     for ref in (session.scene, *session.edits):
@@ -161,7 +165,7 @@ def verify_files(path: Path, session: SessionFile) -> tuple[Path, tuple[Path, ..
         beside = folder / PureWindowsPath(ref.file).name
         if not os.path.isfile(file) and os.path.isfile(beside):
             file = beside
-        if not os.path.isfile(file):  # pathlib's raises where a name is too long
+        if not os.path.isfile(file):  # Path.is_file raises for a name that is too long
             raise ProgdfError(
                 f"{path.name} needs {file}, which does not exist; put it back, or beside the session"
             )
@@ -175,10 +179,10 @@ def verify_files(path: Path, session: SessionFile) -> tuple[Path, tuple[Path, ..
 
 
 def sha256(path: Path) -> str:
-    """Of the file's bytes; read once as long as the file does not change.
+    """Return the SHA-256 of a file, hexadecimal. It is cached until the file changes.
 
     Raises:
-        ProgdfError: it cannot be read.
+        ProgdfError: the file cannot be read.
     """
     check_regular(path)
     try:

@@ -1,7 +1,8 @@
-"""Files of numbers: safetensors whose bytes depend on what is in them alone, and .npy.
+"""Tensor files: reproducible safetensors files with a checksum, and .npy files.
 
-The safetensors library writes several metadata in an order that differs from run to run, so all of them are
-one JSON text in one key. It knows nothing of damaged numbers: a checksum may be among the metadata.
+The safetensors library writes several metadata keys in an order that differs from run to run. All metadata is
+therefore one JSON text under one key, so that equal contents give equal bytes. safetensors does not detect
+damaged numbers, so the metadata includes a checksum.
 """
 
 from __future__ import annotations
@@ -27,10 +28,10 @@ from progdf.errors import ProgdfError
 from .atomic import atomic_write, check_regular, open_error
 
 METADATA = "progdf"
-"""The one key of a file's metadata."""
+"""Only key of a file's metadata."""
 
 _CHECKSUM = "crc32"
-_MAX_LEVELS = 1 << 30  # that a file of a megabyte could ask memory for
+_MAX_LEVELS = 1 << 30  # limit of unpacked levels: a file of 1 MB could request that many
 _TYPES = {
     torch.float64: "F64",
     torch.int64: "I64",
@@ -45,30 +46,37 @@ _TYPES = {
 
 
 def table_of(tensors: Mapping[str, Tensor]) -> dict[str, tuple[tuple[int, ...], str]]:
-    """Shape and type of each tensor, as a file's header calls them.
+    """Return the shape and the safetensors type name of each tensor.
 
     Raises:
-        KeyError: a tensor of another type than those above.
+        KeyError: the type of a tensor is not supported.
     """
     return {name: (tuple(tensor.shape), _TYPES[tensor.dtype]) for name, tensor in tensors.items()}
 
 
 def check_tensor(name: str, tensor: Tensor, shape: Sequence[int | None], *types: torch.dtype) -> None:
-    """Raises ValueError where a tensor has another shape, None standing for any number, or another type."""
+    """Raise ValueError if a tensor has another shape or type.
+
+    Args:
+        name: name of the tensor for the error
+        tensor: the tensor
+        shape: expected shape; None stands for any size
+        types: allowed types
+    """
     fits = len(shape) == tensor.ndim and all(
         n in (None, side) for n, side in zip(shape, tensor.shape, strict=True)
     )
     if not fits or tensor.dtype not in types:
-        sides = ", ".join("any" if side is None else str(side) for side in shape)
+        expected_sides = ", ".join("any" if side is None else str(side) for side in shape)
         kinds = " or ".join(str(kind).removeprefix("torch.") for kind in types)
         kind = str(tensor.dtype).removeprefix("torch.")
-        raise ValueError(f"{name} is {list(tensor.shape)} {kind}, expected [{sides}] {kinds}")
+        raise ValueError(f"{name} is {list(tensor.shape)} {kind}, expected [{expected_sides}] {kinds}")
 
 
 def check_ascent(name: str, numbers: Tensor) -> None:
-    """Raises ValueError where numbers do not ascend from 0 to 1. [n]"""
-    ends = numbers[[0, -1]].tolist() if numbers.ndim == 1 and len(numbers) > 1 else []
-    if ends != [0.0, 1.0] or not bool((numbers.diff() > 0).all()):
+    """Raise ValueError if numbers do not strictly ascend from 0 to 1. [n]"""
+    limits = numbers[[0, -1]].tolist() if numbers.ndim == 1 and len(numbers) > 1 else []
+    if limits != [0.0, 1.0] or not bool((numbers.diff() > 0).all()):
         raise ValueError(f"{name} must ascend from 0 to 1")
 
 
@@ -76,13 +84,13 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
     """Write a safetensors file.
 
     Args:
-        path: where to; see `atomic.atomic_write` for a file that is whole or absent
-        tensors: by name, of the types in the table above; on the CPU
-        metadata: texts by name; a checksum of everything, which `read_tensors` compares, is added
+        path: the file; the write is not atomic, see `atomic.atomic_write`
+        tensors: CPU tensors by name, of the types that `table_of` supports
+        metadata: texts by name; a checksum of the contents is added, which `read_tensors` verifies
 
     Raises:
-        KeyError: a tensor of another type.
-        OSError: the place cannot be written.
+        KeyError: the type of a tensor is not supported.
+        OSError: the file cannot be written.
     """
     metadata = {**metadata, _CHECKSUM: _checksum(metadata, tensors)}
     text = msgspec.json.encode(dict(sorted(metadata.items()))).decode()
@@ -91,11 +99,11 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """The tensors of a file and its metadata.
+    """Read the tensors and the metadata of a file, and verify its checksum.
 
     Raises:
-        OSError: it cannot be read.
-        ValueError: it is no safetensors file, or was damaged.
+        OSError: the file cannot be read.
+        ValueError: the file is no safetensors file of this program, or is damaged.
     """
     try:
         with safe_open(path, framework="pt") as opened:
@@ -105,7 +113,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         raise
     except KeyError:
         raise ValueError("it was not written by progdf") from None
-    except Exception as error:  # the library's own, and torch's where a shape overflows
+    except Exception as error:  # safetensors' own errors, and torch's if a shape overflows
         raise ValueError(" ".join(str(error).split())) from None
     if metadata.pop(_CHECKSUM, None) != _checksum(metadata, tensors):
         raise ValueError("checksum mismatch")
@@ -122,11 +130,10 @@ def _checksum(metadata: Mapping[str, object], tensors: Mapping[str, Tensor]) -> 
 
 
 def deflate(levels: Tensor) -> Tensor:
-    """Whole numbers of 8 bits by zlib, in whichever of two of its ways is shorter. -> [B] uint8
+    """Compress 8-bit integers with zlib, by the shorter of two strategies. Returns [B] uint8.
 
-    Levels of noise compress by how often each comes, by Huffman's codes alone, or with runs of the same:
-    shorter than zlib's own search for repetitions makes them, and ten times as fast
-    (docs/experiments.md, Levels of a residual).
+    Noise-like levels compress best with Huffman codes alone, or with run lengths. Both give shorter results
+    than zlib's search for repetitions, and are ten times as fast (docs/experiments.md, Levels of a residual).
     """
     content = levels.contiguous().numpy().tobytes()
 
@@ -139,17 +146,20 @@ def deflate(levels: Tensor) -> Tensor:
 
 
 def check_levels(shape: Sequence[int]) -> int:
-    """How many levels these are. Raises ValueError where a small file asks for memory without bounds."""
+    """Return the number of levels in a shape; raise ValueError if it exceeds `_MAX_LEVELS`.
+
+    The limit stops a small damaged file from requesting unbounded memory.
+    """
     if (size := math.prod(shape)) > _MAX_LEVELS:
         raise ValueError(f"{list(shape)} packed levels, more than {_MAX_LEVELS}")
     return size
 
 
 def inflate(packed: Tensor, shape: Sequence[int], dtype: torch.dtype) -> Tensor:
-    """The inverse of `deflate`, never more than that many numbers. [B] uint8 -> [...] int8 or uint8
+    """Decompress the output of `deflate` to a given shape. [B] uint8 -> [...] int8 or uint8
 
     Raises:
-        ValueError: they are not as many.
+        ValueError: the bytes are no zlib stream, or do not hold exactly as many numbers.
     """
     size = check_levels(shape)
     if packed.dtype != torch.uint8 or packed.ndim != 1:
@@ -164,21 +174,21 @@ def inflate(packed: Tensor, shape: Sequence[int], dtype: torch.dtype) -> Tensor:
 
 
 def open_npy(path: str | os.PathLike[str], what: str = "numbers") -> NDArray[Any]:
-    """The array of a .npy file, of whole numbers, fractions or bools; its bytes are read when they are used.
+    """Open a .npy file of integers, floats or bools as a memory map.
 
     Args:
         path: the file
-        what: its numbers are, for the message
+        what: meaning of the numbers, for errors
 
     Raises:
-        ProgdfError: no such file, or none that `numpy.save` wrote of numbers.
+        ProgdfError: the file does not exist, or is no numeric .npy file.
     """
     check_regular(path)
     try:
         array: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
     except OSError as error:
         raise open_error(path, error) from None
-    except Exception:  # numpy reads the header as a Python literal, and raises whatever that raises
+    except Exception:  # numpy parses the header as a Python literal, which can raise many types
         raise ProgdfError(
             f"{path} is not a readable .npy file of {what}; save them with numpy.save"
         ) from None
@@ -188,7 +198,7 @@ def open_npy(path: str | os.PathLike[str], what: str = "numbers") -> NDArray[Any
 
 
 def save_npy(path: str | os.PathLike[str], array: NDArray[Any]) -> None:
-    """Write an array, whole or not at all.
+    """Write an array to a .npy file, complete or not at all.
 
     Raises:
         ProgdfError: see `atomic_write`.

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.io.images import (
-    _TURNS,
+    _TRANSPOSES,
     contact_sheet,
     flatten_onto,
     open_picture,
@@ -222,7 +222,7 @@ INVERSE = {**{i: i for i in range(1, 8)}, 6: 8, 8: 6}
 
 def stored_turned(path: Path, orientation: int) -> Path:
     """`CORNERS` stored as a camera that was held so would, with the tag that says it."""
-    turn = _TURNS.get(INVERSE[orientation])
+    turn = _TRANSPOSES.get(INVERSE[orientation])
     picture = Image.fromarray(CORNERS)
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = orientation

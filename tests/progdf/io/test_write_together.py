@@ -152,7 +152,7 @@ def in_a_child(work: Callable[[], object]) -> int:
 
 @posix
 def test_complete_set_of_another_user_is_not_moved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    host = atomic._HOST
+    host = atomic._HOST_HASH
     planted = tmp_path / f".progdf-{host}-999999999-00000000.complete"
     planted.mkdir()
     (planted / "a").write_text("planted")
