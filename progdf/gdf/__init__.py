@@ -1,1 +1,1 @@
-"""The .gdf file: one edit, bound to its scene."""
+"""Reader and writer of .gdf files: one edit each, bound to its scene."""

@@ -1,4 +1,4 @@
-"""The .gdf file: one region's edit, bound to its scene. The only contract of trainer and viewer."""
+"""The .gdf file: one region's edit, bound to its scene. The only interface between trainer and viewer."""
 
 from __future__ import annotations
 
@@ -29,36 +29,40 @@ from . import header
 from .header import SceneFingerprint
 
 _FINGERPRINTS: MutableMapping[Tensor, tuple[tuple[int, Origin] | None, str]] = WeakIdKeyDictionary()
-"""Version, origin and hash of the centers of scenes that are alive."""
+"""Cache by means tensor, while it exists: its version with the scene's origin, and its hash."""
 ANY_SCENE = SceneFingerprint(0, "")
-"""Of a grade that was trained on none."""
-_FAR = 1e18
-"""An offset that is larger is absurd, as a position is (see `progdf.formats.repair`)."""
-_FARTHEST = {"log_scales": 80.0}
-"""Where it is another number: e^80 fits into float32, with a scale of any scene too."""
+"""Fingerprint of a grade that is bound to no scene."""
+_MAX_OFFSET = 1e18
+"""Largest offset of an attribute, like the largest position (see `progdf.formats.repair`)."""
+_MAX_OFFSETS = {"log_scales": 80.0}
+"""Largest offset of attributes with another limit. e^80 fits into float32, also times any scene's scale."""
 
 UNSEEN_LOGIT = -math.log(254.0)
-"""Below it an opacity is less than 1/255, which no engine draws."""
+"""Opacity logit of 1/255. Renderers skip Gaussians below it."""
 ADDED_LOGIT = -6.0
-"""The opacity of added rows at strength 0."""
+"""Opacity logit of added rows at strength 0."""
 
 
 @dataclass(frozen=True)
 class Gdf:
-    """One region's edit. Raises ValueError where region, field and scene differ in their Gaussians."""
+    """Edit of one region.
 
-    name: str  # the layer's, e.g. "shirt"
+    Raises:
+        ValueError: the counts of Gaussians in region, field and scene do not match.
+    """
+
+    name: str  # name of the layer, e.g. "shirt"
     region: Region
-    field: BakedField  # of the region's members, and after them of the added rows
+    field: BakedField  # offsets of the region's members, followed by the added rows
     scene: SceneFingerprint  # the scene it was made for
-    instruction: str = ""  # to the editor, e.g. "recolor:#3060d0"
-    options: Mapping[str, Any] = default(default_factory=dict)  # of the training, JSON values
-    report: Mapping[str, Any] = default(default_factory=dict)  # the run's errors, see report.json
-    applied: bool = False  # the map of a grade that is bound to no scene, on a region of this one
-    # B Gaussians that the scene does not have, as they are at strength 0, where nothing of them is drawn: the
-    # field's last B members, see `progdf.compose.added`
+    instruction: str = ""  # instruction to the editor, e.g. "recolor:#3060d0"
+    options: Mapping[str, Any] = default(default_factory=dict)  # training options, JSON values
+    report: Mapping[str, Any] = default(default_factory=dict)  # errors of the run, see report.json
+    applied: bool = False  # True for the map of a grade that `apply_grade` put on a region
+    # B Gaussians that the scene does not have, at strength 0, where they are invisible; they are the last B
+    # members of the field, see `progdf.compose.added`
     added: Gaussians | None = None
-    from_others: int = 0  # how many of the last members other edits add, see `extend`
+    from_others: int = 0  # number of last members that other edits add, see `extend`
 
     def __post_init__(self) -> None:
         if (self.field.attributes or self.added is not None) and self.field.members != self.members:
@@ -75,24 +79,25 @@ class Gdf:
 
     @property
     def members(self) -> int:
-        """Members of the field: the region's and the added rows."""
+        """Number of members of the field: the region's members and the added rows."""
         return len(self.region) + (0 if self.added is None else len(self.added))
 
 
 def _check_added(added: Gaussians) -> None:
-    """Raises ValueError where a row would show at strength 0, or is nowhere near any scene."""
+    """Raise ValueError if an added row is visible at strength 0, or has numbers beyond the limits."""
     if not bool((added.logit_opacities < UNSEEN_LOGIT).all()):
         raise ValueError("an added row shows at strength 0")
     for name in ATTRIBUTES:
         values = getattr(added, name)
-        if values.numel() and not float(values.abs().max()) < _FARTHEST.get(name, _FAR):
+        if values.numel() and not float(values.abs().max()) < _MAX_OFFSETS.get(name, _MAX_OFFSET):
             raise ValueError(f"{name} of an added row is beyond any scene")
 
 
 def fingerprint(scene: Gaussians) -> SceneFingerprint:
-    """What a .gdf of this scene must carry; hashed once while the means are the same, unwritten tensor.
+    """Return the fingerprint of a scene, which binds a .gdf to it.
 
-    The means are those of the world, so the hash does not depend on the origin that loading has chosen.
+    It is cached while the means tensor is not modified. It hashes world means, so it does not depend on the
+    origin that was chosen when loading.
     """
     means = scene.means
     state = None if means.is_inference() else (means._version, scene.origin)
@@ -106,16 +111,16 @@ def fingerprint(scene: Gaussians) -> SceneFingerprint:
 
 
 def verify(gdf: Gdf, scene: Gaussians, gdf_name: str = "", scene_name: str = "the scene") -> None:
-    """Make sure that an edit belongs to a scene.
+    """Check that an edit belongs to a scene.
 
     Args:
         gdf: the edit
         scene: the scene
-        gdf_name: what to call the edit in the message; its layer name when empty
-        scene_name: what to call the scene in the message
+        gdf_name: name of the edit in the message; empty for its layer name
+        scene_name: name of the scene in the message
 
     Raises:
-        ProgdfError: it was made for another scene.
+        ProgdfError: the edit was made for another scene.
     """
     other = f"{gdf_name or gdf.name} was made for another scene"
     rebind = (
@@ -135,18 +140,18 @@ def verify(gdf: Gdf, scene: Gaussians, gdf_name: str = "", scene_name: str = "th
 
 
 def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
-    """Write an edit, whole or not at all.
+    """Write an edit, complete or not at all.
 
     Raises:
-        ProgdfError: the place cannot be written.
+        ProgdfError: the file cannot be written.
         ValueError: a number of the field is not finite.
-        TypeError: options or report hold something JSON cannot.
+        TypeError: options or report contain a value that JSON cannot store.
     """
     check_first_argument("save_gdf(path, gdf)", path, (str, os.PathLike))
     field, tensors = header.pack_field(gdf.field)
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     tensors |= header.pack_region(gdf.region) | header.pack_added(gdf.added)
-    if broken := _infinite(tensors):
+    if broken := _find_non_finite(tensors):
         raise ValueError(f"{broken} of {gdf.name} has a number that is not finite")
     head = header.GdfHeader(
         name=gdf.name,
@@ -173,18 +178,18 @@ def load_gdf(
     scene_name: str = "the scene",
     place: Callable[[Gdf], Region | None] = lambda stored: None,
 ) -> Gdf:
-    """Read an edit. A network or a grade is baked here, for which the scene is needed.
+    """Load an edit, and bake it if the file stores a network or a grade. Baking needs the scene.
 
     Args:
         path: a .gdf file, or a .cube file, which is a grade of no scene
-        scene: when given, the edit must belong to it
-        scene_name: what to call the scene in the message
-        place: the region of the scene that a grade is applied to, by the edit as it is stored; None: where it
-            was trained, and of a .cube file everywhere
+        scene: the scene that the edit must belong to; None to skip the check
+        scene_name: name of the scene in messages
+        place: function from the stored edit to the region that a grade is applied to; a result of None means
+            the trained region, or the whole scene for a .cube file
 
     Raises:
-        ProgdfError: see `read_gdf`, `apply_grade`; or it was made for another scene; or it is to be baked and
-            no scene is given.
+        ProgdfError: as `read_gdf` and `apply_grade`; or the edit was made for another scene, or must be baked
+            and no scene is given.
     """
     check_first_argument("load_gdf(path, scene)", path, (str, os.PathLike))
     gdf = read_gdf(path)
@@ -214,10 +219,12 @@ def load_gdf(
 
 
 def apply_grade(gdf: Gdf, scene: Gaussians, region: Region) -> Gdf:
-    """The map of a grade on a region of any scene: its mask, residual and figures are of another one.
+    """Apply the color map of a grade to a region of any scene.
+
+    The grade's mask, residual and report are left out, as they belong to the scene it was trained on.
 
     Raises:
-        ProgdfError: it is no grade, its colors are beyond any, or the region has no members.
+        ProgdfError: the edit is no grade, its color offsets exceed the limits, or the region is empty.
     """
     stored = gdf.field.origin
     if not isinstance(stored, GradeForm):
@@ -238,20 +245,21 @@ def apply_grade(gdf: Gdf, scene: Gaussians, region: Region) -> Gdf:
 
 
 def read_gdf(path: str | os.PathLike[str]) -> Gdf:
-    """The edit as it is stored, every byte checked; a network is not baked yet and moves nothing.
+    """Read an edit as stored, and verify its checksum. A network is not baked yet and has no offsets.
 
-    Of a .cube file, a grade of no members, to be applied.
+    A .cube file gives a grade without members, for `apply_grade`.
 
     Raises:
-        ProgdfError: it is no .gdf, from a newer version, truncated, damaged or inconsistent; see `read_cube`.
+        ProgdfError: the file is no .gdf, from a newer version, truncated, damaged or inconsistent; or as
+            `read_cube`.
     """
     name = Path(path).name
     if Path(path).suffix.lower() == CUBE:
-        nobody = Region("any", torch.zeros(0, dtype=torch.int64), torch.zeros(0))
+        empty_region = Region("any", torch.zeros(0, dtype=torch.int64), torch.zeros(0))
         ends = torch.tensor([0.0, 1.0])
         form = lattice_form(read_cube(path))
         field = BakedField("grade", ends, {}, BASE_CHANNELS, origin=form)
-        return Gdf(Path(path).stem, nobody, field, ANY_SCENE, name)
+        return Gdf(Path(path).stem, empty_region, field, ANY_SCENE, name)
     head, tensors = header.unpack_file(read_file(path), name)
     try:
         return _unpack(head, tensors)
@@ -260,7 +268,7 @@ def read_gdf(path: str | os.PathLike[str]) -> Gdf:
 
 
 def _unpack(head: header.GdfHeader, tensors: Mapping[str, Tensor]) -> Gdf:
-    if broken := _infinite(tensors):
+    if broken := _find_non_finite(tensors):
         raise ValueError(f"{broken} has a number that is not finite")
     if not 0 <= head.scene.count <= header.MAX_GAUSSIANS or head.members > head.scene.count:
         raise ValueError(f"{head.members} members of a scene of {head.scene.count} Gaussians")
@@ -288,18 +296,18 @@ def _unpack(head: header.GdfHeader, tensors: Mapping[str, Tensor]) -> Gdf:
     )
 
 
-def _infinite(tensors: Mapping[str, Tensor]) -> str:
-    """The name of a tensor with a number that is not finite; empty where there is none."""
+def _find_non_finite(tensors: Mapping[str, Tensor]) -> str:
+    """Return the name of a tensor with a NaN or an infinity, or an empty text."""
     return next((name for name, tensor in tensors.items() if not bool(torch.isfinite(tensor).all())), "")
 
 
 def _check_reach(field: BakedField) -> None:
-    """Raises ValueError where an offset, whatever the strength, is beyond any scene: sums would overflow."""
+    """Raise ValueError if an offset can exceed the limit at any strength, as sums could overflow."""
     for name, bases in field.attributes.items():
-        most = bases.coefficients.abs().amax(0).double()
-        reach = float(most[0]) * float(bases.end.abs().max() if bases.end_offset.numel() else 0.0)
+        max_coefficients = bases.coefficients.abs().amax(0).double()
+        reach = float(max_coefficients[0]) * float(bases.end.abs().max() if bases.end_offset.numel() else 0.0)
         if bases.residual_basis.numel():
             peaks = bases.residual_basis.abs().amax(1).double() * bases.scale[1:].abs().double()
-            reach += float(most[1:] @ peaks.amax(1))
-        if not reach < _FARTHEST.get(name, _FAR):
+            reach += float(max_coefficients[1:] @ peaks.amax(1))
+        if not reach < _MAX_OFFSETS.get(name, _MAX_OFFSET):
             raise ValueError(f"{name} moves by up to {reach:.3g}, farther than any scene reaches")

@@ -1,7 +1,7 @@
-"""The contents of a .gdf file: one JSON header in the safetensors metadata, and the tensors.
+"""Contents of a .gdf file: a JSON header in the safetensors metadata, and the tensors.
 
-The header ends with one SHA-256 of its own text without that sum, and of every tensor's name, type, shape and
-bytes: a file that is not exactly what was saved is refused. Nothing in it is ever executed.
+The header ends with a SHA-256 over its own text without the checksum, and over every tensor's name, type,
+shape and bytes. A file that differs from the saved one is refused. Nothing in it is executed.
 """
 
 from __future__ import annotations
@@ -36,31 +36,31 @@ from progdf.io.tensors import check_tensor, inflate
 from progdf.region import Region
 
 FORMAT = 7
-"""The version of the file format."""
+"""Version of the file format."""
 
 MAX_GAUSSIANS = 1 << 26
-"""A header that claims a larger scene is not believed: the score would take gigabytes."""
+"""Largest scene that a header may state. The score of a larger one would take gigabytes."""
 
-_MAX_HEADER = 1 << 24  # bytes; a report takes a few kB, and JSON of 100 MB could become a gigabyte
-_METADATA = "progdf"  # the one key: the library writes several in an order that differs from run to run
-_PARTS = ("end_offset", "residual_basis", "scale", "coefficients")  # of `AttributeBases`
-_GRADE = ("knots", "table", "residual", "scale", "coefficients")  # of `GradeForm`
-_PACKED = ".packed"  # of what a grade has by member, see `GradeForm.packed_levels`
-_ADDED = "added."
-_NETWORK = "network."
-_END_CORRECTION = "end_correction."
-_OLDEST = 3  # format that is read
+_MAX_HEADER = 1 << 24  # bytes; a report takes a few kB, and 100 MB of JSON could take 1 GB when parsed
+_METADATA = "progdf"  # only metadata key; safetensors writes several keys in varying order
+_BASES_TENSORS = ("end_offset", "residual_basis", "scale", "coefficients")  # tensors of `AttributeBases`
+_GRADE_TENSORS = ("knots", "table", "residual", "scale", "coefficients")  # tensors of `GradeForm`
+_PACKED_SUFFIX = ".packed"  # ending of compressed per-member tensors, see `GradeForm.packed_levels`
+_ADDED_PREFIX = "added."
+_NETWORK_PREFIX = "network."
+_END_CORRECTION_PREFIX = "end_correction."
+_OLDEST_FORMAT = 3  # oldest format that is read
 
 
 class SceneFingerprint(msgspec.Struct, frozen=True):
-    """What binds a .gdf to its scene."""
+    """Fingerprint that binds a .gdf to its scene."""
 
-    count: int  # Gaussians
-    means_sha256: str  # of the world means, float32
+    count: int  # number of Gaussians
+    means_sha256: str  # SHA-256 of the world means, float32
 
 
 class NetworkHeader(msgspec.Struct, frozen=True):
-    """A network that a file keeps, how many bases each attribute is baked to, and what baking costs."""
+    """Header of a stored network, with the number of bases per attribute and the error of baking."""
 
     shape: NeuralShape
     ranks: dict[str, int]
@@ -69,7 +69,7 @@ class NetworkHeader(msgspec.Struct, frozen=True):
 
 
 class FieldHeader(msgspec.Struct, frozen=True):
-    """A field, see `BakedField`; `network` where one is kept in its place."""
+    """Header of a field, see `BakedField`. `network` is set if a network is stored in place of the field."""
 
     kind: str
     channels: int
@@ -80,7 +80,7 @@ class FieldHeader(msgspec.Struct, frozen=True):
 
 
 class GdfHeader(msgspec.Struct, frozen=True):
-    """The JSON header."""
+    """JSON header of a .gdf file."""
 
     name: str
     instruction: str
@@ -97,7 +97,12 @@ class GdfHeader(msgspec.Struct, frozen=True):
 
 
 def pack_file(header: GdfHeader, tensors: Mapping[str, Tensor]) -> bytes:
-    """The bytes of a .gdf file; the header gets its checksum. Tensors lie on the CPU, row by row."""
+    """Return the bytes of a .gdf file, with the checksum added to the header.
+
+    Args:
+        header: the header without checksum
+        tensors: contiguous CPU tensors by name
+    """
     sha256 = checksum(_encode(header), tensors)
     arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
     text = _encode(msgspec.structs.replace(header, sha256=sha256))
@@ -105,10 +110,14 @@ def pack_file(header: GdfHeader, tensors: Mapping[str, Tensor]) -> bytes:
 
 
 def unpack_file(content: bytes, name: str) -> tuple[GdfHeader, dict[str, Tensor]]:
-    """The inverse of `pack_file`, of older formats too.
+    """Return the header and the tensors of a .gdf file, also of older formats; the inverse of `pack_file`.
+
+    Args:
+        content: bytes of the file
+        name: name of the file for errors
 
     Raises:
-        ProgdfError: it is no .gdf, from a newer version, truncated, damaged or inconsistent.
+        ProgdfError: the file is no .gdf, from a newer version, truncated, damaged or inconsistent.
     """
     size = int.from_bytes(content[:8], "little")
     if not 2 <= size <= _MAX_HEADER or content[8:9] != b"{":
@@ -127,7 +136,7 @@ def unpack_file(content: bytes, name: str) -> tuple[GdfHeader, dict[str, Tensor]
         value = decode_json(text)
         sha256 = convert_json(value["sha256"], str)
         version = convert_json(value["format"], int)
-        intact = checksum(text.replace(sha256, ""), tensors) == sha256 and version >= _OLDEST
+        intact = checksum(text.replace(sha256, ""), tensors) == sha256 and version >= _OLDEST_FORMAT
     except (ValueError, KeyError, TypeError, RuntimeError):
         raise damage from None
     if version > FORMAT:
@@ -135,14 +144,14 @@ def unpack_file(content: bytes, name: str) -> tuple[GdfHeader, dict[str, Tensor]
     if not intact:
         raise damage
     try:
-        # a key that is unknown may be of a later version, which reads the file in another way
+        # an unknown key may come from a later version, in which the file has another meaning
         return convert_json(value, GdfHeader, closed=True), tensors
     except ValueError as error:
         raise contradiction_error(name, error) from error
 
 
 def checksum(text: str, tensors: Mapping[str, Tensor]) -> str:
-    """SHA-256 of a header's text without its checksum, and of tensors."""
+    """Return the SHA-256 of a header's text without its checksum, and of tensors."""
     digest = hashlib.sha256(text.encode())
     for name in sorted(tensors):
         tensor = tensors[name]
@@ -152,7 +161,7 @@ def checksum(text: str, tensors: Mapping[str, Tensor]) -> str:
 
 
 def contradiction_error(name: str, error: Exception) -> ProgdfError:
-    """The line for a file whose parts do not fit each other."""
+    """Return the error for a file with inconsistent parts."""
     reason = " ".join(str(error).split()) or type(error).__name__
     return ProgdfError(f"{name} is inconsistent ({reason}); make it again with progdf train")
 
@@ -166,24 +175,24 @@ def _to_json(value: Any) -> str | float:
 
 
 def pack_field(field: BakedField) -> tuple[FieldHeader, dict[str, Tensor]]:
-    """A field's part of the header, and its tensors; of one that is baked when it is loaded, its origin."""
+    """Return the header and the tensors of a field, or of the network or grade that it was baked from."""
     header = FieldHeader(field.kind, field.channels, list(field.attributes), list(field.recorded))
     if field.origin is None:
         tensors = {"knots": field.knots}
         for name, bases in field.attributes.items():
-            tensors |= {f"{name}.{part}": getattr(bases, part) for part in _PARTS}
+            tensors |= {f"{name}.{part}": getattr(bases, part) for part in _BASES_TENSORS}
         return header, tensors
     form = field.origin
     if isinstance(form, GradeForm):
-        tensors = {name: getattr(form, name) for name in _GRADE if name not in form.packed_levels}
-        tensors |= {name + _PACKED: levels for name, levels in form.packed_levels.items()}
+        tensors = {name: getattr(form, name) for name in _GRADE_TENSORS if name not in form.packed_levels}
+        tensors |= {name + _PACKED_SUFFIX: levels for name, levels in form.packed_levels.items()}
         tensors["remap"] = torch.stack([form.remap.old, form.remap.new])
         return msgspec.structs.replace(header, attributes=[], grade=form.degree), tensors
     network = form.network
     plan = form.plan
-    tensors = {_NETWORK + name: tensor for name, tensor in network.tensors.items()}
+    tensors = {_NETWORK_PREFIX + name: tensor for name, tensor in network.tensors.items()}
     tensors |= {"knots": plan.knots, "end": network.end}
-    tensors |= {_END_CORRECTION + name: share for name, share in plan.end_correction.items()}
+    tensors |= {_END_CORRECTION_PREFIX + name: share for name, share in plan.end_correction.items()}
     if network.shape.code:
         tensors |= {"codes": network.codes, "code_step": network.code_step}
     part = NetworkHeader(network.shape, dict(plan.ranks), form.rows_sha256, dict(form.error or {}))
@@ -191,12 +200,15 @@ def pack_field(field: BakedField) -> tuple[FieldHeader, dict[str, Tensor]]:
 
 
 def unpack_field(header: FieldHeader, tensors: Mapping[str, Tensor], members: int) -> BakedField:
-    """The inverse of `pack_field`; of a network, a field that is not baked yet and moves nothing.
+    """Return the field of a header; the inverse of `pack_field`. Networks and grades are not baked yet.
 
-    `members`: that a grade has
+    Args:
+        header: header of the field
+        tensors: tensors of the file
+        members: number of the region's members, for the packed levels of a grade
 
     Raises:
-        ValueError, KeyError, TypeError: the parts do not fit each other.
+        ValueError, KeyError, TypeError: the parts are inconsistent.
     """
     recorded = tuple(header.recorded)
     for name in header.attributes:
@@ -204,21 +216,21 @@ def unpack_field(header: FieldHeader, tensors: Mapping[str, Tensor], members: in
             raise ValueError(f"unknown attribute {name}")
     if header.grade is not None:
         old, new = tensors["remap"].double()
-        parts = {name: tensors[name] for name in (*_GRADE, "mask") if name in tensors}
+        parts = {name: tensors[name] for name in (*_GRADE_TENSORS, "mask") if name in tensors}
         bases, channels = tensors["scale"].shape
-        if (levels := tensors.get("residual" + _PACKED)) is not None:  # since format 6
-            functions = tensors.get("functions" + _PACKED)  # since format 7
+        if (levels := tensors.get("residual" + _PACKED_SUFFIX)) is not None:  # since format 6
+            functions = tensors.get("functions" + _PACKED_SUFFIX)  # since format 7
             if functions is None:
                 parts["residual"] = inflate(levels, (bases, channels, members), torch.int8).movedim(1, 2)
             else:
                 parts["residual"] = unpack_levels(functions, levels, bases, members, channels)
-        if (levels := tensors.get("mask" + _PACKED)) is not None:
+        if (levels := tensors.get("mask" + _PACKED_SUFFIX)) is not None:
             parts["mask"] = inflate(levels, (members,), torch.uint8)
         grade = GradeForm(header.grade, **parts, remap=SliderRemap(old, new))
         return BakedField("grade", torch.tensor([0.0, 1.0]), {}, header.channels, recorded, grade)
     if header.network is None:
         attributes = {
-            name: AttributeBases(**{part: tensors[f"{name}.{part}"] for part in _PARTS})
+            name: AttributeBases(**{part: tensors[f"{name}.{part}"] for part in _BASES_TENSORS})
             for name in header.attributes
         }
         return BakedField(header.kind, tensors["knots"], attributes, header.channels, recorded)
@@ -228,16 +240,20 @@ def unpack_field(header: FieldHeader, tensors: Mapping[str, Tensor], members: in
         raise ValueError(f"the network has {shape.channels} channels, the field {header.channels}")
     network = NeuralField(
         shape,
-        {name.removeprefix(_NETWORK): t for name, t in tensors.items() if name.startswith(_NETWORK)},
+        {
+            name.removeprefix(_NETWORK_PREFIX): t
+            for name, t in tensors.items()
+            if name.startswith(_NETWORK_PREFIX)
+        },
         end,
         tensors.get("codes", torch.zeros(len(end), 0, dtype=torch.int8)),
         tensors.get("code_step", torch.zeros(0)),
         recorded,
     )
     correction = {
-        name.removeprefix(_END_CORRECTION): t
+        name.removeprefix(_END_CORRECTION_PREFIX): t
         for name, t in tensors.items()
-        if name.startswith(_END_CORRECTION)
+        if name.startswith(_END_CORRECTION_PREFIX)
     }
     plan = BakePlan(tensors["knots"], header.network.ranks, correction)
     form = NeuralForm(network, plan, header.network.rows_sha256, header.network.bake_error)
@@ -245,19 +261,21 @@ def unpack_field(header: FieldHeader, tensors: Mapping[str, Tensor], members: in
 
 
 def pack_added(added: Gaussians | None) -> dict[str, Tensor]:
-    """The tensors of added rows."""
-    return {} if added is None else {_ADDED + name: getattr(added, name).float() for name in ATTRIBUTES}
+    """Return the tensors of added rows by their names in the file."""
+    return (
+        {} if added is None else {_ADDED_PREFIX + name: getattr(added, name).float() for name in ATTRIBUTES}
+    )
 
 
 def unpack_added(header: GdfHeader, tensors: Mapping[str, Tensor]) -> Gaussians | None:
-    """The inverse of `pack_added`.
+    """Return the added rows, or None; the inverse of `pack_added`.
 
     Raises:
-        ValueError, KeyError: they are not as many as the header says, or not in float32.
+        ValueError, KeyError: the number of rows differs from the header, or they are not float32.
     """
     if not header.added:
         return None
-    rows: dict[str, Any] = {name: tensors[_ADDED + name] for name in ATTRIBUTES}
+    rows: dict[str, Any] = {name: tensors[_ADDED_PREFIX + name] for name in ATTRIBUTES}
     if any(values.dtype != torch.float32 for values in rows.values()):
         raise ValueError("an added row is not in float32")
     added = Gaussians(**rows, origin=header.added_origin)
@@ -267,9 +285,9 @@ def unpack_added(header: GdfHeader, tensors: Mapping[str, Tensor]) -> Gaussians 
 
 
 def pack_region(region: Region) -> dict[str, Tensor]:
-    """A region's tensors: rows as bits, runs or numbers; the score as 8 bits where it is soft.
+    """Return the tensors of a region: rows as bits, runs or indices, and the soft part of the score.
 
-    The score is kept to 1/255, and only where that differs from 1 for members and 0 for all others.
+    The score is rounded to 1/255, and only stored where it differs from 1 (members) or 0 (all others).
     """
     members = region.members.cpu().numpy()
     count = len(region.score)
@@ -287,10 +305,16 @@ def pack_region(region: Region) -> dict[str, Tensor]:
 def unpack_region(
     name: str, tensors: Mapping[str, Tensor], count: int, expected: int | None = None
 ) -> Region:
-    """The inverse of `pack_region` for a scene of `count` Gaussians; with how many members, if it is known.
+    """Return the region of a file; the inverse of `pack_region`.
+
+    Args:
+        name: name of the region
+        tensors: tensors of the file
+        count: number of Gaussians in the scene
+        expected: number of members; None if unknown
 
     Raises:
-        ValueError, KeyError: the tensors do not describe rows of that scene.
+        ValueError, KeyError: the tensors do not describe rows of the scene.
     """
     members = _unpack_rows("members", tensors, count, expected)
     score = torch.zeros(count)
@@ -304,7 +328,10 @@ def unpack_region(
 
 
 def _pack_rows(key: str, rows: np.ndarray, count: int) -> dict[str, Tensor]:
-    """Sorted unique rows below `count`: `.bits` [⌈N/8⌉], `.runs` [R,2] first and length, or `.rows` [M]."""
+    """Store sorted unique rows below `count` in the shortest of three forms.
+
+    The forms are `.bits` [⌈N/8⌉], `.runs` [R,2] (first row and length) and `.rows` [M].
+    """
     breaks = np.flatnonzero(np.diff(rows) != 1) + 1
     starts = np.concatenate([rows[:1], rows[breaks]])
     ends = np.concatenate([rows[breaks - 1], rows[-1:]])
@@ -323,8 +350,13 @@ def _pack_rows(key: str, rows: np.ndarray, count: int) -> dict[str, Tensor]:
 
 
 def _unpack_rows(key: str, tensors: Mapping[str, Tensor], count: int, expected: int | None) -> Tensor:
-    """Sorted, unique and within the scene, or a ValueError; as many as expected, checked beforehand,
-    as eight bytes of a run can name millions. [M] int64"""
+    """Return the stored rows, sorted and unique. [M] int64
+
+    The number of rows in runs is checked before they are expanded, as a run of 8 bytes can span millions.
+
+    Raises:
+        ValueError: rows are unsorted, repeated or outside the scene, or runs do not have `expected` rows.
+    """
     if f"{key}.bits" in tensors:
         bits = tensors[f"{key}.bits"]
         check_tensor(f"{key}.bits", bits, ((count + 7) // 8,), torch.uint8)
