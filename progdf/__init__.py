@@ -1,4 +1,4 @@
-"""ProGDF Studio: edit a 3D Gaussian Splatting scene once, then slide through every degree of the edit."""
+"""ProGDF Studio: edit a 3D Gaussian Splatting scene once, then set the strength of the edit with a slider."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ __all__ = [
     "save_scene",
 ]
 
-_MODULES = {
+_PUBLIC_MODULES = {
     "Camera": "progdf.camera",
     "Gaussians": "progdf.gaussians",
     "Gdf": "progdf.gdf.file",
@@ -59,16 +59,16 @@ _NOTEBOOK_CARDS = (
     ("progdf.field.baked", "BakedField"),
     ("progdf.gdf.file", "Gdf"),
 )
-"""Module and class of each type that a notebook shows as a card."""
+"""Module and class of each type that is displayed as a card in a notebook."""
 
 
 def __getattr__(name: str) -> Any:
     """Import a public name on first use, so that `progdf --help` does not wait for torch."""
     if name == "Widget":
         raise AttributeError("progdf.Widget is now viewer.Widget; write `from viewer import Widget`")
-    if name not in _MODULES:
+    if name not in _PUBLIC_MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_MODULES[name]), name)
+    return getattr(importlib.import_module(_PUBLIC_MODULES[name]), name)
 
 
 def _notebook_card(shown: Any) -> str:
@@ -79,7 +79,7 @@ def _notebook_card(shown: Any) -> str:
 
 
 def _register_notebook_cards() -> None:
-    """Tell a running IPython how to show scenes, fields and edits."""
+    """Register the HTML cards of scenes, fields and edits in a running IPython."""
     ipython = sys.modules.get("IPython")
     shell = getattr(ipython, "get_ipython", lambda: None)()
     if shell is None:

@@ -38,7 +38,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "info": ("progdf.cli.info:main", "show the contents of a scene or .gdf, repairs, strays and errors"),
 }
 HIDDEN = {"preview": "trainer.preview:serve"}
-"""Commands that the window runs, and nobody types."""
+"""Internal commands that the window runs → entry points."""
 
 
 def _usage() -> str:
@@ -49,20 +49,21 @@ def _usage() -> str:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status, see `run_guarded`."""
-    if argv is None:  # a process of our own: torch and numba are half a million objects that stay
-        gc.set_threshold(5_000)  # not looked through again and again while they are imported: .3 s
-        atexit.register(gc.freeze)  # nor at the end: .7 s
+    if argv is None:  # own process; torch and numba create 500 000 permanent objects
+        gc.set_threshold(5_000)  # fewer collections during imports save 0.3 s
+        atexit.register(gc.freeze)  # no collection at exit saves 0.7 s
     return run_guarded(_run, list(sys.argv[1:] if argv is None else argv))
 
 
 def run_guarded(run: Callable[[Sequence[str]], int], arguments: Sequence[str]) -> int:
-    """Run a command line; report an error in one line.
+    """Run a command line, and report an error in one line.
 
     Returns:
-        0 done; 2 the user can mend it; 70 it is a mistake of ours, kept in a file; 130 interrupted.
+        Exit status. 0: success; 2: an error that the user can correct; 70: an internal error, whose traceback
+        is saved to a file; 130: interrupted.
     """
     _open_standard_streams()
-    if logging.lastResort is not None:  # prints warnings where no program has said otherwise
+    if logging.lastResort is not None:  # prints warnings if no program has configured logging
         logging.lastResort.setFormatter(PrintableFormatter())
     try:
         _check_current_folder()
@@ -84,7 +85,7 @@ def run_guarded(run: Callable[[Sequence[str]], int], arguments: Sequence[str]) -
 
 
 def _describe_failure(error: BaseException) -> tuple[int, str]:
-    """Return the exit status and the line for an exception; the line is empty if there is nothing to say."""
+    """Return the exit status and the message for an exception; an empty message prints nothing."""
     if isinstance(error, ProgdfError):
         return 2, str(error)
     if isinstance(error, BrokenPipeError):  # `progdf info … | head`
@@ -106,7 +107,7 @@ def _describe_failure(error: BaseException) -> tuple[int, str]:
 
 
 def _drop_unwritable_output() -> None:
-    """Lead streams that cannot be written into nothing; Python would fail again when it ends."""
+    """Redirect streams that cannot be written to the null device; Python would fail again at exit."""
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
@@ -116,7 +117,7 @@ def _drop_unwritable_output() -> None:
 
 
 def _check_arguments(arguments: Sequence[str]) -> None:
-    """Raise ProgdfError if an argument holds a NUL, which neither a file name nor a text option can have."""
+    """Raise ProgdfError if an argument contains a NUL, which file names and text options cannot have."""
     for argument in arguments:
         if "\0" in argument:
             raise ProgdfError(f"the argument {argument!r:.80} holds a NUL character; leave it out")
@@ -131,10 +132,10 @@ def _run(arguments: Sequence[str]) -> int:
 
         print(f"progdf {__version__}")
         return 0
-    places = {name: path for name, (path, _) in COMMANDS.items()} | HIDDEN
-    if arguments[0] not in places:
+    entry_points = {name: path for name, (path, _) in COMMANDS.items()} | HIDDEN
+    if arguments[0] not in entry_points:
         raise ProgdfError(f"unknown command '{arguments[0]}'; use one of {', '.join(COMMANDS)}")
-    module, function = places[arguments[0]].split(":")
+    module, function = entry_points[arguments[0]].split(":")
     return int(getattr(importlib.import_module(module), function)(arguments[1:]) or 0)
 
 
@@ -144,7 +145,7 @@ def _report_failure(line: str) -> None:
 
 
 def _save_traceback() -> str:
-    """Where the traceback of the present exception was written."""
+    """Save the traceback of the current exception, and return the advice to report it with that file."""
     details = f"progdf {' '.join(map(repr, sys.argv[1:]))}\n\n{traceback.format_exc()}"
     for folder in (state_folder(), Path(tempfile.gettempdir())):
         path = folder / "crash.txt" if folder.name == "progdf" else folder / f"progdf-crash-{os.getpid()}.txt"
@@ -158,7 +159,7 @@ def _save_traceback() -> str:
 
 
 def _check_current_folder() -> None:
-    """ProgdfError where it was removed: torch's libraries would end the process with a line of their own."""
+    """Raise ProgdfError if the current folder was removed, as torch's libraries would abort the process."""
     try:
         os.getcwd()
     except FileNotFoundError:
@@ -171,7 +172,10 @@ def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
 
 
 def _open_standard_streams() -> None:
-    """Where 0, 1 or 2 is closed, the next file that is opened would get what is printed."""
+    """Open closed standard streams on the null device.
+
+    If descriptor 0, 1 or 2 is closed, the next opened file would get its number and receive the output.
+    """
     for handle in range(3):
         try:
             os.fstat(handle)

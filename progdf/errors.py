@@ -10,10 +10,10 @@ from .terminal import elide, escape_text
 
 
 class ProgdfError(ValueError):
-    """Error that the user can correct: a broken file, a wrong option, two files that do not belong together.
+    """Error that the user can correct: a broken file, a wrong option, or two files that do not match.
 
-    The message is one line, `PROBLEM; REMEDY`, even if names in files hold line breaks; `elide` shortens long
-    values. Commands print it and exit with status 2.
+    The message is one line, `PROBLEM; REMEDY`, even if file names contain line breaks. `elide` shortens long
+    values. Commands print the message and exit with status 2.
     """
 
     def __str__(self) -> str:
@@ -29,16 +29,16 @@ def check_first_argument(call: str, value: object, kind: type | tuple[type, ...]
         kind: its type
 
     Raises:
-        TypeError: the value has another type, for example since the arguments are swapped.
+        TypeError: the value has another type, for example because the arguments are swapped.
     """
     if not isinstance(value, kind):
         raise TypeError(f"the first argument is of type {type(value).__name__}; call {call}")
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Return True if memory ran out, also behind another error that it caused.
+    """Return whether an error, or the error that caused it, is an out-of-memory error.
 
-    Torch raises a RuntimeError of its allocator, the system an OSError, and its linker an ImportError for a
+    Torch's allocator raises a RuntimeError, the system an OSError, and its linker an ImportError for a
     library that cannot be mapped. Threads cannot start without memory for their stacks.
     """
     if isinstance(error, MemoryError):
@@ -64,19 +64,22 @@ _MEMORY_MESSAGES = (
 )
 
 
-_NAMES = "demo|train|batch|region|views|fit|evaluate|view|render|rebind|edit|export|info"
-_TYPED = re.compile(rf"(?<![\w/.-])(?:--(?=[a-z])|pip install\b|hf download\b|progdf (?:{_NAMES})\b)")
+_COMMAND_NAMES = "demo|train|batch|region|views|fit|evaluate|view|render|rebind|edit|export|info"
+_COMMAND_LINE = re.compile(
+    rf"(?<![\w/.-])(?:--(?=[a-z])|pip install\b|hf download\b|progdf (?:{_COMMAND_NAMES})\b)"
+)
 
 
 def without_commands(line: str) -> str:
-    """An error or a warning for a window: without what one types on a command line.
+    """Return an error or a warning without command line instructions, for a window.
 
-    What is wrong stays, its options without dashes; of each advice, the ways before the first that is typed.
+    The problem stays, with options written without dashes. Each remedy keeps the alternatives before its
+    first command line instruction.
     """
-    wrong, *advice = line.split("; ")
-    parts = [_TYPED.sub(lambda typed: "ProGDF" * typed[0].startswith("progdf"), wrong)]
+    problem, *advice = line.split("; ")
+    parts = [_COMMAND_LINE.sub(lambda typed: "ProGDF" * typed[0].startswith("progdf"), problem)]
     for part in advice:
         ways = re.split(r", (?:or )?", part) if ", or " in part else [part]
-        before = [*takewhile(lambda way: not _TYPED.search(way), ways)]
-        parts += [part if before == ways else ", ".join(before)] * bool(before)
+        kept = [*takewhile(lambda way: not _COMMAND_LINE.search(way), ways)]
+        parts += [part if kept == ways else ", ".join(kept)] * bool(kept)
     return "; ".join(parts)

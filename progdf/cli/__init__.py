@@ -1,1 +1,1 @@
-"""Commands that need neither trainer nor viewer."""
+"""Commands that depend on neither trainer nor viewer."""

@@ -1,4 +1,4 @@
-"""`progdf edit SCENE … -o OUT.ply`: a scene tidied for good, as a new file; or as an edit with a slider."""
+"""The command `progdf edit SCENE … -o OUT`: change regions by hand, in a new scene or as an edit."""
 
 from __future__ import annotations
 
@@ -37,41 +37,43 @@ MAX_SCALE = 1000.0
 
 @dataclass(frozen=True)
 class EditOptions:
-    """Write a scene again without what should not be in it, or with parts of it moved, turned, scaled or
-    copied; or write that as an edit with a slider. The scene itself is never changed.
+    """Remove, move, rotate, scale or copy parts of a scene, as a new scene or as an edit with a slider.
 
-    REGION is written as for progdf train, without what takes pictures; numbers follow its last colon. All
-    regions are of the scene as it is in the file. Whatever the order typed, it is cleaned last, and of what
-    lies in several regions scaled first, then turned, then moved.
+    The scene file itself is never changed. REGION is written as for progdf train, except for forms that need
+    pictures. Numbers follow its last colon. All regions refer to the scene in the file. Overlapping regions
+    are scaled, then rotated, then moved. Cleaning comes last.
     """
 
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
-    """a .ply, .spz, .splat, .ksplat, .sog, .glb or .gltf."""
+    """scene file: .ply, .spz, .splat, .ksplat, .sog, .glb or .gltf."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.ply|NAME.gdf")]
-    """the .ply file to write; or a .gdf of the scene, whose slider goes from nothing to all of it."""
+    """scene file to write; or a .gdf whose slider goes from the scene (0) to the full change (1)."""
     clean: Annotated[bool, tyro.conf.FlagCreatePairsOff, absent_option(None)] = False
-    """leave out floaters, needles, giants and what is too transparent to be drawn; of a .ply alone."""
+    """remove floaters, needles, giants and invisible Gaussians; for a scene output only."""
     delete: Annotated[Specs, absent_option("REGION")] = ()
-    """take away what is in the region; holes, shadows and reflections stay."""
+    """remove the Gaussians of the region; holes, shadows and reflections stay."""
     scale: Annotated[Specs, absent_option("REGION:FACTOR")] = ()
-    """scale the region about the mean of its centers, .001 to 1000 times."""
+    """scale the region about the mean of its centers, by 0.001 to 1000."""
     rotate: Annotated[Specs, absent_option("REGION:AXIS,DEGREES")] = ()
-    """turn the region about the mean of its centers; AXIS is x, y, z or three numbers, and the thumb of a
-    right hand points along it; −360 to 360 degrees."""
+    """rotate the region about the mean of its centers; AXIS: x, y, z or a vector; −360 to 360 degrees."""
     move: Annotated[Specs, absent_option("REGION:DX,DY,DZ")] = ()
-    """shift the region, world units."""
+    """move the region, world units."""
     duplicate: Annotated[Specs, absent_option("REGION:DX,DY,DZ")] = ()
-    """add a copy of the region, shifted, world units."""
+    """add a copy of the region, moved by an offset in world units."""
     glb_axes: GlbAxes = "LUF"
-    """axes of a .glb: LUF, glTF's own, as splat-transform writes; or RUB, OpenGL's, as in .spz and .usdc."""
+    """axes of a .glb: LUF (glTF's own) or RUB (OpenGL's, as in .spz and .usdc)."""
 
 
 def main(argv: Sequence[str]) -> int:
-    """Do what is asked for and write it. Raises ProgdfError where that is nothing, or would leave nothing."""
+    """Apply the requested steps and write the result.
+
+    Raises:
+        ProgdfError: no step is requested, the options are invalid, or no visible Gaussian would remain.
+    """
     options = parse_options(EditOptions, argv, "progdf edit")
     makes_edit = options.out.suffix.lower() == ".gdf"
-    makers = _read_steps(options)
-    if not options.clean and not makers:
+    step_makers = _read_steps(options)
+    if not options.clean and not step_makers:
         raise ProgdfError(
             "nothing was asked for; say what to do with the scene, for example --clean or --delete REGION"
         )
@@ -85,7 +87,7 @@ def main(argv: Sequence[str]) -> int:
     if makes_edit:
         check_text(f"{options.out.stem} {_instruction(options)}", "an edit")
     scene = load_scene(options.scene)
-    steps = [make(scene) for make in makers]
+    steps = [make(scene) for make in step_makers]
     if makes_edit:
         return _write_edit(options, scene, steps)
     edited = bake(scene, steps)
@@ -118,28 +120,32 @@ def _write_edit(options: EditOptions, scene: Gaussians, steps: Sequence[Step]) -
 
 
 def _instruction(options: EditOptions) -> str:
-    """Return the options of the steps as typed, which the edit records."""
-    words = ["edit"]
+    """Return the step options as typed, which the edit stores as its instruction."""
+    parts = ["edit"]
     for name in ("delete", "scale", "rotate", "move", "duplicate"):
-        words += [f"--{name} {spec}" for spec in getattr(options, name)]
-    return " ".join(words)
+        parts += [f"--{name} {spec}" for spec in getattr(options, name)]
+    return " ".join(parts)
 
 
 def _describe(step: Step) -> str:
-    """What is done to how many, for a person."""
-    does = {"remove": "taken away", "transform": "moved as a whole", "duplicate": "copied"}[step.does]
-    return f"{shorten(step.region.name)}: {format_count(len(step.region))} {does}"
+    """Return a description of a step for the user: region, number of Gaussians and action."""
+    action = {"remove": "taken away", "transform": "moved as a whole", "duplicate": "copied"}[step.does]
+    return f"{shorten(step.region.name)}: {format_count(len(step.region))} {action}"
 
 
 def _read_steps(options: EditOptions) -> list[Callable[[Gaussians], Step]]:
-    """What makes each step of a scene, in their order. Raises ProgdfError: no scene can have one."""
+    """Return functions that create the steps for a scene, in their order.
+
+    Raises:
+        ProgdfError: the numbers of an option are invalid, or a region is invalid for any scene.
+    """
     forms: tuple[tuple[str, str, Callable[[str], Motion | None]], ...] = (
-        ("scale", "FACTOR", _factor),
-        ("rotate", "AXIS,DEGREES", _turn),
-        ("move", "DX,DY,DZ", _shift),
-        ("duplicate", "DX,DY,DZ", _shift),
+        ("scale", "FACTOR", _parse_scale),
+        ("rotate", "AXIS,DEGREES", _parse_rotation),
+        ("move", "DX,DY,DZ", _parse_shift),
+        ("duplicate", "DX,DY,DZ", _parse_shift),
     )
-    makers = []
+    step_makers = []
     for name, form, read in forms:
         for text in getattr(options, name):
             spec, _, numbers = text.rpartition(":")
@@ -148,9 +154,9 @@ def _read_steps(options: EditOptions) -> list[Callable[[Gaussians], Step]]:
                 raise ProgdfError(
                     f"'{shorten(text)}' has no usable numbers at its end; write --{name} REGION:{form}"
                 )
-            makers.append(_maker("duplicate" if name == "duplicate" else "transform", spec, motion))
-    makers += [_maker("remove", spec, None) for spec in options.delete]
-    return makers
+            step_makers.append(_maker("duplicate" if name == "duplicate" else "transform", spec, motion))
+    step_makers += [_maker("remove", spec, None) for spec in options.delete]
+    return step_makers
 
 
 def _maker(does: Deed, spec: str, motion: Motion | None) -> Callable[[Gaussians], Step]:
@@ -158,22 +164,22 @@ def _maker(does: Deed, spec: str, motion: Motion | None) -> Callable[[Gaussians]
     return lambda scene: Step(does, parse_region(spec, scene, say=print_line), motion)
 
 
-def _shift(text: str) -> Motion | None:
+def _parse_shift(text: str) -> Motion | None:
     numbers = read_numbers(text)
     return similarity(shift=numbers) if len(numbers) == 3 else None
 
 
-def _factor(text: str) -> Motion | None:
+def _parse_scale(text: str) -> Motion | None:
     numbers = read_numbers(text)
     if len(numbers) != 1 or not 1 / MAX_SCALE <= numbers[0] <= MAX_SCALE:
         return None
     return similarity(scale=numbers[0])
 
 
-def _turn(text: str) -> Motion | None:
+def _parse_rotation(text: str) -> Motion | None:
     axis, _, degrees = text.rpartition(",")
-    named = {"x": "1,0,0", "y": "0,1,0", "z": "0,0,1"}
-    direction = read_numbers(named.get(axis.strip().lower(), axis))
+    axes = {"x": "1,0,0", "y": "0,1,0", "z": "0,0,1"}
+    direction = read_numbers(axes.get(axis.strip().lower(), axis))
     angle = read_numbers(degrees)
     if len(direction) != 3 or not any(direction) or len(angle) != 1 or abs(angle[0]) > MAX_DEGREES:
         return None
@@ -182,7 +188,7 @@ def _turn(text: str) -> Motion | None:
 
 
 def _clean(scene: Gaussians) -> Gaussians:
-    """Without strays; prints which, and what that changes in pictures."""
+    """Remove strays from a scene; print their kinds and the difference in rendered pictures."""
     strays = find_strays(scene)
     if not len(strays.rows):
         print_line("clean: there are no strays")

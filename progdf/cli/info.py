@@ -1,4 +1,4 @@
-"""`progdf info FILE`: the contents of a scene, an edit, a session, or a file or folder of cameras."""
+"""The command `progdf info FILE`: show the contents of a scene, an edit, a session or cameras."""
 
 from __future__ import annotations
 
@@ -40,27 +40,27 @@ from progdf.terminal import (
 
 from .options import absent_option, parse_options
 
-_BOM = b"\xef\xbb\xbf"  # begins UTF-8 text that Windows programs write
+_UTF8_BOM = b"\xef\xbb\xbf"  # start of UTF-8 text from some Windows programs
 
 
 @dataclass(frozen=True)
 class Survey:
-    """A scene in numbers."""
+    """Measurements of a scene."""
 
-    count: int  # Gaussians N
+    count: int  # number of Gaussians N
     center: tuple[float, float, float]  # median of the means, in the world
     radius: float  # distance from the center within which 97 % of the means lie, world units
     farthest: float  # distance of the farthest mean from the center, world units
     # box, bulk_box: the corners of all Gaussians, and of the middle 95 % along each axis, in the world
     box: tuple[float, ...]
     bulk_box: tuple[float, ...]
-    up: UpAxis  # which way is up, and how that was decided
-    surrounding: bool  # it looks like a scene to stand inside, which cameras around it cannot frame
+    up: UpAxis  # up axis, and the reason for it
+    surrounding: bool  # the scene seems to surround the viewer, so cameras around it cannot frame it
     median_size: float  # median of the longest axes, one standard deviation, world units
-    largest_size: float  # the longest axis of all
+    largest_size: float  # longest axis of all Gaussians, one standard deviation, world units
 
     def lines(self) -> list[str]:
-        """The survey for a person, a line per fact."""
+        """Return the survey for the user, one line per fact."""
         center = " ".join(format_place(at, self.radius, 4) for at in self.center)
         lines = [
             f"place: center {center}, radius {self.radius:.4g} (97 % of the Gaussians), "
@@ -80,11 +80,11 @@ class Survey:
 
 
 def survey(scene: Gaussians, up: UpAxis | None = None) -> Survey:
-    """Measure a scene of at least one Gaussian, every number in it finite, as `load_ply` makes them.
+    """Measure a scene of at least one Gaussian with finite numbers, as returned by `load_ply`.
 
     Args:
         scene: N Gaussians
-        up: which way is up; None finds it
+        up: up axis; None to estimate it
     """
     center, radius = scene_sphere(scene)
     up = find_up(scene) if up is None else up
@@ -105,41 +105,50 @@ def survey(scene: Gaussians, up: UpAxis | None = None) -> Survey:
 
 
 def _corners(scene: Gaussians, left_out: float) -> tuple[float, ...]:
-    """Return least x, y, z and largest x, y, z of the means without a share of them on each side."""
+    """Return the smallest and largest x, y, z of the means in the world, as six numbers.
+
+    Args:
+        scene: N Gaussians
+        left_out: share of the means to ignore at each end of an axis, 0 to 0.5
+    """
     means = scene.means.numpy()
     first = int(left_out * len(means))
     last = len(means) - 1 - first
     columns = [np.partition(column, (first, last)) for column in means.T]
-    ends = [float(column[row]) for row in (first, last) for column in columns]
-    return tuple(at + end for at, end in zip(2 * scene.origin, ends, strict=True))
+    extremes = [float(column[row]) for row in (first, last) for column in columns]
+    return tuple(at + end for at, end in zip(2 * scene.origin, extremes, strict=True))
 
 
 def _box(corners: tuple[float, ...]) -> str:
-    """The corners as a region, rounded outwards to a hundred-thousandth of the box."""
+    """Return the corners as a region, rounded outwards to five significant digits of the box's diagonal."""
     step = 10.0 ** math.floor(math.log10(max(math.dist(corners[:3], corners[3:]), 1e-12)) - 4)
-    places = max(0, -round(math.log10(step)))
+    decimals = max(0, -round(math.log10(step)))
     rounded = [(math.floor, math.ceil)[i // 3](corner / step) * step for i, corner in enumerate(corners)]
-    return "box:" + ",".join(f"{corner:.{places}f}" for corner in rounded)
+    return "box:" + ",".join(f"{corner:.{decimals}f}" for corner in rounded)
 
 
 @dataclass(frozen=True)
 class InfoOptions:
     """Show the contents of a scene, a .gdf edit, a session or cameras. Nothing is written.
 
-    Of a scene, also what had to be repaired to load it, and its strays; of an edit, its error report; of
-    cameras, the fields that are ignored.
+    For a scene, this includes its repairs and strays; for an edit, its error report; for cameras, the ignored
+    fields.
     """
 
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
-    """its content decides what it is, not its name."""
+    """file to describe; its type is recognized by content, not by name."""
     cameras: Annotated[Path | None, absent_option("CAMERAS", "those beside the file")] = None
-    """of the scene, which tell the up axis."""
+    """cameras of the scene, used to find the up axis."""
     up: UpChoice = "auto"
-    """the axis of the scene that is up."""
+    """up axis of the scene."""
 
 
 def main(argv: Sequence[str]) -> int:
-    """Print the contents. Raises ProgdfError for a file that is none of ours or cannot be loaded."""
+    """Print the contents of a file.
+
+    Raises:
+        ProgdfError: the file type is unknown, or the file cannot be loaded.
+    """
     options = parse_options(InfoOptions, argv, "progdf info")
     for line in describe(options.file, options.cameras, options.up):
         print_line(line)
@@ -147,25 +156,34 @@ def main(argv: Sequence[str]) -> int:
 
 
 def describe(path: Path, cameras: Path | None = None, up: UpChoice = "auto") -> Iterable[str]:
-    """The contents of a file, line by line, see `kind_of`; `cameras` and `up` are for scenes."""
+    """Return the contents of a file, line by line.
+
+    Args:
+        path: a file of any type in `kind_of`
+        cameras: cameras of a scene; None for those beside it
+        up: up axis of a scene
+
+    Raises:
+        ProgdfError: the file cannot be loaded, or `cameras` or `up` is given for a file that is no scene.
+    """
     kind = kind_of(path)
     if kind == "scene":
         return _scene_lines(path, cameras, up)
     if cameras is not None or up != "auto":
         raise ProgdfError(f"{path} is no scene; leave --cameras and --up out")
-    return _DESCRIBE[kind](path)
+    return _LINES_BY_KIND[kind](path)
 
 
 def kind_of(path: str | os.PathLike[str]) -> str:
-    """ "scene", "gdf", "session" or "cameras", by content, else by name.
+    """Return "scene", "gdf", "session" or "cameras", by content, otherwise by name.
 
     Raises:
-        ProgdfError: it cannot be read, or is nothing we know.
+        ProgdfError: the file cannot be read, or has an unknown type.
     """
     path = scene_file(path)
     if holds_cameras(path):
         return "cameras"
-    start = read_file(path, 64).removeprefix(_BOM)
+    start = read_file(path, 64).removeprefix(_UTF8_BOM)
     if start[8:9] == b"{" and int.from_bytes(start[:8], "little") < 1 << 32:
         return "gdf"
     if scene_format(path) is not None:
@@ -175,13 +193,13 @@ def kind_of(path: str | os.PathLike[str]) -> str:
     if start.lstrip()[:1] in (b"{", b"[") or start.startswith(b"\x89PNG"):
         return "cameras"
     if path.suffix.lower() in (".gdf", CUBE):
-        return "gdf"  # its reader knows best what is wrong
+        return "gdf"  # its reader raises the most specific error
     check_foreign(path, start)
     raise ProgdfError(f"{path} is not a file progdf knows; give a scene, a .gdf edit or a camera file")
 
 
 def _scene_lines(path: Path, cameras: Path | None, up: UpChoice) -> Iterator[str]:
-    """Describe a scene: its repairs, its size and place, and its strays."""
+    """Describe a scene: its repairs, size, position and strays."""
     scene, report = load_scene_with_report(path)
     found = SceneCameras([])
     if cameras is not None:
@@ -246,7 +264,7 @@ def _session_lines(path: Path) -> Iterator[str]:
 
 
 def _describe_field(field: BakedField) -> str:
-    """What a field is made of."""
+    """Return a description of the parts of a field."""
     form = field.origin
     if isinstance(form, GradeForm):
         return f"{form.label}; {len(form.knots)} knots"
@@ -270,14 +288,14 @@ def _camera_lines(path: Path) -> Iterator[str]:
     sizes = sorted({(camera.width, camera.height) for camera in cameras})
     more = f" and {len(sizes) - 4} other sizes" if len(sizes) > 4 else ""
     yield "images: " + ", ".join(f"{width}x{height}" for width, height in sizes[:4]) + more + " pixels"
-    bent = sum(camera.lens is not None for camera in cameras)
-    if bent:
-        yield f"lens: {bent} of {len(cameras)} cameras have one; photographs are straightened"
+    distorted_count = sum(camera.lens is not None for camera in cameras)
+    if distorted_count:
+        yield f"lens: {distorted_count} of {len(cameras)} cameras have one; photographs are straightened"
     if report.ignored:
         yield f"ignored: {', '.join(map(_short_text, report.ignored))}"
 
 
-_DESCRIBE = {
+_LINES_BY_KIND = {
     "gdf": _edit_lines,
     "session": _session_lines,
     "cameras": _camera_lines,
@@ -285,7 +303,10 @@ _DESCRIBE = {
 
 
 def _flatten(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
-    """("field.psnr_worst", "46.9") … of a nested JSON table; long lists are counted, not shown."""
+    """Yield dotted names and values of a nested JSON table, such as ("field.psnr_worst", "46.9").
+
+    A list of more than 8 values is given by its length.
+    """
     for name, value in table.items():
         if isinstance(value, Mapping):
             yield from _flatten(value, f"{above}{name}.")

@@ -1,4 +1,4 @@
-"""Options from a command line, made from their dataclass; what is wrong with them is one line."""
+"""Command line parsing from a dataclass of options, with one-line errors."""
 
 from __future__ import annotations
 
@@ -16,20 +16,25 @@ _Options = TypeVar("_Options")
 
 
 def absent_option(metavar: str | None, absent: str = "") -> Any:
-    """How help shows an option that may be left out: its value's name, and what happens then."""
+    """Return the tyro configuration of an optional argument.
+
+    Args:
+        metavar: name of the value in the help
+        absent: description of the default in the help, or "" for none
+    """
     return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {absent})" if absent else "")
 
 
 def parse_options(
     kind: type[_Options], argv: Sequence[str], command: str, default: _Options | None = None
 ) -> _Options:
-    """Options from the command line; `--help` prints and exits.
+    """Parse options from the command line; `--help` prints and exits.
 
     Args:
         kind: a dataclass of options
         argv: the command line
-        command: what help and errors call it
-        default: where options come from that argv does not give; None: the dataclass
+        command: name of the command in help and errors
+        default: source of options that argv does not set; None for the defaults of the dataclass
 
     Raises:
         ProgdfError: an option is missing, unknown or of the wrong kind, in one line.
@@ -48,7 +53,7 @@ def parse_options(
 
 
 def _join_negative_values(argv: Sequence[str]) -> list[str]:
-    """`--up -y` as `--up=-y`, and so with --orbit: what begins with a minus would be taken for an option."""
+    """Join `--up -y` to `--up=-y`, and likewise --orbit: tyro would parse the negative value as an option."""
     joined: list[str] = []
     for argument in argv:
         if joined and joined[-1] in ("--up", "--orbit"):
@@ -59,14 +64,14 @@ def _join_negative_values(argv: Sequence[str]) -> list[str]:
 
 
 def _short_message(box: str) -> str:
-    """What tyro's message says, without the title, the frame and the advice below the rule.
+    """Return the text of a tyro message, without the title, the frame and the advice below the rule.
 
-    Where the output cannot show a frame, the title stands above a rule of its own.
+    If the output cannot show a frame, the title is followed by its own rule.
     """
     text = re.sub(r"\x1b\[[0-9;]*m", "", box)
     lines = [line.strip("│ \t") for line in text.splitlines()]
     parts = "\n".join(line for line in lines if not line.startswith(("╭", "╰")))
     sections = re.split(r"^[─-]{4,}$", parts, flags=re.MULTILINE)
     message = " ".join(sections[0 if "╭" in text else 1 % len(sections)].split())
-    message = re.sub(r"'None', |, 'None'", "", message).rstrip(".")  # None: the option left out
+    message = re.sub(r"'None', |, 'None'", "", message).rstrip(".")  # None stands for an omitted option
     return message or "the options cannot be read"

@@ -1,7 +1,8 @@
-"""`progdf rebind EDIT.gdf --from A --to B -o C.gdf`: an edit carried over to the same scene in another file.
+"""The command `progdf rebind EDIT.gdf --from A --to B -o C.gdf`: carry an edit over to another scene file.
 
 Other formats change the numbers and the order of the Gaussians. Each Gaussian of B gets the offsets of the
-one of A that it is: the nearest, by place, then color and size, one to one where that is possible.
+matching Gaussian of A. The match minimizes the differences in position, color, opacity and shape among the
+nearest candidates, and is one to one where possible.
 """
 
 from __future__ import annotations
@@ -30,12 +31,12 @@ from progdf.terminal import print_line
 
 from .options import parse_options
 
-_CANDIDATES = 8
+_CANDIDATE_COUNT = 8  # nearest Gaussians of A to consider for each Gaussian of B
 _MIN_MATCHED = 0.9
-"""Share of B's Gaussians that must be found in A: fewer, and it is another scene."""
+"""Smallest share of B's Gaussians that must be found in A. With fewer, B is another scene."""
 
-_COLOR = 0.1
-"""How far a color (0..1) may be off: five times what the coarsest format changes."""
+_COLOR_TOLERANCE = 0.1
+"""Tolerance of color and opacity (0 to 1): five times the error of the coarsest format."""
 
 Rows = NDArray[np.int64]
 
@@ -45,29 +46,33 @@ class RebindOptions:
     """Carry an edit over to the same scene in another file or format."""
 
     edit: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="EDIT.gdf")]
-    """the .gdf file"""
+    """edit to carry over"""
     source: Annotated[Path, tyro.conf.arg(name="from", metavar="SCENE")]
-    """the scene that it was made for"""
+    """scene that the edit was made for"""
     target: Annotated[Path, tyro.conf.arg(name="to", metavar="SCENE")]
-    """the same scene in another file"""
+    """same scene in another file"""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="NEW.gdf")]
-    """the .gdf file to write"""
+    """.gdf file to write"""
 
 
 @dataclass(frozen=True)
 class Match:
-    """Which Gaussian of A each one of B is."""
+    """Assignment of A's Gaussians to those of B, with its quality."""
 
     rows: Rows  # row of A for each row of B. [N] int64
-    matched: float  # share of B's rows that are where and as A's are, 0..1
-    once: float  # share of B's rows whose row of A no other has
-    # median, p95: distance between the two, in the median size of a Gaussian of A
+    matched: float  # share of B's rows that match in position and color, 0 to 1
+    once: float  # share of B's rows whose row of A is used only once, 0 to 1
+    # median, p95: distance between the two, in median sizes of A's Gaussians
     median: float
     p95: float
 
 
 def main(argv: Sequence[str]) -> int:
-    """Write the edit for the other file. Raises ProgdfError where the two scenes are not the same."""
+    """Write the edit for the other file.
+
+    Raises:
+        ProgdfError: the two scenes are not the same.
+    """
     options = parse_options(RebindOptions, argv, "progdf rebind")
     if options.out.suffix.lower() != ".gdf":
         raise ProgdfError(f"{options.out} is not a .gdf file; give the edit a name that ends in .gdf")
@@ -81,10 +86,10 @@ def main(argv: Sequence[str]) -> int:
         f"distance {match.median:.3g} (95 %: {match.p95:.3g}) of the median Gaussian's size"
     )
     if match.matched < _MIN_MATCHED:
-        turned = match_scenes(a, rotate_about_x(b)).matched >= _MIN_MATCHED
-        why = "is that scene after half a turn about x" if turned else "is another scene"
+        is_rotated = match_scenes(a, rotate_about_x(b)).matched >= _MIN_MATCHED
+        fault = "is that scene after half a turn about x" if is_rotated else "is another scene"
         raise ProgdfError(
-            f"{options.target} {why}: {match.matched:.0%} of its Gaussians are found in {options.source}, "
+            f"{options.target} {fault}: {match.matched:.0%} of its Gaussians are found in {options.source}, "
             f"{_MIN_MATCHED:.0%} are needed; give the same scene"
         )
     rebound = rebind_edit(gdf, a, b, match)
@@ -94,45 +99,56 @@ def main(argv: Sequence[str]) -> int:
 
 
 def match_scenes(a: Gaussians, b: Gaussians) -> Match:
-    """Return the Gaussian of A that each one of B is; both hold at least one."""
-    k = min(_CANDIDATES, len(a))
-    places = b.means.numpy() + np.subtract(b.origin, a.origin)  # relative to A's origin, float64
-    distances, candidates = PointTree(a.means.numpy(), k).query(places, k)
+    """Match each Gaussian of B to a Gaussian of A. Both scenes need at least one."""
+    k = min(_CANDIDATE_COUNT, len(a))
+    positions = b.means.numpy() + np.subtract(b.origin, a.origin)  # relative to A's origin, float64
+    distances, candidates = PointTree(a.means.numpy(), k).query(positions, k)
     sizes = a.scales.amax(dim=1).numpy()
     typical = max(float(np.median(sizes)), 1e-12)
     color = np.abs(_colors(a)[candidates] - _colors(b)[:, None]).max(axis=2)
     log_scales = [s.log_scales.clamp(-10.0, 10.0).numpy() for s in (a, b)]
     shape = np.abs(log_scales[0][candidates] - log_scales[1][:, None]).mean(axis=2)
     opacity = np.abs(a.opacities.numpy()[candidates] - b.opacities.numpy()[:, None])
-    costs = (distances / typical) ** 2 + (color / _COLOR) ** 2 + shape**2 + (opacity / _COLOR) ** 2
+    costs = (
+        (distances / typical) ** 2
+        + (color / _COLOR_TOLERANCE) ** 2
+        + shape**2
+        + (opacity / _COLOR_TOLERANCE) ** 2
+    )
     chosen = _assign_rows(candidates, costs, len(a))
     rows = np.take_along_axis(candidates, chosen[:, None], 1)[:, 0]
     distance = np.take_along_axis(distances, chosen[:, None], 1)[:, 0]
-    near = distance <= np.maximum(sizes[rows], typical)
-    alike = np.take_along_axis(color, chosen[:, None], 1)[:, 0] <= _COLOR
-    taken = np.bincount(rows, minlength=len(a))
+    is_near = distance <= np.maximum(sizes[rows], typical)
+    is_alike = np.take_along_axis(color, chosen[:, None], 1)[:, 0] <= _COLOR_TOLERANCE
+    use_counts = np.bincount(rows, minlength=len(a))
     return Match(
         rows=rows,
-        matched=float((near & alike).mean()),
-        once=float((taken[rows] == 1).mean()),
+        matched=float((is_near & is_alike).mean()),
+        once=float((use_counts[rows] == 1).mean()),
         median=float(np.median(distance)) / typical,
         p95=float(np.quantile(distance, 0.95)) / typical,
     )
 
 
 def rebind_edit(gdf: Gdf, a: Gaussians, b: Gaussians, match: Match) -> Gdf:
-    """The edit of A's members on the Gaussians of B that they are; a network is kept as it was baked."""
+    """Return the edit with the offsets of A's members on the matching Gaussians of B.
+
+    A network or a grade becomes the separable field that it was baked to.
+
+    Raises:
+        ProgdfError: the edit has no members, or none of them is in B.
+    """
     members = gdf.region.members.numpy()
     if not len(members):
         raise ProgdfError(f"{gdf.name} has no members; train it again")
     index = np.searchsorted(members, match.rows).clip(max=len(members) - 1)
-    mine = np.flatnonzero(members[index] == match.rows)
-    if not len(mine):
+    member_rows = np.flatnonzero(members[index] == match.rows)
+    if not len(member_rows):
         raise ProgdfError(f"no member of {gdf.name} is in the other scene; give the same scene")
-    rows = torch.from_numpy(mine)
+    rows = torch.from_numpy(member_rows)
     of_a = torch.from_numpy(match.rows)
-    source = torch.cat([torch.from_numpy(index[mine]), torch.arange(len(members), gdf.members)])
-    # q and −q are one rotation, but not with the same offset
+    source = torch.cat([torch.from_numpy(index[member_rows]), torch.arange(len(members), gdf.members)])
+    # q and −q are the same rotation, but their offsets have opposite signs
     flipped = torch.zeros(len(source), dtype=torch.bool)
     flipped[: len(rows)] = (a.quats[of_a[rows]] * b.quats[rows]).sum(dim=1) < 0
     attributes = {}
@@ -154,19 +170,21 @@ def rebind_edit(gdf: Gdf, a: Gaussians, b: Gaussians, match: Match) -> Gdf:
         channels=BASE_CHANNELS + (3 * b.shN.shape[1] if "shN" in attributes else 0),
         recorded=gdf.field.recorded,
     )
-    figures = {"matched": match.matched, "one_to_one": match.once, "median": match.median, "p95": match.p95}
+    quality = {"matched": match.matched, "one_to_one": match.once, "median": match.median, "p95": match.p95}
     return replace(
         gdf,
         region=Region(gdf.region.name, rows, gdf.region.score[of_a]),
         field=field,
         scene=fingerprint(b),
-        report={**gdf.report, "rebound": figures},
+        report={**gdf.report, "rebound": quality},
     )
 
 
 def _assign_rows(candidates: Rows, costs: NDArray[np.float64], count: int) -> Rows:
-    """Which candidate each row of B takes: the cheapest that no other has more cheaply; where none is left,
-    the cheapest. [N,k] -> [N]"""
+    """Assign a candidate to each row of B, greedily by cost and one to one. [N,k] -> [N]
+
+    A row whose candidates are all taken gets its cheapest one.
+    """
     chosen = np.full(len(candidates), -1)
     free = np.ones(count, bool)
     open_rows = np.arange(len(candidates))
@@ -186,6 +204,6 @@ def _assign_rows(candidates: Rows, costs: NDArray[np.float64], count: int) -> Ro
 
 
 def _colors(scene: Gaussians) -> NDArray[np.float32]:
-    """Colors of band 0 as far as every format keeps them, 0..1. [N,3]"""
+    """Return the colors of band 0, clamped to 0 to 1, as some formats store no others. [N,3]"""
     rgb: NDArray[np.float32] = sh0_to_rgb(scene.sh0).clamp(0.0, 1.0).numpy()
     return rgb
