@@ -1,1 +1,1 @@
-"""The method without each of its parts."""
+"""Ablation: the method without each of its parts."""

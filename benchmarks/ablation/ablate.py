@@ -1,8 +1,8 @@
-"""`python -m benchmarks ablate RUN …`: which part of the method is worth what, on one's own edits.
+"""The command `python -m benchmarks ablate RUN …`: the value of each part of the method on finished runs.
 
-Every variant trains towards the run's own edited views and is judged by the same held-out ones, also at
-strengths that it was not shown, with as many seeds as asked for. RUN/ablation holds ablation.json,
-ablation.md and ablation.png, and of each variant its .gdf, so that one can feel the difference in the window.
+Every variant trains on the run's edited views and is evaluated on the same held-out views, also at strengths
+that it was not trained on, with the requested number of seeds. RUN/ablation holds ablation.json, ablation.md
+and ablation.png, and the .gdf of each variant to compare in the window.
 """
 
 from __future__ import annotations
@@ -44,21 +44,21 @@ from .setup import AblationSetup, digest_of, edit_at_equal_strengths, make_ablat
 from .table import Ablation, Outcome, VariantRow, row_line, sheet_of, table_of
 from .variants import EQUAL, Variant, choose_variants, differing_variants, is_seeded
 
-_WIDTH = 176  # of a picture in the sheet, pixels
+_PICTURE_WIDTH = 176  # of one picture in the sheet, pixels
 
 
 def ablate(options: AblateOptions, quiet: bool = False) -> list[Ablation]:
-    """Train and judge the variants that are not done yet, and write the table and the picture of each run.
+    """Train and evaluate the variants that are not done yet, and write the table and the picture of each run.
 
-    `options` may ask for one table and one picture of all runs as well.
+    `options` can request one table and one picture of all runs as well.
 
     Args:
-        options: see AblateOptions
-        quiet: nothing on the screen
+        options: see `AblateOptions`
+        quiet: print nothing
 
     Raises:
-        ProgdfError: a folder is no finished run, its scene or a view is gone, a variant does not exist.
-        KeyboardInterrupt: interrupted; the message says what is kept.
+        ProgdfError: a folder is no finished run, its scene or a view is missing, or a variant does not exist.
+        KeyboardInterrupt: interrupted; the message names the folder of the finished variants.
     """
     check_options(options)
     use_threads(options.threads)
@@ -74,7 +74,7 @@ def ablate(options: AblateOptions, quiet: bool = False) -> list[Ablation]:
 
 
 def check_options(options: AblateOptions) -> None:
-    """Raises ProgdfError for what cannot be met, before an hour has been trained."""
+    """Raise ProgdfError for invalid options, before any training."""
     if not options.runs:
         raise ProgdfError("ablate needs a run; give a folder that progdf train finished")
     if options.seeds < 1:
@@ -90,12 +90,12 @@ def check_options(options: AblateOptions) -> None:
 
 
 def _ablate_run(root: Path, options: AblateOptions, quiet: bool) -> Ablation:
-    """The variants of one run."""
+    """Train and evaluate the variants of one run."""
     run = reopen_run(root, options.scene)
     own = run_plan(run)
     kind = run.record.kind
     variants = differing_variants(own, kind, len(run.trajectory.strengths), run.scene.sh_degree)
-    wanted = [
+    selected = [
         (variant, seed)
         for variant in choose_variants(variants, options.only)
         for seed in range(options.seeds if is_seeded(variant, own, kind) else 1)
@@ -106,23 +106,23 @@ def _ablate_run(root: Path, options: AblateOptions, quiet: bool) -> Ablation:
         log = RunLog(root / "log.txt", quiet)
         try:
             shared = make_ablation_setup(run, own, kind, options.quick)
-            for i, (variant, seed) in enumerate(wanted):
-                home = _home(root, variant.name, seed)
-                if _load_outcome(home, variant, seed, shared) is not None:
-                    log.say(f"{home.name}: done before")
+            for i, (variant, seed) in enumerate(selected):
+                folder = _variant_folder(root, variant.name, seed)
+                if _load_outcome(folder, variant, seed, shared) is not None:
+                    log.say(f"{folder.name}: done before")
                     continue
-                log.say(f"{home.name} ({i + 1} of {len(wanted)}): {variant.what}")
+                log.say(f"{folder.name} ({i + 1} of {len(selected)}): {variant.what}")
                 try:
                     _run_variant(root, variant, seed, shared, quiet)
                 except KeyboardInterrupt:
                     _publish(root, variants, shared)
                     raise KeyboardInterrupt(
-                        f"{i} of {len(wanted)} variants are done and kept in {root}; "
+                        f"{i} of {len(selected)} variants are done and kept in {root}; "
                         "give the same command to go on"
                     ) from None
-                outcome = _load_outcome(home, variant, seed, shared)
+                outcome = _load_outcome(folder, variant, seed, shared)
                 assert outcome is not None
-                log.say(f"{home.name}: {outcome.failed or row_line(VariantRow([outcome]))}")
+                log.say(f"{folder.name}: {outcome.failed or row_line(VariantRow([outcome]))}")
             for state in root.glob("*/state"):
                 StateFolder(state).end()
             return _publish(root, variants, shared)
@@ -130,14 +130,14 @@ def _ablate_run(root: Path, options: AblateOptions, quiet: bool) -> Ablation:
             log.close()
 
 
-def _home(root: Path, name: str, seed: int) -> Path:
-    """The folder of a variant with one seed."""
+def _variant_folder(root: Path, name: str, seed: int) -> Path:
+    """Return the folder of a variant with one seed."""
     return root / (f"{name}+{seed}" if seed else name)
 
 
 def _run_variant(root: Path, variant: Variant, seed: int, shared: AblationSetup, quiet: bool) -> None:
-    """Train and judge one variant, and keep what became of it."""
-    folder = _home(root, variant.name, seed)
+    """Train and evaluate one variant, and save its outcome."""
+    folder = _variant_folder(root, variant.name, seed)
     folder.mkdir(exist_ok=True)
     plan = variant.plan(shared.plan, seed)
     perceptual = perceptual_loss()[0]
@@ -149,7 +149,7 @@ def _run_variant(root: Path, variant: Variant, seed: int, shared: AblationSetup,
     try:
         with variant.patched():
             trajectory = _record(variant, plan, shared, perceptual, state, log)
-            field, asked = fit_variant(variant, trajectory, shared, plan, perceptual, state, log)
+            field, stage_values = fit_variant(variant, trajectory, shared, plan, perceptual, state, log)
     except ProgdfError as error:
         if not isinstance(error.__cause__, FloatingPointError):
             raise
@@ -158,24 +158,24 @@ def _run_variant(root: Path, variant: Variant, seed: int, shared: AblationSetup,
     finally:
         log.close()
     outcome = replace(outcome, seconds=round(_processor_seconds(state), 2))
-    outcome = with_figures(outcome, field, shared, asked, perceptual_loss()[0])
+    outcome = with_figures(outcome, field, shared, stage_values, perceptual_loss()[0])
     region = shared.run.region
     scene = shared.run.scene
-    told = plain(replace(plan, name=variant.name))
-    gdf = Gdf(variant.name, region, field, fingerprint(scene), plan.editor.editor, told)
+    recipe = plain(replace(plan, name=variant.name))
+    gdf = Gdf(variant.name, region, field, fingerprint(scene), plan.editor.editor, recipe)
     save_gdf(folder / f"{variant.name}.gdf", gdf)
-    pictures = strip(shared.evaluator, field, shared.columns, _WIDTH)
+    pictures = strip(shared.evaluator, field, shared.columns, _PICTURE_WIDTH)
     _save_outcome(folder, outcome, pictures, variant, seed, shared)
 
 
 def _state(root: Path, variant: Variant, seed: int, shared: AblationSetup) -> StateFolder:
-    """Where the variant's optimization goes on where it was stopped, or another's that it shares stands."""
-    home = _home(root, variant.trains_as, seed)
-    home.mkdir(exist_ok=True)
-    state = StateFolder(home / "state")
-    begun = {"digest": digest_of(shared, variant, seed, optimization=True)}
-    if state.identity() != begun:
-        state.begin(begun)
+    """Return the state folder of the variant's optimization, which it may share with another variant."""
+    folder = _variant_folder(root, variant.trains_as, seed)
+    folder.mkdir(exist_ok=True)
+    state = StateFolder(folder / "state")
+    identity = {"digest": digest_of(shared, variant, seed, optimization=True)}
+    if state.identity() != identity:
+        state.begin(identity)
     return state
 
 
@@ -187,7 +187,7 @@ def _record(
     state: StateFolder,
     log: RunLog,
 ) -> Trajectory:
-    """The variant's trajectory."""
+    """Optimize a variant and return its trajectory."""
     optimization = resolve_kind(plan, shared.kind, plan.optimize.group_steps or 0)
     setup = whole_views(shared.setup) if optimization.as_printed else shared.setup
     with _count_processor_seconds(state), log.stage("optimize"):
@@ -206,7 +206,7 @@ def _record(
 
 
 def _targets(variant: Variant, plan: TrainOptions, shared: AblationSetup) -> Pictures:
-    """The edited views that a variant is trained on."""
+    """Return the edited views that a variant is trained on."""
     if plan.optimize.stages == 1:
         return {1.0: shared.edited[1.0]}
     return edit_at_equal_strengths(shared) if variant.name == EQUAL else shared.edited
@@ -214,8 +214,10 @@ def _targets(variant: Variant, plan: TrainOptions, shared: AblationSetup) -> Pic
 
 @contextmanager
 def _count_processor_seconds(state: StateFolder) -> Iterator[None]:
-    """Keep beside a state what processor time it took, all sessions together; a look at what is done takes
-    none."""
+    """Save the processor time of the block with the state, over all sessions.
+
+    The time is not changed once the block has finished in an earlier session.
+    """
     saved = state.load("processor")
     begun = time.process_time()
     done = False
@@ -229,7 +231,7 @@ def _count_processor_seconds(state: StateFolder) -> Iterator[None]:
 
 
 def _processor_seconds(state: StateFolder) -> float:
-    """Seconds so far."""
+    """Return the processor seconds so far."""
     saved = state.load("processor")
     return float(saved.values["seconds"]) if saved is not None else 0.0
 
@@ -242,14 +244,14 @@ def _save_outcome(
     seed: int,
     shared: AblationSetup,
 ) -> None:
-    """Write what became of a variant; the figures last, as they tell that it is done."""
+    """Write the outcome of a variant; outcome.json comes last, as it marks the variant as done."""
     if pictures:
         write_image(folder / "strip.png", torch.cat(list(pictures), dim=1))
     write_json(folder / "outcome.json", {"digest": digest_of(shared, variant, seed), **asdict(outcome)})
 
 
 def _load_outcome(folder: Path, variant: Variant, seed: int, shared: AblationSetup) -> Outcome | None:
-    """What became of a variant in an earlier call; None where it was not done, or on other ground."""
+    """Return a variant's outcome of an earlier call; None if it is not done or has other inputs."""
     try:
         found = decode_json((folder / "outcome.json").read_bytes())
         if found.pop("digest") != digest_of(shared, variant, seed):
@@ -260,17 +262,19 @@ def _load_outcome(folder: Path, variant: Variant, seed: int, shared: AblationSet
 
 
 def _load_row(root: Path, variant: Variant, shared: AblationSetup) -> VariantRow | None:
-    """The seeds of a variant that are done, from the run's own on; None where that is not."""
+    """Return the finished seeds of a variant, starting with the run's own; None if that is not done."""
     outcomes: list[Outcome] = []
     while (
-        found := _load_outcome(_home(root, variant.name, len(outcomes)), variant, len(outcomes), shared)
+        found := _load_outcome(
+            _variant_folder(root, variant.name, len(outcomes)), variant, len(outcomes), shared
+        )
     ) is not None:
         outcomes.append(found)
     return VariantRow(outcomes) if outcomes else None
 
 
 def _publish(root: Path, variants: Sequence[Variant], shared: AblationSetup) -> Ablation:
-    """Table and picture of all that is done."""
+    """Write the table and the picture of all finished variants."""
     rows = [row for variant in variants if (row := _load_row(root, variant, shared)) is not None]
     plan = shared.plan
     setup = shared.setup
@@ -289,7 +293,9 @@ def _publish(root: Path, variants: Sequence[Variant], shared: AblationSetup) -> 
         for row in rows
         if not row.failed
     }
-    editor = [(image * 255).round() / 255 for image in editor_strip(evaluator, shared.columns, _WIDTH)]
+    editor = [
+        (image * 255).round() / 255 for image in editor_strip(evaluator, shared.columns, _PICTURE_WIDTH)
+    ]
     caption = f"held-out view {evaluator.names[best_view(evaluator)]}; PSNR to the editor's own pictures"
     write_image(root / "ablation.png", sheet_of(editor, rows, strips, shared.columns, title, caption))
     with atomic_write(root / "ablation.md") as beside:

@@ -1,4 +1,4 @@
-"""The field of an ablation's variant, and the figures that it deserves on held-out views."""
+"""Field of an ablation's variant, and its figures on held-out views."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def fit_variant(
     state: StateFolder,
     log: RunLog,
 ) -> tuple[BakedField, Mapping[float, float]]:
-    """The variant's field, and where on its slider it was shown which of the editor's strengths."""
+    """Fit the variant's field; return it with the slider value of each of the editor's strengths."""
     if variant.linear:
         offsets = trajectory.nodes
         return fit_keyframes(trajectory.s, offsets, 2), {}
@@ -60,8 +60,11 @@ def fit_variant(
 
 
 def _slider_value(asked: Mapping[float, float], strength: float, at: float) -> float:
-    """Where on its slider a variant shows a strength: as it was asked, or between what it was asked; on the
-    run's own slider where it was shown the end alone."""
+    """Return the slider value at which a variant shows a strength.
+
+    Strengths that it was not trained on are interpolated. If it was trained on the end only, the run's slider
+    value `at` is used.
+    """
     if strength in asked or len(asked) < 2:
         return asked.get(strength, at)
     knots = torch.tensor([0.0, *asked], dtype=torch.float64)
@@ -75,21 +78,21 @@ def with_figures(
     asked: Mapping[float, float],
     measure: Perceptual,
 ) -> Outcome:
-    """With the figures that the field deserves; where it was shown no picture, on the run's own slider."""
+    """Return the outcome with the field's figures; a field trained on no picture uses the run's slider."""
     evaluator, _ = shared.evaluators(field.offsets(1.0)[None])
-    shown = [
+    columns = [
         (s, _slider_value(asked, e, at), e)
         for s, (at, e) in zip(SHOWN[1:], shared.columns[1:], strict=True)
         if e
     ]
-    course = against_editor(evaluator, {"slider": field}, [(at, e) for _, at, e in shown], measure)["slider"]
+    curve = against_editor(evaluator, {"slider": field}, [(at, e) for _, at, e in columns], measure)["slider"]
     slider = slider_statistics(lambda s: evaluator.pictures(field.offsets(s)), masks=evaluator.pixels)
     return replace(
         outcome,
-        psnr=round(course.psnr[-1], 2),
-        ssim=round(course.ssim[-1], 4),
-        lpips=round(course.lpips[-1], 4),
-        between={f"{s:g}": round(p, 2) for (s, *_), p in zip(shown[:-1], course.psnr, strict=False)},
+        psnr=round(curve.psnr[-1], 2),
+        ssim=round(curve.ssim[-1], 4),
+        lpips=round(curve.lpips[-1], 4),
+        between={f"{s:g}": round(p, 2) for (s, *_), p in zip(columns[:-1], curve.psnr, strict=False)},
         uniformity=round(slider.uniformity, 3),
         t50=round(slider.t50, 3),
         t90=round(slider.t90, 3),

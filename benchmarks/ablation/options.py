@@ -1,4 +1,4 @@
-"""What an ablation can be told."""
+"""Options of the ablation."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import tyro
 
 @dataclass(frozen=True)
 class AblateOptions:
-    """Train finished runs again without one part of the method, or with another: one table, one picture.
+    """Train finished runs again without one part of the method, or with another, and compare the results.
 
-    What is done is kept in RUN/ablation: an interrupted ablation goes on, and --only adds to it.
+    Finished variants are saved in RUN/ablation. An interrupted ablation resumes, and --only adds to it.
     """
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
-    """Folders that progdf train wrote; scene, region, edited views and options are taken over."""
+    """Folders of progdf train; their scene, region, edited views and options are used."""
     only: str = ""
-    """Some variants by name, as one-target,no-lpips; all that make sense for the run if empty."""
+    """Variants by name, such as one-target,no-lpips; empty for all that apply to the run."""
     seeds: int = 1
-    """How often each variant is trained, from the run's own seed on; once where a seed changes nothing."""
+    """Seeds per variant, starting with the run's own; variants that use no seed are trained once."""
     quick: bool = False
     """A draft: 240 steps in 4 stages, 12 views."""
     markdown: Path | None = None
@@ -28,6 +28,6 @@ class AblateOptions:
     plot: Path | None = None
     """Also draw the figures of all runs into this PNG file."""
     scene: Path | None = None
-    """Where the scene is now, if it has moved since the run."""
+    """New path of the scene, if it has moved since the run."""
     threads: int = 0
-    """CPU threads; 0 takes all cores."""
+    """CPU threads; 0 uses all cores."""

@@ -1,4 +1,4 @@
-"""The picture of ablations: a row per variant, a point per run with ± over the seeds."""
+"""Plot of ablations: a row per variant, a point per run with ± over the seeds."""
 
 from __future__ import annotations
 
@@ -23,24 +23,26 @@ SHOWN = ("end", "between", "even", "s")
 
 _DPI = 100
 # inches
-_ROW = 0.21
-_HEAD = 1.0
-_WIDTH = 12.0
+_ROW_HEIGHT = 0.21
+_HEADER_HEIGHT = 1.0
+_PLOT_WIDTH = 12.0
 
 
 @dataclass(frozen=True)
 class _Line:
-    """A row of the picture."""
+    """A row of the plot."""
 
-    name: str  # of the variant
-    of: str  # of the one that it differs from
-    rows: Sequence[VariantRow | None]  # of each run; None where it makes no difference there
+    name: str  # name of the variant
+    of: str  # name of the variant that it differs from
+    rows: Sequence[VariantRow | None]  # one per run; None if the variant makes no difference there
 
 
 def plot_ablations(ablations: Sequence[Ablation]) -> Tensor:
-    """End, way, evenness and processor time of every variant. [H,W,3], 0..1"""
+    """Draw PSNR at the end and between, uniformity and processor time of every variant. [H,W,3], 0 to 1"""
     lines = [_Line(about.name, about.of, rows) for about, rows in rows_by_name(ablations)]
-    drawing = Drawing(figsize=(_WIDTH, _HEAD + _ROW * len(lines)), dpi=_DPI, facecolor=_hex(PAPER))
+    drawing = Drawing(
+        figsize=(_PLOT_WIDTH, _HEADER_HEIGHT + _ROW_HEIGHT * len(lines)), dpi=_DPI, facecolor=_hex(PAPER)
+    )
     canvas = FigureCanvasAgg(drawing)
     figures = [figure for figure in FIGURES if figure.short in SHOWN]
     panels = drawing.subplots(1, len(figures), sharey=True, squeeze=False)[0]
@@ -57,7 +59,7 @@ def plot_ablations(ablations: Sequence[Ablation]) -> Tensor:
 
 
 def _draw_panel(panel: Axes, figure: Figure, lines: Sequence[_Line], runs: Sequence[str]) -> None:
-    """One figure of all variants: points, ± over seeds, and a stroke to what each variant differs from."""
+    """Draw one figure of all variants: points, ± over seeds, and a line from each one's reference variant."""
     panel.set_facecolor(_hex(PAPER))
     panel.set_title(figure.heading, fontsize=9, color=_hex(INK))
     panel.tick_params(colors=_hex(PALE), labelsize=8, length=0)
@@ -77,13 +79,13 @@ def _draw_panel(panel: Axes, figure: Figure, lines: Sequence[_Line], runs: Seque
             for line in lines
             if (row := line.rows[run]) and (values := row.values(figure.of))
         }
-        for place, line in enumerate(lines):
+        for row_index, line in enumerate(lines):
             if line.name in found:
-                _draw_values(panel, place + shift, line, found, color)
+                _draw_values(panel, row_index + shift, line, found, color)
         panel.plot([], [], "o", color=color, markersize=4, label=name)
-    for place, line in enumerate(lines):
-        if place and line.of == "base" and line.name in {other.of for other in lines}:
-            panel.axhline(place - 0.5, color=_hex(PALE), linewidth=0.8)
+    for row_index, line in enumerate(lines):
+        if row_index and line.of == "base" and line.name in {other.of for other in lines}:
+            panel.axhline(row_index - 0.5, color=_hex(PALE), linewidth=0.8)
 
 
 def _draw_values(

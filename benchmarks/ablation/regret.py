@@ -1,7 +1,8 @@
-"""`python -m benchmarks regret SCENE REGION EDITOR`: how much better or cheaper an edit of colors could be.
+"""The command `python -m benchmarks regret SCENE REGION EDITOR`: possible gains of a color edit in quality or
+time.
 
-The views, strengths, steps and SH functions that a run decides on by itself stand beside a sweep of all of
-them. Every field is measured in views in which nobody trains or chooses, at strengths that are nobody's own.
+The views, strengths, steps and SH functions that a run chooses automatically are compared with a sweep of all
+of them. Every field is measured in views and at strengths that are not used for training or choice.
 """
 
 from __future__ import annotations
@@ -58,15 +59,13 @@ from trainer.views.view import View, crop, name_cameras, region_rig, with_near_p
 from ..table import Table
 
 MEASURED = (0.12, 0.38, 0.64, 0.88, 1.0)
-"""Strengths at which the editor is asked for what it means."""
-STAGES = (8, 4, 2)
-STEPS = (5, 12, 24)
-BANDS = (0, 1, 4, 9)
-VIEWS = (20, 30, 60)
-"""What is swept: even strengths; steps of conjugate gradients for each, where nothing ends them before; SH
-functions of the residual; other numbers of views than a run's own, with what was best for those."""
+"""Strengths at which fields are compared with the editor's pictures."""
+STAGES = (8, 4, 2)  # swept numbers of even strengths
+STEPS = (5, 12, 24)  # swept steps of conjugate gradients per strength, without early stopping
+BANDS = (0, 1, 4, 9)  # swept numbers of SH functions of the residual
+VIEWS = (20, 30, 60)  # swept numbers of views, with the best SH functions of the run's own views
 REPORTING = 13
-"""Cameras of a rig that stand where no training view does."""
+"""Number of rig cameras for the evaluation; the first is skipped, and none is a training camera."""
 NEAR = 0.3
 """dB within which a cheaper field counts as equal."""
 
@@ -82,51 +81,51 @@ NOTE = (
 
 @dataclass(frozen=True)
 class RegretOptions:
-    """Sweep the effort of an edit of colors, beside what a run decides on by itself."""
+    """Sweep the effort of a color edit and compare it with the automatic choice."""
 
     scene: tyro.conf.Positional[Path]
     """The scene."""
     region: tyro.conf.Positional[str]
-    """As progdf train --region has it."""
+    """Region, as for progdf train --region."""
     editor: tyro.conf.Positional[str]
-    """An editor of colors that pictures any strength."""
+    """A color editor that supports any strength."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """One way to make the edit."""
+    """Figures of the edit with one set of options."""
 
     name: str
     psnrs: Sequence[float]  # at `MEASURED`, dB
-    seconds: float  # of the processor
-    bytes: float  # of the field by Gaussian
+    seconds: float  # processor time
+    bytes: float  # of the field, per Gaussian
 
     @property
     def mean(self) -> float:
-        """Of the end and the mean of the in-betweens, dB, each at most that of a level of 8 bits."""
+        """Mean of the PSNR at 1 and the mean PSNR between, dB, each limited to that of one 8-bit level."""
         *between, end = (min(psnr, decibels(LEVEL)) for psnr in self.psnrs)
         return (end + sum(between) / len(between)) / 2
 
     @property
     def cells(self) -> tuple[str, ...]:
-        """As a row of the table."""
+        """Cells of its row in the table."""
         psnrs = " ".join(f"{psnr:.1f}" for psnr in self.psnrs)
         return self.name, psnrs, f"{self.mean:.2f}", f"{self.seconds:.1f}", f"{self.bytes:.0f}"
 
 
 @dataclass
 class RegretEdit:
-    """An edit from one set of views, its pictures and solutions made once."""
+    """An edit from one set of views, with cached pictures and solutions."""
 
     scene: Gaussians
     region: Region
     editor: str
-    painter: ImageEditor  # the same of all sets of views: what it takes for the region's color is of one
+    painter: ImageEditor  # shared by all sets of views, so that its color of the region is the same
     setup: TrainingSetup
-    seconds: float = 0.0  # of the processor, for what every way needs
+    seconds: float = 0.0  # processor time of the work shared by all options
     pictures: dict[float, list[Tensor]] = field(default_factory=dict)  # of all views, by strength
-    courses: list[Callable[[float], Tensor]] = field(default_factory=list)  # of all views
-    a_strength: float = 0.0  # of the processor, for all views' pictures at one strength
+    courses: list[Callable[[float], Tensor]] = field(default_factory=list)  # strength -> picture, per view
+    a_strength: float = 0.0  # processor time of all views' pictures at one strength
 
     def __post_init__(self) -> None:
         self.original = pack(self.scene[self.region.members], with_shN=self.scene.sh_degree > 0)
@@ -140,12 +139,12 @@ class RegretEdit:
         self.solved: dict[tuple[int, int, float, int], tuple[Tensor, Tensor, float]] = {}
 
     def strengths(self, count: int) -> tuple[float, ...]:
-        """So many, evenly visible apart."""
+        """Return `count` strengths with equal visible changes between them."""
         plain = tuple((i + 1) / count for i in range(count))
         return equalized_strengths(self.painter, self.editor, self.setup.views, plain)
 
     def picture(self, s: float) -> list[Tensor]:
-        """All views, as they are kept."""
+        """Return the edited pictures of all views at a strength, quantized to 8 bits."""
         if s not in self.pictures:
             began = time.process_time()
             self.courses = self.courses or [edit_course(self.painter, view) for view in self.setup.views]
@@ -154,25 +153,25 @@ class RegretEdit:
         return self.pictures[s]
 
     def targets(self, s: float) -> list[Tensor]:
-        """The training views' boxes."""
+        """Return the edited boxes of the training views at a strength."""
         pairs = zip(self.picture(s), self.setup.train, strict=False)
         return [crop(picture, view.box) for picture, view in pairs]
 
     def aside(self, s: float) -> list[Tensor]:
-        """The whole pictures of the views that choose."""
+        """Return the whole edited pictures of the views for the choice."""
         return list(split_held_out(self.picture(s)[len(self.setup.train) :])[0])
 
     def automatic(self, judge: Evaluator) -> tuple[Model, Sequence[float], str, Result]:
-        """How much is modelled, at which strengths, all that was decided in words, and what came of it."""
-        waited = 0.0  # for pictures, which are counted by `measure`
+        """Run the automatic choice; return model, strengths, a description of the choice, and its figures."""
+        waited = 0.0  # processor time of pictures, which `measure` counts
         courses = {view.camera.name: edit_course(self.painter, view) for view in self.choosing}
 
         def edit(strengths: Sequence[float], views: Sequence[View]) -> Pictures:
             nonlocal waited
             began = time.process_time()
             chosen = {view.camera.name for view in views}
-            kept = [view.camera.name in chosen for view in self.setup.views]
-            made = {s: list(compress(self.picture(s), kept)) for s in strengths}
+            is_chosen = [view.camera.name in chosen for view in self.setup.views]
+            made = {s: list(compress(self.picture(s), is_chosen)) for s in strengths}
             waited += time.process_time() - began
             return made
 
@@ -189,14 +188,16 @@ class RegretEdit:
         most = iterations(OptimizeOptions().steps)
         for snapshot in solve(solver, model, course, made, state, lambda step, left: None, most):
             made.append(snapshot)
-        spent = time.process_time() - began - waited - self.seconds  # it prepared the views for itself
+        spent = time.process_time() - began - waited - self.seconds  # it prepared the views itself
         strengths, made = course.sort_recordings(made)
         steps = ", ".join(f"{snapshot.means.get(TAKEN, 0):.0f}" for snapshot in made)
         at = ", ".join(f"{s:g}" for s in strengths)
         tables = [snapshot.table for snapshot in made if snapshot.table is not None]
         offsets = [snapshot.offsets for snapshot in made]
         views = len(self.setup.held_out) + len(solver.views)
-        spent -= (1.0 - views / len(self.setup.views)) * (len(made) - 1) * self.a_strength  # not asked for
+        spent -= (
+            (1.0 - views / len(self.setup.views)) * (len(made) - 1) * self.a_strength
+        )  # pictures not needed
         name = f"automatic: {views} views, {len(strengths)} strengths, {model.bands} SH"
         result = self.measure(name, judge, strengths, model.bands, tables, offsets, spent, model.mask)
         return model, strengths, f"{model.line}; strengths {at} in {steps} steps", result
@@ -210,7 +211,7 @@ class RegretEdit:
         stages: Sequence[int],
         mask: Tensor | None,
     ) -> Iterator[Result]:
-        """Some strengths and steps."""
+        """Solve for several strengths and steps, and yield the figures of each combination."""
         began = time.process_time()
         solver = make_solver(self.drawn, self.original)
         last = None
@@ -256,7 +257,7 @@ class RegretEdit:
         spent: float,
         mask: Tensor | None = None,
     ) -> Result:
-        """The field that a run would keep of these, its slider the editor's own strength."""
+        """Fit and measure the field that a run would ship; the slider value is the editor's strength."""
         count = len(strengths)
         trajectory = Trajectory(
             s=torch.tensor([0.0, *strengths]),
@@ -280,7 +281,7 @@ class RegretEdit:
         return Result(name, psnrs, seconds, chosen.bytes_per_member)
 
     def judge(self) -> Evaluator:
-        """Views of nobody's, as large as these."""
+        """Prepare an evaluator of views that are not used for training, of the same size."""
         assert self.setup.up is not None
         camera = self.setup.train[0].camera
         size = max(camera.width, camera.height)
@@ -292,7 +293,7 @@ class RegretEdit:
         return self.evaluator(views, edited)
 
     def evaluator(self, views: Sequence[View], edited: dict[float, list[Tensor]]) -> Evaluator:
-        """These views beside their pictures."""
+        """Prepare an evaluator of views with their edited pictures."""
         channels = self.original.shape[1]
         return make_evaluator(self.scene, self.region, views, edited, self.setup.background, channels, True)
 
@@ -303,7 +304,7 @@ class RegretEdit:
 
 
 def begin_edit(scene: Gaussians, region: Region, editor: str) -> RegretEdit:
-    """From the views that a run takes by itself."""
+    """Prepare an edit with the views that a run chooses automatically."""
     setup = make_training_setup(TrainingViewOptions(), scene, region)
     glances = partial(take_glances, TrainingViewOptions(), scene, region)
     painter = make_editor(EditorOptions(editor), scene, region, setup.views, glances)
@@ -311,10 +312,10 @@ def begin_edit(scene: Gaussians, region: Region, editor: str) -> RegretEdit:
 
 
 def run_regret(options: RegretOptions) -> Table:
-    """Sweep; a line as soon as there is a result, the table at the end.
+    """Run the sweep; print a line per result and return the table.
 
     Raises:
-        ProgdfError: a scene, region or editor that does not work.
+        ProgdfError: the scene, region or editor cannot be used.
     """
     use_threads(1)
     scene = load_scene(options.scene)
@@ -323,30 +324,30 @@ def run_regret(options: RegretOptions) -> Table:
     edit = begin_edit(scene, region, options.editor)
     camera = edit.setup.train[0].camera
     judge = edit.judge()
-    edit.automatic(judge)  # what is loaded at the first use is not counted
+    edit.automatic(judge)  # not counted: the first use loads libraries
     model, _, line, automatic = edit.automatic(judge)
     print_line(line)
     results = [automatic]
     print_line(" | ".join(automatic.cells))
     for bands in (bands for bands in BANDS if bands <= edit.drawn[0].basis.shape[1]):
-        most = STEPS[-1] if bands == model.bands else STEPS[-2]
-        for result in edit.sweep(judge, model.degree, bands, most, STAGES, model.mask):
+        max_steps = STEPS[-1] if bands == model.bands else STEPS[-2]
+        for result in edit.sweep(judge, model.degree, bands, max_steps, STAGES, model.mask):
             print_line(" | ".join(result.cells))
             results.append(result)
-    used = max(results[1:], key=lambda result: result.mean).name.split()[-2]
+    best_bands = max(results[1:], key=lambda result: result.mean).name.split()[-2]
     for views in VIEWS:
         size = max(camera.width, camera.height)
         others = make_training_setup(TrainingViewOptions(views=views, image_size=size), scene, region)
         other = RegretEdit(scene, region, options.editor, edit.painter, others)
-        for result in other.sweep(judge, model.degree, int(used), STEPS[-2], STAGES[:1], model.mask):
+        for result in other.sweep(judge, model.degree, int(best_bands), STEPS[-2], STAGES[:1], model.mask):
             print_line(" | ".join(result.cells))
             results.append(result)
     best = max(results, key=lambda result: result.mean)
-    near = min((r for r in results if r.mean >= best.mean - NEAR), key=lambda result: result.seconds)
-    told = (
+    fast = min((r for r in results if r.mean >= best.mean - NEAR), key=lambda result: result.seconds)
+    summary = (
         f"Regret {best.mean - automatic.mean:.2f} dB to {best.name}. The cheapest within {NEAR:g} dB of that "
-        f"is {near.name}; the automatic one takes {automatic.seconds / near.seconds:.2f} times as long."
+        f"is {fast.name}; the automatic one takes {automatic.seconds / fast.seconds:.2f} times as long."
     )
     columns = ("what", "dB", "mean", "s", "bytes a Gaussian")
     title = f"{options.scene.stem} ({len(region)} members, SH {scene.sh_degree}), {options.editor}"
-    return Table("regret", title, columns, tuple(r.cells for r in results), f"{told} {NOTE}")
+    return Table("regret", title, columns, tuple(r.cells for r in results), f"{summary} {NOTE}")

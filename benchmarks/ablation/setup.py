@@ -1,4 +1,4 @@
-"""What all variants of an ablation share: the run's views and edited views, and who judges."""
+"""Shared inputs of all variants of an ablation: the run's views, edited views and evaluators."""
 
 from __future__ import annotations
 
@@ -40,28 +40,28 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class AblationSetup:
-    """What all variants share."""
+    """Shared inputs of all variants."""
 
     run: FinishedRun  # the finished run
-    plan: TrainOptions  # its own, as a draft if asked for
-    kind: EditKind  # what the edit moves
-    setup: TrainingSetup  # scene, region, views whose boxes hold the edit
+    plan: TrainOptions  # the run's plan, reduced for a draft
+    kind: EditKind  # attributes that the edit changes
+    setup: TrainingSetup  # scene, region, views whose boxes contain the edit
     edited: Pictures  # strength → the edited training views, whole
-    evaluator: Evaluator  # held-out views with the editor's pictures of the shown columns, for whatever moves
-    # the same, and `seen`, for what moves nothing but colors, which they draw faster
+    evaluator: Evaluator  # held-out views with the editor's pictures of `columns`, for any edit
+    # `evaluator` and `seen` for edits of colors only, which render faster
     still: tuple[Evaluator, Evaluator]
-    columns: Columns  # where on the run's slider the variants are shown, and what the editor was asked there
-    seen: Evaluator  # a few training views, on which the field's ranks are chosen
-    weights: Tensor  # how visible each member is. [M]
-    digest: str  # of all of this but the plan
+    columns: Columns  # slider values of the drawn pictures, with the editor's strengths
+    seen: Evaluator  # a small number of training views, on which the field's ranks are chosen
+    weights: Tensor  # visibility of each member. [M]
+    digest: str  # hash of all inputs except the plan
 
     def evaluators(self, offsets: Tensor) -> tuple[Evaluator, Evaluator]:
-        """Held-out views and `seen`, for what moves as these do. [T,M,C]"""
+        """Return the evaluators of held-out views and of `seen` for such offsets. [T,M,C]"""
         return self.still if only_recolors(offsets) else (self.evaluator, self.seen)
 
 
 def run_plan(run: FinishedRun) -> TrainOptions:
-    """The plan of a finished run, with the group steps that it found out."""
+    """Return the plan of a finished run, with the group steps that it chose."""
     plan = run.record.plan
     if plan.optimize.group_steps is not None:
         return plan
@@ -69,16 +69,16 @@ def run_plan(run: FinishedRun) -> TrainOptions:
 
 
 def make_ablation_setup(run: FinishedRun, plan: TrainOptions, kind: EditKind, quick: bool) -> AblationSetup:
-    """The run's views and edited views; for a draft every so manieth of them.
+    """Load the run's views and edited views; for a draft, an even subset of them.
 
     Args:
         run: the finished run
-        plan: its own
-        kind: what the edit moves
-        quick: a draft
+        plan: its plan
+        kind: attributes that the edit changes
+        quick: make a draft
 
     Raises:
-        ProgdfError: an edited view is gone.
+        ProgdfError: an edited view is missing.
     """
     setup = render_run_views(run)
     strengths = run.trajectory.strengths
@@ -90,17 +90,17 @@ def make_ablation_setup(run: FinishedRun, plan: TrainOptions, kind: EditKind, qu
     edited = {s: _read_edited(run, setup.train, s) for s in strengths}
     setup = widen_views(setup, edited)
     columns = columns_of(run.trajectory.stage_strengths)
-    shown = [strength for _, strength in columns[1:] if strength is not None]
-    few = _thin(setup.train, 4)
+    column_strengths = [strength for _, strength in columns[1:] if strength is not None]
+    rank_views = _thin(setup.train, 4)
     channels = BASE_CHANNELS + 3 * run.scene.shN.shape[1]
 
     def evaluator(views: Sequence[View], pictures: Pictures, still: bool) -> Evaluator:
         return make_evaluator(run.scene, run.region, views, pictures, setup.background, channels, still)
 
-    drawn = {s: _read_edited(run, setup.held_out, s) for s in shown}
-    learned = {1.0: _read_edited(run, few, 1.0)}
+    held_out = {s: _read_edited(run, setup.held_out, s) for s in column_strengths}
+    learned = {1.0: _read_edited(run, rank_views, 1.0)}
     digest = hashlib.sha256(run.region.members.numpy().tobytes())
-    for pictures in (*edited.values(), *drawn.values()):
+    for pictures in (*edited.values(), *held_out.values()):
         for picture in pictures:
             digest.update(picture.numpy().tobytes())
     for view in (*setup.train, *setup.held_out):
@@ -111,30 +111,30 @@ def make_ablation_setup(run: FinishedRun, plan: TrainOptions, kind: EditKind, qu
         kind=kind,
         setup=setup,
         edited=edited,
-        evaluator=evaluator(setup.held_out, drawn, False),
-        still=(evaluator(setup.held_out, drawn, True), evaluator(few, learned, True)),
+        evaluator=evaluator(setup.held_out, held_out, False),
+        still=(evaluator(setup.held_out, held_out, True), evaluator(rank_views, learned, True)),
         columns=columns,
-        seen=evaluator(few, learned, False),
+        seen=evaluator(rank_views, learned, False),
         weights=visibility(run.scene, run.region.members, setup.train),
         digest=digest.hexdigest(),
     )
 
 
 def edit_at_equal_strengths(shared: AblationSetup) -> Pictures:
-    """The training views as the editor has them at as many strengths, these equally far apart."""
+    """Edit the training views at the same number of strengths, evenly spaced."""
     return editor_pictures(shared.run, shared.setup.views, shared.setup.train, len(shared.edited))
 
 
 def editor_pictures(
     run: FinishedRun, all_views: Sequence[View], views: Sequence[View], strengths: Sequence[float] | int
 ) -> Pictures:
-    """What a run's editor makes of views.
+    """Edit views with a run's editor.
 
     Args:
         run: the finished run
         all_views: its views
-        views: these or others
-        strengths: at which, or at how many, these equally far apart
+        views: views to edit, from the run or others
+        strengths: the strengths, or the number of evenly spaced ones
     """
     options = replace(run.record.plan.editor, cache=run.folder.paintings)
     glances = partial(take_glances, run.record.plan.views, run.scene, run.region)
@@ -142,8 +142,8 @@ def editor_pictures(
     is_confined = confines_edit(editor, run.record.kind)
 
     def picture(view: View, strength: float) -> Tensor:
-        made = editor.edit(view, strength)
-        return quantize_image(view.confine(made) if is_confined else made)
+        edited = editor.edit(view, strength)
+        return quantize_image(view.confine(edited) if is_confined else edited)
 
     if isinstance(strengths, int):
         strengths = editor_strengths(editor, strengths)
@@ -151,16 +151,16 @@ def editor_pictures(
 
 
 def digest_of(shared: AblationSetup, variant: Variant, seed: int, optimization: bool = False) -> str:
-    """Of all that decides a variant's figures, or of its optimization alone. `seed`: see `Variant.plan`"""
-    decides = plain(variant.plan(shared.plan, seed))
-    del decides["scene"]  # its pictures are in the setup's digest
+    """Hash the inputs of a variant's figures, or of its optimization only. `seed`: see `Variant.plan`"""
+    inputs = plain(variant.plan(shared.plan, seed))
+    del inputs["scene"]  # its renders are in the setup's digest
     if optimization:
-        del decides["optimize"]["slider"]
-        if decides["field"]["field"] != "neural":
-            del decides["field"]
-    name = variant.trains_as if optimization else variant.name  # of which its patches are
-    told = json.dumps([shared.digest, decides, name], sort_keys=True)
-    return hashlib.sha256(told.encode()).hexdigest()
+        del inputs["optimize"]["slider"]
+        if inputs["field"]["field"] != "neural":
+            del inputs["field"]
+    name = variant.trains_as if optimization else variant.name  # the name stands for its patches
+    text = json.dumps([shared.digest, inputs, name], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _read_edited(run: FinishedRun, views: Sequence[View], strength: float) -> Sequence[Tensor]:
@@ -168,6 +168,6 @@ def _read_edited(run: FinishedRun, views: Sequence[View], strength: float) -> Se
 
 
 def _thin(values: Sequence[_T], count: int) -> list[_T]:
-    """At most `count` of them, evenly spread, the last among them."""
+    """Return at most `count` of the values, evenly spread, including the last."""
     count = min(count, len(values))
     return [values[round((i + 1) * len(values) / count) - 1] for i in range(count)]

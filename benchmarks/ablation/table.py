@@ -1,4 +1,4 @@
-"""What ablations found: as a table on the terminal and in Markdown, and as a picture of each run."""
+"""Results of ablations: a table for the terminal and for Markdown, and a picture of each run."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ from trainer.report.report import Columns, column_heading
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one variant with one seed, on held-out views."""
+    """Result of one variant with one seed, on held-out views."""
 
-    # name, what, of: of the variant
+    # name, what, of: see `Variant`
     name: str
     what: str
     of: str = ""
-    # psnr, ssim, lpips: of the finished edit to the edited views
+    # psnr, ssim, lpips: finished edit against the edited views
     psnr: float = 0.0
     ssim: float = 0.0
     lpips: float = 0.0
-    # a quarter, half or three quarters of the slider → PSNR to the editor's own picture from there or near
-    # by, dB, where it was asked
+    # slider value 0.25, 0.5 or 0.75 → PSNR against the editor's picture there or nearby, dB; only values with
+    # one
     between: Mapping[str, float] | None = None
-    uniformity: float = 0.0  # least over largest visible change of twenty equal steps, 0..1
+    uniformity: float = 0.0  # smallest over largest visible change of twenty equal steps, 0 to 1
     # t50, t90: slider value at which half and nine tenths of the change are reached
     t50: float = 0.0
     t90: float = 0.0
     bytes_per_member: float = 0.0  # of the field
-    # processor time of the optimization, with that of a network that is trained beside it
+    # processor time of the optimization, including a jointly trained network
     seconds: float = 0.0
     objective: str = ""  # the loss, in words
-    failed: str = ""  # why there are no figures, "" where there are
+    failed: str = ""  # reason if there are no figures, else ""
 
     @property
     def way(self) -> float | None:
@@ -48,48 +48,48 @@ class Outcome:
 
 @dataclass(frozen=True)
 class VariantRow:
-    """A variant of one run."""
+    """Results of one variant of one run."""
 
-    outcomes: Sequence[Outcome]  # with each seed, at least one
+    outcomes: Sequence[Outcome]  # one per seed, at least one
 
     @property
     def first(self) -> Outcome:
-        """With the run's own seed."""
+        """Outcome with the run's own seed."""
         return self.outcomes[0]
 
     @property
     def failed(self) -> str:
-        """Why there are no figures, "" where there are."""
+        """Reason if there are no figures, else ""."""
         return next((outcome.failed for outcome in self.outcomes if outcome.failed), "")
 
     def values(self, figure: Callable[[Outcome], float | None]) -> list[float]:
-        """A figure with each seed; none where it was not taken."""
+        """Return a figure for each seed, without seeds that lack it."""
         found = [] if self.failed else [figure(outcome) for outcome in self.outcomes]
         return [value for value in found if value is not None]
 
 
 @dataclass(frozen=True)
 class Ablation:
-    """All variants of one run that are done."""
+    """All finished variants of one run."""
 
-    name: str  # of the run
+    name: str  # name of the run
     title: str  # one line
-    note: str  # what was measured, one line
+    note: str  # description of the measurement, one line
     rows: Sequence[VariantRow]  # in order
-    perceptual: str  # name of the distance, LPIPS or what stands in for it
+    perceptual: str  # name of the distance, LPIPS or its substitute
 
 
 @dataclass(frozen=True)
 class Figure:
     """A column of the table."""
 
-    heading: str  # with its unit
-    short: str  # as the terminal has it
-    digits: int  # behind the point
-    of: Callable[[Outcome], float | None]  # reads it
+    heading: str  # heading with unit
+    short: str  # heading on the terminal
+    digits: int  # decimal places
+    of: Callable[[Outcome], float | None]  # reads the figure
 
     def text(self, row: VariantRow, spread: bool = True) -> str:
-        """The mean over the seeds, and ± its standard deviation where there are several."""
+        """Format the mean over the seeds, with ± the standard deviation if there are several."""
         values = row.values(self.of)
         if not values:
             return "–"
@@ -110,7 +110,7 @@ FIGURES = (
 
 
 def rows_by_name(ablations: Sequence[Ablation]) -> Iterator[tuple[Outcome, list[VariantRow | None]]]:
-    """Every variant that any run has, in order, with its row of each run."""
+    """Yield every variant of any run, in order, with its row of each run."""
     names = list(dict.fromkeys(row.first.name for ablation in ablations for row in ablation.rows))
     order = max((ablation.rows for ablation in ablations), key=len, default=())
     places = {row.first.name: i for i, row in enumerate(order)}
@@ -122,7 +122,7 @@ def rows_by_name(ablations: Sequence[Ablation]) -> Iterator[tuple[Outcome, list[
 
 
 def table_of(ablations: Sequence[Ablation], title: str) -> Table:
-    """The variants of all runs as one table; a cell has a line for each run."""
+    """Make one table of the variants of all runs; a cell has a line for each run."""
     headings = tuple(figure.heading for figure in FIGURES)
     perceptual = ablations[0].perceptual
     columns = ("variant", "differs from", "by", "seeds", *headings)
@@ -149,7 +149,7 @@ def table_of(ablations: Sequence[Ablation], title: str) -> Table:
 
 
 def print_table(ablation: Ablation) -> None:
-    """The means of one run on the terminal, within 80 columns."""
+    """Print the means of one run, within 80 columns."""
     drawn = RichTable(title=ablation.title, title_justify="left", box=None, padding=(0, 1, 0, 0))
     for i, column in enumerate(("variant", *(figure.short for figure in FIGURES))):
         drawn.add_column(column, justify="left" if i == 0 else "right", no_wrap=True)
@@ -170,19 +170,20 @@ def sheet_of(
     title: str,
     caption: str,
 ) -> Tensor:
-    """The picture of a run: a row per variant, the editor's own pictures on top.
+    """Draw the picture of a run: a row per variant, with the editor's pictures on top.
 
     Args:
-        editor: what the editor made of the pictured view, at five strengths. [h,w,3] each
+        editor: the editor's pictures of the drawn view, at five strengths. [h,w,3] each
         rows: variants in order
         strips: their pictures with the run's own seed, by name, of the same size
-        columns: where on the run's slider
-        title, caption: a line above and below
+        columns: slider values of the run
+        title: line above
+        caption: line below
     """
-    shown = [row for row in rows if row.first.name in strips]
+    drawn = [row for row in rows if row.first.name in strips]
     return contact_sheet(
-        [editor, *(strips[row.first.name] for row in shown)],
-        ["the editor", *(f"{row.first.name}\n{row_line(row)}" for row in shown)],
+        [editor, *(strips[row.first.name] for row in drawn)],
+        ["the editor", *(f"{row.first.name}\n{row_line(row)}" for row in drawn)],
         [column_heading(*column) for column in columns],
         title,
         caption,
@@ -190,6 +191,6 @@ def sheet_of(
 
 
 def row_line(row: VariantRow) -> str:
-    """In short: the two figures that say most: how good the end is, how good the way."""
-    end, way = (figure.text(row, spread=False) for figure in FIGURES[:2])
-    return f"end {end}" + (f", between {way}" if way != "–" else "") + " dB"
+    """Summarize a row by its two main figures: PSNR at the end and between."""
+    end, between = (figure.text(row, spread=False) for figure in FIGURES[:2])
+    return f"end {end}" + (f", between {between}" if between != "–" else "") + " dB"

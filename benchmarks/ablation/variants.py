@@ -1,8 +1,8 @@
-"""The method without one of its parts, or with another: what `python -m benchmarks ablate` trains again.
+"""Variants of the method for `python -m benchmarks ablate`: without one of its parts, or with another.
 
-A variant differs from another one, which `of` names, in one value of the plan or one patch of the trainer's
-modules: from the run's own options, from the same edit descended view by view where those solve for its
-colors, from the paper's preset, or from that with our field in place of its network.
+A variant differs from the variant named by `of` in one value of the plan or one patch of the trainer's
+modules. The reference is the run itself, the same edit by gradient descent over the views if the run solves
+for colors, the paper's preset, or that preset with our field in place of its network.
 """
 
 from __future__ import annotations
@@ -33,46 +33,46 @@ PAPER = "paper"
 PAPER_PGS = "paper-pgs"
 
 Resolved = tuple[OptimizeOptions, FieldOptions | None, tuple[tuple[str, object], ...]]
-"""All that decides a variant's bits, but for what all variants of a run share."""
+"""Everything that determines a variant's result, apart from the inputs shared by all variants of a run."""
 
 _T = TypeVar("_T")
 
-_AFTERWARDS = (
-    "optimize.slider",
-    "trainer.fit.fit._MIN_ATTRIBUTE_GAIN_DB",
-)  # the optimization knows nothing of these
+# changes that take effect after the optimization
+_POST_OPTIMIZATION = ("optimize.slider", "trainer.fit.fit._MIN_ATTRIBUTE_GAIN_DB")
 
 
 @dataclass(frozen=True)
 class Variant:
     """One row of the ablation."""
 
-    name: str  # short, as --only takes it
-    what: str  # what is different, in words
-    # values of the plan in place of the other variant's, by their paths
+    name: str  # short name, for --only
+    what: str  # the difference, in words
+    # changed values of the plan, by path
     changes: Mapping[str, Any] = field(default_factory=dict)
-    of: str = BASE  # name of that variant
-    linear: bool = False  # the slider goes straight from the original to the end, whatever was recorded
-    # what stands in the trainer's modules meanwhile, by its dotted names
+    of: str = BASE  # name of the variant that it differs from
+    linear: bool = False  # use a straight line from the original to the end instead of the recording
+    # replaced objects of the trainer's modules, by dotted name
     patches: Mapping[str, object] = field(default_factory=dict)
-    longer: float = 1.0  # how many times the other variant's steps it takes
+    longer: float = 1.0  # factor of the other variant's number of steps
 
     @property
     def trains_as(self) -> str:
-        """Name of the variant whose optimization it shares."""
-        shares = self.name != EQUAL and all(path in _AFTERWARDS for path in (*self.changes, *self.patches))
+        """Name of the variant whose optimization it shares, or its own name."""
+        shares = self.name != EQUAL and all(
+            path in _POST_OPTIMIZATION for path in (*self.changes, *self.patches)
+        )
         return self.of if shares else self.name
 
     @contextmanager
     def patched(self) -> Iterator[None]:
-        """The trainer as this variant has it."""
+        """Patch the trainer's modules for this variant."""
         with ExitStack() as stack:
             for name, value in _all_patches(self).items():
                 stack.enter_context(mock.patch(name, value))
             yield
 
     def plan(self, own: TrainOptions, seed: int = 0) -> TrainOptions:
-        """The run's plan with what is different. `seed`: is added to the run's own, of views and network"""
+        """Return the run's plan with the changes. `seed`: added to the run's seeds of views and network"""
         plan = _BY_NAME[self.of].plan(own) if self.of != self.name else own
         for path, value in self.changes.items():
             plan = _put(plan, path, value)
@@ -83,27 +83,27 @@ class Variant:
 
 
 def plan_values(part: object, at: str = "") -> dict[str, Any]:
-    """All values of a plan by their paths, as "optimize.steps"."""
-    found: dict[str, Any] = {}
+    """Return all values of a plan by path, such as "optimize.steps"."""
+    values: dict[str, Any] = {}
     for name in (entry.name for entry in fields(part)):  # type: ignore[arg-type]
         value = getattr(part, name)
-        found |= plan_values(value, f"{at}{name}.") if is_dataclass(value) else {at + name: value}
-    return found
+        values |= plan_values(value, f"{at}{name}.") if is_dataclass(value) else {at + name: value}
+    return values
 
 
 def _put(part: _T, path: str, value: object) -> _T:
-    """A plan with another value at a path."""
+    """Return a plan with another value at a path."""
     name, _, rest = path.partition(".")
     inner = _put(getattr(part, name), rest, value) if rest else value
     return replace(part, **{name: inner})  # type: ignore[type-var]
 
 
 _PAPER_STEPS = PRESETS["paper"]["optimize"]["steps"] / OptimizeOptions.steps
-"""Its steps over ours: a draft shortens both alike."""
+"""Steps of the paper's preset over our default; a draft shortens both alike."""
 
 
 def _as_printed() -> Mapping[str, Any]:
-    """What the paper's preset asks of optimization and field, but for the number of steps."""
+    """Return the paper's options of optimization and field that differ from ours, except the steps."""
     parts = {"optimize": OptimizeOptions, "field": FieldOptions}
     return {
         f"{part}.{name}": value
@@ -114,12 +114,12 @@ def _as_printed() -> Mapping[str, Any]:
 
 
 def _patched(name: str, what: str, path: str, value: object, of: str = BASE) -> Variant:
-    """With something else in one of the trainer's modules."""
+    """Make a variant with one object of the trainer's modules replaced."""
     return Variant(name, what, of=of, patches={path: value})
 
 
 def _other(name: str, what: str, part: str, value: object, of: str = BASE) -> Variant:
-    """With another value of the optimization."""
+    """Make a variant with another value of the optimization."""
     return Variant(name, what, {f"optimize.{part}": value}, of)
 
 
@@ -131,7 +131,7 @@ _LOSSES = "trainer.optimize.losses"
 
 
 def _signed(image: Tensor, *_: object) -> Tensor:
-    """Its gradient is 0 but at the rim of the picture."""
+    """Return the signed L_render; its gradient is 0 except at the boundary of the picture."""
     return -losses.laplacian(image.mean(dim=2)).mean()
 
 
@@ -222,20 +222,20 @@ _BY_NAME = {variant.name: variant for variant in VARIANTS}
 
 
 def differing_variants(plan: TrainOptions, kind: EditKind, stages: int, sh_degree: int) -> list[Variant]:
-    """The variants that differ from a run and from each other.
+    """Return the variants that differ from a run and from each other.
 
     Args:
-        plan: the run's own
-        kind: what the edit moves
-        stages: how many strengths the editor was asked for
-        sh_degree: of the scene
+        plan: the run's plan
+        kind: attributes that the edit changes
+        stages: number of strengths of the editor's pictures
+        sh_degree: SH degree of the scene
     """
     staged = ("one-target", "descent-one-target", EQUAL, "slider-stages", "slider-even", "no-interpolation")
     even = plan.optimize.slider == "even"
-    asked = even and plan.editor.family not in (*EXTERNAL, *COSTLY_STRENGTHS)
+    equalized = even and plan.editor.family not in (*EXTERNAL, *COSTLY_STRENGTHS)
     idle = {
         *(() if stages > 1 else staged),
-        *(() if asked else (EQUAL,)),
+        *(() if equalized else (EQUAL,)),
         *(() if sh_degree > 0 else ("no-sh", "with-sh")),
         *(("no-interpolation", "no-sizing") if kind == "geometry" else ("no-groups",)),
     }
@@ -250,16 +250,16 @@ def differing_variants(plan: TrainOptions, kind: EditKind, stages: int, sh_degre
 
 
 def is_seeded(variant: Variant, plan: TrainOptions, kind: EditKind) -> bool:
-    """Whether a seed changes a variant: not where colors are solved for, all views at once."""
+    """Return True if a seed changes a variant; solving for colors uses all views at once and no seed."""
     optimization, network, _ = _resolve(variant, plan, kind, 1)
     return network is not None or optimization.solver == "descent"
 
 
 def choose_variants(variants: Sequence[Variant], only: str) -> list[Variant]:
-    """Those that `only` names, in their own order, or all.
+    """Return the variants named by `only`, in their own order, or all.
 
     Raises:
-        ProgdfError: a name that is none, or that makes no difference to this run; or no name but commas.
+        ProgdfError: a variant does not exist or makes no difference to this run, or `only` has no name.
     """
     names = {name.strip() for name in only.split(",") if name.strip()}
     known = {variant.name for variant in variants}
@@ -272,7 +272,7 @@ def choose_variants(variants: Sequence[Variant], only: str) -> list[Variant]:
 
 
 def _resolve(variant: Variant, own: TrainOptions, kind: EditKind, stages: int) -> Resolved:
-    """What a variant comes to; what nothing pays for is as good as none."""
+    """Return the options that determine a variant's result, with unused options set to fixed values."""
     plan = variant.plan(own)
     groups = GROUP_STEPS if plan.optimize.group_steps is None else plan.optimize.group_steps
     slider = resolve_slider(plan.optimize.slider, (1.0,) * stages)
@@ -285,7 +285,7 @@ def _resolve(variant: Variant, own: TrainOptions, kind: EditKind, stages: int) -
 
 
 def _all_patches(variant: Variant) -> Mapping[str, object]:
-    """A variant's own, and those of the one that it differs from."""
+    """Return a variant's patches together with those of the variant that it differs from."""
     if variant.of == variant.name:
         return variant.patches
     return {**_all_patches(_BY_NAME[variant.of]), **variant.patches}

@@ -1,1 +1,1 @@
-"""What a slider, a frame and an idle window cost."""
+"""Benchmarks of the viewer: sliders, frames and the idle window."""

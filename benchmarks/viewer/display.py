@@ -1,4 +1,4 @@
-"""The real window for benchmarks: `progdf view` in a process of its own on a virtual X display."""
+"""The real window for benchmarks: `progdf view` in a separate process on a virtual X display."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ _DISPLAYS = 50_000
 
 
 def missing_tools() -> str:
-    """What is needed for a window without a screen and is not installed; empty if nothing is."""
+    """Return the missing programs for a window without a screen; "" if all are installed."""
     return " and ".join(program for program in PROGRAMS if shutil.which(program) is None)
 
 
 @contextmanager
 def display(width: int = 1400, height: int = 900) -> Iterator[str]:
-    """The name of a virtual display, while it is there.
+    """Start a virtual display for the duration of the block and yield its name.
 
     Raises:
         ProgdfError: Xvfb or xdotool is not installed.
@@ -40,15 +40,15 @@ def display(width: int = 1400, height: int = 900) -> Iterator[str]:
             f"{missing_tools()} is not installed; install xvfb and xdotool to measure the window"
         )
     receive, send = os.pipe()
-    # a number of this process's own: servers that look for a free one at once may find the same
+    # a number per process: servers that search for a free one at the same time may find the same
     own = (f":{_FIRST_DISPLAY + os.getpid() % _DISPLAYS}", "-displayfd", str(send))
-    # -r: on a busy machine a key may stay down long enough to repeat
+    # -r turns key repeat off: on a busy machine a key may stay down long enough to repeat
     command = ["Xvfb", *own, "-screen", "0", f"{width}x{height}x24", "-nolisten", "tcp", "-r"]
     server = subprocess.Popen(command, pass_fds=[send], stderr=subprocess.DEVNULL)
     os.close(send)
     try:
-        with os.fdopen(receive, encoding="ascii") as told:
-            yield f":{told.readline().strip()}"
+        with os.fdopen(receive, encoding="ascii") as server_output:
+            yield f":{server_output.readline().strip()}"
     finally:
         server.terminate()
         server.wait()
@@ -56,72 +56,72 @@ def display(width: int = 1400, height: int = 900) -> Iterator[str]:
 
 @dataclass
 class Opened:
-    """A window that is open: its process and what it says of itself."""
+    """An open window: its process and the figures that it reports."""
 
     process: subprocess.Popen[str]  # runs `benchmarks.viewer.watched`
-    environment: dict[str, str]  # with the display
-    figures: dict[str, Any] = field(default_factory=dict)  # what was said so far (see `watched`)
-    name: str = ""
+    environment: dict[str, str]  # environment with the display
+    figures: dict[str, Any] = field(default_factory=dict)  # figures reported so far (see `watched`)
+    name: str = ""  # id of the window, set by `focus`
 
     def listen(self) -> None:
-        """Wait for the next line and take its figures.
+        """Wait for the next line and read its figures.
 
         Raises:
-            ProgdfError: the window closed without one.
+            ProgdfError: the window closed before.
         """
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
         if not line:
             assert self.process.stderr is not None
-            said = self.process.stderr.read().strip().splitlines() or ["it said nothing"]
-            raise ProgdfError(f"the window closed while it was measured: {said[-1]}; try `progdf view`")
+            errors = self.process.stderr.read().strip().splitlines() or ["it said nothing"]
+            raise ProgdfError(f"the window closed while it was measured: {errors[-1]}; try `progdf view`")
         self.figures |= json.loads(line)
 
     def xdotool(self, *arguments: object) -> str:
-        """One call of xdotool; what it prints."""
+        """Call xdotool and return its output."""
         run = subprocess.run(
             ["xdotool", *map(str, arguments)], env=self.environment, capture_output=True, text=True
         )
         return run.stdout.strip()
 
     def focus(self) -> None:
-        """Find the window and give it the keyboard."""
+        """Find the window and give it the keyboard focus."""
         end = time.monotonic() + PATIENCE_S
         while not self.name and time.monotonic() < end:
             self.name = self.xdotool("search", "--onlyvisible", "--name", ". ProGDF Studio").split("\n")[0]
         self.xdotool("windowfocus", self.name)
 
     def processor_s(self) -> float:
-        """Processor time that all its threads have used, seconds."""
+        """Return the processor time of all its threads, seconds."""
         if sys.platform == "win32":
             raise NotImplementedError("Xvfb is not for Windows")
         numbers = Path(f"/proc/{self.process.pid}/stat").read_text("utf-8").rpartition(")")[2].split()
         return (int(numbers[11]) + int(numbers[12])) / os.sysconf("SC_CLK_TCK")
 
     def memory_mb(self) -> float:
-        """Memory that it holds now (resident set), MB of 1e6 bytes."""
+        """Return its resident memory, MB of 1e6 bytes."""
         if sys.platform == "win32":
             raise NotImplementedError("Xvfb is not for Windows")
         pages = int(Path(f"/proc/{self.process.pid}/statm").read_text("ascii").split()[1])
         return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
     def close(self) -> None:
-        """End it as Ctrl+C in a terminal does, and take its last figures.
+        """End it like Ctrl+C in a terminal, and read its last figures.
 
         Raises:
-            ProgdfError: it does not end by itself.
+            ProgdfError: the process does not end in time.
         """
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGINT)
         try:
-            said, _ = self.process.communicate(timeout=PATIENCE_S)
+            output, _ = self.process.communicate(timeout=PATIENCE_S)
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.communicate()
             raise ProgdfError(
                 f"the window did not close within {PATIENCE_S:g} s; try `progdf view`"
             ) from None
-        for line in said.splitlines():
+        for line in output.splitlines():
             self.figures |= json.loads(line)
 
 
@@ -129,17 +129,17 @@ class Opened:
 def window(
     screen: str, arguments: Sequence[object], size: tuple[int, int], folder: Path, leave: bool = False
 ) -> Iterator[Opened]:
-    """`progdf view` with these arguments, opened now.
+    """Open `progdf view` for the duration of the block.
 
     Args:
-        screen: of `display`
-        arguments: of `progdf view`
-        size: of the window, pixels
-        folder: where it works and keeps its list of recent files
-        leave: close it by itself once the first picture is on the screen
+        screen: name of the display, from `display`
+        arguments: arguments of `progdf view`
+        size: window size, pixels
+        folder: working directory, also for its list of recent files
+        leave: close the window after the first picture is on the screen
 
     Raises:
-        ProgdfError: it closed before its first picture.
+        ProgdfError: the window closed before its first picture.
     """
     environment = os.environ | {"DISPLAY": screen, "XDG_STATE_HOME": str(folder)}
     environment.pop("WAYLAND_DISPLAY", None)

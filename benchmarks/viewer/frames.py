@@ -1,8 +1,11 @@
-"""`python -m benchmarks frames`: how long a frame takes while one orbits, how soon the first is there.
+"""The benchmark `frames`: frame time while orbiting, and time to the first picture.
 
-A mouse turns the picture of a whole window; every frame is drawn anew in its own depth order. The two ways
-to draw take turns at every step, in one process; what a picture costs that is coarse while it moves stands
-beside its error. The first picture is that of `progdf view` on a virtual display, from the process's start.
+A mouse orbits the picture of a whole window, and every frame is drawn in its own depth order. The two
+renderers take turns at every step, in one process. The time of a picture that is coarse while it moves is
+given beside its error. The first picture is that of `progdf view` on a virtual display, timed from the start
+of the process.
+
+    python -m benchmarks frames
 """
 
 from __future__ import annotations
@@ -42,55 +45,54 @@ STEPS = 20
 STARTS = 3
 KEPT = 4
 MIN_STEPS = 3
-TURN_S = 20.0
-STARTS_S = 30.0
-"""Slow frames and starts are as many as fit into so many seconds, and at least so many frames."""
+TURN_S = 20.0  # limit for all frames of one orbit, but at least `MIN_STEPS` frames are measured
+STARTS_S = 30.0  # limit for all measured starts
 
 MAX_COPIED = 1_000_000
-"""Gaussians beyond which the largest scene is not laid over itself."""
+"""Largest number of Gaussians for copies of the largest scene."""
 
 TURN_PX = 10.0
-"""How far the mouse goes from one frame to the next: three degrees."""
+"""Mouse movement from one frame to the next, pixels; it orbits by three degrees."""
 
 
 @dataclass(frozen=True)
 class Turning:
-    """One scene turned, drawn one way; an entry of `frames_ms`, `draws_ms` and `coarse_ms` per frame."""
+    """Times of orbiting one scene with one renderer; `frames_ms`, `draws_ms`, `coarse_ms` are per frame."""
 
     count: int  # Gaussians in the scene
     way: str  # a key of `WAYS`
     frames_ms: tuple[float, ...]  # from the mouse's event to finished pixels of the whole window
-    draws_ms: tuple[float, ...]  # the picture in it: sorted and drawn
-    # checked, wrong: pictures that were drawn afresh once more, and how many of them differ
+    draws_ms: tuple[float, ...]  # sorting and drawing of the picture
+    # checked, wrong: number of pictures that were drawn again from scratch, and of those that differ
     checked: int
     wrong: int
     opened_s: float  # from a file opened in the running window to its first picture
     coarse_ms: tuple[float, ...]  # whole frames again, coarse while they move
-    # processor_ms, coarse_processor_ms: medians of the same frames, of all cores together
+    # processor_ms, coarse_processor_ms: median processor time of the same frames, all cores together
     processor_ms: float
     coarse_processor_ms: float
-    coarse_db: float  # PSNR of the coarse pictures against the full ones, the worst
-    at_rest: int  # how far the picture is from the full one once the hand rests, of 255
+    coarse_db: float  # worst PSNR of the coarse pictures against the full ones
+    at_rest: int  # largest difference from the full picture after input stops, of 255
 
 
 @dataclass(frozen=True)
 class Start:
-    """`progdf view` in a process of its own; medians."""
+    """Start of `progdf view` in a separate process; medians."""
 
     first_s: float  # from the start of the process to the first picture on the screen
-    imports_s: float  # of that, until Python has read the program and the libraries
-    memory_mb: float  # the most that the process has held by then
+    imports_s: float  # part of `first_s` until the program and its libraries are imported
+    memory_mb: float  # peak memory until then
 
 
 def tables(scenes: Sequence[Path] = ()) -> list[Table]:
     """Measure, for docs/speed-and-error.md.
 
     Args:
-        scenes: .ply files that take the place of the bears; the largest is also laid over itself four times
-            unless that makes more than `MAX_COPIED` Gaussians
+        scenes: .ply files that replace the bears; the largest is also copied over itself four times unless
+            that makes more than `MAX_COPIED` Gaussians
 
     Raises:
-        ProgdfError: there is no OpenGL here, or a file is broken.
+        ProgdfError: OpenGL is not available, or a file is broken.
     """
     opened = scenes_of(scenes)
     if COPIES * len(opened[-1]) <= MAX_COPIED:
@@ -115,7 +117,7 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
 def measure_turning(
     ctx: moderngl.Context, path: Path, steps: int = STEPS, size: tuple[int, int] = SIZE
 ) -> list[Turning]:
-    """A scene's file opened and turned with the mouse, by every way in turns; then again, coarse."""
+    """Open a scene's file and orbit it with the mouse, with the renderers in turns; then again, coarse."""
     results = []
     with ExitStack() as held:
         nothing = documents.load(path).scene[:0]
@@ -129,7 +131,7 @@ def measure_turning(
             _open(mice[way], path, way)
             empty.release()
             first = mice[way].engine
-            opened_s[way] = _open(mice[way], path, way)  # a window has drawn before
+            opened_s[way] = _open(mice[way], path, way)  # now the window has drawn before
             first.release()
             held.callback(mice[way].engine.release)
         full = _turn(mice, steps)
@@ -162,35 +164,36 @@ def measure_turning(
 
 
 def measure_starts(path: Path, way: str, times: int = STARTS, size: tuple[int, int] = SIZE) -> Start:
-    """`progdf view --draw` of a scene's file, up to so many times, after one more that fills the caches.
+    """Start `progdf view --draw` on a scene's file up to `times` times, after one start that fills the
+    caches.
 
     Raises:
         ProgdfError: Xvfb or xdotool is not installed, or the window does not open.
     """
     figures: list[dict[str, float]] = []
-    wide = (size[0] + round(WIDTH_PX), size[1])
+    window_size = (size[0] + round(WIDTH_PX), size[1])
     with bench_display.display() as screen, tempfile.TemporaryDirectory() as folder:
         began = time.monotonic()
         while len(figures) < 2 or (len(figures) <= times and time.monotonic() - began < STARTS_S):
             arguments = [path, "--draw", way]
-            with bench_display.window(screen, arguments, wide, Path(folder), leave=True) as opened:
+            with bench_display.window(screen, arguments, window_size, Path(folder), leave=True) as opened:
                 figures.append(opened.figures)
     names = ("first_s", "imports_s", "memory_mb")
     return Start(*(statistics.median(figure[name] for figure in figures[1:]) for name in names))
 
 
 def frames_table(turnings: Sequence[Turning], starts: Sequence[Start], renderer: str) -> Table:
-    """Frames while turning, and first pictures. `starts`: one for each in their order, or none."""
+    """Make the table of frames while orbiting and of first pictures. `starts`: one per entry, or none."""
     rows = []
     for i, result in enumerate(turnings):
-        middle, late = np.percentile(result.frames_ms, (50, 95))
+        p50, p95 = np.percentile(result.frames_ms, (50, 95))
         start = starts[i] if starts else None
         rows.append(
             {
                 "Gaussians": group_digits(result.count),
                 "drawn by": WAYS[result.way],
                 Wall("sort and draw, ms"): f"{np.median(result.draws_ms):.1f}",
-                Wall("whole frame p50 / p95, ms"): f"**{middle:.1f}** / {late:.1f}",
+                Wall("whole frame p50 / p95, ms"): f"**{p50:.1f}** / {p95:.1f}",
                 "of the processor, ms": f"{result.processor_ms:.1f}",
                 "the same drawn afresh": f"{result.checked - result.wrong} of {result.checked}",
                 Wall("first picture of an opened file, s"): f"{result.opened_s:.2f}",
@@ -211,7 +214,7 @@ def frames_table(turnings: Sequence[Turning], starts: Sequence[Start], renderer:
 
 
 def coarse_table(turnings: Sequence[Turning], renderer: str) -> Table:
-    """What a picture costs that is coarse while it moves, beside its error moving and at rest."""
+    """Make the table of pictures that are coarse while they move, with their errors in motion and at rest."""
     rows = []
     for result in turnings:
         full = np.median(result.frames_ms)
@@ -241,7 +244,7 @@ def coarse_table(turnings: Sequence[Turning], renderer: str) -> Table:
 
 @dataclass
 class _Turned:
-    """Frames of one turn, and some of the states that were shown with their pictures."""
+    """Frames of one orbit, and some of the view states with their pictures."""
 
     frames_ms: list[float] = field(default_factory=list)
     draws_ms: list[float] = field(default_factory=list)
@@ -250,7 +253,7 @@ class _Turned:
 
 
 def _open(mouse: Mouse, path: Path, way: str) -> float:
-    """Open a file in the window as it is done when one is dropped there; seconds to its first picture."""
+    """Open a file as if dropped on the window; return the seconds to its first picture."""
     began = time.perf_counter()
     document = documents.load(path)
     mouse.engine = ViewEngine(mouse.main_view.context, document.scene, (), way)
@@ -261,7 +264,7 @@ def _open(mouse: Mouse, path: Path, way: str) -> float:
 
 
 def _turn(mice: Mapping[str, Mouse], steps: int) -> dict[str, _Turned]:
-    """Turn every mouse's picture, a frame each in turns, up to `steps` of them (see `TURN_S`)."""
+    """Orbit every mouse's picture, one frame each in turns, for up to `steps` frames (see `TURN_S`)."""
     turns = {way: _Turned() for way in mice}
     for mouse in mice.values():
         mouse.settle()
@@ -285,12 +288,12 @@ def _turn(mice: Mapping[str, Mouse], steps: int) -> dict[str, _Turned]:
 
 
 def affordable_steps(steps: int, one_s: float) -> int:
-    """How many of `steps` fit into `TURN_S` if one takes so many seconds; at least `MIN_STEPS` of them."""
+    """Return how many of `steps` fit into `TURN_S` at `one_s` seconds each, at least `MIN_STEPS`."""
     return min(steps, max(MIN_STEPS, int(TURN_S / max(one_s, 1e-9))))
 
 
 def _draw_anew(mouse: Mouse, view: ViewState) -> NDArray[np.uint8]:
-    """The picture of `view` in full, by an engine that has drawn nothing before."""
+    """Draw `view` in full with a new engine."""
     main_view = mouse.main_view
     engine = mouse.engine
     new = ViewEngine(main_view.context, engine.scene, (), engine.draws_with)
@@ -304,20 +307,20 @@ def _draw_anew(mouse: Mouse, view: ViewState) -> NDArray[np.uint8]:
 
 
 def _at_rest(mouse: Mouse) -> int:
-    """Largest difference from the full picture once the hand, still holding it, has come to rest."""
+    """Return the largest difference from the full picture after the mouse stops with its button held."""
     mouse.main_view.change(replace(mouse.main_view.work.view, dynamic_resolution="on"))
     mouse.grip_picture()
     mouse.turn(TURN_PX)
     if mouse.main_view.canvas.pixels == 1:
         raise AssertionError("the picture in motion was not coarse")
     mouse.wait_sharp()
-    rested = mouse.picture()
+    sharp = mouse.picture()
     view = mouse.main_view.work.view
     mouse.release()
     mouse.settle()
-    return int(np.abs(rested.astype(int) - _draw_anew(mouse, view)).max())
+    return int(np.abs(sharp.astype(int) - _draw_anew(mouse, view)).max())
 
 
 def _psnr(image: NDArray[np.uint8], target: NDArray[np.uint8]) -> float:
-    seen, wanted = (torch.from_numpy(pixels).double() / 255.0 for pixels in (image, target))
-    return psnr(seen, wanted)
+    drawn, expected = (torch.from_numpy(pixels).double() / 255.0 for pixels in (image, target))
+    return psnr(drawn, expected)

@@ -1,4 +1,4 @@
-"""A hand at the whole window without a window: mouse events in, finished pixels out, a clock beside them."""
+"""Simulated mouse for the whole viewer without a window: mouse events in, finished pixels and times out."""
 
 from __future__ import annotations
 
@@ -24,29 +24,29 @@ from viewer.render.engine import ViewEngine
 from viewer.state.view_state import ViewState
 
 SIZE = (640, 480)
-"""Of the picture; the panel stands beside it."""
+"""Size of the picture, pixels; the panel is beside it."""
 
-_STEP_S = 1.0 / 60.0
-_POLL_S = 0.02
-# the panel's layout at 1×
-_INSET = 12 + 10 + 7
-_FIRST = 131.0
+_FRAME_S = 1.0 / 60.0
+_POLL_INTERVAL_S = 0.02
+# the panel's layout at 1×, pixels
+_SLIDER_INSET = 12 + 10 + 7
+_FIRST_SLIDER_Y = 131.0
 
 
 def slider_at(width: float, layer: int, strength: float) -> tuple[float, float]:
-    """Where on a window of this width, at 1×, the handle of a folded layer stands at a strength."""
-    x = width - panel.WIDTH_PX + _INSET + strength * (panel.WIDTH_PX - 2 * _INSET)
-    return x, _FIRST + card.CARD_PX * layer
+    """Return the window position of a folded layer's slider handle at a strength, for a window at 1×."""
+    x = width - panel.WIDTH_PX + _SLIDER_INSET + strength * (panel.WIDTH_PX - 2 * _SLIDER_INSET)
+    return x, _FIRST_SLIDER_Y + card.CARD_PX * layer
 
 
 class Mouse:
-    """Moves the mouse on a main_view of its own and says how long each finished frame took.
+    """Simulated mouse on its own `MainView`, which measures each finished frame.
 
     Args:
-        ctx: the GL context that the window is drawn in
+        ctx: GL context of the window
         engine: draws the splats, with `scene` and `gdfs`
-        view: what is shown first
-        size: of the picture, pixels
+        view: first view state
+        size: picture size, pixels
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class Mouse:
     ) -> None:
         self.engine = engine
         self.size = size
-        self.processor_ms = 0.0  # that the last frame took of all cores together
+        self.processor_ms = 0.0  # processor time of the last frame, all cores together
         self.pixels = (size[0] + round(panel.WIDTH_PX), size[1])
         self._ctx = ctx
         self.main_view = MainView(ctx, engine, Document("scene.ply", scene, tuple(gdfs)).facts(), view)
@@ -78,12 +78,12 @@ class Mouse:
         self.main_view.close()
         self._screen.release()
 
-    def frame(self, seconds: float = _STEP_S, event: bool = True) -> float:
-        """Milliseconds from now to a frame's finished pixels.
+    def frame(self, seconds: float = _FRAME_S, event: bool = True) -> float:
+        """Draw a frame and return the milliseconds to its finished pixels.
 
         Args:
-            seconds: that have passed on the main view's clock since the last one
-            event: whether something has happened; else time alone brings this frame
+            seconds: time since the last frame on the main view's clock
+            event: True if an input event causes the frame, False if only time has passed
         """
         began = time.perf_counter()
         used = time.process_time()
@@ -95,15 +95,15 @@ class Mouse:
         return 1e3 * (time.perf_counter() - began)
 
     def wait_sharp(self, at_most_s: float = 20.0) -> None:
-        """Frames, the hand at rest on the button, until the picture is in full."""
+        """Draw frames without input, with the button held, until the picture is at full resolution."""
         began = time.perf_counter()
         self.frame(seconds=2 * REST_S)
         while self.main_view.canvas.pixels != 1 and time.perf_counter() - began < at_most_s:
-            time.sleep(_POLL_S)
-            self.frame(seconds=_POLL_S, event=False)
+            time.sleep(_POLL_INTERVAL_S)
+            self.frame(seconds=_POLL_INTERVAL_S, event=False)
 
     def wait_pyramid(self) -> Pyramid | None:
-        """What moving pictures are drawn of, once it is built; None where OpenGL has drawn none yet."""
+        """Wait for the LOD pyramid of moving pictures; None if OpenGL has not drawn one yet."""
         renderer = self.engine.renderer
         if isinstance(renderer, CpuRenderer):
             live = renderer._scene
@@ -114,19 +114,19 @@ class Mouse:
         return (live._pyramid or live.begin_pyramid()).result()
 
     def learn_detail(self) -> None:
-        """Turn the picture and let the hand rest on it, which tells how fine is fine enough."""
-        for _ in range(2):  # OpenGL begins its pyramid with the first picture in motion
+        """Orbit the picture and stop, so that the renderer calibrates its level of detail."""
+        for _ in range(2):  # OpenGL starts to build its pyramid at the first moving picture
             self.turn(1.0)
             self.wait_pyramid()
         self.wait_sharp()
 
     def settle(self) -> None:
-        """Frames until nothing is left to draw at once."""
+        """Draw frames until no further one is due immediately."""
         while self.main_view.next_frame_delay() == 0.0:
-            self.main_view.frame(self._screen, _STEP_S)
+            self.main_view.frame(self._screen, _FRAME_S)
 
     def move(self, x: float, y: float) -> float:
-        """Move the mouse there, window pixels; milliseconds to finished pixels."""
+        """Move the mouse to a window position in pixels; return the milliseconds to finished pixels."""
         self._io.add_mouse_pos_event(x, y)
         return self.frame()
 
@@ -139,21 +139,21 @@ class Mouse:
         return self.frame()
 
     def grip_slider(self, layer: int = 0) -> None:
-        """Take the handle of a layer's slider where it stands."""
+        """Press the mouse on the handle of a layer's slider."""
         self.move(*slider_at(self.pixels[0], layer, self.main_view.work.view.layers[layer].strength))
         self.press()
 
     def grip_picture(self) -> None:
-        """Take the picture by its middle, to turn it."""
+        """Press the mouse on the middle of the picture, to orbit it."""
         self.move(self.size[0] / 2, self.size[1] / 2)
-        self.frame(seconds=1.0)  # or it would be the second half of a double click
+        self.frame(seconds=1.0)  # avoids a double click
         self.press()
 
     def turn(self, pixels: float) -> float:
-        """Drag the picture sideways by so many pixels; milliseconds to finished pixels."""
+        """Drag the picture sideways by `pixels`; return the milliseconds to finished pixels."""
         x, y = self._io.mouse_pos
         return self.move(x + pixels, y)
 
     def picture(self) -> NDArray[np.uint8]:
-        """The splats as they are on screen. [H,W,3] uint8"""
+        """Return the picture on the screen, without the panel. [H,W,3] uint8"""
         return read_rgb(self._screen, self.pixels)[:, : self.size[0]]

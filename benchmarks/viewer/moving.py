@@ -1,7 +1,9 @@
-"""`python -m benchmarks moving`: what a hand feels that turns a scene, lets it rest, clicks and selects.
+"""The benchmark `moving`: response times of orbiting, stopping, clicking and selecting.
 
-Whole frames of a whole window, drawn by the CPU, from the mouse's event to finished pixels; beside them the
-error of the pictures in motion, which have fewer Gaussians and pixels.
+It times whole frames of a whole window, drawn by the CPU, from the mouse's event to finished pixels. It also
+measures the error of the pictures in motion, which have fewer Gaussians and pixels.
+
+    python -m benchmarks moving
 """
 
 from __future__ import annotations
@@ -43,40 +45,39 @@ MILLION = 1_000_000
 JUDGED = 6
 TRAINED = 24_000
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-_POLL_S = 0.02
-_SETTLE_S = 3.0
-_LONGEST_S = 20.0
-_UNDER_WAY_S = 0.2  # a training that goes on has its threads at work
+_POLL_INTERVAL_S = 0.02
+_SETTLE_S = 3.0  # duration of drawing after a click or a lasso
+_SHARP_TIMEOUT_S = 20.0  # limit of waiting for the full picture
+_TRAINING_RAMP_S = 0.2  # after this, the threads of a resumed training are busy
 
 
 @dataclass(frozen=True)
 class Moving:
-    """One scene in the hand; times in ms."""
+    """Response times of one scene, ms."""
 
     count: int  # Gaussians
-    turning: tuple[float, ...]  # frames while the picture turns
+    turning: tuple[float, ...]  # frames while orbiting
     beside: tuple[float, ...]  # the same while a training runs
-    sharp: float  # from the last of these to the picture in full, the hand at rest on the button
-    meanwhile: float  # the longest frame until then
-    processor: float  # that a turning frame takes of all cores, the median
-    build: float  # the pyramid of which moving pictures are drawn, s of the processor
-    memory: float  # its bytes over those of the scene that is drawn
-    # click, lasso: the longest frame of a click on the picture; of letting go of a lasso
-    click: float
-    lasso: float
-    full: float  # the picture in full
-    db: float  # PSNR of the pictures in motion to those in full, the worst
-    luminance: float  # difference of their means, the largest, of the full one's
+    sharp: float  # from the last frame in motion to the full picture, with the button held still
+    meanwhile: float  # longest frame until then
+    processor: float  # median processor time of a frame while orbiting, all cores
+    build: float  # processor time of building the LOD pyramid of moving pictures, s
+    memory: float  # bytes of the pyramid over those of the drawn scene
+    click: float  # longest frame of a click on the picture
+    lasso: float  # longest frame after releasing a lasso
+    full: float  # the full picture
+    db: float  # worst PSNR of pictures in motion against the full ones
+    luminance: float  # largest relative difference of their mean luminance
 
 
 def tables(scenes: Sequence[Path] = ()) -> list[Table]:
     """Measure, for docs/speed-and-error.md.
 
     Args:
-        scenes: .ply files that take the place of the bears; the largest is laid over itself up to a million
+        scenes: .ply files that replace the bears; the largest is copied over itself up to a million Gaussians
 
     Raises:
-        ProgdfError: there is no OpenGL here, or a file is broken.
+        ProgdfError: OpenGL is not available, or a file is broken.
     """
     opened = scenes_of(scenes)
     if len(opened[-1]) < MILLION:
@@ -97,14 +98,14 @@ def measure(
     steps: int = STEPS,
     size: tuple[int, int] = SIZE,
 ) -> Moving:
-    """A hand at a window that shows `scene`, always with pictures in motion; at times beside a training."""
+    """Measure a window that shows `scene`, with dynamic resolution on and at times beside a training."""
     engine = ViewEngine(ctx, scene, (), "cpu")
     view = ViewState(first_camera(scene), dynamic_resolution="on")
     with Mouse(ctx, engine, scene, (), view, size) as mouse:
         build, memory = _pyramid(mouse)
         mouse.grip_picture()
         mouse.turn(TURN_PX)
-        mouse.wait_sharp()  # the hand's first rest, which tells how fine is fine enough
+        mouse.wait_sharp()  # the first stop calibrates the level of detail
         turning = []
         processor = []
         beside = []
@@ -114,11 +115,11 @@ def measure(
             turning.append(mouse.turn(TURN_PX))
             processor.append(mouse.processor_ms)
             if step >= 0 and step % max(steps // JUDGED, 1) == 0:
-                error, apart = _compare(mouse, scene)
+                error, luminance_error = _compare(mouse, scene)
                 db = min(db, error)
-                luminance = max(luminance, apart, key=abs)
+                luminance = max(luminance, luminance_error, key=abs)
                 with training.runs():
-                    time.sleep(_UNDER_WAY_S)
+                    time.sleep(_TRAINING_RAMP_S)
                     mouse.turn(TURN_PX)
                     beside += [mouse.turn(TURN_PX) for _ in range(max(steps // JUDGED, 1))]
                 mouse.turn(TURN_PX)
@@ -133,22 +134,22 @@ def measure(
         mouse.main_view.change(replace(held, select=replace(held.select, tool="lasso")))
         _rest(mouse, time.perf_counter())
         middle = (size[0] / 2, size[1] / 2)
-        reach = 0.25 * min(size)
-        mouse.move(middle[0], middle[1] - reach)
+        radius = 0.25 * min(size)
+        mouse.move(middle[0], middle[1] - radius)
         mouse.press()
-        for turn in np.linspace(0.0, 2.0 * np.pi, 40):
-            mouse.move(middle[0] + reach * np.sin(turn), middle[1] - reach * np.cos(turn))
+        for angle in np.linspace(0.0, 2.0 * np.pi, 40):
+            mouse.move(middle[0] + radius * np.sin(angle), middle[1] - radius * np.cos(angle))
         lasso = max(mouse.release(), _rest(mouse, time.perf_counter()))
     engine.release()
-    turned = tuple(turning[WARM_UP:])
-    used = float(np.median(processor[WARM_UP:]))
+    turning_ms = tuple(turning[WARM_UP:])
+    processor_ms = float(np.median(processor[WARM_UP:]))
     return Moving(
         count=len(scene),
-        turning=turned,
+        turning=turning_ms,
         beside=tuple(beside),
         sharp=sharp,
         meanwhile=meanwhile,
-        processor=used,
+        processor=processor_ms,
         build=build,
         memory=memory,
         click=click,
@@ -160,7 +161,7 @@ def measure(
 
 
 def table(results: Sequence[Moving]) -> Table:
-    """A row a scene."""
+    """Make a table with one row per scene."""
     rows = []
     for result in results:
         alone, beside = (np.percentile(frames, (50, 95)) for frames in (result.turning, result.beside))
@@ -191,7 +192,7 @@ def table(results: Sequence[Moving]) -> Table:
 
 
 def _compare(mouse: Mouse, scene: Gaussians) -> tuple[float, float]:
-    """PSNR of the last picture to the one in full, and the relative difference of their luminance."""
+    """Compare the last picture with the full one; return PSNR and the relative difference of luminance."""
     view, (width, height) = mouse.main_view.work.view, mouse.size
     drawn = torch.from_numpy(mouse.engine.renderer.pixels().clip(0.0, 1.0)).movedim(2, 0)[None]
     moving = interpolate(drawn, (height, width), mode="bilinear")[0].movedim(0, 2).numpy()
@@ -201,8 +202,11 @@ def _compare(mouse: Mouse, scene: Gaussians) -> tuple[float, float]:
 
 
 def _pyramid(mouse: Mouse) -> tuple[float, float]:
-    """Build the pyramid once more, when the window's own stands: seconds of the processor, and its bytes over
-    those of the scene that is drawn."""
+    """Build the pyramid again after the window's own is finished.
+
+    Returns:
+        Processor seconds, and the pyramid's bytes over those of the drawn scene.
+    """
     mouse.wait_pyramid()
     assert isinstance(mouse.engine.renderer, CpuRenderer)
     drawn = mouse.engine.renderer._scene.drawn
@@ -210,19 +214,21 @@ def _pyramid(mouse: Mouse) -> tuple[float, float]:
     nodes = Pyramid(drawn).nodes
     seconds = time.process_time() - began
     arrays = nodes.means, nodes.shapes, nodes.order
-    held = sum(tensor.numel() * tensor.element_size() for tensor in drawn.tensors)
-    return seconds, sum(array.nbytes for array in arrays) / held
+    scene_bytes = sum(tensor.numel() * tensor.element_size() for tensor in drawn.tensors)
+    return seconds, sum(array.nbytes for array in arrays) / scene_bytes
 
 
 def _rest(mouse: Mouse, last: float, until_sharp: bool = False) -> float:
-    """Frames while the hand rests, as the window draws them; the longest one, ms.
+    """Draw the frames that the window draws without input; return the longest one, ms.
 
     Args:
-        last: when the last frame began
+        mouse: the simulated mouse
+        last: start of the last frame
+        until_sharp: stop at the first full picture
     """
     began = time.perf_counter()
     longest = 0.0
-    while time.perf_counter() - began < (_LONGEST_S if until_sharp else _SETTLE_S):
+    while time.perf_counter() - began < (_SHARP_TIMEOUT_S if until_sharp else _SETTLE_S):
         if until_sharp and mouse.main_view.canvas.pixels == 1:
             break
         if mouse.main_view.is_due():
@@ -230,5 +236,5 @@ def _rest(mouse: Mouse, last: float, until_sharp: bool = False) -> float:
             longest = max(longest, mouse.frame(seconds=now - last, event=not until_sharp))
             last = now
         wait = mouse.main_view.next_frame_delay()
-        time.sleep(_POLL_S if wait is None else min(wait, _POLL_S))
+        time.sleep(_POLL_INTERVAL_S if wait is None else min(wait, _POLL_INTERVAL_S))
     return longest

@@ -1,7 +1,9 @@
-"""`python -m benchmarks popping`: films of the moving picture beside those of the sharp one.
+"""The benchmark `popping`: films of the moving picture compared with films of the sharp one.
 
-What changes from one frame to the next and does not in the sharp film is popping: detail that comes and
-goes.
+Changes from one frame to the next that the sharp film does not have are popping: detail that appears and
+disappears.
+
+    python -m benchmarks popping
 """
 
 from __future__ import annotations
@@ -28,13 +30,12 @@ from viewer.render.dynamic_resolution import BUDGETS, COARSE, drawn_size
 
 from .scenes import copies, scenes_of
 
-SIZE = (980, 800)
+SIZE = (980, 800)  # pixels
 FRAMES = 40
-RESTS = 4
-BLOCK = 16
-TURN = 1.0
-STEP = 0.004
-"""Degrees of a frame, and what it goes ahead, of the scene's radius."""
+RESTS = 4  # stops before the film, which calibrate the level of detail
+BLOCK = 16  # side of a block, pixels
+TURN = 1.0  # rotation per frame, degrees
+STEP = 0.004  # movement per frame, share of the scene's radius
 
 WHITE = (1.0, 1.0, 1.0)
 NO_ORDER = np.zeros(0, np.uint32)
@@ -42,24 +43,24 @@ NO_ORDER = np.zeros(0, np.uint32)
 
 @dataclass(frozen=True)
 class Film:
-    """A path through a scene; differences are means of a picture of 0..255."""
+    """Measurements of a path through a scene; differences are means of pictures of 0 to 255."""
 
     title: str
     count: int  # Gaussians of the scene
-    limit: float  # of what a node may lose, pixels²
-    sharp: float  # from frame to frame of the sharp film
-    moving: float  # of the moving one
-    apart: float  # of what changes in the one and of what changes in the other
-    blocks: float  # the same of means of 16×16 pixels, the 99th percentile of all blocks and frames
-    halved: float  # that of pictures of all Gaussians in as few pixels
-    db: float  # PSNR of the moving film to the sharp one, the worst frame
+    limit: float  # largest error of a drawn node, pixels²
+    sharp: float  # change from frame to frame of the sharp film
+    moving: float  # change from frame to frame of the moving film
+    apart: float  # difference between these changes
+    blocks: float  # the same for means of 16×16 pixels, 99th percentile of all blocks and frames
+    halved: float  # `blocks` for pictures of all Gaussians with the same small number of pixels
+    db: float  # PSNR of the moving film against the sharp one, worst frame
 
 
 def tables(scenes: Sequence[Path] = ()) -> list[Table]:
     """Make the films, for docs/speed-and-error.md.
 
     Args:
-        scenes: .ply files that take the place of the bears
+        scenes: .ply files that replace the bears
     """
     opened = scenes_of(scenes)
     inside = room(200_000).gaussians
@@ -70,20 +71,20 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
 
 
 def turning(camera: ViewCamera, scene: Gaussians) -> Iterator[ViewCamera]:
-    """Around what is looked at."""
+    """Yield cameras that orbit the pivot."""
     for frame in range(FRAMES):
         yield replace(camera, azimuth=camera.azimuth + TURN * frame)
 
 
 def spinning(camera: ViewCamera, scene: Gaussians) -> Iterator[ViewCamera]:
-    """On the spot."""
+    """Yield cameras that rotate at a fixed position."""
     for turned in turning(camera, scene):
-        off = add_scaled(eye(camera), (-1.0, eye(turned)))
-        yield replace(turned, pivot=add_scaled(turned.pivot, (1.0, off)))
+        shift = add_scaled(eye(camera), (-1.0, eye(turned)))
+        yield replace(turned, pivot=add_scaled(turned.pivot, (1.0, shift)))
 
 
 def walking(camera: ViewCamera, scene: Gaussians) -> Iterator[ViewCamera]:
-    """Ahead, looking to the side by and by."""
+    """Yield cameras that move ahead and gradually turn to the side."""
     step = -STEP * bounds_of(scene).radius
     for frame, turned in enumerate(spinning(camera, scene)):
         yield replace(turned, pivot=add_scaled(turned.pivot, (step * frame, axes(camera).back)))
@@ -91,7 +92,7 @@ def walking(camera: ViewCamera, scene: Gaussians) -> Iterator[ViewCamera]:
 
 @one_thread()
 def film(title: str, scene: Gaussians, views: Sequence[ViewCamera], size: tuple[int, int] = SIZE) -> Film:
-    """Draw a film three times; the moving picture is as fine as it is found to need to be in this scene."""
+    """Draw a film three times; the moving picture has the level of detail calibrated in this scene."""
     renderer, near = CpuRenderer(), near_plane(bounds_of(scene).radius)
     renderer.upload(scene)
     live = renderer._scene
@@ -116,7 +117,7 @@ def film(title: str, scene: Gaussians, views: Sequence[ViewCamera], size: tuple[
     halved = []
     worst = 0.0
     for view in views:
-        # whatever frames take
+        # fixed, independent of the frame time
         live._budget = BUDGETS[2]
         live._finest = limit
         pyramid.limit = limit
@@ -129,7 +130,7 @@ def film(title: str, scene: Gaussians, views: Sequence[ViewCamera], size: tuple[
             blocks.append(_blocks(moved - full))
             halved.append(_blocks(half - full))
         last = frames
-    most, least = (float(np.percentile(np.abs(parts), 99)) for parts in (blocks, halved))
+    blocks_p99, halved_p99 = (float(np.percentile(np.abs(parts), 99)) for parts in (blocks, halved))
     sharp, moving, apart = np.mean(means, axis=0).tolist()
     db = 10.0 * math.log10(255.0**2 / worst)
     return Film(
@@ -139,14 +140,14 @@ def film(title: str, scene: Gaussians, views: Sequence[ViewCamera], size: tuple[
         sharp=sharp,
         moving=moving,
         apart=apart,
-        blocks=most,
-        halved=least,
+        blocks=blocks_p99,
+        halved=halved_p99,
         db=db,
     )
 
 
 def _blocks(change: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The means of blocks. [H,W,3] -> [rows,columns]"""
+    """Return the means of blocks. [H,W,3] -> [rows,columns]"""
     rows = change.shape[0] // BLOCK
     columns = change.shape[1] // BLOCK
     whole = change[: rows * BLOCK, : columns * BLOCK].mean(2)
@@ -155,7 +156,7 @@ def _blocks(change: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def table(films: Sequence[Film]) -> Table:
-    """A row a film."""
+    """Make a table with one row per film."""
     return Table.of(
         "popping",
         f"Films of moving pictures, {SIZE[0]}×{SIZE[1]}: what changes from frame to frame, of 255",

@@ -1,4 +1,4 @@
-"""Scenes and edits for the viewer's benchmarks, made on the spot: anybody can repeat them."""
+"""Generated scenes and edits for the viewer's benchmarks, so that anybody can repeat them."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from progdf.region import Region
 from viewer.camera.view_camera import bounds_of
 
 SIZES = (31_000, 125_000)
-"""Gaussians of the bears that are drawn where no scenes are given."""
+"""Numbers of Gaussians of the default bears."""
 
 COPIES = 4
-"""How many times the largest scene is laid over itself for one that is larger still."""
+"""Copies of the largest scene that make up an even larger one."""
 
 WAYS = {"gl": "OpenGL", "cpu": "CPU"}
-"""Of drawing, of `engine.DRAWS`, and what tables call them."""
+"""Renderers, from `engine.DRAWS`, with their names in tables."""
 
 RANKS = 3
-# of the scene's radius
-_SHIFT = 0.003
-_JITTER = 0.002
+# share of the scene's radius
+_EDIT_SHIFT = 0.003
+_COPY_JITTER = 0.002
 
 
 def scenes_of(paths: Sequence[Path] = ()) -> list[Gaussians]:
-    """The scenes of these .ply files, else bears, the smallest first.
+    """Load the scenes of these .ply files, or make bears; the smallest comes first.
 
     Raises:
         ProgdfError: a file is missing or broken.
@@ -46,28 +46,32 @@ def scenes_of(paths: Sequence[Path] = ()) -> list[Gaussians]:
 
 
 def copies(scene: Gaussians, times: int = COPIES) -> Gaussians:
-    """The scene laid over itself, every copy's centers off by a normal 0.2 % of the radius: as dense as a
-    scene that was trained with `times` as many Gaussians."""
+    """Copy the scene over itself, as dense as a scene trained with `times` as many Gaussians.
+
+    The centers of every copy are shifted by normal noise of 0.2 % of the radius.
+    """
     rng = torch.Generator().manual_seed(0)
     repeated: dict[str, Any] = {name: torch.cat([getattr(scene, name)] * times) for name in ATTRIBUTES}
     many = replace(scene, **repeated)
     off = torch.randn(many.means.shape, generator=rng)
     off[: len(scene)] = 0.0
-    return replace(many, means=many.means + _JITTER * bounds_of(scene).radius * off)
+    return replace(many, means=many.means + _COPY_JITTER * bounds_of(scene).radius * off)
 
 
 def edit_for(scene: Gaussians, members: int, moves: bool) -> Gdf:
-    """A made-up edit of the `members` Gaussians nearest to the scene's center, as large as a trained one:
-    in int8, three bases beside the full offset.
+    """Make a random edit of the Gaussians nearest to the scene's center, with the size of a trained one.
+
+    It is stored in int8, with three bases beside the full offset.
 
     Args:
-        members: how many; all of a scene that has fewer
-        moves: whether it moves and turns them too; else it only recolors them
+        scene: the original
+        members: number of Gaussians; all if the scene has fewer
+        moves: True also moves, rotates and scales them, False only recolors them
     """
     rng = torch.Generator().manual_seed(0)
     region = _nearest(scene, members)
-    far = _SHIFT * bounds_of(scene).radius
-    spread = {"means": far, "log_scales": 0.01, "quats": 0.01, "sh0": 0.5} if moves else {"sh0": 0.5}
+    distance = _EDIT_SHIFT * bounds_of(scene).radius
+    spread = {"means": distance, "log_scales": 0.01, "quats": 0.01, "sh0": 0.5} if moves else {"sh0": 0.5}
     nodes = torch.linspace(0, 1, 9)
     bumps = [torch.sin(math.pi * (k + 1) * nodes) for k in range(RANKS)]
     coefficients = torch.stack([nodes, *bumps], dim=1)

@@ -1,4 +1,4 @@
-"""`python -m benchmarks select`: what a selection by hand takes, on scenes up to a million."""
+"""The benchmark `select`: time of manual selections in scenes of up to a million Gaussians."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from viewer.state import selection
 
 from .scenes import copies, scenes_of
 
-SIZE = (980, 800)
-TIMES = 5
+SIZE = (980, 800)  # pixels
+TIMES = 5  # repetitions, of which the median counts
 CORNERS = 400
-"""Of the lasso: as many as a hand leaves in a few seconds."""
+"""Corners of the lasso, as many as a user draws in a few seconds."""
 
 
 def tables(scenes: Sequence[Path] = ()) -> list[Table]:
     """Measure, for docs/benchmarks.md.
 
     Args:
-        scenes: .ply files that take the place of the bears
+        scenes: .ply files that replace the bears
 
     Raises:
         ProgdfError: a file is missing or broken.
@@ -44,21 +44,21 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
 
 
 def measure(scene: Gaussians) -> dict[str, float]:
-    """Milliseconds of the processor that each thing takes."""
+    """Measure the processor time of each operation, ms."""
     camera = to_camera(first_camera(scene), *SIZE)
-    turn = np.linspace(0.0, 2.0 * np.pi, CORNERS, endpoint=False)
-    reach = 300.0 * (1.0 + 0.2 * np.sin(7.0 * turn))
-    outline = np.stack([SIZE[0] / 2 + reach * np.cos(turn), SIZE[1] / 2 + reach * np.sin(turn)], axis=1)
+    angle = np.linspace(0.0, 2.0 * np.pi, CORNERS, endpoint=False)
+    radius = 300.0 * (1.0 + 0.2 * np.sin(7.0 * angle))
+    outline = np.stack([SIZE[0] / 2 + radius * np.cos(angle), SIZE[1] / 2 + radius * np.sin(angle)], axis=1)
     centers = shapes.project_centers(scene, camera)
     ball = shapes.inside_ball(scene, scene.means.median(0).values.numpy(), 0.3)
     colors, near = shapes.base_colors(scene), Neighborhood(scene)
     seed = int(np.flatnonzero(ball)[0])
 
-    ahead = shapes.Surface(scene, camera)
-    ahead.prepare()
+    prepared = shapes.Surface(scene, camera)
+    prepared.prepare()
 
     def lasso(through: bool, surface: shapes.Surface | None = None) -> bytes:
-        """From the mouse's release to the state: seen, enclosed, in front, packed."""
+        """Compute a selection from the mouse release to the packed state."""
         surface = surface or shapes.Surface(scene, camera)
         mask = shapes.inside_polygon(surface.centers.points, outline)
         return selection.pack(mask if through else surface.in_front(mask))
@@ -66,7 +66,7 @@ def measure(scene: Gaussians) -> dict[str, float]:
     works: dict[str, Callable[[], object]] = {
         "lasso, through": lambda: lasso(True),
         "lasso, front surface, at once": lambda: lasso(False),
-        "lasso, front surface, looked at ahead": lambda: lasso(False, ahead),
+        "lasso, front surface, looked at ahead": lambda: lasso(False, prepared),
         "a step of the brush": lambda: shapes.inside_stroke(centers.points, outline[:2], 40.0),
         "colors": lambda: shapes.base_colors(scene),
         "flood": lambda: grow_along_surface(near, colors, np.array([seed]), colors[seed], 0.08),

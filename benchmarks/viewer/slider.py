@@ -1,7 +1,10 @@
-"""`python -m benchmarks viewer`: milliseconds from a slider's event to finished pixels, and where they go.
+"""The benchmark `viewer`: milliseconds from a slider's event to finished pixels, by part.
 
-A hand drags the slider of a whole window (panel and picture) drawn without a screen; the ways of drawing take
-turns at every step, in one process. The scenes are bears, so that anybody can repeat it, or --scenes.
+Simulated input drags the slider of a whole window (panel and picture) drawn without a screen. The renderers
+take turns at every step, in one process. The scenes are bears, so that the benchmark can be repeated, or
+--scenes.
+
+    python -m benchmarks viewer
 """
 
 from __future__ import annotations
@@ -40,8 +43,8 @@ PARTS = "compose", "upload", "sort", "draw"
 class SliderCase:
     """An edit of a scene."""
 
-    members: int  # Gaussians that it changes
-    moves: bool  # whether it moves them too, so that they have to be sorted anew
+    members: int  # number of Gaussians that it changes
+    moves: bool  # True if it also moves them, so that they must be sorted again
 
     @property
     def title(self) -> str:
@@ -58,19 +61,19 @@ CASES = (
 
 @dataclass(frozen=True)
 class SliderTimes:
-    """What one way took, an entry per slider step, and how far its picture is from the CPU engine's."""
+    """Times of one renderer, an entry per slider step, and its picture's error against the CPU engine."""
 
     case: SliderCase
     count: int  # Gaussians in the scene
     way: str  # a key of `WAYS`
     events_ms: tuple[float, ...]  # from the mouse's event to finished pixels
     processor_ms: tuple[float, ...]  # the same on all cores together
-    parts: tuple[FrameTimings, ...]  # what of that the engine took
+    parts: tuple[FrameTimings, ...]  # the engine's part of these times
     psnr_db: float  # against `progdf.render`, the worst of three strengths
 
     @property
     def rest_ms(self) -> float:
-        """Panel, events and the way to the screen: what the engine did not take; the median."""
+        """Median time outside the engine: panel, events and the transfer to the screen, ms."""
         pairs = zip(self.events_ms, self.parts, strict=True)
         return float(np.median([event - part.total_ms for event, part in pairs]))
 
@@ -79,10 +82,10 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
     """Measure, for docs/speed-and-error.md.
 
     Args:
-        scenes: .ply files that take the place of the bears
+        scenes: .ply files that replace the bears
 
     Raises:
-        ProgdfError: there is no OpenGL here to draw a window with, or a file is broken.
+        ProgdfError: OpenGL is not available, or a file is broken.
     """
     opened = scenes_of(scenes)
     ctx = headless_context()
@@ -103,7 +106,7 @@ def rows(
     steps: int = STEPS,
     size: tuple[int, int] = SIZE,
 ) -> list[SliderTimes]:
-    """One edit, by every way, a step each in turns."""
+    """Measure one edit with every renderer, in turns at each step."""
     gdf = edit_for(scene, case.members, case.moves)
     case = replace(case, members=len(gdf.region))
     layers = (LayerState(0, "edit", 0.05),)
@@ -139,7 +142,7 @@ def rows(
 
 
 def table(results: Sequence[SliderTimes], renderer: str) -> Table:
-    """The measurements, named after what OpenGL was drawn by."""
+    """Make the table of measurements; `renderer` names the OpenGL driver."""
     note = (
         f"OpenGL by {renderer}. A hand drags the slider of a window without a screen; wall clock, the GPU "
         "waited for, the parts are medians; processor: of all cores. The CPU rasterizer sorts as it draws."
@@ -149,7 +152,7 @@ def table(results: Sequence[SliderTimes], renderer: str) -> Table:
 
 
 def _cells(result: SliderTimes) -> dict[str, str]:
-    middle, late = np.percentile(result.events_ms, (50, 95))
+    p50, p95 = np.percentile(result.events_ms, (50, 95))
     parts = {name: np.median([getattr(part, f"{name}_ms") for part in result.parts]) for name in PARTS}
     return {
         "Gaussians": group_digits(result.count),
@@ -158,22 +161,22 @@ def _cells(result: SliderTimes) -> dict[str, str]:
         "drawn by": WAYS[result.way],
         **{Wall(name): f"{part:.1f}" for name, part in parts.items()},
         Wall("panel, screen"): f"{result.rest_ms:.1f}",
-        Wall("in all p50 / p95"): f"**{middle:.1f}** / {late:.1f}",
+        Wall("in all p50 / p95"): f"**{p50:.1f}** / {p95:.1f}",
         "processor": f"{np.median(result.processor_ms):.1f}",
         "PSNR to the CPU engine, dB": "exact" if math.isinf(result.psnr_db) else f"{result.psnr_db:.0f}",
     }
 
 
 def _fitting(scenes: Sequence[Gaussians], members: int) -> Gaussians:
-    """The smallest scene with so many Gaussians, or nearly; else the largest."""
+    """Return the smallest scene with at least 90 % of `members` Gaussians, else the largest."""
     return next((scene for scene in scenes if len(scene) >= 0.9 * members), scenes[-1])
 
 
 def _psnr(engine: ViewEngine, view: ViewState, size: tuple[int, int]) -> float:
     worst = math.inf
     for strength in (0.0, 0.5, 1.0):
-        slid = replace(view, layers=(LayerState(0, "edit", strength),))
-        image = engine.image(slid, size)
-        target = render(engine.gaussians(slid), to_camera(slid.camera, *size)).image
+        moved = replace(view, layers=(LayerState(0, "edit", strength),))
+        image = engine.image(moved, size)
+        target = render(engine.gaussians(moved), to_camera(moved.camera, *size)).image
         worst = min(worst, psnr(torch.from_numpy(image), target))
     return worst

@@ -1,4 +1,4 @@
-"""A training such as the window starts, which a benchmark lets go on and halts."""
+"""A training process as the window starts it, which a benchmark can pause and resume."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from progdf.formats.ply import save_ply
 from progdf.gaussians import Gaussians
 from viewer.jobs.child import Child
 
-_STARTED = "optimize "
-_POLL_S = 0.2
-_LONGEST_S = 600.0  # a busy machine takes minutes to import what a training needs
+_STARTED = "optimize "  # in the log once the first steps are done
+_POLL_INTERVAL_S = 0.2
+_START_TIMEOUT_S = 600.0  # a busy machine takes minutes to import the libraries
 
 
 class Training:
-    """The window's own child, which trains all of a small scene; halted but while it `runs`.
+    """The window's training process on a whole small scene, paused except inside `runs`.
 
-    Not for Windows, where no process is halted.
+    On Windows it is never paused.
     """
 
     def __init__(self, child: Child) -> None:
@@ -33,7 +33,7 @@ class Training:
 
     @contextmanager
     def runs(self) -> Iterator[None]:
-        """Let it go on meanwhile."""
+        """Resume the training for the duration of the block."""
         self._send("SIGCONT")
         try:
             yield
@@ -50,26 +50,26 @@ def begin_training(scene: Gaussians, *effort: str) -> Iterator[Training]:
     """Start a training of `scene`, and yield it at its first steps.
 
     Args:
-        scene: trained in whole
+        scene: the scene, which is the region too
         effort: further options of `progdf train`, such as `"--views", "5"`
 
     Raises:
-        ProgdfError: it does not.
+        ProgdfError: the training does not start.
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         save_ply(folder / "scene.ply", scene)
         words = ["train", str(folder / "scene.ply"), "--out", str(folder / "run"), "--region", "all"]
-        # a descent, which does not end before its steps do
+        # gradient descent, which runs through all of its steps
         words += ["--editor", "stripes:#20a040", "--preset", "paper", "--field", "auto", "--steps", "100000"]
         words += effort
         child = Child(words, folder / "log")
         try:
             began = time.monotonic()
             while _STARTED not in child.log.read_text("utf-8"):
-                if child.status is not None or time.monotonic() - began > _LONGEST_S:
+                if child.status is not None or time.monotonic() - began > _START_TIMEOUT_S:
                     raise ProgdfError(f"the training beside did not start: {child.error()}")
-                time.sleep(_POLL_S)
+                time.sleep(_POLL_INTERVAL_S)
             yield Training(child)
         finally:
             child.kill()

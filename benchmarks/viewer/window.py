@@ -1,7 +1,10 @@
-"""`python -m benchmarks window`: what the window costs while nobody touches it, and whether dragging leaks.
+"""The benchmark `window`: load of the idle window, and memory leaks while a slider is dragged.
 
-`progdf view` runs in a process of its own on a virtual display; xdotool is the hand. What is measured is what
-the system says of that process: its processor time over the wall's, its resident memory once a second.
+`progdf view` runs in a separate process on a virtual display, with input from xdotool. The measurements come
+from the
+system: processor time over wall time, and resident memory after each back-and-forth drag.
+
+    python -m benchmarks window
 """
 
 from __future__ import annotations
@@ -30,33 +33,36 @@ IDLE_S = 10.0
 DRAG_S = 60.0
 MEMBERS = 3_000
 SETTLED_S = 1.5
-_LONGEST_S = 60.0
-_SWEEP = 40
-"""Steps of the mouse from one end of the slider to the other; one about every 1/60 s."""
+_MAX_WAIT_S = 60.0  # for the window to become idle
+_SWEEP_STEPS = 40
+"""Mouse steps of one sweep, one about every 1/60 s."""
 
 
 @dataclass(frozen=True)
 class Idle:
-    """A window that nobody touches."""
+    """Load of an idle window."""
 
-    state: str  # where the mouse is
-    processor_s: float  # time that the process has used, all threads, seconds
-    wall_s: float  # in so many seconds
+    state: str  # position of the mouse
+    processor_s: float  # processor time of all threads, seconds
+    wall_s: float  # duration of the measurement, seconds
 
 
 @dataclass(frozen=True)
 class Dragging:
-    """A slider dragged to and fro."""
+    """Measurements of a slider dragged back and forth."""
 
-    seconds: tuple[float, ...]  # when each sample was taken, since the dragging began
-    memory_mb: tuple[float, ...]  # resident memory, one entry a sample
-    pictures: int  # that were drawn
+    seconds: tuple[float, ...]  # time of each sample since the dragging began
+    memory_mb: tuple[float, ...]  # resident memory, one entry per sample
+    pictures: int  # number of pictures drawn
     slider_ms: tuple[float, ...]  # of the last 120 slider events to finished pixels
 
     @property
     def slope(self) -> float:
-        """MB a minute over the second half, since what fills at the start is no leak: the median of the
-        slopes between all samples, which one odd sample does not move."""
+        """Growth of memory over the second half, MB per minute.
+
+        Memory that fills up in the first half is no leak. The value is the median of the slopes between all
+        samples, so a single outlier does not change it.
+        """
         half = len(self.seconds) // 2
         times = np.array(self.seconds[half:])
         memory = np.array(self.memory_mb[half:])
@@ -69,8 +75,8 @@ def tables(scenes: Sequence[Path] = (), seconds: float = DRAG_S) -> list[Table]:
     """Measure, for docs/benchmarks.md.
 
     Args:
-        scenes: .ply files of which the smallest takes the place of the bear
-        seconds: how long the slider is dragged
+        scenes: .ply files, of which the smallest replaces the bear
+        seconds: duration of the dragging
 
     Raises:
         ProgdfError: Xvfb or xdotool is not installed, or the window does not open.
@@ -80,20 +86,20 @@ def tables(scenes: Sequence[Path] = (), seconds: float = DRAG_S) -> list[Table]:
 
 
 def idle(scene: Gaussians, wall_s: float = IDLE_S) -> list[Idle]:
-    """An edit half way and the mouse at rest over the picture, then over the edit's slider in the panel."""
+    """Measure an edit at strength 0.5 with the mouse still over the picture, then over the edit's slider."""
     measured = []
     with _window(scene) as opened:
-        for state, place in (
+        for state, position in (
             ("the mouse over the picture", (400.0, 400.0)),
             ("the mouse over a slider", slider_at(SIZE[0], 0, 0.5)),
         ):
-            opened.xdotool("mousemove", "--window", opened.name, *map(round, place))
+            opened.xdotool("mousemove", "--window", opened.name, *map(round, position))
             measured.append(_rested(opened, state, wall_s))
     return measured
 
 
 def dragged(scene: Gaussians, seconds: float = DRAG_S) -> Dragging:
-    """The slider of an edit dragged to and fro without a pause, let go at every turn, for so long."""
+    """Drag the slider of an edit back and forth without a pause, with a release at every reversal."""
     moments: list[float] = []
     memory: list[float] = []
     with _window(scene) as opened:
@@ -109,15 +115,15 @@ def dragged(scene: Gaussians, seconds: float = DRAG_S) -> Dragging:
 
 
 def table(idles: Sequence[Idle], dragging: Dragging, count: int) -> Table:
-    """Idle states, then the dragging."""
-    middle, late = np.percentile(dragging.slider_ms, (50, 95)) if dragging.slider_ms else (0.0, 0.0)
+    """Make the table of the idle states and the dragging."""
+    p50, p95 = np.percentile(dragging.slider_ms, (50, 95)) if dragging.slider_ms else (0.0, 0.0)
     share = [f"{100 * one.processor_s / one.wall_s:.1f} % of one core" for one in idles]
     rows = [(f"idle: {one.state}", text, "-", "-") for one, text in zip(idles, share, strict=True)]
     minutes = dragging.seconds[-1] / 60
     rows.append(
         (
             f"a slider dragged for {minutes:.1f} min, {dragging.pictures} pictures",
-            f"{middle:.0f} / {late:.0f} ms from event to pixels, p50 / p95",
+            f"{p50:.0f} / {p95:.0f} ms from event to pixels, p50 / p95",
             f"{dragging.memory_mb[0]:.0f} → {dragging.memory_mb[-1]:.0f}",
             f"{dragging.slope:+.2f}",
         )
@@ -134,15 +140,15 @@ def table(idles: Sequence[Idle], dragging: Dragging, count: int) -> Table:
 
 @contextmanager
 def _window(scene: Gaussians) -> Iterator[Opened]:
-    """The real window on `scene`, with an edit of `MEMBERS` half way and the keyboard on it."""
+    """Open the real window on `scene`, with an edit of `MEMBERS` at strength 0.5 and the keyboard focus."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         save_ply(folder / "scene.ply", scene)
         save_gdf(folder / "edit.gdf", edit_for(scene, MEMBERS, moves=True))
         arguments = [folder / "scene.ply", folder / "edit.gdf", "--set", "edit=0.5"]
-        room = (SIZE[0] + 100, SIZE[1] + 100)
+        screen_size = (SIZE[0] + 100, SIZE[1] + 100)
         with (
-            bench_display.display(*room) as screen,
+            bench_display.display(*screen_size) as screen,
             bench_display.window(screen, arguments, SIZE, folder) as opened,
         ):
             opened.focus()
@@ -150,8 +156,8 @@ def _window(scene: Gaussians) -> Iterator[Opened]:
 
 
 def _rested(opened: Opened, state: str, wall_s: float) -> Idle:
-    """Wait until it has come to rest, then watch it."""
-    end = time.monotonic() + _LONGEST_S
+    """Wait until the window is idle, then measure its load."""
+    end = time.monotonic() + _MAX_WAIT_S
     before = -1.0
     while (now := opened.processor_s()) != before and time.monotonic() < end:
         before = now
@@ -163,10 +169,10 @@ def _rested(opened: Opened, state: str, wall_s: float) -> Idle:
 
 
 def _sweep(opened: Opened, start: float, end: float) -> list[object]:
-    """Arguments of xdotool: the handle taken at a strength, dragged to another and let go."""
+    """Return arguments of xdotool that press the handle at a strength, drag it to another and release it."""
     calls: list[object] = []
-    for step in range(_SWEEP + 1):
-        x, y = slider_at(SIZE[0], 0, start + (end - start) * step / _SWEEP)
+    for step in range(_SWEEP_STEPS + 1):
+        x, y = slider_at(SIZE[0], 0, start + (end - start) * step / _SWEEP_STEPS)
         calls += ["mousemove", "--window", opened.name, round(x), round(y), "sleep", 1 / 60]
         calls += ["mousedown", 1] if step == 0 else []
     return [*calls, "mouseup", 1, "sleep", 1 / 60]
