@@ -1,1 +1,1 @@
-"""The offline trainer: edits a region, records the trajectory, fits the field, writes a .gdf file."""
+"""Offline trainer: edit a region, record the trajectory, fit the field, write a .gdf file."""

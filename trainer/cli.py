@@ -1,4 +1,4 @@
-"""The command lines of the trainer's commands, made from dataclasses."""
+"""Entry points of the trainer's commands, with options made from dataclasses."""
 
 from __future__ import annotations
 
@@ -19,16 +19,17 @@ from .options import (
 
 
 def train(argv: Sequence[str]) -> int:
-    """Run `progdf train`; 0 when the edit is written. Raises ProgdfError for what the user can mend."""
+    """Run `progdf train`; return 0 when the edit is written. Raises ProgdfError for user errors."""
     options = train_options(argv)
-    from trainer.run.run import train as run  # only now: --help and a mistyped option need no torch
+    from trainer.run.run import train as run  # late import: --help and option errors do not need torch
 
     run(options)
     return 0
 
 
 def batch(argv: Sequence[str]) -> int:
-    """Run `progdf batch`; 0 all done, 2 something is wrong and nothing was started, 3 some failed."""
+    """Run `progdf batch`; return 0 if all succeeded, 2 if nothing was started for an error, 3 if some jobs
+    failed."""
     options = parse_options(BatchOptions, argv, "progdf batch")
     from trainer.batch.run import batch as run
 
@@ -36,7 +37,7 @@ def batch(argv: Sequence[str]) -> int:
 
 
 def fit(argv: Sequence[str]) -> int:
-    """Run `progdf fit`; 0 when the edit is rewritten. Raises ProgdfError for what the user can mend."""
+    """Run `progdf fit`; return 0 when the edit is rewritten. Raises ProgdfError for user errors."""
     options = parse_options(FitOptions, argv, "progdf fit")
     from .run.finish import refit
 
@@ -45,7 +46,7 @@ def fit(argv: Sequence[str]) -> int:
 
 
 def evaluate(argv: Sequence[str]) -> int:
-    """Run `progdf evaluate`; 0 when all is measured. Raises ProgdfError for what the user can mend."""
+    """Run `progdf evaluate`; return 0 when all is measured. Raises ProgdfError for user errors."""
     options = parse_options(EvaluateOptions, argv, "progdf evaluate")
     from trainer.evaluate.command import evaluate as run
 
@@ -54,7 +55,7 @@ def evaluate(argv: Sequence[str]) -> int:
 
 
 def train_options(argv: Sequence[str]) -> TrainOptions:
-    """What a command line asks for: what it says itself, then its preset, then the defaults."""
+    """Return the options of a command line: its own values, then its preset's, then the defaults."""
     options = parse_options(TrainOptions, argv, "progdf train")
     if options.preset == "default":
         return options
@@ -62,7 +63,7 @@ def train_options(argv: Sequence[str]) -> TrainOptions:
 
 
 def region(argv: Sequence[str]) -> int:
-    """Run `progdf region`; 0 when it is shown or kept. Raises ProgdfError for what the user can mend."""
+    """Run `progdf region`; return 0 when the output is written. Raises ProgdfError for user errors."""
     options = parse_options(ShowRegionOptions, argv, "progdf region")
     from trainer.regions.command import show
 
@@ -72,7 +73,7 @@ def region(argv: Sequence[str]) -> int:
 
 
 def views(argv: Sequence[str]) -> int:
-    """Run `progdf views`; 0 when they are written. Raises ProgdfError for what the user can mend."""
+    """Run `progdf views`; return 0 when the views are written. Raises ProgdfError for user errors."""
     options = parse_options(WriteViewsOptions, argv, "progdf views")
     from .regions.command import write
 

@@ -148,7 +148,7 @@ class OptimizeOptions:
     progressive: Progressive = "off"
     """Progressive constraint of the paper (eq. 5), relaxed (decay) or tightened (growth) over time."""
     progressive_over: Over = "mean"
-    """Reduction of that constraint over the members' squared steps: mean, or sum."""
+    """Reduction of the progressive constraint over the members' squared steps: mean or sum."""
     rates: Rates = "kind"
     """Learning rates: by the kind of edit, of 3DGS, or of GaussianEditor."""
     slider: Slider = "auto"
@@ -182,7 +182,7 @@ class FieldOptions:
     field_loss: FieldLoss = "parameters"
     """neural: train on the recorded offsets, or on renders with the losses of the paper."""
     target_psnr: Annotated[float | None, absent_option("FLOAT", "a tenth of the edit's own error")] = None
-    """Minimum PSNR of the field against the trajectory, dB, instead of that rule; lower is smaller."""
+    """Minimum PSNR of the field against the trajectory, dB, in place of auto's rule; lower is smaller."""
     as_printed: Fixed[bool] = False  # network with positions only, hard bins of the slider, and no codes
     draft: Fixed[bool] = False  # train a network for a third of its steps
     seed: Fixed[int] = 0  # seed of the network's weights and samples

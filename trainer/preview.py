@@ -1,15 +1,14 @@
-"""`progdf preview`: what an edit will be, for the window, by JSON lines in and out.
+"""`progdf preview`: serve previews of edits to the window, by JSON lines in and out.
 
     {"number": 3, "out": "3.png", "region": "all", "editor": "recolor:#3060d0", "strength": 0.7,
      "background": [1, 1, 1], "viewmat": [[…]], "K": [[…]], "width": 640, "height": 480}
     {"number": 3, "error": "", "made": "grade", "note": "", "models": []}
 
-Where one map of color carries the edit the answer is a grade of it, 3.gdf beside 3.png, for every strength
-and from every side; else the editor's own picture of the view. The editor "grade" alone asks for the region's
-main colors. Requests that a later one has overtaken are
-passed over. A sentence is asked of `model`, again with another `seed`; with `seed` -1
-nothing is painted and `note` says what would paint, and where, and `models` which ones are on this machine.
-It ends when its input does.
+If one color map can represent the edit, the answer is a grade, 3.gdf beside 3.png, for every strength and
+camera. Otherwise it is the editor's own picture of the view. The editor "grade" only requests the region's
+main colors. A request is skipped if a later one has arrived. A prompt is painted by `model`, and again with
+another `seed`. With `seed` -1 nothing is painted; `note` names the model and device, and `models` the models
+on this machine. The process ends with its input.
 """
 
 from __future__ import annotations
@@ -56,16 +55,16 @@ _Side = Annotated[int, msgspec.Meta(ge=1, le=4096)]
 
 @dataclass(frozen=True)
 class PreviewOptions:
-    """Serve what edits will be, as grades or as pictures; for the window."""
+    """Serve previews of edits, as grades or as pictures, for the window."""
 
     scene: tyro.conf.Positional[Path]
-    """The scene."""
+    """Scene file."""
 
 
 class PreviewRequest(msgspec.Struct, frozen=True):
-    """An edit that is to be seen: where its picture goes, what is edited how, and from where one looks.
+    """Requested edit: output path, region, editor, and viewing camera.
 
-    `viewmat` is relative to the origin of the scene, which window and child load alike.
+    `viewmat` is relative to the origin of the scene, which window and child process load alike.
     """
 
     number: int
@@ -83,23 +82,24 @@ class PreviewRequest(msgspec.Struct, frozen=True):
 
 
 class PreviewAnswer(msgspec.Struct):
-    """The request's number, what was made, and why nothing is; "" where it is."""
+    """Answer with the request's number and the kind of output, or the reason for a failure in `error`,
+    otherwise ""."""
 
     number: int
     error: str = ""
     made: Literal["picture", "grade", "note", "palette"] = "picture"
     note: str = ""
     models: list[str] = msgspec.field(default_factory=list)
-    follows: bool = False  # whether the edit of a sentence can follow this picture
+    follows: bool = False  # training on the prompt can follow this picture
     palette: list[str] = msgspec.field(default_factory=list)  # the region's main colors, #rrggbb
 
 
 class Previewer:
-    """Grades and pictures of one scene; what two requests have in common is made once.
+    """Grades and pictures of one scene. Data that consecutive requests share is cached.
 
     Args:
         path: the scene's file
-        cache: folder for what a learned editor painted
+        cache: folder for the pictures of generative editors
     """
 
     def __init__(self, path: Path, cache: Path) -> None:
@@ -109,13 +109,13 @@ class Previewer:
         self._region = lru_cache(maxsize=4)(self._find_region)
         self._view = lru_cache(maxsize=2)(self._make_view)
         self._editor = lru_cache(maxsize=2)(self._make_editor)
-        self._draft: tuple[str, DraftViews | None] = "", None  # the last one's region, and its views
+        self._draft: tuple[str, DraftViews | None] = "", None  # region of the last draft, and its views
 
     def grade(self, request: PreviewRequest) -> Gdf | None:
-        """A grade alone of the edit; None where none carries it.
+        """Return the edit as a grade; None if no grade can represent it.
 
         Raises:
-            ProgdfError: region or editor do not work.
+            ProgdfError: invalid region or editor.
         """
         options = EditorOptions(request.editor, model=request.model)
         check_new_editor(options)
@@ -125,10 +125,10 @@ class Previewer:
         return None if views is None else draft_grade(views, options, options.family)
 
     def palette(self, request: PreviewRequest) -> list[str]:
-        """The main colors of the region as it is seen, #rrggbb; none where nothing of it is.
+        """Return the main visible colors of the region, #rrggbb; empty if it is not visible.
 
         Raises:
-            ProgdfError: the region does not work.
+            ProgdfError: invalid region.
         """
         views = self._views(request)
         if views is None:
@@ -145,12 +145,12 @@ class Previewer:
         return self._draft[1]
 
     def picture(self, request: PreviewRequest) -> Tensor:
-        """The view as the editor makes it. [H,W,3] 0..1
+        """Return the view as edited. [H,W,3], 0 to 1
 
         Raises:
-            ProgdfError: region or editor do not work, or the view shows nothing of the region.
+            ProgdfError: invalid region or editor.
         """
-        # what is looked at, and from where
+        # cache key of region, background and camera
         seen = msgspec.structs.replace(request, number=0, out="", editor="", strength=0.0, model="", seed=0)
         view = self._view(seen)
         if not bool((view.mask > 0.0).any()):
@@ -161,7 +161,7 @@ class Previewer:
         return self._editor(options, seen).edit(view, request.strength)
 
     def note(self, request: PreviewRequest) -> str:
-        """What would paint a sentence, where, and what that takes.
+        """Return a note on the model that would paint a prompt, its device and its memory.
 
         Raises:
             ProgdfError: see `check_instruct`.
@@ -169,15 +169,15 @@ class Previewer:
         return self._painter(request).note
 
     def follows(self, request: PreviewRequest) -> bool:
-        """Whether what is painted is a sentence, by a model that can follow a picture."""
+        """Return True if the editor paints a prompt with a model that can follow a picture."""
         painted = EditorOptions(request.editor).family == "instruct"
         return painted and self._painter(request).references > 0
 
     def _painter(self, request: PreviewRequest) -> InstructEditor:
         options = EditorOptions(request.editor, model=request.model)
-        what = options.editor.partition(":")[2]
+        prompt = options.editor.partition(":")[2]
         region = whole_scene(self.scene)
-        return instruct(EditorInput(what, self.scene, region, (), options))
+        return instruct(EditorInput(prompt, self.scene, region, (), options))
 
     def _find_region(self, spec: str) -> Region:
         request = RegionRequest(
@@ -199,7 +199,7 @@ class Previewer:
 
 
 def serve(argv: Sequence[str]) -> int:
-    """Run `progdf preview`; 0 when its input has ended. Raises ProgdfError for a scene that does not work."""
+    """Run `progdf preview`; return 0 at the end of its input. Raises ProgdfError for an invalid scene."""
     options = parse_options(PreviewOptions, argv, "progdf preview")
     with tempfile.TemporaryDirectory(prefix="progdf-preview-") as cache:
         previewer = Previewer(options.scene, Path(cache))
@@ -212,7 +212,7 @@ def serve(argv: Sequence[str]) -> int:
 
 
 def answer(previewer: Previewer, line: str) -> PreviewAnswer:
-    """Write what a line asks for; what went wrong is in the answer."""
+    """Write the requested output. The answer reports failures."""
     try:
         request = msgspec.json.decode(line, type=PreviewRequest)
     except msgspec.MsgspecError as error:
@@ -242,7 +242,7 @@ def _read_lines(lines: queue.SimpleQueue[str]) -> None:
 
 
 def newest_line(lines: queue.SimpleQueue[str]) -> str:
-    """The last line that has come, "" at the end of the input; waits where none has."""
+    """Return the last line received, "" at the end of the input; wait if there is none."""
     line = lines.get()
     while line and not lines.empty():
         line = lines.get()

@@ -1,7 +1,7 @@
-"""Options checked, and what they leave open filled in: once, before the run; for the kind, once it is known.
+"""Check options and fill in open values: once before the run, and again once the kind of edit is known.
 
-What the scene decides (the axis that is up, the number and size of the views, the SH bands) is decided where
-the scene is looked at. What is resolved is all that the bits of a result depend on, but for files' contents.
+Values that depend on the scene (up axis, number and size of the views, SH bands) are chosen where the scene
+is available. Resolved options determine a result bit for bit, except for the content of files.
 """
 
 from __future__ import annotations
@@ -45,52 +45,57 @@ from .options import (
 )
 
 BLANK = TrainOptions(Path(), Path(), RegionOptions(""), EditorOptions(""))
-"""What a command line says that says nothing."""
+"""Options of an empty command line."""
 
 PERCEPTUAL_WEIGHT: Mapping[EditKind, float] = {"color": 0.1, "style": 0.3, "geometry": 0.3}
 SHARPNESS: Mapping[EditKind, Sharpness] = {"color": "off", "style": "hinge", "geometry": "off"}
 STAGES: Mapping[EditKind, int] = {"color": MAX_STAGES, "style": 1, "geometry": MAX_STAGES}
 COSTLY_STAGES: Mapping[EditKind, int] = {"color": 4, "style": 4, "geometry": 1}
-"""Of what paints each strength anew; where things move its pictures between show two of them."""
+"""Stages for editors that paint each strength anew. Intermediate pictures of moving parts show them twice."""
 
 STAGE_STEPS = 40
-"""A stage needs so many: with fewer each view is seen once or twice, and the next target is there before this
-one is met. `QUICK_STAGES` are asked for then (docs/experiments.md, Stages)."""
+"""Minimum number of steps per stage.
+
+With fewer, each view is used once or twice, and the next target starts before this one is reached. Then
+`QUICK_STAGES` stages are used (docs/experiments.md, Stages).
+"""
 QUICK_STEPS = 240
 QUICK_STAGES = 4
 QUICK_VIEWS = 12
 _MAX_STEPS = 1_000_000  # hours on any machine
-_LONGEST_NAME = 255  # bytes that every file system takes
-_SMALLEST_VIEW = 32  # pixels of a view's longer side
+_MAX_NAME_BYTES = 255  # accepted by every file system
+_MIN_VIEW_PX = 32  # longer side of a view
 
 INSTRUCT_SIZE = 512
-"""Longer side of views that a diffusion model paints, shrunk from what it paints at its own size."""
+"""Longer side of views painted by a diffusion model, downscaled from the model's own size."""
 
 
 def resolve(options: TrainOptions) -> TrainOptions:
-    """The options, checked, with what they leave to each other filled in.
+    """Return the options, checked and with dependent values filled in.
 
     Raises:
-        ProgdfError: one makes no sense.
+        ProgdfError: an option is invalid.
     """
     check_options(options)
     quick = options.quick
     optimize = options.optimize
     views = options.views.views
-    family, _, what = options.editor.editor.partition(":")
+    family, _, argument = options.editor.editor.partition(":")
     stages = min(optimize.stages, QUICK_STAGES) if quick else optimize.stages
     texts = options.texts
     model = options.editor.model or (default_model() if family == "instruct" else "")
-    pictures = picture_paths(what) if family == "pictures" else ()
-    # where the finished edit alone is given, the way there is ours
-    paced = family not in EXTERNAL or (pictures and all(len(strengths_of(path)) == 1 for path in pictures))
+    pictures = picture_paths(argument) if family == "pictures" else ()
+    # if only the full edit is given, the trainer chooses the path to it
+    has_free_path = family not in EXTERNAL or (
+        pictures and all(len(strengths_of(path)) == 1 for path in pictures)
+    )
     return replace(
         options,
         name=check_name(options.name or options.out.resolve().name),
         editor=replace(options.editor, seed=options.seed, model=model),
         views=replace(
             options.views,
-            cameras=options.views.cameras or (_own_cameras(Path(what)) if family == "folder" else None),
+            cameras=options.views.cameras or (_own_cameras(Path(argument)) if family == "folder" else None),
             views=min(views or QUICK_VIEWS, QUICK_VIEWS) if quick else views,
             dense=not quick and family not in PER_VIEW and options.optimize.color_solver,
             image_size=options.views.image_size or (INSTRUCT_SIZE if family == "instruct" else 0),
@@ -102,7 +107,7 @@ def resolve(options: TrainOptions) -> TrainOptions:
             steps=min(optimize.steps, QUICK_STEPS) if quick else optimize.steps,
             stages=stages,
             engine=cast(Engine, choose_engine(optimize.engine)),
-            slider="even" if optimize.slider == "auto" and paced else optimize.slider,
+            slider="even" if optimize.slider == "auto" and has_free_path else optimize.slider,
             seed=options.seed,
         ),
         field=replace(options.field, draft=quick, seed=options.seed),
@@ -111,33 +116,34 @@ def resolve(options: TrainOptions) -> TrainOptions:
 
 
 def _own_cameras(folder: Path) -> Path | None:
-    """The cameras that a run or `progdf views` wrote beside the pictures in a folder."""
-    beside = (place / "cameras.json" for place in (folder, *folder.absolute().parents[:2]))
-    return next((path for path in beside if path.is_file() and kind_of_cameras(path) == "own"), None)
+    """Return the cameras.json of a run or `progdf views` beside the pictures in a folder; None if there is
+    none."""
+    candidates = (place / "cameras.json" for place in (folder, *folder.absolute().parents[:2]))
+    return next((path for path in candidates if path.is_file() and kind_of_cameras(path) == "own"), None)
 
 
 def recorded_options(options: TrainOptions) -> TrainOptions:
-    """Resolved options without where and how the command ran, of which no bit of the result depends."""
+    """Return resolved options without the output folder and the settings that do not affect the result."""
     return replace(options, out=Path(), preset="default", quick=False, threads=0, resume=False)
 
 
 def resolve_kind(
     options: TrainOptions, kind: EditKind, group_steps: int, grow: float = 0.0
 ) -> OptimizeOptions:
-    """How the members are optimized in an edit of this kind: nothing is left open.
+    """Return the optimization options for an edit of this kind, fully resolved.
 
-    What each of the defaults gives, alone, is in docs/experiments.md, Terms and options of a descent.
+    The effect of each default alone is in docs/experiments.md, Terms and options of a descent.
 
     Args:
         options: resolved, see `resolve`
-        kind: what the edit moves
-        group_steps: as asked, or as a trial found; without effect where nothing moves
-        grow: how many rows may be added, as a share of the members; as a trial found
+        kind: attributes that move
+        group_steps: requested or found by a trial run; without effect if nothing moves
+        grow: maximum number of added rows, as a share of the members; found by a trial run
     """
     optimize = options.optimize
     sharpness = SHARPNESS[kind] if optimize.sharpness == "kind" else optimize.sharpness
     solves_colors = (
-        kind == "color"  # colors alone change, and nothing is asked for that only a descent view by view has
+        kind == "color"  # only colors change, and no option needs a descent view by view
         and optimize.color_solver
         and optimize.rates == "kind"
         and optimize.progressive == "off"
@@ -147,14 +153,15 @@ def resolve_kind(
     )
     costly = options.editor.family in COSTLY_STRENGTHS
     weight = optimize.perceptual_weight
-    most = (COSTLY_STAGES if costly else STAGES)[kind]
+    max_stages = (COSTLY_STAGES if costly else STAGES)[kind]
     return replace(
         optimize,
         kind=kind,
-        stages=optimize.stages or min(most, QUICK_STAGES if optimize.steps < STAGE_STEPS * most else most),
+        stages=optimize.stages
+        or min(max_stages, QUICK_STAGES if optimize.steps < STAGE_STEPS * max_stages else max_stages),
         group_steps=group_steps if kind == "geometry" else 0,
         grow=grow,
-        # only an edit of colors may leave the bands alone
+        # only a color edit may leave the SH bands unchanged
         sh="on" if optimize.sh == "auto" and kind != "color" else optimize.sh,
         perceptual_weight=PERCEPTUAL_WEIGHT[kind] if weight is None else weight,
         sharpness=sharpness,
@@ -164,17 +171,17 @@ def resolve_kind(
 
 
 def check_options(options: TrainOptions) -> None:
-    """Refuse what makes no sense, and what would be passed over in silence.
+    """Reject invalid options, and options that would have no effect.
 
     Raises:
-        ProgdfError: a number out of its range, or an option that the editor or the field does not know.
+        ProgdfError: a value out of range, or an option that does not apply to the editor or the field.
     """
     region = options.region
     editor = options.editor
     optimize = options.optimize
     check_ranges(
         ("--views", options.views.views or VIEWS, 3, 96),
-        ("--image-size", options.views.image_size or _SMALLEST_VIEW, _SMALLEST_VIEW, 2048),
+        ("--image-size", options.views.image_size or _MIN_VIEW_PX, _MIN_VIEW_PX, 2048),
         ("--stages", optimize.stages, 0, 16),
         ("--group-steps", optimize.group_steps, 0, 10_000),
         ("--grow", optimize.grow, 0, 1),
@@ -203,24 +210,26 @@ def check_options(options: TrainOptions) -> None:
 
 
 def check_name(name: str) -> str:
-    """The name of a layer and its file, if it can be one.
+    """Return the name of a layer and its file, if valid.
 
     Raises:
-        ProgdfError: it cannot.
+        ProgdfError: the name is invalid.
     """
-    plain = bool(name) and name.isprintable() and not (name.startswith(".") or {"/", "\\"} & set(name))
-    if not plain or not is_portable(name):
-        why = ", as Windows cannot have a file of that name" if plain else ""
+    is_printable_name = (
+        bool(name) and name.isprintable() and not (name.startswith(".") or {"/", "\\"} & set(name))
+    )
+    if not is_printable_name or not is_portable(name):
+        reason = ", as Windows cannot have a file of that name" if is_printable_name else ""
         raise ProgdfError(
-            f"'{name}' is not a valid layer name{why}; choose one with --name, for example --name shirt"
+            f"'{name}' is not a valid layer name{reason}; choose one with --name, for example --name shirt"
         )
-    if len(f"{name}.gdf".encode()) > _LONGEST_NAME:
+    if len(f"{name}.gdf".encode()) > _MAX_NAME_BYTES:
         raise ProgdfError(f"the name '{name[:20]}…' is too long for a file; choose another one with --name")
     return name
 
 
 def _check_editor_options(editor: EditorOptions, optimize: OptimizeOptions) -> None:
-    """No option is passed over in silence: one that the editor does not know is refused."""
+    """Reject options that do not apply to the editor."""
     if editor.family == "pictures" and optimize.kind not in ("auto", "color"):
         raise ProgdfError(
             f"--kind {optimize.kind} does not apply to pictures: few views do not tell how deep a part lies; "
@@ -230,11 +239,11 @@ def _check_editor_options(editor: EditorOptions, optimize: OptimizeOptions) -> N
         raise ProgdfError("--fill picture needs a picture of what was behind; write --editor remove:A.png")
     if editor.family == "pictures" and editor.removal == "never" and editor.fill is not None:
         raise ProgdfError("--fill closes holes of a removal; leave out --removal never, or --fill")
-    of_instruct = ("model", "guidance", "edit_steps", "anchor", "quantize", "device")
+    instruct_options = ("model", "guidance", "edit_steps", "anchor", "quantize", "device")
     if optimize.grow and editor.family not in PER_VIEW:
         raise ProgdfError(f"--grow does not apply to {editor.family}; it is for {' and '.join(PER_VIEW)}")
     for names, kinds in (
-        (of_instruct, ("instruct",)),
+        (instruct_options, ("instruct",)),
         (("edit_size",), ("style", "instruct")),
         (("fill",), ("remove", "pictures")),
         (("removal",), ("pictures",)),
@@ -249,10 +258,10 @@ def _check_editor_options(editor: EditorOptions, optimize: OptimizeOptions) -> N
 
 
 def check_field_options(options: FieldOptions, preset: Preset = "default") -> None:
-    """Options of the field that make sense, and those of a network only where there is one, or by a preset.
+    """Check the options of the field. Options of a network need a network, unless a preset sets them.
 
     Raises:
-        ProgdfError: one does not.
+        ProgdfError: an option is invalid.
     """
     if options.target_psnr is not None and not 0 < options.target_psnr <= NO_DIFFERENCE:
         raise ProgdfError(
@@ -268,17 +277,17 @@ def check_field_options(options: FieldOptions, preset: Preset = "default") -> No
 
 
 def use_threads(threads: int) -> None:
-    """Give torch and the rasterizer `threads` threads; 0 is all cores."""
+    """Set the number of threads of torch and the rasterizer; 0 is all cores."""
     count = count_threads(threads)
     torch.set_num_threads(count)
     set_threads(count)
 
 
 def count_threads(threads: int) -> int:
-    """How many threads `threads` means.
+    """Return the number of threads; 0 becomes the number of cores.
 
     Raises:
-        ProgdfError: fewer than none, or more than any machine has.
+        ProgdfError: negative, or more than any machine has.
     """
     if not 0 <= threads <= MAX_THREADS:
         raise ProgdfError(f"--threads must be between 0 and {MAX_THREADS}, got {threads}")

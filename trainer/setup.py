@@ -1,4 +1,4 @@
-"""What training works on: the views that look at the region, and what the editor makes of each."""
+"""Training data: the views of the region, and their edited pictures."""
 
 from __future__ import annotations
 
@@ -55,21 +55,26 @@ from .views.view import (
 )
 
 SIZE = 256
-"""Longer side of the views, in pixels."""
+"""Default longer side of the views, pixels."""
 
 SAMPLING = math.sqrt(2.0)
-"""How many times larger pictures an edit of colors is meant for: they are looked at from as large as these to
-twice that (docs/experiments.md, Views)."""
+"""Sampling rate of the cameras of a color edit.
+
+Its pictures are displayed at one to two times the size of the views (docs/experiments.md, Views).
+"""
 
 PICTURE_SIZE = 512
-"""The longest side at which a changed picture is trained on."""
+"""Maximum longer side of a changed picture in training, pixels."""
 
-_PROBES = 3
-_GLANCES = 8
+_PROBES = 3  # number of views in which movement is measured
+_MAX_GLANCES = 8
+"""Number of glances; fewer for a large scene, so that a draft of a million Gaussians takes seconds.
+
+With up to 24 no draft improves by 0.1 dB.
+"""
 _GLANCE_SIZE = 192
-"""Of a large scene fewer, so that a draft of a million Gaussians takes seconds; up to 24 make none better by
-.1 dB, and smaller ones mix colors, and the region's own with them."""
-_DRAWN = 3_000_000  # Gaussians, in all of them
+"""Longer side of a glance, pixels; smaller ones mix the region's colors with each other and with others."""
+_MAX_GLANCE_GAUSSIANS = 3_000_000  # rendered in all glances together
 
 Pictures = Mapping[float, Sequence[Tensor]]
 """Strength → whole edited pictures, one per view. [H,W,3] each"""
@@ -77,24 +82,23 @@ Pictures = Mapping[float, Sequence[Tensor]]
 
 @dataclass(frozen=True)
 class TrainingSetup:
-    """The scene, the region, the views on it, and what is to be said of these."""
+    """Scene, region, and views of a run, with notes on them."""
 
-    # scene, region: what is edited
-    scene: Gaussians
-    region: Region
+    scene: Gaussians  # the original
+    region: Region  # members that may change
     train: Sequence[View]  # views to train on
-    held_out: Sequence[View]  # views to measure with; none where there are few, see `judging`
+    held_out: Sequence[View]  # views to measure with; empty if there are too few views, see `judging`
     background: Tensor  # rgb. [3]
     notes: Sequence[str] = ()  # lines for the log
     up: UpAxis | None = None  # the axis that is up
 
     @property
     def views(self) -> list[View]:
-        """All of them."""
+        """All views, training views first."""
         return [*self.train, *self.held_out]
 
     def extend(self, added: Gaussians | None) -> TrainingSetup:
-        """With rows after the scene's own that are members too; of nothing added, as it is."""
+        """Return the setup with added rows after the scene's own, as members too; unchanged for None."""
         if added is None:
             return self
         rows = torch.arange(len(self.scene), len(self.scene) + len(added))
@@ -106,33 +110,33 @@ class TrainingSetup:
         return replace(self, scene=concatenate([self.scene, added]), region=region)
 
     def keep_solved(self, effort: Mapping[str, Any]) -> TrainingSetup:
-        """With those training views that an edit of colors was solved for: all, or every other one."""
+        """Return the setup with the training views that the color solver used: all, or every other one."""
         return replace(self, train=self.train[:: -(-len(self.train) // effort.get("views", len(self.train)))])
 
     @property
     def judging(self) -> Sequence[View]:
-        """What the edit is measured on: where nothing is held out, the views that it was trained on."""
+        """Views that measure the edit: the held-out views, or the training views if none are held out."""
         return self.held_out or self.train
 
     @property
     def judged_on(self) -> str:
-        """The views of `judging` in words, for what stands beside a figure: one view alone says little."""
+        """Description of `judging` for use beside a figure, which points out a single view."""
         if not self.held_out:
             return "the views trained on"
         return f"{len(self.held_out)} held-out views" if len(self.held_out) > 1 else "one held-out view alone"
 
 
 def check_given_cameras(options: TrainingViewOptions, scene: Gaussians) -> None:
-    """Raise ProgdfError if the cameras of --cameras do not show the scene."""
+    """Raise a ProgdfError if the cameras of --cameras do not show the scene."""
     load_given_cameras(options, scene)
 
 
 def make_training_setup(options: TrainingViewOptions, scene: Gaussians, region: Region) -> TrainingSetup:
-    """The views: those of changed pictures; else the best of the given cameras, or of a rig that looks at the
+    """Return the setup with its views: those of changed pictures, the best given cameras, or a rig around the
     region.
 
     Raises:
-        ProgdfError: no camera sees the region, or none are given and the scene is one to stand inside.
+        ProgdfError: no camera sees the region, or none are given for a scene that surrounds the viewer.
     """
     background = torch.tensor(BACKGROUND)
     found = load_given_cameras(options, scene)
@@ -146,8 +150,8 @@ def make_training_setup(options: TrainingViewOptions, scene: Gaussians, region: 
     if options.cameras is None and is_surrounding(scene, up.direction):
         raise ProgdfError(f"the scene {INSIDE}")
 
-    usual = COLOR_VIEWS[scene.sh_degree > 1] if options.dense else VIEWS
-    views = options.views or usual
+    default_count = COLOR_VIEWS[scene.sh_degree > 1] if options.dense else VIEWS
+    views = options.views or default_count
     size = options.image_size or SIZE
 
     def cameras_of(count: int) -> list[Camera]:
@@ -159,12 +163,14 @@ def make_training_setup(options: TrainingViewOptions, scene: Gaussians, region: 
         fitted = [replace(c, sampling=SAMPLING) for c in fitted] if options.dense else fitted
         return with_near_plane(name_cameras(fitted), scene)
 
-    aside = max(1, views // 5 if options.views else min(views // 5, VIEWS // 5))
+    held_out_count = max(1, views // 5 if options.views else min(views // 5, VIEWS // 5))
     if options.cameras is None:
-        choice, train, held_out = _rig_views(scene, region, cameras_of, views - aside, aside, background)
+        choice, train, held_out = _rig_views(
+            scene, region, cameras_of, views - held_out_count, held_out_count, background
+        )
     else:
         choice = choose_views(scene, region, cameras_of(views), views, background)
-        train, held_out = split_views(choice, min(aside, max(1, len(choice.views) // 5)))
+        train, held_out = split_views(choice, min(held_out_count, max(1, len(choice.views) // 5)))
     notes = [*found.notes, f"up is {up.name}, {up.reason}"]
     notes += [choice.line()] if len(choice.views) < choice.offered else []
     if any(view.camera.lens for view in choice.views):
@@ -176,18 +182,18 @@ def make_training_setup(options: TrainingViewOptions, scene: Gaussians, region: 
 
 
 def take_glances(options: TrainingViewOptions, scene: Gaussians, region: Region) -> list[Glance]:
-    """The region from all around, however many views it is edited in and however large these are.
+    """Return glances at the region from all sides, independent of number and size of its views.
 
-    The first few of the given cameras' that show it, spread over their list, or a rig's; none where the scene
-    is one to stand inside and has no cameras.
+    They come from the first given cameras that show it, spread over the list, or from a rig. There are none
+    for a scene that surrounds the viewer and has no cameras.
     """
     given = load_given_cameras(options, scene).cameras
     up = find_up(scene, given, options.up, options.scene).direction
-    count = max(3, min(_GLANCES, _DRAWN // len(scene)))
+    count = max(3, min(_MAX_GLANCES, _MAX_GLANCE_GAUSSIANS // len(scene)))
     if given:
         spread = sorted(range(len(given)), key=lambda i: math.sqrt(2.0) * i % 1.0)
-        places = scene.means[sample_members(scene, region)]
-        spread.sort(key=lambda i: not bool(in_frame(places, given[i]).any()))  # those first that may show it
+        positions = scene.means[sample_members(scene, region)]
+        spread.sort(key=lambda i: not bool(in_frame(positions, given[i]).any()))  # visible region first
         cameras = [fit_size(given[i], _GLANCE_SIZE) for i in spread]
     elif is_surrounding(scene, up):
         return []
@@ -204,12 +210,13 @@ def _rig_views(
     aside: int,
     background: Tensor,
 ) -> tuple[ViewChoice, list[View], list[View]]:
-    """Views of a rig to train with, which leaves no gap, and others half way from one of these to the next.
+    """Return gapless training views of a rig, and held-out views halfway between neighbors.
 
     Args:
-        scene, region: what they look at
-        rig: number -> so many cameras
-        count, aside: how many of each; of a rig up to half as large again where some see nothing
+        scene, region: target of the cameras
+        rig: number -> that many cameras
+        count, aside: numbers of training and held-out views; up to 1.5 times as many cameras if some see
+            nothing
         background: rgb. [3]
     """
     cameras = rig(count)
@@ -218,17 +225,17 @@ def _rig_views(
         cameras = rig(min(-(-count * count // len(choice.views)), count + count // 2))
         choice = choose_views(scene, region, cameras, count, background)
     train = list(choice.views)
-    places = {camera.name: i for i, camera in enumerate(cameras)}
+    indices = {camera.name: i for i, camera in enumerate(cameras)}
     between = rig(2 * len(cameras))[1::2]
-    following = (places[train[k * len(train) // aside].camera.name] for k in range(aside))
-    others = [replace(between[i], name=f"between_{i:03d}") for i in sorted({*following})]
+    successors = (indices[train[k * len(train) // aside].camera.name] for k in range(aside))
+    others = [replace(between[i], name=f"between_{i:03d}") for i in sorted({*successors})]
     views = map_threads(lambda camera: make_view(scene, region, camera, background), others)
     held_out = [view for view in views if bool((view.mask > 0.0).any())]
     return choice, *((train, held_out) if held_out else split_views(choice, aside))
 
 
 def _up_of_pictures(paths: Sequence[Path]) -> UpAxis | None:
-    """What the first picture that says anything was rendered with as up."""
+    """Return the up axis stored in the first picture that has one; None if none has."""
     directions = (up_from_json(up_in_picture(path)) for path in paths)
     found = next((up for up in directions if up is not None), None)
     return None if found is None else UpAxis(found, "as in the window that the picture is from")
@@ -237,7 +244,7 @@ def _up_of_pictures(paths: Sequence[Path]) -> UpAxis | None:
 def _picture_setup(
     options: TrainingViewOptions, scene: Gaussians, region: Region, given: Sequence[Camera], up: UpAxis
 ) -> TrainingSetup:
-    """The views of changed pictures. All are trained on: what one shows no other may."""
+    """Return the setup of changed pictures. All are trained on, as each may show unique areas."""
     background = torch.tensor(BACKGROUND)
     size = options.image_size or PICTURE_SIZE
     cameras = [fit_size(camera, size) for camera in picture_cameras(options.pictures, given, scene.origin)]
@@ -250,12 +257,12 @@ def _picture_setup(
 
 
 def editor_strengths(editor: ImageEditor, stages: int) -> tuple[float, ...]:
-    """What the editor is asked for: its own strengths, or `stages` even ones where any will do."""
+    """Return the strengths to request: the editor's own, or `stages` evenly spaced ones."""
     return editor.stages or tuple((i + 1) / stages for i in range(stages))
 
 
 def confines_edit(editor: ImageEditor, kind: Kind) -> bool:
-    """Whether what the editor changed outside the region is put back: unless the edit moves parts."""
+    """Return True if changes outside the region are reverted: unless the edit moves parts."""
     return kind != "geometry" and not editor.is_confined
 
 
@@ -268,16 +275,16 @@ def edit_views(
     advance: Advance,
     course: Callable[[View], Callable[[float], Tensor]],
 ) -> dict[float, Sequence[Tensor]]:
-    """Every view edited once per strength. What is kept on disk, in 8 bits, is what is trained on.
+    """Edit every view at every strength. Training uses the 8-bit pictures saved to disk.
 
     Args:
         editor: see `ImageEditor`
         views: all views
-        strengths: what the editor is asked for
-        folder: where the pictures go
-        is_confined: put back what changed outside the region; members would be pulled over it otherwise
-        advance: progress
-        course: the editor's way of a view, see `edit_course`
+        strengths: requested strengths
+        folder: folder of the pictures
+        is_confined: revert changes outside the region, to which members would be pulled otherwise
+        advance: reports progress
+        course: returns the editor's path for a view, see `edit_course`
     """
 
     def edit(request: Sequence[tuple[float, int]]) -> list[Tensor]:
@@ -290,11 +297,11 @@ def edit_views(
 
     add_pictures(folder.views, [folder.view("edited", v.camera.name, s) for s in strengths for v in views])
     edited: dict[float, list[Tensor]] = {strength: [] for strength in strengths}
-    together = isinstance(editor, ColorEditor | StripesEditor)  # the others have a network, or use all cores
-    groups = [strengths] if together and strengths else [[strength] for strength in strengths]
+    is_parallel = isinstance(editor, ColorEditor | StripesEditor)  # others run a network, or use all cores
+    groups = [strengths] if is_parallel and strengths else [[strength] for strength in strengths]
     requests = [[(strength, i) for strength in group] for group in groups for i in range(len(views))]
     with ThreadPoolExecutor(threads()) as pool:
-        made = pool.map(edit, requests) if together else map(edit, requests)
+        made = pool.map(edit, requests) if is_parallel else map(edit, requests)
         try:
             for request, pictures in zip(requests, made, strict=True):
                 for (strength, _), picture in zip(request, pictures, strict=True):
@@ -309,20 +316,20 @@ def edit_views(
 def boxed_pictures(
     pictures: Sequence[Tensor], views: Sequence[View], engine: str = "cpu"
 ) -> Sequence[Tensor]:
-    """What the views' boxes hold of their whole pictures, on the engine's device. [h,w,3] each"""
+    """Return the content of the views' boxes in whole pictures, on the engine's device. [h,w,3] each"""
     device = engine_device(engine)
     pairs = zip(pictures, views, strict=False)
     return stored_pictures(crop(picture, view.box).to(device) for picture, view in pairs)
 
 
 def widen_views(setup: TrainingSetup, edited: Pictures) -> TrainingSetup:
-    """The training views with boxes that hold all that the edit changes."""
+    """Return the setup with training views whose boxes hold all changes of the edit."""
     views = [view.widen([pictures[i] for pictures in edited.values()]) for i, view in enumerate(setup.train)]
     return replace(setup, train=views)
 
 
 def whole_views(setup: TrainingSetup) -> TrainingSetup:
-    """The training views with the whole picture as their boxes."""
+    """Return the setup with training views whose boxes are the whole picture."""
     return replace(
         setup, train=[replace(v, box=(0, 0, v.camera.width, v.camera.height)) for v in setup.train]
     )
@@ -331,27 +338,32 @@ def whole_views(setup: TrainingSetup) -> TrainingSetup:
 def shrink_view(
     setup: TrainingSetup, view: View, edited: Tensor, camera: Camera
 ) -> tuple[CropScene, Callable[[Tensor], Tensor], Tensor]:
-    """A view with a smaller camera: what is rendered of it, how its pictures come to that, and how much of
-    each pixel counts, as the region's or edited. [H,W,3] -> [h,w,1]"""
-    across = camera.width / view.camera.width
-    down = camera.height / view.camera.height
+    """Return a view at the size of a smaller camera, for cheap renders.
+
+    Returns:
+        The scene in its box; a function that shrinks pictures of the view to it; and the share of each pixel
+        that counts, as region or edited. [h,w,1]
+    """
+    scale_x = camera.width / view.camera.width
+    scale_y = camera.height / view.camera.height
     x0, y0, x1, y1 = view.box
-    right = min(camera.width, math.ceil(x1 * across))
-    bottom = min(camera.height, math.ceil(y1 * down))
-    box = (math.floor(x0 * across), math.floor(y0 * down), right, bottom)
+    right = min(camera.width, math.ceil(x1 * scale_x))
+    bottom = min(camera.height, math.ceil(y1 * scale_y))
+    box = (math.floor(x0 * scale_x), math.floor(y0 * scale_y), right, bottom)
 
     def shrink(picture: Tensor) -> Tensor:
         return crop(shrink_image(picture, (camera.height, camera.width)), box)
 
-    counts = (view.mask > 0.05) | ((edited - view.image).abs().amax(dim=2) > 2 / 255)
+    counted = (view.mask > 0.05) | ((edited - view.image).abs().amax(dim=2) > 2 / 255)
     scene = crop_scene(setup.scene, setup.region.members, camera, box, setup.background)
-    return scene, shrink, shrink(counts.float()[..., None])
+    return scene, shrink, shrink(counted.float()[..., None])
 
 
 def probe_views(
     setup: TrainingSetup, count: int = _PROBES, still: bool = False, engine: str = "cpu"
 ) -> list[CropScene]:
-    """A few training views at half size, in which movement is measured. Others: see `crop_scene`"""
+    """Return a small number of training views at half size for measuring movement; see `crop_scene` for the
+    arguments."""
     scene = setup.scene.to(engine_device(engine))
     chosen = setup.train[:: max(1, len(setup.train) // count)][:count]
     return [
@@ -369,5 +381,5 @@ def probe_views(
 
 
 def quantize_image(image: Tensor) -> Tensor:
-    """What is left of an image in an 8-bit file. [H,W,3] -> [H,W,3]"""
+    """Return an image after rounding to 8 bits. [H,W,3] -> [H,W,3]"""
     return from_bytes(to_bytes(image))

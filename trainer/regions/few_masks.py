@@ -44,13 +44,13 @@ def drop_strays(
     views_inside: Tensor,
     say: Callable[[str], None] | None = None,
 ) -> Tensor:
-    """Return the members inside two masks, if two views see them, in large connected surfaces.
+    """Return the members of large connected surfaces that lie inside two masks, if two views see them.
 
     Args:
         scene: N Gaussians
         member: members by score alone. [N] bool
         views: number of views with a mask that show each Gaussian. [N]
-        views_inside: number of these in which it lies inside the mask. [N]
+        views_inside: number of views that show it inside the mask. [N]
         say: receives a log line per kind of removed Gaussian
 
     Returns:

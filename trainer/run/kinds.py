@@ -52,7 +52,7 @@ _REPAINTED_SHARE = 0.3  # share of changed pixels outside the region if a tool r
 class Approach:
     """Training variant: the attributes that move, and how."""
 
-    kind: EditKind  # what moves
+    kind: EditKind  # attributes that move
     group_steps: int = 0  # steps of the stage in which connected parts move rigidly; 0 omits it
     grow: float = 0.0  # see `OptimizeOptions.grow`
 
