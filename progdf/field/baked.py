@@ -277,13 +277,14 @@ class GradeForm:
     @property
     def label(self) -> str:
         """Description, as in "grade of degree 2, a mask, 2 bases of DC"."""
+        kind = f"degree {self.degree}" if self.degree else f"{lattice_side(self.table.shape[1])}³ colors"
+        mask = "" if self.mask is None else "a mask, "
         bases = len(self.residual)
-        parts = {12: "two bands", 27: "three bands"}
-        bands = parts.get(self.residual.shape[2], "DC")
-        additions = f"{bases} bas{'is' if bases == 1 else 'es'} of {bands}" if bases else "no residual"
-        additions = additions if self.mask is None else f"a mask, {additions}"
-        side = 0 if self.degree else lattice_side(self.table.shape[1])
-        return f"grade of {f'degree {self.degree}' if self.degree else f'{side}³ colors'}, {additions}"
+        residual = "no residual"
+        if bases:
+            bands = {12: "two bands", 27: "three bands"}.get(self.residual.shape[2], "DC")
+            residual = f"{bases} {'basis' if bases == 1 else 'bases'} of {bands}"
+        return f"grade of {kind}, {mask}{residual}"
 
     @cached_property
     def packed_levels(self) -> dict[str, Tensor]:

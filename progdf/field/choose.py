@@ -147,7 +147,9 @@ class FieldEvaluator:
         added: float = ADDED,
     ) -> None:
         truth_at = truth or (lambda s: interpolate_at(strengths, offsets, s))
-        self._render, self._has_edited, self._added = render, bool(edited), added
+        self._render = render
+        self._has_edited = bool(edited)
+        self._added = added
         self._zero_offsets = torch.zeros(offsets.shape[1:])
         self._expected = self._render_all(truth_at, sample_strengths())
         self._edited = edited or {1.0: self._render_all(truth_at, [1.0])[0]}
@@ -173,10 +175,8 @@ class FieldEvaluator:
         path_error = fmean(curve) if self._has_edited else max(curve)
         excess = max(fmean(editor_errors) - fmean(self._own_errors), path_error) / self._allowed
         if self._has_edited:
-            excess = max(
-                excess,
-                (editor_errors[-1] - self._own_errors[-1]) / allowed_error(self._own_errors[-1], self._added),
-            )
+            end_allowed = allowed_error(self._own_errors[-1], self._added)
+            excess = max(excess, (editor_errors[-1] - self._own_errors[-1]) / end_allowed)
         to_editor = decibels(fmean(editor_errors)) if self._has_edited else None
         return Candidate(field, tuple(decibels(e) for e in curve), label, excess, to_editor)
 
@@ -257,12 +257,13 @@ def choose_field(
 
 def pick_candidate(tried: Sequence[Candidate], wanted: str) -> FieldChoice:
     """Return the smallest accepted field, or else the best."""
-    looked = f"{len(tried)} field{'s'[: len(tried) != 1]}"
-    if good := [c for c in tried if c.excess <= 1.0]:
-        best = min(good, key=lambda c: (c.field.bytes_per_member, c.excess))
-        return FieldChoice(best, True, tuple(tried), f"the smallest of {looked} that {wanted}")
+    fields = "1 field" if len(tried) == 1 else f"{len(tried)} fields"
+    accepted = [candidate for candidate in tried if candidate.excess <= 1.0]
+    if accepted:
+        best = min(accepted, key=lambda c: (c.field.bytes_per_member, c.excess))
+        return FieldChoice(best, True, tuple(tried), f"the smallest of {fields} that {wanted}")
     best = min(tried, key=lambda c: c.excess)
-    return FieldChoice(best, False, tuple(tried), f"the best of {looked}; none {wanted}")
+    return FieldChoice(best, False, tuple(tried), f"the best of {fields}; none {wanted}")
 
 
 def store_ends(offsets: Tensor, evaluator: FieldEvaluator) -> Ends:
@@ -290,9 +291,10 @@ def store_ends(offsets: Tensor, evaluator: FieldEvaluator) -> Ends:
         return sum(END_TYPES[k].itemsize * (moving[n].stop - moving[n].start) for n, k in chosen.items())
 
     current = excess(chosen)
-    while current > 1.0 and (
-        larger := [{**chosen, name: k + 1} for name, k in chosen.items() if k + 1 < len(END_TYPES)]
-    ):
+    while current > 1.0:
+        larger = [{**chosen, name: k + 1} for name, k in chosen.items() if k + 1 < len(END_TYPES)]
+        if not larger:
+            break
         gains = [(current - excess(c)) / (size(c) - size(chosen)) for c in larger]
         chosen = larger[gains.index(max(gains))]
         current = excess(chosen)
@@ -304,18 +306,19 @@ def _grow_fields(seen: RenderedTrajectories, strengths: Tensor, evaluator: Field
 
     The steps double until a field is accepted. A bisection then finds the smallest accepted one.
     """
-    path, tried = grow_ranks(seen), dict[int, Candidate]()
+    path = grow_ranks(seen)
+    tried = dict[int, Candidate]()
 
-    def serves(i: int) -> bool:
+    def is_accepted(i: int) -> bool:
         if i not in tried:
             tried[i] = _fit_ranks(seen, strengths, path[i], evaluator)
         return tried[i].excess <= 1.0
 
     reach = 0
     last = len(path) - 1
-    while not serves(reach) and reach < last:
+    while not is_accepted(reach) and reach < last:
         reach = min(2 * reach + 1, last)
-    bisect_left(range(reach), True, lo=reach // 2, key=serves)
+    bisect_left(range(reach), True, lo=reach // 2, key=is_accepted)
     return list(tried.values())
 
 
@@ -348,11 +351,15 @@ def grow_ranks(seen: RenderedTrajectories) -> list[dict[str, int]]:
     widths = {name: trajectory.offsets.shape[2] for name, trajectory in seen.trajectories.items()}
     ranks = dict.fromkeys(seen.trajectories, 0)
     path = [dict(ranks)]
-    now = float(seen.mse(ranks).mean())
-    while now >= 1e-10 and (growing := [n for n in ranks if ranks[n] < seen.modes[n].shape[1]]):  # 100 dB
-        then = {n: float(seen.mse({**ranks, n: ranks[n] + 1}).mean()) for n in growing}
-        name = max(growing, key=lambda n: math.log(now / max(then[n], 1e-30)) / widths[n])
-        ranks[name], now = ranks[name] + 1, then[name]
+    error = float(seen.mse(ranks).mean())
+    while error >= 1e-10:  # 100 dB
+        growing = [n for n in ranks if ranks[n] < seen.modes[n].shape[1]]
+        if not growing:
+            break
+        next_errors = {n: float(seen.mse({**ranks, n: ranks[n] + 1}).mean()) for n in growing}
+        name = max(growing, key=lambda n: math.log(error / max(next_errors[n], 1e-30)) / widths[n])
+        ranks[name] += 1
+        error = next_errors[name]
         path.append(dict(ranks))
     return path
 

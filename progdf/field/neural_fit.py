@@ -84,7 +84,8 @@ class NeuralFit:
         settings: NeuralSettings,
         visibility: Tensor | None = None,
     ) -> None:
-        self.settings, self._rate = settings.resolve(), EFFORT[settings.size][2]
+        self.settings = settings.resolve()
+        self._rate = EFFORT[settings.size][2]
         width, layers = LAYOUT[settings.size]
         self.shape = NeuralShape(
             width, layers, attributes, channels, settings.inputs, settings.code, hard=settings.bins == "hard"
@@ -235,7 +236,8 @@ class NeuralFit:
             if state:
                 self._adam.state[tensor] = state
         self._frame = {name: saved[f"frame.{name}"].clone() for name in self._frame}
-        self._end, self._importance = saved["end"].clone(), saved["importance"].clone()
+        self._end = saved["end"].clone()
+        self._importance = saved["importance"].clone()
         self.steps = int(saved["steps"])
         self._generator.set_state(saved["draws"])
         self._inputs = neural.encode(self.shape, self._frame, self._rows, self._end)

@@ -160,7 +160,8 @@ def store_attribute(
 def quantize_bases(exact: Tensor, basis_type: torch.dtype) -> tuple[Tensor, Tensor]:
     """Return bases in their stored type, and the value of one unit. [R,M,c] -> [R,M,c], [R,c] float32"""
     largest = exact.abs().amax(dim=1) if exact.shape[1] else exact.new_zeros(exact.shape[0], exact.shape[2])
-    if max_level := _MAX_LEVELS.get(basis_type):
+    max_level = _MAX_LEVELS.get(basis_type)
+    if max_level is not None:
         step = largest / max_level
         step = torch.where(step > 0, step, torch.ones_like(step))
         return (exact / step[:, None]).round().clamp(-max_level, max_level).to(basis_type), step
@@ -293,15 +294,18 @@ def opacity_course(start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
     knots = torch.cat([rise, torch.tensor([0.5], dtype=torch.float64), 1.0 - rise.flip(0)])
     opacity = torch.lerp(start.double().sigmoid(), end.double().sigmoid(), knots[:, None])
     offsets = (opacity.logit() - start.double()).float()
-    offsets[0], offsets[-1] = 0.0, end.float() - start.float()
+    offsets[0] = 0.0
+    offsets[-1] = end.float() - start.float()
     return knots.float(), offsets
 
 
 def keyframe_rows(strengths: Tensor, count: int) -> list[int]:
     """Return the snapshots that `fit_keyframes` keeps, ascending. [T]"""
+    if count >= len(strengths):
+        return list(range(len(strengths)))
     even = torch.linspace(0, 1, count, dtype=strengths.dtype)
     nearest = (strengths[:, None] - even).abs().argmin(dim=0)
-    return sorted({*(nearest if count < len(strengths) else torch.arange(len(strengths))).tolist()})
+    return sorted(set(nearest.tolist()))
 
 
 def fit_keyframes(

@@ -159,7 +159,9 @@ def _unpack(tensors: dict[str, Tensor]) -> Trajectory:
         check_tensor("mask", mask, offsets.shape[1:2], torch.uint8)
     for name, part in added.items():
         check_tensor(name, part, part.shape, torch.float32)
-    numbers = [offsets, end, *added.values(), *([] if maps is None else [maps])]
+    numbers = [offsets, end, *added.values()]
+    if maps is not None:
+        numbers.append(maps)
     if not all(bool(part.isfinite().all()) for part in numbers):
         raise ValueError("it has numbers that are not finite")
     stages = tuple(ends.tolist()), tuple(strengths.tolist())

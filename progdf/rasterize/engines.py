@@ -169,8 +169,10 @@ class RasterEngine(Protocol):
 
 def choose_engine(name: str) -> str:
     """Return the engine for a name. "auto" is warp if a CUDA device and Warp are available, else cpu."""
+    if name != "auto":
+        return name
     has_gpu = torch.cuda.is_available() and find_spec("warp") is not None
-    return name if name != "auto" else "warp" if has_gpu else "cpu"
+    return "warp" if has_gpu else "cpu"
 
 
 def engine_device(name: str) -> torch.device:

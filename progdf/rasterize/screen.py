@@ -28,7 +28,8 @@ def fill_screen(image: Array, screen: Array) -> None:
         image: rgb, upper row first, clamped to 0..1. [h,w,3] float32
         screen: rgba, lower row first, opaque. Filtered linearly if its size differs. [H,W,4] uint8
     """
-    (height, width), (rows, columns) = screen.shape[:2], image.shape[:2]
+    height, width = screen.shape[:2]
+    rows, columns = image.shape[:2]
     chunks = max(1, min(height // _CHUNK_ROWS, 2 * threads()))
     cuts = [height * chunk // chunks for chunk in range(chunks + 1)]
 

@@ -286,7 +286,8 @@ def color_map(
     """Return a color map, see `progdf.rasterize.engines.color_map`. No weight is omitted."""
     with torch.no_grad():
         splats, info = project(gaussians.each(Tensor.double), view)
-    lists, wanted = list_tiles(splats, view.crop), is_listed(splats, info, rows)
+    lists = list_tiles(splats, view.crop)
+    wanted = is_listed(splats, info, rows)
     return DrawnColors(
         splats, rows, len(gaussians.means), pixels, lambda some: blend(some, lists, view.crop, wanted)[0]
     )

@@ -280,7 +280,8 @@ def color_map(
     gaussians: ActivatedGaussians, view: RasterView, rows: Tensor, pixels: Tensor | None, lost: float
 ) -> ListedWeights:
     """Return a color map, see `progdf.rasterize.engines.color_map`."""
-    pinhole, (x0, y0, x1, y1) = make_pinhole(view), view.crop
+    pinhole = make_pinhole(view)
+    x0, y0, x1, y1 = view.crop
     window = (y1 - y0) * (x1 - x0)
     chosen = np.arange(window) if pixels is None else pixels.numpy()
     positions = np.full(window, -1, np.int32)
@@ -292,18 +293,19 @@ def color_map(
     index = np.dtype(np.uint16 if TILE_H * (x1 - x0) < 1 << 16 else np.uint32)
 
     def list_tiles(begin: int, end: int) -> list[Array]:
-        most = int(lists.starts[end] - lists.starts[begin])
+        max_runs = int(lists.starts[end] - lists.starts[begin])
         room = -1
-        entry = ENTRY_ROOM * most
+        entry = ENTRY_ROOM * max_runs
         while entry > room:
             room = entry
-            out = _new_runs(most, entry, index)
+            out = _new_runs(max_runs, entry, index)
             run, entry = list_weights(begin, end, new_scratch(), splats, lists, pinhole, listed, out)
         return [*(part[:run].copy() for part in out[:3]), *(part[:entry].copy() for part in out[3:])]
 
     parts = _share(list_tiles, len(lists.starts) - 1, _MIN_TILES, _MAX_TILES)
     runs = Runs(*map(np.concatenate, zip(*parts, strict=True)))
-    return ListedWeights(len(rows), (y1 - y0, x1 - x0) if pixels is None else (len(pixels),), runs)
+    size = (y1 - y0, x1 - x0) if pixels is None else (len(pixels),)
+    return ListedWeights(len(rows), size, runs)
 
 
 def _new_runs(runs: int, entries: int, index: np.dtype[Any]) -> Runs:

@@ -78,7 +78,11 @@ def kernel(
         allocates: allow the kernel to create arrays. Without it, numba skips reference counting of the array
             arguments, which would make threads that share them wait at each call
     """
-    flags = FAST if fast else {"contract"} if contract else False
+    flags: set[str] | bool = False
+    if fast:
+        flags = FAST
+    elif contract:
+        flags = {"contract"}
 
     def compile_now(function: _F) -> _F:
         options = {"nogil": True, "error_model": "numpy", "forceinline": inline, "_nrt": allocates}
