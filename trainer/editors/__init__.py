@@ -91,7 +91,8 @@ def check_new_editor(options: EditorOptions) -> None:
         check_instruct(what, options)
     if kind == "decal":
         check_decal(what, options)
-    if (check := EDITORS[kind].check) is not None:
+    check = EDITORS[kind].check
+    if check is not None:
         check(what)
 
 

@@ -158,9 +158,11 @@ def decal(given: EditorInput) -> DecalEditor:
     options = given.options
     camera = decal_camera(options.camera, scene.origin)
     place = parse_place(options.at, camera)
-    if (shrink := _MAX_DECAL_SIDE_PX / place.size) < 1.0:
-        size = max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink))
-        camera = camera.resize(*size)
+    shrink = _MAX_DECAL_SIDE_PX / place.size
+    if shrink < 1.0:
+        width = max(1, round(camera.width * shrink))
+        height = max(1, round(camera.height * shrink))
+        camera = camera.resize(width, height)
         place = replace(place, x=place.x * shrink, y=place.y * shrink, size=_MAX_DECAL_SIDE_PX)
     (camera,) = with_near_plane([camera], scene)
     view = make_view(scene, region, camera, torch.tensor(BACKGROUND))

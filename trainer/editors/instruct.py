@@ -165,7 +165,8 @@ def instruct(given: EditorInput) -> InstructEditor:
 
     The model and its options are checked now. Weights are loaded on first use.
     """
-    options, request = given.options, resolve_request(given.what, given.options)
+    options = given.options
+    request = resolve_request(given.what, options)
 
     @cache
     def pipeline() -> MixedSteps:

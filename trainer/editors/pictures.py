@@ -97,14 +97,15 @@ def pictures(given: EditorInput) -> PicturesEditor:
     bends = {}
     intervals = list(pairwise((0.0, *stages)))
     for before, after in intervals:
-        first, last = (
-            torch.cat([by_strength[s] for by_strength in images.values()]) for s in (before, after)
-        )
+        first = torch.cat([by_strength[before] for by_strength in images.values()])
+        last = torch.cat([by_strength[after] for by_strength in images.values()])
         weights = (last - first).norm(dim=2)
         bends[after] = bend_of(typical_color(first, weights), typical_color(last, weights))
     parts = -(-_MIN_STRENGTHS // len(stages))
+    if len(stages) == 1:
+        return PicturesEditor(images, bends, ())
     between = [a + (b - a) * (k + 1) / parts for a, b in intervals for k in range(parts - 1)]
-    return PicturesEditor(images, bends, tuple(sorted({*between, *stages})) if len(stages) > 1 else ())
+    return PicturesEditor(images, bends, tuple(sorted({*between, *stages})))
 
 
 def read_edit(scene: Gaussians, camera: Camera, image: Tensor, path: Path) -> Tensor:
@@ -254,7 +255,8 @@ def background_of(
         rgb. [3] The run's own background, unless another color halves the error where the scene is
         transparent.
     """
-    run, weight = torch.tensor(BACKGROUND), clear[..., 0].double()
+    run = torch.tensor(BACKGROUND)
+    weight = clear[..., 0].double()
     difference = picture - original
     candidates = ((run + difference / clear.clamp_min(1e-6)) * 255.0).round().clamp(0, 255).long()
     # the minimum of Σ clear·|difference − clear·(color − run)| is the median with weights clear²
@@ -293,9 +295,8 @@ def resize_image(image: Tensor, size: tuple[int, int]) -> Tensor:
 
 def lay_over(original: Tensor, picture: Tensor) -> Tensor:
     """Return the picture with a shift of up to two pixels undone. [H,W,3] each"""
-    original_smooth, picture_smooth = (
-        ndimage.uniform_filter(image.numpy(), (3, 3, 1)) for image in (original, picture)
-    )
+    original_smooth = ndimage.uniform_filter(original.numpy(), (3, 3, 1))
+    picture_smooth = ndimage.uniform_filter(picture.numpy(), (3, 3, 1))
     steps = [
         np.abs(move_image(original_smooth, shift) - original_smooth).max(axis=2) for shift in ((0, 1), (1, 0))
     ]
@@ -308,7 +309,8 @@ def lay_over(original: Tensor, picture: Tensor) -> Tensor:
     )
 
     rows, columns = np.nonzero(edges)
-    expected, (height, width) = original_smooth[rows, columns], edges.shape
+    expected = original_smooth[rows, columns]
+    height, width = edges.shape
 
     def misfit(shift: tuple[int, int]) -> float:
         shifted = picture_smooth[

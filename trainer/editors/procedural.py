@@ -136,13 +136,15 @@ def edit_course(editor: ImageEditor, view: View) -> Callable[[float], Tensor]:
 
 def recolor(given: EditorInput) -> ColorEditor:
     """Return the editor of `recolor:#rrggbb[,path=hue]`: another color with the same shading."""
-    (target, path), typical = paint_of(given.what), region_color(given)
+    target, path = paint_of(given.what)
+    typical = region_color(given)
     return ColorEditor(lambda rgb: color.recolor_course(rgb, target, typical, path))
 
 
 def tint(given: EditorInput) -> ColorEditor:
     """Return the editor of `tint:#rrggbb[,path=hue]`: a wash of color with the same lightness."""
-    (target, path), typical = paint_of(given.what), region_color(given)
+    target, path = paint_of(given.what)
+    typical = region_color(given)
     return ColorEditor(lambda rgb: color.tint_course(rgb, target, typical, path))
 
 
@@ -184,7 +186,9 @@ def remove(given: EditorInput) -> RemoveEditor:
 
 def stripe_frame(points: Tensor) -> tuple[Tensor, float, float]:
     """Return the world axis [3] of the widest spread of points [M,3]; period of seven stripes; phase."""
-    low, high = (torch.quantile(points[:: max(1, len(points) // 100_000)], q, dim=0) for q in (0.01, 0.99))
+    sample = points[:: max(1, len(points) // 100_000)]
+    low = torch.quantile(sample, 0.01, dim=0)
+    high = torch.quantile(sample, 0.99, dim=0)
     longest = int((high - low).argmax())
     axis = torch.zeros(3)
     axis[longest] = 1.0

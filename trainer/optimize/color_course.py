@@ -62,10 +62,12 @@ class Course:
                 continue
             smooth = torch.tensordot(weights[2 * i + 1].float(), offsets, 1)
             error = max(self.look(float(places[2 * i + 1])).error(smooth), LEVEL)
-            expected = (0.5 * math.sqrt(errors[i]) * (i > 0) + 0.5 * math.sqrt(errors[i + 1])) ** 2
+            left_root = math.sqrt(errors[i]) if i > 0 else 0.0
+            expected = (0.5 * left_root + 0.5 * math.sqrt(errors[i + 1])) ** 2
             if (end - begin) * math.log(error / max(expected, LEVEL)) > -math.log(MORE_PAYS):
                 added.append((begin + end) / 2)
-        self.targets += self.ask(added) if added else ()
+        if added:
+            self.targets += self.ask(added)
         return bool(added)
 
     def sort_recordings(
@@ -122,13 +124,16 @@ def thin_model(model: Model, solver: Solver, targets: Sequence[Target], steps: i
     if richer:
         refined, error = refine([pad(one, (0, 0, 0, richer - model.bands)) for one in best], steps)
         tried.append((f"with a residual of {richer}{suffix}", decibels(error / len(targets))))
-        best, min_error = (refined, error) if error < MORE_PAYS * min_error else (best, min_error)
+        if error < MORE_PAYS * min_error:
+            best = refined
+            min_error = error
     thinner = best
     error = min_error
     while error * MORE_PAYS <= min_error + len(targets) * spare:
         best = thinner
         min_error = min(min_error, error)
-        if not bool((halved := solver.halve(best))[-1][:, 1:].any()):
+        halved = solver.halve(best)
+        if not bool(halved[-1][:, 1:].any()):
             break
         thinner, error = refine(halved, min(LOOKS, steps - 1))
         total = float(thinner[-1].any(dim=2).float().sum(dim=1).mean())
@@ -172,7 +177,8 @@ def solve(
 
     def learn(index: int) -> None:
         """Store the solution and the error of a target."""
-        (stage, judge), table = course.targets[index], made[index].table
+        stage, judge = course.targets[index]
+        table = made[index].table
         assert table is not None
         offsets = member_bands(made[index].offsets.float())
         residuals[stage.strength] = (offsets - solver.map_offsets(model.degree, table))[:, : model.bands]

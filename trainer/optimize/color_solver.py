@@ -114,13 +114,14 @@ class Model:
     @property
     def line(self) -> str:
         """Description of the choice and its candidates, for the log."""
-        functions = f"{self.bands} SH function{'s' * (self.bands > 1)}"
+        functions = f"{self.bands} SH functions" if self.bands > 1 else f"{self.bands} SH function"
         if self.bands > 1 and self.functions < self.bands:
             functions += f", {self.functions:.1f} of them a Gaussian"
         residual = f"and a residual of {functions}" if self.bands else "alone"
         candidates = ", ".join(f"{name} {error:.1f}" for name, error in self.tried)
         color_map = f"a map of color of degree {self.degree}" if self.degree else "no map"
-        color_map += "" if self.mask is None else ", a mask of it"
+        if self.mask is not None:
+            color_map += ", a mask of it"
         rule = "what leaves least" if self.hold in _TIED_RIDGES else "the least within a twentieth"
         return f"{color_map} {residual}, {rule}; dB: {candidates}"
 
@@ -302,7 +303,9 @@ class Solver:
         preconditioned = direction = inverse @ gradient.descent
         best = current
         taken = 0
-        errors = [math.inf] * (LOOKS - 1) + [math.inf if look is None else look(current)]
+        errors = [math.inf] * LOOKS
+        if look is not None:
+            errors[-1] = look(current)
         while taken < steps:
             step_length = _inner(gradient.descent, direction) / max(
                 self._curvature(gradient, direction, ridge), 1e-30
@@ -388,7 +391,8 @@ def make_solver(views: Sequence[ColorView], original: Tensor, ties: Ties | None 
         original: raw member rows. [M,14+]
         ties: ties between neighbors, if there are few views
     """
-    ones, weights = original.new_ones(len(original), 3), torch.zeros(())
+    ones = original.new_ones(len(original), 3)
+    weights = torch.zeros(())
     weighed = iterate_views(lambda view: view.map.gradient(view.map.picture(ones) * view.counts)[:, 0], views)
     for view, weight in zip(views, weighed, strict=True):
         bands = view.basis[:, : BANDS[-1]]
@@ -457,10 +461,13 @@ class _ModelSearch:
         errors_without_mask = {one.bands: one.error for one in sorted(self.tried, key=lambda one: -one.error)}
         # a mask costs one byte, DC three: expect a third of its gain
         max_error = alone * (errors_without_mask.get(1, alone) / alone) ** (1 / 3)
-        # the mask is estimated from the residual that spreads everywhere
         tried = [best]
-        guess = (self.tried[-len(_TIED_RIDGES)] if self.few else best).change
-        for hold in (_TIED_RIDGES[0], _TIED_RIDGES[-1]) if self.few else (_RESIDUAL_RIDGE,):
+        mask_holds: tuple[float, ...] = (_RESIDUAL_RIDGE,)
+        guess = best.change
+        if self.few:  # estimate the mask from the residual that spreads everywhere
+            mask_holds = (_TIED_RIDGES[0], _TIED_RIDGES[-1])
+            guess = self.tried[-len(_TIED_RIDGES)].change
+        for hold in mask_holds:
             solver = best.solver.guess_mask(guess, best.degree > 0, hold)
             if min(self.judge.error(self.start(degree, solver).offsets) for degree in MONOMIALS) >= max_error:
                 continue
@@ -469,7 +476,8 @@ class _ModelSearch:
             masked = [self.attempt(base, f"a mask of degree {base.degree}", 0, best.hold) for base in bases]
             base = bases[_smallest(masked, lambda one: one.degree).degree - 1]
             base = replace(base, residual=(guess - base.offsets)[:, :1])
-            tried += [] if self.few else masked  # with few pictures a mask needs a residual
+            if not self.few:  # with few pictures a mask needs a residual
+                tried += masked
             for name, bands, held in self.residuals:
                 base = self.attempt(base, f"with a mask and {name}", bands, held)
                 tried.append(base)

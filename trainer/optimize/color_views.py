@@ -163,7 +163,8 @@ def add_pulls(basis: Array, pull: Array, offsets: Array) -> None:
 
 def color_view(crop: CropScene, original: Tensor, every: int, index: int) -> ColorView:
     """Return the `index`th of `color_views`."""
-    camera, (height, width) = crop.camera, crop.size
+    camera = crop.camera
+    height, width = crop.size
     place = torch.arange(width) + every // 2 * torch.arange(height)[:, None] + index
     pixels = (place % every == 0).flatten().nonzero()[:, 0]
     members = unpack(original, crop.member_shN)
@@ -270,7 +271,8 @@ def fit_maps(views: Sequence[ColorView], share: Tensor, most: int = _MAX_FIT_PIX
     stride = max(1, -(-sum(map(len, covered)) // most))
     pixels = [some[::stride].clone() for some in covered]
     layouts = map_threads(lay_out, range(len(views)))
-    design, original = (torch.cat([one[i] for one in layouts]).double() for i in (0, 1))
+    design = torch.cat([one[0] for one in layouts]).double()
+    original = torch.cat([one[1] for one in layouts]).double()
     members = torch.stack([one[2] for one in layouts]).sum(dim=0)
     prior_weight = _MAP_PRIOR_WEIGHT * len(design) / max(1, len(views) * len(views[0].original))
     pixels = [view.pixels[some] for view, some in zip(views, pixels, strict=True)]

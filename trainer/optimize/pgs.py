@@ -70,7 +70,8 @@ class PgsState:
         self.moved = torch.zeros_like(rows, requires_grad=True)
         self.previous = torch.zeros_like(rows)
         self.average = torch.zeros_like(rows)
-        self.first, self.second = torch.zeros_like(rows), torch.zeros_like(rows)
+        self.first = torch.zeros_like(rows)
+        self.second = torch.zeros_like(rows)
         self.pictures: Sequence[Tensor] = ()
         self.step = self.stage = self.local = 0
         self.running = math.nan
@@ -132,9 +133,8 @@ class PgsState:
     def capture_state(self) -> Saved:
         """Return the state for saving (see `state.Resumable`)."""
         # For a solved edit the moments are 0 and the mean equals the offsets.
-        tensors = {
-            name: rows for name in _ROW_FIELDS if bool(_bit_patterns(rows := getattr(self, name)).any())
-        }
+        tensors = {name: getattr(self, name) for name in _ROW_FIELDS}
+        tensors = {name: rows for name, rows in tensors.items() if bool(_bit_patterns(rows).any())}
         if torch.equal(_bit_patterns(self.average), _bit_patterns(self.moved)):
             tensors.pop("average", None)
         else:
@@ -162,7 +162,8 @@ class PgsState:
             setattr(self, name, getattr(values, name))
         self.running = math.nan if values.running is None else values.running
         self.means.sums = dict(values.means)
-        self._order, self._queue = generator(tensors["order"]), list(values.queue)
+        self._order = generator(tensors["order"])
+        self._queue = list(values.queue)
 
 
 def _bit_patterns(rows: Tensor) -> Tensor:
@@ -260,12 +261,14 @@ def pgs_settings(
     rates = learning_rates(options.kind if options.rates == "kind" else options.rates, channels, extent)
     if not bands:
         rates[BASE_CHANNELS:] = 0.0
+    # A single target is approached slowly: fast steps cause speckles of all colors half way.
+    ramp = 0.9 if stages == 1 else 0.6
+    fall = 1.0 if stages == 1 else FALL
     return PgsSettings(
         rates,
         raised=not printed,
-        # A single target is approached slowly: fast steps cause speckles of all colors half way.
-        ramp=(0.9 if stages == 1 else 0.6) if recolors and options.target_ramp else 0.0,
-        fall=0.0 if printed else 1.0 if stages == 1 else FALL,
+        ramp=ramp if recolors and options.target_ramp else 0.0,
+        fall=0.0 if printed else fall,
         reach=REACH if recolors and not printed else 0.0,
         smoothing=0.9 if options.ema else 0.0,
         # a run too short for the paper's interval still records four times

@@ -167,7 +167,10 @@ def straight_recordings(
         return (length(a, b) + length(b, c)) / max(length(a, c), 1e-12) - 1.0
 
     cost = {k: excess(i) for i, k in enumerate(nodes) if k not in fixed}
-    while cost and cost[worst := max(cost, key=lambda k: cost[k])] > detour:
+    while cost:
+        worst = max(cost, key=lambda k: cost[k])
+        if cost[worst] <= detour:
+            break
         index = nodes.index(worst)
         del nodes[index], cost[worst]
         for near in (index - 1, index):

@@ -238,10 +238,10 @@ def _disc_error(image: Array, height: int, width: int) -> Array:
         mode="nearest",
         truncate=4.0,
     )
-    y, x = (slice(side // 2, side // 2 + size) for side, size in ((height, rows), (width, columns)))
-    above, before = (
-        slice((side - 1) // 2, (side - 1) // 2 + size) for side, size in ((height, rows), (width, columns))
-    )
+    y = slice(height // 2, height // 2 + rows)
+    x = slice(width // 2, width // 2 + columns)
+    above = slice((height - 1) // 2, (height - 1) // 2 + rows)
+    before = slice((width - 1) // 2, (width - 1) // 2 + columns)
     seen = 0.25 * (weighed[y, x] + weighed[above, x] + weighed[y, before] + weighed[above, before])
     # the weights of the blur add up to 1, those of a disc to 2π times both standard deviations
     area = 2 * np.pi * spread[0] * spread[1] / (height * width)
@@ -437,7 +437,9 @@ def project_paint(scene: Gaussians, own: Camera, drawn: Tensor, camera: Camera) 
     y, x = np.mgrid[: surface.shape[0] : step, : surface.shape[1] : step]
     K = own.K.double().numpy()
     other_K = camera.K.double().numpy()
-    y, x, z = y + top + 0.5, x + left + 0.5, surface[y, x]
+    z = surface[y, x]
+    y = y + top + 0.5
+    x = x + left + 0.5
     rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1)
     to_other = (camera.viewmat.double() @ torch.linalg.inv(own.viewmat.double())).numpy()
     points = (rays * z[..., None]) @ to_other[:3, :3].T + to_other[:3, 3]
@@ -446,7 +448,8 @@ def project_paint(scene: Gaussians, own: Camera, drawn: Tensor, camera: Camera) 
     u, v = (points[..., i] / depth * other_K[i, i] + other_K[i, 2] for i in (0, 1))
     if min(surface[::step, ::step].shape) < 2:
         return result
-    (uy, ux), (vy, vx) = np.gradient(u), np.gradient(v)
+    uy, ux = np.gradient(u)
+    vy, vx = np.gradient(v)
     front &= ux * vy - uy * vx > 0  # surfaces that face away are hidden by those that face the camera
     if front.sum() < 3 or np.ptp(u[front]) < 1e-6 or np.ptp(v[front]) < 1e-6:
         return result

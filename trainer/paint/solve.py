@@ -33,7 +33,10 @@ _MIN_MARGIN_PX = 32  # pixels; minimum margin around the paint in which colors a
 def box_of(painted: Tensor, camera: Camera) -> Crop:
     """Return the paint's window with half its size added on each side, where moved rows may be visible."""
     rows, columns = painted.nonzero().T
-    (top, bottom), (left, right) = ((int(axis.min()), int(axis.max()) + 1) for axis in (rows, columns))
+    top = int(rows.min())
+    bottom = int(rows.max()) + 1
+    left = int(columns.min())
+    right = int(columns.max()) + 1
     margin = _MIN_MARGIN_PX + max(bottom - top, right - left) // 2
     return (
         max(0, left - margin),
