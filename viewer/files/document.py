@@ -76,7 +76,8 @@ class Document:
 
     def facts(self) -> SceneFacts:
         """Compute the facts for the panel and the camera."""
-        scene, added = self.scene, [gdf.members - len(gdf.region) for gdf in self.edits]
+        scene = self.scene
+        added = [gdf.members - len(gdf.region) for gdf in self.edits]
         neighborhood = _once(lambda: Neighborhood(scene))
         return SceneFacts(
             title=self.title,
@@ -109,7 +110,8 @@ class Document:
 
 def _once(make: Callable[[], _Made]) -> Callable[[], _Made]:
     """Return a thread-safe function that calls `make` once, on first use. Concurrent callers wait."""
-    lock, cached = threading.Lock(), cache(make)
+    lock = threading.Lock()
+    cached = cache(make)
 
     def ask() -> _Made:
         with lock:

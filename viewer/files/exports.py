@@ -103,9 +103,11 @@ def _writable(folder: Path, what: str) -> Iterator[None]:
 def free_path(folder: Path, stem: str, suffix: str) -> Path:
     """Return the path STEM_001 with `suffix`, or with the next free number."""
     number = 1
-    while (path := folder / f"{stem}_{number:03d}{suffix}").exists():
+    while True:
+        path = folder / f"{stem}_{number:03d}{suffix}"
+        if not path.exists():
+            return path
         number += 1
-    return path
 
 
 def keep_region(state: SelectionState, name: str, folder: Path, total: int) -> SelectionState:
@@ -177,7 +179,8 @@ def write_region(region: NamedRegion, total: int) -> None:
 
 def region_folders(session: Path, scene: Path) -> tuple[Path, ...]:
     """Return the folders that may hold a session's region files: its own, and those of edits of its scene."""
-    scene, edits = scene.resolve(), edits_folder(scene)
+    edits = edits_folder(scene)
+    scene = scene.resolve()
     # not resolved, as the folder of edits itself may be a symbolic link to elsewhere
     beside = scene.with_name(f"{scene.stem}.edits")
     return session.resolve().parent, beside, edits.parent.resolve() / edits.name

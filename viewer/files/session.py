@@ -155,7 +155,7 @@ def open_session(path: Path) -> WindowSession:
     )
     warning = ""
     if moved:
-        more = f" and {len(moved) - 1} more" * (len(moved) > 1)
+        more = f" and {len(moved) - 1} more" if len(moved) > 1 else ""
         warning = escape_text(
             f"{path.name}: region {moved[0]}{more} named no {REGION_SUFFIX} file in the session's folder: "
             "unsaved until the session is saved"
@@ -401,5 +401,5 @@ def stem(session: Path) -> str:
 
 def _numbered_paths(session: Path, kind: str = "") -> Iterator[Path]:
     """Yield NAME, NAME-2, NAME-3 …; with a kind NAME.kind, NAME.kind-2 …"""
-    names = numbered_names(stem(session) + f".{kind}" * bool(kind), SUFFIX)
-    return map(session.with_name, names)
+    name = f"{stem(session)}.{kind}" if kind else stem(session)
+    return map(session.with_name, numbered_names(name, SUFFIX))

@@ -76,9 +76,17 @@ def describe_age(seconds: float) -> str:
     """Describe an age: "just now", "5 min ago", "3 h ago", "yesterday", "12 days ago" or "4 months ago"."""
     minutes = int(seconds / 60.0)
     days = int(seconds / 86_400.0)
+    if days >= 60:
+        return f"{days // 30} months ago"
+    if days == 1:
+        return "yesterday"
     if days:
-        return "yesterday" if days == 1 else f"{days} days ago" if days < 60 else f"{days // 30} months ago"
-    return "just now" if minutes < 2 else f"{minutes} min ago" if minutes < 90 else f"{minutes // 60} h ago"
+        return f"{days} days ago"
+    if minutes >= 90:
+        return f"{minutes // 60} h ago"
+    if minutes >= 2:
+        return f"{minutes} min ago"
+    return "just now"
 
 
 def read_layout() -> Layout:

@@ -139,7 +139,8 @@ class SplatRenderer:
         if self._drawn and self._scene is not None and self._buffers is not None:
             self._scene.bind(self._project)
             _set_camera(self._project, camera)
-            self._project["antialiased"], self._project["activated"] = self._antialiased, self._activated
+            self._project["antialiased"] = self._antialiased
+            self._project["activated"] = self._activated
             self._project["highlighted"] = self._highlights is not None
             if self._highlights is not None:
                 self._highlights.bind(self._project, len(self._scene.textures))

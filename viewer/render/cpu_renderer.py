@@ -57,7 +57,8 @@ class _PendingPicture:
 
     def _draw(self, gaussians: ActivatedGaussians) -> float:
         """Draw all bands and return the time taken, ms."""
-        began, (height, width) = time.perf_counter(), self.picture.through.shape
+        started = time.perf_counter()
+        height, width = self.picture.through.shape
         count = min(1 + len(gaussians.means) // BAND, MAX_BANDS, -(-height // MIN_ROWS))
         bands = [(height * k // count, height * (k + 1) // count) for k in range(count)]
         with stopped_by(self.stop):
@@ -65,7 +66,7 @@ class _PendingPicture:
                 part = _draw(gaussians, self.picture.shown, (0, top, width, end))
                 self.picture.image[top:end], self.picture.through[top:end] = part
                 self.bands.append((top, end))
-        return 1e3 * (time.perf_counter() - began)
+        return 1e3 * (time.perf_counter() - started)
 
 
 class CpuRenderer:
@@ -128,7 +129,8 @@ class CpuRenderer:
             self.begun_ms = pending.drawn.result()
             picture = pending.picture.image, pending.picture.through
         picture = picture or _draw(self._scene.drawn, shown)
-        if (coarse := self._coarse(shown)) is not None:
+        coarse = self._coarse(shown)
+        if coarse is not None:
             self._scene.measure(coarse.image, picture[0])
         self._cancel()
         self._rendered = _Rendered(*picture, shown)
@@ -188,8 +190,10 @@ class CpuRenderer:
             top, end = pending.bands[self._bands]
             image = pending.picture.image[top:end]
             through = pending.picture.through[top:end]
-            band_lines = lines * ([picture.shown.pixels] * 4 + [1] * 10) - ([0, top] * 2 + [0] * 10)
-            with lines_behind(image, through, band_lines.astype(np.float32), CLEAR):
+            ends = lines[:, :4].astype(np.float64) * picture.shown.pixels - [0, top, 0, top]
+            band_lines = lines.copy()
+            band_lines[:, :4] = ends
+            with lines_behind(image, through, band_lines, CLEAR):
                 self._copy.write(image, top)
             self._bands += 1
         self._copy.show(screen)

@@ -210,7 +210,9 @@ class LiveScene:
         )
         self._scene = scene
         self._highlights: Array | None = None  # rgb and share, 0 to 1; None for no highlights. [N,4]
-        self._budget, self._finest, self._max_finest = BUDGETS[1], FINE[1], FINE[1]
+        self._budget = BUDGETS[1]
+        self._finest = FINE[1]
+        self._max_finest = FINE[1]
         self._limit = 0.0  # error limit of the last picture in motion, pixels²; 0 if it had all Gaussians
         self._pyramid: Future[Pyramid] | None = None
         # outdated rows of the pyramid: 0 up to date, 1 colors only, 2 more. [N] uint8
@@ -218,7 +220,8 @@ class LiveScene:
 
     def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> None:
         """See `GlRenderer.update`."""
-        self._scene, names = scene, tuple(attributes)
+        self._scene = scene
+        names = tuple(attributes)
         highlighted = self._highlights is not None and any(name in SH for name in names)
         names = tuple(dict.fromkeys((*names, *SH))) if highlighted else names
         for first, last in row_runs(rows):  # slices are many times faster than indices
@@ -264,17 +267,24 @@ class LiveScene:
         started = time.perf_counter()
         pyramid = future.result()
         for lacks in (2, 1):
-            if len(rows := np.flatnonzero(self._outdated == lacks)):
+            rows = np.flatnonzero(self._outdated == lacks)
+            if len(rows):
                 pyramid.refresh(rows, colors_only=lacks == 1)
-        self._outdated[:], pyramid.finest = 0, self._finest
+        self._outdated[:] = 0
+        pyramid.finest = self._finest
         fewer = pyramid.simplify(camera, self._budget, pixels)
         self._limit = pyramid.limit
         picture = draw(fewer)
-        taken_ms, (low, high) = 1e3 * (time.perf_counter() - started), MOVING_MS
+        taken_ms = 1e3 * (time.perf_counter() - started)
+        low, high = MOVING_MS
         if taken_ms > high or (taken_ms < low and len(fewer.means) > 0.8 * self._budget):
             budget = int(self._budget * (0.85 if taken_ms > high else 1.15))
             self._budget = min(max(budget, BUDGETS[0]), BUDGETS[2])
-        finest = self._finest * (1.15 if taken_ms > FINE_MS[1] else 0.85 if taken_ms < FINE_MS[0] else 1.0)
+        finest = self._finest
+        if taken_ms > FINE_MS[1]:
+            finest *= 1.15
+        elif taken_ms < FINE_MS[0]:
+            finest *= 0.85
         self._finest = min(max(finest, FINE[0]), self._max_finest)
         return picture
 

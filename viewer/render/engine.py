@@ -212,7 +212,8 @@ class ViewEngine:
         compose_ms, upload_ms, changed = self._compose(target.edits)
         highlight_ms = self._apply_highlight(highlight)
         started = time.perf_counter()
-        camera, viewmat = replace(camera, near=self.near), camera.viewmat.numpy().tobytes()
+        viewmat = camera.viewmat.numpy().tobytes()
+        camera = replace(camera, near=self.near)
         if self.renderer.wants_order and pixels == 1 and self._ordered_for != viewmat:
             self.order = back_to_front(self.composer.gaussians.means.numpy(), camera)
             self._ordered_for = viewmat
@@ -272,7 +273,9 @@ class ViewEngine:
 
 def draws_with(ctx: moderngl.Context | None, draw: str) -> str:
     """Resolve "auto" in a context: "gl" if OpenGL is hardware-accelerated, else "cpu"."""
-    return draw if draw != "auto" else "cpu" if ctx is None or is_software(ctx) else "gl"
+    if draw != "auto":
+        return draw
+    return "cpu" if ctx is None or is_software(ctx) else "gl"
 
 
 def _with_hidden(highlight: Highlight | None, view: ViewState) -> Highlight | None:

@@ -63,7 +63,9 @@ class GlRenderer:
 
     def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> None:
         """Update the given attributes of the given sorted rows [R]."""
-        self._scene, self._shown, names = scene, None, tuple(attributes)
+        self._scene = scene
+        self._shown = None
+        names = tuple(attributes)
         self._renderer.update(scene, names, rows)
         if self._moving is not None:
             self._moving[0].update(scene, names, rows)

@@ -68,7 +68,8 @@ def requested_highlight(
     """
     if view.compare.mode != "off":
         return None
-    state, kind, index = view.selection, *(pointed or ("", 0))
+    state = view.selection
+    kind, index = pointed or ("", 0)
     if kind == "layer" and index < len(view.layers):
         return Highlight(region=view.layers[index].gdf)
     if view.brush.active:

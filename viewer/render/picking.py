@@ -175,7 +175,9 @@ class Surfaces:
         if (key, colors) == (self._key, self._colors):
             return False
         self.drop()
-        self._key, self._colors, self._surface = key, colors, make()
+        self._surface = make()
+        self._key = key
+        self._colors = colors
         beside(self._surface.prepare, colors)
         return True
 

@@ -282,7 +282,8 @@ def _close_or_unfocus(workspace: Workspace, _: str) -> Workspace:
         return replace(workspace, help=False)
     if workspace.view.brush.active:
         return _change_brush(workspace, active=False)
-    if tool := workspace.view.select.tool:
+    tool = workspace.view.select.tool
+    if tool:
         return _toggle_tool(workspace, tool)
     if workspace.form_open:
         return replace(workspace, form_open=False)
@@ -307,7 +308,9 @@ def _rename_group(workspace: Workspace, argument: str) -> Workspace:
 def _toggle_cards(workspace: Workspace, _: str) -> Workspace:
     """Toggle compact layer rows. The mode becomes "auto" if that gives the requested result."""
     compact = not is_compact(workspace)
-    cards = "auto" if compact != workspace.cards_fit else "compact" if compact else "full"
+    cards = "compact" if compact else "full"
+    if compact != workspace.cards_fit:
+        cards = "auto"
     return replace(workspace, view=replace(workspace.view, cards=cards))
 
 

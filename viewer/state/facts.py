@@ -76,7 +76,8 @@ def layer_rows(scene: Gaussians, gdfs: Sequence[Gdf], added: Sequence[int] = ())
 
 
 def _row(scene: Gaussians, gdf: Gdf, gdfs: Sequence[Gdf], added: int) -> LayerRow:
-    members, region_options = gdf.region.members, gdf.options.get("region")
+    members = gdf.region.members
+    region_options = gdf.options.get("region")
     return LayerRow(
         count=len(members),
         swatch=_mean_color(scene, gdf),

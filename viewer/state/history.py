@@ -250,8 +250,10 @@ def _describe_change(before: HistoryEntry, after: HistoryEntry) -> str:
         added = new.keys() - old.keys()
         removed = old.keys() - new.keys()
         names = [new[gdf].name for gdf in added] or [old[gdf].name for gdf in removed]
-        done = "replace" if added and removed else "add" if added else "delete"
-        return f"{done} {_name_or_count(names)}"
+        verb = "add" if added else "delete"
+        if added and removed:
+            verb = "replace"
+        return f"{verb} {_name_or_count(names)}"
     for attribute, word in _LAYER_LABELS.items():
         names = [new[gdf].name for gdf in new if getattr(old[gdf], attribute) != getattr(new[gdf], attribute)]
         if names:

@@ -49,7 +49,8 @@ def press(workspace: Workspace, argument: str) -> Workspace:
             the layers that the panel lists, so that a range covers listed layers only
     """
     how, at, listed = argument.split(":")
-    index, listed_indices = int(at), [int(i) for i in listed.split(",") if i]
+    index = int(at)
+    listed_indices = [int(i) for i in listed.split(",") if i]
     layers = workspace.view.layers
     focus = workspace.focus
     chosen = selected_layers(workspace)

@@ -126,7 +126,11 @@ def step_layers(view: ViewState, indices: Collection[int], by: int) -> ViewState
     at = passed + 1 if by > 0 else passed
     below = next((remaining[i] for i in range(at - 1, -1, -1) if i in remaining), "")
     above = next((remaining[i] for i in range(at, len(view.layers)) if i in remaining), "")
-    joined = below if below == above or {below} == groups else above if {above} == groups else ""
+    joined = ""
+    if below == above or {below} == groups:
+        joined = below
+    elif {above} == groups:
+        joined = above
     return move_layers(view, indices, at, joined)
 
 

@@ -210,9 +210,12 @@ def with_message(
         seconds: time that it stays visible, unless it is an error or has details or a button
         button: label and action of its button
     """
-    until = now + (DETAILS_S if details else ERROR_S if error or button[0] else seconds)
+    if details:
+        seconds = DETAILS_S
+    elif error or button[0]:
+        seconds = ERROR_S
     text = escape_text(" ".join(text.split()))
-    return replace(workspace, message=Message(text, until, error, details, button))
+    return replace(workspace, message=Message(text, now + seconds, error, details, button))
 
 
 def record_undo(workspace: Workspace) -> Workspace:
