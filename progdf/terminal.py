@@ -136,13 +136,13 @@ _LONG_WORD = re.compile(r"[^\s'\"]{81,}")
 
 def _shorten_word(match: re.Match[str]) -> str:
     word = match[0].rstrip(":;,.)")
-    rest = match[0][len(word) :]
+    suffix = match[0][len(word) :]
     folder = os.path.dirname(word)
     if len(word) <= _MAX_PATH and folder:
         return match[0]
     if os.path.lexists(word) or (folder and os.path.isdir(folder)):
         return match[0]
-    return shorten(word) + rest
+    return shorten(word) + suffix
 
 
 def print_line(line: str) -> None:

@@ -170,10 +170,14 @@ class ColorGrade:
     @property
     def is_neutral(self) -> bool:
         """True if the grade changes nothing."""
-        still = all(self.values.get(name, neutral) == neutral for name, (*_, neutral) in GRADE_RANGES.items())
-        stays = all(torch.equal(source, target) for source, target in self.palette)
+        has_neutral_values = all(
+            self.values.get(name, neutral) == neutral for name, (*_, neutral) in GRADE_RANGES.items()
+        )
+        has_neutral_palette = all(torch.equal(source, target) for source, target in self.palette)
         curves = (*self.palette_curves, self.curve)
-        return still and stays and all(x == y for curve in curves for x, y in curve)
+        return (
+            has_neutral_values and has_neutral_palette and all(x == y for curve in curves for x, y in curve)
+        )
 
 
 def parse_grade(what: str) -> ColorGrade:
@@ -229,8 +233,8 @@ def _curve_of(what: str, text: str) -> Curve:
     """Return the points of a curve such as `0.3:0.2+0.7:0.8`."""
     points = [tuple(number_of(n) for n in point.split(":")) for point in text.split("+")]
     curve = tuple((p[0], p[1]) for p in points if len(p) == 2 and all(0.0 <= x <= 1.0 for x in p))
-    rises = all(a[0] < b[0] for a, b in pairwise(curve))
-    if len(curve) < len(points) or not rises:
+    is_ascending = all(a[0] < b[0] for a, b in pairwise(curve))
+    if len(curve) < len(points) or not is_ascending:
         raise ProgdfError(
             f"in grade:{what:.80} the curve is '{text:.40}'; write FROM:TO+FROM:TO, each 0 to 1, FROM rising"
         )

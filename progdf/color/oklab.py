@@ -121,15 +121,15 @@ def bend_of(reference: Tensor, target: Tensor, path: ColorPath = "bowed") -> Ben
     if path in ("straight", "srgb"):
         return replace(STRAIGHT, fade=path == "srgb")
     start, end = (hue_of(srgb_to_oklab(color.clamp(0, 1))) for color in (reference, target))
-    short = _wrap(end - start)
+    difference = _wrap(end - start)
     to_green = _wrap(_GREEN - start)
-    over_green = bool(to_green * short > 0) and bool(to_green.abs() <= short.abs())
+    over_green = bool(to_green * difference > 0) and bool(to_green.abs() <= difference.abs())
     opposite, green, bow, whole, none = {
         "bowed": (170.0, False, 0.4, 15.0, 60.0),
         "hue": (140.0, True, 1.0, 45.0, 120.0),
     }[path]
-    turns = float(short.abs()) >= math.radians(opposite) and over_green is not green
-    sense = 1.0 if bool(short > 0) is not turns else -1.0
+    is_reversed = float(difference.abs()) >= math.radians(opposite) and over_green is not green
+    sense = 1.0 if bool(difference > 0) is not is_reversed else -1.0
     return Bend(bow, sense, math.radians(whole), math.radians(none))
 
 
@@ -178,8 +178,8 @@ def color_course(rgb: Tensor, end: Tensor, bend: Bend) -> Callable[[Strength], T
 def _oklab_course(a: Tensor, b: Tensor, bend: Bend) -> Callable[[Tensor], Tensor]:
     """Return the path between OKLab colors as a function from strengths [...] to sRGB. [...,3], [...,3]"""
     chroma_a, chroma_b, hue = a[..., 1:].norm(dim=-1), b[..., 1:].norm(dim=-1), hue_of(a)
-    turn = bend.direction * _wrap(hue_of(b) - hue)  # −π to π, positive in the region's sense
-    alone = smoothstep(turn + math.pi, bend.whole, bend.none)
+    rotation = bend.direction * _wrap(hue_of(b) - hue)  # −π to π, positive in the region's sense
+    own_share = smoothstep(rotation + math.pi, bend.whole, bend.none)
     bow = bend.bow * 4 * chroma_a * chroma_b / (chroma_a + chroma_b).clamp_min(1e-6).square()
 
     def colors_at(s: Tensor) -> Tensor:
@@ -189,7 +189,7 @@ def _oklab_course(a: Tensor, b: Tensor, bend: Bend) -> Callable[[Tensor], Tensor
             turned = hue + bend.direction * s * angle
             return torch.stack([chroma * torch.cos(turned), chroma * torch.sin(turned)], dim=-1)
 
-        around = torch.lerp(rotate(turn + 2 * math.pi), rotate(turn), alone[..., None])
+        around = torch.lerp(rotate(rotation + 2 * math.pi), rotate(rotation), own_share[..., None])
         lab = torch.lerp(a, b, s[..., None])
         lab[..., 1:] += bow[..., None] * (around - lab[..., 1:])
         return fit_gamut(lab)

@@ -67,8 +67,8 @@ def find_palette(rgb: Tensor, weights: Tensor, count: int = COLORS) -> Tensor:
     roots = shares.sqrt()  # distinct colors count for more than their area, such as a scarf beside a lawn
     centers = colors[int(shares.argmax())][None]
     while len(centers) < min(count, len(colors)):  # add the cell with the largest weighted error
-        missed = roots * torch.cdist(colors, centers).amin(dim=1).square()
-        centers = torch.cat([centers, colors[int(missed.argmax())][None]])
+        errors = roots * torch.cdist(colors, centers).amin(dim=1).square()
+        centers = torch.cat([centers, colors[int(errors.argmax())][None]])
     for _ in range(_ITERATIONS):
         nearest = torch.cdist(colors, centers).argmin(dim=1)
         sums = torch.zeros_like(centers).index_add_(0, nearest, roots[:, None] * colors)
@@ -118,17 +118,17 @@ def shift_palette(lab: Tensor, sources: Tensor, targets: Tensor, curves: Sequenc
     if len(kernel_sources) > 1:
         weights = weights / weights.sum(dim=1, keepdim=True)
     lightness = lab.reshape(-1, 3)[:, :1].double()
-    own = sources[:, 0].double()
-    dark = lightness / own.clamp_min(1e-3)
-    bright = (1 - lightness) / (1 - own).clamp(1e-3, _WHITE_MARGIN)
-    fade = torch.minimum(dark, bright)
+    source_lightness = sources[:, 0].double()
+    dark_fade = lightness / source_lightness.clamp_min(1e-3)
+    bright_fade = (1 - lightness) / (1 - source_lightness).clamp(1e-3, _WHITE_MARGIN)
+    fade = torch.minimum(dark_fade, bright_fade)
     moved = (weights * fade.clamp(0, 1)) @ (targets - sources).double()
     shifted: Tensor = lab + moved.to(lab).reshape(lab.shape)
     if not any(curves):
         return shifted
     before = shifted[..., :1].clamp(0, 1)
-    bent = torch.cat([bend_lightness(before, curve) - before for curve in curves], dim=-1)
-    after = before + (weights.to(lab).reshape(bent.shape) * bent).sum(dim=-1, keepdim=True)
+    changes = torch.cat([bend_lightness(before, curve) - before for curve in curves], dim=-1)
+    after = before + (weights.to(lab).reshape(changes.shape) * changes).sum(dim=-1, keepdim=True)
     return torch.cat([after, shifted[..., 1:] * less_light(before, after)], dim=-1)
 
 
@@ -150,12 +150,12 @@ def bend_lightness(lightness: Tensor, curve: Sequence[tuple[float, float]]) -> T
         curve: points (input, output), 0 to 1, in ascending order of input
     """
     points = dict([(0.0, 0.0), (1.0, 1.0), *curve])
-    at = sorted(points)
-    table = PchipInterpolator(at, [points[x] for x in at])(np.linspace(0.0, 1.0, _CURVE_STEPS + 1))
+    inputs = sorted(points)
+    table = PchipInterpolator(inputs, [points[x] for x in inputs])(np.linspace(0.0, 1.0, _CURVE_STEPS + 1))
     steps = torch.from_numpy(table).to(lightness).clamp(0, 1)
-    place = lightness.clamp(0, 1) * _CURVE_STEPS
-    below = place.floor().long().clamp_max(_CURVE_STEPS - 1)
-    return torch.lerp(steps[below], steps[below + 1], place - below)
+    position = lightness.clamp(0, 1) * _CURVE_STEPS
+    below = position.floor().long().clamp_max(_CURVE_STEPS - 1)
+    return torch.lerp(steps[below], steps[below + 1], position - below)
 
 
 def _kernel_space(lab: Tensor) -> Tensor:

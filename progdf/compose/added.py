@@ -85,8 +85,8 @@ def _append_rows(scene: Gaussians, added: tuple[Gaussians, ...]) -> Gaussians:
     for rows in added:
         means = rows.means if rows.origin == scene.origin else (rows.world_means - origin)
         bands = fit_bands(rows.shN.flatten(1), shape.numel()).reshape(len(rows), *shape)
-        own = replace(rows, means=means.float(), shN=bands)
-        parts.append(own.to(scene.means.device, scene.means.dtype))
+        converted = replace(rows, means=means.float(), shN=bands)
+        parts.append(converted.to(scene.means.device, scene.means.dtype))
     return concatenate(parts)
 
 

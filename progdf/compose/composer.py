@@ -273,12 +273,12 @@ class Composer:
 
     def _check_weights(self, layers: Sequence[Layer]) -> None:
         """Check weights that are new or were modified, see `check_weights`."""
-        given = [(layer.weights, layer.weights._version) for layer in layers if layer.weights is not None]
+        checked = [(layer.weights, layer.weights._version) for layer in layers if layer.weights is not None]
         for layer in layers:
-            known = any(w is layer.weights and version == w._version for w, version in self._checked)
-            if not known:
+            is_checked = any(w is layer.weights and version == w._version for w, version in self._checked)
+            if not is_checked:
                 check_weights(layer)
-        self._checked = given
+        self._checked = checked
 
     def _edit_of(self, gdf: Gdf) -> int:
         try:

@@ -250,20 +250,23 @@ def _adjusted_colors(scene: Gaussians, rows: Tensor, parts: Sequence[_LayerMembe
         before = {name: total[name][part.rows].clone() for name in names}
         for name in names:
             part.add(total[name], name, hides=True)
-        here = touched[part.rows]
-        if isinstance(form, GradeForm) and names and bool(here.any()):
-            sh = [(old[n][part.rows] + before[n])[here].reshape(int(here.sum()), -1, 3) for n in names]
-            members = torch.arange(len(part.layer.gdf.region))[part.members][here]
+        is_touched = touched[part.rows]
+        if isinstance(form, GradeForm) and names and bool(is_touched.any()):
+            sh = [
+                (old[n][part.rows] + before[n])[is_touched].reshape(int(is_touched.sum()), -1, 3)
+                for n in names
+            ]
+            members = torch.arange(len(part.layer.gdf.region))[part.members][is_touched]
             change = adjust_colors(
                 form, torch.cat(sh, dim=1)[:, :_DRAWN_COEFFICIENTS], members, part.layer.strength
             )
-            factor = part.weights[here, None, None] * part.layer.gain("sh0")
+            factor = part.weights[is_touched, None, None] * part.layer.gain("sh0")
             share = part.coverage["map"][members, None]
             for name, bands in zip(names, (change[:, :1], change[:, 1:]), strict=False):
                 sums = total[name][part.rows]
-                new = before[name][here]
+                new = before[name][is_touched]
                 new[:, : 3 * bands.shape[1]] += (factor * bands).flatten(1)
-                sums[here] = torch.lerp(sums[here], new, share)
+                sums[is_touched] = torch.lerp(sums[is_touched], new, share)
                 total[name][part.rows] = sums
         touched[part.rows] = True
     return total

@@ -80,13 +80,13 @@ def _wool(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
     p = at.points
     if part.name == "scarf":
         along = torch.atan2(at.local[:, 0], at.local[:, 2]) / (2 * math.pi)
-        turns = 13 * along
+        periods = 13 * along
         ribs = 150 * along
     else:
         along = at.local[:, 1] * torch.linalg.svdvals(part.matrix)[0]
-        turns = along / (0.30 if part.name == "knot" else 0.135)
+        periods = along / (0.30 if part.name == "knot" else 0.135)
         ribs = along / 0.0145
-    red = stripe_profile(turns, width=0.52, softness=0.05)
+    red = stripe_profile(periods, width=0.52, softness=0.05)
     color = mix(mix_colors("#e9dfcc", "#fffaf0", 0.6 + 0.4 * noise(p, table, 25.0)), flat("#c8102e", p), red)
     knit = (ribs * 2 * math.pi).sin() * smoothstep(0.013 - at.spacing, 0.0, 0.006)
     fuzz = 1 + 0.07 * noise(p, table, 40.0) + 0.10 * knit
@@ -191,7 +191,7 @@ def _eye(x: float) -> list[Part]:
 def _pads(foot: Part) -> list[Part]:
     """Return the pads of a sole and four toes, set into the front of the foot."""
     sizes = foot.matrix.norm(dim=0)
-    turn = foot.matrix / sizes
+    rotation = foot.matrix / sizes
     positions = [((0.0, -0.055), (0.095, 0.085))]
     positions += [
         ((0.132 * math.cos(angle), 0.012 + 0.135 * math.sin(angle)), (0.036, 0.036))
@@ -204,9 +204,9 @@ def _pads(foot: Part) -> list[Part]:
         outward = outward / outward.norm()
         side = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), outward)
         side = side / side.norm()
-        frame = turn @ torch.stack([side, torch.linalg.cross(outward, side), outward], dim=1)
+        frame = rotation @ torch.stack([side, torch.linalg.cross(outward, side), outward], dim=1)
         matrix = frame @ torch.diag(torch.tensor([wide, tall, 0.022]))
-        center = foot.center + turn @ torch.tensor([x, y, z])
+        center = foot.center + rotation @ torch.tensor([x, y, z])
         pads.append(Part("pad", foot.label, ball(), center, matrix, 3.0, casts_shadow=False, clears=0.08))
     return pads
 

@@ -103,10 +103,10 @@ def _wrap_light(cosine: Tensor, softness: float) -> Tensor:
 
 def _occlusion(points: Tensor, normals: Tensor, local: Tensor, part: Part) -> Tensor:
     """Return the share of the sky that a part hides, approximated by a sphere, 0 to 1. [N]"""
-    away = part.shape.nearest(local) @ part.matrix.T + part.center - points
-    gap = away.norm(dim=1)
+    offset = part.shape.nearest(local) @ part.matrix.T + part.center - points
+    gap = offset.norm(dim=1)
     size = float(torch.linalg.svdvals(part.matrix)[1]) * part.shape.girth
-    towards = torch.where(gap[:, None] > 1e-3, away / gap[:, None].clamp_min(1e-3), normals)
+    towards = torch.where(gap[:, None] > 1e-3, offset / gap[:, None].clamp_min(1e-3), normals)
     outside = part.shape.level(local) > 1
     cosine = torch.where(outside, (normals * towards).sum(1), torch.ones_like(gap))
     near = size / (size + 2.0 * torch.where(outside, gap, torch.zeros_like(gap)))
@@ -116,11 +116,11 @@ def _occlusion(points: Tensor, normals: Tensor, local: Tensor, part: Part) -> Te
 
 def _key_light_share(local: Tensor, part: Part) -> Tensor:
     """Return the share of the key light that passes a part, by the ray's closest approach, 0 to 1. [N]"""
-    towards: Tensor = torch.linalg.inv(part.matrix) @ KEY.direction
-    reach = float(towards.norm())
-    towards = towards / reach
-    ahead = -(local @ towards)
-    closest = (local + ahead[:, None] * towards).norm(dim=1)
+    local_direction: Tensor = torch.linalg.inv(part.matrix) @ KEY.direction
+    reach = float(local_direction.norm())
+    local_direction = local_direction / reach
+    ahead = -(local @ local_direction)
+    closest = (local + ahead[:, None] * local_direction).norm(dim=1)
     world_ahead = ahead.clamp_min(0) / reach
     blur = 0.06 + 0.16 * world_ahead
     passed = smoothstep((closest - 1 + blur) / (2 * blur))

@@ -344,9 +344,9 @@ def _sun(points: Tensor) -> Tensor:
     distance = (points[:, 0] + _HALF_SIDE).clamp_min(0) / -ray[0]
     inside = torch.ones(len(points))
     for axis, middle, half in zip((1, 2), *_WINDOW, strict=True):
-        off = (points[:, axis] + distance * ray[axis] - middle).abs()
-        pane = ((off - 0.03) / 0.03).clamp(0, 1)  # bars of the window
-        inside = inside * ((half - off) / (0.02 + 0.03 * distance) + 0.5).clamp(0, 1) * pane
+        offset = (points[:, axis] + distance * ray[axis] - middle).abs()
+        pane = ((offset - 0.03) / 0.03).clamp(0, 1)  # bars of the window
+        inside = inside * ((half - offset) / (0.02 + 0.03 * distance) + 0.5).clamp(0, 1) * pane
     return inside
 
 
@@ -356,12 +356,12 @@ def _rig(count: int = 32, width: int = 512, height: int = 384) -> tuple[Camera, 
     up = torch.tensor([0.0, 1.0, 0.0])
     cameras = []
     for i in range(count):
-        turn = 2 * math.pi * i / count
-        distance = 1.6 / max(abs(math.sin(turn)), abs(math.cos(turn))) ** 0.3
+        angle = 2 * math.pi * i / count
+        distance = 1.6 / max(abs(math.sin(angle)), abs(math.cos(angle))) ** 0.3
         eye = torch.tensor(
-            [distance * math.sin(turn), 1.1 + 0.5 * ((0.3 + 0.618034 * i) % 1.0), distance * math.cos(turn)]
+            [distance * math.sin(angle), 1.1 + 0.5 * ((0.3 + 0.618034 * i) % 1.0), distance * math.cos(angle)]
         )
-        aside = 0.3 * math.sin(3 * turn)
-        target = torch.tensor([aside * math.cos(turn), 0.75, -aside * math.sin(turn)])
+        sideways = 0.3 * math.sin(3 * angle)
+        target = torch.tensor([sideways * math.cos(angle), 0.75, -sideways * math.sin(angle)])
         cameras.append(Camera(look_at(eye, target, up), K, width, height, name=f"room_{i:03d}"))
     return tuple(cameras)

@@ -81,10 +81,12 @@ def lathe(radii: Sequence[float], heights: Sequence[float]) -> Shape:
     """Return a closed body with radii at descending heights and straight lines between them."""
     outline = torch.tensor([[0.0, heights[0]], *zip(radii, heights, strict=True), [0.0, heights[-1]]])
     lengths = (outline[1:] - outline[:-1]).norm(dim=1)
-    at = torch.cat([lengths.new_zeros(1), lengths.cumsum(0)])
-    places = torch.linspace(0, float(at[-1]), _PROFILE_POINTS)
-    index = (torch.searchsorted(at, places) - 1).clamp(0, len(lengths) - 1)
-    curve = torch.lerp(outline[index], outline[index + 1], ((places - at[index]) / lengths[index])[:, None])
+    starts = torch.cat([lengths.new_zeros(1), lengths.cumsum(0)])
+    positions = torch.linspace(0, float(starts[-1]), _PROFILE_POINTS)
+    index = (torch.searchsorted(starts, positions) - 1).clamp(0, len(lengths) - 1)
+    curve = torch.lerp(
+        outline[index], outline[index + 1], ((positions - starts[index]) / lengths[index])[:, None]
+    )
     rising, radius = torch.tensor(heights).flip(0), torch.tensor(radii).flip(0)
 
     middle = (heights[0] + heights[-1]) / 2

@@ -96,11 +96,11 @@ def _check_positions(path: object, before: Tensor, after: Tensor, excess: Tensor
     if not bool(wrong.any()):
         return
     at = int(excess.nan_to_num(torch.inf).argmax())
-    place, axis = divmod(at, 3)
+    row, axis = divmod(at, 3)
     count = int(wrong.any(dim=1).sum())
     raise ProgdfError(
-        f"{path} was not written: {'xyz'[axis]} of Gaussian {int(rows[place, axis])} is "
-        f"{float(before[place, axis]):.7g} and comes back as {float(after[place, axis]):.7g}, "
+        f"{path} was not written: {'xyz'[axis]} of Gaussian {int(rows[row, axis])} is "
+        f"{float(before[row, axis]):.7g} and comes back as {float(after[row, axis]):.7g}, "
         f"{format_count(count)} in all; write a .ply, or a scene nearer to 0"
     )
 

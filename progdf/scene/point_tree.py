@@ -38,9 +38,9 @@ class PointTree:
         self._surplus = self._find_surplus(max(most + 1, LEAF_SIZE))
         if len(self._surplus):
             count = len(self._points)
-            kept = np.delete(np.arange(count), self._surplus)
-            self._rows = np.append(kept, count)
-            self._tree = _build(self._points[kept])
+            remaining = np.delete(np.arange(count), self._surplus)
+            self._rows = np.append(remaining, count)
+            self._tree = _build(self._points[remaining])
 
     def query(
         self, places: NDArray[np.floating], k: int, within: float = np.inf, workers: int | None = None
@@ -109,8 +109,8 @@ class PointTree:
     @cached_property
     def _crowds(self) -> Rows:
         """Index of the crowded position of each point; -1 for other points. [N]"""
-        places = np.unique(self._points[self._surplus], axis=0)
-        distances, crowds = _build(places).query(self._points)
+        positions = np.unique(self._points[self._surplus], axis=0)
+        distances, crowds = _build(positions).query(self._points)
         crowds[distances > 0.0] = -1
         return np.asarray(crowds, np.int64)
 

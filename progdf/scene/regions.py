@@ -273,8 +273,8 @@ def parse_region(
                 selected = known[kind](text, scene)
             else:
                 raise _unknown_region(part, known)
-            if doubt := _doubt(kind, len(selected), len(scene)):
-                say(f"{shorten(part)} {doubt}")
+            if warning := _doubt(kind, len(selected), len(scene)):
+                say(f"{shorten(part)} {warning}")
             joined = _SIGNS[sign](region, selected)
         if len(region) and not len(joined):
             say(f"nothing is left of the region after {sign}{shorten(part)}")
@@ -431,8 +431,8 @@ def _labels(text: str, scene: Gaussians) -> Region:
     path, ids = _parse_labels(text)
     labels = read_labels(path, len(scene))
     present = torch.unique(labels).tolist()
-    known = set(present)
-    absent = [wanted_id for wanted_id in ids if wanted_id not in known]
+    present_labels = set(present)
+    absent = [wanted_id for wanted_id in ids if wanted_id not in present_labels]
     if absent:
         listed = ", ".join(str(label) for label in present[:12]) + (" …" if len(present) > 12 else "")
         raise ProgdfError(f"{path} has no Gaussian with label {absent[0]}; it has {listed}")

@@ -78,8 +78,8 @@ def rows_under(painted: Mask, seen: Surface) -> Rows:
     within = (points >= 0) & (points < (width, height))  # also false where a point is not a number
     rows = np.flatnonzero(within.all(axis=1))
     column, row = points[rows].astype(np.intp).T
-    under: Rows = rows[painted[row, column]]
-    return under[seen.front(under)] if len(under) else under
+    covered: Rows = rows[painted[row, column]]
+    return covered[seen.front(covered)] if len(covered) else covered
 
 
 def likely_steps(points: NDArray[np.floating], colors: Floats) -> csr_array:
@@ -88,15 +88,20 @@ def likely_steps(points: NDArray[np.floating], colors: Floats) -> csr_array:
     k = min(_WALK_NEIGHBORS, count - 1)
     if k < 1:
         return csr_array((count, count), dtype=np.float32)
-    apart, near = PointTree(points, k + 1).query(points, k + 1)
-    apart = apart[:, 1:]
+    distances, near = PointTree(points, k + 1).query(points, k + 1)
+    distances = distances[:, 1:]
     near = near[:, 1:].astype(np.int32)
-    spacing = np.maximum(np.median(apart, axis=1), 1e-30)
-    far = apart * apart / (spacing[:, None] * spacing[near])
-    unlike = np.linalg.norm(colors[:, None] - colors[near], axis=2)
-    likely = np.exp(-far - _COLOR_EXPONENT * unlike / max(float(np.median(unlike)), 1e-6)) + _MIN_STEP_WEIGHT
+    spacing = np.maximum(np.median(distances, axis=1), 1e-30)
+    scaled_squares = distances * distances / (spacing[:, None] * spacing[near])
+    color_distances = np.linalg.norm(colors[:, None] - colors[near], axis=2)
+    weights = (
+        np.exp(
+            -scaled_squares - _COLOR_EXPONENT * color_distances / max(float(np.median(color_distances)), 1e-6)
+        )
+        + _MIN_STEP_WEIGHT
+    )
     start = np.arange(0, count * k + 1, k, dtype=np.int32)
-    steps = csr_array((likely.astype(np.float32).ravel(), near.ravel(), start), shape=(count, count))
+    steps = csr_array((weights.astype(np.float32).ravel(), near.ravel(), start), shape=(count, count))
     both: csr_array = (steps + steps.T).tocsr()
     return both
 
@@ -120,14 +125,16 @@ class _Multigrid:
 
         The solution of each coarse level starts the next finer one.
         """
-        held: Floats = (_STROKE_WEIGHT * (on | beside) + _OUTSIDE_WEIGHT).astype(np.float32) * self._steps[0]
+        anchors: Floats = (_STROKE_WEIGHT * (on | beside) + _OUTSIDE_WEIGHT).astype(np.float32) * self._steps[
+            0
+        ]
         target: Floats = np.float32(_STROKE_WEIGHT) * on * self._steps[0]
         targets = [target]
-        self._diagonals = [self._steps[0] + held]
+        self._diagonals = [self._steps[0] + anchors]
         for level in range(len(self._groups)):
-            held = self._gather(level, held)
+            anchors = self._gather(level, anchors)
             target = self._gather(level, target)
-            self._diagonals.append(self._steps[level + 1] + held)
+            self._diagonals.append(self._steps[level + 1] + anchors)
             targets.append(target)
         coarsest = self._weights[-1]
         is_small = coarsest.shape[0] <= 4 * _MIN_COARSENED_ROWS

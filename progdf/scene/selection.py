@@ -97,17 +97,19 @@ def inside_polygon(points: Floats, corners: ArrayLike) -> Mask:
         return mask
     low = outline.min(0)
     high = outline.max(0)
-    near = np.flatnonzero(inside_rectangle(points, low, high))
+    candidates = np.flatnonzero(inside_rectangle(points, low, high))
     cell = max(float((high - low).max()) / _MAX_CELLS, 1e-12)
-    filled = _fill((outline - low) / cell + 2.0)
+    cell_kinds = _fill((outline - low) / cell + 2.0)
     column, row = (
-        (points[near, axis] * np.float32(1.0 / cell) + np.float32(2.0 - low[axis] / cell)).astype(np.int32)
+        (points[candidates, axis] * np.float32(1.0 / cell) + np.float32(2.0 - low[axis] / cell)).astype(
+            np.int32
+        )
         for axis in (0, 1)
     )
-    cells = filled.ravel().take(row * filled.shape[1] + column, mode="clip")
-    mask[near] = cells == _INSIDE
-    close = near[cells == _EDGE]
-    mask[close] = _crossings(points[close].astype(np.float64), outline) % 2 == 1
+    cells = cell_kinds.ravel().take(row * cell_kinds.shape[1] + column, mode="clip")
+    mask[candidates] = cells == _INSIDE
+    uncertain = candidates[cells == _EDGE]
+    mask[uncertain] = _crossings(points[uncertain].astype(np.float64), outline) % 2 == 1
     return mask
 
 
@@ -134,8 +136,8 @@ def inside_stroke(points: Floats, path: ArrayLike, radius: float) -> Mask:
 
 def inside_ball(scene: Gaussians, center: ArrayLike, radius: float) -> Mask:
     """Select the Gaussians whose center is at most `radius` world units from `center` [3]. [N]"""
-    away = scene.means.numpy() - np.asarray(center, np.float32)
-    return np.asarray(np.einsum("ij,ij->i", away, away) <= radius * radius)
+    offsets = scene.means.numpy() - np.asarray(center, np.float32)
+    return np.asarray(np.einsum("ij,ij->i", offsets, offsets) <= radius * radius)
 
 
 def base_colors(scene: Gaussians) -> Floats:
@@ -150,8 +152,8 @@ def alike_in_color(colors: Floats, color: ArrayLike, tolerance: float) -> Mask:
 
     A distance of 0.02 is hardly visible.
     """
-    away = colors - np.asarray(color, np.float32)
-    return np.asarray(np.einsum("ij,ij->i", away, away) <= tolerance * tolerance)
+    offsets = colors - np.asarray(color, np.float32)
+    return np.asarray(np.einsum("ij,ij->i", offsets, offsets) <= tolerance * tolerance)
 
 
 def front_surface(

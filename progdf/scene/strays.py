@@ -156,26 +156,26 @@ def _find_once(
     needle = remaining & (thinness > _fence(thinness[remaining])) & (longest > np.median(longest[remaining]))
     suspects = np.flatnonzero(giant | needle)
     body.set_members(remaining & ~giant & ~needle)
-    usual = body.emptiness(_ends(scene, drawn[body.sample(_EMPTINESS_SAMPLE)]))
+    usual_emptiness = body.emptiness(_ends(scene, drawn[body.sample(_EMPTINESS_SAMPLE)]))
     outside = suspects[
-        body.emptiness(_ends(scene, drawn[suspects])) > max(_fence(usual), np.log(_ISOLATION_RATIO))
+        body.emptiness(_ends(scene, drawn[suspects])) > max(_fence(usual_emptiness), np.log(_ISOLATION_RATIO))
     ]
     reference = body.members if len(body.members) <= _MAX_EXACT_GAUSSIANS else body.sample(_LONELINESS_SAMPLE)
     min_loneliness = max(_fence(body.loneliness(reference)), np.log(_ISOLATION_RATIO))
-    apart = body.find_isolated()
-    floaters = apart[body.loneliness(apart) > min_loneliness]
+    isolated = body.find_isolated()
+    floaters = isolated[body.loneliness(isolated) > min_loneliness]
     return {"giants": outside[giant[outside]], "needles": outside[~giant[outside]], "floaters": floaters}
 
 
 def _ends(scene: Gaussians, rows: Rows) -> Floats:
     """Return the four ends of the two longer axes of some rows. [M] -> [M,4,3]"""
-    some = scene[torch.from_numpy(rows)]
-    order = some.log_scales.argsort(dim=1)[:, 1:]
-    lengths = _EXTENT_SIGMAS * some.log_scales.gather(1, order).double().exp()
-    axes = rotation_matrices(some.unit_quats.double())
+    selected = scene[torch.from_numpy(rows)]
+    order = selected.log_scales.argsort(dim=1)[:, 1:]
+    lengths = _EXTENT_SIGMAS * selected.log_scales.gather(1, order).double().exp()
+    axes = rotation_matrices(selected.unit_quats.double())
     longer = axes.gather(2, order[:, None].expand(-1, 3, -1)).transpose(1, 2)
     tips = lengths[:, :, None] * longer
-    center = some.means.double()[:, None]
+    center = selected.means.double()[:, None]
     return torch.cat([center + tips, center - tips], dim=1).numpy()
 
 
@@ -209,12 +209,14 @@ class _Neighborhoods:
         changed = np.flatnonzero(is_member != self._is_member)
         if not len(changed):
             return
-        known = np.flatnonzero(~np.isnan(self._spacing))
-        if len(known):
-            spacing = self._spacing[known]
-            usual = float(np.quantile(spacing, 0.99))  # a bound makes the searches twice as fast
-            away = PointTree(self._points[changed], 1).kth_distances(self._points[known], 1, within=usual)
-            self._spacing[known[(away <= spacing) | (spacing >= usual)]] = np.nan
+        cached = np.flatnonzero(~np.isnan(self._spacing))
+        if len(cached):
+            spacing = self._spacing[cached]
+            bound = float(np.quantile(spacing, 0.99))  # a bound makes the searches twice as fast
+            distances = PointTree(self._points[changed], 1).kth_distances(
+                self._points[cached], 1, within=bound
+            )
+            self._spacing[cached[(distances <= spacing) | (spacing >= bound)]] = np.nan
         self._is_member = is_member
         self.members = np.flatnonzero(is_member)
         self._neighbors = min(_NEIGHBORS, len(self.members) - 1)
@@ -245,10 +247,10 @@ class _Neighborhoods:
         """Return the log ratio of the spacing of members to the median of their neighbors'. [M] -> [M]"""
         lonely = [np.zeros(0)]
         for start in range(0, len(rows), _CHUNK):
-            some = rows[start : start + _CHUNK]
-            near = self._search(some)[1]
-            around = np.median(self._spacing_of(near.ravel()).reshape(near.shape), axis=1)
-            lonely.append(np.log(self._spacing_of(some)) - np.log(around))
+            chunk = rows[start : start + _CHUNK]
+            near = self._search(chunk)[1]
+            neighbor_spacing = np.median(self._spacing_of(near.ravel()).reshape(near.shape), axis=1)
+            lonely.append(np.log(self._spacing_of(chunk)) - np.log(neighbor_spacing))
         return np.concatenate(lonely)
 
     def find_isolated(self) -> Rows:
@@ -274,9 +276,9 @@ class _Neighborhoods:
             count = np.zeros(len(rows), np.int8)
             for step in range(1, min(_WINDOW, len(rows) - 1) + 1):
                 x, y, z = columns[:, step:] - columns[:, :-step]
-                away = x * x + y * y + z * z
-                count[step:] += away <= squares[step:]
-                count[:-step] += away <= squares[:-step]
+                squared_distances = x * x + y * y + z * z
+                count[step:] += squared_distances <= squares[step:]
+                count[:-step] += squared_distances <= squares[:-step]
             inner = slice(start - first, start - first + _BLOCK)
             enclosed[block[inner]] = count[inner] > self._neighbors // 2
 
@@ -289,12 +291,12 @@ class _Neighborhoods:
         needed[rows] = np.isnan(self._spacing[rows])
         unknown = np.flatnonzero(needed)
         for start in range(0, len(unknown), _CHUNK):
-            some = unknown[start : start + _CHUNK]
-            distances, near = self._search(some)
+            chunk = unknown[start : start + _CHUNK]
+            distances, near = self._search(chunk)
             half = self._neighbors // 2
-            reach = self._extents[some, None] + self._extents[near[:, half:]]
-            self._spacing[some] = distances[:, -1]
-            self._touches[some] = (distances[:, half:] <= reach).any(axis=1)
+            reach = self._extents[chunk, None] + self._extents[near[:, half:]]
+            self._spacing[chunk] = distances[:, -1]
+            self._touches[chunk] = (distances[:, half:] <= reach).any(axis=1)
         spacing: Floats = np.maximum(self._spacing[rows], 1e-30)
         return spacing
 

@@ -82,15 +82,15 @@ def fit_eye(points: Tensor, radius: float, axes: Tensor, tangents: tuple[float, 
     """
     right, up, back = (points.double() @ axes.double().T).unbind(1)
     best = []
-    away = -math.inf
+    eye_distance = -math.inf
     for along, tangent in ((right, tangents[0]), (up, tangents[1])):
-        # |along − eye| ≤ tangent · (away − back) for every point: two planes that meet at the eye
+        # |along − eye| ≤ tangent · (eye_distance − back) for every point: two planes that meet at the eye
         margin = radius * math.sqrt(1 + tangent**2)
         high = float(quantile(along + tangent * back, 0.995)) + margin
         low = float(quantile(tangent * back - along, 0.995)) + margin
         best.append(0.5 * (high - low))
-        away = max(away, 0.5 * (high + low) / tangent)
-    return torch.tensor([*best, away], dtype=torch.float64) @ axes.double()
+        eye_distance = max(eye_distance, 0.5 * (high + low) / tangent)
+    return torch.tensor([*best, eye_distance], dtype=torch.float64) @ axes.double()
 
 
 def fit_camera(
@@ -142,16 +142,16 @@ def standpoint(scene: Gaussians, up: Tensor) -> tuple[Tensor, Tensor]:
     center = 0.5 * (low + high)
     half = 0.5 * (high - low)
     sampled = inside[:: -(-len(inside) // _OCCLUSION_SAMPLE)]
-    near = _MIN_CLEARANCE * float(half[:2].min())
+    clearance = _MIN_CLEARANCE * float(half[:2].min())
     best_score = -1.0
     view = (center, center + torch.tensor([float(half[0]), 0.0, 0.0]))
     for offset in torch.cartesian_prod(*[torch.linspace(-0.75, 0.75, 5)] * 2):
         candidate = center + half * torch.cat([offset, torch.tensor([0.2])])
-        free = float((sampled - candidate).norm(dim=1).min()) > near
+        is_free = float((sampled - candidate).norm(dim=1).min()) > clearance
         for turn in range(12):
             angle = math.radians(30 * turn)
             back = torch.tensor([math.cos(angle), math.sin(angle), 0.0])
-            seen = _unoccluded(sampled - candidate, back, wide=1.0).sum() / len(sampled) + float(free)
+            seen = _unoccluded(sampled - candidate, back, wide=1.0).sum() / len(sampled) + float(is_free)
             if float(seen) > best_score:
                 best_score = float(seen)
                 view = (candidate, candidate - float(half[:2].min()) * back)
@@ -203,8 +203,8 @@ def _unoccluded(places: Tensor, back: Tensor, wide: float = 0.0) -> Tensor:
     for cell in cells:
         within &= (cell >= 0) & (cell < 24)
     index = (cells[0] * 24 + cells[1]).clamp(0, 575).long()
-    far = torch.where(within, depth, math.inf)
-    nearest = torch.full((576,), math.inf).scatter_reduce(0, index, far, "amin")
+    masked_depth = torch.where(within, depth, math.inf)
+    nearest = torch.full((576,), math.inf).scatter_reduce(0, index, masked_depth, "amin")
     return within & (depth <= nearest[index] + 0.08 * size)
 
 

@@ -35,8 +35,8 @@ MAX_REMEMBERED = 200
 
 def find_chosen_up(scene: Gaussians) -> Tensor | None:
     """Return the up axis that the user chose for a scene earlier, or None. [3] unit length"""
-    known = _read_choices()
-    numbers = known.get(fingerprint(scene).means_sha256) if known else None
+    choices = _read_choices()
+    numbers = choices.get(fingerprint(scene).means_sha256) if choices else None
     try:
         up = torch.tensor(numbers, dtype=torch.float32)
     except (TypeError, ValueError, RuntimeError):
@@ -48,7 +48,7 @@ def find_chosen_up(scene: Gaussians) -> Tensor | None:
 def remember_chosen_up(scene: Gaussians, up: tuple[float, float, float]) -> None:
     """Remember the up axis chosen for a scene. A file that cannot be written is ignored."""
     key = fingerprint(scene).means_sha256
-    remembered = {name: known for name, known in _read_choices().items() if name != key} | {key: list(up)}
+    remembered = {name: choice for name, choice in _read_choices().items() if name != key} | {key: list(up)}
     with contextlib.suppress(OSError):
         _choices_file().parent.mkdir(parents=True, exist_ok=True)
         write_file(_choices_file(), json.dumps(dict([*remembered.items()][-MAX_REMEMBERED:])))
@@ -56,10 +56,10 @@ def remember_chosen_up(scene: Gaussians, up: tuple[float, float, float]) -> None
 
 def _read_choices() -> dict[str, object]:
     try:
-        known = decode_json(_choices_file().read_bytes())
+        stored = decode_json(_choices_file().read_bytes())
     except (OSError, ValueError):
         return {}
-    return known if isinstance(known, dict) else {}
+    return stored if isinstance(stored, dict) else {}
 
 
 def _choices_file() -> Path:
@@ -168,9 +168,9 @@ def find_up(
         return UpAxis(_snap(view.up, _LEVEL_COSINE), f"as the comment '{view.up_comment}' in the file says")
     if view.camera is not None and (up := _mean_camera_up([view.camera])) is not None:
         return UpAxis(up, "as the camera stored in the file is held")
-    beside = [] if path is None or not len(scene) else scene_cameras_beside(path, scene)
-    if (up := _mean_camera_up(beside)) is not None:
-        return UpAxis(up, f"as the {len(beside)} cameras beside the scene's file are held")
+    cameras_beside = [] if path is None or not len(scene) else scene_cameras_beside(path, scene)
+    if (up := _mean_camera_up(cameras_beside)) is not None:
+        return UpAxis(up, f"as the {len(cameras_beside)} cameras beside the scene's file are held")
     return _up_by_shape(scene)
 
 
@@ -276,15 +276,15 @@ class _Shape:
         band = 0.04 * max(high - low, 1e-6)
         foot = _extent(plan[height < low + band]) - _extent(plan[height > high - band])
         tenth = max(count // 10, 1)
-        blur = float(self.sizes[order[:tenth]].median() - self.sizes[order[-tenth:]].median())
+        blurring = float(self.sizes[order[:tenth]].median() - self.sizes[order[-tenth:]].median())
         along = float(self.edge_weights[(self.edges @ up).abs() > 0.97].sum())
-        turns = [math.pi * k / 6 for k in range(6)]
-        level = max(self._symmetry(math.cos(turn) * ahead + math.sin(turn) * side) for turn in turns)
+        angles = [math.pi * k / 6 for k in range(6)]
+        level = max(self._symmetry(math.cos(angle) * ahead + math.sin(angle) * side) for angle in angles)
         return {
             "vertical edges": math.log(along + 0.02),
             "symmetry": level - self._symmetry(up),
             "wider foot": foot / float(wide.prod().sqrt()),
-            "blurred underside": min(max(blur, -1.5), 1.5),
+            "blurred underside": min(max(blurring, -1.5), 1.5),
             "faint strays below": -float((self.strays @ up) @ self.stray_weights),
             # a ground carries objects; a flat sheet is no ground
             "ground plane": _ground_plane(
@@ -321,10 +321,10 @@ def _shape_of(scene: Gaussians) -> _Shape | None:
     areas = axes[:, 1:].sum(dim=1).exp()
     areas = areas.clamp_max(float(areas.sort().values[int(0.9 * len(areas))]))
     elongated = solid.opacities * areas * (1 - (axes[:, 1] - axes[:, 2]).exp())
-    every = scene[:: -(-len(scene) // (3 * _MAX_SAMPLED_ROWS))]
-    sizes = every.log_scales.amax(dim=1).exp()
-    stray = (sizes > 8 * sizes.median()) & (every.opacities < 0.5)
-    weights = (every.opacities * sizes**2)[stray]
+    sampled = scene[:: -(-len(scene) // (3 * _MAX_SAMPLED_ROWS))]
+    sizes = sampled.log_scales.amax(dim=1).exp()
+    is_stray = (sizes > 8 * sizes.median()) & (sampled.opacities < 0.5)
+    weights = (sampled.opacities * sizes**2)[is_stray]
     return _Shape(
         places / radius,
         normals_of(solid),
@@ -332,7 +332,7 @@ def _shape_of(scene: Gaussians) -> _Shape | None:
         long_axes(solid),
         elongated / elongated.sum().clamp_min(1e-30),
         axes[:, 2] - math.log(radius),
-        ((every.means[stray] - middle) / radius).clamp(-5.0, 5.0),
+        ((sampled.means[is_stray] - middle) / radius).clamp(-5.0, 5.0),
         weights / weights.sum().clamp_min(1e-30) * len(weights) / (len(weights) + 100),
     )
 
@@ -378,8 +378,8 @@ def _ground_normal(places: Tensor) -> Tensor | None:
         distances = sampled @ normals.T - (a * normals).sum(dim=1)
         within = (distances.abs() < 0.04).double().mean(dim=0)
         above, below = ((side > 0.08).double().mean(dim=0) for side in (distances, -distances))
-        worth = within * (above - below).abs() / (above + below).clamp_min(0.02)
-        best = int(worth.argmax())
+        scores = within * (above - below).abs() / (above + below).clamp_min(0.02)
+        best = int(scores.argmax())
         inside = sampled[distances[:, best].abs() < 0.04]
         a = inside.mean(dim=0)[None]
         normals = torch.linalg.svd(inside - a, full_matrices=False).Vh[2][None]
