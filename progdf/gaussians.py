@@ -52,7 +52,7 @@ class Gaussians:
         n = self.means.shape[0] if self.means.ndim else 0
         for name, width in _WIDTHS.items():
             actual = tuple(getattr(self, name).shape)
-            shape = (n, width)[: 2 - (name == "logit_opacities")]
+            shape = (n,) if name == "logit_opacities" else (n, width)
             if actual != shape:
                 raise ValueError(
                     f"{name} has shape {list(actual)}, expected {list(shape)} (N={n} from means)"

@@ -63,7 +63,8 @@ def _lines(shown: Gaussians | BakedField | Gdf) -> list[str]:
         return [format_count(field.members, "member"), *facts]
     added = f", {format_count(shown.members - len(shown.region), 'row')} added" if shown.added else ""
     members = f"{format_count(len(shown.region), 'member')} of {format_count(shown.scene.count)}{added}"
-    return [shown.name, *([shown.instruction] if shown.instruction else []), members, *facts]
+    instructions = [shown.instruction] if shown.instruction else []
+    return [shown.name, *instructions, members, *facts]
 
 
 def _still(scene: Gaussians) -> str:

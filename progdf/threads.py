@@ -94,7 +94,9 @@ def run_chunks(kernel: Callable[[int], _T], chunks: int) -> list[_T]:
         StoppedError: the event of `stopped_by` is set.
     """
     stop: threading.Event | None = getattr(_local, "stop", None)
-    remaining, results, is_inner = iter(range(chunks)), {}, getattr(_local, "is_inner", False)
+    remaining = iter(range(chunks))
+    results: dict[int, _T] = {}
+    is_inner = getattr(_local, "is_inner", False)
 
     def work() -> None:
         _local.is_inner = is_inner or chunks > 1
@@ -106,7 +108,8 @@ def run_chunks(kernel: Callable[[int], _T], chunks: int) -> list[_T]:
         finally:
             _local.is_inner = is_inner
 
-    helpers = [_pool().submit(work) for _ in range(0 if is_inner else min(threads(), chunks) - 1)]
+    helper_count = 0 if is_inner else min(threads(), chunks) - 1
+    helpers = [_pool().submit(work) for _ in range(helper_count)]
     try:
         work()
     finally:

@@ -59,9 +59,11 @@ def similarity(
         turn: axis times angle in radians, which may exceed a full turn. [3]
         scale: scale factor, > 0
     """
-    parts = [shift], [math.log(scale)], [turn]
-    moved, size, turned = (torch.tensor(part, dtype=torch.float64) for part in parts)
-    return Motion(moved, size, turned)
+    return Motion(
+        torch.tensor([shift], dtype=torch.float64),
+        torch.tensor([math.log(scale)], dtype=torch.float64),
+        torch.tensor([turn], dtype=torch.float64),
+    )
 
 
 def tidy(

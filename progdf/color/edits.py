@@ -94,7 +94,8 @@ def recolor_fully(rgb: Tensor, target: Tensor, reference: Tensor) -> Tensor:
     The lightness is scaled so that `reference` becomes `target`, and the chroma follows the lightness. The
     hue is the target's, or unchanged if the target is gray. A dark source is lifted.
     """
-    lab, (new_l, new_a, new_b) = srgb_to_oklab(rgb.clamp(0, 1)), srgb_to_oklab(_as_tensor(target, rgb))
+    lab = srgb_to_oklab(rgb.clamp(0, 1))
+    new_l, new_a, new_b = srgb_to_oklab(_as_tensor(target, rgb))
     new_c = torch.hypot(new_a, new_b)
     ref_l = srgb_to_oklab(_as_tensor(reference, rgb))[0]
     lightness = _relight(lab[..., 0], ref_l.clamp(0.02, 0.98), new_l.clamp(0.02, 0.98))

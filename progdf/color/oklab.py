@@ -177,7 +177,9 @@ def color_course(rgb: Tensor, end: Tensor, bend: Bend) -> Callable[[Strength], T
 
 def _oklab_course(a: Tensor, b: Tensor, bend: Bend) -> Callable[[Tensor], Tensor]:
     """Return the path between OKLab colors as a function from strengths [...] to sRGB. [...,3], [...,3]"""
-    chroma_a, chroma_b, hue = a[..., 1:].norm(dim=-1), b[..., 1:].norm(dim=-1), hue_of(a)
+    chroma_a = a[..., 1:].norm(dim=-1)
+    chroma_b = b[..., 1:].norm(dim=-1)
+    hue = hue_of(a)
     rotation = bend.direction * _wrap(hue_of(b) - hue)  # −π to π, positive in the region's sense
     own_share = smoothstep(rotation + math.pi, bend.whole, bend.none)
     bow = bend.bow * 4 * chroma_a * chroma_b / (chroma_a + chroma_b).clamp_min(1e-6).square()

@@ -63,8 +63,8 @@ class _Bases(NamedTuple):
     @staticmethod
     def of(bases: AttributeBases) -> _Bases:
         stored = (bases.end_offset, bases.residual_basis)
-        levels = (part if part.dtype == torch.int8 else part.float() for part in stored)
-        tensors = *levels, bases.scale, bases.coefficients
+        levels = [part if part.dtype == torch.int8 else part.float() for part in stored]
+        tensors = (*levels, bases.scale, bases.coefficients)
         return _Bases(*(tensor.contiguous().numpy() for tensor in tensors))
 
     def factors(self, at: Segment) -> tuple[Rows, Floats]:

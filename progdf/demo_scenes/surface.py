@@ -87,7 +87,8 @@ def lathe(radii: Sequence[float], heights: Sequence[float]) -> Shape:
     curve = torch.lerp(
         outline[index], outline[index + 1], ((positions - starts[index]) / lengths[index])[:, None]
     )
-    rising, radius = torch.tensor(heights).flip(0), torch.tensor(radii).flip(0)
+    rising = torch.tensor(heights).flip(0)
+    radius = torch.tensor(radii).flip(0)
 
     middle = (heights[0] + heights[-1]) / 2
     half = (heights[0] - heights[-1]) / 2

@@ -128,8 +128,9 @@ def _attribute_notes(written: Gaussians, read: Gaussians, keeps_rows: bool) -> t
         notes.append(f"{name} of {format_count(count)} off by up to {size}")
     if written.shN.shape[1] > read.shN.shape[1]:
         notes.append(f"SH of degree {written.sh_degree} cut to degree {read.sh_degree}")
-    if keeps_rows and (note := _rotation_note(written, read)):
-        notes.append(note)
+    rotation_note = _rotation_note(written, read) if keeps_rows else ""
+    if rotation_note:
+        notes.append(rotation_note)
     return tuple(notes)
 
 

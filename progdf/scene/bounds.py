@@ -57,7 +57,11 @@ def front_direction(up: Tensor) -> Tensor:
     """
     largest = int(up.abs().argmax())
     front = torch.zeros_like(up)
-    front[1 if largest == 2 else 2] = math.copysign(1.0, float(up[largest])) * (-1.0 if largest == 2 else 1.0)
+    sign = math.copysign(1.0, float(up[largest]))
+    if largest == 2:
+        front[1] = -sign
+    else:
+        front[2] = sign
     level = front - (front @ up) * up
     return torch.nn.functional.normalize(level, dim=0)
 

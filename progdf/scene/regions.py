@@ -115,10 +115,13 @@ def read_step(text: str) -> Callable[[Neighborhood, Mask], Mask]:
         ProgdfError: the step is unknown, or its number is out of range.
     """
     name, _, times = text.partition(":")
-    count = int(times) if re.fullmatch(r"[0-9]{1,9}", times) else 1 if not times else 0
+    count = 1 if not times else 0
+    if re.fullmatch(r"[0-9]{1,9}", times):
+        count = int(times)
+    max_count = 1 if name == "largest" else MAX_TIMES
     if name == "refine" and 1 <= count <= 100:
         return lambda neighborhood, mask: neighborhood.refine(mask, count if times else RIM_PERCENT)
-    if name not in STEPS or not 1 <= count <= (1 if name == "largest" else MAX_TIMES):
+    if name not in STEPS or not 1 <= count <= max_count:
         raise ProgdfError(
             f"'{shorten(text)}' is no step of a region; write grow, shrink or smooth:TIMES, "
             f"at most {MAX_TIMES}, refine:PERCENT, or largest"
@@ -273,7 +276,8 @@ def parse_region(
                 selected = known[kind](text, scene)
             else:
                 raise _unknown_region(part, known)
-            if warning := _doubt(kind, len(selected), len(scene)):
+            warning = _doubt(kind, len(selected), len(scene))
+            if warning:
                 say(f"{shorten(part)} {warning}")
             joined = _SIGNS[sign](region, selected)
         if len(region) and not len(joined):
@@ -330,12 +334,13 @@ def _unknown_region(part: str, known: Iterable[str]) -> ProgdfError:
 
 def split_spec(spec: str, kinds: tuple[str, ...]) -> list[tuple[str, str]]:
     """Return the (sign, part) pairs of a spec. The first sign is '+', and a step's sign is '|'."""
-    words, steps = ("|".join(re.escape(word) for word in some) for some in (kinds, STEPS))
+    words = "|".join(re.escape(kind) for kind in kinds)
+    steps = "|".join(re.escape(step) for step in STEPS)
     bare = "|".join(("all", *BARE))
     part = rf"(?:{words}):|(?:{bare})\s*(?:$|[+&|-])"
-    step = rf"(?:{steps})(?::-?[^\s+&|-]*)?\s*(?:$|[+&|-])"
+    step_part = rf"(?:{steps})(?::-?[^\s+&|-]*)?\s*(?:$|[+&|-])"
     # no blanks before the sign: a pattern that begins with blanks takes quadratic time on a run of them
-    pieces = [piece.strip() for piece in re.split(rf"([+&-](?=\s*(?:{part}))|\|(?=\s*{step}))", spec)]
+    pieces = [piece.strip() for piece in re.split(rf"([+&-](?=\s*(?:{part}))|\|(?=\s*{step_part}))", spec)]
     if not all(pieces[0::2]):
         raise ProgdfError(
             f"region '{shorten(spec)}' is missing a part; write, for example, all-sphere:0,0,0,1"

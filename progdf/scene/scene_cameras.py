@@ -170,7 +170,7 @@ def measure_coverage(scene: Gaussians, cameras: Sequence[Camera]) -> Coverage:
     spread = sorted(range(len(cameras)), key=lambda i: math.sqrt(2.0) * i % 1.0)[:_MAX_COUNT]
     near = near_plane(scene_sphere(scene)[1])
 
-    def look(index: int) -> float:
+    def covered_share(index: int) -> float:
         camera = cameras[index]
         scale = min(1.0, _CHECK_SIZE_PX / max(camera.width, camera.height))
         width = max(1, round(camera.width * scale))
@@ -180,11 +180,11 @@ def measure_coverage(scene: Gaussians, cameras: Sequence[Camera]) -> Coverage:
             transmittance = render(scene, small, (0.0, 0.0, 0.0)).transmittance
         return 1.0 - float(transmittance.mean())
 
-    shares = map_threads(look, spread[:_FIRST_COUNT])
+    shares = map_threads(covered_share, spread[:_FIRST_COUNT])
     coverage = Coverage(tuple(shares))
     if coverage.fits or len(spread) <= _FIRST_COUNT:
         return coverage
-    return Coverage((*shares, *map_threads(look, spread[_FIRST_COUNT:])))
+    return Coverage((*shares, *map_threads(covered_share, spread[_FIRST_COUNT:])))
 
 
 def _candidates(
@@ -206,20 +206,20 @@ def _candidates(
         applied_scale = float(dataset[:3, :3].det() ** (1 / 3))
         applied = dataset.clone()
         applied[:3] /= applied_scale
-        ways = [rigid @ torch.linalg.inv(applied)]
+        transforms = [rigid @ torch.linalg.inv(applied)]
         if is_applied:
-            ways.append(rigid)
-        ways.sort(key=lambda way: -_upright(cameras, way))
+            transforms.append(rigid)
+        transforms.sort(key=lambda transform: -_upright(cameras, transform))
         note = f"cameras: moved into nerfstudio's frame by {file}"
-        for way in ways:
-            way[:3] *= scale / applied_scale
-            found.append(SceneCameras([_move(camera, way, origin) for camera in cameras], (note,)))
+        for transform in transforms:
+            transform[:3] *= scale / applied_scale
+            found.append(SceneCameras([_move(camera, transform, origin) for camera in cameras], (note,)))
     note = f"cameras: {file} is not applied, as the scene is not visible with it"
     found.append(SceneCameras(cameras, () if file is None else (note,)))
     if is_applied and dataset is not None:
         note = f"cameras: the applied_transform of {path} is taken back, as the scene was made before it"
-        way = torch.linalg.inv(dataset)
-        found.append(SceneCameras([_move(camera, way, origin) for camera in cameras], (note,)))
+        transform = torch.linalg.inv(dataset)
+        found.append(SceneCameras([_move(camera, transform, origin) for camera in cameras], (note,)))
     return found
 
 

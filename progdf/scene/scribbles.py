@@ -68,13 +68,18 @@ class Scribbles:
         beside = np.zeros(self._count, bool)
         on[inside] = True
         beside[outside] = True
-        on, beside = on & ~beside, beside & ~on
-        return self._levels.chances(on, beside) > 0.5 if on.any() else on
+        both = on & beside
+        on &= ~both
+        beside &= ~both
+        if not on.any():
+            return on
+        return self._levels.chances(on, beside) > 0.5
 
 
 def rows_under(painted: Mask, seen: Surface) -> Rows:
     """Return the Gaussians on the front surface whose centers lie under painted pixels [H,W]."""
-    points, (height, width) = seen.centers.points, painted.shape
+    points = seen.centers.points
+    height, width = painted.shape
     within = (points >= 0) & (points < (width, height))  # also false where a point is not a number
     rows = np.flatnonzero(within.all(axis=1))
     column, row = points[rows].astype(np.intp).T
@@ -138,8 +143,9 @@ class _Multigrid:
             targets.append(target)
         coarsest = self._weights[-1]
         is_small = coarsest.shape[0] <= 4 * _MIN_COARSENED_ROWS
-        matrix = np.diag(self._diagonals[-1].astype(np.float64)) - coarsest.toarray() if is_small else None
-        self._factors = None if matrix is None else cho_factor(matrix)
+        self._factors = None
+        if is_small:
+            self._factors = cho_factor(np.diag(self._diagonals[-1].astype(np.float64)) - coarsest.toarray())
         x = np.zeros(coarsest.shape[0], np.float32)
         for level in reversed(range(len(targets))):
             x = self._solve(

@@ -183,7 +183,8 @@ def front_surface(
     if not visible.any():
         return visible
     cells = np.where(visible[:, None], uv, uv[visible][0]).clip(0, (width - 1, height - 1)).astype(np.intp)
-    (x0, y0), (x1, y1) = cells.min(axis=0).tolist(), cells.max(axis=0).tolist()
+    x0, y0 = cells.min(axis=0).tolist()
+    x1, y1 = cells.max(axis=0).tolist()
     with torch.no_grad():
         z = torch.from_numpy(centers.depths)[:, None].nan_to_num().expand(-1, 3).contiguous()
         crop = (x0, y0, x1 + 1, y1 + 1)
@@ -210,7 +211,8 @@ class Surface:
     def __init__(self, scene: Gaussians, camera: Camera) -> None:
         self.scene = scene
         self.camera = camera
-        self._lock, self._stop = threading.RLock(), threading.Event()
+        self._lock = threading.RLock()
+        self._stop = threading.Event()
         self._centers: Centers | None = None
         self._front: Mask | None = None
         self._colors: Floats | None = None

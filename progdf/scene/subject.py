@@ -111,9 +111,10 @@ def fit_camera(
         fov: vertical field of view, radians
         filled: share of the picture's width or height that the subject fills, 0 to 1
     """
-    ahead, (around, above) = front_direction(up), map(math.radians, turn)
-    level = math.cos(around) * ahead + math.sin(around) * torch.linalg.cross(up, ahead)
-    back = math.cos(above) * level + math.sin(above) * up
+    ahead = front_direction(up)
+    azimuth, elevation = map(math.radians, turn)
+    level = math.cos(azimuth) * ahead + math.sin(azimuth) * torch.linalg.cross(up, ahead)
+    back = math.cos(elevation) * level + math.sin(elevation) * up
     axes = look_at(back, torch.zeros(3), up)[:3, :3] * torch.tensor([[1.0], [-1.0], [-1.0]])
     subject = scene[subject_rows(scene, up)]
     tangent = filled * math.tan(0.5 * fov)

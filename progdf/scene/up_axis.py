@@ -159,17 +159,21 @@ def find_up(
     """
     if choice != "auto":
         return UpAxis(axis_direction(choice), "as --up says")
-    if (up := _mean_camera_up(cameras)) is not None:
+    up = _mean_camera_up(cameras)
+    if up is not None:
         return UpAxis(up, "as the cameras are held")
-    if (chosen := find_chosen_up(scene)) is not None:
+    chosen = find_chosen_up(scene)
+    if chosen is not None:
         return UpAxis(chosen, "as was chosen for this scene before")
     view = PlyView() if path is None else stored_view(path, scene.origin)
     if view.up is not None:
         return UpAxis(_snap(view.up, _LEVEL_COSINE), f"as the comment '{view.up_comment}' in the file says")
-    if view.camera is not None and (up := _mean_camera_up([view.camera])) is not None:
+    up = None if view.camera is None else _mean_camera_up([view.camera])
+    if up is not None:
         return UpAxis(up, "as the camera stored in the file is held")
     cameras_beside = [] if path is None or not len(scene) else scene_cameras_beside(path, scene)
-    if (up := _mean_camera_up(cameras_beside)) is not None:
+    up = _mean_camera_up(cameras_beside)
+    if up is not None:
         return UpAxis(up, f"as the {len(cameras_beside)} cameras beside the scene's file are held")
     return _up_by_shape(scene)
 
@@ -207,7 +211,8 @@ def _up_by_shape(scene: Gaussians) -> UpAxis:
     directions = [axis_direction(axis) for axis in AXES]
     shape_signs = [shape.evidence(direction) for direction in directions]
     is_room = min(evidence["ground plane"] for evidence in shape_signs) >= _ROOM_EVIDENCE
-    if (normal := _ground_normal(shape.places)) is not None:
+    normal = _ground_normal(shape.places)
+    if normal is not None:
         both = [shape.evidence(normal), shape.evidence(-normal)]
         planes = [evidence["ground plane"] for evidence in [*shape_signs, *both]]
         if planes[6] - planes[7] > max(abs(planes[i] - planes[i + 1]) for i in (0, 2, 4)):
