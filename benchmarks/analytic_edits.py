@@ -164,7 +164,8 @@ def warp_edit(name: str, warp: Warp) -> AnalyticEdit:
 
 def stretch_edit(factor: float, axis: Tensor, pivot: Tensor) -> AnalyticEdit:
     """Make an edit that stretches by `factor` along `axis` [3], away from the plane through `pivot` [3]."""
-    unit, root = (axis / axis.norm()).double(), pivot.double()
+    unit = (axis / axis.norm()).double()
+    root = pivot.double()
 
     def warp(points: Tensor, strength: float) -> Tensor:
         moved: Tensor = points + strength * (factor - 1) * ((points - root) @ unit)[:, None] * unit
@@ -183,7 +184,9 @@ def bend_edit(degrees: float, axis: Tensor, along: Tensor, pivot: Tensor, length
         pivot: a point of the axis. [3]
         length: world units
     """
-    turn, out, root = (axis / axis.norm()).double(), (along / along.norm()).double(), pivot.double()
+    turn = (axis / axis.norm()).double()
+    out = (along / along.norm()).double()
+    root = pivot.double()
 
     def warp(points: Tensor, strength: float) -> Tensor:
         arm = points - root

@@ -135,7 +135,8 @@ def tables(scenes: Sequence[Path] = (), plot: Path | None = None) -> list[Table]
 
 def color_forms(name: str, edit: RegretEdit) -> list[Form]:
     """Fit and measure every form of field of a color edit."""
-    judge, forms = edit.judge(), list[Form]()
+    judge = edit.judge()
+    forms = list[Form]()
 
     def measure(kind: str, label: str, size: float, field: Field, began: float) -> None:
         seconds = time.process_time() - began
@@ -192,14 +193,17 @@ def color_forms(name: str, edit: RegretEdit) -> list[Form]:
     measure("float32 ends", "separable of rank 2, float32 ends", field.bytes_per_member, field, began)
     began = time.process_time()
     network = trained_network(edit.original, knots, recording, edit.weights, NETWORK, NETWORK.steps)
-    label, bound = f"network ({NETWORK.size}), {NETWORK.steps} steps", network.bind(edit.original)
-    measure("network", label, network.bytes_per_member, bound, began)
+    label = f"network ({NETWORK.size}), {NETWORK.steps} steps"
+    measure("network", label, network.bytes_per_member, network.bind(edit.original), began)
     chosen = f"{automatic.name.partition(': ')[2]}: what a run ships"
+    chosen_kind = f"grade of degree {model.degree}"
+    if model.mask is not None:
+        chosen_kind = f"masked {chosen_kind}"
     return [
         *forms,
         Form(
             name,
-            f"{'masked ' * (model.mask is not None)}grade of degree {model.degree}",
+            chosen_kind,
             chosen,
             automatic.bytes,
             tuple(automatic.psnrs),

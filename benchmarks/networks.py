@@ -158,9 +158,10 @@ def _trained(run: Path, name: str, settings: NeuralSettings, course: KnownEdit) 
     effort = settings.resolve()
     settings = replace(effort, batch=min(effort.batch, members))
     if not path.is_file():
-        if (each := _step_seconds(course, settings)) * settings.steps > LONGEST:
+        total_seconds = _step_seconds(course, settings) * settings.steps
+        if total_seconds > LONGEST:
             fit = _begin(course, settings)
-            return TrainedNetwork(fit.field(), bake_network(fit.field(), before), 0, each * settings.steps)
+            return TrainedNetwork(fit.field(), bake_network(fit.field(), before), 0, total_seconds)
         begin = time.process_time()
         fit = _begin(course, settings)
         train_network(fit, course.strengths, course.offsets, settings.steps)

@@ -169,7 +169,8 @@ def measure(case: RasterCase, rounds: int = 9, torch_rounds: int = 3) -> RasterT
     _, image, gradients = draw(inputs, camera, "cpu", torch.float32, backward=True)
     duels = []
     for threads in THREADS:
-        duels.append(duel := Duel(threads, [], [], [], [], []))
+        duel = Duel(threads, [], [], [], [], [])
+        duels.append(duel)
         if case.baseline:
             with _threads(threads):
                 draw(inputs, camera, "tiled", torch.float32, backward=True)
@@ -275,10 +276,11 @@ def list_table(cases: Sequence[RasterCase], rounds: int = 9) -> Table:
                     begin = time.process_time()
                     weights = color_map(inputs, camera, window, every, lost=lost)
                     listed = time.process_time()
-                    weights.gradient(picture := weights.picture(inputs.colors))
+                    pictures[lost] = weights.picture(inputs.colors)
+                    weights.gradient(pictures[lost])
                     durations.append((1e3 * (listed - begin), 1e3 * (time.process_time() - listed)))
                     assert isinstance(weights, ListedWeights)
-                    pictures[lost], entries[lost] = picture, len(weights.runs.weights)
+                    entries[lost] = len(weights.runs.weights)
         listing, rendering = (
             [f"{statistics.median(pair[k] for pair in durations[1:]):.1f}" for durations in times.values()]
             for k in (0, 1)

@@ -42,7 +42,8 @@ def fit_variant(
         offsets = trajectory.nodes
         return fit_keyframes(trajectory.s, offsets, 2), {}
     evaluator, seen = shared.evaluators(trajectory.offsets)
-    remap, (choosing, reporting) = identity_remap(), evaluator.halves()
+    remap = identity_remap()
+    choosing, reporting = evaluator.halves()
     if plan.field.field == "neural":
         setup = shared.setup
         weights = shared.weights

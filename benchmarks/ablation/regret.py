@@ -171,32 +171,34 @@ class RegretEdit:
             began = time.process_time()
             chosen = {view.camera.name for view in views}
             is_chosen = [view.camera.name in chosen for view in self.setup.views]
-            made = {s: list(compress(self.picture(s), is_chosen)) for s in strengths}
+            pictures = {s: list(compress(self.picture(s), is_chosen)) for s in strengths}
             waited += time.process_time() - began
-            return made
+            return pictures
 
         def look(s: float, views: Sequence[View]) -> list[Tensor]:
             return [quantize_image(courses[view.camera.name](s)) for view in views]
 
-        whole, waited, began = edit([1.0], self.setup.views), 0.0, time.process_time()
+        finished = edit([1.0], self.setup.views)
+        waited = 0.0
+        began = time.process_time()
         between = Strengths(edit, look)
         with TemporaryDirectory() as folder, closing(RunLog(Path(folder) / "log.txt", quiet=True)) as log:
-            options = OptimizeOptions(), self.setup, whole, between, TrainingViewOptions(), log
+            options = OptimizeOptions(), self.setup, finished, between, TrainingViewOptions(), log
             solver, model, course = plan_colors(*options)
-        made = list[ParameterSnapshot]()
+        snapshots = list[ParameterSnapshot]()
         state = PgsState(self.original)
-        most = iterations(OptimizeOptions().steps)
-        for snapshot in solve(solver, model, course, made, state, lambda step, left: None, most):
-            made.append(snapshot)
+        max_steps = iterations(OptimizeOptions().steps)
+        for snapshot in solve(solver, model, course, snapshots, state, lambda step, left: None, max_steps):
+            snapshots.append(snapshot)
         spent = time.process_time() - began - waited - self.seconds  # it prepared the views itself
-        strengths, made = course.sort_recordings(made)
-        steps = ", ".join(f"{snapshot.means.get(TAKEN, 0):.0f}" for snapshot in made)
+        strengths, snapshots = course.sort_recordings(snapshots)
+        steps = ", ".join(f"{snapshot.means.get(TAKEN, 0):.0f}" for snapshot in snapshots)
         at = ", ".join(f"{s:g}" for s in strengths)
-        tables = [snapshot.table for snapshot in made if snapshot.table is not None]
-        offsets = [snapshot.offsets for snapshot in made]
+        tables = [snapshot.table for snapshot in snapshots if snapshot.table is not None]
+        offsets = [snapshot.offsets for snapshot in snapshots]
         views = len(self.setup.held_out) + len(solver.views)
         spent -= (
-            (1.0 - views / len(self.setup.views)) * (len(made) - 1) * self.a_strength
+            (1.0 - views / len(self.setup.views)) * (len(snapshots) - 1) * self.a_strength
         )  # pictures not needed
         name = f"automatic: {views} views, {len(strengths)} strengths, {model.bands} SH"
         result = self.measure(name, judge, strengths, model.bands, tables, offsets, spent, model.mask)
@@ -237,13 +239,14 @@ class RegretEdit:
             strengths = every[len(every) // count - 1 :: len(every) // count]
             for steps in STEPS[: 1 if not bands else len(STEPS)]:
                 if steps <= most:
-                    made = [self.solved[degree, bands, s, steps] for s in strengths]
-                    words = f", {steps} steps" if bands else ""
-                    words += ", a mask" * (mask is not None)
-                    name = f"{len(self.setup.views)} views, {count} strengths{words}, {bands} SH"
-                    offsets = [band_offsets(change, self.original.shape[1]) for _, change, _ in made]
-                    spent = once + sum(seconds for *_, seconds in made)
-                    tables = [table for table, *_ in made]
+                    solutions = [self.solved[degree, bands, s, steps] for s in strengths]
+                    suffix = f", {steps} steps" if bands else ""
+                    if mask is not None:
+                        suffix += ", a mask"
+                    name = f"{len(self.setup.views)} views, {count} strengths{suffix}, {bands} SH"
+                    offsets = [band_offsets(change, self.original.shape[1]) for _, change, _ in solutions]
+                    spent = once + sum(seconds for *_, seconds in solutions)
+                    tables = [table for table, *_ in solutions]
                     yield self.measure(name, judge, strengths, bands, tables, offsets, spent, mask)
 
     def measure(

@@ -85,7 +85,7 @@ class Start:
 
 
 def tables(scenes: Sequence[Path] = ()) -> list[Table]:
-    """Measure, for docs/speed-and-error.md.
+    """Measure frames and starts, for docs/speed-and-error.md.
 
     Args:
         scenes: .ply files that replace the bears; the largest is also copied over itself four times unless

@@ -71,7 +71,7 @@ class Moving:
 
 
 def tables(scenes: Sequence[Path] = ()) -> list[Table]:
-    """Measure, for docs/speed-and-error.md.
+    """Measure response times in motion, for docs/speed-and-error.md.
 
     Args:
         scenes: .ply files that replace the bears; the largest is copied over itself up to a million Gaussians

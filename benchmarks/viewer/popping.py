@@ -57,7 +57,7 @@ class Film:
 
 
 def tables(scenes: Sequence[Path] = ()) -> list[Table]:
-    """Make the films, for docs/speed-and-error.md.
+    """Draw and compare the films, for docs/speed-and-error.md.
 
     Args:
         scenes: .ply files that replace the bears

@@ -26,7 +26,7 @@ CORNERS = 400
 
 
 def tables(scenes: Sequence[Path] = ()) -> list[Table]:
-    """Measure, for docs/benchmarks.md.
+    """Measure manual selections, for docs/benchmarks.md.
 
     Args:
         scenes: .ply files that replace the bears

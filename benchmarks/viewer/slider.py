@@ -79,7 +79,7 @@ class SliderTimes:
 
 
 def tables(scenes: Sequence[Path] = ()) -> list[Table]:
-    """Measure, for docs/speed-and-error.md.
+    """Measure slider events, for docs/speed-and-error.md.
 
     Args:
         scenes: .ply files that replace the bears

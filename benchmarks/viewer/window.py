@@ -72,7 +72,7 @@ class Dragging:
 
 
 def tables(scenes: Sequence[Path] = (), seconds: float = DRAG_S) -> list[Table]:
-    """Measure, for docs/benchmarks.md.
+    """Measure the idle and the dragged window, for docs/benchmarks.md.
 
     Args:
         scenes: .ply files, of which the smallest replaces the bear

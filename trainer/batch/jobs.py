@@ -180,7 +180,8 @@ def make_options(values: Mapping[str, Any], out: Path) -> TrainOptions:
     options = replace(BLANK, out=out)
     known = [name for name, typed, _ in flat_values(options) if typed and name not in _EXCLUDED_OPTIONS]
     _check_keys({k: v for k, v in values.items() if k != "scene"}, known, "it")
-    if (preset := values.get("preset", "default")) != "default":
+    preset = values.get("preset", "default")
+    if preset != "default":
         if preset not in list(PRESETS):  # a list: values of other types may have no hash
             raise ProgdfError(f"there is no preset {preset!r}")
         options = apply_preset(options, preset)

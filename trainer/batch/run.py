@@ -115,7 +115,8 @@ class LocalPool:
 
     def stop(self) -> None:
         """See `Pool`."""
-        if (worker := self._worker) is not None:
+        worker = self._worker
+        if worker is not None:
             if self._future.running():
                 worker.send_signal(signal.SIGINT)
                 wait([self._future], _STOP_TIMEOUT_S)
@@ -136,7 +137,8 @@ class RayPool:
         _check_address(address)
         import ray
 
-        self._ray, self._references = ray, list[Any]()
+        self._ray = ray
+        self._references = list[Any]()
         self._folder = "" if address else tempfile.mkdtemp(prefix="progdf-ray-")
         own = {"num_cpus": cpus, "object_store_memory": _STORE_BYTES, "_temp_dir": self._folder}
         where: dict[str, Any] = {"address": address} if address else {**own, "include_dashboard": False}
@@ -157,7 +159,8 @@ class RayPool:
     def capacity(self, threads: int) -> int:
         """See `Pool`. The number of machines can change."""
         if time.monotonic() - self._checked_at > _CAPACITY_INTERVAL_S:
-            self._checked_at, self._cpus = time.monotonic(), int(self._ray.cluster_resources().get("CPU", 0))
+            self._checked_at = time.monotonic()
+            self._cpus = int(self._ray.cluster_resources().get("CPU", 0))
         return max(1, self._cpus // threads)
 
     def submit(self, task: Task) -> Future[Any]:
@@ -277,7 +280,8 @@ def _may_start(task: Task, running: Mapping[Future[Any], Task], pool: Pool) -> b
 
 def _result(future: Future[Any]) -> Any:
     """Return a task's result; `Lost` for an error of Ray and after running out of memory."""
-    if (error := future.exception()) is not None:
+    error = future.exception()
+    if error is not None:
         kind = type(error).__name__
         return Lost(f"its worker ended ({kind})", from_memory=kind == "OutOfMemoryError")
     result = future.result()
@@ -498,8 +502,13 @@ def _print_plan(
 ) -> None:
     """Print the jobs as commands, and their total time, disk space and memory."""
     for job in jobs:
-        state = "finished" if job.key in kept else "" if job.key in costs else "cannot be trained"
-        print_line(f"{job.key}: {state or job.command}")
+        if job.key in kept:
+            plan = "finished"
+        elif job.key in costs:
+            plan = job.command
+        else:
+            plan = "cannot be trained"
+        print_line(f"{job.key}: {plan}")
     seconds = sum(cost.seconds for cost in costs.values()) / max(1, workers)
     longest = max((cost.seconds for cost in costs.values()), default=0.0)
     print_line(

@@ -129,7 +129,8 @@ def _is_begun(folder: RunFolder) -> bool:
 
 def _write_preview(result: RunResult, scene: Gaussians) -> None:
     """Draw the edit at strengths 0.5 and 1 in the held-out view that shows most of the region."""
-    folder, gdf = result.folder, load_gdf(result.gdf, scene)
+    folder = result.folder
+    gdf = load_gdf(result.gdf, scene)
     held_out = result.report["views"]["edit"]
     cameras = {camera.name: camera for camera in read_run_cameras(folder, held_out, scene.origin)}
 
@@ -158,7 +159,8 @@ class Lost:
 
 def serve() -> None:
     """Serve as a worker without Ray: pickled tasks from stdin, results to the original stdout."""
-    tasks, results = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    tasks = os.fdopen(os.dup(0), "rb")
+    results = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     queue = SimpleQueue[Any]()
 

@@ -57,7 +57,8 @@ def evaluation_picture(opened: OpenedRun, evaluation: Evaluation) -> Tensor:
             view_caption(evaluator, len(opened.setup.held_out)),
         )
     ]
-    if pairs := evaluation.consistency.pairs:
+    pairs = evaluation.consistency.pairs
+    if pairs:
         sheets.append(_warp_sheet(max(pairs, key=lambda pair: pair.shared)))
     return stack_plots(_join_sheets([to_picture(sheet) for sheet in sheets]), _plots(evaluation))
 

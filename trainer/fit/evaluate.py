@@ -67,9 +67,10 @@ class Evaluator:
         """Return the SSIM over the evaluated pixels of all views, at most 1."""
         total = count = 0.0
         for a, b, pixels in zip(pictures, expected, self.pixels, strict=True):
-            if here := int(pixels.sum()):
-                total += here * float(ssim(a, b, pixels))
-                count += here
+            pixel_count = int(pixels.sum())
+            if pixel_count:
+                total += pixel_count * float(ssim(a, b, pixels))
+                count += pixel_count
         return total / count if count else 1.0
 
     def perceptual(

@@ -1,4 +1,4 @@
-"""Fit the shipped field to a recorded trajectory, and measure its errors beside those of baselines."""
+"""Fit of the shipped field to a recorded trajectory, and its errors beside those of baselines."""
 
 from __future__ import annotations
 
@@ -86,11 +86,9 @@ def choose_path(
         f"the editor's half is met to {recorded_psnr:.1f} dB by the recorded way, "
         f"to {straight_psnr:.1f} dB by a straight one"
     )
-    return (
-        (trajectory, f"as recorded: {why}")
-        if recorded_psnr >= straight_psnr + _PATH_GAIN_DB
-        else (line, f"straight: {why}")
-    )
+    if recorded_psnr >= straight_psnr + _PATH_GAIN_DB:
+        return trajectory, f"as recorded: {why}"
+    return line, f"straight: {why}"
 
 
 BASELINES = (2, 4)  # numbers of keyframes of the baseline fields

@@ -98,9 +98,10 @@ def direction(before: Tensor, after: Tensor, text_before: Tensor, text_after: Te
         before, after: features of the pictures, of unit length. [n,D]
         text_before, text_after: features of the texts, of unit length. [D]
     """
-    direction = (text_after - text_before).double()
+    text_change = (text_after - text_before).double()
     picture_change = (after - before).double()
-    cosines = (picture_change @ direction) / (picture_change.norm(dim=1) * direction.norm()).clamp_min(1e-30)
+    lengths = picture_change.norm(dim=1) * text_change.norm()
+    cosines = (picture_change @ text_change) / lengths.clamp_min(1e-30)
     changes = ~same_features(before, after) & ~same_features(text_before, text_after)
     return [float(c) if changed else None for c, changed in zip(cosines, changes.tolist(), strict=True)]
 

@@ -163,7 +163,8 @@ def measure(
         perceptual: LPIPS or its substitute
         clip: finished CLIP measurement, or the reason if there is none
     """
-    (evaluator, reporting), field = judges, fitted.chosen.field
+    evaluator, reporting = judges
+    field = fitted.chosen.field
     linear = fitted.baselines[COMPARED].field
     slider = slider_statistics(evaluator.course(shipped), masks=evaluator.pixels)
     stages = tuple((remap.at(s), strength) for s, strength in trajectory.stage_strengths)

@@ -183,7 +183,7 @@ class RunLog:
         release_memory()
         begun = last = time.perf_counter()
 
-        def tell(done: int, word: str) -> float:
+        def report_step(done: int, word: str) -> float:
             share = min(done / max(total, 1), 1.0)
             left = self.seconds_left(what, share, time.perf_counter() - begun)
             self._write_progress(what, left, word, done >= total)
@@ -191,7 +191,7 @@ class RunLog:
 
         def advance(done: int, word: str) -> None:
             nonlocal last
-            left = tell(done, word)
+            left = report_step(done, word)
             now = time.perf_counter()
             if now - last >= _LINE_INTERVAL_S and done < total:
                 last = now
@@ -209,7 +209,9 @@ class RunLog:
                 task = progress.add_task(what, total=total, word="")
 
                 def move_bar(done: int, word: str) -> None:
-                    progress.update(task, completed=done, word=f"{word}  {tell(done, word):.0f} s left")
+                    progress.update(
+                        task, completed=done, word=f"{word}  {report_step(done, word):.0f} s left"
+                    )
 
                 yield move_bar
         else:
@@ -219,16 +221,17 @@ class RunLog:
     @contextmanager
     def looks(self, what: str, total: int) -> Iterator[Callable[[], None]]:
         """Report a stage of about `total` equal parts; call the yielded function at each part."""
-        done, lock = 0, threading.Lock()  # any thread may call it
+        done = 0
+        lock = threading.Lock()  # any thread may call it
         with self.steps(what, total) as advance:
 
-            def count_look() -> None:
+            def count_part() -> None:
                 nonlocal done
                 with lock:
                     done += 1
                     advance(min(done, total), "")
 
-            yield count_look
+            yield count_part
 
     def close(self) -> None:
         """Close the file."""

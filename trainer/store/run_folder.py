@@ -53,7 +53,8 @@ def add_pictures(folder: Path, paths: Iterable[Path]) -> None:
     """Add files of the folder to its list."""
     lines = read_pictures_list(folder)
     new = dict.fromkeys(path.relative_to(folder).as_posix() for path in paths)
-    if added := [line for line in new if line not in set(lines)]:
+    added = [line for line in new if line not in set(lines)]
+    if added:
         _write(folder, [*lines, *added])
 
 

@@ -53,17 +53,17 @@ def defer_signals() -> Iterator[Callable[[], bool]]:
     Call it where the state is consistent. If it returns True, save and raise KeyboardInterrupt. A second
     signal raises at once, and a deferred signal raises at the end of the block.
     """
-    came = False
+    received = False
 
     def note(number: int, frame: FrameType | None) -> None:
-        nonlocal came
-        if came:
+        nonlocal received
+        if received:
             raise KeyboardInterrupt
-        came = True
+        received = True
 
     with handle_signals((signal.SIGINT, *ENDINGS), note):
-        yield lambda: came
-    if came:
+        yield lambda: received
+    if received:
         raise KeyboardInterrupt
 
 
@@ -174,7 +174,8 @@ class StateFolder:
         Returns:
             The seconds that the save took. `wait` and all later saves raise its exception too.
         """
-        path, before = self._file(part, index), _writing.get(self.path)
+        path = self._file(part, index)
+        before = _writing.get(self.path)
         header = {"values": json.dumps(dict(values), ensure_ascii=False)}
         tensors = {name: tensor.cpu() for name, tensor in tensors.items()}
 
@@ -194,7 +195,8 @@ class StateFolder:
 
     def wait(self) -> None:
         """Wait until everything is saved. Raises OSError if a save failed, see `save`."""
-        if (writing := _writing.pop(self.path, None)) is not None:
+        writing = _writing.pop(self.path, None)
+        if writing is not None:
             writing.result()
 
     @contextmanager
