@@ -68,7 +68,7 @@ def read_catalogue(path: Path, out: Path) -> tuple[list[BatchJob], list[str]]:
     try:
         content = read_file(path, _MAX_BYTES + 1)
         if len(content) > _MAX_BYTES:
-            raise ProgdfError(f"{path} is larger than any catalogue")
+            raise ProgdfError(f"{path} is too large for a catalogue (at most 16 MB)")
         table = tomllib.loads(content.decode())
     except (ValueError, RecursionError) as error:
         raise ProgdfError(f"{path} is not a TOML file ({error})") from None
@@ -128,7 +128,7 @@ def _check_count(scenes: Sequence[Mapping[str, Any]], sweep: Mapping[str, Sequen
         return
     factors = [f"{group_digits(edits)} edits", *(f"{size} of {name}" for name, size in values.items())]
     raise ProgdfError(
-        f"{group_digits(count)} jobs ({' × '.join(factors)}), the most are {group_digits(MAX_JOBS)}; "
+        f"{group_digits(count)} jobs ({' × '.join(factors)}), at most {group_digits(MAX_JOBS)} are allowed; "
         "split the catalogue"
     )
 
@@ -143,7 +143,7 @@ def _table(table: Mapping[str, Any], key: str) -> dict[str, Any]:
 def _tables(table: Mapping[str, Any], key: str) -> list[dict[str, Any]]:
     value = table.get(key, [])
     if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
-        raise ProgdfError(f"{key} must be tables, {_LIST_OF[key]}")
+        raise ProgdfError(f"{key} must be a list of tables, {_LIST_OF[key]}")
     return value
 
 

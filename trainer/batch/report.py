@@ -66,7 +66,7 @@ class JobRow:
         """One-line summary for the terminal."""
         if self.status != "done":
             return f"{self.job}: {self.status}{': ' if self.reason else ''}{self.reason}"
-        between = "" if self.psnr_between is None else f", {self.psnr_between:.1f} at worst in between"
+        between = "" if self.psnr_between is None else f", worst in between {self.psnr_between:.1f} dB"
         end = "" if self.psnr_end is None else f"{self.psnr_end:.1f} dB{between}, "
         return f"{self.job}: {end}{file_size(self.bytes or 0)}, {self.seconds or 0:.0f} s"
 

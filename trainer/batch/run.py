@@ -111,7 +111,7 @@ class LocalPool:
         except (EOFError, OSError, pickle.UnpicklingError):
             code = self._worker.wait()
             self._worker = None
-            return Lost(f"its worker ended ({signal.Signals(-code).name if code < 0 else f'status {code}'})")
+            return Lost(f"the worker ended ({signal.Signals(-code).name if code < 0 else f'status {code}'})")
 
     def stop(self) -> None:
         """See `Pool`."""
@@ -146,7 +146,7 @@ class RayPool:
             ray.init(log_to_driver=False, logging_level="error", **where)
         except Exception as error:  # Ray raises a bare Exception if its start takes too long
             shutil.rmtree(self._folder, ignore_errors=True)
-            hint = "; where the cluster asks for a token, RAY_AUTH_MODE=token sends it" if address else ""
+            hint = "; if the cluster requires a token, set RAY_AUTH_MODE=token" if address else ""
             reason = str(error).partition("\n")[0] or type(error).__name__
             raise ProgdfError(f"Ray cannot be used ({reason}){hint}") from error
         self._checked_at = 0.0
@@ -283,7 +283,7 @@ def _result(future: Future[Any]) -> Any:
     error = future.exception()
     if error is not None:
         kind = type(error).__name__
-        return Lost(f"its worker ended ({kind})", from_memory=kind == "OutOfMemoryError")
+        return Lost(f"the worker ended ({kind})", from_memory=kind == "OutOfMemoryError")
     result = future.result()
     if isinstance(result, JobRow) and result.status == "memory":
         return Lost(result.reason, from_memory=True)
@@ -299,7 +299,7 @@ def inspect(jobs: Sequence[BatchJob], pool: Pool) -> dict[str, Finding]:
     for task, result in run_tasks([Task(inspect_scene, group) for group in scenes.values()], pool):
         if isinstance(result, Lost):
             result = [
-                Finding(job.key, f"looking at its scene failed: {result.reason}") for job in task.argument
+                Finding(job.key, f"checking its scene failed: {result.reason}") for job in task.argument
             ]
         findings += result
     return {finding.key: finding for finding in findings}
@@ -356,7 +356,7 @@ def batch(options: BatchOptions) -> int:
     jobs, faults = read_catalogue(options.catalogue, options.out)
     rows = read_rows(options.out)
     if rows and not (options.resume or options.dry_run):
-        raise ProgdfError(f"{options.out} holds a batch; add --resume to go on with it")
+        raise ProgdfError(f"{options.out} holds a batch; add --resume to continue it")
     selected = [job for job in jobs if _is_selected(job, options.only)]
     if not selected and not faults:
         raise ProgdfError("no job matches; --dry-run lists them")
@@ -406,7 +406,7 @@ def batch(options: BatchOptions) -> int:
             with hold_lock(options.out / LOCK):
                 _run_batch(options, jobs, tasks, rows, pool, screen)
         except LockedError:
-            raise ProgdfError(f"another batch works in {options.out}; wait for it, or stop it") from None
+            raise ProgdfError(f"another batch is running in {options.out}; wait for it, or stop it") from None
         return screen.total([rows[job.key] for job in selected], options.out) or (
             SOME_FAILED if faults else 0
         )
@@ -425,7 +425,7 @@ def _run_batch(
     def tell(event: str, task: Task, reason: str) -> None:
         screen.event(event, job=task.key, attempt=task.attempt, reason=reason)
         if event == "retry":
-            screen.say(f"{task.key}: {reason}; it is begun again and goes on where it was")
+            screen.say(f"{task.key}: {reason}; restarting it from its saved state")
 
     writers: list[Callable[[Path, Sequence[JobRow]], None]] = [write_rows, partial(write_page, jobs=jobs)]
     due = [0.0, 0.0]  # a row not yet written is recovered from its run folder
@@ -448,7 +448,7 @@ def _run_batch(
     except KeyboardInterrupt:
         again = "--resume" if options.resume else "--resume added"
         raise KeyboardInterrupt(
-            f"what is done is kept in {options.out}; give the same command with {again} to go on"
+            f"finished jobs are saved in {options.out}; run the same command with {again} to continue"
         ) from None
     finally:
         screen.close()
@@ -494,7 +494,7 @@ def _disk_faults(out: Path, costs: Mapping[str, Cost]) -> list[str]:
     free = shutil.disk_usage(folder).free
     if needed <= free:
         return []
-    return [f"{out}: the runs will take about {file_size(needed)}, and {file_size(free)} are free"]
+    return [f"{out}: the runs need about {file_size(needed)}, but only {file_size(free)} are free"]
 
 
 def _print_plan(

@@ -80,9 +80,9 @@ def _warp_sheet(pair: WarpedPair) -> Tensor:
         [EDITED, UNEDITED],
         [
             pair.target,
-            "what both see",
+            "seen by both",
             f"{pair.source} warped",
-            f"difference, {_DIFFERENCE_GAIN} times",
+            f"difference × {_DIFFERENCE_GAIN}",
             "depth",
         ],
         "One held-out view warped onto another by rendered depth",

@@ -253,14 +253,14 @@ def clip_consistency(opened: OpenedRun) -> tuple[float | None, str]:
         return None, str(error)
     views = opened.setup.views
     if len(views) < 2:
-        return None, "there is one view alone, which is no path"
+        return None, "a path needs at least two views"
     path = camera_path([view.camera for view in views[:: -(-len(views) // _MAX_PATH_VIEWS)]])
     before, after = (
         clip.pictures([render_view(scene, camera, opened.setup.background) for camera in path])
         for scene in (opened.run.scene, edited_scene(opened.setup.scene, opened.gdf))
     )
     similarity = neighbor_similarity(before, after)
-    return similarity, "" if similarity is not None else "the edit changes nothing that CLIP sees"
+    return similarity, "" if similarity is not None else "the edit does not change CLIP's features"
 
 
 def neighbor_similarity(before: Tensor, after: Tensor) -> float | None:

@@ -107,7 +107,7 @@ def _path_rows(paths: Mapping[str, SliderPath], lpips: str) -> list[MeasureRow]:
         return {name: None if math.isnan(number) else number for name, number in numbers.items()}
 
     return [
-        MeasureRow("evenness", "20 equal steps: evenness, least over largest change", of("evenness"), 2),
+        MeasureRow("evenness", "20 equal steps: evenness, smallest over largest change", of("evenness"), 2),
         MeasureRow("monotone", "steps that lead away from the original, share", of("monotone"), 2),
         MeasureRow("neighbors_mean", f"{lpips} of neighbors, mean", of("mean"), 4),
         MeasureRow("neighbors_largest", f"{lpips} of neighbors, largest", of("largest"), 4),
@@ -117,7 +117,7 @@ def _path_rows(paths: Mapping[str, SliderPath], lpips: str) -> list[MeasureRow]:
 
 
 def _consistency_rows(consistency: Consistency, lpips: str) -> list[MeasureRow]:
-    missing = "" if consistency.pairs else "no other view sees enough of what a held-out one does"
+    missing = "" if consistency.pairs else "no other view shares enough pixels with a held-out view"
     return [
         MeasureRow(
             "warped_lpips", f"one view warped onto another, {lpips}", dict(consistency.lpips), 3, missing
@@ -152,9 +152,9 @@ def _cost_rows(opened: OpenedRun) -> list[MeasureRow]:
     }
     return [
         MeasureRow("bytes_per_member", f"bytes for each of {len(gdf.region)} members", sizes, 0),
-        MeasureRow("seconds", "run, s", {SLIDER: seconds}, 0, "" if seconds else "report.json does not say"),
+        MeasureRow("seconds", "run, s", {SLIDER: seconds}, 0, "" if seconds else "missing in report.json"),
         MeasureRow(
-            "memory_mb", "peak memory, MB", {SLIDER: memory}, 0, "" if memory else "report.json does not say"
+            "memory_mb", "peak memory, MB", {SLIDER: memory}, 0, "" if memory else "missing in report.json"
         ),
     ]
 

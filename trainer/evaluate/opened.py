@@ -104,7 +104,7 @@ def open_run(root: Path, scene: Path | None = None) -> OpenedRun:
         raise ProgdfError(f"{root} has no views to measure with; train it again")
     shown_at = torch.tensor(gdf.field.recorded, dtype=torch.float32)
     if shown_at.shape != run.trajectory.s.shape:
-        raise ProgdfError(f"{gdf.name}.gdf is not of the recording beside it; run progdf fit {root}")
+        raise ProgdfError(f"{gdf.name}.gdf does not match the recording beside it; run progdf fit {root}")
     trajectory = replace(run.trajectory, s=shown_at)
     evaluator = load_evaluator(run.folder, setup, setup.judging, run.trajectory, gdf)
     extended, (gdf,) = extend(run.scene, [gdf])

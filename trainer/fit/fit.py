@@ -67,7 +67,7 @@ def choose_path(
         return retimed(trajectory), "as the parts move"
     line = select_recordings(trajectory, [0, len(trajectory) - 1])
     if editor is None or editor.stages:
-        return line, "straight: the editor pictures the end alone"
+        return line, "straight: the editor makes no picture between the original and the full edit"
     trajectory = retimed(trajectory)
     views = split_held_out(setup.judging)[0][:_PATH_VIEWS]
     half_pictures = {0.5: [editor.edit(view, 0.5) for view in views]}
@@ -83,8 +83,8 @@ def choose_path(
     recorded_psnr = nearest(trajectory)
     straight_psnr = nearest(line)
     why = (
-        f"the editor's half is met to {recorded_psnr:.1f} dB by the recorded way, "
-        f"to {straight_psnr:.1f} dB by a straight one"
+        f"PSNR to the editor's pictures at strength 0.5: recorded path {recorded_psnr:.1f} dB, "
+        f"straight path {straight_psnr:.1f} dB"
     )
     if recorded_psnr >= straight_psnr + _PATH_GAIN_DB:
         return trajectory, f"as recorded: {why}"

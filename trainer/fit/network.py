@@ -267,7 +267,7 @@ def fit_network(
     offsets = trajectory.nodes
     attributes = tuple(moving_attributes(offsets))
     if not attributes:
-        raise ProgdfError("the edit moves nothing that a network could learn; use --field auto")
+        raise ProgdfError("the edit changes nothing that a network could learn; use --field auto")
     rows = pack(setup.scene[setup.region.members])
     settings = network_settings(options)
     fit = NeuralFit(rows, offsets.shape[2], attributes, settings, weights)

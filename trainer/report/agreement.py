@@ -32,8 +32,8 @@ _MIN_CONTRAST = 0.8  # washed-out views agree, but have lost fine contrast
 _INVISIBLE_ERROR_DB = 28.0  # smaller errors are not visible, whatever their share of a faint change
 _REMEDIES = {
     "style": "use a calmer style (14, 23, 20, 7)",
-    "instruct": "say in the sentence what it leaves open, or --kind geometry if parts move",
-    "folder": "edit the views more alike, or say --kind geometry if parts move",
+    "instruct": "make the prompt more specific, or use --kind geometry if parts move",
+    "folder": "edit the views more consistently, or use --kind geometry if parts move",
 }
 _CG_STEPS = 6  # of conjugate gradients
 DAMPING = 1e-3  # share of the first step's curvature; barely visible members keep their color
@@ -67,7 +67,7 @@ class Agreement:
         if self.agree:
             best = f"the best colors reach {self.psnr:.1f} dB and miss {share}"
             return f"the edited views agree: on {judged_on} {best}"
-        remedy = _REMEDIES.get(editor, "mend them")
+        remedy = _REMEDIES.get(editor, "correct them")
         if self.contrast < _MIN_CONTRAST:
             return (
                 f"the edited views are washed out: {self.contrast:.0%} of the fine contrast that they had "

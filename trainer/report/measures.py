@@ -208,14 +208,14 @@ def clip_curve(
     """
     for text, option in ((texts.text_before, "--text-before"), (texts.text_after, "--text-after")):
         if not text.strip():
-            return Direction(reason=f"{option} was not given: it takes a text for each end of the slider")
+            return Direction(reason=f"{option} is missing; CLIP needs a text for each end of the slider")
     try:
         clip = load_clip(CLIP_MODEL)
     except ProgdfError as error:
         return Direction(reason=str(error))
     before, after = clip.texts([texts.text_before, texts.text_after])
     if bool(same_features(before, after)):
-        return Direction(reason="--text-before and --text-after say the same to CLIP")
+        return Direction(reason="CLIP has the same features for --text-before and --text-after")
     original = clip.pictures([view.image for view in views])
     similarity = [
         _mean(direction(original, _clip_features(clip, evaluator, views, field.offsets(s)), before, after))
@@ -313,7 +313,7 @@ class PaintTaken:
     @property
     def share(self) -> str:
         """One-line summary of the reproduced share."""
-        return f"{100 * self.reached:.0f} % of what was painted is in the edit"
+        return f"{100 * self.reached:.0f} % of the paint was reproduced"
 
     @property
     def warning(self) -> str:
@@ -328,12 +328,12 @@ class PaintTaken:
         reasons = []
         if self.removes:
             reasons.append(
-                "the painting covers things with what lies behind them: nothing is removed by painting "
-                "(--removal always takes it away)"
+                "the paint shows the background in place of an object, but painting removes nothing "
+                "(use --removal always)"
             )
         if is_visible and self.members < self.pixels:
-            counts = f"{format_count(self.members)} stand for {group_digits(self.pixels)} painted pixels"
-            reasons.append(f"{counts}; the detail is finer than they are")
+            counts = f"{format_count(self.members)} for {group_digits(self.pixels)} painted pixels"
+            reasons.append(f"{counts}; the detail is finer than the Gaussians")
         return f"{self.share}: {'; '.join(reasons)}" if reasons else self.share
 
     def figures(self) -> dict[str, Any]:

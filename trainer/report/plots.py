@@ -59,7 +59,7 @@ def draw_plot(plot: Plot, width: int, height: int) -> Image.Image:
     lines = {name: points for name, points in lines.items() if points[0]}
     if not lines:
         axes.set(xticks=[], yticks=[])
-        axes.text(0.5, 0.5, "nothing to show", color=pale, ha="center", transform=axes.transAxes)
+        axes.text(0.5, 0.5, "no data", color=pale, ha="center", transform=axes.transAxes)
         return _image(figure)
     for i, (name, (xs, ys)) in enumerate(lines.items()):
         color = _shade(LINES[i % len(LINES)])

@@ -58,7 +58,7 @@ def report_picture(
             [column_heading(*column) for column in columns],
             title,
             view_caption(evaluator, held_out)
-            + ("; gray: the editor was not asked" if any(at is None for _, at in columns[1:]) else ""),
+            + ("; gray: no editor picture" if any(at is None for _, at in columns[1:]) else ""),
         )
     )
     return stack_plots(sheet, [_error_plots(measured), _uniformity_plots(measured, losses)])
@@ -148,7 +148,7 @@ def _uniformity_plots(measured: Measured, losses: Losses) -> list[Plot]:
         Plot(
             f"visible change of each 1/{len(slider.steps)} of the slider",
             {"change": (middles(len(slider.steps)), slider.steps)},
-            f"slider; least over largest {slider.uniformity:.2f}",
+            f"slider; smallest over largest {slider.uniformity:.2f}",
             low=0.0,
             span=_SPAN,
         ),

@@ -36,7 +36,7 @@ STAGES = {
     "weigh the members": "Packing",
     "fit the field": "Packing",
     "field": "Packing",
-    "even the slider": "Making the slider's steps alike",
+    "even the slider": "Equalizing the slider",
     "measure the edit": "Measuring",
     "draw": "",
 }

@@ -210,7 +210,7 @@ def test_ctrl_c_stops_all_and_resume_ends_with_the_same_bytes(
     finally:
         process.kill()
     assert process.returncode == 130
-    assert "with --resume added to go on" in error
+    assert "with --resume added to continue" in error
     assert [row.status for row in read_rows(out).values()] != ["done", "done"]
     assert not children(process.pid)
     assert cli.batch([str(catalogue), "--out", str(out), "--workers", "1", "--resume"]) == 0

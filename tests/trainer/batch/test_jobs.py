@@ -138,7 +138,7 @@ def test_too_many_jobs_are_counted_before_one_is_built(
     sweep = f"\n[sweep]\nseed = {[*range(400)]}\nsteps = {[*range(400, 557)]}"
     jobs, (fault,) = read(tmp_path, SHOES + sweep)
     assert not jobs
-    assert "188 400 jobs (3 edits × 400 of seed × 157 of steps), the most are 100 000" in fault
+    assert "188 400 jobs (3 edits × 400 of seed × 157 of steps), at most 100 000 are allowed" in fault
 
 
 def test_number_of_jobs_beyond_all_is_one_line(tmp_path: Path) -> None:

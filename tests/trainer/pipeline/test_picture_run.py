@@ -87,7 +87,7 @@ def test_a_fill_that_took_is_reported_without_a_warning(done: RunResult) -> None
     assert done.report["paint"]["warning"] == ""
     log = done.folder.log.read_text()
     assert "warning:" not in log
-    assert "% of what was painted is in the edit" in log.splitlines()[-1]
+    assert "% of the paint was reproduced" in log.splitlines()[-1]
 
 
 @pytest.mark.parametrize("background", [(1.0, 1.0, 1.0), (0.1, 0.2, 0.4)])
@@ -109,7 +109,7 @@ def test_painting_a_thing_away_is_said_to_remove_nothing(
     ]
     found = measure_paint(setup, painted, [behind] * len(painted), scene)
     assert found.reached == pytest.approx(0.0, abs=0.01)
-    assert found.warning.startswith("0 % of what was painted is in the edit: the painting covers things")
+    assert found.warning.startswith("0 % of the paint was reproduced: the paint shows the background")
     assert "nothing is removed by painting" in found.warning
     originals = [view.image for view in setup.train]
     kept = measure_paint(setup, originals, [behind] * len(painted), scene)
@@ -138,8 +138,8 @@ def test_what_saving_does_beside_the_members_is_not_counted_as_painted(folder: P
 
 def test_detail_finer_than_the_splats_is_said_with_both_counts() -> None:
     assert PaintTaken(0.37, 0.2, 2074, 457, False).warning == (
-        "37 % of what was painted is in the edit: 457 Gaussians stand for 2 074 painted pixels; "
-        "the detail is finer than they are"
+        "37 % of the paint was reproduced: 457 Gaussians for 2 074 painted pixels; "
+        "the detail is finer than the Gaussians"
     )
 
 
@@ -156,7 +156,7 @@ def test_the_way_is_neither_gray_nor_raw(done: RunResult) -> None:
 def test_such_a_run_can_be_evaluated(done: RunResult, capsys: pytest.CaptureFixture[str]) -> None:
     evaluate(EvaluateOptions(done.folder.root))
     said = capsys.readouterr().out
-    assert "no other view sees enough of what a held-out one does" in said
+    assert "no other view shares enough pixels with a held-out view" in said
     assert "to the run's own pictures, trained on, at 1, PSNR" in said
 
 

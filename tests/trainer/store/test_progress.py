@@ -51,7 +51,7 @@ def test_the_progress_file_says_how_far_the_whole_run_is(
         ("Editing views", 0.1, ""),
         ("Training", 0.57, "0.0123"),
         ("Packing", 0.67, ""),
-        ("Making the slider's steps alike", 0.67, ""),
+        ("Equalizing the slider", 0.67, ""),
     ]
 
 
