@@ -42,17 +42,17 @@ ASKED = 20  # evenly spaced strengths at which the worst picture of the slider i
 
 EDIT_NOTE = (
     "PSNR on all held-out views, over the pixels that show the region or that the editor changes; LPIPS over "
-    "each view's box. 2 keyframes: original and end, a straight line in raw parameters, made even as ours "
-    "is. Cross-fade: the rendered ends, blended in sRGB. Even: smallest over largest change of 20 equal "
-    "steps. A file holds the field, the region, the plan and the report. Worst: the lowest of "
-    f"{ASKED} even strengths, of most of which training saw no picture, and where; the slider value of each "
-    "lies straight between those of the strengths that training asked for."
+    "each view's box. 2 keyframes: a straight line in raw parameters from the original to the full edit, "
+    "retimed like the slider. Cross-fade: the rendered ends, blended in sRGB. Even: smallest over largest "
+    "change of 20 equal steps. A file holds the field, the region, the plan and the report. Worst: the "
+    f"lowest of {ASKED} even strengths, most of them without a training picture, with its slider value, "
+    "which is interpolated linearly between those of the training strengths."
 )
 SLIDER_NOTE = (
     "Against the recording, on the half of the held-out views on which the field was not chosen. Far views: "
-    f"each of these from {RAISED[0]:.0f}° above, from {-RAISED[1]:.0f}° below, and {ZOOM:.0f} times as near "
-    "by its lens; nothing was trained, chosen or asked for there. Where the editor is a function of the "
-    "picture it is asked for these views too, at the strengths that training used."
+    f"each of these from {RAISED[0]:.0f}° above, from {-RAISED[1]:.0f}° below, and magnified {ZOOM:.0f} "
+    "times; they are not used for training or choice. An editor that is a function of the picture edits "
+    "these views too, at the training strengths."
 )
 
 

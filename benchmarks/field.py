@@ -289,11 +289,11 @@ def field_table(forms: Sequence[Form]) -> Table:
         "field",
         "Fields: error over bytes",
         rows,
-        "Bold: what a run ships. Edits of colors: PSNR to the editor's own pictures in "
-        f"{REPORTING - 1} views in which nobody trained or chose; all forms but the bold one are of the "
-        f"same recording, {STEPS} steps of the residual at each of the run's strengths, and a map costs "
-        "its numbers once for all members. The motion: PSNR to its true course, over the pixels that it "
-        "changes. Seconds: to fit; of the bold grade with its solving.",
+        "Bold: the field that a run ships. Color edits: PSNR against the editor's pictures in "
+        f"{REPORTING - 1} views not used for training or choice. All fields but the bold one are fitted to "
+        f"the same recording, with {STEPS} steps of the residual at each of the run's strengths. A map is "
+        "stored once for all members. The motion: PSNR against its true trajectory, over the pixels that it "
+        "changes. Seconds: of the fit, for the bold grade with its solving.",
     )
 
 
@@ -315,10 +315,10 @@ def _compose_table() -> Table:
         "compose",
         "A slider step: new attributes of all members",
         rows,
-        "Medians, taken in turns. Moved: what a step must read (bases, the original, the last centers, "
-        "row numbers) and write; copying: a NumPy copy that reads and writes as much, one thread. What one "
-        "member takes does not grow. The plain compose also checks that the edit belongs to the scene. A "
-        "network is asked once, untrained.",
+        "Medians, measured in turns. Moved: data that a step must read (bases, the original, the last "
+        "centers, row indices) and write. Copying: a NumPy copy of the same size on one thread. The time for "
+        "one member does not grow with the scene. The plain compose also checks that the edit belongs to the "
+        "scene. The network is evaluated once, untrained.",
     )
 
 

@@ -247,10 +247,11 @@ def tables() -> list[Table]:
 
     note = (
         "Median and range; the engines take turns in one process. The plain version is "
-        "`progdf.rasterize.reference` in float64, forward alone where no gradient error is given. Errors are "
-        "against it: largest difference of a color; of a gradient over the largest, worst input named. Dense "
-        "tiles of torch are the easy opponent: OpenSplat's CPU engine, in one run with an earlier engine of "
-        "ours, took 4.5 to 8.9 times as long as that, its gradients of quats and scales being wrong."
+        "`progdf.rasterize.reference` in float64, forward only if no gradient error is given. Errors are "
+        "against it: largest difference of a color, and of a gradient over its maximum, with the worst input "
+        "named. Dense tiles in torch are a weak baseline. OpenSplat's CPU engine, in one run with an earlier "
+        "engine of ours, took 4.5 to 8.9 times as long as ours, "
+        "and its gradients of quats and scales were wrong."
     )
     return [Table.of("rasterize", "CPU rasterizer", rows, note), list_table(CASES)]
 
@@ -301,9 +302,9 @@ def list_table(cases: Sequence[RasterCase], rounds: int = 9) -> Table:
         "its bound",
     )
     note = (
-        "A view as a function of colors, for edits of colors. Weights that in a pixel come to less than half "
-        "of one of 255 levels, all together, are left out where such edits are solved for; the run is judged "
-        "by whole pictures. In scenes: docs/experiments.md, Weights that hardly show."
+        "A view as a function of colors, for color edits. The solver leaves out weights that together change "
+        "a pixel by less than half of one of 255 levels; the run is evaluated with whole pictures. "
+        "Trained scenes: docs/experiments.md, Weights that hardly show."
     )
     return Table("lists", "A view as lists of weights", columns, tuple(rows), note)
 
@@ -364,11 +365,10 @@ def warp_tables(cases: Sequence[RasterCase] | None = None, rounds: int = 5) -> l
         "its worst gradient error",
     )
     note = (
-        "Median and range, the card waited for; of the processor: forward and backward, on one thread. "
-        "Errors are against the reference in float64; of the cases that a card gets (200 000 and 1 000 000 "
-        "Gaussians) against the cpu engine. A step is a whole one of training: members to picture, L1, LPIPS "
-        "every second step, gradients, Adam. Warp's CPU device runs the same kernels one thread after "
-        "another, for tests alone."
+        "Median and range, after the card has finished. Processor time: forward and backward, on one thread. "
+        "Errors are against the reference in float64, and on a card (200 000 and 1 000 000 Gaussians) "
+        "against the cpu engine. A step is a whole training step: rendering, L1, LPIPS every second step, "
+        "gradients, Adam. Warp's CPU device runs the same kernels one thread after another, for tests only."
     )
     return [Table("warp", "The engine warp", columns, tuple(rows), note)]
 
@@ -431,10 +431,10 @@ def hard_tables() -> list[Table]:
     columns = ("case", "Gaussians", *figures)
     note = (
         "The engines in float32 against the reference in float64, warp on its CPU device: largest "
-        "difference of a color, over the brightest if that is above 1; of a gradient over the largest, of "
-        "the input named. The cases are those of `tests/progdf/rasterize/test_rasterize.py`, which fails "
-        "beyond its tolerances. A camera whose viewmat is no rotation and translation is refused where it "
-        "is made, as engines rely on it."
+        "difference of a color, over the brightest color if that is above 1, and of a gradient over its "
+        "maximum, with the input named. The cases are those of `tests/progdf/rasterize/test_rasterize.py`, "
+        "which checks its tolerances. A camera whose viewmat is not a rotation and translation is "
+        "refused at construction, as engines rely on it."
     )
     return [Table("hard", f"{len(rows)} hard cases", columns, tuple(rows), note)]
 

@@ -170,9 +170,9 @@ def table(found: Mapping[TrainingTask, Sequence[TimedEdit]]) -> Table:
         for task in found
     )
     note = (
-        f"PSNR to the editor's own pictures in {REPORTING - 1} views of a rig in which nobody trained or "
-        "chose, over the pixels that show the region; whole processes, imports and the report's pictures "
-        f"included. Each row is that option added to: {commands}."
+        f"PSNR against the editor's pictures in {REPORTING - 1} rig views not used for training or choice, "
+        "over the pixels that show the region. Times are of whole processes, with imports and the report's "
+        f"pictures. Each row adds its options to: {commands}."
     )
     return Table.of("training", "Training: error over time", rows, note)
 

@@ -207,9 +207,9 @@ def frames_table(turnings: Sequence[Turning], starts: Sequence[Start], renderer:
         "frames",
         "Frames while orbiting, 640×480, and the first picture",
         rows,
-        f"OpenGL by {renderer}. Every frame turns three degrees and has its own exact depth order; a whole "
-        "frame goes from the mouse's event to finished pixels of picture and panel. A file is opened in a "
-        "window that is there; `progdf view` counts from the start of its process, kernels compiled before.",
+        f"OpenGL by {renderer}. Every frame orbits three degrees and has its own exact depth order. A whole "
+        "frame goes from the mouse's event to finished pixels of picture and panel. A file is opened in an "
+        "existing window; `progdf view` counts from the start of its process, with kernels compiled before.",
     )
 
 

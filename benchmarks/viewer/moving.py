@@ -183,11 +183,11 @@ def table(results: Sequence[Moving]) -> Table:
         )
     return Table.of(
         "moving",
-        f"A scene in the hand without a graphics card, {SIZE[0]}×{SIZE[1]}, ms",
+        f"Interaction without a graphics card, {SIZE[0]}×{SIZE[1]}, ms",
         rows,
-        "Whole frames, from the mouse's event to finished pixels of picture and panel; each step of "
-        f"{STEPS} turns three degrees. The errors are the worst of {JUDGED} pictures, on white, as they are "
-        "shown: stretched smoothly. The pyramid is built before.",
+        "Whole frames, from the mouse's event to finished pixels of picture and panel. Each of "
+        f"{STEPS} steps orbits three degrees. The errors are the worst of {JUDGED} pictures on white, scaled "
+        "bilinearly as on the screen. The pyramid is built before.",
     )
 
 

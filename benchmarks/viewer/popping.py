@@ -174,7 +174,7 @@ def table(films: Sequence[Film]) -> Table:
             }
             for film in films
         ],
-        f"{FRAMES} frames, each {TURN:.0f}° on. The moving picture is as fine as it is found to need to be "
-        "where the hand rests before, whatever time that takes; what changes in it and does not in the sharp "
-        f"film is popping (or detail that it lacks), on average and of the means of {BLOCK}×{BLOCK} pixels.",
+        f"{FRAMES} frames, each {TURN:.0f}° apart. The level of detail of the moving picture is calibrated "
+        "at a stop before the film, independent of the frame time. Changes that the sharp film does not have "
+        f"are popping (or missing detail), given on average and for the means of {BLOCK}×{BLOCK} pixels.",
     )

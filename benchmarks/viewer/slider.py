@@ -144,8 +144,9 @@ def rows(
 def table(results: Sequence[SliderTimes], renderer: str) -> Table:
     """Make the table of measurements; `renderer` names the OpenGL driver."""
     note = (
-        f"OpenGL by {renderer}. A hand drags the slider of a window without a screen; wall clock, the GPU "
-        "waited for, the parts are medians; processor: of all cores. The CPU rasterizer sorts as it draws."
+        f"OpenGL by {renderer}. Simulated input drags the slider of a window without a screen. Wall clock, "
+        "after the GPU has finished; the parts are medians. Processor: of all cores. The CPU rasterizer "
+        "sorts as it draws."
     )
     rows = [_cells(result) for result in results]
     return Table.of("viewer", "Slider event to finished pixels, 640×480, ms", rows, note)
