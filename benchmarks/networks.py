@@ -59,12 +59,12 @@ ROUNDS = 15
 
 
 NOTE = (
-    "PSNR against the recording, at 13 slider values, in held-out views that no choice has seen, over the "
-    "pixels that show the region or that the edit changes. A training step draws as many members as there "
-    "are, at most 2048 (6 M: 1024); what would take more than ten minutes of one core is timed untrained. "
-    f"ms: median processor time of {ROUNDS} slider steps on one thread, all fields in turns; asked is the "
-    "network's answer alone, baked the step of the viewer with all new attributes. The paper gives 20 ms on "
-    "a V100 for its own, which cannot be checked here."
+    "PSNR against the recording, at 13 slider values, in held-out views not used for any choice, over the "
+    "pixels that show the region or that the edit changes. A training step samples all members, at most "
+    "2048 (6 M: 1024). Networks that would train for more than ten minutes on one core are timed untrained. "
+    f"ms: median processor time of {ROUNDS} slider steps on one thread, all fields in turns. Asked: "
+    "evaluating the network only; baked: a step of the viewer with all new attributes. The paper gives 20 ms "
+    "on a V100 for its own network, which cannot be checked here."
 )
 
 

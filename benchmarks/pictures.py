@@ -63,9 +63,9 @@ GIVEN = ((0,), (9,), (0, 18), (0, 9, 18, 27))
 DEGREES = (0, 30, 75, 120, 180)  # limits of the angle to the nearest given picture
 
 NOTE = (
-    f"A rig of {RIG} cameras around the region; the pictures given are of {LARGE} pixels, the others, of "
-    f"{SIZE}, judge: PSNR over the pixels that show the region, by degrees from the nearest picture given, "
-    "mean / worst; the solver's processor time."
+    f"A rig of {RIG} cameras around the region. The given pictures have {LARGE} pixels. The other views, of "
+    f"{SIZE} pixels, are evaluated: PSNR over the pixels that show the region, by degrees from the nearest "
+    "given picture, mean / worst. Seconds: processor time of the solver."
 )
 
 

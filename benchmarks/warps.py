@@ -93,10 +93,10 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
                 "seconds",
             ),
             tuple(rows),
-            f"PSNR in held-out views over the pixels that count, dB; {STEPS} steps towards the end, "
-            f"{VIEWS} views of {SIZE} pixels, a fifth of them held out. free: members alone; parts, free: "
-            "connected parts moved as wholes first, as it was; bent: by control points, before and after the "
-            "members' own steps; seconds: processor time, free, then bent and free.",
+            f"PSNR in held-out views over the evaluated pixels, dB; {STEPS} steps towards the full edit, "
+            f"{VIEWS} views of {SIZE} pixels, a fifth of them held out. free: members only; parts, free: "
+            "rigid motions of connected parts first, as before; bent: by control points, before and after "
+            "the members' own steps; seconds: processor time, free, then bent and free.",
         )
     ]
 

@@ -70,12 +70,12 @@ NEAR = 0.3
 """dB within which a cheaper field counts as equal."""
 
 NOTE = (
-    f"dB to the editor's own pictures at strength {', '.join(f'{s:g}' for s in MEASURED)}, in "
-    f"{REPORTING - 1} views of a rig in which nobody trained or chose, over the pixels that show the region; "
-    "mean: of the end and the mean of the in-betweens, what lies beyond a level of 8 bits (48.1 dB) taken as "
-    "that. Seconds: of the processor, one thread, for the pictures, their weights, the model, the solving "
-    "and the choice of the field. The sweep's strengths are solved for once, each from the finished edit's; "
-    "fewer are every other of them."
+    f"dB against the editor's pictures at strength {', '.join(f'{s:g}' for s in MEASURED)}, in "
+    f"{REPORTING - 1} rig views not used for training or choice, over the pixels that show the region. "
+    "Mean: of the end and the mean between, each limited to that of one 8-bit level (48.1 dB). Seconds: "
+    "processor time on one thread, for the pictures, their weights, the model, the solution and the choice "
+    "of the field. The sweep solves each strength once, starting from the solution of the full edit; smaller "
+    "numbers of strengths are subsets."
 )
 
 

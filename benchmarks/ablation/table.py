@@ -136,12 +136,12 @@ def table_of(ablations: Sequence[Ablation], title: str) -> Table:
         failures += [f"{about.name}: {row.failed}." for row in found if row is not None and row.failed]
     runs = [f"{ablation.name}: {ablation.note}" for ablation in ablations]
     note = (
-        "On held-out views, over the pixels that show the region: the finished edit against the edited "
-        "views; the slider near a quarter, half and three quarters against the editor's own pictures, their "
-        "mean (–: it was not asked); least over largest visible change of 20 equal steps; slider value at 50 "
-        "and 90 % of the change; bytes of the field per member; of the optimization alone. "
-        "± is the standard deviation over the seeds; what is solved for is the same with every seed and is "
-        "trained once."
+        "On held-out views, over the pixels that show the region. End: the finished edit against the edited "
+        "views. Between: mean over slider values near 0.25, 0.5 and 0.75 against the editor's pictures (–: "
+        "there are none). Even: smallest over largest visible change of 20 equal steps. t50, t90: slider "
+        "value at 50 and 90 % of the change. Bytes: of the field, per member. Seconds: of the optimization "
+        "only. ± is the standard deviation over the seeds; variants that solve for colors use no seed and "
+        "are trained once."
     )
     if len(ablations) > 1:
         note += f" A cell's lines: {', '.join(ablation.name for ablation in ablations)}."
