@@ -36,7 +36,7 @@ def load_source(name: str) -> Source:
             return
         path = resources.files("shaders") / str(PurePosixPath(file))
         if not path.is_file():
-            raise ShaderError(f"shaders/{file} does not exist; {wanted_by} asks for it")
+            raise ShaderError(f"shaders/{file} does not exist; {wanted_by} includes it")
         number = len(files)
         files.append(file)
         if number:

@@ -123,10 +123,10 @@ class BakePlan:
 
     def __post_init__(self) -> None:
         if self.knots.ndim != 1 or not 2 <= len(self.knots) <= MAX_KNOTS:
-            raise ValueError(f"a bake at knots {list(self.knots.shape)}, expected 2 to {MAX_KNOTS}")
+            raise ValueError(f"bake plan has knots {list(self.knots.shape)}, expected 2 to {MAX_KNOTS}")
         for name, rank in self.ranks.items():
             if not 0 <= rank <= MAX_RANK:
-                raise ValueError(f"a bake of {name} with {rank} bases, expected 0 to {MAX_RANK}")
+                raise ValueError(f"bake plan of {name} has {rank} bases, expected 0 to {MAX_RANK}")
         for name, share in self.end_correction.items():
             check_tensor(f"the end correction of {name}", share, self.knots.shape, torch.float32)
 
@@ -163,7 +163,7 @@ class SliderRemap:
 
     def __post_init__(self) -> None:
         if self.old.shape != self.new.shape:
-            raise ValueError(f"{list(self.old.shape)} old knots for {list(self.new.shape)} new ones")
+            raise ValueError(f"remap has {list(self.old.shape)} old and {list(self.new.shape)} new knots")
         for knots in (self.old, self.new):
             check_ascent("the knots of a remap", knots)
 
@@ -212,7 +212,7 @@ def lattice_side(points: int) -> int:
     """
     side: int = round(points ** (1 / 3))
     if side**3 != points or not 2 <= side <= MAX_SIDE:
-        raise ValueError(f"a lattice of {points} colors, expected a cube of 2 to {MAX_SIDE}")
+        raise ValueError(f"lattice has {points} colors, expected the cube of 2 to {MAX_SIDE}")
     return side
 
 
@@ -244,7 +244,7 @@ class GradeForm:
 
     def __post_init__(self) -> None:
         if self.degree not in (LATTICE, *MONOMIALS) or self.table.ndim != 3:
-            raise ValueError(f"a grade of degree {self.degree}, expected 0 to 3")
+            raise ValueError(f"grade has degree {self.degree}, expected 0 to 3")
         knots = len(self.knots)
         numbers = MONOMIALS.get(self.degree, self.table.shape[1])
         check_tensor("residual", self.residual, (None, None, None), torch.int8)
@@ -254,7 +254,10 @@ class GradeForm:
         check_tensor("scale", self.scale, (ranks, channels), torch.float32)
         check_ascent("knots", self.knots)
         if ranks > MAX_RANK or (self.degree == LATTICE and knots > 2):
-            raise ValueError(f"{ranks} bases at {knots} knots; the most are {MAX_RANK}, and 2 of a lattice")
+            raise ValueError(
+                f"grade has {ranks} bases and {knots} knots, expected at most {MAX_RANK} bases, and at most "
+                "2 knots for a lattice"
+            )
         if channels not in (0, 3, 12, 27, 48):
             raise ValueError(f"residual has {channels} channels, expected whole bands")
         if self.mask is not None:
@@ -418,7 +421,7 @@ def remap_slider(field: BakedField, remap: SliderRemap) -> BakedField:
         ValueError: the field is a network's.
     """
     if isinstance(field.origin, NeuralForm):
-        raise ValueError("a network's slider is its own; the other fields take another")
+        raise ValueError("the slider of a neural field cannot be remapped; use another kind of field")
     origin = None if field.origin is None else replace(field.origin, remap=remap)
     old = field.knots.double()
     far = (remap.old[:, None] - old).abs().amin(dim=1) > _MIN_KNOT_DISTANCE

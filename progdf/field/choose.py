@@ -249,7 +249,7 @@ def choose_field(
     if kind == "lossless":
         everything = fit_keyframes(strengths, offsets, len(strengths))
         candidate = evaluator.candidate(everything, f"all {len(strengths)} snapshots")
-        return FieldChoice(candidate, candidate.excess <= 1.0, (candidate,), "nothing is left out")
+        return FieldChoice(candidate, candidate.excess <= 1.0, (candidate,), "lossless")
     spread = channel_weights(weights, offsets.shape[1], offsets.shape[2])
     seen = render_trajectories(offsets, spread, render, store_ends(offsets, evaluator))
     return pick_candidate(_grow_fields(seen, strengths, evaluator), evaluator.wanted)

@@ -166,7 +166,9 @@ def bake_grade(form: GradeForm, rows: Tensor, mapped: Tensor | None = None) -> B
     """
     width = form.residual.shape[2]
     if len(rows) != form.members or width // 3 > member_bands(rows).shape[1]:
-        raise ValueError(f"a grade of {form.members} members for {len(rows)} of {rows.shape[1]} numbers")
+        raise ValueError(
+            f"grade of {form.members} members does not fit {len(rows)} rows of {rows.shape[1]} numbers"
+        )
     changes = mapped_bands(form, rows) if mapped is None else mapped.clone()
     if len(form.residual):
         changes[:, :, :width] += torch.einsum(

@@ -73,7 +73,7 @@ class NeuralShape:
         known = attribute_slices(self.channels)
         listed = list(self.attributes)
         if not listed or [name for name in known if name in listed] != listed:
-            raise ValueError(f"attributes {listed} are not some of {list(known)}, in this order")
+            raise ValueError(f"attributes {listed} are not a subset of {list(known)}, in this order")
 
     @property
     def columns(self) -> Tensor:
@@ -136,7 +136,7 @@ class NeuralField:
         shape = self.shape
         expected = {**shape.weights(), **shape.frame()}
         if set(self.tensors) != set(expected):
-            raise ValueError(f"the network's tensors are not those of {shape.layers} layers")
+            raise ValueError(f"the tensors do not fit a network of {shape.layers} layers")
         for name, size in expected.items():
             halves = (torch.float16,) if name in shape.weights() else ()
             check_tensor(name, self.tensors[name], size, torch.float32, *halves)
@@ -170,7 +170,7 @@ class NeuralField:
             ValueError: the number of rows differs from the members.
         """
         if rows.shape[0] != self.members:
-            raise ValueError(f"rows is {list(rows.shape)}, expected {self.members} of them")
+            raise ValueError(f"rows is {list(rows.shape)}, expected {self.members} rows")
         weights = {name: tensor.float() for name, tensor in self.tensors.items()}
         return BoundField(self, weights, self.codes.float() * self.code_step, rows)
 

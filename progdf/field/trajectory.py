@@ -154,7 +154,7 @@ def _unpack(tensors: dict[str, Tensor]) -> Trajectory:
     if maps is not None:
         check_tensor("maps", maps, (len(s) - 1, None, 3), torch.float32)
         if maps.shape[1] not in MONOMIALS.values() or bands not in (0, 1, 4, 9):
-            raise ValueError(f"a map of {maps.shape[1]} numbers, and a residual of {bands} bands")
+            raise ValueError(f"unexpected map of {maps.shape[1]} numbers or residual of {bands} bands")
     if mask is not None:
         check_tensor("mask", mask, offsets.shape[1:2], torch.uint8)
     for name, part in added.items():

@@ -250,7 +250,7 @@ def render(
     _check_shapes(activated)
     _check_crop(crop, camera)
     if grad_rows is not None and (camera.viewmat.requires_grad or camera.K.requires_grad):
-        raise ValueError("grad_rows are given, but viewmat or K wants gradients, which need all rows")
+        raise ValueError("grad_rows cannot be combined with gradients of viewmat or K, which need all rows")
     if not isinstance(background, Tensor):
         background = torch.tensor(background, dtype=activated.means.dtype)
     if tuple(background.shape) != (3,):
@@ -313,8 +313,8 @@ def check_intersections(splats: int, pairs: int) -> None:
     """
     if pairs > MAX_INTERSECTIONS:
         raise ProgdfError(
-            f"{splats} Gaussians meet {pairs} tiles of the image, more than {MAX_INTERSECTIONS}; draw a "
-            "smaller image or a crop, or take giant Gaussians out of the scene"
+            f"{splats} Gaussians cover {pairs} tiles of the image, expected at most {MAX_INTERSECTIONS}; "
+            "draw a smaller image or a crop, or remove giant Gaussians from the scene"
         )
 
 

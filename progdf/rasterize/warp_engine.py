@@ -41,7 +41,7 @@ from .reference import DrawnColors, ReferenceSplats, of_rows, project
 try:
     import warp as wp
 except ImportError as error:
-    raise ProgdfError("the engine warp needs warp-lang; pip install 'progdf-studio[gpu]'") from error
+    raise ProgdfError("the warp engine needs warp-lang; pip install 'progdf-studio[gpu]'") from error
 
 TILE = 16
 """Side of a tile, pixels."""

@@ -43,7 +43,7 @@ except Exception as error:  # numba reads its settings on import and raises any 
         ".numba_config.yaml in the current folder"
     ) from error
 if config.DISABLE_JIT:
-    raise ProgdfError("without numba's compiler no kernel works; unset NUMBA_DISABLE_JIT")
+    raise ProgdfError("the rasterizer needs numba's compiler; unset NUMBA_DISABLE_JIT")
 
 log = logging.getLogger("progdf")
 
@@ -104,7 +104,7 @@ def _compile_when_called(compile_now: Callable[[_F], _F]) -> Callable[[_F], _F]:
                 try:
                     result = loaded(*arguments)
                 except Exception as error:  # the type depends on how a cache file is truncated
-                    log.warning("the kernels in %s are compiled anew (%s)", kernel_cache(), error)
+                    log.warning("recompiling the kernels in %s (%s)", kernel_cache(), error)
                     for path in kernel_cache().rglob("*.nb[ic]"):
                         path.unlink(missing_ok=True)
                     loaded = _with_cache_folder(compile_now, function)
@@ -156,7 +156,7 @@ def find_cache_folder() -> Path:
                 return folder
         except OSError:
             continue
-    log.warning("%s cannot be written; the kernels are compiled anew in every process", root)
+    log.warning("cannot write to %s; every process compiles the kernels again", root)
     folder = Path(tempfile.mkdtemp(prefix="progdf-kernels-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder

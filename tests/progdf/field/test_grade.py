@@ -351,7 +351,7 @@ def test_a_slider_that_is_laid_anew_is_kept_by_the_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"degree": 4}, "a grade of degree 4"),
+        ({"degree": 4}, "grade has degree 4"),
         ({"degree": 3}, "table is"),
         ({"table": torch.zeros(3, 10, 3)}, "must be the identity"),
         ({"knots": torch.tensor([0.0, 0.5, 0.5])}, "knots must"),
@@ -370,7 +370,7 @@ def test_parts_that_do_not_fit_each_other_are_refused(change: dict[str, object],
 def test_a_grade_with_more_bands_than_the_scene_is_refused() -> None:
     scene: Gaussians = random_gaussians(60)
     rows = pack(scene, with_shN=False)
-    with pytest.raises(ValueError, match="a grade of 60 members for 60"):
+    with pytest.raises(ValueError, match="grade of 60 members does not fit 60"):
         bake_grade(some_form(rows, bands=4), rows)
     assert identity_remap().is_identity
 

@@ -60,7 +60,7 @@ def test_camera_gradients_of_some_rows_only_are_refused() -> None:
     scene = one_gaussian()
     camera = front_camera()
     free = replace(camera, viewmat=camera.viewmat.clone().requires_grad_())
-    with pytest.raises(ValueError, match="viewmat or K wants gradients, which need all rows"):
+    with pytest.raises(ValueError, match="gradients of viewmat or K, which need all rows"):
         render(scene, free, grad_rows=torch.tensor([0]))
 
 
@@ -69,7 +69,7 @@ def test_too_many_intersections_are_refused_in_one_line(monkeypatch: pytest.Monk
     from progdf.rasterize import engines
 
     monkeypatch.setattr(engines, "MAX_INTERSECTIONS", 100)
-    with pytest.raises(ProgdfError, match="more than 100; draw a smaller image or a crop") as error:
+    with pytest.raises(ProgdfError, match="at most 100; draw a smaller image or a crop") as error:
         render(random_gaussians(200, seed=1), orbit_camera(100, 60), engine=engine)
     assert "\n" not in str(error.value)
 

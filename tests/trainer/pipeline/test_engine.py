@@ -79,7 +79,7 @@ def test_without_warp_the_run_is_refused_before_it_begins(
     monkeypatch.setitem(sys.modules, "warp", None)
     monkeypatch.delitem(sys.modules, ENGINES["warp"], raising=False)
     get_engine.cache_clear()
-    with pytest.raises(ProgdfError, match="the engine warp needs warp-lang; pip install"):
+    with pytest.raises(ProgdfError, match="the warp engine needs warp-lang; pip install"):
         train(quick_options(folder, "none", engine="warp"))
     assert not (folder / "none").exists()
 
