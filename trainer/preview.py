@@ -220,7 +220,8 @@ def answer(previewer: Previewer, line: str) -> PreviewAnswer:
     try:
         if request.editor == "grade":
             return PreviewAnswer(request.number, made="palette", palette=previewer.palette(request))
-        if (draft := previewer.grade(request)) is not None:
+        draft = previewer.grade(request)
+        if draft is not None:
             save_gdf(Path(request.out).with_suffix(".gdf"), draft)
             about = draft.report["draft"]
             return PreviewAnswer(

@@ -153,12 +153,15 @@ def resolve_kind(
     )
     costly = options.editor.family in COSTLY_STRENGTHS
     weight = optimize.perceptual_weight
-    max_stages = (COSTLY_STAGES if costly else STAGES)[kind]
+    stages = optimize.stages
+    if not stages:
+        stages = (COSTLY_STAGES if costly else STAGES)[kind]
+        if optimize.steps < STAGE_STEPS * stages:
+            stages = min(stages, QUICK_STAGES)
     return replace(
         optimize,
         kind=kind,
-        stages=optimize.stages
-        or min(max_stages, QUICK_STAGES if optimize.steps < STAGE_STEPS * max_stages else max_stages),
+        stages=stages,
         group_steps=group_steps if kind == "geometry" else 0,
         grow=grow,
         # only a color edit may leave the SH bands unchanged

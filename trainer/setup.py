@@ -143,8 +143,8 @@ def make_training_setup(options: TrainingViewOptions, scene: Gaussians, region: 
     given = found.cameras
     up = find_up(scene, given, options.up, options.scene)
     if options.pictures:
-        if options.up == "auto" and (pictured_up := _up_of_pictures(options.pictures)) is not None:
-            up = pictured_up
+        if options.up == "auto":
+            up = _up_of_pictures(options.pictures) or up
         setup = _picture_setup(options, scene, region, given, up)
         return replace(setup, notes=[*found.notes, *setup.notes])
     if options.cameras is None and is_surrounding(scene, up.direction):
@@ -160,10 +160,14 @@ def make_training_setup(options: TrainingViewOptions, scene: Gaussians, region: 
         else:
             elevations = HALF_SPHERE if options.dense else ELEVATIONS
             fitted = region_rig(scene, region, count, size, up.direction, elevations)
-        fitted = [replace(c, sampling=SAMPLING) for c in fitted] if options.dense else fitted
+        if options.dense:
+            fitted = [replace(camera, sampling=SAMPLING) for camera in fitted]
         return with_near_plane(name_cameras(fitted), scene)
 
-    held_out_count = max(1, views // 5 if options.views else min(views // 5, VIEWS // 5))
+    held_out_count = views // 5
+    if not options.views:
+        held_out_count = min(held_out_count, VIEWS // 5)
+    held_out_count = max(1, held_out_count)
     if options.cameras is None:
         choice, train, held_out = _rig_views(
             scene, region, cameras_of, views - held_out_count, held_out_count, background
@@ -172,7 +176,8 @@ def make_training_setup(options: TrainingViewOptions, scene: Gaussians, region: 
         choice = choose_views(scene, region, cameras_of(views), views, background)
         train, held_out = split_views(choice, min(held_out_count, max(1, len(choice.views) // 5)))
     notes = [*found.notes, f"up is {up.name}, {up.reason}"]
-    notes += [choice.line()] if len(choice.views) < choice.offered else []
+    if len(choice.views) < choice.offered:
+        notes.append(choice.line())
     if any(view.camera.lens for view in choice.views):
         notes.append(
             "the cameras have lenses that bend photographs, the views here are straight: "

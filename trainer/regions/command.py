@@ -138,7 +138,8 @@ def write(options: WriteViewsOptions) -> list[str]:
         ProgdfError: invalid scene, cameras or region, or a folder that already has cameras.
     """
     check_ranges(("--views", options.views, 1, 96), ("--image-size", options.image_size, 32, 4096))
-    out, background = options.out, torch.tensor(BACKGROUND)
+    out = options.out
+    background = torch.tensor(BACKGROUND)
     if (out / "cameras.json").exists() or (out.exists() and not out.is_dir()):
         raise ProgdfError(f"{out / 'cameras.json'} already exists; give --out another folder")
     scene = load_scene(options.scene)

@@ -188,7 +188,8 @@ def _changed_pictures(
             "changed needs pictures: use it with --editor pictures:A.png, or name them, changed:A.png,B.png"
         )
     for path in paths:
-        if edits := edits_in_picture(path):
+        edits = edits_in_picture(path)
+        if edits:
             raise ProgdfError(
                 f"{path} was taken with edits on ({edits}), which would count as changed; take the view "
                 "without them, or name the region with --region"

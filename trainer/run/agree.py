@@ -134,7 +134,8 @@ _TUKEY = 4.685  # in standard deviations; 95 % of the efficiency of least square
 
 def _step(a: Tensor, b: Tensor, weight: Tensor, parameters: Tensor) -> tuple[Tensor, float]:
     """Return one Gauss-Newton step with Tukey weights [3], and the robust misfit before it."""
-    moved, (x, y) = _sample(b, parameters), _pixel_positions(b)
+    moved = _sample(b, parameters)
+    x, y = _pixel_positions(b)
     counts = (weight > 0)[0, 0]
     if int(counts.sum()) < 16 or float(a[0][:, counts].std(dim=1).max()) < _MIN_TEXTURE:
         return torch.zeros(3, dtype=torch.float64), 0.0
@@ -171,7 +172,8 @@ def _pixel_positions(planes: Tensor) -> tuple[Tensor, Tensor]:
 
 def _sample(planes: Tensor, parameters: Tensor, mode: str = "bilinear") -> Tensor:
     """Return the planes sampled at the positions of `Registration`. [1,C,H,W]"""
-    (x, y), (height, width) = _pixel_positions(planes), planes.shape[2:]
+    x, y = _pixel_positions(planes)
+    height, width = planes.shape[2:]
     dx, dy, zoom = parameters.tolist()
     scale = 2 * max(height, width)
     grid = torch.stack([scale / width * ((1 + zoom) * x + dx), scale / height * ((1 + zoom) * y + dy)], dim=2)
@@ -216,7 +218,8 @@ class Easel:
             place: folder of the picture
             references, source, strength, softness: see `InstructEditor.paint`
         """
-        references, original = references[: self.painter.references], self.painter.original(view)
+        references = references[: self.painter.references]
+        original = self.painter.original(view)
         beside = beside_region(self.crop(view, view.mask[..., None])[..., 0])
         moved = 0.0
         for seed in (self.seed, self.seed + 1):
@@ -303,14 +306,17 @@ def painting_order(setup: TrainingSetup, side: float = SIDE) -> tuple[list[View]
     from all before, until every training view is within `side` of an anchor. The other views follow, nearest
     to an anchor first.
     """
-    views, train = setup.views, len(setup.train)
+    views = setup.views
+    train = len(setup.train)
     center = scene_sphere(setup.scene[setup.region.members])[0]
     eyes = torch.stack([view.camera.position for view in views])
     toward = torch.nn.functional.normalize((eyes - center).double(), dim=1)
     angles = (toward @ toward.T).clamp(-1.0, 1.0).acos()
     anchors = [max(range(train), key=lambda i: _visible_detail(setup, views[i].camera))]
-    while float((nearest := angles[:, anchors].amin(dim=1))[:train].max()) > side:
+    nearest = angles[:, anchors].amin(dim=1)
+    while float(nearest[:train].max()) > side:
         anchors.append(int(nearest[:train].argmax()))
+        nearest = angles[:, anchors].amin(dim=1)
     others = sorted(set(range(len(views))) - set(anchors), key=lambda i: float(nearest[i]))
     return [views[i] for i in (*anchors, *others)], len(anchors)
 

@@ -189,9 +189,14 @@ def approaches(options: TrainOptions, setup: TrainingSetup, edited: Sequence[Ten
     """
     optimize = options.optimize
     groups = GROUP_STEPS if optimize.group_steps is None else optimize.group_steps
-    geometry = [Approach("geometry")] if not groups or optimize.group_steps is None else []
-    geometry += [Approach("geometry", groups)] if groups else []
-    grow = [Approach("geometry", grow=optimize.grow)] if optimize.grow else []
+    geometry = []
+    if not groups or optimize.group_steps is None:
+        geometry.append(Approach("geometry"))
+    if groups:
+        geometry.append(Approach("geometry", groups))
+    grow = []
+    if optimize.grow:
+        grow.append(Approach("geometry", grow=optimize.grow))
     if optimize.kind == "geometry":
         return geometry + grow
     grow = [replace(approach, kind="style") for approach in grow]

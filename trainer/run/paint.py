@@ -248,8 +248,10 @@ def _linear_visibility_knots(
     """Return the strengths for the knots of a straight path, so that its visible change is linear. [S]"""
     paint = paints[0]
     box = box_of(paint.mask, paint.camera)
-    painted, start = crop(paint.mask, box), pack(laid.scene[laid.rows])
-    pushed, faint_discs = pack(laid.ended[laid.rows]) - start, faint(laid.added)
+    painted = crop(paint.mask, box)
+    start = pack(laid.scene[laid.rows])
+    pushed = pack(laid.ended[laid.rows]) - start
+    faint_discs = faint(laid.added)
 
     def look_at(g: float) -> Tensor:
         logits = faint_discs.logit_opacities + interpolate_at(steps, rise, g)
@@ -281,14 +283,17 @@ def sharpen(
         log: log of the run
     """
     end = edited_scene(scene, recolored)
-    paints, weights, background = list[PaintedView](), torch.zeros(len(scene), 2), torch.tensor(BACKGROUND)
+    paints = list[PaintedView]()
+    weights = torch.zeros(len(scene), 2)
+    background = torch.tensor(BACKGROUND)
     for path, camera in pictures.items():
         view = make_view(scene, recolored.region, camera.resize(*picture_size(path)), background)
         target = read_edit(scene, view.camera, view.image, path)
         target = (view if is_named else view.with_painted([target])).confine(target)
         paint, changed = _missed_paint(end, view, target)
         weights += torch.stack([alpha_weights(scene, view.camera, m)[:, 0] for m in (paint.mask, changed)], 1)
-        paints += [paint] if bool(paint.mask.any()) else []
+        if bool(paint.mask.any()):
+            paints.append(paint)
     if not paints:
         return None
     members = recolored.region.members

@@ -66,13 +66,12 @@ def is_removal(options: TrainOptions, setup: TrainingSetup, log: RunLog) -> bool
     share = vanished_share(setup, options) if one_strength else 0.0
     removes = editor.removal == "always" or share > 0.5
     if removes or share > 0.0:
+        decision = "taken away (--removal never recolors it)"
+        if not removes:
+            decision = "recolored (--removal always removes)"
         log.say(
-            f"{100 * share:.0f} % of what was painted is what the scene shows without the region: it is "
-            + (
-                "taken away (--removal never recolors it)"
-                if removes
-                else "recolored (--removal always removes)"
-            )
+            f"{100 * share:.0f} % of what was painted is what the scene shows without the region: "
+            f"it is {decision}"
         )
     return removes
 

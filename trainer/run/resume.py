@@ -214,10 +214,13 @@ def processor_kind() -> str:
 def picture_digests(plan: TrainOptions) -> dict[str, str]:
     """Return the hashes of the changed pictures that a plan names, including those of further strengths."""
     paths = [path for given in plan.views.pictures for path in strengths_of(given).values()]
-    paths += [plan.editor.anchor] if plan.editor.anchor is not None else []
+    if plan.editor.anchor is not None:
+        paths.append(plan.editor.anchor)
     editor_paths = plan.editor.editor.partition(":")[2]
-    paths += [Path(editor_paths)] if plan.editor.family == "decal" else []
-    paths += picture_paths(editor_paths) if plan.editor.family == "remove" and editor_paths else []
+    if plan.editor.family == "decal":
+        paths.append(Path(editor_paths))
+    if plan.editor.family == "remove" and editor_paths:
+        paths += picture_paths(editor_paths)
     return {str(path.resolve()): _digest(path) for path in paths}
 
 

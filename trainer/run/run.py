@@ -153,7 +153,8 @@ def train(options: TrainOptions, quiet: bool = False, shared: Shared | None = No
         ProgdfError: invalid scene, region, cameras or edited views. No .gdf file is changed.
         KeyboardInterrupt: interrupted; the message explains how to resume. No .gdf file is changed.
     """
-    options, shared = resolve(options), shared or Shared()
+    options = resolve(options)
+    shared = shared or Shared()
     check_command(options)
     use_threads(options.threads)
     scene = shared.get("scene", options.scene.resolve(), lambda: load_scene(options.scene))
@@ -410,8 +411,8 @@ def _edit_views(
     spec = options.editor.editor
     names = [view.camera.name for view in views]
     edits: dict[float, Sequence[Tensor]] = {}
-    # names of the views with strengths other than 1; strengths edited by the stopped run
-    on_the_way, known = names, list[float]()
+    on_the_way = names  # views with strengths other than 1
+    known = list[float]()  # strengths edited by the stopped run
     approach = Approach("color")
     trial = None
 

@@ -241,9 +241,13 @@ def plan_colors(
         log: log of the run
         target_psnr: see `FieldOptions`
     """
-    scene, members, count = setup.scene, setup.region.members, len(setup.train)
-    original, few = pack(scene[members], with_shN=scene.sh_degree > 0), bool(options.pictures)
-    stride, max_iterations = 1 if few else pixel_stride(setup), iterations(optimization.steps)
+    scene = setup.scene
+    members = setup.region.members
+    count = len(setup.train)
+    original = pack(scene[members], with_shN=scene.sh_degree > 0)
+    few = bool(options.pictures)
+    stride = 1 if few else pixel_stride(setup)
+    max_iterations = iterations(optimization.steps)
     held_out = split_held_out(setup.held_out)[0] if len(edited[1.0]) > count else []
     train = setup.train
     judging = held_out or setup.train
@@ -280,7 +284,9 @@ def plan_colors(
             fewer = solve_again(model, make_solver(drawn[::2], original), targets[::2], half_target[1])
             if fewer[1].error <= LEVEL:
                 (solver, model), finished, train = fewer, half_target, train[::2]
-    strengths = [s for s in edited if s < 1.0] or [0.5] * (between is not None)
+    strengths = [s for s in edited if s < 1.0]
+    if not strengths and between is not None:
+        strengths = [0.5]
     look = None if between is None else cache(lambda s: judge(between.look(s, judging)))
     course = Course(ask(strengths), finished, look, ask)
     with log.stage("model"):
@@ -292,9 +298,9 @@ def plan_colors(
     evaluated_on = "views that are held out" if held_out else "all views, as none is held out"
     if len(train) < count:
         log.say(f"{len(train)} of {count} views are solved for: all would change nothing that shows")
-    log.say(
-        f"{model.line}, on {evaluated_on if ties is None else 'squares of the pictures that are held out'}"
-    )
+    if ties is not None:
+        evaluated_on = "squares of the pictures that are held out"
+    log.say(f"{model.line}, on {evaluated_on}")
     if ties is not None:
         unseen_count = len(original) - int(solver.asked[:, 0].sum())
         log.say(f"{unseen_count} members that no picture shows follow the map and their own surface")
@@ -305,9 +311,8 @@ def pixel_stride(setup: TrainingSetup) -> int:
     """Return the stride over the views' pixels for the solver, see `color_views`: the largest with enough
     pixels."""
     degree = min(2, setup.scene.sh_degree)  # of the residual
-    unknowns = (
-        (degree + 1) * (degree + 2) // 2 * len(setup.region)
-    )  # unknowns that half a sphere can determine
+    # the bands that half a sphere of directions can determine
+    unknowns = (degree + 1) * (degree + 2) // 2 * len(setup.region)
     region_pixels = sum(int((view.mask > 0.0).sum()) for view in setup.train)
     return next((stride for stride in (4, 2) if region_pixels >= stride * _PIXELS_PER_UNKNOWN * unknowns), 1)
 

@@ -156,12 +156,8 @@ def choose_views(
     max_candidates = _MAX_RENDERED * count
     if len(candidates) > max_candidates:
         toward = _toward(positions, [cameras[i] for i in candidates])
-        candidates = [
-            candidates[k]
-            for k in _greedy(
-                Visibility(framed[candidates].float(), toward, _mean_spacing(max_candidates)), max_candidates
-            )
-        ]
+        visibility = Visibility(framed[candidates].float(), toward, _mean_spacing(max_candidates))
+        candidates = [candidates[k] for k in _greedy(visibility, max_candidates)]
     cover, weights = _measure_visibility(scene, region, rows, [cameras[i] for i in candidates])
     seeing = cover > 0
     if not bool(seeing.any()):

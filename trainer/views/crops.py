@@ -221,7 +221,8 @@ def crop_scene(
             gaussians, camera, torch.zeros_like(background), colors=white, crop=box, engine=engine
         )
         tiles = live_tiles(member_share.image[..., 0] > 0.0, box)
-        if not bool((pixels := live_pixels(tiles, box)).all()):
+        pixels = live_pixels(tiles, box)
+        if not bool(pixels.all()):
             reachable = may_reach(gaussians.means, gaussians.scales, camera, tiles)
             reachable_rows = (reachable | member[index]).nonzero()[:, 0]
             live = pixels[..., None]

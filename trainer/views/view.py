@@ -135,7 +135,9 @@ def make_glances(scene: Gaussians, region: Region, cameras: Sequence[Camera], co
     """Return glances from the first `count` cameras that show the region."""
     activated = activate(scene, torch.zeros_like(scene.means))
     members = scene[region.members]
-    degree, sh, glances = min(scene.sh_degree, 3), members.sh, list[Glance]()
+    degree = min(scene.sh_degree, 3)
+    sh = members.sh
+    glances = list[Glance]()
 
     def color_from(camera: Camera) -> tuple[Tensor, Tensor]:
         weights = basis(degree, torch.nn.functional.normalize(members.means - camera.position))
