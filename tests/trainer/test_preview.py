@@ -111,7 +111,7 @@ def test_what_would_paint_a_sentence_is_said_and_painted_only_when_it_is_asked_f
     asked = {"editor": "instruct:paint it", "model": model}
     told = answer(previewer, request(0, tmp_path, seed=-1, **asked))
     assert (told.error, told.made) == ("", "note")
-    assert told.note == f"{model} on the CPU in float32; 20 calls of its network a picture"
+    assert told.note == f"{model} on the CPU in float32; 20 network calls per picture"
     assert not (tmp_path / "0.png").exists()
     for number, seed in ((1, 0), (2, 1)):
         told = answer(previewer, request(number, tmp_path, seed=seed, **asked))

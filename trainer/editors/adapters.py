@@ -299,7 +299,7 @@ class DevicePlan:
         dtype = str(self.dtype).removeprefix("torch.")
         if not self.need:
             return f"on the {self.device.upper()} in {dtype}"
-        mode = "its parts there in turn" if self.in_turn else "all of it there"
+        mode = "one component at a time" if self.in_turn else "all components at once"
         return f"on {self.device} in {dtype}, {mode}: about {_gb(self.need)} needed, {_gb(self.free)} free"
 
 
@@ -321,8 +321,8 @@ def place(request: PipelineRequest, device: Device) -> DevicePlan:
         count = sum(sizes.values())
         if count > _MAX_CPU_PARAMETERS and device != "cpu":
             raise ProgdfError(
-                f"{model} has {count / 1e9:.0f} billion parameters and torch has no graphics card here "
-                f"(torch {torch.__version__}): a picture takes hours; install torch for your card, use "
+                f"{model} has {count / 1e9:.0f} billion parameters and torch {torch.__version__} finds "
+                "no GPU: a picture would take hours; install torch for your GPU, use "
                 f"--model {SMALL_MODEL}, or add --device cpu"
             )
         if request.quantize != "off":
@@ -345,7 +345,7 @@ def explain_memory(request: PipelineRequest, placement: DevicePlan) -> Iterator[
     except torch.OutOfMemoryError as error:
         advice = "" if request.quantize == "nf4" else "add --quantize nf4, "
         raise ProgdfError(
-            f"out of memory: {request.model} {placement.line()}; {advice}close what else uses the card, "
+            f"out of memory: {request.model} {placement.line()}; {advice}close other programs on the GPU, "
             f"give a smaller --edit-size, or use --model {_KLEIN.model} or {SMALL_MODEL}"
         ) from error
 

@@ -75,7 +75,7 @@ def decal_camera(path: Path | None, origin: Origin = ZERO) -> Camera:
     """
     if path is None:
         raise ProgdfError(
-            "a decal needs --camera, a picture that progdf render wrote or a file of one camera"
+            "decal: needs --camera; give a picture that progdf render wrote or a file with one camera"
         )
     cameras = load_cameras(path, origin)
     if len(cameras) != 1:
@@ -98,7 +98,7 @@ def check_decal(what: str, options: EditorOptions) -> None:
 def _open_decal(path: Path) -> Image.Image:
     picture = open_picture(path).convert("RGBA")
     if not picture.getchannel("A").getextrema()[1]:
-        raise ProgdfError(f"{path} is all transparent; give a picture that shows something")
+        raise ProgdfError(f"{path} is fully transparent; give a picture with visible pixels")
     return picture
 
 
@@ -171,7 +171,7 @@ def decal(given: EditorInput) -> DecalEditor:
     drawn = drawn * ((alpha > OPAQUE) & (view.mask > 0.5 * alpha))[..., None]
     if not bool((drawn[..., 3] > MIN_ALPHA).any()):
         raise ProgdfError(
-            f"{given.what} does not lie on the region '{region.name}': nothing opaque of it is seen there; "
-            "give another place with --at"
+            f"{given.what} does not lie on an opaque part of the region '{region.name}'; "
+            "give another position with --at"
         )
     return DecalEditor(scene, view, drawn)

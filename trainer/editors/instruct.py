@@ -65,8 +65,8 @@ class InstructEditor:
         """Model, device, memory and network calls per picture, for the log."""
         request = self.request
         ignored = unread_words(self.request)
-        line = f"{request.model} {self.placement.line()}; {self.calls((1.0,))} calls of its network a picture"
-        return f"{line}; it does not read the end of the sentence: “{ignored}”" if ignored else line
+        line = f"{request.model} {self.placement.line()}; {self.calls((1.0,))} network calls per picture"
+        return f"{line}; it ignores the end of the prompt: “{ignored}”" if ignored else line
 
     def calls(self, strengths: Sequence[float]) -> int:
         """Return the number of network calls for one view at these strengths."""
@@ -145,7 +145,7 @@ class InstructEditor:
         """
         if len(references) > self.references:
             raise ValueError(
-                f"{self.request.model} takes {self.references} references, not {len(references)}"
+                f"{self.request.model} accepts {self.references} references, not {len(references)}"
             )
         request = self.request
         noise = request.seed if seed is None else seed
@@ -195,8 +195,8 @@ def check_instruct(what: str, options: EditorOptions) -> None:
         find_picture_camera(options.anchor, origin=ZERO)
         if not request.adapter.references:
             raise ProgdfError(
-                f"{request.model} takes one picture alone and cannot follow --anchor; leave it out, use "
-                f"--model {adapters.ADAPTERS['Flux2KleinPipeline'].model}, or train that picture by itself "
+                f"{request.model} accepts no reference pictures and cannot follow --anchor; leave it out, "
+                f"use --model {adapters.ADAPTERS['Flux2KleinPipeline'].model}, or train that picture alone "
                 f"with --editor pictures:{options.anchor}"
             )
 
@@ -223,7 +223,7 @@ def resolve_request(what: str, options: EditorOptions) -> PipelineRequest:
     guidance, image_guidance = parse_guidance(options.guidance)
     if image_guidance is not None and adapter.image_guidance is None:
         raise ProgdfError(
-            f"{model} does not support guidance of the picture; give --guidance one number, "
+            f"{model} does not support picture guidance; give one number with --guidance, "
             f"or use --model {adapters.SMALL_MODEL}"
         )
     for is_given, option in (
@@ -231,7 +231,7 @@ def resolve_request(what: str, options: EditorOptions) -> PipelineRequest:
         (options.edit_size is not None and adapter.is_fixed, "--edit-size"),
     ):
         if is_given:
-            raise ProgdfError(f"{option} does not apply to {model}, which has its own; leave it out")
+            raise ProgdfError(f"{option} does not apply to {model}, which has a fixed value; leave it out")
     return PipelineRequest(
         prompt,
         model,

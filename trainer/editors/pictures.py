@@ -88,7 +88,7 @@ def pictures(given: EditorInput) -> PicturesEditor:
         for strength in stages:
             if strength not in strengths:
                 path = strengths[1.0].parent / f"{strength:g}" / strengths[1.0].name
-                raise ProgdfError(f"{path} is missing; every picture needs one of each strength")
+                raise ProgdfError(f"{path} is missing; every picture needs a file for each strength")
     images = {
         view.camera.name: {0.0: view.image}
         | {s: read_edit(given.scene, view.camera, view.image, path) for s, path in by_strength.items()}
@@ -143,7 +143,7 @@ def picture_paths(what: str) -> tuple[Path, ...]:
     if len(paths) > MAX_PICTURES:
         raise ProgdfError(
             f"pictures: takes at most {MAX_PICTURES} pictures, not {len(paths)}; "
-            "give more as folder:DIR, of views that --cameras has"
+            "for more, use folder:DIR with the views of --cameras"
         )
     return paths
 
@@ -337,7 +337,7 @@ def move_image(image: np.ndarray, shift: tuple[int, int]) -> np.ndarray:
 
 
 _EDITED_ADVICE = "put the edited copies of RUN/views/original/*.png there, under the same names"
-_PHOTOGRAPH_ADVICE = "put the photographs there, under the names that the cameras have"
+_PHOTOGRAPH_ADVICE = "put the photographs there, under the names of their cameras"
 
 
 @dataclass(frozen=True)
@@ -359,8 +359,8 @@ class FolderEditor:
         if not self.bent or self.originals is not None:
             return None
         return (
-            "photographs: without the unedited photographs, what the scene shows otherwise than they do is "
-            "trained as part of the edit; name their folder too, photographs:EDITED,ORIGINALS"
+            "photographs: without the unedited photographs, differences between scene and photographs are "
+            "trained as part of the edit; add their folder, photographs:EDITED,ORIGINALS"
         )
 
     def edit(self, view: View, strength: float) -> Tensor:

@@ -91,7 +91,7 @@ def style_number(what: str) -> int:
     if not 0 <= number < STYLES:
         calm = ", ".join(map(str, CALM))
         raise ProgdfError(
-            f"unknown style '{what}'; use style:N with N from 0 to {STYLES - 1}, best one of {calm}"
+            f"unknown style '{what}'; use style:N with N from 0 to {STYLES - 1}, preferably one of {calm}"
         )
     return number
 

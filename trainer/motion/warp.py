@@ -400,10 +400,10 @@ class PartsPlacement:
         motion = self.motion
         sizes = self.parts.sizes
         return [
-            f"part {index}, {int((self.parts.part == index).sum())} Gaussians: moved by "
-            f"{float(motion.shift[index].norm() / sizes[index]):.2f} of its size, turned by "
+            f"part {index}, {int((self.parts.part == index).sum())} Gaussians: shifted by "
+            f"{float(motion.shift[index].norm() / sizes[index]):.2f} of its size, rotated by "
             f"{math.degrees(float(motion.turn[index].norm())):.0f} degrees, "
-            f"{math.exp(float(motion.log_scale[index])):.2f} times as large"
+            f"scaled by {math.exp(float(motion.log_scale[index])):.2f}"
             for index in range(len(sizes))
         ]
 
@@ -429,8 +429,8 @@ class WarpPlacement:
         turn = self.motion.turn.norm(dim=1)
         stretch = self.motion.stretch[:, :3]
         return [
-            f"bent by {len(self.control)} control points: moved by up to {float(shift.max()):.2f} of their "
-            f"spacing, turned by up to {math.degrees(float(turn.max())):.0f} degrees, stretched "
+            f"bent by {len(self.control)} control points: shifted by up to {float(shift.max()):.2f} of their "
+            f"spacing, rotated by up to {math.degrees(float(turn.max())):.0f} degrees, stretched "
             f"{math.exp(float(stretch.min())):.2f} to {math.exp(float(stretch.max())):.2f} times"
         ]
 

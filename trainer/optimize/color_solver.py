@@ -114,16 +114,19 @@ class Model:
     @property
     def line(self) -> str:
         """Description of the choice and its candidates, for the log."""
-        functions = f"{self.bands} SH functions" if self.bands > 1 else f"{self.bands} SH function"
-        if self.bands > 1 and self.functions < self.bands:
-            functions += f", {self.functions:.1f} of them a Gaussian"
-        residual = f"and a residual of {functions}" if self.bands else "alone"
-        candidates = ", ".join(f"{name} {error:.1f}" for name, error in self.tried)
-        color_map = f"a map of color of degree {self.degree}" if self.degree else "no map"
+        parts = [f"color map of degree {self.degree}" if self.degree else "no color map"]
         if self.mask is not None:
-            color_map += ", a mask of it"
-        rule = "what leaves least" if self.hold in _TIED_RIDGES else "the least within a twentieth"
-        return f"{color_map} {residual}, {rule}; dB: {candidates}"
+            parts.append("mask")
+        if self.bands:
+            functions = f"{self.bands} SH functions" if self.bands > 1 else f"{self.bands} SH function"
+            if self.bands > 1 and self.functions < self.bands:
+                functions += f" ({self.functions:.1f} per Gaussian on average)"
+            parts.append(f"residual of {functions}")
+        candidates = ", ".join(f"{name} {error:.1f}" for name, error in self.tried)
+        rule = (
+            "smallest error" if self.hold in _TIED_RIDGES else "smallest model within 5 % of the best error"
+        )
+        return f"{' + '.join(parts)}. Candidates, held-out dB: {candidates}. Rule: {rule}"
 
 
 @dataclass(frozen=True)

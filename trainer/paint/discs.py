@@ -340,7 +340,7 @@ def _rows_before(
     )
     listed = color_map(activate(scene), camera, box, torch.arange(len(scene)))
     if not isinstance(listed, ListedWeights):
-        raise TypeError("discs are placed by the CPU engine's lists")
+        raise TypeError("place_discs needs the weight lists of the CPU engine")
     runs = listed.runs
     axis = camera.viewmat[2]
     depths = (scene.means.double() @ axis[:3].double() + axis[3].double()).numpy()

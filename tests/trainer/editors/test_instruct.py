@@ -215,7 +215,7 @@ def test_a_folder_that_is_no_whole_pipeline_is_one_line(pix2pix: str, damage: st
 
 
 def test_image_guidance_for_a_model_without_it_is_one_line(diffusers: None, tmp_path: Path) -> None:
-    with pytest.raises(ProgdfError, match="does not support guidance of the picture; "):
+    with pytest.raises(ProgdfError, match="does not support picture guidance; "):
         editor_of(settings_of(str(tiny_flux_kontext(tmp_path)), guidance="2.5,1.5"))
 
 
@@ -259,7 +259,7 @@ def test_a_text_edit_is_trained_in_stages_and_stopped_anywhere_comes_to_the_same
     assert sum(len(list((painted / name).glob("*.png"))) for name in rounds) == 3 * 4
     assert len(result.report["trajectory"]["stages"]) == 4
     log = result.folder.log.read_text(encoding="utf-8")
-    assert "calls of its network a picture" in log
+    assert "network calls per picture" in log
     assert "12 pictures to paint: each after those before, then all twice more" in log
     assert re.search(r"a style edit at strength .*, 1$", log, re.MULTILINE)
     assert {"unexplained", "unexplained_fine", "contrast", "left_out"} < set(result.report["agreement"])
@@ -308,7 +308,7 @@ def test_a_run_follows_an_anchor_of_any_camera_and_not_another_one_when_it_goes_
     other = with_values(text_run(tmp_path, klein, "away"), anchor=anchor)
     with pytest.raises(ProgdfError, match=r"anchor\.png shows nothing of the region; take it from elsewhere"):
         train(other, quiet=True)
-    with pytest.raises(ProgdfError, match="takes one picture alone and cannot follow --anchor"):
+    with pytest.raises(ProgdfError, match="accepts no reference pictures and cannot follow --anchor"):
         train(with_values(text_run(tmp_path, pix2pix, "alone"), anchor=anchor), quiet=True)
 
 
@@ -386,7 +386,7 @@ def test_what_clip_does_not_read_of_a_long_sentence_is_said(pix2pix: str) -> Non
     assert "does not read" not in editor_of(settings_of(pix2pix)).note
     words = " ".join(["very"] * 90 + ["batman"])
     note = editor_of(settings_of(pix2pix), f"instruct:{words}").note
-    assert "it does not read the end of the sentence: “" in note
+    assert "it ignores the end of the prompt: “" in note
     assert note.endswith("batman”")
 
 
@@ -425,13 +425,13 @@ def test_the_log_says_what_will_paint_on_what_and_whether_it_fits(
     assert "on the CPU in float32" in editor_of(settings_of(pix2pix)).note
     card(8 * GIB, 8 * GIB)
     assert (
-        "on cuda in float16, all of it there: about 1.0 GB needed, 8.6 GB free; 2 calls"
+        "on cuda in float16, all components at once: about 1.0 GB needed, 8.6 GB free; 2 network calls"
         in editor_of(settings_of(pix2pix)).note
     )
     card(GIB / 2, 8 * GIB)
     tight = editor_of(settings_of(pix2pix))
     assert tight.placement.in_turn
-    assert "its parts there in turn: about 1.0 GB needed, 0.5 GB free" in tight.note
+    assert "one component at a time: about 1.0 GB needed, 0.5 GB free" in tight.note
     assert editor_of(settings_of(pix2pix, device="cpu")).placement.device == "cpu"
 
 
@@ -466,7 +466,7 @@ def test_a_large_model_on_a_cpu_is_refused_unless_it_is_asked_for(
     pix2pix: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("trainer.editors.adapters._MAX_CPU_PARAMETERS", 1000)
-    with pytest.raises(ProgdfError, match=r"no graphics card here .* or add --device cpu"):
+    with pytest.raises(ProgdfError, match=r"finds no GPU: .* or add --device cpu"):
         editor_of(settings_of(pix2pix))
     assert editor_of(settings_of(pix2pix, device="cpu")).note
 

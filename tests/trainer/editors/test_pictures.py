@@ -92,7 +92,7 @@ def test_subfolders_hold_the_strengths_between(tmp_path: Path) -> None:
     half = editor.edit(views[1], 0.5)
     assert float((half - 0.75 * views[1].image)[views[1].mask > 0.99].abs().max()) < 0.02
     (tmp_path / "0.5" / "B.png").unlink()
-    with pytest.raises(ProgdfError, match=r"0\.5/B\.png is missing; every picture needs one"):
+    with pytest.raises(ProgdfError, match=r"0\.5/B\.png is missing; every picture needs a file"):
         make_editor(EditorOptions(spec), scene, whole_scene(scene), views)
     (tmp_path / "0.5" / "A.png").rename(tmp_path / "2024" / "A.png")
     with pytest.raises(ProgdfError, match="not between 0 and 1; name it"):

@@ -160,7 +160,8 @@ def test_a_residual_that_says_nothing_of_other_pixels_stays_with_its_neighbors()
     for paint, near in ((fill, True), (two_paints.contiguous(), False)):
         _, model = choose_model(solver, split_solver(solver, [paint]), [paint], 20, 1)
         assert (model.hold == 1e-3) is near
-        assert "and a residual of 1 SH function, what leaves least; dB: " in model.line
+        assert "residual of 1 SH function. Candidates, held-out dB: " in model.line
+        assert model.line.endswith("Rule: smallest error")
 
 
 def test_what_the_members_do_not_show_is_no_error_of_theirs() -> None:
