@@ -76,10 +76,18 @@ def without_commands(line: str) -> str:
     The problem stays, with options written without dashes. Each remedy keeps the alternatives before its
     first command line instruction.
     """
-    problem, *advice = line.split("; ")
-    parts = [_COMMAND_LINE.sub(lambda typed: "ProGDF" * typed[0].startswith("progdf"), problem)]
-    for part in advice:
-        ways = re.split(r", (?:or )?", part) if ", or " in part else [part]
-        kept = [*takewhile(lambda way: not _COMMAND_LINE.search(way), ways)]
-        parts += [part if kept == ways else ", ".join(kept)] * bool(kept)
+    problem, *remedies = line.split("; ")
+    parts = [_COMMAND_LINE.sub(_without_command, problem)]
+    for remedy in remedies:
+        alternatives = re.split(r", (?:or )?", remedy) if ", or " in remedy else [remedy]
+        usable = [*takewhile(lambda text: not _COMMAND_LINE.search(text), alternatives)]
+        if usable == alternatives:
+            parts.append(remedy)
+        elif usable:
+            parts.append(", ".join(usable))
     return "; ".join(parts)
+
+
+def _without_command(match: re.Match[str]) -> str:
+    """Return the replacement for a command line word: the program's name for a command, otherwise nothing."""
+    return "ProGDF" if match[0].startswith("progdf") else ""

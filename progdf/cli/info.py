@@ -207,7 +207,8 @@ def _scene_lines(path: Path, cameras: Path | None, up: UpChoice) -> Iterator[str
     yield from report.lines()
     yield from found.notes
     yield from survey(scene, find_up(scene, found.cameras, up, path)).lines()
-    if (camera := stored_view(path, scene.origin).camera) is not None:
+    camera = stored_view(path, scene.origin).camera
+    if camera is not None:
         yield f"camera: the file stores one of {camera.width}x{camera.height} pixels, which is the first view"
     with notice_when_slow(f"looking for strays among {format_count(len(scene))} …"):
         strays = find_strays(scene)
@@ -249,11 +250,16 @@ def _edit_lines(path: Path) -> Iterator[str]:
 def _session_lines(path: Path) -> Iterator[str]:
     session = session_file.read_session(path, session_file.SessionFile)
     yield f"{path.name}: a session of the window, {file_size(path.stat().st_size)}"
-    for what, ref in (("scene", session.scene), *(("edit", edit) for edit in session.edits)):
+    references = [("scene", session.scene), *(("edit", edit) for edit in session.edits)]
+    for kind, ref in references:
         file = ref.path(path.resolve().parent)
-        known = os.path.isfile(file) and session_file.sha256(file) == ref.sha256.lower()
-        state = "as it was saved" if known else "changed since" if os.path.isfile(file) else "missing"
-        yield f"{what}: {ref.file} ({state})"
+        if not os.path.isfile(file):
+            state = "missing"
+        elif session_file.sha256(file) == ref.sha256.lower():
+            state = "as it was saved"
+        else:
+            state = "changed since"
+        yield f"{kind}: {ref.file} ({state})"
     layers = session.view.get("layers", [])
     for layer in layers if isinstance(layers, list) else ():
         if isinstance(layer, dict):

@@ -84,7 +84,8 @@ def check_foreign(path: str | os.PathLike[str], start: bytes) -> None:
     """
     if not start:
         raise ProgdfError(f"{os.fspath(path)} is empty (0 bytes); copy or download it again")
-    if kind := _foreign_kind(start):
+    kind = _foreign_kind(start)
+    if kind:
         raise ProgdfError(f"{os.fspath(path)} {kind}")
 
 

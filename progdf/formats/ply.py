@@ -298,7 +298,8 @@ def _gaussians(rows: npt.NDArray[np.void], columns: dict[str, tuple[str, ...]]) 
 
     If all columns are float32, each block is viewed as a matrix; otherwise the needed columns are stacked.
     """
-    rows, names = np.asarray(rows), rows.dtype.names or ()
+    names = rows.dtype.names or ()
+    rows = np.asarray(rows)
     is_plain = all(rows.dtype[name] == np.dtype("<f4") for name in names)
     if not is_plain:
         names = tuple(name for part in columns.values() for name in part)

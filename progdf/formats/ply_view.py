@@ -92,7 +92,8 @@ def read_view(ply: PlyFile, origin: Origin = ZERO) -> PlyView:
 def _parse_direction(text: str, is_brush: bool) -> Tensor | None:
     """Parse a direction such as "z", "-y", "y-up" or "0 -1 0"; None for other text. [3] unit length"""
     text = text.strip()
-    if axis := _AXIS.fullmatch(text):
+    axis = _AXIS.fullmatch(text)
+    if axis is not None:
         is_negative = axis["sign"] == "-" or (is_brush and not axis["sign"] and axis["axis"] in "yYzZ")
         direction = torch.zeros(3)
         direction["xyz".index(axis["axis"].lower())] = -1.0 if is_negative else 1.0

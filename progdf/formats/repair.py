@@ -85,7 +85,8 @@ def _unusable_reasons(scene: Gaussians) -> list[str]:
             "far too large": is_outside & ~has_nan & ~has_infinity,
         }
         for kind, rows in kinds.items():
-            if count := int(rows.sum()):
+            count = int(rows.sum())
+            if count:
                 article = "an" if kind == "infinite" else "a"
                 reasons.append(f"{group_digits(count)} of {total} have {article} {kind} {name}")
     return reasons

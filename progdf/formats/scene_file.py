@@ -297,7 +297,8 @@ def _read_with_gaussforge(path: Path, kind: str) -> Gaussians:
     _require_gaussforge(path, kind)
     with tempfile.TemporaryDirectory(prefix="progdf-") as folder:
         target = Path(folder) / "scene.ply"
-        if reason := _convert(path, kind, target, "ply"):
+        reason = _convert(path, kind, target, "ply")
+        if reason:
             raise _read_error(path, kind, reason)
         try:
             return read_ply(read_header(target))[0]
@@ -335,9 +336,9 @@ def _convert(source: Path, kind: str, target: Path, to: str) -> str:
         result = native_child.run((memory, output, factor * seconds), 2 * factor * seconds, *words)
     except subprocess.TimeoutExpired:
         return f"did not answer within {2 * factor * seconds} s"
-    return (
-        _failure_reason(result.returncode, result.stderr) if result.returncode or not target.is_file() else ""
-    )
+    if result.returncode or not target.is_file():
+        return _failure_reason(result.returncode, result.stderr)
+    return ""
 
 
 def save_scene(path: Path, scene: Gaussians, glb_axes: Axes = "LUF") -> ReadBack | None:
@@ -414,7 +415,8 @@ def _write_with_gaussforge(path: Path, written: Path, scene: Gaussians, kind: st
         source = Path(folder) / "scene.ply"
         target = Path(folder) / f"scene.{kind}"
         save_ply(source, replace(scene, means=means, origin=ZERO))
-        if reason := _convert(source, "ply", target, kind):
+        reason = _convert(source, "ply", target, kind)
+        if reason:
             raise ProgdfError(f"{path} was not written: the writer of .{kind} {reason}; write a .ply")
         if kind == "spz":
             content = bytearray(gzip.decompress(target.read_bytes()))

@@ -80,7 +80,10 @@ def _write_stage(path: Path, scenes: Iterable[Gaussians], rate: float) -> None:
                 attribute.Set(kind.FromNumpy(previous[name]), 0)
             if time and attribute.GetNumTimeSamples() and attribute.GetTimeSamples()[-1] != time - 1:
                 attribute.Set(kind.FromNumpy(previous[name]), time - 1)
-            attribute.Set(kind.FromNumpy(values), *([time] if time else []))
+            if time:
+                attribute.Set(kind.FromNumpy(values), time)
+            else:
+                attribute.Set(kind.FromNumpy(values))
             previous[name] = values
         if time == 0:
             prim.CreateRadianceSphericalHarmonicsDegreeAttr(scene.sh_degree)

@@ -151,7 +151,8 @@ def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
     field, tensors = header.pack_field(gdf.field)
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     tensors |= header.pack_region(gdf.region) | header.pack_added(gdf.added)
-    if broken := _find_non_finite(tensors):
+    broken = _find_non_finite(tensors)
+    if broken:
         raise ValueError(f"{broken} of {gdf.name} has a number that is not finite")
     head = header.GdfHeader(
         name=gdf.name,
@@ -268,7 +269,8 @@ def read_gdf(path: str | os.PathLike[str]) -> Gdf:
 
 
 def _unpack(head: header.GdfHeader, tensors: Mapping[str, Tensor]) -> Gdf:
-    if broken := _find_non_finite(tensors):
+    broken = _find_non_finite(tensors)
+    if broken:
         raise ValueError(f"{broken} has a number that is not finite")
     if not 0 <= head.scene.count <= header.MAX_GAUSSIANS or head.members > head.scene.count:
         raise ValueError(f"{head.members} members of a scene of {head.scene.count} Gaussians")

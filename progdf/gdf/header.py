@@ -218,14 +218,16 @@ def unpack_field(header: FieldHeader, tensors: Mapping[str, Tensor], members: in
         old, new = tensors["remap"].double()
         parts = {name: tensors[name] for name in (*_GRADE_TENSORS, "mask") if name in tensors}
         bases, channels = tensors["scale"].shape
-        if (levels := tensors.get("residual" + _PACKED_SUFFIX)) is not None:  # since format 6
+        levels = tensors.get("residual" + _PACKED_SUFFIX)  # since format 6
+        if levels is not None:
             functions = tensors.get("functions" + _PACKED_SUFFIX)  # since format 7
             if functions is None:
                 parts["residual"] = inflate(levels, (bases, channels, members), torch.int8).movedim(1, 2)
             else:
                 parts["residual"] = unpack_levels(functions, levels, bases, members, channels)
-        if (levels := tensors.get("mask" + _PACKED_SUFFIX)) is not None:
-            parts["mask"] = inflate(levels, (members,), torch.uint8)
+        mask_levels = tensors.get("mask" + _PACKED_SUFFIX)
+        if mask_levels is not None:
+            parts["mask"] = inflate(mask_levels, (members,), torch.uint8)
         grade = GradeForm(header.grade, **parts, remap=SliderRemap(old, new))
         return BakedField("grade", torch.tensor([0.0, 1.0]), {}, header.channels, recorded, grade)
     if header.network is None:
@@ -262,9 +264,9 @@ def unpack_field(header: FieldHeader, tensors: Mapping[str, Tensor], members: in
 
 def pack_added(added: Gaussians | None) -> dict[str, Tensor]:
     """Return the tensors of added rows by their names in the file."""
-    return (
-        {} if added is None else {_ADDED_PREFIX + name: getattr(added, name).float() for name in ATTRIBUTES}
-    )
+    if added is None:
+        return {}
+    return {_ADDED_PREFIX + name: getattr(added, name).float() for name in ATTRIBUTES}
 
 
 def unpack_added(header: GdfHeader, tensors: Mapping[str, Tensor]) -> Gaussians | None:

@@ -158,7 +158,8 @@ def _to_bytes(path: str | os.PathLike[str], picture: Image.Image, two_values: bo
     if tags.get(_INTERPRETATION_TAG) == _WHITE_IS_ZERO:
         shades = 1.0 - shades
     gray = Image.fromarray((shades.clip(0.0, 1.0) * 255.0).round().astype(np.uint8)[stored])
-    if isinstance(transparent_value := picture.info.get("transparency"), int):
+    transparent_value = picture.info.get("transparency")
+    if isinstance(transparent_value, int):
         gray.putalpha(Image.fromarray(np.where(stored == transparent_value, 0, 255).astype(np.uint8)))
     return gray
 

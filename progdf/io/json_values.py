@@ -119,7 +119,8 @@ def _decode_path(kind: type, value: object) -> object:
 def _parse_finite(digits: str) -> float:
     number = float(digits)
     if not math.isfinite(number):
-        raise ValueError(f"{digits[:12]}{'…' * (len(digits) > 12)} is not a usable number")
+        shown_digits = digits if len(digits) <= 12 else f"{digits[:12]}…"
+        raise ValueError(f"{shown_digits} is not a usable number")
     return number
 
 

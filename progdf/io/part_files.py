@@ -42,7 +42,8 @@ def part_files(path: Path) -> list[Path]:
     ranks = _numbers_between(path.parent, head, tail) | {int(match["part"])}
     declared = match.groupdict().get("count")
     count = int(declared) if declared else max(ranks) + 1
-    if step := _GSPLAT_STEP.fullmatch(head):
+    step = _GSPLAT_STEP.fullmatch(head)
+    if step is not None:
         stem = f"train_step{int(step[1]):04d}_rank"  # gsplat writes a report per rank beside the checkpoints
         reports = _numbers_between(path.parent.parent / "stats", stem, ".json")
         count = max(count, 1 + max(reports, default=0))

@@ -150,7 +150,8 @@ def check_levels(shape: Sequence[int]) -> int:
 
     The limit stops a small damaged file from requesting unbounded memory.
     """
-    if (size := math.prod(shape)) > _MAX_LEVELS:
+    size = math.prod(shape)
+    if size > _MAX_LEVELS:
         raise ValueError(f"{list(shape)} packed levels, more than {_MAX_LEVELS}")
     return size
 

@@ -62,16 +62,23 @@ def read_compressed_ply(ply: PlyFile) -> tuple[Gaussians, tuple[str, ...]]:
         raise damage_error(name, f"the element 'sh' has {counts['sh']} rows for {count} Gaussians")
     if len(sh) not in _SH_REST:
         raise unsupported_error(name, f"{len(sh)} SH coefficients (0, 9, 24 or 45 are)", _CONVERT)
-    if wide := next((column for column, kind in sh.items() if kind != "u1"), None):
+    wide = next((column for column, kind in sh.items() if kind != "u1"), None)
+    if wide:
         raise unsupported_error(name, f"'{wide}' of another type than uchar", _CONVERT)
-    ranged = [_XYZ, _SCALES, *([_RGB] if "min_r" in chunk else [])]
+    ranged = [_XYZ, _SCALES]
+    if "min_r" in chunk:
+        ranged.append(_RGB)
     needed = [f"{edge}_{name}" for names in ranged for name in names for edge in ("min", "max")]
     missing = [n for n in needed if n not in chunk] + [n for n in _PACKED if n not in vertex]
     if missing:
         raise damage_error(name, f"a compressed .ply has {missing[0]}, and this one lacks it")
-    if other := next((column for column in _PACKED if vertex[column] != "u4"), None):
+    other = next((column for column in _PACKED if vertex[column] != "u4"), None)
+    if other:
         raise unsupported_error(name, f"'{other}' of another type than uint", _CONVERT)
-    (ranges, packed, *bands), _ = ply.rows("chunk", "vertex", *(["sh"] if sh else []))
+    elements = ["chunk", "vertex"]
+    if sh:
+        elements.append("sh")
+    (ranges, packed, *bands), _ = ply.rows(*elements)
     chunk_of_row = np.arange(count) // _CHUNK_ROWS
     position, rotation, scale, color = (packed[column].astype(np.uint32) for column in _PACKED)
     rgba = _unpack_shares(color, (24, 16, 8, 0), (8, 8, 8, 8))
@@ -121,7 +128,8 @@ def write_compressed_ply(path: Path, scene: Gaussians) -> None:
     for names, table in values.items():
         low, high = (edge(table, starts, axis=0) for edge in edges.values())
         for i, name in enumerate(names):
-            ranges[f"min_{name}"], ranges[f"max_{name}"] = low[:, i], high[:, i]
+            ranges[f"min_{name}"] = low[:, i]
+            ranges[f"max_{name}"] = high[:, i]
         span = np.where(high > low, high - low, 1.0)
         shares[names] = ((table - low[chunk_of_row]) / span[chunk_of_row]).astype(np.float32)
     quats = scene.unit_quats.cpu().numpy()
@@ -140,7 +148,8 @@ def write_compressed_ply(path: Path, scene: Gaussians) -> None:
     for name, column in zip(_PACKED, words, strict=True):
         packed[name] = column
     elements = [PlyElement.describe(ranges, "chunk"), PlyElement.describe(packed, "vertex")]
-    if bands := arrays["shN"].shape[1]:
+    bands = arrays["shN"].shape[1]
+    if bands:
         coefficients = arrays["shN"].transpose(0, 2, 1).reshape(count, 3 * bands)
         table = ((coefficients / 8.0 + 0.5) * 256.0).clip(0, 255).astype("u1")
         rows = np.ascontiguousarray(table).view([(f"f_rest_{i}", "u1") for i in range(3 * bands)])[:, 0]
