@@ -64,7 +64,7 @@ class Values(dict[str, Any]):
         super().update(getattr(self._widget, self._trait))
 
     def _refuse(self, *_: Any) -> Any:
-        raise RefusedError(f"the names of {self._trait} stay as they are; set the value of one")
+        raise RefusedError(f"entries of {self._trait} cannot be added or removed; set the value of one")
 
     __delitem__ = pop = popitem = clear = setdefault = _refuse
 
@@ -78,14 +78,14 @@ class Widget(anywidget.AnyWidget):
 
     _esm = build_widget()
     _markup = traitlets.Unicode().tag(sync=True)
-    scene = traitlets.Bytes(help="what the browser draws, see `viewer.web.page.pack`").tag(sync=True)
-    strengths = traitlets.Dict(
-        help="slider values by layer name; what a new dict leaves out stays as it is"
-    ).tag(sync=True)
-    hidden = traitlets.List(traitlets.Unicode(), help="names of layers whose eye is closed").tag(sync=True)
-    blend = traitlets.Unicode("adjust", help="how layers go together, of `BLENDS`").tag(sync=True)
+    scene = traitlets.Bytes(help="scene data for the browser, see `viewer.web.page.pack`").tag(sync=True)
+    strengths = traitlets.Dict(help="slider values by layer name; omitted layers are unchanged").tag(
+        sync=True
+    )
+    hidden = traitlets.List(traitlets.Unicode(), help="names of hidden layers").tag(sync=True)
+    blend = traitlets.Unicode("adjust", help="blend rule, one of `BLENDS`").tag(sync=True)
     camera = traitlets.Dict(
-        help="`ViewCamera` as a dict: pivot, distance, azimuth, elevation, fov_y, up; left out: as it is"
+        help="`ViewCamera` as a dict (pivot, distance, azimuth, elevation, fov_y, up); omitted: unchanged"
     ).tag(sync=True)
     height = traitlets.Int(480, min=100, max=4000, help="px").tag(sync=True)
 

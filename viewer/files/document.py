@@ -27,7 +27,7 @@ from viewer.camera.view_camera import SceneUp, bounds_of, find_scene_up, first_c
 from viewer.state.facts import layer_rows
 from viewer.state.workspace import SceneFacts
 
-_Made = TypeVar("_Made")
+_Value = TypeVar("_Value")
 
 Place = Callable[[Gaussians, int, str], Region | None]
 """Function from a scene, an edit's index and its name to the region that the edit's grade is applied to.
@@ -108,12 +108,12 @@ class Document:
         return _free_name(name, self.edits)
 
 
-def _once(make: Callable[[], _Made]) -> Callable[[], _Made]:
+def _once(make: Callable[[], _Value]) -> Callable[[], _Value]:
     """Return a thread-safe function that calls `make` once, on first use. Concurrent callers wait."""
     lock = threading.Lock()
     cached = cache(make)
 
-    def ask() -> _Made:
+    def ask() -> _Value:
         with lock:
             return cached()
 

@@ -80,7 +80,9 @@ class WindowFile(SessionFile, frozen=True, forbid_unknown_fields=True):
         for where, layers in stacks.items():
             for i, layer in enumerate(layers):
                 if not 0 <= layer.gdf < len(self.edits):
-                    raise ValueError(f"{where}.layers[{i}].gdf is {layer.gdf} of {len(self.edits)} edits")
+                    raise ValueError(
+                        f"{where}.layers[{i}].gdf is {layer.gdf}, but there are {len(self.edits)} edits"
+                    )
 
 
 def save(path: Path, session: WindowSession) -> None:
@@ -157,8 +159,8 @@ def open_session(path: Path) -> WindowSession:
     if moved:
         more = f" and {len(moved) - 1} more" if len(moved) > 1 else ""
         warning = escape_text(
-            f"{path.name}: region {moved[0]}{more} named no {REGION_SUFFIX} file in the session's folder: "
-            "unsaved until the session is saved"
+            f"{path.name}: invalid path of region {moved[0]}{more}, not a {REGION_SUFFIX} file "
+            "in the session's folder; save the session to write it there"
         )
         _log.warning(warning)
     return WindowSession(opened, view, snapshots, warning)
@@ -197,7 +199,7 @@ def _check_keys(timeline: Timeline, where: str) -> None:
             raise ValueError(f"{where}[{i}].camera has an up axis without a direction")
     rows = [row for key in timeline.keys for row in split_keys(Timeline((key,))) or [(None, key.frame)]]
     if len(set(rows)) < len(rows) or any(a.frame > b.frame for a, b in pairwise(timeline.keys)):
-        raise ValueError(f"{where} has two keys of one row at one frame, or not in their order")
+        raise ValueError(f"{where} has two keys of one row at one frame, or keys out of order")
 
 
 def _with_region_paths(view: ViewState, change: Callable[[Path], Path]) -> ViewState:

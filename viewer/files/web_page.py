@@ -83,10 +83,10 @@ def write_page(
     size = len(html.encode())
     whole = document.scene.sh_degree
     parts = [f"{size / 1e6:.2f} MB", options.quality]
-    parts += [f"SH of degree {degree} of {whole}"] if degree < whole else []
+    parts += [f"SH degree {degree} of {whole}"] if degree < whole else []
     parts += [f"{error:.1f} dB to the scene"] if error < _EXACT_DB else []
-    takes = "common hosts take" if size > HOST else "most mail takes"
-    warning = f"; more than {takes}, --sh 0 or fewer Gaussians make it smaller" if size > MAIL else ""
+    takes = "common hosts accept" if size > HOST else "most mail servers accept"
+    warning = f"; larger than {takes}: use --sh 0 or fewer Gaussians" if size > MAIL else ""
     return f"wrote {out}: {', '.join(parts)}{warning}"
 
 

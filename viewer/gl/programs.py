@@ -46,4 +46,4 @@ def _first_line(log: str, vertex: str, fragment: str | None, sources: list[Sourc
                 complaints.append(f"shaders/{name}:{match['line']}: {match['text']}")
                 break
     names = vertex if fragment is None else f"{vertex} + {fragment}"
-    return "\n".join([f"{names} does not compile here", *(complaints or [log.strip()])])
+    return "\n".join([f"{names} does not compile with this driver", *(complaints or [log.strip()])])

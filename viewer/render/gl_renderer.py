@@ -209,7 +209,7 @@ def headless_context() -> moderngl.Context:
         except Exception as error:  # each platform's loader raises its own type
             reasons.append(" ".join(str(error).split()))
     raise ProgdfError(
-        f"there is no OpenGL 3.3 here ({reasons[0]}); install libegl1 and libgl1, or use --engine cpu"
+        f"OpenGL 3.3 is not available ({reasons[0]}); install libegl1 and libgl1, or use --engine cpu"
     )
 
 

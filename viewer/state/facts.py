@@ -153,5 +153,5 @@ def draw_thumbnail(scene: Gaussians, gdf: Gdf, camera: ViewCamera) -> NDArray[np
 def describe_applied(gdf: Gdf) -> str:
     """Return one line on the omitted parts of a grade applied to another region, or "" if there are none."""
     parts = gdf.report.get("left_out") if gdf.applied else ""
-    left_out = f"without its {parts}, which fits the scene it was trained on alone"
+    left_out = f"without its {parts}, which fits only the scene it was trained on"
     return f"{gdf.name} on {gdf.region.name}: {left_out}" if parts else ""

@@ -203,7 +203,7 @@ def add_region(state: SelectionState, name: str, path: Path) -> SelectionState:
         ProgdfError: there are already `MAX_REGIONS`.
     """
     if len(state.regions) >= MAX_REGIONS:
-        raise ProgdfError(f"there are {MAX_REGIONS} regions, the most there can be; delete some first")
+        raise ProgdfError(f"there are already {MAX_REGIONS} regions (the maximum); delete some first")
     color = COLORS[len(state.regions) % len(COLORS)]
     region = NamedRegion(name, path, state.members, state.count, color)
     return replace(state, regions=(*state.regions, region))

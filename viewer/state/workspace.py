@@ -56,7 +56,7 @@ class PreviewState(NamedTuple):
 
 
 def _no_facts() -> Any:
-    raise ValueError("nothing is known of this scene's neighborhood")
+    raise ValueError("this scene has no neighborhood")
 
 
 @dataclass(frozen=True)

@@ -324,7 +324,7 @@ def test_a_grade_of_another_scene_goes_on_a_region_of_this_one_and_a_table_every
     assert run("export", *words, "-o", "edited.ply") == 0
     (left_out,) = caplog.messages
     assert left_out == (
-        "look on file:rows.npy: without its residual, which fits the scene it was trained on alone"
+        "look on file:rows.npy: without its residual, which fits only the scene it was trained on"
     )
     scene = bear().scene
     edited = load_ply("edited.ply")

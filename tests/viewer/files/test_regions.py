@@ -126,7 +126,7 @@ def test_a_session_of_a_stranger_writes_and_removes_nothing_outside_of_its_folde
     before = contents(outside)
     opened = session.open_session(file)
     state = opened.view.selection
-    assert f"region r0 (../victim.txt) and {len(paths) - 1} more named no" in opened.warning
+    assert f"region r0 (../victim.txt) and {len(paths) - 1} more, not a .region.npy file" in opened.warning
     for i, region in enumerate(state.regions):
         exports.region_file(region, TOTAL)
         state = exports.rename_region(state, i, f"renamed {i}", TOTAL)
@@ -167,7 +167,7 @@ def test_the_window_says_which_regions_it_did_not_take_and_saves_them_beside_the
         app.file_actions.open(file)
         said = app.main_view.work.message
         assert said is not None
-        assert "region r0 (../victim.txt) named no .region.npy file in the session's folder" in said.text
+        assert "region r0 (../victim.txt), not a .region.npy file in the session's folder" in said.text
         app.handle("save")
         assert (folder / "r0.region.npy").exists()
         (tmp_path / "elsewhere").mkdir()

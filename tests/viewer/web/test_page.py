@@ -585,9 +585,9 @@ def test_a_page_says_how_large_it_is_and_what_fewer_harmonics_cost(tmp_path: Pat
     assert size > written(layers="scarf")[0], "an edit that is at 0 and has no slider is left out"
     smaller, line = written(sh=0)
     assert smaller < size
-    assert re.search(
-        rf"{smaller / 1e6:.2f} MB, compact, SH of degree 0 of 1, \d\d\.\d dB to the scene", line
-    ), line
+    assert re.search(rf"{smaller / 1e6:.2f} MB, compact, SH degree 0 of 1, \d\d\.\d dB to the scene", line), (
+        line
+    )
 
 
 def test_what_cannot_be_is_one_line_and_what_was_there_stays(
