@@ -251,4 +251,4 @@ def newest_line(lines: queue.SimpleQueue[str]) -> str:
 
 
 def _no_masks() -> Path:
-    raise ProgdfError("this region takes a while to find; it has no picture in advance")
+    raise ProgdfError("finding this region takes a while, so it has no preview")

@@ -123,7 +123,7 @@ def region_kinds(request: RegionRequest) -> dict[str, Kind]:
         count = sum(mask is not None for mask in masks)
         if not any(bool(mask.any()) for mask in masks if mask is not None):
             raise ProgdfError(
-                f"none of the {count} masks in {folder} has a bright pixel; paint the thing white on black"
+                f"none of the {count} masks in {folder} has a bright pixel; paint the object white on black"
             )
         if request.say is not None and count < len(masks):
             request.say(f"{count} of {len(masks)} cameras have a mask; the others tell nothing")
@@ -211,7 +211,7 @@ def _scribble_pictures(
     """Return the pictures of `scribbles:A.png,B.png`, and their cameras."""
     if not text:
         raise ProgdfError(
-            "scribbles: needs rendered views with green strokes on the thing and red ones beside it; "
+            "scribbles: needs rendered views with green strokes on the object and red ones beside it; "
             "write scribbles:A.png,B.png"
         )
     paths = list(picture_paths(text))
@@ -232,7 +232,7 @@ def _scribbles_region(text: str, scene: Gaussians, request: RegionRequest) -> Re
     inside, outside = (np.concatenate(parts) for parts in rows.values())
     for color, found, where in (("green", inside, "on"), ("red", outside, "beside")):
         if not len(found):
-            raise ProgdfError(f"no {color} stroke in {text} lies on the scene; paint one {where} the thing")
+            raise ProgdfError(f"no {color} stroke in {text} lies on the scene; paint one {where} the object")
     scribbles = Scribbles(scene.means.nan_to_num().numpy(), base_colors(scene))
     return from_mask(f"scribbles:{text}", torch.from_numpy(scribbles.select(inside, outside)))
 

@@ -476,7 +476,9 @@ def agree_views(
         if view.camera.name not in loop.pictures
     }
     for name, moved in left_out.items():
-        log.say(f"{name} is left out: its answers are shifted or scaled by {moved:.0%}; the fit stands in")
+        log.say(
+            f"{name} is left out, as its answers are shifted or scaled by {moved:.0%}; the fit replaces it"
+        )
     pictures = loop.pictures | {
         view.camera.name: fit.render(view.camera) for view in views if view.camera.name in left_out
     }

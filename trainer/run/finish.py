@@ -223,7 +223,7 @@ def _fit_field(
     """Fit the requested field; also return the network fit if the field is a network."""
     choosing, reporting = evaluator.halves()
     if len(setup.held_out) == 1:
-        log.say("one view alone is held out: the field is chosen and reported on it")
+        log.say("only one view is held out, so the field is both chosen and reported on it")
     if not setup.held_out:
         log.say("no view is held out: all figures are of the views that were trained on")
     weighing = setup.train[::_VISIBILITY_STRIDE]
@@ -320,7 +320,7 @@ def _write_run(
         )
     )
     each = report["file"]["bytes_per_gaussian"]
-    log.say(f"{result.line}, {each:.0f} bytes per Gaussian with all that is in it")
+    log.say(f"{result.line}, {each:.0f} bytes per Gaussian in total")
     if paint is not None:
         log.say(f"warning: {paint.warning}" if paint.warning else paint.share)
     return result

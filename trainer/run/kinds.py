@@ -121,8 +121,8 @@ class Trial:
         if not self.chosen.grow and any(candidate.grow for candidate in self.psnrs):
             note = ": growth would not take a tenth of the error away, or takes the place of what moves"
         return (
-            f"tried for {self.steps} steps with L1 on small views, PSNR in other views: unedited "
-            f"{self.unedited:.1f}, {tried} dB; taken: {self.chosen}{note}"
+            f"trial run of {self.steps} steps with L1 on small views, PSNR in held-out views: unedited "
+            f"{self.unedited:.1f}, {tried} dB; chosen: {self.chosen}{note}"
         )
 
     def figures(self) -> dict[str, Any]:

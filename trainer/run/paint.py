@@ -184,7 +184,7 @@ def choose_discs(
     if log is not None:
         errors = ", ".join(f"{decibels(error):.1f} dB with {laid.gap:g}" for error, laid in candidates)
         log.say(
-            f"what lay before the paint goes {best[1].gap:g} pixels behind it: {errors}, in and "
+            f"occluding Gaussians are moved {best[1].gap:g} pixels behind the paint: {errors}, in and "
             f"{RING} pixels around it, as painted and from up to {max(_TRIAL_ANGLES_DEG)}° to its sides"
         )
     return best[1]

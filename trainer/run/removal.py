@@ -70,8 +70,7 @@ def is_removal(options: TrainOptions, setup: TrainingSetup, log: RunLog) -> bool
         if not removes:
             decision = "recolored (--removal always removes)"
         log.say(
-            f"{100 * share:.0f} % of what was painted is what the scene shows without the region: "
-            f"it is {decision}"
+            f"{100 * share:.0f} % of the painted change equals the scene without the region: it is {decision}"
         )
     return removes
 
@@ -115,9 +114,7 @@ def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder
     region = setup.region
     remaining = scene[~setup.region.mask]
     if len(region) > selected:
-        log.say(
-            f"{format_count(len(region) - selected, 'Gaussian')} that would float alone without it go too"
-        )
+        log.say(f"{format_count(len(region) - selected, 'Gaussian')} left floating are removed too")
     with log.stage("fill"):
         painted, pictures = _painted_views(options, setup)
         around = setup if not options.views.pictures else _views_around(options, setup)
@@ -128,7 +125,7 @@ def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder
             fill = fill_holes(scene, remaining, views, pictures if kind == "picture" else None)
     rows_added = 0 if fill.rows is None else len(fill.rows)
     log.say(
-        f"holes: none is filled, as asked ({kind})"
+        f"holes: not filled, as requested ({kind})"
         if kind == "none"
         else f"holes: {fill.before} pixels in {format_count(len(views), 'view')}, {fill.after} after "
         f"{format_count(rows_added)} from {format_count(fill.views, 'view')} ({kind})"
@@ -163,7 +160,7 @@ def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder
     gdf = replace(gdf, options=differences(report["plan"], DEFAULTS), report=about)
     result = write_result(folder, gdf, report, picture)
     psnr_list = ", ".join(f"{psnr:.1f} dB on {name}" for name, psnr in errors.items())
-    log.say(f"to a render without the region, at its pixels in views not filled from: {psnr_list}")
+    log.say(f"PSNR to a render without the region, in its pixels of views without fill: {psnr_list}")
     log.say(f"{result.line}; shadows and reflections stay")
     return result
 

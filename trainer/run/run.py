@@ -339,7 +339,7 @@ def _write_draft(
     views = draft_views(options.views, scene, region)
     draft = draft_grade(views, options.editor, options.name) if views is not None else None
     if draft is None:
-        log.say("no draft: one map of color does not carry this edit")
+        log.say("no draft: a single color map cannot represent this edit")
         return
     save_gdf(folder.draft, draft)
     log.say(
@@ -494,9 +494,7 @@ def _check_change(edited: Pictures, setup: TrainingSetup, spec: str) -> None:
     """Raise a ProgdfError if no view shows an edit."""
     originals = [quantize_image(view.image) for view in setup.views]
     if all(torch.equal(*pair) for views in edited.values() for pair in zip(views, originals, strict=True)):
-        raise ProgdfError(
-            f"{spec} changes none of the views; check the region and what the editor is asked for"
-        )
+        raise ProgdfError(f"{spec} changes none of the views; check the region and the editor's settings")
 
 
 def _requests_more_strengths(options: TrainOptions, optimization: OptimizeOptions) -> bool:

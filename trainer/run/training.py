@@ -297,13 +297,15 @@ def plan_colors(
         )
     evaluated_on = "views that are held out" if held_out else "all views, as none is held out"
     if len(train) < count:
-        log.say(f"{len(train)} of {count} views are solved for: all would change nothing that shows")
+        log.say(
+            f"{len(train)} of {count} views are solved for, as the others would make no visible difference"
+        )
     if ties is not None:
         evaluated_on = "squares of the pictures that are held out"
     log.say(f"{model.line}, on {evaluated_on}")
     if ties is not None:
         unseen_count = len(original) - int(solver.asked[:, 0].sum())
-        log.say(f"{unseen_count} members that no picture shows follow the map and their own surface")
+        log.say(f"{unseen_count} members are in no picture and follow the color map and their surface")
     return solver.only(model.residual), model, course
 
 

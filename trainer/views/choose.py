@@ -127,10 +127,10 @@ class ViewChoice:
         if self.unseeing:
             parts.append(f"{self.unseeing} do not see the region")
         if self.scant:
-            parts.append(f"{self.scant} see too little of it")
+            parts.append(f"{self.scant} see too little of the region")
         spare = self.offered - len(self.views) - self.unseeing - self.scant
         if spare:
-            parts.append(f"{spare} show what others show")
+            parts.append(f"{spare} are redundant")
         return "; ".join(parts)
 
 

@@ -107,7 +107,7 @@ def test_views_are_taken_from_all_around_and_not_from_the_beginning_of_the_list(
     chosen = choose_views(case.scene, case.region, crowded(case), count, WHITE)
     assert len(chosen.views) == count
     assert widest_gap(azimuths_of(case, [view.camera for view in chosen.views])) < 1.8 * 360 / count
-    assert f"{70 - count} show what others show" in chosen.line()
+    assert f"{70 - count} are redundant" in chosen.line()
 
 
 def test_the_order_of_the_list_does_not_choose_the_views() -> None:
@@ -217,7 +217,7 @@ def test_a_camera_that_shows_the_region_small_is_left_out_and_said_so() -> None:
     little = replace(near[1].resize(24, 24), name="little")
     chosen = choose_views(case.scene, case.region, [*near, far, little], 96, WHITE)
     assert [view.camera.name for view in chosen.views] == [*(c.name for c in near), "little"]
-    assert chosen.line() == "5 of 6 cameras; 1 see too little of it"
+    assert chosen.line() == "5 of 6 cameras; 1 see too little of the region"
 
 
 def test_a_region_behind_a_wall_is_seen_by_those_on_its_side() -> None:
