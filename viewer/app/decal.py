@@ -24,7 +24,7 @@ _FIRST = 0.25  # initial longer side, as a fraction of the view's height
 _STEP = 1.08
 _TURN = 5.0
 _SIZES = (8.0, 8192.0)  # minimum and maximum, window pixels
-_HINT = "Wheel sizes, Shift+wheel turns; click or Enter lays it on, Esc puts it away"
+_HINT = "Wheel: size. Shift+wheel: rotate. Click or Enter: place. Esc: cancel"
 
 
 @dataclass(frozen=True)

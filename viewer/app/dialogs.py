@@ -46,20 +46,20 @@ TITLES = {
 }
 _HINTS = {
     "save": "A .session.json file. The scene and its edits stay where they are.",
-    "open": "A scene (.ply, .spz, .sog …), an edit (.gdf, .cube), a changed picture, a session or cameras.",
+    "open": "A scene (.ply, .spz, .sog …), an edit (.gdf, .cube), an edited picture, a session or cameras.",
     "replace": "An edit (.gdf, .cube). The layer keeps its position, strength and gains.",
-    "rebind": "The scene that it was made for: the same as the open one, in another file or format.",
+    "rebind": "The scene of this edit: the open scene in another file or format.",
     "leave": "Save changes to {}?",
     "overwrite": "{} was not opened in this window. Replacing it cannot be undone.",
     "restore": "The last session was not closed properly. Its unsaved work was saved to {}.",
-    "training": "{} is being trained. A run that is stopped can go on when the scene is opened again.",
-    "discard_run": "Discard {} of training? It cannot be brought back.",
-    "delivery": "{} is not finished. What is stopped now is not kept.",
+    "training": "{} is being trained. A stopped run can be resumed when the scene is opened again.",
+    "discard_run": "Discard {} of training? This cannot be undone.",
+    "delivery": "{} is not finished. If you stop now, nothing is written.",
     "log": "{}",
-    "export": "A plain 3DGS .ply of what the sliders show, which any viewer opens.",
+    "export": "A plain 3DGS .ply of the scene at these strengths, which any viewer opens.",
     "export_page": "One .html file with these sliders, snapshots and film, which any browser opens.",
-    "render_picture": "This view at any size; what stands at its upper and lower edge stays there.",
-    "render_film": "It is rendered beside your work; the panel shows how far it is.",
+    "render_picture": "This view at any size, with the same vertical field of view.",
+    "render_film": "Renders in the background; the panel shows the progress.",
     "about": "Edit a trained 3D Gaussian Splatting scene once, then drag a slider through it.",
 }
 _SUBMIT = {

@@ -49,7 +49,7 @@ def look_through(main_view: MainView, path: Path) -> None:
         ProgdfError: the file holds no camera.
     """
     _take_camera(main_view, load_cameras(path, main_view.facts.origin)[0])
-    main_view.show_message(f"Looking through the first camera of {path.name}")
+    main_view.show_message(f"View set to the first camera of {path.name}")
 
 
 def edit_picture(main_view: MainView, path: Path) -> None:
@@ -61,7 +61,7 @@ def edit_picture(main_view: MainView, path: Path) -> None:
     camera = find_picture_camera(path, origin=main_view.facts.origin)
     if edits := edits_in_picture(path):
         raise ProgdfError(
-            f"{path.name} was taken with edits on ({edits}); take the view with {shortcut('take_view')}"
+            f"{path.name} shows edits ({edits}); take a view without edits with {shortcut('take_view')}"
         )
     _take_camera(main_view, camera)
     work = main_view.work
@@ -239,7 +239,7 @@ class FileActions:
             "save_to": self._save_to,
             "overwrite": lambda path: self._save_to(path, overwrite=True),
             "open": lambda _: ask(Dialog("open")),
-            "decal": lambda _: ask(Dialog("open", notice="A picture; it is then laid on a surface by hand")),
+            "decal": lambda _: ask(Dialog("open", notice="A picture to place on a surface")),
             "browse": self._browse,
             "open_file": lambda path: self.open(parse_path(path)),
             "camera": lambda _: keep_camera(self._app, self.path),
@@ -337,7 +337,7 @@ class FileActions:
         """Write unsaved work next to the session at once; return a line that reports the result."""
         try:
             if not self.has_unsaved:
-                return "nothing was unsaved"
+                return "there was no unsaved work"
             unsaved = workspace.worth_saving(self._app.main_view.work)
             path = self.session_autosave.write(unsaved, self._autosave_base, self._write)
             return f"unsaved work is kept in {path}"

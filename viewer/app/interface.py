@@ -176,7 +176,7 @@ def draw_palette(
         imgui.push_style_var(imgui.StyleVar_.item_spacing, (0.0, 0.0))
         imgui.begin_child("found", (0.0, row * min(ROWS, max(len(found), 1))))
         if not found:
-            imgui.text_disabled("No command is called like that")
+            imgui.text_disabled("No matching command")
         for i, command in enumerate(found):
             if _command_row(command, i == at, ui):
                 requested = command.action
@@ -347,7 +347,7 @@ def over_picture(
         free = imgui.ImVec2(free.x, top)
         if clicked == "copy":
             imgui.set_clipboard_text(line.details)
-            work = workspace.with_message(work, "Copied; paste it into a report of what you did", pointer.now)
+            work = workspace.with_message(work, "Copied. Paste it into a bug report.", pointer.now)
         elif clicked or pointer.now >= line.until:
             work = replace(work, message=None)
             work = perform_actions(work, [line.button[1]] if clicked == "do" else [], pointer)

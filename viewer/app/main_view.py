@@ -542,5 +542,5 @@ class MainView:
             return f"Saved {exports.picture(self.pictures, title, read_rgb(screen, whole))}"
         if request == "take_view":
             taken = self.canvas.save_original(self.pictures, title, self.work.view, self._pointer().size)
-            return f"Saved {taken}; change it in any program, and drop it here"
+            return f"Saved {taken}. Edit it in any program and drop it here."
         return self.canvas.save(self.pictures, title, view, self._pointer().size)

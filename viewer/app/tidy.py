@@ -69,7 +69,7 @@ class TidyActions:
         self._folder = edits_folder(self._app.document.file)
         mask = selection.unpack(main_view.work.view.selection.members, len(scene))
         if not mask.any():
-            raise ProgdfError("nothing of the scene is selected; select it first")
+            raise ProgdfError("nothing is selected; select a part of the scene first")
         region = from_mask("selection", torch.from_numpy(mask.copy()))
         if does == "remove":
             self._add(does, [Step("remove", region)])
@@ -170,13 +170,13 @@ class StrayActions:
         main_view = self._app.main_view
         count = len(self._app.document.scene)
         if not len(strays.rows):
-            main_view.show_message("There are no strays")
+            main_view.show_message("No strays found")
             return
         view = main_view.work.view
         mask = np.zeros(count, bool)
         mask[strays.rows] = True
         main_view.change(replace(view, selection=selection.hide(view.selection, mask)))
-        change = "no pixel differs" if db >= NO_DIFFERENCE else f"{db:.1f} dB to the pictures before"
+        change = "no pixel differs" if db >= NO_DIFFERENCE else f"{db:.1f} dB to the earlier pictures"
         hid = f"Hid {group_digits(len(strays.rows))} strays ({strays.describe()})"
         main_view.show_message(f"{hid}: {change}; {shortcut('show_all')} shows them")
 

@@ -46,7 +46,7 @@ class ViewpointOptions:
     """Camera of cameras.json or transforms.json; without INDEX the first."""
     orbit: Annotated[str | None, word("AZ,EL[,DISTANCE]", "the session's, else chosen from the scene")] = None
     """Orbit camera: azimuth and elevation in degrees, distance in world units (fits the scene)."""
-    frame: Annotated[str | None, word("NAME|all", "what stands in the scene")] = None
+    frame: Annotated[str | None, word("NAME|all", "the subject of the scene")] = None
     """Fill the picture with an edit's region or the whole scene."""
     size: Annotated[str | None, word("WIDTHxHEIGHT", "the camera's own, or 640x480")] = None
     """Width and height in pixels."""

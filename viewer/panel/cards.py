@@ -99,9 +99,7 @@ def draw_selection(state: ViewState, chosen: Sequence[int], ui: UiContext, actio
     with inert(all(state.layers[i].locked for i in chosen)):
         at = imgui.get_cursor_screen_pos()
         room = imgui.get_content_region_avail().x - number - 8.0 * ui.scale
-        help_ = (
-            "Strength of all selected layers: that of the strongest; the others keep their proportion to it"
-        )
+        help_ = "Strength of the strongest selected layer; the others keep their proportion"
         new = slider.draw(
             "##master",
             value,
@@ -137,7 +135,7 @@ def draw_group(
         arrow = Icon.FOLDED if folded else Icon.UNFOLDED
         if icon_button("fold", arrow, ui, side=imgui.get_frame_height()):
             state = toggle_collapsed(state, group.name)
-        tip("List its layers, or not")
+        tip("Show or hide its layers")
         imgui.same_line(0.0, 0.0)
         if icon_button("eye", Icon.SHOWN if group.enabled else Icon.HIDDEN, ui, dim=not group.enabled):
             state = change_group(state, group.name, lambda old: replace(old, enabled=not old.enabled))
@@ -161,7 +159,7 @@ def draw_group(
             group.enabled,
             height=SLIM_PX,
             default=LayerGroup.strength,
-            help_="What the strengths of its layers are multiplied by. Double-click: reset to 1",
+            help_="Factor for the strengths of its layers. Double-click: reset to 1",
         )
         number_at = (imgui.get_item_rect_max().x + 6.0 * scale, corner[1])
         color = u32(PALETTE.text if group.enabled else PALETTE.dim)
@@ -210,8 +208,8 @@ BLEND_TITLES = {"normalized": "Average", "sum": "Add", "over": "Over", "adjust":
 BLEND_HELP = {
     "normalized": "Overlapping edits are averaged by weight; never more than a full edit.",
     "sum": "Overlapping edits add up.",
-    "over": "An edit covers those below it, where and as far as it changes something.",
-    "adjust": "As Over, but edits of colors change the colors that lie below: darkened stripes stay stripes.",
+    "over": "An edit covers those below it, in proportion to its change.",
+    "adjust": "Like Over, but color edits change the colors below: darkened stripes stay stripes.",
 }
 
 
@@ -338,7 +336,7 @@ def draw(
         if touch.press and (work.selected or touch.press in ("toggle", "range")):
             actions.append(f"press_layer:{touch.press}:{i}:{','.join(str(i) for i in listed)}")
     if work.view.layers and not listed:
-        small("No layer has these words", PALETTE.dim)
+        small("No matching layer", PALETTE.dim)
     if work.renaming is not None and not any(l.layers == (work.renaming,) and not l.heads for l in lines):
         work = replace(work, renaming=None)
     if gesture:

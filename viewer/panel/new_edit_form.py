@@ -56,10 +56,10 @@ _GRADES = {
     "exposure": "Stops of light: −1 is half of it, 1 twice as much",
     "temperature": "From blue to amber light",
     "tint": "From green to magenta light",
-    "contrast": "About middle gray",
+    "contrast": "Contrast around middle gray",
     "saturation": "−1 is gray, 1 twice the chroma",
-    "black": "What is as dark as this becomes black",
-    "white": "What is as bright as this becomes white",
+    "black": "Colors this dark become black",
+    "white": "Colors this bright become white",
 }
 
 
@@ -120,7 +120,7 @@ def _content(work: Workspace, count: int, preview: PreviewState, ui: UiContext) 
     imgui.same_line(right - imgui.get_frame_height())
     if icon_button("close form", Icon.CLOSE, ui, dim=True):
         action = "new_edit"
-    tip(f"Close ({shortcut('new_edit')}). What is being trained goes on")
+    tip(f"Close ({shortcut('new_edit')}). Training continues")
     column = COLUMN_PX * ui.scale
     form = _region(form, selection, count, column, ui)
     form, action = _editor(form, action, column, ui)
@@ -144,7 +144,7 @@ def _content(work: Workspace, count: int, preview: PreviewState, ui: UiContext) 
     with inert(bool(form.obstacle)):
         if accent_button(f"{Icon.TRAIN}  Train", imgui.ImVec2(-1.0, 0.0)):
             action = "train"
-    tip(form.obstacle or f"Train it; it comes as a layer with a slider. {_effort(form)}")
+    tip(form.obstacle or f"Train the edit; it becomes a layer with a slider. {_effort(form)}")
     return form, action
 
 
@@ -176,7 +176,7 @@ def _region(form: NewEdit, selection: SelectionState, count: int, column: float,
     titles = [_region_title(region, selection, count) for region in offered]
     current = offered.index(form.region) if form.region in offered else None
     title = elide(_region_title(form.region, selection, count), room)
-    pressed = drop_down("##region", title, titles, current, ui, "What may change")
+    pressed = drop_down("##region", title, titles, current, ui, "Region that the edit may change")
     form = form if pressed is None else replace(form, region=offered[pressed], error="")
     if form.region == TYPED:
         form = replace(form, typed_region=_text_row("", "sphere:0,0,0,1", form.typed_region, column))
@@ -216,10 +216,10 @@ def _settings(form: NewEdit, preview: PreviewState, column: float, ui: UiContext
             changed, (red, green, blue) = imgui.color_edit3("##color", list(form.color), hex_only)
             form = replace(form, color=(red, green, blue)) if changed else form
             paths = {False: "Straight", True: "Hues"}
-            help_ = "Between original and color: the direct way, or around the color wheel"
+            help_ = "Path to the color: straight, or around the color wheel"
             form = replace(form, through_hues=choice_row("Path", paths, form.through_hues, column, ui, help_))
         case "amount":
-            help_ = "Share of the light that is taken away"
+            help_ = "Share of light to remove"
             label("Amount", column)
             form = replace(form, amount=value_slider("##Amount", form.amount, (0.05, 0.98), "%.2f", 0.7, ui))
             tip(help_)
@@ -239,8 +239,8 @@ def _settings(form: NewEdit, preview: PreviewState, column: float, ui: UiContext
             form = _model(form, preview, column, ui)
         case "pictures":
             form = replace(form, pictures=_text_row("Pictures", "A.png, B.png", form.pictures, column))
-            taken = f"One or a few pictures that were taken here ({shortcut('take_view')})"
-            tip(f"{taken} and changed in any program")
+            taken = f"One or a few pictures taken here ({shortcut('take_view')})"
+            tip(f"{taken} and edited in any program")
         case "folder":
             form = replace(form, folder=_text_row("Folder", "FOLDER", form.folder, column))
             tip("Pictures of the training views, edited by any program")
@@ -265,9 +265,7 @@ def _palette(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
             form = replace(form, picked=i)
         if imgui.is_item_clicked(1):
             pairs[i] = source, source
-        tip(
-            f"{source} becomes {new_color}; right-click: as it was" if source != target else f"{source} stays"
-        )
+        tip(f"{source} becomes {new_color}; right-click: reset" if source != target else f"{source} stays")
         if source != target:  # original color, in a corner
             low = (x, y + side)
             corner = u32((*parse_color(source).tolist(), 1.0))
@@ -284,7 +282,7 @@ def _palette(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
         imgui.same_line(0.0, 2.0 * ui.scale)
     imgui.set_cursor_pos_x(right_edge() - side)
     picks = form.picks != icon_button("pick", Icon.COLOR, ui, lit=form.picks)
-    tip("Pick a color in the picture, and choose what becomes of it")
+    tip("Pick a color in the picture, then choose its new color")
     return replace(form, palette=tuple(pairs), picks=picks)
 
 
@@ -300,7 +298,7 @@ def _curve(curve: str, column: float, ui: UiContext) -> str:
     x, y = imgui.get_cursor_screen_pos()
     wide = imgui.get_content_region_avail().x
     imgui.invisible_button("curve", (wide, tall), imgui.ButtonFlags_.enable_nav.value)
-    tip("Lightness: press for a point and drag it, right-click it to take it away; or Space, arrows, Del")
+    tip("Lightness: press to add and drag a point, right-click to delete it; or Space, arrows, Del")
     keyed = imgui.is_item_focused() and imgui.get_current_context().nav_cursor_visible
     storage = imgui.get_state_storage()
     held = imgui.get_id("curve/held")
@@ -357,7 +355,7 @@ def _model(form: NewEdit, preview: PreviewState, column: float, ui: UiContext) -
     label("Model", column)
     imgui.set_next_item_width(-1.0)
     models = ["", *preview.models]
-    titles = [model.partition("/")[2] or model or "What fits this machine" for model in models]
+    titles = [model.partition("/")[2] or model or "Best fit for this machine" for model in models]
     index = models.index(form.model) if form.model in models else 0
     pressed = drop_down("##model", titles[index], titles, index, ui, "Models on this machine")
     return form if pressed is None else replace(form, model=models[pressed], asks=0)
@@ -370,11 +368,11 @@ def _anchor(form: NewEdit, preview: PreviewState, column: float) -> tuple[NewEdi
     with inert(bool(form.obstacle) or preview.busy):
         if imgui.button("Again" if form.asks else "Paint this view", imgui.ImVec2(half, 0.0)):
             form = replace(form, asks=form.asks + 1, anchor="")
-    tip("Paint the view that you see. All views will follow this picture; without one, the front decides")
+    tip("Paint this view. All views will follow the picture; without one, they follow the front view")
     imgui.same_line()
     with inert(not preview.painted):
         action = "paint_over" if imgui.button("Paint over", imgui.ImVec2(half, 0.0)) else ""
-    tip(form.anchor or "Opens the picture in your painting program; each save is shown, and the last trained")
+    tip(form.anchor or "Open it in your painting program; each save is shown, the last one is trained")
     if preview.text:
         wrapped_text(preview.text, PALETTE.error if preview.failed else PALETTE.dim)
     return form, action
@@ -414,7 +412,7 @@ def _preview(form: NewEdit, preview: PreviewState, column: float, ui: UiContext)
     """Draw the preview's visibility and strength, and its state."""
     if not form.choice.pictured:
         if form.choice.setting == "folder":
-            small("No picture in advance: this editor takes its time", PALETTE.dim)
+            small("No preview: this editor is too slow", PALETTE.dim)
         if form.choice.setting == "pictures" and preview.text:
             wrapped_text(preview.text, PALETTE.error if preview.failed else PALETTE.dim)
         return form
@@ -422,7 +420,7 @@ def _preview(form: NewEdit, preview: PreviewState, column: float, ui: UiContext)
     side = imgui.get_frame_height()
     if icon_button("preview", Icon.SHOWN if form.preview else Icon.HIDDEN, ui, dim=not form.preview):
         form = replace(form, preview=not form.preview)
-    tip("What the editor makes of the original in this view, before anything is trained")
+    tip("Show the edited original in this view before training")
     imgui.same_line(column + side)
     with inert(not form.preview):
         strength = value_slider("##strength", form.strength, (0.0, 1.0), "%.2f", 1.0, ui)

@@ -144,8 +144,8 @@ def _buttons(timeline: Timeline, player: Player, actions: list[str], ui: UiConte
     chosen = chosen_keys(timeline, player)
     items = (
         ("play", icon, "" if can_play else "Set at least two keyframes to play"),
-        ("key", icons.ICON_FA_DIAMOND, "In place of the present one" if here else ""),
-        ("drop_key", icons.ICON_FA_TRASH_CAN, "Those chosen" if chosen else ""),
+        ("key", icons.ICON_FA_DIAMOND, "Replaces the current one" if here else ""),
+        ("drop_key", icons.ICON_FA_TRASH_CAN, "The chosen keyframes" if chosen else ""),
     )
     off = []
     if not can_play:
@@ -172,7 +172,7 @@ def _settings(work: Workspace, ruler: _Ruler, actions: list[str]) -> None:
             easing = (ruler.keys[min(chosen)] if chosen else key_before(timeline, ruler.frame)).easing
         if imgui.button(f"{easing.capitalize()}##easing", (58.0 * ui.scale, 0.0)):
             actions.append("easing")
-    hint("easing", "The chosen ones first")
+    hint("easing", "Chosen keyframes first")
     imgui.same_line(0.0, gap)
     if icon_button("ping_pong", icons.ICON_FA_RIGHT_LEFT, ui, dim=not timeline.ping_pong):
         actions.append("ping_pong")

@@ -217,10 +217,10 @@ def _selection(view: ViewState, bar: _Bar, actions: list[str]) -> Pointed | None
 def _select_options(tool: SelectTool, bar: _Bar) -> SelectTool:
     """Draw the options of the selection tool."""
     modes = dict(zip(SELECT_MODES, ("New", "Add", "Subtract", "Intersect"), strict=True))
-    help_ = f"What becomes of the present selection.\n{MODES}"
+    help_ = f"Effect on the current selection.\n{MODES}"
     if tool.tool == "scribble":
         modes = {"new": "On it", "subtract": "Beside it"}
-        help_ = "Where the next stroke is. Ctrl: beside it"
+        help_ = "Position of the next stroke: on the object, or beside it (Ctrl)"
     tool = replace(tool, mode=bar.segments("mode", modes, tool.mode, help_))
     if tool.tool not in ("sphere", "flood", "scribble"):
         through = bar.segments("depth", _DEPTHS, tool.through, "", "select_through")
@@ -231,7 +231,7 @@ def _select_options(tool: SelectTool, bar: _Bar) -> SelectTool:
         radius = bar.slider("Radius", tool.radius, ends, SelectTool.radius, help_, "%.0f px")
         tool = replace(tool, radius=radius)
     if tool.tool in ("flood", "color"):
-        help_ = f"How unlike the clicked color a color may be ({_SIZE_KEYS}). The last click follows it"
+        help_ = f"Maximum difference to the clicked color ({_SIZE_KEYS}). It updates the last click"
         tolerance = bar.slider("Tolerance", tool.tolerance, (0.01, 1.0), SelectTool.tolerance, help_)
         tool = replace(tool, tolerance=tolerance)
     return tool
@@ -247,7 +247,7 @@ def _save(regions: int, bar: _Bar, actions: list[str]) -> None:
     if imgui.button(text, (wide, 0.0)):
         start_naming()
     else:
-        tip("Keep the selection as a file and as a row under Regions")
+        tip("Save the selection as a file and list it under Regions")
 
 
 PAINT_DRAG = "brush"
@@ -280,13 +280,13 @@ def _brush_options(view: ViewState, focus: int | None, bar: _Bar, actions: list[
     radius = bar.slider("Radius", brush.radius, ends, Brush.radius, help_, "%.0f px")
     help_ = f"Brush softness ({shortcut('brush_softness:-0.1')} and ])"
     softness = bar.slider("Softness", brush.softness, (0.0, 1.0), Brush.softness, help_)
-    help_ = "How far one stroke goes; strokes over each other go further"
+    help_ = "Effect of one stroke; repeated strokes increase it"
     flow = bar.slider("Flow", brush.flow, (0.0, 1.0), Brush.flow, help_)
     value = brush.value
     if brush.mode == "add":
-        value = bar.slider("Value", value, (0.0, 1.0), Brush.value, "The share of the edit that Add paints")
+        value = bar.slider("Value", value, (0.0, 1.0), Brush.value, "Share of the edit that Add paints")
     through = bar.segments("depth", _DEPTHS, brush.through, "", "brush_through")
-    help_ = "A light tint over what has less than all of the edit, or all weights from blue (0) to yellow (1)"
+    help_ = "Tint parts with less than the full edit, or color all weights from blue (0) to yellow (1)"
     kinds = {False: "Tint", True: "Colors"}
     weights = bar.segments("weights", kinds, brush.weights, help_, "brush_weights")
     if weights:
@@ -376,7 +376,7 @@ def draw_comparison(
         imgui.same_line()
         if icon_button("comparisons", Icon.UNFOLDED, ui):
             imgui.open_popup("comparisons")
-        tip("How to compare, and with what")
+        tip("Kind and sides of the comparison")
         imgui.pop_style_var()
         _open_below(0.5, ui)
         with menu("comparisons", ui) as is_open:

@@ -187,29 +187,29 @@ def _status_text(job: QueuedTask) -> str:
         case "running":
             left = job.seconds_left
             finds = isinstance(job.task, EditOrder) and job.task.region == "changed"
-            starting = "Finding what changed" if finds else "Starting"
+            starting = "Finding the changes" if finds else "Starting"
             words = [progress.label or starting]
             words += [f"{format_duration(left)} left"] if left is not None else []
             words += [f"loss {progress.loss}"] if progress.loss else []
             return "  ·  ".join(words)
         case "queued":
-            return "Waits for the one before"
+            return "Waiting for the previous job"
         case "stopping":
-            return "Saving what is done" if isinstance(job.task, EditOrder) else _UNWRITTEN
+            return "Saving the state" if isinstance(job.task, EditOrder) else _UNWRITTEN
         case "done":
             return ""
-    return f"{100 * progress.share:.0f} % is done" if progress.share else "Can go on where it was"
+    return f"{100 * progress.share:.0f} % is done" if progress.share else "Can be resumed"
 
 
-_STOP_HELP = "Stop; it can be resumed, also another day"
-_CANCEL = ("Cancel", "stop_run", "Take it off the queue")
-_CLOSE = ("Close", "close_run", "Take the card away; what was made stays")
+_STOP_HELP = "Stop; the run can be resumed later"
+_CANCEL = ("Cancel", "stop_run", "Remove it from the queue")
+_CLOSE = ("Close", "close_run", "Remove the card; the files stay")
 _BUTTONS = {
     ("running", True): (("Stop", "stop_run", _STOP_HELP),),
     ("running", False): (("Stop", "stop_run", _UNWRITTEN),),
     ("queued", True): (_CANCEL,),
     ("queued", False): (_CANCEL,),
-    ("stopped", True): (("Resume", "resume_run", "Go on where it was stopped"),),
+    ("stopped", True): (("Resume", "resume_run", "Resume the run"),),
     ("failed", True): (("Retry", "resume_run", "Try again"),),
     ("failed", False): (_CLOSE,),
     ("done", True): (_CLOSE,),

@@ -38,7 +38,7 @@ EVERY_S = 0.1
 """Time between two frames of the splash, in seconds."""
 FIRST_S = 4.0
 """Delay before `FIRST_TEXT` is added, in seconds."""
-FIRST_TEXT = "(the first time on a machine this takes half a minute)"
+FIRST_TEXT = "(the first start on a machine takes half a minute)"
 """Explanation of a long wait."""
 _HINTS = (
     (glfw.CONTEXT_VERSION_MAJOR, 3),

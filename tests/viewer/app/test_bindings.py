@@ -175,8 +175,8 @@ WRONG = {
     "redo": ("Hyper+Z", "there is no key Hyper+Z"),
     "split": (["Y", 7], 'keys are written as "F6" or ["F6", "Ctrl+B"]'),
     "hide": ({"key": "H"}, 'keys are written as "F6" or ["F6", "Ctrl+B"]'),
-    "solo": ("F7", "F7 is that of lock already"),
-    "fold": ("w", "W flies"),
+    "solo": ("F7", "F7 is already assigned to lock"),
+    "fold": ("w", "W is a flight key"),
 }
 
 

@@ -95,7 +95,7 @@ def test_a_dropped_picture_stands_in_the_form_and_one_looks_from_where_it_was_ta
     assert main_view.work.form.pictures == str(picture)
     assert main_view.work.view.camera.azimuth == pytest.approx(before.azimuth + 20.0, abs=1e-3)
     for name, carried, line in (
-        ("worn", camera_chunk(taken, ["scarf"]), "with edits on (scarf)"),
+        ("worn", camera_chunk(taken, ["scarf"]), "shows edits (scarf)"),
         ("lost", None, "does not say from where"),
     ):
         opened.open(exports.picture(tmp_path, name, image, carried))

@@ -144,7 +144,7 @@ def test_a_scene_that_does_not_tell_which_way_is_up_says_so_until_somebody_sets_
         app._wait_times()
         line = said()
         assert line is not None
-        assert line.text.startswith("That −Y is up in cloud.ply is a guess")
+        assert line.text.startswith("Guessed −Y as up in cloud.ply")
         app.main_view.work = replace(app.main_view.work, message=None)
         camera = with_up(app.main_view.work.view.camera, (0.0, 0.0, 1.0))
         app.main_view.change(replace(app.main_view.work.view, camera=camera))

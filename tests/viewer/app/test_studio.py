@@ -216,10 +216,10 @@ def test_a_view_is_painted_over_in_another_program_and_each_save_is_shown(
     assert cover is not None
     assert (cover.camera, cover.size, cover.name) == (window.main_view.work.view.camera, size, "Painted")
     whole = path.read_bytes()
-    assert save(whole[:4000]) == "This is what you saved; Train makes it an edit", (
+    assert save(whole[:4000]) == "This is the saved picture. Train makes it an edit.", (
         "half a file is not looked at"
     )
-    told = f"is 40×30 pixels now, and was {size[0]}×{size[1]}; keep its size"
+    told = f"has 40×30 pixels instead of {size[0]}×{size[1]}; save it at its original size"
     assert save(taken.resize((40, 30))).endswith(told)
     assert window.main_view.cover is None
     save(taken)

@@ -119,5 +119,5 @@ def test_without_a_selection_nothing_is_done_and_it_is_said(app: App) -> None:
     message = app.main_view.work.message
     assert message is not None
     assert message.error
-    assert "nothing of the scene is selected" in message.text
+    assert "nothing is selected" in message.text
     assert len(app.main_view.work.view.layers) == 2

@@ -88,7 +88,7 @@ def test_an_edited_far_scene_is_exported_as_doubles(run: Run, capsys: pytest.Cap
     for name in ("near", "far"):
         assert run("export", f"{name}.ply", f"{name}.gdf", "-o", f"{name}_edited.ply") == 0
     near, far = capsys.readouterr().out.splitlines()
-    assert far.endswith("scarf 1, x y z as doubles as it is far from 0; read back and compared")
+    assert far.endswith("scarf 1, x y z as doubles (far from 0); read back and compared")
     assert "doubles" not in near
     a = load_ply("near_edited.ply")
     b = load_ply("far_edited.ply")

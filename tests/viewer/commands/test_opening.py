@@ -257,7 +257,7 @@ def test_frames_replace_no_file_that_is_read_and_half_of_them_are_none(
     ("keys", "said"),
     [
         (Timeline((Keyframe(0, camera=ViewCamera()),), 8), "moves no slider"),
-        (Timeline((Keyframe(0, ((0, 0.0),)),), 2000), "has 2001 frames; say how many with --frames"),
+        (Timeline((Keyframe(0, ((0, 0.0),)),), 2000), "has 2001 frames; set their number with --frames"),
     ],
 )
 def test_what_is_no_sequence_is_one_line(
@@ -397,7 +397,7 @@ def test_a_file_of_colors_is_of_one_grade(
     bear().save(here)
     look_of(here)
     assert run("export", "bear.ply", *words, "-o", "x.cube") == 2
-    assert "x.cube holds what one grade does to colors; give one edit" in capsys.readouterr().err
+    assert "x.cube holds the color map of one grade; give one edit" in capsys.readouterr().err
     assert not (here / "x.cube").exists()
 
 

@@ -264,7 +264,7 @@ def test_a_mistake_is_one_line_and_leaves_no_file(
         (("render", "bear.ply", "nope.gdf", "-o", "x.png"), "nope.gdf does not exist"),
         (("render", "bear.ply", "-o", "nowhere/x.png"), "the folder nowhere does not exist"),
         (("render", "bear.ply", "-o", "x.jpg"), "x.jpg is not a .png file"),
-        (("render", "bear.ply", "-o", "x.gif"), "x.gif holds an animation; say what moves: --sweep NAME or"),
+        (("render", "bear.ply", "-o", "x.gif"), "x.gif holds an animation; add --sweep NAME or"),
         (("render", "bear.ply", "--sweep", "ears", "-o", "x.gif"), "--sweep ears: no .gdf file was given"),
         (
             ("render", "bear.ply", "--turntable", "0", "-o", "x.gif"),

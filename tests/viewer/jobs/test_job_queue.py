@@ -175,7 +175,7 @@ def test_what_one_window_trains_another_leaves_alone(stopped: EditOrder) -> None
     assert status(first) == "stopped"
     second.discard(1)
     assert [*stopped.out.parent.iterdir()] == []
-    with pytest.raises(ProgdfError, match="blue is not there any more"):
+    with pytest.raises(ProgdfError, match="blue no longer exists"):
         first.resume(1)
     assert first.jobs == ()
 

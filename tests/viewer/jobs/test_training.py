@@ -267,7 +267,7 @@ def test_the_trainer_has_as_many_paintings_as_the_form() -> None:
 
 
 def test_an_editor_says_what_is_missing_before_it_can_train() -> None:
-    assert "Type what" in form("instruct").obstacle or "pip install" in form("instruct").obstacle
+    assert "Describe the edit" in form("instruct").obstacle or "pip install" in form("instruct").obstacle
     assert "slider" in form("grade").obstacle
     assert form("grade", grade=(1.0, -0.25, *NEUTRAL[2:])).spec == "grade:exposure=1.00,temperature=-0.25"
     assert "folder" in form("folder").obstacle

@@ -186,7 +186,7 @@ def _card(file: StartFile, wide: float, own: bool, ui: UiContext) -> list[str]:
     if own and imgui.is_item_focused() and imgui.is_key_pressed(imgui.Key.delete, False):
         requested = [f"forget_file:{file.path}"]
     path = escape_text(str(file.path))
-    tip(f"{path} is not there any more: open it from where it is now" if file.missing else path)
+    tip(f"{path} was not found. Open it from its new location." if file.missing else path)
     canvas = imgui.get_window_draw_list()
     end = imgui.ImVec2(at.x + wide, at.y + tall)
     picture(file.texture, at, end, rounding, 0.3 if file.missing else 1.0)
@@ -284,7 +284,7 @@ def draw_fields(kind: str, path: str, options: DeliverOptions, ui: UiContext) ->
     imgui.set_next_item_width(-1.0)
     titles = [film_title(name) for name in options.can_move]
     now = options.can_move.index(options.moves)
-    pressed = drop_down("##moves", titles[now], titles, now, ui, "What moves in the film")
+    pressed = drop_down("##moves", titles[now], titles, now, ui, "Animated slider or camera")
     options = options if pressed is None else replace(options, moves=options.can_move[pressed])
     label("Format", column)
     chosen = choice("format", FORMATS, options.format, ui)
@@ -299,7 +299,7 @@ def draw_fields(kind: str, path: str, options: DeliverOptions, ui: UiContext) ->
         clamp = imgui.SliderFlags_.always_clamp.value
         changed, seconds = imgui.slider_float("##seconds", options.seconds, 1.0, 20.0, "%.0f s", clamp)
         options = replace(options, seconds=round(seconds)) if changed else options
-        tip("There and back again")
+        tip("Duration of the film")
     return path, options
 
 

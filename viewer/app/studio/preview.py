@@ -49,7 +49,7 @@ POLL_S = 0.04
 """Interval at which the answer is polled, in seconds."""
 WATCH_S = 0.5
 """Interval at which a picture open in another program is checked, in seconds."""
-PAINT_TEXT = "Paint in the program that opens, and save: what you saved is shown here"
+PAINT_TEXT = "Paint in the other program and save. The saved picture appears here."
 KEPT_S = 120.0
 """Time without an open form after which the preview process ends, in seconds."""
 
@@ -302,9 +302,7 @@ class PreviewActions:
         self._painting = PaintedView(path, camera, size, _file_state(path))
         self._show(PAINT_TEXT, cover)
         if not user_files.open_in_program(path):
-            self._app.main_view.show_message(
-                f"No program opens pictures by itself here: open {path} in yours"
-            )
+            self._app.main_view.show_message(f"No program for pictures was found. Open {path} in yours.")
 
     def _is_painting(self, painted: PaintedView) -> bool:
         """Return whether the form uses the picture that is being painted."""
@@ -326,11 +324,11 @@ class PreviewActions:
         self._painting = replace(painted, state=state)
         height, width = pixels.shape[:2]
         if (width, height) != painted.size:
-            template = "{} is {}×{} pixels now, and was {}×{}; keep its size"
+            template = "{} has {}×{} pixels instead of {}×{}; save it at its original size"
             self._show(template.format(painted.path.name, width, height, *painted.size), None, failed=True)
         else:
             cover = Cover(self._upload(pixels), painted.camera, painted.size, "Painted")
-            self._show("This is what you saved; Train makes it an edit", cover)
+            self._show("This is the saved picture. Train makes it an edit.", cover)
             self._app.main_view.wake()
         return WATCH_S
 
@@ -485,7 +483,7 @@ class PreviewActions:
                     self._painted = self._sent, answer.pixels
                 else:
                     name = f"Example: {argument}"
-                    text = "An example: this model cannot follow a picture"
+                    text = "Example only: this model cannot follow a picture"
             texture = self._upload(answer.pixels)
             self._show(text, Cover(texture, self._sent.camera, self._sent.size, name))
             self._app.main_view.wake()

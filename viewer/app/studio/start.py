@@ -203,8 +203,8 @@ class UpActions:
         guess = not (self._looked or session or document.detected_up.certain)
         if guess and up == document.detected_up.direction and main_view.work.message is None:
             name = up_axis.direction_name(torch.tensor(up)).upper().replace("-", "−")
-            where = "Up axis in the popover under the axes sets it"
-            main_view.show_message(f"That {name} is up in {document.title} is a guess: {where}")
+            where = "Change it under the axes: Up axis."
+            main_view.show_message(f"Guessed {name} as up in {document.title}. {where}")
         self._looked = True
 
     def leave_scene(self) -> None:

@@ -115,7 +115,7 @@ class JobActions:
             if isinstance(job.task, kind):
                 self.queue.stop(job.number)
         if kind is EditOrder:
-            self._app.main_view.show_message("Saving what is trained so far …")
+            self._app.main_view.show_message("Saving the training state …")
 
     def _show_log(self, number: str) -> None:
         self._app.main_view.ask(Dialog("log", str(self.queue.job(int(number)).task.log)))
@@ -262,7 +262,7 @@ class JobActions:
         total = len(self._app.document.original)
         region = {region.name: region for region in selection.regions}.get(form.region)
         if form.region != SELECTION and region is None:
-            raise ProgdfError(f"there is no region {form.region} any more; choose another one")
+            raise ProgdfError(f"the region {form.region} was deleted; choose another one")
         members = selection.members if region is None else region.members
         make_folder(folder)
         path = folder / f"{name or f'{zlib.crc32(members):08x}'}{SUFFIX}"
@@ -297,13 +297,13 @@ class JobActions:
             self._live = None
             if not any(self._edits.finish(path, task.result) for path in (task.draft, task.packed_edit)):
                 self._app.open(task.result)
-            main_view.show_message(f"{task.name} is trained; drag its slider")
+            main_view.show_message(f"{task.name} is ready")
             return
         if self._live is not None:
             self._live = None
             self._app.show(self._app.document)
         if job.status == "done":
-            main_view.show_message(f"{task.name} is trained: {task.result}")
+            main_view.show_message(f"{task.name} is ready: {task.result}")
 
     def leave_scene(self) -> None:
         """Reset the state of the old scene. Its runs continue, and their cards name that scene."""

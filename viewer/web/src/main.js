@@ -287,7 +287,7 @@ export async function show(root, bytes, shaders) {
     return new Page(root, new Container(await bytes), shaders);
   } catch (error) {
     root.querySelector("#notice").textContent = error.message === "no WebGL2"
-      ? "This browser draws no 3D (WebGL2 is off), so this is a still picture."
+      ? "WebGL2 is off in this browser, so this is a still picture."
       : `The scene cannot be shown here: ${error.message}`;
     return null;
   }

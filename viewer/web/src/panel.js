@@ -97,7 +97,7 @@ function rule(root, page) {
   if (page.view.layers.length < 2) return null;
   const options = Object.entries(RULES).map(([value, text]) => make("option", { value, textContent: text }));
   const choice = make("select", {
-    title: "How edits go together where they meet", "aria-label": "Blend rule",
+    title: "Blend rule for overlapping edits", "aria-label": "Blend rule",
     on: { change: () => page.change({ ...page.view, blend: choice.value }) },
   }, ...options);
   root.append(make("div", { class: "head rule" }, make("span", { class: "name", textContent: "Blend" }), choice));
