@@ -159,7 +159,9 @@ def _stated(table: Table, command: str, busy: float) -> Table:
     if busy > BUSY and bare != table:
         table = bare
         share = f"{100 * busy:.0f} %"
-        command += f"; others used {share} of the cores, so wall times and what depends on them are left out"
+        command += (
+            f"; other processes used {share} of the cores, so wall times and derived values are omitted"
+        )
     return replace(table, note=f"{table.note} Made by {command}; {today()}.".strip())
 
 

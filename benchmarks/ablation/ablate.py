@@ -117,8 +117,8 @@ def _ablate_run(root: Path, options: AblateOptions, quiet: bool) -> Ablation:
                 except KeyboardInterrupt:
                     _publish(root, variants, shared)
                     raise KeyboardInterrupt(
-                        f"{i} of {len(selected)} variants are done and kept in {root}; "
-                        "give the same command to go on"
+                        f"{i} of {len(selected)} variants are finished and saved in {root}; "
+                        "run the same command to continue"
                     ) from None
                 outcome = _load_outcome(folder, variant, seed, shared)
                 assert outcome is not None

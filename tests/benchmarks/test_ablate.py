@@ -229,7 +229,9 @@ def test_an_interrupted_ablation_keeps_what_is_done_and_goes_on(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(benchmarks.ablation.ablate, "optimize_members", interrupted)
-    with pytest.raises(KeyboardInterrupt, match=r"1 of 2 variants are done and kept in .*; give the same"):
+    with pytest.raises(
+        KeyboardInterrupt, match=r"1 of 2 variants are finished and saved in .*; run the same"
+    ):
         ablate(AblateOptions((run,), only="base,no-sh", threads=1), quiet=True)
     monkeypatch.setattr(benchmarks.ablation.ablate, "optimize_members", real)
     (done,) = ablate(AblateOptions((run,), only="base,no-sh", threads=1), quiet=True)
@@ -308,7 +310,7 @@ def test_a_descent_has_other_figures_with_another_seed_and_one_solved_for_has_on
     assert base[0].between != equal[0].between
     assert descent[0].psnr != descent[1].psnr
     written = page.read_text(encoding="utf-8")
-    assert "| descent | base | view by view, where colors are solved for | 2 | " in written
+    assert "| descent | base | gradient descent instead of solving for colors | 2 | " in written
     assert " ± " in written
     with Image.open(picture) as opened:
         assert opened.width > 800

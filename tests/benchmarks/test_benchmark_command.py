@@ -59,7 +59,7 @@ def test_wall_times_are_left_out_where_others_use_the_cores(
     assert f"| one | {ms} | 5 |" in text
     assert "A note. Made by `python -m benchmarks hard`" in text
     assert text.count(today()) == 2
-    assert ("others used 50 % of the cores" in text) == (busy > 0)
+    assert ("other processes used 50 % of the cores" in text) == (busy > 0)
     assert f"<!-- bench machine -->\n{machine()}\n<!-- end machine -->" in text
 
 
