@@ -166,12 +166,14 @@ def _trained(run: Path, name: str, settings: NeuralSettings, course: KnownEdit) 
         fit = _begin(course, settings)
         train_network(fit, course.strengths, course.offsets, settings.steps)
         network = fit.field(tuple(course.strengths.tolist()))
-        took = {"steps": settings.steps, "seconds": round(time.process_time() - begin, 1)}
-        made = edit_of(course.scene, course.members, bake_network(network, before, course.truth))
-        save_gdf(path, replace(made, name=name, report=took))
-    kept = load_gdf(path, course.scene)
-    assert isinstance(kept.field.origin, NeuralForm)
-    return TrainedNetwork(kept.field.origin.network, kept.field, kept.report["steps"], kept.report["seconds"])
+        effort_report = {"steps": settings.steps, "seconds": round(time.process_time() - begin, 1)}
+        trained = edit_of(course.scene, course.members, bake_network(network, before, course.truth))
+        save_gdf(path, replace(trained, name=name, report=effort_report))
+    saved = load_gdf(path, course.scene)
+    assert isinstance(saved.field.origin, NeuralForm)
+    return TrainedNetwork(
+        saved.field.origin.network, saved.field, saved.report["steps"], saved.report["seconds"]
+    )
 
 
 def _begin(course: KnownEdit, settings: NeuralSettings) -> NeuralFit:

@@ -119,9 +119,9 @@ def outside_change(opened: OpenedRun) -> dict[str, float]:
         for a, b, box in zip(views, after, boxes, strict=True)
     ]
     original = [crop(view.image, box) for view, box in zip(views, boxes, strict=True)]
-    shown = evaluator.pictures(opened.gdf.field.offsets(1.0))
+    finished = evaluator.pictures(opened.gdf.field.offsets(1.0))
     return {
-        EDITED: visible_change(original, shown, outside),
+        EDITED: visible_change(original, finished, outside),
         EDITOR: visible_change(original, evaluator.edited[1.0], outside),
     }
 

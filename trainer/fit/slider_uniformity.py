@@ -126,13 +126,13 @@ def equalizing_remap(seen: Callable[[float], Tensor]) -> SliderRemap:
     even = torch.linspace(0, 1, STEPS * _STARTS_PER_STEP + 1, dtype=torch.float64)
     places = even
     for _ in range(_RENDER_ROUNDS):
-        looked = places
+        rendered_at = places
         pictures = [seen(float(s)) for s in places]
         best = -1.0
         following = places
         for _ in range(_SPREAD_PASSES + 1):
             current = following
-            blended = [interpolate_at(looked, pictures, float(s)) for s in current]
+            blended = [interpolate_at(rendered_at, pictures, float(s)) for s in current]
             uniformity, following = _spread(current, blended, _STARTS_PER_STEP)
             if uniformity > best:
                 best = uniformity
