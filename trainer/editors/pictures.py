@@ -143,7 +143,7 @@ def picture_paths(what: str) -> tuple[Path, ...]:
     if len(paths) > MAX_PICTURES:
         raise ProgdfError(
             f"pictures: takes at most {MAX_PICTURES} pictures, not {len(paths)}; "
-            "for more, use folder:DIR with the views of --cameras"
+            "give more as folder:DIR, of views that --cameras has"
         )
     return paths
 
