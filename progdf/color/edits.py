@@ -202,7 +202,7 @@ def parse_grade(what: str) -> ColorGrade:
             target, bends, points = number.partition("/")
             pair = parse_color(name), parse_color(target if equals else name)
             if any(are_alike(pair[0], source) for source, _ in pairs):
-                raise ProgdfError(f"grade:{what:.80} has two colors as near as {name}; leave one of them out")
+                raise ProgdfError(f"grade:{what:.80} has two colors close to {name}; remove one of them")
             pairs.append(pair)
             curves.append(_curve_of(what, points) if bends else ())
         elif name == "curve" and not curve:
@@ -219,7 +219,7 @@ def parse_grade(what: str) -> ColorGrade:
             if not low <= values[name] <= high:
                 raise ProgdfError(f"in grade:{what:.80} {name} is '{number:.40}'; write {low:g} to {high:g}")
     if len(pairs) > MAX_PAIRS:
-        raise ProgdfError(f"grade:{what:.80} has {len(pairs)} colors; the most are {MAX_PAIRS}")
+        raise ProgdfError(f"grade:{what:.80} has {len(pairs)} colors; at most {MAX_PAIRS} are possible")
     grade = ColorGrade(values, tuple(pairs), tuple(curves), curve)
     if grade.is_neutral:
         raise ProgdfError(f"grade:{what:.80} changes nothing; write, for example, grade:exposure=0.7")

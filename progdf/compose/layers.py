@@ -106,7 +106,7 @@ def check_weights(layer: Layer) -> None:
     if shape != [members]:
         raise ValueError(f"weights of {layer.gdf.name} has shape {shape}, expected [{members}]")
     if members and not (float(layer.weights.min()) >= 0.0 and float(layer.weights.max()) <= 1.0):
-        raise ValueError(f"weights of {layer.gdf.name} has a number outside 0..1")
+        raise ValueError(f"weights of {layer.gdf.name} has a number outside 0 to 1")
 
 
 Effect = tuple[tuple[float, Gains, Tensor | None, int, int], ...]

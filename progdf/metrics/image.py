@@ -110,5 +110,5 @@ def _mask(mask: Tensor, image: Tensor) -> Tensor:
         raise ValueError(f"mask has shape {list(mask.shape)}, expected {list(image.shape[:-1])}")
     weights = mask.double()
     if not float(weights.sum()) > 0:
-        raise ValueError("the mask counts no pixel")
+        raise ValueError("the mask is empty")
     return weights

@@ -68,8 +68,8 @@ def orbit_rig(
     up = guess_up(scene) if up is None else up.float() / up.float().norm()
     if is_surrounding(scene, up):
         _log.warning(
-            "this looks like a scene to stand inside: cameras around it cannot frame it; "
-            "give its own cameras, or keep views with F4 in progdf view"
+            "the scene seems to surround its cameras, so cameras around it cannot frame it; "
+            "give its own cameras, or save views with F4 in progdf view"
         )
     center, radius = scene_sphere(scene)
     K = intrinsics(fov_y, width, height)

@@ -123,7 +123,7 @@ def read_step(text: str) -> Callable[[Neighborhood, Mask], Mask]:
         return lambda neighborhood, mask: neighborhood.refine(mask, count if times else RIM_PERCENT)
     if name not in STEPS or not 1 <= count <= max_count:
         raise ProgdfError(
-            f"'{shorten(text)}' is no step of a region; write grow, shrink or smooth:TIMES, "
+            f"invalid region step '{shorten(text)}'; write grow, shrink or smooth:TIMES, "
             f"at most {MAX_TIMES}, refine:PERCENT, or largest"
         )
 
@@ -160,7 +160,7 @@ def _flood(scene: Gaussians, point: tuple[float, float, float], tolerance: float
 def _camera(kind: str, text: str, form: str) -> Callable[[Gaussians], Camera]:
     """Check that a camera can be read; return a function that gives it relative to a scene."""
     if not text:
-        raise ProgdfError(f"{kind}: needs a camera; write {kind}:{form}, CAMERA as --camera has it")
+        raise ProgdfError(f"{kind}: needs a camera; write {kind}:{form}, with CAMERA as for --camera")
     read_camera(text, ZERO)
     return lambda scene: read_camera(text, scene.origin)
 
@@ -281,7 +281,7 @@ def parse_region(
                 say(f"{shorten(part)} {warning}")
             joined = _SIGNS[sign](region, selected)
         if len(region) and not len(joined):
-            say(f"nothing is left of the region after {sign}{shorten(part)}")
+            say(f"the region is empty after {sign}{shorten(part)}")
         region = joined
     if not len(region):
         raise ProgdfError(f"region '{shorten(spec)}' holds no Gaussian; the scene reaches {_extent(scene)}")
@@ -293,7 +293,7 @@ def _doubt(kind: str, count: int, total: int) -> str:
     if not count:
         return "selects no Gaussian"
     if kind == "flood" and count < _MIN_FLOOD_GAUSSIANS:
-        return f"selects {format_count(count)} alone; raise its tolerance, or name a point on a surface"
+        return f"selects only {format_count(count)}; raise its tolerance, or name a point on a surface"
     if kind == "color" and 2 * count > total:
         return f"selects {100 * count / total:.0f} % of the scene; lower its tolerance, or add &box:…"
     return ""
@@ -361,7 +361,9 @@ def read_labels(path: str, count: int) -> Tensor:
     labels = _open_labels(path)
     if labels.shape not in ((count,), (count, 1)):
         shape = "x".join(str(side) for side in labels.shape) or "1"
-        raise ProgdfError(f"{path} holds {shape} labels, the scene {count} Gaussians; expected one each")
+        raise ProgdfError(
+            f"{path} holds {shape} labels, the scene has {count} Gaussians; give one label for each"
+        )
     return torch.from_numpy(labels.reshape(-1).astype(np.int64))
 
 
@@ -375,7 +377,9 @@ def read_members(path: str, count: int) -> Tensor:
     if stored.dtype.kind == "b":
         if stored.shape != (count,):
             shape = "x".join(str(side) for side in stored.shape) or "1"
-            raise ProgdfError(f"{path} is a mask of {shape}, the scene has {count} Gaussians; give its own")
+            raise ProgdfError(
+                f"{path} is a mask of {shape}, the scene has {count} Gaussians; give a mask of this scene"
+            )
         return torch.from_numpy(np.flatnonzero(stored))
     if stored.dtype.kind not in "iu" or stored.ndim != 1:
         raise ProgdfError(
@@ -391,12 +395,12 @@ def read_members(path: str, count: int) -> Tensor:
 
 
 def _open_members(path: str) -> NDArray[Any]:
-    return open_npy(path, "rows, as progdf region … -o FILE.npy writes them")
+    return open_npy(path, "rows from progdf region … -o FILE.npy")
 
 
 def _check_file(text: str) -> None:
     if not text:
-        raise ProgdfError("file: needs a file; write file:MEMBERS.npy, as progdf region … -o writes it")
+        raise ProgdfError("file: needs a file; write file:MEMBERS.npy, with a file from progdf region … -o")
     _open_members(text)
 
 

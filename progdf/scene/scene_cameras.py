@@ -149,7 +149,7 @@ def scene_cameras_beside(path: Path, scene: Gaussians) -> list[Camera]:
         return []
     facing = [camera for camera in cameras if _has_middle(camera, scene)]
     if not facing:
-        _warn_once(f"the {len(cameras)} cameras beside {path} look past the scene; they are not used")
+        _warn_once(f"the {len(cameras)} cameras beside {path} do not face the scene and are not used")
     return facing
 
 
@@ -214,10 +214,10 @@ def _candidates(
         for transform in transforms:
             transform[:3] *= scale / applied_scale
             found.append(SceneCameras([_move(camera, transform, origin) for camera in cameras], (note,)))
-    note = f"cameras: {file} is not applied, as the scene is not visible with it"
+    note = f"cameras: {file} is not applied, because the scene is not visible with it"
     found.append(SceneCameras(cameras, () if file is None else (note,)))
     if is_applied and dataset is not None:
-        note = f"cameras: the applied_transform of {path} is taken back, as the scene was made before it"
+        note = f"cameras: the applied_transform of {path} is reverted, because the scene does not include it"
         transform = torch.linalg.inv(dataset)
         found.append(SceneCameras([_move(camera, transform, origin) for camera in cameras], (note,)))
     return found
@@ -281,15 +281,15 @@ def _mismatch_error(
     behind = int((in_camera[:, 2] < 0).sum())
     cause = f"their median distance is {distance:.3g}, the scene's radius {radius:.3g}"
     if 2 * behind > len(cameras):
-        cause = f"the scene is behind {behind} of {len(cameras)}, as with other camera axes"
-    remedy = "give cameras of the scene's frame"
+        cause = f"the scene is behind {behind} of {len(cameras)}, which suggests other camera axes"
+    remedy = "give cameras in the scene's frame"
     if is_foreign:
         remedy = (
-            f"put nerfstudio's {TRANSFORMS_FILE} beside a scene that it trained, or give cameras of its frame"
+            f"put nerfstudio's {TRANSFORMS_FILE} beside a scene that it trained, or give cameras in its frame"
         )
     return ProgdfError(
-        f"{path} is not of the frame of {name}: "
-        f"{coverage.showing} of {len(coverage.shares)} cameras show it, "
+        f"{path} is not in the frame of {name}: "
+        f"{coverage.showing} of {len(coverage.shares)} cameras see it, "
         f"in {100 * max(coverage.shares):.2g} % of a picture at most ({cause}); "
         f"{remedy}, or add --cameras-anyway"
     )

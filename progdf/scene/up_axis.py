@@ -110,7 +110,7 @@ class UpAxis:
     """Up direction of a scene and the reason for it."""
 
     direction: Tensor  # in the world, unit length. [3] float32
-    reason: str  # text for the user, such as "as the cameras are held"
+    reason: str  # text for the user, such as "from the cameras"
     certain: bool = True  # set by the user or cameras, or clear from the shape
     candidates: tuple[Tensor, ...] = ()  # all directions, likeliest first; only if the shape decided
 
@@ -158,23 +158,23 @@ def find_up(
         path: the scene's file
     """
     if choice != "auto":
-        return UpAxis(axis_direction(choice), "as --up says")
+        return UpAxis(axis_direction(choice), "set with --up")
     up = _mean_camera_up(cameras)
     if up is not None:
-        return UpAxis(up, "as the cameras are held")
+        return UpAxis(up, "from the cameras")
     chosen = find_chosen_up(scene)
     if chosen is not None:
-        return UpAxis(chosen, "as was chosen for this scene before")
+        return UpAxis(chosen, "chosen for this scene earlier")
     view = PlyView() if path is None else stored_view(path, scene.origin)
     if view.up is not None:
-        return UpAxis(_snap(view.up, _LEVEL_COSINE), f"as the comment '{view.up_comment}' in the file says")
+        return UpAxis(_snap(view.up, _LEVEL_COSINE), f"from the comment '{view.up_comment}' in the file")
     up = None if view.camera is None else _mean_camera_up([view.camera])
     if up is not None:
-        return UpAxis(up, "as the camera stored in the file is held")
+        return UpAxis(up, "from the camera stored in the file")
     cameras_beside = [] if path is None or not len(scene) else scene_cameras_beside(path, scene)
     up = _mean_camera_up(cameras_beside)
     if up is not None:
-        return UpAxis(up, f"as the {len(cameras_beside)} cameras beside the scene's file are held")
+        return UpAxis(up, f"from the {len(cameras_beside)} cameras beside the scene's file")
     return _up_by_shape(scene)
 
 
@@ -205,7 +205,7 @@ def _up_by_shape(scene: Gaussians) -> UpAxis:
     """Return the likeliest up direction by the scene's shape and by convention."""
     shape = _shape_of(scene)
     if shape is None:
-        reason = "by convention, as too little is there to tell; --up says otherwise"
+        reason = "by convention, because the scene is too small to estimate it; set it with --up"
         axes_by_prior = sorted((axis_direction(axis) for axis in AXES), key=_log_prior, reverse=True)
         return UpAxis(axes_by_prior[0], reason, certain=False, candidates=tuple(axes_by_prior))
     directions = [axis_direction(axis) for axis in AXES]
@@ -243,7 +243,9 @@ def _up_by_shape(scene: Gaussians) -> UpAxis:
     # the convention alone never makes a direction certain: the shape must support it too
     certain = odds >= _MIN_ODDS and sum(advantage.values()) - advantage["convention"] >= _MIN_REASON_NATS
     if not certain:
-        reason += f"; not certain, {other} is {100 * float(likely[rival]):.0f} %: look, and choose with --up"
+        reason += (
+            f"; not certain, {other} is {100 * float(likely[rival]):.0f} %: check it, or set it with --up"
+        )
     candidates = tuple(directions[i] for i in order)
     return UpAxis(directions[best], reason, certain, candidates)
 

@@ -59,7 +59,7 @@ def test_a_comment_decides_which_way_is_up(case: str, tmp_path: Path) -> None:
     path = with_comments(tmp_path / "a.ply", *comments)
     found = find_up(load_ply(path), path=path)
     assert (found.name, found.certain) == (axis, True)
-    assert "in the file says" in found.reason
+    assert "in the file" in found.reason
     assert find_up(load_ply(path), choice="+y", path=path).name == "+y", "--up wins"
 
 
@@ -96,7 +96,7 @@ def test_other_comments_say_nothing(tmp_path: Path) -> None:
 
 def test_info_and_the_window_agree_on_the_comment(tmp_path: Path) -> None:
     path = with_comments(tmp_path / "a.ply", "Vertical Axis: z")
-    assert "up: +z, as the comment 'Vertical Axis: z' in the file says" in list(describe(path))
+    assert "up: +z, from the comment 'Vertical Axis: z' in the file" in list(describe(path))
     assert load(path).detected_up.direction == (0.0, 0.0, 1.0)
 
 
@@ -115,7 +115,7 @@ def test_the_stored_camera_gives_the_first_view(text: bool, tmp_path: Path) -> N
     scene, report = load_ply_with_report(path)
     assert report.ignored_elements == (("frame", 2), ("disparity", 2), ("version", 3))
     up = find_up(scene, path=path)
-    assert (up.name, up.reason) == ("-y", "as the camera stored in the file is held")
+    assert (up.name, up.reason) == ("-y", "from the camera stored in the file")
     opened = open_stack(StackOptions(scene=path))
     stored = opened.document.stored_camera
     view = first_camera(scene, up=opened.up, stored=stored)

@@ -61,7 +61,7 @@ def test_psnr_looks_at_the_mask_only() -> None:
 
 
 def test_a_mask_that_counts_nothing_is_refused() -> None:
-    with pytest.raises(ValueError, match="counts no pixel"):
+    with pytest.raises(ValueError, match="the mask is empty"):
         psnr(picture(), picture(), torch.zeros(48, 40))
 
 

@@ -196,13 +196,13 @@ def refusal(spec: str, scene: Gaussians) -> str:
         ("color:red", "write for example color:#903020"),
         ("color:#ff0000,2", "tolerance"),
         ("flood:1,2", "write flood:x,y,z"),
-        ("all|grow:1000", "no step of a region"),
-        ("sphere:0,0,0,1|grow:-3", "'grow:-3' is no step of a region"),
-        ("all|largest:2", "no step of a region"),
-        ("sphere:0,0,0,1|refine:101", "'refine:101' is no step of a region"),
-        ("all|grow|GROW", "'grow|GROW' is no step of a region"),
-        ("all|largest||", "'largest||' is no step of a region"),
-        ("all|smooth+100", "'smooth+100' is no step of a region"),
+        ("all|grow:1000", "invalid region step"),
+        ("sphere:0,0,0,1|grow:-3", "invalid region step 'grow:-3'"),
+        ("all|largest:2", "invalid region step"),
+        ("sphere:0,0,0,1|refine:101", "invalid region step 'refine:101'"),
+        ("all|grow|GROW", "invalid region step 'grow|GROW'"),
+        ("all|largest||", "invalid region step 'largest||'"),
+        ("all|smooth+100", "invalid region step 'smooth+100'"),
         ("flood:1e308,-1e308,0", "numbers up to 1e+18"),
         ("box:0,0,0,1,1,1e19", "6 numbers up to 1e+18"),
     ],
@@ -362,10 +362,10 @@ def test_parts_that_are_hardly_meant_are_told(scene: Gaussians) -> None:
         "color:#808080,1 selects 100 % of the scene; lower its tolerance, or add &box:…"
     ]
     (few,) = said(f"flood:{x},{y},{z},1e-6")
-    assert few.endswith("selects 1 Gaussian alone; raise its tolerance, or name a point on a surface")
+    assert few.endswith("selects only 1 Gaussian; raise its tolerance, or name a point on a surface")
     assert said("all+box:99,99,99,100,100,100") == ["box:99,99,99,100,100,100 selects no Gaussian"]
-    assert said("all - all + all") == ["nothing is left of the region after -all"]
-    assert said("sphere:0,0,0,0.5|shrink:9+all") == ["nothing is left of the region after |shrink:9"]
+    assert said("all - all + all") == ["the region is empty after -all"]
+    assert said("sphere:0,0,0,0.5|shrink:9+all") == ["the region is empty after |shrink:9"]
 
 
 def test_a_label_file_of_another_scene_or_kind_is_one_line(scene: Gaussians, tmp_path: Path) -> None:
@@ -373,7 +373,7 @@ def test_a_label_file_of_another_scene_or_kind_is_one_line(scene: Gaussians, tmp
     labels = labels_file(path)
     assert "no Gaussian with label 7; it has 0, 1, 2, 3, 4" in refusal(f"labels:{path}:7", scene)
     np.save(path, labels[:-1])
-    assert "199 labels, the scene 200 Gaussians" in refusal(f"labels:{path}:1", scene)
+    assert "199 labels, the scene has 200 Gaussians" in refusal(f"labels:{path}:1", scene)
     np.save(path, labels.reshape(20, 10))
     assert "20x10 labels" in refusal(f"labels:{path}:1", scene)
     np.save(path, labels.astype(np.float32))

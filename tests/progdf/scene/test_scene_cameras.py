@@ -102,7 +102,7 @@ def test_a_scene_made_before_applied_transform_gets_its_cameras(tmp_path: Path) 
         applied_transform=APPLIED[:3].tolist(),
     )
     found = load_scene_cameras(file, world)
-    assert "is taken back" in found.notes[0]
+    assert "is reverted" in found.notes[0]
     assert_same_views(found.cameras, cameras, torch.eye(4, dtype=torch.float64), 1.0)
 
 
@@ -147,7 +147,7 @@ MISMATCHES = {
 @pytest.mark.parametrize("name", MISMATCHES)
 def test_cameras_of_another_frame_are_refused_with_the_cause(tmp_path: Path, name: str) -> None:
     file = write_frames(tmp_path / "transforms.json", MISMATCHES[name]())
-    with pytest.raises(ProgdfError, match=r"transforms.json is not of the frame of .*s\.ply") as caught:
+    with pytest.raises(ProgdfError, match=r"transforms.json is not in the frame of .*s\.ply") as caught:
         load_scene_cameras(file, scene(), tmp_path / "s.ply")
     message = str(caught.value)
     assert "add --cameras-anyway" in message
@@ -196,7 +196,7 @@ def test_up_comes_from_cameras_beside_the_scene_in_its_frame(tmp_path: Path) -> 
     write_frames(tmp_path / "transforms.json", level)
     write_transforms(tmp_path, way, SCALE)
     up = find_up(move_scene(scene(), way, SCALE), path=tmp_path / "s.ply")
-    assert (up.name, up.reason) == ("+z", "as the 6 cameras beside the scene's file are held")
+    assert (up.name, up.reason) == ("+z", "from the 6 cameras beside the scene's file")
 
 
 def test_cameras_beside_that_look_past_the_scene_are_told(
@@ -205,4 +205,4 @@ def test_cameras_beside_that_look_past_the_scene_are_told(
     save_cameras(tmp_path / "cameras.json", rig(6))
     find_up(replace(scene(), means=scene().means + torch.tensor([0.0, 500.0, 0.0])), path=tmp_path / "s.ply")
     assert "the 6 cameras beside" in caplog.text
-    assert "look past the scene; they are not used" in caplog.text
+    assert "do not face the scene and are not used" in caplog.text

@@ -85,7 +85,7 @@ def test_cameras_beside_a_scene_tell_if_they_look_at_it(tmp_path: Path) -> None:
     path = tmp_path / "point_cloud" / "iteration_7" / "point_cloud.ply"
     level = orbit_rig(ball(), 6, 64, 64, up=torch.tensor([1.0, 0.0, 0.0]), elevations=(0.0, 0.0))
     save_cameras(tmp_path / "cameras.json", level)
-    assert find_up(ball(), path=path).reason == "as the 6 cameras beside the scene's file are held"
+    assert find_up(ball(), path=path).reason == "from the 6 cameras beside the scene's file"
     assert find_up(ball(), path=path).name == "+x"
     far = replace(ball(), means=ball().means + 1000.0)
     assert find_up(far, path=path).name == "-y", "cameras of another scene"
@@ -175,8 +175,8 @@ def test_check_prints_boxes_to_paste_and_the_up_axis(
     assert len(whole) == 1000
     assert 850 <= len(bulk) <= 999
     assert 0 not in bulk.members.tolist()
-    assert "up: +z, as --up says" in said("--up", "+z")
-    assert "up: +x, as the cameras are held" in said("--cameras", str(tmp_path / "c.json"))
+    assert "up: +z, set with --up" in said("--up", "+z")
+    assert "up: +x, from the cameras" in said("--cameras", str(tmp_path / "c.json"))
 
 
 def upright(tmp_path: Path, *arguments: str) -> tuple[float, ...]:

@@ -25,7 +25,7 @@ FAULTS = {
     "a grade of nothing": ({"--editor": "grade:exposure=0"}, "changes nothing"),
     "a grade that has no such value": ({"--editor": "grade:gamma=2"}, "has 'gamma=2'; write NAME=NUMBER"),
     "a grade of colors that stay": ({"--editor": "grade:#fff,curve=.2:.2"}, "changes nothing"),
-    "a grade of two like colors": ({"--editor": "grade:#f00=#0f0,#fe0000"}, "two colors as near as #fe0000"),
+    "a grade of two like colors": ({"--editor": "grade:#f00=#0f0,#fe0000"}, "two colors close to #fe0000"),
     "a grade to no color": ({"--editor": "grade:#f00=blue"}, "'blue' is not a color"),
     "a curve that falls back": ({"--editor": "grade:curve=.5:.2+.3:.4"}, "write FROM:TO+FROM:TO"),
     "a curve of one number": ({"--editor": "grade:curve=.5"}, "the curve is '.5'"),
