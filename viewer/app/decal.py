@@ -18,12 +18,11 @@ from viewer.camera.view_camera import to_camera
 from viewer.ui import overlay
 from viewer.ui.pointer import PointerContext
 
-_LARGEST = 1024  # maximum longer side of the picture shown on screen, pixels
-_FIRST = 0.25  # initial longer side, as a fraction of the view's height
-# per notch of the wheel: size factor, rotation in degrees
-_STEP = 1.08
-_TURN = 5.0
-_SIZES = (8.0, 8192.0)  # minimum and maximum, window pixels
+_MAX_TEXTURE_PX = 1024  # maximum longer side of the picture shown on screen, pixels
+_INITIAL_SIZE = 0.25  # initial longer side, as a fraction of the view's height
+_STEP = 1.08  # size factor per notch of the wheel
+_TURN = 5.0  # rotation per notch of the wheel, degrees
+_SIZE_RANGE_PX = (8.0, 8192.0)  # minimum and maximum, window pixels
 _HINT = "Wheel: size. Shift+wheel: rotate. Click or Enter: place. Esc: cancel"
 
 
@@ -45,7 +44,7 @@ class Decal:
             ProgdfError: it cannot be read.
         """
         picture = open_picture(path).convert("RGBA")
-        picture.thumbnail((_LARGEST, _LARGEST))
+        picture.thumbnail((_MAX_TEXTURE_PX, _MAX_TEXTURE_PX))
         texture = context.texture(picture.size, 4, np.asarray(picture).tobytes(), alignment=1)
         texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
         return Decal(path, texture)
@@ -56,14 +55,14 @@ class Decal:
         area = pointer.area
         inside = 0.0 <= io.mouse_pos.x < area.width and 0.0 <= io.mouse_pos.y < area.height
         over = inside and not io.want_capture_mouse
-        size = self.size or _FIRST * area.height
+        size = self.size or _INITIAL_SIZE * area.height
         angle = self.angle
         # some systems turn the wheel sideways with Shift
         notches = (io.mouse_wheel or io.mouse_wheel_h) if over else 0.0
         if notches and io.key_shift:
             angle += math.copysign(_TURN, notches)
         elif notches:
-            size = min(max(size * _STEP**notches, _SIZES[0]), _SIZES[1])
+            size = min(max(size * _STEP**notches, _SIZE_RANGE_PX[0]), _SIZE_RANGE_PX[1])
         at = (io.mouse_pos.x, io.mouse_pos.y) if over else self.at or (area.width / 2, area.height / 2)
         moved = replace(self, size=size, angle=angle, at=at)
         a, b, c, d = (corner for corner in moved.corners)

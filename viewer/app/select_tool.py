@@ -39,7 +39,7 @@ from viewer.ui.pointer import PointerContext
 _STROKE_PX = 4.0  # at 1×: half a stroke's width
 _MAX_PLACES = 16  # sampled places
 _MAX_DOTS = 300  # dots
-_SEEDS = 0.1  # a seed contributes at least this fraction of a pixel's color
+_MIN_SEED_SHARE = 0.1  # a seed contributes at least this fraction of a pixel's color
 
 Point = tuple[float, float]
 
@@ -183,7 +183,7 @@ def rows_at_click(
 
 def _seeds(seen: Seen) -> np.ndarray:
     """Return the Gaussians that contribute most to the color of a pixel."""
-    return seen.rows[seen.shares >= min(_SEEDS, float(seen.shares.max()))]
+    return seen.rows[seen.shares >= min(_MIN_SEED_SHARE, float(seen.shares.max()))]
 
 
 SELECT_DRAG = "select"
@@ -369,7 +369,7 @@ def draw_strokes(strokes: tuple[Strokes, ...], work: Workspace, pointer: Pointer
     canvas = imgui.get_background_draw_list()
     camera = pointer.camera(work.view.camera)
     scene = pointer.scene
-    for some, color in zip(rows, (_ON, _BESIDE), strict=True):
+    for some, color in zip(rows, (_ON_COLOR, _BESIDE_COLOR), strict=True):
         some = some[:: len(some) // _MAX_DOTS + 1]
         at = project_centers(scene[torch.from_numpy(some)], camera).points
         for x, y in at[np.isfinite(at).all(axis=1)].tolist():
@@ -401,7 +401,7 @@ def draw_gesture(gesture: Gesture | None, view: ViewState, ui: UiContext, left: 
         _line(path, True, ui)
     elif gesture.tool == "scribble":
         canvas = imgui.get_background_draw_list()
-        color = _BESIDE if gesture.mode == "subtract" else _ON
+        color = _BESIDE_COLOR if gesture.mode == "subtract" else _ON_COLOR
         canvas.add_polyline([*path], u32(color), 2 * _STROKE_PX * ui.scale, 0)
     elif gesture.tool == "polygon":
         _line([*path, mouse] if over else path, False, ui)
@@ -415,22 +415,22 @@ def draw_gesture(gesture: Gesture | None, view: ViewState, ui: UiContext, left: 
 def _line(path: Sequence[imgui.ImVec2Like], closed: bool, ui: UiContext) -> None:
     canvas = imgui.get_background_draw_list()
     flags = imgui.ImDrawFlags_.closed.value if closed else 0
-    for color, width in ((_DARK, _HALO), (PALETTE.handle, _LINE)):
+    for color, width in ((_OUTLINE_COLOR, _HALO), (PALETTE.handle, _LINE)):
         canvas.add_polyline([*path], u32(color), width * ui.scale, flags)
 
 
 def _circle(center: imgui.ImVec2Like, radius: float, ui: UiContext) -> None:
     canvas = imgui.get_background_draw_list()
-    for color, width in ((_DARK, _HALO), (PALETTE.handle, _LINE)):
+    for color, width in ((_OUTLINE_COLOR, _HALO), (PALETTE.handle, _LINE)):
         canvas.add_circle(center, radius, u32(color), 0, width * ui.scale)
 
 
 def _dot(center: imgui.ImVec2Like, ui: UiContext) -> None:
     canvas = imgui.get_background_draw_list()
-    for color, radius in ((_DARK, 4.5), (PALETTE.handle, 3.0)):
+    for color, radius in ((_OUTLINE_COLOR, 4.5), (PALETTE.handle, 3.0)):
         canvas.add_circle_filled(center, radius * ui.scale, u32(color))
 
 
-_DARK = (0.0, 0.0, 0.0, 0.5)
-_ON = (0.30, 0.85, 0.35, 1.0)
-_BESIDE = (0.95, 0.30, 0.25, 1.0)
+_OUTLINE_COLOR = (0.0, 0.0, 0.0, 0.5)
+_ON_COLOR = (0.30, 0.85, 0.35, 1.0)
+_BESIDE_COLOR = (0.95, 0.30, 0.25, 1.0)

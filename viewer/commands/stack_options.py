@@ -19,7 +19,7 @@ Blend = Literal["normalized", "sum", "over", "adjust"]
 NO_SCENE = Path()
 """Placeholder for a missing scene."""
 SESSION = "--session"
-_BARE = {"--split": "0.5", "--difference": "4"}  # value of an option given without one
+_BARE_VALUES = {"--split": "0.5", "--difference": "4"}  # value of an option given without one
 
 
 def word(metavar: str | None = None, absent: str | Callable[[str], str] | None = None, **more: Any) -> Any:
@@ -92,11 +92,13 @@ def parse(kind: type[Any], argv: Sequence[str], command: str) -> Any:
             first.append(file)
         elif argument.startswith(f"{SESSION}="):
             first.append(argument.removeprefix(f"{SESSION}="))
-        elif words and words[-1] in _BARE and is_number(argument):
+        elif words and words[-1] in _BARE_VALUES and is_number(argument):
             words[-1] += f"={argument}"
         else:
             words.append(argument)
-    words = [f"{argument}={_BARE[argument]}" if argument in _BARE else argument for argument in words]
+    words = [
+        f"{argument}={_BARE_VALUES[argument]}" if argument in _BARE_VALUES else argument for argument in words
+    ]
     return parse_options(kind, [*first, *words], command)
 
 

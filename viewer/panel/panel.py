@@ -21,9 +21,9 @@ from . import card, cards, new_edit_form, snapshot_cards, training_cards
 
 MENU_ID = "main menu"
 MAX_PX = 360.0
-_MENU = ("", "save", "save_as", "take_view", "hide_strays", "", "palette", "help", "about", "quit")
+_MENU_ACTIONS = ("", "save", "save_as", "take_view", "hide_strays", "", "palette", "help", "about", "quit")
 _MAX_RECENT = 6
-_SHARES = ("export", "export_page", "render_picture", "render_film", "picture")
+_SHARE_ACTIONS = ("export", "export_page", "render_picture", "render_film", "picture")
 
 
 def _menu_button(recent: Sequence[Path], side: float, ui: UiContext, actions: list[str]) -> None:
@@ -33,7 +33,7 @@ def _menu_button(recent: Sequence[Path], side: float, ui: UiContext, actions: li
         (widgets.elide(escape_text(path.name), room), f"open_file:{path}", escape_text(str(path)))
         for path in recent[:_MAX_RECENT]
     ]
-    widgets.more_button(MENU_ID, ("open", *files, *_MENU), ui, actions, Icon.BARS, side)
+    widgets.more_button(MENU_ID, ("open", *files, *_MENU_ACTIONS), ui, actions, Icon.BARS, side)
     widgets.tip("Menu")
 
 
@@ -169,7 +169,7 @@ def _title(
         actions.append("save")
     widgets.hint("save")
     imgui.same_line(0.0, 0.0)
-    widgets.more_button("share", _SHARES, ui, actions, Icon.SHARE, side)
+    widgets.more_button("share", _SHARE_ACTIONS, ui, actions, Icon.SHARE, side)
     widgets.tip("Export and render")
     imgui.same_line(0.0, 0.0)
     _menu_button(recent, side, ui, actions)
@@ -245,7 +245,7 @@ def _row(index: int, region: NamedRegion, ui: UiContext, actions: list[str]) -> 
     return bool(hovered)
 
 
-_FOOT = (("timeline", Icon.FILM), ("picture", Icon.PICTURE), ("help", Icon.HELP))
+_FOOTER_BUTTONS = (("timeline", Icon.FILM), ("picture", Icon.PICTURE), ("help", Icon.HELP))
 
 
 def _footer(work: Workspace, ui: UiContext, actions: list[str]) -> None:
@@ -259,4 +259,4 @@ def _footer(work: Workspace, ui: UiContext, actions: list[str]) -> None:
     side = imgui.get_frame_height()
     gap = 6.0 * ui.scale
     imgui.same_line(right - 3 * side - 2 * gap)
-    widgets.icon_row(_FOOT, ui, actions, gap)
+    widgets.icon_row(_FOOTER_BUTTONS, ui, actions, gap)

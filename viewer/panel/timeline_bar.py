@@ -42,7 +42,7 @@ _KEY_PX = 5.0  # half the size of a key
 _GRIP_PX = 8.0  # distance within which the mouse grabs a key
 _CURVE_PX = 3.0  # distance between two points of a curve
 _GAP_PX = 4.0  # gap under the rows
-_NICE = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
+_LABEL_STEPS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ def place(timeline: Timeline, frame: float, start: float, span: float) -> float:
 def label_step(timeline: Timeline, span: float, room: float) -> int:
     """Return the number of frames between two numbers on the ruler that gives each `room` pixels."""
     min_step = timeline.length * room / max(span, 1.0)
-    return next((step for step in _NICE if step >= min_step), _NICE[-1])
+    return next((step for step in _LABEL_STEPS if step >= min_step), _LABEL_STEPS[-1])
 
 
 def _buttons(timeline: Timeline, player: Player, actions: list[str], ui: UiContext) -> None:

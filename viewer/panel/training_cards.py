@@ -16,7 +16,7 @@ BAR_PX = 5.0
 STRIP_PX = 28.0
 _MENU = "menu of a training"
 _ITEMS = (("Show log…", "run_log", ""), ("Discard…", "ask_discard", ""))
-_UNWRITTEN = "Nothing is written"
+_NOTHING_WRITTEN = "Nothing is written"
 
 
 def height(jobs: Sequence[QueuedTask], ui: UiContext) -> float:
@@ -24,7 +24,9 @@ def height(jobs: Sequence[QueuedTask], ui: UiContext) -> float:
     if not _visible_jobs(jobs):
         return 0.0
     storage = imgui.get_state_storage()
-    cards = storage.get_float(imgui.get_id(_TALL)) if storage.get_bool(imgui.get_id(_OPEN)) else 0.0
+    cards = (
+        storage.get_float(imgui.get_id(_HEIGHT_SLOT)) if storage.get_bool(imgui.get_id(_OPEN_SLOT)) else 0.0
+    )
     return (STRIP_PX + 1.0) * ui.scale + imgui.get_style().item_spacing.y * (1 + bool(cards)) + cards
 
 
@@ -34,9 +36,9 @@ def draw(jobs: Sequence[QueuedTask], ui: UiContext, actions: list[str]) -> None:
     storage = imgui.get_state_storage()
     if not listed:
         return
-    is_open = imgui.get_id(_OPEN)
+    is_open = imgui.get_id(_OPEN_SLOT)
     seen = imgui.get_id("seen failure")
-    tall = imgui.get_id(_TALL)
+    tall = imgui.get_id(_HEIGHT_SLOT)
     failed = max((job.number for job in listed if _is_failed(job)), default=0)
     unseen = failed > storage.get_int(seen)
     if unseen:
@@ -63,8 +65,8 @@ def draw(jobs: Sequence[QueuedTask], ui: UiContext, actions: list[str]) -> None:
         storage.set_bool(is_open, not storage.get_bool(is_open))
 
 
-_OPEN = "jobs are open"
-_TALL = "height of the jobs"
+_OPEN_SLOT = "jobs are open"
+_HEIGHT_SLOT = "height of the jobs"
 
 
 def _visible_jobs(jobs: Sequence[QueuedTask]) -> list[QueuedTask]:
@@ -195,7 +197,7 @@ def _status_text(job: QueuedTask) -> str:
         case "queued":
             return "Waiting for the previous job"
         case "stopping":
-            return "Saving the state" if isinstance(job.task, EditOrder) else _UNWRITTEN
+            return "Saving the state" if isinstance(job.task, EditOrder) else _NOTHING_WRITTEN
         case "done":
             return ""
     return f"{100 * progress.share:.0f} % is done" if progress.share else "Can be resumed"
@@ -206,7 +208,7 @@ _CANCEL = ("Cancel", "stop_run", "Remove it from the queue")
 _CLOSE = ("Close", "close_run", "Remove the card; the files stay")
 _BUTTONS = {
     ("running", True): (("Stop", "stop_run", _STOP_HELP),),
-    ("running", False): (("Stop", "stop_run", _UNWRITTEN),),
+    ("running", False): (("Stop", "stop_run", _NOTHING_WRITTEN),),
     ("queued", True): (_CANCEL,),
     ("queued", False): (_CANCEL,),
     ("stopped", True): (("Resume", "resume_run", "Resume the run"),),

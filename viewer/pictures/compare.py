@@ -32,7 +32,7 @@ ORIGINAL = "original"
 EDITED = "edited"
 _SHADE = (22, 24, 27)
 _INK = (222, 225, 230)
-_PLAIN = str.maketrans({"×": "x", "–": "-"})  # Pillow's default font lacks these characters
+_FONT_REPLACEMENTS = str.maketrans({"×": "x", "–": "-"})  # Pillow's default font lacks these characters
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def column(compare: Comparison, width: int) -> int:
 def _tag(draw: ImageDraw.ImageDraw, x: float, side: str, text: str, size: tuple[int, int]) -> None:
     """Draw a label at the top if it fits: ending left of x ("r"), beginning right of it ("l"), or
     centered."""
-    text = text.translate(_PLAIN)
+    text = text.translate(_FONT_REPLACEMENTS)
     letters = max(11, round(size[1] / 28))
     font = ImageFont.load_default(size=letters)
     wide = draw.textlength(text, font)

@@ -43,7 +43,7 @@ _VIDEO_FILTER = (
 _WEBP_QUALITY = 85  # of 100: no visible blocks in a still
 _PALETTE_REACH = 8  # levels: Pillow finds the nearest palette color in steps of 4
 ANIMATIONS = (".gif", ".webp", VIDEO)
-_OPAQUE = (".gif", VIDEO)  # a .gif has no partial transparency
+_OPAQUE_FORMATS = (".gif", VIDEO)  # a .gif has no partial transparency
 SHEET_STRENGTHS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
@@ -209,7 +209,7 @@ def check_output(out: Path, alpha: bool = False) -> None:
     suffix = out.suffix.lower()
     if suffix not in (*ANIMATIONS, ""):
         raise ProgdfError(f"{out} cannot hold a film; write a .gif, a .webp, an .mp4 or a folder of frames")
-    if alpha and suffix in _OPAQUE:
+    if alpha and suffix in _OPAQUE_FORMATS:
         raise ProgdfError(
             f"{out} cannot hold a transparent background; write a .webp or a folder of frames, "
             "or leave out --alpha"

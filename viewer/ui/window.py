@@ -24,7 +24,7 @@ from .splash import MINIMUM_SIZE_PX, Splash
 
 LONGEST_S = 0.3
 """Maximum time between the two presses of a double click, as in imgui, in seconds."""
-_ALWAYS_S = 1e6
+_UNLIMITED_S = 1e6
 
 
 class DoubleClicks:
@@ -56,10 +56,10 @@ class DoubleClicks:
             self._waiting.popleft()
         limit = LONGEST_S
         if self._waiting:
-            limit = _ALWAYS_S if self._waiting[0][1] else 0.0
+            limit = _UNLIMITED_S if self._waiting[0][1] else 0.0
         io = imgui.get_io()
         io.mouse_double_click_time = limit
-        io.mouse_single_click_delay = 2.0 * _ALWAYS_S
+        io.mouse_single_click_delay = 2.0 * _UNLIMITED_S
 
 
 _FLY_KEYS = {name: getattr(glfw, f"KEY_{name}") for name in FLY_KEYS}

@@ -45,10 +45,10 @@ from shaders import load_source
 DRAWN_SH = (0, 3, 8, 15)
 """Number of SH coefficients above the first, by degree."""
 LEVELS = {"i1": 127, "i2": 32767}
-_SEGMENT = 1 << 12  # members composed at once, which limits memory
-_SMALLEST = 1e-4  # share of the scene's spread: a smaller axis is below a pixel in any picture
-_UNSEEN = -1e3  # logit of a Gaussian that is not drawn
-_OPAQUE = 1 - 1 / 512  # 8-bit opacities are clipped to 1 − _OPAQUE … _OPAQUE
+_MAX_SEGMENT = 1 << 12  # members composed at once, which limits memory
+_MIN_AXIS_SHARE = 1e-4  # share of the scene's spread: a smaller axis is below a pixel in any picture
+_UNSEEN_LOGIT = -1e3  # logit of a Gaussian that is not drawn
+_MAX_OPACITY = 1 - 1 / 512  # 8-bit opacities are clipped to 1 − _MAX_OPACITY … _MAX_OPACITY
 
 
 @dataclass
@@ -185,7 +185,7 @@ def _scene(
     moved = {name for gdf in gdfs for name in gdf.field.attributes}
     attributes: dict[str, Any] = {}
     changed: dict[str, Any] = {"shN": torch.zeros_like(scene.shN)}
-    changed["logit_opacities"] = torch.full_like(scene.logit_opacities, _UNSEEN)
+    changed["logit_opacities"] = torch.full_like(scene.logit_opacities, _UNSEEN_LOGIT)
     rows = torch.from_numpy(order)
     for name in ATTRIBUTES:
         old = getattr(scene, name).detach().float()
@@ -213,7 +213,7 @@ def _finite(scene: Gaussians) -> Gaussians:
     flat["log_scales"] = flat["log_scales"].clamp(min=-1e4)
     unseen = ~torch.cat(list(flat.values()), dim=1).isfinite().all(dim=1)
     changed: dict[str, Any] = {name: table.nan_to_num(0.0, 0.0, 0.0) for name, table in flat.items()}
-    changed["logit_opacities"] = changed["logit_opacities"].masked_fill(unseen[:, None], _UNSEEN)
+    changed["logit_opacities"] = changed["logit_opacities"].masked_fill(unseen[:, None], _UNSEEN_LOGIT)
     return replace(scene, **{name: changed[name].reshape(getattr(scene, name).shape) for name in ATTRIBUTES})
 
 
@@ -238,8 +238,8 @@ def _order(scene: Gaussians, groups: NDArray[np.int64]) -> NDArray[np.int64]:
 def _segments(
     groups: NDArray[np.int64], order: NDArray[np.int64], gdfs: Sequence[Gdf]
 ) -> list[tuple[int, list[int]]]:
-    """Return the lengths of runs of members with the same edits, at most `_SEGMENT`, with these edits."""
-    starts = np.flatnonzero((np.diff(groups, prepend=-1) != 0) | (np.arange(len(groups)) % _SEGMENT == 0))
+    """Return the lengths of runs of members with the same edits, at most `_MAX_SEGMENT`, with these edits."""
+    starts = np.flatnonzero((np.diff(groups, prepend=-1) != 0) | (np.arange(len(groups)) % _MAX_SEGMENT == 0))
     inside = [np.isin(order[starts], gdf.region.members.numpy()) for gdf in gdfs]
     edits = [[i for i, there in enumerate(inside) if there[k]] for k in range(len(starts))]
     return list(zip(np.diff(starts, append=len(groups)).tolist(), edits, strict=True))
@@ -268,9 +268,9 @@ def _scene_part(
         return arrays.add(levels, scale=[1.0] * 4, zero=[0.0] * 4), levels
     if name == "logit_opacities":
         opacity = 1 / (1 + np.exp(-np.clip(values.astype(np.float64), -40, 40)))
-        return arrays.add_levels(np.clip(opacity, 1 - _OPAQUE, _OPAQUE), "i1", "logit")
+        return arrays.add_levels(np.clip(opacity, 1 - _MAX_OPACITY, _MAX_OPACITY), "i1", "logit")
     if name == "log_scales" and len(values):
-        values = np.maximum(values, values.max(axis=1).mean() + math.log(_SMALLEST))
+        values = np.maximum(values, values.max(axis=1).mean() + math.log(_MIN_AXIS_SHARE))
     return arrays.add_levels(values, "i1")
 
 

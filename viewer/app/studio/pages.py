@@ -43,7 +43,7 @@ NARROW_PX = 760.0
 """Page width at 1× below which the left column stands above the right one."""
 _TEXT_PX = 44.0  # height of the two lines below a picture
 _HEADING_PX = 32.0  # height of a heading
-_TITLE_TALL_PX = 44.0  # height of the title
+_TITLE_PX = 44.0  # height of the title
 _NO_NAV = imgui.ItemFlags_.no_nav.value
 DROP_TEXT = "Drop a scene or a session"
 
@@ -84,7 +84,7 @@ def draw_start_page(recent: Sequence[StartFile], examples: Sequence[StartFile], 
     imgui.set_cursor_pos((left, top))
     with imgui_ctx.begin_group():
         actions = _head(side, 0.0 if narrow else max(0.75 * thirds, 120.0 * scale), ui)
-    level = imgui.get_cursor_pos_y() + 0.5 * GAP_PX * scale if narrow else top + _TITLE_TALL_PX * scale
+    level = imgui.get_cursor_pos_y() + 0.5 * GAP_PX * scale if narrow else top + _TITLE_PX * scale
     imgui.set_cursor_pos((right, level - (0.0 if narrow else 19.0 * scale)))
     with imgui_ctx.begin_group():
         for heading, files, across in (("Examples", examples, thirds), ("Recent", recent, small_card)):
@@ -118,7 +118,7 @@ def _head(wide: float, tall: float, ui: UiContext) -> list[str]:
         imgui.set_cursor_pos_y(imgui.get_cursor_pos_y() + 11.0 * scale)
         imgui.text_disabled(__version__)
     x = begin.x
-    y = begin.y + _TITLE_TALL_PX * scale
+    y = begin.y + _TITLE_PX * scale
     button = imgui.ImVec2(136.0 * scale, 34.0 * scale)
     frame = imgui.ImVec2(wide, tall or 58.0 * scale)
     # one line: the margin around the button
