@@ -118,7 +118,7 @@ BROKEN: list[tuple[tuple[str | int, ...], Any, str]] = [
     (("scene", "file"), "a\0b", "scene"),
     (("scene", "sha256"), "0" * 64, "another bear.ply"),
     (("edits", 1, "sha256"), "0" * 64, "another ears.gdf"),
-    (("edits",), [], "layers[0].gdf is 1 of 0"),
+    (("edits",), [], "layers[0].gdf is 1, but there are 0 edits"),
     (("view",), [], "expected"),
     (("view", "blur"), 3, "view.blur is unknown"),
     (("view", "camera", "distance"), 0.0, "view.camera.distance"),
