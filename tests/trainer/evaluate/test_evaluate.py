@@ -79,7 +79,7 @@ def test_views_are_compared_with_the_unedited_scene_and_what_lies_outside_hardly
 
 def test_the_table_is_printed_and_the_picture_written(run: Path, printed: str, rows: dict[str, Any]) -> None:
     assert "| slider | 2 keyframes | cross-fade | the editor | unedited |" in printed
-    assert "CLIP direction similarity at 1: not measured, --text-before was not given" in printed
+    assert "CLIP direction similarity at 1: not measured, --text-before is missing" in printed
     assert (run / "evaluation.png").stat().st_size > 10_000
     assert "missing" in rows["clip_direction"]
 
