@@ -77,7 +77,7 @@ pictures: setup extras window browser
 	cp demo/hero.png demo/one-picture.png assets/
 	assets/window.sh $(BIN)/progdf demo assets/window.png
 	$(BIN)/python assets/page.py demo assets/page.jpg
-	$(BIN)/python -m benchmarks --markdown docs/*.md benchmarks/results/*.md --plots assets
+	$(BIN)/python -m benchmarks --markdown docs/*.md docs/lab/*.md --plots assets
 	$(BIN)/python assets/figures.py
 
 # What the start page opens with, and the wheel holds: trained anew in some minutes.

@@ -304,7 +304,7 @@ def list_table(cases: Sequence[RasterCase], rounds: int = 9) -> Table:
     note = (
         "A view as a function of colors, for color edits. The solver leaves out weights that together change "
         "a pixel by less than half of one of 255 levels; the run is evaluated with whole pictures. "
-        "Trained scenes: docs/experiments.md, Weights that hardly show."
+        "Trained scenes: docs/lab/experiments.md, Weights that hardly show."
     )
     return Table("lists", "A view as lists of weights", columns, tuple(rows), note)
 

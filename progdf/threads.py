@@ -82,7 +82,7 @@ def run_chunks(kernel: Callable[[int], _T], chunks: int) -> list[_T]:
 
     When this thread finds no more chunks, it cancels pool threads that have not started. Waking one takes 50
     µs, as long as a small kernel. Kernels release the interpreter lock. numba's own parallel loops are no
-    replacement, see docs/experiments.md, The rasterizer's threads.
+    replacement, see docs/lab/experiments.md, The rasterizer's threads.
 
     Nested calls run on the thread of the outer kernel. The pool is busy with the other chunks and would delay
     the nested ones until these are finished.

@@ -28,7 +28,7 @@ from tests.helpers.edits import curved_field, edit_of, some_rows
 from tests.helpers.paths import ROOT
 from tests.helpers.scenes import ball
 
-DOCUMENTS = [*PAGES, *sorted((ROOT / "benchmarks").rglob("*.md"))]
+DOCUMENTS = [*PAGES, *(path for path in sorted((ROOT / "docs" / "lab").glob("*.md")) if path not in PAGES)]
 MAX_README_LINES = 150
 
 

@@ -15,8 +15,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = ("progdf", "trainer", "viewer", "shaders", "benchmarks", "tests")
 DOCUMENTS = [
     ROOT / "README.md",
-    *sorted((ROOT / "docs").glob("*.md")),
-    *sorted((ROOT / "benchmarks").rglob("*.md")),
+    *sorted((ROOT / "docs").rglob("*.md")),
 ]
 SOURCE_SUFFIXES = {"py", "md", "glsl", "vert", "frag"}
 PLACEHOLDERS = {"NAME", "DIR", "OUT", "SCENE", "VIEW", "PART", "PROMPT", "VERTEX", "FRAGMENT", "A", "V", "I"}

@@ -114,7 +114,7 @@ def test_extras_name_packages_and_messages_and_documents_name_extras() -> None:
                 continue
             assert found in requirement.specifier, f"{name}: {text}, and {found} is installed"
     sources = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
-    sources += [ROOT / "README.md", ROOT / "Makefile", *(ROOT / "docs").glob("*.md")]
+    sources += [ROOT / "README.md", ROOT / "Makefile", *(ROOT / "docs").rglob("*.md")]
     texts = [path.read_text(encoding="utf-8") for path in sources]
     named = {n for text in texts for n in re.findall(r"progdf-studio\[([a-z,]+)\]", text)}
     named |= {n for text in texts for n in re.findall(r"EXTRAS := (.*)", text)}

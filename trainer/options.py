@@ -52,7 +52,7 @@ LARGEST_SEED = 2**32 - 1
 VIEWS = 30
 """Default number of edited views."""
 COLOR_VIEWS = (40, 48)
-"""Default number of views of a color edit: up to SH degree 1, and above (docs/experiments.md, Views)."""
+"""Default number of views of a color edit: up to SH degree 1, and above (docs/lab/experiments.md, Views)."""
 
 
 @dataclass(frozen=True)

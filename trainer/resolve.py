@@ -57,7 +57,7 @@ STAGE_STEPS = 40
 """Minimum number of steps per stage.
 
 With fewer, each view is used once or twice, and the next target starts before this one is reached. Then
-`QUICK_STAGES` stages are used (docs/experiments.md, Stages).
+`QUICK_STAGES` stages are used (docs/lab/experiments.md, Stages).
 """
 QUICK_STEPS = 240
 QUICK_STAGES = 4
@@ -132,7 +132,7 @@ def resolve_kind(
 ) -> OptimizeOptions:
     """Return the optimization options for an edit of this kind, fully resolved.
 
-    The effect of each default alone is in docs/experiments.md, Terms and options of a descent.
+    The effect of each default alone is in docs/lab/experiments.md, Terms and options of a descent.
 
     Args:
         options: resolved, see `resolve`

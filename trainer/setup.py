@@ -60,7 +60,7 @@ SIZE = 256
 SAMPLING = math.sqrt(2.0)
 """Sampling rate of the cameras of a color edit.
 
-Its pictures are displayed at one to two times the size of the views (docs/experiments.md, Views).
+Its pictures are displayed at one to two times the size of the views (docs/lab/experiments.md, Views).
 """
 
 PICTURE_SIZE = 512

@@ -5,7 +5,7 @@ definition their decoded value. The residual is a matrix of snapshots × numbers
 are bases 1..R, stored as int8. The coefficients are then solved for the bases as stored.
 
 a_k(s) is linear between the snapshots. A cubic gains nothing at the number of snapshots that a run records
-(docs/experiments.md, Separable fields).
+(docs/lab/experiments.md, Separable fields).
 
 `course_field` stores an edit whose trajectory is known in full, without training. The baseline is snapshots
 with linear interpolation between them; with all snapshots it equals the recording bit for bit.

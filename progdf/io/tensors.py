@@ -133,7 +133,8 @@ def deflate(levels: Tensor) -> Tensor:
     """Compress 8-bit integers with zlib, by the shorter of two strategies. Returns [B] uint8.
 
     Noise-like levels compress best with Huffman codes alone, or with run lengths. Both give shorter results
-    than zlib's search for repetitions, and are ten times as fast (docs/experiments.md, Levels of a residual).
+    than zlib's search for repetitions, and are ten times as fast (docs/lab/experiments.md, Levels of a
+    residual).
     """
     content = levels.contiguous().numpy().tobytes()
 

@@ -10,7 +10,11 @@ from pathlib import Path
 
 from tests.helpers.paths import ROOT
 
-DOCUMENTS = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+DOCUMENTS = (
+    ROOT / "README.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+    ROOT / "docs" / "lab" / "experiments.md",
+)
 PROGRAMS = ("progdf", "python", "make")
 SHELL_LANGUAGES = ("", "bash", "sh", "console")
 

@@ -8,7 +8,7 @@ strength 1 no step is changed, so the picture equals the stock pipeline's bit fo
 among the pipeline's own latents, so one implementation serves all pipelines, whatever their packing. Steps
 with weight 0 skip the network.
 
-Reasons for softness 1: docs/experiments.md, The degree of a text edit.
+Reasons for softness 1: docs/lab/experiments.md, The degree of a text edit.
 """
 
 from __future__ import annotations

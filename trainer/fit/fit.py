@@ -271,8 +271,8 @@ def visibility(
     """Return the blending weight of each member, summed over the views and scaled to mean 1. [M]
 
     The weights are never 0, so that every row is determined. They weight members, not single values
-    (docs/experiments.md, Separable fields). Members not visible in any view stay in the region: leaving them
-    out saves 0 to 6 % of the bytes.
+    (docs/lab/experiments.md, Separable fields). Members not visible in any view stay in the region: leaving
+    them out saves 0 to 6 % of the bytes.
 
     Args:
         scene: the original; if the edit adds rows, with these rows as they are at strength 1

@@ -1,6 +1,6 @@
 """Neural field of a run: trained jointly with PGS, on the recorded trajectory, or both, then baked.
 
-`--field auto` does not try it, as it misses the default target (docs/experiments.md, Networks).
+`--field auto` does not try it, as it misses the default target (docs/lab/experiments.md, Networks).
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ strengths with equal visible change, all stages are equally far apart, and s = 0
 Last, the fitted field. It leaves out small detours of its recording, which are not spread evenly over the
 slider.
 
-The gain of each is in docs/experiments.md, The slider.
+The gain of each is in docs/lab/experiments.md, The slider.
 """
 
 from __future__ import annotations

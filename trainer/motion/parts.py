@@ -125,8 +125,8 @@ class GroupSearch:
         """Return the motion of the parts that brings the views closest to their targets.
 
         A near search starts at full sharpness. If a quarter of the distance remains, a wide search runs too.
-        The wide search finds positions farther away, but can miss close ones (docs/experiments.md, Parts that
-        move).
+        The wide search finds positions farther away, but can miss close ones (docs/lab/experiments.md, Parts
+        that move).
 
         Args:
             targets: edited box of each view. [h,w,3] each

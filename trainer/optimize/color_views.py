@@ -31,7 +31,7 @@ from trainer.views.crops import CropScene
 _VIEW_BATCH = 8  # views processed at once; limits the memory for results
 _TILES_PER_SIDE = 6  # tiles along a view's longer side; half of the tiles are held out, as on a checkerboard
 _MIN_REGION_WEIGHT = 0.05  # minimum weight of the region in a pixel that shows it
-_MAX_FIT_PIXELS = 60_000  # pixels per fit, evenly spread (docs/experiments.md, Pixels)
+_MAX_FIT_PIXELS = 60_000  # pixels per fit, evenly spread (docs/lab/experiments.md, Pixels)
 _CLAMP_ROUNDS = 3  # least-squares rounds, to treat pixels that stay white or black
 _MAP_RIDGE = 1e-6  # share of the diagonal of a map's normal equations, for regions with few colors
 # weight, relative to the pixels, of the prior that holds a map to the affine map at members' colors

@@ -122,7 +122,7 @@ def progressive_change(
     """Return the paper's progressive constraint (eq. 5): L_prog = α·β^(±t/50)·Σ‖ΔΘ‖², without its λ2. []
 
     ΔΘ is the change of a member's raw parameters by the last step. The paper does not state the norm or the
-    number of members: docs/experiments.md, The progressive constraint.
+    number of members: docs/lab/experiments.md, The progressive constraint.
 
     Args:
         moved: offsets of the members. [M,C]

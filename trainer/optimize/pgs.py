@@ -8,7 +8,7 @@ from the previous stage's pictures to its own, so that the path between them is 
 Edits that change only colors are solved with all views at once instead (`color_solver`), unless an option
 needs descent view by view (`trainer.resolve.resolve_kind`).
 
-Effect of stages: docs/experiments.md, Stages.
+Effect of stages: docs/lab/experiments.md, Stages.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class PgsState:
 
         Adam ignores the magnitude of gradients, so a hardly visible member would wander as far as a fully
         visible one. A tenth of the attribute's typical gradient, added to ε, keeps it in place
-        (docs/experiments.md, Rates and steps).
+        (docs/lab/experiments.md, Rates and steps).
 
         Args:
             gradient: of the loss by `moved`. [M,C]
@@ -434,7 +434,7 @@ def most_change(targets: Sequence[Tensor], before: Sequence[Tensor]) -> float:
     """Return the 95th percentile of the change of a channel over the changing pixels; 0 if none changes.
 
     Steps are sized by this instead of the mean: a few saturated pixels need long steps, a wide even change
-    does not, and long steps make it noisy (docs/experiments.md, Rates and steps).
+    does not, and long steps make it noisy (docs/lab/experiments.md, Rates and steps).
     """
     changes = [(target - start).abs().amax(dim=2) for target, start in zip(targets, before, strict=True)]
     changing = torch.cat([change[change > 1 / 255] for change in changes])

@@ -119,7 +119,8 @@ def lift_masks(
         threshold. If the views decide on no member, there is none. Under the rule `paper` the score alone
         decides, without surface and cleaning.
 
-    The accuracy of rules and thresholds against exact labels is in docs/experiments.md, Regions from masks.
+    The accuracy of rules and thresholds against exact labels is in docs/lab/experiments.md, Regions from
+    masks.
     """
     min_score = THRESHOLDS[rule] if threshold is None else threshold
     evidence = gather(scene, cameras, masks)

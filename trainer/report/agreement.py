@@ -7,8 +7,8 @@ squares. A render is linear in colors, so there is one solution, found in a few 
 change on held-out views that the fit leaves unexplained measures the disagreement.
 
 PSNR alone does not separate agreeing from disagreeing edits; the share does. Stripes at another position in
-every view hardly weigh in the share, so the fine part has a share of its own (docs/experiments.md, Editors
-that agree, or do not). If parts move, colors cannot follow and nothing is measured.
+every view hardly weigh in the share, so the fine part has a share of its own (docs/lab/experiments.md,
+Editors that agree, or do not). If parts move, colors cannot follow and nothing is measured.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ RUN/views/painted/anchor/VIEW.png   the first one is the anchor; if it is painte
                                     views follow it when the run is started again
 RUN/views/painted/reference|sweep|round_1/VIEW.png   the other views; the consensus rounds
 
-Measured gains: docs/experiments.md, Views that agree.
+Measured gains: docs/lab/experiments.md, Views that agree.
 """
 
 from __future__ import annotations

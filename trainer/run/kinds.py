@@ -2,7 +2,7 @@
 
 A picture does not tell whether its edit recolors, paints, bends or moves. The wrong choice tears parts that
 should bend, or freezes parts that should be painted. Therefore all kinds are tried for a few steps, on views
-of 128 pixels with L1 only, and evaluated on held-out views (docs/experiments.md, The trial that finds the
+of 128 pixels with L1 only, and evaluated on held-out views (docs/lab/experiments.md, The trial that finds the
 kind of an edit).
 """
 

@@ -114,7 +114,7 @@ _TIMED_VIEWS = 4  # views that time the slider; 8, or all at full size, are no b
 
 
 # Sufficient number of pixels per unknown. With q pixels, noise adds 1/q to the error. Above 9, doubling q
-# reduces the error by less than 5 % (docs/experiments.md, Pixels).
+# reduces the error by less than 5 % (docs/lab/experiments.md, Pixels).
 _PIXELS_PER_UNKNOWN = (MORE_PAYS - 0.5) / (1.0 - MORE_PAYS)
 
 

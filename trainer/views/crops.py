@@ -286,7 +286,7 @@ def clamp_towards(x: Tensor, low: float, high: float) -> Tensor:
     range.
 
     A sixth of a trained scene's colors have a channel below 0. With the plain clamp they could never change
-    (docs/experiments.md, Rates and steps).
+    (docs/lab/experiments.md, Rates and steps).
     """
     clamped: Tensor = _ClampTowards.apply(x, low, high)  # type: ignore[no-untyped-call]
     return clamped

@@ -298,7 +298,7 @@ class LiveScene:
         screen = np.empty((*full.shape[:2], 4), np.uint8)
         fill_screen(moving, screen)
         difference = screen[::-8, :, :3] / np.float32(255.0) - full[::8].clip(0.0, 1.0)
-        # the error grows with the limit's power of 0.6 to 1.5 (docs/experiments.md, The viewer)
+        # the error grows with the limit's power of 0.6 to 1.5 (docs/lab/experiments.md, The viewer)
         limit = self._limit * (FINE_ERROR / max(float(np.square(difference).mean()), 1e-9)) ** (1 / 1.5)
         self._max_finest = min(max(limit, FINE[0]), FINE[2]) if self._limit else self._max_finest
 

@@ -66,7 +66,7 @@ from .jit import Number, kernel, prefetch
 LEAF = 4
 """Minimum number of Gaussians per leaf.
 
-Fewer cost memory, more lose 0.7 dB (docs/experiments.md, The viewer).
+Fewer cost memory, more lose 0.7 dB (docs/lab/experiments.md, The viewer).
 """
 
 CELL = 8
