@@ -170,6 +170,6 @@ def test_why_nothing_is_measured_is_told(saved: Path, monkeypatch: pytest.Monkey
         assert not found.s
         return found.reason
 
-    assert "--text-after was not given" in reason("a bear", "")
+    assert "--text-after is missing" in reason("a bear", "")
     assert "say the same" in reason("a bear", "a bear")
     assert "hf download" in reason("a bear", "gold", "nobody/no-such-clip")
