@@ -171,5 +171,5 @@ def test_why_nothing_is_measured_is_told(saved: Path, monkeypatch: pytest.Monkey
         return found.reason
 
     assert "--text-after is missing" in reason("a bear", "")
-    assert "say the same" in reason("a bear", "a bear")
+    assert "same features" in reason("a bear", "a bear")
     assert "hf download" in reason("a bear", "gold", "nobody/no-such-clip")
