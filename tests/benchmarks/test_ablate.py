@@ -1,4 +1,4 @@
-"""`python -m benchmarks ablate`: which variants make sense, what is shared, what is kept."""
+"""Tests of `python -m benchmarks ablate`: applicable variants, shared work and reuse of finished rows."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ ONLY = "base,2-keyframes,one-target,slider-time"
 
 @pytest.fixture(scope="module")
 def options(tmp_path_factory: pytest.TempPathFactory) -> TrainOptions:
-    """Of a run of a second or two on a small bear, which is finished."""
+    """Return the options of a small bear run that is trained in a second or two."""
     made = tmp_path_factory.mktemp("bear")
     write_bear(made)
     options = quick_options(made, steps=100, views=4, image_size=48)
@@ -55,7 +55,7 @@ def options(tmp_path_factory: pytest.TempPathFactory) -> TrainOptions:
 
 @pytest.fixture(scope="module")
 def run(options: TrainOptions) -> Path:
-    """The folder of that run, with an ablation of four variants in it."""
+    """Return the run's folder with an ablation of four variants in it."""
     ablate(AblateOptions((options.out,), only=ONLY, threads=1), quiet=True)
     return options.out
 
@@ -68,7 +68,7 @@ def _names(options: TrainOptions, *about: object) -> set[str]:
     return {variant.name for variant in differing_variants(resolve(options), *about)}  # type: ignore[arg-type]
 
 
-def test_only_what_makes_a_difference_to_the_run_is_tried(options: TrainOptions) -> None:
+def test_ablation_lists_only_variants_that_change_the_run(options: TrainOptions) -> None:
     color = _names(options, "color", 4, 1)
     assert {"base", "2-keyframes", "one-target", "no-sh", "slider-stages", "descent", "paper"} <= color
     assert not {"progressive-off", "sharpness-off", "slider-even", "no-groups"} & color
@@ -91,10 +91,8 @@ def test_only_what_makes_a_difference_to_the_run_is_tried(options: TrainOptions)
 
 
 @pytest.mark.parametrize("variant", VARIANTS, ids=lambda variant: variant.name)
-def test_a_variant_differs_from_another_in_one_value_of_the_plan(
-    variant: Variant, options: TrainOptions
-) -> None:
-    """The paper's preset alone differs in many: it is the preset, but for scene, views and steps."""
+def test_variant_differs_from_its_base_in_one_plan_value(variant: Variant, options: TrainOptions) -> None:
+    """Allow only `paper` to differ in many values. It is the preset except for scene, views and steps."""
     own = with_values(options, sh="auto", progressive="decay", perceptual_weight=0.1)
     other = next(one for one in VARIANTS if one.name == variant.of)
     now = plan_values(variant.plan(resolve(own)))
@@ -120,7 +118,7 @@ def test_every_refinement_has_a_variant_without_it(part: str) -> None:
 
 
 @pytest.mark.parametrize("variant", [v for v in VARIANTS if v.patches], ids=lambda variant: variant.name)
-def test_what_a_variant_patches_is_there_and_is_put_back(variant: Variant) -> None:
+def test_variant_patches_existing_names_and_restores_them(variant: Variant) -> None:
     def values() -> list[object]:
         return [pkgutil.resolve_name(name) for name in variant.patches]
 
@@ -130,7 +128,7 @@ def test_what_a_variant_patches_is_there_and_is_put_back(variant: Variant) -> No
     assert values() == before
 
 
-def test_a_seed_reaches_what_descends_and_the_network_and_nothing_that_is_solved_for(
+def test_seed_reaches_descent_and_network_but_no_solved_variant(
     options: TrainOptions,
 ) -> None:
     plan = resolve(options)
@@ -141,7 +139,7 @@ def test_a_seed_reaches_what_descends_and_the_network_and_nothing_that_is_solved
     assert (later["optimize.seed"], later["field.seed"], later["editor.seed"]) == (2, 2, 0)
 
 
-def test_an_unknown_variant_and_one_without_effect_are_told_apart(options: TrainOptions) -> None:
+def test_unknown_and_ineffective_variants_have_separate_errors(options: TrainOptions) -> None:
     variants = differing_variants(resolve(options), "color", 4, 1)
     assert [v.name for v in choose_variants(variants, "no-sh, base")] == ["base", "no-sh"]
     with pytest.raises(ProgdfError, match="'warmup' does not exist; choose of base,"):
@@ -152,9 +150,7 @@ def test_an_unknown_variant_and_one_without_effect_are_told_apart(options: Train
         choose_variants(variants, " ,")
 
 
-def test_a_file_in_the_place_of_the_ablations_folder_is_one_line(
-    options: TrainOptions, tmp_path: Path
-) -> None:
+def test_file_named_like_the_ablation_folder_is_refused(options: TrainOptions, tmp_path: Path) -> None:
     copy = tmp_path / "run"
     shutil.copytree(options.out, copy, ignore=shutil.ignore_patterns("ablation"))
     (copy / "ablation").touch()
@@ -162,14 +158,12 @@ def test_a_file_in_the_place_of_the_ablations_folder_is_one_line(
         ablate(AblateOptions((copy,), threads=1), quiet=True)
 
 
-def test_the_plan_of_a_run_is_read_back_as_it_was(options: TrainOptions) -> None:
+def test_run_plan_is_read_back_unchanged(options: TrainOptions) -> None:
     resolved = with_values(recorded_options(resolve(options)), group_steps=0)
     assert run_plan(reopen_run(options.out)) == resolved, "with what the run found out"
 
 
-def test_every_variant_is_a_row_of_the_table_a_row_of_the_picture_and_an_edit_to_open(
-    options: TrainOptions, run: Path
-) -> None:
+def test_every_variant_has_a_table_row_a_picture_row_and_a_gdf(options: TrainOptions, run: Path) -> None:
     found = json.loads((run / "ablation" / "ablation.json").read_text(encoding="utf-8"))
     assert [row["name"] for row in found["variants"]] == ONLY.split(",")
     markdown = (run / "ablation" / "ablation.md").read_text(encoding="utf-8")
@@ -184,7 +178,7 @@ def test_every_variant_is_a_row_of_the_table_a_row_of_the_picture_and_an_edit_to
     assert not list((run / "ablation").glob("*/state"))
 
 
-def test_variants_of_the_slider_share_one_optimization_and_end_alike(run: Path) -> None:
+def test_slider_variants_share_one_optimization_and_endpoint(run: Path) -> None:
     rows = json.loads((run / "ablation" / "ablation.json").read_text(encoding="utf-8"))["variants"]
     base, linear, plain, by_time = rows
     assert base["psnr"] == by_time["psnr"] == plain["psnr"], "the end is solved for whatever the way"
@@ -195,14 +189,14 @@ def test_variants_of_the_slider_share_one_optimization_and_end_alike(run: Path) 
     assert "going on" not in (run / "ablation/one-target/log.txt").read_text(encoding="utf-8")
 
 
-def test_a_variant_is_judged_at_strengths_that_it_was_never_shown(run: Path) -> None:
+def test_variants_are_evaluated_at_untrained_strengths(run: Path) -> None:
     rows = json.loads((run / "ablation" / "ablation.json").read_text(encoding="utf-8"))["variants"]
     for row in rows:
         assert set(row["between"]) == {"0.25", "0.5", "0.75"}
-    assert rows[0]["between"]["0.5"] > rows[2]["between"]["0.5"] + 3  # stages are for what lies between
+    assert rows[0]["between"]["0.5"] > rows[2]["between"]["0.5"] + 3  # stages improve these strengths
 
 
-def test_what_is_done_is_not_done_again_until_the_edited_views_change(
+def test_finished_variants_are_reused_until_edited_views_change(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(benchmarks.ablation.ablate, "optimize_members", _nothing_trains)
@@ -220,7 +214,7 @@ def test_what_is_done_is_not_done_again_until_the_edited_views_change(
         path.write_bytes(kept)
 
 
-def test_an_interrupted_ablation_keeps_what_is_done_and_goes_on(
+def test_interrupted_ablation_resumes_after_finished_variants(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real = benchmarks.ablation.ablate.optimize_members
@@ -238,7 +232,7 @@ def test_an_interrupted_ablation_keeps_what_is_done_and_goes_on(
     assert "no-sh" in [row.first.name for row in done.rows]
 
 
-def test_a_variant_that_breaks_down_is_a_row_that_says_so(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_ablation_variant_is_reported_as_a_row(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: object, **__: object) -> object:
         raise ProgdfError("training failed") from FloatingPointError("the loss is nan at step 7")
 
@@ -249,14 +243,14 @@ def test_a_variant_that_breaks_down_is_a_row_that_says_so(run: Path, monkeypatch
     assert "paper: the loss is nan at step 7." in markdown
 
 
-def test_what_is_no_finished_run_is_one_line(tmp_path: Path) -> None:
+def test_ablate_refuses_a_folder_without_a_finished_run(tmp_path: Path) -> None:
     for folder in (tmp_path, tmp_path / "nowhere"):
         with pytest.raises(ProgdfError, match="give a folder that progdf train finished"):
             ablate_command([str(folder)])
     assert not list(tmp_path.iterdir())
 
 
-def test_the_command_prints_a_table_that_fits_a_terminal(
+def test_ablate_table_fits_a_terminal(
     run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(benchmarks.ablation.ablate, "optimize_members", _nothing_trains)
@@ -267,7 +261,7 @@ def test_the_command_prints_a_table_that_fits_a_terminal(
     assert not any("…" in line for line in lines)
 
 
-def test_a_failure_has_dashes_for_figures_and_its_reason_below() -> None:
+def test_failed_row_shows_dashes_and_its_reason_below() -> None:
     rows = [VariantRow([Outcome("paper", "as printed", "base", failed="the loss is nan")])]
     table = table_of([Ablation("robot", "title", "note", rows, "LPIPS")], "title")
     assert set(table.rows[0][4:]) == {"–"}
@@ -275,7 +269,7 @@ def test_a_failure_has_dashes_for_figures_and_its_reason_below() -> None:
     assert "paper: the loss is nan." in table.note
 
 
-def test_a_draft_thins_strengths_and_steps_and_keeps_its_figures_apart(
+def test_quick_ablation_uses_fewer_strengths_and_separate_results(
     options: TrainOptions, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     copy = tmp_path / "run"
@@ -294,9 +288,7 @@ def test_a_draft_thins_strengths_and_steps_and_keeps_its_figures_apart(
 
 
 @pytest.mark.slow
-def test_a_descent_has_other_figures_with_another_seed_and_one_solved_for_has_one_row_for_all(
-    options: TrainOptions, tmp_path: Path
-) -> None:
+def test_only_seeded_variants_get_one_row_per_seed(options: TrainOptions, tmp_path: Path) -> None:
     copy = tmp_path / "run"
     picture = tmp_path / "all.png"
     page = tmp_path / "page.md"
@@ -317,7 +309,7 @@ def test_a_descent_has_other_figures_with_another_seed_and_one_solved_for_has_on
 
 
 @pytest.mark.slow
-def test_a_network_is_trained_beside_the_members_and_shipped(
+def test_network_variant_is_trained_and_saved(
     options: TrainOptions, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     copy = tmp_path / "run"
@@ -344,7 +336,7 @@ def test_a_network_is_trained_beside_the_members_and_shipped(
     assert not torch.equal(*weights)
 
 
-def test_what_cannot_be_met_is_told_before_anything_is_trained(run: Path, tmp_path: Path) -> None:
+def test_invalid_ablate_options_fail_before_training(run: Path, tmp_path: Path) -> None:
     for asked, told in (
         (AblateOptions(()), "ablate needs a run"),
         (AblateOptions((run,), seeds=0), "--seeds must be at least 1, got 0"),

@@ -1,4 +1,4 @@
-"""The benchmarks of training and of fields run, put an error beside every speed, and draw both."""
+"""Tests of the training and field benchmarks: every speed has an error, and both are plotted."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-def test_a_training_is_timed_beside_its_error_in_views_of_nobodys(small: None, tmp_path: Path) -> None:
+def test_training_benchmark_reports_time_and_held_out_error(small: None, tmp_path: Path) -> None:
     (made,) = training.tables(plot=tmp_path / "training.png")
     ((edit, way, at_1, worst, between, processor, wall, size),) = made.rows
     assert (edit, way) == ("bear, stripes:#20a040", f"`{training.WAYS[0]}`")
@@ -41,7 +41,7 @@ def test_a_training_is_timed_beside_its_error_in_views_of_nobodys(small: None, t
 
 
 @pytest.mark.slow
-def test_every_form_of_field_is_judged_alike_and_the_shipped_one_is_marked(
+def test_all_field_forms_are_compared_and_the_shipped_form_is_marked(
     small: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     shrink_field(monkeypatch)
@@ -62,7 +62,7 @@ def test_every_form_of_field_is_judged_alike_and_the_shipped_one_is_marked(
         assert picture.width == 2 * 380
 
 
-def test_keyframes_in_oklab_have_the_ends_of_raw_ones_and_go_straight_between() -> None:
+def test_oklab_keyframes_match_raw_ends_and_are_straight_between() -> None:
     rng = torch.Generator().manual_seed(0)
     start = torch.randn(50, 14, generator=rng)
     end = torch.randn(50, 14, generator=rng)
@@ -78,7 +78,7 @@ def test_keyframes_in_oklab_have_the_ends_of_raw_ones_and_go_straight_between() 
     torch.testing.assert_close(srgb_to_oklab(half), ends.mean(dim=0), atol=1e-5, rtol=0)
 
 
-def test_a_scene_is_recolored_where_labels_lie_beside_it_and_else_tinted(small: None, tmp_path: Path) -> None:
+def test_labeled_scenes_are_recolored_and_others_tinted(small: None, tmp_path: Path) -> None:
     (tmp_path / "robot_labels.npy").touch()
     robot = tmp_path / "robot.ply"
     guitar = tmp_path / "guitar.splat"
@@ -90,15 +90,15 @@ def test_a_scene_is_recolored_where_labels_lie_beside_it_and_else_tinted(small: 
     ]
 
 
-def test_the_training_table_names_the_worst_strength_between() -> None:
+def test_training_table_names_the_worst_intermediate_strength() -> None:
     runs = [TimedEdit("", 9.6, 12.3, (31.0, 30.0, 33.0, 34.0, 35.0), 6.0)]
     (row,) = table({TrainingTask(Path("a.ply"), "all", "tint:#c08040"): runs}).rows
     assert row == ("a, tint:#c08040", "(default)", "35.0", "30.0", "31.0 30.0 33.0 34.0", "12", "10", "6")
 
 
-def test_a_point_is_drawn_where_its_error_is(tmp_path: Path) -> None:
+def test_plot_places_points_by_error(tmp_path: Path) -> None:
     def height(psnr: float) -> float:
-        """Where the second point of two is, the first at 30 dB."""
+        """Return the row of the second of two points; the first is at 30 dB."""
         points = [Point("a", 3.0, (30.0, 30.0)), Point("b", 6.0, (psnr, psnr), True)]
         save_plot({"bear": points, "robot": points}, "bytes", tmp_path / "two.png")
         with Image.open(tmp_path / "two.png") as picture:

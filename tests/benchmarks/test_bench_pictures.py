@@ -1,4 +1,4 @@
-"""`python -m benchmarks pictures`: a few of a rig's pictures are given, the others judge."""
+"""Tests of `python -m benchmarks pictures`, which evaluates edits of some pictures of a rig on the others."""
 
 from __future__ import annotations
 
@@ -15,9 +15,7 @@ from tests.helpers.demo_scenes import bear
 from trainer.views.view import View, make_view
 
 
-def test_a_fill_comes_nearer_from_two_sides_than_from_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_fill_from_two_sides_is_closer_than_from_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     demo = bear(1500)
     save_ply(tmp_path / "bear.ply", demo.gaussians)
     body = np.zeros(1500, np.int64)
@@ -28,18 +26,18 @@ def test_a_fill_comes_nearer_from_two_sides_than_from_one(
     monkeypatch.setattr(pictures, "GIVEN", ((0,), (0, 3)))
     (table,) = pictures.tables([tmp_path / "bear.ply"])
     assert [row[1] for row in table.rows] == ["0", "0, 3"]
-    assert table.rows[0][5] != "-" == table.rows[1][5]  # behind one picture, but not behind two
+    assert table.rows[0][5] != "-" == table.rows[1][5]  # hidden behind one view, not behind two
     means = [float(row[3].split(" / ")[0]) for row in table.rows]
     assert means[1] > means[0] - 1.0
     assert min(means) > 18.0
 
 
-def test_pictures_without_a_scene_are_one_line() -> None:
+def test_pictures_benchmark_without_a_scene_is_refused() -> None:
     with pytest.raises(ProgdfError, match="need a scene; name one with --scenes"):
         pictures.tables()
 
 
-def test_a_half_that_is_painted_leaves_the_other_as_it_was(
+def test_painting_one_half_leaves_the_other_unchanged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     save_ply(tmp_path / "bear.ply", bear(1500).gaussians)

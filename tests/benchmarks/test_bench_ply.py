@@ -1,9 +1,9 @@
-"""Loading a .ply against merely reading its bytes.
+"""Benchmark of loading a .ply against reading its raw bytes.
 
     pytest tests/benchmarks/test_bench_ply.py -o addopts= --benchmark-enable
 
-The ways are interleaved in one process; the file lies in the page cache. With benchmarks disabled, as they
-are by default, each runs once on a small scene, so that the benchmark itself stays tested.
+The methods are interleaved in one process, and the file is in the page cache. With benchmarks disabled (the
+default), each method runs once on a small scene, which keeps the benchmark itself tested.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def seconds(work: object, path: Path) -> float:
     return taken
 
 
-def test_loading_sh3_rows_against_the_raw_read(
+def test_load_ply_time_against_a_raw_read(
     tmp_path: Path, request: pytest.FixtureRequest, capsys: pytest.CaptureFixture[str]
 ) -> None:
     measuring = not request.config.getoption("benchmark_disable")

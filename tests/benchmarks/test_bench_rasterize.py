@@ -1,4 +1,4 @@
-"""The rasterizer's benchmark runs, and the engine keeps its floor of speed at its ceiling of error."""
+"""Tests of the rasterizer benchmark: minimum speed and maximum error of the CPU engine."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.helpers.camera_tables import REFUSED_VIEWMATS
 from tests.helpers.drawn import NEEDS_WARP
 
 
-def test_the_rasterizer_benchmark_names_an_error_beside_every_speed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rasterizer_benchmark_reports_an_error_beside_every_speed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench_rasterize, "CASES", (RasterCase(60, 32), RasterCase(90, 40, baseline=False)))
     monkeypatch.setattr(bench_rasterize, "measure", lambda case: measure(case, rounds=1, torch_rounds=1))
     table, lists = tables()
@@ -44,7 +44,7 @@ def test_every_hard_case_has_a_row_with_its_largest_errors(monkeypatch: pytest.M
 
 
 @NEEDS_WARP
-def test_the_engine_warp_has_a_row_that_names_its_device_and_its_errors() -> None:
+def test_warp_row_names_its_device_and_errors() -> None:
     (table,) = warp_tables([RasterCase(60, 32), RasterCase(90, 40, False, 24)], rounds=1)
     cells = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
     assert [row["pixels"] for row in cells] == ["32×32", "40×24"]
@@ -58,14 +58,14 @@ def test_the_engine_warp_has_a_row_that_names_its_device_and_its_errors() -> Non
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", [RasterCase(2_000, 128), RasterCase(20_000, 256)], ids=["2k", "20k"])
-def test_the_cpu_engine_is_40_times_faster_than_a_tiled_torch_renderer(case: RasterCase) -> None:
-    """On one thread each, where a busy machine slows both alike; 90 and 105 times were measured."""
+def test_cpu_engine_is_40_times_faster_than_tiled_torch(case: RasterCase) -> None:
+    """Compare both on one thread each, as a busy machine slows both alike. 90 and 105 times were measured."""
     assert measure(case).duels[0].ratio >= 40.0
 
 
 @pytest.mark.parametrize("case", [RasterCase(2_000, 128), RasterCase(20_000, 256)], ids=["2k", "20k"])
 @pytest.mark.slow
-def test_the_cpu_engine_is_that_fast_at_the_error_it_promises(case: RasterCase) -> None:
+def test_cpu_engine_keeps_its_error_limits_at_full_speed(case: RasterCase) -> None:
     result = measure(case, rounds=1, torch_rounds=1)
     assert result.image_error <= 2e-6
     assert max(result.gradient_errors.values()) <= 2e-5, result.gradient_errors

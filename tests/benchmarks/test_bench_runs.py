@@ -1,4 +1,4 @@
-"""The benchmarks of finished runs: edits beside what is simpler, networks trained to the end."""
+"""Tests of the benchmarks of finished runs: edits against simpler baselines, and fully trained networks."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from tests.helpers.trained import quick_options, train, write_bear
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run of a few seconds."""
+    """Return the folder of a finished run of a few seconds."""
     folder = tmp_path_factory.mktemp("bear")
     write_bear(folder)
     options = quick_options(folder, steps=24, stages=2, views=10, image_size=72)
     return train(options, quiet=True).folder.root
 
 
-def test_far_views_are_raised_lowered_and_zoomed_and_look_at_the_region() -> None:
+def test_far_cameras_are_raised_lowered_and_zoomed_at_the_region() -> None:
     center = torch.tensor([1.0, 2.0, 3.0])
     up = torch.tensor([0.0, 1.0, 0.0])
     eye = center + torch.tensor([4.0, 0.0, 0.0])
@@ -40,7 +40,7 @@ def test_far_views_are_raised_lowered_and_zoomed_and_look_at_the_region() -> Non
         assert float(seen[2]) == pytest.approx(4.0, abs=1e-4)
 
 
-def test_edits_stand_beside_simpler_ones_at_101_values_and_in_far_views(
+def test_edits_are_compared_with_baselines_at_all_strengths(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bench_edits, "VALUES", 11)
@@ -56,7 +56,7 @@ def test_edits_stand_beside_simpler_ones_at_101_values_and_in_far_views(
     assert "-" not in values.rows[0], "this editor can be asked for views from elsewhere"
 
 
-def test_a_network_is_trained_once_judged_and_timed_and_one_that_takes_too_long_is_timed(
+def test_networks_are_trained_once_and_long_ones_only_timed(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     few = {"tiny": NeuralSettings("tiny", steps=4), "long": NeuralSettings("tiny", steps=10**7)}
@@ -76,6 +76,6 @@ def test_a_network_is_trained_once_judged_and_timed_and_one_that_takes_too_long_
 
 
 @pytest.mark.parametrize("tables", [bench_edits.tables, bench_networks.tables])
-def test_without_a_run_there_is_nothing_to_measure(tables: object) -> None:
+def test_benchmarks_of_runs_without_a_run_are_refused(tables: object) -> None:
     with pytest.raises(ProgdfError, match="name some with --runs"):
         tables()  # type: ignore[operator]

@@ -1,4 +1,4 @@
-"""The viewer's benchmarks on scenes small enough for a test: they run, and measure what they say."""
+"""Tests of the viewer benchmarks on small scenes: they run and measure the documented quantity."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ SIZE = (460, 400)
 
 
 @pytest.mark.gl
-def test_the_slider_table_has_a_row_for_each_way_to_draw_with_its_error() -> None:
+def test_slider_table_has_a_row_with_error_for_each_renderer() -> None:
     ctx = headless_context()
     results = bench.rows(ctx, bear(600).gaussians, SliderCase(100, True), steps=2, size=SIZE)
     ctx.release()
@@ -59,7 +59,7 @@ def test_the_slider_table_has_a_row_for_each_way_to_draw_with_its_error() -> Non
 
 
 @pytest.mark.gl
-def test_frames_are_counted_one_a_turn_and_are_the_same_drawn_afresh(tmp_path: Path) -> None:
+def test_turning_benchmark_draws_a_new_correct_frame_per_step(tmp_path: Path) -> None:
     path = tmp_path / "bear.ply"
     save_ply(path, bear(600).gaussians)
     ctx = headless_context()
@@ -85,7 +85,7 @@ def test_frames_are_counted_one_a_turn_and_are_the_same_drawn_afresh(tmp_path: P
 @pytest.mark.gl
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="no process is halted there")
-def test_a_scene_in_the_hand_is_timed_beside_the_error_of_its_motion(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_moving_scene_is_timed_with_its_error_beside_a_training(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(moving, "_SETTLE_S", 0.05)
     ctx = headless_context()
     with begin_training(bear(600).gaussians, *SMALL_TRAINING) as training:
@@ -101,10 +101,10 @@ def test_a_scene_in_the_hand_is_timed_beside_the_error_of_its_motion(monkeypatch
 
 
 @pytest.mark.gl
-def test_a_picture_at_rest_is_looked_at_once_it_is_sharp(
+def test_idle_picture_is_checked_only_once_it_is_sharp(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """A large scene's sharp picture is made beside the window's work and comes some frames later."""
+    """Simulate a large scene, whose sharp picture is made in the background and arrives some frames later."""
     path = tmp_path / "bear.ply"
     asked = list[int]()
     save_ply(path, bear(600).gaussians)
@@ -123,7 +123,7 @@ def test_a_picture_at_rest_is_looked_at_once_it_is_sharp(
     assert [turning.at_rest for turning in turnings] == [0, 0]
 
 
-def test_a_film_of_moving_pictures_has_what_changes_in_it_alone() -> None:
+def test_popping_film_measures_only_changing_pixels() -> None:
     scene = bear(1500).gaussians
     views = [replace(first_camera(scene), azimuth=turn) for turn in (0.0, 1.0, 2.0)]
     turned, still = (popping.film("a path", scene, path, (240, 200)) for path in (views, views[:1] * 2))
@@ -135,7 +135,7 @@ def test_a_film_of_moving_pictures_has_what_changes_in_it_alone() -> None:
 
 
 @pytest.mark.gl
-def test_a_moving_picture_is_compared_as_the_screen_stretches_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_moving_picture_is_compared_as_stretched_to_the_screen(monkeypatch: pytest.MonkeyPatch) -> None:
     size = (43, 30)
     drawn = np.random.default_rng(0).random((15, 22, 3), np.float32)
     screen = np.zeros((size[1], size[0], 4), np.uint8)
@@ -152,7 +152,7 @@ def test_a_moving_picture_is_compared_as_the_screen_stretches_it(monkeypatch: py
     assert abs(apart) < 1e-3
 
 
-def test_slow_frames_are_repeated_as_often_as_there_is_time_for() -> None:
+def test_number_of_steps_is_limited_by_the_time_per_frame() -> None:
     assert bench_frames.affordable_steps(20, 0.05) == 20
     assert bench_frames.affordable_steps(20, bench_frames.TURN_S / 7.5) == 7
     assert bench_frames.affordable_steps(20, 1e4) == bench_frames.MIN_STEPS
@@ -160,7 +160,7 @@ def test_slow_frames_are_repeated_as_often_as_there_is_time_for() -> None:
 
 
 @pytest.mark.gl
-def test_slow_turns_end_early_and_still_have_their_pictures(
+def test_slow_turns_end_early_but_keep_their_pictures(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     path = tmp_path / "bear.ply"
@@ -175,7 +175,7 @@ def test_slow_turns_end_early_and_still_have_their_pictures(
 
 
 @pytest.mark.gl
-def test_a_frame_in_the_order_of_the_last_one_is_found(
+def test_frame_in_the_previous_sort_order_is_detected(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     path = tmp_path / "bear.ply"
@@ -183,7 +183,7 @@ def test_a_frame_in_the_order_of_the_last_one_is_found(
     sort, last = engine.back_to_front, dict[int, Any]()
 
     def stale(means: Any, camera: Camera) -> Any:
-        """What was right for the engine's picture before."""
+        """Return the order of the engine's previous picture."""
         order = sort(means, camera)
         before = last.setdefault(means.ctypes.data, order)
         last[means.ctypes.data] = order
@@ -197,7 +197,7 @@ def test_a_frame_in_the_order_of_the_last_one_is_found(
 
 
 @pytest.mark.gl
-def test_the_mouse_finds_the_sliders_handle_and_the_picture() -> None:
+def test_mouse_finds_the_slider_handle_and_the_picture() -> None:
     scene = bear(600).gaussians
     gdf = edit_for(scene, 50, moves=False)
     ctx = headless_context()
@@ -219,7 +219,7 @@ def test_the_mouse_finds_the_sliders_handle_and_the_picture() -> None:
     ctx.release()
 
 
-def test_made_up_scenes_and_edits_are_the_same_every_time_and_as_large_as_they_say(tmp_path: Path) -> None:
+def test_generated_scenes_and_edits_are_reproducible_and_sized(tmp_path: Path) -> None:
     scene = bear(600).gaussians
     many = copies(scene, 3)
     radius = bounds_of(scene).radius
@@ -238,7 +238,7 @@ def test_made_up_scenes_and_edits_are_the_same_every_time_and_as_large_as_they_s
     assert [len(s) for s in scenes_of([tmp_path / "b.ply", tmp_path / "a.ply"])] == [200, 300]
 
 
-def test_one_odd_sample_is_no_leak_and_a_steady_rise_is_one() -> None:
+def test_memory_slope_ignores_an_outlier_and_finds_a_steady_rise() -> None:
     times = tuple(float(i) for i in range(60))
     flat = [500.0] * 60
     flat[50] = 480.0
@@ -254,7 +254,7 @@ def test_one_odd_sample_is_no_leak_and_a_steady_rise_is_one() -> None:
 @pytest.mark.window
 @pytest.mark.gl
 @pytest.mark.slow
-def test_the_real_window_is_watched_at_rest_and_while_its_slider_is_dragged(
+def test_real_window_is_measured_idle_and_during_a_slider_drag(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     if missing := missing_tools():
@@ -273,7 +273,7 @@ def test_the_real_window_is_watched_at_rest_and_while_its_slider_is_dragged(
 @pytest.mark.window
 @pytest.mark.gl
 @pytest.mark.slow
-def test_the_first_picture_of_progdf_view_is_timed_from_its_start(tmp_path: Path) -> None:
+def test_first_frame_of_progdf_view_is_timed_from_process_start(tmp_path: Path) -> None:
     if missing := missing_tools():
         pytest.skip(f"{missing} is not installed")
     save_ply(tmp_path / "bear.ply", bear(600).gaussians)
@@ -282,14 +282,14 @@ def test_the_first_picture_of_progdf_view_is_timed_from_its_start(tmp_path: Path
     assert start.memory_mb > 50.0
 
 
-def test_options_of_one_benchmark_are_refused_where_it_does_not_run(tmp_path: Path) -> None:
+def test_options_of_another_benchmark_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ProgdfError, match="use python -m benchmarks viewer"):
         front.main(["rasterize", "--scenes", str(tmp_path / "a.ply")])
     with pytest.raises(ProgdfError, match="use python -m benchmarks window"):
         front.main(["frames", "--seconds", "3"])
 
 
-def test_what_cannot_be_measured_here_is_said_and_left_out_unless_it_was_named(
+def test_unmeasurable_benchmarks_are_skipped_unless_named(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def refuse(**_: object) -> list[Table]:

@@ -1,4 +1,4 @@
-"""`python -m benchmarks`: what cannot be written down is not measured."""
+"""Tests of `python -m benchmarks`: outputs are checked before anything is measured."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from progdf.errors import ProgdfError
 
 
 @pytest.mark.parametrize("option", ["--json", "--plots", "--markdown"])
-def test_a_benchmark_that_could_not_be_written_down_is_not_begun(
+def test_benchmark_with_an_unwritable_output_is_not_started(
     option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("benchmarks.__main__.BENCHES", {"field": "nowhere:begun"})
@@ -25,7 +25,9 @@ def test_a_benchmark_that_could_not_be_written_down_is_not_begun(
         main(["field", option, str(tmp_path / "no" / "f.x")])
 
 
-def test_nothing_is_measured_where_a_scene_is_broken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_broken_scene_stops_the_benchmark_before_measuring(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     broken = tmp_path / "scene.ply"
     broken.write_text("ply\n")
     monkeypatch.setattr(command, "_function", lambda name: pytest.fail(f"{name} was begun"))
@@ -33,7 +35,7 @@ def test_nothing_is_measured_where_a_scene_is_broken(tmp_path: Path, monkeypatch
         main(["page", "--scenes", str(broken)])
 
 
-def test_an_unknown_benchmark_is_named_with_those_there_are() -> None:
+def test_unknown_benchmark_error_lists_the_known_ones() -> None:
     with pytest.raises(ProgdfError, match=r"unknown benchmark 'speed'; use one of training, .*ablate"):
         main(["speed"])
 
@@ -43,12 +45,12 @@ def _table(**_: object) -> list[Table]:
 
 
 @pytest.mark.parametrize(("busy", "ms"), [(0.0, "7"), (0.5, "–")])
-def test_wall_times_are_left_out_where_others_use_the_cores(
+def test_wall_times_are_omitted_on_a_busy_machine(
     busy: float, ms: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(command, "BENCHES", {"hard": "here"})
     monkeypatch.setattr(command, "_function", lambda path: _table)
-    shares = iter((0.0, busy))  # before and after
+    shares = iter((0.0, busy))  # busy share before and after the measurement
     monkeypatch.setattr(command, "busy_share", lambda: next(shares))
     page = tmp_path / "page.md"
     page.write_text(
@@ -63,8 +65,8 @@ def test_wall_times_are_left_out_where_others_use_the_cores(
     assert f"<!-- bench machine -->\n{machine()}\n<!-- end machine -->" in text
 
 
-def test_a_loop_in_another_process_is_seen() -> None:
-    """A loop on every core, beside which half of each is left."""
+def test_busy_share_sees_loops_in_other_processes() -> None:
+    """Run a loop on every core, which leaves half of each core."""
     loop = [sys.executable, "-c", "while True: pass"]
     children = [subprocess.Popen(loop) for _ in range(os.cpu_count() or 1)]
     try:
@@ -75,7 +77,7 @@ def test_a_loop_in_another_process_is_seen() -> None:
             child.wait()
 
 
-def test_page_is_all_that_its_document_has_markers_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_page_runs_exactly_the_benchmarks_with_markers(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[str] = []
     monkeypatch.setattr(command, "_function", lambda path: lambda **_: asked.append(path) or [])
     monkeypatch.setattr(command, "atomic_write", lambda path: pytest.fail("nothing was measured"))

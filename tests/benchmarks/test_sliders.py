@@ -1,4 +1,4 @@
-"""The suite of known courses: what is trained is compared with the truth, and trained only once."""
+"""Tests of the suite of known trajectories, which compares edits with the truth and trains them once."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ pytestmark = pytest.mark.slow  # trains its edits
 def suite(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[CaseResult]]:
     folder = tmp_path_factory.mktemp("suite")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("benchmarks.sliders.bear", bear)  # made once for many tests
+        patch.setattr("benchmarks.sliders.bear", bear)  # built once for many tests
         return folder, _run(folder)
 
 
-def test_every_edit_is_compared_at_eleven_strengths_and_exact_at_the_first(
+def test_edits_are_compared_at_eleven_strengths_and_exact_at_zero(
     suite: tuple[Path, list[CaseResult]],
 ) -> None:
     for result in suite[1]:
@@ -43,7 +43,7 @@ def test_every_edit_is_compared_at_eleven_strengths_and_exact_at_the_first(
             assert curve.psnr[-1] == result.curves["slider"].psnr[-1]
 
 
-def test_a_slider_that_has_seen_the_course_follows_it_and_a_cross_fade_does_not(
+def test_trained_slider_follows_the_trajectory_better_than_a_fade(
     suite: tuple[Path, list[CaseResult]],
 ) -> None:
     for result in suite[1]:
@@ -51,7 +51,7 @@ def test_a_slider_that_has_seen_the_course_follows_it_and_a_cross_fade_does_not(
         assert ours > fade + 9 * 3.0, result.case.name
 
 
-def test_a_second_time_nothing_is_trained_and_all_figures_are_the_same(
+def test_second_suite_run_trains_nothing_and_repeats_the_figures(
     suite: tuple[Path, list[CaseResult]],
 ) -> None:
     folder, first = suite
@@ -61,7 +61,7 @@ def test_a_second_time_nothing_is_trained_and_all_figures_are_the_same(
     assert [result.curves for result in again] == [result.curves for result in first]
 
 
-def test_the_table_has_a_row_an_edit_and_the_picture_shows_them(
+def test_suite_table_and_picture_contain_every_edit(
     suite: tuple[Path, list[CaseResult]],
 ) -> None:
     results = suite[1]
@@ -71,7 +71,7 @@ def test_the_table_has_a_row_an_edit_and_the_picture_shows_them(
     assert suite_picture(results).shape[2] == 3
 
 
-def test_every_analytic_edit_of_the_suite_is_one_of_the_bears() -> None:
+def test_every_analytic_edit_of_the_suite_is_a_bear_edit() -> None:
     edits = bear_edits(bear(1500))
     assert {case.name for case in CASES if not case.editor} <= set(edits)
     assert len({case.folder for case in CASES}) == len(CASES)
