@@ -14,14 +14,14 @@ from tests.helpers.documented_files import train_documented_runs, write_document
 
 @pytest.fixture(scope="session", autouse=True)
 def plots() -> Iterator[None]:
-    """Leave out the curves of reports, which take half of the time of a small run."""
+    """Leave out the plots of reports, which take half of the time of a small run."""
     with blank_plots():
         yield
 
 
 @pytest.fixture(scope="session")
 def documented_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Template of the folder in which the documents' commands are typed."""
+    """Return the template of the folder in which the documented commands run."""
     folder = tmp_path_factory.mktemp("documented")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -31,7 +31,7 @@ def documented_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def documented_runs(documented_files: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Template with finished runs in place of bare .gdf files."""
+    """Return the template with finished runs in place of bare .gdf files."""
     folder = tmp_path_factory.mktemp("trained") / "documented"
     shutil.copytree(documented_files, folder)
     with pytest.MonkeyPatch.context() as patch:
@@ -42,13 +42,13 @@ def documented_runs(documented_files: Path, tmp_path_factory: pytest.TempPathFac
 
 @pytest.fixture
 def here(documented_files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Current folder: a copy of `documented_files`."""
+    """Enter a copy of `documented_files` as the current folder."""
     return _enter_copy(documented_files, tmp_path, monkeypatch)
 
 
 @pytest.fixture
 def beside_runs(documented_runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Current folder: a copy of `documented_runs`."""
+    """Enter a copy of `documented_runs` as the current folder."""
     return _enter_copy(documented_runs, tmp_path, monkeypatch)
 
 

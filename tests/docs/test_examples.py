@@ -48,7 +48,7 @@ REFUSALS = {
     "progdf batch catalogue.toml --out /shared/runs --address HEAD:6379 --dry-run": NO_CLUSTER,
     "progdf batch catalogue.toml --out /shared/runs --address HEAD:6379": NO_CLUSTER,
 }
-"""Commands that end with status 2 here: why, and a regular expression for their one line."""
+"""Commands that end with status 2 here: the reason, and a regular expression for their one line."""
 
 DRY_RUNS = {
     "make setup": "installs packages",
@@ -73,10 +73,10 @@ PLACEHOLDERS = {
     "AZ,EL": "30,15",
     "/shared/runs": "shared/runs",
 }
-"""Words of the documents that stand for a user's own, and their values here."""
+"""Placeholder words of the documents and their values in the tests."""
 
 TRAINING = {"--views": "5", "--image-size": "48", "--steps": "24", "--stages": "2", "--threads": "1"}
-"""Options that are appended to `progdf train` where the line does not give them."""
+"""Options appended to `progdf train` if the command does not give them."""
 
 NEEDS_RUNS = ("progdf fit", "progdf evaluate", "python -m benchmarks edits", "python -m benchmarks ablate")
 SLOW = ("progdf train", "progdf demo", "progdf batch", "python", *NEEDS_RUNS)
@@ -92,7 +92,7 @@ EXTRAS = {
 
 
 def is_slow(example: Example) -> bool:
-    """Return whether a command takes more than a second or two."""
+    """Return True for a command that takes more than a second or two."""
     return example.text.startswith(SLOW)
 
 
@@ -119,7 +119,7 @@ def cheap_options(words: list[str]) -> list[str]:
 
 
 def different_examples() -> list[Example]:
-    """Return the documented commands, but one alone of those that a test would run with the same words."""
+    """Return the documented commands, each once if a test would run several with the same words."""
     found: dict[tuple[str, ...], Example] = {}
     for example in command_examples():
         words = [PLACEHOLDERS.get(word, word) for word in example.words]
@@ -149,7 +149,7 @@ def typed_words(example: Example) -> list[str]:
 
 
 def clear_outputs(words: list[str]) -> None:
-    """Remove the output that the template holds already, as a user has none before the command runs."""
+    """Remove the output that the template holds already. A user has none before the command runs."""
     if "--resume" in words or words[1] == "batch":
         return
     for option in ("--out", "-o"):
@@ -159,7 +159,7 @@ def clear_outputs(words: list[str]) -> None:
 
 
 def stop_training(words: list[str]) -> None:
-    """Run a command without its `--resume`, and stop it as Ctrl-C does after its first step."""
+    """Run a command without its `--resume`, and interrupt it as Ctrl-C does after its first step."""
     words = [word for word in words if word != "--resume"]
     clear_outputs(words)
     with pytest.MonkeyPatch.context() as patch:
@@ -208,17 +208,17 @@ def check_example(
 
 
 @pytest.mark.parametrize("example", _params(ALONE))
-def test_a_documented_command_runs(
+def test_documented_command_runs(
     here: Path, example: Example, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     if example.words[0] == "python":
         shrink_benchmarks(monkeypatch)
-        monkeypatch.setattr(benchmarks, "ROOT", here)  # `page` writes the documents below it
+        monkeypatch.setattr(benchmarks, "ROOT", here)  # `page` writes the documents below ROOT
     check_example(example, monkeypatch, capsys)
 
 
 @pytest.mark.parametrize("example", _params(WITH_RUNS))
-def test_a_documented_command_on_a_finished_run_runs(
+def test_documented_command_on_a_finished_run_runs(
     beside_runs: Path, example: Example, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shrink_benchmarks(monkeypatch)
@@ -229,10 +229,10 @@ def test_a_documented_command_on_a_finished_run_runs(
 
 @pytest.mark.gl
 @pytest.mark.parametrize("example", _params(VIEW))
-def test_a_documented_window_opens(
+def test_documented_window_opens(
     here: Path, example: Example, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """On glfw's null platform, closed after its first frame."""
+    """Open it on glfw's null platform and close it after its first frame."""
     opened: list[App] = []
 
     def draw_once(app: App) -> None:
@@ -248,7 +248,7 @@ def test_a_documented_window_opens(
 
 
 @pytest.mark.parametrize("example", _params(MAKE))
-def test_a_documented_target_expands_to_commands_that_exist(example: Example) -> None:
+def test_documented_make_target_expands_to_existing_commands(example: Example) -> None:
     assert example.text in DRY_RUNS
     shown = subprocess.run(
         ["make", "--dry-run", *example.words[1:]], cwd=ROOT, capture_output=True, text=True, check=False
@@ -273,10 +273,10 @@ def test_every_exception_is_still_documented() -> None:
         )
         for example in python_examples()
         if example.document
-        != "docs/recipes.md"  # tests/docs/test_recipes.py runs these and looks at the results
+        != "docs/recipes.md"  # tests/docs/test_recipes.py runs these and checks the results
     ],
 )
-def test_a_documented_block_of_python_runs(here: Path, example: Example) -> None:
+def test_documented_python_block_runs(here: Path, example: Example) -> None:
     camera: Camera = orbit_camera()
     given = {
         "__name__": "example",

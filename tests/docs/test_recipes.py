@@ -1,4 +1,4 @@
-"""docs/recipes.md: its Python blocks and commands, run as they stand on a scene of a few Gaussians."""
+"""Tests of docs/recipes.md: its Python blocks and commands run unchanged on a scene of a few Gaussians."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ PAGE = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
 
 
 def section(heading: str) -> str:
-    """What stands below a heading of the page."""
+    """Return the text below a heading of the page."""
     (text,) = [part for part in PAGE.split("\n## ")[1:] if part.startswith(heading)]
     return text
 
 
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with the files that the page names."""
+    """Enter a folder with the files that the page names."""
     monkeypatch.chdir(tmp_path)
     scene = random_gaussians(60, seed=3, sh_degree=2)
     save_ply("robot.ply", scene)
@@ -47,7 +47,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def run_python(heading: str) -> dict[str, Any]:
-    """The names that the one Python block below a heading leaves behind."""
+    """Run the only Python block below a heading. Return the names it defines."""
     (code,) = blocks(section(heading), "python")
     names: dict[str, Any] = {"__name__": "recipe"}
     exec(compile(code, heading, "exec"), names)
@@ -55,7 +55,7 @@ def run_python(heading: str) -> dict[str, Any]:
 
 
 def run_commands(heading: str) -> int:
-    """Each command below a heading but `train` and `view`; how many they were."""
+    """Run each command below a heading except `train` and `view`. Return their number."""
     lines = [shlex.split(line) for block in blocks(section(heading)) for line in block.splitlines()]
     commands = [words[1:] for words in lines if words[0] == "progdf" and words[1] not in ("train", "view")]
     for words in commands:
@@ -68,7 +68,7 @@ def edited(strength: float) -> Any:
     return compose_layers(scene, [Layer(load_gdf("runs/blue/blue.gdf", scene), strength)])
 
 
-def test_from_python(here: Path) -> None:
+def test_recipe_from_python_renders_and_exports(here: Path) -> None:
     names = run_python("From Python")
     assert names["image"].shape == (24, 32, 3)
     assert Path("edited.png").is_file()
@@ -76,7 +76,7 @@ def test_from_python(here: Path) -> None:
     assert not torch.equal(names["edited"].sh0, names["scene"].sh0)
 
 
-def test_viser_shows_what_the_slider_says(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_viser_shows_the_edit_at_the_slider_strength(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     viser = pytest.importorskip("viser", reason="pip install viser")
     monkeypatch.setattr(viser.ViserServer, "sleep_forever", lambda server: None)
     names = run_python("viser")
@@ -120,9 +120,9 @@ def test_blender_gets_time_samples_in_meters(here: Path) -> None:
     np.testing.assert_array_equal(turned, edited(1.0).means.numpy())
 
 
-def test_supersplat_out_and_in_again(here: Path) -> None:
+def test_supersplat_round_trip_applies_to_a_cropped_scene(here: Path) -> None:
     scene = load_scene("robot.ply")
-    save_ply("cleaned.ply", scene[torch.arange(len(scene) - 1, 3, -1)])  # cropped, in another order
+    save_ply("cleaned.ply", scene[torch.arange(len(scene) - 1, 3, -1)])  # cropped and reordered
     assert run_commands("SuperSplat") == 5
     assert len(list(here.glob("turn_*.ply"))) == 25
     rows = torch.arange(len(scene) - 1, 3, -1)
@@ -162,7 +162,7 @@ def test_checkpoints_and_cameras_of_trainers_are_read(here: Path) -> None:
         assert torch.equal(load_scene(name).shN, scene.shN)
 
 
-def test_every_python_block_is_run_but_that_of_blender() -> None:
+def test_every_python_block_except_blender_is_run() -> None:
     with_code = [part.split(":")[0].strip() for part in PAGE.split("\n## ")[1:] if "```python" in part]
     names = [name.splitlines()[0] for name in with_code]
     assert names == ["From Python", "viser", "Rerun", "Blender"]
