@@ -1,4 +1,4 @@
-"""Fixtures that several test files share: the real data where it is present, threads, golden screenshots."""
+"""Fixtures shared by several test files: real data if present, threads, golden screenshots."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if "ATEN_CPU_CAPABILITY" in os.environ:
-    # torch lays bfloat16 out for what oneDNN finds, which the switch does not change, and then cannot
+    # torch packs bfloat16 for the instructions that oneDNN detects. ATEN_CPU_CAPABILITY does not limit
+    # oneDNN, and the packed format then fails
     os.environ.setdefault("ONEDNN_MAX_CPU_ISA", "AVX2")
 
 import numpy as np
@@ -32,8 +33,8 @@ pytest.register_assert_rewrite(
     "tests.helpers.ply_files", "tests.helpers.refused", "tests.helpers.stopped_runs"
 )
 
-# `make test` tries the same examples everywhere; `make test-all` looks for new ones; a busy machine may take
-# long over each
+# `make test` uses the same examples everywhere, and `make test-all` searches for new ones. A busy machine may
+# take long for each example
 settings.register_profile("same", derandomize=True, deadline=None)
 settings.register_profile("search", derandomize=False, print_blob=True, deadline=None)
 settings.load_profile("same")
@@ -42,8 +43,11 @@ Compare = Callable[[str, np.ndarray], None]
 
 
 def pytest_configure() -> None:
-    """What nohup, a script's `&` or a supervisor had ignored goes on being ignored here, but not in children:
-    these inherit what is ignored, and start anew what is handled."""
+    """Handle the stop signals that nohup, a script's `&` or a supervisor ignores.
+
+    They stay without effect here. Children do not inherit that: an ignored signal stays ignored in a child, a
+    handled one is reset to its default.
+    """
     for name in ("SIGINT", "SIGHUP", "SIGTERM", "SIGQUIT"):
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) == signal.SIG_IGN:
@@ -51,14 +55,14 @@ def pytest_configure() -> None:
 
 
 def pytest_collection_finish() -> None:
-    """What is imported and collected stays, so that the garbage collector need not go through it again."""
+    """Freeze the imported modules and collected tests, so that garbage collections skip them."""
     gc.collect()
     gc.freeze()
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup() -> None:
-    """What is small enough for a test gains nothing from several torch threads, which wait for each other."""
+    """Use one torch thread. Several threads wait for each other on test-sized inputs."""
     torch.set_num_threads(1)
 
 
@@ -72,7 +76,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def own_state_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """What the programs remember for their user is nothing that a test sees or changes."""
+    """Keep the user's remembered state (XDG_STATE_HOME) out of the tests."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
         yield
@@ -80,7 +84,7 @@ def own_state_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]
 
 @pytest.fixture(scope="session", autouse=True)
 def compiled_kernels(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """One worker compiles one part of the kernels, another one the other; all find both in the cache."""
+    """Compile a part of the kernels in each xdist worker. All workers find every part in the cache."""
     worker = os.environ.get("PYTEST_XDIST_WORKER")
     if worker is None:
         return
@@ -97,7 +101,7 @@ def compiled_kernels(tmp_path_factory: pytest.TempPathFactory) -> None:
 
 @pytest.fixture
 def default_signals() -> Iterator[None]:
-    """SIGINT and SIGHUP end this process as they end one that is started from a terminal."""
+    """Handle SIGINT and SIGHUP as in a process started from a terminal."""
     defaults = {signal.SIGINT: signal.default_int_handler, signal.SIGHUP: signal.SIG_DFL}
     earlier = {number: signal.signal(number, handler) for number, handler in defaults.items()}
     yield
@@ -107,7 +111,10 @@ def default_signals() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """Real scenes and odd files kept beside the checkout (or named by PROGDF_TEST_DATA); absent: skip."""
+    """Return the folder of real scenes and unusual files, or skip the test if it is absent.
+
+    The folder is beside the checkout, or the one that PROGDF_TEST_DATA names.
+    """
     folder = Path(os.environ.get("PROGDF_TEST_DATA", SHARED_DATA))
     if not folder.is_dir():
         pytest.skip(f"no real test data at {folder}")
@@ -116,7 +123,7 @@ def shared_data() -> Path:
 
 @pytest.fixture
 def two_threads() -> Iterator[None]:
-    """The rasterizer draws with two threads, as on the smallest machine that has several."""
+    """Rasterize with two threads, as on the smallest multicore machine."""
     from progdf.rasterize import set_threads
 
     set_threads(2)
@@ -126,7 +133,10 @@ def two_threads() -> Iterator[None]:
 
 @pytest.fixture
 def screenshot(request: pytest.FixtureRequest) -> Compare:
-    """`screenshot(name, image)`: image [H,W,3], float 0..1 or uint8, against tests/screenshots/NAME.png."""
+    """Return `screenshot(name, image)`, which compares an image with tests/screenshots/NAME.png.
+
+    The image is float (0 to 1) or uint8. [H,W,3]
+    """
     regenerate: bool = request.config.getoption("--regenerate-screenshots")
 
     def compare(name: str, image: np.ndarray) -> None:
@@ -155,7 +165,7 @@ def _uint8(image: np.ndarray) -> np.ndarray:
 
 
 def _write_difference(name: str, expected: np.ndarray, found: np.ndarray) -> None:
-    """Golden, found and eight times their difference side by side."""
+    """Save the golden, the found image and eight times their difference side by side."""
     panels = [expected, found]
     if expected.shape == found.shape:
         amplified = np.abs(expected.astype(int) - found.astype(int)) * 8
@@ -169,7 +179,7 @@ def _write_difference(name: str, expected: np.ndarray, found: np.ndarray) -> Non
 
 @pytest.fixture(scope="module")
 def software_gpu() -> None:
-    """Goldens hold for one renderer of splats, text and lines; another differs in the last bits."""
+    """Skip the test unless OpenGL is the software renderer of the goldens. Others differ in the last bits."""
     from progdf.errors import ProgdfError
     from viewer.render.gl_renderer import headless_context, is_software
 
@@ -186,7 +196,7 @@ def software_gpu() -> None:
 
 @pytest.fixture(scope="module")
 def ctx() -> Iterator[moderngl.Context]:
-    """An OpenGL context without a window."""
+    """Yield an OpenGL context without a window."""
     from viewer.render.gl_renderer import headless_context
 
     context = headless_context()

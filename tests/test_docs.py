@@ -1,4 +1,4 @@
-"""The documents: links lead somewhere, command lines can be typed as written, every option is told."""
+"""Tests of the documents: valid links, valid command lines, and every option documented."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ MAX_README_LINES = 150
 
 
 def anchors(text: str) -> set[str]:
-    """What the headings of a document are linked by."""
+    """Return the anchors of a document's headings."""
     headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
@@ -45,7 +45,7 @@ def examples_of(*words: str) -> list[Any]:
 
 
 def help_of(run: Callable[[Sequence[str]], int], *command: str) -> str:
-    """What `--help` prints."""
+    """Return the output of `--help`."""
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
         run([*command, "--help"])
@@ -54,20 +54,20 @@ def help_of(run: Callable[[Sequence[str]], int], *command: str) -> str:
 
 @cache
 def mentioned_options(command: str) -> frozenset[str]:
-    """All that a command's help mentions."""
+    """Return all options that a command's help mentions."""
     text = help_of(progdf, command) if command in COMMANDS else help_of(benchmarks, *command.split()[1:])
     return frozenset(re.findall(r"(?<![\w-])--?[a-z][a-z-]*", text))
 
 
 def own_options(command: str) -> set[str]:
-    """The options that a command's help explains, without their opposites."""
+    """Return the options that a command's help explains, without the `--no-` forms."""
     heads = re.findall(r"^\W*?(-.*?)(?:  |$)", help_of(progdf, command).replace("│", " "), re.MULTILINE)
     found = {option for head in heads for option in re.findall(r"--[a-z][a-z-]*", head)}
     return found - {"--help"}
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
-def test_links_lead_to_files_and_headings_that_exist(path: Path) -> None:
+def test_links_lead_to_existing_files_and_headings(path: Path) -> None:
     for target in re.findall(r"\]\(([^)\s]+)\)", path.read_text()):
         if target.startswith("https://"):
             continue
@@ -79,7 +79,7 @@ def test_links_lead_to_files_and_headings_that_exist(path: Path) -> None:
 
 
 @pytest.mark.parametrize("words", examples_of("progdf"))
-def test_a_documented_command_has_the_options_it_is_given(words: list[str]) -> None:
+def test_documented_command_has_its_options(words: list[str]) -> None:
     command = words[1]
     if command == "--version":
         return
@@ -89,7 +89,7 @@ def test_a_documented_command_has_the_options_it_is_given(words: list[str]) -> N
 
 
 @pytest.mark.parametrize("words", examples_of("python", "-m", "benchmarks"))
-def test_a_documented_benchmark_has_the_options_it_is_given(words: list[str]) -> None:
+def test_documented_benchmark_has_its_options(words: list[str]) -> None:
     name = words[3]
     own_command = name in ("ablate", "sliders", "regret")
     command = f"benchmarks {name}" if own_command else "benchmarks"
@@ -97,7 +97,7 @@ def test_a_documented_benchmark_has_the_options_it_is_given(words: list[str]) ->
     assert own_command or name == "page" or name in BENCHES
 
 
-def test_a_benchmark_that_is_named_in_the_documents_exists() -> None:
+def test_documented_benchmark_exists() -> None:
     known = {*BENCHES, "page", "ablate", "sliders", "regret"}
     for path in DOCUMENTS:
         named = re.findall(r"`python -m benchmarks (\w+)", path.read_text(encoding="utf-8"))
@@ -113,7 +113,7 @@ def test_every_option_of_a_command_is_documented(command: str) -> None:
     assert not missing
 
 
-def test_every_option_that_is_documented_exists() -> None:
+def test_every_documented_option_exists() -> None:
     known = {option for command in COMMANDS for option in mentioned_options(command)} | {
         "--version",
         "--no-deps",
@@ -124,12 +124,12 @@ def test_every_option_that_is_documented_exists() -> None:
     assert told <= known
 
 
-def test_the_readme_is_a_page_and_documents_are_in_the_sdist() -> None:
+def test_readme_is_one_page_and_the_sdist_holds_the_documents() -> None:
     assert (ROOT / "README.md").read_text().count("\n") <= MAX_README_LINES
     assert '"docs"' in (ROOT / "pyproject.toml").read_text()
 
 
-def test_docstrings_cite_only_documents_and_sections_that_are_here() -> None:
+def test_docstrings_cite_existing_documents_and_sections() -> None:
     for package in ("progdf", "trainer", "viewer", "shaders", "benchmarks"):
         for path in sorted((ROOT / package).rglob("*")):
             if path.suffix not in (".py", ".vert", ".frag", ".glsl"):
@@ -138,7 +138,7 @@ def test_docstrings_cite_only_documents_and_sections_that_are_here() -> None:
             for cited, rest in re.findall(r"(\w[\w/.-]*\.md\b)(.{0,60})", source):
                 whole = ("ablation.md", "docs/benchmarks.md", "docs/paper.md", "docs/speed-and-error.md")
                 assert cited == "ablation.md" or (ROOT / cited).is_file(), f"{path.name} cites {cited}"
-                if cited in whole or rest[:1] in (")", ".", ";", '"'):  # as a whole
+                if cited in whole or rest[:1] in (")", ".", ";", '"'):  # the whole document is cited
                     continue
                 headings = re.findall(r"^##+ (.*)$", (ROOT / cited).read_text(), re.MULTILINE)
                 wanted = rest.removeprefix(",").strip()
@@ -150,7 +150,7 @@ def test_docstrings_cite_only_documents_and_sections_that_are_here() -> None:
 
 
 @pytest.mark.parametrize("end_type", END_TYPES)
-def test_the_documented_reader_reads_what_is_written(tmp_path: Path, end_type: torch.dtype) -> None:
+def test_documented_reader_reads_a_written_gdf(tmp_path: Path, end_type: torch.dtype) -> None:
     scene = ball(60)
     members = some_rows(scene, 20)
     gdf = edit_of(scene, members, curved_field(20, end_type=end_type))
@@ -170,7 +170,7 @@ def test_the_documented_reader_reads_what_is_written(tmp_path: Path, end_type: t
             np.testing.assert_allclose(found, after.numpy(), atol=1e-6)
 
 
-def test_figures_of_the_readme_are_those_of_their_pages() -> None:
+def test_readme_figures_match_their_pages() -> None:
     figures = runpy.run_path(str(ROOT / "assets" / "figures.py"))
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     assert text.count("<!-- figure ") >= 5

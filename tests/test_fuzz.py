@@ -1,4 +1,4 @@
-"""A fuzz of every reader; a longer round is `python -m tests.helpers.fuzz READER COUNT SEED FOLDER`."""
+"""Fuzz test of every reader. A longer round: `python -m tests.helpers.fuzz READER COUNT SEED FOLDER`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.helpers.paths import ROOT
 
 @pytest.mark.slow
 @pytest.mark.parametrize("reader", READERS)
-def test_whatever_a_file_holds_it_is_read_or_refused_in_one_line(reader: str, tmp_path: Path) -> None:
+def test_fuzzed_file_is_read_or_refused_in_one_line(reader: str, tmp_path: Path) -> None:
     words = [
         sys.executable,
         "-m",

@@ -1,4 +1,4 @@
-"""Names and file names in backticks, in docstrings, comments and documents, exist."""
+"""Test that names and file names in backticks exist, in docstrings, comments and documents."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SINGLE = re.compile(r"(?<![`\w])`([A-Za-z_]\w*)`(?!`)")
 
 
 class Tree:
-    """What the repository defines: files, modules and their names, classes and their attributes, strings."""
+    """Names of the repository: files, modules and their names, classes and their attributes, strings."""
 
     def __init__(self) -> None:
         self.sources = {
@@ -38,7 +38,7 @@ class Tree:
         }
         self.paths = {p.relative_to(ROOT).as_posix() for name in PACKAGES for p in (ROOT / name).rglob("*")}
         self.paths |= {path.relative_to(ROOT).as_posix() for path in DOCUMENTS}
-        self.modules: dict[str, set[str]] = {}  # dotted name -> what stands at its top
+        self.modules: dict[str, set[str]] = {}  # dotted name -> top-level names
         self.attributes: defaultdict[str, set[str]] = defaultdict(set)  # class -> fields and methods
         self.strings: set[str] = set()
         bases: defaultdict[str, set[str]] = defaultdict(set)
@@ -64,11 +64,11 @@ class Tree:
                 names |= set(re.findall(r"\w+", self.sources[Path(*package.split("."), "__init__.py")]))
 
     def holds_file(self, name: str) -> bool:
-        """Whether a path of the repository ends like this."""
+        """Return True if a path of the repository ends with `name`."""
         return any(path == name or path.endswith("/" + name) for path in self.paths)
 
     def defines(self, parts: list[str]) -> bool:
-        """Whether `module.name`, `module.Class.attribute` or `Class.attribute` is defined, in code."""
+        """Return True if code defines `module.name`, `module.Class.attribute` or `Class.attribute`."""
         if len(parts) == 2 and parts[1] in self.attributes.get(parts[0], ()):
             return True
         for cut in range(len(parts), 0, -1):
@@ -84,7 +84,7 @@ class Tree:
 
     @cached_property
     def single_names(self) -> set[str]:
-        """Every name that code defines or uses, and every word of its strings and options."""
+        """Names that code defines or uses, and the words of its strings and options."""
         names = {word for text in self.strings for word in re.findall(r"\w+", text) if len(text) < 200}
         for source in self.sources.values():
             for node in ast.walk(ast.parse(source)):
@@ -95,12 +95,12 @@ class Tree:
         return names
 
     def is_key(self, name: str) -> bool:
-        """Whether a file of ours is called so, or holds a key or tensor of that name."""
+        """Return True if one of our files has this name, or holds a key or tensor of this name."""
         return name in self.strings or "." + name.rpartition(".")[2] in self.strings
 
 
 def defined(node: ast.stmt) -> list[str]:
-    """The names that one statement of a module or class defines."""
+    """Return the names that one statement of a module or class defines."""
     if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.AsyncFunctionDef):
         return [node.name]
     if isinstance(node, ast.Assign):
@@ -116,12 +116,12 @@ def tree() -> Tree:
 
 
 def is_foreign(head: str) -> bool:
-    """Whether the first part is a library's; what it holds is that library's matter."""
+    """Return True if the first part is another library, whose names are not checked."""
     return head in ("imgui", "np") or (head not in PACKAGES and importlib.util.find_spec(head) is not None)
 
 
 def unresolved(text: str, code: str = "") -> list[str]:
-    """The quoted names in `text` that nothing in the tree answers to; `code` is the module they stand in."""
+    """Return the quoted names in `text` that the tree does not define. `code` is the quoting module."""
     missing = []
     for name in QUOTED.findall(text):
         parts = re.split(r"[./]", name)
@@ -143,12 +143,12 @@ def unresolved(text: str, code: str = "") -> list[str]:
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
-def test_what_a_document_names_exists(path: Path) -> None:
+def test_names_in_a_document_exist(path: Path) -> None:
     assert unresolved(path.read_text(encoding="utf-8")) == []
 
 
 @pytest.mark.parametrize("package", PACKAGES)
-def test_what_docstrings_and_comments_name_exists(package: str) -> None:
+def test_names_in_docstrings_and_comments_exist(package: str) -> None:
     missing = {
         path.as_posix(): names
         for path, source in tree().sources.items()
@@ -157,7 +157,7 @@ def test_what_docstrings_and_comments_name_exists(package: str) -> None:
     assert not missing, "\n".join(f"{path}: {', '.join(names)}" for path, names in missing.items())
 
 
-def test_a_name_that_is_gone_is_seen() -> None:
+def test_missing_name_is_found() -> None:
     text = "`progdf.compose.nothing_here` `Layer.nothing_here` `nowhere.py` `gone/file.py` `paint.gone`"
     assert unresolved(text) == re.findall(r"[\w./]+", text)
     assert unresolved("`no_such" + "_name`") == ["no_such" + "_name"]

@@ -1,4 +1,4 @@
-"""What holds on Windows and macOS too, as far as Linux can show it."""
+"""Tests of portability to Windows and macOS, as far as Linux can show it."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ BARE = ROOT / "tests" / "helpers" / "bare_system"
 
 
 def run_bare(folder: Path, what: str) -> str:
-    """`tests.helpers.bare_run` in a process without what Windows lacks, on a console without UTF-8."""
+    """Run `tests.helpers.bare_run` without the modules that Windows lacks, on a console without UTF-8."""
     environment = {
         **os.environ,
         "BARE_FOLDER": os.path.realpath(folder),
         "PYTHONPATH": os.pathsep.join((str(BARE), str(ROOT))),
         "PYTHONIOENCODING": "ascii",
-        "USERNAME": "somebody",  # what getpass reads there
+        "USERNAME": "somebody",  # getpass reads it on Windows
     }
     told = subprocess.run(
         [sys.executable, "-m", "tests.helpers.bare_run", what],
@@ -40,19 +40,19 @@ def run_bare(folder: Path, what: str) -> str:
     return (folder / "bare.txt").read_text("utf-8")
 
 
-def test_commands_need_nothing_that_windows_lacks(tmp_path: Path) -> None:
+def test_commands_need_no_module_that_windows_lacks(tmp_path: Path) -> None:
     assert run_bare(tmp_path, "commands").count("\n") == 1
     assert sorted(path.name for path in tmp_path.glob("*.p*")) == ["a.png", "b.png", "bear.ply", "edited.ply"]
 
 
 @pytest.mark.slow
-def test_trainings_of_the_window_start_stop_resume_and_die_without_what_windows_lacks(tmp_path: Path) -> None:
+def test_window_trainings_start_stop_resume_and_die_as_on_windows(tmp_path: Path) -> None:
     children = run_bare(tmp_path, "jobs").splitlines()[1:]
     assert [line.endswith("--resume") for line in children] == [False, True, False]
 
 
 @pytest.mark.parametrize("times", [1, 3, 100])
-def test_a_file_that_somebody_has_open_is_replaced_once_he_closes_it(
+def test_file_opened_elsewhere_is_replaced_once_it_is_closed(
     times: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "a.txt"
@@ -83,7 +83,7 @@ def test_a_file_that_somebody_has_open_is_replaced_once_he_closes_it(
 @pytest.mark.parametrize(
     "name", ["CON", "nul.x", "Com1.png", "lpt².a.b", "aux ", "a.", "b ", "conout$", "a:b"]
 )
-def test_names_that_windows_cannot_have_are_known(name: str) -> None:
+def test_names_invalid_on_windows_are_not_portable(name: str) -> None:
     assert not is_portable(name)
 
 
@@ -93,7 +93,7 @@ def test_ordinary_names_are_portable(name: str) -> None:
 
 
 def text_without_encoding(tree: ast.AST) -> Iterator[int]:
-    """Lines of calls that open a file as text and leave the encoding to the system."""
+    """Yield the lines of calls that open a text file without an encoding."""
     for node in ast.walk(tree):
         if not isinstance(node, ast.Call):
             continue
@@ -102,7 +102,7 @@ def text_without_encoding(tree: ast.AST) -> Iterator[int]:
         values = [*node.args, *(word.value for word in node.keywords if word.arg == "mode")]
         said = [value.value for value in values if isinstance(value, ast.Constant)]
         modes = [mode for mode in said if isinstance(mode, str) and mode and set(mode) <= set("rwaxbt+")]
-        if name == "open":  # the function, or a path's; not `Image.open(path)` or a window's own
+        if name == "open":  # the function, or a path's method; not `Image.open(path)` or a window's own
             asks = isinstance(called, ast.Name) or bool(modes) or not (node.args or node.keywords)
         else:
             asks = name in ("fdopen", "read_text", "write_text")
@@ -133,5 +133,5 @@ def test_every_text_file_is_opened_with_an_encoding() -> None:
         "os.fdopen(h)",
     ],
 )
-def test_the_test_of_encodings_sees_each_way_to_open_a_text(line: str) -> None:
+def test_encoding_check_sees_each_way_to_open_a_text_file(line: str) -> None:
     assert list(text_without_encoding(ast.parse(line)))

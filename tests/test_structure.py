@@ -1,4 +1,4 @@
-"""The limits of the layout: packages, import cycles, the order of folders, sizes, what the wheel holds."""
+"""Tests of the layout's limits: packages, import cycles, order of folders, sizes and packaging."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from tests.helpers.sizes import Module, calls, dotted, functions, importers, mod
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("progdf", "trainer", "viewer", "benchmarks")
 
-# What a package must not import: progdf ← trainer, progdf ← viewer, and nothing else.
+# Modules that a package must not import. Only progdf ← trainer and progdf ← viewer are allowed.
 FORBIDDEN = {
     "progdf": {"trainer", "viewer", "shaders", "benchmarks", "moderngl", "glfw", "imgui_bundle", "pyrr"},
     "trainer": {"viewer", "shaders", "benchmarks", "moderngl", "glfw", "imgui_bundle", "pyrr"},
     "viewer": {"trainer", "benchmarks", "diffusers", "transformers"},
 }
-ENTRY_POINT = ROOT / "progdf" / "__main__.py"  # the table of commands knows all packages
+ENTRY_POINT = ROOT / "progdf" / "__main__.py"  # its table of commands names all packages
 
-# Inside a package a folder, or a file beside the folders, imports only from those before it.
+# Order of the folders and top-level files of each package. Each imports only from earlier ones.
 ORDER = {
     "progdf": """quaternions sh gaussians similarity terminal errors threads region camera color metrics
         demo_scenes io rasterize field formats gdf scene compose tidy summary cli __init__ __main__""",
@@ -45,23 +45,23 @@ MAX_FILES = 14
 MAX_LINES = 600
 
 MEASURED = ("progdf", "trainer", "viewer")
-# Tables of module names as text, which are imported on first use.
+# Files with module names as text, which are imported on first use.
 LAZY_TABLES = ("progdf/__init__.py", "progdf/__main__.py", "progdf/rasterize/engines.py")
-MAX_IMPORTS = 0.073  # of all lines
+MAX_IMPORTS = 0.073  # share of all lines
 MAX_FILE_IMPORTS = 55  # import statements of one file; this ceiling only falls, to 25
-MAX_SCRIPT_LINES = 1271  # of the JavaScript of the web page, counted alike
+MAX_SCRIPT_LINES = 1271  # JavaScript lines of the web page, counted like Python
 MAX_FUNCTION_LINES = 80
 MAX_POSITIONAL = 8
-MIN_LINES = 80  # of a module that one other imports alone; it is a section of that one
+MIN_LINES = 80  # smallest module with a single importer; a smaller one belongs into its importer
 
-# What looks like a section of its only importer and is none: entry points.
+# Entry points: small modules with a single importer that are no part of it.
 SMALL = {"progdf.__main__"}
 
 Graph = dict[str, set[str]]
 
 
 def source_files() -> list[Path]:
-    """All Python files of the packages, relative to the repository."""
+    """Return all Python files of the packages, relative to the repository."""
     return sorted(path.relative_to(ROOT) for name in PACKAGES for path in (ROOT / name).rglob("*.py"))
 
 
@@ -71,12 +71,12 @@ def module_name(path: Path) -> str:
 
 
 def place(path: Path) -> str:
-    """The folder of a module inside its package, or the module itself beside the folders."""
+    """Return the folder of a module inside its package, or the module itself at the top level."""
     return path.parts[1] if len(path.parts) > 2 else path.stem
 
 
 def imported_modules(source: str, module: str, is_package: bool) -> list[tuple[int, str]]:
-    """Line and absolute name of everything imported, by type checkers too."""
+    """Return the line and absolute name of every import, including those for type checkers."""
     found: list[tuple[int, str]] = []
     home = module.split(".") if is_package else module.split(".")[:-1]
 
@@ -95,7 +95,7 @@ def imported_modules(source: str, module: str, is_package: bool) -> list[tuple[i
 
 
 def strings(source: str) -> set[str]:
-    """Every text that code holds; a dotted module name among them is an import in disguise."""
+    """Return every string constant with a dot. A dotted module name among them is a hidden import."""
     nodes = ast.walk(parse(source))
     return {
         n.value for n in nodes if isinstance(n, ast.Constant) and isinstance(n.value, str) and "." in n.value
@@ -103,7 +103,7 @@ def strings(source: str) -> set[str]:
 
 
 def import_graph(files: Mapping[Path, str]) -> Graph:
-    """Which module imports which, from paths and their source."""
+    """Return the modules that each module imports, from paths and their source."""
     names = {module_name(path) for path in files}
     graph: Graph = {}
     for path, source in files.items():
@@ -120,7 +120,7 @@ def import_graph(files: Mapping[Path, str]) -> Graph:
 
 
 def import_cycle(graph: Graph) -> list[str]:
-    """The modules of one import cycle, if there is any."""
+    """Return the modules of one import cycle, or an empty list."""
     try:
         TopologicalSorter(graph).prepare()
     except CycleError as error:
@@ -129,7 +129,7 @@ def import_cycle(graph: Graph) -> list[str]:
 
 
 def forbidden_imports(source: str, package: str, where: str) -> list[str]:
-    """Imports in `source` that its package must not make, as `where:line imports module`."""
+    """Return the imports in `source` that its package must not make, as `where:line imports module`."""
     found = []
     for node in ast.walk(parse(source)):
         if isinstance(node, ast.Import):
@@ -147,7 +147,7 @@ def forbidden_imports(source: str, package: str, where: str) -> list[str]:
 
 
 def upward_imports(package: str, order: list[str], files: Mapping[Path, str]) -> list[str]:
-    """Imports inside a package that go against its order, as `module imports module`."""
+    """Return the imports inside a package that go against its order, as `module imports module`."""
     mine = {path: source for path, source in files.items() if path.parts[0] == package}
     places = {module_name(path): place(path) for path in mine}
     return [
@@ -164,7 +164,7 @@ def sources() -> dict[Path, str]:
 
 
 @pytest.mark.parametrize("package", sorted(FORBIDDEN))
-def test_no_package_imports_one_it_must_not_know(package: str, sources: dict[Path, str]) -> None:
+def test_packages_do_not_import_forbidden_modules(package: str, sources: dict[Path, str]) -> None:
     offending = [
         line
         for path, source in sources.items()
@@ -174,14 +174,14 @@ def test_no_package_imports_one_it_must_not_know(package: str, sources: dict[Pat
     assert not offending, "\n".join(offending)
 
 
-def test_the_test_of_packages_names_a_forbidden_import() -> None:
+def test_package_check_names_a_forbidden_import() -> None:
     assert forbidden_imports("import viewer.app.app\n", "trainer", "trainer/x.py") == [
         "trainer/x.py:1 imports viewer.app.app"
     ]
     assert forbidden_imports("def f():\n    from trainer import pgs\n", "viewer", "viewer/y.py")
 
 
-def test_no_modules_import_each_other_in_a_circle(sources: dict[Path, str]) -> None:
+def test_modules_have_no_import_cycles(sources: dict[Path, str]) -> None:
     cycle = import_cycle(import_graph(sources))
     assert not cycle, " → ".join(cycle)
 
@@ -195,7 +195,7 @@ def test_folders_import_one_way(package: str, sources: dict[Path, str]) -> None:
     assert not upward, "\n".join(upward)
 
 
-def test_the_tests_of_imports_see_cycles_and_upward_imports() -> None:
+def test_import_checks_find_cycles_and_upward_imports() -> None:
     files = {
         Path("progdf/a/one.py"): "from progdf.b.two import x\n",
         Path("progdf/b/two.py"): "def f():\n    from ..a import one\n",
@@ -216,7 +216,7 @@ def test_the_tests_of_imports_see_cycles_and_upward_imports() -> None:
 
 
 def unsafe_starts(source: str, where: str) -> list[str]:
-    """Where `source` starts Python so that modules of the current folder are run, as `where:line`."""
+    """Return the starts of Python that would run modules of the current folder, as `where:line`."""
     tree = parse(source)
     safe = {
         word
@@ -245,7 +245,7 @@ def is_os(node: ast.AST) -> bool:
     return isinstance(node, ast.Name) and node.id == "os"
 
 
-def test_every_python_that_is_started_runs_no_code_of_the_current_folder(sources: dict[Path, str]) -> None:
+def test_started_python_runs_no_code_of_the_current_folder(sources: dict[Path, str]) -> None:
     unsafe = [where for path, source in sources.items() for where in unsafe_starts(source, path.as_posix())]
     assert not unsafe, f"give -P: {unsafe}"
     assert sum("sys.executable" in source for source in sources.values()) >= 5, "and these were looked at"
@@ -263,12 +263,12 @@ def test_every_python_that_is_started_runs_no_code_of_the_current_folder(sources
         'run(["python3", "-P"])',
     ],
 )
-def test_the_test_of_what_is_started_sees_each_way(code: str) -> None:
+def test_check_of_started_python_sees_each_way(code: str) -> None:
     assert unsafe_starts(code, "x.py") == ["x.py:1"]
     assert unsafe_starts('run([sys.executable, "-P", "-m", "progdf"])', "x.py") == []
 
 
-# Where the origin of the scene stands among the arguments of what lets cameras in or out.
+# Position of the scene's origin among the arguments of functions that read or write cameras.
 ORIGIN_AT = {
     "load_cameras": 1,
     "read_camera": 1,
@@ -284,7 +284,7 @@ ORIGIN_AT = {
 
 
 def calls_without_origin(source: str, where: str) -> list[str]:
-    """Calls that would take a camera of the world for one of the scene, or the other way round."""
+    """Return the calls that would confuse a camera of the world with a camera of the scene."""
     found = []
     for node in ast.walk(parse(source)):
         if isinstance(node, ast.Call):
@@ -294,20 +294,20 @@ def calls_without_origin(source: str, where: str) -> list[str]:
     return found
 
 
-def test_cameras_enter_and_leave_with_the_origin_of_their_scene(sources: dict[Path, str]) -> None:
+def test_camera_files_are_read_and_written_with_the_scene_origin(sources: dict[Path, str]) -> None:
     assert [
         line for path, source in sources.items() for line in calls_without_origin(source, str(path))
     ] == []
 
 
-def test_the_test_of_origins_sees_a_call_without_one() -> None:
+def test_origin_check_sees_a_call_without_origin() -> None:
     assert calls_without_origin("load_cameras(path)\nx.read_camera(text, scene.origin)", "a.py") == [
         "a.py:1 load_cameras"
     ]
 
 
-def test_no_folder_holds_more_files_than_one_can_take_in(sources: dict[Path, str]) -> None:
-    # an `__init__` that says what its folder holds, and nothing more, is no source
+def test_folders_hold_a_limited_number_of_files(sources: dict[Path, str]) -> None:
+    # an `__init__` with only a docstring does not count
     filled = [path for path, source in sources.items() if len(parse(source).body) > 1]
     files = Counter(path.parent.as_posix() for path in filled)
     shaders = Counter(path.parent.as_posix() for path in (ROOT / "shaders").rglob("*.*"))
@@ -315,14 +315,14 @@ def test_no_folder_holds_more_files_than_one_can_take_in(sources: dict[Path, str
     assert not full, f"more than {MAX_FILES} files: {full}"
 
 
-def test_no_file_is_longer_than_one_reads_in_a_sitting(sources: dict[Path, str]) -> None:
+def test_files_have_a_limited_number_of_lines(sources: dict[Path, str]) -> None:
     lengths = {path.as_posix(): source.count("\n") for path, source in sources.items()}
     long = sorted(name for name, lines in lengths.items() if lines > MAX_LINES)
     assert not long, f"more than {MAX_LINES} lines: {long}"
 
 
-def test_the_page_knows_nothing_of_the_window(sources: dict[Path, str]) -> None:
-    """It is made of the library and the shaders, so that a notebook can show it too."""
+def test_page_does_not_import_the_window(sources: dict[Path, str]) -> None:
+    """Check that the page needs only the library and the shaders, so that a notebook can show it too."""
     graph = import_graph(sources)
     page = [module for module in graph if module.startswith("viewer.web")]
     assert page
@@ -330,7 +330,7 @@ def test_the_page_knows_nothing_of_the_window(sources: dict[Path, str]) -> None:
     assert {target.split(".")[0] for target in others} == {"progdf"}
 
 
-def test_the_script_of_the_page_keeps_its_budget() -> None:
+def test_page_script_keeps_its_line_budget() -> None:
     files = sorted((ROOT / "viewer" / "web" / "src").glob("*.js"))
     lines = [line.strip() for file in files for line in file.read_text(encoding="utf-8").splitlines()]
     code = [line for line in lines if line and not line.startswith(("//", "import "))]
@@ -349,7 +349,7 @@ def test_imports_are_a_small_share_of_all_lines(measured: dict[str, list[Module]
     assert imports <= MAX_IMPORTS * lines, f"{imports / lines:.1%} of all lines are imports"
 
 
-def test_no_file_imports_more_than_one_can_keep_in_mind(measured: dict[str, list[Module]]) -> None:
+def test_files_have_a_limited_number_of_imports(measured: dict[str, list[Module]]) -> None:
     counts = {
         module.path.as_posix(): sum(
             isinstance(node, ast.Import | ast.ImportFrom) for node in module.tree.body
@@ -361,7 +361,7 @@ def test_no_file_imports_more_than_one_can_keep_in_mind(measured: dict[str, list
     assert not wide, f"more than {MAX_FILE_IMPORTS} imports in a file: {wide}"
 
 
-def test_a_small_module_that_one_other_imports_is_a_section_of_it(measured: dict[str, list[Module]]) -> None:
+def test_small_module_with_one_importer_belongs_to_it(measured: dict[str, list[Module]]) -> None:
     everything = {dotted(module.path): module for group in measured.values() for module in group}
     alone = {
         name: users
@@ -376,10 +376,10 @@ def test_functions_fit_on_a_screen(measured: dict[str, list[Module]]) -> None:
     assert not [where for size, where in sizes if size > MAX_FUNCTION_LINES]
 
 
-def test_calls_say_by_name_what_many_arguments_are(measured: dict[str, list[Module]]) -> None:
+def test_calls_with_many_arguments_use_keywords(measured: dict[str, list[Module]]) -> None:
     everything = [*measured.values(), modules("benchmarks")]
     wide = [call for group in everything for module in group for call in calls(module)]
-    # compiled kernels take their arrays by position, and a table of ranges is one row an argument
+    # compiled kernels take their arrays by position, and a table of ranges has one row per argument
     plain = [
         (size, where) for size, where in wide if "rasterize/cpu" not in where and "check_ranges" not in where
     ]
@@ -399,20 +399,20 @@ def test_functions_are_verbs_or_nouns_never_bare_participles(measured: dict[str,
     assert not bare
 
 
-def test_the_documented_tree_is_that_of_the_modules() -> None:
+def test_documented_module_tree_is_up_to_date() -> None:
     page = (ROOT / "docs" / "modules.md").read_text(encoding="utf-8")
     assert page == with_tree(page), "run python -m tests.helpers.sizes --tree"
 
 
-def test_builders_draw_what_every_processor_draws_alike() -> None:
-    """torch's normal numbers of one seed differ in their last bits."""
+def test_builders_draw_the_same_numbers_on_every_processor() -> None:
+    """Check that helpers avoid torch's normal numbers, whose last bits differ between processors."""
     drawing = re.compile(r"torch\.(rand|normal)|\.(normal_|uniform_)\(")
     builders = sorted((ROOT / "tests" / "helpers").glob("*.py"))
     assert builders
     assert [path.name for path in builders if drawing.search(path.read_text(encoding="utf-8"))] == []
 
 
-def test_the_wheel_holds_what_is_used_and_the_sdist_what_is_read() -> None:
+def test_wheel_and_sdist_hold_the_right_packages() -> None:
     targets = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]
     assert targets["wheel"]["packages"] == ["progdf", "viewer", "trainer", "shaders"]
     assert {"benchmarks", "tests", "assets", "docs", "README.md", "LICENSE"} <= set(
@@ -438,7 +438,7 @@ print(json.dumps(found))
 
 @pytest.fixture(scope="module")
 def fresh(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, list[str]], Path]:
-    """What imports alone have loaded in a process of its own, and its folder for compiled kernels."""
+    """Return what imports alone load in a separate process, and its folder for compiled kernels."""
     cache = tmp_path_factory.mktemp("fresh") / "cache"
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
     run = subprocess.run(
@@ -456,7 +456,7 @@ def test_progdf_and_trainer_load_no_window_system(fresh: tuple[dict[str, list[st
     assert fresh[0]["windows"] == []
 
 
-def test_what_draws_without_a_window_needs_no_interface_library(
+def test_headless_rendering_needs_no_interface_library(
     fresh: tuple[dict[str, list[str]], Path],
 ) -> None:
     assert fresh[0]["interfaces"] == []

@@ -1,4 +1,4 @@
-"""The wheel in a fresh environment: what it holds, what it installs, and a page that it exports."""
+"""Tests of the wheel in a fresh environment: contents, extras, and an exported page."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def fresh(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The programs of an environment with the wheel in it; what it depends on is that of this environment."""
+    """Return the script folder of an environment with the wheel and this environment's dependencies."""
     folder = tmp_path_factory.mktemp("fresh") / "venv"
     run([sys.executable, "-m", "venv", "--without-pip", str(folder)], folder.parent)
     names = {"base": str(folder), "platbase": str(folder)}
@@ -51,7 +51,7 @@ def fresh(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(command: Sequence[str], folder: Path) -> str:
-    """What a command prints that starts in a folder and knows nothing of the checkout."""
+    """Run a command in a folder without access to the checkout. Return its output."""
     environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
     ended = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr
@@ -67,7 +67,7 @@ def scene_and_edit(folder: Path) -> list[str]:
     return ["scene.ply", "shirt.gdf"]
 
 
-def test_the_wheel_has_every_file_of_the_packages_and_no_other(wheel: Path) -> None:
+def test_wheel_holds_exactly_the_files_of_the_packages(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         packed = {name for name in archive.namelist() if ".dist-info/" not in name}
         (metadata,) = (name for name in archive.namelist() if name.endswith("METADATA"))
@@ -89,8 +89,8 @@ def test_the_wheel_has_every_file_of_the_packages_and_no_other(wheel: Path) -> N
     )
 
 
-@pytest.mark.slow  # what the wheel holds, its command's name too, is tested in every run of the tests
-def test_what_is_installed_is_the_wheel_and_its_command_runs(fresh: Path, tmp_path: Path) -> None:
+@pytest.mark.slow  # contents and command name of the wheel are tested in every run
+def test_installed_wheel_runs_its_command(fresh: Path, tmp_path: Path) -> None:
     code = "import progdf, viewer.web.page, shaders; print(progdf.__file__, viewer.web.page.__file__)"
     for file in run([str(fresh / "python"), "-P", "-c", code], tmp_path).split():
         assert Path(file).is_relative_to(fresh.parent), "from the wheel, not from the checkout"
@@ -100,13 +100,13 @@ def test_what_is_installed_is_the_wheel_and_its_command_runs(fresh: Path, tmp_pa
     assert "read back and compared" in run([str(fresh / "progdf"), "export", *given, "-o", "a.ply"], tmp_path)
 
 
-def test_extras_name_packages_and_messages_and_documents_name_extras() -> None:
+def test_extras_are_installable_and_messages_name_existing_extras() -> None:
     extras = PROJECT["optional-dependencies"]
     for name, packages in extras.items():
         assert packages, name
         for text in packages:
             requirement = Requirement(text)
-            if name in ("quantize", "qwen"):  # for a graphics card, or with a torch of its own
+            if name in ("quantize", "qwen"):  # needs a graphics card or another torch version
                 continue
             try:
                 found = importlib.metadata.version(requirement.name)
@@ -123,7 +123,7 @@ def test_extras_name_packages_and_messages_and_documents_name_extras() -> None:
 
 
 @pytest.mark.slow
-def test_a_page_that_the_wheel_exports_opens_in_a_browser(fresh: Path, tmp_path: Path, browser: Any) -> None:
+def test_page_exported_by_the_wheel_opens_in_a_browser(fresh: Path, tmp_path: Path, browser: Any) -> None:
     given = scene_and_edit(tmp_path)
     assert "page.html" in run([str(fresh / "progdf"), "export", *given, "-o", "page.html"], tmp_path)
     tab = browser.new_page()
