@@ -1,4 +1,4 @@
-"""Commands as child processes: what they run, at which priority, and how they are stopped."""
+"""Child processes for commands: imported code, priority and termination."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from trainer.run import demo
 from viewer.jobs.child import NICE, Child
 
 MODULES = ("numpy", "threading", "torch", "signal", "json", "progdf", "trainer")
-"""Of a stranger's folder; a package `viewer` beside them."""
+"""Modules in a downloaded folder. A package `viewer` lies beside them."""
 WAITING = """
 import signal, sys, time
 signal.signal(signal.SIGINT, signal.SIG_IGN)  # as `progdf view &` in a script has it
@@ -27,7 +27,7 @@ viewer.jobs.child.main()
 
 @pytest.fixture
 def child(tmp_path: Path) -> Iterator[Callable[..., Child]]:
-    """Starts children, and ends them."""
+    """Yield a function that starts children; kill them after the test."""
     started: list[Child] = []
 
     def start(*arguments: str, talks: bool = False) -> Child:
@@ -42,7 +42,7 @@ def child(tmp_path: Path) -> Iterator[Callable[..., Child]]:
 
 @pytest.fixture
 def stranger(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current folder is a stranger's, whose modules say when they are run."""
+    """Work in a downloaded folder whose modules create the returned file when they run."""
     folder = tmp_path / "downloaded"
     (folder / "viewer" / "jobs").mkdir(parents=True)
     code = f"import os\nos.close(os.open({str(tmp_path / 'ran')!r}, os.O_CREAT | os.O_WRONLY))\n"
@@ -54,14 +54,16 @@ def stranger(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "ran"
 
 
-def test_a_child_runs_no_code_of_the_current_folder(child: Callable[..., Child], stranger: Path) -> None:
-    started = child("info", "no.ply")  # imports numpy and torch, and ends
+def test_child_process_runs_no_code_from_the_current_folder(
+    child: Callable[..., Child], stranger: Path
+) -> None:
+    started = child("info", "no.ply")  # imports numpy and torch, then exits
     assert started._process.wait() == 2
     assert started.error().startswith("no.ply does not exist")
     assert not stranger.exists()
 
 
-def test_the_demo_s_window_runs_no_code_of_the_current_folder(
+def test_demo_window_runs_no_code_from_the_current_folder(
     stranger: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "PYTHONSAFEPATH"):
@@ -70,13 +72,13 @@ def test_the_demo_s_window_runs_no_code_of_the_current_folder(
     assert not stranger.exists()
 
 
-def test_the_stranger_s_modules_would_run(stranger: Path) -> None:
+def test_modules_in_the_current_folder_run_without_safe_path(stranger: Path) -> None:
     subprocess.run([sys.executable, "-c", "import numpy"], check=False)
     assert stranger.exists()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="asks for the scheduling policy")
-def test_a_child_is_nice_and_no_more(child: Callable[..., Child]) -> None:
+def test_child_priority_is_lowered_only_for_background_work(child: Callable[..., Child]) -> None:
     started = child("preview", "no.ply")
     mine = os.getpriority(os.PRIO_PROCESS, 0)
     assert os.getpriority(os.PRIO_PROCESS, started.pid) == min(mine + NICE, 19)
@@ -85,18 +87,18 @@ def test_a_child_is_nice_and_no_more(child: Callable[..., Child]) -> None:
     assert os.getpriority(os.PRIO_PROCESS, talking.pid) == mine, "somebody waits for it"
 
 
-def test_a_child_stops_though_the_window_was_started_with_interrupts_ignored() -> None:
+def test_child_stops_if_the_window_ignores_interrupts() -> None:
     words = [sys.executable, "-P", "-c", WAITING, "train"]
     process = subprocess.Popen(
         words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
     )
     assert process.stdout is not None
     assert process.stdout.readline() == b"began\n"
-    process.communicate()  # closes its input
+    process.communicate()  # closes its standard input
     assert process.returncode in (1, 130, -signal.SIGINT)
 
 
-def test_a_child_starts_and_is_killed_where_there_are_no_process_groups_and_priorities(
+def test_child_starts_and_is_killed_without_process_groups(
     child: Callable[..., Child], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("killpg", "setpriority", "getpriority", "nice", "sched_setscheduler"):

@@ -1,4 +1,4 @@
-"""Jobs in turn: real children on a tiny scene, and what becomes of those that fail or are stopped."""
+"""Job queue: real children on a tiny scene, including failed and stopped runs."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ PATIENCE_S = 600.0
 
 @pytest.fixture(autouse=True)
 def children_as_urgent_as_the_tests(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a busy machine they take as long as all else does, not ten times that."""
+    """Run children at normal priority. On a busy machine low priority takes ten times as long."""
     monkeypatch.setattr(child, "NICE", 0)
 
 
 class Waiting:
-    """Stands for a child that trains until it is told to stop, and has saved something by then."""
+    """Stub of a child process that saves state at once and trains until `stop`."""
 
     def __init__(self, arguments: Sequence[str], log: Path) -> None:
         self.status: int | None = None
@@ -47,14 +47,14 @@ class Waiting:
 
 
 def begin(out: Path) -> None:
-    """What a run that was stopped leaves."""
+    """Write the files that a stopped run leaves."""
     (out / "state").mkdir(parents=True, exist_ok=True)
     (out / "state" / "run.json").touch()
 
 
 @pytest.fixture
 def stopped(scene: Path, monkeypatch: pytest.MonkeyPatch) -> EditOrder:
-    """A run that was stopped; children do nothing, and each look is at all of it."""
+    """Return the order of a stopped run. Children are stubs and every poll checks all jobs."""
     monkeypatch.setattr(job_queue, "Child", Waiting)
     monkeypatch.setattr(job_queue, "LOOK_S", 0.0)
     asked = order(scene, "blue")
@@ -64,7 +64,7 @@ def stopped(scene: Path, monkeypatch: pytest.MonkeyPatch) -> EditOrder:
 
 
 def window(stopped: EditOrder) -> JobQueue:
-    """The queue of a window on its scene."""
+    """Return the queue of a window that has opened the scene."""
     queue = JobQueue()
     queue.add_stopped(stopped)
     return queue
@@ -87,7 +87,7 @@ def order(scene: Path, name: str, region: str = "all") -> EditOrder:
 
 
 def wait(queue: JobQueue, until: str = "") -> list[QueuedTask]:
-    """What has ended once nothing is busy, or one job says that it does `until`."""
+    """Poll until nothing is busy or a job has the label `until`; return the finished tasks."""
     ended = []
     begun = time.monotonic()
     while queue.busy() and time.monotonic() - begun < PATIENCE_S:
@@ -98,9 +98,9 @@ def wait(queue: JobQueue, until: str = "") -> list[QueuedTask]:
     return ended
 
 
-def test_runs_train_in_turn_and_a_failure_is_one_line(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_runs_train_in_order_and_a_failure_is_one_line(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     arguments = EditOrder.arguments
-    smaller = ["--views=3", "--image-size=48", "--steps=8", "--stages=1"]  # than the window would have it
+    smaller = ["--views=3", "--image-size=48", "--steps=8", "--stages=1"]  # smaller than in the window
     monkeypatch.setattr(EditOrder, "arguments", lambda *asked: arguments(*asked) + smaller)
     queue = JobQueue()
     queue.add(order(scene, "nowhere", "sphere:99,99,99,1"))
@@ -110,7 +110,7 @@ def test_runs_train_in_turn_and_a_failure_is_one_line(scene: Path, monkeypatch: 
     shown = Count(monkeypatch, JobQueue, "_change")
     begun = time.monotonic()
     failed, done = wait(queue)
-    # the training would have half of the processor otherwise: each change is drawn
+    # redrawing every change would cost half of the processor
     assert shown.calls <= (time.monotonic() - begun) / LOOK_S + 4, "its card changes once a second"
     assert failed.status == "failed"
     assert failed.error.startswith("region 'sphere:99,99,99,1' holds no Gaussian")
@@ -123,7 +123,7 @@ def test_runs_train_in_turn_and_a_failure_is_one_line(scene: Path, monkeypatch: 
 
 
 @pytest.mark.slow
-def test_a_run_that_is_stopped_goes_on_another_day(scene: Path) -> None:
+def test_stopped_run_resumes_in_a_new_queue(scene: Path) -> None:
     queue = JobQueue()
     number = queue.add(order(scene, "blue"))
     wait(queue, until="Editing views")
@@ -143,7 +143,7 @@ def test_a_run_that_is_stopped_goes_on_another_day(scene: Path) -> None:
     later.close()
 
 
-def test_closing_leaves_no_child_and_forgets_what_waits(scene: Path) -> None:
+def test_close_leaves_no_child_and_drops_queued_runs(scene: Path) -> None:
     queue = JobQueue()
     queue.add(order(scene, "blue"))
     waiting = order(scene, "red")
@@ -155,7 +155,7 @@ def test_closing_leaves_no_child_and_forgets_what_waits(scene: Path) -> None:
     assert all(order.out != waiting.out for order in found), "it had not begun"
 
 
-def test_what_one_window_trains_another_leaves_alone(stopped: EditOrder) -> None:
+def test_run_of_another_window_cannot_be_resumed_or_discarded(stopped: EditOrder) -> None:
     first = window(stopped)
     second = window(stopped)
     first.resume(1)
@@ -180,7 +180,7 @@ def test_what_one_window_trains_another_leaves_alone(stopped: EditOrder) -> None
     assert first.jobs == ()
 
 
-def test_a_run_that_a_command_trains_is_left_alone(stopped: EditOrder) -> None:
+def test_run_locked_by_a_command_cannot_be_discarded(stopped: EditOrder) -> None:
     queue = window(stopped)
     with hold_lock(stopped.out / LOCK):
         assert window(stopped).jobs == ()
@@ -190,7 +190,7 @@ def test_a_run_that_a_command_trains_is_left_alone(stopped: EditOrder) -> None:
     assert status(queue) == "stopped"
 
 
-def test_two_windows_never_write_one_log(stopped: EditOrder, scene: Path) -> None:
+def test_two_windows_cannot_queue_the_same_run(stopped: EditOrder, scene: Path) -> None:
     first = JobQueue()
     second = JobQueue()
     asked = order(scene, "red")
@@ -201,7 +201,7 @@ def test_two_windows_never_write_one_log(stopped: EditOrder, scene: Path) -> Non
     first.close()
 
 
-def test_a_run_that_waits_to_go_on_is_kept_when_it_is_taken_off_the_queue(stopped: EditOrder) -> None:
+def test_resumed_run_is_kept_when_removed_from_the_queue(stopped: EditOrder) -> None:
     queue = window(stopped)
     queue.resume(1)
     queue.stop(1)
@@ -213,7 +213,7 @@ def test_a_run_that_waits_to_go_on_is_kept_when_it_is_taken_off_the_queue(stoppe
     assert not stopped.is_locked, "closing lets go of it"
 
 
-def test_a_run_that_cannot_be_started_fails_in_one_line(
+def test_run_that_cannot_start_fails_with_one_line(
     stopped: EditOrder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(arguments: Sequence[str], log: Path) -> None:
@@ -227,9 +227,7 @@ def test_a_run_that_cannot_be_started_fails_in_one_line(
     assert not stopped.is_locked
 
 
-def test_deliveries_go_on_beside_a_training_and_leave_nothing_when_they_are_stopped(
-    stopped: EditOrder, tmp_path: Path
-) -> None:
+def test_stopped_delivery_beside_a_training_leaves_no_files(stopped: EditOrder, tmp_path: Path) -> None:
     queue = window(stopped)
     queue.resume(1)
     out = tmp_path / "film.mp4"
@@ -247,7 +245,7 @@ def test_deliveries_go_on_beside_a_training_and_leave_nothing_when_they_are_stop
     assert not queue.folder.exists()
 
 
-def test_time_left_is_said_once_something_is_done() -> None:
+def test_time_left_is_estimated_from_progress() -> None:
     order = EditOrder(Path("a.ply"), Path("out"), "a", "all", "night")
     half = replace(QueuedTask(1, order, "running"), progress=Progress(0.5), seconds=20.0)
     assert half.seconds_left == 20.0
@@ -256,5 +254,5 @@ def test_time_left_is_said_once_something_is_done() -> None:
     assert replace(half, status="stopped").seconds_left is None
 
 
-def test_durations_are_read_at_a_glance() -> None:
+def test_durations_have_rounded_units() -> None:
     assert [format_duration(s) for s in (0.2, 75.0, 200.0, 5400.0)] == ["1 s", "75 s", "3 min", "1 h 30 min"]

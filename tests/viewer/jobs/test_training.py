@@ -1,4 +1,4 @@
-"""The form of a new edit as data, and the files of its run while it trains."""
+"""Form of a new edit as data, and the files of its training run."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def order(folder: Path, name: str = "blue") -> EditOrder:
     return EditOrder(scene.resolve(), training.free_run(home, name), name, "all", "recolor:#3060d0")
 
 
-def test_runs_lie_beside_their_scene_or_where_the_user_may_write(tmp_path: Path) -> None:
+def test_runs_lie_beside_the_scene_or_in_a_writable_folder(tmp_path: Path) -> None:
     scene = tmp_path / "there" / "bear.ply"
     scene.parent.mkdir()
     scene.touch()
@@ -65,7 +65,7 @@ def test_runs_lie_beside_their_scene_or_where_the_user_may_write(tmp_path: Path)
     assert elsewhere.name.startswith("bear-")
 
 
-def test_a_run_that_was_stopped_is_found_again_and_can_be_discarded(tmp_path: Path) -> None:
+def test_stopped_run_is_found_and_can_be_discarded(tmp_path: Path) -> None:
     asked = order(tmp_path)
     asked.save()
     assert [*training.stopped_orders(asked.out.parent, asked.scene)] == [], "it has not begun"
@@ -98,7 +98,7 @@ def test_a_run_that_was_stopped_is_found_again_and_can_be_discarded(tmp_path: Pa
     ],
     ids=lambda content: "a folder" if content is None else ascii(content[:20]),
 )
-def test_a_damaged_file_of_a_run_is_passed_over(tmp_path: Path, damaged: bytes | None) -> None:
+def test_damaged_run_file_is_skipped(tmp_path: Path, damaged: bytes | None) -> None:
     asked = order(tmp_path)
     good = order(tmp_path, "gold")
     for kept in (asked, good):
@@ -116,7 +116,7 @@ def test_a_damaged_file_of_a_run_is_passed_over(tmp_path: Path, damaged: bytes |
     assert asked.read_progress(Progress(0.1)) == Progress(0.1)
 
 
-def test_a_run_whose_files_are_pipes_is_not_waited_for(tmp_path: Path) -> None:
+def test_run_files_that_are_pipes_do_not_block(tmp_path: Path) -> None:
     asked = order(tmp_path)
     (asked.out / "state").mkdir(parents=True)
     (asked.out / "state" / "run.json").write_text("{}")
@@ -126,7 +126,7 @@ def test_a_run_whose_files_are_pipes_is_not_waited_for(tmp_path: Path) -> None:
     assert asked.read_progress(Progress(0.1)) == Progress(0.1)
 
 
-def test_what_cannot_be_removed_is_whole_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_removal_keeps_the_run_and_explains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = order(tmp_path)
     asked.save()
     (asked.out / "state").mkdir(parents=True)
@@ -149,7 +149,7 @@ def test_what_cannot_be_removed_is_whole_and_says_so(tmp_path: Path, monkeypatch
 
 
 @pytest.mark.parametrize("name", ["..", ".", "", "...", "link"])
-def test_no_order_of_a_stranger_makes_another_folder_a_run(name: str, tmp_path: Path) -> None:
+def test_orders_of_a_third_party_claim_no_other_folder(name: str, tmp_path: Path) -> None:
     asked = order(tmp_path)
     asked.save()
     edits = asked.out.parent
@@ -162,7 +162,7 @@ def test_no_order_of_a_stranger_makes_another_folder_a_run(name: str, tmp_path: 
     assert [*training.stopped_orders(edits, asked.scene)] == []
 
 
-def test_a_finished_edit_is_never_discarded(tmp_path: Path) -> None:
+def test_finished_edit_is_never_discarded(tmp_path: Path) -> None:
     asked = order(tmp_path)
     asked.out.mkdir(parents=True)
     asked.result.touch()
@@ -170,7 +170,7 @@ def test_a_finished_edit_is_never_discarded(tmp_path: Path) -> None:
     assert asked.result.exists()
 
 
-def test_the_trainer_s_progress_and_recordings_are_read_as_it_writes_them(tmp_path: Path) -> None:
+def test_progress_and_recordings_of_the_trainer_are_read(tmp_path: Path) -> None:
     asked = order(tmp_path)
     scene = bear().scene
     folder = RunFolder(asked.out)
@@ -207,24 +207,24 @@ def form(kind: str, **changes: Any) -> NewEdit:
     return replace(NewEdit(editor=KINDS.index(kind)), **changes)
 
 
-def test_every_editor_of_the_form_is_one_of_the_trainer() -> None:
+def test_every_editor_of_the_form_exists_in_the_trainer() -> None:
     assert set(KINDS) <= set(EDITORS)
 
 
 @pytest.mark.parametrize(
     "kind", [kind for kind in KINDS if kind not in ("instruct", "folder", "pictures", "style")]
 )
-def test_what_the_form_asks_for_is_what_the_trainer_takes(kind: str) -> None:
+def test_trainer_accepts_the_specs_of_the_form(kind: str) -> None:
     word, _, what = form(kind).spec.partition(":")
     assert word == kind
-    if kind != "grade":  # which changes nothing until a slider is moved
+    if kind != "grade":  # a grade changes nothing until a slider moves
         check_new_editor(EditorOptions(f"{word}:{what}"))
     moved = form(kind, amount=0.98, through_hues=True, grade=(1.0, -0.25, *NEUTRAL[2:]))
     assert not moved.obstacle
     check_new_editor(EditorOptions(moved.spec))
 
 
-def test_a_grade_says_its_palette_only_where_a_color_of_it_moves() -> None:
+def test_grade_spec_contains_the_palette_only_if_a_color_changes() -> None:
     colors = (("#7eae44", "#7eae44"), ("#b97a30", "#b97a30"))
     still = form("grade", palette=colors)
     assert (still.spec, still.obstacle) == ("grade", STILL)
@@ -240,7 +240,7 @@ def test_a_grade_says_its_palette_only_where_a_color_of_it_moves() -> None:
         assert with_settings(NewEdit(), f"grade:{foreign}") is None
 
 
-def test_a_grade_says_the_curve_of_a_color_with_what_becomes_of_it() -> None:
+def test_grade_spec_contains_the_curve_of_a_color() -> None:
     bent = form("grade", palette=(("#7eae44", "#7eae44/0.50:0.30"), ("#b97a30", "#b97a30")))
     assert bent.spec == "grade:#7eae44=#7eae44/0.50:0.30,#b97a30"
     assert not bent.obstacle
@@ -250,7 +250,7 @@ def test_a_grade_says_the_curve_of_a_color_with_what_becomes_of_it() -> None:
     assert again.palette == bent.palette
 
 
-def test_a_picked_color_stands_in_the_palette_in_place_of_one_like_it() -> None:
+def test_picked_color_replaces_a_similar_palette_color() -> None:
     colors = (("#7eae44", "#3060d0"), ("#b97a30", "#b97a30"))
     alike = with_color(form("grade", palette=colors, picks=True), "#7fad44")
     assert alike.palette == (("#7fad44", "#3060d0"), colors[1])
@@ -262,11 +262,11 @@ def test_a_picked_color_stands_in_the_palette_in_place_of_one_like_it() -> None:
     assert len(with_color(many, "#20c0f0").palette) == MAX_PAIRS
 
 
-def test_the_trainer_has_as_many_paintings_as_the_form() -> None:
+def test_form_and_trainer_have_the_same_number_of_styles() -> None:
     assert TRAINED_STYLES == STYLES
 
 
-def test_an_editor_says_what_is_missing_before_it_can_train() -> None:
+def test_editor_reports_what_is_missing_before_training() -> None:
     assert "Describe the edit" in form("instruct").obstacle or "pip install" in form("instruct").obstacle
     assert "slider" in form("grade").obstacle
     assert form("grade", grade=(1.0, -0.25, *NEUTRAL[2:])).spec == "grade:exposure=1.00,temperature=-0.25"
@@ -281,14 +281,14 @@ def test_an_editor_says_what_is_missing_before_it_can_train() -> None:
     )
 
 
-def test_changed_pictures_find_their_own_region() -> None:
+def test_pictures_editor_finds_its_region_by_default() -> None:
     found = with_editor(NewEdit(), KINDS.index("pictures"))
     assert found.region == CHANGED
     assert with_editor(found, 0).region == ALL
     assert with_editor(NewEdit(region="hands"), KINDS.index("pictures")).region == "hands"
 
 
-def test_a_dropped_picture_is_ready_to_train_and_a_further_one_comes_beside_it() -> None:
+def test_dropped_pictures_are_added_to_the_form() -> None:
     first = with_picture(form("recolor", region="hands", pictures="old.png"), Path("a/helmet.png"), True)
     assert (first.spec, first.region) == (f"pictures:{Path.cwd()}/a/helmet.png", CHANGED)
     assert first.layer_name == "helmet"
@@ -298,14 +298,14 @@ def test_a_dropped_picture_is_ready_to_train_and_a_further_one_comes_beside_it()
     assert with_picture(second, Path("c.png"), False).pictures == "c.png"
 
 
-def test_a_name_is_one_that_a_file_can_have() -> None:
+def test_layer_name_is_a_valid_file_name() -> None:
     assert form("recolor").layer_name == "recolor"
     assert form("recolor", region="hands").layer_name == "hands recolor"
     assert form("night", name=" ../a\\b ").layer_name == "-a-b"
     assert form("style", style=7).layer_name == "style 7"
 
 
-def test_an_order_is_a_command_line_that_the_trainer_reads_back() -> None:
+def test_order_arguments_are_parsed_by_the_trainer() -> None:
     order = EditOrder(Path("a b.ply"), Path("out/-x"), "-x", "all-sphere:0,0,0,1", "night:0.70", True, 1)
     options = train_options(order.arguments(resumes=True)[1:])
     assert (options.scene, options.out, options.name) == (order.scene, order.out, order.name)
@@ -323,7 +323,7 @@ def test_an_order_is_a_command_line_that_the_trainer_reads_back() -> None:
         *("pictures:/a/b.png,/a/c.png", "folder:/a/views"),
     ],
 )
-def test_the_form_is_filled_in_from_an_edit_s_instruction(spec: str) -> None:
+def test_form_is_filled_from_the_instruction_of_an_edit(spec: str) -> None:
     form = with_settings(NewEdit(sentence="x", color=(1.0, 0.0, 0.0)), spec)
     assert form is not None
     assert form.spec == spec
