@@ -1,4 +1,4 @@
-"""Films keep the colors of their frames in players that go by the file's tags."""
+"""Films keep the colors of their frames in players that follow the file's color tags."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from viewer.pictures import film
 SIX = np.array([[0, 255, 0], [255, 0, 0], [0, 0, 255], [255, 255, 255], [0, 0, 0], [190, 120, 60]], np.uint8)
 SIDE = 32
 LUMA = {"bt709": (0.2126, 0.0722), "smpte170m": (0.299, 0.114), "bt470bg": (0.299, 0.114)}
-"""Weights of red and blue in the luma of a matrix."""
+"""Weights of red and blue in the luma of each matrix."""
 
 
 def six_colors(width: int = 3 * SIDE, height: int = 2 * SIDE) -> np.ndarray:
-    """A frame of six fields, two rows of three."""
+    """Return a frame of six color fields in two rows of three. [H,W,3]"""
     frame = SIX.reshape(2, 3, 3).repeat(SIDE, axis=0).repeat(SIDE, axis=1)
     return np.ascontiguousarray(frame[:height, :width])
 
 
 def centers(frame: np.ndarray) -> np.ndarray:
-    """The colors in the middle of the six fields. [6,3]"""
+    """Return the colors at the centers of the six fields. [6,3]"""
     middle = SIDE // 2
     return frame[middle::SIDE, middle::SIDE, :3].reshape(6, 3).astype(int)
 
@@ -39,7 +39,7 @@ def ffmpeg(*arguments: object) -> subprocess.CompletedProcess[bytes]:
 
 
 def video_tags(path: Path) -> dict[str, str]:
-    """What a video says of its colors, and its size."""
+    """Return the color tags and the size of a video."""
     colors = r"(\w+), ([\w-]+)(?:/([\w-]+)/([\w-]+))?"
     facts = re.search(rf"yuv420p\({colors}[^)]*\), (\d+x\d+)", ffmpeg("-i", path).stderr.decode())
     assert facts is not None, "the colors have no tags"
@@ -54,7 +54,7 @@ def video_tags(path: Path) -> dict[str, str]:
 
 
 def played(path: Path) -> np.ndarray:
-    """The first frame of a video as a player shows it by its tags. [H,W,3] 0..255"""
+    """Return the first frame of a video as decoded by its tags. [H,W,3] 0 to 255"""
     tags = video_tags(path)
     width, height = (int(side) for side in tags["size"].split("x"))
     raw = ffmpeg("-i", path, "-frames:v", 1, "-pix_fmt", "yuv420p", "-f", "rawvideo", "-").stdout
@@ -71,7 +71,7 @@ def played(path: Path) -> np.ndarray:
     return shown
 
 
-def test_six_colors_of_a_video_come_back_by_its_tags(tmp_path: Path) -> None:
+def test_video_colors_are_restored_by_its_tags(tmp_path: Path) -> None:
     film.write_film(tmp_path / "film.mp4", [six_colors()] * 2, 24)
     assert video_tags(tmp_path / "film.mp4") == {
         "range": "tv",
@@ -83,14 +83,14 @@ def test_six_colors_of_a_video_come_back_by_its_tags(tmp_path: Path) -> None:
     assert np.abs(centers(played(tmp_path / "film.mp4")) - SIX).max() <= 2
 
 
-def test_an_odd_video_is_padded_to_even_sides(tmp_path: Path) -> None:
+def test_video_with_odd_size_is_padded_to_even_sides(tmp_path: Path) -> None:
     film.write_film(tmp_path / "film.mp4", [six_colors(3 * SIDE - 1, 2 * SIDE - 1)], 24)
     assert video_tags(tmp_path / "film.mp4")["size"] == "96x64"
     assert np.abs(centers(played(tmp_path / "film.mp4")) - SIX).max() <= 2
 
 
 @pytest.mark.parametrize(("ending", "tolerance"), [(".gif", 0), (".webp", 4)])
-def test_six_colors_of_an_animation_come_back(tmp_path: Path, ending: str, tolerance: int) -> None:
+def test_animation_colors_are_restored(tmp_path: Path, ending: str, tolerance: int) -> None:
     path = tmp_path / f"film{ending}"
     film.write_film(path, [six_colors(3 * SIDE - 1, 2 * SIDE - 1)] * 2, 24)
     with Image.open(path) as animation:
@@ -106,7 +106,7 @@ def sweep(tmp_path: Path, out: Path, *words: str) -> int:
 
 
 @pytest.mark.parametrize(("name", "size"), [("film.mp4", "22x16"), ("film.webp", "21x15"), ("film", "21x15")])
-def test_the_line_reports_the_size_that_was_written(
+def test_output_reports_the_written_size(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, size: str
 ) -> None:
     if name.endswith(".mp4"):
@@ -116,7 +116,7 @@ def test_the_line_reports_the_size_that_was_written(
 
 
 @pytest.mark.parametrize("name", ["film.webp", "frames"])
-def test_a_film_has_a_transparent_background(tmp_path: Path, name: str) -> None:
+def test_film_with_alpha_has_a_transparent_background(tmp_path: Path, name: str) -> None:
     out = tmp_path / name
     assert sweep(tmp_path, out, "--alpha") == 0
     first = out if out.is_file() else out / "frame_0000.png"
@@ -128,7 +128,7 @@ def test_a_film_has_a_transparent_background(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["film.gif", "film.mp4"])
-def test_a_film_without_transparency_is_refused_by_name(
+def test_film_format_without_alpha_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
     assert sweep(tmp_path, tmp_path / name, "--alpha") == 2
