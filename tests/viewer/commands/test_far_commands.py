@@ -1,4 +1,4 @@
-"""`progdf render`, `export` and `check` on a scene of doubles far from 0: as on the same scene near 0."""
+"""`progdf render`, `export` and `check` on doubles far from 0 give the same results as near 0."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Run = Callable[..., int]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """near.ply and far.ply, the scarf's edit of each, and the same cameras of each."""
+    """Write near.ply and far.ply, each with the scarf edit and the same cameras."""
     made = tmp_path_factory.mktemp("far")
     stack = bear_stack(800)
     for name, origin in (("near", (0.0, 0.0, 0.0)), ("far", FAR)):
@@ -58,7 +58,7 @@ def pixels(path: Path | str) -> np.ndarray:
     [(), ("--orbit", "30,15"), ("--frame", "scarf"), ("--camera", "{}.json:1")],
     ids=lambda how: how[:1],
 )
-def test_a_far_scene_is_drawn_as_the_near_one(run: Run, how: tuple[str, ...]) -> None:
+def test_far_scene_renders_like_the_near_one(run: Run, how: tuple[str, ...]) -> None:
     for name in ("near", "far"):
         words = [word.format(name) for word in how]
         assert run("render", f"{name}.ply", f"{name}.gdf", *words, *SMALL, "-o", f"{name}.png") == 0
@@ -66,14 +66,14 @@ def test_a_far_scene_is_drawn_as_the_near_one(run: Run, how: tuple[str, ...]) ->
     assert pixels("far.png").std() > 10
 
 
-def test_a_picture_of_a_far_scene_is_a_camera_for_the_next(run: Run) -> None:
+def test_picture_of_a_far_scene_is_reused_as_camera(run: Run) -> None:
     assert run("render", "far.ply", "--orbit", "30,15", *SMALL, "-o", "a.png") == 0
     assert run("render", "far.ply", "--camera", "a.png", "--engine", "cpu", "-o", "b.png") == 0
     assert np.array_equal(pixels("a.png"), pixels("b.png"))
     assert np.abs(load_cameras("a.png")[0].position.numpy() - FAR).max() < 20.0
 
 
-def test_a_far_session_is_drawn_as_it_was_saved(run: Run, folder: Path) -> None:
+def test_far_session_renders_as_saved(run: Run, folder: Path) -> None:
     opened = document.load(folder / "far.ply", [folder / "far.gdf"])
     shown = ViewState(layers=(LayerState(0, "scarf", 1.0),))
     session.save(folder / "far.session.json", WindowSession(opened, shown))
@@ -84,7 +84,7 @@ def test_a_far_session_is_drawn_as_it_was_saved(run: Run, folder: Path) -> None:
     assert np.array_equal(pixels("far.png"), pixels("near.png"))
 
 
-def test_an_edited_far_scene_is_exported_as_doubles(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+def test_edited_far_scene_is_exported_as_doubles(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("near", "far"):
         assert run("export", f"{name}.ply", f"{name}.gdf", "-o", f"{name}_edited.ply") == 0
     near, far = capsys.readouterr().out.splitlines()
@@ -92,12 +92,12 @@ def test_an_edited_far_scene_is_exported_as_doubles(run: Run, capsys: pytest.Cap
     assert "doubles" not in near
     a = load_ply("near_edited.ply")
     b = load_ply("far_edited.ply")
-    assert torch.allclose(b.means, a.means, rtol=0, atol=1e-9)  # doubles at 2e6 are 2e-10 apart
+    assert torch.allclose(b.means, a.means, rtol=0, atol=1e-9)  # doubles at 2e6 have steps of 2e-10
     assert torch.equal(b.sh0, a.sh0)
     assert b.origin == FAR
 
 
-def test_an_edit_that_moves_all_and_so_the_origin_is_exported_too(run: Run) -> None:
+def test_edit_that_moves_the_origin_is_exported(run: Run) -> None:
     scene = load_ply("far.ply")
     offsets = torch.zeros(2, len(scene), BASE_CHANNELS)
     offsets[1, :, :3] = 21.3
@@ -109,7 +109,7 @@ def test_an_edit_that_moves_all_and_so_the_origin_is_exported_too(run: Run) -> N
     assert float((found.world_means - scene.world_means - 21.3).abs().max()) < 1e-5
 
 
-def test_check_says_the_origin_of_a_far_scene_and_what_floats_have_lost(
+def test_info_reports_the_origin_and_float_precision_of_a_far_scene(
     run: Run, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run("info", "far.ply") == 0

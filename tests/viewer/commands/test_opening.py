@@ -1,4 +1,4 @@
-"""Sessions on the command line: rendered, exported and filmed with all that they hold."""
+"""Sessions on the command line: render, export and film them with everything they hold."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ SMALL = ("--size", "64x48", "--engine", "cpu")
 
 
 def saved(folder: Path, view: ViewState) -> Path:
-    """work.session.json in `folder`, beside the bear and its edits."""
+    """Write work.session.json, the bear and its edits to `folder`; return the session's path."""
     scene, *gdfs = bear().save(folder)
     session.save(folder / "work.session.json", WindowSession(document.load(scene, gdfs), view))
     return folder / "work.session.json"
@@ -58,7 +58,7 @@ def run(*argv: str) -> int:
 
 
 @pytest.mark.parametrize("command", ["view", "render", "export"])
-def test_an_edit_given_twice_is_refused_however_its_file_is_named(
+def test_duplicate_edit_is_refused_under_any_file_name(
     here: Path, command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bear().save(here)
@@ -73,8 +73,8 @@ def test_an_edit_given_twice_is_refused_however_its_file_is_named(
 
 
 @pytest.mark.parametrize("blend", ["normalized", "sum", "over"])
-def test_an_exported_session_is_what_the_window_shows(here: Path, blend: str) -> None:
-    """Strengths, gains, paint, which layers show, their order and how they blend."""
+def test_exported_session_matches_the_window(here: Path, blend: str) -> None:
+    """Covers strengths, gains, paint, visibility, layer order and blend rule."""
     view = replace(full_view(), blend=blend)
     again = LayerState(2, "ears once more", 0.6, gains=Gains(1.0, 1.0, 0.3))
     three = tuple(replace(layer, solo=False, enabled=True) for layer in (*view.layers, again))
@@ -93,22 +93,20 @@ def test_an_exported_session_is_what_the_window_shows(here: Path, blend: str) ->
             assert torch.allclose(now, was, rtol=1e-5, atol=1e-6), name
 
 
-def test_an_export_says_which_layers_of_the_session_are_in_it(
-    here: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_export_reports_the_included_layers(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     saved(here, full_view())
     assert run("export", "work.session.json", "-o", "edited.ply") == 0
     assert "ears → gold 0.375; read back" in capsys.readouterr().out
 
 
-def test_a_strength_said_beside_the_session_wins_under_the_layers_name_or_its_edits(here: Path) -> None:
+def test_set_overrides_the_session_by_layer_or_edit_name(here: Path) -> None:
     saved(here, full_view())
     for name in ("ears", "ears → gold"):
         assert run("export", "work.session.json", "--set", f"{name}=0", "-o", "edited.ply") == 0
         assert torch.equal(load_ply("edited.ply").means, bear().scene.means)
 
 
-def test_a_blend_rule_given_beside_the_session_takes_the_place_of_its_own(here: Path) -> None:
+def test_blend_option_overrides_the_session(here: Path) -> None:
     view = replace(full_view(), blend="normalized")
     view = replace(view, layers=tuple(replace(layer, solo=False, enabled=True) for layer in view.layers))
     scene, _, ears = bear().save(here)
@@ -133,7 +131,7 @@ def test_a_blend_rule_given_beside_the_session_takes_the_place_of_its_own(here: 
         (("--out", "x.ply", "ears.gdf"), "an edit was given with the session"),
     ],
 )
-def test_an_export_of_a_session_that_cannot_be_is_one_line_and_changes_no_file(
+def test_invalid_session_export_is_one_line_and_changes_no_file(
     here: Path, argv: tuple[str, ...], told: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     saved(here, full_view())
@@ -145,7 +143,7 @@ def test_an_export_of_a_session_that_cannot_be_is_one_line_and_changes_no_file(
     assert {path: path.read_bytes() for path in here.iterdir()} == before
 
 
-def test_a_sweep_moves_a_renamed_layer_of_a_session_and_leaves_its_comparison_alone(here: Path) -> None:
+def test_sheet_of_a_renamed_layer_ignores_the_comparison(here: Path) -> None:
     saved(here, full_view())
     sheets = []
     for name in ("ears", "ears → gold"):
@@ -157,7 +155,7 @@ def test_a_sweep_moves_a_renamed_layer_of_a_session_and_leaves_its_comparison_al
     assert sheets[0].shape == sheets[1].shape
 
 
-def test_a_sweep_shows_a_layer_whose_group_is_hidden_and_refuses_one_whose_group_is_at_zero(
+def test_sheet_shows_a_layer_in_a_hidden_group_but_not_at_zero(
     here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     ears, scarf = full_view().layers
@@ -175,14 +173,14 @@ def test_a_sweep_shows_a_layer_whose_group_is_hidden_and_refuses_one_whose_group
     assert "its group warm is at 0, so nothing would change" in capsys.readouterr().err
 
 
-def test_a_session_in_a_comparison_is_rendered_in_it(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_session_with_a_comparison_is_rendered_in_it(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     saved(here, replace(full_view(), compare=Comparison("difference", amplify=2.0)))
     assert run("render", "work.session.json", *SMALL, "-o", "a.png") == 0
     assert "PSNR of edited against original" in capsys.readouterr().out
 
 
 def filmed(moving: bool) -> ViewState:
-    """The scarf turned green in eight frames, with or without the camera."""
+    """Return a view whose scarf turns green within eight frames; `moving` adds the camera to the keys."""
     view = replace(full_view(), timeline=Timeline(length=8), compare=Comparison())
     view = replace(view, layers=tuple(replace(layer, solo=False, enabled=True) for layer in view.layers))
     made = view.timeline
@@ -193,7 +191,7 @@ def filmed(moving: bool) -> ViewState:
     return replace(view, timeline=replace(made, keys=keys))
 
 
-def test_the_sessions_own_timeline_can_be_filmed(here: Path) -> None:
+def test_timeline_of_a_session_can_be_filmed(here: Path) -> None:
     view = filmed(moving=True)
     saved(here, view)
     given = ("render", "--session", "work.session.json", "--timeline", *SMALL)
@@ -206,7 +204,7 @@ def test_the_sessions_own_timeline_can_be_filmed(here: Path) -> None:
     assert np.abs(found - film.to_pixels(expected)).max() <= 1
 
 
-def test_the_sliders_of_a_timeline_are_numbered_scenes_as_the_film_draws_them(
+def test_timeline_exports_numbered_scenes_equal_to_the_film(
     here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     view = filmed(moving=True)
@@ -222,7 +220,7 @@ def test_the_sliders_of_a_timeline_are_numbered_scenes_as_the_film_draws_them(
         assert np.abs(found - engine.image(state, (64, 48))).max() < 1e-4, file
 
 
-def test_a_timeline_is_time_samples_of_its_own_pace(here: Path) -> None:
+def test_timeline_exports_usd_time_samples_at_its_frame_rate(here: Path) -> None:
     usd = pytest.importorskip("pxr.Usd", reason="pip install progdf-studio[usd]")
     saved(here, replace(view := filmed(moving=False), timeline=replace(view.timeline, fps=12)))
     given = ("export", "work.session.json", "--timeline")
@@ -232,7 +230,7 @@ def test_a_timeline_is_time_samples_of_its_own_pace(here: Path) -> None:
         assert (stage.GetTimeCodesPerSecond(), stage.GetEndTimeCode()) == (rate, last)
 
 
-def test_frames_replace_no_file_that_is_read_and_half_of_them_are_none(
+def test_failed_frame_export_leaves_no_frames_and_keeps_inputs(
     here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     saved(here, filmed(moving=False))
@@ -260,7 +258,7 @@ def test_frames_replace_no_file_that_is_read_and_half_of_them_are_none(
         (Timeline((Keyframe(0, ((0, 0.0),)),), 2000), "has 2001 frames; set their number with --frames"),
     ],
 )
-def test_what_is_no_sequence_is_one_line(
+def test_timeline_without_a_scene_sequence_is_refused(
     here: Path, keys: Timeline, said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     saved(here, replace(full_view(), timeline=keys))
@@ -270,7 +268,7 @@ def test_what_is_no_sequence_is_one_line(
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 30])
-def test_steps_of_a_film_are_no_frame_twice(count: int) -> None:
+def test_sheet_frames_are_distinct(count: int) -> None:
     from viewer.pictures.film import sheet_frames
 
     found = sheet_frames(Timeline(length=12, ping_pong=True), count)
@@ -279,7 +277,7 @@ def test_steps_of_a_film_are_no_frame_twice(count: int) -> None:
     assert count == 1 or found[-1] == 12
 
 
-def test_a_sheet_of_a_film_is_one_line(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_sheet_of_a_timeline_is_refused(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     saved(here, filmed(moving=True))
     film_of = ("--timeline", "--sheet", "ears")
     assert run("render", "work.session.json", *film_of, *SMALL, "-o", "x.png") == 2
@@ -287,14 +285,14 @@ def test_a_sheet_of_a_film_is_one_line(here: Path, capsys: pytest.CaptureFixture
     assert not list(here.glob("x.*"))
 
 
-def test_a_session_without_keys_cannot_be_filmed(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_session_without_keys_cannot_be_filmed(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     saved(here, replace(full_view(), timeline=Timeline()))
     assert run("render", "work.session.json", "--timeline", "-o", "a.gif") == 2
     assert "there is no key on it" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", ["view", "render", "export"])
-def test_help_says_what_happens_without_an_option(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_describes_the_default_behavior(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([command, "--help"]) == 0
     text = capsys.readouterr().out
     assert [trace for trace in ("None", "False", "(default: )", "STR", "PATH") if trace in text] == []
@@ -302,7 +300,7 @@ def test_help_says_what_happens_without_an_option(command: str, capsys: pytest.C
 
 
 def look_of(folder: Path) -> GradeForm:
-    """look.cube, a table of 5³ colors, and look.gdf, a grade of another scene, with a residual."""
+    """Write look.cube, a table of 5³ colors, and look.gdf, a grade of another scene with a residual."""
     table = torch.rand(125, 3, generator=torch.Generator().manual_seed(1))
     write_cube(folder / "table.cube", table, "table")
     other = random_gaussians(60)
@@ -313,7 +311,7 @@ def look_of(folder: Path) -> GradeForm:
     return lattice_form(read_cube(folder / "table.cube"))
 
 
-def test_a_grade_of_another_scene_goes_on_a_region_of_this_one_and_a_table_everywhere(
+def test_foreign_grade_applies_to_a_region_and_a_table_to_all(
     here: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     bear().save(here)
@@ -336,7 +334,7 @@ def test_a_grade_of_another_scene_goes_on_a_region_of_this_one_and_a_table_every
     assert run("render", *words, *SMALL, "-o", "x.png") == 0
 
 
-def test_the_colors_of_a_grade_are_written_at_its_strength_and_read_as_the_same_edit(
+def test_exported_color_table_has_the_strength_of_the_grade(
     here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bear().save(here)
@@ -357,7 +355,7 @@ def test_the_colors_of_a_grade_are_written_at_its_strength_and_read_as_the_same_
         assert run("export", "bear.ply", *edit, "-o", f"{name}.ply") == 0
     direct = load_ply("direct.ply")
     again = load_ply("again.ply")
-    within = ((bear().scene.sh0 * C0).abs() < 0.4).all(dim=1)  # beyond 0..1 a table has no say
+    within = ((bear().scene.sh0 * C0).abs() < 0.4).all(dim=1)  # a color table covers only 0 to 1
     assert torch.allclose(direct.sh0[within], again.sh0[within], atol=0.05)
     assert int(within.sum()) > 500
 
@@ -377,7 +375,7 @@ def test_the_colors_of_a_grade_are_written_at_its_strength_and_read_as_the_same_
     ],
 )
 @pytest.mark.parametrize("command", ["view", "render", "export"])
-def test_a_grade_that_cannot_be_placed_is_one_line_and_nothing_is_written(
+def test_grade_that_cannot_be_placed_is_refused(
     here: Path, command: str, words: tuple[str, ...], told: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bear().save(here)
@@ -391,7 +389,7 @@ def test_a_grade_that_cannot_be_placed_is_one_line_and_nothing_is_written(
 
 
 @pytest.mark.parametrize("words", [("table.cube", "look.gdf", "--region", "look=all"), ("scarf.gdf",), ()])
-def test_a_file_of_colors_is_of_one_grade(
+def test_color_table_export_needs_exactly_one_grade(
     here: Path, words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
     bear().save(here)
@@ -401,7 +399,7 @@ def test_a_file_of_colors_is_of_one_grade(
     assert not (here / "x.cube").exists()
 
 
-def test_a_session_remembers_where_a_grade_was_applied(here: Path) -> None:
+def test_session_remembers_the_region_of_a_grade(here: Path) -> None:
     scene, scarf, _ = bear().save(here)
     look_of(here)
     (here / "edits").mkdir()

@@ -1,4 +1,4 @@
-"""`progdf render` and `progdf export`, as a person at the keyboard meets them."""
+"""`progdf render` and `progdf export` as command lines."""
 
 from __future__ import annotations
 
@@ -61,21 +61,21 @@ def edited_by(stack: Stack, camera: Camera, scarf: float, ears: float) -> np.nda
     return film.to_pixels(render(compose_layers(stack.scene, layers), camera).image.numpy())
 
 
-def test_a_camera_file_and_strengths_give_the_composed_picture(run: Run, stack: Stack) -> None:
+def test_camera_file_and_strengths_render_the_composed_scene(run: Run, stack: Stack) -> None:
     options = ("--set", "scarf=0.7", "--set", "ears=1", "--camera", "cameras.json:1", "--engine", "cpu")
     assert run("render", "bear.ply", "scarf.gdf", "ears.gdf", *options, "-o", "a.png") == 0
     expected = edited_by(stack, stack.demo.cameras[1].resize(64, 48), 0.7, 1.0)
     assert np.abs(pixels("a.png").astype(int) - expected).max() <= 1
 
 
-def test_a_picture_carries_its_camera_and_is_one_for_the_next(run: Run, stack: Stack) -> None:
+def test_picture_is_reused_as_camera(run: Run, stack: Stack) -> None:
     assert run("render", "bear.ply", "--orbit", "30,15", *SMALL, "-o", "a.png") == 0
     assert run("render", "bear.ply", "--camera", "a.png", "--engine", "cpu", "-o", "b.png") == 0
     assert np.array_equal(pixels("a.png"), pixels("b.png"))
     assert (load_cameras("a.png")[0].width, load_cameras("a.png")[0].name) == (64, "a")
 
 
-def test_a_comparison_carries_no_camera(run: Run) -> None:
+def test_comparison_carries_no_camera(run: Run) -> None:
     assert run("render", "bear.ply", "scarf.gdf", "--split", *SMALL, "-o", "c.png") == 0
     assert camera_in_picture("c.png") is None
 
@@ -88,7 +88,7 @@ def test_both_engines_write_the_same_picture(run: Run) -> None:
     assert np.abs(pixels("cpu.png").astype(int) - pixels("gl.png")).max() <= 3, "the early stop: 0.01 of 255"
 
 
-def test_edits_without_a_strength_are_rendered_at_one(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+def test_edits_render_at_full_strength_by_default(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
     edits = ("bear.ply", "scarf.gdf", "ears.gdf")
     both = ("--set", "scarf=1", "--set", "ears=1")
     for name, settings in (("none", ()), ("full", both), ("one", both[:2])):
@@ -101,12 +101,12 @@ def test_edits_without_a_strength_are_rendered_at_one(run: Run, capsys: pytest.C
     assert np.array_equal(pixels("plain.png"), pixels("zero.png"))
 
 
-def test_edits_without_a_strength_are_exported_at_one(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+def test_edits_export_at_full_strength_by_default(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("export", "bear.ply", "scarf.gdf", "ears.gdf", "-o", "none.ply") == 0
     assert "scarf 1, ears 1" in capsys.readouterr().out
 
 
-def test_an_edit_that_no_set_names_keeps_its_strength(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+def test_edit_without_set_keeps_its_strength(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
     settings = ("--set", "scarf=0.8")
     assert run("export", "bear.ply", "scarf.gdf", "ears.gdf", *settings, "-o", "one.ply") == 0
     assert "scarf 0.8, ears 1;" in capsys.readouterr().out
@@ -115,21 +115,21 @@ def test_an_edit_that_no_set_names_keeps_its_strength(run: Run, capsys: pytest.C
     assert Path("one.ply").read_bytes() == Path("two.ply").read_bytes()
 
 
-def test_a_sweep_of_one_edit_leaves_the_others_at_zero(run: Run) -> None:
+def test_sweep_of_one_edit_leaves_the_others_at_zero(run: Run) -> None:
     for edits in (("ears.gdf",), ("ears.gdf", "scarf.gdf")):
         command = ("render", "bear.ply", *edits, "--sheet", "ears", *SMALL)
         assert run(*command, "-o", f"{len(edits)}.png") == 0
     assert np.array_equal(pixels("1.png"), pixels("2.png"))
 
 
-def test_an_orbit_turns_the_camera_even_with_a_leading_minus(run: Run) -> None:
+def test_orbit_accepts_a_leading_minus(run: Run) -> None:
     for name, orbit in (("left", "-40,10"), ("right", "40,10"), ("near", "-40,10,3")):
         assert run("render", "bear.ply", "--orbit", orbit, *SMALL, "-o", f"{name}.png") == 0
     assert not np.array_equal(pixels("left.png"), pixels("right.png"))
     assert not np.array_equal(pixels("left.png"), pixels("near.png"))
 
 
-def test_a_region_or_the_whole_scene_can_fill_the_picture(run: Run) -> None:
+def test_frame_fits_a_region_or_the_whole_scene(run: Run) -> None:
     for name, frame in (("scarf", ("--frame", "scarf")), ("all", ("--frame", "all")), ("plain", ())):
         options = (*frame, *SMALL, "--background", "#ff00ff", "-o", f"{name}.png")
         assert run("render", "bear.ply", "scarf.gdf", *options) == 0
@@ -138,23 +138,23 @@ def test_a_region_or_the_whole_scene_can_fill_the_picture(run: Run) -> None:
 
 
 def shown_share(path: str) -> float:
-    """The share of a picture that shows its background."""
+    """Return the share of background pixels in a picture, 0 to 1."""
     return float((np.abs(pixels(path).astype(int) - (255, 0, 255)).max(axis=2) < 8).mean())
 
 
-def test_the_frame_follows_the_orbit_and_a_distance_that_is_said_holds(run: Run) -> None:
+def test_frame_follows_the_orbit_and_keeps_a_given_distance(run: Run) -> None:
     for name, orbit in (("side", "90,10"), ("far", "90,10,30")):
         options = ("--frame", "scarf", "--orbit", orbit, *SMALL, "--background", "#ff00ff")
         assert run("render", "bear.ply", "scarf.gdf", *options, "-o", f"{name}.png") == 0
     assert shown_share("side.png") < 0.5 < shown_share("far.png")
 
 
-def test_the_background_is_what_was_asked_for(run: Run) -> None:
+def test_background_has_the_requested_color(run: Run) -> None:
     assert run("render", "bear.ply", "--background", "#204060", *SMALL, "-o", "blue.png") == 0
     assert tuple(pixels("blue.png")[0, 0]) == (0x20, 0x40, 0x60)
 
 
-def test_a_sweep_is_an_animation_there_and_back(run: Run) -> None:
+def test_sweep_is_a_looping_animation_there_and_back(run: Run) -> None:
     assert run("render", "bear.ply", "ears.gdf", "--sweep", "ears", *SMALL, "-o", "ears.gif") == 0
     with Image.open("ears.gif") as animation:
         assert animation.n_frames == 48
@@ -168,7 +168,7 @@ def test_a_sweep_is_an_animation_there_and_back(run: Run) -> None:
     assert np.array_equal(frames[2], frames[3]), "the way back is the way there"
 
 
-def test_all_sliders_in_turn_end_with_all_at_one(run: Run) -> None:
+def test_sweep_of_all_sliders_ends_with_all_at_one(run: Run) -> None:
     edits = ("scarf.gdf", "ears.gdf")
     assert run("render", "bear.ply", *edits, "--sweep", "all", *SMALL, "-o", "all") == 0
     assert len(list(Path("all").iterdir())) == 96
@@ -180,7 +180,7 @@ def test_all_sliders_in_turn_end_with_all_at_one(run: Run) -> None:
         assert np.abs(frame - still).max() <= 1, settings
 
 
-def test_a_turntable_needs_no_edit_and_begins_at_the_chosen_camera(run: Run) -> None:
+def test_turntable_needs_no_edit_and_starts_at_the_given_camera(run: Run) -> None:
     options = ("--turntable", "1", "--orbit", "40,20", *SMALL)
     assert run("render", "bear.ply", *options, "-o", "turn") == 0
     assert run("render", "bear.ply", "--orbit", "40,20", *SMALL, "-o", "still.png") == 0
@@ -192,14 +192,14 @@ def test_a_turntable_needs_no_edit_and_begins_at_the_chosen_camera(run: Run) -> 
     assert np.abs(half - still).mean() > 2.0
 
 
-def test_a_sheet_of_one_slider_is_a_row_of_five(run: Run) -> None:
+def test_sheet_of_one_slider_is_a_row_of_five(run: Run) -> None:
     assert run("render", "bear.ply", "ears.gdf", "--sheet", "ears", *SMALL, "-o", "row.png") == 0
     height, width, _ = pixels("row.png").shape
     assert width >= 5 * 64
     assert 48 < height < 2 * 48
 
 
-def test_a_sheet_of_two_sliders_is_a_grid_with_the_original_in_its_corner(run: Run) -> None:
+def test_sheet_of_two_sliders_is_a_grid_with_the_original(run: Run) -> None:
     edits = ("scarf.gdf", "ears.gdf", "--sheet", "scarf,ears")
     assert run("render", "bear.ply", *edits, *SMALL, "-o", "grid.png") == 0
     grid = pixels("grid.png")
@@ -246,7 +246,7 @@ def test_a_sheet_of_two_sliders_is_a_grid_with_the_original_in_its_corner(run: R
         (("--sheet", "scarf,scarf"), "--sheet scarf,scarf does not name one or two different edits"),
     ],
 )
-def test_a_mistake_is_one_line_and_leaves_no_file(
+def test_invalid_option_is_one_line_and_leaves_no_file(
     run: Run, capsys: pytest.CaptureFixture[str], options: tuple[str, ...], line: str
 ) -> None:
     assert run("render", "bear.ply", "scarf.gdf", "ears.gdf", *options, "-o", "x.png") == 2
@@ -287,7 +287,7 @@ def test_a_mistake_is_one_line_and_leaves_no_file(
         ),
     ],
 )
-def test_wrong_files_are_one_line_each(
+def test_invalid_files_are_one_line_each(
     run: Run, capsys: pytest.CaptureFixture[str], argv: tuple[str, ...], line: str
 ) -> None:
     assert run(*argv) == 2
@@ -296,7 +296,7 @@ def test_wrong_files_are_one_line_each(
     assert error.count("\n") == 1
 
 
-def test_a_film_without_its_encoder_names_what_to_install(
+def test_missing_video_encoder_names_the_extra_to_install(
     run: Run, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(film.importlib.util, "find_spec", lambda name: None)
@@ -305,7 +305,7 @@ def test_a_film_without_its_encoder_names_what_to_install(
     assert error.startswith("progdf: x.mp4 needs a video encoder; pip install progdf-studio[video]")
 
 
-def test_an_exported_scene_is_the_composed_one(
+def test_exported_scene_equals_the_composed_one(
     run: Run, stack: Stack, capsys: pytest.CaptureFixture[str]
 ) -> None:
     settings = ("--set", "ears=0.5", "--set", "scarf=1")
@@ -319,7 +319,7 @@ def test_an_exported_scene_is_the_composed_one(
 
 
 @pytest.mark.parametrize("ending", [".compressed.ply", ".glb", ".splat"])
-def test_another_format_says_what_it_costs_and_what_it_changes(
+def test_export_to_another_format_reports_size_and_loss(
     run: Run, capsys: pytest.CaptureFixture[str], ending: str
 ) -> None:
     assert run("export", "bear.ply", "scarf.gdf", "-o", f"edited{ending}") == 0
@@ -329,7 +329,7 @@ def test_another_format_says_what_it_costs_and_what_it_changes(
     assert re.search(rf"{size}; read back: {shift}, (no pixel differs|[\d.]+ dB to it, )", said), said
 
 
-def test_a_glb_is_exported_in_the_chosen_axes(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+def test_glb_is_exported_in_the_chosen_axes(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
     for axes in ("LUF", "RUB"):
         assert run("export", "bear.ply", "--glb-axes", axes, "-o", "a.glb") == 0
         assert "no pixel differs" in capsys.readouterr().out
@@ -348,7 +348,7 @@ def test_frames_go_from_the_original_to_the_strengths(run: Run, stack: Stack) ->
         assert torch.equal(load_ply(f"step_{number:03d}.ply").sh0, expected.sh0), number
 
 
-def test_an_export_that_does_not_read_back_leaves_no_file(
+def test_export_that_fails_verification_leaves_no_file(
     run: Run, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from progdf.formats import ply
@@ -364,7 +364,7 @@ def test_an_export_that_does_not_read_back_leaves_no_file(
     assert not list(Path().glob(".damaged*"))
 
 
-def test_a_second_edit_of_the_same_name_gets_a_number(stack: Stack, tmp_path: Path) -> None:
+def test_second_edit_of_the_same_name_gets_a_number(stack: Stack, tmp_path: Path) -> None:
     for file in ("a.gdf", "b.gdf"):
         save_gdf(tmp_path / file, stack.gdfs[0])
     gdfs = load_edits([tmp_path / "a.gdf", tmp_path / "b.gdf"], stack.scene, Path("bear.ply"))
@@ -373,12 +373,12 @@ def test_a_second_edit_of_the_same_name_gets_a_number(stack: Stack, tmp_path: Pa
     assert [layer.strength for layer in stack_layers(gdfs, half)] == [0.0, 0.5]
 
 
-def test_the_last_camera_is_minus_one(folder: Path, stack: Stack) -> None:
+def test_camera_index_minus_one_is_the_last(folder: Path, stack: Stack) -> None:
     last = read_camera(f"{folder / 'cameras.json'}:-1")
     assert torch.equal(last.viewmat, stack.demo.cameras[2].viewmat)
 
 
-def test_another_size_shows_the_same_height_undistorted(stack: Stack) -> None:
+def test_other_picture_size_keeps_the_vertical_field_of_view(stack: Stack) -> None:
     camera = stack.demo.cameras[0]
     wide = fit_camera(camera, (2 * camera.width, camera.height))
     assert float(wide.K[0, 0]) == float(wide.K[1, 1]) == float(camera.K[1, 1])
@@ -387,7 +387,7 @@ def test_another_size_shows_the_same_height_undistorted(stack: Stack) -> None:
     assert torch.allclose(half.K, camera.resize(camera.width // 2, camera.height // 2).K)
 
 
-def test_an_orbit_keeps_the_framed_pivot_and_distance() -> None:
+def test_orbit_keeps_the_framed_pivot_and_distance() -> None:
     framed = ViewCamera(pivot=(1.0, 2.0, 3.0), distance=7.0)
     assert parse_orbit("-30,15", framed) == replace(framed, azimuth=-30.0, elevation=15.0)
     assert parse_orbit("0,90,2.5", framed).distance == 2.5

@@ -1,4 +1,4 @@
-"""torch works on one thread while the viewer draws, on all while edits are read."""
+"""torch uses one thread while the viewer draws and all threads while edits are read."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from viewer.commands import render
 from viewer.files import document
 
 
-def test_a_command_draws_on_one_thread_and_reads_edits_on_all(
+def test_commands_draw_on_one_thread_and_read_edits_on_all(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     seen: list[tuple[str, int]] = []
