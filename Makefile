@@ -79,6 +79,7 @@ pictures: setup extras window browser
 	$(BIN)/python assets/page.py demo assets/page.jpg
 	$(BIN)/python -m benchmarks --markdown docs/*.md docs/lab/*.md --plots assets
 	$(BIN)/python assets/figures.py
+	$(BIN)/python assets/architecture.py
 
 # What the start page opens with, and the wheel holds: trained anew in some minutes.
 examples: setup

@@ -27,6 +27,7 @@ from tests.helpers.documents import blocks, command_examples
 from tests.helpers.edits import curved_field, edit_of, some_rows
 from tests.helpers.paths import ROOT
 from tests.helpers.scenes import ball
+from tests.helpers.sizes import PACKAGES, modules
 
 DOCUMENTS = [*PAGES, *(path for path in sorted((ROOT / "docs" / "lab").glob("*.md")) if path not in PAGES)]
 MAX_README_LINES = 150
@@ -175,3 +176,14 @@ def test_readme_figures_match_their_pages() -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     assert text.count("<!-- figure ") >= 5
     assert figures["with_figures"](text) == text, "run python assets/figures.py"
+
+
+def test_the_picture_of_the_packages_has_every_folder() -> None:
+    picture = (ROOT / "docs" / "architecture.svg").read_text(encoding="utf-8")
+    folders = {
+        module.path.parts[1]
+        for package in PACKAGES
+        for module in modules(package)
+        if len(module.path.parts) > 2
+    }
+    assert {folder for folder in folders if f">{folder}/<" not in picture} == set()
