@@ -26,14 +26,14 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("trainer.run.demo:main", "make a scene, train its edits, write previews, open the window"),
     "train": ("trainer.cli:train", "edit a region of a scene and write its .gdf file"),
     "batch": ("trainer.cli:batch", "train every edit of a catalogue, on this machine or a Ray cluster"),
-    "region": ("trainer.cli:region", "show or keep which Gaussians a region selects"),
+    "region": ("trainer.cli:region", "show or save the Gaussians that a region selects"),
     "views": ("trainer.cli:views", "write views of a scene to draw masks or edits on"),
     "fit": ("trainer.cli:fit", "refit a field to a recorded trajectory"),
     "evaluate": ("trainer.cli:evaluate", "measure a run as papers do"),
     "view": ("viewer.commands.view:main", "open the window: splats, layers, sliders"),
     "render": ("viewer.commands.render:render", "write a picture, a sweep or a sheet without a window"),
     "rebind": ("progdf.cli.rebind:main", "carry an edit over to the same scene in another file or format"),
-    "edit": ("progdf.cli.edit:main", "write a scene again without strays"),
+    "edit": ("progdf.cli.edit:main", "change or clean a scene by hand"),
     "export": ("viewer.commands.render:export", "write the edited scene as a 3DGS .ply file"),
     "info": ("progdf.cli.info:main", "show the contents of a scene or .gdf, repairs, strays and errors"),
 }
@@ -100,7 +100,7 @@ def _describe_failure(error: BaseException) -> tuple[int, str]:
         return 2, f"{error.object!r:.80} is not UTF-8, and cannot be written into a file; rename it"
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
-        remedy = "; the disk takes no more, free some space" if disk_full(error) else ""
+        remedy = "; free some space on the disk" if disk_full(error) else ""
         return 2, f"{where}{error.strerror or error}{remedy}"
     message = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
     return 70, f"internal error in progdf ({message[:200]}); {_save_traceback()}"

@@ -75,7 +75,7 @@ def main(argv: Sequence[str]) -> int:
     step_makers = _read_steps(options)
     if not options.clean and not step_makers:
         raise ProgdfError(
-            "nothing was asked for; say what to do with the scene, for example --clean or --delete REGION"
+            "no change is requested; add at least one option, for example --clean or --delete REGION"
         )
     if not makes_edit:
         written_format(options.out)
@@ -95,7 +95,7 @@ def main(argv: Sequence[str]) -> int:
         print_line("; ".join(_describe(step) for step in steps))
     edited = _clean(edited) if options.clean and len(edited) else edited
     if not len(edited):
-        raise ProgdfError(f"nothing of {options.scene} would be left; it has no Gaussian that is drawn")
+        raise ProgdfError(f"no visible Gaussian of {options.scene} would remain; choose another region")
     read_back = save_scene(options.out, edited, options.glb_axes)
     notes = () if read_back is None else read_back.notes
     print_line("; ".join([f"wrote {options.out}: {format_count(len(edited))}", *notes]))
@@ -104,7 +104,7 @@ def main(argv: Sequence[str]) -> int:
         new = shlex.quote(str(options.out))
         print_line(
             f"rows have new numbers: labels and edits of {scene_name(options.scene)} no longer fit; "
-            f"an edit is carried over by progdf rebind EDIT.gdf --from {old} --to {new} -o NEW.gdf"
+            f"carry an edit over with progdf rebind EDIT.gdf --from {old} --to {new} -o NEW.gdf"
         )
     return 0
 
@@ -129,7 +129,7 @@ def _instruction(options: EditOptions) -> str:
 
 def _describe(step: Step) -> str:
     """Return a description of a step for the user: region, number of Gaussians and action."""
-    action = {"remove": "taken away", "transform": "moved as a whole", "duplicate": "copied"}[step.does]
+    action = {"remove": "removed", "transform": "transformed", "duplicate": "copied"}[step.does]
     return f"{shorten(step.region.name)}: {format_count(len(step.region))} {action}"
 
 
@@ -195,13 +195,13 @@ def _clean(scene: Gaussians) -> Gaussians:
         return scene
     edited = clean(scene, strays)
     print_line(
-        f"clean: {group_digits(len(strays.rows))} of {format_count(len(scene))} left out: {strays.describe()}"
+        f"clean: {group_digits(len(strays.rows))} of {format_count(len(scene))} removed: {strays.describe()}"
     )
     mean, worst = picture_difference(scene, edited) if len(edited) else (0.0, 0.0)
     if worst >= NO_DIFFERENCE:
-        print_line("pictures from all around: no pixel differs")
+        print_line("rendered views: no pixel differs")
     else:
         print_line(
-            f"pictures from all around: {mean:.1f} dB to those before, {worst:.1f} dB where most differs"
+            f"rendered views: {mean:.1f} dB to the original on average, {worst:.1f} dB in the worst one"
         )
     return edited

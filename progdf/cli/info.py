@@ -63,7 +63,7 @@ class Survey:
         """Return the survey for the user, one line per fact."""
         center = " ".join(format_place(at, self.radius, 4) for at in self.center)
         lines = [
-            f"place: center {center}, radius {self.radius:.4g} (97 % of the Gaussians), "
+            f"position: center {center}, radius {self.radius:.4g} (97 % of the Gaussians), "
             f"farthest {self.farthest:.4g}",
             f"up: {self.up.name}, {self.up.reason}",
             f"bulk, 95 % along each axis: --region {_box(self.bulk_box)}",
@@ -73,8 +73,8 @@ class Survey:
         ]
         if self.surrounding:
             lines.append(
-                "cameras: a scene to stand inside, which cameras around it cannot frame; give its own, "
-                "or keep views with F4 in progdf view"
+                "cameras: the scene surrounds the viewer, so cameras around it cannot frame it; give its own "
+                "cameras, or save views with F4 in progdf view"
             )
         return lines
 
@@ -195,7 +195,7 @@ def kind_of(path: str | os.PathLike[str]) -> str:
     if path.suffix.lower() in (".gdf", CUBE):
         return "gdf"  # its reader raises the most specific error
     check_foreign(path, start)
-    raise ProgdfError(f"{path} is not a file progdf knows; give a scene, a .gdf edit or a camera file")
+    raise ProgdfError(f"{path} has an unknown file type; give a scene, a .gdf edit or a camera file")
 
 
 def _scene_lines(path: Path, cameras: Path | None, up: UpChoice) -> Iterator[str]:
@@ -209,7 +209,7 @@ def _scene_lines(path: Path, cameras: Path | None, up: UpChoice) -> Iterator[str
     yield from survey(scene, find_up(scene, found.cameras, up, path)).lines()
     camera = stored_view(path, scene.origin).camera
     if camera is not None:
-        yield f"camera: the file stores one of {camera.width}x{camera.height} pixels, which is the first view"
+        yield f"camera: {camera.width}x{camera.height} pixels, stored in the file; it is the first view"
     with notice_when_slow(f"looking for strays among {format_count(len(scene))} …"):
         strays = find_strays(scene)
     if len(strays.rows):
@@ -224,7 +224,7 @@ def _edit_lines(path: Path) -> Iterator[str]:
     count = gdf.scene.count
     yield f"{path.name}: the edit '{gdf.name}', {file_size(size)}"
     if gdf.instruction:
-        yield f"asked for: {gdf.instruction}"
+        yield f"instruction: {gdf.instruction}"
     sizes = ""
     if count:
         yield f"scene: {format_count(count)}, fingerprint {gdf.scene.means_sha256[:12]}"
@@ -232,13 +232,13 @@ def _edit_lines(path: Path) -> Iterator[str]:
         added = members - len(gdf.region)
         yield f"region: {gdf.region.name}, {format_count(region)} ({region / max(1, count):.1%})"
         if added:
-            yield f"adds: {format_count(added)}, none of which shows at strength 0"
+            yield f"adds: {format_count(added)}, all invisible at strength 0"
         each = gdf.field.bytes_per_member
         sizes = f"{each:.4g} bytes per Gaussian, {size / max(1, members):.4g} with the header, "
     yield f"field: {gdf.field.kind}, {sizes}{_describe_field(gdf.field)}"
     if gdf.field.kind == "grade":
-        bound = "bound to its scene; its map alone goes" if count else "bound to no scene; it goes"
-        yield f"grade: {bound} on any with --region {gdf.name}=REGION"
+        bound = "bound to its scene; its map alone" if count else "bound to no scene; it"
+        yield f"grade: {bound} can be applied to any scene with --region {gdf.name}=REGION"
     if gdf.field.recorded:
         yield f"recorded: {len(gdf.field.recorded)} snapshots"
     for head, content in (("option", gdf.options), ("report", gdf.report)):
@@ -256,9 +256,9 @@ def _session_lines(path: Path) -> Iterator[str]:
         if not os.path.isfile(file):
             state = "missing"
         elif session_file.sha256(file) == ref.sha256.lower():
-            state = "as it was saved"
+            state = "unchanged"
         else:
-            state = "changed since"
+            state = "changed"
         yield f"{kind}: {ref.file} ({state})"
     layers = session.view.get("layers", [])
     for layer in layers if isinstance(layers, list) else ():
@@ -276,14 +276,14 @@ def _describe_field(field: BakedField) -> str:
         return f"{form.label}; {len(form.knots)} knots"
     if form is None:
         stored = ", ".join(f"{name} {bases.label}" for name, bases in field.attributes.items())
-        return f"{len(field.knots)} knots; ends and bases: {stored or 'none, nothing moves'}"
+        return f"{len(field.knots)} knots; full edits and bases: {stored or 'none, no offsets'}"
     network = form.network
     error = ", ".join(f"{name} {value:.4g}" for name, value in (form.error or {}).items())
     bases = ", ".join(f"{name} {rank}" for name, rank in form.plan.ranks.items())
     return (
         f"{group_digits(network.parameters)} numbers in {network.shape.layers} layers of "
         f"{network.shape.width}; baked at {len(form.plan.knots)} knots with bases: {bases}; "
-        f"baking costs: {error}"
+        f"baking error: {error}"
     )
 
 
@@ -296,7 +296,7 @@ def _camera_lines(path: Path) -> Iterator[str]:
     yield "images: " + ", ".join(f"{width}x{height}" for width, height in sizes[:4]) + more + " pixels"
     distorted_count = sum(camera.lens is not None for camera in cameras)
     if distorted_count:
-        yield f"lens: {distorted_count} of {len(cameras)} cameras have one; photographs are straightened"
+        yield f"lens: {distorted_count} of {len(cameras)} cameras have one; photographs are undistorted"
     if report.ignored:
         yield f"ignored: {', '.join(map(_short_text, report.ignored))}"
 

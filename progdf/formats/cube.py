@@ -64,18 +64,18 @@ def read_cube(path: str | os.PathLike[str]) -> Tensor:
         raise ProgdfError(f"{name} is not a .cube file of a 3D table: it has no LUT_3D_SIZE before its rows")
     (size,) = keywords["LUT_3D_SIZE"]
     if not (2 <= size <= MAX_SIDE and size == int(size)):
-        raise ProgdfError(f"{name} says LUT_3D_SIZE {size:g}; a size of 2 to {MAX_SIDE} can be read")
+        raise ProgdfError(f"{name} has LUT_3D_SIZE {size:g}; sizes of 2 to {MAX_SIDE} are supported")
     count = int(size) ** 3
     try:
         numbers = np.loadtxt(io.StringIO(rows or "0 0 0"), ndmin=2)
     except ValueError as error:
         reason = " ".join(str(error).split())
-        raise ProgdfError(f"{name} has a row that is no color ({reason:.100}); save it again") from None
+        raise ProgdfError(f"{name} has an invalid row ({reason:.100}); save it again") from None
     if numbers.shape != (count, 3):
         found = f"{numbers.shape[0]} rows of {numbers.shape[1]} numbers"
         raise ProgdfError(f"{name} holds {found}, LUT_3D_SIZE {size:g} needs {count} of 3; save it again")
     if not (np.abs(numbers) <= _MAX_COLOR).all():
-        raise ProgdfError(f"{name} holds a number that is no color (not finite, or beyond {_MAX_COLOR:g})")
+        raise ProgdfError(f"{name} has a color that is not finite or beyond ±{_MAX_COLOR:g}; save it again")
     table = torch.from_numpy(numbers).float()
     min_color, max_color = _domain(keywords, name)
     if bool((min_color == 0.0).all()) and bool((max_color == 1.0).all()):
@@ -125,7 +125,7 @@ def _read_head(head: str, path: str | os.PathLike[str]) -> dict[str, list[float]
         check_fields(path, [word], _KEYWORD_COUNTS, _REFUSED_KEYWORDS, _REMEDY)
         if word not in _KEYWORD_COUNTS or word in keywords:
             raise ProgdfError(
-                f"{name} has a line '{line.strip():.40}', which no .cube file of a 3D table has"
+                f"{name} has a line '{line.strip():.40}', which is invalid in a 3D table; save it again"
             )
         try:
             keywords[word] = [float(value) for value in values]

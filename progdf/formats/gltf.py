@@ -203,7 +203,7 @@ def read_gltf(path: Path, read_spz: ReadSpz) -> GltfScene:
         parts.append(_place(reader.read(placement.mesh, index), placement.matrix, *similarity))
     if not parts:
         raise ProgdfError(
-            f"{path} holds no Gaussians: its scene shows nothing of {EXTENSION}; give a scene of Gaussians"
+            f"{path} holds no Gaussians: its scene has no {EXTENSION}; give a scene of Gaussians"
         )
     scene = _join(file, parts)
     axes = stored_axes(file)

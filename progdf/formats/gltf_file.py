@@ -365,7 +365,7 @@ class GltfFile:
             if source not in self._files:
                 if not os.path.exists(source):
                     raise ProgdfError(
-                        f"{source} does not exist, which holds numbers of {self.path}; put both in one folder"
+                        f"{source} does not exist, but {self.path} needs it; put both in one folder"
                     )
                 needed_bytes = max(
                     other.byteLength for other in self.tables.buffers if other.uri == buffer.uri

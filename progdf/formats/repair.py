@@ -285,7 +285,7 @@ class LoadReport:
             if count
         )
         return (
-            f"positions are float32, which has steps of {step:.2g} so far from 0: {counts} are left of "
+            f"float32 positions have steps of {step:.2g} this far from 0: {counts} remain of "
             f"{format_count(self.count)}; export the scene near 0, or with x, y, z as doubles"
         )
 
@@ -313,20 +313,20 @@ class LoadReport:
         """Return the report for the user, one line per fact."""
         sh = f"SH degree {self.sh_degree}"
         if self.sh_degree == 4:
-            sh += " (band 4 is kept, and not shown)"
+            sh += " (band 4 is kept but not rendered)"
         lines = [
             f"{self.file}: {format_count(self.count)}, {sh}, {self.format}, {file_size(self.file_bytes)}",
             *(f"converted: {phrase}" for phrase in self.conversions),
             *(f"ignored: {phrase}" for phrase in self.ignored_parts),
         ]
         if self.antialiased:
-            lines.append("trained anti-aliased (mip), and drawn so")
+            lines.append("antialiased: trained and rendered with Mip-Splatting's 2D filter")
         if self.scaled_quats:
             lines.append(
                 f"normalized: {format_count(self.scaled_quats, 'quaternion')} of another length than 1"
             )
         if self.origin != ZERO:
-            lines.append(f"origin: {' '.join(f'{at:.17g}' for at in self.origin)}, as it lies far from 0")
+            lines.append(f"origin: {' '.join(f'{at:.17g}' for at in self.origin)} (the scene is far from 0)")
         if self.lost:
             lines.append(f"lost: {self.lost}")
         return lines + [f"repaired: {phrase}" for phrase in self.repairs or ("nothing",)]

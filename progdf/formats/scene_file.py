@@ -540,12 +540,12 @@ def _failure_reason(status: int, stderr: bytes) -> str:
     """
     if status < 0:
         name = signal.Signals(-status).name if -status in set(signal.Signals) else str(-status)
-        return "ran out of its time" if name in ("SIGXCPU", "SIGKILL") else f"crashed ({name})"
+        return "exceeded its time limit" if name in ("SIGXCPU", "SIGKILL") else f"crashed ({name})"
     lines = stderr.decode("utf-8", "replace").strip().splitlines()
     message = escape_text(lines[-1] if lines else "")
     if "bad_alloc" in message or message.startswith("MemoryError"):
-        return "wanted more memory than such a file can need"
-    return f"said: {message[:160]}" if message else "said nothing"
+        return "requested more memory than such a file needs"
+    return f"reported: {message[:160]}" if message else "reported nothing"
 
 
 def _read_error(path: Path, kind: str, why: str) -> ProgdfError:
@@ -556,7 +556,7 @@ def _read_error(path: Path, kind: str, why: str) -> ProgdfError:
         kind: its format
         why: see `_failure_reason`
     """
-    if why.startswith(("said", "returned")):
+    if why.startswith(("reported", "returned")):
         return damage_error(path, f"the reader of .{kind} {why}")
     return ProgdfError(
         f"{path} cannot be read as .{kind}: its reader {why}; export it again, as .ply if possible"

@@ -86,7 +86,7 @@ class Gdf:
 def _check_added(added: Gaussians) -> None:
     """Raise ValueError if an added row is visible at strength 0, or has numbers beyond the limits."""
     if not bool((added.logit_opacities < UNSEEN_LOGIT).all()):
-        raise ValueError("an added row shows at strength 0")
+        raise ValueError("an added row is visible at strength 0")
     for name in ATTRIBUTES:
         values = getattr(added, name)
         if values.numel() and not float(values.abs().max()) < _MAX_OFFSETS.get(name, _MAX_OFFSET):
@@ -129,12 +129,14 @@ def verify(gdf: Gdf, scene: Gaussians, gdf_name: str = "", scene_name: str = "th
     )
     count, scene_count = (f"{n:,}".replace(",", " ") for n in (gdf.scene.count, len(scene)))
     if isinstance(gdf.field.origin, GradeForm):
-        rebind = f"its grade goes on any scene with --region {gdf.name}=all, or another region; {rebind}"
+        rebind = (
+            f"its grade can be applied to any scene with --region {gdf.name}=all, or another region; {rebind}"
+        )
     if gdf.scene.count != len(scene):
         counts = f"it has {count} Gaussians, {scene_name} has {scene_count}"
         raise ProgdfError(f"{other}: {counts}; {rebind}")
     if gdf.scene.means_sha256 != fingerprint(scene).means_sha256:
-        raise ProgdfError(f"{other}: {scene_name} has as many Gaussians, but at other places; {rebind}")
+        raise ProgdfError(f"{other}: {scene_name} has as many Gaussians, but at other positions; {rebind}")
     if gdf.field.channels not in (BASE_CHANNELS, BASE_CHANNELS + 3 * scene.shN.shape[1]):
         raise ProgdfError(f"{other}: {scene_name} has SH degree {scene.sh_degree}, the edit another")
 
@@ -209,7 +211,7 @@ def load_gdf(
     rows = pack(scene[gdf.region.members], with_shN=scene.sh_degree > 0)
     if isinstance(form, NeuralForm) and form.rows_sha256 not in ("", rows_hash(rows)):
         raise ProgdfError(
-            f"{name} was made for another scene: {scene_name} has its Gaussians, but they look different"
+            f"{name} was made for another scene: {scene_name} has its positions, but other attributes"
         )
     try:
         baked = bake_grade(form, rows) if isinstance(form, GradeForm) else bake_form(form, rows)
@@ -229,9 +231,7 @@ def apply_grade(gdf: Gdf, scene: Gaussians, region: Region) -> Gdf:
     """
     stored = gdf.field.origin
     if not isinstance(stored, GradeForm):
-        raise ProgdfError(
-            f"{gdf.name} is no grade: its field is {gdf.field.kind}; only a grade goes on any region"
-        )
+        raise ProgdfError(f"{gdf.name} is no grade: its field is {gdf.field.kind}; give a grade")
     if not len(region):
         raise ProgdfError(f"the region for {gdf.name} has no Gaussians; give another")
     rows = pack(scene[region.members], with_shN=scene.sh_degree > 0)

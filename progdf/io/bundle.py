@@ -136,7 +136,7 @@ def unpack_bundle(path: Path) -> Path:
         if not os.path.lexists(folder):
             _unpack(path, archive, members, folder)
         elif not _is_unpacked(path, folder):
-            raise ProgdfError(f"{folder} is there and is not what {path.name} unpacks to; move it elsewhere")
+            raise ProgdfError(f"{folder} exists and was not unpacked from {path.name}; move it elsewhere")
         opened = folder / session.filename
         if opened.is_file():
             return opened
@@ -182,7 +182,9 @@ def _check_members(path: Path, archive: zipfile.ZipFile) -> list[zipfile.ZipInfo
     """
     members = archive.infolist()
     if len(members) > MAX_FILES:
-        raise ProgdfError(f"{path} is no bundle: it holds {len(members)} files; the most are {MAX_FILES}")
+        raise ProgdfError(
+            f"{path} is no bundle: it holds {len(members)} files; at most {MAX_FILES} are allowed"
+        )
     names = set[str]()
     for member in members:
         name = member.filename

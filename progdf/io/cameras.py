@@ -100,7 +100,7 @@ def log_cameras(path: str | os.PathLike[str], cameras: Sequence[Camera], report:
     distorted_count = sum(camera.lens is not None for camera in cameras)
     if distorted_count:
         _log.info(
-            "%s: %d of %d cameras have a lens that bends photographs; what is drawn is straight",
+            "%s: %d of %d cameras have lens distortion; renderings are undistorted",
             path, distorted_count, len(cameras),
         )  # fmt: skip
 
@@ -224,7 +224,7 @@ def _read_source(source: _Source) -> tuple[list[Camera], CameraReport]:
     if data.startswith(_PNG):
         camera = _embedded_camera(path)
         if camera is None:
-            raise ProgdfError(f"{name} carries no camera; give a picture that progdf render wrote")
+            raise ProgdfError(f"{name} has no stored camera; give a picture written by progdf render")
         return [camera], CameraReport((), ())
     try:
         content = decode_json(data)

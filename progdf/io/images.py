@@ -127,8 +127,8 @@ def _check_proportions(
 
 def _orientation_error(path: str | os.PathLike[str], orientation: int) -> ProgdfError:
     return ProgdfError(
-        f"{path} is stored turned (EXIF orientation {orientation}), and nothing says whether its camera was "
-        "calibrated before or after turning it; save it upright, without that tag"
+        f"{path} is stored rotated (EXIF orientation {orientation}), so it is unclear which orientation its "
+        "camera calibration refers to; save it upright, without that tag"
     )
 
 
@@ -332,8 +332,7 @@ def _check_labels(path: Path, picture: Image.Image) -> None:
     hues.discard((4, 4, 4))
     if len(hues) > 1:
         raise ProgdfError(
-            f"{path} has {len(hues)} colors beside gray, as a map of labels has; "
-            "save the one thing white on black"
+            f"{path} has {len(hues)} colors beside gray, like a label map; save one object as white on black"
         )
 
 

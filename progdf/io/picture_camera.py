@@ -103,8 +103,8 @@ def find_picture_camera(
             raise ProgdfError(f"{len(named)} cameras are named {path.stem}; give {beside.name} beside {path}")
         if not named:
             raise ProgdfError(
-                f"{path} does not say from where it was rendered; put {beside.name} beside it, or give a "
-                f"camera named {path.stem} with --cameras (the .png that progdf render wrote is one)"
+                f"{path} has no stored camera; put {beside.name} beside it, or give a camera named "
+                f"{path.stem} with --cameras (such as the .png written by progdf render)"
             )
         camera = named[0]
     return replace(camera, name=path.stem, lens=None)  # renderings are undistorted

@@ -64,7 +64,7 @@ def test_check_says_it_and_never_shows_a_comment(tmp_path: Path, capsys: pytest.
     path = with_comment(tmp_path / "scene.ply", b"antialiased 1\ncomment \x1b]0;pwned\x07")
     assert main(["info", str(path)]) == 0
     said = capsys.readouterr().out
-    assert "trained anti-aliased (mip), and drawn so" in said
+    assert "antialiased: trained and rendered with Mip-Splatting's 2D filter" in said
     assert "\x1b" not in said
     assert "pwned" not in said
 

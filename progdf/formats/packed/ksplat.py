@@ -193,7 +193,7 @@ def _centers(
     later = section["full_buckets"] + np.searchsorted(ends[1:], index, side="right")
     bucket = np.where(index < full_rows, index // max(section["bucket_size"], 1), later)
     if section["bucket_bytes"] < 12 or (len(index) and int(bucket.max()) >= section["buckets"]):
-        raise damage_error(path, "a row lies in a bucket that is not there")
+        raise damage_error(path, "a row refers to a missing bucket")
     kind = np.dtype({"names": ["xyz"], "formats": [("<f4", 3)], "itemsize": section["bucket_bytes"]})
     centers: Floats = np.frombuffer(content, kind, section["buckets"], centers_at)["xyz"][bucket]
     return centers

@@ -133,14 +133,14 @@ def test_info_of_an_edit_tells_its_scene_region_field_and_errors(
     gdf = replace(stack.gdfs[0], options={"steps": 600, "slider": "even"}, report=report)
     save_gdf(tmp_path / "scarf.gdf", gdf)
     lines = lines_of(capsys, "info", str(tmp_path / "scarf.gdf"))
-    assert f"asked for: {gdf.instruction}" in lines
+    assert f"instruction: {gdf.instruction}" in lines
     assert f"scene: 2 000 Gaussians, fingerprint {gdf.scene.means_sha256[:12]}" in lines
     members = len(gdf.region)
     assert any(line.startswith(f"region: scarf, {members} Gaussians") for line in lines)
     assert any(
         line.startswith(f"field: {gdf.field.kind}, ") and "bytes per Gaussian" in line for line in lines
     )
-    assert any(line.endswith(", 5 knots; ends and bases: sh0 float32 + 1") for line in lines)
+    assert any(line.endswith(", 5 knots; full edits and bases: sh0 float32 + 1") for line in lines)
     assert {"option: steps 600", "option: slider even"} <= set(lines)
     assert {"report: field.psnr_worst 46.91", "report: edit.clip_direction not measured"} <= set(lines)
 
@@ -153,7 +153,7 @@ def test_info_lists_the_ignored_fields_of_cameras(tmp_path: Path, capsys: pytest
     assert lines_of(capsys, "info", str(path)) == [
         "transforms.json: 4 cameras",
         "images: 320x200 pixels",
-        "lens: 3 of 4 cameras have one; photographs are straightened",
+        "lens: 3 of 4 cameras have one; photographs are undistorted",
         "ignored: aabb_scale, sharpness",
     ]
 
@@ -184,7 +184,7 @@ def test_info_of_anything_else_is_one_line(tmp_path: Path, capsys: pytest.Captur
     (tmp_path / "picture.jpg").write_bytes(b"\xff\xd8\xff\xe0")
     assert "is a picture (JPEG), not a scene" in error_of(capsys, "info", str(tmp_path / "picture.jpg"))
     Image.new("RGB", (4, 4)).save(tmp_path / "picture.png")
-    assert "carries no camera" in error_of(capsys, "info", str(tmp_path / "picture.png"))
+    assert "has no stored camera" in error_of(capsys, "info", str(tmp_path / "picture.png"))
     (tmp_path / "a.gdf").write_bytes(b"")
     assert "not a .gdf" in error_of(capsys, "info", str(tmp_path / "a.gdf"))
     (tmp_path / "a.ply").write_bytes(b"version https://git-lfs.github.com/spec/v1\n")

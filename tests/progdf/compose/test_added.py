@@ -201,7 +201,7 @@ def test_hostile_files_are_one_line(scene: Gaussians, hat: Gdf, tmp_path: Path, 
 def test_rows_that_would_show_at_zero_are_refused(scene: Gaussians, hat: Gdf) -> None:
     assert hat.added is not None
     shown = replace(hat.added, logit_opacities=torch.full((25,), -5.0))
-    with pytest.raises(ValueError, match="shows at strength 0"):
+    with pytest.raises(ValueError, match="is visible at strength 0"):
         replace(hat, added=shown)
 
 

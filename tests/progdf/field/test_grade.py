@@ -424,7 +424,9 @@ def test_only_a_grade_goes_on_a_region_of_another_scene_and_only_where_something
         apply_grade(absurd, scene, whole_scene(scene))
     with pytest.raises(ProgdfError, match="look has no Gaussians"):
         load_gdf(tmp_path / "look.gdf", scene, place=lambda stored: from_mask("", torch.zeros(300) > 0))
-    with pytest.raises(ProgdfError, match="its grade goes on any scene with --region look=all") as refused:
+    with pytest.raises(
+        ProgdfError, match="its grade can be applied to any scene with --region look=all"
+    ) as refused:
         load_gdf(tmp_path / "look.gdf", scene)
     assert "\n" not in str(refused.value)
 

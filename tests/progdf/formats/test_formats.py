@@ -221,9 +221,12 @@ def test_a_reader_that_crashes_hangs_or_is_missing_is_one_line(
     for body, said in (
         ("import os; os.kill(os.getpid(), 11)", "crashed (SIGSEGV)"),
         ("import time; time.sleep(60)", "did not answer within 2 s"),
-        ("raise SystemExit(3)", "said nothing"),
-        ("import sys; sys.stderr.write('bad \\x1b[2J\\nworse \\x1b]0;x\\x07'); sys.exit(3)", "said: worse"),
-        ("pass", "said nothing"),
+        ("raise SystemExit(3)", "reported nothing"),
+        (
+            "import sys; sys.stderr.write('bad \\x1b[2J\\nworse \\x1b]0;x\\x07'); sys.exit(3)",
+            "reported: worse",
+        ),
+        ("pass", "reported nothing"),
         ("import sys; open(sys.argv[8], 'w').write('ply')", "returned no scene"),
     ):
         script.write_text(body)

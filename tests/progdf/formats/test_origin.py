@@ -110,11 +110,11 @@ def test_what_float32_has_lost_is_counted_and_said(tmp_path: Path, caplog: pytes
     assert 1 < x < COUNT
     assert report.distinct == (x, y, 0)
     lost = next(line for line in report.lines() if line.startswith("lost: "))
-    assert f"steps of 0.062 so far from 0: {x} distinct x, {y} distinct y are left of 50 Gaussians" in lost
-    assert "origin: 1000000 1000000 0, as it lies far from 0" in report.lines()
+    assert f"steps of 0.062 this far from 0: {x} distinct x, {y} distinct y remain of 50 Gaussians" in lost
+    assert "origin: 1000000 1000000 0 (the scene is far from 0)" in report.lines()
     assert np.array_equal(scene.world_means.numpy(), places(tmp_path / "far.ply"))
     load_scene(tmp_path / "far.ply")
-    assert "far.ply: positions are float32" in caplog.text
+    assert "far.ply: float32 positions have steps" in caplog.text
 
 
 def test_nothing_is_lost_of_doubles_nor_near_zero(tmp_path: Path) -> None:

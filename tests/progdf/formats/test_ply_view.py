@@ -123,7 +123,7 @@ def test_the_stored_camera_gives_the_first_view(text: bool, tmp_path: Path) -> N
     assert view.fov_y == pytest.approx(math.degrees(2 * math.atan(240 / 512)))
     camera = to_camera(view, 640, 480)
     torch.testing.assert_close(camera.viewmat, torch.eye(4), atol=1e-6, rtol=0.0)
-    assert "camera: the file stores one of 640x480 pixels, which is the first view" in list(describe(path))
+    assert "camera: 640x480 pixels, stored in the file; it is the first view" in list(describe(path))
 
 
 def test_render_and_the_window_begin_at_the_stored_camera(tmp_path: Path) -> None:

@@ -159,7 +159,7 @@ def test_a_scene_of_another_size_is_named_with_both_sizes(shirt: Gdf) -> None:
 def test_a_scene_with_one_center_moved_is_another_scene(saved: Path, scene: Gaussians) -> None:
     means = scene.means.clone()
     means[17, 1] += 1e-6
-    with pytest.raises(ProgdfError, match=r"shirt\.gdf was made for another scene: .* at other places"):
+    with pytest.raises(ProgdfError, match=r"shirt\.gdf was made for another scene: .* at other positions"):
         load_gdf(saved, replace(scene, means=means))
 
 

@@ -109,13 +109,13 @@ def test_several_sessions_are_named(tmp_path: Path) -> None:
 def test_unreadable_mark_is_somebody_else_s_folder(bundle: Path, content: bytes) -> None:
     folder = unpack_bundle(bundle).parent
     (folder / ".bundle.sha256").write_bytes(content)
-    with pytest.raises(ProgdfError, match="is not what"):
+    with pytest.raises(ProgdfError, match="was not unpacked from"):
         unpack_bundle(bundle)
 
 
 def test_file_in_the_folder_s_place_is_kept(bundle: Path) -> None:
     bundle.with_name("a.progdf").write_text("mine")
-    with pytest.raises(ProgdfError, match="is not what"):
+    with pytest.raises(ProgdfError, match="was not unpacked from"):
         unpack_bundle(bundle)
 
 

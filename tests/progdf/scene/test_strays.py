@@ -184,8 +184,8 @@ def test_edit_writes_a_scene_without_strays_and_says_what_that_changes(
     before = Path("dirty.ply").read_bytes()
     assert "progdf edit dirty.ply --clean -o CLEAN.ply leaves them out" in run(capsys, "info", "dirty.ply")
     told = run(capsys, "edit", "dirty.ply", "--clean", "-o", "clean.ply").splitlines()
-    assert told[0].startswith("clean: 23 of 3 023 Gaussians left out: ")
-    assert told[1].startswith("pictures from all around: ")
+    assert told[0].startswith("clean: 23 of 3 023 Gaussians removed: ")
+    assert told[1].startswith("rendered views: ")
     assert told[2] == "wrote clean.ply: 3 000 Gaussians"
     assert "labels and edits of dirty.ply no longer fit" in told[3]
     assert "progdf rebind EDIT.gdf --from dirty.ply --to clean.ply -o NEW.gdf" in told[3]
@@ -216,7 +216,7 @@ def test_an_edit_is_carried_over_to_the_cleaned_scene(
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        (("-o", "x.ply"), "nothing was asked for; say what to do with the scene, for example --clean"),
+        (("-o", "x.ply"), "no change is requested; add at least one option, for example --clean"),
         (("--clean", "-o", "x.obj"), "x.obj names no format to write"),
         (("--clean", "-o", "bear.ply"), "bear.ply is one of the files to read; choose another name"),
     ],
@@ -242,7 +242,7 @@ def test_a_scene_of_which_nothing_is_drawn_is_not_cleaned_away(
 ) -> None:
     save_ply(tmp_path / "a.ply", one_gaussian(opacity=0.001))
     assert main(["edit", str(tmp_path / "a.ply"), "--clean", "-o", str(tmp_path / "b.ply")]) == 2
-    assert "nothing of" in capsys.readouterr().err
+    assert "no visible Gaussian" in capsys.readouterr().err
 
 
 def test_attributes_of_what_stays_are_the_same_bits() -> None:

@@ -181,7 +181,7 @@ def test_a_picture_without_camera_is_refused_before_the_scene_is_read(folder: Pa
     options = with_values(
         quick_options(folder), out=folder / "bare", editor=f"pictures:{folder / 'bare.png'}"
     )
-    with pytest.raises(ProgdfError, match="does not say from where it was rendered"):
+    with pytest.raises(ProgdfError, match="has no stored camera"):
         train(options, quiet=True)
     assert not (folder / "bare").exists()
 

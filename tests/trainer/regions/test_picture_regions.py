@@ -142,13 +142,13 @@ def test_pictures_that_are_stored_turned_are_turned_and_photographs_of_known_cam
     mask = read_masks(tmp_path, [camera])[0]
     assert mask is not None
     assert mask[0, 0] < 0.1 < 0.9 < mask[-1, -1]
-    with pytest.raises(ProgdfError, match=r"stored turned \(EXIF orientation 3\)"):
+    with pytest.raises(ProgdfError, match=r"stored rotated \(EXIF orientation 3\)"):
         read_masks(tmp_path, [camera], bent=True)
     black = torch.zeros(SIZE, SIZE, 3)
     view = View(camera, black, mask, black, (0, 0, SIZE, SIZE))
     turned = FolderEditor({1.0: PictureFolder(tmp_path)}, (1.0,)).edit(view, 1.0)
     assert torch.equal(turned[..., 0], mask)
-    with pytest.raises(ProgdfError, match=r"stored turned \(EXIF orientation 3\)"):
+    with pytest.raises(ProgdfError, match=r"stored rotated \(EXIF orientation 3\)"):
         FolderEditor({1.0: PictureFolder(tmp_path)}, (1.0,), bent=True).edit(view, 1.0)
 
 

@@ -96,7 +96,7 @@ def test_a_dropped_picture_stands_in_the_form_and_one_looks_from_where_it_was_ta
     assert main_view.work.view.camera.azimuth == pytest.approx(before.azimuth + 20.0, abs=1e-3)
     for name, carried, line in (
         ("worn", camera_chunk(taken, ["scarf"]), "shows edits (scarf)"),
-        ("lost", None, "does not say from where"),
+        ("lost", None, "has no stored camera"),
     ):
         opened.open(exports.picture(tmp_path, name, image, carried))
         assert main_view.work.message is not None

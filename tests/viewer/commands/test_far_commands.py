@@ -114,11 +114,11 @@ def test_info_reports_the_origin_and_float_precision_of_a_far_scene(
 ) -> None:
     assert run("info", "far.ply") == 0
     lines = capsys.readouterr().out.splitlines()
-    assert "origin: 1000000 2000000 -500000, as it lies far from 0" in lines
+    assert "origin: 1000000 2000000 -500000 (the scene is far from 0)" in lines
     assert not [line for line in lines if line.startswith("lost")]
     write(folder / "floats.ply", as_type("f4")(moved_columns(bear_stack(800).scene, FAR)))
     assert run("info", "floats.ply") == 0
     assert any(
-        line.startswith("lost: positions are float32, which has steps of 0.12 so far from 0: ")
+        line.startswith("lost: float32 positions have steps of 0.12 this far from 0: ")
         for line in capsys.readouterr().out.splitlines()
     )

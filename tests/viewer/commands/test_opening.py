@@ -363,7 +363,7 @@ def test_exported_color_table_has_the_strength_of_the_grade(
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("look.gdf",), "its grade goes on any scene with --region look=all"),
+        (("look.gdf",), "its grade can be applied to any scene with --region look=all"),
         (("table.cube", "--region", "look=all"), "--region look: there is no edit of that name"),
         (("table.cube", "--region", "table"), "--region table has no NAME=REGION"),
         (("table.cube", "--region", "table=all", "--region", "table=all"), "names an edit twice"),

@@ -150,6 +150,6 @@ def test_a_file_that_was_changed_on_the_way_is_refused_by_name(bundle: Path) -> 
 def test_a_folder_of_somebody_else_is_left_alone(bundle: Path) -> None:
     (bundle.parent / "bear.progdf").mkdir()
     (bundle.parent / "bear.progdf" / "mine.txt").write_text("mine")
-    with pytest.raises(ProgdfError, match=r"is not what bear\.progdf\.zip unpacks to"):
+    with pytest.raises(ProgdfError, match=r"was not unpacked from bear\.progdf\.zip"):
         unpack_bundle(bundle)
     assert (bundle.parent / "bear.progdf" / "mine.txt").read_text() == "mine"

@@ -202,7 +202,7 @@ def test_info_tells_what_a_session_holds(saved: Path, capsys: pytest.CaptureFixt
     (saved.parent / "edits" / "ears.gdf").unlink()
     assert main(["info", str(saved)]) == 0
     told = capsys.readouterr().out
-    assert "bear.ply (as it was saved)" in told
+    assert "bear.ply (unchanged)" in told
     assert "ears.gdf (missing)" in told
     assert "ears → gold" in told
     assert "snapshots: 1" in told
