@@ -20,10 +20,10 @@ from progdf.quaternions import normalize_quats
 from progdf.terminal import file_size, format_count, group_digits
 
 LARGEST_MEAN = 1e18
-"""Largest usable coordinate. The square of a larger one overflows float32."""
+"""Largest usable coordinate. It leaves a margin to 1.8e19, whose square overflows float32."""
 
 LARGEST_LOG_SCALE = 40.0
-"""Largest usable log-scale. The variance of a larger one overflows float32."""
+"""Largest usable log-scale. It leaves a margin to 44, at which the variance e^88 nears the float32 limit."""
 
 FLAT_LOG_SCALE = -20.0
 """Replacement for a log-scale of −inf. The scale is 2e-9, like the thinnest Gaussians in real files."""
