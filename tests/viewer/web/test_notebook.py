@@ -1,4 +1,4 @@
-"""docs/notebook.ipynb in a real JupyterLab, in a real Chromium, with a real mouse."""
+"""docs/notebook.ipynb in a real JupyterLab and Chromium, driven by the mouse."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ CELL = "jupyterapp.shell.currentWidget.content.activeCellIndex"
 
 @pytest.fixture
 def jupyter(tmp_path: Path) -> Iterator[str]:
-    """The address of a JupyterLab of its own on a copy of the notebook."""
-    for name in ("anywidget", "jupyterlab"):  # asked for here, as their imports take seconds
+    """Start a JupyterLab server on a copy of the notebook; yield its address."""
+    for name in ("anywidget", "jupyterlab"):  # checked here because importing them takes seconds
         pytest.importorskip(name, reason=f"{name} is not installed")
     shutil.copy(NOTEBOOK, tmp_path)
     settings = tmp_path / "settings" / "labconfig"
@@ -93,7 +93,7 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 
 
 @pytest.mark.slow
-def test_the_notebook_runs_in_jupyterlab_and_its_sliders_go_both_ways(
+def test_notebook_runs_in_jupyterlab_and_its_sliders_sync_both_ways(
     browser: Any, jupyter: str, tmp_path: Path
 ) -> None:
     context = browser.new_context(viewport={"width": 1280, "height": 800})

@@ -1,4 +1,4 @@
-"""The web page in a real Chromium: its numbers, its pictures, and what a person does with it."""
+"""Web page in a real Chromium: its numbers, its pictures and its controls."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ from viewer.state.view_state import Keyframe, LayerGroup, LayerState, Timeline, 
 from viewer.web.page import join
 
 SIZE = 660, 400
-PIXELS = 330, 200  # half as many each way, which the software renderer draws in a quarter of the time
+PIXELS = 330, 200  # half the resolution renders four times as fast in the software renderer
 
 
 @dataclass
 class Opened:
-    """A page in a tab of its own, and what it asked for and complained of."""
+    """A page in its own tab, with its network requests and console messages."""
 
     tab: Any
     requests: list[str]
@@ -55,7 +55,10 @@ class Opened:
         return self.tab.evaluate("Object.fromEntries(progdf.view.layers.map((l) => [l.name, l.strength]))")
 
     def wait(self, expression: str) -> None:
-        """Until it holds. (playwright's own way compiles text in the page, which its policy forbids.)"""
+        """Wait until a JavaScript expression holds.
+
+        Playwright's own wait compiles text in the page, which the page's content security policy forbids.
+        """
         for _ in range(400):
             if self.tab.evaluate(expression):
                 return
@@ -108,7 +111,7 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def grade_form(members: int, degree: int, bands: int, seed: int) -> GradeForm:
-    """A map that bends colors, with a residual, a mask and a slider of its own."""
+    """Return a grade with a nonlinear color map, a residual, a mask and a slider remap."""
     draws = Draws(seed)
     knots = torch.tensor([0.0, 0.5, 1.0])
     same = identity_map(2) if degree else lattice_colors(5)
@@ -154,18 +157,18 @@ RUN = """([layers, blend]) => {
 
 
 def page_order(opened: Opened, scene: Gaussians) -> np.ndarray:
-    """Where the rows of an exact page lie in the scene. [N]"""
+    """Return the scene row of each row of an exact page. [N]"""
     means = np.asarray(opened.tab.evaluate("[...progdf.means]"), np.float32).reshape(-1, 3)
     rows = {row.tobytes(): i for i, row in enumerate(scene.means.numpy())}
     return np.array([rows[row.tobytes()] for row in means])
 
 
 @pytest.mark.parametrize("degree", [0, 1])
-def test_every_attribute_is_that_of_the_plain_form_under_every_rule(
+def test_page_computes_every_attribute_like_compose_for_every_rule(
     open_page: Any, tmp_path: Path, degree: int
 ) -> None:
     scene = random_gaussians(300, seed=5, sh_degree=degree)
-    scene = replace(scene, logit_opacities=scene.logit_opacities.clamp(min=-4.0))  # all are on the page
+    scene = replace(scene, logit_opacities=scene.logit_opacities.clamp(min=-4.0))  # none is pruned
     gdfs = [
         growing(scene, some_rows(scene, 40, 1), 25, 7),
         edit_of(scene, some_rows(scene, 150, 2), curved_field(150, 2, 14 + 3 * len(scene.shN[0])), "shirt"),
@@ -212,7 +215,7 @@ def test_every_attribute_is_that_of_the_plain_form_under_every_rule(
                 continue
             numbers = getattr(plain, name)[torch.from_numpy(order[:count])].numpy()
             page = np.asarray(after[name], np.float32).reshape(numbers.shape)
-            if number < 8:  # one layer at an end
+            if number < 8:  # one layer at an endpoint
                 assert page.tobytes() == numbers.tobytes(), (name, number)
             else:
                 assert np.abs(page - numbers).max() <= 1e-6 * max(1.0, np.abs(numbers).max()), (name, blend)
@@ -220,7 +223,7 @@ def test_every_attribute_is_that_of_the_plain_form_under_every_rule(
 
 @pytest.fixture(scope="module")
 def bear_page(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Stack]:
-    """The bear with its scarf and ears, by the command, both half way."""
+    """Export the bear with scarf and ears at strength 0.5; return the page and the stack."""
     folder = tmp_path_factory.mktemp("bear")
     scene, *edits = bear().save(folder)
     half = [word for gdf in bear().gdfs for word in ("--set", f"{gdf.name}=0.5")]
@@ -230,7 +233,7 @@ def bear_page(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Stack]:
 
 
 def cpu_picture(stack: Stack, camera: dict[str, Any], strengths: Sequence[float]) -> np.ndarray:
-    """What the CPU engine draws from where the page looks. [H,W,3] uint8"""
+    """Render with the CPU engine from the page's camera. [H,W,3] uint8"""
     seen = replace(
         first_camera(stack.scene), **{k: tuple(v) if isinstance(v, list) else v for k, v in camera.items()}
     )
@@ -242,7 +245,7 @@ def cpu_picture(stack: Stack, camera: dict[str, Any], strengths: Sequence[float]
 
 
 @pytest.mark.parametrize(("quality", "least"), [("exact", 60.0), ("compact", 50.0)])
-def test_pictures_are_those_of_the_cpu_engine(
+def test_page_pictures_match_the_cpu_engine(
     open_page: Any, tmp_path: Path, quality: str, least: float
 ) -> None:
     stack = bear()
@@ -257,9 +260,7 @@ def test_pictures_are_those_of_the_cpu_engine(
         assert psnr(picture, cpu_picture(stack, opened.camera(), strengths)) >= least
 
 
-def test_the_mouse_turns_slides_and_zooms_and_sets_the_pivot(
-    open_page: Any, bear_page: tuple[Path, Stack]
-) -> None:
+def test_mouse_orbits_pans_zooms_and_sets_the_pivot(open_page: Any, bear_page: tuple[Path, Stack]) -> None:
     opened = ready(open_page(bear_page[0]))
     mouse = opened.tab.mouse
     start = opened.camera()
@@ -286,11 +287,11 @@ def test_the_mouse_turns_slides_and_zooms_and_sets_the_pivot(
     pivot = np.array(opened.camera()["pivot"])
     scene = bear_page[1].scene
     assert np.abs(pivot - before).max() > 1e-3
-    # on the bear's surface: the nearest Gaussians are as near as neighbors are
+    # the pivot is as close to a Gaussian as neighbors on the bear's surface are
     assert float((scene.means - torch.tensor(pivot)).norm(dim=1).min()) < 0.1
 
 
-def test_a_slider_is_dragged_and_moved_by_keys_and_shows_its_recordings(
+def test_slider_moves_by_mouse_and_keys_and_shows_recordings(
     open_page: Any, bear_page: tuple[Path, Stack]
 ) -> None:
     page, stack = bear_page
@@ -312,9 +313,9 @@ def test_a_slider_is_dragged_and_moved_by_keys_and_shows_its_recordings(
     assert opened.tab.locator(".layer").last.locator("output").text_content() == "97"
 
 
-def test_the_rule_of_the_session_shows_and_another_one_is_taken(open_page: Any, tmp_path: Path) -> None:
+def test_page_starts_with_the_session_blend_rule_and_can_change_it(open_page: Any, tmp_path: Path) -> None:
     scene = random_gaussians(300, seed=5)
-    scene = replace(scene, logit_opacities=scene.logit_opacities.clamp(min=-4.0))  # all are on the page
+    scene = replace(scene, logit_opacities=scene.logit_opacities.clamp(min=-4.0))  # none is pruned
     gdfs = [
         edit_of(scene, some_rows(scene, 150, i), curved_field(150, i, 14), name)
         for i, name in enumerate("ab")
@@ -344,9 +345,7 @@ def test_the_rule_of_the_session_shows_and_another_one_is_taken(open_page: Any, 
     assert opened.complaints == []
 
 
-def test_space_compares_with_the_original_while_it_is_held(
-    open_page: Any, bear_page: tuple[Path, Stack]
-) -> None:
+def test_space_shows_the_original_while_held(open_page: Any, bear_page: tuple[Path, Stack]) -> None:
     opened = ready(open_page(bear_page[0]))
     edited = opened.picture()
     opened.tab.keyboard.down(" ")
@@ -360,7 +359,7 @@ def test_space_compares_with_the_original_while_it_is_held(
     assert opened.tab.evaluate("progdf.view.layers.map((l) => l.enabled)") == [True, False]
 
 
-def test_nothing_is_fetched_and_nothing_complains(open_page: Any, bear_page: tuple[Path, Stack]) -> None:
+def test_page_makes_no_requests_and_logs_no_errors(open_page: Any, bear_page: tuple[Path, Stack]) -> None:
     opened = ready(open_page(bear_page[0]))
     assert opened.complaints == []
     opened.tab.evaluate("fetch('https://example.org/').catch((e) => 0)")
@@ -368,7 +367,7 @@ def test_nothing_is_fetched_and_nothing_complains(open_page: Any, bear_page: tup
     assert "Content Security Policy" in opened.complaints[0], "nor can anything that a name might bring in"
 
 
-def test_two_fingers_slide_and_zoom_on_a_phone(open_page: Any, bear_page: tuple[Path, Stack]) -> None:
+def test_two_fingers_pan_and_zoom_on_a_phone(open_page: Any, bear_page: tuple[Path, Stack]) -> None:
     opened = ready(open_page(bear_page[0], size=(300, 400), has_touch=True, is_mobile=True))
     session = opened.tab.context.new_cdp_session(opened.tab)
 
@@ -394,7 +393,9 @@ def test_two_fingers_slide_and_zoom_on_a_phone(open_page: Any, bear_page: tuple[
 NO_WEBGL = "HTMLCanvasElement.prototype.getContext = () => null"
 
 
-def test_without_webgl_there_is_a_still_and_a_sentence(open_page: Any, bear_page: tuple[Path, Stack]) -> None:
+def test_page_without_webgl_shows_a_still_and_a_message(
+    open_page: Any, bear_page: tuple[Path, Stack]
+) -> None:
     opened = open_page(bear_page[0], NO_WEBGL)
     opened.wait("document.getElementById('notice').textContent.includes('WebGL2')")
     assert opened.tab.evaluate("document.getElementById('still').naturalWidth") == 1200
@@ -403,7 +404,7 @@ def test_without_webgl_there_is_a_still_and_a_sentence(open_page: Any, bear_page
     assert opened.complaints == []
 
 
-def test_a_page_keeps_the_numbers_of_members_only(open_page: Any, tmp_path: Path) -> None:
+def test_page_keeps_only_the_values_of_members_in_memory(open_page: Any, tmp_path: Path) -> None:
     scene = random_gaussians(10_000, seed=6, sh_degree=3)
     members = torch.arange(2500)
     document, view = document_of(scene, [edit_of(scene, members, curved_field(2500, 1, 59), "shirt")])
@@ -413,12 +414,12 @@ def test_a_page_keeps_the_numbers_of_members_only(open_page: Any, tmp_path: Path
     session = opened.tab.context.new_cdp_session(opened.tab)
     session.send("HeapProfiler.collectGarbage")
     used = session.send("Runtime.getHeapUsage")["backingStorageSize"]
-    before = 2 * 2500 * 59 * 4  # with what they become
+    before = 2 * 2500 * 59 * 4  # the members before and after the edit
     levels = 2500 * 59 * (4 + 2)  # the edit's end and bases
     assert used < before + levels + 2.5e6, "what came is 2.4 MB more"
 
 
-def test_a_large_scene_is_sorted_by_a_worker_and_without_one_where_a_policy_forbids_it(
+def test_large_scene_is_sorted_by_a_worker_if_the_policy_allows_it(
     open_page: Any, bear_page: tuple[Path, Stack], tmp_path: Path
 ) -> None:
     page = bear_page[0].read_text()
@@ -441,7 +442,7 @@ def test_a_large_scene_is_sorted_by_a_worker_and_without_one_where_a_policy_forb
 HOSTILE = "</script><script>document.title='run'</script><img src=x onerror=\"document.title='run'\">&lt;"
 
 
-def test_names_and_texts_of_a_stranger_are_text_whatever_they_hold(open_page: Any, tmp_path: Path) -> None:
+def test_untrusted_names_and_texts_are_never_run_as_html(open_page: Any, tmp_path: Path) -> None:
     stack = bear()
     scene, *paths = stack.save(tmp_path)
     names = (HOSTILE, "x" * 10_000)
@@ -469,7 +470,7 @@ def session_page(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return session, out
 
 
-def test_a_session_comes_with_its_camera_groups_snapshots_and_film(
+def test_session_page_has_its_camera_groups_snapshots_and_film(
     open_page: Any, session_page: tuple[Path, Path]
 ) -> None:
     saved = json.loads(session_page[0].read_text())["view"]
@@ -500,13 +501,13 @@ def test_a_session_comes_with_its_camera_groups_snapshots_and_film(
 
 
 def in_page(opened: Opened, expression: str, *values: Any) -> Any:
-    """What an expression of the page's own functions gives; a, b, c … are the values."""
+    """Evaluate an expression with functions of the page; `values` are bound to a, b, c and so on."""
     names = "abcdef"[: len(values)]
     body = join(("camera", "state"), f"return {expression};").removesuffix(";\n")
     return opened.tab.evaluate(f"([{','.join(names)}]) => {body}", list(values))
 
 
-def test_a_film_is_that_of_the_window(open_page: Any, tmp_path: Path) -> None:
+def test_film_on_the_page_matches_the_window(open_page: Any, tmp_path: Path) -> None:
     draws = Draws(3)
     view = full_view()
     keys = tuple(
@@ -537,7 +538,7 @@ def test_a_film_is_that_of_the_window(open_page: Any, tmp_path: Path) -> None:
         assert opened.strengths() == pytest.approx({layer.name: layer.strength for layer in plain.layers})
 
 
-def test_a_snapshot_is_what_the_window_has(open_page: Any, tmp_path: Path) -> None:
+def test_snapshot_on_the_page_matches_the_window(open_page: Any, tmp_path: Path) -> None:
     stack, view = many_edits(bear(), 4)
     draws = Draws(8)
     kept = ()
@@ -572,7 +573,7 @@ def test_a_snapshot_is_what_the_window_has(open_page: Any, tmp_path: Path) -> No
             assert mine["gains"] == pytest.approx(asdict(theirs.gains))
 
 
-def test_a_page_says_how_large_it_is_and_what_fewer_harmonics_cost(tmp_path: Path) -> None:
+def test_export_reports_page_size_and_the_cost_of_fewer_sh_bands(tmp_path: Path) -> None:
     document, view = document_of(bear(600).scene, bear(600).gdfs)
     out = tmp_path / "page.html"
 
@@ -590,7 +591,7 @@ def test_a_page_says_how_large_it_is_and_what_fewer_harmonics_cost(tmp_path: Pat
     )
 
 
-def test_what_cannot_be_is_one_line_and_what_was_there_stays(
+def test_failed_page_export_is_one_line_and_keeps_the_old_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scene, *edits = map(str, bear().save(tmp_path))

@@ -1,4 +1,4 @@
-"""The widget of notebooks: in a real Chromium with a model as anywidget gives one, and its Python side."""
+"""Notebook widget: in a real Chromium with a stub of anywidget's model, and its Python side."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from viewer.widget import Widget
 
 SIZE = 660, 700
 
-# What anywidget gives `render`: a model of values, whose `set` tells who listens; and how often it was saved.
+# Stub of the model that anywidget passes to `render`. `set` notifies listeners; saves are counted.
 HOST = """async ([module, states]) => {
   class Model {
     constructor(values) {
@@ -73,7 +73,7 @@ KEPT = """
 
 @dataclass
 class Cells:
-    """Widgets below one another on a page, and what it complained of."""
+    """Widgets below one another on a page, with its console messages."""
 
     tab: Any
     complaints: list[str]
@@ -83,7 +83,7 @@ class Cells:
             self.tab.evaluate("new Promise(requestAnimationFrame)")
 
     def rest(self) -> None:
-        """Until it is drawn sharp again, as it is not while it moves."""
+        """Wait until the picture is drawn at full resolution, which happens once it stops moving."""
         before = None
         while before is None or (self.picture() != before).any():
             before = self.picture()
@@ -94,7 +94,7 @@ class Cells:
         return self.tab.evaluate(f"views[{view}].model.{values}")
 
     def receive(self, name: str, value: Any, view: int = 0) -> None:
-        """What arrives from Python."""
+        """Set a model value as if it arrived from Python."""
         self.tab.evaluate(f"([name, value]) => views[{view}].model.receive(name, value)", [name, value])
         self.rest() if name == "camera" else self.frames()
 
@@ -104,7 +104,7 @@ class Cells:
 
 
 def state_of(widget: Widget) -> dict[str, Any]:
-    """What a widget sends to the browser, as JSON."""
+    """Return the state that a widget sends to the browser, as JSON."""
     names = "_markup", "strengths", "hidden", "blend", "camera", "height"
     return {
         "scene": base64.b64encode(widget.scene).decode(),
@@ -143,7 +143,7 @@ def bear_widget(*strengths: float, height: int = 300) -> Widget:
     return Widget(bear().scene, layers, height=height)
 
 
-def test_a_value_set_in_python_shows_what_the_cpu_engine_draws(show: Any) -> None:
+def test_values_set_in_python_draw_like_the_cpu_engine(show: Any) -> None:
     widget = bear_widget(0.0, 0.0)
     cells = show(widget)
     cells.tab.locator("#fold").click()
@@ -168,7 +168,7 @@ def test_a_value_set_in_python_shows_what_the_cpu_engine_draws(show: Any) -> Non
     assert cells.complaints == []
 
 
-def test_a_drag_is_sent_to_python_once_a_frame(show: Any) -> None:
+def test_drag_is_sent_to_python_once_per_frame(show: Any) -> None:
     widget = bear_widget(0.5, 0.5)
     cells = show(widget)
     slider = cells.tab.get_by_role("slider", name="ears")
@@ -202,7 +202,7 @@ def test_a_drag_is_sent_to_python_once_a_frame(show: Any) -> None:
     assert widget.hidden == ["scarf"]
 
 
-def test_what_is_moved_in_one_frame_is_sent_as_it_is(show: Any) -> None:
+def test_changes_of_one_frame_are_sent_in_one_save(show: Any) -> None:
     cells = show(bear_widget(0.5, 0.5))
     cells.tab.evaluate(
         """() => { const { root } = views[0], input = root.querySelector("input");
@@ -215,7 +215,7 @@ def test_what_is_moved_in_one_frame_is_sent_as_it_is(show: Any) -> None:
     assert cells.model("saved") == 1
 
 
-def test_what_was_hidden_for_a_frame_comes_back_as_it_should_be(show: Any) -> None:
+def test_widget_hidden_for_a_frame_comes_back_up_to_date(show: Any) -> None:
     """A notebook hides its page while its theme changes."""
     cells = show(bear_widget(1.0, 1.0))
     before = cells.picture()
@@ -232,7 +232,7 @@ def test_what_was_hidden_for_a_frame_comes_back_as_it_should_be(show: Any) -> No
     assert psnr(cells.picture(), before) > 90
 
 
-def test_widgets_are_independent_and_let_go_of_their_context(show: Any) -> None:
+def test_widgets_are_independent_and_release_their_context(show: Any) -> None:
     cells = show(bear_widget(0.0, 0.0), bear_widget(1.0, 1.0))
     before = cells.picture(1)
     assert psnr(cells.picture(0), before) < 40
@@ -247,7 +247,7 @@ def test_widgets_are_independent_and_let_go_of_their_context(show: Any) -> None:
     assert cells.complaints == []
 
 
-def test_keys_and_the_wheel_are_the_notebooks_outside_and_ours_inside(show: Any) -> None:
+def test_widget_takes_keys_and_wheel_only_after_a_click(show: Any) -> None:
     cells = show(bear_widget(1.0, 1.0))
     cells.tab.evaluate(
         "globalThis.heard = []; addEventListener('keydown', (e) => heard.push(e.key));"
@@ -264,8 +264,8 @@ def test_keys_and_the_wheel_are_the_notebooks_outside_and_ours_inside(show: Any)
     cells.frames()
     assert psnr(cells.picture(), edited) > 90, "Space outside compares nothing"
     keyboard.up(" ")
-    cells.tab.evaluate("scrollTo({ top: 60, behavior: 'instant' })")  # Space has scrolled
-    cells.tab.wait_for_timeout(800)  # else the wheel goes on with what it scrolled
+    cells.tab.evaluate("scrollTo({ top: 60, behavior: 'instant' })")  # Space has scrolled the page
+    cells.tab.wait_for_timeout(800)  # ends the smooth scrolling of the wheel
     cells.tab.mouse.click(200, 150)
     cells.tab.mouse.wheel(0, -100)
     cells.tab.wait_for_function("views[0].model.sent.camera", timeout=10_000)
@@ -283,7 +283,7 @@ def test_keys_and_the_wheel_are_the_notebooks_outside_and_ours_inside(show: Any)
     assert cells.tab.evaluate("heard") == ["d", " ", "Control", "s"], "d, d would delete the cell"
 
 
-def test_the_page_of_a_widget_has_its_strengths_and_camera(tmp_path: Path) -> None:
+def test_page_of_a_widget_has_its_strengths_and_camera(tmp_path: Path) -> None:
     widget = bear_widget(0.0, 0.0)
     widget.strengths["ears"] = 0.25
     widget.camera = {"azimuth": -30.0}
@@ -297,7 +297,7 @@ def test_the_page_of_a_widget_has_its_strengths_and_camera(tmp_path: Path) -> No
     assert "MB, compact" in line
 
 
-def test_each_way_to_set_a_part_moves_it() -> None:
+def test_in_place_changes_of_strengths_and_camera_notify_observers() -> None:
     widget = bear_widget(0.0, 0.0)
     told = list[Any]()
     widget.observe(lambda change: told.append(dict(change.new)), ["strengths", "camera"])
@@ -310,7 +310,7 @@ def test_each_way_to_set_a_part_moves_it() -> None:
     assert widget.camera["azimuth"] == 70.0
 
 
-def test_a_scene_that_is_being_trained_is_shown_as_it_is() -> None:
+def test_scene_in_training_is_shown_as_it_is() -> None:
     scene = bear().scene
     gdfs = bear().gdfs
     trained = replace(scene.to(dtype=torch.float64), means=scene.means.clone().requires_grad_())
@@ -318,8 +318,8 @@ def test_a_scene_that_is_being_trained_is_shown_as_it_is() -> None:
     assert (shown == expected).all()
 
 
-def test_values_that_are_none_stop_no_widget(show: Any) -> None:
-    """As another program may send them that speaks to the same model."""
+def test_invalid_values_from_python_are_ignored(show: Any) -> None:
+    """Another program may send such values to the same model."""
     widget = bear_widget(0.5, 0.5)
     cells = show(widget)
     before = cells.picture()
@@ -335,7 +335,7 @@ def test_values_that_are_none_stop_no_widget(show: Any) -> None:
     assert cells.complaints == []
 
 
-def test_what_cannot_be_is_one_clear_line(tmp_path: Path) -> None:
+def test_invalid_arguments_raise_one_clear_line(tmp_path: Path) -> None:
     scene, (scarf, ears) = bear().scene, bear().gdfs
     widget = Widget(scene, [scarf, ears])
     known = {**widget.strengths}
@@ -386,13 +386,13 @@ def test_what_cannot_be_is_one_clear_line(tmp_path: Path) -> None:
     assert Widget(scene, [scarf, scarf]).strengths == {"scarf": 1.0, "scarf-2": 1.0}
 
 
-def test_without_the_extra_one_line_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_extra_is_named_in_the_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "viewer.widget")
     monkeypatch.setitem(sys.modules, "anywidget", None)
     with pytest.raises(ProgdfError, match=re.escape("pip install 'progdf-studio[jupyter]'")):
         _ = viewer.Widget
 
 
-def test_the_old_name_of_the_widget_says_the_new_one() -> None:
+def test_old_import_of_the_widget_names_the_new_location() -> None:
     with pytest.raises(AttributeError, match="`from viewer import Widget`"):
         _ = progdf.Widget
