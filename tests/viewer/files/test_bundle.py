@@ -1,4 +1,4 @@
-"""NAME.progdf.zip: a session and all it needs in one file, from `export` to `view` and the window."""
+"""Bundles NAME.progdf.zip hold a session and all of its files: `export`, `view` and the window."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from viewer.state.view_state import ViewState
 
 @pytest.fixture
 def bundle(tmp_path: Path) -> Path:
-    """The bear's session in a file, alone in a folder."""
+    """Export the bear's session as a bundle into an otherwise empty folder."""
     (tmp_path / "here").mkdir()
     (tmp_path / "there").mkdir()
     saved = saved_session(bear_files(tmp_path / "here"))
@@ -34,7 +34,7 @@ def bundle(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_bundle_is_the_session_in_a_folder_of_its_own(bundle: Path, tmp_path: Path) -> None:
+def test_bundle_unpacks_to_its_session_in_its_own_folder(bundle: Path, tmp_path: Path) -> None:
     (saved,) = (tmp_path / "here").glob("*.session.json")
     before = session.open_session(saved)
     after = session.open_session(unpack_bundle(bundle))
@@ -45,7 +45,7 @@ def test_a_bundle_is_the_session_in_a_folder_of_its_own(bundle: Path, tmp_path: 
     assert again.parent == bundle.parent / "bear.progdf", "what was unpacked is opened, not unpacked again"
 
 
-def test_a_scene_with_edits_is_a_bundle_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_scene_with_edits_exports_as_a_bundle(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = bear_files(tmp_path)
     words = [
         str(folder / "bear.ply"),
@@ -63,7 +63,7 @@ def test_a_scene_with_edits_is_a_bundle_too(tmp_path: Path, capsys: pytest.Captu
     assert {layer.name: layer.strength for layer in opened.view.layers}["ears"] == 0.3
 
 
-def test_regions_come_along_and_are_the_folder_s_own(tmp_path: Path) -> None:
+def test_bundle_contains_its_regions(tmp_path: Path) -> None:
     folder = bear_files(tmp_path)
     third = selection.select(SelectionState(), np.arange(len(bear().scene)) % 3 == 0)
     kept = selection.add_region(third, "third", folder / "edits" / "third.region.npy")
@@ -78,7 +78,7 @@ def test_regions_come_along_and_are_the_folder_s_own(tmp_path: Path) -> None:
     assert region.members == kept.regions[0].members
 
 
-def test_files_of_one_name_get_numbers(tmp_path: Path) -> None:
+def test_files_with_the_same_name_get_numbers(tmp_path: Path) -> None:
     folder = bear_files(tmp_path)
     saved = saved_session(folder)
     for path, other in zip(sorted((folder / "edits").glob("*.gdf")), ("a", "b"), strict=True):
@@ -90,14 +90,14 @@ def test_files_of_one_name_get_numbers(tmp_path: Path) -> None:
         assert {"Edit.gdf", "Edit-2.gdf", "bear.ply"} < set(archive.namelist())
 
 
-def test_the_window_opens_a_bundle(bundle: Path) -> None:
+def test_window_opens_a_bundle(bundle: Path) -> None:
     with null_app(empty(), ViewState(), bundle.parent) as app:
         app.open(bundle)
         assert [layer.name for layer in app.main_view.work.view.layers] == ["ears → gold", "scarf"]
 
 
 def rewritten(path: Path, change: Callable[[dict[str, bytes]], None]) -> Path:
-    """The bundle with other files in it."""
+    """Rewrite the bundle with changed files."""
     with zipfile.ZipFile(path) as archive:
         files = {name: archive.read(name) for name in archive.namelist()}
     change(files)
@@ -110,7 +110,7 @@ def rewritten(path: Path, change: Callable[[dict[str, bytes]], None]) -> Path:
 @pytest.mark.parametrize(
     "name", ["../evil.ply", "/tmp/evil.ply", "a/evil.ply", "..", "a\\evil.ply", "C:evil", ".x"]
 )
-def test_nothing_is_written_outside_its_folder(bundle: Path, name: str) -> None:
+def test_bundle_writes_nothing_outside_its_folder(bundle: Path, name: str) -> None:
     rewritten(bundle, lambda files: files.update({name: b"evil"}))
     with pytest.raises(ProgdfError, match="which is no plain file"):
         unpack_bundle(bundle)
@@ -118,7 +118,7 @@ def test_nothing_is_written_outside_its_folder(bundle: Path, name: str) -> None:
     assert not list(bundle.parents[1].rglob("*evil*"))
 
 
-def test_no_bundle_is_one_line_and_leaves_nothing(bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_bundle_is_one_line_and_leaves_nothing(bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = bundle.read_bytes()
     for content, said in (
         (b"", "is no bundle"),
@@ -141,13 +141,13 @@ def test_no_bundle_is_one_line_and_leaves_nothing(bundle: Path, monkeypatch: pyt
         unpack_bundle(bundle)
 
 
-def test_a_file_that_was_changed_on_the_way_is_refused_by_name(bundle: Path) -> None:
+def test_modified_file_in_a_bundle_is_refused_by_name(bundle: Path) -> None:
     rewritten(bundle, lambda files: files.update({"bear.ply": files["bear.ply"] + b" "}))
     with pytest.raises(ProgdfError, match=r"was saved with another bear\.ply"):
         session.open_session(unpack_bundle(bundle))
 
 
-def test_a_folder_of_somebody_else_is_left_alone(bundle: Path) -> None:
+def test_unpacking_leaves_a_foreign_folder_unchanged(bundle: Path) -> None:
     (bundle.parent / "bear.progdf").mkdir()
     (bundle.parent / "bear.progdf" / "mine.txt").write_text("mine")
     with pytest.raises(ProgdfError, match=r"was not unpacked from bear\.progdf\.zip"):

@@ -1,4 +1,4 @@
-"""Regions as files: kept, renamed, written again, and what progdf reads of them."""
+"""Region files: saved, renamed, rewritten, and read by progdf."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def chosen() -> SelectionState:
     return selection.select(SelectionState(), MASK)
 
 
-def test_a_region_that_is_kept_is_one_that_progdf_trains(chosen: SelectionState, tmp_path: Path) -> None:
+def test_saved_region_can_be_trained_by_progdf(chosen: SelectionState, tmp_path: Path) -> None:
     kept = exports.keep_region(chosen, "jacket", tmp_path, TOTAL)
     assert [(region.name, region.count) for region in kept.regions] == [("jacket", MASK.sum())]
     found = parse_region(f"file:{tmp_path}/jacket.region.npy", bear().scene)
@@ -36,7 +36,7 @@ def test_a_region_that_is_kept_is_one_that_progdf_trains(chosen: SelectionState,
     assert kept.members == chosen.members, "it stays selected"
 
 
-def test_no_region_takes_the_place_of_another_file(chosen: SelectionState, tmp_path: Path) -> None:
+def test_new_region_never_replaces_a_file(chosen: SelectionState, tmp_path: Path) -> None:
     (tmp_path / "jacket.region.npy").write_bytes(b"somebody else's")
     kept = exports.keep_region(
         exports.keep_region(chosen, "jacket", tmp_path, TOTAL), "jacket", tmp_path, TOTAL
@@ -45,7 +45,7 @@ def test_no_region_takes_the_place_of_another_file(chosen: SelectionState, tmp_p
     assert (tmp_path / "jacket.region.npy").read_bytes() == b"somebody else's"
 
 
-def test_a_renamed_region_takes_its_file_along_and_is_written_again_after_undo(
+def test_renaming_a_region_moves_its_file_and_undo_restores_it(
     chosen: SelectionState, tmp_path: Path
 ) -> None:
     kept = exports.keep_region(chosen, "jacket", tmp_path, TOTAL)
@@ -57,7 +57,7 @@ def test_a_renamed_region_takes_its_file_along_and_is_written_again_after_undo(
     assert np.load(kept.regions[0].path).tolist() == np.flatnonzero(MASK).tolist()
 
 
-def test_nothing_selected_and_no_folder_are_one_line(chosen: SelectionState, tmp_path: Path) -> None:
+def test_saving_a_region_needs_a_selection_and_a_folder(chosen: SelectionState, tmp_path: Path) -> None:
     with pytest.raises(ProgdfError, match="nothing is selected"):
         exports.keep_region(SelectionState(), "jacket", tmp_path, TOTAL)
     with pytest.raises(ProgdfError, match="does not exist"):
@@ -65,7 +65,7 @@ def test_nothing_selected_and_no_folder_are_one_line(chosen: SelectionState, tmp
 
 
 def foreign_session(folder: Path, *paths: str) -> Path:
-    """A session of somebody else's whose regions claim these files as their own."""
+    """Write a session of a third party whose regions claim these files."""
     state = selection.select(SelectionState(), MASK)
     for i in range(len(paths)):
         state = selection.add_region(state, f"r{i}", folder / f"r{i}.region.npy")
@@ -79,7 +79,7 @@ def foreign_session(folder: Path, *paths: str) -> Path:
 
 
 def contents(folder: Path) -> dict[str, bytes | None]:
-    """All below a folder, links as they are."""
+    """Return all files below a folder by relative path; None for folders and links."""
     return {
         str(path.relative_to(folder)): None if path.is_symlink() or not path.is_file() else path.read_bytes()
         for path in sorted(folder.rglob("*"))
@@ -96,7 +96,7 @@ FOREIGN = (
     "out/new.region.npy",
     "link.region.npy",  # a link to the victim
     "dangling.region.npy",
-    "bear.edits/x.region.npy",  # which is a link out, too
+    "bear.edits/x.region.npy",  # also a link out of the folder
     "folder.region.npy",
     "gone/new.region.npy",
     "notes.txt",
@@ -109,7 +109,7 @@ FOREIGN = (
 )
 
 
-def test_a_session_of_a_stranger_writes_and_removes_nothing_outside_of_its_folder(tmp_path: Path) -> None:
+def test_third_party_session_changes_nothing_outside_its_folder(tmp_path: Path) -> None:
     outside = tmp_path / "outside"
     folder = tmp_path / "outside" / "in"
     folder.mkdir(parents=True)
@@ -137,7 +137,7 @@ def test_a_session_of_a_stranger_writes_and_removes_nothing_outside_of_its_folde
     assert len(made) == len(paths)
 
 
-def test_files_of_a_sessions_own_folders_stay_with_their_regions(tmp_path: Path) -> None:
+def test_region_files_in_the_session_folders_are_kept(tmp_path: Path) -> None:
     bear_files(tmp_path)
     (tmp_path / "bear.edits").mkdir()
     (tmp_path / "below").mkdir()
@@ -147,7 +147,7 @@ def test_files_of_a_sessions_own_folders_stay_with_their_regions(tmp_path: Path)
     assert [region.path for region in opened.view.selection.regions] == [tmp_path / name for name in names]
 
 
-def test_a_rename_leaves_a_file_that_holds_other_rows(chosen: SelectionState, tmp_path: Path) -> None:
+def test_rename_keeps_a_file_with_other_rows(chosen: SelectionState, tmp_path: Path) -> None:
     kept = exports.keep_region(chosen, "jacket", tmp_path, TOTAL)
     np.save(tmp_path / "jacket.region.npy", np.arange(3))
     exports.rename_region(kept, 0, "coat", TOTAL)
@@ -155,7 +155,7 @@ def test_a_rename_leaves_a_file_that_holds_other_rows(chosen: SelectionState, tm
 
 
 @pytest.mark.gl
-def test_the_window_says_which_regions_it_did_not_take_and_saves_them_beside_the_session(
+def test_window_reports_rejected_regions_and_saves_them_again(
     tmp_path: Path,
 ) -> None:
     folder = tmp_path / "in"
@@ -178,7 +178,7 @@ def test_the_window_says_which_regions_it_did_not_take_and_saves_them_beside_the
 
 
 @pytest.mark.gl
-def test_the_window_keeps_a_region_beside_the_scene_and_in_the_session(tmp_path: Path) -> None:
+def test_window_saves_a_region_beside_the_scene_and_in_the_session(tmp_path: Path) -> None:
     document = opened_document(bear_files(tmp_path))
     view = first_view(bear(), 0.5, 0.5)
     view = replace(view, selection=selection.select(SelectionState(), MASK))

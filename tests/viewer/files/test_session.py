@@ -1,4 +1,4 @@
-"""Session files: what the window held comes back, and nothing else does."""
+"""Session files restore the window's state and reject everything else."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from viewer.state.selection import SelectionState
 from viewer.state.view_state import Comparison, SnapshotPair
 
 
-def test_a_session_brings_back_exactly_what_was_saved(saved: Path) -> None:
+def test_session_restores_exactly_what_was_saved(saved: Path) -> None:
     again = session.open_session(saved)
     assert again.view == full_view()
     assert [kept.edit.blend for kept in again.snapshots] == ["sum"]
     assert [gdf.name for gdf in again.document.gdfs] == ["scarf", "ears"]
 
 
-def test_a_session_can_be_read_by_people_and_moves_with_its_folder(saved: Path, tmp_path: Path) -> None:
+def test_session_is_readable_and_moves_with_its_folder(saved: Path, tmp_path: Path) -> None:
     table = json.loads(saved.read_text())
     assert next(iter(table)) == "progdf_session"
     assert table["scene"] == {"file": "bear.ply", "sha256": sha256(saved.parent / "bear.ply")}
@@ -53,7 +53,7 @@ def test_a_session_can_be_read_by_people_and_moves_with_its_folder(saved: Path, 
     "place",
     ["C:\\\\scenes\\\\", "D:/scenes/", "\\\\\\\\server\\\\share\\\\", "//server/share/", "/home/somebody/"],
 )
-def test_a_session_of_another_system_finds_its_files_beside_it(saved: Path, place: str) -> None:
+def test_session_of_another_system_finds_its_files_beside_it(saved: Path, place: str) -> None:
     text = saved.read_text("utf-8")
     saved.write_text(text.replace('"bear.ply"', f'"{place}bear.ply"'), "utf-8")
     assert session.open_session(saved).document.path == saved.parent / "bear.ply"
@@ -66,7 +66,7 @@ def test_paths_in_files_have_forward_slashes_on_any_system() -> None:
     assert plain({"path": PureWindowsPath("edits\\red.region.npy")}) == {"path": "edits/red.region.npy"}
 
 
-def test_regions_come_back_with_their_files_wherever_the_folder_went(folder: Path, tmp_path: Path) -> None:
+def test_regions_are_restored_after_the_folder_moved(folder: Path, tmp_path: Path) -> None:
     mask = np.arange(len(bear().scene)) % 3 == 0
     chosen = selection.select(SelectionState(), mask)
     kept = selection.add_region(chosen, "third", folder / "third.region.npy")
@@ -82,7 +82,7 @@ def test_regions_come_back_with_their_files_wherever_the_folder_went(folder: Pat
     assert [region.path for region in again.regions] == [moved / "third.region.npy"]
 
 
-def test_a_session_from_before_groups_opens_without_any(saved: Path) -> None:
+def test_session_older_than_groups_opens_without_groups(saved: Path) -> None:
     table = json.loads(saved.read_text())
     for state in (table["view"], *(kept["edit"] for kept in table["snapshots"])):
         for key in ("groups", "pair", "collapsed", "cards"):
@@ -98,7 +98,7 @@ def test_a_session_from_before_groups_opens_without_any(saved: Path) -> None:
     )
 
 
-def test_a_session_from_before_selections_opens_with_nothing_selected(saved: Path) -> None:
+def test_session_older_than_selections_opens_without_a_selection(saved: Path) -> None:
     table = json.loads(saved.read_text())
     for state in (table["view"], *(kept["edit"] for kept in table["snapshots"])):
         del state["selection"]
@@ -150,7 +150,7 @@ BROKEN: list[tuple[tuple[str | int, ...], Any, str]] = [
 
 
 @pytest.mark.parametrize(("keys", "value", "about"), BROKEN)
-def test_what_no_window_wrote_is_refused_in_one_line(
+def test_damaged_session_is_refused_in_one_line(
     saved: Path, keys: tuple[str | int, ...], value: Any, about: str
 ) -> None:
     with pytest.raises(ProgdfError) as refused:
@@ -165,20 +165,20 @@ def test_what_no_window_wrote_is_refused_in_one_line(
     "content",
     [b"{", b"[1]", b"{}", b"\xff\xfe", b'{"progdf_session": 1, "progdf_session": 1}', b"[" * 99_999],
 )
-def test_what_is_no_session_is_refused_in_one_line(tmp_path: Path, content: bytes) -> None:
+def test_file_that_is_no_session_is_refused_in_one_line(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "odd.session.json").write_bytes(content)
     with pytest.raises(ProgdfError) as refused:
         read_session(tmp_path / "odd.session.json", SessionFile)
     assert "\n" not in str(refused.value)
 
 
-def test_a_scene_that_changed_since_is_refused_by_name(saved: Path) -> None:
+def test_changed_scene_is_refused_by_name(saved: Path) -> None:
     save_ply(saved.parent / "bear.ply", bear().scene[:-1])
     with pytest.raises(ProgdfError, match=r"saved with another bear\.ply"):
         session.open_session(saved)
 
 
-def test_what_an_older_file_does_not_hold_has_its_default(saved: Path) -> None:
+def test_missing_fields_of_an_older_session_get_defaults(saved: Path) -> None:
     table = json.loads(saved.read_text())
     del table["view"]["compare"], table["view"]["camera"]["fov_y"], table["snapshots"]
     saved.write_text(json.dumps(table))
@@ -188,7 +188,7 @@ def test_what_an_older_file_does_not_hold_has_its_default(saved: Path) -> None:
     assert again.snapshots == ()
 
 
-def test_a_save_that_fails_leaves_the_old_session(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_save_keeps_the_old_session(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = saved.read_bytes()
     broken = replace(full_view(), background=(float("nan"), 0.0, 0.0))
     with pytest.raises(ValueError, match="JSON"):
@@ -197,7 +197,7 @@ def test_a_save_that_fails_leaves_the_old_session(saved: Path, monkeypatch: pyte
     assert not list(saved.parent.glob(".*"))
 
 
-def test_info_tells_what_a_session_holds(saved: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_lists_the_contents_of_a_session(saved: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert kind_of(saved) == "session"
     (saved.parent / "edits" / "ears.gdf").unlink()
     assert main(["info", str(saved)]) == 0
@@ -208,7 +208,7 @@ def test_info_tells_what_a_session_holds(saved: Path, capsys: pytest.CaptureFixt
     assert "snapshots: 1" in told
 
 
-def test_render_draws_a_session_as_the_window_showed_it(saved: Path, tmp_path: Path) -> None:
+def test_render_draws_a_session_like_the_window(saved: Path, tmp_path: Path) -> None:
     view = replace(full_view(), compare=Comparison())
     session.save(saved, WindowSession(opened_document(saved.parent), view))
     out = tmp_path / "a.png"
@@ -225,7 +225,7 @@ def test_render_draws_a_session_as_the_window_showed_it(saved: Path, tmp_path: P
     assert np.abs(np.asarray(Image.open(out)).astype(int) - expected).max() <= 1
 
 
-def test_render_sets_two_snapshots_of_a_session_beside_each_other(
+def test_render_compares_two_snapshots_of_a_session(
     saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "a.png"
@@ -235,7 +235,7 @@ def test_render_sets_two_snapshots_of_a_session_beside_each_other(
     assert "PSNR of snapshot 1 against original" in capsys.readouterr().out
 
 
-def test_a_session_that_lists_no_layers_shows_the_original(saved: Path, tmp_path: Path) -> None:
+def test_session_without_layers_renders_the_original(saved: Path, tmp_path: Path) -> None:
     path = spoilt(saved, "view", "layers", value=[])
     out = tmp_path / "a.png"
     size = ("--size", "32x24", "--engine", "cpu")
@@ -243,14 +243,12 @@ def test_a_session_that_lists_no_layers_shows_the_original(saved: Path, tmp_path
     assert out.is_file()
 
 
-def test_an_option_that_a_session_says_itself_is_refused(
-    saved: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_option_that_the_session_defines_is_refused(saved: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["render", "--session", str(saved), "--overshoot", "-o", "a.png"]) == 2
     assert "--overshoot was given" in capsys.readouterr().err
 
 
-def test_a_pinhole_camera_becomes_the_windows_camera() -> None:
+def test_pinhole_camera_converts_to_the_window_camera() -> None:
     view = first_view(bear()).camera
     seen = to_camera(view, 320, 240)
     again = from_camera(view, seen, application.Document("b", bear().scene).facts().bounds)

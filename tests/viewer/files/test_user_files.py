@@ -1,4 +1,4 @@
-"""Thumbnails of the start page: kept, read again, and damaged in every way."""
+"""Thumbnails of the start page: saved, read, and damaged in many ways."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from progdf.io.atomic import state_folder
 from viewer.files import user_files
 
 
-def test_a_damaged_thumbnail_is_none_and_is_made_again(tmp_path: Path) -> None:
+def test_damaged_thumbnail_is_ignored_and_made_again(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     width, height = user_files.THUMBNAIL_SIZE
     pixels = rng.integers(0, 256, (height, width, 3), np.uint8)  # noise takes several chunks of the file
