@@ -1,4 +1,4 @@
-"""A grade in the form of a new edit, by mouse: its palette, its curve, and a color picked in the picture."""
+"""Grade in the new-edit form, by mouse: palette, curve and color picker."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def form(hand: Rig) -> NewEdit:
     return hand.main_view.work.form
 
 
-def test_a_press_on_the_curve_makes_a_point_and_drags_it_and_a_right_click_takes_it_away(hand: Rig) -> None:
+def test_curve_points_are_added_dragged_and_removed_by_mouse(hand: Rig) -> None:
     tall = new_edit_form._CURVE_PX
     wide = WINDOW[0] - 22.0 - LEFT
     top = 438.0
@@ -57,14 +57,14 @@ def test_a_press_on_the_curve_makes_a_point_and_drags_it_and_a_right_click_takes
     assert len(parse_curve(form(hand).curve)) == 1
 
 
-def test_the_curve_goes_by_keys_alone(hand: Rig) -> None:
+def test_curve_can_be_edited_by_keys_alone(hand: Rig) -> None:
     def strike(*names: str) -> list[tuple[float, float]]:
         for name in names:
             hand.modifier(getattr(imgui.Key, name))
             hand.modifier(getattr(imgui.Key, name), False)
         return parse_curve(form(hand).curve)
 
-    hand.click(LEFT + 40.0, 557.0)  # the field of the name, below the curve
+    hand.click(LEFT + 40.0, 557.0)  # the name field below the curve
     hand.modifier(imgui.Key.mod_shift)
     strike("tab")
     hand.modifier(imgui.Key.mod_shift, False)
@@ -76,7 +76,7 @@ def test_the_curve_goes_by_keys_alone(hand: Rig) -> None:
     assert strike("space", "up_arrow") == [(0.49, 0.53)]
 
 
-def test_a_swatch_opens_a_picker_and_a_right_click_takes_the_change_back(hand: Rig) -> None:
+def test_swatch_opens_a_picker_and_right_click_resets_its_color(hand: Rig) -> None:
     y = 202.0
     x = LEFT + 4.0
     moved = ((COLORS[0], "#3060d0"), *FORM.palette[1:])
@@ -91,7 +91,7 @@ def test_a_swatch_opens_a_picker_and_a_right_click_takes_the_change_back(hand: R
     assert len(imgui.get_current_context().open_popup_stack) == 1
 
 
-def test_a_click_on_the_picture_takes_its_color_into_the_palette_and_moves_nothing(hand: Rig) -> None:
+def test_picking_a_color_adds_it_to_the_palette_only(hand: Rig) -> None:
     before = hand.main_view.work
     hand.main_view.work = replace(before, form=replace(FORM, picks=True))
     hand.frame(2)

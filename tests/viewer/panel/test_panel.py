@@ -1,4 +1,4 @@
-"""The panel without a GPU: a scripted hand on the real widgets, and what it changes."""
+"""Panel without a GPU: scripted input on the real widgets and the resulting changes."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ STACK = ViewState(
 
 @dataclass
 class Hand:
-    """Draws the panel frame by frame, as the main view does, and keeps what it gives back."""
+    """Draw the panel frame by frame like the main view, and keep its result."""
 
     ui: UiContext
     work: Workspace
@@ -102,7 +102,7 @@ def hand(request: pytest.FixtureRequest) -> Iterator[Hand]:
 LEFT = SIZE[0] - panel.WIDTH_PX
 START = LEFT + 12 + 10 + 7
 SPAN = panel.WIDTH_PX - 2 * (12 + 10 + 7)
-TRACKS = (TRACK + card.CARD_PX, TRACK)  # heights of the two sliders' tracks: the last layer lies on top
+TRACKS = (TRACK + card.CARD_PX, TRACK)  # heights of the two sliders' tracks; the last layer lies on top
 EYES = (HEAD + card.CARD_PX, HEAD)
 
 
@@ -115,7 +115,7 @@ def test_drawing_changes_nothing(hand: Hand) -> None:
     assert hand.actions == []
 
 
-def test_a_drag_moves_the_slider_and_makes_exactly_one_undo_entry(hand: Hand) -> None:
+def test_drag_moves_the_slider_and_makes_one_undo_entry(hand: Hand) -> None:
     hand.move(at(0.5), TRACKS[0])
     hand.button(True)
     for strength in (0.55, 0.6, 0.9, 0.75):
@@ -129,7 +129,7 @@ def test_a_drag_moves_the_slider_and_makes_exactly_one_undo_entry(hand: Hand) ->
     assert perform(undone, "redo", FACTS).view == hand.work.view
 
 
-def test_a_drag_back_to_where_it_began_leaves_no_entry(hand: Hand) -> None:
+def test_drag_back_to_the_start_leaves_no_undo_entry(hand: Hand) -> None:
     hand.move(at(0.5), TRACKS[0])
     hand.button(True)
     hand.move(at(0.8), TRACKS[0])
@@ -139,20 +139,20 @@ def test_a_drag_back_to_where_it_began_leaves_no_entry(hand: Hand) -> None:
     assert hand.work.past.past == ()
 
 
-def test_pressing_the_handle_off_its_center_does_not_make_it_jump(hand: Hand) -> None:
+def test_pressing_the_handle_off_center_does_not_make_it_jump(hand: Hand) -> None:
     hand.move(at(0.5) + 4, TRACKS[0])
     hand.button(True)
     assert hand.strengths[0] == 0.5
     hand.button(False)
 
 
-def test_pressing_the_track_brings_the_handle_there(hand: Hand) -> None:
+def test_pressing_the_track_moves_the_handle_there(hand: Hand) -> None:
     hand.click(at(0.25), TRACKS[1])
     assert hand.strengths == pytest.approx([0.5, 0.25], abs=0.005)
     assert hand.work.focus == 1
 
 
-def test_beyond_the_ends_the_slider_stays_at_exactly_0_and_1(hand: Hand) -> None:
+def test_drag_beyond_the_ends_stops_at_exactly_0_and_1(hand: Hand) -> None:
     for x, expected in ((SIZE[0] - 1, 1.0), (LEFT - 300, 0.0)):
         hand.move(at(hand.strengths[0]), TRACKS[0])
         hand.button(True)
@@ -171,7 +171,7 @@ def test_shift_drags_ten_times_finer(hand: Hand) -> None:
     assert hand.strengths[0] == pytest.approx(0.52, abs=1e-3)
 
 
-def test_a_move_in_the_same_frame_as_shift_still_counts_in_full(hand: Hand) -> None:
+def test_move_in_the_frame_of_the_shift_press_counts_in_full(hand: Hand) -> None:
     hand.move(at(0.5), TRACKS[0])
     hand.button(True)
     imgui.get_io().add_mouse_pos_event(at(0.7) * hand.ui.scale, TRACKS[0] * hand.ui.scale)
@@ -183,7 +183,7 @@ def test_a_move_in_the_same_frame_as_shift_still_counts_in_full(hand: Hand) -> N
     assert hand.strengths[0] == pytest.approx(0.71, abs=4e-3)
 
 
-def test_a_slider_can_be_set_to_within_half_a_per_cent_by_the_mouse_alone() -> None:
+def test_mouse_sets_a_slider_within_half_a_percent() -> None:
     assert 1.0 / SPAN < 0.005
 
 
@@ -200,7 +200,7 @@ def test_ctrl_click_types_a_value(hand: Hand) -> None:
     assert len(hand.work.past.past) == 1
 
 
-def test_escape_leaves_the_typed_value_out(hand: Hand) -> None:
+def test_escape_discards_the_typed_value(hand: Hand) -> None:
     hand.hold(imgui.Key.mod_ctrl, True)
     hand.click(at(0.1), TRACKS[0])
     hand.hold(imgui.Key.mod_ctrl, False)
@@ -212,7 +212,7 @@ def test_escape_leaves_the_typed_value_out(hand: Hand) -> None:
     assert hand.strengths[0] == 0.5
 
 
-def test_looking_at_a_value_without_changing_it_does_not_round_it() -> None:
+def test_opening_a_value_without_a_change_does_not_round_it() -> None:
     view = ViewState(layers=(LayerState(0, "scarf", 0.123456),))
     hand = hand_on(view)
     hand.click(SIZE[0] - 40, EYES[1])
@@ -225,28 +225,28 @@ def test_looking_at_a_value_without_changing_it_does_not_round_it() -> None:
     hand.ui.close()
 
 
-def test_a_click_on_the_number_types_a_value(hand: Hand) -> None:
+def test_click_on_the_number_types_a_value(hand: Hand) -> None:
     hand.click(SIZE[0] - 40, EYES[1])
     hand.frame()
     hand.type("0.125")
     assert hand.strengths[1] == 0.125
 
 
-def test_the_eye_hides_its_layer_and_nothing_else(hand: Hand) -> None:
+def test_eye_hides_only_its_layer(hand: Hand) -> None:
     hand.click(LEFT + 34, EYES[1])
     assert [layer.enabled for layer in hand.work.view.layers] == [True, False]
     assert hand.strengths == [0.5, 0.0]
     assert len(hand.work.past.past) == 1
 
 
-def test_a_click_on_a_card_focuses_it(hand: Hand) -> None:
+def test_click_on_a_card_focuses_it(hand: Hand) -> None:
     assert hand.work.focus == 1
     hand.click(LEFT + 150, EYES[0])
     assert hand.work.focus == 0
     assert hand.work.view == STACK
 
 
-def test_the_blend_rule_is_chosen_from_the_list_and_can_be_undone(hand: Hand) -> None:
+def test_blend_rule_is_chosen_from_the_list_and_can_be_undone(hand: Hand) -> None:
     hand.click(SIZE[0] - 25, 70)
     place = imgui.get_current_context().open_popup_stack[0].window.pos / hand.ui.scale
     hand.click(place.x + 40, place.y + 8 + 21 * 2 + 7)
@@ -254,13 +254,13 @@ def test_the_blend_rule_is_chosen_from_the_list_and_can_be_undone(hand: Hand) ->
     assert perform(hand.work, "undo", FACTS).view == STACK
 
 
-def test_buttons_ask_for_the_actions_that_keys_have(hand: Hand) -> None:
+def test_buttons_request_the_same_actions_as_keys(hand: Hand) -> None:
     hand.click(SIZE[0] - 25, SIZE[1] - 22)
     hand.click(SIZE[0] - 55, SIZE[1] - 22)
     assert hand.actions == ["help", "picture"]
 
 
-def test_undo_is_grayed_while_there_is_nothing_to_undo(hand: Hand) -> None:
+def test_undo_button_is_disabled_without_history(hand: Hand) -> None:
     hand.click(LEFT + 24, SIZE[1] - 22)
     assert hand.actions == []
     hand.click(at(0.3), TRACKS[1])
@@ -268,7 +268,7 @@ def test_undo_is_grayed_while_there_is_nothing_to_undo(hand: Hand) -> None:
     assert hand.actions == ["undo"]
 
 
-def test_an_up_axis_button_rolls_the_camera_upright() -> None:
+def test_up_axis_button_rolls_the_camera_upright() -> None:
     hand = hand_on(ViewState())
     hand.click(LEFT - 24, 129)
     hand.click(LEFT - 64, 169)
@@ -277,7 +277,7 @@ def test_an_up_axis_button_rolls_the_camera_upright() -> None:
     hand.ui.close()
 
 
-def test_what_is_up_in_the_picture_can_become_the_up_axis() -> None:
+def test_up_direction_of_the_view_can_become_the_up_axis() -> None:
     hand = hand_on(ViewState())
     before = axes(hand.work.view.camera)
     hand.click(LEFT - 24, 129)
@@ -289,7 +289,7 @@ def test_what_is_up_in_the_picture_can_become_the_up_axis() -> None:
     hand.ui.close()
 
 
-def test_the_wheel_over_the_panel_scrolls_it_and_changes_no_strength() -> None:
+def test_wheel_over_the_panel_scrolls_without_moving_sliders() -> None:
     layers = tuple(LayerState(i % 2, f"layer {i}", 0.5) for i in range(12))
     hand = hand_on(ViewState(layers=layers))
     hand.move(at(0.5), TRACKS[0])
@@ -305,17 +305,17 @@ def test_the_wheel_over_the_panel_scrolls_it_and_changes_no_strength() -> None:
     ("text", "value"),
     [("0.7", 0.7), (" 70 % ", 0.7), ("0,25", 0.25), ("1.5", 1.0), ("-3", 0.0), ("abc", None), ("", None)],
 )
-def test_typed_strengths_are_read_as_a_person_means_them(text: str, value: float | None) -> None:
+def test_typed_strengths_accept_percent_comma_and_spaces(text: str, value: float | None) -> None:
     assert parse_strength(text) == value
 
 
 @pytest.mark.parametrize("text", ["nan", "inf", "1e999", "%"])
-def test_typed_nonsense_never_becomes_a_strength_outside_0_to_1(text: str) -> None:
+def test_typed_nonsense_never_gives_a_strength_outside_0_to_1(text: str) -> None:
     value = parse_strength(text)
     assert value is None or 0.0 <= value <= 1.0
 
 
-def test_long_names_are_shortened_to_their_room() -> None:
+def test_long_names_are_shortened_to_fit() -> None:
     hand = hand_on(STACK)
     imgui.new_frame()
     room = imgui.calc_text_size("a long name").x

@@ -1,4 +1,4 @@
-"""Long stacks in the panel: compact rows, several selected layers, groups, search: a window for each."""
+"""Long stacks in the panel: compact rows, several selected layers, groups and search."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from viewer.state.view_state import LayerGroup
 pytestmark = pytest.mark.gl
 SIZE = (1024, 800)
 LEFT = SIZE[0] - panel.WIDTH_PX
-# the middle of the first compact row, and from row to row
+# center of the first compact row, and the distance between rows
 TOP = 132.0
 STEP = 28.0
 NAME = LEFT + 90.0
 TRACK = LEFT + 166.5
 SPAN = 78.0
-MASTER = (LEFT + 12.0 + 7.0, 740.0, 219.0)  # where its track begins, and how long it is
+MASTER = (LEFT + 12.0 + 7.0, 740.0, 219.0)  # start of its track, and the track's length
 
 
 def row(layer: int, count: int = len(EDITS)) -> float:
@@ -56,7 +56,7 @@ def order(hand: Rig) -> list[str]:
     return [layer.name for layer in hand.main_view.work.view.layers]
 
 
-def test_twenty_layers_in_800_px_are_rows_whose_strengths_move_together(
+def test_strengths_of_twenty_compact_rows_move_together(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     stack, view = many_edits(bear())
@@ -103,7 +103,7 @@ def test_twenty_layers_in_800_px_are_rows_whose_strengths_move_together(
         assert len(hand.main_view.work.past.past) == entries + 1
         hand.key("Ctrl+Z")
         assert order(hand) == names
-        hand.pause(0.5)  # no double click
+        hand.pause(0.5)  # avoids a double click
         hand.click(NAME, row(3))
         assert selected(hand) == [EDITS[3]], "a click, unlike a drag, leaves the others"
         hand.click(NAME, row(5))
@@ -115,7 +115,7 @@ def test_twenty_layers_in_800_px_are_rows_whose_strengths_move_together(
         assert hand.strengths[0] == pytest.approx(0.9, abs=0.01), "the bar hides no row that is selected"
 
 
-def test_the_search_finds_names_and_regions_and_a_reset_is_of_all_selected() -> None:
+def test_search_finds_names_and_regions_and_reset_covers_selection() -> None:
     stack, view = many_edits(bear(), 12)
     with rig(view, SIZE, stack=stack) as hand:
         hand.click(TRACK + 0.9 * SPAN, row(11, 12))
@@ -136,7 +136,7 @@ def test_the_search_finds_names_and_regions_and_a_reset_is_of_all_selected() -> 
         assert hand.strengths[9:11] == [0.0, 0.0], "also what the search does not show, as all means all"
 
 
-def test_a_group_is_made_folded_dimmed_and_dissolved_in_the_panel() -> None:
+def test_group_is_created_folded_dimmed_and_dissolved_in_the_panel() -> None:
     stack, view = many_edits(bear(), 12)
     with rig(view, SIZE, stack=stack) as hand:
         hand.click(NAME, row(11, 12))
@@ -155,7 +155,7 @@ def test_a_group_is_made_folded_dimmed_and_dissolved_in_the_panel() -> None:
         hand.click(NAME, TOP)
         assert selected(hand) == list(EDITS[9:12])
         entries = len(hand.main_view.work.past.past)
-        hand.pause(0.5)  # no double click
+        hand.pause(0.5)  # avoids a double click
         hand.drag((NAME, TOP), (NAME, TOP + 2 * STEP + 10.0))
         assert order(hand)[7:] == [*EDITS[9:12], *EDITS[7:9]]
         assert {layer.group for layer in hand.main_view.work.view.layers[7:10]} == {"Group"}
@@ -171,17 +171,17 @@ def test_a_group_is_made_folded_dimmed_and_dissolved_in_the_panel() -> None:
         assert hand.strengths[11] == pytest.approx(0.25, abs=0.02)
         for _ in range(4):
             hand.key("Ctrl+Z")
-        hand.move(5.0, 5.0)  # a name that the mouse rests on shows its region
-        hand.rest()  # until what was undone is no longer said
+        hand.move(5.0, 5.0)  # away from the name, which shows its region while hovered
+        hand.rest()  # until the undo message has disappeared
         assert np.array_equal(hand.picture(), bright)
 
 
-def test_a_member_of_the_last_group_is_dragged_to_its_end_or_below_it() -> None:
+def test_member_of_the_last_group_is_dragged_to_its_end_or_below() -> None:
     stack, view = many_edits(bear(), 12)
     members = {i: replace(layer, group="ends") for i, layer in enumerate(view.layers[:3])}
     grouped = replace(view, layers=(*members.values(), *view.layers[3:]), groups=(LayerGroup("ends"),))
     with rig(grouped, SIZE, stack=stack) as hand:
-        # a row for the group lies above them
+        # the group's own row lies above them
         second = TOP + STEP * 11
         last = TOP + STEP * 12
         hand.drag((NAME, second), (NAME, last + 0.5 * STEP))

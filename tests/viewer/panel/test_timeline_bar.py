@@ -1,4 +1,4 @@
-"""The timeline in the window, by mouse and keyboard; and the films made of it."""
+"""Timeline in the window by mouse and keyboard, and the films made from it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ SMALL = ("--size", "64x48", "--engine", "cpu")
 
 
 def keyed(view: ViewState | None = None, length: int = 40) -> ViewState:
-    """The scarf turned green while the camera goes half around, then back more slowly."""
+    """Return a view whose timeline turns the scarf green and orbits by 60° in its first half."""
     view = view or first_view(bear(), 0.0, 0.3)
     made = timeline.with_key(Timeline(length=length), 0, view)
     there = replace(view, camera=replace(view.camera, azimuth=view.camera.azimuth + 60.0))
@@ -51,7 +51,7 @@ def hand(tmp_path: Path) -> Iterator[Rig]:
 
 
 def at(hand: Rig, frame: float) -> tuple[float, float]:
-    """Where a frame of the ruler stands on the window."""
+    """Return the window position of a frame on the ruler."""
     left = 10.0 + timeline_bar.BUTTONS_PX
     wide = WINDOW[0] - panel.WIDTH_PX - 10.0 - left - timeline_bar.SETTINGS_PX
     shown = hand.main_view.work.view.timeline
@@ -62,7 +62,7 @@ def frames_of(hand: Rig) -> list[int]:
     return [key.frame for key in hand.main_view.work.view.timeline.keys]
 
 
-def test_dragging_the_playhead_moves_strengths_and_picture_and_leaves_nothing_to_undo(hand: Rig) -> None:
+def test_dragging_the_playhead_updates_the_view_without_undo_entries(hand: Rig) -> None:
     before = hand.picture()
     hand.drag(at(hand, 5), at(hand, 20))
     assert hand.main_view.work.player.frame == 20
@@ -80,7 +80,7 @@ def test_dragging_a_key_moves_it_with_the_playhead_as_one_entry(hand: Rig) -> No
     assert frames_of(hand) == [0, 20]
 
 
-def test_a_click_on_a_key_goes_there_and_delete_takes_it_away(hand: Rig) -> None:
+def test_click_on_a_key_moves_the_playhead_and_delete_removes_it(hand: Rig) -> None:
     hand.drag(at(hand, 20.4), at(hand, 20.4))
     assert (hand.main_view.work.player.frame, frames_of(hand)) == (20, [0, 20])
     hand.key("Delete")
@@ -89,7 +89,7 @@ def test_a_click_on_a_key_goes_there_and_delete_takes_it_away(hand: Rig) -> None
     assert frames_of(hand) == [0, 20]
 
 
-def test_k_after_a_drag_of_a_slider_sets_a_key_and_two_undos_take_both_back(hand: Rig) -> None:
+def test_k_after_a_slider_drag_sets_a_key_and_two_undos_revert_both(hand: Rig) -> None:
     hand.key(".")
     hand.drag(hand.slider(1, 0.3), hand.slider(1, 0.9))
     hand.key("K")
@@ -101,7 +101,7 @@ def test_k_after_a_drag_of_a_slider_sets_a_key_and_two_undos_take_both_back(hand
     assert hand.strengths[1] == 0.3
 
 
-def test_space_plays_at_the_films_pace_and_again_pauses_and_then_idle_is_idle(hand: Rig) -> None:
+def test_space_plays_at_the_film_rate_pauses_and_then_idles(hand: Rig) -> None:
     hand.key("Space")
     started = hand.main_view.work.player.frame
     hand.frame(30)
@@ -118,7 +118,7 @@ def test_space_plays_at_the_films_pace_and_again_pauses_and_then_idle_is_idle(ha
     assert hand.main_view.work.past.past == ()
 
 
-def test_a_frame_between_two_of_the_film_draws_no_splats(hand: Rig) -> None:
+def test_no_splats_are_drawn_between_two_film_frames(hand: Rig) -> None:
     hand.key("Space")
     drawn = hand.main_view.canvas.pictures_drawn
     frame = hand.main_view.work.player.frame
@@ -126,7 +126,7 @@ def test_a_frame_between_two_of_the_film_draws_no_splats(hand: Rig) -> None:
     assert hand.main_view.canvas.pictures_drawn - drawn <= (hand.main_view.work.player.frame - frame) % 41 + 1
 
 
-def test_commas_and_periods_step_and_with_shift_jump_from_key_to_key(hand: Rig) -> None:
+def test_comma_and_period_step_and_with_shift_jump_between_keys(hand: Rig) -> None:
     seen = []
     for chord in (".", ".", ",", "Shift+.", "Shift+.", "Shift+,"):
         hand.key(chord)
@@ -134,7 +134,7 @@ def test_commas_and_periods_step_and_with_shift_jump_from_key_to_key(hand: Rig) 
     assert seen == [1, 2, 1, 20, 40, 20]
 
 
-def test_the_bars_buttons_do_what_they_say(hand: Rig) -> None:
+def test_buttons_of_the_bar_work(hand: Rig) -> None:
     y = WINDOW[1] - 24.0
     gap = 27.0
     hand.drag(at(hand, 30), at(hand, 30))
@@ -164,13 +164,13 @@ def test_the_bars_buttons_do_what_they_say(hand: Rig) -> None:
 
 
 def row(hand: Rig, number: int, frame: float) -> tuple[float, float]:
-    """Where a frame of a row stands: 0 the camera, then the layers as the panel has them."""
+    """Return the window position of a frame in a row; row 0 is the camera, then the layers in panel order."""
     tall = timeline_bar.TRACK_PX
     top = WINDOW[1] - timeline_bar.height(hand.main_view.work, overlay.Area(724, 640), hand.main_view.ui)
     return at(hand, frame)[0], top + timeline_bar.HEIGHT_PX - 6.0 + tall * (number + 0.5)
 
 
-def test_a_rows_key_is_dragged_alone_with_ctrl_a_copy_of_it_and_deleted(hand: Rig) -> None:
+def test_key_of_a_row_is_dragged_copied_and_deleted_alone(hand: Rig) -> None:
     hand.key("Alt+T")
     before = hand.main_view.work.view.timeline
 
@@ -198,7 +198,7 @@ def test_a_rows_key_is_dragged_alone_with_ctrl_a_copy_of_it_and_deleted(hand: Ri
     assert hand.main_view.work.view.timeline == before
 
 
-def test_auto_key_keys_only_the_slider_that_is_dragged(hand: Rig) -> None:
+def test_auto_key_keys_only_the_dragged_slider(hand: Rig) -> None:
     hand.drag(at(hand, 30), at(hand, 30))
     hand.key("Ctrl+Alt+K")
     hand.drag(hand.slider(1, hand.strengths[1]), hand.slider(1, 0.75))
@@ -207,9 +207,7 @@ def test_auto_key_keys_only_the_slider_that_is_dragged(hand: Rig) -> None:
     assert keys[1, 30].strengths[0][1] == hand.strengths[1] > 0.6
 
 
-def test_the_bar_and_the_film_agree_on_the_number_of_frames(
-    hand: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bar_and_film_agree_on_the_number_of_frames(hand: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     real = imgui.drag_int
     shown = {}
     monkeypatch.setattr(imgui, "drag_int", lambda *a: shown.update({a[0]: a[1]}) or real(*a))
@@ -217,7 +215,7 @@ def test_the_bar_and_the_film_agree_on_the_number_of_frames(
     assert shown["##length"] == len(list(timeline.film_frames(hand.main_view.work.view.timeline))) == 41
 
 
-def test_what_the_bar_covers_is_not_the_pictures_to_orbit(hand: Rig) -> None:
+def test_drag_on_the_bar_does_not_orbit_the_camera(hand: Rig) -> None:
     camera = hand.main_view.work.view.camera
     hand.drag((300.0, WINDOW[1] - 44.0), (380.0, WINDOW[1] - 44.0))
     assert hand.main_view.work.view.camera == camera
@@ -232,12 +230,12 @@ def test_hiding_the_interface_hides_the_bar(hand: Rig) -> None:
 
 
 def save_session(path: Path, view: ViewState) -> None:
-    """A session of the bear and its edits, which are saved beside it."""
+    """Save a session of the bear, with scene and edits beside it."""
     scene, *gdfs = bear().save(path.parent)
     session.save(path, WindowSession(document.load(scene, gdfs), view))
 
 
-def test_render_makes_the_frames_of_a_session_that_the_window_showed(hand: Rig, tmp_path: Path) -> None:
+def test_render_writes_the_frames_that_the_window_showed(hand: Rig, tmp_path: Path) -> None:
     view = hand.main_view.work.view
     save_session(tmp_path / "film.session.json", view)
     command = ("render", str(tmp_path / "film.session.json"), "--timeline", *SMALL)
@@ -257,7 +255,7 @@ def test_render_makes_the_frames_of_a_session_that_the_window_showed(hand: Rig, 
 
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
-    """`progdf render` of a film of four frames of the scarf, without a moving camera."""
+    """Run `progdf render` on a film of the scarf in four frames with a still camera."""
     monkeypatch.chdir(tmp_path)
     keys = (Keyframe(0, ((0, 0.0),)), Keyframe(3, ((0, 1.0),), easing="linear"))
     view = first_view(bear(), 0.0, 0.0)
@@ -266,7 +264,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
     return lambda *arguments: main([*given, *arguments])
 
 
-def test_a_film_as_gif_keeps_its_pace_in_the_mean(run: Callable[..., int]) -> None:
+def test_gif_keeps_the_average_frame_rate(run: Callable[..., int]) -> None:
     assert run("--orbit", "20,15", "-o", "film.gif") == 0
     with Image.open("film.gif") as animation:
         durations = []
@@ -276,7 +274,7 @@ def test_a_film_as_gif_keeps_its_pace_in_the_mean(run: Callable[..., int]) -> No
     assert sum(durations) == 170, "four times 1/24 s, in hundredths"
 
 
-def test_a_film_as_mp4_has_every_frame_at_its_size(run: Callable[..., int]) -> None:
+def test_mp4_has_every_frame_at_its_size(run: Callable[..., int]) -> None:
     if importlib.util.find_spec("imageio_ffmpeg") is None:
         pytest.skip("the extra video is not installed")
     import imageio_ffmpeg
@@ -304,7 +302,7 @@ def test_a_film_as_mp4_has_every_frame_at_its_size(run: Callable[..., int]) -> N
         (("-o", "x.gif", "--sweep", "scarf"), "cannot be combined"),
     ],
 )
-def test_a_film_that_cannot_be_made_is_one_line_and_leaves_no_file(
+def test_failed_film_is_one_line_and_leaves_no_file(
     arguments: tuple[str, ...], told: str, run: Callable[..., int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path("taken").mkdir()
@@ -318,7 +316,7 @@ def test_a_film_that_cannot_be_made_is_one_line_and_leaves_no_file(
     assert sorted(Path().iterdir()) == before
 
 
-def test_a_film_that_moves_the_camera_takes_no_other(
+def test_film_with_camera_keys_rejects_camera_options(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     save_session(tmp_path / "moving.session.json", keyed())
@@ -327,8 +325,8 @@ def test_a_film_that_moves_the_camera_takes_no_other(
     assert "--timeline moves the camera; leave out --camera, --orbit" in capsys.readouterr().err
 
 
-def test_an_empty_folder_is_filled_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Behind a link, or where one stands: neither can be put aside and replaced."""
+def test_empty_folder_is_filled_in_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder behind a link and the current folder cannot be moved aside and replaced."""
     frames = [np.zeros((4, 4, 3), np.uint8)] * 2
     for folder in ("linked", "here"):
         (tmp_path / folder).mkdir()
@@ -341,7 +339,7 @@ def test_an_empty_folder_is_filled_where_it_is(tmp_path: Path, monkeypatch: pyte
     assert (tmp_path / "link").is_symlink()
 
 
-def test_frames_of_an_export_that_was_killed_are_in_nobodys_way(tmp_path: Path) -> None:
+def test_frames_of_a_killed_export_are_cleaned_up(tmp_path: Path) -> None:
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
     folder = tmp_path / "frames"
@@ -354,7 +352,7 @@ def test_frames_of_an_export_that_was_killed_are_in_nobodys_way(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("there", [False, True])
-def test_frames_that_fail_on_the_way_leave_nothing(tmp_path: Path, there: bool) -> None:
+def test_failing_frames_leave_nothing(tmp_path: Path, there: bool) -> None:
     folder = tmp_path / "frames"
     if there:
         folder.mkdir()
@@ -368,14 +366,14 @@ def test_frames_that_fail_on_the_way_leave_nothing(tmp_path: Path, there: bool) 
     assert list(tmp_path.rglob("*")) == [folder] * there
 
 
-def test_frames_for_a_full_disk_are_one_line_and_leave_no_folder(tmp_path: Path) -> None:
+def test_full_disk_is_one_line_and_leaves_no_folder(tmp_path: Path) -> None:
     with files_up_to(20), pytest.raises(ProgdfError, match=r"frames cannot be written \("):
         film.write_sequence(tmp_path / "frames", [np.zeros((4, 4, 3), np.uint8)])
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.usefixtures("software_gpu")
-def test_the_timeline_in_use(screenshot: Callable[[str, np.ndarray], None]) -> None:
+def test_screenshot_of_the_timeline(screenshot: Callable[[str, np.ndarray], None]) -> None:
     with rig(keyed(), WINDOW) as hand:
         hand.key("T")
         hand.drag(at(hand, 5), at(hand, 12))
