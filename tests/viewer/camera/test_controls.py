@@ -1,4 +1,4 @@
-"""The camera never breaks, whatever the hand does; moves can be taken back; the bindings are whole."""
+"""Camera controls stay valid for any input, moves can be reversed, and the key bindings are complete."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ PIXELS = st.floats(-500, 500)
 
 @st.composite
 def cameras(draw: st.DrawFn, radius: float | None = None) -> ViewCamera:
-    """Any camera that the interface can bring about, and slanted up axes from photographs."""
+    """Draw any camera that the interface can produce, and slanted up axes from photographs."""
     size = draw(RADII) if radius is None else radius
     slanted = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: math.hypot(*v) > 0.1)
     up = unit(draw(st.one_of(st.sampled_from(AXES), slanted)), (0.0, 1.0, 0.0))
@@ -68,7 +68,7 @@ def size_of(camera: ViewCamera) -> float:
 
 
 def usable(camera: ViewCamera) -> bool:
-    """All finite, a rotation, in front of the eye: what every engine needs."""
+    """Return True if all values are finite, the rotation is proper and the distance is positive."""
     built = to_camera(camera, 640, 480)
     rotation = built.viewmat[:3, :3].double()
     numbers = (*camera.pivot, camera.distance, camera.azimuth, camera.elevation)
@@ -83,7 +83,7 @@ def usable(camera: ViewCamera) -> bool:
 
 @given(cameras(), ANY, ANY, ANY, st.sampled_from(["orbit", "look", "pan", "dolly"]), RADII)
 @settings(max_examples=300, deadline=None)
-def test_no_drag_breaks_the_camera(
+def test_drag_keeps_the_camera_valid(
     camera: ViewCamera, dx: float, dy: float, height: float, does: str, radius: float
 ) -> None:
     assert usable(controls.drag(camera, does, dx, dy, height, radius))
@@ -91,7 +91,7 @@ def test_no_drag_breaks_the_camera(
 
 @given(cameras(), ANY, st.tuples(*[st.sampled_from([-1.0, 0.0, 1.0])] * 3), ANY, RADII)
 @settings(max_examples=200, deadline=None)
-def test_no_wheel_and_no_flight_breaks_the_camera(
+def test_wheel_and_flight_keep_the_camera_valid(
     camera: ViewCamera, steps: float, wish: Vec3, seconds: float, radius: float
 ) -> None:
     assert usable(controls.zoom(camera, steps, radius))
@@ -120,7 +120,7 @@ def test_zoom_in_and_out_returns_to_the_same_distance(camera: ViewCamera, steps:
 
 
 @given(cameras(), PIXELS, PIXELS)
-def test_up_stays_up_and_the_horizon_level(camera: ViewCamera, dx: float, dy: float) -> None:
+def test_orbit_keeps_the_horizon_level(camera: ViewCamera, dx: float, dy: float) -> None:
     picture = axes(controls.orbit(camera, dx, dy))
     assert abs(dot(picture.right, camera.up)) < 1e-9
     assert dot(picture.up, camera.up) > -1e-9
@@ -134,11 +134,11 @@ def test_orbiting_keeps_the_pivot_and_its_distance(camera: ViewCamera, dx: float
 
 
 @given(cameras(), PIXELS, PIXELS)
-def test_looking_around_keeps_the_eye_in_its_place(camera: ViewCamera, dx: float, dy: float) -> None:
+def test_looking_around_keeps_the_eye_position(camera: ViewCamera, dx: float, dy: float) -> None:
     assert near(eye(controls.look(camera, dx, dy)), eye(camera), 10 * size_of(camera))
 
 
-def test_dragging_right_brings_what_was_at_the_left_to_the_middle() -> None:
+def test_dragging_right_moves_the_scene_to_the_right() -> None:
     camera = ViewCamera(elevation=0.0)
     left = add_scaled(camera.pivot, (-1.0, axes(camera).right), (1.0, axes(camera).back))
     before = to_camera(camera, 400, 400).viewmat @ torch.tensor([*left, 1.0])
@@ -152,13 +152,13 @@ def test_panning_keeps_the_pivot_under_the_cursor(camera: ViewCamera, dx: float,
     moved = to_camera(controls.pan(camera, dx, dy, 480.0), 640, 480)
     seen = moved.viewmat.double() @ torch.tensor([*camera.pivot, 1.0]).double()
     x, y = (moved.K[:2, :2].double() @ (seen[:2] / seen[2])).tolist()
-    lost = 640 * 1e-5 * size_of(camera) / camera.distance  # float32 of a far pivot, seen from close by
+    lost = 640 * 1e-5 * size_of(camera) / camera.distance  # float32 error of a far pivot seen from close by
     assert x == pytest.approx(dx, abs=0.01 + lost)
     assert y == pytest.approx(dy, abs=0.01 + lost)
 
 
 @given(cameras(), st.sampled_from(AXES))
-def test_another_up_axis_leaves_the_eye_and_the_pivot(camera: ViewCamera, up: Vec3) -> None:
+def test_changing_the_up_axis_keeps_eye_and_pivot(camera: ViewCamera, up: Vec3) -> None:
     turned = with_up(camera, up)
     assert turned.up == pytest.approx(up)
     assert turned.pivot == camera.pivot
@@ -166,9 +166,7 @@ def test_another_up_axis_leaves_the_eye_and_the_pivot(camera: ViewCamera, up: Ve
 
 
 @given(cameras(), st.tuples(*[st.floats(-2, 2)] * 3))
-def test_a_double_click_turns_the_view_to_the_point_without_moving_the_eye(
-    camera: ViewCamera, point: Vec3
-) -> None:
+def test_double_click_looks_at_the_point_without_moving_the_eye(camera: ViewCamera, point: Vec3) -> None:
     away = math.dist(eye(camera), point)
     assume(1e-3 < away < 1e3)
     turned = controls.pivot_on(camera, point, 1.0)
@@ -176,7 +174,7 @@ def test_a_double_click_turns_the_view_to_the_point_without_moving_the_eye(
     assert math.dist(eye(turned), eye(camera)) <= 1e-6 * (size_of(camera) + away)
 
 
-def test_a_double_click_on_the_eye_itself_still_leaves_a_camera() -> None:
+def test_double_click_on_the_eye_position_keeps_the_camera_valid() -> None:
     camera = ViewCamera()
     assert usable(controls.pivot_on(camera, eye(camera), 1.0))
 
@@ -193,7 +191,7 @@ def test_framing_shows_the_whole_sphere_in_any_window(
 
 
 @pytest.mark.parametrize("elevation", [-90.0, 90.0])
-def test_the_poles_are_ordinary_views(elevation: float) -> None:
+def test_poles_are_ordinary_views(elevation: float) -> None:
     camera = ViewCamera(elevation=elevation, azimuth=33.0)
     picture = axes(camera)
     assert near(cross(picture.right, picture.up), picture.back)
@@ -201,13 +199,13 @@ def test_the_poles_are_ordinary_views(elevation: float) -> None:
     assert dot(axes(turned).right, picture.right) == pytest.approx(math.cos(math.radians(3.0)))
 
 
-def test_azimuth_0_meets_each_up_axis_from_its_front() -> None:
+def test_azimuth_0_is_the_front_view_for_every_up_axis() -> None:
     fronts = {(0, 1, 0): (0, 0, 1), (0, -1, 0): (0, 0, -1), (0, 0, 1): (0, -1, 0), (0, 0, -1): (0, 1, 0)}
     for up, expected in fronts.items():
         assert axes(ViewCamera(up=up, elevation=0.0)).back == pytest.approx(expected)
 
 
-def test_flying_ahead_moves_the_eye_along_the_view_at_the_scenes_pace() -> None:
+def test_flying_ahead_follows_the_view_at_the_scene_speed() -> None:
     camera = ViewCamera(distance=2.0)
     for radius in (1e-3, 1e4):
         flown = controls.fly(camera, 0, 0, 1, seconds=0.05, radius=radius)
@@ -215,12 +213,12 @@ def test_flying_ahead_moves_the_eye_along_the_view_at_the_scenes_pace() -> None:
         assert dot(step, axes(camera).back) == pytest.approx(-0.05 * 0.6 * radius, rel=1e-6)
 
 
-def test_a_stalled_frame_does_not_throw_the_flight_far_away() -> None:
+def test_stalled_frame_does_not_fly_far() -> None:
     camera = ViewCamera()
     assert controls.fly(camera, 0, 0, 1, 60.0, 1.0) == controls.fly(camera, 0, 0, 1, 0.1, 1.0)
 
 
-def test_a_drag_means_what_the_table_says() -> None:
+def test_drags_match_the_table_of_mouse_bindings() -> None:
     assert drag_for("left", "", "orbit") == "orbit"
     assert drag_for("middle", "Shift", "orbit") == "pan"
     assert drag_for("middle", "Ctrl", "fly") == "dolly"
@@ -230,12 +228,12 @@ def test_a_drag_means_what_the_table_says() -> None:
     assert drag_for("right", "Alt", "orbit") is None
 
 
-def test_no_key_is_bound_twice_and_none_is_a_flight_key_too() -> None:
+def test_no_key_is_bound_twice_or_is_also_a_flight_key() -> None:
     assert len(KEYS) + len(HAND_KEYS) == sum(len(command.keys.split()) for command in COMMANDS.values())
     assert not {*KEYS} & {*FLY_KEYS}
 
 
-def test_every_command_has_its_action_with_layers_and_without() -> None:
+def test_every_command_has_an_action_with_and_without_layers() -> None:
     row = LayerRow(3, (0.5, 0.5, 0.5), (), "", Bounds())
     facts = SceneFacts("bear.ply", 3, Bounds(), (row,))
     for layers in ((), (LayerState(0, "scarf", 0.5),)):
@@ -246,7 +244,7 @@ def test_every_command_has_its_action_with_layers_and_without() -> None:
             assert all(0.0 <= layer.strength <= 1.0 for layer in after.view.layers)
 
 
-def test_the_first_view_shows_the_whole_bear_upright_with_cameras_and_without() -> None:
+def test_first_view_shows_the_whole_bear_with_and_without_cameras() -> None:
     demo = bear(1500)
     for cameras in (demo.cameras, ()):
         camera = first_camera(demo.gaussians, cameras, aspect=1.0)
@@ -259,7 +257,7 @@ def test_the_first_view_shows_the_whole_bear_upright_with_cameras_and_without() 
         assert bool(((pixels > 0) & (pixels < 400)).all())
 
 
-def test_a_slanted_up_axis_is_kept() -> None:
+def test_slanted_up_axis_is_kept() -> None:
     scene = random_gaussians(50)
     tilt = torch.tensor([math.sin(0.2), -math.cos(0.2), 0.0])
     level = look_at(torch.tensor([0.0, 0.0, -4.0]), torch.zeros(3), tilt)
@@ -267,7 +265,7 @@ def test_a_slanted_up_axis_is_kept() -> None:
     assert first_camera(scene, [camera]).up == pytest.approx(tilt.tolist(), abs=1e-5)
 
 
-def test_nothing_at_all_can_still_be_looked_at() -> None:
+def test_first_camera_of_an_empty_scene_is_valid() -> None:
     assert usable(first_camera(random_gaussians(0)))
 
 
