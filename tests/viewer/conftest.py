@@ -1,4 +1,4 @@
-"""The viewer's tests remember nothing of each other; a hand on the bear, and its files."""
+"""Fixtures of the viewer's tests: an empty state folder, a rig with the bear, and the bear's files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.helpers.ui_rig import Rig, rig
 
 @pytest.fixture(autouse=True)
 def empty_state_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the window remembers for its user begins empty."""
+    """Start every test with an empty state folder."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "memory"))
 
 

@@ -1,4 +1,4 @@
-"""What the tests of the viewer's pictures share: a small bear with two edits, and an engine that draws it."""
+"""Fixtures of the render tests: a small bear with two edits and an engine that draws it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def stack() -> Stack:
 
 @pytest.fixture
 def gl_engine(ctx: moderngl.Context, stack: Stack) -> Iterator[ViewEngine]:
-    """Draws with OpenGL."""
+    """Yield an engine that draws with OpenGL."""
     made = ViewEngine(ctx, stack.scene, stack.gdfs, draw="gl")
     yield made
     made.release()

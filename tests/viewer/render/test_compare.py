@@ -1,4 +1,4 @@
-"""Original against edited: held, side by side, subtracted; in the window and in files."""
+"""Original against edited, full screen, side by side or subtracted, in the window and in files."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from viewer.state.view_state import Comparison, ViewState
 
 @cache
 def whole(scarf: float, ears: float, draw: str = "cpu") -> np.ndarray:
-    """The bear without a comparison, as the default rig shows it; asked for first before a rig is up."""
+    """Render the bear without a comparison in the default rig. Call it before another rig exists."""
     with rig(first_view(bear(), scarf, ears), draw=draw) as hand:
         return hand.picture()
 
@@ -38,7 +38,7 @@ def hand() -> Iterator[Rig]:
 
 @pytest.mark.gl
 @pytest.mark.parametrize("draw", ["cpu", "gl"])
-def test_shift_y_shows_the_original_left_and_the_edited_right_of_the_divider(draw: str) -> None:
+def test_shift_y_splits_the_view_into_original_and_edited(draw: str) -> None:
     original = whole(0.0, 0.0, draw)
     with rig(first_view(bear(), 1.0, 1.0), draw=draw) as hand:
         edited = hand.picture()
@@ -52,7 +52,7 @@ def test_shift_y_shows_the_original_left_and_the_edited_right_of_the_divider(dra
 
 
 @pytest.mark.gl
-def test_the_divider_follows_the_hand_and_draws_no_splats(hand: Rig) -> None:
+def test_divider_follows_the_pointer_without_drawing_splats(hand: Rig) -> None:
     hand.key("Shift+Y")
     before = hand.main_view.work.view.camera
     drawn = hand.main_view.canvas.pictures_drawn
@@ -68,7 +68,7 @@ def test_the_divider_follows_the_hand_and_draws_no_splats(hand: Rig) -> None:
 
 
 @pytest.mark.gl
-def test_beside_the_divider_a_drag_turns_both_sides(hand: Rig) -> None:
+def test_drag_beside_the_divider_orbits_both_sides(hand: Rig) -> None:
     hand.key("Shift+Y")
     hand.drag((250.0, 300.0), (280.0, 300.0))
     view = hand.main_view.work.view
@@ -81,7 +81,7 @@ def test_beside_the_divider_a_drag_turns_both_sides(hand: Rig) -> None:
 
 
 @pytest.mark.gl
-def test_a_slider_in_split_changes_the_right_side_alone(hand: Rig) -> None:
+def test_slider_in_split_changes_only_the_right_side(hand: Rig) -> None:
     hand.key("Shift+Y")
     hand.drag((170.0, 300.0), (120.0, 300.0))
     left, right = beside_line(hand.picture(), 120)
@@ -94,7 +94,7 @@ def test_a_slider_in_split_changes_the_right_side_alone(hand: Rig) -> None:
 
 
 @pytest.mark.gl
-def test_the_difference_is_amplified_black_where_nothing_changed_and_tells_the_psnr(hand: Rig) -> None:
+def test_difference_is_amplified_and_reports_the_psnr(hand: Rig) -> None:
     hand.key("Alt+Y")
     view = hand.main_view.work.view
     edited = hand.main_view.engine.image(view, SIZE).clip(0, 1)
@@ -130,7 +130,7 @@ def test_backslash_shows_the_whole_original_over_any_comparison(hand: Rig) -> No
 
 
 @pytest.mark.gl
-def test_at_a_difference_left_and_come_back_to_after_a_slider_moved_the_new_one_is_shown(hand: Rig) -> None:
+def test_difference_is_updated_after_a_slider_moved_in_split_mode(hand: Rig) -> None:
     hand.key("Alt+Y")
     before = hand.picture()
     psnr_before = hand.main_view.canvas.comparer.psnr
@@ -144,11 +144,11 @@ def test_at_a_difference_left_and_come_back_to_after_a_slider_moved_the_new_one_
 
 
 @pytest.mark.gl
-def test_idle_in_a_comparison_draws_nothing(hand: Rig) -> None:
+def test_idle_comparison_draws_nothing(hand: Rig) -> None:
     for chord in ("Shift+Y", "Alt+Y"):
         hand.key(chord)
         hand.pause(1.0)
-        hand.frame(2)  # a tooltip may wait for a second of rest
+        hand.frame(2)  # a tooltip may wait for one second of rest
         drawn = hand.main_view.canvas.pictures_drawn
         hand.frame(3)
         assert hand.main_view.next_frame_delay() is None
@@ -156,7 +156,7 @@ def test_idle_in_a_comparison_draws_nothing(hand: Rig) -> None:
 
 
 @pytest.mark.gl
-def test_a_saved_picture_holds_the_comparison_with_its_labels(tmp_path: Path) -> None:
+def test_saved_picture_holds_the_comparison_with_its_labels(tmp_path: Path) -> None:
     with rig(first_view(bear(), 1.0, 1.0), pictures=tmp_path) as hand:
         hand.key("Shift+Y")
         shown = hand.picture()
@@ -171,7 +171,7 @@ def test_a_saved_picture_holds_the_comparison_with_its_labels(tmp_path: Path) ->
 
 
 @pytest.mark.gl
-def test_y_shows_two_pictures_that_turn_together_and_can_be_picked_in(hand: Rig, tmp_path: Path) -> None:
+def test_y_shows_two_pictures_that_orbit_together_and_allow_picking(hand: Rig, tmp_path: Path) -> None:
     hand.key("Y")
     hand.drag((250.0, 300.0), (290.0, 310.0))
     view = hand.main_view.work.view
@@ -198,7 +198,7 @@ def test_y_shows_two_pictures_that_turn_together_and_can_be_picked_in(hand: Rig,
 
 
 @pytest.mark.gl
-def test_backslash_stays_with_the_original_until_it_is_pressed_again_or_a_slider_moves(hand: Rig) -> None:
+def test_backslash_shows_the_original_until_pressed_or_a_slider_moves(hand: Rig) -> None:
     edited = hand.picture()
     hand.key("\\")
     assert np.array_equal(hand.picture()[BANNER:], whole(0.0, 0.0)[BANNER:])
@@ -209,7 +209,7 @@ def test_backslash_stays_with_the_original_until_it_is_pressed_again_or_a_slider
     assert not hand.main_view.work.before
 
 
-def test_each_mode_goes_on_and_off_and_takes_over_from_the_other() -> None:
+def test_comparison_modes_toggle_and_replace_each_other() -> None:
     view = ViewState()
     split = toggle_mode(view, "split")
     assert split.compare.mode == "split"
@@ -230,7 +230,7 @@ def rendered(*options: str) -> np.ndarray:
     return np.asarray(Image.open("out.png")).astype(int)
 
 
-def test_render_writes_a_split_at_the_share_that_was_said(folder: Path) -> None:
+def test_render_writes_a_split_at_the_given_share(folder: Path) -> None:
     edited = rendered()
     original = rendered("--set", "scarf=0")
     picture = rendered("--split", "0.25")
@@ -239,11 +239,11 @@ def test_render_writes_a_split_at_the_share_that_was_said(folder: Path) -> None:
     assert (picture[:, 24] == 255).all(), "the divider"
 
 
-def test_render_splits_in_the_middle_where_no_share_is_said(folder: Path) -> None:
+def test_render_splits_in_the_middle_by_default(folder: Path) -> None:
     assert (rendered("--split")[:, 48] == 255).all()
 
 
-def test_render_writes_a_difference_and_says_the_psnr(
+def test_render_writes_a_difference_and_reports_the_psnr(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     edited = rendered()
@@ -264,7 +264,7 @@ def test_render_writes_a_difference_and_says_the_psnr(
         (("--split", "--sheet", "scarf"), "one of them"),
     ],
 )
-def test_a_comparison_that_makes_no_sense_is_one_line(
+def test_invalid_comparison_options_are_one_line(
     folder: Path, options: tuple[str, ...], about: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     argv = ["render", "bear.ply", "scarf.gdf", "--engine", "cpu", *options, "-o", "bad.png"]

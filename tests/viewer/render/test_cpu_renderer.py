@@ -1,4 +1,4 @@
-"""The CPU renderer: pictures begun ahead, sessions of sliders, what the screen shows."""
+"""CPU renderer: pictures prepared ahead, sequences of slider changes, and the picture on screen."""
 
 from __future__ import annotations
 
@@ -38,8 +38,10 @@ def view_of(stack: Stack, *strengths: float) -> ViewState:
 
 
 def wandering(scene: Gaussians) -> Gdf:
-    """An edit that sends members across the picture and out of it, behind the camera, up to giants, to
-    nothing and back."""
+    """Return an edit that moves members across and out of the picture and behind the camera.
+
+    The members also grow very large, become transparent and return.
+    """
     rng = torch.Generator().manual_seed(5)
     members = torch.randperm(len(scene), generator=rng)[:60].sort().values
     nodes = torch.tensor([0.0, 0.5, 1.0])
@@ -62,7 +64,7 @@ def wandering(scene: Gaussians) -> Gdf:
     return Gdf("wandering", Region("wandering", members, score), field, fingerprint(scene))
 
 
-def test_a_picture_that_was_begun_is_the_one_that_is_drawn_unless_something_changed(stack: Stack) -> None:
+def test_prepared_picture_is_drawn_unless_the_view_changed(stack: Stack) -> None:
     engine, afresh = (ViewEngine(None, stack.scene, stack.gdfs) for _ in range(2))
     views = [view_of(stack, strength) for strength in (0.2, 0.9)]
     for begun in views:
@@ -76,7 +78,7 @@ def test_a_picture_that_was_begun_is_the_one_that_is_drawn_unless_something_chan
             engine.prepare(shown, replace(camera, viewmat=moved))
 
 
-def test_a_random_session_of_sliders_gives_the_bits_of_whole_pictures(stack: Stack) -> None:
+def test_random_slider_sequence_equals_full_renders_bit_for_bit(stack: Stack) -> None:
     edits = (*stack.gdfs, wandering(stack.scene))
     kept = ViewEngine(None, stack.scene, edits)
     rng = np.random.default_rng(3)
@@ -99,7 +101,7 @@ def _camera(view: ViewState) -> Camera:
     return to_camera(view.camera, *SIZE)
 
 
-def test_a_picture_that_was_handed_out_stays_as_it_is(stack: Stack) -> None:
+def test_returned_picture_is_never_overwritten(stack: Stack) -> None:
     engine = ViewEngine(None, stack.scene, stack.gdfs)
     engine.image(view_of(stack, 0.1), SIZE)
     image = engine.image(view_of(stack, 0.4), SIZE)
@@ -112,18 +114,18 @@ def test_a_picture_that_was_handed_out_stays_as_it_is(stack: Stack) -> None:
 def test_several_changes_before_a_picture_are_all_drawn(stack: Stack) -> None:
     engine = ViewEngine(None, stack.scene, stack.gdfs)
     engine.image(view_of(stack, 0.5, 0.5), SIZE)
-    engine.gaussians(view_of(stack, 0.9, 0.5))  # composes, draws nothing
+    engine.gaussians(view_of(stack, 0.9, 0.5))  # composes without drawing
     view = view_of(stack, 0.9, 0.1)
     fresh = ViewEngine(None, stack.scene, stack.gdfs)
     assert np.array_equal(engine.image(view, SIZE), fresh.image(view, SIZE))
 
 
 @pytest.mark.gl
-def test_the_screen_shows_the_last_picture(ctx: moderngl.Context, stack: Stack) -> None:
+def test_screen_shows_the_last_picture(ctx: moderngl.Context, stack: Stack) -> None:
     screen = ctx.framebuffer([ctx.texture(SIZE, 4)])
     engine, fresh = (ViewEngine(ctx, stack.scene, stack.gdfs, draw="cpu") for _ in range(2))
     for scarf, ears in ((0.0, 0.0), (0.5, 0.0), (1.0, 0.3), (1.0, 0.9), (0.0, 0.9)):
-        engine.image(view_of(stack, scarf, 0.5 * ears), SIZE)  # a picture that never reaches the screen
+        engine.image(view_of(stack, scarf, 0.5 * ears), SIZE)  # this picture never reaches the screen
         engine.draw(view_of(stack, scarf, ears), screen, SIZE)
         shown = read_rgb(screen, SIZE)
         image = np.round(np.clip(fresh.image(view_of(stack, scarf, ears), SIZE), 0.0, 1.0) * 255.0)
@@ -133,7 +135,7 @@ def test_the_screen_shows_the_last_picture(ctx: moderngl.Context, stack: Stack) 
 
 
 @pytest.mark.parametrize("draw", ["cpu", "gl"])
-def test_a_moving_picture_follows_sliders_and_highlights(
+def test_moving_picture_follows_sliders_and_highlights(
     ctx: moderngl.Context, stack: Stack, monkeypatch: pytest.MonkeyPatch, draw: str
 ) -> None:
     monkeypatch.setattr(dynamic_resolution, "BUDGETS", (len(stack.scene),) * 3)
@@ -143,7 +145,7 @@ def test_a_moving_picture_follows_sliders_and_highlights(
 
     def moving(engine: ViewEngine, view: ViewState) -> NDArray[np.float32]:
         engine.draw(replace(view, background=(0.0, 0.0, 0.0)), framebuffer, SIZE, pixels=2)
-        dynamic_resolution._worker().submit(int).result()  # now there is a pyramid
+        dynamic_resolution._worker().submit(int).result()  # the pyramid is finished now
         engine.draw(view, framebuffer, SIZE, pixels=2)
         return engine.renderer.pixels()
 
@@ -153,7 +155,7 @@ def test_a_moving_picture_follows_sliders_and_highlights(
     target = view_of(stack, 0.9, 0.6)
     target = replace(target, selection=replace(target.selection, hidden=pack(hidden.numpy())))
     slid.highlight = afresh.highlight = Highlight(region=1)
-    slid.image(view_of(stack, 0.3, 0.6), SIZE)  # what is not drawn in motion is carried over later
+    slid.image(view_of(stack, 0.3, 0.6), SIZE)  # a full picture, so the pyramid falls behind
     after = moving(slid, target)
     expected = moving(afresh, target)
     assert float(np.abs(after - before).mean()) > 1e-2
@@ -167,7 +169,7 @@ def test_a_moving_picture_follows_sliders_and_highlights(
         engine.release()
 
 
-def test_a_moving_picture_that_is_fine_enough_becomes_finer_only_if_that_is_quick(
+def test_moving_picture_is_refined_only_if_drawing_is_quick(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     scene = bear(6000).gaussians
@@ -183,23 +185,23 @@ def test_a_moving_picture_that_is_fine_enough_becomes_finer_only_if_that_is_quic
     assert slow[0] == slow[2] == quick[0] < quick[1] < quick[29], "the time has changed, not the view"
 
 
-def test_a_small_picture_of_a_large_scene_leaves_the_one_in_full_as_it_is(stack: Stack) -> None:
+def test_small_picture_does_not_affect_the_full_one(stack: Stack) -> None:
     engine, afresh = (ViewEngine(None, stack.scene, stack.gdfs) for _ in range(2))
     engine.image(view_of(stack, 0.1, 0.6), SIZE, pixels=2)
-    dynamic_resolution._worker().submit(int).result()  # now there is a pyramid
+    dynamic_resolution._worker().submit(int).result()  # the pyramid is finished now
     small = engine.image(view_of(stack, 0.4, 0.6), SIZE, pixels=2).copy()
     full = engine.image(view_of(stack, 0.4, 0.6), SIZE)
     assert not np.array_equal(full, small)
     assert np.array_equal(full, afresh.image(view_of(stack, 0.4, 0.6), SIZE))
 
 
-def test_what_is_enough_is_measured_where_a_picture_in_full_follows_one_in_motion() -> None:
+def test_allowed_detail_is_measured_from_full_pictures() -> None:
     scene = bear(6000).gaussians
     live, camera = dynamic_resolution.LiveScene(scene), to_camera(first_camera(scene), *SIZE)
     full = np.full((SIZE[1], SIZE[0], 3), 0.5, np.float32)
 
     def measure(share: float) -> None:
-        """The picture in motion has so many times the error that it may have."""
+        """Compare pictures whose error is `share` times the allowed error."""
         error = np.float32(math.sqrt(share * dynamic_resolution.FINE_ERROR))
         live.measure(full[::2, ::2] + error, full)
 
@@ -216,9 +218,7 @@ def test_what_is_enough_is_measured_where_a_picture_in_full_follows_one_in_motio
 
 @pytest.mark.gl
 @pytest.mark.parametrize("draw", ["cpu", "gl"])
-def test_only_the_same_view_in_full_tells_how_good_a_moving_picture_was(
-    ctx: moderngl.Context, stack: Stack, draw: str
-) -> None:
+def test_detail_is_measured_only_from_the_same_view(ctx: moderngl.Context, stack: Stack, draw: str) -> None:
     engine, view = ViewEngine(ctx, stack.scene, stack.gdfs, draw), view_of(stack, 0.1, 0.6)
     turned = replace(view, camera=replace(view.camera, azimuth=view.camera.azimuth + 30.0))
     slid = view_of(stack, 0.9, 0.6)
@@ -228,7 +228,7 @@ def test_only_the_same_view_in_full_tells_how_good_a_moving_picture_was(
 
     def rest(moving: ViewState, rested: ViewState, grown: int = 0) -> float:
         engine.draw(moving, framebuffer, SIZE, pixels=2)
-        dynamic_resolution._worker().submit(int).result()  # now there is a pyramid
+        dynamic_resolution._worker().submit(int).result()  # the pyramid is finished now
         engine.draw(replace(moving, background=(0.5, 0.5, 0.5)), framebuffer, SIZE, pixels=2)
         engine.draw(moving, framebuffer, SIZE, pixels=2)
         engine.draw(rested, framebuffer, (SIZE[0] + grown, SIZE[1]))
@@ -249,7 +249,7 @@ def test_only_the_same_view_in_full_tells_how_good_a_moving_picture_was(
 
 @pytest.mark.gl
 @pytest.mark.parametrize("done", [1, 3])
-def test_what_is_done_of_a_picture_shows_before_the_rest(
+def test_finished_bands_are_shown_before_the_others(
     ctx: moderngl.Context, stack: Stack, monkeypatch: pytest.MonkeyPatch, done: int
 ) -> None:
     monkeypatch.setattr(cpu_renderer, "BAND", len(stack.scene) // 2)
@@ -275,7 +275,7 @@ def test_what_is_done_of_a_picture_shows_before_the_rest(
     shown = read_rgb(screen, SIZE)
     for top, end in bands:
         coarse[top:end] = full[top:end]
-    # lines of the grid are those of the coarse picture, stretched: where they end may round otherwise
+    # grid lines come from the stretched coarse picture, so their ends may round differently
     assert np.abs(shown.astype(int) - coarse).mean() < 0.02
     engine.draw(view, screen, SIZE)
     assert np.array_equal(read_rgb(screen, SIZE), full)

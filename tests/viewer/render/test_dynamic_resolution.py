@@ -1,4 +1,4 @@
-"""Coarse while it moves, sharp at rest: when, and what one then sees."""
+"""Dynamic resolution: coarse while the view moves, sharp at rest."""
 
 from __future__ import annotations
 
@@ -33,22 +33,22 @@ def twice(known: DynamicResolution, timings: FrameTimings, turned: bool) -> Dyna
     )
 
 
-def test_a_slow_picture_is_coarse_while_the_camera_is_held() -> None:
+def test_slow_picture_is_coarse_while_the_camera_is_dragged() -> None:
     known = twice(DynamicResolution(), SLOW, turned=True)
     moving = dynamic_resolution.before_draw(known, "auto", held=True, turned=True, slid=False, now=1.0)
     assert moving.pixels == COARSE
     assert dynamic_resolution.next_frame_delay(moving, 1.0) == pytest.approx(REST_S)
 
 
-def test_a_quick_picture_never_is() -> None:
+def test_quick_picture_stays_sharp() -> None:
     known = twice(DynamicResolution(), QUICK, turned=True)
     assert (
         dynamic_resolution.before_draw(known, "auto", held=True, turned=True, slid=True, now=1.0).pixels == 1
     )
 
 
-def test_one_slow_picture_among_quick_ones_changes_nothing() -> None:
-    """The first one of all waits for the kernels."""
+def test_single_slow_picture_changes_nothing() -> None:
+    """The first picture is slow because the kernels are compiled."""
     known = dynamic_resolution.after_draw(DynamicResolution(), SLOW, turned=True)
     for then in (
         known,
@@ -62,14 +62,14 @@ def test_one_slow_picture_among_quick_ones_changes_nothing() -> None:
         )
 
 
-def test_a_quick_slider_stays_sharp_in_a_slow_scene() -> None:
+def test_quick_slider_stays_sharp_in_a_slow_scene() -> None:
     known = twice(twice(DynamicResolution(), SLOW, turned=True), QUICK, turned=False)
     assert (
         dynamic_resolution.before_draw(known, "auto", held=True, turned=False, slid=True, now=1.0).pixels == 1
     )
 
 
-def test_a_slider_whose_first_steps_were_slow_goes_on_coarse() -> None:
+def test_slider_becomes_coarse_after_slow_steps() -> None:
     first = dynamic_resolution.before_draw(
         DynamicResolution(), "auto", held=True, turned=False, slid=True, now=1.0
     )
@@ -86,7 +86,7 @@ def test_a_slider_whose_first_steps_were_slow_goes_on_coarse() -> None:
     )
 
 
-def test_a_slider_whose_steps_are_no_slower_than_coarse_ones_stays_sharp() -> None:
+def test_slider_stays_sharp_if_coarse_steps_are_not_faster() -> None:
     known = twice(DynamicResolution(coarse_ms=SLOW_MS + 2.0), SLOW, turned=False)
     for coarse_ms, pixels in ((SLOW_MS + 2.0, 1), (SLOW_MS, COARSE)):
         known = replace(known, coarse_ms=coarse_ms)
@@ -96,14 +96,14 @@ def test_a_slider_whose_steps_are_no_slower_than_coarse_ones_stays_sharp() -> No
         )
 
 
-def test_one_click_is_drawn_sharp_at_once() -> None:
+def test_single_click_is_drawn_sharp_at_once() -> None:
     known = twice(DynamicResolution(), SLOW, turned=True)
     assert (
         dynamic_resolution.before_draw(known, "on", held=False, turned=True, slid=True, now=1.0).pixels == 1
     )
 
 
-def test_it_stays_coarse_between_two_steps_of_a_hand_and_is_sharp_at_rest() -> None:
+def test_drag_stays_coarse_between_steps_and_is_sharp_at_rest() -> None:
     moving = dynamic_resolution.before_draw(
         DynamicResolution(), "on", held=True, turned=True, slid=False, now=1.0
     )
@@ -118,14 +118,14 @@ def test_it_stays_coarse_between_two_steps_of_a_hand_and_is_sharp_at_rest() -> N
     assert dynamic_resolution.next_frame_delay(rested, 2.0) is None
 
 
-def test_what_a_coarse_picture_took_is_not_remembered() -> None:
+def test_time_of_a_coarse_picture_is_not_recorded() -> None:
     moving = dynamic_resolution.before_draw(
         DynamicResolution(camera_ms=(90.0, 90.0)), "auto", held=True, turned=True, slid=False, now=1.0
     )
     assert dynamic_resolution.after_draw(moving, QUICK, turned=True).camera_ms == (90.0, 90.0)
 
 
-def test_off_is_off() -> None:
+def test_off_disables_coarse_pictures() -> None:
     moving = DynamicResolution(pixels=COARSE, rest_at=2.0, camera_ms=(500.0, 500.0))
     assert (
         dynamic_resolution.before_draw(moving, "off", held=True, turned=True, slid=True, now=1.0).pixels == 1
@@ -139,7 +139,7 @@ def hand() -> Iterator[Rig]:
 
 
 def shown(hand: Rig) -> tuple[int, int]:
-    """The size of the picture as it is drawn, pixels."""
+    """Return the size of the drawn picture, pixels."""
     return drawn_size(hand.main_view.picture_size, hand.main_view.canvas.pixels)
 
 
@@ -154,7 +154,7 @@ def wait(hand: Rig, seconds: float) -> None:
 
 
 @pytest.mark.gl
-def test_an_orbit_is_coarse_in_the_hand_and_sharp_where_the_hand_rests(hand: Rig) -> None:
+def test_orbit_is_coarse_during_the_drag_and_sharp_at_rest(hand: Rig) -> None:
     assert shown(hand) == (340, 540)
     hold_and_orbit(hand)
     assert shown(hand) == (170, 270)
@@ -172,10 +172,8 @@ def test_an_orbit_is_coarse_in_the_hand_and_sharp_where_the_hand_rests(hand: Rig
 
 
 @pytest.mark.gl
-def test_a_picture_that_takes_long_is_made_beside_the_windows_work(
-    hand: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for _ in range(2):  # pictures tell that it is slow
+def test_slow_picture_is_drawn_beside_the_window_loop(hand: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    for _ in range(2):  # two pictures to learn that drawing is slow
         hold_and_orbit(hand)
         hand.release()
         wait(hand, REST_S)
@@ -205,14 +203,14 @@ def test_a_picture_that_takes_long_is_made_beside_the_windows_work(
 
 @contextmanager
 def not_done(hand: Rig, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Meanwhile no picture is done, however quick the machine is."""
+    """Keep every picture unfinished, however fast the machine is."""
     with monkeypatch.context() as slow:
         slow.setattr(hand.main_view.canvas.comparer, "prepare", lambda *_: False)
         yield
 
 
 def settle_sharply(hand: Rig) -> None:
-    """Frames until the picture in full is there."""
+    """Draw frames until the full picture is shown."""
     while hand.main_view.next_frame_delay() == 0.0 or hand.main_view.canvas.next_frame_delay(0.0) is not None:
         wait(hand, 0.02)
     image = hand.main_view.engine.image(hand.main_view.work.view, (340, 540))
@@ -220,7 +218,7 @@ def settle_sharply(hand: Rig) -> None:
 
 
 @pytest.mark.gl
-def test_a_slider_is_coarse_in_the_hand_too(hand: Rig) -> None:
+def test_slider_drag_is_coarse_too(hand: Rig) -> None:
     hand.move(*hand.slider(0, 0.5))
     hand.press()
     hand.move(*hand.slider(0, 0.8))
@@ -231,7 +229,7 @@ def test_a_slider_is_coarse_in_the_hand_too(hand: Rig) -> None:
 
 
 @pytest.mark.gl
-def test_a_rested_picture_draws_nothing_more(hand: Rig) -> None:
+def test_picture_at_rest_draws_nothing_more(hand: Rig) -> None:
     hold_and_orbit(hand)
     hand.release()
     wait(hand, REST_S)
@@ -243,7 +241,7 @@ def test_a_rested_picture_draws_nothing_more(hand: Rig) -> None:
 
 
 @pytest.mark.gl
-def test_a_split_is_coarse_on_both_sides_and_a_difference_never(hand: Rig) -> None:
+def test_split_is_coarse_on_both_sides_and_difference_never(hand: Rig) -> None:
     hand.key("Shift+Y")
     hand.move(60.0, 270.0)
     hand.press()
@@ -258,7 +256,7 @@ def test_a_split_is_coarse_on_both_sides_and_a_difference_never(hand: Rig) -> No
 
 
 @pytest.mark.gl
-def test_the_key_goes_through_the_modes(hand: Rig) -> None:
+def test_key_cycles_through_the_modes(hand: Rig) -> None:
     modes = [hand.main_view.work.view.dynamic_resolution]
     for _ in range(3):
         hand.main_view.wake()

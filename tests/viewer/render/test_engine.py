@@ -1,4 +1,4 @@
-"""The engine: only the work between two states, attributes and order together, the same picture every way."""
+"""View engine: minimal work between two states, consistent order, and equal pictures on every path."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def engine(request: pytest.FixtureRequest, ctx: moderngl.Context, stack: Stack) 
 
 
 @pytest.mark.gl
-def test_the_picture_is_the_composed_scene_drawn(engine: ViewEngine, stack: Stack) -> None:
+def test_picture_is_the_composed_scene(engine: ViewEngine, stack: Stack) -> None:
     view = view_of(stack, 0.7, 0.4)
     layers = [Layer(stack.gdfs[SCARF], 0.7), Layer(stack.gdfs[EARS], 0.4)]
     expected = render(compose_layers(stack.scene, layers), to_camera(view.camera, *SIZE)).image.numpy()
@@ -56,7 +56,7 @@ def test_the_picture_is_the_composed_scene_drawn(engine: ViewEngine, stack: Stac
 
 @pytest.mark.gl
 @pytest.mark.parametrize("draw", ["gl", "cpu"])
-def test_a_table_of_colors_over_an_edit_is_drawn_as_composed(
+def test_color_table_over_an_edit_is_drawn_as_composed(
     ctx: moderngl.Context, stack: Stack, draw: str
 ) -> None:
     table = torch.rand(125, 3, generator=torch.Generator().manual_seed(3))
@@ -92,7 +92,7 @@ def test_strength_zero_is_the_original_bit_for_bit(engine: ViewEngine, stack: St
         st.tuples(st.sampled_from([0.0, 0.2, 0.9, 1.0]), st.sampled_from([0.0, 0.5, 1.0])), max_size=4
     )
 )
-def test_the_picture_does_not_depend_on_the_way_to_it(
+def test_picture_does_not_depend_on_earlier_states(
     gl_engine: ViewEngine, ctx: moderngl.Context, stack: Stack, path: list[tuple[float, float]]
 ) -> None:
     for scarf, ears in path:
@@ -104,7 +104,7 @@ def test_the_picture_does_not_depend_on_the_way_to_it(
 
 
 @pytest.mark.gl
-def test_both_ways_to_draw_give_the_same_picture(ctx: moderngl.Context, stack: Stack) -> None:
+def test_both_renderers_give_the_same_picture(ctx: moderngl.Context, stack: Stack) -> None:
     by_gl, by_cpu = (ViewEngine(ctx, stack.scene, stack.gdfs, draw=draw) for draw in ("gl", "cpu"))
     for view in (view_of(stack, 1.0, 0.0), view_of(stack, 0.0, 0.5), view_of(stack, 0.2, 1.0)):
         difference = np.abs(by_gl.image(view, SIZE) - by_cpu.image(view, SIZE))
@@ -115,7 +115,7 @@ def test_both_ways_to_draw_give_the_same_picture(ctx: moderngl.Context, stack: S
 
 
 @pytest.mark.gl
-def test_the_same_state_draws_nothing(
+def test_unchanged_state_draws_nothing(
     engine: ViewEngine, stack: Stack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     view = view_of(stack, 0.5)
@@ -129,7 +129,7 @@ def test_the_same_state_draws_nothing(
 
 
 @pytest.mark.gl
-def test_whatever_changes_the_picture_needs_a_draw(engine: ViewEngine, stack: Stack) -> None:
+def test_every_visible_change_needs_a_draw(engine: ViewEngine, stack: Stack) -> None:
     view = view_of(stack, 0.5, 0.5)
     engine.image(view, SIZE)
     turned = replace(view, camera=replace(view.camera, azimuth=3.0))
@@ -144,7 +144,7 @@ def test_whatever_changes_the_picture_needs_a_draw(engine: ViewEngine, stack: St
 
 
 @pytest.mark.gl
-def test_a_layer_that_is_off_or_at_zero_causes_no_work_at_all(engine: ViewEngine, stack: Stack) -> None:
+def test_hidden_or_zero_layer_causes_no_work(engine: ViewEngine, stack: Stack) -> None:
     engine.image(view_of(stack, 0.5, 0.0), SIZE)
     view = view_of(stack, 0.5, 0.0)
     assert not engine.needs_draw(replace(view, layers=(view.layers[0],)), SIZE)
@@ -154,7 +154,7 @@ def test_a_layer_that_is_off_or_at_zero_causes_no_work_at_all(engine: ViewEngine
 
 
 @pytest.mark.gl
-def test_a_camera_move_composes_nothing(
+def test_camera_move_composes_nothing(
     engine: ViewEngine, stack: Stack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     view = view_of(stack, 0.5)
@@ -168,7 +168,7 @@ def test_a_camera_move_composes_nothing(
 
 
 @pytest.mark.gl
-def test_a_change_of_color_sorts_nothing_and_a_change_of_place_does(
+def test_color_change_skips_sorting_and_position_change_sorts(
     gl_engine: ViewEngine, stack: Stack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     gl_engine.image(view_of(stack), SIZE)
@@ -180,8 +180,8 @@ def test_a_change_of_color_sorts_nothing_and_a_change_of_place_does(
 
 
 @pytest.mark.gl
-def test_no_picture_mixes_new_places_with_the_old_order(gl_engine: ViewEngine, stack: Stack) -> None:
-    """The order on the GPU is that of the means on the GPU, in every frame of a drag."""
+def test_order_matches_the_positions_in_every_picture(gl_engine: ViewEngine, stack: Stack) -> None:
+    """The order on the GPU matches the means on the GPU in every frame of a drag."""
     for ears in (0.0, 0.3, 0.7, 1.0):
         view = view_of(stack, ears=ears)
         gl_engine.image(view, SIZE)
@@ -198,7 +198,7 @@ def test_only_members_of_the_moved_layer_are_composed(engine: ViewEngine, stack:
 
 
 @pytest.mark.gl
-def test_a_state_that_means_nothing_leaves_the_last_picture(engine: ViewEngine, stack: Stack) -> None:
+def test_invalid_state_keeps_the_last_picture(engine: ViewEngine, stack: Stack) -> None:
     good = engine.image(view_of(stack, 0.4, 0.4), SIZE).copy()
     for broken in (
         replace(view_of(stack), layers=(LayerState(7, "gone", 0.5),)),
@@ -212,7 +212,7 @@ def test_a_state_that_means_nothing_leaves_the_last_picture(engine: ViewEngine, 
 
 
 @pytest.mark.gl
-def test_a_window_gets_the_picture_upright_in_its_lower_left_corner(
+def test_window_shows_the_picture_upright_in_its_lower_left_corner(
     engine: ViewEngine, ctx: moderngl.Context, stack: Stack
 ) -> None:
     screen = ctx.framebuffer([ctx.texture((120, 100), 4)])
@@ -227,7 +227,7 @@ def test_a_window_gets_the_picture_upright_in_its_lower_left_corner(
     screen.release()
 
 
-def test_an_engine_without_a_context_draws_on_the_cpu(stack: Stack) -> None:
+def test_engine_without_a_context_draws_on_the_cpu(stack: Stack) -> None:
     engine = ViewEngine(None, stack.scene, stack.gdfs)
     assert engine.draws_with == "cpu"
     assert engine.image(view_of(stack, 1.0), SIZE).shape == (72, 96, 3)
@@ -236,21 +236,19 @@ def test_an_engine_without_a_context_draws_on_the_cpu(stack: Stack) -> None:
 
 
 @pytest.mark.gl
-def test_software_opengl_is_left_to_the_cpu_rasterizer(ctx: moderngl.Context, stack: Stack) -> None:
+def test_software_opengl_uses_the_cpu_rasterizer(ctx: moderngl.Context, stack: Stack) -> None:
     engine = ViewEngine(ctx, stack.scene, stack.gdfs)
     assert engine.draws_with == ("cpu" if is_software(ctx) else "gl")
     engine.release()
 
 
-def test_an_edit_of_another_scene_is_refused(stack: Stack) -> None:
+def test_edit_of_another_scene_is_refused(stack: Stack) -> None:
     with pytest.raises(ProgdfError, match="another scene"):
         ViewEngine(None, stack.scene[:100], stack.gdfs)
 
 
 @pytest.mark.gl
-def test_a_scene_without_gaussians_is_its_background(
-    engine: ViewEngine, ctx: moderngl.Context, stack: Stack
-) -> None:
+def test_empty_scene_shows_the_background(engine: ViewEngine, ctx: moderngl.Context, stack: Stack) -> None:
     empty = ViewEngine(ctx, stack.scene[:0], draw=engine.draws_with)
     image = empty.image(ViewState(background=(0.2, 0.4, 0.6)), (8, 4))
     assert np.allclose(image, (0.2, 0.4, 0.6))
@@ -258,7 +256,7 @@ def test_a_scene_without_gaussians_is_its_background(
 
 
 @pytest.mark.gl
-def test_engines_that_come_and_go_leave_no_gl_error(ctx: moderngl.Context, stack: Stack) -> None:
+def test_released_engines_leave_no_gl_error(ctx: moderngl.Context, stack: Stack) -> None:
     assert ctx.error in ("GL_NO_ERROR", "GL_INVALID_OPERATION"), "asking clears what other tests left"
     for draw in ("gl", "cpu", "gl"):
         engine = ViewEngine(ctx, stack.scene, stack.gdfs, draw=draw)
@@ -272,7 +270,7 @@ def test_timings_add_up() -> None:
     assert FrameTimings(1.0, 2.0, 3.0, 4.0).total_ms == 10.0
 
 
-def test_the_early_stop_is_the_only_rule_that_gl_leaves_out() -> None:
-    """Named here so that a change of the constant meets the tolerances above: 0.01 = 1e-4 / (1 - 0.99)."""
+def test_early_stop_error_bound_matches_the_tolerances() -> None:
+    """A change of the constants has to meet the tolerances above: 0.01 = 1e-4 / (1 - 0.99)."""
     conventions = importlib.import_module("progdf.rasterize.engines")
     assert pytest.approx(0.01) == conventions.TRANSMITTANCE_MIN / (1.0 - conventions.ALPHA_MAX)

@@ -1,4 +1,4 @@
-"""OpenGL against the CPU engines: the hard cases, the bear, a real scene, and partial uploads."""
+"""OpenGL against the CPU engines: hard cases, the bear, a real scene and partial uploads."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def draw(renderer: SplatRenderer) -> Draw:
 
 @pytest.fixture
 def without_early_stop(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The reference engine without the rule that blending back to front cannot follow (see SplatRenderer)."""
+    """Disable the reference engine's early stop, which back-to-front blending lacks (see SplatRenderer)."""
     monkeypatch.setattr(importlib.import_module("progdf.rasterize.reference"), "TRANSMITTANCE_MIN", 0.0)
 
 
@@ -67,11 +67,11 @@ def psnr(image: Image, target: Image) -> float:
 
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.usefixtures("without_early_stop")
-def test_hard_cases_look_the_same(draw: Draw, name: str) -> None:
+def test_hard_cases_match_the_reference(draw: Draw, name: str) -> None:
     case = CASES[name]
     image = draw(case.gaussians, case.camera)
     expected = render(case.gaussians, case.camera, WHITE, engine="reference").image.numpy()
-    # float32 against float64: 120 dB and more is usual, 0.5/255 of one pixel where a rim is at stake
+    # float32 against float64 usually gives 120 dB; at a boundary one pixel may be off by 0.5/255
     peak = max(1.0, float(expected.max()))
     assert psnr(image / peak, expected / peak) >= 100.0
     assert float(np.abs(image - expected).max(initial=0.0)) <= 1.0 / 255.0
@@ -79,7 +79,7 @@ def test_hard_cases_look_the_same(draw: Draw, name: str) -> None:
 
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.usefixtures("without_early_stop")
-def test_opengl_draws_the_depth_of_hard_cases_like_the_reference(renderer: SplatRenderer, name: str) -> None:
+def test_depth_of_hard_cases_matches_the_reference(renderer: SplatRenderer, name: str) -> None:
     scene = CASES[name].gaussians
     camera = CASES[name].camera
     renderer.upload(paint_depth(scene, camera))
@@ -87,26 +87,26 @@ def test_opengl_draws_the_depth_of_hard_cases_like_the_reference(renderer: Splat
     found = depth_of(torch.from_numpy(read(renderer.draw(camera, (0.0, 0.0, 0.0))).copy()))
     expected = render_depth(scene, camera, engine="reference")
     torch.testing.assert_close(found.alpha, expected.alpha, rtol=0, atol=1e-4)
-    both = (found.alpha > 0) & (expected.alpha > 0)  # a rim may be at stake
+    both = (found.alpha > 0) & (expected.alpha > 0)  # boundary pixels may differ
     torch.testing.assert_close(found.depth[both], expected.depth[both], rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.usefixtures("without_early_stop")
-def test_a_dense_scene_agrees_to_120_db_but_for_the_early_stop(draw: Draw) -> None:
+def test_dense_scene_matches_without_the_early_stop(draw: Draw) -> None:
     scene = bear(6000).gaussians
     camera = orbit_rig(scene, 1, 200, 150)[0]
     assert psnr(draw(scene, camera), render(scene, camera, WHITE, engine="reference").image.numpy()) >= 115.0
 
 
-def test_the_bear_looks_the_same_as_on_the_cpu(draw: Draw) -> None:
+def test_bear_matches_the_cpu(draw: Draw) -> None:
     demo = bear(24_000)
     for camera in demo.cameras[::16]:
         small = camera.resize(320, 320)
-        # the early stop at 1e-4 leaves at most 0.01 of a color in a pixel: 76 dB and more
+        # the early stop at 1e-4 leaves at most 0.01 of a color in a pixel: at least 76 dB
         assert psnr(draw(demo.gaussians, small), render(demo.gaussians, small, WHITE).image.numpy()) >= 70.0
 
 
-def test_a_real_scene_looks_the_same_as_on_the_cpu(draw: Draw, shared_data: Path) -> None:
+def test_real_scene_matches_the_cpu(draw: Draw, shared_data: Path) -> None:
     scene = load_ply(shared_data / "playbot_31k.ply")
     for camera in orbit_rig(scene, 2, 400, 300):
         image = draw(scene, camera)
@@ -115,9 +115,7 @@ def test_a_real_scene_looks_the_same_as_on_the_cpu(draw: Draw, shared_data: Path
         assert float(np.abs(image - expected).max()) <= 0.0101, "more than the early stop explains"
 
 
-def test_what_the_early_stop_leaves_out_is_all_that_differs(
-    draw: Draw, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_early_stop_explains_all_differences(draw: Draw, monkeypatch: pytest.MonkeyPatch) -> None:
     case = CASES["400 opaque ones stacked"]
     image = draw(case.gaussians, case.camera)
     stopped = render(case.gaussians, case.camera, WHITE, engine="reference").image.numpy()
@@ -128,8 +126,8 @@ def test_what_the_early_stop_leaves_out_is_all_that_differs(
 
 @pytest.mark.parametrize(("length", "width"), [(1.5, 1e-3), (3.0, 1e-3), (3.0, 1e-4)])
 @pytest.mark.usefixtures("without_early_stop")
-def test_a_needle_of_thousands_of_pixels_keeps_its_width(draw: Draw, length: float, width: float) -> None:
-    """ac − b² in float32 gives 54 to 62 dB here."""
+def test_needle_of_thousands_of_pixels_keeps_its_width(draw: Draw, length: float, width: float) -> None:
+    """ac − b² in float32 gives only 54 to 62 dB here."""
     camera = front_camera(120, 90, focal=2000.0)
     quat = (0.9238795, 0.1, 0.05, 0.3826834)
     scene = one_gaussian(scales=(length, width, width), quat=quat, mean=(0.005, 0.002, 2.0))
@@ -140,7 +138,7 @@ def test_a_needle_of_thousands_of_pixels_keeps_its_width(draw: Draw, length: flo
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.usefixtures("without_early_stop")
-def test_every_band_of_spherical_harmonics_is_shown(draw: Draw, degree: int) -> None:
+def test_every_sh_band_is_drawn(draw: Draw, degree: int) -> None:
     scene = random_gaussians(300, seed=degree, sh_degree=degree)
     camera = orbit_camera(80, 60)
     scene = replace(scene, shN=3.0 * scene.shN)
@@ -149,7 +147,7 @@ def test_every_band_of_spherical_harmonics_is_shown(draw: Draw, degree: int) -> 
 
 
 @pytest.mark.usefixtures("without_early_stop")
-def test_bands_above_the_third_ride_along_unseen(draw: Draw) -> None:
+def test_sh_bands_above_3_are_ignored(draw: Draw) -> None:
     scene = random_gaussians(50, sh_degree=3)
     camera = orbit_camera()
     extended = replace(scene, shN=torch.cat([scene.shN, torch.ones(50, 9, 3)], dim=1))
@@ -157,7 +155,7 @@ def test_bands_above_the_third_ride_along_unseen(draw: Draw) -> None:
 
 
 @pytest.mark.parametrize("attribute", ATTRIBUTES)
-def test_uploading_changed_rows_is_the_same_as_uploading_all(
+def test_uploading_changed_rows_equals_uploading_all(
     renderer: SplatRenderer, draw: Draw, attribute: str
 ) -> None:
     count = 4 * SPLATS_PER_ROW + 7
@@ -174,7 +172,7 @@ def test_uploading_changed_rows_is_the_same_as_uploading_all(
     assert sent > 0
 
 
-def test_only_touched_texture_rows_are_sent(renderer: SplatRenderer) -> None:
+def test_only_touched_texture_rows_are_uploaded(renderer: SplatRenderer) -> None:
     scene = random_gaussians(40 * SPLATS_PER_ROW)
     renderer.upload(scene)
     rows = np.array([5, 20 * SPLATS_PER_ROW])
@@ -183,15 +181,15 @@ def test_only_touched_texture_rows_are_sent(renderer: SplatRenderer) -> None:
     assert renderer.update(scene, ["means"], rows[:0]) == 0
 
 
-def test_rows_near_each_other_are_sent_together() -> None:
+def test_nearby_rows_are_uploaded_together() -> None:
     rows = np.array([0, 1, 600, 511 * 512, 512 * 512 + 3])
     assert list(row_runs(rows)) == [(0, 2), (511, 513)]
 
 
-def test_the_sorting_is_the_reverse_of_depth_then_index() -> None:
+def test_sort_order_is_back_to_front_by_depth_then_index() -> None:
     rng = np.random.default_rng(0)
     means = rng.normal(size=(500, 3)).astype(np.float32)
-    means[100:200, 2] = 0.25  # many at one depth
+    means[100:200, 2] = 0.25  # many Gaussians at one depth
     means[7], means[8] = np.nan, np.inf
     camera = orbit_camera()
     camera = replace(camera, viewmat=torch.tensor(np.diag([1.0, 1, 1, 1]), dtype=torch.float32))
@@ -201,7 +199,7 @@ def test_the_sorting_is_the_reverse_of_depth_then_index() -> None:
     assert order[::-1].tolist() == expected
 
 
-def test_a_smaller_scene_after_a_larger_one_leaves_nothing_of_it(draw: Draw) -> None:
+def test_smaller_scene_leaves_nothing_of_a_larger_one(draw: Draw) -> None:
     small = random_gaussians(20, seed=3)
     large = random_gaussians(3000, seed=4)
     camera = orbit_camera()

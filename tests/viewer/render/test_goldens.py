@@ -1,4 +1,4 @@
-"""The bear in the viewer looks as it did: pictures kept in tests/screenshots."""
+"""The bear in the viewer matches the golden pictures in tests/screenshots."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ Compare = Callable[[str, np.ndarray], None]
 
 @pytest.mark.gl
 @pytest.mark.usefixtures("software_gpu")
-def test_the_goldens_are_compared_on_a_software_renderer(ctx: moderngl.Context) -> None:
+def test_goldens_are_compared_on_a_software_renderer(ctx: moderngl.Context) -> None:
     assert "llvmpipe" in str(ctx.info["GL_RENDERER"])
 
 
 @pytest.mark.gl
 @pytest.mark.usefixtures("software_gpu")
 @pytest.mark.parametrize("strength", [0.0, 0.5, 1.0])
-def test_the_bear_looks_as_it_did(
+def test_bear_matches_its_goldens(
     gl_engine: ViewEngine, stack: Stack, screenshot: Compare, strength: float
 ) -> None:
     screenshot(f"scene_bear_{strength:g}", gl_engine.image(view_of(stack, strength, strength), (240, 180)))
@@ -33,7 +33,7 @@ def test_the_bear_looks_as_it_did(
 
 @pytest.mark.gl
 @pytest.mark.usefixtures("software_gpu")
-def test_a_wrong_golden_is_noticed(
+def test_wrong_golden_is_detected(
     gl_engine: ViewEngine, stack: Stack, screenshot: Compare, request: pytest.FixtureRequest
 ) -> None:
     """scene_wrong.png is scene_bear_1.png with one square 4/255 too bright."""
@@ -47,7 +47,7 @@ def test_a_wrong_golden_is_noticed(
 
 
 @pytest.mark.parametrize("name", ["scene_bear_0.5", "ui_main", "ui_training"])
-def test_a_golden_lets_pass_what_processors_round_otherwise_and_nothing_that_one_sees(name: str) -> None:
+def test_golden_tolerates_rounding_but_not_visible_changes(name: str) -> None:
     golden = np.asarray(Image.open(SCREENSHOTS / f"{name}.png").convert("RGB"))
     rng = np.random.default_rng(0)
     steps = (rng.random(golden.shape[:2]) < 1e-3)[..., None] * rng.integers(-LEVELS, LEVELS + 1, golden.shape)
@@ -58,10 +58,10 @@ def test_a_golden_lets_pass_what_processors_round_otherwise_and_nothing_that_one
     assert "pixels differ by more than 0/255" in difference(golden, brighter), "by one step"
 
 
-def test_a_missing_widget_is_noticed_however_small_it_is() -> None:
+def test_missing_detail_of_one_pixel_is_detected() -> None:
     golden = np.asarray(Image.open(SCREENSHOTS / "ui_main.png").convert("RGB"))
     detail = np.abs(np.diff(golden.astype(int), axis=0)).max(axis=-1) > LEVELS
     for y, x in np.random.default_rng(0).choice(np.argwhere(detail), 20):
         bare = golden.copy()
-        bare[y + 1, x] = bare[y, x]  # a dot of one pixel goes
+        bare[y + 1, x] = bare[y, x]  # removes a dot of one pixel
         assert difference(golden, bare).startswith("1 pixels differ")

@@ -1,4 +1,4 @@
-"""Painted weights shown as colors: the ramp, both ways of drawing, and what does not show them."""
+"""Painted weights shown as colors: the color ramp, both renderers, and pictures without highlights."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SCARF = 0
 
 
 def half_painted() -> str:
-    """The scarf with weights that rise from 0 to 1 along its members."""
+    """Return paint for the scarf that rises from 0 to 1 along its members."""
     return paint.encode(np.linspace(0, 1, len(bear().gdfs[SCARF].region), dtype=np.float32))
 
 
@@ -36,14 +36,14 @@ def view(strength: float = 1.0, painted: str = paint.FULL) -> ViewState:
 
 
 def shown(engine: ViewEngine, state: ViewState, ctx: moderngl.Context) -> np.ndarray:
-    """What `draw` brings on a screen. [H,W,3]"""
+    """Draw to a screen and read it back. [H,W,3]"""
     screen = ctx.framebuffer([ctx.texture(SIZE, 4, dtype="f4")])
     engine.draw(state, screen, SIZE)
     return np.frombuffer(screen.read(components=3, dtype="f4"), np.float32).reshape(SIZE[1], SIZE[0], 3)[::-1]
 
 
 def highlighted(scene: Gaussians, shade: Highlight) -> Gaussians:
-    """The plain way: another scene, in which the members have the mixed colors."""
+    """Return a scene whose members have the mixed colors, as a plain reference."""
     members = bear().gdfs[shade.gdf].region.members
     over = (
         torch.from_numpy(
@@ -59,7 +59,7 @@ def highlighted(scene: Gaussians, shade: Highlight) -> Gaussians:
     return replace(scene, sh0=sh0, shN=shN)
 
 
-def test_the_ramp_rises_in_lightness_and_ends_in_its_named_colors() -> None:
+def test_ramp_rises_in_lightness_between_its_two_named_colors() -> None:
     ramp = highlight.ramp_colors(np.linspace(0, 1, 256, dtype=np.float32)).astype(float)
     assert tuple(ramp[0]) == (0x2B, 0x3F, 0xA8)
     assert tuple(ramp[-1]) == (0xF9, 0xE5, 0x58)
@@ -68,7 +68,7 @@ def test_the_ramp_rises_in_lightness_and_ends_in_its_named_colors() -> None:
     assert lightness[-1] - lightness[0] > 120
 
 
-def test_a_thin_tint_leaves_what_has_all_of_the_edit_as_it_is() -> None:
+def test_thin_tint_leaves_fully_weighted_members_untinted() -> None:
     members = bear().gdfs[SCARF].region.members.numpy()
     total = len(bear().scene)
     colors, tint = (
@@ -82,7 +82,7 @@ def test_a_thin_tint_leaves_what_has_all_of_the_edit_as_it_is() -> None:
 
 @pytest.mark.gl
 @pytest.mark.parametrize("draw", ["cpu", "gl"])
-def test_what_is_shown_is_the_scene_with_mixed_colors(ctx: moderngl.Context, draw: str) -> None:
+def test_highlight_equals_a_scene_with_mixed_colors(ctx: moderngl.Context, draw: str) -> None:
     shade = Highlight(SCARF, half_painted())
     engine = ViewEngine(ctx, bear().scene, bear().gdfs, draw)
     plain = ViewEngine(ctx, highlighted(engine.gaussians(view(1.0, shade.paint)), shade), (), draw)
@@ -92,7 +92,7 @@ def test_what_is_shown_is_the_scene_with_mixed_colors(ctx: moderngl.Context, dra
     assert engine.needs_draw(view(1.0, shade.paint), SIZE)
     found = shown(engine, view(1.0, shade.paint), ctx)
     assert np.abs(found - before).max() > 0.2
-    # the highlights are 8 bits on the one side and 32 on the other only within rounding
+    # highlight colors are 8 bits on the CPU and float on the GPU
     assert np.abs(found - expected).max() < 1e-4
     assert not engine.needs_draw(view(1.0, shade.paint), SIZE)
     engine.release()
@@ -100,7 +100,7 @@ def test_what_is_shown_is_the_scene_with_mixed_colors(ctx: moderngl.Context, dra
 
 
 @pytest.mark.gl
-def test_both_ways_of_drawing_show_the_same_weights(ctx: moderngl.Context) -> None:
+def test_both_renderers_show_the_same_weights(ctx: moderngl.Context) -> None:
     images = []
     for draw in ("cpu", "gl"):
         engine = ViewEngine(ctx, bear().scene, bear().gdfs, draw)
@@ -112,7 +112,7 @@ def test_both_ways_of_drawing_show_the_same_weights(ctx: moderngl.Context) -> No
 
 @pytest.mark.gl
 @pytest.mark.parametrize("draw", ["cpu", "gl"])
-def test_a_session_of_painting_and_sliding_leaves_nothing_behind(ctx: moderngl.Context, draw: str) -> None:
+def test_painting_and_sliding_leave_no_residue(ctx: moderngl.Context, draw: str) -> None:
     engine = ViewEngine(ctx, bear().scene, bear().gdfs, draw)
     clean = shown(engine, view(0.6), ctx).copy()
     rng = np.random.default_rng(1)
@@ -135,9 +135,7 @@ def test_a_session_of_painting_and_sliding_leaves_nothing_behind(ctx: moderngl.C
 
 @pytest.mark.gl
 @pytest.mark.parametrize("draw", ["cpu", "gl"])
-def test_what_is_hidden_is_as_if_it_was_not_there_also_in_saved_pictures(
-    ctx: moderngl.Context, draw: str
-) -> None:
+def test_hidden_splats_are_removed_also_from_saved_pictures(ctx: moderngl.Context, draw: str) -> None:
     scene = bear().scene
     mask = np.arange(len(bear().scene)) % 3 == 0
     engine = ViewEngine(ctx, scene, bear().gdfs, draw)
@@ -147,7 +145,7 @@ def test_what_is_hidden_is_as_if_it_was_not_there_also_in_saved_pictures(
     kept = torch.from_numpy(~mask)
     less = ViewEngine(ctx, engine.gaussians(some)[kept.nonzero()[:, 0]], (), draw)
     assert np.abs(found - shown(less, replace(view(), layers=()), ctx)).max() < 1e-5
-    shown_as = 0.51 / 255.0 if draw == "cpu" else 1e-5  # bytes; floats
+    shown_as = 0.51 / 255.0 if draw == "cpu" else 1e-5  # 8 bits per channel on the CPU, float on the GPU
     assert np.abs(engine.image(some, SIZE) - found).max() < shown_as
     slid = replace(some, layers=view(1.0).layers)
     shown(engine, slid, ctx)
@@ -159,9 +157,7 @@ def test_what_is_hidden_is_as_if_it_was_not_there_also_in_saved_pictures(
 
 @pytest.mark.gl
 @pytest.mark.parametrize("draw", ["cpu", "gl"])
-def test_the_selection_is_tinted_while_a_tool_selects_and_a_trace_without_one(
-    ctx: moderngl.Context, draw: str
-) -> None:
+def test_selection_has_a_full_tint_with_a_tool_and_a_trace_without(ctx: moderngl.Context, draw: str) -> None:
     members = bear().gdfs[SCARF].region.members
     mask = np.zeros(len(bear().scene), bool)
     mask[members] = True
@@ -186,7 +182,7 @@ def test_the_selection_is_tinted_while_a_tool_selects_and_a_trace_without_one(
 
 
 @pytest.mark.gl
-def test_the_selection_steps_aside_for_the_colors_of_what_is_being_made(hand: Rig) -> None:
+def test_selection_tint_is_off_while_the_form_changes_the_picture(hand: Rig) -> None:
     main_view, everything = hand.main_view, np.ones(len(bear().scene), bool)
     view = replace(main_view.work.view, selection=selection.select(SelectionState(), everything))
 
@@ -209,7 +205,7 @@ def test_the_selection_steps_aside_for_the_colors_of_what_is_being_made(hand: Ri
     assert not is_tinted("", form_open=False)
 
 
-def test_regions_that_are_shown_have_their_own_colors_and_the_selection_lies_over_them() -> None:
+def test_visible_regions_keep_their_colors_below_the_selection() -> None:
     mask = np.arange(len(bear().scene)) % 2 == 0
     kept = selection.add_region(selection.select(SelectionState(), mask), "even", Path("even.region.npy"))
     region = replace(kept.regions[0], visible=True)
@@ -222,7 +218,7 @@ def test_regions_that_are_shown_have_their_own_colors_and_the_selection_lies_ove
     assert (colors[12, :3] == np.round(255 * np.array(region.color))).all()
 
 
-def test_weights_are_wanted_while_the_brush_is_out_over_a_layer_that_shows() -> None:
+def test_weights_are_highlighted_while_painting_a_visible_layer() -> None:
     out = replace(view(), brush=Brush(active=True))
     assert highlight.requested_highlight(out, 0) == Highlight(0, paint.FULL, thin=True)
     colors = replace(out, brush=Brush(active=True, weights=True))
@@ -238,7 +234,7 @@ def test_weights_are_wanted_while_the_brush_is_out_over_a_layer_that_shows() -> 
 
 
 @pytest.mark.gl
-def test_c_shows_all_weights_and_saved_pictures_never_show_them() -> None:
+def test_c_shows_all_weights_but_not_in_saved_pictures() -> None:
     with rig(replace(first_view(bear(), 1.0, 1.0), brush=Brush(active=True)), (700, 640)) as hand:
         plain = hand.picture().astype(int)
         saved = hand.main_view.canvas.image(hand.main_view.work.view, (400, 640))
@@ -254,7 +250,7 @@ def test_c_shows_all_weights_and_saved_pictures_never_show_them() -> None:
 
 
 @pytest.mark.gl
-def test_the_mouse_on_the_small_picture_of_a_layer_shows_its_region() -> None:
+def test_hovering_a_layer_thumbnail_shows_its_region() -> None:
     scarf = bear().gdfs[0]
     stack = Stack(bear().demo, (scarf, replace(scarf, name="frost")))
     with rig(first_view(stack, 0.5, 0.5), (700, 640), stack=stack) as hand:

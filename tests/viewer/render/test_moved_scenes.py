@@ -1,4 +1,4 @@
-"""A scene is the same wherever in the world it lies: its pictures by every engine, its cameras, regions."""
+"""A scene far from 0 gives the same pictures, cameras and regions as near 0."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ from viewer.render.engine import ViewEngine
 from viewer.state.view_state import ViewState
 
 MOVES = [1e3, 1e5, 1e6, 1234567.891]
-"""The last one is on no grid: positions are rounded anew, to 1e-7 of the scene's size."""
+"""The last offset is on no grid: positions are rounded again, to 1e-7 of the scene's size."""
 
 ENGINES = {"cpu": 3, "reference": 1, "gl": 3}
-"""With how many cameras each draws; the reference takes long."""
+"""Number of cameras per engine; the reference engine is slow."""
 
 
 @pytest.fixture(scope="module", params=MOVES)
@@ -41,12 +41,12 @@ def moved(request: pytest.FixtureRequest, stack: Stack, tmp_path_factory: pytest
 
 
 class Moved:
-    """A scene, and what is loaded of it when it lies elsewhere.
+    """A scene near 0 and the same scene loaded far from 0.
 
     Args:
         scene: near 0
-        by: how far it is moved along x, twice as far along y, back along z
-        folder: for its file
+        by: offset in world units: `by` along x, 2 `by` along y, -`by` along z
+        folder: folder for its files
     """
 
     def __init__(self, scene: Gaussians, by: float, folder: Path) -> None:
@@ -54,13 +54,13 @@ class Moved:
         self.far = load_scene(write(folder / "far.ply", moved_columns(scene, self.by.tolist())))
 
     def cameras(self, cameras: list[Camera]) -> list[Camera]:
-        """The same cameras moved as the scene is, through a file."""
+        """Return the cameras moved like the scene, after a round trip through a file."""
         x, y, z = self.by.tolist()
         save_cameras(self.folder / "cameras.json", cameras, (x, y, z))
         return load_cameras(self.folder / "cameras.json", self.far.origin)
 
     def spec(self, kind: str, point: tuple[float, ...], rest: str) -> str:
-        """A region's words, with points moved as the scene is."""
+        """Return a region spec whose points are moved like the scene."""
         points = np.reshape(point, (-1, 3)) + self.by
         return f"{kind}:{','.join(map(repr, points.ravel().tolist()))}{rest}"
 
@@ -86,19 +86,19 @@ def draw(ctx: moderngl.Context, request: pytest.FixtureRequest) -> Iterator[obje
 
 
 @pytest.mark.parametrize(("draw", "count"), ENGINES.items(), indirect=["draw"])
-def test_its_pictures_do_not_change(moved: Moved, cameras: list[Camera], draw: object, count: int) -> None:
+def test_pictures_do_not_change(moved: Moved, cameras: list[Camera], draw: object, count: int) -> None:
     for camera, same in zip(cameras[:count], moved.cameras(cameras[:count]), strict=True):
         off = np.abs(draw(moved.far, same) - draw(moved.near, camera))  # type: ignore[operator]
         assert off.max() <= 1 / 255
 
 
-def test_its_depth_does_not_change(moved: Moved, cameras: list[Camera]) -> None:
+def test_depth_does_not_change(moved: Moved, cameras: list[Camera]) -> None:
     far = render_depth(moved.far, moved.cameras(cameras)[0])
     near = render_depth(moved.near, cameras[0])
     assert torch.allclose(far.depth, near.depth, atol=1e-4)
 
 
-def test_its_up_its_rig_and_its_subject_do_not_change(moved: Moved) -> None:
+def test_up_axis_orbit_rig_and_subject_do_not_change(moved: Moved) -> None:
     near = moved.near
     far = moved.far
     up = find_up(near)
@@ -111,7 +111,7 @@ def test_its_up_its_rig_and_its_subject_do_not_change(moved: Moved) -> None:
         assert np.abs((b.position - a.position).numpy() - by).max() < 1e-5 * radius
 
 
-def test_its_first_view_does_not_change(moved: Moved) -> None:
+def test_first_view_does_not_change(moved: Moved) -> None:
     near = first_camera(moved.near)
     far = first_camera(moved.far)
     x, y, z = (moved.by - moved.far.origin).tolist()
@@ -129,7 +129,7 @@ def test_its_first_view_does_not_change(moved: Moved) -> None:
         ("flood", (0.0, 0.3, 0.6), ",0.1"),
     ],
 )
-def test_a_region_by_coordinates_of_the_world_is_the_same(
+def test_region_in_world_coordinates_is_the_same(
     moved: Moved, kind: str, point: tuple[float, ...], rest: str
 ) -> None:
     near = parse_region(f"{kind}:{','.join(map(repr, point))}{rest}", moved.near)
@@ -139,7 +139,7 @@ def test_a_region_by_coordinates_of_the_world_is_the_same(
 
 
 @pytest.mark.parametrize("shape", ["rectangle:{}:20,20,60,60", "front:{}"])
-def test_a_region_drawn_over_a_picture_is_the_same(moved: Moved, cameras: list[Camera], shape: str) -> None:
+def test_region_drawn_over_a_picture_is_the_same(moved: Moved, cameras: list[Camera], shape: str) -> None:
     save_cameras(moved.folder / "near.json", cameras)
     moved.cameras(cameras)
     near = parse_region(shape.format(moved.folder / "near.json"), moved.near)
@@ -148,7 +148,7 @@ def test_a_region_drawn_over_a_picture_is_the_same(moved: Moved, cameras: list[C
     )
 
 
-def test_an_empty_region_says_where_in_the_world_the_scene_is(moved: Moved) -> None:
+def test_empty_region_error_gives_world_coordinates(moved: Moved) -> None:
     x = survey(moved.near).box[0] + moved.by[0]
     with pytest.raises(ProgdfError, match=rf"the scene reaches x {int(x)}\.\d+ to "):
         parse_region("box:0,0,0,1,1,1", moved.far)

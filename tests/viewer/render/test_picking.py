@@ -1,4 +1,4 @@
-"""Double click: the point under the cursor, by the opacity that the picture has there."""
+"""Double click finds the surface point under the cursor by accumulated opacity."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from viewer.render.picking import surface_point
 
 
 def wall(depth: float, opacity: float, width: float = 2.0) -> Gaussians:
-    """One flat Gaussian across the view, at a depth."""
+    """Return one flat Gaussian across the view at a depth."""
     return Gaussians(
         means=torch.tensor([[0.0, 0.0, depth]]),
         quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
@@ -34,13 +34,13 @@ def joined(*parts: Gaussians) -> Gaussians:
     return Gaussians(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})
 
 
-def test_the_point_lies_on_the_ray_at_the_walls_depth() -> None:
+def test_point_lies_on_the_ray_at_the_depth_of_the_wall() -> None:
     x, y, z = surface_point(wall(4.0, 0.95), front_camera(40, 24, focal=30.0), 29.0, 6.0) or (0, 0, 0)
     assert z == pytest.approx(4.0)
     assert (x, y) == pytest.approx((4.0 * (29 - 20) / 30, 4.0 * (6 - 12) / 30))
 
 
-def test_a_veil_in_front_is_looked_through() -> None:
+def test_veil_in_front_is_ignored() -> None:
     scene = joined(wall(2.0, 0.2), wall(5.0, 0.9))
     point = surface_point(scene, front_camera(), 20.0, 12.0)
     assert point is not None
@@ -54,13 +54,13 @@ def test_two_veils_that_are_half_opaque_together_are_a_surface() -> None:
     assert point[2] == pytest.approx(3.0)
 
 
-def test_where_nothing_gets_half_opaque_the_strongest_counts() -> None:
+def test_strongest_veil_is_picked_if_none_gets_half_opaque() -> None:
     point = surface_point(joined(wall(2.0, 0.1), wall(5.0, 0.3)), front_camera(), 20.0, 12.0)
     assert point is not None
     assert point[2] == pytest.approx(5.0)
 
 
-def test_background_and_what_lies_behind_the_camera_are_no_surface() -> None:
+def test_background_and_points_behind_the_camera_are_no_surface() -> None:
     assert surface_point(wall(4.0, 0.9, width=0.01), front_camera(), 1.0, 1.0) is None
     assert surface_point(wall(-4.0, 0.9), front_camera(), 20.0, 12.0) is None
     assert surface_point(wall(4.0, 0.02), front_camera(), 20.0, 12.0) is None
@@ -68,7 +68,7 @@ def test_background_and_what_lies_behind_the_camera_are_no_surface() -> None:
     assert surface_point(empty, front_camera(), 20.0, 12.0) is None
 
 
-def test_rows_that_are_not_numbers_are_passed_over() -> None:
+def test_rows_with_invalid_numbers_are_skipped() -> None:
     broken = wall(1.0, 0.9)
     broken = replace(broken, means=torch.full((1, 3), torch.nan))
     huge = replace(wall(1.0, 0.9), log_scales=torch.full((1, 3), torch.inf))
@@ -78,11 +78,9 @@ def test_rows_that_are_not_numbers_are_passed_over() -> None:
 
 
 @given(st.integers(0, 20), st.floats(0, 40), st.floats(0, 24))
-@example(1, 31.0, 10.0)  # a Gaussian beside the picture, close to the camera: its projection is clamped
+@example(1, 31.0, 10.0)  # a Gaussian beside the picture and close to the camera: its projection is clamped
 @settings(max_examples=40, deadline=None)
-def test_something_is_picked_exactly_where_the_rasterizer_draws_something(
-    seed: int, x: float, y: float
-) -> None:
+def test_pick_succeeds_exactly_on_covered_pixels(seed: int, x: float, y: float) -> None:
     camera = orbit_camera()
     scene = random_gaussians(60, seed)
     x = int(x) + 0.5
@@ -94,7 +92,7 @@ def test_something_is_picked_exactly_where_the_rasterizer_draws_something(
         assert (picked is not None) == (covered > 0.05)
 
 
-def test_the_bears_nose_is_picked_on_its_surface() -> None:
+def test_nose_of_the_bear_is_picked_on_its_surface() -> None:
     demo = bear().demo
     camera = to_camera(first_camera(demo.gaussians, demo.cameras), 400, 400)
     head = demo.gaussians.means[demo.members("head")]

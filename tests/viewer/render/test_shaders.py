@@ -1,4 +1,4 @@
-"""GLSL sources: includes, messages with file and line, layouts that match the dtypes beside them."""
+"""GLSL sources: includes, errors with file and line, and layouts that match their dtypes."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def text_of(name: str) -> str:
 
 
 def declared(name: str, qualifier: str) -> list[tuple[str, int]]:
-    """Names and components of the stage's inputs or outputs, in order."""
+    """Return names and component counts of a stage's inputs or outputs, in order."""
     pattern = re.compile(rf"^{qualifier} (\w+) (\w+);", re.MULTILINE)
     return [(found[2], COMPONENTS[found[1]]) for found in pattern.finditer(text_of(name))]
 
@@ -44,24 +44,24 @@ def fields(dtype: np.dtype) -> list[tuple[str, int]]:
     return [(name, int(np.prod(dtype[name].shape, dtype=int))) for name in dtype.names or ()]
 
 
-def test_the_projected_layout_is_what_one_stage_writes_and_the_next_reads() -> None:
+def test_projected_layout_matches_both_shader_stages() -> None:
     assert declared("project.vert", "out") == fields(PROJECTED)
     assert declared("splat.vert", "in") == fields(PROJECTED)
     assert vertex_format(PROJECTED) == "2f 3f 1f 4f"
     assert PROJECTED.itemsize == 40, "tightly packed, as transform feedback writes it"
 
 
-def test_a_line_of_the_grid_is_read_as_it_is_laid_out() -> None:
+def test_grid_line_layout_matches_its_dtype() -> None:
     assert declared("grid.vert", "in") == fields(GRID_LINE)
     assert f"const float CLEAR = {CLEAR};" in text_of("grid.frag")
 
 
-def test_the_order_is_one_unsigned_integer_a_gaussian() -> None:
+def test_order_is_one_unsigned_integer_per_gaussian() -> None:
     assert re.search(r"^in uint splat;", text_of("project.vert"), re.MULTILINE)
     assert np.dtype("<u4") == ORDER
 
 
-def test_every_scene_texture_is_declared_with_the_fields_of_its_dtype_in_order() -> None:
+def test_scene_textures_declare_the_fields_of_their_dtypes_in_order() -> None:
     source = text_of("include/raw_splats.glsl")
     samplers = dict(re.findall(r"^uniform sampler2D (\w+);\s*//\s*(.*)$", source, re.MULTILINE))
     assert set(samplers) == {*SPLAT_TEXTURES, "shN"}
@@ -71,7 +71,7 @@ def test_every_scene_texture_is_declared_with_the_fields_of_its_dtype_in_order()
         assert places == sorted(places), f"{name}: {samplers[name]}"
 
 
-def test_the_shaders_constants_are_the_rasterizers() -> None:
+def test_shader_constants_equal_the_rasterizer_constants() -> None:
     found = dict(re.findall(r"const float (\w+) = ([^;]+);", text_of("include/conventions.glsl")))
     assert len(found) == 5
     for name, value in found.items():
@@ -79,7 +79,7 @@ def test_the_shaders_constants_are_the_rasterizers() -> None:
         assert float(numerator) / float(denominator or 1) == getattr(engines, name), name
 
 
-def test_every_attribute_has_its_own_components_of_a_texture() -> None:
+def test_every_attribute_has_its_own_texture_components() -> None:
     assert set(PLACES) == set(ATTRIBUTES)
     taken = [
         (place.texture, place.component + i) for place in PLACES.values() for i in range(place.components)
@@ -88,14 +88,14 @@ def test_every_attribute_has_its_own_components_of_a_texture() -> None:
     assert {texture for texture, _ in taken} == {*SPLAT_TEXTURES, "shN"}
 
 
-def test_every_head_says_what_the_stage_reads_and_writes() -> None:
+def test_shader_heads_document_inputs_and_outputs() -> None:
     for name in STAGES:
         head = text_of(name).split("void main")[0]
         assert "// Reads " in head, name
         assert "// Writes " in head, name
 
 
-def test_an_include_is_taken_once_and_keeps_the_files_lines() -> None:
+def test_include_is_inserted_once_and_keeps_line_numbers() -> None:
     source = load_source("project.vert")
     assert source.files[0] == "project.vert"
     assert len(set(source.files)) == len(source.files) == 5
@@ -110,7 +110,7 @@ def test_an_include_is_taken_once_and_keeps_the_files_lines() -> None:
     assert int(lines[directive].split()[1]) + after - directive - 1 == number
 
 
-def test_a_missing_include_names_the_file_and_line_that_wants_it(
+def test_missing_include_error_names_the_including_line(
     monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     folder = tmp_path_factory.mktemp("shaders")
@@ -121,7 +121,7 @@ def test_a_missing_include_names_the_file_and_line_that_wants_it(
 
 
 @pytest.mark.gl
-def test_a_mistake_in_an_include_is_told_with_its_own_file_and_line(
+def test_error_in_an_include_names_its_file_and_line(
     ctx: moderngl.Context, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     folder = tmp_path_factory.mktemp("shaders")
@@ -135,7 +135,7 @@ def test_a_mistake_in_an_include_is_told_with_its_own_file_and_line(
 
 
 @pytest.mark.gl
-def test_a_mistake_after_an_include_is_told_with_the_stages_line(
+def test_error_after_an_include_names_the_line_of_the_stage(
     ctx: moderngl.Context, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     folder = tmp_path_factory.mktemp("shaders")

@@ -1,4 +1,4 @@
-"""A picture without its background, by itself and by the command."""
+"""Pictures with a transparent background, in the library and on the command line."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.helpers.ui_rig import bear
 from viewer.pictures.film import unmix
 
 
-def test_color_and_coverage_are_found_from_black_and_white() -> None:
+def test_color_and_coverage_are_recovered_from_black_and_white() -> None:
     color = np.array([0.8, 0.4, 0.2], np.float32)
     for alpha in (0.0, 0.25, 1.0):
         black = np.broadcast_to(alpha * color, (2, 3, 3)).astype(np.float32)
@@ -24,7 +24,7 @@ def test_color_and_coverage_are_found_from_black_and_white() -> None:
             assert np.abs(rgba[0, 0, :3] / 255.0 - color).max() < 0.003
 
 
-def test_the_command_writes_a_picture_that_can_be_laid_over_another(tmp_path: Path) -> None:
+def test_render_writes_a_picture_that_can_be_overlaid(tmp_path: Path) -> None:
     scene = bear().save(tmp_path)[0]
     over = tmp_path / "over.png"
     opaque = tmp_path / "opaque.png"
