@@ -1,4 +1,4 @@
-"""Undo and redo of how one looks at a scene, and what they say that they take back."""
+"""Undo and redo of view settings, and the names of history entries."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def recorded(work: Workspace, view: ViewState) -> Workspace:
     return workspace.record_undo(replace(work, view=view))
 
 
-def test_up_axis_field_of_view_and_background_are_undone_where_one_stands() -> None:
+def test_view_settings_are_undone_without_moving_the_camera() -> None:
     work = recorded(new_workspace(PLAIN), with_look(PLAIN))
     work = workspace.with_camera(work, replace(work.view.camera, azimuth=100.0, distance=9.0))
     back = undone(work)
@@ -47,7 +47,7 @@ def test_up_axis_field_of_view_and_background_are_undone_where_one_stands() -> N
     assert again.present.look == history.look_of(work.view)
 
 
-def test_a_camera_that_goes_elsewhere_is_no_entry_and_other_undos_leave_it() -> None:
+def test_camera_move_is_no_undo_entry_and_survives_other_undos() -> None:
     work = recorded(new_workspace(PLAIN), layers.change_layer(PLAIN, 0, lambda l: replace(l, strength=1.0)))
     work = workspace.with_camera(work, replace(with_up(work.view.camera, TILTED), fov_y=20.0))
     assert workspace.record_undo(work) is work
@@ -64,7 +64,7 @@ def test_a_camera_that_goes_elsewhere_is_no_entry_and_other_undos_leave_it() -> 
     assert len(workspace.record_undo(after).past.past) == len(playing.past.past)
 
 
-def test_what_is_set_while_the_camera_moves_is_an_entry_all_the_same() -> None:
+def test_setting_changed_while_the_camera_moves_is_an_entry() -> None:
     work = new_workspace(PLAIN)
     sliding = replace(work, view=replace(work.view, camera=replace(work.view.camera, fov_y=70.0)))
     flown = workspace.with_camera(sliding, replace(sliding.view.camera, distance=3.0))
@@ -112,7 +112,7 @@ CHANGES: dict[str, Callable[[ViewState], ViewState]] = {
 
 
 @pytest.mark.parametrize("words", CHANGES)
-def test_undo_and_redo_say_what_they_take_back(words: str) -> None:
+def test_undo_and_redo_name_their_entry(words: str) -> None:
     work = recorded(new_workspace(PLAIN), CHANGES[words](PLAIN))
     assert (history.next_undo(work.past), history.next_redo(work.past)) == (words, "")
     back = undone(work)
@@ -123,7 +123,7 @@ def test_undo_and_redo_say_what_they_take_back(words: str) -> None:
     assert (history.next_undo(back.past), history.next_redo(back.past)) == ("", words)
 
 
-def test_one_goes_to_any_entry_and_those_after_it_stay_until_something_is_done() -> None:
+def test_any_history_entry_can_be_restored_until_the_next_edit() -> None:
     work = new_workspace(PLAIN)
     changes = ("ground grid", "strength of ears", "safe frame", "blend rule")
     for words in changes:
@@ -143,7 +143,7 @@ def test_one_goes_to_any_entry_and_those_after_it_stay_until_something_is_done()
         assert history.go_to(work.past, index) is work.past
 
 
-def test_looking_at_this_and_that_leaves_one_entry_and_none_where_it_ends_as_it_began() -> None:
+def test_repeated_view_changes_merge_into_at_most_one_entry() -> None:
     work = recorded(new_workspace(PLAIN), CHANGES["ground grid"](PLAIN))
     for mode in ("split", "beside", "difference"):
         work = recorded(work, replace(work.view, compare=replace(work.view.compare, mode=mode)))
@@ -154,7 +154,7 @@ def test_looking_at_this_and_that_leaves_one_entry_and_none_where_it_ends_as_it_
 
 
 @pytest.mark.gl
-def test_an_undo_that_ends_a_comparison_of_snapshots_leaves_what_can_be_redone() -> None:
+def test_undo_that_ends_a_snapshot_comparison_keeps_the_redo_entries() -> None:
     with rig(first_view(bear(), 0.5, 0.5), (900, 640)) as hand:
         for chord in ("F5", "Shift+Left", "F5", "Shift+F5", "Ctrl+Z", "Ctrl+Z"):
             hand.key(chord)
@@ -169,7 +169,7 @@ def test_an_undo_that_ends_a_comparison_of_snapshots_leaves_what_can_be_redone()
 
 
 @pytest.mark.gl
-def test_a_click_in_the_list_of_the_history_and_arrows_and_enter_go_there() -> None:
+def test_history_entry_is_opened_by_mouse_and_keys() -> None:
     with rig(first_view(bear(), 0.5, 0.5), (900, 640)) as hand:
         for chord in ("Shift+Left", "H", "Shift+G"):
             strike(hand, chord)
@@ -190,14 +190,14 @@ def test_a_click_in_the_list_of_the_history_and_arrows_and_enter_go_there() -> N
         assert not hand.main_view.work.view.layers[1].enabled
 
 
-def test_a_snapshot_is_named_too() -> None:
+def test_snapshot_entry_has_a_name() -> None:
     work = new_workspace(PLAIN)
     work = workspace.record_undo(replace(work, snapshots=snapshots.take((), PLAIN)))
     assert history.next_undo(work.past) == "snapshots"
 
 
 @pytest.mark.gl
-def test_ctrl_z_after_the_up_axis_leaves_the_layers_and_says_so_for_two_seconds() -> None:
+def test_undo_of_the_up_axis_keeps_layers_and_shows_a_message() -> None:
     with rig(first_view(bear(), 0.5, 0.5), (900, 640)) as hand:
         hand.key("Shift+Left")
         before = hand.main_view.work.view

@@ -1,4 +1,4 @@
-"""Several layers at once: selected, dimmed in proportion, reset, copied, moved, grouped."""
+"""Several layers at once: selected, dimmed in proportion, reset, copied, moved and grouped."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ FACTS = SceneFacts("bear.ply", 100, Bounds(), [LayerRow(10, (0.5, 0.5, 0.5), (0.
 
 
 def six(*strengths: float) -> Workspace:
-    """Layers a to f, of which a is the lowest, f the topmost and focused."""
+    """Return a workspace with layers a (bottom) to f (top, focused)."""
     known = (*strengths, *[0.5] * (len(NAMES) - len(strengths)))
     rows = tuple(LayerState(i, name, known[i]) for i, name in enumerate(NAMES))
     return workspace.new_workspace(ViewState(layers=rows))
 
 
 def act(work: Workspace, *actions: str) -> Workspace:
-    """After these actions, each a gesture of its own."""
+    """Perform the actions, each as its own undo step."""
     for action in actions:
         work = workspace.record_undo(perform(work, action, FACTS))
     return work
@@ -52,7 +52,7 @@ def groups(work: Workspace) -> list[str]:
     return [layer.group for layer in work.view.layers]
 
 
-def test_presses_select_one_toggle_and_take_what_lies_between() -> None:
+def test_presses_select_a_layer_toggle_or_extend_the_range() -> None:
     work = press(six(), "range", "c")
     assert selected(work) == "cdef"
     assert work.focus == 5, "the range begins there, also of the next one"
@@ -69,7 +69,7 @@ def test_presses_select_one_toggle_and_take_what_lies_between() -> None:
     assert selected(act(work, "unfocus", "unfocus")) == ""
 
 
-def test_the_master_keeps_proportions_through_zero_within_a_gesture_and_is_one_undo_entry() -> None:
+def test_master_slider_keeps_proportions_through_zero() -> None:
     work = press(six(0.0, 0.0, 0.0, 0.2, 0.4, 0.8), "range", "d")
     entries = len(work.past.past)
     before = work.view
@@ -91,7 +91,7 @@ def test_the_master_keeps_proportions_through_zero_within_a_gesture_and_is_one_u
     assert strengths(act(work, "nudge:0.1"))[3:] == pytest.approx([0.225, 0.45, 0.9])
 
 
-def test_switches_resets_and_deletions_are_for_all_that_are_selected() -> None:
+def test_hide_lock_reset_and_delete_apply_to_all_selected_layers() -> None:
     work = press(six(), "range", "d")
     assert [layer.enabled for layer in act(work, "hide").view.layers] == [True] * 3 + [False] * 3
     assert [layer.locked for layer in act(work, "lock").view.layers] == [False] * 3 + [True] * 3
@@ -102,7 +102,7 @@ def test_switches_resets_and_deletions_are_for_all_that_are_selected() -> None:
     assert order(act(work, "remove:0")) == "bcdef", "a layer outside of the selection goes alone"
 
 
-def test_a_group_gathers_its_layers_switches_and_dims_them_and_dissolves() -> None:
+def test_group_gathers_hides_dims_and_dissolves_its_layers() -> None:
     work = act(press(press(six(), "one", "b"), "toggle", "e"), "group")
     assert (order(work), groups(work)) == ("acdbef", ["", "", "", "Group", "Group", ""])
     assert selected(work) == "be"
@@ -128,7 +128,7 @@ def test_a_group_gathers_its_layers_switches_and_dims_them_and_dissolves() -> No
     ]
 
 
-def test_a_layer_that_moves_joins_the_group_around_it_and_leaves_its_own_behind() -> None:
+def test_moved_layer_joins_the_surrounding_group() -> None:
     work = act(press(press(six(), "one", "c"), "toggle", "d"), "group")
     joined = act(press(work, "one", "b"), "move:-1")
     assert (order(joined), groups(joined)) == ("acbdef", ["", "Group", "Group", "Group", "", ""])
@@ -143,7 +143,7 @@ def test_a_layer_that_moves_joins_the_group_around_it_and_leaves_its_own_behind(
     assert groups(act(press(two, "one", "d"), "move:1", "move:1")) == ["", "", "", "Group", *["Group 2"] * 2]
 
 
-def test_compact_rows_come_by_themselves_and_a_switch_turns_them_round() -> None:
+def test_compact_rows_are_automatic_and_can_be_toggled() -> None:
     work = six()
     assert act(work, "cards").view.cards == "compact"
     assert act(work, "cards", "cards").view.cards == "auto"

@@ -1,4 +1,4 @@
-"""Layers by the hand, by keys and by the command line: alone, locked, renamed, moved, gains, overshoot."""
+"""Layer stack by mouse, keys and command line: solo, lock, rename, move, gains and overshoot."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def toggle(hand: Rig, name: str, layer: int) -> None:
 
 
 def row(layer: int) -> float:
-    """How far below the top one the card of a layer is: of two, the last one lies on top."""
+    """Return the distance of a layer's card below the top card; the last of two layers is on top."""
     return card.CARD_PX * (1 - layer)
 
 
@@ -92,7 +92,7 @@ def type_name(hand: Rig, text: str, end: imgui.Key = imgui.Key.enter) -> None:
     hand.frame(2)
 
 
-def test_the_number_shows_what_the_slider_says_in_the_same_frame(hand: Rig) -> None:
+def test_number_follows_the_slider_in_the_same_frame(hand: Rig) -> None:
     top = round(HEAD + row(0)) - 12
     left = POINTS[0] - 80
     hand.move(*hand.slider(0, 0.5))
@@ -105,7 +105,7 @@ def test_the_number_shows_what_the_slider_says_in_the_same_frame(hand: Rig) -> N
     np.testing.assert_array_equal(hand.image()[top : top + 24, left:], shown)
 
 
-def test_what_is_alone_shows_though_its_eye_is_closed_and_nothing_else_does() -> None:
+def test_solo_layer_shows_even_if_hidden() -> None:
     view = toggle_solo(THREE, 1)
     view = change_layer(view, 1, lambda layer: LayerState(1, "b", 0.5, enabled=False, solo=True))
     assert [layer.name for layer in visible_layers(view)] == ["b"]
@@ -121,14 +121,14 @@ def test_layers_move_within_the_stack_and_stop_at_its_ends() -> None:
     assert step_layers(THREE, (1, 2), 1) == step_layers(THREE, (0,), -1) == THREE
 
 
-def test_names_stay_apart_on_one_line_and_never_empty() -> None:
+def test_layer_names_are_unique_single_lines_and_never_empty() -> None:
     assert rename_layer(THREE, 0, " b\n ").layers[0].name == "b-2"
     assert rename_layer(THREE, 0, "  \t ") == THREE
     assert rename_layer(THREE, 1, "b") == THREE
     assert len(rename_layer(THREE, 0, "x" * 500).layers[0].name) == LONGEST_NAME
 
 
-def test_a_lock_holds_strength_and_gains() -> None:
+def test_lock_holds_strength_and_gains() -> None:
     locked = LayerState(0, "a", 0.5, locked=True)
     for active_slider in SLIDERS:
         assert with_slider_value(locked, active_slider, 0.1) == locked
@@ -137,7 +137,7 @@ def test_a_lock_holds_strength_and_gains() -> None:
         )
 
 
-def test_without_overshoot_nothing_stands_beyond_one() -> None:
+def test_strength_stays_at_most_1_without_overshoot() -> None:
     over = with_overshoot(THREE, True)
     assert nudge_slider(over, 0, "strength", 0.6).layers[0].strength == 1.1
     assert nudge_slider(over, 0, "strength", 9.0).layers[0].strength == OVERSHOOT
@@ -147,7 +147,7 @@ def test_without_overshoot_nothing_stands_beyond_one() -> None:
     assert parse_strength("130%", largest_strength(over)) == OVERSHOOT
 
 
-def test_the_keys_do_all_that_the_cards_do(hand: Rig) -> None:
+def test_keys_do_everything_that_the_cards_do(hand: Rig) -> None:
     hand.key("1")
     for chord, field in (("Shift+H", "solo"), ("Shift+L", "locked")):
         hand.key(chord)
@@ -175,7 +175,7 @@ def test_the_keys_do_all_that_the_cards_do(hand: Rig) -> None:
     assert hand.strengths == [1.0, 0.5]
 
 
-def test_a_key_brings_the_arrows_to_the_gains_that_the_edit_has(hand: Rig) -> None:
+def test_alt_arrows_select_the_gains_that_the_edit_has(hand: Rig) -> None:
     hand.key("2")
     hand.key("Alt+Right")
     assert hand.main_view.work.active_slider == "color", "a change of color has no other gain"
@@ -191,7 +191,7 @@ def test_a_key_brings_the_arrows_to_the_gains_that_the_edit_has(hand: Rig) -> No
     assert hand.main_view.work.active_slider == "geometry"
 
 
-def test_every_change_of_a_layer_is_one_undo_entry_and_comes_back(hand: Rig) -> None:
+def test_every_layer_change_is_one_undo_entry(hand: Rig) -> None:
     before = hand.picture()
     for i, chord in enumerate(("Shift+H", "Shift+L", "Alt+Down", "O"), 1):
         hand.key(chord)
@@ -200,7 +200,7 @@ def test_every_change_of_a_layer_is_one_undo_entry_and_comes_back(hand: Rig) -> 
     for _ in range(4):
         hand.key("Ctrl+Z")
     assert hand.main_view.work.view == first_view(bear(), 0.5, 0.5)
-    hand.rest()  # until what was undone is no longer said
+    hand.rest()  # until the undo message has disappeared
     assert np.array_equal(hand.picture(), before)
 
 
@@ -210,7 +210,7 @@ def test_unfolding_is_no_undo_entry(hand: Rig) -> None:
 
 
 @pytest.mark.parametrize(("name", "field"), [("solo", "solo"), ("lock", "locked")])
-def test_the_toggles_of_a_card_turn_their_own_layer(hand: Rig, name: str, field: str) -> None:
+def test_card_toggles_change_only_their_own_layer(hand: Rig, name: str, field: str) -> None:
     toggle(hand, name, 1)
     assert [getattr(layer, field) for layer in layers(hand)] == [False, True]
     assert len(hand.main_view.work.past.past) == 1
@@ -218,14 +218,14 @@ def test_the_toggles_of_a_card_turn_their_own_layer(hand: Rig, name: str, field:
     assert not any(getattr(layer, field) for layer in layers(hand))
 
 
-def test_alt_click_on_an_eye_shows_its_layer_alone(hand: Rig) -> None:
+def test_alt_click_on_an_eye_shows_only_its_layer(hand: Rig) -> None:
     hand.modifier(imgui.Key.mod_alt)
     click(hand, LEFT + 34, HEAD + row(1))
     hand.modifier(imgui.Key.mod_alt, False)
     assert [(layer.enabled, layer.solo) for layer in layers(hand)] == [(True, False), (True, True)]
 
 
-def test_what_is_alone_is_what_one_sees(hand: Rig) -> None:
+def test_solo_layer_looks_like_the_others_at_zero(hand: Rig) -> None:
     toggle(hand, "solo", 1)
     alone = hand.picture()
     toggle(hand, "solo", 1)
@@ -234,12 +234,12 @@ def test_what_is_alone_is_what_one_sees(hand: Rig) -> None:
     assert np.array_equal(hand.picture(), alone)
 
 
-def test_the_original_is_held_also_while_a_layer_is_alone() -> None:
+def test_original_is_shown_also_while_a_layer_is_solo() -> None:
     view = toggle_solo(THREE, 0)
     assert visible_layers(original(view)) == ()
 
 
-def test_a_locked_slider_does_not_move(hand: Rig) -> None:
+def test_locked_slider_does_not_move(hand: Rig) -> None:
     toggle(hand, "lock", 0)
     hand.drag(hand.slider(0, 0.5), hand.slider(0, 0.9))
     assert hand.strengths == [0.5, 0.5]
@@ -248,7 +248,7 @@ def test_a_locked_slider_does_not_move(hand: Rig) -> None:
     assert not imgui.get_io().want_text_input
 
 
-def test_a_gain_is_dragged_in_the_fold_and_scales_its_kind_only(hand: Rig) -> None:
+def test_gain_dragged_in_the_fold_scales_only_its_kind(hand: Rig) -> None:
     toggle(hand, "fold", 1)
     before = hand.main_view.engine.gaussians(hand.main_view.work.view).sh0.clone()
     y = 188.0 + row(1)  # the first gain
@@ -278,12 +278,12 @@ def test_dragging_a_name_down_moves_its_layer_as_one_entry(hand: Rig) -> None:
     assert hand.main_view.work.focus == 1
 
 
-def test_a_name_dragged_and_brought_back_changes_nothing(hand: Rig) -> None:
+def test_dragging_a_name_back_changes_nothing(hand: Rig) -> None:
     hand.drag((LEFT + 100, HEAD), (LEFT + 100, HEAD + 30))
     assert hand.main_view.work.past.past == ()
 
 
-def test_a_double_click_on_a_name_types_another(hand: Rig) -> None:
+def test_double_click_on_a_name_renames_the_layer(hand: Rig) -> None:
     hand.double_click(LEFT + 100, HEAD + row(1))
     type_name(hand, "golden ears")
     assert names(hand) == ["scarf", "golden ears"]
@@ -292,7 +292,7 @@ def test_a_double_click_on_a_name_types_another(hand: Rig) -> None:
     assert hand.main_view.work.renaming is None
 
 
-def test_enter_renames_the_focused_layer_and_escape_leaves_it(hand: Rig) -> None:
+def test_enter_renames_the_focused_layer_and_escape_cancels(hand: Rig) -> None:
     hand.key("2")
     hand.key("Enter")
     type_name(hand, "nothing", imgui.Key.escape)
@@ -303,14 +303,14 @@ def test_enter_renames_the_focused_layer_and_escape_leaves_it(hand: Rig) -> None
     assert names(hand) == ["ears-2", "ears"]
 
 
-def test_a_click_on_a_splat_focuses_its_layer_and_a_drag_does_not(hand: Rig) -> None:
+def test_click_on_a_splat_focuses_its_layer_but_a_drag_does_not(hand: Rig) -> None:
     places = bear().scene.means[bear().gdfs[1].region.members]
     ear = places[places[:, 0] > 0].mean(0)
     hand.key("2")
     at = on_screen(hand, ear)
     hand.drag(at, (at[0] + 40, at[1]))
     assert hand.main_view.work.focus == 0
-    hand.pause(0.5)  # no double click
+    hand.pause(0.5)  # avoids a double click
     at = on_screen(hand, ear)
     before = hand.main_view.work.view
     click(hand, *at)
@@ -326,7 +326,7 @@ def on_screen(hand: Rig, point: torch.Tensor) -> tuple[float, float]:
     return float(camera.K[0, 0]) * x / z + LEFT / 2, float(camera.K[1, 1]) * y / z + POINTS[1] / 2
 
 
-def test_a_double_click_still_sets_the_pivot(hand: Rig) -> None:
+def test_double_click_sets_the_pivot(hand: Rig) -> None:
     before = hand.main_view.work.view.camera
     hand.double_click(*on_screen(hand, bear().scene.means[bear().gdfs[0].region.members].mean(0)))
     after = hand.main_view.work.view.camera
@@ -334,7 +334,7 @@ def test_a_double_click_still_sets_the_pivot(hand: Rig) -> None:
     assert eye(after) == pytest.approx(eye(before), abs=1e-4)
 
 
-def test_rows_know_what_they_share_and_what_their_gains_scale() -> None:
+def test_layer_rows_count_shared_members_and_list_gain_kinds() -> None:
     made = bear()
     rows = layer_rows(made.scene, (made.gdfs[0], made.gdfs[1], made.gdfs[0]))
     scarf, ears = (len(gdf.region) for gdf in made.gdfs)
@@ -342,7 +342,7 @@ def test_rows_know_what_they_share_and_what_their_gains_scale() -> None:
     assert [row.kinds for row in rows[:2]] == [{"color"}, {"color", "geometry"}]
 
 
-def test_a_large_region_is_pictured_by_a_part_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_thumbnail_of_a_large_region_uses_a_part_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
     made = bear()
     camera = ViewCamera()
     whole = facts.draw_thumbnail(made.scene, made.gdfs[0], camera).astype(float)
@@ -359,7 +359,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Stack, Path]:
     return made, folder
 
 
-def test_export_and_render_take_gains_solo_and_overshoot(
+def test_export_and_render_accept_gains_solo_and_overshoot(
     saved: tuple[Stack, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made, folder = saved
@@ -390,13 +390,13 @@ def test_export_and_render_take_gains_solo_and_overshoot(
         ({"set": ["scarf=1.3"], "overshoot": True}, "not a number from 0 to 1.2"),
     ],
 )
-def test_a_slip_in_naming_layers_is_one_clear_line(options: dict[str, object], told: str) -> None:
+def test_invalid_layer_option_is_one_clear_line(options: dict[str, object], told: str) -> None:
     with pytest.raises(ProgdfError, match=told) as error:
         stack_layers(bear().gdfs, StackOptions(scene=Path("bear.ply"), **options))  # type: ignore[arg-type]
     assert "\n" not in str(error.value)
 
 
-def test_a_sweep_of_a_layer_that_is_hidden_by_another_is_refused(
+def test_sweep_of_a_layer_hidden_by_solo_is_refused(
     saved: tuple[Stack, Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(saved[1])
@@ -406,7 +406,7 @@ def test_a_sweep_of_a_layer_that_is_hidden_by_another_is_refused(
 
 
 def menu(hand: Rig, layer: int, item: int) -> None:
-    """A right click on a layer's card, then one of Rename, Duplicate, Replace, Again and Delete."""
+    """Right-click a layer's card and pick Rename, Duplicate, Replace, Again or Delete by index."""
     hand.pause(0.5)
     hand.move(LEFT + 150, HEAD + row(layer))
     hand.press(1)
@@ -414,8 +414,8 @@ def menu(hand: Rig, layer: int, item: int) -> None:
     click(hand, LEFT + 180, HEAD + row(layer) + 18.0 + 21.0 * item + (7.0 if item == 4 else 0.0))
 
 
-def test_the_top_of_the_list_lies_on_top(hand: Rig) -> None:
-    """As the rule "over" has it: the last of the layers, and the first card."""
+def test_top_card_is_the_top_layer(hand: Rig) -> None:
+    """The rule "over" puts the last layer on top, and it has the first card."""
     click(hand, LEFT + 100, HEAD)
     assert hand.main_view.work.focus == 1
     hand.key("2")
@@ -428,7 +428,7 @@ def test_the_top_of_the_list_lies_on_top(hand: Rig) -> None:
     assert layers(hand)[hand.main_view.work.focus or 0].name == "new"
 
 
-def test_a_layer_is_deleted_from_its_menu_and_undo_brings_it_back(hand: Rig) -> None:
+def test_layer_deleted_from_its_menu_is_restored_by_undo(hand: Rig) -> None:
     before = hand.main_view.work.view
     picture = hand.picture()
     menu(hand, 1, 4)
@@ -448,7 +448,7 @@ def test_a_layer_is_deleted_from_its_menu_and_undo_brings_it_back(hand: Rig) -> 
     hand.key("Ctrl+Delete")
 
 
-def test_the_menu_renames_and_asks_the_window_for_the_rest(hand: Rig) -> None:
+def test_layer_menu_renames_and_requests_other_actions(hand: Rig) -> None:
     menu(hand, 0, 0)
     type_name(hand, "shawl")
     assert names(hand) == ["shawl", "ears"]
@@ -462,11 +462,11 @@ def test_the_menu_renames_and_asks_the_window_for_the_rest(hand: Rig) -> None:
     assert not imgui.is_popup_open("", imgui.PopupFlags_.any_popup.value)
 
 
-def test_a_double_click_on_a_slider_takes_it_back_to_zero(hand: Rig) -> None:
+def test_double_click_on_a_slider_resets_it_to_its_default(hand: Rig) -> None:
     hand.double_click(*hand.slider(1, 0.5))
     assert hand.strengths == [0.5, 0.0]
     assert len(hand.main_view.work.past.past) == 1, "on the handle it is one step"
-    lens = (LEFT - 60, 96.0)  # in the popover of the view
+    lens = (LEFT - 60, 96.0)  # in the view popover
     hand.pause(0.5)
     click(hand, LEFT - 24, 24.0)
     click(hand, *lens)
@@ -477,7 +477,7 @@ def test_a_double_click_on_a_slider_takes_it_back_to_zero(hand: Rig) -> None:
     assert hand.main_view.work.view.camera.fov_y == 45.0
 
 
-def test_a_replaced_layer_keeps_its_place_strength_and_keys(hand: Rig) -> None:
+def test_replaced_layer_keeps_its_position_strength_and_keys(hand: Rig) -> None:
     view = change_layer(hand.main_view.work.view, 0, lambda layer: LayerState(0, "scarf", 0.3, paint="x"))
     view = timeline_with_key(view)
     after = replace_edit(view, 0, 7, "ears")

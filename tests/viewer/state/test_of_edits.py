@@ -1,4 +1,4 @@
-"""Actions on one layer that ask what is known of its edit: again, limited to a selection, selected."""
+"""Actions on one layer that use its edit: repeat, limit to the selection, and select."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def hand() -> Iterator[Rig]:
 
 
 def of_edit(facts: SceneFacts, instruction: str, spec: str) -> SceneFacts:
-    """The facts, with this said by the scarf's edit."""
+    """Return facts in which the scarf's edit has this instruction and region spec."""
     row = replace(facts.rows[SCARF], instruction=instruction, region_spec=spec)
     return replace(facts, rows=(row, *facts.rows[1:]))
 
@@ -39,7 +39,7 @@ def selecting(work: Workspace, rows: np.ndarray, count: int) -> Workspace:
     return replace(work, view=replace(work.view, selection=selection.select(work.view.selection, mask)))
 
 
-def test_again_opens_the_form_with_the_edits_own_settings(hand: Rig) -> None:
+def test_again_opens_the_form_with_the_settings_of_the_edit(hand: Rig) -> None:
     work = hand.main_view.work
     facts = of_edit(hand.main_view.facts, "recolor:#1b6972,path=hue", "labels:parts.npy:5")
     form = perform(work, f"again:{SCARF}", facts)
@@ -55,7 +55,7 @@ def test_again_opens_the_form_with_the_edits_own_settings(hand: Rig) -> None:
     assert perform(replace(work, view=view), f"again:{SCARF}", named).form.region == "hands"
 
 
-def test_again_leaves_alone_what_no_editor_of_the_form_has_made(hand: Rig) -> None:
+def test_again_ignores_edits_that_no_form_editor_made(hand: Rig) -> None:
     work = hand.main_view.work
     for instruction in (
         "edit --scale head:2",
@@ -68,7 +68,7 @@ def test_again_leaves_alone_what_no_editor_of_the_form_has_made(hand: Rig) -> No
         assert perform(work, f"again:{SCARF}", of_edit(hand.main_view.facts, instruction, "all")) == work
 
 
-def test_a_layer_is_limited_to_what_is_selected_and_again_to_less(hand: Rig) -> None:
+def test_layer_is_limited_to_the_selection_and_can_be_reduced_again(hand: Rig) -> None:
     facts = hand.main_view.facts
     work = hand.main_view.work
     row = facts.rows[SCARF]
@@ -86,7 +86,7 @@ def test_a_layer_is_limited_to_what_is_selected_and_again_to_less(hand: Rig) -> 
     assert row.members[weights.numpy() == 1.0].tolist() == row.members[::6].tolist()
 
 
-def test_what_a_layer_shows_is_selected_by_its_paint(hand: Rig) -> None:
+def test_select_painted_selects_the_painted_members(hand: Rig) -> None:
     facts = hand.main_view.facts
     work = hand.main_view.work
     row = facts.rows[SCARF]

@@ -1,4 +1,4 @@
-"""Painted strength: strokes as pure functions, by the hand, in sessions' text, and from files."""
+"""Painted strength: strokes as pure functions, by mouse, as session text, and across edits."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def scarf_on_screen(hand: Rig) -> tuple[float, float]:
     return float(camera.K[0, 0] * x / z + camera.K[0, 2]), float(camera.K[1, 1] * y / z + camera.K[1, 2])
 
 
-def test_paint_survives_its_text_to_a_255th_and_full_paint_is_no_text() -> None:
+def test_paint_round_trips_within_a_255th_and_full_paint_is_empty() -> None:
     drawn = torch.rand(300, generator=torch.Generator().manual_seed(0)).numpy()
     found = paint.decode(paint.encode(drawn), 300)
     assert found is not None
@@ -69,12 +69,12 @@ def test_paint_survives_its_text_to_a_255th_and_full_paint_is_no_text() -> None:
 @pytest.mark.parametrize(
     "text", ["no base64!", "AAAA", *(paint.encode(np.zeros(n, np.float32)) for n in (4, 7))]
 )
-def test_damaged_or_foreign_paint_is_refused_in_one_line(text: str) -> None:
+def test_damaged_paint_is_refused_in_one_line(text: str) -> None:
     with pytest.raises(ProgdfError, match="paint it again"):
         paint.decode(text, 5)
 
 
-def test_paint_may_lack_the_rows_that_other_edits_add_and_no_more() -> None:
+def test_paint_may_lack_only_rows_that_other_edits_add() -> None:
     found = paint.decode(paint.encode(np.zeros(5, np.float32)), 7, 2)
     assert found is not None
     assert found.tolist() == [0.0] * 5 + [1.0] * 2
@@ -82,7 +82,7 @@ def test_paint_may_lack_the_rows_that_other_edits_add_and_no_more() -> None:
         paint.decode(paint.encode(np.zeros(4, np.float32)), 7, 2)
 
 
-def test_a_brush_is_full_inside_fades_to_its_edge_and_reaches_no_further() -> None:
+def test_brush_is_full_inside_and_fades_to_its_radius() -> None:
     stroke = paint.extend_stroke(LINE, 0.0, 0.0, ERASE)
     assert stroke.reached.tolist() == pytest.approx([1.0, 1.0, 0.0, 0.0, 0.0])
     hazy = paint.extend_stroke(LINE, 0.0, 0.0, replace(ERASE, softness=1.0))
@@ -91,7 +91,7 @@ def test_a_brush_is_full_inside_fades_to_its_edge_and_reaches_no_further() -> No
     assert dense.reached[3] == 1.0, "the radius is in pixels at 1×"
 
 
-def test_a_stroke_does_not_depend_on_how_many_events_it_came_in() -> None:
+def test_stroke_does_not_depend_on_the_number_of_events() -> None:
     whole = paint.extend_stroke(paint.extend_stroke(LINE, -20.0, 0.0, ERASE), 25.0, 0.0, ERASE)
     steps = LINE
     for x in np.linspace(-20.0, 25.0, 31):
@@ -104,14 +104,14 @@ def result(stroke: Stroke, brush: Brush = ERASE, mode: str = "erase") -> np.ndar
     return np.ones(len(stroke.before)) if found is None else found.numpy()
 
 
-def test_erase_and_add_go_to_none_and_to_all_as_far_as_the_brush_touched() -> None:
+def test_erase_and_add_follow_the_brush_coverage() -> None:
     before = np.array([0.0, 1.0, 0.5, 0.25, 0.75], np.float32)
     stroke = replace(LINE, before=before, reached=np.array([1, 1, 0.5, 0, 0], np.float32))
     assert result(stroke, mode="erase").tolist() == pytest.approx([0.0, 0.0, 0.25, 0.25, 0.75], abs=0.003)
     assert result(stroke, mode="add").tolist() == pytest.approx([1.0, 1.0, 0.75, 0.25, 0.75], abs=0.003)
 
 
-def test_flow_goes_part_of_the_way_and_value_is_what_add_gives() -> None:
+def test_flow_scales_the_stroke_and_value_is_the_target_of_add() -> None:
     before = np.full(5, 0.5, np.float32)
     stroke = replace(LINE, before=before, reached=np.ones(5, np.float32))
     added = result(stroke, Brush(flow=0.5, value=0.9), "add")
@@ -120,7 +120,7 @@ def test_flow_goes_part_of_the_way_and_value_is_what_add_gives() -> None:
     assert erased.tolist() == pytest.approx([0.25] * 5, abs=0.003)
 
 
-def test_inverted_paint_is_swapped_and_twice_is_the_paint_again() -> None:
+def test_inverting_paint_twice_restores_it() -> None:
     some = paint.encode(np.array([0.0, 0.2, 1.0], np.float32))
     assert paint.decode(paint.invert(some, 3), 3).tolist() == pytest.approx([1.0, 0.8, 0.0], abs=0.003)
     assert paint.invert(paint.invert(some, 3), 3) == some
@@ -136,13 +136,13 @@ def test_ctrl_i_inverts_the_paint_of_the_layer_as_one_undo_entry(hand: Rig) -> N
 
 
 def step_under_a_brush(behind: float = 0.0) -> Stroke:
-    """A row of weights 0 | 1 along x under a brush that touches all; `behind`: how much deeper 1 lies."""
+    """Return touched weights that step from 0 to 1 along x; the part with 1 lies `behind` units deeper."""
     x = np.arange(-40, 40, dtype=np.float32)
     places = np.stack([x, np.zeros_like(x), np.where(x < 0, 0.0, behind)], 1).astype(np.float32)
     return Stroke((x >= 0).astype(np.float32), places, np.ones(80, np.float32))
 
 
-def test_smoothing_is_local_and_makes_a_ramp_of_a_step() -> None:
+def test_smoothing_turns_a_step_into_a_local_ramp() -> None:
     brush = Brush(active=True, radius=20.0, softness=0.5, mode="smooth")
     smooth = result(step_under_a_brush(), brush, "smooth")
     assert smooth[:15].max() < 0.01
@@ -153,13 +153,13 @@ def test_smoothing_is_local_and_makes_a_ramp_of_a_step() -> None:
     assert np.abs(np.diff(small)).max() > 2 * np.abs(np.diff(smooth)).max(), "a small brush smooths narrowly"
 
 
-def test_smoothing_does_not_mix_what_only_looks_near() -> None:
+def test_smoothing_ignores_points_that_are_close_only_on_screen() -> None:
     brush = Brush(active=True, radius=20.0, softness=0.5, mode="smooth")
     apart = step_under_a_brush(behind=200.0)
     assert result(apart, brush, "smooth") == pytest.approx(apart.before, abs=0.003)
 
 
-def test_smoothing_leaves_what_the_brush_has_not_touched_and_keeps_even_weights() -> None:
+def test_smoothing_changes_only_touched_and_uneven_weights() -> None:
     brush = Brush(active=True, radius=20.0, softness=0.5, mode="smooth")
     step = step_under_a_brush()
     half = replace(step, reached=(step.places[:, 0] < 10).astype(np.float32))
@@ -168,7 +168,7 @@ def test_smoothing_leaves_what_the_brush_has_not_touched_and_keeps_even_weights(
     assert result(even, brush, "smooth") == pytest.approx(np.full(80, 0.6), abs=0.003)
 
 
-def test_a_mean_of_neighbors_stays_within_them_and_does_not_depend_on_where_cells_begin() -> None:
+def test_neighbor_mean_stays_in_range_and_ignores_the_grid_offset() -> None:
     rng = np.random.default_rng(0)
     points = rng.normal(size=(4000, 3)).astype(np.float32)
     values = rng.random(4000).astype(np.float32)
@@ -180,7 +180,7 @@ def test_a_mean_of_neighbors_stays_within_them_and_does_not_depend_on_where_cell
     assert len(near_mean(points[:0], values[:0], 0.5)) == 0
 
 
-def test_feathering_softens_painted_edges_more_each_time_and_leaves_full_paint_full(hand: Rig) -> None:
+def test_feathering_softens_painted_edges_and_keeps_full_paint(hand: Rig) -> None:
     hand.key("Shift+X")
     assert hand.main_view.work.view.layers[0].paint == paint.FULL
     x, y = scarf_on_screen(hand)
@@ -226,7 +226,7 @@ def test_shift_held_at_the_press_smooths_for_one_stroke(hand: Rig) -> None:
     assert hand.main_view.work.view.brush.mode == "erase"
 
 
-def test_the_front_brush_leaves_what_lies_behind_and_the_other_does_not(hand: Rig) -> None:
+def test_front_brush_skips_hidden_members_and_through_brush_does_not(hand: Rig) -> None:
     gdf = bear().gdfs[0]
     scene = bear().scene
     surface = Surface(scene, camera_of(hand))
@@ -240,7 +240,7 @@ def test_the_front_brush_leaves_what_lies_behind_and_the_other_does_not(hand: Ri
     assert depth[hidden].mean() > depth[~hidden].mean()
 
 
-def test_a_stroke_on_the_picture_takes_the_edit_away_there_as_one_undo_entry(hand: Rig) -> None:
+def test_stroke_removes_the_edit_there_as_one_undo_entry(hand: Rig) -> None:
     camera = hand.main_view.work.view.camera
     before = hand.picture()
     x, y = scarf_on_screen(hand)
@@ -261,7 +261,7 @@ def test_a_stroke_on_the_picture_takes_the_edit_away_there_as_one_undo_entry(han
     assert hand.main_view.work.view.layers[0].paint == paint.FULL
 
 
-def test_locked_hidden_or_no_layers_are_not_painted_and_the_window_says_why(hand: Rig) -> None:
+def test_locked_hidden_or_missing_layer_is_not_painted(hand: Rig) -> None:
     x, y = scarf_on_screen(hand)
     for chords, told in (
         (["Shift+L"], "locked"),
@@ -278,7 +278,7 @@ def test_locked_hidden_or_no_layers_are_not_painted_and_the_window_says_why(hand
         hand.pause(0.5)
 
 
-def test_the_keys_of_the_brush_do_what_its_controls_do(hand: Rig) -> None:
+def test_brush_keys_match_the_brush_controls(hand: Rig) -> None:
     hand.key("B")
     assert not hand.main_view.work.view.brush.active
     for chord in ("B", "X", "Shift+B", "]", "Shift+["):
@@ -294,7 +294,7 @@ def test_the_keys_of_the_brush_do_what_its_controls_do(hand: Rig) -> None:
     assert hand.main_view.work.past.past[0].edit.layers[0].paint == paint.FULL
 
 
-def test_paint_lasts_when_rows_come_and_go_with_another_edit() -> None:
+def test_paint_survives_rows_added_and_removed_by_another_edit() -> None:
     scene = random_gaussians(90, seed=2, sh_degree=1)
     drawn = np.linspace(0, 0.8, 90, dtype=np.float32)
     edits = whole_grade(scene), growing(scene, some_rows(scene, 10, 1), 25, 7)

@@ -1,4 +1,4 @@
-"""Selections as values: packed, hidden, kept as regions, undone, and saved."""
+"""Selections as values: packed, hidden, saved as regions, undone and stored."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def selecting(work: Workspace, mask: np.ndarray) -> Workspace:
     return workspace.record_undo(replace(work, view=replace(work.view, selection=chosen)))
 
 
-def test_a_mask_comes_back_as_it_was_packed() -> None:
+def test_packed_mask_round_trips() -> None:
     rng = np.random.default_rng(3)
     for share in (0.0, 0.01, 0.5, 1.0):
         mask = rng.random(TOTAL) < share
@@ -38,7 +38,7 @@ def test_a_mask_comes_back_as_it_was_packed() -> None:
     assert selection.pack(np.zeros(TOTAL, bool)) == NOBODY
 
 
-def test_the_button_that_refines_does_what_the_step_of_a_region_does() -> None:
+def test_refine_button_matches_the_refine_step_of_a_region() -> None:
     scene = bear().scene
     near = Neighborhood(scene)
     facts = SceneFacts("bear.ply", len(scene), Bounds(), (), neighborhood=lambda: near)
@@ -51,13 +51,13 @@ def test_the_button_that_refines_does_what_the_step_of_a_region_does() -> None:
 
 
 @pytest.mark.parametrize("members", [b"not packed", selection.pack(every(3))[:-9]])
-def test_a_mask_that_does_not_fit_is_refused(members: bytes) -> None:
+def test_mask_of_another_size_is_refused(members: bytes) -> None:
     with pytest.raises(ProgdfError, match="select it again"):
         selection.unpack(members, TOTAL)
 
 
 @pytest.mark.parametrize("total", [0, 1, 8, 9, 1000, 1999])
-def test_a_mask_has_no_row_that_was_added_since_and_none_that_is_gone(total: int) -> None:
+def test_mask_adapts_to_added_and_removed_rows(total: int) -> None:
     rng = np.random.default_rng(3)
     mask = rng.random(1000) < 0.5
     kept = np.flatnonzero(rng.random(1000) < 0.3)
@@ -71,14 +71,14 @@ def test_a_mask_has_no_row_that_was_added_since_and_none_that_is_gone(total: int
 
 
 @pytest.mark.parametrize("total", [8, 1009, 2000])
-def test_a_file_s_mask_must_fit_its_scene(total: int) -> None:
+def test_stored_mask_must_fit_its_scene(total: int) -> None:
     state = SelectionState(members=selection.pack(every(2)))
     selection.check(state, TOTAL)
     with pytest.raises(ProgdfError, match="does not fit"):
         selection.check(state, total)
 
 
-def test_what_is_hidden_cannot_be_selected_until_all_is_shown() -> None:
+def test_hidden_splats_cannot_be_selected_until_all_are_shown() -> None:
     state = selection.select(SelectionState(), every(2))
     assert state.count == 502
     hidden = selection.hide(state, every(2))
@@ -87,7 +87,7 @@ def test_what_is_hidden_cannot_be_selected_until_all_is_shown() -> None:
     assert selection.select(selection.show_all(hidden), every(1)).count == TOTAL
 
 
-def test_isolating_hides_all_but_the_selection_and_nothing_without_one() -> None:
+def test_isolate_hides_all_but_the_selection() -> None:
     state = selection.select(SelectionState(), every(4))
     alone = selection.isolate(state, TOTAL)
     assert (selection.unpack(alone.hidden, TOTAL) == ~every(4)).all()
@@ -95,7 +95,7 @@ def test_isolating_hides_all_but_the_selection_and_nothing_without_one() -> None
     assert selection.isolate(SelectionState(), TOTAL) == SelectionState()
 
 
-def test_each_selection_is_one_undo_entry_and_no_reason_to_ask_before_closing() -> None:
+def test_selection_is_one_undo_entry_but_no_unsaved_change() -> None:
     work = workspace.new_workspace(first_view(bear(), 0.5, 0.5))
     facts = SceneFacts("bear.ply", TOTAL, None, ())  # type: ignore[arg-type]
     once = selecting(work, every(5))
@@ -108,7 +108,7 @@ def test_each_selection_is_one_undo_entry_and_no_reason_to_ask_before_closing() 
     assert workspace.has_unsaved(replace(twice, view=replace(twice.view, selection=kept)))
 
 
-def test_regions_have_names_of_their_own_that_files_can_have() -> None:
+def test_region_names_are_unique_and_valid_file_names() -> None:
     state = selection.add_region(SelectionState(), "jacket", Path("jacket.region.npy"))
     assert selection.free_name(state, " Jacket ") == "Jacket-2"
     assert selection.free_name(state, "a/b\\c:d\n e") == "a_b_c_d e"

@@ -1,4 +1,4 @@
-"""Snapshots: taken, gone back to, forgotten."""
+"""Snapshots: added, restored, renamed, reordered and deleted."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from viewer.app import app as application
 from viewer.state import snapshots, workspace
 from viewer.state.actions import perform
 
-# a snapshot at 874, and in its menu
+# y of a snapshot card whose x is 874, and of items in its menu
 CARD = 316.0
 RENAME = 332.0
 DELETE = 436.0
 
 
-def test_snapshots_are_one_undo_entry_to_go_back_to_and_begin_with_the_original() -> None:
+def test_snapshots_can_be_restored_as_one_undo_entry() -> None:
     work = workspace.new_workspace(first_view(bear(), 0.5, 0.5))
     facts = application.Document("bear.ply", bear().scene, bear().gdfs).facts()
 
@@ -48,14 +48,14 @@ def test_snapshots_are_one_undo_entry_to_go_back_to_and_begin_with_the_original(
     assert act(named, "undo").snapshots == work.snapshots
 
 
-def test_going_back_keeps_edits_that_were_opened_since_at_zero() -> None:
+def test_restoring_a_snapshot_sets_later_edits_to_zero() -> None:
     view = first_view(bear(), 0.5, 0.5)
     kept = snapshots.take((), replace(view, layers=view.layers[:1]))
     back = snapshots.restore(view, kept[0])
     assert [(layer.name, layer.strength) for layer in back.layers] == [("scarf", 0.5), ("ears", 0.0)]
 
 
-def test_snapshots_change_places_and_names_and_the_pair_goes_with_them() -> None:
+def test_snapshots_are_reordered_and_renamed_with_their_pair() -> None:
     work = workspace.new_workspace(first_view(bear(), 0.5, 0.5))
     facts = application.Document("bear.ply", bear().scene, bear().gdfs).facts()
     for action in ("snapshot", "nudge:0.1", "snapshot", "nudge:0.1", "snapshot", "choose_snapshot:a:1"):
@@ -72,7 +72,7 @@ def test_snapshots_change_places_and_names_and_the_pair_goes_with_them() -> None
 
 
 @pytest.mark.gl
-def test_a_click_on_a_small_picture_goes_back_to_its_snapshot_and_its_menu_deletes_it() -> None:
+def test_click_on_a_thumbnail_restores_and_its_menu_deletes() -> None:
     with rig(first_view(bear(), 0.5, 0.5), (1024, 640)) as hand:
         first = hand.picture()
         for chord in ("F5", "Shift+Left", "Shift+Left", "F5"):
@@ -108,7 +108,7 @@ def test_a_click_on_a_small_picture_goes_back_to_its_snapshot_and_its_menu_delet
 
 
 @pytest.mark.gl
-def test_two_snapshots_are_compared_until_something_is_edited() -> None:
+def test_two_snapshots_are_compared_until_the_next_edit() -> None:
     with rig(first_view(bear(), 1.0, 0.0), (1024, 640)) as hand:
         hand.key("Shift+F5")
         assert hand.main_view.work.view.compare.mode == "off"
@@ -137,6 +137,6 @@ def test_two_snapshots_are_compared_until_something_is_edited() -> None:
         hand.move(968.0, CARD)
         hand.press(1)
         hand.release(1)
-        hand.click(990.0, 394.0)  # move left
+        hand.click(990.0, 394.0)  # moves it left
         assert [kept.name for kept in hand.main_view.work.snapshots] == ["2", "1"]
         assert hand.strengths == [0.0, 0.8], "and not gone back to"

@@ -1,4 +1,4 @@
-"""The saved state of a run: restored at any step to the same bits, and written not too often."""
+"""Saved state of a run: resuming at any step gives the same bits, and saving takes little time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from trainer.optimize.pgs import PgsState, optimize
 from trainer.store.state import PeriodicSave, Saved, StateFolder
 
 
-def test_the_optimizer_goes_on_from_any_step_to_the_same_bits(tmp_path: Path) -> None:
+def test_optimizer_resumes_from_any_step_bit_for_bit(tmp_path: Path) -> None:
     case = small("body")
     wanted = course(case, steps=6)
     straight = list(optimize(*wanted))
@@ -28,7 +28,7 @@ def test_the_optimizer_goes_on_from_any_step_to_the_same_bits(tmp_path: Path) ->
 
     state = PgsState(original)
     made = []
-    for _ in range(20):  # stopped after every step, every time restored into another state
+    for _ in range(20):  # stopped after every step and restored into a new state
 
         def on_step(step: int, left: float) -> None:
             raise Stop
@@ -49,7 +49,7 @@ def test_the_optimizer_goes_on_from_any_step_to_the_same_bits(tmp_path: Path) ->
         assert (one.step, one.ends_stage, one.means) == (other.step, other.ends_stage, other.means)
 
 
-def test_saving_waits_until_it_is_a_hundredth_of_the_time(
+def test_saving_takes_at_most_one_percent_of_the_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = 0.0
@@ -60,7 +60,7 @@ def test_saving_waits_until_it_is_a_hundredth_of_the_time(
     class Slow:
         def capture_state(self) -> Saved:
             nonlocal now
-            now += 0.5  # seconds that a save takes
+            now += 0.5  # a save takes 0.5 s
             return Saved({}, {})
 
         def restore(self, saved: Saved) -> None: ...
@@ -69,13 +69,11 @@ def test_saving_waits_until_it_is_a_hundredth_of_the_time(
     for _ in range(4000):
         now += 0.1
         kept.step_done()
-        folder.wait()  # the clock stands still for the thread that writes
+        folder.wait()  # the mocked clock does not advance for the writing thread
     assert 0.5 * 0.01 < kept.seconds / now < 1.01 * 0.01
 
 
-def test_training_goes_on_while_a_disk_takes_its_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_training_continues_while_a_slow_disk_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     flushed, rows = threading.Event(), torch.ones(3)
     monkeypatch.setattr("trainer.store.state._flush", lambda path: flushed.wait(60.0))
     folder = StateFolder(tmp_path / "state")
@@ -99,7 +97,7 @@ def test_training_goes_on_while_a_disk_takes_its_time(
     assert saved.tensors["rows/rows"].tolist() == [1.0] * 3, "as it was when it was saved"
 
 
-def test_a_state_folder_that_is_a_link_is_refused_and_nothing_behind_it_is_touched(tmp_path: Path) -> None:
+def test_linked_state_folder_is_refused_and_left_unchanged(tmp_path: Path) -> None:
     own = tmp_path / "own"
     (own / "run.json").parent.mkdir()
     (own / "run.json").write_text("mine")

@@ -1,4 +1,4 @@
-"""Keys and playhead: what lies between keys, what each key press does to them, files that bring them back."""
+"""Keys and playhead: interpolation between keys, key actions and playback."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def two_keys(easing: str = "smooth", length: int = 20) -> Timeline:
 
 
 def shift(made: Timeline, frame: int, to: int) -> Timeline:
-    """The keys of all rows at a frame, elsewhere."""
+    """Move the keys of all rows from one frame to another."""
     return timeline.shift_keys(made, timeline.keys_at(made, frame), to - frame)
 
 
@@ -54,7 +54,7 @@ tracks = st.lists(
 
 
 @given(tracks, st.floats(-10, 210))
-def test_between_two_keys_a_value_never_leaves_their_range(points: list[views.Point], frame: float) -> None:
+def test_value_between_two_keys_stays_in_their_range(points: list[views.Point], frame: float) -> None:
     found = views.value_between(points, frame)
     before = [p for p in points if p[0] <= frame] or points[:1]
     after = [p for p in points if p[0] >= frame] or points[-1:]
@@ -63,11 +63,11 @@ def test_between_two_keys_a_value_never_leaves_their_range(points: list[views.Po
 
 
 @given(tracks)
-def test_at_a_key_a_value_is_exactly_the_keys(points: list[views.Point]) -> None:
+def test_value_at_a_key_is_exact(points: list[views.Point]) -> None:
     assert [views.value_between(points, point[0]) for point in points] == [point[2] for point in points]
 
 
-def test_smooth_leaves_and_comes_gently_and_passes_through_without_a_halt() -> None:
+def test_smooth_easing_starts_and_ends_slowly_and_never_halts_between() -> None:
     points = [(0, "smooth", 0.0), (10, "smooth", 0.5), (20, "smooth", 1.0)]
     steps = [views.value_between(points, f + 1) - views.value_between(points, f) for f in range(20)]
     assert steps[0] < 0.5 * steps[9]
@@ -76,7 +76,7 @@ def test_smooth_leaves_and_comes_gently_and_passes_through_without_a_halt() -> N
     assert min(steps[5:15]) > 0.04
 
 
-def test_smooth_rests_where_the_way_turns_back() -> None:
+def test_smooth_easing_has_zero_slope_at_a_turning_point() -> None:
     points = [(0, "smooth", 0.0), (10, "smooth", 1.0), (20, "smooth", 0.0)]
     assert 1.0 - views.value_between(points, 9.9) < 1e-3
     assert 1.0 - views.value_between(points, 10.1) < 1e-3
@@ -88,14 +88,14 @@ def test_linear_is_even_and_hold_jumps_at_the_next_key() -> None:
     assert (views.value_between(held, 9), views.value_between(held, 10)) == (0.0, 1.0)
 
 
-def test_the_camera_turns_the_shortest_way_and_its_distance_grows_in_proportion() -> None:
+def test_camera_turns_the_shortest_way_and_distance_is_geometric() -> None:
     middle = timeline.camera_at(two_keys(), 10)
     assert middle is not None
     assert abs(middle.azimuth) == pytest.approx(180.0)
     assert middle.distance == pytest.approx(10.0)
 
 
-def test_turning_on_over_several_keys_goes_more_than_once_around() -> None:
+def test_azimuth_can_turn_more_than_once_over_several_keys() -> None:
     assert views.unwrap([0.0, 170.0, -20.0, 150.0, 0.0]) == [0.0, 170.0, 340.0, 510.0, 360.0]
 
 
@@ -104,14 +104,14 @@ ups = st.sampled_from([(0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1), (1, 0, 0), 
 
 @given(ups, ups, st.floats(-180, 180), st.floats(-90, 90), st.integers(0, 20))
 @settings(deadline=None)
-def test_between_any_two_up_axes_the_picture_turns_along_one_arc(
+def test_camera_turns_along_one_arc_between_any_two_up_axes(
     here: tuple[float, float, float],
     there: tuple[float, float, float],
     azimuth: float,
     elevation: float,
     frame: int,
 ) -> None:
-    assume(here != there)  # else it stays level instead, and may bow
+    assume(here != there)  # otherwise it stays level and may leave the arc
     cameras = (
         ViewCamera(up=here, azimuth=20.0, elevation=10.0),
         ViewCamera(up=there, azimuth=azimuth, elevation=elevation),
@@ -132,19 +132,19 @@ def test_between_any_two_up_axes_the_picture_turns_along_one_arc(
         assert found == cameras[frame // 20]
 
 
-def test_before_the_first_key_and_after_the_last_everything_rests() -> None:
+def test_values_are_constant_before_the_first_and_after_the_last_key() -> None:
     made = timeline.set_length(shift(two_keys(), 0, 5), 40)
     assert timeline.state_at(made, 0, view()).layers == timeline.state_at(made, 5, view()).layers
     assert timeline.state_at(made, 40, view()).camera == timeline.state_at(made, 20, view()).camera
 
 
-def test_an_edit_opened_after_the_keys_is_left_alone_and_one_that_is_gone_is_no_trouble() -> None:
+def test_keys_ignore_later_and_missing_edits() -> None:
     third = LayerState(2, "frost", 0.7)
     shown = timeline.state_at(two_keys(), 20, replace(view(), layers=(LAYERS[1], third)))
     assert [layer.strength for layer in shown.layers] == [0.5, 0.7]
 
 
-def test_keys_stay_in_order_and_none_stands_on_another_or_off_the_timeline() -> None:
+def test_keys_stay_ordered_distinct_and_on_the_timeline() -> None:
     made = timeline.with_key(two_keys(), 7, view())
     assert [key.frame for key in made.keys] == [0, 7, 20]
     assert shift(made, 7, 20) == made
@@ -154,26 +154,26 @@ def test_keys_stay_in_order_and_none_stands_on_another_or_off_the_timeline() -> 
     assert [key.frame for key in timeline.without_keys(made, timeline.keys_at(made, 7)).keys] == [0, 20]
 
 
-def test_a_timeline_is_never_shorter_than_its_last_key() -> None:
+def test_timeline_is_never_shorter_than_its_last_key() -> None:
     assert timeline.set_length(two_keys(), 3).length == 20
     assert timeline.set_length(Timeline(), -5).length == 1
     assert timeline.with_fps(Timeline(), 0).fps == 1
 
 
-def test_a_key_set_again_takes_the_new_state_and_keeps_its_easing() -> None:
+def test_key_set_again_takes_the_new_state_and_keeps_its_easing() -> None:
     again = timeline.with_key(two_keys("hold"), 0, view(0.6))
     assert again.keys[0].strengths == ((0, 0.6), (1, 0.4))
     assert again.keys[0].easing == "hold"
 
 
-def test_a_film_goes_there_once_or_there_and_back_without_doubling_its_ends() -> None:
+def test_ping_pong_film_does_not_repeat_its_end_frames() -> None:
     there = Timeline(length=3)
     assert list(timeline.film_frames(there)) == [0, 1, 2, 3]
     assert list(timeline.film_frames(replace(there, ping_pong=True))) == [0, 1, 2, 3, 2, 1]
 
 
 @pytest.mark.parametrize("ping_pong", [False, True])
-def test_playing_shows_the_films_frames_in_their_order_at_its_pace(ping_pong: bool) -> None:
+def test_playback_shows_the_film_frames_in_order_at_its_rate(ping_pong: bool) -> None:
     made = replace(two_keys(length=3), ping_pong=ping_pong, fps=10)
     player = Player(playing=True)
     seen = [0]
@@ -183,7 +183,7 @@ def test_playing_shows_the_films_frames_in_their_order_at_its_pace(ping_pong: bo
     assert seen == (list(timeline.film_frames(made)) * 3)[:12]
 
 
-def test_a_turntable_is_even_and_its_last_frame_is_followed_by_its_first() -> None:
+def test_turntable_is_even_and_loops_seamlessly() -> None:
     start = ViewCamera(azimuth=100.0, elevation=20.0)
     turn = timeline.turntable(start, 24, 1.5)
     frames = list(timeline.film_frames(turn))
@@ -197,7 +197,7 @@ def test_a_turntable_is_even_and_its_last_frame_is_followed_by_its_first() -> No
         assert replace(after, azimuth=0.0) == replace(start, azimuth=0.0)
 
 
-def test_sliders_go_in_turn_and_back_and_the_others_stay() -> None:
+def test_slider_film_moves_sliders_in_turn_and_keeps_the_others() -> None:
     one, both = (timeline.slider_film(view(), gdfs, 10, 2.0) for gdfs in ([1], [1, 0]))
     assert [timeline.strengths_at(one, frame) for frame in (0, 5, 10)] == [
         {0: 0.2, 1: s} for s in (0.0, pytest.approx(0.5), 1.0)
@@ -210,7 +210,7 @@ def test_sliders_go_in_turn_and_back_and_the_others_stay() -> None:
     assert len(list(timeline.film_frames(both))) == 40
 
 
-def test_a_slow_frame_skips_frames_of_the_film_and_keeps_its_pace() -> None:
+def test_slow_frame_skips_film_frames_to_keep_the_rate() -> None:
     made = replace(two_keys(length=20), fps=10)
     fast = Player(playing=True)
     slow = Player(playing=True)
@@ -220,7 +220,7 @@ def test_a_slow_frame_skips_frames_of_the_film_and_keeps_its_pace() -> None:
     assert fast.frame == slow.frame == 7
 
 
-def test_a_key_is_set_at_the_playhead_with_camera_and_strengths_and_can_be_undone() -> None:
+def test_key_is_set_at_the_playhead_and_can_be_undone() -> None:
     work = act(workspace.new_workspace(view(0.3, azimuth=33.0)), "seek:12", "key")
     assert work.view.timeline.keys == (Keyframe(12, ((0, 0.3), (1, 0.4)), work.view.camera),)
     assert work.player.shown
@@ -229,7 +229,7 @@ def test_a_key_is_set_at_the_playhead_with_camera_and_strengths_and_can_be_undon
     assert act(undone, "redo").view.timeline == work.view.timeline
 
 
-def test_the_playhead_takes_strengths_and_camera_along_without_entries_to_undo() -> None:
+def test_playhead_sets_strengths_and_camera_without_undo_entries() -> None:
     work = workspace.new_workspace(replace(view(0.0, 1.0), timeline=two_keys()))
     entries = len(work.past.past)
     for action, scarf in (("seek:20", 1.0), ("step:-20", 0.0), ("jump:1", 1.0), ("seek:10", 0.5)):
@@ -242,12 +242,12 @@ def test_the_playhead_takes_strengths_and_camera_along_without_entries_to_undo()
 
 
 @pytest.mark.parametrize("leaves", [["seek:11", "seek:12", "seek:13"], ["step:1"], ["jump:1"], ["play"]])
-def test_undo_brings_back_what_the_playhead_took_away_before_it_had_a_key(leaves: list[str]) -> None:
+def test_undo_restores_an_unkeyed_change_lost_to_the_playhead(leaves: list[str]) -> None:
     work = workspace.new_workspace(replace(view(0.0, 1.0), timeline=two_keys()))
     work = act(work, "seek:10", "focus:2", "nudge:0.3")
     entries = len(work.past.past)
     left = work
-    for action in leaves:  # of one drag: nothing is settled in between
+    for action in leaves:  # one drag: undo entries are recorded only at its end
         left = perform(left, action, FACTS)
     left = workspace.record_undo(workspace.advance(left, 0.1))
     assert left.view.layers != work.view.layers
@@ -255,7 +255,7 @@ def test_undo_brings_back_what_the_playhead_took_away_before_it_had_a_key(leaves
     assert act(left, "undo").view.layers == work.view.layers
 
 
-def test_one_key_leaves_strengths_and_camera_to_the_hand() -> None:
+def test_single_key_does_not_override_strengths_and_camera() -> None:
     work = act(workspace.new_workspace(view(0.3)), "key", "focus:2", "nudge:0.5")
     there = act(work, "seek:30", "seek:0")
     assert there.view == work.view
@@ -263,13 +263,13 @@ def test_one_key_leaves_strengths_and_camera_to_the_hand() -> None:
     assert only.layers[0].strength == 0.3, "in a film a single key still counts"
 
 
-def test_a_gesture_under_way_is_still_one_entry_when_the_film_plays_on() -> None:
+def test_drag_during_playback_is_one_undo_entry() -> None:
     made = Timeline(
         (Keyframe(0, ((0, 0.0),)), Keyframe(20, ((0, 1.0),))),
         length=20,
     )
     work = act(workspace.new_workspace(replace(view(), timeline=made)), "play")
-    for strength in (0.5, 0.6, 0.7):  # a hand on the other slider
+    for strength in (0.5, 0.6, 0.7):  # a drag of the other slider
         layers = (work.view.layers[0], replace(work.view.layers[1], strength=strength))
         work = workspace.advance(replace(work, view=replace(work.view, layers=layers)), 0.1)
     work = workspace.record_undo(work)
@@ -278,7 +278,7 @@ def test_a_gesture_under_way_is_still_one_entry_when_the_film_plays_on() -> None
     assert act(work, "undo").view.layers[1].strength == 0.4
 
 
-def test_a_moved_key_takes_the_playhead_along_and_the_picture_stays() -> None:
+def test_moved_key_takes_the_playhead_along() -> None:
     work = act(workspace.new_workspace(replace(view(), timeline=two_keys())), "seek:20", "length:40")
     moved = act(work, "choose_keys:-1@20,0@20,1@20", "move_keys:11")
     assert moved.player.frame == 31
@@ -289,7 +289,7 @@ def frames_of(work: Workspace, row: int) -> list[int]:
     return [frame for r, frame in sorted(timeline.split_keys(work.view.timeline)) if r == row]
 
 
-def test_a_timeline_of_whole_keys_is_the_same_film_as_its_rows() -> None:
+def test_whole_keys_split_into_rows_and_join_again() -> None:
     made = timeline.with_key(two_keys(), 7, view(0.9))
     rows = timeline.split_keys(made)
     assert sorted(rows) == [(row, frame) for row in (-1, 0, 1) for frame in (0, 7, 20)]
@@ -297,7 +297,7 @@ def test_a_timeline_of_whole_keys_is_the_same_film_as_its_rows() -> None:
     assert timeline.join_keys(made, dict(reversed(rows.items()))) == made
 
 
-def test_one_rows_key_is_moved_and_the_other_rows_stay() -> None:
+def test_moving_the_key_of_a_row_keeps_the_other_rows() -> None:
     work = act(workspace.new_workspace(replace(view(), timeline=two_keys(length=20))), "length:40")
     moved = act(work, "choose_keys:0@20", "move_keys:5")
     assert [frames_of(moved, row) for row in (timeline.CAMERA, 0, 1)] == [[0, 20], [0, 25], [0, 20]]
@@ -311,12 +311,12 @@ def test_one_rows_key_is_moved_and_the_other_rows_stay() -> None:
     assert act(moved, "undo").view.timeline == work.view.timeline
 
 
-def test_keys_of_one_frame_go_on_each_in_its_own_way() -> None:
+def test_keys_of_one_frame_may_have_different_easings() -> None:
     made = timeline.set_easing(two_keys("linear"), [(0, 0)], "hold")
     assert timeline.strengths_at(made, 10) == {0: 0.0, 1: 0.75}
 
 
-def test_copied_keys_are_pasted_at_the_playhead_in_place_of_what_stands_there() -> None:
+def test_copied_keys_replace_keys_at_the_playhead() -> None:
     work = act(workspace.new_workspace(replace(view(), timeline=two_keys())), "timeline")
     work = act(work, "choose_keys:0@0,0@20", "copy_keys", "seek:10", "paste_keys")
     assert frames_of(work, 0) == [0, 10, 20, 30]
@@ -329,7 +329,7 @@ def test_copied_keys_are_pasted_at_the_playhead_in_place_of_what_stands_there() 
     assert layers.view == replace(work.view), "a layer was taken since, and no key is chosen"
 
 
-def test_copies_are_dragged_off_and_what_they_come_from_stays() -> None:
+def test_dragged_copies_leave_their_originals() -> None:
     work = act(workspace.new_workspace(replace(view(), timeline=two_keys())), "choose_keys:1@20")
     assert act(work, "clone_keys:0").view.timeline == work.view.timeline
     work = act(work, "clone_keys:-5", "move_keys:-1")
@@ -337,7 +337,7 @@ def test_copies_are_dragged_off_and_what_they_come_from_stays() -> None:
     assert act(work, "choose_keys:+1@20").player.chosen == {(1, 14), (1, 20)}
 
 
-def test_auto_key_keys_what_the_hand_has_changed_and_nothing_else_as_one_entry() -> None:
+def test_auto_key_keys_only_changed_values_as_one_entry() -> None:
     work = act(workspace.new_workspace(view()), "auto_key", "seek:10", "focus:2", "nudge:0.3")
     assert work.view.timeline.keys == (Keyframe(10, ((0, 0.5),)),)
     assert len(work.past.past) == 1
@@ -362,7 +362,7 @@ def test_auto_key_keys_the_camera_once_its_row_has_a_key() -> None:
     assert frames_of(work, timeline.CAMERA) == [10, 20], "the playhead is no hand"
 
 
-def test_easing_goes_round_for_the_key_before_the_playhead() -> None:
+def test_easing_action_cycles_for_the_key_before_the_playhead() -> None:
     work = act(workspace.new_workspace(replace(view(), timeline=two_keys())), "seek:5")
     found = []
     for _ in range(3):
@@ -372,7 +372,7 @@ def test_easing_goes_round_for_the_key_before_the_playhead() -> None:
     assert work.view.timeline.keys[1].easing == "smooth"
 
 
-def test_one_key_cannot_be_played_and_hiding_the_bar_stops() -> None:
+def test_single_key_cannot_be_played_and_hiding_the_bar_stops() -> None:
     work = act(workspace.new_workspace(view()), "key", "play")
     assert not work.player.playing
     work = act(workspace.new_workspace(replace(view(), timeline=two_keys())), "play")
@@ -382,7 +382,7 @@ def test_one_key_cannot_be_played_and_hiding_the_bar_stops() -> None:
     assert timeline.next_frame_delay(hidden.player, hidden.view.timeline) is None
 
 
-def test_undo_of_a_longer_timeline_leaves_a_playhead_that_still_works() -> None:
+def test_undo_of_a_longer_timeline_keeps_the_playhead_usable() -> None:
     work = act(
         workspace.new_workspace(replace(view(), timeline=two_keys())), "length:90", "seek:80", "undo", "undo"
     )
@@ -390,12 +390,12 @@ def test_undo_of_a_longer_timeline_leaves_a_playhead_that_still_works() -> None:
     assert act(work, "step:1").player.frame == 20
 
 
-def test_history_restores_the_timeline_with_the_rest() -> None:
+def test_history_restores_the_timeline() -> None:
     past = history.record(history.begin(view()), replace(view(), timeline=two_keys()))
     assert history.undo(past).present.edit.timeline == Timeline()
 
 
-def test_every_action_of_the_timeline_that_a_key_names_exists() -> None:
+def test_every_timeline_action_bound_to_a_key_exists() -> None:
     named = {key.action.partition(":")[0] for key in KEYS.values()}
     assert {"key", "drop_key", "play", "step", "jump", "easing", "ping_pong", "timeline"} <= named
     assert set(timeline.ACTIONS) <= set(ACTIONS)
