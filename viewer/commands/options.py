@@ -83,7 +83,7 @@ class ExportOptions:
 
     stack: OmitArgPrefixes[StackOptions]
     out: Annotated[Path, word("FILE", aliases=["-o"])]
-    """Output: a 3DGS scene, a .html page, a .progdf.zip or a .cube; formats: see docs/cli.md."""
+    """Output: a 3DGS scene, a .html page, a .progdf.zip or a .cube; formats: see docs/formats.md."""
     frames: Annotated[int | None, word("N", "one file")] = None
     """Number of steps from the original to the strengths, or of --timeline frames; a .usdc: time samples."""
     timeline: Switch = False
