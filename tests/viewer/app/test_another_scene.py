@@ -1,4 +1,4 @@
-"""What belongs to a scene goes with it when another one is opened."""
+"""Opening another scene replaces everything that belongs to the old scene."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ OF_THE_WINDOW = {
 
 
 def all_in_use(view: ViewState, count: int) -> ViewState:
-    """With a selection, hidden splats and a region of a scene of `count`, and the brush on."""
+    """Add a selection, hidden splats, a region of a scene of `count` Gaussians and an active brush."""
     half = np.arange(count) % 2 == 0
     third = np.arange(count) % 3 == 0
     region = NamedRegion("half", Path("half.region.npy"), pack(half), int(half.sum()), visible=True)
@@ -50,7 +50,7 @@ def window(tmp_path: Path) -> Iterator[application.App]:
         yield app
 
 
-def test_a_new_scene_takes_over_nothing_but_the_settings_of_the_window() -> None:
+def test_new_scene_keeps_only_the_window_settings() -> None:
     view = all_in_use(full_view(), len(bear().scene))
     view = replace(view, panel=False, grid=True, select=SelectTool("flood"), overshoot=True)
     view = replace(view, dynamic_resolution="on", pair=SnapshotPair("1", "2"), safe_frame="1:1")
@@ -67,7 +67,7 @@ def test_a_new_scene_takes_over_nothing_but_the_settings_of_the_window() -> None
 
 @pytest.mark.gl
 @pytest.mark.parametrize("tool", ["box", "polygon", "flood", "brush"])
-def test_another_scene_opens_while_everything_of_the_old_one_is_in_use(
+def test_another_scene_opens_while_the_old_one_is_in_use(
     window: application.App, tmp_path: Path, tool: str
 ) -> None:
     main_view = window.main_view
@@ -77,7 +77,7 @@ def test_another_scene_opens_while_everything_of_the_old_one_is_in_use(
     for place in (
         (150.0, 250.0),
         (250.0, 350.0),
-    ):  # a gesture under way, or a click that follows its tolerance
+    ):  # a drag in progress, or a click whose tolerance can still change
         imgui.get_io().add_mouse_pos_event(*place)
         imgui.get_io().add_mouse_button_event(0, True)
         window.draw()
@@ -103,7 +103,7 @@ def test_another_scene_opens_while_everything_of_the_old_one_is_in_use(
 
 
 @pytest.mark.gl
-def test_a_scene_that_cannot_be_opened_leaves_the_old_one_as_it_was(
+def test_scene_that_cannot_be_opened_keeps_the_old_one(
     window: application.App, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     window.main_view.change(all_in_use(window.main_view.work.view, len(bear().scene)))
@@ -122,7 +122,7 @@ def test_a_scene_that_cannot_be_opened_leaves_the_old_one_as_it_was(
 
 
 @pytest.mark.gl
-def test_a_session_comes_with_its_selection_and_without_a_tool_in_the_hand(tmp_path: Path) -> None:
+def test_session_restores_its_selection_without_an_active_tool(tmp_path: Path) -> None:
     folder = bear_files(tmp_path)
     opened = opened_document(folder)
     view = all_in_use(replace(first_view(bear(), 0.5, 0.5), select=SelectTool("box")), len(bear().scene))

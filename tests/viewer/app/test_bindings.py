@@ -1,4 +1,4 @@
-"""The one table of commands and its lists: whole, readable at the smallest window, never under a message."""
+"""Table of commands and its lists: complete, readable in the smallest window, never covered by a message."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from viewer.ui.keys import COMMANDS, JOINED, KEYS, bind, find_commands, shortcut
 SMALLEST = (1024, 640)
 
 
-def test_every_command_has_a_name_and_with_a_key_a_row_of_its_topic() -> None:
+def test_every_command_has_a_name_and_keys_have_a_row() -> None:
     listed = [row for topic in interface.topics()[1:] for row in topic.rows]
     assert len(listed) == len(set(listed))
     for command in COMMANDS.values():
@@ -51,11 +51,11 @@ INTERNAL = {
     *("select_invert", "choose_keys", "move_keys", "clone_keys"),
     *("seek", "length", "fps", "go_to", "example", "forget_file"),
 }
-"""Asked for by a button, a question or a drag, with what it is about: nothing to look up by its name."""
+"""Actions of buttons, questions and drags that need an argument, so the command palette omits them."""
 
 
 @pytest.mark.gl
-def test_every_action_has_its_command_or_is_no_one_s_to_look_up(tmp_path: Path) -> None:
+def test_every_action_is_a_command_or_internal(tmp_path: Path) -> None:
     with null_app(empty(), ViewState(), tmp_path) as app:
         everything = {*app.requests, *exports.REQUESTS}
     everything |= {*actions.ACTIONS, *actions.OF_EDITS, *selection.CHANGES, "frame", "home", "invert"}
@@ -78,17 +78,17 @@ def test_every_action_has_its_command_or_is_no_one_s_to_look_up(tmp_path: Path) 
         ("expscn", "export"),  # letters in their order
     ],
 )
-def test_a_command_is_found_by_what_one_remembers_of_it(query: str, first: str) -> None:
+def test_command_is_found_by_parts_of_its_name(query: str, first: str) -> None:
     assert find_commands(query, COMMANDS)[0].action == first
 
 
-def test_what_no_command_is_called_finds_none_and_nothing_typed_finds_all() -> None:
+def test_unknown_query_finds_nothing_and_empty_query_finds_all() -> None:
     assert find_commands("xyzzy", COMMANDS) == []
     assert {command.action for command in find_commands("", COMMANDS)} == {*COMMANDS}
 
 
 @pytest.mark.gl
-def test_a_command_is_done_by_typing_its_name_and_enter_and_arrows_take_others() -> None:
+def test_command_palette_works_by_typing_arrows_and_enter() -> None:
     with rig(None, (900, 700)) as hand:
         before = hand.main_view.work.view
         strike(hand, "Ctrl+P")
@@ -112,7 +112,7 @@ def test_a_command_is_done_by_typing_its_name_and_enter_and_arrows_take_others()
 
 
 @pytest.mark.gl
-def test_a_click_beside_the_list_of_commands_closes_it_and_one_on_a_line_takes_it() -> None:
+def test_click_beside_the_palette_closes_it_and_on_a_line_runs_it() -> None:
     with rig(None, (900, 700)) as hand:
         hand.key("F3")
         hand.click(40.0, 650.0)
@@ -124,7 +124,7 @@ def test_a_click_beside_the_list_of_commands_closes_it_and_one_on_a_line_takes_i
 
 
 @pytest.mark.gl
-def test_the_list_of_keys_comes_and_goes_by_its_key_and_escape() -> None:
+def test_key_list_opens_and_closes_by_f1_and_escape() -> None:
     with rig(None, (900, 700)) as hand:
         for chord in ("F1", "Escape"):
             strike(hand, "F1")
@@ -134,7 +134,7 @@ def test_the_list_of_keys_comes_and_goes_by_its_key_and_escape() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 9])
-def test_columns_keep_all_topics_in_their_order_and_none_is_longer_than_need_be(count: int) -> None:
+def test_columns_keep_all_topics_in_order_and_are_balanced(count: int) -> None:
     topics = interface.topics()
     found = interface.columns(topics, count)
     assert len(found) <= count
@@ -145,13 +145,13 @@ def test_columns_keep_all_topics_in_their_order_and_none_is_longer_than_need_be(
 
 @pytest.fixture
 def own_keys() -> Iterator[None]:
-    """The table's keys again, after the test."""
+    """Restore the default keys after the test."""
     yield
     bind({})
 
 
 @pytest.mark.usefixtures("own_keys")
-def test_a_command_gets_the_keys_it_is_given_and_another_one_loses_them() -> None:
+def test_bound_keys_replace_defaults_and_are_taken_from_others() -> None:
     given = {"snapshot": "f6", "beside": ["shift+ctrl+J", "Y"], "quit": "", "difference": "T", "before": "B"}
     assert bind(given) == []
     found = {
@@ -181,7 +181,7 @@ WRONG = {
 
 
 @pytest.mark.usefixtures("own_keys")
-def test_what_is_wrong_with_a_key_is_a_line_and_its_command_keeps_what_it_had() -> None:
+def test_invalid_key_binding_is_reported_and_keeps_the_old_one() -> None:
     before = dict(KEYS)
     problems = bind({"lock": "F7", **{action: value for action, (value, _) in WRONG.items()}})
     assert problems == [f"{action}: {line}" for action, (_, line) in WRONG.items()]
@@ -192,7 +192,7 @@ def test_what_is_wrong_with_a_key_is_a_line_and_its_command_keeps_what_it_had() 
 
 @pytest.mark.gl
 @pytest.mark.usefixtures("own_keys")
-def test_the_file_of_keys_is_made_whole_and_read_when_the_window_opens(
+def test_keys_file_is_created_complete_and_read_on_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened: list[str] = []
@@ -232,7 +232,7 @@ def shown(hand: Rig) -> imgui.internal.Window:
 @pytest.mark.parametrize(
     ("points", "density", "scale"), [(SMALLEST, 1.0, 1.0), (SMALLEST, 2.0, 1.0), ((2048, 1280), 1.0, 2.0)]
 )
-def test_the_whole_list_is_readable_in_the_smallest_window(
+def test_whole_key_list_is_readable_in_the_smallest_window(
     points: tuple[int, int], density: float, scale: float
 ) -> None:
     with rig(None, points, density, scale) as hand:
@@ -247,7 +247,7 @@ def test_the_whole_list_is_readable_in_the_smallest_window(
 
 
 def fits_its_columns(hand: Rig) -> bool:
-    """Whether no line is longer than its column."""
+    """Return True if every line fits its column."""
     imgui.new_frame()
     imgui.push_font(hand.main_view.ui.fonts.regular, SMALL_PX)
     room = (interface.COLUMN_PX - 8.0) * hand.main_view.ui.scale
@@ -265,7 +265,7 @@ def fits_its_columns(hand: Rig) -> bool:
 
 @pytest.mark.gl
 @pytest.mark.parametrize("times", [1, 4, 16])
-def test_a_message_stands_below_the_list_also_where_it_takes_several_lines(times: int) -> None:
+def test_message_of_several_lines_stays_below_the_key_list(times: int) -> None:
     with rig(None, SMALLEST) as hand:
         hand.key("F1")
         hand.main_view.show_message("a line that is long enough to be wrapped " * times)
@@ -277,7 +277,7 @@ def test_a_message_stands_below_the_list_also_where_it_takes_several_lines(times
 
 
 @pytest.mark.gl
-def test_in_a_window_that_is_too_small_the_list_scrolls_to_its_end() -> None:
+def test_key_list_scrolls_to_its_end_in_a_too_small_window() -> None:
     with rig(None, (640, 400)) as hand:
         hand.key("F1")
         hand.frame(2)
@@ -289,7 +289,7 @@ def test_in_a_window_that_is_too_small_the_list_scrolls_to_its_end() -> None:
         assert hand.main_view.work.view.camera == before, "the wheel over it zooms nothing"
 
 
-def test_on_a_mac_command_does_what_control_does_and_the_list_says_so(
+def test_command_key_acts_as_ctrl_on_a_mac(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     from viewer.ui import window
@@ -303,7 +303,7 @@ def test_on_a_mac_command_does_what_control_does_and_the_list_says_so(
     assert any("Cmd" in row for topic in interface.topics() for row in topic.rows)
 
 
-def test_the_window_asks_for_the_only_context_that_a_mac_gives() -> None:
+def test_window_requests_the_gl_context_that_macs_support() -> None:
     from viewer.ui import splash
 
     asked = dict(splash._HINTS)

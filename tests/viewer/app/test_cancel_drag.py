@@ -1,4 +1,4 @@
-"""Escape or the right button during a drag takes it back: what was dragged and no more; no undo entry."""
+"""Escape or a right click during a drag reverts that drag only and leaves no undo entry."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def by_escape(hand: Rig) -> None:
 
 
 def by_escape_that_imgui_hears_too(hand: Rig) -> None:
-    """As in the window: imgui itself lets go of what is held."""
+    """Press Escape as in the window, where imgui also releases the active item."""
     hand.io.add_key_event(imgui.Key.escape, True)
     hand.key("Escape")
     hand.io.add_key_event(imgui.Key.escape, False)
@@ -50,7 +50,7 @@ def hand() -> Iterator[Rig]:
 def dragged_and_called_off(
     hand: Rig, call_off: CallOff, start: tuple[float, float], *way: tuple[float, float]
 ) -> None:
-    """A drag that is called off half way; the hand goes on and lets go only then."""
+    """Cancel a drag halfway, keep moving and release the button at the end."""
     hand.move(*start)
     before = hand.picture()
     work = hand.main_view.work
@@ -70,7 +70,7 @@ def dragged_and_called_off(
 
 
 @ways
-def test_a_slider_goes_back_to_where_it_was_pressed(hand: Rig, call_off: CallOff) -> None:
+def test_canceled_slider_drag_restores_the_strength(hand: Rig, call_off: CallOff) -> None:
     start = hand.slider(0, 0.5)
     end = hand.slider(0, 0.9)
     dragged_and_called_off(hand, call_off, start, end)
@@ -80,7 +80,7 @@ def test_a_slider_goes_back_to_where_it_was_pressed(hand: Rig, call_off: CallOff
     assert len(hand.main_view.work.past.past) == 1
 
 
-def test_a_gain_goes_back_and_is_not_reset_by_the_right_button(hand: Rig) -> None:
+def test_canceled_gain_drag_restores_the_gain(hand: Rig) -> None:
     y = gain_row(hand)
     hand.pause(0.7)  # a press soon after the last would be a double click, which resets
     hand.drag((LEFT + 218, y), (LEFT + 150, y))
@@ -101,7 +101,7 @@ def test_a_gain_goes_back_and_is_not_reset_by_the_right_button(hand: Rig) -> Non
 
 
 def gain_row(hand: Rig) -> float:
-    """Where the slider of the color gain of the first layer stands."""
+    """Return the y of the slider for the color gain of the first layer."""
     for y in range(400, 200, -12):
         before = hand.main_view.work
         hand.drag((LEFT + 218, y), (LEFT + 150, y))
@@ -114,7 +114,7 @@ def gain_row(hand: Rig) -> float:
 
 
 @ways
-def test_a_layer_stays_in_its_place(hand: Rig, call_off: CallOff) -> None:
+def test_canceled_layer_drag_keeps_the_layer_order(hand: Rig, call_off: CallOff) -> None:
     hand.key("1")  # the card at the top
     dragged_and_called_off(
         hand, call_off, (LEFT + 100, HEAD), (LEFT + 100, HEAD + 60), (LEFT + 100, HEAD + 400)
@@ -122,7 +122,7 @@ def test_a_layer_stays_in_its_place(hand: Rig, call_off: CallOff) -> None:
 
 
 @ways
-def test_a_stroke_is_taken_back_and_the_next_one_paints(hand: Rig, call_off: CallOff) -> None:
+def test_canceled_stroke_is_reverted_and_the_next_one_paints(hand: Rig, call_off: CallOff) -> None:
     brush = Brush(active=True, radius=60.0, softness=0.5)
     hand.main_view.restart(replace(hand.main_view.work.view, brush=brush))
     hand.settle()
@@ -133,7 +133,7 @@ def test_a_stroke_is_taken_back_and_the_next_one_paints(hand: Rig, call_off: Cal
     assert len(hand.main_view.work.past.past) == 1
 
 
-def test_a_key_of_the_timeline_goes_back(hand: Rig) -> None:
+def test_canceled_key_drag_restores_the_key(hand: Rig) -> None:
     keys = (Keyframe(0, ((0, 0.5), (1, 0.5))), Keyframe(36, ((0, 0.5), (1, 0.5))))
     hand.main_view.restart(replace(hand.main_view.work.view, timeline=Timeline(keys)))
     hand.key("T")
@@ -144,7 +144,7 @@ def test_a_key_of_the_timeline_goes_back(hand: Rig) -> None:
 
 
 def grips_key(hand: Rig, x: float, y: float) -> bool:
-    """Whether a drag from there moves the second key."""
+    """Return True if a drag from this position moves the second key."""
     before = hand.main_view.work
     hand.drag((x, y), (x + 40.0, y))
     moved = hand.main_view.work.view.timeline.keys[1].frame != 36
@@ -154,7 +154,7 @@ def grips_key(hand: Rig, x: float, y: float) -> bool:
 
 
 @ways
-def test_the_divider_of_a_split_goes_back(hand: Rig, call_off: CallOff) -> None:
+def test_canceled_divider_drag_restores_the_divider(hand: Rig, call_off: CallOff) -> None:
     hand.key("Shift+Y")
     hand.drag((0.5 * LEFT, 300), (0.3 * LEFT, 300))
     dragged_and_called_off(hand, call_off, (0.3 * LEFT, 300), (0.6 * LEFT, 300), (0.8 * LEFT, 310))
@@ -162,7 +162,7 @@ def test_the_divider_of_a_split_goes_back(hand: Rig, call_off: CallOff) -> None:
     assert hand.main_view.work.view.compare.divider == pytest.approx(0.7), "it can be gripped again"
 
 
-def test_escape_without_a_drag_and_while_the_camera_turns_focuses_no_layer(hand: Rig) -> None:
+def test_escape_without_a_drag_or_during_orbit_unfocuses_the_layer(hand: Rig) -> None:
     hand.move(100, 200)
     hand.press()
     hand.move(160, 220)
@@ -178,11 +178,11 @@ def test_escape_without_a_drag_and_while_the_camera_turns_focuses_no_layer(hand:
 
 
 @ways
-def test_a_tools_tolerance_goes_back_with_what_it_selected(hand: Rig, call_off: CallOff) -> None:
+def test_canceled_tolerance_drag_restores_the_selection(hand: Rig, call_off: CallOff) -> None:
     hand.key("J")
     hand.click(170.0, 320.0)
     hand.frame(2)
     dragged_and_called_off(hand, call_off, (90.0, TOLERANCE), (140.0, TOLERANCE))
-    hand.pause(0.5)  # no double click
+    hand.pause(0.5)  # avoids a double click
     hand.drag((90.0, TOLERANCE), (140.0, TOLERANCE))
     assert hand.main_view.work.view.select.tolerance > SelectTool.tolerance, "what was called off was a drag"

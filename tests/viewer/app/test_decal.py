@@ -1,4 +1,4 @@
-"""A picture with transparency dropped on the window: it follows the pointer, and is laid on where it lies."""
+"""A transparent picture dropped on the window follows the pointer until it is placed on the surface."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def in_hand(app: App) -> Decal:
     return app.main_view.gizmo
 
 
-def test_it_follows_the_pointer_grows_with_the_wheel_and_moves_no_camera(logo: Path) -> None:
+def test_decal_follows_the_pointer_and_scales_with_the_wheel(logo: Path) -> None:
     with rig(first_view(bear())) as hand:
         camera = hand.main_view.work.view.camera
         hand.main_view.gizmo = Decal.take(hand.main_view.context, logo)
@@ -63,7 +63,9 @@ def test_it_follows_the_pointer_grows_with_the_wheel_and_moves_no_camera(logo: P
         assert "put_back" in hand.main_view.take_requests()
 
 
-def test_enter_lays_it_on_where_it_lies(app: App, logo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_enter_places_the_decal_at_its_position(
+    app: App, logo: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     orders: list[EditOrder] = []
     monkeypatch.setattr(app.jobs.queue, "add", orders.append)
     app.open(logo)
@@ -80,7 +82,7 @@ def test_enter_lays_it_on_where_it_lies(app: App, logo: Path, monkeypatch: pytes
     assert (camera.width, camera.height) == app.main_view.picture_size
 
 
-def test_its_corners_turn_counterclockwise(app: App, logo: Path) -> None:
+def test_decal_corners_turn_counterclockwise(app: App, logo: Path) -> None:
     app.open(logo)
     texture = in_hand(app).texture
     flat = Decal(logo, texture, 80.0, 0.0, (100.0, 100.0)).corners
@@ -92,7 +94,7 @@ def test_its_corners_turn_counterclockwise(app: App, logo: Path) -> None:
 @pytest.mark.parametrize(
     ("mode", "alpha", "expected"), [("RGBA", 0, True), ("RGBA", 255, False), ("RGB", 0, False)]
 )
-def test_what_has_transparency_is_a_decal(tmp_path: Path, mode: str, alpha: int, expected: bool) -> None:
+def test_picture_with_transparency_is_a_decal(tmp_path: Path, mode: str, alpha: int, expected: bool) -> None:
     picture = Image.new("RGBA", (8, 8), (9, 9, 9, 255))
     picture.putpixel((0, 0), (9, 9, 9, alpha))
     picture.convert(mode).save(tmp_path / "a.png")

@@ -1,4 +1,4 @@
-"""Double clicks count by when the presses arrived, however long a frame takes."""
+"""Double clicks are timed by the arrival of the presses, however long a frame takes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.gl
 
 
 def click_twice(hand: Rig, gap: float, frame: float, unheard: float = 0.0) -> None:
-    """Two clicks on the upper slider's handle, `gap` seconds apart, in frames of `frame` seconds."""
+    """Click the upper slider's handle twice, `gap` seconds apart, in frames of `frame` seconds."""
     clicks = DoubleClicks()
     hand.move(*hand.slider(1, 0.5))
     for press in range(2):
@@ -32,9 +32,7 @@ def click_twice(hand: Rig, gap: float, frame: float, unheard: float = 0.0) -> No
 
 
 @pytest.mark.parametrize("frame", [1 / 60, 0.12, 0.5])
-def test_two_presses_that_came_quickly_reset_the_slider_however_slow_frames_are(
-    hand: Rig, frame: float
-) -> None:
+def test_quick_presses_reset_the_slider_even_in_slow_frames(hand: Rig, frame: float) -> None:
     click_twice(hand, 0.06, frame)
     assert hand.strengths == [0.5, 0.0]
 
@@ -45,7 +43,7 @@ def test_two_slow_clicks_stay_two_clicks(hand: Rig, frame: float) -> None:
     assert hand.strengths == [0.5, 0.5]
 
 
-def test_a_press_that_waited_for_a_long_frame_to_end_may_be_as_old_as_that(hand: Rig) -> None:
+def test_press_time_allows_for_the_length_of_a_long_frame(hand: Rig) -> None:
     click_twice(hand, 0.45, 0.4, unheard=0.4)
     assert hand.strengths == [0.5, 0.0]
 
@@ -59,7 +57,7 @@ def opened(tmp_path: Path) -> Iterator[application.App]:
         yield app
 
 
-def test_the_window_notes_when_it_heard_of_a_press(opened: application.App) -> None:
+def test_window_records_the_arrival_time_of_a_press(opened: application.App) -> None:
     from viewer.ui.window import glfw
 
     handle = ctypes.cast(opened.window.handle, ctypes.c_void_p).value or 0
@@ -69,6 +67,6 @@ def test_the_window_notes_when_it_heard_of_a_press(opened: application.App) -> N
     for action in (1, 0, 1, 0):
         imgui.backends.glfw_mouse_button_callback(handle, 0, action, 0)
     for _ in range(6):
-        opened.last -= 0.4  # so long a frame takes
+        opened.last -= 0.4  # duration of a frame, seconds
         opened.draw()
     assert [layer.strength for layer in opened.main_view.work.view.layers] == [0.5, 0.0]

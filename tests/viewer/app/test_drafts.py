@@ -1,4 +1,4 @@
-"""A grade of a new edit in the window: live while the form is open, a draft layer while it is trained."""
+"""Grade of a new edit in the window: live while the form is open, a draft layer while it trains."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ pytestmark = pytest.mark.gl
 
 
 class Previews:
-    """Stands for the child: it answers with the same grade, or a picture."""
+    """Stub of the preview process: it returns the same grade or picture every time."""
 
     grade: Path | None = None
     asked = 0
@@ -89,7 +89,7 @@ def with_form(app: application.App, **changes: object) -> None:
 
 
 def opened(app: application.App, **changes: object) -> None:
-    work = app.main_view.work  # before it opens, as then the name is being typed
+    work = app.main_view.work  # set before the form opens, as the name field takes the keys then
     app.main_view.work = replace(work, form=replace(work.form, name="blue"))
     press(app, "Ctrl+N")
     with_form(app, **changes)
@@ -100,7 +100,7 @@ def layer(app: application.App) -> LayerState:
     return only
 
 
-def test_a_grade_is_a_live_layer_that_the_form_drives_from_every_side(window: application.App) -> None:
+def test_grade_is_a_live_layer_driven_by_the_form(window: application.App) -> None:
     opened(window, strength=0.25)
     assert [live.strength for live in window.main_view.live] == [0.25]
     assert (window.main_view.cover, window.main_view.work.view.layers) == (None, ())
@@ -119,7 +119,7 @@ def test_a_grade_is_a_live_layer_that_the_form_drives_from_every_side(window: ap
     assert window.main_view.live == ()
 
 
-def test_while_a_color_is_dragged_each_grade_that_comes_is_shown_and_the_newest_asked_next(
+def test_color_drag_shows_every_grade_and_requests_the_newest_next(
     window: application.App, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = []
@@ -144,7 +144,7 @@ def test_while_a_color_is_dragged_each_grade_that_comes_is_shown_and_the_newest_
     with_form(window, color=(0.5, 0.0, 0.0))
     assert asked[1:] == ["recolor:#800000"], "what was passed by meanwhile is never asked"
     assert len(window.main_view.live) == 1, "what has come is seen, though the color has moved on"
-    with_form(window, color=(0.1, 0.0, 0.0))  # back at what is shown, while another is made
+    with_form(window, color=(0.1, 0.0, 0.0))  # back to the visible color while another grade is computed
     answer()
     turn(window)
     assert asked[2:] == ["recolor:#1a0000"], "the layer is that of the color that was asked for"
@@ -156,7 +156,7 @@ def test_while_a_color_is_dragged_each_grade_that_comes_is_shown_and_the_newest_
     assert window.main_view.engine.gdfs[-1] is shown, "of the region before nothing more is shown"
 
 
-def test_a_grade_by_hand_gets_the_main_colors_of_its_region(
+def test_manual_grade_gets_the_main_colors_of_its_region(
     window: application.App, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = []
@@ -186,7 +186,7 @@ def test_a_grade_by_hand_gets_the_main_colors_of_its_region(
     assert window.main_view.work.form.palette[1][0] not in ("#000001", "#000003")
 
 
-def test_the_view_is_painted_in_every_style_one_after_the_other_behind_the_picture(
+def test_styles_are_previewed_one_after_the_other(
     window: application.App, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[tuple[str, bool]] = []
@@ -230,7 +230,7 @@ def test_the_view_is_painted_in_every_style_one_after_the_other_behind_the_pictu
     assert ("style:23", False) in asked[30:32], "and what the form says does not wait for it"
 
 
-def test_what_no_grade_carries_is_the_editors_own_picture_as_before(window: application.App) -> None:
+def test_preview_without_a_grade_shows_the_picture_of_the_editor(window: application.App) -> None:
     opened(window)
     Previews.grade = None
     with_form(window, editor=2)
@@ -238,7 +238,7 @@ def test_what_no_grade_carries_is_the_editors_own_picture_as_before(window: appl
     assert window.main_view.live == ()
 
 
-def test_a_sentence_is_painted_when_it_is_asked_for_and_the_edit_follows_that_picture(
+def test_prompt_is_painted_on_request_and_the_edit_follows_it(
     window: application.App, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     given = list[Path]()
@@ -280,7 +280,7 @@ def test_a_sentence_is_painted_when_it_is_asked_for_and_the_edit_follows_that_pi
     assert f"--anchor={anchor}" in Trainer.said
 
 
-def test_the_trained_edit_takes_the_place_of_its_draft_and_nothing_else_changes(
+def test_trained_edit_replaces_its_draft_and_nothing_else(
     window: application.App,
 ) -> None:
     opened(window, strength=0.6)
@@ -306,7 +306,7 @@ def test_the_trained_edit_takes_the_place_of_its_draft_and_nothing_else_changes(
     assert layer(window).name == "blue"
 
 
-def test_a_draft_whose_training_ends_badly_stays_until_it_is_deleted(window: application.App) -> None:
+def test_draft_of_a_failed_training_stays_until_deleted(window: application.App) -> None:
     opened(window)
     request(window, "train")
     Trainer.ended = 2
@@ -321,7 +321,7 @@ def test_a_draft_whose_training_ends_badly_stays_until_it_is_deleted(window: app
     assert layer(window).name == "blue"
 
 
-def test_a_deleted_draft_is_not_in_the_way_of_the_trained_edit(window: application.App) -> None:
+def test_deleted_draft_does_not_block_the_trained_edit(window: application.App) -> None:
     opened(window)
     request(window, "train")
     press(window, "Ctrl+Delete")
@@ -330,7 +330,7 @@ def test_a_deleted_draft_is_not_in_the_way_of_the_trained_edit(window: applicati
     assert layer(window).name == "scarf"
 
 
-def test_a_session_saved_with_a_draft_opens_with_what_was_trained_since(
+def test_session_saved_with_a_draft_opens_with_the_trained_edit(
     window: application.App, tmp_path: Path
 ) -> None:
     opened(window, strength=0.6)
@@ -346,7 +346,7 @@ def test_a_session_saved_with_a_draft_opens_with_what_was_trained_since(
     assert layer(window).strength == 0.6
 
 
-def test_without_a_preview_the_draft_of_the_run_becomes_the_layer(window: application.App) -> None:
+def test_draft_of_the_run_becomes_the_layer_without_a_preview(window: application.App) -> None:
     opened(window, preview=False)
     request(window, "train")
     assert window.main_view.work.view.layers == ()

@@ -1,4 +1,4 @@
-"""Files dropped on the window, without a screen: glfw's null platform."""
+"""Files dropped on the window, on glfw's null platform without a screen."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from viewer.state import selection
 
 @pytest.fixture
 def opened(tmp_path: Path) -> Iterator[application.App]:
-    """The application on a window of glfw's null platform: everything but a screen."""
+    """Yield the application in a window of glfw's null platform, which lacks only a screen."""
     from viewer.ui.splash import Splash
     from viewer.ui.window import Window, glfw
 
@@ -47,7 +47,9 @@ def opened(tmp_path: Path) -> Iterator[application.App]:
 
 
 @pytest.mark.gl
-def test_a_dropped_edit_comes_on_top_and_can_be_undone(opened: application.App, tmp_path: Path) -> None:
+def test_dropped_edit_becomes_the_top_layer_and_can_be_undone(
+    opened: application.App, tmp_path: Path
+) -> None:
     gdf = bear().gdfs[1]
     save_gdf(tmp_path / "ears.gdf", gdf)
     opened.open(tmp_path / "ears.gdf")
@@ -60,7 +62,7 @@ def test_a_dropped_edit_comes_on_top_and_can_be_undone(opened: application.App, 
 
 
 @pytest.mark.gl
-def test_a_dropped_table_goes_on_what_is_selected_else_everywhere_and_in_a_layers_place_on_its_region(
+def test_dropped_color_table_applies_to_selection_scene_or_region(
     opened: application.App, tmp_path: Path
 ) -> None:
     write_cube(tmp_path / "look.cube", lattice_colors(5).flip(1), "look")
@@ -81,7 +83,7 @@ def test_a_dropped_table_goes_on_what_is_selected_else_everywhere_and_in_a_layer
 
 
 @pytest.mark.gl
-def test_a_dropped_picture_stands_in_the_form_and_one_looks_from_where_it_was_taken(
+def test_dropped_picture_fills_the_form_and_restores_its_camera(
     opened: application.App, tmp_path: Path
 ) -> None:
     main_view = opened.main_view
@@ -105,7 +107,7 @@ def test_a_dropped_picture_stands_in_the_form_and_one_looks_from_where_it_was_ta
 
 
 @pytest.mark.gl
-def test_a_dropped_scene_takes_the_place_of_the_old_one(opened: application.App, tmp_path: Path) -> None:
+def test_dropped_scene_replaces_the_old_one(opened: application.App, tmp_path: Path) -> None:
     save_ply(tmp_path / "half.ply", bear().scene[:700])
     opened.open(tmp_path / "half.ply")
     opened.draw()
@@ -115,9 +117,7 @@ def test_a_dropped_scene_takes_the_place_of_the_old_one(opened: application.App,
 
 
 @pytest.mark.gl
-def test_a_dropped_file_that_is_broken_is_one_line_and_changes_nothing(
-    opened: application.App, tmp_path: Path
-) -> None:
+def test_broken_dropped_file_is_one_line_and_changes_nothing(opened: application.App, tmp_path: Path) -> None:
     before = opened.main_view.work.view
     other = replace(
         bear().gdfs[1], scene=msgspec.structs.replace(bear().gdfs[1].scene, means_sha256="0" * 64)
@@ -137,9 +137,7 @@ def test_a_dropped_file_that_is_broken_is_one_line_and_changes_nothing(
 
 
 @pytest.mark.gl
-def test_glfw_hands_dropped_files_to_the_next_turn_of_the_loop(
-    opened: application.App, tmp_path: Path
-) -> None:
+def test_glfw_delivers_dropped_files_to_the_next_loop_turn(opened: application.App, tmp_path: Path) -> None:
     from viewer.ui.window import glfw
 
     (tmp_path / "torn.ply").write_bytes(b"ply\nformat")

@@ -1,4 +1,4 @@
-"""A scene far from 0 in the window: what it writes is in the world, and comes back to where it was."""
+"""A scene far from 0 in the window: written files use world coordinates and restore the same view."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ FAR = (1e6, 2e6, -5e5)
 
 
 def far_document(folder: Path) -> document.Document:
-    """The bear and its scarf, far from 0."""
+    """Write the bear and its scarf far from 0 and load them."""
     scene = write(folder / "far.ply", moved_columns(bear().scene, FAR))
     opened = document.load(scene)
     edit = replace(bear().gdfs[0], scene=fingerprint(opened.scene))
@@ -38,7 +38,7 @@ def far_document(folder: Path) -> document.Document:
 
 
 def view() -> ViewState:
-    """Of the bear near 0, and so of the far one relative to its origin."""
+    """Return a view of the bear near 0, which is also a view of the far bear relative to its origin."""
     seen = first_view(bear(), 0.5)
     other = replace(seen.camera, azimuth=70.0)
     return replace(seen, timeline=Timeline((Keyframe(0), Keyframe(3, camera=other)), 3))
@@ -50,7 +50,7 @@ def window(tmp_path: Path) -> Iterator[application.App]:
         yield app
 
 
-def test_a_session_has_its_cameras_in_the_world_and_comes_back(tmp_path: Path) -> None:
+def test_far_session_stores_world_cameras_and_restores_them(tmp_path: Path) -> None:
     opened = far_document(tmp_path)
     seen = view()
     kept = snapshots.take((), seen)
@@ -67,7 +67,7 @@ def test_a_session_has_its_cameras_in_the_world_and_comes_back(tmp_path: Path) -
     assert again.view.timeline.keys[0].camera is None
 
 
-def test_a_session_of_a_scene_near_zero_is_what_it_was(tmp_path: Path) -> None:
+def test_session_near_zero_is_unchanged(tmp_path: Path) -> None:
     bear().save(tmp_path)
     opened = document.load(tmp_path / "bear.ply")
     seen = replace(view(), layers=(), timeline=Timeline())
@@ -78,9 +78,7 @@ def test_a_session_of_a_scene_near_zero_is_what_it_was(tmp_path: Path) -> None:
 
 
 @pytest.mark.gl
-def test_f4_keeps_cameras_of_the_world_and_one_looks_through_them_again(
-    window: application.App, tmp_path: Path
-) -> None:
+def test_f4_saves_world_cameras_that_restore_the_view(window: application.App, tmp_path: Path) -> None:
     shown = to_camera(window.main_view.work.view.camera, *window.main_view.picture_size)
     press(window, "F4")
     press(window, "F4")
@@ -97,7 +95,7 @@ def test_f4_keeps_cameras_of_the_world_and_one_looks_through_them_again(
 
 @pytest.mark.gl
 @pytest.mark.parametrize("key", ["F2", "Ctrl+F2"])
-def test_a_picture_carries_a_camera_of_the_world_and_brings_the_view_back(
+def test_picture_carries_a_world_camera_that_restores_the_view(
     window: application.App, tmp_path: Path, key: str
 ) -> None:
     before = window.main_view.work.view.camera

@@ -1,4 +1,4 @@
-"""The file_actions of the window: what is asked, saved, opened, dropped and remembered."""
+"""File actions of the window: questions, saving, opening, dropped files and recent files."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from viewer.state.workspace import Dialog
 
 @pytest.fixture
 def window(folder: Path, saved: Path) -> Iterator[application.App]:
-    """The application with files."""
+    """Yield the application with the bear's files."""
     with null_app(opened_document(folder), first_view(bear(), 0.5, 0.5), folder) as app:
         yield app
 
@@ -41,7 +41,7 @@ def question(app: application.App) -> Dialog:
     return app.main_view.work.dialog
 
 
-def test_the_recent_files_are_scenes_and_sessions_the_last_twelve(tmp_path: Path) -> None:
+def test_recent_files_are_the_last_twelve_scenes_and_sessions(tmp_path: Path) -> None:
     files = [tmp_path / f"{i}.{kind}" for i, kind in enumerate(["ply", "session.json", "spz"] * 5)]
     others = [tmp_path / name for name in ("e.gdf", "1.autosave.session.json", "1.discarded-2.session.json")]
     for file in (*files, *others):
@@ -54,9 +54,7 @@ def test_the_recent_files_are_scenes_and_sessions_the_last_twelve(tmp_path: Path
     assert read_recent() == tuple(files[:-13:-1])
 
 
-def test_recent_files_are_remembered_the_last_one_first(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_recent_files_are_listed_newest_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     files = [tmp_path / name for name in ("a.ply", "b.session.json", "c.ply")]
     for file in files:
         file.touch()
@@ -74,7 +72,7 @@ def test_recent_files_are_remembered_the_last_one_first(
 
 
 @pytest.mark.gl
-def test_ctrl_s_asks_where_once_and_then_saves_there(window: application.App, folder: Path) -> None:
+def test_ctrl_s_asks_for_a_path_once_and_then_saves_there(window: application.App, folder: Path) -> None:
     press(window, "Ctrl+S")
     assert question(window).text == str(folder / "bear.session.json")
     press(window, "Enter")
@@ -90,7 +88,7 @@ def test_ctrl_s_asks_where_once_and_then_saves_there(window: application.App, fo
 
 
 @pytest.mark.gl
-def test_keys_do_nothing_behind_a_question_and_escape_takes_it_away(window: application.App) -> None:
+def test_keys_do_nothing_behind_a_question_and_escape_closes_it(window: application.App) -> None:
     press(window, "Ctrl+O", "V", "Shift+Left")
     assert window.main_view.work.view.camera.mode == "orbit"
     assert window.main_view.work.view.layers[0].strength == 0.5
@@ -101,7 +99,7 @@ def test_keys_do_nothing_behind_a_question_and_escape_takes_it_away(window: appl
 
 
 @pytest.mark.gl
-def test_a_path_typed_into_the_field_is_opened(window: application.App, saved: Path) -> None:
+def test_typed_path_is_opened(window: application.App, saved: Path) -> None:
     press(window, "Ctrl+O")
     imgui.get_io().add_input_characters_utf8(str(saved))
     for _ in range(3):
@@ -113,7 +111,7 @@ def test_a_path_typed_into_the_field_is_opened(window: application.App, saved: P
 
 
 @pytest.mark.gl
-def test_quitting_asks_only_when_something_would_be_lost(window: application.App, folder: Path) -> None:
+def test_quitting_asks_only_with_unsaved_changes(window: application.App, folder: Path) -> None:
     press(window, "Ctrl+Q")
     assert window.is_closed
     window.is_closed = False
@@ -121,22 +119,20 @@ def test_quitting_asks_only_when_something_would_be_lost(window: application.App
     assert question(window).kind == "leave"
     press(window, "Escape")
     assert not window.is_closed
-    press(window, "Ctrl+Q", "S", "Enter")  # save, under the name that is offered
+    press(window, "Ctrl+Q", "S", "Enter")  # save under the suggested name
     assert (folder / "bear.session.json").is_file()
     assert window.is_closed
 
 
 @pytest.mark.gl
-def test_discarding_leaves_and_writes_nothing(window: application.App, folder: Path) -> None:
+def test_discarding_closes_and_writes_nothing(window: application.App, folder: Path) -> None:
     press(window, "Shift+Left", "Ctrl+Q", "D")
     assert window.is_closed
     assert not (folder / "bear.session.json").exists()
 
 
 @pytest.mark.gl
-def test_unsaved_work_is_autosaved_beside_and_taken_away_once_saved(
-    window: application.App, folder: Path
-) -> None:
+def test_unsaved_work_is_autosaved_until_it_is_saved(window: application.App, folder: Path) -> None:
     assert window.file_actions.autosave(0.0) is None, "nothing to lose"
     press(window, "Shift+Left")
     waits = window.file_actions.autosave(10.0)
@@ -151,7 +147,7 @@ def test_unsaved_work_is_autosaved_beside_and_taken_away_once_saved(
 
 
 @pytest.mark.gl
-def test_an_autosave_opens_as_unsaved_work_of_its_session(window: application.App, folder: Path) -> None:
+def test_autosave_opens_as_unsaved_work_of_its_session(window: application.App, folder: Path) -> None:
     press(window, "Shift+Left")
     beside = left_over(window, folder)
     window.file_actions.save(folder / "bear.session.json")
@@ -166,7 +162,7 @@ def test_an_autosave_opens_as_unsaved_work_of_its_session(window: application.Ap
 
 
 def left_over(window: application.App, folder: Path) -> Path:
-    """An autosave of the present work as a crash leaves it: the window knows nothing of it."""
+    """Leave an autosave of the present work as after a crash, unknown to the window."""
     window.file_actions.autosave(0.0)
     window.file_actions.autosave(session.AUTOSAVE_S)
     beside = folder / "bear.autosave.session.json"
@@ -179,9 +175,7 @@ def left_over(window: application.App, folder: Path) -> Path:
 
 
 @pytest.mark.gl
-def test_a_new_sessions_autosave_never_takes_the_place_of_one_that_was_left(
-    window: application.App, folder: Path
-) -> None:
+def test_new_autosave_never_replaces_a_leftover_autosave(window: application.App, folder: Path) -> None:
     press(window, "Shift+Left")
     beside = left_over(window, folder)
     kept = beside.read_bytes()
@@ -202,9 +196,7 @@ def test_a_new_sessions_autosave_never_takes_the_place_of_one_that_was_left(
 
 
 @pytest.mark.gl
-def test_discarded_work_stays_under_another_name_the_last_three(
-    window: application.App, folder: Path
-) -> None:
+def test_last_three_discarded_works_are_kept_as_files(window: application.App, folder: Path) -> None:
     strengths = []
     for _ in range(session.MAX_DISCARDED + 2):
         press(window, "Shift+Left")
@@ -227,12 +219,10 @@ def test_discarded_work_stays_under_another_name_the_last_three(
 
 
 @pytest.mark.gl
-def test_work_that_never_had_a_name_is_not_saved_over_a_session_that_has_it(
-    window: application.App, folder: Path
-) -> None:
+def test_unnamed_work_is_not_saved_over_an_existing_session(window: application.App, folder: Path) -> None:
     window.file_actions.save(folder / "bear.session.json")
     yesterday = (folder / "bear.session.json").read_bytes()
-    window.file_actions.path = None  # the next day, from the scene
+    window.file_actions.path = None  # the next day, starting from the scene
     press(window, "Shift+Left", "Ctrl+S")
     assert question(window).text == str(folder / "bear-2.session.json")
     press(window, "Enter")
@@ -241,10 +231,12 @@ def test_work_that_never_had_a_name_is_not_saved_over_a_session_that_has_it(
 
 
 @pytest.mark.gl
-def test_a_name_that_a_session_has_is_asked_about(window: application.App, folder: Path, saved: Path) -> None:
+def test_existing_session_is_overwritten_only_after_a_question(
+    window: application.App, folder: Path, saved: Path
+) -> None:
     yesterday = saved.read_bytes()
     press(window, "Shift+Left")
-    for answer in ("Escape", "Enter"):  # Cancel; Rename…, which asks where again
+    for answer in ("Escape", "Enter"):  # Cancel; Rename…, which opens the save question again
         window.handle(f"save_to:{saved}")
         assert question(window).kind == "overwrite"
         press(window, answer)
@@ -261,7 +253,7 @@ def test_a_name_that_a_session_has_is_asked_about(window: application.App, folde
 
 
 @pytest.mark.gl
-def test_the_title_shows_unsaved_changes(window: application.App, folder: Path) -> None:
+def test_title_shows_unsaved_changes(window: application.App, folder: Path) -> None:
     titles: list[str] = []
     window.window.rename = titles.append  # type: ignore[method-assign]
     press(window, "Shift+Left")
@@ -271,13 +263,11 @@ def test_the_title_shows_unsaved_changes(window: application.App, folder: Path) 
 
 
 @pytest.mark.gl
-def test_a_layer_is_duplicated_replaced_and_saved_without_what_was_deleted(
-    window: application.App, folder: Path
-) -> None:
+def test_duplicated_replaced_and_deleted_layers_are_saved(window: application.App, folder: Path) -> None:
     def layers() -> list[tuple[str, int]]:
         return [(layer.name, layer.gdf) for layer in window.main_view.work.view.layers]
 
-    press(window, "2", "Ctrl+D")  # the lower one
+    press(window, "2", "Ctrl+D")  # the lower layer
     assert layers() == [("scarf", 0), ("scarf-2", 2), ("ears", 1)]
     assert window.main_view.work.focus == 1
     assert window.main_view.work.view.layers[1].strength == 0.5
@@ -299,7 +289,7 @@ def test_a_layer_is_duplicated_replaced_and_saved_without_what_was_deleted(
 
 
 @pytest.mark.gl
-def test_an_edit_of_another_scene_replaces_nothing_and_is_one_line(
+def test_replacing_by_a_scene_file_changes_nothing(
     window: application.App, folder: Path, tmp_path: Path
 ) -> None:
     before = window.main_view.work.view
@@ -311,7 +301,7 @@ def test_an_edit_of_another_scene_replaces_nothing_and_is_one_line(
 
 
 @pytest.mark.gl
-def test_files_are_told_apart_by_content_however_they_are_called(
+def test_files_are_recognized_by_content_not_by_name(
     window: application.App, folder: Path, saved: Path
 ) -> None:
     saved.rename(folder / "session.txt")
@@ -327,7 +317,7 @@ def test_files_are_told_apart_by_content_however_they_are_called(
 
 
 @pytest.mark.gl
-def test_a_dropped_camera_file_is_looked_through(window: application.App, folder: Path) -> None:
+def test_dropped_camera_file_sets_the_view(window: application.App, folder: Path) -> None:
     camera = bear().demo.cameras[2]
     save_cameras(folder / "cameras.json", [camera])
     window.open(folder / "cameras.json")
@@ -337,7 +327,7 @@ def test_a_dropped_camera_file_is_looked_through(window: application.App, folder
 
 
 @pytest.mark.gl
-def test_a_scene_dropped_on_unsaved_work_asks_first(window: application.App, folder: Path) -> None:
+def test_scene_dropped_on_unsaved_work_asks_first(window: application.App, folder: Path) -> None:
     save_ply(folder / "half.ply", bear().scene[:700])
     press(window, "Shift+Left")
     window.open(folder / "half.ply")
@@ -350,9 +340,7 @@ def test_a_scene_dropped_on_unsaved_work_asks_first(window: application.App, fol
 
 
 @pytest.mark.gl
-def test_a_session_for_another_scene_changes_nothing_and_is_one_line(
-    window: application.App, folder: Path, saved: Path
-) -> None:
+def test_session_of_another_scene_changes_nothing(window: application.App, folder: Path, saved: Path) -> None:
     before = window.main_view.work.view
     window.open(spoilt(saved, "scene", "sha256", value="0" * 64))
     assert window.main_view.work.view == before
@@ -360,7 +348,7 @@ def test_a_session_for_another_scene_changes_nothing_and_is_one_line(
 
 
 @pytest.mark.gl
-def test_saving_never_writes_over_another_kind_of_file(window: application.App, folder: Path) -> None:
+def test_saving_never_overwrites_another_kind_of_file(window: application.App, folder: Path) -> None:
     save_cameras(folder / "cameras.json", list(bear().demo.cameras[:1]))
     before = (folder / "cameras.json").read_bytes()
     window.handle(f"save_to:{folder / 'cameras.json'}")
@@ -369,7 +357,7 @@ def test_saving_never_writes_over_another_kind_of_file(window: application.App, 
 
 
 def by_hand(window: application.App, *keys: imgui.Key, text: str = "") -> None:
-    """Keys as the path field hears them, then a text."""
+    """Send keys to the path field, then a text."""
     window.main_view.ui.make_current()
     io = imgui.get_io()
     for key in keys:
@@ -383,13 +371,11 @@ def by_hand(window: application.App, *keys: imgui.Key, text: str = "") -> None:
 
 
 @pytest.mark.gl
-def test_a_place_that_cannot_be_written_is_asked_for_again_with_what_was_typed(
-    window: application.App, folder: Path
-) -> None:
+def test_failed_save_asks_again_with_the_typed_path(window: application.App, folder: Path) -> None:
     press(window, "Shift+Left", "Ctrl+S")
     typed = str(folder / "gone" / "bear.session.json")
     by_hand(window, text=typed)
-    by_hand(window, imgui.Key.enter)  # the field lets go of the keys
+    by_hand(window, imgui.Key.enter)  # makes the field release the keyboard
     press(window, "Enter")
     asked = question(window)
     before = window.main_view.work.view
@@ -409,7 +395,7 @@ def test_a_place_that_cannot_be_written_is_asked_for_again_with_what_was_typed(
 
 
 @pytest.mark.gl
-def test_what_was_put_off_for_a_save_waits_until_it_is_saved(window: application.App, folder: Path) -> None:
+def test_quit_waits_until_the_save_succeeds(window: application.App, folder: Path) -> None:
     (folder / "kept").mkdir()
     window.file_actions.save(folder / "kept" / "bear")
     (folder / "kept").rename(folder / "away")
@@ -425,7 +411,7 @@ def test_what_was_put_off_for_a_save_waits_until_it_is_saved(window: application
 
 
 @pytest.mark.gl
-def test_the_home_of_an_unknown_user_is_a_folder_that_does_not_exist(window: application.App) -> None:
+def test_home_of_an_unknown_user_does_not_exist(window: application.App) -> None:
     window.handle("save_to:~nobody-here/bear")
     assert "~nobody-here does not exist" in question(window).error
     window.handle("open_file:~nobody-here/bear.ply")
@@ -434,7 +420,7 @@ def test_the_home_of_an_unknown_user_is_a_folder_that_does_not_exist(window: app
 
 @pytest.mark.gl
 @pytest.mark.parametrize("name", ["x" * 300, "/".join(["x" * 200] * 30), "a\0b", "\x1b[2J\n"])
-def test_a_path_that_no_file_can_have_is_one_line(window: application.App, name: str) -> None:
+def test_impossible_path_is_one_line(window: application.App, name: str) -> None:
     for request in (f"open_file:{name}", f"replace_by:0:{name}"):
         window.handle(request)
         assert message(window)
@@ -446,7 +432,7 @@ def test_a_path_that_no_file_can_have_is_one_line(window: application.App, name:
         window.draw()
 
 
-def test_f4_keeps_each_view_as_a_camera_beside_the_session(window: application.App, folder: Path) -> None:
+def test_f4_saves_each_view_as_a_camera_beside_the_session(window: application.App, folder: Path) -> None:
     assert window.document.path is not None
     kept = folder / f"{window.document.path.stem}.cameras.json"
     for azimuth in (10.0, 70.0):
@@ -462,7 +448,7 @@ def test_f4_keeps_each_view_as_a_camera_beside_the_session(window: application.A
     assert not torch.equal(found[0].viewmat, found[1].viewmat)
 
 
-def test_f4_overwrites_no_file_of_cameras_that_it_did_not_make(window: application.App, folder: Path) -> None:
+def test_f4_does_not_overwrite_a_foreign_camera_file(window: application.App, folder: Path) -> None:
     assert window.document.path is not None
     theirs = folder / f"{window.document.path.stem}.cameras.json"
     theirs.write_text("[]")
@@ -472,7 +458,7 @@ def test_f4_overwrites_no_file_of_cameras_that_it_did_not_make(window: applicati
 
 
 @pytest.mark.gl
-def test_pictures_lie_beside_the_scene_or_among_the_users_and_never_in_the_current_folder(
+def test_pictures_are_never_saved_to_the_current_folder(
     window: application.App,
     folder: Path,
     tmp_path_factory: pytest.TempPathFactory,

@@ -1,4 +1,4 @@
-"""The whole window by keys alone: its parts in turn, what one does in them, the way back to the picture."""
+"""Whole window by keys alone: its parts in turn, their controls, and the way back to the picture."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ def hand() -> Iterator[Rig]:
 
 
 def focused() -> int:
-    """What has the keyboard, and shows it; 0 for nothing."""
+    """Return the id of the item with a visible keyboard focus, 0 for none."""
     context = imgui.get_current_context()
     return context.nav_id if context.nav_cursor_visible and context.nav_window is not None else 0
 
 
 def reach(hand: Rig, label: str, most: int = 40) -> None:
-    """Tab to something of the panel by the end of its id's path."""
+    """Press Tab until the panel item whose id ends with `label` has the focus."""
     panel = imgui.internal.find_window_by_name("panel")
     windows = [w for w in imgui.get_current_context().windows if w.name.startswith("panel") and w.was_active]
     wanted = {window.get_id(label) for window in (panel, *windows)}
@@ -40,7 +40,7 @@ def reach(hand: Rig, label: str, most: int = 40) -> None:
     raise AssertionError(f"no Tab leads to {label}")
 
 
-def test_f6_leads_through_all_parts_that_are_shown_and_back_to_the_picture(hand: Rig) -> None:
+def test_f6_cycles_through_all_visible_parts_and_the_picture(hand: Rig) -> None:
     shown = [name for name in PLACES if name not in ("options", "timeline")]
     for chord, names in (("F6", [*shown, ""]), ("Shift+F6", [*shown[::-1], ""])):
         for name in names:
@@ -54,7 +54,7 @@ def test_f6_leads_through_all_parts_that_are_shown_and_back_to_the_picture(hand:
         assert hand.main_view.work.keyboard == name
 
 
-def test_in_a_part_tab_goes_from_one_to_the_next_and_keys_are_no_shortcuts_but_those_with_ctrl(
+def test_tab_moves_within_a_part_where_only_ctrl_shortcuts_work(
     hand: Rig,
 ) -> None:
     strike(hand, "Tab")
@@ -76,7 +76,7 @@ def test_in_a_part_tab_goes_from_one_to_the_next_and_keys_are_no_shortcuts_but_t
     assert not hand.main_view.work.view.layers[1].enabled, "shortcuts are back"
 
 
-def test_a_click_gives_the_keyboard_back_to_the_picture(hand: Rig) -> None:
+def test_click_returns_the_keyboard_to_the_picture(hand: Rig) -> None:
     strike(hand, "Tab")
     hand.click(300.0, 600.0)
     assert hand.main_view.work.keyboard == ""
@@ -86,8 +86,8 @@ def test_a_click_gives_the_keyboard_back_to_the_picture(hand: Rig) -> None:
     assert hand.strengths[-1] == pytest.approx(before - 0.01)
 
 
-def test_a_slider_with_the_keyboard_takes_arrows_and_enter_types_into_it(hand: Rig) -> None:
-    strike(hand, "Alt+G")  # rows, where there is something beside it
+def test_focused_slider_takes_arrows_and_enter_types_a_value(hand: Rig) -> None:
+    strike(hand, "Alt+G")  # compact rows, where other controls lie beside the slider
     strike(hand, "Tab")
     reach(hand, "##strength")
     at = focused()
@@ -108,7 +108,7 @@ def test_a_slider_with_the_keyboard_takes_arrows_and_enter_types_into_it(hand: R
     assert focused() not in (0, at)
 
 
-def test_menus_of_the_panel_open_and_close_by_keys(hand: Rig) -> None:
+def test_panel_menus_open_and_close_by_keys(hand: Rig) -> None:
     strike(hand, "Tab")
     reach(hand, "main menu")
     strike(hand, "Enter")
@@ -119,7 +119,7 @@ def test_menus_of_the_panel_open_and_close_by_keys(hand: Rig) -> None:
     assert hand.main_view.work.keyboard == "panel"
 
 
-def test_a_tool_is_taken_and_enter_picks_what_is_in_the_middle_of_the_picture(hand: Rig) -> None:
+def test_flood_tool_picks_the_middle_of_the_picture_by_enter(hand: Rig) -> None:
     for chord in (
         "F6",
         "F6",
@@ -147,9 +147,9 @@ def test_a_tool_is_taken_and_enter_picks_what_is_in_the_middle_of_the_picture(ha
     assert hand.main_view.work.view.selection.members == picked.members, "as a click there"
 
 
-def test_a_question_is_answered_by_tab_and_enter_and_enter_alone_takes_the_marked_button(hand: Rig) -> None:
+def test_question_is_answered_by_tab_and_enter(hand: Rig) -> None:
     options = DeliverOptions(640, 480)
-    for chords, width in ((("Enter",), 640), ((*["Tab"] * 8, "Enter"), 853)):  # the eighth is its shape 16:9
+    for chords, width in ((("Enter",), 640), ((*["Tab"] * 8, "Enter"), 853)):  # the eighth is 16:9
         hand.main_view.ask(Dialog("render_picture", "view.png", options=options))
         hand.settle()
         for chord in chords:
@@ -162,7 +162,7 @@ def test_a_question_is_answered_by_tab_and_enter_and_enter_alone_takes_the_marke
         strike(hand, "Escape")
 
 
-def test_with_reduced_motion_the_camera_jumps(hand: Rig) -> None:
+def test_camera_jumps_with_reduced_motion(hand: Rig) -> None:
     for on in (False, True):
         work = hand.main_view.work
         hand.main_view.work = replace(work, layout=replace(work.layout, reduced_motion=on), glide=None)

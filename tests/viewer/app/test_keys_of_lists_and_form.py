@@ -1,4 +1,4 @@
-"""While a list, a menu, a question or the form of a new edit is open, keys are its own."""
+"""An open list, menu, question or new-edit form takes all keys."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.gl
 
 WINDOW = (900, 700)
 LIST = (780.0, 139.0)
-"""Where the regions of the form are listed."""
+"""Window position of the form's region list."""
 NAMES = ("Right", "Left", "Up", "Down", "Enter", "Escape", "Tab", "Space", "Backspace", "Delete")
 TOKENS = {
     **{
@@ -36,7 +36,7 @@ MODIFIERS = {"Ctrl": imgui.Key.mod_ctrl, "Shift": imgui.Key.mod_shift, "Alt": im
 
 
 def strike(hand: Rig, chord: str) -> None:
-    """A key as the window hears it: imgui gets it, and our table."""
+    """Send a key to imgui and to the table of bindings, as the window does."""
     *held, name = chord.split("+")
     for down in (True, False):
         for modifier in held:
@@ -70,12 +70,12 @@ def hand() -> Iterator[Rig]:
 
 @pytest.fixture
 def form(hand: Rig) -> Rig:
-    """With the form open."""
+    """Return the rig with the new-edit form open."""
     strike(hand, "Ctrl+N")
     return hand
 
 
-def test_the_form_that_opens_takes_what_is_typed_and_enter_trains_it(form: Rig) -> None:
+def test_opened_form_takes_typed_text_and_enter_starts_training(form: Rig) -> None:
     before = form.main_view.work.view
     type_text(form, "red jacket")
     assert form.main_view.work.form.name == "red jacket"
@@ -85,7 +85,7 @@ def test_the_form_that_opens_takes_what_is_typed_and_enter_trains_it(form: Rig) 
     assert form.main_view.work.renaming is None
 
 
-def test_escape_closes_the_form_and_keeps_what_was_typed(form: Rig) -> None:
+def test_escape_closes_the_form_and_keeps_the_typed_name(form: Rig) -> None:
     focus = form.main_view.work.focus
     type_text(form, "hat")
     strike(form, "Escape")
@@ -95,7 +95,7 @@ def test_escape_closes_the_form_and_keeps_what_was_typed(form: Rig) -> None:
     assert not form.main_view.work.view.layers[1].enabled, "shortcuts are back"
 
 
-def test_tab_goes_through_the_form_both_ways_and_enter_presses_no_button_of_it(form: Rig) -> None:
+def test_tab_moves_through_the_form_and_enter_always_trains(form: Rig) -> None:
     seen = []
     for _ in range(30):
         seen.append(imgui.get_current_context().nav_id)
@@ -110,7 +110,7 @@ def test_tab_goes_through_the_form_both_ways_and_enter_presses_no_button_of_it(f
     assert form.main_view.take_requests() == ("train",)
 
 
-def test_a_slider_that_tab_comes_to_goes_by_arrows_and_types_nothing(form: Rig) -> None:
+def test_slider_focused_by_tab_moves_by_arrows(form: Rig) -> None:
     def strength() -> float:
         return form.main_view.work.form.strength
 
@@ -130,7 +130,7 @@ def test_a_slider_that_tab_comes_to_goes_by_arrows_and_types_nothing(form: Rig) 
     assert not imgui.is_any_item_active() or form.io.want_text_input
 
 
-def test_a_shift_that_ends_within_a_slow_frame_still_goes_with_its_tab(form: Rig) -> None:
+def test_shift_tab_within_one_slow_frame_moves_backwards(form: Rig) -> None:
     window = Window(cast(Splash, SimpleNamespace(handle=None, context=None)))
 
     def event(key: int, token: imgui.Key, down: bool) -> None:
@@ -150,7 +150,7 @@ def test_a_shift_that_ends_within_a_slow_frame_still_goes_with_its_tab(form: Rig
     assert not form.io.key_shift
 
 
-def test_a_list_takes_arrows_and_enter(form: Rig) -> None:
+def test_list_takes_arrows_and_enter(form: Rig) -> None:
     form.click(*LIST)
     assert list_is_open()
     before = form.main_view.work.view
@@ -163,7 +163,7 @@ def test_a_list_takes_arrows_and_enter(form: Rig) -> None:
     assert form.main_view.work.view == before
 
 
-def test_escape_closes_a_list_and_nothing_else(form: Rig) -> None:
+def test_escape_closes_only_the_list(form: Rig) -> None:
     work = form.main_view.work
     form.click(*LIST)
     strike(form, "Down")
@@ -176,7 +176,7 @@ def test_escape_closes_a_list_and_nothing_else(form: Rig) -> None:
 
 
 @pytest.mark.parametrize("what", ["menu", "list", "question", "form"])
-def test_no_shortcut_acts_while_something_is_open(hand: Rig, what: str) -> None:
+def test_no_shortcut_acts_while_a_menu_or_form_is_open(hand: Rig, what: str) -> None:
     if what in ("list", "form"):
         strike(hand, "Ctrl+N")
     if what == "list":
@@ -203,7 +203,7 @@ def test_no_shortcut_acts_while_something_is_open(hand: Rig, what: str) -> None:
         ), chord
 
 
-def test_the_menu_goes_by_arrows_into_its_lists_and_out(hand: Rig) -> None:
+def test_arrows_open_and_close_submenus(hand: Rig) -> None:
     hand.move(WINDOW[0] - 200.0, HEAD)  # a layer's card
     hand.press(1)
     hand.release(1)
@@ -224,7 +224,7 @@ def test_the_menu_goes_by_arrows_into_its_lists_and_out(hand: Rig) -> None:
     assert hand.main_view.work.focus is not None
 
 
-def test_escape_and_enter_in_a_list_of_a_question_leave_the_question(hand: Rig) -> None:
+def test_escape_and_enter_in_a_list_keep_the_question_open(hand: Rig) -> None:
     options = DeliverOptions(moves="scarf", can_move=("timeline", "scarf", "ears"))
     hand.main_view.ask(Dialog("render_film", "film.mp4", options=options))
     hand.frame(4)
@@ -248,7 +248,7 @@ def question(hand: Rig) -> DeliverOptions:
     return hand.main_view.work.dialog.options
 
 
-def test_a_field_that_merely_has_the_keyboard_covers_no_other_row_with_its_tip(hand: Rig) -> None:
+def test_keyboard_focus_alone_opens_no_tooltip(hand: Rig) -> None:
     hand.move(300.0, 300.0)
     strike(hand, "Ctrl+N")
     for _ in range(4):

@@ -1,4 +1,4 @@
-"""The whole interface, headless: real widgets, real engine, a scripted hand."""
+"""Whole interface without a window: real widgets, real engine and scripted input."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.gl
 VIEW = (170.0, 270.0)  # the middle of the picture
 
 
-def test_dragging_a_slider_changes_the_picture_and_makes_exactly_one_undo_entry(hand: Rig) -> None:
+def test_slider_drag_changes_the_picture_as_one_undo_entry(hand: Rig) -> None:
     before = hand.picture()
     hand.drag(hand.slider(0, 0.5), hand.slider(0, 1.0))
     assert hand.strengths == [1.0, 0.5]
@@ -29,13 +29,13 @@ def test_dragging_a_slider_changes_the_picture_and_makes_exactly_one_undo_entry(
     hand.key("Ctrl+Z")
     assert hand.strengths == [0.5, 0.5]
     hand.move(5.0, 5.0)
-    hand.rest()  # until what was undone is no longer said
+    hand.rest()  # until the undo message has disappeared
     assert np.array_equal(hand.picture(), before)
     hand.key("Ctrl+Shift+Z")
     assert hand.strengths == [1.0, 0.5]
 
 
-def test_every_step_of_a_drag_is_on_screen_in_the_frame_that_handled_it(hand: Rig) -> None:
+def test_every_drag_step_is_on_screen_in_its_own_frame(hand: Rig) -> None:
     hand.move(*hand.slider(0, 0.5))
     hand.press()
     for strength in (0.6, 0.8, 0.3):
@@ -46,7 +46,7 @@ def test_every_step_of_a_drag_is_on_screen_in_the_frame_that_handled_it(hand: Ri
     hand.release()
 
 
-def test_a_slow_frame_that_holds_a_whole_drag_still_ends_at_its_last_value(hand: Rig) -> None:
+def test_drag_within_one_slow_frame_ends_at_its_last_value(hand: Rig) -> None:
     hand.move(*hand.slider(0, 0.5))
     hand.io.add_mouse_button_event(0, True)
     for strength in (0.6, 0.7, 0.9):
@@ -59,22 +59,22 @@ def test_a_slow_frame_that_holds_a_whole_drag_still_ends_at_its_last_value(hand:
     assert len(hand.main_view.work.past.past) == 1
 
 
-def test_idle_draws_nothing_and_waits_for_ever(hand: Rig) -> None:
-    hand.rest()  # the frames that tooltips get
+def test_idle_window_draws_nothing_and_waits(hand: Rig) -> None:
+    hand.rest()  # frames reserved for tooltips
     drawn = hand.main_view.canvas.pictures_drawn
     frames = hand.main_view.frames
     assert hand.main_view.next_frame_delay() is None
     assert (hand.main_view.canvas.pictures_drawn, hand.main_view.frames) == (drawn, frames)
 
 
-def test_moving_the_mouse_draws_the_interface_but_no_splats(hand: Rig) -> None:
+def test_mouse_move_draws_the_interface_but_no_splats(hand: Rig) -> None:
     drawn = hand.main_view.canvas.pictures_drawn
     for x in range(20, 600, 40):
         hand.move(x, 100.0)
     assert hand.main_view.canvas.pictures_drawn == drawn == 1
 
 
-def test_the_camera_is_not_in_the_undo_stack(hand: Rig) -> None:
+def test_camera_is_not_in_the_undo_stack(hand: Rig) -> None:
     hand.drag(VIEW, (VIEW[0] + 40, VIEW[1] + 10))
     moved = hand.main_view.work.view.camera
     assert hand.main_view.work.past.past == ()
@@ -83,7 +83,7 @@ def test_the_camera_is_not_in_the_undo_stack(hand: Rig) -> None:
     assert hand.main_view.work.view.camera == moved
 
 
-def test_f2_saves_the_picture_without_the_interface_and_says_where(tmp_path: Path) -> None:
+def test_f2_saves_the_picture_without_the_interface(tmp_path: Path) -> None:
     with rig(pictures=tmp_path) as hand:
         shown = hand.picture()
         hand.key("F2")
@@ -102,7 +102,7 @@ def test_f2_saves_the_picture_without_the_interface_and_says_where(tmp_path: Pat
         assert str(second) in message.text
 
 
-def test_the_view_taken_to_be_changed_shows_no_edit_and_all_that_is_hidden(tmp_path: Path) -> None:
+def test_view_saved_for_painting_shows_the_whole_original(tmp_path: Path) -> None:
     with rig(pictures=tmp_path) as hand:
         hand.drag(hand.slider(0, 0.5), hand.slider(0, 0.0))
         hand.drag(hand.slider(1, 0.5), hand.slider(1, 0.0))
@@ -116,7 +116,7 @@ def test_the_view_taken_to_be_changed_shows_no_edit_and_all_that_is_hidden(tmp_p
         find_picture_camera(taken)
 
 
-def test_a_picture_that_cannot_be_saved_is_one_line_and_the_window_goes_on(tmp_path: Path) -> None:
+def test_picture_that_cannot_be_saved_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "gone").touch()
     with rig(pictures=tmp_path / "gone") as hand:
         hand.key("F2")
@@ -127,7 +127,7 @@ def test_a_picture_that_cannot_be_saved_is_one_line_and_the_window_goes_on(tmp_p
         hand.frame()
 
 
-def test_messages_leave_by_themselves(hand: Rig) -> None:
+def test_messages_disappear_by_themselves(hand: Rig) -> None:
     hand.main_view.show_message("hello")
     hand.settle()
     assert hand.main_view.next_frame_delay() is not None
@@ -135,7 +135,7 @@ def test_messages_leave_by_themselves(hand: Rig) -> None:
     assert hand.main_view.work.message is None
 
 
-def test_a_splash_says_what_is_opened_and_since_when_and_that_it_goes_on(hand: Rig) -> None:
+def test_splash_shows_the_file_elapsed_seconds_and_progress(hand: Rig) -> None:
     drawn = hand.main_view.canvas.pictures_drawn
     images = []
     picture = SplashPicture(hand.screen.ctx)
@@ -159,7 +159,7 @@ def test_f12_gives_the_whole_window_to_the_picture(hand: Rig) -> None:
 
 
 @pytest.mark.parametrize(("points", "density", "scale"), [((640, 400), 2.0, 1.0), ((1280, 800), 1.0, 2.0)])
-def test_the_picture_has_the_framebuffers_pixels_on_a_dense_screen(
+def test_picture_uses_the_framebuffer_pixels_on_a_dense_screen(
     points: tuple[int, int], density: float, scale: float
 ) -> None:
     with rig(points=points, density=density, scale=scale) as hand:
@@ -169,7 +169,7 @@ def test_the_picture_has_the_framebuffers_pixels_on_a_dense_screen(
 
 
 @pytest.mark.parametrize("draw", ["gl", "cpu"])
-def test_interface_and_splats_leave_each_others_gl_state_alone(draw: str) -> None:
+def test_interface_and_splats_keep_their_gl_states_apart(draw: str) -> None:
     with rig(draw=draw) as hand:
         panel_before = hand.image()[:480, 340:]
         hand.key("F1")
@@ -186,7 +186,7 @@ def test_interface_and_splats_leave_each_others_gl_state_alone(draw: str) -> Non
     assert np.array_equal(used[:480, 340:], panel_before), "all but the undo buttons"
 
 
-def test_a_new_size_of_the_window_is_drawn_at_once(hand: Rig) -> None:
+def test_resized_window_is_drawn_at_once(hand: Rig) -> None:
     hand.pixels = hand.points = (500, 300)
     hand.io.display_size = imgui.ImVec2(500, 300)
     hand.screen = hand.main_view.context.simple_framebuffer((500, 300))
@@ -195,14 +195,14 @@ def test_a_new_size_of_the_window_is_drawn_at_once(hand: Rig) -> None:
     assert np.abs(hand.picture()[:, :200] - np.clip(image, 0, 1) * 255).max() <= 0.51
 
 
-def test_a_window_narrower_than_the_panel_survives(hand: Rig) -> None:
+def test_window_narrower_than_the_panel_survives(hand: Rig) -> None:
     hand.io.display_size = imgui.ImVec2(200, 100)
     hand.screen = hand.main_view.context.simple_framebuffer((200, 100))
     hand.pixels = (200, 100)
     hand.frame(3)
 
 
-def test_an_unknown_layer_count_needs_no_scene(hand: Rig) -> None:
+def test_view_without_layers_accepts_layer_keys(hand: Rig) -> None:
     hand.main_view.restart(replace(hand.main_view.work.view, layers=()))
     hand.settle()
     assert hand.main_view.work.focus is None

@@ -1,4 +1,4 @@
-"""What mouse and keys do on the main view, headless: drags, clicks, the wheel, chords, held keys."""
+"""Mouse and keys on the main view without a window: drags, clicks, wheel, chords and held keys."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.gl
 VIEW = (170.0, 270.0)  # the middle of the picture
 
 
-def test_a_slow_frame_that_holds_a_whole_orbit_still_turns_the_camera(hand: Rig) -> None:
+def test_orbit_within_one_slow_frame_turns_the_camera(hand: Rig) -> None:
     before = hand.main_view.work.view.camera
     hand.move(*VIEW)
     hand.io.add_mouse_button_event(0, True)
@@ -28,20 +28,20 @@ def test_a_slow_frame_that_holds_a_whole_orbit_still_turns_the_camera(hand: Rig)
     assert hand.main_view.work.view.camera.azimuth == pytest.approx(before.azimuth - 15.0)
 
 
-def test_a_slow_frame_that_holds_several_chords_does_all_in_their_order(hand: Rig) -> None:
+def test_chords_within_one_slow_frame_run_in_order(hand: Rig) -> None:
     hand.drag(hand.slider(0, 0.5), hand.slider(0, 0.8))
     hand.frame(keys=Keys((Press("Ctrl+Z"), Press("1"), Press("Right"))))
     assert hand.strengths == pytest.approx([0.5, 0.51])
 
 
-def test_a_drag_that_begins_on_the_picture_goes_on_over_the_panel(hand: Rig) -> None:
+def test_drag_from_the_picture_continues_over_the_panel(hand: Rig) -> None:
     azimuth = hand.main_view.work.view.camera.azimuth
     hand.drag((300.0, TRACK), (500.0, TRACK))
     assert hand.strengths == [0.5, 0.5]
     assert hand.main_view.work.view.camera.azimuth == pytest.approx(azimuth - 60.0)
 
 
-def test_a_drag_that_begins_on_a_slider_does_not_turn_the_camera(hand: Rig) -> None:
+def test_drag_from_a_slider_does_not_orbit_the_camera(hand: Rig) -> None:
     before = hand.main_view.work.view.camera
     hand.drag(hand.slider(1, 0.5), VIEW)
     assert hand.main_view.work.view.camera == before
@@ -58,7 +58,7 @@ def test_a_drag_that_begins_on_a_slider_does_not_turn_the_camera(hand: Rig) -> N
     ],
     ids=["middle orbits", "Shift+middle pans", "Ctrl+middle dollies", "right pans"],
 )
-def test_the_other_buttons_do_what_the_table_says(
+def test_middle_and_right_drags_match_the_bindings(
     hand: Rig, button: int, modifier: imgui.Key | None, kept: str
 ) -> None:
     before = hand.main_view.work.view.camera
@@ -87,7 +87,7 @@ def test_right_drag_looks_around_while_flying(hand: Rig) -> None:
     assert after.pivot != before.pivot
 
 
-def test_the_wheel_zooms_over_the_picture_and_only_scrolls_over_the_panel(hand: Rig) -> None:
+def test_wheel_zooms_over_the_picture_and_scrolls_the_panel(hand: Rig) -> None:
     distance = hand.main_view.work.view.camera.distance
     hand.wheel(500.0, 300.0, 2.0)
     assert hand.main_view.work.view.camera.distance == distance
@@ -95,7 +95,7 @@ def test_the_wheel_zooms_over_the_picture_and_only_scrolls_over_the_panel(hand: 
     assert hand.main_view.work.view.camera.distance < distance
 
 
-def test_a_double_click_on_the_bear_makes_its_surface_the_pivot(hand: Rig) -> None:
+def test_double_click_on_the_bear_sets_the_pivot_on_its_surface(hand: Rig) -> None:
     before = hand.main_view.work.view.camera
     hand.double_click(170.0, 150.0)
     after = hand.main_view.work.view.camera
@@ -104,13 +104,13 @@ def test_a_double_click_on_the_bear_makes_its_surface_the_pivot(hand: Rig) -> No
     assert np.linalg.norm(after.pivot) < 2.0, "on the bear, not behind it"
 
 
-def test_a_double_click_on_the_background_leaves_the_pivot(hand: Rig) -> None:
+def test_double_click_on_the_background_keeps_the_pivot(hand: Rig) -> None:
     before = hand.main_view.work.view.camera
     hand.double_click(20.0, 20.0)
     assert hand.main_view.work.view.camera == before
 
 
-def test_backslash_shows_the_original_and_again_the_edit() -> None:
+def test_backslash_toggles_between_original_and_edit() -> None:
     with rig(first_view(bear(), 0.0, 0.0)) as untouched:
         original = untouched.picture()
     with rig() as hand:
@@ -134,13 +134,13 @@ def test_backslash_shows_the_original_and_again_the_edit() -> None:
     ],
 )
 def test_arrows_step_the_focused_strength(hand: Rig, chord: str, change: float) -> None:
-    hand.key("1")  # the top card: the last layer
+    hand.key("1")  # the top card, which is the last layer
     hand.key(chord)
     assert hand.strengths == pytest.approx([0.5, 0.5 + change], abs=1e-9)
     assert len(hand.main_view.work.past.past) == 1
 
 
-def test_a_held_arrow_repeats_and_is_one_undo_entry(hand: Rig) -> None:
+def test_held_arrow_repeats_and_is_one_undo_entry(hand: Rig) -> None:
     for again in (False, True, True, True):
         hand.frame(keys=Keys((Press("Right", again),), held=frozenset({"Right"})))
         hand.frame(keys=Keys(held=frozenset({"Right"})))
@@ -150,7 +150,7 @@ def test_a_held_arrow_repeats_and_is_one_undo_entry(hand: Rig) -> None:
     assert len(hand.main_view.work.past.past) == 1
 
 
-def test_a_held_letter_does_not_switch_to_and_fro(hand: Rig) -> None:
+def test_held_letter_does_not_toggle_repeatedly(hand: Rig) -> None:
     for again in (False, True):
         hand.frame(keys=Keys((Press("V", again),), held=frozenset({"V"})))
     assert hand.main_view.work.view.camera.mode == "fly"
@@ -167,7 +167,7 @@ def test_number_keys_focus_layers_and_with_shift_hide_them(hand: Rig) -> None:
     assert [layer.enabled for layer in hand.main_view.work.view.layers] == [False, False]
 
 
-def test_a_layer_that_is_focused_by_key_is_scrolled_into_sight() -> None:
+def test_layer_focused_by_key_is_scrolled_into_view() -> None:
     layers = tuple(LayerState(i % 2, f"layer {i}", 0.5) for i in range(9))
     with rig(replace(first_view(bear()), layers=layers, cards="full")) as hand:
         hand.key("9")
@@ -179,7 +179,7 @@ def test_a_layer_that_is_focused_by_key_is_scrolled_into_sight() -> None:
         assert not hand.main_view.work.view.layers[0].enabled
 
 
-def test_a_text_field_owns_the_keys(hand: Rig) -> None:
+def test_text_field_takes_all_keys(hand: Rig) -> None:
     hand.modifier(imgui.Key.mod_ctrl)
     hand.move(*hand.slider(0, 0.2))
     hand.press()
@@ -192,7 +192,7 @@ def test_a_text_field_owns_the_keys(hand: Rig) -> None:
     assert hand.main_view.work.view.camera == before
 
 
-def test_f_frames_the_focused_layer_and_with_none_the_scene_in_this_window(hand: Rig) -> None:
+def test_f_frames_the_focused_layer_or_the_whole_scene(hand: Rig) -> None:
     home = hand.main_view.work.view.camera
     hand.key("F")
     framed = hand.main_view.work.view.camera
@@ -207,7 +207,7 @@ def test_f_frames_the_focused_layer_and_with_none_the_scene_in_this_window(hand:
     assert hand.main_view.work.view.camera == home
 
 
-def test_w_flies_ahead_and_s_comes_back(hand: Rig) -> None:
+def test_w_flies_ahead_and_s_flies_back(hand: Rig) -> None:
     home = hand.main_view.work.view.camera
     hand.frame(10, keys=Keys(fly=frozenset("W")))
     patience = hand.main_view.next_frame_delay()

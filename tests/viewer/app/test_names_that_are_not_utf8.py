@@ -1,4 +1,4 @@
-"""Files whose names are no text: the window shows them with an escape and goes on."""
+"""File names that are not UTF-8 are shown with escapes and cause no crash."""
 
 from __future__ import annotations
 
@@ -29,15 +29,13 @@ def opened(tmp_path: Path) -> Iterator[application.App]:
         yield app
 
 
-def test_the_title_and_the_recent_files_are_shown_and_the_file_is_found_again(
-    opened: application.App, tmp_path: Path
-) -> None:
+def test_title_and_recent_files_show_such_a_name(opened: application.App, tmp_path: Path) -> None:
     assert opened.document.title == "b\\udce4r.ply"
     press(opened, "Ctrl+O")
     assert opened.main_view.recent == (opened.document.path,) == user_files.read_recent()
 
 
-def test_saving_says_in_one_line_that_a_session_cannot_name_it(opened: application.App) -> None:
+def test_saving_a_session_explains_that_it_cannot_name_the_file(opened: application.App) -> None:
     press(opened, "Ctrl+S")
     dialog = opened.main_view.work.dialog
     assert dialog is not None
@@ -48,7 +46,7 @@ def test_saving_says_in_one_line_that_a_session_cannot_name_it(opened: applicati
     assert "it is not UTF-8; rename it" in dialog.error
 
 
-def test_a_message_with_such_a_name_is_shown(opened: application.App, tmp_path: Path) -> None:
+def test_message_with_such_a_name_is_shown(opened: application.App, tmp_path: Path) -> None:
     opened.open(tmp_path / os.fsdecode(b"no\xff.gdf"))
     opened.draw()
     message = opened.main_view.work.message

@@ -1,4 +1,4 @@
-"""The desktop's own file dialogs, with a program of ours in the place of the desktop's."""
+"""Native file dialogs of the desktop, replaced by a scripted program."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ pytestmark = [
 
 @dataclass(frozen=True)
 class Desktop:
-    """The application, and a program that answers for the person."""
+    """Application with a stub of the desktop's dialog program."""
 
     app: App
     folder: Path
 
     def answers(self, script: str) -> None:
-        """What the program `zenity` does from now on; "$@" is what it was asked."""
+        """Set the shell script that `zenity` runs from now on; "$@" are its arguments."""
         program = self.folder / "bin" / "zenity"
         program.write_text(f'#!/bin/sh\necho "$@" > "{self.folder}/asked"\n{script}\n')
         program.chmod(0o755)
@@ -43,7 +43,7 @@ class Desktop:
         return (self.folder / "asked").read_text()
 
     def until_answered(self) -> None:
-        """The window's loop, as long as the program is on screen; it never waits longer than a poll."""
+        """Run the window's loop while the dialog is open; no wait exceeds the polling interval."""
         end = time.monotonic() + 60.0
         while self.app.file_actions.poll_dialog() is not None:
             assert time.monotonic() < end
@@ -78,7 +78,7 @@ def question(desktop: Desktop) -> Dialog:
     return asked
 
 
-def test_a_file_chosen_in_the_desktops_dialog_is_opened(desktop: Desktop) -> None:
+def test_file_chosen_in_the_native_dialog_is_opened(desktop: Desktop) -> None:
     ears = desktop.folder / "work" / "ears.gdf"
     desktop.answers(f'echo "{ears}"')
     press(desktop.app, "Ctrl+O", "Ctrl+B")
@@ -89,7 +89,7 @@ def test_a_file_chosen_in_the_desktops_dialog_is_opened(desktop: Desktop) -> Non
     assert str(desktop.folder / "work") in desktop.asked, "it begins beside the scene"
 
 
-def test_a_place_chosen_in_the_desktops_dialog_is_saved_to(desktop: Desktop) -> None:
+def test_path_chosen_in_the_native_dialog_is_saved_to(desktop: Desktop) -> None:
     there = desktop.folder / "work" / "chosen.session.json"
     desktop.answers(f'echo "{there}"')
     press(desktop.app, "Shift+Left", "Ctrl+S", "Ctrl+B")
@@ -99,7 +99,7 @@ def test_a_place_chosen_in_the_desktops_dialog_is_saved_to(desktop: Desktop) -> 
     assert not desktop.app.file_actions.has_unsaved
 
 
-def test_canceling_it_leaves_the_question_with_what_was_typed(desktop: Desktop) -> None:
+def test_canceled_native_dialog_keeps_the_typed_path(desktop: Desktop) -> None:
     press(desktop.app, "Ctrl+S")
     typed = question(desktop).text
     press(desktop.app, "Ctrl+B")
@@ -109,7 +109,7 @@ def test_canceling_it_leaves_the_question_with_what_was_typed(desktop: Desktop) 
     assert Path(typed).is_file(), "the path field still does its work"
 
 
-def test_the_window_goes_on_while_it_is_open_and_takes_it_away_when_it_answers_itself(
+def test_window_stays_responsive_and_escape_closes_the_dialog(
     desktop: Desktop,
 ) -> None:
     desktop.answers(f'echo $$ > "{desktop.folder}/pid"\nexec sleep 600')
@@ -128,7 +128,7 @@ def test_the_window_goes_on_while_it_is_open_and_takes_it_away_when_it_answers_i
     assert not alive(int(pid.read_text()))
 
 
-def test_closing_the_window_takes_it_away(desktop: Desktop) -> None:
+def test_closing_the_window_closes_the_native_dialog(desktop: Desktop) -> None:
     desktop.answers(f'echo $$ > "{desktop.folder}/pid"\nexec sleep 600')
     press(desktop.app, "Ctrl+O", "Ctrl+B")
     pid = desktop.folder / "pid"
@@ -139,7 +139,7 @@ def test_closing_the_window_takes_it_away(desktop: Desktop) -> None:
 
 
 def alive(pid: int) -> bool:
-    """Whether a process runs; one that ended and was not yet asked about does not."""
+    """Return True while a process runs; zombies count as ended."""
     end = time.monotonic() + 10.0
     while time.monotonic() < end:
         try:
@@ -152,7 +152,7 @@ def alive(pid: int) -> bool:
     return True
 
 
-def test_without_such_a_program_one_line_says_so_and_the_path_field_stays(
+def test_missing_dialog_program_is_explained_beside_the_path_field(
     desktop: Desktop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", str(desktop.folder / "nothing"))
@@ -168,7 +168,7 @@ def test_without_such_a_program_one_line_says_so_and_the_path_field_stays(
 
 
 @pytest.mark.parametrize("kind", ["open", "save"])
-def test_the_button_beside_the_path_field_asks_for_it(kind: str) -> None:
+def test_browse_button_requests_the_native_dialog(kind: str) -> None:
     with rig(points=(900, 640)) as hand:
         hand.main_view.ask(Dialog(kind, "/tmp/x"))
         hand.settle()

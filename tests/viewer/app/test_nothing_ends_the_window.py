@@ -1,4 +1,4 @@
-"""Whatever a part of the window raises, the window goes on, says so, and keeps the unsaved work."""
+"""No exception ends the window: it continues, reports the error and keeps unsaved work."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ DRAWN = {
     "the axes": (overlay, "draw_axes"),
     "the keys": (interface, "_column"),
 }
-"""Parts of a frame, each by what is replaced with something that raises."""
+"""Parts of a frame, each with the function that is replaced by one that raises."""
 
 
 class BrokenError(Exception):
-    """A mistake of ours."""
+    """An error in our own code."""
 
 
 def raises(error: Exception) -> Callable[..., Any]:
@@ -67,7 +67,7 @@ def window(tmp_path: Path) -> Iterator[application.App]:
 
 
 def turns(app: application.App, count: int = 3) -> list[float | None]:
-    """So many turns of the window's loop, in each of which something comes in; what it would have waited."""
+    """Run `count` turns of the window's loop, each with new input; return the wait times."""
     waits: list[float | None] = []
 
     def wait(seconds: float | None) -> None:
@@ -91,21 +91,23 @@ def log(folder: Path) -> str:
     return (state_folder() / LOG).read_text()
 
 
-def test_no_action_ends_the_window(
+def test_failing_action_does_not_end_the_window(
     window: application.App, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ACTIONS:
         before = window.main_view.work.view
         with monkeypatch.context() as broken:
             broken.setattr(interface, "perform", raises(BrokenError(f"in {name}")))
-            window.main_view.frames += 2  # not what failed before and goes on
+            window.main_view.frames += 2  # separates this failure from the previous one
             window.main_view._perform(name)
         assert message(window).text.startswith(f"Internal error (BrokenError: in {name});")
         assert window.main_view.work.view == before
     assert log(tmp_path).count("Traceback") == 1, "all at the same place"
 
 
-def test_no_request_ends_the_window(window: application.App, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failing_request_does_not_end_the_window(
+    window: application.App, monkeypatch: pytest.MonkeyPatch
+) -> None:
     window.requests = dict.fromkeys(window.requests, raises(BrokenError("in a request")))
     monkeypatch.setattr(window.main_view, "_save", raises(BrokenError("in a request")))
     for request in (*window.requests, *exports.REQUESTS):
@@ -116,7 +118,7 @@ def test_no_request_ends_the_window(window: application.App, monkeypatch: pytest
 
 
 @pytest.mark.parametrize("part", DRAWN)
-def test_a_part_of_a_frame_that_fails_each_time_leaves_the_others_as_they_are(
+def test_failing_part_of_a_frame_leaves_the_others_unchanged(
     window: application.App, part: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     press(window, "F5", "K", "Shift+Left", "F1")
@@ -146,7 +148,7 @@ def test_a_part_of_a_frame_that_fails_each_time_leaves_the_others_as_they_are(
     assert window.main_view.work.message is None, "imgui is as it was"
 
 
-def test_a_picture_that_cannot_be_drawn_leaves_the_panel_and_undo(
+def test_failing_picture_keeps_the_panel_and_undo(
     window: application.App, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     press(window, "Shift+Left")
@@ -164,7 +166,7 @@ def test_a_picture_that_cannot_be_drawn_leaves_the_panel_and_undo(
 
 
 @pytest.mark.parametrize("part", ["jobs", "preview", "start", "up"])
-def test_no_job_ends_the_window_and_it_is_looked_at_again(
+def test_failing_job_is_polled_again(
     window: application.App, part: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(getattr(window, part), "poll", raises(BrokenError("a job")))
@@ -173,7 +175,7 @@ def test_no_job_ends_the_window_and_it_is_looked_at_again(
     assert all(wait is not None and wait <= application.RETRY_S for wait in waits)
 
 
-def test_what_the_person_can_mend_is_one_line_without_a_log(
+def test_user_error_is_one_line_without_a_log(
     window: application.App, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for error, line in (
@@ -189,7 +191,7 @@ def test_what_the_person_can_mend_is_one_line_without_a_log(
     assert not (state_folder() / LOG).exists()
 
 
-def test_unsaved_work_is_kept_at_once_and_the_details_are_copied(
+def test_error_saves_unsaved_work_and_details_can_be_copied(
     window: application.App, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     press(window, "Shift+Left")
@@ -207,7 +209,7 @@ def test_unsaved_work_is_kept_at_once_and_the_details_are_copied(
     assert message(window).text.startswith("Copied")
 
 
-def test_work_that_cannot_be_kept_is_told(window: application.App, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_emergency_save_is_reported(window: application.App, monkeypatch: pytest.MonkeyPatch) -> None:
     press(window, "Shift+Left")
     monkeypatch.setattr(session, "save", raises(OSError(28, "No space left on device")))
     window.report(BrokenError("at last"))

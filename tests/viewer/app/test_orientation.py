@@ -1,4 +1,4 @@
-"""Axes, named views, the grid on the ground, which way is up, and moving while a tool is on."""
+"""Axes, named views, ground grid, up axis, and moving the camera while a tool is active."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from viewer.ui import overlay
 from viewer.ui.keys import Keys, Press
 
 pytestmark = pytest.mark.gl
-CENTER = 340.0 - 56.5  # of the axes, from the left; and 56.5 from above
+CENTER = 340.0 - 56.5  # of the axes: x from the left, y is 56.5
 
 
-def test_axes_are_clicked_and_dragged_and_leave_with_the_panel() -> None:
+def test_axes_are_clicked_and_dragged_and_hidden_with_the_panel() -> None:
     with rig(replace(first_view(bear(), 0.5), axes=True)) as hand:
         work = lambda: hand.main_view.work  # noqa: E731
         start = work().view.camera
@@ -52,7 +52,7 @@ def test_axes_are_clicked_and_dragged_and_leave_with_the_panel() -> None:
         assert work().view.camera == turned
 
 
-def test_numbers_look_from_the_sides_and_the_way_there_takes_a_moment() -> None:
+def test_number_keys_turn_smoothly_to_the_side_views() -> None:
     with rig() as hand:
         home = hand.main_view.work.view.camera
         seen = {
@@ -77,7 +77,7 @@ def test_numbers_look_from_the_sides_and_the_way_there_takes_a_moment() -> None:
         assert hand.main_view.work.view.camera == home
 
 
-def test_f_frames_what_is_selected_first() -> None:
+def test_f_frames_the_selection_first() -> None:
     labels = bear().demo.labels.numpy()
     kept = selection.select(selection.SelectionState(), labels == 1)
     with rig(replace(first_view(bear(), 0.5, 0.5), selection=kept)) as hand:
@@ -91,7 +91,7 @@ def test_f_frames_what_is_selected_first() -> None:
 
 
 @pytest.mark.parametrize("chord", ["B", "L"])
-def test_alt_turns_the_camera_while_a_tool_is_on(chord: str) -> None:
+def test_alt_orbits_the_camera_while_a_tool_is_active(chord: str) -> None:
     with rig() as hand:
         before = hand.main_view.work.view
         hand.key(chord)
@@ -103,7 +103,7 @@ def test_alt_turns_the_camera_while_a_tool_is_on(chord: str) -> None:
         assert (after.layers, after.selection) == (before.layers, before.selection)
 
 
-def test_the_grid_lies_behind_what_stands_on_it_whatever_draws_and_saved_pictures_have_none(
+def test_grid_is_occluded_by_splats_and_missing_from_saved_pictures(
     tmp_path: Path,
 ) -> None:
     head = selection.select(selection.SelectionState(), np.isin(bear().demo.labels.numpy(), (1, 2)))
@@ -134,7 +134,7 @@ def test_the_grid_lies_behind_what_stands_on_it_whatever_draws_and_saved_picture
     assert np.abs(lined["cpu"] - lined["gl"]).mean() < 0.5
 
 
-def test_a_scene_that_does_not_tell_which_way_is_up_says_so_until_somebody_sets_it(tmp_path: Path) -> None:
+def test_guessed_up_axis_is_reported_until_the_user_sets_it(tmp_path: Path) -> None:
     save_ply(tmp_path / "cloud.ply", random_gaussians(300, scale=0.2))
     cloud = load(tmp_path / "cloud.ply")
     first = ViewState(camera=first_camera(cloud.scene, up=cloud.detected_up.direction))

@@ -1,4 +1,4 @@
-"""The window lies on the screen: on any monitor, at any scale."""
+"""The window fits on the screen of any monitor at any scale."""
 
 from __future__ import annotations
 
@@ -21,43 +21,43 @@ TITLED = Frame(left=1, top=30, right=1, bottom=1)
 
 
 @pytest.mark.parametrize("scale", [1.5, 2.0, 3.0])
-def test_a_scaled_window_fits_a_small_screen(scale: float) -> None:
+def test_scaled_window_fits_a_small_screen(scale: float) -> None:
     window = Box(0, 0, round(1280 * scale), round(800 * scale))
     assert fit_box(window, Frame(), [HD]) == HD
     assert fit_box(window, TITLED, [HD]) == Box(1, 30, 1278, 689)
 
 
-def test_a_window_that_fits_stays_as_it_is() -> None:
+def test_window_that_fits_is_unchanged() -> None:
     window = Box(100, 40, 800, 600)
     assert fit_box(window, TITLED, [HD]) == window
 
 
-def test_a_panel_of_the_desktop_stays_free() -> None:
+def test_desktop_panel_stays_free() -> None:
     area = Box(60, 32, 1220, 688)
     assert fit_box(Box(0, 0, 2560, 1600), TITLED, [area]) == Box(61, 62, 1218, 657)
 
 
-def test_a_window_stays_on_its_monitor() -> None:
+def test_window_stays_on_its_monitor() -> None:
     assert fit_box(Box(1300, 100, 2560, 1600), Frame(), [HD, BESIDE]) == BESIDE
     assert fit_box(Box(1000, 100, 600, 400), Frame(), [HD, BESIDE]) == Box(1280, 100, 600, 400)
 
 
-def test_a_place_on_a_missing_monitor_moves_to_the_primary_one() -> None:
+def test_position_on_a_missing_monitor_moves_to_the_primary_one() -> None:
     assert fit_box(Box(1500, 200, 1000, 700), TITLED, [HD]) == Box(279, 30, 1000, 689)
     assert fit_box(Box(-3000, -900, 500, 300), Frame(), [HD]) == Box(0, 0, 500, 300)
 
 
-def test_a_monitor_left_of_the_primary_one_has_negative_places() -> None:
+def test_monitor_left_of_the_primary_one_has_negative_positions() -> None:
     left = Box(-1920, 0, 1920, 1080)
     assert fit_box(Box(-1000, 500, 1280, 800), Frame(), [HD, left]) == Box(-1280, 280, 1280, 800)
 
 
-def test_without_a_work_area_the_window_stays() -> None:
+def test_window_is_unchanged_without_a_work_area() -> None:
     window = Box(7, 8, 2560, 1600)
     assert fit_box(window, TITLED, []) == window
 
 
-def test_a_monitor_without_a_work_area_counts_as_a_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_monitor_without_a_work_area_is_used_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     with null_platform():
         whole = glfw.get_video_mode(glfw.get_primary_monitor()).size
         monkeypatch.setattr(glfw, "get_monitor_workarea", lambda monitor: (0, 0, 0, 0))
@@ -84,7 +84,7 @@ print(*glfw.get_window_size(window.handle), round(window.ui_scale, 2))
 
 @pytest.fixture(scope="module")
 def small_screen() -> Iterator[str]:
-    """The name of a virtual display of 600x450 pixels."""
+    """Start a virtual display of 600x450 pixels; yield its name."""
     if missing := missing_tools():
         pytest.skip(f"{missing} is not installed")
     with display(600, 450) as name:
@@ -93,7 +93,7 @@ def small_screen() -> Iterator[str]:
 
 @pytest.mark.window
 @pytest.mark.gl
-def test_the_real_window_is_no_larger_than_the_screen(small_screen: str) -> None:
+def test_real_window_is_no_larger_than_the_screen(small_screen: str) -> None:
     environment = os.environ | {"DISPLAY": small_screen}
     environment.pop("WAYLAND_DISPLAY", None)
     command = [sys.executable, "-c", OPENED, *map(str, SIZE)]

@@ -1,4 +1,4 @@
-"""Where things are: the tools beside the picture, the comparison over it, the panel's width and jobs."""
+"""Layout of the window: tools, options bar, comparison pill, panel width, cards and jobs."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def hand() -> Iterator[Rig]:
 
 
 def tool_place(action: str) -> tuple[float, float]:
-    """Where the button of a tool is."""
+    """Return the window position of a tool's button."""
     above = next(i for i, group in enumerate(tools._TOOLS) if action in [name for name, *_ in group])
     return 28.0, 12.0 + 16.0 + 32.0 * ACTIONS.index(action) + 6.0 * above
 
@@ -44,7 +44,7 @@ def window_at(name: str) -> imgui.internal.Window:
     return next(window for window in found if window.name == name and window.active)
 
 
-def test_the_tools_beside_the_picture_are_taken_and_put_down(hand: Rig) -> None:
+def test_tool_buttons_activate_and_deactivate_tools(hand: Rig) -> None:
     for action in ACTIONS[2:9]:
         hand.click(*tool_place(action))
         assert f"select_tool:{hand.main_view.work.view.select.tool}" == action
@@ -64,7 +64,7 @@ def test_the_tools_beside_the_picture_are_taken_and_put_down(hand: Rig) -> None:
     assert hand.main_view.take_requests() == ("decal",)
 
 
-def test_the_bar_over_the_picture_is_there_while_a_tool_or_a_selection_is() -> None:
+def test_options_bar_appears_with_a_tool_or_a_selection() -> None:
     mask = bear().demo.labels.numpy() == 1
     view = replace(first_view(bear(), 0.5), selection=selection.select(SelectionState(), mask))
     with rig(view, SIZE) as hand:
@@ -88,13 +88,13 @@ def test_the_bar_over_the_picture_is_there_while_a_tool_or_a_selection_is() -> N
 
 
 @pytest.mark.parametrize("count", [9, 10])
-def test_where_the_last_card_would_be_cut_below_the_search_there_are_rows(count: int) -> None:
+def test_cards_become_rows_if_the_last_card_would_be_cut(count: int) -> None:
     stack, view = many_edits(bear(), count)
     with rig(view, (1280, 800), stack=stack) as hand:
         assert hand.main_view.work.cards_fit == (count == 9)
 
 
-def test_six_layers_have_whole_cards_of_two_lines_without_scrolling() -> None:
+def test_six_layers_have_whole_cards_without_scrolling() -> None:
     stack, view = many_edits(bear(), 6)
     with rig(view, SIZE, stack=stack) as hand:
         assert hand.main_view.work.cards_fit
@@ -107,7 +107,7 @@ def test_six_layers_have_whole_cards_of_two_lines_without_scrolling() -> None:
         assert max(window.size.y for window in cards) <= 64.0
 
 
-def test_the_pill_shows_the_original_and_splits_the_picture(hand: Rig) -> None:
+def test_comparison_pill_shows_the_original_and_splits_the_view(hand: Rig) -> None:
     pill = window_at("comparison")
     y = pill.pos.y + 16.0
     left = pill.pos.x
@@ -130,7 +130,7 @@ def test_sections_fold_and_open(hand: Rig) -> None:
     assert hand.main_view.work.layout.folded == ()
 
 
-def test_the_edge_of_the_panel_is_dragged_within_its_limits(hand: Rig) -> None:
+def test_panel_edge_is_dragged_within_its_limits(hand: Rig) -> None:
     hand.drag((LEFT + 2.0, 600.0), (LEFT - 98.0, 600.0))
     assert hand.main_view.work.layout.panel_px == 398.0
     assert hand.main_view.picture_size[0] == SIZE[0] - 398
@@ -142,7 +142,7 @@ def test_the_edge_of_the_panel_is_dragged_within_its_limits(hand: Rig) -> None:
     assert hand.strengths == [0.5, 0.5]
 
 
-def test_a_layout_is_remembered(tmp_path: Path) -> None:
+def test_layout_is_remembered(tmp_path: Path) -> None:
     document = opened_document(bear_files(tmp_path))
     for zoom in (1.0, 1.1):
         with null_app(document, ViewState(), tmp_path) as app:
@@ -156,7 +156,7 @@ def test_a_layout_is_remembered(tmp_path: Path) -> None:
         assert app.main_view.work.layout == Layout(), "what makes no sense is not followed"
 
 
-def test_jobs_are_one_line_that_opens_and_a_failure_opens_it_once(hand: Rig) -> None:
+def test_jobs_strip_opens_by_click_and_once_by_a_failure(hand: Rig) -> None:
     film = Delivery("Rendering film.mp4", Path("/scenes/film.mp4"), (), Path("film.log"), Path("bear.ply"))
     strip = (LEFT + 150.0, SIZE[1] - 37.0 - 14.0)
 
@@ -178,7 +178,7 @@ def test_jobs_are_one_line_that_opens_and_a_failure_opens_it_once(hand: Rig) -> 
     assert cards() == 0, "what was seen does not open it again"
 
 
-def test_a_card_shows_its_toggles_under_the_mouse_alone(hand: Rig) -> None:
+def test_card_shows_its_toggles_only_while_hovered(hand: Rig) -> None:
     assert card.TOGGLE_PX * 5 < 0.4 * panel.WIDTH_PX
     hand.move(LEFT + 100.0, HEAD)
     hand.frame(3)
@@ -190,7 +190,7 @@ def test_a_card_shows_its_toggles_under_the_mouse_alone(hand: Rig) -> None:
     assert abs(plain - plain[0, 0]).max() < 3
 
 
-def test_a_session_gives_its_name_to_the_window_and_the_panel(tmp_path: Path) -> None:
+def test_session_name_is_shown_in_the_window_and_the_panel(tmp_path: Path) -> None:
     with null_app(opened_document(bear_files(tmp_path)), ViewState(), tmp_path) as app:
         assert (app.main_view.work.session, app._title) == ("", "bear.ply – ProGDF Studio")
         app.file_actions.save(tmp_path / "two looks.session.json")

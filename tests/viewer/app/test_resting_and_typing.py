@@ -1,4 +1,4 @@
-"""A mouse that rests and a hand that types fast: tooltips open, no letter is lost or comes too late."""
+"""Tooltips of a resting mouse, and fast typing that loses no letter."""
 
 from __future__ import annotations
 
@@ -27,9 +27,7 @@ def tooltip_is_open() -> bool:
 
 
 @pytest.mark.parametrize("place", [(22.0, 617.0), (222.0, 617.0), (272.0, 617.0), (150.0, 109.0)])
-def test_a_tooltip_opens_under_a_mouse_that_rests_and_then_nothing_is_drawn(
-    hand: Rig, place: tuple[float, float]
-) -> None:
+def test_tooltip_opens_after_rest_and_then_nothing_is_drawn(hand: Rig, place: tuple[float, float]) -> None:
     hand.move(400.0 + place[0], place[1])
     hand.settle()
     assert not tooltip_is_open()
@@ -38,10 +36,10 @@ def test_a_tooltip_opens_under_a_mouse_that_rests_and_then_nothing_is_drawn(
     assert hand.main_view.next_frame_delay() is None
 
 
-def test_other_frames_meanwhile_do_not_take_the_tooltips_place(hand: Rig) -> None:
+def test_other_frames_do_not_prevent_the_tooltip(hand: Rig) -> None:
     hand.move(422.0, 617.0)
     hand.settle()
-    hand.frame(5)  # a picture that sharpens, a message that leaves
+    hand.frame(5)  # for example a picture that sharpens or a message that disappears
     hand.rest()
     assert tooltip_is_open()
 
@@ -56,7 +54,7 @@ def test_rest_takes_a_bounded_number_of_frames() -> None:
 
 
 def type_fast(hand: Rig, text: str, *keys: tuple[imgui.Key, str]) -> None:
-    """All of it between two frames, as the window hears it of a slow frame; then what its loop does."""
+    """Type a text and keys between two frames, as in a slow frame, then settle."""
     for letter in text:
         hand.io.add_key_event(getattr(imgui.Key, f"_{letter}", imgui.Key.period), True)
         hand.io.add_input_characters_utf8(letter)
@@ -71,7 +69,7 @@ def type_fast(hand: Rig, text: str, *keys: tuple[imgui.Key, str]) -> None:
     hand.settle()
 
 
-def test_a_value_typed_faster_than_frames_arrives_whole_and_before_enter(hand: Rig) -> None:
+def test_value_typed_within_one_frame_is_complete_before_enter(hand: Rig) -> None:
     hand.modifier(imgui.Key.mod_ctrl)
     hand.click(*hand.slider(0, 0.2))
     hand.modifier(imgui.Key.mod_ctrl, False)
@@ -80,7 +78,7 @@ def test_a_value_typed_faster_than_frames_arrives_whole_and_before_enter(hand: R
     assert hand.main_view.work.renaming is None, "this Enter was the field's"
 
 
-def test_what_follows_the_click_at_once_is_typed_too(hand: Rig) -> None:
+def test_text_typed_right_after_the_click_is_kept(hand: Rig) -> None:
     hand.move(*hand.slider(0, 0.2))
     hand.io.add_key_event(imgui.Key.mod_ctrl, True)
     for down in (True, False):
@@ -110,7 +108,7 @@ def test_escape_closes_the_list_of_keys_first(hand: Rig) -> None:
     assert hand.main_view.work.focus is None
 
 
-def test_escape_puts_the_tool_down_before_anything_is_unfocused(hand: Rig) -> None:
+def test_escape_deactivates_the_tool_before_unfocusing(hand: Rig) -> None:
     for key, held in (("B", lambda view: view.brush.active), ("R", lambda view: view.select.tool)):
         hand.key(key)
         assert held(hand.main_view.work.view)
@@ -121,7 +119,7 @@ def test_escape_puts_the_tool_down_before_anything_is_unfocused(hand: Rig) -> No
     assert hand.main_view.work.focus is None
 
 
-def test_the_chosen_segment_keeps_its_color_under_the_mouse(hand: Rig) -> None:
+def test_selected_segment_keeps_its_color_while_hovered(hand: Rig) -> None:
     y = 334.0  # Orbit of Orbit | Fly
     hand.move(200.0, 300.0)
     hand.settle()

@@ -1,4 +1,4 @@
-"""The safe frame: what lies inside is what a film of its shape shows."""
+"""Safe frame: its inside is the picture of a film of the same shape."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ TALL = Area(300.0, 600.0)
 @pytest.mark.parametrize("area", [WIDE, TALL], ids=["wide", "tall"])
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("covered", [0.0, 46.0])
-def test_a_frame_has_its_shape_fits_and_touches_an_edge(area: Area, shape: str, covered: float) -> None:
+def test_safe_frame_has_its_shape_fits_and_touches_an_edge(area: Area, shape: str, covered: float) -> None:
     frame = safe_frame(ViewState(safe_frame=shape), area, covered)
     assert frame is not None
     width, height = (int(side) for side in shape.split(":"))
@@ -36,21 +36,21 @@ def test_a_frame_has_its_shape_fits_and_touches_an_edge(area: Area, shape: str, 
     assert min(spare) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_no_frame_stands_over_two_pictures_nor_where_nothing_but_the_picture_is_shown() -> None:
+def test_safe_frame_is_hidden_beside_two_pictures_or_without_panel() -> None:
     for view in (ViewState(), ViewState(safe_frame="1:1", panel=False)):
         assert safe_frame(view, WIDE) is None
     assert safe_frame(ViewState(safe_frame="1:1", compare=Comparison("beside")), WIDE) is None
     assert safe_frame(ViewState(safe_frame="1:1", compare=Comparison("split")), WIDE) is not None
 
 
-def test_the_film_of_a_shape_has_its_sides() -> None:
+def test_film_size_has_the_chosen_shape() -> None:
     assert [picture_size(side, "16:9") for side in SIDES[:2]] == [(1280, 720), (1920, 1080)]
     assert picture_size(1080, "9:16") == (1080, 1920)
     assert picture_size(720, "1:1") == (720, 720)
 
 
 @pytest.mark.gl
-def test_what_lies_inside_is_what_a_film_of_this_shape_shows() -> None:
+def test_inside_of_the_safe_frame_equals_the_film() -> None:
     area = Area(360.0, 480.0)
     with rig(first_view(bear(), 0.7, 0.5), (round(panel.WIDTH_PX) + 360, 480)) as hand:
         before = hand.picture()
@@ -65,7 +65,7 @@ def test_what_lies_inside_is_what_a_film_of_this_shape_shows() -> None:
             top = round((480 - tall) / 2)
             film = hand.main_view.engine.image(view, (wide, tall))
             seen = hand.picture()[top : top + tall, left : left + wide] / np.float32(255.0)
-            # without the line and its name; half a pixel is lost where the frame's height is odd
+            # leaves out the line and its name; half a pixel is lost where the frame's height is odd
             inside = (torch.from_numpy(image[24:-2, 2:-2]) for image in (seen, film))
             assert psnr(*inside) > 30.0, shape
             assert (view.camera, view.safe_frame) == (first_view(bear()).camera, shape)
@@ -74,7 +74,7 @@ def test_what_lies_inside_is_what_a_film_of_this_shape_shows() -> None:
 
 
 @pytest.mark.gl
-def test_a_pan_under_a_frame_follows_the_mouse_and_a_saved_picture_has_no_frame(tmp_path: Path) -> None:
+def test_pan_follows_the_mouse_and_saved_pictures_have_no_frame(tmp_path: Path) -> None:
     view = replace(first_view(bear(), 0.7, 0.5), safe_frame="16:9")
     with rig(view, (round(panel.WIDTH_PX) + 360, 480), pictures=tmp_path) as hand:
         hand.key("F2")
@@ -90,7 +90,9 @@ def test_a_pan_under_a_frame_follows_the_mouse_and_a_saved_picture_has_no_frame(
 
 @pytest.mark.gl
 @pytest.mark.usefixtures("software_gpu")
-def test_a_frame_over_the_timeline(screenshot: Callable[[str, np.ndarray], None]) -> None:
+def test_screenshot_of_the_safe_frame_over_the_timeline(
+    screenshot: Callable[[str, np.ndarray], None],
+) -> None:
     view = replace(first_view(bear(), 0.7, 0.5), safe_frame="16:9")
     with rig(view, (1024, 640)) as hand:
         hand.key("T")

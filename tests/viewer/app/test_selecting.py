@@ -1,4 +1,4 @@
-"""Selecting in the picture with a scripted mouse: every tool, its modes, its undo, what the panel does."""
+"""Selecting in the picture by scripted mouse: every tool, its modes, undo and the panel."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def selected(hand: Rig) -> np.ndarray:
 
 
 def points(hand: Rig) -> np.ndarray:
-    """Where the picture shows the centers."""
+    """Return the projected centers of all Gaussians, pixels. [N,2]"""
     work = hand.main_view.work
     return project_centers(bear().scene, to_camera(work.view.camera, *hand.main_view.picture_size)).points
 
@@ -58,7 +58,7 @@ def undos(hand: Rig) -> int:
     return len(hand.main_view.work.past.past)
 
 
-def test_a_box_selects_what_is_in_it_and_leaves_the_camera_alone(hand: Rig) -> None:
+def test_box_selects_its_content_and_keeps_the_camera(hand: Rig) -> None:
     camera = hand.main_view.work.view.camera
     hand.key("R")
     hand.drag((120, 200), (260, 330))
@@ -68,7 +68,7 @@ def test_a_box_selects_what_is_in_it_and_leaves_the_camera_alone(hand: Rig) -> N
     assert undos(hand) == 1
 
 
-def test_a_lasso_selects_what_it_encloses(hand: Rig) -> None:
+def test_lasso_selects_the_enclosed_splats(hand: Rig) -> None:
     hand.key("L")
     drag_along(hand, LASSO)
     assert (selected(hand) == inside_polygon(points(hand), LASSO)).all()
@@ -77,7 +77,7 @@ def test_a_lasso_selects_what_it_encloses(hand: Rig) -> None:
     assert not selected(hand).any()
 
 
-def test_a_selection_leaves_a_trace_in_the_picture_but_not_over_a_slider_that_moves(hand: Rig) -> None:
+def test_selection_leaves_a_trace_except_while_a_slider_moves(hand: Rig) -> None:
     plain = hand.picture()
     hand.key("L")
     drag_along(hand, LASSO)
@@ -98,7 +98,7 @@ def test_a_selection_leaves_a_trace_in_the_picture_but_not_over_a_slider_that_mo
 
 
 @pytest.mark.parametrize("how", ["Enter", "double click", "first corner"])
-def test_a_polygon_is_clicked_and_closed(hand: Rig, how: str) -> None:
+def test_polygon_is_clicked_and_closed(hand: Rig, how: str) -> None:
     hand.key("P")
     for corner in LASSO:
         hand.click(*corner)
@@ -115,7 +115,7 @@ def test_a_polygon_is_clicked_and_closed(hand: Rig, how: str) -> None:
     assert undos(hand) == 1
 
 
-def test_escape_drops_a_polygon_first_and_then_the_tool(hand: Rig) -> None:
+def test_escape_cancels_a_polygon_first_and_then_the_tool(hand: Rig) -> None:
     hand.key("P")
     for corner in LASSO:
         hand.click(*corner)
@@ -131,7 +131,7 @@ def test_escape_drops_a_polygon_first_and_then_the_tool(hand: Rig) -> None:
     assert hand.main_view.work.focus is None
 
 
-def test_escape_takes_a_lasso_back_while_it_is_drawn(hand: Rig) -> None:
+def test_escape_reverts_a_brush_stroke_in_progress(hand: Rig) -> None:
     hand.key("U")
     hand.move(*MIDDLE)
     hand.press()
@@ -144,7 +144,7 @@ def test_escape_takes_a_lasso_back_while_it_is_drawn(hand: Rig) -> None:
     assert undos(hand) == 0
 
 
-def test_a_brush_selects_what_it_touches(hand: Rig) -> None:
+def test_brush_selects_touched_splats(hand: Rig) -> None:
     hand.key("U")
     path = [(150.0, 250.0), (200.0, 320.0), (260.0, 330.0)]
     drag_along(hand, path)
@@ -152,7 +152,7 @@ def test_a_brush_selects_what_it_touches(hand: Rig) -> None:
     assert undos(hand) == 1
 
 
-def test_a_sphere_is_drawn_from_its_center(hand: Rig) -> None:
+def test_sphere_is_drawn_from_its_center(hand: Rig) -> None:
     hand.key("Shift+R")
     hand.drag(MIDDLE, (MIDDLE[0] + 60, MIDDLE[1]))
     means = bear().scene.means.numpy()[selected(hand)]
@@ -161,7 +161,7 @@ def test_a_sphere_is_drawn_from_its_center(hand: Rig) -> None:
     assert undos(hand) == 1
 
 
-def test_a_click_selects_what_is_connected_and_alike_and_another_tool_all_that_is_alike(hand: Rig) -> None:
+def test_flood_selects_connected_and_color_tool_all_similar_splats(hand: Rig) -> None:
     hand.key("J")
     hand.click(*MIDDLE)
     flooded = selected(hand).copy()
@@ -174,7 +174,7 @@ def test_a_click_selects_what_is_connected_and_alike_and_another_tool_all_that_i
 
 
 @pytest.mark.parametrize("tool", ["J", "I"])
-def test_a_click_follows_its_tolerance_in_its_mode_as_one_undo_step(hand: Rig, tool: str) -> None:
+def test_click_updates_with_its_tolerance_as_one_undo_step(hand: Rig, tool: str) -> None:
     hand.key("Ctrl+A")
     everything = selected(hand).copy()
     hand.key(tool)
@@ -182,7 +182,7 @@ def test_a_click_follows_its_tolerance_in_its_mode_as_one_undo_step(hand: Rig, t
     hand.click(*MIDDLE)
     hand.modifier(imgui.Key.mod_ctrl, False)
     taken = [(~selected(hand)).sum()]
-    hand.drag(MIDDLE, (MIDDLE[0] + 60, MIDDLE[1]), 2)  # turned, it is still what was clicked
+    hand.drag(MIDDLE, (MIDDLE[0] + 60, MIDDLE[1]), 2)  # the tolerance stays with the clicked point
     for _ in range(3):
         hand.key("]")
         hand.frame(2)
@@ -218,7 +218,7 @@ def test_shift_adds_ctrl_subtracts_and_both_intersect(hand: Rig) -> None:
     assert undos(hand) == 4
 
 
-def test_only_the_front_surface_is_selected_unless_n_says_through(hand: Rig) -> None:
+def test_only_the_front_surface_is_selected_without_through(hand: Rig) -> None:
     hand.key("R")
     hand.drag((100, 150), (300, 400))
     through = selected(hand).sum()
@@ -227,7 +227,7 @@ def test_only_the_front_surface_is_selected_unless_n_says_through(hand: Rig) -> 
     assert 0 < selected(hand).sum() < 0.8 * through
 
 
-def test_a_surface_looked_at_ahead_selects_the_same(hand: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_precomputed_surface_selects_the_same(hand: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     hand.key("R")
     hand.key("N")
     found = []
@@ -241,7 +241,7 @@ def test_a_surface_looked_at_ahead_selects_the_same(hand: Rig, monkeypatch: pyte
     assert found[0].any()
 
 
-def test_a_click_beside_selects_nothing_and_with_shift_keeps_what_there_was(hand: Rig) -> None:
+def test_click_beside_clears_the_selection_and_with_shift_keeps_it(hand: Rig) -> None:
     hand.key("R")
     hand.drag((120, 200), (260, 330))
     kept = selected(hand).copy()
@@ -263,7 +263,7 @@ def test_middle_and_right_drags_still_move_the_camera(hand: Rig) -> None:
     assert not selected(hand).any()
 
 
-def test_a_tool_and_the_brush_take_turns(hand: Rig) -> None:
+def test_selection_tool_and_brush_exclude_each_other(hand: Rig) -> None:
     hand.key("B")
     hand.key("L")
     view = hand.main_view.work.view
@@ -276,7 +276,7 @@ def test_a_tool_and_the_brush_take_turns(hand: Rig) -> None:
     assert hand.main_view.work.view.select.tool == "", "its key puts it down again"
 
 
-def test_what_is_hidden_is_neither_seen_nor_selected(hand: Rig) -> None:
+def test_hidden_splats_are_neither_visible_nor_selectable(hand: Rig) -> None:
     plain = hand.picture().astype(int)
     hand.key("R")
     hand.drag((120, 200), (260, 330))
@@ -298,7 +298,7 @@ def test_what_is_hidden_is_neither_seen_nor_selected(hand: Rig) -> None:
     assert not hand.main_view.work.view.selection.hidden
 
 
-def test_keys_change_the_selection_as_a_whole(hand: Rig) -> None:
+def test_keys_change_the_whole_selection(hand: Rig) -> None:
     hand.key("Ctrl+A")
     assert selected(hand).all()
     hand.key("Ctrl+Shift+A")
@@ -316,7 +316,7 @@ def test_keys_change_the_selection_as_a_whole(hand: Rig) -> None:
     assert (selected(hand) == ~few).all()
 
 
-def test_the_mouse_on_the_name_of_a_layer_shows_its_region(hand: Rig) -> None:
+def test_hovering_a_layer_name_shows_its_region(hand: Rig) -> None:
     before = hand.picture().astype(int)
     hand.move(WINDOW[0] - 300 + 90, HEAD)
     hand.pause(1.0)
@@ -329,7 +329,7 @@ def test_the_mouse_on_the_name_of_a_layer_shows_its_region(hand: Rig) -> None:
     assert (hand.picture() == before).all()
 
 
-def test_the_panel_selects_shows_and_keeps_regions() -> None:
+def test_panel_selects_shows_and_saves_regions() -> None:
     mask = bear().demo.labels.numpy() == 1
     kept = selection.add_region(selection.select(SelectionState(), mask), "scarf", Path("scarf.region.npy"))
     some = selection.select(kept, np.arange(len(mask)) < 100)
@@ -361,7 +361,7 @@ def test_the_panel_selects_shows_and_keeps_regions() -> None:
         assert hand.main_view.take_requests() == ("save_region:hat",)
 
 
-def test_strays_are_hidden_when_asked_for_and_undo_shows_them_again(tmp_path: Path) -> None:
+def test_hide_strays_hides_them_and_undo_shows_them(tmp_path: Path) -> None:
     scene = replace(bear().scene, logit_opacities=bear().scene.logit_opacities.clone())
     scene.logit_opacities[:7] = -9.0
     with null_app(Document("a", scene), first_view(bear()), tmp_path) as app:
@@ -378,7 +378,7 @@ def test_strays_are_hidden_when_asked_for_and_undo_shows_them_again(tmp_path: Pa
         assert not app.main_view.work.view.selection.hidden
 
 
-def test_strays_of_a_scene_that_is_no_longer_open_hide_nothing(tmp_path: Path) -> None:
+def test_strays_of_a_closed_scene_hide_nothing(tmp_path: Path) -> None:
     with null_app(Document("a", bear().scene), first_view(bear()), tmp_path) as app:
         app.handle("hide_strays")
         app.show(Document("b", bear(1000).scene))
@@ -388,8 +388,8 @@ def test_strays_of_a_scene_that_is_no_longer_open_hide_nothing(tmp_path: Path) -
         assert "strays (" not in app.main_view.work.message.text
 
 
-def test_strokes_on_a_thing_and_beside_it_select_it_and_undo_takes_the_last_one_back(hand: Rig) -> None:
-    """The head, by a stroke on it and one over the body; another beside takes what it lies on away."""
+def test_strokes_on_and_beside_an_object_select_it(hand: Rig) -> None:
+    """Select the head by a stroke on it and a Ctrl stroke over the body; another Ctrl stroke removes more."""
 
     def beside(path: Sequence[tuple[float, float]]) -> None:
         hand.modifier(imgui.Key.mod_ctrl)

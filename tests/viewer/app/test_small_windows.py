@@ -1,4 +1,4 @@
-"""What has to stay within reach in a small window: questions, timeline controls, the way home."""
+"""Questions, timeline controls and the home view stay reachable in a small window."""
 
 from __future__ import annotations
 
@@ -18,20 +18,18 @@ from viewer.state.workspace import Dialog
 
 pytestmark = pytest.mark.gl
 SMALLEST = (640, 400)
-"""The least size that the window can be given."""
+"""Smallest window size, points."""
 
 
 def windows(name: str) -> list[imgui.internal.Window]:
-    """imgui's windows on screen whose name holds a text."""
+    """Return imgui's active windows whose name contains a text."""
     found = imgui.get_current_context().windows
     return [window for window in found if name in window.name and window.active]
 
 
 @pytest.mark.parametrize("points", [SMALLEST, (800, 600), (1280, 800)])
 @pytest.mark.parametrize("kind", ["open", "save", "leave", "overwrite", "restore", "replace"])
-def test_every_question_lies_within_the_window_with_many_recent_files(
-    points: tuple[int, int], kind: str
-) -> None:
+def test_every_question_fits_the_window_with_many_recent_files(points: tuple[int, int], kind: str) -> None:
     with rig(first_view(bear(), 0.5, 0.5), points) as hand:
         name = "a_scene_with_a_rather_long_name_indeed"
         hand.main_view.recent = tuple(Path(f"/scenes/{name}_{i}.ply") for i in range(user_files.MAX_RECENT))
@@ -48,7 +46,7 @@ def test_every_question_lies_within_the_window_with_many_recent_files(
 
 
 @pytest.mark.parametrize("points", [SMALLEST, (800, 600)])
-def test_the_controls_of_the_timeline_stay_in_a_narrow_window(points: tuple[int, int]) -> None:
+def test_timeline_controls_stay_in_a_narrow_window(points: tuple[int, int]) -> None:
     with rig(first_view(bear(), 0.5, 0.5), points) as hand:
         hand.key("K")
         assert hand.main_view.work.player.shown
@@ -62,7 +60,7 @@ def test_the_controls_of_the_timeline_stay_in_a_narrow_window(points: tuple[int,
         assert hand.main_view.work.view.timeline.ping_pong
 
 
-def test_home_is_upright_and_framed_under_another_up_axis() -> None:
+def test_home_view_is_upright_and_framed_for_any_up_axis() -> None:
     with rig(first_view(bear(), 0.5, 0.5), (700, 640)) as hand:
         first = hand.main_view.work.view.camera
         hand.key("Shift+F")
@@ -86,7 +84,7 @@ def turned_by_hand(hand: Rig, up: tuple[float, float, float]) -> None:
     hand.main_view.work = workspace.with_camera(hand.main_view.work, replace(camera, azimuth=70.0))
 
 
-def test_the_first_look_under_an_axis_is_the_first_camera_that_has_it() -> None:
+def test_home_view_uses_the_first_camera_with_the_same_up_axis() -> None:
     scene = bear().scene
     first = first_camera(scene)
     assert Document("bear.ply", scene).facts().home(ViewCamera(up=first.up), 1.5) == first

@@ -1,4 +1,4 @@
-"""The start page: examples, files that were open, the mouse and the keyboard on it."""
+"""Start page: examples, recent files, mouse and keyboard."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from viewer.ui.splash import Splash
 
 pytestmark = pytest.mark.gl
 LARGEST = 6 << 20
-"""Bytes that all examples may add to the wheel."""
+"""Maximum size of all examples in the wheel, bytes."""
 
 
 @pytest.fixture
@@ -48,7 +48,7 @@ def turn(app: application.App) -> None:
 
 @pytest.fixture
 def hand() -> Iterator[Rig]:
-    """On a page with the examples, in a window of 900x640."""
+    """Yield a start page with the examples in a window of 900x640 points."""
     context = headless_context()
     document = empty()
     engine = ViewEngine(context, document.scene, (), "cpu")
@@ -62,7 +62,7 @@ def hand() -> Iterator[Rig]:
 
 
 def type_keys(hand: Rig, *keys: imgui.Key) -> None:
-    """As imgui itself hears them."""
+    """Send keys to imgui itself."""
     for key in keys:
         for down in (True, False):
             hand.modifier(key, down)
@@ -70,7 +70,7 @@ def type_keys(hand: Rig, *keys: imgui.Key) -> None:
 
 
 @pytest.mark.parametrize("bundle", [*EXAMPLE_TITLES], ids=lambda path: path.name.partition(".")[0])
-def test_an_example_opens_with_its_edits(window: application.App, bundle: Path, tmp_path: Path) -> None:
+def test_example_opens_with_its_edits(window: application.App, bundle: Path, tmp_path: Path) -> None:
     window.main_view.request(f"example:{bundle}")
     turn(window)
     turn(window)
@@ -83,7 +83,7 @@ def test_an_example_opens_with_its_edits(window: application.App, bundle: Path, 
     assert not window.file_actions.has_unsaved
 
 
-def test_the_examples_are_small_and_are_all_there() -> None:
+def test_examples_are_complete_and_small() -> None:
     folder = next(iter(EXAMPLE_TITLES)).parent
     assert {path.name.partition(".")[0] for path in folder.iterdir()} == {
         path.name.partition(".")[0] for path in EXAMPLE_TITLES
@@ -91,12 +91,12 @@ def test_the_examples_are_small_and_are_all_there() -> None:
     assert sum(path.stat().st_size for path in folder.iterdir()) <= LARGEST
 
 
-def test_a_single_click_opens_an_example(hand: Rig) -> None:
-    hand.click(605.0, 160.0)  # the second
+def test_single_click_opens_an_example(hand: Rig) -> None:
+    hand.click(605.0, 160.0)  # the second example
     assert hand.main_view.take_requests() == (f"example:{[*EXAMPLE_TITLES][1]}",)
 
 
-def test_enter_opens_what_the_arrows_lead_to(hand: Rig) -> None:
+def test_arrows_and_enter_open_examples_and_recent_files(hand: Rig) -> None:
     right = imgui.Key.right_arrow
     down = imgui.Key.down_arrow
     enter = imgui.Key.enter
@@ -113,7 +113,7 @@ def test_enter_opens_what_the_arrows_lead_to(hand: Rig) -> None:
     assert hand.main_view.take_requests() == ("open",), "what is gone is looked for"
 
 
-def test_a_file_that_is_gone_says_so_and_is_removed_from_the_page(tmp_path: Path) -> None:
+def test_missing_file_is_marked_and_can_be_removed(tmp_path: Path) -> None:
     files = [tmp_path / "here.ply", tmp_path / "gone.ply"]
     for file in files:
         file.touch()
@@ -134,13 +134,13 @@ def test_a_file_that_is_gone_says_so_and_is_removed_from_the_page(tmp_path: Path
     assert read_recent(missing=True) == (files[0],)
 
 
-def test_the_age_of_a_file_is_told_in_words() -> None:
+def test_file_age_is_described_in_words() -> None:
     ages = {30.0: "just now", 300.0: "5 min ago", 7300.0: "2 h ago", 9e4: "yesterday", 1e6: "11 days ago"}
     assert {seconds: describe_age(seconds) for seconds in ages} == ages
     assert describe_age(1e7) == "3 months ago"
 
 
-def test_an_old_thumbnail_tells_when_the_file_was_open(tmp_path: Path) -> None:
+def test_thumbnail_time_gives_the_age_of_a_file(tmp_path: Path) -> None:
     file = tmp_path / "bear.ply"
     file.touch()
     remember_recent([file])
@@ -152,7 +152,7 @@ def test_an_old_thumbnail_tells_when_the_file_was_open(tmp_path: Path) -> None:
         assert app.main_view.start_files[0][0].line.startswith("3 days ago")
 
 
-def test_a_splash_is_shown_while_a_scene_is_read(
+def test_splash_is_shown_while_a_scene_is_read(
     window: application.App, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bear().save(tmp_path)
@@ -175,7 +175,7 @@ def test_a_splash_is_shown_while_a_scene_is_read(
     assert shown[0] < 0.3
 
 
-def test_what_cannot_be_opened_opens_no_window(
+def test_invalid_file_or_option_opens_no_window(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def no_window(*_: object) -> None:

@@ -1,4 +1,4 @@
-"""New edits in the window, with a trainer that answers at once."""
+"""New edits in the window with a stub of the trainer that finishes on demand."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ pytestmark = pytest.mark.gl
 
 
 class Trainer:
-    """Stands for a child: it runs until it is told to end, and then leaves an edit."""
+    """Stub of a child process: it runs until `ended` is set and then leaves an edit."""
 
     said: Sequence[str] = ()
     ended: int | None = None
@@ -88,7 +88,7 @@ def window(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[applicat
 
 
 def turn(app: application.App) -> None:
-    """What the window's loop does in a turn."""
+    """Run one turn of the window's loop."""
     app._wait_times()
     app.draw()
 
@@ -99,7 +99,7 @@ def request(app: application.App, text: str) -> None:
     turn(app)
 
 
-def test_an_edit_is_trained_and_comes_as_a_layer_at_full_strength(window: application.App) -> None:
+def test_trained_edit_becomes_a_layer_at_full_strength(window: application.App) -> None:
     press(window, "Ctrl+N")
     assert window.main_view.work.form_open
     request(window, "train")
@@ -116,7 +116,7 @@ def test_an_edit_is_trained_and_comes_as_a_layer_at_full_strength(window: applic
     assert window.main_view.work.view.layers == ()
 
 
-def test_what_is_selected_is_the_region_of_a_new_edit(window: application.App) -> None:
+def test_selection_is_the_region_of_a_new_edit(window: application.App) -> None:
     view = window.main_view.work.view
     total = len(window.document.scene)
     mask = selection.unpack(selection.NOBODY, total).copy()
@@ -133,8 +133,8 @@ def test_what_is_selected_is_the_region_of_a_new_edit(window: application.App) -
     assert (after.count, [kept.name for kept in after.regions]) == (0, ["blue"]), "it is a region now"
 
 
-def test_another_selection_is_another_file_for_the_preview(window: application.App, tmp_path: Path) -> None:
-    """Who makes previews reads a file once: under one name, the second selection showed the first one."""
+def test_changed_selection_is_a_new_file_for_the_preview(window: application.App, tmp_path: Path) -> None:
+    """The preview process reads a file once, so a reused name would show the first selection."""
     view = window.main_view.work.view
     total = len(window.document.scene)
     specs = []
@@ -149,7 +149,7 @@ def test_another_selection_is_another_file_for_the_preview(window: application.A
     assert specs[0] == specs[2] != specs[1]
 
 
-def test_what_cannot_be_trained_stands_in_the_form(window: application.App) -> None:
+def test_invalid_edit_is_reported_in_the_form(window: application.App) -> None:
     press(window, "Ctrl+N")
     form = replace(window.main_view.work.form, region=TYPED, typed_region="cube:1")
     window.main_view.work = replace(window.main_view.work, form=form)
@@ -159,7 +159,7 @@ def test_what_cannot_be_trained_stands_in_the_form(window: application.App) -> N
     assert window.main_view.work.jobs == ()
 
 
-def test_what_is_packed_takes_the_drafts_place_while_it_is_measured(window: application.App) -> None:
+def test_packed_edit_replaces_the_draft_while_it_is_measured(window: application.App) -> None:
     request(window, "train")
     (job,) = window.main_view.work.jobs
     order = job.task
@@ -185,7 +185,7 @@ def test_what_is_packed_takes_the_drafts_place_while_it_is_measured(window: appl
     assert [edit.instruction for edit in window.document.edits] == ["measured"]
 
 
-def test_a_view_is_painted_over_in_another_program_and_each_save_is_shown(
+def test_view_painted_in_another_program_is_shown_on_every_save(
     window: application.App, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened = list[Path]()
@@ -231,7 +231,7 @@ def test_a_view_is_painted_over_in_another_program_and_each_save_is_shown(
     assert window.main_view.cover is None, "the form is closed"
 
 
-def test_a_failure_is_one_line_with_its_log(window: application.App) -> None:
+def test_failed_training_is_one_line_with_its_log(window: application.App) -> None:
     request(window, "train")
     Trainer.ended = 2
     Trainer.line = "the disk is full"
@@ -247,7 +247,7 @@ def test_a_failure_is_one_line_with_its_log(window: application.App) -> None:
     assert window.main_view.work.jobs == ()
 
 
-def test_a_training_is_discarded_only_after_a_question(window: application.App) -> None:
+def test_training_is_discarded_only_after_a_question(window: application.App) -> None:
     request(window, "train")
     (job,) = window.main_view.work.jobs
     state = job.task.out / "state"
@@ -271,7 +271,7 @@ def test_a_training_is_discarded_only_after_a_question(window: application.App) 
     assert not job.task.out.exists()
 
 
-def test_what_trains_in_another_window_stays_its_own(window: application.App) -> None:
+def test_run_locked_by_another_window_is_left_alone(window: application.App) -> None:
     request(window, "train")
     (job,) = window.main_view.work.jobs
     (job.task.out / "state").mkdir(parents=True)
@@ -302,7 +302,7 @@ def test_quitting_asks_while_a_training_runs(window: application.App) -> None:
     assert window.is_closed
 
 
-def test_the_scene_is_exported_by_the_command(window: application.App, tmp_path: Path) -> None:
+def test_scene_export_runs_the_command(window: application.App, tmp_path: Path) -> None:
     press(window, "Ctrl+E")
     asked = window.main_view.work.dialog
     assert asked is not None
@@ -347,7 +347,7 @@ def test_the_scene_is_exported_by_the_command(window: application.App, tmp_path:
     assert len({key["camera"]["azimuth"] for key in film["keys"]}) == len(film["keys"]) == 96
 
 
-def test_a_web_page_is_exported_by_the_command_with_the_snapshots(window: application.App) -> None:
+def test_web_page_export_runs_the_command_with_the_snapshots(window: application.App) -> None:
     press(window, "F5", "Ctrl+Shift+E")
     asked = window.main_view.work.dialog
     assert asked is not None
@@ -358,7 +358,7 @@ def test_a_web_page_is_exported_by_the_command_with_the_snapshots(window: applic
     assert len(open_session(Path(Trainer.said[-1])).snapshots) == 1
 
 
-def test_quitting_asks_while_something_is_written(window: application.App, tmp_path: Path) -> None:
+def test_quitting_asks_while_a_file_is_written(window: application.App, tmp_path: Path) -> None:
     (tmp_path / "bear_edited.ply").touch()
     press(window, "Ctrl+E", "Enter")
     press(window, "Ctrl+E")
@@ -377,7 +377,7 @@ def test_quitting_asks_while_something_is_written(window: application.App, tmp_p
     assert window.is_closed
 
 
-def test_without_a_scene_there_is_a_start_page_until_one_is_opened(tmp_path: Path) -> None:
+def test_start_page_is_shown_until_a_scene_is_opened(tmp_path: Path) -> None:
     folder = bear_files(tmp_path)
     with null_app(empty(), ViewState(), folder) as app:
         assert app.main_view.at_start
@@ -395,7 +395,7 @@ def test_without_a_scene_there_is_a_start_page_until_one_is_opened(tmp_path: Pat
     assert load_thumbnail(folder / "bear.ply") is not None, "for the next start page"
 
 
-def test_the_demos_card_counts_its_edits_and_each_is_one_layer_from_its_draft_on(
+def test_demo_card_counts_edits_and_each_draft_becomes_one_layer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(job_queue, "Child", Trainer)
@@ -426,9 +426,7 @@ def test_the_demos_card_counts_its_edits_and_each_is_one_layer_from_its_draft_on
         Trainer.ended = 0
 
 
-def test_what_runs_for_another_scene_goes_on_and_its_card_says_for_which(
-    window: application.App, tmp_path: Path
-) -> None:
+def test_jobs_of_another_scene_continue_and_name_their_scene(window: application.App, tmp_path: Path) -> None:
     save_ply(tmp_path / "half.ply", bear().scene[:700])
     request(window, "train")
     press(window, "Ctrl+E", "Enter")
@@ -448,9 +446,7 @@ def test_what_runs_for_another_scene_goes_on_and_its_card_says_for_which(
     assert (delivery.status, delivery.elsewhere) == ("failed", "")
 
 
-def test_an_edit_of_another_scene_is_rebound_from_its_message(
-    window: application.App, tmp_path: Path
-) -> None:
+def test_edit_of_another_scene_is_rebound_from_its_message(window: application.App, tmp_path: Path) -> None:
     scarf = bear().gdfs[0]
     moved = replace(bear().scene, means=bear().scene.means + 0.001)
     foreign = tmp_path / "foreign.gdf"
@@ -478,7 +474,7 @@ def test_an_edit_of_another_scene_is_rebound_from_its_message(
     assert window.main_view.work.jobs == ()
 
 
-def test_a_saved_region_offers_a_new_edit(window: application.App) -> None:
+def test_saved_region_offers_a_new_edit(window: application.App) -> None:
     press(window, "Ctrl+A")
     request(window, "save_region:all of it")
     said = window.main_view.work.message

@@ -1,4 +1,4 @@
-"""What new edits, the menu and the start page look like on a software GPU."""
+"""Screenshots of new edits, the menu and the start page on a software GPU."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from viewer.ui.splash import MINIMUM_SIZE_PX
 
 Compare = Callable[[str, np.ndarray], None]
 SMALLEST = (1024, 640)
-FOOT_Y = 550  # of the card of a run
+FOOT_Y = 550  # y of the buttons on a run's card
 pytestmark = [pytest.mark.gl, pytest.mark.usefixtures("software_gpu")]
 
 
-def test_the_start_page_with_files_that_were_open(screenshot: Compare) -> None:
+def test_screenshot_of_the_start_page_with_recent_files(screenshot: Compare) -> None:
     context = headless_context()
     document = empty()
     engine = ViewEngine(context, document.scene, (), "cpu")
@@ -52,7 +52,7 @@ def test_the_start_page_with_files_that_were_open(screenshot: Compare) -> None:
         context.release()
 
 
-def test_the_menu(screenshot: Compare) -> None:
+def test_screenshot_of_the_menu(screenshot: Compare) -> None:
     with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
         hand.main_view.recent = (Path("/scenes/bear.ply"),)
         hand.click(999.0, 20.0)
@@ -61,7 +61,7 @@ def test_the_menu(screenshot: Compare) -> None:
         screenshot("ui_menu", hand.image()[:320, 640:])
 
 
-def test_the_form_of_a_new_edit(screenshot: Compare) -> None:
+def test_screenshot_of_the_new_edit_form(screenshot: Compare) -> None:
     with rig(first_view(bear(), 0.7), SMALLEST) as hand:
         form = NewEdit(
             TYPED, "sphere:0,0,0,1", editor=6, name="painted", error="the region holds no Gaussian"
@@ -71,7 +71,7 @@ def test_the_form_of_a_new_edit(screenshot: Compare) -> None:
         screenshot("ui_new_edit", hand.image()[:, 700:])
 
 
-def test_the_cards_of_runs_and_a_film(screenshot: Compare) -> None:
+def test_screenshot_of_run_cards_and_a_film(screenshot: Compare) -> None:
     order = EditOrder(Path("bear.ply"), Path("/scenes/bear.edits/blue"), "blue", "all", "recolor:#3060d0")
     running = QueuedTask(1, order, "running", Progress(0.45, "Training", "0.0114"), 20.0)
     line = "region 'sphere:99,99,99,1' holds no Gaussian"
@@ -92,7 +92,7 @@ def test_the_cards_of_runs_and_a_film(screenshot: Compare) -> None:
         screenshot("ui_training", hand.image()[:, 700:])
 
 
-def test_the_question_about_a_film(screenshot: Compare) -> None:
+def test_screenshot_of_the_film_question(screenshot: Compare) -> None:
     with rig(first_view(bear(), 0.7), SMALLEST) as hand:
         options = DeliverOptions(1280, 720, moves="scarf", can_move=("scarf",))
         hand.main_view.ask(Dialog("render_film", "/scenes/bear_edited.mp4", options=options))
@@ -100,7 +100,7 @@ def test_the_question_about_a_film(screenshot: Compare) -> None:
         screenshot("ui_film", hand.image()[:420, :720])
 
 
-def test_the_buttons_of_the_second_failure_are_whole(screenshot: Compare) -> None:
+def test_screenshot_of_two_failures_with_whole_buttons(screenshot: Compare) -> None:
     film = Delivery("Rendering film.mp4", Path("/scenes/film.mp4"), (), Path("film.log"), Path("bear.ply"))
     line = "no frame could be written: the disk takes no more, free some space"
     jobs = tuple(QueuedTask(number, replace(film), "failed", error=line) for number in (1, 2))
@@ -119,13 +119,13 @@ def test_the_buttons_of_the_second_failure_are_whole(screenshot: Compare) -> Non
         assert closes[-1] - closes[0] >= 12, "one hits it anywhere"
 
 
-def test_a_second_click_where_stop_was_goes_on(software_gpu: None) -> None:
+def test_second_click_on_the_stop_button_resumes(software_gpu: None) -> None:
     order = EditOrder(Path("bear.ply"), Path("/scenes/bear.edits/blue"), "blue", "all", "recolor:#3060d0")
     running = QueuedTask(1, order, "running", Progress(0.45, "Training", "0.0114"), 20.0)
     with rig(first_view(bear(), 0.7), SMALLEST) as hand:
         hand.main_view.work = replace(hand.main_view.work, jobs=(running,))
         hand.settle()
-        hand.click(SMALLEST[0] - 150.0, SMALLEST[1] - 55.0)  # the strip, which opens
+        hand.click(SMALLEST[0] - 150.0, SMALLEST[1] - 55.0)  # opens the strip of jobs
         hand.settle()
 
         def asked(job: QueuedTask, x: float, y: float) -> tuple[str, ...]:

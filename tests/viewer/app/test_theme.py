@@ -1,4 +1,4 @@
-"""The colors of the theme: what is read and what is pressed stands out from what lies under it (WCAG 2.1)."""
+"""Colors of the theme: text and controls contrast with their background (WCAG 2.1)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ FIELDS = ("field", "field_hovered")
 TEXT = 4.5
 ICON = 3.0
 TICK = 4.0
-"""Least contrasts."""
+"""Minimum contrast ratios of text, icons and slider ticks."""
 PAIRS = (
     *[("text", ground, TEXT) for ground in (*GROUNDS, *FIELDS, "field_active", "chosen")],
     *[("dim", ground, TEXT) for ground in (*GROUNDS, "field")],
@@ -41,13 +41,13 @@ def over(color: Rgba, ground: Rgba, alpha: float) -> Rgba:
 
 
 @pytest.mark.parametrize(("color", "ground", "least"), PAIRS)
-def test_what_is_read_and_pressed_stands_out(color: str, ground: str, least: float) -> None:
+def test_text_and_controls_have_enough_contrast(color: str, ground: str, least: float) -> None:
     found = contrast(getattr(PALETTE, color), getattr(PALETTE, ground))
     assert found >= least, f"{color} on {ground}: {found:.2f}"
 
 
 @pytest.mark.parametrize("ground", GROUNDS)
-def test_what_is_disabled_is_darker_than_all_that_is_enabled(ground: str) -> None:
+def test_disabled_text_is_darker_than_all_enabled_colors(ground: str) -> None:
     ui = UiContext()
     alpha = imgui.get_style().disabled_alpha
     ui.close()
@@ -56,7 +56,7 @@ def test_what_is_disabled_is_darker_than_all_that_is_enabled(ground: str) -> Non
     assert disabled < min(contrast(color, below) for color in (PALETTE.faint, PALETTE.dim, PALETTE.text))
 
 
-def test_there_is_one_blue_and_all_else_is_gray_or_a_warning() -> None:
+def test_accent_is_the_only_color_besides_warnings() -> None:
     colored = {
         name
         for name, color in vars(PALETTE).items()

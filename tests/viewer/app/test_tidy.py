@@ -1,4 +1,4 @@
-"""What is done to the selection by hand: removed, moved, copied, each a layer with a slider."""
+"""Removing, moving and copying a selection by hand; each becomes a layer with a slider."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def shown(app: App) -> torch.Tensor:
     return app.engine.gaussians(app.main_view.work.view).opacities
 
 
-def test_what_is_removed_is_a_layer_that_undo_takes_back(app: App, folder: Path) -> None:
+def test_removed_selection_is_a_layer_that_undo_restores(app: App, folder: Path) -> None:
     members = bear().demo.members("scarf")
     count = len(bear().scene)
     press(app, "Alt+Delete")
@@ -56,7 +56,7 @@ def test_what_is_removed_is_a_layer_that_undo_takes_back(app: App, folder: Path)
     assert app.main_view.work.view.selection.count == len(members)
 
 
-def test_what_is_moved_follows_the_handles_and_is_kept_or_put_back(app: App) -> None:
+def test_moved_selection_follows_the_gizmo_and_can_be_canceled(app: App) -> None:
     press(app, "Alt+M")
     gizmo = app.main_view.gizmo
     assert gizmo is not None
@@ -82,7 +82,7 @@ def test_what_is_moved_follows_the_handles_and_is_kept_or_put_back(app: App) -> 
     )
 
 
-def test_a_copy_has_rows_of_its_own_that_are_counted_selected_saved_and_exported(
+def test_copy_has_rows_that_are_counted_selected_saved_and_exported(
     app: App, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     members = bear().demo.members("scarf")
@@ -114,7 +114,7 @@ def test_a_copy_has_rows_of_its_own_that_are_counted_selected_saved_and_exported
     assert bits(load_ply(folder / "out0.ply")) == bits(load_ply(folder / "bear.ply"))
 
 
-def test_without_a_selection_nothing_is_done_and_it_is_said(app: App) -> None:
+def test_tidy_actions_need_a_selection(app: App) -> None:
     press(app, "Ctrl+Shift+A", "Alt+Delete")
     message = app.main_view.work.message
     assert message is not None

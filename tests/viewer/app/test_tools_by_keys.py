@@ -1,4 +1,4 @@
-"""Every tool by keys alone: what it selects and paints is what the mouse does with it, bit for bit."""
+"""Every tool gives the same result bit for bit by keys alone as by mouse."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ DRAG = ("Shift+Right", "Right", "Shift+Down", "Down", "Shift+Left", "Shift+Left"
 
 
 def places(start: tuple[float, float], way: Sequence[str]) -> list[tuple[float, float]]:
-    """Where arrows lead to from there, one after the other."""
+    """Return the positions that arrow keys reach from `start`, in order."""
     found = [start]
     for chord in way:
         modifier, _, arrow = chord.rpartition("+")
@@ -55,9 +55,9 @@ def by_mouse(hand: Rig, tool: str) -> None:
 def by_keys(hand: Rig, tool: str) -> None:
     def strike(chord: str) -> None:
         hand.key(chord)
-        hand.rest(0.5)  # two presses that follow closely are a double click, as of the mouse
+        hand.rest(0.5)  # two presses in quick succession are a double click, as with the mouse
 
-    hand.move(5.0, 600.0)  # wherever it is
+    hand.move(5.0, 600.0)  # an arbitrary mouse position
     for chord in WAY:
         strike(chord)
     strike("Space")
@@ -70,13 +70,13 @@ def by_keys(hand: Rig, tool: str) -> None:
     strike("Enter")
 
 
-def test_the_middle_of_the_picture_is_where_keys_begin() -> None:
+def test_keyboard_pointer_starts_in_the_middle_of_the_picture() -> None:
     with rig(first_view(bear()), WINDOW) as hand:
         assert tuple(side / 2 for side in hand.main_view.picture_size) == MIDDLE
 
 
 @pytest.mark.parametrize("tool", ["R", "L", "P", "U", "Shift+U", "Shift+R", "J", "I", "B"])
-def test_a_tool_does_by_keys_what_it_does_by_the_mouse(tool: str) -> None:
+def test_tool_works_by_keys_as_by_mouse(tool: str) -> None:
     views = []
     for drive in (by_mouse, by_keys):
         with rig(replace(first_view(bear(), 0.7, 0.7), select=SelectTool(through=True)), WINDOW) as hand:
@@ -94,7 +94,7 @@ def test_a_tool_does_by_keys_what_it_does_by_the_mouse(tool: str) -> None:
     assert views[0] == views[1]
 
 
-def test_a_decal_goes_by_keys(tmp_path: Path) -> None:
+def test_decal_is_placed_by_keys(tmp_path: Path) -> None:
     pixels = np.zeros((40, 80, 4), np.uint8)
     pixels[10:30, 20:60] = 200, 30, 30, 255
     Image.fromarray(pixels).save(tmp_path / "logo.png")
@@ -108,7 +108,7 @@ def test_a_decal_goes_by_keys(tmp_path: Path) -> None:
         assert "lay_decal" in hand.main_view.take_requests()
 
 
-def test_escape_lets_go_and_then_the_mouse_has_the_pointer_again() -> None:
+def test_escape_releases_the_pointer_to_the_mouse() -> None:
     with rig(replace(first_view(bear()), select=SelectTool(through=True)), WINDOW) as hand:
         hand.key("U")
         for chord in (*WAY, "Space", "Down"):
@@ -128,7 +128,7 @@ def test_escape_lets_go_and_then_the_mouse_has_the_pointer_again() -> None:
         assert hand.strengths != [0.0, 0.0], "without a tool arrows are those of the layer"
 
 
-def test_the_keys_of_a_tool_can_be_changed_and_leave_those_of_others() -> None:
+def test_tool_keys_can_be_rebound_independently() -> None:
     try:
         assert bind({"point_press": "J", "nudge:0.01": "Left"}) == []
         assert HAND_KEYS["J"].action == "point_press"

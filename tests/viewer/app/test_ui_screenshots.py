@@ -1,4 +1,4 @@
-"""What the interface looks like on a software GPU. After --regenerate-screenshots, look at them."""
+"""Screenshots of the interface on a software GPU. Check them after --regenerate-screenshots."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ Compare = Callable[[str, np.ndarray], None]
 
 pytestmark = [pytest.mark.gl, pytest.mark.usefixtures("software_gpu")]
 SMALLEST = (1024, 640)
-"""The least window size that the layout is made for."""
+"""Smallest window size that the layout supports, points."""
 
 
 def crowded() -> ViewState:
-    """More layers than fit, names that are too long, one layer hidden."""
+    """Return a view with more layers than fit, too long names and one hidden layer."""
     names = (
         "scarf",
         "ears → gold",
@@ -45,27 +45,27 @@ def the_panel(hand: Rig) -> np.ndarray:
     return hand.image()[:, -round(panel.WIDTH_PX) :]
 
 
-def test_the_window_at_its_smallest(screenshot: Compare) -> None:
+def test_screenshot_of_the_smallest_window(screenshot: Compare) -> None:
     with rig(replace(first_view(bear(), 0.7, 0.5), axes=True), SMALLEST) as hand:
         screenshot("ui_main", hand.image())
 
 
-def test_the_window_on_a_dense_screen(screenshot: Compare) -> None:
+def test_screenshot_of_a_dense_screen(screenshot: Compare) -> None:
     with rig(replace(first_view(bear(), 0.7, 0.5), axes=True), (700, 560), density=2.0) as hand:
         screenshot("ui_2x", hand.image())
 
 
-def test_a_scaled_desktop_shows_the_same_as_a_dense_screen() -> None:
+def test_scaled_desktop_looks_like_a_dense_screen() -> None:
     view = first_view(bear(), 0.7, 0.5)
     with rig(view, (700, 560), density=2.0) as hand:
         dense = hand.image()
     with rig(view, (1400, 1120), scale=2.0) as hand:
         scaled = hand.image()
-    # edges of text may fall between pixels of the one and on pixels of the other
+    # edges of text may fall between pixels in one image and on pixels in the other
     assert (np.abs(dense.astype(int) - scaled).max(axis=-1) > 40).mean() < 0.01
 
 
-def test_more_layers_than_fit_are_scrolled_to(screenshot: Compare) -> None:
+def test_screenshot_of_more_layers_than_fit(screenshot: Compare) -> None:
     with rig(crowded(), SMALLEST) as hand:
         screenshot("ui_crowded", the_panel(hand))
         hand.wheel(900.0, 300.0, -100.0)
@@ -73,7 +73,7 @@ def test_more_layers_than_fit_are_scrolled_to(screenshot: Compare) -> None:
         screenshot("ui_crowded_scrolled", the_panel(hand))
 
 
-def test_the_list_of_bindings_and_a_message(screenshot: Compare) -> None:
+def test_screenshot_of_the_key_list_and_a_message(screenshot: Compare) -> None:
     with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
         hand.key("F1")
         hand.main_view.show_message(
@@ -83,14 +83,14 @@ def test_the_list_of_bindings_and_a_message(screenshot: Compare) -> None:
         screenshot("ui_help", hand.image())
 
 
-def test_a_scene_without_edits_and_the_original(screenshot: Compare) -> None:
+def test_screenshot_of_the_original_without_edits(screenshot: Compare) -> None:
     with rig(first_view(bear()), SMALLEST) as hand:
         hand.key("\\")
         hand.frame(2)
         screenshot("ui_original", hand.image())
 
 
-def test_a_value_being_typed(screenshot: Compare) -> None:
+def test_screenshot_of_a_value_being_typed(screenshot: Compare) -> None:
     with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
         hand.modifier(imgui.Key.mod_ctrl)
         hand.move(900.0, TRACK)
@@ -101,7 +101,7 @@ def test_a_value_being_typed(screenshot: Compare) -> None:
         screenshot("ui_typing", the_panel(hand))
 
 
-def test_gains_and_the_curve_unfolded_one_layer_alone_one_locked(screenshot: Compare) -> None:
+def test_screenshot_of_gains_with_a_solo_and_a_locked_layer(screenshot: Compare) -> None:
     view = replace(first_view(bear(), 1.1, 0.5), overshoot=True, unfolded=(0,))
     first, second = view.layers
     layers = (replace(first, solo=True), replace(second, locked=True))
@@ -111,7 +111,7 @@ def test_gains_and_the_curve_unfolded_one_layer_alone_one_locked(screenshot: Com
         screenshot("ui_gains", hand.image())
 
 
-def test_the_original_beside_the_edited(screenshot: Compare) -> None:
+def test_screenshot_of_the_split_comparison(screenshot: Compare) -> None:
     with rig(first_view(bear(), 1.0, 1.0), SMALLEST) as hand:
         hand.key("Shift+Y")
         hand.move(362.0, 250.0)
@@ -119,13 +119,13 @@ def test_the_original_beside_the_edited(screenshot: Compare) -> None:
         screenshot("ui_split", hand.image())
 
 
-def test_the_difference_from_the_original(screenshot: Compare) -> None:
+def test_screenshot_of_the_difference(screenshot: Compare) -> None:
     with rig(first_view(bear(), 1.0, 1.0), SMALLEST) as hand:
         hand.key("Alt+Y")
         screenshot("ui_difference", hand.image())
 
 
-def test_snapshots_and_a_question(screenshot: Compare) -> None:
+def test_screenshot_of_snapshots_and_a_question(screenshot: Compare) -> None:
     with rig(first_view(bear(), 1.0, 0.0), SMALLEST) as hand:
         for chord in ("F5", *["Shift+Left"] * 5, "F5"):
             hand.key(chord)
@@ -136,7 +136,7 @@ def test_snapshots_and_a_question(screenshot: Compare) -> None:
         screenshot("ui_snapshots", hand.image())
 
 
-def test_twenty_layers_as_rows_with_a_group_and_several_selected(screenshot: Compare) -> None:
+def test_screenshot_of_twenty_layers_as_rows_with_a_group(screenshot: Compare) -> None:
     stack, view = many_edits(bear())
     layers = [replace(layer, strength=i * 7 % 20 / 19) for i, layer in enumerate(view.layers)]
     layers[2], layers[6] = replace(layers[2], enabled=False), replace(layers[6], locked=True)
@@ -152,7 +152,7 @@ def test_twenty_layers_as_rows_with_a_group_and_several_selected(screenshot: Com
         screenshot("ui_rows", the_panel(hand))
 
 
-def test_two_snapshots_compared(screenshot: Compare) -> None:
+def test_screenshot_of_two_snapshots_compared(screenshot: Compare) -> None:
     with rig(first_view(bear(), 1.0, 0.0), SMALLEST) as hand:
         for chord in ("F5", *["Shift+Right"] * 10, "2", *["Shift+Left"] * 10, "F5"):
             hand.key(chord)
@@ -163,7 +163,7 @@ def test_two_snapshots_compared(screenshot: Compare) -> None:
         screenshot("ui_compared", hand.image())
 
 
-def test_a_lasso_its_selection_and_a_region(screenshot: Compare) -> None:
+def test_screenshot_of_a_lasso_its_selection_and_a_region(screenshot: Compare) -> None:
     mask = bear().demo.labels.numpy() == 1
     kept = selection.add_region(selection.select(SelectionState(), mask), "scarf", Path("scarf.region.npy"))
     with rig(replace(first_view(bear(), 0.7, 0.5), selection=kept), SMALLEST) as hand:
@@ -182,7 +182,7 @@ def test_a_lasso_its_selection_and_a_region(screenshot: Compare) -> None:
         screenshot("ui_select", hand.image())
 
 
-def test_axes_and_the_grid_on_the_ground(screenshot: Compare) -> None:
+def test_screenshot_of_axes_and_the_ground_grid(screenshot: Compare) -> None:
     head = selection.select(SelectionState(), np.isin(bear().demo.labels.numpy(), (1, 2)))
     view = replace(first_view(bear()), axes=True, grid=True, background=(0.11, 0.11, 0.12))
     view = replace(view, selection=selection.isolate(head, len(bear().scene)))
@@ -193,7 +193,7 @@ def test_axes_and_the_grid_on_the_ground(screenshot: Compare) -> None:
         screenshot("ui_orientation", hand.image())
 
 
-def test_a_brush_on_the_picture_and_its_controls(screenshot: Compare) -> None:
+def test_screenshot_of_a_brush_and_its_controls(screenshot: Compare) -> None:
     view = replace(first_view(bear(), 1.0, 0.5), brush=Brush(active=True, radius=25.0))
     with rig(view, SMALLEST) as hand:
         hand.drag((360.0, 300.0), (420.0, 320.0))
@@ -201,7 +201,7 @@ def test_a_brush_on_the_picture_and_its_controls(screenshot: Compare) -> None:
         screenshot("ui_paint", hand.image())
 
 
-def test_all_commands_and_a_search_among_them(screenshot: Compare) -> None:
+def test_screenshot_of_the_command_palette_and_a_search(screenshot: Compare) -> None:
     with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
         hand.key("Ctrl+P")
         hand.frame(3)
@@ -211,7 +211,7 @@ def test_all_commands_and_a_search_among_them(screenshot: Compare) -> None:
         screenshot("ui_palette_search", hand.image())
 
 
-def test_everything_that_was_done_by_its_name(screenshot: Compare) -> None:
+def test_screenshot_of_the_history(screenshot: Compare) -> None:
     with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
         for chord in ("1", "Shift+Right", "H", "2", "Right", "Ctrl+A", "Ctrl+Z", "Ctrl+Alt+Z"):
             hand.key(chord)
@@ -219,7 +219,7 @@ def test_everything_that_was_done_by_its_name(screenshot: Compare) -> None:
         screenshot("ui_history", hand.image())
 
 
-def test_a_tool_that_keys_move(screenshot: Compare) -> None:
+def test_screenshot_of_a_tool_moved_by_keys(screenshot: Compare) -> None:
     with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
         for chord in ("U", *["Shift+Up"] * 2, "Space", *["Shift+Right"] * 2, "Shift+Down"):
             hand.key(chord)

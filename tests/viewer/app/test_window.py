@@ -1,4 +1,4 @@
-"""The real window: `progdf view` under Xvfb, driven by xdotool."""
+"""Real window: `progdf view` under Xvfb, driven by xdotool."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from viewer.panel import card, panel
 from viewer.ui.keys import KEYS, NAMES
 from viewer.ui.splash import SIZE
 
-PATIENCE_S = 120.0  # a busy machine may take long; what has happened is not waited for
+PATIENCE_S = 120.0  # generous for a busy machine; waiting ends as soon as the condition holds
 WIDTH, HEIGHT = SIZE
 
 
 @dataclass
 class Desktop:
-    """`progdf view` on a display of its own."""
+    """`progdf view` on its own virtual display."""
 
     process: subprocess.Popen[str]
     environment: dict[str, str]
@@ -68,21 +68,21 @@ class Desktop:
         self.xdotool("mouseup", button)
 
     def grip(self, start: tuple[float, float], end: tuple[float, float], button: int = 1) -> None:
-        """A drag that does not let go."""
+        """Press and drag without releasing the button."""
         self.point(*start)
         self.xdotool("mousedown", button)
         for share in (0.3, 0.6, 1.0):
             self.point(*(a + share * (b - a) for a, b in zip(start, end, strict=True)))
 
     def shot(self, keys: str = "shift+F2") -> np.ndarray:
-        """The window as it saves itself, after everything that was sent before."""
+        """Return the window's own screenshot after all earlier input is handled. [H,W,3]"""
         path = self.folder / f"bear_{len(list(self.folder.glob('bear_*.png'))) + 1:03d}.png"
         self.xdotool("key", keys)
         self.until(path.name, path.exists)
         return np.asarray(Image.open(path)).astype(int)
 
     def rest(self) -> np.ndarray:
-        """The window once its picture is still: on a slow machine it is coarse while it is in the hand."""
+        """Return a screenshot once the picture is sharp; on a slow machine it is coarse during a drag."""
         shots = [self.shot()]
 
         def same() -> bool:
@@ -93,11 +93,11 @@ class Desktop:
         return shots[-1]
 
     def turns(self) -> int:
-        """How often the window's loop has gone round: events handled, frames drawn."""
+        """Return the number of turns of the window's loop that handled events or drew frames."""
         return int.from_bytes((self.folder / "turns").read_bytes(), "little")
 
     def until_idle(self, what: str) -> None:
-        """Until a whole second passes in which the window's loop never goes round."""
+        """Wait until the window's loop makes no turn for one second."""
 
         def idle() -> bool:
             before = self.turns()
@@ -109,7 +109,7 @@ class Desktop:
 
 @pytest.fixture
 def screen() -> Iterator[str]:
-    """The name of a virtual display."""
+    """Start a virtual display; yield its name."""
     if missing := missing_tools():
         pytest.skip(f"{missing} is not installed")
     with display(WIDTH + 100, HEIGHT + 100) as name:
@@ -146,26 +146,26 @@ def desktop(screen: str, tmp_path: Path) -> Iterator[Desktop]:
 
 
 def slider(layer: int, strength: float) -> tuple[float, float]:
-    """Of two layers the last one lies on top."""
+    """Return the window position of a strength; the last of two layers is on top."""
     inset = 12 + 10 + 7
     x = WIDTH - panel.WIDTH_PX + inset + strength * (panel.WIDTH_PX - 2 * inset)
     return x, TRACK + card.CARD_PX * (1 - layer)
 
 
 def changed(before: np.ndarray, after: np.ndarray, height: int = HEIGHT - 60) -> int:
-    """Pixels of the picture that differ visibly; without the line at its bottom, if nothing else is said."""
+    """Count visibly different pixels of the picture, by default without the line at its bottom."""
     part = np.s_[:height, : WIDTH - round(panel.WIDTH_PX)]
     return int((np.abs(before[part] - after[part]).max(axis=-1) > 12).sum())
 
 
 def brightness(shot: np.ndarray) -> float:
-    """Mean level of the picture, 0..255."""
+    """Return the mean level of the picture, 0 to 255."""
     return float(shot[:, : WIDTH - round(panel.WIDTH_PX)].mean())
 
 
 @pytest.mark.window
 @pytest.mark.gl
-def test_a_slider_dragged_by_the_real_mouse_changes_the_picture_and_idle_costs_nothing(
+def test_real_mouse_drag_changes_the_picture_and_idle_costs_nothing(
     desktop: Desktop,
 ) -> None:
     first = desktop.rest()
@@ -176,11 +176,11 @@ def test_a_slider_dragged_by_the_real_mouse_changes_the_picture_and_idle_costs_n
     desktop.point(400, 400)  # away from the tooltip
     assert changed(first, desktop.rest()) == 0
     desktop.until_idle("a window that draws nothing when nothing changes")
-    # and it orbits, flies and takes a new size
+    # orbit, fly and resize as well
     desktop.drag((400, 400), (480, 380))
     desktop.until("the turn", lambda: changed(first, desktop.shot()) > 1000)
     orbited = desktop.rest()
-    desktop.xdotool("keydown", "ctrl", "keydown", "a", "keyup", "ctrl")  # as hands let go of a chord
+    desktop.xdotool("keydown", "ctrl", "keydown", "a", "keyup", "ctrl")  # Ctrl is released first
     desktop.until("the tint of all that is selected", lambda: changed(orbited, desktop.shot()) > 1000)
     desktop.rest()
     desktop.xdotool("key", "ctrl+z")
@@ -190,7 +190,7 @@ def test_a_slider_dragged_by_the_real_mouse_changes_the_picture_and_idle_costs_n
     desktop.until("the flight", lambda: changed(orbited, desktop.shot("F2")) > 1000)
     desktop.xdotool("keyup", "w")
     desktop.xdotool("windowsize", "--sync", desktop.window, 900, 650)
-    # the window may be told of its size after the key that follows it
+    # the window may learn its size after the next key
     shapes = (desktop.shot("F2").shape for _ in range(5))
     assert (650, 900 - panel.WIDTH_PX, 3) in shapes
     desktop.xdotool("key", "ctrl+q")
@@ -201,7 +201,7 @@ def test_a_slider_dragged_by_the_real_mouse_changes_the_picture_and_idle_costs_n
 @pytest.mark.window
 @pytest.mark.gl
 @pytest.mark.slow
-def test_the_real_window_comes_back_as_it_was_after_it_was_out_of_sight(desktop: Desktop) -> None:
+def test_real_window_is_unchanged_after_it_was_minimized(desktop: Desktop) -> None:
     first = desktop.rest()
     desktop.xdotool("windowunmap", "--sync", desktop.window)  # what minimizing does to a window
     desktop.until_idle("a window that draws nothing when nobody can see it")
@@ -215,11 +215,11 @@ def test_the_real_window_comes_back_as_it_was_after_it_was_out_of_sight(desktop:
 @pytest.mark.slow
 @pytest.mark.window
 @pytest.mark.gl
-def test_the_real_mouse_paints_undo_takes_the_stroke_away_and_closing_asks_and_saves(
+def test_real_mouse_paints_undo_reverts_and_closing_saves(
     desktop: Desktop,
 ) -> None:
-    desktop.point(*slider(0, 0.5))  # where the brush's ring is not over the picture
-    desktop.xdotool("key", "2")  # the lower card: the scarf
+    desktop.point(*slider(0, 0.5))  # keeps the brush's ring away from the picture
+    desktop.xdotool("key", "2")  # the lower card, the scarf
     clean = desktop.rest()
     desktop.xdotool("key", "b", "c")
     colors = desktop.rest()
@@ -235,7 +235,7 @@ def test_the_real_mouse_paints_undo_takes_the_stroke_away_and_closing_asks_and_s
     assert changed(painted, desktop.rest()) == 0
     desktop.xdotool("key", "b")
     assert changed(clean, desktop.shot()) > 50, "where it was erased the edit is gone"
-    # and closing it with unsaved changes asks, and saves
+    # closing with unsaved changes asks and saves
     bright = brightness(desktop.rest())
     desktop.xdotool("key", "shift+Left")
     desktop.xdotool("key", "ctrl+q")
@@ -254,7 +254,7 @@ def test_the_real_mouse_paints_undo_takes_the_stroke_away_and_closing_asks_and_s
 
 
 def scarf_on_screen() -> tuple[float, float]:
-    """Where the middle of the scarf is in the first picture."""
+    """Return the window position of the scarf's center in the first view."""
     stack = bear()
     size = (WIDTH - round(panel.WIDTH_PX), HEIGHT)
     camera = to_camera(first_camera(stack.scene), *size)
@@ -266,7 +266,7 @@ def scarf_on_screen() -> tuple[float, float]:
 @pytest.mark.window
 @pytest.mark.gl
 @pytest.mark.slow
-def test_escape_takes_a_drag_of_the_real_mouse_back(desktop: Desktop) -> None:
+def test_escape_cancels_a_drag_of_the_real_mouse(desktop: Desktop) -> None:
     first = desktop.rest()
     desktop.grip(slider(0, 0.5), slider(0, 1.0))
     desktop.until("the edit", lambda: changed(first, desktop.shot()) > 200)
@@ -289,7 +289,7 @@ def test_ctrl_c_in_the_terminal_closes_an_idle_window(desktop: Desktop) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux can be without a display")
-def test_without_a_display_view_says_so_in_one_line(
+def test_view_without_a_display_is_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "XDG_SESSION_TYPE"):
@@ -301,7 +301,7 @@ def test_without_a_display_view_says_so_in_one_line(
     assert "progdf render" in said
 
 
-def test_chords_are_named_as_in_the_table_of_bindings() -> None:
+def test_chords_are_named_like_the_bindings() -> None:
     from viewer.ui.window import KEY_NAMES, chord, glfw
 
     assert chord("Z", glfw.MOD_CONTROL | glfw.MOD_SHIFT) == "Ctrl+Shift+Z"
@@ -313,7 +313,7 @@ def test_chords_are_named_as_in_the_table_of_bindings() -> None:
 @pytest.mark.window
 @pytest.mark.gl
 @pytest.mark.slow
-def test_what_the_real_keyboard_types_fast_arrives_whole(desktop: Desktop) -> None:
+def test_fast_typing_on_the_real_keyboard_is_complete(desktop: Desktop) -> None:
     desktop.shot()
     desktop.xdotool("keydown", "ctrl")
     desktop.point(*slider(0, 0.2))
@@ -347,8 +347,10 @@ sys.exit(main(sys.argv[1:]))
 
 
 def view_first(screen: str, *words: object) -> tuple[int, list[str]]:
-    """What a process of its own tells: its status, and which of what is slow to import was there at its first
-    frame; then what it says itself."""
+    """Run `progdf view` in a new process; return its status and its error output.
+
+    The first line names the copy of glfw and the slow imports that are loaded at the first frame.
+    """
     command = [sys.executable, "-c", FIRST_FRAME, "view", *map(str, words)]
     environment = os.environ | {"DISPLAY": screen}
     for name in ("WAYLAND_DISPLAY", "PYGLFW_LIBRARY"):
@@ -359,11 +361,11 @@ def view_first(screen: str, *words: object) -> tuple[int, list[str]]:
 
 @pytest.mark.window
 @pytest.mark.gl
-def test_a_window_is_there_before_what_is_slow_to_import(screen: str, tmp_path: Path) -> None:
+def test_window_opens_before_slow_imports(screen: str, tmp_path: Path) -> None:
     scene, edit, *_ = bear().save(tmp_path)
     status, lines = view_first(screen, scene, edit, "--set", "hat=0.5")
     assert status == 2
-    # without any of it, and of two copies of glfw one would know nothing of the other's window
+    # no slow import is loaded, and there is only one copy of glfw, as two copies do not share windows
     assert lines[0] == "glfw of imgui_bundle"
     assert "there is no edit of that name" in lines[1], "then what only the files tell"
     assert len(lines) == 2
