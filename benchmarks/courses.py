@@ -22,7 +22,7 @@ from .analytic_edits import AnalyticEdit
 
 
 @dataclass(frozen=True)
-class KnownEdit:
+class KnownTrajectory:
     """An edit with its true trajectory."""
 
     name: str  # name of the edit
@@ -47,7 +47,7 @@ def known_edit(
     members: Tensor,
     cameras: Sequence[Camera],
     snapshots: int,
-) -> KnownEdit:
+) -> KnownTrajectory:
     """Prepare an analytic edit for benchmarks of fields.
 
     Args:
@@ -84,7 +84,7 @@ def known_edit(
     )
     weights = visible / visible.mean() + 1e-3
     look = _changed_pixels(scene, members, offsets, seen)
-    return KnownEdit(
+    return KnownTrajectory(
         name=name,
         scene=scene,
         members=members,

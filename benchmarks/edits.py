@@ -26,7 +26,7 @@ from trainer.editors import PER_VIEW
 from trainer.evaluate.opened import FADE, KEYFRAMES, SLIDER, OpenedRun, open_run
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.optimize.losses import perceptual_loss
-from trainer.report.measures import COMPARED, picture_courses
+from trainer.report.measures import COMPARED, error_curves
 from trainer.setup import Pictures
 from trainer.views.choose import split_held_out
 from trainer.views.view import View, crop, make_view
@@ -79,7 +79,7 @@ def edit_table(opened: Sequence[OpenedRun]) -> Table:
     rows = []
     for run in opened:
         strength = dict(run.trajectory.stage_strengths)
-        curves = picture_courses(
+        curves = error_curves(
             run.evaluator,
             run.contenders(),
             tuple(strength),

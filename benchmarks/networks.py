@@ -40,7 +40,7 @@ from progdf.terminal import group_digits
 from trainer.fit.fit import stored_numbers
 from trainer.fit.network import rendered_importance
 
-from .courses import KnownEdit, edit_of, processor_milliseconds
+from .courses import KnownTrajectory, edit_of, processor_milliseconds
 from .recorded_runs import recorded_edit
 from .table import Table, mean_worst
 
@@ -51,7 +51,7 @@ NETWORKS: Mapping[str, NeuralSettings] = {
     "paper's 6 M, smooth bins": NeuralSettings("paper", "position"),
 }
 
-LONGEST = 600.0
+MAX_TRAINING_S = 600.0
 """Largest processor time for training a network, seconds; others are timed untrained."""
 
 ROUNDS = 15
@@ -97,7 +97,7 @@ def tables(runs: Sequence[Path] = ()) -> list[Table]:
     return [Table.of("networks", "Networks, trained to the end", rows, NOTE)]
 
 
-def _rows(run: Path, course: KnownEdit) -> list[dict[str, str]]:
+def _rows(run: Path, course: KnownTrajectory) -> list[dict[str, str]]:
     before = pack(course.scene[course.members])
     make_folder(run / "networks")
     baked: dict[str, BakedField] = {}
@@ -150,7 +150,7 @@ def _rows(run: Path, course: KnownEdit) -> list[dict[str, str]]:
     return rows
 
 
-def _trained(run: Path, name: str, settings: NeuralSettings, course: KnownEdit) -> TrainedNetwork:
+def _trained(run: Path, name: str, settings: NeuralSettings, course: KnownTrajectory) -> TrainedNetwork:
     """Return the network of that name from the run's folder, or train it."""
     path = run / "networks" / f"{name.replace(', ', '-').replace(' ', '-')}.gdf"
     before = pack(course.scene[course.members])
@@ -159,7 +159,7 @@ def _trained(run: Path, name: str, settings: NeuralSettings, course: KnownEdit) 
     settings = replace(effort, batch=min(effort.batch, members))
     if not path.is_file():
         total_seconds = _step_seconds(course, settings) * settings.steps
-        if total_seconds > LONGEST:
+        if total_seconds > MAX_TRAINING_S:
             fit = _begin(course, settings)
             return TrainedNetwork(fit.field(), bake_network(fit.field(), before), 0, total_seconds)
         begin = time.process_time()
@@ -176,7 +176,7 @@ def _trained(run: Path, name: str, settings: NeuralSettings, course: KnownEdit) 
     )
 
 
-def _begin(course: KnownEdit, settings: NeuralSettings) -> NeuralFit:
+def _begin(course: KnownTrajectory, settings: NeuralSettings) -> NeuralFit:
     before = pack(course.scene[course.members])
     moving = tuple(moving_attributes(course.offsets))
     channels = course.offsets.shape[2]
@@ -185,7 +185,7 @@ def _begin(course: KnownEdit, settings: NeuralSettings) -> NeuralFit:
     return fit
 
 
-def _step_seconds(course: KnownEdit, settings: NeuralSettings) -> float:
+def _step_seconds(course: KnownTrajectory, settings: NeuralSettings) -> float:
     """Measure the processor time of one training step, seconds."""
     fit = _begin(course, settings)
     fit.step(course.strengths, course.offsets)

@@ -28,7 +28,7 @@ from progdf.rasterize.cpu.engine import ListedWeights
 from progdf.rasterize.engines import ActivatedGaussians, RasterView, color_map, engine_device
 from progdf.sh import C0
 from progdf.terminal import group_digits
-from trainer.optimize.color_views import LOST
+from trainer.optimize.color_views import OMITTED_WEIGHT
 from trainer.optimize.losses import Objective, perceptual_loss
 from trainer.optimize.pgs import PgsSettings, TargetStage, learning_rates, optimize
 from trainer.options import OptimizeOptions
@@ -268,7 +268,7 @@ def list_table(cases: Sequence[RasterCase], rounds: int = 9) -> Table:
         inputs, camera = cloud(case)
         window = (0, 0, camera.width, camera.height)
         every = torch.arange(case.count)
-        times: dict[float, list[tuple[float, float]]] = {0.0: [], LOST: []}
+        times: dict[float, list[tuple[float, float]]] = {0.0: [], OMITTED_WEIGHT: []}
         pictures = dict[float, Tensor]()
         entries = dict[float, int]()
         with _threads(1, 1):
@@ -286,10 +286,10 @@ def list_table(cases: Sequence[RasterCase], rounds: int = 9) -> Table:
             [f"{statistics.median(pair[k] for pair in durations[1:]):.1f}" for durations in times.values()]
             for k in (0, 1)
         )
-        difference = float((pictures[LOST] - pictures[0.0]).abs().max())
-        left_out = f"{1.0 - entries[LOST] / entries[0.0]:.0%}"
+        difference = float((pictures[OMITTED_WEIGHT] - pictures[0.0]).abs().max())
+        left_out = f"{1.0 - entries[OMITTED_WEIGHT] / entries[0.0]:.0%}"
         size = group_digits(case.count), f"{case.size}²"
-        rows.append((*size, left_out, *listing, *rendering, f"{difference:.4f}", f"{LOST:.4f}"))
+        rows.append((*size, left_out, *listing, *rendering, f"{difference:.4f}", f"{OMITTED_WEIGHT:.4f}"))
     columns = (
         "Gaussians",
         "pixels",

@@ -10,13 +10,13 @@ from trainer.run.finish import load_evaluator
 from trainer.run.record import render_run_views, reopen_run
 from trainer.views.choose import split_held_out
 
-from .courses import KnownEdit
+from .courses import KnownTrajectory
 
 LOOKED = 3  # training views on which ranks are chosen
 JUDGED = 2  # held-out views for the choice, and as many others for the evaluation
 
 
-def recorded_edit(root: Path) -> KnownEdit:
+def recorded_edit(root: Path) -> KnownTrajectory:
     """Load the edit of a run folder; its truth is the recording, interpolated linearly between snapshots.
 
     Raises:
@@ -32,7 +32,7 @@ def recorded_edit(root: Path) -> KnownEdit:
         for views in (rank_views, choosing[:JUDGED], reporting[:JUDGED])
     )
     offsets = trajectory.nodes
-    return KnownEdit(
+    return KnownTrajectory(
         name=f"{run.region.name} (recorded)",
         scene=run.scene,
         members=run.region.members,

@@ -32,13 +32,13 @@ from trainer.evaluate.measures import markdown_table
 from trainer.evaluate.opened import FADE, KEYFRAMES, SLIDER, OpenedRun, open_run
 from trainer.optimize.losses import Perceptual, perceptual_loss
 from trainer.options import EditorOptions, OptimizeOptions, RegionOptions, TrainingViewOptions, TrainOptions
-from trainer.report.measures import ErrorCurve, picture_courses
+from trainer.report.measures import ErrorCurve, error_curves
 from trainer.report.plots import Plot
 from trainer.report.report import stack_plots, thumbnail
 from trainer.resolve import resolve, use_threads
 from trainer.run.demo import Effort, write_scene
 from trainer.run.resume import find_run
-from trainer.setup import make_training_setup, take_glances
+from trainer.setup import make_training_setup, render_thumbnails
 from trainer.store.run_folder import write_json
 from trainer.views.view import crop, render_view
 
@@ -192,7 +192,7 @@ def _judge_case(folder: Path, case: KnownEdit, scene: DemoScene, perceptual: Per
     opened = open_run(folder / case.folder)
     truth = _truth(case, opened, scene)
     contenders = opened.contenders()
-    curves = picture_courses(opened.evaluator, contenders, STRENGTHS, truth, perceptual)
+    curves = error_curves(opened.evaluator, contenders, STRENGTHS, truth, perceptual)
     best = max(range(len(opened.evaluator.pixels)), key=lambda k: int(opened.evaluator.pixels[k].sum()))
     sources = {"truth": truth, **contenders}
     strips = {name: (pictures(0.5)[best], pictures(1.0)[best]) for name, pictures in sources.items()}
@@ -237,7 +237,7 @@ def _truth(case: KnownEdit, opened: OpenedRun, scene: DemoScene) -> Pictures:
     boxes = [crop_scene.box for crop_scene in opened.evaluator.crops]
     if case.editor:
         options = EditorOptions(case.editor)
-        glances = partial(take_glances, opened.run.record.plan.views, setup.scene, setup.region)
+        glances = partial(render_thumbnails, opened.run.record.plan.views, setup.scene, setup.region)
         editor = make_editor(options, setup.scene, setup.region, setup.views, glances)
 
         def pictures(s: float) -> list[Tensor]:

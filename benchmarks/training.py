@@ -37,7 +37,7 @@ from trainer.report.plots import GRID, INK, LINES, PAPER
 from .ablation.regret import MEASURED, REPORTING, RegretEdit, begin_edit
 from .table import Table, Wall
 
-WAYS = ("", "--quick", "--steps 40", "--views 12", "--stages 4", "--preset paper --field auto --quick")
+OPTION_SETS = ("", "--quick", "--steps 40", "--views 12", "--stages 4", "--preset paper --field auto --quick")
 """Options of `progdf train` for each run."""
 
 BEAR = 12_000
@@ -63,7 +63,7 @@ class TrainingTask:
 class TimedEdit:
     """Figures of one run."""
 
-    way: str  # one of `WAYS`
+    way: str  # one of `OPTION_SETS`
     seconds: float  # wall time
     processor: float  # processor seconds of all cores together
     psnrs: tuple[float, ...]  # against the editor's pictures at `MEASURED`, dB
@@ -121,7 +121,7 @@ def train(task: TrainingTask, scene: Gaussians, judge: Evaluator, way: str, out:
 
 
 def tables(scenes: Sequence[Path] = (), plot: Path | None = None) -> list[Table]:
-    """Train each scene with all of `WAYS`.
+    """Train each scene with all of `OPTION_SETS`.
 
     Args:
         scenes: trained in addition to the bear
@@ -132,8 +132,10 @@ def tables(scenes: Sequence[Path] = (), plot: Path | None = None) -> list[Table]
         for task in tasks(Path(name), scenes):
             edit = edit_of_task(task)
             judge = edit.judge()
-            outs = (Path(name) / f"{len(found)}-{i}" for i in range(len(WAYS)))
-            found[task] = [train(task, edit.scene, judge, *pair) for pair in zip(WAYS, outs, strict=True)]
+            outs = (Path(name) / f"{len(found)}-{i}" for i in range(len(OPTION_SETS)))
+            found[task] = [
+                train(task, edit.scene, judge, *pair) for pair in zip(OPTION_SETS, outs, strict=True)
+            ]
     if plot is not None:
         panels = {
             f"{task.scene.stem}, {task.editor}": [

@@ -17,7 +17,7 @@ from progdf.sh import rotation_change
 
 _COLUMNS = attribute_slices(BASE_CHANNELS)
 GEOMETRY = slice(0, _COLUMNS["quats"].stop)  # means, log-scales and quaternions come first in a packed row
-LOOK = slice(GEOMETRY.stop, BASE_CHANNELS)  # opacity and color of band 0
+APPEARANCE = slice(GEOMETRY.stop, BASE_CHANNELS)  # opacity and color of band 0
 _BANDS = slice(BASE_CHANNELS, None)
 
 
@@ -63,7 +63,7 @@ def move_rows(rows: Tensor, parts: Parts, motion: Motion) -> Tensor:
     """Return raw rows after the motion; differentiable. [M,C] -> [M,C]"""
     bands = rows[:, _BANDS]
     turned = bands + band_change(bands, turn_quats(motion.turn), parts.part)
-    return torch.cat([_move_geometry(rows, parts, motion), rows[:, LOOK], turned], dim=1)
+    return torch.cat([_move_geometry(rows, parts, motion), rows[:, APPEARANCE], turned], dim=1)
 
 
 def carry_offsets(original: Tensor, offsets: Tensor, parts: Parts, motion: Motion) -> Tensor:
@@ -112,7 +112,7 @@ def offsets_to(
     """
     bands = offsets[:, _BANDS]
     turned = bands + band_change(original[:, _BANDS] + bands, turns, part)
-    return torch.cat([geometry - original[:, GEOMETRY], offsets[:, LOOK], turned], dim=1)
+    return torch.cat([geometry - original[:, GEOMETRY], offsets[:, APPEARANCE], turned], dim=1)
 
 
 def band_change(bands: Tensor, turns: Tensor, part: Tensor | None = None) -> Tensor:

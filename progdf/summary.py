@@ -18,7 +18,7 @@ from progdf.field.baked import BakedField
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import Gdf
 from progdf.rasterize import render
-from progdf.scene.subject import fit_camera, is_room, richest_turn, standpoint, subject_rows
+from progdf.scene.subject import best_azimuth_offset, fit_camera, is_room, room_viewpoint, subject_rows
 from progdf.scene.up_axis import guess_up
 from progdf.terminal import escape_text, file_size, format_count
 
@@ -88,8 +88,8 @@ def _first_camera(scene: Gaussians) -> Camera:
     """Return the first camera of the viewer: slightly above the subject's front, or inside a room."""
     up = guess_up(scene)
     if is_room(scene, up):
-        return Camera(look_at(*standpoint(scene, up), up), intrinsics(math.radians(60.0), *_SIZE), *_SIZE)
-    turn = 20.0 + richest_turn(scene[subject_rows(scene, up)], up, 20.0, 15.0)
+        return Camera(look_at(*room_viewpoint(scene, up), up), intrinsics(math.radians(60.0), *_SIZE), *_SIZE)
+    turn = 20.0 + best_azimuth_offset(scene[subject_rows(scene, up)], up, 20.0, 15.0)
     return fit_camera(scene, up, (turn, 15.0), _SIZE, math.radians(45.0), 0.72)
 
 

@@ -30,14 +30,14 @@ _KNOT_SPACING = 1 / 8
 _OPACITY_COLUMN = attribute_slices(14)["logit_opacities"].start
 
 
-Deed = Literal["remove", "transform", "duplicate"]
+Operation = Literal["remove", "transform", "duplicate"]
 
 
 @dataclass(frozen=True)
 class Step:
     """One operation on a region of a scene."""
 
-    does: Deed
+    does: Operation
     region: Region
     motion: Motion | None = None  # motion of the region as one part; None: no motion
 

@@ -45,7 +45,7 @@ from trainer.editors.instruct import InstructEditor, instruct
 from trainer.fit.draft import DraftViews, draft_grade, draft_views
 from trainer.options import EditorOptions, RegionOptions, TrainingViewOptions
 from trainer.regions.from_pictures import RegionRequest, region_kinds
-from trainer.setup import take_glances
+from trainer.setup import render_thumbnails
 from trainer.views.view import View, make_view, with_near_plane
 
 _Row3 = tuple[float, float, float]
@@ -194,7 +194,7 @@ class Previewer:
     def _make_editor(self, options: EditorOptions, seen: PreviewRequest) -> ImageEditor:
         check_new_editor(options)
         region = self._region(seen.region)
-        glances = partial(take_glances, TrainingViewOptions(scene=self._path), self.scene, region)
+        glances = partial(render_thumbnails, TrainingViewOptions(scene=self._path), self.scene, region)
         return make_editor(options, self.scene, region, [self._view(seen)], glances)
 
 

@@ -42,7 +42,7 @@ from .views.crops import CropScene, crop_scene
 from .views.view import (
     BACKGROUND,
     INSIDE,
-    Glance,
+    RegionThumbnail,
     View,
     crop,
     fit_size,
@@ -186,7 +186,9 @@ def make_training_setup(options: TrainingViewOptions, scene: Gaussians, region: 
     return TrainingSetup(scene, region, train, held_out, background, notes, up)
 
 
-def take_glances(options: TrainingViewOptions, scene: Gaussians, region: Region) -> list[Glance]:
+def render_thumbnails(
+    options: TrainingViewOptions, scene: Gaussians, region: Region
+) -> list[RegionThumbnail]:
     """Return glances at the region from all sides, independent of number and size of its views.
 
     They come from the first given cameras that show it, spread over the list, or from a rig. There are none

@@ -20,7 +20,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import Gdf, verify
 from progdf.io.images import to_picture
-from progdf.io.json_values import convert_json, plain
+from progdf.io.json_values import convert_json, to_json
 
 from .camera.view_camera import LARGEST_SIDE, ViewCamera, first_camera
 from .files.document import Document
@@ -127,7 +127,7 @@ class Widget(anywidget.AnyWidget):
             background=background,
             overshoot=any(layer.strength > 1.0 for layer in stack),
         )
-        self._view = convert_json(plain(view), ViewState)  # raises ValueError for numbers out of range
+        self._view = convert_json(to_json(view), ViewState)  # raises ValueError for numbers out of range
         still = picture(self._document.scene, self._document.gdfs, self._view, _STILL_SIZE)
         state, _ = first_state(self._document, self._view)
         super().__init__(

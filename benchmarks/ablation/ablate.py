@@ -23,7 +23,7 @@ from progdf.field.trajectory import Trajectory
 from progdf.gdf.file import Gdf, fingerprint, save_gdf
 from progdf.io.atomic import atomic_write, make_folder
 from progdf.io.images import read_picture, write_image
-from progdf.io.json_values import decode_json, plain
+from progdf.io.json_values import decode_json, to_json
 from trainer.fit.fit import drop_idle_attributes
 from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
 from trainer.optimize.retime import smooth_course
@@ -161,7 +161,7 @@ def _run_variant(root: Path, variant: Variant, seed: int, shared: AblationSetup,
     outcome = with_figures(outcome, field, shared, stage_values, perceptual_loss()[0])
     region = shared.run.region
     scene = shared.run.scene
-    recipe = plain(replace(plan, name=variant.name))
+    recipe = to_json(replace(plan, name=variant.name))
     gdf = Gdf(variant.name, region, field, fingerprint(scene), plan.editor.editor, recipe)
     save_gdf(folder / f"{variant.name}.gdf", gdf)
     pictures = strip(shared.evaluator, field, shared.columns, _PICTURE_WIDTH)
@@ -301,6 +301,6 @@ def _publish(root: Path, variants: Sequence[Variant], shared: AblationSetup) -> 
     with atomic_write(root / "ablation.md") as beside:
         beside.write_text(table_of([done], title).markdown() + "\n", encoding="utf-8")
     outcomes: list[Mapping[str, Any]] = [asdict(outcome) for row in rows for outcome in row.outcomes]
-    about = {"machine": machine(), "note": note, "perceptual": measure, "plan": plain(plan)}
+    about = {"machine": machine(), "note": note, "perceptual": measure, "plan": to_json(plan)}
     write_json(root / "ablation.json", {**about, "variants": outcomes})
     return done

@@ -42,13 +42,13 @@ from trainer.optimize.pgs import ParameterSnapshot, PgsState
 from trainer.optimize.retime import smooth_course
 from trainer.options import EditorOptions, FieldOptions, OptimizeOptions, TrainingViewOptions
 from trainer.resolve import use_threads
-from trainer.run.training import Strengths, plan_colors
+from trainer.run.training import StrengthSource, plan_colors
 from trainer.setup import (
     Pictures,
     TrainingSetup,
     make_training_setup,
     quantize_image,
-    take_glances,
+    render_thumbnails,
     widen_views,
 )
 from trainer.store.progress import RunLog
@@ -181,7 +181,7 @@ class RegretEdit:
         finished = edit([1.0], self.setup.views)
         waited = 0.0
         began = time.process_time()
-        between = Strengths(edit, look)
+        between = StrengthSource(edit, look)
         with TemporaryDirectory() as folder, closing(RunLog(Path(folder) / "log.txt", quiet=True)) as log:
             options = OptimizeOptions(), self.setup, finished, between, TrainingViewOptions(), log
             solver, model, course = plan_colors(*options)
@@ -309,7 +309,7 @@ class RegretEdit:
 def begin_edit(scene: Gaussians, region: Region, editor: str) -> RegretEdit:
     """Prepare an edit with the views that a run chooses automatically."""
     setup = make_training_setup(TrainingViewOptions(), scene, region)
-    glances = partial(take_glances, TrainingViewOptions(), scene, region)
+    glances = partial(render_thumbnails, TrainingViewOptions(), scene, region)
     painter = make_editor(EditorOptions(editor), scene, region, setup.views, glances)
     return RegretEdit(scene, region, editor, painter, setup)
 

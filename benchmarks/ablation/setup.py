@@ -12,7 +12,7 @@ from typing import TypeVar
 from torch import Tensor
 
 from progdf.gaussians import BASE_CHANNELS
-from progdf.io.json_values import plain
+from progdf.io.json_values import to_json
 from trainer.editors import make_editor
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.fit.fit import visibility
@@ -26,7 +26,7 @@ from trainer.setup import (
     confines_edit,
     editor_strengths,
     quantize_image,
-    take_glances,
+    render_thumbnails,
     widen_views,
 )
 from trainer.store.run_folder import read_views
@@ -137,7 +137,7 @@ def editor_pictures(
         strengths: the strengths, or the number of evenly spaced ones
     """
     options = replace(run.record.plan.editor, cache=run.folder.paintings)
-    glances = partial(take_glances, run.record.plan.views, run.scene, run.region)
+    glances = partial(render_thumbnails, run.record.plan.views, run.scene, run.region)
     editor = make_editor(options, run.scene, run.region, all_views, glances)
     is_confined = confines_edit(editor, run.record.kind)
 
@@ -152,7 +152,7 @@ def editor_pictures(
 
 def digest_of(shared: AblationSetup, variant: Variant, seed: int, optimization: bool = False) -> str:
     """Hash the inputs of a variant's figures, or of its optimization only. `seed`: see `Variant.plan`"""
-    inputs = plain(variant.plan(shared.plan, seed))
+    inputs = to_json(variant.plan(shared.plan, seed))
     del inputs["scene"]  # its renders are in the setup's digest
     if optimization:
         del inputs["optimize"]["slider"]

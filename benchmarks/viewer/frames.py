@@ -31,14 +31,14 @@ from progdf.threads import one_thread
 from viewer.camera.view_camera import first_camera
 from viewer.files import document as documents
 from viewer.panel.panel import WIDTH_PX
-from viewer.render.dynamic_resolution import COARSE
+from viewer.render.dynamic_resolution import COARSE_PIXELS
 from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import headless_context
 from viewer.state.view_state import ViewState
 
 from . import display as bench_display
 from .mouse import SIZE, Mouse
-from .scenes import COPIES, WAYS, copies, scenes_of
+from .scenes import COPIES, RENDERERS, copies, scenes_of
 
 WARM_UP = 2
 STEPS = 20
@@ -56,11 +56,11 @@ TURN_PX = 10.0
 
 
 @dataclass(frozen=True)
-class Turning:
+class OrbitTimes:
     """Times of orbiting one scene with one renderer; `frames_ms`, `draws_ms`, `coarse_ms` are per frame."""
 
     count: int  # Gaussians in the scene
-    way: str  # a key of `WAYS`
+    way: str  # a key of `RENDERERS`
     frames_ms: tuple[float, ...]  # from the mouse's event to finished pixels of the whole window
     draws_ms: tuple[float, ...]  # sorting and drawing of the picture
     # checked, wrong: number of pictures that were drawn again from scratch, and of those that differ
@@ -101,13 +101,15 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
     try:
         renderer = str(ctx.info["GL_RENDERER"])
         with tempfile.TemporaryDirectory() as folder:
-            turnings: list[Turning] = []
+            turnings: list[OrbitTimes] = []
             starts: list[Start] = []
             for scene in opened:
                 path = Path(folder) / "scene.ply"
                 save_ply(path, scene)
                 turnings += measure_turning(ctx, path)
-                starts += [] if bench_display.missing_tools() else [measure_starts(path, way) for way in WAYS]
+                starts += (
+                    [] if bench_display.missing_tools() else [measure_starts(path, way) for way in RENDERERS]
+                )
     finally:
         ctx.release()
     return [frames_table(turnings, starts, renderer), coarse_table(turnings, renderer)]
@@ -116,14 +118,14 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
 @one_thread()
 def measure_turning(
     ctx: moderngl.Context, path: Path, steps: int = STEPS, size: tuple[int, int] = SIZE
-) -> list[Turning]:
+) -> list[OrbitTimes]:
     """Open a scene's file and orbit it with the mouse, with the renderers in turns; then again, coarse."""
     results = []
     with ExitStack() as held:
         nothing = documents.load(path).scene[:0]
         mice: dict[str, Mouse] = {}
         opened_s: dict[str, float] = {}
-        for way in WAYS:
+        for way in RENDERERS:
             empty = ViewEngine(ctx, nothing, (), way)
             mice[way] = held.enter_context(
                 Mouse(ctx, empty, nothing, (), ViewState(dynamic_resolution="off"), size)
@@ -145,7 +147,7 @@ def measure_turning(
             wrong = sum(not np.array_equal(image, _draw_anew(mouse, view)) for view, image in full[way].kept)
             errors = [_psnr(image, _draw_anew(mouse, view)) for view, image in coarse[way].kept]
             results.append(
-                Turning(
+                OrbitTimes(
                     count=mouse.main_view.facts.count,
                     way=way,
                     frames_ms=tuple(full[way].frames_ms[WARM_UP:]),
@@ -182,7 +184,7 @@ def measure_starts(path: Path, way: str, times: int = STARTS, size: tuple[int, i
     return Start(*(statistics.median(figure[name] for figure in figures[1:]) for name in names))
 
 
-def frames_table(turnings: Sequence[Turning], starts: Sequence[Start], renderer: str) -> Table:
+def frames_table(turnings: Sequence[OrbitTimes], starts: Sequence[Start], renderer: str) -> Table:
     """Make the table of frames while orbiting and of first pictures. `starts`: one per entry, or none."""
     rows = []
     for i, result in enumerate(turnings):
@@ -191,7 +193,7 @@ def frames_table(turnings: Sequence[Turning], starts: Sequence[Start], renderer:
         rows.append(
             {
                 "Gaussians": group_digits(result.count),
-                "drawn by": WAYS[result.way],
+                "drawn by": RENDERERS[result.way],
                 Wall("sort and draw, ms"): f"{np.median(result.draws_ms):.1f}",
                 Wall("whole frame p50 / p95, ms"): f"**{p50:.1f}** / {p95:.1f}",
                 "of the processor, ms": f"{result.processor_ms:.1f}",
@@ -213,7 +215,7 @@ def frames_table(turnings: Sequence[Turning], starts: Sequence[Start], renderer:
     )
 
 
-def coarse_table(turnings: Sequence[Turning], renderer: str) -> Table:
+def coarse_table(turnings: Sequence[OrbitTimes], renderer: str) -> Table:
     """Make the table of pictures that are coarse while they move, with their errors in motion and at rest."""
     rows = []
     for result in turnings:
@@ -222,7 +224,7 @@ def coarse_table(turnings: Sequence[Turning], renderer: str) -> Table:
         rows.append(
             {
                 "Gaussians": group_digits(result.count),
-                "drawn by": WAYS[result.way],
+                "drawn by": RENDERERS[result.way],
                 Wall("frame in full, ms"): f"{full:.1f}",
                 Wall("coarse, ms"): f"{coarse:.1f}",
                 Wall("ratio"): f"{full / coarse:.1f}×",
@@ -238,7 +240,7 @@ def coarse_table(turnings: Sequence[Turning], renderer: str) -> Table:
         "A picture that is coarse while it moves, 640×480",
         rows,
         f"OpenGL by {renderer}. Medians of whole frames while orbiting; one pixel drawn fills "
-        f"{COARSE}×{COARSE} of the window. The error is the worst of {KEPT} frames.",
+        f"{COARSE_PIXELS}×{COARSE_PIXELS} of the window. The error is the worst of {KEPT} frames.",
     )
 
 

@@ -52,7 +52,7 @@ _TRAINING_RAMP_S = 0.2  # after this, the threads of a resumed training are busy
 
 
 @dataclass(frozen=True)
-class Moving:
+class InteractionTimes:
     """Response times of one scene, ms."""
 
     count: int  # Gaussians
@@ -97,7 +97,7 @@ def measure(
     training: Training,
     steps: int = STEPS,
     size: tuple[int, int] = SIZE,
-) -> Moving:
+) -> InteractionTimes:
     """Measure a window that shows `scene`, with dynamic resolution on and at times beside a training."""
     engine = ViewEngine(ctx, scene, (), "cpu")
     view = ViewState(first_camera(scene), dynamic_resolution="on")
@@ -143,7 +143,7 @@ def measure(
     engine.release()
     turning_ms = tuple(turning[WARM_UP:])
     processor_ms = float(np.median(processor[WARM_UP:]))
-    return Moving(
+    return InteractionTimes(
         count=len(scene),
         turning=turning_ms,
         beside=tuple(beside),
@@ -160,7 +160,7 @@ def measure(
     )
 
 
-def table(results: Sequence[Moving]) -> Table:
+def table(results: Sequence[InteractionTimes]) -> Table:
     """Make a table with one row per scene."""
     rows = []
     for result in results:

@@ -26,7 +26,7 @@ from progdf.terminal import group_digits
 from progdf.threads import one_thread
 from viewer.camera.view_camera import ViewCamera, add_scaled, axes, bounds_of, eye, first_camera, to_camera
 from viewer.render.cpu_renderer import CpuRenderer
-from viewer.render.dynamic_resolution import BUDGETS, COARSE, drawn_size
+from viewer.render.dynamic_resolution import BUDGETS, COARSE_PIXELS, drawn_size
 
 from .scenes import copies, scenes_of
 
@@ -104,11 +104,11 @@ def film(title: str, scene: Gaussians, views: Sequence[ViewCamera], size: tuple[
         fill_screen(renderer.pixels(), screen)
         return screen[::-1, :, :3].astype(np.float32)
 
-    small = drawn_size(size, COARSE)
+    small = drawn_size(size, COARSE_PIXELS)
     for _ in range(RESTS):
         live._budget = BUDGETS[2]
         live._finest = live._max_finest
-        draw(to_camera(views[0], *small), COARSE)
+        draw(to_camera(views[0], *small), COARSE_PIXELS)
         draw(to_camera(views[0], *size), 1)
     limit = live._max_finest
     last = list[NDArray[np.float32]]()
@@ -121,7 +121,7 @@ def film(title: str, scene: Gaussians, views: Sequence[ViewCamera], size: tuple[
         live._budget = BUDGETS[2]
         live._finest = limit
         pyramid.limit = limit
-        moving = draw(to_camera(view, *small), COARSE)
+        moving = draw(to_camera(view, *small), COARSE_PIXELS)
         frames = [draw(to_camera(view, *size), 1), moving, draw(to_camera(view, *small), 1)]
         worst = max(worst, float(np.square(frames[0] - moving).mean()))
         if last:

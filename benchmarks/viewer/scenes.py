@@ -26,7 +26,7 @@ SIZES = (31_000, 125_000)
 COPIES = 4
 """Copies of the largest scene that make up an even larger one."""
 
-WAYS = {"gl": "OpenGL", "cpu": "CPU"}
+RENDERERS = {"gl": "OpenGL", "cpu": "CPU"}
 """Renderers, from `engine.DRAWS`, with their names in tables."""
 
 RANKS = 3

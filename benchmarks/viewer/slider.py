@@ -32,7 +32,7 @@ from viewer.render.gl_renderer import headless_context
 from viewer.state.view_state import LayerState, ViewState
 
 from .mouse import SIZE, Mouse, slider_at
-from .scenes import WAYS, edit_for, scenes_of
+from .scenes import RENDERERS, edit_for, scenes_of
 
 WARM_UP = 2
 STEPS = 24
@@ -65,7 +65,7 @@ class SliderTimes:
 
     case: SliderCase
     count: int  # Gaussians in the scene
-    way: str  # a key of `WAYS`
+    way: str  # a key of `RENDERERS`
     events_ms: tuple[float, ...]  # from the mouse's event to finished pixels
     processor_ms: tuple[float, ...]  # the same on all cores together
     parts: tuple[FrameTimings, ...]  # the engine's part of these times
@@ -111,12 +111,12 @@ def rows(
     case = replace(case, members=len(gdf.region))
     layers = (LayerState(0, "edit", 0.05),)
     view = ViewState(first_camera(scene), layers, dynamic_resolution="off")
-    events: dict[str, list[float]] = {way: [] for way in WAYS}
-    processor: dict[str, list[float]] = {way: [] for way in WAYS}
-    parts: dict[str, list[FrameTimings]] = {way: [] for way in WAYS}
+    events: dict[str, list[float]] = {way: [] for way in RENDERERS}
+    processor: dict[str, list[float]] = {way: [] for way in RENDERERS}
+    parts: dict[str, list[FrameTimings]] = {way: [] for way in RENDERERS}
     with ExitStack() as held:
         mice: dict[str, Mouse] = {}
-        for name in WAYS:
+        for name in RENDERERS:
             engine = ViewEngine(ctx, scene, [gdf], name)
             held.callback(engine.release)
             mice[name] = held.enter_context(Mouse(ctx, engine, scene, [gdf], view, size))
@@ -159,7 +159,7 @@ def _cells(result: SliderTimes) -> dict[str, str]:
         "Gaussians": group_digits(result.count),
         "members": group_digits(result.case.members),
         "edit of": result.case.title,
-        "drawn by": WAYS[result.way],
+        "drawn by": RENDERERS[result.way],
         **{Wall(name): f"{part:.1f}" for name, part in parts.items()},
         Wall("panel, screen"): f"{result.rest_ms:.1f}",
         Wall("in all p50 / p95"): f"**{p50:.1f}** / {p95:.1f}",

@@ -25,7 +25,7 @@ from progdf.scene.regions import check_region, parse_region, read_numbers
 from progdf.scene.strays import clean, find_strays, picture_difference
 from progdf.similarity import Motion
 from progdf.terminal import format_count, group_digits, print_line, shorten
-from progdf.tidy import Deed, Step, bake, similarity, tidy
+from progdf.tidy import Operation, Step, bake, similarity, tidy
 
 from .options import absent_option, parse_options
 
@@ -159,7 +159,7 @@ def _read_steps(options: EditOptions) -> list[Callable[[Gaussians], Step]]:
     return step_makers
 
 
-def _maker(does: Deed, spec: str, motion: Motion | None) -> Callable[[Gaussians], Step]:
+def _maker(does: Operation, spec: str, motion: Motion | None) -> Callable[[Gaussians], Step]:
     check_region(spec)
     return lambda scene: Step(does, parse_region(spec, scene, say=print_line), motion)
 

@@ -24,16 +24,16 @@ from .oklab import (
     ColorPath,
     Strength,
     bend_of,
-    color_course,
+    color_path,
     fit_gamut,
     hue_of,
     oklab_to_srgb,
     smoothstep,
     srgb_to_oklab,
 )
-from .palette import Curve, are_alike, bend_lightness, less_light, shift_palette
+from .palette import Curve, are_alike, bend_lightness, chroma_factor, shift_palette
 
-Course = Callable[[Strength], Tensor]
+ColorFunction = Callable[[Strength], Tensor]
 """Function from a strength to colors [...,3]: the path of an edit."""
 
 _MIN_CHROMA = 0.015  # smallest chroma of a target with a hue
@@ -75,7 +75,9 @@ def typical_color(rgb: Tensor, weights: Tensor | None = None) -> Tensor:
     return oklab_to_srgb(mean).clamp(0, 1)
 
 
-def recolor_course(rgb: Tensor, target: Tensor, reference: Tensor, path: ColorPath = "bowed") -> Course:
+def recolor_course(
+    rgb: Tensor, target: Tensor, reference: Tensor, path: ColorPath = "bowed"
+) -> ColorFunction:
     """Return the path from colors to those of `recolor_fully`, which keeps the shading.
 
     Args:
@@ -85,7 +87,7 @@ def recolor_course(rgb: Tensor, target: Tensor, reference: Tensor, path: ColorPa
         path: shape of the path, see `bend_of`
     """
     bend = bend_of(_as_tensor(reference, rgb), _as_tensor(target, rgb), path)
-    return color_course(rgb, recolor_fully(rgb, target, reference), bend)
+    return color_path(rgb, recolor_fully(rgb, target, reference), bend)
 
 
 def recolor_fully(rgb: Tensor, target: Tensor, reference: Tensor) -> Tensor:
@@ -105,14 +107,14 @@ def recolor_fully(rgb: Tensor, target: Tensor, reference: Tensor) -> Tensor:
     return fit_gamut(torch.stack([lightness, chroma * torch.cos(hue), chroma * torch.sin(hue)], dim=-1))
 
 
-def tint_course(rgb: Tensor, target: Tensor, reference: Tensor, path: ColorPath = "bowed") -> Course:
+def tint_course(rgb: Tensor, target: Tensor, reference: Tensor, path: ColorPath = "bowed") -> ColorFunction:
     """Return the path from colors to those of `tint_fully`, a wash with a color.
 
     The lightness is unchanged, and hue and chroma move most of the way to the target's. For the arguments see
     `recolor_course`. `reference` only determines the bend of the path.
     """
     bend = bend_of(_as_tensor(reference, rgb), _as_tensor(target, rgb), path)
-    return color_course(rgb, tint_fully(rgb, target), bend)
+    return color_path(rgb, tint_fully(rgb, target), bend)
 
 
 def tint_fully(rgb: Tensor, target: Tensor, share: float = 0.7) -> Tensor:
@@ -135,9 +137,9 @@ def darken(rgb: Tensor, strength: Strength = 1.0, stops: float = 3.0) -> Tensor:
     return torch.where((s == 0)[..., None], rgb, edited + (1 - s)[..., None] * (rgb - inside))
 
 
-def night_course(rgb: Tensor, stops: float = 3.0) -> Course:
+def night_course(rgb: Tensor, stops: float = 3.0) -> ColorFunction:
     """Return the path to moonlight: `darken`, with colors that fade to a cool blue as in dim light."""
-    bluer = color_course(rgb, tint_fully(rgb, rgb.new_tensor([0.35, 0.50, 0.85]), share=0.75), STRAIGHT)
+    bluer = color_path(rgb, tint_fully(rgb, rgb.new_tensor([0.35, 0.50, 0.85]), share=0.75), STRAIGHT)
     return lambda strength: darken(bluer(strength), strength, stops)
 
 
@@ -250,9 +252,9 @@ def number_of(text: str) -> float:
         return math.nan
 
 
-def grade_course(rgb: Tensor, grade: ColorGrade) -> Course:
+def grade_course(rgb: Tensor, grade: ColorGrade) -> ColorFunction:
     """Return the path from colors to those of `grade_fully`, straight in OKLab."""
-    return color_course(rgb, grade_fully(rgb, grade), STRAIGHT)
+    return color_path(rgb, grade_fully(rgb, grade), STRAIGHT)
 
 
 def grade_fully(rgb: Tensor, grade: ColorGrade) -> Tensor:
@@ -280,7 +282,7 @@ def grade_fully(rgb: Tensor, grade: ColorGrade) -> Tensor:
     steeper = torch.where(lightness < _MIDDLE_GRAY, low, 1 - high)
     if grade.curve:
         steeper = bend_lightness(steeper, grade.curve)
-    chroma = (lab[..., 1:] + cast) * (1 + value["saturation"]) * less_light(lightness, steeper)[..., None]
+    chroma = (lab[..., 1:] + cast) * (1 + value["saturation"]) * chroma_factor(lightness, steeper)[..., None]
     return fit_gamut(torch.cat([steeper[..., None], chroma], dim=-1))
 
 

@@ -158,10 +158,10 @@ def interpolate_colors(rgb: Tensor, end: Tensor, strength: Strength, bend: Bend)
         strength: 0 to 1
         bend: bend of the region
     """
-    return color_course(rgb, end, bend)(strength)
+    return color_path(rgb, end, bend)(strength)
 
 
-def color_course(rgb: Tensor, end: Tensor, bend: Bend) -> Callable[[Strength], Tensor]:
+def color_path(rgb: Tensor, end: Tensor, bend: Bend) -> Callable[[Strength], Tensor]:
     """Return `interpolate_colors` as a function of the strength; shared values are computed once."""
     inside = rgb.clamp(0, 1)
     mix = None if bend.fade else _oklab_course(srgb_to_oklab(inside), srgb_to_oklab(end), bend)

@@ -23,7 +23,7 @@ from .oklab import oklab_to_srgb, srgb_to_oklab
 
 COLORS = 5
 """Default number of main colors."""
-CLOSEST = 0.02
+MIN_SOURCE_DISTANCE = 0.02
 """Smallest kernel distance of two sources; closer sources count as one color."""
 
 _LIGHTNESS_FACTOR = 0.5  # factor on lightness differences, because shading is not another color
@@ -77,7 +77,7 @@ def find_palette(rgb: Tensor, weights: Tensor, count: int = COLORS) -> Tensor:
     covered = shares.new_zeros(len(centers)).index_add_(0, nearest, shares)
     main: list[int] = []
     for i in covered.argsort(descending=True).tolist():
-        is_distinct = all(float((centers[i] - centers[j]).norm()) >= 2 * CLOSEST for j in main)
+        is_distinct = all(float((centers[i] - centers[j]).norm()) >= 2 * MIN_SOURCE_DISTANCE for j in main)
         if is_distinct and float(covered[i]) >= _MIN_SHARE * float(shares.sum()):
             main.append(i)
     return oklab_to_srgb(centers[main] / _kernel_space(centers.new_ones(3))).clamp(0, 1).to(rgb)
@@ -85,7 +85,10 @@ def find_palette(rgb: Tensor, weights: Tensor, count: int = COLORS) -> Tensor:
 
 def are_alike(a: Tensor, b: Tensor) -> bool:
     """Return whether two sRGB colors [3] are too close to be separate sources."""
-    return float((_kernel_space(srgb_to_oklab(a)) - _kernel_space(srgb_to_oklab(b))).norm()) < CLOSEST
+    return (
+        float((_kernel_space(srgb_to_oklab(a)) - _kernel_space(srgb_to_oklab(b))).norm())
+        < MIN_SOURCE_DISTANCE
+    )
 
 
 def shift_palette(lab: Tensor, sources: Tensor, targets: Tensor, curves: Sequence[Curve] = ()) -> Tensor:
@@ -95,7 +98,7 @@ def shift_palette(lab: Tensor, sources: Tensor, targets: Tensor, curves: Sequenc
 
     Args:
         lab: colors. [...,3]
-        sources: source colors, at least `CLOSEST` apart. [k,3]
+        sources: source colors, at least `MIN_SOURCE_DISTANCE` apart. [k,3]
         targets: target colors. [k,3]
         curves: lightness curve near each source, applied after the shift; empty, or k
     """
@@ -129,10 +132,10 @@ def shift_palette(lab: Tensor, sources: Tensor, targets: Tensor, curves: Sequenc
     before = shifted[..., :1].clamp(0, 1)
     changes = torch.cat([bend_lightness(before, curve) - before for curve in curves], dim=-1)
     after = before + (weights.to(lab).reshape(changes.shape) * changes).sum(dim=-1, keepdim=True)
-    return torch.cat([after, shifted[..., 1:] * less_light(before, after)], dim=-1)
+    return torch.cat([after, shifted[..., 1:] * chroma_factor(before, after)], dim=-1)
 
 
-def less_light(before: Tensor, after: Tensor) -> Tensor:
+def chroma_factor(before: Tensor, after: Tensor) -> Tensor:
     """Return the factor on chroma for a change of lightness. [...] -> [...]
 
     It is 1 if the lightness rises, and otherwise that of less light on the same surface.

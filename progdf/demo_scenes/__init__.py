@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from .assemble import DemoScene
-from .bear import SKY, SMALLEST, bear, paint_panda
-from .room import SMALLEST_ROOM, room
+from .bear import MIN_BEAR_GAUSSIANS, SKY, bear, paint_panda
+from .room import MIN_ROOM_GAUSSIANS, room
 
-__all__ = ["SKY", "SMALLEST", "SMALLEST_ROOM", "DemoScene", "bear", "paint_panda", "room"]
+__all__ = ["MIN_BEAR_GAUSSIANS", "MIN_ROOM_GAUSSIANS", "SKY", "DemoScene", "bear", "paint_panda", "room"]

@@ -70,7 +70,7 @@ def _value_noise(places: Tensor, table: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Pelt:
+class GaussianLayout:
     """Shape and orientation of a surface's Gaussians. Most lie flat, some stand out as hairs or blades."""
 
     standing: float = 0.0  # share of Gaussians that stand out, 0 to 1
@@ -84,7 +84,7 @@ class Pelt:
     unruly: float = 0.35  # random variation of directions between neighbors
 
 
-BARE = Pelt()
+BARE = GaussianLayout()
 """Surface without hairs."""
 
 
@@ -98,7 +98,7 @@ class SurfacePaint:
     gloss: float = 0.0  # specular highlight, sRGB units
     # direction of hairs and flat Gaussians; only its component along the surface counts. [N,3]
     flow: Tensor | None = None
-    pelt: Pelt = BARE  # shape and orientation of the Gaussians
+    pelt: GaussianLayout = BARE  # shape and orientation of the Gaussians
     glows: bool = False  # emissive: `color` is visible without lighting
 
 

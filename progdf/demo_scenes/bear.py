@@ -14,16 +14,29 @@ from progdf.color.edits import parse_color, recolor_fully, stripe_profile, typic
 from progdf.color.oklab import smoothstep
 from progdf.errors import ProgdfError
 
-from .assemble import DemoScene, Pelt, SurfacePaint, assemble, bumps, flat, mix, mix_colors, noise, swirl
+from .assemble import (
+    DemoScene,
+    GaussianLayout,
+    SurfacePaint,
+    assemble,
+    bumps,
+    flat,
+    mix,
+    mix_colors,
+    noise,
+    swirl,
+)
 from .surface import Part, Samples, ball, dome, ring
 
 FUR = ("body", "tail", "head", "muzzle", "ear", "arm", "leg", "foot")
 WOOL = ("scarf", "knot", "end")
 
 
-_COAT = Pelt(standing=0.22, flat=(0.85, 0.58, 0.16), hair=(0.70, 0.24, 0.16), length=0.0063)
-_KNIT = Pelt(standing=0.05, flat=(0.80, 0.50, 0.14), hair=(0.70, 0.24, 0.16), length=0.0063, unruly=0.0)
-_TURF = Pelt(
+_COAT = GaussianLayout(standing=0.22, flat=(0.85, 0.58, 0.16), hair=(0.70, 0.24, 0.16), length=0.0063)
+_KNIT = GaussianLayout(
+    standing=0.05, flat=(0.80, 0.50, 0.14), hair=(0.70, 0.24, 0.16), length=0.0063, unruly=0.0
+)
+_TURF = GaussianLayout(
     standing=0.55, flat=(0.83, 0.83, 0.18), hair=(0.45, 0.16, 0.10), length=0.022, rise=1.6, lift=0.5
 )
 
@@ -323,7 +336,7 @@ def _ellipse(
     return ((1 - torch.hypot(along, across)) / 0.12 + 0.5).clamp(0, 1)
 
 
-SMALLEST = 400
+MIN_BEAR_GAUSSIANS = 400
 """Smallest number of Gaussians for the bear."""
 
 SKY = (0.510, 0.639, 0.761)
@@ -336,10 +349,10 @@ def bear(size: int = 24_000, seed: int = 0) -> DemoScene:
     The same seed gives the same bits on the same kind of processor.
 
     Raises:
-        ProgdfError: fewer than `SMALLEST` Gaussians.
+        ProgdfError: fewer than `MIN_BEAR_GAUSSIANS` Gaussians.
     """
-    if size < SMALLEST:
-        raise ProgdfError(f"{size} Gaussians are too few for a bear; use at least {SMALLEST}")
+    if size < MIN_BEAR_GAUSSIANS:
+        raise ProgdfError(f"{size} Gaussians are too few for a bear; use at least {MIN_BEAR_GAUSSIANS}")
     gaussians, labels = assemble(bear_parts(), LABELS, paint_bear, size, seed)
     return DemoScene(gaussians, labels, LABELS, _rig(), torch.tensor([0.0, 1.0, 0.0]), SKY)
 

@@ -12,13 +12,13 @@ from progdf.camera import Camera, intrinsics, look_at
 from progdf.color.oklab import smoothstep
 from progdf.errors import ProgdfError
 
-from .assemble import DemoScene, Pelt, SurfacePaint, assemble, bumps, flat, mix, mix_colors, noise
+from .assemble import DemoScene, GaussianLayout, SurfacePaint, assemble, bumps, flat, mix, mix_colors, noise
 from .bear import Triple, ellipsoid
 from .light import KEY, Daylight
 from .surface import Part, Samples, lathe, panel
 
-_SHAG = Pelt(standing=0.3, flat=(0.72, 0.66, 0.14), hair=(0.55, 0.26, 0.18), length=0.006, rise=1.2)
-_BOARD = Pelt(flat=(0.80, 0.70, 0.10), unruly=0.0)
+_SHAG = GaussianLayout(standing=0.3, flat=(0.72, 0.66, 0.14), hair=(0.55, 0.26, 0.18), length=0.006, rise=1.2)
+_BOARD = GaussianLayout(flat=(0.80, 0.70, 0.10), unruly=0.0)
 _PETALS = ("#e8537a", "#f2b632", "#f4f0e6", "#c04a8c", "#f07f4f")
 
 
@@ -195,7 +195,7 @@ _PAINTERS = {
 
 
 LABELS = ("floor", "walls", "ceiling", "rug", "table", "vase", "lamp", "stool", "picture", "ball")
-SMALLEST_ROOM = 1000
+MIN_ROOM_GAUSSIANS = 1000
 """Smallest number of Gaussians for the room."""
 
 _HALF_SIDE = 2.0  # half width and half length, world units
@@ -209,10 +209,10 @@ def room(size: int = 40_000, seed: int = 0) -> DemoScene:
     The same seed gives the same bits on the same kind of processor.
 
     Raises:
-        ProgdfError: fewer than `SMALLEST_ROOM` Gaussians.
+        ProgdfError: fewer than `MIN_ROOM_GAUSSIANS` Gaussians.
     """
-    if size < SMALLEST_ROOM:
-        raise ProgdfError(f"{size} Gaussians are too few for a room; use at least {SMALLEST_ROOM}")
+    if size < MIN_ROOM_GAUSSIANS:
+        raise ProgdfError(f"{size} Gaussians are too few for a room; use at least {MIN_ROOM_GAUSSIANS}")
     gaussians, labels = assemble(room_parts(), LABELS, paint, size, seed, Daylight(_sun, fill=1.9))
     return DemoScene(gaussians, labels, LABELS, _rig(), torch.tensor([0.0, 1.0, 0.0]), (0.05, 0.05, 0.06))
 

@@ -41,11 +41,11 @@ from .separable import (
     store_attribute,
 )
 
-ADDED = 0.1
+MAX_ADDED_ERROR_SHARE = 0.1
 """Share of an edit's error against its editor that its field may add."""
 
 
-def allowed_error(own: float, added: float = ADDED) -> float:
+def allowed_error(own: float, added: float = MAX_ADDED_ERROR_SHARE) -> float:
     """Return the mean squared error that a field may add to an edit's own error.
 
     An own error of at least `LEVEL` may grow by the share `added`. A smaller one may grow to (1 + added) ·
@@ -66,7 +66,7 @@ MAX_PIXELS = 40_000
 MAX_FITTED_SNAPSHOTS = 40
 """Maximum number of snapshots to render. Between two of them, changes are interpolated linearly."""
 
-UNSEEN = 0.1
+PARAMETER_ERROR_WEIGHT = 0.1
 """Weight of the parameter error relative to the rendered error, for members not visible in these views."""
 
 Ends = Mapping[str, tuple[Tensor, Tensor]]
@@ -144,7 +144,7 @@ class FieldEvaluator:
         truth: Callable[[float], Tensor] | None = None,
         edited: Mapping[float, Tensor] | None = None,
         target: float = 40.0,
-        added: float = ADDED,
+        added: float = MAX_ADDED_ERROR_SHARE,
     ) -> None:
         truth_at = truth or (lambda s: interpolate_at(strengths, offsets, s))
         self._render = render
@@ -380,7 +380,9 @@ class RenderedTrajectories:
         for i, (name, trajectory) in enumerate(self.trajectories.items()):
             seen = self.gram[i, :, i]
             parameters = float(trajectory.gram.diagonal().sum())
-            share = UNSEEN * float(seen.diagonal().sum()) / parameters if parameters > 0 else 0.0
+            share = (
+                PARAMETER_ERROR_WEIGHT * float(seen.diagonal().sum()) / parameters if parameters > 0 else 0.0
+            )
             modes[name] = principal_modes(seen + share * trajectory.gram)
         return modes
 

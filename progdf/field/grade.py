@@ -47,7 +47,7 @@ _CHUNK_MEMBERS = 1 << 11  # members at once
 MAX_RESIDUALS = MAX_RANK // 2
 """Maximum number of residual bases to try. Each may be stored as two."""
 
-COARSER = tuple(2.0 ** (i / 8) for i in range(-8, 25))
+RESIDUAL_STEPS = tuple(2.0 ** (i / 8) for i in range(-8, 25))
 """Step sizes of a residual's levels to try. At 1, nearly all members fit into 8 bits."""
 
 _FITTING_SHARE = 0.999  # share of the members that fit into 8 bits: outliers must not coarsen all levels

@@ -32,7 +32,7 @@ from .containers import START_BYTES, check_foreign
 
 LARGEST_PICKLE = 16 << 20  # bytes; the pickle of a checkpoint has about 100 kB
 LEGACY_MAGIC = b"\x80\x02"  # start of a protocol 2 pickle; files since torch 1.6 are zip archives
-DEEPEST_TABLE = 4  # levels of nested tables that are searched for tensors
+MAX_TABLE_DEPTH = 4  # levels of nested tables that are searched for tensors
 RESAVE = "load it with torch and save dense float tensors with torch.save"
 EXPORT = (
     "export a .ply with the training program (nerfstudio: `ns-export gaussian-splat`, gsplat: `--save-ply`)"
@@ -135,7 +135,7 @@ def _find_tensors(table: Mapping[Any, Any], prefix: str, seen: set[int]) -> Iter
             yield name, value
             continue
         is_new = isinstance(value, dict) and id(value) not in seen
-        if is_new and key not in _TRAINING_STATE and name.count(".") < DEEPEST_TABLE:
+        if is_new and key not in _TRAINING_STATE and name.count(".") < MAX_TABLE_DEPTH:
             yield from _find_tensors(value, f"{name}.", seen)
 
 

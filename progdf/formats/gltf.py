@@ -37,7 +37,7 @@ from .gltf_file import (
     FLOAT,
     JSON_CHUNK,
     MAGIC,
-    REFUSED,
+    REFUSED_EXTENSIONS,
     SIZES,
     GltfFile,
     Primitive,
@@ -233,7 +233,7 @@ def _check_required(file: GltfFile) -> None:
     for name in file.tables.extensionsRequired:
         if name not in _SUPPORTED_EXTENSIONS and not name.startswith(_IRRELEVANT_EXTENSIONS):
             feature = f"the required extension {escape_text(name)[:80]}"
-            raise unsupported_error(file.path, feature, REFUSED.get(name, _EXPORT_AGAIN))
+            raise unsupported_error(file.path, feature, REFUSED_EXTENSIONS.get(name, _EXPORT_AGAIN))
 
 
 def _is_splats(primitive: Primitive) -> bool:
@@ -424,7 +424,7 @@ class _Reader:
         if primitive.targets:
             remedy = "export it with the shape applied"
             raise unsupported_error(path, f"morph targets in {name}", remedy)
-        for extension, remedy in REFUSED.items():
+        for extension, remedy in REFUSED_EXTENSIONS.items():
             if extension in primitive.extensions:
                 raise unsupported_error(path, f"{extension} in {name}", remedy)
         properties = primitive.extensions.get(EXTENSION)

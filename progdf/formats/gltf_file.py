@@ -53,7 +53,7 @@ _MESHOPT = ("EXT_meshopt_compression", "KHR_meshopt_compression")
 DECOMPRESS = "decompress it with `gltf-transform copy in.glb out.glb`"
 
 T = TypeVar("T")
-REFUSED = {
+REFUSED_EXTENSIONS = {
     "EXT_meshopt_compression": DECOMPRESS,
     "KHR_meshopt_compression": DECOMPRESS,
     "KHR_draco_mesh_compression": DECOMPRESS,

@@ -14,7 +14,7 @@ from progdf.io.file_rules import damage_error, unsupported_error
 from progdf.quaternions import matrix_quats, rotation_matrices
 from progdf.terminal import escape_text
 
-from .gltf_file import REFUSED, GltfFile, Node, entry
+from .gltf_file import REFUSED_EXTENSIONS, GltfFile, Node, entry
 
 VISIBILITY = "KHR_node_visibility"
 
@@ -156,7 +156,7 @@ def _check_node(file: GltfFile, index: int) -> None:
     if node.skin is not None:
         remedy = "export it without the skeleton"
         raise unsupported_error(file.path, f"the skin of {_node_name(file, index)}", remedy)
-    for name, remedy in REFUSED.items():
+    for name, remedy in REFUSED_EXTENSIONS.items():
         if name in node.extensions:
             raise unsupported_error(file.path, f"{name} in {_node_name(file, index)}", remedy)
 

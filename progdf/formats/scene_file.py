@@ -59,7 +59,7 @@ CONTAINERS = ("zip", "gz")
 FORMATS = ("ply", "spz", "splat", "ksplat", "sog", "glb", "gltf", "ckpt", *CONTAINERS)
 """Formats that are read, by the ending of the name. A compressed .ply counts as a .ply."""
 
-WRITTEN = (".ply", ".compressed.ply", ".spz", ".sog", ".splat", ".glb", usd.SUFFIX)
+WRITTEN_SUFFIXES = (".ply", ".compressed.ply", ".spz", ".sog", ".splat", ".glb", usd.SUFFIX)
 """Formats that `save_scene` writes, by the ending of the name."""
 
 MAX_FRAMES = 1000
@@ -82,9 +82,9 @@ _SPZ_MAX_DEGREE = 4  # largest SH degree
 # limits of the gaussforge process: a base, and an increment per byte of the file
 _MEMORY_LIMIT = (1 << 30, 64)  # bytes of memory
 _OUTPUT_LIMIT = (64 << 20, 64)  # bytes of output
-SECONDS = (60, 2e-6)  # seconds of processor time
+TIME_LIMIT_S = (60, 2e-6)  # seconds of processor time
 _WRITE_TIME_FACTOR = 30
-"""Factor on `SECONDS` for writing. Clustering the SH bands of a million Gaussians takes minutes (.sog)."""
+"""Factor on `TIME_LIMIT_S` for writing. Clustering a million Gaussians' SH bands takes minutes (.sog)."""
 
 _log = logging.getLogger(__name__)
 
@@ -329,7 +329,7 @@ def _convert(source: Path, kind: str, target: Path, to: str) -> str:
     size = scene_bytes(source)
     factor = 1 if to == "ply" else _WRITE_TIME_FACTOR
     memory, output, seconds = (
-        int(base + each * size) for base, each in (_MEMORY_LIMIT, _OUTPUT_LIMIT, SECONDS)
+        int(base + each * size) for base, each in (_MEMORY_LIMIT, _OUTPUT_LIMIT, TIME_LIMIT_S)
     )
     words = "convert", kind, str(source.resolve()), to, str(target)
     try:
@@ -353,7 +353,7 @@ def save_scene(path: Path, scene: Gaussians, glb_axes: Axes = "LUF") -> ReadBack
         .glb, .usdc       float32, KHR_gaussian_splatting and ParticleField3DGaussianSplat
 
     Args:
-        path: ends in one of `WRITTEN`
+        path: ends in one of `WRITTEN_SUFFIXES`
         scene: N Gaussians, finite; SH bands above degree 3 are written to a .ply only
         glb_axes: axes of a .glb, LUF (glTF's own) or RUB (OpenGL's)
 
@@ -362,7 +362,8 @@ def save_scene(path: Path, scene: Gaussians, glb_axes: Axes = "LUF") -> ReadBack
         cannot be read back.
 
     Raises:
-        ProgdfError: the ending is none of `WRITTEN`, a package is missing, or a position is out of range.
+        ProgdfError: the ending is none of `WRITTEN_SUFFIXES`, a package is missing, or a position is out of
+            range.
     """
     check_first_argument("save_scene(path, scene)", path, (str, os.PathLike))
     ending = written_format(path)
@@ -450,7 +451,7 @@ def _position_bounds(ending: str, scene: Gaussians) -> torch.Tensor:
     """Return the largest rounding error of each coordinate in a format, world units. [N,3] float64
 
     Args:
-        ending: an entry of `WRITTEN` whose format can be read back
+        ending: an entry of `WRITTEN_SUFFIXES` whose format can be read back
         scene: the scene in the order of the file; any order for .sog
     """
     means = scene.world_means
@@ -475,7 +476,7 @@ def save_frames(
     names attributes that the format cannot store, for the first scene that loses any.
 
     Args:
-        path: ends in one of `WRITTEN`
+        path: ends in one of `WRITTEN_SUFFIXES`
         scenes: N Gaussians each; a .usdc needs the same rows in all scenes
         rate: samples per second of a .usdc
         glb_axes: as `save_scene`
@@ -513,17 +514,16 @@ def frame_path(path: Path, number: int) -> Path:
 
 
 def written_format(path: Path) -> str:
-    """Return the entry of `WRITTEN` that a file name ends in.
+    """Return the entry of `WRITTEN_SUFFIXES` that a file name ends in.
 
     Raises:
         ProgdfError: the name ends in none of them.
     """
-    for ending in sorted(WRITTEN, key=len, reverse=True):
+    for ending in sorted(WRITTEN_SUFFIXES, key=len, reverse=True):
         if path.name.lower().endswith(ending):
             return ending
-    raise ProgdfError(
-        f"{path} names no format to write; end it in {', '.join(WRITTEN[:-1])} or {WRITTEN[-1]}"
-    )
+    *others, last = WRITTEN_SUFFIXES
+    raise ProgdfError(f"{path} names no format to write; end it in {', '.join(others)} or {last}")
 
 
 def _require_gaussforge(path: Path, kind: str) -> None:

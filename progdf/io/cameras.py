@@ -173,7 +173,7 @@ def read_camera(text: str, origin: Origin = ZERO) -> Camera:
     return replace(cameras[number], sampling=1.0)
 
 
-def beside_folder(path: Path) -> Path:
+def camera_search_folder(path: Path) -> Path:
     """Return the folder that may hold a scene's cameras: its own, or the model folder of an Inria run."""
     folder = path.resolve().parent
     if folder.name.startswith("iteration_") and folder.parent.name == "point_cloud":

@@ -177,7 +177,7 @@ def picture_text(path: str | os.PathLike[str], key: str) -> str | None:
         return None if text is None else str(text)
 
 
-def save_as(path: str | os.PathLike[str]) -> Callable[[Tensor], Tensor]:
+def saving_loss(path: str | os.PathLike[str]) -> Callable[[Tensor], Tensor]:
     """Return a function that applies the losses of saving an image in the format of a file.
 
     A JPEG is imitated with its quantization tables and subsampling, other formats with rounding to 8 bits.

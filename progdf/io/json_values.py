@@ -15,7 +15,7 @@ from progdf.errors import ProgdfError
 
 from .atomic import read_file
 
-DEEPEST = 64
+MAX_NESTING = 64
 """Largest nesting depth of lists and tables. It keeps recursive functions within the stack."""
 
 _MAX_BYTES = 1 << 20  # largest size of the program's own small files
@@ -39,7 +39,7 @@ def decode_json(content: bytes | str) -> Any:
             object_pairs_hook=_refuse_repeats,
         )
     except RecursionError:
-        raise ValueError(f"it is nested more than {DEEPEST} deep") from None
+        raise ValueError(f"it is nested more than {MAX_NESTING} deep") from None
     _check_value(value, 0)
     return value
 
@@ -60,7 +60,7 @@ def convert_json(value: object, kind: type[_T], closed: bool = False) -> _T:
     except msgspec.ValidationError as error:
         raise ValueError(_explain(str(error), value)) from None
     if closed:
-        _refuse_unknown(value, plain(converted), "")
+        _refuse_unknown(value, to_json(converted), "")
     return converted
 
 
@@ -101,7 +101,7 @@ def one_of(names: Sequence[str]) -> msgspec.Meta:
     return msgspec.Meta(pattern=rf"^({'|'.join(names)})\Z")
 
 
-def plain(value: object) -> Any:
+def to_json(value: object) -> Any:
     """Convert a value to JSON types that `convert_json` reads back; paths get forward slashes."""
     return msgspec.to_builtins(value, enc_hook=_encode_path)
 
@@ -132,8 +132,8 @@ def _refuse_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _check_value(value: object, depth: int) -> None:
-    if depth > DEEPEST:
-        raise ValueError(f"it is nested more than {DEEPEST} deep")
+    if depth > MAX_NESTING:
+        raise ValueError(f"it is nested more than {MAX_NESTING} deep")
     if isinstance(value, str):
         value.encode()  # half a surrogate pair raises UnicodeEncodeError, a ValueError
     elif isinstance(value, list):

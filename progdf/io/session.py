@@ -29,7 +29,7 @@ from progdf.errors import ProgdfError
 
 from . import atomic
 from .atomic import check_regular, open_error, read_file
-from .json_values import check_text, convert_json, decode_json, plain
+from .json_values import check_text, convert_json, decode_json, to_json
 
 VERSION = 1
 MARK = "progdf_session"
@@ -111,7 +111,7 @@ def write_session(path: Path, session: SessionFile) -> None:
     Raises:
         ProgdfError: the folder does not exist.
     """
-    text = json.dumps({MARK: VERSION} | plain(session), indent=2, ensure_ascii=False, allow_nan=False)
+    text = json.dumps({MARK: VERSION} | to_json(session), indent=2, ensure_ascii=False, allow_nan=False)
     # put lists of numbers on one line; JSON strings contain no line breaks, so the pattern matches none
     text = re.sub(r"\[\n\s+([^\[\]{}\"]*?)\n\s+\]", lambda match: f"[{' '.join(match[1].split())}]", text)
     atomic.write_file(path, text + "\n")

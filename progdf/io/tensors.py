@@ -45,7 +45,7 @@ _TYPES = {
 }
 
 
-def table_of(tensors: Mapping[str, Tensor]) -> dict[str, tuple[tuple[int, ...], str]]:
+def tensor_specs(tensors: Mapping[str, Tensor]) -> dict[str, tuple[tuple[int, ...], str]]:
     """Return the shape and the safetensors type name of each tensor.
 
     Raises:
@@ -85,7 +85,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
 
     Args:
         path: the file; the write is not atomic, see `atomic.atomic_write`
-        tensors: CPU tensors by name, of the types that `table_of` supports
+        tensors: CPU tensors by name, of the types that `tensor_specs` supports
         metadata: texts by name; a checksum of the contents is added, which `read_tensors` verifies
 
     Raises:
@@ -121,7 +121,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 
 def _checksum(metadata: Mapping[str, object], tensors: Mapping[str, Tensor]) -> str:
-    sum_ = zlib.crc32(repr((sorted(metadata.items()), sorted(table_of(tensors).items()))).encode())
+    sum_ = zlib.crc32(repr((sorted(metadata.items()), sorted(tensor_specs(tensors).items()))).encode())
     for name in sorted(tensors):
         sum_ = zlib.crc32(
             tensors[name].detach().contiguous().reshape(-1).view(torch.uint8).numpy().data, sum_

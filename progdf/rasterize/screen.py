@@ -103,7 +103,7 @@ def _stretch(
 
 
 @contextmanager
-def lines_behind(image: Array, transmittance: Array, lines: Array, clear: float) -> Iterator[None]:
+def draw_lines_behind(image: Array, transmittance: Array, lines: Array, clear: float) -> Iterator[None]:
     """Draw smooth lines, one pixel wide, into a picture for the duration of the context.
 
     The picture is restored afterwards, bit for bit.

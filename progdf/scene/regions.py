@@ -65,14 +65,14 @@ also the hair."""
 MAX_TIMES = 100
 """Largest number of repetitions of a step."""
 
-LARGEST = 1e18
+MAX_NUMBER = 1e18
 """Largest magnitude of a number in a region. The sum of a few squares still fits float32."""
 
-Selecting = Callable[[Gaussians], Mask]
+PartSelector = Callable[[Gaussians], Mask]
 """Function from a scene to the mask that a part selects."""
 
 
-def read_part(kind: str, argument: str) -> Selecting:
+def read_part(kind: str, argument: str) -> PartSelector:
     """Return the selection function of a part whose kind is one of `PARTS`.
 
     Raises:
@@ -181,18 +181,19 @@ def _final_numbers(kind: str, typed: str, text: str, form: str) -> list[float]:
     numbers = read_numbers(text)
     if not numbers:
         raise ProgdfError(
-            f"region '{kind}:{shorten(typed)}' does not end in numbers up to {LARGEST:g}; write {kind}:{form}"
+            f"region '{kind}:{shorten(typed)}' does not end in numbers up to {MAX_NUMBER:g}; "
+            f"write {kind}:{form}"
         )
     return numbers
 
 
 def read_numbers(text: str) -> list[float]:
-    """Return the numbers between commas; [] if one cannot be read or exceeds `LARGEST`."""
+    """Return the numbers between commas; [] if one cannot be read or exceeds `MAX_NUMBER`."""
     try:
         numbers = [float(word) for word in text.split(",")]
     except ValueError:
         return []
-    return numbers if all(abs(number) <= LARGEST for number in numbers) else []
+    return numbers if all(abs(number) <= MAX_NUMBER for number in numbers) else []
 
 
 def _oklab(text: str, code: str) -> list[float]:
@@ -237,7 +238,7 @@ _SIGNS = {"+": union, "-": difference, "&": intersection}
 _NO_KINDS: Mapping[str, Kind] = {}
 _NO_CHECKS: Mapping[str, Check] = {}
 
-BARE = ("changed",)
+KINDS_WITHOUT_ARGUMENT = ("changed",)
 """Kinds without a colon and a text."""
 
 
@@ -272,7 +273,7 @@ def parse_region(
             kind, colon, text = part.partition(":")
             if part == "all":
                 selected = whole_scene(scene)
-            elif kind in known and (colon or kind in BARE):
+            elif kind in known and (colon or kind in KINDS_WITHOUT_ARGUMENT):
                 selected = known[kind](text, scene)
             else:
                 raise _unknown_region(part, known)
@@ -321,14 +322,14 @@ def check_region(spec: str, checks: Mapping[str, Check] = _NO_CHECKS) -> None:
         kind, colon, text = part.partition(":")
         if sign == "|":
             read_step(part)
-        elif kind in known and (colon or kind in BARE):
+        elif kind in known and (colon or kind in KINDS_WITHOUT_ARGUMENT):
             known[kind](text)
         elif part != "all":
             raise _unknown_region(part, known)
 
 
 def _unknown_region(part: str, known: Iterable[str]) -> ProgdfError:
-    choice = ", ".join(["all", *(word if word in BARE else f"{word}:…" for word in known)])
+    choice = ", ".join(["all", *(word if word in KINDS_WITHOUT_ARGUMENT else f"{word}:…" for word in known)])
     return ProgdfError(f"unknown region '{shorten(part)}'; write {choice}")
 
 
@@ -336,7 +337,7 @@ def split_spec(spec: str, kinds: tuple[str, ...]) -> list[tuple[str, str]]:
     """Return the (sign, part) pairs of a spec. The first sign is '+', and a step's sign is '|'."""
     words = "|".join(re.escape(kind) for kind in kinds)
     steps = "|".join(re.escape(step) for step in STEPS)
-    bare = "|".join(("all", *BARE))
+    bare = "|".join(("all", *KINDS_WITHOUT_ARGUMENT))
     part = rf"(?:{words}):|(?:{bare})\s*(?:$|[+&|-])"
     step_part = rf"(?:{steps})(?::-?[^\s+&|-]*)?\s*(?:$|[+&|-])"
     # no blanks before the sign: a pattern that begins with blanks takes quadratic time on a run of them
@@ -474,7 +475,8 @@ def _numbers(kind: str, text: str, form: str) -> list[float]:
     count = form.count(",") + 1
     if len(numbers) != count:
         raise ProgdfError(
-            f"region '{kind}:{shorten(text)}' is not {count} numbers up to {LARGEST:g}; write {kind}:{form}"
+            f"region '{kind}:{shorten(text)}' is not {count} numbers up to {MAX_NUMBER:g}; "
+            f"write {kind}:{form}"
         )
     return numbers
 

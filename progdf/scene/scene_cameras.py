@@ -31,7 +31,7 @@ from progdf.gaussians import Gaussians, Origin
 from progdf.io.atomic import read_file
 from progdf.io.camera_json import make_rigid
 from progdf.io.cameras import (
-    beside_folder,
+    camera_search_folder,
     load_cameras_with_report,
     log_cameras,
     relative_viewmat,
@@ -144,7 +144,7 @@ def scene_cameras_beside(path: Path, scene: Gaussians) -> list[Camera]:
     used to find the up axis.
     """
     try:
-        cameras = load_scene_cameras(beside_folder(path), scene, path, anyway=True).cameras
+        cameras = load_scene_cameras(camera_search_folder(path), scene, path, anyway=True).cameras
     except (ProgdfError, OSError):
         return []
     facing = [camera for camera in cameras if _has_middle(camera, scene)]

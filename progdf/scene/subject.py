@@ -128,7 +128,7 @@ def is_room(scene: Gaussians, up: Tensor) -> bool:
     return has_ceiling(scene[_without_background(scene, _sample(scene))], up)
 
 
-def standpoint(scene: Gaussians, up: Tensor) -> tuple[Tensor, Tensor]:
+def room_viewpoint(scene: Gaussians, up: Tensor) -> tuple[Tensor, Tensor]:
     """Return the eye and target inside a room that show the most, from free space at eye height.
 
     Returns:
@@ -160,7 +160,7 @@ def standpoint(scene: Gaussians, up: Tensor) -> tuple[Tensor, Tensor]:
     return middle + eye @ axes, middle + (target - torch.tensor([0.0, 0.0, 0.1 * float(half[2])])) @ axes
 
 
-def richest_turn(scene: Gaussians, up: Tensor, azimuth: float, elevation: float) -> float:
+def best_azimuth_offset(scene: Gaussians, up: Tensor, azimuth: float, elevation: float) -> float:
     """Return the angle from an azimuth to the side that shows most of the subject, degrees.
 
     It finds the side of subjects such as an alcove or a face, which are open or solid on one side only. It is

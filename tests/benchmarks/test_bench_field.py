@@ -21,7 +21,9 @@ from trainer.report.plots import LINES
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training, "BEAR", 700)
-    monkeypatch.setattr(training, "WAYS", ("--quick --views 5 --image-size 48 --stages 2 --threads 1",))
+    monkeypatch.setattr(
+        training, "OPTION_SETS", ("--quick --views 5 --image-size 48 --stages 2 --threads 1",)
+    )
 
 
 @pytest.mark.slow

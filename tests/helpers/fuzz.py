@@ -31,7 +31,7 @@ from progdf.formats.ply import load_ply, save_ply
 from progdf.gdf.file import load_gdf, save_gdf
 from progdf.io.cameras import load_cameras, save_cameras
 from progdf.io.images import read_picture
-from progdf.io.json_values import plain
+from progdf.io.json_values import to_json
 from progdf.io.tensors import open_npy
 from tests.helpers.edits import curved_field, edit_of, some_rows
 from tests.helpers.fuzz_changes import Change, changed_bytes, changed_gdf, changed_json, changed_parts
@@ -137,7 +137,7 @@ def inputs(folder: Path, reader: str) -> dict[str, tuple[str, Callable[[Path], A
     table = json.loads(saved.read_text())
     mask = np.arange(len(opened.document.scene)) % 3 == 0
     kept = add_region(select(SelectionState(), mask), "third", folder / "s" / "third.region.npy")
-    table["view"]["selection"] = plain(replace(kept, hidden=kept.members))
+    table["view"]["selection"] = to_json(replace(kept, hidden=kept.members))
     saved.write_text(json.dumps(table))
     read: Callable[[Path], bytes] = Path.read_bytes
 

@@ -11,7 +11,14 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.gaussians import normalize_quats
 from progdf.quaternions import matrix_quats, rotation_matrices
-from progdf.rasterize.cpu.pyramid import CELL, COARSER, CROWD, DARKEST, LEAF, SLICES
+from progdf.rasterize.cpu.pyramid import (
+    CELL,
+    COARSE_CUT_FACTOR,
+    DENSITY_EXPONENT,
+    LEAF,
+    MAX_OPTICAL_DEPTH,
+    SLICES,
+)
 from progdf.rasterize.engines import (
     ALPHA_MAX,
     ALPHA_MIN,
@@ -95,7 +102,7 @@ class PlainCut:
         self._gaussians, self._camera, self._nodes = gaussians, camera, plain_tree(gaussians)
         self._dilation = DILATION / pixels**2
         self._depths: Tensor | None = None
-        coarse = self._cut(0, limit * COARSER)
+        coarse = self._cut(0, limit * COARSE_CUT_FACTOR)
         shape = (-(-camera.height // CELL), -(-camera.width // CELL), SLICES)
         depths = torch.zeros(shape, dtype=torch.double)
         for pick in coarse:
@@ -139,7 +146,7 @@ class PlainCut:
             dilated = (values[:, 1:].clamp_min(0.0) + wide[:, None]).prod(1).sqrt()
             dense = torch.maximum(opacity, (own[:, 0] + wide * own[:, 1]) / dilated)
             opacity = torch.where(merged, dense, opacity)
-        opacity = torch.where(merged, opacity.minimum(opacity**CROWD), opacity)
+        opacity = torch.where(merged, opacity.minimum(opacity**DENSITY_EXPONENT), opacity)
         sizes = (scales**2 + more).clamp_min(0.0).sqrt()
         a, _, c, det0 = covariances(points, quats, scales, view)
         fine = det0 + self._dilation * (a + c) + self._dilation**2
@@ -208,7 +215,7 @@ class PlainCut:
             if self._depths is not None:
                 cells = self._cells(x, y, (z - largest) * 2 ** (-1 / 32))
                 depth = sum(share * float(self._depths[cell]) for cell, share in cells)
-                loss *= math.exp(-0.5 * min(depth, DARKEST))
+                loss *= math.exp(-0.5 * min(depth, MAX_OPTICAL_DEPTH))
         leaf = 2 * index + 1 >= len(self._nodes)
         if loss <= limit or (leaf and self._depths is None):  # a leaf as it is tells the light
             return [index]

@@ -47,7 +47,7 @@ def shrink_field(patch: pytest.MonkeyPatch) -> None:
 
 def _shrink_training(patch: pytest.MonkeyPatch) -> None:
     shrink_field(patch)
-    patch.setattr(training, "WAYS", ("--quick --views 5 --image-size 48 --stages 2 --threads 1",))
+    patch.setattr(training, "OPTION_SETS", ("--quick --views 5 --image-size 48 --stages 2 --threads 1",))
     patch.setattr(run_edits, "VALUES", 3)
     patch.setattr(run_edits, "ASKED", 2)
     patch.setattr(warps, "STEPS", 32)

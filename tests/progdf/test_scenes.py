@@ -30,7 +30,7 @@ def _same(a: Gaussians, b: Gaussians) -> bool:
     return all(torch.equal(getattr(a, name), getattr(b, name)) for name in ATTRIBUTES)
 
 
-@pytest.mark.parametrize("size", [scenes.SMALLEST, 401, 5003])
+@pytest.mark.parametrize("size", [scenes.MIN_BEAR_GAUSSIANS, 401, 5003])
 def test_the_bear_has_exactly_the_size_asked_for_and_leaves_torch_as_it_was(size: int) -> None:
     torch.manual_seed(5)
     before = torch.get_rng_state()
@@ -59,7 +59,7 @@ def test_a_room_has_its_size_and_all_its_things_and_is_seeded(room: scenes.DemoS
     assert set(scene.labels.tolist()) == set(range(len(scene.label_names)))
     assert _same(scene.gaussians, scenes.room(2503).gaussians)
     with pytest.raises(ProgdfError, match="too few for a room; use at least"):
-        scenes.room(scenes.SMALLEST_ROOM - 1)
+        scenes.room(scenes.MIN_ROOM_GAUSSIANS - 1)
 
 
 def test_cameras_in_the_room_are_inside_and_see_walls_everywhere() -> None:
@@ -85,7 +85,7 @@ def test_a_part_that_lies_inside_another_is_reported_not_searched_for() -> None:
 
 def test_too_few_gaussians_for_a_bear_are_refused() -> None:
     with pytest.raises(ProgdfError, match="too few for a bear; use at least"):
-        scenes.bear(scenes.SMALLEST - 1)
+        scenes.bear(scenes.MIN_BEAR_GAUSSIANS - 1)
 
 
 def test_every_number_of_the_bear_is_usable(bear: scenes.DemoScene) -> None:

@@ -10,8 +10,8 @@ from progdf.camera import Camera, intrinsics, look_at
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.rasterize import render
-from trainer.paint.discs import PaintedView, lay_on
-from trainer.run.paint import Laid, lay_discs, paint_gdf
+from trainer.paint.discs import PaintedView, composite_over
+from trainer.run.paint import DiscLayout, lay_discs, paint_gdf
 from trainer.views.view import BACKGROUND
 
 SIDE = 128
@@ -58,9 +58,9 @@ def letters(scene: Gaussians) -> PaintedView:
 def paint_on(scene: Gaussians, painted: torch.Tensor) -> PaintedView:
     """These pixels in dark blue. [H,W] bool"""
     drawn = painted[..., None] * torch.tensor([0.1, 0.15, 0.5, 1.0])
-    return PaintedView(CAMERA, lay_on(picture(scene), drawn), drawn)
+    return PaintedView(CAMERA, composite_over(picture(scene), drawn), drawn)
 
 
-def edit_of(scene: Gaussians, paint: PaintedView) -> tuple[Gdf, Laid]:
+def edit_of(scene: Gaussians, paint: PaintedView) -> tuple[Gdf, DiscLayout]:
     laid = lay_discs(scene, [paint], 4.0)
     return paint_gdf(laid, scene, [paint], "letters", None), laid

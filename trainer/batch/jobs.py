@@ -19,7 +19,7 @@ from typing import Any
 
 from progdf.errors import ProgdfError
 from progdf.io.atomic import read_file
-from progdf.io.json_values import convert_json, plain
+from progdf.io.json_values import convert_json, to_json
 from progdf.terminal import group_digits
 from trainer.options import MAX_STAGES, PRESETS, VIEWS, TrainOptions, apply_preset, flat_values, with_values
 from trainer.resolve import BLANK, check_name, resolve
@@ -187,7 +187,7 @@ def make_options(values: Mapping[str, Any], out: Path) -> TrainOptions:
         options = apply_preset(options, preset)
     options = with_values(options, **{"threads": THREADS, **values})
     try:
-        options = convert_json(plain(options), TrainOptions)
+        options = convert_json(to_json(options), TrainOptions)
     except ValueError as error:
         raise ProgdfError(re.sub(r"^(\w+\.)?(\w+)", r"\2", str(error))) from None
     resolve(options)

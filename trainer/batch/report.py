@@ -21,7 +21,7 @@ from rich.text import Text
 
 from progdf.errors import ProgdfError
 from progdf.io.atomic import read_file, write_file
-from progdf.io.json_values import convert_json, decode_json, plain
+from progdf.io.json_values import convert_json, decode_json, to_json
 from progdf.terminal import escape_text, file_size, format_count, format_duration
 from trainer.store.run_folder import RunFolder
 
@@ -348,7 +348,7 @@ class Screen:
         remaining = self._remaining(running)
         ended = len(self._rows)
         failed = sum(row.status == "failed" for row in self._rows)
-        self.event("progress", running=plain(states), ended=ended, failed=failed, seconds_left=remaining)
+        self.event("progress", running=to_json(states), ended=ended, failed=failed, seconds_left=remaining)
         if live:
             lines = [f"  {key:<40} {_state(state)}" for key, state in states.items()]
             time_left = f", about {format_duration(remaining)} left" if remaining else ""

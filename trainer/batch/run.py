@@ -290,7 +290,7 @@ def _result(future: Future[Any]) -> Any:
     return result
 
 
-def inspect(jobs: Sequence[BatchJob], pool: Pool) -> dict[str, Finding]:
+def check_jobs(jobs: Sequence[BatchJob], pool: Pool) -> dict[str, Finding]:
     """Check all jobs, scene by scene, before any starts; return the findings by key."""
     scenes: dict[tuple[Path, Path], list[BatchJob]] = {}
     for job in jobs:
@@ -325,7 +325,7 @@ def train_task(job: BatchJob, memory: int = 0) -> Task:
 
 
 def run(jobs: Sequence[BatchJob], workers: int = 0, address: str = "") -> Iterator[JobRow]:
-    """Train jobs in parallel, for Python programs. The jobs are not checked first, see `inspect`.
+    """Train jobs in parallel, for Python programs. The jobs are not checked first, see `check_jobs`.
 
     Args:
         jobs: runs; finished runs stay unchanged, stopped runs resume
@@ -371,7 +371,7 @@ def batch(options: BatchOptions) -> int:
         redirect_stdout(sys.stderr),  # Ray prints notices about machines
         open_pool(options.workers, options.address, threads, len(pending)) as pool,
     ):
-        findings = inspect(pending, pool)
+        findings = check_jobs(pending, pool)
         faults += [f"{f.key}: {f.fault}" for f in findings.values() if f.fault]
         healthy = [job for job in pending if not findings[job.key].fault]
         costs = {

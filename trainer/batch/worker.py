@@ -32,7 +32,7 @@ from trainer.options import TrainOptions
 from trainer.resolve import resolve
 from trainer.run.finish import RunResult
 from trainer.run.run import check_command, select_region, train
-from trainer.store.pretrained import Shared, keep_models
+from trainer.store.pretrained import LastValueCache, keep_models
 from trainer.store.run_folder import RunFolder, read_run_cameras
 from trainer.views.view import BACKGROUND
 
@@ -54,10 +54,10 @@ class Finding:
 
 
 @cache
-def _shared_parts() -> Shared:
+def _shared_parts() -> LastValueCache:
     """Return the cache shared by this process's jobs; models and weights stay loaded from now on."""
     keep_models()
-    return Shared()
+    return LastValueCache()
 
 
 def inspect_scene(jobs: Sequence[BatchJob]) -> list[Finding]:

@@ -14,7 +14,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.region import Region
 from trainer.options import EditorOptions
-from trainer.views.view import Glance, View
+from trainer.views.view import RegionThumbnail, View
 
 from .base import EditorInput, ImageEditor
 from .decal import check_decal, decal
@@ -98,7 +98,7 @@ def check_new_editor(options: EditorOptions) -> None:
 
 def make_editor(
     options: EditorOptions, scene: Gaussians, region: Region, views: Sequence[View],
-    glances: Callable[[], Sequence[Glance]] = list,
+    glances: Callable[[], Sequence[RegionThumbnail]] = list,
 ) -> ImageEditor:  # fmt: skip
     """Return the editor that the options name (see `EditorInput`).
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from progdf.gaussians import Gaussians
 from progdf.region import Region
 from trainer.options import EditKind, EditorOptions
-from trainer.views.view import Glance, View
+from trainer.views.view import RegionThumbnail, View
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class EditorInput:
     options: EditorOptions
     # Small samples of the region, independent of the views. If there are none, the region's color is computed
     # from the views.
-    glances: Callable[[], Sequence[Glance]] = list
+    glances: Callable[[], Sequence[RegionThumbnail]] = list
 
 
 class ImageEditor(Protocol):

@@ -28,7 +28,7 @@ Recipe = Mapping[str, str | int | float | None]
 
 
 @dataclass(frozen=True)
-class KeptPictures:
+class PictureCache:
     """Cache of pictures in a folder. Without a folder nothing is cached."""
 
     folder: Path | None

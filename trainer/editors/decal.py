@@ -19,7 +19,7 @@ from progdf.io.images import open_picture
 from progdf.rasterize.engines import render_depth
 from progdf.scene.regions import read_numbers
 from trainer.options import EditKind, EditorOptions
-from trainer.paint.discs import MIN_ALPHA, OPAQUE, PaintedView, lay_on, project_paint, sample_image
+from trainer.paint.discs import MIN_ALPHA, OPAQUE, PaintedView, composite_over, project_paint, sample_image
 from trainer.views.view import BACKGROUND, View, make_view, with_near_plane
 
 from .base import EditorInput
@@ -141,7 +141,7 @@ class DecalEditor:
         drawn = self.drawn
         if view is not self.view:
             drawn = project_paint(self.scene, self.view.camera, drawn, view.camera)
-        return lay_on(view.image, strength * drawn)
+        return composite_over(view.image, strength * drawn)
 
 
 def decal(given: EditorInput) -> DecalEditor:

@@ -29,7 +29,7 @@ from trainer.views.view import BACKGROUND, View, region_box, render_view, shrink
 from . import adapters
 from .adapters import DevicePlan, PipelineRequest
 from .base import EditorInput
-from .cache import KeptPictures, Recipe
+from .cache import PictureCache, Recipe
 from .mixed_steps import MixedSteps, network_steps
 
 _BOX_MARGIN = 0.4  # share of the box's width and height that is added, half on each side
@@ -43,7 +43,7 @@ class InstructEditor:
     request: PipelineRequest
     placement: DevicePlan
     load: Callable[[], MixedSteps]  # loads the pipeline on first use
-    kept: KeptPictures  # cache of the outputs, at their own size
+    kept: PictureCache  # cache of the outputs, at their own size
     stages: tuple[float, ...] = ()
     kind: EditKind = "style"
     is_confined: bool = False
@@ -178,7 +178,7 @@ def instruct(given: EditorInput) -> InstructEditor:
         )
 
     placement = adapters.place(request, options.device)
-    return InstructEditor(given.scene, request, placement, pipeline, KeptPictures(options.cache))
+    return InstructEditor(given.scene, request, placement, pipeline, PictureCache(options.cache))
 
 
 def check_instruct(what: str, options: EditorOptions) -> None:

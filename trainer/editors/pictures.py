@@ -29,7 +29,7 @@ from progdf.color.edits import number_of, typical_color
 from progdf.color.oklab import Bend, bend_of, interpolate_colors
 from progdf.errors import ProgdfError
 from progdf.gaussians import ZERO, Gaussians, Origin
-from progdf.io.images import picture_size, read_picture, save_as
+from progdf.io.images import picture_size, read_picture, saving_loss
 from progdf.io.picture_camera import find_picture_camera
 from progdf.io.picture_files import PictureFolder, find_picture, name_key, split_path
 from progdf.rasterize import render
@@ -118,7 +118,7 @@ def read_edit(scene: Gaussians, camera: Camera, image: Tensor, path: Path) -> Te
         ProgdfError: the picture is broken.
     """
     original, picture = read_change(scene, path, camera.resize(*picture_size(path)))
-    change = lay_over(original, picture) - original
+    change = undo_shift(original, picture) - original
     return (image + shrink_image(change, (camera.height, camera.width))).clamp(0.0, 1.0)
 
 
@@ -222,7 +222,9 @@ def read_change(scene: Gaussians, path: Path, camera: Camera) -> tuple[Tensor, T
     run = torch.tensor(BACKGROUND)
     size = (picture.shape[1], picture.shape[0])
     drawn, clear = _draw(scene, camera)
-    background = background_of(picture, resize_image(drawn, size), resize_image(clear, size), save_as(path))
+    background = background_of(
+        picture, resize_image(drawn, size), resize_image(clear, size), saving_loss(path)
+    )
     original = resize_image((drawn + clear * (background - run)).clamp(0.0, 1.0), size)
     return original, picture
 
@@ -230,7 +232,7 @@ def read_change(scene: Gaussians, path: Path, camera: Camera) -> tuple[Tensor, T
 def picture_background(scene: Gaussians, path: Path, camera: Camera) -> Tensor:
     """Return the background color of a picture, found at the camera's size (see `read_change`). rgb [3]"""
     picture = resize_image(read_picture(path), (camera.width, camera.height))
-    return background_of(picture, *_draw(scene, camera), save_as(path))
+    return background_of(picture, *_draw(scene, camera), saving_loss(path))
 
 
 def _draw(scene: Gaussians, camera: Camera) -> tuple[Tensor, Tensor]:
@@ -249,7 +251,7 @@ def background_of(
         picture: [H,W,3]
         original: the render over the run's background, not clamped. [H,W,3]
         clear: transmittance of the scene. [H,W,1]
-        save: returns an image as saving changes it (see `save_as`)
+        save: returns an image as saving changes it (see `saving_loss`)
 
     Returns:
         rgb. [3] The run's own background, unless another color halves the error where the scene is
@@ -293,7 +295,7 @@ def resize_image(image: Tensor, size: tuple[int, int]) -> Tensor:
     return torch.from_numpy(np.stack(scaled, axis=2))
 
 
-def lay_over(original: Tensor, picture: Tensor) -> Tensor:
+def undo_shift(original: Tensor, picture: Tensor) -> Tensor:
     """Return the picture with a shift of up to two pixels undone. [H,W,3] each"""
     original_smooth = ndimage.uniform_filter(original.numpy(), (3, 3, 1))
     picture_smooth = ndimage.uniform_filter(picture.numpy(), (3, 3, 1))

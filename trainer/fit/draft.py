@@ -21,14 +21,14 @@ from progdf.metrics.image import ROUNDING, decibels
 from progdf.region import Region
 from trainer.editors import COLOR_FUNCTIONS, make_editor
 from trainer.editors.procedural import edit_course
-from trainer.optimize.color_views import MORE_PAYS, ColorView, MapFit, fit_maps
+from trainer.optimize.color_views import MAX_ERROR_SHARE, ColorView, MapFit, fit_maps
 from trainer.options import MAX_STAGES, EditorOptions, TrainingViewOptions
-from trainer.setup import take_glances
-from trainer.views.view import BACKGROUND, Glance, View, render_view
+from trainer.setup import render_thumbnails
+from trainer.views.view import BACKGROUND, RegionThumbnail, View, render_view
 
 from .slider_uniformity import equalized_strengths
 
-CARRIED = 0.1
+MAX_UNEXPLAINED_SHARE = 0.1
 """Largest share of an edit's squared change that a grade may leave unexplained."""
 
 _FIT_PIXELS = 1500  # sampled from the fitting views
@@ -52,7 +52,7 @@ class DraftViews:
 
     scene: Gaussians
     region: Region
-    glances: Sequence[Glance]
+    glances: Sequence[RegionThumbnail]
     fitted: _Pixels
     judged: _Pixels  # from test views, to which nothing is fitted
 
@@ -67,7 +67,7 @@ def draft_views(options: TrainingViewOptions, scene: Gaussians, region: Region) 
         scene: the original
         region: the edited region
     """
-    glances = take_glances(options, scene, region)
+    glances = render_thumbnails(options, scene, region)
     views = [_glance_view(scene, region, glance) for glance in glances]
     parts = [[view for i, view in enumerate(views) if (i % 3 == 1) is is_test] for is_test in (False, True)]
     samples = [
@@ -78,7 +78,7 @@ def draft_views(options: TrainingViewOptions, scene: Gaussians, region: Region) 
     return DraftViews(scene, region, glances, *samples)
 
 
-def _glance_view(scene: Gaussians, region: Region, glance: Glance) -> tuple[View, ColorView]:
+def _glance_view(scene: Gaussians, region: Region, glance: RegionThumbnail) -> tuple[View, ColorView]:
     """Return a glance as views of one pixel row."""
     background = torch.tensor(BACKGROUND)
     drawn = glance.map.picture(glance.colors.clamp_min(0.0))
@@ -120,8 +120,8 @@ def draft_grade(views: DraftViews, options: EditorOptions, name: str) -> Gdf | N
     test views, dB.
 
     Returns:
-        The grade; None if the editor is no function of color, or if the grade leaves more than `CARRIED` of
-        the edit. A manual grade is always returned.
+        The grade; None if the editor is no function of color, or if the grade leaves more than
+        `MAX_UNEXPLAINED_SHARE` of the edit. A manual grade is always returned.
 
     Raises:
         ProgdfError: the editor does not exist.
@@ -137,9 +137,9 @@ def draft_grade(views: DraftViews, options: EditorOptions, name: str) -> Gdf | N
     expected = editor.edit(judged.row, 1.0)
     ends = {degree: fitted.maps.solve(degree, targets[-1:]) for degree in MONOMIALS}
     errors = {degree: _error(judged.maps.picture(end), expected) for degree, end in ends.items()}
-    degree = min(d for d in errors if MORE_PAYS * errors[d] <= min(errors.values()))
+    degree = min(d for d in errors if MAX_ERROR_SHARE * errors[d] <= min(errors.values()))
     error = _drawn_error(views, ends[degree], degree, expected)
-    max_error = CARRIED * _error(judged.row.image[0], expected) + ROUNDING
+    max_error = MAX_UNEXPLAINED_SHARE * _error(judged.row.image[0], expected) + ROUNDING
     if error > max_error and options.family != "grade":  # a manual grade is checked by eye
         return None
     maps = [fitted.maps.solve(degree, [target]) for target in targets]

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from progdf.field import BakedField, Candidate, FieldChoice, FieldEvaluator, choose_field
 from progdf.field.baked import GradeForm, NeuralForm
-from progdf.field.choose import ADDED, MAX_FITTED_SNAPSHOTS, SAMPLES, pick_candidate
+from progdf.field.choose import MAX_ADDED_ERROR_SHARE, MAX_FITTED_SNAPSHOTS, SAMPLES, pick_candidate
 from progdf.field.grade import (
-    COARSER,
+    RESIDUAL_STEPS,
     bake_grade,
     fit_grade,
     map_form,
@@ -39,8 +39,8 @@ from trainer.views.view import View
 
 from .evaluate import Evaluator, make_evaluator
 
-THINNED = 0.025
-"""Part of `ADDED` that is reserved for leaving out functions of single members, see `thin_model`."""
+THINNING_ERROR_SHARE = 0.025
+"""Part of `MAX_ADDED_ERROR_SHARE` reserved for leaving out functions of single members, see `thin_model`."""
 
 _PATH_VIEWS = 3  # views on which a path is chosen
 _PATH_GAIN_DB = 0.5  # a curved path must be better by this: it takes several times the bytes
@@ -164,7 +164,9 @@ def fit_grades(
 
     def fails(rank: int, index: int = 0) -> bool:
         nonlocal smallest
-        form = fit_grade(trajectory.s, degree, table, course, rank, weights, alone.mask, COARSER[index])
+        form = fit_grade(
+            trajectory.s, degree, table, course, rank, weights, alone.mask, RESIDUAL_STEPS[index]
+        )
         if form.bytes_per_member > smallest:
             return False
         release_memory()
@@ -184,7 +186,7 @@ def fit_grades(
         fewest = min(2 * fewest + 1, limit)
     fewest = bisect_left(range(fewest), True, lo=low, key=lambda rank: not fails(rank))
     for rank in range(max(1, fewest), min(fewest + 1, limit) + 1):
-        bisect_left(range(1, len(COARSER)), True, key=partial(fails, rank))
+        bisect_left(range(1, len(RESIDUAL_STEPS)), True, key=partial(fails, rank))
     choice = pick_candidate(tried, evaluator.wanted)
     form = choice.best.field.origin
     assert isinstance(form, GradeForm)
@@ -200,7 +202,9 @@ def field_evaluator(trajectory: Trajectory, views: Evaluator, target: float | No
     edited = {s: views.count(views.edited[e]) for s, e in trajectory.stage_strengths if e in views.edited}
     course = trajectory.s, trajectory.offsets, views.counted_pixels, trajectory.at
     if target is None:
-        added = ADDED if trajectory.bands < 2 else ADDED - THINNED
+        added = (
+            MAX_ADDED_ERROR_SHARE if trajectory.bands < 2 else MAX_ADDED_ERROR_SHARE - THINNING_ERROR_SHARE
+        )
         return FieldEvaluator(*course, edited=edited, added=added)
     return FieldEvaluator(*course, target=target)
 
@@ -221,7 +225,7 @@ def _measure_choice(choice: FieldChoice, trajectory: Trajectory, reporting: Eval
     return Fitted(errors.candidate(best.field, best.label), choice, baselines)
 
 
-def expected_looks(trajectory: Trajectory, kind: FieldKind) -> int:
+def expected_renders(trajectory: Trajectory, kind: FieldKind) -> int:
     """Return about how often `fit_field` renders its views, for a progress bar."""
     snapshots = min(len(trajectory), MAX_FITTED_SNAPSHOTS)
     moving = len(moving_attributes(trajectory.offsets))

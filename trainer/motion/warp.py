@@ -435,7 +435,7 @@ class WarpPlacement:
         ]
 
 
-def between(a: RegionMotion, b: RegionMotion, share: float) -> RegionMotion:
+def interpolate_placement(a: RegionMotion, b: RegionMotion, share: float) -> RegionMotion:
     """Interpolate two placements of the same kind."""
     if isinstance(a, PartsPlacement) and isinstance(b, PartsPlacement):
         return PartsPlacement(a.parts, interpolate_motion(a.motion, b.motion, share))

@@ -15,8 +15,8 @@ from torch.nn.functional import pad
 from progdf.field.grade import band_offsets, member_bands
 from progdf.metrics.image import LEVEL, decibels
 
-from .color_solver import BANDS, LOOKS, Model, Solver, add_bands
-from .color_views import MORE_PAYS, Judge
+from .color_solver import BANDS, GAIN_WINDOW_STEPS, Model, Solver, add_bands
+from .color_views import MAX_ERROR_SHARE, ColorEvaluator
 from .pgs import OnStep, ParameterSnapshot, PgsState, TargetStage
 from .retime import smooth_weights
 
@@ -25,18 +25,18 @@ STEPS = "steps"
 
 _MIN_INTERVAL = 1 / 16  # smallest interval between strengths; it is not subdivided further
 
-Target = tuple[TargetStage, Judge]
+Target = tuple[TargetStage, ColorEvaluator]
 """Pictures at one strength, and an evaluator on held-out views that decides when they are matched."""
 
 
 @dataclass
-class Course:
+class StrengthSchedule:
     """Strengths to solve for."""
 
     targets: list[Target]  # in solving order, without the finished edit
     finished: Target
     # evaluator at any other strength; None: no strength can be added
-    look: Callable[[float], Judge] | None = None
+    look: Callable[[float], ColorEvaluator] | None = None
     ask: Callable[[Sequence[float]], Sequence[Target]] | None = None  # makes targets at further strengths
 
     def extend(self, known: Mapping[float, tuple[Tensor, float]]) -> bool:
@@ -64,7 +64,7 @@ class Course:
             error = max(self.look(float(places[2 * i + 1])).error(smooth), LEVEL)
             left_root = math.sqrt(errors[i]) if i > 0 else 0.0
             expected = (0.5 * left_root + 0.5 * math.sqrt(errors[i + 1])) ** 2
-            if (end - begin) * math.log(error / max(expected, LEVEL)) > -math.log(MORE_PAYS):
+            if (end - begin) * math.log(error / max(expected, LEVEL)) > -math.log(MAX_ERROR_SHARE):
                 added.append((begin + end) / 2)
         if added:
             self.targets += self.ask(added)
@@ -124,18 +124,18 @@ def thin_model(model: Model, solver: Solver, targets: Sequence[Target], steps: i
     if richer:
         refined, error = refine([pad(one, (0, 0, 0, richer - model.bands)) for one in best], steps)
         tried.append((f"with a residual of {richer}{suffix}", decibels(error / len(targets))))
-        if error < MORE_PAYS * min_error:
+        if error < MAX_ERROR_SHARE * min_error:
             best = refined
             min_error = error
     thinner = best
     error = min_error
-    while error * MORE_PAYS <= min_error + len(targets) * spare:
+    while error * MAX_ERROR_SHARE <= min_error + len(targets) * spare:
         best = thinner
         min_error = min(min_error, error)
         halved = solver.halve(best)
         if not bool(halved[-1][:, 1:].any()):
             break
-        thinner, error = refine(halved, min(LOOKS, steps - 1))
+        thinner, error = refine(halved, min(GAIN_WINDOW_STEPS, steps - 1))
         total = float(thinner[-1].any(dim=2).float().sum(dim=1).mean())
         tried.append((f"{total:.1f} of these a Gaussian{suffix}", decibels(error / len(targets))))
     starts_by_strength = {stage.strength: one for (stage, _), one in zip(targets, best, strict=True)}
@@ -145,7 +145,7 @@ def thin_model(model: Model, solver: Solver, targets: Sequence[Target], steps: i
 def solve(
     solver: Solver,
     model: Model,
-    course: Course,
+    course: StrengthSchedule,
     made: Sequence[ParameterSnapshot],
     state: PgsState,
     on_step: OnStep,
@@ -168,7 +168,7 @@ def solve(
     Raises:
         FloatingPointError: the loss or the solution is not finite; the state is that of the previous stage.
     """
-    finished = Judge(solver.views, course.finished[0].targets)
+    finished = ColorEvaluator(solver.views, course.finished[0].targets)
     judge = course.finished[1]
     _, mapped = solver.fit_map(model.degree, course.finished[0].targets)
     end = add_bands(mapped, model.residual)
@@ -209,7 +209,7 @@ def solve(
         state.step = state.step + 1
         state.stage = state.stage + 1
         state.running = remaining
-        means |= {"l2": Judge(solver.views, stage.targets).error(offsets), "left": remaining}
+        means |= {"l2": ColorEvaluator(solver.views, stage.targets).error(offsets), "left": remaining}
         return ParameterSnapshot(state.step, True, moved, means, table)
 
     for index in range(min(state.stage, len(course.targets))):

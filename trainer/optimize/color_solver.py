@@ -39,12 +39,12 @@ from progdf.sh import C0
 from progdf.threads import map_threads, one_thread
 
 from .color_views import (
-    MORE_PAYS,
+    MAX_ERROR_SHARE,
+    ColorEvaluator,
     ColorView,
-    Judge,
     MapFit,
     add_colors,
-    add_pulls,
+    add_gradients,
     fit_maps,
     improve_mask,
     iterate_views,
@@ -52,11 +52,11 @@ from .color_views import (
 )
 from .ties import Ties
 
-STEPS_OF_OTHERS = 8
+VIEW_STEPS_PER_ITERATION = 8
 """Number of single-view optimizer steps that one iteration over all views replaces."""
 
-SETTLED = 0.01
-"""Minimum share of the held-out error that `LOOKS` steps must remove for another step to follow."""
+MIN_GAIN_SHARE = 0.01
+"""Minimum share of the held-out error that `GAIN_WINDOW_STEPS` steps must remove, or the steps end."""
 
 BANDS = (1, 4, 9)
 """Numbers of SH functions to try for the residual.
@@ -73,7 +73,7 @@ _TIED_RIDGES = (1e-8, 1e-5, 1e-3)
 _DETERMINED_PX = 0.5  # pixels; a member this large in two pictures is determined by them
 _STEP_FRACTIONS = (1.0, 0.5, 0.2)  # fractions of a step to try if the full step runs into clamps
 
-LOOKS = 3
+GAIN_WINDOW_STEPS = 3
 """Number of steps over which the gain is measured. A single step may gain nothing in held-out views."""
 
 
@@ -247,7 +247,7 @@ class Solver:
         start: Tensor,
         targets: Sequence[Tensor],
         steps: int,
-        judge: Judge | None = None,
+        judge: ColorEvaluator | None = None,
         floor: float = 0.0,
         hold: float = _RESIDUAL_RIDGE,
         tell: Callable[[], None] = lambda: None,
@@ -263,7 +263,8 @@ class Solver:
             targets: pictures of the views
             steps: maximum number of steps
             judge: evaluator on held-out views; the best residual there is returned, and steps end when they
-                gain little there (see `SETTLED`) or the remaining error is invisible. None: take all steps
+                gain little there (see `MIN_GAIN_SHARE`) or the remaining error is invisible. None: take all
+                steps
             floor: held-out error that counts as 0, see `Model.error`; `LEVEL` always does
             hold: see `Model.hold`
             tell: called after each step
@@ -306,7 +307,7 @@ class Solver:
         preconditioned = direction = inverse @ gradient.descent
         best = current
         taken = 0
-        errors = [math.inf] * LOOKS
+        errors = [math.inf] * GAIN_WINDOW_STEPS
         if look is not None:
             errors[-1] = look(current)
         while taken < steps:
@@ -332,7 +333,7 @@ class Solver:
                 error = look(current)
                 best = current if error < min(errors) else best
                 errors.append(error)
-                settled = errors[-1 - LOOKS] - error <= SETTLED * max(error, floor, LEVEL)
+                settled = errors[-1 - GAIN_WINDOW_STEPS] - error <= MIN_GAIN_SHARE * max(error, floor, LEVEL)
                 if settled or error <= LEVEL:
                     break
             preconditioned = inverse @ gradient.descent
@@ -368,7 +369,7 @@ class Solver:
         error = _inner(residual, self._regularize(residual, ridge))
         results = iterate_views(look, range(len(self.views)))
         for view, (passed, negative, squared) in zip(self.views, results, strict=True):
-            add_pulls(view.basis.numpy(), negative.numpy(), descent.numpy())
+            add_gradients(view.basis.numpy(), negative.numpy(), descent.numpy())
             error += squared
             all_passed.append(passed)
         return _Gradient(descent, error, drawn, all_passed)
@@ -414,10 +415,10 @@ def make_solver(views: Sequence[ColorView], original: Tensor, ties: Ties | None 
     return Solver(views, original, weights, fit_maps(views, share), share, ties, free, scaled_ties)
 
 
-def split_solver(solver: Solver, targets: Sequence[Tensor]) -> tuple[Solver, Judge]:
+def split_solver(solver: Solver, targets: Sequence[Tensor]) -> tuple[Solver, ColorEvaluator]:
     """Return a trial for `choose_model` that holds out half of the tiles of every view."""
     fitted, held_out = zip(*(view.halves() for view in solver.views), strict=True)
-    return make_solver(fitted, solver.original, solver.ties), Judge(held_out, targets)
+    return make_solver(fitted, solver.original, solver.ties), ColorEvaluator(held_out, targets)
 
 
 @dataclass
@@ -425,7 +426,7 @@ class _ModelSearch:
     """Search for the best model, evaluated on views or pixels that the solver does not use."""
 
     solver: Solver
-    judge: Judge
+    judge: ColorEvaluator
     targets: Sequence[Tensor]  # finished edit in the solver's views
     most_steps: int  # maximum number of conjugate gradient steps per residual
     few: bool  # True if there are few views
@@ -484,7 +485,9 @@ class _ModelSearch:
             for name, bands, held in self.residuals:
                 base = self.attempt(base, f"with a mask and {name}", bands, held)
                 tried.append(base)
-                if not self.few and not LEVEL < base.error < MORE_PAYS * errors_without_mask.get(bands, 0.0):
+                if not self.few and not LEVEL < base.error < MAX_ERROR_SHARE * errors_without_mask.get(
+                    bands, 0.0
+                ):
                     break
         # size in bytes of a member, with one basis; the degree of the map costs none
         size = (lambda one: one.error) if self.few else (lambda one: 3 * one.bands + (one.mask_hold > 0.0))
@@ -493,7 +496,7 @@ class _ModelSearch:
 
 def choose_model(
     solver: Solver,
-    trial: tuple[Solver, Judge],
+    trial: tuple[Solver, ColorEvaluator],
     targets: Sequence[Tensor],
     steps: int,
     most_bands: int,
@@ -527,7 +530,7 @@ def choose_model(
         last = search.attempt(last, f"with {name}", bands, hold)
         if last.error >= best.error and not few:
             break
-        if max(last.error, LEVEL) < MORE_PAYS * best.error:
+        if max(last.error, LEVEL) < MAX_ERROR_SHARE * best.error:
             best = last
     if few:
         best = min(search.tried[-len(tied_residuals) :], key=lambda one: (one.error, -one.hold))
@@ -544,7 +547,7 @@ def choose_model(
 
 
 def solve_again(
-    model: Model, solver: Solver, targets: Sequence[Tensor], judge: Judge
+    model: Model, solver: Solver, targets: Sequence[Tensor], judge: ColorEvaluator
 ) -> tuple[Solver, Model]:
     """Solve for a chosen model on other views with the same number of steps. Return the solver and the model.
 
@@ -575,7 +578,7 @@ def _solve_whole(
         solver = solver.guess_mask(best.change, spreads, best.mask_hold).improve_mask(targets)
     map_change = solver.fit_map(best.degree, targets)[1]
     start = (best.change - map_change)[:, :1] if best.mask_hold else torch.zeros_like(best.residual)
-    judge = Judge(solver.views, targets)
+    judge = ColorEvaluator(solver.views, targets)
     return solver, solver.residual(map_change, start, targets, steps, judge, best.error, best.hold)[0]
 
 
@@ -584,7 +587,7 @@ def _smallest(
 ) -> _Candidate:
     """Return the smallest candidate within 5 % of the smallest error, or of an invisible error."""
     min_error = max(floor, min(one.error for one in attempts))
-    return min((one for one in attempts if MORE_PAYS * one.error <= min_error), key=size)
+    return min((one for one in attempts if MAX_ERROR_SHARE * one.error <= min_error), key=size)
 
 
 def _inner(a: Tensor, b: Tensor) -> float:
@@ -600,4 +603,4 @@ def add_bands(offsets: Tensor, residual: Tensor) -> Tensor:
 
 def iterations(steps: int) -> int:
     """Return the maximum number of conjugate gradient steps for `--steps` of one view each."""
-    return max(1, round(steps / STEPS_OF_OTHERS))
+    return max(1, round(steps / VIEW_STEPS_PER_ITERATION))

@@ -45,10 +45,10 @@ _MIN_MASK_GAIN = 0.01  # minimum share of the error that a step must remove
 _MASK_STEP_LENGTHS = (4.0, 2.0, 1.0, 0.5, 0.25)
 _MASK_RIDGE = 0.01  # share of a typical curvature, for hardly visible members
 
-LOST = 0.5 / 255.0
+OMITTED_WEIGHT = 0.5 / 255.0
 """Total weight per pixel that may be omitted. No color with this weight is visible in 8 bits."""
 
-MORE_PAYS = 0.95
+MAX_ERROR_SHARE = 0.95
 """Maximum share of the error that a larger model may leave to be worth its bytes."""
 
 _A = TypeVar("_A")
@@ -153,7 +153,7 @@ def add_colors(basis: Array, offsets: Array, colors: Array) -> None:
 
 
 @kernel(contract=True, cache=True)
-def add_pulls(basis: Array, pull: Array, offsets: Array) -> None:
+def add_gradients(basis: Array, pull: Array, offsets: Array) -> None:
     """Add Σ basis · pull to the offsets, the transpose of `add_colors`. [M,B], [M,3], [M,b,3] float32"""
     for m in range(len(pull)):
         for b in range(offsets.shape[1]):
@@ -171,7 +171,7 @@ def color_view(crop: CropScene, original: Tensor, every: int, index: int) -> Col
     directions = torch.nn.functional.normalize(members.means - camera.position, dim=1)
     weights = basis(min(members.sh_degree, 3), directions)
     colors = (weights[..., None] * members.sh[:, : weights.shape[1]]).sum(dim=1) + 0.5
-    weighed = color_map(crop.gaussians, camera, crop.box, crop.rows, crop.engine, pixels, LOST)
+    weighed = color_map(crop.gaussians, camera, crop.box, crop.rows, crop.engine, pixels, OMITTED_WEIGHT)
     others = crop.original.flatten(0, 1)[pixels] - weighed.picture(colors.clamp_min(0.0))
     counts = torch.ones_like(others[:, :1], dtype=torch.bool)
     weights = weights[:, : member_bands(original[:1]).shape[1]].contiguous()
@@ -361,7 +361,7 @@ def improve_mask(
 
 
 @dataclass(frozen=True)
-class Judge:
+class ColorEvaluator:
     """Evaluator of an edit in held-out views."""
 
     views: Sequence[ColorView]

@@ -26,13 +26,13 @@ from trainer.motion.warp import (
     WarpMotion,
     WarpPlacement,
     WarpSearch,
-    between,
+    interpolate_placement,
     rest_warp,
     warp_of_parts,
 )
 from trainer.views.crops import CropScene, render_all
 
-from .pgs import ParameterSnapshot, TargetStage, visible_way
+from .pgs import ParameterSnapshot, TargetStage, mean_visible_change
 
 GROUP_STEPS = 120
 """Steps of the group stage per strength if parts move as wholes."""
@@ -87,8 +87,8 @@ class Groups:
         for stage, placement in zip(stages, self.placements, strict=True):
             carried = partial(placement.carry, original)
             moved = render_all(crops, original + carried(torch.zeros_like(original)))
-            total, _ = visible_way(stage.targets, before)
-            remaining, left = visible_way(stage.targets, moved)
+            total, _ = mean_visible_change(stage.targets, before)
+            remaining, left = mean_visible_change(stage.targets, moved)
             length = min(1.0, left / _FULL_STEP_CHANGE, remaining / (_FULL_STEP_REMAINDER * max(total, 1e-9)))
             staged.append(replace(stage, place=carried, length=max(0.02, length)))
             before = stage.targets
@@ -227,7 +227,7 @@ def group_path(
         next_own = after.carry_back(original, end)
         for i in range(1, each):
             share = i / each
-            halfway = between(placement, after, share)
+            halfway = interpolate_placement(placement, after, share)
             offsets = halfway.carry(original, torch.lerp(own, next_own, share))
             done = start_step + round(share * (step - start_step))
             placements.append(ParameterSnapshot(done, False, offsets.half().cpu(), {}))

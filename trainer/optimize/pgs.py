@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from progdf.gaussians import BASE_CHANNELS, attribute_slices
-from progdf.io.json_values import convert_json, plain
+from progdf.io.json_values import convert_json, to_json
 from trainer.options import OptimizeOptions
 from trainer.store.state import Saved, generator
 from trainer.views.crops import CropScene, render_all
@@ -144,7 +144,7 @@ class PgsState:
         running = self.running if self.step else None
         sums = self.means.sums
         counts = {name: getattr(self, name) for name in _COUNT_FIELDS}
-        return Saved(tensors, plain(_StateValues(**counts, running=running, means=sums, queue=self._queue)))
+        return Saved(tensors, to_json(_StateValues(**counts, running=running, means=sums, queue=self._queue)))
 
     def restore(self, saved: Saved) -> None:
         """Restore a saved state (see `state.Resumable`)."""
@@ -211,14 +211,14 @@ LEARNING_RATES: Mapping[str, Mapping[str, float]] = {
     },
 }
 
-GROWTH = 2.0
+MAX_GROWTH = 2.0
 """Maximum growth factor of a Gaussian beyond that of its part.
 
 Larger Gaussians are fog that hides an error.
 """
-REACH = 0.16
+REFERENCE_CHANGE = 0.16
 """Change of a channel within a stage for which the rates are tuned (see `PgsSettings.reach`)."""
-FALL = 0.35
+DECAY_SHARE = 0.35
 """Final share of a stage's steps over which the learning rate falls (see `PgsSettings.fall`)."""
 SNAPSHOTS = 32
 """Approximate number of recordings over all stages."""
@@ -231,12 +231,14 @@ class PgsSettings:
     rates: Tensor  # learning rate of each column of a packed row, raw units. [C]
     raised: bool = True  # raise Adam's ε to keep hardly visible members in place, see `PgsState.descend`
     ramp: float = 0.6  # share of a stage's steps over which its target is blended from the last stage's
-    fall: float = FALL  # final share of a stage's steps over which the rate falls to a tenth; 0: constant
+    fall: float = (
+        DECAY_SHARE  # final share of a stage's steps over which the rate falls to a tenth; 0: constant
+    )
     # Change that 95 % of the changing pixels stay below. Smaller changes get smaller steps, down to a
     # quarter, larger ones larger steps, up to 1.5 times; 0: the same for all. Steps larger than the change
     # needs become random walks where the views do not resolve single Gaussians: close up, these are speckles
     # of all colors.
-    reach: float = REACH
+    reach: float = REFERENCE_CHANGE
     smoothing: float = 0.9  # weight of the recorded running mean's previous value; 0: raw iterates
     growth: float = math.inf  # maximum growth of a Gaussian beyond its stage's placement
     snapshots: int = SNAPSHOTS  # approximate number of recordings over all stages
@@ -263,17 +265,17 @@ def pgs_settings(
         rates[BASE_CHANNELS:] = 0.0
     # A single target is approached slowly: fast steps cause speckles of all colors half way.
     ramp = 0.9 if stages == 1 else 0.6
-    fall = 1.0 if stages == 1 else FALL
+    fall = 1.0 if stages == 1 else DECAY_SHARE
     return PgsSettings(
         rates,
         raised=not printed,
         ramp=ramp if recolors and options.target_ramp else 0.0,
         fall=0.0 if printed else fall,
-        reach=REACH if recolors and not printed else 0.0,
+        reach=REFERENCE_CHANGE if recolors and not printed else 0.0,
         smoothing=0.9 if options.ema else 0.0,
         # a run too short for the paper's interval still records four times
         every=min(100, max(1, options.steps // 4)) if printed else 0,
-        growth=GROWTH if options.group_steps else math.inf,
+        growth=MAX_GROWTH if options.group_steps else math.inf,
         seed=options.seed,
     )
 
@@ -362,7 +364,7 @@ def optimize(
         before = stages[index - 1].targets if index else render_all(crops, original)
         objective.begin_stage()
         size = _step_size(stage, before, settings.reach)
-        spacing = visible_way(stage.targets, before)[0] * len(stages) / settings.snapshots
+        spacing = mean_visible_change(stage.targets, before)[0] * len(stages) / settings.snapshots
         while state.local < stage.steps:
             view = state.view(len(crops))
             share = (state.local + 1) / max(1.0, settings.ramp * stage.steps)
@@ -393,7 +395,7 @@ def _step_size(stage: TargetStage, before: Sequence[Tensor], reach: float) -> fl
     """Return the rate factor of a stage, see `TargetStage.length` and `PgsSettings.reach`."""
     if stage.length is not None:
         return stage.length
-    return min(1.5, max(0.25, most_change(stage.targets, before) / reach)) if reach > 0 else 1.0
+    return min(1.5, max(0.25, p95_change(stage.targets, before) / reach)) if reach > 0 else 1.0
 
 
 def _gradient(objective: Objective, moment: Moment, state: PgsState, finished: Tensor) -> Tensor:
@@ -417,7 +419,7 @@ def _gradient(objective: Objective, moment: Moment, state: PgsState, finished: T
     return gradient
 
 
-def visible_way(targets: Sequence[Tensor], before: Sequence[Tensor]) -> tuple[float, float]:
+def mean_visible_change(targets: Sequence[Tensor], before: Sequence[Tensor]) -> tuple[float, float]:
     """Return the mean change of the pictures, over all pixels and over the changing ones."""
     total = 0.0
     every = 0
@@ -430,7 +432,7 @@ def visible_way(targets: Sequence[Tensor], before: Sequence[Tensor]) -> tuple[fl
     return total / max(1, every), total / max(1, changing)
 
 
-def most_change(targets: Sequence[Tensor], before: Sequence[Tensor]) -> float:
+def p95_change(targets: Sequence[Tensor], before: Sequence[Tensor]) -> float:
     """Return the 95th percentile of the change of a channel over the changing pixels; 0 if none changes.
 
     Steps are sized by this instead of the mean: a few saturated pixels need long steps, a wide even change

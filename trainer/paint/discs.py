@@ -37,7 +37,7 @@ DISC_LOGIT = 4.0
 """Opacity logit of a disc at strength 1."""
 MIN_ALPHA = 1 / 255
 """Minimum alpha of a painted pixel."""
-GROWN = 2
+BORDER_PX = 2
 """Pixels; width of the border around the paint that discs reproduce unchanged.
 
 The border is needed because Gaussians drawn there were moved.
@@ -110,7 +110,7 @@ def place_discs(
     depth = render_depth(scene, camera)
     opaque = (depth.alpha > OPAQUE).numpy()
     surface, even, pieces = _paint_surface(depth, camera)
-    mask = ndimage.binary_dilation(paint.mask.numpy() & opaque, iterations=GROWN) & opaque
+    mask = ndimage.binary_dilation(paint.mask.numpy() & opaque, iterations=BORDER_PX) & opaque
     if not mask.any():
         return Discs(scene[:0], torch.zeros(0, dtype=torch.int64), cleared)
     cells = merge_pixels(paint.picture.numpy(), mask, flat, even)
@@ -402,7 +402,7 @@ def sample_image(image: Tensor, x: Tensor, y: Tensor) -> Tensor:
     return grid_sample(image.permute(2, 0, 1)[None], grid, align_corners=False)[0].permute(1, 2, 0)
 
 
-def lay_on(image: Tensor, drawn: Tensor) -> Tensor:
+def composite_over(image: Tensor, drawn: Tensor) -> Tensor:
     """Composite premultiplied colors and alpha over a picture. [H,W,3], [H,W,4] -> [H,W,3]"""
     return image * (1.0 - drawn[..., 3:]) + drawn[..., :3]
 

@@ -24,13 +24,13 @@ from torch.nn.functional import interpolate
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
-from progdf.io.images import save_as
+from progdf.io.images import saving_loss
 from progdf.rasterize import alpha_weights
 from progdf.region import Region
 from progdf.scene.point_tree import PointTree
 from progdf.sh import sh0_to_rgb
 from progdf.terminal import format_count
-from trainer.editors.pictures import STEP, STILL, lay_over, move_image, read_change
+from trainer.editors.pictures import STEP, STILL, move_image, read_change, undo_shift
 from trainer.setup import quantize_image
 from trainer.views.view import fit_size, with_near_plane
 
@@ -82,7 +82,7 @@ def changed_region(
     masks = []
     small_cameras = []
     for path, camera in zip(paths, cameras, strict=True):
-        change = find_change(*read_change(scene, path, camera), save_as(path))
+        change = find_change(*read_change(scene, path, camera), saving_loss(path))
         small_cameras.append(fit_size(camera.resize(change.shape[1], change.shape[0]), LIFTED_AT))
         masks.append(_close_gaps(_shrink_mask(change, small_cameras[-1])))
     if not any(bool(mask.any()) for mask in masks):
@@ -125,13 +125,13 @@ def find_change(
     Args:
         original: the render. [H,W,3]
         picture: [H,W,3]
-        save: returns an image after saving, see `save_as`
+        save: returns an image after saving, see `saving_loss`
 
     Returns:
         [H,W] bool
     """
     original_values = original.numpy()
-    picture_values = lay_over(original, picture).numpy()
+    picture_values = undo_shift(original, picture).numpy()
     saved = save(original).numpy()
     exact = quantize_image(original).numpy()
     # bound by the loss of saving within a block

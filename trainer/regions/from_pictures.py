@@ -27,7 +27,7 @@ from progdf.scene.regions import Check, Kind
 from progdf.scene.scribbles import Rows, Scribbles, rows_under
 from progdf.scene.selection import Surface, base_colors
 from progdf.scene.up_axis import find_up
-from trainer.editors.cache import KeptPictures, Recipe
+from trainer.editors.cache import PictureCache, Recipe
 from trainer.editors.pictures import picture_paths, read_change, rendered_cameras
 from trainer.options import VIEWS, RegionOptions, TrainingViewOptions
 from trainer.store.pretrained import last_model
@@ -329,7 +329,7 @@ def _segment(
     def paint(image: Tensor) -> Tensor:
         return loaded()(image, prompt).float()[..., None].expand(-1, -1, 3)
 
-    pictures = KeptPictures(folder)
+    pictures = PictureCache(folder)
     masks = []
     views = with_near_plane(cameras, scene)
     for camera in track(views, description=f"segment '{prompt}'", disable=request.quiet, transient=True):

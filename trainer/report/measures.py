@@ -46,7 +46,7 @@ class ErrorCurve:
         return {name: [round(x, 2 if name == "psnr" else 4) for x in xs] for name, xs in asdict(self).items()}
 
 
-def picture_courses(
+def error_curves(
     evaluator: Evaluator,
     pictures: Mapping[str, Pictures],
     strengths: Sequence[float],
@@ -96,11 +96,11 @@ def against_editor(
         fields: by name
         stages: slider value and the editor strength that belongs to it, ascending
         perceptual: LPIPS or its substitute
-        most: see `picture_courses`
+        most: see `error_curves`
     """
     pictures = {name: evaluator.course(field) for name, field in fields.items()}
     truth = {s: evaluator.edited[at] for s, at in stages}
-    return picture_courses(evaluator, pictures, tuple(truth), truth.__getitem__, perceptual, most)
+    return error_curves(evaluator, pictures, tuple(truth), truth.__getitem__, perceptual, most)
 
 
 COMPARED = "keyframes2"
@@ -301,7 +301,7 @@ def _round4(value: float) -> float:
 
 
 @dataclass(frozen=True)
-class PaintTaken:
+class PaintReproduction:
     """Share of the painting on pictures that the edit reproduces."""
 
     reached: float  # reproduced share of the painted change's energy, 0 to 1
@@ -344,7 +344,7 @@ class PaintTaken:
 
 def measure_paint(
     setup: TrainingSetup, painted: Sequence[Tensor], backgrounds: Sequence[Tensor], edited: Gaussians
-) -> PaintTaken:
+) -> PaintReproduction:
     """Compare the edit with the painted pictures that it was made from.
 
     Args:
@@ -374,7 +374,7 @@ def measure_paint(
     visible_count = int((inside > 0.5 * weight).sum()) + len(edited) - len(scene)
     rms = (missing / max(1, 3 * pixels)) ** 0.5
     reached = max(0.0, 1.0 - missing / max(change, 1e-12))
-    return PaintTaken(reached, rms, pixels, visible_count, behind > 0.5 * change)
+    return PaintReproduction(reached, rms, pixels, visible_count, behind > 0.5 * change)
 
 
 def _shows_behind(

@@ -40,7 +40,7 @@ from progdf.gaussians import attribute_slices, pack
 from progdf.scene.bounds import scene_sphere
 from progdf.sh import C0
 from trainer.editors.base import ImageEditor
-from trainer.editors.cache import KeptPictures, Recipe, digest
+from trainer.editors.cache import PictureCache, Recipe, digest
 from trainer.editors.instruct import InstructEditor
 from trainer.editors.style import cross_fade
 from trainer.options import EditKind
@@ -181,7 +181,7 @@ def _sample(planes: Tensor, parameters: Tensor, mode: str = "bilinear") -> Tenso
 
 
 @dataclass(frozen=True)
-class Easel:
+class PaintCache:
     """Cache of painted views, so that a resumed or repeated run paints nothing twice.
 
     The sidecar file of a picture holds the digests of all its inputs.
@@ -189,7 +189,7 @@ class Easel:
 
     painter: InstructEditor
     recipe: Recipe  # inputs of a picture besides the arguments of `InstructEditor.paint`
-    kept: KeptPictures
+    kept: PictureCache
     seed: int
 
     def crop(self, view: View, picture: Tensor) -> Tensor:
@@ -273,7 +273,7 @@ class Fit:
 class AgreedEditor:
     """Editor whose views agree. Further strengths are painted on demand."""
 
-    easel: Easel
+    easel: PaintCache
     pictures: Mapping[str, Tensor]  # view's name → the finished edit. [H,W,3]
     fit: Fit
     stages: tuple[float, ...]
@@ -346,7 +346,7 @@ class _PaintingLoop:
     """
 
     def __init__(
-        self, easel: Easel, setup: TrainingSetup, advance: Advance, approved: tuple[View, Tensor] | None
+        self, easel: PaintCache, setup: TrainingSetup, advance: Advance, approved: tuple[View, Tensor] | None
     ) -> None:
         self._easel = easel
         self._setup = setup
@@ -427,7 +427,7 @@ class _PaintingLoop:
 
 
 def agree_views(
-    easel: Easel,
+    easel: PaintCache,
     setup: TrainingSetup,
     editor: ImageEditor,
     log: RunLog,

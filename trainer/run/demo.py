@@ -73,7 +73,7 @@ class Effort:
 
 
 @dataclass(frozen=True)
-class Show:
+class DemoPlan:
     """Scene of the demo and its edits."""
 
     make: Callable[[int, int], DemoScene]  # size and seed -> the scene
@@ -88,7 +88,7 @@ class Show:
 
 _FUR_PARTS = ("body", "head", "ears", "arms", "legs")
 SHOWS = {
-    "bear": Show(
+    "bear": DemoPlan(
         bear,
         size=24_000,
         view=2,
@@ -105,7 +105,7 @@ SHOWS = {
             DemoEdit("panda", paint=paint_panda),
         ),
     ),
-    "room": Show(
+    "room": DemoPlan(
         room,
         size=40_000,
         view=0,
@@ -251,7 +251,7 @@ def write_pictures(folder: Path, scene: DemoScene, gdfs: Mapping[str, Gdf], view
     return written
 
 
-def _train_edits(options: DemoOptions, show: Show, scene: DemoScene) -> dict[str, Path]:
+def _train_edits(options: DemoOptions, show: DemoPlan, scene: DemoScene) -> dict[str, Path]:
     """Train the edits, continue a stopped demo, and return their .gdf files by name."""
     from .resume import find_run  # late import: `--help` and the pictures do not need it
     from .run import train
@@ -279,7 +279,7 @@ def _train_edits(options: DemoOptions, show: Show, scene: DemoScene) -> dict[str
     return {edit.name: _gdf_path(options.out, edit) for edit in show.edits}
 
 
-def _train_options(options: DemoOptions, show: Show, scene: DemoScene, edit: DemoEdit) -> TrainOptions:
+def _train_options(options: DemoOptions, show: DemoPlan, scene: DemoScene, edit: DemoEdit) -> TrainOptions:
     """Return the training options of one edit."""
     ids = ",".join(str(scene.label_names.index(part)) for part in edit.parts)
     folder = options.out

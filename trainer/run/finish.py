@@ -18,12 +18,12 @@ from progdf.field.trajectory import Trajectory, load_trajectory
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
 from progdf.gdf.file import Gdf, fingerprint, load_gdf, save_gdf
 from progdf.io.images import write_image
-from progdf.io.json_values import convert_json, decode_json, plain
+from progdf.io.json_values import convert_json, decode_json, to_json
 from progdf.terminal import file_size, format_count
 from progdf.threads import map_threads
 from trainer.editors.pictures import picture_background
 from trainer.fit.evaluate import Evaluator, make_evaluator
-from trainer.fit.fit import Fitted, evaluate_field, expected_looks, fit_field, fit_grades, visibility
+from trainer.fit.fit import Fitted, evaluate_field, expected_renders, fit_field, fit_grades, visibility
 from trainer.fit.network import NetworkFit, fit_network
 from trainer.fit.slider_uniformity import equalize_slider
 from trainer.optimize.losses import Perceptual, perceptual_loss
@@ -31,7 +31,7 @@ from trainer.optimize.retime import resolve_slider
 from trainer.options import FieldOptions, FitOptions, TextOptions, TrainOptions, with_values
 from trainer.regions.from_pictures import CHANGED
 from trainer.report.measures import (
-    PaintTaken,
+    PaintReproduction,
     against_editor,
     clip_curve,
     expected_measures,
@@ -57,7 +57,7 @@ _KEYS_OF_REPORT_ONLY = (
     *("plan", "time", "memory_mb", "curves", "views", "pictures"),
     *("losses", "trajectory", "effort", "choice", "baselines", "between"),
 )
-DEFAULTS = plain(BLANK)
+DEFAULTS = to_json(BLANK)
 
 _LPIPS_AREA = (
     "each view's box around all that shows the region or that the editor changes, at least 64 pixels"
@@ -158,14 +158,14 @@ def finish_run(
         "paint": paint.figures() if paint is not None else None,
         "time": {**(_earlier_seconds(folder) if log.refits else {}), **log.rounded_seconds()},
         "memory_mb": log.peak_mb(),
-        "plan": plain(options),
+        "plan": to_json(options),
     }
     return _write_run(folder, gdf, report, picture, shipped, setup, paint, log)
 
 
 def _build_gdf(options: TrainOptions, setup: TrainingSetup, field: BakedField, added: Gaussians) -> Gdf:
     """Return the edit without its report and without discs for paint finer than the Gaussians."""
-    plan = plain(options if len(added) else with_values(options, grow=0.0))
+    plan = to_json(options if len(added) else with_values(options, grow=0.0))
     changed_options = differences(plan, DEFAULTS)
     scene_print = fingerprint(setup.scene)
     instruction = options.editor.editor
@@ -241,7 +241,7 @@ def _fit_field(
             trajectory, setup, rank_evaluator, reporting, weights, options, perceptual, log, begun=begun
         )
         return evaluate_field(trajectory, reporting, network.field, options.target_psnr), network
-    with log.looks("fit the field", expected_looks(trajectory, options.field)) as count_view:
+    with log.looks("fit the field", expected_renders(trajectory, options.field)) as count_view:
         choosing = replace(choosing, looked=count_view)
         reporting = replace(reporting, looked=count_view)
         if trajectory.maps is not None and options.field == "auto":
@@ -267,7 +267,7 @@ def write_finals(setup: TrainingSetup, edited: Gaussians, folder: RunFolder, log
 
 def _measure_paint(
     folder: RunFolder, setup: TrainingSetup, files: Sequence[Path], edited: Gaussians
-) -> PaintTaken | None:
+) -> PaintReproduction | None:
     """Return the share of the pictures' paint that the edit reproduces; None for edits not made from
     pictures."""
     if not files:
@@ -302,7 +302,7 @@ def _write_run(
     picture: Tensor,
     trajectory: Trajectory,
     setup: TrainingSetup,
-    paint: PaintTaken | None,
+    paint: PaintReproduction | None,
     log: RunLog,
 ) -> RunResult:
     """Write all files and log their content."""

@@ -29,7 +29,15 @@ from progdf.region import Region
 from progdf.terminal import group_digits
 from trainer.editors.decal import DecalEditor
 from trainer.editors.pictures import read_edit
-from trainer.paint.discs import DISC_LOGIT, GROWN, PaintedView, faint, lay_on, place_discs, project_paint
+from trainer.paint.discs import (
+    BORDER_PX,
+    DISC_LOGIT,
+    PaintedView,
+    composite_over,
+    faint,
+    place_discs,
+    project_paint,
+)
 from trainer.paint.solve import box_of, solve_colors
 from trainer.store.progress import RunLog
 from trainer.views.view import BACKGROUND, View, crop, make_view, render_view
@@ -52,7 +60,7 @@ _OPACITY_CHANNEL = 10  # of a packed row, see `attribute_slices`
 
 
 @dataclass(frozen=True)
-class Laid:
+class DiscLayout:
     """Paint converted to discs."""
 
     scene: Gaussians  # the scene under the discs, at strength 1
@@ -67,7 +75,7 @@ class Laid:
         return concatenate([self.ended, self.added])
 
 
-def lay_discs(scene: Gaussians, paints: Sequence[PaintedView], gap: float) -> Laid:
+def lay_discs(scene: Gaussians, paints: Sequence[PaintedView], gap: float) -> DiscLayout:
     """Convert painted pixels to discs, for each picture in the areas that no previous picture shows.
 
     Args:
@@ -85,7 +93,7 @@ def lay_discs(scene: Gaussians, paints: Sequence[PaintedView], gap: float) -> La
             with_discs = concatenate([cleared, added])
             disc_coverage = render(with_discs, paint.camera, (0.0, 0.0, 0.0), colors=colors).image[..., 0]
             # discs extend beyond the paint by this margin
-            near_discs = ndimage.binary_dilation((disc_coverage > 0.5).numpy(), iterations=GROWN)
+            near_discs = ndimage.binary_dilation((disc_coverage > 0.5).numpy(), iterations=BORDER_PX)
             unseen_paint = replace(paint, drawn=paint.drawn * ~torch.from_numpy(near_discs)[..., None])
         discs = place_discs(scene, unseen_paint, _DISC_COLOR_RMS, gap, cleared)
         cleared = discs.scene
@@ -96,14 +104,14 @@ def lay_discs(scene: Gaussians, paints: Sequence[PaintedView], gap: float) -> La
         before, after = (
             render(state, paint.camera, BACKGROUND, crop=box).image for state in (scene, cleared)
         )
-        beside = ~ndimage.binary_dilation(paint.mask.numpy(), iterations=GROWN)
+        beside = ~ndimage.binary_dilation(paint.mask.numpy(), iterations=BORDER_PX)
         spill = torch.zeros_like(paint.mask)
         crop(spill, box)[:] = (after - before).abs().amax(dim=2) > _SPILL_COLOR
         spill_weight = alpha_weights(cleared, paint.camera, spill & torch.from_numpy(beside))[:, 0]
         changed |= spill_weight > _MIN_SPILL_WEIGHT_PX
     rows = changed.nonzero()[:, 0]
     ended, added = solve_colors(cleared, rows, added, paints)
-    return Laid(scene, ended, rows, added, gap)
+    return DiscLayout(scene, ended, rows, added, gap)
 
 
 @dataclass(frozen=True)
@@ -117,7 +125,9 @@ class PaintView:
     around: Tensor  # the ring around them. [H,W] bool
 
 
-def look_around(scene: Gaussians, paints: Sequence[PaintedView], degrees: Sequence[float]) -> list[PaintView]:
+def views_around_paint(
+    scene: Gaussians, paints: Sequence[PaintedView], degrees: Sequence[float]
+) -> list[PaintView]:
     """Return views rotated around the paint, with their expected images.
 
     Args:
@@ -136,7 +146,7 @@ def look_around(scene: Gaussians, paints: Sequence[PaintedView], degrees: Sequen
                 covered = torch.zeros(expected.shape[:2], dtype=torch.bool)
                 for other in paints:
                     projected = project_paint(scene, other.camera, other.drawn, camera)
-                    expected = lay_on(expected, projected)
+                    expected = composite_over(expected, projected)
                     covered = covered | (projected[..., 3] > 0)
             else:
                 expected = paint.picture
@@ -162,19 +172,19 @@ def _mean_square_error(finished: Gaussians, looks: Sequence[PaintView]) -> float
 
 def choose_discs(
     scene: Gaussians, paints: Sequence[PaintedView], looks: Sequence[PaintView], log: RunLog | None
-) -> Laid:
+) -> DiscLayout:
     """Return the discs with the gap that reproduces the paint best, in its own views and from the sides.
 
     Args:
         scene: the scene under the discs
         paints: painted views of one object
-        looks: see `look_around`
+        looks: see `views_around_paint`
         log: log of the run
 
     Raises:
         ProgdfError: the paint is not on an opaque surface.
     """
-    candidates = list[tuple[float, Laid]]()
+    candidates = list[tuple[float, DiscLayout]]()
     for gap in _GAPS_PX:
         laid = lay_discs(scene, paints, gap)
         if not len(laid.added):
@@ -191,7 +201,7 @@ def choose_discs(
 
 
 def paint_gdf(
-    laid: Laid, scene: Gaussians, paints: Sequence[PaintedView], name: str, recolored: Gdf | None
+    laid: DiscLayout, scene: Gaussians, paints: Sequence[PaintedView], name: str, recolored: Gdf | None
 ) -> Gdf:
     """Return the edit that ends in discs. Their visible change is linear in the strength.
 
@@ -243,7 +253,7 @@ def _scaled_recolor_offsets(recolored: Gdf, members: Tensor, end: Tensor, knots:
 
 
 def _linear_visibility_knots(
-    laid: Laid, paints: Sequence[PaintedView], steps: Tensor, rise: Tensor
+    laid: DiscLayout, paints: Sequence[PaintedView], steps: Tensor, rise: Tensor
 ) -> Tensor:
     """Return the strengths for the knots of a straight path, so that its visible change is linear. [S]"""
     paint = paints[0]
@@ -302,7 +312,7 @@ def sharpen(
     reverted = scene.replace_rows(members, rows + unpainted_shares[:, None] * recolored.field.offsets(1.0))
     # revert the recolor of painted members if that is better beside the paint, as between letters
     base = min((end, reverted), key=lambda one: sum(_error_beside(one, paint) for paint in paints))
-    views = look_around(base, paints, _TRIAL_ANGLES_DEG)
+    views = views_around_paint(base, paints, _TRIAL_ANGLES_DEG)
     try:
         laid = choose_discs(base, paints, views, log)
     except ProgdfError:
@@ -335,7 +345,7 @@ def _missed_paint(end: Gaussians, view: View, target: Tensor) -> tuple[PaintedVi
         ndimage.gaussian_filter((target - image).square().mean(dim=2).numpy(), _ERROR_SIGMA_PX)
         > _MISSED_COLOR**2
     )
-    sharp = changed & torch.from_numpy(ndimage.binary_dilation(missed, iterations=GROWN))
+    sharp = changed & torch.from_numpy(ndimage.binary_dilation(missed, iterations=BORDER_PX))
     drawn = torch.cat([target, torch.ones_like(target[..., :1])], dim=2) * sharp[..., None]
     return PaintedView(view.camera, target, drawn), changed
 
@@ -360,11 +370,11 @@ def train_decal(editor: DecalEditor, scene: Gaussians, name: str, log: RunLog | 
         log: log of the run
     """
     paints = [editor.paint]
-    laid = choose_discs(scene, paints, look_around(scene, paints, _TRIAL_ANGLES_DEG), log)
+    laid = choose_discs(scene, paints, views_around_paint(scene, paints, _TRIAL_ANGLES_DEG), log)
     gdf = paint_gdf(laid, scene, paints, name, None)
     edited = edited_scene(scene, gdf)
     background = torch.tensor(BACKGROUND)
-    views = look_around(scene, paints, TURNS)
+    views = views_around_paint(scene, paints, TURNS)
     images = [render_view(edited, look.camera, background).clamp(0.0, 1.0) for look in views]
     errors = [
         round(psnr(image, look.expected, look.covered), 2) if bool(look.covered.any()) else None

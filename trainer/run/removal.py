@@ -15,7 +15,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians, concatenate
 from progdf.gdf.file import Gdf
 from progdf.io.images import contact_sheet
-from progdf.io.json_values import plain
+from progdf.io.json_values import to_json
 from progdf.metrics.image import decibels
 from progdf.rasterize import render
 from progdf.region import Region, from_mask
@@ -110,7 +110,7 @@ def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder
     """
     scene = setup.scene
     selected = len(setup.region)
-    setup = replace(setup, region=with_crumbs(scene, setup.region))
+    setup = replace(setup, region=with_strays(scene, setup.region))
     region = setup.region
     remaining = scene[~setup.region.mask]
     if len(region) > selected:
@@ -150,7 +150,7 @@ def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder
             "views": {"held_out": bool(around.held_out), "edit": [view.camera.name for view in judging]},
             "time": log.rounded_seconds(),
             "memory_mb": log.peak_mb(),
-            "plan": plain(recorded_options(options)),
+            "plan": to_json(recorded_options(options)),
         }
         picture = _contact_sheet(scene, gdf, judging, f"{options.name}: {options.editor.editor}")
     finals = {view.camera.name: render_view(removed, view.camera, setup.background) for view in setup.views}
@@ -165,7 +165,7 @@ def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder
     return result
 
 
-def with_crumbs(scene: Gaussians, region: Region) -> Region:
+def with_strays(scene: Gaussians, region: Region) -> Region:
     """Return the region with the floaters that its removal would leave behind, see `find_strays`."""
     mask = ~region.mask
     alone = mask.nonzero()[:, 0][find_strays(scene[mask]).floaters]

@@ -19,7 +19,7 @@ import torch
 from progdf.errors import ProgdfError
 from progdf.io.atomic import check_regular, disk_full, open_error
 from progdf.io.cameras import camera_files
-from progdf.io.json_values import convert_json, decode_json, plain
+from progdf.io.json_values import convert_json, decode_json, to_json
 from progdf.region import Region
 from trainer.editors.pictures import picture_paths, strengths_of
 from trainer.options import MAX_THREADS, TrainOptions, flat_values
@@ -116,7 +116,7 @@ def decide_resume(folder: RunFolder, options: TrainOptions, region: Region, coun
             f"add --resume to continue it, or delete {folder.state.path} to start over"
         )
     begin_log(folder, plan.edit)
-    folder.state.begin(plain(requested))
+    folder.state.begin(to_json(requested))
     folder.state.save(REGION, {"members": region.members, "score": region.score}, {"name": region.name})
     notes = ["nothing to resume was saved yet, so the run starts from the beginning"] if resume else []
     return ResumeDecision("start", threads, tuple(notes))

@@ -20,7 +20,7 @@ from progdf.gdf.file import save_gdf
 from progdf.io.atomic import read_file
 from progdf.io.cameras import load_cameras, save_cameras
 from progdf.io.images import contact_sheet, read_picture
-from progdf.io.json_values import check_text, plain
+from progdf.io.json_values import check_text, to_json
 from progdf.io.picture_camera import find_picture_camera
 from progdf.rasterize.engines import get_engine
 from progdf.region import Region
@@ -60,11 +60,11 @@ from trainer.setup import (
     editor_strengths,
     make_training_setup,
     quantize_image,
-    take_glances,
+    render_thumbnails,
     whole_views,
     widen_views,
 )
-from trainer.store.pretrained import Shared
+from trainer.store.pretrained import LastValueCache
 from trainer.store.progress import LATER, RunLog
 from trainer.store.run_folder import (
     RunFolder,
@@ -79,14 +79,14 @@ from trainer.store.state import interrupt_on_signals
 from trainer.views.crops import only_recolors
 from trainer.views.view import BACKGROUND, View, fit_size, make_view, with_near_plane
 
-from .agree import AgreedEditor, Easel, agree_views
+from .agree import AgreedEditor, PaintCache, agree_views
 from .finish import RunResult, end_rows, finish_run, load_evaluator, load_result, write_finals, write_result
 from .kinds import Approach, choose_approach, resolve_approach
 from .paint import RING, TURNS, train_decal
 from .record import RunRecord, read_record
 from .removal import is_removal, remove_region
 from .resume import check_exists, decide_resume, explain_stop, load_region, picture_digests
-from .training import Strengths, optimize_members, retime_trajectory
+from .training import StrengthSource, optimize_members, retime_trajectory
 
 _MAX_CACHED_PIXELS = 1_000_000  # pixels and painted members whose editor state is cached, up to 80 bytes each
 
@@ -141,7 +141,7 @@ def region_request(
     return RegionRequest(options.region, options.views, cache, quiet, say)
 
 
-def train(options: TrainOptions, quiet: bool = False, shared: Shared | None = None) -> RunResult:
+def train(options: TrainOptions, quiet: bool = False, shared: LastValueCache | None = None) -> RunResult:
     """Edit a region of a scene and write its .gdf file.
 
     Args:
@@ -154,7 +154,7 @@ def train(options: TrainOptions, quiet: bool = False, shared: Shared | None = No
         KeyboardInterrupt: interrupted; the message explains how to resume. No .gdf file is changed.
     """
     options = resolve(options)
-    shared = shared or Shared()
+    shared = shared or LastValueCache()
     check_command(options)
     use_threads(options.threads)
     scene = shared.get("scene", options.scene.resolve(), lambda: load_scene(options.scene))
@@ -191,7 +191,7 @@ def train(options: TrainOptions, quiet: bool = False, shared: Shared | None = No
 
 
 def select_region(
-    options: TrainOptions, scene: Gaussians, quiet: bool, shared: Shared
+    options: TrainOptions, scene: Gaussians, quiet: bool, shared: LastValueCache
 ) -> tuple[Region, list[str]]:
     """Return the region that resolved options name, and lines for the log.
 
@@ -213,7 +213,7 @@ def _run_training(
     scene: Gaussians,
     region: Region,
     folder: RunFolder,
-    shared: Shared,
+    shared: LastValueCache,
     log: RunLog,
 ) -> RunResult:
     """Run all stages. Skip finished stages of the saved state, or repeat them with the same bits."""
@@ -258,7 +258,7 @@ def _run_training(
             **outcome,
         )
         extra = {"members": region.members, "score": region.score}
-        save_trajectory(folder.trajectory, trajectory, extra, plain(record))
+        save_trajectory(folder.trajectory, trajectory, extra, to_json(record))
         setup = setup.keep_solved(record.effort)
         with log.stage("final"):
             grown = setup.extend(trajectory.added)
@@ -312,7 +312,7 @@ def _run_decal(
         "views": {"held_out": False, "edit": [name]},
         "time": log.rounded_seconds(),
         "memory_mb": log.peak_mb(),
-        "plan": plain(recorded_options(options)),
+        "plan": to_json(recorded_options(options)),
         "pictures": picture_digests(options),
     }
     rows = [painted.expected, painted.shown]
@@ -358,7 +358,7 @@ def _describe_views(setup: TrainingSetup) -> str:
 
 
 def _render_originals(
-    options: TrainOptions, scene: Gaussians, region: Region, folder: RunFolder, shared: Shared
+    options: TrainOptions, scene: Gaussians, region: Region, folder: RunFolder, shared: LastValueCache
 ) -> TrainingSetup:
     """Render the views and write them to disk."""
     key = options.views, region.members.numpy().tobytes(), region.score.numpy().tobytes()
@@ -376,12 +376,12 @@ def _render_originals(
 def _make_editor(options: TrainOptions, setup: TrainingSetup, folder: RunFolder, log: RunLog) -> ImageEditor:
     """Return the run's editor. A generative editor is wrapped so that its views agree."""
     settings = replace(options.editor, cache=folder.paintings)
-    glances = partial(take_glances, options.views, setup.scene, setup.region)
+    glances = partial(render_thumbnails, options.views, setup.scene, setup.region)
     editor = make_editor(settings, setup.scene, setup.region, setup.views, glances)
     if not isinstance(editor, InstructEditor):
         return editor
     log.say(editor.note)
-    easel = Easel(editor, editor.recipe, editor.kept, settings.seed)
+    easel = PaintCache(editor, editor.recipe, editor.kept, settings.seed)
     approved = None
     if settings.anchor is not None:
         camera = fit_size(
@@ -401,7 +401,7 @@ def _edit_views(
     editor: Callable[[], ImageEditor],
     folder: RunFolder,
     log: RunLog,
-) -> tuple[Pictures, Approach, dict[str, Any] | None, Strengths | None]:
+) -> tuple[Pictures, Approach, dict[str, Any] | None, StrengthSource | None]:
     """Edit all views and choose how to train.
 
     Returns: the edited views by strength, read lazily from disk; the training approach; the figures of the
@@ -445,9 +445,9 @@ def _edit_views(
             pictures = [view.confine(picture) for view, picture in zip(some, pictures, strict=True)]
         return [quantize_image(picture) for picture in pictures]
 
-    def between() -> Strengths | None:
+    def between() -> StrengthSource | None:
         more = _requests_more_strengths(options, resolve_approach(options, approach))
-        return Strengths(edit, look) if more else None
+        return StrengthSource(edit, look) if more else None
 
     done = folder.state.load("edited")
     if done is not None:
@@ -548,7 +548,7 @@ def _record(
     optimization: OptimizeOptions,
     setup: TrainingSetup,
     edited: Pictures,
-    between: Strengths | None,
+    between: StrengthSource | None,
     editor: Callable[[], ImageEditor],
     perceptual: Perceptual,
     folder: RunFolder,

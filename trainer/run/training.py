@@ -22,7 +22,7 @@ from progdf.metrics.image import LEVEL
 from progdf.rasterize.engines import engine_device
 from progdf.scene.bounds import scene_sphere
 from trainer.fit.network import JointTraining, begin_joint_training, save_network
-from trainer.optimize.color_course import STEPS, Course, Target, solve, thin_model
+from trainer.optimize.color_course import STEPS, StrengthSchedule, Target, solve, thin_model
 from trainer.optimize.color_solver import (
     Model,
     Solver,
@@ -32,7 +32,7 @@ from trainer.optimize.color_solver import (
     solve_again,
     split_solver,
 )
-from trainer.optimize.color_views import MORE_PAYS, ColorView, Judge, color_views
+from trainer.optimize.color_views import MAX_ERROR_SHARE, ColorEvaluator, ColorView, color_views
 from trainer.optimize.groups import Groups, group_path, group_stage, restore_groups
 from trainer.optimize.growth import add_rows, place_seeds, removal_costs, seed_rows
 from trainer.optimize.losses import Losses, Objective, Perceptual, erode, loss_table
@@ -115,7 +115,7 @@ _TIMED_VIEWS = 4  # views that time the slider; 8, or all at full size, are no b
 
 # Sufficient number of pixels per unknown. With q pixels, noise adds 1/q to the error. Above 9, doubling q
 # reduces the error by less than 5 % (docs/lab/experiments.md, Pixels).
-_PIXELS_PER_UNKNOWN = (MORE_PAYS - 0.5) / (1.0 - MORE_PAYS)
+_PIXELS_PER_UNKNOWN = (MAX_ERROR_SHARE - 0.5) / (1.0 - MAX_ERROR_SHARE)
 
 
 Optimized = tuple[Trajectory, Losses, Mapping[str, Any]]
@@ -123,7 +123,7 @@ Optimized = tuple[Trajectory, Losses, Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
-class Strengths:
+class StrengthSource:
     """Callbacks that edit further strengths on demand."""
 
     edit: Callable[[Sequence[float], Sequence[View]], Pictures]  # edits the given views, keeps them on disk
@@ -138,7 +138,7 @@ def optimize_members(
     perceptual: Perceptual,
     folder: StateFolder,
     log: RunLog,
-    between: Strengths | None = None,
+    between: StrengthSource | None = None,
 ) -> Optimized:
     """Optimize the members, from the beginning or from the saved state.
 
@@ -224,11 +224,11 @@ def plan_colors(
     optimization: OptimizeOptions,
     setup: TrainingSetup,
     edited: Pictures,
-    between: Strengths | None,
+    between: StrengthSource | None,
     options: TrainingViewOptions,
     log: RunLog,
     target_psnr: float | None = None,
-) -> tuple[Solver, Model, Course]:
+) -> tuple[Solver, Model, StrengthSchedule]:
     """Solve for the finished edit, then choose the model size and the strengths to solve for next.
 
     Args:
@@ -256,8 +256,8 @@ def plan_colors(
         make = partial(crop_scene, scene, members, background=setup.background)
         return color_views(LazySequence(views, lambda v: make(v.camera, v.box)), original, stride)
 
-    def judge(pictures: Sequence[Tensor]) -> Judge:
-        return Judge(aside, boxed_pictures(pictures, judging))
+    def judge(pictures: Sequence[Tensor]) -> ColorEvaluator:
+        return ColorEvaluator(aside, boxed_pictures(pictures, judging))
 
     def target(s: float, pictures: Sequence[Tensor]) -> Target:
         stage = TargetStage(s, boxed_pictures(pictures, train), 1)
@@ -288,7 +288,7 @@ def plan_colors(
     if not strengths and between is not None:
         strengths = [0.5]
     look = None if between is None else cache(lambda s: judge(between.look(s, judging)))
-    course = Course(ask(strengths), finished, look, ask)
+    course = StrengthSchedule(ask(strengths), finished, look, ask)
     with log.stage("model"):
         middle = len(course.targets) // 2 if between is None else 0
         allowed_error = 0.0 if target_psnr is None else 10 ** (-target_psnr / 10)
@@ -320,7 +320,7 @@ def pixel_stride(setup: TrainingSetup) -> int:
 
 
 def _solve(
-    solver: Solver, model: Model, course: Course, most_steps: int, folder: StateFolder, log: RunLog
+    solver: Solver, model: Model, course: StrengthSchedule, most_steps: int, folder: StateFolder, log: RunLog
 ) -> Optimized:
     """Solve for colors over all views at once."""
     state = PgsState(solver.original)

@@ -21,7 +21,7 @@ BROKEN = (OSError, ValueError, RuntimeError, KeyError, TypeError, SafetensorErro
 _T = TypeVar("_T")
 
 
-class Shared:
+class LastValueCache:
     """Cache of the last object of each kind in this process."""
 
     def __init__(self) -> None:
@@ -36,13 +36,13 @@ class Shared:
         return value
 
 
-_models: Shared | None = None
+_models: LastValueCache | None = None
 
 
 def keep_models() -> None:
     """Keep the last model of each kind in memory from now on, for a process that trains many edits."""
     global _models
-    _models = _models or Shared()
+    _models = _models or LastValueCache()
 
 
 def last_model(kind: str, key: object, load: Callable[[], _T]) -> _T:

@@ -119,7 +119,7 @@ def render_view(scene: Gaussians, camera: Camera, background: Tensor) -> Tensor:
     return render_colors(scene, seen_colors(scene, camera), camera, background)
 
 
-class Glance(NamedTuple):
+class RegionThumbnail(NamedTuple):
     """Subset of the pixels of a small picture of the region."""
 
     camera: Camera
@@ -131,26 +131,28 @@ class Glance(NamedTuple):
     inside: Tensor  # see `View`. [P,3]
 
 
-def make_glances(scene: Gaussians, region: Region, cameras: Sequence[Camera], count: int) -> list[Glance]:
+def make_glances(
+    scene: Gaussians, region: Region, cameras: Sequence[Camera], count: int
+) -> list[RegionThumbnail]:
     """Return glances from the first `count` cameras that show the region."""
     activated = activate(scene, torch.zeros_like(scene.means))
     members = scene[region.members]
     degree = min(scene.sh_degree, 3)
     sh = members.sh
-    glances = list[Glance]()
+    glances = list[RegionThumbnail]()
 
     def color_from(camera: Camera) -> tuple[Tensor, Tensor]:
         weights = basis(degree, torch.nn.functional.normalize(members.means - camera.position))
         return weights, torch.einsum("nb,nbc->nc", weights, sh[:, : weights.shape[1]]) + 0.5
 
-    def look(camera: Camera) -> Glance:
+    def look(camera: Camera) -> RegionThumbnail:
         box = (0, 0, camera.width, camera.height)
         pixels = torch.arange(camera.width * camera.height)
         weight_map = color_map(activated, camera, box, region.members, pixels=pixels[::_PIXEL_STRIDE])
         weights, colors = color_from(camera) if degree else plain
         mask = weight_map.picture(torch.ones_like(colors))[:, 0].clamp(0.0, 1.0)
         inside = (weight_map.picture(colors.clamp_min(0.0)) / mask.clamp_min(1e-4)[:, None]).clamp(0.0, 1.0)
-        return Glance(camera, pixels[::_PIXEL_STRIDE], weight_map, weights, colors, mask, inside)
+        return RegionThumbnail(camera, pixels[::_PIXEL_STRIDE], weight_map, weights, colors, mask, inside)
 
     plain = color_from(cameras[0])
     while cameras and len(glances) < count:

@@ -41,7 +41,7 @@ from .tidy import StrayActions, TidyActions
 
 _Made = TypeVar("_Made")
 
-SAY_AGAIN_S = 10.0
+REPEAT_MESSAGE_S = 10.0
 """Seconds until an error that repeats in every frame is shown again."""
 RETRY_S = 1.0
 """Seconds until the next poll of a part whose last poll raised an error."""
@@ -180,7 +180,7 @@ class App:
         frame = self.main_view.frames
         now = time.perf_counter()
         before, shown_at = self._failures.get(where, (-2, 0.0))
-        repeats = frame - before <= 1 and now - shown_at < SAY_AGAIN_S
+        repeats = frame - before <= 1 and now - shown_at < REPEAT_MESSAGE_S
         self._failures[where] = frame, shown_at if repeats else now
         if repeats:
             return  # an error that repeats in every frame requests no further frame

@@ -23,7 +23,7 @@ from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import Image
 from viewer.state.facts import LayerRow
 from viewer.state.layers import visible_edits
-from viewer.state.selection import NOBODY
+from viewer.state.selection import EMPTY_MASK
 from viewer.state.snapshots import SliderSnapshot, restore, with_original
 from viewer.state.view_state import Comparison, ViewState
 from viewer.state.workspace import Pointed, Workspace, original
@@ -191,7 +191,7 @@ class Canvas:
             ProgdfError: see `exports.picture`.
         """
         view = original(view)
-        view = replace(view, selection=replace(view.selection, hidden=NOBODY))
+        view = replace(view, selection=replace(view.selection, hidden=EMPTY_MASK))
         camera = to_camera(view.camera, *size)
         chunk = camera_chunk(camera, (), self.comparer.engine.scene.origin, view.camera.up)
         return exports.picture(folder, title, to_pixels(self.image(view, size)), chunk)
@@ -216,7 +216,7 @@ class Canvas:
         target = replace(edited, camera=snapshot.camera, compare=Comparison())
         engine = self.comparer.engine
         try:
-            many = len(engine.scene) >= dynamic_resolution.MANY
+            many = len(engine.scene) >= dynamic_resolution.SLOW_SCENE_GAUSSIANS
             return to_pixels(engine.image(target, SIZE, pixels=2 if many else 1))
         except ProgdfError:  # the edit is not open
             return np.zeros((SIZE[1], SIZE[0], 3), np.uint8)

@@ -325,7 +325,7 @@ class FileActions:
         if not self.has_unsaved:
             self.session_autosave.stop()
             return None
-        unsaved = workspace.worth_saving(self._app.main_view.work)
+        unsaved = workspace.saved_state(self._app.main_view.work)
         try:
             wait = self.session_autosave.wait(now, unsaved, self._autosave_base, self._write)
         except (ProgdfError, OSError) as error:
@@ -338,7 +338,7 @@ class FileActions:
         try:
             if not self.has_unsaved:
                 return "there was no unsaved work"
-            unsaved = workspace.worth_saving(self._app.main_view.work)
+            unsaved = workspace.saved_state(self._app.main_view.work)
             path = self.session_autosave.write(unsaved, self._autosave_base, self._write)
             return f"unsaved work is kept in {path}"
         except Exception as error:  # the work itself may be invalid

@@ -18,7 +18,7 @@ from viewer.state.view_state import Brush, SelectTool, ViewState
 from viewer.state.workspace import Workspace
 from viewer.ui import overlay
 from viewer.ui.context import PALETTE, UiContext, u32
-from viewer.ui.keys import HAND_KEYS, Keys, any_button_down, has_pending_input, modifier, started_drag
+from viewer.ui.keys import TOOL_KEYS, Keys, any_button_down, has_pending_input, modifier, started_drag
 from viewer.ui.overlay import Area
 from viewer.ui.pointer import PointerContext
 
@@ -120,7 +120,7 @@ def point_by_keys(
     ):
         at = None  # the mouse was moved
     for press in keys.pressed:
-        if (command := HAND_KEYS.get(press.chord)) is None:
+        if (command := TOOL_KEYS.get(press.chord)) is None:
             continue
         at = at or (area.width / 2, area.height / 2)
         if command.action == "point_press" and press.again:
@@ -133,7 +133,7 @@ def point_by_keys(
             for pressed in (True, False) if clicks else (not down,):
                 io.add_mouse_button_event(0, pressed)
             down = not (clicks or down)
-    unused = tuple(press for press in keys.pressed if press.chord not in HAND_KEYS)
+    unused = tuple(press for press in keys.pressed if press.chord not in TOOL_KEYS)
     return KeyPointer(at, down), replace(keys, pressed=unused)
 
 

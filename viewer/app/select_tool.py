@@ -28,7 +28,7 @@ from progdf.scene.selection import (
 )
 from viewer.camera.view_camera import Vec3
 from viewer.jobs.training import with_color
-from viewer.render.picking import Seen, seen_at, surface_point
+from viewer.render.picking import PixelGaussians, seen_at, surface_point
 from viewer.state import history, selection
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import Workspace, original
@@ -181,7 +181,7 @@ def rows_at_click(
     return mask if through else surface.in_front(mask)
 
 
-def _seeds(seen: Seen) -> np.ndarray:
+def _seeds(seen: PixelGaussians) -> np.ndarray:
     """Return the Gaussians that contribute most to the color of a pixel."""
     return seen.rows[seen.shares >= min(_MIN_SEED_SHARE, float(seen.shares.max()))]
 

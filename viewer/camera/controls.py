@@ -15,8 +15,8 @@ DEGREES_PER_PIXEL = 0.3
 ZOOM_PER_STEP = 0.12  # relative change of the distance per wheel step
 DOLLY_PER_PIXEL = 0.005  # relative change of the distance per pixel
 FLY_RADII_PER_SECOND = 0.6  # speed, scene radii per second
-CLOSEST = 1e-4  # smallest distance of the eye to the pivot, scene radii
-WIDEST = 1e4  # largest distance of the eye to the pivot, scene radii
+MIN_DISTANCE_RADII = 1e-4  # smallest distance of the eye to the pivot, scene radii
+MAX_DISTANCE_RADII = 1e4  # largest distance of the eye to the pivot, scene radii
 
 
 def orbit(camera: ViewCamera, dx: float, dy: float) -> ViewCamera:
@@ -121,7 +121,7 @@ def toggle_fly(camera: ViewCamera) -> ViewCamera:
 
 
 def _clamp_distance(distance: float, radius: float) -> float:
-    return max(CLOSEST * radius, min(WIDEST * radius, distance))
+    return max(MIN_DISTANCE_RADII * radius, min(MAX_DISTANCE_RADII * radius, distance))
 
 
 def _wrap_degrees(degrees: float) -> float:

@@ -22,7 +22,7 @@ from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.io.json_values import one_of
 from progdf.scene.bounds import front_direction, scene_sphere
-from progdf.scene.subject import fit_eye, is_room, richest_turn, standpoint, subject_rows
+from progdf.scene.subject import best_azimuth_offset, fit_eye, is_room, room_viewpoint, subject_rows
 from progdf.scene.up_axis import find_up, up_from_json
 
 Vec3 = tuple[float, float, float]
@@ -353,10 +353,10 @@ def first_camera(
         half_height = max(math.tan(math.radians(view.fov_y) / 2.0), half_width / aspect)
         return replace(view, fov_y=min(2.0 * math.degrees(math.atan(half_height)), 179.0))
     if is_room(scene, axis):
-        eye_at, target = (tuple(at.tolist()) for at in standpoint(scene, axis))
+        eye_at, target = (tuple(at.tolist()) for at in room_viewpoint(scene, axis))
         return look_from(replace(camera, fov_y=max(fov_y, INSIDE_FOV)), eye_at, target)
     subject = scene[subject_rows(scene, axis)]
-    azimuth = camera.azimuth + richest_turn(subject, axis, camera.azimuth, camera.elevation)
+    azimuth = camera.azimuth + best_azimuth_offset(subject, axis, camera.azimuth, camera.elevation)
     return fit(replace(camera, azimuth=azimuth), subject, aspect)
 
 

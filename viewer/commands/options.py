@@ -191,7 +191,7 @@ def open_view(stack: StackOptions, drawing: DrawingOptions) -> tuple[session.Win
     return session.WindowSession(opened.document, state, opened.snapshots, opened.warning), opened.session
 
 
-def _placing(texts: Sequence[str]) -> document.Place:
+def _placing(texts: Sequence[str]) -> document.RegionChooser:
     """Return the function that gives an edit its region from `--region NAME=REGION`; check the syntax now."""
     specs: dict[str, str] = {}
     for text in texts:

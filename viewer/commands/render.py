@@ -64,7 +64,7 @@ DEFAULT_SIZE = (640, 480)
 _PROGRESS_INTERVAL_S = 0.5
 _LONGEST_S = 120.0  # maximum duration of a turntable
 _SWEEP_S = 2.0  # duration of a slider's way there and back
-ONE_OF = ("sweep", "sheet", "split", "difference", "timeline", "turntable")
+EXCLUSIVE_OPTIONS = ("sweep", "sheet", "split", "difference", "timeline", "turntable")
 """Options that choose the kind of picture; only one may be given."""
 
 
@@ -388,7 +388,7 @@ def _say_frames() -> film.Advance:
 def _check_output(options: RenderOptions) -> None:
     """Check that the file's name fits its content."""
     suffix = options.out.suffix.lower()
-    given = [name for name in ONE_OF if getattr(options, name) not in (None, False)]
+    given = [name for name in EXCLUSIVE_OPTIONS if getattr(options, name) not in (None, False)]
     if len(given) > 1:
         raise ProgdfError(f"--{given[0]} and --{given[1]} cannot be combined; give only one of them")
     if options.sweep is not None or options.turntable is not None or options.timeline:

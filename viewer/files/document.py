@@ -29,7 +29,7 @@ from viewer.state.workspace import SceneFacts
 
 _Value = TypeVar("_Value")
 
-Place = Callable[[Gaussians, int, str], Region | None]
+RegionChooser = Callable[[Gaussians, int, str], Region | None]
 """Function from a scene, an edit's index and its name to the region that the edit's grade is applied to.
 
 It returns None if the edit keeps its own region.
@@ -128,7 +128,7 @@ def empty() -> Document:
     return Document("", Gaussians(row, torch.eye(4)[:1], row - 5.0, logit, row, no_sh))
 
 
-def load(scene: Path, gdfs: Sequence[Path] = (), place: Place = _own_region) -> Document:
+def load(scene: Path, gdfs: Sequence[Path] = (), place: RegionChooser = _own_region) -> Document:
     """Load a scene and its edits.
 
     Args:
@@ -146,7 +146,7 @@ def load(scene: Path, gdfs: Sequence[Path] = (), place: Place = _own_region) -> 
 
 
 def load_edits(
-    paths: Sequence[Path], scene: Gaussians, scene_path: Path, place: Place = _own_region
+    paths: Sequence[Path], scene: Gaussians, scene_path: Path, place: RegionChooser = _own_region
 ) -> tuple[Gdf, ...]:
     """Load the edits of a scene. A second edit of the same name becomes NAME-2, so that --set is unambiguous.
 

@@ -19,7 +19,7 @@ from PIL import Image
 from progdf.errors import ProgdfError
 from progdf.io.atomic import atomic_write, make_folder, state_folder
 from progdf.io.images import flatten_onto, open_picture
-from progdf.io.json_values import plain, read_json
+from progdf.io.json_values import read_json, to_json
 from viewer.state.workspace import Layout
 
 from .session import session_of
@@ -99,7 +99,7 @@ def read_layout() -> Layout:
 
 def keep_layout(layout: Layout) -> None:
     """Save the layout of the window. Write errors are ignored."""
-    _remember("layout.json", json.dumps(plain(layout)))
+    _remember("layout.json", json.dumps(to_json(layout)))
 
 
 def read_keys() -> dict[str, Any]:

@@ -22,7 +22,7 @@ from viewer.state import history, snapshots, timeline
 from viewer.state.layers import largest_strength, visible_layers
 from viewer.state.paint import decode, layer_of
 from viewer.state.view_state import LayerState, Timeline, ViewState
-from viewer.web.page import DRAWN_SH, HOST, MAIL, PageTexts, build_page, pack
+from viewer.web.page import DRAWN_SH, HOST, MAIL_LIMIT_BYTES, PageTexts, build_page, pack
 
 from .document import Document
 
@@ -86,7 +86,7 @@ def write_page(
     parts += [f"SH degree {degree} of {whole}"] if degree < whole else []
     parts += [f"{error:.1f} dB to the scene"] if error < _EXACT_DB else []
     takes = "common hosts accept" if size > HOST else "most mail servers accept"
-    warning = f"; larger than {takes}: use --sh 0 or fewer Gaussians" if size > MAIL else ""
+    warning = f"; larger than {takes}: use --sh 0 or fewer Gaussians" if size > MAIL_LIMIT_BYTES else ""
     return f"wrote {out}: {', '.join(parts)}{warning}"
 
 

@@ -29,7 +29,7 @@ SH bands 1 to 3 are in `shN`: rgb32f, K texels per Gaussian.
 HIGHLIGHT = np.dtype([("rgb", "u1", 3), ("share", "u1")])
 """Highlight of a Gaussian: a texel of `highlight` in shaders/project.vert, 0 to 255 read as 0 to 1."""
 
-SHOWN_SH = 15
+MAX_DRAWN_SH = 15
 """Largest K. SH coefficients above degree 3 stay in the scene but are not drawn."""
 
 
@@ -42,7 +42,7 @@ class TextureSlot:
     components: int
 
 
-PLACES = {
+TEXTURE_SLOTS = {
     "means": TextureSlot("mean_logit", 0, 3),
     "logit_opacities": TextureSlot("mean_logit", 3, 1),
     "log_scales": TextureSlot("log_scale", 0, 3),
@@ -116,7 +116,7 @@ class SplatTextures:
         runs = [(0, self.rows)] if rows is None else list(row_runs(rows))
         dirty = []
         for attribute in attributes:
-            texel = PLACES[attribute]
+            texel = TEXTURE_SLOTS[attribute]
             if texel.texture not in self._memory:
                 continue
             values = getattr(scene, attribute).detach()

@@ -14,7 +14,7 @@ from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 
 from .programs import load_program
-from .scene_textures import GRID_LINE, ORDER, PROJECTED, SHOWN_SH, HighlightTexture, SplatTextures
+from .scene_textures import GRID_LINE, MAX_DRAWN_SH, ORDER, PROJECTED, HighlightTexture, SplatTextures
 
 Rgb = tuple[float, float, float]
 
@@ -88,7 +88,7 @@ class SplatRenderer:
             activated: its logits are opacities, which may be above 1
         """
         count = len(scene)
-        coefficients = min(int(scene.shN.shape[1]), SHOWN_SH)
+        coefficients = min(int(scene.shN.shape[1]), MAX_DRAWN_SH)
         size = (count, coefficients)
         scene_textures = self._scene
         if scene_textures is None or (scene_textures.count, scene_textures.sh_coefficients) != size:

@@ -23,7 +23,7 @@ from .training import EditOrder
 POLL_S = 0.3
 """Seconds between two checks for ended children."""
 
-LOOK_S = 1.0
+PROGRESS_INTERVAL_S = 1.0
 """Seconds between two reads of their progress; the window redraws their cards at each."""
 
 Status = Literal["queued", "running", "stopping", "stopped", "failed", "done"]
@@ -252,7 +252,7 @@ class JobQueue:
         ended: list[QueuedTask | None] = []
         reads_progress = time.monotonic() >= self._look_at
         if reads_progress:
-            self._look_at = time.monotonic() + LOOK_S
+            self._look_at = time.monotonic() + PROGRESS_INTERVAL_S
         for job in self.jobs:
             child = self._children.get(job.number)
             if child is not None and (status := child.status) is not None:

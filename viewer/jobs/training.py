@@ -34,7 +34,7 @@ from progdf.field.separable import fit_keyframes
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, fingerprint
 from progdf.io import atomic
-from progdf.io.json_values import convert_json, plain, read_json
+from progdf.io.json_values import convert_json, read_json, to_json
 from progdf.io.tensors import read_tensors
 from progdf.region import Region
 
@@ -100,7 +100,7 @@ EDITORS = (
 Point = tuple[float, float]
 NEUTRAL = tuple(neutral for _, _, neutral in GRADE_RANGES.values())
 """Values of a grade that changes nothing."""
-STILL = "Change a color, the curve or a slider of the grade"
+NO_CHANGE = "Change a color, the curve or a slider of the grade"
 """Obstacle: the grade changes nothing."""
 MAX_PAIRS = 8
 
@@ -201,7 +201,7 @@ class NewEdit:
             return "Enter the folder of the edited views"
         if self.region == TYPED and not self.typed_region.strip():
             return "Enter the region, such as sphere:0,0,0,1"
-        return STILL if self.choice.setting == "grade" and self.spec == "grade" else ""
+        return NO_CHANGE if self.choice.setting == "grade" and self.spec == "grade" else ""
 
 
 def parse_curve(text: str) -> list[Point]:
@@ -386,7 +386,7 @@ class EditOrder:
             ProgdfError: the folder cannot be created or written to.
         """
         atomic.make_folder(self.out.parent)
-        values = plain(self) | {"scene": str(self.scene)}
+        values = to_json(self) | {"scene": str(self.scene)}
         del values["out"]  # it is implied by the file's location
         atomic.write_file(self._beside(ORDER), msgspec.json.format(msgspec.json.encode(values)))
 

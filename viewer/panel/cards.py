@@ -46,14 +46,14 @@ from . import slider
 from .card import COMPACT_PX, SLIDER_PX, SLIM_PX, draw_card
 
 MASTER_PX = 20.0  # height of its slider, at 1×
-UNSEARCHED = 6
+SEARCH_THRESHOLD = 6
 """Number of layers above which the search field is shown."""
 _BUTTONS = ("group", "reset")
 
 
 def draw_search(work: Workspace, ui: UiContext) -> str:
     """Draw the search field, if there are many layers, and return its text."""
-    if not (len(work.view.layers) > UNSEARCHED or work.searching or work.search):
+    if not (len(work.view.layers) > SEARCH_THRESHOLD or work.searching or work.search):
         return work.search
     side = imgui.get_frame_height()
     gap = 4.0 * ui.scale

@@ -89,7 +89,7 @@ def draw(
     footer = imgui.get_frame_height() + imgui.get_style().item_spacing.y * 2
     footer += training_cards.height(work.jobs, ui)
     room = imgui.get_content_region_avail().y - footer - cards.HEADING_PX * ui.scale
-    if len(work.view.layers) > cards.UNSEARCHED:
+    if len(work.view.layers) > cards.SEARCH_THRESHOLD:
         room -= imgui.get_frame_height_with_spacing()
     work = replace(work, cards_fit=len(work.view.layers) * card.CARD_PX * ui.scale <= room)
     selected = selected_layers(work)

@@ -25,7 +25,7 @@ from viewer.state.timeline import (
     split_keys,
     tracks,
 )
-from viewer.state.view_state import FASTEST, LONGEST, Keyframe, Timeline
+from viewer.state.view_state import MAX_FPS, MAX_FRAME, Keyframe, Timeline
 from viewer.state.workspace import Workspace
 from viewer.ui.context import PALETTE, ROW_COLORS, SMALL_PX, Icon, Rgba, UiContext, u32
 from viewer.ui.overlay import Area
@@ -180,8 +180,8 @@ def _settings(work: Workspace, ruler: _Ruler, actions: list[str]) -> None:
     imgui.same_line(0.0, gap)
     count = timeline.length + 1
     for name, now, ends, unit, help_text in (
-        ("length", count, (2, LONGEST + 1), "f", f"0 to {timeline.length}: {count / timeline.fps:.2f} s"),
-        ("fps", timeline.fps, (1, FASTEST), "fps", "Frames per second"),
+        ("length", count, (2, MAX_FRAME + 1), "f", f"0 to {timeline.length}: {count / timeline.fps:.2f} s"),
+        ("fps", timeline.fps, (1, MAX_FPS), "fps", "Frames per second"),
     ):
         imgui.set_next_item_width(54.0 * ui.scale)
         clamp = imgui.SliderFlags_.always_clamp.value

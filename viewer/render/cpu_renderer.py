@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.rasterize import ActivatedGaussians, Crop, render
-from progdf.rasterize.screen import fill_screen, lines_behind
+from progdf.rasterize.screen import draw_lines_behind, fill_screen
 from progdf.threads import stopped_by
 from viewer.camera.view_camera import Vec3
 from viewer.gl.present import ScreenCopy
@@ -184,7 +184,7 @@ class CpuRenderer:
             self._stale = False
             self._grid = grid
             self._bands = 0
-            with lines_behind(picture.image, picture.through, lines, CLEAR):
+            with draw_lines_behind(picture.image, picture.through, lines, CLEAR):
                 self._copy.write(picture.image)
         while pending is not None and self.has_parts:
             top, end = pending.bands[self._bands]
@@ -193,7 +193,7 @@ class CpuRenderer:
             ends = lines[:, :4].astype(np.float64) * picture.shown.pixels - [0, top, 0, top]
             band_lines = lines.copy()
             band_lines[:, :4] = ends
-            with lines_behind(image, through, band_lines, CLEAR):
+            with draw_lines_behind(image, through, band_lines, CLEAR):
                 self._copy.write(image, top)
             self._bands += 1
         self._copy.show(screen)

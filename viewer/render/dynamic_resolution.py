@@ -39,7 +39,7 @@ MOVING_MS = 20.0, 27.0
 Outside the range, the next picture has fewer or more Gaussians.
 """
 
-FINE = (0.25, 4.0, 64.0)
+ERROR_LIMITS_PX2 = (0.25, 4.0, 64.0)
 """Smallest, initial and largest limit of the pyramid's merging error of a node, pixels²."""
 
 FINE_ERROR = 9e-4
@@ -63,13 +63,13 @@ REST_S = 0.06
 POLL_S = 0.01
 """Interval for polling whether it is done, in seconds."""
 
-MANY = 150_000
+SLOW_SCENE_GAUSSIANS = 150_000
 """Number of Gaussians from which CPU pictures are assumed to be slow before the first one is measured."""
 
 JUMP_MS = 100.0
 """Longest time of a single picture after a click or a key, in ms, before it is drawn in the background."""
 
-COARSE = 2
+COARSE_PIXELS = 2
 """Number of window pixels per pixel of a coarse picture, along each axis."""
 
 
@@ -82,7 +82,7 @@ def drawn_size(size: tuple[int, int], pixels: int) -> tuple[int, int]:
 class DynamicResolution:
     """Resolution during interaction, and the measured times of recent pictures."""
 
-    pixels: int = 1  # window pixels per drawn pixel along each axis: 1 or `COARSE`
+    pixels: int = 1  # window pixels per drawn pixel along each axis: 1 or `COARSE_PIXELS`
     # time of the next full picture, seconds on the main view's clock; None while the picture is full
     rest_at: float | None = None
     # times of the last two full pictures, as a single one may have been delayed
@@ -94,7 +94,7 @@ class DynamicResolution:
 
 def first_known(count: int, draws_with: str) -> DynamicResolution:
     """Return the initial state for a scene of `count` Gaussians that was not drawn yet."""
-    slow = draws_with == "cpu" and count >= MANY
+    slow = draws_with == "cpu" and count >= SLOW_SCENE_GAUSSIANS
     return DynamicResolution(camera_ms=(math.inf, math.inf) if slow else ())
 
 
@@ -106,7 +106,7 @@ def takes_long(before: DynamicResolution, known: DynamicResolution) -> bool:
 
 def wait(known: DynamicResolution, now: float, coarsely: bool) -> DynamicResolution:
     """Wait for an unfinished full picture, and meanwhile draw coarsely or keep the last picture."""
-    return replace(known, pixels=COARSE if coarsely else 1, rest_at=now + POLL_S)
+    return replace(known, pixels=COARSE_PIXELS if coarsely else 1, rest_at=now + POLL_S)
 
 
 def before_draw(
@@ -129,7 +129,7 @@ def before_draw(
     if turned or slid:
         slow = _slow(known.camera_ms) if turned else _slow(known.slider_ms, max(SLOW_MS, known.coarse_ms))
         pays = mode == "on" or known.pixels > 1 or slow
-        return replace(known, pixels=COARSE, rest_at=now + REST_S) if held and pays else full
+        return replace(known, pixels=COARSE_PIXELS, rest_at=now + REST_S) if held and pays else full
     return full if known.rest_at is None or now >= known.rest_at else known
 
 
@@ -211,8 +211,8 @@ class LiveScene:
         self._scene = scene
         self._highlights: Array | None = None  # rgb and share, 0 to 1; None for no highlights. [N,4]
         self._budget = BUDGETS[1]
-        self._finest = FINE[1]
-        self._max_finest = FINE[1]
+        self._finest = ERROR_LIMITS_PX2[1]
+        self._max_finest = ERROR_LIMITS_PX2[1]
         self._limit = 0.0  # error limit of the last picture in motion, pixels²; 0 if it had all Gaussians
         self._pyramid: Future[Pyramid] | None = None
         # outdated rows of the pyramid: 0 up to date, 1 colors only, 2 more. [N] uint8
@@ -285,7 +285,7 @@ class LiveScene:
             finest *= 1.15
         elif taken_ms < FINE_MS[0]:
             finest *= 0.85
-        self._finest = min(max(finest, FINE[0]), self._max_finest)
+        self._finest = min(max(finest, ERROR_LIMITS_PX2[0]), self._max_finest)
         return picture
 
     def measure(self, moving: Array, full: Array) -> None:
@@ -300,7 +300,9 @@ class LiveScene:
         difference = screen[::-8, :, :3] / np.float32(255.0) - full[::8].clip(0.0, 1.0)
         # the error grows with the limit's power of 0.6 to 1.5 (docs/lab/experiments.md, The viewer)
         limit = self._limit * (FINE_ERROR / max(float(np.square(difference).mean()), 1e-9)) ** (1 / 1.5)
-        self._max_finest = min(max(limit, FINE[0]), FINE[2]) if self._limit else self._max_finest
+        self._max_finest = (
+            min(max(limit, ERROR_LIMITS_PX2[0]), ERROR_LIMITS_PX2[2]) if self._limit else self._max_finest
+        )
 
     def _write(self, scene: Gaussians, name: str, part: slice) -> None:
         means, quats, scales, opacities, sh = (tensor.numpy() for tensor in self.drawn.tensors)

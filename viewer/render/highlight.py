@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from progdf.gdf.file import Gdf
 from viewer.state import paint
 from viewer.state.layers import is_visible
-from viewer.state.selection import NOBODY, Color, unpack
+from viewer.state.selection import EMPTY_MASK, Color, unpack
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import Pointed
 
-SHARE = 0.75
+RAMP_SHARE = 0.75
 """Share of the color ramp in a member's color. The remainder keeps its shape recognizable."""
 
-THIN = 0.2
+THIN_TINT_SHARE = 0.2
 """Share of the thin tint at weight 0, falling to 0 at weight 1, so that the result stays visible."""
 
 RAMP = ((0.0, 0x2B3FA8), (0.25, 0x7A35B5), (0.5, 0xC8407A), (0.75, 0xF08A3C), (1.0, 0xF9E558))
@@ -26,7 +26,7 @@ RAMP = ((0.0, 0x2B3FA8), (0.25, 0x7A35B5), (0.5, 0xC8407A), (0.75, 0xF08A3C), (1
 
 SELECTED: Color = (1.0, 0.72, 0.05)  # tint of the selection
 TINT = 140  # share of a tint, of 255
-TRACE = 45  # share of the selection's tint while no selection tool is active, of 255
+FAINT_TINT = 45  # share of the selection's tint while no selection tool is active, of 255
 HIDDEN = 255  # share that marks a Gaussian as not drawn
 
 Bytes = NDArray[np.uint8]
@@ -43,7 +43,7 @@ class Highlight:
     # packed masks, their colors and shares of 255; later ones cover earlier ones
     tinted: tuple[tuple[bytes, Color, int], ...] = ()
     region: int | None = None  # edit whose members are all tinted (a `LayerState.gdf`), or None
-    hidden: bytes = NOBODY  # packed mask of hidden Gaussians
+    hidden: bytes = EMPTY_MASK  # packed mask of hidden Gaussians
 
 
 def requested_highlight(
@@ -84,7 +84,7 @@ def requested_highlight(
     ]
     strong = bool(view.select.tool) or kind == "selection"
     if state.count and (strong or (view.panel and not looks)):
-        tinted.append((state.members, SELECTED, TINT if strong else TRACE))
+        tinted.append((state.members, SELECTED, TINT if strong else FAINT_TINT))
     return Highlight(tinted=tuple(tinted)) if tinted else None
 
 
@@ -118,7 +118,7 @@ def highlight_colors(highlight: Highlight, gdfs: Sequence[Gdf], total: int) -> B
     for packed, color, share in highlight.tinted:
         mask = unpack(packed, total)
         if (
-            share != TRACE or not hidden.any() or not (mask | hidden).all()
+            share != FAINT_TINT or not hidden.any() or not (mask | hidden).all()
         ):  # an isolated selection needs no faint tint
             colors[mask] = _tint(color, share)
     if highlight.region is not None:
@@ -129,7 +129,7 @@ def highlight_colors(highlight: Highlight, gdfs: Sequence[Gdf], total: int) -> B
         decoded = paint.decode(highlight.paint, len(members), gdf.from_others)
         weights = np.ones(len(members), np.float32) if decoded is None else decoded.numpy()
         colors[members, :3] = ramp_colors(weights)
-        shares = THIN * (1.0 - weights) if highlight.thin else np.full_like(weights, SHARE)
+        shares = THIN_TINT_SHARE * (1.0 - weights) if highlight.thin else np.full_like(weights, RAMP_SHARE)
         colors[members, 3] = np.round(255.0 * shares)
     colors[hidden, 3] = HIDDEN
     return colors

@@ -23,13 +23,13 @@ from viewer.camera.view_camera import Vec3
 from viewer.state.layers import is_visible
 from viewer.state.view_state import ViewState
 
-HALF = 0.5  # accumulated opacity that defines the surface
-FAINT = 0.05  # accumulated opacity below which a pixel is background
+SURFACE_OPACITY = 0.5  # accumulated opacity that defines the surface
+BACKGROUND_OPACITY = 0.05  # accumulated opacity below which a pixel is background
 MIN_SHARE = 0.25  # share of a pixel's color that a layer needs to be picked
 
 
 @dataclass(frozen=True)
-class Seen:
+class PixelGaussians:
     """Visible Gaussians at a pixel, nearest first."""
 
     rows: NDArray[np.int64]  # indices of the Gaussians. [M] int64
@@ -42,7 +42,7 @@ def surface_point(scene: Gaussians, camera: Camera, x: float, y: float, near: fl
     """Return the surface point under a pixel position.
 
     The point is on the pixel's ray, at the depth of the Gaussian at which the accumulated opacity reaches
-    `HALF`, or else of the Gaussian with the largest share.
+    `SURFACE_OPACITY`, or else of the Gaussian with the largest share.
 
     Args:
         scene: the edited scene on screen
@@ -56,7 +56,7 @@ def surface_point(scene: Gaussians, camera: Camera, x: float, y: float, near: fl
     seen = seen_at(scene, camera, x, y, near)
     if seen is None:
         return None
-    opaque = np.flatnonzero(np.cumsum(seen.shares) >= HALF)
+    opaque = np.flatnonzero(np.cumsum(seen.shares) >= SURFACE_OPACITY)
     at = int(opaque[0]) if len(opaque) else int(seen.shares.argmax())
     z = float(seen.depths[at])
     fx, fy, cx, cy = _lens(camera)
@@ -68,7 +68,7 @@ def surface_point(scene: Gaussians, camera: Camera, x: float, y: float, near: fl
     return (wx, wy, wz) if all(math.isfinite(v) for v in (wx, wy, wz)) else None
 
 
-def layer_at(view: ViewState, gdfs: Sequence[Gdf], seen: Seen) -> int | None:
+def layer_at(view: ViewState, gdfs: Sequence[Gdf], seen: PixelGaussians) -> int | None:
     """Return the layer with the largest share of a pixel.
 
     Visible layers take precedence over hidden ones, and later layers over earlier ones with an equal share.
@@ -96,7 +96,9 @@ def layer_at(view: ViewState, gdfs: Sequence[Gdf], seen: Seen) -> int | None:
     return chosen
 
 
-def seen_at(scene: Gaussians, camera: Camera, x: float, y: float, near: float = 1e-4) -> Seen | None:
+def seen_at(
+    scene: Gaussians, camera: Camera, x: float, y: float, near: float = 1e-4
+) -> PixelGaussians | None:
     """Return the visible Gaussians at a pixel position, or None on the background. See `surface_point`."""
     rotation = camera.viewmat[:3, :3].numpy()
     translation = camera.viewmat[:3, 3].numpy()
@@ -118,10 +120,10 @@ def seen_at(scene: Gaussians, camera: Camera, x: float, y: float, near: float = 
         return None
     rows, alphas = _alphas(scene, near_ray, camera, x, y, near)
     through = np.cumprod(1.0 - alphas)
-    if not len(rows) or 1.0 - through[-1] < FAINT:
+    if not len(rows) or 1.0 - through[-1] < BACKGROUND_OPACITY:
         return None
     shares = alphas * np.concatenate([[1.0], through[:-1]])
-    return Seen(rows, shares, depth[rows].astype(np.float64))
+    return PixelGaussians(rows, shares, depth[rows].astype(np.float64))
 
 
 def _lens(camera: Camera) -> tuple[float, float, float, float]:
@@ -145,7 +147,7 @@ def _alphas(
     return rows[splats.rows.numpy()], alphas.numpy()
 
 
-MANY = 100_000
+PREPARE_MIN_GAUSSIANS = 100_000
 """Number of Gaussians below which nothing is prepared ahead, as on demand it takes about 0.1 s."""
 
 
@@ -178,7 +180,7 @@ class Surfaces:
         self._surface = make()
         self._key = key
         self._colors = colors
-        beside(self._surface.prepare, colors)
+        run_in_background(self._surface.prepare, colors)
         return True
 
     def drop(self) -> None:
@@ -188,7 +190,7 @@ class Surfaces:
         self._key = self._surface = None
 
 
-def beside(work: Callable[..., object], *arguments: object) -> None:
+def run_in_background(work: Callable[..., object], *arguments: object) -> None:
     """Run `work` in another thread, after the work submitted earlier."""
     _worker().submit(work, *arguments)
 

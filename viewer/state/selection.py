@@ -28,7 +28,7 @@ LONGEST_NAME = 60  # characters in the name of a region
 MAX_REGIONS = 1000
 """Largest number of regions of a scene, few enough to draw and save at once."""
 
-NOBODY = b""
+EMPTY_MASK = b""
 """Packed mask without members."""
 
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
@@ -61,16 +61,16 @@ class NamedRegion:
 class SelectionState:
     """Current selection, hidden Gaussians and regions. Undo covers all of it."""
 
-    members: bytes = NOBODY  # packed mask of the selection
+    members: bytes = EMPTY_MASK  # packed mask of the selection
     count: Annotated[int, Meta(ge=0)] = 0  # number of selected Gaussians
-    hidden: bytes = NOBODY  # packed mask of Gaussians that are not drawn and cannot be selected
+    hidden: bytes = EMPTY_MASK  # packed mask of Gaussians that are not drawn and cannot be selected
     # in the order of the panel's rows
     regions: Annotated[tuple[NamedRegion, ...], Meta(max_length=MAX_REGIONS)] = ()
 
 
 def pack(mask: Mask) -> bytes:
-    """Pack a mask [N] for storage in a state; `NOBODY` if it is empty."""
-    return zlib.compress(np.packbits(mask).tobytes(), 1) if mask.any() else NOBODY
+    """Pack a mask [N] for storage in a state; `EMPTY_MASK` if it is empty."""
+    return zlib.compress(np.packbits(mask).tobytes(), 1) if mask.any() else EMPTY_MASK
 
 
 @lru_cache(maxsize=64)
@@ -87,7 +87,7 @@ def unpack(members: bytes, total: int) -> Mask:
         ProgdfError: the packed mask is damaged.
     """
     mask = np.zeros(total, bool)
-    if members != NOBODY:
+    if members != EMPTY_MASK:
         unpacker = zlib.decompressobj()
         size = -(-total // 8)
         try:
@@ -103,14 +103,14 @@ def unpack(members: bytes, total: int) -> Mask:
 
 def select(state: SelectionState, mask: Mask) -> SelectionState:
     """Replace the selection by `mask` [N] without the hidden Gaussians."""
-    if state.hidden != NOBODY:
+    if state.hidden != EMPTY_MASK:
         mask = mask & ~unpack(state.hidden, len(mask))
     return replace(state, members=pack(mask), count=int(np.count_nonzero(mask)))
 
 
 def select_none(state: SelectionState) -> SelectionState:
     """Clear the selection."""
-    return replace(state, members=NOBODY, count=0)
+    return replace(state, members=EMPTY_MASK, count=0)
 
 
 def hide(state: SelectionState, mask: Mask) -> SelectionState:
@@ -126,7 +126,7 @@ def isolate(state: SelectionState, total: int) -> SelectionState:
 
 def show_all(state: SelectionState) -> SelectionState:
     """Show all hidden Gaussians."""
-    return replace(state, hidden=NOBODY)
+    return replace(state, hidden=EMPTY_MASK)
 
 
 def change(
@@ -222,7 +222,7 @@ def check(state: SelectionState, total: int) -> None:
     for members in (state.members, state.hidden, *(region.members for region in state.regions)):
         unpack(members, total)
         size = -(-total // 8)
-        if members != NOBODY and len(zlib.decompressobj().decompress(members, size + 1)) != size:
+        if members != EMPTY_MASK and len(zlib.decompressobj().decompress(members, size + 1)) != size:
             raise ProgdfError(f"a selection does not fit the scene's {total} Gaussians; select it again")
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from viewer.camera import views
 from viewer.camera.view_camera import ViewCamera
 
-from .view_state import FASTEST, LONGEST, Keyframe, LayerState, Timeline, ViewState, following
+from .view_state import MAX_FPS, MAX_FRAME, Keyframe, LayerState, Timeline, ViewState, following
 
 EASINGS = views.EASINGS
 
@@ -102,14 +102,14 @@ def key_before(timeline: Timeline, frame: int) -> Keyframe:
 
 
 def set_length(timeline: Timeline, length: int) -> Timeline:
-    """Set the last frame, clamped to the last key (so that no key is lost) to `LONGEST`."""
+    """Set the last frame, clamped to the last key (so that no key is lost) to `MAX_FRAME`."""
     last = timeline.keys[-1].frame if timeline.keys else 0
-    return replace(timeline, length=max(1, last, min(length, LONGEST)))
+    return replace(timeline, length=max(1, last, min(length, MAX_FRAME)))
 
 
 def with_fps(timeline: Timeline, fps: int) -> Timeline:
-    """Set the frame rate, clamped to 1 to `FASTEST` frames per second."""
-    return replace(timeline, fps=max(1, min(fps, FASTEST)))
+    """Set the frame rate, clamped to 1 to `MAX_FPS` frames per second."""
+    return replace(timeline, fps=max(1, min(fps, MAX_FPS)))
 
 
 def neighbor(timeline: Timeline, frame: int, step: int) -> int:
@@ -122,7 +122,7 @@ def neighbor(timeline: Timeline, frame: int, step: int) -> int:
 
 def turntable(camera: ViewCamera, fps: int, seconds: float) -> Timeline:
     """Return a timeline that orbits the pivot once at constant speed and loops seamlessly."""
-    count = min(max(2, round(fps * seconds)), LONGEST)
+    count = min(max(2, round(fps * seconds)), MAX_FRAME)
     azimuths = [(camera.azimuth + 180.0 + 360.0 * frame / count) % 360.0 - 180.0 for frame in range(count)]
     keys = tuple(
         Keyframe(frame, (), replace(camera, azimuth=azimuth)) for frame, azimuth in enumerate(azimuths)
@@ -135,7 +135,7 @@ def slider_film(view: ViewState, gdfs: Sequence[int], fps: int, seconds: float) 
 
     The other strengths are unchanged.
     """
-    step = min(max(1, round(fps * seconds / 2)), LONGEST // len(gdfs))
+    step = min(max(1, round(fps * seconds / 2)), MAX_FRAME // len(gdfs))
     still = tuple((layer.gdf, layer.strength) for layer in view.layers if layer.gdf not in gdfs)
     keys = tuple(
         Keyframe(i * step, (*((gdf, float(at < i)) for at, gdf in enumerate(gdfs)), *still))
@@ -325,7 +325,7 @@ def _paste_keys(view: ViewState, player: Player, _: str) -> tuple[Timeline, Play
     """Paste the copied keys, the first at the playhead, over existing ones. The timeline grows if needed."""
     by = player.frame - min((key.frame for _, key in player.copied), default=0)
     pasted = {(row, key.frame + by): replace(key, frame=key.frame + by) for row, key in player.copied}
-    pasted = {at: key for at, key in pasted.items() if at[1] <= LONGEST}
+    pasted = {at: key for at, key in pasted.items() if at[1] <= MAX_FRAME}
     joined = join_keys(view.timeline, split_keys(view.timeline) | pasted)
     return joined, replace(player, chosen=frozenset(pasted))
 

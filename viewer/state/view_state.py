@@ -27,8 +27,8 @@ SELECT_MODES = ("new", "add", "subtract", "intersect")
 COMPARE_MODES = ("off", "beside", "split", "difference")
 AGAINST = ("original", "snapshots")
 MAX_AMPLIFIED = 64.0  # largest factor of a difference view
-LONGEST = 9999  # largest last frame of a timeline
-FASTEST = 120  # largest frame rate of a timeline, frames per second
+MAX_FRAME = 9999  # largest last frame of a timeline
+MAX_FPS = 120  # largest frame rate of a timeline, frames per second
 CARD_MODES = ("auto", "full", "compact")
 """Values of `ViewState.cards`: compact rows if full cards do not fit, never, always."""
 FRAMES = ("", *SHAPES)
@@ -40,8 +40,8 @@ Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 Strength = Annotated[float, Meta(ge=0.0, le=OVERSHOOT)]
 Blend = Annotated[str, one_of(BLENDS)]
 Frame = Annotated[int, Meta(ge=0)]
-Length = Annotated[int, Meta(ge=1, le=LONGEST)]
-Fps = Annotated[int, Meta(ge=1, le=FASTEST)]
+Length = Annotated[int, Meta(ge=1, le=MAX_FRAME)]
+Fps = Annotated[int, Meta(ge=1, le=MAX_FPS)]
 Easing = Annotated[str, one_of(EASINGS)]
 
 

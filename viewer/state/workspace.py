@@ -144,7 +144,7 @@ class Workspace:
     history: bool | None = None  # state of the history list: True as it opens, then False, None if closed
     message: Message | None = None  # line at the bottom of the picture
     snapshots: tuple[SliderSnapshot, ...] = ()  # without the original
-    # last saved state, see `worth_saving`; None before the first
+    # last saved state, see `saved_state`; None before the first
     saved: tuple[Edit, tuple[SliderSnapshot, ...]] | None = None
     dialog: Dialog | None = None  # the open dialog
     requests: tuple[str, ...] = ()  # pending work that only the window can do
@@ -168,7 +168,7 @@ def new_workspace(view: ViewState, snapshots: tuple[SliderSnapshot, ...] = ()) -
     return mark_saved(Workspace(view, past, view.camera, focus, snapshots=snapshots))
 
 
-def worth_saving(workspace: Workspace) -> tuple[Edit, tuple[SliderSnapshot, ...]]:
+def saved_state(workspace: Workspace) -> tuple[Edit, tuple[SliderSnapshot, ...]]:
     """Return the saved part of the workspace: edits, regions and snapshots, without camera and selection."""
     edit = history.edit_of(workspace.view)
     return replace(edit, selection=SelectionState(regions=edit.selection.regions)), workspace.snapshots
@@ -176,12 +176,12 @@ def worth_saving(workspace: Workspace) -> tuple[Edit, tuple[SliderSnapshot, ...]
 
 def mark_saved(workspace: Workspace) -> Workspace:
     """Mark the current state as saved."""
-    return replace(workspace, saved=worth_saving(workspace))
+    return replace(workspace, saved=saved_state(workspace))
 
 
 def has_unsaved(workspace: Workspace) -> bool:
     """Return whether closing would lose unsaved work."""
-    return workspace.saved != worth_saving(workspace)
+    return workspace.saved != saved_state(workspace)
 
 
 def original(view: ViewState) -> ViewState:

@@ -255,7 +255,7 @@ TOPICS: dict[str, tuple[Command, ...]] = {
 COMMANDS = {command.action: command for commands in TOPICS.values() for command in commands}
 KEYS: dict[str, Command] = {}
 """Command of each chord; filled by `bind`."""
-HAND_KEYS: dict[str, Command] = {}
+TOOL_KEYS: dict[str, Command] = {}
 """Command of each chord that has priority while a tool is active; filled by `bind`."""
 NAMES = (
     *"ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789\\[],.=-",
@@ -296,13 +296,13 @@ def bind(changes: Mapping[str, Any]) -> list[str]:
         except ValueError as error:
             problems.append(f"{action}: {error}")
     KEYS.clear()
-    HAND_KEYS.clear()
+    TOOL_KEYS.clear()
     chords.cache_clear()
     for command in COMMANDS.values():
         new_chords = [chord for (chord, _), other in given.items() if other is command]
         table_chords = [] if command in changed else command.keys.split()
         remaining_chords = [chord for chord in table_chords if (chord, command.in_hand) not in given]
-        (HAND_KEYS if command.in_hand else KEYS).update(
+        (TOOL_KEYS if command.in_hand else KEYS).update(
             dict.fromkeys([*new_chords, *remaining_chords], command)
         )
     return problems
@@ -330,7 +330,7 @@ def is_changed(command: Command) -> bool:
 
 def bound_chords(command: Command) -> list[str]:
     """Return the chords of a command."""
-    keys = HAND_KEYS if command.in_hand else KEYS
+    keys = TOOL_KEYS if command.in_hand else KEYS
     return [chord for chord, other in keys.items() if other is command]
 
 

@@ -14,8 +14,8 @@ from progdf.gaussians import Gaussians
 from progdf.scene.selection import Surface
 from viewer.camera.view_camera import ViewCamera, half_camera, half_scale, to_camera
 from viewer.render.engine import ViewEngine
-from viewer.render.picking import MANY, Surfaces, beside
-from viewer.state.selection import NOBODY, unpack
+from viewer.render.picking import PREPARE_MIN_GAUSSIANS, Surfaces, run_in_background
+from viewer.state.selection import EMPTY_MASK, unpack
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import SceneFacts
 
@@ -78,7 +78,7 @@ class PointerContext:
         """Gaussians of the picture without the hidden ones; valid until another strength is drawn."""
         scene = self.engine.gaussians(self.shown)
         hidden = self.shown.selection.hidden
-        if hidden == NOBODY:
+        if hidden == EMPTY_MASK:
             return scene
         drawn = torch.from_numpy(np.where(unpack(hidden, len(scene)), np.float32(-np.inf), np.float32(0.0)))
         return replace(scene, logit_opacities=scene.logit_opacities + drawn)
@@ -91,11 +91,11 @@ class PointerContext:
     def look_ahead(self) -> None:
         """Compute in another thread the data of a still picture that the active tool will need."""
         tool = self.shown.select.tool
-        if self.facts.count < MANY or not (tool or self.shown.brush.active):
+        if self.facts.count < PREPARE_MIN_GAUSSIANS or not (tool or self.shown.brush.active):
             return
         another = self.surfaces.look(self._surface_key, self._copy_surface, tool in ("flood", "color"))
         if another and tool in ("flood", "scribble"):
-            beside(self.facts.neighborhood if tool == "flood" else self.facts.scribbles)
+            run_in_background(self.facts.neighborhood if tool == "flood" else self.facts.scribbles)
 
     @property
     def _surface_key(self) -> object:

@@ -32,7 +32,7 @@ _INKS = [f"#{color:06x}" for color in (PANEL, FIELD, TEXT, ACCENT)]
 TEXT_PX = 15.0
 FONTS = BUNDLE / "assets" / "fonts"
 REGULAR = FONTS / "Roboto" / "Roboto-Regular.ttf"
-AFTER_S = 0.15
+SPLASH_DELAY_S = 0.15
 """Delay before the splash is shown, in seconds."""
 EVERY_S = 0.1
 """Time between two frames of the splash, in seconds."""
@@ -99,7 +99,7 @@ class Splash:
         """Wait for the result of another thread; handle window events meanwhile, and show a splash after a
         delay."""
         begun = time.perf_counter()
-        patience = AFTER_S
+        patience = SPLASH_DELAY_S
         while not wait([work], patience).done:
             patience = EVERY_S
             seconds = time.perf_counter() - begun

@@ -355,7 +355,7 @@ def _numbers(tensor: Tensor) -> Any:
 MODULES = ("camera", "data", "grade", "compose", "sort", "renderer", "state", "panel", "input", "main")
 """Modules of `src`, each after its imports; then follows the module for the page's host."""
 STAGES = ("web.vert", "splat.frag", "present.vert", "present.frag", "stretch.frag")
-MAIL = 25e6
+MAIL_LIMIT_BYTES = 25e6
 """Size limit of attachments in mail, bytes."""
 HOST = 100e6
 """Size limit of common hosts, bytes."""

@@ -216,7 +216,7 @@ def step_and_color(batch: Array, splat: Number) -> tuple[Number, Number, Number,
     return batch[splat + STEP], batch[splat + RED], batch[splat + GREEN], batch[splat + BLUE]
 
 
-class Picture(NamedTuple):
+class RenderBuffers(NamedTuple):
     """Rendered window."""
 
     image: Array  # [h,w,3] float32
@@ -279,7 +279,7 @@ def _blend_tile(
 ) -> None:  # fmt: skip
     """Blend a tile.
 
-    state: initialized here, [5·PLANE] float32; last: see `Picture`; others: see `find_spans`
+    state: initialized here, [5·PLANE] float32; last: see `RenderBuffers`; others: see `find_spans`
     """
     plane = np.int64(PLANE)
     state[:plane] = ONE
@@ -299,7 +299,7 @@ def _blend_tile(
 @kernel(cache=True)
 def blend(
     begin: int, end: int, scratch: TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
-    background: Array, out: Picture, last: Array | None,
+    background: Array, out: RenderBuffers, last: Array | None,
 ) -> None:  # fmt: skip
     """Blend tiles begin … end − 1 into the picture. background: [3] float32; last: the picture's"""
     state, batch, bounds = scratch
@@ -428,7 +428,7 @@ def _blend_tile_backward(
 @kernel(cache=True)
 def blend_backward(
     begin: int, end: int, scratch: TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
-    background: Array, out: Picture, gradients: Picture, grad_mask: Array, sums: Array,
+    background: Array, out: RenderBuffers, gradients: RenderBuffers, grad_mask: Array, sums: Array,
 ) -> None:  # fmt: skip
     """Compute the gradients of `blend`, which has the same first arguments.
 
@@ -486,7 +486,7 @@ class Runs(NamedTuple):
     weights: Array  # αT of each entry. [E] float32
 
 
-class Listed(NamedTuple):
+class ListSelection(NamedTuple):
     """Selection of the Gaussians and pixels to list."""
 
     rows: Array  # index of each Gaussian in the lists, −1: not listed. [N] int32
@@ -563,7 +563,7 @@ def accumulate_weights(
 
 @kernel(contract=True, inline=True)
 def _list_tile(
-    tile: int, splats: Splats, listed: Listed, camera: Pinhole, members: Array, state: Array,
+    tile: int, splats: Splats, listed: ListSelection, camera: Pinhole, members: Array, state: Array,
     run: int, entry: int, out: Runs,
 ) -> tuple[int, int]:  # fmt: skip
     """Write one tile's runs and entries from `run` and `entry` on, as far as there is room.
@@ -634,7 +634,7 @@ def _list_tile(
 @kernel(cache=True)
 def list_weights(
     begin: int, end: int, scratch: TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
-    listed: Listed, out: Runs,
+    listed: ListSelection, out: Runs,
 ) -> tuple[int, int]:  # fmt: skip
     """List the weights of the splats in tiles begin … end − 1.
 

@@ -31,8 +31,8 @@ from .backward import new_scratch as new_backward_scratch
 from .blend import (
     SUMS,
     WEIGHT_SUMS,
-    Listed,
-    Picture,
+    ListSelection,
+    RenderBuffers,
     Runs,
     accumulate_weights,
     blend,
@@ -199,7 +199,7 @@ class _Rasterize(torch.autograd.Function):
         camera, grad_rows, scene, background, splats, lists, out = ctx.forward_pass
         viewmat, K = ctx.saved_tensors[6:8]  # this also checks that none of them has been changed since
         by_image, by_transmittance = (np.ascontiguousarray(grad.numpy()) for grad in grads)
-        by_out = Picture(by_image, by_transmittance, out.last)
+        by_out = RenderBuffers(by_image, by_transmittance, out.last)
         grad_mask = _ALL_ROWS
         if grad_rows is not None:
             grad_mask = np.bincount(grad_rows.numpy(force=True), minlength=len(scene.means)) > 0
@@ -226,11 +226,11 @@ class _Rasterize(torch.autograd.Function):
         return None, None, None, *results
 
 
-def _new_picture(camera: Pinhole, with_last: bool) -> Picture:
+def _new_picture(camera: Pinhole, with_last: bool) -> RenderBuffers:
     x0, y0, x1, y1 = camera.window
     size = y1 - y0, x1 - x0
     last = np.empty(size, np.float32) if with_last else None
-    return Picture(np.empty((*size, 3), np.float32), np.empty(size, np.float32), last)
+    return RenderBuffers(np.empty((*size, 3), np.float32), np.empty(size, np.float32), last)
 
 
 def _camera_gradients(parts: Array, viewmat: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
@@ -288,7 +288,7 @@ def color_map(
     positions[chosen] = np.arange(len(chosen), dtype=np.int32)
     row_of = np.full(len(gaussians.means), -1, np.int32)
     row_of[rows.numpy()] = np.arange(len(rows), dtype=np.int32)
-    listed = Listed(row_of, positions, np.float32(lost))
+    listed = ListSelection(row_of, positions, np.float32(lost))
     splats, lists = bin_view(gaussians, pinhole)
     index = np.dtype(np.uint16 if TILE_H * (x1 - x0) < 1 << 16 else np.uint32)
 

@@ -75,26 +75,26 @@ CELL = 8
 SLICES = 224
 """Depth slices of the grid from the near plane on, 16 per factor of two in depth."""
 
-DARKEST = 3.0
+MAX_OPTICAL_DEPTH = 3.0
 """Limit of the optical depth that reduces a node's error.
 
 The grid does not resolve gaps, so more proves nothing.
 """
 
-CROWD = 0.6
+DENSITY_EXPONENT = 0.6
 """Exponent that turns a node's density above 1 into its opacity.
 
 An opacity above 1 makes the center opaque and the edge steep, like several Gaussians that cover each other. A
 surface of nodes as soft as one Gaussian would have holes.
 """
 
-COARSER = 4.0
+COARSE_CUT_FACTOR = 4.0
 """Factor of the threshold for the coarser cut that provides the transmittance."""
 
-FINEST = 1e-3
+MIN_ERROR_PX2 = 1e-3
 """Smallest threshold, pixels². An error below it is invisible in an 8-bit picture."""
 
-ENOUGH = 0.85
+BUDGET_FILL = 0.85
 """Share of the budget at which the threshold search stops."""
 
 LONGEST, DENSITY, WEIGHT, POINTS, LOSS = range(3, 8)
@@ -130,7 +130,9 @@ _SLICES_PER_BIT = 2.0**-19  # depth slices per unit in the last place of a float
 _SHADOW_DEPTH_RATIO = 2.0 ** (-1 / 32)  # depth factor, half a slice nearer: a surface must not shadow itself
 _CHUNK_LEVELS = 4  # upper levels of the tree whose nodes are chunks for the threads
 _PREFETCH_ROWS = 8  # rows to prefetch ahead, because they lie far apart in memory
-_MAX_DARKENING = math.exp(0.5 * DARKEST)  # multiple of the threshold above which no shadow helps a node
+_MAX_DARKENING = math.exp(
+    0.5 * MAX_OPTICAL_DEPTH
+)  # multiple of the threshold above which no shadow helps a node
 _MIN_WEIGHT = 1e-30
 _MAX_WEIGHT = 1e30
 _MAX_TRIALS = 12  # cuts per threshold search
@@ -171,7 +173,7 @@ class Pyramid:
         quats = shapes[:, :SCALES].view(np.int16)
         self.nodes = Nodes(means, shapes, quats, order, levels)
         self.limit = 1.0  # threshold for a node's error, pixels²; the last search ended here
-        self.finest = FINEST  # smallest threshold of the search, pixels²
+        self.finest = MIN_ERROR_PX2  # smallest threshold of the search, pixels²
         self._places: Array | None = (
             None  # position of each row in the order, computed on first use. [N] int32
         )
@@ -222,14 +224,14 @@ class Pyramid:
         for _ in range(_MAX_TRIALS):
             self.limit = max(self.limit, self.finest)
             depths = np.zeros((-(-view.window[3] // CELL), -(-view.window[2] // CELL), SLICES), np.float32)
-            coarse = self._cut(view, self.limit * COARSER, dilation, np.zeros(1, np.float32))
+            coarse = self._cut(view, self.limit * COARSE_CUT_FACTOR, dilation, np.zeros(1, np.float32))
             _add_depths(coarse, self.nodes, view, dilation, depths.reshape(-1))
             _sum_depths(depths)
             picks = self._cut(view, self.limit, dilation, depths.reshape(-1))
-            if len(picks) <= budget and (len(picks) >= ENOUGH * budget or self.limit <= self.finest):
+            if len(picks) <= budget and (len(picks) >= BUDGET_FILL * budget or self.limit <= self.finest):
                 break
             # twice the threshold leaves about half as many
-            self.limit *= (len(picks) + 1) / (0.5 * (1.0 + ENOUGH) * budget)
+            self.limit *= (len(picks) + 1) / (0.5 * (1.0 + BUDGET_FILL) * budget)
         return picks
 
     def _cut(self, view: Pinhole, limit: float, dilation: float, depths: Array) -> Array:
@@ -611,7 +613,7 @@ def _walk(
                 for corner in range(8):
                     cell, share = _cell(x, y, (z - longest) * _SHADOW_DEPTH_RATIO, corner, camera)
                     depth += share * depths[cell]
-                loss *= math.exp(-0.5 * min(depth, DARKEST))
+                loss *= math.exp(-0.5 * min(depth, MAX_OPTICAL_DEPTH))
         if loss <= limit or (i >= first_leaf and depths.size == 1):
             picks[count] = i
             count += 1
@@ -687,7 +689,7 @@ def _resolve_picks(
                 wide = dilation * unit
                 dilated = math.sqrt((longest * longest + wide) * (middle * middle + wide))
                 opacity = max(opacity, (own[WEIGHT] + wide * own[POINTS]) / max(dilated, _MIN_WEIGHT))
-            opacity = min(opacity, opacity**CROWD)
+            opacity = min(opacity, opacity**DENSITY_EXPONENT)
         else:
             opacity = float(scene.opacities[i])
         # replace the fine dilation by the coarse one: reduce the size as far as possible, then the opacity

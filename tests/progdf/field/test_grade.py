@@ -23,8 +23,8 @@ from progdf.field.baked import (
     unpack_levels,
 )
 from progdf.field.grade import (
-    COARSER,
     MAX_COLOR,
+    RESIDUAL_STEPS,
     bake_grade,
     band_offsets,
     fit_grade,
@@ -241,7 +241,7 @@ def test_coarser_levels_take_fewer_bytes_and_are_off_by_a_step_at_most() -> None
     table = torch.stack([identity_map(1), some_table(1)])
     forms = {
         k: fit_grade(torch.tensor([0.0, 1.0]), 1, table, course, 1, torch.ones(len(rows)), coarser=k)
-        for k in COARSER
+        for k in RESIDUAL_STEPS
     }
     sizes = [form.bytes_per_member for form in forms.values()]
     assert sizes[::2] == sorted(sizes[::2], reverse=True)

@@ -217,7 +217,7 @@ def test_a_reader_that_crashes_hangs_or_is_missing_is_one_line(
     path = write_scene(tmp_path / "a.spz", scene_of())
     script = tmp_path / "child.py"
     monkeypatch.setattr(native_child, "__file__", str(script))
-    monkeypatch.setattr(formats, "SECONDS", (1, 0.0))
+    monkeypatch.setattr(formats, "TIME_LIMIT_S", (1, 0.0))
     for body, said in (
         ("import os; os.kill(os.getpid(), 11)", "crashed (SIGSEGV)"),
         ("import time; time.sleep(60)", "did not answer within 2 s"),

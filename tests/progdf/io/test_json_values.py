@@ -9,7 +9,7 @@ import pytest
 from progdf.cli.info import main as info
 from progdf.errors import ProgdfError
 from progdf.io.cameras import load_cameras
-from progdf.io.json_values import DEEPEST, decode_json
+from progdf.io.json_values import MAX_NESTING, decode_json
 from progdf.io.session import SessionFile, read_session
 from tests.helpers.hostile import JSON_TEXTS
 from trainer.store.state import StateFolder
@@ -29,7 +29,7 @@ def test_ordinary_values_come_as_they_are() -> None:
         "b": {"c": 123456789012345678},
     }
     assert decode_json("1" + "0" * 30) == 1e30
-    deep = "[" * DEEPEST + "]" * DEEPEST
+    deep = "[" * MAX_NESTING + "]" * MAX_NESTING
     assert decode_json(deep) is not None
 
 

@@ -18,8 +18,8 @@ from progdf.quaternions import normalize_quats, rotation_matrices
 from progdf.rasterize import ActivatedGaussians, activate, render
 from progdf.rasterize.cpu.engine import make_pinhole
 from progdf.rasterize.cpu.pyramid import (
+    BUDGET_FILL,
     DENSITY,
-    ENOUGH,
     LONGEST,
     SCALES,
     SPREAD,
@@ -97,7 +97,7 @@ def test_the_fast_one_draws_what_the_plain_one_draws(count: int, budget: int, an
     # a loss within rounding of the limit falls on either side
     assert len(set(picks) ^ set(plain.picks)) <= 0.02 * len(picks)
     assert len(picks) <= budget
-    assert (len(picks) >= ENOUGH * budget) == (budget < count)
+    assert (len(picks) >= BUDGET_FILL * budget) == (budget < count)
     both = [pick in plain.picks for pick in picks]
     fast = pyramid.simplify(camera, budget, PIXELS).select(torch.tensor(both))
     expected = plain.taken([pick for pick, shared in zip(picks, both, strict=True) if shared])

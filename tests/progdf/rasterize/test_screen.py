@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from progdf.rasterize.screen import fill_screen, lines_behind
+from progdf.rasterize.screen import draw_lines_behind, fill_screen
 
 
 @pytest.mark.parametrize("size", [(130, 90), (260, 180), (259, 179), (1, 1)])
@@ -33,7 +33,7 @@ def test_a_line_is_a_pixel_wide_seen_through_and_gone_afterwards_bit_for_bit() -
     through[:, 15:] = 0.0
     before = image.copy()
     lines = np.array([line(-1e7, 10.5, 1e7, 10.5), line(5.5, -3, 5.5, 400), line(0, 0, 30, 20)], np.float32)
-    with lines_behind(image, through, lines, 0.5):
+    with draw_lines_behind(image, through, lines, 0.5):
         assert (image[10, :15] == 0.0).all()
         assert (image[:, 5] == 0.0).all()
         assert np.array_equal(image[:, 15:], before[:, 15:]), "behind what covers it"
@@ -47,12 +47,12 @@ def test_lines_fade_and_those_that_are_nowhere_draw_nothing() -> None:
     through = np.ones((8, 64), np.float32)
     fading = line(0, 4.5, 64, 4.5)
     fading[8] = 1.0
-    with lines_behind(image, through, np.array([fading], np.float32), 0.25):
+    with draw_lines_behind(image, through, np.array([fading], np.float32), 0.25):
         assert (np.diff(image[4, :, 0]) >= 0.0).all()
         assert image[4, 0, 0] == 0.0
         assert image[4, 63, 0] > 0.98
     nowhere = [line(3, 3, 3, 3), line(-9, -9, -5, 90), line(9, 100, 90, 100)]
-    with lines_behind(image, through, np.array(nowhere, np.float32), 0.5):
+    with draw_lines_behind(image, through, np.array(nowhere, np.float32), 0.5):
         assert (image == 1.0).all()
 
 
@@ -63,7 +63,7 @@ def test_the_last_bit_of_a_line_that_crosses_the_picture_moves_no_pixel() -> Non
     for shift in np.linspace(-2e-5, 2e-5, 21):
         image = np.ones((24, 64, 3), np.float32)
         lines = [line(-20.0 + shift, 3.3, 84.0 + shift, 16.1), line(12.3, -9.0 + shift, 18.4, 40.0 + shift)]
-        with lines_behind(image, through, np.array(lines, np.float32), 0.5):
+        with draw_lines_behind(image, through, np.array(lines, np.float32), 0.5):
             drawn.append(image.copy())
     # a pixel's share follows the line's place: 4e-5 of a pixel, and float32 has steps of 8e-6 there
     assert np.ptp(np.stack(drawn), axis=0).max() < 1e-4

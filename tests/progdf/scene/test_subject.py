@@ -15,7 +15,7 @@ from progdf.demo_scenes import DemoScene
 from progdf.formats.ply import load_ply
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.scene.bounds import front_direction, is_surrounding
-from progdf.scene.subject import fit_eye, is_room, standpoint, subject_rows
+from progdf.scene.subject import fit_eye, is_room, room_viewpoint, subject_rows
 from progdf.scene.up_axis import AXES, axis_direction, guess_up
 from tests.helpers.demo_scenes import bear, room
 from tests.helpers.paths import SHARED_DATA
@@ -155,7 +155,7 @@ def test_fitting_keeps_the_direction_and_the_lens(demo: DemoScene) -> None:
 def test_a_room_is_met_inside_past_what_stands_in_it() -> None:
     demo = room(4000)
     assert is_room(demo.gaussians, UP)
-    eye, target = standpoint(demo.gaussians, UP)
+    eye, target = room_viewpoint(demo.gaussians, UP)
     assert float(eye[[0, 2]].abs().max()) < 1.9, "within its walls"
     assert 0.8 < float(eye[1]) < 2.2, "between its floor and its ceiling"
     assert float((target - eye).norm()) > 1.0

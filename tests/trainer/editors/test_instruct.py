@@ -33,7 +33,7 @@ from trainer.editors.mixed_steps import MixedSteps, network_steps
 from trainer.options import EditorOptions, TrainOptions, with_values
 from trainer.resolve import resolve, resolve_kind
 from trainer.run.run import check_command
-from trainer.store.pretrained import Shared
+from trainer.store.pretrained import LastValueCache
 from trainer.store.run_folder import RunFolder, begin_log
 from trainer.views.view import render_view
 
@@ -159,7 +159,7 @@ def test_what_a_model_leaves_alone_stays_to_the_bit(pix2pix: str) -> None:
 def test_a_kept_model_is_loaded_again_where_its_sentence_would_be_encoded_otherwise(
     pix2pix: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("trainer.store.pretrained._models", Shared())
+    monkeypatch.setattr("trainer.store.pretrained._models", LastValueCache())
     view = small().views[0]
     with_guidance, without, again = (
         editor_of(settings_of(pix2pix, guidance=guidance)).edit(view, 1.0) for guidance in ("7.5", "1", "7.5")

@@ -13,7 +13,7 @@ from progdf.errors import ProgdfError
 from progdf.io.images import write_image
 from tests.helpers.trained import small
 from trainer.editors import make_editor
-from trainer.editors.cache import KeptPictures
+from trainer.editors.cache import PictureCache
 from trainer.editors.style import StyleEditor, cross_fade
 from trainer.options import EditKind, EditorOptions
 from trainer.setup import confines_edit
@@ -102,7 +102,7 @@ class Counting:
 
 def _negatives(folder: Path, recipe: dict[str, str | int | float | None]) -> tuple[StyleEditor, Counting]:
     paint = Counting()
-    return StyleEditor(paint, recipe, KeptPictures(folder)), paint
+    return StyleEditor(paint, recipe, PictureCache(folder)), paint
 
 
 def test_a_view_is_painted_once_whatever_the_strengths(tmp_path: Path) -> None:
@@ -118,7 +118,7 @@ def test_a_view_is_painted_once_whatever_the_strengths(tmp_path: Path) -> None:
 @pytest.mark.parametrize("change", ["recipe", "view", "picture deleted", "picture broken", "note broken"])
 def test_a_picture_that_is_kept_of_something_else_is_painted_anew(tmp_path: Path, change: str) -> None:
     source = small().views[0].image
-    KeptPictures(tmp_path).picture("v", source, {"style": 1}, Counting())
+    PictureCache(tmp_path).picture("v", source, {"style": 1}, Counting())
     recipe: dict[str, str | int | float | None] = {"style": 1}
     if change == "recipe":
         recipe = {"style": 2}
@@ -131,32 +131,32 @@ def test_a_picture_that_is_kept_of_something_else_is_painted_anew(tmp_path: Path
     else:
         (tmp_path / "v.json").write_text("{")
     paint = Counting()
-    found = KeptPictures(tmp_path).picture("v", source, recipe, paint)
+    found = PictureCache(tmp_path).picture("v", source, recipe, paint)
     assert paint.calls == 1
     assert torch.allclose(found, 1.0 - source, atol=0.5 / 255 + 1e-6)
-    KeptPictures(tmp_path).picture("v", source, recipe, paint)
+    PictureCache(tmp_path).picture("v", source, recipe, paint)
     assert paint.calls == 1, "and kept"
 
 
 def test_a_picture_touched_up_by_hand_stays(tmp_path: Path) -> None:
     source = small().views[0].image
-    KeptPictures(tmp_path).picture("v", source, {"style": 1}, Counting())
+    PictureCache(tmp_path).picture("v", source, {"style": 1}, Counting())
     touched = torch.full_like(source, 128 / 255)
     write_image(tmp_path / "v.png", touched)
-    assert torch.equal(KeptPictures(tmp_path).picture("v", source, {"style": 1}, Counting()), touched)
+    assert torch.equal(PictureCache(tmp_path).picture("v", source, {"style": 1}, Counting()), touched)
 
 
 def test_a_painter_that_fails_leaves_no_note_behind(tmp_path: Path) -> None:
     source = small().views[0].image
-    KeptPictures(tmp_path).picture("v", source, {"style": 1}, Counting())
+    PictureCache(tmp_path).picture("v", source, {"style": 1}, Counting())
 
     def fails(picture: Tensor) -> Tensor:
         raise RuntimeError
 
     with pytest.raises(RuntimeError):
-        KeptPictures(tmp_path).picture("v", source, {"style": 2}, fails)
+        PictureCache(tmp_path).picture("v", source, {"style": 2}, fails)
     paint = Counting()
-    KeptPictures(tmp_path).picture("v", source, {"style": 1}, paint)
+    PictureCache(tmp_path).picture("v", source, {"style": 1}, paint)
     assert paint.calls == 0, "what was kept before is complete"
 
 
@@ -164,7 +164,7 @@ def test_killed_between_picture_and_note_it_is_painted_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = small().views[0].image
-    KeptPictures(tmp_path).picture("v", source, {"style": 1}, Counting())
+    PictureCache(tmp_path).picture("v", source, {"style": 1}, Counting())
 
     class Killed(BaseException):
         pass
@@ -175,9 +175,9 @@ def test_killed_between_picture_and_note_it_is_painted_anew(
     with monkeypatch.context() as patched:
         patched.setattr("trainer.editors.cache.write_json", killed)
         with pytest.raises(Killed):
-            KeptPictures(tmp_path).picture("v", source, {"style": 2}, lambda picture: 0.5 * picture)
+            PictureCache(tmp_path).picture("v", source, {"style": 2}, lambda picture: 0.5 * picture)
     paint = Counting()
-    KeptPictures(tmp_path).picture("v", source, {"style": 1}, paint)
+    PictureCache(tmp_path).picture("v", source, {"style": 1}, paint)
     assert paint.calls == 1, "the picture on disk is that of style 2"
 
 

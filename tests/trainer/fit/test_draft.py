@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from progdf.compose.reference import Layer, compose_layers
-from progdf.demo_scenes import SMALLEST_ROOM, room
+from progdf.demo_scenes import MIN_ROOM_GAUSSIANS, room
 from progdf.gdf.file import Gdf, load_gdf, save_gdf
 from progdf.region import from_mask
 from tests.helpers.trained import WHITE, masked_psnr, small
@@ -70,13 +70,13 @@ def test_a_draft_says_that_it_is_one_and_how_near_it_is(tmp_path: Path) -> None:
 
 def test_what_a_map_of_color_leaves_too_much_of_has_no_draft(monkeypatch: pytest.MonkeyPatch) -> None:
     assert draft_grade(views(), EditorOptions("stripes:#20a040"), "stripes") is None
-    monkeypatch.setattr(draft, "CARRIED", 1e-5)
+    monkeypatch.setattr(draft, "MAX_UNEXPLAINED_SHARE", 1e-5)
     monkeypatch.setattr(draft, "ROUNDING", 0.0)
     assert draft_grade(views(), EditorOptions("recolor:#3060d0"), "blue") is None
 
 
 def test_a_grade_by_hand_is_live_however_little_a_map_carries_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(draft, "CARRIED", 1e-5)
+    monkeypatch.setattr(draft, "MAX_UNEXPLAINED_SHARE", 1e-5)
     monkeypatch.setattr(draft, "ROUNDING", 0.0)
     made = draft_grade(views(), EditorOptions(GRADE), "grade")
     assert made is not None
@@ -90,7 +90,7 @@ def test_a_region_that_no_view_shows_has_no_draft() -> None:
 
 
 def test_a_scene_to_stand_inside_has_no_draft_without_cameras() -> None:
-    scene = room(SMALLEST_ROOM).gaussians
+    scene = room(MIN_ROOM_GAUSSIANS).gaussians
     region = from_mask("all", torch.ones(len(scene), dtype=torch.bool))
     assert draft_views(TrainingViewOptions(), scene, region) is None
 

@@ -19,7 +19,7 @@ from progdf.rasterize.engines import color_map
 from progdf.sh import rgb_to_sh0
 from progdf.threads import map_threads
 from tests.helpers.scenes import random_gaussians
-from trainer.optimize.color_course import Course, Target, solve, thin_model
+from trainer.optimize.color_course import StrengthSchedule, Target, solve, thin_model
 from trainer.optimize.color_solver import (
     Model,
     Solver,
@@ -27,7 +27,7 @@ from trainer.optimize.color_solver import (
     choose_model,
     make_solver,
 )
-from trainer.optimize.color_views import Judge, color_views
+from trainer.optimize.color_views import ColorEvaluator, color_views
 from trainer.optimize.pgs import OnStep, ParameterSnapshot, PgsState, TargetStage
 from trainer.views.crops import CropScene, crop_scene, render_all
 
@@ -72,7 +72,7 @@ def grainy(pictures: list[Tensor], sigma: float) -> list[Tensor]:
 
 
 def model_of(solver: Solver, targets: list[Tensor], steps: int = 40, bands: int = 4) -> Model:
-    return choose_model(solver, (solver, Judge(solver.views, targets)), targets, steps, bands)[1]
+    return choose_model(solver, (solver, ColorEvaluator(solver.views, targets)), targets, steps, bands)[1]
 
 
 def solve_all(
@@ -85,8 +85,8 @@ def solve_all(
     made: list[ParameterSnapshot] | None = None,
 ) -> list[ParameterSnapshot]:
     """The recordings, in half precision as a run has them; all views say when a stage is done."""
-    targets = [(stage, Judge(solver.views, stage.targets)) for stage in stages]
-    course = Course(targets[:-1], targets[-1])
+    targets = [(stage, ColorEvaluator(solver.views, stage.targets)) for stage in stages]
+    course = StrengthSchedule(targets[:-1], targets[-1])
     made = [] if made is None else made
     for snapshot in solve(solver, model, course, made, state, on_step, steps):
         made.append(replace(snapshot, offsets=snapshot.offsets.half()))
@@ -201,7 +201,7 @@ def test_what_some_members_get_and_others_do_not_is_a_mask(profile: str) -> None
     others, _ = prepared(scene, cameras[6:])
     targets, aside = (render_all(some, pack(edited, with_shN=True)) for some in (crops, others))
     solver = make_solver(color_views(crops, original), original)
-    judge = Judge(color_views(others, original), aside)
+    judge = ColorEvaluator(color_views(others, original), aside)
     solver, model = choose_model(solver, (solver, judge), targets, 40, 4)
     assert (model.degree, model.mask is None) == (1, False), model.line
     seen = solver.weights[:, 0, 0] > 0.2 * solver.typical
@@ -227,7 +227,7 @@ def test_a_pattern_of_many_colors_gets_a_residual_and_only_as_many_bands_as_pay(
             [p + 0.01 * torch.randn(p.shape, generator=rng) for p in render_all(some, rows)]
             for some in (crops, others)
         )
-        judge = Judge(color_views(others, original), aside)
+        judge = ColorEvaluator(color_views(others, original), aside)
         return choose_model(solver, (solver, judge), targets, 40, most)[1].bands
 
     solver = make_solver(color_views(crops, original), original)
@@ -248,7 +248,7 @@ def test_only_members_that_need_them_have_functions_beyond_dc(turning: float, sp
     solver = make_solver(color_views(crops, original), original)
     targets = grainy(render_all(crops, rows), 0.0125)
     aside = grainy(render_all(others, rows), 0.0125)
-    judge = Judge(color_views(others, original), aside)
+    judge = ColorEvaluator(color_views(others, original), aside)
     solver, model = choose_model(solver, (solver, judge), targets, 40, 4)
     thinner = thin_model(model, solver, [(TargetStage(1.0, targets, 1), judge)], 40, spare)
     mapped = solver.fit_map(model.degree, targets)[1]
@@ -273,7 +273,7 @@ def test_where_the_end_shows_no_error_another_band_is_tried_for_the_way(turned: 
 
     def target(s: float, shn: Tensor) -> Target:
         rows = pack(replace(scene, sh0=scene.sh0 + s * draws, shN=shn), with_shN=True)
-        return TargetStage(s, render_all(crops, rows), 1), Judge(aside, render_all(others, rows))
+        return TargetStage(s, render_all(crops, rows), 1), ColorEvaluator(aside, render_all(others, rows))
 
     end = target(1.0, scene.shN)
     half = target(0.5, -scene.shN if turned else scene.shN)
@@ -308,8 +308,8 @@ def test_strengths_are_asked_for_where_those_that_are_solved_for_say_too_little(
         moved = replace(scene, sh0=scene.sh0 + side * torch.tensor(courses[bend](s)))
         return grainy(render_all(some, pack(moved, with_shN=False)), 0.01 * s)
 
-    def look(s: float) -> Judge:
-        return Judge(aside, pictures(others, s))
+    def look(s: float) -> ColorEvaluator:
+        return ColorEvaluator(aside, pictures(others, s))
 
     rounds = [0]  # how many were asked for by the end of each
 
@@ -317,8 +317,8 @@ def test_strengths_are_asked_for_where_those_that_are_solved_for_say_too_little(
         rounds.append(rounds[-1] + len(strengths))
         return [(TargetStage(s, pictures(crops, s), 1), look(s)) for s in strengths]
 
-    def course_of(asked: Sequence[float]) -> Course:
-        return Course(ask(asked), ask([1.0])[0], look, ask)
+    def course_of(asked: Sequence[float]) -> StrengthSchedule:
+        return StrengthSchedule(ask(asked), ask([1.0])[0], look, ask)
 
     _, model = choose_model(solver, (solver, look(1.0)), pictures(crops, 1.0), 40, 1)
     course = course_of([])
@@ -358,7 +358,7 @@ def test_steps_end_where_other_views_gain_little_and_go_on_where_members_are_den
     solver = make_solver(color_views(crops, original), original)
     _, mapped = solver.fit_map(1, targets)
     start = torch.zeros(members, 1, 3)
-    judge = Judge(color_views(others, original), aside)
+    judge = ColorEvaluator(color_views(others, original), aside)
     found, taken = solver.residual(mapped, start, targets, most, judge)
     assert taken > 0.9 * most if members == 6000 else taken < most / 2
     further, all_steps = solver.residual(mapped, start, targets, most)

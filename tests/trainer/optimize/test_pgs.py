@@ -12,7 +12,7 @@ from progdf.gaussians import attribute_slices, pack
 from progdf.rasterize import render
 from tests.helpers.trained import WHITE, Small, course, masked_psnr, small
 from trainer.editors import make_editor
-from trainer.optimize.pgs import ParameterSnapshot, learning_rates, most_change, optimize
+from trainer.optimize.pgs import ParameterSnapshot, learning_rates, optimize, p95_change
 from trainer.options import EditorOptions
 from trainer.views.crops import crop_scene
 from trainer.views.view import crop
@@ -103,8 +103,8 @@ def test_steps_are_sized_by_the_farthest_changes_and_not_by_their_mean() -> None
     target = torch.full((10, 10, 3), 0.02)
     target[:1, :, 1] = 0.5  # a tenth of the pixels goes far
     target[5:] = 0.0  # half do not change at all
-    assert most_change([target], [before]) == pytest.approx(0.5)
-    assert most_change([before], [before]) == 0.0
+    assert p95_change([target], [before]) == pytest.approx(0.5)
+    assert p95_change([before], [before]) == 0.0
     strip = torch.full((20, 10, 3), 0.1)
     strip[0, :2] = 1.0  # a hundredth is no measure
-    assert most_change([strip], [torch.zeros(20, 10, 3)]) == pytest.approx(0.1)
+    assert p95_change([strip], [torch.zeros(20, 10, 3)]) == pytest.approx(0.1)

@@ -13,7 +13,7 @@ from progdf.metrics.image import decibels
 from progdf.sh import C0, rgb_to_sh0
 from tests.helpers.trained import edit_few
 from trainer.optimize.color_solver import choose_model, make_solver, split_solver
-from trainer.optimize.color_views import Judge, color_views
+from trainer.optimize.color_views import ColorEvaluator, color_views
 from trainer.optimize.ties import Ties, surface_graph
 from trainer.views.crops import crop_scene
 from trainer.views.view import render_view
@@ -174,7 +174,7 @@ def test_what_the_members_do_not_show_is_no_error_of_theirs() -> None:
     same = render_view(scene, camera, WHITE)
     still = torch.zeros(len(members), 1, 3)
     share = views[0].share.view(96, 96, 1)
-    assert Judge(views, [same]).mean(still, 1.0) < 1e-3
-    assert Judge(views, [same.where(share > 0.0, torch.zeros(3))]).mean(still, 1.0) < 1e-3
-    black = Judge(views, [torch.zeros_like(same)]).mean(still, 1.0)
+    assert ColorEvaluator(views, [same]).mean(still, 1.0) < 1e-3
+    assert ColorEvaluator(views, [same.where(share > 0.0, torch.zeros(3))]).mean(still, 1.0) < 1e-3
+    black = ColorEvaluator(views, [torch.zeros_like(same)]).mean(still, 1.0)
     assert abs(black - 0.5) < 0.05  # the mean of the wall's color

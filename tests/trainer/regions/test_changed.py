@@ -15,7 +15,7 @@ from torch import Tensor
 from progdf.camera import Camera, intrinsics, look_at
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
-from progdf.io.images import save_as, to_picture
+from progdf.io.images import saving_loss, to_picture
 from progdf.io.picture_camera import camera_chunk
 from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.regions import check_region, parse_region
@@ -150,7 +150,7 @@ def test_an_untouched_picture_has_no_change(
     for name, how in (("A.png", {}), ("A.jpg", {"quality": 90})):
         rendered.save(tmp_path / name, **how)
         original, picture = read_change(scene, tmp_path / name, camera)
-        assert not bool(find_change(original, picture, save_as(tmp_path / name)).any()), name
+        assert not bool(find_change(original, picture, saving_loss(tmp_path / name)).any()), name
 
 
 def test_a_faint_tint_of_a_png_is_found(tmp_path: Path) -> None:
@@ -162,7 +162,9 @@ def test_a_faint_tint_of_a_png_is_found(tmp_path: Path) -> None:
     truth &= (rendered > 4).all(axis=2)
     rendered[truth] -= 4
     Image.fromarray(rendered).save(tmp_path / "A.png")
-    found = find_change(*read_change(scene, tmp_path / "A.png", camera), save_as(tmp_path / "A.png")).numpy()
+    found = find_change(
+        *read_change(scene, tmp_path / "A.png", camera), saving_loss(tmp_path / "A.png")
+    ).numpy()
     assert (found & truth).sum() > 0.95 * (found | truth).sum()
 
 

@@ -23,7 +23,7 @@ from tests.helpers.trained import WHITE, Small, small
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.fit.fit import drop_idle_attributes
 from trainer.optimize.losses import GradientL1
-from trainer.report.measures import picture_courses
+from trainer.report.measures import error_curves
 from trainer.report.plots import LINES, Plot, draw_plot
 from trainer.report.report import best_view, columns_of, editor_strip, strip, thumbnail
 from trainer.store.progress import RunLog
@@ -54,7 +54,7 @@ def test_a_field_that_is_what_it_should_be_has_no_error_in_any_measure() -> None
     field = _darker(bear)
     truth = {s: evaluator.pictures(field.offsets(s)) for s in (0.3, 0.8)}
     shown = {"slider": evaluator.course(field)}
-    found = picture_courses(evaluator, shown, (0.3, 0.8), lambda s: truth[s], GradientL1())["slider"]
+    found = error_curves(evaluator, shown, (0.3, 0.8), lambda s: truth[s], GradientL1())["slider"]
     assert found.s == (0.3, 0.8)
     assert found.psnr == (99.0, 99.0)
     assert found.ssim == pytest.approx((1.0, 1.0), abs=1e-5)  # single precision
@@ -66,7 +66,7 @@ def test_all_measures_agree_which_of_two_fields_is_nearer() -> None:
     evaluator = _judged(bear)
     shown = {name: evaluator.course(_darker(bear, by)) for name, by in (("near", 0.55), ("far", 0.2))}
     truth = evaluator.pictures(_darker(bear).offsets(1.0))
-    found = picture_courses(evaluator, shown, (1.0,), lambda _: truth, GradientL1())
+    found = error_curves(evaluator, shown, (1.0,), lambda _: truth, GradientL1())
     assert found["near"].psnr[0] > found["far"].psnr[0] + 6
     assert found["near"].ssim[0] > found["far"].ssim[0]
     assert found["near"].lpips[0] < found["far"].lpips[0]

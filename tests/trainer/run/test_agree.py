@@ -19,14 +19,14 @@ from progdf.io.images import write_image
 from progdf.metrics.image import decibels
 from tests.helpers.ideal_painter import IdealPainter, WholeViews, hues, phases
 from tests.helpers.trained import WHITE, Small, small
-from trainer.editors.cache import KeptPictures
+from trainer.editors.cache import PictureCache
 from trainer.editors.style import StyleEditor
 from trainer.report.agreement import Agreement, fit_colors, measure_agreement, view_change
 from trainer.run.agree import (
     MAX_MOVED,
     AgreedEditor,
-    Easel,
     Fit,
+    PaintCache,
     Registration,
     agree_views,
     beside_region,
@@ -37,7 +37,7 @@ from trainer.setup import TrainingSetup
 from trainer.store.progress import RunLog
 from trainer.views.view import View
 
-NOTHING = KeptPictures(None)
+NOTHING = PictureCache(None)
 STYLE = StyleEditor(lambda picture: picture, {}, NOTHING)
 
 
@@ -92,7 +92,7 @@ def followed(kind: str) -> tuple[int, float, float]:
 
 def agreed(some: Family, painter: IdealPainter, folder: Path, seed: int = 0) -> AgreedEditor:
     log = RunLog(folder / "log.txt", quiet=True)
-    return agree_views(Easel(painter, {}, NOTHING, seed), some.setup, STYLE, log)
+    return agree_views(PaintCache(painter, {}, NOTHING, seed), some.setup, STYLE, log)
 
 
 @cache
@@ -130,7 +130,7 @@ def test_views_follow_a_picture_that_was_approved_at_every_degree(tmp_path: Path
     log = RunLog(tmp_path / "log.txt", quiet=True)
     view = some.setup.train[0]
     for approved in (2, 7):
-        easel = Easel(some.painter(), {}, NOTHING, 0)
+        easel = PaintCache(some.painter(), {}, NOTHING, 0)
         made = agree_views(easel, some.setup, STYLE, log, (view, some.choices[0][approved]))
         for s in (1.0, 0.5):
             off = 0
@@ -214,7 +214,7 @@ def clumsy(seeds: Sequence[int], folder: Path) -> tuple[AgreedEditor, Clumsy, Vi
     view = setup.train[3]
     painter = Clumsy(view, 0.09, seeds)
     log = folder / "log.txt"
-    made = agree_views(Easel(painter, {}, NOTHING, 5), setup, STYLE, RunLog(log, quiet=True))
+    made = agree_views(PaintCache(painter, {}, NOTHING, 5), setup, STYLE, RunLog(log, quiet=True))
     return made, painter, view, log.read_text(encoding="utf-8")
 
 
@@ -240,7 +240,7 @@ def test_a_model_that_moves_everything_is_one_line(tmp_path: Path) -> None:
         def paint(self, picture: Tensor, references: Sequence[Tensor] = (), **how: object) -> Tensor:
             return moved(picture, 0.0, 0.0, 0.1)
 
-    easel = Easel(Enlarging(setup.train[0], 0.1, ()), {}, NOTHING, 0)
+    easel = PaintCache(Enlarging(setup.train[0], 0.1, ()), {}, NOTHING, 0)
     with pytest.raises(ProgdfError, match=f"by more than {MAX_MOVED:.0%}; ") as told:
         agree_views(easel, setup, STYLE, RunLog(tmp_path / "log.txt", quiet=True))
     assert "\n" not in str(told.value)
@@ -272,7 +272,7 @@ class Counting(WholeViews):
 def painted(folder: Path, painter: Counting, recipe: dict[str, str] | None = None) -> AgreedEditor:
     folder.mkdir(exist_ok=True)
     setup = setup_of(small("scarf", 1500, 6, 64), 1)
-    easel = Easel(painter, recipe or {}, KeptPictures(folder / "painted"), 0)
+    easel = PaintCache(painter, recipe or {}, PictureCache(folder / "painted"), 0)
     return agree_views(easel, setup, STYLE, RunLog(folder / "log.txt", quiet=True))
 
 
@@ -357,7 +357,7 @@ def test_pictures_that_agree_because_they_are_washed_out_do_not_agree(tmp_path: 
             return edits.mean(dim=0) if source is not None else edits[int(how["seed"]) % len(edits)]
 
     log = RunLog(tmp_path / "log.txt", quiet=True)
-    made = agree_views(Easel(Washing(some.painter()), {}, NOTHING, 0), some.setup, STYLE, log)
+    made = agree_views(PaintCache(Washing(some.painter()), {}, NOTHING, 0), some.setup, STYLE, log)
     found = judge(some, [made.edit(view, 1.0) for view in some.setup.views])
     assert found.agree, "by themselves"
     contrast = made.figures["contrast"]

@@ -22,7 +22,7 @@ from tests.helpers.trained import quick_options, train
 from trainer.editors import make_editor
 from trainer.evaluate.command import evaluate
 from trainer.options import EditorOptions, EvaluateOptions, TrainingViewOptions, with_values
-from trainer.report.measures import PaintTaken, measure_paint
+from trainer.report.measures import PaintReproduction, measure_paint
 from trainer.run.run import RunResult
 from trainer.setup import make_training_setup
 from trainer.views.view import View, render_view
@@ -137,15 +137,15 @@ def test_what_saving_does_beside_the_members_is_not_counted_as_painted(folder: P
 
 
 def test_detail_finer_than_the_splats_is_said_with_both_counts() -> None:
-    assert PaintTaken(0.37, 0.2, 2074, 457, False).warning == (
+    assert PaintReproduction(0.37, 0.2, 2074, 457, False).warning == (
         "37 % of the paint was reproduced: 457 Gaussians for 2 074 painted pixels; "
         "the detail is finer than the Gaussians"
     )
 
 
 def test_a_faint_paint_warns_where_the_larger_part_is_missing() -> None:
-    assert PaintTaken(0.49, 0.01, 100, 90, False).warning
-    assert not PaintTaken(0.51, 0.01, 100, 90, False).warning
+    assert PaintReproduction(0.49, 0.01, 100, 90, False).warning
+    assert not PaintReproduction(0.51, 0.01, 100, 90, False).warning
 
 
 def test_the_way_is_neither_gray_nor_raw(done: RunResult) -> None:

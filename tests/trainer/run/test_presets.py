@@ -12,7 +12,7 @@ import torch
 
 import trainer.run.run
 from progdf.errors import ProgdfError
-from progdf.io.json_values import convert_json, plain
+from progdf.io.json_values import convert_json, to_json
 from trainer.cli import train_options
 from trainer.optimize.pgs import pgs_settings
 from trainer.options import (
@@ -45,14 +45,14 @@ def test_every_preset_is_there_and_the_default_one_changes_nothing() -> None:
 
 @pytest.mark.parametrize("preset", [name for name in PRESETS if name != "default"])
 def test_a_preset_is_its_values_and_no_more(preset: Preset) -> None:
-    plain = asked()
+    to_json = asked()
     found = asked("--preset", preset)
     for part, values in PRESETS[preset].items():
-        before = vars(getattr(plain, part))
+        before = vars(getattr(to_json, part))
         after = vars(getattr(found, part))
         assert after == {**before, **values}
-    parts = {part: getattr(plain, part) for part in PRESETS[preset]}
-    assert replace(found, preset="default", **parts) == plain
+    parts = {part: getattr(to_json, part) for part in PRESETS[preset]}
+    assert replace(found, preset="default", **parts) == to_json
     assert found == apply_preset(asked(), preset), "Python has the same"
 
 
@@ -124,19 +124,19 @@ def test_parts_move_as_wholes_only_where_something_moves() -> None:
 
 def test_a_color_edit_holds_the_geometry_still_unless_the_plain_rates_are_asked_for() -> None:
     ours = pgs_settings(planned("color"), True, 23, 1.0, 4).rates
-    plain = pgs_settings(planned("color", "--preset", "paper"), True, 23, 1.0, 4).rates
+    to_json = pgs_settings(planned("color", "--preset", "paper"), True, 23, 1.0, 4).rates
     assert torch.equal(ours[:11], torch.zeros(11))
-    assert float(plain[:11].min()) > 0
-    assert float(ours[11]) > 5 * float(plain[11])
+    assert float(to_json[:11].min()) > 0
+    assert float(ours[11]) > 5 * float(to_json[11])
 
 
 def test_the_papers_rates_are_those_of_3dgs_as_gaussian_editor_multiplies_them() -> None:
-    plain, multiplied = (
+    to_json, multiplied = (
         pgs_settings(planned("color", "--preset", "paper", *words), True, 14, 1.0, 1).rates
         for words in (("--rates", "3dgs"), ())
     )
     factors = [5.0] * 3 + [2.0] * 8 + [5.0] * 3  # means; log-scales, quaternion, opacity; color
-    assert torch.allclose(multiplied / plain, torch.tensor(factors))
+    assert torch.allclose(multiplied / to_json, torch.tensor(factors))
 
 
 @pytest.mark.parametrize(("part", "changes"), [("target_ramp", "ramp"), ("ema", "smoothing")])
@@ -165,7 +165,7 @@ def test_only_a_color_edit_may_leave_the_bands_alone() -> None:
 def test_a_plan_is_read_back_from_json_as_it_was() -> None:
     for words in ((), ("--preset", "paper"), ("--quick", "--cameras", "c.json", "--text-before", "a bear")):
         plan = resolve(asked(*words))
-        assert convert_json(json.loads(json.dumps(plain(plan))), TrainOptions) == plan
+        assert convert_json(json.loads(json.dumps(to_json(plan))), TrainOptions) == plan
 
 
 def test_two_plans_differ_by_the_first_option_that_does() -> None:

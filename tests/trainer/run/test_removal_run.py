@@ -34,7 +34,7 @@ from trainer.options import (
     TrainOptions,
     with_values,
 )
-from trainer.run.removal import on_backgrounds, with_crumbs
+from trainer.run.removal import on_backgrounds, with_strays
 from trainer.run.resume import picture_digests
 from trainer.run.run import train
 from trainer.setup import TrainingSetup, make_training_setup
@@ -255,12 +255,12 @@ def test_what_would_float_alone_without_the_region_goes_with_it(scene_file: Path
     region = from_mask(
         "post", (torch.arange(len(whole)) >= len(rest)) & (torch.arange(len(whole)) < len(scene))
     )
-    taken = with_crumbs(whole, region)
+    taken = with_strays(whole, region)
     assert taken.members.tolist() == [*region.members.tolist(), len(scene), len(scene) + 1]
-    assert torch.equal(with_crumbs(scene, members_of(scene)).members, members_of(scene).members)
+    assert torch.equal(with_strays(scene, members_of(scene)).members, members_of(scene).members)
     # what floats already is nobody's crumb
     assert (
-        len(with_crumbs(concatenate([rest, far]), from_mask("none", torch.zeros(len(rest) + 1).bool()))) == 0
+        len(with_strays(concatenate([rest, far]), from_mask("none", torch.zeros(len(rest) + 1).bool()))) == 0
     )
 
 

@@ -22,9 +22,9 @@ from tests.helpers.trained import train
 from tests.trainer.painted_wall import CAMERA, letters, paint_on, picture, wall
 from trainer.evaluate.command import evaluate
 from trainer.options import EditorOptions, EvaluateOptions, RegionOptions, TrainOptions, with_values
-from trainer.paint.discs import lay_on, place_discs, project_paint
+from trainer.paint.discs import composite_over, place_discs, project_paint
 from trainer.run.finish import RunResult
-from trainer.run.paint import Laid, choose_discs, lay_discs, orbit
+from trainer.run.paint import DiscLayout, choose_discs, lay_discs, orbit
 from trainer.views.view import BACKGROUND, render_view
 
 
@@ -95,7 +95,7 @@ def test_below_discs_a_fill_stays_and_what_lies_between_letters_goes_back(
     """What is better beside the sharp paint in its own picture; from aside one sees what lies below it."""
     bases = list[Gaussians]()
 
-    def choose(base: Gaussians, *rest: Any) -> Laid:
+    def choose(base: Gaussians, *rest: Any) -> DiscLayout:
         bases.append(base)
         return choose_discs(base, *rest)
 
@@ -146,7 +146,7 @@ def test_two_pictures_of_one_stripe_share_one_set_of_rows() -> None:
     first = paint_on(scene, stripe)
     camera = orbit(CAMERA, torch.zeros(3), 20.0)
     seen = project_paint(scene, CAMERA, first.drawn, camera)
-    image = lay_on(render_view(scene, camera, torch.tensor(BACKGROUND)).clamp(0, 1), seen)
+    image = composite_over(render_view(scene, camera, torch.tensor(BACKGROUND)).clamp(0, 1), seen)
     second = replace(first, camera=camera, picture=image, drawn=seen)
     alone, both = (lay_discs(scene, paints, 4.0) for paints in ([first], [first, second]))
     assert len(both.added) <= 1.05 * len(alone.added)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from trainer.editors.cache import KeptPictures
+from trainer.editors.cache import PictureCache
 from trainer.store.run_folder import RunFolder, remove_stale_views, write_views
 
 PICTURE = torch.zeros(2, 2, 3)
@@ -18,7 +18,7 @@ def written(root: Path) -> RunFolder:
     for kind, strength in (("original", 1.0), ("edited", 1.0), ("edited", 0.25)):
         write_views(folder, kind, {"a": PICTURE, "b": PICTURE}, strength)
     for name in "ab":
-        KeptPictures(folder.paintings).picture(name, PICTURE, {}, lambda image: image)
+        PictureCache(folder.paintings).picture(name, PICTURE, {}, lambda image: image)
     return folder
 
 

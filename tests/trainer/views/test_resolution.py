@@ -16,7 +16,7 @@ from tests.helpers.trained import quick_options, train, write_bear
 from trainer.options import EditorOptions, TrainingViewOptions
 from trainer.resolve import resolve
 from trainer.run.training import pixel_stride
-from trainer.setup import SAMPLING, SIZE, TrainingSetup, make_training_setup, take_glances
+from trainer.setup import SAMPLING, SIZE, TrainingSetup, make_training_setup, render_thumbnails
 
 
 def setup_of(count: int = 400, bands: int = 3, **said: object) -> TrainingSetup:
@@ -73,10 +73,10 @@ def test_a_region_is_looked_at_by_cameras_that_show_it(tmp_path: Path) -> None:
     region = Region("body", demo.members("body"), torch.ones(len(demo.members("body"))))
     away = [replace(c, viewmat=torch.diag(torch.tensor([-1.0, 1, -1, 1])) @ c.viewmat) for c in demo.cameras]
     save_cameras(tmp_path / "cameras.json", [*away, *demo.cameras[:4], *away])
-    seen = take_glances(TrainingViewOptions(tmp_path / "cameras.json"), demo.gaussians, region)
+    seen = render_thumbnails(TrainingViewOptions(tmp_path / "cameras.json"), demo.gaussians, region)
     assert len(seen) == 4
     assert all(bool(one.mask.any()) for one in seen)
-    assert len(take_glances(TrainingViewOptions(), demo.gaussians, region)) == 8
+    assert len(render_thumbnails(TrainingViewOptions(), demo.gaussians, region)) == 8
 
 
 @pytest.mark.parametrize("beside", ["", "views", "views/edited"])

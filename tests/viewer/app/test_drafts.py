@@ -67,7 +67,7 @@ def window(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[applicat
     folder = bear_files(tmp_path)
     monkeypatch.setattr(job_queue, "Child", Trainer)
     monkeypatch.setattr(preview, "PreviewChild", Previews)
-    monkeypatch.setattr(preview, "REST_S", 0.0)
+    monkeypatch.setattr(preview, "CAMERA_SETTLE_S", 0.0)
     Trainer.ended = None
     Trainer.line = ""
     Trainer.edit = folder / "edits" / "scarf.gdf"

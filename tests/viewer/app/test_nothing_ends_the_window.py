@@ -131,10 +131,10 @@ def test_failing_part_of_a_frame_leaves_the_others_unchanged(
     window.main_view.work = replace(window.main_view.work, message=None)
     turns(window)
     assert window.main_view.work.message is None, "its cross takes the message away"
-    monkeypatch.setattr(application, "SAY_AGAIN_S", 0.0)
+    monkeypatch.setattr(application, "REPEAT_MESSAGE_S", 0.0)
     turns(window, 2)
     assert f"BrokenError: {part}" in message(window).text, "and after a while it is said again"
-    monkeypatch.setattr(application, "SAY_AGAIN_S", 10.0)
+    monkeypatch.setattr(application, "REPEAT_MESSAGE_S", 10.0)
     drawn = window.main_view.frames
     while (wait := window.main_view.next_frame_delay()) == 0.0:
         window.draw()

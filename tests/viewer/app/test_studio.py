@@ -119,7 +119,7 @@ def test_trained_edit_becomes_a_layer_at_full_strength(window: application.App) 
 def test_selection_is_the_region_of_a_new_edit(window: application.App) -> None:
     view = window.main_view.work.view
     total = len(window.document.scene)
-    mask = selection.unpack(selection.NOBODY, total).copy()
+    mask = selection.unpack(selection.EMPTY_MASK, total).copy()
     mask[[3, 7]] = True
     chosen = selection.select(view.selection, mask)
     window.main_view.work = replace(window.main_view.work, view=replace(view, selection=chosen))
@@ -399,7 +399,7 @@ def test_demo_card_counts_edits_and_each_draft_becomes_one_layer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(job_queue, "Child", Trainer)
-    monkeypatch.setattr(job_queue, "LOOK_S", 0.0)
+    monkeypatch.setattr(job_queue, "PROGRESS_INTERVAL_S", 0.0)
     Trainer.ended = None
     Trainer.edit = None
     made = bear_files(tmp_path)

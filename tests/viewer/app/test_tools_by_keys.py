@@ -13,7 +13,7 @@ from PIL import Image
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.app.decal import Decal
 from viewer.state.view_state import SelectTool
-from viewer.ui.keys import HAND_KEYS, bind
+from viewer.ui.keys import TOOL_KEYS, bind
 
 pytestmark = pytest.mark.gl
 WINDOW = (700, 640)
@@ -131,8 +131,8 @@ def test_escape_releases_the_pointer_to_the_mouse() -> None:
 def test_tool_keys_can_be_rebound_independently() -> None:
     try:
         assert bind({"point_press": "J", "nudge:0.01": "Left"}) == []
-        assert HAND_KEYS["J"].action == "point_press"
-        assert "Space" not in HAND_KEYS
-        assert HAND_KEYS["Left"].action == "point:-4,0", "a key may be both"
+        assert TOOL_KEYS["J"].action == "point_press"
+        assert "Space" not in TOOL_KEYS
+        assert TOOL_KEYS["Left"].action == "point:-4,0", "a key may be both"
     finally:
         bind({})

@@ -34,7 +34,7 @@ from viewer.state.actions import perform
 from viewer.state.facts import LayerRow
 from viewer.state.view_state import LayerState, ViewState
 from viewer.state.workspace import SceneFacts
-from viewer.ui.keys import COMMANDS, FLY_KEYS, HAND_KEYS, KEYS, drag_for
+from viewer.ui.keys import COMMANDS, FLY_KEYS, KEYS, TOOL_KEYS, drag_for
 
 AXES: tuple[Vec3, ...] = ((0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1), (1, 0, 0), (-1, 0, 0))
 RADII = st.sampled_from([1e-3, 0.1, 1.0, 30.0, 1e4])
@@ -229,7 +229,7 @@ def test_drags_match_the_table_of_mouse_bindings() -> None:
 
 
 def test_no_key_is_bound_twice_or_is_also_a_flight_key() -> None:
-    assert len(KEYS) + len(HAND_KEYS) == sum(len(command.keys.split()) for command in COMMANDS.values())
+    assert len(KEYS) + len(TOOL_KEYS) == sum(len(command.keys.split()) for command in COMMANDS.values())
     assert not {*KEYS} & {*FLY_KEYS}
 
 

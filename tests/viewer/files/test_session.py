@@ -15,7 +15,7 @@ from progdf.__main__ import main
 from progdf.cli.info import kind_of
 from progdf.errors import ProgdfError
 from progdf.formats.ply import save_ply
-from progdf.io.json_values import plain
+from progdf.io.json_values import to_json
 from progdf.io.session import SessionFile, read_session, sha256
 from tests.helpers.sessions import full_view, opened_document, spoilt
 from tests.helpers.ui_rig import bear, first_view
@@ -63,7 +63,7 @@ def test_session_of_another_system_finds_its_files_beside_it(saved: Path, place:
 
 
 def test_paths_in_files_have_forward_slashes_on_any_system() -> None:
-    assert plain({"path": PureWindowsPath("edits\\red.region.npy")}) == {"path": "edits/red.region.npy"}
+    assert to_json({"path": PureWindowsPath("edits\\red.region.npy")}) == {"path": "edits/red.region.npy"}
 
 
 def test_regions_are_restored_after_the_folder_moved(folder: Path, tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from tests.helpers.count import Count
 from tests.helpers.demo_scenes import bear
 from viewer.jobs import child, job_queue, training
 from viewer.jobs.child import Progress
-from viewer.jobs.job_queue import LOOK_S, Delivery, JobQueue, QueuedTask
+from viewer.jobs.job_queue import PROGRESS_INTERVAL_S, Delivery, JobQueue, QueuedTask
 from viewer.jobs.training import EditOrder
 
 PATIENCE_S = 600.0
@@ -56,7 +56,7 @@ def begin(out: Path) -> None:
 def stopped(scene: Path, monkeypatch: pytest.MonkeyPatch) -> EditOrder:
     """Return the order of a stopped run. Children are stubs and every poll checks all jobs."""
     monkeypatch.setattr(job_queue, "Child", Waiting)
-    monkeypatch.setattr(job_queue, "LOOK_S", 0.0)
+    monkeypatch.setattr(job_queue, "PROGRESS_INTERVAL_S", 0.0)
     asked = order(scene, "blue")
     asked.save()
     begin(asked.out)
@@ -111,7 +111,9 @@ def test_runs_train_in_order_and_a_failure_is_one_line(scene: Path, monkeypatch:
     begun = time.monotonic()
     failed, done = wait(queue)
     # redrawing every change would cost half of the processor
-    assert shown.calls <= (time.monotonic() - begun) / LOOK_S + 4, "its card changes once a second"
+    assert shown.calls <= (time.monotonic() - begun) / PROGRESS_INTERVAL_S + 4, (
+        "its card changes once a second"
+    )
     assert failed.status == "failed"
     assert failed.error.startswith("region 'sphere:99,99,99,1' holds no Gaussian")
     assert done.number == number

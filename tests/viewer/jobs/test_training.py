@@ -28,7 +28,7 @@ from viewer.jobs.training import (
     CHANGED,
     MAX_PAIRS,
     NEUTRAL,
-    STILL,
+    NO_CHANGE,
     STYLES,
     TYPED,
     EditOrder,
@@ -227,7 +227,7 @@ def test_trainer_accepts_the_specs_of_the_form(kind: str) -> None:
 def test_grade_spec_contains_the_palette_only_if_a_color_changes() -> None:
     colors = (("#7eae44", "#7eae44"), ("#b97a30", "#b97a30"))
     still = form("grade", palette=colors)
-    assert (still.spec, still.obstacle) == ("grade", STILL)
+    assert (still.spec, still.obstacle) == ("grade", NO_CHANGE)
     moved = form("grade", palette=(("#7eae44", "#3060d0"), colors[1]), curve="0.30:0.20+0.70:0.80")
     assert moved.spec == "grade:#7eae44=#3060d0,#b97a30,curve=0.30:0.20+0.70:0.80"
     check_new_editor(EditorOptions(moved.spec))

@@ -139,7 +139,7 @@ def test_moving_picture_follows_sliders_and_highlights(
     ctx: moderngl.Context, stack: Stack, monkeypatch: pytest.MonkeyPatch, draw: str
 ) -> None:
     monkeypatch.setattr(dynamic_resolution, "BUDGETS", (len(stack.scene),) * 3)
-    monkeypatch.setattr(dynamic_resolution, "FINE", (1e-3, 1e-3))
+    monkeypatch.setattr(dynamic_resolution, "ERROR_LIMITS_PX2", (1e-3, 1e-3))
     slid, afresh = (ViewEngine(ctx, stack.scene, stack.gdfs, draw) for _ in range(2))
     framebuffer = ctx.simple_framebuffer(SIZE)
 
@@ -178,10 +178,10 @@ def test_moving_picture_is_refined_only_if_drawing_is_quick(
     pyramid = live.begin_pyramid().result()
     monkeypatch.setattr(dynamic_resolution, "FINE_MS", (0.0, 0.0))
     slow = [live.draw_fewer(lambda fewer: len(fewer.means), camera, 2) for _ in range(3)]
-    assert pyramid.limit == dynamic_resolution.FINE[1]
+    assert pyramid.limit == dynamic_resolution.ERROR_LIMITS_PX2[1]
     monkeypatch.setattr(dynamic_resolution, "FINE_MS", (1e9, 1e9))
     quick = [live.draw_fewer(lambda fewer: len(fewer.means), camera, 2) for _ in range(30)]
-    assert pyramid.limit == dynamic_resolution.FINE[0]
+    assert pyramid.limit == dynamic_resolution.ERROR_LIMITS_PX2[0]
     assert slow[0] == slow[2] == quick[0] < quick[1] < quick[29], "the time has changed, not the view"
 
 
@@ -206,14 +206,14 @@ def test_allowed_detail_is_measured_from_full_pictures() -> None:
         live.measure(full[::2, ::2] + error, full)
 
     measure(10.0)
-    assert live._max_finest == dynamic_resolution.FINE[1], "there is no pyramid yet"
+    assert live._max_finest == dynamic_resolution.ERROR_LIMITS_PX2[1], "there is no pyramid yet"
     live.begin_pyramid().result()
     live.draw_fewer(lambda fewer: None, camera, 2)
     for share in (8.0, 0.5):
         measure(share)
         assert live._max_finest == pytest.approx(live._limit / share ** (1 / 1.5), rel=0.1), "of bytes"
     measure(0.0)
-    assert live._max_finest == dynamic_resolution.FINE[2]
+    assert live._max_finest == dynamic_resolution.ERROR_LIMITS_PX2[2]
 
 
 @pytest.mark.gl
@@ -224,7 +224,7 @@ def test_detail_is_measured_only_from_the_same_view(ctx: moderngl.Context, stack
     slid = view_of(stack, 0.9, 0.6)
     black = replace(view, background=(0.0, 0.0, 0.0))
     framebuffer = ctx.simple_framebuffer(SIZE)
-    first = dynamic_resolution.FINE[1]
+    first = dynamic_resolution.ERROR_LIMITS_PX2[1]
 
     def rest(moving: ViewState, rested: ViewState, grown: int = 0) -> float:
         engine.draw(moving, framebuffer, SIZE, pixels=2)

@@ -12,7 +12,7 @@ import pytest
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.render import dynamic_resolution
 from viewer.render.dynamic_resolution import (
-    COARSE,
+    COARSE_PIXELS,
     REST_S,
     SLOW_MS,
     DynamicResolution,
@@ -36,7 +36,7 @@ def twice(known: DynamicResolution, timings: FrameTimings, turned: bool) -> Dyna
 def test_slow_picture_is_coarse_while_the_camera_is_dragged() -> None:
     known = twice(DynamicResolution(), SLOW, turned=True)
     moving = dynamic_resolution.before_draw(known, "auto", held=True, turned=True, slid=False, now=1.0)
-    assert moving.pixels == COARSE
+    assert moving.pixels == COARSE_PIXELS
     assert dynamic_resolution.next_frame_delay(moving, 1.0) == pytest.approx(REST_S)
 
 
@@ -77,7 +77,7 @@ def test_slider_becomes_coarse_after_slow_steps() -> None:
     second = twice(first, SLOW, turned=False)
     assert (
         dynamic_resolution.before_draw(second, "auto", held=True, turned=False, slid=True, now=1.1).pixels
-        == COARSE
+        == COARSE_PIXELS
     )
     let_go = dynamic_resolution.before_draw(second, "auto", held=False, turned=False, slid=False, now=1.1)
     assert (
@@ -88,7 +88,7 @@ def test_slider_becomes_coarse_after_slow_steps() -> None:
 
 def test_slider_stays_sharp_if_coarse_steps_are_not_faster() -> None:
     known = twice(DynamicResolution(coarse_ms=SLOW_MS + 2.0), SLOW, turned=False)
-    for coarse_ms, pixels in ((SLOW_MS + 2.0, 1), (SLOW_MS, COARSE)):
+    for coarse_ms, pixels in ((SLOW_MS + 2.0, 1), (SLOW_MS, COARSE_PIXELS)):
         known = replace(known, coarse_ms=coarse_ms)
         assert (
             dynamic_resolution.before_draw(known, "auto", held=True, turned=False, slid=True, now=1.0).pixels
@@ -110,7 +110,7 @@ def test_drag_stays_coarse_between_steps_and_is_sharp_at_rest() -> None:
     between = dynamic_resolution.before_draw(
         moving, "on", held=True, turned=False, slid=False, now=1.0 + 0.5 * REST_S
     )
-    assert between.pixels == COARSE
+    assert between.pixels == COARSE_PIXELS
     rested = dynamic_resolution.before_draw(
         between, "on", held=True, turned=False, slid=False, now=1.0 + REST_S
     )
@@ -126,7 +126,7 @@ def test_time_of_a_coarse_picture_is_not_recorded() -> None:
 
 
 def test_off_disables_coarse_pictures() -> None:
-    moving = DynamicResolution(pixels=COARSE, rest_at=2.0, camera_ms=(500.0, 500.0))
+    moving = DynamicResolution(pixels=COARSE_PIXELS, rest_at=2.0, camera_ms=(500.0, 500.0))
     assert (
         dynamic_resolution.before_draw(moving, "off", held=True, turned=True, slid=True, now=1.0).pixels == 1
     )
@@ -222,7 +222,7 @@ def test_slider_drag_is_coarse_too(hand: Rig) -> None:
     hand.move(*hand.slider(0, 0.5))
     hand.press()
     hand.move(*hand.slider(0, 0.8))
-    assert hand.main_view.canvas.pixels == COARSE
+    assert hand.main_view.canvas.pixels == COARSE_PIXELS
     hand.release()
     wait(hand, REST_S)
     assert hand.main_view.canvas.pixels == 1
@@ -246,7 +246,7 @@ def test_split_is_coarse_on_both_sides_and_difference_never(hand: Rig) -> None:
     hand.move(60.0, 270.0)
     hand.press()
     hand.move(90.0, 270.0)
-    assert hand.main_view.canvas.pixels == COARSE
+    assert hand.main_view.canvas.pixels == COARSE_PIXELS
     hand.release()
     wait(hand, REST_S)
     hand.key("Alt+Y")

@@ -163,7 +163,7 @@ def test_selection_has_a_full_tint_with_a_tool_and_a_trace_without(ctx: moderngl
     mask[members] = True
     chosen = selection.select(SelectionState(), mask)
     still = replace(view(0.6), selection=chosen)
-    trace = Highlight(tinted=((chosen.members, highlight.SELECTED, highlight.TRACE),))
+    trace = Highlight(tinted=((chosen.members, highlight.SELECTED, highlight.FAINT_TINT),))
     assert highlight.requested_highlight(still, 0) == trace
     assert highlight.requested_highlight(still, 0, looks=True) is None
     assert highlight.requested_highlight(replace(still, panel=False), 0) is None

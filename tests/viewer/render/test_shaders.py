@@ -14,7 +14,7 @@ from progdf.gaussians import ATTRIBUTES
 from progdf.rasterize import engines
 from shaders import ShaderError, load_source
 from viewer.gl.programs import load_program
-from viewer.gl.scene_textures import GRID_LINE, ORDER, PLACES, PROJECTED, SPLAT_TEXTURES
+from viewer.gl.scene_textures import GRID_LINE, ORDER, PROJECTED, SPLAT_TEXTURES, TEXTURE_SLOTS
 from viewer.gl.splats import vertex_format
 from viewer.render.ground_grid import CLEAR
 
@@ -80,9 +80,11 @@ def test_shader_constants_equal_the_rasterizer_constants() -> None:
 
 
 def test_every_attribute_has_its_own_texture_components() -> None:
-    assert set(PLACES) == set(ATTRIBUTES)
+    assert set(TEXTURE_SLOTS) == set(ATTRIBUTES)
     taken = [
-        (place.texture, place.component + i) for place in PLACES.values() for i in range(place.components)
+        (place.texture, place.component + i)
+        for place in TEXTURE_SLOTS.values()
+        for i in range(place.components)
     ]
     assert len(set(taken)) == len(taken)
     assert {texture for texture, _ in taken} == {*SPLAT_TEXTURES, "shN"}

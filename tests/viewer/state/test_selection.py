@@ -15,7 +15,7 @@ from tests.helpers.ui_rig import bear, first_view
 from viewer.camera.view_camera import Bounds
 from viewer.state import selection, workspace
 from viewer.state.actions import perform
-from viewer.state.selection import NOBODY, SelectionState
+from viewer.state.selection import EMPTY_MASK, SelectionState
 from viewer.state.workspace import SceneFacts, Workspace
 
 TOTAL = 1003
@@ -35,7 +35,7 @@ def test_packed_mask_round_trips() -> None:
     for share in (0.0, 0.01, 0.5, 1.0):
         mask = rng.random(TOTAL) < share
         assert (selection.unpack(selection.pack(mask), TOTAL) == mask).all()
-    assert selection.pack(np.zeros(TOTAL, bool)) == NOBODY
+    assert selection.pack(np.zeros(TOTAL, bool)) == EMPTY_MASK
 
 
 def test_refine_button_matches_the_refine_step_of_a_region() -> None:

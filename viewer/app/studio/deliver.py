@@ -9,7 +9,7 @@ from pathlib import Path
 
 from progdf import __version__
 from progdf.errors import ProgdfError
-from progdf.formats.scene_file import WRITTEN
+from progdf.formats.scene_file import WRITTEN_SUFFIXES
 from progdf.io.bundle import BUNDLE
 from viewer.app.application import Application, Requests, failure_line
 from viewer.files import exports, session
@@ -95,7 +95,7 @@ class DeliverActions:
         out = parse_path(dialog.text).resolve()
         options = dialog.options or DeliverOptions()
         suffix = options.format if kind == "render_film" else SUFFIXES[kind]
-        named = kind == "export" and out.name.lower().endswith((*WRITTEN, BUNDLE))
+        named = kind == "export" and out.name.lower().endswith((*WRITTEN_SUFFIXES, BUNDLE))
         if suffix and not named and out.suffix.lower() != suffix:
             out = out.with_name(out.name + suffix)
         if not out.parent.is_dir():

@@ -28,13 +28,13 @@ from progdf.errors import ProgdfError, without_commands
 from progdf.gdf.file import Gdf, load_gdf
 from progdf.io.atomic import make_folder
 from progdf.io.cameras import save_cameras
-from progdf.io.json_values import convert_json, decode_json, plain
+from progdf.io.json_values import convert_json, decode_json, to_json
 from viewer.app.application import Application, Requests, error_line
 from viewer.camera.view_camera import Vec3, ViewCamera, to_camera
 from viewer.files import user_files
 from viewer.jobs import training
 from viewer.jobs.child import Child
-from viewer.jobs.training import EDITORS, SHEET_COLUMNS, SHEET_PX, STILL, STYLE_ORDER, NewEdit
+from viewer.jobs.training import EDITORS, NO_CHANGE, SHEET_COLUMNS, SHEET_PX, STYLE_ORDER, NewEdit
 from viewer.state.view_state import LayerState
 from viewer.state.workspace import PreviewState
 from viewer.ui.window import wake_window
@@ -43,14 +43,14 @@ from .pages import Cover
 
 LONGEST_SIDE = 960
 """Longest side of a preview, in pixels; larger windows show it enlarged."""
-REST_S = 0.12
+CAMERA_SETTLE_S = 0.12
 """Time without camera motion before a preview is requested, in seconds."""
 POLL_S = 0.04
 """Interval at which the answer is polled, in seconds."""
 WATCH_S = 0.5
 """Interval at which a picture open in another program is checked, in seconds."""
 PAINT_TEXT = "Paint in the other program and save. The saved picture appears here."
-KEPT_S = 120.0
+IDLE_TIMEOUT_S = 120.0
 """Time without an open form after which the preview process ends, in seconds."""
 
 
@@ -118,7 +118,7 @@ class PreviewChild:
     def ask(self, region: str, request: _Request, camera: Camera) -> int:
         """Request a grade or a picture and return the request's number."""
         number = next(self._numbers)
-        values = plain(request) | {"number": number, "out": str(self._picture(number)), "region": region}
+        values = to_json(request) | {"number": number, "out": str(self._picture(number)), "region": region}
         values |= {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist()}
         values |= {"width": camera.width, "height": camera.height}
         self._child.send(msgspec.json.encode(values).decode())
@@ -237,9 +237,9 @@ class PreviewActions:
             self._show("", None)
             self._end_live()
             self._broken = False
-            if self._child is not None and now - self._used_at > KEPT_S:
+            if self._child is not None and now - self._used_at > IDLE_TIMEOUT_S:
                 self._end()
-            return KEPT_S if self._child is not None else None
+            return IDLE_TIMEOUT_S if self._child is not None else None
         self._used_at = now
         if self._child is None and not self._broken:
             try:
@@ -262,9 +262,9 @@ class PreviewActions:
                 self._seen is None or request.camera != self._seen.camera or request.size != self._seen.size
             )
             self._seen = request
-            self._seen_at = now if moved else now - REST_S
+            self._seen_at = now if moved else now - CAMERA_SETTLE_S
         # One request at a time. Changes in the meantime are requested next, and every answer is shown.
-        if request != self._sent and not self._outstanding and now - self._seen_at >= REST_S:
+        if request != self._sent and not self._outstanding and now - self._seen_at >= CAMERA_SETTLE_S:
             self._send(request, self._child)
         elif request == self._sent and not self._outstanding and request.editor.startswith("style:"):
             self._ask_painting(request, self._child)
@@ -372,7 +372,7 @@ class PreviewActions:
         view = work.view
         of_sentence = form.choice.setting == "sentence"
         pictured = (form.preview and form.choice.pictured) or of_sentence
-        if not (work.form_open and view.panel and pictured) or form.obstacle not in ("", STILL):
+        if not (work.form_open and view.panel and pictured) or form.obstacle not in ("", NO_CHANGE):
             return None
         region = f"{form.region}|{form.typed_region}|{hash(view.selection.members)}"
         if form.choice.setting == "grade" and self._palette_of != region:

@@ -28,7 +28,7 @@ from viewer.files import exports
 from viewer.jobs import training
 from viewer.jobs.job_queue import Delivery, JobQueue, QueuedTask
 from viewer.jobs.training import ALL, CHANGED, SELECTION, TYPED, EditOrder, NewEdit
-from viewer.state.selection import NOBODY, SUFFIX, NamedRegion, add_region, free_name
+from viewer.state.selection import EMPTY_MASK, SUFFIX, NamedRegion, add_region, free_name
 from viewer.state.view_state import LayerState
 from viewer.state.workspace import Dialog
 
@@ -173,7 +173,7 @@ class JobActions:
             view = main_view.work.view
             name = free_name(view.selection, out.name)
             path = out.with_name(f"{out.name}{SUFFIX}")
-            selection = replace(add_region(view.selection, name, path), members=NOBODY, count=0)
+            selection = replace(add_region(view.selection, name, path), members=EMPTY_MASK, count=0)
             main_view.change(replace(view, selection=selection))
 
     def _lay_decal(self, _: str) -> None:
