@@ -19,8 +19,8 @@ def empty_state_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def hand() -> Iterator[Rig]:
-    with rig() as made:
-        yield made
+    with rig() as opened:
+        yield opened
 
 
 @pytest.fixture

@@ -210,8 +210,8 @@ def test_keys_file_is_created_complete_and_read_on_start(
         assert app.main_view.work.message.text.startswith("Keys are read from")
         path.write_text('{"grid": "F8", "undo": 3, "nothing": "F9"}')
         app.bind_keys()
-        said = 'keys.json: undo: keys are written as "F6" or ["F6", "Ctrl+B"], and 1 more in window.log'
-        assert app.main_view.work.message.text == said
+        message = 'keys.json: undo: keys are written as "F6" or ["F6", "Ctrl+B"], and 1 more in window.log'
+        assert app.main_view.work.message.text == message
         assert "nothing: there is no such command" in (state_folder() / "window.log").read_text()
         press(app, "Shift+G")
         assert not app.main_view.work.view.grid
@@ -306,8 +306,8 @@ def test_command_key_acts_as_ctrl_on_a_mac(
 def test_window_requests_the_gl_context_that_macs_support() -> None:
     from viewer.ui import splash
 
-    asked = dict(splash._HINTS)
+    hints = dict(splash._HINTS)
     glfw = splash.glfw
-    assert (asked[glfw.CONTEXT_VERSION_MAJOR], asked[glfw.CONTEXT_VERSION_MINOR]) == (3, 3)
-    assert asked[glfw.OPENGL_PROFILE] == glfw.OPENGL_CORE_PROFILE
-    assert asked[glfw.OPENGL_FORWARD_COMPAT]
+    assert (hints[glfw.CONTEXT_VERSION_MAJOR], hints[glfw.CONTEXT_VERSION_MINOR]) == (3, 3)
+    assert hints[glfw.OPENGL_PROFILE] == glfw.OPENGL_CORE_PROFILE
+    assert hints[glfw.OPENGL_FORWARD_COMPAT]

@@ -42,9 +42,9 @@ ways = pytest.mark.parametrize("call_off", WAYS)
 
 @pytest.fixture
 def hand() -> Iterator[Rig]:
-    with rig(replace(first_view(bear(), 0.5, 0.5), unfolded=(0,)), POINTS) as made:
-        made.key("2")  # the lower layer, the scarf
-        yield made
+    with rig(replace(first_view(bear(), 0.5, 0.5), unfolded=(0,)), POINTS) as opened:
+        opened.key("2")  # the lower layer, the scarf
+        yield opened
 
 
 def dragged_and_called_off(

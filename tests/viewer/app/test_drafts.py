@@ -122,12 +122,12 @@ def test_grade_is_a_live_layer_driven_by_the_form(window: application.App) -> No
 def test_color_drag_shows_every_grade_and_requests_the_newest_next(
     window: application.App, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked = []
+    requested = []
     waits = []
 
     def ask(self: Previews, region: str, request: preview._Request, _: Camera) -> int:
         self._number += 1
-        asked.append(request.editor)
+        requested.append(request.editor)
         waits.append((self, preview.Preview(self._number, grade=Previews.grade, made="grade")))
         return self._number
 
@@ -139,48 +139,48 @@ def test_color_drag_shows_every_grade_and_requests_the_newest_next(
     opened(window, color=(0.1, 0.0, 0.0))
     for red in (0.2, 0.3, 0.4):
         with_form(window, color=(red, 0.0, 0.0))
-    assert (asked, window.main_view.live) == (["recolor:#1a0000"], ()), "one at a time"
+    assert (requested, window.main_view.live) == (["recolor:#1a0000"], ()), "one at a time"
     answer()
     with_form(window, color=(0.5, 0.0, 0.0))
-    assert asked[1:] == ["recolor:#800000"], "what was passed by meanwhile is never asked"
+    assert requested[1:] == ["recolor:#800000"], "what was passed by meanwhile is never asked"
     assert len(window.main_view.live) == 1, "what has come is seen, though the color has moved on"
     with_form(window, color=(0.1, 0.0, 0.0))  # back to the visible color while another grade is computed
     answer()
     turn(window)
-    assert asked[2:] == ["recolor:#1a0000"], "the layer is that of the color that was asked for"
+    assert requested[2:] == ["recolor:#1a0000"], "the layer is that of the color that was asked for"
     shown = window.main_view.engine.gdfs[-1]
     with_form(window, region="typed", typed_region="sphere:0,0,0,9")
     answer()
     turn(window)
-    assert asked[3:] == ["recolor:#1a0000"], "another region, asked for"
+    assert requested[3:] == ["recolor:#1a0000"], "another region, asked for"
     assert window.main_view.engine.gdfs[-1] is shown, "of the region before nothing more is shown"
 
 
 def test_manual_grade_gets_the_main_colors_of_its_region(
     window: application.App, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked = []
+    requested = []
 
     def ask(self: Previews, region: str, request: preview._Request, _: Camera) -> int:
         self._number += 1
-        asked.append(request.editor)
-        made = preview.Preview(self._number, grade=Previews.grade, made="grade")
+        requested.append(request.editor)
+        answer = preview.Preview(self._number, grade=Previews.grade, made="grade")
         if request.editor == "grade":
             colors = ("#7eae44", f"#0000{self._number:02x}")
-            made = preview.Preview(self._number, made="palette", palette=colors)
-        self._answers.append(made)
+            answer = preview.Preview(self._number, made="palette", palette=colors)
+        self._answers.append(answer)
         return self._number
 
     monkeypatch.setattr(Previews, "ask", ask)
     opened(window, editor=next(i for i, e in enumerate(EDITORS) if e.kind == "grade"))
     form = window.main_view.work.form
     assert form.palette == (("#7eae44", "#7eae44"), ("#000001", "#000001"))
-    assert (asked, window.main_view.live) == (["grade"], ())
+    assert (requested, window.main_view.live) == (["grade"], ())
     with_form(window, palette=(("#7eae44", "#3060d0"), form.palette[1]))
-    assert asked[1:] == ["grade:#7eae44=#3060d0,#000001"]
+    assert requested[1:] == ["grade:#7eae44=#3060d0,#000001"]
     assert len(window.main_view.live) == 1
     with_form(window, region="typed", typed_region="sphere:0,0,0,9")
-    assert asked[2] == "grade"
+    assert requested[2] == "grade"
     assert window.main_view.work.form.palette[0] == ("#7eae44", "#3060d0"), "nothing that was chosen is lost"
     with_form(window, region="all", palette=form.palette)
     assert window.main_view.work.form.palette[1][0] not in ("#000001", "#000003")
@@ -189,18 +189,18 @@ def test_manual_grade_gets_the_main_colors_of_its_region(
 def test_styles_are_previewed_one_after_the_other(
     window: application.App, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[tuple[str, bool]] = []
+    requested: list[tuple[str, bool]] = []
 
     def ask(self: Previews, region: str, request: preview._Request, camera: Camera) -> int:
         self._number += 1
         small = (camera.width, camera.height) == SHEET_PX
-        asked.append((request.editor, small))
+        requested.append((request.editor, small))
         pixels = np.full(
             (camera.height, camera.width, 3), 9 * int(request.editor.partition(":")[2]), np.uint8
         )
-        failed = "no" if asked[-1] == ("style:3", True) else ""
-        made = preview.Preview(self._number, pixels if not failed else None, error=failed)
-        self._answers.append(made)
+        failed = "no" if requested[-1] == ("style:3", True) else ""
+        answer = preview.Preview(self._number, pixels if not failed else None, error=failed)
+        self._answers.append(answer)
         return self._number
 
     monkeypatch.setattr(Previews, "ask", ask)
@@ -208,7 +208,7 @@ def test_styles_are_previewed_one_after_the_other(
     for _ in range(30):
         turn(window)
     order = [(f"style:{number}", True) for number in STYLE_ORDER]
-    assert asked == [("style:14", False), *order], "what the form says first, then each style once"
+    assert requested == [("style:14", False), *order], "what the form says first, then each style once"
     shown = window.main_view.preview
     assert shown.styles == {*STYLE_ORDER} - {3}, "what cannot be painted stays a number"
     assert not shown.failed
@@ -218,16 +218,16 @@ def test_styles_are_previewed_one_after_the_other(
     expected = [0 if number == 3 else 9 * number for number in STYLE_ORDER]
     assert tiles[: len(STYLE_ORDER)].tolist() == expected, "each in its place"
     with_form(window, strength=0.5)
-    assert asked[27:] == [("style:14", False)], "another strength is another picture, and the same sheet"
+    assert requested[27:] == [("style:14", False)], "another strength is another picture, and the same sheet"
     work = window.main_view.work
     camera = replace(work.view.camera, azimuth=work.view.camera.azimuth + 20.0)
     window.main_view.work = replace(work, view=replace(work.view, camera=camera))
     for _ in range(3):
         turn(window)
-    assert asked[28:30] == [("style:14", False), order[0]], "another view is painted anew"
+    assert requested[28:30] == [("style:14", False), order[0]], "another view is painted anew"
     assert window.main_view.preview.styles == shown.styles, "over the last, which stays until then"
     with_form(window, style=23)
-    assert ("style:23", False) in asked[30:32], "and what the form says does not wait for it"
+    assert ("style:23", False) in requested[30:32], "and what the form says does not wait for it"
 
 
 def test_preview_without_a_grade_shows_the_picture_of_the_editor(window: application.App) -> None:

@@ -377,10 +377,10 @@ def test_failed_save_asks_again_with_the_typed_path(window: application.App, fol
     by_hand(window, text=typed)
     by_hand(window, imgui.Key.enter)  # makes the field release the keyboard
     press(window, "Enter")
-    asked = question(window)
+    dialog = question(window)
     before = window.main_view.work.view
-    assert asked.text == typed
-    assert "gone does not exist" in asked.error
+    assert dialog.text == typed
+    assert "gone does not exist" in dialog.error
     assert window.file_actions.has_unsaved
     press(window, "V", "Shift+Left")
     assert window.main_view.work.view == before, "keys are no shortcuts meanwhile"

@@ -18,8 +18,8 @@ pytestmark = pytest.mark.gl
 
 @pytest.fixture
 def hand() -> Iterator[Rig]:
-    with rig(first_view(bear(), 0.5, 0.5), (1000, 700)) as made:
-        yield made
+    with rig(first_view(bear(), 0.5, 0.5), (1000, 700)) as opened:
+        yield opened
 
 
 def focused() -> int:
@@ -154,10 +154,10 @@ def test_question_is_answered_by_tab_and_enter(hand: Rig) -> None:
         hand.settle()
         for chord in chords:
             strike(hand, chord)
-        asked = hand.main_view.work.dialog
-        assert asked is not None
-        assert asked.options is not None
-        assert (asked.options.width, asked.options.height) == (width, 480)
+        dialog = hand.main_view.work.dialog
+        assert dialog is not None
+        assert dialog.options is not None
+        assert (dialog.options.width, dialog.options.height) == (width, 480)
         assert hand.main_view.take_requests() == ("deliver:render_picture",) * (width == 640)
         strike(hand, "Escape")
 

@@ -64,8 +64,8 @@ def hand() -> Iterator[Rig]:
     view = first_view(bear(), 0.5, 0.5)
     names = ("arm", "red hat", "red jacket", "shoes")
     regions = tuple(NamedRegion(name, Path(f"{name}.region.npy"), b"", 0) for name in names)
-    with rig(replace(view, selection=replace(view.selection, regions=regions)), WINDOW) as made:
-        yield made
+    with rig(replace(view, selection=replace(view.selection, regions=regions)), WINDOW) as opened:
+        yield opened
 
 
 @pytest.fixture

@@ -67,15 +67,15 @@ def desktop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Desktop
     monkeypatch.setenv("XDG_CURRENT_DESKTOP", "GNOME")
     scene, *gdfs = bear().save(tmp_path / "work")
     with null_app(document.load(scene, gdfs[:1]), first_view(bear(), 0.5), tmp_path / "work") as app:
-        made = Desktop(app, tmp_path)
-        made.answers("exit 1")
-        yield made
+        opened = Desktop(app, tmp_path)
+        opened.answers("exit 1")
+        yield opened
 
 
 def question(desktop: Desktop) -> Dialog:
-    asked = desktop.app.main_view.work.dialog
-    assert asked is not None
-    return asked
+    dialog = desktop.app.main_view.work.dialog
+    assert dialog is not None
+    return dialog
 
 
 def test_file_chosen_in_the_native_dialog_is_opened(desktop: Desktop) -> None:

@@ -139,10 +139,10 @@ def test_guessed_up_axis_is_reported_until_the_user_sets_it(tmp_path: Path) -> N
     cloud = load(tmp_path / "cloud.ply")
     first = ViewState(camera=first_camera(cloud.scene, up=cloud.detected_up.direction))
     with null_app(cloud, first, tmp_path) as app:
-        said = lambda: app.main_view.work.message  # noqa: E731
+        message = lambda: app.main_view.work.message  # noqa: E731
         app._wait_times()
         app._wait_times()
-        line = said()
+        line = message()
         assert line is not None
         assert line.text.startswith("Guessed −Y as up in cloud.ply")
         app.main_view.work = replace(app.main_view.work, message=None)
@@ -161,9 +161,9 @@ def test_guessed_up_axis_is_reported_until_the_user_sets_it(tmp_path: Path) -> N
         app.main_view.work = replace(app.main_view.work, message=None)
         app.open(tmp_path / "other.ply")
         app._wait_times()
-        assert said() is None
+        assert message() is None
         assert app.main_view.work.view.camera.up == (0.0, 0.0, 1.0)
         save_ply(tmp_path / "cloud.ply", random_gaussians(50, scale=0.2))
         app.open(tmp_path / "cloud.ply")
         app._wait_times()
-        assert said() is not None
+        assert message() is not None

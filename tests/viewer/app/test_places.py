@@ -29,8 +29,8 @@ ACTIONS = [action for group in tools._TOOLS for action, *_ in group]
 
 @pytest.fixture
 def hand() -> Iterator[Rig]:
-    with rig(first_view(bear(), 0.5, 0.5), SIZE) as made:
-        yield made
+    with rig(first_view(bear(), 0.5, 0.5), SIZE) as opened:
+        yield opened
 
 
 def tool_place(action: str) -> tuple[float, float]:

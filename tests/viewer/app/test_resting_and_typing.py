@@ -16,8 +16,8 @@ pytestmark = pytest.mark.gl
 
 @pytest.fixture
 def hand() -> Iterator[Rig]:
-    with rig(first_view(bear(), 0.5, 0.5), (700, 640)) as made:
-        yield made
+    with rig(first_view(bear(), 0.5, 0.5), (700, 640)) as opened:
+        yield opened
 
 
 def tooltip_is_open() -> bool:
@@ -45,10 +45,10 @@ def test_other_frames_do_not_prevent_the_tooltip(hand: Rig) -> None:
 
 
 def test_rest_takes_a_bounded_number_of_frames() -> None:
-    made = pace.FramePacer()
+    pacer = pace.FramePacer()
     frames = 0
-    while (wait := made.next_frame_delay(())) is not None:
-        made.step(max(wait, 1 / 60))
+    while (wait := pacer.next_frame_delay(())) is not None:
+        pacer.step(max(wait, 1 / 60))
         frames += 1
     assert frames == 2 * pace.SETTLE_FRAMES + 1
 

@@ -32,8 +32,8 @@ LASSO = ((120.0, 200.0), (300.0, 220.0), (290.0, 400.0), (210.0, 330.0), (110.0,
 @pytest.fixture
 def hand() -> Iterator[Rig]:
     view = replace(first_view(bear(), 0.0, 0.0), select=SelectTool(through=True))
-    with rig(view, WINDOW) as made:
-        yield made
+    with rig(view, WINDOW) as opened:
+        yield opened
 
 
 def selected(hand: Rig) -> np.ndarray:
@@ -305,15 +305,15 @@ def test_keys_change_the_whole_selection(hand: Rig) -> None:
     assert not selected(hand).any()
     hand.key("R")
     hand.drag((120, 200), (260, 330))
-    few = selected(hand).copy()
+    before = selected(hand).copy()
     hand.key("Ctrl+]")
-    assert selected(hand).sum() > few.sum()
+    assert selected(hand).sum() > before.sum()
     hand.key("Ctrl+[")
     hand.key("Ctrl+Z")
     hand.key("Ctrl+Z")
-    assert (selected(hand) == few).all()
+    assert (selected(hand) == before).all()
     hand.key("Ctrl+I")
-    assert (selected(hand) == ~few).all()
+    assert (selected(hand) == ~before).all()
 
 
 def test_hovering_a_layer_name_shows_its_region(hand: Rig) -> None:
@@ -372,8 +372,8 @@ def test_hide_strays_hides_them_and_undo_shows_them(tmp_path: Path) -> None:
             time.sleep(0.05)
         hidden = unpack(app.main_view.work.view.selection.hidden, len(scene))
         assert np.array_equal(np.flatnonzero(hidden), find_strays(scene).rows)
-        said = app.main_view.work.message.text
-        assert said.startswith("Hid 7 strays (7 too transparent to be drawn): no pixel differs")
+        message = app.main_view.work.message.text
+        assert message.startswith("Hid 7 strays (7 too transparent to be drawn): no pixel differs")
         press(app, "Ctrl+Z")
         assert not app.main_view.work.view.selection.hidden
 

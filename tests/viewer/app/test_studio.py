@@ -219,8 +219,8 @@ def test_view_painted_in_another_program_is_shown_on_every_save(
     assert save(whole[:4000]) == "This is the saved picture. Train makes it an edit.", (
         "half a file is not looked at"
     )
-    told = f"has 40×30 pixels instead of {size[0]}×{size[1]}; save it at its original size"
-    assert save(taken.resize((40, 30))).endswith(told)
+    message = f"has 40×30 pixels instead of {size[0]}×{size[1]}; save it at its original size"
+    assert save(taken.resize((40, 30))).endswith(message)
     assert window.main_view.cover is None
     save(taken)
     assert window.main_view.cover is not None
@@ -258,9 +258,9 @@ def test_training_is_discarded_only_after_a_question(window: application.App) ->
     turn(window)
     assert window.main_view.work.jobs[0].status == "stopped"
     request(window, f"ask_discard:{job.number}")
-    asked = window.main_view.work.dialog
-    assert asked is not None
-    assert (asked.kind, asked.text) == ("discard_run", "38 min")
+    dialog = window.main_view.work.dialog
+    assert dialog is not None
+    assert (dialog.kind, dialog.text) == ("discard_run", "38 min")
     press(window, "Enter")
     assert window.main_view.work.dialog is None
     assert state.is_dir(), "Enter keeps it"
@@ -279,12 +279,12 @@ def test_run_locked_by_another_window_is_left_alone(window: application.App) -> 
     request(window, f"stop_run:{job.number}")
     turn(window)
     with job.task.lock():
-        for asked in ("resume_run", "discard_run"):
-            request(window, f"{asked}:{job.number}")
-            told = window.main_view.work.message
-            if asked == "resume_run":
-                assert told is not None
-                assert told.text == "blue trains in another window; stop it there first"
+        for action in ("resume_run", "discard_run"):
+            request(window, f"{action}:{job.number}")
+            message = window.main_view.work.message
+            if action == "resume_run":
+                assert message is not None
+                assert message.text == "blue trains in another window; stop it there first"
             assert window.main_view.work.jobs[0].status == "stopped"
     assert (job.task.out / "state" / "run.json").is_file()
 
@@ -304,9 +304,9 @@ def test_quitting_asks_while_a_training_runs(window: application.App) -> None:
 
 def test_scene_export_runs_the_command(window: application.App, tmp_path: Path) -> None:
     press(window, "Ctrl+E")
-    asked = window.main_view.work.dialog
-    assert asked is not None
-    assert asked.text == str(tmp_path / "bear_edited.ply")
+    dialog = window.main_view.work.dialog
+    assert dialog is not None
+    assert dialog.text == str(tmp_path / "bear_edited.ply")
     press(window, "Enter")
     assert window.main_view.work.dialog is None
     turn(window)
@@ -325,9 +325,9 @@ def test_scene_export_runs_the_command(window: application.App, tmp_path: Path) 
     press(window, "Ctrl+Alt+P")
     (tmp_path / "bear_edited.png").touch()
     press(window, "Enter")
-    asked = window.main_view.work.dialog
-    assert asked is not None
-    assert asked.error == "bear_edited.png exists; give another name, or press again to replace it"
+    dialog = window.main_view.work.dialog
+    assert dialog is not None
+    assert dialog.error == "bear_edited.png exists; give another name, or press again to replace it"
     press(window, "Enter")
     assert window.main_view.work.dialog is None
     turn(window)
@@ -336,10 +336,10 @@ def test_scene_export_runs_the_command(window: application.App, tmp_path: Path) 
     turn(window)
     Trainer.ended = None
     press(window, "Ctrl+Shift+P")
-    asked = window.main_view.work.dialog
-    assert asked is not None
-    assert asked.options is not None
-    assert asked.options.can_move == (TURNTABLE,), "a film needs no edit"
+    dialog = window.main_view.work.dialog
+    assert dialog is not None
+    assert dialog.options is not None
+    assert dialog.options.can_move == (TURNTABLE,), "a film needs no edit"
     press(window, "Enter")
     for _ in range(2):
         turn(window)
@@ -349,12 +349,12 @@ def test_scene_export_runs_the_command(window: application.App, tmp_path: Path) 
 
 def test_web_page_export_runs_the_command_with_the_snapshots(window: application.App) -> None:
     press(window, "F5", "Ctrl+Shift+E")
-    asked = window.main_view.work.dialog
-    assert asked is not None
-    assert asked.text.endswith("bear_edited.html")
+    dialog = window.main_view.work.dialog
+    assert dialog is not None
+    assert dialog.text.endswith("bear_edited.html")
     press(window, "Enter")
     turn(window)
-    assert Trainer.said[:3] == ("export", f"--out={asked.text}", "--title=bear")
+    assert Trainer.said[:3] == ("export", f"--out={dialog.text}", "--title=bear")
     assert len(open_session(Path(Trainer.said[-1])).snapshots) == 1
 
 
@@ -362,13 +362,13 @@ def test_quitting_asks_while_a_file_is_written(window: application.App, tmp_path
     (tmp_path / "bear_edited.ply").touch()
     press(window, "Ctrl+E", "Enter")
     press(window, "Ctrl+E")
-    asked = window.main_view.work.dialog
-    assert asked is not None
-    assert asked.text == str(tmp_path / "bear_edited-3.ply"), "one is there, one is being written"
+    dialog = window.main_view.work.dialog
+    assert dialog is not None
+    assert dialog.text == str(tmp_path / "bear_edited-3.ply"), "one is there, one is being written"
     press(window, "Escape", "Ctrl+Q")
-    asked = window.main_view.work.dialog
-    assert asked is not None
-    assert (asked.kind, asked.text) == ("delivery", "Exporting bear_edited-2.ply")
+    dialog = window.main_view.work.dialog
+    assert dialog is not None
+    assert (dialog.kind, dialog.text) == ("delivery", "Exporting bear_edited-2.ply")
     press(window, "Enter")
     assert not window.is_closed
     press(window, "Ctrl+Q", "S")
@@ -402,7 +402,7 @@ def test_demo_card_counts_edits_and_each_draft_becomes_one_layer(
     monkeypatch.setattr(job_queue, "PROGRESS_INTERVAL_S", 0.0)
     Trainer.ended = None
     Trainer.edit = None
-    made = bear_files(tmp_path)
+    files = bear_files(tmp_path)
     demo = state_folder() / "demo"
     scarf = state_folder() / "demo" / "scarf"
     with null_app(empty(), ViewState(), tmp_path) as app:
@@ -410,11 +410,11 @@ def test_demo_card_counts_edits_and_each_draft_becomes_one_layer(
         (job,) = app.jobs.queue.jobs
         assert job.progress.share == 0.0
         (scarf / "state").mkdir(parents=True)
-        shutil.copy(made / "bear.ply", demo / "scene.ply")
+        shutil.copy(files / "bear.ply", demo / "scene.ply")
         job.task.log.write_text("24000 Gaussians\n\n1 of 4: scarf: recolor:#1b6972 on scarf\nloss: L2\n")
         (scarf / "state" / "progress.json").write_text('{"share": 0.5, "label": "Training", "seconds": 9}')
         for name, strength in (("draft.gdf", 1.0), ("draft.gdf", 0.3), ("scarf.gdf", 0.3)):
-            shutil.copy(made / "edits" / "scarf.gdf", scarf / name)
+            shutil.copy(files / "edits" / "scarf.gdf", scarf / name)
             for _ in range(3):
                 turn(app)
             view = app.main_view.work.view
@@ -454,13 +454,13 @@ def test_edit_of_another_scene_is_rebound_from_its_message(window: application.A
     save_gdf(foreign, replace(scarf, scene=fingerprint(moved)))
     save_ply(tmp_path / "moved.ply", moved)
     window.open(foreign)
-    said = window.main_view.work.message
-    assert said is not None
-    assert (said.text, said.button[0]) == ("foreign.gdf was made for another scene", "Rebind…")
-    request(window, said.button[1])
-    asked = window.main_view.work.dialog
-    assert asked is not None
-    window.main_view.ask(replace(asked, text=str(tmp_path / "moved.ply")))
+    message = window.main_view.work.message
+    assert message is not None
+    assert (message.text, message.button[0]) == ("foreign.gdf was made for another scene", "Rebind…")
+    request(window, message.button[1])
+    dialog = window.main_view.work.dialog
+    assert dialog is not None
+    window.main_view.ask(replace(dialog, text=str(tmp_path / "moved.ply")))
     press(window, "Enter")
     turn(window)
     scenes = (f"--from={tmp_path / 'moved.ply'}", f"--to={tmp_path / 'bear.ply'}")
@@ -477,9 +477,9 @@ def test_edit_of_another_scene_is_rebound_from_its_message(window: application.A
 def test_saved_region_offers_a_new_edit(window: application.App) -> None:
     press(window, "Ctrl+A")
     request(window, "save_region:all of it")
-    said = window.main_view.work.message
-    assert said is not None
-    assert said.text == "Region 'all of it' saved"
+    message = window.main_view.work.message
+    assert message is not None
+    assert message.text == "Region 'all of it' saved"
     for _ in range(3):
         window.draw()
     bar = imgui.internal.find_window_by_name("message")

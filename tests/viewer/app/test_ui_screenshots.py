@@ -168,10 +168,10 @@ def test_screenshot_of_a_lasso_its_selection_and_a_region(screenshot: Compare) -
     kept = selection.add_region(selection.select(SelectionState(), mask), "scarf", Path("scarf.region.npy"))
     with rig(replace(first_view(bear(), 0.7, 0.5), selection=kept), SMALLEST) as hand:
         hand.key("L")
-        way = ((250, 130), (330, 100), (450, 120), (480, 230), (420, 330), (300, 320), (240, 240))
-        hand.move(*way[0])
+        path = ((250, 130), (330, 100), (450, 120), (480, 230), (420, 330), (300, 320), (240, 240))
+        hand.move(*path[0])
         hand.press()
-        for place in way[1:]:
+        for place in path[1:]:
             hand.move(*place)
         hand.release()
         hand.modifier(imgui.Key.mod_ctrl)

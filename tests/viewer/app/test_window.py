@@ -136,10 +136,10 @@ def desktop(screen: str, tmp_path: Path) -> Iterator[Desktop]:
         stderr=subprocess.PIPE,
         text=True,
     )
-    made = Desktop(process, environment, tmp_path)
+    opened = Desktop(process, environment, tmp_path)
     try:
-        made.open()
-        yield made
+        opened.open()
+        yield opened
     finally:
         process.terminate()
         process.communicate(timeout=PATIENCE_S)
@@ -203,7 +203,7 @@ def test_real_mouse_drag_changes_the_picture_and_idle_costs_nothing(
 @pytest.mark.slow
 def test_real_window_is_unchanged_after_it_was_minimized(desktop: Desktop) -> None:
     first = desktop.rest()
-    desktop.xdotool("windowunmap", "--sync", desktop.window)  # what minimizing does to a window
+    desktop.xdotool("windowunmap", "--sync", desktop.window)  # minimizing unmaps the window
     desktop.until_idle("a window that draws nothing when nobody can see it")
     desktop.xdotool("windowmap", "--sync", desktop.window)
     desktop.xdotool("windowfocus", "--sync", desktop.window)
@@ -295,10 +295,10 @@ def test_view_without_a_display_is_one_line(
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "XDG_SESSION_TYPE"):
         monkeypatch.delenv(name, raising=False)
     assert main(["view", str(bear().save(tmp_path)[0])]) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert said.startswith("progdf: no window")
-    assert "progdf render" in said
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert error.startswith("progdf: no window")
+    assert "progdf render" in error
 
 
 def test_chords_are_named_like_the_bindings() -> None:

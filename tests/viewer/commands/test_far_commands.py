@@ -32,15 +32,15 @@ Run = Callable[..., int]
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write near.ply and far.ply, each with the scarf edit and the same cameras."""
-    made = tmp_path_factory.mktemp("far")
+    path = tmp_path_factory.mktemp("far")
     stack = bear_stack(800)
     for name, origin in (("near", (0.0, 0.0, 0.0)), ("far", FAR)):
-        scene = load_ply(write(made / f"{name}.ply", moved_columns(stack.scene, origin)))
+        scene = load_ply(write(path / f"{name}.ply", moved_columns(stack.scene, origin)))
         assert scene.origin == origin
-        save_gdf(made / f"{name}.gdf", replace(stack.gdfs[0], scene=fingerprint(scene)))
+        save_gdf(path / f"{name}.gdf", replace(stack.gdfs[0], scene=fingerprint(scene)))
         cameras = [camera.resize(64, 48) for camera in stack.demo.cameras[:2]]
-        save_cameras(made / f"{name}.json", cameras, origin)
-    return made
+        save_cameras(path / f"{name}.json", cameras, origin)
+    return path
 
 
 @pytest.fixture

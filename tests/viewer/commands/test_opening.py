@@ -183,12 +183,12 @@ def filmed(moving: bool) -> ViewState:
     """Return a view whose scarf turns green within eight frames; `moving` adds the camera to the keys."""
     view = replace(full_view(), timeline=Timeline(length=8), compare=Comparison())
     view = replace(view, layers=tuple(replace(layer, solo=False, enabled=True) for layer in view.layers))
-    made = view.timeline
+    film_keys = view.timeline
     for frame, strength in ((0, 0.0), (8, 1.0)):
         layers = tuple(replace(layer, strength=strength) for layer in view.layers)
-        made = timeline.with_key(made, frame, replace(view, layers=layers))
-    keys = made.keys if moving else tuple(replace(key, camera=None) for key in made.keys)
-    return replace(view, timeline=replace(made, keys=keys))
+        film_keys = timeline.with_key(film_keys, frame, replace(view, layers=layers))
+    keys = film_keys.keys if moving else tuple(replace(key, camera=None) for key in film_keys.keys)
+    return replace(view, timeline=replace(film_keys, keys=keys))
 
 
 def test_timeline_of_a_session_can_be_filmed(here: Path) -> None:
@@ -305,8 +305,8 @@ def look_of(folder: Path) -> GradeForm:
     write_cube(folder / "table.cube", table, "table")
     other = random_gaussians(60)
     maps = torch.stack([identity_map(1), identity_map(1) * 0.25])
-    course = torch.stack([torch.zeros(60, 3), torch.full((60, 3), 0.2)])
-    form = fit_grade(torch.tensor([0.0, 1.0]), 1, maps, course, 1, torch.ones(60))
+    residual = torch.stack([torch.zeros(60, 3), torch.full((60, 3), 0.2)])
+    form = fit_grade(torch.tensor([0.0, 1.0]), 1, maps, residual, 1, torch.ones(60))
     save_gdf(folder / "look.gdf", edit_of(other, torch.arange(60), bake_grade(form, pack(other)), "look"))
     return lattice_form(read_cube(folder / "table.cube"))
 

@@ -40,10 +40,10 @@ def stack() -> Stack:
 
 @pytest.fixture(scope="module")
 def folder(stack: Stack, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = tmp_path_factory.mktemp("render")
-    stack.save(made)
-    save_cameras(made / "cameras.json", [camera.resize(64, 48) for camera in stack.demo.cameras[:3]])
-    return made
+    path = tmp_path_factory.mktemp("render")
+    stack.save(path)
+    save_cameras(path / "cameras.json", [camera.resize(64, 48) for camera in stack.demo.cameras[:3]])
+    return path
 
 
 @pytest.fixture
@@ -323,10 +323,10 @@ def test_export_to_another_format_reports_size_and_loss(
     run: Run, capsys: pytest.CaptureFixture[str], ending: str
 ) -> None:
     assert run("export", "bear.ply", "scarf.gdf", "-o", f"edited{ending}") == 0
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     size = r"[\d.]+ kB, [\d.]+ bytes each"
     shift = r"positions (?:exact|within [\d.e-]+)"
-    assert re.search(rf"{size}; read back: {shift}, (no pixel differs|[\d.]+ dB to it, )", said), said
+    assert re.search(rf"{size}; read back: {shift}, (no pixel differs|[\d.]+ dB to it, )", output), output
 
 
 def test_glb_is_exported_in_the_chosen_axes(run: Run, capsys: pytest.CaptureFixture[str]) -> None:

@@ -131,10 +131,10 @@ def test_third_party_session_changes_nothing_outside_its_folder(tmp_path: Path) 
         exports.region_file(region, TOTAL)
         state = exports.rename_region(state, i, f"renamed {i}", TOTAL)
     after = contents(outside)
-    made = {name: after.pop(name) for name in set(after) - set(before)}
+    new_files = {name: after.pop(name) for name in set(after) - set(before)}
     assert after == before
-    assert all(name.startswith("in/renamed ") and name.endswith(".region.npy") for name in made)
-    assert len(made) == len(paths)
+    assert all(name.startswith("in/renamed ") and name.endswith(".region.npy") for name in new_files)
+    assert len(new_files) == len(paths)
 
 
 def test_region_files_in_the_session_folders_are_kept(tmp_path: Path) -> None:
@@ -165,9 +165,9 @@ def test_window_reports_rejected_regions_and_saves_them_again(
     file = foreign_session(folder, "../victim.txt")
     with null_app(opened_document(folder), first_view(bear()), tmp_path) as app:
         app.file_actions.open(file)
-        said = app.main_view.work.message
-        assert said is not None
-        assert "region r0 (../victim.txt), not a .region.npy file in the session's folder" in said.text
+        message = app.main_view.work.message
+        assert message is not None
+        assert "region r0 (../victim.txt), not a .region.npy file in the session's folder" in message.text
         app.handle("save")
         assert (folder / "r0.region.npy").exists()
         (tmp_path / "elsewhere").mkdir()

@@ -155,10 +155,10 @@ def test_damaged_session_is_refused_in_one_line(
 ) -> None:
     with pytest.raises(ProgdfError) as refused:
         session.open_session(spoilt(saved, *keys, value=value))
-    told = str(refused.value)
-    assert about in told
-    assert "\n" not in told
-    assert "; " in told
+    message = str(refused.value)
+    assert about in message
+    assert "\n" not in message
+    assert "; " in message
 
 
 @pytest.mark.parametrize(
@@ -201,11 +201,11 @@ def test_info_lists_the_contents_of_a_session(saved: Path, capsys: pytest.Captur
     assert kind_of(saved) == "session"
     (saved.parent / "edits" / "ears.gdf").unlink()
     assert main(["info", str(saved)]) == 0
-    told = capsys.readouterr().out
-    assert "bear.ply (unchanged)" in told
-    assert "ears.gdf (missing)" in told
-    assert "ears → gold" in told
-    assert "snapshots: 1" in told
+    output = capsys.readouterr().out
+    assert "bear.ply (unchanged)" in output
+    assert "ears.gdf (missing)" in output
+    assert "ears → gold" in output
+    assert "snapshots: 1" in output
 
 
 def test_render_draws_a_session_like_the_window(saved: Path, tmp_path: Path) -> None:

@@ -57,10 +57,10 @@ def stopped(scene: Path, monkeypatch: pytest.MonkeyPatch) -> EditOrder:
     """Return the order of a stopped run. Children are stubs and every poll checks all jobs."""
     monkeypatch.setattr(job_queue, "Child", Waiting)
     monkeypatch.setattr(job_queue, "PROGRESS_INTERVAL_S", 0.0)
-    asked = order(scene, "blue")
-    asked.save()
-    begin(asked.out)
-    return asked
+    edit_order = order(scene, "blue")
+    edit_order.save()
+    begin(edit_order.out)
+    return edit_order
 
 
 def window(stopped: EditOrder) -> JobQueue:
@@ -195,10 +195,10 @@ def test_run_locked_by_a_command_cannot_be_discarded(stopped: EditOrder) -> None
 def test_two_windows_cannot_queue_the_same_run(stopped: EditOrder, scene: Path) -> None:
     first = JobQueue()
     second = JobQueue()
-    asked = order(scene, "red")
-    first.add(asked)
+    edit_order = order(scene, "red")
+    first.add(edit_order)
     with pytest.raises(LockedError):
-        second.add(asked)
+        second.add(edit_order)
     assert second.jobs == ()
     first.close()
 

@@ -66,16 +66,16 @@ def test_runs_lie_beside_the_scene_or_in_a_writable_folder(tmp_path: Path) -> No
 
 
 def test_stopped_run_is_found_and_can_be_discarded(tmp_path: Path) -> None:
-    asked = order(tmp_path)
-    asked.save()
-    assert [*training.stopped_orders(asked.out.parent, asked.scene)] == [], "it has not begun"
-    (asked.out / "state").mkdir(parents=True)
-    (asked.out / "state" / "run.json").write_text("{}")
-    assert [*training.stopped_orders(asked.out.parent, asked.scene)] == [asked]
-    assert [*training.stopped_orders(asked.out.parent, tmp_path / "other.ply")] == []
+    edit_order = order(tmp_path)
+    edit_order.save()
+    assert [*training.stopped_orders(edit_order.out.parent, edit_order.scene)] == [], "it has not begun"
+    (edit_order.out / "state").mkdir(parents=True)
+    (edit_order.out / "state" / "run.json").write_text("{}")
+    assert [*training.stopped_orders(edit_order.out.parent, edit_order.scene)] == [edit_order]
+    assert [*training.stopped_orders(edit_order.out.parent, tmp_path / "other.ply")] == []
     assert order(tmp_path).out.name == "blue-2", "its name is taken"
-    asked.discard()
-    assert [*asked.out.parent.iterdir()] == []
+    edit_order.discard()
+    assert [*edit_order.out.parent.iterdir()] == []
 
 
 @pytest.mark.parametrize(
@@ -99,38 +99,38 @@ def test_stopped_run_is_found_and_can_be_discarded(tmp_path: Path) -> None:
     ids=lambda content: "a folder" if content is None else ascii(content[:20]),
 )
 def test_damaged_run_file_is_skipped(tmp_path: Path, damaged: bytes | None) -> None:
-    asked = order(tmp_path)
+    edit_order = order(tmp_path)
     good = order(tmp_path, "gold")
-    for kept in (asked, good):
+    for kept in (edit_order, good):
         kept.save()
         (kept.out / "state").mkdir(parents=True)
         (kept.out / "state" / "run.json").write_text("{}")
-    told = asked.out.with_name("blue.train.json"), asked.out / "state" / "progress.json"
-    told[0].unlink()
-    for path in told:
+    paths = edit_order.out.with_name("blue.train.json"), edit_order.out / "state" / "progress.json"
+    paths[0].unlink()
+    for path in paths:
         if damaged is None:
             path.mkdir()
         else:
             path.write_bytes(damaged)
-    assert [*training.stopped_orders(asked.out.parent, asked.scene)] == [good]
-    assert asked.read_progress(Progress(0.1)) == Progress(0.1)
+    assert [*training.stopped_orders(edit_order.out.parent, edit_order.scene)] == [good]
+    assert edit_order.read_progress(Progress(0.1)) == Progress(0.1)
 
 
 def test_run_files_that_are_pipes_do_not_block(tmp_path: Path) -> None:
-    asked = order(tmp_path)
-    (asked.out / "state").mkdir(parents=True)
-    (asked.out / "state" / "run.json").write_text("{}")
-    for path in (asked.out.with_name("blue.train.json"), asked.out / "state" / "progress.json"):
+    edit_order = order(tmp_path)
+    (edit_order.out / "state").mkdir(parents=True)
+    (edit_order.out / "state" / "run.json").write_text("{}")
+    for path in (edit_order.out.with_name("blue.train.json"), edit_order.out / "state" / "progress.json"):
         os.mkfifo(path)
-    assert [*training.stopped_orders(asked.out.parent, asked.scene)] == []
-    assert asked.read_progress(Progress(0.1)) == Progress(0.1)
+    assert [*training.stopped_orders(edit_order.out.parent, edit_order.scene)] == []
+    assert edit_order.read_progress(Progress(0.1)) == Progress(0.1)
 
 
 def test_failed_removal_keeps_the_run_and_explains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = order(tmp_path)
-    asked.save()
-    (asked.out / "state").mkdir(parents=True)
-    (asked.out / "state" / "run.json").write_text("{}")
+    edit_order = order(tmp_path)
+    edit_order.save()
+    (edit_order.out / "state").mkdir(parents=True)
+    (edit_order.out / "state" / "run.json").write_text("{}")
 
     def refuse(self: Path, missing_ok: bool = False) -> None:
         raise PermissionError(errno.EACCES, "Permission denied")
@@ -138,55 +138,55 @@ def test_failed_removal_keeps_the_run_and_explains(tmp_path: Path, monkeypatch: 
     with monkeypatch.context() as patch:
         patch.setattr(Path, "unlink", refuse)
         with pytest.raises(ProgdfError, match=r"cannot be removed \(Permission"):
-            asked.discard()
-    assert [*training.stopped_orders(asked.out.parent, asked.scene)] == [asked]
+            edit_order.discard()
+    assert [*training.stopped_orders(edit_order.out.parent, edit_order.scene)] == [edit_order]
     elsewhere = tmp_path / "elsewhere"
-    (asked.out / "state").rename(elsewhere)
-    (asked.out / "state").symlink_to(elsewhere)
+    (edit_order.out / "state").rename(elsewhere)
+    (edit_order.out / "state").symlink_to(elsewhere)
     with pytest.raises(ProgdfError, match="behind a link"):
-        asked.discard()
+        edit_order.discard()
     assert (elsewhere / "run.json").is_file()
 
 
 @pytest.mark.parametrize("name", ["..", ".", "", "...", "link"])
 def test_orders_of_a_third_party_claim_no_other_folder(name: str, tmp_path: Path) -> None:
-    asked = order(tmp_path)
-    asked.save()
-    edits = asked.out.parent
+    edit_order = order(tmp_path)
+    edit_order.save()
+    edits = edit_order.out.parent
     other = tmp_path / "other"
     for folder in (tmp_path, edits, other):
         (folder / "state").mkdir(parents=True)
         (folder / "state" / "run.json").write_text("{}")
     (edits / "link").symlink_to(other)
     edits.joinpath("blue.train.json").rename(edits / f"{name}.train.json")
-    assert [*training.stopped_orders(edits, asked.scene)] == []
+    assert [*training.stopped_orders(edits, edit_order.scene)] == []
 
 
 def test_finished_edit_is_never_discarded(tmp_path: Path) -> None:
-    asked = order(tmp_path)
-    asked.out.mkdir(parents=True)
-    asked.result.touch()
-    asked.discard()
-    assert asked.result.exists()
+    edit_order = order(tmp_path)
+    edit_order.out.mkdir(parents=True)
+    edit_order.result.touch()
+    edit_order.discard()
+    assert edit_order.result.exists()
 
 
 def test_progress_and_recordings_of_the_trainer_are_read(tmp_path: Path) -> None:
-    asked = order(tmp_path)
+    edit_order = order(tmp_path)
     scene = bear().scene
-    folder = RunFolder(asked.out)
-    assert asked.read_progress(Progress(0.1)) == Progress(0.1)
-    assert asked.newest_recording() is None
+    folder = RunFolder(edit_order.out)
+    assert edit_order.read_progress(Progress(0.1)) == Progress(0.1)
+    assert edit_order.newest_recording() is None
     folder.state.path.mkdir(parents=True)
     log = RunLog(folder.log, quiet=True, progress=folder.progress)
     with log.steps("optimize", 10) as advance:
         advance(10, "loss to the edit 0.5")
     log.close()
-    told = asked.read_progress(Progress())
-    assert (told.label, told.loss) == ("Training", "0.5")
-    assert 0.0 < told.share < 1.0, "the field is still to come"
-    assert told.seconds > 0.0, "for the question whether to discard it"
+    progress = edit_order.read_progress(Progress())
+    assert (progress.label, progress.loss) == ("Training", "0.5")
+    assert 0.0 < progress.share < 1.0, "the field is still to come"
+    assert progress.seconds > 0.0, "for the question whether to discard it"
     later = Progress(0.9999, "Packing", "", 1e6)
-    assert asked.read_progress(later) == Progress(0.9999, "Training", "0.5", 1e6), "never back"
+    assert edit_order.read_progress(later) == Progress(0.9999, "Training", "0.5", 1e6), "never back"
     members = torch.tensor([1, 5])
     region = Region("blue", members, torch.zeros(len(scene)).index_fill(0, members, 1.0))
     folder.state.save("region", {"members": region.members, "score": region.score}, {"name": "blue"})
@@ -194,13 +194,13 @@ def test_progress_and_recordings_of_the_trainer_are_read(tmp_path: Path) -> None
     offsets[:, -3:] = 0.25
     for index in range(2):
         folder.state.save("recordings", {"offsets": (offsets * index).half()}, {}, index)
-    newest = asked.newest_recording()
+    newest = edit_order.newest_recording()
     assert newest is not None
     assert newest.name.startswith("000001")
-    edit = asked.recorded_edit(newest, scene)
+    edit = edit_order.recorded_edit(newest, scene)
     assert edit is not None
     assert torch.equal(edit.field.offsets(1.0), offsets)
-    assert asked.recorded_edit(newest, scene[:10]) is None, "another scene"
+    assert edit_order.recorded_edit(newest, scene[:10]) is None, "another scene"
 
 
 def form(kind: str, **changes: Any) -> NewEdit:

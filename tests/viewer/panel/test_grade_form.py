@@ -25,10 +25,10 @@ LEFT = WINDOW[0] - panel.WIDTH_PX + 12.0 + 10.0 + new_edit_form.COLUMN_PX
 
 @pytest.fixture
 def hand() -> Iterator[Rig]:
-    with rig(first_view(bear(), 0.0, 0.0), WINDOW) as made:
-        made.main_view.work = replace(made.main_view.work, form=FORM, form_open=True)
-        made.frame(3)
-        yield made
+    with rig(first_view(bear(), 0.0, 0.0), WINDOW) as opened:
+        opened.main_view.work = replace(opened.main_view.work, form=FORM, form_open=True)
+        opened.frame(3)
+        yield opened
 
 
 def form(hand: Rig) -> NewEdit:

@@ -94,9 +94,9 @@ def hand_on(view: ViewState, scale: float = 1.0) -> Hand:
 
 @pytest.fixture(params=[1.0, 2.0], ids=["1x", "2x"])
 def hand(request: pytest.FixtureRequest) -> Iterator[Hand]:
-    made = hand_on(STACK, request.param)
-    yield made
-    made.ui.close()
+    opened = hand_on(STACK, request.param)
+    yield opened
+    opened.ui.close()
 
 
 LEFT = SIZE[0] - panel.WIDTH_PX

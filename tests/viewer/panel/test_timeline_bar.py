@@ -36,18 +36,20 @@ SMALL = ("--size", "64x48", "--engine", "cpu")
 def keyed(view: ViewState | None = None, length: int = 40) -> ViewState:
     """Return a view whose timeline turns the scarf green and orbits by 60° in its first half."""
     view = view or first_view(bear(), 0.0, 0.3)
-    made = timeline.with_key(Timeline(length=length), 0, view)
+    animation = timeline.with_key(Timeline(length=length), 0, view)
     there = replace(view, camera=replace(view.camera, azimuth=view.camera.azimuth + 60.0))
     layers = (replace(view.layers[0], strength=1.0), view.layers[1])
-    made = timeline.with_key(made, length // 2, replace(there, layers=layers))
-    return replace(view, timeline=timeline.set_easing(made, timeline.keys_at(made, length // 2), "linear"))
+    animation = timeline.with_key(animation, length // 2, replace(there, layers=layers))
+    return replace(
+        view, timeline=timeline.set_easing(animation, timeline.keys_at(animation, length // 2), "linear")
+    )
 
 
 @pytest.fixture
 def hand(tmp_path: Path) -> Iterator[Rig]:
-    with rig(keyed(), WINDOW, pictures=tmp_path) as made:
-        made.key("T")
-        yield made
+    with rig(keyed(), WINDOW, pictures=tmp_path) as opened:
+        opened.key("T")
+        yield opened
 
 
 def at(hand: Rig, frame: float) -> tuple[float, float]:

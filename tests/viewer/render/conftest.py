@@ -19,6 +19,6 @@ def stack() -> Stack:
 @pytest.fixture
 def gl_engine(ctx: moderngl.Context, stack: Stack) -> Iterator[ViewEngine]:
     """Yield an engine that draws with OpenGL."""
-    made = ViewEngine(ctx, stack.scene, stack.gdfs, draw="gl")
-    yield made
-    made.release()
+    engine = ViewEngine(ctx, stack.scene, stack.gdfs, draw="gl")
+    yield engine
+    engine.release()

@@ -32,8 +32,8 @@ def whole(scarf: float, ears: float, draw: str = "cpu") -> np.ndarray:
 @pytest.fixture
 def hand() -> Iterator[Rig]:
     whole(0.0, 0.0), whole(1.0, 1.0)
-    with rig(first_view(bear(), 1.0, 1.0)) as made:
-        yield made
+    with rig(first_view(bear(), 1.0, 1.0)) as opened:
+        yield opened
 
 
 @pytest.mark.gl
@@ -269,7 +269,7 @@ def test_invalid_comparison_options_are_one_line(
 ) -> None:
     argv = ["render", "bear.ply", "scarf.gdf", "--engine", "cpu", *options, "-o", "bad.png"]
     assert main(argv) == 2
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1
-    assert about in told
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert about in error
     assert not Path("bad.png").exists()

@@ -38,9 +38,9 @@ Compare = Callable[[str, np.ndarray], None]
 
 @pytest.fixture(params=["gl", "cpu"])
 def engine(request: pytest.FixtureRequest, ctx: moderngl.Context, stack: Stack) -> Iterator[ViewEngine]:
-    made = ViewEngine(ctx, stack.scene, stack.gdfs, request.param)
-    yield made
-    made.release()
+    view_engine = ViewEngine(ctx, stack.scene, stack.gdfs, request.param)
+    yield view_engine
+    view_engine.release()
 
 
 @pytest.mark.gl
@@ -63,7 +63,7 @@ def test_color_table_over_an_edit_is_drawn_as_composed(
     members = torch.zeros(0, dtype=torch.int64)
     field = BakedField("grade", torch.tensor([0.0, 1.0]), {}, 14, (), lattice_form(table))
     look = apply_grade(edit_of(stack.scene, members, field, "look"), stack.scene, whole_scene(stack.scene))
-    made = ViewEngine(ctx, stack.scene, (*stack.gdfs, look), draw)
+    engine = ViewEngine(ctx, stack.scene, (*stack.gdfs, look), draw)
     painted = encode(np.linspace(0.0, 1.0, len(look.region)))
     for strength, paint in ((0.4, ""), (1.0, painted), (1.2, ""), (0.0, "")):
         first = view_of(stack, 0.7, 0.4)
@@ -72,10 +72,10 @@ def test_color_table_over_an_edit_is_drawn_as_composed(
         layers = [Layer(stack.gdfs[SCARF], 0.7), Layer(stack.gdfs[EARS], 0.4)]
         layers.append(Layer(look, strength, gains=Gains(color=0.75), weights=decode(paint, len(look.region))))
         expected = compose_layers(stack.scene, layers, "adjust")
-        assert bits(made.gaussians(view)) == bits(expected)
+        assert bits(engine.gaussians(view)) == bits(expected)
         picture = render(expected, to_camera(view.camera, *SIZE)).image.numpy()
-        assert float(np.abs(made.image(view, SIZE) - picture).max()) <= 0.0101, "see above"
-    made.release()
+        assert float(np.abs(engine.image(view, SIZE) - picture).max()) <= 0.0101, "see above"
+    engine.release()
 
 
 @pytest.mark.gl

@@ -31,8 +31,8 @@ def half_painted() -> str:
 
 
 def view(strength: float = 1.0, painted: str = paint.FULL) -> ViewState:
-    made = first_view(bear(), strength, 0.5)
-    return replace(made, layers=(replace(made.layers[0], paint=painted), *made.layers[1:]))
+    first = first_view(bear(), strength, 0.5)
+    return replace(first, layers=(replace(first.layers[0], paint=painted), *first.layers[1:]))
 
 
 def shown(engine: ViewEngine, state: ViewState, ctx: moderngl.Context) -> np.ndarray:
@@ -210,9 +210,9 @@ def test_visible_regions_keep_their_colors_below_the_selection() -> None:
     kept = selection.add_region(selection.select(SelectionState(), mask), "even", Path("even.region.npy"))
     region = replace(kept.regions[0], visible=True)
     kept = selection.change_region(selection.select(kept, np.arange(len(mask)) < 10), 0, region)
-    asked = highlight.requested_highlight(replace(view(), selection=kept, select=SelectTool("box")), 0)
-    assert asked is not None
-    colors = highlight.highlight_colors(asked, (), len(mask))
+    requested = highlight.requested_highlight(replace(view(), selection=kept, select=SelectTool("box")), 0)
+    assert requested is not None
+    colors = highlight.highlight_colors(requested, (), len(mask))
     assert (colors[:10, :3] == np.round(255 * np.array(highlight.SELECTED))).all()
     assert (colors[10:, 3] > 0).tolist() == mask[10:].tolist()
     assert (colors[12, :3] == np.round(255 * np.array(region.color))).all()

@@ -72,16 +72,16 @@ def cameras(stack: Stack) -> list[Camera]:
 
 @pytest.fixture
 def draw(ctx: moderngl.Context, request: pytest.FixtureRequest) -> Iterator[object]:
-    made: list[ViewEngine] = []
+    engines: list[ViewEngine] = []
 
     def picture(scene: Gaussians, camera: Camera) -> np.ndarray:
         if request.param != "gl":
             return render(scene, camera, engine=request.param).image.detach().clamp(0, 1).numpy()
-        made.append(ViewEngine(ctx, scene, (), "gl"))
-        return np.asarray(made[-1].image(ViewState(), camera=camera))
+        engines.append(ViewEngine(ctx, scene, (), "gl"))
+        return np.asarray(engines[-1].image(ViewState(), camera=camera))
 
     yield picture
-    for engine in made:
+    for engine in engines:
         engine.release()
 
 

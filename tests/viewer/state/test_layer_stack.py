@@ -55,8 +55,8 @@ THREE = ViewState(layers=(LayerState(0, "a", 0.5), LayerState(1, "b", 0.5), Laye
 
 @pytest.fixture
 def hand() -> Iterator[Rig]:
-    with rig(first_view(bear(), 0.5, 0.5), POINTS) as made:
-        yield made
+    with rig(first_view(bear(), 0.5, 0.5), POINTS) as opened:
+        yield opened
 
 
 def click(hand: Rig, x: float, y: float) -> None:
@@ -335,39 +335,39 @@ def test_double_click_sets_the_pivot(hand: Rig) -> None:
 
 
 def test_layer_rows_count_shared_members_and_list_gain_kinds() -> None:
-    made = bear()
-    rows = layer_rows(made.scene, (made.gdfs[0], made.gdfs[1], made.gdfs[0]))
-    scarf, ears = (len(gdf.region) for gdf in made.gdfs)
+    stack = bear()
+    rows = layer_rows(stack.scene, (stack.gdfs[0], stack.gdfs[1], stack.gdfs[0]))
+    scarf, ears = (len(gdf.region) for gdf in stack.gdfs)
     assert [row.shared for row in rows] == [(scarf, 0, scarf), (0, ears, 0), (scarf, 0, scarf)]
     assert [row.kinds for row in rows[:2]] == [{"color"}, {"color", "geometry"}]
 
 
 def test_thumbnail_of_a_large_region_uses_a_part_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = bear()
+    stack = bear()
     camera = ViewCamera()
-    whole = facts.draw_thumbnail(made.scene, made.gdfs[0], camera).astype(float)
-    monkeypatch.setattr(facts, "MAX_COUNTED_MEMBERS", len(made.gdfs[0].region) // 2)
-    part = facts.draw_thumbnail(made.scene, made.gdfs[0], camera).astype(float)
+    whole = facts.draw_thumbnail(stack.scene, stack.gdfs[0], camera).astype(float)
+    monkeypatch.setattr(facts, "MAX_COUNTED_MEMBERS", len(stack.gdfs[0].region) // 2)
+    part = facts.draw_thumbnail(stack.scene, stack.gdfs[0], camera).astype(float)
     assert 0.0 < abs(part - whole).mean() < 0.25 * abs(whole - whole[0, 0]).mean()
 
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Stack, Path]:
-    made = bear_stack(800)
+    stack = bear_stack(800)
     folder = tmp_path_factory.mktemp("layers")
-    made.save(folder)
-    return made, folder
+    stack.save(folder)
+    return stack, folder
 
 
 def test_export_and_render_accept_gains_solo_and_overshoot(
     saved: tuple[Stack, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made, folder = saved
+    stack, folder = saved
     monkeypatch.chdir(folder)
     options = ("--set", "scarf=1", "--set", "ears=1.1", "--overshoot", "--gain", "ears:geometry=0.5")
     edits = ("bear.ply", "scarf.gdf", "ears.gdf", *options)
     assert main(["export", *edits, "--solo", "ears", "-o", "a.ply"]) == 0
-    expected = compose_layers(made.scene, [Layer(made.gdfs[1], 1.1, gains=Gains(geometry=0.5))])
+    expected = compose_layers(stack.scene, [Layer(stack.gdfs[1], 1.1, gains=Gains(geometry=0.5))])
     read = load_ply("a.ply")
     for name in set(ATTRIBUTES) - {"quats"}:
         assert torch.equal(getattr(read, name), getattr(expected, name))

@@ -36,9 +36,9 @@ ERASE = Brush(active=True, radius=20.0, softness=0.5)
 
 @pytest.fixture
 def hand() -> Iterator[Rig]:
-    with rig(replace(first_view(bear(), 1.0, 1.0), brush=ERASE), POINTS) as made:
-        made.key("2")  # the lower layer, the scarf
-        yield made
+    with rig(replace(first_view(bear(), 1.0, 1.0), brush=ERASE), POINTS) as opened:
+        opened.key("2")  # the lower layer, the scarf
+        yield opened
 
 
 def weights(hand: Rig, layer: int = 0) -> np.ndarray:

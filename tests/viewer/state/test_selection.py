@@ -45,9 +45,9 @@ def test_refine_button_matches_the_refine_step_of_a_region() -> None:
     rough = scene.means[:, 1].numpy() > 0.3
     work = selecting(workspace.new_workspace(first_view(bear())), rough)
     refined = perform(work, "select_refine", facts).view.selection
-    made = selection.unpack(refined.members, len(scene))
-    assert np.array_equal(made, read_step("refine")(near, rough))
-    assert refined.count == made.sum() != rough.sum()
+    mask = selection.unpack(refined.members, len(scene))
+    assert np.array_equal(mask, read_step("refine")(near, rough))
+    assert refined.count == mask.sum() != rough.sum()
 
 
 @pytest.mark.parametrize("members", [b"not packed", selection.pack(every(3))[:-9]])
@@ -65,9 +65,9 @@ def test_mask_adapts_to_added_and_removed_rows(total: int) -> None:
     expected[:1000] = mask[:total]
     assert np.array_equal(selection.unpack(selection.pack(mask), total), expected)
     state = SelectionState(members=selection.pack(mask), count=int(mask.sum()))
-    rest = selection.take_rows(state, 1000, kept)
-    assert np.array_equal(selection.unpack(rest.members, len(kept)), mask[kept])
-    assert rest.count == mask[kept].sum()
+    remaining = selection.take_rows(state, 1000, kept)
+    assert np.array_equal(selection.unpack(remaining.members, len(kept)), mask[kept])
+    assert remaining.count == mask[kept].sum()
 
 
 @pytest.mark.parametrize("total", [8, 1009, 2000])

@@ -112,9 +112,9 @@ def test_two_snapshots_are_compared_until_the_next_edit() -> None:
     with rig(first_view(bear(), 1.0, 0.0), (1024, 640)) as hand:
         hand.key("Shift+F5")
         assert hand.main_view.work.view.compare.mode == "off"
-        said = hand.main_view.work.message
-        assert said is not None
-        assert said.text == "There is no snapshot to compare; F5 adds one"
+        message = hand.main_view.work.message
+        assert message is not None
+        assert message.text == "There is no snapshot to compare; F5 adds one"
         warm = hand.picture()
         hand.key("F5")
         hand.key("2")
@@ -129,9 +129,9 @@ def test_two_snapshots_are_compared_until_the_next_edit() -> None:
         middle = round(0.5 * 724)
         assert np.array_equal(*(beside_line(p, middle)[0] for p in (seen, warm)))
         assert np.array_equal(*(beside_line(p, middle)[1] for p in (seen, gold)))
-        said = hand.main_view.canvas.comparer.labels(hand.main_view.work.view)
-        assert said.left == "1"
-        assert said.right == "2"
+        message = hand.main_view.canvas.comparer.labels(hand.main_view.work.view)
+        assert message.left == "1"
+        assert message.right == "2"
         hand.key("Shift+Left")
         assert hand.main_view.work.view.compare.mode == "off", "one sees what one does"
         hand.move(968.0, CARD)

@@ -27,14 +27,14 @@ def test_optimizer_resumes_from_any_step_bit_for_bit(tmp_path: Path) -> None:
         pass
 
     state = PgsState(original)
-    made = []
+    resumed = []
     for _ in range(20):  # stopped after every step and restored into a new state
 
         def on_step(step: int, left: float) -> None:
             raise Stop
 
         try:
-            made.extend(snapshot for snapshot in optimize(*wanted, on_step, state))
+            resumed.extend(snapshot for snapshot in optimize(*wanted, on_step, state))
             break
         except Stop:
             saved = state.capture_state()
@@ -43,8 +43,8 @@ def test_optimizer_resumes_from_any_step_bit_for_bit(tmp_path: Path) -> None:
             restored = folder.load("pgs")
             assert restored is not None
             state.restore(restored)
-    assert len(made) == len(straight)
-    for one, other in zip(made, straight, strict=True):
+    assert len(resumed) == len(straight)
+    for one, other in zip(resumed, straight, strict=True):
         assert torch.equal(one.offsets, other.offsets)
         assert (one.step, one.ends_stage, one.means) == (other.step, other.ends_stage, other.means)
 

@@ -29,9 +29,9 @@ def view(scarf: float = 0.2, ears: float = 0.4, **camera: object) -> ViewState:
 
 
 def two_keys(easing: str = "smooth", length: int = 20) -> Timeline:
-    made = timeline.with_key(Timeline(length=length), 0, view(0.0, 1.0, azimuth=170.0, distance=1.0))
-    made = timeline.with_key(made, length, view(1.0, 0.5, azimuth=-170.0, distance=100.0))
-    return timeline.set_easing(made, timeline.keys_at(made, 0), easing)
+    film = timeline.with_key(Timeline(length=length), 0, view(0.0, 1.0, azimuth=170.0, distance=1.0))
+    film = timeline.with_key(film, length, view(1.0, 0.5, azimuth=-170.0, distance=100.0))
+    return timeline.set_easing(film, timeline.keys_at(film, 0), easing)
 
 
 def shift(made: Timeline, frame: int, to: int) -> Timeline:
@@ -133,9 +133,9 @@ def test_camera_turns_along_one_arc_between_any_two_up_axes(
 
 
 def test_values_are_constant_before_the_first_and_after_the_last_key() -> None:
-    made = timeline.set_length(shift(two_keys(), 0, 5), 40)
-    assert timeline.state_at(made, 0, view()).layers == timeline.state_at(made, 5, view()).layers
-    assert timeline.state_at(made, 40, view()).camera == timeline.state_at(made, 20, view()).camera
+    film = timeline.set_length(shift(two_keys(), 0, 5), 40)
+    assert timeline.state_at(film, 0, view()).layers == timeline.state_at(film, 5, view()).layers
+    assert timeline.state_at(film, 40, view()).camera == timeline.state_at(film, 20, view()).camera
 
 
 def test_keys_ignore_later_and_missing_edits() -> None:
@@ -145,13 +145,13 @@ def test_keys_ignore_later_and_missing_edits() -> None:
 
 
 def test_keys_stay_ordered_distinct_and_on_the_timeline() -> None:
-    made = timeline.with_key(two_keys(), 7, view())
-    assert [key.frame for key in made.keys] == [0, 7, 20]
-    assert shift(made, 7, 20) == made
-    assert shift(made, 7, 21) == made
-    assert shift(made, 7, -1) == made
-    assert [key.frame for key in shift(made, 0, 12).keys] == [7, 12, 20]
-    assert [key.frame for key in timeline.without_keys(made, timeline.keys_at(made, 7)).keys] == [0, 20]
+    film = timeline.with_key(two_keys(), 7, view())
+    assert [key.frame for key in film.keys] == [0, 7, 20]
+    assert shift(film, 7, 20) == film
+    assert shift(film, 7, 21) == film
+    assert shift(film, 7, -1) == film
+    assert [key.frame for key in shift(film, 0, 12).keys] == [7, 12, 20]
+    assert [key.frame for key in timeline.without_keys(film, timeline.keys_at(film, 7)).keys] == [0, 20]
 
 
 def test_timeline_is_never_shorter_than_its_last_key() -> None:
@@ -174,13 +174,13 @@ def test_ping_pong_film_does_not_repeat_its_end_frames() -> None:
 
 @pytest.mark.parametrize("ping_pong", [False, True])
 def test_playback_shows_the_film_frames_in_order_at_its_rate(ping_pong: bool) -> None:
-    made = replace(two_keys(length=3), ping_pong=ping_pong, fps=10)
+    film = replace(two_keys(length=3), ping_pong=ping_pong, fps=10)
     player = Player(playing=True)
     seen = [0]
     for _ in range(11):
-        player = timeline.advance(player, made, 0.1 + 1e-9)
+        player = timeline.advance(player, film, 0.1 + 1e-9)
         seen.append(player.frame)
-    assert seen == (list(timeline.film_frames(made)) * 3)[:12]
+    assert seen == (list(timeline.film_frames(film)) * 3)[:12]
 
 
 def test_turntable_is_even_and_loops_seamlessly() -> None:
@@ -211,12 +211,12 @@ def test_slider_film_moves_sliders_in_turn_and_keeps_the_others() -> None:
 
 
 def test_slow_frame_skips_film_frames_to_keep_the_rate() -> None:
-    made = replace(two_keys(length=20), fps=10)
+    film = replace(two_keys(length=20), fps=10)
     fast = Player(playing=True)
     slow = Player(playing=True)
     for _ in range(47):
-        fast = timeline.advance(fast, made, 0.0155)
-    slow = timeline.advance(slow, made, 47 * 0.0155)
+        fast = timeline.advance(fast, film, 0.0155)
+    slow = timeline.advance(slow, film, 47 * 0.0155)
     assert fast.frame == slow.frame == 7
 
 
@@ -264,11 +264,11 @@ def test_single_key_does_not_override_strengths_and_camera() -> None:
 
 
 def test_drag_during_playback_is_one_undo_entry() -> None:
-    made = Timeline(
+    film = Timeline(
         (Keyframe(0, ((0, 0.0),)), Keyframe(20, ((0, 1.0),))),
         length=20,
     )
-    work = act(workspace.new_workspace(replace(view(), timeline=made)), "play")
+    work = act(workspace.new_workspace(replace(view(), timeline=film)), "play")
     for strength in (0.5, 0.6, 0.7):  # a drag of the other slider
         layers = (work.view.layers[0], replace(work.view.layers[1], strength=strength))
         work = workspace.advance(replace(work, view=replace(work.view, layers=layers)), 0.1)
@@ -290,11 +290,11 @@ def frames_of(work: Workspace, row: int) -> list[int]:
 
 
 def test_whole_keys_split_into_rows_and_join_again() -> None:
-    made = timeline.with_key(two_keys(), 7, view(0.9))
-    rows = timeline.split_keys(made)
+    film = timeline.with_key(two_keys(), 7, view(0.9))
+    rows = timeline.split_keys(film)
     assert sorted(rows) == [(row, frame) for row in (-1, 0, 1) for frame in (0, 7, 20)]
-    assert timeline.join_keys(made, rows) == made
-    assert timeline.join_keys(made, dict(reversed(rows.items()))) == made
+    assert timeline.join_keys(film, rows) == film
+    assert timeline.join_keys(film, dict(reversed(rows.items()))) == film
 
 
 def test_moving_the_key_of_a_row_keeps_the_other_rows() -> None:
@@ -312,8 +312,8 @@ def test_moving_the_key_of_a_row_keeps_the_other_rows() -> None:
 
 
 def test_keys_of_one_frame_may_have_different_easings() -> None:
-    made = timeline.set_easing(two_keys("linear"), [(0, 0)], "hold")
-    assert timeline.strengths_at(made, 10) == {0: 0.0, 1: 0.75}
+    film = timeline.set_easing(two_keys("linear"), [(0, 0)], "hold")
+    assert timeline.strengths_at(film, 10) == {0: 0.0, 1: 0.75}
 
 
 def test_copied_keys_replace_keys_at_the_playhead() -> None:

@@ -299,13 +299,13 @@ def test_page_of_a_widget_has_its_strengths_and_camera(tmp_path: Path) -> None:
 
 def test_in_place_changes_of_strengths_and_camera_notify_observers() -> None:
     widget = bear_widget(0.0, 0.0)
-    told = list[Any]()
-    widget.observe(lambda change: told.append(dict(change.new)), ["strengths", "camera"])
+    changes = list[Any]()
+    widget.observe(lambda change: changes.append(dict(change.new)), ["strengths", "camera"])
     widget.strengths["ears"] = 0.5
     widget.strengths |= {"ears": np.float32(0.25)}
     widget.strengths.update(scarf=torch.tensor(0.75))
     widget.camera["azimuth"] = 70.0
-    assert [each.get("ears", each.get("azimuth")) for each in told] == [0.5, 0.25, 0.25, 70.0]
+    assert [each.get("ears", each.get("azimuth")) for each in changes] == [0.5, 0.25, 0.25, 70.0]
     assert widget.strengths == {"scarf": 0.75, "ears": 0.25}
     assert widget.camera["azimuth"] == 70.0
 
