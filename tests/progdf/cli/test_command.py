@@ -1,4 +1,4 @@
-"""The front door: what a person sees who types something wrong."""
+"""Tests of the progdf command: errors for wrong input, signals, and internal errors."""
 
 from __future__ import annotations
 
@@ -32,29 +32,29 @@ def stderr_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     return captured.err
 
 
-def test_without_a_command_it_lists_them_all(capsys: pytest.CaptureFixture[str]) -> None:
+def test_progdf_without_a_command_lists_all_commands(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([]) == 0
     out = capsys.readouterr().out
     assert all(name in out for name in COMMANDS)
 
 
-def test_help_does_not_wait_for_torch() -> None:
+def test_help_does_not_import_torch() -> None:
     code = "import sys; from progdf.__main__ import main; main(['--help']); print('torch' in sys.modules)"
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert said.splitlines()[-1] == "False"
 
 
-def test_every_public_name_is_found() -> None:
+def test_every_public_name_exists() -> None:
     assert all(hasattr(progdf, name) for name in progdf.__all__)
     assert not hasattr(progdf, "undo_everything")
 
 
-def test_an_unknown_command_is_one_line_that_names_the_known_ones(capsys: pytest.CaptureFixture[str]) -> None:
+def test_unknown_command_error_names_the_known_ones(capsys: pytest.CaptureFixture[str]) -> None:
     assert "train" in stderr_of(capsys, "trian")
 
 
 @pytest.mark.parametrize("command", ["info", "render", "export", "train", "fit", "view"])
-def test_a_missing_file_is_one_line_and_exit_2(
+def test_missing_file_is_reported_in_one_line_with_exit_2(
     command: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     missing = str(tmp_path / "nowhere.ply")
@@ -67,7 +67,7 @@ def test_a_missing_file_is_one_line_and_exit_2(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_full_disk_says_what_to_do(
+def test_full_disk_error_suggests_freeing_space(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(argv: object) -> None:
@@ -78,13 +78,13 @@ def test_a_full_disk_says_what_to_do(
 
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))
-def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([command, "--help"]) == 0
     assert "usage" in capsys.readouterr().out.lower()
 
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))
-def test_an_option_that_does_not_exist_is_one_line(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unknown_option_is_reported_in_one_line(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     said = stderr_of(capsys, command, "--no-such-option")
     assert f"see progdf {command} --help" in said
 
@@ -95,12 +95,12 @@ NO_PRESET = (
 )
 
 
-def test_a_choice_that_is_none_names_those_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_choice_error_lists_the_valid_ones(capsys: pytest.CaptureFixture[str]) -> None:
     said = stderr_of(capsys, "train", "scene.ply", "--preset", "tables")
     assert said == f"progdf: {NO_PRESET}\n"
 
 
-def test_options_are_refused_in_one_line_where_no_frame_can_be_drawn() -> None:
+def test_option_errors_are_reported_in_one_line_on_an_ascii_terminal() -> None:
     command = [sys.executable, "-m", "progdf", "train", "scene.ply", "--preset", "tables"]
     env = {**os.environ, "PYTHONIOENCODING": "ascii"}
     refused = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
@@ -108,7 +108,7 @@ def test_options_are_refused_in_one_line_where_no_frame_can_be_drawn() -> None:
 
 
 @pytest.mark.parametrize("threads", ["-1", "99999"])
-def test_a_number_of_threads_that_cannot_be_is_told(
+def test_thread_count_out_of_range_is_refused(
     threads: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     assert "--threads must be between 0 and 1024" in stderr_of(
@@ -117,7 +117,7 @@ def test_a_number_of_threads_that_cannot_be_is_told(
 
 
 @pytest.mark.parametrize("psnr", ["nan", "inf", "0", "-3", "99.1", "1e99"])
-def test_a_refit_to_what_no_field_can_measure_is_refused(
+def test_unmeasurable_target_psnr_is_refused(
     psnr: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     assert "--target-psnr must be above 0" in stderr_of(capsys, "fit", str(tmp_path), "--target-psnr", psnr)
@@ -135,7 +135,7 @@ def test_a_refit_to_what_no_field_can_measure_is_refused(
         ("--steps", "-1"),
     ],
 )
-def test_a_run_of_numbers_that_cannot_be_is_not_begun(
+def test_out_of_range_numbers_stop_a_run_before_it_starts(
     option: str, number: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     save_ply(tmp_path / "scene.ply", random_gaussians(20))
@@ -149,7 +149,7 @@ def test_a_run_of_numbers_that_cannot_be_is_not_begun(
 @pytest.mark.parametrize(
     "editor", ["recolor:#30", "tint:", "stripes:red", "darken:nan", "style:99", "folder:nope"]
 )
-def test_an_editor_that_cannot_be_is_told_before_a_folder_is_made(
+def test_invalid_editor_is_refused_before_a_folder_is_created(
     editor: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     run = tmp_path / "run"
@@ -160,7 +160,7 @@ def test_an_editor_that_cannot_be_is_told_before_a_folder_is_made(
     assert not run.exists()
 
 
-def test_a_mistake_of_ours_is_one_line_and_a_file_with_the_details(
+def test_internal_error_prints_one_line_and_writes_a_crash_file(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     def wrong(argv: object) -> None:
@@ -188,7 +188,7 @@ def test_a_mistake_of_ours_is_one_line_and_a_file_with_the_details(
         RuntimeError("DefaultCPUAllocator: not enough memory: you tried to allocate 9 bytes."),
     ],
 )
-def test_too_little_memory_is_one_line(
+def test_out_of_memory_is_reported_in_one_line(
     error: Exception, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def large(argv: object) -> None:
@@ -201,7 +201,7 @@ def test_too_little_memory_is_one_line(
 @pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize("command", ["info", "view"])
 @pytest.mark.parametrize("number", ["SIGTERM", "SIGHUP"])
-def test_a_signal_that_ends_a_command_takes_its_temporary_files_along(
+def test_signal_that_ends_a_command_removes_its_temporary_files(
     command: str,
     number: str,
     monkeypatch: pytest.MonkeyPatch,
@@ -221,7 +221,7 @@ def test_a_signal_that_ends_a_command_takes_its_temporary_files_along(
     assert signal.getsignal(getattr(signal, number)) == signal.SIG_DFL
 
 
-def test_a_current_folder_that_was_removed_is_one_line(
+def test_removed_current_folder_is_reported_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "gone").mkdir()
@@ -232,7 +232,7 @@ def test_a_current_folder_that_was_removed_is_one_line(
     )
 
 
-def test_settings_that_numba_does_not_work_with_are_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unusable_numba_settings_are_reported_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     # the module alone, as its package loads torch
     code = f"import runpy; runpy.run_path({jit.__file__!r})"
     settings = {"NUMBA_NUM_THREADS": "0"}
@@ -253,7 +253,7 @@ def test_settings_that_numba_does_not_work_with_are_one_line(monkeypatch: pytest
         (["region", "scene.ply", "all", "-o"], "trainer.regions.command.show"),
     ],
 )
-def test_control_characters_of_own_arguments_are_escaped(
+def test_control_characters_of_arguments_are_escaped(
     words: list[str], writer: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def wrote(options: WriteViewsOptions | ShowRegionOptions) -> list[str]:
@@ -264,7 +264,7 @@ def test_control_characters_of_own_arguments_are_escaped(
     assert capsys.readouterr().out == "wrote a\\x1b[2J\\n.png\n"
 
 
-def test_a_signal_that_is_ignored_stays_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ignored_signal_stays_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("progdf.cli.info.main", lambda argv: os.kill(os.getpid(), signal.SIGHUP))
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
     try:
@@ -273,13 +273,13 @@ def test_a_signal_that_is_ignored_stays_ignored(monkeypatch: pytest.MonkeyPatch)
         signal.signal(signal.SIGHUP, before)
 
 
-def test_a_child_of_a_test_heeds_signals() -> None:
+def test_child_of_a_test_handles_signals() -> None:
     code = "import signal as s; print([s.getsignal(n) for n in (s.SIGINT, s.SIGHUP, s.SIGTERM)])"
     child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "SIG_IGN" not in child.stdout
 
 
-def test_tests_pass_where_signals_arrive_ignored() -> None:
+def test_tests_pass_if_signals_are_inherited_ignored() -> None:
     command = [sys.executable, "-m", "pytest", "-n", "0", __file__, "-k", "SIGHUP or child_of_a_test"]
     env = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
     shell = ["sh", "-c", "trap '' INT HUP; exec \"$@\"", "sh"]
@@ -294,7 +294,7 @@ def test_tests_pass_where_signals_arrive_ignored() -> None:
         *("CON", "nul.x", "a:b", "com1 .y", "a.", "a ", "what?"),
     ],
 )
-def test_a_name_that_cannot_be_a_file_is_told_before_a_folder_is_made(
+def test_invalid_edit_name_is_refused_before_a_folder_is_created(
     name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     out = ("--out", str(tmp_path / "run"), "--region", "all", "--editor", "night", "--name", name)
@@ -316,7 +316,7 @@ STREAMS = "import sys; from progdf.__main__ import main; sys.exit(main(sys.argv[
         ('LC_ALL=C PYTHONUTF8=0 PYTHONCOERCECLOCALE=0 "$0" -c "$1" $(printf "\\351")', 2),
     ],
 )
-def test_streams_that_are_closed_full_or_of_few_letters_end_no_command(shell: str, status: int) -> None:
+def test_closed_full_or_ascii_streams_do_not_crash_a_command(shell: str, status: int) -> None:
     ran = subprocess.run(["sh", "-c", shell, sys.executable, STREAMS], capture_output=True)
     assert ran.returncode == status, ran
     assert b"Traceback" not in ran.stderr

@@ -1,4 +1,4 @@
-"""Arguments that are no text, very long values, outputs that take nothing, too little memory."""
+"""Tests of command lines that are not UTF-8 or very long, of full outputs and of low memory."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ posix = pytest.mark.skipif(os.name == "nt", reason="needs a POSIX shell")
 
 
 def line_of(capsys: pytest.CaptureFixture[str], *words: str) -> str:
-    """Return the one line in which a command line is refused."""
+    """Return the single line of a refused command line."""
     assert main(list(words)) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1, said
@@ -51,7 +51,7 @@ RUN = ("--out", "run", "--views", "3", "--image-size", "32")
     ("region", "editor"),
     [(f"file:{NO_TEXT}.npy", "night"), ("all", f"instruct:{NO_TEXT}"), (f"text:{NO_TEXT}", "night")],
 )
-def test_run_with_options_that_are_not_utf8_is_not_begun(
+def test_run_with_options_that_are_not_utf8_is_not_started(
     scene: str, region: str, editor: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = entries()
@@ -60,7 +60,7 @@ def test_run_with_options_that_are_not_utf8_is_not_begun(
     assert entries() == before
 
 
-def test_run_of_a_scene_whose_name_is_not_utf8_is_not_begun(
+def test_run_of_a_scene_with_a_name_that_is_not_utf8_is_not_started(
     scene: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     os.rename(scene, f"{NO_TEXT}.ply")
@@ -78,7 +78,7 @@ def test_run_of_a_scene_whose_name_is_not_utf8_is_not_begun(
         ("--move", f"file:{NO_TEXT}.npy:1,2,3", "-o", "a.gdf"),
     ],
 )
-def test_edit_that_would_record_no_text_is_not_written(
+def test_edit_that_would_record_invalid_text_is_not_written(
     scene: str, words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
     np.save(f"{NO_TEXT}.npy", np.arange(5))
@@ -100,11 +100,11 @@ def test_bundle_of_any_name_opens_again(
 
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))
-def test_nul_in_an_argument_is_one_line(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_nul_in_an_argument_is_reported_in_one_line(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert "holds a NUL" in line_of(capsys, command, "a\0b")
 
 
-def test_text_that_is_not_utf8_is_no_mistake_of_ours(
+def test_text_that_is_not_utf8_is_no_internal_error(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("progdf.cli.info.main", lambda argv: NO_TEXT.encode())
@@ -144,7 +144,7 @@ def test_error_elides_each_value_and_keeps_the_remedy() -> None:
     assert len(short) == 80
 
 
-def test_path_that_exists_stays_whole(tmp_path: Path) -> None:
+def test_existing_path_is_not_elided(tmp_path: Path) -> None:
     deep = tmp_path / ("d" * 200) / ("e" * 200)
     deep.mkdir(parents=True)
     for path in (deep, deep / "absent.ply"):
@@ -164,7 +164,7 @@ def test_path_that_exists_stays_whole(tmp_path: Path) -> None:
         ('set -o pipefail; "$0" -c "$1" train --help | true', 0),
     ],
 )
-def test_output_that_takes_nothing_ends_in_one_line(scene: str, shell: str, status: int) -> None:
+def test_full_output_is_reported_in_one_line(scene: str, shell: str, status: int) -> None:
     words = ["bash", "-c", shell, sys.executable, PROGRAM, scene]
     buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
     ran = subprocess.run(words, capture_output=True, text=True, env=buffered)
@@ -186,7 +186,7 @@ def test_output_that_takes_nothing_ends_in_one_line(scene: str, shell: str, stat
         RuntimeError("can't start new thread"),
     ],
 )
-def test_memory_that_ran_out_is_recognized_behind_other_errors(error: Exception) -> None:
+def test_out_of_memory_is_recognized_behind_other_errors(error: Exception) -> None:
     assert is_out_of_memory(error)
     outer = ValueError("a")
     outer.__cause__ = error
@@ -200,7 +200,7 @@ def test_memory_that_ran_out_is_recognized_behind_other_errors(error: Exception)
 
 
 @posix
-def test_little_address_space_is_one_line(scene: str) -> None:
+def test_low_address_space_is_reported_in_one_line(scene: str) -> None:
     words = ["bash", "-c", 'ulimit -v 400000; "$0" -c "$1" info "$2"', sys.executable, PROGRAM, scene]
     ran = subprocess.run(words, capture_output=True, text=True)
     assert (ran.returncode, ran.stderr.count("\n")) == (2, 1), ran
@@ -208,7 +208,7 @@ def test_little_address_space_is_one_line(scene: str) -> None:
 
 
 @posix
-def test_home_that_cannot_be_written_costs_nothing(scene: str, tmp_path: Path) -> None:
+def test_unwritable_home_folder_does_no_harm(scene: str, tmp_path: Path) -> None:
     (tmp_path / "home").write_text("no folder")
     homes = {"HOME": str(tmp_path / "home"), "TMPDIR": str(tmp_path / "absent")}
     environment = {name: value for name, value in os.environ.items() if not name.startswith("XDG_")} | homes

@@ -1,4 +1,4 @@
-"""`progdf info`: what a person reads about a file."""
+"""Tests of `progdf info`: the description of a file."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ FAR = 1e6
 
 
 def tidy(count: int = 300) -> Gaussians:
-    """Small round Gaussians of unit quaternions, none of them odd."""
+    """Return small round Gaussians with unit quaternions, none of them unusual."""
     scene = random_gaussians(count, seed=6)
     return replace(
         scene,
@@ -55,7 +55,7 @@ def error_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     return captured.err
 
 
-def test_info_says_how_many_and_that_nothing_was_repaired(
+def test_info_shows_the_count_and_that_nothing_was_repaired(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     save_ply(tmp_path / "scene.ply", tidy(1200))
@@ -80,7 +80,7 @@ def test_info_names_every_repair(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert "repaired: nothing" not in lines
 
 
-def test_info_points_at_strays_and_at_the_command_that_leaves_them_out(
+def test_info_reports_strays_and_the_command_that_removes_them(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scene = tidy()
@@ -93,7 +93,7 @@ def test_info_points_at_strays_and_at_the_command_that_leaves_them_out(
     assert ", 5 too transparent to be drawn; progdf edit " in line
 
 
-def test_the_survey_is_about_the_bulk_of_the_scene() -> None:
+def test_survey_describes_the_bulk_of_the_scene() -> None:
     scene = tidy(2000)
     scene.means[0] = torch.tensor([500.0, 0.0, 0.0])
     found = survey(scene)
@@ -104,14 +104,16 @@ def test_the_survey_is_about_the_bulk_of_the_scene() -> None:
     assert not found.surrounding
 
 
-def test_info_of_a_broken_file_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_of_a_broken_file_is_reported_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "scene.ply"
     save_ply(path, tidy())
     path.write_bytes(path.read_bytes()[:-10])
     assert "truncated" in error_of(capsys, "info", str(path))
 
 
-def test_info_tells_files_by_content_and_not_by_name(
+def test_info_detects_files_by_content_not_by_name(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     stack = bear_stack(2000)
@@ -123,7 +125,7 @@ def test_info_tells_files_by_content_and_not_by_name(
         assert said in lines_of(capsys, "info", str(disguised))[0]
 
 
-def test_info_of_an_edit_tells_its_scene_region_field_and_errors(
+def test_info_of_an_edit_shows_its_scene_region_field_and_errors(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from progdf.gdf.file import save_gdf
@@ -145,11 +147,11 @@ def test_info_of_an_edit_tells_its_scene_region_field_and_errors(
     assert {"report: field.psnr_worst 46.91", "report: edit.clip_direction not measured"} <= set(lines)
 
 
-def test_info_lists_the_ignored_fields_of_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_lists_ignored_fields_of_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     content = nerfstudio(some_cameras(), aabb_scale=16, k1=0.1)
     content["frames"][1] |= {"sharpness": 20.5, "k1": 0.0}
     path = tmp_path / "transforms.json"
-    path.write_bytes(b"\xef\xbb\xbf" + json.dumps(content).encode())  # as Windows programs begin a text
+    path.write_bytes(b"\xef\xbb\xbf" + json.dumps(content).encode())  # byte order mark
     assert lines_of(capsys, "info", str(path)) == [
         "transforms.json: 4 cameras",
         "images: 320x200 pixels",
@@ -168,7 +170,9 @@ def test_info_shows_a_folder_of_cameras(tmp_path: Path, capsys: pytest.CaptureFi
     assert "is a folder" in error_of(capsys, "info", str(tmp_path / "sparse" / ".." / ".."))
 
 
-def test_cameras_and_up_are_for_scenes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_cameras_and_up_options_are_for_scenes_only(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     save_ply(tmp_path / "scene.ply", tidy())
     save_cameras(tmp_path / "c.json", orbit_rig(tidy(), 3, 64, 48))
     told = lines_of(capsys, "info", str(tmp_path / "scene.ply"), "--cameras", str(tmp_path / "c.json"))
@@ -180,7 +184,9 @@ def test_cameras_and_up_are_for_scenes(tmp_path: Path, capsys: pytest.CaptureFix
     assert "is no scene" in error_of(capsys, "info", str(tmp_path / "c.json"), "--up", "+z")
 
 
-def test_info_of_anything_else_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_of_any_other_file_is_reported_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "picture.jpg").write_bytes(b"\xff\xd8\xff\xe0")
     assert "is a picture (JPEG), not a scene" in error_of(capsys, "info", str(tmp_path / "picture.jpg"))
     Image.new("RGB", (4, 4)).save(tmp_path / "picture.png")
@@ -210,7 +216,7 @@ def test_every_real_file_is_described_or_refused_in_one_line(
 
 
 class Terminal(io.StringIO):
-    """A stderr that is a terminal and knows when a line arrives."""
+    """Stderr that claims to be a terminal and signals when a line arrives."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -223,7 +229,7 @@ class Terminal(io.StringIO):
         self.written.set()
 
 
-def test_a_slow_search_is_announced_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slow_search_is_announced_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     with notice_when_slow("looking for strays", seconds=0.0):
@@ -231,7 +237,7 @@ def test_a_slow_search_is_announced_on_a_terminal(monkeypatch: pytest.MonkeyPatc
     assert terminal.getvalue() == "looking for strays\n"
 
 
-def test_a_quick_search_prints_no_notice(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_quick_search_prints_no_notice(monkeypatch: pytest.MonkeyPatch) -> None:
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     with notice_when_slow("looking for strays", seconds=3600.0):
@@ -241,7 +247,7 @@ def test_a_quick_search_prints_no_notice(monkeypatch: pytest.MonkeyPatch) -> Non
     assert terminal.getvalue() == ""
 
 
-def test_a_slow_search_adds_nothing_to_a_log(capsys: pytest.CaptureFixture[str]) -> None:
+def test_slow_search_adds_nothing_to_a_log(capsys: pytest.CaptureFixture[str]) -> None:
     with notice_when_slow("looking for strays", seconds=0.0):
         pass
     assert capsys.readouterr().err == ""
