@@ -1,4 +1,4 @@
-"""What lies between a color and its edit: between the ends, never gray, the same way for neighbors."""
+"""Tests of the path between a color and its edit: between both ends, never gray, alike for neighbors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.helpers.color_edits import recolor
 PAIRS = {
     "skin to blue": ("#e0ac88", "#3060d0"),
     "brown to blue": ("#8b5a2b", "#3060d0"),
-    "brown to sky": ("#8b5a2b", "#62b3ea"),  # 178 degrees, and the shorter way is the one over green
+    "brown to sky": ("#8b5a2b", "#62b3ea"),  # 178 degrees apart; the shorter arc passes green
     "orange to blue": ("#ff8c1a", "#3060d0"),
     "red to green": ("#c02020", "#20a040"),
     "gray to red": ("#808080", "#c02020"),
@@ -26,11 +26,11 @@ STRENGTHS = torch.linspace(0, 1, 21)
 ORANGE = torch.tensor([0.85, 0.45, 0.10])
 BLUE = torch.tensor([0.19, 0.38, 0.82])
 CHROMA_OF_GRAY = 0.01
-BIT = 2 / 255  # two channels that lie closer are as good as equal
+BIT = 2 / 255  # two channels closer than this are equal
 
 
 @pytest.mark.parametrize("name", PAIRS)
-def test_every_strength_lies_between_the_ends(name: str) -> None:
+def test_every_strength_lies_between_both_ends(name: str) -> None:
     start, end = (parse_color(text) for text in PAIRS[name])
     way = recolor(start.expand(21, 3), end, STRENGTHS, reference=start)
     lab = srgb_to_oklab(way)
@@ -49,7 +49,7 @@ def test_every_strength_lies_between_the_ends(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", PAIRS)
-def test_the_ends_are_exact_and_the_way_is_even(name: str) -> None:
+def test_color_path_has_exact_ends_and_even_steps(name: str) -> None:
     start, end = (parse_color(text) for text in PAIRS[name])
     way = recolor(start.expand(21, 3), end, STRENGTHS, reference=start)
     assert torch.equal(way[0], start)
@@ -58,17 +58,17 @@ def test_the_ends_are_exact_and_the_way_is_even(name: str) -> None:
     assert float(steps.max()) < 2.5 * float(steps.min())
 
 
-def test_the_hue_path_turns_along_the_circle_and_keeps_its_chroma() -> None:
+def test_hue_path_follows_the_hue_circle_and_keeps_chroma() -> None:
     lab = srgb_to_oklab(recolor(ORANGE.expand(21, 3), BLUE, STRENGTHS, ORANGE, path="hue"))
     hue = torch.rad2deg(torch.atan2(lab[10, 2], lab[10, 1]))
     assert 130 < float(hue) < 200, "over green"
     chroma = lab[:, 1:].norm(dim=1)
-    # sRGB has no teal as rich as these two
+    # sRGB has no teal as saturated as these two
     assert float(chroma.min()) > 0.6 * float(torch.minimum(chroma[0], chroma[-1]))
 
 
 def hues(lightness: float, chroma: float, count: int = 360) -> Tensor:
-    """sRGB colors all around the hue circle. [count,3]"""
+    """Return sRGB colors all around the hue circle. [count,3]"""
     angle = torch.linspace(0, 2 * math.pi, count + 1)[:-1]
     lab = torch.stack([torch.full_like(angle, lightness), chroma * angle.cos(), chroma * angle.sin()], dim=1)
     return oklab_to_srgb(lab).clamp(0, 1)
@@ -76,16 +76,16 @@ def hues(lightness: float, chroma: float, count: int = 360) -> Tensor:
 
 @pytest.mark.parametrize("path", ["bowed", "hue"])
 @pytest.mark.parametrize("reference", ["#d9731a", "#8b5a2b", "#d9a012", "#20a040", "#808080"])
-def test_neighboring_hues_stay_neighbors_on_the_way(reference: str, path: ColorPath) -> None:
+def test_neighboring_hues_stay_neighbors_along_the_path(reference: str, path: ColorPath) -> None:
     circle = hues(0.65, 0.11)
     for s in (0.25, 0.5, 0.75):
         way = recolor(circle, BLUE, s, parse_color(reference), path)
         apart = (way - way.roll(1, dims=0)).abs().amax(dim=1)
-        # a degree of hue is up to .008 before the edit; where two ways part, a few times that
+        # one degree of hue is up to 0.008 before the edit, and a few times that where two paths part
         assert float(apart.max()) < (0.03 if path == "bowed" else 0.07)
 
 
-def test_a_region_on_both_sides_of_the_opposite_hue_goes_one_way() -> None:
+def test_region_around_the_opposite_hue_takes_one_direction() -> None:
     lab = srgb_to_oklab(BLUE)
     opposite = math.atan2(-float(lab[2]), -float(lab[1]))
     angle = opposite + torch.deg2rad(torch.linspace(-15, 15, 31))
@@ -97,7 +97,7 @@ def test_a_region_on_both_sides_of_the_opposite_hue_goes_one_way() -> None:
         assert float(hue.mean().abs()) < math.radians(60), "by way of rose, as green is nobody's half"
 
 
-def test_the_grays_of_a_thing_do_not_shine_when_its_color_turns() -> None:
+def test_near_gray_colors_stay_dull_during_a_hue_change() -> None:
     for s in (0.2, 0.4, 0.6, 0.8):
         warm, cool = recolor(torch.tensor([[0.70, 0.68, 0.66], [0.66, 0.68, 0.70]]), BLUE, s, ORANGE)
         assert float((warm - cool).abs().max()) < 0.06, "they were neighbors and stay so"
@@ -105,14 +105,14 @@ def test_the_grays_of_a_thing_do_not_shine_when_its_color_turns() -> None:
 
 @pytest.mark.parametrize("s", [0.25, 0.5, 0.75])
 @pytest.mark.parametrize("path", ["bowed", "hue"])
-def test_hues_near_the_target_take_their_own_short_way(s: float, path: ColorPath) -> None:
+def test_hues_near_the_target_take_their_own_short_path(s: float, path: ColorPath) -> None:
     eyes = torch.tensor([[0.10, 0.70, 0.85], [0.15, 0.60, 0.95], [0.25, 0.45, 0.95]])  # cyan to blue
     way = recolor(eyes, BLUE, s, ORANGE, path)
     assert bool((way[:, 2] > way[:, 0] + 0.2).all()), "no orange fleck on the way to blue"
     assert bool((way[:, 2] > way[:, 1]).all())
 
 
-def test_the_straight_paths_are_straight_in_oklab_and_in_srgb() -> None:
+def test_straight_paths_are_straight_in_oklab_and_srgb() -> None:
     start = parse_color("#e0ac88").expand(21, 3)
     end = recolor(parse_color("#e0ac88").expand(21, 3), BLUE)
     lab, faded = (
@@ -125,10 +125,10 @@ def test_the_straight_paths_are_straight_in_oklab_and_in_srgb() -> None:
     assert float((lab - faded).abs().max()) > 0.02, "they are two ways"
 
 
-def test_a_straight_and_a_bent_way_have_the_same_lightness() -> None:
+def test_straight_and_bent_paths_have_equal_lightness() -> None:
     start = parse_color("#e0ac88").expand(21, 3)
     end = BLUE.expand(21, 3)
     lab = srgb_to_oklab(interpolate_colors(start, end, STRENGTHS, bend_of(start[0], BLUE)))
     expected = torch.lerp(srgb_to_oklab(start), srgb_to_oklab(end), STRENGTHS[:, None])
-    # colors on the edge of the gamut are known to a thousandth
+    # colors at the gamut boundary are known to 0.001
     assert torch.allclose(lab[:, 0], expected[:, 0], atol=2e-3)

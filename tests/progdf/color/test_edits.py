@@ -1,4 +1,4 @@
-"""Color edits: shading survives, strength 0 is the input."""
+"""Tests of color edits: shading is preserved, and strength 0 is the input."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def _polar(rgb: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return lightness, torch.hypot(a, b), torch.rad2deg(torch.atan2(b, a))
 
 
-def test_the_typical_color_of_many_pixels_is_the_same_on_any_number_of_threads() -> None:
+def test_typical_color_is_independent_of_the_thread_count() -> None:
     rng = torch.Generator().manual_seed(1)
     found = list[Tensor]()
     rgb = torch.rand(1_000_000, 3, generator=rng)
@@ -37,7 +37,7 @@ def test_the_typical_color_of_many_pixels_is_the_same_on_any_number_of_threads()
     assert all(torch.equal(found[0], other) for other in found[1:])
 
 
-def test_oklab_there_and_back_is_the_same_color() -> None:
+def test_oklab_round_trip_returns_the_same_color() -> None:
     rgb = _random()
     # single precision through two cubes and a power of 2.4
     assert (oklab_to_srgb(srgb_to_oklab(rgb)) - rgb).abs().max() < 1e-4
@@ -56,7 +56,7 @@ def test_small_steps_of_strength_are_small_steps_of_color(edit: str) -> None:
     rgb = torch.cat([_random(), torch.full((4, 3), 0.5), torch.tensor([[-0.3, 1.4, 0.5]])])
     steps = torch.stack([_edited(edit, rgb, float(s)) for s in torch.linspace(0, 1, 101)])
     largest = (steps[1:] - steps[:-1]).abs().amax(dim=(1, 2))
-    # a hundredth of the way, and the steepest part of a hue circle's sRGB is some ten times the mean slope
+    # one hundredth of the path; its steepest part in sRGB has about ten times the mean slope
     assert largest.max() < 0.2
 
 
@@ -74,13 +74,13 @@ def _edited(edit: str, rgb: Tensor, strength: float) -> Tensor:
     return (recolor if edit == "recolor" else tint)(rgb, BLUE, strength)
 
 
-def test_recoloring_takes_the_reference_to_the_target() -> None:
+def test_recolor_maps_the_reference_to_the_target() -> None:
     assert torch.allclose(recolor(ORANGE[None], BLUE)[0], BLUE, atol=2e-3)
     black = torch.full((1, 3), 0.03)
     assert torch.allclose(recolor(black, ORANGE)[0], ORANGE, atol=2e-3)
 
 
-def test_recoloring_keeps_the_order_of_lightness() -> None:
+def test_recolor_keeps_the_order_of_lightness() -> None:
     shades = torch.linspace(0.1, 1.0, 30)[:, None] * ORANGE
     before = _polar(shades)[0]
     after = _polar(recolor(shades, BLUE, 1.0))[0]
@@ -95,13 +95,13 @@ def test_gray_takes_the_hue_of_the_target() -> None:
         assert torch.allclose(hue, _polar(BLUE[None])[2], atol=3.0)
 
 
-def test_a_gray_target_keeps_the_source_hue_on_the_way() -> None:
+def test_gray_target_keeps_the_source_hue_along_the_path() -> None:
     half = recolor(ORANGE[None], torch.full((3,), 0.6), 0.5)
     assert torch.allclose(_polar(half)[2], _polar(ORANGE[None])[2], atol=3.0)
     assert float(_polar(recolor(ORANGE[None], torch.full((3,), 0.6)))[1]) < 0.01
 
 
-def test_edited_colors_can_be_shown() -> None:
+def test_edited_colors_are_displayable() -> None:
     for strength in (0.3, 1.0):
         for target in (BLUE, ORANGE, torch.ones(3), torch.zeros(3)):
             out = recolor(_random(), target, strength)
@@ -110,19 +110,19 @@ def test_edited_colors_can_be_shown() -> None:
             assert out.max() <= 1
 
 
-def test_tinting_keeps_lightness() -> None:
+def test_tint_keeps_lightness() -> None:
     rgb = 0.2 + 0.6 * _random()
     assert (_polar(tint(rgb, BLUE))[0] - _polar(rgb)[0]).abs().max() < 0.01
 
 
-def test_a_stop_halves_the_light() -> None:
+def test_darkening_by_one_stop_halves_the_light() -> None:
     gray = torch.full((1, 3), 0.8)
     linear = ((0.8 + 0.055) / 1.055) ** 2.4
     darker = ((color.darken(gray, 1.0, stops=1.0) + 0.055) / 1.055) ** 2.4
     assert torch.allclose(darker, torch.full((1, 3), linear / 2), rtol=1e-3)
 
 
-def test_each_value_of_a_grade_does_what_its_name_says() -> None:
+def test_each_grade_value_has_its_named_effect() -> None:
     def graded(rgb: Tensor, **values: float) -> Tensor:
         return color.grade_fully(rgb, color.ColorGrade(values))
 
@@ -139,7 +139,7 @@ def test_each_value_of_a_grade_does_what_its_name_says() -> None:
     assert graded(some, saturation=-1.0).std(dim=1).max() < 1e-3
     more = _polar(graded(some, saturation=0.2))[1] / _polar(some)[1]
     assert 1.15 < more.median() < 1.21
-    middle = torch.full((1, 3), 0.4613)  # of 18 % of the light
+    middle = torch.full((1, 3), 0.4613)  # 18 % of the light
     assert torch.allclose(graded(middle, contrast=0.8), middle, atol=2e-3)
     steeper = graded(torch.tensor([[0.3, 0.3, 0.3], [0.7, 0.7, 0.7]]), contrast=0.5)
     assert steeper[0].max() < 0.28
@@ -153,7 +153,7 @@ def test_each_value_of_a_grade_does_what_its_name_says() -> None:
         assert 0 <= made.min() <= made.max() <= 1
 
 
-def test_strength_may_differ_from_pixel_to_pixel() -> None:
+def test_strength_may_differ_per_pixel() -> None:
     image = _random(64).reshape(8, 8, 3)
     strength = torch.linspace(0, 1, 64).reshape(8, 8)
     reference = color.typical_color(image)
@@ -162,24 +162,24 @@ def test_strength_may_differ_from_pixel_to_pixel() -> None:
     assert torch.allclose(whole[3, 5], one, atol=1e-5)
 
 
-def test_stripes_are_a_function_of_place() -> None:
+def test_stripes_are_a_function_of_position() -> None:
     along = torch.tensor([0.0, 0.25, 0.5, 1.0, 1.5])
     points = torch.stack([7 * along, 0.3 * along, along], dim=1)
     pattern = color.stripe_pattern(points, torch.tensor([0.0, 0.0, 3.0]), period=1.0)
     assert torch.allclose(pattern, torch.tensor([1.0, 0.5, 0.0, 1.0, 0.0]), atol=1e-5)
 
 
-def test_typical_color_counts_only_where_the_weights_are() -> None:
+def test_typical_color_ignores_pixels_of_zero_weight() -> None:
     rgb = torch.stack([ORANGE, BLUE])
     assert torch.allclose(color.typical_color(rgb, torch.tensor([1.0, 0.0])), ORANGE, atol=1e-3)
 
 
-def test_colors_are_read_from_hex() -> None:
+def test_colors_are_parsed_from_hex() -> None:
     assert torch.equal(color.parse_color("#ff0033"), torch.tensor([1.0, 0.0, 0.2]))
     assert torch.equal(color.parse_color("f03"), color.parse_color("#ff0033"))
 
 
 @pytest.mark.parametrize("text", ["", "#12", "gold", "#gggggg", "#1234567"])
-def test_what_is_no_color_is_refused_in_one_line(text: str) -> None:
+def test_invalid_color_is_refused_in_one_line(text: str) -> None:
     with pytest.raises(ProgdfError, match="is not a color; write it as #rrggbb"):
         color.parse_color(text)

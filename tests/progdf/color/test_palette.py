@@ -1,4 +1,4 @@
-"""The main colors of a region, and the maps of color that a hand makes: a palette, a curve of lightness."""
+"""Tests of the main colors of a region, and of hand-made color maps: palette and lightness curve."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ LAWN, BEAR, SCARF, STONE = (color.parse_color(c) for c in ("#7eae44", "#b97a30",
 
 
 def scene(counts: dict[int, torch.Tensor]) -> torch.Tensor:
-    """So many colors about each of some."""
+    """Return the given number of colors around each key color. [N,3]"""
     draws = Draws(5)
     return torch.cat([c + 0.02 * draws.normal(n, 3).float() for n, c in counts.items()]).clamp(0, 1)
 
 
-def test_a_palette_has_the_large_colors_first_and_a_small_one_that_is_unlike_them() -> None:
+def test_palette_starts_with_large_colors_and_keeps_a_distinct_small_one() -> None:
     rgb = scene({6000: LAWN, 3000: BEAR, 1000: STONE, 150: SCARF})
     found = find_palette(rgb, torch.ones(len(rgb)))
     assert len(found) <= COLORS
@@ -30,7 +30,7 @@ def test_a_palette_has_the_large_colors_first_and_a_small_one_that_is_unlike_the
     assert len(find_palette(LAWN.expand(50, 3), torch.ones(50))) == 1
 
 
-def test_a_scarf_is_a_main_color_beside_two_like_greens_of_a_lawn() -> None:
+def test_distinct_scarf_is_a_main_color_beside_similar_greens() -> None:
     pale = color.parse_color("#a4c860")
     dark = color.parse_color("#201810")
     rgb = scene({30_000: LAWN, 29_000: pale, 9000: BEAR, 8000: STONE, 7000: dark, 1000: SCARF})
@@ -38,13 +38,13 @@ def test_a_scarf_is_a_main_color_beside_two_like_greens_of_a_lawn() -> None:
     assert (found - SCARF).abs().amax(dim=1).min() < 0.1
 
 
-def test_what_is_not_seen_is_in_no_palette() -> None:
+def test_invisible_colors_are_not_in_the_palette() -> None:
     rgb = torch.stack([LAWN, SCARF])
     weights = torch.tensor([1.0, 0.0])
     assert torch.allclose(find_palette(rgb, weights), LAWN[None], atol=1e-5)
 
 
-def test_sources_become_their_targets_and_colors_that_are_held_stay() -> None:
+def test_palette_maps_sources_to_targets_and_holds_the_others() -> None:
     blue = color.parse_color("#3060d0")
     asked = color.ColorGrade(palette=((LAWN, blue), (BEAR, BEAR), (STONE, STONE)))
     made = color.grade_fully(torch.stack([LAWN, BEAR, STONE]), asked)
@@ -55,7 +55,7 @@ def test_sources_become_their_targets_and_colors_that_are_held_stay() -> None:
     assert torch.allclose(color.grade_fully(ends, asked), ends, atol=5e-3)
 
 
-def test_of_several_colors_each_goes_all_the_way_with_its_nearest_one() -> None:
+def test_each_color_moves_fully_with_its_nearest_palette_color() -> None:
     blue = color.parse_color("#3060d0")
     lab = srgb_to_oklab(torch.stack([LAWN, BEAR, STONE, blue, color.parse_color("#a8d860")]))
     targets = torch.stack([lab[3], lab[1], lab[2]])
@@ -63,7 +63,7 @@ def test_of_several_colors_each_goes_all_the_way_with_its_nearest_one() -> None:
     assert torch.allclose(lime - lab[4], lab[3] - lab[0], atol=0.02)
 
 
-def test_a_single_color_takes_those_near_it_along_and_leaves_far_ones() -> None:
+def test_single_palette_color_moves_near_colors_and_leaves_far_ones() -> None:
     lab = srgb_to_oklab(torch.stack([SCARF, LAWN, STONE]))
     target = srgb_to_oklab(torch.tensor([[0.2, 0.3, 0.9]]))
     made = shift_palette(lab, lab[:1], target)
@@ -71,7 +71,7 @@ def test_a_single_color_takes_those_near_it_along_and_leaves_far_ones() -> None:
     assert (made[1:] - lab[1:]).abs().max() < 0.02
 
 
-def test_the_map_of_a_palette_has_no_steps() -> None:
+def test_palette_map_has_no_steps() -> None:
     sources = srgb_to_oklab(torch.stack([LAWN, BEAR, STONE, SCARF]))
     targets = sources.clone()
     targets[0] = torch.tensor([0.5, 0.0, -0.15])
@@ -81,7 +81,7 @@ def test_the_map_of_a_palette_has_no_steps() -> None:
 
 
 @pytest.mark.parametrize("curve", [((0.25, 0.1), (0.75, 0.9)), ((0.5, 0.3),), ((0.0, 0.2), (1.0, 0.7))])
-def test_a_curve_passes_its_points_and_never_leaves_their_range(
+def test_lightness_curve_passes_its_points_and_stays_in_range(
     curve: tuple[tuple[float, float], ...],
 ) -> None:
     at = torch.tensor([x for x, _ in curve])
@@ -91,7 +91,7 @@ def test_a_curve_passes_its_points_and_never_leaves_their_range(
     assert torch.allclose(bend_lightness(torch.linspace(0, 1, 9), ()), torch.linspace(0, 1, 9), atol=1e-6)
 
 
-def test_a_curve_moves_lightness_and_keeps_the_hue() -> None:
+def test_lightness_curve_keeps_the_hue() -> None:
     asked = color.ColorGrade(curve=((0.5, 0.35),))
     rgb = torch.stack([LAWN, BEAR])
     before = srgb_to_oklab(rgb)
@@ -101,13 +101,13 @@ def test_a_curve_moves_lightness_and_keeps_the_hue() -> None:
     assert torch.allclose(*hues, atol=0.02)
 
 
-def test_a_grade_of_palette_and_curve_is_exact_at_strength_0() -> None:
+def test_palette_and_curve_grade_is_exact_at_strength_0() -> None:
     asked = color.ColorGrade(palette=((LAWN, SCARF),), curve=((0.5, 0.3),))
     rgb = scene({50: LAWN})
     assert torch.equal(color.grade_course(rgb, asked)(0.0), rgb)
 
 
-def test_a_curve_of_one_color_bends_what_is_near_it_and_nothing_else() -> None:
+def test_curve_of_one_color_bends_only_nearby_colors() -> None:
     held = tuple((c, c) for c in (LAWN, BEAR, STONE))
     colors = torch.stack([LAWN, BEAR, STONE])
     lightness = srgb_to_oklab(LAWN)[0].item()
@@ -124,7 +124,7 @@ def test_a_curve_of_one_color_bends_what_is_near_it_and_nothing_else() -> None:
     assert torch.allclose(color.grade_fully(colors, straight), colors, atol=2e-3)
 
 
-def test_the_curve_of_a_color_has_no_steps() -> None:
+def test_curve_of_one_color_has_no_steps() -> None:
     bent = color.ColorGrade(
         palette=((LAWN, BEAR), (STONE, STONE)), palette_curves=(((0.4, 0.6), (0.8, 0.7)), ((0.5, 0.3),))
     )
