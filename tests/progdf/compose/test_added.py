@@ -1,4 +1,4 @@
-"""Edits that add Gaussians and take some away: nothing shows at strength 0, all at 1, linearly between."""
+"""Tests of edits that add and remove Gaussians: invisible at strength 0, complete at 1, linear between."""
 
 from __future__ import annotations
 
@@ -41,18 +41,18 @@ def hat(scene: Gaussians) -> Gdf:
     return growing(scene, some_rows(scene, 40, 1), 25, 7)
 
 
-def test_nothing_of_what_is_added_or_taken_away_shows_at_zero(scene: Gaussians, hat: Gdf) -> None:
+def test_added_and_removed_rows_change_nothing_at_zero(scene: Gaussians, hat: Gdf) -> None:
     composed = compose_layers(scene, [Layer(hat, 0.0)])
     assert len(composed) == COUNT + 25
     assert bits(composed[:COUNT]) == bits(scene)
     assert bits(composed[remaining_rows(scene, composed)]) == bits(scene)
     before, after = (render(each, front_camera()).image for each in (scene, composed))
     assert float(before.std()) > 0.01
-    # how many numbers are vectorized together depends on their number, so last bits may differ
+    # the number of vectorized values depends on the row count, so last bits may differ
     assert float((before - after).abs().max()) <= 1e-6
 
 
-def test_opacity_goes_linearly_from_nothing_and_to_nothing(scene: Gaussians, hat: Gdf) -> None:
+def test_opacity_of_added_and_removed_rows_is_linear(scene: Gaussians, hat: Gdf) -> None:
     end = compose_layers(scene, [Layer(hat, 1.0)]).opacities
     members = hat.region.members[::2]
     for s in np.linspace(0.0, 1.0, 41):
@@ -63,7 +63,7 @@ def test_opacity_goes_linearly_from_nothing_and_to_nothing(scene: Gaussians, hat
         )
 
 
-def test_at_one_the_file_has_what_is_there_and_not_what_is_gone(scene: Gaussians, hat: Gdf) -> None:
+def test_exported_rows_at_one_include_added_and_exclude_removed(scene: Gaussians, hat: Gdf) -> None:
     composed = compose_layers(scene, [Layer(hat, 1.0)])
     rows = remaining_rows(scene, composed)
     faint = scene.logit_opacities < -np.log(254)
@@ -72,7 +72,7 @@ def test_at_one_the_file_has_what_is_there_and_not_what_is_gone(scene: Gaussians
 
 
 @pytest.mark.parametrize("blend", BLENDS)
-def test_the_composer_is_the_plain_form_on_random_stacks(scene: Gaussians, blend: str) -> None:
+def test_composer_matches_the_reference_on_random_stacks(scene: Gaussians, blend: str) -> None:
     draws = Draws(11)
     gdfs = [
         growing(scene, some_rows(scene, 40, 1), 25, 7),
@@ -93,12 +93,12 @@ def test_the_composer_is_the_plain_form_on_random_stacks(scene: Gaussians, blend
             for i in order
         ]
         composer.update(layers, blend)
-        # the plain form appends rows in the order of its layers
+        # the reference appends rows in the order of its layers
         plain = compose_layers(scene, [*(Layer(gdf, 0.0) for gdf in gdfs), *layers], blend)
         assert bits(composer.gaussians) == bits(plain)
 
 
-def test_an_extended_scene_composes_as_the_scene_and_its_edits(scene: Gaussians, hat: Gdf) -> None:
+def test_extended_scene_composes_like_the_scene_and_its_edits(scene: Gaussians, hat: Gdf) -> None:
     extended, (edit,) = extend(scene, [hat])
     assert bits(compose_layers(extended, [Layer(edit, 0.6)])) == bits(
         compose_layers(scene, [Layer(hat, 0.6)])
@@ -106,9 +106,7 @@ def test_an_extended_scene_composes_as_the_scene_and_its_edits(scene: Gaussians,
     assert extend(extended, [edit])[0] is extended
 
 
-def test_added_rows_come_back_as_they_were_saved_and_know_the_world(
-    scene: Gaussians, hat: Gdf, tmp_path: Path
-) -> None:
+def test_added_rows_are_saved_exactly_with_their_origin(scene: Gaussians, hat: Gdf, tmp_path: Path) -> None:
     save_gdf(tmp_path / "hat.gdf", hat)
     loaded = load_gdf(tmp_path / "hat.gdf", scene)
     assert loaded.added is not None
@@ -121,7 +119,7 @@ def test_added_rows_come_back_as_they_were_saved_and_know_the_world(
     assert torch.equal(moved.means[COUNT:], far.world_means.float())
 
 
-def test_an_edit_is_carried_over_with_its_added_rows(
+def test_rebind_carries_added_rows_over(
     scene: Gaussians, hat: Gdf, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     order = Draws(2).order(COUNT)
@@ -139,7 +137,7 @@ def test_an_edit_is_carried_over_with_its_added_rows(
 
 
 def hostile_changes(draws: Draws, tensors: dict[str, torch.Tensor]) -> dict[str, object]:
-    """One thing that a wrong or hostile writer may have done."""
+    """Return one change that a wrong or hostile writer may make."""
     names = sorted(tensors)
     name = names[int(draws.uniform(1) * len(names))]
     tensor = tensors[name]
@@ -170,7 +168,9 @@ def hostile_changes(draws: Draws, tensors: dict[str, torch.Tensor]) -> dict[str,
 
 
 @pytest.mark.parametrize("count", [200, pytest.param(2000, marks=pytest.mark.slow)])
-def test_hostile_files_are_one_line(scene: Gaussians, hat: Gdf, tmp_path: Path, count: int) -> None:
+def test_hostile_files_are_refused_in_one_line(
+    scene: Gaussians, hat: Gdf, tmp_path: Path, count: int
+) -> None:
     path = tmp_path / "hat.gdf"
     save_gdf(path, hat)
     content = path.read_bytes()
@@ -198,28 +198,28 @@ def test_hostile_files_are_one_line(scene: Gaussians, hat: Gdf, tmp_path: Path, 
     assert refused > count / 2
 
 
-def test_rows_that_would_show_at_zero_are_refused(scene: Gaussians, hat: Gdf) -> None:
+def test_added_rows_visible_at_zero_are_refused(scene: Gaussians, hat: Gdf) -> None:
     assert hat.added is not None
     shown = replace(hat.added, logit_opacities=torch.full((25,), -5.0))
     with pytest.raises(ValueError, match="is visible at strength 0"):
         replace(hat, added=shown)
 
 
-def test_a_field_without_members_for_the_added_rows_is_refused(scene: Gaussians, hat: Gdf) -> None:
+def test_field_without_members_for_the_added_rows_is_refused(scene: Gaussians, hat: Gdf) -> None:
     with pytest.raises(ValueError, match="25 rows are added"):
         replace(hat, field=curved_field(40))
     with pytest.raises(ValueError, match="25 rows are added"):
         replace(hat, field=BakedField("separable", torch.tensor([0.0, 1.0]), {}, 14))
 
 
-def test_info_says_how_many_rows_an_edit_adds(hat: Gdf, tmp_path: Path) -> None:
+def test_info_counts_the_added_rows(hat: Gdf, tmp_path: Path) -> None:
     save_gdf(tmp_path / "hat.gdf", hat)
     assert read_gdf(tmp_path / "hat.gdf").members == 65
 
 
 @pytest.mark.parametrize("blend", BLENDS)
 @pytest.mark.parametrize("first", [True, False])
-def test_a_grade_of_the_whole_scene_reaches_the_rows_that_others_add(
+def test_scene_grade_also_reaches_rows_added_by_other_layers(
     scene: Gaussians, hat: Gdf, blend: str, first: bool
 ) -> None:
     dark = whole_grade(scene)
@@ -244,7 +244,7 @@ def test_a_grade_of_the_whole_scene_reaches_the_rows_that_others_add(
         assert bits(composer.gaussians[:COUNT]) == bits(scene)
 
 
-def test_an_average_shares_the_kinds_of_change_that_a_layer_makes(scene: Gaussians) -> None:
+def test_average_shares_only_the_attributes_that_both_layers_change(scene: Gaussians) -> None:
     dark = whole_grade(scene)
     shirt = edit_of(scene, torch.arange(90), curved_field(90, 2), "shirt")
     both = compose_layers(scene, [Layer(shirt, 1.0), Layer(dark, 1.0)])

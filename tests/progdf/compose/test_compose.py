@@ -1,4 +1,4 @@
-"""The rules of several edits on one scene, and that dragging a slider follows them to the last bit."""
+"""Tests of the rules for several edits on one scene, and of the Composer, which matches them to the bit."""
 
 from __future__ import annotations
 
@@ -58,9 +58,7 @@ def test_strength_zero_is_the_original_bit_for_bit(
 
 
 @pytest.mark.parametrize("blend", BLENDS)
-def test_one_layer_at_full_strength_is_the_recorded_end_exactly(
-    scene: Gaussians, shirt: Gdf, blend: str
-) -> None:
+def test_one_layer_at_full_strength_is_the_recorded_end(scene: Gaussians, shirt: Gdf, blend: str) -> None:
     edited = compose_layers(scene, [Layer(shirt, 1.0)], blend)
     full = torch.cat([bases.end for bases in shirt.field.attributes.values()], dim=1)
     expected = scene.replace_rows(shirt.region.members, pack(scene)[shirt.region.members] + full)
@@ -78,7 +76,7 @@ def test_rows_outside_all_members_keep_their_bytes(
     assert bits(edited[outside]) == bits(scene[outside])
 
 
-def test_attributes_that_no_layer_moves_are_the_scenes_own(scene: Gaussians, hat: Gdf) -> None:
+def test_unmoved_attributes_are_the_tensors_of_the_scene(scene: Gaussians, hat: Gdf) -> None:
     edited = compose_layers(scene, [Layer(hat, 0.5)])
     assert edited.means is scene.means
     assert edited.shN is scene.shN
@@ -98,7 +96,7 @@ def test_weights_scale_the_change(scene: Gaussians, shirt: Gdf) -> None:
     assert torch.allclose(half, whole / 2, atol=1e-6)
 
 
-def test_gains_scale_their_own_kind_of_attribute_only(scene: Gaussians, shirt: Gdf) -> None:
+def test_gains_scale_only_their_own_kind_of_attribute(scene: Gaussians, shirt: Gdf) -> None:
     whole = change(scene, compose_layers(scene, [Layer(shirt, 0.6)]))
     found = change(
         scene, compose_layers(scene, [Layer(shirt, 0.6, gains=Gains(geometry=0.5, opacity=0.0, color=2.0))])
@@ -116,20 +114,22 @@ def test_disabled_layers_do_nothing(scene: Gaussians, shirt: Gdf, hat: Gdf) -> N
 
 
 @pytest.mark.parametrize("blend", ["normalized", "sum"])
-def test_the_order_of_layers_does_not_matter(scene: Gaussians, shirt: Gdf, hat: Gdf, blend: str) -> None:
+def test_order_of_layers_does_not_matter(scene: Gaussians, shirt: Gdf, hat: Gdf, blend: str) -> None:
     layers = [Layer(shirt, 0.8), Layer(hat, 0.9)]
     a, b = (change(scene, compose_layers(scene, order, blend)) for order in (layers, layers[::-1]))
     assert torch.allclose(a, b, atol=1e-6)
 
 
-def test_normalized_is_the_plain_sum_while_strengths_add_up_to_one(
+def test_normalized_is_the_sum_while_strengths_total_at_most_one(
     scene: Gaussians, shirt: Gdf, hat: Gdf
 ) -> None:
     layers = [Layer(shirt, 0.5), Layer(hat, 0.5)]
     assert bits(compose_layers(scene, layers, "normalized")) == bits(compose_layers(scene, layers, "sum"))
 
 
-def test_normalized_shares_where_strengths_add_up_to_more(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
+def test_normalized_divides_where_strengths_total_more_than_one(
+    scene: Gaussians, shirt: Gdf, hat: Gdf
+) -> None:
     layers = [Layer(shirt, 1.0), Layer(hat, 0.5)]
     both = torch.tensor(np.intersect1d(shirt.region.members, hat.region.members))
     assert len(both) > 10
@@ -142,7 +142,7 @@ def test_normalized_shares_where_strengths_add_up_to_more(scene: Gaussians, shir
     assert bool((summed[:, :3] != 0).any(dim=1).all())
 
 
-def test_over_puts_what_the_last_layer_changes_on_top(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
+def test_over_puts_changes_of_the_last_layer_on_top(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
     both = torch.tensor(np.intersect1d(shirt.region.members, hat.region.members))
     hidden = both[coverage(scene, hat)["color"][torch.searchsorted(hat.region.members, both)] == 1]
     assert len(hidden) > 10
@@ -151,7 +151,7 @@ def test_over_puts_what_the_last_layer_changes_on_top(scene: Gaussians, shirt: G
     assert torch.allclose(stacked.sh0[hidden], alone.sh0[hidden], atol=1e-6)
 
 
-def test_over_shows_the_layers_below_where_the_last_one_changes_nothing(scene: Gaussians, shirt: Gdf) -> None:
+def test_over_shows_lower_layers_where_the_last_changes_nothing(scene: Gaussians, shirt: Gdf) -> None:
     gold = compose_layers(scene, [Layer(shirt, 0.8)])
     for s in (0.3, 1.0):
         stacked = compose_layers(scene, [Layer(shirt, 0.8), Layer(striped(scene, shirt), s)], "over")
@@ -165,7 +165,7 @@ def test_over_shows_the_layers_below_where_the_last_one_changes_nothing(scene: G
 
 
 def striped(scene: Gaussians, below: Gdf) -> Gdf:
-    """Every other member of the edit below brighter by 1, the others as they are."""
+    """Return an edit that brightens every other member of the edit below by 1."""
     changes = torch.zeros(3, len(below.region), 14)
     changes[1:, 1::2, 11:14] = torch.tensor([0.5, 1.0])[:, None, None]
     field = fit_keyframes(torch.tensor([0.0, 0.5, 1.0]), changes, 2)
@@ -173,7 +173,7 @@ def striped(scene: Gaussians, below: Gdf) -> Gdf:
 
 
 @pytest.mark.parametrize("dragged", [0, 1])
-def test_over_moves_continuously_with_either_slider(scene: Gaussians, shirt: Gdf, dragged: int) -> None:
+def test_over_is_continuous_in_either_slider(scene: Gaussians, shirt: Gdf, dragged: int) -> None:
     stripes = striped(scene, shirt)
 
     def at(s: float) -> torch.Tensor:
@@ -184,11 +184,11 @@ def test_over_moves_continuously_with_either_slider(scene: Gaussians, shirt: Gdf
 
     largest = float((at(1.0) - at(0.0)).abs().max())
     steps = [float((at(s) - at(s - 0.01)).abs().max()) for s in (0.01, 0.02, 0.35, 0.7, 0.71, 1.0)]
-    # a bent course is up to a few times as fast as a straight one
+    # a bent path is up to a few times as fast as a straight one
     assert max(steps) < 0.05 * largest
 
 
-def test_over_hides_as_much_of_a_kind_as_its_gain_lets_through(scene: Gaussians, shirt: Gdf) -> None:
+def test_over_hides_as_much_of_a_kind_as_its_gain(scene: Gaussians, shirt: Gdf) -> None:
     top = striped(scene, shirt)
     below = compose_layers(scene, [Layer(shirt, 1.0)])
     for gain in (0.0, 0.5):
@@ -198,9 +198,9 @@ def test_over_hides_as_much_of_a_kind_as_its_gain_lets_through(scene: Gaussians,
         assert torch.allclose(stacked.sh0[stripe], expected, atol=1e-6)
 
 
-def test_coverage_rises_with_the_change_of_each_kind_and_ends_at_one(scene: Gaussians) -> None:
+def test_coverage_rises_with_each_kind_of_change_and_ends_at_one(scene: Gaussians) -> None:
     changes = torch.zeros(2, 40, 14)
-    changes[1, :, 0] = 0.001  # of a region some units wide: nobody sees it
+    changes[1, :, 0] = 0.001  # invisible in a region some units wide
     changes[1, :, 11] = torch.linspace(0, 2, 40)
     edit = edit_of(scene, torch.arange(40), fit_keyframes(torch.tensor([0.0, 1.0]), changes, 2))
     covered = coverage(scene, edit)
@@ -211,19 +211,19 @@ def test_coverage_rises_with_the_change_of_each_kind_and_ends_at_one(scene: Gaus
     assert bool((covered["color"][20:] == 1.0).all()), "half of the largest changes, and more"
 
 
-def test_an_overshooting_layer_alone_is_not_divided(scene: Gaussians, shirt: Gdf) -> None:
+def test_single_layer_above_strength_one_is_not_divided(scene: Gaussians, shirt: Gdf) -> None:
     assert bits(compose_layers(scene, [Layer(shirt, 1.2)])) == bits(
         compose_layers(scene, [Layer(shirt, 1.2)], "sum")
     )
 
 
 @pytest.mark.parametrize("strength", [float("nan"), float("inf")])
-def test_strengths_that_are_no_numbers_are_refused(scene: Gaussians, shirt: Gdf, strength: float) -> None:
+def test_strengths_that_are_not_finite_are_refused(scene: Gaussians, shirt: Gdf, strength: float) -> None:
     with pytest.raises(ProgdfError, match="the strength of shirt is"):
         compose_layers(scene, [Layer(shirt, strength)])
 
 
-def test_an_unknown_blend_rule_is_refused(scene: Gaussians, shirt: Gdf) -> None:
+def test_unknown_blend_rule_is_refused(scene: Gaussians, shirt: Gdf) -> None:
     with pytest.raises(ProgdfError, match="normalized, sum, over"):
         compose_layers(scene, [Layer(shirt)], "multiply")
 
@@ -231,12 +231,14 @@ def test_an_unknown_blend_rule_is_refused(scene: Gaussians, shirt: Gdf) -> None:
 @pytest.mark.parametrize(
     "weights", [torch.ones(149), torch.full((150,), 1.5), torch.full((150,), float("nan"))]
 )
-def test_weights_that_do_not_fit_are_refused(scene: Gaussians, shirt: Gdf, weights: torch.Tensor) -> None:
+def test_weights_of_wrong_size_or_range_are_refused(
+    scene: Gaussians, shirt: Gdf, weights: torch.Tensor
+) -> None:
     with pytest.raises(ValueError, match="weights of shirt"):
         compose_layers(scene, [Layer(shirt, 0.5, weights=weights)])
 
 
-def test_a_scene_written_to_in_place_is_another_scene(scene: Gaussians, shirt: Gdf) -> None:
+def test_scene_modified_in_place_counts_as_another_scene(scene: Gaussians, shirt: Gdf) -> None:
     own = replace(scene, means=scene.means.clone())
     compose_layers(own, [Layer(shirt)])
     own.means[0] += 1.0
@@ -244,18 +246,20 @@ def test_a_scene_written_to_in_place_is_another_scene(scene: Gaussians, shirt: G
         compose_layers(own, [Layer(shirt)])
 
 
-def test_an_edit_of_another_scene_is_refused(scene: Gaussians, shirt: Gdf) -> None:
+def test_edit_of_another_scene_is_refused(scene: Gaussians, shirt: Gdf) -> None:
     with pytest.raises(ProgdfError, match="shirt was made for another scene: it has 400 Gaussians"):
         compose_layers(random_gaussians(30), [Layer(shirt)])
 
 
-# ---- the fast twin
+# ---- Composer, the fast twin
 
 
 @pytest.fixture(scope="module")
 def wardrobe(scene: Gaussians, shirt: Gdf, hat: Gdf) -> list[Gdf]:
-    """Overlapping edits of every storage type: int8, one member of float32, everything in float16 and
-    int16 with SH."""
+    """Return overlapping edits of every storage type.
+
+    One is int8, one a single member of float32, one float16 in everything, and one int16 with SH.
+    """
     channels = 14 + 9
     single = edit_of(
         scene, some_rows(scene, 1, 5), curved_field(1, 5, channels, basis_type=torch.float32), "pin"
@@ -281,7 +285,7 @@ def random_stack(rng: np.random.Generator, wardrobe: list[Gdf], order: np.ndarra
 
 
 @pytest.mark.parametrize("blend", BLENDS)
-def test_the_composer_gives_the_bits_of_compose_through_a_random_session(
+def test_composer_matches_compose_through_a_random_session(
     scene: Gaussians, wardrobe: list[Gdf], blend: str
 ) -> None:
     rng = np.random.default_rng(BLENDS.index(blend))
@@ -304,7 +308,7 @@ def test_the_composer_gives_the_bits_of_compose_through_a_random_session(
 
 
 @pytest.mark.parametrize("blend", BLENDS)
-def test_edits_that_overlap_the_dragged_one_keep_their_part(
+def test_edits_overlapping_the_dragged_edit_keep_their_share(
     scene: Gaussians, wardrobe: list[Gdf], blend: str
 ) -> None:
     composer = Composer(scene, wardrobe)
@@ -320,41 +324,41 @@ def test_edits_that_overlap_the_dragged_one_keep_their_part(
         assert bits(composer.gaussians) == bits(compose_layers(scene, layers, blend))
 
 
-def test_the_composer_leaves_the_scene_alone(scene: Gaussians, shirt: Gdf) -> None:
+def test_composer_does_not_modify_the_scene(scene: Gaussians, shirt: Gdf) -> None:
     before = bits(scene)
     Composer(scene, [shirt]).update([Layer(shirt, 0.5)])
     assert bits(scene) == before
 
 
-def test_a_slider_changes_the_rows_of_its_own_edit_only(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
+def test_slider_changes_only_the_rows_of_its_own_edit(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
     composer = Composer(scene, [shirt, hat])
     composer.update([Layer(shirt, 0.5), Layer(hat, 0.5)])
     told = composer.update([Layer(shirt, 0.5), Layer(hat, 0.6)], "normalized")
     assert np.array_equal(told.rows, hat.region.members.numpy())
 
 
-def test_nothing_is_reported_where_nothing_changed(scene: Gaussians, shirt: Gdf) -> None:
+def test_composer_reports_nothing_if_nothing_changed(scene: Gaussians, shirt: Gdf) -> None:
     composer = Composer(scene, [shirt])
     composer.update([Layer(shirt, 0.5)])
     told = composer.update([Layer(shirt, 0.5)])
     assert (len(told.rows), told.attributes, told.largest_move) == (0, (), 0.0)
 
 
-def test_a_color_gain_does_not_ask_for_a_new_depth_order(scene: Gaussians, shirt: Gdf) -> None:
+def test_color_gain_needs_no_new_depth_order(scene: Gaussians, shirt: Gdf) -> None:
     composer = Composer(scene, [shirt])
     composer.update([Layer(shirt, 0.5)])
     told = composer.update([Layer(shirt, 0.5, gains=Gains(color=0.3))])
     assert not told.means_moved
 
 
-def test_an_edit_of_colors_alone_does_not_ask_for_a_new_depth_order(scene: Gaussians, hat: Gdf) -> None:
+def test_color_edit_needs_no_new_depth_order(scene: Gaussians, hat: Gdf) -> None:
     told = Composer(scene, [hat]).update([Layer(hat, 0.5)])
     assert told.attributes == ("sh0",)
     assert told.largest_move == 0.0
 
 
 @pytest.mark.parametrize("count", [255, 256, 257, 700])
-def test_blocks_of_any_length_give_the_bits_of_compose(count: int) -> None:
+def test_composer_matches_compose_for_blocks_of_any_length(count: int) -> None:
     scene = random_gaussians(900, seed=count)
     edits = [
         edit_of(scene, some_rows(scene, count, 1), curved_field(count, 1), "first"),
@@ -366,7 +370,7 @@ def test_blocks_of_any_length_give_the_bits_of_compose(count: int) -> None:
         assert bits(composer.gaussians) == bits(compose_layers(scene, layers))
 
 
-def test_rows_that_begin_within_a_block_give_the_bits_of_compose() -> None:
+def test_composer_matches_compose_for_rows_starting_within_a_block() -> None:
     scene = random_gaussians(800, seed=8)
     low, high = (
         edit_of(scene, rows, curved_field(len(rows), 3)) for rows in torch.arange(700).split(300)[:2]
@@ -374,11 +378,11 @@ def test_rows_that_begin_within_a_block_give_the_bits_of_compose() -> None:
     composer = Composer(scene, [low, high])
     composer.update([Layer(low, 0.3)])
     layers = [Layer(low, 0.3), Layer(high, 0.4)]
-    composer.update(layers)  # rewrites rows 300 to 599 alone
+    composer.update(layers)  # rewrites only rows 300 to 599
     assert bits(composer.gaussians) == bits(compose_layers(scene, layers))
 
 
-def test_an_attribute_that_rests_at_a_node_adds_nothing(scene: Gaussians, shirt: Gdf) -> None:
+def test_attribute_with_zero_coefficients_at_a_node_adds_nothing(scene: Gaussians, shirt: Gdf) -> None:
     still = {
         name: replace(bases, coefficients=bases.coefficients.index_fill(0, torch.tensor([4]), 0.0))
         for name, bases in shirt.field.attributes.items()
@@ -390,7 +394,7 @@ def test_an_attribute_that_rests_at_a_node_adds_nothing(scene: Gaussians, shirt:
     assert bits(composer.gaussians) == bits(compose_layers(scene, layers))
 
 
-def test_weights_outside_their_range_are_refused_while_painting(scene: Gaussians, shirt: Gdf) -> None:
+def test_weights_out_of_range_are_refused_while_painting(scene: Gaussians, shirt: Gdf) -> None:
     composer = Composer(scene, [shirt])
     weights = torch.ones(150)
     composer.update([Layer(shirt, 0.5, weights=weights)])
@@ -399,7 +403,7 @@ def test_weights_outside_their_range_are_refused_while_painting(scene: Gaussians
         composer.update([Layer(shirt, 0.5, weights=weights)])
 
 
-def test_weights_painted_in_place_are_seen(scene: Gaussians, shirt: Gdf) -> None:
+def test_weights_painted_in_place_are_noticed(scene: Gaussians, shirt: Gdf) -> None:
     composer = Composer(scene, [shirt])
     weights = torch.ones(150)
     composer.update([Layer(shirt, 0.5, weights=weights)])
@@ -423,21 +427,21 @@ def test_one_thread_and_two_give_the_same_bits() -> None:
     assert found[0] == found[1]
 
 
-def test_numbers_that_are_not_finite_stay_in_their_row(shirt: Gdf, scene: Gaussians) -> None:
+def test_values_that_are_not_finite_stay_in_their_row(shirt: Gdf, scene: Gaussians) -> None:
     spoiled = replace(scene, sh0=scene.sh0.index_fill(0, shirt.region.members[:1], float("nan")))
     composer = Composer(spoiled, [shirt])
     composer.update([Layer(shirt, 0.5)])
     assert composer.gaussians.sh0.isnan().any(dim=1).sum() == 1
 
 
-def test_an_edit_without_any_change_is_an_edit(scene: Gaussians) -> None:
+def test_edit_without_any_change_composes(scene: Gaussians) -> None:
     still = edit_of(scene, some_rows(scene, 7), curved_field(7, moving=()))
     composer = Composer(scene, [still])
     composer.update([Layer(still, 0.5)])
     assert bits(composer.gaussians) == bits(compose_layers(scene, [Layer(still, 0.5)])) == bits(scene)
 
 
-def test_a_stranger_is_refused_by_the_composer(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
+def test_composer_refuses_an_unknown_edit(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
     with pytest.raises(ValueError, match="hat is not one of the composer's edits"):
         Composer(scene, [shirt]).update([Layer(hat, 0.5)])
 
@@ -453,8 +457,10 @@ def test_every_attribute_has_a_gain(scene: Gaussians) -> None:
 def graded(
     scene: Gaussians, members: torch.Tensor, darker: float, residual: bool = True, masked: bool = False
 ) -> Gdf:
-    """An edit that takes all colors of some rows towards black, and a little of single ones elsewhere; with a
-    mask each by another share."""
+    """Return an edit that darkens all colors of some rows and changes those of single rows a little.
+
+    With a mask, each row takes another share.
+    """
     knots = torch.tensor([0.0, 0.5, 1.0])
     table = torch.stack([identity_map(1) * torch.tensor(1.0 - darker * float(s)) for s in knots])
     course = torch.zeros(3, len(members), 3)
@@ -467,7 +473,7 @@ def graded(
 
 
 @pytest.mark.parametrize("strength", [0.0, 0.3, 1.0])
-def test_adjust_maps_the_colors_that_lie_below(scene: Gaussians, shirt: Gdf, strength: float) -> None:
+def test_adjust_maps_the_colors_of_the_layers_below(scene: Gaussians, shirt: Gdf, strength: float) -> None:
     dark = graded(scene, shirt.region.members, 0.6, residual=False)
     below = compose_layers(scene, [Layer(shirt, 1.0)])
     both = compose_layers(scene, [Layer(shirt, 1.0), Layer(dark, strength)], "adjust")
@@ -479,7 +485,7 @@ def test_adjust_maps_the_colors_that_lie_below(scene: Gaussians, shirt: Gdf, str
         assert bits(both) == bits(below)
 
 
-def test_adjust_alone_is_the_edit_as_trained_and_its_paint_counts(scene: Gaussians, shirt: Gdf) -> None:
+def test_adjust_on_the_original_is_the_trained_edit_and_keeps_weights(scene: Gaussians, shirt: Gdf) -> None:
     dark = graded(scene, shirt.region.members, 0.6)
     alone = compose_layers(scene, [Layer(dark, 0.7)])
     assert bits(compose_layers(scene, [Layer(dark, 0.7)], "adjust")) == bits(alone)
@@ -492,7 +498,7 @@ def test_adjust_alone_is_the_edit_as_trained_and_its_paint_counts(scene: Gaussia
     assert bits(unpainted) == bits(compose_layers(scene, [Layer(shirt, 1.0)]))
 
 
-def test_adjust_maps_what_lies_below_as_far_as_the_mask_lets_it(scene: Gaussians, shirt: Gdf) -> None:
+def test_adjust_maps_lower_layers_by_the_share_of_the_mask(scene: Gaussians, shirt: Gdf) -> None:
     rows = shirt.region.members
     dark = graded(scene, rows, 0.6, residual=False, masked=True)
     below = compose_layers(scene, [Layer(shirt, 1.0)])
@@ -502,16 +508,14 @@ def test_adjust_maps_what_lies_below_as_far_as_the_mask_lets_it(scene: Gaussians
     torch.testing.assert_close(both.sh[rows], expected, atol=2e-6, rtol=0)
 
 
-def test_adjust_counts_the_order(scene: Gaussians, shirt: Gdf) -> None:
+def test_adjust_depends_on_the_order_of_layers(scene: Gaussians, shirt: Gdf) -> None:
     dark = graded(scene, shirt.region.members, 0.9)
     above = compose_layers(scene, [Layer(shirt, 1.0), Layer(dark, 1.0)], "adjust")
     below = compose_layers(scene, [Layer(dark, 1.0), Layer(shirt, 1.0)], "adjust")
     assert not torch.equal(above.sh0, below.sh0)
 
 
-def test_a_grade_that_is_a_pattern_lies_over_what_is_below_as_far_as_its_map_does_not_say_it(
-    scene: Gaussians, shirt: Gdf
-) -> None:
+def test_adjust_overlays_the_residual_of_a_pattern_grade(scene: Gaussians, shirt: Gdf) -> None:
     rows = torch.arange(len(scene))
     dark = compose_layers(scene, [Layer(graded(scene, rows, 0.6, residual=False))])
     knots = torch.tensor([0.0, 1.0])
@@ -533,7 +537,7 @@ def test_a_grade_that_is_a_pattern_lies_over_what_is_below_as_far_as_its_map_doe
     assert int(far.sum()) > 50
 
 
-def test_grades_that_share_no_gaussian_are_adjusted_as_fast_as_any_edit(
+def test_grades_without_common_rows_use_the_fast_path_of_adjust(
     scene: Gaussians, hat: Gdf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     halves = [graded(scene, half, 0.6) for half in torch.arange(len(scene)).split(len(scene) // 2)]
@@ -547,7 +551,7 @@ def test_grades_that_share_no_gaussian_are_adjusted_as_fast_as_any_edit(
 
 
 @pytest.mark.parametrize("masked", [False, True])
-def test_the_composer_adjusts_as_compose_does(scene: Gaussians, shirt: Gdf, hat: Gdf, masked: bool) -> None:
+def test_composer_adjusts_like_compose(scene: Gaussians, shirt: Gdf, hat: Gdf, masked: bool) -> None:
     dark = graded(scene, shirt.region.members, 0.6, masked=masked)
     composer = Composer(scene, [shirt, hat, dark])
     for stack in (
@@ -561,7 +565,7 @@ def test_the_composer_adjusts_as_compose_does(scene: Gaussians, shirt: Gdf, hat:
         assert bits(composer.gaussians) == bits(compose_layers(scene, stack, "adjust"))
 
 
-def test_the_composer_adjusts_with_grades_of_other_scenes_and_tables_as_compose_does(
+def test_composer_adjusts_with_foreign_grades_and_tables_like_compose(
     scene: Gaussians, shirt: Gdf, hat: Gdf
 ) -> None:
     table = torch.rand(125, 3, generator=torch.Generator().manual_seed(5))
