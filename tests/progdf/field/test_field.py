@@ -1,4 +1,4 @@
-"""Fields: exact ends, errors that fall with rank, and a choice that needs few bytes."""
+"""Tests of fields: exact ends, errors that fall with rank, and the choice of a small field."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ BASIS_TYPES = [torch.int8, torch.float16, torch.float32]
 
 
 @pytest.mark.parametrize("basis_type", BASIS_TYPES)
-def test_the_ends_of_a_separable_field_are_exact(basis_type: torch.dtype) -> None:
+def test_ends_of_a_separable_field_are_exact(basis_type: torch.dtype) -> None:
     strengths, offsets = curved_trajectory(50, channels=14 + 24)
     field = fit_separable(strengths, offsets, EVERYTHING, basis_type=basis_type)
     assert not bool(field.offsets(0.0).any())
@@ -50,7 +50,7 @@ def test_the_ends_of_a_separable_field_are_exact(basis_type: torch.dtype) -> Non
 
 @pytest.mark.parametrize("in_half", [False, True])
 @pytest.mark.parametrize("count", [2, 3, 4, 9, 40])
-def test_the_ends_of_a_keyframe_field_are_exact(in_half: bool, count: int) -> None:
+def test_ends_of_a_keyframe_field_are_exact(in_half: bool, count: int) -> None:
     strengths, offsets = curved_trajectory(50)
     offsets[1:-1] = offsets[1:-1].half().float() if in_half else offsets[1:-1]
     field = fit_keyframes(strengths, offsets, count)
@@ -59,7 +59,7 @@ def test_the_ends_of_a_keyframe_field_are_exact(in_half: bool, count: int) -> No
 
 
 @pytest.mark.parametrize("kind", ["separable", "keyframes"])
-def test_attributes_that_never_move_are_absent(kind: str) -> None:
+def test_unmoved_attributes_are_absent(kind: str) -> None:
     strengths, offsets = curved_trajectory(50, channels=14 + 9, moving=("sh0",))
     made = (
         fit_separable(strengths, offsets, EVERYTHING)
@@ -71,19 +71,19 @@ def test_attributes_that_never_move_are_absent(kind: str) -> None:
 
 
 @pytest.mark.parametrize("members", [0, 1, 2])
-def test_hardly_any_members_are_enough(members: int) -> None:
+def test_fields_of_at_most_two_members_work(members: int) -> None:
     strengths, offsets = curved_trajectory(members)
     for field in (fit_separable(strengths, offsets, EVERYTHING), fit_keyframes(strengths, offsets, 3)):
         assert torch.equal(field.offsets(1.0), offsets[-1])
 
 
-def test_two_snapshots_are_a_straight_way() -> None:
+def test_two_snapshots_give_a_straight_path() -> None:
     strengths, offsets = curved_trajectory(20, snapshots=2)
     field = fit_separable(strengths, offsets, EVERYTHING)
     assert torch.allclose(field.offsets(0.25), 0.25 * offsets[-1])
 
 
-def test_an_edit_that_returns_to_its_start_is_followed() -> None:
+def test_edit_that_returns_to_its_start_is_followed() -> None:
     strengths, offsets = curved_trajectory(40)
     offsets[-1] = 0.0
     field = fit_separable(strengths, offsets, dict.fromkeys(ATTRIBUTES, 7))
@@ -105,7 +105,7 @@ def test_an_edit_that_returns_to_its_start_is_followed() -> None:
         ),
     ],
 )
-def test_what_is_no_trajectory_is_refused(strengths: Tensor, offsets: Tensor, message: str) -> None:
+def test_invalid_trajectory_is_refused(strengths: Tensor, offsets: Tensor, message: str) -> None:
     for fit in (lambda: fit_separable(strengths, offsets, {}), lambda: fit_keyframes(strengths, offsets, 3)):
         with pytest.raises(ValueError, match=message):
             fit()
@@ -114,13 +114,13 @@ def test_what_is_no_trajectory_is_refused(strengths: Tensor, offsets: Tensor, me
 # ---- separable
 
 
-def test_a_trajectory_of_two_bends_is_exact_with_two_bases() -> None:
+def test_trajectory_of_two_bends_is_exact_with_two_bases() -> None:
     strengths, offsets = curved_trajectory(80)
     field = fit_separable(strengths, offsets, EVERYTHING, basis_type=torch.float32)
     assert torch.allclose(at_snapshots(field, strengths), offsets, atol=1e-5)
 
 
-def test_int8_bases_stay_within_half_a_step_each() -> None:
+def test_int8_bases_are_within_half_a_step() -> None:
     exact = torch.randn(3, 100, 4, generator=torch.Generator().manual_seed(0))
     rest, step = quantize_bases(exact, torch.int8)
     assert rest.dtype == torch.int8
@@ -140,7 +140,7 @@ def test_error_falls_with_rank() -> None:
     assert errors[-1] < 1e-3 * errors[0]
 
 
-def test_between_snapshots_the_course_is_straight() -> None:
+def test_offsets_are_linear_between_snapshots() -> None:
     field = curved_field(30)
     low = float(field.knots[3])
     high = float(field.knots[4])
@@ -148,13 +148,13 @@ def test_between_snapshots_the_course_is_straight() -> None:
     assert torch.allclose(middle, 0.25 * field.offsets(low) + 0.75 * field.offsets(high), atol=1e-5)
 
 
-def test_beyond_the_end_the_last_stretch_goes_on() -> None:
+def test_last_segment_is_extrapolated_beyond_the_end() -> None:
     field = curved_field(30)
     last = field.offsets(1.0) - field.offsets(float(field.knots[-2]))
     assert torch.allclose(field.offsets(1.125), field.offsets(1.0) + last, atol=1e-4)
 
 
-def test_weights_turn_the_bases_to_what_shows() -> None:
+def test_weights_improve_the_fit_of_visible_members() -> None:
     strengths, offsets = curved_trajectory(60, seed=1)
     offsets[:, 30:] += 3 * curved_trajectory(30, seed=2)[1][:, :, :]
     weights = torch.ones(60)
@@ -169,7 +169,7 @@ def test_weights_turn_the_bases_to_what_shows() -> None:
     )
 
 
-def test_a_fit_is_the_same_every_time() -> None:
+def test_fit_is_deterministic() -> None:
     a = curved_field(40, seed=7)
     b = curved_field(40, seed=7)
     for name, bases in a.attributes.items():
@@ -179,7 +179,7 @@ def test_a_fit_is_the_same_every_time() -> None:
 # ---- baked fields
 
 
-def test_bases_that_do_not_fit_each_other_are_refused() -> None:
+def test_inconsistent_bases_are_refused() -> None:
     bases = curved_field(5).attributes["means"]
     for broken in (
         {"end_offset": bases.end_offset[:4]},
@@ -193,7 +193,7 @@ def test_bases_that_do_not_fit_each_other_are_refused() -> None:
             replace(bases, **broken)
 
 
-def test_nodes_must_run_upwards_from_zero_to_one() -> None:
+def test_knots_must_ascend_from_zero_to_one() -> None:
     field = curved_field(5)
     for nodes in (field.knots * 2, field.knots.flip(0), field.knots.double(), field.knots[:1]):
         with pytest.raises(ValueError, match="knots"):
@@ -207,10 +207,10 @@ def test_attributes_must_have_the_same_members() -> None:
         replace(field, attributes={**field.attributes, "sh0": other.attributes["sh0"]})
 
 
-# ---- the choice
+# ---- choice of a field
 
 
-def test_the_choice_meets_its_target_with_fewer_bytes_than_keyframes_need() -> None:
+def test_chosen_field_meets_its_target_with_fewer_bytes_than_keyframes() -> None:
     strengths, offsets = curved_trajectory(60, snapshots=17)
     render = linear_pictures(60, 14)
     evaluator = FieldEvaluator(strengths, offsets, render, target=45.0)
@@ -224,7 +224,7 @@ def test_the_choice_meets_its_target_with_fewer_bytes_than_keyframes_need() -> N
     assert float((render(end) - render(offsets[-1])).square().mean()) <= 10**-4.5
 
 
-def test_the_choice_spends_no_byte_on_what_no_picture_shows() -> None:
+def test_chosen_field_spends_no_bytes_on_invisible_attributes() -> None:
     strengths, offsets = curved_trajectory(60, snapshots=17)
     render = linear_pictures(60, 14)
     evaluator = FieldEvaluator(strengths, offsets, render, target=50.0)
@@ -233,7 +233,7 @@ def test_the_choice_spends_no_byte_on_what_no_picture_shows() -> None:
     assert field.attributes["sh0"].residual_basis.shape[0] > 0
 
 
-def test_a_straight_trajectory_needs_a_byte_a_number() -> None:
+def test_straight_trajectory_needs_one_byte_per_value() -> None:
     strengths, offsets = curved_trajectory(20)
     straight = strengths[:, None, None] * offsets[-1]
     chosen = choose_field(strengths, straight, linear_pictures(20, 14))
@@ -242,7 +242,7 @@ def test_a_straight_trajectory_needs_a_byte_a_number() -> None:
     assert chosen.best.worst > 55
 
 
-def test_a_target_out_of_reach_is_said_and_the_best_is_kept() -> None:
+def test_unreachable_target_is_reported_with_the_best_field() -> None:
     rng = torch.Generator().manual_seed(4)
     offsets = torch.randn(33, 40, 14, generator=rng)
     offsets[0] = 0
@@ -255,7 +255,7 @@ def test_a_target_out_of_reach_is_said_and_the_best_is_kept() -> None:
     assert chosen.why.endswith("none reaches 98 dB")
 
 
-def test_the_choice_says_that_its_field_is_the_smallest_that_serves() -> None:
+def test_choice_reports_the_smallest_sufficient_field() -> None:
     strengths, offsets = curved_trajectory(60, snapshots=17)
     chosen = choose_field(strengths, offsets, linear_pictures(60, 14))
     assert chosen.why == f"the smallest of {len(chosen.tried)} fields that reaches 40 dB"
@@ -264,8 +264,8 @@ def test_the_choice_says_that_its_field_is_the_smallest_that_serves() -> None:
 
 
 @pytest.mark.parametrize(("at", "serves"), [(2, True), (4, False)])
-def test_a_field_serves_that_is_near_at_the_finished_edit_too(at: int, serves: bool) -> None:
-    """One strength of four is off by 1.3 levels of 8 bits, which the mean of all hides."""
+def test_field_must_be_close_at_full_strength_too(at: int, serves: bool) -> None:
+    """Shift one of four strengths by 1.3 levels of 8 bits, which the mean over all hides."""
     strengths = torch.linspace(0, 1, 5)
     offsets = strengths[:, None, None].expand(5, 40, 14).contiguous()
     edited = {float(s): o[:, :3] for s, o in zip(strengths[1:], offsets[1:], strict=True)}
@@ -275,7 +275,7 @@ def test_a_field_serves_that_is_near_at_the_finished_edit_too(at: int, serves: b
     assert (evaluator.candidate(fit_keyframes(strengths, off, 5), "off").excess <= 1.0) is serves
 
 
-def test_what_an_edit_misses_of_its_editor_decides_how_much_is_stored() -> None:
+def test_error_of_the_edit_decides_how_much_is_stored() -> None:
     strengths, offsets = curved_trajectory(60, snapshots=17)
     render = linear_pictures(60, 14)
     noise = torch.randn(render(offsets[-1]).shape, generator=torch.Generator().manual_seed(0))
@@ -299,7 +299,7 @@ def test_what_an_edit_misses_of_its_editor_decides_how_much_is_stored() -> None:
     assert 10 ** (-fine.best.to_editor / 10) > 1.1 * own
 
 
-def test_an_end_that_moves_far_is_stored_in_more_bits_and_the_others_are_not() -> None:
+def test_only_far_moving_ends_are_stored_in_16_bits() -> None:
     strengths, offsets = curved_trajectory(60)
     render = linear_pictures(60, 14)
     means = attribute_slices(14)["means"]
@@ -316,7 +316,7 @@ def test_an_end_that_moves_far_is_stored_in_more_bits_and_the_others_are_not() -
 
 
 @pytest.mark.parametrize("end_type", END_TYPES)
-def test_the_end_is_what_its_levels_decode_to(end_type: torch.dtype) -> None:
+def test_end_offset_is_decoded_from_its_levels(end_type: torch.dtype) -> None:
     strengths, offsets = curved_trajectory(40)
     offsets = offsets[:, :, attribute_slices(14)["means"]].clone()
     stored = None if end_type == torch.float32 else quantize_bases(offsets[-1:], end_type)
@@ -330,7 +330,7 @@ def test_the_end_is_what_its_levels_decode_to(end_type: torch.dtype) -> None:
     assert not bool(field.offsets(0.0).any())
 
 
-def test_a_lossless_field_can_be_asked_for_whatever_it_takes() -> None:
+def test_lossless_field_can_be_requested() -> None:
     strengths, offsets = curved_trajectory(20)
     chosen = choose_field(strengths, offsets, linear_pictures(20, 14), kind="lossless")
     assert chosen.met
@@ -338,20 +338,20 @@ def test_a_lossless_field_can_be_asked_for_whatever_it_takes() -> None:
     assert torch.equal(at_snapshots(chosen.best.field, strengths), offsets)
 
 
-def test_an_edit_that_moves_nothing_is_a_choice_too() -> None:
+def test_edit_that_moves_nothing_gets_an_empty_field() -> None:
     chosen = choose_field(torch.linspace(0, 1, 5), torch.zeros(5, 9, 14), linear_pictures(9, 14))
     assert chosen.met
     assert chosen.best.field.bytes_per_member == 0
 
 
-def test_an_edit_that_no_view_shows_gets_the_fewest_bytes() -> None:
+def test_edit_invisible_in_every_view_gets_the_fewest_bytes() -> None:
     strengths, offsets = curved_trajectory(20)
     chosen = choose_field(strengths, offsets, lambda moved: torch.zeros(0, 3))
     assert chosen.met
     assert chosen.best.field.bytes_per_member == 14
 
 
-def test_the_expected_error_is_the_rendered_one_where_rendering_is_linear() -> None:
+def test_expected_error_matches_a_linear_rendering() -> None:
     strengths, offsets = curved_trajectory(40, snapshots=17)
     render = linear_pictures(40, 14)
     seen = render_trajectories(offsets, channel_weights(None, 40, 14), render)
@@ -364,7 +364,7 @@ def test_the_expected_error_is_the_rendered_one_where_rendering_is_linear() -> N
     assert torch.allclose(expected, torch.tensor(found, dtype=torch.float64), rtol=1e-3, atol=1e-12)
 
 
-def test_the_expected_error_counts_the_bases_that_are_kept() -> None:
+def test_expected_error_accounts_for_the_kept_bases() -> None:
     _, offsets = curved_trajectory(40, snapshots=17)
     render = linear_pictures(40, 14)
     seen = render_trajectories(offsets, channel_weights(None, 40, 14), render)
@@ -378,7 +378,7 @@ def test_the_expected_error_counts_the_bases_that_are_kept() -> None:
     assert torch.allclose(expected, found, rtol=1e-2, atol=1e-9)
 
 
-def test_bytes_go_first_to_what_shows_most() -> None:
+def test_bytes_go_to_the_most_visible_attributes_first() -> None:
     strengths, offsets = curved_trajectory(60, snapshots=17)
     render = linear_pictures(60, 14)
     judge = FieldEvaluator(strengths, offsets, render)
@@ -396,7 +396,7 @@ def test_bytes_go_first_to_what_shows_most() -> None:
         assert best.worst > judge.candidate(other, "").worst
 
 
-def test_the_judge_finds_no_error_in_all_snapshots() -> None:
+def test_all_snapshots_as_keyframes_have_no_error() -> None:
     strengths, offsets = curved_trajectory(20)
     judge = FieldEvaluator(strengths, offsets, linear_pictures(20, 14))
     assert min(judge.curve(fit_keyframes(strengths, offsets, 9))) > 90

@@ -1,4 +1,4 @@
-"""A grade: one map of color for a region, beside it a small residual, and nothing else in the file."""
+"""Tests of grades: one color map per region plus a small residual, and nothing else in the file."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ KNOTS = torch.tensor([0.0, 0.4, 1.0])
 
 
 def some_table(degree: int, strength: float = 1.0, seed: int = 1) -> Tensor:
-    """A map that mixes the channels, and bends them where it can."""
+    """Return a map that mixes the channels, and bends them if its degree allows it."""
     draws = torch.Generator().manual_seed(seed)
     return identity_map(degree) + strength * 0.2 * torch.randn(MONOMIALS[degree], 3, generator=draws)
 
 
 def some_form(rows: Tensor, degree: int = 2, bands: int = 1, rank: int = 2) -> GradeForm:
-    """A grade of these members with a residual that is drawn."""
+    """Return a grade of these members with a random residual."""
     draws = torch.Generator().manual_seed(4)
     table = torch.stack([some_table(degree, float(s)) for s in KNOTS])
     course = 0.1 * torch.randn(2, len(rows), 3 * bands, generator=draws)
@@ -69,26 +69,26 @@ def directions(count: int = 300) -> Tensor:
 
 
 def drawn(sh: Tensor, toward: Tensor) -> Tensor:
-    """Colors from each direction, as they are drawn. [M,B,3], [D,3] -> [M,D,3]"""
+    """Return the rendered colors from each direction. [M,B,3], [D,3] -> [M,D,3]"""
     values = basis(int(sh.shape[1] ** 0.5) - 1, toward)
     return (torch.einsum("db,mbc->mdc", values, sh) + 0.5).clamp_min(0.0)
 
 
 def polynomial(colors: Tensor, table: Tensor, degree: int) -> Tensor:
-    """What a map makes of colors. [...,3] -> [...,3]"""
+    """Return the colors after the map. [...,3] -> [...,3]"""
     return torch.einsum("k...,kc->...c", monomials(colors.movedim(-1, 0), degree), table)
 
 
 @pytest.mark.parametrize("degree", MONOMIALS)
 @pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
-def test_the_map_that_changes_nothing_changes_no_bit(degree: int, sh_degree: int) -> None:
+def test_identity_map_changes_no_bit(degree: int, sh_degree: int) -> None:
     sh = member_bands(pack(random_gaussians(50, sh_degree=sh_degree), with_shN=sh_degree > 0))
     assert torch.equal(map_colors(sh, identity_map(degree), degree), sh)
     assert monomials(torch.rand(3, 4, 5), degree).shape == (MONOMIALS[degree], 4, 5)
 
 
 @pytest.mark.parametrize("degree", MONOMIALS)
-def test_a_region_without_bands_is_mapped_exactly_as_it_is_drawn(degree: int) -> None:
+def test_map_of_a_region_without_bands_is_exact_as_rendered(degree: int) -> None:
     sh = member_bands(pack(random_gaussians(200), with_shN=False))
     table = some_table(degree)
     colors = sh[:, 0] * C0 + 0.5
@@ -98,7 +98,7 @@ def test_a_region_without_bands_is_mapped_exactly_as_it_is_drawn(degree: int) ->
 
 
 @pytest.mark.parametrize("sh_degree", [1, 2, 3])
-def test_a_linear_map_of_colors_that_are_not_clamped_is_exact_from_everywhere(sh_degree: int) -> None:
+def test_linear_map_of_unclamped_colors_is_exact_from_every_side(sh_degree: int) -> None:
     sh = 0.1 * member_bands(pack(random_gaussians(80, sh_degree=sh_degree), with_shN=True))
     table = torch.tensor([[0.1, 0.0, 0.05], [0.5, 0.2, 0.0], [0.1, 0.6, 0.1], [0.0, 0.1, 0.7]])
     expected = polynomial(drawn(sh, directions()), table, 1)
@@ -106,7 +106,7 @@ def test_a_linear_map_of_colors_that_are_not_clamped_is_exact_from_everywhere(sh
     torch.testing.assert_close(found, expected, atol=2e-5, rtol=0)
 
 
-def test_colors_that_are_clamped_are_nearer_than_their_least_squares() -> None:
+def test_clamped_colors_are_closer_than_a_least_squares_fit() -> None:
     sh = member_bands(pack(random_gaussians(300, sh_degree=2), with_shN=True))
     table = some_table(1, 0.3)
     toward = directions()
@@ -122,13 +122,13 @@ def test_colors_that_are_clamped_are_nearer_than_their_least_squares() -> None:
 
 
 def some_mask(members: int) -> Tensor:
-    """Shares of a map, none and all among them."""
+    """Return shares of a map, from none to all. [M] uint8"""
     return torch.linspace(0, 255, members).round().to(torch.uint8)
 
 
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("sh_degree", [0, 2])
-def test_a_file_gives_the_same_field_and_at_most_a_byte_a_number_of_mask_and_residual(
+def test_grade_file_restores_the_field_in_at_most_a_byte_per_value(
     tmp_path: Path, sh_degree: int, masked: bool
 ) -> None:
     scene = random_gaussians(400, sh_degree=sh_degree)
@@ -156,7 +156,7 @@ def test_a_file_gives_the_same_field_and_at_most_a_byte_a_number_of_mask_and_res
 
 @pytest.fixture
 def packed(tmp_path: Path) -> tuple[dict[str, object], dict[str, Tensor], GradeForm]:
-    """The header, the tensors and the grade of a file of 150 members."""
+    """Return the header, the tensors and the grade of a file of 150 members."""
     scene = random_gaussians(400)
     members = some_rows(scene, 150)
     rows = pack(scene[members], with_shN=False)
@@ -166,7 +166,7 @@ def packed(tmp_path: Path) -> tuple[dict[str, object], dict[str, Tensor], GradeF
     return header_of(content), safetensors.torch.load(content), form
 
 
-def test_a_file_from_before_functions_were_left_out_gives_the_same_grade(
+def test_grade_file_of_format_6_gives_the_same_grade(
     packed: tuple[dict[str, object], dict[str, Tensor], GradeForm], tmp_path: Path
 ) -> None:
     header, tensors, form = packed
@@ -179,7 +179,7 @@ def test_a_file_from_before_functions_were_left_out_gives_the_same_grade(
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 1.0])
-def test_functions_that_members_lack_take_no_levels(share: float) -> None:
+def test_functions_missing_in_members_take_no_levels(share: float) -> None:
     draws = torch.Generator().manual_seed(2)
     levels = torch.randint(-90, 90, (2, 999, 9, 3), generator=draws, dtype=torch.int8)
     levels[:, :, 1:] *= torch.rand(999, 8, 1, generator=draws) < share
@@ -193,7 +193,7 @@ def test_functions_that_members_lack_take_no_levels(share: float) -> None:
     assert form.bytes_per_member < 1.02 * (6 + 48 * share) + 1.0
 
 
-def test_a_file_from_before_levels_were_packed_gives_the_same_grade(
+def test_grade_file_of_format_5_gives_the_same_grade(
     packed: tuple[dict[str, object], dict[str, Tensor], GradeForm], tmp_path: Path
 ) -> None:
     header, tensors, form = packed
@@ -224,7 +224,7 @@ def test_a_file_from_before_levels_were_packed_gives_the_same_grade(
         {"scale": torch.ones(3)},
     ],
 )
-def test_packed_levels_that_are_not_as_many_as_said_are_refused(
+def test_packed_levels_of_a_wrong_count_are_refused(
     packed: tuple[dict[str, object], dict[str, Tensor], GradeForm], tmp_path: Path, wrong: dict[str, Tensor]
 ) -> None:
     header, tensors, _ = packed
@@ -233,7 +233,7 @@ def test_packed_levels_that_are_not_as_many_as_said_are_refused(
         read_gdf(tmp_path / "wrong.gdf")
 
 
-def test_coarser_levels_take_fewer_bytes_and_are_off_by_a_step_at_most() -> None:
+def test_coarser_levels_take_fewer_bytes_and_err_by_at_most_a_step() -> None:
     rows = pack(random_gaussians(2000), with_shN=False)
     draws = torch.Generator().manual_seed(4)
     course = torch.zeros(2, len(rows), 3)
@@ -252,7 +252,7 @@ def test_coarser_levels_take_fewer_bytes_and_are_off_by_a_step_at_most() -> None
         assert float((found - course[1]).abs().max()) < k * 0.2 / 127
 
 
-def test_the_few_members_beyond_eight_bits_are_reached_by_bases_of_their_own() -> None:
+def test_members_beyond_eight_bits_get_extra_bases() -> None:
     rows = pack(random_gaussians(4000), with_shN=False)
     course = torch.zeros(2, len(rows), 3)
     course[1] = 0.05 * torch.randn(len(rows), 3, generator=torch.Generator().manual_seed(4)).clamp(-2, 2)
@@ -265,7 +265,7 @@ def test_the_few_members_beyond_eight_bits_are_reached_by_bases_of_their_own() -
     assert float((found - course[1]).abs().max()) < 1.1 * 0.1 / 127 / 2
 
 
-def test_both_ends_are_what_the_file_says(tmp_path: Path) -> None:
+def test_both_ends_match_the_stored_grade(tmp_path: Path) -> None:
     scene = random_gaussians(300, sh_degree=1)
     members = some_rows(scene, 120)
     rows = pack(scene[members], with_shN=True)
@@ -279,7 +279,7 @@ def test_both_ends_are_what_the_file_says(tmp_path: Path) -> None:
     assert torch.equal(edited.sh, scene.sh)
 
 
-def test_the_way_between_the_knots_is_that_of_the_map_and_its_residual() -> None:
+def test_grade_between_knots_is_the_map_and_its_residual() -> None:
     rows = pack(random_gaussians(500, sh_degree=2), with_shN=True)
     form = some_form(rows, bands=4)
     field = bake_grade(form, rows)
@@ -290,7 +290,7 @@ def test_the_way_between_the_knots_is_that_of_the_map_and_its_residual() -> None
     assert error < 0.01
 
 
-def test_a_mask_says_how_much_of_the_map_each_member_takes() -> None:
+def test_mask_scales_the_map_per_member() -> None:
     rows = pack(random_gaussians(200, sh_degree=1), with_shN=True)
     whole = some_form(rows, rank=0)
     form = replace(whole, mask=some_mask(200))
@@ -307,7 +307,7 @@ def test_a_mask_says_how_much_of_the_map_each_member_takes() -> None:
             replace(whole, mask=mask)
 
 
-def test_what_few_members_need_more_than_the_rest_does_not_take_their_levels() -> None:
+def test_outlier_members_do_not_coarsen_the_others() -> None:
     members = 5000
     course = torch.zeros(2, members, 3)
     course[1] = 0.1 * torch.rand(members, 3, generator=torch.Generator().manual_seed(2))
@@ -319,7 +319,7 @@ def test_what_few_members_need_more_than_the_rest_does_not_take_their_levels() -
 
 
 @pytest.mark.parametrize("sh_degree", [0, 1, 2, 3, 4])
-def test_the_bands_that_are_drawn_are_read_from_their_columns_and_written_there(sh_degree: int) -> None:
+def test_rendered_bands_are_read_from_and_written_to_their_columns(sh_degree: int) -> None:
     scene = random_gaussians(40, sh_degree=sh_degree)
     rows = pack(scene, with_shN=sh_degree > 0)
     bands = member_bands(rows)
@@ -332,7 +332,7 @@ def test_the_bands_that_are_drawn_are_read_from_their_columns_and_written_there(
         assert int(offsets.any(dim=0).sum()) == 3 * count
 
 
-def test_a_slider_that_is_laid_anew_is_kept_by_the_file(tmp_path: Path) -> None:
+def test_remapped_slider_is_kept_by_the_file(tmp_path: Path) -> None:
     scene = random_gaussians(300)
     members = some_rows(scene, 120)
     rows = pack(scene[members], with_shN=False)
@@ -361,13 +361,13 @@ def test_a_slider_that_is_laid_anew_is_kept_by_the_file(tmp_path: Path) -> None:
         ({"residual": torch.zeros(2, 120, 3)}, "expected .* int8"),
     ],
 )
-def test_parts_that_do_not_fit_each_other_are_refused(change: dict[str, object], message: str) -> None:
+def test_inconsistent_parts_are_refused(change: dict[str, object], message: str) -> None:
     form = some_form(pack(random_gaussians(120), with_shN=False))
     with pytest.raises(ValueError, match=message):
         replace(form, **change)  # type: ignore[arg-type]
 
 
-def test_a_grade_with_more_bands_than_the_scene_is_refused() -> None:
+def test_grade_with_more_bands_than_the_scene_is_refused() -> None:
     scene: Gaussians = random_gaussians(60)
     rows = pack(scene, with_shN=False)
     with pytest.raises(ValueError, match="grade of 60 members does not fit 60"):
@@ -381,7 +381,7 @@ def some_lattice(side: int = 5) -> GradeForm:
 
 @pytest.mark.parametrize("form", ["degree 2", "lattice"])
 @pytest.mark.parametrize("sh_degree", [0, 2])
-def test_a_grade_of_another_scene_shows_what_its_map_makes_of_this_one(
+def test_grade_of_another_scene_maps_the_colors_of_this_scene(
     tmp_path: Path, form: str, sh_degree: int
 ) -> None:
     scene = random_gaussians(300, sh_degree=sh_degree)
@@ -409,7 +409,7 @@ def test_a_grade_of_another_scene_shows_what_its_map_makes_of_this_one(
     assert torch.equal(again.field.offsets(0.7), gdf.field.offsets(0.7))
 
 
-def test_only_a_grade_goes_on_a_region_of_another_scene_and_only_where_something_is(tmp_path: Path) -> None:
+def test_only_a_bounded_grade_applies_to_a_foreign_region(tmp_path: Path) -> None:
     scene, other = random_gaussians(300), random_gaussians(90, seed=5)
     save_gdf(tmp_path / "bent.gdf", edit_of(other, torch.arange(12), curved_field(12), "bent"))
     with pytest.raises(ProgdfError, match="bent is no grade: its field is separable"):
@@ -432,7 +432,7 @@ def test_only_a_grade_goes_on_a_region_of_another_scene_and_only_where_something
 
 
 @pytest.mark.parametrize("spoilt", ["rows", "knots", "identity"])
-def test_a_lattice_that_is_none_is_refused(spoilt: str) -> None:
+def test_invalid_lattice_is_refused(spoilt: str) -> None:
     good = some_lattice(3)
     tables = {"rows": good.table[:, :26], "identity": good.table.flip(0), "knots": good.table[[0, 0, 1]]}
     knots = KNOTS if spoilt == "knots" else good.knots

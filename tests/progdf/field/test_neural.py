@@ -1,4 +1,4 @@
-"""What a neural field answers: exact where it must be, outputs for what moves, layouts that make sense."""
+"""Tests of neural fields: exact start and end, outputs only for moved attributes, valid layouts."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from tests.helpers.networks import FORMS, MEMBERS, network, rows
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_a_network_answers_exactly_zero_at_zero(form: str) -> None:
+def test_network_is_exactly_zero_at_zero(form: str) -> None:
     assert not bool(network(form).bind(rows()).offsets(0.0).any())
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_no_answer_of_the_network_moves_anything_at_zero(form: str) -> None:
+def test_network_output_of_any_size_moves_nothing_at_zero(form: str) -> None:
     shape = network(form).shape
     wild = torch.full((5, 6), 1e6)
     assert not bool(offsets_of_answer(shape, torch.zeros(5), wild, wild).any())
 
 
 @pytest.mark.parametrize("form", ["own", "position"])
-def test_interpolated_bins_leave_no_jump(form: str) -> None:
+def test_interpolated_bins_have_no_jumps(form: str) -> None:
     field = network(form).bind(rows())
     whole = float((field.offsets(1.0) - field.offsets(0.0)).abs().max())
     for edge in torch.arange(11) / 10:
@@ -32,10 +32,10 @@ def test_interpolated_bins_leave_no_jump(form: str) -> None:
         assert float(step.abs().max()) < 0.02 * whole
 
 
-def test_hard_bins_stand_still_and_jump() -> None:
+def test_hard_bins_are_constant_and_jump() -> None:
     field = network("position, hard bins").bind(rows())
     assert torch.equal(field.offsets(0.31), field.offsets(0.39))
-    assert torch.equal(field.offsets(1e-6), field.offsets(0.199))  # the paper's s = 0 and s = 0.1 are one
+    assert torch.equal(field.offsets(1e-6), field.offsets(0.199))  # the paper's s = 0 and 0.1 share a bin
     assert float((field.offsets(0.401) - field.offsets(0.399)).abs().max()) > 1e-3
 
 
@@ -46,12 +46,12 @@ def test_hard_bins_are_gracos_clamp() -> None:
     assert hard_bin(torch.tensor([-1.0, 0.999999, 2.0])).tolist() == [0, 8, 9], "the last is s = 1 alone"
 
 
-def test_a_network_that_keeps_the_end_meets_it_by_itself() -> None:
+def test_network_that_stores_the_end_meets_it_exactly() -> None:
     _, offsets = curved_trajectory(MEMBERS, moving=("means", "sh0"))
     assert torch.equal(network().bind(rows()).offsets(1.0), offsets[-1])
 
 
-def test_only_attributes_that_move_have_outputs() -> None:
+def test_only_moved_attributes_have_outputs() -> None:
     shape = network().shape
     assert shape.attributes == ("means", "sh0")
     assert network().tensors["heads.weight"].shape[0] == 6
@@ -60,7 +60,7 @@ def test_only_attributes_that_move_have_outputs() -> None:
     assert not any(bool(packed[:, columns].any()) for columns in still)
 
 
-def test_layouts_that_make_no_sense_are_refused() -> None:
+def test_invalid_layouts_are_refused() -> None:
     for changed in (
         {"width": 0},
         {"layers": 65},

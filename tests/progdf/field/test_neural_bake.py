@@ -1,4 +1,4 @@
-"""A network baked to run: exact ends, an error that is told, what it misses spread over the way."""
+"""Tests of baked networks: exact ends, a recorded error, and the missing end offset spread over the path."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from tests.helpers.networks import FORMS, MEMBERS, baked, network, rows
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_the_ends_of_a_baked_network_are_exact(form: str) -> None:
+def test_ends_of_a_baked_network_are_exact(form: str) -> None:
     _, offsets = curved_trajectory(MEMBERS, moving=("means", "sh0"))
     assert not bool(baked(form).offsets(0.0).any())
     assert torch.equal(baked(form).offsets(1.0), offsets[-1])
 
 
 @pytest.mark.parametrize("form", ["own", "own, hard bins"])
-def test_baking_costs_as_much_as_it_says_and_that_is_little(form: str) -> None:
+def test_recorded_bake_error_is_correct_and_small(form: str) -> None:
     field = baked(form)
     bound = network(form).bind(rows())
     strengths = sample_strengths()
@@ -34,7 +34,7 @@ def test_baking_costs_as_much_as_it_says_and_that_is_little(form: str) -> None:
     assert field.origin.error["rms"] < 0.02
 
 
-def test_what_a_network_misses_of_the_end_is_spread_over_the_way() -> None:
+def test_missing_end_offset_is_spread_over_the_path() -> None:
     form = network("position")
     _, offsets = curved_trajectory(MEMBERS, moving=("means", "sh0"))
     missing = float((form.bind(rows()).offsets(1.0) - offsets[-1]).norm())
@@ -43,7 +43,7 @@ def test_what_a_network_misses_of_the_end_is_spread_over_the_way() -> None:
     assert last < 0.2 * missing
 
 
-def test_the_pull_follows_the_recorded_errors_where_they_are_known() -> None:
+def test_correction_follows_the_recorded_errors_if_known() -> None:
     strengths, offsets = curved_trajectory(MEMBERS, moving=("means", "sh0"))
     judge = FieldEvaluator(strengths, offsets, lambda moved: moved[:, 11:14])
     follows = FieldEvaluator.curve
@@ -66,28 +66,28 @@ def test_hard_bins_are_baked_as_steps() -> None:
     assert jump > 10 * float((field.offsets(0.3999) - field.offsets(0.31)).abs().max())
 
 
-def test_a_form_refuses_other_numbers_of_members() -> None:
+def test_baking_refuses_another_number_of_members() -> None:
     form = baked().origin
     assert isinstance(form, NeuralForm)
     with pytest.raises(ValueError, match="expected 40"):
         bake_form(form, rows()[:39])
 
 
-def test_a_looser_bake_has_fewer_bases() -> None:
+def test_looser_tolerance_gives_fewer_bases() -> None:
     tight, loose = (bake_network(network(), rows(), tolerance=given).origin for given in (1e-3, 0.3))
     assert tight is not None
     assert loose is not None
     assert sum(loose.plan.ranks.values()) < sum(tight.plan.ranks.values())
 
 
-def test_the_error_of_a_bake_is_not_that_of_the_network_at_the_end() -> None:
-    form = baked("position").origin  # which misses the end by much, as all members see is their place
+def test_bake_error_excludes_the_error_of_the_network() -> None:
+    form = baked("position").origin  # misses the end by much, as members are distinguished by position only
     assert form is not None
     assert form.error is not None
     assert form.error["rms"] < 0.02
 
 
 @pytest.mark.parametrize("count", [1, 258])
-def test_a_plan_of_too_few_or_too_many_nodes_is_refused(count: int) -> None:
+def test_plan_of_too_few_or_too_many_nodes_is_refused(count: int) -> None:
     with pytest.raises(ValueError, match="expected 2 to 257"):
         BakePlan(torch.linspace(0, 1, count), {}, {})

@@ -1,4 +1,4 @@
-"""Training a neural field: the same every time, nearer with every step, and to be interrupted."""
+"""Tests of training a neural field: deterministic, converging and resumable."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.helpers.edits import curved_trajectory
 from tests.helpers.networks import MEMBERS, SHORT, fit_neural, members, rows, scene, smooth_trajectory
 
 
-def test_the_same_seed_gives_the_same_network_and_another_seed_another() -> None:
+def test_network_is_determined_by_its_seed() -> None:
     strengths, offsets = curved_trajectory(MEMBERS)
     found = [fit_neural(strengths, offsets, rows(), replace(SHORT, seed=seed)) for seed in (0, 0, 1)]
     same = [
@@ -27,7 +27,7 @@ def test_the_same_seed_gives_the_same_network_and_another_seed_another() -> None
     assert torch.equal(found[0].codes, found[1].codes)
 
 
-def test_training_brings_the_network_to_the_trajectory() -> None:
+def test_training_converges_to_the_trajectory() -> None:
     strengths, offsets = smooth_trajectory(scene().means[members()])
     errors = []
     for steps in (1, 300):
@@ -35,10 +35,10 @@ def test_training_brings_the_network_to_the_trajectory() -> None:
         field = fit_neural(strengths, offsets, rows(), given).bind(rows())
         middle = field.offsets(float(strengths[4])) - offsets[4]
         errors.append(float(middle.square().mean() / offsets[4].square().mean()))
-    assert errors[1] < 0.02 < 0.5 < errors[0]  # .0005 when written
+    assert errors[1] < 0.02 < 0.5 < errors[0]  # 0.0005 when written
 
 
-def test_a_code_tells_what_no_place_can() -> None:
+def test_code_distinguishes_members_at_the_same_position() -> None:
     strengths, offsets = curved_trajectory(MEMBERS, moving=("sh0",))
     same_place = rows().clone()
     same_place[:] = same_place[0]
@@ -62,7 +62,7 @@ def test_visible_members_are_fitted_first() -> None:
 
 
 class Watched:
-    """A loss of pictures that is none, and keeps what it is asked."""
+    """Image loss that compares offsets and records its arguments."""
 
     views = 3
 
@@ -74,7 +74,7 @@ class Watched:
         return (found - recorded).abs().mean()
 
 
-def test_pictures_are_compared_at_a_snapshot_drawn_at_random_never_between_two() -> None:
+def test_image_loss_uses_random_snapshots_and_never_between_two() -> None:
     strengths, offsets = curved_trajectory(MEMBERS, moving=("sh0",))
     pictures = Watched()
     fit = NeuralFit(rows(), offsets.shape[2], ("sh0",), SHORT)
@@ -90,7 +90,7 @@ def test_pictures_are_compared_at_a_snapshot_drawn_at_random_never_between_two()
     assert all(found.shape == (MEMBERS, 14) for found, *_ in pictures.asked), "of all members"
 
 
-def test_a_loss_of_pictures_takes_the_place_of_the_one_of_offsets() -> None:
+def test_image_loss_replaces_the_offset_loss() -> None:
     strengths, offsets = curved_trajectory(MEMBERS, moving=("sh0",))
     fit = NeuralFit(rows(), 14, ("sh0",), SHORT)
     pictures = Watched()
@@ -101,7 +101,7 @@ def test_a_loss_of_pictures_takes_the_place_of_the_one_of_offsets() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_hardly_any_members_are_enough(count: int) -> None:
+def test_fit_works_with_at_most_one_member(count: int) -> None:
     strengths, offsets = curved_trajectory(max(count, 1))
     field = fit_neural(strengths, offsets[:, :1], rows()[:1], SHORT)
     assert torch.equal(bake_network(field, rows()[:1]).offsets(1.0), offsets[-1])
@@ -109,7 +109,7 @@ def test_hardly_any_members_are_enough(count: int) -> None:
     assert empty.step(strengths, offsets[:, :0]) == 0.0
 
 
-def test_a_fit_goes_on_to_the_same_bits_after_it_was_saved() -> None:
+def test_saved_fit_continues_to_the_same_bits() -> None:
     strengths, offsets = curved_trajectory(MEMBERS, moving=("sh0",))
 
     def new() -> NeuralFit:
@@ -125,7 +125,7 @@ def test_a_fit_goes_on_to_the_same_bits_after_it_was_saved() -> None:
     for _ in range(3):
         first.step(strengths, offsets)
     kept = {name: tensor.clone() for name, tensor in first.capture_state().items()}
-    first.step(strengths, offsets)  # what was saved does not change with it
+    first.step(strengths, offsets)  # does not change the saved state
     second.restore(kept)
     for _ in range(3):
         second.step(strengths, offsets)
@@ -135,7 +135,7 @@ def test_a_fit_goes_on_to_the_same_bits_after_it_was_saved() -> None:
     )
 
 
-def test_a_trajectory_that_grows_does_not_change_what_the_network_answers() -> None:
+def test_growing_trajectory_keeps_the_output_of_the_network() -> None:
     strengths, offsets = curved_trajectory(MEMBERS, moving=("sh0",))
     fit = NeuralFit(rows(), 14, ("sh0",), replace(SHORT, inputs="position"))
     fit.scale_to(0.1 * offsets)
@@ -146,7 +146,7 @@ def test_a_trajectory_that_grows_does_not_change_what_the_network_answers() -> N
     assert torch.allclose(before, after, atol=2e-3 * float(before.abs().max()))  # half precision
 
 
-def test_a_fit_takes_over_the_outputs_that_still_move() -> None:
+def test_fit_adopts_the_outputs_of_attributes_that_still_move() -> None:
     strengths, offsets = curved_trajectory(MEMBERS, moving=("means", "sh0"))
     given = replace(SHORT, inputs="position")
     first = NeuralFit(rows(), 14 + 9, ("means", "sh0", "shN"), given)
