@@ -1,4 +1,4 @@
-"""Checkpoints of trainings: names of several trainers, several GPUs, and files that are refused."""
+"""Tests of trainer checkpoints: names of several trainers, several GPUs, and refused files."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_names_of_every_splatfacto_are_read(prefix: str, tmp_path: Path) -> None
     assert_same(load_scene(saved(tmp_path / "a.ckpt", content)), scene)
 
 
-def test_parameters_half_floats_and_older_names_of_gsplat_are_read(tmp_path: Path) -> None:
+def test_parameters_half_floats_and_older_gsplat_names_are_read(tmp_path: Path) -> None:
     scene = scene_of(1, 12)
     tensors = gsplat_tensors(scene)
     tensors["means3d"] = tensors.pop("means")
@@ -57,7 +57,7 @@ def test_parameters_half_floats_and_older_names_of_gsplat_are_read(tmp_path: Pat
     assert load_scene(saved(tmp_path / "c.pt", tensors)).sh_degree == 0
 
 
-def test_doubles_far_from_zero_keep_their_places(tmp_path: Path) -> None:
+def test_doubles_far_from_zero_keep_their_positions(tmp_path: Path) -> None:
     tensors = gsplat_tensors(scene_of(0, 12))
     far = torch.tensor([5e6, 0.0, 0.0], dtype=torch.float64)
     tensors["means"] = tensors["means"].double() + far
@@ -65,7 +65,7 @@ def test_doubles_far_from_zero_keep_their_places(tmp_path: Path) -> None:
     assert torch.allclose(found.world_means, tensors["means"], rtol=0.0, atol=1e-6)
 
 
-def test_a_copy_of_the_numbers_is_made(tmp_path: Path) -> None:
+def test_checkpoint_values_are_copied(tmp_path: Path) -> None:
     scene = scene_of(1, 12)
     path = saved(tmp_path / "a.pt", {"splats": gsplat_tensors(scene)})
     found = load_scene(path)
@@ -107,7 +107,7 @@ def test_tensors_that_are_not_plain_floats_are_named(kind: str, tmp_path: Path) 
     assert main(["info", str(path)]) == 2
 
 
-def test_expanded_tensors_take_no_memory(tmp_path: Path) -> None:
+def test_expanded_tensors_allocate_no_memory(tmp_path: Path) -> None:
     count = 30_000_000
     zeros = {
         "means": torch.zeros(1).expand(count, 3),
@@ -125,7 +125,7 @@ def test_expanded_tensors_take_no_memory(tmp_path: Path) -> None:
 
 
 def rewritten(path: Path, change: Callable[[bytes], bytes], compression: int = zipfile.ZIP_STORED) -> Path:
-    """Write the archive again with another pickle."""
+    """Rewrite the archive with another pickle."""
     with zipfile.ZipFile(path) as archive:
         entries = {name: archive.read(name) for name in archive.namelist()}
     with zipfile.ZipFile(path, "w", compression) as archive:
@@ -146,7 +146,7 @@ DAMAGES: dict[str, tuple[Callable[[bytes], bytes], str]] = {
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_damaged_pickles_are_one_line(damage: str, tmp_path: Path) -> None:
+def test_damaged_pickles_are_reported_in_one_line(damage: str, tmp_path: Path) -> None:
     change, named = DAMAGES[damage]
     path = saved(tmp_path / "a.pt", {"splats": gsplat_tensors(scene_of(1, 12))})
     assert named in refusal(load_scene, rewritten(path, change))
@@ -180,7 +180,7 @@ FOREIGN = {
 
 @pytest.mark.parametrize("kind", FOREIGN)
 @pytest.mark.parametrize("name", ["a.ckpt", "a.pt", "a.pth"])
-def test_files_that_are_no_checkpoints_are_named(kind: str, name: str, tmp_path: Path) -> None:
+def test_files_that_are_not_checkpoints_are_named(kind: str, name: str, tmp_path: Path) -> None:
     content, named = FOREIGN[kind]
     (tmp_path / name).write_bytes(content)
     message = refusal(load_scene, tmp_path / name)
@@ -188,7 +188,7 @@ def test_files_that_are_no_checkpoints_are_named(kind: str, name: str, tmp_path:
     assert "damaged" not in message
 
 
-def test_a_table_of_taichi_is_named_with_its_converter(tmp_path: Path) -> None:
+def test_taichi_table_is_named_with_its_converter(tmp_path: Path) -> None:
     path = tmp_path / "scene_29999.parquet"
     path.write_bytes(b"PAR1" + b"a" * 40)
     assert "parquet_to_ply.py" in refusal(load_scene, path)
@@ -213,7 +213,7 @@ COLOR_FIELDS = {
 
 
 @pytest.mark.parametrize("field", COLOR_FIELDS)
-def test_fields_that_change_colors_or_places_are_refused_by_name(field: str, tmp_path: Path) -> None:
+def test_fields_that_change_colors_or_positions_are_refused_by_name(field: str, tmp_path: Path) -> None:
     more, named = COLOR_FIELDS[field]
     content: dict[str, Any] = {"splats": dict(gsplat_tensors(scene_of(1, 12)))}
     for table, tensors in more.items():
@@ -230,7 +230,7 @@ def test_harmless_tensors_are_listed(tmp_path: Path) -> None:
     assert report.ignored_properties == ("camera_optimizer", "lpips")
 
 
-def test_a_training_state_of_the_original_code_is_named(tmp_path: Path) -> None:
+def test_training_state_of_the_original_code_is_named(tmp_path: Path) -> None:
     columns = [torch.nn.Parameter(getattr(scene_of(1, 12), name)) for name in ATTRIBUTES]
     content = ((3, *columns, {"state": {}}, 1.0), 30_000)
     message = refusal(load_scene, saved(tmp_path / "chkpnt30000.pth", content))
@@ -245,7 +245,7 @@ def two_ranks(folder: Path, step: int = 29999) -> tuple[Gaussians, Path, Path]:
     return scene, first, save_gsplat(folder / f"ckpt_{step}_rank1.pt", scene[10:], step)
 
 
-def test_the_ranks_of_a_training_are_read_together(tmp_path: Path) -> None:
+def test_ranks_of_a_training_are_read_together(tmp_path: Path) -> None:
     scene, first, second = two_ranks(tmp_path)
     two_ranks(tmp_path, 6999)
     for path in (first, second):
@@ -255,7 +255,7 @@ def test_the_ranks_of_a_training_are_read_together(tmp_path: Path) -> None:
         assert report.file_bytes == first.stat().st_size + second.stat().st_size
 
 
-def test_a_missing_rank_is_named(tmp_path: Path) -> None:
+def test_missing_rank_is_named(tmp_path: Path) -> None:
     _, first, second = two_ranks(tmp_path / "ckpts")
     first.unlink()
     assert "ckpt_29999_rank0.pt is missing" in refusal(load_scene, second)
@@ -278,9 +278,7 @@ def test_ranks_of_different_trainings_are_not_joined(tmp_path: Path) -> None:
     assert f"{second} does not belong to {first.name}" in refusal(load_scene, second)
 
 
-def test_one_of_several_parts_does_not_go_into_a_bundle(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_single_part_of_a_scene_is_not_bundled(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _, first, _ = two_ranks(tmp_path)
     assert main(["export", str(first), "-o", str(tmp_path / "a.progdf.zip")]) == 2
     assert "one of several parts of a scene; export the scene as a .ply" in capsys.readouterr().err
@@ -299,10 +297,10 @@ def test_parts_of_grendel_are_joined(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["room_part_1_of_3.ply", "room-00001-of-00003.ply", "part2of2.ply"])
-def test_other_parts_are_named(name: str, tmp_path: Path) -> None:
+def test_parts_of_unknown_trainers_are_named(name: str, tmp_path: Path) -> None:
     assert "a name for part" in refusal(load_scene, write(tmp_path / name, table_of(scene_of(0, 9))))
 
 
 @pytest.mark.parametrize("name", ["turn_1_of_25.ply", "point_cloud_7000.ply", "part_1_of_1.ply", "rank0.ply"])
-def test_names_of_whole_scenes_are_no_parts(name: str, tmp_path: Path) -> None:
+def test_names_of_whole_scenes_are_not_parts(name: str, tmp_path: Path) -> None:
     assert len(load_scene(write(tmp_path / name, table_of(scene_of(0, 9))))) == 9

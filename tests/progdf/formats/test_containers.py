@@ -1,4 +1,4 @@
-"""Archives with a scene inside, and files that are no scene: read, or named with a remedy."""
+"""Tests of archives with a scene inside, and of other files, which are named with a remedy."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12
 
 
 def scene_of() -> Gaussians:
-    """A small scene."""
+    """Return a small scene."""
     return random_gaussians(40, seed=4, sh_degree=0)
 
 
 def ply_bytes(folder: Path) -> bytes:
-    """The content of a .ply."""
+    """Return the content of a .ply."""
     path = folder / "source.ply"
     save_ply(path, scene_of())
     content = path.read_bytes()
@@ -108,13 +108,13 @@ def test_encrypted_zip_is_named(tmp_path: Path) -> None:
     assert "uses encryption, which is not supported; unpack it with its password" in refusal(load_scene, path)
 
 
-def test_zip_compression_that_cannot_be_bounded_is_named(tmp_path: Path) -> None:
+def test_unbounded_zip_compression_is_named(tmp_path: Path) -> None:
     path = write_zip(tmp_path / "a.zip", {"a.ply": ply_bytes(tmp_path)}, zipfile.ZIP_LZMA)
     assert "the zip compression method 14" in refusal(load_scene, path)
 
 
 @pytest.mark.parametrize("container", ["gz", "zip"])
-def test_bomb_is_refused_by_its_size(container: str, tmp_path: Path) -> None:
+def test_zip_bomb_is_refused_by_its_size(container: str, tmp_path: Path) -> None:
     content = bytes(100 << 20)
     path = tmp_path / f"a.ply.{container}"
     if container == "gz":
@@ -130,7 +130,7 @@ def test_bomb_is_refused_by_its_size(container: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("container", ["gz", "zip"])
-def test_archive_that_was_cut_is_damaged(container: str, tmp_path: Path) -> None:
+def test_truncated_archive_is_damaged(container: str, tmp_path: Path) -> None:
     path = tmp_path / f"a.ply.{container}"
     content = ply_bytes(tmp_path)
     if container == "gz":
@@ -142,7 +142,7 @@ def test_archive_that_was_cut_is_damaged(container: str, tmp_path: Path) -> None
 
 
 def tar_bytes() -> bytes:
-    """A tar archive of one file."""
+    """Return a tar archive of one file."""
     stream = io.BytesIO()
     with tarfile.open(fileobj=stream, mode="w") as archive:
         archive.addfile(tarfile.TarInfo("a.ply"))
@@ -150,7 +150,7 @@ def tar_bytes() -> bytes:
 
 
 def image_bytes(kind: str) -> bytes:
-    """A small picture."""
+    """Return a small picture in the given format."""
     stream = io.BytesIO()
     Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(stream, kind)
     return stream.getvalue()
@@ -194,7 +194,7 @@ def test_foreign_file_is_named_under_every_ending(kind: str, ending: str, tmp_pa
     assert "damaged" not in message
 
 
-def test_scene_inside_an_archive_without_usable_rows_is_refused(tmp_path: Path) -> None:
+def test_scene_in_an_archive_without_usable_rows_is_refused(tmp_path: Path) -> None:
     rows = np.zeros((30, 32), np.uint8)
     rows[:, :24].view("<f4")[:, 3:6] = np.nan
     splat = tmp_path / "a.splat"

@@ -1,4 +1,4 @@
-"""Tables of colors: what a .cube file says is what is read, and what is broken is refused in one line."""
+"""Tests of .cube color tables: values are read as written, and broken files are refused in one line."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def some_table(side: int = 5) -> torch.Tensor:
     return torch.rand(side**3, 3, generator=torch.Generator().manual_seed(side))
 
 
-def test_what_is_written_is_read_again_to_the_sixth_place(tmp_path: Path) -> None:
+def test_table_round_trip_is_exact_to_six_digits(tmp_path: Path) -> None:
     table = some_table(33)
     write_cube(tmp_path / "look.cube", table, 'a "look"\nof höhe')
     lines = (tmp_path / "look.cube").read_text().splitlines()
@@ -34,7 +34,7 @@ def test_what_is_written_is_read_again_to_the_sixth_place(tmp_path: Path) -> Non
     torch.testing.assert_close(read_cube(tmp_path / "look.cube"), table, atol=6e-7, rtol=0)
 
 
-def test_what_is_written_stays_within_the_colors_of_a_screen(tmp_path: Path) -> None:
+def test_written_table_is_clamped_to_display_colors(tmp_path: Path) -> None:
     write_cube(tmp_path / "look.cube", 3 * some_table() - 1, "")
     read = read_cube(tmp_path / "look.cube")
     assert (float(read.min()), float(read.max())) == (0.0, 1.0)
@@ -50,7 +50,7 @@ def test_what_is_written_stays_within_the_colors_of_a_screen(tmp_path: Path) -> 
         f"# made by hand\nLUT_3D_SIZE 2\nLUT_3D_INPUT_RANGE 0.0 1.0\n# rows\n{ROWS}# the end\n\n",
     ],
 )
-def test_comments_marks_and_the_line_ends_of_any_system_do_not_count(tmp_path: Path, text: str) -> None:
+def test_comments_marks_and_line_ends_are_ignored(tmp_path: Path, text: str) -> None:
     assert torch.equal(read_cube(written(tmp_path, text)), identity_map(LATTICE, 8))
 
 
@@ -70,7 +70,7 @@ def test_tables_of_any_system_are_read(tmp_path: Path, ends: str, encoding: str)
     assert torch.equal(read_cube(written(tmp_path, text.encode(encoding))), identity_map(LATTICE, 8))
 
 
-def test_red_is_the_fastest_of_the_rows() -> None:
+def test_red_varies_fastest_in_the_rows() -> None:
     assert lattice_colors(3)[1].tolist() == [0.5, 0.0, 0.0]
     assert lattice_colors(3)[9].tolist() == [0.0, 0.0, 0.5]
     table = lattice_colors(3) * torch.tensor([1.0, 0.5, 0.25])
@@ -78,18 +78,18 @@ def test_red_is_the_fastest_of_the_rows() -> None:
     torch.testing.assert_close(look_up(color, table)[:, 0], torch.tensor([0.3, 0.3, 0.2]))
 
 
-def test_a_table_of_another_domain_is_looked_up_where_its_colors_are(tmp_path: Path) -> None:
+def test_table_of_another_domain_is_resampled(tmp_path: Path) -> None:
     table = read_cube(written(tmp_path, f"LUT_3D_SIZE 2\nDOMAIN_MIN -1 0 0\nDOMAIN_MAX 1 2 1\n{ROWS}"))
     expected = lattice_colors(65) * torch.tensor([0.5, 0.5, 1.0]) + torch.tensor([0.5, 0.0, 0.0])
     torch.testing.assert_close(table, expected, atol=1e-6, rtol=0)
 
 
-def test_an_input_range_is_the_domain_of_all_channels(tmp_path: Path) -> None:
+def test_input_range_is_the_domain_of_all_channels(tmp_path: Path) -> None:
     table = read_cube(written(tmp_path, f"LUT_3D_SIZE 2\nLUT_3D_INPUT_RANGE -1 3\n{ROWS}"))
     torch.testing.assert_close(table, (lattice_colors(65) + 1.0) / 4.0, atol=1e-6, rtol=0)
 
 
-def test_a_color_is_mapped_as_the_eight_points_around_it_say() -> None:
+def test_lookup_is_trilinear() -> None:
     table = some_table(4)
     draws = torch.Generator().manual_seed(2)
     colors = torch.rand(3, 50, generator=draws)
@@ -105,14 +105,14 @@ def test_a_color_is_mapped_as_the_eight_points_around_it_say() -> None:
     torch.testing.assert_close(look_up(colors, table), expected, atol=1e-6, rtol=0)
 
 
-def test_colors_that_no_table_reaches_are_those_at_its_edge() -> None:
+def test_colors_beyond_the_table_are_those_at_its_edge() -> None:
     table = some_table()
     sh0 = rgb_to_sh0(torch.tensor([[1.4, -0.2, 0.5], [1.0, 0.0, 0.5]]))
     found = map_colors(sh0[:, None], table, LATTICE)[:, 0] * C0 + 0.5
     torch.testing.assert_close(found[0], found[1])
 
 
-def test_between_the_ends_a_table_goes_the_straight_way() -> None:
+def test_table_strength_is_linear_between_the_ends() -> None:
     form = lattice_form(some_table())
     colors = lattice_colors(9)
     ends = [mapped_lattice(form, s, 9) for s in (0.0, 1.0)]
@@ -149,7 +149,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_a_broken_table_is_refused_in_one_short_line(tmp_path: Path, name: str) -> None:
+def test_broken_table_is_refused_in_one_short_line(tmp_path: Path, name: str) -> None:
     text, reason = BROKEN[name]
     with pytest.raises(ProgdfError, match=reason) as refused:
         read_gdf(written(tmp_path, text))
@@ -157,8 +157,8 @@ def test_a_broken_table_is_refused_in_one_short_line(tmp_path: Path, name: str) 
     assert "\n" not in str(refused.value)
 
 
-def test_a_file_that_no_table_fills_is_not_read(tmp_path: Path) -> None:
+def test_oversized_table_file_is_not_read(tmp_path: Path) -> None:
     with written(tmp_path, "LUT_3D_SIZE 2\n").open("r+b") as file:
-        file.truncate(2 << 30)  # of no bytes on the disk
+        file.truncate(2 << 30)  # a sparse file, without bytes on the disk
     with pytest.raises(ProgdfError, match="is larger than 80 MB"):
         read_cube(tmp_path / "look.cube")

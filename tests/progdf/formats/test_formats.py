@@ -1,4 +1,4 @@
-"""Scenes in the formats that people have: each gives the scene that was written, within its quantization."""
+"""Tests of scene formats: each returns the written scene within its quantization."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ Write = Callable[[Path, Gaussians], Path]
 
 
 def scene_of(degree: int = 0, count: int = 300) -> Gaussians:
-    """Colors within 0..1 and opacities that a byte can hold; quaternions of unit length."""
+    """Return a scene with colors in 0 to 1, opacities that a byte holds, and unit quaternions."""
     scene = random_gaussians(count, seed=4, sh_degree=degree, scale=0.05)
     rng = torch.Generator().manual_seed(5)
     return replace(
@@ -55,20 +55,20 @@ def scene_of(degree: int = 0, count: int = 300) -> Gaussians:
 
 
 def saved(path: Path, scene: Gaussians) -> Path:
-    """What we write ourselves."""
+    """Write a scene with `save_scene`."""
     save_scene(path, scene)
     return path
 
 
 def zipped(path: Path, scene: Gaussians) -> Path:
-    """As Luma exports it: a .ply in a zip archive."""
+    """Write a .ply in a zip archive, as Luma exports it."""
     save_ply(path.with_suffix(".ply"), scene)
     content = path.with_suffix(".ply").read_bytes()
     return write_zip(path, {"luma/scene.ply": content, "__MACOSX/luma/._scene.ply": b"x", ".DS_Store": b"x"})
 
 
 def gzipped(path: Path, scene: Gaussians) -> Path:
-    """A scene with .gz behind its name."""
+    """Write a scene with .gz after its name."""
     write_scene(path.with_suffix(""), scene)
     path.write_bytes(gzip.compress(path.with_suffix("").read_bytes()))
     return path
@@ -98,21 +98,24 @@ WRITERS: dict[str, tuple[Write, str, int]] = {
     "saved sog": (saved, "scene.sog", 2),
     "saved glb": (saved, "scene.glb", 3),
 }
-"""How each is written, its name, and the degree of its spherical harmonics."""
+"""Writer, file name and SH degree of each format."""
 
 MEANS = {"compressed": 4e-3, "compressed, older": 4e-3, "ksplat 1": 4e-4, "ksplat 2": 4e-4}
 MEANS |= {"sog 1": 1e-4, "spz 2": 2e-4, "spz 3": 2e-4, "spz 4": 2e-4, "sog": 1e-3}
-"""Largest error of a center: half a step of each format over a cloud about 7 wide; the others keep floats."""
+"""Largest error of a center: half a step over a cloud about 7 units wide. Other formats keep floats."""
 SH = {"compressed": 0.017, "ksplat 1": 5e-4, "ksplat 2": 6e-3, "spz 2": 0.07, "spz 3": 0.07, "spz 4": 0.07}
 SH |= {"sog": 0.03, "sog 1": 0.01}
 for saved_one in ("compressed", "spz", "sog"):
     MEANS[f"saved {saved_one}"] = MEANS.get(saved_one, 2e-4)
     SH[f"saved {saved_one}"] = SH.get(saved_one, 0.07)
-"""Of a coefficient: bytes of −4..4, halves, bytes of −1.5..1.5, 4 and 5 bits of −1..1, and a palette."""
+"""Largest error of an SH coefficient.
+
+The formats use bytes of −4 to 4, halves, bytes of −1.5 to 1.5, 4 and 5 bits of −1 to 1, and a palette.
+"""
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_every_format_gives_the_scene_that_was_written(name: str, tmp_path: Path) -> None:
+def test_every_format_returns_the_written_scene(name: str, tmp_path: Path) -> None:
     writer, file, degree = WRITERS[name]
     scene = scene_of(degree, 200)
     path = writer(tmp_path / file, scene)
@@ -120,7 +123,7 @@ def test_every_format_gives_the_scene_that_was_written(name: str, tmp_path: Path
     found, report = load_scene_with_report(path)
     assert (report.file, report.count, report.sh_degree) == (file, len(scene), degree)
     assert report.file_bytes == path.stat().st_size
-    if name in ("sog", "saved sog", "saved compressed"):  # in an order of its own
+    if name in ("sog", "saved sog", "saved compressed"):  # reordered
         nearest = torch.cdist(found.means, scene.means).argmin(dim=1)
         assert len(nearest.unique()) == len(scene)
         scene = scene[nearest]
@@ -128,9 +131,9 @@ def test_every_format_gives_the_scene_that_was_written(name: str, tmp_path: Path
     assert float((found.log_scales - scene.log_scales).abs().max()) <= 0.033  # SPZ: half of 1/16
     # SOG 1 keeps a byte of the logit
     assert float((found.opacities - scene.opacities).abs().max()) <= (0.01 if name == "sog 1" else 1.01 / 255)
-    assert float((found.sh0 - scene.sh0).abs().max()) <= 0.0142  # a byte of 0..1 truncated, of band 0
+    assert float((found.sh0 - scene.sh0).abs().max()) <= 0.0142  # a truncated byte of 0 to 1, in band 0
     angles = (found.quats * scene.quats).sum(dim=1).abs().clamp(max=1.0).acos() * 2
-    # SPZ 2 keeps x, y, z as bytes, which w near 0 is worked out from
+    # SPZ 2 keeps x, y and z as bytes, and derives w from them even near 0
     assert float(angles.rad2deg().max()) <= (10.0 if name == "spz 2" else 1.0)
     if degree:
         assert float((found.shN - scene.shN).abs().max()) <= SH.get(name, 1e-6)
@@ -141,7 +144,7 @@ def test_every_format_gives_the_scene_that_was_written(name: str, tmp_path: Path
     ["ksplat 1", "spz 4", "sog", "compressed", "saved compressed", "saved spz", "saved sog", "saved glb"],
 )
 def test_every_format_looks_the_same_from_a_side(name: str, tmp_path: Path) -> None:
-    """A turned axis, a swapped band or a wrong sign costs tens of dB."""
+    """Render both scenes. A rotated axis, a swapped band or a wrong sign costs tens of dB."""
     writer, file, degree = WRITERS[name]
     scene = scene_of(degree)
     found = load_scene(writer(tmp_path / file, scene))
@@ -150,8 +153,8 @@ def test_every_format_looks_the_same_from_a_side(name: str, tmp_path: Path) -> N
     assert -10 * float(error.log10()) > 32.0
 
 
-def test_half_a_turn_about_x_turns_what_is_seen() -> None:
-    """The signs of all bands, against the basis itself: what is seen along d is then seen along d turned."""
+def test_half_turn_about_x_rotates_the_appearance() -> None:
+    """Check the signs of all bands against the basis: a color seen along d is then seen along d rotated."""
     scene = scene_of(3, 50)
     turned = rotate_about_x(scene)
     turn = torch.tensor([1.0, -1.0, -1.0])
@@ -175,7 +178,7 @@ def test_saturated_opacities_are_clamped_and_counted(tmp_path: Path) -> None:
         assert report.opaque == 300, path.name
 
 
-def test_every_format_that_can_say_so_keeps_antialiased(tmp_path: Path) -> None:
+def test_formats_with_an_antialiased_flag_keep_it(tmp_path: Path) -> None:
     spz = write_scene(tmp_path / "a.spz", scene_of())
     content = bytearray(spz.read_bytes())
     content[14] |= 1
@@ -191,7 +194,7 @@ def test_every_format_that_can_say_so_keeps_antialiased(tmp_path: Path) -> None:
         assert report.antialiased, path
 
 
-def test_content_decides_before_the_name_does(tmp_path: Path) -> None:
+def test_content_overrides_the_file_name(tmp_path: Path) -> None:
     scene = scene_of()
     for file, written in (("spz", "a.spz"), ("sog", "b.sog")):
         path = write_scene(tmp_path / written, scene).rename(tmp_path / f"{file}.dat")
@@ -202,7 +205,7 @@ def test_content_decides_before_the_name_does(tmp_path: Path) -> None:
     assert kind_of(tmp_path / "cameras.spz") == "cameras"
 
 
-def test_info_and_export_say_what_the_scene_was(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_and_export_name_the_source_format(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write_scene(tmp_path / "a.spz", scene_of(1))
     assert main(["info", str(path)]) == 0
     assert ".spz 4, turned from y up to y down" in capsys.readouterr().out
@@ -211,7 +214,7 @@ def test_info_and_export_say_what_the_scene_was(tmp_path: Path, capsys: pytest.C
     assert torch.equal(load_ply(tmp_path / "b.ply").means, load_scene(path).means)
 
 
-def test_a_reader_that_crashes_hangs_or_is_missing_is_one_line(
+def test_reader_that_crashes_hangs_or_is_missing_is_reported_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = write_scene(tmp_path / "a.spz", scene_of())
@@ -240,7 +243,7 @@ def test_a_reader_that_crashes_hangs_or_is_missing_is_one_line(
 @pytest.mark.parametrize(
     ("name", "extra"), [("a.spz", "formats"), ("a.sog", "formats"), ("a.splat", "formats"), ("a.usdc", "usd")]
 )
-def test_a_format_without_its_package_is_one_line_that_names_the_extra_and_no_file_of_ours(
+def test_missing_package_error_names_the_extra(
     tmp_path: Path, name: str, extra: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(formats.importlib.util, "find_spec", lambda module: None)
@@ -252,8 +255,8 @@ def test_a_format_without_its_package_is_one_line_that_names_the_extra_and_no_fi
     assert not list(tmp_path.iterdir())
 
 
-def test_a_reader_gets_no_more_memory_than_a_file_can_need(tmp_path: Path) -> None:
-    """A gigabyte asked for beyond the limit is a line, and no gigabyte."""
+def test_reader_memory_is_limited_by_the_need_of_the_file(tmp_path: Path) -> None:
+    """Request 1 GB beyond the limit, which is refused in one line without allocating it."""
     script = tmp_path / "greedy.py"
     here = "    path = Path(source)\n"
     own = Path(native_child.__file__).read_text()
@@ -265,8 +268,8 @@ def test_a_reader_gets_no_more_memory_than_a_file_can_need(tmp_path: Path) -> No
     assert ended.stderr.startswith("MemoryError")
 
 
-def test_a_compressed_ply_is_the_written_scene_in_the_order_of_a_curve(tmp_path: Path) -> None:
-    """The plain form of the tests writes the same numbers, a column at a time."""
+def test_compressed_ply_is_the_scene_in_morton_order(tmp_path: Path) -> None:
+    """Compare with the reference writer of the tests, which writes the same values one column at a time."""
     scene = replace(scene_of(3, 600), antialiased=True)
     ordered = scene[morton_order(scene.means)]
     save_scene(tmp_path / "a.compressed.ply", scene)
@@ -287,7 +290,7 @@ def test_a_compressed_ply_is_the_written_scene_in_the_order_of_a_curve(tmp_path:
     assert float(step) < 0.5 * float((scene.means[1:] - scene.means[:-1]).norm(dim=1).mean())
 
 
-def test_usd_has_the_numbers_of_every_step_and_stores_once_what_stays(tmp_path: Path) -> None:
+def test_usd_has_values_of_every_step_and_stores_constants_once(tmp_path: Path) -> None:
     Usd = pytest.importorskip("pxr.Usd", reason="pip install progdf-studio[usd]")
     scene = scene_of(2)
     steps = [scene, scene, replace(scene, sh0=scene.sh0 + 0.1), replace(scene, sh0=scene.sh0 + 0.2)]
@@ -312,7 +315,7 @@ def test_usd_has_the_numbers_of_every_step_and_stores_once_what_stays(tmp_path: 
 
 
 def checkpoints(scene: Gaussians) -> dict[str, object]:
-    """As gsplat's trainer and nerfstudio's splatfacto save them, with and without bands."""
+    """Return checkpoints as gsplat and nerfstudio's splatfacto save them, with and without bands."""
     splats = {"means": scene.means, "quats": scene.quats, "scales": scene.log_scales}
     colors = {"features_dc": scene.sh0, "features_rest": scene.shN}
     model = splats | {"opacities": scene.logit_opacities[:, None]} | colors
@@ -330,7 +333,7 @@ def checkpoints(scene: Gaussians) -> dict[str, object]:
     return {"gsplat.pt": gsplat, "nerfstudio.ckpt": nerfstudio(model), "flat.ckpt": nerfstudio(flat)}
 
 
-def test_checkpoints_of_trainings_open_as_scenes(tmp_path: Path) -> None:
+def test_checkpoints_open_as_scenes(tmp_path: Path) -> None:
     scene = scene_of(2)
     for name, content in checkpoints(scene).items():
         torch.save(content, tmp_path / name)
@@ -343,7 +346,7 @@ def test_checkpoints_of_trainings_open_as_scenes(tmp_path: Path) -> None:
 
 
 class Evil:
-    """What a pickle can do."""
+    """Object whose unpickling runs code."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -352,7 +355,7 @@ class Evil:
         return Path.touch, (self.path,)
 
 
-def test_a_checkpoint_runs_nothing_and_what_is_none_is_one_line(tmp_path: Path) -> None:
+def test_checkpoint_runs_no_code_and_other_files_are_refused(tmp_path: Path) -> None:
     whole = checkpoints(scene_of(1))["gsplat.pt"]
     cases = {
         "code.pt": (
@@ -372,7 +375,7 @@ def test_a_checkpoint_runs_nothing_and_what_is_none_is_one_line(tmp_path: Path) 
     assert not (tmp_path / "touched").exists()
 
 
-def test_frames_are_numbered_and_each_is_a_scene(tmp_path: Path) -> None:
+def test_frames_are_numbered_scenes(tmp_path: Path) -> None:
     scene = scene_of()
     paths = save_frames(tmp_path / "turn.compressed.ply", (scene[: 300 - n] for n in range(3)))
     assert [path.name for path in paths] == [f"turn_{n:03d}.compressed.ply" for n in range(3)]
@@ -381,19 +384,19 @@ def test_frames_are_numbered_and_each_is_a_scene(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", WRITERS)
-def test_damaged_files_are_one_line_or_a_drawable_scene(name: str, tmp_path: Path) -> None:
-    """Cut short anywhere, or with bits flipped: a line with the file's name, or finite numbers."""
+def test_damaged_files_give_an_error_or_a_drawable_scene(name: str, tmp_path: Path) -> None:
+    """Cut the file or flip bits: it gives one line with the file's name, or finite values."""
     writer, file, degree = WRITERS[name]
     whole = writer(tmp_path / file, scene_of(degree, 70)).read_bytes()
     rng = np.random.default_rng(6)
-    own = name.startswith(("compressed", "ksplat", "saved glb"))  # our readers are tried in a millisecond
+    own = name.startswith(("compressed", "ksplat", "saved glb"))  # our readers take a millisecond each
     refused = 0
     for trial in range(200 if own else 16):
         broken = bytearray(whole)
         if trial % 2:
             broken = broken[: int(rng.integers(0, len(whole)))]
         else:
-            top = len(whole) if trial % 4 else min(4400, len(whole))  # headers above all
+            top = len(whole) if trial % 4 else min(4400, len(whole))  # mostly headers
             for at in rng.integers(0, top, 1 + trial % 7):
                 broken[at] ^= 1 << int(rng.integers(0, 8))
         (tmp_path / file).write_bytes(bytes(broken))

@@ -1,4 +1,4 @@
-"""Scenes in glTF files (.glb, .gltf): each gives the scene that was written, or one line with the reason."""
+"""Tests of glTF scenes (.glb, .gltf): each returns the written scene, or one line with the reason."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def small(degree: int = 0, count: int = 12, seed: int = 1) -> Gaussians:
 
 
 def loaded(path: Path) -> Gaussians:
-    """The scene of a file in the file's own axes LUF."""
+    """Return the scene of a file in the file's own axes LUF."""
     return convert_axes(load_scene(path), "RDF", "LUF")
 
 
@@ -66,7 +66,7 @@ def covariances(scene: Gaussians) -> Tensor:
 
 
 def foreign_scene() -> Gaussians:
-    """The scene that splat-transform converted."""
+    """Return the scene that splat-transform converted."""
     rows = np.array(SPLAT_TRANSFORM_ROWS, np.float32)
     rest = rows[:, 6:15].reshape(-1, 3, 3).transpose(0, 2, 1)
     columns = {"means": rows[:, :3], "sh0": rows[:, 3:6], "shN": rest, "logit_opacities": rows[:, 15]}
@@ -74,18 +74,18 @@ def foreign_scene() -> Gaussians:
 
 
 @pytest.mark.parametrize("version", ["1.10.1", "2.3.1", "2.7.1"])
-def test_splat_transform_files_give_the_scene_of_the_ply(version: str, tmp_path: Path) -> None:
+def test_splat_transform_files_match_the_scene_of_the_ply(version: str, tmp_path: Path) -> None:
     path = tmp_path / "a.glb"
     path.write_bytes(splat_transform_glb(version))
     found, report = load_scene_with_report(path)
     assert_close(found, foreign_scene(), 1e-6)
     same = found.quats * foreign_scene().unit_quats
-    assert float(same.sum(dim=1).abs().min()) > 1 - 1e-6  # edits change these numbers
+    assert float(same.sum(dim=1).abs().min()) > 1 - 1e-6  # edits change these values
     assert any("logarithms" in phrase for phrase in report.conversions) == (version != "2.7.1")
     assert report.repairs == ()
 
 
-def test_written_glb_has_the_numbers_of_splat_transform(tmp_path: Path) -> None:
+def test_written_glb_matches_splat_transform(tmp_path: Path) -> None:
     save_scene(tmp_path / "a.glb", foreign_scene())
     (tmp_path / "b.glb").write_bytes(splat_transform_glb("2.7.1"))
     ours = columns_of(tmp_path / "a.glb")
@@ -99,7 +99,7 @@ def test_written_glb_has_the_numbers_of_splat_transform(tmp_path: Path) -> None:
 
 
 def columns_of(path: Path) -> dict[str, np.ndarray]:
-    """The attributes of the one primitive of a .glb with packed views."""
+    """Return the attributes of the only primitive of a .glb with packed views."""
     content = path.read_bytes()
     size = struct.unpack_from("<I", content, 12)[0]
     tables = json.loads(content[20 : 20 + size])
@@ -114,7 +114,7 @@ def columns_of(path: Path) -> dict[str, np.ndarray]:
     return columns
 
 
-def test_a_glb_shows_points_of_linear_colors_elsewhere(tmp_path: Path) -> None:
+def test_glb_has_linear_point_colors_for_other_viewers(tmp_path: Path) -> None:
     scene = small()
     save_scene(tmp_path / "a.glb", scene)
     expected = linear_from_srgb(sh0_to_rgb(scene.sh0).clamp(0, 1)) * 255
@@ -122,7 +122,7 @@ def test_a_glb_shows_points_of_linear_colors_elsewhere(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("axes", ["LUF", "RUB"])
-def test_a_glb_in_any_axes_loads_to_the_same_bits(axes: Axes, tmp_path: Path) -> None:
+def test_glb_in_any_axes_loads_to_the_same_bits(axes: Axes, tmp_path: Path) -> None:
     scene = small(3)
     save_scene(tmp_path / "a.glb", scene, axes)
     found = load_scene(tmp_path / "a.glb")
@@ -134,13 +134,13 @@ def test_a_glb_in_any_axes_loads_to_the_same_bits(axes: Axes, tmp_path: Path) ->
     assert torch.equal(stored, scene.means * torch.tensor(signs))
 
 
-def test_a_glb_of_this_program_without_axes_is_opengls(tmp_path: Path) -> None:
+def test_progdf_glb_without_axes_uses_opengl_axes(tmp_path: Path) -> None:
     builder = one_mesh(convert_axes(small(), "RDF", "RUB"))
     builder.tables["asset"]["generator"] = "progdf"
     assert_close(load_scene(builder.write(tmp_path / "a.glb")), small())
 
 
-def test_a_glb_keeps_its_place_far_away(tmp_path: Path) -> None:
+def test_glb_keeps_positions_far_from_zero(tmp_path: Path) -> None:
     scene = replace(small(2), origin=(4e6, -3e6, 2e6))
     save_scene(tmp_path / "a.glb", scene)
     found = load_scene(tmp_path / "a.glb")
@@ -165,7 +165,7 @@ def test_edit_writes_the_chosen_axes(
 
 @pytest.mark.parametrize("start", AXES)
 @pytest.mark.parametrize("end", AXES)
-def test_axes_turn_there_and_back_to_the_same_bits(start: Axes, end: Axes) -> None:
+def test_axes_conversion_round_trip_keeps_the_bits(start: Axes, end: Axes) -> None:
     scene = replace(small(3), origin=(1.0, 2.0, 3.0))
     turned = convert_axes(scene, start, end)
     back = convert_axes(turned, end, start)
@@ -254,7 +254,9 @@ def test_sparse_rows_are_applied(based: bool, tmp_path: Path) -> None:
         (1, 0, 5126, "row numbers of type 5126"),
     ],
 )
-def test_sparse_rows_outside_are_refused(count: int, row: int, kind: int, said: str, tmp_path: Path) -> None:
+def test_sparse_rows_out_of_range_are_refused(
+    count: int, row: int, kind: int, said: str, tmp_path: Path
+) -> None:
     builder = GltfBuilder()
     attributes = builder.attributes(small())
     view = builder.view(np.array([row, 0], "<u2").tobytes())
@@ -266,7 +268,7 @@ def test_sparse_rows_outside_are_refused(count: int, row: int, kind: int, said: 
     assert said in refusal(load_scene, builder.write(tmp_path / "a.glb"))
 
 
-def test_integers_stand_for_shares_or_for_themselves(tmp_path: Path) -> None:
+def test_integers_are_normalized_or_taken_as_values(tmp_path: Path) -> None:
     builder = GltfBuilder()
     scene = replace(small(), quats=torch.tensor([[1.0, 0, 0, 0]]).expand(12, 4))
     attributes = builder.attributes(scene)
@@ -294,7 +296,7 @@ def test_indices_choose_the_rows(tmp_path: Path) -> None:
 # ---- meshes and nodes
 
 
-def test_parts_of_another_degree_are_padded_with_zeros(tmp_path: Path) -> None:
+def test_parts_of_a_lower_degree_are_padded_with_zeros(tmp_path: Path) -> None:
     builder = GltfBuilder()
     parts = [small(0), small(2, 5, seed=2), small(1, 3, seed=3)]
     builder.mesh(*(builder.primitive(builder.attributes(part)) for part in parts))
@@ -331,7 +333,7 @@ def test_meshes_outside_the_scene_are_left_out_and_listed(tmp_path: Path) -> Non
         ([{"mesh": 0, "extensions": {"KHR_node_visibility": {"visible": False}}}, {"mesh": 1}], (0, 1), [2]),
     ],
 )
-def test_only_what_the_scene_shows_is_read(
+def test_only_meshes_of_the_scene_are_read(
     nodes: list[dict[str, Any]], roots: tuple[int, ...] | None, chosen: list[int], tmp_path: Path
 ) -> None:
     builder = two_meshes()
@@ -342,14 +344,14 @@ def test_only_what_the_scene_shows_is_read(
     assert torch.equal(found.means, torch.cat([small(seed=seed).means for seed in chosen]))
 
 
-def test_the_chosen_scene_is_read(tmp_path: Path) -> None:
+def test_chosen_scene_is_read(tmp_path: Path) -> None:
     builder = two_meshes()
     builder.nodes({"mesh": 0}, {"mesh": 1})
     builder.tables |= {"scene": 1, "scenes": [{"nodes": [0]}, {"nodes": [1]}]}
     assert torch.equal(loaded(builder.write(tmp_path / "a.glb")).means, small(seed=2).means)
 
 
-def test_an_identity_matrix_changes_nothing(tmp_path: Path) -> None:
+def test_identity_matrix_changes_nothing(tmp_path: Path) -> None:
     save_scene(tmp_path / "a.glb", small(3))
     builder = one_mesh(convert_axes(small(3), "RDF", "LUF"), {"matrix": IDENTITY})
     found = load_scene(builder.write(tmp_path / "b.glb"))
@@ -358,7 +360,7 @@ def test_an_identity_matrix_changes_nothing(tmp_path: Path) -> None:
         assert torch.equal(getattr(found, name), getattr(expected, name)), name
 
 
-TURN = [0.5, -0.1, 0.7, 0.5]  # xyzw, made a unit below
+TURN = [0.5, -0.1, 0.7, 0.5]  # xyzw, normalized below
 TURN = [float(part) for part in np.array(TURN) / np.linalg.norm(TURN)]
 QUARTER = [0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)]
 
@@ -420,7 +422,7 @@ def test_nodes_place_their_gaussians(name: str, tmp_path: Path) -> None:
         ({"matrix": [1.0, 0, 0, 0, 0.6, 0.8, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}, "mirrors or shears"),
     ],
 )
-def test_a_node_that_deforms_is_named(node: dict[str, Any], does: str, tmp_path: Path) -> None:
+def test_deforming_node_is_named(node: dict[str, Any], does: str, tmp_path: Path) -> None:
     builder = one_mesh(small())
     builder.nodes({"children": [1]}, {"name": "table", "children": [2]} | node, {"mesh": 0})
     said = refusal(load_scene, builder.write(tmp_path / "a.glb"))
@@ -441,13 +443,15 @@ def test_a_node_that_deforms_is_named(node: dict[str, Any], does: str, tmp_path:
         ([{"mesh": 0, "extensions": {"EXT_mesh_gpu_instancing": {}}}], "EXT_mesh_gpu_instancing in nodes[0]"),
     ],
 )
-def test_nodes_that_cannot_be_are_one_line(nodes: list[dict[str, Any]], said: str, tmp_path: Path) -> None:
+def test_invalid_nodes_are_reported_in_one_line(
+    nodes: list[dict[str, Any]], said: str, tmp_path: Path
+) -> None:
     builder = one_mesh(small())
     builder.nodes(*nodes)
     assert said in refusal(load_scene, builder.write(tmp_path / "a.glb"))
 
 
-# ---- features by name
+# ---- unsupported features, refused by name
 
 
 @pytest.mark.parametrize(
@@ -461,7 +465,7 @@ def test_nodes_that_cannot_be_are_one_line(nodes: list[dict[str, Any]], said: st
         ({"kernel": 3}, "kernel '3'"),
     ],
 )
-def test_an_unknown_look_is_refused_by_name(look: dict[str, Any], said: str, tmp_path: Path) -> None:
+def test_unknown_appearance_is_refused_by_name(look: dict[str, Any], said: str, tmp_path: Path) -> None:
     assert said in refusal(load_scene, one_mesh(small(), **look).write(tmp_path / "a.glb"))
 
 
@@ -469,13 +473,13 @@ def test_an_unknown_look_is_refused_by_name(look: dict[str, Any], said: str, tmp
     "name",
     ["EXT_meshopt_compression", "KHR_meshopt_compression", "KHR_draco_mesh_compression", "EXT_future"],
 )
-def test_an_unknown_required_extension_is_refused_by_name(name: str, tmp_path: Path) -> None:
+def test_unknown_required_extension_is_refused_by_name(name: str, tmp_path: Path) -> None:
     builder = one_mesh(small())
     builder.tables["extensionsRequired"] = [name]
     assert f"the required extension {name}" in refusal(load_scene, builder.write(tmp_path / "a.glb"))
 
 
-def test_extensions_of_materials_are_listed_only(tmp_path: Path) -> None:
+def test_material_extensions_are_only_listed(tmp_path: Path) -> None:
     builder = one_mesh(small())
     builder.tables["extensionsRequired"] = ["KHR_materials_unlit"]
     builder.tables["extensionsUsed"] += ["KHR_materials_unlit", "MSFT_lod"]
@@ -484,7 +488,7 @@ def test_extensions_of_materials_are_listed_only(tmp_path: Path) -> None:
     assert "animations (the scene at rest is read), KHR_materials_unlit, MSFT_lod" in report.lines()[1]
 
 
-def test_a_compressed_view_without_a_fallback_is_refused_by_name(tmp_path: Path) -> None:
+def test_compressed_view_without_a_fallback_is_refused_by_name(tmp_path: Path) -> None:
     builder = one_mesh(small())
     compression = {"EXT_meshopt_compression": {"buffer": 0, "byteLength": 9}}
     builder.tables["bufferViews"][0] |= {"buffer": 1, "extensions": compression}
@@ -517,7 +521,7 @@ def test_morph_targets_are_refused_by_name(tmp_path: Path) -> None:
     assert "morph targets" in refusal(load_scene, builder.write(tmp_path / "a.glb"))
 
 
-def test_a_file_of_triangles_holds_no_gaussians(tmp_path: Path) -> None:
+def test_file_of_triangles_holds_no_gaussians(tmp_path: Path) -> None:
     builder = GltfBuilder()
     builder.mesh({"attributes": {"POSITION": builder.accessor(np.zeros((3, 3), "<f4"))}})
     builder.nodes({"mesh": 0})
@@ -542,7 +546,7 @@ def spz_file(content: bytes, name: str, count: int | None) -> GltfBuilder:
 
 @pytest.mark.parametrize("name", [f"{EXTENSION}_compression_spz", f"{EXTENSION}_compression_spz_2"])
 @pytest.mark.parametrize("count", [60, None])
-def test_an_spz_inside_gives_the_scene_of_the_spz(name: str, count: int | None, tmp_path: Path) -> None:
+def test_embedded_spz_matches_the_scene_of_the_spz(name: str, count: int | None, tmp_path: Path) -> None:
     path = write_scene(tmp_path / "a.spz", random_gaussians(60, seed=2, sh_degree=1), 3)
     builder = spz_file(path.read_bytes(), name, count)
     found, report = load_scene_with_report(builder.write(tmp_path / "a.glb"))
@@ -551,13 +555,13 @@ def test_an_spz_inside_gives_the_scene_of_the_spz(name: str, count: int | None, 
 
 
 @pytest.mark.parametrize("content", [b"\0" * 32, b"NGSP" + b"\xff" * 40, b"?"])
-def test_a_broken_spz_inside_is_one_line(content: bytes, tmp_path: Path) -> None:
+def test_broken_embedded_spz_is_reported_in_one_line(content: bytes, tmp_path: Path) -> None:
     pytest.importorskip("gaussforge")
     builder = spz_file(content, f"{EXTENSION}_compression_spz_2", 3)
     assert "a.glb: its .spz part" in refusal(load_scene, builder.write(tmp_path / "a.glb"))
 
 
-def test_an_spz_of_another_count_is_refused(tmp_path: Path) -> None:
+def test_embedded_spz_of_another_count_is_refused(tmp_path: Path) -> None:
     path = write_scene(tmp_path / "a.spz", random_gaussians(60, seed=2), 3)
     builder = spz_file(path.read_bytes(), f"{EXTENSION}_compression_spz", 61)
     assert "has 61 Gaussians and its .spz 60" in refusal(load_scene, builder.write(tmp_path / "a.glb"))
@@ -570,9 +574,7 @@ def test_an_spz_of_another_count_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("uri", "place"), [("a.bin", "a.bin"), ("my%20files/b%C3%BC.bin", "my files/bü.bin"), (None, None)]
 )
-def test_buffers_outside_the_file_are_read(
-    ending: str, uri: str | None, place: str | None, tmp_path: Path
-) -> None:
+def test_external_buffers_are_read(ending: str, uri: str | None, place: str | None, tmp_path: Path) -> None:
     builder = one_mesh(small(1))
     path = builder.write(tmp_path / f"a.{ending}", uri or builder.data_uri())
     size = path.stat().st_size
@@ -586,7 +588,7 @@ def test_buffers_outside_the_file_are_read(
     assert report.file_bytes == size
 
 
-def test_info_and_a_picture_take_a_gltf(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_and_render_accept_a_gltf(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     builder = one_mesh(small())
     path = builder.write(tmp_path / "a.gltf", "a.bin")
     (tmp_path / "a.bin").write_bytes(builder.data)
@@ -595,7 +597,7 @@ def test_info_and_a_picture_take_a_gltf(tmp_path: Path, capsys: pytest.CaptureFi
     assert main(["render", str(path), "--size", "16x16", "-o", str(tmp_path / "a.png")]) == 0
 
 
-def test_a_gltf_is_not_bundled(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_gltf_is_not_bundled(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     builder = one_mesh(small())
     path = builder.write(tmp_path / "a.gltf", builder.data_uri())
     assert main(["export", str(path), "-o", str(tmp_path / "a.progdf.zip")]) == 2
@@ -627,7 +629,7 @@ def test_a_gltf_is_not_bundled(tmp_path: Path, capsys: pytest.CaptureFixture[str
         ("link", "does not exist"),
     ],
 )
-def test_buffers_elsewhere_are_refused(uri: str, said: str, tmp_path: Path) -> None:
+def test_buffers_in_other_places_are_refused(uri: str, said: str, tmp_path: Path) -> None:
     path = one_mesh(small()).write(tmp_path / "a.gltf", uri)
     (tmp_path.parent / "a.bin").write_bytes(b"\0" * 4096)
     (tmp_path / "folder").mkdir()
@@ -638,7 +640,7 @@ def test_buffers_elsewhere_are_refused(uri: str, said: str, tmp_path: Path) -> N
     assert "\n" not in str(caught.value)
 
 
-def test_a_short_buffer_is_the_file_at_fault(tmp_path: Path) -> None:
+def test_short_buffer_error_names_the_buffer_file(tmp_path: Path) -> None:
     builder = one_mesh(small())
     path = builder.write(tmp_path / "a.gltf", "a.bin")
     (tmp_path / "a.bin").write_bytes(builder.data[:-1])
@@ -697,7 +699,7 @@ def set_view(**values: Any) -> Change:
         ),
     ],
 )
-def test_a_damaged_file_is_one_line_in_words_of_gltf(change: Change, said: str, tmp_path: Path) -> None:
+def test_damaged_file_is_reported_in_gltf_terms(change: Change, said: str, tmp_path: Path) -> None:
     builder = one_mesh(small())
     change(builder)
     message = refusal(load_scene, builder.write(tmp_path / "a.glb"))
@@ -717,7 +719,7 @@ def test_a_damaged_file_is_one_line_in_words_of_gltf(change: Change, said: str, 
         (b"gltf\2\0\0\0", "does not begin with glTF"),
     ],
 )
-def test_a_broken_container_is_one_line(content: bytes, said: str, tmp_path: Path) -> None:
+def test_broken_container_is_reported_in_one_line(content: bytes, said: str, tmp_path: Path) -> None:
     (tmp_path / "a.glb").write_bytes(content)
     assert said in refusal(load_scene, tmp_path / "a.glb")
 
@@ -759,7 +761,7 @@ def empty_indices() -> GltfBuilder:
 
 
 @pytest.mark.parametrize("make", [repeated_mesh, repeated_nodes, empty_columns, empty_indices])
-def test_rows_are_bounded_by_the_file_before_memory_is(
+def test_row_count_is_bounded_by_the_file_before_allocation(
     make: Callable[[], GltfBuilder], tmp_path: Path
 ) -> None:
     path = make().write(tmp_path / "a.glb")
@@ -771,13 +773,13 @@ def test_rows_are_bounded_by_the_file_before_memory_is(
     assert peak < 16 << 20
 
 
-def test_a_few_instances_are_no_bomb(tmp_path: Path) -> None:
+def test_few_instances_are_accepted(tmp_path: Path) -> None:
     builder = one_mesh(small(count=200))
     builder.nodes(*({"mesh": 0} for _ in range(100)), roots=tuple(range(100)))
     assert len(load_scene(builder.write(tmp_path / "a.glb"))) == 20_000
 
 
-def test_a_buffer_is_bounded_by_its_file(tmp_path: Path) -> None:
+def test_buffer_is_bounded_by_its_file(tmp_path: Path) -> None:
     path = one_mesh(small()).write(tmp_path / "a.gltf", "a.bin")
     tables = json.loads(path.read_text())
     tables["buffers"][0]["byteLength"] = 1 << 40
@@ -791,7 +793,7 @@ def test_a_buffer_is_bounded_by_its_file(tmp_path: Path) -> None:
     assert peak < 16 << 20
 
 
-def test_the_json_is_bounded_too(tmp_path: Path) -> None:
+def test_json_size_is_bounded(tmp_path: Path) -> None:
     (tmp_path / "a.gltf").write_text("[" + "[]," * 2_100_000 + "0]")
     assert "values in its JSON" in refusal(load_scene, tmp_path / "a.gltf")
 

@@ -1,4 +1,4 @@
-"""Scenes far from 0: what loading takes off their positions, and how it comes back in files and figures."""
+"""Tests of scenes far from 0: the origin that loading subtracts, and its return in files and figures."""
 
 from __future__ import annotations
 
@@ -25,31 +25,31 @@ FAR = (1e6, 2e6, -5e5)
 
 
 def places(path: Path) -> np.ndarray:
-    """x, y, z as a file has them, in float64. [N,3]"""
+    """Return x, y, z as a file has them, in float64. [N,3]"""
     rows = PlyData.read(str(path))["vertex"].data
     return np.stack([rows[name].astype(np.float64) for name in "xyz"], axis=1)
 
 
 def small() -> Gaussians:
-    """A scene a few units wide of Gaussians of a hundredth."""
+    """Return a scene a few units wide with Gaussians of size 0.01."""
     scene = scene_of()
     return replace(scene, log_scales=torch.full((COUNT, 3), 0.01).log())
 
 
 @pytest.mark.parametrize("far", [64.0, 1e3, 1e5, 1e6])
-def test_a_scene_of_doubles_is_the_same_bits_wherever_it_lies(tmp_path: Path, far: float) -> None:
+def test_doubles_load_to_the_same_bits_at_any_distance(tmp_path: Path, far: float) -> None:
     path = write(tmp_path / "far.ply", moved_columns(small(), (far, -far, 0.0)))
     assert_same(load_ply(path), load_ply(write(tmp_path / "near.ply", table_of(small()))))
     assert np.abs(np.abs(load_ply(path).origin) - (far, far, 0.0)).max() < 2.0
 
 
-def test_a_scene_near_zero_has_no_origin(tmp_path: Path) -> None:
+def test_scene_near_zero_has_no_origin(tmp_path: Path) -> None:
     for by in (0.0, 1.0, 10.0):
         assert load_ply(write(tmp_path / "a.ply", moved_columns(small(), (by, by, by)))).origin == ZERO
     assert load_ply(write(tmp_path / "a.ply", table_of(small()))).origin == ZERO
 
 
-def test_how_near_is_near_goes_with_the_size_of_the_scene() -> None:
+def test_distance_for_an_origin_scales_with_the_scene() -> None:
     for unit in (1e-6, 1e-3, 1.0, 1e3):
         means = unit * small().means.double()
         log_scales = small().log_scales + np.log(unit)
@@ -58,7 +58,7 @@ def test_how_near_is_near_goes_with_the_size_of_the_scene() -> None:
         assert all(abs(at - 1e4 * unit) < 4 * unit for at in origin)
 
 
-def test_numbers_that_are_not_finite_do_not_move_the_origin() -> None:
+def test_values_that_are_not_finite_do_not_move_the_origin() -> None:
     means = small().means.double() + 1e6
     log_scales = small().log_scales
     origin = find_origin(means, log_scales)
@@ -70,7 +70,7 @@ def test_numbers_that_are_not_finite_do_not_move_the_origin() -> None:
     assert find_origin(means, torch.full_like(log_scales, torch.nan)) == ZERO
 
 
-def test_doubles_are_written_as_doubles_and_are_the_same_when_read_back(tmp_path: Path) -> None:
+def test_doubles_are_written_as_doubles_and_read_back_equal(tmp_path: Path) -> None:
     path = write(tmp_path / "far.ply", moved_columns(small(), FAR))
     scene = load_ply(path)
     save_ply(tmp_path / "again.ply", scene)
@@ -81,20 +81,20 @@ def test_doubles_are_written_as_doubles_and_are_the_same_when_read_back(tmp_path
     assert again.origin == scene.origin
 
 
-def test_a_scene_near_zero_is_written_as_floats(tmp_path: Path) -> None:
+def test_scene_near_zero_is_written_as_floats(tmp_path: Path) -> None:
     save_ply(tmp_path / "near.ply", load_ply(write(tmp_path / "a.ply", moved_columns(small(), ZERO))))
     assert PlyData.read(str(tmp_path / "near.ply"))["vertex"].data.dtype["x"] == np.dtype("<f4")
 
 
 @pytest.mark.parametrize("text", [True, False])
-def test_doubles_of_text_and_of_the_other_byte_order_are_read_too(tmp_path: Path, text: bool) -> None:
+def test_text_and_big_endian_doubles_are_read(tmp_path: Path, text: bool) -> None:
     path = write(tmp_path / "far.ply", moved_columns(small(), FAR), text=text, byte_order=">")
     scene = load_ply(path)
     assert float((scene.world_means - torch.from_numpy(places(path))).abs().max()) < 1e-6
     assert scene.origin != ZERO
 
 
-def test_rows_without_a_place_are_hidden_in_the_middle_of_a_far_scene(tmp_path: Path) -> None:
+def test_rows_without_a_position_are_hidden_at_the_scene_center(tmp_path: Path) -> None:
     columns = moved_columns(small(), FAR)
     columns["x"][3] = np.nan
     scene, report = load_ply_with_report(write(tmp_path / "far.ply", columns))
@@ -103,7 +103,9 @@ def test_rows_without_a_place_are_hidden_in_the_middle_of_a_far_scene(tmp_path: 
     assert len(scene) == COUNT
 
 
-def test_what_float32_has_lost_is_counted_and_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_positions_lost_to_float32_are_counted_and_reported(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     columns = as_type("f4")(moved_columns(small(), (1e6, 1e6, 0.0)))
     scene, report = load_ply_with_report(write(tmp_path / "far.ply", columns))
     x, y = (len(np.unique(columns[name])) for name in "xy")
@@ -117,24 +119,24 @@ def test_what_float32_has_lost_is_counted_and_said(tmp_path: Path, caplog: pytes
     assert "far.ply: float32 positions have steps" in caplog.text
 
 
-def test_nothing_is_lost_of_doubles_nor_near_zero(tmp_path: Path) -> None:
+def test_doubles_and_scenes_near_zero_lose_nothing(tmp_path: Path) -> None:
     for columns in (moved_columns(small(), FAR), table_of(small())):
         report = load_ply_with_report(write(tmp_path / "a.ply", columns))[1]
         assert report.lost == ""
         assert not [line for line in report.lines() if line.startswith("lost")]
 
 
-def test_floats_far_from_zero_keep_the_fingerprint_that_they_had(tmp_path: Path) -> None:
+def test_floats_far_from_zero_keep_their_fingerprint(tmp_path: Path) -> None:
     columns = as_type("f4")(moved_columns(small(), FAR))
     far = load_ply(write(tmp_path / "far.ply", columns))
     plain = replace(far, means=torch.from_numpy(np.stack([columns[n] for n in "xyz"], axis=1)), origin=ZERO)
     assert fingerprint(far) == fingerprint(plain)
     save_ply(tmp_path / "doubles.ply", far)
     assert fingerprint(load_ply(tmp_path / "doubles.ply")) == fingerprint(far)
-    assert fingerprint(replace(far, origin=ZERO)) != fingerprint(far)  # of the same tensor
+    assert fingerprint(replace(far, origin=ZERO)) != fingerprint(far)  # the same tensor at another origin
 
 
-def test_figures_are_in_the_world(tmp_path: Path) -> None:
+def test_figures_are_in_world_coordinates(tmp_path: Path) -> None:
     near = load_ply(write(tmp_path / "near.ply", table_of(small())))
     far = load_ply(write(tmp_path / "far.ply", moved_columns(small(), FAR)))
     a = survey(near)
@@ -144,11 +146,11 @@ def test_figures_are_in_the_world(tmp_path: Path) -> None:
     assert np.allclose(np.subtract(b.box, 2 * FAR), a.box, rtol=0, atol=1e-9)
     box = next(line for line in b.lines() if line.startswith("all: "))
     assert box.startswith("all: --region box:99999")
-    assert len(box.split(",")[0].partition(".")[2]) >= 3  # the box can be told from its neighbor
+    assert len(box.split(",")[0].partition(".")[2]) >= 3  # the box is distinct from its neighbor
 
 
 @pytest.mark.parametrize("kind", ["spz", "splat", "ksplat", "sog"])
-def test_other_formats_come_in_relative_to_their_origin(tmp_path: Path, kind: str) -> None:
+def test_other_formats_load_relative_to_their_origin(tmp_path: Path, kind: str) -> None:
     pytest.importorskip("gaussforge")
     near = random_gaussians(60, seed=3)
     scene = replace(near, quats=near.unit_quats, log_scales=near.log_scales - 3, shN=near.shN[:, :0])
@@ -157,18 +159,18 @@ def test_other_formats_come_in_relative_to_their_origin(tmp_path: Path, kind: st
     found = load_scene(path)
     assert found.origin[0] != 0
     assert found.origin[1] != 0
-    center = found.world_means.median(dim=0).values  # rows of a .sog come in another order
+    center = found.world_means.median(dim=0).values  # a .sog reorders its rows
     assert float((center - far.means.double().median(dim=0).values).abs().max()) < 0.1
 
 
-def test_half_a_turn_about_x_turns_the_origin_too() -> None:
+def test_half_turn_about_x_rotates_the_origin_too() -> None:
     scene = replace(small(), origin=FAR)
     expected = scene.world_means * torch.tensor([1.0, -1.0, -1.0]).double()
     assert torch.equal(rotate_about_x(scene).world_means, expected)
     assert str(rotate_about_x(small()).origin) == "(0.0, 0.0, 0.0)"
 
 
-def test_an_edit_is_carried_between_two_origins_of_one_scene() -> None:
+def test_edit_is_carried_between_two_origins_of_one_scene() -> None:
     scene = small()
     shifted = replace(scene, means=scene.means - 4.0, origin=(1004.0, 1004.0, 1004.0))
     match = match_scenes(replace(scene, origin=(1000.0, 1000.0, 1000.0)), shifted)

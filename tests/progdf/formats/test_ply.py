@@ -1,4 +1,4 @@
-"""The .ply files of the wild: valid variants give the same scene, anything else is refused in one line."""
+"""Tests of .ply files in use: valid variants give the same scene, others are refused in one line."""
 
 from __future__ import annotations
 
@@ -64,13 +64,13 @@ def test_every_valid_variant_gives_the_same_scene(variant: str, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
-def test_a_saved_scene_loads_to_the_same_bits(degree: int, tmp_path: Path) -> None:
+def test_saved_scene_loads_to_the_same_bits(degree: int, tmp_path: Path) -> None:
     scene = scene_of(degree)
     save_ply(tmp_path / "scene.ply", scene)
     assert_same(load_ply(tmp_path / "scene.ply"), scene)
 
 
-def test_loading_is_idempotent_after_quaternions_were_normalized(tmp_path: Path) -> None:
+def test_loading_is_idempotent_after_quaternion_normalization(tmp_path: Path) -> None:
     scene = random_gaussians(5000, seed=3, sh_degree=1)
     save_ply(tmp_path / "raw.ply", scene)
     once, report = load_ply_with_report(tmp_path / "raw.ply")
@@ -82,7 +82,7 @@ def test_loading_is_idempotent_after_quaternions_were_normalized(tmp_path: Path)
     assert report.scaled_quats == 0
 
 
-def test_a_saved_file_is_what_the_original_code_writes(tmp_path: Path) -> None:
+def test_saved_file_matches_the_original_code(tmp_path: Path) -> None:
     scene = scene_of()
     save_ply(tmp_path / "scene.ply", scene)
     vertex = PlyData.read(str(tmp_path / "scene.ply"))["vertex"].data
@@ -92,7 +92,7 @@ def test_a_saved_file_is_what_the_original_code_writes(tmp_path: Path) -> None:
         assert np.array_equal(vertex[name], values), name
 
 
-def test_many_blocks_and_threads_keep_every_row_in_its_place(tmp_path: Path) -> None:
+def test_many_blocks_and_threads_keep_the_row_order(tmp_path: Path) -> None:
     scene = scene_of(1, count=20_011, seed=5)
     save_ply(tmp_path / "scene.ply", scene)
     assert_same(load_ply(tmp_path / "scene.ply"), scene)
@@ -109,7 +109,7 @@ def test_crlf_headers_and_comments_are_read(tmp_path: Path) -> None:
     assert_same(load_ply(tmp_path / "crlf.ply"), scene)
 
 
-def test_a_failed_save_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+def test_failed_save_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
     path = tmp_path / "scene.ply"
     save_ply(path, scene_of())
     old = path.read_bytes()
@@ -123,7 +123,7 @@ def test_a_failed_save_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> N
     assert [entry.name for entry in tmp_path.iterdir()] == ["scene.ply"]
 
 
-def test_the_public_names_are_the_same_functions() -> None:
+def test_public_names_are_the_same_functions() -> None:
     assert progdf.load_ply is load_ply
     assert progdf.save_ply is save_ply
 
@@ -166,22 +166,22 @@ def lacking(*names: str) -> dict[str, np.ndarray]:
         (("z",), "z"),
     ],
 )
-def test_a_missing_property_is_named(lost: tuple[str, ...], said: str, tmp_path: Path) -> None:
+def test_missing_property_is_named(lost: tuple[str, ...], said: str, tmp_path: Path) -> None:
     assert said in refusal(load_ply, write(tmp_path / "scene.ply", lacking(*lost)))
 
 
-def test_a_gap_in_the_sh_properties_is_named(tmp_path: Path) -> None:
+def test_gap_in_the_sh_properties_is_named(tmp_path: Path) -> None:
     columns = {("f_rest_45" if k == "f_rest_44" else k): v for k, v in table_of(scene_of()).items()}
     assert "without f_rest_44" in refusal(load_ply, write(tmp_path / "scene.ply", columns))
 
 
-def test_an_element_after_the_gaussians_must_fit_behind_them(tmp_path: Path) -> None:
+def test_element_after_the_gaussians_must_fit_the_file(tmp_path: Path) -> None:
     path = write(tmp_path / "scene.ply", table_of(scene_of()), after=[camera_element()])
     path.write_bytes(path.read_bytes().replace(b"camera 1", b"camera 2"))
     assert "declares 2 rows of 'camera'" in refusal(load_ply, path)
 
 
-def test_other_kinds_of_file_are_called_by_their_name(tmp_path: Path) -> None:
+def test_other_file_kinds_are_named(tmp_path: Path) -> None:
     columns = {name: values for name, values in table_of(scene_of()).items() if name in "xyz"}
     path = tmp_path / "scene.ply"
     assert "mesh" in refusal(load_ply, write(path, columns, after=[face_element()]))
@@ -210,12 +210,12 @@ def test_other_kinds_of_file_are_called_by_their_name(tmp_path: Path) -> None:
         assert said in refusal(load_ply, path)
 
 
-def test_a_missing_file_and_a_folder_are_one_line(tmp_path: Path) -> None:
+def test_missing_file_and_folder_are_reported_in_one_line(tmp_path: Path) -> None:
     assert "does not exist" in refusal(load_ply, tmp_path / "nowhere.ply")
     assert "folder" in refusal(load_ply, tmp_path)
 
 
-def test_zero_gaussians_are_refused_on_both_ways(tmp_path: Path) -> None:
+def test_zero_gaussians_are_refused_on_load_and_save(tmp_path: Path) -> None:
     save_ply(tmp_path / "scene.ply", scene_of())
     content = (tmp_path / "scene.ply").read_bytes().replace(b"vertex 50\n", b"vertex 0\n")
     (tmp_path / "scene.ply").write_bytes(content[: content.index(b"end_header\n") + 11])
@@ -227,7 +227,7 @@ def test_zero_gaussians_are_refused_on_both_ways(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize("kept", [0.999, 0.5, 0.3])
-def test_a_file_cut_short_is_refused(text: bool, kept: float, tmp_path: Path) -> None:
+def test_truncated_file_is_refused(text: bool, kept: float, tmp_path: Path) -> None:
     path = write(tmp_path / "scene.ply", table_of(scene_of()), text=text)
     content = path.read_bytes()
     path.write_bytes(content[: int(kept * len(content))])
@@ -236,7 +236,7 @@ def test_a_file_cut_short_is_refused(text: bool, kept: float, tmp_path: Path) ->
 
 @pytest.mark.parametrize("count", [b"51", b"2000000000", b"9999999999999999999", b"9" * 5000])
 @pytest.mark.parametrize("text", [False, True])
-def test_a_false_count_is_refused_and_allocates_nothing(count: bytes, text: bool, tmp_path: Path) -> None:
+def test_false_count_is_refused_without_allocation(count: bytes, text: bool, tmp_path: Path) -> None:
     path = write(tmp_path / "scene.ply", table_of(scene_of()), text=text, before=[camera_element()])
     content = path.read_bytes()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -248,7 +248,7 @@ def test_a_false_count_is_refused_and_allocates_nothing(count: bytes, text: bool
 
 
 @pytest.mark.parametrize(("kind", "length"), [("uint", 4_000_000_000), ("int", -1)])
-def test_a_list_of_impossible_length_is_refused(kind: str, length: int, tmp_path: Path) -> None:
+def test_list_of_impossible_length_is_refused(kind: str, length: int, tmp_path: Path) -> None:
     path = tmp_path / "scene.ply"
     save_ply(path, scene_of())
     head, body = path.read_bytes().split(b"element vertex", 1)
@@ -267,7 +267,7 @@ def test_a_list_of_impossible_length_is_refused(kind: str, length: int, tmp_path
     assert "ends within" in refusal(load_ply, path)
 
 
-def test_words_between_the_numbers_are_refused(tmp_path: Path) -> None:
+def test_words_between_numbers_are_refused(tmp_path: Path) -> None:
     path = write(tmp_path / "scene.ply", table_of(scene_of(0)), text=True)
     lines = path.read_bytes().split(b"\n")
     lines[-3] = lines[-3].replace(b" ", b" ?", 1)
@@ -275,7 +275,7 @@ def test_words_between_the_numbers_are_refused(tmp_path: Path) -> None:
     assert "no number, at row" in refusal(load_ply, path)
 
 
-def test_a_number_longer_than_any_costs_no_memory(tmp_path: Path) -> None:
+def test_overlong_number_costs_no_memory(tmp_path: Path) -> None:
     path = write(tmp_path / "scene.ply", table_of(scene_of(0)), text=True)
     lines = path.read_bytes().split(b"\n")
     lines[-3] = lines[-3].replace(b" ", b" " + b"1" * 400_000, 1)
@@ -285,7 +285,7 @@ def test_a_number_longer_than_any_costs_no_memory(tmp_path: Path) -> None:
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
 
 
-def test_millions_of_lists_before_the_vertices_are_refused_and_not_stepped_over(tmp_path: Path) -> None:
+def test_millions_of_lists_before_the_vertices_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "scene.ply"
     save_ply(path, scene_of())
     head, body = path.read_bytes().split(b"element vertex", 1)
@@ -295,7 +295,7 @@ def test_millions_of_lists_before_the_vertices_are_refused_and_not_stepped_over(
     assert "vertices first" in refusal(load_ply, path)
 
 
-def test_a_million_million_rows_of_nothing_cost_nothing(tmp_path: Path) -> None:
+def test_huge_count_of_empty_rows_costs_nothing(tmp_path: Path) -> None:
     path = tmp_path / "scene.ply"
     save_ply(path, scene_of())
     content = path.read_bytes().replace(b"element vertex", b"element a 1000000000000\nelement vertex")
@@ -305,8 +305,8 @@ def test_a_million_million_rows_of_nothing_cost_nothing(tmp_path: Path) -> None:
     assert "truncated" in refusal(load_ply, path)
 
 
-def test_a_header_is_looked_through_once(tmp_path: Path) -> None:
-    """A million bytes of elements or properties: compared with one another, they would take minutes."""
+def test_header_is_parsed_in_linear_time(tmp_path: Path) -> None:
+    """Write a megabyte of elements or properties, whose pairwise comparison would take minutes."""
     path = tmp_path / "scene.ply"
     for what in (b"element a%d 0\n", b"property float a%d\n"):
         lines = b"".join(what % i for i in range(20_000))
@@ -335,7 +335,7 @@ BASE = base_bytes()
     kept=st.one_of(st.just(len(BASE)), st.integers(0, len(BASE))),
 )
 @example(flips=[(BASE.index(b"face 2") + 5, ord("9"))], kept=len(BASE))
-def test_a_damaged_file_loads_to_finite_numbers_or_is_refused(
+def test_damaged_file_is_read_as_finite_values_or_refused(
     flips: list[tuple[int, int]], kept: int, tmp_path: Path
 ) -> None:
     content = bytearray(BASE)

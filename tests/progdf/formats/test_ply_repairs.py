@@ -1,4 +1,4 @@
-"""What a damaged scene is repaired to: the row that is broken, and no other."""
+"""Tests of repairs of a damaged scene: only the broken rows change."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ UNUSABLE = [
 
 
 @pytest.mark.parametrize(("column", "value"), UNUSABLE)
-def test_an_unusable_row_becomes_invisible_and_keeps_its_place(
+def test_unusable_row_becomes_invisible_and_keeps_its_index(
     column: str, value: float, tmp_path: Path
 ) -> None:
     scene, report = damaged(tmp_path, {column: (7, value)})
@@ -53,7 +53,7 @@ def test_infinite_opacities_become_finite_and_look_the_same(tmp_path: Path) -> N
     assert (report.transparent, report.hidden) == (1, 0)
 
 
-def test_a_zero_quaternion_is_no_rotation(tmp_path: Path) -> None:
+def test_zero_quaternion_becomes_the_identity(tmp_path: Path) -> None:
     scene, report = damaged(tmp_path, {f"rot_{i}": (9, 0.0) for i in range(4)})
     assert scene.quats[9].tolist() == [1, 0, 0, 0]
     assert report.zero_quats == 1
@@ -66,7 +66,7 @@ def test_huge_and_tiny_quaternions_are_normalized_without_overflow(tmp_path: Pat
     torch.testing.assert_close(scene.quats[0], torch.tensor([0.6, 0.8, 0.0, 0.0]))
 
 
-def test_a_broken_sh_coefficient_costs_only_itself(tmp_path: Path) -> None:
+def test_broken_sh_coefficient_changes_only_itself(tmp_path: Path) -> None:
     scene, report = damaged(tmp_path, {"f_rest_20": (4, np.nan)})  # green (20 // 15 = 1), coefficient 5
     expected = scene_of()
     assert float(scene.shN[4, 5, 1]) == 0
@@ -75,7 +75,7 @@ def test_a_broken_sh_coefficient_costs_only_itself(tmp_path: Path) -> None:
     assert (report.bad_sh, report.hidden) == (1, 0)
 
 
-def test_an_exactly_flat_gaussian_stays_visible(tmp_path: Path) -> None:
+def test_exactly_flat_gaussian_stays_visible(tmp_path: Path) -> None:
     scene, report = damaged(tmp_path, {"scale_2": (4, -np.inf)})
     assert bool(scene.log_scales.isfinite().all())
     assert float(scene.scales[4, 2]) < 1e-8
@@ -117,7 +117,7 @@ def test_unusable_rows_for_two_reasons_are_both_named(tmp_path: Path) -> None:
     assert "20 of 50 Gaussians have a NaN position, 30 of 50 Gaussians have a NaN opacity" in message
 
 
-def test_the_report_names_what_was_ignored(tmp_path: Path) -> None:
+def test_report_names_ignored_content(tmp_path: Path) -> None:
     columns = with_extra("label", "i4", 99)(table_of(scene_of(4)))
     path = write(tmp_path / "scene.ply", columns, after=[camera_element()])
     path.write_bytes(path.read_bytes() + b"tail")
@@ -131,7 +131,7 @@ def test_the_report_names_what_was_ignored(tmp_path: Path) -> None:
         assert part in text
 
 
-def test_the_real_damaged_file_is_repaired_row_by_row(shared_data: Path) -> None:
+def test_real_damaged_file_is_repaired_row_by_row(shared_data: Path) -> None:
     base = load_ply(shared_data / "weird" / "sh3_inria.ply")
     scene, report = load_ply_with_report(shared_data / "weird" / "nan_inf_zeroquat.ply")
     assert (report.hidden, report.bad_means, report.bad_scales) == (3, 1, 2)

@@ -1,4 +1,4 @@
-"""Fields of .ply files from other trainers: converted, refused by name, or listed."""
+"""Tests of .ply fields of other trainers: converted, refused by name, or listed."""
 
 from __future__ import annotations
 
@@ -51,20 +51,20 @@ def test_rgb_without_f_dc_is_read(dtype: str, largest: float, text: bool, tmp_pa
 
 
 @pytest.mark.parametrize("prefix", ["diffuse_", ""])
-def test_other_names_of_colors_are_read(prefix: str, tmp_path: Path) -> None:
+def test_other_color_names_are_read(prefix: str, tmp_path: Path) -> None:
     names = ("diffuse_red", "diffuse_green", "diffuse_blue") if prefix else ("r", "g", "b")
     columns = columns_without(scene_of(0, COUNT), *F_DC) | rgb_columns("u1", 255, names)
     assert float(sh0_to_rgb(load_ply(write(tmp_path / "a.ply", columns)).sh0).max()) == pytest.approx(1.0)
 
 
-def test_f_dc_wins_over_red_green_blue(tmp_path: Path) -> None:
+def test_f_dc_overrides_red_green_blue(tmp_path: Path) -> None:
     scene = scene_of(1, COUNT)
     found, report = load_ply_with_report(write(tmp_path / "a.ply", table_of(scene) | rgb_columns("u1", 255)))
     assert_same(found, scene)
     assert report.ignored_properties == ("red", "green", "blue")
 
 
-def test_colors_of_an_unknown_range_are_not_guessed(tmp_path: Path) -> None:
+def test_colors_of_an_unknown_range_are_refused(tmp_path: Path) -> None:
     plain = columns_without(scene_of(0, COUNT), *F_DC)
     path = write(tmp_path / "a.ply", plain | rgb_columns("f4", 255.0))
     assert "'red' as floats from 0 to 255" in refusal(load_ply, path)
@@ -78,7 +78,7 @@ def test_colors_of_an_unknown_range_are_not_guessed(tmp_path: Path) -> None:
     assert report.bad_colors == 1
 
 
-def test_a_point_cloud_with_colors_stays_a_point_cloud(tmp_path: Path) -> None:
+def test_colored_point_cloud_stays_a_point_cloud(tmp_path: Path) -> None:
     cloud = {name: values for name, values in table_of(scene_of(0, COUNT)).items() if name in "xyz"}
     path = write(tmp_path / "a.ply", cloud | rgb_columns("u1", 255))
     assert "is a point cloud, not a Gaussian scene" in refusal(load_ply, path)
@@ -167,7 +167,7 @@ def test_filter_3d_of_extreme_gaussians_stays_finite(tmp_path: Path) -> None:
     assert report.hidden == 2, "the rows with an unusable filter"
 
 
-def test_unknown_elements_stay_listed(tmp_path: Path) -> None:
+def test_unknown_elements_are_listed(tmp_path: Path) -> None:
     path = write(tmp_path / "a.ply", table_of(scene_of(0, COUNT)), after=[camera_element()])
     assert load_ply_with_report(path)[1].ignored_elements == (("camera", 1),)
 
@@ -177,7 +177,7 @@ def test_compressed_files_keep_their_own_columns(tmp_path: Path) -> None:
     assert load_scene_with_report(path)[1].conversions == ()
 
 
-def test_rgb_is_what_f_dc_would_say(tmp_path: Path) -> None:
+def test_rgb_equals_the_same_colors_as_f_dc(tmp_path: Path) -> None:
     scene = scene_of(0, COUNT)
     colors = rgb_columns("u1", 255)
     as_bytes = load_ply(write(tmp_path / "a.ply", columns_without(scene, *F_DC) | colors))

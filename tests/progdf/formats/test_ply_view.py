@@ -1,4 +1,4 @@
-"""The up axis and the camera that a .ply stores: SHARP's elements and comments of the header."""
+"""Tests of the up axis and the camera stored in a .ply: SHARP's elements and header comments."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from viewer.files.document import load
 
 
 def with_comments(path: Path, *comments: str) -> Path:
-    """A ball, whose own shape says -y, with comments in its header."""
+    """Write a ball, whose own shape suggests -y, with comments in its header."""
     save_ply(path, ball())
     lines = "".join(f"\ncomment {comment}" for comment in comments).encode()
     path.write_bytes(path.read_bytes().replace(b"\nelement", lines + b"\nelement", 1))
@@ -54,7 +54,7 @@ COMMENTS = {
 
 
 @pytest.mark.parametrize("case", COMMENTS)
-def test_a_comment_decides_which_way_is_up(case: str, tmp_path: Path) -> None:
+def test_comment_decides_the_up_axis(case: str, tmp_path: Path) -> None:
     comments, axis = COMMENTS[case]
     path = with_comments(tmp_path / "a.ply", *comments)
     found = find_up(load_ply(path), path=path)
@@ -63,7 +63,7 @@ def test_a_comment_decides_which_way_is_up(case: str, tmp_path: Path) -> None:
     assert find_up(load_ply(path), choice="+y", path=path).name == "+y", "--up wins"
 
 
-def test_a_slanted_vector_is_kept(tmp_path: Path) -> None:
+def test_slanted_up_vector_is_kept(tmp_path: Path) -> None:
     path = with_comments(tmp_path / "a.ply", "Vertical axis: 0.6 -0.8 0")
     assert find_up(load_ply(path), path=path).direction.tolist() == pytest.approx([0.6, -0.8, 0.0])
 
@@ -79,7 +79,7 @@ def test_a_slanted_vector_is_kept(tmp_path: Path) -> None:
         ("Vertical Axis: z", "Vertical Axis: y"),
     ],
 )
-def test_unknown_axes_are_named_and_not_guessed(comments: tuple[str, ...], tmp_path: Path) -> None:
+def test_unknown_axes_are_listed_and_not_used(comments: tuple[str, ...], tmp_path: Path) -> None:
     path = with_comments(tmp_path / "a.ply", *comments)
     scene, report = load_ply_with_report(path)
     assert "convention" in find_up(scene, path=path).reason
@@ -87,21 +87,21 @@ def test_unknown_axes_are_named_and_not_guessed(comments: tuple[str, ...], tmp_p
     assert f"ignored: comment '{comments[0]}', which is not used as an up axis" in list(describe(path))
 
 
-def test_other_comments_say_nothing(tmp_path: Path) -> None:
+def test_other_comments_are_ignored(tmp_path: Path) -> None:
     path = with_comments(tmp_path / "a.ply", "made with y up", "vertical axis is not known", "Axis: z")
     _, report = load_ply_with_report(path)
     assert stored_view(path).up is None
     assert report.ignored_comments == ()
 
 
-def test_info_and_the_window_agree_on_the_comment(tmp_path: Path) -> None:
+def test_info_and_window_agree_on_the_comment(tmp_path: Path) -> None:
     path = with_comments(tmp_path / "a.ply", "Vertical Axis: z")
     assert "up: +z, from the comment 'Vertical Axis: z' in the file" in list(describe(path))
     assert load(path).detected_up.direction == (0.0, 0.0, 1.0)
 
 
 def sharp(path: Path, text: bool = False, **changes: object) -> Path:
-    """A wall of 12 × 9 Gaussians three units before the camera, as SHARP writes it."""
+    """Write a wall of 12 × 9 Gaussians three units before the camera, as SHARP does."""
     scene = scene_of(0, 108)
     x, y = np.meshgrid(np.linspace(-1.0, 1.0, 12), np.linspace(-0.75, 0.75, 9))
     places = {"x": x.ravel(), "y": y.ravel(), "z": np.full(108, 3.0)}
@@ -110,7 +110,7 @@ def sharp(path: Path, text: bool = False, **changes: object) -> Path:
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_the_stored_camera_gives_the_first_view(text: bool, tmp_path: Path) -> None:
+def test_stored_camera_gives_the_first_view(text: bool, tmp_path: Path) -> None:
     path = sharp(tmp_path / "a.ply", text)
     scene, report = load_ply_with_report(path)
     assert report.ignored_elements == (("frame", 2), ("disparity", 2), ("version", 3))
@@ -126,7 +126,7 @@ def test_the_stored_camera_gives_the_first_view(text: bool, tmp_path: Path) -> N
     assert "camera: 640x480 pixels, stored in the file; it is the first view" in list(describe(path))
 
 
-def test_render_and_the_window_begin_at_the_stored_camera(tmp_path: Path) -> None:
+def test_render_and_window_start_at_the_stored_camera(tmp_path: Path) -> None:
     path = sharp(tmp_path / "a.ply")
     assert main(["render", str(path), "--size", "64x48", "-o", str(tmp_path / "a.png")]) == 0
     rendered = read_camera(str(tmp_path / "a.png"))
@@ -138,13 +138,13 @@ def test_render_and_the_window_begin_at_the_stored_camera(tmp_path: Path) -> Non
     assert eye(home) == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
 
 
-def test_a_tall_window_shows_the_whole_stored_picture(tmp_path: Path) -> None:
+def test_tall_window_shows_the_whole_stored_picture(tmp_path: Path) -> None:
     path = sharp(tmp_path / "a.ply")
     view = first_camera(load_ply(path), aspect=0.5, up=(0.0, -1.0, 0.0), stored=stored_view(path).camera)
     assert math.tan(math.radians(view.fov_y / 2)) * 0.5 == pytest.approx(320 / 512)
 
 
-def test_a_stored_camera_is_relative_to_the_origin(tmp_path: Path) -> None:
+def test_stored_camera_is_relative_to_the_origin(tmp_path: Path) -> None:
     extrinsic = np.eye(4)
     extrinsic[:3, 3] = -1e6, 0.0, 0.0
     path = sharp(tmp_path / "a.ply", extrinsic=extrinsic.ravel())
@@ -201,7 +201,7 @@ def test_several_frames_in_one_file_are_refused_by_name(tmp_path: Path) -> None:
     assert "'frame' (3 frames of 36" in refusal(load_ply, sharp(tmp_path / "a.ply", frame=np.array([3, 36])))
 
 
-def test_an_element_of_lists_is_no_camera(tmp_path: Path) -> None:
+def test_element_of_lists_is_not_a_camera(tmp_path: Path) -> None:
     numbers = np.empty(16, [("extrinsic", object)])
     numbers["extrinsic"] = [np.zeros(2, np.float32)] * 16
     lists = PlyElement.describe(

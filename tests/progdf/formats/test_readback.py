@@ -1,4 +1,4 @@
-"""Exports are read back: every position within the format's rounding, and the rest named if it differs."""
+"""Tests of reading exports back: positions within the format's rounding, other differences named."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _needs_gaussforge() -> None:
 
 
 def scene_of(degree: int = 0) -> Gaussians:
-    """A scene that every format holds."""
+    """Return a scene that every format can store."""
     scene = random_gaussians(60, seed=3, sh_degree=degree, scale=0.05)
     colors = scene.sh0.clamp(-1.0, 1.0)
     return replace(
@@ -37,7 +37,7 @@ def scene_of(degree: int = 0) -> Gaussians:
 
 
 def with_mean(scene: Gaussians, row: int, mean: tuple[float, float, float]) -> Gaussians:
-    """The scene with one Gaussian elsewhere."""
+    """Return the scene with one Gaussian moved to `mean`."""
     means = scene.means.clone()
     means[row] = torch.tensor(mean)
     return replace(scene, means=means)
@@ -46,7 +46,7 @@ def with_mean(scene: Gaussians, row: int, mean: tuple[float, float, float]) -> G
 @pytest.mark.parametrize(
     ("farthest", "bits"), [(3.0, 12), (2047.9, 12), (2048.0, 11), (5000.0, 10), (1e6, 3), (8e6, 0)]
 )
-def test_spz_uses_fewer_fractional_bits_far_out(farthest: float, bits: int, tmp_path: Path) -> None:
+def test_spz_uses_fewer_fractional_bits_for_far_positions(farthest: float, bits: int, tmp_path: Path) -> None:
     scene = with_mean(scene_of(), 17, (0.25, -farthest, 1.5))
     path = tmp_path / "a.spz"
     found = save_scene(path, scene)
@@ -75,7 +75,7 @@ def test_far_positions_come_back_in_every_format(ending: str, farthest: float, t
 
 
 @pytest.mark.parametrize("ending", LOSSY)
-def test_scene_with_an_origin_is_written_in_the_world(ending: str, tmp_path: Path) -> None:
+def test_scene_with_an_origin_is_written_in_world_coordinates(ending: str, tmp_path: Path) -> None:
     scene = replace(scene_of(), origin=(4e6, -3e6, 2e6))
     found = save_scene(tmp_path / f"a{ending}", scene)
     assert found is not None
@@ -90,7 +90,7 @@ def test_scene_in_range_comes_back_without_a_note(ending: str, tmp_path: Path) -
 
 
 def changed(**values: Tensor) -> Gaussians:
-    """The scene with the first two Gaussians changed."""
+    """Return the scene with the first two Gaussians changed."""
     scene = scene_of(1)
     tensors = {name: getattr(scene, name).clone() for name in values}
     for name, value in values.items():
@@ -119,7 +119,7 @@ def test_values_beyond_a_format_are_named(ending: str, scene: Gaussians, note: s
 
 @pytest.mark.parametrize("ending", LOSSY)
 @pytest.mark.parametrize("name", ["means", "log_scales", "quats", "sh0", "logit_opacities"])
-def test_not_a_number_is_refused_with_its_row(ending: str, name: str, tmp_path: Path) -> None:
+def test_nan_is_refused_with_its_row(ending: str, name: str, tmp_path: Path) -> None:
     scene = scene_of()
     values = getattr(scene, name).clone()
     values[7] = torch.nan
@@ -129,7 +129,7 @@ def test_not_a_number_is_refused_with_its_row(ending: str, name: str, tmp_path: 
 
 
 @pytest.mark.parametrize("keeps_rows", [True, False])
-def test_one_wrong_row_is_named(keeps_rows: bool) -> None:
+def test_single_wrong_row_is_named(keeps_rows: bool) -> None:
     scene = scene_of()
     wrong = with_mean(scene, 23, (904.0, 0.0, 0.0))
     bounds = torch.full((60, 3), 1e-3, dtype=torch.float64)
@@ -139,7 +139,7 @@ def test_one_wrong_row_is_named(keeps_rows: bool) -> None:
         compare("a.spz", scene, wrong[:59], bounds, keeps_rows)
 
 
-def test_order_of_rows_does_not_matter_for_sog(tmp_path: Path) -> None:
+def test_row_order_does_not_matter_for_sog(tmp_path: Path) -> None:
     scene = scene_of()
     found = compare("a.sog", scene, scene[torch.randperm(60)], torch.zeros(60, 3), keeps_rows=False)
     assert found.position_error == 0.0
@@ -163,7 +163,7 @@ def test_frames_warn_once_about_lost_values(tmp_path: Path, caplog: pytest.LogCa
     assert caplog.text.count("color of 2 Gaussians") == 1
 
 
-def test_export_says_how_far_positions_moved(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_reports_the_position_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     save_ply(tmp_path / "a.ply", with_mean(changed(sh0=torch.tensor(5.0)), 9, (5000.0, 0.0, 0.0)))
     assert main(["export", str(tmp_path / "a.ply"), "-o", str(tmp_path / "a.spz")]) == 0
     line = capsys.readouterr().out

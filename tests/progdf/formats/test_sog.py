@@ -24,12 +24,12 @@ from tests.helpers.scenes import random_gaussians
 
 
 def scene_of(degree: int = 0) -> Gaussians:
-    """A scene of two image rows and a part of a third."""
+    """Return a scene of two image rows and a part of a third."""
     return random_gaussians(40, seed=4, sh_degree=degree)
 
 
 def change_table(folder: Path, changes: dict[str, Any]) -> Path:
-    """Set values of a folder's meta.json by dotted names."""
+    """Set values of a folder's meta.json by dotted names. Return the folder."""
     meta = folder / "meta.json"
     table = json.loads(meta.read_text())
     for name, value in changes.items():
@@ -43,13 +43,13 @@ def change_table(folder: Path, changes: dict[str, Any]) -> Path:
 
 
 def unpacked_sog2(folder: Path, degree: int = 1) -> Path:
-    """A folder of version 2."""
+    """Write a folder of version 2."""
     with zipfile.ZipFile(write_scene(folder.with_suffix(".sog"), scene_of(degree))) as archive:
         archive.extractall(folder)
     return folder
 
 
-def test_an_unpacked_sog_opens_by_its_folder_and_by_its_table(tmp_path: Path) -> None:
+def test_unpacked_sog_opens_by_its_folder_and_by_meta_json(tmp_path: Path) -> None:
     bundle = write_scene(tmp_path / "scene.sog", scene_of(1))
     folder = tmp_path / "robot"
     with zipfile.ZipFile(bundle) as archive:
@@ -63,7 +63,7 @@ def test_an_unpacked_sog_opens_by_its_folder_and_by_its_table(tmp_path: Path) ->
     assert main(["info", str(folder)]) == 0
 
 
-def test_a_sog_that_names_files_elsewhere_is_refused(tmp_path: Path) -> None:
+def test_sog_that_names_files_elsewhere_is_refused(tmp_path: Path) -> None:
     with zipfile.ZipFile(write_scene(tmp_path / "scene.sog", scene_of())) as archive:
         archive.extractall(tmp_path / "robot")
     meta = tmp_path / "robot" / "meta.json"
@@ -74,7 +74,7 @@ def test_a_sog_that_names_files_elsewhere_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["link", "pipe", "folder", "missing"])
-def test_an_image_of_a_sog_that_is_no_regular_file_is_refused_at_once(kind: str, tmp_path: Path) -> None:
+def test_sog_image_that_is_no_regular_file_is_refused_at_once(kind: str, tmp_path: Path) -> None:
     with zipfile.ZipFile(write_scene(tmp_path / "scene.sog", scene_of())) as archive:
         archive.extractall(tmp_path / "robot")
     image = tmp_path / "robot" / "quats.webp"
@@ -89,8 +89,8 @@ def test_an_image_of_a_sog_that_is_no_regular_file_is_refused_at_once(kind: str,
 
 
 @pytest.mark.parametrize("packed", [zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA, None])
-def test_the_table_of_a_sog_is_bounded_before_it_is_parsed(packed: int | None, tmp_path: Path) -> None:
-    """15 kB that unpack to 16 MB, also where the archive says that they are 2."""
+def test_sog_table_size_is_bounded_before_parsing(packed: int | None, tmp_path: Path) -> None:
+    """Write 15 kB that unpack to 16 MB, also in an archive that declares 2 bytes."""
     content = b'{"means": {}, "quats": [' + b"0," * 7_999_900 + b"0]}"
     path = tmp_path / ("meta.json" if packed is None else "a.sog")
     if packed is None:
@@ -106,7 +106,7 @@ def test_the_table_of_a_sog_is_bounded_before_it_is_parsed(packed: int | None, t
     assert most < 8 << 20
 
 
-def test_a_table_of_a_sog_that_is_too_large_is_told(tmp_path: Path) -> None:
+def test_oversized_sog_table_is_named(tmp_path: Path) -> None:
     (tmp_path / "meta.json").write_text('{"means": {}, "quats": "' + "a" * (1 << 20) + '"}')
     assert "a meta.json of more than 1 MB" in refusal(load_scene, tmp_path / "meta.json")
 
@@ -140,7 +140,7 @@ def test_sog1_positions_are_within_half_a_step(tmp_path: Path) -> None:
         ({"scales.mins": "0"}, "is damaged: in meta.json, scales.mins is '0'"),
     ],
 )
-def test_sog1_table_that_is_not_read_is_named(changes: dict[str, Any], said: str, tmp_path: Path) -> None:
+def test_unsupported_sog1_table_is_named(changes: dict[str, Any], said: str, tmp_path: Path) -> None:
     folder = change_table(write_sog1(tmp_path / "robot", scene_of(1)), changes)
     assert said in refusal(load_scene, folder)
 
@@ -197,7 +197,7 @@ def test_zipped_sog_folder_opens_under_any_name(prefix: str, tmp_path: Path) -> 
     assert torch.equal(load_scene(path).means, load_scene(folder).means)
 
 
-def test_png_images_serve_as_well(tmp_path: Path) -> None:
+def test_png_images_are_accepted(tmp_path: Path) -> None:
     folder = write_sog1(tmp_path / "robot", scene_of())
     expected = load_scene(folder)
     stream = io.BytesIO()
