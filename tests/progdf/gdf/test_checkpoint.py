@@ -1,4 +1,4 @@
-"""A .gdf file comes back as it was saved, or is refused with one line."""
+"""Tests of .gdf files: they load as saved, or are refused in one line."""
 
 from __future__ import annotations
 
@@ -77,13 +77,13 @@ def same(a: Gdf, b: Gdf) -> bool:
     )
 
 
-def test_an_edit_comes_back_as_it_was_saved(shirt: Gdf, saved: Path, scene: Gaussians) -> None:
+def test_edit_loads_as_saved(shirt: Gdf, saved: Path, scene: Gaussians) -> None:
     assert same(load_gdf(saved, scene), shirt)
 
 
 @pytest.mark.parametrize("end_type", END_TYPES)
 @pytest.mark.parametrize("basis_type", BASIS_TYPES)
-def test_every_storage_type_survives(
+def test_every_storage_type_loads_as_saved(
     scene: Gaussians, tmp_path: Path, basis_type: torch.dtype, end_type: torch.dtype
 ) -> None:
     field = curved_field(9, basis_type=basis_type, end_type=end_type)
@@ -93,20 +93,22 @@ def test_every_storage_type_survives(
 
 
 @pytest.mark.parametrize("count", [0, 1, 7, 299, 300])
-def test_regions_of_any_size_survive(scene: Gaussians, tmp_path: Path, count: int) -> None:
+def test_regions_of_any_size_load_as_saved(scene: Gaussians, tmp_path: Path, count: int) -> None:
     edit = edit_of(scene, some_rows(scene, count), curved_field(count))
     save_gdf(tmp_path / "a.gdf", edit)
     assert same(load_gdf(tmp_path / "a.gdf"), edit)
 
 
 @pytest.mark.parametrize("members", [torch.arange(20, 200), torch.arange(0, 300, 2), torch.tensor([3, 250])])
-def test_runs_patterns_and_lone_rows_survive(scene: Gaussians, tmp_path: Path, members: torch.Tensor) -> None:
+def test_runs_patterns_and_single_rows_load_as_saved(
+    scene: Gaussians, tmp_path: Path, members: torch.Tensor
+) -> None:
     edit = edit_of(scene, members, curved_field(len(members)))
     save_gdf(tmp_path / "a.gdf", edit)
     assert torch.equal(load_gdf(tmp_path / "a.gdf").region.members, members)
 
 
-def test_a_soft_score_is_kept_to_half_a_level(scene: Gaussians, tmp_path: Path) -> None:
+def test_soft_score_is_kept_to_half_a_level(scene: Gaussians, tmp_path: Path) -> None:
     score = torch.rand(300, generator=torch.Generator().manual_seed(0))
     members = (score >= 0.7).nonzero()[:, 0]
     edit = Gdf("soft", Region("soft", members, score), curved_field(len(members)), fingerprint(scene))
@@ -114,7 +116,7 @@ def test_a_soft_score_is_kept_to_half_a_level(scene: Gaussians, tmp_path: Path) 
     assert float((load_gdf(tmp_path / "a.gdf").region.score - score).abs().max()) <= 0.5 / 255 + 1e-6
 
 
-def test_the_file_is_hardly_larger_than_its_members(tmp_path: Path) -> None:
+def test_file_is_hardly_larger_than_its_members(tmp_path: Path) -> None:
     scene = random_gaussians(30_000, seed=2)
     field = curved_field(3_000)
     save_gdf(tmp_path / "a.gdf", edit_of(scene, some_rows(scene, 3_000), field))
@@ -122,14 +124,14 @@ def test_the_file_is_hardly_larger_than_its_members(tmp_path: Path) -> None:
     assert (tmp_path / "a.gdf").stat().st_size <= 3_000 * field.bytes_per_member + members_as_bits + 4_096
 
 
-def test_numbers_that_json_does_not_know_become_null(shirt: Gdf, tmp_path: Path) -> None:
+def test_values_unknown_to_json_become_null(shirt: Gdf, tmp_path: Path) -> None:
     save_gdf(
         tmp_path / "a.gdf", replace(shirt, report={"clip": float("nan"), "sizes": (1, 2), "at": Path("x")})
     )
     assert load_gdf(tmp_path / "a.gdf").report == {"clip": None, "sizes": [1, 2], "at": "x"}
 
 
-def test_a_field_with_numbers_that_are_not_finite_is_not_saved(shirt: Gdf, tmp_path: Path) -> None:
+def test_field_with_values_that_are_not_finite_is_not_saved(shirt: Gdf, tmp_path: Path) -> None:
     bases = shirt.field.attributes["means"]
     broken = replace(bases, end_offset=bases.end_offset.index_fill(0, torch.tensor([0]), float("inf")))
     field = replace(shirt.field, attributes={**shirt.field.attributes, "means": broken})
@@ -138,7 +140,7 @@ def test_a_field_with_numbers_that_are_not_finite_is_not_saved(shirt: Gdf, tmp_p
     assert not list(tmp_path.iterdir())
 
 
-def test_a_place_that_does_not_exist_is_named(shirt: Gdf, tmp_path: Path) -> None:
+def test_missing_folder_is_named(shirt: Gdf, tmp_path: Path) -> None:
     with pytest.raises(ProgdfError, match=r"does not exist; create it first"):
         save_gdf(tmp_path / "nowhere" / "a.gdf", shirt)
 
@@ -146,7 +148,7 @@ def test_a_place_that_does_not_exist_is_named(shirt: Gdf, tmp_path: Path) -> Non
 # ---- other scenes
 
 
-def test_a_scene_of_another_size_is_named_with_both_sizes(shirt: Gdf) -> None:
+def test_scene_of_another_size_is_named_with_both_sizes(shirt: Gdf) -> None:
     far_larger = replace(shirt, region=Region("r", torch.zeros(0, dtype=torch.int64), torch.zeros(41_203)),
                          field=curved_field(0, moving=()), scene=SceneFingerprint(41_203, ""))  # fmt: skip
     expected = "shirt.gdf was made for another scene: it has 41 203 Gaussians, room.ply has 52 870"
@@ -156,14 +158,14 @@ def test_a_scene_of_another_size_is_named_with_both_sizes(shirt: Gdf) -> None:
     assert "progdf rebind shirt.gdf --from SCENE --to room.ply" in str(refused.value)
 
 
-def test_a_scene_with_one_center_moved_is_another_scene(saved: Path, scene: Gaussians) -> None:
+def test_scene_with_one_moved_center_is_another_scene(saved: Path, scene: Gaussians) -> None:
     means = scene.means.clone()
     means[17, 1] += 1e-6
     with pytest.raises(ProgdfError, match=r"shirt\.gdf was made for another scene: .* at other positions"):
         load_gdf(saved, replace(scene, means=means))
 
 
-def test_a_scene_of_another_sh_degree_is_refused(saved: Path, scene: Gaussians) -> None:
+def test_scene_of_another_sh_degree_is_refused(saved: Path, scene: Gaussians) -> None:
     with pytest.raises(ProgdfError, match="SH degree 0"):
         load_gdf(saved, replace(scene, shN=scene.shN[:, :0]))
 
@@ -172,7 +174,7 @@ def test_colors_may_differ(saved: Path, scene: Gaussians) -> None:
     load_gdf(saved, replace(scene, sh0=scene.sh0 + 1))
 
 
-# ---- files that are not what was saved
+# ---- files that differ from the saved ones
 
 
 def refusal(path: Path) -> str:
@@ -196,33 +198,33 @@ def test_files_of_another_kind_are_refused(tmp_path: Path, content: bytes) -> No
     assert "shirt.gdf is not a .gdf file" in refusal(written(tmp_path, content))
 
 
-def test_safetensors_of_something_else_are_refused(tmp_path: Path) -> None:
+def test_other_safetensors_files_are_refused(tmp_path: Path) -> None:
     content = safetensors.torch.save({"weight": torch.ones(3)}, {"format": "pt"})
     assert "is a safetensors file, but not a .gdf" in refusal(written(tmp_path, content))
 
 
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
+def test_missing_file_is_named(tmp_path: Path) -> None:
     assert "shirt.gdf does not exist" in refusal(tmp_path / "shirt.gdf")
 
 
-def test_a_folder_is_no_edit(tmp_path: Path) -> None:
+def test_folder_is_refused(tmp_path: Path) -> None:
     assert "is a folder" in refusal(tmp_path)
 
 
 @pytest.mark.parametrize("kept", [0.02, 0.3, 0.999])
-def test_a_file_cut_short_says_so(saved: Path, tmp_path: Path, kept: float) -> None:
+def test_truncated_file_is_refused(saved: Path, tmp_path: Path, kept: float) -> None:
     content = saved.read_bytes()
     assert "truncated" in refusal(written(tmp_path, content[: int(kept * len(content))]))
 
 
-def test_one_flipped_bit_of_a_number_is_noticed(saved: Path, tmp_path: Path) -> None:
+def test_single_flipped_bit_is_noticed(saved: Path, tmp_path: Path) -> None:
     content = bytearray(saved.read_bytes())
     content[-100] ^= 1
     assert "is damaged" in refusal(written(tmp_path, bytes(content)))
 
 
 def rewritten(saved: Path, tmp_path: Path, **changes: object) -> Path:
-    """The file with other values in its header, its checksum made to fit: a wrong writer's."""
+    """Write the file with other header values and a matching checksum, as a wrong writer would."""
     content = saved.read_bytes()
     header = header_of(content)
     tensors = safetensors.torch.load(content)
@@ -236,7 +238,7 @@ def rewritten(saved: Path, tmp_path: Path, **changes: object) -> Path:
     return written(tmp_path, signed_gdf(header, tensors))
 
 
-def test_a_file_of_a_newer_version_asks_for_an_update(saved: Path, tmp_path: Path) -> None:
+def test_file_of_a_newer_version_suggests_an_update(saved: Path, tmp_path: Path) -> None:
     line = refusal(rewritten(saved, tmp_path, format=FORMAT + 6))
     assert line == f"shirt.gdf has format {FORMAT + 6}, this progdf reads format {FORMAT}; update progdf"
 
@@ -271,15 +273,13 @@ def test_a_file_of_a_newer_version_asks_for_an_update(saved: Path, tmp_path: Pat
         {"log_scales__end_offset": torch.full((40, 3), 200.0)},
     ],
 )
-def test_a_file_that_contradicts_itself_is_refused(
-    saved: Path, tmp_path: Path, changes: dict[str, object]
-) -> None:
+def test_inconsistent_file_is_refused(saved: Path, tmp_path: Path, changes: dict[str, object]) -> None:
     assert "is inconsistent" in refusal(rewritten(saved, tmp_path, **changes))
 
 
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_flipped_or_missing_bytes_give_the_same_edit_or_one_line(
+def test_flipped_or_missing_bytes_give_the_same_edit_or_an_error(
     saved: Path, shirt: Gdf, tmp_path: Path, data: st.DataObject
 ) -> None:
     content = bytearray(saved.read_bytes())
@@ -297,22 +297,22 @@ def test_flipped_or_missing_bytes_give_the_same_edit_or_one_line(
     assert "\n" not in refused if refused else same(found, shirt)
 
 
-# ---- headers that somebody changed
+# ---- changed headers
 
 
-def test_a_header_with_another_number_of_members_is_refused(saved: Path, tmp_path: Path) -> None:
+def test_header_with_another_number_of_members_is_refused(saved: Path, tmp_path: Path) -> None:
     assert "has 41 members" in refusal(rewritten(saved, tmp_path, members=41))
 
 
 def places(value: object, at: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
-    """Where in a JSON value there are values."""
+    """Yield the paths of all values inside a JSON value."""
     yield at
     if isinstance(value, dict | list):
         for key, entry in value.items() if isinstance(value, dict) else enumerate(value):
             yield from places(entry, (*at, key))
 
 
-def test_info_of_any_header_is_told_or_refused_in_one_line(
+def test_info_shows_or_refuses_any_header_in_one_line(
     saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     content = saved.read_bytes()
@@ -337,7 +337,7 @@ def test_info_of_any_header_is_told_or_refused_in_one_line(
     assert all(line.isprintable() for line in capsys.readouterr().out.splitlines())
 
 
-def test_a_small_file_of_a_huge_scene_costs_little(saved: Path, tmp_path: Path) -> None:
+def test_small_file_of_a_huge_scene_costs_little_memory(saved: Path, tmp_path: Path) -> None:
     content = safetensors.torch.load(saved.read_bytes())
     there: dict[str, object] = {name: None for name in content if name.startswith("members.")}
     there["members.runs"] = torch.tensor([[0, 1 << 25]], dtype=torch.int32)

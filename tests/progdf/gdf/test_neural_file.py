@@ -1,4 +1,4 @@
-"""A network in a .gdf file: small, the same bytes every time, for its scene alone, or refused in one line."""
+"""Tests of a network in a .gdf file: small, deterministic, bound to its scene, or refused in one line."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def saved(edit: Gdf, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_a_network_comes_back_and_is_written_to_the_same_bytes(tmp_path: Path, form: str) -> None:
+def test_network_loads_as_saved_and_rewrites_the_same_bytes(tmp_path: Path, form: str) -> None:
     save_gdf(tmp_path / "a.gdf", edit_of(scene(), members(), baked(form)))
     found = load_gdf(tmp_path / "a.gdf", scene())
     for s in (0.0, 0.37, 1.0):
@@ -44,7 +44,7 @@ def test_a_network_comes_back_and_is_written_to_the_same_bytes(tmp_path: Path, f
     assert (tmp_path / "a.gdf").read_bytes() == (tmp_path / "b.gdf").read_bytes()
 
 
-def test_a_baked_network_is_composed_as_any_field(saved: Path) -> None:
+def test_baked_network_composes_like_any_field(saved: Path) -> None:
     gdf = load_gdf(saved, scene())
     assert gdf.field.kind == "neural"
     start = compose_layers(scene(), [Layer(gdf, 0.0)])
@@ -53,7 +53,7 @@ def test_a_baked_network_is_composed_as_any_field(saved: Path) -> None:
     assert torch.equal(pack(end[members()]), rows() + gdf.field.offsets(1.0))
 
 
-def test_the_file_holds_the_network_and_not_what_is_baked_of_it(saved: Path, edit: Gdf) -> None:
+def test_file_holds_the_network_without_the_baked_field(saved: Path, edit: Gdf) -> None:
     assert saved.stat().st_size <= MEMBERS * edit.field.bytes_per_member + 300 / 8 + 4_096
     content = saved.read_bytes()
     names = set(safetensors.torch.load(content))
@@ -61,25 +61,25 @@ def test_the_file_holds_the_network_and_not_what_is_baked_of_it(saved: Path, edi
     assert not any(name.endswith(".residual_basis") for name in names)
 
 
-def test_a_network_needs_its_scene(saved: Path) -> None:
+def test_network_needs_its_scene(saved: Path) -> None:
     with pytest.raises(ProgdfError, match=r"shirt\.gdf keeps a neural field, .*; load it with the scene"):
         load_gdf(saved)
     assert read_gdf(saved).field.origin is not None
 
 
-def test_another_scene_is_refused_before_anything_is_baked(saved: Path) -> None:
+def test_another_scene_is_refused_before_baking(saved: Path) -> None:
     means = scene().means.clone()
     means[3] += 1.0
     with pytest.raises(ProgdfError, match="made for another scene"):
         load_gdf(saved, replace(scene(), means=means))
 
 
-def test_a_network_that_looks_at_colors_refuses_a_scene_of_other_colors(saved: Path) -> None:
+def test_network_with_color_inputs_refuses_other_colors(saved: Path) -> None:
     with pytest.raises(ProgdfError, match=r"another scene: room\.ply .* look different"):
         load_gdf(saved, replace(scene(), sh0=scene().sh0 + 1), "room.ply")
 
 
-def test_a_network_that_sees_places_alone_does_not_mind_other_colors(tmp_path: Path) -> None:
+def test_network_with_position_inputs_accepts_other_colors(tmp_path: Path) -> None:
     save_gdf(tmp_path / "a.gdf", edit_of(scene(), members(), baked("position")))
     load_gdf(tmp_path / "a.gdf", replace(scene(), sh0=scene().sh0 + 1))
 
@@ -87,7 +87,7 @@ def test_a_network_that_sees_places_alone_does_not_mind_other_colors(tmp_path: P
 def rewritten(
     saved: Path, tmp_path: Path, network: dict[str, object], tensors: dict[str, Tensor | None]
 ) -> Path:
-    """The file with other values, its checksum made to fit: a wrong writer's."""
+    """Write the file with other values and a matching checksum, as a wrong writer would."""
     header = header_of(saved.read_bytes())
     header["field"]["network"] |= network
     kept = safetensors.torch.load(saved.read_bytes())
@@ -137,7 +137,7 @@ LAYOUT = {
         ({}, {"end_correction.means": torch.zeros(7)}),
     ],
 )
-def test_a_network_that_contradicts_itself_is_refused(
+def test_inconsistent_network_is_refused(
     saved: Path, tmp_path: Path, network: dict[str, object], tensors: dict[str, Tensor | None]
 ) -> None:
     with pytest.raises(ProgdfError, match="is inconsistent") as refused:
@@ -147,7 +147,9 @@ def test_a_network_that_contradicts_itself_is_refused(
 
 @settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_flipped_or_missing_bytes_are_one_line(saved: Path, tmp_path: Path, data: st.DataObject) -> None:
+def test_flipped_or_missing_bytes_are_reported_in_one_line(
+    saved: Path, tmp_path: Path, data: st.DataObject
+) -> None:
     content = bytearray(saved.read_bytes())
     reach = 8 + int.from_bytes(content[:8], "little") if data.draw(st.booleans()) else len(content)
     place = data.draw(st.integers(0, reach - 1))

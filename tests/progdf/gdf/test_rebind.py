@@ -1,4 +1,4 @@
-"""`progdf rebind`: an edit on the same scene in another file, in another order, with other numbers."""
+"""Tests of `progdf rebind`: an edit on the same scene in another file, order or precision."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def stack() -> Stack:
 
 
 def shuffled(scene: Gaussians, seed: int = 3) -> tuple[Gaussians, torch.Tensor]:
-    """Its rows in another order, every other quaternion negated, which is the same rotation."""
+    """Return the scene with shuffled rows and every other quaternion negated, which is the same rotation."""
     order = torch.randperm(len(scene), generator=torch.Generator().manual_seed(seed))
     other = scene[order]
     signs = torch.where(torch.arange(len(scene)) % 2 == 0, 1.0, -1.0)
@@ -40,7 +40,7 @@ def psnr(a: Gaussians, b: Gaussians, stack: Stack) -> float:
     return -10 * float((render(a, camera).image - render(b, camera).image).square().mean().log10())
 
 
-def test_shuffled_rows_get_their_own_offsets_back(stack: Stack) -> None:
+def test_shuffled_rows_keep_their_own_offsets(stack: Stack) -> None:
     other, order = shuffled(stack.scene)
     match = match_scenes(stack.scene, other)
     assert np.array_equal(match.rows, order.numpy())
@@ -52,7 +52,7 @@ def test_shuffled_rows_get_their_own_offsets_back(stack: Stack) -> None:
             assert torch.equal(getattr(found, name), getattr(expected, name)), name
 
 
-def test_a_negated_quaternion_turns_the_same_way(stack: Stack) -> None:
+def test_negated_quaternion_rotates_the_same_way(stack: Stack) -> None:
     gdf = stack.gdfs[0]
     scene = stack.scene
     bases = gdf.field.attributes["sh0"]
@@ -73,8 +73,8 @@ def test_a_negated_quaternion_turns_the_same_way(stack: Stack) -> None:
     torch.testing.assert_close(same, torch.ones(len(scene)))
 
 
-def test_no_gaussian_serves_two_while_another_is_free(stack: Stack) -> None:
-    """Two at one place, told apart by their colors alone."""
+def test_each_gaussian_is_matched_once_while_others_are_free(stack: Stack) -> None:
+    """Match pairs at one position, which differ only in color."""
     twice = stack.scene[torch.arange(400).repeat_interleave(2)]
     sh0 = twice.sh0.clone()
     sh0[1::2] = -sh0[1::2]
@@ -86,7 +86,7 @@ def test_no_gaussian_serves_two_while_another_is_free(stack: Stack) -> None:
 
 
 @pytest.mark.parametrize("file", ["b.sog", "b.spz", "b.ply"])
-def test_an_edit_is_carried_to_another_format(
+def test_edit_is_carried_to_another_format(
     stack: Stack, tmp_path: Path, file: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     a, edit, *_ = stack.save(tmp_path)
@@ -100,7 +100,7 @@ def test_an_edit_is_carried_to_another_format(
     scene = load_scene(b)
     gdf = load_gdf(new, scene)
     assert gdf.report["rebound"]["matched"] > 0.99
-    # the edit loses no more than the format itself has lost
+    # the edit loses no more than the format itself
     before = psnr(scene, stack.scene, stack)
     after = psnr(
         compose_layers(scene, [Layer(gdf, 1.0)]),
@@ -110,7 +110,7 @@ def test_an_edit_is_carried_to_another_format(
     assert after > before - 1.0
 
 
-def test_another_scene_is_refused_and_a_turned_one_is_named(
+def test_other_scene_is_refused_and_a_half_turn_is_named(
     stack: Stack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     a, edit, *_ = stack.save(tmp_path)
@@ -123,7 +123,7 @@ def test_another_scene_is_refused_and_a_turned_one_is_named(
     assert not (tmp_path / "new.gdf").exists()
 
 
-def test_a_rebound_edit_takes_the_place_of_none_of_its_inputs(
+def test_rebind_never_overwrites_its_inputs(
     stack: Stack, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     a, edit, *_ = stack.save(tmp_path)
