@@ -1,4 +1,4 @@
-"""Bundles as people, mailers and other programs change them."""
+"""Tests of bundles changed by people, mail programs and other tools."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def write_zip(
 
 
 def with_central_field(path: Path, offset: int, value: int) -> Path:
-    """Set a 16-bit field of the first entry of the archive's table."""
+    """Set a 16-bit field of the first entry in the archive's central directory."""
     content = bytearray(path.read_bytes())
     entry = content.index(b"PK\x01\x02")
     content[entry + offset : entry + offset + 2] = struct.pack("<H", value)
@@ -53,10 +53,10 @@ def assert_refused(path: Path, *words: str) -> None:
     "name",
     ["a.autosave.session.json", "a.discarded.session.json", "0.session.json", "A.session.json", "z.json"],
 )
-def test_second_opening_opens_the_bundle_s_own_session(bundle: Path, name: str) -> None:
+def test_second_opening_opens_the_original_session(bundle: Path, name: str) -> None:
     first = unpack_bundle(bundle)
     (first.parent / name).write_bytes(SESSION + b"other work")
-    os.rename(first, first.with_suffix(".moved"))  # so that the order of the folder changes
+    os.rename(first, first.with_suffix(".moved"))  # changes the order of the folder
     os.rename(first.with_suffix(".moved"), first)
     assert unpack_bundle(bundle) == first
     assert first.name == "a.session.json"
@@ -106,14 +106,14 @@ def test_several_sessions_are_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"\xff\xfe", b"", b"a" * 10**6])
-def test_unreadable_mark_is_somebody_else_s_folder(bundle: Path, content: bytes) -> None:
+def test_folder_with_an_unreadable_mark_is_not_touched(bundle: Path, content: bytes) -> None:
     folder = unpack_bundle(bundle).parent
     (folder / ".bundle.sha256").write_bytes(content)
     with pytest.raises(ProgdfError, match="was not unpacked from"):
         unpack_bundle(bundle)
 
 
-def test_file_in_the_folder_s_place_is_kept(bundle: Path) -> None:
+def test_file_named_like_the_bundle_folder_is_kept(bundle: Path) -> None:
     bundle.with_name("a.progdf").write_text("mine")
     with pytest.raises(ProgdfError, match="was not unpacked from"):
         unpack_bundle(bundle)
@@ -148,7 +148,7 @@ def test_later_zip_version_is_named(bundle: Path) -> None:
 def test_damaged_deflate_stream_is_damage(tmp_path: Path) -> None:
     path = write_zip(tmp_path / "a.progdf.zip", {"a.session.json": SESSION})
     content = bytearray(path.read_bytes())
-    content[44:52] = b"\xff" * 8  # just after the first member's header
+    content[44:52] = b"\xff" * 8  # directly after the first member's header
     path.write_bytes(content)
     assert_refused(path, "is damaged", "a.session.json")
 
@@ -157,7 +157,7 @@ def test_member_larger_than_its_entry_is_damage(bundle: Path) -> None:
     assert_refused(with_central_field(bundle, 24, 5), "is damaged")
 
 
-def test_member_that_appears_twice_is_damage(tmp_path: Path) -> None:
+def test_duplicate_member_is_damage(tmp_path: Path) -> None:
     members = {"a.session.json": SESSION, "b.ply": b"1", "B.ply": b"2"}
     assert_refused(write_zip(tmp_path / "a.progdf.zip", members), "is damaged", "twice")
 

@@ -1,4 +1,4 @@
-"""The camera files of other programs and our own are read alike."""
+"""Tests of reading camera files of ProGDF and of other programs."""
 
 from __future__ import annotations
 
@@ -30,9 +30,7 @@ from tests.helpers.refused import refusal
 def assert_same_views(found: list[Camera], expected: list[Camera]) -> None:
     assert len(found) == len(expected)
     for a, b in zip(found, expected, strict=True):
-        torch.testing.assert_close(
-            a.viewmat, b.viewmat, atol=2e-6, rtol=0
-        )  # the matrices were inverted twice
+        torch.testing.assert_close(a.viewmat, b.viewmat, atol=2e-6, rtol=0)  # two matrix inversions
         torch.testing.assert_close(a.K, b.K)
         assert (a.width, a.height) == (b.width, b.height)
 
@@ -47,7 +45,7 @@ def test_saved_cameras_load_to_the_same_bits(tmp_path: Path) -> None:
     assert progdf.load_cameras is load_cameras
 
 
-def test_what_pixels_are_samples_of_is_saved(tmp_path: Path) -> None:
+def test_sampling_of_a_camera_is_saved(tmp_path: Path) -> None:
     cameras = [replace(some_cameras()[0], sampling=sampling) for sampling in (1.0, math.sqrt(2.0))]
     save_cameras(tmp_path / "c.json", cameras)
     assert [camera.sampling for camera in load_cameras(tmp_path / "c.json")] == [1.0, math.sqrt(2.0)]
@@ -55,7 +53,7 @@ def test_what_pixels_are_samples_of_is_saved(tmp_path: Path) -> None:
     assert read_camera(f"{tmp_path / 'c.json'}:1").sampling == 1.0, "who looks from there sees a picture"
 
 
-def test_one_camera_or_a_bare_list_of_ours_is_read(tmp_path: Path) -> None:
+def test_single_camera_or_bare_list_is_read(tmp_path: Path) -> None:
     cameras = some_cameras()
     save_cameras(tmp_path / "cameras.json", cameras)
     entries = json.loads((tmp_path / "cameras.json").read_text())["cameras"]
@@ -95,7 +93,7 @@ def test_inria_principal_point_and_lens_are_used(tmp_path: Path) -> None:
     assert (second.name, second.lens) == ("left/b", None)
 
 
-def test_inria_fields_of_view_stand_in_for_focal_lengths(tmp_path: Path) -> None:
+def test_inria_fields_of_view_replace_missing_focal_lengths(tmp_path: Path) -> None:
     cameras = some_cameras()
     entries = inria(cameras)
     for entry in entries:
@@ -109,7 +107,7 @@ def test_nerfstudio_transforms_are_read(tmp_path: Path) -> None:
     assert_same_views(load_cameras(written(tmp_path / "t.json", nerfstudio(cameras))), cameras)
 
 
-def test_a_frames_own_intrinsics_go_before_those_of_the_file(tmp_path: Path) -> None:
+def test_frame_intrinsics_override_those_of_the_file(tmp_path: Path) -> None:
     content = nerfstudio(some_cameras())
     content["frames"][2] |= {"fl_x": 111.0, "fl_y": 222.0, "cx": 30.0, "cy": 40.0, "w": 66, "h": 88}
     cameras = load_cameras(written(tmp_path / "t.json", content))
@@ -118,7 +116,7 @@ def test_a_frames_own_intrinsics_go_before_those_of_the_file(tmp_path: Path) -> 
     assert_same_views(cameras[:2], some_cameras()[:2])
 
 
-def test_a_field_of_view_stands_in_for_a_focal_length(tmp_path: Path) -> None:
+def test_field_of_view_replaces_a_missing_focal_length(tmp_path: Path) -> None:
     cameras = some_cameras()
     angle = 2 * math.atan(160 / float(cameras[0].K[0, 0]))
     content = nerfstudio(cameras, fl_x=None, fl_y=None, cx=None, cy=None, camera_angle_x=angle)
@@ -138,7 +136,7 @@ def test_a_field_of_view_stands_in_for_a_focal_length(tmp_path: Path) -> None:
     ],
     ids=["fl_x", "fl_y", "angle y", "both angles"],
 )
-def test_what_is_said_of_one_axis_alone_holds_for_both(
+def test_intrinsics_of_one_axis_apply_to_both(
     given: dict[str, float], focal: tuple[float, float], tmp_path: Path
 ) -> None:
     content = nerfstudio(some_cameras(), **{"fl_x": None, "fl_y": None, **given})
@@ -146,7 +144,7 @@ def test_what_is_said_of_one_axis_alone_holds_for_both(
     assert (float(K[0, 0]), float(K[1, 1])) == pytest.approx(focal, rel=1e-6)
 
 
-def test_a_frames_own_angle_goes_before_the_files_length(tmp_path: Path) -> None:
+def test_frame_angle_overrides_the_focal_length_of_the_file(tmp_path: Path) -> None:
     content = nerfstudio(some_cameras())
     content["frames"][1]["camera_angle_x"] = 2 * math.atan(160 / 123)
     cameras = load_cameras(written(tmp_path / "t.json", content))
@@ -161,7 +159,7 @@ def test_fields_of_view_in_degrees_are_read(tmp_path: Path) -> None:
     assert (float(K[0, 0]), float(K[1, 1])) == pytest.approx((250, 250), rel=1e-6)
 
 
-def test_lens_fields_that_are_switched_off_change_nothing(tmp_path: Path) -> None:
+def test_disabled_lens_fields_change_nothing(tmp_path: Path) -> None:
     off = {"is_fisheye": False, "k4": 0.0, "rolling_shutter": [0, 0, 0], "camera_type": "perspective"}
     cameras = some_cameras()
     assert_same_views(load_cameras(written(tmp_path / "t.json", nerfstudio(cameras, **off))), cameras)
@@ -187,21 +185,21 @@ def test_rounded_matrices_are_made_rotations(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("model", [None, "opencv", "Simple_Pinhole"])
-def test_a_camera_model_may_be_missing_or_written_in_small_letters(model: str | None, tmp_path: Path) -> None:
+def test_camera_model_may_be_missing_or_lowercase(model: str | None, tmp_path: Path) -> None:
     cameras = some_cameras()
     found = load_cameras(written(tmp_path / "t.json", nerfstudio(cameras, camera_model=model)))
     assert_same_views(found, cameras)
     assert found[0].name == f"{cameras[0].name}.png"
 
 
-def test_the_image_size_is_taken_from_the_picture_where_the_file_has_none(tmp_path: Path) -> None:
+def test_missing_image_size_is_read_from_the_picture(tmp_path: Path) -> None:
     cameras = some_cameras()
     content = nerfstudio(cameras, w=None, h=None)
     assert "w and h" in refusal(load_cameras, written(tmp_path / "t.json", content))
     (tmp_path / "images").mkdir()
     for camera, frame in zip(cameras, content["frames"], strict=True):
         Image.new("RGB", (320, 200)).save(tmp_path / "images" / f"{camera.name}.png")
-        frame["file_path"] = f"./images/{camera.name}"  # synthetic NeRF scenes leave the suffix off
+        frame["file_path"] = f"./images/{camera.name}"  # synthetic NeRF scenes omit the suffix
     assert_same_views(load_cameras(written(tmp_path / "t.json", content)), cameras)
 
 
@@ -217,7 +215,7 @@ def test_windows_paths_name_the_same_picture(tmp_path: Path) -> None:
     assert [camera.name for camera in found] == [f"{camera.name}.png" for camera in cameras]
 
 
-def test_distortion_is_kept_as_the_cameras_lens_and_not_ignored(tmp_path: Path) -> None:
+def test_distortion_is_kept_as_the_lens_of_the_camera(tmp_path: Path) -> None:
     content = nerfstudio(some_cameras(), k1=0.1, k2=-0.02, p1=0.003, p2=0.004, k3=0.0)
     content["frames"][1] |= {"k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
     cameras = load_cameras(written(tmp_path / "t.json", content))
@@ -228,7 +226,7 @@ def test_distortion_is_kept_as_the_cameras_lens_and_not_ignored(tmp_path: Path) 
     assert cameras[0].resize(32, 20).lens == cameras[0].lens
 
 
-def test_what_lenses_bend_is_told_in_the_log(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_number_of_distorted_cameras_is_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     content = nerfstudio(some_cameras(), k1=0.1)
     content["frames"][1] |= {"k1": 0.0}
     with caplog.at_level(logging.INFO, logger="progdf"):
@@ -239,7 +237,7 @@ def test_what_lenses_bend_is_told_in_the_log(tmp_path: Path, caplog: pytest.LogC
         assert caplog.text == ""
 
 
-def test_a_save_that_fails_leaves_the_old_cameras_and_nothing_else(tmp_path: Path) -> None:
+def test_failed_save_leaves_the_old_cameras_and_nothing_else(tmp_path: Path) -> None:
     path = tmp_path / "cameras.json"
     save_cameras(path, some_cameras())
     old = path.read_bytes()
@@ -249,6 +247,6 @@ def test_a_save_that_fails_leaves_the_old_cameras_and_nothing_else(tmp_path: Pat
     assert [entry.name for entry in tmp_path.iterdir()] == ["cameras.json"]
 
 
-def test_what_cannot_be_read_is_no_kind_of_cameras(tmp_path: Path) -> None:
+def test_kind_of_an_unreadable_camera_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ProgdfError, match="does not exist"):
         kind_of_cameras(tmp_path / "cameras.json")

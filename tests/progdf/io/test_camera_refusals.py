@@ -1,4 +1,4 @@
-"""Camera files that are broken or of another kind: each is refused in one line."""
+"""Tests of broken or unsupported camera files: each is refused in one line."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.helpers.camera_tables import REFUSED_VIEWMATS, inria, nerfstudio, som
 from tests.helpers.refused import refusal
 
 
-def test_a_picture_without_a_size_that_can_be_read_is_one_line(
+def test_picture_without_a_readable_size_is_reported_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     content = nerfstudio(some_cameras()[:1], w=None, h=None)
@@ -34,14 +34,14 @@ def test_a_picture_without_a_size_that_can_be_read_is_one_line(
     assert f"has no image size, and {picture} cannot be read as a picture" in refusal(load_cameras, path)
 
 
-def test_distortion_of_a_kind_that_programs_read_differently_is_refused(tmp_path: Path) -> None:
+def test_ambiguous_distortion_is_refused(tmp_path: Path) -> None:
     for key in ("k4", "k5", "k6"):
         assert "undistort" in refusal(
             load_cameras, written(tmp_path / "t.json", nerfstudio(some_cameras(), **{key: 0.01}))
         )
 
 
-def test_a_camera_file_name_that_is_too_long_is_one_line(tmp_path: Path) -> None:
+def test_overlong_camera_file_name_is_reported_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(ProgdfError, match="cannot be read \\(File name too long\\)"):
         load_cameras(tmp_path / ("9" * 5000))
 
@@ -93,7 +93,7 @@ def test_inria_fields_that_change_the_camera_are_refused(tmp_path: Path, field: 
     assert f"'{field}'" in message
 
 
-def test_an_inria_camera_without_focal_length_is_refused(tmp_path: Path) -> None:
+def test_inria_camera_without_focal_length_is_refused(tmp_path: Path) -> None:
     entries = inria(some_cameras())
     for key in ("fx", "fy"):
         del entries[0][key]
@@ -101,14 +101,14 @@ def test_an_inria_camera_without_focal_length_is_refused(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("case", REFUSED_VIEWMATS)
-def test_a_viewmat_must_be_a_rotation_and_a_translation(case: str) -> None:
+def test_viewmat_must_be_a_rotation_and_a_translation(case: str) -> None:
     change, fault = REFUSED_VIEWMATS[case]
     camera = some_cameras()[0]
     with pytest.raises(ValueError, match=rf"the viewmat {fault}.*; it must be a rotation and a translation"):
         replace(camera, viewmat=change @ camera.viewmat)
 
 
-def test_intrinsics_must_have_no_entries_that_nothing_reads() -> None:
+def test_intrinsics_must_have_no_unused_entries() -> None:
     camera = some_cameras()[0]
     oblique = camera.K.clone()
     oblique[0, 1] = 3.0
@@ -122,12 +122,12 @@ Change = Callable[[dict[str, Any]], object]
 
 
 def angle_instead(content: dict[str, Any], angle: float) -> None:
-    """The field of view, in place of the focal lengths."""
+    """Replace the focal lengths by a field of view."""
     del content["fl_x"], content["fl_y"]
     content["camera_angle_x"] = angle
 
 
-BROKEN: dict[str, tuple[Change, str]] = {  # what is done to a good file, what must be said about it
+BROKEN: dict[str, tuple[Change, str]] = {  # change of a valid file, and expected error
     "fisheye": (lambda t: t.update(camera_model="OPENCV_FISHEYE"), "OPENCV_FISHEYE"),
     "no focal length": (lambda t: (t.pop("fl_x"), t.pop("fl_y")), "focal length"),
     "words": (lambda t: t.update(fl_x="wide"), "fl_x"),
@@ -170,7 +170,7 @@ BROKEN: dict[str, tuple[Change, str]] = {  # what is done to a good file, what m
 
 
 @pytest.mark.parametrize("case", BROKEN)
-def test_a_broken_camera_is_named_in_one_line(case: str, tmp_path: Path) -> None:
+def test_broken_camera_is_named_in_one_line(case: str, tmp_path: Path) -> None:
     change, said = BROKEN[case]
     content = nerfstudio(some_cameras())
     change(content)
@@ -184,28 +184,26 @@ def test_a_broken_camera_is_named_in_one_line(case: str, tmp_path: Path) -> None
         '[{"rotation": 1, "position": 2}]',
     ],
 )
-def test_any_other_json_is_one_line(content: str, tmp_path: Path) -> None:
+def test_any_other_json_is_reported_in_one_line(content: str, tmp_path: Path) -> None:
     path = tmp_path / "cameras.json"
     path.write_bytes(content.encode("latin-1"))
     refusal(load_cameras, path)
 
 
 @pytest.mark.parametrize("diagonal", [(0, 0, 0, 0), (2, 2, 2, 1), (-1, 1, 1, 1), (1, 1, 1, 2)])
-def test_a_saved_camera_that_does_more_than_turn_and_move_is_refused(
-    diagonal: tuple[int, ...], tmp_path: Path
-) -> None:
+def test_saved_camera_that_is_no_rigid_motion_is_refused(diagonal: tuple[int, ...], tmp_path: Path) -> None:
     viewmat = torch.diag(torch.tensor(diagonal)).tolist()
     entry = {"width": 4, "height": 4, "K": torch.eye(3).tolist(), "viewmat": viewmat}
     assert "not a rotation" in refusal(load_cameras, written(tmp_path / "one.json", entry))
 
 
 @pytest.mark.parametrize("sampling", [0, -1, 0.5, 17, 1e300, "2", None])
-def test_pixels_of_a_smaller_picture_are_refused(sampling: object, tmp_path: Path) -> None:
+def test_invalid_sampling_is_refused(sampling: object, tmp_path: Path) -> None:
     entry = {"width": 4, "height": 4, "K": torch.eye(3).tolist(), "viewmat": torch.eye(4).tolist()}
     refusal(load_cameras, written(tmp_path / "one.json", entry | {"sampling": sampling}))
 
 
-def test_a_missing_camera_file_is_one_line(tmp_path: Path) -> None:
+def test_missing_camera_file_is_reported_in_one_line(tmp_path: Path) -> None:
     assert "does not exist" in refusal(load_cameras, tmp_path / "nowhere.json")
 
 
@@ -223,7 +221,7 @@ JSON = st.recursive(
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(content=JSON, kind=st.sampled_from(["inria", "nerfstudio", "ours"]), data=st.data())
-def test_any_value_in_any_place_loads_or_is_refused(
+def test_any_value_in_any_field_loads_or_is_refused(
     content: object, kind: str, data: st.DataObject, tmp_path: Path
 ) -> None:
     entry: Any = inria(some_cameras())[0]

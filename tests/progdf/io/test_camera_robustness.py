@@ -1,4 +1,4 @@
-"""The camera never breaks, in pictures: any size, up axis and window, poles, the inside of things."""
+"""Tests of the viewing camera in pictures: any scene size, up axis and window, poles, and inside objects."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ BACKGROUND: Vec3 = (1.0, 1.0, 1.0)
 
 @cache
 def the_bear() -> Gaussians:
-    """Without view dependence, which would have to turn with the scene."""
+    """Return the bear without view dependence, which would have to rotate with the scene."""
     scene = bear(1500).gaussians
     return replace(scene, shN=scene.shN[:, :0])
 
@@ -55,7 +55,7 @@ def scaled(scene: Gaussians, factor: float) -> Gaussians:
 
 
 def about_x(scene: Gaussians, degrees: float) -> Gaussians:
-    """The scene turned around x."""
+    """Return the scene rotated about x."""
     half = math.radians(degrees) / 2
     c = math.cos(half)
     s = math.sin(half)
@@ -89,7 +89,7 @@ def agreement(a: Image, b: Image) -> float:
 
 @DRAWS
 @pytest.mark.parametrize("factor", [1e-3, 1e-1, 1e4])
-def test_a_scene_of_any_size_is_met_with_the_same_picture(
+def test_scene_of_any_size_opens_with_the_same_picture(
     ctx: moderngl.Context, draw: str, factor: float
 ) -> None:
     scene = the_bear()
@@ -98,7 +98,7 @@ def test_a_scene_of_any_size_is_met_with_the_same_picture(
 
 @DRAWS
 @pytest.mark.parametrize(("degrees", "up"), [(180.0, (0, -1, 0)), (90.0, (0, 0, 1)), (-90.0, (0, 0, -1))])
-def test_a_scene_of_any_up_axis_is_met_with_the_same_picture(
+def test_scene_of_any_up_axis_opens_with_the_same_picture(
     ctx: moderngl.Context, draw: str, degrees: float, up: Vec3
 ) -> None:
     scene = the_bear()
@@ -110,7 +110,7 @@ def test_a_scene_of_any_up_axis_is_met_with_the_same_picture(
 @DRAWS
 @pytest.mark.parametrize("factor", [1e-3, 1e4])
 @pytest.mark.parametrize("elevation", [-90.0, 90.0])
-def test_at_the_poles_there_is_a_picture_and_no_jump(
+def test_camera_at_the_poles_draws_without_a_jump(
     ctx: moderngl.Context, draw: str, factor: float, elevation: float
 ) -> None:
     scene = scaled(the_bear(), factor)
@@ -124,9 +124,7 @@ def test_at_the_poles_there_is_a_picture_and_no_jump(
 
 @DRAWS
 @pytest.mark.parametrize("factor", [1e-3, 1.0, 1e4])
-def test_as_near_as_the_wheel_goes_the_picture_is_finite_and_the_way_back_is_open(
-    ctx: moderngl.Context, draw: str, factor: float
-) -> None:
+def test_closest_zoom_is_finite_and_can_be_undone(ctx: moderngl.Context, draw: str, factor: float) -> None:
     scene = scaled(the_bear(), factor)
     first = first_camera(scene)
     radius = bounds_of(scene).radius
@@ -142,14 +140,14 @@ def test_as_near_as_the_wheel_goes_the_picture_is_finite_and_the_way_back_is_ope
 
 
 @DRAWS
-def test_a_camera_on_its_own_pivot_still_draws(ctx: moderngl.Context, draw: str) -> None:
+def test_camera_on_its_own_pivot_still_draws(ctx: moderngl.Context, draw: str) -> None:
     image = pictured(ctx, the_bear(), draw, ViewCamera(distance=1e-12))
     assert np.isfinite(image).all()
 
 
 @DRAWS
 @pytest.mark.parametrize("size", [(40, 160), (160, 40), (1, 200), (200, 1), (1, 1)])
-def test_a_window_of_any_shape_shows_the_whole_scene_when_framed(
+def test_framing_shows_the_whole_scene_in_any_window(
     ctx: moderngl.Context, draw: str, size: tuple[int, int]
 ) -> None:
     scene = the_bear()
@@ -165,7 +163,7 @@ def test_a_window_of_any_shape_shows_the_whole_scene_when_framed(
 
 
 def filled(camera: ViewCamera, shown: Gaussians, aspect: float) -> np.ndarray:
-    """How far left, right, up and down these Gaussians reach, strays aside: 1 at the edges. [4]"""
+    """Return how far these Gaussians reach left, right, up and down without strays; 1 is the edge. [4]"""
     built = to_camera(camera, round(1200 * aspect), 1200)
     local = shown.means @ built.viewmat[:3, :3].T + built.viewmat[:3, 3]
     assert bool((local[:, 2] > 0).all())
@@ -176,17 +174,15 @@ def filled(camera: ViewCamera, shown: Gaussians, aspect: float) -> np.ndarray:
 
 
 def is_filled(camera: ViewCamera, shown: Gaussians, aspect: float) -> bool:
-    """Whether they fill the tighter side of the picture and stand in its middle."""
+    """Return True if the Gaussians fill the tighter side of the picture and are centered."""
     left, right, up, down = filled(camera, shown, aspect)
-    widest = max(left, right, up, down)  # of centers: Gaussians as large as the ears' here add a third
+    widest = max(left, right, up, down)  # of centers; Gaussians as large as these ears add a third
     return abs(left - right) < 0.07 and abs(up - down) < 0.07 and 0.45 < widest < FILL
 
 
 @pytest.mark.parametrize("aspect", [0.25, 0.5, 1.0, 4.0])
 @pytest.mark.parametrize("factor", [1e-3, 1.0, 1e4])
-def test_f_without_a_layer_fills_any_window_with_what_the_scene_is_about(
-    aspect: float, factor: float
-) -> None:
+def test_f_without_a_layer_frames_the_subject_in_any_window(aspect: float, factor: float) -> None:
     scene = scaled(the_bear(), factor)
     for azimuth, elevation in ((20.0, 15.0), (110.0, 40.0)):
         view = ViewState(camera=ViewCamera(azimuth=azimuth, elevation=elevation))
@@ -197,7 +193,7 @@ def test_f_without_a_layer_fills_any_window_with_what_the_scene_is_about(
 
 @pytest.mark.parametrize("aspect", [0.5, 1.5])
 @pytest.mark.parametrize("layer", [0, 1])
-def test_f_fills_the_window_with_the_members_of_the_focused_layer(aspect: float, layer: int) -> None:
+def test_f_frames_the_members_of_the_focused_layer(aspect: float, layer: int) -> None:
     stack = bear_stack(1500)
     view = first_view(stack, 0.5, 0.5)
     work = replace(workspace.new_workspace(view), focus=layer)
@@ -207,7 +203,7 @@ def test_f_fills_the_window_with_the_members_of_the_focused_layer(aspect: float,
     assert axes(camera) == axes(view.camera)
 
 
-def test_f_shows_all_of_a_room_from_outside_and_of_nothing_the_origin() -> None:
+def test_f_frames_a_room_from_outside_and_an_empty_scene_at_the_origin() -> None:
     scene = room(4000).gaussians
     inside = workspace.new_workspace(ViewState(camera=first_camera(scene)))
     outside = perform(inside, "frame", Document("x", scene).facts()).view.camera
@@ -217,7 +213,7 @@ def test_f_shows_all_of_a_room_from_outside_and_of_nothing_the_origin() -> None:
 
 
 @pytest.mark.parametrize("points", [(400, 900), (1600, 400)])
-def test_narrow_and_wide_windows_can_be_worked_in(points: tuple[int, int]) -> None:
+def test_narrow_and_wide_windows_are_usable(points: tuple[int, int]) -> None:
     with rig(points=points) as hand:
         before = hand.main_view.work.view.camera
         hand.drag((100.0, 200.0), (130.0, 220.0))

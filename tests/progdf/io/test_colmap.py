@@ -1,4 +1,4 @@
-"""COLMAP sparse models: read as pycolmap writes them, with or without points, and broken."""
+"""Tests of COLMAP sparse models as pycolmap writes them, with and without points, and damaged."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def write_model(
     text: bool = False,
     points: bool = True,
 ) -> Path:
-    """A model of 320x200 pixels with one point; its images are in the reverse order of their names."""
+    """Write a model of 320x200 pixels with one point. Its images are in the reverse order of their names."""
     model = pycolmap.Reconstruction()
     kind, numbers = lens
     model.add_camera_with_trivial_rig(
@@ -53,7 +53,7 @@ def views() -> list[Camera]:
 
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize("points", [False, True])
-def test_a_model_is_read_with_or_without_its_points(tmp_path: Path, text: bool, points: bool) -> None:
+def test_model_is_read_with_or_without_points(tmp_path: Path, text: bool, points: bool) -> None:
     found = load_cameras(write_model(tmp_path / "m", views(), text=text, points=points))
     assert [camera.name for camera in found] == [f"left/{i}.jpg" for i in (6, 7, 8, 9)]
     for camera, view in zip(found, reversed(views()), strict=True):
@@ -63,25 +63,25 @@ def test_a_model_is_read_with_or_without_its_points(tmp_path: Path, text: bool, 
 
 
 @pytest.mark.parametrize("place", ["", "sparse/0", "sparse", "0", "colmap/sparse/0"])
-def test_a_model_is_found_in_the_project_that_holds_it(tmp_path: Path, place: str) -> None:
+def test_model_is_found_in_its_project_folder(tmp_path: Path, place: str) -> None:
     write_model(tmp_path / "project" / place, views())
     assert len(load_cameras(tmp_path / "project")) == 4
     assert len(load_cameras(tmp_path / "project" / place / "images.bin")) == 4
 
 
-def test_a_binary_model_goes_before_a_text_beside_it(tmp_path: Path) -> None:
+def test_binary_model_is_preferred_to_text(tmp_path: Path) -> None:
     model = write_model(tmp_path / "m", views())
     for name in ("cameras.txt", "images.txt"):
         (model / name).write_text("left over from an export\n")
     assert len(load_cameras(model)) == 4
 
 
-def test_a_model_in_which_no_image_is_registered_is_refused(tmp_path: Path) -> None:
+def test_model_without_registered_images_is_refused(tmp_path: Path) -> None:
     assert "no registered image" in refusal(load_cameras, write_model(tmp_path / "m", []))
 
 
 def rig_model(folder: Path) -> pycolmap.Reconstruction:
-    """A model of two cameras on a rig, whose second camera is turned and moved against the first."""
+    """Return a model of two cameras on a rig, the second rotated and moved against the first."""
     model = pycolmap.Reconstruction()
     rig = pycolmap.Rig(rig_id=1)
     pairs = zip((1, 2), ("OPENCV", "SIMPLE_RADIAL"), strict=True)
@@ -111,7 +111,7 @@ def rig_model(folder: Path) -> pycolmap.Reconstruction:
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_poses_and_intrinsics_of_a_rig_are_pycolmaps(tmp_path: Path, text: bool) -> None:
+def test_poses_and_intrinsics_of_a_rig_match_pycolmap(tmp_path: Path, text: bool) -> None:
     folder = tmp_path / "m"
     model = rig_model(folder)
     (model.write_text if text else model.write_binary)(folder)
@@ -126,7 +126,7 @@ def test_poses_and_intrinsics_of_a_rig_are_pycolmaps(tmp_path: Path, text: bool)
         assert torch.equal(found[name].K, K)
 
 
-def test_a_model_older_than_rigs_is_read(tmp_path: Path) -> None:
+def test_model_older_than_rigs_is_read(tmp_path: Path) -> None:
     model = write_model(tmp_path / "m", views())
     for name in ("rigs.bin", "frames.bin"):
         (model / name).unlink()
@@ -147,7 +147,7 @@ def test_a_model_older_than_rigs_is_read(tmp_path: Path) -> None:
         ("SIMPLE_RADIAL", [250.0, 160.0, 100.0, 0.0], None),
     ],
 )
-def test_a_lens_is_kept_and_bends_rays_as_colmap_bends_them(
+def test_lens_distorts_rays_like_colmap(
     tmp_path: Path, kind: str, numbers: list[float], lens: Lens | None
 ) -> None:
     camera = load_cameras(write_model(tmp_path / "m", views(), (kind, numbers)))[0]
@@ -168,9 +168,7 @@ def test_a_lens_is_kept_and_bends_rays_as_colmap_bends_them(
         ("FULL_OPENCV", [250.0, 240.0, 160.0, 100.0, 0, 0, 0, 0, 0, 0.1, 0, 0], "k4"),
     ],
 )
-def test_a_lens_we_cannot_straighten_is_refused(
-    tmp_path: Path, kind: str, numbers: list[float], said: str
-) -> None:
+def test_unsupported_lens_is_refused(tmp_path: Path, kind: str, numbers: list[float], said: str) -> None:
     message = refusal(load_cameras, write_model(tmp_path / "m", views(), (kind, numbers)))
     assert said in message
     assert "image_undistorter" in message
@@ -190,7 +188,7 @@ DAMAGES: dict[str, Damage] = {
 }
 
 
-def test_a_model_that_claims_more_points_than_its_file_has_is_refused(tmp_path: Path) -> None:
+def test_model_with_an_excessive_point_count_is_refused(tmp_path: Path) -> None:
     model = write_model(tmp_path / "m", views())
     content = bytearray((model / "images.bin").read_bytes())
     at = content.index(b".jpg\0") + 5
@@ -198,17 +196,17 @@ def test_a_model_that_claims_more_points_than_its_file_has_is_refused(tmp_path: 
     (model / "images.bin").write_bytes(bytes(content))
     message = refusal(load_cameras, model)
     assert "pycolmap cannot read" in message
-    assert "damaged" not in message  # nor is it known to be
+    assert "damaged" not in message  # not known to be damaged
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_a_broken_model_is_one_line(tmp_path: Path, damage: str) -> None:
+def test_broken_model_is_reported_in_one_line(tmp_path: Path, damage: str) -> None:
     model = write_model(tmp_path / "m", views())
     DAMAGES[damage](model)
     refusal(load_cameras, model)
 
 
-def test_a_folder_without_cameras_and_one_with_two_kinds_are_refused(tmp_path: Path) -> None:
+def test_folder_without_cameras_or_with_two_kinds_is_refused(tmp_path: Path) -> None:
     assert "sparse/0" in refusal(load_cameras, tmp_path)
     write_model(tmp_path / "sparse" / "0", views())
     save_cameras(tmp_path / "cameras.json", views())
@@ -216,12 +214,12 @@ def test_a_folder_without_cameras_and_one_with_two_kinds_are_refused(tmp_path: P
     assert len(load_cameras(tmp_path / "cameras.json")) == 4
 
 
-def test_a_folder_with_one_file_of_cameras_is_that_file(tmp_path: Path) -> None:
+def test_folder_with_one_camera_file_reads_that_file(tmp_path: Path) -> None:
     save_cameras(tmp_path / "cameras.json", views())
     assert len(load_cameras(tmp_path)) == 4
 
 
-def test_without_pycolmap_the_line_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_pycolmap_error_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = write_model(tmp_path / "m", views())
     monkeypatch.setattr("progdf.io.colmap.importlib.util.find_spec", lambda name: None)
     assert "progdf-studio[colmap]" in refusal(load_cameras, model)

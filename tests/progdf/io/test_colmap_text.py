@@ -1,4 +1,4 @@
-"""COLMAP models in their text form, and the choice among several models; neither needs pycolmap."""
+"""Tests of COLMAP text models, and of choosing among several models. Neither needs pycolmap."""
 
 from __future__ import annotations
 
@@ -40,18 +40,18 @@ def test_image_names_are_the_rest_of_the_line(tmp_path: Path, names: list[str]) 
     assert names_of(write_text_model(tmp_path / "bare", names, points=None)) == names
 
 
-def test_backslashes_in_image_names_are_slashes(tmp_path: Path) -> None:
+def test_backslashes_in_image_names_become_slashes(tmp_path: Path) -> None:
     assert names_of(write_text_model(tmp_path / "m", ["left\\a.jpg"])) == ["left/a.jpg"]
 
 
 @pytest.mark.parametrize("points", ["", "10.5 20.25 -1 3 4 17", "  ", None, "1e2 5.0 3"])
-def test_lines_of_points_may_be_full_empty_or_left_out(tmp_path: Path, points: str | None) -> None:
+def test_point_lines_may_be_full_empty_or_omitted(tmp_path: Path, points: str | None) -> None:
     found = load_cameras(write_text_model(tmp_path / "m", NAMES, points=points))
     assert [camera.name for camera in found] == sorted(NAMES)
     assert [float(camera.viewmat[2, 3]) for camera in found] == [2.0, 1.0, 3.0]
 
 
-def test_lines_may_end_as_on_windows_and_begin_with_a_mark(tmp_path: Path) -> None:
+def test_windows_line_ends_and_byte_order_mark_are_accepted(tmp_path: Path) -> None:
     model = write_text_model(tmp_path / "m", NAMES, header="# Image list")
     for name in ("images.txt", "cameras.txt"):
         content = (model / name).read_bytes().replace(b"\n", b"\r\n")
@@ -63,12 +63,12 @@ def test_fewer_images_than_the_header_counts_are_refused(tmp_path: Path) -> None
     header = "# Number of images: {}, mean observations per image: 0"
     message = refusal(load_cameras, write_text_model(tmp_path / "m", NAMES, header=header.format(4)))
     assert "images.txt lists 3 of the 4 images that its header counts" in message
-    for count in (3, 2):  # 2: the header of COLMAP's manual, which writers copy
+    for count in (3, 2):  # 2 is the header of COLMAP's manual, which writers copy
         model = write_text_model(tmp_path / f"m{count}", NAMES, header=header.format(count))
         assert len(load_cameras(model)) == 3
 
 
-def test_each_image_has_the_camera_that_it_names(tmp_path: Path) -> None:
+def test_each_image_uses_its_named_camera(tmp_path: Path) -> None:
     cameras = ["7 SIMPLE_RADIAL 64 48 50 32 24 0.1", PINHOLE]
     model = write_text_model(tmp_path / "m", NAMES, cameras=cameras)
     images = (model / "images.txt").read_text()
@@ -79,7 +79,7 @@ def test_each_image_has_the_camera_that_it_names(tmp_path: Path) -> None:
     assert second.K.tolist() == [[50, 0, 32], [0, 50, 24], [0, 0, 1]]
 
 
-DAMAGES = {  # what replaces what, in which file, and what must be said about it
+DAMAGES = {  # file, old text, new text, expected error
     "a name gone": ("images.txt", " b.jpg", "", "line 1 has 9 of 10 fields of an image"),
     "a word for a number": ("images.txt", "1 1 0", "1 one 0", "line 1 has 'one' in place of a number"),
     "NaN": ("images.txt", "1 1 0", "1 nan 0", "line 1 has 'nan' in place of a number"),
@@ -94,7 +94,7 @@ DAMAGES = {  # what replaces what, in which file, and what must be said about it
 
 
 @pytest.mark.parametrize("case", DAMAGES)
-def test_a_damaged_line_is_named_with_its_file(tmp_path: Path, case: str) -> None:
+def test_damaged_line_is_named_with_its_file(tmp_path: Path, case: str) -> None:
     file, old, new, said = DAMAGES[case]
     path = write_text_model(tmp_path / "m", NAMES) / file
     content = path.read_text()
@@ -125,7 +125,7 @@ def test_latin_1_names_are_unsupported_not_damaged(tmp_path: Path) -> None:
         ("1 PINHOLE 640 9999999999 500 501 320 240", "640x9999999999 pixels"),
     ],
 )
-def test_cameras_that_are_no_pinhole_are_refused_by_name(tmp_path: Path, camera: str, said: str) -> None:
+def test_unsupported_text_cameras_are_refused_by_name(tmp_path: Path, camera: str, said: str) -> None:
     model = write_text_model(tmp_path / "m", NAMES, cameras=[camera])
     message = refusal(load_cameras, model)
     assert said in message
@@ -133,7 +133,7 @@ def test_cameras_that_are_no_pinhole_are_refused_by_name(tmp_path: Path, camera:
 
 
 @pytest.mark.parametrize("place", ["sparse", "", "colmap/sparse"])
-def test_the_largest_of_several_models_is_read(
+def test_largest_of_several_models_is_read(
     tmp_path: Path, place: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     for number, names in enumerate((NAMES[:1], NAMES, NAMES[:2])):
@@ -149,7 +149,7 @@ def test_the_largest_of_several_models_is_read(
     assert camera_files(tmp_path) == (chosen / "cameras.txt", chosen / "images.txt")
 
 
-def test_a_model_that_is_named_is_read_even_if_another_is_larger(tmp_path: Path) -> None:
+def test_named_model_is_read_even_if_another_is_larger(tmp_path: Path) -> None:
     small = write_text_model(tmp_path / "sparse" / "0", NAMES[:1])
     large = write_text_model(tmp_path / "sparse" / "1", NAMES)
     cameras, report = load_cameras_with_report(small)
@@ -158,7 +158,7 @@ def test_a_model_that_is_named_is_read_even_if_another_is_larger(tmp_path: Path)
     assert load_cameras_with_report(large)[1].notes == ()
 
 
-def test_a_binary_count_weighs_against_a_text_model(tmp_path: Path) -> None:
+def test_binary_image_count_is_compared_with_a_text_model(tmp_path: Path) -> None:
     write_text_model(tmp_path / "sparse" / "0", NAMES)
     binary = tmp_path / "sparse" / "1"
     binary.mkdir()
@@ -169,7 +169,7 @@ def test_a_binary_count_weighs_against_a_text_model(tmp_path: Path) -> None:
     assert "needs pycolmap" in refusal(lambda _: load_cameras(tmp_path), binary)
 
 
-def test_a_file_of_a_model_stands_for_its_own_form(tmp_path: Path) -> None:
+def test_model_file_selects_its_own_form(tmp_path: Path) -> None:
     model = write_text_model(tmp_path / "m", NAMES)
     for name in ("cameras.bin", "images.bin"):
         (model / name).write_bytes(bytes(8))
@@ -177,7 +177,7 @@ def test_a_file_of_a_model_stands_for_its_own_form(tmp_path: Path) -> None:
     assert camera_files(model / "images.bin") == (model / "cameras.bin", model / "images.bin")
 
 
-def test_a_text_pose_is_the_rotation_of_its_quaternion(tmp_path: Path) -> None:
+def test_text_pose_is_the_rotation_of_its_quaternion(tmp_path: Path) -> None:
     model = write_text_model(tmp_path / "m", ["a.jpg"])
     (model / "images.txt").write_text("1 0.5 0.5 0.5 0.5 1 2 3 1 a.jpg\n")
     (camera,) = load_cameras(model)

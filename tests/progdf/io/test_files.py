@@ -1,4 +1,4 @@
-"""Outputs are whole or absent; a lock is held by one process, and let go of when it ends."""
+"""Tests of atomic outputs, and of locks that one process holds until it ends."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.helpers.full_disk import files_up_to, refuse_temporary_files
 from tests.helpers.refused import refusal
 
 
-def test_a_file_appears_when_it_is_complete_and_not_before(tmp_path: Path) -> None:
+def test_file_appears_only_when_complete(tmp_path: Path) -> None:
     path = tmp_path / "out.txt"
     with atomic_write(path) as temporary_file:
         temporary_file.write_text("half")
@@ -38,7 +38,7 @@ def test_a_file_appears_when_it_is_complete_and_not_before(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
-def test_an_interrupted_write_leaves_the_old_file_and_nothing_beside_it(
+def test_interrupted_write_leaves_the_old_file_and_nothing_else(
     error: type[BaseException], tmp_path: Path
 ) -> None:
     path = tmp_path / "out.txt"
@@ -55,7 +55,7 @@ def test_an_interrupted_write_leaves_the_old_file_and_nothing_beside_it(
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_full_disk_is_told_with_the_name_of_the_file_and_leaves_the_old_one(tmp_path: Path) -> None:
+def test_full_disk_error_names_the_file_and_keeps_the_old_one(tmp_path: Path) -> None:
     path = tmp_path / "out.txt"
     path.write_text("old")
     told = pytest.raises(ProgdfError, match=r"/out\.txt cannot be written \(.*\); choose a place")
@@ -71,7 +71,7 @@ def test_a_full_disk_is_told_with_the_name_of_the_file_and_leaves_the_old_one(tm
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_whoever_still_reads_the_old_file_keeps_it(tmp_path: Path) -> None:
+def test_open_reader_keeps_the_old_content(tmp_path: Path) -> None:
     path = tmp_path / "out.txt"
     path.write_text("old")
     with path.open() as reader:
@@ -81,7 +81,7 @@ def test_whoever_still_reads_the_old_file_keeps_it(tmp_path: Path) -> None:
     assert path.read_text() == "new"
 
 
-def test_permissions_are_those_of_an_ordinary_file_or_of_the_old_one(tmp_path: Path) -> None:
+def test_permissions_follow_the_umask_or_the_old_file(tmp_path: Path) -> None:
     ordinary = tmp_path / "ordinary.txt"
     old = tmp_path / "old.txt"
     ordinary.touch()
@@ -95,13 +95,13 @@ def test_permissions_are_those_of_an_ordinary_file_or_of_the_old_one(tmp_path: P
 
 
 @pytest.mark.parametrize("mask", [0o022, 0o077, 0o002])
-def test_a_new_file_obeys_the_umask_and_nobody_elses_is_touched(
+def test_new_file_obeys_the_umask_without_changing_it(
     mask: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     earlier = os.umask(mask)
     try:
         with monkeypatch.context() as patched:
-            # the process's umask holds for all its threads: to look at it is to change it for a moment
+            # the umask holds for all threads of the process, and reading it changes it for a moment
             patched.setattr(os, "umask", lambda mask: pytest.fail("the umask was changed"))
             with atomic_write(tmp_path / "new.txt") as temporary_file:
                 temporary_file.write_text("x")
@@ -110,19 +110,19 @@ def test_a_new_file_obeys_the_umask_and_nobody_elses_is_touched(
     assert (tmp_path / "new.txt").stat().st_mode & 0o777 == 0o666 & ~mask
 
 
-def test_the_suffix_is_kept_for_writers_that_go_by_it(tmp_path: Path) -> None:
+def test_suffix_is_kept_for_writers_that_depend_on_it(tmp_path: Path) -> None:
     with atomic_write(tmp_path / "picture.png") as temporary_file:
         assert temporary_file.suffix == ".png"
 
 
-def test_a_missing_folder_and_a_folder_in_place_of_a_file_are_one_line(tmp_path: Path) -> None:
+def test_missing_folder_and_folder_in_place_of_a_file_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ProgdfError, match="does not exist"), atomic_write(tmp_path / "no" / "a.txt"):
         pass
     with pytest.raises(ProgdfError, match="is a folder"), atomic_write(tmp_path):
         pass
 
 
-def test_a_place_that_cannot_be_written_to_is_told_by_the_name_that_was_given(
+def test_unwritable_folder_error_names_the_given_path(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     refuse_temporary_files(monkeypatch, errno.EACCES)
@@ -132,9 +132,9 @@ def test_a_place_that_cannot_be_written_to_is_told_by_the_name_that_was_given(
     assert str(told.value).startswith(f"{path} cannot be written (Permission denied); ")
 
 
-def test_a_link_stays_a_link_and_what_it_leads_to_is_replaced(tmp_path: Path) -> None:
+def test_write_through_a_link_replaces_its_target(tmp_path: Path) -> None:
     (tmp_path / "there").mkdir()
-    for name in ("old", "new"):  # the second leads to nothing yet
+    for name in ("old", "new"):  # the second target does not exist
         real = tmp_path / "there" / f"{name}.txt"
         link = tmp_path / f"{name}.txt"
         link.symlink_to(Path("there") / real.name)
@@ -154,12 +154,10 @@ def read_session_file(path: Path) -> SessionFile:
 @pytest.mark.parametrize(
     "read", [load_scene, load_gdf, kind_of, load_cameras, open_npy, open_picture, read_session_file, sha256]
 )
-def test_a_pipe_that_is_read_from_is_refused_and_not_waited_for(
-    read: Callable[[Path], object], tmp_path: Path
-) -> None:
+def test_pipe_as_input_is_refused_without_waiting(read: Callable[[Path], object], tmp_path: Path) -> None:
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
-    signal.alarm(20)  # ends the process, where a reader waits
+    signal.alarm(20)  # ends the process if a reader waits
     try:
         for path in (pipe, Path("/dev/zero")):
             assert refusal(read, path) == f"{path} is a pipe or a device; give a file"
@@ -167,7 +165,7 @@ def test_a_pipe_that_is_read_from_is_refused_and_not_waited_for(
         signal.alarm(0)
 
 
-def test_a_pipe_gets_the_bytes_and_stays_a_pipe(tmp_path: Path) -> None:
+def test_pipe_as_output_gets_the_bytes_and_stays_a_pipe(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe.png"
     os.mkfifo(pipe)
     handle = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
@@ -191,7 +189,7 @@ with atomic_write(sys.argv[1]) as beside:
 """
 
 
-def test_what_a_killed_process_left_goes_at_the_next_write_and_nothing_else(tmp_path: Path) -> None:
+def test_leftovers_of_a_killed_process_are_removed_at_the_next_write(tmp_path: Path) -> None:
     path = tmp_path / "out.txt"
     subprocess.run([sys.executable, "-c", KILLED, str(path)], check=False)
     left = list(tmp_path.iterdir())
@@ -200,14 +198,14 @@ def test_what_a_killed_process_left_goes_at_the_next_write_and_nothing_else(tmp_
     own = [tmp_path / name for name in (".out.abcdefgh.txt", ".progdf", ".progdf-notes.txt", "x.progdf-1")]
     for mine in own:
         mine.write_text("mine")
-    elsewhere = tmp_path / ".progdf-00000000-1-abcdefgh.txt"  # another machine's, which may be at work
+    elsewhere = tmp_path / ".progdf-00000000-1-abcdefgh.txt"  # another machine's, which may still run
     elsewhere.write_text("half")
     with atomic_write(tmp_path / "a.txt") as running:
         with atomic_write(path) as temporary_file:
             temporary_file.write_text("whole")
         assert running.exists(), "a process that runs keeps what it writes"
         running.write_text("whole")
-    folder = tmp_path / f"{left[0].name.rpartition('-')[0]}-abcdefgh"  # as `temporary_subfolder` makes
+    folder = tmp_path / f"{left[0].name.rpartition('-')[0]}-abcdefgh"  # as `temporary_subfolder` creates it
     folder.mkdir()
     (folder / "frame_0000.png").touch()
     os.utime(elsewhere, (0, 0))
@@ -218,7 +216,7 @@ def test_what_a_killed_process_left_goes_at_the_next_write_and_nothing_else(tmp_
     assert not folder.exists(), "its process was killed"
 
 
-def test_a_name_as_long_as_names_can_be_is_written(tmp_path: Path) -> None:
+def test_longest_possible_name_is_written(tmp_path: Path) -> None:
     path = tmp_path / ("n" * 251 + ".txt")
     with atomic_write(path) as temporary_file:
         temporary_file.write_text("whole")
@@ -235,7 +233,7 @@ with hold_lock(Path(sys.argv[1])):
 """
 
 
-def test_a_lock_is_let_go_of_when_its_process_is_killed(tmp_path: Path) -> None:
+def test_lock_is_released_when_its_process_is_killed(tmp_path: Path) -> None:
     path = tmp_path / LOCK
     holder = subprocess.Popen([sys.executable, "-P", "-c", HOLDER, str(path)], stdout=subprocess.PIPE)
     try:
@@ -253,24 +251,24 @@ def test_a_lock_is_let_go_of_when_its_process_is_killed(tmp_path: Path) -> None:
         assert is_locked(path), "of this process too"
 
 
-def test_the_copy_of_a_folder_that_is_locked_is_not_locked(tmp_path: Path) -> None:
+def test_copy_of_a_locked_folder_is_not_locked(tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     with hold_lock(tmp_path / "run" / LOCK):
         shutil.copytree(tmp_path / "run", tmp_path / "copy")
         copied = tmp_path / "copy" / LOCK
-        copied.chmod(0o444)  # as from a read-only place
+        copied.chmod(0o444)  # as from a read-only folder
         assert not is_locked(copied)
         with hold_lock(copied):
             assert is_locked(copied)
 
 
-def test_asking_for_a_lock_writes_nothing(tmp_path: Path) -> None:
+def test_checking_a_lock_writes_nothing(tmp_path: Path) -> None:
     assert not is_locked(tmp_path / LOCK)
     assert not is_locked(tmp_path / "nowhere" / LOCK)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_cannot_be_written_is_not_locked_and_cannot_be_held(
+def test_unwritable_folder_is_not_locked_and_cannot_be_locked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / LOCK).touch()
@@ -288,12 +286,12 @@ def test_what_cannot_be_written_is_not_locked_and_cannot_be_held(
             hold_lock(tmp_path / LOCK),
         ):
             pass
-    refusal[0] = errno.ENOLCK  # a file system without locks: one trains there as before there were any
+    refusal[0] = errno.ENOLCK  # a file system without locks, where training runs unlocked
     with hold_lock(tmp_path / LOCK):
         assert not is_locked(tmp_path / LOCK)
 
 
-def test_a_link_in_the_place_of_a_lock_is_not_followed(tmp_path: Path) -> None:
+def test_link_in_place_of_a_lock_is_not_followed(tmp_path: Path) -> None:
     (tmp_path / "private").write_text("mine")
     (tmp_path / "private").chmod(0o400)
     (tmp_path / LOCK).symlink_to(tmp_path / "private")
@@ -304,6 +302,6 @@ def test_a_link_in_the_place_of_a_lock_is_not_followed(tmp_path: Path) -> None:
     assert (tmp_path / "private").stat().st_mode & 0o777 == 0o400
 
 
-def test_a_name_that_is_too_long_is_one_line(tmp_path: Path) -> None:
+def test_overlong_name_is_reported_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(ProgdfError, match="cannot be read \\(File name too long\\)"):
         load_scene(tmp_path / ("9" * 5000))

@@ -1,4 +1,4 @@
-"""JSON that somebody made to do harm: refused in one line by whatever reads it."""
+"""Tests of hostile JSON: every reader refuses it in one line."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from trainer.store.state import StateFolder
 
 
 @pytest.mark.parametrize("content", JSON_TEXTS.values(), ids=JSON_TEXTS.keys())
-def test_what_no_program_writes_is_no_json(content: str) -> None:
+def test_hostile_json_is_refused(content: str) -> None:
     with pytest.raises(ValueError) as refused:  # noqa: PT011  of one line, whatever it says
         decode_json(content)
     assert "\n" not in str(refused.value)
 
 
-def test_ordinary_values_come_as_they_are() -> None:
+def test_ordinary_values_are_unchanged() -> None:
     text = '{"a": [1, -2.5, true, null, "ä\\ud83d\\ude00"], "b": {"c": 123456789012345678}}'
     assert decode_json(text) == {
         "a": [1, -2.5, True, None, "ä\N{GRINNING FACE}"],
@@ -42,7 +42,7 @@ def test_ordinary_values_come_as_they_are() -> None:
     ],
     ids=["session", "cameras"],
 )
-def test_every_reader_refuses_it_in_one_line(frame: str, content: str, tmp_path: Path) -> None:
+def test_every_reader_refuses_hostile_json_in_one_line(frame: str, content: str, tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     path.write_text(frame % content)
     readers = [lambda: info([str(path)]), lambda: load_cameras(path), lambda: read_session(path, SessionFile)]
@@ -53,7 +53,7 @@ def test_every_reader_refuses_it_in_one_line(frame: str, content: str, tmp_path:
 
 
 @pytest.mark.parametrize("content", JSON_TEXTS.values(), ids=JSON_TEXTS.keys())
-def test_a_run_that_was_stopped_with_it_is_damaged(content: str, tmp_path: Path) -> None:
+def test_stopped_run_with_hostile_json_is_damaged(content: str, tmp_path: Path) -> None:
     folder = StateFolder(tmp_path)
     (tmp_path / "run.json").write_text(f'{{"options": {content}}}')
     with pytest.raises(ProgdfError, match="is damaged"):

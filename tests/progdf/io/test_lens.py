@@ -1,4 +1,4 @@
-"""Lens distortion: photographs are straightened exactly where they show something."""
+"""Tests of lens distortion: photographs are undistorted exactly inside their visible area."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ HEIGHT = 96
 
 
 def pattern(rays: Tensor) -> Tensor:
-    """A smooth world on the plane z = 1: what color each ray has. [...,2] -> [...,3]"""
+    """Return the color of each ray in a smooth world on the plane z = 1. [...,2] -> [...,3]"""
     x = rays[..., 0]
     y = rays[..., 1]
     return 0.5 + 0.4 * torch.stack([torch.sin(7 * x), torch.sin(6 * y), torch.cos(5 * (x + y))], dim=-1)
@@ -30,7 +30,7 @@ def pixel_rays() -> Tensor:
 
 
 def photograph(lens: Lens) -> Tensor:
-    """What a camera with this lens sees of `pattern`: the ray of each pixel by fixed-point iteration."""
+    """Return `pattern` through a camera with this lens. Fixed-point iteration finds the ray of each pixel."""
     seen = pixel_rays()
     rays = seen.clone()
     for _ in range(200):
@@ -39,7 +39,7 @@ def photograph(lens: Lens) -> Tensor:
     return pattern(rays).float()
 
 
-def test_a_photograph_is_straightened_to_what_a_pinhole_sees() -> None:
+def test_undistorted_photograph_matches_a_pinhole_camera() -> None:
     straight, shown = undistort(photograph(BARREL), K, BARREL)
     expected = pattern(pixel_rays()).float()
     assert float(shown.float().mean()) > 0.7
@@ -51,7 +51,7 @@ def test_a_photograph_is_straightened_to_what_a_pinhole_sees() -> None:
     assert float(bent) > 0.05, "the lens bends too little to test anything"
 
 
-def test_what_the_photograph_does_not_show_is_told() -> None:
+def test_area_outside_the_photograph_is_masked() -> None:
     pincushion = Lens(k1=0.4)
     straight, shown = undistort(photograph(Lens()), K, pincushion)
     for row, column in ((0, 0), (0, -1), (-1, 0), (-1, -1)):
@@ -60,19 +60,19 @@ def test_what_the_photograph_does_not_show_is_told() -> None:
     assert float(straight[~shown].abs().max()) == 0.0
 
 
-def test_the_edge_of_a_photograph_is_not_darkened() -> None:
+def test_edge_of_a_photograph_is_not_darkened() -> None:
     straight, shown = undistort(torch.ones(HEIGHT, WIDTH, 3), K, Lens(k1=0.1))
     torch.testing.assert_close(straight[shown], torch.ones(int(shown.sum()), 3))
 
 
-def test_no_lens_changes_no_bit() -> None:
+def test_identity_lens_changes_nothing() -> None:
     image = photograph(Lens())
     straight, shown = undistort(image, K, Lens())
     assert bool(shown.all())
     torch.testing.assert_close(straight, image, atol=2e-5, rtol=0)
 
 
-def test_where_the_formula_folds_back_nothing_is_shown() -> None:
+def test_nothing_is_shown_beyond_the_fold_of_the_formula() -> None:
     folding = Lens(k1=-0.6)
     wide = torch.tensor([[40.0, 0.0, 64.0], [0.0, 40.0, 48.0], [0.0, 0.0, 1.0]])
     _, shown = undistort(torch.rand(HEIGHT, WIDTH, 3), wide, folding)
@@ -83,23 +83,21 @@ def test_where_the_formula_folds_back_nothing_is_shown() -> None:
 @pytest.mark.parametrize(
     ("lens", "radius"),
     [
-        (Lens(k1=-0.6), (1 / 1.8) ** (1 / 2)),  # r (1 - 0.6 r²) turns round where 1 - 1.8 r² is 0
+        (Lens(k1=-0.6), (1 / 1.8) ** (1 / 2)),  # r (1 - 0.6 r²) has its maximum where 1 - 1.8 r² is 0
         (Lens(k2=-0.3), (1 / 1.5) ** (1 / 4)),
         (Lens(k3=-0.2), (1 / 1.4) ** (1 / 6)),
-        (Lens(k1=-0.05), (1 / 0.15) ** (1 / 2)),  # 69° to the side
+        (Lens(k1=-0.05), (1 / 0.15) ** (1 / 2)),  # 69° off axis
         (Lens(k1=0.3), math.inf),
         (Lens(p1=0.1, p2=0.1), math.inf),
     ],
 )
-def test_the_valid_radius_is_where_the_radial_part_turns_round_and_never_beyond(
-    lens: Lens, radius: float
-) -> None:
+def test_valid_radius_is_at_most_the_maximum_of_the_radial_part(lens: Lens, radius: float) -> None:
     found = lens.valid_radius()
     assert found <= radius
     assert found == pytest.approx(radius, abs=2e-3)
 
 
-def test_a_lens_that_bends_nothing_is_false() -> None:
+def test_lens_without_distortion_is_false() -> None:
     assert not Lens()
     assert Lens(p2=1e-9)
     with pytest.raises(ValueError, match="finite"):

@@ -1,4 +1,4 @@
-"""Masks in the forms in which programs write them."""
+"""Tests of masks in the forms that programs write."""
 
 from __future__ import annotations
 
@@ -68,14 +68,14 @@ def test_tiff_masks_of_zeros_and_ones_are_read(tmp_path: Path, kind: type) -> No
     assert torch.equal(read_mask(tmp_path / "m.tif", (32, 24)), torch.from_numpy(SHAPE).float())
 
 
-def test_soft_alpha_stays_soft_and_a_mask_of_another_size_is_averaged(tmp_path: Path) -> None:
+def test_soft_alpha_is_kept_and_other_sizes_are_averaged(tmp_path: Path) -> None:
     alpha = np.linspace(0, 255, 32).round() * np.ones((24, 1))
     with_alpha(np.array([9, 9, 9]), alpha).save(tmp_path / "m.png")
     half = torch.from_numpy(alpha.reshape(12, 2, 16, 2).mean(axis=(1, 3)).astype(np.float32) / 255)
     assert torch.allclose(read_mask(tmp_path / "m.png", (16, 12)), half, atol=1.1 / 255)
 
 
-def test_a_map_of_labels_is_refused(tmp_path: Path) -> None:
+def test_label_map_is_refused(tmp_path: Path) -> None:
     colors = np.zeros((24, 32, 3), np.uint8)
     colors[SHAPE] = (128, 0, 0)
     colors[:4] = (0, 128, 0)

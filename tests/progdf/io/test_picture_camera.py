@@ -1,4 +1,4 @@
-"""A picture carries the camera from which it was rendered, and is found one where a program dropped it."""
+"""Tests of the camera stored in a rendered picture, and of substitutes where a program removed it."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def assert_same(found: Camera | None, expected: Camera) -> None:
     assert (found.width, found.height) == (expected.width, expected.height)
 
 
-def test_a_picture_gives_back_the_camera_that_it_carries_to_the_bit(tmp_path: Path) -> None:
+def test_picture_returns_its_stored_camera_to_the_bit(tmp_path: Path) -> None:
     camera = some_cameras()[1]
     path = saved(tmp_path / "A.png", camera)
     assert_same(find_picture_camera(path), camera)
@@ -47,7 +47,7 @@ def test_a_picture_gives_back_the_camera_that_it_carries_to_the_bit(tmp_path: Pa
     assert_same(load_cameras(path)[0], camera)
 
 
-def test_a_text_behind_the_pixels_is_found_too(tmp_path: Path) -> None:
+def test_text_chunk_after_the_pixels_is_found(tmp_path: Path) -> None:
     path = saved(tmp_path / "A.png", some_cameras()[1])
     content = path.read_bytes()
     at = content.index(b"tEXt") - 4
@@ -58,16 +58,16 @@ def test_a_text_behind_the_pixels_is_found_too(tmp_path: Path) -> None:
     assert_same(find_picture_camera(path), some_cameras()[1])
 
 
-def test_a_file_beside_the_picture_stands_in_for_the_text(tmp_path: Path) -> None:
+def test_camera_file_beside_the_picture_replaces_the_text(tmp_path: Path) -> None:
     camera, other = some_cameras()[:2]
     path = saved(tmp_path / "A.png", None)
     save_cameras(tmp_path / "A.camera.json", [camera])
     assert_same(find_picture_camera(path), camera)
-    saved(path, other)  # what it carries itself goes first
+    saved(path, other)  # the camera in the picture has priority
     assert_same(find_picture_camera(path), other)
 
 
-def test_a_jpeg_takes_the_given_camera_of_its_name(tmp_path: Path) -> None:
+def test_jpeg_takes_the_given_camera_of_its_name(tmp_path: Path) -> None:
     cameras = some_cameras()
     for name in (cameras[2].name, f"images/{cameras[2].name}.PNG"):
         named = [*cameras[:2], Camera(cameras[2].viewmat, cameras[2].K, 320, 200, name)]
@@ -76,7 +76,7 @@ def test_a_jpeg_takes_the_given_camera_of_its_name(tmp_path: Path) -> None:
         assert_same(find_picture_camera(path, named), cameras[2])
 
 
-def test_a_picture_without_any_camera_is_one_line(tmp_path: Path) -> None:
+def test_picture_without_a_camera_is_reported_in_one_line(tmp_path: Path) -> None:
     path = saved(tmp_path / "A.png", None)
     message = refusal(find_picture_camera, path)
     assert "A.camera.json" in message
@@ -91,7 +91,7 @@ def test_a_picture_without_any_camera_is_one_line(tmp_path: Path) -> None:
         find_picture_camera(path, twice)
 
 
-def test_files_that_are_no_pictures_are_one_line(tmp_path: Path) -> None:
+def test_files_that_are_no_pictures_are_reported_in_one_line(tmp_path: Path) -> None:
     path = tmp_path / "A.png"
     assert "does not exist" in refusal(find_picture_camera, path)
     path.write_bytes(b"\x89PNG\r\n\x1a\n")
@@ -124,11 +124,11 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("what", HOSTILE)
-def test_a_hostile_text_is_one_line(tmp_path: Path, what: str) -> None:
+def test_hostile_text_is_reported_in_one_line(tmp_path: Path, what: str) -> None:
     refusal(camera_in_picture, with_text(tmp_path / "A.png", HOSTILE[what]))
 
 
-def test_a_text_that_unpacks_to_gigabytes_is_one_line(tmp_path: Path) -> None:
+def test_text_that_unpacks_to_gigabytes_is_reported_in_one_line(tmp_path: Path) -> None:
     path = with_text(tmp_path / "A.png", " " * (64 << 20), zipped=True)
     assert path.stat().st_size < 1 << 20
     refusal(camera_in_picture, path)

@@ -1,4 +1,4 @@
-"""Names of views, and the pictures found for them in folders."""
+"""Tests of view names and of finding their pictures in folders."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def touch(folder: Path, *names: str) -> Path:
     return folder
 
 
-def test_endings_are_those_of_the_formats_that_are_read() -> None:
+def test_endings_match_the_formats_that_are_read() -> None:
     Image.init()
     read = {ending for ending, kind in Image.registered_extensions().items() if kind in images.FORMATS}
     assert set(ENDINGS) == read
@@ -39,18 +39,18 @@ def test_two_pictures_of_one_name_are_refused_by_naming_both(tmp_path: Path) -> 
         find_picture(tmp_path, "a")
 
 
-def test_a_name_in_the_same_case_goes_before_another(tmp_path: Path) -> None:
+def test_name_in_the_same_case_is_preferred(tmp_path: Path) -> None:
     touch(tmp_path, "a.png", "A.png")
     assert find_picture(tmp_path, "A") == tmp_path / "A.png"
 
 
-def test_a_picture_of_a_name_with_signs_is_found_by_its_view(tmp_path: Path) -> None:
+def test_picture_with_special_characters_is_found_by_its_view(tmp_path: Path) -> None:
     touch(tmp_path, "my shot (1).JPG", "caf\u00e9.png")
     assert find_picture(tmp_path, view_name("my shot (1).jpg") or "") == tmp_path / "my shot (1).JPG"
     assert find_picture(tmp_path, view_name("cafe\u0301.png") or "") == tmp_path / "caf\u00e9.png"
 
 
-def test_a_format_that_is_not_read_is_named(tmp_path: Path) -> None:
+def test_unsupported_format_is_named(tmp_path: Path) -> None:
     touch(tmp_path, "a.HEIC")
     with pytest.raises(ProgdfError, match=r"a\.HEIC uses the picture format HEIC.*save it as PNG"):
         PictureFolder(tmp_path).require("a", "put it there")
@@ -65,7 +65,7 @@ def test_pictures_in_subfolders_are_found_by_their_path(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
-def test_a_flat_picture_of_two_views_is_of_neither(tmp_path: Path) -> None:
+def test_picture_that_fits_two_views_is_used_for_neither(tmp_path: Path) -> None:
     touch(tmp_path, "1.png")
     pictures = PictureFolder(tmp_path, ["cam0/1", "cam1/1"])
     assert pictures.find("cam0/1") is None
@@ -93,7 +93,7 @@ def test_view_names_are_safe_relative_paths(name: str, expected: str | None) -> 
     assert view_name(name) == expected
 
 
-def test_the_folder_of_all_photographs_is_no_part_of_their_names() -> None:
+def test_common_folder_is_not_part_of_picture_names() -> None:
     assert without_common_folder(["images/a.png", "images/b.png"]) == ["a.png", "b.png"]
     assert without_common_folder(["../d/cam0/1.png", "../d/cam1/1.png"]) == ["cam0/1.png", "cam1/1.png"]
     assert without_common_folder(["./train/r_0", "./test/r_0"]) == ["train/r_0", "test/r_0"]

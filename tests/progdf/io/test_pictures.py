@@ -1,4 +1,4 @@
-"""Contact sheets: every picture is there unchanged, every word is there."""
+"""Tests of contact sheets and of reading and writing pictures."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ def _found(sheet: Tensor, red: float) -> int:
     return int(((sheet - wanted).abs().amax(dim=2) < 1 / 255).sum())
 
 
-def test_every_picture_is_on_the_sheet_pixel_for_pixel() -> None:
+def test_contact_sheet_contains_every_picture_unchanged() -> None:
     shades = [0.0, 0.25, 0.5, 0.75, 1.0]
     sheet = contact_sheet([[_plain(r) for r in shades[:3]], [_plain(r) for r in shades[3:]]])
     assert [_found(sheet, red) for red in shades] == [40 * 50] * 5
 
 
-def test_words_take_room_beside_the_pictures_not_over_them() -> None:
+def test_labels_do_not_cover_pictures() -> None:
     rows = [[_plain(0.3)], [_plain(0.6)]]
     bare = contact_sheet(rows)
     worded = contact_sheet(rows, ["one", "a longer word"], ["strength 0.5"], "Title", "caption")
@@ -52,7 +52,7 @@ def test_words_take_room_beside_the_pictures_not_over_them() -> None:
     assert dark > 50
 
 
-def test_a_long_title_widens_the_sheet() -> None:
+def test_long_title_widens_the_sheet() -> None:
     sheet = contact_sheet([[_plain(0.3)]], title="a title far longer than one small picture is wide")
     assert sheet.shape[1] > 300
     assert (sheet[:, -3:] - sheet[0, 0]).abs().max() < 1e-6
@@ -65,31 +65,31 @@ def test_pictures_of_different_sizes_are_refused() -> None:
         contact_sheet([])
 
 
-def test_more_words_than_columns_are_refused() -> None:
+def test_more_labels_than_columns_are_refused() -> None:
     with pytest.raises(ValueError, match="2 column labels"):
         contact_sheet([[_plain(0.1)]], column_labels=["a", "b"])
 
 
-def test_an_image_is_atomic_write_and_cut_to_what_a_file_can_hold(tmp_path: Path) -> None:
+def test_image_is_written_atomically_and_clamped(tmp_path: Path) -> None:
     path = tmp_path / "new" / "a.png"
     write_image(path, torch.tensor([[[-1.0, 0.5, 2.0]]]))
     assert np.asarray(Image.open(path)).tolist() == [[[0, 128, 255]]]
     assert [p.name for p in path.parent.iterdir()] == ["a.png"]
 
 
-def test_an_image_for_a_folder_that_cannot_be_is_one_line(tmp_path: Path) -> None:
+def test_image_for_an_impossible_folder_is_reported_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "taken").touch()
     with pytest.raises(ProgdfError, match="taken is a file; give the name of a folder"):
         write_image(tmp_path / "taken" / "a.png", torch.zeros(1, 1, 3))
 
 
 def chunk(kind: bytes, content: bytes) -> bytes:
-    """A part of a .png."""
+    """Return a chunk of a .png."""
     return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
 
 
 def bomb(path: Path, width: int, height: int) -> Path:
-    """A PNG of a few kilobytes that claims many pixels."""
+    """Write a PNG of a few kilobytes that claims many pixels."""
     header = struct.pack(">IIBBBBB", width, height, 8, 6, 0, 0, 0)
     rows = chunk(b"IDAT", zlib.compress(b"\0" * 2_000_000, 9))
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + rows + chunk(b"IEND", b""))
@@ -97,9 +97,7 @@ def bomb(path: Path, width: int, height: int) -> Path:
 
 
 @pytest.mark.parametrize("size", [(13_000, 13_000), (1_000_000_000, 1), (8_200, 8_200)])
-def test_a_picture_that_claims_too_much_is_refused_before_it_is_unpacked(
-    size: tuple[int, int], tmp_path: Path
-) -> None:
+def test_oversized_picture_is_refused_before_unpacking(size: tuple[int, int], tmp_path: Path) -> None:
     path = bomb(tmp_path / "a.png", *size)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     refusal(open_picture, path)
@@ -107,20 +105,20 @@ def test_a_picture_that_claims_too_much_is_refused_before_it_is_unpacked(
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
 
 
-def test_a_picture_of_other_proportions_is_not_unpacked(tmp_path: Path) -> None:
+def test_picture_of_other_proportions_is_not_unpacked(tmp_path: Path) -> None:
     path = bomb(tmp_path / "a.png", 8_000, 8_000)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     assert "proportions" in refusal(lambda p: open_picture(p, (40, 30)), path)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
 
 
-def test_what_needs_a_program_to_be_read_is_no_picture(tmp_path: Path) -> None:
+def test_postscript_is_not_a_picture(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
     path.write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 4 4\n%%EndComments\n")
     refusal(open_picture, path)
 
 
-def test_transparency_counts_as_the_paper(tmp_path: Path) -> None:
+def test_transparency_becomes_the_background(tmp_path: Path) -> None:
     Image.new("RGBA", (4, 2), (255, 0, 0, 0)).save(tmp_path / "a.png")
     Image.new("L", (4, 2), 7).save(tmp_path / "b.png")
     assert flatten_onto(open_picture(tmp_path / "a.png"), "white").getpixel((0, 0)) == (255, 255, 255)
@@ -129,11 +127,14 @@ def test_transparency_counts_as_the_paper(tmp_path: Path) -> None:
 
 
 RAMP = np.linspace(0.0, 1.0, 64)[None, :].repeat(16, axis=0)
-"""From black on the left to white on the right. [16,64]"""
+"""Ramp from black on the left to white on the right. [16,64]"""
 
 
 def write_png(path: Path, ramp: np.ndarray, color: int, *extra: tuple[bytes, bytes]) -> Path:
-    """A .png of 16 bits a channel: `color` 0 gray, 2 RGB, 4 and 6 the same with alpha; more chunks last."""
+    """Write a .png with 16 bits per channel, more chunks last.
+
+    `color` is 0 for gray, 2 for RGB, and 4 and 6 for the same with alpha.
+    """
     gray = np.round(ramp * 65535).astype(np.uint16)[..., None]
     channels = [gray] * (1 if color in (0, 4) else 3) + [np.full_like(gray, 65535)] * (color >= 4)
     pixels = np.concatenate(channels, axis=2).astype(">u2")
@@ -147,7 +148,10 @@ def write_png(path: Path, ramp: np.ndarray, color: int, *extra: tuple[bytes, byt
 def write_tiff(
     path: Path, pixels: bytes, bits: int, kind: int = 1, interpretation: int = 1, order: str = "<"
 ) -> Path:
-    """A .tiff of one gray strip as large as `RAMP`; `kind` 1 without, 2 with a sign, 3 floating-point."""
+    """Write a .tiff of one gray strip of the size of `RAMP`.
+
+    `kind` is 1 for unsigned, 2 for signed and 3 for floating-point values.
+    """
     height, width = RAMP.shape
     tags = {256: width, 257: height, 258: bits, 259: 1, 262: interpretation, 273: 8, 277: 1, 278: height}
     tags |= {279: len(pixels), 339: kind}
@@ -158,7 +162,7 @@ def write_tiff(
 
 
 def twelve_bits(ramp: np.ndarray) -> bytes:
-    """Two numbers in three bytes."""
+    """Pack two values into three bytes."""
     a, b = np.round(ramp * 4095).astype(np.uint16).reshape(-1, 2).T
     return np.stack([a >> 4, (a & 15) << 4 | b >> 8, b & 255], axis=1).astype(np.uint8).tobytes()
 
@@ -187,14 +191,14 @@ RAMPS = {
 
 
 @pytest.mark.parametrize("kind", RAMPS)
-def test_a_ramp_of_any_depth_is_a_ramp(kind: str, tmp_path: Path) -> None:
+def test_ramp_of_any_depth_is_read(kind: str, tmp_path: Path) -> None:
     RAMPS[kind](tmp_path)
     found = read_picture(next(tmp_path.iterdir())).numpy()
     np.testing.assert_allclose(found, RAMP[..., None].repeat(3, axis=2), atol=1.01 / 255)
 
 
 @pytest.mark.parametrize("form", ["<u4", "<i4", "<f4", "<i2"])
-def test_numbers_without_a_white_are_refused(form: str, tmp_path: Path) -> None:
+def test_values_without_a_white_level_are_refused(form: str, tmp_path: Path) -> None:
     kind = {"u": 1, "i": 2, "f": 3}[form[1]]
     path = write_tiff(tmp_path / "a.tiff", (RAMP * 1000).astype(form).tobytes(), 8 * int(form[2]), kind)
     assert "which have no white; save it in gray or RGB with 8 or 16 bits" in refusal(open_picture, path)
@@ -202,7 +206,7 @@ def test_numbers_without_a_white_are_refused(form: str, tmp_path: Path) -> None:
     assert "holds LAB colors; save it in gray or RGB" in refusal(open_picture, tmp_path / "lab.tiff")
 
 
-def test_the_transparent_gray_of_16_bits_is_transparent(tmp_path: Path) -> None:
+def test_transparent_gray_of_16_bits_is_transparent(tmp_path: Path) -> None:
     path = write_png(tmp_path / "a.png", RAMP, 0)
     content = path.read_bytes()
     at = content.index(b"IDAT") - 4
@@ -212,16 +216,16 @@ def test_the_transparent_gray_of_16_bits_is_transparent(tmp_path: Path) -> None:
     assert found[:, 1].max() < 0.1
 
 
-# A turned picture's corners: its upper left is red, its upper right green.
+# Corners of a rotated picture: its upper left is red, its upper right green.
 CORNERS = np.zeros((32, 64, 3), np.uint8)
 CORNERS[:16, :32] = (255, 0, 0)
 CORNERS[:16, 32:] = (0, 255, 0)
 INVERSE = {**{i: i for i in range(1, 8)}, 6: 8, 8: 6}
-"""The turn that takes a turn back."""
+"""EXIF orientation that undoes each orientation."""
 
 
 def stored_turned(path: Path, orientation: int) -> Path:
-    """`CORNERS` stored as a camera that was held so would, with the tag that says it."""
+    """Write `CORNERS` as a rotated camera would store it, with the orientation tag."""
     turn = _TRANSPOSES.get(INVERSE[orientation])
     picture = Image.fromarray(CORNERS)
     exif = Image.Exif()
@@ -235,9 +239,7 @@ def stored_turned(path: Path, orientation: int) -> Path:
 
 @pytest.mark.parametrize("orientation", range(1, 9))
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".tiff"])
-def test_a_picture_that_is_stored_turned_is_read_upright(
-    orientation: int, suffix: str, tmp_path: Path
-) -> None:
+def test_rotated_picture_is_read_upright(orientation: int, suffix: str, tmp_path: Path) -> None:
     path = stored_turned(tmp_path / f"a{suffix}", orientation)
     assert picture_size(path) == (64, 32)
     found = read_picture(path, (64, 32)).numpy()
@@ -250,7 +252,7 @@ def test_a_picture_that_is_stored_turned_is_read_upright(
         assert f"EXIF orientation {orientation}), and nothing says whether its camera was calibrated" in said
 
 
-def test_a_png_that_says_behind_its_pixels_how_it_is_stored_is_read_upright(tmp_path: Path) -> None:
+def test_png_with_orientation_after_its_pixels_is_read_upright(tmp_path: Path) -> None:
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = 3
     path = write_png(tmp_path / "a.png", RAMP[:, ::-1], 0, (b"eXIf", exif.tobytes()[6:]))

@@ -1,4 +1,4 @@
-"""Files of numbers: .npy and safetensors come back; anything else is one line and costs nothing."""
+"""Tests of .npy and safetensors files: values load as saved, other content is one line without allocation."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ TYPES = (
 
 
 def some(dtype: torch.dtype) -> dict[str, Tensor]:
-    """Tensors of a type in every shape that matters: empty, one number, not contiguous."""
+    """Return tensors of a type in every relevant shape: empty, one value, not contiguous."""
     full = torch.arange(24).reshape(2, 3, 4).to(dtype)
     return {"b": full, "none": full[:0], "a": full[1, 2, 3], "turned": full.permute(2, 0, 1)}
 
 
 @pytest.mark.parametrize("dtype", TYPES, ids=str)
-def test_the_library_reads_every_type_and_shape(tmp_path: Path, dtype: torch.dtype) -> None:
+def test_safetensors_reads_every_type_and_shape(tmp_path: Path, dtype: torch.dtype) -> None:
     tensors = {**some(dtype), "wide": torch.tensor([0.1], dtype=torch.float64)}
     write_tensors(tmp_path / "x", tensors, {"z": "ä", "a": '"{}"'})
     found = load_file(tmp_path / "x")
@@ -46,7 +46,7 @@ def test_the_library_reads_every_type_and_shape(tmp_path: Path, dtype: torch.dty
     assert not metadata
 
 
-def test_the_order_in_which_things_are_given_changes_no_byte(tmp_path: Path) -> None:
+def test_input_order_changes_no_byte(tmp_path: Path) -> None:
     tensors = some(torch.float32)
     metadata = {"format": "1", "about": "2", "sha": "3"}
     write_tensors(tmp_path / "x", tensors, metadata)
@@ -54,13 +54,13 @@ def test_the_order_in_which_things_are_given_changes_no_byte(tmp_path: Path) -> 
     assert (tmp_path / "x").read_bytes() == (tmp_path / "y").read_bytes()
 
 
-def test_every_tensor_lies_where_its_type_is_aligned(tmp_path: Path) -> None:
+def test_every_tensor_is_aligned_to_its_type(tmp_path: Path) -> None:
     tensors = {"a": torch.zeros(3, dtype=torch.int8), "b": torch.zeros(5, dtype=torch.float16)}
     write_tensors(tmp_path / "x", {**tensors, "c": torch.ones(1, dtype=torch.float64)}, {})
     content = (tmp_path / "x").read_bytes()
     size = int.from_bytes(content[:8], "little")
     assert size % 8 == 0
-    assert content[8 + size : 16 + size] == b"\0\0\0\0\0\0\xf0\x3f"  # 1.0 comes first
+    assert content[8 + size : 16 + size] == b"\0\0\0\0\0\0\xf0\x3f"  # 1.0 is first
 
 
 def test_every_flipped_bit_is_noticed(tmp_path: Path) -> None:
@@ -81,13 +81,13 @@ def test_every_flipped_bit_is_noticed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("header", NPY_HEADERS.values(), ids=NPY_HEADERS.keys())
-def test_a_hostile_header_is_refused_and_allocates_nothing(header: bytes, tmp_path: Path) -> None:
+def test_hostile_header_is_refused_without_allocation(header: bytes, tmp_path: Path) -> None:
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     refusal(open_npy, npy(tmp_path / "a.npy", header))
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
 
 
-def test_what_is_no_npy_at_all_is_refused(tmp_path: Path) -> None:
+def test_other_content_is_no_npy(tmp_path: Path) -> None:
     path = tmp_path / "a.npy"
     for content in (b"", b"\x93NUMPY", b"PK\x03\x04", b"\x93NUMPY\x07\x00" + b"\0" * 90):
         path.write_bytes(content)
@@ -96,7 +96,7 @@ def test_what_is_no_npy_at_all_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("dtype", ["<f4", ">i2", "u1", "?"])
-def test_numbers_of_any_type_are_read(dtype: str, tmp_path: Path) -> None:
+def test_arrays_of_any_type_are_read(dtype: str, tmp_path: Path) -> None:
     numbers = np.array([[0, 1], [1, 0]]).astype(dtype)
     np.save(tmp_path / "a.npy", numbers)
     assert np.array_equal(open_npy(tmp_path / "a.npy"), numbers)

@@ -1,4 +1,4 @@
-"""Names in files may hold what commands a terminal; it is shown, and does not happen."""
+"""Tests of names with terminal control characters, which are printed as escapes."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ def harmless(text: str) -> bool:
     return all(line.isprintable() for line in text.splitlines()) and "\r" not in text
 
 
-def test_what_is_nothing_to_look_at_becomes_its_escape() -> None:
+def test_unprintable_characters_become_escapes() -> None:
     assert escape_text(EVIL) == r"a\x1b]0;owned\x07\x1b[2J\r\u202e\x9b"
     assert escape_text("two\nlines") == r"two\nlines"
     assert escape_text("caf\udce9") == r"caf\udce9", "a file name that is no UTF-8"
     assert escape_text("Größe 12 345 × “…” 界") == "Größe 12 345 × “…” 界"
 
 
-def test_an_error_is_one_line_whatever_names_it_tells() -> None:
+def test_error_has_one_line_for_any_name() -> None:
     told = str(ProgdfError(f"camera {EVIL}\nis broken; export it again"))
     assert told.endswith("is broken; export it again")
     assert told.isprintable()
 
 
-def test_info_shows_names_of_a_ply_harmlessly(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_escapes_names_of_a_ply(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     evil = EVIL.replace("\r", "").encode("ascii", "ignore").decode().replace(" ", "")
     path = write(tmp_path / "scene.ply", with_extra("label", "u1", 5)(table_of(scene_of(0))))
     path.write_bytes(path.read_bytes().replace(b"label", evil.encode()))
@@ -49,7 +49,7 @@ def test_info_shows_names_of_a_ply_harmlessly(tmp_path: Path, capsys: pytest.Cap
     assert harmless(told)
 
 
-def test_info_shows_names_of_edits_sessions_and_cameras_harmlessly(
+def test_info_escapes_names_of_edits_sessions_and_cameras(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     session = {
@@ -66,7 +66,7 @@ def test_info_shows_names_of_edits_sessions_and_cameras_harmlessly(
         assert harmless(capsys.readouterr().out)
 
 
-def test_an_error_line_and_a_warning_are_harmless(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_error_line_and_warning_are_escaped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info", str(tmp_path / f"{EVIL}\nb.ply")]) == 2
     told = capsys.readouterr().err
     assert told.count("\n") == 1
@@ -75,7 +75,7 @@ def test_an_error_line_and_a_warning_are_harmless(tmp_path: Path, capsys: pytest
     assert harmless(PrintableFormatter().format(record))
 
 
-def test_the_log_of_a_run_is_harmless(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_log_of_a_run_is_escaped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = RunLog(tmp_path / "log.txt")
     log.say(EVIL)
     log.close()

@@ -1,4 +1,4 @@
-"""Several files that appear together: stopped by an error, an interrupt, a full disk and kill -9."""
+"""Tests of files that appear together, stopped by an error, an interrupt, a full disk and kill -9."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_files_are_replaced_together(tmp_path: Path) -> None:
     assert contents(tmp_path / "x") == NEW
 
 
-def test_new_folder_appears_whole(tmp_path: Path) -> None:
+def test_new_folder_appears_complete(tmp_path: Path) -> None:
     write_new(tmp_path / "x")
     assert contents(tmp_path / "x") == dict.fromkeys(NAMES, "new")
     assert [path.name for path in tmp_path.iterdir()] == ["x"]
@@ -80,7 +80,9 @@ def test_failed_block_changes_nothing(tmp_path: Path, error: BaseException, exis
     assert (tmp_path / "x").exists() == exists
 
 
-def test_interrupt_between_moves_ends_with_all_new(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupt_between_moves_ends_with_all_new_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = write_old(tmp_path / "x")
     moved = 0
     move = atomic.replace_file
@@ -127,7 +129,7 @@ def test_kill_between_moves_is_finished_by_the_next_write(tmp_path: Path, number
 
 
 @posix
-def test_kill_within_the_block_leaves_the_old(tmp_path: Path) -> None:
+def test_kill_within_the_block_leaves_the_old_files(tmp_path: Path) -> None:
     folder = write_old(tmp_path / "x")
 
     def killed() -> None:
@@ -161,7 +163,7 @@ def test_complete_set_of_another_user_is_not_moved(tmp_path: Path, monkeypatch: 
     assert not (tmp_path / "a").exists()
 
 
-def test_folder_in_a_file_s_place_is_refused(tmp_path: Path) -> None:
+def test_folder_in_place_of_a_file_is_refused(tmp_path: Path) -> None:
     folder = write_old(tmp_path / "x")
     (folder / "b").unlink()
     (folder / "b").mkdir()
@@ -171,7 +173,7 @@ def test_folder_in_a_file_s_place_is_refused(tmp_path: Path) -> None:
 
 
 @posix
-def test_permissions_and_links(tmp_path: Path) -> None:
+def test_permissions_are_kept_and_links_are_replaced(tmp_path: Path) -> None:
     folder = write_old(tmp_path / "x")
     (folder / "a").chmod(0o640)
     (folder / "b").unlink()
@@ -182,7 +184,7 @@ def test_permissions_and_links(tmp_path: Path) -> None:
     assert (folder / "other").read_text() == "old"
 
 
-def test_missing_parent_is_one_line(tmp_path: Path) -> None:
+def test_missing_parent_is_reported_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(ProgdfError, match="does not exist; create it first"):
         write_new(tmp_path / "no" / "x")
 
@@ -240,7 +242,7 @@ def pictures(count: int, stop: BaseException | None = None) -> Iterator[film.Pix
 
 
 @pytest.mark.parametrize("exists", [True, False])
-def test_stopped_film_leaves_the_folder_as_it_was(tmp_path: Path, exists: bool) -> None:
+def test_stopped_film_leaves_the_folder_unchanged(tmp_path: Path, exists: bool) -> None:
     folder = tmp_path / "film"
     if exists:
         folder.mkdir()
