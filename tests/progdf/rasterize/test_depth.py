@@ -1,4 +1,4 @@
-"""Rendered depth: what it is, that it has the picture's own weights, and that all engines agree."""
+"""Tests of rendered depth: its definition, its weights, and agreement of all engines."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ pytestmark = pytest.mark.usefixtures("two_threads")
 
 
 def _wall(z: float, opacity: float) -> Gaussians:
-    """A Gaussian so broad that it covers the whole picture evenly."""
+    """Return a Gaussian so wide that it covers the whole picture evenly."""
     return one_gaussian(
         mean=(0.0, 0.0, z), scales=(1e3, 1e3, 1e-3), quat=(1.0, 0.0, 0.0, 0.0), opacity=opacity
     )
 
 
 @pytest.mark.parametrize("engine", EVERY)
-def test_depth_is_the_mean_of_what_a_pixel_shows_by_what_each_contributes(engine: str) -> None:
+def test_depth_is_the_mean_weighted_by_contribution(engine: str) -> None:
     camera = front_camera()
     found = render_depth(concatenate(_wall(5.0, 0.8), _wall(2.0, 0.5)), camera, engine)
     near = 0.5
@@ -36,7 +36,7 @@ def test_depth_is_the_mean_of_what_a_pixel_shows_by_what_each_contributes(engine
 
 @pytest.mark.parametrize("engine", FAST)
 @pytest.mark.parametrize("name", CASES)
-def test_a_fast_engine_draws_the_references_depth_of_each_hard_case(name: str, engine: str) -> None:
+def test_fast_engine_matches_the_reference_depth_in_each_hard_case(name: str, engine: str) -> None:
     case = CASES[name]
     found, expected = (render_depth(case.gaussians, case.camera, some) for some in (engine, "reference"))
     assert bool(found.depth.isfinite().all())
@@ -45,13 +45,13 @@ def test_a_fast_engine_draws_the_references_depth_of_each_hard_case(name: str, e
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_depth_is_drawn_exactly_where_the_picture_is(name: str) -> None:
+def test_depth_alpha_matches_the_picture(name: str) -> None:
     case = CASES[name]
     alpha = 1.0 - render(case.gaussians, case.camera).transmittance
     torch.testing.assert_close(render_depth(case.gaussians, case.camera).alpha, alpha, rtol=0, atol=1e-5)
 
 
-def test_the_depth_of_a_crop_is_that_of_the_picture() -> None:
+def test_depth_of_a_crop_matches_the_whole_picture() -> None:
     scene = random_gaussians(300, seed=4, sh_degree=1)
     camera = orbit_camera(90, 60)
     whole = render_depth(scene, camera)
@@ -60,7 +60,7 @@ def test_the_depth_of_a_crop_is_that_of_the_picture() -> None:
     assert torch.equal(part.alpha, whole.alpha[10:43, 20:71])
 
 
-def test_a_scene_that_moves_away_gets_deeper_by_as_much_and_its_gradient_says_so() -> None:
+def test_depth_and_its_gradient_follow_the_scene() -> None:
     camera = front_camera()
     scene = one_gaussian()
     means = scene.means.clone().requires_grad_()

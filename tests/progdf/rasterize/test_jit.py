@@ -1,4 +1,4 @@
-"""The cache of compiled kernels, where a cut file costs a compilation; eight numbers at once, as in numpy."""
+"""Tests of the kernel cache, whose truncated files are recompiled, and of vectors of eight numbers."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def twice(cache: Path) -> Callable[[float], float]:
-    """The kernel as a new process has it: compiled, or from the cache."""
+    """Return the kernel as a new process gets it, compiled or from the cache."""
     spec = importlib.util.spec_from_file_location("kernels", cache.parent / "kernels.py")
     assert spec is not None
     assert spec.loader is not None
@@ -67,9 +67,7 @@ def twice(cache: Path) -> Callable[[float], float]:
 
 @pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
 @pytest.mark.parametrize("share", [0.0, 0.5])
-def test_a_file_that_was_cut_short_is_dropped_and_compiled_anew(
-    suffix: str, share: float, cache: Path
-) -> None:
+def test_truncated_cache_file_is_dropped_and_recompiled(suffix: str, share: float, cache: Path) -> None:
     assert twice(cache)(4) == 8
     (file,) = cache.rglob(f"*{suffix}")
     content = file.read_bytes()
@@ -79,7 +77,7 @@ def test_a_file_that_was_cut_short_is_dropped_and_compiled_anew(
     assert twice(cache)(4) == 8
 
 
-def test_a_cold_cache_says_once_that_it_compiles(
+def test_cold_cache_announces_compilation_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
@@ -94,7 +92,7 @@ def test_a_cold_cache_says_once_that_it_compiles(
 
 @pytest.fixture
 def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The user's folder among temporary files, where there is no other."""
+    """Return the user's temporary folder, the only writable one."""
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     return atomic.temporary_folder()
@@ -104,7 +102,7 @@ def homeless() -> Path:
     raise RuntimeError("Could not determine home directory.")
 
 
-def test_without_a_home_the_kernels_are_kept_among_temporary_files(
+def test_kernels_are_cached_in_temporary_files_without_a_home(
     temporary: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("pathlib.Path.home", homeless)
@@ -113,7 +111,7 @@ def test_without_a_home_the_kernels_are_kept_among_temporary_files(
     assert atomic.state_folder() == temporary
 
 
-def test_where_the_cache_cannot_be_written_all_processes_share_one_elsewhere(
+def test_processes_share_a_temporary_cache_if_the_cache_is_unwritable(
     temporary: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "file").touch()
@@ -125,7 +123,7 @@ def test_where_the_cache_cannot_be_written_all_processes_share_one_elsewhere(
     assert folder == jit.find_cache_folder()
 
 
-def test_a_temporary_folder_that_others_may_write_to_is_not_used(
+def test_temporary_folder_writable_by_others_is_not_used(
     temporary: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("pathlib.Path.home", homeless)
@@ -136,8 +134,8 @@ def test_a_temporary_folder_that_others_may_write_to_is_not_used(
     assert os.stat(folder).st_mode & 0o077 == 0
 
 
-def test_a_second_process_waits_for_the_kernels_that_another_compiles(cache: Path) -> None:
-    """Both would write the same files."""
+def test_second_process_waits_for_kernels_that_another_compiles(cache: Path) -> None:
+    """Wait, as both processes would write the same files."""
     assert twice(cache)(4) == 8, "and from here on it is loaded in no time, unless it waits"
     results: list[float] = []
     drawing = threading.Thread(target=lambda: results.append(twice(cache)(4)))
@@ -166,7 +164,7 @@ def _arithmetic(a: Array, b: Array, single: Number, out: Array) -> None:
     store(out, np.uint64(32), added)
 
 
-def test_arithmetic_is_lane_by_lane_and_a_single_number_stands_for_eight() -> None:
+def test_arithmetic_is_per_lane_and_broadcasts_a_scalar() -> None:
     a = numbers(0)[0]
     b = numbers(1)[0]
     out = np.zeros(40, np.float32)
@@ -187,7 +185,7 @@ def _comparisons(a: Array, b: Array, out: Array) -> None:
     store(out, np.uint64(24), select((zero < x) & (x < y), x, y))
 
 
-def test_comparisons_choose_lane_by_lane_and_tell_less_from_equal() -> None:
+def test_comparisons_are_per_lane_and_distinguish_less_from_equal() -> None:
     a = numbers(2)[0]
     b = numbers(3)[0]
     b[:3] = a[:3]
@@ -202,7 +200,7 @@ def _at(source: Array, start: Number, out: Array) -> None:
     store(out, start, load(source, start) + lane_indices())
 
 
-def test_loads_and_stores_begin_at_any_place_and_leave_the_rest_alone() -> None:
+def test_loads_and_stores_start_anywhere_and_keep_other_values() -> None:
     source = np.arange(20, dtype=np.float32)
     out = np.full(20, -1, np.float32)
     _at(source, np.uint64(5), out)
@@ -224,7 +222,7 @@ def _sums(rows: Array, out: Array) -> None:
         out[8 + k] = lane_sum(load(flat, np.uint64(8 * k)))
 
 
-def test_eight_sums_at_once_are_eight_sums_one_by_one() -> None:
+def test_eight_sums_at_once_match_eight_single_sums() -> None:
     rows = numbers(4, rows=8)
     out = np.zeros(16, np.float32)
     _sums(rows, out)
@@ -239,7 +237,7 @@ def _wholes(a: Array, out: Array) -> None:
     store(out, np.uint64(8), ldexp(broadcast(np.float32(0.75)), truncate(x)))
 
 
-def test_whole_numbers_are_cut_towards_zero_and_scale_by_powers_of_two() -> None:
+def test_truncation_is_towards_zero_and_ldexp_scales_by_powers_of_two() -> None:
     a = np.array([-125.5, -3.999, -1, -0.5, 0, 0.5, 3.999, 100], np.float32)
     out = np.zeros(16, np.float32)
     _wholes(a, out)
@@ -255,7 +253,7 @@ def _exp2(a: Array, out: Array) -> None:
         store(out, at, powers)
 
 
-def test_powers_of_two_are_right_to_the_last_bits_and_exact_at_whole_numbers() -> None:
+def test_exp2_is_accurate_and_exact_at_integers() -> None:
     a = np.concatenate([np.linspace(-20, 0, 4000), -np.arange(120.0), np.zeros(8)]).astype(np.float32)
     out = np.empty_like(a)
     _exp2(a, out)
@@ -263,7 +261,7 @@ def test_powers_of_two_are_right_to_the_last_bits_and_exact_at_whole_numbers() -
     np.testing.assert_array_equal(out[4000:4120], np.exp2(-np.arange(120.0)))
 
 
-def test_vectors_of_another_type_are_refused_when_the_kernel_is_compiled() -> None:
+def test_vectors_of_another_type_fail_to_compile() -> None:
     from numba.core.errors import TypingError
 
     with pytest.raises(TypingError):

@@ -1,4 +1,4 @@
-"""Fewer Gaussians for a picture in motion: the plain version, the budget, the brightness, and changes."""
+"""Tests of the LOD pyramid: reference version, budget, brightness and changes."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def coarse(camera: Camera) -> Camera:
 
 
 def cloud(count: int, size: float = 0.25, antialiased: bool = False) -> ActivatedGaussians:
-    """Small ones, as in a scene of a million."""
+    """Return small Gaussians, as in a scene of a million."""
     scene = random_gaussians(count, seed=3, sh_degree=2)
     scene = replace(scene, log_scales=scene.log_scales + torch.tensor(size).log(), antialiased=antialiased)
     return activate(scene)
@@ -54,7 +54,7 @@ def picture(scene: ActivatedGaussians, camera: Camera, white: float = 1.0) -> Te
     return render(scene, camera, (white,) * 3).image
 
 
-def test_a_node_has_the_moments_of_all_that_is_below_it() -> None:
+def test_node_has_the_moments_of_all_its_rows() -> None:
     scene = cloud(1003)
     pyramid = Pyramid(scene)
     plain = plain_tree(scene)
@@ -65,7 +65,7 @@ def test_a_node_has_the_moments_of_all_that_is_below_it() -> None:
     first = len(plain) // 2
     leaves = np.array_split(pyramid.nodes.order, [(k * 1003) // (first + 1) for k in range(1, first + 1)])
     assert [set(leaf) for leaf in leaves] == [set(node.rows.tolist()) for node in plain[first:]]
-    # of eight bits each level is half a one off, most often not the same way
+    # an 8-bit value is off by half a level, mostly in different directions
     halves = torch.from_numpy((nodes.shapes[:, SPREAD:].astype(np.uint32) << 16).view(np.float32)).double()
     scales = means[:, LONGEST, None] * shapes[:, SCALES:SPREAD] / 65535.0
     turned = covariances(scales, torch.from_numpy(nodes.quats.astype(np.float64)))
@@ -73,7 +73,7 @@ def test_a_node_has_the_moments_of_all_that_is_below_it() -> None:
         ("spreads", halves[:, 0], [node.spread for node in plain], 2**-7),
         ("contrasts", halves[:, 1], [node.contrast for node in plain], 2**-7),
         ("colors", halves[:, 2:], [node.colors.flatten() for node in plain], 2**-7),
-        # float32 moments of float32 moments, eight levels of them
+        # float32 moments of float32 moments, over eight levels
         ("means", means[:, :3], [node.mean for node in plain], 1e-4),
         ("opacities", means[:, DENSITY], [node.opacity for node in plain], 1e-4),
         ("covariances", turned, [node.covariance for node in plain], 2e-4),
@@ -87,14 +87,14 @@ def test_a_node_has_the_moments_of_all_that_is_below_it() -> None:
 @pytest.mark.parametrize(
     ("count", "budget", "antialiased"), [(4000, 300, False), (4000, 300, True), (1000, 100_000, True)]
 )
-def test_the_fast_one_draws_what_the_plain_one_draws(count: int, budget: int, antialiased: bool) -> None:
+def test_fast_cut_matches_the_reference_cut(count: int, budget: int, antialiased: bool) -> None:
     scene = cloud(count, antialiased=antialiased)
     camera = coarse(orbit_camera(WIDTH, HEIGHT))
     pyramid = Pyramid(scene)
     view = make_pinhole(RasterView.of(camera, scene))
     picks = pyramid.cut(view, budget, DILATION / PIXELS**2).tolist()
     plain = PlainCut(scene, camera, pyramid.limit, PIXELS)
-    # a loss within rounding of the limit falls on either side
+    # a loss within rounding of the limit may fall on either side
     assert len(set(picks) ^ set(plain.picks)) <= 0.02 * len(picks)
     assert len(picks) <= budget
     assert (len(picks) >= BUDGET_FILL * budget) == (budget < count)
@@ -103,36 +103,36 @@ def test_the_fast_one_draws_what_the_plain_one_draws(count: int, budget: int, an
     expected = plain.taken([pick for pick, shared in zip(picks, both, strict=True) if shared])
     for name in ("means", "opacities"):
         torch.testing.assert_close(getattr(fast, name), getattr(expected, name), rtol=1e-3, atol=1e-4)
-    # what nodes keep of colors: half a step of a picture of eight bits
+    # colors of nodes: half a step of an 8-bit picture
     torch.testing.assert_close(fast.colors, expected.colors, rtol=0.0, atol=0.5 / 255.0)
     sizes = covariances(fast.scales, fast.quats), covariances(expected.scales, expected.quats)
     torch.testing.assert_close(*sizes, rtol=1e-3, atol=3e-5)  # rotations of 16 bits
 
 
 @pytest.mark.parametrize("white", [0.0, 1.0])
-def test_a_quarter_of_the_gaussians_on_a_quarter_of_the_pixels_is_as_bright(white: float) -> None:
+def test_quarter_of_gaussians_on_quarter_of_pixels_keeps_brightness(white: float) -> None:
     scene = cloud(20_000, 0.4)
     camera = orbit_camera(8 * WIDTH, 8 * HEIGHT)
     fewer = Pyramid(scene).simplify(coarse(camera), 5_000, PIXELS)
     fine = picture(scene, camera, white)
     moving = picture(fewer, coarse(camera), white)
-    # real scenes are within .3 % (docs/speed-and-error.md); a ball of fog is the harder case
+    # real scenes are within 0.3 % (docs/speed-and-error.md); a ball of fog is the harder case
     assert float(moving.mean()) == pytest.approx(float(fine.mean()), rel=0.02)
     plain = picture(scene.select(torch.arange(0, 20_000, 4)), coarse(camera), white)
     assert abs(float(plain.mean()) / float(fine.mean()) - 1.0) > 0.02, "every fourth alone is not"
 
 
-def test_specks_below_a_pixel_are_as_dense_as_all_their_dilations() -> None:
+def test_merged_subpixel_gaussians_keep_their_dilated_density() -> None:
     scene = cloud(8000, 0.05)
     camera = orbit_camera(WIDTH, HEIGHT)
     fewer = Pyramid(scene).simplify(camera, 1500)
     assert len(fewer.means) <= 1500
     full, merged = (1.0 - render(some, camera).transmittance for some in (scene, fewer))
-    # by their areas alone merged ones have a quarter of it
+    # the areas alone would give the merged ones a quarter of it
     assert float(merged.mean()) == pytest.approx(float(full.mean()), rel=0.12)
 
 
-def test_a_few_more_or_less_do_not_show() -> None:
+def test_small_change_of_the_budget_is_invisible() -> None:
     scene = activate(bear(6000).gaussians)
     camera = orbit_camera(2 * WIDTH, 2 * HEIGHT, distance=6.0)
     pyramid = Pyramid(scene)
@@ -143,7 +143,7 @@ def test_a_few_more_or_less_do_not_show() -> None:
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_nodes_that_are_dense_are_drawn_as_the_plain_one_draws_them(antialiased: bool) -> None:
+def test_dense_nodes_match_the_reference(antialiased: bool) -> None:
     scene = cloud(1000, 2.0, antialiased)
     camera = coarse(orbit_camera(WIDTH, HEIGHT))
     pyramid = Pyramid(scene)
@@ -156,7 +156,7 @@ def test_nodes_that_are_dense_are_drawn_as_the_plain_one_draws_them(antialiased:
     torch.testing.assert_close(*sizes, rtol=1e-3, atol=3e-5)  # rotations of 16 bits
 
 
-def test_an_opaque_surface_hides_most_of_what_is_behind_it() -> None:
+def test_opaque_surface_hides_most_of_the_background() -> None:
     columns, rows = torch.meshgrid(torch.linspace(-4, 4, 100), torch.linspace(-3, 3, 80), indexing="xy")
     count = columns.numel()
     wall = ActivatedGaussians(
@@ -171,23 +171,23 @@ def test_an_opaque_surface_hides_most_of_what_is_behind_it() -> None:
         picture(some, camera)[10:-10, 10:-10] for some in (wall, Pyramid(wall).simplify(camera, 500))
     )
     assert float(full.max()) < 0.23, "a dark wall before white"
-    # nodes let through .34 where they meet; as soft as one Gaussian .62, and .40 on average
+    # nodes let 0.34 through where they meet; as soft as one Gaussian 0.62, and 0.40 on average
     assert float(merged.max()) < 0.36
     assert float(merged.mean()) == pytest.approx(float(full.mean()), abs=0.02)
 
 
-def test_what_others_hide_is_coarser() -> None:
+def test_occluded_areas_are_coarser() -> None:
     scene = activate(random_gaussians(8000, seed=1, scale=0.1))
     flat = scene.means * torch.tensor([1.0, 1.0, 0.02]) + torch.tensor([0.0, 0.0, 4.0])
     flat[4000:, 2] += 4.0
     scene = scene._replace(means=flat, opacities=torch.full((8000,), 0.95))
     depths = Pyramid(scene).simplify(front_camera(WIDTH, HEIGHT, focal=100.0), 1000).means[:, 2]
-    # twice as far it shows a quarter of the detail: so much alone makes 2.5 times as many in front
+    # at twice the distance a quarter of the detail is visible, which alone gives 2.5 times as many in front
     assert int((depths < 6.0).sum()) > 4 * int((depths > 6.0).sum())
 
 
 @pytest.mark.parametrize("changed", ["colors", "opacities", "scales"])
-def test_a_change_is_carried_to_the_nodes(changed: str) -> None:
+def test_changes_reach_the_nodes(changed: str) -> None:
     scene = cloud(3001)
     rows = torch.arange(100, 900, 3)
     pyramid = Pyramid(scene)
@@ -196,7 +196,7 @@ def test_a_change_is_carried_to_the_nodes(changed: str) -> None:
     getattr(scene, changed)[rows] *= 0.5
     pyramid.refresh(rows.numpy(), changed == "colors")
     other = Pyramid(scene)
-    other.limit = pyramid.limit  # the search begins alike
+    other.limit = pyramid.limit  # starts the search alike
     after = pyramid.simplify(camera, 500)
     anew = other.simplify(camera, 500)
     assert not torch.equal(before.colors, after.colors[: len(before.colors)])
@@ -206,7 +206,7 @@ def test_a_change_is_carried_to_the_nodes(changed: str) -> None:
     assert np.array_equal(pyramid.nodes.shapes, other.nodes.shapes)
 
 
-def test_moved_gaussians_are_where_they_moved() -> None:
+def test_moved_gaussians_update_the_nodes() -> None:
     scene = cloud(503)
     rows = torch.arange(200)
     pyramid = Pyramid(scene)
@@ -221,7 +221,7 @@ def test_moved_gaussians_are_where_they_moved() -> None:
     torch.testing.assert_close(torch.from_numpy(means).double(), torch.stack(expected), rtol=1e-5, atol=1e-5)
 
 
-def test_what_is_drawn_stays_nearly_the_same_as_the_camera_turns() -> None:
+def test_cut_is_stable_while_the_camera_rotates() -> None:
     scene = activate(bear(6000).gaussians)
     pyramid = Pyramid(scene)
     pyramid.finest = 4.0
@@ -230,11 +230,11 @@ def test_what_is_drawn_stays_nearly_the_same_as_the_camera_turns() -> None:
         view = make_pinhole(RasterView.of(orbit_camera(240, 160, turn), scene))
         cuts.append(set(pyramid.cut(view, 9999, DILATION)))
     changed = [len(before - after) / len(before) for before, after in pairwise(cuts)]
-    # .3 % where the light is that of the nearest cell
+    # 0.3 % with the light of the nearest cell only
     assert 0.0 < np.mean(changed) < 0.0015
 
 
-def test_what_is_behind_the_camera_costs_nothing() -> None:
+def test_gaussians_behind_the_camera_use_no_budget() -> None:
     scene = cloud(4000)
     behind = scene._replace(means=scene.means + torch.tensor([0.0, 0.0, -500.0]))
     both = ActivatedGaussians(*(torch.cat(pair) for pair in zip(scene.tensors, behind.tensors, strict=True)))
@@ -245,7 +245,7 @@ def test_what_is_behind_the_camera_costs_nothing() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1, 7, 8])
-def test_small_scenes_are_drawn_as_they_are(count: int) -> None:
+def test_small_scenes_are_drawn_unmerged(count: int) -> None:
     scene = cloud(count, 1.0)
     camera = orbit_camera(WIDTH, HEIGHT)
     found = Pyramid(scene).simplify(camera, 10)
@@ -253,7 +253,7 @@ def test_small_scenes_are_drawn_as_they_are(count: int) -> None:
     assert float((picture(found, camera) - picture(scene, camera)).abs().max()) < 2e-2
 
 
-def test_what_is_not_finite_is_left_out() -> None:
+def test_values_that_are_not_finite_are_left_out() -> None:
     scene = cloud(500)
     scene.means[7] = float("nan")
     scene.opacities[8] = float("inf")

@@ -1,4 +1,4 @@
-"""The rasterizer: the engines against each other and against finite differences, on every hard case."""
+"""Tests of the rasterizer: engines against each other and finite differences, on every hard case."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ pytestmark = pytest.mark.usefixtures("two_threads")
 
 @pytest.mark.parametrize("engine", FAST)
 @pytest.mark.parametrize("name", CASES)
-def test_a_fast_engine_draws_each_hard_case_like_the_reference(name: str, engine: str) -> None:
+def test_fast_engine_matches_the_reference_in_each_hard_case(name: str, engine: str) -> None:
     found = drawn_case(name, engine)
     expected = drawn_case(name, "reference")
     assert found.image.shape == expected.image.shape
@@ -42,7 +42,7 @@ def test_a_fast_engine_draws_each_hard_case_like_the_reference(name: str, engine
 
 @pytest.mark.parametrize("engine", FAST)
 @pytest.mark.parametrize("name", CASES)
-def test_a_fast_engine_has_the_references_gradients_in_each_hard_case(name: str, engine: str) -> None:
+def test_fast_engine_gradients_match_the_reference_in_each_hard_case(name: str, engine: str) -> None:
     errors = relative_errors(drawn_case(name, engine), drawn_case(name, "reference"))
     assert set(errors) == set(INPUTS)
     assert max(errors.values()) <= 1e-4, errors
@@ -50,14 +50,14 @@ def test_a_fast_engine_has_the_references_gradients_in_each_hard_case(name: str,
 
 @pytest.mark.parametrize("engine", EVERY)
 @pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.poisoned])
-def test_a_gaussian_that_is_not_finite_leaves_all_others_untouched(name: str, engine: str) -> None:
+def test_gaussian_that_is_not_finite_does_not_affect_others(name: str, engine: str) -> None:
     case = CASES[name]
     rows = list(CASES[name].poisoned)
     if "quats" in name:
         clean_quats = case.gaussians.quats.clone()
         clean_quats[rows] = torch.tensor([1.0, 0.0, 0.0, 0.0])
         without = draw(replace(case.gaussians, quats=clean_quats), case.camera, engine)
-    else:  # hidden, not left out: what a processor makes of a row's exponential may depend on where it stands
+    else:  # hidden, not removed: the exponential of a row may depend on its position in a vector
         other = next(i for i in range(len(case.gaussians)) if i not in case.poisoned)
         values = {name: getattr(case.gaussians, name).clone() for name in ATTRIBUTES}
         for value in values.values():
@@ -83,8 +83,8 @@ def test_random_scenes_meet_the_stated_errors(seed: int, antialiased: bool, engi
     assert max(errors.values()) <= 2e-5, errors
 
 
-def test_the_reference_has_the_gradients_of_finite_differences() -> None:
-    """Broad, faint Gaussians over the whole image, so that no pixel is near the 1/255 or 1e-4 cuts."""
+def test_reference_gradients_match_finite_differences() -> None:
+    """Draw wide, faint Gaussians over the whole image, so that no pixel is near the 1/255 or 1e-4 cuts."""
     rng = torch.Generator().manual_seed(3)
     count = 6
     inputs = {
@@ -119,7 +119,7 @@ def test_the_reference_has_the_gradients_of_finite_differences() -> None:
 
 
 @pytest.mark.parametrize("engine", FAST)
-def test_gradients_of_a_crop_match_the_references(engine: str) -> None:
+def test_gradients_of_a_crop_match_the_reference(engine: str) -> None:
     scene = random_gaussians(200, seed=5, sh_degree=1)
     camera = orbit_camera(90, 61)
     crop = (21, 13, 70, 44)
@@ -130,7 +130,7 @@ def test_gradients_of_a_crop_match_the_references(engine: str) -> None:
 
 
 @pytest.mark.parametrize("engine", EVERY)
-def test_only_the_wanted_rows_get_gradients_and_theirs_are_the_full_ones(engine: str) -> None:
+def test_only_requested_rows_get_their_full_gradients(engine: str) -> None:
     scene = random_gaussians(200, seed=12, sh_degree=1)
     camera = orbit_camera(90, 61)
     rows = torch.arange(3, 200, 7)
@@ -161,7 +161,7 @@ def test_double_precision_inputs_get_double_precision_gradients(engine: str) -> 
 
 
 @pytest.mark.parametrize("engine", FAST)
-def test_a_real_scene_matches_the_reference(shared_data: Path, engine: str) -> None:
+def test_real_scene_matches_the_reference(shared_data: Path, engine: str) -> None:
     from progdf.formats.ply import load_ply
 
     scene = load_ply(shared_data / "playbot_8k.ply")

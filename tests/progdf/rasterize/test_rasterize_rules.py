@@ -1,4 +1,4 @@
-"""What a rasterized picture is, in every engine: crops, order, support, background, weights of masks."""
+"""Tests of rules that every engine follows: crops, order, support, background and mask weights."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("two_threads")
 
 @pytest.mark.parametrize("crop", [(0, 0, 90, 61), (13, 7, 14, 8), (31, 8, 65, 40), (64, 33, 90, 61)])
 @pytest.mark.parametrize("engine", EVERY)
-def test_a_crop_is_the_slice_of_the_whole_picture(engine: str, crop: tuple[int, int, int, int]) -> None:
+def test_crop_is_the_slice_of_the_whole_picture(engine: str, crop: tuple[int, int, int, int]) -> None:
     camera = orbit_camera(90, 61)
     camera = replace(camera, K=camera.K + torch.tensor([[0.0, 0.0, 7.0], [0.0, 0.0, -5.0], [0.0, 0.0, 0.0]]))
     scene = concatenate(
@@ -29,7 +29,7 @@ def test_a_crop_is_the_slice_of_the_whole_picture(engine: str, crop: tuple[int, 
     whole = draw(scene, camera, engine)
     part = draw(scene, camera, engine, crop=crop)
     x0, y0, x1, y1 = crop
-    # bit for bit, but for the reference: BLAS may add 151 products in another order, each rounded by 1.1e-16
+    # bit for bit, except the reference: BLAS may add 151 products in another order, each rounded by 1.1e-16
     rounding = 2e-14 if engine == "reference" else 0.0
     for found, expected in ((part.image, whole.image), (part.transmittance, whole.transmittance)):
         torch.testing.assert_close(found, expected[y0:y1, x0:x1], atol=rounding, rtol=0.0)
@@ -47,7 +47,7 @@ def test_samples_are_pixels_of_the_larger_picture(engine: str, antialiased: bool
 
 
 @pytest.mark.parametrize("engine", FAST)
-def test_the_order_of_the_list_does_not_matter_where_depths_differ(engine: str) -> None:
+def test_row_order_does_not_matter_for_different_depths(engine: str) -> None:
     scene = random_gaussians(300, seed=8)
     camera = orbit_camera(50, 40)
     activated = activate(scene, scene.sh0.sigmoid())
@@ -57,7 +57,7 @@ def test_the_order_of_the_list_does_not_matter_where_depths_differ(engine: str) 
 
 
 @pytest.mark.parametrize("engine", EVERY)
-def test_equal_depths_are_drawn_in_the_order_of_the_list(engine: str) -> None:
+def test_equal_depths_are_drawn_in_row_order(engine: str) -> None:
     red = one_gaussian(rgb=(1.0, 0.0, 0.0), opacity=0.99)
     green = one_gaussian(rgb=(0.0, 1.0, 0.0), opacity=0.99)
     camera = front_camera()
@@ -67,7 +67,7 @@ def test_equal_depths_are_drawn_in_the_order_of_the_list(engine: str) -> None:
 
 
 @pytest.mark.parametrize("engine", EVERY)
-def test_the_support_ends_exactly_where_alpha_falls_below_1_255(engine: str) -> None:
+def test_support_ends_exactly_where_alpha_falls_below_1_255(engine: str) -> None:
     camera = front_camera(60, 40)
     one = ActivatedGaussians(
         torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.full((1, 3), 0.3),
@@ -83,13 +83,13 @@ def test_the_support_ends_exactly_where_alpha_falls_below_1_255(engine: str) -> 
 
 
 @pytest.mark.parametrize("engine", EVERY)
-def test_no_pixel_falls_below_the_least_transmittance(engine: str) -> None:
+def test_no_pixel_falls_below_the_minimum_transmittance(engine: str) -> None:
     drawn = drawn_case("400 opaque ones stacked", engine)
     assert 1e-4 < float(drawn.transmittance.min()) < 2e-3
 
 
 @pytest.mark.parametrize("engine", EVERY)
-def test_no_gaussians_leave_the_background(engine: str) -> None:
+def test_empty_scene_shows_the_background(engine: str) -> None:
     nothing = random_gaussians(5)[:0]
     image, transmittance, _ = render(nothing, front_camera(), (0.25, 0.5, 0.75), engine=engine)
     assert torch.equal(image, torch.tensor([0.25, 0.5, 0.75]).expand(24, 40, 3))
@@ -120,7 +120,7 @@ def test_mask_weights_of_every_hard_case_are_finite(engine: str) -> None:
 
 
 @pytest.mark.parametrize("engine", EVERY)
-def test_a_color_map_draws_its_rows_and_its_gradient_is_the_transpose(engine: str) -> None:
+def test_color_map_draws_its_rows_and_its_gradient_is_the_transpose(engine: str) -> None:
     scene = random_gaussians(300, seed=11)
     camera = orbit_camera(90, 61)
     window = (21, 13, 70, 44)
@@ -141,7 +141,7 @@ def test_a_color_map_draws_its_rows_and_its_gradient_is_the_transpose(engine: st
 
 @pytest.mark.parametrize("channels", [1, 2, 4, 20])
 @pytest.mark.parametrize("engine", EVERY)
-def test_a_color_map_draws_any_number_of_channels(engine: str, channels: int) -> None:
+def test_color_map_draws_any_number_of_channels(engine: str, channels: int) -> None:
     scene = random_gaussians(300, seed=11)
     camera = orbit_camera(90, 61)
     window = (21, 13, 70, 44)
@@ -156,7 +156,7 @@ def test_a_color_map_draws_any_number_of_channels(engine: str, channels: int) ->
 
 
 @pytest.mark.parametrize("engine", EVERY)
-def test_a_color_map_of_some_pixels_is_that_of_all_where_they_are(engine: str) -> None:
+def test_color_map_of_some_pixels_matches_the_full_map(engine: str) -> None:
     scene = random_gaussians(300, seed=11)
     camera = orbit_camera(90, 61)
     window = (21, 13, 70, 44)
@@ -172,11 +172,11 @@ def test_a_color_map_of_some_pixels_is_that_of_all_where_they_are(engine: str) -
 
 
 @pytest.mark.parametrize("lost", [0.0, 0.5 / 255.0, 0.3])
-def test_a_color_map_leaves_out_no_more_than_it_may(lost: float) -> None:
+def test_color_map_omits_at_most_the_allowed_loss(lost: float) -> None:
     scene = random_gaussians(3000, seed=11)
     camera = orbit_camera(90, 61)
     window = (21, 13, 70, 44)
-    rows = torch.arange(0, 3000, 2)  # the others only hide what is behind them
+    rows = torch.arange(0, 3000, 2)  # the others only occlude
     all_of_it = color_map(activate(scene), camera, window, rows)
     listed = color_map(activate(scene), camera, window, rows, lost=lost)
     assert isinstance(listed, ListedWeights)
@@ -192,7 +192,7 @@ def test_a_color_map_leaves_out_no_more_than_it_may(lost: float) -> None:
     assert float(away) <= lost + 1e-6
 
 
-def test_a_color_map_lets_go_of_what_it_was_made_of() -> None:
+def test_color_map_releases_its_inputs() -> None:
     scene = activate(random_gaussians(300, seed=11))
     camera = orbit_camera(90, 61)
     make = partial(color_map, scene, camera, (0, 0, 90, 61), torch.arange(300))

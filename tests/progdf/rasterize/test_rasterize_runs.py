@@ -1,4 +1,4 @@
-"""How the rasterizer runs: threads, compiling, limits, and what it refuses."""
+"""Tests of running the rasterizer: threads, compilation, limits and errors."""
 
 from __future__ import annotations
 
@@ -20,9 +20,7 @@ pytestmark = pytest.mark.usefixtures("two_threads")
 
 
 @pytest.mark.parametrize("room", [0, 1, 8])
-def test_bits_do_not_depend_on_the_run_the_number_of_threads_or_the_room_for_tiles(
-    room: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bits_do_not_depend_on_run_threads_or_tile_memory(room: int, monkeypatch: pytest.MonkeyPatch) -> None:
     from progdf.rasterize.cpu import engine
 
     scene = random_gaussians(4000, seed=6, sh_degree=1)
@@ -56,7 +54,7 @@ def test_two_python_threads_may_draw_at_once(engine: str) -> None:
     assert all(torch.equal(drawn.gradients["means"], expected.gradients["means"]) for drawn in found)
 
 
-def test_camera_gradients_of_some_rows_only_are_refused() -> None:
+def test_camera_gradients_of_some_rows_are_refused() -> None:
     scene = one_gaussian()
     camera = front_camera()
     free = replace(camera, viewmat=camera.viewmat.clone().requires_grad_())
@@ -88,7 +86,7 @@ def test_wrong_shapes_and_windows_are_refused_by_name() -> None:
 
 
 @pytest.mark.parametrize("shown", [0, 5, 400])
-def test_rows_that_no_pixel_shows_get_gradients_of_zero_whatever_memory_held(
+def test_invisible_rows_get_zero_gradients_in_uninitialized_memory(
     shown: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = random_gaussians(900, seed=3, sh_degree=1)
@@ -97,7 +95,7 @@ def test_rows_that_no_pixel_shows_get_gradients_of_zero_whatever_memory_held(
     scene.means[rows, 2] += 54.0
     leaves = [tensor.clone().requires_grad_() for tensor in activate(scene).tensors]
     camera = front_camera()
-    draw(scene, camera, "cpu")  # so that the kernels are compiled
+    draw(scene, camera, "cpu")  # compiles the kernels
     monkeypatch.setattr(np, "empty", lambda shape, dtype=float: np.full(shape, 77, dtype))
     image, _, info = render(ActivatedGaussians(*leaves), camera)
     image.square().sum().backward()  # type: ignore[no-untyped-call]
@@ -108,7 +106,7 @@ def test_rows_that_no_pixel_shows_get_gradients_of_zero_whatever_memory_held(
         assert bool(leaf.grad[info.visible].any()) == (shown > 0)
 
 
-def test_inputs_changed_in_place_before_the_backward_pass_are_noticed() -> None:
+def test_inputs_changed_in_place_before_backward_are_noticed() -> None:
     one = one_gaussian()
     camera = front_camera()
     means = one.means.clone().requires_grad_()
@@ -119,7 +117,7 @@ def test_inputs_changed_in_place_before_the_backward_pass_are_noticed() -> None:
         image.sum().backward()  # type: ignore[no-untyped-call]
 
 
-def test_a_picture_for_gradients_has_the_same_bits_as_one_without() -> None:
+def test_picture_with_gradients_has_the_same_bits_as_without() -> None:
     scene = activate(random_gaussians(300, seed=4))
     camera = orbit_camera()
     learned = scene._replace(means=scene.means.clone().requires_grad_())
@@ -129,7 +127,7 @@ def test_a_picture_for_gradients_has_the_same_bits_as_one_without() -> None:
 
 @pytest.mark.parametrize("count", [0, 1, 1000, 200_000])
 @pytest.mark.parametrize("values", ["equal", "many", "of all sizes"])
-def test_depth_order_is_numpys_stable_sort(count: int, values: str) -> None:
+def test_depth_order_matches_numpy_stable_sort(count: int, values: str) -> None:
     rng = np.random.default_rng(0)
     kinds = {
         "equal": [3.0],
@@ -143,7 +141,7 @@ def test_depth_order_is_numpys_stable_sort(count: int, values: str) -> None:
     np.testing.assert_array_equal(depth_order(depths, visible), expected)
 
 
-def test_the_kernels_are_cached_outside_the_source_tree() -> None:
+def test_kernels_are_cached_outside_the_source_tree() -> None:
     from progdf.rasterize.cpu.jit import kernel_cache
 
     render(one_gaussian(), front_camera())

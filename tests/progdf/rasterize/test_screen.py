@@ -1,4 +1,4 @@
-"""A picture on the screen: bytes rounded as saved pictures are, stretched as torch does; lines behind it."""
+"""Tests of a picture on the screen: bytes rounded as in saved files, scaled as in torch, lines behind it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from progdf.rasterize.screen import draw_lines_behind, fill_screen
 
 
 @pytest.mark.parametrize("size", [(130, 90), (260, 180), (259, 179), (1, 1)])
-def test_the_screen_has_the_picture_upside_down_in_any_size(size: tuple[int, int]) -> None:
+def test_screen_has_the_flipped_picture_in_any_size(size: tuple[int, int]) -> None:
     image = torch.rand(90, 130, 3, generator=torch.Generator().manual_seed(0)) * 1.2 - 0.1
     screen = np.zeros((size[1], size[0], 4), np.uint8)
     fill_screen(image.numpy(), screen)
@@ -27,7 +27,7 @@ def line(x0: float, y0: float, x1: float, y1: float) -> list[float]:
     return [x0, y0, x1, y1, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
 
 
-def test_a_line_is_a_pixel_wide_seen_through_and_gone_afterwards_bit_for_bit() -> None:
+def test_line_is_one_pixel_wide_transparent_and_removed_exactly() -> None:
     image = np.random.default_rng(0).random((20, 30, 3), np.float32) + 1.0
     through = np.ones((20, 30), np.float32)
     through[:, 15:] = 0.0
@@ -42,7 +42,7 @@ def test_a_line_is_a_pixel_wide_seen_through_and_gone_afterwards_bit_for_bit() -
     assert np.array_equal(image, before)
 
 
-def test_lines_fade_and_those_that_are_nowhere_draw_nothing() -> None:
+def test_lines_fade_and_invisible_lines_draw_nothing() -> None:
     image = np.ones((8, 64, 3), np.float32)
     through = np.ones((8, 64), np.float32)
     fading = line(0, 4.5, 64, 4.5)
@@ -56,8 +56,8 @@ def test_lines_fade_and_those_that_are_nowhere_draw_nothing() -> None:
         assert (image == 1.0).all()
 
 
-def test_the_last_bit_of_a_line_that_crosses_the_picture_moves_no_pixel() -> None:
-    """It enters and leaves on borders of pixels: how many it crosses, the last bit would decide."""
+def test_last_bit_of_a_crossing_line_moves_no_pixel() -> None:
+    """Let lines enter and leave at pixel borders, where the last bit would decide the number of pixels."""
     through = np.ones((24, 64), np.float32)
     drawn = []
     for shift in np.linspace(-2e-5, 2e-5, 21):
@@ -65,5 +65,5 @@ def test_the_last_bit_of_a_line_that_crosses_the_picture_moves_no_pixel() -> Non
         lines = [line(-20.0 + shift, 3.3, 84.0 + shift, 16.1), line(12.3, -9.0 + shift, 18.4, 40.0 + shift)]
         with draw_lines_behind(image, through, np.array(lines, np.float32), 0.5):
             drawn.append(image.copy())
-    # a pixel's share follows the line's place: 4e-5 of a pixel, and float32 has steps of 8e-6 there
+    # a pixel's share follows the line's position: 4e-5 px, where float32 has steps of 8e-6
     assert np.ptp(np.stack(drawn), axis=0).max() < 1e-4

@@ -1,4 +1,4 @@
-"""The engine for graphics cards, on Warp's CPU device: blocks of threads, code for cards, a quiet start."""
+"""Tests of the GPU engine on Warp's CPU device: blocks of threads, code for GPUs, a quiet start."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from tests.helpers.drawn import INPUTS, NEEDS_WARP, draw
 from tests.helpers.scenes import orbit_camera, random_gaussians
 
 ARCHITECTURES = (75, 86, 89, 90)
-"""Of the cards from RTX 20 to H100; the oldest and the newest in every run of the tests."""
+"""Compute capabilities from RTX 20 to H100. The oldest and the newest are in every test run."""
 
 
 @NEEDS_WARP
-def test_the_bits_are_the_same_in_every_run() -> None:
+def test_bits_are_the_same_in_every_run() -> None:
     scene = random_gaussians(1000, seed=6, sh_degree=1)
     camera = orbit_camera(64, 48)
     first = draw(scene, camera, "warp")
@@ -31,8 +31,8 @@ def test_the_bits_are_the_same_in_every_run() -> None:
 
 @pytest.mark.slow
 @NEEDS_WARP
-def test_a_block_of_threads_adds_up_what_single_threads_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As on a card: 256 threads of a tile that meet at each sum. Otherwise a CPU runs them one by one."""
+def test_block_of_threads_adds_up_like_single_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run 256 threads of a tile that meet at each sum, as on a GPU. A CPU runs them one by one by default."""
     import warp as wp
 
     scene = random_gaussians(300, seed=6, sh_degree=1)
@@ -49,7 +49,7 @@ def test_a_block_of_threads_adds_up_what_single_threads_do(monkeypatch: pytest.M
 @pytest.mark.parametrize(
     "architectures", [ARCHITECTURES[::3], pytest.param(ARCHITECTURES[1:3], marks=pytest.mark.slow)]
 )
-def test_the_kernels_compile_for_cards_without_a_card(tmp_path: Path, architectures: tuple[int, ...]) -> None:
+def test_kernels_compile_for_gpus_without_a_gpu(tmp_path: Path, architectures: tuple[int, ...]) -> None:
     import warp as wp
 
     from progdf.rasterize import warp_engine
@@ -62,7 +62,7 @@ def test_the_kernels_compile_for_cards_without_a_card(tmp_path: Path, architectu
 
 
 @NEEDS_WARP
-def test_nothing_is_loaded_before_the_engine_is_asked_for_and_its_start_is_quiet() -> None:
+def test_warp_is_loaded_on_demand_and_starts_quietly() -> None:
     code = (
         "import sys; import progdf, progdf.rasterize; assert 'warp' not in sys.modules;"
         "from tests.helpers.scenes import front_camera, one_gaussian;"
@@ -73,7 +73,7 @@ def test_nothing_is_loaded_before_the_engine_is_asked_for_and_its_start_is_quiet
     assert set(done.stderr.splitlines()) <= {NO_DRIVER}
 
 
-def test_without_warp_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_warp_error_names_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "warp", None)
     monkeypatch.delitem(sys.modules, ENGINES["warp"], raising=False)
     with pytest.raises(ProgdfError, match=r"needs warp-lang; pip install 'progdf-studio\[gpu\]'"):
@@ -83,4 +83,4 @@ def test_without_warp_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPa
 NO_DRIVER = (
     "Warp CUDA warning: Could not find or load the NVIDIA CUDA driver. GPU execution will not be available."
 )
-"""Printed by Warp's native part, which no setting reaches, on machines without a card."""
+"""Printed by Warp's native part on machines without a GPU; no setting suppresses it."""
