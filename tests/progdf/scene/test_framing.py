@@ -1,4 +1,4 @@
-"""Which way is up, where is the front, and is one to stand inside."""
+"""Tests of the up direction, the front, and of scenes viewed from inside."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def small_bear() -> Gaussians:
 
 
 @pytest.mark.parametrize("up", AXES, ids=["+x", "-x", "+y", "-y", "+z", "-z"])
-def test_up_is_found_however_the_bear_lies(up: Tensor, small_bear: Gaussians) -> None:
+def test_up_is_found_for_any_orientation_of_the_bear(up: Tensor, small_bear: Gaussians) -> None:
     assert torch.equal(guess_up(turned(small_bear, upright_turn(up))), up)
 
 
@@ -39,14 +39,14 @@ def test_normals_are_the_shortest_axes() -> None:
     torch.testing.assert_close(normals_of(scene), expected)
 
 
-def test_cameras_that_agree_tell_the_up_direction(small_bear: Gaussians) -> None:
+def test_agreeing_cameras_determine_up(small_bear: Gaussians) -> None:
     up = torch.nn.functional.normalize(torch.tensor([0.1, -1.0, 0.2]), dim=0)
     cameras = orbit_rig(ball(), 12, 64, 64, up=up)
     found = guess_up(small_bear, cameras)
     torch.testing.assert_close(found, up, atol=0.05, rtol=0)
 
 
-def test_the_front_is_level_and_of_unit_length() -> None:
+def test_front_is_level_and_of_unit_length() -> None:
     for up in [*AXES, torch.nn.functional.normalize(torch.tensor([0.3, -0.9, 0.4]), dim=0)]:
         assert abs(float(front_direction(up) @ up)) < 1e-6
         assert abs(float(front_direction(up).norm()) - 1) < 1e-6
@@ -55,7 +55,7 @@ def test_the_front_is_level_and_of_unit_length() -> None:
 
 
 def walls(ceiling: bool) -> Gaussians:
-    """A room of 4 x 3 x 4 with furniture, y up, with or without its ceiling."""
+    """Return a room of 4 x 3 x 4 units with furniture, y up, with or without its ceiling."""
     spots = torch.rand(6000, 3, generator=torch.Generator().manual_seed(0)) - 0.5
     side = torch.arange(6000) % (6 if ceiling else 5)
     for face, (axis, place) in enumerate([(0, -0.5), (0, 0.5), (1, -0.5), (2, -0.5), (2, 0.5), (1, 0.5)]):
@@ -64,9 +64,7 @@ def walls(ceiling: bool) -> Gaussians:
     return replace(scene, means=spots * torch.tensor([4.0, 3.0, 4.0]))
 
 
-def test_a_scene_to_stand_inside_is_recognized(
-    small_bear: Gaussians, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_surrounding_scene_is_recognized(small_bear: Gaussians, caplog: pytest.LogCaptureFixture) -> None:
     assert is_surrounding(walls(ceiling=True), Y_UP)
     assert not is_surrounding(walls(ceiling=False), Y_UP)
     assert not is_surrounding(small_bear, Y_UP)

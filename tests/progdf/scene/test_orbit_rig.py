@@ -1,4 +1,4 @@
-"""The rig of cameras around a scene: what it frames, where it stands, which cameras are held out."""
+"""Tests of the rig of cameras around a scene: framing, positions and held-out cameras."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Y_UP = torch.tensor([0.0, 1.0, 0.0])
 
 
 def seen(scene: Gaussians, camera: Camera) -> Tensor:
-    """Which centers fall into the picture. [N] bool"""
+    """Return the mask of centers inside the picture. [N] bool"""
     places = scene.means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     pixels = (places @ camera.K.T)[:, :2] / places[:, 2:]
     inside = (pixels >= 0) & (pixels <= torch.tensor([camera.width, camera.height]))
@@ -29,7 +29,7 @@ def seen(scene: Gaussians, camera: Camera) -> Tensor:
 
 @pytest.mark.parametrize(("width", "height"), [(64, 64), (128, 64), (64, 128)])
 @pytest.mark.parametrize("fov", [20.0, 60.0, 100.0])
-def test_the_rig_frames_the_scene_whatever_the_lens(width: int, height: int, fov: float) -> None:
+def test_rig_frames_the_scene_for_any_lens(width: int, height: int, fov: float) -> None:
     scene = ball()
     for camera in orbit_rig(scene, 5, width, height, fov_y=math.radians(fov), up=Y_UP):
         assert float(seen(scene, camera).float().mean()) > 0.99
@@ -40,7 +40,7 @@ def test_the_rig_frames_the_scene_whatever_the_lens(width: int, height: int, fov
         assert float(spread.max()) > 0.6 * min(width, height)
 
 
-def test_the_rig_surrounds_the_scene_evenly() -> None:
+def test_rig_surrounds_the_scene_evenly() -> None:
     cameras = orbit_rig(ball(), 40, 64, 64, up=Y_UP)
     places = torch.stack([camera.position for camera in cameras])
     azimuths = torch.atan2(places[:, 0], places[:, 2]).sort().values
@@ -55,7 +55,7 @@ def test_the_rig_surrounds_the_scene_evenly() -> None:
     assert float(every_fifth.max() - every_fifth.min()) > 0.6 * (high - low)
 
 
-def test_the_rig_looks_at_the_center_with_up_up_and_begins_at_the_front() -> None:
+def test_rig_looks_at_the_center_upright_and_starts_at_the_front() -> None:
     scene = ball()
     scene = replace(scene, means=scene.means + torch.tensor([5.0, -3.0, 2.0]))
     center, _ = scene_sphere(scene)
@@ -71,7 +71,7 @@ def test_the_rig_looks_at_the_center_with_up_up_and_begins_at_the_front() -> Non
     assert [camera.name for camera in cameras[:2]] == ["orbit_000", "orbit_001"]
 
 
-def test_the_rig_may_look_from_below() -> None:
+def test_rig_may_look_from_below() -> None:
     cameras = orbit_rig(ball(), 20, 64, 64, up=Y_UP, elevations=(-40.0, 40.0))
     heights = torch.stack([camera.position[1] for camera in cameras])
     assert 8 <= int((heights < 0).sum()) <= 12
@@ -86,7 +86,7 @@ def test_far_strays_do_not_move_the_rig() -> None:
     assert 0.8 < radius < 1.1
 
 
-def test_a_single_gaussian_is_framed_by_its_own_size() -> None:
+def test_single_gaussian_is_framed_by_its_own_size() -> None:
     scene = ball(1)
     camera = orbit_rig(scene, 1, 64, 64)[0]
     distance = float((camera.position - scene.means[0]).norm())
@@ -94,6 +94,6 @@ def test_a_single_gaussian_is_framed_by_its_own_size() -> None:
 
 
 @pytest.mark.parametrize(("count", "elevations"), [(0, (5.0, 60.0)), (4, (60.0, 5.0)), (4, (0.0, 90.0))])
-def test_an_impossible_rig_is_one_line(count: int, elevations: tuple[float, float]) -> None:
+def test_impossible_rig_is_reported_in_one_line(count: int, elevations: tuple[float, float]) -> None:
     with pytest.raises(ProgdfError, match="the rig"):
         orbit_rig(ball(), count, 64, 64, elevations=elevations)

@@ -1,4 +1,4 @@
-"""Neighbor searches stay exact and bounded where many points share one place."""
+"""Tests of neighbor searches, which stay exact and bounded if many points share one position."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ APART = 300
 
 
 def crowded_points() -> np.ndarray:
-    """A cloud, and a crowd at one place inside it."""
+    """Return a cloud, and many points at one position inside it."""
     cloud = np.random.default_rng(5).random((APART, 3))
     return np.concatenate([cloud, np.full((CROWD, 3), 0.5)])
 
@@ -30,7 +30,7 @@ def crowded_scene() -> Gaussians:
     return replace(scene, means=torch.from_numpy(crowded_points()).float())
 
 
-def test_a_crowded_place_makes_no_large_leaf() -> None:
+def test_crowded_position_makes_no_large_leaf() -> None:
     tree = PointTree(crowded_points(), 8)
     assert tree.largest_leaf == LEAF_SIZE
     assert PointTree(crowded_points(), 24).largest_leaf == 25
@@ -38,7 +38,7 @@ def test_a_crowded_place_makes_no_large_leaf() -> None:
 
 
 @pytest.mark.parametrize("within", [np.inf, 0.1])
-def test_distances_are_those_of_all_points(within: float) -> None:
+def test_distances_match_a_full_search(within: float) -> None:
     points = crowded_points()
     places = np.random.default_rng(6).random((50, 3))
     tree = PointTree(points, 9)
@@ -52,7 +52,7 @@ def test_distances_are_those_of_all_points(within: float) -> None:
     np.testing.assert_allclose(tree.kth_distances(places, 4), every[:, 3])
 
 
-def test_two_neighbors_of_one_point_are_one() -> None:
+def test_missing_second_neighbor_is_infinitely_far() -> None:
     distances, rows = PointTree(np.zeros((1, 3)), 2).query(np.ones((1, 3)), 2)
     assert rows.tolist() == [[0, 1]]
     assert np.isinf(distances).tolist() == [[False, True]]
@@ -67,14 +67,14 @@ def test_neighbors_in_a_crowd_are_other_rows() -> None:
     assert all(len(set(row)) == 5 for row in near.tolist())
 
 
-def test_growing_reaches_a_whole_crowd() -> None:
+def test_grow_reaches_a_whole_crowd() -> None:
     scene = crowded_scene()
     mask = np.zeros(len(scene), bool)
     mask[-1] = True
     assert Neighborhood(scene).grow(mask)[APART:].all()
 
 
-def test_a_crowd_is_one_connected_part() -> None:
+def test_crowd_is_one_connected_part() -> None:
     scene = crowded_scene()
     neighborhood = Neighborhood(replace(scene, log_scales=torch.full((len(scene), 3), -12.0)))
     crowd = np.arange(len(scene)) >= APART
@@ -85,7 +85,7 @@ def test_a_crowd_is_one_connected_part() -> None:
 
 
 @pytest.mark.parametrize("step", ["shrink", "smooth", "refine"])
-def test_the_other_steps_take_a_crowd(step: str) -> None:
+def test_other_steps_accept_a_crowd(step: str) -> None:
     scene = crowded_scene()
     mask = scene.means[:, 0].numpy() <= 0.5
     changed = getattr(Neighborhood(scene), step)(mask)
@@ -99,12 +99,12 @@ def test_steps_of_a_walk_in_a_crowd_are_bounded() -> None:
     assert np.isfinite(steps.data).all()
 
 
-def test_all_nearest_neighbors_are_searched_in_point_trees() -> None:
+def test_all_nearest_neighbor_searches_use_point_trees() -> None:
     users = {
         path.relative_to(ROOT).as_posix()
         for package in ("progdf", "trainer", "viewer")
         for path in (ROOT / package).rglob("*.py")
         if "scipy.spatial import" in path.read_text("utf-8")
     }
-    # parts.py joins the centroids of cells, of which no two share a place
+    # parts.py joins the centroids of cells, which never share a position
     assert users == {"progdf/scene/point_tree.py", "trainer/motion/parts.py"}

@@ -1,4 +1,4 @@
-"""Regions: the language they are written in, the files they come from, and their set operations."""
+"""Tests of regions: their language, their files and their set operations."""
 
 from __future__ import annotations
 
@@ -52,14 +52,14 @@ def test_all_is_every_gaussian(scene: Gaussians) -> None:
     assert region.name == "all"
 
 
-def test_a_box_holds_what_lies_between_its_corners_in_any_order(scene: Gaussians) -> None:
+def test_box_contains_centers_between_its_corners_in_any_order(scene: Gaussians) -> None:
     x, y, z = scene.means.unbind(1)
     expected = (x >= -0.5) & (x <= 1) & (y >= -1.5) & (y <= 0.1) & (z >= 0) & (z <= 9)
     assert members("box:-0.5,-1.5,0,1,1e-1,+9", scene) == rows(expected)
     assert members("box:1,1e-1,+9,-0.5,-1.5,0", scene) == rows(expected)
 
 
-def test_a_sphere_holds_what_is_near_its_center(scene: Gaussians) -> None:
+def test_sphere_contains_centers_within_its_radius(scene: Gaussians) -> None:
     distance = (scene.means - torch.tensor([0.1, -0.2, 0.3])).norm(dim=1)
     assert members("sphere:0.1,-0.2,.3,1.2", scene) == rows(distance <= 1.2)
 
@@ -80,7 +80,7 @@ def test_parts_join_from_left_to_right(scene: Gaussians, tmp_path: Path) -> None
     assert members("all-sphere:0,0,0,1", scene) == rows(~near)
 
 
-def test_what_is_in_both_parts_is_kept_and_steps_change_all_before_them(scene: Gaussians) -> None:
+def test_intersection_keeps_both_and_steps_apply_to_all_before(scene: Gaussians) -> None:
     near = scene.means.norm(dim=1) <= 1.2
     right = scene.means[:, 0] >= 0
     spec = "sphere:0,0,0,1.2 & box:0,-99,-99,99,99,99"
@@ -110,7 +110,7 @@ def test_shapes_are_drawn_over_the_picture_of_a_camera(scene: Gaussians, tmp_pat
     )
 
 
-def test_a_color_and_a_flood_take_a_tolerance(scene: Gaussians) -> None:
+def test_color_and_flood_take_a_tolerance(scene: Gaussians) -> None:
     assert len(members("color:#808080,0.1", scene)) < len(members("color:#808080,.2", scene)) < COUNT
     assert members("color:#808080", scene) == members("color:#808080,0.08", scene)
     x, y, z = scene.means[7].tolist()
@@ -146,12 +146,12 @@ SPECS = st.lists(
 
 
 @given(parts=SPECS, blank=st.sampled_from(["", " ", "  "]))
-def test_what_was_joined_comes_apart_again(parts: list[tuple[str, str]], blank: str) -> None:
+def test_joined_spec_is_split_again(parts: list[tuple[str, str]], blank: str) -> None:
     spec = parts[0][1] + "".join(f"{blank}{sign}{blank}{part}" for sign, part in parts[1:])
     assert split_spec(spec, KINDS) == [("+", parts[0][1]), *parts[1:]]
 
 
-def test_a_caller_may_add_kinds(scene: Gaussians) -> None:
+def test_caller_may_add_kinds(scene: Gaussians) -> None:
     def first(rest: str, scene: Gaussians) -> Region:
         return from_mask(rest, torch.arange(len(scene)) < int(rest))
 
@@ -207,7 +207,7 @@ def refusal(spec: str, scene: Gaussians) -> str:
         ("box:0,0,0,1,1,1e19", "6 numbers up to 1e+18"),
     ],
 )
-def test_a_spec_that_cannot_be_meant_is_one_line(spec: str, said: str, scene: Gaussians) -> None:
+def test_meaningless_spec_is_reported_in_one_line(spec: str, said: str, scene: Gaussians) -> None:
     assert said in refusal(spec, scene)
 
 
@@ -230,8 +230,8 @@ LONG = 1_000_000
     ],
     ids=lambda spec: spec[:12],
 )
-def test_a_spec_of_a_megabyte_is_read_at_once_and_repeated_in_short(spec: str) -> None:
-    """What goes through its input once for each of its characters would take hours."""
+def test_huge_spec_is_read_quickly_and_quoted_in_short(spec: str) -> None:
+    """Parse a megabyte. Scanning the input once per character would take hours."""
     said = ""
     try:
         check_region(spec)
@@ -240,7 +240,7 @@ def test_a_spec_of_a_megabyte_is_read_at_once_and_repeated_in_short(spec: str) -
     assert len(said) < 500
 
 
-# What the language is made of, wrong as often as right.
+# Tokens of the language, valid as often as not.
 SCRAPS = st.sampled_from(
     [
         *(
@@ -334,9 +334,7 @@ def folder_of_parts(scene: Gaussians, tmp_path_factory: pytest.TempPathFactory) 
 
 
 @given(spec=SPECS_OF_ALL_KINDS)
-def test_whatever_is_typed_is_a_region_or_one_line(
-    spec: str, scene: Gaussians, folder_of_parts: Path
-) -> None:
+def test_any_input_is_a_region_or_an_error(spec: str, scene: Gaussians, folder_of_parts: Path) -> None:
     said: list[str] = []
     refused = []
     with contextlib.chdir(folder_of_parts):
@@ -349,7 +347,7 @@ def test_whatever_is_typed_is_a_region_or_one_line(
     assert len(refused) != 1 or "holds no Gaussian" in refused[0] or "no Gaussian with label" in refused[0]
 
 
-def test_parts_that_are_hardly_meant_are_told(scene: Gaussians) -> None:
+def test_suspicious_parts_are_reported(scene: Gaussians) -> None:
     def said(spec: str) -> list[str]:
         lines: list[str] = []
         parse_region(spec, scene, say=lines.append)
@@ -368,7 +366,9 @@ def test_parts_that_are_hardly_meant_are_told(scene: Gaussians) -> None:
     assert said("sphere:0,0,0,0.5|shrink:9+all") == ["the region is empty after |shrink:9"]
 
 
-def test_a_label_file_of_another_scene_or_kind_is_one_line(scene: Gaussians, tmp_path: Path) -> None:
+def test_label_file_of_another_scene_or_kind_is_reported_in_one_line(
+    scene: Gaussians, tmp_path: Path
+) -> None:
     path = tmp_path / "l.npy"
     labels = labels_file(path)
     assert "no Gaussian with label 7; it has 0, 1, 2, 3, 4" in refusal(f"labels:{path}:7", scene)
@@ -393,7 +393,7 @@ def test_a_label_file_of_another_scene_or_kind_is_one_line(scene: Gaussians, tmp
     assert "folder" in refusal(f"labels:{tmp_path}:1", scene)
 
 
-def test_a_label_file_that_claims_too_much_allocates_nothing(scene: Gaussians, tmp_path: Path) -> None:
+def test_label_file_that_claims_too_much_allocates_nothing(scene: Gaussians, tmp_path: Path) -> None:
     path = tmp_path / "l.npy"
     labels_file(path)
     path.write_bytes(path.read_bytes().replace(b"(200,)", b"(9999999999,)").replace(b"       }", b"}", 1))
@@ -406,7 +406,7 @@ MASKS = st.lists(st.booleans(), min_size=12, max_size=12).map(torch.tensor)
 
 
 @given(a=MASKS, b=MASKS)
-def test_set_operations_are_those_of_sets(a: torch.Tensor, b: torch.Tensor) -> None:
+def test_set_operations_match_those_of_sets(a: torch.Tensor, b: torch.Tensor) -> None:
     one = from_mask("a", a)
     two = from_mask("b", b)
     for operation, expected in ((union, a | b), (difference, a & ~b)):
@@ -415,7 +415,7 @@ def test_set_operations_are_those_of_sets(a: torch.Tensor, b: torch.Tensor) -> N
         assert torch.equal(region.score, expected.float())
 
 
-def test_soft_scores_keep_their_shades() -> None:
+def test_soft_scores_are_kept() -> None:
     a = Region("a", torch.tensor([0, 1]), torch.tensor([0.9, 0.8, 0.4, 0.0]))
     b = Region("b", torch.tensor([1, 3]), torch.tensor([0.2, 0.75, 0.5, 1.0]))
     assert union(a, b).score.tolist() == pytest.approx([0.9, 0.8, 0.5, 1.0])
@@ -430,7 +430,7 @@ def test_regions_of_different_scenes_do_not_mix() -> None:
             operation(a, b)
 
 
-def test_the_real_labels_fit_their_scene(shared_data: Path) -> None:
+def test_real_labels_fit_their_scene(shared_data: Path) -> None:
     from progdf.formats.ply import load_ply
 
     real = load_ply(shared_data / "playbot_8k.ply")

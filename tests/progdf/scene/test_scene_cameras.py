@@ -1,4 +1,4 @@
-"""Cameras brought into a scene's frame, and refused where they are of another."""
+"""Tests of moving cameras into a scene's frame, and of refusing cameras of another scene."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def rig(count: int = 12, to: Gaussians | None = None) -> list[Camera]:
 
 
 def to_nerfstudio(cameras: Sequence[Camera]) -> Tensor:
-    """The turn and move by which nerfstudio centers cameras whose mean up is +y, and turns it to +z. [4,4]"""
+    """Return nerfstudio's rigid motion, which centers cameras and rotates their mean up to +z. [4,4]"""
     way = torch.eye(4, dtype=torch.float64)
     way[:3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     centers = torch.stack([camera.position for camera in cameras]).double()
@@ -45,7 +45,7 @@ def to_nerfstudio(cameras: Sequence[Camera]) -> Tensor:
 
 
 def assert_same_views(found: Sequence[Camera], given: Sequence[Camera], way: Tensor, scale: float) -> None:
-    """Cameras see after the similarity as the given ones did before."""
+    """Check that the moved cameras see the moved scene as the given cameras see the original."""
     point = torch.tensor([0.3, -0.2, 0.5])
     there = (scale * (way[:3, :3] @ point.double() + way[:3, 3])).float()
     for one, other in zip(found, given, strict=True):
@@ -72,7 +72,7 @@ def test_nerfstudio_frames_are_applied(tmp_path: Path, beside: str, kind: str) -
     assert note.startswith("cameras: moved into nerfstudio's frame by")
 
 
-def test_applied_scale_is_counted_in(tmp_path: Path) -> None:
+def test_applied_scale_is_included(tmp_path: Path) -> None:
     cameras = rig()
     way = to_nerfstudio(cameras)
     fields = {"applied_transform": APPLIED[:3].tolist(), "applied_scale": 2.0}
@@ -82,7 +82,7 @@ def test_applied_scale_is_counted_in(tmp_path: Path) -> None:
     assert_same_views(found.cameras, cameras, way, SCALE)
 
 
-def test_a_scene_of_the_datasets_frame_keeps_its_cameras(tmp_path: Path) -> None:
+def test_scene_in_the_dataset_frame_keeps_its_cameras(tmp_path: Path) -> None:
     cameras = rig()
     file = write_frames(tmp_path / "transforms.json", cameras)
     write_transforms(tmp_path, to_nerfstudio(cameras), 40.0)
@@ -91,7 +91,7 @@ def test_a_scene_of_the_datasets_frame_keeps_its_cameras(tmp_path: Path) -> None
     assert_same_views(found.cameras, cameras, torch.eye(4, dtype=torch.float64), 1.0)
 
 
-def test_a_scene_made_before_applied_transform_gets_its_cameras(tmp_path: Path) -> None:
+def test_scene_older_than_applied_transform_gets_its_cameras(tmp_path: Path) -> None:
     away = torch.eye(4, dtype=torch.float64)
     away[:3, 3] = torch.tensor([0.0, 30.0, 0.0])
     world = move_scene(scene(), away, 1.0)
@@ -106,7 +106,7 @@ def test_a_scene_made_before_applied_transform_gets_its_cameras(tmp_path: Path) 
     assert_same_views(found.cameras, cameras, torch.eye(4, dtype=torch.float64), 1.0)
 
 
-def test_cameras_that_this_program_saved_are_never_moved(tmp_path: Path) -> None:
+def test_cameras_saved_by_progdf_are_never_moved(tmp_path: Path) -> None:
     cameras = rig()
     save_cameras(tmp_path / "cameras.json", cameras)
     write_transforms(tmp_path, to_nerfstudio(cameras), SCALE)
@@ -199,9 +199,7 @@ def test_up_comes_from_cameras_beside_the_scene_in_its_frame(tmp_path: Path) -> 
     assert (up.name, up.reason) == ("+z", "from the 6 cameras beside the scene's file")
 
 
-def test_cameras_beside_that_look_past_the_scene_are_told(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_unused_cameras_beside_the_scene_are_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     save_cameras(tmp_path / "cameras.json", rig(6))
     find_up(replace(scene(), means=scene().means + torch.tensor([0.0, 500.0, 0.0])), path=tmp_path / "s.ply")
     assert "the 6 cameras beside" in caplog.text

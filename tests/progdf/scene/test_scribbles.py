@@ -1,4 +1,4 @@
-"""Things selected by a few strokes."""
+"""Tests of selecting objects by a few strokes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from progdf.scene.selection import Surface, alike_in_color, base_colors
 
 NONE = np.zeros(0, np.int64)
 
-# Lines over the room's first camera at 800x600: on the table, and on what it stands on and what stands on it.
+# Lines over the room's first camera at 800x600: on the table, on the floor below it and on objects on top.
 ON_TABLE = [[(420, 290), (620, 300), (680, 290)], [(528, 350), (528, 420), (500, 430), (560, 440)]]
 BESIDE = [
     [(420, 340), (490, 380)],
@@ -53,7 +53,7 @@ def strokes() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return rows_under(painted(ON_TABLE), seen), rows_under(painted(BESIDE), seen)
 
 
-def test_strokes_take_a_table_that_no_color_takes() -> None:
+def test_strokes_select_a_table_that_no_color_selects() -> None:
     made, _ = furnished()
     truth = made.members("table").numpy()
     table = np.zeros(len(made.gaussians), bool)
@@ -69,7 +69,7 @@ def test_strokes_take_a_table_that_no_color_takes() -> None:
     assert not mask[outside].any()
 
 
-def test_the_same_scene_moved_turned_and_scaled_is_the_same_selection() -> None:
+def test_moved_rotated_and_scaled_scene_gives_the_same_selection() -> None:
     made, _ = furnished()
     points = made.gaussians.means.double()
     colors = base_colors(made.gaussians)
@@ -79,7 +79,7 @@ def test_the_same_scene_moved_turned_and_scaled_is_the_same_selection() -> None:
     assert (before != after).mean() < 1e-3, "whose chances are even, up to rounding"
 
 
-def test_chances_are_those_of_the_whole_system_solved_exactly() -> None:
+def test_selection_matches_the_exact_solution() -> None:
     rng = np.random.default_rng(0)
     points = rng.normal(size=(3000, 3))
     colors = rng.random((3000, 3)).astype(np.float32)
@@ -97,7 +97,7 @@ def test_chances_are_those_of_the_whole_system_solved_exactly() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 5, 12])
-def test_few_or_equal_points_are_selected_as_far_as_strokes_tell(count: int) -> None:
+def test_few_or_equal_points_are_selected_by_their_strokes(count: int) -> None:
     for points in (np.zeros((count, 3)), np.arange(3.0 * count).reshape(count, 3)):
         scribbles = Scribbles(points, np.full((count, 3), 0.5, np.float32))
         assert not scribbles.select(NONE, NONE).any()
@@ -110,7 +110,7 @@ def test_few_or_equal_points_are_selected_as_far_as_strokes_tell(count: int) -> 
             assert scribbles.select(np.array([0]), NONE).all()
 
 
-def test_what_no_walk_reaches_is_outside() -> None:
+def test_unreachable_points_are_outside() -> None:
     near = np.random.default_rng(0).normal(size=(40, 3))
     far = np.concatenate([near, near + 1e6])
     mask = Scribbles(far, np.full((80, 3), 0.5, np.float32)).select(np.array([0, 1]), NONE)
@@ -118,7 +118,7 @@ def test_what_no_walk_reaches_is_outside() -> None:
     assert not mask[40:].any()
 
 
-def test_a_border_is_where_the_color_changes_however_far_the_strokes() -> None:
+def test_border_is_at_the_color_change_for_far_strokes() -> None:
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.random((4000, 2)), np.zeros((4000, 1))], axis=1)
     red = points[:, 0] < 0.8

@@ -1,4 +1,4 @@
-"""Selecting by hand: shapes over a picture, a ball, a color, the front surface, the neighborhood."""
+"""Tests of manual selection: shapes over a picture, ball, color, front surface and neighborhood."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ POINTS[::100] = np.nan
 
 
 def star(count: int, turns: int = 1) -> np.ndarray:
-    """An outline whose corners go in and out, around the middle so many times."""
+    """Return an outline whose corners go in and out, around the middle `turns` times."""
     t = np.linspace(0, 2 * np.pi * turns, count, endpoint=False)
     r = 150 + 60 * np.sin(5.3 * t)
     return np.stack([200 + r * np.cos(t), 210 + 0.8 * r * np.sin(t)], axis=1)
 
 
 def sheet(colors: torch.Tensor, z: float = 3.0, side: int = 20) -> Gaussians:
-    """A square of opaque Gaussians that touch each other, facing a camera at the origin. [side²,3] rgb"""
+    """Return a square of touching opaque Gaussians that faces a camera at the origin. [side²,3] rgb"""
     x, y = np.meshgrid(np.linspace(-1, 1, side), np.linspace(-1, 1, side))
     means = torch.tensor(np.stack([x.ravel(), y.ravel(), np.full(side**2, z)], axis=1)).float()
     scene = random_gaussians(side**2)
@@ -63,7 +63,7 @@ def camera() -> Camera:
     return front_camera(200, 200, 250.0)
 
 
-def test_centers_are_where_the_camera_sees_them_and_nowhere_behind_it() -> None:
+def test_projected_centers_match_the_camera_and_are_nan_behind_it() -> None:
     scene = random_gaussians(300)
     seen = orbit_camera(90, 60, distance=1.0)
     points, depths = project_centers(scene, seen)
@@ -78,7 +78,7 @@ def test_centers_are_where_the_camera_sees_them_and_nowhere_behind_it() -> None:
 
 
 @pytest.mark.parametrize("outline", [star(3), star(12), star(400), star(31, turns=2)], ids=len)
-def test_a_polygon_holds_exactly_the_points_inside_also_where_it_crosses_itself(outline: np.ndarray) -> None:
+def test_polygon_contains_exactly_its_points_even_if_it_crosses_itself(outline: np.ndarray) -> None:
     expected = Outline(outline).contains_points(np.nan_to_num(POINTS.astype(float), nan=1e9))
     assert (inside_polygon(POINTS, outline) == expected).all()
     thin = outline * (1.0, 1e-3) + (0.0, 200.0)
@@ -91,13 +91,13 @@ def test_two_corners_enclose_nothing() -> None:
     assert not inside_polygon(POINTS, np.full((5, 2), 100.0)).any()
 
 
-def test_a_rectangle_takes_its_corners_in_any_order() -> None:
+def test_rectangle_takes_its_corners_in_any_order() -> None:
     x, y = POINTS.T
     expected = (x >= 30) & (x <= 120) & (y >= 60) & (y <= 90)
     assert (inside_rectangle(POINTS, (30, 90), (120, 60)) == expected).all()
 
 
-def test_a_stroke_touches_what_is_within_its_radius_of_its_path() -> None:
+def test_stroke_selects_points_within_its_radius() -> None:
     path = np.array([(20.0, 30.0), (200.0, 180.0), (200.0, 180.0), (90.0, 300.0)])
     dense = np.concatenate([np.linspace(a, b, 4000) for a, b in pairwise(path)])
     near = np.array(
@@ -109,7 +109,7 @@ def test_a_stroke_touches_what_is_within_its_radius_of_its_path() -> None:
     assert (inside_stroke(POINTS, [(100, 100)], 40.0) == dot).all()
 
 
-def test_a_ball_holds_the_centers_within_its_radius() -> None:
+def test_ball_contains_centers_within_its_radius() -> None:
     scene = random_gaussians(500)
     expected = (scene.means - torch.tensor([0.2, 0.0, -0.3])).norm(dim=1) <= 0.9
     assert (inside_ball(scene, (0.2, 0.0, -0.3), 0.9) == expected.numpy()).all()
@@ -130,7 +130,7 @@ def test_only_colors_within_the_tolerance_are_alike() -> None:
     assert 80 < found.sum() < 110
 
 
-def test_the_front_surface_leaves_out_what_another_hides() -> None:
+def test_front_surface_excludes_hidden_gaussians() -> None:
     scene = joined(sheet(gray(), 3.0), sheet(gray(), 4.0), sheet(gray(), -3.0))
     centers = project_centers(scene, camera())
     front = front_surface(scene, camera(), centers)
@@ -141,7 +141,7 @@ def test_the_front_surface_leaves_out_what_another_hides() -> None:
     assert not front[400:800][hidden].any()
 
 
-def test_asking_about_a_part_of_the_picture_gives_the_same_answer() -> None:
+def test_front_surface_of_some_rows_matches_the_whole() -> None:
     scene = random_gaussians(3000, scale=0.08)
     seen = orbit_camera(160, 120)
     centers = project_centers(scene, seen)
@@ -152,7 +152,7 @@ def test_asking_about_a_part_of_the_picture_gives_the_same_answer() -> None:
     assert front_surface(scene, seen, centers, rows[:0]).shape == (0,)
 
 
-def test_growing_and_shrinking_move_the_border_by_a_neighbor() -> None:
+def test_grow_and_shrink_move_the_border_by_one_neighbor() -> None:
     scene = sheet(gray())
     near = Neighborhood(scene)
     x = scene.means[:, 0].numpy()
@@ -165,14 +165,14 @@ def test_growing_and_shrinking_move_the_border_by_a_neighbor() -> None:
     assert (near.shrink(grown) == square).mean() > 0.98
 
 
-def test_nothing_grows_from_nothing_and_all_stays_all() -> None:
+def test_empty_selection_stays_empty_and_full_stays_full() -> None:
     near = Neighborhood(sheet(gray()))
     for change in (near.grow, near.shrink, near.smooth, near.largest_part, near.refine):
         assert not change(np.zeros(400, bool)).any()
         assert change(np.ones(400, bool)).all()
 
 
-def test_a_lone_gaussian_far_away_is_nobodys_neighbor() -> None:
+def test_far_lone_gaussian_is_no_neighbor() -> None:
     far = replace(sheet(gray(), side=20), means=sheet(gray()).means + torch.tensor([40.0, 0.0, 0.0]))
     scene = joined(sheet(gray()), far[:1])
     mask = np.ones(401, bool)
@@ -191,7 +191,7 @@ def test_smoothing_drops_strays_and_fills_holes() -> None:
 
 
 @pytest.mark.parametrize(("shift", "percent"), [(-1, 35), (1, 35), (-3, 70), (3, 70)])
-def test_a_rough_rim_goes_where_the_color_changes(shift: int, percent: int) -> None:
+def test_refine_moves_a_rough_border_to_the_color_change(shift: int, percent: int) -> None:
     colors = gray(40).reshape(40, 40, 3)
     truth = np.zeros((40, 40), bool)
     truth[10:28, 8:30] = True
@@ -203,7 +203,7 @@ def test_a_rough_rim_goes_where_the_color_changes(shift: int, percent: int) -> N
     assert not (rough == truth).all()
 
 
-def test_a_rough_rim_goes_where_a_gap_is() -> None:
+def test_refine_moves_a_rough_border_to_a_gap() -> None:
     scene = joined(
         sheet(gray()), replace(sheet(gray()), means=sheet(gray()).means + torch.tensor([2.6, 0, 0]))
     )
@@ -211,7 +211,7 @@ def test_a_rough_rim_goes_where_a_gap_is() -> None:
     assert (Neighborhood(scene).refine(rough, 60) == truth).all()
 
 
-def test_a_thin_part_is_held_along_its_middle() -> None:
+def test_refine_keeps_a_thin_part() -> None:
     colors = gray(40).reshape(40, 40, 3)
     truth = np.zeros((40, 40), bool)
     truth[18:21, 4:36] = True
@@ -223,12 +223,12 @@ def test_a_thin_part_is_held_along_its_middle() -> None:
     assert (made & truth).sum() / (made | truth).sum() > 0.95
 
 
-def test_the_largest_part_is_that_of_most_members() -> None:
+def test_largest_part_has_the_most_members() -> None:
     scene = joined(sheet(gray(), 3.0), sheet(torch.full((100, 3), 0.5), 9.0, side=10))
     assert Neighborhood(scene).largest_part(np.ones(500, bool)).tolist() == [True] * 400 + [False] * 100
 
 
-def test_a_flood_stops_at_another_color_and_at_a_gap() -> None:
+def test_flood_stops_at_another_color_and_at_a_gap() -> None:
     colors = gray()
     colors[:200] = torch.tensor([0.8, 0.2, 0.1])  # the upper half
     scene = joined(sheet(colors, 3.0), sheet(colors, 9.0))
@@ -243,7 +243,7 @@ def test_a_flood_stops_at_another_color_and_at_a_gap() -> None:
     assert np.flatnonzero(grow_along_surface(near, lab, np.array([deep]), lab[300], 0.1)).tolist() == [deep]
 
 
-def test_a_surface_that_was_looked_at_ahead_says_the_same_as_one_that_was_not() -> None:
+def test_prepared_surface_matches_an_unprepared_one() -> None:
     scene = random_gaussians(3000, seed=4)
     seen = camera()
     ahead = Surface(scene, seen)

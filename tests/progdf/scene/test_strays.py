@@ -1,4 +1,4 @@
-"""Strays: what is planted is found, what belongs to a scene stays."""
+"""Tests of strays: planted ones are found, Gaussians of the scene are kept."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.helpers.scenes import concatenate, one_gaussian, random_gaussians
 from tests.helpers.stacks import bear_stack
 
 ONE_STEP_DB = 20 * np.log10(255)
-"""PSNR at which pictures differ by one step of 8 bits: what does not show."""
+"""PSNR of pictures that differ by one 8-bit step, which is invisible."""
 
 
 @cache
@@ -33,7 +33,7 @@ def bear() -> Gaussians:
 
 @cache
 def littered() -> tuple[Gaussians, dict[str, list[int]]]:
-    """The bear with strays among its rows, and where these are."""
+    """Return the bear with strays among its rows, and the rows of each kind."""
     scene = bear()
     small = float(scene.scales.median())
     rng = np.random.default_rng(3)
@@ -68,7 +68,7 @@ def same(a: Strays, b: Strays) -> bool:
     return all(np.array_equal(x, y) for x, y in zip(vars(a).values(), vars(b).values(), strict=True))
 
 
-def test_planted_strays_are_found_and_the_scenes_own_rows_are_kept() -> None:
+def test_planted_strays_are_found_and_scene_rows_are_kept() -> None:
     scene, where = littered()
     found = find_strays(scene)
     assert sorted(where["faint"]) == found.faint.tolist()
@@ -79,7 +79,7 @@ def test_planted_strays_are_found_and_the_scenes_own_rows_are_kept() -> None:
 
 
 @pytest.mark.parametrize("factor", [1.0, 2.0**-9, 2.0**11])
-def test_a_moved_turned_and_scaled_scene_has_the_same_strays(factor: float) -> None:
+def test_moved_rotated_and_scaled_scene_has_the_same_strays(factor: float) -> None:
     scene, _ = littered()
     half_turn = scene.quats[:, [1, 0, 3, 2]] * torch.tensor([-1.0, 1.0, -1.0, 1.0])  # about x
     moved = replace(
@@ -92,7 +92,7 @@ def test_a_moved_turned_and_scaled_scene_has_the_same_strays(factor: float) -> N
     assert same(find_strays(moved), find_strays(scene))
 
 
-def test_what_is_cleaned_has_nothing_left_to_clean() -> None:
+def test_cleaned_scene_has_no_strays() -> None:
     scene, _ = littered()
     cleaned = clean(scene, find_strays(scene))
     assert find_strays(cleaned).describe() == "none"
@@ -100,13 +100,13 @@ def test_what_is_cleaned_has_nothing_left_to_clean() -> None:
 
 
 @pytest.mark.parametrize("size", [1000, 2000, 4000])
-def test_a_clean_scene_loses_nothing_that_shows(size: int) -> None:
+def test_clean_scene_loses_nothing_visible(size: int) -> None:
     scene = bear_stack(size).scene
     _, worst = picture_difference(scene, clean(scene, find_strays(scene)))
     assert worst >= ONE_STEP_DB
 
 
-def test_what_is_too_transparent_to_be_drawn_changes_no_pixel() -> None:
+def test_removing_invisible_gaussians_changes_no_pixel() -> None:
     scene = bear()
     faint = replace(scene, logit_opacities=scene.logit_opacities.clone())
     faint.logit_opacities[::3] = -5.6  # 1/271
@@ -116,13 +116,13 @@ def test_what_is_too_transparent_to_be_drawn_changes_no_pixel() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 10, 70])
-def test_few_gaussians_or_many_in_one_place_have_no_strays(count: int) -> None:
+def test_few_or_coincident_gaussians_have_no_strays(count: int) -> None:
     assert find_strays(bear()[:count]).describe() == "none"
     assert find_strays(one_gaussian()[torch.zeros(count, dtype=torch.int64)]).describe() == "none"
 
 
 def crowded() -> Gaussians:
-    """The litter, with a third of the bear's rows at one place."""
+    """Return the scene with strays, with a third of the bear's rows at one position."""
     scene, _ = littered()
     means = scene.means.clone()
     means[::3] = scene.means.median(dim=0).values
@@ -131,7 +131,7 @@ def crowded() -> Gaussians:
 
 @pytest.mark.parametrize("exact", [strays._MAX_EXACT_GAUSSIANS, 0])
 @pytest.mark.parametrize("make", [lambda: littered()[0], crowded, bear, lambda: random_gaussians(3000, 1)])
-def test_shortcuts_find_the_strays_of_a_whole_search(
+def test_shortcuts_find_the_strays_of_a_full_search(
     make: Callable[[], Gaussians], exact: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(strays, "_MAX_EXACT_GAUSSIANS", exact)
@@ -142,7 +142,7 @@ def test_shortcuts_find_the_strays_of_a_whole_search(
     )
 
 
-def test_a_large_scene_searches_few_neighborhoods(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_scene_searches_few_neighborhoods(monkeypatch: pytest.MonkeyPatch) -> None:
     searched = []
     search = strays._Neighborhoods._search
 
@@ -160,7 +160,7 @@ def test_a_large_scene_searches_few_neighborhoods(monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["plant.ply", "playbot_31k.ply"])
-def test_a_real_scene_is_clean_after_it_was_cleaned(name: str) -> None:
+def test_real_scene_is_clean_after_cleaning(name: str) -> None:
     path = SHARED_DATA / name
     if not path.exists():
         pytest.skip(f"{name} is not here")
@@ -175,7 +175,7 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     return capsys.readouterr().out
 
 
-def test_edit_writes_a_scene_without_strays_and_says_what_that_changes(
+def test_clean_writes_a_scene_without_strays_and_reports_changes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -196,7 +196,7 @@ def test_edit_writes_a_scene_without_strays_and_says_what_that_changes(
     assert "strays" not in run(capsys, "info", "clean.ply")
 
 
-def test_an_edit_is_carried_over_to_the_cleaned_scene(
+def test_edit_is_carried_over_to_the_cleaned_scene(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -221,7 +221,7 @@ def test_an_edit_is_carried_over_to_the_cleaned_scene(
         (("--clean", "-o", "bear.ply"), "bear.ply is one of the files to read; choose another name"),
     ],
 )
-def test_an_edit_that_cannot_be_is_one_line(
+def test_impossible_edit_is_reported_in_one_line(
     arguments: tuple[str, ...],
     line: str,
     tmp_path: Path,
@@ -237,7 +237,7 @@ def test_an_edit_that_cannot_be_is_one_line(
     assert [path.name for path in Path().iterdir()] == ["bear.ply"]
 
 
-def test_a_scene_of_which_nothing_is_drawn_is_not_cleaned_away(
+def test_scene_without_visible_gaussians_is_not_cleaned(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     save_ply(tmp_path / "a.ply", one_gaussian(opacity=0.001))
@@ -245,7 +245,7 @@ def test_a_scene_of_which_nothing_is_drawn_is_not_cleaned_away(
     assert "no visible Gaussian" in capsys.readouterr().err
 
 
-def test_attributes_of_what_stays_are_the_same_bits() -> None:
+def test_attributes_of_remaining_rows_keep_their_bits() -> None:
     scene, _ = littered()
     strays = find_strays(scene)
     rows = np.setdiff1d(np.arange(len(scene)), strays.rows)

@@ -1,4 +1,4 @@
-"""What a picture of a scene is about: what stands on the ground, whatever floats about."""
+"""Tests of finding the subject of a scene: the object on the ground, without floaters."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def joined(*scenes: Gaussians) -> Gaussians:
 
 
 def shell(like: Gaussians, count: int, nearest: float, farthest: float, size: float) -> Gaussians:
-    """Gaussians all around, above the ground, between two distances."""
+    """Return Gaussians all around, above the ground, between two distances."""
     shape = like.shN.shape[1]
     found = replace(random_gaussians(count, seed=3), shN=torch.zeros(count, shape, 3))
     away = torch.nn.functional.normalize(found.means, dim=1) * torch.tensor([1.0, 0.0, 1.0]) + UP
@@ -51,13 +51,13 @@ def shell(like: Gaussians, count: int, nearest: float, farthest: float, size: fl
 
 
 def agreement(rows: Tensor, wanted: Tensor) -> float:
-    """Intersection over union of two sets of rows."""
+    """Return the intersection over union of two sets of rows."""
     both = len(np.intersect1d(rows.numpy(), wanted.numpy()))
     return both / (len(rows) + len(wanted) - both)
 
 
 def spans(scene: Gaussians, rows: Tensor, width: int = 600, height: int = 400) -> tuple[float, float]:
-    """The share of the width and of the height that these rows span in the first picture of the scene."""
+    """Return the share of width and height that these rows span in the first picture of the scene."""
     camera = to_camera(first_camera(scene, aspect=width / height), width, height)
     seen = scene.means[rows] @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     assert bool((seen[:, 2] > 0).all())
@@ -67,12 +67,12 @@ def spans(scene: Gaussians, rows: Tensor, width: int = 600, height: int = 400) -
     return float(x.max() - x.min()) / width, float(y.max() - y.min()) / height
 
 
-def test_the_subject_is_the_bear_and_what_it_sits_on_but_not_the_lawn(demo: DemoScene) -> None:
+def test_subject_is_the_bear_and_its_plinth_without_the_lawn(demo: DemoScene) -> None:
     rows = subject_rows(demo.gaussians, UP)
     assert agreement(rows, demo.members(*FIGURE)) > 0.9
 
 
-def test_a_tilted_ground_is_a_ground(demo: DemoScene) -> None:
+def test_tilted_ground_is_a_ground(demo: DemoScene) -> None:
     angle = math.radians(15)
     turn = torch.tensor(
         [[1, 0, 0], [0, math.cos(angle), -math.sin(angle)], [0, math.sin(angle), math.cos(angle)]]
@@ -89,36 +89,36 @@ def test_sky_and_floaters_are_not_the_subject(demo: DemoScene) -> None:
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1e4])
-def test_the_subject_does_not_depend_on_the_unit_of_length(demo: DemoScene, factor: float) -> None:
+def test_subject_does_not_depend_on_the_unit_of_length(demo: DemoScene, factor: float) -> None:
     scene = demo.gaussians
     scaled = replace(scene, means=factor * scene.means, log_scales=scene.log_scales + math.log(factor))
     assert agreement(subject_rows(scaled, UP), subject_rows(scene, UP)) > 0.999
 
 
-def test_without_a_ground_all_is_the_subject(demo: DemoScene) -> None:
+def test_everything_is_the_subject_without_a_ground(demo: DemoScene) -> None:
     alone = demo.gaussians[demo.members(*FIGURE[:-1])]
     assert len(subject_rows(alone, UP)) > 0.99 * int((alone.opacities > 0.1).sum())
 
 
-def test_a_bare_ground_is_the_subject_itself(demo: DemoScene) -> None:
+def test_bare_ground_is_the_subject(demo: DemoScene) -> None:
     lawn = demo.gaussians[demo.members("grass")]
     assert len(subject_rows(lawn, UP)) > 0.95 * int((lawn.opacities > 0.1).sum())
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 63, 64, 65])
-def test_a_few_gaussians_have_a_subject_too(count: int) -> None:
+def test_few_gaussians_have_a_subject(count: int) -> None:
     rows = subject_rows(random_gaussians(count), UP)
     assert 1 <= len(rows) <= count
 
 
-def test_in_the_first_picture_the_subject_takes_two_thirds(demo: DemoScene) -> None:
+def test_subject_fills_two_thirds_of_the_first_picture(demo: DemoScene) -> None:
     width, height = spans(demo.gaussians, demo.members(*FIGURE))
     assert 0.6 < max(width, height) < 0.8
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="needs the shared scenes")
 @pytest.mark.parametrize("name", ["playbot_8k", "playbot_31k", "playbot_125k"])
-def test_a_trained_robot_and_its_hands_fill_the_first_picture_and_the_ground_does_not(name: str) -> None:
+def test_trained_robot_fills_the_first_picture_without_the_ground(name: str) -> None:
     scene = load_ply(DATA / f"{name}.ply")
     robot = torch.from_numpy(np.load(DATA / f"{name}_labels.npy")).bool().nonzero()[:, 0]
     rows = torch.zeros(len(scene), dtype=torch.bool)
@@ -130,7 +130,7 @@ def test_a_trained_robot_and_its_hands_fill_the_first_picture_and_the_ground_doe
     assert 0.6 < max(spans(scene, robot)) < 0.8
 
 
-def test_the_eye_stands_as_near_as_it_can() -> None:
+def test_eye_is_as_close_as_possible() -> None:
     corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3) * torch.tensor([3.0, 1.0, 2.0])
     eye = fit_eye(corners, 0.0, torch.eye(3), (0.5, 0.5))
     torch.testing.assert_close(eye, torch.tensor([0.0, 0.0, 8.0], dtype=torch.float64))
@@ -138,21 +138,21 @@ def test_the_eye_stands_as_near_as_it_can() -> None:
     assert float((shown[:, :2].abs().amax(dim=1) / -shown[:, 2]).max()) == pytest.approx(0.5)
 
 
-def test_one_gaussian_fills_the_picture_by_its_size() -> None:
+def test_single_gaussian_fills_the_picture_by_its_size() -> None:
     scene = random_gaussians(1)
     camera = first_camera(scene, aspect=1.0)
     half = math.atan(2 * float(scene.scales.max()) / camera.distance)
     assert half == pytest.approx(math.atan(FILL * math.tan(math.radians(22.5))), rel=0.1)
 
 
-def test_fitting_keeps_the_direction_and_the_lens(demo: DemoScene) -> None:
+def test_fit_keeps_the_direction_and_the_lens(demo: DemoScene) -> None:
     first = replace(first_camera(demo.gaussians), azimuth=80.0, elevation=-10.0, fov_y=30.0)
     scarf = fit(first, demo.gaussians[demo.members("scarf")], 1.5)
     assert (scarf.azimuth, scarf.elevation, scarf.fov_y, scarf.up) == (80.0, -10.0, 30.0, first.up)
     assert scarf.distance < first.distance
 
 
-def test_a_room_is_met_inside_past_what_stands_in_it() -> None:
+def test_room_opens_from_inside_without_obstacles() -> None:
     demo = room(4000)
     assert is_room(demo.gaussians, UP)
     eye, target = room_viewpoint(demo.gaussians, UP)
@@ -164,18 +164,18 @@ def test_a_room_is_met_inside_past_what_stands_in_it() -> None:
     assert first_camera(demo.gaussians).fov_y == 60.0
 
 
-def test_a_bear_under_the_sky_is_no_room(demo: DemoScene) -> None:
+def test_bear_under_a_sky_is_no_room(demo: DemoScene) -> None:
     assert not is_room(demo.gaussians, UP)
 
 
 def seen_in_first_picture(scene: Gaussians, size: float = 1.0, up: Vec3 | None = None) -> Tensor:
-    """Where each Gaussian is in the first picture's own axes, in units of `size`. [N,3]"""
+    """Return the positions of all Gaussians in the first picture's axes, in units of `size`. [N,3]"""
     camera = to_camera(first_camera(scene, up=up), 600, 400)
     return (scene.means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]) / size
 
 
 @pytest.mark.parametrize("up", AXES)
-def test_a_scene_opens_the_same_however_it_lies_in_its_file(up: str) -> None:
+def test_scene_opens_the_same_in_any_orientation(up: str) -> None:
     scene = high_chair()
     front = front_direction(axis_direction(up))
     side = torch.linalg.cross(axis_direction(up), front)
@@ -184,7 +184,7 @@ def test_a_scene_opens_the_same_however_it_lies_in_its_file(up: str) -> None:
 
 
 @pytest.mark.parametrize(("factor", "moved"), [(1e-3, 0.0), (1e3, 0.0), (1.0, 100.0)])
-def test_a_scaled_or_moved_scene_opens_the_same(factor: float, moved: float) -> None:
+def test_scaled_or_moved_scene_opens_the_same(factor: float, moved: float) -> None:
     scene = high_chair()
     other = replace(scene, means=factor * scene.means + moved, log_scales=scene.log_scales + math.log(factor))
     expected = seen_in_first_picture(scene)
@@ -201,7 +201,7 @@ def test_strays_do_not_move_the_first_view() -> None:
 
 
 def guitar(count: int = 4000) -> Gaussians:
-    """A body of most of the Gaussians, and a neck five times as long, y up."""
+    """Return a body of most of the Gaussians, and a neck five times as long, y up."""
     draw = np.random.default_rng(2)
     means = draw.normal(0.0, 0.1, (count, 3))
     neck = np.arange(count) % 8 == 0
@@ -212,7 +212,7 @@ def guitar(count: int = 4000) -> Gaussians:
 
 
 @pytest.mark.parametrize("make", [guitar, high_chair])
-def test_all_of_the_core_is_in_the_first_picture_with_a_margin(make: Callable[[], Gaussians]) -> None:
+def test_core_is_in_the_first_picture_with_a_margin(make: Callable[[], Gaussians]) -> None:
     scene = make()
     camera = to_camera(first_camera(scene, up=(0.0, 1.0, 0.0)), 600, 400)
     seen = scene.means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
@@ -220,7 +220,7 @@ def test_all_of_the_core_is_in_the_first_picture_with_a_margin(make: Callable[[]
     assert float((across.amax(dim=1) < 0.9).float().mean()) > 0.999, "5 % of each side are free"
 
 
-def test_a_head_is_no_room() -> None:
+def test_head_is_no_room() -> None:
     scene = random_gaussians(6000, seed=1, scale=0.005)
     inside = torch.from_numpy(np.random.default_rng(1).uniform(-0.5, 0.5, (6000, 3))).float()
     head = replace(scene, means=inside * torch.tensor([0.28, 0.38, 0.15]))
@@ -229,13 +229,13 @@ def test_a_head_is_no_room() -> None:
 
 
 @pytest.mark.parametrize("open_side", [1.0, -1.0])
-def test_an_alcove_is_met_from_its_open_side(open_side: float) -> None:
+def test_alcove_opens_from_its_open_side(open_side: float) -> None:
     draw = np.random.default_rng(0)
     spots = torch.from_numpy(draw.uniform(-0.5, 0.5, (6000, 3))).float()
     side = torch.arange(6000) % 7
     for face, (axis, place) in enumerate([(0, -0.5), (0, 0.5), (1, -0.5), (2, -0.5 * open_side)]):
         spots[side == face, axis] = place
-    shelves = side > 3  # along the wall at the back
+    shelves = side > 3  # along the back wall
     spots[shelves, 2] = (0.05 * (20 * spots[shelves, 1]).sin() - 0.3) * open_side
     scene = replace(random_gaussians(6000, scale=0.02), means=spots, logit_opacities=torch.full((6000,), 2.0))
     camera = first_camera(scene, up=(0.0, 1.0, 0.0))

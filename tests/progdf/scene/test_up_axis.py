@@ -1,4 +1,4 @@
-"""Which way is up: said, told by cameras, shown by a ground, kept with an edit; else the convention."""
+"""Tests of the up direction: option, cameras, ground, saved edit, and else the convention."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ MINUS_Y = [0.0, -1.0, 0.0]
 
 
 def statue() -> Gaussians:
-    """A tall thing without a ground, whose flat sides face x: nothing tells which way is up."""
+    """Return a tall object without a ground, whose flat sides face x. Nothing indicates its up direction."""
     scene = random_gaussians(4000, seed=3)
     place = torch.rand(4000, 3, generator=torch.Generator().manual_seed(3)) - 0.5
     place[:, 0] = 0.5 * place[:, 0].sign()
@@ -46,24 +46,24 @@ def statue() -> Gaussians:
     )
 
 
-def test_flat_sides_of_a_thing_without_a_ground_are_no_floor() -> None:
+def test_flat_sides_without_a_ground_are_no_floor() -> None:
     assert guess_up(statue()).tolist() == MINUS_Y
 
 
-def test_a_picture_that_lies_flat_is_no_ground() -> None:
+def test_flat_scene_is_no_ground() -> None:
     flat = statue()
     flat = replace(flat, means=flat.means * torch.tensor([0.001, 1.0, 1.0]))
     assert guess_up(flat).tolist() == MINUS_Y
 
 
 @pytest.mark.parametrize("up", AXES)
-def test_a_thing_that_stands_on_its_feet_is_upright_however_it_lies_in_its_file(up: str) -> None:
+def test_object_on_feet_is_upright_in_any_orientation(up: str) -> None:
     found = find_up(turned(high_chair(), upright_turn(axis_direction(up))))
     assert found.name == up
     assert "wider foot" in found.reason
 
 
-def test_a_slanted_ground_tells_its_own_normal() -> None:
+def test_slanted_ground_gives_its_own_normal() -> None:
     slant = torch.nn.functional.normalize(torch.tensor([0.0, 0.94, 0.34]), dim=0)
     side = torch.tensor([1.0, 0.0, 0.0])
     demo = bear(3000).gaussians
@@ -72,7 +72,7 @@ def test_a_slanted_ground_tells_its_own_normal() -> None:
     assert float(found.direction @ slant) > 0.998, "within 3.6 degrees"
 
 
-def test_the_convention_alone_is_no_certainty_and_the_runner_up_is_named() -> None:
+def test_convention_alone_is_uncertain_and_lists_candidates() -> None:
     found = find_up(ball())
     assert found.direction.tolist() == MINUS_Y
     assert not found.certain
@@ -80,7 +80,7 @@ def test_the_convention_alone_is_no_certainty_and_the_runner_up_is_named() -> No
     assert len(found.candidates) >= 6
 
 
-def test_cameras_beside_a_scene_tell_if_they_look_at_it(tmp_path: Path) -> None:
+def test_cameras_beside_a_scene_determine_up_if_they_face_it(tmp_path: Path) -> None:
     (tmp_path / "point_cloud" / "iteration_7").mkdir(parents=True)
     path = tmp_path / "point_cloud" / "iteration_7" / "point_cloud.ply"
     level = orbit_rig(ball(), 6, 64, 64, up=torch.tensor([1.0, 0.0, 0.0]), elevations=(0.0, 0.0))
@@ -94,7 +94,7 @@ def test_cameras_beside_a_scene_tell_if_they_look_at_it(tmp_path: Path) -> None:
     assert find_up(replace(ball(), origin=(1e6, 0.0, 0.0)), path=path).name == "+x", "far from 0 in the file"
 
 
-def test_a_training_from_a_picture_has_the_up_axis_of_the_window_that_it_is_from(tmp_path: Path) -> None:
+def test_training_from_a_picture_uses_the_up_axis_of_its_window(tmp_path: Path) -> None:
     scene = ball()
     camera = orbit_rig(scene, 1, 32, 32)[0]
     image = Image.new("RGB", (32, 32))
@@ -106,14 +106,14 @@ def test_a_training_from_a_picture_has_the_up_axis_of_the_window_that_it_is_from
 
 
 @pytest.mark.parametrize("make", [bear, room])
-def test_the_grounds_of_the_demo_scenes_speak_against_the_convention(make: object) -> None:
+def test_grounds_of_the_demo_scenes_override_the_convention(make: object) -> None:
     demo = make(3000)  # type: ignore[operator]
     found = find_up(demo.gaussians)
     assert torch.equal(found.direction, demo.up)
     assert "ground" in found.reason
 
 
-def test_what_is_said_goes_before_cameras_and_ground() -> None:
+def test_option_overrides_cameras_and_ground() -> None:
     demo = bear(3000)
     for axis in AXES:
         found = find_up(demo.gaussians, demo.cameras, axis)
@@ -121,19 +121,19 @@ def test_what_is_said_goes_before_cameras_and_ground() -> None:
         assert torch.equal(found.direction, axis_direction(axis))
 
 
-def test_cameras_go_before_a_ground_and_are_level_within_two_degrees() -> None:
+def test_cameras_override_a_ground_and_are_level_within_two_degrees() -> None:
     scene = bear(3000).gaussians
     held = torch.nn.functional.normalize(torch.tensor([0.01, 0.0, -1.0]), dim=0)
     assert find_up(scene, orbit_rig(ball(), 12, 64, 64, up=held, elevations=(0.0, 0.0))).name == "-z"
 
 
-def test_too_few_gaussians_are_upright_by_convention() -> None:
+def test_too_few_gaussians_use_the_convention() -> None:
     found = find_up(random_gaussians(3))
     assert found.direction.tolist() == MINUS_Y
     assert [direction_name(up) for up in found.candidates][:3] == ["-y", "+y", "+z"], "the usual ones first"
 
 
-def test_a_saved_up_axis_comes_back_and_nonsense_does_not() -> None:
+def test_saved_up_axis_is_restored_and_nonsense_is_ignored() -> None:
     up = find_up(bear(3000).gaussians)
     kept = up_from_json(up.to_json())
     assert kept is not None
@@ -149,14 +149,12 @@ def test_a_saved_up_axis_comes_back_and_nonsense_does_not() -> None:
         assert up_from_json(nonsense) is None
 
 
-def test_an_axis_may_begin_with_a_minus_on_the_command_line() -> None:
+def test_axis_option_may_start_with_a_minus() -> None:
     words = ["a.ply", "--up", "-z", "-o", "b.png"]
     assert parse_options(RenderOptions, words, "progdf render").drawing.up == "-z"
 
 
-def test_check_prints_boxes_to_paste_and_the_up_axis(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_info_prints_boxes_and_the_up_axis(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = random_gaussians(1000, seed=5)
     scene.means[0] = torch.tensor([70.0, 0.0, 0.0])
     save_ply(tmp_path / "a.ply", scene)
@@ -185,7 +183,7 @@ def upright(tmp_path: Path, *arguments: str) -> tuple[float, ...]:
     return found.up if found.session is None else found.view.camera.up
 
 
-def test_an_edit_shows_its_scene_upright_without_being_asked(tmp_path: Path) -> None:
+def test_edit_stores_the_up_axis_of_its_scene(tmp_path: Path) -> None:
     stack = bear_stack(2000)
     scene, scarf, _ = stack.save(tmp_path)
     plus_y = (0.0, 1.0, 0.0)
@@ -196,7 +194,7 @@ def test_an_edit_shows_its_scene_upright_without_being_asked(tmp_path: Path) -> 
     assert upright(tmp_path, str(scene), str(scarf), "--up", "+y") == plus_y
 
 
-def test_a_session_keeps_the_up_axis_and_up_changes_it(tmp_path: Path) -> None:
+def test_session_keeps_the_up_axis_and_up_option_changes_it(tmp_path: Path) -> None:
     stack = bear_stack(2000)
     scene, _, _ = stack.save(tmp_path)
     options = parse_options(RenderOptions, [str(scene), "-o", "p.png"], "progdf render")
@@ -211,13 +209,13 @@ def tilted(up: Tensor) -> str:
     return find_up(statue(), orbit_rig(ball(), 12, 64, 64, up=up, elevations=(0.0, 0.0))).name
 
 
-def test_a_tilted_up_direction_is_named_by_its_numbers() -> None:
+def test_tilted_up_direction_is_named_by_its_components() -> None:
     for rounding in (0.0, 4e-17, -4e-8):
         assert tilted(torch.tensor([rounding, -0.957826, 0.287348])) == "0 -0.958 0.287"
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_cloud_without_any_direction_is_not_decided_by_the_convention_alone(
+def test_cloud_without_a_direction_is_uncertain(
     seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
