@@ -1,4 +1,4 @@
-"""Scenes trained with Mip-Splatting's 2D filter: they say so, and are drawn so everywhere."""
+"""Tests of scenes trained with Mip-Splatting's 2D filter: the flag is kept, and every renderer applies it."""
 
 from __future__ import annotations
 
@@ -55,12 +55,14 @@ def with_comment(path: Path, comment: bytes) -> Path:
         (b"SplatRenderMode: \x1b[2Jmip\xff\xfe", False),
     ],
 )
-def test_a_comment_says_that_a_scene_is_antialiased(tmp_path: Path, comment: bytes, expected: bool) -> None:
+def test_comment_marks_a_scene_as_antialiased(tmp_path: Path, comment: bytes, expected: bool) -> None:
     scene, report = load_ply_with_report(with_comment(tmp_path / "scene.ply", comment))
     assert scene.antialiased is report.antialiased is expected
 
 
-def test_check_says_it_and_never_shows_a_comment(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_reports_antialiased_and_never_prints_a_comment(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = with_comment(tmp_path / "scene.ply", b"antialiased 1\ncomment \x1b]0;pwned\x07")
     assert main(["info", str(path)]) == 0
     said = capsys.readouterr().out
@@ -69,7 +71,7 @@ def test_check_says_it_and_never_shows_a_comment(tmp_path: Path, capsys: pytest.
     assert "pwned" not in said
 
 
-def test_a_saved_scene_still_says_it(tmp_path: Path) -> None:
+def test_saved_scene_keeps_antialiased(tmp_path: Path) -> None:
     save_ply(tmp_path / "mip.ply", replace(scene_of(1), antialiased=True))
     assert read_header(tmp_path / "mip.ply").antialiased
     again = load_ply(tmp_path / "mip.ply")
@@ -78,7 +80,7 @@ def test_a_saved_scene_still_says_it(tmp_path: Path) -> None:
     assert b"comment" not in (tmp_path / "plain.ply").read_bytes()[:400]
 
 
-def test_a_repaired_scene_still_says_it(tmp_path: Path) -> None:
+def test_repaired_scene_keeps_antialiased(tmp_path: Path) -> None:
     columns = table_of(scene_of(0))
     columns["opacity"][3] = torch.inf
     path = write(tmp_path / "inf.ply", columns)
@@ -88,7 +90,7 @@ def test_a_repaired_scene_still_says_it(tmp_path: Path) -> None:
     assert scene.antialiased
 
 
-def test_rows_types_and_edits_keep_it(stack: Stack) -> None:
+def test_row_selection_conversion_and_edits_keep_antialiased(stack: Stack) -> None:
     scene = stack.scene
     rows = torch.arange(5)
     assert scene[rows].antialiased
@@ -97,15 +99,15 @@ def test_rows_types_and_edits_keep_it(stack: Stack) -> None:
     assert compose_layers(scene, [Layer(stack.gdfs[0], 0.5)]).antialiased
 
 
-def test_an_exported_edit_still_says_it(stack: Stack, tmp_path: Path) -> None:
+def test_exported_edit_keeps_antialiased(stack: Stack, tmp_path: Path) -> None:
     scene, edit, *_ = stack.save(tmp_path)
     assert main(["export", str(scene), str(edit), "--out", str(tmp_path / "edited.ply")]) == 0
     assert load_ply(tmp_path / "edited.ply").antialiased
 
 
 @pytest.mark.parametrize("engine", EVERY)
-def test_weights_count_what_is_drawn(stack: Stack, engine: str) -> None:
-    """Σ w over all Gaussians is the share of a pixel that they cover, with the filter as without."""
+def test_alpha_weights_use_the_filter(stack: Stack, engine: str) -> None:
+    """Compare Σ w over all Gaussians with the share of a pixel that they cover."""
     scene = stack.scene
     camera = to_camera(first_camera(stack.scene, stack.demo.cameras), 40, 30)
     white = replace(scene, sh0=torch.full_like(scene.sh0, 1.7724539), shN=scene.shN[:, :0])
@@ -114,7 +116,7 @@ def test_weights_count_what_is_drawn(stack: Stack, engine: str) -> None:
     torch.testing.assert_close(weights, covered, rtol=1e-4, atol=0.0)  # sums of float32
 
 
-def test_training_views_show_what_is_drawn(stack: Stack) -> None:
+def test_training_views_use_the_filter(stack: Stack) -> None:
     scene = stack.scene
     camera = to_camera(first_camera(stack.scene, stack.demo.cameras), *SIZE)
     region = Region("all", torch.arange(len(scene)), torch.ones(len(scene)))
@@ -129,7 +131,7 @@ def test_training_views_show_what_is_drawn(stack: Stack) -> None:
 
 @pytest.mark.gl
 @pytest.mark.parametrize("draw", ["gl", "cpu"])
-def test_the_window_draws_it_as_the_rasterizer_does(ctx: moderngl.Context, stack: Stack, draw: str) -> None:
+def test_viewer_draws_antialiased_like_the_rasterizer(ctx: moderngl.Context, stack: Stack, draw: str) -> None:
     view = ViewState(
         camera=first_camera(stack.scene, stack.demo.cameras), layers=(LayerState(0, "scarf", 0.7),)
     )
@@ -141,12 +143,12 @@ def test_the_window_draws_it_as_the_rasterizer_does(ctx: moderngl.Context, stack
     edited = compose_layers(stack.scene, [Layer(stack.gdfs[0], 0.7)])
     expected = render(edited, to_camera(view.camera, *SIZE), view.background).image
     fat = render(replace(edited, antialiased=False), to_camera(view.camera, *SIZE), view.background).image
-    assert float((found - expected).abs().max()) < 1 / 255  # a rim at the 1/255 cut, as in test_gl_parity
+    assert float((found - expected).abs().max()) < 1 / 255  # boundary at the 1/255 cut, as in test_gl_parity
     assert float((found - fat).abs().max()) > 0.1
 
 
-def test_one_point_is_drawn_with_the_stated_share_of_its_opacity() -> None:
-    """det0 / det is 0 for a point, and the root of the floor 0.005 is left of its opacity."""
+def test_single_point_is_drawn_with_the_stated_share_of_opacity() -> None:
+    """A point has det0 / det = 0, so the square root of the floor 0.005 of its opacity remains."""
     camera = front_camera(9, 9)
     point = Gaussians(
         means=torch.tensor([[0.0, 0.0, 2.0]]),

@@ -1,4 +1,4 @@
-"""What the window shows of an error: no command line, whichever of our errors it is."""
+"""Tests of error texts in the window: no command line in any of our errors."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TYPED = re.compile(rf"(?<![\w/.-])--[a-z]|pip install|hf download|progdf ({'|'.j
 
 
 def raised_texts(package: str) -> Iterator[str]:
-    """The messages of what a package raises, its values as X."""
+    """Yield the messages of a package's exceptions, with their values as X."""
     for path in sorted((ROOT / package).rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
@@ -33,7 +33,7 @@ def raised_texts(package: str) -> Iterator[str]:
                         yield text.value
 
 
-def test_no_error_of_ours_has_a_command_line_in_the_window() -> None:
+def test_window_errors_contain_no_command_line() -> None:
     texts = [text for package in ("progdf", "trainer", "viewer") for text in raised_texts(package)]
     assert len([text for text in texts if TYPED.search(text)]) > 80, "there are such"
     for text in texts:
@@ -61,7 +61,7 @@ def test_no_error_of_ours_has_a_command_line_in_the_window() -> None:
         ("/work/a--b.ply is damaged; load it again", "/work/a--b.ply is damaged; load it again"),
     ],
 )
-def test_what_is_wrong_stays_and_what_one_can_do_by_hand(error: str, shown: str) -> None:
+def test_window_errors_keep_the_cause_and_manual_remedies(error: str, shown: str) -> None:
     assert without_commands(error) == shown
 
 

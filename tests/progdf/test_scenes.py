@@ -1,4 +1,4 @@
-"""The bear: exact size, seeded, labeled, opaque; and edits whose course is known."""
+"""Tests of the demo scenes (exact size, seeded, labeled, opaque) and of edits with a known path."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def _same(a: Gaussians, b: Gaussians) -> bool:
 
 
 @pytest.mark.parametrize("size", [scenes.MIN_BEAR_GAUSSIANS, 401, 5003])
-def test_the_bear_has_exactly_the_size_asked_for_and_leaves_torch_as_it_was(size: int) -> None:
+def test_bear_has_the_requested_size_and_leaves_torch_unchanged(size: int) -> None:
     torch.manual_seed(5)
     before = torch.get_rng_state()
     threads = torch.get_num_threads()
@@ -43,7 +43,7 @@ def test_the_bear_has_exactly_the_size_asked_for_and_leaves_torch_as_it_was(size
     assert set(scene.labels.tolist()) == set(range(len(scene.label_names)))
 
 
-def test_the_same_seed_gives_the_same_bear_and_another_seed_another(bear: scenes.DemoScene) -> None:
+def test_bear_is_determined_by_its_seed(bear: scenes.DemoScene) -> None:
     assert _same(bear.gaussians, scenes.bear(6000).gaussians)
     assert not torch.equal(bear.gaussians.means, scenes.bear(6000, seed=1).gaussians.means)
 
@@ -53,7 +53,7 @@ def room() -> scenes.DemoScene:
     return scenes.room(2503)
 
 
-def test_a_room_has_its_size_and_all_its_things_and_is_seeded(room: scenes.DemoScene) -> None:
+def test_room_has_its_size_and_all_parts_and_is_seeded(room: scenes.DemoScene) -> None:
     scene = room
     assert len(scene.gaussians) == 2503
     assert set(scene.labels.tolist()) == set(range(len(scene.label_names)))
@@ -62,7 +62,7 @@ def test_a_room_has_its_size_and_all_its_things_and_is_seeded(room: scenes.DemoS
         scenes.room(scenes.MIN_ROOM_GAUSSIANS - 1)
 
 
-def test_cameras_in_the_room_are_inside_and_see_walls_everywhere() -> None:
+def test_room_cameras_are_inside_and_see_walls_everywhere() -> None:
     scene = scenes.room(6000)
     for camera in scene.cameras:
         x, y, z = camera.position.tolist()
@@ -72,11 +72,11 @@ def test_cameras_in_the_room_are_inside_and_see_walls_everywhere() -> None:
     red, green = (
         render(scene.gaussians, camera, background=c).image for c in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
     )
-    # closed on all sides: next to nothing of the background is left
+    # closed on all sides: nearly no background is visible
     assert float((red - green).abs().mean()) < 0.02
 
 
-def test_a_part_that_lies_inside_another_is_reported_not_searched_for() -> None:
+def test_part_inside_another_is_refused() -> None:
     outer = surface.Part("outer", "x", surface.ball(), torch.zeros(3), torch.eye(3))
     inner = surface.Part("inner", "x", surface.ball(), torch.zeros(3), 0.1 * torch.eye(3))
     with pytest.raises(ValueError, match="lies inside other parts; move it"):
@@ -88,7 +88,7 @@ def test_too_few_gaussians_for_a_bear_are_refused() -> None:
         scenes.bear(scenes.MIN_BEAR_GAUSSIANS - 1)
 
 
-def test_every_number_of_the_bear_is_usable(bear: scenes.DemoScene) -> None:
+def test_every_value_of_the_bear_is_usable(bear: scenes.DemoScene) -> None:
     g = bear.gaussians
     assert all(getattr(g, name).isfinite().all() for name in ATTRIBUTES)
     assert g.sh_degree == 1
@@ -105,7 +105,7 @@ def test_some_colors_are_clamped_as_in_real_scenes(bear: scenes.DemoScene) -> No
     assert (rgb > 0.97).any()
 
 
-def test_labels_tell_where_the_parts_are(bear: scenes.DemoScene) -> None:
+def test_labels_match_the_positions_of_parts(bear: scenes.DemoScene) -> None:
     order = ["ears", "head", "scarf", "body", "plinth", "grass"]
     heights = [float(bear.gaussians.means[bear.members(name), 1].mean()) for name in order]
     assert heights == sorted(heights, reverse=True)
@@ -121,8 +121,8 @@ def test_no_gaussian_is_buried_in_another_part() -> None:
     assert float(body.depth(others).max()) < 0.05
 
 
-def test_the_bear_has_no_holes_seen_from_its_cameras(bear: scenes.DemoScene) -> None:
-    # what shines through from behind changes with the background, and nothing else does
+def test_bear_has_no_holes_from_its_cameras(bear: scenes.DemoScene) -> None:
+    # only light from behind changes with the background
     red, green = (
         render(bear.gaussians, bear.cameras[0].resize(160, 160), background=color).image
         for color in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
@@ -135,7 +135,7 @@ def test_the_bear_has_no_holes_seen_from_its_cameras(bear: scenes.DemoScene) -> 
     assert float(leak[:10].min()) > 0.95
 
 
-def test_the_first_camera_sees_the_face(bear: scenes.DemoScene) -> None:
+def test_first_camera_sees_the_face(bear: scenes.DemoScene) -> None:
     front = bear.cameras[0]
     back = bear.cameras[16]
     assert float(front.position[2]) > 2
@@ -144,14 +144,14 @@ def test_the_first_camera_sees_the_face(bear: scenes.DemoScene) -> None:
     image = render(bear.gaussians, front.resize(128, 128), background=bear.background).image
     assert torch.allclose(image[2, 2], torch.tensor(bear.background), atol=0.02)
     dark = (image.amax(dim=2) < 0.2).nonzero().float().mean(0)
-    assert 25 < float(dark[0]) < 60  # eyes and nose: the darkest of the picture, in its upper half
+    assert 25 < float(dark[0]) < 60  # eyes and nose, the darkest pixels, are in the upper half
 
 
 @pytest.mark.parametrize(
     "shape",
     [surface.ball(), surface.ball(5.0), surface.ring(0.3), surface.lathe((0.5, 1.0, 0.3), (1.0, 0.2, -1.0))],
 )
-def test_samples_lie_on_the_surface_and_their_normals_point_out(shape: surface.Shape) -> None:
+def test_samples_lie_on_the_surface_with_outward_normals(shape: surface.Shape) -> None:
     matrix = torch.tensor([[0.5, 0.1, 0.0], [0.0, 0.8, 0.0], [0.1, 0.0, 0.3]])
     part = surface.Part("x", "x", shape, torch.tensor([1.0, 2.0, 3.0]), matrix)
     at = surface.sample(part, 700)
@@ -172,9 +172,7 @@ EDITS = ("gold", "blue scarf", "stripes", "big ears", "tilted ears", "long ears"
 
 
 @pytest.mark.parametrize("name", EDITS)
-def test_an_analytic_edit_leaves_other_rows_and_strength_zero_alone(
-    bear: scenes.DemoScene, name: str
-) -> None:
+def test_analytic_edit_keeps_other_rows_and_strength_zero(bear: scenes.DemoScene, name: str) -> None:
     edit, members = analytic_edits.bear_edits(bear)[name]
     assert _same(edit.apply(bear.gaussians, members, 0.0), bear.gaussians)
     edited = edit.apply(bear.gaussians, members, 0.7)
@@ -184,7 +182,7 @@ def test_an_analytic_edit_leaves_other_rows_and_strength_zero_alone(
     assert not _same(edited[members], bear.gaussians[members])
 
 
-def test_growing_doubles_sizes_and_distances_from_the_pivot(bear: scenes.DemoScene) -> None:
+def test_scale_edit_doubles_sizes_and_distances_from_the_pivot(bear: scenes.DemoScene) -> None:
     ears = bear.members("ears")
     pivot = torch.tensor([[0.0, 1.0, 0.0]])
     edited = analytic_edits.scale_edit(3.0, pivot).apply(bear.gaussians, ears, 0.5)
@@ -193,7 +191,7 @@ def test_growing_doubles_sizes_and_distances_from_the_pivot(bear: scenes.DemoSce
     assert torch.allclose(edited.scales[ears], 2 * before.scales, rtol=1e-5)
 
 
-def test_swinging_is_a_rigid_turn(bear: scenes.DemoScene) -> None:
+def test_swing_edit_is_a_rigid_rotation(bear: scenes.DemoScene) -> None:
     ears = bear.members("ears")
     pivot = torch.tensor([[0.0, 1.0, 0.0]])
     edit = analytic_edits.swing_edit(180.0, torch.tensor([0.0, 0.0, 2.0]), pivot)
@@ -201,7 +199,7 @@ def test_swinging_is_a_rigid_turn(bear: scenes.DemoScene) -> None:
     arm = bear.gaussians.means[ears] - pivot
     expected = torch.stack([-arm[:, 1], arm[:, 0], arm[:, 2]], dim=1)
     assert torch.allclose(half.means - pivot, expected, atol=1e-5)
-    # the picture turns with it: a quarter turn about z of everything, seen by a camera turned alike
+    # the picture rotates too: a quarter turn about z of the whole scene, with a camera rotated alike
     camera = bear.cameras[0].resize(96, 96)
     whole = torch.arange(len(bear.gaussians))
     plain = bear.gaussians
@@ -214,7 +212,7 @@ def test_swinging_is_a_rigid_turn(bear: scenes.DemoScene) -> None:
     assert (same - render(plain, camera).image).abs().max() < 1e-2
 
 
-def test_a_deformation_that_is_a_turn_or_a_growth_looks_like_one(bear: scenes.DemoScene) -> None:
+def test_deformation_matches_an_equal_rotation_or_scaling(bear: scenes.DemoScene) -> None:
     ears, pivot, camera = bear.members("ears"), torch.tensor([0.0, 1.0, 0.0]), bear.cameras[3].resize(96, 96)
     axis = torch.tensor([1.0, 0.0, 0.0])
 
@@ -238,7 +236,7 @@ def test_a_deformation_that_is_a_turn_or_a_growth_looks_like_one(bear: scenes.De
         assert float((pictures[0] - pictures[1]).abs().max()) < 1e-3
 
 
-def test_stretching_keeps_what_lies_across_and_bending_keeps_distances_from_the_pivot(
+def test_stretch_keeps_cross_sections_and_bend_keeps_pivot_distances(
     bear: scenes.DemoScene,
 ) -> None:
     ears = bear.members("ears")
@@ -259,14 +257,14 @@ def test_stretching_keeps_what_lies_across_and_bending_keeps_distances_from_the_
     assert torch.allclose(angle, math.radians(45) * (before[:, 1] - 1) / 0.5, atol=1e-4)
 
 
-def test_recoloring_is_exact_at_its_end(bear: scenes.DemoScene) -> None:
+def test_recolor_edit_is_exact_at_full_strength(bear: scenes.DemoScene) -> None:
     scarf = bear.members("scarf")
     target = torch.tensor([0.1, 0.5, 0.3])
     edited = analytic_edits.recolor_edit(target).apply(bear.gaussians, scarf, 1.0)
     assert torch.allclose(typical_color(sh0_to_rgb(edited.sh0[scarf])), target, atol=0.12)
 
 
-def test_the_pandas_picture_changes_the_coat_and_keeps_face_scarf_and_ground(bear: scenes.DemoScene) -> None:
+def test_panda_picture_changes_the_coat_and_keeps_the_rest(bear: scenes.DemoScene) -> None:
     camera = bear.cameras[2].resize(200, 200)
 
     def cover(parts: tuple[str, ...]) -> torch.Tensor:
@@ -289,12 +287,12 @@ def test_the_pandas_picture_changes_the_coat_and_keeps_face_scarf_and_ground(bea
 
 
 @pytest.mark.parametrize("strength", [-0.1, 1.1, math.nan])
-def test_a_strength_outside_its_range_is_refused(bear: scenes.DemoScene, strength: float) -> None:
+def test_strength_out_of_range_is_refused(bear: scenes.DemoScene, strength: float) -> None:
     with pytest.raises(ProgdfError, match="between 0 and 1"):
         analytic_edits.darken_edit().apply(bear.gaussians, torch.arange(3), strength)
 
 
-def test_which_of_parts_of_one_size_gets_the_gaussian_that_is_left_does_not_hang_on_rounding() -> None:
+def test_leftover_gaussian_of_equal_parts_is_independent_of_rounding() -> None:
     random = np.random.default_rng(0)
     counts = set()
     for _ in range(6):

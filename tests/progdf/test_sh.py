@@ -1,4 +1,4 @@
-"""Higher SH bands turn with their Gaussians."""
+"""Tests of rotating higher SH bands with their Gaussians."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ def rotate_bands(shN: torch.Tensor, quats: torch.Tensor) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_what_was_seen_along_a_direction_is_seen_along_the_turned_one(degree: int) -> None:
+def test_rotated_bands_show_the_same_colors_along_rotated_directions(degree: int) -> None:
     quats = turns()
     shN = bands(degree)
-    sh0 = 2.0 * torch.ones(COUNT, 1, 3)  # so that nothing is clamped at 0
+    sh0 = 2.0 * torch.ones(COUNT, 1, 3)  # prevents clamping at 0
     directions = torch.nn.functional.normalize(Draws(2).normal(COUNT, 3), dim=1)
     before = shade(degree, directions.double(), torch.cat([sh0, shN], dim=1).double())
     turned = rotate_vectors(directions.double(), quats.double())
@@ -36,7 +36,7 @@ def test_what_was_seen_along_a_direction_is_seen_along_the_turned_one(degree: in
     torch.testing.assert_close(after, before, rtol=0.0, atol=1e-6)
 
 
-def test_one_turn_after_another_is_their_product() -> None:
+def test_two_rotations_equal_their_product() -> None:
     first = turns(3)
     second = turns(4)
     shN = bands(3)
@@ -44,7 +44,7 @@ def test_one_turn_after_another_is_their_product() -> None:
     torch.testing.assert_close(there, rotate_bands(shN, multiply_quats(second, first)), rtol=0.0, atol=2e-6)
 
 
-def test_without_a_turn_nothing_changes_and_band_4_never_does() -> None:
+def test_identity_changes_nothing_and_band_4_is_never_rotated() -> None:
     rest = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(COUNT, 4)
     assert not bool(rotation_change(bands(3), rest).any())
     change = rotation_change(0.3 * Draws(1).normal(COUNT, 24, 3), turns())
@@ -52,13 +52,13 @@ def test_without_a_turn_nothing_changes_and_band_4_never_does() -> None:
     assert not bool(change[:, 15:].any())
 
 
-def test_parts_turn_their_members() -> None:
+def test_parts_rotate_their_members() -> None:
     part = torch.arange(COUNT) % 3
     expected = rotation_change(bands(2), turns()[:3][part])
     assert torch.equal(rotation_change(bands(2), turns()[:3], part), expected)
 
 
-def test_half_a_turn_about_x_changes_signs_only() -> None:
+def test_half_turn_about_x_changes_only_signs() -> None:
     half = torch.tensor([[0.0, 1.0, 0.0, 0.0]]).expand(COUNT, 4)
     torch.testing.assert_close(
         half_turn(bands(3), (1.0, -1.0, -1.0)), rotate_bands(bands(3), half), rtol=0.0, atol=1e-6

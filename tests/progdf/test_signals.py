@@ -1,4 +1,4 @@
-"""Ctrl+C that arrives where Python ignores exceptions."""
+"""Tests of Ctrl+C in places where Python ignores exceptions."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from progdf.terminal import handle_signals
 from trainer.store.state import defer_signals, interrupt_on_signals
 
 pytestmark = [pytest.mark.skipif(os.name == "nt", reason="needs signals that wake the main thread")]
-WAIT_S = 60.0  # the signal ends the wait; this ends a failing test
+WAIT_S = 60.0  # the signal ends the wait, or this timeout ends a failing test
 
 
 class Thing:
-    """An object whose end calls a function."""
+    """Object that calls a function when it is deleted."""
 
     def __init__(self, callback: Callable[[], object]) -> None:
         self.callback = callback
@@ -32,7 +32,7 @@ class Thing:
 
 
 class Plain:
-    """An object that weak references may point to."""
+    """Object that supports weak references."""
 
 
 def in_weakref_callback(function: Callable[[], object]) -> None:
@@ -62,7 +62,7 @@ def interrupt(number: int, frame: FrameType | None) -> NoReturn:
 
 
 def work(place: Callable[[Callable[[], object]], None], number: int) -> None:
-    """Get a signal inside the callback, then work on."""
+    """Raise a signal inside the callback, then continue."""
     place(lambda: signal.raise_signal(number))
     threading.Event().wait(WAIT_S)
     pytest.fail("the signal is lost")

@@ -1,4 +1,4 @@
-"""What a notebook shows of scenes, fields and edits."""
+"""Tests of the notebook cards of scenes, fields and edits."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Tags(HTMLParser):
 
 
 def still(card: str) -> np.ndarray:
-    """The picture of a card. [H,W,4] uint8"""
+    """Return the picture of a card. [H,W,4] uint8"""
     source = re.search("src='data:image/webp;base64,([^']+)'", card)
     assert source is not None
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(source[1]))).convert("RGBA"))
@@ -57,7 +57,7 @@ def shirt(scene: Gaussians, name: str = "shirt") -> Gdf:
     return edit_of(scene, rows, curved_field(len(rows), 2, 14 + 3 * scene.shN.shape[1]), name)
 
 
-def test_a_scene_shows_itself_from_the_front_with_its_size() -> None:
+def test_scene_card_shows_a_front_view_and_the_size() -> None:
     scene = bear(1500).gaussians
     card = to_html(scene)
     assert Tags(card).words == ["1 500 Gaussians", "SH degree 1", "138.0 kB in memory"]
@@ -70,7 +70,7 @@ def test_a_scene_shows_itself_from_the_front_with_its_size() -> None:
     assert middle[0] > middle[2] + 30, "the bear, which is brown, is in the middle"
 
 
-def test_a_large_scene_takes_no_time_and_no_room() -> None:
+def test_card_of_a_large_scene_is_fast_and_small() -> None:
     scene = concatenate([bear(6000).gaussians] * 20)
     to_html(scene)
     began = time.process_time()
@@ -79,7 +79,7 @@ def test_a_large_scene_takes_no_time_and_no_room() -> None:
     assert len(card) < 40_000
 
 
-def test_an_edit_and_its_field_show_their_course_and_their_size() -> None:
+def test_edit_and_field_cards_show_their_curves_and_size() -> None:
     edit = shirt(random_gaussians(300, seed=3, sh_degree=1))
     for shown in (edit, edit.field):
         card = to_html(shown)
@@ -91,7 +91,7 @@ def test_an_edit_and_its_field_show_their_course_and_their_size() -> None:
     assert "7 rows added" in to_html(growing(random_gaussians(300, seed=3), torch.arange(20), 7, 1))
 
 
-def test_texts_of_a_stranger_are_texts() -> None:
+def test_untrusted_texts_are_escaped() -> None:
     edit = replace(
         shirt(random_gaussians(100, seed=3), HOSTILE), instruction=HOSTILE + "\x1b[2J" + "x" * 10_000
     )
@@ -104,7 +104,7 @@ def test_texts_of_a_stranger_are_texts() -> None:
 
 
 @pytest.mark.parametrize("broken", ["empty", "nan", "far", "double", "grad", "one"])
-def test_what_cannot_be_drawn_is_left_out(broken: str) -> None:
+def test_undrawable_scene_has_a_card_without_a_picture(broken: str) -> None:
     scene = random_gaussians(60, seed=1)
     scene = {
         "empty": lambda: scene[:0],
@@ -118,7 +118,7 @@ def test_what_cannot_be_drawn_is_left_out(broken: str) -> None:
     assert ("src=" in to_html(scene)) == (broken in ("double", "grad", "one"))
 
 
-def test_an_edit_that_is_not_baked_says_so(tmp_path: Path) -> None:
+def test_card_of_an_unbaked_edit_shows_not_baked(tmp_path: Path) -> None:
     write_cube(tmp_path / "warm.cube", lattice_colors(2), "warm")
     card = to_html(read_gdf(tmp_path / "warm.cube"))
     assert "not baked" in card

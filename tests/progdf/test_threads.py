@@ -1,4 +1,4 @@
-"""Chunks that threads share are each done once, whoever does them."""
+"""Tests of chunks shared by threads: each chunk runs exactly once."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("two_threads")
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
 @pytest.mark.parametrize("chunks", [0, 1, 3, 1000])
-def test_every_chunk_is_done_once_and_results_are_in_order(threads: int, chunks: int) -> None:
+def test_every_chunk_runs_once_and_results_are_in_order(threads: int, chunks: int) -> None:
     set_threads(threads)
     done: list[int] = []
 
@@ -29,18 +29,18 @@ def test_every_chunk_is_done_once_and_results_are_in_order(threads: int, chunks:
     assert sorted(done) == list(range(chunks))
 
 
-def test_a_thread_of_the_pool_takes_part() -> None:
+def test_thread_of_the_pool_takes_part() -> None:
     met = threading.Barrier(2, timeout=60)
     run_chunks(lambda _: met.wait(), 2)
 
 
-def test_many_callers_at_once_each_get_their_own() -> None:
+def test_concurrent_callers_each_get_their_own_results() -> None:
     with ThreadPoolExecutor(8) as callers:
         found = list(callers.map(lambda n: run_chunks(lambda chunk: n * chunk, 50), range(40)))
     assert found == [[n * chunk for chunk in range(50)] for n in range(40)]
 
 
-def test_a_caller_is_not_kept_waiting_by_a_pool_that_is_busy() -> None:
+def test_busy_pool_does_not_block_a_caller() -> None:
     release, busy = threading.Event(), threading.Barrier(3, timeout=60)
 
     def hold(_: int) -> None:
@@ -60,7 +60,7 @@ def test_a_caller_is_not_kept_waiting_by_a_pool_that_is_busy() -> None:
     assert in_time == list(range(10))
 
 
-def test_an_error_in_any_thread_reaches_the_caller_when_all_are_done() -> None:
+def test_error_in_any_thread_reaches_the_caller_after_all_chunks() -> None:
     met = threading.Barrier(2, timeout=60)
     done = []
 
@@ -78,7 +78,7 @@ def test_an_error_in_any_thread_reaches_the_caller_when_all_are_done() -> None:
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-def test_a_forked_process_gets_threads_of_its_own() -> None:
+def test_forked_process_gets_its_own_threads() -> None:
     run_chunks(lambda chunk: chunk, 2)
     child = os.fork()
     if child == 0:
@@ -91,13 +91,13 @@ def test_a_forked_process_gets_threads_of_its_own() -> None:
     assert status == 0
 
 
-def test_python_ends_after_threads_have_drawn() -> None:
+def test_python_exits_after_threads_ran() -> None:
     code = "from progdf.threads import *; set_threads(2); run_chunks(print, 4)"
     assert subprocess.run([sys.executable, "-c", code], timeout=600, check=False).returncode == 0
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_what_was_cancelled_stops_between_two_chunks(count: int) -> None:
+def test_cancelled_work_stops_between_two_chunks(count: int) -> None:
     set_threads(count)
     stop = threading.Event()
     done = []
@@ -112,8 +112,8 @@ def test_what_was_cancelled_stops_between_two_chunks(count: int) -> None:
     assert run_chunks(lambda chunk: chunk, 3) == [0, 1, 2], "the next one goes on"
 
 
-def test_what_a_kernel_asks_for_stays_on_its_thread_and_leaves_nothing_behind() -> None:
-    """Else the pool, busy with others, would hold what was asked for, and its arrays, until all are done."""
+def test_nested_chunks_run_on_the_thread_that_started_them() -> None:
+    """A busy pool would otherwise keep the nested chunks and their arrays until all are done."""
     set_threads(2)
     seen: list[set[str]] = []
 

@@ -1,4 +1,4 @@
-"""Removing, moving and copying regions: exact ends, what lies between, what stays, and the command."""
+"""Tests of removing, moving and copying regions: exact ends, intermediate strengths and the command."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ BLACK = (0.0, 0.0, 0.0)
 WHITE = (1.0, 1.0, 1.0)
 TURN = (0.3, -1.1, 0.4)
 ROUNDING = 1 / 255
-"""A step of 8 bits: ends are kept in 16 bits of the farthest way, what lies between to a three-hundredth."""
+"""One 8-bit step. Ends are stored in 16 bits of the longest path, intermediate offsets to 1/300."""
 
 
 COUNT = 384
-"""What any processor's vectors divide: what is left over is activated by another loop, an ulp beside."""
+"""Divisible by every processor's vector width. Remainders are activated by another loop, 1 ulp off."""
 
 
 def scene_of(degree: int = 2) -> Gaussians:
@@ -60,7 +60,7 @@ def picture(scene: Gaussians, background: tuple[float, float, float], camera: Ca
 
 
 def checker(scene: Gaussians) -> Gaussians:
-    """The scene with a wall of black and white tiles behind it."""
+    """Return the scene with a wall of black and white tiles behind it."""
     x, y = torch.meshgrid(torch.arange(-6, 7), torch.arange(-6, 7), indexing="ij")
     count = x.numel()
     tone = ((x + y) % 2).float().flatten()[:, None].expand(-1, 3)
@@ -76,7 +76,7 @@ def checker(scene: Gaussians) -> Gaussians:
     return Gaussians(**joined)
 
 
-def test_what_is_removed_is_gone_on_white_black_and_checker() -> None:
+def test_removed_region_is_gone_before_any_background() -> None:
     scene = checker(scene_of())
     region = left_half(scene)
     region = Region("left", region.members[region.members < COUNT], region.score)
@@ -88,11 +88,11 @@ def test_what_is_removed_is_gone_on_white_black_and_checker() -> None:
             gone = picture(removed, background, camera)
             reference = picture(without, background, camera)
             assert float((there - reference).abs().max()) > 0.1
-            # the last rows of a tensor are activated by another loop than the others: an ulp
+            # the last rows of a tensor are activated by another loop, 1 ulp off
             assert float((gone - reference).abs().max()) < 1e-5
 
 
-def test_opacity_falls_linearly_and_ends_where_nothing_is_drawn() -> None:
+def test_removal_is_linear_in_opacity_and_ends_below_the_cutoff() -> None:
     scene = scene_of()
     region = left_half(scene)
     gdf = tidy(scene, [Step("remove", region)], "gone")
@@ -104,7 +104,7 @@ def test_opacity_falls_linearly_and_ends_where_nothing_is_drawn() -> None:
 
 
 @pytest.mark.parametrize("does", ["remove", "transform", "duplicate"])
-def test_strength_zero_is_the_scene_and_rows_outside_are_never_touched(does: str) -> None:
+def test_strength_zero_is_the_scene_and_other_rows_never_change(does: str) -> None:
     scene = scene_of()
     region, motion = left_half(scene), similarity((0.2, 0.1, 0.0), TURN, 1.3)
     gdf = {
@@ -124,7 +124,7 @@ def test_strength_zero_is_the_scene_and_rows_outside_are_never_touched(does: str
 
 
 def moved_camera(camera: Camera, center: Tensor, motion: Motion) -> Camera:
-    """The camera that sees what has moved as the given one saw what was there; it must not be scaled."""
+    """Return the camera that sees the moved scene as `camera` sees the original. `motion` must not scale."""
     turn = rotation_matrices(turn_quats(motion.turn))[0]
     # x' = c + t + R (x − c), so that x = Rᵀ (x' − c − t) + c
     back = turn.T
@@ -136,18 +136,18 @@ def moved_camera(camera: Camera, center: Tensor, motion: Motion) -> Camera:
 
 
 @pytest.mark.parametrize("share", [0.37, 1.0])
-def test_a_thing_and_a_camera_that_move_alike_show_the_same_picture(share: float) -> None:
+def test_scene_and_camera_moved_alike_give_the_same_picture(share: float) -> None:
     scene = scene_of(degree=3)
     motion = similarity((0.4, -0.2, 0.3), TURN)
     gdf = tidy(scene, [Step("transform", whole_scene(scene), motion)], "moved")
     part = Motion(*(share * value for value in vars(motion).values()))
     camera = front_camera(64, 48, 50.0)
     seen = picture(at(scene, gdf, share), BLACK, moved_camera(camera, scene.means.double().mean(0), part))
-    # colors that did not turn with it would be off by more than a tenth
+    # without rotated SH, colors would be off by more than 0.1
     assert float((seen - picture(scene, BLACK, camera)).square().mean().sqrt()) < ROUNDING
 
 
-def test_a_turn_goes_along_an_arc_even_all_the_way_round() -> None:
+def test_rotation_follows_an_arc_even_for_a_full_turn() -> None:
     scene = scene_of()
     region = left_half(scene)
     gdf = tidy(scene, [Step("transform", region, similarity(turn=(0.0, 2 * math.pi, 0.0)))], "round")
@@ -162,7 +162,7 @@ def test_a_turn_goes_along_an_arc_even_all_the_way_round() -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 2])
-def test_a_copy_in_place_is_the_region_twice(degree: int) -> None:
+def test_copy_in_place_is_the_region_twice(degree: int) -> None:
     scene = scene_of(degree)
     region = left_half(scene)
     gdf = tidy(scene, [Step("duplicate", region, similarity())], "twice")
@@ -178,7 +178,7 @@ def test_a_copy_in_place_is_the_region_twice(degree: int) -> None:
         )
 
 
-def test_copies_go_where_the_motion_takes_the_region_itself() -> None:
+def test_copies_go_where_the_motion_moves_the_region() -> None:
     scene = scene_of(degree=3)
     region = left_half(scene)
     motion = similarity((0.2, 0.1, 0.0), TURN, 1.3)
@@ -189,7 +189,7 @@ def test_copies_go_where_the_motion_takes_the_region_itself() -> None:
     assert torch.equal(copy.shN, moved.shN)
 
 
-def test_what_is_baked_is_the_slider_at_its_end() -> None:
+def test_baked_scene_is_the_slider_at_full_strength() -> None:
     scene = scene_of(degree=3)
     left = left_half(scene)
     low = from_mask("low", scene.means[:, 1] > 0.4)
@@ -206,7 +206,7 @@ def test_what_is_baked_is_the_slider_at_its_end() -> None:
     assert torch.allclose(pack(drawn, True), pack(kept, True), atol=ROUNDING)
 
 
-def test_an_edit_that_only_adds_is_a_file_like_any_other(tmp_path: Path) -> None:
+def test_edit_that_only_adds_is_saved_like_any_other(tmp_path: Path) -> None:
     scene = scene_of()
     gdf = tidy(scene, [Step("duplicate", left_half(scene), similarity((1.0, 0.0, 0.0)))], "copy")
     save_gdf(tmp_path / "copy.gdf", gdf)
@@ -224,7 +224,7 @@ def ply(tmp_path: Path) -> Path:
 LEFT = "box:-9,-9,-9,0,9,9"
 
 
-def test_the_command_deletes_and_copies_for_good(ply: Path, tmp_path: Path) -> None:
+def test_edit_command_deletes_and_copies_permanently(ply: Path, tmp_path: Path) -> None:
     scene = load_ply(ply)
     out = tmp_path / "out.ply"
     assert main(["edit", str(ply), "--delete", LEFT, "--duplicate", f"all-{LEFT}:2,0,0", "-o", str(out)]) == 0
@@ -234,7 +234,7 @@ def test_the_command_deletes_and_copies_for_good(ply: Path, tmp_path: Path) -> N
     assert torch.allclose(edited.means[len(rest) :], rest.means + torch.tensor([2.0, 0.0, 0.0]))
 
 
-def test_the_command_writes_a_slider(ply: Path, tmp_path: Path) -> None:
+def test_edit_command_writes_a_slider(ply: Path, tmp_path: Path) -> None:
     out = tmp_path / "turned.gdf"
     arguments = ["--rotate", f"{LEFT}:y,90", "--scale", f"{LEFT}:2", "--move", f"{LEFT}:0,-1,0"]
     assert main(["edit", str(ply), *arguments, "-o", str(out)]) == 0
@@ -275,7 +275,7 @@ def test_the_command_writes_a_slider(ply: Path, tmp_path: Path) -> None:
         ["--duplicate", "masks:nowhere:1,0,0"],
     ],
 )
-def test_what_cannot_be_is_one_line_and_writes_nothing(
+def test_impossible_edit_is_refused_and_writes_nothing(
     ply: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str]
 ) -> None:
     out = tmp_path / "out.ply"
@@ -285,7 +285,7 @@ def test_what_cannot_be_is_one_line_and_writes_nothing(
 
 
 @pytest.mark.parametrize("options", [["--clean", "-o", "a.gdf"], ["--delete", LEFT, "-o", "a.obj"]])
-def test_an_output_that_does_not_fit_is_refused(
+def test_unsuitable_output_name_is_refused(
     ply: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
