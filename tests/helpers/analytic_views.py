@@ -1,9 +1,9 @@
-"""Edited views whose truth is known: an analytic edit of a scene, pictured where a training run will look.
+"""Edited views with a known truth: an analytic edit of a scene, drawn from the views of a training run.
 
     python -m tests.helpers.analytic_views ears|tilted|hands OUT [--strengths 0.25,0.5,1] [--size N] [--quick]
 
 writes OUT/scene.ply, OUT/labels.npy, OUT/edited/*.png (and OUT/edited/0.25/*.png …), and prints the command
-that trains from them: a `folder:` edit as any other tool would leave it, with a right answer.
+that trains from them: a `folder:` edit as any other tool would leave it, with a known answer.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ _HANDS = (2, 3)
 
 @dataclass(frozen=True)
 class Truth:
-    """A scene and what an edit really does to it.
+    """A scene and the exact edit of it.
 
     Args:
         scene: the original
         labels: part of each Gaussian. [N] uint8
         parts: the labels that the edit changes
-        edit: what it does to them
+        edit: the change
     """
 
     scene: Gaussians
@@ -52,7 +52,7 @@ class Truth:
 
 
 def bear_truth(name: str = _EARS, size: int = 6000) -> Truth:
-    """A bear whose ears are edited; `name`: "big ears" or "tilted ears"."""
+    """Return a bear with edited ears; `name` is "big ears" or "tilted ears"."""
     demo = bear(size)
     edit, members = bear_edits(demo)[name]
     labels = demo.labels.numpy()
@@ -60,7 +60,7 @@ def bear_truth(name: str = _EARS, size: int = 6000) -> Truth:
 
 
 def hands_truth(path: Path = PLAYBOT, factor: float = 1.35, lift: float = 0.12) -> Truth:
-    """The toy robot with both hands enlarged and lifted by `lift` world units (its y axis points down)."""
+    """Return the toy robot with both hands enlarged and lifted by `lift` world units (its y axis is down)."""
     scene = load_ply(path)
     labels = np.load(path.with_name(f"{path.stem}_labels.npy"))
     centers = [scene.means[torch.from_numpy(labels == hand)].mean(dim=0) for hand in _HANDS]
@@ -70,7 +70,7 @@ def hands_truth(path: Path = PLAYBOT, factor: float = 1.35, lift: float = 0.12) 
 
 
 def write_truth(folder: Path, truth: Truth) -> tuple[Path, str]:
-    """Write scene.ply and labels.npy; the scene's path and the region to train."""
+    """Write scene.ply and labels.npy. Return the scene's path and the region to train."""
     folder.mkdir(parents=True, exist_ok=True)
     save_ply(folder / "scene.ply", truth.scene)
     np.save(folder / "labels.npy", truth.labels)
@@ -80,12 +80,12 @@ def write_truth(folder: Path, truth: Truth) -> tuple[Path, str]:
 def write_analytic_views(
     folder: Path, truth: Truth, options: TrainOptions, strengths: Sequence[float]
 ) -> None:
-    """Picture the edit in every view that a run with these options will have.
+    """Draw the edit in every view that a run with these options will have.
 
     Args:
-        folder: where the pictures go: those of strength 1 into it, others into a folder of their own in it
-        truth: what to picture
-        options: as `train` will be given them; of these, what decides about the views counts
+        folder: folder of the pictures of strength 1; other strengths go into subfolders
+        truth: the scene and its edit
+        options: the options of `train`, of which those that determine the views matter
         strengths: ascending, the last 1
     """
     options = resolve(options)
@@ -107,17 +107,17 @@ class Options:
     what: tyro.conf.Positional[Literal["ears", "tilted", "hands"]]
     """The bear's ears grown 1.7 times or tilted, or the hands of playbot_31k.ply enlarged and lifted."""
     out: tyro.conf.Positional[Path]
-    """Folder for them."""
+    """Output folder."""
     strengths: str = "1"
-    """Strengths that are pictured, as 0.25,0.5,0.75,1."""
+    """Strengths to draw, such as 0.25,0.5,0.75,1."""
     size: int = 24_000
-    """Gaussians of the bear."""
+    """Number of Gaussians of the bear."""
     quick: bool = False
-    """The views of a --quick run."""
+    """Draw the views of a --quick run."""
 
 
 def main() -> None:
-    """Make the folder and print the command."""
+    """Write the folder and print the command."""
     options = tyro.cli(Options)
     truth = (
         hands_truth()

@@ -1,4 +1,4 @@
-"""What a person does with the program, in a process that `bare_system` has stripped: commands or jobs."""
+"""Typical commands or jobs of the program, in a process that `bare_system` has stripped."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def commands() -> None:
     run("render", "bear.ply", "--size=64x48", "--engine=cpu", "--out=a.png")
     run("train", "bear.ply", "--out=run", f"--region={EARS}", *TRAIN)
     run("info", "run/run.gdf")
-    for _ in range(2):  # the second replaces what the first wrote
+    for _ in range(2):  # the second replaces the files of the first
         run("export", "bear.ply", "run/run.gdf", "--out=edited.ply")
         opened = document.load(Path("bear.ply"), [Path("run/run.gdf")])
         view = ViewState(layers=(LayerState(0, "run", 0.25),))
@@ -53,7 +53,7 @@ def jobs() -> None:
         return EditOrder(Path("bear.ply"), out, name, EARS, "tint:#3060d0", quick=True, threads=1)
 
     def wait(until: str = "") -> str:
-        """What became of the job, or that it does `until`."""
+        """Wait until the job ends, or until its state is `until`. Return its state."""
         while queue.busy():
             for ended in queue.poll():
                 return ended.status + ended.error

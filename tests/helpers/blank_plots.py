@@ -1,4 +1,4 @@
-"""Reports without their curves, which take half of the time of a small run."""
+"""Reports without their plots, which take half of the time of a small run."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from trainer.report.plots import PAPER, Plot
 
 @contextmanager
 def blank_plots() -> Iterator[None]:
-    """Meanwhile a plot in report.png is bare paper."""
+    """Leave the plots in report.png blank."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report, "draw_plot", _leave_blank)
         yield

@@ -1,4 +1,4 @@
-"""One Chromium for all that is looked at in a browser."""
+"""One Chromium shared by all browser tests."""
 
 from __future__ import annotations
 

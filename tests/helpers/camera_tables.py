@@ -1,4 +1,4 @@
-"""The camera files of other programs, as tables to write, and viewmats that no camera may have."""
+"""Camera files of other programs as tables to write, and invalid viewmats."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ REFUSED_VIEWMATS = {
     "collapsed": (_axes(0.0, 0.0, 0.0), "stretches or shears"),
     "scaled by its last row": (_axes(1.0, 1.0, 1.0, 1.7), "has the last row"),
 }
-"""What is multiplied to a good viewmat from the left → the change, and the fault that is named."""
+"""Factor to multiply a valid viewmat from the left, and the fault that the error names."""
 
 
 def some_cameras() -> list[Camera]:
@@ -45,7 +45,7 @@ def written(path: Path, content: object) -> Path:
 
 
 def nerfstudio(cameras: list[Camera], **changes: object) -> dict[str, Any]:
-    """transforms.json as nerfstudio writes it; a change to None removes the key."""
+    """Return transforms.json as nerfstudio writes it. A change to None removes the key."""
     frames = []
     for camera in cameras:
         c2w = camera.c2w.double()

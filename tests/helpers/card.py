@@ -1,7 +1,7 @@
-"""A graphics card without one: tensors that have their values, but say that they are on another device.
+"""Simulated GPU: tensors with their values on the CPU that report another device.
 
-What would fail on a card fails here: an operation between a tensor on the card and one that is not, unless
-the latter is a single number; a tensor on the card as a numpy array.
+Operations that would fail on a GPU fail here: an operation between a tensor on the GPU and a CPU tensor that
+is not a single number, and a numpy array of a tensor on the GPU.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
 CARD = torch.device("meta")
-"""What the tensors say; torch knows it, and no other tensor here is there."""
+"""Device of the simulated tensors; torch knows it, and no other tensor here uses it."""
 
 _MOVES = ("aten::_to_copy", "aten::copy_")
 
 
 class OnCard(Tensor):
-    """A tensor on the card. `values`: what it holds, on the CPU"""
+    """A tensor on the simulated GPU. `values` holds its numbers on the CPU."""
 
     values: Tensor
     __torch_function__ = torch._C._disabled_torch_function_impl
@@ -40,15 +40,15 @@ class OnCard(Tensor):
         return made
 
     def tolist(self) -> Any:
-        """As of any tensor."""
+        """Return the values as any tensor does."""
         return self.values.tolist()
 
     def new_tensor(self, *args: Any, **kwargs: Any) -> Tensor:
-        """As of any tensor; torch makes it without asking."""
+        """Return a new tensor on the same device, which torch makes without dispatch."""
         return OnCard(self.values.new_tensor(*args, **kwargs))
 
     def __getitem__(self, index: Any) -> Tensor:
-        """As of any tensor; of lists torch makes indices without asking."""
+        """Return the indexed part. Torch makes index tensors of lists without dispatch."""
         parts = index if isinstance(index, tuple) else (index,)
         parts = tuple(
             OnCard(torch.tensor(some)) if isinstance(some, list | tuple) else some for some in parts
@@ -63,7 +63,7 @@ class OnCard(Tensor):
 
 
 class Card(TorchDispatchMode):
-    """While it is entered, tensors can be made on CARD. `moved`: numbers moved to it and from it"""
+    """Mode in which tensors can be made on CARD. `moved` counts the numbers moved to it and from it."""
 
     moved = 0
 

@@ -11,7 +11,7 @@ from progdf.gaussians import Gaussians
 
 
 def gsplat_tensors(scene: Gaussians) -> dict[str, Tensor]:
-    """The table `splats` of gsplat's simple_trainer."""
+    """Return the table `splats` of gsplat's simple_trainer."""
     return {
         "means": scene.means.clone(),
         "quats": scene.quats.clone(),
@@ -23,7 +23,7 @@ def gsplat_tensors(scene: Gaussians) -> dict[str, Tensor]:
 
 
 def nerfstudio_tensors(scene: Gaussians) -> dict[str, Tensor]:
-    """The parameters of splatfacto, without the prefix of its model."""
+    """Return the parameters of splatfacto, without the prefix of its model."""
     return {
         "means": scene.means.clone(),
         "quats": scene.quats.clone(),
@@ -35,6 +35,6 @@ def nerfstudio_tensors(scene: Gaussians) -> dict[str, Tensor]:
 
 
 def save_gsplat(path: Path, scene: Gaussians, step: int = 29_999) -> Path:
-    """A checkpoint of simple_trainer, of one GPU."""
+    """Write a checkpoint of simple_trainer on one GPU."""
     torch.save({"step": step, "splats": gsplat_tensors(scene)}, path)
     return path

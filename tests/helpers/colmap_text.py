@@ -1,4 +1,4 @@
-"""COLMAP models in their text form, written without pycolmap."""
+"""COLMAP text models, written without pycolmap."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ def write_text_model(
     header: str = "",
     cameras: Sequence[str] = (PINHOLE,),
 ) -> Path:
-    """Write a model whose image N looks along z from (0, 0, −N), and return its folder.
+    """Write a model whose image N looks along z from (0, 0, −N). Return its folder.
 
     Args:
-        names: of the images
-        points: the line of 2D points after each image; None leaves it out
+        names: names of the images
+        points: the line of 2D points after each image; None omits it
         header: the first line of images.txt, if any
         cameras: lines of cameras.txt
     """

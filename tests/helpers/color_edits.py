@@ -1,4 +1,4 @@
-"""Color edits at one strength, the reference being the colors' own where none is given."""
+"""Color edits at one strength. The default reference is the typical color of the input."""
 
 from __future__ import annotations
 

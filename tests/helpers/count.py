@@ -1,4 +1,4 @@
-"""How often something is called."""
+"""Counting of calls."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import pytest
 
 
 class Count:
-    """A function in its place that counts its calls."""
+    """Replacement for a function that counts its calls."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, target: object, name: str) -> None:
         self.calls = 0

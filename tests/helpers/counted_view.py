@@ -1,6 +1,6 @@
-"""`progdf view` as it is, which counts the turns of its loop: python counted_view.py TURNS ARGUMENTS…
+"""`progdf view` with a count of its loop's turns: python counted_view.py TURNS ARGUMENTS…
 
-A turn handles the events that are there and draws at most one frame; a window at rest takes none.
+A turn handles the pending events and draws at most one frame. An idle window takes no turns.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from viewer.app.app import App
 
 
 def count_turns(path: str) -> None:
-    """Keep in the file how often the window's loop has come to draw since it was opened, 8 bytes."""
+    """Write the number of turns of the window's loop to the file, in 8 bytes."""
     file = os.open(path, os.O_RDWR | os.O_CREAT)
     draw = App.draw
     turns = 0

@@ -1,4 +1,4 @@
-"""The demo's scenes for tests: making one takes a second, so each is made once and handed out as a copy."""
+"""Cached demo scenes. Building one takes a second, so each is built once and returned as a copy."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ _room = cache(demo_scenes.room)
 
 
 def bear(size: int, seed: int = 0) -> DemoScene:
-    """See `progdf.demo_scenes.bear`."""
+    """Return a copy of `progdf.demo_scenes.bear`."""
     return _copy(_bear(size, seed))
 
 
 def room(size: int, seed: int = 0) -> DemoScene:
-    """See `progdf.demo_scenes.room`."""
+    """Return a copy of `progdf.demo_scenes.room`."""
     return _copy(_room(size, seed))
 
 

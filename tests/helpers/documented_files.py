@@ -47,9 +47,9 @@ EDITS = {
     "demo/blue/blue": "head",
     "demo/scarf/scarf": "scarf",
 }
-""".gdf files without their runs, and the part that each edits."""
+"""Single .gdf files, and the part that each edits."""
 RUNS = {"blue": "head", "hand": "ears", "body": "head", "scarf": "scarf"}
-"""Folders of finished runs below runs/, and the part that each edits."""
+"""Folders of finished runs in runs/, and the part that each edits."""
 
 CATALOGUE = """
 [defaults]
@@ -102,7 +102,7 @@ def train_documented_runs() -> None:
 
 
 def identity_lattice(side: int = 5) -> torch.Tensor:
-    """Return the colors of a table that changes nothing, red fastest. [side³,3]"""
+    """Return the colors of an identity table, red fastest. [side³,3]"""
     steps = torch.linspace(0.0, 1.0, side)
     blue, green, red = torch.meshgrid(steps, steps, steps, indexing="ij")
     return torch.stack([red, green, blue], dim=-1).reshape(-1, 3)

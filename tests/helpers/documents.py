@@ -1,4 +1,4 @@
-"""Command lines and Python blocks of the documents, with the section in which they stand."""
+"""Command lines and Python blocks of the documents, with their section."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Example:
     """A command line or a block of code in a document."""
 
     document: str  # relative to the repository
-    heading: str  # of the section in which it stands; empty before the first one
+    heading: str  # heading of the section; empty before the first heading
     text: str  # without prompt, path of the environment and comment
 
     @property
@@ -91,7 +91,7 @@ def _fenced_lines(text: str) -> Iterator[str]:
 
 
 def _inline_lines(text: str) -> Iterator[str]:
-    """Yield complete command lines between backticks; a command's name alone is no example."""
+    """Yield complete command lines between backticks. The name of a command alone is no example."""
     prose = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
     for span in re.findall(r"`([^`]+)`", prose):
         command = _bare_command(" ".join(span.split()))
@@ -109,7 +109,7 @@ def _bare_command(line: str) -> str:
 
 
 def _is_complete(words: list[str]) -> bool:
-    """Tell a command line from the name of a command or of one of its options."""
+    """Return True for a command line, False for the name of a command or of one of its options."""
     if words[:2] == ["progdf", "--version"]:
         return True
     names = {"progdf": 2, "python": 4, "make": 1}[words[0]]

@@ -1,4 +1,4 @@
-"""Hard cases drawn by either engine, with their gradients, and how far two drawings are apart."""
+"""Hard cases rendered by any engine, with their gradients, and the difference of two renderings."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.helpers.scenes import HardCase, hard_cases, orbit_camera, random_gaus
 
 INPUTS = ("means", "quats", "scales", "opacities", "colors", "viewmat", "K", "background")
 CASES = hard_cases() | {
-    # of trainings alone: what is on a screen is a picture
+    # used only in training; a screen shows whole pictures
     "samples of a larger picture": HardCase(
         random_gaussians(200, seed=4, scale=0.01), replace(orbit_camera(), sampling=3.0)
     )
@@ -29,12 +29,12 @@ NEEDS_WARP = pytest.mark.skipif(importlib.util.find_spec("warp") is None, reason
 EVERY = [pytest.param(name, marks=NEEDS_WARP if name == "warp" else ()) for name in ENGINES]
 """All engines."""
 FAST = EVERY[1:]
-"""All but the reference."""
+"""All engines except the reference."""
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """A picture and the gradients of a fixed random weighting of it, by input name."""
+    """A rendering, and the gradients of a fixed random weighting of it by input name."""
 
     image: Tensor
     transmittance: Tensor
@@ -48,7 +48,7 @@ def draw(
     engine: str,
     crop: Crop | None = None,
 ) -> Drawn:
-    """Drawn where the engine draws: on the card, if there is one and it is warp. Results are the CPU's."""
+    """Render on the engine's device, a GPU if there is one and the engine is warp. Results are on the CPU."""
     dtype = torch.float64 if engine == "reference" else torch.float32
     device = engine_device(engine)
     background = torch.tensor([0.2, 0.4, 0.6])
@@ -70,7 +70,7 @@ def draw(
 def render_leaves(
     leaves: dict[str, Tensor], camera: Camera, antialiased: bool, engine: str, crop: Crop | None = None
 ) -> Rendering:
-    """Draw with each of `INPUTS` in place of the scene's and the camera's own."""
+    """Render with each of `INPUTS` in place of the scene's and the camera's own."""
     activated = ActivatedGaussians(*(leaves[name] for name in INPUTS[:5]), antialiased)
     placed = replace(camera, viewmat=leaves["viewmat"], K=leaves["K"])
     return render(activated, placed, leaves["background"], crop=crop, engine=engine)
@@ -91,7 +91,10 @@ def image_error(found: Drawn, expected: Drawn) -> float:
 
 
 def relative_errors(found: Drawn, expected: Drawn) -> dict[str, float]:
-    """Largest gradient error over the largest gradient, by input; below 1e-6 a gradient counts as zero."""
+    """Return the largest gradient error over the largest gradient, per input.
+
+    Gradients below 1e-6 count as zero.
+    """
     errors = {}
     for name, reference in expected.gradients.items():
         difference = (found.gradients[name] - reference).abs()

@@ -1,4 +1,4 @@
-"""Builders of trajectories, fields and edits that tests share."""
+"""Builders of trajectories, fields and edits shared by tests."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def curved_trajectory(
     moving: Collection[str] = ATTRIBUTES,
     snapshots: int = 9,
 ) -> tuple[Tensor, Tensor]:
-    """Strengths [T] and offsets [T,M,C] of members that bend away from the straight way in two manners."""
+    """Return strengths [T] and offsets [T,M,C] of members whose paths bend in two ways."""
     draws = Draws(seed)
     strengths = torch.linspace(0, 1, snapshots)
     bend = torch.sin(torch.pi * strengths)
@@ -51,7 +51,7 @@ def curved_field(
     basis_type: torch.dtype = torch.int8,
     end_type: torch.dtype = torch.float32,
 ) -> BakedField:
-    """A separable field of `curved_trajectory`, its ends stored in `end_type`."""
+    """Return a separable field of `curved_trajectory` with its ends stored in `end_type`."""
     strengths, offsets = curved_trajectory(members, seed, channels, moving)
     field = fit_separable(strengths, offsets, dict.fromkeys(ATTRIBUTES, rank), basis_type=basis_type)
     if end_type == torch.float32:
@@ -65,12 +65,12 @@ def curved_field(
 
 
 def at_snapshots(field: BakedField, strengths: Tensor) -> Tensor:
-    """The field's offsets at these strengths. [T,M,C]"""
+    """Return the field's offsets at these strengths. [T,M,C]"""
     return torch.stack([field.offsets(float(s)) for s in strengths])
 
 
 def linear_pictures(members: int, channels: int, seed: int = 0) -> Render:
-    """A stand-in for a renderer: shows color well, geometry little, half of the members not at all."""
+    """Return a simulated renderer that shows color well, geometry little, and half of the members never."""
     draws = Draws(seed)
     shown = draws.normal(90, members, channels) / (members * channels) ** 0.5
     shown[:, ::2] = 0.0
@@ -80,7 +80,7 @@ def linear_pictures(members: int, channels: int, seed: int = 0) -> Render:
 
 
 def edit_of(scene: Gaussians, members: Tensor, field: BakedField, name: str = "shirt") -> Gdf:
-    """An edit of these rows ([M] int64, sorted)."""
+    """Return an edit of these rows ([M] int64, sorted)."""
     score = torch.zeros(len(scene))
     score[members] = 1.0
     return Gdf(name, Region(name, members, score), field, fingerprint(scene), "recolor:#3060d0")
@@ -92,7 +92,7 @@ def added_rows(count: int, seed: int, bands: int = 1) -> Gaussians:
 
 
 def growing(scene: Gaussians, members: torch.Tensor, count: int, seed: int, name: str = "hat") -> Gdf:
-    """Takes every second member away, and lets so many rows appear that move as they do."""
+    """Return an edit that removes every second member and adds `count` rows that move like the others."""
     draws = Draws(seed)
     added = added_rows(count, seed)
     start = torch.cat([scene.logit_opacities[members], added.logit_opacities])
@@ -110,7 +110,7 @@ def grown(offsets: torch.Tensor, knots: torch.Tensor, added: Gaussians) -> dict[
 
 
 def whole_grade(scene: Gaussians) -> Gdf:
-    """Half of the light everywhere; a residual and a mask of single rows."""
+    """Return an edit that halves the light everywhere, with a residual and a mask of single rows."""
     return grade_of(scene, torch.arange(len(scene)), "dark")
 
 
@@ -129,10 +129,10 @@ def grade_of(scene: Gaussians, members: Tensor, name: str) -> Gdf:
 
 
 def some_rows(scene: Gaussians, count: int, seed: int = 0) -> Tensor:
-    """`count` different rows, sorted. [M] int64"""
+    """Return `count` different rows, sorted. [M] int64"""
     return Draws(seed).order(len(scene))[:count].sort().values
 
 
 def bits(gaussians: Gaussians) -> dict[str, bytes]:
-    """Every attribute's bytes, so that 0.0 and −0.0 differ."""
+    """Return the bytes of every attribute, which distinguish 0.0 from −0.0."""
     return {name: getattr(gaussians, name).contiguous().numpy().tobytes() for name in ATTRIBUTES}

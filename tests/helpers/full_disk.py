@@ -1,4 +1,4 @@
-"""Disks that take no more or nothing at all, for tests of what is written."""
+"""Simulated full or read-only disks."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from progdf.io.atomic import is_temporary
 
 @contextmanager
 def files_up_to(size: int) -> Iterator[None]:
-    """No file may grow beyond so many bytes: the system refuses, as it does where a disk is full."""
+    """Limit the size of files. The system refuses larger ones, as on a full disk."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:
@@ -26,7 +26,7 @@ def files_up_to(size: int) -> Iterator[None]:
 
 
 def refuse_temporary_files(monkeypatch: pytest.MonkeyPatch, code: int) -> None:
-    """The system refuses to make any file for `atomic_write`, for a reason of `errno`."""
+    """Refuse to create files for `atomic_write`, with a code of `errno`."""
     system_open = os.open
 
     def refuse(path: Any, flags: int, *more: Any, **named: Any) -> int:

@@ -1,8 +1,8 @@
 """Hostile inputs for every reader: `python -m tests.helpers.fuzz READER COUNT SEED FOLDER`.
 
-Bytes are flipped, cut, doubled and put in; values of JSON are replaced by what no program writes, with the
-checksums made to fit. Each input must give an object or a ProgdfError of one line, within a few seconds and a
-gigabyte. Failures are printed, one a line, and their inputs are kept in FOLDER.
+Bytes are flipped, cut, doubled and inserted. Values of JSON are replaced by others that no program writes,
+with matching checksums. Each input must give an object or a ProgdfError of one line, within a few seconds
+and 1 GB. Failures are printed, one per line, and their inputs are kept in FOLDER.
 """
 
 from __future__ import annotations
@@ -46,26 +46,25 @@ from trainer.store.state import StateFolder
 from viewer.files import exports, session
 from viewer.state.selection import SelectionState, add_region, select
 
-SECONDS = 10
-BYTES = 1 << 30
-"""What one input may take, at most."""
+SECONDS = 10  # time limit of one input
+BYTES = 1 << 30  # memory limit of one input
 
 
 def read_info(path: Path) -> None:
-    """All lines of `progdf info`."""
+    """Read all lines of `progdf info`."""
     for line in describe(path):
         assert isinstance(line, str)
 
 
 def read_gdf(path: Path) -> None:
-    """The edit, which must not move anything to where no number is."""
+    """Read an edit and check that its offsets are finite."""
     gdf = load_gdf(path)
     for s in (0.0, 0.5, 1.0):
         assert bool(gdf.field.offsets(s).isfinite().all())
 
 
 def use_session(path: Path) -> None:
-    """Rename and save the regions of a session, which touches nothing but region files of its folder."""
+    """Rename and save the regions of a session. It must touch only region files of its folder."""
 
     def others() -> dict[Path, int]:
         files = (file for file in path.parents[1].rglob("*") if file.is_file())
@@ -82,12 +81,12 @@ def use_session(path: Path) -> None:
 
 
 def read_state(path: Path) -> None:
-    """A part of a stopped run."""
+    """Read a part of a stopped run."""
     StateFolder(path.parent).load(path.stem)
 
 
 def inputs(folder: Path, reader: str) -> dict[str, tuple[str, Callable[[Path], Any], list[Change]]]:
-    """By reader: the file's name, the reader, and what is done to a good file."""
+    """Return the file name, the reader function and the changes of a valid file for each reader."""
     scene = random_gaussians(40, seed=1, sh_degree=1)
     edit = edit_of(scene, some_rows(scene, 12), curved_field(12, channels=14 + 9))
     edit = replace(edit, options={"name": "shirt", "steps": 600}, report={"a": {"b": [1.0, 2.0]}, "c": None})
@@ -216,7 +215,7 @@ READERS = (
 
 
 def failures(reader: str, count: int, seed: int, folder: Path) -> Iterator[str]:
-    """What got through, a line each; the inputs are kept."""
+    """Yield each failure as one line, and keep its input."""
     name, read, changes = inputs(folder, reader)[reader]
 
     def late(*_: object) -> None:

@@ -1,4 +1,4 @@
-"""What `tests.helpers.fuzz` does to good files: bytes, values of JSON and tensors are changed."""
+"""Changes that `tests.helpers.fuzz` makes to valid files: bytes, values of JSON and tensors."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ VALUES: list[Any] = [
         "n" * 300 + ".region.npy",
     ),
 ]
-"""In place of what a file holds."""
+"""Replacements for values of a file."""
 
 Change = Callable[[random.Random, Path], None]
-"""Writes another input to a path."""
+"""Function that writes another input to a path."""
 
 
 def changed_bytes(content: bytes) -> Change:
-    """Damage as of disks and downloads."""
+    """Return a change of bytes, as by damaged disks and downloads."""
 
     def change(rng: random.Random, path: Path) -> None:
         data = bytearray(content)
@@ -81,7 +81,7 @@ def changed_bytes(content: bytes) -> Change:
 
 
 def changed_value(rng: random.Random, value: Any) -> Any:
-    """A JSON value with one to three places of it replaced, removed or doubled."""
+    """Return a JSON value with one to three of its parts replaced, removed or doubled."""
     value = json.loads(json.dumps(value))
     for _ in range(rng.choice([1, 1, 2, 3])):
         inner = None
@@ -91,7 +91,7 @@ def changed_value(rng: random.Random, value: Any) -> Any:
             inner = found
             place = rng.choice(list(found) if isinstance(found, dict) else range(len(found)))
             found = inner[place]
-        other = copy.deepcopy(rng.choice(VALUES))  # which may be put into itself
+        other = copy.deepcopy(rng.choice(VALUES))  # a copy, as it may be inserted into itself
         if inner is None or place is None:
             value = other if rng.random() < 0.2 else value
         elif (kind := rng.randrange(6)) == 0:
@@ -108,7 +108,7 @@ def changed_value(rng: random.Random, value: Any) -> Any:
 
 
 def changed_json(content: bytes) -> Change:
-    """Damage as by somebody who knows the form: other values, and now and then what is no JSON at all."""
+    """Return a change of JSON values, and sometimes of the syntax."""
 
     def change(rng: random.Random, path: Path) -> None:
         text = json.dumps(changed_value(rng, json.loads(content)))
@@ -137,7 +137,7 @@ def changed_glb(content: bytes) -> Change:
 
 
 def changed_tensors(rng: random.Random, tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Tensors of which one has other numbers, another type, shape or name, or is gone."""
+    """Return tensors of which one has other values, another type, shape or name, or is missing."""
     tensors = dict(tensors)
     name = rng.choice(sorted(tensors))
     tensor = tensors.pop(name)
@@ -165,20 +165,20 @@ def changed_tensors(rng: random.Random, tensors: dict[str, torch.Tensor]) -> dic
 
 
 def header_of(content: bytes) -> Any:
-    """The JSON header of a .gdf file, its checksum left out."""
+    """Return the JSON header of a .gdf file with an empty checksum."""
     size = int.from_bytes(content[:8], "little")
     return json.loads(json.loads(content[8 : 8 + size])["__metadata__"]["progdf"]) | {"sha256": ""}
 
 
 def signed_gdf(header: Any, tensors: dict[str, torch.Tensor]) -> bytes:
-    """A .gdf file of these, its checksum made to fit: a wrong writer's."""
+    """Return a .gdf file of these parts with a matching checksum, as a wrong writer would make it."""
     if isinstance(header, dict):
         header = {**header, "sha256": checksum(json.dumps({**header, "sha256": ""}), tensors)}
     return safetensors.torch.save(tensors, {"progdf": json.dumps(header)})
 
 
 def changed_gdf(content: bytes) -> Change:
-    """An edit with another header or other tensors, signed as if progdf had written it."""
+    """Return a change of an edit's header or tensors, with a matching checksum."""
     header = header_of(content)
     tensors = safetensors.torch.load(content)
 
@@ -192,7 +192,7 @@ def changed_gdf(content: bytes) -> Change:
 
 
 def changed_parts(content: bytes, key: str) -> Change:
-    """A tensor file with another JSON text among its metadata, or other tensors, its checksum made to fit."""
+    """Return a change of a tensor file's JSON metadata or tensors, with a matching checksum."""
     size = int.from_bytes(content[:8], "little")
     metadata = json.loads(json.loads(content[8 : 8 + size])["__metadata__"]["progdf"])
     metadata.pop("crc32", None)

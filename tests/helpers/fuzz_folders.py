@@ -1,4 +1,4 @@
-"""More for `fuzz.py`: converted scenes, COLMAP models, masks, compiled kernels, folders of runs."""
+"""More inputs for `fuzz.py`: converted scenes, COLMAP models, masks, compiled kernels, run folders."""
 
 from __future__ import annotations
 
@@ -50,15 +50,15 @@ FILES_OF_RUNS = {
     "fit cameras": "cameras.json",
     "fit report": "report.json",
 }
-"""What is damaged in a run's folder before `progdf train --resume` or `progdf fit` is called on it."""
+"""Files damaged in a run folder before `progdf train --resume` or `progdf fit`."""
 
 GLTF_READERS = ("glb", "gltf", "spz in glb")
 
 CONVERTED = ("spz", "splat", "sog", "sog1", "ksplat", "compressed", "zip", "gz")
-"""Scenes in files of one kind, of which bytes are changed."""
+"""Kinds of scene files whose bytes are changed."""
 
 COSTLY = ("spz", "spz in glb", "colmap", "kernels", *FILES_OF_RUNS)
-"""A second or so for each input."""
+"""Readers that take about one second per input."""
 
 KERNEL = """
 from progdf.rasterize.cpu.jit import kernel
@@ -70,7 +70,7 @@ def twice(number):
 
 
 def more_inputs(folder: Path, reader: str) -> dict[str, Reader]:
-    """The one of these readers that is asked for, as `fuzz.inputs` has it; none, if it is another's."""
+    """Return the requested reader like `fuzz.inputs`, or nothing if it is defined elsewhere."""
     makers: dict[str, Callable[[Path], Reader]] = {
         **{kind: partial(_converted, kind) for kind in CONVERTED},
         **{kind: partial(_sog_folder, kind) for kind in ("sog1 table", "sog1 image")},
@@ -116,7 +116,7 @@ def _converted(kind: str, folder: Path) -> Reader:
 
 
 def _sog_folder(kind: str, folder: Path) -> Reader:
-    """An unpacked SOG of version 1: other values in its table, or damage in one of its images."""
+    """Change the table of an unpacked SOG of version 1, or damage one of its images."""
     unpacked = write_sog1(folder / "robot", random_gaussians(60, seed=2, sh_degree=1))
     images = {path.name: path.read_bytes() for path in sorted(unpacked.glob("*.webp"))}
 
@@ -137,7 +137,7 @@ def _sog_folder(kind: str, folder: Path) -> Reader:
 
 
 def _bundles(folder: Path) -> Reader:
-    """Bundles with damaged bytes, and folders of earlier openings with damaged or other files."""
+    """Damage bundles, and folders of earlier openings."""
     session = b'{"progdf_session": 1, "scene": {"file": "a.ply", "sha256": ""}}' + b" " * 400
     contents = []
     methods = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
@@ -177,7 +177,7 @@ def _bundles(folder: Path) -> Reader:
 
 
 def _gltf(kind: str, folder: Path) -> Reader:
-    """A file with nested nodes, instances, sparse rows, indices, linear colors, and perhaps an .spz."""
+    """Change a file with nested nodes, instances, sparse rows, indices, linear colors, and maybe an .spz."""
     builder = gltf_with_everything()
     if kind == "spz in glb":
         write_scene(folder / "good.spz", random_gaussians(20, seed=2, sh_degree=1), 3)
@@ -207,7 +207,7 @@ def _gltf(kind: str, folder: Path) -> Reader:
 
 
 def _colmap(text: bool, folder: Path) -> Reader:
-    """A COLMAP model with one damaged file."""
+    """Damage one file of a COLMAP model."""
     from tests.progdf.io.test_colmap import views, write_model
 
     good = write_model(folder / "good", views(), text=text)
@@ -264,7 +264,7 @@ def _numbers(spec: str, folder: Path) -> Reader:
 
 
 def _kernels(folder: Path) -> Reader:
-    """A file of the cache that was cut short costs a compilation."""
+    """Truncate a file of the kernel cache, which must be recompiled."""
     (folder / "kernels.py").write_text(KERNEL)
     cache = folder / "cache"
     cache.mkdir()
@@ -299,7 +299,7 @@ def _kernels(folder: Path) -> Reader:
 
 
 def _run(name: str, folder: Path) -> Reader:
-    """A run, stopped or finished, of which one file is changed each time."""
+    """Change one file of a stopped or finished run each time."""
     write_bear(folder, 400)
     options = quick_options(folder, views=4, image_size=48, steps=64, stages=2)
     resumes = name.startswith("resume")
@@ -327,7 +327,7 @@ def _run(name: str, folder: Path) -> Reader:
 
 
 def _train(options: TrainOptions, stops: bool) -> None:
-    """Train, or begin to: Ctrl-C comes after the first recording."""
+    """Train, or interrupt the training with Ctrl-C after the first recording."""
     done = PeriodicSave.step_done
 
     def step_done(self: PeriodicSave) -> None:

@@ -36,13 +36,13 @@ PICKLE_PARTS = (b"\x80\x02", b"}q\x00", b"(", b"t", b"R", b"Q", b".", b"K\x00", 
 
 
 def trainer_inputs(folder: Path, reader: str) -> dict[str, Reader]:
-    """Return the requested reader, as `fuzz.inputs` has it; nothing if it is another one."""
+    """Return the requested reader like `fuzz.inputs`, or nothing if it is defined elsewhere."""
     makers = {"checkpoints": _checkpoints, "plys of trainers": _plys}
     return {reader: makers[reader](folder)} if reader in makers else {}
 
 
 def silently(change: Change) -> Change:
-    """Return a change without the warnings of the libraries that write its files."""
+    """Return a change that suppresses the warnings of the libraries that write its files."""
 
     def silent_change(rng: random.Random, path: Path) -> None:
         with np.errstate(all="ignore"), warnings.catch_warnings():
@@ -120,7 +120,7 @@ def _is_plain(value: object) -> bool:
 
 
 def _special_tensor(rng: random.Random, tensor: Tensor) -> Any:
-    """Return a tensor of another kind, which torch saves as it is."""
+    """Return a tensor of another kind, which torch saves unchanged."""
     kind = rng.randrange(10)
     if kind == 0:
         return torch.nn.Parameter(tensor) if tensor.is_floating_point() else tensor

@@ -1,4 +1,4 @@
-"""Builders of glTF files by the letter of the specification, independent of the program's own writer."""
+"""Builders of glTF files after the specification, independent of the program's own writer."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
 class GltfBuilder:
-    """Tables and one buffer of a file to be."""
+    """Tables and one buffer of a file under construction."""
 
     def __init__(self) -> None:
         self.data = bytearray()
@@ -76,7 +76,7 @@ class GltfBuilder:
         return len(self.tables["meshes"]) - 1
 
     def nodes(self, *nodes: dict[str, Any], roots: tuple[int, ...] = (0,)) -> None:
-        """Set the nodes, and those that the scene shows."""
+        """Set the nodes, and the roots of the scene."""
         self.tables |= {"scene": 0, "scenes": [{"nodes": list(roots)}], "nodes": list(nodes)}
 
     def write(self, path: Path, uri: str | None = None) -> Path:
@@ -102,7 +102,7 @@ class GltfBuilder:
 
 
 def one_mesh(scene: Gaussians, node: dict[str, Any] | None = None, **look: Any) -> GltfBuilder:
-    """Return a file with one mesh, which one node shows."""
+    """Return a file with one mesh in one node."""
     builder = GltfBuilder()
     mesh = builder.mesh(builder.primitive(builder.attributes(scene), **look))
     builder.nodes({"mesh": mesh} | (node or {}))
@@ -131,7 +131,7 @@ def gltf_with_everything() -> GltfBuilder:
 
 
 def splat_transform_glb(version: str) -> bytes:
-    """Return what splat-transform makes of three Gaussians, `SPLAT_TRANSFORM_ROWS`."""
+    """Return splat-transform's conversion of the three Gaussians in `SPLAT_TRANSFORM_ROWS`."""
     return zlib.decompress(base64.b85decode("".join(_SPLAT_TRANSFORM[version])))
 
 
@@ -149,7 +149,7 @@ SPLAT_TRANSFORM_ROWS = (
         0.25, -0.4, 0.01, 0.0, -2.5, -2.5, -4.0, 0.5, -0.5, 0.5, 0.5,
     ),
 )  # fmt: skip
-"""x y z, f_dc 3, f_rest 9 (by channel), opacity, scale 3, rot 4, as in the .ply that was converted."""
+"""Columns: x y z, f_dc 3, f_rest 9 (by channel), opacity, scale 3, rot 4, as in the converted .ply."""
 
 _SPLAT_TRANSFORM = {
     "1.10.1": (

@@ -1,4 +1,4 @@
-"""Golden pictures: where they are, and what of a picture may differ from its golden."""
+"""Golden pictures: their folder and the allowed differences."""
 
 from __future__ import annotations
 
@@ -9,15 +9,21 @@ from .paths import ROOT
 
 SCREENSHOTS = ROOT / "tests" / "screenshots"
 LEVELS = 2
-"""Of 255. The last bits of both engines and of a software GPU differ between processors. It shows where
-values are rounded to 8 bits: into the picture of the splats, and where something is blended over it."""
+"""Largest difference of a pixel, of 255 levels.
+
+The last bits of both engines and of a software GPU differ between processors. They become visible where
+values are rounded to 8 bits: in the picture of the splats, and where colors are blended over it.
+"""
 SHARE = 0.02
-"""Of the pixels may differ at all. Float32 errors round one in 20 000 otherwise; the most that was seen are
-two pictures that llvmpipe without AVX scales down in a card (1.2 % of the window)."""
+"""Largest share of pixels that may differ at all.
+
+Float32 errors change about one pixel in 20 000. The largest observed share is 1.2 % of the window, from two
+pictures that llvmpipe without AVX scales down in a card.
+"""
 
 
 def difference(golden: NDArray[np.uint8], found: NDArray[np.uint8]) -> str:
-    """What is wrong with a picture; "" where it is its golden, but for how processors round. [H,W,3] both"""
+    """Return the fault of a picture, or "" if it matches its golden within rounding. [H,W,3] both"""
     if golden.shape != found.shape:
         return f"the picture is {found.shape}, its golden {golden.shape}"
     apart = np.abs(golden.astype(int) - found.astype(int)).max(axis=-1)

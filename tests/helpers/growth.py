@@ -1,4 +1,4 @@
-"""Things that are put on the bear in 3D, so that the truth is known, and pictures of them as an edit."""
+"""Objects added to the bear in 3D, which gives a known truth, and pictures of them as an edit."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ BLUE = (0.1, 0.3, 0.8)
 
 
 def balls(scene: Gaussians, means: Tensor, colors: Tensor, size: float) -> Gaussians:
-    """Opaque round Gaussians. [n,3], [n,3]"""
+    """Return opaque round Gaussians. [n,3], [n,3]"""
     rows = scene[torch.zeros(len(means), dtype=torch.int64)]
     return replace(
         rows,
@@ -37,7 +37,7 @@ def balls(scene: Gaussians, means: Tensor, colors: Tensor, size: float) -> Gauss
 
 
 def things(scene: Gaussians, head: Tensor) -> dict[str, Gaussians]:
-    """A striped hat that stands on a head, and a rod a few pixels thick that stands off it."""
+    """Return a striped hat on the head, and a rod a few pixels thick that sticks out of it."""
     means = scene.means[head]
     x, _, z = means.median(dim=0).values.tolist()
     top = float(means[:, 1].quantile(0.98))
@@ -55,8 +55,10 @@ def things(scene: Gaussians, head: Tensor) -> dict[str, Gaussians]:
 
 
 def write_growth(folder: Path, what: str, size: int = 1500, **more: object) -> TrainOptions:
-    """Options of a quick run towards pictures of the bear with one of `things`, or without its ears ("no
-    ears"), all of which are written into the folder."""
+    """Write pictures of the bear with one of `things`, or without its ears ("no ears"), into the folder.
+
+    Return the options of a quick run towards them.
+    """
     write_bear(folder, size)
     part = "ears" if what == "no ears" else "head"
     case = small(part, size)

@@ -1,4 +1,4 @@
-"""Files that somebody made to do harm, or that a disk has damaged."""
+"""Files made to do harm or damaged by a disk."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def npy(path: Path, header: bytes, magic: bytes = b"\x93NUMPY\x01\x00") -> Path:
-    """A .npy file with this header, and 64 bytes of numbers."""
+    """Write a .npy file with this header and 64 bytes of numbers."""
     path.write_bytes(magic + len(header).to_bytes(2, "little") + header + b"\0" * 64)
     return path
 

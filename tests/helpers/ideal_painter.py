@@ -1,7 +1,7 @@
-"""An ideal painter: the exact denoiser of a family of edits, for tests of what makes views agree.
+"""Ideal painter: the exact denoiser of a family of edits, for tests of consistent views.
 
-A picture is one of K edits of its view, each as likely as the others, or as a reference says. Its noise
-decides which, early, as in a trained model; Euler's steps of a flow, x = (1 − σ) picture + σ noise.
+A picture is one of K edits of its view, equally likely or weighted by a reference. Its noise decides early
+which, as in a trained model. The steps are Euler steps of a flow, x = (1 − σ) picture + σ noise.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ UP = torch.tensor([0.0, 1.0, 0.0])
 
 
 class WholeViews:
-    """Paints all of a view, at its own size; see `InstructEditor`."""
+    """Painter of whole views at their own size; see `InstructEditor`."""
 
     def frame(self, view: View) -> tuple[Crop, Camera]:
-        """All of it."""
+        """Return the whole view."""
         return (0, 0, view.camera.width, view.camera.height), view.camera
 
     def original(self, view: View) -> Tensor:
@@ -47,22 +47,22 @@ class WholeViews:
 
 @dataclass
 class IdealPainter(WholeViews):
-    """Paints any of the views that it knows.
+    """Painter of the given views.
 
-    Choice k of K lies at the angle 2π k / K.
+    Choice k of K is at the angle 2π k / K.
     """
 
     views: Sequence[View]
-    choices: Sequence[Tensor]  # of each view. [K,H,W,3]
+    choices: Sequence[Tensor]  # edits of each view. [K,H,W,3]
     references: int = 2
-    reach: float = math.radians(33)  # standard deviation about the choice that references show
-    scale: float = 0.25  # of the pictures against the noise
-    alone: bool = True  # whether each view has noise of its own: what it decides, it decides alone
+    reach: float = math.radians(33)  # standard deviation about the choice of the references
+    scale: float = 0.25  # scale of the pictures against the noise
+    alone: bool = True  # each view has its own noise and decides independently
     calls: int = 0
     chosen: list[int] = field(default_factory=list)
 
     def view_of(self, picture: Tensor) -> int:
-        """Index of the view that a picture is of."""
+        """Return the index of the view of a picture."""
         return next(i for i, v in enumerate(self.views) if torch.equal(v.image, picture))
 
     def paint(
@@ -98,7 +98,7 @@ class IdealPainter(WholeViews):
         return image
 
     def prior(self, index: int, references: Sequence[Tensor]) -> Tensor:
-        """Logarithm of how likely each choice is. [K]"""
+        """Return the log probability of each choice. [K]"""
         count = len(self.choices[0])
         direction = sum((self.direction(index, reference) for reference in references), 0j)
         if abs(direction) < 1e-3:
@@ -108,9 +108,9 @@ class IdealPainter(WholeViews):
         return -0.5 * (apart / self.reach).square()
 
     def direction(self, index: int, reference: Tensor) -> complex:
-        """The choice that a reference shows, as a unit vector times the share of the region that it edits.
+        """Return the choice in a reference, as a unit vector times the edited share of the region.
 
-        It is a picture of a view that it equals beside the region: its own, or else this one.
+        The reference is a picture of the view that it equals outside the region, or else of this view.
         """
         beside = [v.mask < 1e-3 for v in self.views]
         of = index
@@ -125,7 +125,7 @@ class IdealPainter(WholeViews):
 
 
 def hues(case: Small, count: int) -> list[Tensor]:
-    """Each view recolored in so many hues of one lightness, all around. [K,H,W,3] each"""
+    """Return each view recolored in `count` hues of one lightness, all around. [K,H,W,3] each"""
     editors = []
     for k in range(count):
         angle = 2 * math.pi * k / count
@@ -136,7 +136,7 @@ def hues(case: Small, count: int) -> list[Tensor]:
 
 
 def phases(case: Small, count: int) -> list[Tensor]:
-    """Each view with level stripes at so many phases. [K,H,W,3] each"""
+    """Return each view with level stripes at `count` phases. [K,H,W,3] each"""
     editor = make_editor(EditorOptions("stripes:#f0f0ff"), case.scene, case.region, case.views)
     assert isinstance(editor, StripesEditor)
     heights = case.scene.means[case.region.members] @ UP

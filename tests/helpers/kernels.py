@@ -1,4 +1,4 @@
-"""Everything that is compiled, run once on next to nothing: two parts that take about as long."""
+"""All compiled kernels, run once on tiny inputs, in two parts that take about as long."""
 
 from __future__ import annotations
 
@@ -53,5 +53,5 @@ PARTS = (_DRAW, _REST)
 
 
 def run_kernels(part: str) -> None:
-    """Compile what of a part is not in the cache, in a process of its own."""
+    """Compile the missing kernels of a part in a separate process."""
     subprocess.run([sys.executable, "-c", part], check=True, cwd=ROOT)

@@ -1,4 +1,4 @@
-"""Small networks of one small scene, trained once, that tests share."""
+"""Small networks of one small scene, trained once and shared by tests."""
 
 from __future__ import annotations
 
@@ -46,7 +46,15 @@ def fit_neural(
     settings: NeuralSettings,
     visibility: Tensor | None = None,
 ) -> NeuralField:
-    """A neural field of a finished trajectory. [T], [T,M,C], raw member rows [M,≥14], visibility [M]"""
+    """Return a neural field of a finished trajectory.
+
+    Args:
+        strengths: strengths of the snapshots. [T]
+        offsets: offsets of the members. [T,M,C]
+        rows: raw rows of the members. [M,≥14]
+        settings: settings of the network and its training
+        visibility: weight of each member. [M]
+    """
     check_trajectory(strengths, offsets)
     fit = NeuralFit(rows, offsets.shape[2], tuple(moving_attributes(offsets)), settings, visibility)
     fit.scale_to(offsets)
@@ -66,7 +74,7 @@ def baked(form: str = "own") -> BakedField:
 
 
 def smooth_trajectory(places: Tensor) -> tuple[Tensor, Tensor]:
-    """Strengths and offsets of members whose colors change as a smooth function of their place."""
+    """Return strengths and offsets of members whose colors change as a smooth function of position."""
     strengths = torch.linspace(0, 1, 9)
     offsets = torch.zeros(9, len(places), 14)
     wave = torch.sin(places)

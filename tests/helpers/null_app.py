@@ -1,4 +1,4 @@
-"""The application on a window of glfw's null platform: all of it, without a screen."""
+"""The whole application on a window of glfw's null platform, without a screen."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from viewer.ui.keys import Keys, Press
 
 @contextmanager
 def null_platform() -> Iterator[None]:
-    """Give glfw a platform without a screen for the next window; skip the test where there is none."""
+    """Give glfw a platform without a screen for the next window, or skip the test if there is none."""
     from viewer.ui.window import glfw
 
     glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_NULL)
@@ -31,7 +31,7 @@ def null_platform() -> Iterator[None]:
 
 @contextmanager
 def null_app(document: Document, view: ViewState, folder: Path) -> Iterator[App]:
-    """Open the application on `document` and draw its first frame; its memory goes to `folder`."""
+    """Open the application on `document` and draw its first frame. Its memory is saved in `folder`."""
     from viewer.ui.splash import Splash
     from viewer.ui.window import Window
 
@@ -45,7 +45,7 @@ def null_app(document: Document, view: ViewState, folder: Path) -> Iterator[App]
 
 
 def press(app: App, *chords: str) -> None:
-    """Keys as the window hears them."""
+    """Send keys to the window, one frame for each."""
     for chord in chords:
         app.window.take_keys = lambda c=chord: Keys((Press(c),))  # type: ignore[method-assign]
         app.main_view.wake()

@@ -1,4 +1,4 @@
-"""Where the checkout and the real scenes beside it lie."""
+"""Paths of the checkout and of the real scenes beside it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`progdf.rasterize.cpu.pyramid` in plain torch: the tree by recursion, each node of all that is below it."""
+"""Reference of `progdf.rasterize.cpu.pyramid` in plain torch: a recursive tree, each node from its rows."""
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ from progdf.sh import shade
 
 
 class Node(NamedTuple):
-    """What stands for some rows."""
+    """Merged Gaussian of some rows."""
 
     rows: Tensor
     weight: float
     mean: Tensor  # [3]
     covariance: Tensor  # [3,3]
-    spread: float  # of the centers
-    contrast: float  # the same of the colors of band 0
-    opacity: float  # as a density, beyond 1 too
+    spread: float  # spread of the centers
+    contrast: float  # spread of the colors of band 0
+    opacity: float  # density, also above 1
     points: float  # Σ opacity
     colors: Tensor  # [K,3]
 
 
 def plain_tree(gaussians: ActivatedGaussians) -> list[Node]:
-    """Every node, level after level."""
+    """Return every node, level by level."""
     count = len(gaussians.means)
     levels = max((count // LEAF).bit_length() - 1, 0)
     lists = [torch.arange(count)]
@@ -67,7 +67,7 @@ def plain_tree(gaussians: ActivatedGaussians) -> list[Node]:
 
 
 def merge_rows(gaussians: ActivatedGaussians, rows: Tensor) -> Node:
-    """One Gaussian with the moments of some rows."""
+    """Return one Gaussian with the moments of some rows."""
     means, quats, scales, opacities, colors = (tensor[rows].double() for tensor in gaussians.tensors)
     weights = opacities * scales.sort(1).values[:, 1:].prod(1)
     weights = torch.where(opacities >= ALPHA_MIN, weights, 0.0)
@@ -89,13 +89,13 @@ def merge_rows(gaussians: ActivatedGaussians, rows: Tensor) -> Node:
 
 
 class PlainCut:
-    """A scene as a view draws it under a limit.
+    """Cut of a scene for a view under a limit.
 
     Args:
-        gaussians: all of the scene, in harmonics
-        camera: of the coarse picture
-        limit: of what a node may lose, pixels²
-        pixels: of the fine picture that one of the coarse one covers, each way
+        gaussians: the whole scene, colors as spherical harmonics
+        camera: camera of the coarse picture
+        limit: largest loss of a node, pixels²
+        pixels: fine pixels per coarse pixel along each side
     """
 
     def __init__(self, gaussians: ActivatedGaussians, camera: Camera, limit: float, pixels: int) -> None:
@@ -123,13 +123,13 @@ class PlainCut:
         self.picks = self._cut(0, limit)
 
     def taken(self, picks: list[int]) -> ActivatedGaussians:
-        """Picks as they are drawn."""
+        """Return the picks as they are drawn."""
         means, sigmas, opacities, colors = zip(*map(self._parts, picks), strict=True)
         mean = torch.stack(means)
         colors = torch.stack(colors)
         opacity = torch.tensor(opacities).double()
         values, vectors = torch.linalg.eigh(torch.stack(sigmas))
-        vectors = vectors * torch.linalg.det(vectors)[:, None, None]  # rotations, not mirrors
+        vectors = vectors * torch.linalg.det(vectors)[:, None, None]  # makes mirrors rotations
         quats = matrix_quats(vectors)
         scales = values.clamp_min(0.0).sqrt()
         view = RasterView.of(self._camera, self._gaussians)
@@ -163,7 +163,7 @@ class PlainCut:
         return float(self._camera.K[0, 0] * self._camera.K[1, 1])
 
     def _parts(self, pick: int) -> tuple[Tensor, Tensor, float, Tensor]:
-        """Mean, covariance, opacity and colors of a node or, ~row, of a row."""
+        """Return mean, covariance, opacity and colors of a node or, if the pick is ~row, of a row."""
         if pick >= 0:
             node = self._nodes[pick]
             return node.mean, node.covariance, node.opacity, node.colors
@@ -179,7 +179,7 @@ class PlainCut:
         return float(K[0, 0]) * x / z + float(K[0, 2]), float(K[1, 1]) * y / z + float(K[1, 2]), z
 
     def _cells(self, x: float, y: float, z: float) -> list[tuple[tuple[int, int, int], float]]:
-        """The cells about a point, and its shares of them."""
+        """Return the cells around a point and its share of each."""
         near = torch.tensor(z / self._camera.near).float().view(torch.int32)
         slices = int(near - torch.tensor(1.0).view(torch.int32)) / 2**19
         sides = -(-self._camera.height // CELL), -(-self._camera.width // CELL), SLICES
@@ -196,7 +196,7 @@ class PlainCut:
         ]
 
     def _cut(self, index: int, limit: float) -> list[int]:
-        """Picks below a node, in no order."""
+        """Return the picks below a node, unordered."""
         node = self._nodes[index]
         near = self._camera.near
         largest = float(torch.linalg.eigvalsh(node.covariance)[-1]) ** 0.5
@@ -217,7 +217,7 @@ class PlainCut:
                 depth = sum(share * float(self._depths[cell]) for cell, share in cells)
                 loss *= math.exp(-0.5 * min(depth, MAX_OPTICAL_DEPTH))
         leaf = 2 * index + 1 >= len(self._nodes)
-        if loss <= limit or (leaf and self._depths is None):  # a leaf as it is tells the light
+        if loss <= limit or (leaf and self._depths is None):  # leaves determine the light unmerged
             return [index]
         if leaf:
             means = self._gaussians.means.double()
@@ -231,7 +231,7 @@ class PlainCut:
         return self._cut(2 * index + 1, limit) + self._cut(2 * index + 2, limit)
 
     def _in_window(self, mean: Tensor, extent: float) -> bool:
-        """Whether a Gaussian of a largest scale may reach the window."""
+        """Return True if a Gaussian with this largest scale may reach the window."""
         x, y, z = self._project(mean)
         if z <= self._camera.near:
             return False

@@ -1,4 +1,4 @@
-"""The search for strays without shortcuts: all neighborhoods, measured anew in each round."""
+"""Reference search for strays without shortcuts: measures all neighborhoods again in each round."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Rows = NDArray[np.int64]
 
 
 def find_strays(scene: Gaussians) -> dict[str, list[int]]:
-    """Return the rows of giants, needles and floaters, see `progdf.scene.strays.find_strays`."""
+    """Return the rows of giants, needles and floaters; see `progdf.scene.strays.find_strays`."""
     remaining = np.flatnonzero((scene.opacities >= INVISIBLE).numpy())
     found: dict[str, list[int]] = {kind: [] for kind in KINDS}
     step = -(-len(remaining) // SAMPLE)
@@ -38,7 +38,7 @@ def find_strays(scene: Gaussians) -> dict[str, list[int]]:
 
 
 def find_once(scene: Gaussians, sampled: NDArray[np.bool_]) -> dict[str, Rows]:
-    """Return the strays of one round; a suspect holds no other row up."""
+    """Return the strays of one round. A suspect does not support other rows."""
     points = scene.means.double().numpy()
     order = scene.log_scales.argsort(dim=1)
     sizes = scene.log_scales.gather(1, order).double()

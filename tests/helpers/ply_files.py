@@ -1,4 +1,4 @@
-"""Builders of .ply files, written by plyfile, the oracle of the format."""
+"""Builders of .ply files, written by plyfile, the reference implementation of the format."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ COUNT = 50
 
 
 def scene_of(sh_degree: int = 3, count: int = COUNT, seed: int = 1) -> Gaussians:
-    """A scene with quaternions of unit length, as a file gives it."""
+    """Return a scene with unit quaternions, as read from a file."""
     scene = random_gaussians(count, seed=seed)
     higher = Draws(seed).normal(count, (sh_degree + 1) ** 2 - 1, 3)
     return replace(scene, quats=scene.unit_quats, shN=higher)
@@ -32,7 +32,7 @@ def assert_same(found: Gaussians, expected: Gaussians) -> None:
 
 
 def table_of(scene: Gaussians) -> dict[str, np.ndarray]:
-    """The scene as the file's columns, in the order of the original 3DGS code."""
+    """Return the scene as the file's columns, in the order of the original 3DGS code."""
     rest = scene.shN.transpose(1, 2).flatten(1)
     columns: dict[str, Tensor] = dict(zip("xyz", scene.means.unbind(1), strict=True))
     columns |= {name: torch.zeros(len(scene)) for name in ("nx", "ny", "nz")}
@@ -45,7 +45,7 @@ def table_of(scene: Gaussians) -> dict[str, np.ndarray]:
 
 
 def moved_columns(scene: Gaussians, by: Sequence[float]) -> dict[str, np.ndarray]:
-    """The columns of the scene elsewhere in the world, x, y and z as doubles."""
+    """Return the columns of the scene moved in the world, with x, y and z as doubles."""
     places = {name: scene.means[:, i].double().numpy() + by[i] for i, name in enumerate("xyz")}
     return table_of(scene) | places
 
@@ -58,7 +58,7 @@ def write(
     before: Sequence[PlyElement] = (),
     after: Sequence[PlyElement] = (),
 ) -> Path:
-    """A .ply written by plyfile, the oracle of the format."""
+    """Write a .ply with plyfile."""
     rows = np.empty(len(columns["x"]), [(name, values.dtype) for name, values in columns.items()])
     for name, values in columns.items():
         rows[name] = values
@@ -92,9 +92,10 @@ def with_extra(name: str, code: str, place: int) -> Callable[[dict[str, np.ndarr
 
 
 def sharp_elements(count: int, **changes: Any) -> list[PlyElement]:
-    """The elements that Apple's SHARP writes after its vertices, for a photo of 640 by 480 pixels.
+    """Return the elements that Apple's SHARP writes after its vertices, for a photo of 640 by 480 pixels.
 
-    `changes`: other numbers by the name of their element; `renamed` names one whose property is renamed.
+    `changes` replaces numbers by the name of their element. `renamed` names an element whose property is
+    renamed.
     """
     renamed = changes.pop("renamed", "")
     contents: dict[str, tuple[Any, str]] = {

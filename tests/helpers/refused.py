@@ -1,4 +1,4 @@
-"""How the tests ask for the one line in which a file is refused."""
+"""Access to the one-line error of a refused file."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from progdf.errors import ProgdfError
 
 
 def refusal(load: Callable[[Path], object], path: Path) -> str:
-    """What loading a broken file says: one line, with its name, and what would be right."""
+    """Return the error of loading a broken file. It must be one line with the file's path and a remedy."""
     with pytest.raises(ProgdfError) as caught:
         load(path)
     message = str(caught.value)

@@ -1,4 +1,4 @@
-"""Scene files in formats other than .ply: written by gaussforge where it does it right, else by hand."""
+"""Scene files in formats other than .ply, written by gaussforge if it is correct, else by hand."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from progdf.sh import C0
 
 
 def write_scene(path: Path, scene: Gaussians, spz_version: int = 4) -> Path:
-    """The scene in the format of the path's ending (.spz, .splat, .sog); skips where gaussforge is absent."""
+    """Write the scene in the format of the path's ending (.spz, .splat, .sog), or skip without gaussforge."""
     gaussforge = pytest.importorskip("gaussforge")
     kind = path.suffix.lstrip(".")
     plain = path.with_suffix(".plain.ply")
-    save_ply(plain, rotate_about_x(scene) if kind == "spz" else scene)  # gaussforge leaves axes as they are
+    save_ply(plain, rotate_about_x(scene) if kind == "spz" else scene)  # gaussforge keeps the axes
     found = gaussforge.GaussForge().convert(plain.read_bytes(), "ply", kind, spz_version=spz_version)
     plain.unlink()
     path.write_bytes(found["data"])
@@ -32,7 +32,7 @@ def write_scene(path: Path, scene: Gaussians, spz_version: int = 4) -> Path:
 
 
 def write_compressed_ply(path: Path, scene: Gaussians, comment: str = "", colors: bool = True) -> Path:
-    """As SuperSplat writes it; without `colors` as it did before chunks had a range of colors."""
+    """Write as SuperSplat does; without `colors` as it did before chunks had a color range."""
     n = len(scene)
     places = scene.means.numpy()
     scales = scene.log_scales.numpy()
@@ -149,7 +149,7 @@ def _grid(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 
 
 def write_ksplat(path: Path, scene: Gaussians, level: int, per_bucket: int = 32, block: float = 20.0) -> Path:
-    """As GaussianSplats3D writes it: one section; the last two buckets are partial ones."""
+    """Write as GaussianSplats3D does: one section, whose last two buckets are partial."""
     n = len(scene)
     degree = scene.sh_degree
     sizes = [per_bucket, n % per_bucket]

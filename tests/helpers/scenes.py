@@ -1,4 +1,4 @@
-"""Builders of the scenes that tests share: random ones, and the hard cases that every engine must survive."""
+"""Builders of shared test scenes: random ones, and hard cases that every engine must survive."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from tests.helpers.draws import Draws
 def random_gaussians(
     count: int, seed: int = 0, sh_degree: int = 0, spread: float = 1.0, scale: float = 0.05
 ) -> Gaussians:
-    """A cloud around the origin.
+    """Return a cloud around the origin.
 
     Args:
         count: N
         seed: the same seed gives the same cloud
-        sh_degree: 0..3
+        sh_degree: 0 to 3
         spread: standard deviation of the centers, world units
         scale: median standard deviation of one Gaussian, world units; axes differ by a factor of about 2
     """
@@ -39,7 +39,7 @@ def random_gaussians(
 
 
 def ball(count: int = 2000, radius: float = 1.0, seed: int = 0) -> Gaussians:
-    """Gaussians inside a ball around the origin."""
+    """Return Gaussians inside a ball around the origin."""
     scene = random_gaussians(count, seed=seed, scale=0.01)
     places = torch.nn.functional.normalize(scene.means, dim=1)
     distances = Draws(seed + 1).uniform(count, 1) ** (1 / 3)
@@ -49,7 +49,10 @@ def ball(count: int = 2000, radius: float = 1.0, seed: int = 0) -> Gaussians:
 def orbit_camera(
     width: int = 40, height: int = 24, azimuth: float = 0.4, elevation: float = 0.3, distance: float = 4.0
 ) -> Camera:
-    """A camera on a sphere around the origin (angles in radians, y down); vertical field of view 0.9."""
+    """Return a camera on a sphere around the origin.
+
+    Angles are in radians, y points down, and the vertical field of view is 0.9.
+    """
     az = torch.tensor(azimuth).double()
     el = torch.tensor(elevation).double()
     eye = distance * torch.stack([az.sin() * el.cos(), -el.sin(), -az.cos() * el.cos()])
@@ -58,7 +61,7 @@ def orbit_camera(
 
 
 def front_camera(width: int = 40, height: int = 24, focal: float = 30.0) -> Camera:
-    """A camera at the origin that looks along +z; x right, y down: world and camera axes are the same."""
+    """Return a camera at the origin that looks along +z, with axes equal to the world's: x right, y down."""
     K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
     return Camera(torch.eye(4), K, width, height)
 
@@ -70,7 +73,7 @@ def one_gaussian(
     opacity: float = 0.8,
     rgb: tuple[float, float, float] = (0.9, 0.3, 0.1),
 ) -> Gaussians:
-    """A single Gaussian in activated units: opacity 0..1, deviations in world units, color 0..1."""
+    """Return a single Gaussian from activated units: opacity and color 0 to 1, deviations in world units."""
     return Gaussians(
         means=torch.tensor([mean]),
         quats=torch.tensor([quat]),
@@ -82,7 +85,7 @@ def one_gaussian(
 
 
 def logit_of(opacity: Tensor) -> Tensor:
-    """Logits whose float32 sigmoid is `opacity` as nearly as float32 allows, and not below it. [N] -> [N]"""
+    """Return logits with a float32 sigmoid as close as possible to `opacity`, not below it. [N] -> [N]"""
     logit = torch.logit(opacity.double()).float()
     for _ in range(64):
         low = logit.sigmoid() < opacity
@@ -93,7 +96,7 @@ def logit_of(opacity: Tensor) -> Tensor:
 
 
 def concatenate(*parts: Gaussians) -> Gaussians:
-    """The rows of all parts, in order; all must have the same number of SH bands."""
+    """Return the rows of all parts, in order. All must have the same number of SH bands."""
     return Gaussians(
         **{
             name: torch.cat([getattr(part, name) for part in parts])
@@ -104,12 +107,12 @@ def concatenate(*parts: Gaussians) -> Gaussians:
 
 @dataclass(frozen=True)
 class HardCase:
-    """A scene and a camera that some engine, somewhere, gets wrong.
+    """A scene and a camera that an engine is likely to get wrong.
 
     Args:
         gaussians: raw parameters
         camera: the view
-        poisoned: rows that hold something not finite; all other rows must render as if these were absent
+        poisoned: rows with values that are not finite; all other rows must render as if these were absent
     """
 
     gaussians: Gaussians
@@ -118,7 +121,7 @@ class HardCase:
 
 
 def hard_cases() -> dict[str, HardCase]:
-    """Every hard case by name, for test ids. Small images: each is quick."""
+    """Return every hard case by name, for test ids. Small images keep each case quick."""
     front = front_camera()
     cases: dict[str, HardCase] = {}
 
@@ -227,7 +230,7 @@ def _camera_of_angle(degrees: float) -> Camera:
 
 
 def _one_ulp_apart(means: Tensor) -> Tensor:
-    """Return means whose depths, in a drawn order, follow each other as closely as float32 allows. [N,3]"""
+    """Return means whose depths, in random order, are as close as float32 allows. [N,3]"""
     count = len(means)
     near = means[0, 2].view(torch.int32)
     order = Draws(7).order(count).to(torch.int32)
@@ -253,7 +256,7 @@ def _stack(layer: Gaussians, count: int) -> Gaussians:
 
 
 def high_chair(count: int = 4000) -> Gaussians:
-    """A chair without a ground, y up: legs that stand apart, a seat, a narrower back with upright bars."""
+    """Return a chair without a ground, y up: separate legs, a seat, and a narrower back with upright bars."""
     draw = np.random.default_rng(5)
     part = draw.integers(0, 3, count)
     x, y, z = draw.uniform(-1.0, 1.0, (3, count))
@@ -276,7 +279,7 @@ def high_chair(count: int = 4000) -> Gaussians:
 
 
 def _quat_of(rotation: Tensor) -> Tensor:
-    """The quaternion wxyz of a rotation matrix of a quarter or half turn. [3,3] -> [4]"""
+    """Return the quaternion wxyz of a rotation matrix of a quarter or half turn. [3,3] -> [4]"""
     w = 0.5 * math.sqrt(max(0.0, 1 + float(rotation.trace())))
     xyz = torch.stack(
         [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
@@ -288,14 +291,14 @@ def _quat_of(rotation: Tensor) -> Tensor:
 
 
 def turned(scene: Gaussians, rotation: Tensor) -> Gaussians:
-    """The scene rotated about the origin, its Gaussians with it."""
+    """Return the scene rotated about the origin, including its Gaussians."""
     w, x, y, z = _quat_of(rotation)
     left = torch.tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
     return replace(scene, means=scene.means @ rotation.T, quats=normalize_quats(scene.quats) @ left.T)
 
 
 def upright_turn(up: Tensor) -> Tensor:
-    """The quarter turns that bring y to an axis. [3] -> [3,3]"""
+    """Return the quarter turns that bring y to an axis. [3] -> [3,3]"""
     second = torch.eye(3)[(int(up.abs().argmax()) + 1) % 3]
     # y -> up, z -> second, x -> their cross product
     return torch.stack([torch.linalg.cross(up, second), up, second], dim=1)

@@ -1,4 +1,4 @@
-"""A session of the bear on disk, and the same with something spoilt."""
+"""A session of the bear on disk, valid or with a spoiled value."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from viewer.state.view_state import Comparison, Keyframe, LayerGroup, SnapshotPa
 
 
 def full_view() -> ViewState:
-    """A view in which nothing is as it is by default."""
+    """Return a view in which every value differs from its default."""
     view = first_view(bear(), 0.25, 0.75)
     ears = bear().gdfs[1].region
     painted = paint.encode(np.linspace(0, 1, len(ears)))
@@ -43,7 +43,7 @@ def full_view() -> ViewState:
 
 
 def bear_files(folder: Path) -> Path:
-    """The bear's scene in a folder, and its edits in another below."""
+    """Save the bear's scene into the folder and its edits into a subfolder. Return the folder."""
     (folder / "edits").mkdir()
     scene, *edits = bear().save(folder)
     for edit in edits:
@@ -57,7 +57,7 @@ def opened_document(folder: Path) -> document.Document:
 
 
 def saved_session(folder: Path) -> Path:
-    """The session of `full_view` on the files of `bear_files`, with a snapshot."""
+    """Save the session of `full_view` on the files of `bear_files`, with a snapshot. Return its path."""
     view = full_view()
     kept = snapshots.take((), replace(view, blend="sum"))
     session.save(folder / "work.session.json", WindowSession(opened_document(folder), view, kept))
@@ -65,7 +65,7 @@ def saved_session(folder: Path) -> Path:
 
 
 def spoilt(path: Path, *keys: str | int, value: Any = None) -> Path:
-    """The session with another value at a place, under another name."""
+    """Write the session with another value at `keys` under another name. Return its path."""
     table = json.loads(path.read_text())
     place = table
     for key in keys[:-1]:

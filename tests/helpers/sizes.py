@@ -1,4 +1,4 @@
-"""How large the packages are, and the tree of their modules.
+"""Sizes of the packages, and the tree of their modules.
 
 `python -m tests.helpers.sizes` prints the table, `--tree` writes the tree into docs/modules.md.
 """
@@ -30,12 +30,12 @@ _NO_CODE = (
 )
 
 parse = cache(ast.parse)
-"""Each file is looked at by several tests."""
+"""Cached parser, as several tests read each file."""
 
 
 @dataclass(frozen=True)
 class Module:
-    """One file's lines: all of them, those of code (no blank, comment, docstring or import), of imports."""
+    """Line counts of a file: all lines, code (no blank, comment, docstring or import) and imports."""
 
     path: Path
     lines: int
@@ -45,7 +45,7 @@ class Module:
 
 
 def measure(path: Path, source: str) -> Module:
-    """The sizes of a file."""
+    """Return the sizes of a file."""
     tree = parse(source)
     texts: set[int] = set()
     imports: set[int] = set()
@@ -64,14 +64,14 @@ def measure(path: Path, source: str) -> Module:
 
 @cache
 def modules(package: str) -> list[Module]:
-    """All modules of a package that hold more than a line."""
+    """Return all modules of a package with more than one statement."""
     paths = sorted((ROOT / package).rglob("*.py"), key=lambda path: (path.parent.parts, path.name))
     measured = [measure(path.relative_to(ROOT), path.read_text(encoding="utf-8")) for path in paths]
     return [module for module in measured if len(module.tree.body) > 1]
 
 
 def functions(module: Module) -> Iterator[tuple[int, str]]:
-    """Lines and name of every function, its decorators and docstring left out."""
+    """Yield lines and name of every function, without its decorators and docstring."""
     for node in ast.walk(module.tree):
         if isinstance(node, ast.FunctionDef):
             body = node.body[1:] if ast.get_docstring(node) is not None and node.body[1:] else node.body
@@ -79,14 +79,14 @@ def functions(module: Module) -> Iterator[tuple[int, str]]:
 
 
 def calls(module: Module) -> Iterator[tuple[int, str]]:
-    """How many arguments each call gives by position alone, and where it is."""
+    """Yield the number of positional arguments of each call, and its location."""
     for node in ast.walk(module.tree):
         if isinstance(node, ast.Call):
             yield len(node.args), f"{module.path}:{node.lineno} {ast.unparse(node.func)}"
 
 
 def importers(all_modules: Mapping[str, Module]) -> dict[str, set[str]]:
-    """For each module (dotted) those that import it."""
+    """Return the importing modules of each module, by dotted names."""
     result: dict[str, set[str]] = {name: set() for name in all_modules}
     for name, module in all_modules.items():
         is_package = module.path.stem == "__init__"
@@ -109,7 +109,7 @@ def dotted(path: Path) -> str:
 
 
 def table() -> str:
-    """Sizes of each package and of all, as Markdown."""
+    """Return the sizes of each package and of all, as Markdown."""
     head = ["modules", "lines", "code", "imports", "median file", "longest function", "widest call"]
     rows = ["| | " + " | ".join(head) + " |", "|" + " --- |" * (len(head) + 1)]
     groups = {name: modules(name) for name in PACKAGES}
@@ -132,7 +132,7 @@ def table() -> str:
 
 
 def tree() -> str:
-    """The modules of the packages by folder, each with the first line that it says of itself."""
+    """Return the modules of the packages by folder, each with the first line of its docstring."""
     lines = ["```"]
     for package in PACKAGES:
         folder = None
@@ -146,7 +146,7 @@ def tree() -> str:
 
 
 def with_tree(page: str) -> str:
-    """A page with the tree between its markers."""
+    """Return a page with the tree between its markers."""
     head = page.split(BEGIN)[0]
     tail = page.split(END)[1]
     return f"{head}{BEGIN}{tree()}{END}{tail}"

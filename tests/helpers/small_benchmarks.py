@@ -1,4 +1,4 @@
-"""Benchmarks on scenes and with repetitions that are small enough for a test; all else is as it ships."""
+"""Benchmarks with scenes and repetitions small enough for a test; all else is unchanged."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def _shrink_viewer(patch: pytest.MonkeyPatch) -> None:
 
 
 def _measure_one_start(measure: Callable[..., frames.Start]) -> Callable[..., frames.Start]:
-    """Return a `measure_starts` that opens a window for its first scene alone; each takes some seconds."""
+    """Return a `measure_starts` that opens a window only for its first scene, as each takes some seconds."""
     starts: list[frames.Start] = []
 
     def measure_once(path: Path, way: str) -> frames.Start:

@@ -1,4 +1,4 @@
-"""A bear with two edits made by hand, for tests of the viewer: a green scarf, and golden ears that grow."""
+"""A bear with two hand-made edits for tests of the viewer: a green scarf, and growing golden ears."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Stack:
         return first_camera(self.scene, self.demo.cameras)
 
     def save(self, folder: Path) -> list[Path]:
-        """bear.ply, scarf.gdf, ears.gdf in `folder`; their paths in this order."""
+        """Save bear.ply, scarf.gdf and ears.gdf in `folder`. Return their paths in this order."""
         paths = [folder / "bear.ply", *(folder / f"{gdf.name}.gdf" for gdf in self.gdfs)]
         save_ply(paths[0], self.scene)
         for path, gdf in zip(paths[1:], self.gdfs, strict=True):
@@ -71,7 +71,7 @@ EDITS = (
 
 
 def many_edits(stack: Stack, count: int = len(EDITS)) -> tuple[Stack, ViewState]:
-    """The stack with up to 20 edits of names of their own, in turn its scarf and its ears, all half way."""
+    """Return the stack with up to 20 named edits, alternating between scarf and ears, all at strength 0.5."""
     gdfs = tuple(replace(stack.gdfs[i % 2], name=name) for i, name in enumerate(EDITS[:count]))
     view = view_of(stack)
     layers = tuple(LayerState(i, gdf.name, 0.5) for i, gdf in enumerate(gdfs))
@@ -79,7 +79,7 @@ def many_edits(stack: Stack, count: int = len(EDITS)) -> tuple[Stack, ViewState]
 
 
 def recording_of(gdf: Gdf) -> Trajectory:
-    """What a run that led to this edit may have recorded: on the way, more of it than the field shows."""
+    """Return a possible recording of this edit. At intermediate strengths it moves farther than the field."""
     s = torch.tensor(gdf.field.recorded)
     rows = [(1.0 + 0.5 * float(x) * (1.0 - float(x))) * gdf.field.offsets(float(x)) for x in s]
     ends = (len(s) - 1,)
@@ -87,7 +87,7 @@ def recording_of(gdf: Gdf) -> Trajectory:
 
 
 def bear_stack(size: int = 4000) -> Stack:
-    """The scene is the same every time; the recorded strengths are uneven, as in a real run."""
+    """Return a deterministic scene with two edits. Their recorded strengths are uneven, as in a real run."""
     demo = bear(size)
     scene = demo.gaussians
     scarf = demo.members("scarf")
@@ -117,7 +117,7 @@ def _towards(scene: Gaussians, members: Tensor, rgb: tuple[float, float, float])
 
 
 def _gdf(scene: Gaussians, name: str, members: Tensor, instruction: str, offsets: dict[str, Tensor]) -> Gdf:
-    """Offsets that grow evenly, but for a swing of a tenth half way."""
+    """Return an edit whose offsets grow linearly, with an extra swing of a tenth at strength 0.5."""
     score = torch.zeros(len(scene))
     score[members] = 1.0
     coefficients = torch.stack([NODES, torch.sin(torch.pi * NODES).round(decimals=6)], dim=1)
@@ -136,7 +136,7 @@ def _gdf(scene: Gaussians, name: str, members: Tensor, instruction: str, offsets
 
 
 def view_of(stack: Stack, scarf: float = 0.0, ears: float = 0.0) -> ViewState:
-    """The bear's head and scarf from the front, its edits at these strengths."""
+    """Return a front view of the bear's head and scarf with its edits at these strengths."""
     layers = (LayerState(SCARF, "scarf", scarf), LayerState(EARS, "ears", ears))
     camera = replace(stack.first_camera, pivot=(0.0, 0.75, 0.2), distance=5.5)
     return ViewState(camera=camera, layers=layers)

@@ -1,12 +1,12 @@
-"""Training commands that are stopped in every way there is, and what they must have in common afterwards.
+"""Training commands stopped in every possible way.
 
     python -m tests.helpers.stopped SCENE_FOLDER OPTIONS MOMENT[,MOMENT…]
 
 trains with these OPTIONS, a JSON table that may have `save_every` in seconds, into the folder `run` of the
-current one, again and again with --resume, and is killed -9 each time: at a whole MOMENT just before (even)
-or after (odd) that many files were put in place, at a broken one after so many seconds. The processes are
-forked from one that has imported everything. After the last moment nothing is killed. Prints a line for each:
-the moment and how it ended.
+current one, repeatedly with --resume. Each process is killed with -9. A whole MOMENT kills it just before
+(even) or after (odd) that many files were put in place, a fractional one after that many seconds. The
+processes are forked from one that has imported everything. After the last moment nothing is killed. Each
+line of the output has a moment and the exit status.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ OUT = Path("run")
 
 
 def small_run(scene_folder: Path, **more: object) -> TrainOptions:
-    """Options of a run of a second or two into `run`, on the bear of `write_bear` in `scene_folder`."""
+    """Return the options of a run of about two seconds into `run`, on the bear in `scene_folder`."""
     settings = {"views": 6, "image_size": 48, "steps": 24, "stages": 2, "field": "lossless"}
-    settings |= {"perceptual_weight": 0.1, **more}  # descends view by view, in steps of a few milliseconds
+    settings |= {"perceptual_weight": 0.1, **more}  # optimizes view by view, in steps of a few milliseconds
     return replace(quick_options(scene_folder, **settings), out=OUT)
 
 
 def bits(root: Path) -> dict[str, str]:
-    """Hashes of all that a run leaves; of the report, everything but times and memory."""
+    """Return hashes of all files of a run; of the report, everything except times and memory."""
     found = {
         str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in sorted(root.rglob("*"))
@@ -52,7 +52,7 @@ def _timeless(report: Mapping[str, object]) -> dict[str, object]:
 
 
 def _killed_at_file(number: int) -> None:
-    """Let this process kill itself at its N-th `os.replace`: before it where N is even, else after it."""
+    """Let this process kill itself at its N-th `os.replace`: before it if N is even, else after it."""
     put = os.replace
     calls = 0
 
@@ -69,7 +69,7 @@ def _killed_at_file(number: int) -> None:
 
 
 def killed_again_and_again(options: TrainOptions, moments: Sequence[float]) -> list[int]:
-    """How each process ended, −9 for a killed one; stops at the first that comes to its end."""
+    """Return the exit status of each process, −9 if killed. Stop at the first that finishes."""
     ended: list[int] = []
     for number, moment in enumerate([*moments, 0.0]):
         child = os.fork()

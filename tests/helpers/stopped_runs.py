@@ -1,4 +1,4 @@
-"""Runs that were stopped, as fixtures, and what stops them: keys, a kill."""
+"""Fixtures of stopped runs, and functions that stop them: keys, a kill."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ NEVER = 1e6  # seconds between saves
 
 @pytest.fixture(scope="session")
 def bear_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a small bear."""
+    """Return a folder with a small bear."""
     made = tmp_path_factory.mktemp("bear")
     write_bear(made)
     return made
@@ -38,7 +38,7 @@ def bear_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def uninterrupted(bear_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The run folder that all others must equal."""
+    """Return the run folder that all others must equal."""
     made = tmp_path_factory.mktemp("uninterrupted")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(made)
@@ -48,13 +48,13 @@ def uninterrupted(bear_folder: Path, tmp_path_factory: pytest.TempPathFactory) -
 
 @pytest.fixture
 def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every test trains into `run` of its own folder: the path stands in the files."""
+    """Train into `run` of the test's own folder, as the path is stored in the files."""
     monkeypatch.chdir(tmp_path)
 
 
 @pytest.fixture(scope="session")
 def interrupted(bear_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run folder that was left with Ctrl-C in its tenth step."""
+    """Return a run folder that was interrupted with Ctrl-C in its tenth step."""
     made = tmp_path_factory.mktemp("interrupted")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(made)
@@ -67,12 +67,12 @@ def interrupted(bear_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 @pytest.fixture
 def stopped(interrupted: Path, elsewhere: None) -> None:
-    """The folder `run` holds a run that was stopped at step 10."""
+    """Put a run that was stopped at step 10 into the folder `run`."""
     shutil.copytree(interrupted, OUT)
 
 
 def at_step(monkeypatch: pytest.MonkeyPatch, number: int, happens: Callable[[], object]) -> None:
-    """Let something happen when the optimizer has done so many steps in this process."""
+    """Call a function after the optimizer has done `number` steps in this process."""
     calls = 0
     done = PeriodicSave.step_done
 
@@ -87,25 +87,25 @@ def at_step(monkeypatch: pytest.MonkeyPatch, number: int, happens: Callable[[], 
 
 
 def gone_on(bear_folder: Path, uninterrupted: Path, **more: object) -> str:
-    """Go on to the trajectory, which must be the uninterrupted run's, and no further; the log."""
+    """Resume up to the trajectory, which must equal the uninterrupted run's, and stop. Return the log."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(trainer.run.run, "finish_run", lambda *_: None)
         train(replace(small_run(bear_folder, **more), resume=True), quiet=True)
     found, expected = (_recorded(root / "trajectory.safetensors") for root in (OUT, uninterrupted))
     assert found[0].keys() == expected[0].keys()
     assert all(torch.equal(found[0][name], tensor) for name, tensor in expected[0].items())
-    assert more or found[1] == expected[1]  # the options stand in the header
+    assert more or found[1] == expected[1]  # the options are in the header
     return (OUT / "log.txt").read_text(encoding="utf-8")
 
 
 def _recorded(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors and header of a trajectory."""
+    """Return tensors and header of a trajectory."""
     made, extra, about = load_trajectory(path)
     return {**extra, "s": made.s, "offsets": made.offsets, "end": made.end, "steps": made.steps}, about
 
 
 def words(bear_folder: Path, *more: str) -> list[str]:
-    """The command line of `small_run`."""
+    """Return the command line of `small_run`."""
     options = small_run(bear_folder)
     values = {
         "region": options.region.region,
@@ -123,14 +123,14 @@ def words(bear_folder: Path, *more: str) -> list[str]:
 
 
 def saved_step() -> int:
-    """How far the saved state is."""
+    """Return the step of the saved state."""
     saved = RunFolder(OUT).state.load("training")
     assert saved is not None
     return int(saved.values["pgs"]["step"])
 
 
 def killed(bear_folder: Path, where: Path, moments: Sequence[float], **options: object) -> list[str]:
-    """`python -m tests.helpers.stopped`; its lines."""
+    """Run `python -m tests.helpers.stopped`. Return its lines."""
     arguments = [str(bear_folder), json.dumps(options), ",".join(map(str, moments))]
     told = subprocess.run(
         [sys.executable, "-m", "tests.helpers.stopped", *arguments],

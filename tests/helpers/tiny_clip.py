@@ -1,4 +1,4 @@
-"""A real CLIP with tiny random networks and a tokenizer made here, saved as real ones are."""
+"""A real CLIP with tiny random networks and a generated tokenizer, saved like real ones."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CLIP_VOCABULARY = len(_WORDS) + 2
 
 
 def tiny_clip(folder: Path, seed: int = 0) -> Path:
-    """A CLIPModel of about 30 000 parameters that takes pictures of 32 pixels, in `folder`."""
+    """Save a CLIPModel of about 30 000 parameters for pictures of 32 pixels in `folder`. Return its path."""
     from transformers import CLIPConfig, CLIPModel
 
     torch.manual_seed(seed)
@@ -38,7 +38,7 @@ def tiny_clip(folder: Path, seed: int = 0) -> Path:
 
 
 def clip_tokenizer(folder: Path) -> Any:
-    """A CLIPTokenizer that knows single letters, from files that it writes into `folder`."""
+    """Return a CLIPTokenizer that knows single letters, and write its files into `folder`."""
     from transformers import CLIPTokenizer
 
     write_vocabulary(folder, _WORDS)
@@ -46,7 +46,7 @@ def clip_tokenizer(folder: Path) -> Any:
 
 
 def write_vocabulary(folder: Path, words: Sequence[str]) -> None:
-    """The two files of a byte-pair tokenizer that never merges."""
+    """Write the two files of a byte-pair tokenizer that never merges."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "vocab.json").write_text(json.dumps({word: i for i, word in enumerate(words)}))
     (folder / "merges.txt").write_text("#version: 0.2\n")

@@ -1,4 +1,4 @@
-"""Real pipelines of diffusers with tiny random networks and a tokenizer made here, saved as real ones are."""
+"""Real diffusers pipelines with tiny random networks and a generated tokenizer, saved like real ones."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _UNET: dict[str, Any] = {
     "block_out_channels": (8, 16),
     "layers_per_block": 1,
     "sample_size": 16,
-    "in_channels": 8,  # the noise and the picture
+    "in_channels": 8,  # noise and picture
     "out_channels": 4,
     "down_block_types": ("DownBlock2D", "CrossAttnDownBlock2D"),
     "up_block_types": ("CrossAttnUpBlock2D", "UpBlock2D"),
@@ -47,7 +47,10 @@ _FLUX: dict[str, Any] = {
 
 
 def pix2pix_pipeline(folder: Path) -> Any:
-    """A StableDiffusionInstructPix2PixPipeline of about 100 000 parameters; its words go to `folder`."""
+    """Return a StableDiffusionInstructPix2PixPipeline of about 100 000 parameters.
+
+    Its vocabulary is written into `folder`.
+    """
     from diffusers import (
         AutoencoderKL,
         EulerAncestralDiscreteScheduler,
@@ -71,7 +74,7 @@ def pix2pix_pipeline(folder: Path) -> Any:
 
 
 def pix2pix_xl_pipeline(folder: Path) -> Any:
-    """A StableDiffusionXLInstructPix2PixPipeline of about 100 000 parameters."""
+    """Return a StableDiffusionXLInstructPix2PixPipeline of about 100 000 parameters."""
     from diffusers import (
         AutoencoderKL,
         EulerDiscreteScheduler,
@@ -99,7 +102,7 @@ def pix2pix_xl_pipeline(folder: Path) -> Any:
 
 
 def kontext_pipeline(folder: Path) -> Any:
-    """A FluxKontextPipeline of about 100 000 parameters."""
+    """Return a FluxKontextPipeline of about 100 000 parameters."""
     from diffusers import FlowMatchEulerDiscreteScheduler, FluxKontextPipeline, FluxTransformer2DModel
     from transformers import T5Config, T5EncoderModel
 
@@ -127,12 +130,12 @@ def kontext_pipeline(folder: Path) -> Any:
 
 
 def klein_pipeline(folder: Path, kind: str = "Flux2KleinPipeline", is_distilled: bool = True) -> Any:
-    """A Flux2KleinPipeline, Flux2KleinKVPipeline or Flux2Pipeline of about 100 000 parameters."""
+    """Return a Flux2KleinPipeline, Flux2KleinKVPipeline or Flux2Pipeline of about 100 000 parameters."""
     import diffusers
     from transformers import Qwen3Config, Qwen3ForCausalLM
 
     torch.manual_seed(0)
-    is_dev = kind == "Flux2Pipeline"  # it reads hidden states 10, 20 and 30, the others 9, 18 and 27
+    is_dev = kind == "Flux2Pipeline"  # it uses hidden states 10, 20 and 30, the others 9, 18 and 27
     text = Qwen3ForCausalLM(
         Qwen3Config(
             vocab_size=160,
@@ -166,7 +169,7 @@ def klein_pipeline(folder: Path, kind: str = "Flux2KleinPipeline", is_distilled:
 
 
 def qwen_pipeline(folder: Path, kind: str = "QwenImageEditPlusPipeline") -> Any:
-    """A QwenImageEditPlusPipeline or QwenImageEditPipeline, whose reader of pictures is a stand-in."""
+    """Return a QwenImageEditPlusPipeline or QwenImageEditPipeline with a simulated image reader."""
     import diffusers
 
     torch.manual_seed(0)
@@ -200,13 +203,13 @@ def qwen_pipeline(folder: Path, kind: str = "QwenImageEditPlusPipeline") -> Any:
 
 
 def longcat_pipeline(folder: Path) -> Any:
-    """A LongCatImageEditPipeline, whose reader of pictures is a stand-in."""
+    """Return a LongCatImageEditPipeline with a simulated image reader."""
     import diffusers
 
     torch.manual_seed(0)
     transformer = diffusers.LongCatImageTransformer2DModel(
         patch_size=1,
-        in_channels=64,  # its pipeline takes 16 channels of latents for granted
+        in_channels=64,  # its pipeline assumes 16 channels of latents
         num_layers=1,
         num_single_layers=1,
         attention_head_dim=16,
@@ -241,26 +244,26 @@ PIPELINES: dict[str, Callable[[Path], Any]] = {
     },
     "LongCatImageEditPipeline": longcat_pipeline,
 }
-"""Class in diffusers -> a tiny one, in memory."""
+"""Class in diffusers -> builder of a tiny one in memory."""
 
 
 def tiny_instruct_pix2pix(folder: Path) -> Path:
-    """A saved StableDiffusionInstructPix2PixPipeline."""
+    """Save a StableDiffusionInstructPix2PixPipeline. Return its path."""
     return _saved(pix2pix_pipeline(folder), folder)
 
 
 def tiny_flux_kontext(folder: Path) -> Path:
-    """A saved FluxKontextPipeline."""
+    """Save a FluxKontextPipeline. Return its path."""
     return _saved(kontext_pipeline(folder), folder)
 
 
 def tiny_flux2_klein(folder: Path) -> Path:
-    """A saved Flux2KleinPipeline."""
+    """Save a Flux2KleinPipeline. Return its path."""
     return _saved(klein_pipeline(folder), folder)
 
 
 class _Conversation:
-    """What FLUX.2 dev takes its sentence's tokens from."""
+    """Source of FLUX.2 dev's tokens."""
 
     def __init__(self, words: Any) -> None:
         self._words = words
@@ -273,7 +276,7 @@ class _Conversation:
 
 
 class _ReaderInput:
-    """Words and pictures for `_Reader`: characters, and a picture's mean color."""
+    """Input of `_Reader`: characters as words, and the mean color of a picture."""
 
     merge_size = 1
 
@@ -294,7 +297,7 @@ class _ReaderInput:
 
 
 class _Reader(torch.nn.Module):
-    """A text encoder that sees the picture too."""
+    """Text encoder that also receives the picture."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -364,7 +367,7 @@ def _qwen_tokenizer(folder: Path) -> Any:
 
 @contextmanager
 def small_megapixels(side: int) -> Iterator[None]:
-    """Pipelines that scale every picture to a megapixel take it for a square of this side meanwhile."""
+    """Replace the megapixel to which some pipelines scale every picture by a square of this side."""
     from diffusers.pipelines.longcat_image import pipeline_longcat_image_edit as longcat
     from diffusers.pipelines.qwenimage import pipeline_qwenimage_edit as qwen
     from diffusers.pipelines.qwenimage import pipeline_qwenimage_edit_plus as plus

@@ -1,4 +1,4 @@
-"""A real GroundingDINO and a real SAM with tiny random networks, saved as real ones are."""
+"""A real GroundingDINO and a real SAM with tiny random networks, saved like real ones."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 
 
 def tiny_detector(folder: Path, seed: int = 0) -> Path:
-    """A GroundingDinoForObjectDetection with its processor, in `folder`; it finds boxes in anything."""
+    """Save a GroundingDinoForObjectDetection with its processor in `folder`. It finds boxes anywhere."""
     from transformers import (
         BertConfig,
         BertTokenizer,
@@ -56,7 +56,7 @@ def tiny_detector(folder: Path, seed: int = 0) -> Path:
 
 
 def tiny_sam(folder: Path, seed: int = 0) -> Path:
-    """A SamModel with its processor, in `folder`; pictures are 64 pixels to it."""
+    """Save a SamModel with its processor in `folder`; it scales pictures to 64 pixels."""
     from transformers import (
         SamConfig,
         SamImageProcessorPil,

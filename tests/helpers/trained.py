@@ -1,4 +1,4 @@
-"""A small bear and its edits, for the tests of the trainer."""
+"""A small bear and its edits, for tests of the trainer."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ WHITE = torch.ones(3)
 
 @dataclass(frozen=True)
 class Small:
-    """A scene, a region of it, and views that look at the region."""
+    """A scene, a region of it, and views of the region."""
 
     scene: Gaussians
     region: Region
@@ -43,7 +43,7 @@ class Small:
 
 @cache
 def small(part: str = "scarf", size: int = 1500, count: int = 6, image_size: int = 72) -> Small:
-    """A bear with `part` as its region, seen in `count` views of `image_size` pixels."""
+    """Return a bear with `part` as its region, seen in `count` views of `image_size` pixels."""
     demo = bear(size)
     mask = torch.zeros(size, dtype=torch.bool)
     mask[demo.members(part)] = True
@@ -56,7 +56,7 @@ Optimization = tuple[Tensor, list[CropScene], list[CropScene], list[TargetStage]
 
 
 def course(case: Small, steps: int = 40, **more: object) -> Optimization:
-    """What `optimize` needs to recolor a small bear's part in two stages."""
+    """Return the arguments of `optimize` to recolor a small bear's part in two stages."""
     editor = make_editor(EditorOptions("recolor:#3060d0"), case.scene, case.region, case.views)
     original = pack(case.scene[case.region.members], with_shN=True)
     crops = [crop_scene(case.scene, case.region.members, v.camera, v.box, WHITE) for v in case.views]
@@ -73,7 +73,7 @@ def course(case: Small, steps: int = 40, **more: object) -> Optimization:
 
 
 def edit_few(scene: Gaussians, members: Tensor, crops: list[CropScene], targets: list[Tensor]) -> Tensor:
-    """What a handful of pictures changes of the members' lowest bands. [M,B,3]"""
+    """Return the change of the members' lowest bands from a small number of pictures. [M,B,3]"""
     original = pack(scene[members], with_shN=scene.sh_degree > 0)
     ties = surface_ties(scene, members, [some.camera for some in crops])
     solver = make_solver(color_views(crops, original), original, ties)
@@ -82,13 +82,13 @@ def edit_few(scene: Gaussians, members: Tensor, crops: list[CropScene], targets:
 
 
 def label_mask(scene: Gaussians, member: Tensor, camera: Camera) -> Tensor:
-    """Where the members [N] bool make up more than half of what a pixel shows. [H,W] bool"""
+    """Return the pixels of which the members [N] bool contribute more than half. [H,W] bool"""
     white = member.float()[:, None].expand(-1, 3).contiguous()
     return render_colors(scene, white, camera, torch.zeros(3))[..., 0] > 0.5
 
 
 def write_bear(folder: Path, size: int = 1500) -> tuple[Path, Path]:
-    """scene.ply and labels.npy of a small bear."""
+    """Write scene.ply and labels.npy of a small bear. Return their paths."""
     demo = bear(size)
     save_ply(folder / "scene.ply", demo.gaussians)
     np.save(folder / "labels.npy", demo.labels.numpy())
@@ -96,7 +96,7 @@ def write_bear(folder: Path, size: int = 1500) -> tuple[Path, Path]:
 
 
 def quick_options(folder: Path, out: str = "run", part: str = "body", **more: object) -> TrainOptions:
-    """Options of a run that takes a few seconds on the bear of `write_bear` in `folder`."""
+    """Return the options of a run of a few seconds on the bear of `write_bear` in `folder`."""
     number = LABELS.index(part)
     settings: dict[str, object] = {
         "views": 6,
@@ -112,10 +112,10 @@ def quick_options(folder: Path, out: str = "run", part: str = "body", **more: ob
 
 
 def train(options: TrainOptions, quiet: bool = True) -> RunResult:
-    """`progdf train`, with its options."""
+    """Run `progdf train` with these options."""
     return trainer.run.run.train(options, quiet)
 
 
 def masked_psnr(image: Tensor, target: Tensor, mask: Tensor) -> float:
-    """PSNR over the pixels of a mask, dB. [H,W,3], [H,W,3], [H,W] bool"""
+    """Return the PSNR over the pixels of a mask in dB. [H,W,3], [H,W,3], [H,W] bool"""
     return float(-10 * torch.log10((image[mask] - target[mask]).square().mean()))

@@ -1,4 +1,4 @@
-"""The whole window without a window: main view, engine and a hand, in a headless context."""
+"""The whole user interface without a window: main view, engine and pointer, in a headless context."""
 
 from __future__ import annotations
 
@@ -23,9 +23,8 @@ from viewer.state.view_state import LayerState, ViewState
 from viewer.ui.keys import NO_KEYS, Keys, Press
 
 STEP_S = 1.0 / 60.0
-HEAD = 107.0
-TRACK = 131.0
-"""Heights of the middle of the name, and of the slider, on the top card."""
+HEAD = 107.0  # height of the name's center on the top card
+TRACK = 131.0  # height of the slider's center on the top card
 BACKGROUND = (0.749, 0.847, 0.945)
 
 
@@ -35,8 +34,10 @@ def bear(size: int = 1500) -> Stack:
 
 
 def first_view(stack: Stack, *strengths: float) -> ViewState:
-    """The bear from the front, its edits at these strengths; never coarse, however slow the machine is, and
-    without axes over it."""
+    """Return a front view of the bear with its edits at these strengths.
+
+    It is never coarse, however slow the machine is, and shows no axes.
+    """
     layers = tuple(LayerState(i, stack.gdfs[i].name, s) for i, s in enumerate(strengths))
     return ViewState(
         camera=stack.first_camera,
@@ -51,10 +52,10 @@ _render = imgui.backends.opengl3_render_draw_data
 
 
 class Rig:
-    """A hand on the main view: each move, press and key is followed by one frame, as in the window.
+    """Pointer and keys for the main view. One frame follows each move, press and key, as in the window.
 
-    What imgui draws over the picture is painted when somebody looks: a software GPU takes longer for it than
-    all else of a frame.
+    Imgui's drawing over the picture is painted on demand, as a software GPU takes longer for it than for the
+    rest of a frame.
     """
 
     def __init__(self, main_view: MainView, points: tuple[int, int], density: float) -> None:
@@ -73,23 +74,23 @@ class Rig:
             self.main_view.frame(self.screen, STEP_S, keys)
 
     def settle(self) -> None:
-        """What the window's loop does while the main view has no patience."""
+        """Draw frames as the window's loop does, until the main view needs no immediate frame."""
         while self.main_view.next_frame_delay() == 0.0:
             self.frame()
 
     def rest(self, seconds: float = 3.0) -> None:
-        """What the window's loop does for so long while nothing comes in."""
+        """Draw frames as the window's loop does for `seconds` without input."""
         while seconds > 0.0 and (wait := self.main_view.next_frame_delay()) is not None:
             passed = max(min(wait, seconds), STEP_S)
             self.main_view.frame(self.screen, passed)
             seconds -= passed
 
     def pause(self, seconds: float) -> None:
-        """One frame that comes so much later."""
+        """Draw one frame after `seconds`."""
         self.main_view.frame(self.screen, seconds)
 
     def event(self) -> None:
-        """Something came in: the window wakes the main view and draws."""
+        """Wake the main view and draw a frame, as the window does for any input."""
         self.main_view.wake()
         self.frame()
 
@@ -131,7 +132,7 @@ class Rig:
         self.settle()
 
     def key(self, chord: str) -> None:
-        """Press a chord of `keys.KEYS` and let go."""
+        """Press and release a chord of `keys.KEYS`."""
         name = chord.rpartition("+")[2]
         self.main_view.wake()
         self.frame(keys=Keys((Press(chord),), frozenset({name})))
@@ -139,12 +140,12 @@ class Rig:
         self.settle()
 
     def modifier(self, key: imgui.Key, down: bool = True) -> None:
-        """Hold a modifier for the mouse, or let it go."""
+        """Press or release a modifier for the mouse."""
         self.io.add_key_event(key, down)
         self.event()
 
     def render(self, data: imgui.ImDrawData) -> None:
-        """In place of imgui's backend; what is written to a file is painted at once."""
+        """Replace imgui's backend. A frame that is written to a file is painted at once."""
         self._unpainted = data
         if self.main_view.work.requests:
             self._paint()
@@ -156,12 +157,12 @@ class Rig:
             self._unpainted = None
 
     def image(self) -> NDArray[np.uint8]:
-        """What is on screen. [H,W,3]"""
+        """Return the pixels on screen. [H,W,3]"""
         self._paint()
         return read_rgb(self.screen, self.pixels)
 
     def picture(self) -> NDArray[np.uint8]:
-        """The part of it that shows the splats, without what imgui draws over it."""
+        """Return the area of the splats, without imgui's drawing over it."""
         if self._unpainted is None:
             self.frame()
         wide = self.pixels[0] - round(panel.WIDTH_PX * self.pixels[0] / self.points[0])
@@ -172,8 +173,8 @@ class Rig:
         return [layer.strength for layer in self.main_view.work.view.layers]
 
     def slider(self, layer: int, strength: float) -> tuple[float, float]:
-        """Where on the window (at 1×) the handle of a layer stands at a strength; the top one is the last."""
-        inset = 12 + 10 + 7  # the panel's and the card's padding, the handle's radius
+        """Return the window position (at 1×) of a layer's handle at a strength. The last layer is on top."""
+        inset = 12 + 10 + 7  # padding of the panel and the card, radius of the handle
         span = panel.WIDTH_PX - 2 * inset
         row = len(self.main_view.work.view.layers) - 1 - layer
         return self.points[0] - panel.WIDTH_PX + inset + strength * span, TRACK + card.CARD_PX * row
@@ -189,14 +190,14 @@ def rig(
     pictures: Path = Path(),
     draw: str = "cpu",
 ) -> Iterator[Rig]:
-    """A main view on the bear.
+    """Open a main view on the bear.
 
     Args:
-        view: the first state; the bear with both edits half way if None
+        view: the first state; None is the bear with both edits at strength 0.5
         points: size of the window in its own coordinates
         density: framebuffer pixels per window coordinate, as on a Mac
         scale: window coordinates per design pixel, as on Windows and X11
-        draw: what draws the splats, as for the engine
+        draw: renderer of the splats, as for the engine
     """
     stack = stack or bear()
     context = headless_context()

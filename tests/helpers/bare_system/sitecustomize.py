@@ -1,7 +1,8 @@
-"""With this folder on PYTHONPATH, Python lacks what Windows lacks, from the first import of ours on.
+"""Removal of the modules and functions that Windows lacks, active with this folder on PYTHONPATH.
 
-Other packages are imported before, as those of Windows are built for it. A file that the process itself has
-open cannot be replaced, and the first replacement of any file in $BARE_FOLDER is refused, as by a scanner.
+It happens at the first import of a ProGDF package. Other packages are imported before, as their Windows
+builds do not need them. A file that the process itself has open cannot be replaced, and the first replacement
+of any file in $BARE_FOLDER is refused, as by a virus scanner.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ BEFORE = (
 
 
 def _refuses(real: Any) -> Any:
-    """`os.replace` of Windows."""
+    """Return an `os.replace` that refuses like that of Windows."""
     listdir, readlink, refused = os.listdir, os.readlink, set()
 
     def replace(source: Any, target: Any, **more: Any) -> None:
@@ -74,7 +75,7 @@ def _refuses(real: Any) -> Any:
                 try:
                     handles.add(readlink(f"/proc/self/fd/{handle}"))
                 except OSError:
-                    continue  # of this very look
+                    continue  # handle of this check
             if own not in refused or own in handles:
                 refused.add(own)
                 error = PermissionError(13, "The process cannot access the file", str(target))
@@ -95,7 +96,7 @@ def _without_proc(real: Any) -> Any:
 
 
 def bare() -> None:
-    """Take away what Windows lacks."""
+    """Remove everything that Windows lacks."""
     for name in BEFORE:
         importlib.import_module(name)
     kill = os.kill
@@ -118,7 +119,7 @@ def bare() -> None:
 
 
 class _Before:
-    """Sees the first import of ours."""
+    """Import hook that notices the first import of a ProGDF package."""
 
     def find_spec(self, name: str, path: object = None, target: object = None) -> None:
         if name.partition(".")[0] in OURS:
