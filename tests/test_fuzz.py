@@ -21,7 +21,7 @@ def test_fuzzed_file_is_read_or_refused_in_one_line(reader: str, tmp_path: Path)
         "-m",
         "tests.helpers.fuzz",
         reader,
-        "30" if reader in COSTLY else "400",
+        "20" if reader in COSTLY else "200",
         "1",
         str(tmp_path),
     ]

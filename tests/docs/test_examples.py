@@ -29,7 +29,7 @@ from tests.helpers.documents import Example, command_examples, python_examples
 from tests.helpers.null_app import null_platform
 from tests.helpers.paths import ROOT
 from tests.helpers.scenes import orbit_camera
-from tests.helpers.small_benchmarks import shrink_benchmarks
+from tests.helpers.small_benchmarks import shrink_benchmarks, shrink_demo
 from tests.helpers.stopped_runs import at_step
 from tests.helpers.trained import quick_options
 from viewer.app.app import App
@@ -214,6 +214,8 @@ def test_documented_command_runs(
     if example.words[0] == "python":
         shrink_benchmarks(monkeypatch)
         monkeypatch.setattr(benchmarks, "ROOT", here)  # `page` writes the documents below ROOT
+    if example.words[:2] == ["progdf", "demo"]:
+        shrink_demo(monkeypatch)
     check_example(example, monkeypatch, capsys)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from benchmarks.viewer.training import begin_training
 from progdf.field import NeuralSettings
 from tests.helpers import demo_scenes, drawn
 from trainer.options import TrainingViewOptions
+from trainer.run import demo
 from trainer.run.demo import Effort
 
 PICTURE = (240, 200)  # pixels
@@ -30,6 +32,17 @@ def shrink_benchmarks(patch: pytest.MonkeyPatch) -> None:
     _shrink_training(patch)
     _shrink_viewer(patch)
     _shrink_rasterizer(patch)
+
+
+def shrink_demo(patch: pytest.MonkeyPatch) -> None:
+    """Make `progdf demo --quick` take seconds, whatever its size is."""
+    for name, plan in demo.SHOWS.items():
+        small = replace(
+            plan,
+            make=lambda _, seed, make=plan.make: make(1500, seed),
+            draft=Effort(views=4, image_size=48, steps=32),
+        )
+        patch.setitem(demo.SHOWS, name, small)
 
 
 def shrink_field(patch: pytest.MonkeyPatch) -> None:
