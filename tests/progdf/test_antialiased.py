@@ -32,8 +32,8 @@ SIZE = (96, 72)
 
 @pytest.fixture(scope="module")
 def stack() -> Stack:
-    made = bear_stack(1500)
-    return replace(made, demo=replace(made.demo, gaussians=replace(made.scene, antialiased=True)))
+    bear = bear_stack(1500)
+    return replace(bear, demo=replace(bear.demo, gaussians=replace(bear.scene, antialiased=True)))
 
 
 def with_comment(path: Path, comment: bytes) -> Path:
@@ -65,10 +65,10 @@ def test_info_reports_antialiased_and_never_prints_a_comment(
 ) -> None:
     path = with_comment(tmp_path / "scene.ply", b"antialiased 1\ncomment \x1b]0;pwned\x07")
     assert main(["info", str(path)]) == 0
-    said = capsys.readouterr().out
-    assert "antialiased: trained and rendered with Mip-Splatting's 2D filter" in said
-    assert "\x1b" not in said
-    assert "pwned" not in said
+    output = capsys.readouterr().out
+    assert "antialiased: trained and rendered with Mip-Splatting's 2D filter" in output
+    assert "\x1b" not in output
+    assert "pwned" not in output
 
 
 def test_saved_scene_keeps_antialiased(tmp_path: Path) -> None:

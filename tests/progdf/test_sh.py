@@ -40,8 +40,8 @@ def test_two_rotations_equal_their_product() -> None:
     first = turns(3)
     second = turns(4)
     shN = bands(3)
-    there = rotate_bands(rotate_bands(shN, first), second)
-    torch.testing.assert_close(there, rotate_bands(shN, multiply_quats(second, first)), rtol=0.0, atol=2e-6)
+    rotated = rotate_bands(rotate_bands(shN, first), second)
+    torch.testing.assert_close(rotated, rotate_bands(shN, multiply_quats(second, first)), rtol=0.0, atol=2e-6)
 
 
 def test_identity_changes_nothing_and_band_4_is_never_rotated() -> None:

@@ -126,13 +126,13 @@ def test_second_interrupt_of_a_step_is_not_lost() -> None:
 
 @pytest.mark.usefixtures("default_signals")
 def test_other_ignored_exceptions_are_still_reported(capfd: pytest.CaptureFixture[str]) -> None:
-    heard = []
+    reported = []
 
     def hook(unraisable: object) -> None:
-        heard.append(unraisable)
+        reported.append(unraisable)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.unraisablehook", hook)
         with handle_signals((signal.SIGINT,), interrupt):
             in_del(lambda: 1 // 0)
-    assert len(heard) == 1
+    assert len(reported) == 1

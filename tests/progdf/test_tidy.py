@@ -84,10 +84,10 @@ def test_removed_region_is_gone_before_any_background() -> None:
     without = scene[outside(scene, region)]
     for background in (WHITE, BLACK):
         for camera in (front_camera(96, 64, 60.0), orbit_camera(96, 64, azimuth=2.0)):
-            there = picture(scene, background, camera)
+            original = picture(scene, background, camera)
             gone = picture(removed, background, camera)
             reference = picture(without, background, camera)
-            assert float((there - reference).abs().max()) > 0.1
+            assert float((original - reference).abs().max()) > 0.1
             # the last rows of a tensor are activated by another loop, 1 ulp off
             assert float((gone - reference).abs().max()) < 1e-5
 
@@ -201,9 +201,9 @@ def test_baked_scene_is_the_slider_at_full_strength() -> None:
     end = at(scene, tidy(scene, steps, "all"), 1.0)
     baked = bake(scene, steps)
     drawn = end[end.opacities >= ALPHA_MIN]
-    kept = baked[baked.opacities >= ALPHA_MIN]
-    assert len(drawn) == len(kept)
-    assert torch.allclose(pack(drawn, True), pack(kept, True), atol=ROUNDING)
+    expected = baked[baked.opacities >= ALPHA_MIN]
+    assert len(drawn) == len(expected)
+    assert torch.allclose(pack(drawn, True), pack(expected, True), atol=ROUNDING)
 
 
 def test_edit_that_only_adds_is_saved_like_any_other(tmp_path: Path) -> None:

@@ -40,8 +40,8 @@ def test_progdf_without_a_command_lists_all_commands(capsys: pytest.CaptureFixtu
 
 def test_help_does_not_import_torch() -> None:
     code = "import sys; from progdf.__main__ import main; main(['--help']); print('torch' in sys.modules)"
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert said.splitlines()[-1] == "False"
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert output.splitlines()[-1] == "False"
 
 
 def test_every_public_name_exists() -> None:
@@ -85,8 +85,8 @@ def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))
 def test_unknown_option_is_reported_in_one_line(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    said = stderr_of(capsys, command, "--no-such-option")
-    assert f"see progdf {command} --help" in said
+    message = stderr_of(capsys, command, "--no-such-option")
+    assert f"see progdf {command} --help" in message
 
 
 NO_PRESET = (
@@ -96,8 +96,8 @@ NO_PRESET = (
 
 
 def test_invalid_choice_error_lists_the_valid_ones(capsys: pytest.CaptureFixture[str]) -> None:
-    said = stderr_of(capsys, "train", "scene.ply", "--preset", "tables")
-    assert said == f"progdf: {NO_PRESET}\n"
+    message = stderr_of(capsys, "train", "scene.ply", "--preset", "tables")
+    assert message == f"progdf: {NO_PRESET}\n"
 
 
 def test_option_errors_are_reported_in_one_line_on_an_ascii_terminal() -> None:
@@ -140,9 +140,9 @@ def test_out_of_range_numbers_stop_a_run_before_it_starts(
 ) -> None:
     save_ply(tmp_path / "scene.ply", random_gaussians(20))
     words = ("--out", str(tmp_path / "run"), "--region", "all", "--editor", "instruct:make it blue")
-    said = stderr_of(capsys, "train", str(tmp_path / "scene.ply"), *words, option, number)
-    assert said.startswith(f"progdf: {option} must be between ")
-    assert said.strip().endswith(f"got {number}")
+    message = stderr_of(capsys, "train", str(tmp_path / "scene.ply"), *words, option, number)
+    assert message.startswith(f"progdf: {option} must be between ")
+    assert message.strip().endswith(f"got {number}")
     assert not (tmp_path / "run").exists()
 
 
@@ -169,11 +169,11 @@ def test_internal_error_prints_one_line_and_writes_a_crash_file(
     monkeypatch.setattr("progdf.cli.info.main", wrong)
     monkeypatch.setattr("progdf.__main__.state_folder", lambda: tmp_path / "progdf")
     assert main(["info", "scene.ply"]) == 70
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1
-    assert told.startswith("progdf: internal error in progdf (IndexError: list index out of range); ")
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert message.startswith("progdf: internal error in progdf (IndexError: list index out of range); ")
     details = (tmp_path / "progdf" / "crash.txt").read_text()
-    assert str(tmp_path / "progdf" / "crash.txt") in told
+    assert str(tmp_path / "progdf" / "crash.txt") in message
     assert "Traceback" in details
     assert "in wrong" in details
 

@@ -28,9 +28,9 @@ posix = pytest.mark.skipif(os.name == "nt", reason="needs a POSIX shell")
 def line_of(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     """Return the single line of a refused command line."""
     assert main(list(words)) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1, said
-    return said
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1, message
+    return message
 
 
 @pytest.fixture
@@ -55,8 +55,8 @@ def test_run_with_options_that_are_not_utf8_is_not_started(
     scene: str, region: str, editor: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = entries()
-    said = line_of(capsys, "train", scene, "--region", region, "--editor", editor, *RUN)
-    assert "is not UTF-8" in said
+    message = line_of(capsys, "train", scene, "--region", region, "--editor", editor, *RUN)
+    assert "is not UTF-8" in message
     assert entries() == before
 
 
@@ -65,8 +65,8 @@ def test_run_of_a_scene_with_a_name_that_is_not_utf8_is_not_started(
 ) -> None:
     os.rename(scene, f"{NO_TEXT}.ply")
     before = entries()
-    said = line_of(capsys, "train", f"{NO_TEXT}.ply", "--region", "all", "--editor", "night", *RUN)
-    assert "the record of --scene cannot hold" in said
+    message = line_of(capsys, "train", f"{NO_TEXT}.ply", "--region", "all", "--editor", "night", *RUN)
+    assert "the record of --scene cannot hold" in message
     assert entries() == before
 
 
@@ -132,15 +132,15 @@ def test_long_values_are_elided(
     scene: str, words: tuple[str, ...], value: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = entries()
-    said = line_of(capsys, *(word.replace("VALUE", value) for word in words))
-    assert len(said) < 1300
+    message = line_of(capsys, *(word.replace("VALUE", value) for word in words))
+    assert len(message) < 1300
     assert entries() == before
 
 
 def test_error_elides_each_value_and_keeps_the_remedy() -> None:
-    said = str(ProgdfError(f"'{LONG}' and {LONG}: no such thing; write {'y' * 80} or 'z'"))
+    message = str(ProgdfError(f"'{LONG}' and {LONG}: no such thing; write {'y' * 80} or 'z'"))
     short = shorten(LONG)
-    assert said == f"'{short}' and {short}: no such thing; write {'y' * 80} or 'z'"
+    assert message == f"'{short}' and {short}: no such thing; write {'y' * 80} or 'z'"
     assert len(short) == 80
 
 

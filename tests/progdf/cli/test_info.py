@@ -120,9 +120,9 @@ def test_info_detects_files_by_content_not_by_name(
     scene, scarf, _ = stack.save(tmp_path)
     save_cameras(tmp_path / "c.json", orbit_rig(stack.scene, 3, 64, 48))
     expected = {scene: "2 000 Gaussians", scarf: "the edit 'scarf'", tmp_path / "c.json": "3 cameras"}
-    for path, said in expected.items():
+    for path, description in expected.items():
         disguised = path.rename(tmp_path / f"{path.stem}.txt")
-        assert said in lines_of(capsys, "info", str(disguised))[0]
+        assert description in lines_of(capsys, "info", str(disguised))[0]
 
 
 def test_info_of_an_edit_shows_its_scene_region_field_and_errors(
@@ -175,8 +175,8 @@ def test_cameras_and_up_options_are_for_scenes_only(
 ) -> None:
     save_ply(tmp_path / "scene.ply", tidy())
     save_cameras(tmp_path / "c.json", orbit_rig(tidy(), 3, 64, 48))
-    told = lines_of(capsys, "info", str(tmp_path / "scene.ply"), "--cameras", str(tmp_path / "c.json"))
-    assert any(line.startswith("up: ") for line in told)
+    lines = lines_of(capsys, "info", str(tmp_path / "scene.ply"), "--cameras", str(tmp_path / "c.json"))
+    assert any(line.startswith("up: ") for line in lines)
     assert any(
         line.startswith("up: +z")
         for line in lines_of(capsys, "info", str(tmp_path / "scene.ply"), "--up", "+z")

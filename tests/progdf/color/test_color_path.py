@@ -32,16 +32,16 @@ BIT = 2 / 255  # two channels closer than this are equal
 @pytest.mark.parametrize("name", PAIRS)
 def test_every_strength_lies_between_both_ends(name: str) -> None:
     start, end = (parse_color(text) for text in PAIRS[name])
-    way = recolor(start.expand(21, 3), end, STRENGTHS, reference=start)
-    lab = srgb_to_oklab(way)
+    colors = recolor(start.expand(21, 3), end, STRENGTHS, reference=start)
+    lab = srgb_to_oklab(colors)
     detour = ((lab - lab[0]).norm(dim=1) + (lab - lab[-1]).norm(dim=1)) / (lab[-1] - lab[0]).norm()
     assert float(detour.max()) <= 1.10
     chroma = lab[:, 1:].norm(dim=1)
     assert float(chroma.min()) >= 0.4 * min(float(chroma[0]), float(chroma[-1]))
-    strongest = {int(way[i].argmax()) for i in (0, 20) if float(chroma[i]) > CHROMA_OF_GRAY}
-    assert {int(i) for i in way[1:-1].argmax(dim=1)} <= strongest
+    strongest = {int(colors[i].argmax()) for i in (0, 20) if float(chroma[i]) > CHROMA_OF_GRAY}
+    assert {int(i) for i in colors[1:-1].argmax(dim=1)} <= strongest
     for a, b in ((0, 1), (1, 2), (0, 2)):
-        above = way[:, a] - way[:, b]
+        above = colors[:, a] - colors[:, b]
         if min(float(above[0]), float(above[-1])) > BIT:
             assert float(above.min()) > -BIT
         if max(float(above[0]), float(above[-1])) < -BIT:
@@ -51,10 +51,10 @@ def test_every_strength_lies_between_both_ends(name: str) -> None:
 @pytest.mark.parametrize("name", PAIRS)
 def test_color_path_has_exact_ends_and_even_steps(name: str) -> None:
     start, end = (parse_color(text) for text in PAIRS[name])
-    way = recolor(start.expand(21, 3), end, STRENGTHS, reference=start)
-    assert torch.equal(way[0], start)
-    assert torch.equal(way[-1], color.recolor_fully(start.expand(21, 3), end, start)[-1])
-    steps = srgb_to_oklab(way).diff(dim=0).norm(dim=1)
+    colors = recolor(start.expand(21, 3), end, STRENGTHS, reference=start)
+    assert torch.equal(colors[0], start)
+    assert torch.equal(colors[-1], color.recolor_fully(start.expand(21, 3), end, start)[-1])
+    steps = srgb_to_oklab(colors).diff(dim=0).norm(dim=1)
     assert float(steps.max()) < 2.5 * float(steps.min())
 
 
@@ -79,8 +79,8 @@ def hues(lightness: float, chroma: float, count: int = 360) -> Tensor:
 def test_neighboring_hues_stay_neighbors_along_the_path(reference: str, path: ColorPath) -> None:
     circle = hues(0.65, 0.11)
     for s in (0.25, 0.5, 0.75):
-        way = recolor(circle, BLUE, s, parse_color(reference), path)
-        apart = (way - way.roll(1, dims=0)).abs().amax(dim=1)
+        recolored = recolor(circle, BLUE, s, parse_color(reference), path)
+        apart = (recolored - recolored.roll(1, dims=0)).abs().amax(dim=1)
         # one degree of hue is up to 0.008 before the edit, and a few times that where two paths part
         assert float(apart.max()) < (0.03 if path == "bowed" else 0.07)
 
@@ -107,9 +107,9 @@ def test_near_gray_colors_stay_dull_during_a_hue_change() -> None:
 @pytest.mark.parametrize("path", ["bowed", "hue"])
 def test_hues_near_the_target_take_their_own_short_path(s: float, path: ColorPath) -> None:
     eyes = torch.tensor([[0.10, 0.70, 0.85], [0.15, 0.60, 0.95], [0.25, 0.45, 0.95]])  # cyan to blue
-    way = recolor(eyes, BLUE, s, ORANGE, path)
-    assert bool((way[:, 2] > way[:, 0] + 0.2).all()), "no orange fleck on the way to blue"
-    assert bool((way[:, 2] > way[:, 1]).all())
+    recolored = recolor(eyes, BLUE, s, ORANGE, path)
+    assert bool((recolored[:, 2] > recolored[:, 0] + 0.2).all()), "no orange fleck on the way to blue"
+    assert bool((recolored[:, 2] > recolored[:, 1]).all())
 
 
 def test_straight_paths_are_straight_in_oklab_and_srgb() -> None:

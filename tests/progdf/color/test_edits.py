@@ -148,9 +148,11 @@ def test_each_grade_value_has_its_named_effect() -> None:
     assert torch.allclose(levels[:, 0], torch.tensor([0.0, 0.5, 1.0]), atol=2e-3)
     extreme = [(name, end) for name, (low, high, _) in color.GRADE_RANGES.items() for end in (low, high)]
     for name, end in extreme:
-        made = graded(torch.cat([_random(), torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])]), **{name: end})
-        assert made.isfinite().all()
-        assert 0 <= made.min() <= made.max() <= 1
+        edited = graded(
+            torch.cat([_random(), torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])]), **{name: end}
+        )
+        assert edited.isfinite().all()
+        assert 0 <= edited.min() <= edited.max() <= 1
 
 
 def test_strength_may_differ_per_pixel() -> None:
@@ -158,8 +160,8 @@ def test_strength_may_differ_per_pixel() -> None:
     strength = torch.linspace(0, 1, 64).reshape(8, 8)
     reference = color.typical_color(image)
     whole = recolor(image, BLUE, strength, reference)
-    one = recolor(image[3, 5], BLUE, float(strength[3, 5]), reference)
-    assert torch.allclose(whole[3, 5], one, atol=1e-5)
+    pixel = recolor(image[3, 5], BLUE, float(strength[3, 5]), reference)
+    assert torch.allclose(whole[3, 5], pixel, atol=1e-5)
 
 
 def test_stripes_are_a_function_of_position() -> None:

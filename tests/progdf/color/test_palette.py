@@ -46,13 +46,13 @@ def test_invisible_colors_are_not_in_the_palette() -> None:
 
 def test_palette_maps_sources_to_targets_and_holds_the_others() -> None:
     blue = color.parse_color("#3060d0")
-    asked = color.ColorGrade(palette=((LAWN, blue), (BEAR, BEAR), (STONE, STONE)))
-    made = color.grade_fully(torch.stack([LAWN, BEAR, STONE]), asked)
-    assert torch.allclose(made, torch.stack([blue, BEAR, STONE]), atol=2e-3)
+    grade = color.ColorGrade(palette=((LAWN, blue), (BEAR, BEAR), (STONE, STONE)))
+    edited = color.grade_fully(torch.stack([LAWN, BEAR, STONE]), grade)
+    assert torch.allclose(edited, torch.stack([blue, BEAR, STONE]), atol=2e-3)
     lawn = scene({500: LAWN})
-    assert (color.grade_fully(lawn, asked).mean(dim=0) - blue).abs().max() < 0.06
+    assert (color.grade_fully(lawn, grade).mean(dim=0) - blue).abs().max() < 0.06
     ends = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
-    assert torch.allclose(color.grade_fully(ends, asked), ends, atol=5e-3)
+    assert torch.allclose(color.grade_fully(ends, grade), ends, atol=5e-3)
 
 
 def test_each_color_moves_fully_with_its_nearest_palette_color() -> None:
@@ -66,9 +66,9 @@ def test_each_color_moves_fully_with_its_nearest_palette_color() -> None:
 def test_single_palette_color_moves_near_colors_and_leaves_far_ones() -> None:
     lab = srgb_to_oklab(torch.stack([SCARF, LAWN, STONE]))
     target = srgb_to_oklab(torch.tensor([[0.2, 0.3, 0.9]]))
-    made = shift_palette(lab, lab[:1], target)
-    assert torch.allclose(made[0], target[0], atol=1e-5)
-    assert (made[1:] - lab[1:]).abs().max() < 0.02
+    shifted = shift_palette(lab, lab[:1], target)
+    assert torch.allclose(shifted[0], target[0], atol=1e-5)
+    assert (shifted[1:] - lab[1:]).abs().max() < 0.02
 
 
 def test_palette_map_has_no_steps() -> None:
@@ -86,25 +86,25 @@ def test_lightness_curve_passes_its_points_and_stays_in_range(
 ) -> None:
     at = torch.tensor([x for x, _ in curve])
     assert torch.allclose(bend_lightness(at, curve), torch.tensor([y for _, y in curve]), atol=1e-3)
-    made = bend_lightness(torch.linspace(0, 1, 500), curve)
-    assert (made.diff() >= -1e-6).all()
+    bent = bend_lightness(torch.linspace(0, 1, 500), curve)
+    assert (bent.diff() >= -1e-6).all()
     assert torch.allclose(bend_lightness(torch.linspace(0, 1, 9), ()), torch.linspace(0, 1, 9), atol=1e-6)
 
 
 def test_lightness_curve_keeps_the_hue() -> None:
-    asked = color.ColorGrade(curve=((0.5, 0.35),))
+    grade = color.ColorGrade(curve=((0.5, 0.35),))
     rgb = torch.stack([LAWN, BEAR])
     before = srgb_to_oklab(rgb)
-    after = srgb_to_oklab(color.grade_fully(rgb, asked))
+    after = srgb_to_oklab(color.grade_fully(rgb, grade))
     assert (after[:, 0] < before[:, 0] - 0.05).all()
     hues = [torch.atan2(lab[:, 2], lab[:, 1]) for lab in (before, after)]
     assert torch.allclose(*hues, atol=0.02)
 
 
 def test_palette_and_curve_grade_is_exact_at_strength_0() -> None:
-    asked = color.ColorGrade(palette=((LAWN, SCARF),), curve=((0.5, 0.3),))
+    grade = color.ColorGrade(palette=((LAWN, SCARF),), curve=((0.5, 0.3),))
     rgb = scene({50: LAWN})
-    assert torch.equal(color.grade_course(rgb, asked)(0.0), rgb)
+    assert torch.equal(color.grade_course(rgb, grade)(0.0), rgb)
 
 
 def test_curve_of_one_color_bends_only_nearby_colors() -> None:
@@ -112,11 +112,13 @@ def test_curve_of_one_color_bends_only_nearby_colors() -> None:
     colors = torch.stack([LAWN, BEAR, STONE])
     lightness = srgb_to_oklab(LAWN)[0].item()
     darker = color.ColorGrade(palette=held, palette_curves=(((lightness, lightness - 0.2),), (), ()))
-    made = srgb_to_oklab(color.grade_fully(colors, darker))
+    edited = srgb_to_oklab(color.grade_fully(colors, darker))
     before = srgb_to_oklab(colors)
-    assert made[0, 0].item() == pytest.approx(lightness - 0.2, abs=5e-3)
-    assert torch.allclose(made[1:], before[1:], atol=2e-3)
-    assert torch.allclose(made[0, 1:] / made[0, 0], before[0, 1:] / before[0, 0], atol=5e-3), "in less light"
+    assert edited[0, 0].item() == pytest.approx(lightness - 0.2, abs=5e-3)
+    assert torch.allclose(edited[1:], before[1:], atol=2e-3)
+    assert torch.allclose(edited[0, 1:] / edited[0, 0], before[0, 1:] / before[0, 0], atol=5e-3), (
+        "in less light"
+    )
     assert torch.equal(color.grade_course(colors, darker)(0.0), colors), "exact at strength 0"
     assert not darker.is_neutral
     straight = color.ColorGrade(palette=held, palette_curves=(((0.5, 0.5),), (), ()))
@@ -128,6 +130,6 @@ def test_curve_of_one_color_has_no_steps() -> None:
     bent = color.ColorGrade(
         palette=((LAWN, BEAR), (STONE, STONE)), palette_curves=(((0.4, 0.6), (0.8, 0.7)), ((0.5, 0.3),))
     )
-    way = torch.lerp(LAWN, STONE, torch.linspace(0, 1, 2001)[:, None])
-    steps = color.grade_fully(way, bent).diff(dim=0).abs()
-    assert steps.max() < 30 * way.diff(dim=0).abs().max()
+    ramp = torch.lerp(LAWN, STONE, torch.linspace(0, 1, 2001)[:, None])
+    steps = color.grade_fully(ramp, bent).diff(dim=0).abs()
+    assert steps.max() < 30 * ramp.diff(dim=0).abs().max()

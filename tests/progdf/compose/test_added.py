@@ -130,10 +130,10 @@ def test_rebind_carries_added_rows_over(
     rebind.main([str(tmp_path / "hat.gdf"), *paths, "-o", str(tmp_path / "new.gdf")])
     a = load_ply(tmp_path / "a.ply")
     b = load_ply(tmp_path / "b.ply")
-    there = compose_layers(b, [Layer(load_gdf(tmp_path / "new.gdf", b), 0.7)])
-    here = compose_layers(a, [Layer(hat, 0.7)])
+    rebound = compose_layers(b, [Layer(load_gdf(tmp_path / "new.gdf", b), 0.7)])
+    original = compose_layers(a, [Layer(hat, 0.7)])
     rows = torch.cat([order, torch.arange(COUNT, COUNT + 25)])
-    assert bits(there) == bits(here[rows])
+    assert bits(rebound) == bits(original[rows])
 
 
 def hostile_changes(draws: Draws, tensors: dict[str, torch.Tensor]) -> dict[str, object]:

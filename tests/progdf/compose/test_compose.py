@@ -295,15 +295,15 @@ def test_composer_matches_compose_through_a_random_session(
         if step % 5 == 0:
             order = rng.permutation(4)[: rng.integers(0, 5)]
         layers = random_stack(rng, wardrobe, order)
-        told = composer.update(layers, blend)
+        changes = composer.update(layers, blend)
         assert bits(composer.gaussians) == bits(compose_layers(scene, layers, blend))
         now = pack(composer.gaussians, True).clone()
         moved = (now != before).any(dim=1).nonzero()[:, 0].numpy()
-        assert np.isin(moved, told.rows).all()
+        assert np.isin(moved, changes.rows).all()
         for name, columns in attribute_slices(now.shape[1]).items():
-            assert name in told.attributes or torch.equal(now[:, columns], before[:, columns])
+            assert name in changes.attributes or torch.equal(now[:, columns], before[:, columns])
         farthest = float((now[:, :3].double() - before[:, :3].double()).norm(dim=1).max())
-        assert told.largest_move == pytest.approx(farthest, rel=1e-5, abs=1e-7)
+        assert changes.largest_move == pytest.approx(farthest, rel=1e-5, abs=1e-7)
         before = now
 
 
@@ -333,28 +333,28 @@ def test_composer_does_not_modify_the_scene(scene: Gaussians, shirt: Gdf) -> Non
 def test_slider_changes_only_the_rows_of_its_own_edit(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
     composer = Composer(scene, [shirt, hat])
     composer.update([Layer(shirt, 0.5), Layer(hat, 0.5)])
-    told = composer.update([Layer(shirt, 0.5), Layer(hat, 0.6)], "normalized")
-    assert np.array_equal(told.rows, hat.region.members.numpy())
+    changes = composer.update([Layer(shirt, 0.5), Layer(hat, 0.6)], "normalized")
+    assert np.array_equal(changes.rows, hat.region.members.numpy())
 
 
 def test_composer_reports_nothing_if_nothing_changed(scene: Gaussians, shirt: Gdf) -> None:
     composer = Composer(scene, [shirt])
     composer.update([Layer(shirt, 0.5)])
-    told = composer.update([Layer(shirt, 0.5)])
-    assert (len(told.rows), told.attributes, told.largest_move) == (0, (), 0.0)
+    changes = composer.update([Layer(shirt, 0.5)])
+    assert (len(changes.rows), changes.attributes, changes.largest_move) == (0, (), 0.0)
 
 
 def test_color_gain_needs_no_new_depth_order(scene: Gaussians, shirt: Gdf) -> None:
     composer = Composer(scene, [shirt])
     composer.update([Layer(shirt, 0.5)])
-    told = composer.update([Layer(shirt, 0.5, gains=Gains(color=0.3))])
-    assert not told.means_moved
+    changes = composer.update([Layer(shirt, 0.5, gains=Gains(color=0.3))])
+    assert not changes.means_moved
 
 
 def test_color_edit_needs_no_new_depth_order(scene: Gaussians, hat: Gdf) -> None:
-    told = Composer(scene, [hat]).update([Layer(hat, 0.5)])
-    assert told.attributes == ("sh0",)
-    assert told.largest_move == 0.0
+    changes = Composer(scene, [hat]).update([Layer(hat, 0.5)])
+    assert changes.attributes == ("sh0",)
+    assert changes.largest_move == 0.0
 
 
 @pytest.mark.parametrize("count", [255, 256, 257, 700])
@@ -463,11 +463,11 @@ def graded(
     """
     knots = torch.tensor([0.0, 0.5, 1.0])
     table = torch.stack([identity_map(1) * torch.tensor(1.0 - darker * float(s)) for s in knots])
-    course = torch.zeros(3, len(members), 3)
+    residuals = torch.zeros(3, len(members), 3)
     if residual:
-        course[1:] = 0.1 * torch.rand(2, len(members), 3, generator=torch.Generator().manual_seed(3))
+        residuals[1:] = 0.1 * torch.rand(2, len(members), 3, generator=torch.Generator().manual_seed(3))
     mask = torch.arange(len(members)).to(torch.uint8) if masked else None
-    form = fit_grade(knots, 1, table, course, int(residual), torch.ones(len(members)), mask)
+    form = fit_grade(knots, 1, table, residuals, int(residual), torch.ones(len(members)), mask)
     rows = pack(scene[members], with_shN=scene.sh_degree > 0)
     return edit_of(scene, members, bake_grade(form, rows), "dark")
 
@@ -522,9 +522,9 @@ def test_adjust_overlays_the_residual_of_a_pattern_grade(scene: Gaussians, shirt
     table = identity_map(1)
     halfway = table + 0.5 * (torch.tensor([[0.1, 0.3, 0.9]] + [[0.0] * 3] * 3) - table)
     mapped = map_colors(scene.sh, halfway, 1) - scene.sh
-    course = torch.zeros(2, len(scene), 12)
-    course[1] = torch.where(rows[:, None] % 2 == 0, -1.0, 1.0) * mapped.flatten(1)
-    form = fit_grade(knots, 1, torch.stack([table, halfway]), course, 1, torch.ones(len(scene)))
+    residual = torch.zeros(2, len(scene), 12)
+    residual[1] = torch.where(rows[:, None] % 2 == 0, -1.0, 1.0) * mapped.flatten(1)
+    form = fit_grade(knots, 1, torch.stack([table, halfway]), residual, 1, torch.ones(len(scene)))
     stripes = edit_of(scene, rows, bake_grade(form, pack(scene, True)), "stripes")
     assert float(coverage(scene, stripes)["map"].mean()) < 0.1, "half of it is undone, the other half doubled"
     layers = [Layer(graded(scene, rows, 0.6, residual=False)), Layer(stripes)]

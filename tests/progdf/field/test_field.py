@@ -61,13 +61,13 @@ def test_ends_of_a_keyframe_field_are_exact(in_half: bool, count: int) -> None:
 @pytest.mark.parametrize("kind", ["separable", "keyframes"])
 def test_unmoved_attributes_are_absent(kind: str) -> None:
     strengths, offsets = curved_trajectory(50, channels=14 + 9, moving=("sh0",))
-    made = (
+    field = (
         fit_separable(strengths, offsets, EVERYTHING)
         if kind == "separable"
         else fit_keyframes(strengths, offsets, 4)
     )
-    assert list(made.attributes) == ["sh0"]
-    assert made.bytes_per_member == 3 * (4 + 2) if kind == "separable" else 3 * 4 * 3
+    assert list(field.attributes) == ["sh0"]
+    assert field.bytes_per_member == 3 * (4 + 2) if kind == "separable" else 3 * 4 * 3
 
 
 @pytest.mark.parametrize("members", [0, 1, 2])
@@ -381,7 +381,7 @@ def test_expected_error_accounts_for_the_kept_bases() -> None:
 def test_bytes_go_to_the_most_visible_attributes_first() -> None:
     strengths, offsets = curved_trajectory(60, snapshots=17)
     render = linear_pictures(60, 14)
-    judge = FieldEvaluator(strengths, offsets, render)
+    evaluator = FieldEvaluator(strengths, offsets, render)
     seen = render_trajectories(offsets, channel_weights(None, 60, 14), render)
     columns = attribute_slices(14)
 
@@ -390,16 +390,16 @@ def test_bytes_go_to_the_most_visible_attributes_first() -> None:
 
     ranks = [ranks for ranks in grow_ranks(seen) if size(ranks) <= 6][-1]
     bases = {n: store_attribute(t, seen.modes[n][:, : ranks[n]]) for n, t in seen.trajectories.items()}
-    best = judge.candidate(BakedField("separable", strengths, bases, 14), "")
+    best = evaluator.candidate(BakedField("separable", strengths, bases, 14), "")
     for ranks in ({"means": 2}, {"means": 1, "log_scales": 1}, {"quats": 1, "logit_opacities": 2}):
         other = fit_separable(strengths, offsets, ranks)
-        assert best.worst > judge.candidate(other, "").worst
+        assert best.worst > evaluator.candidate(other, "").worst
 
 
 def test_all_snapshots_as_keyframes_have_no_error() -> None:
     strengths, offsets = curved_trajectory(20)
-    judge = FieldEvaluator(strengths, offsets, linear_pictures(20, 14))
-    assert min(judge.curve(fit_keyframes(strengths, offsets, 9))) > 90
+    evaluator = FieldEvaluator(strengths, offsets, linear_pictures(20, 14))
+    assert min(evaluator.curve(fit_keyframes(strengths, offsets, 9))) > 90
 
 
 @settings(max_examples=40, deadline=None)

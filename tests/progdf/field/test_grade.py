@@ -57,9 +57,9 @@ def some_form(rows: Tensor, degree: int = 2, bands: int = 1, rank: int = 2) -> G
     """Return a grade of these members with a random residual."""
     draws = torch.Generator().manual_seed(4)
     table = torch.stack([some_table(degree, float(s)) for s in KNOTS])
-    course = 0.1 * torch.randn(2, len(rows), 3 * bands, generator=draws)
-    course = torch.stack([torch.zeros_like(course[0]), 0.5 * course[0], course[1]])
-    return fit_grade(KNOTS, degree, table, course, rank, torch.ones(len(rows)))
+    residual = 0.1 * torch.randn(2, len(rows), 3 * bands, generator=draws)
+    residual = torch.stack([torch.zeros_like(residual[0]), 0.5 * residual[0], residual[1]])
+    return fit_grade(KNOTS, degree, table, residual, rank, torch.ones(len(rows)))
 
 
 def directions(count: int = 300) -> Tensor:
@@ -236,11 +236,11 @@ def test_packed_levels_of_a_wrong_count_are_refused(
 def test_coarser_levels_take_fewer_bytes_and_err_by_at_most_a_step() -> None:
     rows = pack(random_gaussians(2000), with_shN=False)
     draws = torch.Generator().manual_seed(4)
-    course = torch.zeros(2, len(rows), 3)
-    course[1] = 0.1 * torch.randn(len(rows), 3, generator=draws).clamp(-2, 2)
+    residual = torch.zeros(2, len(rows), 3)
+    residual[1] = 0.1 * torch.randn(len(rows), 3, generator=draws).clamp(-2, 2)
     table = torch.stack([identity_map(1), some_table(1)])
     forms = {
-        k: fit_grade(torch.tensor([0.0, 1.0]), 1, table, course, 1, torch.ones(len(rows)), coarser=k)
+        k: fit_grade(torch.tensor([0.0, 1.0]), 1, table, residual, 1, torch.ones(len(rows)), coarser=k)
         for k in RESIDUAL_STEPS
     }
     sizes = [form.bytes_per_member for form in forms.values()]
@@ -249,20 +249,20 @@ def test_coarser_levels_take_fewer_bytes_and_err_by_at_most_a_step() -> None:
     assert sizes[-1] < 0.7 * sizes[0], "of some 7.9 bits three go"
     for k, form in forms.items():
         found = torch.einsum("r,rmc->mc", form.coefficients[1], form.residual * form.scale[:, None])
-        assert float((found - course[1]).abs().max()) < k * 0.2 / 127
+        assert float((found - residual[1]).abs().max()) < k * 0.2 / 127
 
 
 def test_members_beyond_eight_bits_get_extra_bases() -> None:
     rows = pack(random_gaussians(4000), with_shN=False)
-    course = torch.zeros(2, len(rows), 3)
-    course[1] = 0.05 * torch.randn(len(rows), 3, generator=torch.Generator().manual_seed(4)).clamp(-2, 2)
-    course[1, :3] *= 0.19 / course[1, :3].abs().clamp_min(1e-3)
+    residual = torch.zeros(2, len(rows), 3)
+    residual[1] = 0.05 * torch.randn(len(rows), 3, generator=torch.Generator().manual_seed(4)).clamp(-2, 2)
+    residual[1, :3] *= 0.19 / residual[1, :3].abs().clamp_min(1e-3)
     table = torch.stack([identity_map(1), some_table(1)])
-    form = fit_grade(torch.tensor([0.0, 1.0]), 1, table, course, 1, torch.ones(len(rows)))
+    form = fit_grade(torch.tensor([0.0, 1.0]), 1, table, residual, 1, torch.ones(len(rows)))
     assert len(form.residual) == 2
     assert form.residual[1].any(dim=1).nonzero()[:, 0].tolist() == [0, 1, 2]
     found = torch.einsum("r,rmc->mc", form.coefficients[1], form.residual * form.scale[:, None])
-    assert float((found - course[1]).abs().max()) < 1.1 * 0.1 / 127 / 2
+    assert float((found - residual[1]).abs().max()) < 1.1 * 0.1 / 127 / 2
 
 
 def test_both_ends_match_the_stored_grade(tmp_path: Path) -> None:
@@ -283,10 +283,10 @@ def test_grade_between_knots_is_the_map_and_its_residual() -> None:
     rows = pack(random_gaussians(500, sh_degree=2), with_shN=True)
     form = some_form(rows, bands=4)
     field = bake_grade(form, rows)
-    wanted = mapped_bands(form, rows)
-    wanted[:, :, :12] += torch.einsum("sr,rmc->smc", form.coefficients, form.residual * form.scale[:, None])
+    expected = mapped_bands(form, rows)
+    expected[:, :, :12] += torch.einsum("sr,rmc->smc", form.coefficients, form.residual * form.scale[:, None])
     found = torch.stack([member_bands(field.offsets(float(s))).flatten(1) for s in KNOTS])
-    error = float((found - wanted).square().mean().sqrt() / wanted.square().mean().sqrt())
+    error = float((found - expected).square().mean().sqrt() / expected.square().mean().sqrt())
     assert error < 0.01
 
 
@@ -309,13 +309,13 @@ def test_mask_scales_the_map_per_member() -> None:
 
 def test_outlier_members_do_not_coarsen_the_others() -> None:
     members = 5000
-    course = torch.zeros(2, members, 3)
-    course[1] = 0.1 * torch.rand(members, 3, generator=torch.Generator().manual_seed(2))
-    course[1, :3] = 30.0
+    residual = torch.zeros(2, members, 3)
+    residual[1] = 0.1 * torch.rand(members, 3, generator=torch.Generator().manual_seed(2))
+    residual[1, :3] = 30.0
     table = torch.stack([identity_map(1), some_table(1)])
-    form = fit_grade(torch.tensor([0.0, 1.0]), 1, table, course, 1, torch.ones(members))
+    form = fit_grade(torch.tensor([0.0, 1.0]), 1, table, residual, 1, torch.ones(members))
     found = form.coefficients[1, 0] * form.residual[0] * form.scale[0]
-    assert float((found[3:] - course[1, 3:]).abs().max()) < 0.001
+    assert float((found[3:] - residual[1, 3:]).abs().max()) < 0.001
 
 
 @pytest.mark.parametrize("sh_degree", [0, 1, 2, 3, 4])

@@ -45,10 +45,10 @@ def test_missing_end_offset_is_spread_over_the_path() -> None:
 
 def test_correction_follows_the_recorded_errors_if_known() -> None:
     strengths, offsets = curved_trajectory(MEMBERS, moving=("means", "sh0"))
-    judge = FieldEvaluator(strengths, offsets, lambda moved: moved[:, 11:14])
+    evaluator = FieldEvaluator(strengths, offsets, lambda moved: moved[:, 11:14])
     follows = FieldEvaluator.curve
     known = bake_network(network("position"), rows(), lambda s: _at(strengths, offsets, s))
-    assert sum(follows(judge, known)) >= sum(follows(judge, baked("position"))) - 1e-6
+    assert sum(follows(evaluator, known)) >= sum(follows(evaluator, baked("position"))) - 1e-6
 
 
 def _at(strengths: Tensor, offsets: Tensor, s: float) -> Tensor:

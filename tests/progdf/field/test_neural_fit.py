@@ -82,7 +82,7 @@ def test_image_loss_uses_random_snapshots_and_never_between_two() -> None:
     train_network(fit, strengths, offsets, 60, pictures)
     assert len(pictures.asked) == 60, "in every step"
     drawn = {
-        next(i for i, made in enumerate(offsets) if torch.equal(made, recorded))
+        next(i for i, snapshot in enumerate(offsets) if torch.equal(snapshot, recorded))
         for _, recorded, _ in pictures.asked
     }
     assert drawn == set(range(1, len(offsets))), "each of them, but not the original"
@@ -124,9 +124,9 @@ def test_saved_fit_continues_to_the_same_bits() -> None:
         whole.step(strengths, offsets)
     for _ in range(3):
         first.step(strengths, offsets)
-    kept = {name: tensor.clone() for name, tensor in first.capture_state().items()}
+    saved = {name: tensor.clone() for name, tensor in first.capture_state().items()}
     first.step(strengths, offsets)  # does not change the saved state
-    second.restore(kept)
+    second.restore(saved)
     for _ in range(3):
         second.step(strengths, offsets)
     assert whole.capture_state().keys() == second.capture_state().keys()

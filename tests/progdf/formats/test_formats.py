@@ -258,9 +258,9 @@ def test_missing_package_error_names_the_extra(
 def test_reader_memory_is_limited_by_the_need_of_the_file(tmp_path: Path) -> None:
     """Request 1 GB beyond the limit, which is refused in one line without allocating it."""
     script = tmp_path / "greedy.py"
-    here = "    path = Path(source)\n"
+    line = "    path = Path(source)\n"
     own = Path(native_child.__file__).read_text()
-    script.write_text(own.replace(here, f"    bytes(1 << 30)\n{here}"))
+    script.write_text(own.replace(line, f"    bytes(1 << 30)\n{line}"))
     limits = map(str, (1 << 30, 1_000_000, 10))
     words = [sys.executable, "-P", str(script), *limits, "convert", "splat", "missing", "ply", "out"]
     ended = subprocess.run(words, capture_output=True, text=True, check=False)
@@ -400,11 +400,11 @@ def test_damaged_files_give_an_error_or_a_drawable_scene(name: str, tmp_path: Pa
             for at in rng.integers(0, top, 1 + trial % 7):
                 broken[at] ^= 1 << int(rng.integers(0, 8))
         (tmp_path / file).write_bytes(bytes(broken))
-        said, scene = _attempt(tmp_path / file)
+        message, scene = _attempt(tmp_path / file)
         if scene is None:
             refused += 1
-            assert said.isprintable(), (trial, said)
-            assert file in said, (trial, said)
+            assert message.isprintable(), (trial, message)
+            assert file in message, (trial, message)
         else:
             for tensor in (scene.means, scene.log_scales, scene.logit_opacities, scene.sh0, scene.shN):
                 assert bool(tensor.isfinite().all()), trial

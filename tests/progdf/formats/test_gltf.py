@@ -218,8 +218,8 @@ def test_linear_colors_with_bands_are_close_from_every_side(tmp_path: Path) -> N
     views = spread_directions(30).float()
     error = []
     for direction in views:
-        there = direction.expand(40, 3)
-        error.append(shade(2, there, found.sh) - srgb_from_linear(shade(2, there, scene.sh)))
+        directions = direction.expand(40, 3)
+        error.append(shade(2, directions, found.sh) - srgb_from_linear(shade(2, directions, scene.sh)))
     rms = float(torch.stack(error).square().mean().sqrt())
     assert rms < 0.01
 
@@ -407,9 +407,9 @@ def test_nodes_place_their_gaussians(name: str, tmp_path: Path) -> None:
     torch.testing.assert_close(
         covariances(found), linear @ covariances(scene) @ linear.T, rtol=1e-4, atol=1e-5
     )
-    there = torch.nn.functional.normalize(torch.tensor([[0.3, -0.7, 0.6]]), dim=1).expand(12, 3)
-    turned = torch.nn.functional.normalize(there @ linear.T, dim=1)
-    torch.testing.assert_close(shade(3, turned, found.sh), shade(3, there, scene.sh), rtol=0, atol=1e-5)
+    directions = torch.nn.functional.normalize(torch.tensor([[0.3, -0.7, 0.6]]), dim=1).expand(12, 3)
+    turned = torch.nn.functional.normalize(directions @ linear.T, dim=1)
+    torch.testing.assert_close(shade(3, turned, found.sh), shade(3, directions, scene.sh), rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -425,8 +425,8 @@ def test_nodes_place_their_gaussians(name: str, tmp_path: Path) -> None:
 def test_deforming_node_is_named(node: dict[str, Any], does: str, tmp_path: Path) -> None:
     builder = one_mesh(small())
     builder.nodes({"children": [1]}, {"name": "table", "children": [2]} | node, {"mesh": 0})
-    said = refusal(load_scene, builder.write(tmp_path / "a.glb"))
-    assert f"nodes[1] 'table', which {does} Gaussians" in said
+    message = refusal(load_scene, builder.write(tmp_path / "a.glb"))
+    assert f"nodes[1] 'table', which {does} Gaussians" in message
 
 
 @pytest.mark.parametrize(
@@ -502,9 +502,9 @@ def test_compressed_view_without_a_fallback_is_refused_by_name(tmp_path: Path) -
     rest = content[20 + size :]
     head = b"glTF" + struct.pack("<IIII", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A)
     path.write_bytes(head + text + rest)
-    said = refusal(load_scene, path)
-    assert "compression (EXT_meshopt_compression)" in said
-    assert "gltf-transform copy" in said
+    message = refusal(load_scene, path)
+    assert "compression (EXT_meshopt_compression)" in message
+    assert "gltf-transform copy" in message
 
 
 def test_attributes_without_the_extension_are_gaussians(tmp_path: Path) -> None:
@@ -644,8 +644,8 @@ def test_short_buffer_error_names_the_buffer_file(tmp_path: Path) -> None:
     builder = one_mesh(small())
     path = builder.write(tmp_path / "a.gltf", "a.bin")
     (tmp_path / "a.bin").write_bytes(builder.data[:-1])
-    said = refusal(lambda _: load_scene(path), tmp_path / "a.bin")
-    assert said.startswith(f"{tmp_path / 'a.bin'} is damaged: it has {len(builder.data) - 1} of")
+    message = refusal(lambda _: load_scene(path), tmp_path / "a.bin")
+    assert message.startswith(f"{tmp_path / 'a.bin'} is damaged: it has {len(builder.data) - 1} of")
 
 
 # ---- damage
@@ -766,10 +766,10 @@ def test_row_count_is_bounded_by_the_file_before_allocation(
 ) -> None:
     path = make().write(tmp_path / "a.glb")
     tracemalloc.start()
-    said = refusal(load_scene, path)
+    message = refusal(load_scene, path)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert "repeats its rows beyond 16 times its size" in said
+    assert "repeats its rows beyond 16 times its size" in message
     assert peak < 16 << 20
 
 
@@ -786,10 +786,10 @@ def test_buffer_is_bounded_by_its_file(tmp_path: Path) -> None:
     path.write_text(json.dumps(tables))
     (tmp_path / "a.bin").write_bytes(b"\0" * 9)
     tracemalloc.start()
-    said = refusal(lambda _: load_scene(path), tmp_path / "a.bin")
+    message = refusal(lambda _: load_scene(path), tmp_path / "a.bin")
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert "it has 9 of 1099511627776 bytes" in said
+    assert "it has 9 of 1099511627776 bytes" in message
     assert peak < 16 << 20
 
 

@@ -101,9 +101,9 @@ def test_sog_table_size_is_bounded_before_parsing(packed: int | None, tmp_path: 
         path.write_bytes(path.read_bytes().replace(len(content).to_bytes(4, "little"), b"\2\0\0\0"))
     tracemalloc.start()
     refusal(load_scene, path)
-    most = tracemalloc.get_traced_memory()[1]
+    peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert most < 8 << 20
+    assert peak < 8 << 20
 
 
 def test_oversized_sog_table_is_named(tmp_path: Path) -> None:

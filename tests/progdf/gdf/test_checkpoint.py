@@ -287,8 +287,8 @@ def test_flipped_or_missing_bytes_give_the_same_edit_or_an_error(
     reach = 8 + int.from_bytes(content[:8], "little") if in_header else len(content)
     for place in data.draw(st.lists(st.integers(0, reach - 1), max_size=4)):
         content[place] ^= data.draw(st.integers(1, 255))
-    kept = data.draw(st.one_of(st.just(len(content)), st.integers(0, len(content))))
-    path = written(tmp_path, bytes(content[:kept]))
+    length = data.draw(st.one_of(st.just(len(content)), st.integers(0, len(content))))
+    path = written(tmp_path, bytes(content[:length]))
     refused = None
     try:
         found = load_gdf(path)
@@ -339,11 +339,11 @@ def test_info_shows_or_refuses_any_header_in_one_line(
 
 def test_small_file_of_a_huge_scene_costs_little_memory(saved: Path, tmp_path: Path) -> None:
     content = safetensors.torch.load(saved.read_bytes())
-    there: dict[str, object] = {name: None for name in content if name.startswith("members.")}
-    there["members.runs"] = torch.tensor([[0, 1 << 25]], dtype=torch.int32)
+    members: dict[str, object] = {name: None for name in content if name.startswith("members.")}
+    members["members.runs"] = torch.tensor([[0, 1 << 25]], dtype=torch.int32)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     scene = {"count": 1 << 25, "means_sha256": ""}
-    refusal(rewritten(saved, tmp_path, scene=scene, members=1 << 25, **there))
-    refusal(rewritten(saved, tmp_path, scene=scene, **there))
-    refusal(rewritten(saved, tmp_path, scene={"count": 1 << 28, "means_sha256": ""}, **there))
+    refusal(rewritten(saved, tmp_path, scene=scene, members=1 << 25, **members))
+    refusal(rewritten(saved, tmp_path, scene=scene, **members))
+    refusal(rewritten(saved, tmp_path, scene={"count": 1 << 28, "means_sha256": ""}, **members))
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB

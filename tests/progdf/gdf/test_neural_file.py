@@ -90,14 +90,14 @@ def rewritten(
     """Write the file with other values and a matching checksum, as a wrong writer would."""
     header = header_of(saved.read_bytes())
     header["field"]["network"] |= network
-    kept = safetensors.torch.load(saved.read_bytes())
+    stored = safetensors.torch.load(saved.read_bytes())
     for name, tensor in tensors.items():
         if tensor is None:
-            del kept[name]
+            del stored[name]
         else:
-            kept[name] = tensor
+            stored[name] = tensor
     path = tmp_path / "shirt.gdf"
-    path.write_bytes(signed_gdf(header, kept))
+    path.write_bytes(signed_gdf(header, stored))
     return path
 
 
@@ -154,9 +154,9 @@ def test_flipped_or_missing_bytes_are_reported_in_one_line(
     reach = 8 + int.from_bytes(content[:8], "little") if data.draw(st.booleans()) else len(content)
     place = data.draw(st.integers(0, reach - 1))
     content[place] ^= data.draw(st.integers(1, 255))
-    kept = data.draw(st.one_of(st.just(len(content)), st.integers(0, len(content) - 1)))
+    length = data.draw(st.one_of(st.just(len(content)), st.integers(0, len(content) - 1)))
     path = tmp_path / "shirt.gdf"
-    path.write_bytes(content[:kept])
+    path.write_bytes(content[:length])
     refused = None
     try:
         found = load_gdf(path, scene())

@@ -214,10 +214,10 @@ def test_f_frames_a_room_from_outside_and_an_empty_scene_at_the_origin() -> None
 
 @pytest.mark.parametrize("points", [(400, 900), (1600, 400)])
 def test_narrow_and_wide_windows_are_usable(points: tuple[int, int]) -> None:
-    with rig(points=points) as hand:
-        before = hand.main_view.work.view.camera
-        hand.drag((100.0, 200.0), (130.0, 220.0))
-        assert hand.main_view.work.view.camera != before
-        hand.key("F")
-        hand.key("T")
-        assert np.isfinite(hand.main_view.engine.image(hand.main_view.work.view, (20, 80))).all()
+    with rig(points=points) as user:
+        before = user.main_view.work.view.camera
+        user.drag((100.0, 200.0), (130.0, 220.0))
+        assert user.main_view.work.view.camera != before
+        user.key("F")
+        user.key("T")
+        assert np.isfinite(user.main_view.engine.image(user.main_view.work.view, (20, 80))).all()

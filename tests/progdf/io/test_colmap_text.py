@@ -144,8 +144,8 @@ def test_largest_of_several_models_is_read(
         load_cameras(tmp_path)
     (record,) = caplog.records
     chosen = tmp_path / place / "1"
-    said = f"{chosen} is used, the largest of 4 COLMAP models: 3 images, 0 has 1, 2 has 2, 10 has 2"
-    assert record.getMessage() == said
+    message = f"{chosen} is used, the largest of 4 COLMAP models: 3 images, 0 has 1, 2 has 2, 10 has 2"
+    assert record.getMessage() == message
     assert camera_files(tmp_path) == (chosen / "cameras.txt", chosen / "images.txt")
 
 

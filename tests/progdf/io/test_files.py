@@ -58,9 +58,9 @@ def test_interrupted_write_leaves_the_old_file_and_nothing_else(
 def test_full_disk_error_names_the_file_and_keeps_the_old_one(tmp_path: Path) -> None:
     path = tmp_path / "out.txt"
     path.write_text("old")
-    told = pytest.raises(ProgdfError, match=r"/out\.txt cannot be written \(.*\); choose a place")
+    refused = pytest.raises(ProgdfError, match=r"/out\.txt cannot be written \(.*\); choose a place")
     with (
-        told as caught,
+        refused as caught,
         files_up_to(100),
         atomic_write(path) as temporary_file,
         atomic_write(temporary_file) as within,
@@ -127,9 +127,9 @@ def test_unwritable_folder_error_names_the_given_path(
 ) -> None:
     refuse_temporary_files(monkeypatch, errno.EACCES)
     path = tmp_path / "out.txt"
-    with pytest.raises(ProgdfError) as told, atomic_write(path):
+    with pytest.raises(ProgdfError) as refused, atomic_write(path):
         pass
-    assert str(told.value).startswith(f"{path} cannot be written (Permission denied); ")
+    assert str(refused.value).startswith(f"{path} cannot be written (Permission denied); ")
 
 
 def test_write_through_a_link_replaces_its_target(tmp_path: Path) -> None:

@@ -31,8 +31,8 @@ def _plain(red: float) -> Tensor:
 
 
 def _found(sheet: Tensor, red: float) -> int:
-    wanted = torch.tensor([red, 0.2, 0.4])
-    return int(((sheet - wanted).abs().amax(dim=2) < 1 / 255).sum())
+    color = torch.tensor([red, 0.2, 0.4])
+    return int(((sheet - color).abs().amax(dim=2) < 1 / 255).sum())
 
 
 def test_contact_sheet_contains_every_picture_unchanged() -> None:
@@ -248,8 +248,10 @@ def test_rotated_picture_is_read_upright(orientation: int, suffix: str, tmp_path
     if orientation == 1:
         assert open_picture(path, calibrated=True).size == (64, 32)
     else:
-        said = refusal(lambda p: open_picture(p, calibrated=True), path)
-        assert f"EXIF orientation {orientation}), and nothing says whether its camera was calibrated" in said
+        message = refusal(lambda p: open_picture(p, calibrated=True), path)
+        assert (
+            f"EXIF orientation {orientation}), and nothing says whether its camera was calibrated" in message
+        )
 
 
 def test_png_with_orientation_after_its_pixels_is_read_upright(tmp_path: Path) -> None:

@@ -74,8 +74,8 @@ def test_every_flipped_bit_is_noticed(tmp_path: Path) -> None:
         path.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
         with pytest.raises(ValueError):  # noqa: PT011  the library's words
             read_tensors(path)
-    for kept in range(len(content)):
-        path.write_bytes(content[:kept])
+    for length in range(len(content)):
+        path.write_bytes(content[:length])
         with pytest.raises(ValueError):  # noqa: PT011  the library's words
             read_tensors(path)
 

@@ -34,9 +34,9 @@ def test_unprintable_characters_become_escapes() -> None:
 
 
 def test_error_has_one_line_for_any_name() -> None:
-    told = str(ProgdfError(f"camera {EVIL}\nis broken; export it again"))
-    assert told.endswith("is broken; export it again")
-    assert told.isprintable()
+    message = str(ProgdfError(f"camera {EVIL}\nis broken; export it again"))
+    assert message.endswith("is broken; export it again")
+    assert message.isprintable()
 
 
 def test_info_escapes_names_of_a_ply(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -44,9 +44,9 @@ def test_info_escapes_names_of_a_ply(tmp_path: Path, capsys: pytest.CaptureFixtu
     path = write(tmp_path / "scene.ply", with_extra("label", "u1", 5)(table_of(scene_of(0))))
     path.write_bytes(path.read_bytes().replace(b"label", evil.encode()))
     assert main(["info", str(path)]) == 0
-    told = capsys.readouterr().out
-    assert r"\x1b]0;owned" in told
-    assert harmless(told)
+    output = capsys.readouterr().out
+    assert r"\x1b]0;owned" in output
+    assert harmless(output)
 
 
 def test_info_escapes_names_of_edits_sessions_and_cameras(
@@ -68,9 +68,9 @@ def test_info_escapes_names_of_edits_sessions_and_cameras(
 
 def test_error_line_and_warning_are_escaped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info", str(tmp_path / f"{EVIL}\nb.ply")]) == 2
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1
-    assert harmless(told)
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert harmless(message)
     record = logging.LogRecord("progdf", logging.WARNING, "", 0, "%s is odd", (EVIL,), None)
     assert harmless(PrintableFormatter().format(record))
 

@@ -198,8 +198,8 @@ def test_lpips_penalizes_blur_more_than_a_tint_of_the_same_psnr(network: Lpips) 
 def test_lpips_with_cached_features_is_the_same(network: Lpips) -> None:
     image = picture(64, 64)
     target = picture(64, 64, seed=5)
-    kept = network.features(target)
-    assert float(network.distance(network.features(image), kept)) == float(network(image, target))
+    cached = network.features(target)
+    assert float(network.distance(network.features(image), cached)) == float(network(image, target))
 
 
 def test_lpips_gradient_is_finite_without_activations(network: Lpips) -> None:

@@ -198,10 +198,10 @@ def test_changes_reach_the_nodes(changed: str) -> None:
     other = Pyramid(scene)
     other.limit = pyramid.limit  # starts the search alike
     after = pyramid.simplify(camera, 500)
-    anew = other.simplify(camera, 500)
+    rebuilt = other.simplify(camera, 500)
     assert not torch.equal(before.colors, after.colors[: len(before.colors)])
     if changed == "colors":
-        assert all(map(torch.equal, after.tensors, anew.tensors)), "the same cut, to the bit"
+        assert all(map(torch.equal, after.tensors, rebuilt.tensors)), "the same cut, to the bit"
     assert np.array_equal(pyramid.nodes.means, other.nodes.means)
     assert np.array_equal(pyramid.nodes.shapes, other.nodes.shapes)
 

@@ -135,9 +135,9 @@ def test_only_requested_rows_get_their_full_gradients(engine: str) -> None:
     camera = orbit_camera(90, 61)
     rows = torch.arange(3, 200, 7)
     found = []
-    for wanted in (None, rows):
+    for grad_rows in (None, rows):
         leaves = [tensor.double().requires_grad_() for tensor in activate(scene).tensors]
-        image = render(ActivatedGaussians(*leaves), camera, grad_rows=wanted, engine=engine).image
+        image = render(ActivatedGaussians(*leaves), camera, grad_rows=grad_rows, engine=engine).image
         (image[20:] ** 2).sum().backward()
         found.append([leaf.grad for leaf in leaves])
     others = torch.ones(200, dtype=torch.bool).index_fill(0, rows, False)

@@ -69,11 +69,11 @@ def test_equal_depths_are_drawn_in_row_order(engine: str) -> None:
 @pytest.mark.parametrize("engine", EVERY)
 def test_support_ends_exactly_where_alpha_falls_below_1_255(engine: str) -> None:
     camera = front_camera(60, 40)
-    one = ActivatedGaussians(
+    gaussian = ActivatedGaussians(
         torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.full((1, 3), 0.3),
         torch.tensor([0.7]), torch.ones(1, 3),
     )  # fmt: skip
-    image, transmittance, _ = render(one, camera, (0.0, 0.0, 0.0), engine=engine)
+    image, transmittance, _ = render(gaussian, camera, (0.0, 0.0, 0.0), engine=engine)
     x, y = torch.meshgrid(torch.arange(60) + 0.5 - 30, torch.arange(40) + 0.5 - 20, indexing="xy")
     variance = (0.3 * 30.0 / 2.0) ** 2 + 0.3
     alpha = 0.7 * torch.exp(-0.5 * (x.double() ** 2 + y.double() ** 2) / variance)

@@ -107,10 +107,10 @@ def test_invisible_rows_get_zero_gradients_in_uninitialized_memory(
 
 
 def test_inputs_changed_in_place_before_backward_are_noticed() -> None:
-    one = one_gaussian()
+    gaussian = one_gaussian()
     camera = front_camera()
-    means = one.means.clone().requires_grad_()
-    image = render(replace(one, means=means), camera).image
+    means = gaussian.means.clone().requires_grad_()
+    image = render(replace(gaussian, means=means), camera).image
     with torch.no_grad():
         means += 1.0
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):

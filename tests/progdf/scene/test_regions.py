@@ -232,12 +232,12 @@ LONG = 1_000_000
 )
 def test_huge_spec_is_read_quickly_and_quoted_in_short(spec: str) -> None:
     """Parse a megabyte. Scanning the input once per character would take hours."""
-    said = ""
+    message = ""
     try:
         check_region(spec)
     except ProgdfError as refused:
-        said = str(refused)
-    assert len(said) < 500
+        message = str(refused)
+    assert len(message) < 500
 
 
 # Tokens of the language, valid as often as not.
@@ -335,15 +335,15 @@ def folder_of_parts(scene: Gaussians, tmp_path_factory: pytest.TempPathFactory) 
 
 @given(spec=SPECS_OF_ALL_KINDS)
 def test_any_input_is_a_region_or_an_error(spec: str, scene: Gaussians, folder_of_parts: Path) -> None:
-    said: list[str] = []
+    notes: list[str] = []
     refused = []
     with contextlib.chdir(folder_of_parts):
-        for read in (lambda: check_region(spec), lambda: parse_region(spec, scene, say=said.append)):
+        for read in (lambda: check_region(spec), lambda: parse_region(spec, scene, say=notes.append)):
             try:
                 read()
             except ProgdfError as error:
                 refused.append(str(error))
-    assert all(len(line.splitlines()) == 1 for line in (*refused, *said))
+    assert all(len(line.splitlines()) == 1 for line in (*refused, *notes))
     assert len(refused) != 1 or "holds no Gaussian" in refused[0] or "no Gaussian with label" in refused[0]
 
 
@@ -359,8 +359,8 @@ def test_suspicious_parts_are_reported(scene: Gaussians) -> None:
     assert said("color:#808080,1") == [
         "color:#808080,1 selects 100 % of the scene; lower its tolerance, or add &box:…"
     ]
-    (few,) = said(f"flood:{x},{y},{z},1e-6")
-    assert few.endswith("selects only 1 Gaussian; raise its tolerance, or name a point on a surface")
+    (note,) = said(f"flood:{x},{y},{z},1e-6")
+    assert note.endswith("selects only 1 Gaussian; raise its tolerance, or name a point on a surface")
     assert said("all+box:99,99,99,100,100,100") == ["box:99,99,99,100,100,100 selects no Gaussian"]
     assert said("all - all + all") == ["the region is empty after -all"]
     assert said("sphere:0,0,0,0.5|shrink:9+all") == ["the region is empty after |shrink:9"]

@@ -37,20 +37,20 @@ def rig(count: int = 12, to: Gaussians | None = None) -> list[Camera]:
 
 def to_nerfstudio(cameras: Sequence[Camera]) -> Tensor:
     """Return nerfstudio's rigid motion, which centers cameras and rotates their mean up to +z. [4,4]"""
-    way = torch.eye(4, dtype=torch.float64)
-    way[:3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    motion = torch.eye(4, dtype=torch.float64)
+    motion[:3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     centers = torch.stack([camera.position for camera in cameras]).double()
-    way[:3, 3] = -way[:3, :3] @ (centers.mean(dim=0) + torch.tensor([2.0, 0.5, -1.0]))
-    return way
+    motion[:3, 3] = -motion[:3, :3] @ (centers.mean(dim=0) + torch.tensor([2.0, 0.5, -1.0]))
+    return motion
 
 
 def assert_same_views(found: Sequence[Camera], given: Sequence[Camera], way: Tensor, scale: float) -> None:
     """Check that the moved cameras see the moved scene as the given cameras see the original."""
     point = torch.tensor([0.3, -0.2, 0.5])
-    there = (scale * (way[:3, :3] @ point.double() + way[:3, 3])).float()
+    moved_point = (scale * (way[:3, :3] @ point.double() + way[:3, 3])).float()
     for one, other in zip(found, given, strict=True):
         before = other.viewmat[:3, :3] @ point + other.viewmat[:3, 3]
-        after = one.viewmat[:3, :3] @ there + one.viewmat[:3, 3]
+        after = one.viewmat[:3, :3] @ moved_point + one.viewmat[:3, 3]
         torch.testing.assert_close(after, scale * before, atol=1e-4, rtol=1e-4)
 
 
@@ -58,28 +58,28 @@ def assert_same_views(found: Sequence[Camera], given: Sequence[Camera], way: Ten
 @pytest.mark.parametrize("kind", ["plain", "applied", "older"])
 def test_nerfstudio_frames_are_applied(tmp_path: Path, beside: str, kind: str) -> None:
     cameras = rig()
-    way = to_nerfstudio(cameras)
+    motion = to_nerfstudio(cameras)
     fields = {} if kind == "plain" else {"applied_transform": APPLIED[:3].tolist()}
     for name in ("s", "c", "s/nerfstudio_models"):
         (tmp_path / name).mkdir()
     file = write_frames(tmp_path / "c" / "transforms.json", cameras, **fields)
-    stated = way @ APPLIED if kind == "applied" else way
+    stated = motion @ APPLIED if kind == "applied" else motion
     write_transforms(tmp_path / ("c" if beside == "cameras" else "s"), stated, SCALE)
     path = tmp_path / ("s/nerfstudio_models/step.ckpt" if beside == "checkpoint" else "s/scene.ply")
-    found = load_scene_cameras(file, move_scene(scene(), way, SCALE), path)
-    assert_same_views(found.cameras, cameras, way, SCALE)
+    found = load_scene_cameras(file, move_scene(scene(), motion, SCALE), path)
+    assert_same_views(found.cameras, cameras, motion, SCALE)
     (note,) = found.notes
     assert note.startswith("cameras: moved into nerfstudio's frame by")
 
 
 def test_applied_scale_is_included(tmp_path: Path) -> None:
     cameras = rig()
-    way = to_nerfstudio(cameras)
+    motion = to_nerfstudio(cameras)
     fields = {"applied_transform": APPLIED[:3].tolist(), "applied_scale": 2.0}
     file = write_frames(tmp_path / "transforms.json", cameras, **fields)
-    write_transforms(tmp_path, way @ APPLIED, 2.0 * SCALE)
-    found = load_scene_cameras(file, move_scene(scene(), way, SCALE))
-    assert_same_views(found.cameras, cameras, way, SCALE)
+    write_transforms(tmp_path, motion @ APPLIED, 2.0 * SCALE)
+    found = load_scene_cameras(file, move_scene(scene(), motion, SCALE))
+    assert_same_views(found.cameras, cameras, motion, SCALE)
 
 
 def test_scene_in_the_dataset_frame_keeps_its_cameras(tmp_path: Path) -> None:
@@ -192,10 +192,10 @@ def test_some_cameras_may_look_away(tmp_path: Path, facing: int) -> None:
 
 def test_up_comes_from_cameras_beside_the_scene_in_its_frame(tmp_path: Path) -> None:
     level = orbit_rig(scene(), 6, 64, 64, up=UP_Y, elevations=(0.0, 0.0))
-    way = to_nerfstudio(level)
+    motion = to_nerfstudio(level)
     write_frames(tmp_path / "transforms.json", level)
-    write_transforms(tmp_path, way, SCALE)
-    up = find_up(move_scene(scene(), way, SCALE), path=tmp_path / "s.ply")
+    write_transforms(tmp_path, motion, SCALE)
+    up = find_up(move_scene(scene(), motion, SCALE), path=tmp_path / "s.ply")
     assert (up.name, up.reason) == ("+z", "from the 6 cameras beside the scene's file")
 
 

@@ -32,8 +32,8 @@ BESIDE = [
 
 @cache
 def furnished() -> tuple[DemoScene, Surface]:
-    made = room(30_000)
-    return made, Surface(made.gaussians, made.cameras[0].resize(800, 600))
+    demo = room(30_000)
+    return demo, Surface(demo.gaussians, demo.cameras[0].resize(800, 600))
 
 
 def painted(lines: list[list[tuple[int, int]]]) -> NDArray[np.bool_]:
@@ -54,12 +54,12 @@ def strokes() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 def test_strokes_select_a_table_that_no_color_selects() -> None:
-    made, _ = furnished()
-    truth = made.members("table").numpy()
-    table = np.zeros(len(made.gaussians), bool)
+    demo, _ = furnished()
+    truth = demo.members("table").numpy()
+    table = np.zeros(len(demo.gaussians), bool)
     table[truth] = True
-    colors = base_colors(made.gaussians)
-    mask = Scribbles(made.gaussians.means.numpy(), colors).select(*strokes())
+    colors = base_colors(demo.gaussians)
+    mask = Scribbles(demo.gaussians.means.numpy(), colors).select(*strokes())
     tolerances = np.linspace(0.02, 0.5, 25)
     by_color = max(iou(alike_in_color(colors, np.median(colors[table], 0), t), table) for t in tolerances)
     assert by_color < 0.4
@@ -70,9 +70,9 @@ def test_strokes_select_a_table_that_no_color_selects() -> None:
 
 
 def test_moved_rotated_and_scaled_scene_gives_the_same_selection() -> None:
-    made, _ = furnished()
-    points = made.gaussians.means.double()
-    colors = base_colors(made.gaussians)
+    demo, _ = furnished()
+    points = demo.gaussians.means.double()
+    colors = base_colors(demo.gaussians)
     turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0)).double())[0]
     moved = (7.0 * points @ turn + torch.tensor([30.0, -4.0, 9.0])).numpy()
     before, after = (Scribbles(at, colors).select(*strokes()) for at in (points.numpy(), moved))

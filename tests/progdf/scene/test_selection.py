@@ -219,8 +219,8 @@ def test_refine_keeps_a_thin_part() -> None:
     rough = np.zeros_like(truth)
     rough[17:22, 4:36] = True
     near = Neighborhood(sheet(colors.reshape(-1, 3), side=40))
-    made = near.refine(rough.ravel(), 60).reshape(40, 40)
-    assert (made & truth).sum() / (made | truth).sum() > 0.95
+    refined = near.refine(rough.ravel(), 60).reshape(40, 40)
+    assert (refined & truth).sum() / (refined | truth).sum() > 0.95
 
 
 def test_largest_part_has_the_most_members() -> None:

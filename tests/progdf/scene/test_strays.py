@@ -183,12 +183,12 @@ def test_clean_writes_a_scene_without_strays_and_reports_changes(
     save_ply("dirty.ply", scene)
     before = Path("dirty.ply").read_bytes()
     assert "progdf edit dirty.ply --clean -o CLEAN.ply leaves them out" in run(capsys, "info", "dirty.ply")
-    told = run(capsys, "edit", "dirty.ply", "--clean", "-o", "clean.ply").splitlines()
-    assert told[0].startswith("clean: 23 of 3 023 Gaussians removed: ")
-    assert told[1].startswith("rendered views: ")
-    assert told[2] == "wrote clean.ply: 3 000 Gaussians"
-    assert "labels and edits of dirty.ply no longer fit" in told[3]
-    assert "progdf rebind EDIT.gdf --from dirty.ply --to clean.ply -o NEW.gdf" in told[3]
+    lines = run(capsys, "edit", "dirty.ply", "--clean", "-o", "clean.ply").splitlines()
+    assert lines[0].startswith("clean: 23 of 3 023 Gaussians removed: ")
+    assert lines[1].startswith("rendered views: ")
+    assert lines[2] == "wrote clean.ply: 3 000 Gaussians"
+    assert "labels and edits of dirty.ply no longer fit" in lines[3]
+    assert "progdf rebind EDIT.gdf --from dirty.ply --to clean.ply -o NEW.gdf" in lines[3]
     assert Path("dirty.ply").read_bytes() == before
     again = run(capsys, "edit", "clean.ply", "--clean", "-o", "again.ply").splitlines()
     assert again == ["clean: there are no strays", "wrote again.ply: 3 000 Gaussians"]
@@ -208,9 +208,9 @@ def test_edit_is_carried_over_to_the_cleaned_scene(
     run(capsys, "rebind", str(scarf), "--from", str(path), "--to", "clean.ply", "-o", "new.gdf")
     cleaned = load_ply("clean.ply")
     members = load_gdf(Path("new.gdf"), cleaned).region.members
-    kept = set(stack.gdfs[0].region.members.tolist()) - set(range(5, 40, 5))
+    expected = set(stack.gdfs[0].region.members.tolist()) - set(range(5, 40, 5))
     rows = [row for row in range(3000) if row not in range(5, 40, 5)]
-    assert {rows[int(i)] for i in members} == kept
+    assert {rows[int(i)] for i in members} == expected
 
 
 @pytest.mark.parametrize(

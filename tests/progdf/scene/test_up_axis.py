@@ -135,9 +135,9 @@ def test_too_few_gaussians_use_the_convention() -> None:
 
 def test_saved_up_axis_is_restored_and_nonsense_is_ignored() -> None:
     up = find_up(bear(3000).gaussians)
-    kept = up_from_json(up.to_json())
-    assert kept is not None
-    assert torch.equal(kept, up.direction)
+    restored = up_from_json(up.to_json())
+    assert restored is not None
+    assert torch.equal(restored, up.direction)
     for nonsense in (
         None,
         3,
