@@ -45,9 +45,9 @@ ONLY = "base,2-keyframes,one-target,slider-time"
 @pytest.fixture(scope="module")
 def options(tmp_path_factory: pytest.TempPathFactory) -> TrainOptions:
     """Return the options of a small bear run that is trained in a second or two."""
-    made = tmp_path_factory.mktemp("bear")
-    write_bear(made)
-    options = quick_options(made, steps=100, views=4, image_size=48)
+    folder = tmp_path_factory.mktemp("bear")
+    write_bear(folder)
+    options = quick_options(folder, steps=100, views=4, image_size=48)
     with blank_plots():
         train(options, quiet=True)
     return options
@@ -204,14 +204,14 @@ def test_finished_variants_are_reused_until_edited_views_change(
     assert [row.first.name for row in again.rows] == ONLY.split(",")
     name = reopen_run(run).record.held_out[0]
     path = RunFolder(run).view("edited", name)
-    kept = path.read_bytes()
+    content = path.read_bytes()
     try:
         with Image.open(path) as opened:
             Image.new("RGB", opened.size, "red").save(path)
         with pytest.raises(AssertionError, match="trains again"):
             ablate(AblateOptions((run,), only="base", threads=1), quiet=True)
     finally:
-        path.write_bytes(kept)
+        path.write_bytes(content)
 
 
 def test_interrupted_ablation_resumes_after_finished_variants(
@@ -274,17 +274,17 @@ def test_quick_ablation_uses_fewer_strengths_and_separate_results(
 ) -> None:
     copy = tmp_path / "run"
     shutil.copytree(options.out, copy, ignore=shutil.ignore_patterns("ablation"))
-    asked: list[OptimizeOptions] = []
+    requested: list[OptimizeOptions] = []
 
     def noted(_: TrainOptions, wanted: OptimizeOptions, *__: object, **more: object) -> object:
-        asked.append(wanted)
+        requested.append(wanted)
         raise ProgdfError("enough") from FloatingPointError("enough")
 
     monkeypatch.setattr(benchmarks.ablation.ablate, "optimize_members", noted)
     monkeypatch.setattr("benchmarks.ablation.setup.QUICK_STEPS", 40)
     monkeypatch.setattr("benchmarks.ablation.setup.QUICK_STAGES", 2)
     ablate(AblateOptions((copy,), only="base", quick=True, threads=1), quiet=True)
-    assert (asked[0].steps, asked[0].stages) == (40, 2)
+    assert (requested[0].steps, requested[0].stages) == (40, 2)
 
 
 @pytest.mark.slow
@@ -295,8 +295,8 @@ def test_only_seeded_variants_get_one_row_per_seed(options: TrainOptions, tmp_pa
     shutil.copytree(options.out, copy, ignore=shutil.ignore_patterns("ablation"))
     page.write_text("<!-- bench ablation -->\n<!-- end ablation -->\n", encoding="utf-8")
     only = "base,equal-strengths,descent"
-    asked = AblateOptions((copy,), only=only, seeds=2, markdown=page, plot=picture, threads=1)
-    (done,) = ablate(asked, quiet=True)
+    requested = AblateOptions((copy,), only=only, seeds=2, markdown=page, plot=picture, threads=1)
+    (done,) = ablate(requested, quiet=True)
     assert [len(row.outcomes) for row in done.rows] == [1, 1, 2]
     base, equal, descent = (row.outcomes for row in done.rows)
     assert base[0].between != equal[0].between
@@ -337,7 +337,7 @@ def test_network_variant_is_trained_and_saved(
 
 
 def test_invalid_ablate_options_fail_before_training(run: Path, tmp_path: Path) -> None:
-    for asked, told in (
+    for requested, message in (
         (AblateOptions(()), "ablate needs a run"),
         (AblateOptions((run,), seeds=0), "--seeds must be at least 1, got 0"),
         (AblateOptions((run, run)), "a run is given twice"),
@@ -345,5 +345,5 @@ def test_invalid_ablate_options_fail_before_training(run: Path, tmp_path: Path) 
         (AblateOptions((run,), markdown=tmp_path / "page.md"), "does not exist"),
         (AblateOptions((run,), plot=tmp_path / "no" / "all.png"), "does not exist; create it first"),
     ):
-        with pytest.raises(ProgdfError, match=told):
-            ablate(asked, quiet=True)
+        with pytest.raises(ProgdfError, match=message):
+            ablate(requested, quiet=True)

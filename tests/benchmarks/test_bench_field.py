@@ -28,16 +28,16 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 def test_training_benchmark_reports_time_and_held_out_error(small: None, tmp_path: Path) -> None:
-    (made,) = training.tables(plot=tmp_path / "training.png")
-    ((edit, way, at_1, worst, between, processor, wall, size),) = made.rows
-    assert (edit, way) == ("bear, stripes:#20a040", f"`{training.WAYS[0]}`")
+    (result,) = training.tables(plot=tmp_path / "training.png")
+    ((edit, arguments, at_1, worst, between, processor, wall, size),) = result.rows
+    assert (edit, arguments) == ("bear, stripes:#20a040", f"`{training.WAYS[0]}`")
     assert 20.0 < float(worst) <= min(map(float, between.split())) + 0.05
     assert 20.0 < float(at_1) < 70.0
     assert float(processor) >= 1
     assert float(wall) >= 1
     assert float(size) >= 0
-    assert "progdf train bear.ply --region labels:bear_labels.npy:5 --editor stripes:#20a040" in made.note
-    assert made.without_wall().rows[0][-2] == "–"
+    assert "progdf train bear.ply --region labels:bear_labels.npy:5 --editor stripes:#20a040" in result.note
+    assert result.without_wall().rows[0][-2] == "–"
     with Image.open(tmp_path / "training.png") as picture:
         assert picture.width == 380
 

@@ -29,9 +29,9 @@ def sh3_scene(count: int) -> Gaussians:
 
 def seconds(work: object, path: Path) -> float:
     start = time.perf_counter()
-    kept = work(path)  # type: ignore[operator]
+    result = work(path)  # type: ignore[operator]
     taken = time.perf_counter() - start
-    del kept
+    del result
     return taken
 
 
@@ -46,15 +46,15 @@ def test_load_ply_time_against_a_raw_read(
     loaded = load_ply(path)
     assert all(torch.equal(getattr(loaded, name), getattr(scene, name)) for name in ATTRIBUTES)
     del scene, loaded
-    ways = {
+    methods = {
         "read()": lambda path: path.read_bytes(),
         "numpy.fromfile": lambda path: np.fromfile(path, np.uint8),
         "load_ply": load_ply,
     }
-    times: dict[str, list[float]] = {name: [] for name in ways}
+    times: dict[str, list[float]] = {name: [] for name in methods}
     for _ in range(rounds):
-        for name, way in ways.items():
-            times[name].append(seconds(way, path))
+        for name, method in methods.items():
+            times[name].append(seconds(method, path))
     if measuring:
         with capsys.disabled():
             print(f"\n{count} SH3 rows, {path.stat().st_size / 1e6:.0f} MB, median of {rounds}:")

@@ -59,20 +59,20 @@ def test_edits_are_compared_with_baselines_at_all_strengths(
 def test_networks_are_trained_once_and_long_ones_only_timed(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    few = {"tiny": NeuralSettings("tiny", steps=4), "long": NeuralSettings("tiny", steps=10**7)}
-    monkeypatch.setattr(bench_networks, "NETWORKS", few)
+    networks = {"tiny": NeuralSettings("tiny", steps=4), "long": NeuralSettings("tiny", steps=10**7)}
+    monkeypatch.setattr(bench_networks, "NETWORKS", networks)
     monkeypatch.setattr(bench_networks, "ROUNDS", 1)
     (table,) = bench_networks.tables([run])
     rows = {row[1]: row for row in table.rows}
     assert rows["tiny"][4] == "4"
     assert rows["long"][4:8] == ("-", "-", "-", "-")
-    assert all(float(rows[name][8]) > 0 and rows[name][11].endswith("×") for name in few)
+    assert all(float(rows[name][8]) > 0 and rows[name][11].endswith("×") for name in networks)
     assert any(label.startswith("auto at 40 dB") for label in rows)
     assert [path.name for path in (run / "networks").iterdir()] == ["tiny.gdf"]
-    kept = (run / "networks" / "tiny.gdf").stat().st_mtime_ns
+    modified_ns = (run / "networks" / "tiny.gdf").stat().st_mtime_ns
     (again,) = bench_networks.tables([run])
     assert {row[1]: row[5:8] for row in again.rows}["tiny"] == rows["tiny"][5:8]
-    assert (run / "networks" / "tiny.gdf").stat().st_mtime_ns == kept
+    assert (run / "networks" / "tiny.gdf").stat().st_mtime_ns == modified_ns
 
 
 @pytest.mark.parametrize("tables", [bench_edits.tables, bench_networks.tables])

@@ -106,20 +106,20 @@ def test_idle_picture_is_checked_only_once_it_is_sharp(
 ) -> None:
     """Simulate a large scene, whose sharp picture is made in the background and arrives some frames later."""
     path = tmp_path / "bear.ply"
-    asked = list[int]()
+    requests = list[int]()
     save_ply(path, bear(600).gaussians)
     prepare = CpuRenderer.prepare
 
     def slow(renderer: CpuRenderer, *picture: Any) -> bool:
-        asked.append(1)
-        return prepare(renderer, *picture) and len(asked) % 5 == 0
+        requests.append(1)
+        return prepare(renderer, *picture) and len(requests) % 5 == 0
 
     monkeypatch.setattr(CpuRenderer, "prepare", slow)
     monkeypatch.setattr(dynamic_resolution, "SLOW_MS", -1.0)
     ctx = headless_context()
     turnings = bench_frames.measure_turning(ctx, path, steps=2, size=SIZE)
     ctx.release()
-    assert len(asked) >= 5
+    assert len(requests) >= 5
     assert [turning.at_rest for turning in turnings] == [0, 0]
 
 

@@ -78,13 +78,13 @@ def test_busy_share_sees_loops_in_other_processes() -> None:
 
 
 def test_page_runs_exactly_the_benchmarks_with_markers(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[str] = []
-    monkeypatch.setattr(command, "_function", lambda path: lambda **_: asked.append(path) or [])
+    requested: list[str] = []
+    monkeypatch.setattr(command, "_function", lambda path: lambda **_: requested.append(path) or [])
     monkeypatch.setattr(command, "atomic_write", lambda path: pytest.fail("nothing was measured"))
     with pytest.raises(ProgdfError, match="unknown benchmark 'page'"):
         main(["page", "hard"])
     main(["page"])
-    assert asked == [command.BENCHES[name] for name in command.PAGE]
+    assert requested == [command.BENCHES[name] for name in command.PAGE]
     text = (command.ROOT / "docs" / "speed-and-error.md").read_text()
     named = set(re.findall(r"<!-- bench (\w+) -->", text))
     assert named == {"machine", "compose", "coarse", "lists", *command.PAGE}

@@ -12,13 +12,13 @@ from tests.helpers.demo_scenes import bear
 from trainer.optimize.losses import GradientL1
 from trainer.run.demo import Effort
 
-_FEW = tuple(case for case in CASES if case.name in ("blue scarf", "tilted ears"))
+_USED_CASES = tuple(case for case in CASES if case.name in ("blue scarf", "tilted ears"))
 _SIZES = {"bear": 1500}
 _EFFORT = Effort(views=4, image_size=64, steps=32)
 
 
 def _run(folder: Path) -> list[CaseResult]:
-    return run_suite(folder, GradientL1(), 1, cases=_FEW, sizes=_SIZES, effort=_EFFORT)
+    return run_suite(folder, GradientL1(), 1, cases=_USED_CASES, sizes=_SIZES, effort=_EFFORT)
 
 
 pytestmark = pytest.mark.slow  # trains its edits
@@ -66,8 +66,8 @@ def test_suite_table_and_picture_contain_every_edit(
 ) -> None:
     results = suite[1]
     table = suite_table(results).splitlines()
-    assert [line.split(" | ")[0] for line in table[2:]] == [f"| {case.name}" for case in _FEW]
-    assert set(suite_json(results, "gradient-l1")["edits"]) == {case.name for case in _FEW}
+    assert [line.split(" | ")[0] for line in table[2:]] == [f"| {case.name}" for case in _USED_CASES]
+    assert set(suite_json(results, "gradient-l1")["edits"]) == {case.name for case in _USED_CASES}
     assert suite_picture(results).shape[2] == 3
 
 
