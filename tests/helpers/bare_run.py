@@ -66,9 +66,9 @@ def jobs() -> None:
     number = queue.add(order("blue"))
     assert wait("Editing views") == "Editing views"
     queue.stop(number)
-    assert (said := wait()) == "stopped", said
+    assert (status := wait()) == "stopped", status
     queue.resume(number)
-    assert (said := wait()) == "done", said
+    assert (status := wait()) == "done", status
     queue.add(order("red"))
     assert wait("Editing views") == "Editing views"
     (child,) = queue._children.values()

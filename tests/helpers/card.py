@@ -28,7 +28,7 @@ class OnCard(Tensor):
 
     @staticmethod
     def __new__(cls, values: Tensor) -> OnCard:
-        made = torch.Tensor._make_wrapper_subclass(
+        tensor = torch.Tensor._make_wrapper_subclass(
             cls,
             values.shape,
             strides=values.stride(),
@@ -36,8 +36,8 @@ class OnCard(Tensor):
             dtype=values.dtype,
             device=CARD,
         )
-        made.values = values
-        return made
+        tensor.values = values
+        return tensor
 
     def tolist(self) -> Any:
         """Return the values as any tensor does."""

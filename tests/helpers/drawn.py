@@ -63,8 +63,8 @@ def draw(
         weights = weights[crop[1] : crop[3], crop[0] : crop[2]]
     ((image * weights[..., :3]).sum() + (transmittance * weights[..., 3]).sum()).backward()
     gradients = {name: leaf.grad.cpu() for name, leaf in leaves.items() if leaf.grad is not None}
-    there = RasterInfo(*(getattr(info, field.name).cpu() for field in fields(info)))
-    return Drawn(image.detach().cpu(), transmittance.detach().cpu(), there, gradients)
+    info_on_cpu = RasterInfo(*(getattr(info, field.name).cpu() for field in fields(info)))
+    return Drawn(image.detach().cpu(), transmittance.detach().cpu(), info_on_cpu, gradients)
 
 
 def render_leaves(

@@ -33,8 +33,8 @@ def curved_trajectory(
     bend = torch.sin(torch.pi * strengths)
     wave = torch.sin(2 * torch.pi * strengths)
     offsets = torch.zeros(snapshots, members, channels)
-    for course, size in ((strengths, 1.0), (bend, 0.5), (wave, 0.2)):
-        offsets += course[:, None, None] * size * draws.normal(members, channels)
+    for curve, size in ((strengths, 1.0), (bend, 0.5), (wave, 0.2)):
+        offsets += curve[:, None, None] * size * draws.normal(members, channels)
     for name, columns in attribute_slices(channels).items():
         if name not in moving:
             offsets[:, :, columns] = 0.0
@@ -119,11 +119,11 @@ def grade_of(scene: Gaussians, members: Tensor, name: str) -> Gdf:
     knots = torch.tensor([0.0, 0.5, 1.0])
     count = len(members)
     table = torch.stack([identity_map(1) * (1.0 - 0.5 * float(s)) for s in knots])
-    course = torch.zeros(3, count, 3)
-    course[1:] = 0.1 * Draws(4).uniform(2, count, 3)
+    residual = torch.zeros(3, count, 3)
+    residual[1:] = 0.1 * Draws(4).uniform(2, count, 3)
     mask = torch.full((count,), 255, dtype=torch.uint8)
     mask[::3] = 230
-    form = fit_grade(knots, 1, table, course, 1, torch.ones(count), mask)
+    form = fit_grade(knots, 1, table, residual, 1, torch.ones(count), mask)
     field = bake_grade(form, pack(scene[members], with_shN=True))
     return edit_of(scene, members, field, name)
 

@@ -135,8 +135,8 @@ def inputs(folder: Path, reader: str) -> dict[str, tuple[str, Callable[[Path], A
     opened = session.open_session(saved)
     table = json.loads(saved.read_text())
     mask = np.arange(len(opened.document.scene)) % 3 == 0
-    kept = add_region(select(SelectionState(), mask), "third", folder / "s" / "third.region.npy")
-    table["view"]["selection"] = to_json(replace(kept, hidden=kept.members))
+    regions = add_region(select(SelectionState(), mask), "third", folder / "s" / "third.region.npy")
+    table["view"]["selection"] = to_json(replace(regions, hidden=regions.members))
     saved.write_text(json.dumps(table))
     read: Callable[[Path], bytes] = Path.read_bytes
 
@@ -239,8 +239,8 @@ def failures(reader: str, count: int, seed: int, folder: Path) -> Iterator[str]:
             wrong = f"{type(error).__name__}: {str(error)[:100]} ({Path(last.filename).name}:{last.lineno})"
         signal.alarm(0)
         if wrong:
-            kept = folder / f"kept-{reader}-{seed}-{i}{path.suffix}"
-            kept.write_bytes(path.read_bytes())
+            copy = folder / f"kept-{reader}-{seed}-{i}{path.suffix}"
+            copy.write_bytes(path.read_bytes())
             yield f"{reader} {i}: {' '.join(wrong.split())}"
 
 

@@ -199,10 +199,10 @@ def changed_parts(content: bytes, key: str) -> Change:
     tensors = safetensors.torch.load(content)
 
     def change(rng: random.Random, path: Path) -> None:
-        told = metadata
+        changed = metadata
         if rng.random() < 0.6:
-            told = {**metadata, key: json.dumps(changed_value(rng, json.loads(metadata[key])))}
+            changed = {**metadata, key: json.dumps(changed_value(rng, json.loads(metadata[key])))}
         found = changed_tensors(rng, tensors) if rng.random() < 0.6 else tensors
-        write_tensors(path, found, told)
+        write_tensors(path, found, changed)
 
     return change

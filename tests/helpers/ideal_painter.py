@@ -78,12 +78,12 @@ class IdealPainter(WholeViews):
         """See `InstructEditor.paint`."""
         self.calls += 1
         index = self.view_of(picture)
-        shows = self.views[index].mask > 0.05
-        edits = self.choices[index][:, shows].flatten(1) * self.scale  # [K,D]
-        start = (picture if source is None else source)[shows].flatten() * self.scale
+        inside = self.views[index].mask > 0.05
+        edits = self.choices[index][:, inside].flatten(1) * self.scale  # [K,D]
+        start = (picture if source is None else source)[inside].flatten() * self.scale
         prior = self.prior(index, references)
         noise = np.random.default_rng([int(seed or 0), index * self.alone]).standard_normal(picture.shape)
-        x = torch.from_numpy(noise).float()[shows].flatten()
+        x = torch.from_numpy(noise).float()[inside].flatten()
         painted = start
         for step in range(STEPS):
             sigma = 1 - step / STEPS
@@ -94,7 +94,7 @@ class IdealPainter(WholeViews):
             painted = weight * finished + (1 - weight) * start
             x = x + (after - sigma) * (x - painted) / sigma
         image = picture.clone()
-        image[shows] = painted.unflatten(0, (-1, 3)) / self.scale
+        image[inside] = painted.unflatten(0, (-1, 3)) / self.scale
         return image
 
     def prior(self, index: int, references: Sequence[Tensor]) -> Tensor:

@@ -7,7 +7,7 @@ import sys
 
 from .paths import ROOT
 
-_DRAW = """
+_RASTERIZER_KERNELS = """
 import torch
 from progdf.rasterize import ActivatedGaussians, activate, render
 from tests.helpers.scenes import ball, front_camera
@@ -21,7 +21,7 @@ for antialiased in (False, True):
     render(gaussians, camera, grad_rows=torch.arange(5)).image.sum().backward()
 """
 
-_REST = """
+_OTHER_KERNELS = """
 import numpy
 import torch
 from progdf.compose.composer import Composer
@@ -49,7 +49,7 @@ weighed.gradient(weighed.picture(torch.ones(20, 3)))
 alpha_weights(scene, camera, left)
 """
 
-PARTS = (_DRAW, _REST)
+PARTS = (_RASTERIZER_KERNELS, _OTHER_KERNELS)
 
 
 def run_kernels(part: str) -> None:

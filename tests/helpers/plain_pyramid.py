@@ -205,8 +205,8 @@ class PlainCut:
             return []
         loss = math.inf
         wide = 0.0 if self._gaussians.antialiased else self._dilation * z**2 / self._focal2
-        least = (node.weight + wide * node.points) / (largest**2 + wide)  # dense, each dilated
-        if z - 3.0 * largest > near and max(node.opacity, least) >= ALPHA_MIN:
+        dilated_opacity = (node.weight + wide * node.points) / (largest**2 + wide)  # dense, each dilated
+        if z - 3.0 * largest > near and max(node.opacity, dilated_opacity) >= ALPHA_MIN:
             if not self._in_window(node.mean, largest):
                 return []
             area = node.weight * math.sqrt(max(node.opacity, 1.0))

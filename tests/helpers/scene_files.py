@@ -95,8 +95,8 @@ def write_sog1(path: Path, scene: Gaussians) -> Path:
         table = values.double().numpy()
         low = table.min(axis=0)
         high = table.max(axis=0)
-        most = 65535 if name == "means" else 255
-        levels = np.round((table - low) / np.maximum(high - low, 1e-9) * most).astype(np.int64)
+        max_level = 65535 if name == "means" else 255
+        levels = np.round((table - low) / np.maximum(high - low, 1e-9) * max_level).astype(np.int64)
         parts = {"means_l": levels & 255, "means_u": levels >> 8} if name == "means" else {name: levels}
         images |= parts
         files = [f"{part}.webp" for part in parts]

@@ -59,8 +59,8 @@ def opened_document(folder: Path) -> document.Document:
 def saved_session(folder: Path) -> Path:
     """Save the session of `full_view` on the files of `bear_files`, with a snapshot. Return its path."""
     view = full_view()
-    kept = snapshots.take((), replace(view, blend="sum"))
-    session.save(folder / "work.session.json", WindowSession(opened_document(folder), view, kept))
+    saved_snapshots = snapshots.take((), replace(view, blend="sum"))
+    session.save(folder / "work.session.json", WindowSession(opened_document(folder), view, saved_snapshots))
     return folder / "work.session.json"
 
 

@@ -31,19 +31,19 @@ NEVER = 1e6  # seconds between saves
 @pytest.fixture(scope="session")
 def bear_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with a small bear."""
-    made = tmp_path_factory.mktemp("bear")
-    write_bear(made)
-    return made
+    folder = tmp_path_factory.mktemp("bear")
+    write_bear(folder)
+    return folder
 
 
 @pytest.fixture(scope="session")
 def uninterrupted(bear_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the run folder that all others must equal."""
-    made = tmp_path_factory.mktemp("uninterrupted")
+    folder = tmp_path_factory.mktemp("uninterrupted")
     with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(made)
+        patch.chdir(folder)
         train(small_run(bear_folder), quiet=True)
-    return made / OUT
+    return folder / OUT
 
 
 @pytest.fixture
@@ -55,14 +55,14 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="session")
 def interrupted(bear_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a run folder that was interrupted with Ctrl-C in its tenth step."""
-    made = tmp_path_factory.mktemp("interrupted")
+    folder = tmp_path_factory.mktemp("interrupted")
     with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(made)
+        patch.chdir(folder)
         patch.setattr("trainer.store.state.SAVE_EVERY", NEVER)
         at_step(patch, 9, lambda: os.kill(os.getpid(), signal.SIGINT))
         with pytest.raises(KeyboardInterrupt):
             train(small_run(bear_folder), quiet=True)
-    return made / OUT
+    return folder / OUT
 
 
 @pytest.fixture
@@ -100,8 +100,14 @@ def gone_on(bear_folder: Path, uninterrupted: Path, **more: object) -> str:
 
 def _recorded(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Return tensors and header of a trajectory."""
-    made, extra, about = load_trajectory(path)
-    return {**extra, "s": made.s, "offsets": made.offsets, "end": made.end, "steps": made.steps}, about
+    trajectory, extra, header = load_trajectory(path)
+    return {
+        **extra,
+        "s": trajectory.s,
+        "offsets": trajectory.offsets,
+        "end": trajectory.end,
+        "steps": trajectory.steps,
+    }, header
 
 
 def words(bear_folder: Path, *more: str) -> list[str]:
@@ -132,7 +138,7 @@ def saved_step() -> int:
 def killed(bear_folder: Path, where: Path, moments: Sequence[float], **options: object) -> list[str]:
     """Run `python -m tests.helpers.stopped`. Return its lines."""
     arguments = [str(bear_folder), json.dumps(options), ",".join(map(str, moments))]
-    told = subprocess.run(
+    finished = subprocess.run(
         [sys.executable, "-m", "tests.helpers.stopped", *arguments],
         cwd=where,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
@@ -140,5 +146,5 @@ def killed(bear_folder: Path, where: Path, moments: Sequence[float], **options: 
         text=True,
         check=False,
     )
-    assert told.returncode == 0, told.stdout + told.stderr
-    return told.stdout.splitlines()
+    assert finished.returncode == 0, finished.stdout + finished.stderr
+    return finished.stdout.splitlines()

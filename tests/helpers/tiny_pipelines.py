@@ -269,10 +269,10 @@ class _Conversation:
         self._words = words
 
     def apply_chat_template(self, conversations: Any, **_: Any) -> Any:
-        said = [
+        texts = [
             turn["content"][0]["text"] for talk in conversations for turn in talk if turn["role"] == "user"
         ]
-        return self._words(said, padding="max_length", truncation=True, max_length=77, return_tensors="pt")
+        return self._words(texts, padding="max_length", truncation=True, max_length=77, return_tensors="pt")
 
 
 class _ReaderInput:

@@ -204,10 +204,10 @@ def rig(
     engine = ViewEngine(context, stack.scene, stack.gdfs, draw)
     facts = Document("bear.ply", stack.scene, stack.gdfs).facts()
     main_view = MainView(context, engine, facts, view or first_view(stack, 0.5, 0.5), scale, pictures)
-    made = Rig(main_view, points, density)
+    new_rig = Rig(main_view, points, density)
     try:
-        with patch.object(imgui.backends, "opengl3_render_draw_data", made.render):
-            yield made
+        with patch.object(imgui.backends, "opengl3_render_draw_data", new_rig.render):
+            yield new_rig
     finally:
         main_view.close()
         engine.release()

@@ -63,7 +63,7 @@ BEFORE = (
 )
 
 
-def _refuses(real: Any) -> Any:
+def _refusing_replace(real: Any) -> Any:
     """Return an `os.replace` that refuses like that of Windows."""
     listdir, readlink, refused = os.listdir, os.readlink, set()
 
@@ -105,7 +105,7 @@ def bare() -> None:
         where.kill = where.terminate = lambda self: None if self.poll() is not None else kill(self.pid, nine)  # type: ignore[method-assign]
     for name in ("CREATE_NEW_PROCESS_GROUP", "BELOW_NORMAL_PRIORITY_CLASS", "CREATE_NO_WINDOW"):
         setattr(subprocess, name, 0)
-    os.replace = _refuses(os.replace)
+    os.replace = _refusing_replace(os.replace)
     builtins.open = io.open = _without_proc(open)
     for name in MODULES:
         sys.modules[name] = None  # type: ignore[assignment]
@@ -114,11 +114,11 @@ def bare() -> None:
     for name in SIGNALS:
         vars(signal).pop(name, None)
     sys.platform = "win32"
-    with open(Path(os.environ["BARE_FOLDER"]) / "bare.txt", "a", encoding="utf-8") as told:
-        told.write(" ".join(sys.argv) + "\n")
+    with open(Path(os.environ["BARE_FOLDER"]) / "bare.txt", "a", encoding="utf-8") as file:
+        file.write(" ".join(sys.argv) + "\n")
 
 
-class _Before:
+class _ImportHook:
     """Import hook that notices the first import of a ProGDF package."""
 
     def find_spec(self, name: str, path: object = None, target: object = None) -> None:
@@ -128,4 +128,4 @@ class _Before:
 
 
 if "BARE_FOLDER" in os.environ:
-    sys.meta_path.insert(0, _Before())  # type: ignore[arg-type]
+    sys.meta_path.insert(0, _ImportHook())  # type: ignore[arg-type]
