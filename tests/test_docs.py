@@ -121,8 +121,8 @@ def test_every_documented_option_exists() -> None:
         "--regenerate-screenshots",
     }
     known |= mentioned_options("benchmarks") | mentioned_options("benchmarks ablate")
-    told = {o for path in DOCUMENTS for o in re.findall(r"`(--[a-z][a-z-]*)", path.read_text())}
-    assert told <= known
+    documented = {o for path in DOCUMENTS for o in re.findall(r"`(--[a-z][a-z-]*)", path.read_text())}
+    assert documented <= known
 
 
 def test_readme_is_one_page_and_the_sdist_holds_the_documents() -> None:

@@ -28,7 +28,7 @@ def run_bare(folder: Path, what: str) -> str:
         "PYTHONIOENCODING": "ascii",
         "USERNAME": "somebody",  # getpass reads it on Windows
     }
-    told = subprocess.run(
+    finished = subprocess.run(
         [sys.executable, "-m", "tests.helpers.bare_run", what],
         cwd=folder,
         env=environment,
@@ -36,7 +36,7 @@ def run_bare(folder: Path, what: str) -> str:
         text=True,
         timeout=900,
     )
-    assert told.returncode == 0, told.stdout + told.stderr
+    assert finished.returncode == 0, finished.stdout + finished.stderr
     return (folder / "bare.txt").read_text("utf-8")
 
 
@@ -100,8 +100,8 @@ def text_without_encoding(tree: ast.AST) -> Iterator[int]:
         called = node.func
         name = called.attr if isinstance(called, ast.Attribute) else getattr(called, "id", "")
         values = [*node.args, *(word.value for word in node.keywords if word.arg == "mode")]
-        said = [value.value for value in values if isinstance(value, ast.Constant)]
-        modes = [mode for mode in said if isinstance(mode, str) and mode and set(mode) <= set("rwaxbt+")]
+        constants = [value.value for value in values if isinstance(value, ast.Constant)]
+        modes = [mode for mode in constants if isinstance(mode, str) and mode and set(mode) <= set("rwaxbt+")]
         if name == "open":  # the function, or a path's method; not `Image.open(path)` or a window's own
             asks = isinstance(called, ast.Name) or bool(modes) or not (node.args or node.keywords)
         else:
