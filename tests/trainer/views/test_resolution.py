@@ -1,4 +1,4 @@
-"""How many views an edit gets and of how many pixels."""
+"""Number and resolution of the views of an edit."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from trainer.setup import SAMPLING, SIZE, TrainingSetup, make_training_setup, re
 
 
 def setup_of(count: int = 400, bands: int = 3, **said: object) -> TrainingSetup:
-    """The views that the bear gets, if so much is said, of so many SH functions beyond DC."""
+    """Return the setup of a bear with these view options and `bands` SH functions beyond DC."""
     scene = bear(count).gaussians
     scene = replace(scene, shN=torch.zeros(count, bands, 3))
     region = Region("all", torch.arange(count), torch.ones(count))
     return make_training_setup(replace(TrainingViewOptions(), **said), scene, region)  # type: ignore[arg-type]
 
 
-def test_an_edit_of_colors_has_more_views_and_what_was_typed_is_kept() -> None:
+def test_color_edit_gets_more_views_and_given_values_are_kept() -> None:
     assert [len(setup_of(dense=dense).train) for dense in (True, False)] == [34, 24]
     assert [len(setup_of(bands=bands).train) for bands in (0, 8)] == [34, 42]
     assert len(setup_of(views=7).train) == 6
@@ -36,25 +36,23 @@ def test_an_edit_of_colors_has_more_views_and_what_was_typed_is_kept() -> None:
 
 
 @pytest.mark.parametrize(("dense", "sampling"), [(True, SAMPLING), (False, 1.0)])
-def test_an_edit_of_colors_is_meant_for_larger_pictures(dense: bool, sampling: float) -> None:
+def test_color_edit_is_sampled_for_larger_pictures(dense: bool, sampling: float) -> None:
     setup = setup_of(views=5, dense=dense)
     assert {view.camera.sampling for view in setup.views} == {sampling}
 
 
 @pytest.mark.parametrize(("dense", "lowest", "highest"), [(True, 0.0, 89.0), (False, 5.0, 60.0)])
-def test_an_edit_of_colors_is_looked_at_from_level_and_from_above(
-    dense: bool, lowest: float, highest: float
-) -> None:
+def test_color_edit_is_viewed_from_level_to_above(dense: bool, lowest: float, highest: float) -> None:
     setup = setup_of(views=60, dense=dense, up="+y")
     ahead = torch.stack([view.camera.viewmat[2, :3] for view in setup.views])
     rises = -ahead[:, 1].asin().rad2deg()
     assert lowest - 0.1 <= float(rises.min()) <= lowest + 2.0
-    # even in area: of 60 views the highest is at 80°
+    # even in area; the highest of 60 views is at 80°
     assert highest - 10.0 <= float(rises.max()) <= highest + 0.1
 
 
 @pytest.mark.parametrize("editor", ["recolor:#3060d0", "stripes:#20a040"])
-def test_a_picture_is_the_same_whatever_other_views_there_are(tmp_path: Path, editor: str) -> None:
+def test_edited_picture_does_not_depend_on_the_other_views(tmp_path: Path, editor: str) -> None:
     write_bear(tmp_path)
     save_cameras(tmp_path / "cameras.json", [camera.resize(64, 48) for camera in bear(1500).cameras])
     made = []
@@ -68,7 +66,7 @@ def test_a_picture_is_the_same_whatever_other_views_there_are(tmp_path: Path, ed
     assert all(made[0][name] == made[1][name] for name in shared)
 
 
-def test_a_region_is_looked_at_by_cameras_that_show_it(tmp_path: Path) -> None:
+def test_region_is_viewed_by_cameras_that_show_it(tmp_path: Path) -> None:
     demo = bear(1500)
     region = Region("body", demo.members("body"), torch.ones(len(demo.members("body"))))
     away = [replace(c, viewmat=torch.diag(torch.tensor([-1.0, 1, -1, 1])) @ c.viewmat) for c in demo.cameras]
@@ -80,14 +78,14 @@ def test_a_region_is_looked_at_by_cameras_that_show_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("beside", ["", "views", "views/edited"])
-def test_pictures_of_a_run_are_of_its_own_cameras(tmp_path: Path, beside: str) -> None:
+def test_pictures_of_a_run_use_its_own_cameras(tmp_path: Path, beside: str) -> None:
     pictures = tmp_path / "views" / "edited"
     given = tmp_path / "others.json"
     pictures.mkdir(parents=True)
     options = quick_options(tmp_path, editor=f"folder:{pictures}")
     assert resolve(options).views.cameras is None
     path = tmp_path / beside / "cameras.json"
-    path.write_text("[]", encoding="utf-8")  # of some other program
+    path.write_text("[]", encoding="utf-8")  # from another program
     assert resolve(options).views.cameras is None
     save_cameras(path, orbit_rig(bear(400).gaussians, 3, 20, 20))
     assert resolve(options).views.cameras == path
@@ -96,7 +94,7 @@ def test_pictures_of_a_run_are_of_its_own_cameras(tmp_path: Path, beside: str) -
     assert resolve(said).views.cameras == given
 
 
-def test_what_is_painted_view_by_view_a_draft_and_the_papers_way_are_as_they_look() -> None:
+def test_dense_views_are_only_for_solved_color_edits() -> None:
     plans = [
         resolve(quick_options(Path(), views=0, image_size=0, **more))
         for more in ({}, {"quick": True}, {"editor": "style:14"}, {"color_solver": False})
@@ -107,9 +105,7 @@ def test_what_is_painted_view_by_view_a_draft_and_the_papers_way_are_as_they_loo
 @pytest.mark.parametrize(
     ("members", "bands", "every"), [(4000, 0, 1), (1500, 0, 2), (500, 0, 4), (500, 3, 2)]
 )
-def test_fewer_pixels_are_solved_for_where_many_show_each_number(
-    members: int, bands: int, every: int
-) -> None:
+def test_fewer_pixels_are_solved_if_many_show_each_number(members: int, bands: int, every: int) -> None:
     setup = setup_of(members, bands, views=5, image_size=160)
     assert pixel_stride(setup) == every
     shown = sum(int((view.mask > 0.0).sum()) for view in setup.train) / members / (1 if bands == 0 else 3)

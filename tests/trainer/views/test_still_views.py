@@ -1,4 +1,4 @@
-"""Views whose geometry stays: linear maps from colors to the same pictures."""
+"""Views with fixed geometry: linear maps from colors to the same pictures."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tests.trainer.views.test_tiles import COLORS, recolored
 from trainer.views.crops import crop_scene, only_recolors, render_all
 
 
-def test_a_still_view_without_gradients_is_the_picture_of_the_whole_box() -> None:
+def test_still_view_without_gradients_matches_the_whole_box() -> None:
     case = small(count=2)
     rows = recolored(case.scene, case.region.members)
     assert only_recolors(rows - rows)
@@ -27,7 +27,7 @@ def test_a_still_view_without_gradients_is_the_picture_of_the_whole_box() -> Non
         )
 
 
-def test_a_still_view_has_the_original_where_no_member_shows_too() -> None:
+def test_still_view_shows_the_original_where_no_member_is_visible() -> None:
     case = small(count=2)
     for view in case.views:
         box = (0, 0, view.camera.width, view.camera.height)
@@ -41,7 +41,7 @@ def test_a_still_view_has_the_original_where_no_member_shows_too() -> None:
         assert float((unedited - whole.original.clamp(0, 1)).abs().max()) < 2e-6
 
 
-def test_what_moves_is_not_only_recolored() -> None:
+def test_moved_members_are_not_only_recolored() -> None:
     offsets = torch.zeros(4, 5, 14)
     offsets[2, 3, 12] = 0.1
     assert only_recolors(offsets)

@@ -1,4 +1,4 @@
-"""Tiles that an edit cannot change are not drawn again; picture and gradients are the same bits."""
+"""Tiles that an edit cannot change are not redrawn; picture and gradients stay bit-identical."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def recolored(scene: Gaussians, members: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("part", ["scarf", "ears", "head"])
-def test_picture_and_gradients_are_the_bits_of_the_whole_box(part: str) -> None:
+def test_tiles_match_the_whole_box_in_picture_and_gradients(part: str) -> None:
     case = small(part, count=3, image_size=120)
     rows = recolored(case.scene, case.region.members)
     saved = 0
@@ -54,7 +54,7 @@ def test_picture_and_gradients_are_the_bits_of_the_whole_box(part: str) -> None:
     assert saved > 0, "nothing was left out"
 
 
-def test_a_region_that_no_pixel_shows_is_the_original_picture() -> None:
+def test_invisible_region_gives_the_original_picture() -> None:
     scene = random_gaussians(50, seed=4, sh_degree=1)
     scene.means[:3] = torch.tensor([0.0, 0.0, -50.0])
     members = torch.arange(3)
@@ -88,8 +88,8 @@ def test_tiles_end_with_the_box() -> None:
     assert last.nonzero().tolist() == [[40 // TILE_H, 64 // TILE_W]]
 
 
-def test_needles_beyond_the_edge_of_an_off_center_picture_are_not_left_out() -> None:
-    """They lie so that the projection stretches them most, beside the picture, where it is clamped."""
+def test_needles_beyond_the_edge_of_an_off_center_picture_are_kept() -> None:
+    """Place needles beside the picture, where the clamped projection stretches them most."""
     rng = torch.Generator().manual_seed(6)
     camera = front_camera(160, 80, focal=60.0)
     K = torch.tensor([[60.0, 0.0, 30.0], [0.0, 90.0, 65.0], [0.0, 0.0, 1.0]])

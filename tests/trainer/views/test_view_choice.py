@@ -1,4 +1,4 @@
-"""Which cameras an edit is trained from, and which are held out."""
+"""Choice of the cameras for training and the held-out cameras."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from trainer.views.choose import (
 )
 
 
-def test_a_camera_that_looks_away_is_left_out() -> None:
+def test_camera_facing_away_is_left_out() -> None:
     case = small()
     camera = case.views[0].camera
     turned = replace(
@@ -50,7 +50,7 @@ def test_a_camera_that_looks_away_is_left_out() -> None:
         choose_views(case.scene, case.region, [turned], 96, WHITE)
 
 
-def test_fewer_views_than_there_are_cameras_are_spread_around_the_region() -> None:
+def test_chosen_views_are_spread_around_the_region() -> None:
     case = small(count=6)
     chosen = choose_views(case.scene, case.region, [view.camera for view in case.views], 3, WHITE).views
     center = case.scene.means[case.region.members].mean(dim=0)
@@ -70,7 +70,7 @@ def test_held_out_views_are_not_trained_on() -> None:
 
 
 def around(case: Small, azimuths: list[float], name: str = "a", size: int = 64) -> list[Camera]:
-    """Cameras at these azimuths (degrees) around the region, at three heights in turn."""
+    """Return cameras at these azimuths (degrees) around the region, at three heights in turn."""
     center = case.scene.means[case.region.members].mean(dim=0)
     up = torch.tensor([0.0, 1.0, 0.0])
     cameras = []
@@ -92,7 +92,7 @@ def widest_gap(azimuths: list[float]) -> float:
 
 
 def crowded(case: Small) -> list[Camera]:
-    """Someone stood still for forty pictures, then walked around once."""
+    """Return forty cameras at nearly one position, then thirty around the region."""
     return around(case, [0.1 * i for i in range(40)], "still") + around(case, [12.0 * i for i in range(30)])
 
 
@@ -102,7 +102,7 @@ def choice_of(case: Small) -> ViewChoice:
 
 
 @pytest.mark.parametrize("count", [8, 24])
-def test_views_are_taken_from_all_around_and_not_from_the_beginning_of_the_list(count: int) -> None:
+def test_views_are_chosen_from_all_around_not_in_list_order(count: int) -> None:
     case = small("head")
     chosen = choose_views(case.scene, case.region, crowded(case), count, WHITE)
     assert len(chosen.views) == count
@@ -110,7 +110,7 @@ def test_views_are_taken_from_all_around_and_not_from_the_beginning_of_the_list(
     assert f"{70 - count} are redundant" in chosen.line()
 
 
-def test_the_order_of_the_list_does_not_choose_the_views() -> None:
+def test_list_order_does_not_choose_the_views() -> None:
     case = small("head")
     cameras = around(case, [9.0 * i for i in range(40)])
     shuffled = [cameras[i] for i in torch.randperm(40, generator=torch.Generator().manual_seed(1)).tolist()]
@@ -127,7 +127,7 @@ def test_the_order_of_the_list_does_not_choose_the_views() -> None:
     ]
 
 
-def test_held_out_views_stand_on_all_sides_whatever_the_order() -> None:
+def test_held_out_views_are_on_all_sides_for_any_order() -> None:
     case = small("head")
     azimuths = [15.0 * i for i in range(24)]
     order = torch.randperm(24, generator=torch.Generator().manual_seed(2)).tolist()
@@ -138,8 +138,8 @@ def test_held_out_views_stand_on_all_sides_whatever_the_order() -> None:
     assert widest_gap(azimuths_of(case, [view.camera for view in train])) < 50
 
 
-def test_views_from_within_show_every_wall() -> None:
-    """Cameras stand in a box and mostly look at one wall; few views are to show all four."""
+def test_views_from_inside_show_every_wall() -> None:
+    """Place cameras in a box, mostly facing one wall; six views must show all four."""
     side = torch.linspace(-1, 1, 12)
     first, second = (axis.flatten() for axis in torch.meshgrid(side, side, indexing="ij"))
     walls = [torch.stack([first, second, torch.full_like(first, d)], dim=1)[:, order]
@@ -163,14 +163,14 @@ def test_views_from_within_show_every_wall() -> None:
     assert {"v30", "v31", "v32"} <= {view.camera.name for view in chosen.views}
 
 
-def test_a_scene_to_stand_inside_asks_for_its_cameras(tmp_path: Path) -> None:
+def test_indoor_scene_asks_for_its_cameras(tmp_path: Path) -> None:
     demo = room(1500)
     save_ply(tmp_path / "room.ply", demo.gaussians)
     settings = TrainingViewOptions(views=6, image_size=48)
     region = from_mask("rug", torch.isin(torch.arange(1500), demo.members("rug")))
-    with pytest.raises(ProgdfError, match="--cameras") as told:
+    with pytest.raises(ProgdfError, match="--cameras") as caught:
         make_training_setup(settings, demo.gaussians, region)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(caught.value)
     save_cameras(tmp_path / "c.json", [replace(c, lens=Lens(k1=0.1)) for c in demo.cameras])
     setup = make_training_setup(replace(settings, cameras=tmp_path / "c.json"), demo.gaussians, region)
     assert len(setup.train) + len(setup.held_out) == 6
@@ -179,7 +179,7 @@ def test_a_scene_to_stand_inside_asks_for_its_cameras(tmp_path: Path) -> None:
 
 
 def picked(visible: Tensor, held_out: int) -> list[int]:
-    """Which of the views are held out that show so much of some members, all from one side. [V,S]"""
+    """Return the held-out views for this visibility [V,S], with all members seen from one side."""
     views = tuple(replace(small().views[0], box=(i, 0, 64, 64)) for i in range(len(visible)))
     toward = torch.tensor([0.0, 0.0, 1.0]).expand(*visible.shape, 3)
     train, held = split_views(ViewChoice(views, Visibility(visible, toward, 1.0), len(views), 0, 0), held_out)
@@ -189,28 +189,28 @@ def picked(visible: Tensor, held_out: int) -> list[int]:
     return [view.box[0] for view in held]
 
 
-def test_views_that_show_what_the_others_show_are_held_out_one_from_each_side() -> None:
+def test_redundant_views_are_held_out_from_each_side() -> None:
     visible = torch.zeros(6, 4)
     visible[:3, 0] = visible[3:, 2] = 1.0
-    visible[1, :2] = 1.0  # view 1 shows what 0 and 2 show, but they do not show all that it shows
+    visible[1, :2] = 1.0  # view 1 covers views 0 and 2, but they do not cover view 1
     visible[5, 2:] = 1.0
-    visible[0, 2:] = 0.4  # which is nothing new once 5 is held out
+    visible[0, 2:] = 0.4  # adds nothing once view 5 is held out
     visible[5, 0] = 0.1
     assert picked(visible, 1) == [5]
     assert picked(visible, 2) == [1, 5], "in the order of the list"
 
 
-def test_one_half_of_the_held_out_views_chooses_and_the_other_reports_unless_there_is_one() -> None:
+def test_held_out_views_split_into_choosing_and_reporting_halves() -> None:
     assert split_held_out(range(6)) == (range(0, 6, 2), range(1, 6, 2))
     assert split_held_out("a") == ("a", "a")
 
 
-def test_no_more_than_a_third_is_held_out_and_no_view_twice() -> None:
+def test_at_most_a_third_is_held_out_and_no_view_twice() -> None:
     assert picked(torch.ones(6, 3), 5) == [0, 1]
     assert picked(torch.ones(2, 3), 1) == []
 
 
-def test_a_camera_that_shows_the_region_small_is_left_out_and_said_so() -> None:
+def test_camera_that_shows_the_region_small_is_dropped_and_reported() -> None:
     case = small("head")
     near = around(case, [0.0, 90.0, 180.0, 270.0])
     far = replace(near[0], K=near[0].K * torch.tensor([[0.2, 1, 1], [1, 0.2, 1], [1, 1, 1]]), name="far")
@@ -220,7 +220,7 @@ def test_a_camera_that_shows_the_region_small_is_left_out_and_said_so() -> None:
     assert chosen.line() == "5 of 6 cameras; 1 see too little of the region"
 
 
-def test_a_region_behind_a_wall_is_seen_by_those_on_its_side() -> None:
+def test_region_behind_a_wall_is_seen_from_its_side() -> None:
     member = one_gaussian(mean=(0.0, 0.0, 0.0), scales=(0.1, 0.1, 0.1))
     layers = [
         one_gaussian((0.0, 0.0, -0.5 - 0.1 * i), (9.0, 9.0, 0.01), (1, 0, 0, 0), opacity=0.999)
@@ -236,14 +236,14 @@ def test_a_region_behind_a_wall_is_seen_by_those_on_its_side() -> None:
     assert chosen.line() == "2 of 7 cameras; 5 do not see the region"
 
 
-def test_what_reaches_into_the_picture_from_beside_it_is_seen() -> None:
+def test_gaussian_reaching_into_the_picture_is_seen() -> None:
     scene = one_gaussian(mean=(0.9, 0.0, 1.0), scales=(0.3, 0.3, 0.3))
     region = from_mask("all", torch.tensor([True]))
     camera = front_camera(64, 64, focal=50.0)
     assert len(choose_views(scene, region, [camera], 1, WHITE).views) == 1
 
 
-def test_places_are_framed_as_far_as_half_a_picture_beside_it() -> None:
+def test_frame_extends_half_a_picture_beyond_its_edges() -> None:
     camera = replace(orbit_camera(60, 40, azimuth=0.8, elevation=0.5), name="odd")
     depth = torch.tensor(3.0)
     pixels = torch.tensor([[30.0, 20.0], [-29, 20], [-31, 20], [89, 59], [30, 61], [30, 20]])
@@ -253,19 +253,19 @@ def test_places_are_framed_as_far_as_half_a_picture_beside_it() -> None:
     assert in_frame(places, camera).tolist() == [True, True, False, True, False, False]
 
 
-def test_as_many_views_as_are_asked_for_even_where_all_show_the_same() -> None:
+def test_requested_number_of_views_is_chosen_even_if_all_are_alike() -> None:
     case = small("head")
     same = [replace(case.views[0].camera, name=str(i)) for i in range(5)]
     assert len(choose_views(case.scene, case.region, same, 3, WHITE).views) == 3
 
 
-def test_a_wide_view_shows_what_a_narrow_one_does_and_not_the_other_way_round() -> None:
+def test_wide_view_covers_a_narrow_view_but_not_vice_versa() -> None:
     left, right = (one_gaussian(mean=(x, 0.0, 4.0), scales=(0.3, 0.3, 0.3)) for x in (-0.7, 0.7))
     scene = concatenate(left, right)
     wide = front_camera(64, 64, focal=80.0)
     narrow = replace(
         wide, K=wide.K + torch.tensor([[0.0, 0, 40], [0, 0, 0], [0, 0, 0]])
-    )  # the left one alone
+    )  # only the left Gaussian
     region = from_mask("both", torch.ones(2, dtype=torch.bool))
     shown = choose_views(scene, region, [wide, narrow], 2, WHITE).shown
     shares = [
@@ -286,9 +286,11 @@ def test_members_are_sampled_all_over_the_region() -> None:
     assert int(rows.diff().max()) <= 5
 
 
-def test_a_rig_is_as_large_as_the_views_that_are_asked_for_and_larger_where_some_see_nothing() -> None:
-    """Every camera of an even rig: the best of a larger one crowd where the region shows most, and one that
-    is taken out of it leaves a gap."""
+def test_rig_has_the_requested_size_and_grows_if_views_see_nothing() -> None:
+    """Use every camera of an even rig.
+
+    The best cameras of a larger rig crowd where the region is most visible, and a removed one leaves a gap.
+    """
     case = small("head")
     settings = TrainingViewOptions(views=10, image_size=48)
     setup = make_training_setup(settings, case.scene, case.region)
@@ -312,13 +314,13 @@ def test_a_rig_is_as_large_as_the_views_that_are_asked_for_and_larger_where_some
     assert int(offered[1]) > 8, "a larger rig"
 
 
-def test_cameras_tilted_against_the_scene_are_told(tmp_path: Path) -> None:
+def test_tilted_cameras_are_reported(tmp_path: Path) -> None:
     scene = bear(3000).gaussians
-    for up, told in (("y", False), ("x", True)):
+    for up, is_reported in (("y", False), ("x", True)):
         direction = torch.tensor([float(axis == up) for axis in "xyz"])
         save_cameras(tmp_path / "c.json", orbit_rig(scene, 8, 48, 48, up=direction))
         found = load_given_cameras(TrainingViewOptions(tmp_path / "c.json"), scene)
-        assert any("cameras are tilted by 9" in note for note in found.notes) == told
+        assert any("cameras are tilted by 9" in note for note in found.notes) == is_reported
 
 
 def test_dataset_cameras_of_another_frame_are_refused(tmp_path: Path) -> None:
@@ -338,7 +340,7 @@ def test_dataset_cameras_of_another_frame_are_refused(tmp_path: Path) -> None:
     assert "nerfstudio's frame" in load_given_cameras(options, trained).notes[0]
 
 
-def test_dataset_cameras_that_look_straight_down_pass(tmp_path: Path) -> None:
+def test_dataset_cameras_looking_straight_down_pass(tmp_path: Path) -> None:
     scene = room(3000).gaussians
     above = [
         Camera(

@@ -1,4 +1,4 @@
-"""Views: what of their pictures an edit can change, and where the cameras stand."""
+"""Views: the box that an edit can change, masks, names, and camera rigs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from trainer.options import EditorOptions
 from trainer.views.view import fit_size, make_view, name_cameras, region_box, region_rig, seen_colors
 
 
-def test_a_box_grows_to_what_an_edit_changes() -> None:
+def test_box_grows_to_the_edited_pixels() -> None:
     view = small().views[0]
     moved = view.image.clone()
     moved[0, 0] = 1.0 - moved[0, 0]
@@ -36,7 +36,7 @@ def test_a_box_grows_to_what_an_edit_changes() -> None:
     assert view.widen([view.image]).box == view.box
 
 
-def test_the_rig_covers_a_small_region_with_pixels() -> None:
+def test_rig_fills_the_picture_with_a_small_region() -> None:
     case = small("scarf", size=1500)
     for view in case.views:
         x0, y0, x1, y1 = view.box
@@ -45,28 +45,28 @@ def test_the_rig_covers_a_small_region_with_pixels() -> None:
         assert max((x1 - x0) / width, (y1 - y0) / height) > 0.4
 
 
-def test_view_names_are_distinct_and_can_be_file_names() -> None:
+def test_view_names_are_distinct_and_valid_file_names() -> None:
     camera = small().views[0].camera
     names = ["images/a.png", "a.JPG", "", "../..", "b c", "../../e.tif", "C:\\d\\f.png", "/g/CON/h", "0.5/i"]
     found = [c.name for c in name_cameras([replace(camera, name=name) for name in names])]
     assert found == ["images/a", "a", "view_002", "view_003", "b_c", "e", "d/f", "view_007", "0_5/i"]
 
 
-def test_view_names_are_files_of_their_own_on_windows_and_macos() -> None:
+def test_view_names_are_distinct_files_on_windows_and_macos() -> None:
     camera = small().views[0].camera
     names = ["Front", "front", "caf\u00e9", "cafe\u0301", "CON", "nul.x", "a.", "LPT1.png"]
     found = [c.name for c in name_cameras([replace(camera, name=name) for name in names])]
     assert found == ["Front", "view_001", "caf\u00e9", *(f"view_{i:03d}" for i in range(3, 8))]
 
 
-def test_a_name_too_long_for_a_file_is_cut() -> None:
+def test_name_too_long_for_a_file_is_cut() -> None:
     camera = small().views[0].camera
     first, second = (c.name for c in name_cameras([replace(camera, name="\U00020000" * 300)] * 2))
     assert len(f"{first}.png".encode()) < 250
     assert second == "view_001"
 
 
-def test_edited_photographs_are_straightened_before_they_are_targets(tmp_path: Path) -> None:
+def test_edited_photographs_are_undistorted_before_training(tmp_path: Path) -> None:
     case = small()
     lens = Lens(k1=2.5)
     view = replace(case.views[0], camera=replace(case.views[0].camera, lens=lens))
@@ -91,7 +91,7 @@ def test_edited_photographs_are_straightened_before_they_are_targets(tmp_path: P
     assert torch.equal(editor.edit(plain, 1.0), raw)
 
 
-def test_of_photographs_with_their_originals_only_the_change_is_trained(tmp_path: Path) -> None:
+def test_only_the_change_from_the_original_photographs_is_trained(tmp_path: Path) -> None:
     case = small()
     view = case.views[0]
     sharp = (
@@ -121,13 +121,13 @@ def test_of_photographs_with_their_originals_only_the_change_is_trained(tmp_path
 @pytest.mark.parametrize(
     "spec", ["photographs:", "photographs:{0},", "photographs:{0},{0}/no", "photographs:{0}/no"]
 )
-def test_photographs_that_are_not_there_are_refused_in_one_line(tmp_path: Path, spec: str) -> None:
-    with pytest.raises(ProgdfError, match="; ") as told:
+def test_missing_photographs_are_a_one_line_error(tmp_path: Path, spec: str) -> None:
+    with pytest.raises(ProgdfError, match="; ") as caught:
         check_new_editor(EditorOptions(spec.format(tmp_path)))
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(caught.value)
 
 
-def test_an_original_photograph_that_is_missing_is_refused_before_training(tmp_path: Path) -> None:
+def test_missing_original_photograph_is_refused_before_training(tmp_path: Path) -> None:
     case = small(count=3)
     (tmp_path / "before").mkdir()
     for view in case.views:
@@ -141,7 +141,7 @@ def test_an_original_photograph_that_is_missing_is_refused_before_training(tmp_p
         )
 
 
-def test_what_is_put_in_place_of_the_inside_is_mixed_as_the_original_was() -> None:
+def test_blend_mixes_new_colors_like_the_original() -> None:
     view = small().views[0]
     assert float((view.blend(view.inside) - view.image).abs().max()) < 1e-6, "nothing changed"
     green = torch.tensor([0.1, 0.8, 0.2]).expand_as(view.image)
@@ -152,7 +152,7 @@ def test_what_is_put_in_place_of_the_inside_is_mixed_as_the_original_was() -> No
     assert torch.equal(view.blend(green)[view.mask == 0], view.image[view.mask == 0])
 
 
-def test_outside_the_region_an_edit_is_put_back_and_from_a_fifth_on_it_is_taken() -> None:
+def test_confine_restores_the_outside_and_keeps_masks_above_a_fifth() -> None:
     view = replace(small().views[0], mask=torch.tensor([0.0, 0.1, 0.2, 1.0]).repeat_interleave(18)[:, None])
     edited = 1 - view.image
     found = view.confine(edited)
@@ -161,7 +161,7 @@ def test_outside_the_region_an_edit_is_put_back_and_from_a_fifth_on_it_is_taken(
     torch.testing.assert_close(found[36:], edited[36:])
 
 
-def test_a_box_grows_with_a_change_in_one_channel_and_not_with_one_too_small_to_see() -> None:
+def test_box_grows_with_a_single_channel_but_not_with_invisible_change() -> None:
     view = small().views[0]
     faint = view.image.clone()
     blue = view.image.clone()
@@ -171,7 +171,7 @@ def test_a_box_grows_with_a_change_in_one_channel_and_not_with_one_too_small_to_
     assert view.widen([blue]).box[:2] == (0, 0)
 
 
-def test_a_view_shows_the_scene_and_of_the_region_its_own_color() -> None:
+def test_view_shows_the_scene_and_the_color_of_its_region() -> None:
     behind = one_gaussian(mean=(0.1, 0.0, 3.0), scales=(0.3, 0.3, 0.3), rgb=(0.1, 0.2, 0.9))
     scene = concatenate(
         behind, one_gaussian(mean=(-0.1, 0.0, 2.0), scales=(0.2, 0.2, 0.2), rgb=(0.8, 0.3, 0.1))
@@ -196,10 +196,10 @@ def test_a_view_shows_the_scene_and_of_the_region_its_own_color() -> None:
         ((0, 1), (0, 1), (0, 0, 64, 64)),
         ((199, 200), (299, 300), (236, 136, 300, 200)),
         ((0, 200), (0, 300), (0, 0, 300, 200)),
-        ((0, 0), (0, 0), (0, 0, 300, 200)),  # nothing shows it
+        ((0, 0), (0, 0), (0, 0, 300, 200)),  # nothing is visible
     ],
 )
-def test_a_box_has_a_margin_64_pixels_and_stays_in_the_picture(
+def test_box_has_a_margin_and_64_pixels_and_stays_in_the_picture(
     rows: tuple[int, int], columns: tuple[int, int], box: tuple[int, int, int, int]
 ) -> None:
     mask = torch.full((200, 300), 0.02)
@@ -207,11 +207,11 @@ def test_a_box_has_a_margin_64_pixels_and_stays_in_the_picture(
     assert region_box(mask) == box
 
 
-def test_a_picture_smaller_than_64_pixels_is_all_box() -> None:
+def test_picture_below_64_pixels_is_all_box() -> None:
     assert region_box(torch.ones(40, 50)) == (0, 0, 50, 40)
 
 
-def test_the_rig_fills_the_picture_with_the_region_to_a_half_up_to_four_fifths() -> None:
+def test_rig_fills_half_to_four_fifths_of_the_picture() -> None:
     scene = ball(400)
     region = from_mask("piece", (scene.means - torch.tensor([0.3, 0.0, 0.0])).norm(dim=1) < 0.25)
     center, radius = scene_sphere(scene[region.members])
@@ -230,8 +230,6 @@ def test_the_rig_fills_the_picture_with_the_region_to_a_half_up_to_four_fifths()
     ("size", "found"),
     [((400, 100), (64, 16)), ((100, 400), (16, 64)), ((64, 20), (64, 20)), ((20, 9), (20, 9))],
 )
-def test_the_longer_side_is_fitted_and_nothing_is_enlarged(
-    size: tuple[int, int], found: tuple[int, int]
-) -> None:
+def test_longer_side_is_fitted_and_nothing_is_enlarged(size: tuple[int, int], found: tuple[int, int]) -> None:
     camera = fit_size(front_camera(*size), 64)
     assert (camera.width, camera.height) == found
