@@ -1,4 +1,4 @@
-"""A run deletes the pictures that it has written, and no others."""
+"""Cleanup of a run: it deletes only pictures that it has written."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ PICTURE = torch.zeros(2, 2, 3)
 
 
 def written(root: Path) -> RunFolder:
-    """A run of the views a and b."""
+    """Write the pictures of a run with the views a and b; return its folder."""
     folder = RunFolder(root)
     for kind, strength in (("original", 1.0), ("edited", 1.0), ("edited", 0.25)):
         write_views(folder, kind, {"a": PICTURE, "b": PICTURE}, strength)
@@ -26,7 +26,7 @@ def files(folder: Path) -> set[str]:
     return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
 
 
-def test_pictures_of_views_that_are_no_more_go(tmp_path: Path) -> None:
+def test_pictures_of_dropped_views_are_deleted(tmp_path: Path) -> None:
     folder = written(tmp_path)
     remove_stale_views(folder, ["b"])
     expected = {"original/b.png", "edited/b.png", "edited/0.25/b.png", "painted/b.png", "painted/b.json"}
@@ -35,7 +35,7 @@ def test_pictures_of_views_that_are_no_more_go(tmp_path: Path) -> None:
     assert files(folder.views) == {"pictures.txt", "painted/pictures.txt"}
 
 
-def test_pictures_in_subfolders_stay_while_their_view_does(tmp_path: Path) -> None:
+def test_pictures_in_subfolders_stay_with_their_view(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
     for strength in (0.25, 1.0):
         write_views(folder, "edited", {"cam0/1": PICTURE, "cam1/1": PICTURE}, strength)
@@ -45,7 +45,7 @@ def test_pictures_in_subfolders_stay_while_their_view_does(tmp_path: Path) -> No
     assert files(folder.views) == {*kept, "pictures.txt"}
 
 
-def test_pictures_of_ones_own_stay_whatever_they_are_called(tmp_path: Path) -> None:
+def test_user_pictures_stay_under_any_name(tmp_path: Path) -> None:
     folder = written(tmp_path)
     own = {"edited/mine.png", "edited/mine.json", "edited/variants/a.png", "favorites/a.png"}
     for name in own:
@@ -66,7 +66,7 @@ def test_nothing_behind_a_link_is_deleted(tmp_path: Path) -> None:
     assert files(photographs) == {"a.png", "b.png"}
 
 
-def test_without_a_list_nothing_is_deleted(tmp_path: Path) -> None:
+def test_nothing_is_deleted_without_a_list(tmp_path: Path) -> None:
     folder = written(tmp_path)
     (folder.views / "pictures.txt").write_bytes(b"\xff\xfe")
     before = files(folder.views / "edited")

@@ -1,4 +1,4 @@
-"""How far a run is, as programs read it that wait for the run."""
+"""Progress of a run, as programs that wait for it read it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_every_long_stage_of_the_trainer_has_its_label() -> None:
     assert set(LATER) <= set(STAGES)
 
 
-def test_the_progress_file_says_how_far_the_whole_run_is(
+def test_progress_file_reports_the_share_of_the_whole_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = 0.0
@@ -40,13 +40,13 @@ def test_the_progress_file_says_how_far_the_whole_run_is(
         ("even the slider", 0.0, 0, "strengths"),
     ):
         with log.steps(stage, 10) as advance:
-            # each is written
+            # writes every update
             log._written = -1.0
             now = now + seconds
             advance(done, word)
         found.append(json.loads((tmp_path / "progress.json").read_text("utf-8")))
     log.close()
-    # 10 s of 100; then, at the pace of all but the editor's work, 40 of 40 + 7.5 · 4 and 60 of 60 + 10 · 3
+    # 10 s of 100; then, at the pace without editing, 40 of 40 + 7.5 · 4 and 60 of 60 + 10 · 3
     assert [(line["label"], round(line["share"], 2), line["loss"]) for line in found] == [
         ("Editing views", 0.1, ""),
         ("Training", 0.57, "0.0123"),
@@ -60,15 +60,15 @@ WORK = {"views": 3.0, "edit": 4.0, "optimize": 10.0, "measure the edit": 5.0}
 
 @pytest.mark.parametrize("pace", [0.2, 50.0])
 @pytest.mark.parametrize("long", ["views", "edit", "optimize", "measure the edit"])
-def test_a_run_is_told_from_its_first_tenth_on_within_a_factor_of_two(
+def test_remaining_time_is_within_a_factor_of_two(
     long: str, pace: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = 0.0
     monkeypatch.setattr("trainer.store.progress.time.perf_counter", lambda: now)
     log = RunLog(tmp_path / "log.txt", quiet=True)
     log.expect(WORK)
-    now = 100.0  # before the first stage, whatever that took
-    # on a machine of any speed, and one stage takes 1.6 times as long as it usually does
+    now = 100.0  # time before the first stage does not count
+    # a machine of any speed; one stage takes 1.6 times its usual time
     takes = {stage: pace * work * (1.6 if stage == long else 1.0) for stage, work in WORK.items()}
     end = now + sum(takes.values())
     worst = 1.0
