@@ -1,4 +1,4 @@
-"""Paint that is finer than the Gaussians, on a wall made here: a plane of large, soft, thick Gaussians."""
+"""Paint finer than the Gaussians, on a wall of large, soft, thick Gaussians."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from trainer.views.view import BACKGROUND
 
 
 def put(folder: Path, image: np.ndarray) -> EditorOptions:
-    """A decal of this RGBA picture in the middle of the wall."""
+    """Return options for a decal of this RGBA picture in the middle of the wall."""
     Image.fromarray(image).save(folder / "logo.png")
     save_cameras(folder / "camera.json", [CAMERA])
     return EditorOptions(f"decal:{folder / 'logo.png'}", at="64,64,40", camera=folder / "camera.json")
@@ -41,18 +41,18 @@ def make(options: EditorOptions, scene: Gaussians) -> DecalEditor:
     return decal(EditorInput(options.editor.partition(":")[2], scene, whole_scene(scene), (), options))
 
 
-def test_letters_finer_than_the_gaussians_are_as_sharp_as_they_were_painted() -> None:
+def test_letters_finer_than_the_gaussians_are_as_sharp_as_painted() -> None:
     scene = wall()
     paint = letters(scene)
     gdf, _ = edit_of(scene, paint)
-    made = picture(compose_layers(scene, [Layer(gdf, 1.0)]))
-    assert psnr(made, paint.picture, paint.mask) > 34.0
+    edited = picture(compose_layers(scene, [Layer(gdf, 1.0)]))
+    assert psnr(edited, paint.picture, paint.mask) > 34.0
     near = torch.zeros_like(paint.mask)
     near[36:92, 34:92] = True
-    assert psnr(made, paint.picture, near & ~paint.mask) > 34.0
+    assert psnr(edited, paint.picture, near & ~paint.mask) > 34.0
 
 
-def test_strength_zero_is_the_original_bit_for_bit_and_nothing_outside_the_region_changes() -> None:
+def test_strength_zero_and_rows_outside_the_region_are_bit_identical() -> None:
     scene = wall()
     gdf, laid = edit_of(scene, letters(scene))
     start = compose_layers(scene, [Layer(gdf, 0.0)])
@@ -64,7 +64,7 @@ def test_strength_zero_is_the_original_bit_for_bit_and_nothing_outside_the_regio
     assert bits(finished) == bits(edited_scene(scene, gdf))
 
 
-def test_what_shows_of_paint_is_linear_along_the_slider() -> None:
+def test_visible_paint_is_linear_along_the_slider() -> None:
     scene = wall()
     paint = letters(scene)
     gdf, _ = edit_of(scene, paint)
@@ -76,23 +76,23 @@ def test_what_shows_of_paint_is_linear_along_the_slider() -> None:
         assert float(share) == pytest.approx(s, abs=0.05)
 
 
-def test_what_moves_back_keeps_its_outline_in_the_painted_view() -> None:
+def test_gaussians_moved_back_keep_their_outline_in_the_view() -> None:
     scene = wall()
     discs = place_discs(scene, letters(scene), 0.02, 4.0)
     assert len(discs.moved) > 0
     row = discs.moved[:1]
     before, after = (render(some[row], CAMERA, (0.0, 0.0, 0.0)).image for some in (scene, discs.scene))
-    assert float((before - after).abs().max()) < 1e-4  # float32 of both
+    assert float((before - after).abs().max()) < 1e-4  # float32 rounding of both
 
 
-def test_what_stood_hidden_behind_others_does_not_cover_the_paint(tmp_path: Path) -> None:
+def test_hidden_gaussians_do_not_cover_the_paint(tmp_path: Path) -> None:
     scene = wall(count=20_000, size=0.035, rough=0.01)
     logo = np.full((32, 32, 4), (200, 30, 40, 255), np.uint8)
     discs = place_discs(scene, make(put(tmp_path, logo), scene).paint, 0.03, 4.0)
     assert float(discs.scene.means[discs.moved, 2].min()) > float(discs.added.means[:, 2].max())
 
 
-def test_an_untouched_picture_and_paint_beyond_the_silhouette_add_nothing() -> None:
+def test_unpainted_picture_and_paint_off_the_surface_add_nothing() -> None:
     scene = wall()
     nothing = torch.zeros(SIDE, SIDE, dtype=torch.bool)
     assert not len(place_discs(scene, paint_on(scene, nothing), 0.02, 4.0).added)
@@ -125,7 +125,7 @@ def test_every_pixel_is_in_one_rectangle_and_flat_paint_needs_few(seed: int) -> 
     assert len(merge_pixels(noise, mask, 0.02, mask)) == mask.sum()
 
 
-def test_paint_is_not_seen_through_a_thin_thing_from_behind() -> None:
+def test_paint_does_not_show_through_a_thin_wall() -> None:
     scene = replace(wall(), means=wall().means * torch.tensor([1.0, 1.0, 0.3]))
     paint = letters(scene)
     gdf, _ = edit_of(scene, paint)
@@ -135,10 +135,10 @@ def test_paint_is_not_seen_through_a_thin_thing_from_behind() -> None:
     )
     shown = torch.zeros(SIDE, SIDE, dtype=torch.bool)
     shown[50:78, 45:80] = True
-    assert psnr(after, before, shown) > 24.0  # the bars themselves are 12 dB away from the wall
+    assert psnr(after, before, shown) > 24.0  # the bars differ from the wall by 12 dB
 
 
-def test_a_decal_lies_on_the_surface_from_the_sides_too(tmp_path: Path) -> None:
+def test_decal_lies_on_the_surface_from_the_sides_too(tmp_path: Path) -> None:
     scene = wall(count=20_000, size=0.035, rough=0.01)
     logo = np.zeros((32, 32, 4), np.uint8)
     logo[:, :, :] = (200, 30, 40, 255)
@@ -150,7 +150,7 @@ def test_a_decal_lies_on_the_surface_from_the_sides_too(tmp_path: Path) -> None:
     assert bits(load_gdf(tmp_path / "logo.gdf", scene).added) == bits(painted.gdf.added)
 
 
-def test_transparency_leaves_the_scene_as_it_is(tmp_path: Path) -> None:
+def test_transparent_pixels_leave_the_scene_unchanged(tmp_path: Path) -> None:
     scene = wall()
     logo = np.full((30, 30, 4), 255, np.uint8)
     logo[:, 15:, 3] = 0
@@ -162,7 +162,7 @@ def test_transparency_leaves_the_scene_as_it_is(tmp_path: Path) -> None:
         make(put(tmp_path, logo), scene)
 
 
-def test_an_angle_turns_a_decal_counterclockwise(tmp_path: Path) -> None:
+def test_angle_turns_a_decal_counterclockwise(tmp_path: Path) -> None:
     scene = wall()
     logo = np.full((20, 40, 4), (0, 0, 0, 255), np.uint8)
     logo[:, 20:] = (255, 0, 0, 255)
@@ -172,7 +172,7 @@ def test_an_angle_turns_a_decal_counterclockwise(tmp_path: Path) -> None:
     assert float(red[68:].sum()) < 1.0
 
 
-def test_a_place_is_in_pixels_or_in_shares() -> None:
+def test_decal_position_is_in_pixels_or_in_shares() -> None:
     wide = replace(CAMERA, width=2 * SIDE)
     assert parse_place("64,32,40", wide) == parse_place("0.25,0.25,0.15625", wide)
 
@@ -193,13 +193,13 @@ def test_a_place_is_in_pixels_or_in_shares() -> None:
         "inf,0,1",
     ],
 )
-def test_a_place_that_is_none_is_one_line(at: str) -> None:
-    with pytest.raises(ProgdfError, match="--at") as raised:
+def test_invalid_decal_position_is_a_one_line_error(at: str) -> None:
+    with pytest.raises(ProgdfError, match="--at") as caught:
         parse_place(at, CAMERA)
-    assert "\n" not in str(raised.value)
+    assert "\n" not in str(caught.value)
 
 
-def test_a_decal_that_is_no_picture_or_has_no_camera_is_one_line(tmp_path: Path) -> None:
+def test_decal_without_picture_or_camera_is_a_one_line_error(tmp_path: Path) -> None:
     from trainer.editors import check_new_editor
 
     good = put(tmp_path, np.full((8, 8, 4), 255, np.uint8))
@@ -214,12 +214,12 @@ def test_a_decal_that_is_no_picture_or_has_no_camera_is_one_line(tmp_path: Path)
     )
     check_new_editor(good)
     for options in bad:
-        with pytest.raises(ProgdfError) as raised:
+        with pytest.raises(ProgdfError) as caught:
             check_new_editor(options)
-        assert "\n" not in str(raised.value)
+        assert "\n" not in str(caught.value)
 
 
-def test_no_disc_lies_between_two_depths_and_what_stands_in_front_stays() -> None:
+def test_discs_avoid_depth_gaps_and_objects_in_front_stay() -> None:
     back, near = (wall(seed, count=20_000, size=0.035, rough=0.01) for seed in (0, 1))
     near = replace(near, means=near.means - torch.tensor([0, 0, 0.6]))
     near = near[(near.means[:, 0] > 0.0).nonzero()[:, 0]]
