@@ -1,4 +1,4 @@
-"""A whole run towards an edit that bends: the log says so, and the finished edit is met."""
+"""Full run towards a bending edit: the log reports the bend, and the result matches the edit."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.helpers.trained import quick_options, train
 
 
 @pytest.mark.slow
-def test_a_bent_body_is_met_by_control_points(tmp_path: Path) -> None:
+def test_bent_body_is_reproduced_by_control_points(tmp_path: Path) -> None:
     demo = bear(1500)
     edit = column_warps(demo.gaussians.means[demo.members("body")], demo.up)["stretch and bend"]
     truth = Truth(demo.gaussians, demo.labels.numpy(), (demo.label_names.index("body"),), edit)

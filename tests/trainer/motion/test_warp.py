@@ -1,4 +1,4 @@
-"""Warps: control points bend a region as the views show it, and nothing else moves."""
+"""Warps: control points bend a region to match the views, and nothing else moves."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def body() -> Small:
 
 
 def held(count: int = 12) -> tuple[Tensor, ControlPoints]:
-    """Packed rows of a bear's arms, and control points of both."""
+    """Return packed rows of a bear's arms, and their control points."""
     case = small("arms")
     rows = pack(case.scene[case.region.members], with_shN=True)
     return rows, make_control_points(rows[:, MEANS], connected_parts(rows[:, MEANS]), count)
@@ -57,7 +57,7 @@ def some_motion(control: ControlPoints, seed: int = 0, size: float = 0.3) -> War
 
 
 def bent(case: Small, degrees: float = 30.0, factor: float = 1.3) -> AnalyticEdit:
-    """The body stretched and bent from its feet, which no similarity explains."""
+    """Return an edit that stretches and bends the body from its feet, which is no similarity."""
     means = case.scene.means[case.region.members]
     base = means.mean(dim=0) * (1 - UP) + means.amin(dim=0) * UP
     length = float(means[:, 1].max() - means[:, 1].min())
@@ -68,7 +68,7 @@ def bent(case: Small, degrees: float = 30.0, factor: float = 1.3) -> AnalyticEdi
 def pictured(
     case: Small, edit: AnalyticEdit, strengths: tuple[float, ...]
 ) -> tuple[Tensor, list[CropScene], list[list[Tensor]], list[Tensor]]:
-    """Members' rows, the views with boxes that hold the edit, the edited boxes, the true rows by strength."""
+    """Return members' rows, views with boxes around the edit, edited boxes, and true rows by strength."""
     truths = [edit.apply(case.scene, case.region.members, s) for s in strengths]
     with torch.no_grad():
         whole = [[render(t, v.camera, WHITE).image.clamp(0, 1) for v in case.views] for t in truths]
@@ -79,7 +79,7 @@ def pictured(
     return rows, crops, boxes, ends
 
 
-def test_control_points_are_shared_by_parts_and_followed_within_them() -> None:
+def test_control_points_are_split_by_part_and_followed_within_it() -> None:
     rows, control = held(12)
     part = connected_parts(rows[:, MEANS])
     assert set(control.part.tolist()) == {0, 1}
@@ -90,7 +90,7 @@ def test_control_points_are_shared_by_parts_and_followed_within_them() -> None:
     assert bool((control.part[control.links[:, 0]] == control.part[control.links[:, 1]]).all())
 
 
-def test_farthest_points_lie_apart_and_differ() -> None:
+def test_farthest_points_are_distinct_and_far_apart() -> None:
     points = torch.rand(300, 3, generator=torch.Generator().manual_seed(0))
     chosen = farthest_points(points, 20)
     assert len(set(chosen.tolist())) == 20
@@ -107,12 +107,12 @@ def test_few_members_have_a_control_point_each(count: int) -> None:
     assert torch.allclose(control.weights.sum(dim=1), torch.ones(count))
 
 
-def test_at_rest_nothing_moves() -> None:
+def test_rest_warp_moves_nothing() -> None:
     rows, control = held()
     assert torch.allclose(warp_rows(rows, control, rest_warp(control)), rows, atol=1e-5)
 
 
-def test_offsets_carried_along_can_be_carried_back() -> None:
+def test_carried_offsets_can_be_carried_back() -> None:
     rows, control = held()
     maps = map_members(rows, control, some_motion(control))
     offsets = 0.1 * torch.randn(rows.shape, generator=torch.Generator().manual_seed(1))
@@ -121,7 +121,7 @@ def test_offsets_carried_along_can_be_carried_back() -> None:
     assert torch.equal(there[:, 10:14], offsets[:, 10:14])
 
 
-def test_control_points_that_do_what_their_part_does_move_it_as_a_whole() -> None:
+def test_uniform_control_points_move_a_part_as_a_whole() -> None:
     rows, control = held()
     parts = make_parts(rows, connected_parts(rows[:, MEANS]))
     motion = Motion(
@@ -138,7 +138,7 @@ def test_control_points_that_do_what_their_part_does_move_it_as_a_whole() -> Non
     assert float(disagreement(control, warp)) < 1e-8
 
 
-def test_a_motion_held_at_more_points_stays_what_it_was() -> None:
+def test_motion_is_unchanged_on_more_control_points() -> None:
     rows, control = held(12)
     finer = held(40)[1]
     parts = make_parts(rows, connected_parts(rows[:, MEANS]))
@@ -150,7 +150,7 @@ def test_a_motion_held_at_more_points_stays_what_it_was() -> None:
     assert torch.allclose(there[:, :6], warp_rows(rows, control, whole)[:, :6], atol=1e-3)
 
 
-def test_the_way_between_motions_begins_and_ends_at_them_and_turns_along_the_great_circle() -> None:
+def test_interpolated_motion_meets_its_ends_and_turns_evenly() -> None:
     _, control = held()
     a = some_motion(control, 1)
     b = some_motion(control, 2)
@@ -162,7 +162,7 @@ def test_the_way_between_motions_begins_and_ends_at_them_and_turns_along_the_gre
     assert torch.allclose(half.turn, extrapolate_warp(b, 0.5).turn, atol=1e-5)
 
 
-def test_a_gaussian_in_a_stretched_place_grows_along_it() -> None:
+def test_gaussian_grows_along_a_stretch() -> None:
     rows, control = held()
     rows[:, attribute_slices(14)["quats"]] = torch.tensor([1.0, 0.0, 0.0, 0.0])
     motion = rest_warp(control)
@@ -172,7 +172,7 @@ def test_a_gaussian_in_a_stretched_place_grows_along_it() -> None:
 
 
 @pytest.mark.slow
-def test_a_known_bend_is_recovered_where_parts_as_wholes_cannot() -> None:
+def test_known_bend_is_recovered_better_than_by_whole_parts() -> None:
     case = body()
     rows, crops, boxes, ends = pictured(case, bent(case), (0.5, 1.0))
     groups = group_stage(rows, crops, boxes, steps=60)
@@ -187,7 +187,7 @@ def test_a_known_bend_is_recovered_where_parts_as_wholes_cannot() -> None:
         assert float(missed) < 0.5 * float(stiff)
 
 
-def test_a_warp_is_the_same_again_and_comes_back_from_the_saved_state() -> None:
+def test_warp_is_deterministic_and_restored_from_saved_state() -> None:
     case = body()
     rows, crops, boxes, _ = pictured(case, bent(case), (1.0,))
     first, again = (group_stage(rows, crops, boxes, steps=16, seed=3) for _ in range(2))
@@ -199,7 +199,7 @@ def test_a_warp_is_the_same_again_and_comes_back_from_the_saved_state() -> None:
     assert torch.equal(back.warps[0].carry(rows, offsets), first.warps[0].carry(rows, offsets))
 
 
-def test_the_ways_ends_are_exact_and_between_them_a_bend_is_a_lesser_bend() -> None:
+def test_path_of_a_bend_has_exact_ends_and_a_half_bend_between() -> None:
     case = body()
     rows, crops, boxes, _ = pictured(case, bent(case), (1.0,))
     groups = group_stage(rows, crops, boxes, steps=60)
