@@ -1,4 +1,4 @@
-"""`progdf evaluate` on a finished run: its table, its files, what it says where something is missing."""
+"""`progdf evaluate` on a finished run: its table, its files and its errors for missing data."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.helpers.trained import quick_options, train, write_bear
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run of a small bear."""
+    """Train a small bear; return the run folder."""
     folder = tmp_path_factory.mktemp("evaluate")
     write_bear(folder)
     train(quick_options(folder, steps=40, stages=2, views=12, image_size=56, threads=1), quiet=True)
@@ -27,7 +27,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def printed(run: Path) -> str:
-    """What the command prints that measures the run."""
+    """Return the output of `progdf evaluate` for the run."""
     with redirect_stdout(StringIO()) as out:
         assert main(["evaluate", str(run), "--threads", "1"]) == 0
     return out.getvalue()
@@ -35,12 +35,12 @@ def printed(run: Path) -> str:
 
 @pytest.fixture(scope="module")
 def rows(run: Path, printed: str) -> dict[str, Any]:
-    """evaluation.json's rows."""
+    """Return the rows of evaluation.json."""
     found: dict[str, Any] = json.loads((run / "evaluation.json").read_text())["rows"]
     return found
 
 
-def test_figures_that_the_report_has_too_are_the_reports(run: Path, rows: dict[str, Any]) -> None:
+def test_figures_agree_with_the_report(run: Path, rows: dict[str, Any]) -> None:
     report = json.loads((run / "report.json").read_text())
     edit = report["edit"]
     slider = report["slider"]
@@ -54,22 +54,22 @@ def test_figures_that_the_report_has_too_are_the_reports(run: Path, rows: dict[s
     assert rows["seconds"]["slider"] == pytest.approx(report["time"]["total"], abs=0.01)
 
 
-def test_all_that_is_compared_ends_at_the_same_picture(rows: dict[str, Any]) -> None:
+def test_compared_edits_end_at_the_same_picture(rows: dict[str, Any]) -> None:
     for measure in ("psnr_end", "ssim_end", "lpips_end"):
         assert len(set(rows[measure].values())) == 1
         assert set(rows[measure]) == {"slider", "2 keyframes", "cross-fade"}
 
 
-def test_a_cross_fade_is_even_and_the_path_of_no_slider_is_shorter_than_straight(
+def test_cross_fade_is_even_and_no_path_is_shorter_than_straight(
     rows: dict[str, Any],
 ) -> None:
     assert rows["evenness"]["cross-fade"] == pytest.approx(1.0, abs=1e-3)
     assert rows["monotone"]["cross-fade"] == 1.0
-    # LPIPS has weights; its stand-in is an L1, of which roots add up to more
+    # LPIPS needs weights; the L1 in its place has square roots that add up to more
     assert all(value >= 1.0 for value in rows["triangle_excess"].values())
 
 
-def test_views_are_compared_with_the_unedited_scene_and_what_lies_outside_hardly_changes(
+def test_warped_views_are_compared_and_the_outside_hardly_changes(
     rows: dict[str, Any],
 ) -> None:
     assert set(rows["warped_lpips"]) == {"slider", "the editor", "unedited"}
@@ -77,14 +77,14 @@ def test_views_are_compared_with_the_unedited_scene_and_what_lies_outside_hardly
     assert rows["outside"]["slider"] < 1.0
 
 
-def test_the_table_is_printed_and_the_picture_written(run: Path, printed: str, rows: dict[str, Any]) -> None:
+def test_table_is_printed_and_picture_is_written(run: Path, printed: str, rows: dict[str, Any]) -> None:
     assert "| slider | 2 keyframes | cross-fade | the editor | unedited |" in printed
     assert "CLIP direction similarity at 1: not measured, --text-before is missing" in printed
     assert (run / "evaluation.png").stat().st_size > 10_000
     assert "missing" in rows["clip_direction"]
 
 
-def test_clip_is_asked_where_its_weights_are_there(
+def test_clip_rows_are_measured_if_weights_are_installed(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("transformers")
@@ -109,7 +109,7 @@ def test_clip_is_asked_where_its_weights_are_there(
         (["{tmp}", "--threads", "-1"], "--threads must be between 0 and 1024"),
     ],
 )
-def test_what_cannot_be_measured_is_one_line(
+def test_invalid_evaluate_command_is_a_one_line_error(
     arguments: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["evaluate", *(argument.format(tmp=tmp_path) for argument in arguments)]) == 2
@@ -119,7 +119,7 @@ def test_what_cannot_be_measured_is_one_line(
 
 
 @pytest.mark.parametrize("file", ["report.json", "run.gdf", "views/edited/"])
-def test_a_run_of_which_a_file_is_gone_is_one_line(
+def test_run_with_a_missing_file_is_a_one_line_error(
     file: str, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     copy = tmp_path / "run"

@@ -1,4 +1,4 @@
-"""A slider in equal steps, and a camera path: what the figures say of ways that are known."""
+"""Figures of slider paths with known answers, and camera paths for measuring consistency."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from trainer.fit.evaluate import Evaluator
 
 
 class _Squared:
-    """As LPIPS, a squared distance; of pictures of one color."""
+    """Squared distance, like LPIPS, for pictures of one color."""
 
     name = "squared"
 
@@ -24,11 +24,11 @@ class _Squared:
         return (image - target).square().mean()
 
     def forget(self) -> None:
-        """Nothing is kept."""
+        """Do nothing, because there is no cache."""
 
 
 def _walked(course: list[float]) -> SliderPath:
-    """The path of a slider that shows these values of gray, linear in between."""
+    """Return the path of a slider that shows these gray values, interpolated linearly."""
     pixels = [torch.ones(4, 4, dtype=torch.bool)]
     evaluator = Evaluator(torch.zeros(0, 14), [], pixels, {}, ["a"])
 
@@ -40,7 +40,7 @@ def _walked(course: list[float]) -> SliderPath:
     return slider_path(evaluator, pictures, _Squared())
 
 
-def test_a_straight_slider_is_even_monotone_and_has_no_triangle_excess() -> None:
+def test_straight_slider_is_even_monotone_without_triangle_excess() -> None:
     path = _walked([0.0, 1.0])
     assert path.evenness == pytest.approx(1.0, abs=1e-4)
     assert path.monotone == 1.0
@@ -49,20 +49,20 @@ def test_a_straight_slider_is_even_monotone_and_has_no_triangle_excess() -> None
     assert path.mean == pytest.approx(path.largest, rel=1e-3)
 
 
-def test_a_slider_that_overshoots_and_comes_back_goes_further_than_it_has_to() -> None:
+def test_overshooting_slider_has_a_longer_path() -> None:
     path = _walked([0.0, 1.0, 0.5])
     assert path.monotone == pytest.approx(0.5)
     assert path.triangle_excess == pytest.approx((1.0 + 0.5) / 0.5, rel=1e-3)
     assert path.evenness == pytest.approx(0.5, rel=1e-3)
 
 
-def test_a_slider_that_does_nothing_has_no_excess_to_tell() -> None:
+def test_slider_without_effect_has_no_triangle_excess() -> None:
     path = _walked([0.3, 0.3])
     assert math.isnan(path.triangle_excess)
     assert path.monotone == 0.0
 
 
-def test_the_path_passes_through_every_camera_and_turns_evenly_between() -> None:
+def test_camera_path_passes_every_camera_and_turns_evenly() -> None:
     cameras = [orbit_camera(azimuth=a) for a in (0.0, 1.8, 0.9, 2.7)]
     path = camera_path(cameras)
     assert len(path) == 3 * FRAMES + 1
@@ -71,12 +71,12 @@ def test_the_path_passes_through_every_camera_and_turns_evenly_between() -> None
     for frame in path:
         turn = frame.viewmat[:3, :3]
         torch.testing.assert_close(turn @ turn.T, torch.eye(3), rtol=0, atol=1e-5)
-        middle = frame.viewmat[:3, 3]  # where the frame sees the orbit's center: straight ahead to 3 %
+        middle = frame.viewmat[:3, 3]  # orbit center in camera coordinates, straight ahead within 3 %
         assert float(middle[:2].abs().max()) < 0.03 * 4.0
         assert 3.5 < float(middle[2]) < 4.01
 
 
-def test_changes_that_are_alike_from_frame_to_frame_are_consistent() -> None:
+def test_equal_changes_between_frames_are_consistent() -> None:
     before = torch.nn.functional.normalize(
         torch.randn(5, 8, generator=torch.Generator().manual_seed(0)), dim=1
     )

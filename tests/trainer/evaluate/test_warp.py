@@ -1,4 +1,4 @@
-"""One view warped onto another by depth: what both see looks the same, what only one sees does not count."""
+"""Warp of one view onto another by depth: shared surfaces match, all other pixels are excluded."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def _picture(scene: Gaussians, camera: Camera) -> Tensor:
 
 
 def _wall(depth: float, half: float, count: int = 60, seed: int = 0) -> Gaussians:
-    """A square of opaque Gaussians across the view, in soft random colors."""
+    """Return a square of opaque Gaussians across the view, in smooth random colors."""
     side = torch.linspace(-half, half, count)
     x, y = torch.meshgrid(side, side, indexing="xy")
     coarse = torch.rand(1, 3, 7, 7, generator=torch.Generator().manual_seed(seed))
@@ -46,7 +46,7 @@ def _from(x: float, y: float = 0.0) -> Camera:
     return replace(camera, viewmat=viewmat)
 
 
-def test_a_view_warped_onto_itself_is_itself() -> None:
+def test_view_warped_onto_itself_is_unchanged() -> None:
     scene = _wall(4.0, 5.0)
     camera = _from(0.3)
     image = _picture(scene, camera)
@@ -57,7 +57,7 @@ def test_a_view_warped_onto_itself_is_itself() -> None:
 
 
 def _painted_wall(camera: Camera, depth: float = 4.0) -> tuple[Tensor, SeenDepth]:
-    """A smooth pattern on a plane across the axis of the first camera, and its depth, both by formula."""
+    """Return a smooth pattern on a plane across the z axis, and its depth, both analytic."""
     rows, columns = torch.meshgrid(
         torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij"
     )
@@ -73,7 +73,7 @@ def _painted_wall(camera: Camera, depth: float = 4.0) -> tuple[Tensor, SeenDepth
     return image, SeenDepth(camera, Depth(z, torch.ones_like(z)))
 
 
-def test_a_plane_warps_exactly_but_for_the_sampling() -> None:
+def test_plane_warps_exactly_up_to_resampling() -> None:
     (image, here), (other, there) = _painted_wall(_from(0.0)), _painted_wall(_from(1.2, 0.4))
     warped, both = warp_view(other, there, here)
     assert float(both.float().mean()) > 0.7
@@ -81,7 +81,7 @@ def test_a_plane_warps_exactly_but_for_the_sampling() -> None:
     assert psnr(other, image, both) < 20
 
 
-def test_a_wall_seen_from_elsewhere_warps_onto_what_is_seen_here() -> None:
+def test_wall_warps_between_two_views() -> None:
     scene = _wall(4.0, 5.0)
     here = _from(0.0)
     there = _from(1.2, 0.4)
@@ -89,12 +89,12 @@ def test_a_wall_seen_from_elsewhere_warps_onto_what_is_seen_here() -> None:
     other = _picture(scene, there)
     warped, both = warp_view(other, see_depth(scene, there), see_depth(scene, here))
     assert float(both.float().mean()) > 0.7
-    # which of two overlapping Gaussians lies in front is another from there: colors shift by half of one
+    # the order of overlapping Gaussians differs between views, which shifts colors by half a Gaussian
     assert psnr(warped, image, both) > 27
     assert psnr(other, image, both) < 25
 
 
-def test_what_something_else_covers_in_the_other_view_is_not_seen_by_both() -> None:
+def test_occluded_pixels_are_not_shared() -> None:
     back = _wall(4.0, 6.0)
     front = _wall(2.0, 0.4, 30, seed=1)
     scene = concatenate(back, front)
@@ -106,12 +106,12 @@ def test_what_something_else_covers_in_the_other_view_is_not_seen_by_both() -> N
     image = _picture(scene, here)
     everywhere = torch.ones_like(both)
     assert psnr(warped, image, both) > psnr(warped, image, everywhere) + 6
-    # behind the small square as the other camera sees it
+    # hidden behind the small square in the other view
     covered = (seen_here.depth.depth > 3.5) & ~both
     assert 50 < int(covered.sum()) < 0.4 * covered.numel()
 
 
-def test_what_lies_outside_the_other_view_or_is_empty_does_not_count() -> None:
+def test_pixels_outside_the_other_view_or_empty_are_excluded() -> None:
     scene = _wall(4.0, 1.0)
     here = _from(0.0)
     there = _from(0.5)
