@@ -1,4 +1,4 @@
-"""The memory bank, and networks that a run trains alongside its edit or after it."""
+"""Memory bank, and networks trained jointly with the edit or after it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from trainer.run.run import RunResult
 
 @pytest.fixture(scope="module", autouse=True)
 def short_fits() -> Iterator[None]:
-    """Networks of a few hundred steps."""
+    """Limit the training of networks to a few hundred steps."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(neural_fit, "EFFORT", {"tiny": (200, 256, 5e-3)})
         patch.setattr("trainer.fit.network.EFFORT", neural_fit.EFFORT)
@@ -37,29 +37,29 @@ def short_fits() -> Iterator[None]:
 
 
 def train_jointly(folder: Path, out: str, resume: bool = False) -> RunResult:
-    """A short run whose network sees positions and is trained beside the members."""
+    """Train a short run whose position network is trained jointly with the members."""
     settings = {"steps": 60, "stages": 2, "views": 5, "image_size": 56, "field": "neural", "name": "joint"}
-    bending = "recolor:#30a050"  # unlike the way between two keyframes
+    bending = "recolor:#30a050"  # its path differs from the line between two keyframes
     options = quick_options(folder, out, **settings, editor=bending, as_printed=True, resume=resume)
     return trainer.run.run.train(options, quiet=True)
 
 
 @pytest.fixture(scope="module")
 def alongside(folder: Path) -> RunResult:
-    """A finished run whose network was trained beside the edit."""
+    """Return a finished run whose network was trained jointly with the edit."""
     return train_jointly(folder, "joint")
 
 
-# ---- the bank
+# ---- memory bank
 
 
-def test_a_bank_begins_with_the_original() -> None:
+def test_bank_begins_with_the_original() -> None:
     bank = MemoryBank(5, 14)
     assert bank.strengths.tolist() == [0.0]
     assert not bool(bank.offsets.any())
 
 
-def test_a_bank_keeps_half_precision_in_order() -> None:
+def test_bank_stores_half_precision_in_order() -> None:
     bank = MemoryBank(5, 14)
     offsets = torch.randn(5, 14)
     bank.add(0.25, offsets)
@@ -69,7 +69,7 @@ def test_a_bank_keeps_half_precision_in_order() -> None:
         bank.add(0.25, offsets)
 
 
-def test_a_full_bank_drops_what_its_neighbors_tell() -> None:
+def test_full_bank_drops_the_most_redundant_snapshot() -> None:
     bank = MemoryBank(1, 14, most=4)
     for strength in (0.3, 0.35, 0.4, 1.0):
         bank.add(strength, torch.full((1, 14), strength))
@@ -84,12 +84,12 @@ def beside(seed: int = 0) -> JointTraining:
     return JointTraining(fit, 14, (0.5, 1.0), (10, 20), lambda moved: moved[:, 11:14])
 
 
-def test_until_the_way_is_known_a_step_stands_for_its_place_in_its_stage() -> None:
+def test_step_maps_linearly_to_strength_within_its_stage() -> None:
     along = beside()
     assert [along.strength(step) for step in (0, 5, 10, 20, 30)] == [0.0, 0.25, 0.5, 0.75, 1.0]
 
 
-def test_the_field_waits_for_the_first_recording() -> None:
+def test_field_waits_for_the_first_recording() -> None:
     along = beside()
     along.step()
     assert along.fit.steps == 0
@@ -98,7 +98,7 @@ def test_the_field_waits_for_the_first_recording() -> None:
     assert along.fit.steps == 1
 
 
-def test_what_trains_alongside_goes_on_to_the_same_bits() -> None:
+def test_joint_training_resumes_to_the_same_bits() -> None:
     _, offsets = curved_trajectory(20, moving=("sh0",))
     recordings = [(4, offsets[3].half()), (11, offsets[5].half()), (25, offsets[8].half())]
 
@@ -125,9 +125,7 @@ def test_what_trains_alongside_goes_on_to_the_same_bits() -> None:
 # ---- runs
 
 
-def test_a_network_trained_alongside_is_finished_and_follows_the_recording(
-    folder: Path, alongside: RunResult
-) -> None:
+def test_joint_network_is_finished_and_matches_the_recording(folder: Path, alongside: RunResult) -> None:
     field = alongside.report["field"]
     assert field["kind"] == "neural"
     assert field["endpoint_error"] == 0.0
@@ -140,7 +138,7 @@ def test_a_network_trained_alongside_is_finished_and_follows_the_recording(
 
 
 @pytest.mark.slow
-def test_an_interrupted_run_finishes_its_network_to_the_same_bits(
+def test_interrupted_run_finishes_its_network_to_the_same_bits(
     folder: Path, alongside: RunResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     step = JointTraining.step
@@ -167,7 +165,7 @@ def test_an_interrupted_run_finishes_its_network_to_the_same_bits(
         assert torch.equal(tensor, other.network.tensors[name]), name
 
 
-def test_a_refit_trains_a_network_on_what_was_recorded(folder: Path, alongside: RunResult) -> None:
+def test_refit_trains_a_network_on_the_recording(folder: Path, alongside: RunResult) -> None:
     before = alongside.folder.trajectory.read_bytes()
     kept = alongside.gdf.read_bytes()
     found = refit(
@@ -197,19 +195,17 @@ def _end(result: RunResult, folder: Path) -> Tensor:
         ),
     ],
 )
-def test_network_options_that_mean_nothing_are_told(
-    folder: Path, changed: dict[str, object], message: str
-) -> None:
+def test_unused_network_options_are_refused(folder: Path, changed: dict[str, object], message: str) -> None:
     with pytest.raises(ProgdfError, match=message):
         check_options(quick_options(folder, **changed))
 
 
-def test_a_refit_knows_its_options_too(folder: Path) -> None:
+def test_refit_checks_its_options_too(folder: Path) -> None:
     with pytest.raises(ProgdfError, match="--size does not apply"):
         check_field_options(with_values(FitOptions(folder), size="small").field)
 
 
-def test_importance_is_what_pictures_show() -> None:
+def test_importance_is_the_rendered_change() -> None:
     _, offsets = curved_trajectory(30, moving=("means", "sh0"))
     found = rendered_importance(offsets, lambda moved: moved[:, 11:14])
     assert found["sh0"] > 0.999

@@ -1,4 +1,4 @@
-"""A grade alone before anything is trained: near the editor's own pictures, or none at all."""
+"""Drafts: a grade fitted before training, close to the editor's pictures or absent."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def views() -> DraftViews:
 
 
 def drafted(editor: str, folder: Path) -> Gdf:
-    """The draft of an edit of the bear's body as a window loads it."""
+    """Return the draft of an edit of the bear's body, saved and loaded like in the window."""
     made = draft_grade(views(), EditorOptions(editor), "blue")
     assert made is not None
     save_gdf(folder / "draft.gdf", made)
@@ -45,7 +45,7 @@ PALETTE = "grade:#b97a30=#3060d0,#e0c898,curve=0.3:0.25+0.7:0.8"
 
 
 @pytest.mark.parametrize("spec", ["recolor:#3060d0", "tint:#3060d0", "darken:0.6", "night", GRADE, PALETTE])
-def test_a_draft_shows_an_edit_at_every_strength_as_its_editor_does(spec: str, tmp_path: Path) -> None:
+def test_draft_matches_its_editor_at_every_strength(spec: str, tmp_path: Path) -> None:
     case = small("body")
     gdf = drafted(spec, tmp_path)
     editor = make_editor(EditorOptions(spec), case.scene, case.region, case.views)
@@ -62,20 +62,20 @@ def test_a_draft_shows_an_edit_at_every_strength_as_its_editor_does(spec: str, t
     assert min(steps) > 0.6 * max(steps), "equal steps look equally large"
 
 
-def test_a_draft_says_that_it_is_one_and_how_near_it_is(tmp_path: Path) -> None:
+def test_draft_reports_its_error_and_is_small(tmp_path: Path) -> None:
     gdf = drafted("recolor:#3060d0", tmp_path)
     assert gdf.report["draft"]["psnr"] > 25.0
     assert (tmp_path / "draft.gdf").stat().st_size < 6000
 
 
-def test_what_a_map_of_color_leaves_too_much_of_has_no_draft(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_edit_that_a_color_map_cannot_carry_has_no_draft(monkeypatch: pytest.MonkeyPatch) -> None:
     assert draft_grade(views(), EditorOptions("stripes:#20a040"), "stripes") is None
     monkeypatch.setattr(draft, "MAX_UNEXPLAINED_SHARE", 1e-5)
     monkeypatch.setattr(draft, "ROUNDING", 0.0)
     assert draft_grade(views(), EditorOptions("recolor:#3060d0"), "blue") is None
 
 
-def test_a_grade_by_hand_is_live_however_little_a_map_carries_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_manual_grade_always_has_a_draft(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(draft, "MAX_UNEXPLAINED_SHARE", 1e-5)
     monkeypatch.setattr(draft, "ROUNDING", 0.0)
     made = draft_grade(views(), EditorOptions(GRADE), "grade")
@@ -83,20 +83,20 @@ def test_a_grade_by_hand_is_live_however_little_a_map_carries_it(monkeypatch: py
     assert made.report["draft"]["psnr"] > 25.0
 
 
-def test_a_region_that_no_view_shows_has_no_draft() -> None:
+def test_region_without_visible_members_has_no_draft() -> None:
     case = small("body")
     hidden = replace(case.scene, logit_opacities=torch.full_like(case.scene.logit_opacities, -30.0))
     assert draft_views(TrainingViewOptions(), hidden, case.region) is None
 
 
-def test_a_scene_to_stand_inside_has_no_draft_without_cameras() -> None:
+def test_indoor_scene_without_cameras_has_no_draft() -> None:
     scene = room(MIN_ROOM_GAUSSIANS).gaussians
     region = from_mask("all", torch.ones(len(scene), dtype=torch.bool))
     assert draft_views(TrainingViewOptions(), scene, region) is None
 
 
-def test_no_further_strengths_are_no_pictures(tmp_path: Path) -> None:
-    """Where the slider is even with one recording already."""
+def test_no_extra_strengths_request_no_pictures(tmp_path: Path) -> None:
+    """Cover a slider that is already even with one recording."""
     case = small("body")
     editor = make_editor(EditorOptions(GRADE), case.scene, case.region, case.views)
     assert edit_views(editor, case.views, (), RunFolder(tmp_path), True, lambda *_: None, editor.course) == {}

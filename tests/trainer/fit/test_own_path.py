@@ -1,4 +1,4 @@
-"""An edit of one target goes straight unless its own way is nearer to the editor's half."""
+"""Path of a single-target edit: straight unless the recording is closer to the editor at strength 0.5."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def setup() -> TrainingSetup:
 
 
 def way(bend: float, attribute: str = "sh0") -> Trajectory:
-    """To another color (or place), half way `bend` off the straight line."""
+    """Return a path to another color or position that is `bend` off the straight line at strength 0.5."""
     rows = pack(setup().scene[setup().region.members], with_shN=False)
     column = attribute_slices(rows.shape[1])[attribute].start
     offsets = torch.zeros(3, *rows.shape)
@@ -40,7 +40,7 @@ def same(trajectory: Trajectory) -> Trajectory:
 
 @dataclass(frozen=True)
 class Halfway:
-    """An editor whose half is what the scene shows at these offsets."""
+    """Editor whose picture at strength 0.5 is the scene with these offsets."""
 
     offsets: Tensor
     stages: tuple[float, ...] = ()
@@ -54,14 +54,14 @@ class Halfway:
         return render_view(setup().scene.replace_rows(members, rows), view.camera, WHITE)
 
 
-def test_a_detour_that_the_editor_takes_too_is_kept() -> None:
+def test_detour_matched_by_the_editor_is_kept() -> None:
     bent = way(0.6)
     kept, why = choose_path(bent, setup(), Halfway(bent.node(1)), False, same)
     assert kept is bent
     assert why.startswith("as recorded")
 
 
-def test_a_detour_that_the_editor_does_not_take_is_left() -> None:
+def test_detour_not_matched_by_the_editor_is_straightened() -> None:
     bent = way(0.6)
     kept, why = choose_path(bent, setup(), Halfway(0.5 * bent.end), False, same)
     assert len(kept) == 2
@@ -72,18 +72,18 @@ def test_a_detour_that_the_editor_does_not_take_is_left() -> None:
     assert why.startswith("straight: the editor's half")
 
 
-def test_where_nobody_pictures_the_half_it_goes_straight() -> None:
+def test_path_is_straight_without_an_editor_picture_at_half_strength() -> None:
     bent = way(0.6)
     assert len(choose_path(bent, setup(), None, False, same)[0]) == 2
     assert len(choose_path(bent, setup(), Halfway(bent.end, stages=(1.0,)), False, same)[0]) == 2
 
 
-def test_parts_keep_their_way() -> None:
+def test_moving_parts_keep_their_path() -> None:
     turned = way(0.4, "means")
     assert choose_path(turned, setup(), None, True, same)[0] is turned
 
 
-def test_a_way_that_is_not_kept_is_not_retimed() -> None:
+def test_discarded_path_is_not_retimed() -> None:
     def never(trajectory: Trajectory) -> Trajectory:
         raise AssertionError("re-timed in vain")
 

@@ -1,4 +1,4 @@
-"""Equal steps of a slider look equally large: what the editor is asked for, and the fitted field."""
+"""Slider uniformity: equal steps look equally large, in the editor's strengths and the fitted field."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ QUARTERS = (0.25, 0.5, 0.75, 1.0)
 
 @dataclass
 class Late:
-    """Shows nearly nothing of the edit before the end; counts how often it is asked."""
+    """Editor whose change appears late; it counts its calls."""
 
     stages: tuple[float, ...] = ()
     kind: EditKind = "color"
@@ -47,7 +47,7 @@ def uniformity(dial_of: Tensor) -> float:
     return float(steps.min() / steps.max())
 
 
-def test_an_editor_is_asked_for_pictures_that_are_evenly_far_from_each_other() -> None:
+def test_editor_is_requested_at_evenly_spaced_changes() -> None:
     views = small(count=4).views
     editor = Late()
     asked = equalized_strengths(editor, "darken:0.5", views, QUARTERS)
@@ -57,7 +57,7 @@ def test_an_editor_is_asked_for_pictures_that_are_evenly_far_from_each_other() -
     assert float(steps.min() / steps.max()) > 0.95
 
 
-def test_a_model_that_takes_its_time_is_asked_nine_strengths_of_one_view() -> None:
+def test_slow_model_is_sampled_at_nine_strengths_of_one_view() -> None:
     views = small(count=4).views
     editor = Late()
     asked = equalized_strengths(editor, "instruct:make him smile", views, QUARTERS)
@@ -65,7 +65,7 @@ def test_a_model_that_takes_its_time_is_asked_nine_strengths_of_one_view() -> No
     assert editor.asked == 9
 
 
-def test_strengths_name_folders_and_so_have_three_decimals() -> None:
+def test_strengths_have_three_decimals_for_folder_names() -> None:
     asked = equalized_strengths(Late(), "darken:0.5", small(count=4).views, QUARTERS)
     assert all(float(f"{s:g}") == s and s == round(s, 3) for s in asked)
     assert asked[-1] == 1.0
@@ -78,19 +78,19 @@ def test_strengths_name_folders_and_so_have_three_decimals() -> None:
         (Late(), "darken:0.5", (1.0,)),
     ],
 )
-def test_given_strengths_and_single_targets_are_not_asked_around(
+def test_given_strengths_and_single_targets_are_not_probed(
     editor: Late, spec: str, plain: tuple[float, ...]
 ) -> None:
     assert equalized_strengths(editor, spec, small(count=4).views, plain) == plain
     assert editor.asked == 0
 
 
-def test_an_edit_that_jumps_is_asked_at_the_plain_strengths() -> None:
+def test_abrupt_edit_uses_the_plain_strengths() -> None:
     assert equalized_strengths(Late(power=300.0), "darken:0.5", small(count=4).views, QUARTERS) == QUARTERS
     assert equalized_strengths(Late(power=1e6), "darken:0.5", small(count=4).views, QUARTERS) == QUARTERS
 
 
-def test_steps_are_even_wherever_they_begin() -> None:
+def test_steps_are_even_from_any_start() -> None:
     def seen(s: float) -> Tensor:
         return torch.tensor([s + 0.8 * (1 - math.cos(9 * s)) / 9 + 2.0 * s**4], dtype=torch.float64)
 
@@ -103,12 +103,12 @@ def test_steps_are_even_wherever_they_begin() -> None:
         assert uniformity(steps) > 0.75, phase
 
 
-def test_what_never_changes_keeps_its_slider() -> None:
+def test_unchanging_edit_keeps_its_slider() -> None:
     remap = equalizing_remap(lambda s: torch.zeros(4))
     assert remap.at(0.3) == pytest.approx(0.3)
 
 
-def test_a_fitted_field_is_as_even_in_views_that_were_not_looked_at() -> None:
+def test_fitted_field_is_even_in_held_out_views() -> None:
     case = small(count=6)
     members = case.region.members
     original = pack(case.scene[members])
@@ -131,7 +131,7 @@ def test_a_fitted_field_is_as_even_in_views_that_were_not_looked_at() -> None:
     assert remap.at(0.5) < 0.3, "half the strength is far less than half of the change"
 
 
-def test_auto_is_even_but_pinned_where_pictures_of_several_strengths_were_given() -> None:
+def test_auto_slider_is_even_unless_pictures_of_strengths_are_given() -> None:
     def resolved(slider: Slider, editor: str, strengths: tuple[float, ...] = QUARTERS) -> str:
         options = resolve(quick_options(Path("nowhere"), editor=editor, slider=slider))
         return resolve_slider(options.optimize.slider, strengths)
@@ -144,7 +144,7 @@ def test_auto_is_even_but_pinned_where_pictures_of_several_strengths_were_given(
     assert resolved("time", "recolor:#3060d0") == "time"
 
 
-def test_the_stripes_of_a_scarf_are_asked_for_where_they_show() -> None:
+def test_stripes_are_requested_at_strengths_of_visible_change() -> None:
     case = small(count=6)
     editor = make_editor(EditorOptions("stripes:#20a040"), case.scene, case.region, case.views)
     asked = equalized_strengths(editor, "stripes:#20a040", case.views, QUARTERS)
