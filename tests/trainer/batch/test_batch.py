@@ -1,4 +1,4 @@
-"""`progdf batch`: what it writes, what it refuses, and what becomes of workers and machines that are lost."""
+"""`progdf batch`: output files, refused catalogues, and recovery from lost workers and machines."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ editor = "darken:.5"
 
 @pytest.fixture(scope="module")
 def catalogue(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A catalogue of two edits of a small bear."""
+    """Write a catalogue of two edits of a small bear; return its path."""
     from progdf.demo_scenes.bear import LABELS
 
     folder = tmp_path_factory.mktemp("bears")
@@ -62,7 +62,7 @@ def catalogue(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def singly(catalogue: Path) -> dict[str, bytes]:
-    """The .gdf bytes of each job's command, run alone."""
+    """Return the .gdf bytes of each job trained alone, by job key."""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(catalogue.parent)
         jobs, _ = read_catalogue(catalogue, catalogue.parent / "alone")
@@ -74,7 +74,7 @@ def gdf_bytes(folder: Path) -> dict[str, bytes]:
 
 
 def children(of: int) -> list[int]:
-    """Processes below another, at any depth."""
+    """Return the ids of all descendants of a process."""
     listed = subprocess.run(["ps", "-eo", "pid=,ppid="], capture_output=True, text=True, check=True).stdout
     parents = {int(pid): int(parent) for pid, parent in (line.split() for line in listed.splitlines())}
     below = [pid for pid, parent in parents.items() if parent == of]
@@ -92,7 +92,7 @@ def ends(tasks: list[Task], pool: LocalPool | RayPool, **more: object) -> dict[s
     return {row.job: row for row in run_jobs(tasks, pool, **more)}  # type: ignore[arg-type]
 
 
-def test_a_batch_writes_ordinary_runs_a_table_and_a_page_and_names_what_is_broken(
+def test_batch_writes_runs_table_and_page_and_reports_broken_scenes(
     catalogue: Path, singly: dict[str, bytes], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     text = catalogue.read_text(encoding="utf-8")
@@ -122,7 +122,7 @@ def test_a_batch_writes_ordinary_runs_a_table_and_a_page_and_names_what_is_broke
     assert "bear/body: finished" in capsys.readouterr().out
 
 
-def test_everything_is_checked_before_anything_starts(
+def test_all_faults_are_reported_before_any_job_starts(
     catalogue: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     text = catalogue.read_text(encoding="utf-8").replace("recolor:#3060d0", "recolour:#3060d0")
@@ -150,8 +150,8 @@ def test_everything_is_checked_before_anything_starts(
     assert not out.exists()
 
 
-@pytest.mark.slow  # one that always dies is tried again in every run of the tests
-def test_a_killed_worker_s_job_goes_on_in_another_one(
+@pytest.mark.slow  # the fast tests cover retries with a job that always dies
+def test_job_of_a_killed_worker_continues_in_another(
     catalogue: Path, singly: dict[str, bytes], tmp_path: Path
 ) -> None:
     jobs, _ = read_catalogue(catalogue, tmp_path / "runs")
@@ -176,7 +176,7 @@ def test_a_killed_worker_s_job_goes_on_in_another_one(
     assert gdf_bytes(tmp_path / "runs") == singly
 
 
-def test_a_job_that_always_dies_fails_and_the_others_are_done(tmp_path: Path) -> None:
+def test_job_that_always_dies_fails_after_four_attempts(tmp_path: Path) -> None:
     write_bear(tmp_path)
     pool = LocalPool()
     try:
@@ -188,9 +188,9 @@ def test_a_job_that_always_dies_fails_and_the_others_are_done(tmp_path: Path) ->
     assert "SIGKILL" in outcome.reason
 
 
-@pytest.mark.slow  # half a minute; a single run's Ctrl+C is tested in every run of the tests
+@pytest.mark.slow  # 30 seconds; the fast tests cover Ctrl+C of a single run
 @pytest.mark.skipif(sys.platform == "win32", reason="signals")
-def test_ctrl_c_stops_all_and_resume_ends_with_the_same_bytes(
+def test_ctrl_c_stops_all_workers_and_resume_yields_the_same_bytes(
     catalogue: Path, singly: dict[str, bytes], tmp_path: Path
 ) -> None:
     out = tmp_path / "runs"
@@ -217,7 +217,7 @@ def test_ctrl_c_stops_all_and_resume_ends_with_the_same_bytes(
     assert gdf_bytes(out) == singly
 
 
-def test_a_row_is_read_back_as_it_was_written(tmp_path: Path) -> None:
+def test_rows_round_trip_and_the_page_escapes_html(tmp_path: Path) -> None:
     from trainer.batch.report import write_page, write_rows
 
     rows = [
@@ -230,12 +230,12 @@ def test_a_row_is_read_back_as_it_was_written(tmp_path: Path) -> None:
     assert "<script>alert" not in (tmp_path / "batch.html").read_text(encoding="utf-8")
 
 
-def test_a_cluster_that_does_not_answer_is_named(
+def test_unreachable_cluster_is_named(
     catalogue: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("ray")
     with socket.socket() as closed:
-        closed.bind(("127.0.0.1", 0))  # a port on which nothing listens
+        closed.bind(("127.0.0.1", 0))  # nothing listens on this port
         address = f"127.0.0.1:{closed.getsockname()[1]}"
         for host in (address, "no-such-host.invalid:6379", "127.0.0.1:99999"):
             assert main(["batch", str(catalogue), "--out", str(tmp_path / "runs"), "--address", host]) == 2
@@ -245,7 +245,7 @@ def test_a_cluster_that_does_not_answer_is_named(
 
 
 @pytest.mark.slow  # imports Ray
-def test_a_ray_that_does_not_start_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_ray_start_is_a_one_line_error(monkeypatch: pytest.MonkeyPatch) -> None:
     ray = pytest.importorskip("ray")
 
     def time_out(**_: object) -> None:
@@ -260,7 +260,7 @@ def test_a_ray_that_does_not_start_is_one_line(monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.fixture
 def cluster() -> Iterator[object]:
-    """Two simulated machines of one core each."""
+    """Start a simulated cluster of one machine with one core; shut it down after the test."""
     pytest.importorskip("ray")
     made = start_cluster()
     yield made
@@ -268,7 +268,10 @@ def cluster() -> Iterator[object]:
 
 
 def start_cluster() -> Any:
-    """Start the head of a cluster; Ray itself gives up after 30 seconds, too little on a busy machine."""
+    """Start the head of a cluster, in up to `CLUSTER_ATTEMPTS` attempts.
+
+    Ray gives up after 30 seconds, which is too short on a busy machine.
+    """
     from ray.cluster_utils import Cluster
 
     arguments = {"num_cpus": 1, "object_store_memory": 80 * 2**20}
@@ -279,15 +282,15 @@ def start_cluster() -> Any:
 
 
 def add_machine(cluster: Any) -> Any:
-    """Add a machine to a cluster, see `start_cluster`."""
+    """Add a machine to a cluster, with the attempts of `start_cluster`."""
     for _ in range(CLUSTER_ATTEMPTS - 1):
         with contextlib.suppress(Exception):
             return cluster.add_node(num_cpus=1, object_store_memory=80 * 2**20)
     return cluster.add_node(num_cpus=1, object_store_memory=80 * 2**20)
 
 
-@pytest.mark.slow  # a quarter of a minute, most of it Ray's own start
-def test_on_a_cluster_a_lost_machine_s_job_goes_on_elsewhere(
+@pytest.mark.slow  # 15 seconds, mostly Ray's startup
+def test_job_of_a_lost_machine_continues_on_another(
     catalogue: Path, singly: dict[str, bytes], tmp_path: Path, cluster: object
 ) -> None:
     second = add_machine(cluster)
@@ -318,7 +321,7 @@ def test_on_a_cluster_a_lost_machine_s_job_goes_on_elsewhere(
 
 
 @pytest.mark.slow
-def test_programs_train_jobs_side_by_side(tmp_path: Path) -> None:
+def test_workers_train_jobs_in_parallel(tmp_path: Path) -> None:
     write_bear(tmp_path)
     sizes: dict[str, object] = {"views": 4, "image_size": 48, "steps": 24, "stages": 2}
     jobs = [BatchJob(part, quick_options(tmp_path, part, part, **sizes)) for part in ("scarf", "ears")]
@@ -329,7 +332,7 @@ def test_programs_train_jobs_side_by_side(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_twelve_jobs_survive_a_killed_worker_a_lost_machine_and_ctrl_c(
+def test_twelve_jobs_survive_killed_worker_lost_machine_and_ctrl_c(
     catalogue: Path, tmp_path: Path, cluster: object
 ) -> None:
     second = add_machine(cluster)

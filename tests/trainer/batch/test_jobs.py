@@ -1,4 +1,4 @@
-"""What a catalogue says, and what is wrong with one."""
+"""Batch catalogues: options of jobs, sweeps, cost estimates and reported faults."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def read(folder: Path, text: str) -> tuple[list[BatchJob], list[str]]:
     return read_catalogue(folder / "catalogue.toml", folder / "runs")
 
 
-def test_a_job_has_the_options_of_the_catalogue_its_scene_and_its_edit(tmp_path: Path) -> None:
+def test_job_merges_options_of_catalogue_scene_and_edit(tmp_path: Path) -> None:
     jobs, faults = read(tmp_path, SHOES)
     assert not faults
     assert [job.key for job in jobs] == ["left/blue", "left/night", "right/blue"]
@@ -55,7 +55,7 @@ def test_a_job_has_the_options_of_the_catalogue_its_scene_and_its_edit(tmp_path:
     assert {job.folder for job in jobs} == {tmp_path}
 
 
-def test_a_sweep_makes_every_combination(tmp_path: Path) -> None:
+def test_sweep_makes_every_combination(tmp_path: Path) -> None:
     jobs, faults = read(tmp_path, SHOES + '\n[sweep]\nsteps = [400, 800]\nslider = ["even", "stages"]')
     assert not faults
     names = [job.key for job in jobs if job.key.startswith("left/blue")]
@@ -65,7 +65,7 @@ def test_a_sweep_makes_every_combination(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("more", ["", "preset = 'paper'\n", "quick = true\nperceptual-weight = 0.5\n"])
-def test_a_job_s_command_has_its_options(tmp_path: Path, more: str) -> None:
+def test_job_command_reproduces_its_options(tmp_path: Path, more: str) -> None:
     for job in read(tmp_path, SHOES.replace("views = 12", more + "seed = 3"))[0]:
         words = shlex.split(job.command)
         assert words[:2] == ["progdf", "train"]
@@ -91,13 +91,13 @@ def test_a_job_s_command_has_its_options(tmp_path: Path, more: str) -> None:
         ("[defaults]", "[sweep]", "[sweep] views must be a list of values"),
     ],
 )
-def test_a_fault_is_one_line_that_names_its_place(tmp_path: Path, old: str, new: str, fault: str) -> None:
+def test_fault_is_one_line_that_names_its_location(tmp_path: Path, old: str, new: str, fault: str) -> None:
     _, faults = read(tmp_path, SHOES.replace(old, new, 1))
     assert any(fault in line for line in faults), faults
     assert all("\n" not in line for line in faults)
 
 
-def test_all_faults_are_told_at_once(tmp_path: Path) -> None:
+def test_all_faults_are_reported_together(tmp_path: Path) -> None:
     text = SHOES.replace('region = "all"', "").replace("views = 20", "views = 1").replace("up =", "upp =")
     assert len(read(tmp_path, text)[1]) == 3
 
@@ -105,7 +105,7 @@ def test_all_faults_are_told_at_once(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "text", ["", "scenes = 3", "[[scenes]]\npath = 'a.ply'", "defaults = []", "x = [" * 9000]
 )
-def test_what_is_no_catalogue_is_one_line(tmp_path: Path, text: str) -> None:
+def test_invalid_catalogue_is_a_one_line_error(tmp_path: Path, text: str) -> None:
     try:
         jobs, faults = read(tmp_path, text)
     except ProgdfError as error:
@@ -115,20 +115,20 @@ def test_what_is_no_catalogue_is_one_line(tmp_path: Path, text: str) -> None:
     assert len(faults) == 1
 
 
-def test_more_members_views_and_pixels_are_expected_to_take_more(tmp_path: Path) -> None:
+def test_cost_estimate_grows_with_scene_members_and_pixels(tmp_path: Path) -> None:
     options = read(tmp_path, SHOES)[0][0].options
     larger = replace(options, views=replace(options.views, image_size=512))
-    few, many, large = (
+    small, many, large = (
         estimate_cost(*given)
         for given in ((options, 10_000, 500), (options, 900_000, 90_000), (larger, 10_000, 500))
     )
     for cost in (many, large):
-        assert cost.seconds > few.seconds
-        assert cost.memory > few.memory
-        assert cost.disk > few.disk
+        assert cost.seconds > small.seconds
+        assert cost.memory > small.memory
+        assert cost.disk > small.disk
 
 
-def test_too_many_jobs_are_counted_before_one_is_built(
+def test_too_many_jobs_are_refused_before_any_is_built(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def build(*_: object) -> None:
@@ -141,7 +141,7 @@ def test_too_many_jobs_are_counted_before_one_is_built(
     assert "188 400 jobs (3 edits × 400 of seed × 157 of steps), at most 100 000 are allowed" in fault
 
 
-def test_number_of_jobs_beyond_all_is_one_line(tmp_path: Path) -> None:
+def test_huge_number_of_jobs_is_a_one_line_error(tmp_path: Path) -> None:
     names = ("seed", "steps", "views", "stages", "threads", "image-size")
     sweep = "\n[sweep]\n" + "\n".join(f"{name} = {[1] * 1000}" for name in names)
     jobs, (fault,) = read(tmp_path, SHOES + sweep)

@@ -1,4 +1,4 @@
-"""The table of a batch: rows that a session could not write, and reports that a disk has damaged."""
+"""Table of a batch: rows left by an interrupted session, and damaged reports."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ editor = "recolor:#3060d0"
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
-    """The command line of a batch of one job, which is done."""
+    """Train a batch of one job; return the command line that resumes it."""
     folder = tmp_path_factory.mktemp("bear")
     write_bear(folder, 400)
     (folder / "jobs.toml").write_text(CATALOGUE, encoding="utf-8")
@@ -54,7 +54,7 @@ def events_of(capsys: pytest.CaptureFixture[str]) -> list[dict[str, Any]]:
 
 
 @pytest.mark.parametrize("status", ["waiting", "stopped", "failed"])
-def test_run_that_ended_unseen_is_done_when_resumed(
+def test_row_of_a_finished_run_becomes_done_on_resume(
     finished: list[str], status: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_rows(out_of(finished), [JobRow("bear/all", status)])
@@ -66,7 +66,7 @@ def test_run_that_ended_unseen_is_done_when_resumed(
     assert (row.status, bool(row.bytes)) == ("done", True)
 
 
-def test_finished_run_is_told_of_once(finished: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_finished_run_is_reported_once(finished: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.batch(finished) == 0
     capsys.readouterr()
     assert cli.batch([*finished, "--json"]) == 0
@@ -95,7 +95,7 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("place", DAMAGE)
-def test_damaged_report_is_one_line_when_resumed(
+def test_damaged_report_is_a_one_line_error_on_resume(
     finished: list[str], place: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     report = out_of(finished) / "bear" / "all" / "report.json"
@@ -117,7 +117,7 @@ def test_damaged_report_is_one_line_when_resumed(
 
 
 @pytest.mark.parametrize("content", [*JSON_TEXTS.values(), "[]", "5", "", '{"curves": 5}'])
-def test_page_is_written_whatever_a_report_holds(tmp_path: Path, content: str) -> None:
+def test_page_is_written_despite_a_damaged_report(tmp_path: Path, content: str) -> None:
     options = TrainOptions(Path("a.ply"), tmp_path / "a" / "b", RegionOptions("all"), EditorOptions("night"))
     job = BatchJob("a/b", options)
     options.out.mkdir(parents=True)
@@ -130,7 +130,7 @@ def test_page_is_written_whatever_a_report_holds(tmp_path: Path, content: str) -
 @pytest.mark.parametrize(
     "content", ['{"share": "a"}', '{"share": 7}', "[]", '{"seconds": []}', '{"label": 5}']
 )
-def test_damaged_progress_counts_as_the_beginning(
+def test_damaged_progress_counts_as_zero(
     finished: list[str], tmp_path: Path, content: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from trainer.batch.report import Screen
@@ -148,7 +148,7 @@ def test_damaged_progress_counts_as_the_beginning(
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals")
 @pytest.mark.parametrize("content", [b"", b"no task", b"ctrainer.batch.jobs\nAbsent\n."])
-def test_worker_that_cannot_read_its_tasks_ends(content: bytes) -> None:
+def test_worker_exits_on_unreadable_tasks(content: bytes) -> None:
     words = [sys.executable, "-P", "-c", "from trainer.batch.worker import serve; serve()"]
     worker = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert worker.communicate(content, timeout=300)[0] == b""
