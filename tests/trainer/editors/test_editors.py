@@ -1,4 +1,4 @@
-"""Image editors: exact at strength 0, soft at edges, the same in every view; folders of edited views."""
+"""Image editors: exact at strength 0, soft at edges, consistent across views; folders of edited views."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_strength_zero_is_the_original_view_bit_for_bit(spec: str) -> None:
 
 
 @pytest.mark.parametrize("spec", PROCEDURAL)
-def test_pixels_that_do_not_show_the_region_keep_their_color(spec: str) -> None:
+def test_pixels_outside_the_region_keep_their_color(spec: str) -> None:
     case = small()
     view = case.views[0]
     edited = make_editor(EditorOptions(spec), case.scene, case.region, case.views).edit(view, 1.0)
@@ -49,7 +49,7 @@ def test_pixels_that_do_not_show_the_region_keep_their_color(spec: str) -> None:
 
 
 @pytest.mark.parametrize("spec", PROCEDURAL)
-def test_the_edit_grows_continuously_with_the_strength(spec: str) -> None:
+def test_edit_grows_continuously_with_strength(spec: str) -> None:
     case = small()
     view = case.views[0]
     editor = make_editor(EditorOptions(spec), case.scene, case.region, case.views)
@@ -58,11 +58,11 @@ def test_the_edit_grows_continuously_with_the_strength(spec: str) -> None:
     assert max(steps) < 0.25
 
 
-def test_what_shares_a_pixel_with_the_region_is_not_edited() -> None:
+def test_background_sharing_a_pixel_with_the_region_is_not_edited() -> None:
     case = small()
     view = replace(
         case.views[0],
-        image=torch.tensor([[[0.8, 0.6, 0.5]]]),  # half orange region, half white from behind
+        image=torch.tensor([[[0.8, 0.6, 0.5]]]),  # half orange region, half white background
         mask=torch.tensor([[0.5]]),
         inside=torch.tensor([[[0.6, 0.2, 0.0]]]),
     )
@@ -70,7 +70,7 @@ def test_what_shares_a_pixel_with_the_region_is_not_edited() -> None:
     assert torch.allclose(view.blend(blue.expand(1, 1, 3)), 0.5 * blue + 0.5, atol=1e-6)
 
 
-def test_mask_and_inside_rebuild_the_view_with_the_region_taken_out() -> None:
+def test_mask_and_inside_rebuild_the_view_without_the_region() -> None:
     case = small()
     view = case.views[1]
     rest = view.image - view.mask[..., None] * view.inside
@@ -80,7 +80,7 @@ def test_mask_and_inside_rebuild_the_view_with_the_region_taken_out() -> None:
     assert torch.allclose(rest, render(hidden, view.camera).image.clamp(0, 1), atol=2e-3)
 
 
-def test_stripes_are_painted_on_the_thing_and_so_the_same_from_everywhere() -> None:
+def test_stripes_are_consistent_across_views() -> None:
     case = small("body")
     matt = replace(case.scene, shN=case.scene.shN[:, :0])
     views = [make_view(matt, case.region, view.camera, WHITE) for view in case.views]
@@ -92,7 +92,7 @@ def test_stripes_are_painted_on_the_thing_and_so_the_same_from_everywhere() -> N
     for view in views:
         expected = render(scene, view.camera).image.clamp(0, 1)
         difference = (editor.edit(view, 1.0) - expected).abs().amax(dim=2)
-        # a pixel's colors are cut at 1 before they are edited, the members' are not
+        # pixel colors are clamped to 1 before the edit, member colors are not
         assert float(difference.max()) < 0.05
         assert float((difference > 0.02).float().mean()) < 0.001
     share = float((editor.pattern > 0.5).float().mean())
@@ -112,18 +112,18 @@ def test_stripes_are_painted_on_the_thing_and_so_the_same_from_everywhere() -> N
         "folder:",
     ],
 )
-def test_an_editor_that_makes_no_sense_is_one_line_that_says_what_would(spec: str) -> None:
+def test_invalid_editor_is_a_one_line_error_with_a_remedy(spec: str) -> None:
     case = small()
-    with pytest.raises(ProgdfError, match="; ") as told:
+    with pytest.raises(ProgdfError, match="; ") as caught:
         make_editor(EditorOptions(spec), case.scene, case.region, case.views)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(caught.value)
 
 
 def test_every_editor_is_known_by_its_name() -> None:
     assert {check_editor(name)[0] for name in EDITORS} == set(EDITORS)
 
 
-def test_a_folder_of_edited_views_comes_back_as_it_was_saved(tmp_path: Path) -> None:
+def test_folder_of_edited_views_round_trips(tmp_path: Path) -> None:
     case = small()
     half = [(0.5 * view.image * 255).round() / 255 for view in case.views]
     for view, picture in zip(case.views, half, strict=True):
@@ -154,7 +154,7 @@ def test_edited_views_are_found_in_subfolders_in_any_case_and_format(tmp_path: P
         assert torch.equal(editor.edit(view, 1.0), red)
 
 
-def test_a_larger_edited_view_is_scaled_and_transparency_is_white(tmp_path: Path) -> None:
+def test_larger_edited_view_is_scaled_and_transparency_is_white(tmp_path: Path) -> None:
     case = small(count=3)
     for view in case.views:
         side = 2 * view.camera.width
@@ -166,7 +166,7 @@ def test_a_larger_edited_view_is_scaled_and_transparency_is_white(tmp_path: Path
 @pytest.mark.parametrize(
     "damage", ["missing view", "broken picture", "other proportions", "no folder", "bad strength"]
 )
-def test_a_folder_that_does_not_fit_is_refused_in_one_line(tmp_path: Path, damage: str) -> None:
+def test_unsuitable_folder_is_a_one_line_error(tmp_path: Path, damage: str) -> None:
     case = small(count=3)
     for view in case.views:
         write_image(tmp_path / f"{view.camera.name}.png", view.image)
@@ -188,14 +188,14 @@ def test_a_folder_that_does_not_fit_is_refused_in_one_line(tmp_path: Path, damag
         for view in case.views:
             editor.edit(view, 1.0)
 
-    with pytest.raises(ProgdfError, match="; ") as told:
+    with pytest.raises(ProgdfError, match="; ") as caught:
         edit_all()
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(caught.value)
 
 
-def test_an_edit_of_the_whole_picture_is_confined_to_the_region() -> None:
+def test_whole_picture_edit_is_confined_to_the_region() -> None:
     view = small().views[0]
-    is_confined = view.confine(1.0 - view.image)
-    assert torch.equal(is_confined[view.mask == 0], view.image[view.mask == 0])
+    confined = view.confine(1.0 - view.image)
+    assert torch.equal(confined[view.mask == 0], view.image[view.mask == 0])
     inside = view.mask > 0.5
-    assert torch.allclose(is_confined[inside], 1.0 - view.image[inside], atol=1e-6)
+    assert torch.allclose(confined[inside], 1.0 - view.image[inside], atol=1e-6)

@@ -63,7 +63,7 @@ def editor_of(settings: EditorOptions, spec: str = BATMAN) -> InstructEditor:
 
 
 @pytest.mark.parametrize("make", [tiny_instruct_pix2pix, tiny_flux_kontext, tiny_flux2_klein])
-def test_a_saved_pipeline_edits_a_view_at_its_own_size(
+def test_saved_pipeline_edits_a_view_at_its_own_size(
     diffusers: None, make: Callable[[Path], Path], tmp_path: Path
 ) -> None:
     view = small(image_size=66).views[0]
@@ -75,7 +75,7 @@ def test_a_saved_pipeline_edits_a_view_at_its_own_size(
     assert torch.equal(editor.edit(view, 0.0), view.image)
 
 
-def test_the_same_seed_gives_the_same_picture_and_another_another(pix2pix: str) -> None:
+def test_same_seed_repeats_the_picture_and_another_seed_differs(pix2pix: str) -> None:
     view = small().views[0]
     first, again, other = (editor_of(settings_of(pix2pix, seed=s)).edit(view, 1.0) for s in (0, 0, 1))
     assert torch.equal(first, again)
@@ -91,7 +91,7 @@ def test_every_option_reaches_the_pipeline(pix2pix: str, change: dict[str, objec
     assert not torch.equal(plain, changed)
 
 
-def test_the_sentence_reaches_the_pipeline_without_its_quotes(pix2pix: str) -> None:
+def test_prompt_reaches_the_pipeline_without_its_quotes(pix2pix: str) -> None:
     view = small().views[0]
     quoted = editor_of(settings_of(pix2pix)).edit(view, 1.0)
     plain = editor_of(settings_of(pix2pix), "instruct:turn him into Batman").edit(view, 1.0)
@@ -100,7 +100,7 @@ def test_the_sentence_reaches_the_pipeline_without_its_quotes(pix2pix: str) -> N
     assert not torch.equal(quoted, other)
 
 
-def test_any_strength_can_be_asked_for_and_the_change_grows_with_it(pix2pix: str) -> None:
+def test_any_strength_works_and_the_change_grows_with_it(pix2pix: str) -> None:
     view = small().views[0]
     editor = editor_of(settings_of(pix2pix, edit_steps=4))
     assert editor.stages == ()
@@ -110,7 +110,7 @@ def test_any_strength_can_be_asked_for_and_the_change_grows_with_it(pix2pix: str
     assert editor.calls((0.25, 0.5, 0.75, 1.0)) == 1 + 3 + 4 + 4
 
 
-def test_a_view_is_edited_once_for_all_runs(pix2pix: str, tmp_path: Path) -> None:
+def test_view_is_edited_once_for_all_runs(pix2pix: str, tmp_path: Path) -> None:
     view = small().views[0]
     settings = settings_of(pix2pix, cache=tmp_path)
     first = editor_of(settings).edit(view, 1.0)
@@ -126,9 +126,7 @@ def test_a_view_is_edited_once_for_all_runs(pix2pix: str, tmp_path: Path) -> Non
             replace(other, load=fails).edit(view, 0.5)
 
 
-def test_a_model_gets_the_region_with_a_margin_at_its_own_size_and_its_answer_is_kept(
-    pix2pix: str, tmp_path: Path
-) -> None:
+def test_model_receives_the_padded_region_and_its_output_is_cached(pix2pix: str, tmp_path: Path) -> None:
     view = small(image_size=200).views[0]
     editor = editor_of(settings_of(pix2pix, edit_size=128, cache=tmp_path))
     (x0, y0, x1, y1), camera = editor.frame(view)
@@ -138,7 +136,7 @@ def test_a_model_gets_the_region_with_a_margin_at_its_own_size_and_its_answer_is
     assert (x1 - x0) * (y1 - y0) < 0.8 * 200 * 200
     assert camera.width % 32 == camera.height % 32 == 0
     assert 0.7 * 128**2 < camera.width * camera.height <= 128**2
-    middle = torch.tensor([[x0 + x1, y0 + y1]]) / 2  # of the box, in the view: of the frame, in the frame
+    middle = torch.tensor([[x0 + x1, y0 + y1]]) / 2  # of the box, in view pixels
     rays = (middle - view.camera.K[:2, 2]) / view.camera.K.diagonal()[:2]
     framed = rays * camera.K.diagonal()[:2] + camera.K[:2, 2]
     assert torch.allclose(framed, torch.tensor([[camera.width, camera.height]]) / 2, atol=1e-3)
@@ -150,13 +148,13 @@ def test_a_model_gets_the_region_with_a_margin_at_its_own_size_and_its_answer_is
     assert torch.equal(edited[outside], view.image[outside])
 
 
-def test_what_a_model_leaves_alone_stays_to_the_bit(pix2pix: str) -> None:
+def test_unchanged_model_output_leaves_the_view_bit_identical(pix2pix: str) -> None:
     view = small(image_size=200).views[0]
     editor = editor_of(settings_of(pix2pix, edit_size=128))
     assert torch.equal(editor.paste(view, editor.original(view)), view.image)
 
 
-def test_a_kept_model_is_loaded_again_where_its_sentence_would_be_encoded_otherwise(
+def test_model_is_reloaded_if_guidance_changes_the_prompt_encoding(
     pix2pix: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("trainer.store.pretrained._models", LastValueCache())
@@ -169,7 +167,7 @@ def test_a_kept_model_is_loaded_again_where_its_sentence_would_be_encoded_otherw
 
 
 @pytest.mark.parametrize("name", ADAPTERS)
-def test_what_pipelines_are_asked_is_among_their_keywords(diffusers: None, name: str) -> None:
+def test_adapter_arguments_are_keywords_of_the_pipeline(diffusers: None, name: str) -> None:
     import diffusers as library
 
     adapter = ADAPTERS[name]
@@ -182,17 +180,17 @@ def test_what_pipelines_are_asked_is_among_their_keywords(diffusers: None, name:
 
 
 @pytest.mark.parametrize("model", ["timbrooks/instruct-pix2pix", "someone/no-such-model"])
-def test_missing_pipeline_are_one_line_that_names_what_to_download(
+def test_missing_pipeline_error_names_the_download(
     diffusers: None, model: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
-    with pytest.raises(ProgdfError, match=f"hf download {model} --include") as told:
+    with pytest.raises(ProgdfError, match=f"hf download {model} --include") as caught:
         editor_of(EditorOptions(BATMAN, model))
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("damage", ["no model_index.json", "no weights", "cut weights", "another pipeline"])
-def test_a_folder_that_is_no_whole_pipeline_is_one_line(pix2pix: str, damage: str, tmp_path: Path) -> None:
+def test_incomplete_pipeline_folder_is_a_one_line_error(pix2pix: str, damage: str, tmp_path: Path) -> None:
     import shutil
 
     folder = tmp_path / "model"
@@ -209,22 +207,22 @@ def test_a_folder_that_is_no_whole_pipeline_is_one_line(pix2pix: str, damage: st
         index["_class_name"] = "StableDiffusionPipeline"
         (folder / "model_index.json").write_text(json.dumps(index))
     view = small().views[0]
-    with pytest.raises(ProgdfError, match="; ") as told:
+    with pytest.raises(ProgdfError, match="; ") as caught:
         editor_of(settings_of(str(folder))).edit(view, 1.0)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(caught.value)
 
 
-def test_image_guidance_for_a_model_without_it_is_one_line(diffusers: None, tmp_path: Path) -> None:
+def test_image_guidance_for_a_model_without_it_is_refused(diffusers: None, tmp_path: Path) -> None:
     with pytest.raises(ProgdfError, match="does not support picture guidance; "):
         editor_of(settings_of(str(tiny_flux_kontext(tmp_path)), guidance="2.5,1.5"))
 
 
-def test_an_empty_sentence_is_one_line() -> None:
+def test_empty_prompt_is_refused() -> None:
     with pytest.raises(ProgdfError, match="needs an instruction; "):
         editor_of(EditorOptions(""), 'instruct:""')
 
 
-def test_without_the_packages_one_line_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_packages_are_reported_with_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "diffusers", None)
     with pytest.raises(ProgdfError, match=r"pip install progdf-studio\[diffusion\]"):
         editor_of(EditorOptions(""))
@@ -247,7 +245,7 @@ def text_run(folder: Path, model: str, out: str, **more: object) -> TrainOptions
     )
 
 
-def test_a_text_edit_is_trained_in_stages_and_stopped_anywhere_comes_to_the_same_bits(
+def test_text_edit_trains_in_stages_and_resumes_to_the_same_bits(
     pix2pix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_bear(tmp_path, 900)
@@ -281,10 +279,8 @@ def test_a_text_edit_is_trained_in_stages_and_stopped_anywhere_comes_to_the_same
     assert all(torch.equal(whole.offsets(s), again.offsets(s)) for s in (0.25, 0.5, 1.0))
 
 
-@pytest.mark.slow  # four runs; that views follow an approved picture is tested in every run of the tests
-def test_a_run_follows_an_anchor_of_any_camera_and_not_another_one_when_it_goes_on(
-    pix2pix: str, tmp_path: Path
-) -> None:
+@pytest.mark.slow  # four runs; the fast tests cover views that follow an approved picture
+def test_run_follows_the_anchor_and_refuses_a_changed_anchor(pix2pix: str, tmp_path: Path) -> None:
     klein = str(tiny_flux2_klein(tmp_path / "klein"))
     demo = bear(900)
     _ = write_bear(tmp_path, 900)
@@ -312,9 +308,7 @@ def test_a_run_follows_an_anchor_of_any_camera_and_not_another_one_when_it_goes_
         train(with_values(text_run(tmp_path, pix2pix, "alone"), anchor=anchor), quiet=True)
 
 
-def test_weights_are_looked_for_before_a_used_folder_is_trained_in_again(
-    pix2pix: str, tmp_path: Path
-) -> None:
+def test_weights_are_checked_before_a_run_folder_is_reused(pix2pix: str, tmp_path: Path) -> None:
     write_bear(tmp_path, 900)
     (tmp_path / "run" / "views").mkdir(parents=True)
     begin_log(RunFolder(tmp_path / "run"), text_run(tmp_path, "gone", "run").edit)
@@ -322,32 +316,32 @@ def test_weights_are_looked_for_before_a_used_folder_is_trained_in_again(
         check_command(resolve(text_run(tmp_path, "gone", "run")))
 
 
-def test_where_things_move_the_end_alone_is_asked(pix2pix: str, tmp_path: Path) -> None:
+def test_geometry_edit_requests_only_the_full_strength(pix2pix: str, tmp_path: Path) -> None:
     options = resolve(text_run(tmp_path, pix2pix, "run"))
     assert [resolve_kind(options, kind, 0).stages for kind in ("color", "style", "geometry")] == [4, 4, 1]
     several = replace(options, optimize=replace(options.optimize, stages=3))
     assert resolve_kind(several, "geometry", 0).stages == 3
 
 
-def test_views_of_text_edits_have_512_pixels_unless_others_are_asked_for(tmp_path: Path) -> None:
+def test_text_edits_default_to_512_pixel_views(tmp_path: Path) -> None:
     assert resolve(with_values(text_run(tmp_path, "m", "run"), image_size=0)).views.image_size == 512
     assert resolve(text_run(tmp_path, "m", "run")).views.image_size == 64
     assert resolve(quick_options(tmp_path, image_size=0)).views.image_size == 0
 
 
 @pytest.mark.parametrize("option", [{"quantize": "nf4"}, {"device": "cpu"}])
-def test_options_of_models_are_for_text_edits_alone(option: dict[str, object], tmp_path: Path) -> None:
+def test_model_options_are_for_text_edits_only(option: dict[str, object], tmp_path: Path) -> None:
     with pytest.raises(ProgdfError, match="does not apply to recolor; it is for instruct"):
         resolve(quick_options(tmp_path, **option))
 
 
-def test_parts_that_go_to_the_card_in_turn_paint_the_same_picture(
+def test_components_on_the_gpu_in_turn_paint_the_same_picture(
     pix2pix: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from diffusers import AutoencoderKL
 
     tiled = []
-    # a tiny autoencoder's tiles would be of 32 pixels
+    # the tiny autoencoder would have tiles of 32 pixels
     monkeypatch.setattr(AutoencoderKL, "enable_tiling", lambda self: tiled.append(self))
     editor = editor_of(settings_of(pix2pix))
     view = small().views[0]
@@ -359,7 +353,7 @@ def test_parts_that_go_to_the_card_in_turn_paint_the_same_picture(
     assert mixed.calls == 2 * network_steps(0.5, 1.0, 2) + 2
 
 
-def test_four_bits_need_their_package_and_a_card(pix2pix: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_four_bit_weights_need_their_package_and_a_gpu(pix2pix: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("trainer.editors.adapters.find_spec", lambda package: package)
     with pytest.raises(ProgdfError, match="needs a graphics card"):
         editor_of(settings_of(pix2pix, quantize="nf4"))
@@ -378,11 +372,11 @@ def test_four_bits_need_their_package_and_a_card(pix2pix: str, monkeypatch: pyte
         ("'twas night", "'twas night"),
     ],
 )
-def test_only_a_pair_of_quotes_around_a_sentence_is_taken_off(typed: str, read: str) -> None:
+def test_only_a_pair_of_enclosing_quotes_is_removed(typed: str, read: str) -> None:
     assert sentence(typed) == read
 
 
-def test_what_clip_does_not_read_of_a_long_sentence_is_said(pix2pix: str) -> None:
+def test_note_reports_the_end_of_the_prompt_that_clip_ignores(pix2pix: str) -> None:
     assert "does not read" not in editor_of(settings_of(pix2pix)).note
     words = " ".join(["very"] * 90 + ["batman"])
     note = editor_of(settings_of(pix2pix), f"instruct:{words}").note
@@ -390,7 +384,7 @@ def test_what_clip_does_not_read_of_a_long_sentence_is_said(pix2pix: str) -> Non
     assert note.endswith("batman”")
 
 
-def test_a_base_model_of_klein_s_is_asked_as_such(diffusers: None, tmp_path: Path) -> None:
+def test_base_model_of_klein_gets_its_own_settings(diffusers: None, tmp_path: Path) -> None:
     model = str(tmp_path / "base")
     klein_pipeline(tmp_path, is_distilled=False).save_pretrained(model)
     base = editor_of(EditorOptions(BATMAN, model, edit_size=64)).request
@@ -405,7 +399,7 @@ GIB = 2**30
 
 @pytest.fixture
 def card(monkeypatch: pytest.MonkeyPatch) -> Callable[[float, float], None]:
-    """A graphics card that has so many bytes free, for all that only asks."""
+    """Return a function that simulates a GPU with the given free and total bytes."""
 
     def has(free: float, total: float) -> None:
         monkeypatch.setattr("trainer.editors.adapters.gpu_memory", lambda: (int(free), int(total)))
@@ -419,9 +413,7 @@ def card(monkeypatch: pytest.MonkeyPatch) -> Callable[[float, float], None]:
     return has
 
 
-def test_the_log_says_what_will_paint_on_what_and_whether_it_fits(
-    pix2pix: str, card: Callable[[float, float], None]
-) -> None:
+def test_note_reports_device_precision_and_memory(pix2pix: str, card: Callable[[float, float], None]) -> None:
     assert "on the CPU in float32" in editor_of(settings_of(pix2pix)).note
     card(8 * GIB, 8 * GIB)
     assert (
@@ -435,36 +427,34 @@ def test_the_log_says_what_will_paint_on_what_and_whether_it_fits(
     assert editor_of(settings_of(pix2pix, device="cpu")).placement.device == "cpu"
 
 
-def test_a_card_without_bfloat16_gets_float16(
+def test_gpu_without_bfloat16_uses_float16(
     diffusers: None, tmp_path: Path, card: Callable[[float, float], None]
 ) -> None:
     card(8 * GIB, 8 * GIB)
     assert editor_of(settings_of(str(tiny_flux2_klein(tmp_path)))).placement.dtype == torch.float16
 
 
-def test_klein_is_the_default_where_it_is_here_and_fits(
+def test_klein_is_the_default_if_installed_and_fitting(
     monkeypatch: pytest.MonkeyPatch, card: Callable[[float, float], None]
 ) -> None:
-    small_one = "timbrooks/instruct-pix2pix"
+    small_model = "timbrooks/instruct-pix2pix"
     sizes = {"transformer": 3_880_000_000, "text_encoder": 4_020_000_000, "vae": 80_000_000}
-    assert default_model() == small_one  # no card
+    assert default_model() == small_model  # no GPU
     card(1 * GIB, 12 * GIB)
     monkeypatch.setattr("trainer.editors.adapters.component_sizes", lambda model, adapter: sizes)
     assert default_model() == "black-forest-labs/FLUX.2-klein-4B"
     card(8 * GIB, 8 * GIB)
-    assert default_model() == small_one
+    assert default_model() == small_model
 
     def absent(model: str, adapter: Adapter) -> dict[str, int]:
         raise missing_pipeline(model)
 
     card(80 * GIB, 80 * GIB)
     monkeypatch.setattr("trainer.editors.adapters.component_sizes", absent)
-    assert default_model() == small_one
+    assert default_model() == small_model
 
 
-def test_a_large_model_on_a_cpu_is_refused_unless_it_is_asked_for(
-    pix2pix: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_large_model_on_a_cpu_needs_an_explicit_device(pix2pix: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("trainer.editors.adapters._MAX_CPU_PARAMETERS", 1000)
     with pytest.raises(ProgdfError, match=r"finds no GPU: .* or add --device cpu"):
         editor_of(settings_of(pix2pix))
@@ -472,7 +462,7 @@ def test_a_large_model_on_a_cpu_is_refused_unless_it_is_asked_for(
 
 
 @pytest.mark.parametrize("when", ["loading", "painting"])
-def test_a_card_whose_memory_runs_out_is_one_line_with_what_to_try(
+def test_gpu_out_of_memory_is_one_line_with_remedies(
     pix2pix: str, when: str, monkeypatch: pytest.MonkeyPatch, card: Callable[[float, float], None]
 ) -> None:
     from diffusers import StableDiffusionInstructPix2PixPipeline as Pipeline
@@ -490,12 +480,12 @@ def test_a_card_whose_memory_runs_out_is_one_line_with_what_to_try(
         editor = replace(editor, load=lambda: MixedSteps.__new__(MixedSteps))
     with pytest.raises(
         ProgdfError, match=r"about 1\.0 GB needed, 0\.5 GB free; add --quantize nf4, .*klein-4B"
-    ) as told:
+    ) as caught:
         editor.edit(small().views[0], 1.0)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(caught.value)
 
 
-def test_a_gated_model_is_told_with_its_login(
+def test_gated_model_error_names_the_login(
     diffusers: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
@@ -513,7 +503,7 @@ def test_a_gated_model_is_told_with_its_login(
         ("QwenImageEditPlusPipeline", {}, "constraints.txt 'progdf-studio.qwen.'"),
     ],
 )
-def test_what_a_model_does_not_take_is_one_line(
+def test_option_or_package_unsuited_to_the_model_is_refused(
     diffusers: None,
     kind: str,
     option: dict[str, object],
@@ -531,9 +521,7 @@ def test_what_a_model_does_not_take_is_one_line(
 
 @pytest.mark.parametrize("name", ADAPTERS)
 @pytest.mark.parametrize("shape", [(1, 1), (16, 9), (9, 1), (3, 4), (1, 30)])
-def test_pictures_are_painted_at_the_model_s_area_in_sizes_that_it_takes(
-    name: str, shape: tuple[int, int]
-) -> None:
+def test_paint_size_has_the_area_and_multiples_of_the_model(name: str, shape: tuple[int, int]) -> None:
     adapter = ADAPTERS[name]
     for size in (adapter.size, 64, 32):
         width, height = adapter.paint_size(*shape, size)
@@ -545,7 +533,7 @@ def test_pictures_are_painted_at_the_model_s_area_in_sizes_that_it_takes(
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (16, 9), (9, 1), (3, 4), (700, 333)])
-def test_models_that_scale_to_an_area_of_their_own_leave_our_sizes_as_they_are(
+def test_paint_size_is_unchanged_by_the_rescaling_of_the_model(
     diffusers: None, shape: tuple[int, int]
 ) -> None:
     from diffusers.pipelines.qwenimage.pipeline_qwenimage_edit_plus import calculate_dimensions

@@ -1,4 +1,4 @@
-"""The source-mixed step in tiny pipelines of every class."""
+"""Source-mixed steps in tiny pipelines of every class."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from trainer.editors.mixed_steps import MixedSteps, euler_scheduler, network_ste
 SIDE = 64
 STEPS = 4
 KINDS = list(PIPELINES)
-ROUNDING = 1e-5  # of a picture decoded twice; its latents meet to 1e-6
+ROUNDING = 1e-5  # tolerance for a picture decoded twice; latents agree to 1e-6
 
 Ask = Callable[[Sequence[Tensor]], dict[str, object]]
 
@@ -52,7 +52,7 @@ def asking(kind: str, steps: int = STEPS) -> Ask:
 
 @cache
 def made(kind: str, folder: Path) -> tuple[MixedSteps, Tensor]:
-    """A pipeline with mixed steps, and what it made of `view()` before it had them."""
+    """Return a pipeline with mixed steps, and its picture of `view()` without them."""
     pipeline = PIPELINES[kind](folder)
     pipeline.set_progress_bar_config(disable=True)
     stock = pipeline(**asking(kind)([view()]), output_type="pt").images[0].permute(1, 2, 0)
@@ -70,7 +70,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def view(shift: float = 0.0) -> Tensor:
-    """Smooth colors, in 8 bits. [64,64,3]"""
+    """Return smooth colors, rounded to 8 bits. [64,64,3]"""
     ramp = torch.linspace(0, 1, SIDE)
     image = torch.stack(
         [ramp.expand(SIDE, SIDE), ramp[:, None].expand(SIDE, SIDE), ramp.flip(0) * ramp[:, None]], -1
@@ -82,14 +82,14 @@ def paint(mixed: MixedSteps, kind: str, strength: float, softness: float = 1.0) 
     return mixed.paint(asking(kind), [view()], view(), strength, softness)
 
 
-def test_strength_one_is_the_stock_pipeline_to_the_bit(kind: str, folder: Path) -> None:
+def test_strength_one_is_bit_identical_to_the_stock_pipeline(kind: str, folder: Path) -> None:
     mixed, stock = made(kind, folder)
-    paint(mixed, kind, 0.5)  # leaves nothing behind
+    paint(mixed, kind, 0.5)  # must leave no state behind
     assert torch.equal(paint(mixed, kind, 1.0), stock)
     assert float((stock - view()).abs().mean()) > 0.05
 
 
-def test_at_strength_zero_every_step_leads_to_the_source(
+def test_strength_zero_leads_every_step_to_the_source(
     kind: str, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mixed, _ = made(kind, folder)
@@ -111,12 +111,12 @@ def test_at_strength_zero_every_step_leads_to_the_source(
         latents = latents * mixed.pipeline.vae.config.scaling_factor
     assert float((ended - latents).abs().max()) < 1e-6 * float(latents.abs().max().clamp_min(1.0))
     assert float((painted - view()).abs().max()) < ROUNDING
-    remembers = 2 if kind == "Flux2KleinKVPipeline" else 0  # it keeps what it saw in its first step
-    assert mixed.calls - before == remembers
+    cache_calls = 2 if kind == "Flux2KleinKVPipeline" else 0  # it fills its cache in the first step
+    assert mixed.calls - before == cache_calls
     assert torch.equal(paint(mixed, kind, 0.0), view())
 
 
-def test_networks_that_predict_velocity_in_euler_s_steps_are_led_to_the_source_too(folder: Path) -> None:
+def test_velocity_predictions_in_euler_steps_reach_the_source(folder: Path) -> None:
     kind = "StableDiffusionXLInstructPix2PixPipeline"
     pipeline = PIPELINES[kind](folder)
     pipeline.set_progress_bar_config(disable=True)
@@ -133,14 +133,14 @@ def test_networks_that_predict_velocity_in_euler_s_steps_are_led_to_the_source_t
     assert float((ended - latents).abs().max()) > 0.1
 
 
-def test_the_change_grows_with_the_strength(kind: str, folder: Path) -> None:
+def test_change_grows_with_strength(kind: str, folder: Path) -> None:
     mixed, stock = made(kind, folder)
     whole = float((stock - view()).norm())
     shares = [float((paint(mixed, kind, s) - view()).norm()) / whole for s in (0.25, 0.5, 0.75)]
     assert 0.0 < shares[0] < shares[1] < shares[2] < 1.0
 
 
-def test_steps_without_a_say_ask_no_network(kind: str, folder: Path) -> None:
+def test_steps_without_weight_skip_the_network(kind: str, folder: Path) -> None:
     mixed, _ = made(kind, folder)
     before = mixed.calls
     paint(mixed, kind, 0.25)
@@ -149,14 +149,14 @@ def test_steps_without_a_say_ask_no_network(kind: str, folder: Path) -> None:
     assert mixed.calls - before == ADAPTERS[kind].passes + extra
 
 
-def test_nine_strengths_ask_178_times_where_all_steps_would_be_252() -> None:
+def test_nine_strengths_need_178_network_steps_instead_of_252() -> None:
     assert sum(network_steps(i / 8, 1.0, 28) for i in range(9)) == 178
     assert sum(network_steps(i / 8, 0.25, 28) for i in range(9)) == 145
     assert {step_weight(1.0, soft, i / 28) for soft in (0.25, 1.0, 9.0) for i in range(28)} == {1.0}
     assert {step_weight(0.0, soft, i / 28) for soft in (0.25, 1.0, 9.0) for i in range(28)} == {0.0}
 
 
-def test_a_source_of_its_own_is_where_strength_zero_ends(kind: str, folder: Path) -> None:
+def test_strength_zero_ends_at_a_separate_source(kind: str, folder: Path) -> None:
     mixed, _ = made(kind, folder)
     other = view(0.2)
     ended = mixed.paint(asking(kind), [view()], other, 1e-9, 1.0)
@@ -166,7 +166,7 @@ def test_a_source_of_its_own_is_where_strength_zero_ends(kind: str, folder: Path
 
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if ADAPTERS[kind].references])
-def test_further_pictures_are_looked_at_and_are_not_the_source(kind: str, folder: Path) -> None:
+def test_reference_pictures_are_used_but_are_not_the_source(kind: str, folder: Path) -> None:
     mixed, stock = made(kind, folder)
     with_reference = [view(), view(0.4)]
     assert not torch.equal(mixed.paint(asking(kind), with_reference, view(), 1.0, 1.0), stock)
@@ -176,7 +176,7 @@ def test_further_pictures_are_looked_at_and_are_not_the_source(kind: str, folder
 
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if ADAPTERS[kind].encodes_alone])
-def test_a_sentence_is_encoded_once_and_its_encoder_may_go(kind: str, folder: Path) -> None:
+def test_prompt_is_encoded_once_and_its_encoder_can_be_freed(kind: str, folder: Path) -> None:
     pipeline = PIPELINES[kind](folder)
     pipeline.set_progress_bar_config(disable=True)
     _, stock = made(kind, folder)
@@ -188,7 +188,7 @@ def test_a_sentence_is_encoded_once_and_its_encoder_may_go(kind: str, folder: Pa
     assert torch.equal(mixed.paint(asking(kind), [view()], view(), 1.0, 1.0), stock)
 
 
-def test_steps_of_ddim_are_replaced_by_euler_s(folder: Path) -> None:
+def test_unsupported_schedulers_are_replaced_by_euler(folder: Path) -> None:
     from diffusers import DDIMScheduler, HeunDiscreteScheduler
 
     pipeline = PIPELINES["StableDiffusionInstructPix2PixPipeline"](folder)

@@ -1,4 +1,4 @@
-"""`pictures:A.png`: what was rendered, changed anywhere and given back, with its camera."""
+"""`pictures:A.png`: rendered views, edited in any program and returned with their cameras."""
 
 from __future__ import annotations
 
@@ -42,41 +42,41 @@ def views_of(scene: Gaussians, *paths: Path) -> list[View]:
     return [make_view(scene, whole_scene(scene), camera, WHITE) for camera in picture_cameras(paths, ())]
 
 
-def test_a_picture_is_its_view_s_edit(tmp_path: Path) -> None:
+def test_picture_is_the_edit_of_its_view(tmp_path: Path) -> None:
     scene = ball()
     camera = looking(scene)[0]
-    shown = render_view(scene, camera, WHITE).clamp(0, 1)  # as a view is: a picture knows nothing above white
+    shown = render_view(scene, camera, WHITE).clamp(0, 1)  # clamped like a view
     path = save(tmp_path / "A.png", 1 - 0.5 * shown, camera)
     (view,) = views_of(scene, path)
     editor = make_editor(EditorOptions(f"pictures:{path}"), scene, whole_scene(scene), [view])
-    assert editor.stages == ()  # the way there is ours
+    assert editor.stages == ()  # the trainer interpolates intermediate strengths
     assert editor.kind == "color"
     assert torch.equal(editor.edit(view, 0.0), view.image)
     inside = view.mask > 0.99
     expected = 1 - 0.5 * view.image
     assert float((editor.edit(view, 1.0) - expected)[inside].abs().max()) < 0.01
-    way = [editor.edit(view, k / 8) for k in range(9)]
-    steps = [float((b - a)[inside].abs().mean()) for a, b in pairwise(way)]
-    assert min(steps) > 0.6 * max(steps)  # .8 when written: straight in OKLab, not one jump
+    images = [editor.edit(view, k / 8) for k in range(9)]
+    steps = [float((b - a)[inside].abs().mean()) for a, b in pairwise(images)]
+    assert min(steps) > 0.6 * max(steps)  # 0.8 when written: straight in OKLab, not one jump
 
 
 @pytest.mark.parametrize("color", [[0.0, 0.0, 0.0], [0.1, 0.3, 0.8]])
-def test_a_background_of_another_color_is_found(color: list[float]) -> None:
+def test_background_of_another_color_is_found(color: list[float]) -> None:
     scene = ball()
     background = torch.tensor(color)
     drawn = render(scene, looking(scene)[0])
     picture = quantize_image(drawn.image + drawn.transmittance[..., None] * (background - 1))
-    picture[:12] = torch.tensor([0.9, 0.1, 0.2])  # a quarter of it painted over
+    picture[:12] = torch.tensor([0.9, 0.1, 0.2])  # a quarter is painted over
     found = background_of(picture, drawn.image, drawn.transmittance[..., None], quantize_image)
     assert float((found - background).abs().max()) <= 0.51 / 255
 
 
-def test_a_picture_without_any_background_has_the_run_s() -> None:
+def test_picture_without_background_has_the_background_of_the_run() -> None:
     picture = torch.rand(8, 8, 3, generator=torch.Generator().manual_seed(0))
     assert torch.equal(background_of(picture, picture.flip(0), torch.zeros(8, 8, 1), quantize_image), WHITE)
 
 
-def test_subfolders_hold_the_strengths_between(tmp_path: Path) -> None:
+def test_subfolders_hold_intermediate_strengths(tmp_path: Path) -> None:
     scene = ball()
     cameras = looking(scene)
     paths = []
@@ -84,11 +84,11 @@ def test_subfolders_hold_the_strengths_between(tmp_path: Path) -> None:
         image = render_view(scene, camera, WHITE)
         paths.append(save(tmp_path / f"{name}.png", 0.5 * image, camera))
         save(tmp_path / "0.5" / f"{name}.png", 0.75 * image, None)
-    (tmp_path / "2024").mkdir()  # a folder of something else
+    (tmp_path / "2024").mkdir()  # an unrelated folder
     spec = f"pictures:{paths[0]},{paths[1]}"
     views = views_of(scene, *paths)
     editor = make_editor(EditorOptions(spec), scene, whole_scene(scene), views)
-    assert editor.stages == tuple(k / 8 for k in range(1, 9))  # eight at least, those given among them
+    assert editor.stages == tuple(k / 8 for k in range(1, 9))  # at least eight, including the given ones
     half = editor.edit(views[1], 0.5)
     assert float((half - 0.75 * views[1].image)[views[1].mask > 0.99].abs().max()) < 0.02
     (tmp_path / "0.5" / "B.png").unlink()
@@ -99,7 +99,7 @@ def test_subfolders_hold_the_strengths_between(tmp_path: Path) -> None:
         make_editor(EditorOptions(spec), scene, whole_scene(scene), views)
 
 
-def test_a_picture_of_another_size_brings_its_camera_along(tmp_path: Path) -> None:
+def test_picture_of_another_size_scales_its_camera(tmp_path: Path) -> None:
     scene = ball()
     camera = looking(scene)[0]
     path = save(tmp_path / "A.png", render_view(scene, camera.resize(128, 96), WHITE), camera)
@@ -108,14 +108,14 @@ def test_a_picture_of_another_size_brings_its_camera_along(tmp_path: Path) -> No
     assert torch.allclose(found.K, camera.resize(128, 96).K)
 
 
-def test_a_picture_that_was_cropped_is_one_line(tmp_path: Path) -> None:
+def test_cropped_picture_is_refused(tmp_path: Path) -> None:
     camera = looking(ball())[0]
     path = save(tmp_path / "A.png", torch.ones(48, 48, 3), camera)
     with pytest.raises(ProgdfError, match="48x48 pixels, it was rendered with 64x48; keep the proportions"):
         picture_cameras([path], ())
 
 
-def test_what_is_no_list_of_pictures_is_one_line(tmp_path: Path) -> None:
+def test_invalid_picture_list_is_a_one_line_error(tmp_path: Path) -> None:
     Image.new("RGB", (4, 4)).save(tmp_path / "A.png")
     (tmp_path / "B").mkdir()
     Image.new("RGB", (4, 4)).save(tmp_path / "B" / "A.jpg")
@@ -135,12 +135,12 @@ def test_what_is_no_list_of_pictures_is_one_line(tmp_path: Path) -> None:
         picture_paths(",".join(str(path) for path in many))
 
 
-def test_a_comma_in_a_name_is_none_between_two(tmp_path: Path) -> None:
+def test_comma_in_a_file_name_is_no_separator(tmp_path: Path) -> None:
     Image.new("RGB", (4, 4)).save(tmp_path / "a,b.png")
     assert picture_paths(f"{tmp_path}/a,b.png") == (tmp_path / "a,b.png",)
 
 
-def test_a_shift_by_two_pixels_is_undone_before_training(tmp_path: Path) -> None:
+def test_shift_by_two_pixels_is_undone_before_training(tmp_path: Path) -> None:
     scene = ball()
     camera = looking(scene)[0]
     image = render_view(scene, camera, WHITE).clamp(0, 1)

