@@ -13,14 +13,14 @@ from tests.helpers.trained import write_bear
 
 @pytest.fixture(scope="session", autouse=True)
 def plots() -> Iterator[None]:
-    """Runs draw no curves; the tests of the report draw them."""
+    """Replace the curves of reports by blank images; the tests of the report draw them."""
     with blank_plots():
         yield
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a small bear."""
-    made = tmp_path_factory.mktemp("bear")
-    write_bear(made)
-    return made
+    """Write a small bear to a folder; return the folder."""
+    folder = tmp_path_factory.mktemp("bear")
+    write_bear(folder)
+    return folder

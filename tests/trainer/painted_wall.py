@@ -1,4 +1,4 @@
-"""A wall of large, soft, thick Gaussians, and paint on it that is finer than they are."""
+"""Test wall of large, soft, thick Gaussians, and paint on it that is finer than they are."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CAMERA = Camera(
 
 
 def wall(seed: int = 0, count: int = 2500, size: float = 0.09, rough: float = 0.05) -> Gaussians:
-    """A wall across the picture, whose Gaussians are 5 pixels large and lie up to 6 before and behind it."""
+    """Return a wall across the picture; its Gaussians are 5 pixels wide and up to 6 pixels off its plane."""
     random = torch.Generator().manual_seed(seed)
     means = torch.rand(count, 3, generator=random) * torch.tensor([3.2, 3.2, 0.0]) - torch.tensor(
         [1.6, 1.6, 0.0]
@@ -48,7 +48,7 @@ def picture(scene: Gaussians) -> torch.Tensor:
 
 
 def letters(scene: Gaussians) -> PaintedView:
-    """Bars of five pixels in dark blue, as wide as what is between them, in the middle of the wall."""
+    """Return the wall with dark blue bars, 5 pixels wide with gaps of 5, in its middle."""
     painted = torch.zeros(SIDE, SIDE, dtype=torch.bool)
     for left in range(45, 85, 10):
         painted[50:78, left : left + 5] = True
@@ -56,7 +56,7 @@ def letters(scene: Gaussians) -> PaintedView:
 
 
 def paint_on(scene: Gaussians, painted: torch.Tensor) -> PaintedView:
-    """These pixels in dark blue. [H,W] bool"""
+    """Return the wall with the pixels of `painted` in dark blue. [H,W] bool"""
     drawn = painted[..., None] * torch.tensor([0.1, 0.15, 0.5, 1.0])
     return PaintedView(CAMERA, composite_over(picture(scene), drawn), drawn)
 

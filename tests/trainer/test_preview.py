@@ -1,4 +1,4 @@
-"""`progdf preview`: a grade of an edit, or its editor's own picture, asked for and answered in lines."""
+"""`progdf preview`: requests and responses, one JSON line each; grades, palettes and pictures."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def request(number: int, out: Path, **changes: object) -> str:
     camera = bear(600).cameras[0].resize(64, 48)
-    asked = {
+    values = {
         "number": number,
         "out": str(out / f"{number}.png"),
         "region": "all",
@@ -41,10 +41,10 @@ def request(number: int, out: Path, **changes: object) -> str:
         "width": 64,
         "height": 48,
     }
-    return json.dumps(asked | changes)
+    return json.dumps(values | changes)
 
 
-def test_strength_0_is_the_original_and_1_is_not(scene: Path, tmp_path: Path) -> None:
+def test_preview_changes_more_at_higher_strength(scene: Path, tmp_path: Path) -> None:
     previewer = Previewer(scene, tmp_path / "kept")
     for number, strength in enumerate((0.0, 0.5, 1.0)):
         line = request(number, tmp_path, strength=strength, editor="stripes:#3060d0")
@@ -54,24 +54,22 @@ def test_strength_0_is_the_original_and_1_is_not(scene: Path, tmp_path: Path) ->
     assert 0.0 < float(change[0]) < float(change[1])
 
 
-def test_an_edit_that_a_map_of_color_carries_is_answered_with_a_grade(scene: Path, tmp_path: Path) -> None:
+def test_color_edit_is_answered_with_a_grade(scene: Path, tmp_path: Path) -> None:
     previewer = Previewer(scene, tmp_path / "kept")
     for number, editor in enumerate(("recolor:#3060d0", "darken:0.5")):
-        told = answer(previewer, request(number, tmp_path, editor=editor))
-        assert (told.error, told.made) == ("", "grade")
+        response = answer(previewer, request(number, tmp_path, editor=editor))
+        assert (response.error, response.made) == ("", "grade")
         gdf = load_gdf(tmp_path / f"{number}.gdf", previewer.scene)
         assert (gdf.field.kind, gdf.instruction) == ("grade", editor)
         assert not (tmp_path / f"{number}.png").exists()
 
 
-def test_the_main_colors_of_a_region_come_first_and_a_grade_says_how_near_it_is(
-    scene: Path, tmp_path: Path
-) -> None:
+def test_region_palette_is_returned_and_a_grade_reports_its_error(scene: Path, tmp_path: Path) -> None:
     previewer = Previewer(scene, tmp_path / "kept")
-    told = answer(previewer, request(1, tmp_path, editor="grade"))
-    assert (told.error, told.made) == ("", "palette")
-    assert 3 <= len(told.palette) <= 5
-    spec = "grade:" + ",".join([f"{told.palette[0]}=#3060d0", *told.palette[1:]])
+    response = answer(previewer, request(1, tmp_path, editor="grade"))
+    assert (response.error, response.made) == ("", "palette")
+    assert 3 <= len(response.palette) <= 5
+    spec = "grade:" + ",".join([f"{response.palette[0]}=#3060d0", *response.palette[1:]])
     graded = answer(previewer, request(2, tmp_path, editor=spec))
     assert (graded.error, graded.made) == ("", "grade")
     assert graded.note.endswith("dB to the exact colors")
@@ -81,7 +79,7 @@ def test_the_main_colors_of_a_region_come_first_and_a_grade_says_how_near_it_is(
     )
 
 
-def test_what_does_not_work_is_one_line_and_the_next_request_does(scene: Path, tmp_path: Path) -> None:
+def test_failed_request_is_one_line_and_the_next_succeeds(scene: Path, tmp_path: Path) -> None:
     previewer = Previewer(scene, tmp_path / "kept")
     assert "holds no Gaussian" in answer(previewer, request(1, tmp_path, region="sphere:99,99,99,1")).error
     assert "unknown editor" in answer(previewer, request(2, tmp_path, editor="paint:1")).error
@@ -89,34 +87,34 @@ def test_what_does_not_work_is_one_line_and_the_next_request_does(scene: Path, t
     assert answer(previewer, request(3, tmp_path)).error == ""
 
 
-def test_only_the_last_of_several_requests_is_answered() -> None:
+def test_only_the_newest_request_is_answered() -> None:
     lines: queue.SimpleQueue[str] = queue.SimpleQueue()
     for line in ("first", "second", "third"):
         lines.put(line)
     assert newest_line(lines) == "third"
 
 
-def test_the_command_ends_with_its_input(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_command_ends_with_its_input(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stdin", io.StringIO(""))
     assert main(["preview", str(scene)]) == 0
 
 
-def test_what_would_paint_a_sentence_is_said_and_painted_only_when_it_is_asked_for(
-    scene: Path, tmp_path: Path
-) -> None:
+def test_text_edit_returns_a_note_until_a_picture_is_requested(scene: Path, tmp_path: Path) -> None:
     for package in ("diffusers", "transformers", "accelerate"):
         pytest.importorskip(package, reason="pip install progdf-studio[diffusion]")
     model = str(tiny_instruct_pix2pix(tmp_path / "pix2pix"))
     previewer = Previewer(scene, tmp_path / "kept")
-    asked = {"editor": "instruct:paint it", "model": model}
-    told = answer(previewer, request(0, tmp_path, seed=-1, **asked))
-    assert (told.error, told.made) == ("", "note")
-    assert told.note == f"{model} on the CPU in float32; 20 network calls per picture"
+    values = {"editor": "instruct:paint it", "model": model}
+    response = answer(previewer, request(0, tmp_path, seed=-1, **values))
+    assert (response.error, response.made) == ("", "note")
+    assert response.note == f"{model} on the CPU in float32; 20 network calls per picture"
     assert not (tmp_path / "0.png").exists()
     for number, seed in ((1, 0), (2, 1)):
-        told = answer(previewer, request(number, tmp_path, seed=seed, **asked))
-        assert (told.error, told.made, told.follows) == ("", "picture", False), "it takes one picture alone"
+        response = answer(previewer, request(number, tmp_path, seed=seed, **values))
+        assert (response.error, response.made, response.follows) == ("", "picture", False), (
+            "it takes one picture alone"
+        )
     first, again = (read_picture(tmp_path / f"{number}.png") for number in (1, 2))
     assert not torch.equal(first, again), "another seed, another picture"
-    told = answer(previewer, request(3, tmp_path, seed=-1, editor="instruct:paint it", model="gone"))
-    assert told.error.startswith("the weights of gone are not on this machine")
+    response = answer(previewer, request(3, tmp_path, seed=-1, editor="instruct:paint it", model="gone"))
+    assert response.error.startswith("the weights of gone are not on this machine")
