@@ -1,4 +1,4 @@
-"""`--region changed`: the members that show where pictures differ from the scene."""
+"""`--region changed`: the members visible where pictures differ from the scene."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def settings(pictures: list[Path], folder: Path) -> RegionRequest:
 
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Four sides of the bear, its body filled with blue, as .png with their cameras."""
+    """Write four views of the bear with a blue body as .png with their cameras; return the paths."""
     folder = tmp_path_factory.mktemp("pictures")
     case = small("body", count=6, image_size=160)
     editor = make_editor(EditorOptions("recolor:#3060d0"), case.scene, case.region, case.views)
@@ -51,14 +51,14 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return paths
 
 
-def test_what_was_filled_is_found_again(pictures: list[Path], tmp_path: Path) -> None:
+def test_filled_region_is_found_again(pictures: list[Path], tmp_path: Path) -> None:
     case = small("body", count=6, image_size=160)
     found = parse_region("changed", case.scene, kinds=region_kinds(settings(pictures, tmp_path)))
     truth = set(case.region.members.tolist())
     members = set(found.members.tolist())
     assert len(truth & members) > 0.4 * len(
         truth | members
-    )  # .47 of few, large Gaussians; .94-.99 of the robot's
+    )  # 0.47 with few, large Gaussians; 0.94 to 0.99 on the robot
     named = "changed:" + ",".join(str(path) for path in pictures)
     again = parse_region(named, case.scene, kinds=region_kinds(settings([], tmp_path)))
     assert torch.equal(again.members, found.members)
@@ -66,21 +66,21 @@ def test_what_was_filled_is_found_again(pictures: list[Path], tmp_path: Path) ->
     assert len(without) == len(case.scene) - len(found)
 
 
-def test_pictures_that_differ_nowhere_are_one_line(tmp_path: Path) -> None:
+def test_unchanged_pictures_are_a_one_line_error(tmp_path: Path) -> None:
     case = small("body", count=6, image_size=160)
     to_picture(case.views[0].image).save(tmp_path / "A.png", pnginfo=camera_chunk(case.views[0].camera))
     with pytest.raises(ProgdfError, match="differ nowhere from the scene; change them"):
         parse_region("changed", case.scene, kinds=region_kinds(settings([tmp_path / "A.png"], tmp_path)))
 
 
-def test_changed_without_pictures_is_one_line_before_the_scene_is_read(tmp_path: Path) -> None:
+def test_changed_without_pictures_is_refused_before_the_scene_is_read(tmp_path: Path) -> None:
     with pytest.raises(ProgdfError, match="changed needs pictures: use it with --editor pictures"):
         check_region("changed", region_checks(settings([], tmp_path)))
     with pytest.raises(ProgdfError, match="unknown region 'changed'"):
         check_region("changed")
 
 
-def test_a_picture_that_shows_edits_is_one_line_before_the_scene_is_read(tmp_path: Path) -> None:
+def test_picture_with_edits_is_refused_before_the_scene_is_read(tmp_path: Path) -> None:
     case = small("body", count=6, image_size=160)
     carried = camera_chunk(case.views[0].camera, ["jacket", "gold"])
     to_picture(case.views[0].image).save(tmp_path / "A.png", pnginfo=carried)
@@ -89,7 +89,7 @@ def test_a_picture_that_shows_edits_is_one_line_before_the_scene_is_read(tmp_pat
 
 
 def scene_picture() -> Tensor:
-    """Soft blobs on white, as a render has them."""
+    """Return soft blobs on white, like a render."""
     rows, columns = np.mgrid[:120, :160]
     image = np.ones((120, 160, 3), np.float32)
     for y, x, color in ((40, 50, (0.8, 0.3, 0.1)), (70, 110, (0.2, 0.5, 0.3)), (90, 40, (0.3, 0.3, 0.7))):
@@ -121,7 +121,7 @@ def test_noise_and_a_shift_are_no_change(how: str) -> None:
     found = find_change(original, saved(painted(original)))
     truth = torch.zeros_like(found)
     truth[35:50, 40:60] = True
-    assert float((found & truth).sum() / (found | truth).sum()) > 0.45  # rims of a pixel or two
+    assert float((found & truth).sum() / (found | truth).sum()) > 0.45  # borders of one or two pixels differ
     assert bool(found[36:49, 41:59].all())
 
 
@@ -129,7 +129,7 @@ SIZES = ((256, 256), (511, 383), (980, 800), (1619, 1080), (2040, 1530))
 
 
 def fine_scene(kind: str) -> Gaussians:
-    """Busy at every size: splats of a pixel and less, soft ones, and an object of many parts."""
+    """Return a scene with detail at every size: a bear, dots below a pixel, or soft blobs."""
     if kind == "bear":
         return bear(4000).gaussians
     return random_gaussians(6000, seed=3, sh_degree=2, spread=0.4, scale=0.004 if kind == "dots" else 0.04)
@@ -141,7 +141,7 @@ def fine_scene(kind: str) -> Gaussians:
     "size",
     [size if size in SIZES[1:2] else pytest.param(size, marks=pytest.mark.slow) for size in SIZES],
 )
-def test_an_untouched_picture_has_no_change(
+def test_untouched_picture_has_no_change(
     tmp_path: Path, kind: str, size: tuple[int, int], background: tuple[int, int, int]
 ) -> None:
     scene = fine_scene(kind)
@@ -153,7 +153,7 @@ def test_an_untouched_picture_has_no_change(
         assert not bool(find_change(original, picture, saving_loss(tmp_path / name)).any()), name
 
 
-def test_a_faint_tint_of_a_png_is_found(tmp_path: Path) -> None:
+def test_faint_tint_of_a_png_is_found(tmp_path: Path) -> None:
     scene = fine_scene("bear")
     camera = orbit_rig(scene, 5, 700, 600, up=torch.tensor([0.0, 1.0, 0.0]))[1]
     rendered = np.asarray(to_picture(render_view(scene, camera, torch.ones(3)))).copy()
@@ -169,7 +169,7 @@ def test_a_faint_tint_of_a_png_is_found(tmp_path: Path) -> None:
 
 
 def two_sheets(gap: float, side: int = 26) -> Gaussians:
-    """A square sheet of thin splats of one color across z = 0, and the same `gap` behind it; radius 1."""
+    """Return a square sheet of thin splats of one color at z = 0, and a second one `gap` behind it."""
     rng = np.random.default_rng(0)
     line = np.linspace(-0.75, 0.75, side)
     plan = np.stack(np.meshgrid(line, line), axis=2).reshape(-1, 2) + rng.normal(0, 0.004, (side**2, 2))
@@ -187,16 +187,14 @@ def two_sheets(gap: float, side: int = 26) -> Gaussians:
 
 
 def seen_from(z: float, size: int = 160) -> Camera:
-    # straight: splats are drawn by the depth of their centers, which mixes near sheets that are seen aslant
+    # straight on, because sorting by center depth mixes close sheets in an oblique view
     viewmat = look_at(torch.tensor([0.0, 0.0, z]), torch.zeros(3), torch.tensor([0.0, -1.0, 0.0]))
     return Camera(viewmat, intrinsics(0.6, size, size), size, size)
 
 
 @pytest.mark.parametrize("region", ["changed", "all"])
 @pytest.mark.parametrize("gap", [0.01, 0.05, 0.2])
-def test_what_is_painted_on_a_thin_thing_s_front_does_not_show_from_behind(
-    tmp_path: Path, gap: float, region: str
-) -> None:
+def test_paint_on_a_thin_sheet_is_invisible_from_behind(tmp_path: Path, gap: float, region: str) -> None:
     scene, camera = two_sheets(gap), seen_from(-3.0)
     painted = render_view(scene, camera, torch.ones(3)).clamp(0, 1)
     rows, columns = np.mgrid[:160, :160]
@@ -215,7 +213,7 @@ def test_what_is_painted_on_a_thin_thing_s_front_does_not_show_from_behind(
 
     def change(z: float) -> float:
         before, after = (render_view(some, seen_from(z), torch.ones(3)) for some in (scene, edited))
-        return float((after - before).abs()[40:120, 40:120].max())  # the rims are soft
+        return float((after - before).abs()[40:120, 40:120].max())  # the borders are soft
 
     assert change(-3.0) > 0.2
     assert change(3.0) < 1 / 255

@@ -1,4 +1,4 @@
-"""What a handful of rough masks leaves wrong: strays seen by one view, loose pieces, holes."""
+"""Repairs of regions from few rough masks: strays seen by one view, loose pieces, holes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from trainer.regions.few_masks import connected_pieces, drop_strays, find_holes
 
 
 def grids(*places: tuple[float, int]) -> Gaussians:
-    """Square sheets of Gaussians 0.1 apart, each at some depth with so many on a side."""
+    """Return square sheets of Gaussians 0.1 apart, each given as (depth, Gaussians per side)."""
     sheets = []
     for depth, side in places:
         x, y = torch.meshgrid(torch.arange(side), torch.arange(side), indexing="ij")
@@ -21,36 +21,36 @@ def grids(*places: tuple[float, int]) -> Gaussians:
     return replace(random_gaussians(len(means)), means=means)
 
 
-def test_what_one_of_two_masks_holds_is_no_member() -> None:
+def test_gaussian_inside_one_of_two_masks_is_no_member() -> None:
     scene = grids((0.0, 10))
     views = torch.full((100,), 3.0)
     inside = torch.full((100,), 2.0)
     inside[40:60] = 1.0
-    said: list[str] = []
-    kept = drop_strays(scene, torch.ones(100, dtype=torch.bool), views, inside, said.append)
+    messages: list[str] = []
+    kept = drop_strays(scene, torch.ones(100, dtype=torch.bool), views, inside, messages.append)
     assert kept.nonzero()[:, 0].tolist() == [*range(40), *range(60, 100)]
-    assert said == [
+    assert messages == [
         "the masks: 20 Gaussians inside one mask only, where two views see it, left to what surrounds them"
     ]
 
 
-def test_a_tree_behind_that_one_view_sees_is_left_out_though_it_is_larger() -> None:
+def test_larger_background_seen_by_one_view_is_dropped() -> None:
     scene = grids((0.0, 10), (5.0, 20))
     near = torch.arange(500) < 100
     views = torch.where(near, 3.0, 1.0)
-    said: list[str] = []
-    kept = drop_strays(scene, torch.ones(500, dtype=torch.bool), views, views, said.append)
+    messages: list[str] = []
+    kept = drop_strays(scene, torch.ones(500, dtype=torch.bool), views, views, messages.append)
     assert torch.equal(kept, near)
-    assert said == ["the masks: 400 Gaussians apart from the 1 largest connected surface, left out"]
+    assert messages == ["the masks: 400 Gaussians apart from the 1 largest connected surface, left out"]
 
 
-def test_two_hands_are_both_kept() -> None:
+def test_two_separate_pieces_are_both_kept() -> None:
     scene = grids((0.0, 10), (5.0, 8))
     views = torch.full((164,), 2.0)
     assert bool(drop_strays(scene, torch.ones(164, dtype=torch.bool), views, views).all())
 
 
-def test_a_hole_is_filled_unless_two_views_see_through_it() -> None:
+def test_hole_is_filled_unless_two_views_see_through_it() -> None:
     scene = grids((0.0, 12))
     member = torch.ones(144, dtype=torch.bool)
     member[65] = False
@@ -58,20 +58,20 @@ def test_a_hole_is_filled_unless_two_views_see_through_it() -> None:
     outside = torch.zeros(144)
     assert find_holes(scene, member, outside).tolist() == [65, 78]
     outside[78] = 2.0
-    said: list[str] = []
-    assert find_holes(scene, member, outside, said.append).tolist() == [65]
-    assert said == ["the masks: 1 Gaussian in holes of it, added"]
+    messages: list[str] = []
+    assert find_holes(scene, member, outside, messages.append).tolist() == [65]
+    assert messages == ["the masks: 1 Gaussian in holes of it, added"]
 
 
-def test_no_member_at_all_stays_none() -> None:
+def test_empty_region_stays_empty() -> None:
     scene = grids((0.0, 4))
-    nobody = torch.zeros(16, dtype=torch.bool)
+    no_members = torch.zeros(16, dtype=torch.bool)
     views = torch.zeros(16)
-    assert not bool(drop_strays(scene, nobody, views, views).any())
-    assert not len(find_holes(scene, nobody, views))
+    assert not bool(drop_strays(scene, no_members, views, views).any())
+    assert not len(find_holes(scene, no_members, views))
 
 
-def test_large_gaussians_that_touch_are_one_piece_beside_many_small_ones() -> None:
+def test_touching_large_gaussians_are_one_piece_beside_small_ones() -> None:
     scene = grids((0.0, 10), (9.0, 30))
     small = torch.arange(1000) >= 100
     means = torch.where(small[:, None], scene.means * torch.tensor([0.01, 0.01, 1.0]), scene.means)

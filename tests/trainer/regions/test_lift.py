@@ -1,4 +1,4 @@
-"""Masks lifted to Gaussians: the rules, their thresholds, and what becomes of Gaussians no view shows."""
+"""Lifting of masks to Gaussians: rules, thresholds, and the surface vote for hidden Gaussians."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ WALL = 15
 
 
 def overlap(members: Tensor, expected: Tensor) -> float:
-    """Intersection over union of rows [M] and a mask [N]."""
+    """Return the intersection over union of rows [M] and a mask [N]."""
     found = torch.zeros_like(expected)
     found[members] = True
     return float((found & expected).sum() / (found | expected).sum())
 
 
 def wall(depth: float, side: int = WALL, spacing: float = 0.1) -> Gaussians:
-    """Flat Gaussians that cover a square across the z axis at this depth."""
+    """Return flat Gaussians that cover a square across the z axis at this depth."""
     line = (torch.arange(side) - (side - 1) / 2) * spacing
     x, y = (grid.flatten() for grid in torch.meshgrid(line, line, indexing="xy"))
     count = len(x)
@@ -63,11 +63,11 @@ def test_masks_of_a_part_lift_back_to_the_part(demo: DemoScene, cameras: list[Ca
     member = demo.labels == demo.label_names.index(part)
     masks = [label_mask(demo.gaussians, member, camera) for camera in cameras]
     region = lift_masks(demo.gaussians, cameras, masks)
-    assert overlap(region.members, member) > 0.94  # .955-1 when written, .68-.93 without the neighbors
+    assert overlap(region.members, member) > 0.94  # 0.955-1 when written, 0.68-0.93 without the neighbors
 
 
 @pytest.mark.slow
-def test_every_large_part_of_the_whole_bear_lifts_back_to_97_per_cent() -> None:
+def test_large_parts_of_the_full_bear_lift_back_to_97_percent() -> None:
     demo = bear(24_000)
     views = orbit_rig(demo.gaussians, 32, 512, 512)
     for number, name in enumerate(demo.label_names):
@@ -78,9 +78,7 @@ def test_every_large_part_of_the_whole_bear_lifts_back_to_97_per_cent() -> None:
             assert overlap(region.members, member) >= 0.97, name
 
 
-def test_masks_over_everything_select_everything_and_over_nothing_nothing(
-    demo: DemoScene, cameras: list[Camera]
-) -> None:
+def test_full_masks_select_everything_and_empty_masks_nothing(demo: DemoScene, cameras: list[Camera]) -> None:
     white = [torch.ones(256, 256)] * 4
     assert len(lift_masks(demo.gaussians, cameras[:4], white)) == len(demo.gaussians)
     nothing = lift_masks(demo.gaussians, cameras[:4], [1 - mask for mask in white])
@@ -91,15 +89,15 @@ def test_masks_over_everything_select_everything_and_over_nothing_nothing(
 # ------------------------------------------------------------------------------------------------- rules
 
 
-def test_the_rules_are_shares_of_weight_and_of_pixels() -> None:
+def test_rules_are_shares_of_weight_and_of_pixels() -> None:
     sums = torch.tensor([[3.0, 6.0, 4.0, 10.0], [0.0, 0.0, 0.0, 0.0]])
     evidence = Evidence(*sums.unbind(1), *torch.ones(4, 2))
     assert score(evidence, "share").tolist() == pytest.approx([3 / 4, 0.0])
     assert score(evidence, "paper").tolist() == pytest.approx([6 / 10, 0.0])
 
 
-def test_a_gaussian_is_a_member_from_the_threshold_on() -> None:
-    scene = replace(wall(3.0), log_scales=wall(3.0).log_scales - 1.2)  # apart: none covers another
+def test_gaussian_is_a_member_from_the_threshold_on() -> None:
+    scene = replace(wall(3.0), log_scales=wall(3.0).log_scales - 1.2)  # so small that none covers another
     camera = front_camera(64, 64, 64.0)
     mask = torch.zeros(64, 64)
     mask[:, :31] = 1.0
@@ -110,9 +108,7 @@ def test_a_gaussian_is_a_member_from_the_threshold_on() -> None:
         assert region.members.tolist() == (by_rule >= threshold).nonzero()[:, 0].tolist()
 
 
-def test_the_score_of_every_member_reaches_the_threshold_and_no_other_does(
-    demo: DemoScene, cameras: list[Camera]
-) -> None:
+def test_members_are_exactly_the_scores_from_the_threshold_on(demo: DemoScene, cameras: list[Camera]) -> None:
     member = demo.labels == demo.label_names.index("scarf")
     masks = [label_mask(demo.gaussians, member, camera) for camera in cameras[:6]]
     for threshold in (0.5, 0.7, 0.8):
@@ -121,14 +117,14 @@ def test_the_score_of_every_member_reaches_the_threshold_and_no_other_does(
         assert 0.0 <= float(region.score.min()) <= float(region.score.max()) <= 1.0
 
 
-def test_by_the_papers_rule_the_share_of_pixels_alone_decides(demo: DemoScene, cameras: list[Camera]) -> None:
+def test_paper_rule_decides_by_the_share_of_pixels_alone(demo: DemoScene, cameras: list[Camera]) -> None:
     member = demo.labels == demo.label_names.index("head")
     masks = [label_mask(demo.gaussians, member, camera) for camera in cameras]
     region = lift_masks(demo.gaussians, cameras, masks, rule="paper")
     by_rule = score(gather(demo.gaussians, cameras, masks), "paper")
     assert torch.equal(region.score, by_rule)
     assert region.members.tolist() == (by_rule >= 0.8).nonzero()[:, 0].tolist()
-    assert overlap(region.members, member) > 0.6  # .7 when written
+    assert overlap(region.members, member) > 0.6  # 0.7 when written
 
 
 def test_gray_masks_count_in_part() -> None:
@@ -142,7 +138,7 @@ def test_gray_masks_count_in_part() -> None:
 # --------------------------------------------------------------------------------------------- never seen
 
 
-def test_a_bare_gaussian_is_clear_and_one_behind_a_wall_is_not() -> None:
+def test_unobstructed_gaussian_is_clear_and_a_covered_gaussian_is_not() -> None:
     scene = concatenate(one_gaussian(mean=(0, 0, 1.5), opacity=0.9), wall(3.0), wall(3.5), one_gaussian())
     scene = replace(scene, means=torch.cat([scene.means[:-1], torch.tensor([[0.0, 0.0, 5.0]])]))
     clearness = gather(scene, [front_camera(64, 64, 64.0)], [torch.zeros(64, 64)]).clearness
@@ -150,8 +146,8 @@ def test_a_bare_gaussian_is_clear_and_one_behind_a_wall_is_not() -> None:
     assert float(clearness[-1]) < 0.01
 
 
-def test_what_no_view_shows_goes_with_the_surface_it_continues() -> None:
-    """Two parallel walls, the rear one red on the left; a screen in front hides the middle of both."""
+def test_hidden_gaussians_follow_the_surface_they_continue() -> None:
+    """Use two close parallel walls, the rear one red; the middle of both is undecided."""
     front = wall(3.0)
     rear = wall(3.03)
     red = torch.tensor([1.5, -1.5, -1.5])
@@ -164,8 +160,8 @@ def test_what_no_view_shows_goes_with_the_surface_it_continues() -> None:
     assert torch.equal(vote > 0, member[inner])
 
 
-def test_a_hidden_gaussian_takes_no_label_from_what_covers_it() -> None:
-    """The mask shows the wall in front; what little shines through it of the one behind proves nothing."""
+def test_hidden_gaussian_takes_no_label_from_its_cover() -> None:
+    """Mask the front wall only; the little of the rear wall that shines through is no evidence."""
     cover = wall(3.0, side=31)
     behind = replace(wall(4.0), sh0=torch.zeros(WALL * WALL, 3))
     bare = replace(behind, means=behind.means + torch.tensor([WALL * 0.1, 0.0, 0.0]))
@@ -181,13 +177,13 @@ def test_a_hidden_gaussian_takes_no_label_from_what_covers_it() -> None:
     assert float(taken) < 0.1
 
 
-def test_nothing_in_reach_is_no_vote() -> None:
+def test_no_decided_neighbor_gives_no_vote() -> None:
     scene = random_gaussians(30, seed=1)
     assert SurfaceVote(scene)(torch.ones(30, dtype=torch.bool), torch.arange(30)).tolist() == [0.0] * 30
 
 
-def test_weak_ties_are_left_out_and_a_second_vote_is_as_a_first(demo: DemoScene) -> None:
-    """Beside the plain form, every neighbor's likelihood in a dense table."""
+def test_sparse_vote_matches_the_dense_vote_and_can_be_reused(demo: DemoScene) -> None:
+    """Compare with the plain iteration over a dense table of neighbor likelihoods."""
     scene = demo.gaussians
     member = demo.labels == 1
     rows = (scene.means[:, 2] > scene.means[:, 2].median()).nonzero()[:, 0]
@@ -207,7 +203,7 @@ def test_weak_ties_are_left_out_and_a_second_vote_is_as_a_first(demo: DemoScene)
 
 
 @pytest.mark.parametrize("count", [2, 5, 100, 700, 3001])
-def test_the_nearest_rows_are_those_of_brute_force(count: int) -> None:
+def test_nearest_rows_match_brute_force(count: int) -> None:
     rng = torch.Generator().manual_seed(count)
     points = torch.randn(count, 3, generator=rng) * torch.tensor([5.0, 1.0, 0.1])
     rows = torch.randperm(count, generator=rng)[: max(1, count // 3)]
@@ -220,7 +216,7 @@ def test_the_nearest_rows_are_those_of_brute_force(count: int) -> None:
     assert not bool((found == rows[:, None]).any())
 
 
-def test_points_in_one_place_are_neighbors_of_each_other() -> None:
+def test_coincident_points_are_neighbors() -> None:
     points = torch.cat([torch.zeros(300, 3), torch.ones(3, 3)])
     found, distances = nearest_rows(points, torch.tensor([0, 301]), 5)
     assert distances[0].tolist() == [0.0] * 5
@@ -229,7 +225,7 @@ def test_points_in_one_place_are_neighbors_of_each_other() -> None:
     assert len(set(found[0].tolist())) == 5
 
 
-def test_the_undecided_are_the_hidden_and_the_half_hidden_of_mixed_share() -> None:
+def test_undecided_rows_are_hidden_or_half_hidden_with_mixed_share() -> None:
     share = torch.tensor([1.0, 0.5, 0.5, 0.9, 0.0, 0.75])
     evidence = Evidence(
         share,

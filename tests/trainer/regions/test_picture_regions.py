@@ -1,4 +1,4 @@
-"""Regions that pictures tell of: folders of masks, and sentences through GroundingDINO and SAM."""
+"""Regions from pictures: folders of masks, and text prompts through GroundingDINO and SAM."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def six_cameras() -> list[Camera]:
 
 @pytest.fixture
 def masks(tmp_path: Path) -> Path:
-    """A folder with masks of the scarf, and their cameras."""
+    """Write masks of the scarf and their cameras to a folder; return the folder."""
     folder = tmp_path / "masks"
     for camera in six_cameras():
         mask = label_mask(SCENE, SCARF, camera).float()
@@ -82,12 +82,12 @@ def overlap(region: Region, expected: Tensor) -> float:
 # -------------------------------------------------------------------------------------- folders of masks
 
 
-def test_a_folder_of_masks_with_its_cameras_is_a_region(masks: Path, tmp_path: Path) -> None:
+def test_folder_of_masks_with_cameras_is_a_region(masks: Path, tmp_path: Path) -> None:
     region = region_of(f"masks:{masks}", settings(tmp_path))
     assert overlap(region, SCARF) > 0.6  # 1500 Gaussians at 96 pixels; see test_lift for real sizes
 
 
-def test_masks_without_cameras_of_their_own_take_those_given(masks: Path, tmp_path: Path) -> None:
+def test_masks_without_cameras_use_the_given_cameras(masks: Path, tmp_path: Path) -> None:
     own = region_of(f"masks:{masks}", settings(tmp_path))
     given = (masks / "cameras.json").rename(tmp_path / "given.json")
     assert "give --cameras" in refusal(f"masks:{masks}", settings(tmp_path))
@@ -95,7 +95,7 @@ def test_masks_without_cameras_of_their_own_take_those_given(masks: Path, tmp_pa
     assert torch.equal(found.members, own.members)
 
 
-def test_masks_join_with_other_kinds_of_region(masks: Path, tmp_path: Path) -> None:
+def test_masks_combine_with_other_kinds_of_region(masks: Path, tmp_path: Path) -> None:
     alone = set(region_of(f"masks:{masks}", settings(tmp_path)).members.tolist())
     np.save(tmp_path / "l.npy", DEMO.labels.numpy())
     head = DEMO.label_names.index("head")
@@ -106,9 +106,7 @@ def test_masks_join_with_other_kinds_of_region(masks: Path, tmp_path: Path) -> N
     assert set(rest.members.tolist()) == set(range(len(SCENE))) - alone
 
 
-def test_masks_of_another_size_are_scaled_and_see_through_pixels_are_outside(
-    masks: Path, tmp_path: Path
-) -> None:
+def test_masks_are_scaled_and_transparent_pixels_are_outside(masks: Path, tmp_path: Path) -> None:
     original = read_masks(masks, six_cameras())
     for path in masks.glob("*.png"):
         with Image.open(path) as picture:
@@ -119,19 +117,19 @@ def test_masks_of_another_size_are_scaled_and_see_through_pixels_are_outside(
     assert all(torch.equal(a, b) for a, b in zip(original, read_masks(masks, six_cameras()), strict=True))
 
 
-def test_masks_of_photographs_are_straightened(tmp_path: Path) -> None:
+def test_masks_of_photographs_are_undistorted(tmp_path: Path) -> None:
     camera = replace(six_cameras()[0], lens=Lens(k1=-0.2))
     ramp = torch.linspace(0, 1, SIZE).expand(SIZE, SIZE)
     write_image(tmp_path / f"{camera.name}.png", ramp[..., None].expand(-1, -1, 3))
     straight = read_masks(tmp_path, [camera])[0]
     unbent = read_masks(tmp_path, [camera], bent=True)[0]
     assert torch.allclose(straight, ramp, atol=1 / 255)
-    # barrel distortion drew the picture together: straightened, its edges show less of the ramp
+    # undistorting a barrel distortion crops the ramp at the edges
     assert float(unbent[SIZE // 2, -1]) < float(straight[SIZE // 2, -1]) - 0.02
     assert float(unbent[SIZE // 2, SIZE // 2]) == pytest.approx(0.5, abs=0.02)
 
 
-def test_pictures_that_are_stored_turned_are_turned_and_photographs_of_known_cameras_refused(
+def test_exif_rotation_is_applied_but_refused_for_known_cameras(
     tmp_path: Path,
 ) -> None:
     camera = six_cameras()[0]
@@ -152,7 +150,7 @@ def test_pictures_that_are_stored_turned_are_turned_and_photographs_of_known_cam
         FolderEditor({1.0: PictureFolder(tmp_path)}, (1.0,), bent=True).edit(view, 1.0)
 
 
-def test_masks_that_do_not_fit_are_one_line(masks: Path, tmp_path: Path) -> None:
+def test_unsuitable_masks_are_a_one_line_error(masks: Path, tmp_path: Path) -> None:
     told = settings(tmp_path)
     given = settings(tmp_path, masks / "cameras.json")
     name = six_cameras()[2].name
@@ -165,16 +163,14 @@ def test_masks_that_do_not_fit_are_one_line(masks: Path, tmp_path: Path) -> None
     assert "cannot be read as a picture" in refusal(f"masks:{masks}", told)
 
 
-def test_a_camera_without_a_mask_tells_nothing_and_none_at_all_is_one_line(
-    masks: Path, tmp_path: Path
-) -> None:
+def test_cameras_without_masks_are_skipped_and_no_mask_is_an_error(masks: Path, tmp_path: Path) -> None:
     whole = set(region_of(f"masks:{masks}", settings(tmp_path)).members.tolist())
     names = [camera.name for camera in load_cameras(masks / "cameras.json")]
     (masks / f"{names[0]}.png").unlink()
-    said: list[str] = []
-    fewer = set(region_of(f"masks:{masks}", settings(tmp_path, say=said.append)).members.tolist())
+    messages: list[str] = []
+    fewer = set(region_of(f"masks:{masks}", settings(tmp_path, say=messages.append)).members.tolist())
     assert len(whole & fewer) > 0.8 * len(whole | fewer)
-    assert "5 of 6 cameras have a mask; the others tell nothing" in said
+    assert "5 of 6 cameras have a mask; the others tell nothing" in messages
     for name in names[1:]:
         (masks / f"{name}.png").unlink()
     assert f"no mask for any of the 6 cameras; name each as its view, as {names[0]}.png" in refusal(
@@ -182,7 +178,7 @@ def test_a_camera_without_a_mask_tells_nothing_and_none_at_all_is_one_line(
     )
 
 
-def test_masks_that_select_nothing_tell_the_highest_score(masks: Path, tmp_path: Path) -> None:
+def test_masks_that_select_nothing_report_the_highest_score(masks: Path, tmp_path: Path) -> None:
     for path in masks.glob("*.png"):
         Image.new("L", (SIZE, SIZE)).save(path)
     assert "none of the 6 masks" in refusal(f"masks:{masks}", settings(tmp_path))
@@ -191,7 +187,7 @@ def test_masks_that_select_nothing_tell_the_highest_score(masks: Path, tmp_path:
     assert "highest score is 0" in refusal(f"masks:{masks}", settings(tmp_path))
 
 
-# ------------------------------------------------------------------------------------------- sentences
+# ------------------------------------------------------------------------------------------- text prompts
 
 
 Asked = list[str]
@@ -199,7 +195,7 @@ Asked = list[str]
 
 @pytest.fixture
 def reddish(monkeypatch: pytest.MonkeyPatch) -> Asked:
-    """A segmenter that finds what is red, in place of the networks; what it was asked."""
+    """Replace the networks by a segmenter of red pixels; return the list of its prompts."""
     asked: Asked = []
 
     def segment(image: Tensor, prompt: str) -> Tensor:
@@ -216,10 +212,10 @@ def reddish(monkeypatch: pytest.MonkeyPatch) -> Asked:
     return asked
 
 
-def test_a_sentence_is_segmented_once_and_kept(reddish: Asked, tmp_path: Path) -> None:
+def test_prompt_is_segmented_once_and_cached(reddish: Asked, tmp_path: Path) -> None:
     told = settings(tmp_path)
     first = region_of('text:"the Red scarf"', told)
-    assert reddish == ["the Red scarf"] * (2 * VIEWS)  # around the scene, and near what was found
+    assert reddish == ["the Red scarf"] * (2 * VIEWS)  # around the scene, then close to the found region
     again = region_of('text:"the Red scarf"', told)
     assert len(reddish) == 2 * VIEWS
     assert torch.equal(first.members, again.members)
@@ -228,13 +224,13 @@ def test_a_sentence_is_segmented_once_and_kept(reddish: Asked, tmp_path: Path) -
     assert len(reddish) == 4 * VIEWS
 
 
-def test_what_a_sentence_found_is_a_folder_of_masks(reddish: Asked, tmp_path: Path) -> None:
+def test_masks_of_a_prompt_can_be_used_as_a_mask_folder(reddish: Asked, tmp_path: Path) -> None:
     found = region_of('text:"scarf"', settings(tmp_path))
     kept = region_of(f"masks:{tmp_path}/segmented/scarf", settings(tmp_path))
     assert torch.equal(found.members, kept.members)
 
 
-def test_sentences_join_with_other_kinds_of_region(reddish: Asked, tmp_path: Path) -> None:
+def test_prompts_combine_with_other_kinds_of_region(reddish: Asked, tmp_path: Path) -> None:
     scarf = set(region_of("text:scarf", settings(tmp_path)).members.tolist())
     rest = region_of('all - text:"scarf"', settings(tmp_path))
     assert set(rest.members.tolist()) == set(range(len(SCENE))) - scarf
@@ -249,12 +245,12 @@ def test_given_cameras_are_thinned_out_evenly(reddish: Asked, tmp_path: Path) ->
     assert kept == ["orbit_002", "orbit_007", "orbit_012", "orbit_017"]
 
 
-def test_what_is_found_nowhere_is_one_line(reddish: Asked, tmp_path: Path) -> None:
+def test_prompt_without_a_match_is_a_one_line_error(reddish: Asked, tmp_path: Path) -> None:
     assert "found in none of 6 views" in refusal('text:"a unicorn"', settings(tmp_path))
     assert "needs a prompt" in refusal('text:""', settings(tmp_path))
 
 
-def test_a_sentence_leaves_a_folder_that_is_no_run_alone(reddish: Asked, tmp_path: Path) -> None:
+def test_prompt_does_not_touch_a_folder_that_is_no_run(reddish: Asked, tmp_path: Path) -> None:
     write_bear(tmp_path)
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "thesis.txt").write_text("important")
@@ -264,7 +260,7 @@ def test_a_sentence_leaves_a_folder_that_is_no_run_alone(reddish: Asked, tmp_pat
     assert reddish == []
 
 
-def test_after_a_sentence_that_finds_nothing_another_can_be_tried(reddish: Asked, tmp_path: Path) -> None:
+def test_another_prompt_can_follow_a_prompt_without_a_match(reddish: Asked, tmp_path: Path) -> None:
     write_bear(tmp_path)
     options = quick_options(tmp_path, steps=8, stages=1, views=5)
     with pytest.raises(ProgdfError, match="found in none"):
@@ -274,7 +270,7 @@ def test_after_a_sentence_that_finds_nothing_another_can_be_tried(reddish: Asked
     assert len(list((done.folder.segment_masks / "scarf").glob("*.png"))) == 10
 
 
-def test_prompts_are_asked_as_the_detector_was_trained() -> None:
+def test_prompts_are_normalized_for_the_detector() -> None:
     assert normalize_prompt("  The man's  Shirt ") == "the man's shirt."
     assert normalize_prompt("a cat. a dog.") == "a cat. a dog."
 
@@ -284,7 +280,7 @@ def test_prompts_are_asked_as_the_detector_was_trained() -> None:
 
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> RegionOptions:
-    """A detector and an sam_model of the real classes, saved and found as real ones are."""
+    """Save a tiny detector and a tiny SAM of the real classes; return options that name them."""
     pytest.importorskip("transformers")
     folder = tmp_path_factory.mktemp("models")
     return RegionOptions(
@@ -295,7 +291,7 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> RegionOptions:
     )
 
 
-def test_the_networks_make_a_mask_of_the_pictures_size(tiny: RegionOptions) -> None:
+def test_networks_return_a_mask_of_the_picture_size(tiny: RegionOptions) -> None:
     segment = SEGMENTERS["text"](tiny)
     image = torch.rand(60, 90, 3, generator=torch.Generator().manual_seed(0))
     mask = segment(image, "The scarf")
@@ -318,7 +314,7 @@ def test_boxes_are_in_pixels_of_the_picture(tiny: RegionOptions) -> None:
 
 
 @pytest.mark.slow
-def test_a_run_trains_a_region_that_a_sentence_names(tiny: RegionOptions, tmp_path: Path) -> None:
+def test_run_trains_a_region_from_a_prompt(tiny: RegionOptions, tmp_path: Path) -> None:
     write_bear(tmp_path, 800)
     options = with_values(
         quick_options(tmp_path, steps=8, stages=1, views=3),
@@ -333,7 +329,7 @@ def test_a_run_trains_a_region_that_a_sentence_names(tiny: RegionOptions, tmp_pa
     assert len(list((done.folder.segment_masks / "the-scarf").glob("*.png"))) == 6
 
 
-def test_missing_weights_are_one_line_that_tells_how_to_get_them(
+def test_missing_weights_error_names_the_remedy(
     tiny: RegionOptions, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "empty"))
@@ -349,15 +345,13 @@ def test_missing_weights_are_one_line_that_tells_how_to_get_them(
     assert "not hold a complete model with safetensors weights" in refusal("text:scarf", broken)
 
 
-def test_a_model_of_another_kind_is_one_line(tiny: RegionOptions, tmp_path: Path) -> None:
+def test_model_of_another_kind_is_a_one_line_error(tiny: RegionOptions, tmp_path: Path) -> None:
     swapped = RegionOptions("", detector=tiny.sam_model, sam_model=tiny.detector)
     assert "is a sam model, not grounding-dino; give --detector" in refusal(
         "text:scarf", settings(tmp_path, options=swapped)
     )
 
 
-def test_a_missing_package_is_one_line_that_names_the_extra(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missing_package_is_reported_with_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "transformers", None)
     assert "pip install progdf-studio[segment]" in refusal("text:scarf", settings(tmp_path))

@@ -1,4 +1,4 @@
-"""`progdf region`: what a region selects, shown and kept; `progdf views`: pictures to draw masks on."""
+"""`progdf region`: preview and saving of a region; `progdf views`: pictures to draw masks on."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     return capsys.readouterr().err
 
 
-def test_what_region_keeps_is_the_same_region_again(
+def test_saved_region_loads_as_the_same_region(
     demo: DemoScene, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     spec = f"labels:{tmp_path}/labels.npy:0+sphere:0,1,0,0.2"
@@ -76,7 +76,7 @@ def test_what_region_keeps_is_the_same_region_again(
         (np.zeros((2, 2), np.int64), "2 dimensions"),
     ],
 )
-def test_rows_of_another_scene_are_one_line(
+def test_rows_of_another_scene_are_a_one_line_error(
     stored: np.ndarray, told: str, demo: DemoScene, tmp_path: Path
 ) -> None:
     np.save(tmp_path / "m.npy", stored)
@@ -84,7 +84,7 @@ def test_rows_of_another_scene_are_one_line(
         parse_region(f"file:{tmp_path}/m.npy", demo.gaussians)
 
 
-def test_the_picture_tints_the_region_and_takes_the_color_from_the_rest(demo: DemoScene) -> None:
+def test_picture_tints_the_region_and_grays_the_remainder(demo: DemoScene) -> None:
     camera = demo.cameras[0].resize(64, 64)
     nothing = picture(demo.gaussians, from_mask("", torch.zeros(3000, dtype=torch.bool)), camera)
     assert float((nothing.amax(dim=2) - nothing.amin(dim=2)).max()) < 1e-3, "gray"
@@ -97,7 +97,7 @@ def test_the_picture_tints_the_region_and_takes_the_color_from_the_rest(demo: De
     assert red > blue + 0.2
 
 
-def test_the_region_is_shown_from_four_sides_or_as_one_asks(
+def test_region_is_shown_from_four_sides_or_a_given_camera(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     save_cameras(tmp_path / "c.json", orbit_rig(bear(1000).gaussians, 2, 40, 30))
@@ -110,7 +110,7 @@ def test_the_region_is_shown_from_four_sides_or_as_one_asks(
         assert Image.open(out).size == size
 
 
-def test_what_region_cannot_do_is_one_line_and_leaves_nothing(
+def test_invalid_region_command_is_refused_and_writes_nothing(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "r.png"
@@ -120,7 +120,7 @@ def test_what_region_cannot_do_is_one_line_and_leaves_nothing(
     assert not out.exists()
 
 
-def test_masks_drawn_over_the_views_are_the_region_that_train_takes(
+def test_masks_drawn_on_views_select_the_region_for_training(
     demo: DemoScene, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "v"
@@ -146,7 +146,7 @@ def test_masks_drawn_over_the_views_are_the_region_that_train_takes(
     assert int(both) > 0.85 * max(len(found), len(bear_itself))
 
 
-def test_views_of_cameras_in_subfolders_are_written_into_subfolders(
+def test_views_of_cameras_in_subfolders_keep_the_subfolders(
     demo: DemoScene, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rig = orbit_rig(demo.gaussians, 4, 64, 64)
@@ -163,7 +163,7 @@ def test_views_of_cameras_in_subfolders_are_written_into_subfolders(
     assert len(parse_region(f"masks:{out}", demo.gaussians, kinds=region_kinds(request)))
 
 
-def test_views_overwrite_no_folder_of_views(
+def test_views_do_not_overwrite_a_folder_of_views(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "cameras.json").write_text("[]")
@@ -173,7 +173,7 @@ def test_views_overwrite_no_folder_of_views(
 
 
 def paint_strokes(view: Path, out: Path, **lines: list[tuple[int, int]]) -> Path:
-    """Lines of named colors drawn over a rendered view, as a painting program saves them."""
+    """Draw colored lines over a rendered view and save it like a painting program; return the path."""
     with Image.open(view) as opened:
         info = PngInfo()
         for key, text in opened.text.items():  # type: ignore[attr-defined]
@@ -185,7 +185,7 @@ def paint_strokes(view: Path, out: Path, **lines: list[tuple[int, int]]) -> Path
     return out
 
 
-def test_strokes_painted_on_a_view_are_a_region(
+def test_strokes_painted_on_a_view_select_a_region(
     demo: DemoScene, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     view = tmp_path / "view.png"
