@@ -1,4 +1,4 @@
-"""Whether edited views agree is told before training, and told right."""
+"""Agreement of edited views, measured before training."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def setup() -> TrainingSetup:
 
 
 def body() -> Small:
-    """Its last three views stand between the others."""
+    """Return the body with 12 views; the last three stand between the others."""
     case = small("body", count=12, image_size=96)
     others = [view for i, view in enumerate(case.views) if i % 4]
     return replace(case, views=(*others, *case.views[::4]))
@@ -44,7 +44,7 @@ def edited(spec: str) -> list[Tensor]:
 
 
 def stripes_of_its_own(period: float, seed: int) -> list[Tensor]:
-    """Every view with stripes in another direction."""
+    """Return every view with stripes in its own random direction."""
     rng = torch.Generator().manual_seed(seed)
     pictures = []
     for view in body().views:
@@ -61,7 +61,7 @@ def stripes_of_its_own(period: float, seed: int) -> list[Tensor]:
 
 
 @pytest.mark.parametrize("spec", ["recolor:#3060d0", "stripes:#20a040", "night"])
-def test_edits_that_are_the_same_from_everywhere_agree(spec: str) -> None:
+def test_edits_consistent_across_views_agree(spec: str) -> None:
     found = judged(edited(spec))
     assert found.agree
     assert found.unexplained < 0.15
@@ -84,7 +84,7 @@ def test_another_hue_in_every_view_disagrees() -> None:
     assert not judged(pictures).agree
 
 
-def test_differences_too_faint_to_see_are_no_disagreement() -> None:
+def test_invisible_differences_are_no_disagreement() -> None:
     rng = torch.Generator().manual_seed(3)
     pictures = [
         view.blend((view.inside + 0.02 * torch.randn(3, generator=rng)).clamp(0, 1)) for view in body().views
@@ -94,7 +94,7 @@ def test_differences_too_faint_to_see_are_no_disagreement() -> None:
     assert found.agree
 
 
-def test_colors_that_the_members_can_have_are_found() -> None:
+def test_colors_that_members_can_have_are_explained() -> None:
     case = body()
     rng = torch.Generator().manual_seed(4)
     changed = case.scene.sh0.clone()
@@ -106,7 +106,7 @@ def test_colors_that_the_members_can_have_are_found() -> None:
     assert found.agree
 
 
-def test_the_line_tells_decibels_share_and_remedy() -> None:
+def test_summary_line_has_decibels_share_and_remedy() -> None:
     alone = "one held-out view alone"
     line = Agreement(psnr=12.34, unexplained=0.61, unexplained_fine=0.8).line("style", alone)
     assert line.startswith("the edited views disagree: no 3D scene shows all of them, best possible 12.3 dB")
@@ -122,7 +122,7 @@ def test_measuring_twice_gives_the_same_figures() -> None:
     assert judged(pictures) == judged(pictures)
 
 
-def test_a_smooth_change_that_colors_can_make_is_explained() -> None:
+def test_smooth_color_change_is_explained() -> None:
     case = body()
     change = torch.zeros(len(case.scene), 3)
     change[case.region.members] = 0.3 * case.scene.means[case.region.members, 1:2]
@@ -132,7 +132,7 @@ def test_a_smooth_change_that_colors_can_make_is_explained() -> None:
 
 @dataclass(frozen=True)
 class LinearSight:
-    """A view of which the picture is a known matrix [P,M] times the colors."""
+    """View whose picture is a known matrix [P,M] times the colors."""
 
     matrix: Tensor
     change: Tensor
@@ -144,7 +144,7 @@ class LinearSight:
         return self.matrix.T @ picture
 
 
-def test_the_fit_is_the_damped_least_squares_solution(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fit_is_the_damped_least_squares_solution(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("trainer.report.agreement.DAMPING", 0.2)
     rng = torch.Generator().manual_seed(5)
     changes = [
@@ -159,7 +159,7 @@ def test_the_fit_is_the_damped_least_squares_solution(monkeypatch: pytest.Monkey
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
 
 
-def test_the_decibels_are_of_what_the_fit_leaves_where_the_held_out_views_change() -> None:
+def test_decibels_count_the_residual_where_held_out_views_change() -> None:
     count = len(setup().train)
     pictures = [view.image for view in body().views]
     for view, i in zip(setup().held_out, range(count, len(pictures)), strict=True):
@@ -171,7 +171,7 @@ def test_the_decibels_are_of_what_the_fit_leaves_where_the_held_out_views_change
     assert found.psnr == pytest.approx(20 + 10 * math.log10(counted / changed), abs=0.1)
 
 
-def test_views_that_nothing_changed_agree_with_nothing_to_explain() -> None:
+def test_unchanged_views_agree_without_residual() -> None:
     found = judged([view.image for view in body().views])
     assert found == Agreement(99.0, 0.0)
     assert found.figures() == {
@@ -183,7 +183,7 @@ def test_views_that_nothing_changed_agree_with_nothing_to_explain() -> None:
     }
 
 
-def test_a_box_at_half_size_holds_all_of_its_odd_pixels_in_their_place() -> None:
+def test_half_size_box_keeps_odd_pixels_at_their_position() -> None:
     view = replace(body().views[0], box=(11, 20, 61, 75))
     x, y = torch.meshgrid(torch.arange(96.0), torch.arange(96.0), indexing="xy")
     ramp = torch.stack([0.1 + x / 200, 0.1 + y / 200, torch.full_like(x, 0.2)], dim=2)

@@ -1,4 +1,4 @@
-"""CLIP directional similarity: the formula, a real model read from disk, and why it is not measured."""
+"""CLIP directional similarity: formula, a real model from disk, and reasons for not measuring it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from trainer.run.finish import refit
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a tiny CLIP."""
+    """Return the folder of a tiny CLIP model."""
     pytest.importorskip("transformers")
     return tiny_clip(tmp_path_factory.mktemp("clip"))
 
@@ -38,7 +38,7 @@ def _unit(*values: float) -> Tensor:
     return torch.nn.functional.normalize(torch.tensor(values), dim=0)
 
 
-def test_a_picture_that_changes_as_the_words_do_scores_one_and_one_that_does_the_opposite_minus_one() -> None:
+def test_direction_is_1_for_the_described_change_and_minus_1_reversed() -> None:
     bear = _unit(1.0, 0.0, 0.2)
     golden = _unit(0.8, 0.6, 0.2)
     before = _unit(0.1, 0.2, 1.0)
@@ -47,7 +47,7 @@ def test_a_picture_that_changes_as_the_words_do_scores_one_and_one_that_does_the
     assert found == pytest.approx([1.0, -1.0], abs=1e-5)
 
 
-def test_a_picture_or_a_text_that_does_not_change_has_no_direction() -> None:
+def test_unchanged_picture_or_text_has_no_direction() -> None:
     a = _unit(1.0, 2.0, 3.0)
     b = _unit(3.0, 1.0, 0.0)
     assert direction(a[None], a[None], a, b) == [None]
@@ -57,7 +57,7 @@ def test_a_picture_or_a_text_that_does_not_change_has_no_direction() -> None:
     assert direction(a[None], b[None], a, rounded) == [None]
 
 
-def test_a_model_read_from_disk_gives_features_of_unit_length_that_tell_things_apart(saved: Path) -> None:
+def test_model_from_disk_gives_distinct_unit_features(saved: Path) -> None:
     clip = load_clip(str(saved))
     torch.manual_seed(1)
     pictures = clip.pictures([torch.rand(40, 60, 3), torch.rand(40, 60, 3)])
@@ -68,7 +68,7 @@ def test_a_model_read_from_disk_gives_features_of_unit_length_that_tell_things_a
         assert float((features[0] - features[1]).norm()) > 1e-3
 
 
-def test_features_are_those_of_the_model_itself(saved: Path) -> None:
+def test_features_match_the_original_model(saved: Path) -> None:
     from transformers import CLIPModel
 
     clip = load_clip(str(saved))
@@ -82,7 +82,7 @@ def test_features_are_those_of_the_model_itself(saved: Path) -> None:
     assert torch.allclose(clip.pictures([image])[0], expected[0] / expected.norm(), atol=1e-5)
 
 
-def test_what_older_transformers_return_is_taken_too() -> None:
+def test_return_values_of_older_transformers_are_accepted() -> None:
     features = torch.tensor([[3.0, 4.0]])
 
     def network(answer: Any) -> Any:
@@ -93,7 +93,7 @@ def test_what_older_transformers_return_is_taken_too() -> None:
         assert torch.allclose(found, torch.tensor([[0.6, 0.8]]))
 
 
-def test_a_wide_picture_is_seen_whole() -> None:
+def test_wide_picture_is_seen_whole() -> None:
     image = torch.zeros(20, 60, 3)
     image[:, :4] = torch.tensor([1.0, 0.0, 0.0])
     seen = square_picture(image, 30)
@@ -103,15 +103,15 @@ def test_a_wide_picture_is_seen_whole() -> None:
     assert torch.allclose(seen[:, 0], torch.ones(3, 30))
 
 
-def test_pictures_are_scaled_as_pillow_does_it_for_clip() -> None:
-    # not as far as black and white, as Pillow cuts what overshoots between its two passes
+def test_pictures_are_scaled_like_pillow_does_for_clip() -> None:
+    # away from black and white, because Pillow clamps overshoot between its two passes
     image = 0.3 + 0.4 * torch.rand(50, 50, 3, generator=torch.Generator().manual_seed(0))
     scaled = to_picture(image).resize((32, 32), Image.Resampling.BICUBIC)
     expected = torch.from_numpy(np.asarray(scaled, dtype=np.float32) / 255)
     assert (square_picture(image, 32).permute(1, 2, 0) - expected).abs().max() < 2.5 / 255
 
 
-def test_what_is_missing_or_no_clip_is_one_line_that_names_the_remedy(
+def test_missing_or_wrong_clip_model_error_names_the_remedy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("transformers")
@@ -127,14 +127,14 @@ def test_what_is_missing_or_no_clip_is_one_line_that_names_the_remedy(
         load_clip("nobody/no-such-clip")
 
 
-def test_an_instruction_is_no_description_of_what_one_sees_after() -> None:
-    told = quick_options(Path(), editor='instruct:"make it gold"', text_before="a bear")
-    assert resolve(told).texts.text_after == ""
-    assert resolve(with_values(told, text_after="a golden bear")).texts.text_after == "a golden bear"
+def test_instruction_is_not_used_as_text_after() -> None:
+    options = quick_options(Path(), editor='instruct:"make it gold"', text_before="a bear")
+    assert resolve(options).texts.text_after == ""
+    assert resolve(with_values(options, text_after="a golden bear")).texts.text_after == "a golden bear"
 
 
 @pytest.mark.slow
-def test_a_run_reports_the_course_over_the_slider_and_a_refit_can_ask_in_other_words(
+def test_run_reports_clip_along_the_slider_and_refit_accepts_other_texts(
     tmp_path: Path, saved: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("trainer.report.measures.CLIP_MODEL", str(saved))
@@ -154,7 +154,7 @@ def test_a_run_reports_the_course_over_the_slider_and_a_refit_can_ask_in_other_w
     assert again.report["edit"]["clip_direction"] != edit["clip_direction"]
 
 
-def test_why_nothing_is_measured_is_told(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reason_for_not_measuring_clip_is_reported(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bear = small(count=3)
     unedited = {1.0: [view.image for view in bear.views]}
     evaluator = make_evaluator(bear.scene, bear.region, bear.views, unedited, WHITE, 14)

@@ -1,4 +1,4 @@
-"""What a report tells: errors over the slider, plots one can read, memory by stage."""
+"""Report: errors over the slider, readable plots, memory by stage."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ from trainer.views.crops import moving_attributes
 
 
 def _judged(bear: Small) -> Evaluator:
-    """A judge whose editor has painted everything darker, at half strength and in full."""
+    """Return an evaluator whose editor darkens everything, at strengths 0.5 and 1."""
     edited = {s: [view.image * (1 - 0.5 * s) for view in bear.views] for s in (0.5, 1.0)}
     return make_evaluator(bear.scene, bear.region, bear.views, edited, WHITE, 14)
 
 
 def _darker(bear: Small, amount: float = 0.6) -> BakedField:
-    """A field that goes straight to a darker region."""
+    """Return a field that darkens the region linearly."""
     end = torch.zeros(len(bear.region), 14)
     end[:, 11:] = -amount
     return fit_keyframes(torch.tensor([0.0, 1.0]), torch.stack([torch.zeros_like(end), end]), 2)
@@ -48,7 +48,7 @@ def _color_count(picture: Image.Image, color: Sequence[int]) -> int:
     return int((np.abs(np.asarray(picture, dtype=int) - np.array(color)).max(axis=2) <= 12).sum())
 
 
-def test_a_field_that_is_what_it_should_be_has_no_error_in_any_measure() -> None:
+def test_perfect_field_has_no_error_in_any_measure() -> None:
     bear = small(count=3)
     evaluator = _judged(bear)
     field = _darker(bear)
@@ -61,7 +61,7 @@ def test_a_field_that_is_what_it_should_be_has_no_error_in_any_measure() -> None
     assert found.lpips == (0.0, 0.0)
 
 
-def test_all_measures_agree_which_of_two_fields_is_nearer() -> None:
+def test_all_measures_rank_two_fields_alike() -> None:
     bear = small(count=3)
     evaluator = _judged(bear)
     shown = {name: evaluator.course(_darker(bear, by)) for name, by in (("near", 0.55), ("far", 0.2))}
@@ -72,7 +72,7 @@ def test_all_measures_agree_which_of_two_fields_is_nearer() -> None:
     assert found["near"].lpips[0] < found["far"].lpips[0]
 
 
-def test_ssim_looks_at_the_region_and_not_at_what_is_beyond_its_windows() -> None:
+def test_ssim_covers_the_region_and_nothing_beyond_its_windows() -> None:
     bear = small(count=3)
     unedited = {1.0: [view.image for view in bear.views]}
     evaluator = make_evaluator(bear.scene, bear.region, bear.views, unedited, WHITE, 14)
@@ -88,7 +88,7 @@ def test_ssim_looks_at_the_region_and_not_at_what_is_beyond_its_windows() -> Non
     assert evaluator.psnr(beyond, truth) == 99.0
 
 
-def test_strips_show_the_same_view_at_five_strengths_and_gray_where_the_editor_was_not_asked() -> None:
+def test_strips_show_one_view_at_five_strengths_and_gray_gaps() -> None:
     bear = small(count=3)
     evaluator = _judged(bear)
     columns = columns_of([(1.0, 1.0)])
@@ -104,7 +104,7 @@ def test_strips_show_the_same_view_at_five_strengths_and_gray_where_the_editor_w
 
 
 @pytest.mark.parametrize("size", [(40, 40), (20, 60), (90, 30)])
-def test_a_thumbnail_has_the_width_that_is_asked_for_and_is_never_tall(size: tuple[int, int]) -> None:
+def test_thumbnail_has_the_requested_width_and_limited_height(size: tuple[int, int]) -> None:
     picture = thumbnail(torch.zeros(*size, 3), 80)
     assert picture.shape[1] == 80
     assert picture.shape[0] <= 100
@@ -136,12 +136,12 @@ def test_gaps_zeros_and_empty_lines_do_not_break_a_plot() -> None:
     assert _color_count(empty, LINES[0]) == 0
 
 
-def test_a_line_far_below_another_is_drawn_on_a_logarithmic_axis() -> None:
+def test_low_line_is_drawn_on_a_logarithmic_axis() -> None:
     lines = {"high": ([0.0, 1.0], [1.0, 0.5]), "low": ([0.0, 1.0], [1e-6, 3e-6])}
     assert _color_count(draw_plot(Plot("t", lines, scale="log"), 400, 270), LINES[1]) > 150
 
 
-def test_a_legend_that_is_too_wide_goes_on_in_a_second_row() -> None:
+def test_wide_legend_continues_in_a_second_row() -> None:
     lines = {f"a name of some length {k}": ([0.0, 1.0], [k, k + 1.0]) for k in range(4)}
     picture = np.asarray(draw_plot(Plot("t", lines), 400, 270), dtype=int)
     for color in LINES[:4]:
@@ -164,19 +164,19 @@ assert min(peaks) >= 128 and max(peaks) - min(peaks) <= 2, peaks
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="/proc is Linux's")
-def test_the_peak_of_memory_is_the_one_that_the_system_reports() -> None:
-    # a process of its own, in which nothing was ever larger
+def test_memory_peak_matches_the_system() -> None:
+    # a separate process, whose peak is this block
     subprocess.run([sys.executable, "-c", PEAKS], check=True, timeout=600)
 
 
-def test_a_resumed_run_remembers_the_peak_of_its_first_session(tmp_path: Path) -> None:
+def test_resumed_run_keeps_the_memory_peak_of_its_first_session(tmp_path: Path) -> None:
     log = RunLog(tmp_path / "log.txt", quiet=True)
     log.restore(Saved({}, {"seconds": {}, "total": 0.0, "memory": 1 << 21}))
     assert log.peak_mb() == 1 << 21
     log.close()
 
 
-def test_the_judge_takes_narrow_offsets_where_the_scene_has_more_bands() -> None:
+def test_evaluator_accepts_narrow_offsets_for_a_scene_with_more_bands() -> None:
     bear = small(count=3)
     edited = {1.0: [view.image for view in bear.views]}
     wide = pack(bear.scene[bear.region.members], with_shN=True).shape[1]
@@ -188,12 +188,14 @@ def test_the_judge_takes_narrow_offsets_where_the_scene_has_more_bands() -> None
         assert torch.allclose(a, b, atol=1e-6)
 
 
-def test_attributes_that_show_little_each_are_not_all_left_out_where_together_they_show() -> None:
-    """Two attributes worth .07 dB each: one may go, both would cost more than what is allowed in all. A third
-    that shows nothing goes as well."""
+def test_idle_attributes_are_dropped_only_within_the_total_allowance() -> None:
+    """Use two attributes worth 0.07 dB each and a third without effect.
+
+    Only one of the two may be dropped, because both exceed the total allowance. The third is dropped as well.
+    """
 
     class Judging(Evaluator):
-        """Each of the two that is missing takes .07 dB."""
+        """Evaluator that loses 0.07 dB for each of the two attributes that is missing."""
 
         def pictures(self, offsets: Tensor) -> list[Tensor]:
             missing = 2 - sum(bool(offsets[:, c].any()) for c in (slice(0, 3), slice(6, 10)))
@@ -218,8 +220,8 @@ def test_attributes_that_show_little_each_are_not_all_left_out_where_together_th
     assert "sh0" not in moving
 
 
-def test_a_grade_keeps_the_bands_that_its_map_leaves_alone() -> None:
-    """A part was painted and there is no map: a grade is of all bands of the scene, as is its recording."""
+def test_grade_keeps_bands_that_its_map_leaves_unchanged() -> None:
+    """Check that a grade and its recording keep all bands of the scene; without a map only DC remains."""
 
     class Judging(Evaluator):
         def pictures(self, offsets: Tensor) -> list[Tensor]:
