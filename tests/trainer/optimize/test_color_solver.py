@@ -1,4 +1,4 @@
-"""Edits of colors alone are solved for: a map of the region, and what single members need beside it."""
+"""Color solver: a color map of the region plus a residual of single members."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ WHITE = torch.ones(3)
 
 
 def orbit(count: int, size: int) -> list[Camera]:
-    """Cameras around the origin at distance 4, one of them from above."""
+    """Return cameras around the origin at horizontal distance 4, at heights 1 and 2 in turn."""
     cameras = []
     for i in range(count):
         angle = torch.tensor(2 * torch.pi * i / count)
@@ -46,7 +46,7 @@ def orbit(count: int, size: int) -> list[Camera]:
 
 
 def dense_ball(count: int = 3000, bands: int = 0) -> Gaussians:
-    """An opaque ball of many small Gaussians in all colors."""
+    """Return a ball of many small Gaussians in random colors."""
     rng = torch.Generator().manual_seed(3)
     means = torch.nn.functional.normalize(torch.randn(count, 3, generator=rng), dim=1)
     return Gaussians(
@@ -66,7 +66,7 @@ def prepared(scene: Gaussians, cameras: list[Camera]) -> tuple[list[CropScene], 
 
 
 def grainy(pictures: list[Tensor], sigma: float) -> list[Tensor]:
-    """With noise: what is left shows, and nothing ends because it does not."""
+    """Add noise, so that the remaining error stays visible and no solve ends early."""
     rng = torch.Generator().manual_seed(5)
     return [picture + sigma * torch.randn(picture.shape, generator=rng) for picture in pictures]
 
@@ -84,7 +84,7 @@ def solve_all(
     on_step: OnStep = lambda step, left: None,
     made: list[ParameterSnapshot] | None = None,
 ) -> list[ParameterSnapshot]:
-    """The recordings, in half precision as a run has them; all views say when a stage is done."""
+    """Return the recordings in half precision, like a run; all views decide when a stage is done."""
     targets = [(stage, ColorEvaluator(solver.views, stage.targets)) for stage in stages]
     course = StrengthSchedule(targets[:-1], targets[-1])
     made = [] if made is None else made
@@ -94,7 +94,7 @@ def solve_all(
 
 
 def solved(scene: Gaussians, edited: Gaussians, cameras: list[Camera], steps: int = 40) -> Tensor:
-    """Offsets of the edit of `scene` whose pictures are those of `edited`."""
+    """Return the offsets that make `scene` look like `edited`."""
     crops, original = prepared(scene, cameras)
     targets = render_all(crops, pack(edited, with_shN=scene.sh_degree > 0))
     solver = make_solver(color_views(crops, original), original)
@@ -110,7 +110,7 @@ def psnr(scene: Gaussians, edited: Gaussians, offsets: Tensor, cameras: list[Cam
     return float(-10 * torch.stack([(a - b).square().mean() for a, b in pairs]).mean().log10())
 
 
-def test_a_color_map_draws_and_differentiates_as_the_rasterizer_does() -> None:
+def test_color_map_matches_the_rasterizer_and_its_gradients() -> None:
     scene = random_gaussians(400, seed=2)
     scene = replace(scene, means=0.4 * scene.means / scene.means.norm(dim=1).max())
     camera = orbit(3, 80)[1]
@@ -124,13 +124,13 @@ def test_a_color_map_draws_and_differentiates_as_the_rasterizer_does() -> None:
     (image * pull).sum().backward()  # type: ignore[no-untyped-call]
     weighed = color_map(activate(scene), camera, window, rows)
     assert float(image.detach().amax()) > 0.1
-    # float32 sums in another order
+    # float32 sums differ in order
     torch.testing.assert_close(weighed.picture(colors.detach()[rows]), image.detach(), atol=2e-5, rtol=0)
     assert colors.grad is not None
     torch.testing.assert_close(weighed.gradient(pull), colors.grad[rows], atol=2e-4, rtol=1e-4)
 
 
-def test_of_some_pixels_each_view_looks_at_others_and_the_edit_is_as_good() -> None:
+def test_solving_on_a_pixel_subset_is_as_good() -> None:
     scene = replace(dense_ball(600), sh0=0.5 * torch.rand(600, 3, generator=torch.Generator().manual_seed(7)))
     edited = replace(scene, sh0=scene.sh0.flip(1) + 0.3)
     cameras = orbit(8, 64)
@@ -146,7 +146,7 @@ def test_of_some_pixels_each_view_looks_at_others_and_the_edit_is_as_good() -> N
     assert psnr(scene, edited, offsets, cameras) > 45.0
 
 
-def test_members_smaller_than_a_pixel_learn_their_color() -> None:
+def test_subpixel_members_learn_their_color() -> None:
     scene = dense_ball(9000)
     edited = replace(scene, sh0=scene.sh0.flip(1) + 0.3)
     cameras = orbit(6, 40)
@@ -158,7 +158,7 @@ def test_members_smaller_than_a_pixel_learn_their_color() -> None:
     assert not bool(offsets[:, :11].any())
 
 
-def test_a_color_below_zero_is_reached_through_clamps_that_lead_back() -> None:
+def test_color_below_zero_is_reached_through_clamps() -> None:
     scene = dense_ball(500)
     dark = replace(scene, sh0=rgb_to_sh0(torch.full((500, 3), -0.2)))
     crops, original = prepared(dark, orbit(3, 32))
@@ -169,8 +169,8 @@ def test_a_color_below_zero_is_reached_through_clamps_that_lead_back() -> None:
     assert float((offsets > 0.0).float().mean()) > 0.5
 
 
-def test_a_change_of_all_colors_is_a_map_alone_and_holds_where_no_view_looks() -> None:
-    """Red and blue are exchanged: SH 2, two views, another one to judge by."""
+def test_global_color_change_is_a_map_that_holds_in_unseen_views() -> None:
+    """Swap red and blue with SH degree 2; fit two views, evaluate a third."""
     scene = dense_ball(1200, bands=8)
     edited = replace(scene, sh0=scene.sh0.flip(1), shN=scene.shN.flip(2))
     cameras = orbit(8, 64)
@@ -185,8 +185,8 @@ def test_a_change_of_all_colors_is_a_map_alone_and_holds_where_no_view_looks() -
 
 
 @pytest.mark.parametrize("profile", ["halves", "ramp"])
-def test_what_some_members_get_and_others_do_not_is_a_mask(profile: str) -> None:
-    """Black and white on one side of a ball of SH 2, or more and more of it; two of eight views judge."""
+def test_partial_change_becomes_a_mask(profile: str) -> None:
+    """Gray one half of a ball (SH degree 2), or a ramp across it; evaluate two of eight views."""
     scene = dense_ball(1500, bands=8)
     x = scene.means[:, 0]
     share = (x > 0).float() if profile == "halves" else (0.5 + 0.5 * x).clamp(0, 1)
@@ -212,7 +212,7 @@ def test_what_some_members_get_and_others_do_not_is_a_mask(profile: str) -> None
     assert "color map of degree 1 + mask" in model.line
 
 
-def test_a_pattern_of_many_colors_gets_a_residual_and_only_as_many_bands_as_pay() -> None:
+def test_pattern_gets_a_residual_with_only_useful_bands() -> None:
     scene = dense_ball(1500, bands=3)
     side = (scene.means[:, :1] > 0).float()
     rng = torch.Generator().manual_seed(9)
@@ -221,7 +221,7 @@ def test_a_pattern_of_many_colors_gets_a_residual_and_only_as_many_bands_as_pay(
     others, _ = prepared(scene, orbit(16, 64)[1::2])
 
     def bands_of(edited: Gaussians, most: int = 4) -> int:
-        rng = torch.Generator().manual_seed(5)  # pictures disagree by a hundredth: no band is for that
+        rng = torch.Generator().manual_seed(5)  # noise of 0.01 between pictures, which must add no band
         rows = pack(edited, with_shN=True)
         targets, aside = (
             [p + 0.01 * torch.randn(p.shape, generator=rng) for p in render_all(some, rows)]
@@ -264,7 +264,7 @@ def test_only_members_that_need_them_have_functions_beyond_dc(turning: float, sp
 
 
 @pytest.mark.parametrize(("turned", "most"), [(False, 4), (True, 4), (True, 1)])
-def test_where_the_end_shows_no_error_another_band_is_tried_for_the_way(turned: bool, most: int) -> None:
+def test_band_is_added_for_the_path_if_the_end_has_no_error(turned: bool, most: int) -> None:
     scene = dense_ball(1000, bands=3)
     draws = 0.3 * torch.randn(1000, 3, generator=torch.Generator().manual_seed(9))
     (crops, original), (others, _) = (prepared(scene, c) for c in (orbit(8, 64), orbit(16, 64)[1::2]))
@@ -288,11 +288,13 @@ def test_where_the_end_shows_no_error_another_band_is_tried_for_the_way(turned: 
 @pytest.mark.parametrize(
     ("bend", "asked"), [("straight", set()), ("bent", {0.25, 0.5, 0.75}), ("late", {0.5, 0.75})]
 )
-def test_strengths_are_asked_for_where_those_that_are_solved_for_say_too_little(
+def test_strengths_are_added_where_the_solved_strengths_are_insufficient(
     bend: str, asked: set[float]
 ) -> None:
-    """A change that goes straight, one whose channels turn, and one that begins at the half; and each stopped
-    on the way goes on to the same bits."""
+    """Cover a straight change, one with curved channels, and one that begins at strength 0.5.
+
+    Each is also stopped after every stage and must resume to the same bits.
+    """
     scene = dense_ball(800)
     side = torch.where(scene.means[:, :1] > 0, 1.0, -0.5)
     courses: dict[str, Callable[[float], list[float]]] = {
@@ -311,7 +313,7 @@ def test_strengths_are_asked_for_where_those_that_are_solved_for_say_too_little(
     def look(s: float) -> ColorEvaluator:
         return ColorEvaluator(aside, pictures(others, s))
 
-    rounds = [0]  # how many were asked for by the end of each
+    rounds = [0]  # number of strengths requested by the end of each round
 
     def ask(strengths: Sequence[float]) -> list[Target]:
         rounds.append(rounds[-1] + len(strengths))
@@ -345,10 +347,8 @@ def test_strengths_are_asked_for_where_those_that_are_solved_for_say_too_little(
 
 
 @pytest.mark.parametrize(("members", "size", "most"), [(200, 64, 60), (6000, 40, 40)])
-def test_steps_end_where_other_views_gain_little_and_go_on_where_members_are_dense(
-    members: int, size: int, most: int
-) -> None:
-    """A few of 60 steps for members of many pixels each; nearly all of 40 for those smaller than a pixel."""
+def test_steps_end_early_unless_members_are_dense(members: int, size: int, most: int) -> None:
+    """Expect a few of 60 steps for members of many pixels, nearly all of 40 for members below a pixel."""
     scene = dense_ball(members)
     side = scene.means[:, :1] > 0
     edited = replace(scene, sh0=torch.where(side, scene.sh0.flip(1), scene.sh0 + 0.3))
@@ -366,7 +366,7 @@ def test_steps_end_where_other_views_gain_little_and_go_on_where_members_are_den
     assert judge.error(add_bands(mapped, found)) <= 1.02 * judge.error(add_bands(mapped, further))
 
 
-def test_a_member_that_no_view_shows_follows_the_map() -> None:
+def test_invisible_member_follows_the_map() -> None:
     scene = dense_ball(3000)
     hidden = replace(
         scene, means=torch.where(torch.arange(3000)[:, None] < 50, 0.01 * scene.means, scene.means)
@@ -377,7 +377,7 @@ def test_a_member_that_no_view_shows_follows_the_map() -> None:
     assert float((offsets[:50, 11:14] - wanted).abs().max()) < 0.02
 
 
-def test_what_was_stopped_goes_on_to_the_same_bits() -> None:
+def test_stopped_solve_resumes_to_the_same_bits() -> None:
     scene = dense_ball(300)
     crops, original = prepared(scene, orbit(3, 40))
     side = torch.where(scene.means[:, :1] > 0, -1.0, 0.5)
@@ -413,8 +413,8 @@ def test_what_was_stopped_goes_on_to_the_same_bits() -> None:
 
 
 @pytest.mark.usefixtures("two_threads")
-def test_torch_works_on_one_thread_whoever_gets_a_view() -> None:
-    """Sums are added in an order that depends on torch's threads: two runs would not have the same bits."""
+def test_torch_uses_one_thread_per_view_worker() -> None:
+    """Guard reproducibility, because the order of torch's sums depends on its number of threads."""
     torch.set_num_threads(2)
     both = threading.Barrier(2, timeout=60)
 
@@ -426,8 +426,8 @@ def test_torch_works_on_one_thread_whoever_gets_a_view() -> None:
     assert torch.get_num_threads() == 2
 
 
-def test_a_view_says_what_its_clamps_pass() -> None:
-    """The fused pass over the pixels against the same in torch, with colors and pixels beyond both ends."""
+def test_fused_pixel_pass_matches_torch_with_clamps() -> None:
+    """Compare the fused pass over the pixels with torch, for colors and pixels beyond both range ends."""
     crops, original = prepared(dense_ball(400), orbit(1, 40))
     view = color_views(crops, original, 2)[0]
     rng = torch.Generator().manual_seed(5)
@@ -446,7 +446,7 @@ def test_a_view_says_what_its_clamps_pass() -> None:
     assert squared == pytest.approx(float(wanted), rel=1e-6)
 
 
-def test_one_thread_and_two_solve_to_the_same_bits() -> None:
+def test_one_and_two_threads_solve_to_the_same_bits() -> None:
     scene = dense_ball(20_000, bands=3)
     cameras = orbit(3, 48)
     crops, original = prepared(scene, cameras)
@@ -466,7 +466,7 @@ def test_one_thread_and_two_solve_to_the_same_bits() -> None:
     assert torch.equal(*ends)
 
 
-def test_a_target_that_is_not_finite_stops_before_the_step() -> None:
+def test_nonfinite_target_stops_before_the_step() -> None:
     scene = dense_ball(200)
     crops, original = prepared(scene, orbit(2, 40))
     pictures = render_all(crops, original)
@@ -479,7 +479,7 @@ def test_a_target_that_is_not_finite_stops_before_the_step() -> None:
     assert not bool(state.moved.any())
 
 
-def test_a_picture_that_nothing_changes_gives_no_change() -> None:
+def test_unchanged_picture_gives_no_change() -> None:
     scene = dense_ball(500, bands=3)
     offsets = solved(scene, scene, orbit(4, 48))
     assert float(offsets.abs().max()) < 1e-4
@@ -488,7 +488,7 @@ def test_a_picture_that_nothing_changes_gives_no_change() -> None:
 @pytest.mark.parametrize(
     "case", ["one color", "black", "white", "beyond white", "hidden", "one member", "huge bands"]
 )
-def test_hard_regions_give_finite_offsets_and_their_pictures(case: str) -> None:
+def test_hard_regions_have_finite_offsets_and_no_larger_error(case: str) -> None:
     scene = dense_ball(400, bands=8)
     colors = {"one color": 0.4, "black": -0.2, "white": 1.0, "beyond white": 3.0}
     if case in colors:

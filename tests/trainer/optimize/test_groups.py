@@ -1,4 +1,4 @@
-"""The group stage: parts are found, moved as wholes, and taken along the slider as wholes."""
+"""Group stage: parts are found, moved as wholes, and carried along the slider as wholes."""
 
 from __future__ import annotations
 
@@ -35,31 +35,31 @@ from trainer.views.view import crop
 
 
 def blob(count: int, center: tuple[float, float, float], seed: int) -> Tensor:
-    """Points in a ball of radius about 1. [count,3]"""
+    """Return points in a cube of side 1 around `center`. [count,3]"""
     rng = torch.Generator().manual_seed(seed)
     return torch.rand(count, 3, generator=rng) - 0.5 + torch.tensor(center)
 
 
-def test_two_blobs_apart_are_two_parts_and_the_larger_is_the_first() -> None:
+def test_separate_blobs_are_two_parts_largest_first() -> None:
     means = torch.cat([blob(200, (0, 0, 0), 0), blob(300, (2, 0, 0), 1)])
     part = connected_parts(means)
     assert part.tolist() == [1] * 200 + [0] * 300
 
 
-def test_what_a_bridge_joins_is_one_part() -> None:
+def test_bridged_blobs_are_one_part() -> None:
     bridge = torch.stack([torch.linspace(0.4, 1.6, 40), torch.zeros(40), torch.zeros(40)], dim=1)
     means = torch.cat([blob(200, (0, 0, 0), 0), blob(300, (2, 0, 0), 1), bridge])
     assert connected_parts(means).unique().tolist() == [0]
 
 
-def test_parts_do_not_depend_on_order_scale_or_place() -> None:
+def test_parts_do_not_depend_on_order_scale_or_position() -> None:
     means = torch.cat([blob(150, (0, 0, 0), 0), blob(300, (2, 0, 0), 1)])
     order = torch.randperm(len(means), generator=torch.Generator().manual_seed(3))
     assert torch.equal(connected_parts(means[order]), connected_parts(means)[order])
     assert torch.equal(connected_parts(1e-3 * means + 7.0), connected_parts(means))
 
 
-def test_strays_go_with_the_nearest_part() -> None:
+def test_strays_join_the_nearest_part() -> None:
     stray = torch.tensor([[3.5, 0.0, 0.0], [3.5, 0.1, 0.0], [-1.5, 0.0, 0.0]])
     means = torch.cat([blob(200, (0, 0, 0), 0), blob(300, (2, 0, 0), 1), stray])
     assert connected_parts(means)[-3:].tolist() == [0, 0, 1]
@@ -70,12 +70,12 @@ def test_few_members_are_one_part(count: int) -> None:
     assert connected_parts(blob(count, (0, 0, 0), 0)).tolist() == [0] * count
 
 
-def test_members_at_one_place_are_one_part() -> None:
+def test_coincident_members_are_one_part() -> None:
     assert connected_parts(torch.ones(50, 3)).tolist() == [0] * 50
 
 
 def some_motion(parts: Parts, seed: int = 0) -> Motion:
-    """Shifts of about a size, turns of about a radian."""
+    """Return random shifts of about the part's size and turns of about a radian."""
     rng = torch.Generator().manual_seed(seed)
     count = len(parts)
     return Motion(
@@ -86,13 +86,13 @@ def some_motion(parts: Parts, seed: int = 0) -> Motion:
 
 
 def some_parts() -> tuple[Tensor, Parts]:
-    """Packed rows of a bear's arms, in two parts."""
+    """Return packed rows of a bear's arms, in two parts."""
     case = small("arms")
     rows = pack(case.scene[case.region.members], with_shN=True)
     return rows, make_parts(rows, connected_parts(rows[:, :3]))
 
 
-def test_offsets_carried_with_their_parts_can_be_carried_back() -> None:
+def test_carried_offsets_can_be_carried_back() -> None:
     rows, parts = some_parts()
     offsets = 0.1 * torch.randn(rows.shape, generator=torch.Generator().manual_seed(1))
     motion = some_motion(parts)
@@ -101,7 +101,7 @@ def test_offsets_carried_with_their_parts_can_be_carried_back() -> None:
     assert torch.equal(there[:, 10:14], offsets[:, 10:14])
 
 
-def test_a_moved_part_looks_as_it_did_from_a_camera_that_moved_along() -> None:
+def test_moved_part_looks_unchanged_from_a_camera_moved_along() -> None:
     case = small("arms")
     rows, _ = some_parts()
     one = make_parts(rows, torch.zeros(len(rows), dtype=torch.int64))
@@ -124,7 +124,7 @@ def test_a_moved_part_looks_as_it_did_from_a_camera_that_moved_along() -> None:
         assert float((render(after, camera).image - before).abs().max()) > 0.2
 
 
-def test_half_way_a_part_has_half_the_shift_half_the_turn_and_half_the_growth_in_logs() -> None:
+def test_half_motion_has_half_the_shift_turn_and_log_scale() -> None:
     _, parts = some_parts()
     end = Motion(
         torch.ones(2, 3),
@@ -140,7 +140,7 @@ def test_half_way_a_part_has_half_the_shift_half_the_turn_and_half_the_growth_in
 
 
 def pictured(case: Small, edit: AnalyticEdit) -> tuple[Tensor, list[CropScene], list[Tensor]]:
-    """Members' rows, the views with boxes that hold the edit, and the edited boxes."""
+    """Return members' rows, views with boxes around the edit, and the edited boxes."""
     edited = edit.apply(case.scene, case.region.members, 1.0)
     with torch.no_grad():
         whole = [render(edited, view.camera, WHITE).image.clamp(0, 1) for view in case.views]
@@ -151,12 +151,12 @@ def pictured(case: Small, edit: AnalyticEdit) -> tuple[Tensor, list[CropScene], 
 
 
 def arm_pivots(case: Small) -> Tensor:
-    """Middle of each arm. [2,3]"""
+    """Return the center of each arm. [2,3]"""
     means = case.scene.means[case.region.members]
     return torch.stack([means[means[:, 0] * side > 0].mean(dim=0) for side in (1, -1)])
 
 
-def test_a_shift_with_growth_is_found_to_a_hundredth_of_the_part() -> None:
+def test_shift_with_growth_is_recovered() -> None:
     case = small("arms")
     shift = torch.tensor([0.0, 0.2, 0.1])
     rows, crops, targets = pictured(case, scale_edit(1.3, arm_pivots(case), shift))
@@ -168,7 +168,7 @@ def test_a_shift_with_growth_is_found_to_a_hundredth_of_the_part() -> None:
     assert float(motion.turn.norm(dim=1).max()) < 0.05
 
 
-def test_a_turn_is_found() -> None:
+def test_turn_is_recovered() -> None:
     case = small("arms")
     rows, crops, targets = pictured(case, swing_edit(30.0, torch.tensor([1.0, 0.0, 0.0]), arm_pivots(case)))
     motion = group_stage(rows, crops, [targets], steps=90).motions[0]
@@ -176,14 +176,14 @@ def test_a_turn_is_found() -> None:
     assert float((motion.turn - expected).norm(dim=1).max()) < math.radians(3.0)
 
 
-def test_where_nothing_moves_the_parts_stay_exactly() -> None:
+def test_parts_stay_exactly_if_nothing_moves() -> None:
     case = small("arms")
     rows, crops, targets = pictured(case, AnalyticEdit("nothing", lambda part, _: part))
     motion = group_stage(rows, crops, [targets], steps=8).motions[0]
     assert not any(bool(values.any()) for values in (motion.shift, motion.log_scale, motion.turn))
 
 
-def test_the_same_seed_finds_the_same_bits() -> None:
+def test_same_seed_finds_the_same_bits() -> None:
     case = small("arms")
     rows, crops, targets = pictured(case, scale_edit(1.3, arm_pivots(case)))
     first, again = (group_stage(rows, crops, [targets], steps=10, seed=4).capture_state() for _ in range(2))
@@ -193,7 +193,7 @@ def test_the_same_seed_finds_the_same_bits() -> None:
     assert torch.equal(kept.capture_state()["motions"], first["motions"])
 
 
-def test_a_place_three_sizes_away_is_found_by_the_wide_search() -> None:
+def test_wide_search_finds_a_shift_of_three_sizes() -> None:
     case = small("arms")
     pivots = arm_pivots(case)
     rows = pack(case.scene[case.region.members], with_shN=True)
@@ -204,7 +204,7 @@ def test_a_place_three_sizes_away_is_found_by_the_wide_search() -> None:
     assert float((motion.shift - shift).norm(dim=1).max()) < 0.1 * size
 
 
-def test_targets_that_are_not_finite_stop_the_search() -> None:
+def test_nonfinite_targets_stop_the_search() -> None:
     case = small("arms")
     rows, crops, targets = pictured(case, scale_edit(1.3, arm_pivots(case)))
     parts = make_parts(rows, connected_parts(rows[:, :3]))
@@ -212,7 +212,7 @@ def test_targets_that_are_not_finite_stop_the_search() -> None:
         GroupSearch(rows, parts, crops, 4).find([t * float("nan") for t in targets], parts.rest_motion())
 
 
-def test_on_the_way_a_part_keeps_its_shape_and_the_ends_are_exact() -> None:
+def test_path_keeps_the_shape_of_parts_and_exact_ends() -> None:
     rows, parts = some_parts()
     motions = (some_motion(parts, 1), some_motion(parts, 2))
     nothing = torch.zeros_like(rows)
@@ -228,10 +228,10 @@ def test_on_the_way_a_part_keeps_its_shape_and_the_ends_are_exact() -> None:
         for k in range(2):
             now = (rows + one.offsets.float())[parts.part == k, :3]
             ratio = torch.cdist(now, now)[own[k] > 0.1] / own[k][own[k] > 0.1]
-            assert float(ratio.max() / ratio.min()) < 1.03  # half precision; a straight way would shrink it
+            assert float(ratio.max() / ratio.min()) < 1.03  # half precision; a straight path shrinks it
 
 
-def test_no_member_grows_beyond_the_clamp() -> None:
+def test_member_growth_is_limited_by_the_clamp() -> None:
     case = small("arms")
     rows, crops, targets = pictured(case, scale_edit(2.5, arm_pivots(case)))
     largest = []
@@ -245,7 +245,7 @@ def test_no_member_grows_beyond_the_clamp() -> None:
 
 
 def ears_run(folder: Path, truth: Truth, strengths: tuple[float, ...], **more: object) -> RunResult:
-    """Train the small bear's ears towards pictures of the truth; the pictures are made if need be."""
+    """Train the small bear's ears towards pictures of the truth, which are rendered if missing."""
     edited = folder / f"edited{len(strengths)}"
     _, region = write_truth(folder, truth)
     name = "-".join([f"run{len(strengths)}", *(f"{key}{value}" for key, value in more.items())])
@@ -259,7 +259,7 @@ def ears_run(folder: Path, truth: Truth, strengths: tuple[float, ...], **more: o
 
 
 @pytest.mark.slow
-def test_grown_ears_arrive_with_the_group_stage_and_smear_without(tmp_path: Path) -> None:
+def test_group_stage_improves_grown_ears(tmp_path: Path) -> None:
     truth = bear_truth(size=4000)
     free = ears_run(tmp_path, truth, (1.0,), group_steps=0)
     grouped = ears_run(tmp_path, truth, (1.0,), group_steps=80)
@@ -270,7 +270,7 @@ def test_grown_ears_arrive_with_the_group_stage_and_smear_without(tmp_path: Path
 
 
 @pytest.mark.slow
-def test_stages_of_a_tilt_are_met_and_the_slider_passes_the_truth_between_them(tmp_path: Path) -> None:
+def test_tilt_stages_are_met_and_the_slider_is_accurate_between(tmp_path: Path) -> None:
     truth = bear_truth("tilted ears", size=4000)
     run = ears_run(tmp_path, truth, (0.5, 1.0), group_steps=80)
     assert run.report["between"]["0.5"]["psnr"] > 28.0

@@ -1,4 +1,4 @@
-"""The clamp that keeps useful gradients and the perceptual terms."""
+"""Clamp that keeps useful gradients, and perceptual losses."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from trainer.optimize.losses import GradientL1, LpipsLoss, perceptual_loss
 from trainer.views.crops import clamp_towards
 
 
-def test_the_clamp_gives_the_plain_clamps_values() -> None:
+def test_clamp_has_the_values_of_the_plain_clamp() -> None:
     x = torch.linspace(-2.0, 3.0, 101)
     assert torch.equal(clamp_towards(x, 0.0, 1.0), x.clamp(0.0, 1.0))
 
 
-def test_the_clamp_passes_a_gradient_that_leads_back_into_the_range_and_no_other() -> None:
+def test_clamp_passes_only_gradients_back_into_the_range() -> None:
     x = torch.tensor([-1.0, -1.0, 0.5, 0.5, 2.0, 2.0], requires_grad=True)
-    pull = torch.tensor([-1.0, 1.0, -1.0, 1.0, -1.0, 1.0])  # descent goes against it
-    (clamp_towards(x, 0.0, 1.0) * pull).sum().backward()
+    gradient = torch.tensor([-1.0, 1.0, -1.0, 1.0, -1.0, 1.0])  # descent moves against the gradient
+    (clamp_towards(x, 0.0, 1.0) * gradient).sum().backward()
     assert x.grad is not None
     assert x.grad.tolist() == [-1.0, 0.0, -1.0, 1.0, 0.0, 1.0]
 
 
-def test_a_channel_below_zero_can_be_trained_to_a_color_above_it() -> None:
+def test_channel_below_zero_can_be_trained_to_a_positive_color() -> None:
     x = torch.tensor([-0.3], requires_grad=True)
     optimizer = torch.optim.Adam([x], lr=0.05)
     for _ in range(60):
@@ -35,7 +35,7 @@ def test_a_channel_below_zero_can_be_trained_to_a_color_above_it() -> None:
     assert float(x.detach()) == pytest.approx(0.4, abs=0.06)
 
 
-def test_the_gradient_stand_in_is_zero_for_equal_images_and_sees_lost_texture() -> None:
+def test_gradient_l1_is_zero_for_equal_images_and_detects_lost_texture() -> None:
     texture = torch.rand(40, 40, 3, generator=torch.Generator().manual_seed(0))
     measure = GradientL1()
     assert float(measure(texture, texture)) == 0.0
@@ -43,7 +43,7 @@ def test_the_gradient_stand_in_is_zero_for_equal_images_and_sees_lost_texture() 
     assert float(measure(flat, texture)) > 5 * float(measure(texture + 0.05, texture))
 
 
-def test_absent_lpips_weights_mean_the_stand_in_and_a_line_that_says_so(
+def test_missing_lpips_weights_fall_back_with_a_note(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def absent() -> Lpips:
@@ -56,7 +56,7 @@ def test_absent_lpips_weights_mean_the_stand_in_and_a_line_that_says_so(
     assert "pip install" in line
 
 
-def test_cached_lpips_targets_change_nothing_and_are_forgotten_when_told() -> None:
+def test_cached_lpips_targets_keep_their_values_until_forgotten() -> None:
     try:
         measure = LpipsLoss(Lpips.load())
     except ProgdfError:

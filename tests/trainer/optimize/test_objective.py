@@ -1,4 +1,4 @@
-"""The loss, term by term: right gradients, paid when due, and each doing what it is there for."""
+"""Loss terms: gradients, schedule and effect of each."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def noise(*shape: int, seed: int = 0) -> Tensor:
 
 
 def moment(**more: object) -> Moment:
-    """A step in the middle of a run that has arrived at its stage."""
+    """Return a step in the middle of a run, at the target of its stage."""
     moved = (noise(5, 14, seed=2) - 0.5).requires_grad_()
     settled = Moment(
         noise(8, 9, 3).requires_grad_(), noise(8, 9, 3, seed=1), 0, 100, 10, True, moved, torch.zeros(5, 14)
@@ -49,7 +49,7 @@ def moment(**more: object) -> Moment:
 
 
 def paying(perceptual_weight: float = 0.1, **more: object) -> OptimizeOptions:
-    """What an objective is to pay for."""
+    """Return optimization options with these loss terms."""
     return replace(OptimizeOptions(), perceptual_weight=perceptual_weight, **more)  # type: ignore[arg-type]
 
 
@@ -59,7 +59,7 @@ ALL_TERMS = paying(0.3, perceptual_every=1, progressive="decay", sharpness="hing
 # ---- gradients
 
 
-def test_l1_and_the_stand_in_have_the_gradients_of_finite_differences() -> None:
+def test_l1_and_gradient_l1_match_finite_differences() -> None:
     image = noise(8, 9, 3).requires_grad_()
     target = noise(8, 9, 3, seed=1)
     for measure in (l1, GradientL1()):
@@ -67,7 +67,7 @@ def test_l1_and_the_stand_in_have_the_gradients_of_finite_differences() -> None:
 
 
 @pytest.mark.parametrize("form", ["hinge", "paper"])
-def test_sharpness_has_the_gradient_of_finite_differences(form: str) -> None:
+def test_sharpness_gradient_matches_finite_differences(form: str) -> None:
     image = 0.5 * noise(8, 9, 3)
     target = noise(8, 9, 3, seed=1)
     inside = noise(8, 9, seed=3) > 0.3
@@ -80,13 +80,13 @@ def test_sharpness_has_the_gradient_of_finite_differences(form: str) -> None:
 
 @pytest.mark.parametrize("grows", [False, True])
 @pytest.mark.parametrize("over", get_args(Over))
-def test_the_progressive_change_has_the_gradient_of_finite_differences(grows: bool, over: Over) -> None:
+def test_progressive_gradient_matches_finite_differences(grows: bool, over: Over) -> None:
     moved = noise(5, 14).requires_grad_()
     previous = noise(5, 14, seed=1)
     assert torch.autograd.gradcheck(lambda x: progressive_change(x, previous, 70, grows, over), moved)
 
 
-def test_lpips_has_the_gradient_of_finite_differences() -> None:
+def test_lpips_gradient_matches_finite_differences() -> None:
     try:
         network = Lpips.load()
     except ProgdfError as error:
@@ -101,22 +101,22 @@ def test_lpips_has_the_gradient_of_finite_differences() -> None:
     measure(image, target).backward()
     assert image.grad is not None
     for seed in range(3):
-        nudge = 1e-7 * (noise(32, 32, 3, seed=10 + seed) - 0.5)  # longer ones step over kinks of the ReLUs
+        nudge = 1e-7 * (noise(32, 32, 3, seed=10 + seed) - 0.5)  # larger steps cross kinks of the ReLUs
         with torch.no_grad():
             rise = float(measure(image + nudge, target) - measure(image - nudge, target)) / 2
         assert float((image.grad * nudge).sum()) == pytest.approx(rise, rel=1e-5)
 
 
-# ---- which terms, when
+# ---- schedule of terms
 
 
-def test_each_term_has_its_name_and_their_sum_is_the_loss() -> None:
+def test_loss_is_the_sum_of_its_named_terms() -> None:
     terms = Objective(GradientL1(), ALL_TERMS).terms(moment())
     assert list(terms) == ["l1", "perceptual", "progressive", "sharpness"]
     assert float(total_loss(terms).detach()) == pytest.approx(sum(float(x.detach()) for x in terms.values()))
 
 
-def test_weights_scale_their_terms_and_leave_l1_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_weights_scale_their_terms_and_leave_l1_unchanged(monkeypatch: pytest.MonkeyPatch) -> None:
     now = moment(image=0.5 * noise(8, 9, 3))
     single = Objective(GradientL1(), ALL_TERMS).terms(now)
     monkeypatch.setattr("trainer.optimize.losses.PROGRESSIVE_WEIGHT", 10.0)
@@ -128,14 +128,14 @@ def test_weights_scale_their_terms_and_leave_l1_alone(monkeypatch: pytest.Monkey
         assert float(double[name].detach()) == pytest.approx(factor * float(value.detach())), name
 
 
-def test_the_perceptual_term_is_paid_every_so_many_steps_and_only_at_the_stages_own_picture() -> None:
+def test_perceptual_term_is_computed_every_n_steps_at_the_stage_target() -> None:
     objective = Objective(GradientL1(), paying(perceptual_every=3))
     paid = ["perceptual" in objective.terms(moment(local=local)) for local in range(6)]
     assert paid == [True, False, False, True, False, False]
     assert "perceptual" not in objective.terms(moment(local=0, arrived=False))
 
 
-def test_a_new_stage_forgets_the_targets_of_the_last() -> None:
+def test_new_stage_forgets_the_targets_of_the_last() -> None:
     forgotten = []
 
     class Watched(GradientL1):
@@ -146,7 +146,7 @@ def test_a_new_stage_forgets_the_targets_of_the_last() -> None:
     assert forgotten == [True]
 
 
-def test_the_line_for_the_log_names_what_is_really_used() -> None:
+def test_loss_description_names_the_active_terms() -> None:
     assert describe_loss(paying(), "gradient-l1") == "L1 + 0.1 gradient-l1 every 2 steps"
     assert describe_loss(ALL_TERMS, "lpips-vgg") == (
         "L1 + 0.3 lpips-vgg + 5 progressive (decay, mean) + 0.1 sharpness (hinge)"
@@ -156,7 +156,7 @@ def test_the_line_for_the_log_names_what_is_really_used() -> None:
 # ---- the progressive constraint
 
 
-def test_the_progressive_change_is_the_printed_sum_or_the_members_mean() -> None:
+def test_progressive_change_is_the_printed_sum_or_the_member_mean() -> None:
     moved = noise(5, 14)
     previous = noise(5, 14, seed=1)
     squares = (moved - previous).square().sum(dim=1)
@@ -171,7 +171,7 @@ def test_the_progressive_change_is_the_printed_sum_or_the_members_mean() -> None
 
 
 def recolored(weights: OptimizeOptions, steps: int = 30, **more: object) -> list[ParameterSnapshot]:
-    """The recordings of a short recoloring of a small bear."""
+    """Return the recordings of a short recoloring of a small bear."""
     case = small("body")
     editor = make_editor(EditorOptions("recolor:#3060d0"), case.scene, case.region, case.views)
     original = pack(case.scene[case.region.members], with_shN=True)
@@ -183,12 +183,12 @@ def recolored(weights: OptimizeOptions, steps: int = 30, **more: object) -> list
 
 
 def distance_traveled(weights: OptimizeOptions) -> float:
-    """Mean offset at the end of it."""
+    """Return the mean absolute offset at the end of a short recoloring."""
     return float(recolored(weights)[-1].offsets.abs().mean())
 
 
 @pytest.mark.parametrize("progressive", ["decay", "growth"])
-def test_the_sum_over_members_holds_an_edit_back_far_more_than_their_mean(progressive: Progressive) -> None:
+def test_sum_over_members_restrains_an_edit_more_than_the_mean(progressive: Progressive) -> None:
     free = distance_traveled(paying())
     mean, total = (
         distance_traveled(paying(progressive=progressive, progressive_over=over)) for over in get_args(Over)
@@ -196,7 +196,7 @@ def test_the_sum_over_members_holds_an_edit_back_far_more_than_their_mean(progre
     assert 5 * total < mean < free
 
 
-def test_a_frozen_edit_is_recorded_too_where_recordings_go_by_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frozen_edit_is_recorded_at_fixed_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("trainer.optimize.losses.PROGRESSIVE_WEIGHT", 1e4)
     frozen = paying(progressive="growth", progressive_over="sum")
     assert [found.step for found in recolored(frozen, every=8, smoothing=0.0)] == [8, 16, 24, 30]
@@ -206,7 +206,7 @@ def test_a_frozen_edit_is_recorded_too_where_recordings_go_by_steps(monkeypatch:
 # ---- sharpness
 
 
-def test_the_hinge_is_shut_where_the_render_is_as_sharp_as_its_target() -> None:
+def test_hinge_is_zero_if_the_render_is_as_sharp_as_its_target() -> None:
     texture = noise(20, 20, 3)
     soft = texture.mean(dim=(0, 1)).expand_as(texture)
     assert float(sharpness(texture, texture, "hinge")) == 0.0
@@ -214,7 +214,7 @@ def test_the_hinge_is_shut_where_the_render_is_as_sharp_as_its_target() -> None:
     assert float(sharpness(soft, texture, "hinge")) > 0.1
 
 
-def test_the_hinge_looks_inside_the_mask_only() -> None:
+def test_hinge_covers_only_the_mask() -> None:
     texture = noise(20, 20, 3)
     soft = texture.clone()
     soft[:, 10:] = 0.5
@@ -224,8 +224,8 @@ def test_the_hinge_looks_inside_the_mask_only() -> None:
     assert float(sharpness(soft, texture, "hinge", ~left)) > 0.0
 
 
-def test_the_papers_sharpness_pulls_at_pixels_inside_the_picture_and_pays_for_contrast() -> None:
-    """The printed sum of signed Laplacians telescopes to the rim; that of squares does not."""
+def test_paper_sharpness_acts_inside_the_picture_and_rewards_contrast() -> None:
+    """Guard against signed Laplacians, whose sum telescopes to the border; that of squares does not."""
     image = noise(20, 20, 3).requires_grad_()
     lost = sharpness(image, image.detach(), "paper")
     lost.backward()
@@ -234,7 +234,7 @@ def test_the_papers_sharpness_pulls_at_pixels_inside_the_picture_and_pays_for_co
     assert float(sharpness(2 * image, image, "paper").detach()) == pytest.approx(4 * float(lost.detach()))
 
 
-def test_descending_the_hinge_brings_back_a_lost_texture_s_sharpness() -> None:
+def test_descending_the_hinge_restores_lost_sharpness() -> None:
     target = noise(24, 24, 3)
     image = (0.25 * target + 0.75 * target.mean()).requires_grad_()
     optimizer = torch.optim.SGD([image], lr=20.0)
@@ -247,7 +247,7 @@ def test_descending_the_hinge_brings_back_a_lost_texture_s_sharpness() -> None:
     assert float(sharpness(image, target, "hinge").detach()) < 0.1 * before
 
 
-def test_erosion_takes_the_rim_but_not_at_the_border_of_the_picture() -> None:
+def test_erosion_shrinks_the_mask_except_at_the_picture_border() -> None:
     mask = torch.zeros(12, 12)
     mask[3:, 3:] = 1.0
     inner = erode(mask, by=2)
@@ -258,7 +258,7 @@ def test_erosion_takes_the_rim_but_not_at_the_border_of_the_picture() -> None:
 # ---- means
 
 
-def test_a_terms_mean_is_over_the_steps_that_paid_for_it() -> None:
+def test_term_mean_covers_only_the_steps_that_computed_it() -> None:
     means = TermMeans()
     means.add({"l1": 1.0, "perceptual": 4.0})
     means.add({"l1": 2.0})
@@ -266,12 +266,12 @@ def test_a_terms_mean_is_over_the_steps_that_paid_for_it() -> None:
     assert means.read() == {}
 
 
-def test_the_table_of_losses_has_a_gap_where_a_term_was_not_paid() -> None:
+def test_loss_table_has_gaps_for_skipped_terms() -> None:
     table = loss_table([(3, {"l1": 0.123456789}), (7, {"l1": 0.1, "perceptual": 0.5})])
     assert table == {"step": [3, 7], "l1": [0.12346, 0.1], "perceptual": [None, 0.5]}
 
 
-def test_kept_features_have_a_bound_and_values_do_not_depend_on_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_feature_cache_is_bounded_without_changing_values(monkeypatch: pytest.MonkeyPatch) -> None:
     try:
         network = Lpips.load()
     except ProgdfError as error:
@@ -284,7 +284,7 @@ def test_kept_features_have_a_bound_and_values_do_not_depend_on_it(monkeypatch: 
     features = Count(monkeypatch, Lpips, "features")
 
     def distances(loss: LpipsLoss) -> tuple[list[float], int]:
-        """Of all targets, and of how many pictures features were computed."""
+        """Return the distances to all targets, and the number of pictures whose features were computed."""
         before = features.calls
         values = [float(loss(pictures[0], target, key)) for key, target in enumerate(pictures[1:])]
         return values, features.calls - before

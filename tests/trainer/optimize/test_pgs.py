@@ -1,4 +1,4 @@
-"""The edit optimization: it arrives, records on the way, moves nothing else, and repeats bit for bit."""
+"""Edit optimization: it reaches the target, records snapshots, moves nothing else and is reproducible."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from trainer.views.view import crop
 
 
 def run(case: Small, steps: int = 40, **more: object) -> tuple[Tensor, list[ParameterSnapshot]]:
-    """Original rows and recordings of a course."""
+    """Return the original rows and the recordings of an optimization."""
     wanted = course(case, steps, **more)
     return wanted[0], list(optimize(*wanted))
 
 
-def test_the_members_arrive_at_the_edited_views() -> None:
+def test_members_reach_the_edited_views() -> None:
     case = small("body")
     original, found = run(case, steps=60)
     edited = case.scene.replace_rows(case.region.members, original + found[-1].offsets)
@@ -38,7 +38,7 @@ def test_the_members_arrive_at_the_edited_views() -> None:
         assert after > before + 12.0
 
 
-def test_the_distance_from_the_finished_edit_falls() -> None:
+def test_distance_to_the_finished_edit_falls() -> None:
     _, found = run(small("body"))
     assert found[-1].means["left"] < 0.25 * found[0].means["left"]
 
@@ -51,33 +51,33 @@ def test_each_stage_ends_with_a_recording_and_steps_ascend() -> None:
     assert len(found) >= 8
 
 
-def test_the_first_steps_start_from_the_original_exactly() -> None:
+def test_first_steps_start_from_the_original() -> None:
     _, found = run(small("body"), snapshots=10_000)
     assert float(found[0].offsets.abs().max()) < 0.1 * float(found[-1].offsets.abs().max())
 
 
-def test_a_color_edit_moves_colors_and_nothing_else() -> None:
+def test_color_edit_moves_only_colors() -> None:
     _, found = run(small("body"))
     for name, columns in attribute_slices(found[-1].offsets.shape[1]).items():
         moved = bool(found[-1].offsets[:, columns].any())
         assert moved == (name in ("sh0", "shN")), name
 
 
-def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not() -> None:
+def test_same_seed_repeats_the_bits_and_another_seed_differs() -> None:
     case = small("body")
     first, again, other = (run(case, steps=12, seed=seed)[1][-1].offsets for seed in (3, 3, 4))
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
 
 
-def test_a_loss_that_is_not_finite_stops_the_run_instead_of_spoiling_it() -> None:
+def test_nonfinite_loss_stops_the_run() -> None:
     case = small("body")
     broken = replace(case, views=tuple(replace(v, image=v.image * float("nan")) for v in case.views))
     with pytest.raises(FloatingPointError, match="step"):
         run(broken, steps=3)
 
 
-def test_a_crop_equals_the_composed_scene_rendered_whole() -> None:
+def test_crop_matches_the_render_of_the_composed_scene() -> None:
     case = small("body")
     view = case.views[0]
     rows = pack(case.scene[case.region.members], with_shN=True)
@@ -90,7 +90,7 @@ def test_a_crop_equals_the_composed_scene_rendered_whole() -> None:
     assert torch.allclose(prepared.original.clamp(0, 1), crop(view.image, view.box), atol=1e-6)
 
 
-def test_geometry_edits_have_rates_for_everything_and_scale_with_the_size_of_the_region() -> None:
+def test_geometry_rates_cover_everything_and_scale_with_the_region() -> None:
     small_rates, large_rates = (learning_rates("geometry", 14, extent) for extent in (1.0, 10.0))
     assert bool((small_rates > 0).all())
     means = attribute_slices(14)["means"]
@@ -98,13 +98,13 @@ def test_geometry_edits_have_rates_for_everything_and_scale_with_the_size_of_the
     assert torch.equal(large_rates[3:], small_rates[3:])
 
 
-def test_steps_are_sized_by_the_farthest_changes_and_not_by_their_mean() -> None:
+def test_step_size_follows_the_largest_changes_not_the_mean() -> None:
     before = torch.zeros(10, 10, 3)
     target = torch.full((10, 10, 3), 0.02)
-    target[:1, :, 1] = 0.5  # a tenth of the pixels goes far
-    target[5:] = 0.0  # half do not change at all
+    target[:1, :, 1] = 0.5  # a tenth of the pixels changes a lot
+    target[5:] = 0.0  # half of the pixels stay
     assert p95_change([target], [before]) == pytest.approx(0.5)
     assert p95_change([before], [before]) == 0.0
     strip = torch.full((20, 10, 3), 0.1)
-    strip[0, :2] = 1.0  # a hundredth is no measure
+    strip[0, :2] = 1.0  # 1 % of the pixels must not count
     assert p95_change([strip], [torch.zeros(20, 10, 3)]) == pytest.approx(0.1)

@@ -1,4 +1,4 @@
-"""Colors from one picture: what it shows is painted, what it does not show follows its surface or stays."""
+"""Colors from one picture: visible members are painted, hidden ones follow their surface or stay."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SIDE = 24
 
 
 def wall(z: float, color: Tensor) -> Gaussians:
-    """A wall of flat, opaque Gaussians at depth z, ±1 wide."""
+    """Return a wall of flat, opaque Gaussians at depth z, from -1 to 1."""
     line = torch.linspace(-1, 1, SIDE)
     means = torch.stack([*torch.meshgrid(line, line, indexing="xy"), torch.full((SIDE, SIDE), z)], dim=2)
     count = SIDE * SIDE
@@ -36,26 +36,26 @@ def wall(z: float, color: Tensor) -> Gaussians:
 
 
 def two_walls() -> Gaussians:
-    """An orange wall before a gray one, so near that both are in one region."""
+    """Return an orange wall in front of a gray one, so close that both are in one region."""
     front = wall(0.0, torch.tensor([0.8, 0.5, 0.2]))
     back = wall(0.4, torch.tensor([0.5, 0.5, 0.5]))
     return Gaussians(**{name: torch.cat([getattr(front, name), getattr(back, name)]) for name in ATTRIBUTES})
 
 
 def ahead(width: float = 0.6) -> Camera:
-    """From before the front wall; it sees the walls whole, or less of them where `width` is larger."""
+    """Return a camera in front of the walls; `width` (radians) is its field of view, 0.6 shows them whole."""
     viewmat = look_at(torch.tensor([0.0, 0.0, -3.0]), torch.zeros(3), torch.tensor([0.0, -1.0, 0.0]))
     return Camera(viewmat, intrinsics(width, 96, 96), 96, 96)
 
 
 def change_of(scene: Gaussians, camera: Camera, painted: Tensor) -> Tensor:
-    """What one picture changes of the members' colors. [M,3]"""
+    """Return the change of the members' colors by one painted picture. [M,3]"""
     members = torch.arange(len(scene))
     crops = [crop_scene(scene, members, camera, (0, 0, 96, 96), WHITE, True)]
     return C0 * edit_few(scene, members, crops, [painted])[:, 0]
 
 
-def test_a_hidden_wall_is_not_painted_with_the_one_before_it() -> None:
+def test_hidden_wall_is_not_painted_with_the_front_wall() -> None:
     scene = two_walls()
     camera = ahead()
     painted = render_view(scene, camera, WHITE).clamp(0, 1)
@@ -64,42 +64,44 @@ def test_a_hidden_wall_is_not_painted_with_the_one_before_it() -> None:
     middle = (scene.means[:, :2].abs() < 0.4).all(dim=1)
     front = middle & (scene.means[:, 2] == 0.0)
     back = middle & (scene.means[:, 2] > 0.0)
-    assert float(change[front, 2].mean()) > 0.6  # of .7: it is blue
+    assert float(change[front, 2].mean()) > 0.6  # 0.7 is fully blue
     assert float(change[back].abs().max()) < 0.05
 
 
-def test_what_is_seen_through_others_is_asked_where_a_second_picture_shows_it() -> None:
+def test_unclear_members_are_solved_only_with_a_second_picture() -> None:
     scene = wall(0.0, torch.zeros(3))
     cameras = (ahead(), ahead(0.8))
     crops = [crop_scene(scene, torch.arange(len(scene)), c, (0, 0, 96, 96), WHITE, True) for c in cameras]
     original = pack(scene, with_shN=False)
-    nobody = torch.zeros(len(scene), dtype=torch.bool)
-    ties = Ties(surface_graph(scene, nobody), nobody)  # no picture shows any of it clearly
+    none_clear = torch.zeros(len(scene), dtype=torch.bool)
+    ties = Ties(surface_graph(scene, none_clear), none_clear)  # no picture shows a member clearly
     asked = [make_solver(color_views(crops[:n], original), original, ties).asked for n in (1, 2)]
     assert not bool(asked[0].any())
     assert float(asked[1].float().mean()) > 0.9
 
 
-def test_what_lies_beside_the_picture_follows_a_fill() -> None:
+def test_members_beside_the_picture_follow_a_fill() -> None:
     scene = wall(0.0, torch.tensor([0.8, 0.5, 0.2]))
-    camera = ahead(0.3)  # the middle of the wall alone
+    camera = ahead(0.3)  # only the middle of the wall is visible
     painted = render_view(scene, camera, WHITE).clamp(0, 1) * 0.5
     change = change_of(scene, camera, painted)
     corner = (scene.means[:, :2].abs() > 0.9).all(dim=1)
     assert float((change[corner] - torch.tensor([-0.4, -0.25, -0.1])).abs().max()) < 0.05
 
 
-def test_a_few_pictures_choose_the_degree_of_the_map_by_maps_alone() -> None:
+def test_map_degree_for_few_pictures_is_chosen_by_maps_alone() -> None:
     rng = torch.Generator().manual_seed(0)
     camera = ahead(0.3)
     gray = 0.4 + 0.2 * torch.rand(SIDE * SIDE, 1, generator=rng).expand(-1, 3)
     scene = replace(wall(0.0, torch.zeros(3)), sh0=rgb_to_sh0(gray).clone())
     painted = [render_view(scene, camera, WHITE).clamp(0, 1) * 0.9]
-    painted[0][:, 48:] *= 0.5  # which a residual says better than any map
+    painted[0][:, 48:] *= 0.5  # a residual fits this better than any map
     crops = [crop_scene(scene, torch.arange(len(scene)), camera, (0, 0, 96, 96), WHITE, True)]
     original = pack(scene, with_shN=False)
-    nobody = torch.zeros(len(scene), dtype=torch.bool)
-    solver = make_solver(color_views(crops, original), original, Ties(surface_graph(scene, nobody), ~nobody))
+    none_clear = torch.zeros(len(scene), dtype=torch.bool)
+    solver = make_solver(
+        color_views(crops, original), original, Ties(surface_graph(scene, none_clear), ~none_clear)
+    )
     by, judge = split_solver(solver, painted)
     _, model = choose_model(solver, (by, judge), painted, 20, 1)
     found = dict(model.tried)
@@ -109,10 +111,10 @@ def test_a_few_pictures_choose_the_degree_of_the_map_by_maps_alone() -> None:
     assert model.bands == 1
 
 
-def test_what_lies_beside_the_picture_takes_the_nearest_of_two_paints() -> None:
+def test_members_beside_the_picture_take_the_nearest_of_two_paints() -> None:
     scene = wall(0.0, torch.zeros(3))
     camera = ahead(0.3)
-    right = camera.viewmat[0, :3] @ scene.means.T  # beyond .5 it is out of sight
+    right = camera.viewmat[0, :3] @ scene.means.T  # outside the picture beyond 0.5
     gray = 0.4 + 0.2 * torch.rand(len(scene), generator=torch.Generator().manual_seed(0))
     scene = replace(scene, sh0=rgb_to_sh0(gray[:, None].expand(-1, 3)).clone())
     painted = torch.tensor([0.9, 0.2, 0.2]).expand(96, 96, 3).clone()
@@ -121,11 +123,11 @@ def test_what_lies_beside_the_picture_takes_the_nearest_of_two_paints() -> None:
     colors = gray[:, None] + change
     for side, channel in ((right < -0.8, 0), (right > 0.8, 2)):
         found = colors[side].mean(dim=0)
-        assert float(found[channel] - found[2 - channel]) > 0.15  # of .7, where the other paint is far
-        assert abs(float(found[1]) - 0.2) < 0.03  # of both paints
+        assert float(found[channel] - found[2 - channel]) > 0.15  # of 0.7, where the other paint is far
+        assert abs(float(found[1]) - 0.2) < 0.03  # the value in both paints
 
 
-def test_a_half_goes_on_beyond_the_picture_but_a_pattern_does_not() -> None:
+def test_half_continues_beyond_the_picture_but_a_pattern_does_not() -> None:
     scene, camera = wall(0.0, torch.zeros(3)), ahead(0.3)
     right, down = (camera.viewmat[i, :3] @ scene.means.T for i in (0, 1))
     gray = 0.4 + 0.2 * torch.rand(len(scene), generator=torch.Generator().manual_seed(0))
@@ -133,28 +135,30 @@ def test_a_half_goes_on_beyond_the_picture_but_a_pattern_does_not() -> None:
     paint = torch.tensor([0.2, 0.3, 0.6])
 
     def taken(masked: Tensor) -> Tensor:
-        """How much of the paint each member takes, of a picture where these have all of it. [M]"""
+        """Return each member's share of the paint, for a picture in which `masked` is painted. [M]"""
         colors = gray[:, None] + masked[:, None] * (paint - 0.5 * gray[:, None])
         truth = replace(scene, sh0=rgb_to_sh0(colors).clone())
         change = change_of(scene, camera, render_view(truth, camera, WHITE).clamp(0, 1))
         return change.sum(dim=1) / (paint - 0.5 * gray[:, None]).sum(dim=1)
 
     half = taken((right > 0.0).float())
-    for side, least, most in ((right > 0.8, 0.8, 1.0), (right < -0.8, 0.0, 0.2)):
-        assert least < float(half[side].mean()) < most
+    for side, low, high in ((right > 0.8, 0.8, 1.0), (right < -0.8, 0.0, 0.2)):
+        assert low < float(half[side].mean()) < high
         assert float(half[side].std()) < 0.1
     stripes = taken(((down * 12.0).floor() % 2.0 == 0.0).float())
     assert 0.35 < float(stripes[right.abs() > 0.8].mean()) < 0.65
     assert float(stripes[right.abs() > 0.8].std()) < 0.1
 
 
-def test_a_residual_that_says_nothing_of_other_pixels_stays_with_its_neighbors() -> None:
+def test_residual_without_held_out_gain_stays_close_to_its_neighbors() -> None:
     scene = wall(0.0, torch.tensor([0.8, 0.5, 0.2]))
     camera = ahead(0.3)
     crops = [crop_scene(scene, torch.arange(len(scene)), camera, (0, 0, 96, 96), WHITE, True)]
     original = pack(scene, with_shN=False)
-    nobody = torch.zeros(len(scene), dtype=torch.bool)
-    solver = make_solver(color_views(crops, original), original, Ties(surface_graph(scene, nobody), ~nobody))
+    none_clear = torch.zeros(len(scene), dtype=torch.bool)
+    solver = make_solver(
+        color_views(crops, original), original, Ties(surface_graph(scene, none_clear), ~none_clear)
+    )
     fill = torch.full((96, 96, 3), 0.3)
     two_paints = torch.eye(3)[torch.arange(96) // 48].expand(96, 96, 3)
     for paint, near in ((fill, True), (two_paints.contiguous(), False)):
@@ -164,7 +168,7 @@ def test_a_residual_that_says_nothing_of_other_pixels_stays_with_its_neighbors()
         assert model.line.endswith("Rule: smallest error")
 
 
-def test_what_the_members_do_not_show_is_no_error_of_theirs() -> None:
+def test_pixels_without_members_are_no_error() -> None:
     scene = wall(0.0, torch.tensor([0.8, 0.5, 0.2]))
     camera = ahead()
     members = (scene.means[:, 0] < 0.0).nonzero()[:, 0]
