@@ -1,4 +1,4 @@
-"""Views that agree: one picture decides, the others follow it, answers are laid over their views."""
+"""Consistent views: one picture decides, the others follow it, and outputs are registered to views."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def setup_of(case: Small, held_out: int) -> TrainingSetup:
 
 @dataclass
 class Family:
-    """Views, K edits of each, and how well a scene shows one and the same."""
+    """Views with K edits each, and a measure of how well a scene shows a single edit."""
 
     setup: TrainingSetup
     choices: list[Tensor]
@@ -60,7 +60,7 @@ class Family:
         return IdealPainter(self.setup.views, self.choices, **more)  # type: ignore[arg-type]
 
     def nearest(self, render: Callable[[Camera], Tensor]) -> float:
-        """PSNR of what is rendered in held-out views to the nearest single edit, dB."""
+        """Return the PSNR of held-out renders against the nearest single edit, in dB."""
         first = len(self.setup.train)
         errors = torch.zeros(len(self.choices[0]))
         count = 0
@@ -80,7 +80,7 @@ def family(kind: str, choices: int, views: int, size: int, image_size: int) -> F
 
 @cache
 def followed(kind: str) -> tuple[int, float, float]:
-    """Of twelve choices in 16 views that follow one picture: calls, what `nearest` gives, the contrast."""
+    """Return calls, `nearest` and contrast for twelve choices in 16 views that follow one picture."""
     some = family(kind, 12, 16, 2000, 56)
     painter = some.painter()
     with TemporaryDirectory() as folder:
@@ -97,7 +97,7 @@ def agreed(some: Family, painter: IdealPainter, folder: Path, seed: int = 0) -> 
 
 @cache
 def one_by_one(kind: str, *sizes: int, seed: int = 0) -> float:
-    """The same measure where every view decides by itself."""
+    """Return `nearest` for views that are painted independently."""
     some = family(kind, *sizes)
     painter = some.painter()
     seen = [
@@ -115,7 +115,7 @@ def test_views_that_follow_one_picture_show_one_edit(kind: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["hue", "stripes"])
-def test_an_ideal_editor_is_held_to_one_edit_of_many(kind: str, tmp_path: Path) -> None:
+def test_ideal_editor_is_reduced_to_one_edit_of_many(kind: str, tmp_path: Path) -> None:
     sizes = (24, 20, 6000, 96)
     seeds = range(3)
     some = family(kind, *sizes)
@@ -125,7 +125,7 @@ def test_an_ideal_editor_is_held_to_one_edit_of_many(kind: str, tmp_path: Path) 
     assert sum(alone) / 3 <= 25, alone
 
 
-def test_views_follow_a_picture_that_was_approved_at_every_degree(tmp_path: Path) -> None:
+def test_views_follow_an_approved_picture_at_every_strength(tmp_path: Path) -> None:
     some = family("stripes", 12, 16, 2000, 56)
     log = RunLog(tmp_path / "log.txt", quiet=True)
     view = some.setup.train[0]
@@ -143,7 +143,7 @@ def test_views_follow_a_picture_that_was_approved_at_every_degree(tmp_path: Path
         assert torch.equal(made.edit(view, 0.0), view.image)
 
 
-def test_a_painter_of_one_picture_sweeps(tmp_path: Path) -> None:
+def test_painter_without_references_sweeps(tmp_path: Path) -> None:
     some = family("hue", 12, 16, 2000, 56)
     painter = some.painter(references=0)
     together = agreed(some, painter, tmp_path)
@@ -152,7 +152,7 @@ def test_a_painter_of_one_picture_sweeps(tmp_path: Path) -> None:
 
 
 def moved(picture: Tensor, x: float, y: float, zoom: float) -> Tensor:
-    """A picture shifted by pixels and enlarged about its middle."""
+    """Return a picture shifted by pixels and enlarged about its center."""
     longer = max(picture.shape[:2])
     inverse = 1 / (1 + zoom)
     shift = (-x / longer * inverse, -y / longer * inverse)
@@ -163,24 +163,24 @@ SHIFTS = [(1.0, -0.6, 0.005), (-3.0, 2.0, 0.02), (4.0, 4.0, -0.03), (0.0, 0.0, 0
 
 
 @pytest.mark.parametrize(("x", "y", "zoom"), SHIFTS)
-def test_a_shift_and_a_zoom_are_found_beside_the_region(x: float, y: float, zoom: float) -> None:
+def test_shift_and_zoom_are_found_beside_the_region(x: float, y: float, zoom: float) -> None:
     view = small("scarf", 6000, 6, 160).views[0]
     picture = moved(view.blend(view.inside * torch.tensor([0.2, 0.9, 0.4])), x, y, zoom)
-    picture = (0.9 * picture + 0.03).clamp(0, 1)  # as autoencoders shift what they return
+    picture = (0.9 * picture + 0.03).clamp(0, 1)  # a color shift like that of autoencoders
     laid = register(view.image, picture, beside_region(view.mask))
     longer = max(view.image.shape[:2])
     assert laid.zoom == pytest.approx(zoom, abs=1e-3)
     assert [v * longer for v in laid.shift] == pytest.approx([x, y], abs=0.15)
 
 
-def test_what_lies_right_is_taken_bit_for_bit() -> None:
+def test_aligned_picture_is_taken_bit_for_bit() -> None:
     view = small("scarf", 6000, 6, 160).views[0]
     picture = view.blend(1.0 - view.inside)
     laid = register(view.image, picture, beside_region(view.mask))
     assert torch.equal(laid.lay(picture), picture)
 
 
-def test_nothing_is_moved_where_all_beside_the_region_is_plain_or_painted_anew() -> None:
+def test_nothing_is_registered_without_detail_beside_the_region() -> None:
     view = small("scarf", 6000, 6, 160).views[0]
     beside = beside_region(view.mask)
     plain = torch.full_like(view.image, 0.5)
@@ -192,7 +192,7 @@ def test_nothing_is_moved_where_all_beside_the_region_is_plain_or_painted_anew()
 
 @dataclass
 class Clumsy(WholeViews):
-    """Darkens pictures, and enlarges those of one view, unless another seed is given that it spares."""
+    """Painter that darkens pictures and enlarges those of one view for the given seeds."""
 
     view: View
     zoom: float
@@ -218,14 +218,14 @@ def clumsy(seeds: Sequence[int], folder: Path) -> tuple[AgreedEditor, Clumsy, Vi
     return made, painter, view, log.read_text(encoding="utf-8")
 
 
-def test_an_answer_that_is_moved_too_far_is_painted_again_with_another_seed(tmp_path: Path) -> None:
+def test_misaligned_output_is_painted_again_with_another_seed(tmp_path: Path) -> None:
     made, painter, _, log = clumsy((5,), tmp_path)
     assert painter.calls.count(6) == 2, "in either round"
     assert made.figures["left_out"] == {}
     assert "left out" not in log
 
 
-def test_a_view_that_is_moved_too_far_by_every_answer_is_left_out_and_said(tmp_path: Path) -> None:
+def test_view_misaligned_by_every_seed_is_left_out_and_logged(tmp_path: Path) -> None:
     made, _, view, log = clumsy((5, 6), tmp_path)
     name = view.camera.name
     assert made.figures["left_out"] == {name: pytest.approx(0.09, abs=0.005)}
@@ -233,7 +233,7 @@ def test_a_view_that_is_moved_too_far_by_every_answer_is_left_out_and_said(tmp_p
     assert torch.equal(made.edit(view, 1.0), made.fit.render(view.camera))
 
 
-def test_a_model_that_moves_everything_is_one_line(tmp_path: Path) -> None:
+def test_model_that_moves_everything_is_a_one_line_error(tmp_path: Path) -> None:
     setup = setup_of(small("scarf", 2500, 6, 96), 1)
 
     class Enlarging(Clumsy):
@@ -241,18 +241,18 @@ def test_a_model_that_moves_everything_is_one_line(tmp_path: Path) -> None:
             return moved(picture, 0.0, 0.0, 0.1)
 
     easel = PaintCache(Enlarging(setup.train[0], 0.1, ()), {}, NOTHING, 0)
-    with pytest.raises(ProgdfError, match=f"by more than {MAX_MOVED:.0%}; ") as told:
+    with pytest.raises(ProgdfError, match=f"by more than {MAX_MOVED:.0%}; ") as caught:
         agree_views(easel, setup, STYLE, RunLog(tmp_path / "log.txt", quiet=True))
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(caught.value)
 
 
 class StoppedError(Exception):
-    """As by a kill: nothing is tidied up."""
+    """Simulated kill, without cleanup."""
 
 
 @dataclass
 class Counting(WholeViews):
-    """Paints what depends on all that it is given; stops at one call."""
+    """Painter whose output depends on all of its inputs; it stops at one call."""
 
     stop: int = -1
     references: int = 2
@@ -278,10 +278,10 @@ def painted(folder: Path, painter: Counting, recipe: dict[str, str] | None = Non
 
 @pytest.mark.parametrize("references", [pytest.param(0, marks=pytest.mark.slow), 2])
 @pytest.mark.parametrize("each", [5, pytest.param(1, marks=pytest.mark.slow)])
-def test_a_loop_that_is_killed_at_any_picture_goes_on_to_the_same_bits(
+def test_loop_killed_at_any_picture_resumes_to_the_same_bits(
     tmp_path: Path, references: int, each: int
 ) -> None:
-    """With five pictures between two kills each kind of round is once begun, once half done."""
+    """Use five pictures between kills, which stop each kind of round once at its start, once half done."""
     whole = painted(tmp_path / "whole", made := Counting(references=references))
     folder = tmp_path / "killed"
     kills = (made.calls - 1) // each
@@ -295,7 +295,7 @@ def test_a_loop_that_is_killed_at_any_picture_goes_on_to_the_same_bits(
     assert torch.equal(again.fit.colors, whole.fit.colors)
 
 
-def test_all_follow_an_anchor_that_was_painted_over_by_hand(tmp_path: Path) -> None:
+def test_all_views_follow_an_anchor_painted_by_the_user(tmp_path: Path) -> None:
     first = painted(tmp_path, Counting())
     setup = first.fit.setup
     anchor = painting_order(setup)[0][0]
@@ -308,13 +308,13 @@ def test_all_follow_an_anchor_that_was_painted_over_by_hand(tmp_path: Path) -> N
     assert (again.pictures[setup.train[-1].camera.name] != first.pictures[setup.train[-1].camera.name]).any()
 
 
-def test_another_model_paints_everything_anew(tmp_path: Path) -> None:
+def test_another_model_repaints_everything(tmp_path: Path) -> None:
     painted(tmp_path, before := Counting())
     painted(tmp_path, after := Counting(), {"model": "another"})
     assert before.calls == after.calls
 
 
-def test_the_first_view_is_a_front_and_every_side_has_an_anchor() -> None:
+def test_first_view_is_frontal_and_every_side_has_an_anchor() -> None:
     setup = setup_of(small("body", 6000, 16, 112), 3)
     views, anchors = painting_order(setup)
     assert views[0].camera.name == "orbit_000", "the bear's face"
@@ -330,7 +330,7 @@ def judge(some: Family, pictures: Sequence[Tensor]) -> Agreement:
     return measure_agreement(some.setup, pictures[:count], pictures[count:])
 
 
-def test_stripes_of_random_phase_do_not_agree_though_little_of_the_change_is_unexplained() -> None:
+def test_stripes_of_random_phase_disagree_despite_a_small_residual() -> None:
     some = family("stripes", 8, 16, 4000, 96)
     alike = judge(some, [edits[1] for edits in some.choices])
     assert alike.agree
@@ -342,7 +342,7 @@ def test_stripes_of_random_phase_do_not_agree_though_little_of_the_change_is_une
         assert not mixed.agree
 
 
-def test_pictures_that_agree_because_they_are_washed_out_do_not_agree(tmp_path: Path) -> None:
+def test_washed_out_pictures_do_not_agree(tmp_path: Path) -> None:
     some = family("hue", 12, 16, 2000, 56)
 
     @dataclass

@@ -1,4 +1,4 @@
-"""`progdf fit` and the ablation on the folder of a run that is damaged, or made to do harm."""
+"""`progdf fit` and the ablation on damaged or malicious run folders."""
 
 from __future__ import annotations
 
@@ -35,18 +35,16 @@ CHANGES: dict[str, Change] = {
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run."""
-    made = tmp_path_factory.mktemp("bear")
-    write_bear(made, 400)
-    options = quick_options(made, views=4, image_size=48, steps=16, stages=2)
+    """Train a small bear; return the run folder."""
+    folder = tmp_path_factory.mktemp("bear")
+    write_bear(folder, 400)
+    options = quick_options(folder, views=4, image_size=48, steps=16, stages=2)
     train(options, quiet=True)
     return options.out
 
 
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES.keys())
-def test_what_a_trajectory_tells_is_checked_before_it_is_used(
-    change: Change, run: Path, tmp_path: Path
-) -> None:
+def test_trajectory_metadata_is_checked_before_use(change: Change, run: Path, tmp_path: Path) -> None:
     shutil.copytree(run, tmp_path / "run")
     path = tmp_path / "run" / "trajectory.safetensors"
     trajectory, extra, about = load_trajectory(path)
@@ -76,7 +74,7 @@ CAMERA_CHANGES: dict[str, tuple[Callable[[list[dict[str, Any]]], object], str]] 
 
 
 @pytest.mark.parametrize("name", CAMERA_CHANGES)
-def test_cameras_that_are_not_the_runs_are_refused_by_file(name: str, run: Path, tmp_path: Path) -> None:
+def test_cameras_of_another_run_are_refused_by_file_name(name: str, run: Path, tmp_path: Path) -> None:
     root = tmp_path / "run"
     shutil.copytree(run, root)
     render_edited_views(reopen_run(root))
@@ -87,7 +85,7 @@ def test_cameras_that_are_not_the_runs_are_refused_by_file(name: str, run: Path,
     assert "\n" not in str(caught.value)
 
 
-def test_an_edited_view_of_another_size_is_refused_by_file(run: Path, tmp_path: Path) -> None:
+def test_edited_view_of_another_size_is_refused_by_file_name(run: Path, tmp_path: Path) -> None:
     root = tmp_path / "run"
     shutil.copytree(run, root)
     for path in sorted((root / "views" / "edited").glob("*.png")):

@@ -1,4 +1,4 @@
-"""The demo: files that load again, pictures of every slider, a command line that opens them."""
+"""`progdf demo`: files that load again, pictures of every slider, and the command that opens them."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def bear() -> scenes.DemoScene:
 
 
 def _edit(folder: Path, scene: scenes.DemoScene, edit: demo.DemoEdit) -> Gdf:
-    """The edit without training: each Gaussian recolored by formula."""
+    """Return the edit without training; a formula recolors each Gaussian."""
     gaussians = load_ply(folder / "scene.ply")
     ids = [scene.label_names.index(part) for part in edit.parts or ("head",)]
     region = from_labels(edit.name, scene.labels, ids)
@@ -64,7 +64,7 @@ def _edit(folder: Path, scene: scenes.DemoScene, edit: demo.DemoEdit) -> Gdf:
 
 @pytest.fixture
 def commands(monkeypatch: pytest.MonkeyPatch, bear: scenes.DemoScene) -> list[Sequence[str]]:
-    """Replaces the training by a formula and the window by a list of the commands that would open it."""
+    """Replace training by a formula; return the list of commands that would open the window."""
 
     def train(options: TrainOptions) -> None:
         plan = resolve(options)
@@ -92,14 +92,14 @@ def commands(monkeypatch: pytest.MonkeyPatch, bear: scenes.DemoScene) -> list[Se
 
 
 @pytest.mark.parametrize("name", list(demo.SHOWS))
-def test_two_edits_of_the_demo_share_nothing_and_the_third_meets_the_second(name: str) -> None:
+def test_second_demo_edit_is_apart_from_the_first_and_overlaps_the_third(name: str) -> None:
     scene = demo.SHOWS[name].make(2000, 0)
     first, second, third = (set(scene.members(*edit.parts).tolist()) for edit in demo.SHOWS[name].edits[:3])
     assert not first & second
     assert second & third
 
 
-def test_the_scene_is_written_so_that_it_loads_to_the_same(tmp_path: Path, bear: scenes.DemoScene) -> None:
+def test_scene_file_loads_to_the_same_scene(tmp_path: Path, bear: scenes.DemoScene) -> None:
     demo.write_scene(tmp_path / "new", bear)
     assert torch.equal(load_ply(tmp_path / "new" / "scene.ply").means, bear.gaussians.means)
     assert np.array_equal(np.load(tmp_path / "new" / "labels.npy"), bear.labels.numpy())
@@ -107,7 +107,7 @@ def test_the_scene_is_written_so_that_it_loads_to_the_same(tmp_path: Path, bear:
     assert [camera.name for camera in cameras] == [camera.name for camera in bear.cameras]
 
 
-def test_the_pictures_show_the_original_at_zero_and_the_edit_at_one(
+def test_pictures_show_the_original_at_zero_and_the_edit_at_one(
     tmp_path: Path, bear: scenes.DemoScene
 ) -> None:
     demo.write_scene(tmp_path, bear)
@@ -122,7 +122,7 @@ def test_the_pictures_show_the_original_at_zero_and_the_edit_at_one(
     assert 0.2 < changed[4] < 0.65  # the bear and the grass, neither stone nor sky
 
 
-def test_the_demo_ends_with_the_command_that_opens_its_edits(
+def test_demo_ends_with_the_command_that_opens_its_edits(
     tmp_path: Path,
     commands: list[Sequence[str]],
     monkeypatch: pytest.MonkeyPatch,
@@ -138,7 +138,7 @@ def test_the_demo_ends_with_the_command_that_opens_its_edits(
     assert last.strip() == f"progdf view {out}/scene.ply {edits} --background '#82a3c2'"
 
 
-def test_with_a_display_the_window_opens_in_a_process_of_its_own(
+def test_window_opens_in_a_separate_process_if_there_is_a_display(
     tmp_path: Path, commands: list[Sequence[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("DISPLAY", ":99")
@@ -152,18 +152,18 @@ def test_with_a_display_the_window_opens_in_a_process_of_its_own(
     ("option", "number"),
     [("--seed", "-1"), ("--seed", "9" * 20), ("--threads", "-1"), ("--size", "9" * 12), ("--size", "9" * 20)],
 )
-def test_a_demo_asked_for_numbers_that_cannot_be_writes_nothing(
+def test_invalid_numbers_are_refused_and_write_nothing(
     option: str, number: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     size = () if option == "--size" else ("--size", str(SIZE))
     assert main(["demo", *size, "--out", str(tmp_path / "demo"), option, number]) == 2
-    said = capsys.readouterr().err.strip()
-    assert said.startswith(f"progdf: {option} must be ")
-    assert said.endswith(f"got {number}")
+    error = capsys.readouterr().err.strip()
+    assert error.startswith(f"progdf: {option} must be ")
+    assert error.endswith(f"got {number}")
     assert not (tmp_path / "demo").exists()
 
 
-def test_a_demo_with_too_few_gaussians_writes_nothing(tmp_path: Path) -> None:
+def test_too_few_gaussians_are_refused_and_write_nothing(tmp_path: Path) -> None:
     with pytest.raises(ProgdfError, match="too few for a bear"):
         demo.main(["--size", "10", "--out", str(tmp_path / "demo")])
     assert not (tmp_path / "demo").exists()
@@ -177,7 +177,7 @@ def test_a_demo_with_too_few_gaussians_writes_nothing(tmp_path: Path) -> None:
         ("taken/demo", "taken/demo cannot be written ("),
     ],
 )
-def test_a_demo_without_a_place_for_its_folder_is_one_line(
+def test_unusable_output_folder_is_a_one_line_error(
     out: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -187,7 +187,7 @@ def test_a_demo_without_a_place_for_its_folder_is_one_line(
     assert list(tmp_path.iterdir()) == [tmp_path / "taken"]
 
 
-def test_a_demo_that_was_stopped_goes_on_and_one_that_was_not_starts_over(
+def test_stopped_demo_resumes_and_otherwise_starts_over(
     tmp_path: Path, bear: scenes.DemoScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[tuple[str, bool]] = []

@@ -1,4 +1,4 @@
-"""Which engine draws a run's steps: the same edit from each, and a run keeps to the one it began with."""
+"""Rendering engine of a run: all give the same edit, and a run keeps the engine it started with."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from trainer.views.crops import crop_scene
     ],
     ids=["style", "geometry"],
 )
-def test_a_run_on_warp_ends_at_the_cpu_engine_s_digits(folder: Path, asked: dict[str, object]) -> None:
+def test_run_on_warp_matches_the_cpu_engine(folder: Path, asked: dict[str, object]) -> None:
     ends = []
     for engine in ("cpu", "warp"):
         out = f"{engine}-{asked.get('kind', 'color')}"
@@ -47,7 +47,7 @@ def test_a_run_on_warp_ends_at_the_cpu_engine_s_digits(folder: Path, asked: dict
     cpu, warp = ends
     assert "the steps are drawn by warp on " in warp.folder.log.read_text()
     assert "by warp" not in cpu.folder.log.read_text()
-    # a step's gradients differ by 1e-5 of the largest, and Adam takes what hardly shows for as much
+    # gradients differ by 1e-5 of the largest; Adam scales small gradients up to the same size
     assert warp.report["edit"]["psnr_to_views"] == pytest.approx(
         cpu.report["edit"]["psnr_to_views"], abs=0.02
     )
@@ -58,7 +58,7 @@ def test_a_run_on_warp_ends_at_the_cpu_engine_s_digits(folder: Path, asked: dict
     assert float(difference) < 0.01
 
 
-def test_auto_is_warp_where_there_is_a_card_and_warp_and_else_the_cpu(
+def test_auto_engine_is_warp_with_a_gpu_and_warp_else_cpu(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     for card, installed, chosen in ((True, True, "warp"), (True, False, "cpu"), (False, True, "cpu")):
@@ -68,14 +68,12 @@ def test_auto_is_warp_where_there_is_a_card_and_warp_and_else_the_cpu(
         assert choose_engine("cpu") == "cpu"
 
 
-def test_colors_are_solved_for_on_the_processor_whatever_draws_the_steps(folder: Path) -> None:
+def test_colors_are_solved_on_the_cpu_for_any_engine(folder: Path) -> None:
     options = resolve(quick_options(folder, "either", part="scarf", engine="warp"))
     assert [resolve_kind(options, kind, 0).engine for kind in ("color", "style")] == ["cpu", "warp"]
 
 
-def test_without_warp_the_run_is_refused_before_it_begins(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_run_without_warp_is_refused_before_it_begins(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "warp", None)
     monkeypatch.delitem(sys.modules, ENGINES["warp"], raising=False)
     get_engine.cache_clear()
@@ -84,7 +82,7 @@ def test_without_warp_the_run_is_refused_before_it_begins(
     assert not (folder / "none").exists()
 
 
-def test_a_run_goes_on_with_the_engine_that_it_began_with(folder: Path) -> None:
+def test_run_keeps_the_engine_it_began_with(folder: Path) -> None:
     asked = {"views": 4, "image_size": 48, "steps": 16, "stages": 1, "part": "scarf"}
     train(quick_options(folder, "kept", **asked))
     with pytest.raises(ProgdfError, match="was started with --engine cpu, not warp"):
@@ -93,7 +91,7 @@ def test_a_run_goes_on_with_the_engine_that_it_began_with(folder: Path) -> None:
 
 @pytest.fixture
 def card(monkeypatch: pytest.MonkeyPatch) -> Iterator[Card]:
-    """A card on which the reference draws in place of warp."""
+    """Simulate a GPU on which the reference engine replaces warp."""
     monkeypatch.setitem(ENGINES, "warp", ENGINES["reference"])
     get_engine.cache_clear()
     for module in (training, trainer.setup):
@@ -114,10 +112,8 @@ def card(monkeypatch: pytest.MonkeyPatch) -> Iterator[Card]:
     ],
     ids=["style", "geometry"],
 )
-def test_a_whole_run_works_where_its_steps_are_on_a_card(
-    tmp_path: Path, card: Card, asked: dict[str, object]
-) -> None:
-    """Nothing on the card meets what is not, and the result is that of the processor."""
+def test_full_run_works_with_steps_on_a_gpu(tmp_path: Path, card: Card, asked: dict[str, object]) -> None:
+    """Check that no operation mixes devices and that the result matches the CPU."""
     write_bear(tmp_path, 400)
     asked = {"part": "scarf", "views": 4, "image_size": 40} | asked
     there = train(quick_options(tmp_path, "there", engine="warp", **asked))
@@ -131,12 +127,12 @@ def test_a_whole_run_works_where_its_steps_are_on_a_card(
 
 @pytest.fixture(scope="module")
 def case() -> Small:
-    """Made before there is a card, on which all takes ten times as long."""
+    """Return a case made before the simulated GPU, on which everything takes ten times as long."""
     return small("scarf", 400, 2, 32)
 
 
 @pytest.mark.parametrize("kind", ["color", "style", "geometry"])
-def test_no_step_moves_anything_to_the_card_or_back(case: Small, card: Card, kind: str) -> None:
+def test_no_step_transfers_data_to_or_from_the_gpu(case: Small, card: Card, kind: str) -> None:
     moved = []
     scene = case.scene.to(CARD)
     original = pack(scene[case.region.members.to(CARD)], with_shN=True)
@@ -154,7 +150,7 @@ def test_no_step_moves_anything_to_the_card_or_back(case: Small, card: Card, kin
     assert moved[2] == moved[1], "the first brings the network there, each its rates"
 
 
-def test_a_saved_state_goes_back_to_the_card(card: Card) -> None:
+def test_saved_state_is_restored_to_the_gpu(card: Card) -> None:
     rows = torch.rand(5, 14).to(CARD)
     state = PgsState(rows)
     state.view(3)

@@ -1,4 +1,4 @@
-"""A run on a scene of doubles far from 0 makes the edit of the same scene near 0, bit for bit."""
+"""Run on a scene of doubles far from 0: the same edit as near 0, bit for bit."""
 
 from __future__ import annotations
 
@@ -30,10 +30,12 @@ BOX = (-0.9, -0.9, -0.4, 0.9, 0.9, 0.9)
 
 @pytest.fixture(scope="module")
 def runs(folder: Path) -> dict[str, RunResult]:
-    """Of the same box of the bear, near and far: its means on a grid of 2⁻²⁰, which float32 holds near 0 and
-    doubles at 2e6 (their step is 2⁻³²), so that both files hold the same scene.
+    """Train the same box of the bear near 0 and far from it.
+
+    The means lie on a grid of 2⁻²⁰, which float32 holds near 0 and doubles hold at 2e6 (their step is 2⁻³²).
+    Both files therefore hold the same scene.
     """
-    made = {}
+    results = {}
     bear = load_ply(folder / "scene.ply")
     bear = replace(bear, means=(bear.means * 2**20).round() / 2**20)
     for name, origin in (("near", (0.0, 0.0, 0.0)), ("far", FAR)):
@@ -48,20 +50,18 @@ def runs(folder: Path) -> dict[str, RunResult]:
             "name": "coat",
         }
         options = with_values(quick_options(folder), scene=folder / f"{name}.ply", out=folder / name, **more)
-        made[name] = train(options)
-    return made
+        results[name] = train(options)
+    return results
 
 
-def test_the_edit_is_the_same(folder: Path, runs: dict[str, RunResult]) -> None:
+def test_edit_is_the_same_near_and_far(folder: Path, runs: dict[str, RunResult]) -> None:
     near, far = (load_gdf(runs[name].gdf, load_ply(folder / f"{name}.ply")) for name in ("near", "far"))
     assert torch.equal(far.region.members, near.region.members)
     assert torch.equal(far.field.offsets(0.7), near.field.offsets(0.7))
     assert near.scene != far.scene
 
 
-def test_cameras_of_a_run_are_in_the_world_and_are_read_back(
-    folder: Path, runs: dict[str, RunResult]
-) -> None:
+def test_run_cameras_are_in_world_coordinates_and_read_back(folder: Path, runs: dict[str, RunResult]) -> None:
     near = load_cameras(runs["near"].folder.cameras)
     for a, b in zip(near, load_cameras(runs["far"].folder.cameras), strict=True):
         assert np.abs((b.position - a.position).numpy() - FAR).max() < 1.0  # float32 at 2e6
@@ -69,14 +69,14 @@ def test_cameras_of_a_run_are_in_the_world_and_are_read_back(
         assert torch.allclose(a.viewmat, b.viewmat, atol=1e-6)
 
 
-def test_a_far_run_is_opened_again_with_its_views(runs: dict[str, RunResult]) -> None:
+def test_far_run_is_reopened_with_its_views(runs: dict[str, RunResult]) -> None:
     views = render_run_views(reopen_run(runs["far"].folder.root)).views
     for view in views:
         original = read_picture(runs["far"].folder.view("original", view.camera.name))
         assert float((view.image.clamp(0, 1) - original).abs().max()) < 2 / 255
 
 
-def test_masks_over_views_of_a_far_scene_find_their_region(folder: Path, runs: dict[str, RunResult]) -> None:
+def test_masks_over_views_of_a_far_scene_select_a_region(folder: Path, runs: dict[str, RunResult]) -> None:
     scene = load_ply(folder / "far.ply")
     command.write(WriteViewsOptions(folder / "far.ply", folder / "drawn", views=4, image_size=64))
     for path in sorted((folder / "drawn" / "original").iterdir()):
@@ -90,9 +90,7 @@ def test_masks_over_views_of_a_far_scene_find_their_region(folder: Path, runs: d
     assert 0 < len(found) < len(scene)
 
 
-def test_a_changed_picture_of_a_far_scene_tells_what_was_changed(
-    folder: Path, runs: dict[str, RunResult]
-) -> None:
+def test_changed_picture_of_a_far_scene_selects_a_region(folder: Path, runs: dict[str, RunResult]) -> None:
     scene = load_ply(folder / "far.ply")
     view = render_run_views(reopen_run(runs["far"].folder.root)).views[0]
     changed = view.image.clone()

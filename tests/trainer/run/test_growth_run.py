@@ -1,4 +1,4 @@
-"""Gaussians that an edit adds: a hat on a bear is grown, fades in, and is there in views never trained on."""
+"""Gaussians added by an edit: a hat on a bear is grown, fades in and appears in held-out views."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ LOGIT = attribute_slices(BASE_CHANNELS)["logit_opacities"]
 
 
 @pytest.mark.parametrize("what", ["hat", "rod"])
-def test_seeds_lie_on_what_is_new(what: str) -> None:
+def test_seeds_lie_on_new_objects(what: str) -> None:
     case = small("head", count=12)
     new = things(case.scene, case.region.members)[what]
     with torch.no_grad():
@@ -48,19 +48,19 @@ def test_seeds_lie_on_what_is_new(what: str) -> None:
     away = torch.from_numpy(cKDTree(new.means.numpy()).query(seeds.means.numpy())[0])
     camera = case.views[0].camera
     pixel = float((camera.position - seeds.means.mean(dim=0)).norm() / camera.K[0, 0])
-    # what is seen of a Gaussian reaches two standard deviations from its center; depths are two pixels apart
+    # a Gaussian is visible within two standard deviations; depths are two pixels apart
     near = away < 2 * float(new.scales.max()) + 2 * pixel
     assert float(near.float().mean()) > 0.85
 
 
-def test_pictures_that_show_nothing_new_seed_nothing() -> None:
+def test_unchanged_pictures_seed_nothing() -> None:
     case = small("head")
     setup = TrainingSetup(case.scene, case.region, case.views, [], WHITE)
     assert not len(seed_rows(setup, case.views, [view.image for view in case.views], 80, 0))
 
 
 @pytest.mark.parametrize("spec", ["", "stripes:#20a040"], ids=["where it is right", "where it is wrong"])
-def test_what_a_row_is_worth_is_close_to_the_error_without_it(spec: str) -> None:
+def test_removal_cost_approximates_the_error_without_a_row(spec: str) -> None:
     case = small("scarf", count=8)
     crops = [crop_scene(case.scene, case.region.members, v.camera, v.box, WHITE) for v in case.views]
     rows = pack(case.scene[case.region.members], with_shN=True)
@@ -81,14 +81,14 @@ def test_what_a_row_is_worth_is_close_to_the_error_without_it(spec: str) -> None
         exact.append(error(without) - error(rows))
     costs = torch.stack([removal_costs(crops, rows, targets, seed) for seed in range(4)]).mean(dim=0)
     pair = torch.stack([torch.tensor(exact), costs[list(chosen)]])
-    # to second order in opacity, where many are nearly opaque; sorting by either is much the same
+    # costs are second order in opacity, but many rows are nearly opaque; the ranking is similar
     assert float(torch.corrcoef(pair.argsort(dim=1).argsort(dim=1).double())[0, 1]) > 0.8
     assert spec or (bool((pair >= 0.0).all()) and float(pair[1].max()) > 0.0)
 
 
 @pytest.fixture(scope="module")
 def hat(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the run `grown`, which may grow a hat, and `plain`, which may not."""
+    """Train the runs `grown`, with growth, and `plain`, without; return their folder."""
     folder = tmp_path_factory.mktemp("hat")
     options = write_growth(folder, "hat", views=8)
     train(replace(options, out=folder / "plain"))
@@ -96,11 +96,11 @@ def hat(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_hat_is_grown_and_nothing_else_changes_outside(hat: Path) -> None:
+def test_hat_is_grown_and_nothing_outside_changes(hat: Path) -> None:
     plain, grown = (open_run(hat / name) for name in ("plain", "grown"))
     assert "taken: geometry with growth" in (hat / "grown" / "log.txt").read_text(encoding="utf-8")
-    # a hat that members are stretched over has 19.6 to 19.8 dB, a grown one 23.7, on two kinds of processor;
-    # of a fifth of these pixels and steps 31
+    # members stretched over the hat reach 19.6 to 19.8 dB and a grown hat 23.7, on two kinds of processor,
+    # and 31 with a fifth of these pixels and steps
     assert grown.report["edit"]["psnr_to_views"] > plain.report["edit"]["psnr_to_views"] + 3
     scene = load_ply(hat / "scene.ply")
     gdf, other = (load_gdf(hat / name / f"{name}.gdf", scene) for name in ("grown", "plain"))
@@ -111,7 +111,7 @@ def test_a_hat_is_grown_and_nothing_else_changes_outside(hat: Path) -> None:
     assert grown.report["slider"]["monotone"]
 
 
-def test_at_strength_0_a_grown_edit_is_the_original_bit_for_bit(hat: Path) -> None:
+def test_grown_edit_at_strength_0_is_the_original_bit_for_bit(hat: Path) -> None:
     scene = load_ply(hat / "scene.ply")
     gdf = load_gdf(hat / "grown" / "grown.gdf", scene)
     composed = compose_layers(scene, [Layer(gdf, 0.0)])
@@ -122,7 +122,7 @@ def test_at_strength_0_a_grown_edit_is_the_original_bit_for_bit(hat: Path) -> No
     assert torch.equal(render(composed, camera, WHITE).image, render(scene, camera, WHITE).image)
 
 
-def test_a_grown_run_is_measured_and_fitted_again_with_its_rows(hat: Path) -> None:
+def test_grown_run_is_evaluated_and_refitted_with_its_rows(hat: Path) -> None:
     before = (hat / "grown" / "grown.gdf").read_bytes()
     opened = open_run(hat / "grown")
     pictures = opened.contenders()[SLIDER](1.0)
@@ -132,8 +132,8 @@ def test_a_grown_run_is_measured_and_fitted_again_with_its_rows(hat: Path) -> No
     assert (hat / "grown" / "grown.gdf").read_bytes() == before
 
 
-def test_half_of_what_is_added_is_there_halfway(hat: Path) -> None:
-    """Of the recording; the slider is then made even, as any is."""
+def test_added_opacity_grows_linearly_along_the_recording(hat: Path) -> None:
+    """Check the recording; the slider is made even afterwards."""
     trajectory, _, _ = load_trajectory(hat / "grown" / "trajectory.safetensors")
     assert trajectory.added is not None
     count = len(trajectory.added)
@@ -143,7 +143,7 @@ def test_half_of_what_is_added_is_there_halfway(hat: Path) -> None:
         assert float(opacity / end) == pytest.approx(s, abs=0.02)
 
 
-def test_a_course_of_any_recordings_keeps_both_ends_to_the_bit() -> None:
+def test_fade_in_keeps_both_ends_exact_for_any_recording() -> None:
     draw = torch.Generator().manual_seed(3)
     rows = small("head").scene[torch.arange(4)]
     added = replace(rows, logit_opacities=torch.full((4,), ADDED_LOGIT))
@@ -153,19 +153,19 @@ def test_a_course_of_any_recordings_keeps_both_ends_to_the_bit() -> None:
     given = Trajectory(s, offsets.half(), offsets[-1], torch.arange(9), (8,), (1.0,), added=added)
     stages = replace(given, stage_ends=(4, 8), strengths=(0.5, 1.0))
     for trajectory in (given, stages, select_recordings(given, [0, len(given) - 1])):
-        laid = fade_in(trajectory)
-        assert torch.equal(laid.at(1.0), trajectory.end)
-        assert not bool(laid.at(0.0).any())
-        assert laid.stage_strengths == trajectory.stage_strengths
-        assert torch.allclose(laid.at(0.4)[:6], trajectory.at(0.4)[:6], atol=2e-3)  # half precision
-        opacity = (ADDED_LOGIT + torch.stack([laid.at(float(x)) for x in laid.s])[:, -4:, LOGIT]).sigmoid()
-        expected = laid.s[:, None] * (ADDED_LOGIT + trajectory.end[-4:, LOGIT]).sigmoid().flatten()
-        assert torch.allclose(opacity[..., 0], expected, atol=4e-3)  # what is drawn by none at 0
+        faded = fade_in(trajectory)
+        assert torch.equal(faded.at(1.0), trajectory.end)
+        assert not bool(faded.at(0.0).any())
+        assert faded.stage_strengths == trajectory.stage_strengths
+        assert torch.allclose(faded.at(0.4)[:6], trajectory.at(0.4)[:6], atol=2e-3)  # half precision
+        opacity = (ADDED_LOGIT + torch.stack([faded.at(float(x)) for x in faded.s])[:, -4:, LOGIT]).sigmoid()
+        expected = faded.s[:, None] * (ADDED_LOGIT + trajectory.end[-4:, LOGIT]).sigmoid().flatten()
+        assert torch.allclose(opacity[..., 0], expected, atol=4e-3)  # `ADDED_LOGIT` itself is not drawn
 
 
 @pytest.mark.slow  # two runs
-def test_growth_that_does_not_pay_adds_nothing_and_writes_the_same_file(tmp_path: Path) -> None:
-    """Ears that are gone leave a hole, which other pixels' rows do not fill."""
+def test_unprofitable_growth_adds_nothing_and_keeps_the_file(tmp_path: Path) -> None:
+    """Use removed ears, which leave a hole that rows from other pixels do not fill."""
     options = write_growth(tmp_path, "no ears", steps=60, views=6, name="edit")
     for name, share in (("plain", 0.0), ("grown", 0.5)):
         train(with_values(replace(options, out=tmp_path / name), grow=share))
@@ -175,7 +175,7 @@ def test_growth_that_does_not_pay_adds_nothing_and_writes_the_same_file(tmp_path
     assert files[0] == files[1]
 
 
-def test_a_recording_whose_added_rows_are_damaged_is_refused_in_one_line(hat: Path, tmp_path: Path) -> None:
+def test_damaged_added_rows_are_a_one_line_error(hat: Path, tmp_path: Path) -> None:
     trajectory, extra, about = load_trajectory(hat / "grown" / "trajectory.safetensors")
     assert trajectory.added is not None
     rows = trajectory.added
@@ -199,7 +199,9 @@ def test_a_recording_whose_added_rows_are_damaged_is_refused_in_one_line(hat: Pa
         ("style:14", {"grow": float("nan")}, "--grow must be between 0 and 1, got nan"),
     ],
 )
-def test_what_cannot_grow_is_said_in_one_line(editor: str, more: dict[str, object], line: str) -> None:
+def test_growth_for_unsuitable_edits_is_a_one_line_error(
+    editor: str, more: dict[str, object], line: str
+) -> None:
     options = with_values(quick_options(Path("nowhere")), editor=editor)
     with pytest.raises(ProgdfError, match=line):
         resolve(with_values(options, **{"grow": 0.2, **more}))

@@ -1,4 +1,4 @@
-"""What pictures edited elsewhere move is found by trying."""
+"""Trial runs that find the kind of an edit given as pictures."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def pictured(case: Small, edit: AnalyticEdit) -> list[Tensor]:
 
 
 def waves(part: Gaussians, strength: float) -> Gaussians:
-    """A soft warp: up and down around the neck."""
+    """Return the part with a soft vertical wave around the neck."""
     means = part.means.clone()
     means[:, 1] += 0.1 * strength * torch.sin(5 * torch.atan2(means[:, 0], means[:, 2]))
     return replace(part, means=means)
@@ -56,7 +56,7 @@ def scarf() -> Small:
     return small("scarf", count=6, image_size=72)
 
 
-def test_a_recolor_given_as_pictures_is_a_color_edit() -> None:
+def test_recolor_given_as_pictures_is_a_color_edit() -> None:
     case = scarf()
     editor = make_editor(EditorOptions("recolor:#3060d0"), case.scene, case.region, case.views)
     pictures = [editor.edit(view, 1.0) for view in case.views]
@@ -65,7 +65,7 @@ def test_a_recolor_given_as_pictures_is_a_color_edit() -> None:
     assert trial.psnrs[COLOR] > trial.psnrs[FREE] + 2
 
 
-def test_a_part_that_moved_is_geometry_in_parts() -> None:
+def test_moved_part_is_a_geometry_edit_in_parts() -> None:
     case = small("ears", count=6, image_size=72)
     edit, _ = bear_edits(bear(1500))["big ears"]
     trial = try_approaches(asked(), setup(case), pictured(case, edit), [COLOR, STYLE, FREE, IN_PARTS])
@@ -73,7 +73,7 @@ def test_a_part_that_moved_is_geometry_in_parts() -> None:
     assert trial.psnrs[IN_PARTS] > trial.psnrs[FREE] + 2
 
 
-def test_what_bends_softly_is_geometry_without_parts() -> None:
+def test_soft_bend_is_a_geometry_edit_without_parts() -> None:
     case = scarf()
     pictures = pictured(case, AnalyticEdit("waves", waves))
     trial = try_approaches(asked(), setup(case), pictures, [COLOR, STYLE, FREE, IN_PARTS])
@@ -81,7 +81,7 @@ def test_what_bends_softly_is_geometry_without_parts() -> None:
     assert trial.psnrs[FREE] > trial.psnrs[STYLE]
 
 
-def test_the_same_trial_gives_the_same_figures() -> None:
+def test_same_trial_gives_the_same_figures() -> None:
     case = scarf()
     pictures = pictured(case, AnalyticEdit("waves", waves))
     assert try_approaches(asked(), setup(case), pictures, [STYLE]) == try_approaches(
@@ -89,32 +89,32 @@ def test_the_same_trial_gives_the_same_figures() -> None:
     )
 
 
-def test_colors_alone_are_taken_where_training_all_is_hardly_better() -> None:
+def test_colors_alone_win_if_full_training_is_hardly_better() -> None:
     assert Trial(40, {COLOR: 19.9, STYLE: 20.0, FREE: 12.0}, 10.0).chosen == COLOR
     assert Trial(40, {COLOR: 19.0, STYLE: 20.0, FREE: 12.0}, 10.0).chosen == STYLE
 
 
-def test_moving_is_taken_where_it_gains_nearly_as_much_as_paint() -> None:
+def test_geometry_wins_if_it_gains_nearly_as_much_as_paint() -> None:
     assert Trial(40, {COLOR: 20.7, STYLE: 21.3, FREE: 21.1, IN_PARTS: 20.2}, 19.8).chosen == FREE
     assert Trial(40, {COLOR: 15.1, STYLE: 14.9, FREE: 12.2, IN_PARTS: 9.8}, 10.4).chosen == COLOR
     assert Trial(40, {FREE: 9.0, IN_PARTS: 9.5}, 10.0).chosen == IN_PARTS
     assert Trial(40, {COLOR: 9.0, STYLE: 9.5, FREE: 9.9}, 10.0).chosen == STYLE, "nothing gains"
 
 
-def test_growth_is_taken_where_it_gains_a_tenth_of_the_error_and_nothing_moves() -> None:
+def test_growth_wins_with_a_tenth_less_error_unless_something_moves() -> None:
     assert Trial(60, {COLOR: 14.8, STYLE: 15.2, IN_PARTS: 20.2, GROWN: 27.1}, 14.6).chosen == GROWN
     assert Trial(60, {COLOR: 20.4, STYLE: 20.4, GROWN: 20.4}, 20.4).chosen == COLOR
-    # a tenth of the error is .46 dB
+    # a tenth of the error is 0.46 dB
     assert Trial(60, {STYLE: 20.0, GROWN_STYLE: 20.4}, 10.0).chosen == STYLE
     assert Trial(60, {STYLE: 20.0, GROWN_STYLE: 20.5}, 10.0).chosen == GROWN_STYLE
-    # what moves would fade in anew
+    # growth would fade in an object that only moves
     moved = Trial(60, {FREE: 17.0, IN_PARTS: 28.0, GROWN: 29.5}, 14.0)
     assert moved.chosen == IN_PARTS
     assert "growth would not take a tenth of the error away, or takes the place of what moves" in moved.line()
     assert moved.figures() == Trial(60, {FREE: 17.0, IN_PARTS: 28.0}, 14.0).figures()
 
 
-def test_the_line_tells_what_was_tried_and_what_was_taken() -> None:
+def test_summary_line_names_tried_and_chosen_approaches() -> None:
     line = Trial(40, {COLOR: 18.0, FREE: 21.23}, 10.0).line()
     assert "40 steps with L1" in line
     assert "color 18.0, geometry 21.2 dB" in line
@@ -136,12 +136,12 @@ def test_the_line_tells_what_was_tried_and_what_was_taken() -> None:
         ({"grow": 0.2, "kind": "style"}, [STYLE, GROWN_STYLE]),
     ],
 )
-def test_what_the_options_say_is_not_tried(more: dict[str, object], expected: list[Approach]) -> None:
+def test_options_restrict_the_tried_approaches(more: dict[str, object], expected: list[Approach]) -> None:
     case = scarf()
     assert approaches(asked(**more), setup(case), [view.image for view in case.views]) == expected
 
 
-def test_pictures_that_are_repainted_all_over_do_not_move_the_region() -> None:
+def test_pictures_repainted_all_over_do_not_try_geometry() -> None:
     case = scarf()
     repainted = [0.8 * view.image for view in case.views]
     assert approaches(asked(), setup(case), repainted) == [COLOR, STYLE]

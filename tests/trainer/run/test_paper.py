@@ -1,4 +1,4 @@
-"""`--preset paper`, line by line as docs/paper.md, has it."""
+"""`--preset paper`, line by line as documented in docs/paper.md."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ def plan(*more: str, region: str = "all") -> TrainOptions:
 
 @pytest.fixture(scope="module")
 def finishing() -> list[int]:
-    """How many steps networks are trained once all is recorded."""
+    """Return the list of network training steps after the recording, which `run` fills."""
     return []
 
 
 @pytest.fixture(scope="module")
 def run(folder: Path, finishing: list[int]) -> Iterator[RunResult]:
-    """A short run of the preset, with a small network."""
+    """Train a short run of the preset with a small network."""
     options = apply_preset(quick_options(folder, "paper", part="scarf"), "paper")
     short = {"steps": 40, "views": 5, "image_size": 56, "size": "tiny"}
     with pytest.MonkeyPatch.context() as patch:
@@ -44,8 +44,8 @@ def run(folder: Path, finishing: list[int]) -> Iterator[RunResult]:
         yield train(with_values(options, **short))
 
 
-def test_pgs_pays_what_is_printed_whatever_the_edit() -> None:
-    """λ = 1, 5, 1: L1 + LPIPS, α·β^(−t/s)·mean‖ΔΘ‖², −(∇²R)²; one target, 1500 to 2000 steps."""
+def test_pgs_has_the_printed_loss_for_every_kind_of_edit() -> None:
+    """Check λ = 1, 5, 1 for L1 + LPIPS, α·β^(−t/s)·mean‖ΔΘ‖², −(∇²R)²; one target, 1500 to 2000 steps."""
     for kind in ("color", "style", "geometry"):
         found = resolve_kind(plan(), kind, 0)
         assert describe_loss(found, "LPIPS") == (
@@ -56,7 +56,7 @@ def test_pgs_pays_what_is_printed_whatever_the_edit() -> None:
         assert 1500 <= found.steps <= 2000
 
 
-def test_pgs_is_the_plain_optimizer_of_3dgs_and_records_its_iterates_every_100_steps() -> None:
+def test_pgs_is_the_plain_3dgs_optimizer_and_records_every_100_steps() -> None:
     found = resolve_kind(plan(), "color", 0)
     settings = pgs_settings(found, found.sh != "off", 23, 1.0, 1)
     assert bool((settings.rates[:14] > 0).all()), "all attributes are free"
@@ -65,18 +65,18 @@ def test_pgs_is_the_plain_optimizer_of_3dgs_and_records_its_iterates_every_100_s
     assert (settings.smoothing, settings.every) == (0.0, 100)
 
 
-def test_at_most_96_views_and_the_slider_is_time() -> None:
+def test_paper_uses_at_most_96_views_and_a_time_slider() -> None:
     assert (plan().views.views, plan().optimize.slider) == (96, "time")
 
 
-def test_the_field_is_a_network_of_positions_and_hard_bins_trained_beside_pgs_on_pictures() -> None:
+def test_field_is_a_position_network_with_hard_bins_fitted_to_pictures() -> None:
     network = network_settings(plan().field)
     assert (network.size, network.inputs, network.bins, network.code) == ("paper", "position", "hard", 0)
     assert plan().field.field_loss == "pictures"
 
 
-def test_the_loss_of_the_field_is_the_printed_sum() -> None:
-    """L_GDF = L1 + LPIPS between the renders of Θ0 + GDF(s) and of the snapshot, −(∇²R)² of the former."""
+def test_field_loss_is_the_printed_sum() -> None:
+    """Check L_GDF = L1 + LPIPS of the renders of Θ0 + GDF(s) and the snapshot, −(∇²R)² of the former."""
     case = small("body")
     rows = pack(case.scene[case.region.members])
     height = case.views[0].camera.height
@@ -96,7 +96,7 @@ def test_the_loss_of_the_field_is_the_printed_sum() -> None:
     assert float(loss(found, recorded, 1)) == pytest.approx(float(printed), rel=1e-6)
 
 
-def test_losses_are_of_whole_pictures(folder: Path, run: RunResult, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_losses_cover_whole_pictures(folder: Path, run: RunResult, monkeypatch: pytest.MonkeyPatch) -> None:
     assert plan().optimize.as_printed
     assert not quick_options(folder).optimize.as_printed
     assert run.report["objective"] == (
@@ -104,19 +104,21 @@ def test_losses_are_of_whole_pictures(folder: Path, run: RunResult, monkeypatch:
     )
 
 
-def test_every_attribute_is_kept_and_nobody_follows(run: RunResult) -> None:
+def test_every_attribute_but_higher_sh_is_recorded(run: RunResult) -> None:
     trajectory, _, _ = load_trajectory(run.folder.trajectory)
     assert trajectory.end.shape[1] == 14
     assert set(moving_attributes(trajectory.end)) == set(ATTRIBUTES) - {"shN"}
 
 
-def test_snapshots_lie_where_they_were_taken_and_the_last_one_is_the_end(run: RunResult) -> None:
+def test_snapshots_lie_at_their_steps_and_the_last_is_the_end(run: RunResult) -> None:
     trajectory, _, _ = load_trajectory(run.folder.trajectory)
     assert trajectory.steps.tolist() == [0, 10, 20, 30, 40], "a short run has four"
     assert torch.allclose(trajectory.s, torch.linspace(0, 1, 5))
 
 
-def test_nothing_is_trained_once_all_is_recorded(folder: Path, run: RunResult, finishing: list[int]) -> None:
+def test_network_is_not_trained_after_the_recording(
+    folder: Path, run: RunResult, finishing: list[int]
+) -> None:
     assert finishing == [0]
     origin = load_gdf(run.gdf, load_ply(folder / "scene.ply")).field.origin
     assert origin is not None

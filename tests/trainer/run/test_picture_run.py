@@ -1,4 +1,4 @@
-"""A run on one changed picture: `progdf train --editor pictures:A.png`."""
+"""Run on one changed picture: `progdf train --editor pictures:A.png`."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SPEC = "recolor:#3060d0"
 
 @pytest.fixture(scope="module")
 def views(folder: Path) -> tuple[View, ...]:
-    """Views of the bear's region, the first of which is the picture's."""
+    """Return views of the bear's region; the first belongs to the picture."""
     scene, region = bear(folder)
     setup = make_training_setup(TrainingViewOptions(views=12, image_size=96), scene, region)
     return tuple(setup.views)
@@ -45,7 +45,7 @@ def bear(folder: Path) -> tuple:  # type: ignore[type-arg]
 
 @pytest.fixture(scope="module")
 def picture(folder: Path, views: tuple[View, ...]) -> Path:
-    """The first view, recolored, as a .png that carries its camera."""
+    """Save the first view, recolored, as a .png with its camera; return the path."""
     scene, region = bear(folder)
     edited = make_editor(EditorOptions(SPEC), scene, region, views).edit(views[0], 1.0)
     to_picture(edited).save(folder / "A.png", pnginfo=camera_chunk(views[0].camera))
@@ -69,10 +69,10 @@ def test_other_sides_follow_a_fill_from_one_picture(
         counts = view.mask > 0.05
         error = decibels(float((shown - truth.edit(view, 1.0))[counts].square().mean()))
         unedited = decibels(float((view.image - truth.edit(view, 1.0))[counts].square().mean()))
-        assert error > unedited + 6.0  # 7.5 at the least when written
+        assert error > unedited + 6.0  # at least 7.5 when written
 
 
-def test_the_report_says_that_nothing_was_held_out(done: RunResult) -> None:
+def test_report_states_that_no_view_was_held_out(done: RunResult) -> None:
     views = done.report["views"]
     assert views["held_out"] is False
     assert views["edit"] == ["A"]
@@ -82,7 +82,7 @@ def test_the_report_says_that_nothing_was_held_out(done: RunResult) -> None:
     assert json.loads(done.folder.report.read_text())["trajectory"]["slider"] == "even"
 
 
-def test_a_fill_that_took_is_reported_without_a_warning(done: RunResult) -> None:
+def test_reproduced_fill_is_reported_without_a_warning(done: RunResult) -> None:
     assert done.report["paint"]["reached"] > 0.9
     assert done.report["paint"]["warning"] == ""
     log = done.folder.log.read_text()
@@ -92,13 +92,13 @@ def test_a_fill_that_took_is_reported_without_a_warning(done: RunResult) -> None
 
 @pytest.mark.parametrize("background", [(1.0, 1.0, 1.0), (0.1, 0.2, 0.4)])
 @pytest.mark.parametrize("all_of_it", [False, True])
-def test_painting_a_thing_away_is_said_to_remove_nothing(
+def test_painting_an_object_away_warns_that_nothing_is_removed(
     folder: Path, background: tuple[float, float, float], all_of_it: bool
 ) -> None:
     scene, region = bear(folder)
     setup = make_training_setup(TrainingViewOptions(views=6, image_size=96), scene, region)
     others = torch.ones(len(scene), dtype=torch.bool).index_fill(0, region.members, False)
-    # all of it: with what the members hide, which are then less than was painted away
+    # `all_of_it` also paints away what the members hide, which is more than the members
     left = scene[:0] if all_of_it else scene[others.nonzero()[:, 0]]
     behind = torch.tensor(background)
     painted = [
@@ -117,7 +117,7 @@ def test_painting_a_thing_away_is_said_to_remove_nothing(
 
 
 @pytest.mark.parametrize("color", [(0.9, 0.9, 0.9), (0.8, 0.1, 0.1)])
-def test_a_thing_painted_in_a_color_of_its_own_is_not_told_as_removed(
+def test_object_painted_in_another_color_is_not_reported_as_removed(
     folder: Path, color: tuple[float, float, float]
 ) -> None:
     scene, region = bear(folder)
@@ -128,7 +128,7 @@ def test_a_thing_painted_in_a_color_of_its_own_is_not_told_as_removed(
     assert not measure_paint(setup, painted, [setup.background] * len(painted), scene).removes
 
 
-def test_what_saving_does_beside_the_members_is_not_counted_as_painted(folder: Path) -> None:
+def test_noise_beside_the_members_is_not_counted_as_paint(folder: Path) -> None:
     scene, region = bear(folder)
     setup = make_training_setup(TrainingViewOptions(views=6, image_size=96), scene, region)
     noise = torch.rand(96, 96, 3, generator=torch.Generator().manual_seed(0)) * 0.04
@@ -136,33 +136,31 @@ def test_what_saving_does_beside_the_members_is_not_counted_as_painted(folder: P
     assert measure_paint(setup, saved, [setup.background] * len(saved), scene).pixels == 0
 
 
-def test_detail_finer_than_the_splats_is_said_with_both_counts() -> None:
+def test_detail_finer_than_the_gaussians_is_reported_with_counts() -> None:
     assert PaintReproduction(0.37, 0.2, 2074, 457, False).warning == (
         "37 % of the paint was reproduced: 457 Gaussians for 2 074 painted pixels; "
         "the detail is finer than the Gaussians"
     )
 
 
-def test_a_faint_paint_warns_where_the_larger_part_is_missing() -> None:
+def test_weak_paint_warns_if_most_of_it_is_missing() -> None:
     assert PaintReproduction(0.49, 0.01, 100, 90, False).warning
     assert not PaintReproduction(0.51, 0.01, 100, 90, False).warning
 
 
-def test_the_way_is_neither_gray_nor_raw(done: RunResult) -> None:
+def test_path_of_a_picture_edit_is_even_and_not_two_keyframes(done: RunResult) -> None:
     assert len(done.trajectory) > 4  # straight in OKLab, not two keyframes
     assert done.report["slider"]["uniformity"] > 0.7
 
 
-def test_such_a_run_can_be_evaluated(done: RunResult, capsys: pytest.CaptureFixture[str]) -> None:
+def test_picture_run_can_be_evaluated(done: RunResult, capsys: pytest.CaptureFixture[str]) -> None:
     evaluate(EvaluateOptions(done.folder.root))
-    said = capsys.readouterr().out
-    assert "no other view shares enough pixels with a held-out view" in said
-    assert "to the run's own pictures, trained on, at 1, PSNR" in said
+    output = capsys.readouterr().out
+    assert "no other view shares enough pixels with a held-out view" in output
+    assert "to the run's own pictures, trained on, at 1, PSNR" in output
 
 
-def test_a_finished_run_of_another_picture_is_not_taken_for_this_one_s(
-    folder: Path, done: RunResult, picture: Path
-) -> None:
+def test_finished_run_of_another_picture_is_not_reused(folder: Path, done: RunResult, picture: Path) -> None:
     options = with_values(quick_options(folder), out=folder / "one", editor=f"pictures:{picture}", name="")
     assert train(replace(options, resume=True), quiet=True).gdf == done.gdf
     was = picture.read_bytes()
@@ -176,7 +174,7 @@ def test_a_finished_run_of_another_picture_is_not_taken_for_this_one_s(
         picture.write_bytes(was)
 
 
-def test_a_picture_without_camera_is_refused_before_the_scene_is_read(folder: Path) -> None:
+def test_picture_without_camera_is_refused_before_the_scene_is_read(folder: Path) -> None:
     to_picture(torch.ones(8, 8, 3)).save(folder / "bare.png")
     options = with_values(
         quick_options(folder), out=folder / "bare", editor=f"pictures:{folder / 'bare.png'}"
@@ -186,7 +184,7 @@ def test_a_picture_without_camera_is_refused_before_the_scene_is_read(folder: Pa
     assert not (folder / "bare").exists()
 
 
-def test_a_picture_that_does_not_show_the_region_is_one_line(folder: Path, picture: Path) -> None:
+def test_picture_that_does_not_show_the_region_is_refused(folder: Path, picture: Path) -> None:
     scene, region = bear(folder)
     away = Region("nothing there", region.members, region.score)
     far = replace(scene, means=scene.means + 1e4)

@@ -1,4 +1,4 @@
-"""Faults that need no scene to be seen: one line, exit 2, no scene loaded and no folder made."""
+"""Faults found without the scene: a one-line error, exit code 2, no scene loaded and no folder made."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ FAULTS = {
 
 @pytest.fixture(autouse=True)
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with a scene that must not be read."""
+    """Enter a folder with a scene that must not be read; return the folder."""
     monkeypatch.chdir(tmp_path)
     Path("bear.ply").write_bytes(b"ply")
     Path("broken.json").write_text("{")
@@ -70,10 +70,10 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def refused(capsys: pytest.CaptureFixture[str], **changes: str) -> str:
-    """The one line with which the command ends; nothing is left of it."""
+    """Return the error line of the command; check that the command leaves no files."""
     options = {"scene": "bear.ply", "--out": "run", **GOOD, **changes}
     before = sorted(Path().rglob("*"))
-    capsys.readouterr()  # of what made the files
+    capsys.readouterr()  # discard the output of creating the files
     words = [options.pop("scene"), *(word for option in options.items() for word in option)]
     assert main(["train", *words]) == 2
     assert sorted(Path().rglob("*")) == before
@@ -85,11 +85,11 @@ def refused(capsys: pytest.CaptureFixture[str], **changes: str) -> str:
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_fault_that_needs_no_scene_is_told_before_one_is_loaded(
+def test_fault_that_needs_no_scene_is_reported_before_loading(
     fault: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    changes, told = FAULTS[fault]
-    assert told in refused(capsys, **changes)
+    changes, message = FAULTS[fault]
+    assert message in refused(capsys, **changes)
 
 
 @pytest.mark.parametrize(
@@ -100,7 +100,7 @@ def test_a_fault_that_needs_no_scene_is_told_before_one_is_loaded(
         ("transformers", {"--region": "text:scarf"}, "segment"),
     ],
 )
-def test_a_missing_extra_is_told_before_the_scene_is_loaded(
+def test_missing_extra_is_reported_before_loading(
     package: str,
     changes: dict[str, str],
     extra: str,
@@ -112,7 +112,7 @@ def test_a_missing_extra_is_told_before_the_scene_is_loaded(
 
 
 @pytest.mark.parametrize("damage", ["none", "no detector", "no sam_model", "no weights", "cut weights"])
-def test_a_segmenter_that_cannot_be_loaded_is_told_before_the_scene_is(
+def test_unloadable_segmenter_is_reported_before_loading(
     damage: str, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("transformers")
@@ -132,14 +132,14 @@ def test_a_segmenter_that_cannot_be_loaded_is_told_before_the_scene_is(
         weights.write_bytes(weights.read_bytes()[:1000])
     options = {"--region": "text:scarf", "--detector": "detector", "--sam-model": "sam_model"}
     absent = {"no detector": {"--detector": "some/where"}, "no sam_model": {"--sam-model": "some/where"}}
-    told = refused(capsys, **{**options, **absent.get(damage, {})})
+    message = refused(capsys, **{**options, **absent.get(damage, {})})
     assert (
         "hf download some/where" if damage in absent else "sam_model does not hold a complete model"
-    ) in told
+    ) in message
 
 
 @pytest.mark.parametrize("damage", ["none", "no weights", "cut weights", "a shard missing", "a part missing"])
-def test_a_pipeline_that_cannot_be_loaded_is_told_before_the_scene_is(
+def test_unloadable_pipeline_is_reported_before_loading(
     damage: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("diffusers")
@@ -161,11 +161,11 @@ def test_a_pipeline_that_cannot_be_loaded_is_told_before_the_scene_is(
         (weights.parent / f"{weights.name}.index.json").write_text(json.dumps(index))
     else:
         shutil.rmtree(model / "vae")
-    told = refused(capsys, **{"--editor": "instruct:as Batman", "--model": str(model)})
-    assert "does not hold a complete diffusers pipeline" in told
+    message = refused(capsys, **{"--editor": "instruct:as Batman", "--model": str(model)})
+    assert "does not hold a complete diffusers pipeline" in message
 
 
-def test_a_folder_that_is_taken_is_told_before_the_scene_is_loaded(
+def test_occupied_folder_is_reported_before_loading(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert "neither empty nor a run of progdf train" in refused(capsys, **{"--out": "masks"})

@@ -1,4 +1,4 @@
-"""Presets and what the options mean: the command line goes first, then the preset, then the defaults."""
+"""Presets and resolved options: the command line overrides the preset, which overrides the defaults."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ def planned(kind: EditKind, *more: str, group_steps: int = 0) -> OptimizeOptions
     return resolve_kind(resolve(asked(*more)), kind, group_steps)
 
 
-def test_every_preset_is_there_and_the_default_one_changes_nothing() -> None:
+def test_every_preset_exists_and_the_default_changes_nothing() -> None:
     assert set(PRESETS) == set(get_args(Preset))
     assert asked("--preset", "default") == asked()
 
 
 @pytest.mark.parametrize("preset", [name for name in PRESETS if name != "default"])
-def test_a_preset_is_its_values_and_no_more(preset: Preset) -> None:
+def test_preset_sets_exactly_its_values(preset: Preset) -> None:
     to_json = asked()
     found = asked("--preset", preset)
     for part, values in PRESETS[preset].items():
@@ -57,7 +57,7 @@ def test_a_preset_is_its_values_and_no_more(preset: Preset) -> None:
 
 
 @pytest.mark.parametrize("preset", [name for name in PRESETS if name != "default"])
-def test_each_value_of_a_preset_could_be_given_on_the_command_line(preset: Preset) -> None:
+def test_preset_values_can_be_given_on_the_command_line(preset: Preset) -> None:
     fixed = {"perceptual_every", "sharpness", "as_printed", "color_solver", "ema", "target_ramp"}
     values = {name: value for part in PRESETS[preset].values() for name, value in part.items()}
     words = [w for n, v in values.items() if n not in fixed for w in (f"--{n.replace('_', '-')}", str(v))]
@@ -66,7 +66,7 @@ def test_each_value_of_a_preset_could_be_given_on_the_command_line(preset: Prese
     )
 
 
-def test_what_the_command_line_says_goes_before_the_preset_wherever_it_stands() -> None:
+def test_command_line_overrides_the_preset_in_any_order() -> None:
     before = asked("--steps", "300", "--preset", "paper")
     after = asked("--preset", "paper", "--steps", "300")
     assert before == after
@@ -74,26 +74,26 @@ def test_what_the_command_line_says_goes_before_the_preset_wherever_it_stands() 
     assert before.optimize.progressive == "decay"
 
 
-def test_a_default_that_the_command_line_spells_out_goes_before_the_preset_too() -> None:
+def test_explicit_default_overrides_the_preset() -> None:
     assert asked("--preset", "paper", "--stages", "0").optimize.stages == asked().optimize.stages == 0
 
 
-def test_the_papers_trainer_can_leave_out_its_network() -> None:
+def test_paper_preset_can_leave_out_its_network() -> None:
     plan = resolve(asked("--preset", "paper", "--field", "auto"))
     assert plan.field.field == "auto"
 
 
-def test_the_paper_can_tighten_instead_of_letting_go() -> None:
+def test_paper_preset_can_use_progressive_growth() -> None:
     assert planned("style", "--preset", "paper", "--progressive", "growth").progressive == "growth"
 
 
-def test_by_default_a_color_edit_is_paid_in_l1_mostly_and_a_style_for_its_texture_too() -> None:
+def test_default_loss_weights_depend_on_the_kind() -> None:
     color, style, geometry = (planned(kind) for kind in ("color", "style", "geometry"))
     assert (color.perceptual_weight, style.perceptual_weight, geometry.perceptual_weight) == (0.1, 0.3, 0.3)
     assert (color.sharpness, style.sharpness, geometry.sharpness) == ("off", "hinge", "off")
 
 
-def test_colors_are_solved_for_unless_something_is_asked_for_that_a_descent_has() -> None:
+def test_color_solver_is_used_unless_a_descent_option_is_given() -> None:
     assert planned("color").solver == "colors"
     assert planned("color", "--perceptual-weight", "0").solver == "colors"
     assert planned("style").solver == "descent"
@@ -101,7 +101,7 @@ def test_colors_are_solved_for_unless_something_is_asked_for_that_a_descent_has(
         assert planned("color", *words).solver == "descent"
 
 
-def test_a_style_goes_straight_to_its_end_unless_stages_are_asked_for() -> None:
+def test_default_stages_depend_on_kind_and_steps() -> None:
     asks = {kind: planned(kind).stages for kind in ("color", "style", "geometry")}
     assert asks == {"color": 8, "style": 1, "geometry": 8}
     assert planned("style", "--stages", "4").stages == 4
@@ -112,17 +112,17 @@ def test_a_style_goes_straight_to_its_end_unless_stages_are_asked_for() -> None:
     assert planned("color", "--quick", "--stages", "2").stages == 2
 
 
-def test_weights_that_are_given_hold_whatever_the_edit_and_zero_is_a_weight() -> None:
+def test_given_weights_hold_for_every_kind_including_zero() -> None:
     for kind in ("color", "style"):
         assert planned(kind, "--perceptual-weight", "0").perceptual_weight == 0.0
 
 
-def test_parts_move_as_wholes_only_where_something_moves() -> None:
+def test_group_steps_apply_only_to_geometry() -> None:
     assert planned("geometry", group_steps=9).group_steps == 9
     assert planned("color", group_steps=9).group_steps == 0
 
 
-def test_a_color_edit_holds_the_geometry_still_unless_the_plain_rates_are_asked_for() -> None:
+def test_color_edit_keeps_geometry_except_with_plain_rates() -> None:
     ours = pgs_settings(planned("color"), True, 23, 1.0, 4).rates
     to_json = pgs_settings(planned("color", "--preset", "paper"), True, 23, 1.0, 4).rates
     assert torch.equal(ours[:11], torch.zeros(11))
@@ -130,7 +130,7 @@ def test_a_color_edit_holds_the_geometry_still_unless_the_plain_rates_are_asked_
     assert float(ours[11]) > 5 * float(to_json[11])
 
 
-def test_the_papers_rates_are_those_of_3dgs_as_gaussian_editor_multiplies_them() -> None:
+def test_paper_rates_are_3dgs_rates_scaled_as_in_gaussian_editor() -> None:
     to_json, multiplied = (
         pgs_settings(planned("color", "--preset", "paper", *words), True, 14, 1.0, 1).rates
         for words in (("--rates", "3dgs"), ())
@@ -140,7 +140,7 @@ def test_the_papers_rates_are_those_of_3dgs_as_gaussian_editor_multiplies_them()
 
 
 @pytest.mark.parametrize(("part", "changes"), [("target_ramp", "ramp"), ("ema", "smoothing")])
-def test_each_refinement_of_a_descent_can_be_left_out_alone(part: str, changes: str) -> None:
+def test_each_refinement_of_descent_can_be_disabled_alone(part: str, changes: str) -> None:
     without = resolve_kind(with_values(resolve(asked()), **{part: False}), "style", 0)
     whole = vars(pgs_settings(planned("style"), True, 14, 1.0, 4))
     less = vars(pgs_settings(without, True, 14, 1.0, 4))
@@ -149,26 +149,26 @@ def test_each_refinement_of_a_descent_can_be_left_out_alone(part: str, changes: 
     assert not less[changes]
 
 
-def test_colors_are_solved_for_unless_that_is_left_out() -> None:
+def test_color_solver_can_be_disabled() -> None:
     assert planned("color").solver == "colors"
     descends = with_values(resolve(asked()), color_solver=False)
     assert resolve_kind(descends, "color", 0).solver == "descent"
 
 
-def test_only_a_color_edit_may_leave_the_bands_alone() -> None:
+def test_only_color_edits_may_leave_the_sh_bands_unchanged() -> None:
     assert planned("color").sh == "auto"
     assert planned("style").sh == "on"
     assert planned("color", "--preset", "paper").sh == planned("style", "--sh", "off").sh == "off"
     assert planned("style", "--sh", "off").sh == "off"
 
 
-def test_a_plan_is_read_back_from_json_as_it_was() -> None:
+def test_plan_round_trips_through_json() -> None:
     for words in ((), ("--preset", "paper"), ("--quick", "--cameras", "c.json", "--text-before", "a bear")):
         plan = resolve(asked(*words))
         assert convert_json(json.loads(json.dumps(to_json(plan))), TrainOptions) == plan
 
 
-def test_two_plans_differ_by_the_first_option_that_does() -> None:
+def test_plan_difference_names_the_first_differing_option() -> None:
     def resolve(options: TrainOptions) -> TrainOptions:
         return recorded_options(trainer.resolve.resolve(options))
 
@@ -190,6 +190,6 @@ def test_two_plans_differ_by_the_first_option_that_does() -> None:
         (("--preset", "papers"), "preset"),
     ],
 )
-def test_weights_and_presets_that_make_no_sense_are_named(words: tuple[str, ...], named: str) -> None:
+def test_invalid_weights_and_presets_are_named(words: tuple[str, ...], named: str) -> None:
     with pytest.raises(ProgdfError, match=named):
         resolve(asked(*words))

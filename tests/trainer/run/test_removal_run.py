@@ -1,4 +1,4 @@
-"""A run that removes: `progdf train --editor remove`, and changed pictures that show what is behind."""
+"""Removal runs: `progdf train --editor remove`, and changed pictures that show the background."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ POST = f"all-{TABLE}"
 
 
 def splats(means: Tensor, normals: Tensor, size: float, rgb: Tensor) -> Gaussians:
-    """Opaque discs on a surface."""
+    """Return opaque discs on a surface."""
     axis = torch.nn.functional.normalize(
         torch.linalg.cross(normals, torch.eye(3)[normals.abs().argmin(1)]), dim=1
     )
@@ -60,7 +60,7 @@ def splats(means: Tensor, normals: Tensor, size: float, rgb: Tensor) -> Gaussian
 
 @cache
 def table(hole: float) -> Gaussians:
-    """A plane with a gradient of color, and a round hole of this radius in its middle."""
+    """Return a plane with a color gradient and a round hole of this radius in its center."""
     line = torch.linspace(-1.2, 1.2, 60)
     x, z = torch.meshgrid(line, line, indexing="ij")
     means = torch.stack([x.flatten(), torch.zeros(x.numel()), z.flatten()], dim=1)
@@ -73,7 +73,7 @@ def table(hole: float) -> Gaussians:
 
 @cache
 def post() -> Gaussians:
-    """A cylinder that stands on the table, a little wider than the hole."""
+    """Return a cylinder on the table, slightly wider than the hole."""
     at = torch.arange(2500)
     angle = at * math.pi * (3 - math.sqrt(5))
     height = -0.01 - 0.8 * at / len(at)
@@ -87,7 +87,7 @@ def post() -> Gaussians:
 
 @cache
 def case(hole: float = 0.27) -> tuple[Gaussians, Gaussians, TrainingSetup]:
-    """The post on the table, the table alone, and views of them."""
+    """Return the post on the table, the table alone, and a setup with views."""
     scene = concatenate([table(hole), post()])
     region = from_mask("post", torch.arange(len(scene)) >= len(table(hole)))
     return (
@@ -97,7 +97,7 @@ def case(hole: float = 0.27) -> tuple[Gaussians, Gaussians, TrainingSetup]:
     )
 
 
-def test_a_membrane_continues_a_plane_and_ends_evenly_at_the_edge() -> None:
+def test_membrane_continues_a_plane_and_is_flat_at_the_edge() -> None:
     y, x = torch.meshgrid(torch.arange(20.0), torch.arange(30.0), indexing="ij")
     plane = torch.stack([0.3 * x - 0.1 * y, torch.ones_like(x)], dim=2)
     hole = (x - 14).square() + (y - 9).square() < 36
@@ -108,7 +108,7 @@ def test_a_membrane_continues_a_plane_and_ends_evenly_at_the_edge() -> None:
     )
 
 
-def test_a_hole_that_nobody_saw_is_closed_as_the_surface_around_it() -> None:
+def test_unseen_hole_is_closed_like_the_surface_around_it() -> None:
     scene, rest, setup = case()
     fill = fill_holes(scene, rest, setup.train)
     assert fill.rows is not None
@@ -120,13 +120,15 @@ def test_a_hole_that_nobody_saw_is_closed_as_the_surface_around_it() -> None:
         pictures = [render_view(some, view.camera, WHITE).clamp(0, 1) for some in (rest, done, whole)]
         before, after = (decibels(float((one - pictures[2])[hole].square().mean())) for one in pictures[:2])
         assert before < 15.0
-        assert after > 33.0  # 35 at the least when written
-        # nothing of what was seen is covered
+        assert after > 33.0  # at least 35 when written
+        # no visible pixel is covered
         assert decibels(float((pictures[1] - pictures[0])[~hole].square().mean())) > 40.0
 
 
 @pytest.mark.parametrize(("depth", "behind_region", "is_hole"), [("inf", False, False), ("1", True, True)])
-def test_where_a_view_saw_through_there_is_no_hole(depth: str, behind_region: bool, is_hole: bool) -> None:
+def test_hole_excludes_pixels_that_another_view_saw_through(
+    depth: str, behind_region: bool, is_hole: bool
+) -> None:
     _, rest, setup = case()
     view = setup.train[0]
     other = setup.train[1].camera
@@ -137,7 +139,7 @@ def test_where_a_view_saw_through_there_is_no_hole(depth: str, behind_region: bo
 
 
 @pytest.mark.parametrize("fine", [False, True])
-def test_flat_parts_of_a_hole_take_few_rows(fine: bool) -> None:
+def test_flat_parts_of_a_hole_need_few_rows(fine: bool) -> None:
     camera = case()[2].train[0].camera.resize(128, 128)
     mask = torch.zeros(128, 128, dtype=torch.bool)
     mask[10:110, 10:110] = True
@@ -148,7 +150,7 @@ def test_flat_parts_of_a_hole_take_few_rows(fine: bool) -> None:
     assert len(rows) == 10_000 if fine else len(rows) < 1000
 
 
-def test_a_thing_before_an_empty_background_leaves_nothing_to_fill() -> None:
+def test_object_before_an_empty_background_leaves_no_hole() -> None:
     scene, rest, _ = case()
     region = from_mask("table", torch.arange(len(scene)) < len(rest))
     setup = make_training_setup(TrainingViewOptions(views=12, image_size=96), scene, region)
@@ -173,7 +175,7 @@ def members_of(scene: Gaussians) -> Region:
     return from_mask("post", torch.arange(len(scene)) >= len(case()[1]))
 
 
-def test_a_removal_is_a_run_like_any_other(scene_file: Path, tmp_path: Path) -> None:
+def test_removal_is_a_regular_run(scene_file: Path, tmp_path: Path) -> None:
     out = tmp_path / "gone"
     result = train(options_of(scene_file, out), quiet=True)
     scene = load_ply(scene_file)
@@ -191,7 +193,7 @@ def test_a_removal_is_a_run_like_any_other(scene_file: Path, tmp_path: Path) -> 
         evaluate(EvaluateOptions(out))
 
 
-def test_without_a_fill_the_rows_are_gone_and_nothing_is_added(scene_file: Path, tmp_path: Path) -> None:
+def test_removal_without_fill_adds_nothing(scene_file: Path, tmp_path: Path) -> None:
     result = train(options_of(scene_file, tmp_path / "gone", fill="none"), quiet=True)
     scene = load_ply(scene_file)
     gdf = load_gdf(result.gdf, scene)
@@ -199,7 +201,7 @@ def test_without_a_fill_the_rows_are_gone_and_nothing_is_added(scene_file: Path,
     removed = compose_layers(scene, [Layer(gdf, 1.0)])
     for view in case()[2].held_out:
         pairs = zip(on_backgrounds(removed, view.camera), on_backgrounds(case()[1], view.camera), strict=True)
-        assert all(float((a - b).abs().max()) < 1e-5 for a, b in pairs)  # an ulp, see test_tidy.py
+        assert all(float((a - b).abs().max()) < 1e-5 for a, b in pairs)  # one ulp, see test_tidy.py
 
 
 def paint(path: Path, image: Tensor, view: View) -> Path:
@@ -208,7 +210,7 @@ def paint(path: Path, image: Tensor, view: View) -> Path:
 
 
 @pytest.mark.parametrize("removal", ["auto", "never"])
-def test_a_picture_of_what_is_behind_is_a_removal(scene_file: Path, tmp_path: Path, removal: str) -> None:
+def test_picture_of_the_background_is_a_removal(scene_file: Path, tmp_path: Path, removal: str) -> None:
     _, rest, setup = case()
     view = setup.train[0]
     picture = paint(tmp_path / "A.png", render_view(rest, view.camera, WHITE).clamp(0, 1), view)
@@ -220,7 +222,7 @@ def test_a_picture_of_what_is_behind_is_a_removal(scene_file: Path, tmp_path: Pa
     assert ("it is taken away" in (out / "log.txt").read_text()) == (removal == "auto")
 
 
-def test_a_picture_in_another_color_is_no_removal(scene_file: Path, tmp_path: Path) -> None:
+def test_recolored_picture_is_no_removal(scene_file: Path, tmp_path: Path) -> None:
     view = case()[2].train[0]
     blue = view.blend(torch.tensor([0.2, 0.3, 0.9]).expand_as(view.image))
     picture = paint(tmp_path / "A.png", blue, view)
@@ -230,7 +232,7 @@ def test_a_picture_in_another_color_is_no_removal(scene_file: Path, tmp_path: Pa
     assert "logit_opacities" not in load_gdf(result.gdf, load_ply(scene_file)).field.attributes
 
 
-def test_a_painted_picture_gives_the_hole_its_colors(scene_file: Path, tmp_path: Path) -> None:
+def test_painted_picture_colors_the_hole(scene_file: Path, tmp_path: Path) -> None:
     _, rest, setup = case()
     view = max(setup.train, key=lambda view: int(find_hole(rest, view, []).mask.sum()))
     hole = find_hole(rest, view, []).mask
@@ -239,12 +241,12 @@ def test_a_painted_picture_gives_the_hole_its_colors(scene_file: Path, tmp_path:
     picture = paint(tmp_path / "A.png", torch.where(hole[..., None], green, drawn), view)
     result = train(options_of(scene_file, tmp_path / "run", f"remove:{picture}"), quiet=True)
     scene = load_ply(scene_file)
-    made = compose_layers(scene, [Layer(load_gdf(result.gdf, scene), 1.0)])
-    shown = render_view(made, view.camera, WHITE).clamp(0, 1)[hole]
+    removed = compose_layers(scene, [Layer(load_gdf(result.gdf, scene), 1.0)])
+    shown = render_view(removed, view.camera, WHITE).clamp(0, 1)[hole]
     assert float((shown.median(dim=0).values - green).abs().max()) < 0.03
 
 
-def test_what_would_float_alone_without_the_region_goes_with_it(scene_file: Path, tmp_path: Path) -> None:
+def test_gaussians_left_floating_are_removed_with_the_region(scene_file: Path, tmp_path: Path) -> None:
     scene, rest, _ = case()
     at = torch.tensor([[0.4, -0.4, 0.0], [0.0, -0.5, 0.4]])  # beside the post, high above the table
     crumbs = splats(
@@ -258,13 +260,13 @@ def test_what_would_float_alone_without_the_region_goes_with_it(scene_file: Path
     taken = with_strays(whole, region)
     assert taken.members.tolist() == [*region.members.tolist(), len(scene), len(scene) + 1]
     assert torch.equal(with_strays(scene, members_of(scene)).members, members_of(scene).members)
-    # what floats already is nobody's crumb
+    # Gaussians that already float are no crumbs
     assert (
         len(with_strays(concatenate([rest, far]), from_mask("none", torch.zeros(len(rest) + 1).bool()))) == 0
     )
 
 
-def test_a_removal_with_another_picture_is_not_the_same_run(scene_file: Path, tmp_path: Path) -> None:
+def test_removal_with_another_picture_is_another_run(scene_file: Path, tmp_path: Path) -> None:
     setup = case()[2]
     picture = paint(
         tmp_path / "A.png", render_view(case()[1], setup.train[0].camera, WHITE).clamp(0, 1), setup.train[0]
@@ -285,7 +287,7 @@ def test_a_removal_with_another_picture_is_not_the_same_run(scene_file: Path, tm
         ({"editor": "remove:nowhere.png"}, "does not exist"),
     ],
 )
-def test_options_that_make_no_sense_are_one_line(
+def test_invalid_removal_options_are_a_one_line_error(
     scene_file: Path, tmp_path: Path, values: dict[str, str], said: str
 ) -> None:
     with pytest.raises(ProgdfError, match=said) as caught:

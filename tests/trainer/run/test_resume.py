@@ -1,4 +1,4 @@
-"""A run that is stopped, however and whenever, goes on to the same bits, and says in one line how."""
+"""Stopped runs: they resume to the same bits from any point, and one line tells how."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ pytest_plugins = ["tests.helpers.stopped_runs"]
 pytestmark = pytest.mark.usefixtures("elsewhere")
 
 
-def test_a_run_killed_wherever_it_writes_goes_on_to_the_same_bits(
+def test_run_killed_at_any_write_resumes_to_the_same_bits(
     bear_folder: Path, uninterrupted: Path, tmp_path: Path
 ) -> None:
     draw = random.Random(7)
-    # among the views, and in the optimization
+    # while views are rendered, and in the optimization
     spans = ((2, 12), (30, 50))
     lines = killed(bear_folder, tmp_path, [float(draw.randint(*span)) for span in spans], save_every=0)
     assert any(line.endswith("-9") for line in lines), lines
@@ -61,7 +61,7 @@ def test_a_run_killed_wherever_it_writes_goes_on_to_the_same_bits(
     ],
     ids=["color", "parts", "joint"],
 )
-def test_runs_killed_at_sixteen_moments_go_on_to_the_same_bits(
+def test_runs_killed_at_sixteen_moments_resume_to_the_same_bits(
     bear_folder: Path, tmp_path: Path, options: dict[str, object]
 ) -> None:
     killed(bear_folder, tmp_path, [], **options)
@@ -74,7 +74,7 @@ def test_runs_killed_at_sixteen_moments_go_on_to_the_same_bits(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_ctrl_c_saves_the_state_exits_130_and_tells_how_to_go_on(
+def test_ctrl_c_saves_the_state_and_exits_130_with_instructions(
     bear_folder: Path,
     uninterrupted: Path,
     number: signal.Signals,
@@ -92,7 +92,7 @@ def test_ctrl_c_saves_the_state_exits_130_and_tells_how_to_go_on(
 
 
 @pytest.mark.usefixtures("default_signals")
-def test_ctrl_c_before_the_optimization_is_kept_too(
+def test_ctrl_c_before_the_optimization_is_saved_too(
     bear_folder: Path, uninterrupted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
@@ -103,7 +103,7 @@ def test_ctrl_c_before_the_optimization_is_kept_too(
 
 
 @pytest.mark.usefixtures("default_signals")
-def test_a_draft_is_there_until_the_edit_is(
+def test_draft_exists_until_the_edit_is_finished(
     bear_folder: Path, uninterrupted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
@@ -118,13 +118,13 @@ def test_a_draft_is_there_until_the_edit_is(
     assert not (OUT / "draft.gdf").exists()
 
 
-def test_an_edit_that_is_called_draft_is_none(bear_folder: Path) -> None:
+def test_edit_named_draft_is_no_draft(bear_folder: Path) -> None:
     done = train(replace(small_run(bear_folder), name="draft"), quiet=True)
     assert "draft" not in load_gdf(done.gdf, load_ply(bear_folder / "scene.ply")).report
 
 
 @pytest.mark.usefixtures("stopped")
-def test_resuming_with_another_option_names_it_and_touches_nothing(bear_folder: Path) -> None:
+def test_resume_with_another_option_names_it_and_changes_nothing(bear_folder: Path) -> None:
     before = {path: path.read_bytes() for path in OUT.rglob("*") if path.is_file()}
     with pytest.raises(ProgdfError, match="started with --steps 24, not 40; "):
         train(replace(small_run(bear_folder, steps=40), resume=True), quiet=True)
@@ -132,16 +132,16 @@ def test_resuming_with_another_option_names_it_and_touches_nothing(bear_folder: 
 
 
 @pytest.mark.usefixtures("stopped")
-def test_resuming_with_another_scene_under_the_same_name_is_refused(bear_folder: Path) -> None:
+def test_resume_with_a_changed_scene_is_refused(bear_folder: Path) -> None:
     about = OUT / "state" / "run.json"
-    told = json.loads(about.read_text(encoding="utf-8"))
-    about.write_text(json.dumps({**told, "scene": "another"}), encoding="utf-8")
+    identity = json.loads(about.read_text(encoding="utf-8"))
+    about.write_text(json.dumps({**identity, "scene": "another"}), encoding="utf-8")
     with pytest.raises(ProgdfError, match="the scene has changed since run was started; "):
         train(replace(small_run(bear_folder), resume=True), quiet=True)
 
 
 @pytest.mark.parametrize("change", ["another pose", "another size", "a larger model"])
-def test_resuming_notices_a_changed_camera_folder(bear_folder: Path, change: str) -> None:
+def test_resume_detects_a_changed_camera_folder(bear_folder: Path, change: str) -> None:
     cameras = Path("colmap")
     names = [f"{i} a.jpg" for i in range(8)]
     model = write_text_model(cameras / "sparse" / "0", names)
@@ -164,7 +164,7 @@ def test_resuming_notices_a_changed_camera_folder(bear_folder: Path, change: str
         decide_resume(folder, again, region, 9)
 
 
-def test_cameras_in_a_folder_are_trained_with(bear_folder: Path) -> None:
+def test_cameras_in_a_folder_are_used_for_training(bear_folder: Path) -> None:
     demo = bear(1500)
     Path("data").mkdir()
     save_cameras(Path("data", "cameras.json"), demo.cameras)
@@ -182,43 +182,43 @@ def test_cameras_in_a_folder_are_trained_with(bear_folder: Path) -> None:
         (OSError(errno.ENOSPC, "No space left"), "the disk of run is full"),
     ],
 )
-def test_a_system_error_is_blamed_on_the_file_that_it_names(error: OSError, said: str) -> None:
+def test_system_error_names_the_file_at_fault(error: OSError, said: str) -> None:
     with pytest.raises(ProgdfError) as caught, explain_stop(RunFolder(OUT)):
         raise error
     assert str(caught.value).startswith(said)
     assert str(caught.value).endswith("then continue with --resume")
 
 
-def test_a_missing_picture_is_named_not_the_run(bear_folder: Path) -> None:
+def test_missing_picture_is_named_instead_of_the_run(bear_folder: Path) -> None:
     options = small_run(bear_folder, editor="decal:logo.png")
     with pytest.raises(ProgdfError, match=r"^logo\.png does not exist; "):
         picture_digests(options)
 
 
 @pytest.mark.usefixtures("stopped")
-def test_a_run_that_another_version_began_is_not_resumed(bear_folder: Path) -> None:
+def test_run_of_another_version_is_not_resumed(bear_folder: Path) -> None:
     about = OUT / "state" / "run.json"
-    told = json.loads(about.read_text(encoding="utf-8"))
-    del told["version"]
-    about.write_text(json.dumps(told), encoding="utf-8")
+    identity = json.loads(about.read_text(encoding="utf-8"))
+    del identity["version"]
+    about.write_text(json.dumps(identity), encoding="utf-8")
     with pytest.raises(ProgdfError, match="another version of progdf began run; train again"):
         train(replace(small_run(bear_folder), resume=True), quiet=True)
 
 
 @pytest.mark.usefixtures("stopped")
-def test_a_resumed_run_keeps_to_the_threads_it_began_with(bear_folder: Path, uninterrupted: Path) -> None:
+def test_resumed_run_keeps_its_number_of_threads(bear_folder: Path, uninterrupted: Path) -> None:
     assert "1 threads, as the run began with" in gone_on(bear_folder, uninterrupted, threads=2)
     assert torch.get_num_threads() == 1
 
 
 @pytest.mark.usefixtures("stopped")
-def test_a_stopped_run_is_not_lost_by_starting_it_again(bear_folder: Path) -> None:
+def test_stopped_run_is_not_lost_by_starting_again(bear_folder: Path) -> None:
     with pytest.raises(ProgdfError, match="stopped at step 10 of 24; add --resume"):
         train(small_run(bear_folder), quiet=True)
     assert saved_step() == 10
 
 
-def test_resuming_a_finished_run_says_so_and_leaves_it(
+def test_resume_of_a_finished_run_reports_it_and_changes_nothing(
     bear_folder: Path, uninterrupted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shutil.copytree(uninterrupted, OUT)
@@ -229,12 +229,12 @@ def test_resuming_a_finished_run_says_so_and_leaves_it(
         train(replace(small_run(bear_folder), resume=True, seed=1), quiet=True)
 
 
-def test_resuming_where_nothing_was_saved_starts(bear_folder: Path, uninterrupted: Path) -> None:
+def test_resume_without_saved_state_starts_the_run(bear_folder: Path, uninterrupted: Path) -> None:
     assert "nothing to resume" in gone_on(bear_folder, uninterrupted)
 
 
 @pytest.mark.usefixtures("stopped")
-def test_no_view_is_edited_and_no_region_looked_for_again(
+def test_resume_repeats_no_edited_view_and_no_region_search(
     bear_folder: Path, uninterrupted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def again(*_: object) -> None:
@@ -247,7 +247,7 @@ def test_no_view_is_edited_and_no_region_looked_for_again(
 
 @pytest.mark.parametrize("change", ["half the rows", "above 1", "whole numbers", "no name"])
 @pytest.mark.usefixtures("stopped")
-def test_a_saved_region_that_is_not_of_the_scene_is_one_line(bear_folder: Path, change: str) -> None:
+def test_saved_region_of_another_scene_is_a_one_line_error(bear_folder: Path, change: str) -> None:
     state = StateFolder(OUT / "state")
     saved = state.load("region")
     assert saved is not None
@@ -268,9 +268,7 @@ def test_a_saved_region_that_is_not_of_the_scene_is_one_line(bear_folder: Path, 
 
 @pytest.mark.parametrize("broken", ["gone", "truncated"])
 @pytest.mark.usefixtures("stopped")
-def test_an_edited_view_that_was_lost_is_edited_again(
-    bear_folder: Path, uninterrupted: Path, broken: str
-) -> None:
+def test_lost_edited_view_is_edited_again(bear_folder: Path, uninterrupted: Path, broken: str) -> None:
     lost = sorted((OUT / "views" / "edited").glob("*.png"))[0]
     if broken == "gone":
         lost.unlink()
@@ -280,9 +278,7 @@ def test_an_edited_view_that_was_lost_is_edited_again(
 
 
 @pytest.mark.usefixtures("stopped")
-def test_a_run_goes_on_on_another_kind_of_processor_and_says_so_in_one_line(
-    bear_folder: Path, uninterrupted: Path
-) -> None:
+def test_resume_on_another_processor_is_logged_in_one_line(bear_folder: Path, uninterrupted: Path) -> None:
     about = OUT / "state" / "run.json"
     identity = json.loads(about.read_text(encoding="utf-8"))
     assert identity["processor"] == processor_kind()
@@ -292,7 +288,7 @@ def test_a_run_goes_on_on_another_kind_of_processor_and_says_so_in_one_line(
     assert log.count("the last bits may differ, the quality does not") == 1
 
 
-def test_a_switch_that_changes_the_last_bits_makes_another_kind_of_processor(
+def test_processor_kind_includes_switches_that_change_the_last_bits(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     kinds = [processor_kind()]
@@ -306,7 +302,7 @@ def test_a_switch_that_changes_the_last_bits_makes_another_kind_of_processor(
 
 
 @pytest.mark.slow  # the fast tests stop a run of colors; parts and their rows are saved by the same code
-def test_a_run_that_moves_parts_goes_on_to_the_same_bits(
+def test_run_that_moves_parts_resumes_to_the_same_bits(
     bear_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     options = small_run(bear_folder, kind="geometry", group_steps=8, steps=16)
@@ -327,11 +323,11 @@ def test_a_run_that_moves_parts_goes_on_to_the_same_bits(
     assert (OUT / "trajectory.safetensors").read_bytes() == expected
 
 
-@pytest.mark.slow  # a plain run is killed wherever it writes in every run of the tests
-def test_run_that_decides_on_its_strengths_resumes_to_the_same_bits(
+@pytest.mark.slow  # the fast tests kill a plain run at its writes
+def test_run_that_chooses_its_strengths_resumes_to_the_same_bits(
     bear_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Stopped while the views are edited at the strengths that were decided on, then between two of them."""
+    """Stop while views are edited at the chosen strengths, then between two strengths."""
     free = {"perceptual_weight": None, "steps": 200, "stages": 0, "views": 0, "image_size": 40}
     options = small_run(bear_folder, field="auto", **free)
     monkeypatch.setattr(trainer.run.run, "finish_run", lambda *_: None)
@@ -351,7 +347,7 @@ def test_run_that_decides_on_its_strengths_resumes_to_the_same_bits(
         patch.setattr(trainer.run.run, "edit_views", edit_views)
         with pytest.raises(KeyboardInterrupt):
             train(options, quiet=True)
-    # the finished edit and the middle come first; how they differ decides on the others
+    # the full and the half edit come first; their difference decides on the other strengths
     assert requested[:2] == [[1.0], [0.5]]
     assert len(requested[2]) > 1
     with monkeypatch.context() as patch:
@@ -363,7 +359,7 @@ def test_run_that_decides_on_its_strengths_resumes_to_the_same_bits(
     assert (OUT / "trajectory.safetensors").read_bytes() == expected
 
 
-def test_what_is_found_in_a_folder_depends_on_the_options(
+def test_state_of_a_folder_depends_on_the_options(
     bear_folder: Path, uninterrupted: Path, interrupted: Path
 ) -> None:
     assert find_run(small_run(bear_folder)) == "nothing"
@@ -375,8 +371,8 @@ def test_what_is_found_in_a_folder_depends_on_the_options(
     assert find_run(small_run(bear_folder)) == "finished"
 
 
-@pytest.mark.slow  # a plain run is killed wherever it writes in every run of the tests
-def test_a_run_killed_while_it_grows_goes_on_to_the_same_bits(tmp_path: Path) -> None:
+@pytest.mark.slow  # the fast tests kill a plain run at its writes
+def test_run_killed_while_growing_resumes_to_the_same_bits(tmp_path: Path) -> None:
     options = write_growth(tmp_path, "hat", views=8, image_size=64)
     more = {"editor": options.editor.editor, "region": options.region.region, "views": options.views.views}
     more |= {"grow": 0.5, "kind": "geometry", "group_steps": 0, "save_every": 0, "image_size": 64}
@@ -385,21 +381,21 @@ def test_a_run_killed_while_it_grows_goes_on_to_the_same_bits(tmp_path: Path) ->
     killed(tmp_path, tmp_path / "whole", [], **more)
     log = (tmp_path / "whole" / OUT / "log.txt").read_text(encoding="utf-8")
     assert "Gaussians added, of" in log
-    # in the trial, around the file of the rows, and among the steps of all together
+    # in the trial, near the file of the rows, and in the joint optimization
     lines = killed(tmp_path, tmp_path / "cut", [31.0, 44.0, 15.0, 19.0, 24.0], **more)
     assert sum(line.endswith("-9") for line in lines) == 5, lines
     assert bits(tmp_path / "cut" / OUT) == bits(tmp_path / "whole" / OUT)
 
 
 def _striped(bear_folder: Path) -> TrainOptions:
-    """Return options of a run that decides on its views and strengths, and needs half of the views."""
+    """Return options of a run that chooses its views and strengths and needs half of the views."""
     options = quick_options(bear_folder, views=0, stages=0, image_size=48)
     return replace(options, out=OUT, editor=EditorOptions("stripes:#20a040"))
 
 
 @pytest.fixture(scope="session")
 def striped_bits(bear_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """The bits of such a run that was not stopped, after a check of the views that it kept."""
+    """Return the bits of such a run without interruption; check the views that it kept."""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("striped"))
         whole = train(_striped(bear_folder))
@@ -426,7 +422,7 @@ def striped_bits(bear_folder: Path, tmp_path_factory: pytest.TempPathFactory) ->
         pytest.param("finish_run", marks=pytest.mark.slow),
     ],
 )
-def test_a_run_that_keeps_half_of_its_views_resumes_to_the_same_bits(
+def test_run_that_keeps_half_of_its_views_resumes_to_the_same_bits(
     bear_folder: Path, striped_bits: dict[str, str], monkeypatch: pytest.MonkeyPatch, where: str
 ) -> None:
     def stop(*_: object, **__: object) -> None:

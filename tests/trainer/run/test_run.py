@@ -1,4 +1,4 @@
-"""The whole job: `progdf train` and `progdf fit` on a small bear."""
+"""Full runs of `progdf train` and `progdf fit` on a small bear."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ from trainer.run.record import render_run_views, reopen_run
 from trainer.run.run import RunResult
 
 WHOLE = {"views": 10, "image_size": 72}
-"""As many views, and as large, as it takes that their halves differ and that a map alone is too little."""
+"""Views numerous and large enough that their halves differ and that a map alone is insufficient."""
 
 
 @pytest.fixture(scope="module")
 def done(folder: Path) -> RunResult:
-    """A finished run of a few seconds, shared by the tests that only look; with its curves drawn."""
+    """Return a finished run of a few seconds with its curves drawn, for tests that only read it."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("trainer.report.report.draw_plot", draw_plot)
         return train(quick_options(folder, **WHOLE), quiet=True)
@@ -46,36 +46,36 @@ def done(folder: Path) -> RunResult:
 
 @pytest.fixture(scope="module")
 def brief(folder: Path) -> RunResult:
-    """A run of few steps whose field is all that was recorded; tests that change it take a copy."""
+    """Return a run of few steps with a lossless field; tests that change it use a copy."""
     return train(quick_options(folder, "brief", steps=16, stages=2, field="lossless", **WHOLE), quiet=True)
 
 
 def copy_of(run: RunResult, folder: Path) -> Path:
-    """The run in another folder."""
+    """Return a copy of the run in another folder."""
     return shutil.copytree(run.folder.root, folder / run.folder.root.name)
 
 
-def test_the_report_s_picture_ends_in_curves(done: RunResult) -> None:
+def test_report_picture_ends_with_curves(done: RunResult) -> None:
     with Image.open(done.folder.root / "report.png") as picture:
         last = np.asarray(picture.convert("RGB"), dtype=int)[-200:]
     for line in LINES[:2]:
         assert (np.abs(last - line).max(axis=2) <= 12).sum() > 50
 
 
-def test_training_lowers_the_loss_and_reaches_held_out_views(done: RunResult) -> None:
+def test_training_lowers_the_loss_and_matches_held_out_views(done: RunResult) -> None:
     _, _, recorded = load_trajectory(done.folder.trajectory)
     losses = recorded["losses"]["left"]
     assert losses[-1] < 0.2 * sum(losses[:3]) / 3
     assert done.report["edit"]["psnr_to_views"] > 32.0  # 35.8 when written; 16 before the edit
 
 
-def test_the_slider_is_nearer_to_the_editor_than_two_keyframes(done: RunResult) -> None:
+def test_slider_is_closer_to_the_editor_than_two_keyframes(done: RunResult) -> None:
     assert len(done.report["between"]) == 3
     for s, between in done.report["between"].items():
         assert between["psnr"] > between["keyframes2"] + 4.0, s
 
 
-def test_a_figure_from_one_held_out_view_says_that_it_is_one(
+def test_figure_from_a_single_held_out_view_is_labeled(
     folder: Path, done: RunResult, capsys: pytest.CaptureFixture[str]
 ) -> None:
     few = quick_options(folder, out=folder / "few", views=4, image_size=48, steps=16, stages=1)
@@ -87,11 +87,11 @@ def test_a_figure_from_one_held_out_view_says_that_it_is_one(
     assert re.search(r"\d+ held-out views: .* dB, ", done.folder.log.read_text())
 
 
-def test_equal_steps_of_the_slider_look_equally_large(done: RunResult) -> None:
-    assert done.report["slider"]["uniformity"] > 0.7  # .9 when written; .5 with the editor's strengths pinned
+def test_equal_slider_steps_look_equally_large(done: RunResult) -> None:
+    assert done.report["slider"]["uniformity"] > 0.7  # 0.9 when written; 0.5 with pinned strengths
 
 
-def test_the_report_says_at_which_strength_the_editor_was_asked(done: RunResult) -> None:
+def test_report_records_the_strengths_requested_from_the_editor(done: RunResult) -> None:
     report = done.report
     asked = [between["strength"] for between in report["between"].values()]
     assert asked == report["trajectory"]["stages"][:-1] == list(done.trajectory.strengths[:-1])
@@ -101,7 +101,7 @@ def test_the_report_says_at_which_strength_the_editor_was_asked(done: RunResult)
     assert asked != [0.25, 0.5, 0.75], "this editor's strengths are not evenly visible"
 
 
-def test_the_field_tells_where_it_shows_what_was_recorded(folder: Path, done: RunResult) -> None:
+def test_field_stores_the_strengths_of_its_recordings(folder: Path, done: RunResult) -> None:
     gdf = load_gdf(done.gdf, load_ply(folder / "scene.ply"))
     trajectory, _, _ = load_trajectory(done.folder.trajectory)
     assert gdf.field.recorded == pytest.approx(done.trajectory.s.tolist(), abs=1e-6)
@@ -110,7 +110,7 @@ def test_the_field_tells_where_it_shows_what_was_recorded(folder: Path, done: Ru
     assert float((done.trajectory.end - trajectory.end).square().mean().sqrt()) < 0.05
 
 
-def test_effort_that_nobody_gives_is_decided_on_the_scene_and_reported(folder: Path, done: RunResult) -> None:
+def test_default_effort_is_chosen_from_the_scene_and_reported(folder: Path, done: RunResult) -> None:
     free = train(
         quick_options(folder, "free", stages=0, views=0, image_size=40, editor="darken:0.4"), quiet=True
     )
@@ -121,23 +121,21 @@ def test_effort_that_nobody_gives_is_decided_on_the_scene_and_reported(folder: P
     assert len(given["strengths"]) == 4
     assert len(effort["steps"]) == (len(effort["strengths"]) if effort["sh_functions"] else 0)
     assert max(given["steps"]) <= given["most_steps"] == 25
-    assert effort["views"] == 17  # of 34: with these nothing that is left shows
+    assert effort["views"] == 17  # of 34; with these the remainder is invisible
     assert len(free.report["views"]["edit"]) == 6
     how = "in " if effort["steps"] else "by maps alone"
     assert f"{len(effort['strengths'])} strengths {how}" in free.folder.log.read_text()
     assert free.report["edit"]["psnr_to_views"] > 32.0
 
 
-def test_with_stages_the_slider_is_the_editors_own_strength(folder: Path) -> None:
+def test_slider_with_stages_is_the_strength_of_the_editor(folder: Path) -> None:
     result = train(quick_options(folder, "pinned", slider="stages", steps=24), quiet=True)
     assert set(result.report["between"]) == {"0.25", "0.5", "0.75"}
     assert all(float(s) == found["strength"] for s, found in result.report["between"].items())
     assert result.report["trajectory"]["stages_at"] == [0.25, 0.5, 0.75, 1.0]
 
 
-def test_strength_zero_is_the_scene_bit_for_bit_and_one_is_what_the_file_says(
-    folder: Path, done: RunResult
-) -> None:
+def test_strength_zero_is_the_scene_and_one_is_the_stored_end(folder: Path, done: RunResult) -> None:
     scene = load_ply(folder / "scene.ply")
     gdf = load_gdf(done.gdf, scene)
     at_zero = compose_layers(scene, [Layer(gdf, 0.0)])
@@ -150,7 +148,7 @@ def test_strength_zero_is_the_scene_bit_for_bit_and_one_is_what_the_file_says(
     assert done.report["field"]["endpoint_error"] == 0.0
 
 
-def test_rows_outside_the_region_are_byte_identical_at_any_strength(folder: Path, done: RunResult) -> None:
+def test_rows_outside_the_region_are_identical_at_any_strength(folder: Path, done: RunResult) -> None:
     scene = load_ply(folder / "scene.ply")
     gdf = load_gdf(done.gdf, scene)
     outside = torch.ones(len(scene), dtype=torch.bool)
@@ -162,7 +160,7 @@ def test_rows_outside_the_region_are_byte_identical_at_any_strength(folder: Path
     assert done.report["field"]["outside_change"] == 0.0
 
 
-def test_the_report_has_what_others_read_from_it(done: RunResult) -> None:
+def test_report_has_its_documented_keys(done: RunResult) -> None:
     report = json.loads(done.folder.report.read_text(encoding="utf-8"))
     expected = {
         "field": {"kind", "bytes_per_gaussian", "parameters", "psnr_mean", "psnr_worst", "endpoint_error"},
@@ -181,7 +179,7 @@ def test_the_report_has_what_others_read_from_it(done: RunResult) -> None:
     assert set(report["baselines"]["keyframes2"]) >= {"psnr_mean", "psnr_worst", "bytes_per_gaussian"}
 
 
-def test_a_field_s_errors_are_reported_on_views_that_its_choice_has_not_seen(done: RunResult) -> None:
+def test_field_errors_are_reported_on_views_unseen_by_the_choice(done: RunResult) -> None:
     views = done.report["views"]
     report = done.report
     assert set(views["field_chosen"]) & set(views["field"]) == set()
@@ -202,7 +200,7 @@ def test_a_field_s_errors_are_reported_on_views_that_its_choice_has_not_seen(don
     assert tried[report["choice"]["chosen"]] != report["field"]["psnr_worst"]
 
 
-def test_bytes_per_gaussian_are_given_without_and_with_the_header(done: RunResult) -> None:
+def test_bytes_per_gaussian_are_given_with_and_without_the_header(done: RunResult) -> None:
     file = done.report["file"]
     members = len(read_gdf(done.gdf).region)
     assert file["bytes"] == done.gdf.stat().st_size
@@ -210,7 +208,7 @@ def test_bytes_per_gaussian_are_given_without_and_with_the_header(done: RunResul
     assert file["bytes_per_gaussian"] > done.report["field"]["bytes_per_gaussian"]
 
 
-def test_every_view_is_kept_before_and_after(done: RunResult) -> None:
+def test_every_view_is_saved_before_and_after(done: RunResult) -> None:
     views = done.folder.root / "views"
     names = {path.name for path in (views / "original").glob("*.png")}
     assert len(names) == 10
@@ -221,16 +219,14 @@ def test_every_view_is_kept_before_and_after(done: RunResult) -> None:
         assert picture.width > 600
 
 
-def test_half_of_an_edit_is_solved_for_even_where_it_lies_on_a_straight_way(folder: Path) -> None:
-    """What bends both ways does so there as well."""
+def test_half_strength_is_solved_even_on_a_straight_path(folder: Path) -> None:
+    """Keep the half, because an S-shaped path also crosses the straight line there."""
     options = quick_options(folder, "straight", editor="grade:exposure=0.2", stages=0, views=6)
     strengths = train(options, quiet=True).report["effort"]["strengths"]
     assert strengths == [0.5, 1.0]
 
 
-def test_the_kept_pictures_of_a_run_are_a_folder_that_can_be_trained_from(
-    folder: Path, done: RunResult
-) -> None:
+def test_saved_edited_views_can_be_trained_from(folder: Path, done: RunResult) -> None:
     options = quick_options(
         folder, "again", editor=f"folder:{done.folder.root / 'views' / 'edited'}", kind="color", **WHOLE
     )
@@ -240,13 +236,13 @@ def test_the_kept_pictures_of_a_run_are_a_folder_that_can_be_trained_from(
     assert set(result.report["between"]) == given, "pinned where they were given"
 
 
-def test_the_same_seed_gives_the_same_bits(folder: Path, brief: RunResult) -> None:
+def test_same_seed_gives_the_same_bits(folder: Path, brief: RunResult) -> None:
     again = train(quick_options(folder, "twice", steps=16, stages=2, field="lossless", **WHOLE), quiet=True)
     first, second = (load_trajectory(run.folder.trajectory)[0].offsets for run in (brief, again))
     assert torch.equal(first, second)
 
 
-def test_refitting_changes_the_field_and_nothing_that_was_optimized(brief: RunResult, tmp_path: Path) -> None:
+def test_refit_changes_only_the_field(brief: RunResult, tmp_path: Path) -> None:
     before = brief.folder.trajectory.read_bytes()
     options = FitOptions(copy_of(brief, tmp_path))
     again = refit(with_values(options, field="separable", threads=1), quiet=True)
@@ -261,7 +257,7 @@ def test_refitting_changes_the_field_and_nothing_that_was_optimized(brief: RunRe
         assert again.report["time"][stage] == brief.report["time"][stage]
 
 
-def test_an_interrupted_run_leaves_the_earlier_edit_whole(
+def test_interrupted_run_leaves_the_earlier_edit_intact(
     folder: Path, brief: RunResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root = copy_of(brief, tmp_path)
@@ -278,7 +274,7 @@ def test_an_interrupted_run_leaves_the_earlier_edit_whole(
     assert not [path for path in root.rglob("*") if path.name.startswith(".")]
 
 
-def test_a_folder_with_other_things_or_another_edit_in_it_is_refused_untouched(
+def test_folder_with_other_files_or_another_edit_is_refused(
     folder: Path, done: RunResult, tmp_path: Path
 ) -> None:
     (tmp_path / "thesis.txt").write_text("important")
@@ -310,28 +306,30 @@ def test_a_folder_with_other_things_or_another_edit_in_it_is_refused_untouched(
         "--out r",
     ],
 )
-def test_bad_input_is_one_line_and_leaves_no_edit(folder: Path, tmp_path: Path, arguments: str) -> None:
+def test_bad_input_is_a_one_line_error_and_leaves_no_edit(
+    folder: Path, tmp_path: Path, arguments: str
+) -> None:
     words = arguments.format(scene=folder / "scene.ply", labels=folder / "labels.npy").split()
     words = [str(tmp_path / "r") if word == "r" else word for word in words]
-    with pytest.raises(ProgdfError, match=r"; |must be between") as told:
+    with pytest.raises(ProgdfError, match=r"; |must be between") as caught:
         cli.train(words)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(caught.value)
     assert not list(tmp_path.rglob("*.gdf"))
 
 
-def test_an_edit_that_changes_nothing_is_told_before_training(folder: Path, done: RunResult) -> None:
+def test_edit_without_effect_is_reported_before_training(folder: Path, done: RunResult) -> None:
     originals = done.folder.root / "views" / "original"
     same = {"editor": f"folder:{originals}", "cameras": done.folder.cameras}
     with pytest.raises(ProgdfError, match="changes none of the views; "):
         train(quick_options(folder, "nothing", **same, **WHOLE), quiet=True)
 
 
-def test_fitting_what_is_no_run_is_one_line(tmp_path: Path) -> None:
+def test_fit_of_a_folder_without_a_run_is_a_one_line_error(tmp_path: Path) -> None:
     with pytest.raises(ProgdfError, match="progdf train"):
         cli.fit([str(tmp_path)])
 
 
-def test_the_command_line_sets_every_option_it_is_given(folder: Path) -> None:
+def test_command_line_sets_every_given_option(folder: Path) -> None:
     words = (
         f"{folder / 'scene.ply'} --out r --region all --editor night --quick --seed 7 --slider even".split()
     )
@@ -340,7 +338,7 @@ def test_the_command_line_sets_every_option_it_is_given(folder: Path) -> None:
     assert (plan.optimize.steps, plan.views.views) == (240, 12)
 
 
-def test_one_member_in_one_view_is_enough(folder: Path) -> None:
+def test_single_member_is_enough(folder: Path) -> None:
     labels = np.zeros(1500, dtype=np.uint8)
     scene = load_ply(folder / "scene.ply")
     labels[int(scene.means[:, 1].argmax())] = 1

@@ -1,4 +1,4 @@
-"""What goes wrong around a run (disk, folder, files, numbers) is one line, and what was saved goes on."""
+"""Failures around a run (disk, folder, files, numbers): one-line errors, and saved work resumes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ pytest_plugins = ["tests.helpers.stopped_runs"]
 pytestmark = pytest.mark.usefixtures("elsewhere")
 
 
-def test_an_edited_view_that_vanishes_while_training_is_one_line_and_nothing_is_lost(
+def test_edited_view_lost_while_training_is_one_line_and_resumes(
     bear_folder: Path, uninterrupted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def lose_all() -> None:
@@ -46,7 +46,7 @@ def test_an_edited_view_that_vanishes_while_training_is_one_line_and_nothing_is_
 
 
 @pytest.mark.usefixtures("stopped")
-def test_a_full_disk_is_one_line_and_what_was_saved_before_goes_on(
+def test_full_disk_is_one_line_and_saved_work_resumes(
     bear_folder: Path,
     uninterrupted: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -63,7 +63,7 @@ def test_a_full_disk_is_one_line_and_what_was_saved_before_goes_on(
 
 
 @pytest.mark.parametrize("size", [0, 2_000])
-def test_a_disk_that_is_full_from_the_start_is_one_line(
+def test_disk_full_from_the_start_is_a_one_line_error(
     bear_folder: Path, size: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with files_up_to(size):
@@ -71,7 +71,7 @@ def test_a_disk_that_is_full_from_the_start_is_one_line(
     assert "the disk of run is full; " in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_a_loss_that_is_not_finite_keeps_the_state_before_it(
+def test_nonfinite_loss_keeps_the_state_before_it(
     bear_folder: Path, uninterrupted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls = 0
@@ -91,7 +91,7 @@ def test_a_loss_that_is_not_finite_keeps_the_state_before_it(
     gone_on(bear_folder, uninterrupted)
 
 
-def test_a_run_folder_that_is_removed_while_training_is_one_line(
+def test_run_folder_removed_while_training_is_a_one_line_error(
     bear_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("trainer.store.state.SAVE_EVERY", 0.0)
@@ -100,9 +100,7 @@ def test_a_run_folder_that_is_removed_while_training_is_one_line(
         train(small_run(bear_folder), quiet=True)
 
 
-def test_a_folder_that_cannot_be_written_is_one_line(
-    bear_folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unwritable_folder_is_a_one_line_error(bear_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     OUT.mkdir()
     refuse_temporary_files(monkeypatch, errno.EROFS)
     with pytest.raises(ProgdfError, match=r"run.log\.txt cannot be written \(Read-only file system\); "):
@@ -119,7 +117,7 @@ def test_two_runs_in_one_folder_are_refused(bear_folder: Path) -> None:
 
 @pytest.mark.usefixtures("stopped")
 def test_values_of_another_type_are_a_damaged_state(bear_folder: Path) -> None:
-    """Signed as if they had been saved."""
+    """Sign the changed values as if the run had saved them."""
     path = OUT / "state" / "training.safetensors"
     mapped, metadata = read_tensors(path)
     tensors = {name: tensor.clone() for name, tensor in mapped.items()}
@@ -132,14 +130,14 @@ def test_values_of_another_type_are_a_damaged_state(bear_folder: Path) -> None:
 
 @pytest.mark.parametrize("part", ["run.json", "training.safetensors", "recordings/000001.safetensors"])
 @pytest.mark.usefixtures("stopped")
-def test_a_damaged_state_is_one_line(bear_folder: Path, part: str) -> None:
+def test_damaged_state_is_a_one_line_error(bear_folder: Path, part: str) -> None:
     path = OUT / "state" / part
     path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(ProgdfError, match=r"is damaged .*; delete .*state and train again"):
         train(replace(small_run(bear_folder), resume=True), quiet=True)
 
 
-def test_a_recording_with_a_map_of_another_degree_is_no_recording_of_the_run(tmp_path: Path) -> None:
+def test_recording_with_a_map_of_another_degree_is_refused(tmp_path: Path) -> None:
     offsets = torch.zeros(3, 12)
     no_mask = torch.zeros(3, 0, 3)
     models = [Model(degree, 1.0, no_mask, None, 0.1, [], 1, 1) for degree in (1, 2)]
@@ -167,10 +165,10 @@ def test_a_recording_with_a_map_of_another_degree_is_no_recording_of_the_run(tmp
         ("pictures:A.png", {"kind": "geometry"}),
     ],
 )
-def test_an_option_that_means_nothing_to_the_editor_is_one_line(
+def test_option_that_does_not_apply_to_the_editor_is_refused(
     tmp_path: Path, editor: str, more: dict[str, object]
 ) -> None:
-    with pytest.raises(ProgdfError, match=r"; it is for|does not apply to|must be ") as told:
+    with pytest.raises(ProgdfError, match=r"; it is for|does not apply to|must be ") as caught:
         train(quick_options(tmp_path, editor=editor, **more), quiet=True)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(caught.value)
     assert not (tmp_path / "run").exists()

@@ -1,4 +1,4 @@
-"""The unit of length means nothing: a scene a millimetre wide trains to the edit of one of kilometres."""
+"""Independence of the unit of length: millimeter and kilometer scenes train to the same edit."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def scaled(scene: Gaussians, factor: float) -> Gaussians:
 
 
 @pytest.mark.parametrize("factor", FACTORS)
-def test_a_scene_of_any_size_is_trained_on_the_same_pictures(factor: float) -> None:
+def test_scene_of_any_size_is_trained_on_the_same_pictures(factor: float) -> None:
     demo = bear(1500)
     members = demo.members("scarf")
     region = Region("scarf", members, torch.zeros(1500).index_fill(0, members, 1.0))
@@ -53,7 +53,7 @@ def test_a_scene_of_any_size_is_trained_on_the_same_pictures(factor: float) -> N
 
 
 def trained(folder: Path, scene: Gaussians, members: Tensor, editor: str, kind: Kind) -> Gaussians:
-    """The scene under a whole edit, trained in a hurry."""
+    """Return the scene with a full edit from a short training run."""
     folder.mkdir()
     save_ply(folder / "scene.ply", scene)
     labels = torch.zeros(len(scene), dtype=torch.uint8).index_fill(0, members, 1)
@@ -77,7 +77,7 @@ def trained(folder: Path, scene: Gaussians, members: Tensor, editor: str, kind: 
     [("recolor:#3060d0", "color"), ("darken:0.6", "style")],
 )
 @pytest.mark.slow
-def test_a_scaled_scene_trains_to_the_same_picture(tmp_path: Path, editor: str, kind: Kind) -> None:
+def test_scaled_scene_trains_to_the_same_picture(tmp_path: Path, editor: str, kind: Kind) -> None:
     demo = bear(1500)
     members = demo.members("scarf")
     region = Region("scarf", members, torch.zeros(1500).index_fill(0, members, 1.0))
@@ -91,10 +91,10 @@ def test_a_scaled_scene_trains_to_the_same_picture(tmp_path: Path, editor: str, 
             change = finished[1.0] - render_view(scene, camera, torch.ones(3))
             assert float(change.abs().max()) > 0.2, "the edit shows"
     for factor in FACTORS:
-        # each step of Adam divides by the size of the gradient, so that rounding grows
+        # each step of Adam divides by the size of the gradient, which amplifies rounding
         assert float((finished[factor] - finished[1.0]).abs().mean()) < 2e-3
 
 
-def test_the_near_plane_comes_nearer_with_smaller_scenes_only() -> None:
+def test_near_plane_is_closer_only_for_smaller_scenes() -> None:
     assert near_plane(1e-3) == pytest.approx(1e-5)
     assert near_plane(1.0) == near_plane(1e4) == NEAR

@@ -1,4 +1,4 @@
-"""Changed pictures whose paint is finer than the Gaussians: what recoloring leaves becomes discs."""
+"""Changed pictures with paint finer than the Gaussians: the remainder of recoloring becomes discs."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def lettered(place: Path) -> RunResult:
     return train(options(place, save(place, "letters", image), "lettered"), quiet=True)
 
 
-def test_letters_on_a_picture_are_as_sharp_as_they_were_painted(place: Path, lettered: RunResult) -> None:
+def test_letters_on_a_picture_are_as_sharp_as_painted(place: Path, lettered: RunResult) -> None:
     scene = load_ply(place / "wall.ply")
     gdf = load_gdf(lettered.gdf, scene)
     assert gdf.added is not None
@@ -67,12 +67,12 @@ def test_letters_on_a_picture_are_as_sharp_as_they_were_painted(place: Path, let
     assert lettered.report["edit"]["psnr_to_views"] > 30.0
 
 
-def test_a_run_with_discs_is_measured_as_it_is_shipped(lettered: RunResult) -> None:
+def test_run_with_discs_is_measured_as_shipped(lettered: RunResult) -> None:
     (found,) = evaluate(EvaluateOptions(lettered.folder.root))
     assert found.curves["slider"].psnr[-1] == pytest.approx(lettered.report["edit"]["psnr_to_views"], abs=0.1)
 
 
-def test_a_run_that_is_stopped_at_its_discs_goes_on_to_the_same_bits(
+def test_run_stopped_at_its_discs_resumes_to_the_same_bits(
     place: Path, lettered: RunResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def stop(*_: object) -> None:
@@ -89,10 +89,10 @@ def test_a_run_that_is_stopped_at_its_discs_goes_on_to_the_same_bits(
 
 
 @pytest.mark.parametrize("fills", [True, False])
-def test_below_discs_a_fill_stays_and_what_lies_between_letters_goes_back(
+def test_fill_below_discs_stays_and_gaps_between_letters_are_restored(
     place: Path, fills: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What is better beside the sharp paint in its own picture; from aside one sees what lies below it."""
+    """Keep the base that matches the picture beside the sharp paint; the sides show it below the paint."""
     bases = list[Gaussians]()
 
     def choose(base: Gaussians, *rest: Any) -> DiscLayout:
@@ -116,7 +116,7 @@ def test_below_discs_a_fill_stays_and_what_lies_between_letters_goes_back(
     assert (float((bases[0].sh0 - recolored.sh0).abs().max()) < 1e-4) is fills
 
 
-def test_a_change_that_recoloring_meets_adds_nothing(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_change_reproduced_by_recoloring_adds_nothing(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = load_ply(place / "wall.ply")
     colors = scene.sh0 - 0.5 * torch.exp(-4 * scene.means.square().sum(dim=1, keepdim=True))
     image = save(place, "shade", picture(replace(scene, sh0=colors)))
@@ -127,7 +127,9 @@ def test_a_change_that_recoloring_meets_adds_nothing(place: Path, monkeypatch: p
     assert done.gdf.read_bytes() == plain.gdf.read_bytes()
 
 
-def test_discs_that_lose_from_the_sides_are_not_added(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_discs_that_are_worse_from_the_sides_are_not_added(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def lift(scene: Gaussians, paint: object, *rest: object) -> object:
         discs = place_discs(scene, paint, *rest)  # type: ignore[arg-type]
         toward = 0.5 * (CAMERA.position - discs.added.means)
