@@ -170,7 +170,13 @@ VARIANTS = (
     _patched("no-damping", "barely visible members not damped", _EPSILON, 0.0, DESCENT),
     _other("no-interpolation", "a stage's own target from its first step", "target_ramp", False, DESCENT),
     _patched("no-slowing", "no short steps at a stage's end", f"{_PGS}._decay", lambda *_: 1.0, DESCENT),
-    _patched("no-sizing", "step size independent of a stage's path length", f"{_PGS}.REACH", 0.0, DESCENT),
+    _patched(
+        "no-sizing",
+        "step size independent of a stage's path length",
+        f"{_PGS}.REFERENCE_CHANGE",
+        0.0,
+        DESCENT,
+    ),
     _other("no-running-mean", "iterates recorded without averaging", "ema", False, DESCENT),
     Variant(
         "descent-plain-clamps",

@@ -30,7 +30,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_training_benchmark_reports_time_and_held_out_error(small: None, tmp_path: Path) -> None:
     (result,) = training.tables(plot=tmp_path / "training.png")
     ((edit, arguments, at_1, worst, between, processor, wall, size),) = result.rows
-    assert (edit, arguments) == ("bear, stripes:#20a040", f"`{training.WAYS[0]}`")
+    assert (edit, arguments) == ("bear, stripes:#20a040", f"`{training.OPTION_SETS[0]}`")
     assert 20.0 < float(worst) <= min(map(float, between.split())) + 0.05
     assert 20.0 < float(at_1) < 70.0
     assert float(processor) >= 1

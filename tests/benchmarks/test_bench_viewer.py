@@ -45,7 +45,7 @@ def test_slider_table_has_a_row_with_error_for_each_renderer() -> None:
     ctx = headless_context()
     results = bench.rows(ctx, bear(600).gaussians, SliderCase(100, True), steps=2, size=SIZE)
     ctx.release()
-    assert [result.way for result in results] == list(bench.WAYS)
+    assert [result.way for result in results] == list(bench.RENDERERS)
     for result in results:
         assert len(result.events_ms) == len(result.parts) == 2
         assert min(result.processor_ms) > 0.0
@@ -65,7 +65,7 @@ def test_turning_benchmark_draws_a_new_correct_frame_per_step(tmp_path: Path) ->
     ctx = headless_context()
     turnings = bench_frames.measure_turning(ctx, path, steps=2, size=SIZE)
     ctx.release()
-    assert [turning.way for turning in turnings] == list(bench_frames.WAYS)
+    assert [turning.way for turning in turnings] == list(bench_frames.RENDERERS)
     for turning in turnings:
         assert len(turning.frames_ms) == len(turning.draws_ms) == len(turning.coarse_ms) == 2
         assert min(turning.draws_ms) > 0.0, "every frame is a new picture"

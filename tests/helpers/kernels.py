@@ -29,7 +29,7 @@ from progdf.compose.layers import Layer
 from progdf.rasterize import activate, alpha_weights
 from progdf.rasterize.engines import color_map
 from progdf.rasterize.cpu.pyramid import Pyramid
-from progdf.rasterize.screen import lines_behind
+from progdf.rasterize.screen import draw_lines_behind
 from tests.helpers.edits import curved_field, edit_of, some_rows
 from tests.helpers.scenes import ball, front_camera
 
@@ -42,7 +42,7 @@ pyramid.simplify(camera, 10)
 pyramid.refresh(rows.numpy(), True)
 picture, left = torch.ones(camera.height, camera.width, 3), torch.ones(camera.height, camera.width)
 lines = numpy.zeros((0, 14), numpy.float32)
-with lines_behind(picture.numpy(), left.numpy(), lines, 0.5):
+with draw_lines_behind(picture.numpy(), left.numpy(), lines, 0.5):
     pass
 weighed = color_map(activate(scene), camera, (0, 0, camera.width, camera.height), rows)
 weighed.gradient(weighed.picture(torch.ones(20, 3)))

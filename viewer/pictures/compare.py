@@ -228,7 +228,7 @@ class Comparer:
             try:
                 original = other.draw(its_view, framebuffer, size, pixels)
             finally:
-                framebuffer.scissor = None  # its annotation lacks None
+                framebuffer.scissor = None  # type: ignore[assignment]  # its annotation lacks None
         return _add_timings(edited, original)
 
     def _draw_difference(

@@ -232,7 +232,7 @@ def test_precomputed_surface_selects_the_same(hand: Rig, monkeypatch: pytest.Mon
     hand.key("N")
     found = []
     for many in (10**9, 1):
-        monkeypatch.setattr(pointer, "MANY", many)
+        monkeypatch.setattr(pointer, "PREPARE_MIN_GAUSSIANS", many)
         hand.frame()
         hand.drag((100, 150), (300, 400))
         found.append(selected(hand).copy())
