@@ -22,7 +22,7 @@ from progdf.errors import ProgdfError
 from progdf.field import BakedField
 from progdf.field.baked import interpolate_at
 from progdf.field.choose import sample_strengths
-from trainer.editors import PER_VIEW
+from trainer.editors import editor_row
 from trainer.evaluate.opened import FADE, KEYFRAMES, SLIDER, OpenedRun, open_run
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.optimize.losses import perceptual_loss
@@ -158,7 +158,7 @@ def worst_places(run: OpenedRun) -> dict[str, str]:
 
 def _editor_pictures(run: OpenedRun, views: Sequence[View], strengths: Sequence[float]) -> Pictures:
     """Return the editor's pictures, see `editor_pictures`; none if it edits views one by one."""
-    if run.run.record.plan.editor.family in PER_VIEW:
+    if editor_row(run.run.record.plan.editor).per_view:
         return {}
     return editor_pictures(run.run, run.setup.views, views, strengths)
 

@@ -109,6 +109,11 @@ class EditorOptions:
         """Kind of editor, the part before the colon."""
         return self.editor.partition(":")[0]
 
+    @property
+    def text(self) -> str:
+        """Text of the editor, the part after the colon."""
+        return self.editor.partition(":")[2]
+
 
 @dataclass(frozen=True)
 class TrainingViewOptions:

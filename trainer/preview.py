@@ -38,7 +38,7 @@ from progdf.gdf.file import Gdf, save_gdf
 from progdf.io.images import write_image
 from progdf.region import Region, whole_scene
 from progdf.scene.regions import parse_region
-from trainer.editors import COLOR_FUNCTIONS, check_new_editor, make_editor
+from trainer.editors import check_new_editor, editor_row, make_editor
 from trainer.editors.adapters import models_here
 from trainer.editors.base import EditorInput, ImageEditor
 from trainer.editors.instruct import InstructEditor, instruct
@@ -119,7 +119,7 @@ class Previewer:
         """
         options = EditorOptions(request.editor, model=request.model)
         check_new_editor(options)
-        if options.family not in COLOR_FUNCTIONS:
+        if not editor_row(options).color_function:
             return None
         views = self._views(request)
         return None if views is None else draft_grade(views, options, options.family)
@@ -170,14 +170,13 @@ class Previewer:
 
     def follows(self, request: PreviewRequest) -> bool:
         """Return True if the editor paints a prompt with a model that can follow a picture."""
-        painted = EditorOptions(request.editor).family == "instruct"
-        return painted and self._painter(request).references > 0
+        paints = editor_row(EditorOptions(request.editor)).model is not None
+        return paints and self._painter(request).references > 0
 
     def _painter(self, request: PreviewRequest) -> InstructEditor:
         options = EditorOptions(request.editor, model=request.model)
-        prompt = options.editor.partition(":")[2]
         region = whole_scene(self.scene)
-        return instruct(EditorInput(prompt, self.scene, region, (), options))
+        return instruct(EditorInput(options.text, self.scene, region, (), options))
 
     def _find_region(self, spec: str) -> Region:
         request = RegionRequest(

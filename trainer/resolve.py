@@ -17,14 +17,12 @@ import torch
 
 from progdf.errors import ProgdfError
 from progdf.io.atomic import is_portable
-from progdf.io.cameras import kind_of_cameras
 from progdf.metrics.image import NO_DIFFERENCE
 from progdf.rasterize import set_threads
 from progdf.rasterize.engines import choose_engine
-from trainer.editors import COSTLY_STRENGTHS, EXTERNAL, PER_VIEW
-from trainer.editors.adapters import default_model
+from trainer.editors import EDITORS, editor_row
 from trainer.editors.instruct import parse_guidance
-from trainer.editors.pictures import picture_paths, strengths_of
+from trainer.editors.pictures import strengths_of
 from trainer.options import EditKind
 
 from .options import (
@@ -66,9 +64,6 @@ _MAX_STEPS = 1_000_000  # hours on any machine
 _MAX_NAME_BYTES = 255  # accepted by every file system
 _MIN_VIEW_PX = 32  # longer side of a view
 
-INSTRUCT_SIZE = 512
-"""Longer side of views painted by a diffusion model, downscaled from the model's own size."""
-
 
 def resolve(options: TrainOptions) -> TrainOptions:
     """Return the options, checked and with dependent values filled in.
@@ -80,25 +75,26 @@ def resolve(options: TrainOptions) -> TrainOptions:
     quick = options.quick
     optimize = options.optimize
     views = options.views.views
-    family, _, argument = options.editor.editor.partition(":")
+    row = editor_row(options.editor)
+    text = options.editor.text
     stages = min(optimize.stages, QUICK_STAGES) if quick else optimize.stages
     texts = options.texts
-    model = options.editor.model or (default_model() if family == "instruct" else "")
-    pictures = picture_paths(argument) if family == "pictures" else ()
+    model = options.editor.model
+    if not model and row.model is not None:
+        model = row.model()
+    pictures = row.files(text) if row.sets_views else ()
     # if only the full edit is given, the trainer chooses the path to it
-    has_free_path = family not in EXTERNAL or (
-        pictures and all(len(strengths_of(path)) == 1 for path in pictures)
-    )
+    has_free_path = not row.external or (pictures and all(len(strengths_of(path)) == 1 for path in pictures))
     return replace(
         options,
         name=check_name(options.name or options.out.resolve().name),
         editor=replace(options.editor, seed=options.seed, model=model),
         views=replace(
             options.views,
-            cameras=options.views.cameras or (_own_cameras(Path(argument)) if family == "folder" else None),
+            cameras=options.views.cameras or row.cameras(text),
             views=min(views or QUICK_VIEWS, QUICK_VIEWS) if quick else views,
-            dense=not quick and family not in PER_VIEW and options.optimize.color_solver,
-            image_size=options.views.image_size or (INSTRUCT_SIZE if family == "instruct" else 0),
+            dense=not quick and not row.per_view and options.optimize.color_solver,
+            image_size=options.views.image_size or row.image_size,
             pictures=pictures,
             scene=options.scene,
         ),
@@ -113,13 +109,6 @@ def resolve(options: TrainOptions) -> TrainOptions:
         field=replace(options.field, draft=quick, seed=options.seed),
         texts=replace(texts, asked=bool(texts.text_before or texts.text_after)),
     )
-
-
-def _own_cameras(folder: Path) -> Path | None:
-    """Return the cameras.json of a run or `progdf views` beside the pictures in a folder; None if there is
-    none."""
-    candidates = (place / "cameras.json" for place in (folder, *folder.absolute().parents[:2]))
-    return next((path for path in candidates if path.is_file() and kind_of_cameras(path) == "own"), None)
 
 
 def recorded_options(options: TrainOptions) -> TrainOptions:
@@ -151,11 +140,11 @@ def resolve_kind(
         and not optimize.perceptual_weight
         and not optimize.as_printed
     )
-    costly = options.editor.family in COSTLY_STRENGTHS
     weight = optimize.perceptual_weight
     stages = optimize.stages
     if not stages:
-        stages = (COSTLY_STAGES if costly else STAGES)[kind]
+        stages_by_kind = COSTLY_STAGES if editor_row(options.editor).slow_strengths else STAGES
+        stages = stages_by_kind[kind]
         if optimize.steps < STAGE_STEPS * stages:
             stages = min(stages, QUICK_STAGES)
     return replace(
@@ -233,31 +222,24 @@ def check_name(name: str) -> str:
 
 def _check_editor_options(editor: EditorOptions, optimize: OptimizeOptions) -> None:
     """Reject options that do not apply to the editor."""
-    if editor.family == "pictures" and optimize.kind not in ("auto", "color"):
+    row = editor_row(editor)
+    if row.sets_views and optimize.kind not in ("auto", "color"):
         raise ProgdfError(
             f"--kind {optimize.kind} does not apply to pictures: few views do not tell how deep a part lies; "
             "give more as folder:DIR, of views that --cameras has"
         )
-    if editor.editor == "remove" and editor.fill == "picture":
+    if row.run == "removed" and not editor.text and editor.fill == "picture":
         raise ProgdfError("--fill picture needs a picture of what was behind; write --editor remove:A.png")
-    if editor.family == "pictures" and editor.removal == "never" and editor.fill is not None:
+    if optimize.grow and not row.per_view:
+        kinds = [kind for kind, other in EDITORS.items() if other.per_view]
+        raise ProgdfError(f"--grow does not apply to {editor.family}; it is for {' and '.join(kinds)}")
+    for name in dict.fromkeys(name for other in EDITORS.values() for name in other.options):
+        if getattr(editor, name) != getattr(EditorOptions, name) and name not in row.options:
+            kinds = [kind for kind, other in EDITORS.items() if name in other.options]
+            option = "--" + name.replace("_", "-")
+            raise ProgdfError(f"{option} does not apply to {editor.family}; it is for {' and '.join(kinds)}")
+    if editor.removal == "never" and editor.fill is not None:
         raise ProgdfError("--fill closes holes of a removal; leave out --removal never, or --fill")
-    instruct_options = ("model", "guidance", "edit_steps", "anchor", "quantize", "device")
-    if optimize.grow and editor.family not in PER_VIEW:
-        raise ProgdfError(f"--grow does not apply to {editor.family}; it is for {' and '.join(PER_VIEW)}")
-    for names, kinds in (
-        (instruct_options, ("instruct",)),
-        (("edit_size",), ("style", "instruct")),
-        (("fill",), ("remove", "pictures")),
-        (("removal",), ("pictures",)),
-        (("at", "camera"), ("decal",)),
-    ):
-        for name in names:
-            if getattr(editor, name) != getattr(EditorOptions, name) and editor.family not in kinds:
-                option = "--" + name.replace("_", "-")
-                raise ProgdfError(
-                    f"{option} does not apply to {editor.family}; it is for {' and '.join(kinds)}"
-                )
 
 
 def check_field_options(options: FieldOptions, preset: Preset = "default") -> None:

@@ -26,7 +26,6 @@ from progdf.threads import map_threads, threads
 
 from .editors.base import ImageEditor
 from .editors.pictures import picture_cameras
-from .editors.procedural import ColorEditor, StripesEditor
 from .options import COLOR_VIEWS, VIEWS, Kind, TrainingViewOptions
 from .store.progress import Advance
 from .store.run_folder import LazySequence, RunFolder, add_pictures, from_bytes, stored_pictures, to_bytes
@@ -274,7 +273,7 @@ def confines_edit(editor: ImageEditor, kind: Kind) -> bool:
 
 
 def edit_views(
-    editor: ImageEditor,
+    is_parallel: bool,
     views: Sequence[View],
     strengths: Sequence[float],
     folder: RunFolder,
@@ -285,7 +284,7 @@ def edit_views(
     """Edit every view at every strength. Training uses the 8-bit pictures saved to disk.
 
     Args:
-        editor: see `ImageEditor`
+        is_parallel: see `EditorRow.is_parallel`
         views: all views
         strengths: requested strengths
         folder: folder of the pictures
@@ -304,7 +303,6 @@ def edit_views(
 
     add_pictures(folder.views, [folder.view("edited", v.camera.name, s) for s in strengths for v in views])
     edited: dict[float, list[Tensor]] = {strength: [] for strength in strengths}
-    is_parallel = isinstance(editor, ColorEditor | StripesEditor)  # others run a network, or use all cores
     groups = [strengths] if is_parallel and strengths else [[strength] for strength in strengths]
     requests = [[(strength, i) for strength in group] for group in groups for i in range(len(views))]
     with ThreadPoolExecutor(threads()) as pool:

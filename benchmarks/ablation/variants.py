@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from trainer.editors import COSTLY_STRENGTHS, EXTERNAL
+from trainer.editors import editor_row
 from trainer.optimize import losses
 from trainer.optimize.groups import GROUP_STEPS
 from trainer.optimize.retime import resolve_slider
@@ -241,7 +241,8 @@ def differing_variants(plan: TrainOptions, kind: EditKind, stages: int, sh_degre
     """
     staged = ("one-target", "descent-one-target", EQUAL, "slider-stages", "slider-even", "no-interpolation")
     even = plan.optimize.slider == "even"
-    equalized = even and plan.editor.family not in (*EXTERNAL, *COSTLY_STRENGTHS)
+    row = editor_row(plan.editor)
+    equalized = even and not row.external and not row.slow_strengths
     idle = {
         *(() if stages > 1 else staged),
         *(() if equalized else (EQUAL,)),

@@ -27,6 +27,7 @@ from typing import Any, BinaryIO, Protocol, cast
 from progdf.errors import ProgdfError
 from progdf.io.atomic import LOCK, LockedError, hold_lock, make_folder
 from progdf.terminal import escape_text, file_size, format_count, format_duration, print_line
+from trainer.editors import editor_row
 from trainer.options import BatchOptions, check_ranges
 from trainer.resolve import count_threads
 from trainer.run.resume import find_run
@@ -320,7 +321,8 @@ def run_jobs(
 
 def train_task(job: BatchJob, memory: int = 0) -> Task:
     """Return a job as a task; memory in bytes, 0: unknown."""
-    gpu = job.options.editor.family == "instruct" or "text:" in job.options.region.region
+    runs_model = editor_row(job.options.editor).model is not None
+    gpu = runs_model or "text:" in job.options.region.region
     return Task(run_job, job, job.key, count_threads(job.options.threads), memory, gpu)
 
 

@@ -1,13 +1,13 @@
 """Image editors: functions from a view to its edited view.
 
-Each family of editors has one module, one line in `EDITORS` and one test module.
+Each editor has one factory and one row in `EDITORS`, which answers every question about it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple
+from pathlib import Path
 
 from progdf.color.edits import parse_grade
 from progdf.errors import ProgdfError
@@ -16,53 +16,125 @@ from progdf.region import Region
 from trainer.options import EditorOptions
 from trainer.views.view import RegionThumbnail, View
 
-from .base import EditorInput, ImageEditor
+from .adapters import default_model
+from .base import EditorInput, EditorRow, ImageEditor
 from .decal import check_decal, decal
-from .instruct import check_instruct, instruct
-from .pictures import folder, folder_of, photograph_folders, photographs, picture_paths, pictures
+from .instruct import IMAGE_SIZE, check_instruct, instruct
+from .pictures import (
+    folder,
+    folder_cameras,
+    folder_of,
+    photograph_folders,
+    photographs,
+    photographs_note,
+    picture_paths,
+    pictures,
+    removal_pictures,
+)
 from .procedural import darken, grade, night, paint_of, recolor, remove, stops_of, stripes, tint
 from .style import check_style, style
 
 
-class Family(NamedTuple):
-    """One kind of editor."""
+def _text_check(check: Callable[[str], object]) -> Callable[[str, EditorOptions], object]:
+    """Return a check of the text alone as a check of text and options."""
+    return lambda what, options: check(what)
 
-    make: Callable[[EditorInput], ImageEditor]
-    example: str  # an example of its option value
-    check: Callable[[str], object] | None = None  # checks the text after the colon without reading the scene
 
+_check_paint = _text_check(paint_of)
 
 EDITORS = {
-    "recolor": Family(recolor, "recolor:#3060d0", paint_of),
-    "tint": Family(tint, "tint:#d4af37", paint_of),
-    "stripes": Family(stripes, "stripes:#20a040", paint_of),
-    "darken": Family(darken, "darken:0.7", partial(stops_of, editor="darken")),
-    "night": Family(night, "night", partial(stops_of, editor="night")),
-    "grade": Family(grade, "grade:exposure=0.7", parse_grade),
-    "folder": Family(folder, "folder:DIR", folder_of),
-    "photographs": Family(photographs, "photographs:EDITED,ORIGINALS", photograph_folders),
-    "pictures": Family(pictures, "pictures:A.png,B.png", picture_paths),
-    "decal": Family(decal, "decal:LOGO.png"),
-    "style": Family(style, "style:14", check_style),
-    "instruct": Family(instruct, 'instruct:"turn him into Batman"'),
-    "remove": Family(remove, "remove", lambda what: picture_paths(what) if what else ()),
+    "recolor": EditorRow(recolor, "recolor:#3060d0", _check_paint, color_function=True, is_parallel=True),
+    "tint": EditorRow(tint, "tint:#d4af37", _check_paint, color_function=True, is_parallel=True),
+    "stripes": EditorRow(stripes, "stripes:#20a040", _check_paint, is_parallel=True, paints_members=True),
+    "darken": EditorRow(
+        darken,
+        "darken:0.7",
+        _text_check(partial(stops_of, editor="darken")),
+        color_function=True,
+        is_parallel=True,
+    ),
+    "night": EditorRow(
+        night,
+        "night",
+        _text_check(partial(stops_of, editor="night")),
+        color_function=True,
+        is_parallel=True,
+    ),
+    "grade": EditorRow(
+        grade,
+        "grade:exposure=0.7",
+        _text_check(parse_grade),
+        color_function=True,
+        is_parallel=True,
+        is_manual=True,
+    ),
+    "folder": EditorRow(
+        folder,
+        "folder:DIR",
+        _text_check(folder_of),
+        per_view=True,
+        external=True,
+        knows_kind=False,
+        cameras=folder_cameras,
+        remedy="edit the views more consistently, or use --kind geometry if parts move",
+    ),
+    "photographs": EditorRow(
+        photographs,
+        "photographs:EDITED,ORIGINALS",
+        _text_check(photograph_folders),
+        per_view=True,
+        external=True,
+        knows_kind=False,
+        note=photographs_note,
+    ),
+    "pictures": EditorRow(
+        pictures,
+        "pictures:A.png,B.png",
+        _text_check(picture_paths),
+        external=True,
+        files=picture_paths,
+        sets_views=True,
+        options=("fill", "removal"),
+        run="trained or removed",
+    ),
+    "decal": EditorRow(
+        decal,
+        "decal:LOGO.png",
+        check_decal,
+        files=lambda what: (Path(what),),
+        options=("at", "camera"),
+        run="pasted",
+    ),
+    "style": EditorRow(
+        style,
+        "style:14",
+        _text_check(check_style),
+        per_view=True,
+        options=("edit_size",),
+        remedy="use a calmer style (14, 23, 20, 7)",
+    ),
+    "instruct": EditorRow(
+        instruct,
+        'instruct:"turn him into Batman"',
+        check_instruct,
+        per_view=True,
+        knows_kind=False,
+        slow_strengths=True,
+        model=default_model,
+        image_size=IMAGE_SIZE,
+        options=("model", "guidance", "edit_steps", "anchor", "quantize", "device", "edit_size"),
+        remedy="make the prompt more specific, or use --kind geometry if parts move",
+    ),
+    "remove": EditorRow(
+        remove,
+        "remove",
+        _text_check(removal_pictures),
+        files=removal_pictures,
+        options=("fill",),
+        run="removed",
+    ),
 }
-"""Editor families by kind."""
-
-PER_VIEW = ("folder", "photographs", "style", "instruct")
-"""Kinds that edit each view on its own. Nothing makes the views agree."""
-
-COLOR_FUNCTIONS = ("recolor", "tint", "darken", "night", "grade")
-"""Kinds that map each color to another color, independent of its position."""
-
-EXTERNAL = ("folder", "photographs", "pictures")
-"""Kinds whose pictures are made elsewhere. They exist only at the strengths that the user supplies."""
-
-KIND_UNKNOWN = ("folder", "photographs", "instruct")
-"""Kinds that cannot tell which attributes their pictures change."""
-
-COSTLY_STRENGTHS = ("instruct",)
-"""Kinds that run a model for every strength. Previews must not request their strengths."""
+"""The editors, one row each, by the word before the colon."""
 
 
 def check_editor(spec: str) -> tuple[str, str]:
@@ -73,9 +145,18 @@ def check_editor(spec: str) -> tuple[str, str]:
     """
     kind, _, what = spec.partition(":")
     if kind not in EDITORS:
-        examples = ", ".join(family.example for family in EDITORS.values())
+        examples = ", ".join(row.example for row in EDITORS.values())
         raise ProgdfError(f"unknown editor '{kind}'; use one of {examples}")
     return kind, what
+
+
+def editor_row(options: EditorOptions) -> EditorRow:
+    """Return the row of the editor that the options name.
+
+    Raises:
+        ProgdfError: the kind is unknown.
+    """
+    return EDITORS[check_editor(options.editor)[0]]
 
 
 def check_new_editor(options: EditorOptions) -> None:
@@ -86,14 +167,9 @@ def check_new_editor(options: EditorOptions) -> None:
     Raises:
         ProgdfError: the editor, its text or one of its options is invalid.
     """
-    kind, what = check_editor(options.editor)
-    if kind == "instruct":
-        check_instruct(what, options)
-    if kind == "decal":
-        check_decal(what, options)
-    check = EDITORS[kind].check
-    if check is not None:
-        check(what)
+    row = editor_row(options)
+    if row.check is not None:
+        row.check(options.text, options)
 
 
 def make_editor(
@@ -105,5 +181,5 @@ def make_editor(
     Raises:
         ProgdfError: the editor cannot be made.
     """
-    kind, what = check_editor(options.editor)
-    return EDITORS[kind].make(EditorInput(what, scene, region, views, options, glances))
+    row = editor_row(options)
+    return row.make(EditorInput(options.text, scene, region, views, options, glances))

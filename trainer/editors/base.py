@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from pathlib import Path
+from typing import Literal, Protocol
 
 from torch import Tensor
 
 from progdf.gaussians import Gaussians
 from progdf.region import Region
 from trainer.options import EditKind, EditorOptions
+from trainer.paint.discs import PaintedView
 from trainer.views.view import RegionThumbnail, View
 
 
@@ -52,3 +54,48 @@ class ImageEditor(Protocol):
     def edit(self, view: View, strength: float) -> Tensor:
         """Return the edited view. Strength 0 returns `view.image` bit for bit. -> [H,W,3] 0..1"""
         ...
+
+
+class PastingEditor(ImageEditor, Protocol):
+    """Editor that pastes paint onto the surface that one view shows. Its row has the run "pasted"."""
+
+    @property
+    def view(self) -> View:
+        """The view in which the paint is given."""
+        ...
+
+    @property
+    def paint(self) -> PaintedView:
+        """Target of that view."""
+        ...
+
+
+RunKind = Literal["trained", "pasted", "removed", "trained or removed"]
+"""Kinds of run. The content of the pictures decides "trained or removed"."""
+
+
+@dataclass(frozen=True)
+class EditorRow:
+    """Everything that the program knows about one editor."""
+
+    make: Callable[[EditorInput], ImageEditor]
+    example: str  # an example of its option value
+    # checks the text after the colon and the options before a new run, without reading the scene
+    check: Callable[[str, EditorOptions], object] | None = None
+    per_view: bool = False  # edits each view on its own, so nothing makes the views agree
+    external: bool = False  # pictures made elsewhere, which exist only at the supplied strengths
+    knows_kind: bool = True  # False if it cannot tell which attributes its pictures change
+    color_function: bool = False  # maps each color to another color, independent of its position
+    slow_strengths: bool = False  # runs a model for every strength, so previews must not request them
+    run: RunKind = "trained"
+    is_parallel: bool = False  # edits views in parallel threads; others run a network or use all cores
+    paints_members: bool = False  # its state per view has a color for every member
+    is_manual: bool = False  # set by eye, so a draft is kept whatever its error
+    model: Callable[[], str] | None = None  # returns the default of --model; None: no generative model
+    image_size: int = 0  # longer side of its views, pixels; 0 is the default
+    files: Callable[[str], tuple[Path, ...]] = lambda what: ()  # picture files that its text names
+    sets_views: bool = False  # the views of the run are those of its files
+    cameras: Callable[[str], Path | None] = lambda what: None  # cameras found beside its pictures
+    options: tuple[str, ...] = ()  # fields of `EditorOptions` that apply to it, besides the common ones
+    note: Callable[[str], str] = lambda what: ""  # warning before its views are edited; "" if none
+    remedy: str = "correct them"  # advice if its views disagree

@@ -32,6 +32,9 @@ from .base import EditorInput
 from .cache import PictureCache, Recipe
 from .mixed_steps import MixedSteps, network_steps
 
+IMAGE_SIZE = 512
+"""Longer side of the views, pixels, downscaled from the model's own size."""
+
 _BOX_MARGIN = 0.4  # share of the box's width and height that is added, half on each side
 
 

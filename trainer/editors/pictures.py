@@ -29,6 +29,7 @@ from progdf.color.edits import number_of, typical_color
 from progdf.color.oklab import Bend, bend_of, interpolate_colors
 from progdf.errors import ProgdfError
 from progdf.gaussians import ZERO, Gaussians, Origin
+from progdf.io.cameras import kind_of_cameras
 from progdf.io.images import picture_size, read_picture, saving_loss
 from progdf.io.picture_camera import find_picture_camera
 from progdf.io.picture_files import PictureFolder, find_picture, name_key, split_path
@@ -146,6 +147,11 @@ def picture_paths(what: str) -> tuple[Path, ...]:
             "give more as folder:DIR, of views that --cameras has"
         )
     return paths
+
+
+def removal_pictures(what: str) -> tuple[Path, ...]:
+    """Return the paths of `remove:A.png[,B.png…]`, none for `remove`. Raises as `picture_paths`."""
+    return picture_paths(what) if what else ()
 
 
 def strengths_of(path: Path) -> dict[float, Path]:
@@ -355,16 +361,6 @@ class FolderEditor:
     # replace the views.
     originals: PictureFolder | None = None
 
-    @property
-    def note(self) -> str | None:
-        """Warning to show before training, if any."""
-        if not self.bent or self.originals is not None:
-            return None
-        return (
-            "photographs: without the unedited photographs, differences between scene and photographs are "
-            "trained as part of the edit; add their folder, photographs:EDITED,ORIGINALS"
-        )
-
     def edit(self, view: View, strength: float) -> Tensor:
         """See `ImageEditor.edit`.
 
@@ -417,6 +413,24 @@ def photograph_folders(what: str) -> tuple[Path, Path | None]:
         if not root.is_dir():
             raise ProgdfError(f"{root} is not a folder; {_PHOTOGRAPH_ADVICE}")
     return roots[0], roots[1] if len(roots) > 1 else None
+
+
+def photographs_note(what: str) -> str:
+    """Return a warning if `photographs:EDITED` has no unedited photographs, else an empty text."""
+    if photograph_folders(what)[1] is not None:
+        return ""
+    return (
+        "photographs: without the unedited photographs, differences between scene and photographs are "
+        "trained as part of the edit; add their folder, photographs:EDITED,ORIGINALS"
+    )
+
+
+def folder_cameras(what: str) -> Path | None:
+    """Return the cameras.json of a run or `progdf views` beside the pictures of `folder:DIR`; None if there
+    is none."""
+    root = Path(what)
+    candidates = (place / "cameras.json" for place in (root, *root.absolute().parents[:2]))
+    return next((path for path in candidates if path.is_file() and kind_of_cameras(path) == "own"), None)
 
 
 def folder(given: EditorInput) -> FolderEditor:

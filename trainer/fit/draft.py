@@ -19,7 +19,7 @@ from progdf.gaussians import BASE_CHANNELS, Gaussians, pack
 from progdf.gdf.file import Gdf, fingerprint
 from progdf.metrics.image import ROUNDING, decibels
 from progdf.region import Region
-from trainer.editors import COLOR_FUNCTIONS, make_editor
+from trainer.editors import editor_row, make_editor
 from trainer.editors.procedural import edit_course
 from trainer.optimize.color_views import MAX_ERROR_SHARE, ColorView, MapFit, fit_maps
 from trainer.options import MAX_STAGES, EditorOptions, TrainingViewOptions
@@ -126,7 +126,8 @@ def draft_grade(views: DraftViews, options: EditorOptions, name: str) -> Gdf | N
     Raises:
         ProgdfError: the editor does not exist.
     """
-    if options.family not in COLOR_FUNCTIONS:
+    row = editor_row(options)
+    if not row.color_function:
         return None
     fitted = views.fitted
     judged = views.judged
@@ -140,7 +141,7 @@ def draft_grade(views: DraftViews, options: EditorOptions, name: str) -> Gdf | N
     degree = min(d for d in errors if MAX_ERROR_SHARE * errors[d] <= min(errors.values()))
     error = _drawn_error(views, ends[degree], degree, expected)
     max_error = MAX_UNEXPLAINED_SHARE * _error(judged.row.image[0], expected) + ROUNDING
-    if error > max_error and options.family != "grade":  # a manual grade is checked by eye
+    if error > max_error and not row.is_manual:
         return None
     maps = [fitted.maps.solve(degree, [target]) for target in targets]
     knots = torch.tensor((0.0, *plain))

@@ -29,9 +29,10 @@ from progdf.field.baked import (
     remap_slider,
 )
 from progdf.gaussians import BASE_CHANNELS, pack
-from trainer.editors import COSTLY_STRENGTHS, check_editor
+from trainer.editors import editor_row
 from trainer.editors.base import ImageEditor
 from trainer.editors.procedural import edit_course
+from trainer.options import EditorOptions
 from trainer.setup import TrainingSetup, probe_views
 from trainer.store.progress import RunLog
 from trainer.views.crops import GEOMETRY, render_all
@@ -66,7 +67,7 @@ def equalized_strengths(
     """
     if editor.stages or len(plain) == 1:
         return plain
-    costly = check_editor(spec)[0] in COSTLY_STRENGTHS
+    costly = editor_row(EditorOptions(spec)).slow_strengths
     measured_views = views[:1] if costly else views[:: max(1, len(views) // _EDITOR_VIEWS)][:_EDITOR_VIEWS]
     view_edits = [edit_course(editor, view) for view in measured_views]
 

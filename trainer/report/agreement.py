@@ -30,11 +30,6 @@ _MAX_UNEXPLAINED = 0.4  # midway between edits that agree and edits that do not,
 _MAX_UNEXPLAINED_FINE = 0.5  # calm styles leave up to 0.47, stripes of random phase 0.55 and more
 _MIN_CONTRAST = 0.8  # washed-out views agree, but have lost fine contrast
 _INVISIBLE_ERROR_DB = 28.0  # smaller errors are not visible, whatever their share of a faint change
-_REMEDIES = {
-    "style": "use a calmer style (14, 23, 20, 7)",
-    "instruct": "make the prompt more specific, or use --kind geometry if parts move",
-    "folder": "edit the views more consistently, or use --kind geometry if parts move",
-}
 _CG_STEPS = 6  # of conjugate gradients
 DAMPING = 1e-3  # share of the first step's curvature; barely visible members keep their color
 
@@ -56,18 +51,17 @@ class Agreement:
         alike = self.unexplained <= _MAX_UNEXPLAINED and self.unexplained_fine <= _MAX_UNEXPLAINED_FINE
         return self.contrast >= _MIN_CONTRAST and (alike or self.psnr >= _INVISIBLE_ERROR_DB)
 
-    def line(self, editor: str, judged_on: str) -> str:
+    def line(self, remedy: str, judged_on: str) -> str:
         """Return one line for the log, with advice if the views disagree.
 
         Args:
-            editor: kind of the editor
+            remedy: advice, see `EditorRow.remedy`
             judged_on: the views of the figures, in words
         """
         share = f"{self.unexplained:.0%} of the change, {self.unexplained_fine:.0%} of its fine part"
         if self.agree:
             best = f"the best colors reach {self.psnr:.1f} dB and miss {share}"
             return f"the edited views agree: on {judged_on} {best}"
-        remedy = _REMEDIES.get(editor, "correct them")
         if self.contrast < _MIN_CONTRAST:
             return (
                 f"the edited views are washed out: {self.contrast:.0%} of the fine contrast that they had "

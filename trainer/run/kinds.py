@@ -18,7 +18,7 @@ from torch import Tensor
 from progdf.gaussians import pack
 from progdf.metrics.image import ROUNDING
 from progdf.scene.bounds import scene_sphere
-from trainer.editors import KIND_UNKNOWN
+from trainer.editors import editor_row
 from trainer.editors.base import ImageEditor
 from trainer.fit.evaluate import Evaluator
 from trainer.optimize.groups import GROUP_STEPS, group_stage
@@ -157,7 +157,7 @@ def choose_approach(
         ProgdfError: an edited view is missing or broken.
     """
     optimize = options.optimize
-    knows_kind = options.editor.family not in KIND_UNKNOWN
+    knows_kind = editor_row(options.editor).knows_kind
     kind = editor.kind if optimize.kind == "auto" and knows_kind else optimize.kind
     if kind == "color" or (kind == "style" and not optimize.grow):
         return Approach(kind), None

@@ -27,7 +27,7 @@ from progdf.rasterize import alpha_weights, render
 from progdf.rasterize.engines import render_depth
 from progdf.region import Region
 from progdf.terminal import group_digits
-from trainer.editors.decal import DecalEditor
+from trainer.editors.base import PastingEditor
 from trainer.editors.pictures import read_edit
 from trainer.paint.discs import (
     BORDER_PX,
@@ -360,11 +360,11 @@ class Painted:
     shown: list[Tensor]  # renders of the edit in these views. [H,W,3] each
 
 
-def train_decal(editor: DecalEditor, scene: Gaussians, name: str, log: RunLog | None = None) -> Painted:
+def train_decal(editor: PastingEditor, scene: Gaussians, name: str, log: RunLog | None = None) -> Painted:
     """Return the edit of a decal, measured in its own view and from the sides.
 
     Args:
-        editor: see `DecalEditor`
+        editor: see `PastingEditor`
         scene: the original
         name: name of the layer
         log: log of the run

@@ -22,7 +22,8 @@ from progdf.region import Region, from_mask
 from progdf.scene.strays import find_strays
 from progdf.terminal import format_count
 from progdf.tidy import Step, tidy
-from trainer.editors.pictures import picture_background, picture_paths, read_edit, strengths_of
+from trainer.editors import editor_row
+from trainer.editors.pictures import picture_background, read_edit, strengths_of
 from trainer.fill import Fill, fill_holes
 from trainer.options import TrainOptions
 from trainer.resolve import recorded_options
@@ -54,9 +55,10 @@ def is_removal(options: TrainOptions, setup: TrainingSetup, log: RunLog) -> bool
         log: log of the run
     """
     editor = options.editor
-    if editor.family == "remove":
-        return True
-    if editor.family != "pictures" or editor.removal == "never":
+    run = editor_row(editor).run
+    if run != "trained or removed":
+        return run == "removed"
+    if editor.removal == "never":
         return False
     one_strength = all(len(strengths_of(path)) == 1 for path in options.views.pictures)
     if editor.removal == "always" and not one_strength:
@@ -175,10 +177,9 @@ def with_strays(scene: Gaussians, region: Region) -> Region:
 
 def _painted_views(options: TrainOptions, setup: TrainingSetup) -> tuple[list[View], Mapping[str, Tensor]]:
     """Return the views of the pictures that show the background, and these pictures by view name. [H,W,3]"""
-    editor_paths = options.editor.editor.partition(":")[2]
-    if not editor_paths:
+    paths = options.views.pictures or editor_row(options.editor).files(options.editor.text)
+    if not paths:
         return [], {}
-    paths = options.views.pictures or picture_paths(editor_paths)
     if not options.views.pictures:
         setup = make_training_setup(replace(options.views, pictures=paths), setup.scene, setup.region)
     pairs = list(zip(setup.train, paths, strict=True))

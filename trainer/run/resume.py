@@ -21,7 +21,8 @@ from progdf.io.atomic import check_regular, disk_full, open_error
 from progdf.io.cameras import camera_files
 from progdf.io.json_values import convert_json, decode_json, to_json
 from progdf.region import Region
-from trainer.editors.pictures import picture_paths, strengths_of
+from trainer.editors import editor_row
+from trainer.editors.pictures import strengths_of
 from trainer.options import MAX_THREADS, TrainOptions, flat_values
 from trainer.resolve import count_threads, recorded_options, resolve
 from trainer.store.run_folder import RunFolder, begin_log, remove_leftovers
@@ -216,11 +217,8 @@ def picture_digests(plan: TrainOptions) -> dict[str, str]:
     paths = [path for given in plan.views.pictures for path in strengths_of(given).values()]
     if plan.editor.anchor is not None:
         paths.append(plan.editor.anchor)
-    editor_paths = plan.editor.editor.partition(":")[2]
-    if plan.editor.family == "decal":
-        paths.append(Path(editor_paths))
-    if plan.editor.family == "remove" and editor_paths:
-        paths += picture_paths(editor_paths)
+    if not plan.views.pictures:
+        paths += editor_row(plan.editor).files(plan.editor.text)
     return {str(path.resolve()): _digest(path) for path in paths}
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -26,20 +26,11 @@ from progdf.rasterize.engines import get_engine
 from progdf.region import Region
 from progdf.scene.regions import check_region, parse_region
 from progdf.terminal import group_digits
-from trainer.editors import (
-    COLOR_FUNCTIONS,
-    COSTLY_STRENGTHS,
-    EXTERNAL,
-    PER_VIEW,
-    check_editor,
-    check_new_editor,
-    make_editor,
-)
-from trainer.editors.base import ImageEditor
-from trainer.editors.decal import DecalEditor
+from trainer.editors import check_editor, check_new_editor, editor_row, make_editor
+from trainer.editors.base import ImageEditor, PastingEditor
 from trainer.editors.instruct import InstructEditor
-from trainer.editors.pictures import FolderEditor, picture_cameras
-from trainer.editors.procedural import StripesEditor, edit_course
+from trainer.editors.pictures import picture_cameras
+from trainer.editors.procedural import edit_course
 from trainer.fit.draft import draft_grade, draft_views
 from trainer.fit.fit import choose_path, drop_idle_attributes
 from trainer.fit.network import PART as NETWORK
@@ -120,7 +111,7 @@ def check_command(options: TrainOptions) -> None:
     if not options.resume or load_region(options.out) is None:
         check_region(options.region.region, region_checks(region_request(options, quiet=True)))
     is_new = not folder.root.is_dir() or not any(folder.root.iterdir())
-    if is_new or (options.editor.family in COSTLY_STRENGTHS and not options.resume):
+    if is_new or (editor_row(options.editor).slow_strengths and not options.resume):
         check_new_editor(replace(options.editor, cache=folder.paintings))
 
 
@@ -170,7 +161,7 @@ def train(options: TrainOptions, quiet: bool = False, shared: LastValueCache | N
         try:
             for note in (*session.notes, *notes):
                 log.say(note)
-            if options.editor.family == "decal":  # takes seconds, so it is redone instead of resumed
+            if editor_row(options.editor).run == "pasted":  # takes seconds, so it is not resumed
                 result = _run_decal(options, scene, region, folder, log)
                 folder.state.end()
                 return result
@@ -286,9 +277,7 @@ def _run_decal(
 ) -> RunResult:
     """Place a decal, measure it, and write the files of a run, except for a trajectory."""
     with log.stage("edit"):
-        editor = make_editor(options.editor, scene, region, ())
-    if not isinstance(editor, DecalEditor):
-        raise TypeError(f"{options.editor.editor} paints nothing")
+        editor = cast(PastingEditor, make_editor(options.editor, scene, region, ()))
     view = editor.view
     with log.stage("fit"):
         painted = train_decal(editor, scene, options.name, log)
@@ -332,7 +321,7 @@ def _write_draft(
     options: TrainOptions, scene: Gaussians, region: Region, folder: RunFolder, log: RunLog
 ) -> None:
     """Write a first slider with only a grade, if a grade can represent the edit."""
-    if folder.draft == folder.gdf(options.name) or options.editor.family not in COLOR_FUNCTIONS:
+    if folder.draft == folder.gdf(options.name) or not editor_row(options.editor).color_function:
         return
     folder.draft.unlink(missing_ok=True)
     start_time = time.perf_counter()
@@ -378,14 +367,15 @@ def _make_editor(options: TrainOptions, setup: TrainingSetup, folder: RunFolder,
     settings = replace(options.editor, cache=folder.paintings)
     glances = partial(render_thumbnails, options.views, setup.scene, setup.region)
     editor = make_editor(settings, setup.scene, setup.region, setup.views, glances)
-    if not isinstance(editor, InstructEditor):
+    if editor_row(settings).model is None:
         return editor
-    log.say(editor.note)
-    easel = PaintCache(editor, editor.recipe, editor.kept, settings.seed)
+    painter = cast(InstructEditor, editor)
+    log.say(painter.note)
+    easel = PaintCache(painter, painter.recipe, painter.kept, settings.seed)
     approved = None
     if settings.anchor is not None:
         camera = fit_size(
-            find_picture_camera(settings.anchor, origin=setup.scene.origin), editor.request.size
+            find_picture_camera(settings.anchor, origin=setup.scene.origin), painter.request.size
         )
         (camera,) = with_near_plane([camera], setup.scene)
         view = make_view(setup.scene, setup.region, camera, setup.background)
@@ -419,13 +409,14 @@ def _edit_views(
     def edit(strengths: Sequence[float], views: Sequence[View] = views) -> Pictures:
         nonlocal on_the_way
         new = [s for s in strengths if s not in edits]
+        parallel = editor_row(options.editor).is_parallel
         is_confined = confines_edit(editor(), approach.kind)
-        way = course if _fits_cache(editor(), setup) else partial(edit_course, editor())
+        way = course if _fits_cache(options, setup) else partial(edit_course, editor())
         with log.steps("edit", len(views) * len(new)) as advance:
             within = views
             if options.region.region == CHANGED:  # few members are found for paint finer than the Gaussians
                 within = [view.with_painted([editor().edit(view, 1.0)]) for view in views]
-            edits.update(edit_views(editor(), within, new, folder, is_confined, advance, way))
+            edits.update(edit_views(parallel, within, new, folder, is_confined, advance, way))
         log.say(f"{spec}: a {approach.kind} edit at strength {', '.join(f'{s:g}' for s in strengths)}")
         if min(strengths) < 1.0:
             on_the_way = [view.camera.name for view in views]
@@ -467,9 +458,10 @@ def _edit_views(
             known = done.values["strengths"]
             log.say(f"the views are edited again: {str(error).partition(';')[0]}")
     painter = editor()
-    if isinstance(painter, FolderEditor) and painter.note is not None:
-        log.say(painter.note)
-    approach, trial = choose_approach(options, setup, editor(), log)
+    note = editor_row(options.editor).note(options.editor.text)
+    if note:
+        log.say(note)
+    approach, trial = choose_approach(options, setup, painter, log)
     optimization = resolve_approach(options, approach)
     strengths = editor_strengths(editor(), optimization.stages)
     log.expect(expected_work(setup, optimization, len(strengths)))
@@ -484,9 +476,9 @@ def _edit_views(
     return edited, approach, trial, between()
 
 
-def _fits_cache(editor: ImageEditor, setup: TrainingSetup) -> bool:
+def _fits_cache(options: TrainOptions, setup: TrainingSetup) -> bool:
     """Return True if the strength-independent editor state of all views fits the cache."""
-    painted = len(setup.region) if isinstance(editor, StripesEditor) else 0
+    painted = len(setup.region) if editor_row(options.editor).paints_members else 0
     return sum(int((view.mask > 0.0).sum()) + painted for view in setup.views) <= _MAX_CACHED_PIXELS
 
 
@@ -499,7 +491,8 @@ def _check_change(edited: Pictures, setup: TrainingSetup, spec: str) -> None:
 
 def _requests_more_strengths(options: TrainOptions, optimization: OptimizeOptions) -> bool:
     """Return True if training requests further strengths once the error of the first ones is known."""
-    is_fixed = options.optimize.stages or options.editor.family in (*EXTERNAL, *COSTLY_STRENGTHS)
+    row = editor_row(options.editor)
+    is_fixed = options.optimize.stages or row.external or row.slow_strengths
     return optimization.solver == "colors" and not is_fixed
 
 
@@ -534,12 +527,13 @@ def _agreement(
     """Measure how well the edited views agree; None for editors that edit all views alike."""
     saved = folder.state.load("edited")
     shared = saved.values.get("shared", {}) if saved is not None else {}
-    if kind == "geometry" or options.editor.family not in PER_VIEW:
+    row = editor_row(options.editor)
+    if kind == "geometry" or not row.per_view:
         return shared or None
     count = len(setup.train)
     agreement = measure_agreement(setup, edited[1.0][:count], edited[1.0][count:] or edited[1.0])
     agreement = replace(agreement, contrast=shared.get("contrast", 1.0))
-    log.say(agreement.line(options.editor.family, setup.judged_on))
+    log.say(agreement.line(row.remedy, setup.judged_on))
     return {**shared, **agreement.figures()}
 
 
@@ -579,7 +573,8 @@ def _record(
         if has_one_target and not optimization.as_printed and options.field.field != "neural":
             # external pictures may be gone by now and have no intermediate strengths; generative models
             # edited only strength 1
-            painter = None if options.editor.family in (*EXTERNAL, *COSTLY_STRENGTHS) else editor()
+            row = editor_row(options.editor)
+            painter = None if row.external or row.slow_strengths else editor()
             retimed = partial(retime_trajectory, setup=setup, optimization=optimization, log=log)
             moves_groups = bool(optimization.group_steps)
             trajectory, reason = choose_path(trajectory, setup, painter, moves_groups, retimed)

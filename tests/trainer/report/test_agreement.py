@@ -12,7 +12,7 @@ from torch import Tensor
 
 from progdf.rasterize import render
 from tests.helpers.trained import WHITE, Small, small
-from trainer.editors import make_editor
+from trainer.editors import EDITORS, make_editor
 from trainer.options import EditorOptions
 from trainer.report.agreement import Agreement, fit_colors, measure_agreement, view_change
 from trainer.setup import TrainingSetup
@@ -108,12 +108,12 @@ def test_colors_that_members_can_have_are_explained() -> None:
 
 def test_summary_line_has_decibels_share_and_remedy() -> None:
     alone = "one held-out view alone"
-    line = Agreement(psnr=12.34, unexplained=0.61, unexplained_fine=0.8).line("style", alone)
+    line = Agreement(psnr=12.34, unexplained=0.61, unexplained_fine=0.8).line(EDITORS["style"].remedy, alone)
     assert line.startswith("the edited views disagree: no 3D scene shows all of them, best possible 12.3 dB")
     assert f"dB on {alone}" in line
     assert "61% of the change, 80% of its fine part; use a calmer style" in line
     assert "\n" not in line
-    agreed = Agreement(psnr=25.0, unexplained=0.1).line("style", alone)
+    agreed = Agreement(psnr=25.0, unexplained=0.1).line(EDITORS["style"].remedy, alone)
     assert agreed.startswith(f"the edited views agree: on {alone} the best colors reach 25.0 dB")
 
 

@@ -19,7 +19,7 @@ from progdf.scene.bounds import scene_sphere
 from tests.helpers.scenes import ball, concatenate, front_camera, one_gaussian
 from tests.helpers.trained import small
 from trainer.editors import check_new_editor, make_editor
-from trainer.editors.pictures import FolderEditor
+from trainer.editors.pictures import FolderEditor, photographs_note
 from trainer.options import EditorOptions
 from trainer.views.view import fit_size, make_view, name_cameras, region_box, region_rig, seen_colors
 
@@ -113,9 +113,8 @@ def test_only_the_change_from_the_original_photographs_is_trained(tmp_path: Path
     torch.testing.assert_close(alone.edit(view, 1.0), painted, atol=0.6 / 255, rtol=0)
     assert isinstance(editor, FolderEditor)
     assert isinstance(alone, FolderEditor)
-    assert editor.note is None
-    assert alone.note is not None
-    assert "photographs:EDITED,ORIGINALS" in alone.note
+    assert photographs_note(spec.partition(":")[2]) == ""
+    assert "photographs:EDITED,ORIGINALS" in photographs_note(str(tmp_path / "after"))
 
 
 @pytest.mark.parametrize(
