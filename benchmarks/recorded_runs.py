@@ -20,7 +20,7 @@ def recorded_edit(root: Path) -> KnownTrajectory:
     """Load the edit of a run folder; its truth is the recording, interpolated linearly between snapshots.
 
     Raises:
-        ProgdfError: the folder is no finished run, or its scene is missing or differs.
+        ProgdfError: the folder is not a finished run, or its scene is missing or differs.
     """
     run = reopen_run(root)
     setup = render_run_views(run)

@@ -111,7 +111,7 @@ class Camera:
 
     Raises:
         ValueError: a shape is wrong, a size or focal length is not positive, a number is not finite, the
-            viewmat is no rotation and translation, or K has oblique axes.
+            viewmat is not a rotation and translation, or K has oblique axes.
     """
 
     viewmat: Tensor  # world → camera, a rotation and a translation. [4,4] float32, column vectors
@@ -166,7 +166,7 @@ class Camera:
 
 
 def rigid_fault(matrix: Tensor, tolerance: float = RIGID_TOLERANCE) -> str:
-    """Return how a matrix differs from a rotation and a translation, such as "scales by 1.7"; or "".
+    """Return the deviation of a matrix from a rotation and a translation, such as "scales by 1.7"; or "".
 
     Args:
         matrix: column vectors, every number finite. [4,4]

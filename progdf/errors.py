@@ -29,7 +29,7 @@ def check_first_argument(call: str, value: object, kind: type | tuple[type, ...]
         kind: its type
 
     Raises:
-        TypeError: the value has another type, for example because the arguments are swapped.
+        TypeError: the value has the wrong type, for example because the arguments are swapped.
     """
     if not isinstance(value, kind):
         raise TypeError(f"the first argument is of type {type(value).__name__}; call {call}")

@@ -62,7 +62,7 @@ def inside_box(name: str, scene: Gaussians, corner: Tensor, opposite: Tensor) ->
     """Return the Gaussians whose mean lies in an axis-aligned box, boundary included.
 
     Args:
-        name: of the region
+        name: name of the region
         scene: N Gaussians
         corner, opposite: two opposite corners in the world; float64 for scenes far from 0. [3]
     """

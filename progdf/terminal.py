@@ -31,7 +31,7 @@ class _Delivery:
     """State of the signals of the main thread."""
 
     number: int = signal.SIGINT  # the latest signal
-    depth: int = 0  # open blocks of `handle_signals`; outside of them nothing is sent again
+    depth: int = 0  # number of open `handle_signals` blocks; lost signals are sent again only inside one
     thread: threading.Thread | None = None  # runs `_send_lost_signals`
 
 

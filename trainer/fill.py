@@ -29,14 +29,14 @@ from progdf.sh import rgb_to_sh0
 from trainer.views.view import View, render_colors, seen_colors
 
 _OPAQUE = 0.9  # alpha of an opaque boundary pixel; also the minimum share of such pixels in a boundary
-_MIN_REGION_WEIGHT = 0.05  # of a removed pixel; the region's soft edge occludes too
+_MIN_REGION_WEIGHT = 0.05  # weight of the region in a removed pixel; its soft edge occludes too
 _BLOCKS = (8, 4, 2, 1)  # side of a disc's square in pixels, as large as the colors allow
 _COLOR_TOLERANCE = 2 / 255  # maximum color range within a disc
 _WIDTH = 0.7  # standard deviation of a disc, as a share of the side
-_THICKNESS = 0.1  # of a disc, as a share of its width
+_THICKNESS = 0.1  # thickness of a disc, as a share of its width
 _OPACITY_LOGIT = 5.0
 _MIN_COSINE = 0.3  # limits the stretching of slanted discs
-_MIN_HOLE_SHARE = 0.01  # of the region's pixels; smaller holes are irregularities of the boundary
+_MIN_HOLE_SHARE = 0.01  # share of the region's pixels; smaller holes are irregularities of the boundary
 _MAX_VIEWS = 12
 _REACH_PX = 4.0  # maximum distance of a point from a surface that still belongs to it
 
@@ -164,7 +164,7 @@ def membrane(values: Tensor, unknown: Tensor) -> Tensor:
     index = np.full(mask.shape, -1)
     index[mask] = np.arange(mask.sum())
     count = int(mask.sum())
-    # pixels without a connection to known ones become 0, as their surface was never seen
+    # pixels without a connection to known ones become 0, as no view shows their surface
     diagonal = np.full(count, 1e-9)
     right = np.zeros((count, known.shape[2]))
     rows = []

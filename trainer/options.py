@@ -94,7 +94,7 @@ class EditorOptions:
     device: Device = "auto"
     """instruct: auto is the graphics card, or the CPU for small models; cpu is the CPU for any model."""
     fill: Annotated[Fill | None, absent_option("{none,picture,surface}", "by the editor")] = None
-    """remove, pictures: fill holes from the picture, from their borders (surface), or not (none)."""
+    """remove, pictures: source to fill holes from: the picture, the surface around them, or none."""
     removal: Removal = "auto"
     """pictures: remove the region instead of recoloring it (always, never, or as the picture suggests)."""
     seed: Fixed[int] = 0  # seed of the noise, the same in every view
@@ -187,7 +187,7 @@ class FieldOptions:
     field_loss: FieldLoss = "parameters"
     """neural: train on the recorded offsets, or on renders with the losses of the paper."""
     target_psnr: Annotated[float | None, absent_option("FLOAT", "a tenth of the edit's own error")] = None
-    """Minimum PSNR of the field against the trajectory, dB, in place of auto's rule; lower is smaller."""
+    """Minimum PSNR of the field to the trajectory, dB, instead of auto's rule; lower gives smaller files."""
     as_printed: Fixed[bool] = False  # network with positions only, hard bins of the slider, and no codes
     draft: Fixed[bool] = False  # train a network for a third of its steps
     seed: Fixed[int] = 0  # seed of the network's weights and samples

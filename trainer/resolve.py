@@ -225,7 +225,7 @@ def _check_editor_options(editor: EditorOptions, optimize: OptimizeOptions) -> N
     row = editor_row(editor)
     if row.sets_views and optimize.kind not in ("auto", "color"):
         raise ProgdfError(
-            f"--kind {optimize.kind} does not apply to pictures: few views do not tell how deep a part lies; "
+            f"--kind {optimize.kind} does not apply to pictures: few views do not show the depth of a part; "
             "give more as folder:DIR, of views that --cameras has"
         )
     if row.run == "removed" and not editor.text and editor.fill == "picture":

@@ -67,13 +67,13 @@ PICTURE_SIZE = 512
 
 _PROBES = 3  # number of views in which movement is measured
 _MAX_GLANCES = 8
-"""Number of glances; fewer for a large scene, so that a draft of a million Gaussians takes seconds.
+"""Number of thumbnails; fewer for a large scene, so that a draft of a million Gaussians takes seconds.
 
 With up to 24 no draft improves by 0.1 dB.
 """
 _GLANCE_SIZE = 192
-"""Longer side of a glance, pixels; smaller ones mix the region's colors with each other and with others."""
-_MAX_GLANCE_GAUSSIANS = 3_000_000  # rendered in all glances together
+"""Longer side of a thumbnail, pixels; smaller ones mix the region's colors with each other and others."""
+_MAX_GLANCE_GAUSSIANS = 3_000_000  # rendered in all thumbnails together
 
 Pictures = Mapping[float, Sequence[Tensor]]
 """Strength → whole edited pictures, one per view. [H,W,3] each"""
@@ -188,7 +188,7 @@ def make_training_setup(options: TrainingViewOptions, scene: Gaussians, region: 
 def render_thumbnails(
     options: TrainingViewOptions, scene: Gaussians, region: Region
 ) -> list[RegionThumbnail]:
-    """Return glances at the region from all sides, independent of number and size of its views.
+    """Return thumbnails of the region from all sides, independent of number and size of its views.
 
     They come from the first given cameras that show it, spread over the list, or from a rig. There are none
     for a scene that surrounds the viewer and has no cameras.

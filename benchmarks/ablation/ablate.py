@@ -57,7 +57,7 @@ def ablate(options: AblateOptions, quiet: bool = False) -> list[Ablation]:
         quiet: print nothing
 
     Raises:
-        ProgdfError: a folder is no finished run, its scene or a view is missing, or a variant does not exist.
+        ProgdfError: a folder is not a finished run, its scene or a view is missing, or a variant is unknown.
         KeyboardInterrupt: interrupted; the message names the folder of the finished variants.
     """
     check_options(options)

@@ -60,8 +60,8 @@ class Dragging:
     def slope(self) -> float:
         """Growth of memory over the second half, MB per minute.
 
-        Memory that fills up in the first half is no leak. The value is the median of the slopes between all
-        samples, so a single outlier does not change it.
+        Memory that fills up in the first half is not a leak. The value is the median of the slopes between
+        all samples, so a single outlier does not change it.
         """
         half = len(self.seconds) // 2
         times = np.array(self.seconds[half:])

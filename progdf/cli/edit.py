@@ -45,23 +45,23 @@ class EditOptions:
     """
 
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
-    """scene file: .ply, .spz, .splat, .ksplat, .sog, .glb or .gltf."""
+    """Scene file: .ply, .spz, .splat, .ksplat, .sog, .glb or .gltf."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.ply|NAME.gdf")]
-    """scene file to write; or a .gdf whose slider goes from the scene (0) to the full change (1)."""
+    """Scene file to write; or a .gdf whose slider goes from the scene (0) to the full change (1)."""
     clean: Annotated[bool, tyro.conf.FlagCreatePairsOff, absent_option(None)] = False
-    """remove floaters, needles, giants and invisible Gaussians; for a scene output only."""
+    """Remove floaters, needles, giants and invisible Gaussians; for a scene output only."""
     delete: Annotated[Specs, absent_option("REGION")] = ()
-    """remove the Gaussians of the region; holes, shadows and reflections stay."""
+    """Remove the Gaussians of the region; holes, shadows and reflections stay."""
     scale: Annotated[Specs, absent_option("REGION:FACTOR")] = ()
-    """scale the region about the mean of its centers, by 0.001 to 1000."""
+    """Scale the region about the mean of its centers, by 0.001 to 1000."""
     rotate: Annotated[Specs, absent_option("REGION:AXIS,DEGREES")] = ()
-    """rotate the region about the mean of its centers; AXIS: x, y, z or a vector; −360 to 360 degrees."""
+    """Rotate the region about the mean of its centers; AXIS: x, y, z or a vector; −360 to 360 degrees."""
     move: Annotated[Specs, absent_option("REGION:DX,DY,DZ")] = ()
-    """move the region, world units."""
+    """Move the region, world units."""
     duplicate: Annotated[Specs, absent_option("REGION:DX,DY,DZ")] = ()
-    """add a copy of the region, moved by an offset in world units."""
+    """Add a copy of the region, moved by an offset in world units."""
     glb_axes: GlbAxes = "LUF"
-    """axes of a .glb: LUF (glTF's own) or RUB (OpenGL's, as in .spz and .usdc)."""
+    """Axes of a .glb: LUF (glTF's own) or RUB (OpenGL's, as in .spz and .usdc)."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -80,7 +80,7 @@ def main(argv: Sequence[str]) -> int:
     if not makes_edit:
         written_format(options.out)
     if options.out.suffix.lower() != ".glb" and options.glb_axes != "LUF":
-        raise ProgdfError(f"{options.out} is no .glb; leave out --glb-axes")
+        raise ProgdfError(f"{options.out} is not a .glb; leave out --glb-axes")
     if makes_edit and options.clean:
         raise ProgdfError("--clean has no slider; write a .ply, or leave --clean out")
     check_not_an_input(options.out, [options.scene])

@@ -136,11 +136,11 @@ class InfoOptions:
     """
 
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
-    """file to describe; its type is recognized by content, not by name."""
+    """File to describe; its type is recognized by content, not by name."""
     cameras: Annotated[Path | None, absent_option("CAMERAS", "those beside the file")] = None
-    """cameras of the scene, used to find the up axis."""
+    """Cameras of the scene, used to find the up axis."""
     up: UpChoice = "auto"
-    """up axis of the scene."""
+    """Up axis of the scene."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -164,13 +164,13 @@ def describe(path: Path, cameras: Path | None = None, up: UpChoice = "auto") -> 
         up: up axis of a scene
 
     Raises:
-        ProgdfError: the file cannot be loaded, or `cameras` or `up` is given for a file that is no scene.
+        ProgdfError: the file cannot be loaded, or `cameras` or `up` is given for a file that is not a scene.
     """
     kind = kind_of(path)
     if kind == "scene":
         return _scene_lines(path, cameras, up)
     if cameras is not None or up != "auto":
-        raise ProgdfError(f"{path} is no scene; leave --cameras and --up out")
+        raise ProgdfError(f"{path} is not a scene; leave --cameras and --up out")
     return _LINES_BY_KIND[kind](path)
 
 

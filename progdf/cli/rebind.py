@@ -46,13 +46,13 @@ class RebindOptions:
     """Carry an edit over to the same scene in another file or format."""
 
     edit: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="EDIT.gdf")]
-    """edit to carry over"""
+    """Edit to carry over."""
     source: Annotated[Path, tyro.conf.arg(name="from", metavar="SCENE")]
-    """scene that the edit was made for"""
+    """Scene that the edit was made for."""
     target: Annotated[Path, tyro.conf.arg(name="to", metavar="SCENE")]
-    """same scene in another file"""
+    """Same scene in another file."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="NEW.gdf")]
-    """.gdf file to write"""
+    """File to write, ending in .gdf."""
 
 
 @dataclass(frozen=True)

@@ -287,7 +287,7 @@ def grade_fully(rgb: Tensor, grade: ColorGrade) -> Tensor:
 
 
 def stripe_pattern(points: Tensor, axis: Tensor, period: float, phase: float = 0.0) -> Tensor:
-    """Return how much each 3D point lies in a stripe. Stripes depend on position, so all views agree.
+    """Return the stripe coverage of each 3D point. Stripes depend on position, so all views agree.
 
     Args:
         points: world positions. [...,3]

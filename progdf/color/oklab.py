@@ -113,8 +113,7 @@ def bend_of(reference: Tensor, target: Tensor, path: ColorPath = "bowed") -> Ben
     """Return the bend for a region whose typical color `reference` becomes `target`; sRGB, [3] each.
 
     - "bowed": mostly straight, with a bow of 0.4 along the shorter hue arc. So strength 0.5 towards blue
-    looks
-      half blue, not gray. Hues within 10° of opposite avoid green, which would be unexpected.
+      looks half blue, not gray. Hues within 10° of opposite avoid green, which would be unexpected.
     - "hue": along the shorter hue arc, or over green between nearly opposite hues.
     - "straight": straight in OKLab. "srgb": straight in sRGB. Both pass through gray between opposite hues.
     """

@@ -35,7 +35,7 @@ _MAX_SAMPLED_MEMBERS = 100_000  # members that are sampled to find an edit's lar
 
 
 def coverage(scene: Gaussians, gdf: Gdf) -> Mapping[str, Tensor]:
-    """Return how much an edit at strength 1 hides of lower edits, per member and kind of change.
+    """Return the share of lower edits that an edit at strength 1 hides, per member and kind of change.
 
     With z the visible size of a member's change at strength 1, c = smoothstep(z / max(floor, z₉₀ / 2)). z₉₀
     is the 90th percentile over the members. So an unchanged member hides nothing, and one with half of the
@@ -45,8 +45,7 @@ def coverage(scene: Gaussians, gdf: Gdf) -> Mapping[str, Tensor]:
       (C0 · √Σ Δ² over the SH coefficients); floor 0.1
     - "opacity": the change of σ(logit); floor 0.2
     - "geometry": the largest of the movement / 0.05 of the region's size, the change of a log-scale / 0.4,
-    and
-      the rotation |Δq| / 0.4 |q|; floor 1
+      and the rotation |Δq| / 0.4 |q|; floor 1
 
     Coverage is not stored. It follows from the offsets at strength 1, and so is defined for every .gdf.
 
@@ -129,19 +128,17 @@ def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "norm
     With m the layer's weights, g its gain for the kind of attribute, and Δ(s) its field at strength s:
 
     - "normalized": Σ m g Δ(s) / max(1, Σ m s). The lower sum is over the layers that make this kind of
-    change.
-      A single layer is unchanged, and the order does not matter. It equals "sum" while the strengths on a
-      Gaussian add up to at most 1.
+      change. A single layer is unchanged, and the order does not matter. It equals "sum" while the strengths
+      on a Gaussian add up to at most 1.
     - "sum": Σ m g Δ(s).
     - "over": in the given order, Δ ← Δ · (1 − m s c min(1, |g|)) + m g Δ(s). The last layer lies on top. Its
-      `coverage` c, 0 to 1, is how much it changes of that kind. Lower layers are visible where it changes
-      nothing.
+      `coverage` c, 0 to 1, is the size of its change of that kind. Lower layers are visible where it
+      changes nothing.
     - "adjust": as "over", but a grade (see `progdf.field.grade`) hides nothing. It maps the colors that
-    result
-      from the layers below, Δ ← Δ + m g (grade(Θ0 + Δ, s) − Θ0 − Δ). On unchanged Gaussians it is the edit as
-      trained, and darkened stripes stay stripes. A member whose change comes more from the residual than from
-      the map lies over the lower layers to that extent, see `map_share`. So dark gaps between stripes stay
-      dark.
+      result from the layers below, Δ ← Δ + m g (grade(Θ0 + Δ, s) − Θ0 − Δ). On unchanged Gaussians it is the
+      edit as trained, and darkened stripes stay stripes. A member whose change comes more from the residual
+      than from the map lies over the lower layers to that extent, see `map_share`. So dark gaps between
+      stripes stay dark.
 
     In Σ m s and 1 − m s c, s is clamped to 0 to 1. A strength above 1 exaggerates its own edit without
     dimming the others.

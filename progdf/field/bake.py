@@ -25,7 +25,7 @@ TOLERANCE = 0.01
 """RMS error of the factoring, as a share of the trajectory's own RMS."""
 
 _NODES_PER_BIN = 4
-_NODES_PER_BIN_LARGE = 2  # of a large network
+_NODES_PER_BIN_LARGE = 2  # nodes per bin of a large network
 _LARGE_NETWORK = 100_000  # numbers of a network; above this, fewer nodes keep loading fast
 _EDGE_WIDTH = 1e-5  # strength between the two nodes at the edge of hard bins
 

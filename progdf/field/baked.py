@@ -208,7 +208,7 @@ def lattice_side(points: int) -> int:
     """Return the number of points along an edge of a lattice.
 
     Raises:
-        ValueError: the number of points is no cube of 2 to `MAX_SIDE`.
+        ValueError: the number of points is not a cube of 2 to `MAX_SIDE`.
     """
     side: int = round(points ** (1 / 3))
     if side**3 != points or not 2 <= side <= MAX_SIDE:
@@ -326,7 +326,7 @@ def unpack_levels(functions: Tensor, levels: Tensor, bases: int, members: int, c
 
 @dataclass(frozen=True)
 class BakedField:
-    """Field in its final form, for the members it was made for."""
+    """Field as stored bases of M members and their coefficients over the strength."""
 
     kind: str  # "grade", "separable", "keyframes" or "neural"
     knots: Tensor  # strengths at which the coefficients are given, ascending, first 0, last 1. [S] float32

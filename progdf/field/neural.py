@@ -122,7 +122,7 @@ class NeuralField:
     """Trained network and its data in addition to the scene.
 
     Raises:
-        ValueError: a tensor is absent or has another shape or type.
+        ValueError: a tensor is absent or has the wrong shape or type.
     """
 
     shape: NeuralShape  # layout

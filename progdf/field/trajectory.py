@@ -112,7 +112,7 @@ def load_trajectory(path: Path) -> tuple[Trajectory, dict[str, Tensor], dict[str
     """Read a file of `save_trajectory`: trajectory, extra tensors, about.
 
     Raises:
-        ProgdfError: the file is absent, damaged or of another kind.
+        ProgdfError: the file is absent, damaged or not a trajectory file.
     """
     try:
         tensors, header = read_tensors(path)

@@ -119,7 +119,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
     if missing:
         found = ", ".join([*columns, *others][:6]) or "no tensors"
         raise ProgdfError(
-            f"{path} is no checkpoint of Gaussians from gsplat or nerfstudio: it holds no "
+            f"{path} is not a checkpoint of Gaussians from gsplat or nerfstudio: it holds no "
             f"{', '.join(missing)}, but {found}; {EXPORT}"
         )
     step = content.get("step")
@@ -220,7 +220,7 @@ def _read_pickle(path: Path) -> bytes:
         raise unsupported_error(path, "the archive format of torch before 1.6", RESAVE)
     if not start.startswith(b"PK"):
         check_foreign(path, start)
-        raise ProgdfError(f"{path} is no checkpoint of torch, which is a zip archive; {EXPORT}")
+        raise ProgdfError(f"{path} is not a checkpoint of torch, which is a zip archive; {EXPORT}")
     try:
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()
@@ -247,7 +247,7 @@ def _check_entries(path: Path, entries: Sequence[zipfile.ZipInfo]) -> None:
     if any(entry.filename.endswith("/constants.pkl") for entry in entries):
         raise unsupported_error(path, "a compiled program of torch (TorchScript)", EXPORT)
     if len(pickles) != 1:
-        raise ProgdfError(f"{path} is a zip archive but no checkpoint of torch; {EXPORT}")
+        raise ProgdfError(f"{path} is a zip archive but not a checkpoint of torch; {EXPORT}")
     if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
         raise unsupported_error(path, "a compressed archive", "save it again with torch.save")
     if sum(entry.file_size for entry in entries) > path.stat().st_size:

@@ -73,7 +73,7 @@ _SCENE_MAGICS = (b"ply", b"glTF", b"NGSP")
 
 
 def check_foreign(path: str | os.PathLike[str], start: bytes) -> None:
-    """Refuse a file that starts like a known file type that is no scene, whatever its name.
+    """Refuse a file that starts like a known file type that is not a scene, whatever its name.
 
     Args:
         path: the file
@@ -90,7 +90,7 @@ def check_foreign(path: str | os.PathLike[str], start: bytes) -> None:
 
 
 def _foreign_kind(start: bytes) -> str:
-    """Return the type of a file that is no scene and a remedy, or an empty text."""
+    """Return the type of a file that is not a scene and a remedy, or an empty text."""
     for magic, kind, remedy in _OTHER_FILE_TYPES:
         if start.startswith(magic) and not (magic == b"BM" and start[6:10] != b"\0\0\0\0"):
             return f"{kind}; {remedy}"
@@ -239,5 +239,5 @@ def _check_size(path: Path, unpacked: int) -> None:
     if unpacked > base + each * packed:
         raise ProgdfError(
             f"{path} has {file_size(packed)} and unpacks to {file_size(unpacked)} or more, "
-            "which no scene does; unpack it yourself if you trust it"
+            "too much for a scene; unpack it yourself if you trust it"
         )

@@ -50,7 +50,7 @@ def read_cube(path: str | os.PathLike[str]) -> Tensor:
     A table with another domain is resampled at 65³ points. Line ends of any system are read.
 
     Raises:
-        ProgdfError: the file cannot be read, is no 3D table, or its rows do not match its header.
+        ProgdfError: the file cannot be read, is not a 3D table, or its rows do not match its header.
     """
     name = Path(path).name
     content = read_file(path, _MAX_FILE_BYTES + 1)

@@ -255,7 +255,7 @@ class GltfFile:
         """Return an accessor of the given type.
 
         Raises:
-            ProgdfError: the accessor does not exist, has another type or has no rows.
+            ProgdfError: the accessor does not exist, has the wrong type or has no rows.
         """
         accessor = entry(self, self.tables.accessors, index, "accessors")
         if accessor.type != kind or accessor.componentType not in _NUMBER_TYPES:

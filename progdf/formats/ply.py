@@ -60,7 +60,7 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
     are normalized, wxyz. Rows keep their order and number.
 
     Raises:
-        ProgdfError: the file is missing, broken, holds no Gaussians, or is no 3DGS .ply.
+        ProgdfError: the file is missing, broken, holds no Gaussians, or is not a 3DGS .ply.
     """
     check_first_argument("load_ply(path)", path, (str, os.PathLike))
     scene, report = load_ply_with_report(path)
@@ -93,7 +93,7 @@ def read_ply(ply: PlyFile) -> tuple[Gaussians, dict[str, Any]]:
     Colors come from `f_dc`, or from RGB columns without it. Mip-Splatting's `filter_3D` is fused.
 
     Raises:
-        ProgdfError: the file is no 3DGS .ply, or has an unsupported property or element.
+        ProgdfError: the file is not a 3DGS .ply, or has an unsupported property or element.
     """
     ignored = _check_variants(ply)
     columns = _find_columns(ply)

@@ -62,7 +62,7 @@ class PlyFile:
     comments: tuple[str, ...] = ()
 
     def columns(self, element: str) -> dict[str, str]:
-        """Return the numpy type of each property that is no list; empty if the element is missing."""
+        """Return the numpy type of each property that is not a list; empty if the element is missing."""
         properties = self.layout[element].properties if element in self.layout else ()
         return {p.name: p.val_dtype for p in properties if not isinstance(p, PlyListProperty)}
 
@@ -150,7 +150,7 @@ def read_header(path: str | os.PathLike[str]) -> PlyFile:
     """Read the header of a .ply file, and check that the declared rows fit into the file.
 
     Raises:
-        ProgdfError: the file is no .ply, its header is broken, or it declares more rows than the file holds.
+        ProgdfError: the file is not a .ply, its header is broken, or it declares more rows than it holds.
     """
     check_regular(path)
     try:

@@ -245,7 +245,7 @@ class LoadReport:
     opaque: int = 0  # +inf opacity logit, replaced by `OPAQUE_LOGIT`
     transparent: int = 0  # −inf opacity logit, replaced by `INVISIBLE_LOGIT`
     zero_quats: int = 0  # |q| < 1e-6, treated as no rotation
-    scaled_quats: int = 0  # quaternions of another length than 1, normalized
+    scaled_quats: int = 0  # quaternions that were not unit length, normalized
     ignored_properties: tuple[str, ...] = ()  # vertex properties that 3DGS does not have
     ignored_elements: tuple[tuple[str, int], ...] = ()  # unused elements with their row counts
     ignored_comments: tuple[str, ...] = ()  # comments about the up axis that name no axis, or different ones
@@ -322,9 +322,7 @@ class LoadReport:
         if self.antialiased:
             lines.append("antialiased: trained and rendered with Mip-Splatting's 2D filter")
         if self.scaled_quats:
-            lines.append(
-                f"normalized: {format_count(self.scaled_quats, 'quaternion')} of another length than 1"
-            )
+            lines.append(f"normalized: {format_count(self.scaled_quats, 'quaternion')} not of unit length")
         if self.origin != ZERO:
             lines.append(f"origin: {' '.join(f'{at:.17g}' for at in self.origin)} (the scene is far from 0)")
         if self.lost:

@@ -90,7 +90,7 @@ _log = logging.getLogger(__name__)
 
 
 def scene_format(path: str | os.PathLike[str]) -> str | None:
-    """Return the format of a file, by content or otherwise by name; None if it is no scene.
+    """Return the format of a file, by content or otherwise by name; None if it is not a scene.
 
     Returns:
         One of `FORMATS`, or None.
@@ -141,7 +141,7 @@ def load_scene(path: str | os.PathLike[str]) -> Gaussians:
     rotated by half a turn about x.
 
     Raises:
-        ProgdfError: the file is missing, broken or no scene, or its reader is not installed.
+        ProgdfError: the file is missing, broken or not a scene, or its reader is not installed.
     """
     check_first_argument("load_scene(path)", path, (str, os.PathLike))
     scene, report = load_scene_with_report(path)
@@ -168,7 +168,7 @@ def load_scene_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, Loa
 
 
 def _load(path: Path, kind: str | None) -> tuple[Gaussians, LoadReport]:
-    """Return the scene of a file that is no archive, and the report.
+    """Return the scene of a file that is not an archive, and the report.
 
     Args:
         path: the file
@@ -479,13 +479,13 @@ def save_frames(
         path: ends in one of `WRITTEN_SUFFIXES`
         scenes: N Gaussians each; a .usdc needs the same rows in all scenes
         rate: samples per second of a .usdc
-        glb_axes: as `save_scene`
+        glb_axes: see `save_scene`
 
     Returns:
         The files, in the order of the scenes.
 
     Raises:
-        ProgdfError: as `save_scene`.
+        ProgdfError: see `save_scene`.
     """
     if written_format(path) == usd.SUFFIX:
         with atomic_write(path) as written:
@@ -523,7 +523,7 @@ def written_format(path: Path) -> str:
         if path.name.lower().endswith(ending):
             return ending
     *others, last = WRITTEN_SUFFIXES
-    raise ProgdfError(f"{path} names no format to write; end it in {', '.join(others)} or {last}")
+    raise ProgdfError(f"{path} does not end in a known format; use {', '.join(others)} or {last}")
 
 
 def _require_gaussforge(path: Path, kind: str) -> None:
@@ -532,7 +532,7 @@ def _require_gaussforge(path: Path, kind: str) -> None:
 
 
 def _failure_reason(status: int, stderr: bytes) -> str:
-    """Return why the gaussforge process failed.
+    """Return the reason why the gaussforge process failed.
 
     Args:
         status: exit status, or the negative number of the signal that ended the process

@@ -138,7 +138,7 @@ def verify(gdf: Gdf, scene: Gaussians, gdf_name: str = "", scene_name: str = "th
     if gdf.scene.means_sha256 != fingerprint(scene).means_sha256:
         raise ProgdfError(f"{other}: {scene_name} has as many Gaussians, but at other positions; {rebind}")
     if gdf.field.channels not in (BASE_CHANNELS, BASE_CHANNELS + 3 * scene.shN.shape[1]):
-        raise ProgdfError(f"{other}: {scene_name} has SH degree {scene.sh_degree}, the edit another")
+        raise ProgdfError(f"{other}: {scene_name} has SH degree {scene.sh_degree}, unlike the edit")
 
 
 def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
@@ -191,8 +191,8 @@ def load_gdf(
             the trained region, or the whole scene for a .cube file
 
     Raises:
-        ProgdfError: as `read_gdf` and `apply_grade`; or the edit was made for another scene, or must be baked
-            and no scene is given.
+        ProgdfError: see `read_gdf` and `apply_grade`; or the edit was made for another scene, or must be
+            baked and no scene is given.
     """
     check_first_argument("load_gdf(path, scene)", path, (str, os.PathLike))
     gdf = read_gdf(path)
@@ -227,11 +227,11 @@ def apply_grade(gdf: Gdf, scene: Gaussians, region: Region) -> Gdf:
     The grade's mask, residual and report are left out, as they belong to the scene it was trained on.
 
     Raises:
-        ProgdfError: the edit is no grade, its color offsets exceed the limits, or the region is empty.
+        ProgdfError: the edit is not a grade, its color offsets exceed the limits, or the region is empty.
     """
     stored = gdf.field.origin
     if not isinstance(stored, GradeForm):
-        raise ProgdfError(f"{gdf.name} is no grade: its field is {gdf.field.kind}; give a grade")
+        raise ProgdfError(f"{gdf.name} is not a grade: its field is {gdf.field.kind}; give a grade")
     if not len(region):
         raise ProgdfError(f"the region for {gdf.name} has no Gaussians; give another")
     rows = pack(scene[region.members], with_shN=scene.sh_degree > 0)
@@ -251,8 +251,8 @@ def read_gdf(path: str | os.PathLike[str]) -> Gdf:
     A .cube file gives a grade without members, for `apply_grade`.
 
     Raises:
-        ProgdfError: the file is no .gdf, from a newer version, truncated, damaged or inconsistent; or as
-            `read_cube`.
+        ProgdfError: the file is not a .gdf file, from a newer version, truncated, damaged or inconsistent;
+            see also `read_cube`.
     """
     name = Path(path).name
     if Path(path).suffix.lower() == CUBE:

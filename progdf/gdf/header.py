@@ -117,7 +117,7 @@ def unpack_file(content: bytes, name: str) -> tuple[GdfHeader, dict[str, Tensor]
         name: name of the file for errors
 
     Raises:
-        ProgdfError: the file is no .gdf, from a newer version, truncated, damaged or inconsistent.
+        ProgdfError: the file is not a .gdf file, from a newer version, truncated, damaged or inconsistent.
     """
     size = int.from_bytes(content[:8], "little")
     if not 2 <= size <= _MAX_HEADER or content[8:9] != b"{":
@@ -126,12 +126,12 @@ def unpack_file(content: bytes, name: str) -> tuple[GdfHeader, dict[str, Tensor]
         tensors: dict[str, Tensor] = safetensors.torch.load(content)
         text = (decode_json(content[8 : 8 + size]).get("__metadata__") or {}).get(_METADATA)
     except (safetensors.SafetensorError, ValueError, KeyError, RuntimeError, OverflowError):
-        raise ProgdfError(f"{name} is truncated or damaged; copy it again or make it again") from None
+        raise ProgdfError(f"{name} is truncated or damaged; copy it again or train the edit again") from None
     if text is None:
         raise ProgdfError(
             f"{name} is a safetensors file, but not a .gdf; give one that progdf train has written"
         )
-    damage = ProgdfError(f"{name} is damaged (checksum mismatch); copy it again or make it again")
+    damage = ProgdfError(f"{name} is damaged (checksum mismatch); copy it again or train the edit again")
     try:
         value = decode_json(text)
         sha256 = convert_json(value["sha256"], str)
@@ -163,7 +163,7 @@ def checksum(text: str, tensors: Mapping[str, Tensor]) -> str:
 def contradiction_error(name: str, error: Exception) -> ProgdfError:
     """Return the error for a file with inconsistent parts."""
     reason = " ".join(str(error).split()) or type(error).__name__
-    return ProgdfError(f"{name} is inconsistent ({reason}); make it again with progdf train")
+    return ProgdfError(f"{name} is inconsistent ({reason}); train the edit again")
 
 
 def _encode(header: GdfHeader) -> str:

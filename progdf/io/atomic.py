@@ -67,7 +67,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     try:
         yield temporary_file
         replace_file(temporary_file, target)
-    except (OSError, ProgdfError) as error:  # of a nested write, which only knows `temporary_file`
+    except (OSError, ProgdfError) as error:  # raised by a nested write, which only knows `temporary_file`
         full = disk_full(error)
         if full is None:
             raise
@@ -163,12 +163,12 @@ def _match_target(path: Path, target: Path) -> None:
     """Give a new file the permissions of the file that it will replace.
 
     Raises:
-        ProgdfError: the target is no regular file.
+        ProgdfError: the target is not a regular file.
     """
     if target.is_symlink() or not target.exists():
         return
     if not target.is_file():
-        raise ProgdfError(f"{target} is no file; choose another name")
+        raise ProgdfError(f"{target} is not a file; choose another name")
     with suppress(OSError):  # a file system without permissions
         path.chmod(target.stat().st_mode & 0o777)
 
@@ -325,7 +325,7 @@ def read_file(path: str | os.PathLike[str], most: int = -1) -> bytes:
     """Return the content of a file, or its first `most` bytes.
 
     Raises:
-        ProgdfError: the file does not exist, is no regular file, or cannot be read.
+        ProgdfError: the file does not exist, is not a regular file, or cannot be read.
     """
     check_regular(path)
     try:
@@ -434,7 +434,7 @@ def is_owned(path: Path) -> bool:
 
 
 def is_private(folder: Path) -> bool:
-    """Return whether only the user can write to a folder that is no link (always True on Windows)."""
+    """Return whether only the user can write to a folder that is not a link (always True on Windows)."""
     if sys.platform == "win32":
         return True
     status = folder.lstat()

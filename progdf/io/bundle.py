@@ -68,7 +68,7 @@ def write_bundle(path: Path, source: Path) -> int:
         The number of files in the bundle.
 
     Raises:
-        ProgdfError: as `verify_files`, or the scene has several files, such as an unpacked .sog or a .gltf.
+        ProgdfError: see `verify_files`, or the scene has several files, such as an unpacked .sog or a .gltf.
     """
     session = read_session(source, SessionFile)
     scene, edits = verify_files(source, session)
@@ -126,7 +126,7 @@ def unpack_bundle(path: Path) -> Path:
     Nothing is written outside that folder, which appears complete or not at all.
 
     Raises:
-        ProgdfError: the file is damaged, no bundle, or uses an unsupported feature of .zip. Or the folder
+        ProgdfError: the file is damaged, not a bundle, or uses an unsupported feature of .zip. Or the folder
             was not unpacked from this bundle, or cannot be written.
     """
     folder = path.resolve().with_name(path.name.removesuffix(".zip"))
@@ -153,7 +153,7 @@ def _open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
     """Open a bundle as a .zip archive.
 
     Raises:
-        ProgdfError: the file cannot be read, is no .zip archive, or is damaged.
+        ProgdfError: the file cannot be read, is not a .zip archive, or is damaged.
     """
     atomic.check_regular(path)
     try:
@@ -162,7 +162,7 @@ def _open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
         raise atomic.open_error(path, error) from error
     with file:
         if file.read(2) != b"PK":
-            raise ProgdfError(f"{path} is no bundle: it is no .zip archive; copy or export it again")
+            raise ProgdfError(f"{path} is not a bundle: it is not a .zip archive; copy or export it again")
         try:
             archive = zipfile.ZipFile(file)
         except NotImplementedError as error:  # a later version of the format
@@ -177,20 +177,20 @@ def _check_members(path: Path, archive: zipfile.ZipFile) -> list[zipfile.ZipInfo
     """Return the members of a bundle, after a check that each is a plain file within the limits.
 
     Raises:
-        ProgdfError: a name is no plain file name or appears twice, a member is encrypted or compressed with
-            another method than deflate, or the members are too many or too large.
+        ProgdfError: a name is not a plain file name or appears twice, a member is encrypted or compressed
+            with a method other than deflate, or the members are too many or too large.
     """
     members = archive.infolist()
     if len(members) > MAX_FILES:
         raise ProgdfError(
-            f"{path} is no bundle: it holds {len(members)} files; at most {MAX_FILES} are allowed"
+            f"{path} is not a bundle: it holds {len(members)} files; at most {MAX_FILES} are allowed"
         )
     names = set[str]()
     for member in members:
         name = member.filename
         if not atomic.is_portable(name) or name.startswith(".") or not name.isprintable():
             raise ProgdfError(
-                f"{path} is no bundle: it names {name!r:.80}, which is no plain file; export it again"
+                f"{path} is not a bundle: it names {name!r:.80}, which is not a plain file; export it again"
             )
         if name.casefold() in names:
             raise damage_error(path, f"it holds {name!r:.80} twice")
@@ -203,7 +203,7 @@ def _check_members(path: Path, archive: zipfile.ZipFile) -> list[zipfile.ZipInfo
     unpacked = sum(member.file_size for member in members)
     if unpacked > MAX_EXPANSION * max(path.stat().st_size, 1 << 20):
         raise ProgdfError(
-            f"{path} is no bundle: it would be unpacked to far more than it can hold; export it again"
+            f"{path} is not a bundle: it would be unpacked to far more than it can hold; export it again"
         )
     return members
 
@@ -226,7 +226,7 @@ def _find_session(
         names = ", ".join(repr(member.filename) for member in sessions)
         found = f"it holds {len(sessions)} sessions in {len(members)} files"
         named = f" ({names:.80})" if names else ""
-        raise ProgdfError(f"{path} is no bundle: {found}{named}; keep one session in it")
+        raise ProgdfError(f"{path} is not a bundle: {found}{named}; keep one session in it")
     return sessions[0]
 
 

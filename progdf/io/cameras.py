@@ -250,7 +250,7 @@ def camera_in_picture(path: str | os.PathLike[str], origin: Origin = ZERO) -> Ca
     """Return the camera embedded in a rendered picture, relative to `origin`; None if there is none.
 
     Raises:
-        ProgdfError: the file is no picture, or the embedded text is no camera.
+        ProgdfError: the file is not a picture, or the embedded text is not a camera.
     """
     camera = _embedded_camera(path)
     return None if camera is None else _to_scene_frame(camera, origin, os.fspath(path))

@@ -67,8 +67,8 @@ def open_picture(
         two_values: map pixels of more than 8 bits to black and white if they are 0 or one other value
 
     Raises:
-        ProgdfError: the file is missing, no picture, too large, of another aspect ratio, or of a number type
-            without a defined white.
+        ProgdfError: the file is missing, not a picture or too large, or its aspect ratio or number type is
+            wrong. A number type needs a defined white.
     """
     with _open(path) as picture:
         stored_orientation = _orientation(picture)
@@ -168,7 +168,7 @@ def picture_text(path: str | os.PathLike[str], key: str) -> str | None:
     """Return the text chunk of a .png with the given key, before or after its pixels; None if missing.
 
     Raises:
-        ProgdfError: as `open_picture`.
+        ProgdfError: see `open_picture`.
     """
     with _open(path) as picture:
         if not isinstance(picture, PngImageFile):
@@ -184,7 +184,7 @@ def saving_loss(path: str | os.PathLike[str]) -> Callable[[Tensor], Tensor]:
     The function maps [H,W,3] to [H,W,3], 0 to 1.
 
     Raises:
-        ProgdfError: as `open_picture`.
+        ProgdfError: see `open_picture`.
     """
     with _open(path) as picture:
         lossy = isinstance(picture, JpegImageFile) and picture.mode == "RGB"
@@ -254,18 +254,18 @@ def read_picture(path: Path, size: tuple[int, int] | None = None, calibrated: bo
         calibrated: see `open_picture`
 
     Raises:
-        ProgdfError: as `open_picture`.
+        ProgdfError: see `open_picture`.
     """
     picture = flatten_onto(open_picture(path, size, calibrated), "white", size)
     return torch.from_numpy(np.asarray(picture, dtype=np.float32) / 255.0)
 
 
-_MIN_OPAQUE = 128  # of 255; alpha of an opaque pixel
-_MAX_BLACK = 26  # of 255; within a tenth of black
-_MIN_WHITE = 229  # of 255; within a tenth of white
-_MIN_DRAWN_SHARE = 0.001  # of the opaque pixels; with fewer black or white ones a picture is no drawing
-_MIN_LABEL_BRIGHTNESS = 32  # of 255; the hue of darker pixels is noise
-_MAX_LABEL_COLORS = 256  # a picture with more colors is no label map
+_MIN_OPAQUE = 128  # alpha of an opaque pixel, 0 to 255
+_MAX_BLACK = 26  # within a tenth of black, 0 to 255
+_MIN_WHITE = 229  # within a tenth of white, 0 to 255
+_MIN_DRAWN_SHARE = 0.001  # share of the opaque pixels; a drawing has more black and more white ones
+_MIN_LABEL_BRIGHTNESS = 32  # 0 to 255; the hue of darker pixels is noise
+_MAX_LABEL_COLORS = 256  # a picture with more colors is not a label map
 
 
 def read_mask(path: Path, size: tuple[int, int], calibrated: bool = False) -> Tensor:
@@ -281,7 +281,7 @@ def read_mask(path: Path, size: tuple[int, int], calibrated: bool = False) -> Te
         calibrated: see `open_picture`
 
     Raises:
-        ProgdfError: as `open_picture`, or the picture is a label map in several colors.
+        ProgdfError: see `open_picture`, or the picture is a label map in several colors.
     """
     picture = open_picture(path, size, calibrated, two_values=True)
     alpha = _varying_alpha(picture)

@@ -28,7 +28,7 @@ def decode_json(content: bytes | str) -> Any:
     """Parse a JSON text. All numbers are finite, all texts encodable, and the nesting is bounded.
 
     Raises:
-        ValueError: the text is no JSON, repeats a key, or breaks one of these rules; one line.
+        ValueError: the text is not JSON, repeats a key, or breaks one of these rules; one line.
     """
     try:
         value = json.loads(
@@ -68,7 +68,7 @@ def read_json(path: Path, kind: type[_T]) -> _T:
     """Read a small JSON file of this program as `kind`, see `convert_json`.
 
     Raises:
-        ProgdfError: the file is missing, no regular file, damaged or larger than 1 MB; one line.
+        ProgdfError: the file is missing, not a regular file, damaged or larger than 1 MB; one line.
     """
     content = read_file(path, _MAX_BYTES + 1)
     try:

@@ -54,7 +54,7 @@ def camera_chunk(
 
 
 def edits_in_picture(path: str | os.PathLike[str]) -> str:
-    """Return the names of the edits stored in a .png, or ""; raise ProgdfError if it is no picture."""
+    """Return the names of the edits stored in a .png, or ""; raise ProgdfError if it is not a picture."""
     return picture_text(path, EDITS_KEY) or ""
 
 
@@ -62,7 +62,7 @@ def up_in_picture(path: str | os.PathLike[str]) -> object:
     """Return the up axis stored in a picture as decoded JSON, for `up_from_json`; None if there is none.
 
     Raises:
-        ProgdfError: the file is no picture.
+        ProgdfError: the file is not a picture.
     """
     text = picture_text(path, UP_KEY)
     with contextlib.suppress(ValueError):
@@ -87,7 +87,7 @@ def find_picture_camera(
         The camera, named like the picture, with the size of the rendering and without a lens.
 
     Raises:
-        ProgdfError: the file is no picture, the camera is invalid, or no camera or several are found.
+        ProgdfError: the file is not a picture, the camera is invalid, or no camera or several are found.
     """
     path = Path(path)
     camera = camera_in_picture(path, origin)

@@ -42,7 +42,7 @@ class FileRef(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Reference to a file that a session needs."""
 
     file: str  # as written, with forward slashes; relative to the session's folder
-    sha256: str  # of the file's bytes, lower-case hexadecimal
+    sha256: str  # hash of the file's bytes, lower-case hexadecimal
 
     def __post_init__(self) -> None:
         if not self.file or "\0" in self.file:
@@ -100,7 +100,7 @@ def reference(path: Path, folder: Path) -> FileRef:
     """Return the reference to a file for a session in `folder`, with its hash.
 
     Raises:
-        ProgdfError: the file cannot be read; or as `relative_name`.
+        ProgdfError: the file cannot be read; see also `relative_name`.
     """
     return FileRef(relative_name(path, folder), sha256(path.resolve()))
 
@@ -121,7 +121,7 @@ def read_session(path: str | os.PathLike[str], kind: type[File]) -> File:
     """Read a session file as `kind`. The files that it names are not opened, see `verify_files`.
 
     Raises:
-        ProgdfError: the file cannot be read, is no session, has a newer version, or has invalid contents.
+        ProgdfError: the file cannot be read, is not a session, has a newer version, or has invalid contents.
     """
     name = Path(path).name
     content = read_file(path, _MAX_BYTES + 1)
@@ -171,8 +171,8 @@ def verify_files(path: Path, session: SessionFile) -> tuple[Path, tuple[Path, ..
             )
         if sha256(file) != ref.sha256.lower():
             raise ProgdfError(
-                f"{path.name} was saved with another {file.name} than {file} holds now; "
-                "put that file back or save a new session"
+                f"{path.name} was saved with a {file.name} that differs from {file}; "
+                "put the original file back or save a new session"
             )
         files.append(file)
     return files[0], tuple(files[1:])

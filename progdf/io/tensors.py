@@ -55,7 +55,7 @@ def tensor_specs(tensors: Mapping[str, Tensor]) -> dict[str, tuple[tuple[int, ..
 
 
 def check_tensor(name: str, tensor: Tensor, shape: Sequence[int | None], *types: torch.dtype) -> None:
-    """Raise ValueError if a tensor has another shape or type.
+    """Raise ValueError if a tensor has the wrong shape or type.
 
     Args:
         name: name of the tensor for the error
@@ -103,7 +103,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: the file is no safetensors file of this program, or is damaged.
+        ValueError: the file is not a safetensors file of this program, or is damaged.
     """
     try:
         with safe_open(path, framework="pt") as opened:
@@ -161,7 +161,7 @@ def inflate(packed: Tensor, shape: Sequence[int], dtype: torch.dtype) -> Tensor:
     """Decompress the output of `deflate` to a given shape. [B] uint8 -> [...] int8 or uint8
 
     Raises:
-        ValueError: the bytes are no zlib stream, or do not hold exactly as many numbers.
+        ValueError: the bytes are not a zlib stream, or do not hold exactly as many numbers.
     """
     size = check_levels(shape)
     if packed.dtype != torch.uint8 or packed.ndim != 1:
@@ -169,7 +169,7 @@ def inflate(packed: Tensor, shape: Sequence[int], dtype: torch.dtype) -> Tensor:
     try:
         content = zlib.decompressobj().decompress(packed.numpy().tobytes(), size + 1)
     except zlib.error as error:
-        raise ValueError(f"levels are no zlib stream ({error})") from None
+        raise ValueError(f"levels are not a zlib stream ({error})") from None
     if len(content) != size:
         raise ValueError(f"{len(content)} packed levels, expected {list(shape)}")
     return torch.from_numpy(np.frombuffer(content, np.int8).copy()).view(dtype).view(*shape)
@@ -183,7 +183,7 @@ def open_npy(path: str | os.PathLike[str], what: str = "numbers") -> NDArray[Any
         what: meaning of the numbers, for errors
 
     Raises:
-        ProgdfError: the file does not exist, or is no numeric .npy file.
+        ProgdfError: the file does not exist, or is not a numeric .npy file.
     """
     check_regular(path)
     try:

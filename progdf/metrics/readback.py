@@ -17,10 +17,10 @@ from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.sh import C0
 from progdf.terminal import format_count
 
-SCALE_TOLERANCE = 0.05  # of a log-scale: 5 %; .spz has steps of 1/16, so it is off by 1/32 at most
+SCALE_TOLERANCE = 0.05  # log-scale: 5 %; .spz has steps of 1/16, so it is off by 1/32 at most
 OPACITY_TOLERANCE = 0.01
 COLOR_TOLERANCE = 0.02  # 0 to 1
-SH_TOLERANCE = 0.1  # of a coefficient of bands above 0; .spz has steps of 1/8
+SH_TOLERANCE = 0.1  # coefficient of a band above 0; .spz has steps of 1/8
 ANGLE_TOLERANCE_DEG = 3.0
 
 FLOAT_ROUNDING = 2.0**-22

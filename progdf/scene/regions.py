@@ -290,7 +290,7 @@ def parse_region(
 
 
 def _doubt(kind: str, count: int, total: int) -> str:
-    """Return why a part that selects `count` of `total` Gaussians is probably not intended, or ""."""
+    """Return a warning if a part that selects `count` of `total` Gaussians is probably unintended, or ""."""
     if not count:
         return "selects no Gaussian"
     if kind == "flood" and count < _MIN_FLOOD_GAUSSIANS:
@@ -357,7 +357,7 @@ def read_labels(path: str, count: int) -> Tensor:
     """Read one integer label per Gaussian from a .npy file. [count] int64
 
     Raises:
-        ProgdfError: the file is missing, is no .npy, or does not hold one integer per Gaussian.
+        ProgdfError: the file is missing, is not a .npy file, or does not hold one integer per Gaussian.
     """
     labels = _open_labels(path)
     if labels.shape not in ((count,), (count, 1)):
@@ -372,7 +372,7 @@ def read_members(path: str, count: int) -> Tensor:
     """Read rows from a .npy file of integers or of one bool per Gaussian. Sorted and unique, [M] int64
 
     Raises:
-        ProgdfError: the file is missing, is no .npy, has another type, or names rows outside the scene.
+        ProgdfError: the file is missing, not a .npy, of the wrong type, or names rows outside the scene.
     """
     stored = _open_members(path)
     if stored.dtype.kind == "b":

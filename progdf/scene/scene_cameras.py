@@ -138,7 +138,7 @@ def load_scene_cameras(
 
 
 def scene_cameras_beside(path: Path, scene: Gaussians) -> list[Camera]:
-    """Return the cameras beside a scene's file that have its middle in their picture, in its frame.
+    """Return the cameras beside a scene's file whose pictures contain its middle, in its frame.
 
     A log line reports cameras that all look past it. The check renders nothing, because the cameras are only
     used to find the up axis.
@@ -246,7 +246,7 @@ def _read_transforms(file: Path) -> tuple[Tensor, float]:
     """Return a rigid transform, [4,4] float64, and the scale that follows it.
 
     Raises:
-        ProgdfError: the file is damaged, or its transform is no rotation and translation.
+        ProgdfError: the file is damaged, or its transform is not a rotation and translation.
     """
     try:
         content = convert_json(decode_json(read_file(file)), _Transforms)

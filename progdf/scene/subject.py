@@ -124,7 +124,7 @@ def fit_camera(
 
 
 def is_room(scene: Gaussians, up: Tensor) -> bool:
-    """Return whether a ceiling hides the scene from outside. A far sky is background and no ceiling."""
+    """Return whether a ceiling hides the scene from outside. A far sky is background, not a ceiling."""
     return has_ceiling(scene[_without_background(scene, _sample(scene))], up)
 
 

@@ -293,7 +293,7 @@ class _Shape:
             "wider foot": foot / float(wide.prod().sqrt()),
             "blurred underside": min(max(blurring, -1.5), 1.5),
             "faint strays below": -float((self.strays @ up) @ self.stray_weights),
-            # a ground carries objects; a flat sheet is no ground
+            # a ground carries objects; a flat sheet is not a ground
             "ground plane": _ground_plane(
                 height,
                 (plan - _quantiles(plan, 0.02)) / wide,

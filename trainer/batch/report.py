@@ -49,7 +49,7 @@ class JobRow:
 
     job: str  # key of the job
     status: Status  # stopped: by Ctrl-C; memory: ran out of memory and is restarted
-    reason: str = ""  # why the job is not done, in one line
+    reason: str = ""  # reason why the job is not done, in one line
     psnr_end: float | None = None  # full edit against the editor's pictures on held-out views, dB
     psnr_between: float | None = None  # worst strength below 1, dB
     bytes: int | None = None  # size of the .gdf

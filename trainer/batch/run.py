@@ -64,7 +64,7 @@ class Task:
 
 
 class Pool(Protocol):
-    """A pool of workers."""
+    """Pool of worker processes that run tasks."""
 
     name: str
 

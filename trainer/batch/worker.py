@@ -48,7 +48,7 @@ class Finding:
     """Result of checking a job before the start."""
 
     key: str  # key of the job
-    fault: str = ""  # why it cannot be trained, in one line
+    fault: str = ""  # reason why it cannot be trained, in one line
     gaussians: int = 0  # number in the scene
     members: int = 0  # number in the region; 0 if a network has to find it
 
@@ -169,7 +169,7 @@ def serve() -> None:
             with suppress(EOFError):
                 while True:
                     queue.put(pickle.load(tasks))
-        finally:  # the batch has ended, or sends tasks of another version: save the state of the running job
+        finally:  # the batch has ended, or its version differs: save the state of the running job
             signal_main_thread()
             queue.put(None)  # if the signal is ignored
 

@@ -40,7 +40,7 @@ class Adapter:
     """Call signature and defaults of one diffusers pipeline."""
 
     model: str  # id of the weights on the Hugging Face hub
-    # Values that the model was made for: steps, guidance (how closely it follows the instruction) and
+    # Recommended values of the model: steps, guidance (how closely it follows the instruction) and
     # image_guidance (how closely it follows the picture). None: the pipeline has no such argument.
     steps: int
     guidance: float | None
@@ -87,7 +87,7 @@ class Adapter:
         image_guidance: float | None,
     ) -> dict[str, object]:
         """Return the keyword arguments of a call that are in `known`, all except `generator`."""
-        width, height = pictures[0].size  # of the view
+        width, height = pictures[0].size  # size of the view
         values = {
             "num_inference_steps": steps,
             self.guidance_word: guidance,
@@ -242,7 +242,7 @@ def memory_need(adapter: Adapter, sizes: Mapping[str, int], quantize: str, size:
     """Estimate the GPU memory that painting takes.
 
     Args:
-        adapter: of the pipeline
+        adapter: adapter of the pipeline
         sizes: number of parameters by component
         quantize: see `EditorOptions.quantize`
         size: side of a square of the painted area, pixels

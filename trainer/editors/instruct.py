@@ -141,7 +141,7 @@ class InstructEditor:
             strength: 0 returns `source`, 1 the model's output
             softness: share of the steps over which the weight of the model's prediction rises from 0 to 1
             source: result at strength 0, as large as `picture`; None: `picture`. [H,W,3]
-            seed: of the noise; None: the editor's
+            seed: seed of the noise; None: the editor's
 
         Raises:
             ProgdfError: weights are missing or broken, or the GPU runs out of memory.
@@ -173,7 +173,7 @@ def instruct(given: EditorInput) -> InstructEditor:
 
     @cache
     def pipeline() -> MixedSteps:
-        # place it again: the previous model is unloaded by then
+        # choose the device again: the previous model is unloaded by now
         return last_model(
             "pipeline",
             (request, options.device),
@@ -189,7 +189,7 @@ def check_instruct(what: str, options: EditorOptions) -> None:
 
     Raises:
         ProgdfError: the instruction is empty, a package or weights are missing or truncated, an option does
-            not apply, or the anchor is no picture, has no camera, or the model accepts no reference
+            not apply, or the anchor is not a picture, has no camera, or the model accepts no reference
             pictures.
     """
     request = resolve_request(what, options)

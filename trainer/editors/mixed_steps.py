@@ -42,7 +42,7 @@ class MixedSteps:
     """A pipeline with mixed steps. Make it before anything else wraps the pipeline's network.
 
     Args:
-        pipeline: of diffusers, with an Euler scheduler (`euler_scheduler`)
+        pipeline: pipeline of diffusers, with an Euler scheduler (`euler_scheduler`)
         encodes_alone: encode the prompt once, without the picture (see `encode`)
     """
 

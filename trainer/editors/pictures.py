@@ -365,7 +365,7 @@ class FolderEditor:
         """See `ImageEditor.edit`.
 
         Raises:
-            ProgdfError: the picture is missing, broken or of another shape.
+            ProgdfError: the picture is missing, broken or has a different shape.
         """
         if strength == 0.0:
             return view.image

@@ -123,7 +123,7 @@ def evaluate(options: EvaluateOptions) -> list[Evaluation]:
     """Measure a finished run, or all runs of a batch, and print the table.
 
     Raises:
-        ProgdfError: the folder is no finished run, one of its files is damaged, or its scene is missing or
+        ProgdfError: the folder is not a finished run, one of its files is damaged, or its scene is missing or
             differs.
     """
     use_threads(options.threads)

@@ -45,7 +45,7 @@ class WarpedPair:
     # by source of the pictures: target's box, and the source warped onto it where both see. [h,w,3] each
     pictures: dict[str, tuple[Tensor, Tensor]]
     both: Tensor  # mask of the compared pixels. [h,w] bool
-    depth: Tensor  # of the edited scene in the target's box, world units; 0 where it is not opaque. [h,w]
+    depth: Tensor  # edited scene in the target's box, world units; 0 where it is not opaque. [h,w]
 
 
 @dataclass(frozen=True)
@@ -223,7 +223,7 @@ def warp_view(image: Tensor, source: SeenDepth, target: SeenDepth) -> tuple[Tens
 FRAMES = 5
 """Frames from one view to the next on the path."""
 
-_MAX_PATH_VIEWS = 6  # of the run's views on the path; straight lines between distant ones cross the object
+_MAX_PATH_VIEWS = 6  # views of the run on the path; straight lines between distant ones cross the object
 
 
 def camera_path(cameras: Sequence[Camera]) -> list[Camera]:
@@ -246,7 +246,10 @@ def camera_path(cameras: Sequence[Camera]) -> list[Camera]:
 
 
 def clip_consistency(opened: OpenedRun) -> tuple[float | None, str]:
-    """Return the consistency of CLIP's direction along a path at strength 1, −1 to 1; or None and why not."""
+    """Return the consistency of CLIP's direction along a path at strength 1, −1 to 1.
+
+    If it is undefined, the result is None and the reason.
+    """
     try:
         clip = load_clip(CLIP_MODEL)
     except ProgdfError as error:

@@ -88,7 +88,7 @@ def open_run(root: Path, scene: Path | None = None) -> OpenedRun:
         scene: new path of the scene, if it has moved
 
     Raises:
-        ProgdfError: the folder is no finished run, or one of its files or the scene is missing or damaged.
+        ProgdfError: the folder is not a finished run, or one of its files or the scene is missing or damaged.
     """
     run = reopen_run(root, scene)
     try:

@@ -79,7 +79,7 @@ def draft_views(options: TrainingViewOptions, scene: Gaussians, region: Region) 
 
 
 def _glance_view(scene: Gaussians, region: Region, glance: RegionThumbnail) -> tuple[View, ColorView]:
-    """Return a glance as views of one pixel row."""
+    """Return a thumbnail of the region as views of one pixel row."""
     background = torch.tensor(BACKGROUND)
     drawn = glance.map.picture(glance.colors.clamp_min(0.0))
     others = (1.0 - glance.mask[:, None]) * background
@@ -120,7 +120,7 @@ def draft_grade(views: DraftViews, options: EditorOptions, name: str) -> Gdf | N
     test views, dB.
 
     Returns:
-        The grade; None if the editor is no function of color, or if the grade leaves more than
+        The grade; None if the editor is not a function of color, or if the grade leaves more than
         `MAX_UNEXPLAINED_SHARE` of the edit. A manual grade is always returned.
 
     Raises:

@@ -226,7 +226,7 @@ def _measure_choice(choice: FieldChoice, trajectory: Trajectory, reporting: Eval
 
 
 def expected_renders(trajectory: Trajectory, kind: FieldKind) -> int:
-    """Return about how often `fit_field` renders its views, for a progress bar."""
+    """Return the approximate number of renders of all views by `fit_field`, for a progress bar."""
     snapshots = min(len(trajectory), MAX_FITTED_SNAPSHOTS)
     moving = len(moving_attributes(trajectory.offsets))
     fitting = SAMPLES if kind == "lossless" else (1 + moving) * snapshots + 6 * SAMPLES
@@ -239,7 +239,7 @@ def evaluate_field(
     """Measure an existing field, a network's, beside the same baselines."""
     evaluator = field_evaluator(trajectory, reporting, target)
     network = evaluator.candidate(field, field.kind)
-    why = f"a network was asked for{'; none' if network.excess > 1.0 else ' and'} {evaluator.wanted}"
+    why = f"a network was requested{'; none' if network.excess > 1.0 else ' and'} {evaluator.wanted}"
     choice = FieldChoice(network, network.excess <= 1.0, (network,), why)
     return _measure_choice(choice, trajectory, reporting)
 

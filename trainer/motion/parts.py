@@ -119,7 +119,7 @@ class GroupSearch:
     parts: Parts
     crops: Sequence[CropScene]  # the training views
     steps: int = 120  # steps per search, each in one view
-    seed: int = 0  # of the view order
+    seed: int = 0  # seed of the view order
 
     def find(self, targets: Sequence[Tensor], start: Motion, on_step: OnStep | None = None) -> Motion:
         """Return the motion of the parts that brings the views closest to their targets.
@@ -227,7 +227,7 @@ def descend(
         rates_at: steps done -> step length of each column. [C]
         steps: total
         views: number of views; drawn in random order without replacement, then again
-        seed: of the order
+        seed: seed of the order
         damping: share of a column's typical gradient added to Adam's denominator: hardly visible rows stay
             in place
         on_step: progress

@@ -267,7 +267,7 @@ class WarpSearch:
     part: Tensor  # connected part of each member. [M] int64
     crops: Sequence[CropScene]  # the training views
     steps: int = 120  # steps per level, each in one view
-    seed: int = 0  # of the view order
+    seed: int = 0  # seed of the view order
 
     @cached_property
     def levels(self) -> tuple[ControlPoints, ...]:

@@ -127,9 +127,9 @@ def group_stage(
         targets: per stage, the edited box of each view. [h,w,3] each
         steps: per search; a stage takes one or two searches, and one per level of control points if it is
             bent
-        seed: of the view order
+        seed: seed of the view order
         on_step: progress: steps done in all, with `steps` per stage however many it takes; loss
-        strengths: of the stages; evenly spaced if not given
+        strengths: strengths of the stages; evenly spaced if not given
 
     Raises:
         FloatingPointError: the loss is not finite.
@@ -178,7 +178,7 @@ def bend_groups(
     Args:
         groups: parts moved as wholes
         search: search that found their motions
-        targets, strengths: of the stages
+        targets, strengths: target pictures and strengths of the stages
         on_step: progress: stage, steps done in it, loss
 
     Returns:

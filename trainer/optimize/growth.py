@@ -51,7 +51,7 @@ def seed_rows(
         views: some views of it
         targets: edited pictures of these. [H,W,3] each
         count: maximum number of rows
-        seed: of the random sampling
+        seed: seed of the random sampling
     """
     scene = setup.scene
     cameras = [view.camera for view in views]
@@ -100,11 +100,11 @@ def _place_pixels(
     """Return the nearest position of each pixel at which the views that can see it show its color.
 
     Args:
-        index: of the view
+        index: index of the view
         pixels: row by row. [n]
-        cameras, targets: of all views
-        depths: of the original in all views; positions behind them are hidden
-        center: of the region; the search range around it is as deep as the view is wide there
+        cameras, targets: cameras and edited pictures of all views
+        depths: depths of the original in all views; positions behind them are hidden
+        center: center of the region; the search range around it is as deep as the view is wide there
 
     Returns:
         positions [n,3]; True for positions that enough views can see [n] bool
@@ -193,7 +193,7 @@ def removal_costs(crops: Sequence[CropScene], rows: Tensor, targets: Sequence[Te
         crops: training views
         rows: raw member rows. [M,C]
         targets: target pictures of these views. [h,w,3] each
-        seed: of the signs
+        seed: seed of the signs
     """
     draw = torch.Generator().manual_seed(seed)
     logit = attribute_slices(rows.shape[1])["logit_opacities"]

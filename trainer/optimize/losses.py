@@ -131,7 +131,7 @@ def progressive_change(
         grows: True for the printed exponent +t/50, which forces shorter and shorter steps; False for −t/50,
             which relaxes the constraint
         over: mean or sum over the members
-        alpha, beta: of the paper
+        alpha, beta: constants of the paper
     """
     period = 50.0
     factor: float = alpha * beta ** ((step if grows else -step) / period)

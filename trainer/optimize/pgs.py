@@ -52,7 +52,7 @@ class PgsState:
 
     Args:
         rows: packed raw rows of the members; the state starts exactly at these. [M,C]
-        seed: of the view order
+        seed: seed of the view order
 
     Attributes:
         moved: offsets of the members, a leaf that takes gradients. [M,C]
@@ -104,7 +104,7 @@ class PgsState:
         (docs/lab/experiments.md, Rates and steps).
 
         Args:
-            gradient: of the loss by `moved`. [M,C]
+            gradient: gradient of the loss by `moved`. [M,C]
             rates: learning rate of each column. [C]
             length: factor to all rates
             raised: raise ε as above; False is Adam as published
@@ -243,7 +243,7 @@ class PgsSettings:
     growth: float = math.inf  # maximum growth of a Gaussian beyond its stage's placement
     snapshots: int = SNAPSHOTS  # approximate number of recordings over all stages
     every: int = 0  # record at this interval of steps; 0: by visible change
-    seed: int = 0  # of the view order
+    seed: int = 0  # seed of the view order
 
 
 def pgs_settings(

@@ -41,7 +41,7 @@ class Ties:
 
         Args:
             residual: [M,b,3]
-            weights: of the members, in units of the sum of a member's ties; 0: the residual is meaningless.
+            weights: weights of the members, in sums of a member's ties; 0: the residual is meaningless.
                 [M]
             ridge: pull to 0 in the same unit
         """

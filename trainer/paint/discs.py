@@ -101,9 +101,9 @@ def place_discs(
         scene: the original
         paint: see `PaintedView`
         flat: maximum root mean square color error of one disc over its pixels, 0..1
-        gap: distance in pixels between a disc and the Gaussians moved behind it, which are wide and visible
-            from the sides too
-        cleared: the scene as other paint has moved it
+        gap: distance in pixels between a disc and the Gaussians moved behind it. Those are wide, so they
+            are visible from the sides too
+        cleared: the scene after the moves for other paint
     """
     camera = paint.camera
     cleared = scene if cleared is None else cleared

@@ -47,16 +47,16 @@ _BLOCK_PX = 17  # a 16-pixel JPEG block with subsampled chroma, around its cente
 _SOFT_EDGE_PX = 8  # width of a soft edge, at the lifting size
 _MIN_WIDTH_PX = 2  # narrower changes are noise
 _MAX_GAP_PX = 5  # wider gaps stay open
-_MAX_HOLE_SHARE = 0.002  # of the picture; smaller holes in the change are closed
-_MIN_CHANGED_SHARE = 0.5  # of a member's visible weight, in changed pixels
+_MAX_HOLE_SHARE = 0.002  # share of the picture; smaller holes in the change are closed
+_MIN_CHANGED_SHARE = 0.5  # share of a member's visible weight, in changed pixels
 _COVERED_CLEARNESS = 0.5  # below it, more than half of the visible color belongs to occluders
 _BOUNDARY_PX = 3.0  # maximum excess width of a mask; half the depth of thinner pieces
-_MIN_INNER_SHARE = 0.1  # of a connected piece's visible weight, inside that boundary; with less it is a stray
-_BOUNDARY_SHARE = 0.3  # of a member's visible weight along the boundary, from which its surface decides
-_NEGLIGIBLE_SHARE = 1e-3  # of the inner weight of the largest piece
-_OUTLIER_COLOR_DISTANCE = 0.06  # from nearly all visible members
-_VOTED_SCORE_MARGIN = 0.001  # above the minimum score
-_OUTLIER_SHARE = 0.01  # of the visible members, which may lie on the boundary
+_MIN_INNER_SHARE = 0.1  # share of a piece's visible weight inside that boundary; a piece with less is a stray
+_BOUNDARY_SHARE = 0.3  # share of a member's visible weight on the boundary, from which its surface decides
+_NEGLIGIBLE_SHARE = 1e-3  # share of the largest piece's inner weight
+_OUTLIER_COLOR_DISTANCE = 0.06  # color distance from nearly all visible members
+_VOTED_SCORE_MARGIN = 0.001  # distance above the minimum score
+_OUTLIER_SHARE = 0.01  # share of the visible members, which may lie on the boundary
 
 
 def changed_region(
@@ -86,7 +86,7 @@ def changed_region(
         small_cameras.append(fit_size(camera.resize(change.shape[1], change.shape[0]), LIFTED_AT))
         masks.append(_close_gaps(_shrink_mask(change, small_cameras[-1])))
     if not any(bool(mask.any()) for mask in masks):
-        raise ProgdfError("the pictures differ nowhere from the scene; change them, or name the region")
+        raise ProgdfError("the pictures do not differ from the scene; change them, or name the region")
     min_score = _MIN_CHANGED_SHARE if threshold is None else threshold
     covered = covered_rows(scene, small_cameras)
     evidence = gather(scene, small_cameras, masks)
@@ -101,7 +101,7 @@ def changed_region(
     region = _drop_strays(scene, candidates, evidence, inner, min_score)
     if not len(region):
         raise ProgdfError(
-            "no Gaussian lies mostly where the pictures differ; change more, or name the region with --region"
+            "no Gaussian lies mostly in changed pixels; change more, or name the region with --region"
         )
     if say is not None:
         share = sum(float(mask.float().mean()) for mask in masks) / len(masks)

@@ -82,7 +82,7 @@ def drop_strays(
 def find_holes(
     scene: Gaussians, member: Tensor, views_outside: Tensor, say: Callable[[str], None] | None = None
 ) -> Tensor:
-    """Return the Gaussians to add: surrounded by members, and not seen outside the masks by two views.
+    """Return the Gaussians to add: surrounded by members, and not visible outside the masks in two views.
 
     Args:
         scene: N Gaussians

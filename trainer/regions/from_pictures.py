@@ -126,7 +126,7 @@ def region_kinds(request: RegionRequest) -> dict[str, Kind]:
                 f"none of the {count} masks in {folder} has a bright pixel; paint the object white on black"
             )
         if request.say is not None and count < len(masks):
-            request.say(f"{count} of {len(masks)} cameras have a mask; the others tell nothing")
+            request.say(f"{count} of {len(masks)} cameras have a mask; the others are ignored")
         return _lift(scene, cameras, masks, f"{kind}:{text}", request)
 
     def from_text(text: str, scene: Gaussians) -> Region:

@@ -22,7 +22,7 @@ THRESHOLDS: dict[LiftRule, float] = {"share": 0.7, "paper": 0.8}
 """Minimum score of a member under each rule."""
 
 HIDDEN = 0.06
-"""Clearness below which a Gaussian counts as never seen, as its pixels show its occluders."""
+"""Clearness below which a Gaussian counts as not visible, as its pixels show its occluders."""
 
 _HALF_HIDDEN = 0.3
 """Clearness below which a mixed share does not decide."""

@@ -32,7 +32,7 @@ _SIGMA_DISTANCE = 2.0
 _SIGMA_OFF_PLANE = 0.5
 _SIGMA_ANGLE = 0.18  # radians between the normals
 _SIGMA_COLOR = 0.16  # sRGB, length of the difference
-_FLOAT32_ERROR = 1e-6  # of squares of about 1, summed over a pixel
+_FLOAT32_ERROR = 1e-6  # error of squares of about 1, summed over a pixel
 _THICKNESS_SIGMAS = 3.0  # standard deviations that contain nearly all of a surface
 _SIGMA_SIZE = 0.25  # natural logarithm of the three scales, length of the difference
 

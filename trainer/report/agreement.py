@@ -30,7 +30,7 @@ _MAX_UNEXPLAINED = 0.4  # midway between edits that agree and edits that do not,
 _MAX_UNEXPLAINED_FINE = 0.5  # calm styles leave up to 0.47, stripes of random phase 0.55 and more
 _MIN_CONTRAST = 0.8  # washed-out views agree, but have lost fine contrast
 _INVISIBLE_ERROR_DB = 28.0  # smaller errors are not visible, whatever their share of a faint change
-_CG_STEPS = 6  # of conjugate gradients
+_CG_STEPS = 6  # steps of conjugate gradients
 DAMPING = 1e-3  # share of the first step's curvature; barely visible members keep their color
 
 
@@ -38,7 +38,7 @@ DAMPING = 1e-3  # share of the first step's curvature; barely visible members ke
 class Agreement:
     """Agreement of the edited views with one scene."""
 
-    psnr: float  # of the best colors on held-out views, over pixels that show the region or change, dB
+    psnr: float  # PSNR of the best colors on held-out views, over pixels that show the region or change, dB
     unexplained: float  # share of the change's energy there that these colors leave, 0 is best
     # the same share of the fine part, which varies within 9 pixels at half size
     unexplained_fine: float = 0.0

@@ -191,14 +191,14 @@ def measure(
 
 
 def expected_measures(trajectory: Trajectory) -> int:
-    """Return about how often `measure` renders its views, for a progress bar."""
+    """Return the approximate number of renders of all views by `measure`, for a progress bar."""
     return 30 + 2 * len(trajectory.stage_strengths) + 2 * _RECORDING_SAMPLES
 
 
 def clip_curve(
     evaluator: Evaluator, views: Sequence[View], field: BakedField, texts: TextOptions
 ) -> Direction:
-    """Measure the CLIP directional similarity of the whole held-out views, or return the reason why not.
+    """Measure the CLIP directional similarity of the whole held-out views; return the reason if it fails.
 
     Args:
         evaluator: held-out views
@@ -302,7 +302,7 @@ def _round4(value: float) -> float:
 
 @dataclass(frozen=True)
 class PaintReproduction:
-    """Share of the painting on pictures that the edit reproduces."""
+    """Share of the paint on the pictures that the edit reproduces."""
 
     reached: float  # reproduced share of the painted change's energy, 0 to 1
     missing: float  # RMS color difference between painting and edit over the painted pixels

@@ -67,12 +67,12 @@ SOFTNESS = 0.25
 """Share of the denoising over which the render's influence fades out; the remainder is free."""
 
 MAX_MOVED = 0.05
-"""Maximum shift (share of the longer side) or zoom at which an answer is aligned with its view."""
+"""Maximum shift (share of the longer side) or zoom at which a painted picture is aligned with its view."""
 
 
 @dataclass(frozen=True)
 class Registration:
-    """Alignment of an answer: a point at `p` from the view's center is found at (1 + zoom) p + shift."""
+    """Alignment of painted pixels: a point at `p` from the view's center is found at (1 + zoom) p + shift."""
 
     shift: tuple[float, float] = (0.0, 0.0)  # x, y, shares of the longer side
     zoom: float = 0.0
@@ -83,7 +83,7 @@ class Registration:
         return max(abs(self.shift[0]), abs(self.shift[1]), abs(self.zoom))
 
     def lay(self, picture: Tensor) -> Tensor:
-        """Return the answer, moved back; unchanged bit for bit if it moved less than 0.25 pixels. [H,W,3]"""
+        """Return the painted picture, moved back; the same bits if it moved less than 0.25 pixels. [H,W,3]"""
         longer = max(picture.shape[:2])
         if self.size * longer < 0.25:
             return picture
@@ -211,7 +211,7 @@ class PaintCache:
         """Return the painted frame of a view, aligned with its original, and its motion, see `Registration`.
         [h,w,3]
 
-        The frame is None if the answers to two seeds moved too far to be aligned.
+        The frame is None if the pictures of two seeds moved too far to be aligned.
 
         Args:
             view: the view to paint
@@ -358,7 +358,7 @@ class _PaintingLoop:
         self._calls = 0
 
     def paint(self, view: View, place: str, **how: Any) -> None:
-        """Paint a view. If the answer cannot be aligned with it, the previous picture stays."""
+        """Paint a view. If the result cannot be aligned with it, the previous picture stays."""
         picture, moved = self._easel.paint(view, place, **how)
         self._calls += 1
         self._advance(self._calls, place)
@@ -444,7 +444,7 @@ def agree_views(
             anchor
 
     Raises:
-        ProgdfError: no answer can be aligned with its view.
+        ProgdfError: no painted picture can be aligned with its view.
     """
     follows = easel.painter.references > 0
     views, anchors = painting_order(setup, SIDE if follows else math.pi)

@@ -72,7 +72,7 @@ class Trial:
     """Result of a trial run."""
 
     steps: int  # per approach
-    psnrs: Mapping[Approach, float]  # of each approach in the held-out views, dB
+    psnrs: Mapping[Approach, float]  # PSNR of each approach in the held-out views, dB
     unedited: float  # PSNR of the original in these views, dB
 
     @property

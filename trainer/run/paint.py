@@ -56,7 +56,7 @@ _MISSED_COLOR = 0.05  # color error from which a painted pixel counts as missed 
 _ROUNDING_COLOR = 1.5 / 255  # two 8-bit images may differ by this much through rounding
 _ERROR_SIGMA_PX = 2.0  # sigma of the Gaussian filter over the squared error
 _VISIBILITY_STEPS = 12  # steps in strength between which the visible change is measured
-_OPACITY_CHANNEL = 10  # of a packed row, see `attribute_slices`
+_OPACITY_CHANNEL = 10  # column of a packed row, see `attribute_slices`
 
 
 @dataclass(frozen=True)

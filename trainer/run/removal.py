@@ -46,7 +46,7 @@ def is_removal(options: TrainOptions, setup: TrainingSetup, log: RunLog) -> bool
     decision.
 
     Recoloring can reproduce any paint, also the background behind the region, so its success is no evidence
-    against removal. But if most of the paint equals the scene without the region, the pictures intend a
+    against removal. But if most of the paint equals the scene without the region, the pictures show a
     removal.
 
     Args:

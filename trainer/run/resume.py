@@ -27,11 +27,11 @@ from trainer.options import MAX_THREADS, TrainOptions, flat_values
 from trainer.resolve import count_threads, recorded_options, resolve
 from trainer.store.run_folder import RunFolder, begin_log, remove_leftovers
 
-_VERSION = 7  # of the saved state; 7: with few pictures, training chooses how to constrain their mask
+_VERSION = 7  # version of the saved state; 7: with few pictures, training chooses how to constrain their mask
 _SWITCHES = (
     "NUMBA_CPU_FEATURES", "MKL_ENABLE_INSTRUCTIONS", "MKL_CBWR", "OPENBLAS_CORETYPE", "ONEDNN_MAX_CPU_ISA",
 )  # fmt: skip
-_SOG_SUFFIXES = (".json", ".webp")  # of the files of an unpacked .sog
+_SOG_SUFFIXES = (".json", ".webp")  # suffixes of the files of an unpacked .sog
 
 REGION = "region"
 """Part of the saved state with the region's members and score."""
@@ -248,7 +248,7 @@ def plan_difference(was: TrainOptions, now: TrainOptions) -> str:
 
 
 def _plain(name: str, value: Any) -> Any:
-    """Return a value in comparable form: absolute paths, and None if 0 stands for the default."""
+    """Return a value for comparison: absolute paths, and None for a 0 that stands for the default."""
     if name in ("views", "image_size", "stages"):
         value = value or None
     return value.resolve() if isinstance(value, Path) else value

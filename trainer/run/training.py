@@ -312,7 +312,7 @@ def plan_colors(
 def pixel_stride(setup: TrainingSetup) -> int:
     """Return the stride over the views' pixels for the solver, see `color_views`: the largest with enough
     pixels."""
-    degree = min(2, setup.scene.sh_degree)  # of the residual
+    degree = min(2, setup.scene.sh_degree)  # degree of the residual
     # the bands that half a sphere of directions can determine
     unknowns = (degree + 1) * (degree + 2) // 2 * len(setup.region)
     region_pixels = sum(int((view.mask > 0.0).sum()) for view in setup.train)

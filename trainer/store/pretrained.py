@@ -16,7 +16,7 @@ from safetensors import SafetensorError, safe_open
 from progdf.errors import ProgdfError
 
 BROKEN = (OSError, ValueError, RuntimeError, KeyError, TypeError, SafetensorError)
-"""Exceptions of transformers and diffusers for a model that is missing, incomplete or of another type."""
+"""Exceptions of transformers and diffusers for a model that is missing, incomplete or of the wrong type."""
 
 _T = TypeVar("_T")
 

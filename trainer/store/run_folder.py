@@ -256,7 +256,7 @@ def read_views(
     """Return the pictures of the cameras' views, see `stored_pictures`. [H,W,3] each
 
     Raises:
-        ProgdfError: a picture is missing, broken, or of another size than its camera.
+        ProgdfError: a picture is missing, broken, or differs in size from its camera.
     """
     remedy = "train again, with --resume if the run was stopped"
 

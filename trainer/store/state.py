@@ -232,7 +232,7 @@ class StateFolder:
             raise self.damage_error(self._file(part, None), type(error).__name__) from error
 
     def clear(self) -> None:
-        """Remove everything, run.json first, so that leftovers are no run. Links are not followed."""
+        """Remove everything, run.json first, so that leftovers are not a run. Links are not followed."""
         if self.path.is_symlink():
             return
         self._run.unlink(missing_ok=True)

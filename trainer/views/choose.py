@@ -50,7 +50,7 @@ From more cameras, the best spread ones are selected without rendering.
 
 _MAX_TILT = 45.0  # degrees between the up axes of cameras and scene, as cameras are usually held level
 
-_SMALL_SHARE = 0.25  # of a picture; the median view of a scene usually fills more
+_SMALL_SHARE = 0.25  # share of a picture; the median view of a scene usually fills more
 
 _MIN_COVER = 0.25
 """Minimum visible area of the region, as a share of the median view's; views with less are dropped."""
@@ -81,9 +81,9 @@ def load_given_cameras(options: TrainingViewOptions, scene: Gaussians) -> SceneC
         if median < _SMALL_SHARE:
             name = "the scene" if options.scene is None else os.fspath(options.scene)
             raise ProgdfError(
-                f"{options.cameras} is probably not of the frame of {name}: the cameras are tilted by "
+                f"{options.cameras} is probably not in the frame of {name}: the cameras are tilted by "
                 f"{tilt:.0f}° and show the scene in {100 * median:.2g} % of a picture (median); put "
-                f"nerfstudio's {TRANSFORMS_FILE} beside the scene, give cameras of its frame, or add "
+                f"nerfstudio's {TRANSFORMS_FILE} beside the scene, give cameras in its frame, or add "
                 "--cameras-anyway"
             )
     if not shape.certain:
@@ -116,7 +116,7 @@ class ViewChoice:
     """Chosen views of an edit."""
 
     views: tuple[View, ...]  # in the order of the cameras' list
-    shown: Visibility  # of the members in these views
+    shown: Visibility  # visibility of the members in these views
     offered: int  # number of cameras to choose from
     unseeing: int  # number of cameras that do not see the region
     scant: int  # number of cameras that show less than a quarter of the median view's area

@@ -35,7 +35,7 @@ INSIDE = (
 
 _MIN_BOX = 64  # pixels per side that LPIPS needs
 _SEEN = 0.05  # member weight above which a pixel shows the region
-_PIXEL_STRIDE = 23  # along the rows, for glances
+_PIXEL_STRIDE = 23  # stride of a thumbnail's sampled pixels, in row-major order
 _CHANGED = 0.05  # difference of a channel above which a pixel counts as changed
 
 
@@ -134,7 +134,7 @@ class RegionThumbnail(NamedTuple):
 def make_glances(
     scene: Gaussians, region: Region, cameras: Sequence[Camera], count: int
 ) -> list[RegionThumbnail]:
-    """Return glances from the first `count` cameras that show the region."""
+    """Return thumbnails from the first `count` cameras that show the region."""
     activated = activate(scene, torch.zeros_like(scene.means))
     members = scene[region.members]
     degree = min(scene.sh_degree, 3)

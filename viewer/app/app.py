@@ -64,7 +64,7 @@ def run(splash: Splash, opens: Callable[[], Opened], draw: str = "auto") -> int:
         The exit status, 0.
 
     Raises:
-        ProgdfError: as `opens`.
+        ProgdfError: see `opens`.
     """
     with interruptible(), ThreadPoolExecutor(2) as workers:
         draws = workers.submit(_draw_once) if draws_with(splash.context, draw) == "cpu" else None

@@ -149,7 +149,7 @@ def draw(dialog: Dialog, pressed: Sequence[str], ui: UiContext, area: Area) -> D
 
 
 def _content(dialog: Dialog, pressed: Sequence[str], ui: UiContext, bottom: float) -> DialogResult:
-    """Draw the content of a dialog. `bottom`: its maximum lower edge, window pixels"""
+    """Draw the content of a dialog. `bottom`: limit of its lower edge, window pixels"""
     with imgui_ctx.push_font(ui.fonts.bold, 0.0):
         imgui.text(TITLES[dialog.kind])
     wrapped_text(_HINTS[dialog.kind].format(escape_text(Path(dialog.text).name)), PALETTE.dim)

@@ -56,7 +56,7 @@ def edit_picture(main_view: MainView, path: Path) -> None:
     """Put an edited picture into the form of a new edit, and move the view to its camera.
 
     Raises:
-        ProgdfError: it is no picture, its camera is not found, or it was taken with edits on.
+        ProgdfError: it is not a picture, its camera is not found, or it was taken with edits on.
     """
     camera = find_picture_camera(path, origin=main_view.facts.origin)
     if edits := edits_in_picture(path):
@@ -106,7 +106,7 @@ class EditActions:
             name: name of the layer, "" for the edit's name
 
         Raises:
-            ProgdfError: the file is missing or broken, or it is no grade and was made for another scene.
+            ProgdfError: the file is missing or broken, or it is not a grade and was made for another scene.
         """
         before = self._app.main_view.work.view
         scene = self._app.document.original
@@ -126,7 +126,7 @@ class EditActions:
         The state does not change: strength, gains, paint, order, selection and undo history stay.
 
         Raises:
-            ProgdfError: as for `add`.
+            ProgdfError: see `add`.
         """
         document = self._app.document
         view = self._app.main_view.work.view
@@ -156,7 +156,7 @@ class EditActions:
         """Replace a layer's edit; a grade of another scene, or of none, takes the layer's region.
 
         Raises:
-            ProgdfError: as for `add`.
+            ProgdfError: see `add`.
         """
         view = self._app.main_view.work.view
         index = self.layer(layer)
@@ -225,7 +225,7 @@ class FileActions:
 
     @property
     def requests(self) -> Requests:
-        """Requests for files.
+        """Handlers of the requests about files, by name.
 
         `save:THEN` and `save_as:THEN` request THEN afterwards. `save_to`, `overwrite`, `open_file`,
         `restore_autosave` and `discard_autosave` name a file. `duplicate` and `replace` take a layer's index,
@@ -255,7 +255,7 @@ class FileActions:
         }
 
     def _open_keys(self, _: str) -> None:
-        """Write a file with all key bindings, if none exists, and open it in the desktop's program for it."""
+        """Open the file of key bindings in its default program; create it with all keys if it is missing."""
         keys = {action: command.keys.split() for action, command in COMMANDS.items()}
         path = write_keys(keys)
         webbrowser.open(path.as_uri())

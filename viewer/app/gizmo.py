@@ -26,7 +26,7 @@ class Gizmo:
 
     does: Literal["transform", "duplicate"]
     center: tuple[float, float, float]  # center of the selection, where the handles start
-    # from the original to the current place, about the center; world axes. [4,4]
+    # from the original to the current position, about the center; world axes. [4,4]
     matrix: NDArray[np.float64]
     using: bool = False  # the mouse drags a handle
 
@@ -61,7 +61,7 @@ class Gizmo:
 
     @property
     def is_moved(self) -> bool:
-        """True if the selection is not at its original place."""
+        """True if the selection is not at its original position."""
         return not np.allclose(self.matrix, np.eye(4), atol=1e-9)
 
     @property

@@ -146,7 +146,7 @@ class MainView:
         self._keys = NO_KEYS  # keys of the current frame
         self._held = False  # an item of the interface was active in the last frame, by mouse or keyboard
         self._popups = 0, 0  # number of open popups at the start of the last frame and of this one
-        self._half = 0  # of two pictures side by side, the one under the mouse: 0 left, 1 right
+        self._half = 0  # picture under the mouse if two are side by side: 0 left, 1 right
         self._clock = 0.0
         self._pending = PendingKeys()
         self._resting = False

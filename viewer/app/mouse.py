@@ -79,8 +79,8 @@ class MouseTool:
 
     # one of `keys.DRAGS`, `DIVIDER`, `PAINT_DRAG`, `SELECT_DRAG` or `AXES_DRAG`; None without a drag
     drag: str | None = None
-    stroke: Stroke | None = None  # of the brush, from its first drag on
-    gesture: Gesture | None = None  # of a selection tool; for a polygon also between its clicks
+    stroke: Stroke | None = None  # brush stroke, from its first drag on
+    gesture: Gesture | None = None  # gesture of a selection tool; for a polygon also between its clicks
     # the last click of a tool that selects by one click, while it follows the tool's tolerance
     click: Click | None = None
     strokes: tuple[Strokes, ...] = ()  # strokes that a tool spreads, one entry per change
@@ -195,7 +195,7 @@ def handle_mouse(tool: MouseTool, work: Workspace, pointer: PointerContext) -> t
 def cancel_drag(tool: MouseTool, work: Workspace) -> Workspace:
     """Restore the state from before the drag.
 
-    Edits come back from the undo history. Settings of the tools and the divider are no edits and come back
+    Edits come back from the undo history. Settings of the tools and the divider are not edits and come back
     from `tool`.
     """
     work = workspace.cancel_drag(work)

@@ -37,7 +37,7 @@ from viewer.ui.keys import Keys
 from viewer.ui.pointer import PointerContext
 
 _STROKE_PX = 4.0  # at 1×: half a stroke's width
-_MAX_PLACES = 16  # sampled places
+_MAX_PLACES = 16  # sampled positions
 _MAX_DOTS = 300  # dots
 _MIN_SEED_SHARE = 0.1  # a seed contributes at least this fraction of a pixel's color
 
@@ -48,21 +48,21 @@ Point = tuple[float, float]
 class Brushed:
     """Gaussians that a brush can reach, and those it has touched."""
 
-    centers: Centers  # of all Gaussians
+    centers: Centers  # centers of all Gaussians
     reachable: Mask  # Gaussians that are not occluded, or all. [N]
-    touched: Mask  # so far. [N]
+    touched: Mask  # Gaussians touched so far. [N]
 
 
 @dataclass(frozen=True)
 class Gesture:
     """Selection gesture in progress."""
 
-    tool: str  # of `SELECT_TOOLS`
-    mode: str  # of `SELECT_MODES`
+    tool: str  # one of `SELECT_TOOLS`
+    mode: str  # one of `SELECT_MODES`
     before: bytes  # selection before the gesture, packed
     path: tuple[Point, ...]  # pointer positions, pixels of the picture; the corners of a polygon
-    brushed: Brushed | None = None  # of a brush
-    center: Vec3 | None = None  # of a sphere, world units
+    brushed: Brushed | None = None  # state of a brush
+    center: Vec3 | None = None  # center of a sphere, world units
     scale: float = 0.0  # world units per pixel at the center
 
     @property
@@ -77,7 +77,7 @@ class Strokes:
 
     on: Rows  # Gaussians under strokes on the object
     beside: Rows  # Gaussians under strokes next to it
-    after: bytes  # selection that resulted, packed
+    after: bytes  # selection afterwards, packed
 
 
 @dataclass(frozen=True)
@@ -85,12 +85,12 @@ class Click:
     """Click of "flood" or "color", which follows its tolerance until something else is selected."""
 
     tool: str  # "flood" or "color"
-    mode: str  # of `SELECT_MODES`
+    mode: str  # one of `SELECT_MODES`
     before: bytes  # selection before the click, packed
     at: Point  # pixels of the picture
     surface: Surface  # surface of the scene on screen at the click
     options: tuple[float, bool]  # tolerance and depth of the last selection
-    after: bytes  # selection that resulted, packed
+    after: bytes  # selection afterwards, packed
     recorded: bytes  # selection in the undo history, packed
 
 

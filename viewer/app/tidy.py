@@ -48,7 +48,7 @@ class TidyActions:
 
     @property
     def requests(self) -> Requests:
-        """Requests for the selection and for the handles that move it."""
+        """Handlers of the requests about the selection and the handles that move it, by name."""
         return {
             "remove_selected": lambda _: self._begin("remove"),
             "move_selected": lambda _: self._begin("transform"),
@@ -87,7 +87,7 @@ class TidyActions:
         return [Step(gizmo.does, self._region, similarity(*gizmo.step))]
 
     def _place(self, _: str) -> None:
-        """Show the moved selection at the place of the handles."""
+        """Show the moved selection at the position of the handles."""
         if steps := self._steps():
             document = self._app.document
             gdf = tidy(document.original, steps, _NAMES[steps[0].does])
@@ -140,7 +140,7 @@ class StrayActions:
 
     @property
     def requests(self) -> Requests:
-        """Requests for strays."""
+        """Handlers of the requests about strays, by name."""
         return {"hide_strays": self._begin}
 
     def _begin(self, _: str) -> None:

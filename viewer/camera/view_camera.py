@@ -288,7 +288,7 @@ def fit(camera: ViewCamera, scene: Gaussians, aspect: float = 1.0) -> ViewCamera
     Args:
         camera: the camera
         scene: Gaussians to frame; if empty, the unit sphere at the origin is framed
-        aspect: width / height of the picture_axes
+        aspect: width / height of the picture
     """
     if not len(scene):
         return frame(camera, bounds_of(scene), aspect)

@@ -92,9 +92,9 @@ class ExportOptions:
     """Axes of a .glb: LUF (glTF, splat-transform) or RUB (OpenGL, .spz, .usdc)."""
     page: OmitArgPrefixes[PageOptions] = PageOptions()
     up: UpChoice = "auto"
-    """Up axis of a page; auto: as in the edits' training, else estimated from the ground."""
+    """Up axis of the page; auto: as used to train the edits, else estimated from the ground."""
     background: Annotated[str, word("COLOR")] = "white"
-    """Background of a page: #rrggbb, white or black."""
+    """Background of the page: #rrggbb, white or black."""
 
     @property
     def drawing(self) -> DrawingOptions:
@@ -308,7 +308,7 @@ def parse_background(text: str) -> Vec3:
     """Return the color of `#rrggbb`, "white" or "black", 0..1.
 
     Raises:
-        ProgdfError: it is no color.
+        ProgdfError: it is not a color.
     """
     red, green, blue = parse_color({"white": "#ffffff", "black": "#000000"}.get(text.lower(), text)).tolist()
     return red, green, blue

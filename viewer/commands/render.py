@@ -63,7 +63,7 @@ from .stack_options import parse
 DEFAULT_SIZE = (640, 480)
 _PROGRESS_INTERVAL_S = 0.5
 _LONGEST_S = 120.0  # maximum duration of a turntable
-_SWEEP_S = 2.0  # duration of a slider's way there and back
+_SWEEP_S = 2.0  # duration of a slider's sweep from 0 to 1 and back
 EXCLUSIVE_OPTIONS = ("sweep", "sheet", "split", "difference", "timeline", "turntable")
 """Options that choose the kind of picture; only one may be given."""
 
@@ -81,9 +81,9 @@ def export(argv: Sequence[str]) -> int:
     if options.frames is not None and not 2 <= options.frames <= scene_file.MAX_FRAMES:
         raise ProgdfError(f"--frames takes 2 to {scene_file.MAX_FRAMES} steps, not {options.frames}")
     if ending != PAGE and (options.page, options.up, options.background) != (PageOptions(), "auto", "white"):
-        raise ProgdfError(f"{out} is no web page; leave out the options of .html pages")
+        raise ProgdfError(f"{out} is not a web page; leave out the options of .html pages")
     if ending != ".glb" and options.glb_axes != "LUF":
-        raise ProgdfError(f"{out} is no .glb; leave out --glb-axes")
+        raise ProgdfError(f"{out} is not a .glb; leave out --glb-axes")
     drawing = options.drawing if ending == PAGE else None
     opened = open_stack(options.stack, drawing, unset=1.0)
     check_not_an_input(out, opened.files)
@@ -128,14 +128,14 @@ def _export_frames(options: ExportOptions, opened: OpenStack) -> int:
     else:
         keys = _keys(opened)
         if not any(key.strengths for key in keys.keys):
-            raise ProgdfError("--timeline: it moves no slider, so all frames would be alike")
+            raise ProgdfError("--timeline: the timeline moves no slider, so all frames would be equal")
         steps = [*timeline.film_frames(keys)]
         rate = float(keys.fps)
         if options.frames is not None:
             steps = film.sheet_frames(keys, options.frames)
             rate *= (len(steps) - 1) / keys.length  # same duration
         if len(steps) > scene_file.MAX_FRAMES:
-            raise ProgdfError(f"--timeline: it has {len(steps)} frames; set their number with --frames N")
+            raise ProgdfError(f"--timeline: the film has {len(steps)} frames; limit them with --frames N")
         states = (timeline.state_at(keys, frame, opened.view) for frame in steps)
         scenes = (_compose(document, state, 1.0, whole) for state in states)
         what = "frames of the timeline"
@@ -305,7 +305,7 @@ def _keys(opened: OpenStack) -> Timeline:
     """Return the session's timeline."""
     if not opened.view.timeline.keys:
         raise ProgdfError(
-            "--timeline: there is no key on it; set some with K in the window, and save a session"
+            "--timeline: the timeline has no keys; set some with K in the window, and save a session"
         )
     return opened.view.timeline
 
@@ -344,7 +344,7 @@ def _check_visible(name: str, view: ViewState, option: str) -> str:
     check_edit(name, view.layers, option)
     group = next(layer.group for layer in view.layers if layer.name == name)
     if any(known.name == group and not known.strength for known in view.groups):
-        raise ProgdfError(f"{option} {name}: its group {group} is at 0, so nothing would change; raise that")
+        raise ProgdfError(f"{option} {name}: its group {group} is at 0, so nothing would change; raise it")
     solo_layers = [layer.name for layer in view.layers if layer.solo]
     if solo_layers and name not in solo_layers:
         raise ProgdfError(
@@ -464,7 +464,7 @@ def parse_size(text: str) -> tuple[int, int]:
     """Return width and height of `WxH` in pixels.
 
     Raises:
-        ProgdfError: it is no size, or a side is not 1 to `LARGEST_SIDE`.
+        ProgdfError: it is not a size, or a side is not 1 to `LARGEST_SIDE`.
     """
     width, cross, height = text.lower().partition("x")
     if not cross or not all(re.fullmatch(r"[0-9]{1,9}", side) for side in (width, height)):

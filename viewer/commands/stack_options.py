@@ -66,7 +66,7 @@ class DrawingOptions:
     """Drawing settings of a scene."""
 
     up: UpChoice = "auto"
-    """Up axis of the scene; auto: as in the edits' training, else from the ground, else −y."""
+    """Up axis of the scene; auto: as used to train the edits, else from the ground, else −y."""
     background: Annotated[str, word("COLOR")] = "white"
     """Background: #rrggbb, white or black."""
     engine: Annotated[Literal["auto", "gl", "cpu"], word(aliases=["--draw"])] = "auto"

@@ -34,7 +34,7 @@ class Presenter:
         Args:
             picture: the picture
             framebuffer: target
-            size: width and height, px; None for the picture's own size, another size scales it smoothly
+            size: width and height, px; None for the picture's own size; a different size scales it smoothly
             left: first column, px
         """
         size = size or picture.size
@@ -65,7 +65,7 @@ class ScreenCopy:
 
     Args:
         ctx: GL context
-        size: width and height that the picture fills, px; a picture of another size is scaled smoothly
+        size: width and height that the picture fills, px; a picture of a different size is scaled smoothly
         left: first column in the framebuffer, px
     """
 

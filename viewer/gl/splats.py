@@ -51,8 +51,7 @@ class SplatRenderer:
     The CPU engine, like 3DGS, skips a Gaussian that would reduce a pixel's transmittance to 1e-4 or below,
     and all Gaussians behind it. Back-to-front blending draws them, as it does not know the later Gaussians in
     front. The difference is at most 0.01 of a color, 76 to 80 dB in a picture. Without that rule the engines
-    agree
-    to 120 dB and more.
+    agree to 120 dB and more.
     """
 
     def __init__(self, ctx: moderngl.Context) -> None:

@@ -51,7 +51,7 @@ class Child:
     """Running command.
 
     Args:
-        arguments: words after `progdf`
+        arguments: command-line arguments after `progdf`
         log: file for its output
         talks: the command reads its standard input, and `output` returns what it prints; it must end by
             itself when its input ends. The user waits for it, so it keeps the window's priority

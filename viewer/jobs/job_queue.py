@@ -73,11 +73,11 @@ _COUNT = re.compile(r"^((?:frame )?(\d+)(?:/| of )(\d+)(?:: [^:\n]+)?)", re.MULT
 
 @dataclass(frozen=True)
 class Delivery:
-    """Command that writes a file or a folder; stopped, it leaves nothing."""
+    """Command that writes a file or a folder. It leaves no files if it is stopped."""
 
     name: str  # title of its card
     out: Path
-    words: tuple[str, ...]  # words after `progdf`
+    words: tuple[str, ...]  # command-line arguments after `progdf`
     log: Path  # file for its output
     scene: Path  # the source file
 
@@ -90,7 +90,7 @@ class Delivery:
         return self.out
 
     def arguments(self, resumes: bool) -> tuple[str, ...]:
-        """Return the words after `progdf`."""
+        """Return the command-line arguments after `progdf`."""
         return self.words
 
     def read_progress(self, before: Progress) -> Progress:

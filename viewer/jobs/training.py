@@ -133,7 +133,7 @@ class NewEdit:
     quick: bool = True  # a draft in a third of the time
     preview: bool = True  # show the editor's own picture of the current view
     strength: float = 1.0  # strength of that picture, 0..1
-    error: str = ""  # one line why training cannot begin, "" if it was not tried
+    error: str = ""  # reason why training cannot begin, in one line; "" if it was not tried
 
     @property
     def choice(self) -> EditorChoice:
@@ -316,7 +316,7 @@ class EditOrder:
     camera: str = ""  # file of that camera
 
     def arguments(self, resumes: bool = False) -> list[str]:
-        """Return the words after `progdf`."""
+        """Return the command-line arguments after `progdf`."""
         words = ["train", str(self.scene), f"--out={self.out}", f"--region={self.region}"]
         words += [f"--editor={self.editor}", f"--name={self.name}", f"--threads={self.threads}"]
         given = {"model": self.model, "anchor": self.anchor, "at": self.at, "camera": self.camera}
@@ -354,7 +354,7 @@ class EditOrder:
 
     @property
     def is_locked(self) -> bool:
-        """True if another window, or a process, has the run; this window must not hold it itself."""
+        """True if another window or process holds the run's lock; this window must not hold it."""
         return atomic.is_locked(self._beside(WINDOW_LOCK)) or atomic.is_locked(self.out / atomic.LOCK)
 
     @contextlib.contextmanager

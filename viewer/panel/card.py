@@ -264,7 +264,7 @@ def _focus_bar(clip: tuple[imgui.ImVec2, imgui.ImVec2], color: Rgba, scale: floa
 def _head(
     work: Workspace, index: int, row: LayerRow, active: bool, texture: int, ui: UiContext, actions: list[str]
 ) -> tuple[Workspace, CardTouch]:
-    """Draw visibility, thumbnail, name and toggles. Reserve the number's place; it is drawn once the
+    """Draw visibility, thumbnail, name and toggles. Reserve space for the number; it is drawn once the
     slider has its value."""
     scale = ui.scale
     compact = is_compact(work)

@@ -15,7 +15,7 @@ from viewer.ui.context import PALETTE, Rgba, u32
 from viewer.ui.widgets import is_entered, is_released, key_step, tip
 
 HEIGHT_PX = 20.0  # at 1×, same as its text field, so that typing moves nothing
-RADIUS_PX = 7.0  # of the handle, at 1×
+RADIUS_PX = 7.0  # radius of the handle, at 1×
 FINE = 0.1
 DEFAULT = 0.0
 """Strength of the original; a double click resets to it."""

@@ -40,7 +40,7 @@ _VIDEO_FILTER = (
 )
 """Filter that converts to these colors. Newer encoders read the tags from frames, older ones from options."""
 
-_WEBP_QUALITY = 85  # of 100: no visible blocks in a still
+_WEBP_QUALITY = 85  # 0 to 100; without visible blocks in a still
 _PALETTE_REACH = 8  # levels: Pillow finds the nearest palette color in steps of 4
 ANIMATIONS = (".gif", ".webp", VIDEO)
 _OPAQUE_FORMATS = (".gif", VIDEO)  # a .gif has no partial transparency
@@ -53,14 +53,14 @@ def to_pixels(image: NDArray[np.float32]) -> Pixels:
 
 
 def transparent_image(engine: ViewEngine, view: ViewState, camera: Camera) -> Pixels:
-    """Return the view with its coverage as alpha, the colors not multiplied by it. [H,W,4]"""
+    """Return the view with its coverage as alpha, and colors not premultiplied by it. [H,W,4]"""
     black = engine.image(replace(view, background=(0.0, 0.0, 0.0)), camera=camera).copy()
     white = engine.image(replace(view, background=(1.0, 1.0, 1.0)), camera=camera)
     return unmix(black, white)
 
 
 def unmix(black: NDArray[np.float32], white: NDArray[np.float32]) -> Pixels:
-    """Return the color and alpha of a picture by its renders on black and on white.
+    """Return the color and alpha of a picture from its renders on black and on white.
 
     [H,W,3] twice -> [H,W,4]
     """
@@ -95,7 +95,7 @@ def contact_sheet(names: Sequence[str], draw: Draw, view: ViewState) -> Pixels:
 
 
 def write_film(path: Path, frames: Iterable[Pixels], frames_per_second: int) -> None:
-    """Write frames of equal duration as they arrive: .gif or .webp, endless, or .mp4.
+    """Write frames of equal duration as they arrive: looping .gif or .webp, or .mp4.
 
     Frames are [H,W,3], for a .webp also [H,W,4]. A .gif has durations in hundredths of a second, so its
     frames alternate between slightly longer and shorter ones. No frame is shorter than 2 hundredths, as
@@ -205,7 +205,7 @@ Advance = Callable[[int, int], None]
 
 
 def check_output(out: Path, alpha: bool = False) -> None:
-    """Raise ProgdfError if `out` is no film, cannot hold transparency, or cannot be a folder of frames."""
+    """Raise ProgdfError if `out` is not a film, cannot hold transparency, or cannot be a folder of frames."""
     suffix = out.suffix.lower()
     if suffix not in (*ANIMATIONS, ""):
         raise ProgdfError(f"{out} cannot hold a film; write a .gif, a .webp, an .mp4 or a folder of frames")
@@ -247,7 +247,7 @@ def frames(
 
 
 def sheet_frames(keys: Timeline, count: int) -> list[int]:
-    """Return at most `count` evenly spaced frames from first to last. A ping-pong's way back adds none."""
+    """Return at most `count` evenly spaced frames from first to last. The return of a ping-pong adds none."""
     steps = max(count - 1, 1)
     return sorted({round(i * keys.length / steps) for i in range(count)})
 

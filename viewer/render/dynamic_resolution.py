@@ -251,7 +251,7 @@ class LiveScene:
         return self._pyramid
 
     def draw_fewer(self, draw: Callable[[ActivatedGaussians], T], camera: Camera, pixels: int) -> T | None:
-        """Draw as many Gaussians as the frame's time permits, and adapt the budget to the time taken_ms.
+        """Draw as many Gaussians as the frame's time permits, and adapt the budget to the time taken.
 
         Args:
             draw: draws the given Gaussians

@@ -59,7 +59,7 @@ def ground_plane(scene: Gaussians, up: Vec3) -> GroundPlane:
 
 
 def grid_lines(plane: GroundPlane, camera: Camera, background: Vec3) -> Lines:
-    """Project the grid lines in front family a camera.
+    """Project the grid lines in front of a camera.
 
     Args:
         plane: the ground plane

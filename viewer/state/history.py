@@ -15,7 +15,7 @@ from viewer.camera.view_camera import Vec3, ViewCamera, with_up
 from .selection import SelectionState
 from .view_state import Blend, Comparison, LayerGroup, LayerState, SnapshotPair, Timeline, ViewState
 
-LONGEST = 1000  # most entries; each takes a few hundred bytes, or some kilobytes with a selection
+LONGEST = 1000  # maximum entries; each takes a few hundred bytes, or some kilobytes with a selection
 
 
 @dataclass(frozen=True)

@@ -110,10 +110,10 @@ def move_layers(view: ViewState, indices: Collection[int], at: int, group: str =
 
 
 def step_layers(view: ViewState, indices: Collection[int], by: int) -> ViewState:
-    """Move layers passed the next one above (1) or below (−1), up to the ends of the stack.
+    """Move layers past the next one above (1) or below (−1), up to the ends of the stack.
 
     Layers that end up between two layers of a group join it. Layers that move away from their group leave it.
-    Whole groups move passed whole groups.
+    Whole groups move past whole groups.
     """
     passed = max(indices) + 1 if by > 0 else min(indices) - 1
     if not 0 <= passed < len(view.layers):

@@ -145,7 +145,7 @@ def slider_film(view: ViewState, gdfs: Sequence[int], fps: int, seconds: float) 
 
 
 def film_frames(timeline: Timeline) -> Iterator[int]:
-    """Yield the frames of one loop in playback order, including the way back of a ping-pong."""
+    """Yield the frames of one loop in playback order, including the return of a ping-pong."""
     yield from range(timeline.length + 1)
     if timeline.ping_pong:
         yield from range(timeline.length - 1, 0, -1)
@@ -203,7 +203,7 @@ class Player:
 
     frame: int = 0  # 0 to the timeline's length
     playing: bool = False  # whether playback is running
-    backwards: bool = False  # whether a ping-pong is on its way back
+    backwards: bool = False  # whether a ping-pong runs backwards
     part: float = 0.0  # elapsed share of the current frame's time, 0 to 1
     shown: bool = False  # whether the timeline bar is visible
     unfolded: bool = False  # whether the bar has a row for the camera and each layer

@@ -99,7 +99,7 @@ class Dialog:
     notice: str = ""  # one line about the desktop's file dialog, "" for none
     choosing: bool = False  # whether the desktop's file dialog is open
     chosen: str = ""  # file chosen in it
-    error: str = ""  # one line on why the path was rejected, "" if it was not tried
+    error: str = ""  # reason why the path was rejected, in one line; "" if it was not tried
     options: DeliverOptions | None = None  # options of the requested picture or film
 
 
@@ -139,9 +139,9 @@ class Workspace:
     help: bool = False  # whether the key list is open
     keyboard: str = ""  # part of the window with keyboard focus, one of `PLACES`, "" for the picture
     keyboard_by: int = 1  # direction of the last focus change, 1 or −1
-    palette: int | None = None  # active line of the command palette, −1 as it opens
+    palette: int | None = None  # active line of the command palette, −1 when it opens
     query: str = ""  # search text of the palette
-    history: bool | None = None  # state of the history list: True as it opens, then False, None if closed
+    history: bool | None = None  # state of the history list: True when it opens, then False, None if closed
     message: Message | None = None  # line at the bottom of the picture
     snapshots: tuple[SliderSnapshot, ...] = ()  # without the original
     # last saved state, see `saved_state`; None before the first

@@ -184,7 +184,7 @@ class UiContext:
 
 
 def _silence_imgui(silent: bool) -> None:
-    """Turn off imgui's own reports about items that were begun and not ended."""
+    """Turn off imgui's own reports about unclosed items."""
     io = imgui.get_io()
     io.config_error_recovery_enable_assert = not silent
     io.config_error_recovery_enable_debug_log = not silent

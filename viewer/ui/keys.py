@@ -336,7 +336,7 @@ def bound_chords(command: Command) -> list[str]:
 
 @cache  # tooltips and menus call this a hundred times per frame
 def chords(action: str) -> tuple[str, ...]:
-    """Return all chords of an action in the user's words; none for an unknown action."""
+    """Return all chords of an action as shown to the user; none for an unknown action."""
     bound = bound_chords(COMMANDS[action]) if action in COMMANDS else []
     return tuple(
         chord.replace("Delete", "Del").replace("Num", "Numpad ").replace("Escape", "Esc") for chord in bound
@@ -347,7 +347,7 @@ bind({})
 
 
 def shortcut(action: str) -> str:
-    """Return the first chord of an action in the user's words; "" if it has none."""
+    """Return the first chord of an action as shown to the user; "" if it has none."""
     return next(iter(chords(action)), "")
 
 
@@ -360,7 +360,7 @@ def describe(action: str, more: str = "") -> str:
 
 
 def match(query: str, name: str, beside: str = "") -> int | None:
-    """Return how well a name matches a query: 0 is best, None is no match.
+    """Return the rank of a name for a query: 0 is the best match, None means no match.
 
     Args:
         beside: other text to search if the name does not match

@@ -480,7 +480,7 @@ def choice_row(
 
 
 def swatch(color: tuple[float, float, float], alpha: float, edge: bool, ui: UiContext) -> None:
-    """Draw a small square of a color on the current line; `edge`: with an outline."""
+    """Draw a color swatch on the current line; `edge`: with an outline."""
     side = 12.0 * ui.scale
     tall = imgui.get_frame_height()
     x, y = imgui.get_cursor_screen_pos()

@@ -109,7 +109,7 @@ class Packed:
     """Content of a page."""
 
     data: bytes  # the container
-    scene: Gaussians  # the original as decoded by the page, in the scene's order; omitted rows are unseen
+    scene: Gaussians  # the original as decoded by the page, in the scene's order; omitted rows are invisible
 
 
 def pack(
@@ -208,7 +208,7 @@ def _scene(
 
 
 def _finite(scene: Gaussians) -> Gaussians:
-    """Return the scene with finite numbers. Rows with others, which no engine draws, become unseen."""
+    """Return the scene with finite numbers. Rows with others, which no engine draws, become invisible."""
     flat = {name: torch.from_numpy(_table(getattr(scene, name).detach().numpy())) for name in ATTRIBUTES}
     flat["log_scales"] = flat["log_scales"].clamp(min=-1e4)
     unseen = ~torch.cat(list(flat.values()), dim=1).isfinite().all(dim=1)
@@ -246,7 +246,7 @@ def _segments(
 
 
 def _ascending(places: NDArray[np.int64]) -> Tensor:
-    """Return the members on the page, in its order; the others have the place −1."""
+    """Return the members on the page, in its order; the others have the position −1."""
     present = np.flatnonzero(places >= 0)
     return torch.from_numpy(present[np.argsort(places[present])])
 
@@ -254,7 +254,7 @@ def _ascending(places: NDArray[np.int64]) -> Tensor:
 def _scene_part(
     arrays: Arrays, name: str, values: NDArray[Any], exact: bool, moves: bool
 ) -> tuple[dict[str, Any], NDArray[Any]]:
-    """Append rows of an attribute: float32, or 16 bits if an edit changes it and it is no color, else 8
+    """Append rows of an attribute: float32, or 16 bits if an edit changes it and it is not a color, else 8
     bits."""
     if exact:
         return arrays.add(values.astype(np.float32)), values

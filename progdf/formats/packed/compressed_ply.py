@@ -64,7 +64,7 @@ def read_compressed_ply(ply: PlyFile) -> tuple[Gaussians, tuple[str, ...]]:
         raise unsupported_error(name, f"{len(sh)} SH coefficients (0, 9, 24 or 45 are)", _CONVERT)
     wide = next((column for column, kind in sh.items() if kind != "u1"), None)
     if wide:
-        raise unsupported_error(name, f"'{wide}' of another type than uchar", _CONVERT)
+        raise unsupported_error(name, f"'{wide}' of a type other than uchar", _CONVERT)
     ranged = [_XYZ, _SCALES]
     if "min_r" in chunk:
         ranged.append(_RGB)
@@ -74,7 +74,7 @@ def read_compressed_ply(ply: PlyFile) -> tuple[Gaussians, tuple[str, ...]]:
         raise damage_error(name, f"a compressed .ply has {missing[0]}, and this one lacks it")
     other = next((column for column in _PACKED if vertex[column] != "u4"), None)
     if other:
-        raise unsupported_error(name, f"'{other}' of another type than uint", _CONVERT)
+        raise unsupported_error(name, f"'{other}' of a type other than uint", _CONVERT)
     elements = ["chunk", "vertex"]
     if sh:
         elements.append("sh")

@@ -57,7 +57,7 @@ def read_splat(path: str | os.PathLike[str]) -> Gaussians:
     Opacities of 0 and 1 give infinite logits; the caller repairs them.
 
     Raises:
-        ProgdfError: the size of the file is no multiple of 32 bytes.
+        ProgdfError: the size of the file is not a multiple of 32 bytes.
     """
     content = read_file(path)
     if len(content) % _SPLAT_DTYPE.itemsize:

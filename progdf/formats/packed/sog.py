@@ -90,7 +90,7 @@ class SogScene:
 
 
 def read_table(path: Path) -> dict[str, Any] | None:
-    """Return the table of a SOG scene, or None if the file is no SOG scene.
+    """Return the table of a SOG scene, or None if the file is not a SOG scene.
 
     Args:
         path: a zip archive, or the meta.json of a folder
@@ -214,7 +214,7 @@ def _load_images(path: Path, meta: _Meta, count: int) -> list[Bytes]:
         try:
             decoded = np.asarray(image.convert("RGBA"))
         except Exception as error:  # each format's reader raises its own errors
-            raise damage_error(path, f"{file} is no readable image ({type(error).__name__})") from None
+            raise damage_error(path, f"{file} is not a readable image ({type(error).__name__})") from None
         if index == _PALETTE_INDEX:
             rows.append(decoded.reshape(-1, image.width // _PALETTE_COLUMNS, 4))
         else:
@@ -228,7 +228,7 @@ def _lerp(path: Path, part: _Part, name: str, shares: npt.NDArray[np.floating]) 
     edges = []
     for key, numbers in (("mins", part.mins), ("maxs", part.maxs)):
         if not isinstance(numbers, list) or len(numbers) != channels:
-            raise damage_error(path, f"{name}.{key} is no list of {channels} numbers")
+            raise damage_error(path, f"{name}.{key} is not a list of {channels} numbers")
         edges.append(np.array(numbers))
     low, high = edges
     values: npt.NDArray[np.float64] = low + (high - low) * shares
@@ -242,7 +242,7 @@ def _codebook(path: Path, part: _Part, name: str) -> npt.NDArray[np.float64]:
     """
     values = part.codebook
     if values is None or len(values) != 256 or any(value is None for value in values[1:]):
-        raise damage_error(path, f"{name}.codebook is no list of 256 numbers")
+        raise damage_error(path, f"{name}.codebook is not a list of 256 numbers")
     book = np.array([0.0 if value is None else value for value in values])
     if values[0] is None:
         book[0] = book[1] + (book[1] - book[255]) / 255.0
@@ -281,7 +281,7 @@ def _higher_bands(path: Path, meta: _Meta, images: list[Bytes], count: int) -> F
         low = part.mins
         high = part.maxs
         if not isinstance(low, float | int) or not isinstance(high, float | int):
-            raise damage_error(path, "shN.mins and shN.maxs are no numbers")
+            raise damage_error(path, "shN.mins and shN.maxs are not numbers")
         values = low + (high - low) * (colors / 255.0)
     else:
         values = _codebook(path, part, "shN")[colors]
@@ -301,7 +301,7 @@ def _open_image(path: Path, name: str) -> Image.Image:
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limit below is lower
             image = Image.open(io.BytesIO(content), formats=_IMAGE_FORMATS)
     except Exception as error:  # each format's reader raises its own errors
-        raise damage_error(path, f"{name[:80]} is no image ({type(error).__name__})") from None
+        raise damage_error(path, f"{name[:80]} is not an image ({type(error).__name__})") from None
     base, each = _MAX_PIXELS
     if image.width * image.height > base + each * scene_bytes(path):
         raise damage_error(path, f"{name} claims {image.width}x{image.height} pixels, more than it can hold")

@@ -434,7 +434,7 @@ def blend_backward(
 
     Args:
         out: result of `blend`; the image is not read
-        gradients: of the loss to the image and to the transmittance; its `last` is not read
+        gradients: gradients of the loss to the image and to the transmittance; its `last` is not read
         grad_mask: rows that get gradients; [0] selects all. [N] bool
         sums: out, one row per slot; not set for rows outside `grad_mask`. [I,9] float32
     """
@@ -482,7 +482,7 @@ class Runs(NamedTuple):
     rows: Array  # Gaussian of each run, 0..M−1. [R] int32
     counts: Array  # number of entries of each run, in run order. [R] uint16
     firsts: Array  # pixel of each run's first entry, in row-major order of the window. [R] int32
-    pixels: Array  # pixel of each entry, from its run's first. [E] uint16, or uint32 in wide windows
+    pixels: Array  # offset of each entry from its run's first pixel. [E] uint16, or uint32 in wide windows
     weights: Array  # αT of each entry. [E] float32
 
 

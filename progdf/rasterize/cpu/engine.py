@@ -360,7 +360,7 @@ def add_channels(runs: Runs, values: Array, image: Array) -> None:
 def add_gradients(runs: Runs, gradient: Array, by_colors: Array) -> None:
     """Add Σ w·g to the gradient of each color.
 
-    gradient: of the image, [h·w,3] float32; by_colors: [M,3] float32
+    gradient: gradient of the image, [h·w,3] float32; by_colors: [M,3] float32
     """
     end = np.uint64(0)
     for run in range(runs.rows.size):

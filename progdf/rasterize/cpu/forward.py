@@ -290,7 +290,7 @@ def largest_extents(camera: Pinhole, scene: Scene, i: int) -> tuple[bool, float,
 def extents(
     camera: Pinhole, mean: Vec, z: float, largest: float, opacity: float
 ) -> tuple[float, float, float, float]:
-    """Return the center and the squares of half the sides of a box around the support, in pixels.
+    """Return the center and the squared half extents of a box around the support, in pixels.
 
     Args:
         largest: largest of the scales, world units
@@ -483,7 +483,7 @@ def bin_splats(order: Array, tiles: Array, counts: Array, tile_count: int, with_
 
     Args:
         order: rows of the splats, nearest first. [V] int32
-        tiles, counts: of all rows, see `find_tiles`. [I], [N]
+        tiles, counts: tiles of all rows and their numbers, see `find_tiles`. [I], [N]
         tile_count: number of tiles in the window
         with_slots: fill `TileLists.slots`
     """

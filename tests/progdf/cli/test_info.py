@@ -181,7 +181,7 @@ def test_cameras_and_up_options_are_for_scenes_only(
         line.startswith("up: +z")
         for line in lines_of(capsys, "info", str(tmp_path / "scene.ply"), "--up", "+z")
     )
-    assert "is no scene" in error_of(capsys, "info", str(tmp_path / "c.json"), "--up", "+z")
+    assert "is not a scene" in error_of(capsys, "info", str(tmp_path / "c.json"), "--up", "+z")
 
 
 def test_info_of_any_other_file_is_reported_in_one_line(

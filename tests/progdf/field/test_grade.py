@@ -412,7 +412,7 @@ def test_grade_of_another_scene_maps_the_colors_of_this_scene(
 def test_only_a_bounded_grade_applies_to_a_foreign_region(tmp_path: Path) -> None:
     scene, other = random_gaussians(300), random_gaussians(90, seed=5)
     save_gdf(tmp_path / "bent.gdf", edit_of(other, torch.arange(12), curved_field(12), "bent"))
-    with pytest.raises(ProgdfError, match="bent is no grade: its field is separable"):
+    with pytest.raises(ProgdfError, match="bent is not a grade: its field is separable"):
         load_gdf(tmp_path / "bent.gdf", scene, place=lambda stored: whole_scene(scene))
     rows = pack(other[torch.arange(40)], with_shN=False)
     form = some_form(rows)

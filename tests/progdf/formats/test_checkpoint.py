@@ -158,7 +158,7 @@ def test_archives_that_torch_does_not_write_are_named(tmp_path: Path) -> None:
     assert "a compressed archive" in refusal(load_scene, rewritten(path, bytes, zipfile.ZIP_DEFLATED))
     with zipfile.ZipFile(tmp_path / "b.pt", "w") as archive:
         archive.writestr("readme.txt", "hello")
-    assert "no checkpoint of torch" in refusal(load_scene, tmp_path / "b.pt")
+    assert "not a checkpoint of torch" in refusal(load_scene, tmp_path / "b.pt")
     with zipfile.ZipFile(tmp_path / "c.pt", "w") as archive:
         archive.writestr("c/data.pkl", b"")
         archive.writestr("c/constants.pkl", b"")
@@ -172,7 +172,7 @@ FOREIGN = {
     "web page": (b"<html></html>", "is a web page"),
     "empty": (b"", "is empty"),
     "text": (b"hello", "is a text file"),
-    "noise": (b"\xff\x81" * 40, "is no checkpoint of torch"),
+    "noise": (b"\xff\x81" * 40, "is not a checkpoint of torch"),
     "Parquet": (b"PAR1" + b"a" * 40, "is a Parquet table"),
     "safetensors": (b"\x40\0\0\0\0\0\0\0" + b'{"means": {}}', "is a safetensors file, but no scene"),
 }

@@ -160,7 +160,7 @@ def test_edit_writes_the_chosen_axes(
     assert main([*words, "b.glb"]) == 0
     assert b'"axes": "RUB"' in Path("b.glb").read_bytes()
     assert main([*words, "b.ply"]) == 2
-    assert "b.ply is no .glb; leave out --glb-axes" in capsys.readouterr().err
+    assert "b.ply is not a .glb; leave out --glb-axes" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("start", AXES)

@@ -130,9 +130,9 @@ def test_sog1_positions_are_within_half_a_step(tmp_path: Path) -> None:
         ({"quats.encoding": "euler"}, "quats.encoding 'euler'"),
         ({"shN.quantization": 6}, "shN.quantization 6"),
         ({"model": "2dgs"}, "the model '2dgs'"),
-        ({"means.mins": [0.0, 0.0]}, "is damaged: means.mins is no list of 3 numbers"),
-        ({"sh0.maxs": [1.0, 1.0, 1.0]}, "is damaged: sh0.maxs is no list of 4 numbers"),
-        ({"shN.mins": [0.0]}, "shN.mins and shN.maxs are no numbers"),
+        ({"means.mins": [0.0, 0.0]}, "is damaged: means.mins is not a list of 3 numbers"),
+        ({"sh0.maxs": [1.0, 1.0, 1.0]}, "is damaged: sh0.maxs is not a list of 4 numbers"),
+        ({"shN.mins": [0.0]}, "shN.mins and shN.maxs are not numbers"),
         ({"means.shape": [5000, 3]}, "means_l.webp has 48 pixels for 5000 Gaussians"),
         ({"means.shape": []}, "holds 0 Gaussians"),
         ({"means.files": ["means_l.webp"]}, "means names 1 images, the format has 2"),
@@ -153,7 +153,7 @@ def test_future_sog_versions_are_refused_by_number(version: int, tmp_path: Path)
 
 def test_short_codebook_of_sog2_is_damage(tmp_path: Path) -> None:
     folder = change_table(unpacked_sog2(tmp_path / "robot"), {"scales.codebook": [0.0] * 255})
-    assert "scales.codebook is no list of 256 numbers" in refusal(load_scene, folder)
+    assert "scales.codebook is not a list of 256 numbers" in refusal(load_scene, folder)
 
 
 def test_empty_first_codebook_entry_continues_the_others(tmp_path: Path) -> None:

@@ -165,7 +165,7 @@ def test_duplicate_member_is_damage(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["a\nb.ply", "a\x1b[2J.ply"])
 def test_control_characters_in_names_are_refused(tmp_path: Path, name: str) -> None:
     members = {"a.session.json": SESSION, name: b"1"}
-    assert_refused(write_zip(tmp_path / "a.progdf.zip", members), "no plain file")
+    assert_refused(write_zip(tmp_path / "a.progdf.zip", members), "not a plain file")
 
 
 @pytest.mark.parametrize("content", [b"", b"P", b"not a zip file", b"PK\x03\x04 and no more"])

@@ -167,7 +167,7 @@ def test_folder_in_place_of_a_file_is_refused(tmp_path: Path) -> None:
     folder = write_old(tmp_path / "x")
     (folder / "b").unlink()
     (folder / "b").mkdir()
-    with pytest.raises(ProgdfError, match=r"b is no file"):
+    with pytest.raises(ProgdfError, match=r"b is not a file"):
         write_new(folder)
     assert (folder / "a").read_text() == "old"
 

@@ -217,7 +217,7 @@ def test_edit_is_carried_over_to_the_cleaned_scene(
     ("arguments", "line"),
     [
         (("-o", "x.ply"), "no change is requested; add at least one option, for example --clean"),
-        (("--clean", "-o", "x.obj"), "x.obj names no format to write"),
+        (("--clean", "-o", "x.obj"), "x.obj does not end in a known format"),
         (("--clean", "-o", "bear.ply"), "bear.ply is one of the files to read; choose another name"),
     ],
 )

@@ -69,7 +69,7 @@ def test_filled_region_is_found_again(pictures: list[Path], tmp_path: Path) -> N
 def test_unchanged_pictures_are_a_one_line_error(tmp_path: Path) -> None:
     case = small("body", count=6, image_size=160)
     to_picture(case.views[0].image).save(tmp_path / "A.png", pnginfo=camera_chunk(case.views[0].camera))
-    with pytest.raises(ProgdfError, match="differ nowhere from the scene; change them"):
+    with pytest.raises(ProgdfError, match="do not differ from the scene; change them"):
         parse_region("changed", case.scene, kinds=region_kinds(settings([tmp_path / "A.png"], tmp_path)))
 
 

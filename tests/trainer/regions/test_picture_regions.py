@@ -170,7 +170,7 @@ def test_cameras_without_masks_are_skipped_and_no_mask_is_an_error(masks: Path, 
     messages: list[str] = []
     fewer = set(region_of(f"masks:{masks}", settings(tmp_path, say=messages.append)).members.tolist())
     assert len(whole & fewer) > 0.8 * len(whole | fewer)
-    assert "5 of 6 cameras have a mask; the others tell nothing" in messages
+    assert "5 of 6 cameras have a mask; the others are ignored" in messages
     for name in names[1:]:
         (masks / f"{name}.png").unlink()
     assert f"no mask for any of the 6 cameras; name each as its view, as {names[0]}.png" in refusal(

@@ -332,7 +332,7 @@ def test_dataset_cameras_of_another_frame_are_refused(tmp_path: Path) -> None:
     )
     trained = move_scene(scene, to_z_up.double(), 0.23)
     options = TrainingViewOptions(cameras, scene=tmp_path / "point_cloud.ply")
-    with pytest.raises(ProgdfError, match=r"not of the frame of .*point_cloud\.ply.*dataparser"):
+    with pytest.raises(ProgdfError, match=r"not in the frame of .*point_cloud\.ply.*dataparser"):
         load_given_cameras(options, trained)
     assert len(load_given_cameras(replace(options, cameras_anyway=True), trained).cameras) == 8
     assert len(load_given_cameras(options, scene).cameras) == 8

@@ -255,7 +255,7 @@ def test_failed_frame_export_leaves_no_frames_and_keeps_inputs(
     ("keys", "said"),
     [
         (Timeline((Keyframe(0, camera=ViewCamera()),), 8), "moves no slider"),
-        (Timeline((Keyframe(0, ((0, 0.0),)),), 2000), "has 2001 frames; set their number with --frames"),
+        (Timeline((Keyframe(0, ((0, 0.0),)),), 2000), "has 2001 frames; limit them with --frames"),
     ],
 )
 def test_timeline_without_a_scene_sequence_is_refused(
@@ -288,7 +288,7 @@ def test_sheet_of_a_timeline_is_refused(here: Path, capsys: pytest.CaptureFixtur
 def test_session_without_keys_cannot_be_filmed(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     saved(here, replace(full_view(), timeline=Timeline()))
     assert run("render", "work.session.json", "--timeline", "-o", "a.gif") == 2
-    assert "there is no key on it" in capsys.readouterr().err
+    assert "the timeline has no keys" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", ["view", "render", "export"])
@@ -369,7 +369,7 @@ def test_exported_color_table_has_the_strength_of_the_grade(
         (("table.cube", "--region", "table=all", "--region", "table=all"), "names an edit twice"),
         (("table.cube", "--region", "table=masks:x"), "unknown region 'masks:x'"),
         (("table.cube", "--region", "table=sphere:99,99,99,1"), "holds no Gaussian"),
-        (("scarf.gdf", "--region", "scarf=all"), "scarf is no grade: its field is"),
+        (("scarf.gdf", "--region", "scarf=all"), "scarf is not a grade: its field is"),
         (("no.cube",), "no.cube does not exist"),
         (("bad.cube",), "bad.cube has a line 'hello'"),
     ],

@@ -275,7 +275,7 @@ def test_invalid_option_is_one_line_and_leaves_no_file(
         (("export", "bear.ply", "ears.gdf", "-o", "bear.ply"), "bear.ply is one of the files to read"),
         (
             ("export", "bear.ply", "ears.gdf", "-o", "x.obj"),
-            "x.obj names no format to write; end it in .ply,",
+            "x.obj does not end in a known format; use .ply,",
         ),
         (
             ("export", "bear.ply", "ears.gdf", "--frames", "1", "-o", "x.ply"),
@@ -335,7 +335,7 @@ def test_glb_is_exported_in_the_chosen_axes(run: Run, capsys: pytest.CaptureFixt
         assert "no pixel differs" in capsys.readouterr().out
         assert f'"axes": "{axes}"'.encode() in Path("a.glb").read_bytes()
     assert run("export", "bear.ply", "--glb-axes", "RUB", "-o", "a.ply") == 2
-    assert "a.ply is no .glb; leave out --glb-axes" in capsys.readouterr().err
+    assert "a.ply is not a .glb; leave out --glb-axes" in capsys.readouterr().err
 
 
 def test_frames_go_from_the_original_to_the_strengths(run: Run, stack: Stack) -> None:

@@ -112,7 +112,7 @@ def rewritten(path: Path, change: Callable[[dict[str, bytes]], None]) -> Path:
 )
 def test_bundle_writes_nothing_outside_its_folder(bundle: Path, name: str) -> None:
     rewritten(bundle, lambda files: files.update({name: b"evil"}))
-    with pytest.raises(ProgdfError, match="which is no plain file"):
+    with pytest.raises(ProgdfError, match="which is not a plain file"):
         unpack_bundle(bundle)
     assert [path.name for path in bundle.parent.iterdir()] == ["bear.progdf.zip"]
     assert not list(bundle.parents[1].rglob("*evil*"))
@@ -121,7 +121,7 @@ def test_bundle_writes_nothing_outside_its_folder(bundle: Path, name: str) -> No
 def test_invalid_bundle_is_one_line_and_leaves_nothing(bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = bundle.read_bytes()
     for content, said in (
-        (b"", "is no bundle"),
+        (b"", "is not a bundle"),
         (whole[: len(whole) // 2], "is damaged"),
         (whole[:2000] + bytes(500) + whole[2500:], "is damaged"),
     ):
@@ -143,7 +143,7 @@ def test_invalid_bundle_is_one_line_and_leaves_nothing(bundle: Path, monkeypatch
 
 def test_modified_file_in_a_bundle_is_refused_by_name(bundle: Path) -> None:
     rewritten(bundle, lambda files: files.update({"bear.ply": files["bear.ply"] + b" "}))
-    with pytest.raises(ProgdfError, match=r"was saved with another bear\.ply"):
+    with pytest.raises(ProgdfError, match=r"was saved with a bear\.ply"):
         session.open_session(unpack_bundle(bundle))
 
 

@@ -58,7 +58,7 @@ def test_session_of_another_system_finds_its_files_beside_it(saved: Path, place:
     saved.write_text(text.replace('"bear.ply"', f'"{place}bear.ply"'), "utf-8")
     assert session.open_session(saved).document.path == saved.parent / "bear.ply"
     (saved.parent / "bear.ply").write_bytes(b"another")
-    with pytest.raises(ProgdfError, match="was saved with another bear"):
+    with pytest.raises(ProgdfError, match="was saved with a bear"):
         session.open_session(saved)
 
 

@@ -39,7 +39,7 @@ class DeliverActions:
 
     @property
     def requests(self) -> Requests:
-        """Requests: `SUFFIXES`, `deliver:QUESTION`, `rebind:EDIT`, `rebind_from:EDIT\\nSCENE` and `about`."""
+        """Handlers of `SUFFIXES`, `deliver:QUESTION`, `rebind:EDIT`, `rebind_from:EDIT\\nSCENE`, `about`."""
         ask, version = self._app.main_view.ask, sys.version.split()[0]
         return {
             **{name: partial(self._ask, name) for name in SUFFIXES},

@@ -222,7 +222,7 @@ class PreviewActions:
 
     @property
     def requests(self) -> Requests:
-        """Requests that this class handles."""
+        """Handlers of the requests about previews, by name."""
         return {"paint_view": self._paint_view}
 
     def poll(self) -> float | None:
@@ -467,7 +467,7 @@ class PreviewActions:
         elif answer.grade is not None:
             gdf = load_gdf(answer.grade, self._app.document.original)
             self._grade = self._sent, gdf, answer.grade
-            self._app.main_view.live = ()  # of the previous color
+            self._app.main_view.live = ()  # remove the preview of the previous color
             self._show(f"Live: {answer.note}", None)
         elif answer.pixels is not None:
             kind, _, argument = self._sent.editor.partition(":")

@@ -63,7 +63,7 @@ class StartActions:
 
     @property
     def requests(self) -> Requests:
-        """Requests: `demo`, `example:BUNDLE`, `forget_file:PATH`."""
+        """Handlers of the requests `demo`, `example:BUNDLE`, `forget_file:PATH`, by name."""
         return {"demo": self._start_demo, "example": self._open_example, "forget_file": self._forget}
 
     def _forget(self, path: str) -> None:

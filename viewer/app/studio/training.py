@@ -82,7 +82,7 @@ class JobActions:
 
     @property
     def requests(self) -> Requests:
-        """Requests of the form and the cards; those of the cards name a job by its number."""
+        """Handlers of the requests of the form and the cards. Requests of a card name a job by its number."""
         queue = self.queue
         return {
             "train": self._train,
