@@ -1,4 +1,4 @@
-"""Check options and fill in open values: once before the run, and again once the kind of edit is known.
+"""Checks of options, and values for open ones: once before the run, and again once the kind of edit is known.
 
 Values that depend on the scene (up axis, number and size of the views, SH bands) are chosen where the scene
 is available. Resolved options determine a result bit for bit, except for the content of files.

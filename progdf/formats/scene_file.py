@@ -1,4 +1,4 @@
-"""Load and save scenes: .ply, .spz, .splat, .ksplat, .sog, .glb, .gltf, .ckpt.
+"""Loading and saving of scenes: .ply, .spz, .splat, .ksplat, .sog, .glb, .gltf, .ckpt.
 
 The format is recognized by content, otherwise by name, also inside a .zip or .gz. The library gaussforge
 reads .spz and writes .spz, .splat and .sog. It runs in a separate process (see `native_child`) because

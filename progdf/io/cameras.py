@@ -1,4 +1,4 @@
-"""Load and save cameras, from files and folders.
+"""Loading and saving of cameras, from files and folders.
 
 Files are recognized by content: Inria cameras.json, nerfstudio transforms.json, our own JSON, also embedded
 in a rendered picture. A folder is a COLMAP sparse model, or contains one of these files.

@@ -1,4 +1,4 @@
-"""Run jobs in parallel on Ray, or one after another without it; lost jobs are restarted elsewhere."""
+"""Parallel jobs on Ray, or one after another without it; lost jobs are restarted elsewhere."""
 
 from __future__ import annotations
 

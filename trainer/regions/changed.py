@@ -1,4 +1,4 @@
-"""Find the region that an edited picture changes.
+"""Region that an edited picture changes.
 
 1. Render the original at the picture's size and save it in the picture's format, so that JPEG blocks and
    rounding cancel out.

@@ -1,4 +1,4 @@
-"""Clean a region lifted from a small number of rough masks: remove strays and loose pieces, fill holes.
+"""Cleanup of a region from a small number of rough masks: strays and loose pieces go, holes are filled.
 
 Many masks outvote each other's mistakes. With a small number, background that a single view shows inside its
 mask would be selected, such as a tree behind a bear.

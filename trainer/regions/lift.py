@@ -1,4 +1,4 @@
-"""Lift 2D masks of several views to a region of Gaussians (docs/method.md 4)."""
+"""Lifting of 2D masks of several views to a region of Gaussians (docs/method.md 4)."""
 
 from __future__ import annotations
 

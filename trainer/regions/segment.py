@@ -1,6 +1,6 @@
-"""Segment the object that a prompt names: GroundingDINO (Liu et al. 2023) finds boxes, SAM (Kirillov et al.
-2023) masks.
+"""Segmentation of the object that a prompt names, by two pretrained networks.
 
+GroundingDINO (Liu et al. 2023) finds boxes, and SAM (Kirillov et al. 2023) finds masks.
 Together they are the LangSAM of the paper. Weights are read from this machine and never downloaded
 implicitly.
 """

@@ -1,4 +1,4 @@
-"""Find neighboring Gaussians on the same surface, and let them vote on Gaussians that no view shows."""
+"""Neighboring Gaussians on the same surface, and their vote on Gaussians that no view shows."""
 
 from __future__ import annotations
 

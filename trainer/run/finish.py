@@ -1,4 +1,4 @@
-"""Finish a run: fit the field, measure it, write NAME.gdf, report.json and report.png."""
+"""End of a run: fit the field, measure it, write NAME.gdf, report.json and report.png."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Convert paint finer than the Gaussians to discs: decals, and the remainder after recoloring to pictures."""
+"""Discs for paint finer than the Gaussians: decals, and the remainder after recoloring to pictures."""
 
 from __future__ import annotations
 

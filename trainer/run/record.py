@@ -1,4 +1,4 @@
-"""Reopen a finished run: its scene, region, views and recordings."""
+"""Finished run, opened again: its scene, region, views and recordings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Remove a region. The path over strengths is known in closed form, so nothing is optimized; holes are
+"""Removal of a region. The path over strengths is known in closed form, so nothing is optimized; holes are
 filled."""
 
 from __future__ import annotations

@@ -1,5 +1,4 @@
-"""Decide how a training command continues in its folder: start, resume a stopped run, or reuse a finished
-one."""
+"""Decision of a training command in its folder: start, resume a stopped run, or reuse a finished one."""
 
 from __future__ import annotations
 

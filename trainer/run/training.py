@@ -1,4 +1,4 @@
-"""Optimize the members over a run's training views, save the state regularly, and return a trajectory."""
+"""Optimization of the members over a run's training views, with regular saves, to a trajectory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Choose the cameras for training and measuring an edit.
+"""Choice of the cameras for training and measuring an edit.
 
 A scene comes with hundreds of cameras in capture order, and ProGDF (AAAI 2025) edits at most 96. The first 96
 would cover one side only. The value of a camera is the visible part of the region that no chosen camera shows
