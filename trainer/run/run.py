@@ -3,83 +3,68 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, replace
-from functools import cache, partial
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
 import torch
-from torch import Tensor
 
-from progdf.errors import ProgdfError
 from progdf.field.trajectory import Trajectory, load_trajectory, save_trajectory
 from progdf.formats.scene_file import load_scene
 from progdf.gaussians import BASE_CHANNELS, ZERO, Gaussians
 from progdf.gdf.file import save_gdf
 from progdf.io.atomic import read_file
 from progdf.io.cameras import load_cameras, save_cameras
-from progdf.io.images import contact_sheet, read_picture
+from progdf.io.images import contact_sheet
 from progdf.io.json_values import check_text, to_json
-from progdf.io.picture_camera import find_picture_camera
 from progdf.rasterize.engines import get_engine
 from progdf.region import Region
 from progdf.scene.regions import check_region, parse_region
 from progdf.terminal import group_digits
 from trainer.editors import check_editor, check_new_editor, editor_row, make_editor
-from trainer.editors.base import ImageEditor, PastingEditor
-from trainer.editors.instruct import InstructEditor
+from trainer.editors.base import PastingEditor
 from trainer.editors.pictures import picture_cameras
-from trainer.editors.procedural import edit_course
 from trainer.fit.draft import draft_grade, draft_views
 from trainer.fit.fit import choose_path, drop_idle_attributes
 from trainer.fit.network import PART as NETWORK
-from trainer.fit.slider_uniformity import equalized_strengths
 from trainer.optimize.growth import fade_in
 from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
-from trainer.optimize.retime import resolve_slider, smooth_course
+from trainer.optimize.retime import smooth_course
 from trainer.options import EditKind, OptimizeOptions, TrainOptions, flat_values
-from trainer.regions.from_pictures import CHANGED, RegionRequest, region_checks, region_kinds
+from trainer.regions.from_pictures import RegionRequest, region_checks, region_kinds
 from trainer.report.agreement import measure_agreement
 from trainer.resolve import recorded_options, resolve, use_threads
 from trainer.setup import (
     Pictures,
     TrainingSetup,
     check_given_cameras,
-    confines_edit,
-    edit_views,
-    editor_strengths,
     make_training_setup,
-    quantize_image,
-    render_thumbnails,
     whole_views,
     widen_views,
 )
 from trainer.store.pretrained import LastValueCache
-from trainer.store.progress import LATER, RunLog
+from trainer.store.progress import RunLog
 from trainer.store.run_folder import (
     RunFolder,
     check_folder,
     lock_folder,
     open_run_folder,
-    read_views,
     remove_stale_views,
     write_views,
 )
 from trainer.store.state import interrupt_on_signals
 from trainer.views.crops import only_recolors
-from trainer.views.view import BACKGROUND, View, fit_size, make_view, with_near_plane
+from trainer.views.view import BACKGROUND
 
-from .agree import AgreedEditor, PaintCache, agree_views
+from .edited_views import EditedViews
 from .finish import RunResult, end_rows, finish_run, load_evaluator, load_result, write_finals, write_result
-from .kinds import Approach, choose_approach, resolve_approach
 from .paint import RING, TURNS, train_decal
 from .record import RunRecord, read_record
 from .removal import is_removal, remove_region
 from .resume import check_exists, decide_resume, explain_stop, load_region, picture_digests
-from .training import StrengthSource, optimize_members, retime_trajectory
-
-_MAX_CACHED_PIXELS = 1_000_000  # pixels and painted members whose editor state is cached, up to 80 bytes each
+from .training import optimize_members, retime_trajectory
 
 
 def check_command(options: TrainOptions) -> None:
@@ -218,12 +203,14 @@ def _run_training(
         log.say(note)
     if is_removal(options, setup, log):
         return remove_region(options, setup, folder, log)
-    editor = cache(partial(_make_editor, options, setup, folder, log))
+    views = EditedViews(options, setup, folder, log)
     with log.stage("edit"):
-        edited, approach, trial, between = _edit_views(options, setup, editor, folder, log)
-        optimization = resolve_approach(options, approach)
+        views.prepare()
+        edited = views.pictures
+        kind = views.approach.kind
+        optimization = views.optimization
         # if more strengths may be requested, the boxes must not depend on which of them exist already
-        strengths = (1.0,) if _requests_more_strengths(options, optimization) else edited
+        strengths = (1.0,) if views.requests_strengths else edited
         train_edits = {s: edited[s][: len(setup.train)] for s in strengths}
         setup = whole_views(setup) if options.optimize.as_printed else widen_views(setup, train_edits)
     if optimization.solver == "colors":  # small sums, over which torch's threads spun for 100 s on 16 cores
@@ -231,18 +218,16 @@ def _run_training(
     recorded = folder.state.load("recorded")
     if recorded is None:
         with log.stage("agree"):
-            agreement = _agreement(options, setup, edited, approach.kind, folder, log)
-        trajectory, outcome = _record(
-            options, optimization, setup, edited, between, editor, perceptual, folder=folder, log=log
-        )
+            agreement = _agreement(options, setup, edited, kind, folder, log)
+        trajectory, outcome = _record(options, optimization, setup, views, perceptual, folder, log)
         record = RunRecord(
             recorded_options(options),
             options.scene.resolve(),
             [view.camera.name for view in setup.held_out],
             BACKGROUND,
-            approach.kind,
+            kind,
             optimization.group_steps or 0,
-            kind_trial=trial,
+            kind_trial=views.trial,
             agreement=agreement,
             up=setup.up.to_json() if setup.up is not None else None,
             pictures=picture_digests(options),
@@ -260,7 +245,7 @@ def _run_training(
     else:
         log.restore(recorded)
         log.say("the trajectory is recorded")
-    del edited, train_edits, between  # the needed parts are read again from disk
+    del edited, train_edits, views  # the needed parts are read again from disk
     trajectory, _, about = load_trajectory(folder.trajectory)
     record = read_record(about)
     begun = folder.state.load(NETWORK)
@@ -362,160 +347,6 @@ def _render_originals(
     return setup
 
 
-def _make_editor(options: TrainOptions, setup: TrainingSetup, folder: RunFolder, log: RunLog) -> ImageEditor:
-    """Return the run's editor. A generative editor is wrapped so that its views agree."""
-    settings = replace(options.editor, cache=folder.paintings)
-    glances = partial(render_thumbnails, options.views, setup.scene, setup.region)
-    editor = make_editor(settings, setup.scene, setup.region, setup.views, glances)
-    if editor_row(settings).model is None:
-        return editor
-    painter = cast(InstructEditor, editor)
-    log.say(painter.note)
-    easel = PaintCache(painter, painter.recipe, painter.kept, settings.seed)
-    approved = None
-    if settings.anchor is not None:
-        camera = fit_size(
-            find_picture_camera(settings.anchor, origin=setup.scene.origin), painter.request.size
-        )
-        (camera,) = with_near_plane([camera], setup.scene)
-        view = make_view(setup.scene, setup.region, camera, setup.background)
-        if not bool((view.mask > 0.0).any()):
-            raise ProgdfError(f"{settings.anchor} shows nothing of the region; take it from elsewhere")
-        approved = view, read_picture(settings.anchor, size=(camera.width, camera.height))
-    return agree_views(easel, setup, editor, log, approved)
-
-
-def _edit_views(
-    options: TrainOptions,
-    setup: TrainingSetup,
-    editor: Callable[[], ImageEditor],
-    folder: RunFolder,
-    log: RunLog,
-) -> tuple[Pictures, Approach, dict[str, Any] | None, StrengthSource | None]:
-    """Edit all views and choose how to train.
-
-    Returns: the edited views by strength, read lazily from disk; the training approach; the figures of the
-    trial run that chose it; and a source of further strengths, if training may request them.
-    """
-    views = setup.views
-    spec = options.editor.editor
-    names = [view.camera.name for view in views]
-    edits: dict[float, Sequence[Tensor]] = {}
-    on_the_way = names  # views with strengths other than 1
-    known = list[float]()  # strengths edited by the stopped run
-    approach = Approach("color")
-    trial = None
-
-    def edit(strengths: Sequence[float], views: Sequence[View] = views) -> Pictures:
-        nonlocal on_the_way
-        new = [s for s in strengths if s not in edits]
-        parallel = editor_row(options.editor).is_parallel
-        is_confined = confines_edit(editor(), approach.kind)
-        way = course if _fits_cache(options, setup) else partial(edit_course, editor())
-        with log.steps("edit", len(views) * len(new)) as advance:
-            within = views
-            if options.region.region == CHANGED:  # few members are found for paint finer than the Gaussians
-                within = [view.with_painted([editor().edit(view, 1.0)]) for view in views]
-            edits.update(edit_views(parallel, within, new, folder, is_confined, advance, way))
-        log.say(f"{spec}: a {approach.kind} edit at strength {', '.join(f'{s:g}' for s in strengths)}")
-        if min(strengths) < 1.0:
-            on_the_way = [view.camera.name for view in views]
-        edited = [*dict.fromkeys((*known, *edits))]
-        saved = {"strengths": edited, "on_the_way": on_the_way, **asdict(approach)}
-        shared = painter.figures if isinstance(painter := editor(), AgreedEditor) else {}
-        folder.state.save("edited", {}, saved | {"trial": trial, "shared": shared})
-        return edits
-
-    @cache
-    def course(view: View) -> Callable[[float], Tensor]:
-        return edit_course(editor(), view)
-
-    def look(s: float, some: Sequence[View]) -> list[Tensor]:
-        pictures = [course(view)(s) for view in some]
-        if confines_edit(editor(), approach.kind):
-            pictures = [view.confine(picture) for view, picture in zip(some, pictures, strict=True)]
-        return [quantize_image(picture) for picture in pictures]
-
-    def between() -> StrengthSource | None:
-        more = _requests_more_strengths(options, resolve_approach(options, approach))
-        return StrengthSource(edit, look) if more else None
-
-    done = folder.state.load("edited")
-    if done is not None:
-        try:
-            on_the_way = done.values["on_the_way"]
-            for s in done.values["strengths"]:
-                wanted = set(names if s == 1.0 else on_the_way)
-                cameras = [view.camera for view in views if view.camera.name in wanted]
-                edits[s] = read_views(folder, "edited", cameras, s)
-            approach = Approach(*(done.values[name] for name in ("kind", "group_steps", "grow")))
-            trial = done.values["trial"]
-            log.say("the edited views are on disk")
-            log.expect(expected_work(setup, resolve_approach(options, approach), len(edits)))
-            return edits, approach, trial, between()
-        except ProgdfError as error:
-            edits.clear()
-            known = done.values["strengths"]
-            log.say(f"the views are edited again: {str(error).partition(';')[0]}")
-    painter = editor()
-    note = editor_row(options.editor).note(options.editor.text)
-    if note:
-        log.say(note)
-    approach, trial = choose_approach(options, setup, painter, log)
-    optimization = resolve_approach(options, approach)
-    strengths = editor_strengths(editor(), optimization.stages)
-    log.expect(expected_work(setup, optimization, len(strengths)))
-    if _requests_more_strengths(options, optimization):
-        strengths = (1.0,)
-    elif not optimization.as_printed and resolve_slider(optimization.slider, strengths) == "even":
-        strengths = equalized_strengths(editor(), spec, views, strengths)
-    edited = edit(strengths)
-    _check_change(edited, setup, spec)
-    if rest := [s for s in known if s not in edited]:
-        edited = edit(rest, [view for view in views if view.camera.name in on_the_way])
-    return edited, approach, trial, between()
-
-
-def _fits_cache(options: TrainOptions, setup: TrainingSetup) -> bool:
-    """Return True if the strength-independent editor state of all views fits the cache."""
-    painted = len(setup.region) if editor_row(options.editor).paints_members else 0
-    return sum(int((view.mask > 0.0).sum()) + painted for view in setup.views) <= _MAX_CACHED_PIXELS
-
-
-def _check_change(edited: Pictures, setup: TrainingSetup, spec: str) -> None:
-    """Raise a ProgdfError if no view shows an edit."""
-    originals = [quantize_image(view.image) for view in setup.views]
-    if all(torch.equal(*pair) for views in edited.values() for pair in zip(views, originals, strict=True)):
-        raise ProgdfError(f"{spec} changes none of the views; check the region and the editor's settings")
-
-
-def _requests_more_strengths(options: TrainOptions, optimization: OptimizeOptions) -> bool:
-    """Return True if training requests further strengths once the error of the first ones is known."""
-    row = editor_row(options.editor)
-    is_fixed = options.optimize.stages or row.external or row.slow_strengths
-    return optimization.solver == "colors" and not is_fixed
-
-
-def expected_work(setup: TrainingSetup, optimization: OptimizeOptions, strengths: int) -> dict[str, float]:
-    """Return the expected work per stage for `RunLog.expect`, in units of preparing one view.
-
-    Args:
-        setup: scene, region, views
-        optimization: fully resolved options
-        strengths: number of edited strengths
-    """
-    views = len(setup.views)
-    train = len(setup.train)
-    work = {name: each * views for name, each in LATER.items()} | {
-        "views": views,
-        "edit": 0.1 * views * strengths,
-    }
-    if optimization.solver == "colors":
-        return work | {"weights": 0.5 * train, "model": 1.5 * train, "optimize": 0.45 * train * strengths}
-    group_steps = optimization.group_steps or 0
-    return work | {"move parts": 0.2 * group_steps * strengths, "optimize": 0.25 * optimization.steps}
-
-
 def _agreement(
     options: TrainOptions,
     setup: TrainingSetup,
@@ -541,9 +372,7 @@ def _record(
     options: TrainOptions,
     optimization: OptimizeOptions,
     setup: TrainingSetup,
-    edited: Pictures,
-    between: StrengthSource | None,
-    editor: Callable[[], ImageEditor],
+    views: EditedViews,
     perceptual: Perceptual,
     folder: RunFolder,
     log: RunLog,
@@ -555,7 +384,7 @@ def _record(
         log.say(f"--group-steps: without effect on this {optimization.kind} edit, whose loss is {objective}")
     with log.stage("optimize"):
         trajectory, losses, effort = optimize_members(
-            options, optimization, setup, edited, perceptual, folder.state, log, between
+            options, optimization, setup, views.pictures, perceptual, folder.state, log, views.source
         )
     setup = setup.keep_solved(effort).extend(trajectory.added)
     with log.stage("retime"):
@@ -574,7 +403,7 @@ def _record(
             # external pictures may be gone by now and have no intermediate strengths; generative models
             # edited only strength 1
             row = editor_row(options.editor)
-            painter = None if row.external or row.slow_strengths else editor()
+            painter = None if row.external or row.slow_strengths else views.editor
             retimed = partial(retime_trajectory, setup=setup, optimization=optimization, log=log)
             moves_groups = bool(optimization.group_steps)
             trajectory, reason = choose_path(trajectory, setup, painter, moves_groups, retimed)

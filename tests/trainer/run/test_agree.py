@@ -27,14 +27,13 @@ from trainer.run.agree import (
     AgreedEditor,
     Fit,
     PaintCache,
-    Registration,
     agree_views,
     beside_region,
     painting_order,
-    register,
 )
 from trainer.setup import TrainingSetup
 from trainer.store.progress import RunLog
+from trainer.views.register import Registration, register
 from trainer.views.view import View
 
 NOTHING = PictureCache(None)

@@ -31,7 +31,7 @@ from tests.helpers.stopped import OUT, bits, small_run
 from tests.helpers.stopped_runs import NEVER, at_step, gone_on, killed, saved_step, words
 from tests.helpers.trained import quick_options, train
 from trainer.options import EditorOptions, TrainOptions
-from trainer.run import training
+from trainer.run import agree, edited_views, training
 from trainer.run.resume import decide_resume, explain_stop, find_run, picture_digests, processor_kind
 from trainer.store.run_folder import RunFolder, open_run_folder
 from trainer.store.state import StateFolder
@@ -96,7 +96,7 @@ def test_ctrl_c_before_the_optimization_is_saved_too(
     bear_folder: Path, uninterrupted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(trainer.run.run, "edit_views", lambda *_: os.kill(os.getpid(), signal.SIGINT))
+        patch.setattr(edited_views, "edit_views", lambda *_: os.kill(os.getpid(), signal.SIGINT))
         with pytest.raises(KeyboardInterrupt, match="--resume"):
             train(small_run(bear_folder), quiet=True)
     gone_on(bear_folder, uninterrupted)
@@ -240,8 +240,8 @@ def test_resume_repeats_no_edited_view_and_no_region_search(
     def again(*_: object) -> None:
         raise AssertionError("made again")
 
-    for name in ("make_editor", "parse_region"):
-        monkeypatch.setattr(trainer.run.run, name, again)
+    monkeypatch.setattr(trainer.run.run, "parse_region", again)
+    monkeypatch.setattr(agree, "make_editor", again)
     gone_on(bear_folder, uninterrupted)
 
 
@@ -337,14 +337,14 @@ def test_run_that_chooses_its_strengths_resumes_to_the_same_bits(
     monkeypatch.setattr("trainer.store.state.SAVE_EVERY", 0.0)
     requested: list[list[float]] = []
 
-    def edit_views(*given: Any, made: Callable[..., object] = trainer.run.run.edit_views) -> object:
+    def edit_views(*given: Any, made: Callable[..., object] = edited_views.edit_views) -> object:
         requested.append(list(given[2]))
         if len(requested) == 3:
             raise KeyboardInterrupt
         return made(*given)
 
     with monkeypatch.context() as patch:
-        patch.setattr(trainer.run.run, "edit_views", edit_views)
+        patch.setattr(edited_views, "edit_views", edit_views)
         with pytest.raises(KeyboardInterrupt):
             train(options, quiet=True)
     # the full and the half edit come first; their difference decides on the other strengths
