@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -85,9 +85,9 @@ class TrainingSetup:
 
     scene: Gaussians  # the original
     region: Region  # members that may change
-    train: Sequence[View]  # views to train on
-    held_out: Sequence[View]  # views to measure with; empty if there are too few views, see `judging`
-    background: Tensor  # rgb. [3]
+    train: Sequence[View] = ()  # views to train on
+    held_out: Sequence[View] = ()  # views to measure with; empty if there are too few views, see `judging`
+    background: Tensor = field(default_factory=lambda: torch.tensor(BACKGROUND))  # rgb. [3]
     notes: Sequence[str] = ()  # lines for the log
     up: UpAxis | None = None  # the axis that is up
 

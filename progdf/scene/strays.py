@@ -21,6 +21,7 @@ from progdf.gaussians import Gaussians
 from progdf.metrics.image import decibels
 from progdf.quaternions import rotation_matrices
 from progdf.rasterize.engines import render
+from progdf.region import Region, from_mask
 from progdf.terminal import format_count, group_digits
 from progdf.threads import map_threads
 
@@ -304,3 +305,11 @@ class _Neighborhoods:
         """Return the distances and rows of the neighbors of some members. [M] -> [M,16] each"""
         distances, near = self._tree.query(self._points[rows], self._neighbors + 1)
         return distances[:, 1:], self.members[near[:, 1:]]
+
+
+def with_strays(scene: Gaussians, region: Region) -> Region:
+    """Return the region with the floaters that its removal would leave behind, see `find_strays`."""
+    mask = ~region.mask
+    alone = mask.nonzero()[:, 0][find_strays(scene[mask]).floaters]
+    mask[alone[~torch.isin(alone, torch.from_numpy(find_strays(scene).floaters))]] = False
+    return from_mask(region.name, ~mask)

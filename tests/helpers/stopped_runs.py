@@ -17,11 +17,11 @@ import pytest
 import torch
 from torch import Tensor
 
-import trainer.run.run
 from progdf.field.trajectory import load_trajectory
 from tests.helpers.paths import ROOT
 from tests.helpers.stopped import OUT, small_run
 from tests.helpers.trained import train, write_bear
+from trainer.run import trained
 from trainer.store.run_folder import RunFolder
 from trainer.store.state import PeriodicSave
 
@@ -89,7 +89,7 @@ def at_step(monkeypatch: pytest.MonkeyPatch, number: int, happens: Callable[[], 
 def gone_on(bear_folder: Path, uninterrupted: Path, **more: object) -> str:
     """Resume up to the trajectory, which must equal the uninterrupted run's, and stop. Return the log."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(trainer.run.run, "finish_run", lambda *_: None)
+        patch.setattr(trained, "finish_run", lambda *_: None)
         train(replace(small_run(bear_folder, **more), resume=True), quiet=True)
     found, expected = (_recorded(root / "trajectory.safetensors") for root in (OUT, uninterrupted))
     assert found[0].keys() == expected[0].keys()

@@ -30,8 +30,9 @@ from progdf.rasterize import render
 from progdf.terminal import signal_main_thread
 from trainer.options import TrainOptions
 from trainer.resolve import resolve
+from trainer.run.command import check_command, select_region
 from trainer.run.finish import RunResult
-from trainer.run.run import check_command, select_region, train
+from trainer.run.run import train
 from trainer.store.pretrained import LastValueCache, keep_models
 from trainer.store.run_folder import RunFolder, read_run_cameras
 from trainer.views.view import BACKGROUND

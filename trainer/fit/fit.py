@@ -35,6 +35,7 @@ from trainer.options import FieldKind, FieldOptions
 from trainer.setup import TrainingSetup
 from trainer.store.progress import release_memory
 from trainer.views.choose import split_held_out
+from trainer.views.crops import only_recolors
 from trainer.views.view import View
 
 from .evaluate import Evaluator, make_evaluator
@@ -292,6 +293,13 @@ def visibility(
         if looked is not None:
             looked()
     return total / total.mean().clamp_min(1e-12) + 1e-3
+
+
+def may_have_idle_attributes(trajectory: Trajectory) -> bool:
+    """Return True if attributes could be dropped: not for a grade, nor if only the base colors move."""
+    if trajectory.maps is not None:
+        return False
+    return not only_recolors(trajectory.offsets) or trajectory.end.shape[1] > BASE_CHANNELS
 
 
 def drop_idle_attributes(

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -21,13 +20,12 @@ from progdf.field.separable import course_field, opacity_course
 from progdf.gaussians import BASE_CHANNELS, Gaussians, concatenate, pack
 from progdf.gdf.file import Gdf, fingerprint
 from progdf.io.images import picture_size
-from progdf.metrics.image import decibels, psnr
+from progdf.metrics.image import decibels
 from progdf.quaternions import rotate_vectors
 from progdf.rasterize import alpha_weights, render
 from progdf.rasterize.engines import render_depth
 from progdf.region import Region
 from progdf.terminal import group_digits
-from trainer.editors.base import PastingEditor
 from trainer.editors.pictures import read_edit
 from trainer.paint.discs import (
     BORDER_PX,
@@ -44,10 +42,10 @@ from trainer.views.view import BACKGROUND, View, crop, make_view, render_view
 
 RING = 15
 """Width of the ring around the paint that must stay unchanged, pixels."""
-TURNS = (-45, -30, -15, 0, 15, 30, 45)
-"""Angles of the measured views around the paint, degrees."""
 
-_TRIAL_ANGLES_DEG = (-30, -15, 0, 15, 30)  # views that choose the gap
+TRIAL_ANGLES_DEG = (-30, -15, 0, 15, 30)
+"""Angles of the views around the paint that choose the gap, degrees."""
+
 _GAPS_PX = (4.0, 1.0)  # tried distances between discs and the Gaussians pushed behind them
 _DISC_COLOR_RMS = 0.015  # maximum RMS color error of a disc over its pixels
 _SPILL_COLOR = 1 / 255  # smallest color change beside the paint that counts as caused by pushed Gaussians
@@ -195,7 +193,7 @@ def choose_discs(
         errors = ", ".join(f"{decibels(error):.1f} dB with {laid.gap:g}" for error, laid in candidates)
         log.say(
             f"occluding Gaussians are moved {best[1].gap:g} pixels behind the paint: {errors}, in and "
-            f"{RING} pixels around it, as painted and from up to {max(_TRIAL_ANGLES_DEG)}° to its sides"
+            f"{RING} pixels around it, as painted and from up to {max(TRIAL_ANGLES_DEG)}° to its sides"
         )
     return best[1]
 
@@ -312,7 +310,7 @@ def sharpen(
     reverted = scene.replace_rows(members, rows + unpainted_shares[:, None] * recolored.field.offsets(1.0))
     # revert the recolor of painted members if that is better beside the paint, as between letters
     base = min((end, reverted), key=lambda one: sum(_error_beside(one, paint) for paint in paints))
-    views = views_around_paint(base, paints, _TRIAL_ANGLES_DEG)
+    views = views_around_paint(base, paints, TRIAL_ANGLES_DEG)
     try:
         laid = choose_discs(base, paints, views, log)
     except ProgdfError:
@@ -348,48 +346,6 @@ def _missed_paint(end: Gaussians, view: View, target: Tensor) -> tuple[PaintedVi
     sharp = changed & torch.from_numpy(ndimage.binary_dilation(missed, iterations=BORDER_PX))
     drawn = torch.cat([target, torch.ones_like(target[..., :1])], dim=2) * sharp[..., None]
     return PaintedView(view.camera, target, drawn), changed
-
-
-@dataclass(frozen=True)
-class Painted:
-    """Edit that adds discs, and its measured quality."""
-
-    gdf: Gdf
-    figures: dict[str, Any]  # for report.json
-    expected: list[Tensor]  # expected images of the views of `TURNS`. [H,W,3] each
-    shown: list[Tensor]  # renders of the edit in these views. [H,W,3] each
-
-
-def train_decal(editor: PastingEditor, scene: Gaussians, name: str, log: RunLog | None = None) -> Painted:
-    """Return the edit of a decal, measured in its own view and from the sides.
-
-    Args:
-        editor: see `PastingEditor`
-        scene: the original
-        name: name of the layer
-        log: log of the run
-    """
-    paints = [editor.paint]
-    laid = choose_discs(scene, paints, views_around_paint(scene, paints, _TRIAL_ANGLES_DEG), log)
-    gdf = paint_gdf(laid, scene, paints, name, None)
-    edited = edited_scene(scene, gdf)
-    background = torch.tensor(BACKGROUND)
-    views = views_around_paint(scene, paints, TURNS)
-    images = [render_view(edited, look.camera, background).clamp(0.0, 1.0) for look in views]
-    errors = [
-        round(psnr(image, look.expected, look.covered), 2) if bool(look.covered.any()) else None
-        for image, look in zip(images, views, strict=True)
-    ]
-    middle = TURNS.index(0)
-    figures = {
-        "pixels": int(paints[0].mask.sum()),
-        "added": 0 if gdf.added is None else len(gdf.added),
-        "moved": len(gdf.region),
-        "own": errors[middle],
-        "ring": round(psnr(images[middle], views[middle].expected, views[middle].around), 2),
-        "turned": {f"{degrees:+d}": error for degrees, error in zip(TURNS, errors, strict=True)},
-    }
-    return Painted(gdf, figures, [look.expected for look in views], images)
 
 
 def _pivot(scene: Gaussians, paint: PaintedView) -> Tensor:

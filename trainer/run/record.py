@@ -11,10 +11,10 @@ from typing import Any
 import torch
 
 from progdf.errors import ProgdfError
-from progdf.field.trajectory import Trajectory, load_trajectory
+from progdf.field.trajectory import Trajectory, load_trajectory, save_trajectory
 from progdf.formats.scene_file import load_scene, scene_file
 from progdf.gaussians import Gaussians
-from progdf.io.json_values import convert_json
+from progdf.io.json_values import convert_json, to_json
 from progdf.region import Region
 from trainer.options import EditKind, TrainOptions
 from trainer.resolve import check_name
@@ -60,6 +60,18 @@ def read_record(about: Mapping[str, Any]) -> RunRecord:
         ValueError: it is not a record, or damaged.
     """
     return convert_json(about, RunRecord)
+
+
+def save_recording(folder: RunFolder, region: Region, trajectory: Trajectory, record: RunRecord) -> None:
+    """Write the trajectory file of a run: recordings, region and record."""
+    extra = {"members": region.members, "score": region.score}
+    save_trajectory(folder.trajectory, trajectory, extra, to_json(record))
+
+
+def load_recording(folder: RunFolder) -> tuple[Trajectory, RunRecord]:
+    """Return the recordings and the record of a run's trajectory file."""
+    trajectory, _, about = load_trajectory(folder.trajectory)
+    return trajectory, read_record(about)
 
 
 @dataclass(frozen=True)

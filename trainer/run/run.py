@@ -1,120 +1,41 @@
-"""Training run: scene → views → edited views → trajectory → field → .gdf and report, each saved to disk."""
+"""Training run: draft, views, and one of the kinds of run, which are trained, pasted and removed."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
-from pathlib import Path
-from typing import Any, cast
 
-import torch
-
-from progdf.field.trajectory import Trajectory, load_trajectory, save_trajectory
 from progdf.formats.scene_file import load_scene
-from progdf.gaussians import BASE_CHANNELS, ZERO, Gaussians
+from progdf.gaussians import Gaussians
 from progdf.gdf.file import save_gdf
-from progdf.io.atomic import read_file
-from progdf.io.cameras import load_cameras, save_cameras
-from progdf.io.images import contact_sheet
-from progdf.io.json_values import check_text, to_json
-from progdf.rasterize.engines import get_engine
+from progdf.io.cameras import save_cameras
 from progdf.region import Region
-from progdf.scene.regions import check_region, parse_region
-from progdf.terminal import group_digits
-from trainer.editors import check_editor, check_new_editor, editor_row, make_editor
-from trainer.editors.base import PastingEditor
-from trainer.editors.pictures import picture_cameras
+from trainer.editors import editor_row
 from trainer.fit.draft import draft_grade, draft_views
-from trainer.fit.fit import choose_path, drop_idle_attributes
-from trainer.fit.network import PART as NETWORK
-from trainer.optimize.growth import fade_in
-from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
-from trainer.optimize.retime import smooth_course
-from trainer.options import EditKind, OptimizeOptions, TrainOptions, flat_values
-from trainer.regions.from_pictures import RegionRequest, region_checks, region_kinds
-from trainer.report.agreement import measure_agreement
-from trainer.resolve import recorded_options, resolve, use_threads
+from trainer.optimize.losses import perceptual_loss
+from trainer.options import TrainOptions
+from trainer.resolve import resolve, use_threads
 from trainer.setup import (
-    Pictures,
     TrainingSetup,
-    check_given_cameras,
     make_training_setup,
-    whole_views,
-    widen_views,
 )
 from trainer.store.pretrained import LastValueCache
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import (
     RunFolder,
-    check_folder,
     lock_folder,
     open_run_folder,
     remove_stale_views,
     write_views,
 )
 from trainer.store.state import interrupt_on_signals
-from trainer.views.crops import only_recolors
-from trainer.views.view import BACKGROUND
 
-from .edited_views import EditedViews
-from .finish import RunResult, end_rows, finish_run, load_evaluator, load_result, write_finals, write_result
-from .paint import RING, TURNS, train_decal
-from .record import RunRecord, read_record
-from .removal import is_removal, remove_region
-from .resume import check_exists, decide_resume, explain_stop, load_region, picture_digests
-from .training import optimize_members, retime_trajectory
-
-
-def check_command(options: TrainOptions) -> None:
-    """Check everything that the command names, as far as possible without the scene.
-
-    A resumed run no longer needs its sources, as its region and its edited views are saved.
-
-    Args:
-        options: resolved options
-
-    Raises:
-        ProgdfError: the folder is occupied, the editor or the segmenter cannot run, a file is missing, or a
-            text for the run's record is not UTF-8.
-    """
-    for name, _, value in flat_values(recorded_options(options)):
-        for part in value if isinstance(value, tuple) else (value,):
-            check_text(str(part), f"the record of --{name.replace('_', '-')}")
-    get_engine(options.optimize.engine)
-    check_editor(options.editor.editor)
-    folder = check_folder(options.out, options.edit)
-    views = options.views
-    if not options.scene.is_dir():  # some formats are folders
-        read_file(options.scene, 0)
-    if views.cameras is not None and not options.resume:
-        load_cameras(views.cameras, ZERO)
-    if views.pictures:
-        cameras = [] if views.cameras is None else load_cameras(views.cameras, ZERO)
-        picture_cameras(views.pictures, cameras, ZERO)
-    if not options.resume or load_region(options.out) is None:
-        check_region(options.region.region, region_checks(region_request(options, quiet=True)))
-    is_new = not folder.root.is_dir() or not any(folder.root.iterdir())
-    if is_new or (editor_row(options.editor).slow_strengths and not options.resume):
-        check_new_editor(replace(options.editor, cache=folder.paintings))
-
-
-def region_request(
-    options: TrainOptions, quiet: bool, say: Callable[[str], None] | None = None
-) -> RegionRequest:
-    """Return the request for a region made from pictures. Segmentation masks are saved in the run's folder.
-
-    Args:
-        options: resolved options
-        quiet, say: see `RegionRequest`
-    """
-
-    def cache() -> Path:
-        # never write into a folder that is not a run folder
-        return open_run_folder(options.out, options.edit).segment_masks
-
-    return RegionRequest(options.region, options.views, cache, quiet, say)
+from .command import check_command, select_region
+from .finish import RunResult, load_result
+from .pasted import paste_decal
+from .removed import is_removal, remove_region
+from .resume import check_exists, decide_resume, explain_stop, load_region
+from .trained import train_region
 
 
 def train(options: TrainOptions, quiet: bool = False, shared: LastValueCache | None = None) -> RunResult:
@@ -147,7 +68,8 @@ def train(options: TrainOptions, quiet: bool = False, shared: LastValueCache | N
             for note in (*session.notes, *notes):
                 log.say(note)
             if editor_row(options.editor).run == "pasted":  # takes seconds, so it is not resumed
-                result = _run_decal(options, scene, region, folder, log)
+                setup = TrainingSetup(scene, region)
+                result = paste_decal(options, setup, folder, log)
                 folder.state.end()
                 return result
             if session.does == "nothing":
@@ -156,7 +78,9 @@ def train(options: TrainOptions, quiet: bool = False, shared: LastValueCache | N
             with check_exists(folder), folder.state.writing():
                 if session.does == "start":
                     _write_draft(options, scene, region, folder, log)
-                result = _run_training(options, scene, region, folder, shared, log)
+                setup = _prepare_views(options, scene, region, folder, shared, log)
+                run = remove_region if is_removal(options, setup, log) else train_region
+                result = run(options, setup, folder, log)
             folder.state.end()
             return result
         except KeyboardInterrupt:
@@ -166,34 +90,16 @@ def train(options: TrainOptions, quiet: bool = False, shared: LastValueCache | N
             log.close()
 
 
-def select_region(
-    options: TrainOptions, scene: Gaussians, quiet: bool, shared: LastValueCache
-) -> tuple[Region, list[str]]:
-    """Return the region that resolved options name, and lines for the log.
-
-    Raises:
-        ProgdfError: see `parse_region`; or the cameras do not show the scene.
-    """
-
-    def select() -> tuple[Region, list[str]]:
-        notes = list[str]()
-        check_given_cameras(options.views, scene)  # fail before a folder is created
-        kinds = region_kinds(region_request(options, quiet, notes.append))
-        return parse_region(options.region.region, scene, options.name, kinds, notes.append), notes
-
-    return shared.get("region", (options.scene.resolve(), options.region, options.views), select)
-
-
-def _run_training(
+def _prepare_views(
     options: TrainOptions,
     scene: Gaussians,
     region: Region,
     folder: RunFolder,
     shared: LastValueCache,
     log: RunLog,
-) -> RunResult:
-    """Run all stages. Skip finished stages of the saved state, or repeat them with the same bits."""
-    perceptual, warning = perceptual_loss()
+) -> TrainingSetup:
+    """Render the views, write them to disk and describe them in the log."""
+    _, warning = perceptual_loss()
     if warning:
         log.say(warning)
     with log.stage("views"):
@@ -201,105 +107,7 @@ def _run_training(
     log.say(f"{len(scene)} Gaussians, {len(region)} in the region; {_describe_views(setup)}")
     for note in setup.notes:
         log.say(note)
-    if is_removal(options, setup, log):
-        return remove_region(options, setup, folder, log)
-    views = EditedViews(options, setup, folder, log)
-    with log.stage("edit"):
-        views.prepare()
-        edited = views.pictures
-        kind = views.approach.kind
-        optimization = views.optimization
-        # if more strengths may be requested, the boxes must not depend on which of them exist already
-        strengths = (1.0,) if views.requests_strengths else edited
-        train_edits = {s: edited[s][: len(setup.train)] for s in strengths}
-        setup = whole_views(setup) if options.optimize.as_printed else widen_views(setup, train_edits)
-    if optimization.solver == "colors":  # small sums, over which torch's threads spun for 100 s on 16 cores
-        torch.set_num_threads(1)
-    recorded = folder.state.load("recorded")
-    if recorded is None:
-        with log.stage("agree"):
-            agreement = _agreement(options, setup, edited, kind, folder, log)
-        trajectory, outcome = _record(options, optimization, setup, views, perceptual, folder, log)
-        record = RunRecord(
-            recorded_options(options),
-            options.scene.resolve(),
-            [view.camera.name for view in setup.held_out],
-            BACKGROUND,
-            kind,
-            optimization.group_steps or 0,
-            kind_trial=views.trial,
-            agreement=agreement,
-            up=setup.up.to_json() if setup.up is not None else None,
-            pictures=picture_digests(options),
-            **outcome,
-        )
-        extra = {"members": region.members, "score": region.score}
-        save_trajectory(folder.trajectory, trajectory, extra, to_json(record))
-        setup = setup.keep_solved(record.effort)
-        with log.stage("final"):
-            grown = setup.extend(trajectory.added)
-            finals = grown.scene.replace_rows(grown.region.members, end_rows(grown, trajectory))
-            write_finals(setup, finals, folder, log)
-        folder.state.save("recorded", {}, log.capture_state().values)
-        del trajectory, grown, finals
-    else:
-        log.restore(recorded)
-        log.say("the trajectory is recorded")
-    del edited, train_edits, views  # the needed parts are read again from disk
-    trajectory, _, about = load_trajectory(folder.trajectory)
-    record = read_record(about)
-    begun = folder.state.load(NETWORK)
-    setup = setup.keep_solved(record.effort)
-    result = finish_run(folder, setup, trajectory, record, perceptual, log, begun)
-    # only at the end, as a stopped run needs all views to resume
-    save_cameras(folder.cameras, [view.camera for view in setup.views], scene.origin)
-    remove_stale_views(folder, [view.camera.name for view in setup.views])
-    return result
-
-
-def _run_decal(
-    options: TrainOptions, scene: Gaussians, region: Region, folder: RunFolder, log: RunLog
-) -> RunResult:
-    """Place a decal, measure it, and write the files of a run, except for a trajectory."""
-    with log.stage("edit"):
-        editor = cast(PastingEditor, make_editor(options.editor, scene, region, ()))
-    view = editor.view
-    with log.stage("fit"):
-        painted = train_decal(editor, scene, options.name, log)
-    decal = f"decal:{Path(options.editor.editor.partition(':')[2]).name}"
-    figures = painted.figures
-    name = view.camera.name
-    view_psnr = figures["own"]
-    side_psnrs = figures["turned"]
-    about = {"edit": {"psnr_to_views": view_psnr}, "paint": figures}
-    save_cameras(folder.cameras, [view.camera], scene.origin)
-    front_index = TURNS.index(0)
-    mask = view.mask[..., None].expand(-1, -1, 3)
-    pictures = {"original": view.image, "mask": mask, "edited": painted.expected[front_index]}
-    for folder_name, picture in (pictures | {"final": painted.shown[front_index]}).items():
-        write_views(folder, folder_name, {name: picture})
-    labels = [f"{degrees:+d}°" if degrees else "0°" for degrees in TURNS]
-    title = f"{options.name}: {options.editor.editor}"
-    notes = [[], [f"{error} dB" if error is not None else "" for error in side_psnrs.values()]]
-    report = {
-        **about,
-        "views": {"held_out": False, "edit": [name]},
-        "time": log.rounded_seconds(),
-        "memory_mb": log.peak_mb(),
-        "plan": to_json(recorded_options(options)),
-        "pictures": picture_digests(options),
-    }
-    rows = [painted.expected, painted.shown]
-    sheet = contact_sheet(rows, ["projected", "the edit"], labels, title, notes=notes)
-    result = write_result(folder, replace(painted.gdf, instruction=decal, report=about), report, sheet)
-    added, pixels, moved = (group_digits(figures[name]) for name in ("added", "pixels", "moved"))
-    log.say(
-        f"{added} Gaussians added for {pixels} painted pixels, {moved} of the scene moved behind them; "
-        f"{view_psnr} dB in the decal's own view, {figures['ring']} dB in the {RING} pixels around it, "
-        f"{side_psnrs['-30']} and {side_psnrs['+30']} dB from 30° to its sides"
-    )
-    log.say(result.line)
-    return result
+    return setup
 
 
 def _write_draft(
@@ -345,77 +153,3 @@ def _render_originals(
     write_views(folder, "mask", masks)
     save_cameras(folder.cameras, [view.camera for view in views], scene.origin)
     return setup
-
-
-def _agreement(
-    options: TrainOptions,
-    setup: TrainingSetup,
-    edited: Pictures,
-    kind: EditKind,
-    folder: RunFolder,
-    log: RunLog,
-) -> Mapping[str, Any] | None:
-    """Measure how well the edited views agree; None for editors that edit all views alike."""
-    saved = folder.state.load("edited")
-    shared = saved.values.get("shared", {}) if saved is not None else {}
-    row = editor_row(options.editor)
-    if kind == "geometry" or not row.per_view:
-        return shared or None
-    count = len(setup.train)
-    agreement = measure_agreement(setup, edited[1.0][:count], edited[1.0][count:] or edited[1.0])
-    agreement = replace(agreement, contrast=shared.get("contrast", 1.0))
-    log.say(agreement.line(row.remedy, setup.judged_on))
-    return {**shared, **agreement.figures()}
-
-
-def _record(
-    options: TrainOptions,
-    optimization: OptimizeOptions,
-    setup: TrainingSetup,
-    views: EditedViews,
-    perceptual: Perceptual,
-    folder: RunFolder,
-    log: RunLog,
-) -> tuple[Trajectory, dict[str, Any]]:
-    """Optimize, and return the trajectory on its slider and the figures for the run's record."""
-    objective = describe_loss(optimization, perceptual.name)
-    log.say(f"loss: {objective}")
-    if options.optimize.group_steps and optimization.kind != "geometry":
-        log.say(f"--group-steps: without effect on this {optimization.kind} edit, whose loss is {objective}")
-    with log.stage("optimize"):
-        trajectory, losses, effort = optimize_members(
-            options, optimization, setup, views.pictures, perceptual, folder.state, log, views.source
-        )
-    setup = setup.keep_solved(effort).extend(trajectory.added)
-    with log.stage("retime"):
-        trajectory = smooth_course(trajectory)
-        costs: dict[str, float] = {}
-        recolors = only_recolors(trajectory.offsets)
-        # a grade has no attributes to drop
-        if trajectory.maps is None and (not recolors or trajectory.end.shape[1] > BASE_CHANNELS):
-            choosing, _ = load_evaluator(folder, setup, setup.judging, trajectory).halves()
-            prunes = not optimization.as_printed
-            trajectory, costs = drop_idle_attributes(trajectory, choosing, prunes)
-        count = len(trajectory)
-        reason = ""
-        has_one_target = len(trajectory.strengths) == 1
-        if has_one_target and not optimization.as_printed and options.field.field != "neural":
-            # external pictures may be gone by now and have no intermediate strengths; generative models
-            # edited only strength 1
-            row = editor_row(options.editor)
-            painter = None if row.external or row.slow_strengths else views.editor
-            retimed = partial(retime_trajectory, setup=setup, optimization=optimization, log=log)
-            moves_groups = bool(optimization.group_steps)
-            trajectory, reason = choose_path(trajectory, setup, painter, moves_groups, retimed)
-        else:
-            trajectory = retime_trajectory(trajectory, setup, optimization, log)
-        trajectory = fade_in(trajectory)
-    log.say(f"{count} recordings, {len(trajectory)} kept; without an attribute, dB: {costs or 'none moves'}")
-    if reason:
-        log.say(f"between original and edit: {reason}")
-    return trajectory, {
-        "objective": objective,
-        "losses": losses,
-        "effort": effort,
-        "attribute_worth_db": costs,
-    }

@@ -33,6 +33,10 @@ INSIDE = (
 """Message for such a scene without cameras, after its name."""
 
 
+BACKGROUND_NAMES = ("white", "black", "checker")
+"""Backgrounds of `on_backgrounds`."""
+
+_CHECKER_TILES = 16  # tiles of the checker along the longer side of a picture
 _MIN_BOX = 64  # pixels per side that LPIPS needs
 _SEEN = 0.05  # member weight above which a pixel shows the region
 _PIXEL_STRIDE = 23  # stride of a thumbnail's sampled pixels, in row-major order
@@ -117,6 +121,18 @@ def render_colors(
 def render_view(scene: Gaussians, camera: Camera, background: Tensor) -> Tensor:
     """Render the scene, without gradients. [H,W,3]"""
     return render_colors(scene, seen_colors(scene, camera), camera, background)
+
+
+def on_backgrounds(scene: Gaussians, camera: Camera) -> list[Tensor]:
+    """Return the scene rendered on each of `BACKGROUND_NAMES`. [H,W,3] each"""
+    with torch.no_grad():
+        output = render(scene, camera, (0.0, 0.0, 0.0))
+    side = max(1, max(camera.width, camera.height) // _CHECKER_TILES)
+    rows = torch.arange(camera.height)[:, None] // side
+    columns = torch.arange(camera.width) // side
+    checker = ((rows + columns) % 2).float()
+    shades = (torch.ones_like(checker), torch.zeros_like(checker), checker)
+    return [(output.image + (output.transmittance * shade)[..., None]).clamp(0.0, 1.0) for shade in shades]
 
 
 class RegionThumbnail(NamedTuple):

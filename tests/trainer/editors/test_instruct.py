@@ -32,7 +32,7 @@ from trainer.editors.instruct import InstructEditor, sentence
 from trainer.editors.mixed_steps import MixedSteps, network_steps
 from trainer.options import EditorOptions, TrainOptions, with_values
 from trainer.resolve import resolve, resolve_kind
-from trainer.run.run import check_command
+from trainer.run.command import check_command
 from trainer.store.pretrained import LastValueCache
 from trainer.store.run_folder import RunFolder, begin_log
 from trainer.views.view import render_view

@@ -26,7 +26,8 @@ from trainer.editors.base import EditorInput
 from trainer.editors.decal import DecalEditor, decal, parse_place
 from trainer.options import EditorOptions
 from trainer.paint.discs import merge_pixels, place_discs
-from trainer.run.paint import choose_discs, orbit, train_decal
+from trainer.run.paint import choose_discs, orbit
+from trainer.run.pasted import train_decal
 from trainer.views.view import BACKGROUND
 
 

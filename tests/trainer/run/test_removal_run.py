@@ -23,6 +23,7 @@ from progdf.metrics.image import decibels
 from progdf.quaternions import matrix_quats
 from progdf.rasterize import render
 from progdf.region import Region, from_mask
+from progdf.scene.strays import with_strays
 from progdf.sh import rgb_to_sh0
 from trainer.evaluate.command import evaluate
 from trainer.fill import Hole, fill_holes, find_hole, membrane, place_discs
@@ -34,11 +35,10 @@ from trainer.options import (
     TrainOptions,
     with_values,
 )
-from trainer.run.removal import on_backgrounds, with_strays
 from trainer.run.resume import picture_digests
 from trainer.run.run import train
 from trainer.setup import TrainingSetup, make_training_setup
-from trainer.views.view import View, render_view
+from trainer.views.view import View, on_backgrounds, render_view
 
 WHITE = torch.ones(3)
 TABLE = "box:-9,-0.005,-9,9,9,9"

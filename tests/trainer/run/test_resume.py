@@ -31,7 +31,7 @@ from tests.helpers.stopped import OUT, bits, small_run
 from tests.helpers.stopped_runs import NEVER, at_step, gone_on, killed, saved_step, words
 from tests.helpers.trained import quick_options, train
 from trainer.options import EditorOptions, TrainOptions
-from trainer.run import agree, edited_views, training
+from trainer.run import agree, command, edited_views, trained, training
 from trainer.run.resume import decide_resume, explain_stop, find_run, picture_digests, processor_kind
 from trainer.store.run_folder import RunFolder, open_run_folder
 from trainer.store.state import StateFolder
@@ -240,7 +240,7 @@ def test_resume_repeats_no_edited_view_and_no_region_search(
     def again(*_: object) -> None:
         raise AssertionError("made again")
 
-    monkeypatch.setattr(trainer.run.run, "parse_region", again)
+    monkeypatch.setattr(command, "parse_region", again)
     monkeypatch.setattr(agree, "make_editor", again)
     gone_on(bear_folder, uninterrupted)
 
@@ -306,7 +306,7 @@ def test_run_that_moves_parts_resumes_to_the_same_bits(
     bear_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     options = small_run(bear_folder, kind="geometry", group_steps=8, steps=16)
-    monkeypatch.setattr(trainer.run.run, "finish_run", lambda *_: None)
+    monkeypatch.setattr(trained, "finish_run", lambda *_: None)
     train(options, quiet=True)
     expected = (OUT / "trajectory.safetensors").read_bytes()
     shutil.rmtree(OUT)
@@ -330,7 +330,7 @@ def test_run_that_chooses_its_strengths_resumes_to_the_same_bits(
     """Stop while views are edited at the chosen strengths, then between two strengths."""
     free = {"perceptual_weight": None, "steps": 200, "stages": 0, "views": 0, "image_size": 40}
     options = small_run(bear_folder, field="auto", **free)
-    monkeypatch.setattr(trainer.run.run, "finish_run", lambda *_: None)
+    monkeypatch.setattr(trained, "finish_run", lambda *_: None)
     train(options, quiet=True)
     expected = (OUT / "trajectory.safetensors").read_bytes()
     shutil.rmtree(OUT)
@@ -434,7 +434,7 @@ def test_run_that_keeps_half_of_its_views_resumes_to_the_same_bits(
         if loses_a_view or where == "step 2":
             at_step(patch, 2, lambda: os.kill(os.getpid(), signal.SIGINT))
         else:
-            patch.setattr(trainer.run.run, where, stop)
+            patch.setattr(trained, where, stop)
         with pytest.raises(KeyboardInterrupt):
             train(options)
     if loses_a_view:

@@ -6,10 +6,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-import torch
 from torch import Tensor
 
-from progdf.camera import Camera
 from progdf.compose.reference import edited_scene
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians, concatenate
@@ -17,9 +15,7 @@ from progdf.gdf.file import Gdf
 from progdf.io.images import contact_sheet
 from progdf.io.json_values import to_json
 from progdf.metrics.image import decibels
-from progdf.rasterize import render
-from progdf.region import Region, from_mask
-from progdf.scene.strays import find_strays
+from progdf.scene.strays import with_strays
 from progdf.terminal import format_count
 from progdf.tidy import Step, tidy
 from trainer.editors import editor_row
@@ -30,14 +26,12 @@ from trainer.resolve import recorded_options
 from trainer.setup import TrainingSetup, make_training_setup
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder, write_views
-from trainer.views.view import View, render_view
+from trainer.views.view import BACKGROUND_NAMES, View, on_backgrounds, render_view
 
 from .finish import DEFAULTS, RunResult, differences, write_result
 
-BACKGROUNDS = ("white", "black", "checker")
 _TOLERANCE = 0.05  # color tolerance of equal pixels; also the mask value from which a pixel counts as region
 _MIN_PAINT = 2 / 255  # smallest color change that counts as paint
-_CHECKER_TILES = 16  # tiles of the checker along the longer side of a picture
 _STRENGTH_STEPS = 20  # steps between strengths 0 and 1 in which the opacities are compared
 
 
@@ -167,14 +161,6 @@ def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder
     return result
 
 
-def with_strays(scene: Gaussians, region: Region) -> Region:
-    """Return the region with the floaters that its removal would leave behind, see `find_strays`."""
-    mask = ~region.mask
-    alone = mask.nonzero()[:, 0][find_strays(scene[mask]).floaters]
-    mask[alone[~torch.isin(alone, torch.from_numpy(find_strays(scene).floaters))]] = False
-    return from_mask(region.name, ~mask)
-
-
 def _painted_views(options: TrainOptions, setup: TrainingSetup) -> tuple[list[View], Mapping[str, Tensor]]:
     """Return the views of the pictures that show the background, and these pictures by view name. [H,W,3]"""
     paths = options.views.pictures or editor_row(options.editor).files(options.editor.text)
@@ -198,27 +184,15 @@ def _views_around(options: TrainOptions, setup: TrainingSetup) -> TrainingSetup:
 
 def _measure(edited: Gaussians, reference: Gaussians, views: Sequence[View]) -> dict[str, float]:
     """Return the PSNR at the region's pixels over all views, by background, dB."""
-    errors = dict.fromkeys(BACKGROUNDS, 0.0)
+    errors = dict.fromkeys(BACKGROUND_NAMES, 0.0)
     count = 0
     for view in views:
         pixels = view.mask > _TOLERANCE
         count += 3 * int(pixels.sum())
         pairs = zip(on_backgrounds(edited, view.camera), on_backgrounds(reference, view.camera), strict=True)
-        for name, (a, b) in zip(BACKGROUNDS, pairs, strict=True):
+        for name, (a, b) in zip(BACKGROUND_NAMES, pairs, strict=True):
             errors[name] += float((a - b)[pixels].double().square().sum())
     return {name: round(decibels(error / max(1, count)), 2) for name, error in errors.items()}
-
-
-def on_backgrounds(scene: Gaussians, camera: Camera) -> list[Tensor]:
-    """Return the scene rendered on each of `BACKGROUNDS`. [H,W,3] each"""
-    with torch.no_grad():
-        output = render(scene, camera, (0.0, 0.0, 0.0))
-    side = max(1, max(camera.width, camera.height) // _CHECKER_TILES)
-    rows = torch.arange(camera.height)[:, None] // side
-    columns = torch.arange(camera.width) // side
-    checker = ((rows + columns) % 2).float()
-    shades = (torch.ones_like(checker), torch.zeros_like(checker), checker)
-    return [(output.image + (output.transmittance * shade)[..., None]).clamp(0.0, 1.0) for shade in shades]
 
 
 def _max_deviation_from_linear(scene: Gaussians, gdf: Gdf) -> float:
@@ -255,5 +229,5 @@ def _contact_sheet(scene: Gaussians, gdf: Gdf, views: Sequence[View], title: str
     columns = [on_backgrounds(edited_scene(scene, gdf, s), view.camera) for s in strengths]
     rows = [list(row) for row in zip(*columns, strict=True)]
     return contact_sheet(
-        rows, BACKGROUNDS, [f"s = {s:g}" for s in strengths], title, f"view {view.camera.name}"
+        rows, BACKGROUND_NAMES, [f"s = {s:g}" for s in strengths], title, f"view {view.camera.name}"
     )

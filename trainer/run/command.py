@@ -1,0 +1,98 @@
+"""Check of a training command, and selection of its region."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from progdf.gaussians import ZERO, Gaussians
+from progdf.io.atomic import read_file
+from progdf.io.cameras import load_cameras
+from progdf.io.json_values import check_text
+from progdf.rasterize.engines import get_engine
+from progdf.region import Region
+from progdf.scene.regions import check_region, parse_region
+from trainer.editors import check_editor, check_new_editor, editor_row
+from trainer.editors.pictures import picture_cameras
+from trainer.options import TrainOptions, flat_values
+from trainer.regions.from_pictures import RegionRequest, region_checks, region_kinds
+from trainer.resolve import recorded_options
+from trainer.setup import (
+    check_given_cameras,
+)
+from trainer.store.pretrained import LastValueCache
+from trainer.store.run_folder import (
+    check_folder,
+    open_run_folder,
+)
+
+from .resume import load_region
+
+
+def check_command(options: TrainOptions) -> None:
+    """Check everything that the command names, as far as possible without the scene.
+
+    A resumed run no longer needs its sources, as its region and its edited views are saved.
+
+    Args:
+        options: resolved options
+
+    Raises:
+        ProgdfError: the folder is occupied, the editor or the segmenter cannot run, a file is missing, or a
+            text for the run's record is not UTF-8.
+    """
+    for name, _, value in flat_values(recorded_options(options)):
+        for part in value if isinstance(value, tuple) else (value,):
+            check_text(str(part), f"the record of --{name.replace('_', '-')}")
+    get_engine(options.optimize.engine)
+    check_editor(options.editor.editor)
+    folder = check_folder(options.out, options.edit)
+    views = options.views
+    if not options.scene.is_dir():  # some formats are folders
+        read_file(options.scene, 0)
+    if views.cameras is not None and not options.resume:
+        load_cameras(views.cameras, ZERO)
+    if views.pictures:
+        cameras = [] if views.cameras is None else load_cameras(views.cameras, ZERO)
+        picture_cameras(views.pictures, cameras, ZERO)
+    if not options.resume or load_region(options.out) is None:
+        check_region(options.region.region, region_checks(region_request(options, quiet=True)))
+    is_new = not folder.root.is_dir() or not any(folder.root.iterdir())
+    if is_new or (editor_row(options.editor).slow_strengths and not options.resume):
+        check_new_editor(replace(options.editor, cache=folder.paintings))
+
+
+def region_request(
+    options: TrainOptions, quiet: bool, say: Callable[[str], None] | None = None
+) -> RegionRequest:
+    """Return the request for a region made from pictures. Segmentation masks are saved in the run's folder.
+
+    Args:
+        options: resolved options
+        quiet, say: see `RegionRequest`
+    """
+
+    def cache() -> Path:
+        # never write into a folder that is not a run folder
+        return open_run_folder(options.out, options.edit).segment_masks
+
+    return RegionRequest(options.region, options.views, cache, quiet, say)
+
+
+def select_region(
+    options: TrainOptions, scene: Gaussians, quiet: bool, shared: LastValueCache
+) -> tuple[Region, list[str]]:
+    """Return the region that resolved options name, and lines for the log.
+
+    Raises:
+        ProgdfError: see `parse_region`; or the cameras do not show the scene.
+    """
+
+    def select() -> tuple[Region, list[str]]:
+        notes = list[str]()
+        check_given_cameras(options.views, scene)  # fail before a folder is created
+        kinds = region_kinds(region_request(options, quiet, notes.append))
+        return parse_region(options.region.region, scene, options.name, kinds, notes.append), notes
+
+    return shared.get("region", (options.scene.resolve(), options.region, options.views), select)

@@ -1,0 +1,127 @@
+"""Pasted edit: paint of one view as discs on the surface. Nothing is trained."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+
+from progdf.compose.reference import edited_scene
+from progdf.gaussians import Gaussians
+from progdf.gdf.file import Gdf
+from progdf.io.cameras import save_cameras
+from progdf.io.images import contact_sheet
+from progdf.io.json_values import to_json
+from progdf.metrics.image import psnr
+from progdf.terminal import group_digits
+from trainer.editors import make_editor
+from trainer.editors.base import PastingEditor
+from trainer.options import TrainOptions
+from trainer.resolve import recorded_options
+from trainer.setup import TrainingSetup
+from trainer.store.progress import RunLog
+from trainer.store.run_folder import RunFolder, write_views
+from trainer.views.view import BACKGROUND, render_view
+
+from .finish import RunResult, write_result
+from .paint import RING, TRIAL_ANGLES_DEG, choose_discs, paint_gdf, views_around_paint
+from .resume import picture_digests
+
+TURNS = (-45, -30, -15, 0, 15, 30, 45)
+"""Angles of the measured views around the paint, degrees."""
+
+
+def paste_decal(options: TrainOptions, setup: TrainingSetup, folder: RunFolder, log: RunLog) -> RunResult:
+    """Paste paint onto the region, measure it, and write the files of a run, except for a trajectory.
+
+    Args:
+        options: resolved options
+        setup: scene and region; the editor brings its own view
+        folder: folder of the run
+        log: log of the run
+    """
+    scene = setup.scene
+    with log.stage("edit"):
+        editor = cast(PastingEditor, make_editor(options.editor, scene, setup.region, ()))
+    view = editor.view
+    with log.stage("fit"):
+        painted = train_decal(editor, scene, options.name, log)
+    decal = f"decal:{Path(options.editor.text).name}"
+    figures = painted.figures
+    name = view.camera.name
+    view_psnr = figures["own"]
+    side_psnrs = figures["turned"]
+    about = {"edit": {"psnr_to_views": view_psnr}, "paint": figures}
+    save_cameras(folder.cameras, [view.camera], scene.origin)
+    front_index = TURNS.index(0)
+    mask = view.mask[..., None].expand(-1, -1, 3)
+    pictures = {"original": view.image, "mask": mask, "edited": painted.expected[front_index]}
+    for folder_name, picture in (pictures | {"final": painted.shown[front_index]}).items():
+        write_views(folder, folder_name, {name: picture})
+    labels = [f"{degrees:+d}°" if degrees else "0°" for degrees in TURNS]
+    title = f"{options.name}: {options.editor.editor}"
+    notes = [[], [f"{error} dB" if error is not None else "" for error in side_psnrs.values()]]
+    report = {
+        **about,
+        "views": {"held_out": False, "edit": [name]},
+        "time": log.rounded_seconds(),
+        "memory_mb": log.peak_mb(),
+        "plan": to_json(recorded_options(options)),
+        "pictures": picture_digests(options),
+    }
+    rows = [painted.expected, painted.shown]
+    sheet = contact_sheet(rows, ["projected", "the edit"], labels, title, notes=notes)
+    result = write_result(folder, replace(painted.gdf, instruction=decal, report=about), report, sheet)
+    added, pixels, moved = (group_digits(figures[name]) for name in ("added", "pixels", "moved"))
+    log.say(
+        f"{added} Gaussians added for {pixels} painted pixels, {moved} of the scene moved behind them; "
+        f"{view_psnr} dB in the decal's own view, {figures['ring']} dB in the {RING} pixels around it, "
+        f"{side_psnrs['-30']} and {side_psnrs['+30']} dB from 30° to its sides"
+    )
+    log.say(result.line)
+    return result
+
+
+@dataclass(frozen=True)
+class Painted:
+    """Edit that adds discs, and its measured quality."""
+
+    gdf: Gdf
+    figures: dict[str, Any]  # for report.json
+    expected: list[Tensor]  # expected images of the views of `TURNS`. [H,W,3] each
+    shown: list[Tensor]  # renders of the edit in these views. [H,W,3] each
+
+
+def train_decal(editor: PastingEditor, scene: Gaussians, name: str, log: RunLog | None = None) -> Painted:
+    """Return the edit of a decal, measured in its own view and from the sides.
+
+    Args:
+        editor: see `PastingEditor`
+        scene: the original
+        name: name of the layer
+        log: log of the run
+    """
+    paints = [editor.paint]
+    laid = choose_discs(scene, paints, views_around_paint(scene, paints, TRIAL_ANGLES_DEG), log)
+    gdf = paint_gdf(laid, scene, paints, name, None)
+    edited = edited_scene(scene, gdf)
+    background = torch.tensor(BACKGROUND)
+    views = views_around_paint(scene, paints, TURNS)
+    images = [render_view(edited, look.camera, background).clamp(0.0, 1.0) for look in views]
+    errors = [
+        round(psnr(image, look.expected, look.covered), 2) if bool(look.covered.any()) else None
+        for image, look in zip(images, views, strict=True)
+    ]
+    middle = TURNS.index(0)
+    figures = {
+        "pixels": int(paints[0].mask.sum()),
+        "added": 0 if gdf.added is None else len(gdf.added),
+        "moved": len(gdf.region),
+        "own": errors[middle],
+        "ring": round(psnr(images[middle], views[middle].expected, views[middle].around), 2),
+        "turned": {f"{degrees:+d}": error for degrees, error in zip(TURNS, errors, strict=True)},
+    }
+    return Painted(gdf, figures, [look.expected for look in views], images)
