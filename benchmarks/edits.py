@@ -27,7 +27,7 @@ from trainer.evaluate.opened import FADE, KEYFRAMES, SLIDER, OpenedRun, open_run
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.optimize.losses import perceptual_loss
 from trainer.report.measures import COMPARED, error_curves
-from trainer.setup import Pictures
+from trainer.views.boxes import Pictures
 from trainer.views.choose import split_held_out
 from trainer.views.view import View, crop, make_view
 

@@ -31,7 +31,7 @@ from trainer.optimize.color_solver import add_bands, choose_model, make_solver, 
 from trainer.optimize.color_views import color_views
 from trainer.optimize.ties import surface_ties
 from trainer.options import EditorOptions
-from trainer.setup import quantize_image
+from trainer.store.run_folder import quantize_image
 from trainer.views.crops import crop_scene
 from trainer.views.view import (
     BACKGROUND,

@@ -38,8 +38,8 @@ from trainer.report.report import stack_plots, thumbnail
 from trainer.resolve import resolve, use_threads
 from trainer.run.demo import Effort, write_scene
 from trainer.run.resume import find_run
-from trainer.setup import make_training_setup, render_thumbnails
 from trainer.store.run_folder import write_json
+from trainer.views.setup import make_training_setup, render_thumbnails
 from trainer.views.view import crop, render_view
 
 from .analytic_edits import AnalyticEdit, bear_edits

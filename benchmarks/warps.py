@@ -31,8 +31,10 @@ from trainer.optimize.pgs import TargetStage, optimize, pgs_settings
 from trainer.options import EditorOptions, OptimizeOptions, RegionOptions, TrainingViewOptions, TrainOptions
 from trainer.resolve import resolve, resolve_kind
 from trainer.run.kinds import Approach, approaches, try_approaches
-from trainer.setup import TrainingSetup, make_training_setup, probe_views, quantize_image, widen_views
+from trainer.store.run_folder import quantize_image
+from trainer.views.boxes import probe_views, widen_views
 from trainer.views.crops import CropScene, crop_scene
+from trainer.views.setup import TrainingSetup, make_training_setup
 from trainer.views.view import View, crop
 
 from .analytic_edits import AnalyticEdit, column_warps, smile_warp

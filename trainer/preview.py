@@ -45,7 +45,7 @@ from trainer.editors.instruct import InstructEditor, instruct
 from trainer.fit.draft import DraftViews, draft_grade, draft_views
 from trainer.options import EditorOptions, RegionOptions, TrainingViewOptions
 from trainer.regions.from_pictures import RegionRequest, region_kinds
-from trainer.setup import render_thumbnails
+from trainer.views.setup import render_thumbnails
 from trainer.views.view import View, make_view, with_near_plane
 
 _Row3 = tuple[float, float, float]

@@ -32,10 +32,10 @@ from trainer.report.report import SHOWN, best_view, editor_strip, strip
 from trainer.resolve import resolve_kind, use_threads
 from trainer.run.record import reopen_run
 from trainer.run.training import optimize_members, retime_trajectory
-from trainer.setup import Pictures, whole_views
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder, lock_folder, write_json
 from trainer.store.state import StateFolder, interrupt_on_signals
+from trainer.views.boxes import Pictures, whole_views
 
 from .judge import fit_variant, with_figures
 from .options import AblateOptions

@@ -43,17 +43,12 @@ from trainer.optimize.retime import smooth_course
 from trainer.options import EditorOptions, FieldOptions, OptimizeOptions, TrainingViewOptions
 from trainer.resolve import use_threads
 from trainer.run.training import StrengthSource, plan_colors
-from trainer.setup import (
-    Pictures,
-    TrainingSetup,
-    make_training_setup,
-    quantize_image,
-    render_thumbnails,
-    widen_views,
-)
 from trainer.store.progress import RunLog
+from trainer.store.run_folder import quantize_image
+from trainer.views.boxes import Pictures, widen_views
 from trainer.views.choose import choose_views, split_held_out
 from trainer.views.crops import CropScene, crop_scene
+from trainer.views.setup import TrainingSetup, make_training_setup, render_thumbnails
 from trainer.views.view import View, crop, name_cameras, region_rig, with_near_plane
 
 from ..table import Table

@@ -14,23 +14,17 @@ from torch import Tensor
 from progdf.gaussians import BASE_CHANNELS
 from progdf.io.json_values import to_json
 from trainer.editors import make_editor
+from trainer.editors.base import confines_edit, editor_strengths
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.fit.fit import visibility
 from trainer.options import EditKind, TrainOptions, with_values
 from trainer.report.report import Columns, columns_of
 from trainer.resolve import QUICK_STAGES, QUICK_STEPS, QUICK_VIEWS
 from trainer.run.record import FinishedRun, render_run_views
-from trainer.setup import (
-    Pictures,
-    TrainingSetup,
-    confines_edit,
-    editor_strengths,
-    quantize_image,
-    render_thumbnails,
-    widen_views,
-)
-from trainer.store.run_folder import read_views
+from trainer.store.run_folder import quantize_image, read_views
+from trainer.views.boxes import Pictures, widen_views
 from trainer.views.crops import only_recolors
+from trainer.views.setup import TrainingSetup, render_thumbnails
 from trainer.views.view import View
 
 from .variants import Variant

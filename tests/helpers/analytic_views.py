@@ -27,7 +27,7 @@ from progdf.scene.regions import parse_region
 from tests.helpers.demo_scenes import bear
 from trainer.options import EditorOptions, OptimizeOptions, RegionOptions, TrainOptions
 from trainer.resolve import resolve
-from trainer.setup import make_training_setup
+from trainer.views.setup import make_training_setup
 
 PLAYBOT = Path("playbot_31k.ply")  # in the current folder, as in docs/benchmarks.md
 _EARS = "big ears"

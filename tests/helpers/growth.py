@@ -16,7 +16,7 @@ from progdf.sh import rgb_to_sh0
 from tests.helpers.trained import WHITE, quick_options, small, write_bear
 from trainer.options import TrainOptions
 from trainer.resolve import resolve
-from trainer.setup import make_training_setup
+from trainer.views.setup import make_training_setup
 
 RED = (0.85, 0.15, 0.15)
 YELLOW = (0.95, 0.85, 0.3)

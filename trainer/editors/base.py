@@ -11,7 +11,7 @@ from torch import Tensor
 
 from progdf.gaussians import Gaussians
 from progdf.region import Region
-from trainer.options import EditKind, EditorOptions
+from trainer.options import EditKind, EditorOptions, Kind
 from trainer.paint.discs import PaintedView
 from trainer.views.view import RegionThumbnail, View
 
@@ -54,6 +54,16 @@ class ImageEditor(Protocol):
     def edit(self, view: View, strength: float) -> Tensor:
         """Return the edited view. Strength 0 returns `view.image` bit for bit. -> [H,W,3] 0..1"""
         ...
+
+
+def editor_strengths(editor: ImageEditor, stages: int) -> tuple[float, ...]:
+    """Return the strengths to request: the editor's own, or `stages` evenly spaced ones."""
+    return editor.stages or tuple((i + 1) / stages for i in range(stages))
+
+
+def confines_edit(editor: ImageEditor, kind: Kind) -> bool:
+    """Return True if changes outside the region are reverted: unless the edit moves parts."""
+    return kind != "geometry" and not editor.is_confined
 
 
 class PastingEditor(ImageEditor, Protocol):

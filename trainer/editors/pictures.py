@@ -5,9 +5,9 @@
     folder:DIR                       an edited copy of every view
     photographs:EDITED,ORIGINALS     edited photographs and, optionally, the unedited ones
 
-A picture of `pictures` needs the camera that rendered it (see `trainer.setup`). The run's views are then the
-views of these pictures. The background behind the scene can have any single color: it is detected and
-replaced by the run's background. A shift by one or two pixels is undone.
+A picture of `pictures` needs the camera that rendered it (see `trainer.views.picture_cameras`). The run's
+views are then the views of these pictures. The background behind the scene can have any single color: it is
+detected and replaced by the run's background. A shift by one or two pixels is undone.
 """
 
 from __future__ import annotations
@@ -28,10 +28,9 @@ from progdf.camera import Camera, undistort
 from progdf.color.edits import number_of, typical_color
 from progdf.color.oklab import Bend, bend_of, interpolate_colors
 from progdf.errors import ProgdfError
-from progdf.gaussians import ZERO, Gaussians, Origin
+from progdf.gaussians import Gaussians
 from progdf.io.cameras import kind_of_cameras
 from progdf.io.images import picture_size, read_picture, saving_loss
-from progdf.io.picture_camera import find_picture_camera
 from progdf.io.picture_files import PictureFolder, find_picture, name_key, split_path
 from progdf.rasterize import render
 from trainer.options import EditKind
@@ -51,7 +50,6 @@ STILL = 0.4  # quantile of the difference that rates a shift: much of a picture 
 _EDGE_CONTRAST = 0.02  # color difference of neighboring pixels at an edge; flat areas match at any shift
 # share of the unshifted error that a shift must beat: noise alone favors one shift a little
 _MAX_SHIFTED_ERROR = 0.8
-_MAX_ASPECT_ERROR = 0.02  # relative difference in proportions allowed between a picture and its camera
 
 
 @dataclass(frozen=True)
@@ -177,37 +175,6 @@ def strengths_of(path: Path) -> dict[float, Path]:
             )
         paths[strength] = picture
     return paths
-
-
-def picture_cameras(paths: Sequence[Path], given: Sequence[Camera], origin: Origin = ZERO) -> list[Camera]:
-    """Return the cameras of the pictures, at the pictures' sizes.
-
-    Args:
-        paths: the pictures
-        given: cameras to choose from
-        origin: origin of the scene; the cameras are relative to it
-
-    Raises:
-        ProgdfError: a picture has no camera (see `find_picture_camera`), or its proportions are different.
-    """
-    sizes = [picture_size(path) for path in paths]
-    cameras = rendered_cameras(paths, given, origin)
-    return [camera.resize(*size) for camera, size in zip(cameras, sizes, strict=True)]
-
-
-def rendered_cameras(paths: Sequence[Path], given: Sequence[Camera], origin: Origin = ZERO) -> list[Camera]:
-    """Return the cameras of the pictures at the sizes of their renders (see `picture_cameras`)."""
-    cameras = []
-    for path in paths:
-        camera = find_picture_camera(path, given, origin)
-        width, height = picture_size(path)
-        if abs(width * camera.height / (height * camera.width) - 1) > _MAX_ASPECT_ERROR:
-            raise ProgdfError(
-                f"{path} is {width}x{height} pixels, it was rendered with {camera.width}x{camera.height}; "
-                "keep the proportions, and crop nothing"
-            )
-        cameras.append(camera)
-    return cameras
 
 
 def read_change(scene: Gaussians, path: Path, camera: Camera) -> tuple[Tensor, Tensor]:

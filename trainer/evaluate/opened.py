@@ -21,7 +21,7 @@ from trainer.fit.evaluate import Evaluator
 from trainer.fit.slider_uniformity import equalize_slider
 from trainer.run.finish import load_evaluator
 from trainer.run.record import FinishedRun, render_edited_views, reopen_run
-from trainer.setup import TrainingSetup
+from trainer.views.setup import TrainingSetup
 
 SLIDER = "slider"
 """Contender: the shipped field."""

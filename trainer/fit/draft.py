@@ -23,7 +23,7 @@ from trainer.editors import editor_row, make_editor
 from trainer.editors.procedural import edit_course
 from trainer.optimize.color_views import MAX_ERROR_SHARE, ColorView, MapFit, fit_maps
 from trainer.options import MAX_STAGES, EditorOptions, TrainingViewOptions
-from trainer.setup import render_thumbnails
+from trainer.views.setup import render_thumbnails
 from trainer.views.view import BACKGROUND, RegionThumbnail, View, render_view
 
 from .slider_uniformity import equalized_strengths

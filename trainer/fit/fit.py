@@ -32,10 +32,10 @@ from progdf.threads import one_thread
 from trainer.editors.base import ImageEditor
 from trainer.optimize.retime import select_recordings
 from trainer.options import FieldKind, FieldOptions
-from trainer.setup import TrainingSetup
 from trainer.store.progress import release_memory
 from trainer.views.choose import split_held_out
 from trainer.views.crops import only_recolors
+from trainer.views.setup import TrainingSetup
 from trainer.views.view import View
 
 from .evaluate import Evaluator, make_evaluator

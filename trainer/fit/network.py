@@ -26,10 +26,11 @@ from trainer.optimize.losses import Perceptual, l1, sharpness
 from trainer.optimize.pgs import TargetStage
 from trainer.optimize.retime import resolve_slider
 from trainer.options import FieldOptions, OptimizeOptions
-from trainer.setup import TrainingSetup, probe_views
 from trainer.store.progress import RunLog
 from trainer.store.state import Saved, StateFolder
+from trainer.views.boxes import probe_views
 from trainer.views.crops import CropScene, crop_scene, render_all
+from trainer.views.setup import TrainingSetup
 
 from .evaluate import Evaluator
 from .fit import visibility

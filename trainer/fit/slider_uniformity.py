@@ -33,9 +33,10 @@ from trainer.editors import editor_row
 from trainer.editors.base import ImageEditor
 from trainer.editors.procedural import edit_course
 from trainer.options import EditorOptions
-from trainer.setup import TrainingSetup, probe_views
 from trainer.store.progress import RunLog
+from trainer.views.boxes import probe_views
 from trainer.views.crops import GEOMETRY, render_all
+from trainer.views.setup import TrainingSetup
 from trainer.views.view import View
 
 STEPS = 20

@@ -24,8 +24,8 @@ from progdf.rasterize.engines import Depth, render_depth
 from progdf.scene.bounds import scene_sphere
 from progdf.scene.point_tree import PointTree
 from progdf.sh import rgb_to_sh0
-from trainer.setup import TrainingSetup
 from trainer.views.crops import CropScene
+from trainer.views.setup import TrainingSetup
 from trainer.views.view import View
 
 from .pgs import TargetStage

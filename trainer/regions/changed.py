@@ -31,7 +31,7 @@ from progdf.scene.point_tree import PointTree
 from progdf.sh import sh0_to_rgb
 from progdf.terminal import format_count
 from trainer.editors.pictures import STEP, STILL, move_image, read_change, undo_shift
-from trainer.setup import quantize_image
+from trainer.store.run_folder import quantize_image
 from trainer.views.view import fit_size, with_near_plane
 
 from .few_masks import FEW, connected_pieces

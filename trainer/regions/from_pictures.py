@@ -28,10 +28,11 @@ from progdf.scene.scribbles import Rows, Scribbles, rows_under
 from progdf.scene.selection import Surface, base_colors
 from progdf.scene.up_axis import find_up
 from trainer.editors.cache import PictureCache, Recipe
-from trainer.editors.pictures import picture_paths, read_change, rendered_cameras
+from trainer.editors.pictures import picture_paths, read_change
 from trainer.options import VIEWS, RegionOptions, TrainingViewOptions
 from trainer.store.pretrained import last_model
 from trainer.views.choose import load_given_cameras
+from trainer.views.picture_cameras import rendered_cameras
 from trainer.views.view import (
     BACKGROUND,
     INSIDE,

@@ -22,8 +22,9 @@ from torch import Tensor
 from progdf.metrics.image import NO_DIFFERENCE, decibels
 from progdf.rasterize import render
 from trainer.editors.style import smooth
-from trainer.setup import TrainingSetup, shrink_view
+from trainer.views.boxes import shrink_view
 from trainer.views.crops import CropScene
+from trainer.views.setup import TrainingSetup
 from trainer.views.view import View
 
 _MAX_UNEXPLAINED = 0.4  # midway between edits that agree and edits that do not, see above

@@ -24,7 +24,7 @@ from trainer.fit.evaluate import Evaluator
 from trainer.fit.fit import Fitted, choice_figures, field_figures, stored_numbers
 from trainer.optimize.losses import Perceptual
 from trainer.options import TextOptions
-from trainer.setup import TrainingSetup
+from trainer.views.setup import TrainingSetup
 from trainer.views.view import View, render_view
 
 from .clip import CLIP_MODEL, Clip, direction, load_clip, same_features

@@ -49,10 +49,10 @@ from trainer.editors.instruct import InstructEditor
 from trainer.editors.style import cross_fade
 from trainer.options import EditKind, TrainOptions
 from trainer.report.agreement import ViewChange, fine_energy, fit_colors, robust_colors, view_change
-from trainer.setup import TrainingSetup, render_thumbnails
 from trainer.store.progress import Advance, RunLog
 from trainer.store.run_folder import RunFolder
 from trainer.views.register import register
+from trainer.views.setup import TrainingSetup, render_thumbnails
 from trainer.views.view import (
     View,
     fit_size,

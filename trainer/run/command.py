@@ -14,18 +14,16 @@ from progdf.rasterize.engines import get_engine
 from progdf.region import Region
 from progdf.scene.regions import check_region, parse_region
 from trainer.editors import check_editor, check_new_editor, editor_row
-from trainer.editors.pictures import picture_cameras
 from trainer.options import TrainOptions, flat_values
 from trainer.regions.from_pictures import RegionRequest, region_checks, region_kinds
 from trainer.resolve import recorded_options
-from trainer.setup import (
-    check_given_cameras,
-)
 from trainer.store.pretrained import LastValueCache
 from trainer.store.run_folder import (
     check_folder,
     open_run_folder,
 )
+from trainer.views.picture_cameras import picture_cameras
+from trainer.views.setup import check_given_cameras
 
 from .resume import load_region
 

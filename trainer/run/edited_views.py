@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from functools import cached_property, partial
 from typing import Any
@@ -10,24 +11,28 @@ from typing import Any
 from torch import Tensor
 
 from progdf.errors import ProgdfError
+from progdf.io.images import write_image
+from progdf.threads import threads
 from trainer.editors import editor_row
-from trainer.editors.base import ImageEditor
+from trainer.editors.base import ImageEditor, confines_edit, editor_strengths
 from trainer.editors.procedural import edit_course
 from trainer.fit.slider_uniformity import equalized_strengths
 from trainer.optimize.retime import resolve_slider
 from trainer.options import OptimizeOptions, TrainOptions
 from trainer.regions.from_pictures import CHANGED
-from trainer.setup import (
-    Pictures,
-    TrainingSetup,
-    confines_edit,
-    edit_views,
-    editor_strengths,
+from trainer.store.progress import LATER, Advance, RunLog
+from trainer.store.run_folder import (
+    LazySequence,
+    RunFolder,
+    add_pictures,
+    from_bytes,
     quantize_image,
+    read_views,
+    to_bytes,
 )
-from trainer.store.progress import LATER, RunLog
-from trainer.store.run_folder import RunFolder, read_views
 from trainer.store.state import Saved
+from trainer.views.boxes import Pictures
+from trainer.views.setup import TrainingSetup
 from trainer.views.view import View
 
 from .agree import make_run_editor
@@ -195,6 +200,52 @@ class EditedViews:
         painted = len(self._setup.region) if paints_members else 0
         counts = [int((view.mask > 0.0).sum()) + painted for view in self._setup.views]
         return sum(counts) <= _MAX_CACHED_PIXELS
+
+
+def edit_views(
+    is_parallel: bool,
+    views: Sequence[View],
+    strengths: Sequence[float],
+    folder: RunFolder,
+    is_confined: bool,
+    advance: Advance,
+    course: Callable[[View], Callable[[float], Tensor]],
+) -> dict[float, Sequence[Tensor]]:
+    """Edit every view at every strength. Training uses the 8-bit pictures saved to disk.
+
+    Args:
+        is_parallel: see `EditorRow.is_parallel`
+        views: all views
+        strengths: requested strengths
+        folder: folder of the pictures
+        is_confined: revert changes outside the region, to which members would be pulled otherwise
+        advance: reports progress
+        course: returns the editor's path for a view, see `edit_course`
+    """
+
+    def edit(request: Sequence[tuple[float, int]]) -> list[Tensor]:
+        made = []
+        for strength, i in request:
+            whole = course(views[i])(strength)
+            made.append(to_bytes(views[i].confine(whole) if is_confined else whole))
+            write_image(folder.view("edited", views[i].camera.name, strength), from_bytes(made[-1]))
+        return made
+
+    add_pictures(folder.views, [folder.view("edited", v.camera.name, s) for s in strengths for v in views])
+    edited: dict[float, list[Tensor]] = {strength: [] for strength in strengths}
+    groups = [strengths] if is_parallel and strengths else [[strength] for strength in strengths]
+    requests = [[(strength, i) for strength in group] for group in groups for i in range(len(views))]
+    with ThreadPoolExecutor(threads()) as pool:
+        made = pool.map(edit, requests) if is_parallel else map(edit, requests)
+        try:
+            for request, pictures in zip(requests, made, strict=True):
+                for (strength, _), picture in zip(request, pictures, strict=True):
+                    edited[strength].append(picture)
+                advance(sum(map(len, edited.values())), f"strength {request[-1][0]:g}")
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    return {strength: LazySequence(pictures, from_bytes) for strength, pictures in edited.items()}
 
 
 def _check_change(edited: Pictures, setup: TrainingSetup, spec: str) -> None:

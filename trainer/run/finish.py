@@ -41,11 +41,11 @@ from trainer.report.measures import (
 )
 from trainer.report.report import report_picture
 from trainer.resolve import BLANK, check_field_options, use_threads
-from trainer.setup import TrainingSetup
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder, read_views, write_json, write_views
 from trainer.store.state import Saved
 from trainer.views.crops import only_recolors
+from trainer.views.setup import TrainingSetup
 from trainer.views.view import View, render_view
 
 from .paint import sharpen

@@ -19,7 +19,7 @@ from progdf.gaussians import pack
 from progdf.metrics.image import ROUNDING
 from progdf.scene.bounds import scene_sphere
 from trainer.editors import editor_row
-from trainer.editors.base import ImageEditor
+from trainer.editors.base import ImageEditor, confines_edit
 from trainer.fit.evaluate import Evaluator
 from trainer.optimize.groups import GROUP_STEPS, group_stage
 from trainer.optimize.growth import place_seeds, seed_rows
@@ -27,9 +27,10 @@ from trainer.optimize.losses import GradientL1, Objective
 from trainer.optimize.pgs import TargetStage, optimize, pgs_settings
 from trainer.options import EditKind, OptimizeOptions, TrainOptions, with_values
 from trainer.resolve import resolve_kind
-from trainer.setup import TrainingSetup, confines_edit, shrink_view
 from trainer.store.progress import Advance, RunLog
+from trainer.views.boxes import shrink_view
 from trainer.views.crops import CropScene
+from trainer.views.setup import TrainingSetup
 from trainer.views.view import View, fit_size
 
 _SMALL_SIDE_PX = 128  # longer side of the small views

@@ -21,9 +21,9 @@ from trainer.editors import make_editor
 from trainer.editors.base import PastingEditor
 from trainer.options import TrainOptions
 from trainer.resolve import recorded_options
-from trainer.setup import TrainingSetup
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder, write_views
+from trainer.views.setup import TrainingSetup
 from trainer.views.view import BACKGROUND, render_view
 
 from .finish import RunResult, write_result

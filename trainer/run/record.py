@@ -18,8 +18,9 @@ from progdf.io.json_values import convert_json, to_json
 from progdf.region import Region
 from trainer.options import EditKind, TrainOptions
 from trainer.resolve import check_name
-from trainer.setup import TrainingSetup, whole_views, widen_views
 from trainer.store.run_folder import RunFolder, read_run_cameras, read_views
+from trainer.views.boxes import whole_views, widen_views
+from trainer.views.setup import TrainingSetup
 from trainer.views.view import make_view, with_near_plane
 
 

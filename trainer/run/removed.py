@@ -23,9 +23,9 @@ from trainer.editors.pictures import picture_background, read_edit, strengths_of
 from trainer.fill import Fill, fill_holes
 from trainer.options import TrainOptions
 from trainer.resolve import recorded_options
-from trainer.setup import TrainingSetup, make_training_setup
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder, write_views
+from trainer.views.setup import TrainingSetup, make_training_setup
 from trainer.views.view import BACKGROUND_NAMES, View, on_backgrounds, render_view
 
 from .finish import DEFAULTS, RunResult, differences, write_result

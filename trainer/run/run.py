@@ -15,10 +15,6 @@ from trainer.fit.draft import draft_grade, draft_views
 from trainer.optimize.losses import perceptual_loss
 from trainer.options import TrainOptions
 from trainer.resolve import resolve, use_threads
-from trainer.setup import (
-    TrainingSetup,
-    make_training_setup,
-)
 from trainer.store.pretrained import LastValueCache
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import (
@@ -29,6 +25,7 @@ from trainer.store.run_folder import (
     write_views,
 )
 from trainer.store.state import interrupt_on_signals
+from trainer.views.setup import TrainingSetup, make_training_setup
 
 from .command import check_command, select_region
 from .finish import RunResult, load_result

@@ -19,16 +19,13 @@ from trainer.optimize.retime import smooth_course
 from trainer.options import TrainOptions
 from trainer.report.agreement import measure_agreement
 from trainer.resolve import recorded_options
-from trainer.setup import (
-    TrainingSetup,
-    whole_views,
-    widen_views,
-)
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import (
     RunFolder,
     remove_stale_views,
 )
+from trainer.views.boxes import whole_views, widen_views
+from trainer.views.setup import TrainingSetup
 from trainer.views.view import BACKGROUND
 
 from .edited_views import EditedViews

@@ -40,12 +40,13 @@ from trainer.optimize.pgs import OnStep, ParameterSnapshot, PgsState, TargetStag
 from trainer.optimize.retime import record, retime, select_recordings, straight_recordings
 from trainer.optimize.ties import surface_ties
 from trainer.options import MAX_STAGES, OptimizeOptions, TrainingViewOptions, TrainOptions
-from trainer.setup import Pictures, TrainingSetup, boxed_pictures, probe_views
 from trainer.store.progress import RunLog, release_memory
 from trainer.store.run_folder import LazySequence
 from trainer.store.state import PeriodicSave, Resumable, Saved, StateFolder, defer_signals
+from trainer.views.boxes import Pictures, boxed_pictures, probe_views
 from trainer.views.choose import split_held_out
 from trainer.views.crops import CropScene, crop_scene, moving_attributes, only_recolors, render_all
+from trainer.views.setup import TrainingSetup
 from trainer.views.view import View, crop
 
 

@@ -350,6 +350,11 @@ def from_bytes(stored: Tensor) -> Tensor:
     return stored.float() / 255.0
 
 
+def quantize_image(image: Tensor) -> Tensor:
+    """Return an image after rounding to 8 bits. [H,W,3] -> [H,W,3]"""
+    return from_bytes(to_bytes(image))
+
+
 def remove_stale_views(folder: RunFolder, names: Sequence[str]) -> None:
     """Delete pictures of views that only an earlier run of the same edit had."""
     for directory in (folder.views, folder.paintings):

@@ -24,7 +24,7 @@ from tests.helpers.demo_scenes import bear, room
 from tests.helpers.scenes import ball, high_chair, random_gaussians, turned, upright_turn
 from tests.helpers.stacks import bear_stack
 from trainer.options import TrainingViewOptions
-from trainer.setup import make_training_setup
+from trainer.views.setup import make_training_setup
 from viewer.camera.view_camera import first_camera
 from viewer.commands.options import RenderOptions, open_stack
 from viewer.files import session

@@ -20,9 +20,10 @@ from progdf.region import whole_scene
 from progdf.scene.orbit_rig import orbit_rig
 from tests.helpers.scenes import ball
 from trainer.editors import check_new_editor, make_editor
-from trainer.editors.pictures import background_of, picture_cameras, picture_paths
+from trainer.editors.pictures import background_of, picture_paths
 from trainer.options import EditorOptions
-from trainer.setup import quantize_image
+from trainer.store.run_folder import quantize_image
+from trainer.views.picture_cameras import picture_cameras
 from trainer.views.view import View, make_view, render_view
 
 WHITE = torch.ones(3)

@@ -13,10 +13,10 @@ from progdf.errors import ProgdfError
 from progdf.io.images import write_image
 from tests.helpers.trained import small
 from trainer.editors import make_editor
+from trainer.editors.base import confines_edit
 from trainer.editors.cache import PictureCache
 from trainer.editors.style import StyleEditor, cross_fade
 from trainer.options import EditKind, EditorOptions
-from trainer.setup import confines_edit
 
 
 def crispness(image: Tensor) -> float:

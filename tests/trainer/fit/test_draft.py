@@ -19,7 +19,7 @@ from trainer.editors import make_editor
 from trainer.fit import draft
 from trainer.fit.draft import DraftViews, draft_grade, draft_views
 from trainer.options import EditorOptions, TrainingViewOptions
-from trainer.setup import edit_views
+from trainer.run.edited_views import edit_views
 from trainer.store.run_folder import RunFolder
 from trainer.views.view import render_view
 

@@ -13,7 +13,7 @@ from progdf.gaussians import attribute_slices, pack
 from tests.helpers.trained import WHITE, small
 from trainer.fit.fit import choose_path
 from trainer.options import EditKind
-from trainer.setup import TrainingSetup
+from trainer.views.setup import TrainingSetup
 from trainer.views.view import View, render_view
 
 

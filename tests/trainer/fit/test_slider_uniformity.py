@@ -20,8 +20,8 @@ from trainer.fit.slider_uniformity import equalize_slider, equalized_strengths, 
 from trainer.optimize.retime import resolve_slider
 from trainer.options import EditKind, EditorOptions, Slider
 from trainer.resolve import resolve
-from trainer.setup import TrainingSetup
 from trainer.views.crops import crop_scene, render_all
+from trainer.views.setup import TrainingSetup
 from trainer.views.view import View
 
 QUARTERS = (0.25, 0.5, 0.75, 1.0)

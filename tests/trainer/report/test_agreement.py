@@ -15,7 +15,7 @@ from tests.helpers.trained import WHITE, Small, small
 from trainer.editors import EDITORS, make_editor
 from trainer.options import EditorOptions
 from trainer.report.agreement import Agreement, fit_colors, measure_agreement, view_change
-from trainer.setup import TrainingSetup
+from trainer.views.setup import TrainingSetup
 from trainer.views.view import crop, render_colors
 
 

@@ -31,9 +31,9 @@ from trainer.run.agree import (
     beside_region,
     painting_order,
 )
-from trainer.setup import TrainingSetup
 from trainer.store.progress import RunLog
 from trainer.views.register import Registration, register
+from trainer.views.setup import TrainingSetup
 from trainer.views.view import View
 
 NOTHING = PictureCache(None)

@@ -11,7 +11,6 @@ import pytest
 import torch
 from torch import Tensor
 
-import trainer.setup
 from progdf.errors import ProgdfError
 from progdf.gaussians import pack
 from progdf.rasterize import engines
@@ -24,6 +23,7 @@ from trainer.optimize.pgs import PgsSettings, PgsState, TargetStage, learning_ra
 from trainer.options import OptimizeOptions
 from trainer.resolve import resolve, resolve_kind
 from trainer.run import training
+from trainer.views import boxes
 from trainer.views.crops import crop_scene
 
 
@@ -94,7 +94,7 @@ def card(monkeypatch: pytest.MonkeyPatch) -> Iterator[Card]:
     """Simulate a GPU on which the reference engine replaces warp."""
     monkeypatch.setitem(ENGINES, "warp", ENGINES["reference"])
     get_engine.cache_clear()
-    for module in (training, trainer.setup):
+    for module in (training, boxes):
         monkeypatch.setattr(
             module, "engine_device", lambda name: CARD if name == "warp" else torch.device("cpu")
         )

@@ -17,12 +17,12 @@ from progdf.io.picture_camera import camera_chunk
 from progdf.scene.regions import parse_region
 from tests.helpers.ply_files import moved_columns, write
 from tests.helpers.trained import quick_options, train
-from trainer.editors.pictures import picture_cameras
 from trainer.options import RegionOptions, TrainingViewOptions, WriteViewsOptions, with_values
 from trainer.regions import command
 from trainer.regions.from_pictures import RegionRequest, region_kinds
 from trainer.run.record import render_run_views, reopen_run
 from trainer.run.run import RunResult
+from trainer.views.picture_cameras import picture_cameras
 
 FAR = (1e6, 2e6, -5e5)
 BOX = (-0.9, -0.9, -0.4, 0.9, 0.9, 0.9)

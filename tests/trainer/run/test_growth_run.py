@@ -27,8 +27,8 @@ from trainer.optimize.retime import select_recordings
 from trainer.options import EditorOptions, FitOptions, with_values
 from trainer.resolve import resolve
 from trainer.run.finish import refit
-from trainer.setup import TrainingSetup
 from trainer.views.crops import crop_scene, render_all
+from trainer.views.setup import TrainingSetup
 from trainer.views.view import crop
 
 LOGIT = attribute_slices(BASE_CHANNELS)["logit_opacities"]

@@ -19,7 +19,7 @@ from trainer.editors import make_editor
 from trainer.options import EditorOptions, TrainOptions, with_values
 from trainer.resolve import resolve
 from trainer.run.kinds import Approach, Trial, approaches, try_approaches
-from trainer.setup import TrainingSetup
+from trainer.views.setup import TrainingSetup
 
 COLOR = Approach("color")
 STYLE = Approach("style")

@@ -24,7 +24,7 @@ from trainer.evaluate.command import evaluate
 from trainer.options import EditorOptions, EvaluateOptions, TrainingViewOptions, with_values
 from trainer.report.measures import PaintReproduction, measure_paint
 from trainer.run.run import RunResult
-from trainer.setup import make_training_setup
+from trainer.views.setup import make_training_setup
 from trainer.views.view import View, render_view
 
 SPEC = "recolor:#3060d0"

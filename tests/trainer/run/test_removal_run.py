@@ -37,7 +37,7 @@ from trainer.options import (
 )
 from trainer.run.resume import picture_digests
 from trainer.run.run import train
-from trainer.setup import TrainingSetup, make_training_setup
+from trainer.views.setup import TrainingSetup, make_training_setup
 from trainer.views.view import View, on_backgrounds, render_view
 
 WHITE = torch.ones(3)

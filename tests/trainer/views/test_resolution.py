@@ -16,7 +16,7 @@ from tests.helpers.trained import quick_options, train, write_bear
 from trainer.options import EditorOptions, TrainingViewOptions
 from trainer.resolve import resolve
 from trainer.run.training import pixel_stride
-from trainer.setup import SAMPLING, SIZE, TrainingSetup, make_training_setup, render_thumbnails
+from trainer.views.setup import SAMPLING, SIZE, TrainingSetup, make_training_setup, render_thumbnails
 
 
 def setup_of(count: int = 400, bands: int = 3, **said: object) -> TrainingSetup:

@@ -23,7 +23,6 @@ from tests.helpers.nerfstudio import move_scene, write_frames, write_transforms
 from tests.helpers.scenes import concatenate, front_camera, one_gaussian, orbit_camera, random_gaussians
 from tests.helpers.trained import WHITE, Small, small
 from trainer.options import TrainingViewOptions
-from trainer.setup import make_training_setup
 from trainer.views.choose import (
     ViewChoice,
     Visibility,
@@ -34,6 +33,7 @@ from trainer.views.choose import (
     split_held_out,
     split_views,
 )
+from trainer.views.setup import make_training_setup
 
 
 def test_camera_facing_away_is_left_out() -> None:

@@ -1,10 +1,9 @@
-"""Training data: the views of the region, and their edited pictures."""
+"""Training setup: scene, region and the views to train on and to measure with."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,21 +14,15 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians, concatenate
-from progdf.io.images import write_image
 from progdf.io.picture_camera import up_in_picture
-from progdf.rasterize.engines import engine_device
 from progdf.region import Region
 from progdf.scene.bounds import is_surrounding
 from progdf.scene.orbit_rig import ELEVATIONS, HALF_SPHERE
 from progdf.scene.up_axis import UpAxis, find_up, up_from_json
-from progdf.threads import map_threads, threads
+from progdf.threads import map_threads
+from trainer.options import COLOR_VIEWS, VIEWS, TrainingViewOptions
 
-from .editors.base import ImageEditor
-from .editors.pictures import picture_cameras
-from .options import COLOR_VIEWS, VIEWS, Kind, TrainingViewOptions
-from .store.progress import Advance
-from .store.run_folder import LazySequence, RunFolder, add_pictures, from_bytes, stored_pictures, to_bytes
-from .views.choose import (
+from .choose import (
     ViewChoice,
     choose_views,
     in_frame,
@@ -37,19 +30,17 @@ from .views.choose import (
     sample_members,
     split_views,
 )
-from .views.crops import CropScene, crop_scene
-from .views.view import (
+from .picture_cameras import picture_cameras
+from .view import (
     BACKGROUND,
     INSIDE,
     RegionThumbnail,
     View,
-    crop,
     fit_size,
     make_glances,
     make_view,
     name_cameras,
     region_rig,
-    shrink_image,
     with_near_plane,
 )
 
@@ -65,7 +56,6 @@ Its pictures are displayed at one to two times the size of the views (docs/lab/e
 PICTURE_SIZE = 512
 """Maximum longer side of a changed picture in training, pixels."""
 
-_PROBES = 3  # number of views in which movement is measured
 _MAX_GLANCES = 8
 """Number of thumbnails; fewer for a large scene, so that a draft of a million Gaussians takes seconds.
 
@@ -74,9 +64,6 @@ With up to 24 no draft improves by 0.1 dB.
 _GLANCE_SIZE = 192
 """Longer side of a thumbnail, pixels; smaller ones mix the region's colors with each other and others."""
 _MAX_GLANCE_GAUSSIANS = 3_000_000  # rendered in all thumbnails together
-
-Pictures = Mapping[float, Sequence[Tensor]]
-"""Strength → whole edited pictures, one per view. [H,W,3] each"""
 
 
 @dataclass(frozen=True)
@@ -260,131 +247,3 @@ def _picture_setup(
         if not bool((view.mask > 0).any()):
             raise ProgdfError(f"{path} does not show the region '{region.name}'; leave it out")
     return TrainingSetup(scene, region, views, [], background, [f"up is {up.name}, {up.reason}"], up)
-
-
-def editor_strengths(editor: ImageEditor, stages: int) -> tuple[float, ...]:
-    """Return the strengths to request: the editor's own, or `stages` evenly spaced ones."""
-    return editor.stages or tuple((i + 1) / stages for i in range(stages))
-
-
-def confines_edit(editor: ImageEditor, kind: Kind) -> bool:
-    """Return True if changes outside the region are reverted: unless the edit moves parts."""
-    return kind != "geometry" and not editor.is_confined
-
-
-def edit_views(
-    is_parallel: bool,
-    views: Sequence[View],
-    strengths: Sequence[float],
-    folder: RunFolder,
-    is_confined: bool,
-    advance: Advance,
-    course: Callable[[View], Callable[[float], Tensor]],
-) -> dict[float, Sequence[Tensor]]:
-    """Edit every view at every strength. Training uses the 8-bit pictures saved to disk.
-
-    Args:
-        is_parallel: see `EditorRow.is_parallel`
-        views: all views
-        strengths: requested strengths
-        folder: folder of the pictures
-        is_confined: revert changes outside the region, to which members would be pulled otherwise
-        advance: reports progress
-        course: returns the editor's path for a view, see `edit_course`
-    """
-
-    def edit(request: Sequence[tuple[float, int]]) -> list[Tensor]:
-        made = []
-        for strength, i in request:
-            whole = course(views[i])(strength)
-            made.append(to_bytes(views[i].confine(whole) if is_confined else whole))
-            write_image(folder.view("edited", views[i].camera.name, strength), from_bytes(made[-1]))
-        return made
-
-    add_pictures(folder.views, [folder.view("edited", v.camera.name, s) for s in strengths for v in views])
-    edited: dict[float, list[Tensor]] = {strength: [] for strength in strengths}
-    groups = [strengths] if is_parallel and strengths else [[strength] for strength in strengths]
-    requests = [[(strength, i) for strength in group] for group in groups for i in range(len(views))]
-    with ThreadPoolExecutor(threads()) as pool:
-        made = pool.map(edit, requests) if is_parallel else map(edit, requests)
-        try:
-            for request, pictures in zip(requests, made, strict=True):
-                for (strength, _), picture in zip(request, pictures, strict=True):
-                    edited[strength].append(picture)
-                advance(sum(map(len, edited.values())), f"strength {request[-1][0]:g}")
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-    return {strength: LazySequence(pictures, from_bytes) for strength, pictures in edited.items()}
-
-
-def boxed_pictures(
-    pictures: Sequence[Tensor], views: Sequence[View], engine: str = "cpu"
-) -> Sequence[Tensor]:
-    """Return the content of the views' boxes in whole pictures, on the engine's device. [h,w,3] each"""
-    device = engine_device(engine)
-    pairs = zip(pictures, views, strict=False)
-    return stored_pictures(crop(picture, view.box).to(device) for picture, view in pairs)
-
-
-def widen_views(setup: TrainingSetup, edited: Pictures) -> TrainingSetup:
-    """Return the setup with training views whose boxes hold all changes of the edit."""
-    views = [view.widen([pictures[i] for pictures in edited.values()]) for i, view in enumerate(setup.train)]
-    return replace(setup, train=views)
-
-
-def whole_views(setup: TrainingSetup) -> TrainingSetup:
-    """Return the setup with training views whose boxes are the whole picture."""
-    return replace(
-        setup, train=[replace(v, box=(0, 0, v.camera.width, v.camera.height)) for v in setup.train]
-    )
-
-
-def shrink_view(
-    setup: TrainingSetup, view: View, edited: Tensor, camera: Camera
-) -> tuple[CropScene, Callable[[Tensor], Tensor], Tensor]:
-    """Return a view at the size of a smaller camera, for cheap renders.
-
-    Returns:
-        The scene in its box; a function that shrinks pictures of the view to it; and the share of each pixel
-        that counts, as region or edited. [h,w,1]
-    """
-    scale_x = camera.width / view.camera.width
-    scale_y = camera.height / view.camera.height
-    x0, y0, x1, y1 = view.box
-    right = min(camera.width, math.ceil(x1 * scale_x))
-    bottom = min(camera.height, math.ceil(y1 * scale_y))
-    box = (math.floor(x0 * scale_x), math.floor(y0 * scale_y), right, bottom)
-
-    def shrink(picture: Tensor) -> Tensor:
-        return crop(shrink_image(picture, (camera.height, camera.width)), box)
-
-    counted = (view.mask > 0.05) | ((edited - view.image).abs().amax(dim=2) > 2 / 255)
-    scene = crop_scene(setup.scene, setup.region.members, camera, box, setup.background)
-    return scene, shrink, shrink(counted.float()[..., None])
-
-
-def probe_views(
-    setup: TrainingSetup, count: int = _PROBES, still: bool = False, engine: str = "cpu"
-) -> list[CropScene]:
-    """Return a small number of training views at half size for measuring movement; see `crop_scene` for the
-    arguments."""
-    scene = setup.scene.to(engine_device(engine))
-    chosen = setup.train[:: max(1, len(setup.train) // count)][:count]
-    return [
-        crop_scene(
-            scene,
-            setup.region.members,
-            view.camera.resize(max(1, view.camera.width // 2), max(1, view.camera.height // 2)),
-            (view.box[0] // 2, view.box[1] // 2, max(1, view.box[2] // 2), max(1, view.box[3] // 2)),
-            setup.background,
-            still,
-            engine,
-        )
-        for view in chosen
-    ]
-
-
-def quantize_image(image: Tensor) -> Tensor:
-    """Return an image after rounding to 8 bits. [H,W,3] -> [H,W,3]"""
-    return from_bytes(to_bytes(image))
