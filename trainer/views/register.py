@@ -15,7 +15,7 @@ _TUKEY = 4.685  # in standard deviations; 95 % of the efficiency of least square
 
 @dataclass(frozen=True)
 class Registration:
-    """Alignment of an answer: a point at `p` from the view's center is found at (1 + zoom) p + shift."""
+    """Alignment of painted pixels: a point at `p` from the view's center is found at (1 + zoom) p + shift."""
 
     shift: tuple[float, float] = (0.0, 0.0)  # x, y, shares of the longer side
     zoom: float = 0.0
@@ -26,7 +26,7 @@ class Registration:
         return max(abs(self.shift[0]), abs(self.shift[1]), abs(self.zoom))
 
     def lay(self, picture: Tensor) -> Tensor:
-        """Return the answer, moved back; unchanged bit for bit if it moved less than 0.25 pixels. [H,W,3]"""
+        """Return the painted picture, moved back; the same bits if it moved less than 0.25 pixels. [H,W,3]"""
         longer = max(picture.shape[:2])
         if self.size * longer < 0.25:
             return picture
