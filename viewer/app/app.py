@@ -24,6 +24,7 @@ from viewer.files.document import Document
 from viewer.files.session import WindowSession
 from viewer.render.engine import ViewEngine, draws_with
 from viewer.state import workspace
+from viewer.state.commands import Action, Plain, argument
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import LayerState, ViewState
 from viewer.ui.keys import bind
@@ -216,7 +217,7 @@ class App:
                     self.open(path)
             if self.window.closing and not self.is_closed:
                 self.window.stay_open()
-                self.main_view.request("quit")
+                self.main_view.request(Plain("quit"))
             with self._guard():
                 if self.main_view.is_due():
                     self.draw()
@@ -242,11 +243,10 @@ class App:
         for request in self.main_view.take_requests():
             self.handle(request)
 
-    def handle(self, request: str) -> None:
+    def handle(self, request: Action) -> None:
         """Perform one of `requests`, which need the whole window."""
-        name, _, argument = request.partition(":")
         with self._guard():
-            attempt(self.main_view, lambda: self.requests[name](argument))
+            attempt(self.main_view, lambda: self.requests[request.name](argument(request)))
 
     def _wait_times(self) -> tuple[float | None, ...]:
         """Return the seconds until each part must be polled again; None means never."""

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from logging.handlers import RotatingFileHandler
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from progdf import __version__
 from progdf.errors import ProgdfError, without_commands
@@ -52,8 +52,8 @@ class Application(Protocol):
         """Close the window without a question."""
 
 
-Requests = dict[str, Callable[[str], object]]
-"""Actions of one part of the application: request name to function of the text after the request's colon."""
+Requests = dict[str, Callable[[Any], object]]
+"""Functions of the commands that one part of the application performs; they receive the `argument`."""
 
 
 def attempt(main_view: MainView, act: Callable[[], object]) -> None:

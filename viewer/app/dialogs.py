@@ -16,6 +16,7 @@ from imgui_bundle import imgui, imgui_ctx
 from imgui_bundle import portable_file_dialogs as dialogs
 
 from progdf.terminal import escape_text
+from viewer.state.commands import Action, OnItem, Plain, RebindEdit, ReplaceEdit, Save, WithText
 from viewer.state.workspace import Dialog
 from viewer.ui.context import PALETTE, UiContext
 from viewer.ui.overlay import Area
@@ -63,16 +64,16 @@ _HINTS = {
     "about": "Edit a trained 3D Gaussian Splatting scene once, then drag a slider through it.",
 }
 _SUBMIT = {
-    "save": ("Save", "save_to:{path}"),
-    "open": ("Open", "open_file:{path}"),
-    "replace": ("Replace", "replace_by:{then}:{path}"),
-    "rebind": ("Rebind", "rebind_from:{then}\n{path}"),
-    "export": ("Export", "deliver:export"),
-    "export_page": ("Export", "deliver:export_page"),
-    "render_picture": ("Render", "deliver:render_picture"),
-    "render_film": ("Render", "deliver:render_film"),
+    "save": "Save",
+    "open": "Open",
+    "replace": "Replace",
+    "rebind": "Rebind",
+    "export": "Export",
+    "export_page": "Export",
+    "render_picture": "Render",
+    "render_film": "Render",
 }
-"""Button and request of each dialog that has a path field."""
+"""Button of each dialog that has a path field."""
 _DELIVERS = ("export", "export_page", "render_picture", "render_film")
 
 
@@ -94,17 +95,6 @@ _CHOICES = {
     "about": (_Button("Close", ("Enter",)),),
     "restore": (_Button("Restore", ("Enter", "R")), _Button("Discard", ("D",)), _Button("Later")),
 }
-_REQUESTS = {
-    ("leave", "Save"): ("save:{then}",),
-    ("leave", "Discard"): ("discard", "{then}"),
-    ("overwrite", "Replace"): ("overwrite:{path}",),
-    ("training", "Stop and quit"): ("stop_and_quit",),
-    ("discard_run", "Discard"): ("discard_run:{then}",),
-    ("delivery", "Stop and quit"): ("drop_and_quit",),
-    ("restore", "Restore"): ("restore_autosave:{path}",),
-    ("restore", "Discard"): ("discard_autosave:{path}",),
-}
-"""Requests of the buttons that do more than close the dialog."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +102,7 @@ class DialogResult:
     """Dialog after this frame, None once it is closed, and the resulting requests."""
 
     dialog: Dialog | None
-    requests: tuple[str, ...] = ()
+    requests: tuple[Action, ...] = ()
 
 
 def draw(dialog: Dialog, pressed: Sequence[str], ui: UiContext, area: Area) -> DialogResult:
@@ -183,7 +173,7 @@ def _content(dialog: Dialog, pressed: Sequence[str], ui: UiContext, bottom: floa
         browse = imgui.button("…", (more, 0.0))
     tip("Browse with the system file dialog (Ctrl+B)")
     if browse or ("Ctrl+B" in pressed and not dialog.choosing):
-        return DialogResult(dialog, ("browse",))
+        return DialogResult(dialog, (Plain("browse"),))
     if dialog.notice:
         small(dialog.notice, PALETTE.warning)
     if dialog.error:
@@ -193,7 +183,7 @@ def _content(dialog: Dialog, pressed: Sequence[str], ui: UiContext, bottom: floa
         text, options = pages.draw_fields(kind, dialog.text, dialog.options, ui)
         dialog = replace(dialog, text=text, options=options)
     imgui.dummy((0.0, 2.0 * ui.scale))
-    name, _ = _SUBMIT[dialog.kind]
+    name = _SUBMIT[dialog.kind]
     button = _buttons((name, "Cancel"), ui)
     if button == "Cancel":
         return DialogResult(None)
@@ -216,7 +206,21 @@ def _is_new(kind: str) -> bool:
 def _submit(dialog: Dialog, path: str) -> DialogResult:
     """Request the file; the dialog stays open if the file may be rejected."""
     stays = replace(dialog, text=path, chosen="") if dialog.kind in ("save", *_DELIVERS) else None
-    return DialogResult(stays, (_SUBMIT[dialog.kind][1].format(path=path, then=dialog.then),))
+    return DialogResult(stays, (_submission(dialog, path),))
+
+
+def _submission(dialog: Dialog, path: str) -> Action:
+    """Return the request of a dialog that has a path field."""
+    match dialog.kind:
+        case "save":
+            return WithText("save_to", path)
+        case "open":
+            return WithText("open_file", path)
+        case "replace":
+            return ReplaceEdit(dialog.item, path)
+        case "rebind":
+            return RebindEdit(dialog.file, path)
+    return WithText("deliver", dialog.kind)
 
 
 def _pressed_button(choices: Sequence[_Button], pressed: Sequence[str], ui: UiContext) -> str:
@@ -232,9 +236,31 @@ def _answer(dialog: Dialog, button: str) -> DialogResult:
         return DialogResult(dialog)
     if button == "Rename…":
         return DialogResult(Dialog("save", dialog.text, dialog.then))
-    requests = _REQUESTS.get((dialog.kind, button), ())
     stays = dialog if button == "Replace" else None  # until the file is written
-    return DialogResult(stays, tuple(each.format(path=dialog.text, then=dialog.then) for each in requests))
+    return DialogResult(stays, _requests(dialog, button))
+
+
+def _requests(dialog: Dialog, button: str) -> tuple[Action, ...]:
+    """Return the requests of a button; none if it only closes the dialog."""
+    then = () if dialog.then is None else (dialog.then,)
+    match dialog.kind, button:
+        case "leave", "Save":
+            return tuple(Save(action) for action in then)
+        case "leave", "Discard":
+            return Plain("discard"), *then
+        case "overwrite", "Replace":
+            return (WithText("overwrite", dialog.text),)
+        case "training", "Stop and quit":
+            return (Plain("stop_and_quit"),)
+        case "delivery", "Stop and quit":
+            return (Plain("drop_and_quit"),)
+        case "discard_run", "Discard" if dialog.item is not None:
+            return (OnItem("discard_run", dialog.item),)
+        case "restore", "Restore":
+            return (WithText("restore_autosave", dialog.text),)
+        case "restore", "Discard":
+            return (WithText("discard_autosave", dialog.text),)
+    return ()
 
 
 def _log(path: Path, bottom: float, ui: UiContext) -> None:

@@ -30,6 +30,7 @@ from viewer.files.session import SessionAutosave, WindowSession, session_file
 from viewer.files.user_files import parse_path, read_recent, remember_recent, write_keys
 from viewer.jobs.training import with_picture
 from viewer.state import selection, workspace
+from viewer.state.commands import Action, Plain, Rename, WithText
 from viewer.state.facts import describe_applied
 from viewer.state.layers import add_layer, duplicate_layer, replace_edit
 from viewer.state.view_state import ViewState, on_another_scene
@@ -152,7 +153,7 @@ class EditActions:
         path = document.gdf_paths[gdf] if gdf < len(document.gdf_paths) else None
         self._apply(duplicate_layer(view, index, self._open(document.edits[gdf], path)), index + 1)
 
-    def replace(self, layer: str, path: str) -> None:
+    def replace(self, layer: int | None, path: str) -> None:
         """Replace a layer's edit; a grade of another scene, or of none, takes the layer's region.
 
         Raises:
@@ -164,14 +165,14 @@ class EditActions:
         gdf = self._load(file, self._app.document.edits[view.layers[index].gdf].region)
         self._apply(replace_edit(view, index, self._open(gdf, file), gdf.name), index)
 
-    def layer(self, index: str) -> int:
-        """Return the layer of a request: the given index, or the focused layer for "".
+    def layer(self, index: int | None) -> int:
+        """Return the layer of a request: the given index, or the focused layer for None.
 
         Raises:
             ProgdfError: there is no such layer.
         """
         work = self._app.main_view.work
-        chosen = int(index) if index else work.focus
+        chosen = work.focus if index is None else index
         if chosen is None or not 0 <= chosen < len(work.view.layers):
             raise ProgdfError("no layer is selected; click one first")
         return chosen
@@ -227,9 +228,9 @@ class FileActions:
     def requests(self) -> Requests:
         """Handlers of the requests about files, by name.
 
-        `save:THEN` and `save_as:THEN` request THEN afterwards. `save_to`, `overwrite`, `open_file`,
-        `restore_autosave` and `discard_autosave` name a file. `duplicate` and `replace` take a layer's index,
-        or use the focused layer. `browse` shows the system file dialog next to the open dialog.
+        `save_to`, `overwrite`, `open_file`, `restore_autosave` and `discard_autosave` name a file.
+        `duplicate` and `replace` take a layer's index, or use the focused layer. `browse` shows the system
+        file dialog next to the open dialog.
         """
         ask = self._app.main_view.ask
         edits = self._edits
@@ -247,16 +248,16 @@ class FileActions:
             "restore_autosave": lambda path: self.open(Path(path)),
             "discard_autosave": self._discard_autosave,
             "duplicate": lambda index: edits.duplicate(edits.layer(index)),
-            "replace": lambda index: ask(Dialog("replace", then=index)),
-            "replace_by": lambda edit: edits.replace(*edit.split(":", 1)),
+            "replace": lambda index: ask(Dialog("replace", item=index)),
+            "replace_by": lambda action: edits.replace(action.index, action.path),
             "save_region": self._keep_region,
-            "rename_region": lambda region: self._rename_region(*region.split(":", 1)),
+            "rename_region": self._rename_region,
             "keys_file": self._open_keys,
         }
 
-    def _open_keys(self, _: str) -> None:
-        """Open the file of key bindings in its default program; create it with all keys if it is missing."""
-        keys = {action: command.keys.split() for action, command in COMMANDS.items()}
+    def _open_keys(self, _: None) -> None:
+        """Write a file with all key bindings, if none exists, and open it in the desktop's program for it."""
+        keys = {name: command.keys.split() for name, command in COMMANDS.items()}
         path = write_keys(keys)
         webbrowser.open(path.as_uri())
         self._app.main_view.show_message(f"Keys are read from {path} when the window opens")
@@ -374,10 +375,10 @@ class FileActions:
                 if "made for another scene" not in str(error):
                     raise
                 line = f"{path.name} was made for another scene"
-                main_view.show_message(line, True, button=("Rebind…", f"rebind:{path}"))
+                main_view.show_message(line, True, button=("Rebind…", WithText("rebind", str(path))))
                 return
         elif self.has_unsaved:
-            self._app.main_view.ask(self._closing_question(f"open_file:{path}"))
+            self._app.main_view.ask(self._closing_question(WithText("open_file", str(path))))
             return
         elif kind == "session":
             self._open_session(path)
@@ -415,7 +416,7 @@ class FileActions:
             self._put_off.add(new[0])  # in case the user does not decide now
             self._app.main_view.ask(Dialog("restore", str(new[0])))
 
-    def _discard(self, _: str) -> None:
+    def _discard(self, _: None) -> None:
         """Discard unsaved work; its autosave stays under another name."""
         self._app.main_view.work = workspace.mark_saved(self._app.main_view.work)
         self.session_autosave.discard()
@@ -448,12 +449,12 @@ class FileActions:
         selection = exports.keep_region(view.selection, name, folder, total)
         main_view.change(replace(view, selection=selection))
         line = f"Region '{selection.regions[-1].name}' saved"
-        main_view.show_message(line, button=("New edit", "new_edit"))
+        main_view.show_message(line, button=("New edit", Plain("new_edit")))
 
-    def _rename_region(self, index: str, name: str) -> None:
+    def _rename_region(self, action: Rename) -> None:
         view = self._app.main_view.work.view
         total = len(self._app.document.original)
-        renamed = exports.rename_region(view.selection, int(index), name, total)
+        renamed = exports.rename_region(view.selection, action.index, action.text, total)
         self._app.main_view.change(replace(view, selection=renamed))
 
     def _claim_regions(self, path: Path) -> None:
@@ -472,13 +473,13 @@ class FileActions:
         work = self._app.main_view.work
         return WindowSession(self._app.document, work.view, work.snapshots)
 
-    def _save_where(self, then: str, ask: bool) -> None:
+    def _save_where(self, then: Action | None, ask: bool) -> None:
         if self.path is None or ask:
             self._app.main_view.ask(Dialog("save", str(self._autosave_base()), then))
             return
         self._save_to(str(self.path), then)
 
-    def _save_to(self, path: str, then: str | None = None, overwrite: bool = False) -> None:
+    def _save_to(self, path: str, then: Action | None = None, overwrite: bool = False) -> None:
         """Save to `path`, then perform the postponed request. On failure, ask for another path and show the
         error.
 
@@ -491,7 +492,7 @@ class FileActions:
         main_view = self._app.main_view
         dialog = self._app.main_view.work.dialog
         if then is None:
-            then = dialog.then if dialog else ""
+            then = dialog.then if dialog else None
 
         def save() -> None:
             file = session_file(parse_path(path))
@@ -500,13 +501,13 @@ class FileActions:
                 return
             self.save(file)
             main_view.work = replace(main_view.work, dialog=None)
-            if then:
+            if then is not None:
                 main_view.request(then)
 
         if error := failure_line(save):
             main_view.ask(Dialog("save", path, then, error=error))
 
-    def _browse(self, _: str) -> None:
+    def _browse(self, _: None) -> None:
         """Open the system file dialog next to the open dialog."""
         main_view = self._app.main_view
         if main_view.work.dialog is not None:
@@ -516,11 +517,11 @@ class FileActions:
     def leave(self) -> None:
         """Close the window, after a question if there are unsaved changes."""
         if self.has_unsaved:
-            self._app.main_view.ask(self._closing_question("quit"))
+            self._app.main_view.ask(self._closing_question(Plain("quit")))
         else:
             self._app.leave()
 
-    def _closing_question(self, then: str) -> Dialog:
+    def _closing_question(self, then: Action) -> Dialog:
         return Dialog("leave", str(self._autosave_base()), then)
 
     def _session_name(self) -> Path:

@@ -14,10 +14,11 @@ from viewer.panel import panel, timeline_bar, tools
 from viewer.pictures.compare import Labels
 from viewer.state import history, workspace
 from viewer.state.actions import GLIDES, perform
+from viewer.state.commands import Action, OnItem
 from viewer.state.workspace import PreviewState, Workspace
 from viewer.ui import overlay
 from viewer.ui.context import FIXED, PALETTE, SMALL_PX, UiContext, u32
-from viewer.ui.keys import JOINED, TOPICS, Command, chords, find_commands, is_changed, shortcut
+from viewer.ui.keys import COMMANDS, JOINED, TOPICS, Command, chords, find_commands, is_changed, shortcut
 from viewer.ui.pointer import PointerContext
 from viewer.ui.widgets import elide, menu, search_field
 
@@ -76,11 +77,11 @@ def _lines(commands: Sequence[Command]) -> Iterator[tuple[str, str]]:
     text."""
     is_joined = False  # the row before this one includes the command
     for command, following in zip_longest(commands, commands[1:]):
-        keys = chords(command.action)
+        keys = chords(command.id)
         joins = following is not None and following.row == JOINED
         changed = is_changed(command) or (joins and is_changed(following))
         if joins and not changed:
-            keys += tuple(k for k in chords(following.action) if k.replace("Shift+", "") not in keys)
+            keys += tuple(k for k in chords(following.id) if k.replace("Shift+", "") not in keys)
         if keys and not is_joined:
             plain = changed or command.row == JOINED
             listed, text = ("", "") if plain else (command.listed, command.row)
@@ -128,7 +129,7 @@ def draw_lists(
     """Draw the undo history and the command palette, if they are open.
 
     Args:
-        offered: actions listed in the palette
+        offered: commands listed in the palette
         pressed: chords pressed in this frame
     """
     if work.history is not None:
@@ -136,10 +137,11 @@ def draw_lists(
         work = perform_actions(work, chosen, pointer)
     if work.palette is None:
         return work
-    numbered = [f"{name}:{i}" for name in ("focus", "toggle") for i in range(len(work.view.layers) + 1, 10)]
-    listed = [action for action in offered if action not in numbered]
+    missing = range(len(work.view.layers) + 1, 10)  # numbers of layers in the table that do not exist
+    numbered = [OnItem(name, i) for name in ("focus", "toggle") for i in missing]
+    listed = [command for command in offered if COMMANDS[command].action not in numbered]
     work, requested = draw_palette(work, listed, pressed, pointer.ui, pointer.area)
-    return perform_actions(work, [requested] if requested else [], pointer)
+    return perform_actions(work, [requested] if requested is not None else [], pointer)
 
 
 PALETTE_PX = 460.0
@@ -149,11 +151,11 @@ ROWS = 12
 
 def draw_palette(
     work: Workspace, offered: Sequence[str], pressed: Sequence[str], ui: UiContext, area: overlay.Area
-) -> tuple[Workspace, str]:
+) -> tuple[Workspace, Action | None]:
     """Draw a search field and below it the matching commands, the best match first.
 
     Returns:
-        The workspace; the chosen action, "" for none.
+        The workspace; the chosen action, None for none.
     """
     if work.palette == -1:
         imgui.open_popup("commands")
@@ -162,11 +164,11 @@ def draw_palette(
     place = (area.width / 2, max(0.12 * area.height, 8.0 * ui.scale))
     imgui.set_next_window_pos(place, 0, (0.5, 0.0))
     imgui.set_next_window_size((wide, 0.0))
-    requested = ""
+    requested: Action | None = None
     at = work.palette or 0
     with menu("commands", ui, imgui.WindowFlags_.no_nav.value) as is_open:
         if not is_open:
-            return replace(work, palette=None), ""
+            return replace(work, palette=None), None
         query = search_field("Search all commands", work.query)
         found = find_commands(query, offered)
         moved = 0 if at == -1 else ("Down" in pressed) - ("Up" in pressed)
@@ -186,7 +188,7 @@ def draw_palette(
         imgui.pop_style_var()
         if work.palette != -1 and "Enter" in pressed and found:
             requested = found[at].action
-        closes = requested or (work.palette != -1 and "Escape" in pressed)
+        closes = requested is not None or (work.palette != -1 and "Escape" in pressed)
         if closes:
             imgui.close_current_popup()
     return replace(work, query=query, palette=None if closes else at), requested
@@ -197,7 +199,7 @@ def _command_row(command: Command, chosen: bool, ui: UiContext) -> bool:
     x, y = imgui.get_cursor_screen_pos()
     wide = imgui.get_content_region_avail().x
     tall = imgui.get_frame_height()
-    pressed = imgui.invisible_button(command.action, (wide, tall))
+    pressed = imgui.invisible_button(command.id, (wide, tall))
     canvas = imgui.get_window_draw_list()
     pad = 8.0 * ui.scale
     if chosen or imgui.is_item_hovered():
@@ -205,7 +207,7 @@ def _command_row(command: Command, chosen: bool, ui: UiContext) -> bool:
         canvas.add_rect_filled((x, y), (x + wide, y + tall), ground, 4.0 * ui.scale)
     ink, dim = (u32(PALETTE.ink),) * 2 if chosen else (u32(PALETTE.text), u32(PALETTE.dim))
     top = round(y + imgui.get_style().frame_padding.y)
-    key = shortcut(command.action)
+    key = shortcut(command.id)
     end = x + wide - pad - imgui.calc_text_size(key).x
     canvas.add_text((round(x + pad), top), ink, command.name)
     canvas.add_text((round(end), top), ink, key)
@@ -266,7 +268,7 @@ def panels(
     Args:
         compared: labels of the comparison on screen, and whether the original is visible
     """
-    actions: list[str] = []
+    actions: list[Action] = []
     area = pointer.area
     ui = pointer.ui
     work = panel.draw(work, pointer.facts, pictures, preview, recent, reveal, ui, actions)
@@ -285,7 +287,7 @@ def panels(
 
 def draw_pill(
     work: Workspace, pointer: PointerContext, compared: tuple[Labels, bool], foot: float
-) -> tuple[Workspace, list[str]]:
+) -> tuple[Workspace, list[Action]]:
     """Draw the comparison bar, if there is anything to compare.
 
     Args:
@@ -304,7 +306,7 @@ def draw_pill(
     middle = min((wide + tools.TOOLBAR_PX * scale) / 2, free - 85.0 * scale)  # half of its usual width
     place = (middle, foot + tools.EDGE_PX * scale)
     work, requested = tools.draw_comparison(work, words, original, place, pointer.ui)
-    return work, [requested] if requested else []
+    return work, [requested] if requested is not None else []
 
 
 def over_picture(
@@ -350,7 +352,8 @@ def over_picture(
             work = workspace.with_message(work, "Copied. Paste it into a bug report.", pointer.now)
         elif clicked or pointer.now >= line.until:
             work = replace(work, message=None)
-            work = perform_actions(work, [line.button[1]] if clicked == "do" else [], pointer)
+            if clicked == "do" and line.button is not None:
+                work = perform_actions(work, [line.button[1]], pointer)
     if work.help:
         draw_keys(free, ui)
     return work
@@ -364,27 +367,28 @@ def draw_dialog(work: Workspace, pointer: PointerContext, pressed: Sequence[str]
     return replace(work, dialog=answer.dialog, requests=(*work.requests, *answer.requests))
 
 
-def perform_actions(work: Workspace, actions: Sequence[str], pointer: PointerContext) -> Workspace:
+def perform_actions(work: Workspace, actions: Sequence[Action], pointer: PointerContext) -> Workspace:
     """Perform the actions of keys and buttons, see `perform`. An undo shows the name of the undone change."""
     for action in actions:
         before = work
         work = perform(work, action, pointer.facts, pointer.area.width / pointer.area.height)
-        if action.partition(":")[0] in GLIDES and not work.layout.reduced_motion:
+        name = action.name
+        if name in GLIDES and not work.layout.reduced_motion:
             work = workspace.glide_from(work, before.view.camera)
-        elif action == "reduced_motion":
+        elif name == "reduced_motion":
             text = f"Reduced motion is {'on' if work.layout.reduced_motion else 'off'}"
             work = workspace.with_message(work, text, pointer.now)
-        elif action == "compare_snapshots" and not work.snapshots:
+        elif name == "compare_snapshots" and not work.snapshots:
             text = f"There is no snapshot to compare; {shortcut('snapshot')} adds one"
             work = workspace.with_message(work, text, pointer.now)
-        elif action in _UNDOES and work.past is not before.past:
-            did, describe = _UNDOES[action]
+        elif name in _UNDOES and work.past is not before.past:
+            did, describe = _UNDOES[name]
             work = workspace.with_message(
                 work, f"{did}: {describe(before.past)}", pointer.now, seconds=UNDO_S
             )
-        elif action.startswith("go_to:"):
-            name = history.describe_entry(work.past, len(work.past.past))
-            work = workspace.with_message(work, f"Back to: {name}", pointer.now, seconds=UNDO_S)
+        elif name == "go_to":
+            entry = history.describe_entry(work.past, len(work.past.past))
+            work = workspace.with_message(work, f"Back to: {entry}", pointer.now, seconds=UNDO_S)
     return work
 
 
@@ -395,7 +399,7 @@ _HISTORY_PX = 280.0
 _FLAT = imgui.ChildFlags_.nav_flattened.value
 
 
-def draw_history(work: Workspace, ui: UiContext) -> tuple[Workspace, list[str]]:
+def draw_history(work: Workspace, ui: UiContext) -> tuple[Workspace, list[Action]]:
     """Draw the undo history above the panel's undo buttons, the latest change at the bottom.
 
     Returns:
@@ -405,7 +409,7 @@ def draw_history(work: Workspace, ui: UiContext) -> tuple[Workspace, list[str]]:
         imgui.open_popup("history")
     display = imgui.get_io().display_size
     row = imgui.get_text_line_height_with_spacing()
-    requests = list[str]()
+    requests = list[Action]()
     at = (display.x - 12.0 * ui.scale, display.y - 44.0 * ui.scale)
     imgui.set_next_window_pos(at, 0, (1.0, 1.0))
     with menu("history", ui) as is_open:
@@ -421,7 +425,7 @@ def draw_history(work: Workspace, ui: UiContext) -> tuple[Workspace, list[str]]:
             while clipper.step():
                 for i in range(clipper.display_start, clipper.display_end):
                     if _history_row(work.past, i, ui):
-                        requests.append(f"go_to:{i}")
+                        requests.append(OnItem("go_to", i))
         if is_open:
             imgui.end_child()
     return replace(work, history=False if is_open else None), requests

@@ -23,6 +23,7 @@ from viewer.panel import new_edit_form, panel, timeline_bar
 from viewer.render.engine import ViewEngine
 from viewer.render.picking import Surfaces
 from viewer.state import actions, layer_selection, timeline, workspace
+from viewer.state.commands import Action, Plain, WithValue
 from viewer.state.layers import add_layer
 from viewer.state.snapshots import SliderSnapshot, compare_sides
 from viewer.state.view_state import LayerState, ViewState
@@ -39,7 +40,7 @@ from viewer.ui.keys import (
     has_pending_input,
     is_flying,
     is_repeating,
-    requested_actions,
+    requested_commands,
 )
 from viewer.ui.pointer import PointerContext
 
@@ -217,9 +218,9 @@ class MainView:
         return self.next_frame_delay() == 0.0 or not self.canvas.awaits_picture()
 
     def show_message(
-        self, text: str, error: bool = False, details: str = "", button: tuple[str, str] = ("", "")
+        self, text: str, error: bool = False, details: str = "", button: tuple[str, Action] | None = None
     ) -> None:
-        """Show one line at the bottom of the picture for a while, with a button (name and action)."""
+        """Show one line at the bottom of the picture for a while, with a button (label and command)."""
         self.work = workspace.with_message(self.work, text, self._clock, error, details, button=button)
         self.wake()
 
@@ -317,12 +318,12 @@ class MainView:
         self._point_by_keys(asks)
         if asks:  # no key is a shortcut or flies
             self._keys = Keys(self._keys.pressed)
-        for action in requested_actions(self._keys):
-            if self.at_start and action not in pages.COMMANDS:
+        for command in requested_commands(self._keys):
+            if self.at_start and command.id not in pages.COMMANDS:
                 continue
             # window_picture saves the open window and changes nothing
-            if not asks or action == "window_picture":
-                self._perform(action)
+            if not asks or command.id == "window_picture":
+                self._perform(command.action)
         if self.at_start:
             for action in pages.draw_start_page(*self.start_files, self.ui):
                 self._perform(action)
@@ -386,7 +387,7 @@ class MainView:
         windows = {name: imgui.internal.find_window_by_name(name) for name in PLACES}
         shown = [name for name, window in windows.items() if window is not None and window.was_active]
         while self.work.keyboard and self.work.keyboard not in shown:
-            self._perform(f"next_place:{self.work.keyboard_by}")
+            self._perform(WithValue("next_place", self.work.keyboard_by))
         self.ui.keyboard = self.work.keyboard
         self.ui.focused = self.ui.focused if self.work.keyboard else ""
 
@@ -402,7 +403,7 @@ class MainView:
         if "Escape" in pressed or "Enter" in pressed:
             asked = "put_back" if "Escape" in pressed else keep
         if asked:
-            self.request(asked)
+            self.request(Plain(asked))
         if isinstance(self.gizmo, Gizmo) and self.gizmo.using:
             self.wake()
         return self.gizmo.takes_mouse
@@ -428,7 +429,7 @@ class MainView:
         imgui.internal.clear_active_id()
         self._keys = replace(self._keys, pressed=())
 
-    def _perform(self, action: str) -> None:
+    def _perform(self, action: Action) -> None:
         with self._guard():
             self.work = interface.perform_actions(self.work, [action], self._pointer())
 
@@ -512,12 +513,12 @@ class MainView:
         self.work = replace(self.work, dialog=dialog)
         self.wake()
 
-    def request(self, request: str) -> None:
+    def request(self, request: Action) -> None:
         """Add a request that the window performs after the next frame."""
         self.work = replace(self.work, requests=(*self.work.requests, request))
         self.wake()
 
-    def take_requests(self) -> tuple[str, ...]:
+    def take_requests(self) -> tuple[Action, ...]:
         """Return the pending requests of the window and clear them."""
         requests = self.work.requests
         self.work = replace(self.work, requests=())
@@ -525,12 +526,12 @@ class MainView:
 
     def _save_files(self, screen: moderngl.Framebuffer) -> None:
         """Serve the requests for files that need only the main view."""
-        served = [request for request in self.work.requests if request in exports.REQUESTS]
+        served = [request for request in self.work.requests if request.name in exports.REQUESTS]
         unserved = tuple(request for request in self.work.requests if request not in served)
         self.work = replace(self.work, requests=unserved)
         for request in served:
             with self._guard():
-                self.show_message(self._save(request, screen))
+                self.show_message(self._save(request.name, screen))
 
     def _save(self, request: str, screen: moderngl.Framebuffer) -> str:
         title = self.facts.title

@@ -12,6 +12,7 @@ from viewer.camera.views import AXES, look_at_view
 from viewer.panel import tools
 from viewer.render.picking import layer_at, seen_at, surface_point
 from viewer.state import paint, workspace
+from viewer.state.commands import MovePointer
 from viewer.state.layers import with_paint
 from viewer.state.paint import Stroke
 from viewer.state.view_state import Brush, SelectTool, ViewState
@@ -123,13 +124,15 @@ def point_by_keys(
         if (command := TOOL_KEYS.get(press.chord)) is None:
             continue
         at = at or (area.width / 2, area.height / 2)
-        if command.action == "point_press" and press.again:
-            continue
-        if steps := command.action.partition(":")[2]:
-            x, y = (a + float(step) * pointer.ui.scale for a, step in zip(at, steps.split(","), strict=True))
+        action = command.action
+        if isinstance(action, MovePointer):
+            x = at[0] + action.x * pointer.ui.scale
+            y = at[1] + action.y * pointer.ui.scale
             at = round(min(max(x, 0.0), area.width - 1.0)), round(min(max(y, 0.0), area.height - 1.0))
+        elif press.again:
+            continue
         io.add_mouse_pos_event(*at)
-        if not steps:
+        if not isinstance(action, MovePointer):
             for pressed in (True, False) if clicks else (not down,):
                 io.add_mouse_button_event(0, pressed)
             down = not (clicks or down)

@@ -86,22 +86,22 @@ class TidyActions:
             return []
         return [Step(gizmo.does, self._region, similarity(*gizmo.step))]
 
-    def _place(self, _: str) -> None:
-        """Show the moved selection at the position of the handles."""
+    def _place(self, _: None) -> None:
+        """Show the moved selection at the place of the handles."""
         if steps := self._steps():
             document = self._app.document
             gdf = tidy(document.original, steps, _NAMES[steps[0].does])
             live = (LayerState(len(document.edits), gdf.name, 1.0),)
             self._app.show(document, (gdf,), live)
 
-    def _keep(self, _: str) -> None:
+    def _keep(self, _: None) -> None:
         gizmo = self._app.main_view.gizmo
         steps = self._steps()
         if isinstance(gizmo, Gizmo) and steps and (gizmo.does == "duplicate" or gizmo.is_moved):
             self._add(steps[0].does, steps)
         self._end()
 
-    def _put_back(self, _: str) -> None:
+    def _put_back(self, _: None) -> None:
         moved = self._region is not None
         self._end()
         if moved:
@@ -143,7 +143,7 @@ class StrayActions:
         """Handlers of the requests about strays, by name."""
         return {"hide_strays": self._begin}
 
-    def _begin(self, _: str) -> None:
+    def _begin(self, _: None) -> None:
         """Start the search for strays, which takes seconds."""
         if self._search is None:
             self._scene = self._app.document.original

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from imgui_bundle import imgui, imgui_ctx
 
 from viewer.jobs.training import NewEdit, with_settings
+from viewer.state.commands import Action, OnItem, Plain, WithText
 from viewer.state.facts import LayerRow
 from viewer.state.layers import (
     SLIDERS,
@@ -114,7 +115,7 @@ def draw_card(
     rows: Sequence[LayerRow],
     texture: int,
     ui: UiContext,
-    actions: list[str],
+    actions: list[Action],
 ) -> tuple[Workspace, CardTouch]:
     """Draw the card of a layer: visibility, thumbnail, name, value and slider. Return the changed state.
 
@@ -212,7 +213,7 @@ def _press(named: bool) -> str:
 
 
 def _menu(
-    state: ViewState, index: int, row: LayerRow, several: int, ui: UiContext, actions: list[str]
+    state: ViewState, index: int, row: LayerRow, several: int, ui: UiContext, actions: list[Action]
 ) -> None:
     """Draw the context menu of a layer.
 
@@ -233,21 +234,21 @@ def _menu(
                 imgui.separator()
             else:
                 name = f"Delete {several} layers" if action == "remove" and several > 1 else ""
-                request = f"{action}:{index}" if action in _LAYER_ACTIONS else action
                 if menu_item(action, enabled=action not in off, name=name):
-                    actions.append(request)
+                    on_layer = action in _LAYER_ACTIONS
+                    actions.append(OnItem(action, index) if on_layer else Plain(action))
 
 
-def _group_menu(state: ViewState, layer: LayerState, ui: UiContext, actions: list[str]) -> None:
+def _group_menu(state: ViewState, layer: LayerState, ui: UiContext, actions: list[Action]) -> None:
     if imgui.begin_menu("Group"):
         if menu_item("group"):
-            actions.append("group")
+            actions.append(Plain("group"))
         for group in state.groups:
             name = elide(group.name, 200.0 * ui.scale)
             if imgui.menu_item(f"{name}##{group.name}", "", group.name == layer.group)[0]:
-                actions.append(f"group:{group.name}")
+                actions.append(WithText("group", group.name))
         if layer.group and menu_item("ungroup"):
-            actions.append("ungroup")
+            actions.append(Plain("ungroup"))
         imgui.end_menu()
 
 
@@ -262,7 +263,13 @@ def _focus_bar(clip: tuple[imgui.ImVec2, imgui.ImVec2], color: Rgba, scale: floa
 
 
 def _head(
-    work: Workspace, index: int, row: LayerRow, active: bool, texture: int, ui: UiContext, actions: list[str]
+    work: Workspace,
+    index: int,
+    row: LayerRow,
+    active: bool,
+    texture: int,
+    ui: UiContext,
+    actions: list[Action],
 ) -> tuple[Workspace, CardTouch]:
     """Draw visibility, thumbnail, name and toggles. Reserve space for the number; it is drawn once the
     slider has its value."""
@@ -306,7 +313,7 @@ def _head(
     return work, touch
 
 
-def _toggles(work: Workspace, index: int, over: bool, ui: UiContext, actions: list[str]) -> None:
+def _toggles(work: Workspace, index: int, over: bool, ui: UiContext, actions: list[Action]) -> None:
     """Draw the buttons for menu, brush, details, lock and solo. Without hover, show only lock and solo
     that are on."""
     view = work.view
@@ -339,7 +346,7 @@ def _toggles(work: Workspace, index: int, over: bool, ui: UiContext, actions: li
     if "menu" in pressed:
         imgui.open_popup(_MENU)
     else:
-        actions += pressed  # they apply to the focused layer, which is now this one
+        actions += map(Plain, pressed)  # they apply to the focused layer, which is now this one
 
 
 def _thumbnail(

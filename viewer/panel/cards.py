@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 
 from imgui_bundle import imgui, imgui_ctx
 
 from progdf.compose.reference import BLENDS
+from viewer.state.commands import Action, Plain, PressLayer, Rename, WithText, WithValue
 from viewer.state.facts import LayerRow
 from viewer.state.layer_selection import filter_layers, master_strength, selected_layers
 from viewer.state.layers import (
@@ -80,7 +82,7 @@ def selection_height(chosen: Sequence[int], ui: UiContext) -> float:
     return (SMALL_PX + 6.0 + MASTER_PX) * ui.scale + 3 * spacing
 
 
-def draw_selection(state: ViewState, chosen: Sequence[int], ui: UiContext, actions: list[str]) -> None:
+def draw_selection(state: ViewState, chosen: Sequence[int], ui: UiContext, actions: list[Action]) -> None:
     """Draw the strength of several selected layers and their actions, under the cards."""
     if len(chosen) < 2:
         return
@@ -114,15 +116,14 @@ def draw_selection(state: ViewState, chosen: Sequence[int], ui: UiContext, actio
     corner = (at.x + room + 8.0 * ui.scale, at.y)
     imgui.get_window_draw_list().add_text(corner, u32(PALETTE.text), f"{new:.3f}")
     if new != value:
-        actions.append(f"master:{new!r}")
+        actions.append(WithValue("master", new))
 
 
 _MENU = "menu of a group"
-_ITEMS = (("Rename…", "", ""), ("Select its layers", "select_layers", ""), ("Ungroup", "ungroup", ""))
 
 
 def draw_group(
-    state: ViewState, group: LayerGroup, count: int, ui: UiContext, actions: list[str]
+    state: ViewState, group: LayerGroup, count: int, ui: UiContext, actions: list[Action]
 ) -> tuple[ViewState, str]:
     """Draw the row of a group of `count` layers; return the changed state and the gesture, see `grip`.
 
@@ -170,7 +171,7 @@ def draw_group(
 
 
 def _group_name(
-    state: ViewState, group: LayerGroup, count: int, room: float, ui: UiContext, actions: list[str]
+    state: ViewState, group: LayerGroup, count: int, room: float, ui: UiContext, actions: list[Action]
 ) -> tuple[tuple[float, float], str]:
     """Draw the name and its menu; return the corner of its text, and the gesture.
 
@@ -178,12 +179,13 @@ def _group_name(
     """
     x, y = imgui.get_cursor_screen_pos()
     corner = (x, y + imgui.get_style().frame_padding.y)
-    if name_field(group.name, room, f"rename_group:{state.groups.index(group)}", actions):
+    select = WithText("select_layers", group.name)
+    if name_field(group.name, room, partial(Rename, "rename_group", state.groups.index(group)), actions):
         return corner, ""
     imgui.invisible_button("name", (max(room, 1.0), imgui.get_frame_height()))
     gesture = grip(ui)
     if gesture == "clicked":
-        actions.append(f"select_layers:{group.name}")
+        actions.append(select)
     hovered = imgui.is_item_hovered()
     tip(f"{group.name}, {count} layers\nClick to select them, drag to reorder, double-click to rename")
     if hovered and imgui.is_mouse_double_clicked(imgui.MouseButton_.left.value):
@@ -195,9 +197,12 @@ def _group_name(
         if hovered:
             color = PALETTE.handle
         imgui.get_window_draw_list().add_text(corner, u32(color), elide(group.name, room))
-    for action in menu_items(_MENU, _ITEMS, ui):
-        start_naming(not action)
-        actions += [f"{action}:{group.name}"] if action else []
+    ungroup = WithText("ungroup", group.name)
+    items = (("Rename…", None, ""), ("Select its layers", select, ""), ("Ungroup", ungroup, ""))
+    for action in menu_items(_MENU, items, ui):
+        start_naming(action is None)
+        if action is not None:
+            actions.append(action)
     return corner, gesture
 
 
@@ -224,7 +229,7 @@ class _Row:
     heads: bool = False  # the row is that of a group
 
 
-def draw_heading(work: Workspace, ui: UiContext, actions: list[str]) -> Workspace:
+def draw_heading(work: Workspace, ui: UiContext, actions: list[Action]) -> Workspace:
     """Draw the heading of the stack, with the button for a new edit and the menu for all layers."""
     right = right_edge()
     work = replace(work, layout=section("Edits", work.layout, ui))
@@ -234,7 +239,7 @@ def draw_heading(work: Workspace, ui: UiContext, actions: list[str]) -> Workspac
     menu_button = side + 4.0 * ui.scale if work.view.layers else 0.0
     imgui.same_line(right - wide - menu_button)
     if (imgui.button if work.view.layers else accent_button)(text, (wide, 0.0)):
-        actions.append("new_edit")
+        actions.append(Plain("new_edit"))
     hint("new_edit")
     if not work.view.layers:
         return work
@@ -246,7 +251,7 @@ def draw_heading(work: Workspace, ui: UiContext, actions: list[str]) -> Workspac
         return replace(work, view=_choose_rules(work, ui, actions)) if is_open else work
 
 
-def _choose_rules(work: Workspace, ui: UiContext, actions: list[str]) -> ViewState:
+def _choose_rules(work: Workspace, ui: UiContext, actions: list[Action]) -> ViewState:
     """Draw the menu for all layers: blend rule, overshoot, compact rows. Return the changed state."""
     state = work.view
     imgui.text_disabled(f"Where edits overlap ({shortcut('blend')})")
@@ -258,7 +263,7 @@ def _choose_rules(work: Workspace, ui: UiContext, actions: list[str]) -> ViewSta
     if menu_item("overshoot", state.overshoot):
         state = with_overshoot(state, not state.overshoot)
     if menu_item("cards", is_compact(work)):
-        actions.append("cards")
+        actions.append(Plain("cards"))
     return state
 
 
@@ -268,7 +273,7 @@ def draw(
     thumbnails: Sequence[int],
     reveal: bool,
     ui: UiContext,
-    actions: list[str],
+    actions: list[Action],
 ) -> Workspace:
     """Draw all cards, under their group rows, and return the changed workspace.
 
@@ -334,7 +339,7 @@ def draw(
             imgui.internal.scroll_to_item(imgui.internal.ScrollFlags_.keep_visible_edge_y.value)
         focus = i if touch.touched and touch.press in ("", "one", "keep") else focus
         if touch.press and (work.selected or touch.press in ("toggle", "range")):
-            actions.append(f"press_layer:{touch.press}:{i}:{','.join(str(i) for i in listed)}")
+            actions.append(PressLayer(touch.press, i, tuple(listed)))
     if work.view.layers and not listed:
         small("No matching layer", PALETTE.dim)
     if work.renaming is not None and not any(l.layers == (work.renaming,) and not l.heads for l in lines):
@@ -345,7 +350,7 @@ def draw(
     return replace(work, focus=focus)
 
 
-def _group(state: ViewState, name: str, ui: UiContext, actions: list[str]) -> tuple[ViewState, str]:
+def _group(state: ViewState, name: str, ui: UiContext, actions: list[Action]) -> tuple[ViewState, str]:
     """Draw the row of a group, see `draw_group`; add a group that only its layers name."""
     group = next((group for group in state.groups if group.name == name), LayerGroup(name))
     if group not in state.groups:

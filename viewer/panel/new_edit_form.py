@@ -26,6 +26,7 @@ from viewer.jobs.training import (
     parse_curve,
     with_editor,
 )
+from viewer.state.commands import Action, Plain
 from viewer.state.selection import SelectionState
 from viewer.state.workspace import PreviewState, Workspace
 from viewer.ui.context import PALETTE, Icon, UiContext, u32
@@ -63,7 +64,9 @@ _GRADES = {
 }
 
 
-def draw(work: Workspace, count: int, preview: PreviewState, ui: UiContext, actions: list[str]) -> Workspace:
+def draw(
+    work: Workspace, count: int, preview: PreviewState, ui: UiContext, actions: list[Action]
+) -> Workspace:
     """Draw the form if it is open. Tab moves through it, Enter trains, Escape closes it.
 
     Args:
@@ -83,13 +86,13 @@ def draw(work: Workspace, count: int, preview: PreviewState, ui: UiContext, acti
             for key in _ENTER:  # keep Enter from pressing buttons and opening lists
                 imgui.internal.set_key_owner(key, listed)
         if closes:  # skip the fields, which would undo the typing
-            actions.append("new_edit")
+            actions.append(Plain("new_edit"))
         else:
             form, action = _content(work, count, preview, ui)
             if trains:
                 action = "train"
             if action:
-                actions.append(action)
+                actions.append(Plain(action))
             work = replace(work, form=form, form_opening=False)
         storage.set_bool(listed, imgui.is_popup_open("", imgui.PopupFlags_.any_popup.value))
     return work

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,6 +12,7 @@ from imgui_bundle import imgui, imgui_ctx
 
 from progdf.terminal import escape_text
 from viewer.state import history
+from viewer.state.commands import Action, OnItem, Plain, Rename, SelectRegion, WithText
 from viewer.state.layer_selection import selected_layers
 from viewer.state.selection import NamedRegion
 from viewer.state.workspace import UNSAVED, Layout, PreviewState, SceneFacts, Workspace, has_unsaved
@@ -26,11 +28,15 @@ _MAX_RECENT = 6
 _SHARE_ACTIONS = ("export", "export_page", "render_picture", "render_film", "picture")
 
 
-def _menu_button(recent: Sequence[Path], side: float, ui: UiContext, actions: list[str]) -> None:
+def _menu_button(recent: Sequence[Path], side: float, ui: UiContext, actions: list[Action]) -> None:
     """Draw the menu at the right of the current line; `recent`: recently opened files, the last one first."""
     room = MAX_PX * ui.scale
     files = [
-        (widgets.elide(escape_text(path.name), room), f"open_file:{path}", escape_text(str(path)))
+        (
+            widgets.elide(escape_text(path.name), room),
+            WithText("open_file", str(path)),
+            escape_text(str(path)),
+        )
         for path in recent[:_MAX_RECENT]
     ]
     widgets.more_button(MENU_ID, ("open", *files, *_MENU_ACTIONS), ui, actions, Icon.BARS, side)
@@ -61,7 +67,7 @@ def draw(
     recent: Sequence[Path],
     reveal: bool,
     ui: UiContext,
-    actions: list[str],
+    actions: list[Action],
 ) -> Workspace:
     """Draw the panel along the right edge of the display, between `imgui.new_frame` and `imgui.render`.
 
@@ -147,7 +153,7 @@ def _end_body() -> None:
 
 
 def _title(
-    work: Workspace, facts: SceneFacts, recent: Sequence[Path], ui: UiContext, actions: list[str]
+    work: Workspace, facts: SceneFacts, recent: Sequence[Path], ui: UiContext, actions: list[Action]
 ) -> None:
     """Draw the session's name, with a dot for unsaved changes, the scene with its size, and the icons."""
     corner = imgui.get_cursor_pos()
@@ -166,7 +172,7 @@ def _title(
     below = imgui.get_cursor_pos()
     imgui.set_cursor_pos((corner.x + room - 3 * side, corner.y - 2.0 * scale))
     if widgets.icon_button("save", Icon.SAVE, ui, side=side):
-        actions.append("save")
+        actions.append(Plain("save"))
     widgets.hint("save")
     imgui.same_line(0.0, 0.0)
     widgets.more_button("share", _SHARE_ACTIONS, ui, actions, Icon.SHARE, side)
@@ -178,16 +184,19 @@ def _title(
 
 
 _REGION_MENU = "menu of a region"
-_ITEMS = (
-    ("Select", "region:{}:new", ""),
-    ("Add to selection", "region:{}:add", ""),
-    ("Subtract from selection", "region:{}:subtract", ""),
-    ("Rename…", "", ""),
-    ("Delete", "forget_region:{}", ""),
-)
 
 
-def _regions(work: Workspace, ui: UiContext, actions: list[str]) -> Workspace:
+def _region_menu(index: int) -> tuple[tuple[str, Action | None, str], ...]:
+    return (
+        ("Select", SelectRegion(index), ""),
+        ("Add to selection", SelectRegion(index, "add"), ""),
+        ("Subtract from selection", SelectRegion(index, "subtract"), ""),
+        ("Rename…", None, ""),
+        ("Delete", OnItem("forget_region", index), ""),
+    )
+
+
+def _regions(work: Workspace, ui: UiContext, actions: list[Action]) -> Workspace:
     """Draw the section "Regions" with a row for each region, if there are any."""
     regions = work.view.selection.regions
     layout = work.layout
@@ -201,13 +210,13 @@ def _regions(work: Workspace, ui: UiContext, actions: list[str]) -> Workspace:
     return replace(work, layout=layout)
 
 
-def _row(index: int, region: NamedRegion, ui: UiContext, actions: list[str]) -> bool:
+def _row(index: int, region: NamedRegion, ui: UiContext, actions: list[Action]) -> bool:
     """Draw visibility, swatch, name and count of a region; return whether the mouse hovers it."""
     right = widgets.right_edge()
     scale = ui.scale
     icon = Icon.SHOWN if region.visible else Icon.HIDDEN
     if widgets.icon_button("eye", icon, ui, dim=not region.visible):
-        actions.append(f"show_region:{index}")
+        actions.append(OnItem("show_region", index))
     widgets.tip("Tint this region in the picture")
     imgui.same_line()
     widgets.swatch(region.color, 1.0, False, ui)
@@ -218,7 +227,7 @@ def _row(index: int, region: NamedRegion, ui: UiContext, actions: list[str]) -> 
     with imgui_ctx.push_font(None, SMALL_PX):
         wide = imgui.calc_text_size(count).x
     room = right - wide - 10.0 * scale - imgui.get_cursor_pos_x()
-    if widgets.name_field(region.name, room, f"rename_region:{index}", actions):
+    if widgets.name_field(region.name, room, partial(Rename, "rename_region", index), actions):
         return False
     x, y = imgui.get_cursor_screen_pos()
     io = imgui.get_io()
@@ -229,7 +238,7 @@ def _row(index: int, region: NamedRegion, ui: UiContext, actions: list[str]) -> 
         mode = "subtract" if io.key_ctrl else "new"
         if io.key_shift:
             mode = "add"
-        actions.append(f"region:{index}:{mode}")
+        actions.append(SelectRegion(index, mode))
     hovered = imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value)
     color = u32(PALETTE.text if imgui.is_item_hovered() else PALETTE.dim)
     widgets.tip(f"{region.path}\nClick to select; Shift adds, Ctrl subtracts. Right-click: rename, delete")
@@ -239,16 +248,17 @@ def _row(index: int, region: NamedRegion, ui: UiContext, actions: list[str]) -> 
     canvas.add_text((x, y + above), u32(PALETTE.text), widgets.elide(region.name, room))
     at = (imgui.get_item_rect_max().x - wide, y + above + 1.0 * scale)
     canvas.add_text(ui.fonts.regular, SMALL_PX * scale, at, color, count)
-    for action in widgets.menu_items(_REGION_MENU, _ITEMS, ui):
-        actions += [action.format(index)] if action else []
-        widgets.start_naming(not action)
+    for action in widgets.menu_items(_REGION_MENU, _region_menu(index), ui):
+        widgets.start_naming(action is None)
+        if action is not None:
+            actions.append(action)
     return bool(hovered)
 
 
 _FOOTER_BUTTONS = (("timeline", Icon.FILM), ("picture", Icon.PICTURE), ("help", Icon.HELP))
 
 
-def _footer(work: Workspace, ui: UiContext, actions: list[str]) -> None:
+def _footer(work: Workspace, ui: UiContext, actions: list[Action]) -> None:
     imgui.separator()
     right = widgets.right_edge()
     changes = {"undo": history.next_undo(work.past), "redo": history.next_redo(work.past)}

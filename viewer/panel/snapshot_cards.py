@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from imgui_bundle import imgui, imgui_ctx
 
+from viewer.state.commands import Action, ChooseSnapshot, MoveSnapshot, OnItem, Plain, Rename
 from viewer.state.snapshots import compare_sides, pair_of, with_original
 from viewer.state.workspace import Workspace
 from viewer.ui import widgets
@@ -14,14 +16,23 @@ from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
 
 COLUMNS = 3
 _MENU = "menu of a snapshot"
-_ITEMS = (
-    ("Rename…", "", ""),
-    ("Use as A", "choose_snapshot:a:{name}", ""),
-    ("Use as B", "choose_snapshot:b:{name}", ""),
-    ("Move left", "move_snapshot:{at}:{before}", ""),
-    ("Move right", "move_snapshot:{at}:{after}", ""),
-    ("Delete", "forget:{at}", ""),
-)
+
+
+def _menu(index: int, name: str) -> tuple[tuple[str, Action | None, str], ...]:
+    """Return the menu of a snapshot. The original cannot be renamed or moved."""
+    compare = (
+        ("Use as A", ChooseSnapshot("a", name), ""),
+        ("Use as B", ChooseSnapshot("b", name), ""),
+    )
+    if not index:
+        return compare
+    return (
+        ("Rename…", None, ""),
+        *compare,
+        ("Move left", MoveSnapshot(index, index - 1), ""),
+        ("Move right", MoveSnapshot(index, index + 1), ""),
+        ("Delete", OnItem("forget", index), ""),
+    )
 
 
 @dataclass(frozen=True)
@@ -34,7 +45,7 @@ class _Cards:
     b: int
 
 
-def draw(work: Workspace, textures: Sequence[int], ui: UiContext, actions: list[str]) -> Workspace:
+def draw(work: Workspace, textures: Sequence[int], ui: UiContext, actions: list[Action]) -> Workspace:
     """Draw the section and return the workspace with its fold state.
 
     Args:
@@ -46,7 +57,7 @@ def draw(work: Workspace, textures: Sequence[int], ui: UiContext, actions: list[
     wide = imgui.calc_text_size(name).x + 2 * imgui.get_style().frame_padding.x
     imgui.same_line(right - wide)
     if imgui.button(f"{name}##snapshot"):
-        actions.append("snapshot")
+        actions.append(Plain("snapshot"))
     widgets.hint("snapshot")
     if len(textures) < 2 or "Snapshots" in work.layout.folded:
         return work
@@ -62,7 +73,7 @@ def draw(work: Workspace, textures: Sequence[int], ui: UiContext, actions: list[
     return work
 
 
-def _pair(cards: _Cards, compared: bool, ui: UiContext, actions: list[str]) -> None:
+def _pair(cards: _Cards, compared: bool, ui: UiContext, actions: list[Action]) -> None:
     """Draw the choice of the two snapshots, and the button that compares them."""
     side = imgui.get_frame_height()
     gap = 4.0 * ui.scale
@@ -71,7 +82,7 @@ def _pair(cards: _Cards, compared: bool, ui: UiContext, actions: list[str]) -> N
         if slot == "b":
             imgui.same_line(0.0, gap)
             if widgets.icon_button("compare snapshots", Icon.SPLIT, ui, dim=not compared):
-                actions.append("compare_snapshots")
+                actions.append(Plain("compare_snapshots"))
             widgets.hint("compare_snapshots")
             imgui.same_line(0.0, gap)
         imgui.set_next_item_width(wide)
@@ -81,10 +92,10 @@ def _pair(cards: _Cards, compared: bool, ui: UiContext, actions: list[str]) -> N
         shown = widgets.elide(label, room)
         pressed = widgets.drop_down(f"##snapshot {slot}", shown, cards.names, chosen, ui, help_)
         if pressed is not None:
-            actions.append(f"choose_snapshot:{slot}:{cards.names[pressed]}")
+            actions.append(ChooseSnapshot(slot, cards.names[pressed]))
 
 
-def _card(index: int, cards: _Cards, wide: float, ui: UiContext, actions: list[str]) -> None:
+def _card(index: int, cards: _Cards, wide: float, ui: UiContext, actions: list[Action]) -> None:
     """Draw a picture with its name and its menu."""
     name = cards.names[index]
     badge = ""
@@ -96,7 +107,7 @@ def _card(index: int, cards: _Cards, wide: float, ui: UiContext, actions: list[s
         at = imgui.get_cursor_screen_pos()
         tall = 0.75 * wide
         if imgui.invisible_button(f"restore{index}", (wide, tall), imgui.ButtonFlags_.enable_nav.value):
-            actions.append(f"restore:{index}")
+            actions.append(OnItem("restore", index))
         hovered = imgui.is_item_hovered()
         widgets.tip(
             "Restore. Right-click: rename, A, B, reorder, delete"
@@ -106,14 +117,15 @@ def _card(index: int, cards: _Cards, wide: float, ui: UiContext, actions: list[s
         if imgui.is_item_clicked(imgui.MouseButton_.right.value):
             imgui.open_popup(_MENU)
         last = len(cards.names) - 1
-        off = {_ITEMS[3][1]: index > 1, _ITEMS[4][1]: index < last}
-        items = _ITEMS if index else _ITEMS[1:3]  # the original cannot be renamed or moved
-        for action in widgets.menu_items(
-            _MENU, items, ui, [action for action, can in off.items() if not can]
-        ):
-            widgets.start_naming(not action)
-            names = {"name": name, "at": index, "before": index - 1, "after": index + 1}
-            actions += [action.format_map(names)] if action else []
+        off = []
+        if index <= 1:
+            off.append("Move left")
+        if index >= last:
+            off.append("Move right")
+        for action in widgets.menu_items(_MENU, _menu(index, name), ui, off):
+            widgets.start_naming(action is None)
+            if action is not None:
+                actions.append(action)
         canvas = imgui.get_window_draw_list()
         end = (at.x + wide, at.y + tall)
         widgets.picture(cards.textures[index], at, end, 4.0 * ui.scale)
@@ -123,7 +135,7 @@ def _card(index: int, cards: _Cards, wide: float, ui: UiContext, actions: list[s
             if badge:
                 _badge(badge, at, ui)
         with imgui_ctx.push_font(None, SMALL_PX):
-            if not widgets.name_field(name, wide, f"name_snapshot:{index}", actions):
+            if not widgets.name_field(name, wide, partial(Rename, "name_snapshot", index), actions):
                 imgui.text_disabled(widgets.elide(name, wide))
                 left = imgui.MouseButton_.left.value
                 if index and imgui.is_item_hovered() and imgui.is_mouse_double_clicked(left):

@@ -1,6 +1,6 @@
 """Timeline along the lower edge of the picture: keyframes and playhead to drag, rows, and settings.
 
-It changes no state: it returns actions of `timeline.ACTIONS`, like keyboard input.
+It changes no state: it returns commands of `timeline.ACTIONS`, like keyboard input.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from imgui_bundle import icons_fontawesome_6 as icons
 from imgui_bundle import imgui, imgui_ctx
 
 from viewer.camera.views import value_between
+from viewer.state.commands import Action, ChooseKeys, OnItem, Plain, WithValue
 from viewer.state.timeline import (
     CAMERA,
     EASINGS,
@@ -89,7 +90,7 @@ def _rows_height(work: Workspace, area: Area, ui: UiContext) -> float:
     return (rows + _GAP_PX) * ui.scale if work.player.unfolded else 0.0
 
 
-def draw(work: Workspace, area: Area, ui: UiContext) -> tuple[str, ...]:
+def draw(work: Workspace, area: Area, ui: UiContext) -> tuple[Action, ...]:
     """Draw the bar over the lower edge of `area`, between `imgui.new_frame` and `imgui.render`.
 
     Returns:
@@ -99,7 +100,7 @@ def draw(work: Workspace, area: Area, ui: UiContext) -> tuple[str, ...]:
     roomy = _is_wide(area, ui)
     scale = ui.scale
     timeline = work.view.timeline
-    actions = list[str]()
+    actions = list[Action]()
     corner = (0.0, area.height - tall)
     with plate("timeline", corner, ui, pad=10.0, size=(area.width, tall)):
         left = imgui.get_cursor_screen_pos().x
@@ -132,7 +133,7 @@ def label_step(timeline: Timeline, span: float, room: float) -> int:
     return next((step for step in _LABEL_STEPS if step >= min_step), _LABEL_STEPS[-1])
 
 
-def _buttons(timeline: Timeline, player: Player, actions: list[str], ui: UiContext) -> None:
+def _buttons(timeline: Timeline, player: Player, actions: list[Action], ui: UiContext) -> None:
     gap = 2.0 * ui.scale
     auto = player.auto_key is not None
     folds = Icon.UNFOLDED if player.unfolded else Icon.FOLDED
@@ -156,12 +157,12 @@ def _buttons(timeline: Timeline, player: Player, actions: list[str], ui: UiConte
     imgui.same_line(0.0, gap)
     imgui.push_style_color(imgui.Col_.text, PALETTE.error if auto else PALETTE.faint)
     if imgui.button(f"{icons.ICON_FA_CIRCLE}##auto", (imgui.get_frame_height(), 0.0)):
-        actions.append("auto_key")
+        actions.append(Plain("auto_key"))
     imgui.pop_style_color()
     hint("auto_key", "Now " + ("on" if auto else "off"))
 
 
-def _settings(work: Workspace, ruler: _Ruler, actions: list[str]) -> None:
+def _settings(work: Workspace, ruler: _Ruler, actions: list[Action]) -> None:
     timeline = ruler.timeline
     ui = ruler.ui
     gap = 4.0 * ui.scale
@@ -171,11 +172,11 @@ def _settings(work: Workspace, ruler: _Ruler, actions: list[str]) -> None:
             chosen = chosen_keys(timeline, ruler.player)
             easing = (ruler.keys[min(chosen)] if chosen else key_before(timeline, ruler.frame)).easing
         if imgui.button(f"{easing.capitalize()}##easing", (58.0 * ui.scale, 0.0)):
-            actions.append("easing")
+            actions.append(Plain("easing"))
     hint("easing", "Chosen keyframes first")
     imgui.same_line(0.0, gap)
     if icon_button("ping_pong", icons.ICON_FA_RIGHT_LEFT, ui, dim=not timeline.ping_pong):
-        actions.append("ping_pong")
+        actions.append(Plain("ping_pong"))
     hint("ping_pong", "Now " + ("on" if timeline.ping_pong else "off"))
     imgui.same_line(0.0, gap)
     count = timeline.length + 1
@@ -187,20 +188,20 @@ def _settings(work: Workspace, ruler: _Ruler, actions: list[str]) -> None:
         clamp = imgui.SliderFlags_.always_clamp.value
         changed, value = imgui.drag_int(f"##{name}", now, 0.25, *ends, f"%d {unit}", clamp)
         if changed and value != now:
-            actions.append(f"{name}:{value - (name == 'length')}")
+            actions.append(WithValue(name, value - 1 if name == "length" else value))
         tip(f"{help_text}; drag, or Ctrl+click to type")
         imgui.same_line(0.0, gap)
     if imgui.button("Film…"):
-        actions.append("render_film")
+        actions.append(Plain("render_film"))
     hint("render_film")
     imgui.same_line(0.0, gap)
     frame = work.view.safe_frame
     if icon_button("safe_frame", icons.ICON_FA_CROP_SIMPLE, ui, dim=not frame):
-        actions.append("safe_frame")
+        actions.append(Plain("safe_frame"))
     hint("safe_frame", f"Now {frame or 'none'}")
 
 
-def _draw_ruler(ruler: _Ruler, wide: float, actions: list[str]) -> None:
+def _draw_ruler(ruler: _Ruler, wide: float, actions: list[Action]) -> None:
     """Draw the keys of all rows, the frame numbers and the playhead."""
     frames: dict[int, list[RowKey]] = {}
     for key in ruler.keys:
@@ -216,7 +217,7 @@ def _drag(
     frames: Mapping[int, Sequence[RowKey]],
     size: imgui.ImVec2Like,
     ruler: _Ruler,
-    actions: list[str],
+    actions: list[Action],
 ) -> int | None:
     """Drag the keys under the mouse, with Ctrl copies of them, otherwise the playhead.
 
@@ -241,20 +242,18 @@ def _drag(
         storage.set_int(copies, int(io.key_ctrl))
         keys = () if hovered_frame is None else frames[hovered_frame]
         if io.key_shift or not keys or not set(keys) <= player.chosen:
-            names = ",".join(f"{row}@{frame}" for row, frame in keys)
-            sign = "+" if io.key_shift else ""
-            actions.append(f"choose_keys:{sign}{names}")
-        actions.append(f"seek:{mouse_frame if hovered_frame is None else hovered_frame}")
+            actions.append(ChooseKeys(frozenset(keys), toggles=io.key_shift))
+        actions.append(WithValue("seek", mouse_frame if hovered_frame is None else hovered_frame))
     elif imgui.is_item_active() or is_released():  # a slow frame may contain move and release
         origin = storage.get_int(held, -1)
         moved = imgui.get_mouse_drag_delta(0, 3.0 * ruler.ui.scale).x != 0.0 or imgui.is_item_deactivated()
         if origin < 0 and mouse_frame != ruler.frame:
-            actions.append(f"seek:{mouse_frame}")
+            actions.append(WithValue("seek", mouse_frame))
         elif origin >= 0 and moved and mouse_frame != origin:
             copy = bool(storage.get_int(copies, 0))
             chosen = chosen_keys(timeline, player)
             if shift_keys(timeline, chosen, mouse_frame - origin, copy) is not timeline:
-                actions.append(f"{'clone' if copy else 'move'}_keys:{mouse_frame - origin}")
+                actions.append(WithValue("clone_keys" if copy else "move_keys", mouse_frame - origin))
                 storage.set_int(held, mouse_frame)
                 storage.set_int(copies, 0)
     if hovered_frame is not None:
@@ -262,7 +261,7 @@ def _drag(
     return hovered_frame
 
 
-def _rows(work: Workspace, ruler: _Ruler, left: float, tall: float, actions: list[str]) -> None:
+def _rows(work: Workspace, ruler: _Ruler, left: float, tall: float, actions: list[Action]) -> None:
     """Draw a row of keys for the camera and each layer, in the panel's order; many rows scroll."""
     layers = list(enumerate(reversed(work.view.layers), 1))
     curves = tracks(ruler.timeline)
@@ -274,7 +273,7 @@ def _rows(work: Workspace, ruler: _Ruler, left: float, tall: float, actions: lis
         color = ROW_COLORS[layer.gdf % len(ROW_COLORS)]
         points = curves.get(layer.gdf, ())
         if _row(layer.gdf, layer.name, color, points, ruler, left, focused, actions):
-            actions.append(f"focus:{number}")
+            actions.append(OnItem("focus", number))
     imgui.end_child()
     imgui.pop_style_var()
 
@@ -287,7 +286,7 @@ def _row(
     ruler: _Ruler,
     left: float,
     focused: bool,
-    actions: list[str],
+    actions: list[Action],
 ) -> bool:
     """Draw the name, the button for a key at the playhead, the keys and the curve; return True if the name
     is pressed."""
@@ -311,7 +310,7 @@ def _row(
             imgui.same_line(0.0, 0.0)
             here = (row, ruler.frame) in ruler.keys
             if imgui.invisible_button("key", (tall, tall)):
-                actions.append(f"{'drop_key' if here else 'key'}:{row}")
+                actions.append(OnItem("drop_key" if here else "key", row))
             ink = u32(color if here else p.faint)
             if imgui.is_item_hovered():
                 ink = u32(p.handle)

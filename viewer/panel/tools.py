@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from typing import TypeVar
 
@@ -11,6 +12,7 @@ from imgui_bundle import imgui
 from viewer.camera.view_camera import Vec3, ViewCamera, axes, with_up
 from viewer.pictures.compare import Labels
 from viewer.render import highlight
+from viewer.state.commands import Action, Plain, WithText
 from viewer.state.layers import is_visible
 from viewer.state.view_state import (
     LARGEST_PX,
@@ -83,13 +85,13 @@ def _open_below(share: float, ui: UiContext) -> None:
     imgui.set_next_window_pos(at, 0, (share, 0.0))
 
 
-def draw_toolbar(view: ViewState, area: Area, ui: UiContext, actions: list[str]) -> None:
+def draw_toolbar(view: ViewState, area: Area, ui: UiContext, actions: list[Action]) -> None:
     """Draw the toolbar along the left edge of the picture; `area`: the picture without the timeline."""
-    active_tool = f"navigate:{view.camera.mode}"
+    active_tool: Action = WithText("navigate", view.camera.mode)
     if view.select.tool:
-        active_tool = f"select_tool:{view.select.tool}"
+        active_tool = WithText("select_tool", view.select.tool)
     elif view.brush.active:
-        active_tool = "brush"
+        active_tool = Plain("brush")
     off = {"brush": not view.layers, "move_selected": not view.selection.count}
     count = sum(map(len, _TOOLS))
     gap = 6.0 * ui.scale
@@ -100,12 +102,13 @@ def draw_toolbar(view: ViewState, area: Area, ui: UiContext, actions: list[str])
         for i, group in enumerate(_TOOLS):
             if i:
                 imgui.dummy((1.0, gap))
-            for action, icon in group:
-                with inert(off.get(action, False)):
-                    if icon_button(action, icon, ui, lit=action == active_tool, side=side):
+            for command, icon in group:
+                action = COMMANDS[command].action
+                with inert(off.get(command, False)):
+                    if icon_button(command, icon, ui, lit=action == active_tool, side=side):
                         actions.append(action)
-                needs_selection = action == "move_selected" and off[action]
-                hint(action, "Select something first" if needs_selection else "")
+                needs_selection = command == "move_selected" and off[command]
+                hint(command, "Select something first" if needs_selection else "")
     imgui.pop_style_var()
 
 
@@ -154,15 +157,17 @@ class _Bar:
         tip(help_)
         return value
 
-    def button(self, action: str, actions: list[str], icon: str = "") -> None:
-        text = icon + COMMANDS[action].name
+    def button(self, command: str, actions: list[Action], icon: str = "") -> None:
+        text = icon + COMMANDS[command].name
         self.follow(imgui.calc_text_size(text).x + 2 * imgui.get_style().frame_padding.x)
-        if imgui.button(f"{text}##{action}"):
-            actions.append(action)
-        hint(action)
+        if imgui.button(f"{text}##{command}"):
+            actions.append(COMMANDS[command].action)
+        hint(command)
 
 
-def draw_options(work: Workspace, area: Area, ui: UiContext, actions: list[str]) -> tuple[Workspace, float]:
+def draw_options(
+    work: Workspace, area: Area, ui: UiContext, actions: list[Action]
+) -> tuple[Workspace, float]:
     """Draw the bar above the picture with the options of the active tool and the actions for the selection.
 
     Returns:
@@ -192,7 +197,7 @@ def draw_options(work: Workspace, area: Area, ui: UiContext, actions: list[str])
     return replace(work, view=view, pointed=work.pointed or pointed), foot
 
 
-def _selection(view: ViewState, bar: _Bar, actions: list[str]) -> Pointed | None:
+def _selection(view: ViewState, bar: _Bar, actions: list[Action]) -> Pointed | None:
     """Draw the number of selected Gaussians and the actions for them; return "selection" if it is hovered."""
     count = view.selection.count
     pointed = None
@@ -237,12 +242,12 @@ def _select_options(tool: SelectTool, bar: _Bar) -> SelectTool:
     return tool
 
 
-def _save(regions: int, bar: _Bar, actions: list[str]) -> None:
+def _save(regions: int, bar: _Bar, actions: list[Action]) -> None:
     """Draw the button that saves the selection, or in its place the field for the name."""
     text = "Save as region…"
     wide = 128.0 * bar.ui.scale
     bar.follow(wide)
-    if name_field(f"region-{regions + 1}", wide, "save_region", actions):
+    if name_field(f"region-{regions + 1}", wide, partial(WithText, "save_region"), actions):
         return
     if imgui.button(text, (wide, 0.0)):
         start_naming()
@@ -269,7 +274,7 @@ def paint_obstacle(view: ViewState, focus: int | None) -> str:
     return ""
 
 
-def _brush_options(view: ViewState, focus: int | None, bar: _Bar, actions: list[str]) -> ViewState:
+def _brush_options(view: ViewState, focus: int | None, bar: _Bar, actions: list[Action]) -> ViewState:
     """Draw the options of the brush."""
     brush = view.brush
     modes = {"add": "Add", "erase": "Erase", "smooth": "Smooth"}
@@ -341,7 +346,7 @@ _AGAINST = (
 
 def draw_comparison(
     work: Workspace, words: Labels, original: bool, place: imgui.ImVec2Like, ui: UiContext
-) -> tuple[Workspace, str]:
+) -> tuple[Workspace, Action | None]:
     """Draw the pill at the top of the picture that chooses the two sides and the kind of comparison.
 
     Args:
@@ -350,7 +355,7 @@ def draw_comparison(
         place: the middle of its upper edge, window pixels
 
     Returns:
-        The changed workspace, and the requested action, "" for none.
+        The changed workspace, and the requested action, None for none.
     """
     compare = work.view.compare
     requested = ""
@@ -381,7 +386,8 @@ def draw_comparison(
         _open_below(0.5, ui)
         with menu("comparisons", ui) as is_open:
             compare = _choose_comparison(compare, bool(work.snapshots), ui) if is_open else compare
-    return replace(work, view=replace(work.view, compare=compare)), requested
+    work = replace(work, view=replace(work.view, compare=compare))
+    return work, Plain(requested) if requested else None
 
 
 def _word(name: str, text: str, bright: bool, ui: UiContext) -> bool:
@@ -434,7 +440,7 @@ def view_width(view: ViewState, area: Area, ui: UiContext) -> float:
     return max(overlay.axes_height(view, area, ui), buttons)
 
 
-def draw_view(view: ViewState, area: Area, foot: float, ui: UiContext, actions: list[str]) -> ViewState:
+def draw_view(view: ViewState, area: Area, foot: float, ui: UiContext, actions: list[Action]) -> ViewState:
     """Draw the buttons under the axes: frame, home, and the view settings. `foot`: lower edge of the
     options bar"""
     top = max(overlay.axes_height(view, area, ui), EDGE_PX * ui.scale)
@@ -454,7 +460,7 @@ def draw_view(view: ViewState, area: Area, foot: float, ui: UiContext, actions: 
     return view
 
 
-def _view_rows(view: ViewState, ui: UiContext, actions: list[str]) -> ViewState:
+def _view_rows(view: ViewState, ui: UiContext, actions: list[Action]) -> ViewState:
     column = COLUMN_PX * ui.scale
     wide = 232.0 * ui.scale
     camera = view.camera
@@ -475,5 +481,5 @@ def _view_rows(view: ViewState, ui: UiContext, actions: list[str]) -> ViewState:
     background = (red, green, blue) if changed else view.background
     for action, on in (("grid", view.grid), ("axes", view.axes)):
         if menu_item(action, on):
-            actions.append(action)
+            actions.append(Plain(action))
     return replace(view, camera=camera, background=background)

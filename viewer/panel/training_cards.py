@@ -9,13 +9,14 @@ from imgui_bundle import imgui, imgui_ctx
 from progdf.terminal import format_duration
 from viewer.jobs.job_queue import Delivery, QueuedTask
 from viewer.jobs.training import EditOrder
+from viewer.state.commands import Action, OnItem
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, Rgba, UiContext, u32
 from viewer.ui.widgets import card, elide, menu_items, right_edge, small, tip, wrapped_text
 
 BAR_PX = 5.0
 STRIP_PX = 28.0
 _MENU = "menu of a training"
-_ITEMS = (("Show log…", "run_log", ""), ("Discard…", "ask_discard", ""))
+_DISCARD = "Discard…"
 _NOTHING_WRITTEN = "Nothing is written"
 
 
@@ -30,7 +31,7 @@ def height(jobs: Sequence[QueuedTask], ui: UiContext) -> float:
     return (STRIP_PX + 1.0) * ui.scale + imgui.get_style().item_spacing.y * (1 + bool(cards)) + cards
 
 
-def draw(jobs: Sequence[QueuedTask], ui: UiContext, actions: list[str]) -> None:
+def draw(jobs: Sequence[QueuedTask], ui: UiContext, actions: list[Action]) -> None:
     """Draw the strip and its unfolded cards; a new failure unfolds it."""
     listed = _visible_jobs(jobs)
     storage = imgui.get_state_storage()
@@ -107,7 +108,7 @@ def _strip(jobs: Sequence[QueuedTask], is_open: bool, ui: UiContext) -> bool:
     return bool(pressed)
 
 
-def _card(job: QueuedTask, ui: UiContext) -> list[str]:
+def _card(job: QueuedTask, ui: UiContext) -> list[Action]:
     """Draw name, status, progress and buttons of a job, and its menu; return the requested actions."""
     task = job.task
     failed = _is_failed(job)
@@ -129,8 +130,14 @@ def _card(job: QueuedTask, ui: UiContext) -> list[str]:
         if _MENU in actions or (menu and right_click):
             actions = []
             imgui.open_popup(_MENU)
-        actions += menu_items(_MENU, _ITEMS, ui, () if job.status in ("stopped", "failed") else _ITEMS[1])
-        return [f"{action}:{job.number}" for action in actions]
+        requested: list[Action] = [OnItem(name, job.number) for name in actions]
+        items = (
+            ("Show log…", OnItem("run_log", job.number), ""),
+            (_DISCARD, OnItem("ask_discard", job.number), ""),
+        )
+        off = () if job.status in ("stopped", "failed") else (_DISCARD,)
+        chosen = menu_items(_MENU, items, ui, off)
+        return [*requested, *(action for action in chosen if action is not None)]
 
 
 def _status(job: QueuedTask) -> str:

@@ -1,6 +1,6 @@
-"""Actions on the workspace as pure functions. Keys, panel buttons and tests all call `perform`.
+"""Commands on the workspace as pure functions. Keys, panel buttons and tests all call `perform`.
 
-Actions that only the window can perform (write a file, go full screen) are appended to `Workspace.requests`.
+Commands that only the window can perform (write a file, go full screen) are appended to `Workspace.requests`.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from viewer.camera.views import look_at_view
 from viewer.jobs.training import ALL, CHANGED, SELECTION, TYPED, with_settings
 
 from . import history, layer_selection, paint, selection, snapshots, timeline
+from .commands import Action, ChooseSnapshot, MoveSnapshot, OnItem, Plain, Rename, WithValue, argument
 from .history import History
 from .layers import (
     SLIDERS,
@@ -79,17 +80,17 @@ FEATHER = 0.1
 """Width of feathered paint edges, as a share of the radius of the layer's region."""
 
 
-def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float = 1.0) -> Workspace:
-    """Return the workspace after an action of `keys.COMMANDS`. Unknown actions become requests to the window.
+def perform(workspace: Workspace, action: Action, facts: SceneFacts, aspect: float = 1.0) -> Workspace:
+    """Return the workspace after a command. Unknown commands become requests to the window.
 
     Args:
-        action: name of the action, followed by a colon and its argument if it takes one
+        action: the command
         facts: facts about the open scene
         aspect: width / height of the picture
     """
-    name, _, argument = action.partition(":")
-    if name == "invert":
-        name = "paint_invert" if workspace.view.brush.active else "select_invert"
+    if action == Plain("invert"):
+        action = Plain("paint_invert" if workspace.view.brush.active else "select_invert")
+    name = action.name
     if name in ("focus", "press_layer", "unfocus"):  # focusing a layer deselects the keys
         workspace = replace(workspace, player=replace(workspace.player, chosen=frozenset()))
     if name in ("frame", "home"):
@@ -98,15 +99,17 @@ def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float 
         return _repaint(workspace, name, facts)
     if name in selection.CHANGES:
         state = workspace.view.selection
-        changed = selection.change(state, name, argument, facts.count, facts.neighborhood)
+        changed = selection.change(state, action, facts.count, facts.neighborhood)
         return replace(workspace, view=replace(workspace.view, selection=changed))
-    if name == "next_slider":
-        return _select_slider(workspace, int(argument), facts)
     if name in OF_EDITS:
-        at = int(argument) if argument else workspace.focus
+        at = action.index if isinstance(action, OnItem) else workspace.focus
         return workspace if at is None else OF_EDITS[name](workspace, at, facts)
+    if isinstance(action, WithValue) and name == "next_slider":
+        return _select_slider(workspace, int(action.value), facts)
+    if name in timeline.ACTIONS:
+        return _perform_on_timeline(workspace, action)
     if name in ACTIONS:
-        return ACTIONS[name](workspace, argument)
+        return ACTIONS[name](workspace, argument(action))
     return replace(workspace, requests=(*workspace.requests, action))
 
 
@@ -178,13 +181,13 @@ def _view_from(workspace: Workspace, name: str) -> Workspace:
     return with_camera(workspace, look_at_view(workspace.view.camera, name))
 
 
-def _focus(workspace: Workspace, number: str) -> Workspace:
+def _focus(workspace: Workspace, number: int) -> Workspace:
     """Focus a layer by its number, counted from 1 at the top of the panel's list."""
-    return focus_layer(workspace, index_of(workspace.view, int(number) - 1))
+    return focus_layer(workspace, index_of(workspace.view, number - 1))
 
 
-def _toggle(workspace: Workspace, number: str) -> Workspace:
-    index = index_of(workspace.view, int(number) - 1)
+def _toggle(workspace: Workspace, number: int) -> Workspace:
+    index = index_of(workspace.view, number - 1)
     view = change_layer(workspace.view, index, lambda layer: replace(layer, enabled=not layer.enabled))
     return replace(workspace, view=view)
 
@@ -203,9 +206,9 @@ def _select_slider(workspace: Workspace, by: int, facts: SceneFacts) -> Workspac
     return replace(workspace, active_slider=slider, view=view)
 
 
-def _rename(workspace: Workspace, index: str) -> Workspace:
+def _rename(workspace: Workspace, index: int | None) -> Workspace:
     """Edit the name of a layer in a text field (default: the focused layer)."""
-    return replace(workspace, renaming=int(index) if index else workspace.focus)
+    return replace(workspace, renaming=workspace.focus if index is None else index)
 
 
 def _change_brush(workspace: Workspace, **changes: Any) -> Workspace:
@@ -253,30 +256,30 @@ def _navigate(workspace: Workspace, mode: str) -> Workspace:
     return with_camera(replace(workspace, view=replace(workspace.view, select=select)), camera)
 
 
-def _zoom(workspace: Workspace, times: str) -> Workspace:
+def _zoom(workspace: Workspace, times: float) -> Workspace:
     """Multiply the zoom of the interface by `times`; 0 resets it to 1."""
-    zoom = min(max(round(workspace.layout.zoom * float(times), 3), MIN_ZOOM), MAX_ZOOM)
-    return replace(workspace, layout=replace(workspace.layout, zoom=zoom if float(times) else 1.0))
+    zoom = min(max(round(workspace.layout.zoom * times, 3), MIN_ZOOM), MAX_ZOOM)
+    return replace(workspace, layout=replace(workspace.layout, zoom=zoom if times else 1.0))
 
 
-def _toggle_brush(workspace: Workspace, _: str) -> Workspace:
+def _toggle_brush(workspace: Workspace, _: None) -> Workspace:
     view = replace(workspace.view, select=replace(workspace.view.select, tool=""))
     return _change_brush(replace(workspace, view=view), active=not view.brush.active)
 
 
-def _resize(workspace: Workspace, times: str) -> Workspace:
+def _resize(workspace: Workspace, times: float) -> Workspace:
     """Scale the radius of the brush or of the active selection tool, or the tool's color tolerance."""
     view = workspace.view
     if not view.select.tool:
-        return _change_brush(workspace, radius=paint.radius(view.brush.radius * float(times)))
+        return _change_brush(workspace, radius=paint.radius(view.brush.radius * times))
     if view.select.tool in ("flood", "color"):
-        tolerance = min(1.0, max(0.01, round(view.select.tolerance * float(times), 3)))
+        tolerance = min(1.0, max(0.01, round(view.select.tolerance * times, 3)))
         return replace(workspace, view=replace(view, select=replace(view.select, tolerance=tolerance)))
-    radius = paint.radius(view.select.radius * float(times))
+    radius = paint.radius(view.select.radius * times)
     return replace(workspace, view=replace(view, select=replace(view.select, radius=radius)))
 
 
-def _close_or_unfocus(workspace: Workspace, _: str) -> Workspace:
+def _close_or_unfocus(workspace: Workspace, _: None) -> Workspace:
     """Close or deactivate the first active item: key list, brush, tool, form, multi-selection, focus."""
     if workspace.help:
         return replace(workspace, help=False)
@@ -292,20 +295,19 @@ def _close_or_unfocus(workspace: Workspace, _: str) -> Workspace:
     return replace(workspace, focus=None)
 
 
-def _show_all(workspace: Workspace, _: str) -> Workspace:
+def _show_all(workspace: Workspace, _: None) -> Workspace:
     view = show_all(workspace.view)
     return replace(workspace, view=replace(view, selection=selection.show_all(view.selection)))
 
 
-def _rename_group(workspace: Workspace, argument: str) -> Workspace:
-    """Rename a group (`INDEX:NAME`, where INDEX is an index into `view.groups`)."""
-    index, _, name = argument.partition(":")
-    old = workspace.view.groups[int(index)].name
+def _rename_group(workspace: Workspace, action: Rename) -> Workspace:
     view = workspace.view
-    return replace(workspace, view=change_group(view, old, lambda group: replace(group, name=name)))
+    old = view.groups[action.index].name
+    renamed = change_group(view, old, lambda group: replace(group, name=action.text))
+    return replace(workspace, view=renamed)
 
 
-def _toggle_cards(workspace: Workspace, _: str) -> Workspace:
+def _toggle_cards(workspace: Workspace, _: None) -> Workspace:
     """Toggle compact layer rows. The mode becomes "auto" if that gives the requested result."""
     compact = not is_compact(workspace)
     cards = "compact" if compact else "full"
@@ -328,40 +330,32 @@ def _go_to_entry(workspace: Workspace, past: History) -> Workspace:
     return with_layers_of(workspace, history.apply_present(workspace.view, past))
 
 
-def _timeline_action(name: str) -> Callable[[Workspace, str], Workspace]:
-    """Return an action that applies a timeline action to the workspace."""
-
-    def act(workspace: Workspace, argument: str) -> Workspace:
-        view, player = timeline.perform(workspace.view, workspace.player, f"{name}:{argument}")
-        past = history.follow_look(workspace.past, workspace.view, view)
-        if loses_strengths(workspace, view):  # a separate entry, or part of the edit of the keys
-            past = (
-                past
-                if name in ("move_keys", "clone_keys")
-                else history.record(past, view, workspace.snapshots)
-            )
-        elif past.present.edit.layers == workspace.view.layers:
-            past = history.follow_playhead(past, workspace.view, view)
-        return replace(workspace, view=view, player=player, past=past)
-
-    return act
+def _perform_on_timeline(workspace: Workspace, action: Action) -> Workspace:
+    view, player = timeline.perform(workspace.view, workspace.player, action)
+    past = history.follow_look(workspace.past, workspace.view, view)
+    if loses_strengths(workspace, view):  # a separate entry, or part of the edit of the keys
+        if action.name not in ("move_keys", "clone_keys"):
+            past = history.record(past, view, workspace.snapshots)
+    elif past.present.edit.layers == workspace.view.layers:
+        past = history.follow_playhead(past, workspace.view, view)
+    return replace(workspace, view=view, player=player, past=past)
 
 
-def _restore(workspace: Workspace, index: str) -> Workspace:
+def _restore(workspace: Workspace, index: int) -> Workspace:
     """Restore a snapshot by its index in the panel. Index 0 is the original."""
     listed = snapshots.with_original(workspace.snapshots, workspace.view)
-    if not 0 <= int(index) < len(listed):
+    if not 0 <= index < len(listed):
         return workspace
-    return with_layers_of(workspace, snapshots.restore(workspace.view, listed[int(index)]))
+    return with_layers_of(workspace, snapshots.restore(workspace.view, listed[index]))
 
 
-def _name_snapshot(workspace: Workspace, argument: str) -> Workspace:
-    """Rename a snapshot (`INDEX:NAME`), also in the compared pair."""
-    index, _, name = argument.partition(":")
+def _name_snapshot(workspace: Workspace, action: Rename) -> Workspace:
+    """Rename a snapshot, also in the compared pair."""
+    index = action.index - 1
     old = workspace.snapshots
-    new = snapshots.rename(workspace.snapshots, int(index) - 1, name)
-    old_name = old[int(index) - 1].name
-    new_name = new[int(index) - 1].name
+    new = snapshots.rename(workspace.snapshots, index, action.text)
+    old_name = old[index].name
+    new_name = new[index].name
     pair = workspace.view.pair
     pair = replace(
         pair, a=new_name if pair.a == old_name else pair.a, b=new_name if pair.b == old_name else pair.b
@@ -369,19 +363,17 @@ def _name_snapshot(workspace: Workspace, argument: str) -> Workspace:
     return replace(workspace, snapshots=new, view=replace(workspace.view, pair=pair))
 
 
-def _move_snapshot(workspace: Workspace, argument: str) -> Workspace:
-    """Move a snapshot (`INDEX:TO`)."""
-    index, to = (int(number) - 1 for number in argument.split(":"))
-    return replace(workspace, snapshots=snapshots.move(workspace.snapshots, index, to))
+def _move_snapshot(workspace: Workspace, action: MoveSnapshot) -> Workspace:
+    moved = snapshots.move(workspace.snapshots, action.index - 1, action.to - 1)
+    return replace(workspace, snapshots=moved)
 
 
-def _choose_snapshot(workspace: Workspace, argument: str) -> Workspace:
-    """Put a snapshot into the compared pair (`SLOT:NAME`, where SLOT is a or b)."""
-    slot, _, name = argument.partition(":")
-    return replace(workspace, view=snapshots.choose(workspace.view, slot, name))
+def _choose_snapshot(workspace: Workspace, action: ChooseSnapshot) -> Workspace:
+    """Put a snapshot into the compared pair."""
+    return replace(workspace, view=snapshots.choose(workspace.view, action.slot, action.snapshot))
 
 
-def _move_keyboard_focus(workspace: Workspace, by: str) -> Workspace:
+def _move_keyboard_focus(workspace: Workspace, by: float) -> Workspace:
     """Move the keyboard focus to the next or previous part of the window.
 
     The picture follows the last part.
@@ -391,7 +383,7 @@ def _move_keyboard_focus(workspace: Workspace, by: str) -> Workspace:
     return replace(workspace, keyboard=places[at], keyboard_by=int(by))
 
 
-def _new_edit(workspace: Workspace, _: str) -> Workspace:
+def _new_edit(workspace: Workspace, _: None) -> Workspace:
     """Open or close the form of a new edit. Its region defaults to the selection if there is one."""
     form = workspace.form
     selection = workspace.view.selection
@@ -405,13 +397,13 @@ def _new_edit(workspace: Workspace, _: str) -> Workspace:
 
 
 GLIDES = ("frame", "home", "look")
-"""Actions that move the camera, which the window animates as a glide."""
-ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
+"""Names of the commands that move the camera, which the window animates as a glide."""
+ACTIONS: dict[str, Callable[[Workspace, Any], Workspace]] = {
     "focus": _focus,
     "unfocus": _close_or_unfocus,
     "toggle": _toggle,
     "hide": lambda workspace, _: layer_selection.switch_selected(workspace, "enabled"),
-    "nudge": lambda workspace, by: layer_selection.nudge(workspace, float(by)),
+    "nudge": lambda workspace, by: layer_selection.nudge(workspace, by),
     "move": lambda workspace, by: layer_selection.move(workspace, int(by)),
     "solo": lambda workspace, _: layer_selection.switch_selected(workspace, "solo"),
     "show_all": _show_all,
@@ -421,7 +413,7 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "remove": layer_selection.remove,
     "press_layer": layer_selection.press,
     "select_layers": layer_selection.select_layers,
-    "master": lambda workspace, strength: layer_selection.set_master(workspace, float(strength)),
+    "master": lambda workspace, strength: layer_selection.set_master(workspace, strength),
     "reset": lambda workspace, _: layer_selection.reset(workspace, everything=False),
     "reset_all": lambda workspace, _: layer_selection.reset(workspace, everything=True),
     "group": layer_selection.group,
@@ -439,19 +431,17 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "brush_weights": lambda w, _: _change_brush(w, weights=not w.view.brush.weights),
     "brush_through": lambda w, _: _change_brush(w, through=not w.view.brush.through),
     "brush_radius": _resize,
-    "brush_softness": lambda w, by: _change_brush(
-        w, softness=paint.softness(w.view.brush.softness + float(by))
-    ),
+    "brush_softness": lambda w, by: _change_brush(w, softness=paint.softness(w.view.brush.softness + by)),
     "overshoot": lambda w, _: replace(w, view=with_overshoot(w.view, not w.view.overshoot)),
     "snapshot": lambda w, _: replace(w, snapshots=snapshots.take(w.snapshots, w.view)),
     "restore": _restore,
-    "forget": lambda w, at: replace(w, snapshots=snapshots.remove(w.snapshots, int(at) - 1)),
+    "forget": lambda w, at: replace(w, snapshots=snapshots.remove(w.snapshots, at - 1)),
     "name_snapshot": _name_snapshot,
     "move_snapshot": _move_snapshot,
     "choose_snapshot": _choose_snapshot,
     "undo": lambda w, _: _go_to_entry(w, history.undo(w.past)),
     "redo": lambda w, _: _go_to_entry(w, history.redo(w.past)),
-    "go_to": lambda w, index: _go_to_entry(w, history.go_to(w.past, int(index))),
+    "go_to": lambda w, index: _go_to_entry(w, history.go_to(w.past, index)),
     "next_place": _move_keyboard_focus,
     "history": lambda w, _: replace(w, history=True),
     "navigate": _navigate,
@@ -474,5 +464,5 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "dynamic_resolution": lambda w, _: _next_value(w, "dynamic_resolution", RESOLUTION_MODES),
     "new_edit": _new_edit,
     "panel": lambda w, _: replace(w, view=replace(w.view, panel=not w.view.panel)),
-    **{name: _timeline_action(name) for name in timeline.ACTIONS},
 }
+"""Function of each other command; it receives the command's `argument`."""

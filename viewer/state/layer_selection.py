@@ -11,6 +11,7 @@ from typing import Any
 
 from progdf.compose.layers import Gains
 
+from .commands import PressLayer
 from .layers import (
     dissolve_groups,
     group_layers,
@@ -41,23 +42,17 @@ def selected_layers(workspace: Workspace) -> tuple[int, ...]:
     return tuple(i for i, layer in enumerate(layers) if i == focus or layer.gdf in workspace.selected)
 
 
-def press(workspace: Workspace, argument: str) -> Workspace:
-    """Update the focus and the selection after a press on the card of a layer.
-
-    Args:
-        argument: `HOW:INDEX:LISTED`, where HOW is one of `PRESSES`; LISTED are the comma-separated indices of
-            the layers that the panel lists, so that a range covers listed layers only
-    """
-    how, at, listed = argument.split(":")
-    index = int(at)
-    listed_indices = [int(i) for i in listed.split(",") if i]
+def press(workspace: Workspace, action: PressLayer) -> Workspace:
+    """Update the focus and the selection after a press on the card of a layer."""
+    how = action.how
+    index = action.index
     layers = workspace.view.layers
     focus = workspace.focus
     chosen = selected_layers(workspace)
     if how == "range" and focus is not None:
         low, high = sorted((focus, index))
         return replace(
-            workspace, selected=frozenset(layers[i].gdf for i in listed_indices if low <= i <= high)
+            workspace, selected=frozenset(layers[i].gdf for i in action.listed if low <= i <= high)
         )
     if how == "toggle" and index in chosen:
         remaining = [i for i in chosen if i != index]
@@ -72,7 +67,7 @@ def press(workspace: Workspace, argument: str) -> Workspace:
     return replace(workspace, focus=index, selected=frozenset())
 
 
-def select_layers(workspace: Workspace, group: str = "") -> Workspace:
+def select_layers(workspace: Workspace, group: str | None = None) -> Workspace:
     """Select all layers of a group, or all layers. If the focus is not among them, focus the topmost one."""
     layers = workspace.view.layers
     chosen = [i for i, layer in enumerate(layers) if not group or layer.group == group]
@@ -160,10 +155,10 @@ def move(workspace: Workspace, by: int) -> Workspace:
     return _with_focus(workspace, step_layers(workspace.view, chosen, -by)) if chosen else workspace
 
 
-def remove(workspace: Workspace, index: str) -> Workspace:
+def remove(workspace: Workspace, index: int | None) -> Workspace:
     """Remove a layer, or all selected layers if it is selected, and focus the layer below."""
     chosen = selected_layers(workspace)
-    at = int(index) if index else workspace.focus
+    at = workspace.focus if index is None else index
     if at is None or not 0 <= at < len(workspace.view.layers):
         return workspace
     view = workspace.view
@@ -174,7 +169,7 @@ def remove(workspace: Workspace, index: str) -> Workspace:
     return replace(workspace, view=view, focus=focus, selected=frozenset(), renaming=None)
 
 
-def group(workspace: Workspace, name: str) -> Workspace:
+def group(workspace: Workspace, name: str | None) -> Workspace:
     """Group the selected layers, or move them to the bottom of the group of this name."""
     view = workspace.view
     chosen = selected_layers(workspace)
@@ -182,7 +177,7 @@ def group(workspace: Workspace, name: str) -> Workspace:
     return _with_focus(workspace, grouped)
 
 
-def ungroup(workspace: Workspace, name: str) -> Workspace:
+def ungroup(workspace: Workspace, name: str | None) -> Workspace:
     """Dissolve a group, or the groups of the selected layers."""
     view = workspace.view
     names = {name} if name else {view.layers[i].group for i in selected_layers(workspace)}

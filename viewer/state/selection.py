@@ -22,6 +22,8 @@ from progdf.io.atomic import is_portable, numbered_names
 from progdf.scene.neighbors import Neighborhood
 from progdf.scene.selection import Mask, combine
 
+from .commands import Action, OnItem, SelectRegion
+
 SUFFIX = ".region.npy"
 """File name suffix of a region, after its name."""
 LONGEST_NAME = 60  # characters in the name of a region
@@ -130,35 +132,38 @@ def show_all(state: SelectionState) -> SelectionState:
 
 
 def change(
-    state: SelectionState, name: str, argument: str, total: int, neighborhood: Callable[[], Neighborhood]
+    state: SelectionState, action: Action, total: int, neighborhood: Callable[[], Neighborhood]
 ) -> SelectionState:
     """Apply one of `CHANGES`.
 
     Args:
         state: the current state
-        name: name of the change
-        argument: for a region its index, and optionally a colon and a mode of `combine`
+        action: the command; its name is one of `CHANGES`
         total: number of Gaussians in the scene
         neighborhood: returns the neighborhood of the scene, computed on first use
     """
     mask = unpack(state.members, total)
-    if name in _CHANGES:
-        return _CHANGES[name](state, mask)
-    if name in _REGION_CHANGES:
-        return _change_region(state, name, argument, mask)
-    return select(state, CHANGES_BY_NEIGHBORS[name](neighborhood(), mask)) if state.count else state
+    match action:
+        case SelectRegion(index, mode):
+            region = _region(state, index)
+            if region is None:
+                return state
+            return select(state, combine(mask, unpack(region.members, total), mode))
+        case OnItem("show_region", index):
+            region = _region(state, index)
+            if region is None:
+                return state
+            return change_region(state, index, replace(region, visible=not region.visible))
+        case OnItem("forget_region", index):
+            return change_region(state, index, None)
+    if action.name in _CHANGES:
+        return _CHANGES[action.name](state, mask)
+    change_mask = CHANGES_BY_NEIGHBORS[action.name]
+    return select(state, change_mask(neighborhood(), mask)) if state.count else state
 
 
-def _change_region(state: SelectionState, name: str, argument: str, mask: Mask) -> SelectionState:
-    """Select, tint, untint or remove a region. Its file is kept. An invalid index changes nothing."""
-    index, _, mode = argument.partition(":")
-    if not 0 <= int(index) < len(state.regions):
-        return state
-    region = state.regions[int(index)]
-    if name == "region":
-        return select(state, combine(mask, unpack(region.members, len(mask)), mode or "new"))
-    toggled = replace(region, visible=not region.visible)
-    return change_region(state, int(index), toggled if name == "show_region" else None)
+def _region(state: SelectionState, index: int) -> NamedRegion | None:
+    return state.regions[index] if 0 <= index < len(state.regions) else None
 
 
 CHANGES_BY_NEIGHBORS: dict[str, Callable[[Neighborhood, Mask], Mask]] = {
@@ -178,10 +183,7 @@ _CHANGES: dict[str, Callable[[SelectionState, Mask], SelectionState]] = {
 }
 _REGION_CHANGES = ("region", "show_region", "forget_region")
 CHANGES = (*_CHANGES, *_REGION_CHANGES, *CHANGES_BY_NEIGHBORS)
-"""Actions on the selection.
-
-Those on regions are `region:INDEX[:MODE]`, `show_region:INDEX` and `forget_region:INDEX`.
-"""
+"""Names of the commands on the selection. The file of a removed region is kept."""
 
 
 def free_name(state: SelectionState, text: str, is_taken: Callable[[str], bool] = lambda name: False) -> str:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from viewer.camera import views
 from viewer.camera.view_camera import ViewCamera
 
+from .commands import Action, ChooseKeys, argument
 from .view_state import MAX_FPS, MAX_FRAME, Keyframe, LayerState, Timeline, ViewState, following
 
 EASINGS = views.EASINGS
@@ -248,19 +250,18 @@ def next_frame_delay(player: Player, timeline: Timeline) -> float | None:
     return (1.0 - player.part) / timeline.fps if player.playing else None
 
 
-def perform(view: ViewState, player: Player, action: str) -> tuple[ViewState, Player]:
+def perform(view: ViewState, player: Player, action: Action) -> tuple[ViewState, Player]:
     """Apply an action. If the playhead moves, the view takes the values of its new frame.
 
     Args:
         view: the state
         player: the playhead
-        action: a name of `ACTIONS`, followed by a colon and its argument if it takes one
+        action: a command; its name is one of `ACTIONS`
 
     Raises:
         KeyError: the action is unknown.
     """
-    name, _, argument = action.partition(":")
-    timeline, after = ACTIONS[name](view, player, argument)
+    timeline, after = ACTIONS[action.name](view, player, argument(action))
     after = replace(after, frame=max(0, min(after.frame, timeline.length)))
     view = replace(view, timeline=timeline)
     if after.frame != player.frame:
@@ -276,16 +277,16 @@ def _step_frames(timeline: Timeline, frame: int, backwards: bool, steps: int) ->
     return (step, False) if step < last else (2 * last - step, True)
 
 
-def _key(view: ViewState, player: Player, row: str) -> tuple[Timeline, Player]:
+def _key(view: ViewState, player: Player, row: int | None) -> tuple[Timeline, Player]:
     """Set a key at the playhead for the named row, or for all rows."""
-    rows = [int(row)] if row else None
+    rows = None if row is None else [row]
     return with_key(view.timeline, player.frame, view, rows), replace(player, shown=True)
 
 
-def _drop_key(view: ViewState, player: Player, row: str) -> tuple[Timeline, Player]:
+def _drop_key(view: ViewState, player: Player, row: int | None) -> tuple[Timeline, Player]:
     """Delete the chosen keys, else the keys at the playhead. With a row, delete its key at the playhead."""
-    here = [key for key in keys_at(view.timeline, player.frame) if row in ("", str(key[0]))]
-    chosen = () if row else chosen_keys(view.timeline, player)
+    here = [key for key in keys_at(view.timeline, player.frame) if row in (None, key[0])]
+    chosen = chosen_keys(view.timeline, player) if row is None else ()
     return without_keys(view.timeline, chosen or here), replace(player, chosen=frozenset())
 
 
@@ -294,16 +295,14 @@ def chosen_keys(timeline: Timeline, player: Player) -> frozenset[RowKey]:
     return player.chosen & split_keys(timeline).keys()
 
 
-def _choose_keys(view: ViewState, player: Player, names: str) -> tuple[Timeline, Player]:
-    """Select keys (`ROW@FRAME,ROW@FRAME`, "" for none). A leading plus sign toggles them."""
-    pairs = [name.split("@") for name in names.removeprefix("+").split(",") if name]
-    keys = frozenset((int(row), int(frame)) for row, frame in pairs)
-    if names.startswith("+"):
+def _choose_keys(view: ViewState, player: Player, action: ChooseKeys) -> tuple[Timeline, Player]:
+    keys = action.keys
+    if action.toggles:
         keys = player.chosen - keys if keys <= player.chosen else player.chosen | keys
     return view.timeline, replace(player, chosen=keys)
 
 
-def _move_keys(view: ViewState, player: Player, by: str, copy: bool = False) -> tuple[Timeline, Player]:
+def _move_keys(view: ViewState, player: Player, by: float, copy: bool = False) -> tuple[Timeline, Player]:
     """Move or copy the chosen keys. The playhead follows a chosen key at its frame."""
     chosen = chosen_keys(view.timeline, player)
     step = int(by)
@@ -315,13 +314,13 @@ def _move_keys(view: ViewState, player: Player, by: str, copy: bool = False) -> 
     return moved, replace(player, chosen=frozenset((row, frame + step) for row, frame in chosen))
 
 
-def _copy_keys(view: ViewState, player: Player, _: str) -> tuple[Timeline, Player]:
+def _copy_keys(view: ViewState, player: Player, _: None) -> tuple[Timeline, Player]:
     chosen = chosen_keys(view.timeline, player)
     keys = ((row, key) for (row, frame), key in split_keys(view.timeline).items() if (row, frame) in chosen)
     return view.timeline, replace(player, copied=tuple(keys))
 
 
-def _paste_keys(view: ViewState, player: Player, _: str) -> tuple[Timeline, Player]:
+def _paste_keys(view: ViewState, player: Player, _: None) -> tuple[Timeline, Player]:
     """Paste the copied keys, the first at the playhead, over existing ones. The timeline grows if needed."""
     by = player.frame - min((key.frame for _, key in player.copied), default=0)
     pasted = {(row, key.frame + by): replace(key, frame=key.frame + by) for row, key in player.copied}
@@ -330,21 +329,21 @@ def _paste_keys(view: ViewState, player: Player, _: str) -> tuple[Timeline, Play
     return joined, replace(player, chosen=frozenset(pasted))
 
 
-def _play(view: ViewState, player: Player, _: str) -> tuple[Timeline, Player]:
+def _play(view: ViewState, player: Player, _: None) -> tuple[Timeline, Player]:
     """Play or pause. With fewer than two keys nothing can move, so only the bar appears."""
     playing = not player.playing and len(view.timeline.keys) > 1
     return view.timeline, replace(player, playing=playing, part=0.0, shown=True)
 
 
-def _seek(view: ViewState, player: Player, frame: str) -> tuple[Timeline, Player]:
+def _seek(view: ViewState, player: Player, frame: float) -> tuple[Timeline, Player]:
     return view.timeline, _seek_to(player, int(frame))
 
 
-def _step(view: ViewState, player: Player, by: str) -> tuple[Timeline, Player]:
+def _step(view: ViewState, player: Player, by: float) -> tuple[Timeline, Player]:
     return view.timeline, replace(_seek_to(player, player.frame + int(by)), shown=True)
 
 
-def _jump(view: ViewState, player: Player, way: str) -> tuple[Timeline, Player]:
+def _jump(view: ViewState, player: Player, way: float) -> tuple[Timeline, Player]:
     return view.timeline, _seek_to(player, neighbor(view.timeline, player.frame, int(way)))
 
 
@@ -352,7 +351,7 @@ def _seek_to(player: Player, frame: int) -> Player:
     return replace(player, frame=frame, playing=False, backwards=False, part=0.0)
 
 
-def _easing(view: ViewState, player: Player, name: str) -> tuple[Timeline, Player]:
+def _easing(view: ViewState, player: Player, name: str | None) -> tuple[Timeline, Player]:
     """Set an easing (default: the next one) on the chosen keys, else on those that apply at the playhead."""
     if not view.timeline.keys:
         return view.timeline, player
@@ -363,21 +362,21 @@ def _easing(view: ViewState, player: Player, name: str) -> tuple[Timeline, Playe
     return set_easing(view.timeline, chosen or keys_at(view.timeline, deciding.frame), name), player
 
 
-def _auto_key(view: ViewState, player: Player, _: str) -> tuple[Timeline, Player]:
+def _auto_key(view: ViewState, player: Player, _: None) -> tuple[Timeline, Player]:
     return view.timeline, replace(player, auto_key=None if player.auto_key else view.camera, shown=True)
 
 
-def _ping_pong(view: ViewState, player: Player, _: str) -> tuple[Timeline, Player]:
+def _ping_pong(view: ViewState, player: Player, _: None) -> tuple[Timeline, Player]:
     toggled = replace(view.timeline, ping_pong=not view.timeline.ping_pong)
     return toggled, replace(player, backwards=False)
 
 
-def _toggle_bar(view: ViewState, player: Player, _: str) -> tuple[Timeline, Player]:
+def _toggle_bar(view: ViewState, player: Player, _: None) -> tuple[Timeline, Player]:
     """Show or hide the timeline bar and stop playback."""
     return view.timeline, replace(player, shown=not player.shown, playing=False)
 
 
-ACTIONS: dict[str, Callable[[ViewState, Player, str], tuple[Timeline, Player]]] = {
+ACTIONS: dict[str, Callable[[ViewState, Player, Any], tuple[Timeline, Player]]] = {
     "key": _key,
     "drop_key": _drop_key,
     "choose_keys": _choose_keys,

@@ -23,6 +23,7 @@ from viewer.jobs.job_queue import DeliverOptions, QueuedTask
 from viewer.jobs.training import NewEdit
 
 from . import history, timeline
+from .commands import Action
 from .facts import LayerRow
 from .history import Edit, History
 from .selection import SelectionState
@@ -86,7 +87,7 @@ class Message:
     until: float
     error: bool = False
     details: str = ""  # details of an internal error, to be copied into a report
-    button: tuple[str, str] = ("", "")  # label and action of its button
+    button: tuple[str, Action] | None = None  # label and command of its button
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,9 @@ class Dialog:
 
     kind: str  # key of `dialogs.TITLES`
     text: str = ""  # content of the path field; in a dialog without one, the file concerned
-    then: str = ""  # request to continue with afterwards, "" for none; for "replace" the layer's index
+    then: Action | None = None  # command to continue with afterwards
+    item: int | None = None  # the layer or job concerned
+    file: str = ""  # the edit to rebind
     notice: str = ""  # one line about the desktop's file dialog, "" for none
     choosing: bool = False  # whether the desktop's file dialog is open
     chosen: str = ""  # file chosen in it
@@ -147,7 +150,7 @@ class Workspace:
     # last saved state, see `saved_state`; None before the first
     saved: tuple[Edit, tuple[SliderSnapshot, ...]] | None = None
     dialog: Dialog | None = None  # the open dialog
-    requests: tuple[str, ...] = ()  # pending work that only the window can do
+    requests: tuple[Action, ...] = ()  # pending work that only the window can do
     player: Player = Player()  # the playhead of `view.timeline`
     pointed: Pointed | None = None  # panel item under the mouse, highlighted in the picture
     form: NewEdit = NewEdit()  # form of a new edit, as last left
@@ -197,7 +200,7 @@ def with_message(
     error: bool = False,
     details: str = "",
     seconds: float = MESSAGE_S,
-    button: tuple[str, str] = ("", ""),
+    button: tuple[str, Action] | None = None,
 ) -> Workspace:
     """Show a one-line message at the bottom of the picture.
 
@@ -208,11 +211,11 @@ def with_message(
         error: mark it as an error
         details: details to copy into a report
         seconds: time that it stays visible, unless it is an error or has details or a button
-        button: label and action of its button
+        button: label and command of its button
     """
     if details:
         seconds = DETAILS_S
-    elif error or button[0]:
+    elif error or button:
         seconds = ERROR_S
     text = escape_text(" ".join(text.split()))
     return replace(workspace, message=Message(text, now + seconds, error, details, button))

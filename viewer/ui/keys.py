@@ -15,13 +15,14 @@ from imgui_bundle import imgui
 
 from viewer.camera import controls
 from viewer.camera.view_camera import ViewCamera
+from viewer.state.commands import Action, parse_action
 
 
 @dataclass(frozen=True)
 class Command:
     """Action of `actions.perform` with the texts and keys that the user sees."""
 
-    action: str
+    id: str  # text form of the action, see `parse_action`; also its name in the keys file
     name: str  # used everywhere, also as the accessible name of its icon
     keys: str = ""  # chords separated by blanks: modifiers in the order Ctrl, Shift, Alt, then the key's name
     help: str = ""  # text of the tooltip below the name
@@ -30,6 +31,10 @@ class Command:
     row: str = ""  # text for several commands in the list of keys; `JOINED` for the rest of them
     listed: str = ""  # its keys there, if they are too many
     in_hand: bool = False  # for an active tool or decal, whose keys have priority
+
+    @property
+    def action(self) -> Action:
+        return parse_action(self.id)
 
 
 DRAGS = {
@@ -252,7 +257,7 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("quit", "Quit", "Ctrl+Q"),
     ),
 }
-COMMANDS = {command.action: command for commands in TOPICS.values() for command in commands}
+COMMANDS = {command.id: command for commands in TOPICS.values() for command in commands}
 KEYS: dict[str, Command] = {}
 """Command of each chord; filled by `bind`."""
 TOOL_KEYS: dict[str, Command] = {}
@@ -288,7 +293,7 @@ def bind(changes: Mapping[str, Any]) -> list[str]:
             command = COMMANDS[action]
             chosen = {(parse_chord(text), command.in_hand): command for text in texts}
             if twice := [key for key in chosen if key in given]:
-                raise ValueError(f"{twice[0][0]} is already assigned to {given[twice[0]].action}")
+                raise ValueError(f"{twice[0][0]} is already assigned to {given[twice[0]].id}")
             if flies := [chord for chord, _ in chosen if chord in FLY_KEYS]:
                 raise ValueError(f"{flies[0]} is a flight key")
             given.update(chosen)
@@ -335,9 +340,9 @@ def bound_chords(command: Command) -> list[str]:
 
 
 @cache  # tooltips and menus call this a hundred times per frame
-def chords(action: str) -> tuple[str, ...]:
-    """Return all chords of an action as shown to the user; none for an unknown action."""
-    bound = bound_chords(COMMANDS[action]) if action in COMMANDS else []
+def chords(command: str) -> tuple[str, ...]:
+    """Return all chords of an action in the user's words; none for an unknown action."""
+    bound = bound_chords(COMMANDS[command]) if command in COMMANDS else []
     return tuple(
         chord.replace("Delete", "Del").replace("Num", "Numpad ").replace("Escape", "Esc") for chord in bound
     )
@@ -382,10 +387,10 @@ def match(query: str, name: str, beside: str = "") -> int | None:
 def find_commands(query: str, offered: Collection[str]) -> list[Command]:
     """Return the commands among `offered` that match the query, the best first; all for ""."""
     ranks = [
-        (match(query, command.name, f"{command.help} {topic} {' '.join(chords(command.action))}"), command)
+        (match(query, command.name, f"{command.help} {topic} {' '.join(chords(command.id))}"), command)
         for topic, commands in TOPICS.items()
         for command in commands
-        if command.action in offered
+        if command.id in offered
     ]
     found = [(rank, bool(command.listed), command) for rank, command in ranks if rank is not None]
     return [command for *_, command in sorted(found, key=lambda answer: answer[:2])]
@@ -461,12 +466,12 @@ def next_event_id() -> int:
     return int(imgui.get_current_context().input_events_next_event_id)
 
 
-def requested_actions(keys: Keys) -> list[str]:
-    """Return the requested actions of `KEYS`; none while a text field is open."""
+def requested_commands(keys: Keys) -> list[Command]:
+    """Return the requested commands of `KEYS`; none while a text field is open."""
     if imgui.get_io().want_text_input:
         return []
     pressed = [(KEYS[press.chord], press.again) for press in keys.pressed if press.chord in KEYS]
-    return [key.action for key, again in pressed if key.repeats or not again]
+    return [key for key, again in pressed if key.repeats or not again]
 
 
 def is_repeating(keys: Keys) -> bool:

@@ -103,7 +103,7 @@ def message(line: Message, area: Area, ui: UiContext) -> tuple[str, float]:
         buttons = {}
         if line.details:
             buttons["Copy details"] = "copy"
-        elif line.button[0]:
+        elif line.button is not None:
             buttons[line.button[0]] = "do"
         buttons["×"] = "close"
         around = 2 * imgui.get_style().frame_padding.x + imgui.get_style().item_spacing.x

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import TypeVar
 
 from imgui_bundle import imgui, imgui_ctx
 
+from viewer.state.commands import Action
 from viewer.state.workspace import Layout
 
 from .context import BEHIND, FIXED, PALETTE, SMALL_PX, UNFOCUSED, Icon, Rgba, UiContext, u32
@@ -18,7 +19,7 @@ from .keys import COMMANDS, NUDGES, describe, shortcut
 
 T = TypeVar("T")
 
-MenuItems = Sequence[str | tuple[str, str, str]]
+MenuItems = Sequence[str | tuple[str, Action | None, str]]
 IconItems = Sequence[tuple[str, str] | tuple[str, str, str]]
 _GRIP_PX = 4.0  # a press that moves no further is a click, at 1×
 
@@ -178,68 +179,73 @@ def icon_button(
     return pressed
 
 
-def hint(action: str, more: str = "") -> None:
+def hint(command: str, more: str = "") -> None:
     """Show the tooltip of the last item's command, followed by `more`."""
-    tip(describe(action, more))
+    tip(describe(command, more))
 
 
 def icon_row(
-    items: IconItems, ui: UiContext, actions: list[str], gap: float = 0.0, off: Collection[str] = ()
+    items: IconItems, ui: UiContext, actions: list[Action], gap: float = 0.0, off: Collection[str] = ()
 ) -> None:
     """Draw the buttons of commands on a line; those in `off` are disabled."""
-    for i, (action, icon, *more) in enumerate(items):
+    for i, (command, icon, *more) in enumerate(items):
         if i:
             imgui.same_line(0.0, gap)
-        with inert(action in off):
-            if icon_button(action, icon, ui):
-                actions.append(action)
-        hint(action, *more)
+        with inert(command in off):
+            if icon_button(command, icon, ui):
+                actions.append(COMMANDS[command].action)
+        hint(command, *more)
 
 
 def more_button(
-    name: str, items: MenuItems, ui: UiContext, actions: list[str], icon: str = Icon.MENU, side: float = 0.0
+    name: str,
+    items: MenuItems,
+    ui: UiContext,
+    actions: list[Action],
+    icon: str = Icon.MENU,
+    side: float = 0.0,
 ) -> None:
     """Draw a button that opens a menu, see `menu_items`; append the chosen action to `actions`."""
     if icon_button(name, icon, ui, side=side):
         imgui.open_popup(name)
-    actions += menu_items(name, items, ui)
+    actions += [action for action in menu_items(name, items, ui) if action is not None]
 
 
-def menu_items(name: str, items: MenuItems, ui: UiContext, off: Collection[str] = ()) -> list[str]:
+def menu_items(name: str, items: MenuItems, ui: UiContext, off: Collection[str] = ()) -> list[Action | None]:
     """Draw the menu that `imgui.open_popup(name)` opens; return the chosen action, if any.
 
     Args:
         items: commands of the table, "" for a line, or text, action and tooltip of another item
-        off: disabled actions
+        off: disabled commands, and texts of disabled items
     """
-    requested: list[str] = []
+    requested: list[Action | None] = []
     with menu(name, ui) as is_open:
         for item in items if is_open else ():
             if not item:
                 imgui.separator()
             elif isinstance(item, str):
                 if menu_item(item, enabled=item not in off):
-                    requested.append(item)
+                    requested.append(COMMANDS[item].action)
             else:
                 text, action, help_ = item
-                if imgui.menu_item(f"{text}##{action}", "", False, action not in off)[0]:
+                if imgui.menu_item(f"{text}##{action}", "", False, text not in off)[0]:
                     requested.append(action)
                 if help_:
                     tip(help_)
     return requested
 
 
-def menu_item(action: str, on: bool = False, enabled: bool = True, name: str = "") -> bool:
+def menu_item(command: str, on: bool = False, enabled: bool = True, name: str = "") -> bool:
     """Draw a command with its key in an open menu; return True if it was chosen.
 
     Args:
         on: it has a check mark
         name: replaces the name in the table
     """
-    command = COMMANDS[action]
-    chosen = imgui.menu_item(f"{name or command.name}##{action}", shortcut(action), on, enabled)[0]
-    if command.help:
-        tip(command.help)
+    row = COMMANDS[command]
+    chosen = imgui.menu_item(f"{name or row.name}##{command}", shortcut(command), on, enabled)[0]
+    if row.help:
+        tip(row.help)
     return bool(chosen)
 
 
@@ -264,16 +270,18 @@ def start_naming(starts: bool = True) -> None:
     imgui.get_state_storage().set_bool(imgui.get_id("naming"), starts)
 
 
-def name_field(name: str, room: float, action: str, actions: list[str]) -> bool:
+def name_field(name: str, room: float, rename: Callable[[str], Action], actions: list[Action]) -> bool:
     """Draw the text field of a name if `start_naming` opened it, and return whether it did.
 
-    The typed name is requested as `action`:NAME.
+    Args:
+        rename: returns the command for a typed name
     """
     if not imgui.get_state_storage().get_bool(imgui.get_id("naming")):
         return False
     typed = typed_name(name, room)
     start_naming(typed is None)
-    actions += [f"{action}:{typed}"] if typed else []
+    if typed:
+        actions.append(rename(typed))
     return True
 
 

@@ -20,7 +20,8 @@ from tests.viewer.app.test_keys_of_lists_and_form import strike, type_text
 from viewer.app import interface
 from viewer.files import exports
 from viewer.files.document import empty
-from viewer.state import actions, selection
+from viewer.state import actions, selection, timeline
+from viewer.state.commands import Plain
 from viewer.state.view_state import ViewState
 from viewer.ui.context import SMALL_PX
 from viewer.ui.keys import COMMANDS, JOINED, KEYS, bind, find_commands, shortcut
@@ -58,10 +59,11 @@ INTERNAL = {
 def test_every_action_is_a_command_or_internal(tmp_path: Path) -> None:
     with null_app(empty(), ViewState(), tmp_path) as app:
         everything = {*app.requests, *exports.REQUESTS}
-    everything |= {*actions.ACTIONS, *actions.OF_EDITS, *selection.CHANGES, "frame", "home", "invert"}
+    everything |= {*actions.ACTIONS, *timeline.ACTIONS, *actions.OF_EDITS, *selection.CHANGES}
+    everything |= {"frame", "home", "invert"}
     everything |= {"paint_clear", "paint_fill", "paint_invert", "paint_feather"}
     everything |= {"next_slider", "point", "point_press"}
-    named = {action.partition(":")[0] for action in COMMANDS}
+    named = {command.action.name for command in COMMANDS.values()}
     assert named | INTERNAL == everything
     assert not named & INTERNAL
 
@@ -79,12 +81,12 @@ def test_every_action_is_a_command_or_internal(tmp_path: Path) -> None:
     ],
 )
 def test_command_is_found_by_parts_of_its_name(query: str, first: str) -> None:
-    assert find_commands(query, COMMANDS)[0].action == first
+    assert find_commands(query, COMMANDS)[0].id == first
 
 
 def test_unknown_query_finds_nothing_and_empty_query_finds_all() -> None:
     assert find_commands("xyzzy", COMMANDS) == []
-    assert {command.action for command in find_commands("", COMMANDS)} == {*COMMANDS}
+    assert {command.id for command in find_commands("", COMMANDS)} == {*COMMANDS}
 
 
 @pytest.mark.gl
@@ -94,7 +96,7 @@ def test_command_palette_works_by_typing_arrows_and_enter() -> None:
         strike(hand, "Ctrl+P")
         assert hand.main_view.work.palette == 0
         type_text(hand, "view")
-        found = [command.action for command in find_commands("view", COMMANDS)]
+        found = [command.id for command in find_commands("view", COMMANDS)]
         for chord in ("Down", "Down", "Up"):
             strike(hand, chord)
         assert hand.main_view.work.palette == 1
@@ -155,7 +157,7 @@ def test_bound_keys_replace_defaults_and_are_taken_from_others() -> None:
     given = {"snapshot": "f6", "beside": ["shift+ctrl+J", "Y"], "quit": "", "difference": "T", "before": "B"}
     assert bind(given) == []
     found = {
-        action: [chord for chord, command in KEYS.items() if command.action == action] for action in COMMANDS
+        action: [chord for chord, command in KEYS.items() if command.id == action] for action in COMMANDS
     }
     assert (found["snapshot"], found["beside"], found["quit"]) == (["F6"], ["Ctrl+Shift+J", "Y"], [])
     assert (found["timeline"], found["brush"]) == ([], []), "T and B do something else now"
@@ -185,8 +187,8 @@ def test_invalid_key_binding_is_reported_and_keeps_the_old_one() -> None:
     before = dict(KEYS)
     problems = bind({"lock": "F7", **{action: value for action, (value, _) in WRONG.items()}})
     assert problems == [f"{action}: {line}" for action, (_, line) in WRONG.items()]
-    assert {chord: key for chord, key in KEYS.items() if key.action != "lock"} == {
-        chord: key for chord, key in before.items() if key.action != "lock"
+    assert {chord: key for chord, key in KEYS.items() if key.id != "lock"} == {
+        chord: key for chord, key in before.items() if key.id != "lock"
     }
 
 
@@ -198,7 +200,7 @@ def test_keys_file_is_created_complete_and_read_on_start(
     opened: list[str] = []
     monkeypatch.setattr(webbrowser, "open", opened.append)
     with null_app(opened_document(bear_files(tmp_path)), first_view(bear(), 0.5, 0.5), tmp_path) as app:
-        app.main_view.request("keys_file")
+        app.main_view.request(Plain("keys_file"))
         app.draw()
         path = state_folder() / "keys.json"
         assert opened == [path.as_uri()]

@@ -17,6 +17,7 @@ from tests.helpers.ui_rig import bear, first_view, rig
 from viewer.app.app import App
 from viewer.app.decal import Decal, is_decal
 from viewer.jobs.training import EditOrder
+from viewer.state.commands import Plain
 
 pytestmark = pytest.mark.gl
 
@@ -60,7 +61,7 @@ def test_decal_follows_the_pointer_and_scales_with_the_wheel(logo: Path) -> None
         assert (now.size, now.angle) == (pytest.approx(1.08 * first.size), 5.0)
         assert hand.main_view.work.view.camera == camera
         hand.key("Escape")
-        assert "put_back" in hand.main_view.take_requests()
+        assert Plain("put_back") in hand.main_view.take_requests()
 
 
 def test_enter_places_the_decal_at_its_position(

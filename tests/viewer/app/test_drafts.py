@@ -27,6 +27,7 @@ from viewer.files.session import open_session
 from viewer.jobs import job_queue
 from viewer.jobs.training import EDITORS, SHEET_COLUMNS, SHEET_PX, STYLE_ORDER
 from viewer.state import paint
+from viewer.state.commands import OnItem, Plain
 from viewer.state.layers import visible_layers
 from viewer.state.view_state import LayerState
 
@@ -259,7 +260,7 @@ def test_prompt_is_painted_on_request_and_the_edit_follows_it(
     press(window, "Home", "5")
     turn(window)
     assert Previews.asked == 2, "a picture takes its time: a camera that moves asks for none"
-    request(window, "paint_over")
+    request(window, Plain("paint_over"))
     anchor = Path(window.main_view.work.form.anchor)
     assert torch.allclose(find_picture_camera(anchor).viewmat, painted.viewmat, atol=1e-6)
     assert given == [anchor], "the program that paints pictures has it"
@@ -276,7 +277,7 @@ def test_prompt_is_painted_on_request_and_the_edit_follows_it(
     assert "cannot follow a picture" in window.main_view.preview.text
     assert not window.main_view.preview.painted
     with_form(window, asks=1, model="", anchor=str(anchor))
-    request(window, "train")
+    request(window, Plain("train"))
     assert f"--anchor={anchor}" in Trainer.said
 
 
@@ -284,7 +285,7 @@ def test_trained_edit_replaces_its_draft_and_nothing_else(
     window: application.App,
 ) -> None:
     opened(window, strength=0.6)
-    request(window, "train")
+    request(window, Plain("train"))
     assert (layer(window).name, layer(window).strength, window.main_view.live) == ("blue", 0.6, ())
     assert window.document.facts().rows[0].draft
     view = window.main_view.work.view
@@ -308,12 +309,12 @@ def test_trained_edit_replaces_its_draft_and_nothing_else(
 
 def test_draft_of_a_failed_training_stays_until_deleted(window: application.App) -> None:
     opened(window)
-    request(window, "train")
+    request(window, Plain("train"))
     Trainer.ended = 2
     Trainer.line = "the disk is full"
     turn(window)
     (job,) = window.main_view.work.jobs
-    request(window, f"discard_run:{job.number}")
+    request(window, OnItem("discard_run", job.number))
     assert layer(window).name == "blue"
     press(window, "Ctrl+Delete")
     assert window.main_view.work.view.layers == ()
@@ -323,7 +324,7 @@ def test_draft_of_a_failed_training_stays_until_deleted(window: application.App)
 
 def test_deleted_draft_does_not_block_the_trained_edit(window: application.App) -> None:
     opened(window)
-    request(window, "train")
+    request(window, Plain("train"))
     press(window, "Ctrl+Delete")
     Trainer.ended = 0
     turn(window)
@@ -334,7 +335,7 @@ def test_session_saved_with_a_draft_opens_with_the_trained_edit(
     window: application.App, tmp_path: Path
 ) -> None:
     opened(window, strength=0.6)
-    request(window, "train")
+    request(window, Plain("train"))
     window.file_actions.save(tmp_path / "bear.session.json")
     saved = open_session(tmp_path / "bear.session.json")
     assert [path.name for path in saved.document.gdf_paths] == ["blue.draft.gdf"]
@@ -348,7 +349,7 @@ def test_session_saved_with_a_draft_opens_with_the_trained_edit(
 
 def test_draft_of_the_run_becomes_the_layer_without_a_preview(window: application.App) -> None:
     opened(window, preview=False)
-    request(window, "train")
+    request(window, Plain("train"))
     assert window.main_view.work.view.layers == ()
     (job,) = window.main_view.work.jobs
     job.task.out.mkdir(parents=True)

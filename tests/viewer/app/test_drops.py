@@ -21,6 +21,7 @@ from viewer.app import app as application
 from viewer.camera.view_camera import to_camera
 from viewer.files import exports
 from viewer.state import selection
+from viewer.state.commands import ReplaceEdit
 
 
 @pytest.fixture
@@ -78,7 +79,7 @@ def test_dropped_color_table_applies_to_selection_scene_or_region(
     some = int(mask.sum())
     assert [row.count for row in opened.main_view.facts.rows][1:] == [total, some]
     assert [row.region for row in opened.main_view.facts.rows][1:] == ["all", "selection"]
-    opened.handle(f"replace_by:0:{tmp_path / 'look.cube'}")
+    opened.handle(ReplaceEdit(0, str(tmp_path / "look.cube")))
     assert opened.document.gdfs[-1].region == opened.document.gdfs[0].region
 
 

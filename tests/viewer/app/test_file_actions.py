@@ -22,6 +22,7 @@ from viewer.camera.view_camera import to_camera
 from viewer.files import exports, session
 from viewer.files.user_files import read_recent, remember_recent
 from viewer.state import workspace
+from viewer.state.commands import Plain, ReplaceEdit, WithText
 from viewer.state.workspace import Dialog
 
 
@@ -167,7 +168,7 @@ def left_over(window: application.App, folder: Path) -> Path:
     window.file_actions.autosave(session.AUTOSAVE_S)
     beside = folder / "bear.autosave.session.json"
     kept = beside.read_bytes()
-    window.handle("discard")
+    window.handle(Plain("discard"))
     for discarded in folder.glob("*.discarded*"):
         discarded.unlink()
     beside.write_bytes(kept)
@@ -206,13 +207,13 @@ def test_last_three_discarded_works_are_kept_as_files(window: application.App, f
         strengths.append(window.main_view.work.view.layers[-1].strength)
         window.file_actions.offer_autosave()
         assert window.main_view.work.dialog is None, "its own autosave is nothing that was left"
-        window.handle(f"discard_autosave:{left_over_now}")
+        window.handle(WithText("discard_autosave", str(left_over_now)))
         window.file_actions.session_autosave = session.SessionAutosave()
     kept = sorted(folder.glob("bear.discarded*"), key=lambda path: path.stat().st_mtime_ns)
     assert len(kept) == session.MAX_DISCARDED
     found = [session.open_session(path).view.layers[-1].strength for path in kept]
     assert sorted(found) == sorted(strengths[-session.MAX_DISCARDED :])
-    window.handle("discard")
+    window.handle(Plain("discard"))
     window.open(kept[-1])
     assert window.file_actions.path is None, "saving it asks where"
     assert window.file_actions.has_unsaved
@@ -237,7 +238,7 @@ def test_existing_session_is_overwritten_only_after_a_question(
     yesterday = saved.read_bytes()
     press(window, "Shift+Left")
     for answer in ("Escape", "Enter"):  # Cancel; Rename…, which opens the save question again
-        window.handle(f"save_to:{saved}")
+        window.handle(WithText("save_to", str(saved)))
         assert question(window).kind == "overwrite"
         press(window, answer)
     assert question(window).kind == "save"
@@ -245,7 +246,7 @@ def test_existing_session_is_overwritten_only_after_a_question(
     by_hand(window, text="another name")
     assert question(window).text == "another name", "the field has the keyboard"
     assert saved.read_bytes() == yesterday
-    window.handle(f"overwrite:{saved}")
+    window.handle(WithText("overwrite", str(saved)))
     assert window.main_view.work.dialog is None
     assert session.open_session(saved).view.layers == window.main_view.work.view.layers
     press(window, "Shift+Left", "Ctrl+S")
@@ -271,7 +272,7 @@ def test_duplicated_replaced_and_deleted_layers_are_saved(window: application.Ap
     assert layers() == [("scarf", 0), ("scarf-2", 2), ("ears", 1)]
     assert window.main_view.work.focus == 1
     assert window.main_view.work.view.layers[1].strength == 0.5
-    window.handle(f"replace_by:1:{folder / 'edits' / 'ears.gdf'}")
+    window.handle(ReplaceEdit(1, str(folder / "edits" / "ears.gdf")))
     assert layers() == [("scarf", 0), ("ears-2", 3), ("ears", 1)]
     assert window.main_view.work.view.layers[1].strength == 0.5
     press(window, "Ctrl+Z")
@@ -293,7 +294,7 @@ def test_replacing_by_a_scene_file_changes_nothing(
     window: application.App, folder: Path, tmp_path: Path
 ) -> None:
     before = window.main_view.work.view
-    window.handle(f"replace_by:0:{folder / 'bear.ply'}")
+    window.handle(ReplaceEdit(0, str(folder / "bear.ply")))
     assert window.main_view.work.view == before
     assert "\n" not in message(window)
     assert window.main_view.work.message is not None
@@ -310,7 +311,7 @@ def test_files_are_recognized_by_content_not_by_name(
     (folder / "edits" / "scarf.gdf").rename(folder / "scarf.bin")
     window.open(folder / "scarf.bin")
     assert [layer.name for layer in window.main_view.work.view.layers][-1] == "scarf-2", message(window)
-    window.handle("discard")
+    window.handle(Plain("discard"))
     (folder / "bear.ply").rename(folder / "scene.dat")
     window.open(folder / "scene.dat")
     assert window.main_view.facts.title == "scene.dat", message(window)
@@ -351,7 +352,7 @@ def test_session_of_another_scene_changes_nothing(window: application.App, folde
 def test_saving_never_overwrites_another_kind_of_file(window: application.App, folder: Path) -> None:
     save_cameras(folder / "cameras.json", list(bear().demo.cameras[:1]))
     before = (folder / "cameras.json").read_bytes()
-    window.handle(f"save_to:{folder / 'cameras.json'}")
+    window.handle(WithText("save_to", str(folder / "cameras.json")))
     assert (folder / "cameras.json").read_bytes() == before
     assert "is not a session" in question(window).error
 
@@ -412,22 +413,22 @@ def test_quit_waits_until_the_save_succeeds(window: application.App, folder: Pat
 
 @pytest.mark.gl
 def test_home_of_an_unknown_user_does_not_exist(window: application.App) -> None:
-    window.handle("save_to:~nobody-here/bear")
+    window.handle(WithText("save_to", "~nobody-here/bear"))
     assert "~nobody-here does not exist" in question(window).error
-    window.handle("open_file:~nobody-here/bear.ply")
+    window.handle(WithText("open_file", "~nobody-here/bear.ply"))
     assert "~nobody-here/bear.ply" in message(window)
 
 
 @pytest.mark.gl
 @pytest.mark.parametrize("name", ["x" * 300, "/".join(["x" * 200] * 30), "a\0b", "\x1b[2J\n"])
 def test_impossible_path_is_one_line(window: application.App, name: str) -> None:
-    for request in (f"open_file:{name}", f"replace_by:0:{name}"):
+    for request in (WithText("open_file", name), ReplaceEdit(0, name)):
         window.handle(request)
         assert message(window)
         assert "\x1b" not in message(window)
         window.draw()
     for path in (f"no folder/{name}", "/"):
-        window.handle(f"save_to:{path}")
+        window.handle(WithText("save_to", str(path)))
         assert question(window).error
         window.draw()
 

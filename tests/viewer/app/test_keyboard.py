@@ -11,6 +11,7 @@ from imgui_bundle import imgui
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from tests.viewer.app.test_keys_of_lists_and_form import list_is_open, strike, type_text
 from viewer.jobs.job_queue import DeliverOptions
+from viewer.state.commands import WithText
 from viewer.state.workspace import PLACES, Dialog
 
 pytestmark = pytest.mark.gl
@@ -158,7 +159,7 @@ def test_question_is_answered_by_tab_and_enter(hand: Rig) -> None:
         assert dialog is not None
         assert dialog.options is not None
         assert (dialog.options.width, dialog.options.height) == (width, 480)
-        assert hand.main_view.take_requests() == ("deliver:render_picture",) * (width == 640)
+        assert hand.main_view.take_requests() == (WithText("deliver", "render_picture"),) * (width == 640)
         strike(hand, "Escape")
 
 
@@ -166,6 +167,6 @@ def test_camera_jumps_with_reduced_motion(hand: Rig) -> None:
     for on in (False, True):
         work = hand.main_view.work
         hand.main_view.work = replace(work, layout=replace(work.layout, reduced_motion=on), glide=None)
-        hand.main_view._perform("look:top" if on else "look:right")
+        hand.main_view._perform(WithText("look", "top") if on else WithText("look", "right"))
         assert (hand.main_view.work.glide is None) == on
         hand.settle()

@@ -13,6 +13,7 @@ from imgui_bundle import imgui
 
 from tests.helpers.ui_rig import HEAD, Rig, bear, first_view, rig
 from viewer.jobs.job_queue import DeliverOptions
+from viewer.state.commands import Plain
 from viewer.state.selection import NamedRegion
 from viewer.state.workspace import Dialog
 from viewer.ui.keys import KEYS, Keys, Press, next_event_id
@@ -81,7 +82,7 @@ def test_opened_form_takes_typed_text_and_enter_starts_training(form: Rig) -> No
     assert form.main_view.work.form.name == "red jacket"
     assert form.main_view.work.view == before, "no letter was a shortcut"
     strike(form, "Enter")
-    assert form.main_view.take_requests() == ("train",)
+    assert form.main_view.take_requests() == (Plain("train"),)
     assert form.main_view.work.renaming is None
 
 
@@ -107,7 +108,7 @@ def test_tab_moves_through_the_form_and_enter_always_trains(form: Rig) -> None:
     quick = form.main_view.work.form.quick
     strike(form, "Enter")
     assert form.main_view.work.form.quick == quick
-    assert form.main_view.take_requests() == ("train",)
+    assert form.main_view.take_requests() == (Plain("train"),)
 
 
 def test_slider_focused_by_tab_moves_by_arrows(form: Rig) -> None:

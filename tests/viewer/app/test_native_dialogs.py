@@ -17,6 +17,7 @@ from tests.helpers.ui_rig import bear, first_view, rig
 from viewer.app import dialogs
 from viewer.app.app import App
 from viewer.files import document, session
+from viewer.state.commands import Plain
 from viewer.state.workspace import Dialog
 
 pytestmark = [
@@ -175,7 +176,7 @@ def test_browse_button_requests_the_native_dialog(kind: str) -> None:
         x = (900 - 300) / 2 + 260 - 16 - 18
         for y in range(60, 320, 8):
             hand.click(x, float(y))
-            if "browse" in hand.main_view.work.requests:
+            if Plain("browse") in hand.main_view.work.requests:
                 break
-        assert "browse" in hand.main_view.work.requests
+        assert Plain("browse") in hand.main_view.work.requests
         assert hand.main_view.work.dialog is not None, "the question stays"

@@ -20,7 +20,8 @@ from viewer.app import interface, mouse
 from viewer.app.application import LOG
 from viewer.files import exports, session
 from viewer.panel import card, cards, snapshot_cards, timeline_bar, tools
-from viewer.state import actions, selection
+from viewer.state import actions, selection, timeline
+from viewer.state.commands import Plain
 from viewer.state.workspace import Message
 from viewer.ui import overlay
 
@@ -28,6 +29,7 @@ pytestmark = pytest.mark.gl
 
 ACTIONS = (
     *actions.ACTIONS,
+    *timeline.ACTIONS,
     *actions.OF_EDITS,
     *selection.CHANGES,
     "frame",
@@ -99,7 +101,7 @@ def test_failing_action_does_not_end_the_window(
         with monkeypatch.context() as broken:
             broken.setattr(interface, "perform", raises(BrokenError(f"in {name}")))
             window.main_view.frames += 2  # separates this failure from the previous one
-            window.main_view._perform(name)
+            window.main_view._perform(Plain(name))
         assert message(window).text.startswith(f"Internal error (BrokenError: in {name});")
         assert window.main_view.work.view == before
     assert log(tmp_path).count("Traceback") == 1, "all at the same place"
@@ -112,7 +114,7 @@ def test_failing_request_does_not_end_the_window(
     monkeypatch.setattr(window.main_view, "_save", raises(BrokenError("in a request")))
     for request in (*window.requests, *exports.REQUESTS):
         window.main_view.work = replace(window.main_view.work, message=None)
-        window.main_view.request(request)
+        window.main_view.request(Plain(request))
         turns(window, 2)
         assert "BrokenError: in a request" in message(window).text, request
 

@@ -17,6 +17,7 @@ from tests.helpers.ui_rig import HEAD, Rig, bear, first_view, rig
 from viewer.jobs.job_queue import Delivery, QueuedTask
 from viewer.panel import card, panel, tools
 from viewer.state import selection
+from viewer.state.commands import Plain
 from viewer.state.selection import SelectionState
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import WIDEST_PX, Layout
@@ -61,7 +62,7 @@ def test_tool_buttons_activate_and_deactivate_tools(hand: Rig) -> None:
     hand.click(*tool_place("move_selected"))
     assert hand.main_view.take_requests() == (), "nothing is selected"
     hand.click(*tool_place("decal"))
-    assert hand.main_view.take_requests() == ("decal",)
+    assert hand.main_view.take_requests() == (Plain("decal"),)
 
 
 def test_options_bar_appears_with_a_tool_or_a_selection() -> None:

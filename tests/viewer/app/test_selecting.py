@@ -18,6 +18,7 @@ from tests.helpers.ui_rig import HEAD, Rig, bear, first_view, rig
 from viewer.camera.view_camera import to_camera
 from viewer.files.document import Document
 from viewer.state import selection
+from viewer.state.commands import Plain, WithText
 from viewer.state.selection import SelectionState, unpack
 from viewer.state.view_state import SelectTool
 from viewer.ui import pointer
@@ -358,14 +359,14 @@ def test_panel_selects_shows_and_saves_regions() -> None:
         hand.modifier(imgui.Key.enter)
         hand.modifier(imgui.Key.enter, False)
         hand.frame(2)
-        assert hand.main_view.take_requests() == ("save_region:hat",)
+        assert hand.main_view.take_requests() == (WithText("save_region", "hat"),)
 
 
 def test_hide_strays_hides_them_and_undo_shows_them(tmp_path: Path) -> None:
     scene = replace(bear().scene, logit_opacities=bear().scene.logit_opacities.clone())
     scene.logit_opacities[:7] = -9.0
     with null_app(Document("a", scene), first_view(bear()), tmp_path) as app:
-        app.main_view.request("hide_strays")
+        app.main_view.request(Plain("hide_strays"))
         app.draw()
         assert "Looking for strays" in app.main_view.work.message.text
         while app.strays.poll() is not None:
@@ -380,7 +381,7 @@ def test_hide_strays_hides_them_and_undo_shows_them(tmp_path: Path) -> None:
 
 def test_strays_of_a_closed_scene_hide_nothing(tmp_path: Path) -> None:
     with null_app(Document("a", bear().scene), first_view(bear()), tmp_path) as app:
-        app.handle("hide_strays")
+        app.handle(Plain("hide_strays"))
         app.show(Document("b", bear(1000).scene))
         while app.strays.poll() is not None:
             time.sleep(0.05)

@@ -25,6 +25,7 @@ from viewer.files.document import empty
 from viewer.files.user_files import describe_age, keep_thumbnail, read_recent, remember_recent
 from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import headless_context
+from viewer.state.commands import Plain, WithText
 from viewer.state.view_state import ViewState
 from viewer.ui.splash import Splash
 
@@ -71,7 +72,7 @@ def type_keys(hand: Rig, *keys: imgui.Key) -> None:
 
 @pytest.mark.parametrize("bundle", [*EXAMPLE_TITLES], ids=lambda path: path.name.partition(".")[0])
 def test_example_opens_with_its_edits(window: application.App, bundle: Path, tmp_path: Path) -> None:
-    window.main_view.request(f"example:{bundle}")
+    window.main_view.request(WithText("example", str(bundle)))
     turn(window)
     turn(window)
     assert not window.main_view.at_start
@@ -93,7 +94,7 @@ def test_examples_are_complete_and_small() -> None:
 
 def test_single_click_opens_an_example(hand: Rig) -> None:
     hand.click(605.0, 160.0)  # the second example
-    assert hand.main_view.take_requests() == (f"example:{[*EXAMPLE_TITLES][1]}",)
+    assert hand.main_view.take_requests() == (WithText("example", str([*EXAMPLE_TITLES][1])),)
 
 
 def test_arrows_and_enter_open_examples_and_recent_files(hand: Rig) -> None:
@@ -102,15 +103,17 @@ def test_arrows_and_enter_open_examples_and_recent_files(hand: Rig) -> None:
     enter = imgui.Key.enter
     first, second, _ = EXAMPLE_TITLES
     type_keys(hand, enter)
-    assert hand.main_view.take_requests() == (f"example:{first}",), "the first card has the keyboard"
+    assert hand.main_view.take_requests() == (WithText("example", str(first)),), (
+        "the first card has the keyboard"
+    )
     type_keys(hand, right, enter)
-    assert hand.main_view.take_requests() == (f"example:{second}",)
+    assert hand.main_view.take_requests() == (WithText("example", str(second)),)
     type_keys(hand, imgui.Key.left_arrow, down, enter)
-    assert hand.main_view.take_requests() == ("open_file:/scenes/bear.ply",)
+    assert hand.main_view.take_requests() == (WithText("open_file", "/scenes/bear.ply"),)
     type_keys(hand, imgui.Key.delete)
-    assert hand.main_view.take_requests() == ("forget_file:/scenes/bear.ply",)
+    assert hand.main_view.take_requests() == (WithText("forget_file", "/scenes/bear.ply"),)
     type_keys(hand, right, enter)
-    assert hand.main_view.take_requests() == ("open",), "what is gone is looked for"
+    assert hand.main_view.take_requests() == (Plain("open"),), "what is gone is looked for"
 
 
 def test_missing_file_is_marked_and_can_be_removed(tmp_path: Path) -> None:
@@ -127,7 +130,7 @@ def test_missing_file_is_marked_and_can_be_removed(tmp_path: Path) -> None:
         assert gone.line.startswith("Moved?")
         assert here.line.startswith("just now  ·  ")
         assert app.main_view.recent == (files[0],), "questions offer what is there"
-        app.main_view.request(f"forget_file:{gone.path}")
+        app.main_view.request(WithText("forget_file", str(gone.path)))
         turn(app)
         turn(app)
         assert [file.path for file in app.main_view.start_files[0]] == [files[0]]

@@ -36,6 +36,7 @@ from viewer.jobs import job_queue
 from viewer.jobs.job_queue import TURNTABLE
 from viewer.jobs.training import CHANGED, SELECTION, TYPED
 from viewer.state import selection
+from viewer.state.commands import Action, OnItem, Plain, WithText
 from viewer.state.view_state import ViewState
 
 pytestmark = pytest.mark.gl
@@ -93,8 +94,8 @@ def turn(app: application.App) -> None:
     app.draw()
 
 
-def request(app: application.App, text: str) -> None:
-    app.main_view.request(text)
+def request(app: application.App, action: Action) -> None:
+    app.main_view.request(action)
     app.draw()
     turn(app)
 
@@ -102,7 +103,7 @@ def request(app: application.App, text: str) -> None:
 def test_trained_edit_becomes_a_layer_at_full_strength(window: application.App) -> None:
     press(window, "Ctrl+N")
     assert window.main_view.work.form_open
-    request(window, "train")
+    request(window, Plain("train"))
     assert not window.main_view.work.form_open
     (job,) = window.main_view.work.jobs
     assert (job.status, job.task.name) == ("running", "blue")
@@ -125,7 +126,7 @@ def test_selection_is_the_region_of_a_new_edit(window: application.App) -> None:
     window.main_view.work = replace(window.main_view.work, view=replace(view, selection=chosen))
     press(window, "Ctrl+N")
     assert window.main_view.work.form.region == SELECTION
-    request(window, "train")
+    request(window, Plain("train"))
     region = next(word for word in Trainer.said if word.startswith("--region="))
     assert region.startswith("--region=file:")
     assert region.endswith("blue.region.npy")
@@ -153,14 +154,14 @@ def test_invalid_edit_is_reported_in_the_form(window: application.App) -> None:
     press(window, "Ctrl+N")
     form = replace(window.main_view.work.form, region=TYPED, typed_region="cube:1")
     window.main_view.work = replace(window.main_view.work, form=form)
-    request(window, "train")
+    request(window, Plain("train"))
     assert window.main_view.work.form_open
     assert window.main_view.work.form.error.startswith("unknown region 'cube:1'")
     assert window.main_view.work.jobs == ()
 
 
 def test_packed_edit_replaces_the_draft_while_it_is_measured(window: application.App) -> None:
-    request(window, "train")
+    request(window, Plain("train"))
     (job,) = window.main_view.work.jobs
     order = job.task
     packed = job.task.out / "draft.gdf"
@@ -191,7 +192,7 @@ def test_view_painted_in_another_program_is_shown_on_every_save(
     opened = list[Path]()
     monkeypatch.setattr(user_files, "open_in_program", lambda path: opened.append(path) or True)
     press(window, "Ctrl+N")
-    request(window, "paint_view")
+    request(window, Plain("paint_view"))
     (path,) = opened
     form = window.main_view.work.form
     size = window.main_view.picture_size
@@ -225,46 +226,46 @@ def test_view_painted_in_another_program_is_shown_on_every_save(
     save(taken)
     assert window.main_view.cover is not None
     assert find_picture_camera(path).height == size[1], "though the program dropped what the picture carried"
-    request(window, "train")
+    request(window, Plain("train"))
     assert f"--editor=pictures:{path}" in Trainer.said
     turn(window)
     assert window.main_view.cover is None, "the form is closed"
 
 
 def test_failed_training_is_one_line_with_its_log(window: application.App) -> None:
-    request(window, "train")
+    request(window, Plain("train"))
     Trainer.ended = 2
     Trainer.line = "the disk is full"
     turn(window)
     (job,) = window.main_view.work.jobs
     assert (job.status, job.error) == ("failed", "the disk is full")
     assert window.main_view.work.message is None, "its card says it, and nothing else"
-    request(window, f"run_log:{job.number}")
+    request(window, OnItem("run_log", job.number))
     assert window.main_view.work.dialog is not None
     assert window.main_view.work.dialog.kind == "log"
     press(window, "Enter")
-    request(window, f"discard_run:{job.number}")
+    request(window, OnItem("discard_run", job.number))
     assert window.main_view.work.jobs == ()
 
 
 def test_training_is_discarded_only_after_a_question(window: application.App) -> None:
-    request(window, "train")
+    request(window, Plain("train"))
     (job,) = window.main_view.work.jobs
     state = job.task.out / "state"
     state.mkdir(parents=True)
     (state / "run.json").touch()
     (state / "progress.json").write_text('{"share": 0.5, "label": "Training", "seconds": 2280}')
-    request(window, f"stop_run:{job.number}")
+    request(window, OnItem("stop_run", job.number))
     turn(window)
     assert window.main_view.work.jobs[0].status == "stopped"
-    request(window, f"ask_discard:{job.number}")
+    request(window, OnItem("ask_discard", job.number))
     dialog = window.main_view.work.dialog
     assert dialog is not None
     assert (dialog.kind, dialog.text) == ("discard_run", "38 min")
     press(window, "Enter")
     assert window.main_view.work.dialog is None
     assert state.is_dir(), "Enter keeps it"
-    request(window, f"ask_discard:{job.number}")
+    request(window, OnItem("ask_discard", job.number))
     press(window, "D")
     turn(window)
     assert window.main_view.work.jobs == ()
@@ -272,15 +273,15 @@ def test_training_is_discarded_only_after_a_question(window: application.App) ->
 
 
 def test_run_locked_by_another_window_is_left_alone(window: application.App) -> None:
-    request(window, "train")
+    request(window, Plain("train"))
     (job,) = window.main_view.work.jobs
     (job.task.out / "state").mkdir(parents=True)
     (job.task.out / "state" / "run.json").touch()
-    request(window, f"stop_run:{job.number}")
+    request(window, OnItem("stop_run", job.number))
     turn(window)
     with job.task.lock():
         for action in ("resume_run", "discard_run"):
-            request(window, f"{action}:{job.number}")
+            request(window, OnItem(action, job.number))
             message = window.main_view.work.message
             if action == "resume_run":
                 assert message is not None
@@ -290,7 +291,7 @@ def test_run_locked_by_another_window_is_left_alone(window: application.App) -> 
 
 
 def test_quitting_asks_while_a_training_runs(window: application.App) -> None:
-    request(window, "train")
+    request(window, Plain("train"))
     press(window, "Ctrl+Q")
     assert window.main_view.work.dialog is not None
     assert window.main_view.work.dialog.kind == "training"
@@ -317,9 +318,9 @@ def test_scene_export_runs_the_command(window: application.App, tmp_path: Path) 
     turn(window)
     (job,) = window.main_view.work.jobs
     assert job.status == "done", "it stays until it is closed"
-    request(window, f"copy_path:{job.number}")
+    request(window, OnItem("copy_path", job.number))
     assert imgui.get_clipboard_text() == str(tmp_path / "bear_edited.ply")
-    request(window, f"close_run:{job.number}")
+    request(window, OnItem("close_run", job.number))
     assert window.main_view.work.jobs == ()
     Trainer.ended = None
     press(window, "Ctrl+Alt+P")
@@ -406,7 +407,7 @@ def test_demo_card_counts_edits_and_each_draft_becomes_one_layer(
     demo = state_folder() / "demo"
     scarf = state_folder() / "demo" / "scarf"
     with null_app(empty(), ViewState(), tmp_path) as app:
-        request(app, "demo")
+        request(app, Plain("demo"))
         (job,) = app.jobs.queue.jobs
         assert job.progress.share == 0.0
         (scarf / "state").mkdir(parents=True)
@@ -428,7 +429,7 @@ def test_demo_card_counts_edits_and_each_draft_becomes_one_layer(
 
 def test_jobs_of_another_scene_continue_and_name_their_scene(window: application.App, tmp_path: Path) -> None:
     save_ply(tmp_path / "half.ply", bear().scene[:700])
-    request(window, "train")
+    request(window, Plain("train"))
     press(window, "Ctrl+E", "Enter")
     window.open(tmp_path / "half.ply")
     turn(window)
@@ -476,7 +477,7 @@ def test_edit_of_another_scene_is_rebound_from_its_message(window: application.A
 
 def test_saved_region_offers_a_new_edit(window: application.App) -> None:
     press(window, "Ctrl+A")
-    request(window, "save_region:all of it")
+    request(window, WithText("save_region", "all of it"))
     message = window.main_view.work.message
     assert message is not None
     assert message.text == "Region 'all of it' saved"

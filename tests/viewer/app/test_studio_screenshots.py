@@ -19,6 +19,7 @@ from viewer.jobs.job_queue import DeliverOptions, Delivery, QueuedTask
 from viewer.jobs.training import TYPED, EditOrder, NewEdit
 from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import headless_context
+from viewer.state.commands import OnItem
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import Dialog
 from viewer.ui.splash import MINIMUM_SIZE_PX
@@ -114,7 +115,7 @@ def test_screenshot_of_two_failures_with_whole_buttons(screenshot: Compare) -> N
             y
             for y in range(MINIMUM_SIZE_PX[1] - 120, MINIMUM_SIZE_PX[1] - 60, 2)
             if not hand.click(MINIMUM_SIZE_PX[0] - 60.0, float(y))
-            and hand.main_view.take_requests() == ("close_run:2",)
+            and hand.main_view.take_requests() == (OnItem("close_run", 2),)
         ]
         assert closes[-1] - closes[0] >= 12, "one hits it anywhere"
 
@@ -138,8 +139,8 @@ def test_second_click_on_the_stop_button_resumes(software_gpu: None) -> None:
             (x, y)
             for x in range(SMALLEST[0] - 90, SMALLEST[0] - 10, 12)
             for y in (FOOT_Y - 5, FOOT_Y + 3)
-            if asked(running, x, y) == ("stop_run:1",)
+            if asked(running, x, y) == (OnItem("stop_run", 1),)
         ]
         assert len(stops) >= 4
         found = {asked(replace(running, status="stopped"), x, y) for x, y in stops}
-        assert found == {("resume_run:1",)}
+        assert found == {(OnItem("resume_run", 1),)}

@@ -20,6 +20,7 @@ from viewer.commands.render import export
 from viewer.files import session
 from viewer.files.session import WindowSession
 from viewer.state import selection
+from viewer.state.commands import Plain
 
 pytestmark = pytest.mark.gl
 
@@ -63,7 +64,7 @@ def test_moved_selection_follows_the_gizmo_and_can_be_canceled(app: App) -> None
     matrix = np.eye(4)
     matrix[:3, 3] = 0.5, 0.25, -0.125
     app.main_view.gizmo = replace(gizmo, matrix=matrix)
-    app.main_view.request("place")
+    app.main_view.request(Plain("place"))
     app.draw()
     app.draw()
     assert [layer.name for layer in app.main_view.live] == ["moved"]

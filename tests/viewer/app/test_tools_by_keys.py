@@ -12,6 +12,7 @@ from PIL import Image
 
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.app.decal import Decal
+from viewer.state.commands import Plain
 from viewer.state.view_state import SelectTool
 from viewer.ui.keys import TOOL_KEYS, bind
 
@@ -105,7 +106,7 @@ def test_decal_is_placed_by_keys(tmp_path: Path) -> None:
         assert isinstance(hand.main_view.gizmo, Decal)
         assert hand.main_view.gizmo.at == places(MIDDLE, WAY)[-1]
         hand.key("Space")
-        assert "lay_decal" in hand.main_view.take_requests()
+        assert Plain("lay_decal") in hand.main_view.take_requests()
 
 
 def test_escape_releases_the_pointer_to_the_mouse() -> None:
@@ -131,8 +132,8 @@ def test_escape_releases_the_pointer_to_the_mouse() -> None:
 def test_tool_keys_can_be_rebound_independently() -> None:
     try:
         assert bind({"point_press": "J", "nudge:0.01": "Left"}) == []
-        assert TOOL_KEYS["J"].action == "point_press"
+        assert TOOL_KEYS["J"].id == "point_press"
         assert "Space" not in TOOL_KEYS
-        assert TOOL_KEYS["Left"].action == "point:-4,0", "a key may be both"
+        assert TOOL_KEYS["Left"].id == "point:-4,0", "a key may be both"
     finally:
         bind({})

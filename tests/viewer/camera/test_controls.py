@@ -238,8 +238,8 @@ def test_every_command_has_an_action_with_and_without_layers() -> None:
     facts = SceneFacts("bear.ply", 3, Bounds(), (row,))
     for layers in ((), (LayerState(0, "scarf", 0.5),)):
         work = workspace.new_workspace(ViewState(layers=layers))
-        for action in COMMANDS:
-            after = perform(work, action, facts)
+        for command in COMMANDS.values():
+            after = perform(work, command.action, facts)
             assert usable(after.view.camera)
             assert all(0.0 <= layer.strength <= 1.0 for layer in after.view.layers)
 

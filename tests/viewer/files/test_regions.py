@@ -17,6 +17,7 @@ from tests.helpers.ui_rig import bear, first_view
 from viewer.files import exports, session
 from viewer.files.session import WindowSession
 from viewer.state import selection
+from viewer.state.commands import Plain, Rename, WithText
 from viewer.state.selection import SelectionState
 
 TOTAL = 1500
@@ -168,7 +169,7 @@ def test_window_reports_rejected_regions_and_saves_them_again(
         message = app.main_view.work.message
         assert message is not None
         assert "region r0 (../victim.txt), not a .region.npy file in the session's folder" in message.text
-        app.handle("save")
+        app.handle(Plain("save"))
         assert (folder / "r0.region.npy").exists()
         (tmp_path / "elsewhere").mkdir()
         app.file_actions.save(tmp_path / "elsewhere" / "moved")
@@ -183,8 +184,8 @@ def test_window_saves_a_region_beside_the_scene_and_in_the_session(tmp_path: Pat
     view = first_view(bear(), 0.5, 0.5)
     view = replace(view, selection=selection.select(SelectionState(), MASK))
     with null_app(document, view, tmp_path) as app:
-        app.handle("save_region: jacket ")
-        app.handle("rename_region:0:coat")
+        app.handle(WithText("save_region", " jacket "))
+        app.handle(Rename("rename_region", 0, "coat"))
         work = app.main_view.work
         assert [region.name for region in work.view.selection.regions] == ["coat"]
         assert (tmp_path / "coat.region.npy").exists()

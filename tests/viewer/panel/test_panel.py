@@ -14,6 +14,7 @@ from viewer.panel import card, panel, tools
 from viewer.panel.slider import parse_strength
 from viewer.state import history, workspace
 from viewer.state.actions import perform
+from viewer.state.commands import Action, Plain
 from viewer.state.facts import LayerRow
 from viewer.state.view_state import LayerState, ViewState
 from viewer.state.workspace import PreviewState, SceneFacts, Workspace
@@ -37,7 +38,7 @@ class Hand:
 
     ui: UiContext
     work: Workspace
-    actions: list[str] = field(default_factory=list)
+    actions: list[Action] = field(default_factory=list)
 
     def frame(self) -> None:
         imgui.new_frame()
@@ -124,9 +125,9 @@ def test_drag_moves_the_slider_and_makes_one_undo_entry(hand: Hand) -> None:
     hand.button(False)
     assert hand.strengths == pytest.approx([0.75, 0.0], abs=0.01)
     assert len(hand.work.past.past) == 1
-    undone = perform(hand.work, "undo", FACTS)
+    undone = perform(hand.work, Plain("undo"), FACTS)
     assert undone.view == STACK
-    assert perform(undone, "redo", FACTS).view == hand.work.view
+    assert perform(undone, Plain("redo"), FACTS).view == hand.work.view
 
 
 def test_drag_back_to_the_start_leaves_no_undo_entry(hand: Hand) -> None:
@@ -251,13 +252,13 @@ def test_blend_rule_is_chosen_from_the_list_and_can_be_undone(hand: Hand) -> Non
     place = imgui.get_current_context().open_popup_stack[0].window.pos / hand.ui.scale
     hand.click(place.x + 40, place.y + 8 + 21 * 2 + 7)
     assert hand.work.view.blend == "sum"
-    assert perform(hand.work, "undo", FACTS).view == STACK
+    assert perform(hand.work, Plain("undo"), FACTS).view == STACK
 
 
 def test_buttons_request_the_same_actions_as_keys(hand: Hand) -> None:
     hand.click(SIZE[0] - 25, SIZE[1] - 22)
     hand.click(SIZE[0] - 55, SIZE[1] - 22)
-    assert hand.actions == ["help", "picture"]
+    assert hand.actions == [Plain("help"), Plain("picture")]
 
 
 def test_undo_button_is_disabled_without_history(hand: Hand) -> None:
@@ -265,7 +266,7 @@ def test_undo_button_is_disabled_without_history(hand: Hand) -> None:
     assert hand.actions == []
     hand.click(at(0.3), TRACKS[1])
     hand.click(LEFT + 24, SIZE[1] - 22)
-    assert hand.actions == ["undo"]
+    assert hand.actions == [Plain("undo")]
 
 
 def test_up_axis_button_rolls_the_camera_upright() -> None:

@@ -25,6 +25,7 @@ from viewer.commands.stack_options import StackOptions
 from viewer.panel import card, panel
 from viewer.panel.slider import parse_strength
 from viewer.state import facts, timeline
+from viewer.state.commands import OnItem
 from viewer.state.facts import layer_rows
 from viewer.state.layers import (
     LONGEST_NAME,
@@ -454,7 +455,7 @@ def test_layer_menu_renames_and_requests_other_actions(hand: Rig) -> None:
     assert names(hand) == ["shawl", "ears"]
     menu(hand, 0, 1)
     menu(hand, 1, 2)
-    assert hand.main_view.take_requests() == ("duplicate:0", "replace:1")
+    assert hand.main_view.take_requests() == (OnItem("duplicate", 0), OnItem("replace", 1))
     toggle(hand, "menu", 0)
     assert imgui.is_popup_open("", imgui.PopupFlags_.any_popup.value)
     hand.modifier(imgui.Key.escape)

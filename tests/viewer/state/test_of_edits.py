@@ -13,6 +13,7 @@ from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.jobs.training import ALL, TYPED
 from viewer.state import paint, selection
 from viewer.state.actions import perform
+from viewer.state.commands import OnItem, Plain
 from viewer.state.selection import NamedRegion
 from viewer.state.workspace import SceneFacts, Workspace
 
@@ -42,17 +43,17 @@ def selecting(work: Workspace, rows: np.ndarray, count: int) -> Workspace:
 def test_again_opens_the_form_with_the_settings_of_the_edit(hand: Rig) -> None:
     work = hand.main_view.work
     facts = of_edit(hand.main_view.facts, "recolor:#1b6972,path=hue", "labels:parts.npy:5")
-    form = perform(work, f"again:{SCARF}", facts)
+    form = perform(work, OnItem("again", SCARF), facts)
     assert (form.form_open, form.form_opening) == (True, True)
     assert form.form.spec == "recolor:#1b6972,path=hue"
     assert (form.form.region, form.form.typed_region) == (TYPED, "labels:parts.npy:5")
     assert form.form.name == work.view.layers[SCARF].name
-    everywhere = perform(work, f"again:{SCARF}", of_edit(facts, "night:0.40", "all")).form
+    everywhere = perform(work, OnItem("again", SCARF), of_edit(facts, "night:0.40", "all")).form
     assert (everywhere.region, everywhere.spec) == (ALL, "night:0.40")
     regions = (NamedRegion("hands", Path("/scenes/hands.region.npy"), b"", 3),)
     view = replace(work.view, selection=replace(work.view.selection, regions=regions))
     named = of_edit(facts, "tint:#ff0000", "file:/scenes/hands.region.npy")
-    assert perform(replace(work, view=view), f"again:{SCARF}", named).form.region == "hands"
+    assert perform(replace(work, view=view), OnItem("again", SCARF), named).form.region == "hands"
 
 
 def test_again_ignores_edits_that_no_form_editor_made(hand: Rig) -> None:
@@ -65,22 +66,24 @@ def test_again_ignores_edits_that_no_form_editor_made(hand: Rig) -> None:
         "grade:x",
         "",
     ):
-        assert perform(work, f"again:{SCARF}", of_edit(hand.main_view.facts, instruction, "all")) == work
+        assert (
+            perform(work, OnItem("again", SCARF), of_edit(hand.main_view.facts, instruction, "all")) == work
+        )
 
 
 def test_layer_is_limited_to_the_selection_and_can_be_reduced_again(hand: Rig) -> None:
     facts = hand.main_view.facts
     work = hand.main_view.work
     row = facts.rows[SCARF]
-    assert perform(work, f"limit_to_selection:{SCARF}", facts) == work, "nothing is selected"
+    assert perform(work, OnItem("limit_to_selection", SCARF), facts) == work, "nothing is selected"
     half = row.members[::2]
     third = row.members[::3]
-    work = perform(selecting(work, half, facts.count), f"limit_to_selection:{SCARF}", facts)
+    work = perform(selecting(work, half, facts.count), OnItem("limit_to_selection", SCARF), facts)
     weights = paint.decode(work.view.layers[SCARF].paint, row.count)
     assert weights is not None
     assert row.members[weights.numpy() == 1.0].tolist() == half.tolist()
     assert work.view.layers[EARS].paint == paint.FULL
-    work = perform(selecting(work, third, facts.count), f"limit_to_selection:{SCARF}", facts)
+    work = perform(selecting(work, third, facts.count), OnItem("limit_to_selection", SCARF), facts)
     weights = paint.decode(work.view.layers[SCARF].paint, row.count)
     assert weights is not None
     assert row.members[weights.numpy() == 1.0].tolist() == row.members[::6].tolist()
@@ -92,7 +95,7 @@ def test_select_painted_selects_the_painted_members(hand: Rig) -> None:
     row = facts.rows[SCARF]
 
     def selected(work: Workspace) -> list[int]:
-        found = perform(replace(work, focus=SCARF), "select_painted", facts).view.selection
+        found = perform(replace(work, focus=SCARF), Plain("select_painted"), facts).view.selection
         return np.flatnonzero(selection.unpack(found.members, facts.count)).tolist()
 
     assert selected(work) == row.members.tolist(), "all of its region where nothing is painted"

@@ -15,6 +15,7 @@ from tests.helpers.ui_rig import bear, first_view
 from viewer.camera.view_camera import Bounds
 from viewer.state import selection, workspace
 from viewer.state.actions import perform
+from viewer.state.commands import Plain
 from viewer.state.selection import EMPTY_MASK, SelectionState
 from viewer.state.workspace import SceneFacts, Workspace
 
@@ -44,7 +45,7 @@ def test_refine_button_matches_the_refine_step_of_a_region() -> None:
     facts = SceneFacts("bear.ply", len(scene), Bounds(), (), neighborhood=lambda: near)
     rough = scene.means[:, 1].numpy() > 0.3
     work = selecting(workspace.new_workspace(first_view(bear())), rough)
-    refined = perform(work, "select_refine", facts).view.selection
+    refined = perform(work, Plain("select_refine"), facts).view.selection
     mask = selection.unpack(refined.members, len(scene))
     assert np.array_equal(mask, read_step("refine")(near, rough))
     assert refined.count == mask.sum() != rough.sum()
@@ -102,8 +103,8 @@ def test_selection_is_one_undo_entry_but_no_unsaved_change() -> None:
     twice = selecting(once, every(7))
     assert len(twice.past.past) == 2
     assert not workspace.has_unsaved(twice)
-    assert perform(twice, "undo", facts).view.selection == once.view.selection
-    assert perform(perform(twice, "undo", facts), "redo", facts).view == twice.view
+    assert perform(twice, Plain("undo"), facts).view.selection == once.view.selection
+    assert perform(perform(twice, Plain("undo"), facts), Plain("redo"), facts).view == twice.view
     kept = selection.add_region(twice.view.selection, "jacket", Path("jacket.region.npy"))
     assert workspace.has_unsaved(replace(twice, view=replace(twice.view, selection=kept)))
 

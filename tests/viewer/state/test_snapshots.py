@@ -13,6 +13,7 @@ from tests.helpers.ui_rig import bear, first_view, rig
 from viewer.app import app as application
 from viewer.state import snapshots, workspace
 from viewer.state.actions import perform
+from viewer.state.commands import Action, ChooseSnapshot, MoveSnapshot, OnItem, Plain, Rename, WithValue
 
 # y of a snapshot card whose x is 874, and of items in its menu
 CARD = 316.0
@@ -24,28 +25,28 @@ def test_snapshots_can_be_restored_as_one_undo_entry() -> None:
     work = workspace.new_workspace(first_view(bear(), 0.5, 0.5))
     facts = application.Document("bear.ply", bear().scene, bear().gdfs).facts()
 
-    def act(work: workspace.Workspace, action: str) -> workspace.Workspace:
+    def act(work: workspace.Workspace, action: Action) -> workspace.Workspace:
         return workspace.record_undo(perform(work, action, facts))
 
-    work = act(work, "snapshot")
-    assert act(work, "snapshot").snapshots == work.snapshots, "the same twice is once"
-    work = act(work, "nudge:0.25")
-    work = act(work, "snapshot")
+    work = act(work, Plain("snapshot"))
+    assert act(work, Plain("snapshot")).snapshots == work.snapshots, "the same twice is once"
+    work = act(work, WithValue("nudge", 0.25))
+    work = act(work, Plain("snapshot"))
     assert [s.name for s in snapshots.with_original(work.snapshots, work.view)] == ["original", "1", "2"]
     entries = len(work.past.past)
-    back = act(work, "restore:1")
+    back = act(work, OnItem("restore", 1))
     assert [layer.strength for layer in back.view.layers] == [0.5, 0.5]
     assert back.view.blend == work.view.blend
     assert len(back.past.past) == entries + 1
-    assert act(back, "undo").view == work.view
-    assert [layer.strength for layer in act(work, "restore:0").view.layers] == [0.0, 0.0]
-    deleted = act(work, "forget:1")
+    assert act(back, Plain("undo")).view == work.view
+    assert [layer.strength for layer in act(work, OnItem("restore", 0)).view.layers] == [0.0, 0.0]
+    deleted = act(work, OnItem("forget", 1))
     assert [s.name for s in deleted.snapshots] == ["2"]
-    assert act(deleted, "undo").snapshots == work.snapshots
-    assert act(act(deleted, "undo"), "redo").snapshots == deleted.snapshots
-    named = act(work, "name_snapshot:2: warm  light ")
+    assert act(deleted, Plain("undo")).snapshots == work.snapshots
+    assert act(act(deleted, Plain("undo")), Plain("redo")).snapshots == deleted.snapshots
+    named = act(work, Rename("name_snapshot", 2, " warm  light "))
     assert [s.name for s in named.snapshots] == ["1", "warm light"]
-    assert act(named, "undo").snapshots == work.snapshots
+    assert act(named, Plain("undo")).snapshots == work.snapshots
 
 
 def test_restoring_a_snapshot_sets_later_edits_to_zero() -> None:
@@ -58,16 +59,18 @@ def test_restoring_a_snapshot_sets_later_edits_to_zero() -> None:
 def test_snapshots_are_reordered_and_renamed_with_their_pair() -> None:
     work = workspace.new_workspace(first_view(bear(), 0.5, 0.5))
     facts = application.Document("bear.ply", bear().scene, bear().gdfs).facts()
-    for action in ("snapshot", "nudge:0.1", "snapshot", "nudge:0.1", "snapshot", "choose_snapshot:a:1"):
+    take = Plain("snapshot")
+    nudge = WithValue("nudge", 0.1)
+    for action in (take, nudge, take, nudge, take, ChooseSnapshot("a", "1")):
         work = workspace.record_undo(perform(work, action, facts))
-    moved = workspace.record_undo(perform(work, "move_snapshot:3:1", facts))
+    moved = workspace.record_undo(perform(work, MoveSnapshot(3, 1), facts))
     assert [kept.name for kept in moved.snapshots] == ["3", "1", "2"]
-    assert [kept.name for kept in perform(moved, "undo", facts).snapshots] == ["1", "2", "3"]
-    assert [kept.name for kept in perform(moved, "move_snapshot:1:0", facts).snapshots] == ["3", "1", "2"]
-    named = perform(moved, "name_snapshot:2:dusk", facts)
+    assert [kept.name for kept in perform(moved, Plain("undo"), facts).snapshots] == ["1", "2", "3"]
+    assert [kept.name for kept in perform(moved, MoveSnapshot(1, 0), facts).snapshots] == ["3", "1", "2"]
+    named = perform(moved, Rename("name_snapshot", 2, "dusk"), facts)
     assert named.view.pair.a == "dusk"
-    assert perform(named, "name_snapshot:3:original", facts).snapshots[2].name == "original-2"
-    gone = perform(named, "forget:2", facts)
+    assert perform(named, Rename("name_snapshot", 3, "original"), facts).snapshots[2].name == "original-2"
+    gone = perform(named, OnItem("forget", 2), facts)
     assert snapshots.pair_of(snapshots.with_original(gone.snapshots, gone.view), gone.view.pair) == (1, 2)
 
 

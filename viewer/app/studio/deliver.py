@@ -39,13 +39,13 @@ class DeliverActions:
 
     @property
     def requests(self) -> Requests:
-        """Handlers of `SUFFIXES`, `deliver:QUESTION`, `rebind:EDIT`, `rebind_from:EDIT\\nSCENE`, `about`."""
+        """Requests for the dialogs of `SUFFIXES`, for their output, and for rebinding an edit."""
         ask, version = self._app.main_view.ask, sys.version.split()[0]
         return {
             **{name: partial(self._ask, name) for name in SUFFIXES},
             "deliver": self._deliver,
-            "rebind": lambda edit: ask(Dialog("rebind", then=edit)),
-            "rebind_from": lambda files: self._rebind(*files.split("\n", 1)),
+            "rebind": lambda edit: ask(Dialog("rebind", file=edit)),
+            "rebind_from": lambda action: self._rebind(action.edit, action.scene),
             "about": lambda _: ask(Dialog("about", f"ProGDF Studio {__version__}, Python {version}")),
         }
 
@@ -57,7 +57,7 @@ class DeliverActions:
             main_view.work = replace(main_view.work, dialog=replace(dialog, error=error) if error else None)
             main_view.wake()
 
-    def _ask(self, name: str, _: str) -> None:
+    def _ask(self, name: str, _: None) -> None:
         path = self._app.document.file
         main_view = self._app.main_view
         view = main_view.work.view

@@ -14,6 +14,7 @@ from progdf.io.session import SUFFIX
 from progdf.terminal import escape_text
 from viewer.camera.view_camera import LARGEST_SIDE, SHAPES, ViewCamera
 from viewer.jobs.job_queue import FORMATS, FPS, SIDES, DeliverOptions, film_title, picture_size
+from viewer.state.commands import Action, Plain, WithText
 from viewer.state.view_state import ViewState
 from viewer.ui import overlay
 from viewer.ui.context import BEHIND, FIXED, PALETTE, SMALL_PX, Icon, UiContext, u32
@@ -62,7 +63,9 @@ class StartFile:
     missing: bool = False
 
 
-def draw_start_page(recent: Sequence[StartFile], examples: Sequence[StartFile], ui: UiContext) -> list[str]:
+def draw_start_page(
+    recent: Sequence[StartFile], examples: Sequence[StartFile], ui: UiContext
+) -> list[Action]:
     """Draw the start page over the whole window and return the requested actions."""
     display = imgui.get_io().display_size
     scale = ui.scale
@@ -102,13 +105,13 @@ def _columns(room: float, count: int, ui: UiContext) -> float:
     return float(int((room - (count - 1) * GAP_PX * ui.scale) / count))
 
 
-def _head(wide: float, tall: float, ui: UiContext) -> list[str]:
+def _head(wide: float, tall: float, ui: UiContext) -> list[Action]:
     """Draw the program's name and the buttons that open a file or train the demo.
 
     `tall` is the height of the drop field in pixels; 0 draws it as one line.
     """
     scale = ui.scale
-    actions = []
+    actions = list[Action]()
     flat = not tall
     begin = imgui.get_cursor_pos()
     with imgui_ctx.push_font(ui.fonts.bold, 26.0):
@@ -133,7 +136,7 @@ def _head(wide: float, tall: float, ui: UiContext) -> list[str]:
     imgui.text_disabled(DROP_TEXT)
     imgui.set_cursor_pos((x + side, y + side) if flat else (middle[0], middle[1] - 2.0 * scale))
     if accent_button(f"{Icon.OPEN}  Open…", button):
-        actions.append("open")
+        actions.append(Plain("open"))
     hint("open")
     if flat:
         imgui.set_cursor_pos((x + frame.x - button.x - side, y + side))
@@ -141,7 +144,7 @@ def _head(wide: float, tall: float, ui: UiContext) -> list[str]:
         imgui.set_cursor_pos((x, y + frame.y + 12.0 * scale))
     imgui.push_item_flag(_NO_NAV, True)
     if imgui.button("Train the demo", (button.x if flat else wide, button.y)):
-        actions.append("demo")
+        actions.append(Plain("demo"))
     imgui.pop_item_flag()
     hint("demo")
     imgui.set_cursor_pos((x, y))
@@ -149,9 +152,9 @@ def _head(wide: float, tall: float, ui: UiContext) -> list[str]:
     return actions
 
 
-def _grid(files: Sequence[StartFile], wide: float, room: float, own: bool, ui: UiContext) -> list[str]:
+def _grid(files: Sequence[StartFile], wide: float, room: float, own: bool, ui: UiContext) -> list[Action]:
     """Draw cards of `wide` pixels and return the requested actions. `own`: the user can remove the cards"""
-    actions = list[str]()
+    actions = list[Action]()
     gap = GAP_PX * ui.scale
     across = max(int((room + gap + 1.0) // (wide + gap)), 1)
     for i, file in enumerate(files):
@@ -162,7 +165,7 @@ def _grid(files: Sequence[StartFile], wide: float, room: float, own: bool, ui: U
     return actions
 
 
-def _card(file: StartFile, wide: float, own: bool, ui: UiContext) -> list[str]:
+def _card(file: StartFile, wide: float, own: bool, ui: UiContext) -> list[Action]:
     """Draw a picture with two lines of text and return the action requested by click, Enter or the close
     button."""
     tall = 0.75 * wide
@@ -170,7 +173,7 @@ def _card(file: StartFile, wide: float, own: bool, ui: UiContext) -> list[str]:
     scale = ui.scale
     imgui.begin_group()
     at = imgui.get_cursor_screen_pos()
-    requested = list[str]()
+    requested = list[Action]()
     storage = imgui.get_state_storage()
     known = int(imgui.internal.get_current_window().id_)
     if not storage.get_bool(known):  # the first card has the keyboard focus
@@ -179,12 +182,13 @@ def _card(file: StartFile, wide: float, own: bool, ui: UiContext) -> list[str]:
         imgui.set_nav_cursor_visible(True)
     imgui.set_next_item_allow_overlap()
     if imgui.invisible_button("file", (wide, tall), imgui.ButtonFlags_.enable_nav.value):
-        requested = ["open"] if file.missing else [f"{'open_file' if own else 'example'}:{file.path}"]
+        opened = WithText("open_file" if own else "example", str(file.path))
+        requested = [Plain("open") if file.missing else opened]
     hovered = imgui.is_item_hovered(
         imgui.HoveredFlags_.no_nav_override.value
     )  # imgui frames the item with the keyboard focus
     if own and imgui.is_item_focused() and imgui.is_key_pressed(imgui.Key.delete, False):
-        requested = [f"forget_file:{file.path}"]
+        requested = [WithText("forget_file", str(file.path))]
     path = escape_text(str(file.path))
     tip(f"{path} was not found. Open it from its new location." if file.missing else path)
     canvas = imgui.get_window_draw_list()
@@ -203,7 +207,7 @@ def _card(file: StartFile, wide: float, own: bool, ui: UiContext) -> list[str]:
         imgui.set_cursor_screen_pos(corner)
         imgui.push_item_flag(_NO_NAV, True)  # the arrow keys move from card to card
         if icon_button("forget", Icon.CLOSE, ui):
-            requested = [f"forget_file:{file.path}"]
+            requested = [WithText("forget_file", str(file.path))]
         imgui.pop_item_flag()
         tip("Remove from this page (Del); the file stays")
         imgui.set_cursor_screen_pos(below)

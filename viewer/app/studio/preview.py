@@ -270,7 +270,7 @@ class PreviewActions:
             self._ask_painting(request, self._child)
         return POLL_S if self._outstanding or request != self._sent else None
 
-    def _paint_view(self, _: str) -> None:
+    def _paint_view(self, _: None) -> None:
         """Save a picture of this view of the original, open it in another program and add it to the form.
 
         Raises:

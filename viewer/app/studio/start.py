@@ -63,7 +63,7 @@ class StartActions:
 
     @property
     def requests(self) -> Requests:
-        """Handlers of the requests `demo`, `example:BUNDLE`, `forget_file:PATH`, by name."""
+        """Requests for the demo, for a bundle of the examples, and to forget a file."""
         return {"demo": self._start_demo, "example": self._open_example, "forget_file": self._forget}
 
     def _forget(self, path: str) -> None:
@@ -113,7 +113,7 @@ class StartActions:
                 texture.release()
         self._textures.clear()
 
-    def _start_demo(self, _: str) -> None:
+    def _start_demo(self, _: None) -> None:
         folder = (state_folder() / "demo").resolve()
         self._demo = folder
         self._added = {}

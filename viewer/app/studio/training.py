@@ -28,6 +28,7 @@ from viewer.files import exports
 from viewer.jobs import training
 from viewer.jobs.job_queue import Delivery, JobQueue, QueuedTask
 from viewer.jobs.training import ALL, CHANGED, SELECTION, TYPED, EditOrder, NewEdit
+from viewer.state.commands import Plain
 from viewer.state.selection import EMPTY_MASK, SUFFIX, NamedRegion, add_region, free_name
 from viewer.state.view_state import LayerState
 from viewer.state.workspace import Dialog
@@ -88,13 +89,13 @@ class JobActions:
             "train": self._train,
             "paint_over": self._paint_over,
             "lay_decal": self._lay_decal,
-            "stop_run": lambda number: queue.stop(int(number)),
-            "resume_run": lambda number: queue.resume(int(number)),
+            "stop_run": queue.stop,
+            "resume_run": queue.resume,
             "ask_discard": self._ask_discard,
-            "discard_run": lambda number: queue.discard(int(number)),
-            "close_run": lambda number: queue.dismiss(int(number)),
-            "show_file": lambda number: webbrowser.open(queue.job(int(number)).task.out.parent.as_uri()),
-            "copy_path": lambda number: imgui.set_clipboard_text(str(queue.job(int(number)).task.out)),
+            "discard_run": queue.discard,
+            "close_run": queue.dismiss,
+            "show_file": lambda number: webbrowser.open(queue.job(number).task.out.parent.as_uri()),
+            "copy_path": lambda number: imgui.set_clipboard_text(str(queue.job(number).task.out)),
             "run_log": self._show_log,
             "stop_and_quit": lambda _: self._quit(EditOrder),
             "drop_and_quit": lambda _: self._quit(Delivery),
@@ -117,8 +118,8 @@ class JobActions:
         if kind is EditOrder:
             self._app.main_view.show_message("Saving the training state …")
 
-    def _show_log(self, number: str) -> None:
-        self._app.main_view.ask(Dialog("log", str(self.queue.job(int(number)).task.log)))
+    def _show_log(self, number: int) -> None:
+        self._app.main_view.ask(Dialog("log", str(self.queue.job(number).task.log)))
 
     def poll(self) -> float | None:
         """Poll the jobs; return the seconds until the next poll, None for never."""
@@ -129,14 +130,14 @@ class JobActions:
         self._publish()
         if self._quits is not None and not self.queue.busy(self._quits):
             self._quits = None
-            self._app.main_view.request("quit")
+            self._app.main_view.request(Plain("quit"))
         return self.queue.next_poll()
 
     def close(self) -> None:
         """Stop the running jobs."""
         self.queue.close()
 
-    def _train(self, _: str) -> None:
+    def _train(self, _: None) -> None:
         """Queue the form's edit; an error stays in the form."""
         main_view = self._app.main_view
         form = main_view.work.form
@@ -176,7 +177,7 @@ class JobActions:
             selection = replace(add_region(view.selection, name, path), members=EMPTY_MASK, count=0)
             main_view.change(replace(view, selection=selection))
 
-    def _lay_decal(self, _: str) -> None:
+    def _lay_decal(self, _: None) -> None:
         """Queue the placed decal with its camera and its position in the picture."""
         main_view = self._app.main_view
         scene = self._app.document.path
@@ -233,7 +234,7 @@ class JobActions:
             Image.fromarray(taken[0]).save(temporary_file, "PNG", pnginfo=chunk)
         return str(path)
 
-    def _paint_over(self, _: str) -> None:
+    def _paint_over(self, _: None) -> None:
         """Save the picture for editing in another program, and follow that file from now on."""
         main_view = self._app.main_view
         scene = self._app.document.file
@@ -269,12 +270,12 @@ class JobActions:
         exports.write_region(NamedRegion(name, path, members, selection.count), total)
         return f"file:{path}"
 
-    def _ask_discard(self, number: str) -> None:
+    def _ask_discard(self, number: int) -> None:
         """Ask before discarding a run that has begun; discard a waiting one directly."""
-        job = self.queue.job(int(number))
+        job = self.queue.job(number)
         if job.task.is_begun:
             spent = job.task.read_progress(job.progress).seconds
-            self._app.main_view.ask(Dialog("discard_run", format_duration(spent), number))
+            self._app.main_view.ask(Dialog("discard_run", format_duration(spent), item=number))
         else:
             self.queue.discard(job.number)
 
