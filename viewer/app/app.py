@@ -118,6 +118,7 @@ class App:
             window.ui_scale,
             exports.folder_of(document.path),
         )
+        self.store = self.main_view.store
         self.file_actions = FileActions(self, session)
         self.jobs = JobActions(
             self,
@@ -140,7 +141,7 @@ class App:
         self._waits = False  # a splash is visible
         self._title = ""
         self._layout = user_files.read_layout()
-        self.main_view.work = replace(self.main_view.work, layout=self._layout)
+        self.store.replace(replace(self.store.get(), layout=self._layout))
         # by place: frame number of the last failure, time of its last message
         self._failures: dict[str, tuple[int, float]] = {}
         self.main_view.report = self.report
@@ -237,7 +238,7 @@ class App:
         self.window.new_frame()
         screen = self.context.screen
         self.main_view.frame(screen, seconds, self.window.take_keys())
-        self.window.point(self.main_view.pointed.at)
+        self.window.point(self.store.get().transient.pointer.at)
         self.window.present()
         self._rename()
         for request in self.main_view.take_requests():
@@ -361,7 +362,7 @@ class App:
         main_view = self.main_view
         name = escape_text(path.name.removesuffix(".session.json")) if path else ""
         if name != main_view.work.session:
-            main_view.work = replace(main_view.work, session=name)
+            self.store.replace(replace(main_view.work, session=name))
             main_view.wake()
         if main_view.work.layout != self._layout and not imgui.is_mouse_down(0):
             self._layout = main_view.work.layout

@@ -19,6 +19,7 @@ from progdf.io.atomic import state_folder
 from viewer.files.document import Document
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import LayerState, ViewState
+from viewer.state.workspace import Store
 
 from .main_view import MainView
 
@@ -31,6 +32,7 @@ class Application(Protocol):
 
     document: Document
     main_view: MainView
+    store: Store  # the window's state
 
     def open(self, path: Path) -> None:
         """Open a file according to its content."""

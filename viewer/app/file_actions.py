@@ -34,12 +34,12 @@ from viewer.state.commands import Action, Plain, Rename, WithText
 from viewer.state.facts import describe_applied
 from viewer.state.layers import add_layer, duplicate_layer, replace_edit
 from viewer.state.view_state import ViewState, on_another_scene
-from viewer.state.workspace import Dialog, focus_layer, with_camera
+from viewer.state.workspace import Dialog, focus_layer, with_camera, with_transient
 from viewer.ui.keys import COMMANDS, shortcut
 
 from . import dialogs
 from .application import Application, Requests, attempt, error_details, failure_line, log_error
-from .decal import Decal, is_decal
+from .decal import is_decal, load_decal
 from .main_view import MainView
 
 
@@ -66,12 +66,13 @@ def edit_picture(main_view: MainView, path: Path) -> None:
         )
     _take_camera(main_view, camera)
     work = main_view.work
-    main_view.work = replace(work, form=with_picture(work.form, path, work.form_open), form_open=True)
+    form = with_picture(work.form, path, work.form_open)
+    main_view.store.replace(replace(work, form=form, form_open=True))
 
 
 def _take_camera(main_view: MainView, camera: Camera) -> None:
     view_camera = from_camera(main_view.work.view.camera, camera, main_view.facts.bounds)
-    main_view.work = with_camera(main_view.work, view_camera)
+    main_view.store.replace(with_camera(main_view.work, view_camera))
 
 
 def keep_camera(app: Application, session: Path | None) -> None:
@@ -203,7 +204,7 @@ class EditActions:
         """Set the changed stack and focus one layer."""
         main_view = self._app.main_view
         main_view.change(view)
-        main_view.work = focus_layer(main_view.work, focus)
+        self._app.store.replace(focus_layer(main_view.work, focus))
 
 
 class FileActions:
@@ -222,7 +223,7 @@ class FileActions:
         self._browser = dialogs.Browser()
         self._edits = EditActions(app)
         opened = app.document
-        app.main_view.recent = self._remember(*(file for file in (opened.path, path) if file is not None))
+        self._remember(*(file for file in (opened.path, path) if file is not None))
 
     @property
     def requests(self) -> Requests:
@@ -310,8 +311,8 @@ class FileActions:
         self.session_autosave.drop()
         self.path = path
         main_view = self._app.main_view
-        main_view.work = workspace.mark_saved(main_view.work)
-        main_view.recent = self._remember(path)
+        self._app.store.replace(workspace.mark_saved(main_view.work))
+        self._remember(path)
         main_view.show_message(f"Saved {path.resolve()}")
 
     def autosave(self, now: float) -> float | None:
@@ -360,7 +361,8 @@ class FileActions:
         main_view = self._app.main_view
         if kind == "picture":
             if is_decal(path) and self._app.document.path is not None:
-                main_view.gizmo = Decal.take(main_view.context, path)
+                decal = load_decal(main_view.context, path)
+                self._app.store.replace(with_transient(main_view.work, gizmo=decal))
                 main_view.wake()
             else:
                 edit_picture(main_view, path)
@@ -384,7 +386,7 @@ class FileActions:
             self._open_session(path)
         else:
             self._open_scene(path)
-        self._app.main_view.recent = self._remember(path)
+        self._remember(path)
 
     def _open_session(self, path: Path) -> None:
         main_view = self._app.main_view
@@ -398,7 +400,7 @@ class FileActions:
             self.path = path
             self.offer_autosave()
             return
-        main_view.work = replace(main_view.work, saved=None)
+        self._app.store.replace(replace(main_view.work, saved=None))
         discarded = session.is_discarded(path)
         # work that was never saved, or was discarded, never replaces a session without a question
         self.path = saved if saved.is_file() and not discarded else None
@@ -418,7 +420,7 @@ class FileActions:
 
     def _discard(self, _: None) -> None:
         """Discard unsaved work; its autosave stays under another name."""
-        self._app.main_view.work = workspace.mark_saved(self._app.main_view.work)
+        self._app.store.replace(workspace.mark_saved(self._app.store.get()))
         self.session_autosave.discard()
 
     def _discard_autosave(self, path: str) -> None:
@@ -500,7 +502,7 @@ class FileActions:
                 main_view.ask(Dialog("overwrite", str(file), then))
                 return
             self.save(file)
-            main_view.work = replace(main_view.work, dialog=None)
+            self._app.store.replace(replace(main_view.work, dialog=None))
             if then is not None:
                 main_view.request(then)
 
@@ -532,5 +534,8 @@ class FileActions:
         """Return the session's file, or an unused name if it has none."""
         return self.path or session.free_session(self._session_name(), self.session_autosave.path)
 
-    def _remember(self, *paths: Path) -> tuple[Path, ...]:
-        return remember_recent(paths) if paths else read_recent()
+    def _remember(self, *paths: Path) -> None:
+        """Add files to the recent ones."""
+        recent = remember_recent(paths) if paths else read_recent()
+        store = self._app.store
+        store.replace(with_transient(store.get(), recent=recent))

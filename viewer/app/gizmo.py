@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import replace
 
 import numpy as np
 from imgui_bundle import imgui
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from viewer.camera.view_camera import to_camera
+from viewer.state.transient import Gizmo
 from viewer.ui.pointer import PointerContext
 from viewer.ui.widgets import accent_button, plate
 
@@ -20,54 +20,38 @@ _OPERATION = im_guizmo.OPERATION
 _HANDLES = _OPERATION(_OPERATION.translate | _OPERATION.rotate | _OPERATION.scaleu)
 
 
-@dataclass(frozen=True)
-class Gizmo:
-    """Handles around the selection being moved."""
+def draw_gizmo(gizmo: Gizmo, pointer: PointerContext) -> tuple[Gizmo, str]:
+    """Draw the handles; return them after this frame's mouse input, and the request, "" for none."""
+    size = pointer.size
+    camera = to_camera(pointer.shown.camera, *size)
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL looks along −z
+    view = flip @ camera.viewmat.double().numpy()
+    place = np.eye(4)
+    place[:3, 3] = gizmo.center
+    im_guizmo.begin_frame()
+    im_guizmo.set_drawlist(imgui.get_background_draw_list())
+    im_guizmo.set_rect(0.0, 0.0, pointer.area.width, pointer.area.height)
+    model = _columns(place @ gizmo.matrix)
+    projection = _columns(_projection(pointer.shown.camera.fov_y, size[0] / size[1], pointer.engine.near))
+    im_guizmo.manipulate(_columns(view), projection, _HANDLES, im_guizmo.MODE.world, model)
+    moved = np.linalg.inv(place) @ np.array(model.values, np.float64).reshape(4, 4).T
+    using = bool(im_guizmo.is_using())
+    matrix = moved if using or gizmo.using else gizmo.matrix
+    request = "place" if gizmo.using and not using else _buttons(gizmo, pointer)
+    return replace(gizmo, matrix=matrix, using=using), request
 
-    does: Literal["transform", "duplicate"]
-    center: tuple[float, float, float]  # center of the selection, where the handles start
-    # from the original to the current position, about the center; world axes. [4,4]
-    matrix: NDArray[np.float64]
-    using: bool = False  # the mouse drags a handle
 
-    def draw(self, pointer: PointerContext) -> tuple[Gizmo, str]:
-        """Draw the handles; return them after this frame's mouse input, and the resulting request, "" for
-        none."""
-        size = pointer.size
-        camera = to_camera(pointer.shown.camera, *size)
-        flip = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL looks along −z
-        view = flip @ camera.viewmat.double().numpy()
-        place = np.eye(4)
-        place[:3, 3] = self.center
-        im_guizmo.begin_frame()
-        im_guizmo.set_drawlist(imgui.get_background_draw_list())
-        im_guizmo.set_rect(0.0, 0.0, pointer.area.width, pointer.area.height)
-        model = _columns(place @ self.matrix)
-        projection = _columns(_projection(pointer.shown.camera.fov_y, size[0] / size[1], pointer.engine.near))
-        im_guizmo.manipulate(_columns(view), projection, _HANDLES, im_guizmo.MODE.world, model)
-        moved = np.linalg.inv(place) @ np.array(model.values, np.float64).reshape(4, 4).T
-        using = bool(im_guizmo.is_using())
-        matrix = moved if using or self.using else self.matrix
-        request = "place" if self.using and not using else _buttons(self, pointer)
-        return replace(self, matrix=matrix, using=using), request
+def gizmo_takes_mouse(gizmo: Gizmo) -> bool:
+    """Return True if the mouse is over a handle or drags one."""
+    return gizmo.using or bool(im_guizmo.is_over())
 
-    @property
-    def step(self) -> tuple[list[float], list[float], float]:
-        """Translation, rotation (axis times radians) and scale of the selection."""
-        linear = self.matrix[:3, :3]
-        scale = max(abs(float(np.linalg.det(linear))) ** (1 / 3), 1e-6)
-        rotation = Rotation.from_matrix(linear / scale).as_rotvec()
-        return self.matrix[:3, 3].tolist(), rotation.tolist(), scale
 
-    @property
-    def is_moved(self) -> bool:
-        """True if the selection is not at its original position."""
-        return not np.allclose(self.matrix, np.eye(4), atol=1e-9)
-
-    @property
-    def takes_mouse(self) -> bool:
-        """True if the mouse is over a handle or drags one."""
-        return self.using or bool(im_guizmo.is_over())
+def gizmo_step(gizmo: Gizmo) -> tuple[list[float], list[float], float]:
+    """Return translation, rotation (axis times radians) and scale of the selection."""
+    linear = gizmo.matrix[:3, :3]
+    scale = max(abs(float(np.linalg.det(linear))) ** (1 / 3), 1e-6)
+    rotation = Rotation.from_matrix(linear / scale).as_rotvec()
+    return gizmo.matrix[:3, 3].tolist(), rotation.tolist(), scale
 
 
 def _columns(matrix: NDArray[np.float64]) -> im_guizmo.Matrix16:

@@ -6,7 +6,6 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import zip_longest
-from pathlib import Path
 
 from imgui_bundle import imgui, imgui_ctx
 
@@ -15,7 +14,7 @@ from viewer.pictures.compare import Labels
 from viewer.state import history, workspace
 from viewer.state.actions import GLIDES, perform
 from viewer.state.commands import Action, OnItem
-from viewer.state.workspace import PreviewState, Workspace
+from viewer.state.workspace import Workspace
 from viewer.ui import overlay
 from viewer.ui.context import FIXED, PALETTE, SMALL_PX, UiContext, u32
 from viewer.ui.keys import COMMANDS, JOINED, TOPICS, Command, chords, find_commands, is_changed, shortcut
@@ -258,8 +257,6 @@ def panels(
     work: Workspace,
     pointer: PointerContext,
     pictures: panel.Pictures,
-    preview: PreviewState,
-    recent: Sequence[Path],
     reveal: bool,
     compared: tuple[Labels, bool],
 ) -> Workspace:
@@ -271,7 +268,7 @@ def panels(
     actions: list[Action] = []
     area = pointer.area
     ui = pointer.ui
-    work = panel.draw(work, pointer.facts, pictures, preview, recent, reveal, ui, actions)
+    work = panel.draw(work, pointer.facts, pictures, reveal, ui, actions)
     work = perform_actions(work, actions, pointer)
     if work.player.shown:
         requested = timeline_bar.draw(work, area, ui)

@@ -26,8 +26,9 @@ from viewer.state import actions, layer_selection, timeline, workspace
 from viewer.state.commands import Action, Plain, WithValue
 from viewer.state.layers import add_layer
 from viewer.state.snapshots import SliderSnapshot, compare_sides
+from viewer.state.transient import Decal, Gizmo, KeyPointer, Transient
 from viewer.state.view_state import LayerState, ViewState
-from viewer.state.workspace import PLACES, Dialog, PreviewState, SceneFacts
+from viewer.state.workspace import PLACES, Dialog, SceneFacts, Store, Workspace, with_transient
 from viewer.ui import overlay
 from viewer.ui.context import UiContext
 from viewer.ui.keys import (
@@ -46,11 +47,10 @@ from viewer.ui.pointer import PointerContext
 
 from . import interface, mouse, select_tool
 from .canvas import Canvas
-from .decal import Decal
-from .gizmo import Gizmo
-from .mouse import KeyPointer, MouseTool
+from .decal import decal_takes_mouse, draw_decal, place_decal
+from .gizmo import draw_gizmo, gizmo_takes_mouse
+from .mouse import MouseTool
 from .studio import pages
-from .studio.pages import Cover
 
 SETTLE_FRAMES = 3  # imgui needs a frame or two until hovering and layout follow an event
 LINGER_S = 0.65
@@ -127,21 +127,15 @@ class MainView:
         self.facts = facts
         self.pictures = pictures
         self.canvas = Canvas(context, engine)
-        self.recent: tuple[Path, ...] = ()  # recently opened files, for the dialogs
         # for the start page: recently opened files, and examples
         self.start_files: tuple[Sequence[pages.StartFile], Sequence[pages.StartFile]] = (), ()
-        self.cover: Cover | None = None  # image drawn over the picture
-        self.preview = PreviewState()  # state of the preview of a new edit
-        self.live: tuple[LayerState, ...] = ()  # edits in training, on top of the layer stack
         self.report: Callable[[Exception], None] = self._report  # receives the errors of a part of a frame
-        self.gizmo: Gizmo | Decal | None = None  # handles of a selection being moved, or a decal being placed
         self.surfaces = Surfaces()
         self.ui = UiContext(scale)
         imgui.backends.opengl3_init("#version 330")
-        self.work = workspace.new_workspace(view)
+        self.store = Store(workspace.new_workspace(view))
         self.frames = 0  # number of frames drawn
         self._tool = MouseTool()
-        self.pointed = KeyPointer()
         # the layer shown in the panel, and whether several are selected
         self._revealed = (self.work.focus, False)
         self._keys = NO_KEYS  # keys of the current frame
@@ -153,6 +147,15 @@ class MainView:
         self._resting = False
         self._pace = FramePacer()
         self.wake = self._pace.wake
+
+    @property
+    def work(self) -> Workspace:
+        """State of the window."""
+        return self.store.get()
+
+    @work.setter
+    def work(self, work: Workspace) -> None:
+        self.store.replace(work)
 
     def rest(self) -> None:
         """Stop drawing until the next frame, as the window is minimized."""
@@ -177,7 +180,7 @@ class MainView:
         self.surfaces.drop()
         self.engine = engine
         self.facts = facts
-        self.live = live
+        self.work = with_transient(self.work, live=live)
         self.canvas = Canvas(self.context, engine, self.canvas)
         self.wake()
 
@@ -189,9 +192,12 @@ class MainView:
     def restart(self, view: ViewState, snapshots: tuple[SliderSnapshot, ...] = ()) -> None:
         """Set a new state and snapshots, with an empty undo history, no active drag and nothing over the
         picture."""
-        self.work = replace(workspace.new_workspace(view, snapshots), layout=self.work.layout)
+        old = self.work.transient
+        transient = Transient(live=old.live, pointer=old.pointer, recent=old.recent)
+        self.work = replace(
+            workspace.new_workspace(view, snapshots), layout=self.work.layout, transient=transient
+        )
         self._tool = MouseTool()
-        self.cover, self.preview, self.gizmo = None, PreviewState(), None
         self.wake()
 
     def next_frame_delay(self) -> float | None:
@@ -283,7 +289,7 @@ class MainView:
         self.canvas.comparer.sides = compare_sides(self.work.snapshots, view)
         pointed = self.work.pointed if view.panel else None
         held = self._is_held()
-        live = bool(self.live)
+        live = bool(self.work.transient.live)
         self.canvas.draw(view, screen, area, held, self._clock, self.work.focus, pointed, live)
         if self.canvas.pixels == 1 and not self._is_held():
             self._pointer().look_ahead()
@@ -339,9 +345,7 @@ class MainView:
                 if missing:
                     self.wake()
                 compared = self.canvas.comparer.labels(self.work.view), self.work.before
-                self.work = interface.panels(
-                    self.work, self._pointer(), pictures, self.preview, self.recent, reveal, compared
-                )
+                self.work = interface.panels(self.work, self._pointer(), pictures, reveal, compared)
             self._revealed = self.work.focus, several
         held = self._tool.drag is None and self._move_gizmo()
         if not off and not held:  # else the right button was only pressed to cancel the drag
@@ -355,17 +359,17 @@ class MainView:
     def _point_by_keys(self, asks: bool) -> None:
         """Move the pointer of the active tool by keys."""
         work = self.work
-        decal = isinstance(self.gizmo, Decal)
+        held = work.transient.pointer
+        decal = isinstance(work.transient.gizmo, Decal)
         picks = work.form_open and work.form.picks
         if decal or picks or work.view.select.tool or work.view.brush.active:
             clicks = decal or picks or work.view.select.tool in select_tool.CLICKED
             if not (asks or self.at_start or imgui.get_io().want_text_input):
-                self.pointed, self._keys = mouse.point_by_keys(
-                    self.pointed, self._keys, self._pointer(), clicks
-                )
-        elif self.pointed.at or self.pointed.down:
-            mouse.let_go(self.pointed)
-            self.pointed = KeyPointer()
+                held, self._keys = mouse.point_by_keys(held, self._keys, self._pointer(), clicks)
+                self.work = with_transient(work, pointer=held)
+        elif held.at or held.down:
+            mouse.let_go(held)
+            self.work = with_transient(work, pointer=KeyPointer())
 
     def _follow_keyboard(self, asks: bool) -> None:
         """Restrict the keys while a part of the window has the keyboard.
@@ -393,28 +397,36 @@ class MainView:
 
     def _move_gizmo(self) -> bool:
         """Move the handles or the decal with the mouse; return True if they take the mouse."""
-        if self.gizmo is None:
+        gizmo = self.work.transient.gizmo
+        if gizmo is None:
             return False
         pressed = [press.chord for press in self._keys.pressed]
-        keep = "lay_decal"
-        if isinstance(self.gizmo, Gizmo):
+        moved: Gizmo | Decal
+        if isinstance(gizmo, Gizmo):
             keep = "keep_placed"
-        self.gizmo, asked = self.gizmo.draw(self._pointer())
+            moved, asked = draw_gizmo(gizmo, self._pointer())
+            takes_mouse = gizmo_takes_mouse(moved)
+        else:
+            keep = "lay_decal"
+            moved, asked = draw_decal(gizmo, self._pointer())
+            takes_mouse = decal_takes_mouse()
+        self.work = with_transient(self.work, gizmo=moved)
         if "Escape" in pressed or "Enter" in pressed:
             asked = "put_back" if "Escape" in pressed else keep
         if asked:
             self.request(Plain(asked))
-        if isinstance(self.gizmo, Gizmo) and self.gizmo.using:
+        if isinstance(moved, Gizmo) and moved.using:
             self.wake()
-        return self.gizmo.takes_mouse
+        return takes_mouse
 
     @property
     def decal_place(self) -> tuple[Path, Camera, str] | None:
         """File of the decal being placed, the camera from which it is placed, and its position in that
         picture."""
-        if not isinstance(self.gizmo, Decal):
+        decal = self.work.transient.gizmo
+        if not isinstance(decal, Decal):
             return None
-        return self.gizmo.path, *self.gizmo.place(self._pointer())
+        return decal.path, *place_decal(decal, self._pointer())
 
     def _takes_keys(self) -> bool:
         """Return True if a dialog, list, menu or form takes all keys, or Escape has just closed one."""
@@ -425,7 +437,7 @@ class MainView:
     def _cancel_drag(self) -> None:
         """Restore the state from before the drag and end the drag."""
         self.work, self._tool = mouse.cancel_drag(self._tool, self.work), MouseTool()
-        self.pointed = mouse.let_go(self.pointed)
+        self.work = with_transient(self.work, pointer=mouse.let_go(self.work.transient.pointer))
         imgui.internal.clear_active_id()
         self._keys = replace(self._keys, pressed=())
 
@@ -459,10 +471,12 @@ class MainView:
         sides = compare_sides(self.work.snapshots, view)
         if sides is not None:
             return sides.right
-        for layer in self.live:
+        transient = self.work.transient
+        for layer in transient.live:
             view = add_layer(view, layer.gdf, layer.name, layer.strength)
-        moved = self.work.form_open or self.gizmo is not None  # the live edit is theirs, not from training
-        if self.live and moved and self._tool.gesture is None:
+        # the live edit is theirs, not from training
+        moved = self.work.form_open or transient.gizmo is not None
+        if transient.live and moved and self._tool.gesture is None:
             view = replace(view, select=replace(view.select, tool=""))
         return view
 
@@ -470,7 +484,9 @@ class MainView:
         """Return the size of the safe frame; None while an image lies over the picture."""
         area = self._area()
         covered = timeline_bar.height(self.work, self._area(), self.ui)
-        return None if self.cover is not None else overlay.safe_frame(self.work.view, area, covered)
+        if self.work.transient.cover is not None:
+            return None
+        return overlay.safe_frame(self.work.view, area, covered)
 
     def _is_held(self) -> bool:
         """Return True if the user's input or a playing film moves the picture."""
@@ -489,15 +505,16 @@ class MainView:
             self.work = interface.draw_dialog(self.work, pointer, pressed)
         original = self.work.before
         with self._guard():
-            if self.cover is not None and not original:
-                pages.draw_cover(self.cover, self.work.view, pointer.size, pointer.area, self.ui)
+            cover = self.work.transient.cover
+            if cover is not None and not original:
+                pages.draw_cover(cover, self.work.view, pointer.size, pointer.area, self.ui)
         if (frame := self._frame()) is not None:
             overlay.draw_frame(self.work.view.safe_frame, frame, pointer.area, self.ui)
         with self._guard():
             offered = pages.COMMANDS if self.at_start else [a for a, c in COMMANDS.items() if not c.in_hand]
             self.work = interface.draw_lists(self.work, pointer, offered, pressed)
         labels = self.canvas.comparer.labels(self.work.view)
-        at = self.pointed.at
+        at = self.work.transient.pointer.at
         self.work = interface.over_picture(self.work, pointer, self._tool, labels, original, at)
         gone = (before.dialog, self.work.dialog), (before.message, self.work.message)
         if any(was is not None and now is None for was, now in gone):

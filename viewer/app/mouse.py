@@ -15,6 +15,7 @@ from viewer.state import paint, workspace
 from viewer.state.commands import MovePointer
 from viewer.state.layers import with_paint
 from viewer.state.paint import Stroke
+from viewer.state.transient import KeyPointer
 from viewer.state.view_state import Brush, SelectTool, ViewState
 from viewer.state.workspace import Workspace
 from viewer.ui import overlay
@@ -89,14 +90,6 @@ class MouseTool:
     axis: str = ""  # the pressed end of an axis, of `AXES`, or another part of the axes
     # settings of the selection tool and the brush before a button was pressed
     settings: tuple[SelectTool, Brush] | None = None
-
-
-@dataclass(frozen=True)
-class KeyPointer:
-    """Pointer of a tool when it is moved by keys."""
-
-    at: tuple[float, float] | None = None  # in the window; None while the mouse moves it
-    down: bool = False  # keys pressed the button
 
 
 def point_by_keys(

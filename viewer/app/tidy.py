@@ -22,12 +22,14 @@ from progdf.terminal import group_digits
 from progdf.tidy import Step, similarity, tidy
 from viewer.jobs.training import edits_folder, free_path
 from viewer.state import selection
+from viewer.state.transient import Gizmo
 from viewer.state.view_state import LayerState
+from viewer.state.workspace import with_transient
 from viewer.ui.keys import shortcut
 
 from .application import Application, Requests
 from .file_actions import EditActions
-from .gizmo import Gizmo
+from .gizmo import gizmo_step
 
 _NAMES = {"remove": "removed", "transform": "moved", "duplicate": "copy"}
 _INSTRUCTIONS = {"remove": "remove", "transform": "move", "duplicate": "copy"}
@@ -61,7 +63,7 @@ class TidyActions:
     def leave_scene(self) -> None:
         """Drop the handles when another scene opens."""
         self._region = None
-        self._app.main_view.gizmo = None
+        self._set_gizmo(None)
 
     def _begin(self, does: str) -> None:
         main_view = self._app.main_view
@@ -77,14 +79,15 @@ class TidyActions:
         center = scene.means[region.members].double().mean(dim=0)
         kind: Literal["transform", "duplicate"] = "duplicate" if does == "duplicate" else "transform"
         self._region = region
-        main_view.gizmo = Gizmo(kind, (float(center[0]), float(center[1]), float(center[2])), np.eye(4))
+        at = (float(center[0]), float(center[1]), float(center[2]))
+        self._set_gizmo(Gizmo(kind, at, np.eye(4)))
         main_view.wake()
 
     def _steps(self) -> list[Step]:
-        gizmo = self._app.main_view.gizmo
+        gizmo = self._app.store.get().transient.gizmo
         if not isinstance(gizmo, Gizmo) or self._region is None:
             return []
-        return [Step(gizmo.does, self._region, similarity(*gizmo.step))]
+        return [Step(gizmo.does, self._region, similarity(*gizmo_step(gizmo)))]
 
     def _place(self, _: None) -> None:
         """Show the moved selection at the place of the handles."""
@@ -95,7 +98,7 @@ class TidyActions:
             self._app.show(document, (gdf,), live)
 
     def _keep(self, _: None) -> None:
-        gizmo = self._app.main_view.gizmo
+        gizmo = self._app.store.get().transient.gizmo
         steps = self._steps()
         if isinstance(gizmo, Gizmo) and steps and (gizmo.does == "duplicate" or gizmo.is_moved):
             self._add(steps[0].does, steps)
@@ -109,8 +112,12 @@ class TidyActions:
 
     def _end(self) -> None:
         self._region = None
-        self._app.main_view.gizmo = None
+        self._set_gizmo(None)
         self._app.main_view.wake()
+
+    def _set_gizmo(self, gizmo: Gizmo | None) -> None:
+        store = self._app.store
+        store.replace(with_transient(store.get(), gizmo=gizmo))
 
     def _add(self, does: str, steps: Sequence[Step]) -> None:
         """Write the edit and add it as a layer on top."""

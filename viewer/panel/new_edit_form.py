@@ -28,7 +28,8 @@ from viewer.jobs.training import (
 )
 from viewer.state.commands import Action, Plain
 from viewer.state.selection import SelectionState
-from viewer.state.workspace import PreviewState, Workspace
+from viewer.state.transient import PreviewState
+from viewer.state.workspace import Workspace
 from viewer.ui.context import PALETTE, Icon, UiContext, u32
 from viewer.ui.keys import COMMANDS, shortcut
 from viewer.ui.widgets import (
@@ -64,9 +65,7 @@ _GRADES = {
 }
 
 
-def draw(
-    work: Workspace, count: int, preview: PreviewState, ui: UiContext, actions: list[Action]
-) -> Workspace:
+def draw(work: Workspace, count: int, ui: UiContext, actions: list[Action]) -> Workspace:
     """Draw the form if it is open. Tab moves through it, Enter trains, Escape closes it.
 
     Args:
@@ -88,7 +87,7 @@ def draw(
         if closes:  # skip the fields, which would undo the typing
             actions.append(Plain("new_edit"))
         else:
-            form, action = _content(work, count, preview, ui)
+            form, action = _content(work, count, ui)
             if trains:
                 action = "train"
             if action:
@@ -108,12 +107,13 @@ def has_keyboard() -> bool:
     return window is not None and window.was_active and f"/{_NAME}_" in window.name
 
 
-def _content(work: Workspace, count: int, preview: PreviewState, ui: UiContext) -> tuple[NewEdit, str]:
+def _content(work: Workspace, count: int, ui: UiContext) -> tuple[NewEdit, str]:
     """Draw the form; return the changed form and the requested action.
 
     The action is "train", "paint_over", "new_edit" to close the form, or "" for none.
     """
     form = work.form
+    preview = work.transient.preview
     selection = work.view.selection
     action = ""
     right = right_edge()

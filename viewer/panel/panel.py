@@ -15,7 +15,7 @@ from viewer.state import history
 from viewer.state.commands import Action, OnItem, Plain, Rename, SelectRegion, WithText
 from viewer.state.layer_selection import selected_layers
 from viewer.state.selection import NamedRegion
-from viewer.state.workspace import UNSAVED, Layout, PreviewState, SceneFacts, Workspace, has_unsaved
+from viewer.state.workspace import UNSAVED, Layout, SceneFacts, Workspace, has_unsaved
 from viewer.ui import widgets
 from viewer.ui.context import BEHIND, FIXED, PALETTE, SMALL_PX, Icon, UiContext, u32
 
@@ -63,8 +63,6 @@ def draw(
     work: Workspace,
     facts: SceneFacts,
     pictures: Pictures,
-    preview: PreviewState,
-    recent: Sequence[Path],
     reveal: bool,
     ui: UiContext,
     actions: list[Action],
@@ -75,8 +73,6 @@ def draw(
         work: the state to show and change
         facts: data of the open scene
         pictures: thumbnails of snapshots and edits
-        preview: state of the preview of a new edit
-        recent: recently opened files, the last one first
         reveal: scroll to the focused layer
         ui: fonts and scale
         actions: receives the requested actions, see `perform`
@@ -91,7 +87,7 @@ def draw(
     imgui.begin("panel", None, FIXED | BEHIND | flags | ui.nav_flags("panel"))
     ui.take_keyboard("panel")
     work = replace(work, layout=_drag_edge(work.layout, ui))
-    _title(work, facts, recent, ui, actions)
+    _title(work, facts, ui, actions)
     footer = imgui.get_frame_height() + imgui.get_style().item_spacing.y * 2
     footer += training_cards.height(work.jobs, ui)
     room = imgui.get_content_region_avail().y - footer - cards.HEADING_PX * ui.scale
@@ -101,7 +97,7 @@ def draw(
     selected = selected_layers(work)
     _begin_body(footer + cards.selection_height(selected, ui), ui)
     work = cards.draw_heading(work, ui, actions)
-    work = new_edit_form.draw(work, facts.count, preview, ui, actions)
+    work = new_edit_form.draw(work, facts.count, ui, actions)
     work = cards.draw(work, facts.rows, pictures.edits, reveal, ui, actions)
     work = _regions(work, ui, actions)
     work = snapshot_cards.draw(work, pictures.snapshots, ui, actions)
@@ -152,9 +148,7 @@ def _end_body() -> None:
     imgui.get_state_storage().set_bool(imgui.get_id("overflows"), overflows)
 
 
-def _title(
-    work: Workspace, facts: SceneFacts, recent: Sequence[Path], ui: UiContext, actions: list[Action]
-) -> None:
+def _title(work: Workspace, facts: SceneFacts, ui: UiContext, actions: list[Action]) -> None:
     """Draw the session's name, with a dot for unsaved changes, the scene with its size, and the icons."""
     corner = imgui.get_cursor_pos()
     side = 24.0 * ui.scale
@@ -178,7 +172,7 @@ def _title(
     widgets.more_button("share", _SHARE_ACTIONS, ui, actions, Icon.SHARE, side)
     widgets.tip("Export and render")
     imgui.same_line(0.0, 0.0)
-    _menu_button(recent, side, ui, actions)
+    _menu_button(work.transient.recent, side, ui, actions)
     imgui.set_cursor_pos(below)
     imgui.dummy((0.0, 2.0 * scale))
 

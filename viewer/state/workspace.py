@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 from msgspec import Meta
 
@@ -29,6 +29,7 @@ from .history import Edit, History
 from .selection import SelectionState
 from .snapshots import SliderSnapshot
 from .timeline import Player
+from .transient import Transient
 from .view_state import Comparison, ViewState
 
 MESSAGE_S = 6.0  # time that a message stays visible, s
@@ -42,18 +43,6 @@ UNSAVED = "• "
 """Prefix of the scene's name while there are unsaved changes."""
 PLACES = ("panel", "tools", "options", "view", "comparison", "timeline")
 """Parts of the window in the order of keyboard focus. Some may be hidden."""
-
-
-class PreviewState(NamedTuple):
-    """State of the preview in the form of a new edit."""
-
-    text: str = ""  # progress such as "drawing", or the reason of a failure
-    failed: bool = False  # whether `text` is that reason
-    busy: bool = False  # whether a model is generating
-    painted: bool = False  # whether the picture of a prompt is available
-    models: tuple[str, ...] = ()  # models installed on this machine
-    sheet: int = 0  # GL name of the texture with the style previews of this view, see `SHEET_PX`
-    styles: frozenset[int] = frozenset()  # styles available in it
 
 
 def _no_facts() -> Any:
@@ -162,6 +151,22 @@ class Workspace:
     glide: Glide | None = None  # running animation of the camera
     layout: Layout = Layout()
     session: str = ""  # name of the session file, "" before there is one
+    transient: Transient = Transient()
+
+
+class Store:
+    """Holder of the window's workspace. The parts of the window read and replace it here alone."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        self._workspace = workspace
+
+    def get(self) -> Workspace:
+        """Return the current workspace."""
+        return self._workspace
+
+    def replace(self, workspace: Workspace) -> None:
+        """Set the workspace from now on."""
+        self._workspace = workspace
 
 
 def new_workspace(view: ViewState, snapshots: tuple[SliderSnapshot, ...] = ()) -> Workspace:
@@ -185,6 +190,11 @@ def mark_saved(workspace: Workspace) -> Workspace:
 def has_unsaved(workspace: Workspace) -> bool:
     """Return whether closing would lose unsaved work."""
     return workspace.saved != saved_state(workspace)
+
+
+def with_transient(workspace: Workspace, **changes: Any) -> Workspace:
+    """Return the workspace with these attributes of its transient state."""
+    return replace(workspace, transient=replace(workspace.transient, **changes))
 
 
 def original(view: ViewState) -> ViewState:

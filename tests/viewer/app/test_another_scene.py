@@ -19,8 +19,9 @@ from viewer.files import session
 from viewer.files.session import WindowSession
 from viewer.state import selection
 from viewer.state.selection import NamedRegion, SelectionState, pack
+from viewer.state.transient import PreviewState
 from viewer.state.view_state import Brush, SelectTool, SnapshotPair, ViewState, on_another_scene
-from viewer.state.workspace import PreviewState, mark_saved, new_workspace
+from viewer.state.workspace import mark_saved, new_workspace
 
 OF_THE_WINDOW = {
     "safe_frame",
@@ -99,7 +100,7 @@ def test_another_scene_opens_while_the_old_one_is_in_use(
     assert work.view.selection.regions == ()
     assert not work.view.brush.active
     assert (work.form_open, work.form, work.player) == (fresh.form_open, fresh.form, fresh.player)
-    assert (main_view.cover, main_view.preview) == (None, PreviewState())
+    assert (main_view.work.transient.cover, main_view.work.transient.preview) == (None, PreviewState())
 
 
 @pytest.mark.gl

@@ -15,9 +15,11 @@ from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.ui_rig import bear, first_view, rig
 from viewer.app.app import App
-from viewer.app.decal import Decal, is_decal
+from viewer.app.decal import decal_corners, is_decal, load_decal
 from viewer.jobs.training import EditOrder
 from viewer.state.commands import Plain
+from viewer.state.transient import Decal
+from viewer.state.workspace import with_transient
 
 pytestmark = pytest.mark.gl
 
@@ -37,17 +39,19 @@ def app(tmp_path: Path) -> Iterator[App]:
 
 
 def in_hand(app: App) -> Decal:
-    assert isinstance(app.main_view.gizmo, Decal)
-    return app.main_view.gizmo
+    assert isinstance(app.main_view.work.transient.gizmo, Decal)
+    return app.main_view.work.transient.gizmo
 
 
 def test_decal_follows_the_pointer_and_scales_with_the_wheel(logo: Path) -> None:
     with rig(first_view(bear())) as hand:
         camera = hand.main_view.work.view.camera
-        hand.main_view.gizmo = Decal.take(hand.main_view.context, logo)
+        hand.main_view.work = with_transient(
+            hand.main_view.work, gizmo=load_decal(hand.main_view.context, logo)
+        )
         hand.io.add_mouse_pos_event(200.0, 300.0)
         hand.frame(2)
-        first = hand.main_view.gizmo
+        first = hand.main_view.work.transient.gizmo
         assert isinstance(first, Decal)
         assert first.at == (200.0, 300.0)
         assert first.size == 0.25 * hand.io.display_size.y
@@ -56,7 +60,7 @@ def test_decal_follows_the_pointer_and_scales_with_the_wheel(logo: Path) -> None
             hand.io.add_mouse_wheel_event(0.0, 1.0)
             hand.frame(2)
         hand.modifier(imgui.Key.mod_shift, False)
-        now = hand.main_view.gizmo
+        now = hand.main_view.work.transient.gizmo
         assert isinstance(now, Decal)
         assert (now.size, now.angle) == (pytest.approx(1.08 * first.size), 5.0)
         assert hand.main_view.work.view.camera == camera
@@ -74,7 +78,7 @@ def test_enter_places_the_decal_at_its_position(
     x, y = app.main_view.picture_size
     press(app, "Enter")
     app.draw()
-    assert app.main_view.gizmo is None
+    assert app.main_view.work.transient.gizmo is None
     (order,) = orders
     words = dict(word.lstrip("-").split("=", 1) for word in order.arguments() if "=" in word)
     assert words["editor"] == f"decal:{logo}"
@@ -85,10 +89,11 @@ def test_enter_places_the_decal_at_its_position(
 
 def test_decal_corners_turn_counterclockwise(app: App, logo: Path) -> None:
     app.open(logo)
-    texture = in_hand(app).texture
-    flat = Decal(logo, texture, 80.0, 0.0, (100.0, 100.0)).corners
+    decal = in_hand(app)
+    texture, size = decal.texture, decal.texture_size
+    flat = decal_corners(Decal(logo, texture, size, 80.0, 0.0, (100.0, 100.0)))
     assert flat == [(60.0, 80.0), (140.0, 80.0), (140.0, 120.0), (60.0, 120.0)]
-    turned = Decal(logo, texture, 80.0, 90.0, (100.0, 100.0)).corners
+    turned = decal_corners(Decal(logo, texture, size, 80.0, 90.0, (100.0, 100.0)))
     assert np.allclose(turned, [(80.0, 140.0), (80.0, 60.0), (120.0, 60.0), (120.0, 140.0)])
 
 

@@ -103,8 +103,8 @@ def layer(app: application.App) -> LayerState:
 
 def test_grade_is_a_live_layer_driven_by_the_form(window: application.App) -> None:
     opened(window, strength=0.25)
-    assert [live.strength for live in window.main_view.live] == [0.25]
-    assert (window.main_view.cover, window.main_view.work.view.layers) == (None, ())
+    assert [live.strength for live in window.main_view.work.transient.live] == [0.25]
+    assert (window.main_view.work.transient.cover, window.main_view.work.view.layers) == (None, ())
     with_form(window, strength=0.75)
     press(window, "Home", "5")
     assert [live.strength for live in visible_layers(window.main_view._displayed_view())] == [0.75]
@@ -115,9 +115,9 @@ def test_grade_is_a_live_layer_driven_by_the_form(window: application.App) -> No
     assert not window.main_view._displayed_view().select.tool, "a selection would hide the colors"
     window.main_view.work = work
     with_form(window, color=(1.0, 0.0, 0.0))
-    assert (Previews.asked, len(window.main_view.live)) == (2, 1)
+    assert (Previews.asked, len(window.main_view.work.transient.live)) == (2, 1)
     with_form(window, preview=False)
-    assert window.main_view.live == ()
+    assert window.main_view.work.transient.live == ()
 
 
 def test_color_drag_shows_every_grade_and_requests_the_newest_next(
@@ -140,11 +140,13 @@ def test_color_drag_shows_every_grade_and_requests_the_newest_next(
     opened(window, color=(0.1, 0.0, 0.0))
     for red in (0.2, 0.3, 0.4):
         with_form(window, color=(red, 0.0, 0.0))
-    assert (requested, window.main_view.live) == (["recolor:#1a0000"], ()), "one at a time"
+    assert (requested, window.main_view.work.transient.live) == (["recolor:#1a0000"], ()), "one at a time"
     answer()
     with_form(window, color=(0.5, 0.0, 0.0))
     assert requested[1:] == ["recolor:#800000"], "what was passed by meanwhile is never asked"
-    assert len(window.main_view.live) == 1, "what has come is seen, though the color has moved on"
+    assert len(window.main_view.work.transient.live) == 1, (
+        "what has come is seen, though the color has moved on"
+    )
     with_form(window, color=(0.1, 0.0, 0.0))  # back to the visible color while another grade is computed
     answer()
     turn(window)
@@ -176,10 +178,10 @@ def test_manual_grade_gets_the_main_colors_of_its_region(
     opened(window, editor=next(i for i, e in enumerate(EDITORS) if e.kind == "grade"))
     form = window.main_view.work.form
     assert form.palette == (("#7eae44", "#7eae44"), ("#000001", "#000001"))
-    assert (requested, window.main_view.live) == (["grade"], ())
+    assert (requested, window.main_view.work.transient.live) == (["grade"], ())
     with_form(window, palette=(("#7eae44", "#3060d0"), form.palette[1]))
     assert requested[1:] == ["grade:#7eae44=#3060d0,#000001"]
-    assert len(window.main_view.live) == 1
+    assert len(window.main_view.work.transient.live) == 1
     with_form(window, region="typed", typed_region="sphere:0,0,0,9")
     assert requested[2] == "grade"
     assert window.main_view.work.form.palette[0] == ("#7eae44", "#3060d0"), "nothing that was chosen is lost"
@@ -210,7 +212,7 @@ def test_styles_are_previewed_one_after_the_other(
         turn(window)
     order = [(f"style:{number}", True) for number in STYLE_ORDER]
     assert requested == [("style:14", False), *order], "what the form says first, then each style once"
-    shown = window.main_view.preview
+    shown = window.main_view.work.transient.preview
     assert shown.styles == {*STYLE_ORDER} - {3}, "what cannot be painted stays a number"
     assert not shown.failed
     assert window.preview._sheet is not None
@@ -226,7 +228,9 @@ def test_styles_are_previewed_one_after_the_other(
     for _ in range(3):
         turn(window)
     assert requested[28:30] == [("style:14", False), order[0]], "another view is painted anew"
-    assert window.main_view.preview.styles == shown.styles, "over the last, which stays until then"
+    assert window.main_view.work.transient.preview.styles == shown.styles, (
+        "over the last, which stays until then"
+    )
     with_form(window, style=23)
     assert ("style:23", False) in requested[30:32], "and what the form says does not wait for it"
 
@@ -235,8 +239,8 @@ def test_preview_without_a_grade_shows_the_picture_of_the_editor(window: applica
     opened(window)
     Previews.grade = None
     with_form(window, editor=2)
-    assert window.main_view.cover is not None
-    assert window.main_view.live == ()
+    assert window.main_view.work.transient.cover is not None
+    assert window.main_view.work.transient.live == ()
 
 
 def test_prompt_is_painted_on_request_and_the_edit_follows_it(
@@ -249,13 +253,15 @@ def test_prompt_is_painted_on_request_and_the_edit_follows_it(
     opened(window)
     Previews.asked = 0
     with_form(window, editor=7, sentence="make it a statue")
-    state = window.main_view.preview
+    state = window.main_view.work.transient.preview
     assert (state.text, state.models, state.painted) == ("tiny on the CPU", ("a/tiny",), False)
-    assert (window.main_view.cover, Previews.asked) == (None, 1), "said what would paint, nothing painted"
+    assert (window.main_view.work.transient.cover, Previews.asked) == (None, 1), (
+        "said what would paint, nothing painted"
+    )
     with_form(window, asks=1)
-    assert window.main_view.cover is not None
-    assert window.main_view.cover.name == "Anchor: make it a statue"
-    assert (window.main_view.preview.painted, Previews.asked) == (True, 2)
+    assert window.main_view.work.transient.cover is not None
+    assert window.main_view.work.transient.cover.name == "Anchor: make it a statue"
+    assert (window.main_view.work.transient.preview.painted, Previews.asked) == (True, 2)
     painted = to_camera(window.main_view.work.view.camera, 4, 4)
     press(window, "Home", "5")
     turn(window)
@@ -264,7 +270,9 @@ def test_prompt_is_painted_on_request_and_the_edit_follows_it(
     anchor = Path(window.main_view.work.form.anchor)
     assert torch.allclose(find_picture_camera(anchor).viewmat, painted.viewmat, atol=1e-6)
     assert given == [anchor], "the program that paints pictures has it"
-    assert window.main_view.cover.name == "Anchor: make it a statue", "seen until something is saved"
+    assert window.main_view.work.transient.cover.name == "Anchor: make it a statue", (
+        "seen until something is saved"
+    )
     with Image.open(anchor) as picture:
         size = picture.size
         chunk = PngInfo()
@@ -272,10 +280,10 @@ def test_prompt_is_painted_on_request_and_the_edit_follows_it(
             chunk.add_text(key, text)
     Image.new("RGB", size, (200, 30, 30)).save(anchor, pnginfo=chunk)
     turn(window)
-    assert window.main_view.cover.name == "Painted", "what was saved lies over the view"
+    assert window.main_view.work.transient.cover.name == "Painted", "what was saved lies over the view"
     with_form(window, asks=1, model="a/tiny", anchor="")
-    assert "cannot follow a picture" in window.main_view.preview.text
-    assert not window.main_view.preview.painted
+    assert "cannot follow a picture" in window.main_view.work.transient.preview.text
+    assert not window.main_view.work.transient.preview.painted
     with_form(window, asks=1, model="", anchor=str(anchor))
     request(window, Plain("train"))
     assert f"--anchor={anchor}" in Trainer.said
@@ -286,7 +294,11 @@ def test_trained_edit_replaces_its_draft_and_nothing_else(
 ) -> None:
     opened(window, strength=0.6)
     request(window, Plain("train"))
-    assert (layer(window).name, layer(window).strength, window.main_view.live) == ("blue", 0.6, ())
+    assert (layer(window).name, layer(window).strength, window.main_view.work.transient.live) == (
+        "blue",
+        0.6,
+        (),
+    )
     assert window.document.facts().rows[0].draft
     view = window.main_view.work.view
     weights = paint.encode(np.linspace(0, 1, len(window.document.gdfs[0].region), dtype=np.float32))

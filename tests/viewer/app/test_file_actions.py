@@ -182,7 +182,7 @@ def test_new_autosave_never_replaces_a_leftover_autosave(window: application.App
     kept = beside.read_bytes()
     window.file_actions.offer_autosave()
     assert question(window).kind == "restore"
-    assert beside not in window.main_view.recent
+    assert beside not in window.main_view.work.transient.recent
     press(window, "Escape", "Shift+Left")
     window.file_actions.autosave(100.0)
     window.file_actions.autosave(100.0 + session.AUTOSAVE_S)
@@ -337,7 +337,7 @@ def test_scene_dropped_on_unsaved_work_asks_first(window: application.App, folde
     press(window, "D")
     assert window.main_view.facts.title == "half.ply"
     assert window.main_view.work.dialog is None
-    assert window.main_view.recent[0] == folder / "half.ply"
+    assert window.main_view.work.transient.recent[0] == folder / "half.ply"
 
 
 @pytest.mark.gl

@@ -32,7 +32,7 @@ def opened(tmp_path: Path) -> Iterator[application.App]:
 def test_title_and_recent_files_show_such_a_name(opened: application.App, tmp_path: Path) -> None:
     assert opened.document.title == "b\\udce4r.ply"
     press(opened, "Ctrl+O")
-    assert opened.main_view.recent == (opened.document.path,) == user_files.read_recent()
+    assert opened.main_view.work.transient.recent == (opened.document.path,) == user_files.read_recent()
 
 
 def test_saving_a_session_explains_that_it_cannot_name_the_file(opened: application.App) -> None:

@@ -14,7 +14,7 @@ from viewer.files import user_files
 from viewer.files.document import Document
 from viewer.panel import panel, timeline_bar
 from viewer.state import workspace
-from viewer.state.workspace import Dialog
+from viewer.state.workspace import Dialog, with_transient
 
 pytestmark = pytest.mark.gl
 SMALLEST = (640, 400)
@@ -32,7 +32,10 @@ def windows(name: str) -> list[imgui.internal.Window]:
 def test_every_question_fits_the_window_with_many_recent_files(points: tuple[int, int], kind: str) -> None:
     with rig(first_view(bear(), 0.5, 0.5), points) as hand:
         name = "a_scene_with_a_rather_long_name_indeed"
-        hand.main_view.recent = tuple(Path(f"/scenes/{name}_{i}.ply") for i in range(user_files.MAX_RECENT))
+        hand.main_view.work = with_transient(
+            hand.main_view.work,
+            recent=tuple(Path(f"/scenes/{name}_{i}.ply") for i in range(user_files.MAX_RECENT)),
+        )
         hand.main_view.ask(
             Dialog(kind, f"/scenes/{name}.session.json", error="it cannot be read", notice="type it")
         )

@@ -129,7 +129,7 @@ def test_missing_file_is_marked_and_can_be_removed(tmp_path: Path) -> None:
         assert (gone.path.name, gone.missing, here.missing) == ("gone.ply", True, False)
         assert gone.line.startswith("Moved?")
         assert here.line.startswith("just now  ·  ")
-        assert app.main_view.recent == (files[0],), "questions offer what is there"
+        assert app.main_view.work.transient.recent == (files[0],), "questions offer what is there"
         app.main_view.request(WithText("forget_file", str(gone.path)))
         turn(app)
         turn(app)

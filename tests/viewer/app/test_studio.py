@@ -198,7 +198,10 @@ def test_view_painted_in_another_program_is_shown_on_every_save(
     size = window.main_view.picture_size
     assert (form.choice.kind, form.region, form.pictures) == ("pictures", CHANGED, str(path))
     turn(window)
-    assert (window.main_view.cover, window.main_view.preview.text) == (None, PAINT_TEXT)
+    assert (window.main_view.work.transient.cover, window.main_view.work.transient.preview.text) == (
+        None,
+        PAINT_TEXT,
+    )
 
     def save(picture: Image.Image | bytes) -> str:
         if isinstance(picture, bytes):
@@ -207,13 +210,13 @@ def test_view_painted_in_another_program_is_shown_on_every_save(
             picture.save(path)
         os.utime(path, ns=(time.time_ns() + next(later),) * 2)
         turn(window)
-        return window.main_view.preview.text
+        return window.main_view.work.transient.preview.text
 
     later, taken = count(1_000_000, 1_000_000), Image.open(path).convert("RGB")
     assert taken.size == size
     taken.paste((250, 0, 250), (10, 10, 60, 60))
     save(taken)
-    cover = window.main_view.cover
+    cover = window.main_view.work.transient.cover
     assert cover is not None
     assert (cover.camera, cover.size, cover.name) == (window.main_view.work.view.camera, size, "Painted")
     whole = path.read_bytes()
@@ -222,14 +225,14 @@ def test_view_painted_in_another_program_is_shown_on_every_save(
     )
     message = f"has 40×30 pixels instead of {size[0]}×{size[1]}; save it at its original size"
     assert save(taken.resize((40, 30))).endswith(message)
-    assert window.main_view.cover is None
+    assert window.main_view.work.transient.cover is None
     save(taken)
-    assert window.main_view.cover is not None
+    assert window.main_view.work.transient.cover is not None
     assert find_picture_camera(path).height == size[1], "though the program dropped what the picture carried"
     request(window, Plain("train"))
     assert f"--editor=pictures:{path}" in Trainer.said
     turn(window)
-    assert window.main_view.cover is None, "the form is closed"
+    assert window.main_view.work.transient.cover is None, "the form is closed"
 
 
 def test_failed_training_is_one_line_with_its_log(window: application.App) -> None:

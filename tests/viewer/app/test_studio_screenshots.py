@@ -21,7 +21,7 @@ from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import headless_context
 from viewer.state.commands import OnItem
 from viewer.state.view_state import ViewState
-from viewer.state.workspace import Dialog
+from viewer.state.workspace import Dialog, with_transient
 from viewer.ui.splash import MINIMUM_SIZE_PX
 
 Compare = Callable[[str, np.ndarray], None]
@@ -55,7 +55,7 @@ def test_screenshot_of_the_start_page_with_recent_files(screenshot: Compare) -> 
 
 def test_screenshot_of_the_menu(screenshot: Compare) -> None:
     with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
-        hand.main_view.recent = (Path("/scenes/bear.ply"),)
+        hand.main_view.work = with_transient(hand.main_view.work, recent=(Path("/scenes/bear.ply"),))
         hand.click(999.0, 20.0)
         hand.move(880.0, 400.0)
         hand.frame(3)

@@ -21,6 +21,7 @@ from viewer.files import session
 from viewer.files.session import WindowSession
 from viewer.state import selection
 from viewer.state.commands import Plain
+from viewer.state.workspace import with_transient
 
 pytestmark = pytest.mark.gl
 
@@ -59,20 +60,20 @@ def test_removed_selection_is_a_layer_that_undo_restores(app: App, folder: Path)
 
 def test_moved_selection_follows_the_gizmo_and_can_be_canceled(app: App) -> None:
     press(app, "Alt+M")
-    gizmo = app.main_view.gizmo
+    gizmo = app.main_view.work.transient.gizmo
     assert gizmo is not None
     matrix = np.eye(4)
     matrix[:3, 3] = 0.5, 0.25, -0.125
-    app.main_view.gizmo = replace(gizmo, matrix=matrix)
+    app.main_view.work = with_transient(app.main_view.work, gizmo=replace(gizmo, matrix=matrix))
     app.main_view.request(Plain("place"))
     app.draw()
     app.draw()
-    assert [layer.name for layer in app.main_view.live] == ["moved"]
+    assert [layer.name for layer in app.main_view.work.transient.live] == ["moved"]
     press(app, "Escape")
-    assert app.main_view.gizmo is None
-    assert not app.main_view.live
+    assert app.main_view.work.transient.gizmo is None
+    assert not app.main_view.work.transient.live
     press(app, "Alt+M")
-    app.main_view.gizmo = replace(gizmo, matrix=matrix)
+    app.main_view.work = with_transient(app.main_view.work, gizmo=replace(gizmo, matrix=matrix))
     press(app, "Enter")
     members = bear().demo.members("scarf")
     means = app.engine.gaussians(app.main_view.work.view).means[members] - bear().scene.means[members]

@@ -11,9 +11,11 @@ import pytest
 from PIL import Image
 
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
-from viewer.app.decal import Decal
+from viewer.app.decal import load_decal
 from viewer.state.commands import Plain
+from viewer.state.transient import Decal
 from viewer.state.view_state import SelectTool
+from viewer.state.workspace import with_transient
 from viewer.ui.keys import TOOL_KEYS, bind
 
 pytestmark = pytest.mark.gl
@@ -100,11 +102,13 @@ def test_decal_is_placed_by_keys(tmp_path: Path) -> None:
     pixels[10:30, 20:60] = 200, 30, 30, 255
     Image.fromarray(pixels).save(tmp_path / "logo.png")
     with rig(first_view(bear()), WINDOW) as hand:
-        hand.main_view.gizmo = Decal.take(hand.main_view.context, tmp_path / "logo.png")
+        hand.main_view.work = with_transient(
+            hand.main_view.work, gizmo=load_decal(hand.main_view.context, tmp_path / "logo.png")
+        )
         for chord in WAY:
             hand.key(chord)
-        assert isinstance(hand.main_view.gizmo, Decal)
-        assert hand.main_view.gizmo.at == places(MIDDLE, WAY)[-1]
+        assert isinstance(hand.main_view.work.transient.gizmo, Decal)
+        assert hand.main_view.work.transient.gizmo.at == places(MIDDLE, WAY)[-1]
         hand.key("Space")
         assert Plain("lay_decal") in hand.main_view.take_requests()
 
@@ -120,10 +124,10 @@ def test_escape_releases_the_pointer_to_the_mouse() -> None:
         assert hand.main_view.work.view.selection.count == 0
         assert not hand.io.mouse_down[0]
         assert hand.main_view.work.view.select.tool == "brush"
-        assert hand.main_view.pointed.at is not None
+        assert hand.main_view.work.transient.pointer.at is not None
         hand.move(120.0, 200.0)
         hand.frame(2)
-        assert hand.main_view.pointed.at is None
+        assert hand.main_view.work.transient.pointer.at is None
         hand.key("Escape")
         hand.key("Right")
         assert hand.strengths != [0.0, 0.0], "without a tool arrows are those of the layer"

@@ -16,7 +16,7 @@ from viewer.panel import panel
 from viewer.state import selection
 from viewer.state.selection import SelectionState
 from viewer.state.view_state import Brush, LayerGroup, LayerState, ViewState
-from viewer.state.workspace import Dialog
+from viewer.state.workspace import Dialog, with_transient
 
 Compare = Callable[[str, np.ndarray], None]
 
@@ -130,7 +130,9 @@ def test_screenshot_of_snapshots_and_a_question(screenshot: Compare) -> None:
         for chord in ("F5", *["Shift+Left"] * 5, "F5"):
             hand.key(chord)
         hand.frame(5)
-        hand.main_view.recent = (Path("/scenes/bear.ply"), Path("/scenes/edits/scarf.gdf"))
+        hand.main_view.work = with_transient(
+            hand.main_view.work, recent=(Path("/scenes/bear.ply"), Path("/scenes/edits/scarf.gdf"))
+        )
         hand.main_view.ask(Dialog("open"))
         hand.frame(3)
         screenshot("ui_snapshots", hand.image())

@@ -17,7 +17,7 @@ from viewer.state.actions import perform
 from viewer.state.commands import Action, Plain
 from viewer.state.facts import LayerRow
 from viewer.state.view_state import LayerState, ViewState
-from viewer.state.workspace import PreviewState, SceneFacts, Workspace
+from viewer.state.workspace import SceneFacts, Workspace
 from viewer.ui import widgets
 from viewer.ui.context import UiContext
 from viewer.ui.overlay import Area
@@ -42,9 +42,7 @@ class Hand:
 
     def frame(self) -> None:
         imgui.new_frame()
-        self.work = panel.draw(
-            self.work, FACTS, panel.Pictures(), PreviewState(), (), False, self.ui, self.actions
-        )
+        self.work = panel.draw(self.work, FACTS, panel.Pictures(), False, self.ui, self.actions)
         area = Area((SIZE[0] - panel.WIDTH_PX) * self.ui.scale, SIZE[1] * self.ui.scale)
         view = tools.draw_view(self.work.view, area, 0.0, self.ui, self.actions)
         self.work = replace(self.work, view=view)

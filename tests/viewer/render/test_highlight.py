@@ -20,6 +20,7 @@ from viewer.render.highlight import Highlight
 from viewer.state import paint, selection
 from viewer.state.selection import SelectionState
 from viewer.state.view_state import Brush, Comparison, LayerState, SelectTool, ViewState
+from viewer.state.workspace import with_transient
 
 SIZE = (160, 120)
 SCARF = 0
@@ -193,7 +194,7 @@ def test_selection_tint_is_off_while_the_form_changes_the_picture(hand: Rig) -> 
         return main_view.engine.highlight is not None
 
     assert is_tinted("")
-    main_view.live = (LayerState(0, "what the form says", 1.0),)
+    main_view.work = with_transient(main_view.work, live=(LayerState(0, "what the form says", 1.0),))
     assert not is_tinted("")
     assert not is_tinted("lasso"), "it is the form that changes the picture"
     hand.move(300.0, 300.0)

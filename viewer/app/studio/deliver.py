@@ -54,7 +54,8 @@ class DeliverActions:
         main_view = self._app.main_view
         if (dialog := main_view.work.dialog) is not None:
             error = failure_line(lambda: self._start(kind, dialog))
-            main_view.work = replace(main_view.work, dialog=replace(dialog, error=error) if error else None)
+            after = replace(dialog, error=error) if error else None
+            self._app.store.replace(replace(main_view.work, dialog=after))
             main_view.wake()
 
     def _ask(self, name: str, _: None) -> None:

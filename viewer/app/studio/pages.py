@@ -12,9 +12,10 @@ from imgui_bundle import imgui, imgui_ctx
 from progdf import __version__
 from progdf.io.session import SUFFIX
 from progdf.terminal import escape_text
-from viewer.camera.view_camera import LARGEST_SIDE, SHAPES, ViewCamera
+from viewer.camera.view_camera import LARGEST_SIDE, SHAPES
 from viewer.jobs.job_queue import FORMATS, FPS, SIDES, DeliverOptions, film_title, picture_size
 from viewer.state.commands import Action, Plain, WithText
+from viewer.state.transient import Cover
 from viewer.state.view_state import ViewState
 from viewer.ui import overlay
 from viewer.ui.context import BEHIND, FIXED, PALETTE, SMALL_PX, Icon, UiContext, u32
@@ -247,16 +248,6 @@ def _dashed_frame(size: imgui.ImVec2, ui: UiContext) -> None:
             begin = (left + dx * low, top + dy * low)
             end = (left + dx * high, top + dy * high)
             canvas.add_line(begin, end, ink, 1.5 * scale)
-
-
-@dataclass(frozen=True)
-class Cover:
-    """Picture drawn over the view while the camera stays where the picture was rendered."""
-
-    texture: int  # GL name
-    camera: ViewCamera  # the picture's camera
-    size: tuple[int, int]  # size of the view, pixels
-    name: str = ""  # text of the banner above the picture
 
 
 def draw_cover(

@@ -35,11 +35,10 @@ from viewer.files import user_files
 from viewer.jobs import training
 from viewer.jobs.child import Child
 from viewer.jobs.training import EDITORS, NO_CHANGE, SHEET_COLUMNS, SHEET_PX, STYLE_ORDER, NewEdit
+from viewer.state.transient import Cover, PreviewState
 from viewer.state.view_state import LayerState
-from viewer.state.workspace import PreviewState
+from viewer.state.workspace import with_transient
 from viewer.ui.window import wake_window
-
-from .pages import Cover
 
 LONGEST_SIDE = 960
 """Longest side of a preview, in pixels; larger windows show it enlarged."""
@@ -250,7 +249,7 @@ class PreviewActions:
         if self._child is not None:
             self._take(self._child, request)
         if self._outstanding and request.editor.startswith("instruct:") and request.seed >= 0:
-            self._show(f"Painting … {now - self._sent_at:.0f} s", self._app.main_view.cover)
+            self._show(f"Painting … {now - self._sent_at:.0f} s", self._app.store.get().transient.cover)
         self._show_live()
         if self._child is None or self._broken:
             return None
@@ -287,14 +286,14 @@ class PreviewActions:
         beside = path.with_name(f"{path.stem}.camera.json")  # a program may drop the picture's metadata
         save_cameras(beside, [to_camera(camera, *size)], self._app.document.scene.origin)
         form = training.with_picture(main_view.work.form, path, further=False)
-        main_view.work = replace(main_view.work, form=form, form_open=True)
+        self._app.store.replace(replace(main_view.work, form=form, form_open=True))
         self._open_painter(path, camera, size, None)
 
     def follow_anchor(self, path: Path) -> None:
         """Open a sentence's picture, written at `path`, in another program and show the saved result."""
         if self._pose is not None and self._painted is not None:
             height, width = self._painted[1].shape[:2]
-            self._open_painter(path, self._pose[1], (width, height), self._app.main_view.cover)
+            self._open_painter(path, self._pose[1], (width, height), self._app.store.get().transient.cover)
 
     def _open_painter(
         self, path: Path, camera: ViewCamera, size: tuple[int, int], cover: Cover | None
@@ -400,7 +399,7 @@ class PreviewActions:
         self._number = child.ask(region, request, to_camera(request.camera, width, height))
         self._outstanding = True
         self._region_sent = region
-        cover = self._app.main_view.cover
+        cover = self._app.store.get().transient.cover
         in_place = cover is not None and (cover.camera, cover.size) == (request.camera, request.size)
         text = "Looking for models …" if request.seed < 0 else "Drawing …"
         self._show("" if in_place or self._grade else text, cover)
@@ -434,9 +433,10 @@ class PreviewActions:
         offset = index % SHEET_COLUMNS * width, index // SHEET_COLUMNS * height
         self._sheet.write(np.ascontiguousarray(pixels).tobytes(), (*offset, width, height), alignment=1)
         self._drawn |= {style}
-        main_view = self._app.main_view
-        main_view.preview = main_view.preview._replace(sheet=int(self._sheet.glo), styles=self._drawn)
-        main_view.wake()
+        store = self._app.store
+        preview = store.get().transient.preview._replace(sheet=int(self._sheet.glo), styles=self._drawn)
+        store.replace(with_transient(store.get(), preview=preview))
+        self._app.main_view.wake()
 
     def _take(self, child: PreviewChild, now: _Request) -> None:
         """Show the answer of the process unless the region or the editor family has changed since."""
@@ -460,14 +460,15 @@ class PreviewActions:
             work = self._app.main_view.work
             if all(source == target for source, target in work.form.palette):
                 form = replace(work.form, palette=tuple((color, color) for color in answer.palette))
-                self._app.main_view.work = replace(work, form=form)
+                self._app.store.replace(replace(work, form=form))
             self._app.main_view.wake()
         elif answer.note and answer.grade is None:
             self._show(answer.note, None, models=answer.models)
         elif answer.grade is not None:
             gdf = load_gdf(answer.grade, self._app.document.original)
             self._grade = self._sent, gdf, answer.grade
-            self._app.main_view.live = ()  # remove the preview of the previous color
+            # of the previous color
+            self._app.store.replace(with_transient(self._app.store.get(), live=()))
             self._show(f"Live: {answer.note}", None)
         elif answer.pixels is not None:
             kind, _, argument = self._sent.editor.partition(":")
@@ -499,14 +500,15 @@ class PreviewActions:
         solo = any(layer.solo for layer in layers)
         strength = main_view.work.form.strength
         live = (LayerState(len(document.gdfs), name, strength, solo=solo),)
-        if not main_view.live:
+        shown = main_view.work.transient.live
+        if not shown:
             self._app.show(document, (self._grade[1],), live)
-        elif main_view.live != live:
-            main_view.live = live
+        elif shown != live:
+            self._app.store.replace(with_transient(main_view.work, live=live))
             main_view.wake()
 
     def _end_live(self) -> None:
-        if self._grade is not None and self._app.main_view.live:
+        if self._grade is not None and self._app.store.get().transient.live:
             self._app.show(self._app.document)
         self._grade = None
 
@@ -524,15 +526,14 @@ class PreviewActions:
         self, text: str, cover: Cover | None, failed: bool = False, models: tuple[str, ...] | None = None
     ) -> None:
         """Set the picture over the view and the preview's state in the form."""
-        main_view = self._app.main_view
-        available_models = main_view.preview.models if models is None else models
+        work = self._app.store.get()
+        available_models = work.transient.preview.models if models is None else models
         painted = self._painted is not None and self._painted[0] == self._request()
         sheet = 0 if self._sheet is None else int(self._sheet.glo)
         state = PreviewState(text, failed, self._outstanding, painted, available_models, sheet, self._drawn)
-        if (main_view.cover, main_view.preview) != (cover, state):
-            main_view.cover = cover
-            main_view.preview = state
-            main_view.wake()
+        if (work.transient.cover, work.transient.preview) != (cover, state):
+            self._app.store.replace(with_transient(work, cover=cover, preview=state))
+            self._app.main_view.wake()
 
     def _end(self) -> None:
         if self._child is not None:

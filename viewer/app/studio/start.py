@@ -27,6 +27,7 @@ from viewer.pictures.film import to_pixels
 from viewer.render.engine import ViewEngine
 from viewer.state import history
 from viewer.state.view_state import Comparison, ViewState
+from viewer.state.workspace import with_transient
 
 from .pages import StartFile, folder_name
 
@@ -67,7 +68,9 @@ class StartActions:
         return {"demo": self._start_demo, "example": self._open_example, "forget_file": self._forget}
 
     def _forget(self, path: str) -> None:
-        self._app.main_view.recent = user_files.forget_recent(Path(path))
+        recent = user_files.forget_recent(Path(path))
+        store = self._app.store
+        store.replace(with_transient(store.get(), recent=recent))
 
     def poll(self) -> float | None:
         """Open the finished parts of the demo; return the seconds until the next poll, None for never."""
@@ -83,7 +86,7 @@ class StartActions:
             self._app.open(scene)
             main_view = self._app.main_view
             view = replace(main_view.work.view, background=SKY)
-            main_view.work = replace(main_view.work, view=view, past=history.begin(view))
+            self._app.store.replace(replace(main_view.work, view=view, past=history.begin(view)))
         folders = sorted(file.parent for file in self._demo.glob("*/*.gdf") if self._app.document.path)
         for folder in dict.fromkeys(folders):
             attempt(self._app.main_view, partial(self._show_edit, folder))

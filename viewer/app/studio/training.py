@@ -31,7 +31,7 @@ from viewer.jobs.training import ALL, CHANGED, SELECTION, TYPED, EditOrder, NewE
 from viewer.state.commands import Plain
 from viewer.state.selection import EMPTY_MASK, SUFFIX, NamedRegion, add_region, free_name
 from viewer.state.view_state import LayerState
-from viewer.state.workspace import Dialog
+from viewer.state.workspace import Dialog, with_transient
 
 LIVE_EVERY_S = 3.0
 """Minimum interval between the recordings shown during a run, in seconds."""
@@ -143,7 +143,7 @@ class JobActions:
         form = main_view.work.form
         error = form.obstacle or failure_line(lambda: self._enqueue(form))
         form = replace(form, error=error) if error else replace(form, error="", name="")
-        main_view.work = replace(main_view.work, form=form, form_open=bool(error))
+        self._app.store.replace(replace(main_view.work, form=form, form_open=bool(error)))
         main_view.wake()
 
     def _enqueue(self, form: NewEdit) -> None:
@@ -182,7 +182,7 @@ class JobActions:
         main_view = self._app.main_view
         scene = self._app.document.path
         placed = main_view.decal_place
-        main_view.gizmo = None
+        self._app.store.replace(with_transient(main_view.work, gizmo=None))
         if placed is None or scene is None:
             return
         path, camera, at = placed
@@ -241,7 +241,7 @@ class JobActions:
         form = main_view.work.form
         run = training.free_run(training.edits_folder(scene), form.layer_name)
         if path := self._write_anchor(form, run):
-            main_view.work = replace(main_view.work, form=replace(form, anchor=path))
+            self._app.store.replace(replace(main_view.work, form=replace(form, anchor=path)))
             self._follow(Path(path))
 
     def region_spec(self, form: NewEdit, folder: Path, name: str = "") -> str:
@@ -330,7 +330,7 @@ class JobActions:
         order = next((task for task in orders if isinstance(task, EditOrder)), None)
         if order is None or order.scene != self._scene or now < self._live_due:
             return
-        live = self._app.main_view.live
+        live = self._app.store.get().transient.live
         packed = order.out / "draft.gdf"
         layers = {order.draft, order.packed_edit}.intersection(self._app.document.gdf_paths)
         if order.draft in layers and is_newer(packed, order.draft):
@@ -355,12 +355,12 @@ class JobActions:
 
     def _publish(self) -> None:
         """Publish the jobs of this scene and the busy jobs of others to the panel."""
-        main_view = self._app.main_view
         jobs = tuple(
             replace(job, elsewhere="" if job.task.scene == self._scene else job.task.scene.name)
             for job in self.queue.jobs
             if job.task.scene == self._scene or job.busy
         )
-        if jobs != main_view.work.jobs:
-            main_view.work = replace(main_view.work, jobs=jobs)
-            main_view.wake()
+        store = self._app.store
+        if jobs != store.get().jobs:
+            store.replace(replace(store.get(), jobs=jobs))
+            self._app.main_view.wake()

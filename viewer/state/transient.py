@@ -1,0 +1,84 @@
+"""State of the moment: what lies over the picture and follows the pointer. It is neither undone nor saved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viewer.camera.view_camera import ViewCamera
+
+from .view_state import LayerState
+
+
+@dataclass(frozen=True)
+class Cover:
+    """Picture drawn over the view while the camera stays where the picture was rendered."""
+
+    texture: int  # GL name
+    camera: ViewCamera  # the picture's camera
+    size: tuple[int, int]  # size of the view, pixels
+    name: str = ""  # text of the banner above the picture
+
+
+class PreviewState(NamedTuple):
+    """State of the preview in the form of a new edit."""
+
+    text: str = ""  # progress such as "drawing", or the reason of a failure
+    failed: bool = False  # whether `text` is that reason
+    busy: bool = False  # whether a model is generating
+    painted: bool = False  # whether the picture of a prompt is available
+    models: tuple[str, ...] = ()  # models installed on this machine
+    sheet: int = 0  # GL name of the texture with the style previews of this view, see `SHEET_PX`
+    styles: frozenset[int] = frozenset()  # styles available in it
+
+
+@dataclass(frozen=True)
+class Gizmo:
+    """Handles around the selection being moved."""
+
+    does: Literal["transform", "duplicate"]
+    center: tuple[float, float, float]  # center of the selection, where the handles start
+    # from the original to the current place, about the center; world axes. [4,4]
+    matrix: NDArray[np.float64] = field(compare=False)
+    using: bool = False  # the mouse drags a handle
+
+    @property
+    def is_moved(self) -> bool:
+        """True if the selection is not at its original place."""
+        return not np.allclose(self.matrix, np.eye(4), atol=1e-9)
+
+
+@dataclass(frozen=True)
+class Decal:
+    """Picture with transparency and its placement in the window."""
+
+    path: Path
+    texture: int  # GL name
+    texture_size: tuple[int, int]  # pixels
+    size: float = 0.0  # longer side, window pixels; 0 before the first frame
+    angle: float = 0.0  # degrees, counterclockwise
+    at: tuple[float, float] | None = None  # center, window pixels; None before the first frame
+
+
+@dataclass(frozen=True)
+class KeyPointer:
+    """Pointer of a tool when it is moved by keys."""
+
+    at: tuple[float, float] | None = None  # in the window; None while the mouse moves it
+    down: bool = False  # keys pressed the button
+
+
+@dataclass(frozen=True)
+class Transient:
+    """State of the moment."""
+
+    cover: Cover | None = None  # image drawn over the picture
+    preview: PreviewState = PreviewState()  # state of the preview of a new edit
+    live: tuple[LayerState, ...] = ()  # edits in training, on top of the layer stack
+    gizmo: Gizmo | Decal | None = None  # handles of a selection being moved, or a decal being placed
+    pointer: KeyPointer = KeyPointer()  # pointer of the active tool
+    recent: tuple[Path, ...] = ()  # recently opened files, for menu and dialogs; the last one first
