@@ -1,1 +1,1 @@
-"""Application window: main view, tools, dialogs, file actions and the studio."""
+"""Application window: main view, tools, file actions, training, previews and exports."""

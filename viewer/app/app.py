@@ -32,13 +32,13 @@ from viewer.ui.splash import TITLE, Splash
 from viewer.ui.window import Window, interruptible
 
 from .application import LOG, attempt, error_details, error_line, log_error
+from .deliver import DeliverActions
 from .file_actions import FileActions
 from .main_view import MainView
-from .studio.deliver import DeliverActions
-from .studio.preview import PreviewActions
-from .studio.start import StartActions, UpActions
-from .studio.training import JobActions
+from .preview import PreviewActions
+from .start import StartActions, UpActions
 from .tidy import StrayActions, TidyActions
+from .training import JobActions
 
 _Made = TypeVar("_Made")
 
@@ -132,8 +132,8 @@ class App:
         self.preview = PreviewActions(self, self.context, self.jobs.region_spec)
         self.strays = StrayActions(self)
         self.tidy = TidyActions(self)
-        studio = self.jobs, self.deliver, self.start, self.preview
-        by_part = [part.requests for part in (self.file_actions, *studio, self.strays, self.tidy)]
+        jobs = self.jobs, self.deliver, self.start, self.preview
+        by_part = [part.requests for part in (self.file_actions, *jobs, self.strays, self.tidy)]
         self.requests = {name: act for acts in by_part for name, act in acts.items()}
         self.requests["full_screen"] = lambda _: window.toggle_full_screen()
         self.requests["quit"] = lambda _: None if self.jobs.holds_window() else self.file_actions.leave()

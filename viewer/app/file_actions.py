@@ -29,6 +29,7 @@ from viewer.files.document import Document
 from viewer.files.session import SessionAutosave, WindowSession, session_file
 from viewer.files.user_files import parse_path, read_recent, remember_recent, write_keys
 from viewer.jobs.training import with_picture
+from viewer.panel import dialogs
 from viewer.state import selection, workspace
 from viewer.state.commands import Action, Plain, Rename, WithText
 from viewer.state.facts import describe_applied
@@ -37,9 +38,8 @@ from viewer.state.view_state import ViewState, on_another_scene
 from viewer.state.workspace import Dialog, focus_layer, with_camera, with_transient
 from viewer.ui.keys import COMMANDS, shortcut
 
-from . import dialogs
 from .application import Application, Requests, attempt, error_details, failure_line, log_error
-from .decal import is_decal, load_decal
+from .handles import is_decal, load_decal
 from .main_view import MainView
 
 

@@ -9,7 +9,7 @@ from itertools import zip_longest
 
 from imgui_bundle import imgui, imgui_ctx
 
-from viewer.panel import panel, timeline_bar, tools
+from viewer.panel import dialogs, panel, timeline_bar, tools
 from viewer.pictures.compare import Labels
 from viewer.state import history, workspace
 from viewer.state.actions import GLIDES, perform
@@ -21,7 +21,7 @@ from viewer.ui.keys import COMMANDS, JOINED, TOPICS, Command, chords, find_comma
 from viewer.ui.pointer import PointerContext
 from viewer.ui.widgets import elide, menu, search_field
 
-from . import dialogs, mouse, select_tool
+from . import mouse, select_tool
 from .mouse import MouseTool
 
 MOUSE_HELP = (

@@ -19,7 +19,7 @@ from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from viewer.files import exports
 from viewer.gl.present import read_rgb
-from viewer.panel import new_edit_form, panel, timeline_bar
+from viewer.panel import new_edit_form, pages, panel, timeline_bar
 from viewer.render.engine import ViewEngine
 from viewer.render.picking import Surfaces
 from viewer.state import actions, layer_selection, timeline, workspace
@@ -47,10 +47,8 @@ from viewer.ui.pointer import PointerContext
 
 from . import interface, mouse, select_tool
 from .canvas import Canvas
-from .decal import decal_takes_mouse, draw_decal, place_decal
-from .gizmo import draw_gizmo, gizmo_takes_mouse
+from .handles import decal_takes_mouse, draw_decal, draw_gizmo, gizmo_takes_mouse, place_decal
 from .mouse import MouseTool
-from .studio import pages
 
 SETTLE_FRAMES = 3  # imgui needs a frame or two until hovering and layout follow an event
 LINGER_S = 0.65

@@ -29,7 +29,7 @@ from viewer.ui.keys import shortcut
 
 from .application import Application, Requests
 from .file_actions import EditActions
-from .gizmo import gizmo_step
+from .handles import gizmo_step
 
 _NAMES = {"remove": "removed", "transform": "moved", "duplicate": "copy"}
 _INSTRUCTIONS = {"remove": "remove", "transform": "move", "duplicate": "copy"}

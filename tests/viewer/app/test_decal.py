@@ -15,7 +15,7 @@ from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.ui_rig import bear, first_view, rig
 from viewer.app.app import App
-from viewer.app.decal import decal_corners, is_decal, load_decal
+from viewer.app.handles import decal_corners, is_decal, load_decal
 from viewer.jobs.training import EditOrder
 from viewer.state.commands import Plain
 from viewer.state.transient import Decal

@@ -20,7 +20,7 @@ from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.ui_rig import bear, first_view
 from tests.viewer.app.test_studio import Trainer, request, turn
 from viewer.app import app as application
-from viewer.app.studio import preview
+from viewer.app import preview
 from viewer.camera.view_camera import to_camera
 from viewer.files import user_files
 from viewer.files.session import open_session

@@ -14,9 +14,9 @@ import pytest
 from progdf.formats.scene_file import FORMATS
 from tests.helpers.null_app import null_app, press
 from tests.helpers.ui_rig import bear, first_view, rig
-from viewer.app import dialogs
 from viewer.app.app import App
 from viewer.files import document, session
+from viewer.panel import dialogs
 from viewer.state.commands import Plain
 from viewer.state.workspace import Dialog
 

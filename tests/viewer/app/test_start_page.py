@@ -18,11 +18,11 @@ from tests.helpers.null_app import null_app
 from tests.helpers.ui_rig import Rig, bear
 from viewer.app import app as application
 from viewer.app.main_view import MainView
-from viewer.app.studio.pages import StartFile
-from viewer.app.studio.start import EXAMPLE_TITLES
+from viewer.app.start import EXAMPLE_TITLES
 from viewer.files import document as documents
 from viewer.files.document import empty
 from viewer.files.user_files import describe_age, keep_thumbnail, read_recent, remember_recent
+from viewer.panel.pages import StartFile
 from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import headless_context
 from viewer.state.commands import Plain, WithText

@@ -26,7 +26,7 @@ from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app import app as application
-from viewer.app.studio.preview import PAINT_TEXT
+from viewer.app.preview import PAINT_TEXT
 from viewer.camera.view_camera import first_camera
 from viewer.files import user_files
 from viewer.files.document import empty

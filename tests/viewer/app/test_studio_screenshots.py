@@ -11,12 +11,12 @@ import pytest
 
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.app.main_view import MainView
-from viewer.app.studio.pages import StartFile
-from viewer.app.studio.start import EXAMPLE_TITLES
+from viewer.app.start import EXAMPLE_TITLES
 from viewer.files.document import empty
 from viewer.jobs.child import Progress
 from viewer.jobs.job_queue import DeliverOptions, Delivery, QueuedTask
 from viewer.jobs.training import TYPED, EditOrder, NewEdit
+from viewer.panel.pages import StartFile
 from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import headless_context
 from viewer.state.commands import OnItem

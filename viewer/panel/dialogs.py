@@ -22,7 +22,7 @@ from viewer.ui.context import PALETTE, UiContext
 from viewer.ui.overlay import Area
 from viewer.ui.widgets import accent_button, inert, small, tip, wrapped_text
 
-from .studio import pages
+from . import pages
 
 WIDTH_PX = 520.0  # at 1×
 _POPUP = "##dialog"

@@ -23,13 +23,12 @@ from viewer.camera.view_camera import Vec3
 from viewer.files import user_files
 from viewer.gl.present import picture_texture
 from viewer.jobs.job_queue import Delivery, JobQueue
+from viewer.panel.pages import StartFile, folder_name
 from viewer.pictures.film import to_pixels
 from viewer.render.engine import ViewEngine
 from viewer.state import history
 from viewer.state.view_state import Comparison, ViewState
 from viewer.state.workspace import with_transient
-
-from .pages import StartFile, folder_name
 
 POLL_S = 0.5
 EXAMPLES = Path(viewer.__file__).parent / "examples"

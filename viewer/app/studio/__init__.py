@@ -1,1 +1,0 @@
-"""New edits, previews, deliveries and the start page of the window."""
