@@ -36,7 +36,7 @@ ORDER = {
         demo_scenes io rasterize field formats gdf scene compose tidy summary cli __init__ __main__""",
     "trainer": """__init__ options store views paint fill editors resolve regions
         motion optimize fit report preview run evaluate batch cli""",
-    "viewer": "camera gl jobs state render web files widget __init__ pictures ui panel app commands",
+    "viewer": "camera gl state jobs render web files widget __init__ pictures ui panel app commands",
     "benchmarks": """__init__ analytic_edits courses table ablation rasterizer training
         recorded_runs viewer field edits networks sliders warps pictures __main__""",
 }

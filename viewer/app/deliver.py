@@ -14,9 +14,10 @@ from progdf.io.bundle import BUNDLE
 from viewer.app.application import Application, Requests, failure_line
 from viewer.files import exports, session
 from viewer.files.user_files import parse_path
-from viewer.jobs.job_queue import ALL_SLIDERS, TURNTABLE, DeliverOptions, Delivery, JobQueue, picture_size
+from viewer.jobs.job_queue import Delivery, JobQueue
 from viewer.jobs.training import free_path
 from viewer.state import timeline
+from viewer.state.forms import ALL_SLIDERS, TURNTABLE, DeliverOptions, picture_size
 from viewer.state.view_state import Comparison, ViewState
 from viewer.state.workspace import Dialog
 

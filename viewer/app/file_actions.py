@@ -28,11 +28,11 @@ from viewer.files import exports, session
 from viewer.files.document import Document
 from viewer.files.session import SessionAutosave, WindowSession, session_file
 from viewer.files.user_files import parse_path, read_recent, remember_recent, write_keys
-from viewer.jobs.training import with_picture
 from viewer.panel import dialogs
 from viewer.state import selection, workspace
 from viewer.state.commands import Action, Plain, Rename, WithText
 from viewer.state.facts import describe_applied
+from viewer.state.forms import with_picture
 from viewer.state.layers import add_layer, duplicate_layer, replace_edit
 from viewer.state.view_state import ViewState, on_another_scene
 from viewer.state.workspace import Dialog, focus_layer, with_camera, with_transient

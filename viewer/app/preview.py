@@ -34,7 +34,7 @@ from viewer.camera.view_camera import Vec3, ViewCamera, to_camera
 from viewer.files import user_files
 from viewer.jobs import training
 from viewer.jobs.child import Child
-from viewer.jobs.training import EDITORS, NO_CHANGE, SHEET_COLUMNS, SHEET_PX, STYLE_ORDER, NewEdit
+from viewer.state.forms import EDITORS, NO_CHANGE, SHEET_COLUMNS, SHEET_PX, STYLE_ORDER, NewEdit, with_picture
 from viewer.state.transient import Cover, PreviewState
 from viewer.state.view_state import LayerState
 from viewer.state.workspace import with_transient
@@ -285,7 +285,7 @@ class PreviewActions:
         path = main_view.canvas.save_original(folder, scene.stem, main_view.work.view, size)
         beside = path.with_name(f"{path.stem}.camera.json")  # a program may drop the picture's metadata
         save_cameras(beside, [to_camera(camera, *size)], self._app.document.scene.origin)
-        form = training.with_picture(main_view.work.form, path, further=False)
+        form = with_picture(main_view.work.form, path, further=False)
         self._app.store.replace(replace(main_view.work, form=form, form_open=True))
         self._open_painter(path, camera, size, None)
 

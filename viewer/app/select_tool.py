@@ -27,9 +27,9 @@ from progdf.scene.selection import (
     project_centers,
 )
 from viewer.camera.view_camera import Vec3
-from viewer.jobs.training import with_color
 from viewer.render.picking import PixelGaussians, seen_at, surface_point
 from viewer.state import history, selection
+from viewer.state.forms import with_color
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import Workspace, original
 from viewer.ui.context import PALETTE, UiContext, u32

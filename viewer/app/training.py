@@ -27,11 +27,12 @@ from viewer.app.file_actions import EditActions
 from viewer.files import exports
 from viewer.jobs import training
 from viewer.jobs.job_queue import Delivery, JobQueue, QueuedTask
-from viewer.jobs.training import ALL, CHANGED, SELECTION, TYPED, EditOrder, NewEdit
+from viewer.jobs.training import EditOrder
 from viewer.state.commands import Plain
+from viewer.state.forms import ALL, CHANGED, SELECTION, TYPED, NewEdit
 from viewer.state.selection import EMPTY_MASK, SUFFIX, NamedRegion, add_region, free_name
 from viewer.state.view_state import LayerState
-from viewer.state.workspace import Dialog, with_transient
+from viewer.state.workspace import Dialog, JobCard, with_transient
 
 LIVE_EVERY_S = 3.0
 """Minimum interval between the recordings shown during a run, in seconds."""
@@ -49,6 +50,30 @@ def is_newer(file: Path, other: Path) -> bool:
 
 _REGION_KINDS = ("masks", "photomasks", "text", "changed")
 """Kinds of regions, besides those that every command supports."""
+
+
+def job_card(job: QueuedTask) -> JobCard:
+    """Return a job as the panel shows it."""
+    task = job.task
+    training = ""
+    starting = "Starting"
+    if isinstance(task, EditOrder):
+        training = f"{task.editor} on {task.region}"
+        if task.region == CHANGED:
+            starting = "Finding the changes"
+    return JobCard(
+        job.number,
+        task.name,
+        task.out,
+        job.status,
+        training,
+        job.progress.label or starting,
+        job.progress.share,
+        job.progress.loss,
+        seconds_left=job.seconds_left,
+        error=job.error,
+        warning=job.warning,
+    )
 
 
 class JobActions:
@@ -356,7 +381,7 @@ class JobActions:
     def _publish(self) -> None:
         """Publish the jobs of this scene and the busy jobs of others to the panel."""
         jobs = tuple(
-            replace(job, elsewhere="" if job.task.scene == self._scene else job.task.scene.name)
+            replace(job_card(job), elsewhere="" if job.task.scene == self._scene else job.task.scene.name)
             for job in self.queue.jobs
             if job.task.scene == self._scene or job.busy
         )

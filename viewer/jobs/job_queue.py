@@ -12,10 +12,10 @@ import time
 from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 from progdf.errors import ProgdfError, without_commands
-from viewer.camera.view_camera import SHAPES
+from viewer.state.workspace import JobStatus
 
 from .child import Child, Progress, last_line
 from .training import EditOrder
@@ -25,46 +25,6 @@ POLL_S = 0.3
 
 PROGRESS_INTERVAL_S = 1.0
 """Seconds between two reads of their progress; the window redraws their cards at each."""
-
-Status = Literal["queued", "running", "stopping", "stopped", "failed", "done"]
-
-
-FORMATS = {".mp4": "MP4", ".gif": "GIF", ".webp": "WebP", "": "PNG frames"}
-"""Formats of films: three file types, and a folder of frames."""
-SIDES = (720, 1080, 1440, 2160)
-"""Shorter sides of pictures and films, pixels."""
-FPS = (12, 24, 25, 30, 60)
-
-
-ALL_SLIDERS = "\0sliders"
-"""Value of `DeliverOptions.moves` for a film of all sliders."""
-TURNTABLE = "\0turntable"
-"""Value of `DeliverOptions.moves` for a film of one orbit."""
-
-
-def picture_size(side: int, shape: str) -> tuple[int, int]:
-    """Return width and height of a picture whose shorter side has `side` pixels, for one of `SHAPES`."""
-    return round(side * max(SHAPES[shape], 1.0)), round(side / min(SHAPES[shape], 1.0))
-
-
-def film_title(moves: str) -> str:
-    """Return the title of a film for the user."""
-    whole = {"timeline": "The timeline", ALL_SLIDERS: "All sliders in turn", TURNTABLE: "Once around"}
-    return whole.get(moves, f"The slider of {moves}, to 1 and back")
-
-
-@dataclass(frozen=True)
-class DeliverOptions:
-    """Options of a picture or a film."""
-
-    width: int = 1920  # pixels
-    height: int = 1080
-    alpha: bool = False  # the background is transparent
-    fps: int = 24  # frames per second
-    seconds: float = 4.0  # duration of a film of sliders or of an orbit
-    format: str = ".mp4"  # one of `FORMATS`
-    moves: str = ""  # "timeline", the name of a layer, `ALL_SLIDERS` or `TURNTABLE`
-    can_move: tuple[str, ...] = ()  # available values of `moves`
 
 
 _COUNT = re.compile(r"^((?:frame )?(\d+)(?:/| of )(\d+)(?:: [^:\n]+)?)", re.MULTILINE)
@@ -118,18 +78,17 @@ class Delivery:
 
 @dataclass(frozen=True)
 class QueuedTask:
-    """Task in the queue, in the state shown on its card."""
+    """Task in the queue, with its progress."""
 
     number: int  # id in requests
     task: EditOrder | Delivery
-    status: Status = "queued"
+    status: JobStatus = "queued"
     progress: Progress = Progress()
     seconds: float = 0.0  # running time of this session
     error: str = ""  # one line about a failure
     warning: str = ""  # one line about a poor result
     resumes: bool = False  # it continues a stopped run
     began_at: float = 0.0  # share done at the start of this session
-    elsewhere: str = ""  # name of its scene while another one is open
 
     @property
     def busy(self) -> bool:

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 from imgui_bundle import imgui, imgui_ctx
 
-from viewer.jobs.training import NewEdit, with_settings
 from viewer.state.commands import Action, OnItem, Plain, WithText
 from viewer.state.facts import LayerRow
+from viewer.state.forms import NewEdit, with_settings
 from viewer.state.layers import (
     SLIDERS,
     change_layer,

@@ -10,7 +10,8 @@ from imgui_bundle import imgui, imgui_ctx
 
 from progdf.color.edits import GRADE_RANGES, hex_color, parse_color
 from progdf.color.palette import bend_lightness
-from viewer.jobs.training import (
+from viewer.state.commands import Action, Plain
+from viewer.state.forms import (
     ALL,
     BEST_STYLES,
     CHANGED,
@@ -26,7 +27,6 @@ from viewer.jobs.training import (
     parse_curve,
     with_editor,
 )
-from viewer.state.commands import Action, Plain
 from viewer.state.selection import SelectionState
 from viewer.state.transient import PreviewState
 from viewer.state.workspace import Workspace

@@ -13,8 +13,8 @@ from progdf import __version__
 from progdf.io.session import SUFFIX
 from progdf.terminal import escape_text
 from viewer.camera.view_camera import LARGEST_SIDE, SHAPES
-from viewer.jobs.job_queue import FORMATS, FPS, SIDES, DeliverOptions, film_title, picture_size
 from viewer.state.commands import Action, Plain, WithText
+from viewer.state.forms import FORMATS, FPS, SIDES, DeliverOptions, film_title, picture_size
 from viewer.state.transient import Cover
 from viewer.state.view_state import ViewState
 from viewer.ui import overlay

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from imgui_bundle import imgui, imgui_ctx
 
 from progdf.terminal import format_duration
-from viewer.jobs.job_queue import Delivery, QueuedTask
-from viewer.jobs.training import EditOrder
 from viewer.state.commands import Action, OnItem
+from viewer.state.workspace import JobCard
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, Rgba, UiContext, u32
 from viewer.ui.widgets import card, elide, menu_items, right_edge, small, tip, wrapped_text
 
@@ -20,7 +19,7 @@ _DISCARD = "Discard…"
 _NOTHING_WRITTEN = "Nothing is written"
 
 
-def height(jobs: Sequence[QueuedTask], ui: UiContext) -> float:
+def height(jobs: Sequence[JobCard], ui: UiContext) -> float:
     """Return the height of the strip and its unfolded cards, in window pixels."""
     if not _visible_jobs(jobs):
         return 0.0
@@ -31,7 +30,7 @@ def height(jobs: Sequence[QueuedTask], ui: UiContext) -> float:
     return (STRIP_PX + 1.0) * ui.scale + imgui.get_style().item_spacing.y * (1 + bool(cards)) + cards
 
 
-def draw(jobs: Sequence[QueuedTask], ui: UiContext, actions: list[Action]) -> None:
+def draw(jobs: Sequence[JobCard], ui: UiContext, actions: list[Action]) -> None:
     """Draw the strip and its unfolded cards; a new failure unfolds it."""
     listed = _visible_jobs(jobs)
     storage = imgui.get_state_storage()
@@ -70,16 +69,16 @@ _OPEN_SLOT = "jobs are open"
 _HEIGHT_SLOT = "height of the jobs"
 
 
-def _visible_jobs(jobs: Sequence[QueuedTask]) -> list[QueuedTask]:
+def _visible_jobs(jobs: Sequence[JobCard]) -> list[JobCard]:
     """Return the jobs that have a card. A trained edit is a layer and needs none."""
-    return [job for job in jobs if job.status != "done" or job.warning or isinstance(job.task, Delivery)]
+    return [job for job in jobs if job.status != "done" or job.warning or not job.training]
 
 
-def _is_failed(job: QueuedTask) -> bool:
+def _is_failed(job: JobCard) -> bool:
     return job.status == "failed" or bool(job.warning)
 
 
-def _strip(jobs: Sequence[QueuedTask], is_open: bool, ui: UiContext) -> bool:
+def _strip(jobs: Sequence[JobCard], is_open: bool, ui: UiContext) -> bool:
     """Draw one line with the most important job and the number of others; return True if it was pressed."""
     order = ("failed", "running", "stopping", "done")
     job = min(jobs, key=lambda job: order.index(job.status) if job.status in order else len(order))
@@ -100,7 +99,7 @@ def _strip(jobs: Sequence[QueuedTask], is_open: bool, ui: UiContext) -> bool:
     sizes = [imgui.calc_text_size(text).x for text in (status, end)]
     top = start.y + (tall - imgui.get_text_line_height()) / 2
     imgui.set_cursor_pos((start.x + 4 * dot, top))
-    imgui.text(elide(job.task.name, right - start.x - sum(sizes) - 8 * dot))
+    imgui.text(elide(job.name, right - start.x - sum(sizes) - 8 * dot))
     for text, at in ((status, 0.0), (end, right - sizes[1])):
         imgui.same_line(at)
         imgui.text_disabled(text)
@@ -108,22 +107,21 @@ def _strip(jobs: Sequence[QueuedTask], is_open: bool, ui: UiContext) -> bool:
     return bool(pressed)
 
 
-def _card(job: QueuedTask, ui: UiContext) -> list[Action]:
+def _card(job: JobCard, ui: UiContext) -> list[Action]:
     """Draw name, status, progress and buttons of a job, and its menu; return the requested actions."""
-    task = job.task
     failed = _is_failed(job)
     word = _status(job)
     with card("card", PALETTE.card, ui):
         right = right_edge()
         wide = imgui.calc_text_size(word).x
         imgui.align_text_to_frame_padding()
-        imgui.text(elide(task.name, right - wide - 16.0 * ui.scale))
-        about = f"{task.name}\n{task.editor} on {task.region}\n" if isinstance(task, EditOrder) else ""
-        tip(f"{about}{task.out}")
+        imgui.text(elide(job.name, right - wide - 16.0 * ui.scale))
+        about = f"{job.name}\n{job.training}\n" if job.training else ""
+        tip(f"{about}{job.out}")
         imgui.same_line(right - wide)
         imgui.text_colored(PALETTE.error if failed else PALETTE.dim, word)
         color = PALETTE.accent if job.status == "running" else PALETTE.faint
-        _bar(job.progress.share, PALETTE.error if failed else color, ui)
+        _bar(job.share, PALETTE.error if failed else color, ui)
         menu = bool(about) and job.status != "queued"
         actions = _foot(job, right, menu, ui)
         right_click = imgui.is_mouse_clicked(imgui.MouseButton_.right.value) and imgui.is_window_hovered()
@@ -140,9 +138,9 @@ def _card(job: QueuedTask, ui: UiContext) -> list[Action]:
         return [*requested, *(action for action in chosen if action is not None)]
 
 
-def _status(job: QueuedTask) -> str:
+def _status(job: JobCard) -> str:
     if job.status == "running":
-        return f"{100 * job.progress.share:.0f} %" if job.progress.share else ""
+        return f"{100 * job.share:.0f} %" if job.share else ""
     return job.status.capitalize()
 
 
@@ -158,9 +156,9 @@ def _bar(share: float, color: Rgba, ui: UiContext) -> None:
             imgui.get_window_draw_list().add_rect_filled((x, y), end, u32(ink), tall / 2)
 
 
-def _foot(job: QueuedTask, right: float, menu: bool, ui: UiContext) -> list[str]:
+def _foot(job: JobCard, right: float, menu: bool, ui: UiContext) -> list[str]:
     """Draw the current step, or the error, and the buttons at the right."""
-    buttons = list(_BUTTONS.get((job.status, isinstance(job.task, EditOrder)), ()))
+    buttons = list(_BUTTONS.get((job.status, bool(job.training)), ()))
     if menu:
         buttons.append((Icon.MENU, _MENU, "Log, discard (right-click)"))
     with imgui_ctx.push_font(None, SMALL_PX):
@@ -190,24 +188,21 @@ def _foot(job: QueuedTask, right: float, menu: bool, ui: UiContext) -> list[str]
     return actions
 
 
-def _status_text(job: QueuedTask) -> str:
-    progress = job.progress
+def _status_text(job: JobCard) -> str:
     match job.status:
         case "running":
             left = job.seconds_left
-            finds = isinstance(job.task, EditOrder) and job.task.region == "changed"
-            starting = "Finding the changes" if finds else "Starting"
-            words = [progress.label or starting]
+            words = [job.label]
             words += [f"{format_duration(left)} left"] if left is not None else []
-            words += [f"loss {progress.loss}"] if progress.loss else []
+            words += [f"loss {job.loss}"] if job.loss else []
             return "  ·  ".join(words)
         case "queued":
             return "Waiting for the previous job"
         case "stopping":
-            return "Saving the state" if isinstance(job.task, EditOrder) else _NOTHING_WRITTEN
+            return "Saving the state" if job.training else _NOTHING_WRITTEN
         case "done":
             return ""
-    return f"{100 * progress.share:.0f} % is done" if progress.share else "Can be resumed"
+    return f"{100 * job.share:.0f} % is done" if job.share else "Can be resumed"
 
 
 _STOP_HELP = "Stop; the run can be resumed later"

@@ -15,7 +15,7 @@ from progdf.compose.layers import BLENDS
 from viewer.camera import controls
 from viewer.camera.view_camera import FARTHEST
 from viewer.camera.views import look_at_view
-from viewer.jobs.training import ALL, CHANGED, SELECTION, TYPED, with_settings
+from viewer.state.forms import ALL, CHANGED, SELECTION, TYPED, with_settings
 
 from . import history, layer_selection, paint, selection, snapshots, timeline
 from .commands import Action, ChooseSnapshot, MoveSnapshot, OnItem, Plain, Rename, WithValue, argument

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
@@ -19,8 +20,7 @@ from progdf.scene.selection import Mask
 from progdf.terminal import escape_text
 from viewer.camera.view_camera import Bounds, Fit, ViewCamera, keep_camera
 from viewer.camera.views import Glide, glide_on
-from viewer.jobs.job_queue import DeliverOptions, QueuedTask
-from viewer.jobs.training import NewEdit
+from viewer.state.forms import DeliverOptions, NewEdit
 
 from . import history, timeline
 from .commands import Action
@@ -95,6 +95,27 @@ class Dialog:
     options: DeliverOptions | None = None  # options of the requested picture or film
 
 
+JobStatus = Literal["queued", "running", "stopping", "stopped", "failed", "done"]
+
+
+@dataclass(frozen=True)
+class JobCard:
+    """Training, export or render job, as its card in the panel shows it."""
+
+    number: int  # of the job in the queue
+    name: str
+    out: Path  # its file or folder
+    status: JobStatus = "queued"
+    training: str = ""  # editor and region of a training, "" for an export or a picture
+    label: str = ""  # current step
+    share: float = 0.0  # share that is done, 0 to 1
+    loss: str = ""  # loss of the training, "" without one
+    seconds_left: float | None = None  # None before there is an estimate
+    error: str = ""  # one line about a failure
+    warning: str = ""  # one line about a poor result
+    elsewhere: str = ""  # name of its scene while another one is open
+
+
 Pointed = tuple[str, int]
 """Panel item under the mouse: "layer" or "region" and its index, or ("selection", 0)."""
 
@@ -146,7 +167,7 @@ class Workspace:
     form_open: bool = False  # whether the form is open
     form_opening: bool = False  # the form opens and has no keyboard focus yet
     # running and waiting training, export and render jobs, as of the last poll
-    jobs: tuple[QueuedTask, ...] = ()
+    jobs: tuple[JobCard, ...] = ()
     before: bool = False  # show the original until its key is pressed again or a slider moves
     glide: Glide | None = None  # running animation of the camera
     layout: Layout = Layout()

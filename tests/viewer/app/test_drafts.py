@@ -25,9 +25,9 @@ from viewer.camera.view_camera import to_camera
 from viewer.files import user_files
 from viewer.files.session import open_session
 from viewer.jobs import job_queue
-from viewer.jobs.training import EDITORS, SHEET_COLUMNS, SHEET_PX, STYLE_ORDER
 from viewer.state import paint
 from viewer.state.commands import OnItem, Plain
+from viewer.state.forms import EDITORS, SHEET_COLUMNS, SHEET_PX, STYLE_ORDER
 from viewer.state.layers import visible_layers
 from viewer.state.view_state import LayerState
 
@@ -325,7 +325,7 @@ def test_draft_of_a_failed_training_stays_until_deleted(window: application.App)
     Trainer.ended = 2
     Trainer.line = "the disk is full"
     turn(window)
-    (job,) = window.main_view.work.jobs
+    (job,) = window.jobs.queue.jobs
     request(window, OnItem("discard_run", job.number))
     assert layer(window).name == "blue"
     press(window, "Ctrl+Delete")
@@ -363,7 +363,7 @@ def test_draft_of_the_run_becomes_the_layer_without_a_preview(window: applicatio
     opened(window, preview=False)
     request(window, Plain("train"))
     assert window.main_view.work.view.layers == ()
-    (job,) = window.main_view.work.jobs
+    (job,) = window.jobs.queue.jobs
     job.task.out.mkdir(parents=True)
     (job.task.out / "draft.gdf").write_bytes((Previews.grade or Path()).read_bytes())
     turn(window)

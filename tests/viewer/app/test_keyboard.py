@@ -10,8 +10,8 @@ from imgui_bundle import imgui
 
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from tests.viewer.app.test_keys_of_lists_and_form import list_is_open, strike, type_text
-from viewer.jobs.job_queue import DeliverOptions
 from viewer.state.commands import WithText
+from viewer.state.forms import DeliverOptions
 from viewer.state.workspace import PLACES, Dialog
 
 pytestmark = pytest.mark.gl

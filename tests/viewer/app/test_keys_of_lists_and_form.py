@@ -12,8 +12,8 @@ import pytest
 from imgui_bundle import imgui
 
 from tests.helpers.ui_rig import HEAD, Rig, bear, first_view, rig
-from viewer.jobs.job_queue import DeliverOptions
 from viewer.state.commands import Plain
+from viewer.state.forms import DeliverOptions
 from viewer.state.selection import NamedRegion
 from viewer.state.workspace import Dialog
 from viewer.ui.keys import KEYS, Keys, Press, next_event_id

@@ -14,13 +14,12 @@ from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.stacks import many_edits
 from tests.helpers.ui_rig import HEAD, Rig, bear, first_view, rig
-from viewer.jobs.job_queue import Delivery, QueuedTask
 from viewer.panel import card, panel, tools
 from viewer.state import selection
 from viewer.state.commands import Plain
 from viewer.state.selection import SelectionState
 from viewer.state.view_state import ViewState
-from viewer.state.workspace import WIDEST_PX, Layout
+from viewer.state.workspace import WIDEST_PX, JobCard, Layout
 
 pytestmark = pytest.mark.gl
 SIZE = (1280, 800)
@@ -158,7 +157,6 @@ def test_layout_is_remembered(tmp_path: Path) -> None:
 
 
 def test_jobs_strip_opens_by_click_and_once_by_a_failure(hand: Rig) -> None:
-    film = Delivery("Rendering film.mp4", Path("/scenes/film.mp4"), (), Path("film.log"), Path("bear.ply"))
     strip = (LEFT + 150.0, SIZE[1] - 37.0 - 14.0)
 
     def cards() -> int:
@@ -167,13 +165,18 @@ def test_jobs_strip_opens_by_click_and_once_by_a_failure(hand: Rig) -> None:
             "jobs" in w.name and "/card_" in w.name and w.active for w in imgui.get_current_context().windows
         )
 
-    hand.main_view.work = replace(hand.main_view.work, jobs=(QueuedTask(1, film, "running"),))
+    hand.main_view.work = replace(
+        hand.main_view.work, jobs=(JobCard(1, "Rendering film.mp4", Path("/scenes/film.mp4"), "running"),)
+    )
     assert cards() == 0
     hand.click(*strip)
     assert cards() == 1
     hand.click(*strip)
     assert cards() == 0
-    hand.main_view.work = replace(hand.main_view.work, jobs=(QueuedTask(1, film, "failed", error="no room"),))
+    hand.main_view.work = replace(
+        hand.main_view.work,
+        jobs=(JobCard(1, "Rendering film.mp4", Path("/scenes/film.mp4"), "failed", error="no room"),),
+    )
     assert cards() == 1
     hand.click(*strip)
     assert cards() == 0, "what was seen does not open it again"

@@ -14,9 +14,9 @@ from PIL import Image
 from progdf.metrics.image import psnr
 from tests.helpers.ui_rig import bear, first_view, rig
 from viewer.camera.view_camera import SHAPES
-from viewer.jobs.job_queue import SIDES, picture_size
 from viewer.panel import panel
 from viewer.pictures.film import to_pixels
+from viewer.state.forms import SIDES, picture_size
 from viewer.state.view_state import Comparison, ViewState
 from viewer.ui.overlay import Area, safe_frame
 

@@ -33,10 +33,9 @@ from viewer.files.document import empty
 from viewer.files.session import open_session
 from viewer.files.user_files import load_thumbnail
 from viewer.jobs import job_queue
-from viewer.jobs.job_queue import TURNTABLE
-from viewer.jobs.training import CHANGED, SELECTION, TYPED
 from viewer.state import selection
 from viewer.state.commands import Action, OnItem, Plain, WithText
+from viewer.state.forms import CHANGED, SELECTION, TURNTABLE, TYPED
 from viewer.state.view_state import ViewState
 
 pytestmark = pytest.mark.gl
@@ -105,7 +104,7 @@ def test_trained_edit_becomes_a_layer_at_full_strength(window: application.App) 
     assert window.main_view.work.form_open
     request(window, Plain("train"))
     assert not window.main_view.work.form_open
-    (job,) = window.main_view.work.jobs
+    (job,) = window.jobs.queue.jobs
     assert (job.status, job.task.name) == ("running", "blue")
     assert "--editor=recolor:#3061d1" in Trainer.said
     Trainer.ended = 0
@@ -162,7 +161,7 @@ def test_invalid_edit_is_reported_in_the_form(window: application.App) -> None:
 
 def test_packed_edit_replaces_the_draft_while_it_is_measured(window: application.App) -> None:
     request(window, Plain("train"))
-    (job,) = window.main_view.work.jobs
+    (job,) = window.jobs.queue.jobs
     order = job.task
     packed = job.task.out / "draft.gdf"
     packed.parent.mkdir(parents=True)
@@ -240,7 +239,7 @@ def test_failed_training_is_one_line_with_its_log(window: application.App) -> No
     Trainer.ended = 2
     Trainer.line = "the disk is full"
     turn(window)
-    (job,) = window.main_view.work.jobs
+    (job,) = window.jobs.queue.jobs
     assert (job.status, job.error) == ("failed", "the disk is full")
     assert window.main_view.work.message is None, "its card says it, and nothing else"
     request(window, OnItem("run_log", job.number))
@@ -253,7 +252,7 @@ def test_failed_training_is_one_line_with_its_log(window: application.App) -> No
 
 def test_training_is_discarded_only_after_a_question(window: application.App) -> None:
     request(window, Plain("train"))
-    (job,) = window.main_view.work.jobs
+    (job,) = window.jobs.queue.jobs
     state = job.task.out / "state"
     state.mkdir(parents=True)
     (state / "run.json").touch()
@@ -277,7 +276,7 @@ def test_training_is_discarded_only_after_a_question(window: application.App) ->
 
 def test_run_locked_by_another_window_is_left_alone(window: application.App) -> None:
     request(window, Plain("train"))
-    (job,) = window.main_view.work.jobs
+    (job,) = window.jobs.queue.jobs
     (job.task.out / "state").mkdir(parents=True)
     (job.task.out / "state" / "run.json").touch()
     request(window, OnItem("stop_run", job.number))
@@ -319,7 +318,7 @@ def test_scene_export_runs_the_command(window: application.App, tmp_path: Path) 
     assert [job.status for job in window.main_view.work.jobs] == ["running"]
     Trainer.ended = 0
     turn(window)
-    (job,) = window.main_view.work.jobs
+    (job,) = window.jobs.queue.jobs
     assert job.status == "done", "it stays until it is closed"
     request(window, OnItem("copy_path", job.number))
     assert imgui.get_clipboard_text() == str(tmp_path / "bear_edited.ply")
@@ -425,7 +424,7 @@ def test_demo_card_counts_edits_and_each_draft_becomes_one_layer(
             assert [(layer.name, layer.strength) for layer in view.layers] == [("scarf", strength)]
             assert app.document.gdf_paths == (scarf / name,)
             app.main_view.change(replace(view, layers=(replace(view.layers[0], strength=0.3),)))
-        (job,) = app.main_view.work.jobs
+        (job,) = app.jobs.queue.jobs
         assert (job.progress.label, job.progress.share) == ("1 of 4: scarf", 0.0)
         Trainer.ended = 0
 
@@ -436,7 +435,7 @@ def test_jobs_of_another_scene_continue_and_name_their_scene(window: application
     press(window, "Ctrl+E", "Enter")
     window.open(tmp_path / "half.ply")
     turn(window)
-    job, delivery = window.main_view.work.jobs
+    job, delivery = window.jobs.queue.jobs
     assert (job.status, job.elsewhere, delivery.elsewhere) == ("running", "bear.ply", "bear.ply")
     Trainer.ended = 2
     Trainer.line = "the disk is full"
@@ -445,7 +444,7 @@ def test_jobs_of_another_scene_continue_and_name_their_scene(window: application
     assert window.main_view.work.jobs == (), "what failed is the scene's"
     window.open(tmp_path / "bear.ply")
     turn(window)
-    job, delivery = window.main_view.work.jobs
+    job, delivery = window.jobs.queue.jobs
     assert (job.status, job.elsewhere) == ("failed", "")
     assert (delivery.status, delivery.elsewhere) == ("failed", "")
 

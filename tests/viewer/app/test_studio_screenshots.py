@@ -12,14 +12,16 @@ import pytest
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.app.main_view import MainView
 from viewer.app.start import EXAMPLE_TITLES
+from viewer.app.training import job_card
 from viewer.files.document import empty
 from viewer.jobs.child import Progress
-from viewer.jobs.job_queue import DeliverOptions, Delivery, QueuedTask
-from viewer.jobs.training import TYPED, EditOrder, NewEdit
+from viewer.jobs.job_queue import Delivery, QueuedTask
+from viewer.jobs.training import EditOrder
 from viewer.panel.pages import StartFile
 from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import headless_context
 from viewer.state.commands import OnItem
+from viewer.state.forms import TYPED, DeliverOptions, NewEdit
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import Dialog, with_transient
 from viewer.ui.splash import MINIMUM_SIZE_PX
@@ -86,7 +88,8 @@ def test_screenshot_of_run_cards_and_a_film(screenshot: Compare) -> None:
     frames = Progress(30 / 96, "frame 30 of 96")
     with rig(first_view(bear(), 0.7), SMALLEST) as hand:
         hand.main_view.work = replace(
-            hand.main_view.work, jobs=(*jobs, QueuedTask(5, film, "running", frames, 10.0))
+            hand.main_view.work,
+            jobs=tuple(map(job_card, (*jobs, QueuedTask(5, film, "running", frames, 10.0)))),
         )
         hand.settle()
         hand.frame(3)
@@ -107,7 +110,7 @@ def test_screenshot_of_two_failures_with_whole_buttons(screenshot: Compare) -> N
     jobs = tuple(QueuedTask(number, replace(film), "failed", error=line) for number in (1, 2))
     with rig(first_view(bear(), 0.7), MINIMUM_SIZE_PX) as hand:
         for count in (1, 2):
-            hand.main_view.work = replace(hand.main_view.work, jobs=jobs[:count])
+            hand.main_view.work = replace(hand.main_view.work, jobs=tuple(map(job_card, jobs[:count])))
             hand.main_view.wake()
             hand.settle()
         screenshot("ui_failures", hand.image()[:, 330:])
@@ -124,13 +127,13 @@ def test_second_click_on_the_stop_button_resumes(software_gpu: None) -> None:
     order = EditOrder(Path("bear.ply"), Path("/scenes/bear.edits/blue"), "blue", "all", "recolor:#3060d0")
     running = QueuedTask(1, order, "running", Progress(0.45, "Training", "0.0114"), 20.0)
     with rig(first_view(bear(), 0.7), SMALLEST) as hand:
-        hand.main_view.work = replace(hand.main_view.work, jobs=(running,))
+        hand.main_view.work = replace(hand.main_view.work, jobs=(job_card(running),))
         hand.settle()
         hand.click(SMALLEST[0] - 150.0, SMALLEST[1] - 55.0)  # opens the strip of jobs
         hand.settle()
 
         def asked(job: QueuedTask, x: float, y: float) -> tuple[str, ...]:
-            hand.main_view.work = replace(hand.main_view.work, jobs=(job,))
+            hand.main_view.work = replace(hand.main_view.work, jobs=(job_card(job),))
             hand.settle()
             hand.click(x, y)
             return hand.main_view.take_requests()

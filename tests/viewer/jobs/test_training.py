@@ -23,7 +23,8 @@ from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder
 from viewer.jobs import training
 from viewer.jobs.child import Progress
-from viewer.jobs.training import (
+from viewer.jobs.training import EditOrder
+from viewer.state.forms import (
     ALL,
     CHANGED,
     MAX_PAIRS,
@@ -31,7 +32,6 @@ from viewer.jobs.training import (
     NO_CHANGE,
     STYLES,
     TYPED,
-    EditOrder,
     NewEdit,
     missing_package,
     with_color,
@@ -39,7 +39,7 @@ from viewer.jobs.training import (
     with_picture,
     with_settings,
 )
-from viewer.jobs.training import EDITORS as CHOICES
+from viewer.state.forms import EDITORS as CHOICES
 
 KINDS = [choice.kind for choice in CHOICES]
 

@@ -10,8 +10,8 @@ from imgui_bundle import imgui
 
 from progdf.color.edits import parse_color
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
-from viewer.jobs.training import EDITORS, NewEdit, parse_curve
 from viewer.panel import new_edit_form, panel
+from viewer.state.forms import EDITORS, NewEdit, parse_curve
 
 pytestmark = pytest.mark.gl
 WINDOW = (1024, 800)

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
-from viewer.jobs.training import ALL, TYPED
 from viewer.state import paint, selection
 from viewer.state.actions import perform
 from viewer.state.commands import OnItem, Plain
+from viewer.state.forms import ALL, TYPED
 from viewer.state.selection import NamedRegion
 from viewer.state.workspace import SceneFacts, Workspace
 

