@@ -35,12 +35,13 @@ class DeliverActions:
 
     def __init__(self, app: Application, queue: JobQueue) -> None:
         self._app = app
+        self._store = app.store
         self._queue = queue
         self._options: dict[str, DeliverOptions] = {}  # the last options of each dialog, preset in the next
 
     @property
     def requests(self) -> Requests:
-        """Requests for the dialogs of `SUFFIXES`, for their output, and for rebinding an edit."""
+        """Handlers for the dialogs of `SUFFIXES`, for their output, and for rebinding an edit."""
         ask, version = self._app.main_view.ask, sys.version.split()[0]
         return {
             **{name: partial(self._ask, name) for name in SUFFIXES},
@@ -53,17 +54,17 @@ class DeliverActions:
     def _deliver(self, kind: str) -> None:
         """Queue the delivery; an error stays in the dialog."""
         main_view = self._app.main_view
-        if (dialog := main_view.work.dialog) is not None:
+        if (dialog := self._store.get().dialog) is not None:
             error = failure_line(lambda: self._start(kind, dialog))
             after = replace(dialog, error=error) if error else None
-            self._app.store.replace(replace(main_view.work, dialog=after))
+            self._store.replace(replace(self._store.get(), dialog=after))
             main_view.wake()
 
     def _ask(self, name: str, _: None) -> None:
         path = self._app.document.file
         main_view = self._app.main_view
-        view = main_view.work.view
-        focus = main_view.work.focus
+        view = self._store.get().view
+        focus = self._store.get().focus
         options = self._options.get(name, DeliverOptions())
         if name == "render_film":
             keys = ("timeline",) if len(view.timeline.keys) > 1 else ()
@@ -108,14 +109,14 @@ class DeliverActions:
         if out.exists() and dialog.error != exists:
             raise ProgdfError(exists)
         document = self._app.document
-        view = replace(self._app.main_view.work.view, compare=Comparison())
+        view = replace(self._store.get().view, compare=Comparison())
         if kind == "render_film" and options.moves != "timeline":
             view = _film(view, options)
         elif kind == "render_film":
             view = replace(view, timeline=replace(view.timeline, fps=options.fps))
         number = len(list(self._queue.folder.iterdir()))
         stack = self._queue.folder / f"stack{number}.session.json"
-        session.save(stack, session.WindowSession(document, view, self._app.main_view.work.snapshots))
+        session.save(stack, session.WindowSession(document, view, self._store.get().snapshots))
         size = f"--size={options.width}x{options.height}"
         background = ["--alpha"] if options.alpha else []
         words = {

@@ -97,6 +97,7 @@ class EditActions:
 
     def __init__(self, app: Application) -> None:
         self._app = app
+        self._store = app.store
 
     def add(self, path: Path, name: str = "", strength: float = 1.0, deselect: bool = False) -> None:
         """Add an edit on top, see `add_layer`.
@@ -110,7 +111,7 @@ class EditActions:
         Raises:
             ProgdfError: the file is missing or broken, or it is not a grade and was made for another scene.
         """
-        before = self._app.main_view.work.view
+        before = self._store.get().view
         scene = self._app.document.original
         selected = selection.unpack(before.selection.members, len(scene)).copy()
         where, mask = ("selection", selected) if selected.any() else ("all", np.ones(len(scene), bool))
@@ -131,7 +132,7 @@ class EditActions:
             ProgdfError: see `add`.
         """
         document = self._app.document
-        view = self._app.main_view.work.view
+        view = self._store.get().view
         drafts = [i for i, known in enumerate(document.gdf_paths) if known == draft]
         if not drafts:
             return False
@@ -149,7 +150,7 @@ class EditActions:
     def duplicate(self, index: int) -> None:
         """Add a copy of a layer above it, with its own edit, as the timeline and undo distinguish edits."""
         document = self._app.document
-        view = self._app.main_view.work.view
+        view = self._store.get().view
         gdf = view.layers[index].gdf
         path = document.gdf_paths[gdf] if gdf < len(document.gdf_paths) else None
         self._apply(duplicate_layer(view, index, self._open(document.edits[gdf], path)), index + 1)
@@ -160,7 +161,7 @@ class EditActions:
         Raises:
             ProgdfError: see `add`.
         """
-        view = self._app.main_view.work.view
+        view = self._store.get().view
         index = self.layer(layer)
         file = parse_path(path)
         gdf = self._load(file, self._app.document.edits[view.layers[index].gdf].region)
@@ -172,7 +173,7 @@ class EditActions:
         Raises:
             ProgdfError: there is no such layer.
         """
-        work = self._app.main_view.work
+        work = self._store.get()
         chosen = work.focus if index is None else index
         if chosen is None or not 0 <= chosen < len(work.view.layers):
             raise ProgdfError("no layer is selected; click one first")
@@ -204,7 +205,7 @@ class EditActions:
         """Set the changed stack and focus one layer."""
         main_view = self._app.main_view
         main_view.change(view)
-        self._app.store.replace(focus_layer(main_view.work, focus))
+        self._store.replace(focus_layer(self._store.get(), focus))
 
 
 class FileActions:
@@ -217,6 +218,7 @@ class FileActions:
 
     def __init__(self, app: Application, path: Path | None = None) -> None:
         self._app = app
+        self._store = app.store
         self.path = path
         self.session_autosave = SessionAutosave()
         self._put_off: set[Path] = set()  # autosaves that the user decides about later
@@ -257,7 +259,7 @@ class FileActions:
         }
 
     def _open_keys(self, _: None) -> None:
-        """Write a file with all key bindings, if none exists, and open it in the desktop's program for it."""
+        """Open the file of key bindings in its default program; create it with all keys if it is missing."""
         keys = {name: command.keys.split() for name, command in COMMANDS.items()}
         path = write_keys(keys)
         webbrowser.open(path.as_uri())
@@ -270,15 +272,15 @@ class FileActions:
             Seconds until the next call; None if no system dialog is open.
         """
         main_view = self._app.main_view
-        dialog = self._browser.poll(main_view.work.dialog)
-        if dialog is not None and dialog != main_view.work.dialog:
+        dialog = self._browser.poll(self._store.get().dialog)
+        if dialog is not None and dialog != self._store.get().dialog:
             main_view.ask(dialog)
         return dialogs.POLL_S if self._browser.on_screen else None
 
     @property
     def has_unsaved(self) -> bool:
         """True if there are unsaved changes that a session can store."""
-        return self._app.document.path is not None and workspace.has_unsaved(self._app.main_view.work)
+        return self._app.document.path is not None and workspace.has_unsaved(self._store.get())
 
     def open(self, path: Path) -> None:
         """Open a file according to its content.
@@ -306,12 +308,12 @@ class FileActions:
             raise ProgdfError(f"{path} is not a session; choose another name")
         self._claim_regions(path)
         self._write(path)
-        for region in self._app.main_view.work.view.selection.regions:
+        for region in self._store.get().view.selection.regions:
             exports.region_file(region, len(self._app.document.original))
         self.session_autosave.drop()
         self.path = path
         main_view = self._app.main_view
-        self._app.store.replace(workspace.mark_saved(main_view.work))
+        self._store.replace(workspace.mark_saved(self._store.get()))
         self._remember(path)
         main_view.show_message(f"Saved {path.resolve()}")
 
@@ -327,7 +329,7 @@ class FileActions:
         if not self.has_unsaved:
             self.session_autosave.stop()
             return None
-        unsaved = workspace.saved_state(self._app.main_view.work)
+        unsaved = workspace.saved_state(self._store.get())
         try:
             wait = self.session_autosave.wait(now, unsaved, self._autosave_base, self._write)
         except (ProgdfError, OSError) as error:
@@ -340,7 +342,7 @@ class FileActions:
         try:
             if not self.has_unsaved:
                 return "there was no unsaved work"
-            unsaved = workspace.saved_state(self._app.main_view.work)
+            unsaved = workspace.saved_state(self._store.get())
             path = self.session_autosave.write(unsaved, self._autosave_base, self._write)
             return f"unsaved work is kept in {path}"
         except Exception as error:  # the work itself may be invalid
@@ -362,7 +364,7 @@ class FileActions:
         if kind == "picture":
             if is_decal(path) and self._app.document.path is not None:
                 decal = load_decal(main_view.context, path)
-                self._app.store.replace(with_transient(main_view.work, gizmo=decal))
+                self._store.replace(with_transient(self._store.get(), gizmo=decal))
                 main_view.wake()
             else:
                 edit_picture(main_view, path)
@@ -400,7 +402,7 @@ class FileActions:
             self.path = path
             self.offer_autosave()
             return
-        self._app.store.replace(replace(main_view.work, saved=None))
+        self._store.replace(replace(self._store.get(), saved=None))
         discarded = session.is_discarded(path)
         # work that was never saved, or was discarded, never replaces a session without a question
         self.path = saved if saved.is_file() and not discarded else None
@@ -420,7 +422,7 @@ class FileActions:
 
     def _discard(self, _: None) -> None:
         """Discard unsaved work; its autosave stays under another name."""
-        self._app.store.replace(workspace.mark_saved(self._app.store.get()))
+        self._store.replace(workspace.mark_saved(self._store.get()))
         self.session_autosave.discard()
 
     def _discard_autosave(self, path: str) -> None:
@@ -435,7 +437,7 @@ class FileActions:
             return opened, first_camera(opened.scene, up=up, stored=opened.stored_camera)
 
         opened, camera = self._app.wait_for(load, f"Opening {path.name} …")
-        self._app.open_document(opened, on_another_scene(self._app.main_view.work.view, camera))
+        self._app.open_document(opened, on_another_scene(self._store.get().view, camera))
         self.session_autosave.drop()
         self.path = None
         self.offer_autosave()
@@ -446,7 +448,7 @@ class FileActions:
         if self.path is None and opened.path is None:
             raise ProgdfError(f"{opened.title} was not opened from a file; save the scene first")
         folder = (self.path or opened.path or Path()).resolve().parent
-        view = main_view.work.view
+        view = self._store.get().view
         total = len(opened.original)
         selection = exports.keep_region(view.selection, name, folder, total)
         main_view.change(replace(view, selection=selection))
@@ -454,7 +456,7 @@ class FileActions:
         main_view.show_message(line, button=("New edit", Plain("new_edit")))
 
     def _rename_region(self, action: Rename) -> None:
-        view = self._app.main_view.work.view
+        view = self._store.get().view
         total = len(self._app.document.original)
         renamed = exports.rename_region(view.selection, action.index, action.text, total)
         self._app.main_view.change(replace(view, selection=renamed))
@@ -463,7 +465,7 @@ class FileActions:
         """Assign new files next to a session at `path` to regions whose files it could not load."""
         main_view = self._app.main_view
         scene = self._app.document.path
-        view = main_view.work.view
+        view = self._store.get().view
         if scene is not None and view.selection.regions:
             folders = exports.region_folders(path, scene)
             main_view.change(replace(view, selection=exports.claim_regions(view.selection, folders)))
@@ -472,7 +474,7 @@ class FileActions:
         session.save(path, self._session())
 
     def _session(self) -> WindowSession:
-        work = self._app.main_view.work
+        work = self._store.get()
         return WindowSession(self._app.document, work.view, work.snapshots)
 
     def _save_where(self, then: Action | None, ask: bool) -> None:
@@ -492,7 +494,7 @@ class FileActions:
             overwrite: the user has confirmed the replacement
         """
         main_view = self._app.main_view
-        dialog = self._app.main_view.work.dialog
+        dialog = self._store.get().dialog
         if then is None:
             then = dialog.then if dialog else None
 
@@ -502,7 +504,7 @@ class FileActions:
                 main_view.ask(Dialog("overwrite", str(file), then))
                 return
             self.save(file)
-            self._app.store.replace(replace(main_view.work, dialog=None))
+            self._store.replace(replace(self._store.get(), dialog=None))
             if then is not None:
                 main_view.request(then)
 
@@ -512,9 +514,10 @@ class FileActions:
     def _browse(self, _: None) -> None:
         """Open the system file dialog next to the open dialog."""
         main_view = self._app.main_view
-        if main_view.work.dialog is not None:
+        dialog = self._store.get().dialog
+        if dialog is not None:
             near = self.path or self._app.document.path or Path("file")
-            main_view.ask(self._browser.open(main_view.work.dialog, near))
+            main_view.ask(self._browser.open(dialog, near))
 
     def leave(self) -> None:
         """Close the window, after a question if there are unsaved changes."""
@@ -537,5 +540,4 @@ class FileActions:
     def _remember(self, *paths: Path) -> None:
         """Add files to the recent ones."""
         recent = remember_recent(paths) if paths else read_recent()
-        store = self._app.store
-        store.replace(with_transient(store.get(), recent=recent))
+        self._store.replace(with_transient(self._store.get(), recent=recent))

@@ -26,7 +26,7 @@ from viewer.state import actions, layer_selection, timeline, workspace
 from viewer.state.commands import Action, Plain, WithValue
 from viewer.state.layers import add_layer
 from viewer.state.snapshots import SliderSnapshot, compare_sides
-from viewer.state.transient import Decal, Gizmo, KeyPointer, Transient
+from viewer.state.transient import Decal, Gizmo, KeyPointer, PreviewState
 from viewer.state.view_state import LayerState, ViewState
 from viewer.state.workspace import PLACES, Dialog, SceneFacts, Store, Workspace, with_transient
 from viewer.ui import overlay
@@ -125,8 +125,6 @@ class MainView:
         self.facts = facts
         self.pictures = pictures
         self.canvas = Canvas(context, engine)
-        # for the start page: recently opened files, and examples
-        self.start_files: tuple[Sequence[pages.StartFile], Sequence[pages.StartFile]] = (), ()
         self.report: Callable[[Exception], None] = self._report  # receives the errors of a part of a frame
         self.surfaces = Surfaces()
         self.ui = UiContext(scale)
@@ -191,7 +189,7 @@ class MainView:
         """Set a new state and snapshots, with an empty undo history, no active drag and nothing over the
         picture."""
         old = self.work.transient
-        transient = Transient(live=old.live, pointer=old.pointer, recent=old.recent)
+        transient = replace(old, cover=None, preview=PreviewState(), gizmo=None)
         self.work = replace(
             workspace.new_workspace(view, snapshots), layout=self.work.layout, transient=transient
         )
@@ -329,7 +327,8 @@ class MainView:
             if not asks or command.id == "window_picture":
                 self._perform(command.action)
         if self.at_start:
-            for action in pages.draw_start_page(*self.start_files, self.ui):
+            transient = self.work.transient
+            for action in pages.draw_start_page(transient.start_files, transient.examples, self.ui):
                 self._perform(action)
             return
         if is_flying(self._keys):

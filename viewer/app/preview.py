@@ -196,6 +196,7 @@ class PreviewActions:
         self, app: Application, context: moderngl.Context, region: Callable[[NewEdit, Path], str]
     ) -> None:
         self._app = app
+        self._store = app.store
         self._context = context
         self._region = region
         self._child: PreviewChild | None = None
@@ -249,7 +250,7 @@ class PreviewActions:
         if self._child is not None:
             self._take(self._child, request)
         if self._outstanding and request.editor.startswith("instruct:") and request.seed >= 0:
-            self._show(f"Painting … {now - self._sent_at:.0f} s", self._app.store.get().transient.cover)
+            self._show(f"Painting … {now - self._sent_at:.0f} s", self._store.get().transient.cover)
         self._show_live()
         if self._child is None or self._broken:
             return None
@@ -278,22 +279,22 @@ class PreviewActions:
         main_view = self._app.main_view
         scene = self._app.document.file
         self._end_live()
-        camera = main_view.work.view.camera
+        camera = self._store.get().view.camera
         size = main_view.picture_size
         folder = training.edits_folder(scene)
         make_folder(folder)
-        path = main_view.canvas.save_original(folder, scene.stem, main_view.work.view, size)
+        path = main_view.canvas.save_original(folder, scene.stem, self._store.get().view, size)
         beside = path.with_name(f"{path.stem}.camera.json")  # a program may drop the picture's metadata
         save_cameras(beside, [to_camera(camera, *size)], self._app.document.scene.origin)
-        form = with_picture(main_view.work.form, path, further=False)
-        self._app.store.replace(replace(main_view.work, form=form, form_open=True))
+        form = with_picture(self._store.get().form, path, further=False)
+        self._store.replace(replace(self._store.get(), form=form, form_open=True))
         self._open_painter(path, camera, size, None)
 
     def follow_anchor(self, path: Path) -> None:
         """Open a sentence's picture, written at `path`, in another program and show the saved result."""
         if self._pose is not None and self._painted is not None:
             height, width = self._painted[1].shape[:2]
-            self._open_painter(path, self._pose[1], (width, height), self._app.store.get().transient.cover)
+            self._open_painter(path, self._pose[1], (width, height), self._store.get().transient.cover)
 
     def _open_painter(
         self, path: Path, camera: ViewCamera, size: tuple[int, int], cover: Cover | None
@@ -305,7 +306,7 @@ class PreviewActions:
 
     def _is_painting(self, painted: PaintedView) -> bool:
         """Return whether the form uses the picture that is being painted."""
-        work = self._app.main_view.work
+        work = self._store.get()
         path = str(painted.path)
         is_in_form = path in work.form.pictures.split(", ") or path == work.form.anchor
         return work.form_open and work.view.panel and is_in_form
@@ -343,7 +344,7 @@ class PreviewActions:
     def draft(self, form: NewEdit) -> Path | None:
         """Return the grade's file that previews the form; None if there is none."""
         request = self._request()
-        if form != self._app.main_view.work.form or request is None or self._grade is None:
+        if form != self._store.get().form or request is None or self._grade is None:
             return None
         return self._grade[2] if request.of_all_views == self._grade[0].of_all_views else None
 
@@ -365,7 +366,7 @@ class PreviewActions:
 
     def _request(self) -> _Request | None:
         """Return the request for the form and the view; None for no preview."""
-        work = self._app.main_view.work
+        work = self._store.get()
         size = self._app.main_view.picture_size
         form = work.form
         view = work.view
@@ -391,7 +392,7 @@ class PreviewActions:
         scale = min(1.0, LONGEST_SIDE / max(request.size))
         width, height = (max(round(side * scale), 1) for side in request.size)
         try:
-            region = self._region(self._app.main_view.work.form, child.folder)
+            region = self._region(self._store.get().form, child.folder)
         except (ProgdfError, OSError) as error:
             self._outstanding = False
             self._show(error_line(error), None, failed=True)
@@ -399,7 +400,7 @@ class PreviewActions:
         self._number = child.ask(region, request, to_camera(request.camera, width, height))
         self._outstanding = True
         self._region_sent = region
-        cover = self._app.store.get().transient.cover
+        cover = self._store.get().transient.cover
         in_place = cover is not None and (cover.camera, cover.size) == (request.camera, request.size)
         text = "Looking for models …" if request.seed < 0 else "Drawing …"
         self._show("" if in_place or self._grade else text, cover)
@@ -433,7 +434,7 @@ class PreviewActions:
         offset = index % SHEET_COLUMNS * width, index // SHEET_COLUMNS * height
         self._sheet.write(np.ascontiguousarray(pixels).tobytes(), (*offset, width, height), alignment=1)
         self._drawn |= {style}
-        store = self._app.store
+        store = self._store
         preview = store.get().transient.preview._replace(sheet=int(self._sheet.glo), styles=self._drawn)
         store.replace(with_transient(store.get(), preview=preview))
         self._app.main_view.wake()
@@ -457,18 +458,18 @@ class PreviewActions:
             return
         elif answer.made == "palette":
             self._palette_of = self._sent.region
-            work = self._app.main_view.work
+            work = self._store.get()
             if all(source == target for source, target in work.form.palette):
                 form = replace(work.form, palette=tuple((color, color) for color in answer.palette))
-                self._app.store.replace(replace(work, form=form))
+                self._store.replace(replace(work, form=form))
             self._app.main_view.wake()
         elif answer.note and answer.grade is None:
             self._show(answer.note, None, models=answer.models)
         elif answer.grade is not None:
             gdf = load_gdf(answer.grade, self._app.document.original)
             self._grade = self._sent, gdf, answer.grade
-            # of the previous color
-            self._app.store.replace(with_transient(self._app.store.get(), live=()))
+            # remove the preview of the previous color
+            self._store.replace(with_transient(self._store.get(), live=()))
             self._show(f"Live: {answer.note}", None)
         elif answer.pixels is not None:
             kind, _, argument = self._sent.editor.partition(":")
@@ -495,20 +496,20 @@ class PreviewActions:
             return
         main_view = self._app.main_view
         document = self._app.document
-        layers = main_view.work.view.layers
-        name = main_view.work.form.layer_name
+        layers = self._store.get().view.layers
+        name = self._store.get().form.layer_name
         solo = any(layer.solo for layer in layers)
-        strength = main_view.work.form.strength
+        strength = self._store.get().form.strength
         live = (LayerState(len(document.gdfs), name, strength, solo=solo),)
-        shown = main_view.work.transient.live
+        shown = self._store.get().transient.live
         if not shown:
             self._app.show(document, (self._grade[1],), live)
         elif shown != live:
-            self._app.store.replace(with_transient(main_view.work, live=live))
+            self._store.replace(with_transient(self._store.get(), live=live))
             main_view.wake()
 
     def _end_live(self) -> None:
-        if self._grade is not None and self._app.store.get().transient.live:
+        if self._grade is not None and self._store.get().transient.live:
             self._app.show(self._app.document)
         self._grade = None
 
@@ -526,13 +527,13 @@ class PreviewActions:
         self, text: str, cover: Cover | None, failed: bool = False, models: tuple[str, ...] | None = None
     ) -> None:
         """Set the picture over the view and the preview's state in the form."""
-        work = self._app.store.get()
+        work = self._store.get()
         available_models = work.transient.preview.models if models is None else models
         painted = self._painted is not None and self._painted[0] == self._request()
         sheet = 0 if self._sheet is None else int(self._sheet.glo)
         state = PreviewState(text, failed, self._outstanding, painted, available_models, sheet, self._drawn)
         if (work.transient.cover, work.transient.preview) != (cover, state):
-            self._app.store.replace(with_transient(work, cover=cover, preview=state))
+            self._store.replace(with_transient(work, cover=cover, preview=state))
             self._app.main_view.wake()
 
     def _end(self) -> None:

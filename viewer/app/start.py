@@ -23,10 +23,11 @@ from viewer.camera.view_camera import Vec3
 from viewer.files import user_files
 from viewer.gl.present import picture_texture
 from viewer.jobs.job_queue import Delivery, JobQueue
-from viewer.panel.pages import StartFile, folder_name
+from viewer.panel.pages import folder_name
 from viewer.pictures.film import to_pixels
 from viewer.render.engine import ViewEngine
 from viewer.state import history
+from viewer.state.transient import StartFile
 from viewer.state.view_state import Comparison, ViewState
 from viewer.state.workspace import with_transient
 
@@ -54,6 +55,7 @@ class StartActions:
 
     def __init__(self, app: Application, context: moderngl.Context, queue: JobQueue) -> None:
         self._app = app
+        self._store = app.store
         self._context = context
         self._queue = queue
         self._textures: dict[Path, moderngl.Texture | None] = {}
@@ -63,13 +65,12 @@ class StartActions:
 
     @property
     def requests(self) -> Requests:
-        """Requests for the demo, for a bundle of the examples, and to forget a file."""
+        """Handlers for the demo, for a bundle of the examples, and to forget a file."""
         return {"demo": self._start_demo, "example": self._open_example, "forget_file": self._forget}
 
     def _forget(self, path: str) -> None:
         recent = user_files.forget_recent(Path(path))
-        store = self._app.store
-        store.replace(with_transient(store.get(), recent=recent))
+        self._store.replace(with_transient(self._store.get(), recent=recent))
 
     def poll(self) -> float | None:
         """Open the finished parts of the demo; return the seconds until the next poll, None for never."""
@@ -83,9 +84,9 @@ class StartActions:
             return None
         if opened is None and scene.is_file():
             self._app.open(scene)
-            main_view = self._app.main_view
-            view = replace(main_view.work.view, background=SKY)
-            self._app.store.replace(replace(main_view.work, view=view, past=history.begin(view)))
+            work = self._store.get()
+            view = replace(work.view, background=SKY)
+            self._store.replace(replace(work, view=view, past=history.begin(view)))
         folders = sorted(file.parent for file in self._demo.glob("*/*.gdf") if self._app.document.path)
         for folder in dict.fromkeys(folders):
             attempt(self._app.main_view, partial(self._show_edit, folder))
@@ -158,9 +159,10 @@ class StartActions:
             line = "  ·  ".join(filter(None, ("Moved?" if missing else age, folder_name(path))))
             recent.append(StartFile(path, self._texture(path), line=line, missing=missing))
         examples = [StartFile(path, self._texture(path), *about) for path, about in EXAMPLE_TITLES.items()]
-        files = tuple(recent), tuple(examples)
-        if files != main_view.start_files:
-            main_view.start_files = files
+        work = self._store.get()
+        updated = with_transient(work, start_files=tuple(recent), examples=tuple(examples))
+        if updated != work:
+            self._store.replace(updated)
             main_view.wake()
 
     def _texture(self, path: Path) -> int:
@@ -183,6 +185,7 @@ class UpActions:
 
     def __init__(self, app: Application) -> None:
         self._app = app
+        self._store = app.store
         self._looked = False  # the scene has been checked
         self._up: Vec3 | None = None  # the user's up axis at the last poll
 
@@ -195,7 +198,7 @@ class UpActions:
         main_view = self._app.main_view
         document = self._app.document
         # The axis set by the user, also by undo; a film, a picture or a snapshot may move the camera.
-        up = main_view.work.past.present.look.up
+        up = self._store.get().past.present.look.up
         before = self._up
         self._up = up
         if document.path is None:
@@ -203,7 +206,7 @@ class UpActions:
         if self._looked and up != before:
             up_axis.remember_chosen_up(document.scene, up)
         guess = not (self._looked or session or document.detected_up.certain)
-        if guess and up == document.detected_up.direction and main_view.work.message is None:
+        if guess and up == document.detected_up.direction and self._store.get().message is None:
             name = up_axis.direction_name(torch.tensor(up)).upper().replace("-", "−")
             where = "Change it under the axes: Up axis."
             main_view.show_message(f"Guessed {name} as up in {document.title}. {where}")

@@ -44,6 +44,7 @@ class TidyActions:
 
     def __init__(self, app: Application) -> None:
         self._app = app
+        self._store = app.store
         self._edits = EditActions(app)
         self._region: Region | None = None  # the region being moved
         self._folder = Path()  # folder of new edits
@@ -69,7 +70,7 @@ class TidyActions:
         main_view = self._app.main_view
         scene = self._app.document.original
         self._folder = edits_folder(self._app.document.file)
-        mask = selection.unpack(main_view.work.view.selection.members, len(scene))
+        mask = selection.unpack(self._store.get().view.selection.members, len(scene))
         if not mask.any():
             raise ProgdfError("nothing is selected; select a part of the scene first")
         region = from_mask("selection", torch.from_numpy(mask.copy()))
@@ -84,13 +85,13 @@ class TidyActions:
         main_view.wake()
 
     def _steps(self) -> list[Step]:
-        gizmo = self._app.store.get().transient.gizmo
+        gizmo = self._store.get().transient.gizmo
         if not isinstance(gizmo, Gizmo) or self._region is None:
             return []
         return [Step(gizmo.does, self._region, similarity(*gizmo_step(gizmo)))]
 
     def _place(self, _: None) -> None:
-        """Show the moved selection at the place of the handles."""
+        """Show the moved selection at the position of the handles."""
         if steps := self._steps():
             document = self._app.document
             gdf = tidy(document.original, steps, _NAMES[steps[0].does])
@@ -98,7 +99,7 @@ class TidyActions:
             self._app.show(document, (gdf,), live)
 
     def _keep(self, _: None) -> None:
-        gizmo = self._app.store.get().transient.gizmo
+        gizmo = self._store.get().transient.gizmo
         steps = self._steps()
         if isinstance(gizmo, Gizmo) and steps and (gizmo.does == "duplicate" or gizmo.is_moved):
             self._add(steps[0].does, steps)
@@ -116,8 +117,7 @@ class TidyActions:
         self._app.main_view.wake()
 
     def _set_gizmo(self, gizmo: Gizmo | None) -> None:
-        store = self._app.store
-        store.replace(with_transient(store.get(), gizmo=gizmo))
+        self._store.replace(with_transient(self._store.get(), gizmo=gizmo))
 
     def _add(self, does: str, steps: Sequence[Step]) -> None:
         """Write the edit and add it as a layer on top."""
@@ -141,6 +141,7 @@ class StrayActions:
 
     def __init__(self, app: Application) -> None:
         self._app = app
+        self._store = app.store
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="strays")
         self._search: Future[tuple[Strays, float]] | None = None
         self._scene: Gaussians | None = None  # the scene being searched
@@ -179,7 +180,7 @@ class StrayActions:
         if not len(strays.rows):
             main_view.show_message("No strays found")
             return
-        view = main_view.work.view
+        view = self._store.get().view
         mask = np.zeros(count, bool)
         mask[strays.rows] = True
         main_view.change(replace(view, selection=selection.hide(view.selection, mask)))

@@ -94,6 +94,7 @@ class JobActions:
         follow: Callable[[Path], None] = lambda _: None,
     ) -> None:
         self._app = app
+        self._store = app.store
         self._draft = draft
         self._anchor = anchor
         self._follow = follow
@@ -165,10 +166,10 @@ class JobActions:
     def _train(self, _: None) -> None:
         """Queue the form's edit; an error stays in the form."""
         main_view = self._app.main_view
-        form = main_view.work.form
+        form = self._store.get().form
         error = form.obstacle or failure_line(lambda: self._enqueue(form))
         form = replace(form, error=error) if error else replace(form, error="", name="")
-        self._app.store.replace(replace(main_view.work, form=form, form_open=bool(error)))
+        self._store.replace(replace(self._store.get(), form=form, form_open=bool(error)))
         main_view.wake()
 
     def _enqueue(self, form: NewEdit) -> None:
@@ -196,7 +197,7 @@ class JobActions:
             attempt(self._app.main_view, partial(self._add_draft, order, draft, form.strength))
         if form.region == SELECTION:  # its selection becomes a region: the highlight would hide the edit
             main_view = self._app.main_view
-            view = main_view.work.view
+            view = self._store.get().view
             name = free_name(view.selection, out.name)
             path = out.with_name(f"{out.name}{SUFFIX}")
             selection = replace(add_region(view.selection, name, path), members=EMPTY_MASK, count=0)
@@ -207,7 +208,7 @@ class JobActions:
         main_view = self._app.main_view
         scene = self._app.document.path
         placed = main_view.decal_place
-        self._app.store.replace(with_transient(main_view.work, gizmo=None))
+        self._store.replace(with_transient(self._store.get(), gizmo=None))
         if placed is None or scene is None:
             return
         path, camera, at = placed
@@ -261,12 +262,11 @@ class JobActions:
 
     def _paint_over(self, _: None) -> None:
         """Save the picture for editing in another program, and follow that file from now on."""
-        main_view = self._app.main_view
         scene = self._app.document.file
-        form = main_view.work.form
+        form = self._store.get().form
         run = training.free_run(training.edits_folder(scene), form.layer_name)
         if path := self._write_anchor(form, run):
-            self._app.store.replace(replace(main_view.work, form=replace(form, anchor=path)))
+            self._store.replace(replace(self._store.get(), form=replace(form, anchor=path)))
             self._follow(Path(path))
 
     def region_spec(self, form: NewEdit, folder: Path, name: str = "") -> str:
@@ -284,7 +284,7 @@ class JobActions:
             spec = form.typed_region.strip()
             check_region(spec, {kind: lambda _: None for kind in _REGION_KINDS})
             return spec
-        selection = self._app.main_view.work.view.selection
+        selection = self._store.get().view.selection
         total = len(self._app.document.original)
         region = {region.name: region for region in selection.regions}.get(form.region)
         if form.region != SELECTION and region is None:
@@ -310,7 +310,8 @@ class JobActions:
         main_view = self._app.main_view
         if job.status == "done" and not job.warning and isinstance(task, EditOrder):
             self.queue.dismiss(job.number)
-        if job.status == "failed" and not main_view.work.view.panel:  # otherwise its card shows the error
+        # with the panel, its card shows the error
+        if job.status == "failed" and not self._store.get().view.panel:
             main_view.show_message(f"{task.name}: {job.error}", error=True)
         if isinstance(task, Delivery):
             if job.status == "done" and task.words[0] == "rebind":
@@ -355,7 +356,7 @@ class JobActions:
         order = next((task for task in orders if isinstance(task, EditOrder)), None)
         if order is None or order.scene != self._scene or now < self._live_due:
             return
-        live = self._app.store.get().transient.live
+        live = self._store.get().transient.live
         packed = order.out / "draft.gdf"
         layers = {order.draft, order.packed_edit}.intersection(self._app.document.gdf_paths)
         if order.draft in layers and is_newer(packed, order.draft):
@@ -385,7 +386,6 @@ class JobActions:
             for job in self.queue.jobs
             if job.task.scene == self._scene or job.busy
         )
-        store = self._app.store
-        if jobs != store.get().jobs:
-            store.replace(replace(store.get(), jobs=jobs))
+        if jobs != self._store.get().jobs:
+            self._store.replace(replace(self._store.get(), jobs=jobs))
             self._app.main_view.wake()

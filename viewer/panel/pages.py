@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from imgui_bundle import imgui, imgui_ctx
@@ -15,7 +15,7 @@ from progdf.terminal import escape_text
 from viewer.camera.view_camera import LARGEST_SIDE, SHAPES
 from viewer.state.commands import Action, Plain, WithText
 from viewer.state.forms import FORMATS, FPS, SIDES, DeliverOptions, film_title, picture_size
-from viewer.state.transient import Cover
+from viewer.state.transient import Cover, StartFile
 from viewer.state.view_state import ViewState
 from viewer.ui import overlay
 from viewer.ui.context import BEHIND, FIXED, PALETTE, SMALL_PX, Icon, UiContext, u32
@@ -48,20 +48,6 @@ _HEADING_PX = 32.0  # height of a heading
 _TITLE_PX = 44.0  # height of the title
 _NO_NAV = imgui.ItemFlags_.no_nav.value
 DROP_TEXT = "Drop a scene or a session"
-
-
-@dataclass(frozen=True)
-class StartFile:
-    """File on the start page: a recently opened scene or session, or an example.
-
-    `texture`: GL name of its picture, 0 for none; `missing`: the file no longer exists
-    """
-
-    path: Path  # an example's bundle file
-    texture: int = 0
-    title: str = ""  # empty: the file's name
-    line: str = ""  # text below the title
-    missing: bool = False
 
 
 def draw_start_page(

@@ -100,7 +100,7 @@ class NewEdit:
     quick: bool = True  # a draft in a third of the time
     preview: bool = True  # show the editor's own picture of the current view
     strength: float = 1.0  # strength of that picture, 0..1
-    error: str = ""  # one line why training cannot begin, "" if it was not tried
+    error: str = ""  # reason why training cannot begin, in one line; "" if it was not tried
 
     @property
     def choice(self) -> EditorChoice:

@@ -42,13 +42,13 @@ class Gizmo:
 
     does: Literal["transform", "duplicate"]
     center: tuple[float, float, float]  # center of the selection, where the handles start
-    # from the original to the current place, about the center; world axes. [4,4]
+    # from the original to the current position, about the center; world axes. [4,4]
     matrix: NDArray[np.float64] = field(compare=False)
     using: bool = False  # the mouse drags a handle
 
     @property
     def is_moved(self) -> bool:
-        """True if the selection is not at its original place."""
+        """True if the selection is not at its original position."""
         return not np.allclose(self.matrix, np.eye(4), atol=1e-9)
 
 
@@ -73,6 +73,20 @@ class KeyPointer:
 
 
 @dataclass(frozen=True)
+class StartFile:
+    """File on the start page: a recently opened scene or session, or an example.
+
+    `texture`: GL name of its picture, 0 for none; `missing`: the file no longer exists
+    """
+
+    path: Path  # an example's bundle file
+    texture: int = 0
+    title: str = ""  # empty: the file's name
+    line: str = ""  # text below the title
+    missing: bool = False
+
+
+@dataclass(frozen=True)
 class Transient:
     """State of the moment."""
 
@@ -82,3 +96,5 @@ class Transient:
     gizmo: Gizmo | Decal | None = None  # handles of a selection being moved, or a decal being placed
     pointer: KeyPointer = KeyPointer()  # pointer of the active tool
     recent: tuple[Path, ...] = ()  # recently opened files, for menu and dialogs; the last one first
+    start_files: tuple[StartFile, ...] = ()  # recently opened files, for the start page
+    examples: tuple[StartFile, ...] = ()  # examples on the start page

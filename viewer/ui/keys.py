@@ -341,7 +341,7 @@ def bound_chords(command: Command) -> list[str]:
 
 @cache  # tooltips and menus call this a hundred times per frame
 def chords(command: str) -> tuple[str, ...]:
-    """Return all chords of an action in the user's words; none for an unknown action."""
+    """Return all chords of a command as shown to the user; none for an unknown one."""
     bound = bound_chords(COMMANDS[command]) if command in COMMANDS else []
     return tuple(
         chord.replace("Delete", "Del").replace("Num", "Numpad ").replace("Escape", "Esc") for chord in bound

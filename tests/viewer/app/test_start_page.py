@@ -22,11 +22,12 @@ from viewer.app.start import EXAMPLE_TITLES
 from viewer.files import document as documents
 from viewer.files.document import empty
 from viewer.files.user_files import describe_age, keep_thumbnail, read_recent, remember_recent
-from viewer.panel.pages import StartFile
 from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import headless_context
 from viewer.state.commands import Plain, WithText
+from viewer.state.transient import StartFile
 from viewer.state.view_state import ViewState
+from viewer.state.workspace import with_transient
 from viewer.ui.splash import Splash
 
 pytestmark = pytest.mark.gl
@@ -55,7 +56,8 @@ def hand() -> Iterator[Rig]:
     engine = ViewEngine(context, document.scene, (), "cpu")
     main_view = MainView(context, engine, document.facts(), ViewState())
     recent = (StartFile(Path("/scenes/bear.ply")), StartFile(Path("/scenes/gone.ply"), missing=True))
-    main_view.start_files = recent, tuple(StartFile(path) for path in EXAMPLE_TITLES)
+    examples = tuple(StartFile(path) for path in EXAMPLE_TITLES)
+    main_view.work = with_transient(main_view.work, start_files=recent, examples=examples)
     yield Rig(main_view, (900, 640), 1.0)
     main_view.close()
     engine.release()
@@ -125,7 +127,7 @@ def test_missing_file_is_marked_and_can_be_removed(tmp_path: Path) -> None:
     files[1].unlink()
     with null_app(empty(), ViewState(), tmp_path) as app:
         turn(app)
-        gone, here = app.main_view.start_files[0]
+        gone, here = app.main_view.work.transient.start_files
         assert (gone.path.name, gone.missing, here.missing) == ("gone.ply", True, False)
         assert gone.line.startswith("Moved?")
         assert here.line.startswith("just now  ·  ")
@@ -133,7 +135,7 @@ def test_missing_file_is_marked_and_can_be_removed(tmp_path: Path) -> None:
         app.main_view.request(WithText("forget_file", str(gone.path)))
         turn(app)
         turn(app)
-        assert [file.path for file in app.main_view.start_files[0]] == [files[0]]
+        assert [file.path for file in app.main_view.work.transient.start_files] == [files[0]]
     assert read_recent(missing=True) == (files[0],)
 
 
@@ -152,7 +154,7 @@ def test_thumbnail_time_gives_the_age_of_a_file(tmp_path: Path) -> None:
     os.utime(picture, (time.time() - 3 * 86_400.0,) * 2)
     with null_app(empty(), ViewState(), tmp_path) as app:
         turn(app)
-        assert app.main_view.start_files[0][0].line.startswith("3 days ago")
+        assert app.main_view.work.transient.start_files[0].line.startswith("3 days ago")
 
 
 def test_splash_is_shown_while_a_scene_is_read(

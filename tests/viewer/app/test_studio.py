@@ -435,7 +435,7 @@ def test_jobs_of_another_scene_continue_and_name_their_scene(window: application
     press(window, "Ctrl+E", "Enter")
     window.open(tmp_path / "half.ply")
     turn(window)
-    job, delivery = window.jobs.queue.jobs
+    job, delivery = window.main_view.work.jobs
     assert (job.status, job.elsewhere, delivery.elsewhere) == ("running", "bear.ply", "bear.ply")
     Trainer.ended = 2
     Trainer.line = "the disk is full"
@@ -444,7 +444,7 @@ def test_jobs_of_another_scene_continue_and_name_their_scene(window: application
     assert window.main_view.work.jobs == (), "what failed is the scene's"
     window.open(tmp_path / "bear.ply")
     turn(window)
-    job, delivery = window.jobs.queue.jobs
+    job, delivery = window.main_view.work.jobs
     assert (job.status, job.elsewhere) == ("failed", "")
     assert (delivery.status, delivery.elsewhere) == ("failed", "")
 

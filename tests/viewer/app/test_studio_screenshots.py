@@ -17,11 +17,11 @@ from viewer.files.document import empty
 from viewer.jobs.child import Progress
 from viewer.jobs.job_queue import Delivery, QueuedTask
 from viewer.jobs.training import EditOrder
-from viewer.panel.pages import StartFile
 from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import headless_context
 from viewer.state.commands import OnItem
 from viewer.state.forms import TYPED, DeliverOptions, NewEdit
+from viewer.state.transient import StartFile
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import Dialog, with_transient
 from viewer.ui.splash import MINIMUM_SIZE_PX
@@ -46,7 +46,7 @@ def test_screenshot_of_the_start_page_with_recent_files(screenshot: Compare) -> 
         for i, name in enumerate(names)
     )
     examples = tuple(StartFile(path, texture.glo, *about) for path, about in EXAMPLE_TITLES.items())
-    main_view.start_files = recent, examples
+    main_view.work = with_transient(main_view.work, start_files=recent, examples=examples)
     try:
         screenshot("ui_start_page", Rig(main_view, SMALLEST, 1.0).image())
     finally:
