@@ -74,7 +74,7 @@ bench: setup
 # Everything the README and the documents show that a command made.
 pictures: setup extras window browser
 	$(BIN)/progdf demo --out demo --no-window
-	cp demo/hero.png demo/one-picture.png assets/
+	cp demo/one-picture.png assets/
 	assets/window.sh $(BIN)/progdf demo assets/window.png
 	$(BIN)/python assets/page.py demo assets/page.jpg
 	$(BIN)/python -m benchmarks --markdown docs/*.md docs/lab/*.md --plots assets
