@@ -43,6 +43,12 @@ ORDER = {
 
 MAX_FILES = 14
 MAX_LINES = 600
+# Longer files, each one algorithm whose parts call each other. These numbers only fall.
+LONG_FILES = {
+    "progdf/rasterize/cpu/pyramid.py": 713,
+    "progdf/rasterize/cpu/blend.py": 648,
+    "trainer/optimize/color_solver.py": 606,
+}
 
 MEASURED = ("progdf", "trainer", "viewer")
 # Files with module names as text, which are imported on first use.
@@ -317,7 +323,7 @@ def test_folders_hold_a_limited_number_of_files(sources: dict[Path, str]) -> Non
 
 def test_files_have_a_limited_number_of_lines(sources: dict[Path, str]) -> None:
     lengths = {path.as_posix(): source.count("\n") for path, source in sources.items()}
-    long = sorted(name for name, lines in lengths.items() if lines > MAX_LINES)
+    long = sorted(name for name, lines in lengths.items() if lines > LONG_FILES.get(name, MAX_LINES))
     assert not long, f"more than {MAX_LINES} lines: {long}"
 
 

@@ -152,7 +152,7 @@ def room_viewpoint(scene: Gaussians, up: Tensor) -> tuple[Tensor, Tensor]:
         for turn in range(12):
             angle = math.radians(30 * turn)
             back = torch.tensor([math.cos(angle), math.sin(angle), 0.0])
-            seen = _unoccluded(sampled - candidate, back, wide=1.0).sum() / len(sampled) + float(is_free)
+            seen = _visible_points(sampled - candidate, back, wide=1.0).sum() / len(sampled) + float(is_free)
             if float(seen) > best_score:
                 best_score = float(seen)
                 view = (candidate, candidate - float(half[:2].min()) * back)
@@ -182,12 +182,12 @@ def best_azimuth_offset(scene: Gaussians, up: Tensor, azimuth: float, elevation:
         around = math.radians(azimuth + 45 * turn)
         level = math.cos(above)
         back = torch.tensor([level * math.cos(around), level * math.sin(around), math.sin(above)])
-        shares.append(float(_unoccluded(points, back).float().mean()))
+        shares.append(float(_visible_points(points, back).float().mean()))
     best = max(range(8), key=lambda turn: shares[turn])
     return 45.0 * ((best + 4) % 8 - 4) if shares[best] >= _MIN_VISIBILITY_RATIO * shares[0] else 0.0
 
 
-def _unoccluded(places: Tensor, back: Tensor, wide: float = 0.0) -> Tensor:
+def _visible_points(places: Tensor, back: Tensor, wide: float = 0.0) -> Tensor:
     """Return the points that are not occluded in a picture of 24 x 24 cells. [P,3] -> [P] bool
 
     Args:

@@ -130,7 +130,17 @@ def _is_product(node: ast.AST) -> bool:
         return False
     conditions = ast.Compare | ast.BoolOp | ast.Attribute | ast.UnaryOp | ast.Call
     pairs = ((node.left, node.right), (node.right, node.left))
-    return any(_is_literal(text) and isinstance(factor, conditions) for text, factor in pairs)
+    return any(
+        _is_literal(text) and isinstance(factor, conditions) and not _is_count(factor)
+        for text, factor in pairs
+    )
+
+
+def _is_count(node: ast.AST) -> bool:
+    """Return True for `len(…)` and `.ndim`: repeating a list so often is no hidden condition."""
+    if isinstance(node, ast.Attribute):
+        return node.attr == "ndim"
+    return isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "len"
 
 
 def _is_literal(node: ast.AST) -> bool:
