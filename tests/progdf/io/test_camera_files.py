@@ -231,7 +231,7 @@ def test_number_of_distorted_cameras_is_logged(tmp_path: Path, caplog: pytest.Lo
     content["frames"][1] |= {"k1": 0.0}
     with caplog.at_level(logging.INFO, logger="progdf"):
         load_cameras(written(tmp_path / "t.json", content))
-        assert "3 of 4 cameras have a lens" in caplog.text
+        assert "3 of 4 cameras have lens distortion" in caplog.text
         caplog.clear()
         load_cameras(written(tmp_path / "t.json", nerfstudio(some_cameras())))
         assert caplog.text == ""

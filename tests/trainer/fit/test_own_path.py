@@ -69,7 +69,7 @@ def test_detour_not_matched_by_the_editor_is_straightened() -> None:
     assert torch.equal(kept.at(0.25), 0.25 * bent.end)
     assert kept.stage_ends == (1,)
     assert kept.stage_strengths == ((1.0, 1.0),)
-    assert why.startswith("straight: the editor's half")
+    assert why.startswith("straight: PSNR to the editor's pictures at strength 0.5")
 
 
 def test_path_is_straight_without_an_editor_picture_at_half_strength() -> None:

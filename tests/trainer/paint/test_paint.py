@@ -159,7 +159,7 @@ def test_transparent_pixels_leave_the_scene_unchanged(tmp_path: Path) -> None:
     assert not bool(editor.paint.mask[:, 70:].any())
     assert bool(editor.paint.mask[:, 50:60].any())
     logo[..., 3] = 0
-    with pytest.raises(ProgdfError, match="all transparent"):
+    with pytest.raises(ProgdfError, match="is fully transparent"):
         make(put(tmp_path, logo), scene)
 
 

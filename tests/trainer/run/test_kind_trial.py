@@ -118,7 +118,7 @@ def test_summary_line_names_tried_and_chosen_approaches() -> None:
     line = Trial(40, {COLOR: 18.0, FREE: 21.23}, 10.0).line()
     assert "40 steps with L1" in line
     assert "color 18.0, geometry 21.2 dB" in line
-    assert "taken: geometry (--kind geometry --group-steps 0 skips the trial)" in line
+    assert "chosen: geometry (--kind geometry --group-steps 0 skips the trial)" in line
     assert "\n" not in line
 
 
