@@ -1,5 +1,4 @@
-"""Hole filling: areas occluded by a removed object in every view are closed from their boundary with surface
-discs.
+"""Hole filling: areas that a removed object hides in every view are closed with surface discs.
 
 A hole in a view is a connected component of pixels of the object without an opaque background, and with an
 opaque boundary. An object in front of an empty background leaves no hole. Alpha, inverse depth and color,

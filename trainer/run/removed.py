@@ -1,5 +1,7 @@
-"""Removal of a region. The path over strengths is known in closed form, so nothing is optimized; holes are
-filled."""
+"""Removal of a region.
+
+The path over strengths is known in closed form, so nothing is optimized. Holes are filled.
+"""
 
 from __future__ import annotations
 

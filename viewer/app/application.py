@@ -1,5 +1,4 @@
-"""Application interface for the parts of the window, and the reporting of failures as messages and in the
-log."""
+"""Application interface for the parts of the window, and reports of failures as messages and log lines."""
 
 from __future__ import annotations
 
