@@ -171,7 +171,7 @@ def verify_files(path: Path, session: SessionFile) -> tuple[Path, tuple[Path, ..
             )
         if sha256(file) != ref.sha256.lower():
             raise ProgdfError(
-                f"{path.name} was saved with a {file.name} that differs from {file}; "
+                f"{path.name} was saved with another version of {file.name} than {file}; "
                 "put the original file back or save a new session"
             )
         files.append(file)

@@ -34,6 +34,7 @@ from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import Image
 from viewer.state import workspace
 from viewer.state.actions import perform
+from viewer.state.commands import Plain
 from viewer.state.view_state import ViewState
 
 pytestmark = pytest.mark.gl
@@ -186,7 +187,7 @@ def test_f_without_a_layer_frames_the_subject_in_any_window(aspect: float, facto
     scene = scaled(the_bear(), factor)
     for azimuth, elevation in ((20.0, 15.0), (110.0, 40.0)):
         view = ViewState(camera=ViewCamera(azimuth=azimuth, elevation=elevation))
-        work = perform(workspace.new_workspace(view), "frame", Document("x", scene).facts(), aspect)
+        work = perform(workspace.new_workspace(view), Plain("frame"), Document("x", scene).facts(), aspect)
         assert is_filled(work.view.camera, scene[subject_rows(scene, UP)], aspect)
         assert axes(work.view.camera) == axes(view.camera)
 
@@ -198,7 +199,7 @@ def test_f_frames_the_members_of_the_focused_layer(aspect: float, layer: int) ->
     view = first_view(stack, 0.5, 0.5)
     work = replace(workspace.new_workspace(view), focus=layer)
     facts = Document("x", stack.scene, stack.gdfs).facts()
-    camera = perform(work, "frame", facts, aspect).view.camera
+    camera = perform(work, Plain("frame"), facts, aspect).view.camera
     assert is_filled(camera, stack.scene[stack.gdfs[layer].region.members], aspect)
     assert axes(camera) == axes(view.camera)
 
@@ -206,9 +207,9 @@ def test_f_frames_the_members_of_the_focused_layer(aspect: float, layer: int) ->
 def test_f_frames_a_room_from_outside_and_an_empty_scene_at_the_origin() -> None:
     scene = room(4000).gaussians
     inside = workspace.new_workspace(ViewState(camera=first_camera(scene)))
-    outside = perform(inside, "frame", Document("x", scene).facts()).view.camera
+    outside = perform(inside, Plain("frame"), Document("x", scene).facts()).view.camera
     assert filled(outside, scene, 1.0).max() < 1.0
-    nothing = perform(inside, "frame", Document("x", scene[:0]).facts()).view.camera
+    nothing = perform(inside, Plain("frame"), Document("x", scene[:0]).facts()).view.camera
     assert nothing == frame(inside.view.camera, Bounds())
 
 

@@ -345,7 +345,7 @@ def test_session_of_another_scene_changes_nothing(window: application.App, folde
     before = window.main_view.work.view
     window.open(spoilt(saved, "scene", "sha256", value="0" * 64))
     assert window.main_view.work.view == before
-    assert "saved with another bear.ply" in message(window)
+    assert "saved with another version of bear.ply" in message(window)
 
 
 @pytest.mark.gl

@@ -143,7 +143,7 @@ def test_invalid_bundle_is_one_line_and_leaves_nothing(bundle: Path, monkeypatch
 
 def test_modified_file_in_a_bundle_is_refused_by_name(bundle: Path) -> None:
     rewritten(bundle, lambda files: files.update({"bear.ply": files["bear.ply"] + b" "}))
-    with pytest.raises(ProgdfError, match=r"was saved with a bear\.ply"):
+    with pytest.raises(ProgdfError, match=r"was saved with another version of bear\.ply"):
         session.open_session(unpack_bundle(bundle))
 
 

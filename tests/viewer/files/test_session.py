@@ -58,7 +58,7 @@ def test_session_of_another_system_finds_its_files_beside_it(saved: Path, place:
     saved.write_text(text.replace('"bear.ply"', f'"{place}bear.ply"'), "utf-8")
     assert session.open_session(saved).document.path == saved.parent / "bear.ply"
     (saved.parent / "bear.ply").write_bytes(b"another")
-    with pytest.raises(ProgdfError, match="was saved with a bear"):
+    with pytest.raises(ProgdfError, match="was saved with another version of bear"):
         session.open_session(saved)
 
 
@@ -116,8 +116,8 @@ BROKEN: list[tuple[tuple[str | int, ...], Any, str]] = [
     (("scene", "file"), "g" * 5000, "does not exist"),
     (("scene", "file"), "", "scene"),
     (("scene", "file"), "a\0b", "scene"),
-    (("scene", "sha256"), "0" * 64, "another bear.ply"),
-    (("edits", 1, "sha256"), "0" * 64, "another ears.gdf"),
+    (("scene", "sha256"), "0" * 64, "another version of bear.ply"),
+    (("edits", 1, "sha256"), "0" * 64, "another version of ears.gdf"),
     (("edits",), [], "layers[0].gdf is 1, but there are 0 edits"),
     (("view",), [], "expected"),
     (("view", "blur"), 3, "view.blur is unknown"),
@@ -174,7 +174,7 @@ def test_file_that_is_no_session_is_refused_in_one_line(tmp_path: Path, content:
 
 def test_changed_scene_is_refused_by_name(saved: Path) -> None:
     save_ply(saved.parent / "bear.ply", bear().scene[:-1])
-    with pytest.raises(ProgdfError, match=r"saved with another bear\.ply"):
+    with pytest.raises(ProgdfError, match=r"saved with another version of bear\.ply"):
         session.open_session(saved)
 
 
