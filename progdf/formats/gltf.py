@@ -309,7 +309,7 @@ def _join(file: GltfFile, parts: list[Gaussians]) -> Gaussians:
 
 
 @dataclass(frozen=True)
-class _Plan:
+class _PrimitivePlan:
     """Checked primitive of N Gaussians whose data is not read yet."""
 
     name: str  # for errors
@@ -335,7 +335,7 @@ class _Reader:
         self.conversions: dict[str, None] = {}  # in the order found
         self.ignored: dict[str, None] = {}
         self._read_spz = read_spz
-        self._plans: dict[tuple[int, int], _Plan] = {}
+        self._plans: dict[tuple[int, int], _PrimitivePlan] = {}
         self._parts: dict[tuple[int, int], Gaussians] = {}
 
     def measure(self, mesh: int, index: int) -> None:
@@ -368,7 +368,7 @@ class _Reader:
             self.file.take(len(part), 14 + 3 * part.shN.shape[1])
         return part
 
-    def _plan(self, mesh: int, index: int) -> _Plan:
+    def _plan(self, mesh: int, index: int) -> _PrimitivePlan:
         """Check a primitive and find its columns."""
         file = self.file
         primitive = file.tables.meshes[mesh].primitives[index]
@@ -379,7 +379,9 @@ class _Reader:
             rows = 0
             if "POSITION" in attributes:
                 rows = file.accessor(attributes["POSITION"], "VEC3").count
-            return _Plan(name, color_space, spz, _ATTRIBUTE_TYPES, attributes, rows, primitive.indices)
+            return _PrimitivePlan(
+                name, color_space, spz, _ATTRIBUTE_TYPES, attributes, rows, primitive.indices
+            )
         degree = 0
         while degree < MAX_DEGREE and any(n in attributes for n in _coefficient_names(degree + 1)):
             degree += 1
@@ -401,9 +403,11 @@ class _Reader:
                 file.view_bytes(accessor.bufferView)  # counts as stored
         extra = [column for column in attributes if column.startswith(EXTENSION) and column not in columns]
         self.ignored.update(dict.fromkeys(escape_text(column)[:60] for column in extra))
-        return _Plan(name, color_space, None, columns, attributes, positions.count, primitive.indices)
+        return _PrimitivePlan(
+            name, color_space, None, columns, attributes, positions.count, primitive.indices
+        )
 
-    def _read_part(self, plan: _Plan) -> Gaussians:
+    def _read_part(self, plan: _PrimitivePlan) -> Gaussians:
         """Return the Gaussians of a primitive in sRGB, with its indices applied."""
         part = self._read_columns(plan) if plan.spz is None else self._read_compressed(plan, plan.spz)
         if plan.indices is not None:
@@ -461,7 +465,7 @@ class _Reader:
                 raise damage_error(path, f"{extension} of {name} has no bufferView")
         return str(properties.get("colorSpace", SRGB)), spz_view
 
-    def _read_columns(self, plan: _Plan) -> Gaussians:
+    def _read_columns(self, plan: _PrimitivePlan) -> Gaussians:
         """Return the Gaussians of a primitive whose columns are accessors."""
         tables = {
             name: self.file.read_accessor(plan.attributes[name], kind) for name, kind in plan.columns.items()
@@ -491,7 +495,7 @@ class _Reader:
         with np.errstate(divide="ignore"):  # a flat Gaussian becomes infinite and is repaired later
             return np.log(np.maximum(scales, np.float32(0.0)))
 
-    def _read_compressed(self, plan: _Plan, view: int) -> Gaussians:
+    def _read_compressed(self, plan: _PrimitivePlan, view: int) -> Gaussians:
         """Return the Gaussians of an .spz inside the file, in glTF's axes LUF as its extension requires."""
         content = bytes(self.file.view_bytes(view))
         self.has_spz = True

@@ -72,7 +72,7 @@ class Buffer(msgspec.Struct, frozen=True):
     uri: str | None = None
 
 
-class View(msgspec.Struct, frozen=True):
+class BufferView(msgspec.Struct, frozen=True):
     """Part of a buffer (`bufferView` in glTF)."""
 
     buffer: Count
@@ -146,7 +146,7 @@ class Node(msgspec.Struct, frozen=True):
     extensions: dict[str, Any] = {}
 
 
-class Scene(msgspec.Struct, frozen=True):
+class SceneEntry(msgspec.Struct, frozen=True):
     """Root nodes that are drawn together."""
 
     nodes: list[Count] = []
@@ -166,11 +166,11 @@ class Tables(msgspec.Struct, frozen=True):
 
     asset: Asset
     buffers: list[Buffer] = []
-    bufferViews: list[View] = []
+    bufferViews: list[BufferView] = []
     accessors: list[Accessor] = []
     meshes: list[Mesh] = []
     nodes: list[Node] = []
-    scenes: list[Scene] = []
+    scenes: list[SceneEntry] = []
     scene: Count | None = None
     animations: list[Any] = []
     extensionsUsed: list[str] = []

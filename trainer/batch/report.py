@@ -133,7 +133,7 @@ class RunReport:
 
 
 @dataclass(frozen=True)
-class Progress:
+class BatchProgress:
     """Progress of a run; the trainer writes it to RUN/state/progress.json."""
 
     share: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.0  # elapsed share of its whole time
@@ -180,12 +180,12 @@ def read_report(job: BatchJob) -> RunReport:
         ) from None
 
 
-def _read_progress(job: BatchJob) -> Progress:
+def _read_progress(job: BatchJob) -> BatchProgress:
     """Return the progress of a job; zero progress if the file is missing or damaged."""
     with suppress(OSError, ValueError):
         path = RunFolder(job.options.out).progress
-        return convert_json(decode_json(path.read_bytes()), Progress)
-    return Progress()
+        return convert_json(decode_json(path.read_bytes()), BatchProgress)
+    return BatchProgress()
 
 
 def read_rows(out: Path) -> dict[str, JobRow]:
@@ -386,7 +386,7 @@ class Screen:
         return sum(ended.values()) / expected * ahead / self._workers
 
 
-def _state(state: Progress) -> str:
+def _state(state: BatchProgress) -> str:
     time_left = ""
     if state.share > 0.1:
         time_left = f"{format_duration(state.seconds / state.share * (1 - state.share))} left"

@@ -164,7 +164,7 @@ class PreviewChild:
 
 
 @dataclass(frozen=True)
-class PaintedView:
+class PreviewedView:
     """Picture of a view that is open in another program."""
 
     path: Path
@@ -218,7 +218,7 @@ class PreviewActions:
         self._drawn: frozenset[int] = frozenset()  # styles in the sheet, also of an earlier view
         self._tile = -1  # the requested style
         self._region_sent = ""  # region in the process's format
-        self._painting: PaintedView | None = None
+        self._painting: PreviewedView | None = None
 
     @property
     def requests(self) -> Requests:
@@ -299,19 +299,19 @@ class PreviewActions:
     def _open_painter(
         self, path: Path, camera: ViewCamera, size: tuple[int, int], cover: Cover | None
     ) -> None:
-        self._painting = PaintedView(path, camera, size, _file_state(path))
+        self._painting = PreviewedView(path, camera, size, _file_state(path))
         self._show(PAINT_TEXT, cover)
         if not user_files.open_in_program(path):
             self._app.main_view.show_message(f"No program for pictures was found. Open {path} in yours.")
 
-    def _is_painting(self, painted: PaintedView) -> bool:
+    def _is_painting(self, painted: PreviewedView) -> bool:
         """Return whether the form uses the picture that is being painted."""
         work = self._store.get()
         path = str(painted.path)
         is_in_form = path in work.form.pictures.split(", ") or path == work.form.anchor
         return work.form_open and work.view.panel and is_in_form
 
-    def _follow(self, painted: PaintedView) -> float:
+    def _follow(self, painted: PreviewedView) -> float:
         """Show the saved picture over the view; return the seconds until the next check."""
         state = _file_state(painted.path)
         if state == painted.state:
