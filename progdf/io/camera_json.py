@@ -156,14 +156,16 @@ class _Frame(msgspec.Struct):
     file_path: Any = ""
 
 
-def read_own_camera(file: str, index: int, entry: object) -> Camera:
-    """Return the camera of an entry written by `save_cameras`."""
+def read_own_camera(file: str, index: int, entry: object) -> tuple[Camera, tuple[str, ...]]:
+    """Return the camera of an entry written by `save_cameras`, and its ignored fields."""
     where = f"camera {index} of {file}"
+    ignored = _check_fields(where, entry, frozenset(_SavedCamera.__struct_fields__), _REFUSED_FIELDS)
     camera = _read(where, entry, _SavedCamera)
     viewmat = make_rigid(where, torch.tensor(camera.viewmat, dtype=torch.float64))
     K = torch.tensor(camera.K, dtype=torch.float64)
     size = camera.width, camera.height
-    return make_camera(where, viewmat, K, size, str(camera.name), camera.lens or None, camera.sampling)
+    lens = camera.lens or None
+    return make_camera(where, viewmat, K, size, str(camera.name), lens, camera.sampling), ignored
 
 
 def read_inria_camera(file: str, index: int, entry: object) -> tuple[Camera, tuple[str, ...]]:

@@ -270,7 +270,7 @@ def _embedded_camera(path: str | os.PathLike[str]) -> Camera | None:
         raise ProgdfError(f"{where} is not JSON ({error}); render the picture again") from None
     match content:
         case {"format": format, "cameras": [entry]} if format == _FORMAT:
-            return replace(read_own_camera(where, 0, entry), name=Path(path).stem)
+            return replace(read_own_camera(where, 0, entry)[0], name=Path(path).stem)
     raise ProgdfError(f"{where} is not a camera; render the picture again")
 
 
@@ -289,11 +289,11 @@ def _from_content(name: str, content: Any, path: Path) -> tuple[list[Camera], tu
         case [{"rotation": _, "position": _}, *_]:
             read = [read_inria_camera(name, i, entry) for i, entry in enumerate(content)]
         case {"cameras": list() as entries}:
-            return [read_own_camera(name, i, entry) for i, entry in enumerate(entries)], ()
+            read = [read_own_camera(name, i, entry) for i, entry in enumerate(entries)]
         case {"viewmat": _}:
-            return [read_own_camera(name, 0, content)], ()
+            read = [read_own_camera(name, 0, content)]
         case [{"viewmat": _}, *_]:
-            return [read_own_camera(name, i, entry) for i, entry in enumerate(content)], ()
+            read = [read_own_camera(name, i, entry) for i, entry in enumerate(content)]
         case []:
             return [], ()
         case _:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,7 +16,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from progdf.errors import ProgdfError
-from progdf.io.cameras import load_cameras
+from progdf.io.cameras import load_cameras, load_cameras_with_report, save_cameras
 from tests.helpers.camera_tables import REFUSED_VIEWMATS, inria, nerfstudio, some_cameras, written
 from tests.helpers.refused import refusal
 
@@ -91,6 +92,21 @@ def test_inria_fields_that_change_the_camera_are_refused(tmp_path: Path, field: 
     message = refusal(load_cameras, written(tmp_path / "cameras.json", entries))
     assert message.startswith("camera 1 of ")
     assert f"'{field}'" in message
+
+
+def test_unknown_fields_of_saved_cameras_are_listed_or_refused(tmp_path: Path) -> None:
+    path = tmp_path / "cameras.json"
+    save_cameras(path, some_cameras())
+    content = json.loads(path.read_text(encoding="utf-8"))
+    content["cameras"][1]["shutter"] = "closed"
+    path.write_text(json.dumps(content), encoding="utf-8")
+    cameras, report = load_cameras_with_report(path)
+    assert len(cameras) == 4
+    assert report.ignored == ("shutter",)
+    content["cameras"][1]["is_fisheye"] = True
+    path.write_text(json.dumps(content), encoding="utf-8")
+    with pytest.raises(ProgdfError, match=r"camera 1 of .*'is_fisheye' \(a fisheye lens\)"):
+        load_cameras(path)
 
 
 def test_inria_camera_without_focal_length_is_refused(tmp_path: Path) -> None:
