@@ -68,7 +68,7 @@ class RegionOptions:
     detector: str = DETECTOR
     """text: id or folder of the GroundingDINO model that finds objects; download it first."""
     sam_model: str = SAM_MODEL
-    """text: id or folder of the SAM model that segments them; download it first."""
+    """text: id or folder of the SAM model that segments the found objects; download it first."""
     box_threshold: float = 0.3
     """text: minimum detection confidence, 0 to 1; lower finds more, including false matches."""
 
@@ -357,13 +357,13 @@ class ShowRegionOptions:
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """picture.png with the region tinted and the remainder pale; or members.npy with its rows (int64)."""
     cameras: Annotated[Path | None, absent_option("PATH", "none")] = None
-    """masks: their cameras, if DIR has none; text: cameras of the searched views."""
+    """masks: cameras of the masks, if DIR has none; text: cameras of the searched views."""
     cameras_anyway: bool = False
     """Use --cameras even if most of them do not show the scene."""
     camera: Annotated[str | None, absent_option("FILE[:INDEX]", "four sides")] = None
     """Camera of the picture, from a file (INDEX 0 by default); without it, four sides."""
     size: Annotated[str, tyro.conf.arg(metavar="WxH")] = "640x480"
-    """Size of each picture in pixels; --camera has its own."""
+    """Size of each picture in pixels. With --camera, that camera's size is used."""
     up: UpChoice = "auto"
     """Up axis of the scene."""
     lift_rule: LiftRule = "share"

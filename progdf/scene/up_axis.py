@@ -365,7 +365,7 @@ def _ground_plane(height: Tensor, plan: Tensor, facing: Tensor) -> float:
     within = faced[:-1] + faced[1:]
     visible = table[:-1] + table[1:] > 0
     total = table.sum(dim=1).cumsum(0)
-    below = torch.cat([torch.zeros(2), total[:-3]])  # a row apart from the slab's two
+    below = torch.cat([torch.zeros(2), total[:-3]])  # excludes the row next to the slab
     above = 1 - torch.cat([total[2:], torch.ones(1)])
     side = (above - below) / (above + below).clamp_min(0.02)
     cover = visible.float().sum(dim=1) / (table.sum(dim=0) > 0).float().sum()

@@ -348,7 +348,7 @@ class Solver:
         return float(self.weights[self.asked[:, 0], 0, 0].mean())
 
     def _regularize(self, x: Tensor, ridge: float) -> Tensor:
-        """Return the gradient of half the cost of a residual beside the pixels. [M,b,3] -> [M,b,3]"""
+        """Return the gradient of half the regularization of a residual. [M,b,3] -> [M,b,3]"""
         return ridge * x + torch.from_numpy(self.held @ x.flatten(1).numpy()).view_as(x)
 
     def _gradient(

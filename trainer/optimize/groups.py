@@ -37,9 +37,9 @@ from .pgs import ParameterSnapshot, TargetStage, mean_visible_change
 GROUP_STEPS = 120
 """Steps of the group stage per strength if parts move as wholes."""
 
-# The members' own learning rate is a share of this many part sizes. Steps are shorter if the motion of the
-# parts has left less than `_FULL_STEP_CHANGE` (a mean over the pixels that still change) and less than the
-# share `_FULL_STEP_REMAINDER` of the change (docs/lab/experiments.md, Parts that move).
+# The members' own learning rate is a share of this many part sizes. After the motion of the parts, a color
+# change remains. Steps are shorter if it is below both `_FULL_STEP_CHANGE` (mean over the pixels that still
+# change) and the share `_FULL_STEP_REMAINDER` of the whole change (docs/lab/experiments.md, Parts that move).
 _EXTENT_IN_PART_SIZES = 7.0  # extent of the learning rates, in mean part sizes
 _FULL_STEP_CHANGE = 0.065  # remaining mean color change from which steps have full length
 _FULL_STEP_REMAINDER = 0.28  # remaining share of the change from which steps have full length

@@ -59,7 +59,7 @@ def is_removal(options: TrainOptions, setup: TrainingSetup, log: RunLog) -> bool
     one_strength = all(len(strengths_of(path)) == 1 for path in options.views.pictures)
     if editor.removal == "always" and not one_strength:
         raise ProgdfError(
-            "--removal always takes the finished edit alone; give no pictures of other strengths"
+            "--removal always uses only pictures of the full edit; leave out those of other strengths"
         )
     share = vanished_share(setup, options) if one_strength else 0.0
     removes = editor.removal == "always" or share > 0.5

@@ -240,7 +240,7 @@ def with_color(form: NewEdit, color: str) -> NewEdit:
 
 
 def with_picture(form: NewEdit, path: Path, further: bool) -> NewEdit:
-    """Return the form with an edited picture, after those that it has if this is a `further` one."""
+    """Return the form with an edited picture: added to the present ones if `further`, else instead."""
     names = [name.strip() for name in form.pictures.split(",") if name.strip()]
     earlier_names = names if further and form.choice.kind == "pictures" else []
     names = [*(name for name in earlier_names if name != str(path)), str(path)]

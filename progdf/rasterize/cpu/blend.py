@@ -217,7 +217,7 @@ def step_and_color(batch: Array, splat: Number) -> tuple[Number, Number, Number,
 
 
 class RenderBuffers(NamedTuple):
-    """Rendered window."""
+    """Output buffers of a rendered window of the picture."""
 
     image: Array  # [h,w,3] float32
     transmittance: Array  # [h,w] float32
