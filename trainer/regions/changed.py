@@ -107,8 +107,8 @@ def changed_region(
         share = sum(float(mask.float().mean()) for mask in masks) / len(masks)
         strays = len(candidates) - len(region)
         say(
-            f"changed: {share:.1%} of the pictures differ, which {format_count(len(region))} show"
-            + (f"; {format_count(strays)} beside it left out" if strays else "")
+            f"changed: {100 * share:.1f} % of the pictures differ; {format_count(len(region))} show it"
+            + (f" ({format_count(strays)} beside it left out)" if strays else "")
         )
     return region
 

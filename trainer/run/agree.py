@@ -356,10 +356,10 @@ def agree_views(
     order = f"{anchors} first, {len(views) - anchors} after these" if follows else "each after those before"
     repeats = "once" if rounds == 1 else "twice"
     calls = len(views) * (1 + rounds)
-    log.say(f"{calls} pictures to paint: {order}, then all {repeats} more, away from what they share")
+    log.say(f"{calls} pictures to paint: {order}, then all {repeats} more to make them agree")
     if easel.kept.folder is not None and approved is None:
         path = easel.kept.folder / ANCHOR / f"{views[0].camera.name}.png"
-        log.say(f"{path} decides: paint over it and begin again, and all views follow it")
+        log.say(f"all views follow {path}; to change the edit, paint over that picture and start again")
     with log.steps("edit", calls) as advance:
         loop = _PaintingLoop(easel, setup, advance, approved)
         if follows:
@@ -380,9 +380,7 @@ def agree_views(
         if view.camera.name not in loop.pictures
     }
     for name, moved in left_out.items():
-        log.say(
-            f"{name} is left out, as its answers are shifted or scaled by {moved:.0%}; the fit replaces it"
-        )
+        log.say(f"{name}: every painted picture is shifted or scaled by {moved:.0%}; the fit replaces it")
     pictures = loop.pictures | {
         view.camera.name: fit.render(view.camera) for view in views if view.camera.name in left_out
     }

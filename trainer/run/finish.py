@@ -225,7 +225,7 @@ def _fit_field(
     if len(setup.held_out) == 1:
         log.say("only one view is held out, so the field is both chosen and reported on it")
     if not setup.held_out:
-        log.say("no view is held out: all figures are of the views that were trained on")
+        log.say("no view is held out; all figures are measured on the training views")
     weighing = setup.train[::_VISIBILITY_STRIDE]
     with log.looks("weigh the members", len(weighing)) as count_view:
         members = setup.region.members

@@ -190,10 +190,10 @@ def choose_discs(
         candidates.append((_mean_square_error(laid.end, looks), laid))
     best = min(candidates, key=lambda one: one[0])
     if log is not None:
-        errors = ", ".join(f"{decibels(error):.1f} dB with {laid.gap:g}" for error, laid in candidates)
+        errors = ", ".join(f"{decibels(error):.1f} dB with {laid.gap:g} px" for error, laid in candidates)
         log.say(
-            f"occluding Gaussians are moved {best[1].gap:g} pixels behind the paint: {errors}, in and "
-            f"{RING} pixels around it, as painted and from up to {max(TRIAL_ANGLES_DEG)}° to its sides"
+            f"occluding Gaussians move {best[1].gap:g} px behind the paint; tried: {errors} (in the paint "
+            f"and {RING} px around it, from the painted view and up to {max(TRIAL_ANGLES_DEG)}° to its sides)"
         )
     return best[1]
 
@@ -322,9 +322,9 @@ def sharpen(
     pixels = group_digits(sum(int(one.mask.sum()) for one in paints))
     discs = group_digits(len(laid.added))
     log.say(
-        f"{pixels} painted pixels are finer than the Gaussians: {discs} discs for them have {own_db[1]} dB "
-        f"where recoloring has {own_db[0]}, from their sides {side_db[1]} where it has {side_db[0]}: "
-        + ("they are added" if improves else "none is added")
+        f"{pixels} painted pixels are finer than the Gaussians; {discs} discs reach {own_db[1]} dB instead "
+        f"of {own_db[0]} by recoloring, and {side_db[1]} instead of {side_db[0]} from their sides: "
+        + ("added" if improves else "not added")
     )
     return paint_gdf(laid, scene, paints, recolored.name, recolored) if improves else None
 

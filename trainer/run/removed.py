@@ -64,11 +64,12 @@ def is_removal(options: TrainOptions, setup: TrainingSetup, log: RunLog) -> bool
     share = vanished_share(setup, options) if one_strength else 0.0
     removes = editor.removal == "always" or share > 0.5
     if removes or share > 0.0:
-        decision = "taken away (--removal never recolors it)"
+        decision = "removed (--removal never recolors it)"
         if not removes:
-            decision = "recolored (--removal always removes)"
+            decision = "recolored (--removal always removes it)"
         log.say(
-            f"{100 * share:.0f} % of the painted change equals the scene without the region: it is {decision}"
+            f"{100 * share:.0f} % of the painted change equals the scene without the region: "
+            f"the region is {decision}"
         )
     return removes
 

@@ -10,6 +10,7 @@ from progdf.gaussians import Gaussians
 from progdf.gdf.file import save_gdf
 from progdf.io.cameras import save_cameras
 from progdf.region import Region
+from progdf.terminal import format_count
 from trainer.editors import editor_row
 from trainer.fit.draft import draft_grade, draft_views
 from trainer.optimize.losses import perceptual_loss
@@ -121,9 +122,12 @@ def _write_draft(
         log.say("no draft: a single color map cannot represent this edit")
         return
     save_gdf(folder.draft, draft)
+    seconds = time.perf_counter() - start_time
+    degree = draft.report["draft"]["degree"]
+    psnr = draft.report["draft"]["psnr"]
     log.say(
-        "{} after {:.1f} s: a grade of degree {degree}, {psnr:.1f} dB in views that it was not fitted to; "
-        "training goes on".format(folder.draft, time.perf_counter() - start_time, **draft.report["draft"])
+        f"{folder.draft} after {seconds:.1f} s: a grade of degree {degree}, {psnr:.1f} dB in held-out views; "
+        "training continues"
     )
 
 
@@ -131,9 +135,11 @@ def _describe_views(setup: TrainingSetup) -> str:
     """Return a description of the number, use and size of the views."""
     cameras = [view.camera for view in setup.views]
     sizes = dict.fromkeys(f"{camera.width}x{camera.height}" for camera in cameras)
-    held_out_part = f" and {len(setup.held_out)} to measure with"
-    use_of_others = held_out_part if setup.held_out else ", by which the edit is measured too"
-    return f"{len(setup.train)} views to train on{use_of_others}, {', '.join(sizes)} pixels"
+    training = format_count(len(setup.train), "training view")
+    measuring = ", used to measure the edit too"
+    if setup.held_out:
+        measuring = f" and {format_count(len(setup.held_out), 'held-out view')}"
+    return f"{training}{measuring}, {', '.join(sizes)} pixels"
 
 
 def _render_originals(

@@ -165,7 +165,8 @@ def _record(
         else:
             trajectory = retime_trajectory(trajectory, setup, optimization, log)
         trajectory = fade_in(trajectory)
-    log.say(f"{count} recordings, {len(trajectory)} kept; without an attribute, dB: {costs or 'none moves'}")
+    cost_text = f"; dB without each attribute: {costs}" if costs else ""
+    log.say(f"kept {len(trajectory)} of {count} recordings{cost_text}")
     if reason:
         log.say(f"between original and edit: {reason}")
     return trajectory, {

@@ -21,6 +21,7 @@ from progdf.io.tensors import check_tensor
 from progdf.metrics.image import LEVEL
 from progdf.rasterize.engines import engine_device
 from progdf.scene.bounds import scene_sphere
+from progdf.terminal import format_count
 from trainer.fit.network import JointTraining, begin_joint_training, save_network
 from trainer.optimize.color_course import STEPS, StrengthSchedule, Target, solve, thin_model
 from trainer.optimize.color_solver import (
@@ -168,7 +169,7 @@ def optimize_members(
     device = engine_device(optimization.engine)
     if engine == "warp":
         card = torch.cuda.get_device_name(device) if device.type == "cuda" else "the CPU, in place of a card"
-        log.say(f"the steps are drawn by warp on {card}")
+        log.say(f"warp renders the training steps on {card}")
     original = pack(scene[members], with_shN=scene.sh_degree > 0).to(device)
     still = optimization.kind == "color" and optimization.rates == "kind"
     crops = _crops(setup, still, engine)
@@ -296,17 +297,15 @@ def plan_colors(
         model = thin_model(
             model, solver, [*course.targets[middle : middle + 1], finished], max_iterations, allowed_error
         )
-    evaluated_on = "views that are held out" if held_out else "all views, as none is held out"
+    evaluated_on = "held-out views" if held_out else "all views, as none is held out"
     if len(train) < count:
-        log.say(
-            f"{len(train)} of {count} views are solved for, as the others would make no visible difference"
-        )
+        log.say(f"solving for {len(train)} of {count} views; the others would make no visible difference")
     if ties is not None:
-        evaluated_on = "squares of the pictures that are held out"
+        evaluated_on = "held-out squares of the pictures"
     log.say(f"{model.line}, on {evaluated_on}")
     if ties is not None:
         unseen_count = len(original) - int(solver.asked[:, 0].sum())
-        log.say(f"{unseen_count} members are in no picture and follow the color map and their surface")
+        log.say(f"{unseen_count} members are in no picture; they follow the color map and their surface")
     return solver.only(model.residual), model, course
 
 
@@ -336,8 +335,9 @@ def _solve(
     rows = [
         (one.step, {name: mean for name, mean in one.means.items() if name != STEPS}) for one in snapshots
     ]
-    steps = f"in {', '.join(map(str, step_counts))} steps, of {most_steps} each at most"
-    log.say(f"{len(strengths)} strengths {steps if step_counts else 'by maps alone'}")
+    steps = f"in {', '.join(map(str, step_counts))} steps (at most {most_steps} each)"
+    effort_text = steps if step_counts else "by color maps alone"
+    log.say(f"solved {format_count(len(strengths), 'strength')} {effort_text}")
     effort = {
         "strengths": strengths,
         STEPS: step_counts,
@@ -419,7 +419,7 @@ def _record_snapshots(
         save_network(joint, folder)
     distances = [made.means["left"] for made in recordings.made]
     log.say(f"L1 to the finished edit: {distances[0]:.4f} at first, {distances[-1]:.4f} at the end")
-    log.say(f"the state was saved {saver.saves} times, in {saver.seconds:.2f} s")
+    log.say(f"saved the state {format_count(saver.saves, 'time')} in {saver.seconds:.2f} s")
     return recordings.made
 
 

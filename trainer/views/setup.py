@@ -108,7 +108,7 @@ class TrainingSetup:
     def judged_on(self) -> str:
         """Description of `judging` for use beside a figure, which points out a single view."""
         if not self.held_out:
-            return "the views trained on"
+            return "training views"
         return f"{len(self.held_out)} held-out views" if len(self.held_out) > 1 else "one held-out view alone"
 
 

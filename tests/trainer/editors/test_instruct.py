@@ -295,7 +295,7 @@ def test_run_follows_the_anchor_and_refuses_a_changed_anchor(pix2pix: str, tmp_p
     options = with_values(text_run(tmp_path, klein, "run"), anchor=anchor)
     result = train(options, quiet=True)
     log = result.folder.log.read_text(encoding="utf-8")
-    assert "decides: paint over it" not in log, "one is given"
+    assert "all views follow" not in log, "one is given"
     save(painted.flip(0))
     with pytest.raises(ProgdfError, match=r"anchor\.png has changed since"):
         train(replace(options, resume=True), quiet=True)

@@ -45,7 +45,7 @@ def test_run_on_warp_matches_the_cpu_engine(folder: Path, asked: dict[str, objec
         options = quick_options(folder, out, part="scarf", views=4, image_size=48, engine=engine, **asked)
         ends.append(train(options))
     cpu, warp = ends
-    assert "the steps are drawn by warp on " in warp.folder.log.read_text()
+    assert "warp renders the training steps on " in warp.folder.log.read_text()
     assert "by warp" not in cpu.folder.log.read_text()
     # gradients differ by 1e-5 of the largest; Adam scales small gradients up to the same size
     assert warp.report["edit"]["psnr_to_views"] == pytest.approx(

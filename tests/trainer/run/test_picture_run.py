@@ -77,8 +77,8 @@ def test_report_states_that_no_view_was_held_out(done: RunResult) -> None:
     assert views["held_out"] is False
     assert views["edit"] == ["A"]
     log = done.folder.log.read_text()
-    assert "no view is held out: all figures are of the views that were trained on" in log
-    assert "the views trained on: " in log
+    assert "no view is held out; all figures are measured on the training views" in log
+    assert "training views: " in log
     assert json.loads(done.folder.report.read_text())["trajectory"]["slider"] == "even"
 
 

@@ -219,7 +219,7 @@ def test_picture_of_the_background_is_a_removal(scene_file: Path, tmp_path: Path
     result = train(options, quiet=True)
     gdf = load_gdf(result.gdf, load_ply(scene_file))
     assert ("logit_opacities" in gdf.field.attributes) == (removal == "auto")
-    assert ("it is taken away" in (out / "log.txt").read_text()) == (removal == "auto")
+    assert ("the region is removed" in (out / "log.txt").read_text()) == (removal == "auto")
 
 
 def test_recolored_picture_is_no_removal(scene_file: Path, tmp_path: Path) -> None:

@@ -123,7 +123,7 @@ def test_default_effort_is_chosen_from_the_scene_and_reported(folder: Path, done
     assert max(given["steps"]) <= given["most_steps"] == 25
     assert effort["views"] == 17  # of 34; with these the remainder is invisible
     assert len(free.report["views"]["edit"]) == 6
-    how = "in " if effort["steps"] else "by maps alone"
+    how = "in " if effort["steps"] else "by color maps alone"
     assert f"{len(effort['strengths'])} strengths {how}" in free.folder.log.read_text()
     assert free.report["edit"]["psnr_to_views"] > 32.0
 
