@@ -40,6 +40,7 @@ def run_bare(folder: Path, what: str) -> str:
     return (folder / "bare.txt").read_text("utf-8")
 
 
+@pytest.mark.slow
 def test_commands_need_no_module_that_windows_lacks(tmp_path: Path) -> None:
     assert run_bare(tmp_path, "commands").count("\n") == 1
     assert sorted(path.name for path in tmp_path.glob("*.p*")) == ["a.png", "b.png", "bear.ply", "edited.ply"]

@@ -68,6 +68,7 @@ def _names(options: TrainOptions, *about: object) -> set[str]:
     return {variant.name for variant in differing_variants(resolve(options), *about)}  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_ablation_lists_only_variants_that_change_the_run(options: TrainOptions) -> None:
     color = _names(options, "color", 4, 1)
     assert {"base", "2-keyframes", "one-target", "no-sh", "slider-stages", "descent", "paper"} <= color

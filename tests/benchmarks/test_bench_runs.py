@@ -40,6 +40,7 @@ def test_far_cameras_are_raised_lowered_and_zoomed_at_the_region() -> None:
         assert float(seen[2]) == pytest.approx(4.0, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_edits_are_compared_with_baselines_at_all_strengths(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

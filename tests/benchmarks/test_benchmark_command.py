@@ -77,6 +77,7 @@ def test_busy_share_sees_loops_in_other_processes() -> None:
             child.wait()
 
 
+@pytest.mark.slow
 def test_page_runs_exactly_the_benchmarks_with_markers(monkeypatch: pytest.MonkeyPatch) -> None:
     requested: list[str] = []
     monkeypatch.setattr(command, "_function", lambda path: lambda **_: requested.append(path) or [])

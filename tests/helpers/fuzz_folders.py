@@ -299,14 +299,17 @@ def _kernels(folder: Path) -> Reader:
 
 
 def _run(name: str, folder: Path) -> Reader:
-    """Change one file of a stopped or finished run each time."""
-    write_bear(folder, 400)
-    options = quick_options(folder, views=4, image_size=48, steps=64, stages=2)
+    """Change one file of a stopped or finished run each time. Readers beside each other share the run."""
     resumes = name.startswith("resume")
     file = FILES_OF_RUNS[name]
-    _train(options, stops=resumes)
-    good = folder / "good"
-    options.out.rename(good)
+    shared = folder.parent / ("stopped run" if resumes else "finished run")
+    options = quick_options(shared, views=4, image_size=48, steps=64, stages=2)
+    good = shared / "good"
+    if not shared.exists():
+        shared.mkdir()
+        write_bear(shared, 400)
+        _train(options, stops=resumes)
+        options.out.rename(good)
     content = (good / file).read_bytes()
     changes: dict[str, list[Change]] = {".json": [changed_json(content)] * 3}
     if file.endswith(".safetensors"):

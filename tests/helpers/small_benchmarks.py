@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import edits as run_edits
-from benchmarks import field, rasterizer, sliders, training, warps
+from benchmarks import field, rasterizer, sliders, table, training, warps
 from benchmarks.ablation import regret, setup
 from benchmarks.analytic_edits import column_warps
 from benchmarks.rasterizer import RasterCase
@@ -29,6 +29,7 @@ SMALL_TRAINING = ("--views", "5", "--image-size", "48")
 
 def shrink_benchmarks(patch: pytest.MonkeyPatch) -> None:
     """Make every benchmark take seconds."""
+    patch.setattr(table, "_SPIN_S", 0.01)
     _shrink_training(patch)
     _shrink_viewer(patch)
     _shrink_rasterizer(patch)
@@ -60,6 +61,8 @@ def shrink_field(patch: pytest.MonkeyPatch) -> None:
 
 def _shrink_training(patch: pytest.MonkeyPatch) -> None:
     shrink_field(patch)
+    for module in (training, field):
+        patch.setattr(module, "tasks", _last_task)
     patch.setattr(training, "OPTION_SETS", ("--quick --views 5 --image-size 48 --stages 2 --threads 1",))
     patch.setattr(run_edits, "VALUES", 3)
     patch.setattr(run_edits, "ASKED", 2)
@@ -87,6 +90,14 @@ def _shrink_training(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(sliders, "run_suite", small)
 
 
+_tasks = training.tasks
+
+
+def _last_task(folder: Path, scenes: Sequence[Path] = ()) -> list[training.TrainingTask]:
+    """Return the task of the last given scene, or that of the bear if there is none."""
+    return _tasks(folder, scenes[-1:])[-1:]
+
+
 def _shrink_viewer(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(scenes, "SIZES", (600,))
     patch.setattr(slider, "CASES", (SliderCase(100, True),))
@@ -107,14 +118,16 @@ def _shrink_viewer(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(window, "idle", partial(window.idle, wall_s=0.2))
 
 
+_STARTS: list[frames.Start] = []
+
+
 def _measure_one_start(measure: Callable[..., frames.Start]) -> Callable[..., frames.Start]:
-    """Return a `measure_starts` that opens a window only for its first scene, as each takes some seconds."""
-    starts: list[frames.Start] = []
+    """Return a `measure_starts` that opens one window per process, as each takes some seconds."""
 
     def measure_once(path: Path, way: str) -> frames.Start:
-        if not starts:
-            starts.append(measure(path, way, times=1, size=(460, 400)))
-        return starts[0]
+        if not _STARTS:
+            _STARTS.append(measure(path, way, times=1, size=(460, 400)))
+        return _STARTS[0]
 
     return measure_once
 

@@ -30,6 +30,7 @@ def _same(a: Gaussians, b: Gaussians) -> bool:
     return all(torch.equal(getattr(a, name), getattr(b, name)) for name in ATTRIBUTES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [scenes.MIN_BEAR_GAUSSIANS, 401, 5003])
 def test_bear_has_the_requested_size_and_leaves_torch_unchanged(size: int) -> None:
     torch.manual_seed(5)
@@ -43,6 +44,7 @@ def test_bear_has_the_requested_size_and_leaves_torch_unchanged(size: int) -> No
     assert set(scene.labels.tolist()) == set(range(len(scene.label_names)))
 
 
+@pytest.mark.slow
 def test_bear_is_determined_by_its_seed(bear: scenes.DemoScene) -> None:
     assert _same(bear.gaussians, scenes.bear(6000).gaussians)
     assert not torch.equal(bear.gaussians.means, scenes.bear(6000, seed=1).gaussians.means)
@@ -53,6 +55,7 @@ def room() -> scenes.DemoScene:
     return scenes.room(2503)
 
 
+@pytest.mark.slow
 def test_room_has_its_size_and_all_parts_and_is_seeded(room: scenes.DemoScene) -> None:
     scene = room
     assert len(scene.gaussians) == 2503

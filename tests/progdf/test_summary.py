@@ -135,6 +135,7 @@ print("500 Gaussians" in data["text/html"])
 """
 
 
+@pytest.mark.slow
 def test_ipython_shows_a_scene_as_its_card() -> None:
     run = subprocess.run([sys.executable, "-c", NOTEBOOK], capture_output=True, text=True, cwd=ROOT)
     assert run.stdout.strip() == "True", run.stderr

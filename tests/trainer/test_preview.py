@@ -99,6 +99,7 @@ def test_command_ends_with_its_input(scene: Path, monkeypatch: pytest.MonkeyPatc
     assert main(["preview", str(scene)]) == 0
 
 
+@pytest.mark.slow
 def test_text_edit_returns_a_note_until_a_picture_is_requested(scene: Path, tmp_path: Path) -> None:
     for package in ("diffusers", "transformers", "accelerate"):
         pytest.importorskip(package, reason="pip install progdf-studio[diffusion]")

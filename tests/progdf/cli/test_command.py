@@ -279,6 +279,7 @@ def test_child_of_a_test_handles_signals() -> None:
     assert "SIG_IGN" not in child.stdout
 
 
+@pytest.mark.slow
 def test_tests_pass_if_signals_are_inherited_ignored() -> None:
     command = [sys.executable, "-m", "pytest", "-n", "0", __file__, "-k", "SIGHUP or child_of_a_test"]
     env = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}

@@ -152,6 +152,7 @@ def test_existing_path_is_not_elided(tmp_path: Path) -> None:
     assert "…" in elide(f"{deep / 'no' / 'absent.ply'} cannot be read")
 
 
+@pytest.mark.slow
 @posix
 @pytest.mark.parametrize(
     ("shell", "status"),

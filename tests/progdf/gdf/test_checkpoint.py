@@ -312,6 +312,7 @@ def places(value: object, at: tuple[str | int, ...] = ()) -> Iterator[tuple[str 
             yield from places(entry, (*at, key))
 
 
+@pytest.mark.slow
 def test_info_shows_or_refuses_any_header_in_one_line(
     saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

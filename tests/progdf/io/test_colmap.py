@@ -62,6 +62,7 @@ def test_model_is_read_with_or_without_points(tmp_path: Path, text: bool, points
         assert (camera.width, camera.height, camera.lens) == (320, 200, None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", ["", "sparse/0", "sparse", "0", "colmap/sparse/0"])
 def test_model_is_found_in_its_project_folder(tmp_path: Path, place: str) -> None:
     write_model(tmp_path / "project" / place, views())

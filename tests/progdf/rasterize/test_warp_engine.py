@@ -61,6 +61,7 @@ def test_kernels_compile_for_gpus_without_a_gpu(tmp_path: Path, architectures: t
         assert (tmp_path / name).stat().st_size > 10_000
 
 
+@pytest.mark.slow
 @NEEDS_WARP
 def test_warp_is_loaded_on_demand_and_starts_quietly() -> None:
     code = (

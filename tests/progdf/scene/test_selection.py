@@ -63,6 +63,7 @@ def camera() -> Camera:
     return front_camera(200, 200, 250.0)
 
 
+@pytest.mark.slow
 def test_projected_centers_match_the_camera_and_are_nan_behind_it() -> None:
     scene = random_gaussians(300)
     seen = orbit_camera(90, 60, distance=1.0)

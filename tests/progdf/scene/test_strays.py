@@ -99,6 +99,7 @@ def test_cleaned_scene_has_no_strays() -> None:
     assert len(cleaned) == len(bear())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1000, 2000, 4000])
 def test_clean_scene_loses_nothing_visible(size: int) -> None:
     scene = bear_stack(size).scene

@@ -53,6 +53,7 @@ def events_of(capsys: pytest.CaptureFixture[str]) -> list[dict[str, Any]]:
     return [json.loads(line) for line in capsys.readouterr().out.splitlines()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("status", ["waiting", "stopped", "failed"])
 def test_row_of_a_finished_run_becomes_done_on_resume(
     finished: list[str], status: Any, capsys: pytest.CaptureFixture[str]
@@ -146,6 +147,7 @@ def test_damaged_progress_counts_as_zero(
     assert event["running"] == {job.key: {"share": 0.0, "label": "", "loss": "", "seconds": 0.0}}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="signals")
 @pytest.mark.parametrize("content", [b"", b"no task", b"ctrainer.batch.jobs\nAbsent\n."])
 def test_worker_exits_on_unreadable_tasks(content: bytes) -> None:

@@ -62,6 +62,7 @@ def editor_of(settings: EditorOptions, spec: str = BATMAN) -> InstructEditor:
     return editor
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [tiny_instruct_pix2pix, tiny_flux_kontext, tiny_flux2_klein])
 def test_saved_pipeline_edits_a_view_at_its_own_size(
     diffusers: None, make: Callable[[Path], Path], tmp_path: Path
@@ -245,6 +246,7 @@ def text_run(folder: Path, model: str, out: str, **more: object) -> TrainOptions
     )
 
 
+@pytest.mark.slow
 def test_text_edit_trains_in_stages_and_resumes_to_the_same_bits(
     pix2pix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

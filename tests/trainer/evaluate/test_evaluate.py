@@ -40,6 +40,7 @@ def rows(run: Path, printed: str) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.slow
 def test_figures_agree_with_the_report(run: Path, rows: dict[str, Any]) -> None:
     report = json.loads((run / "report.json").read_text())
     edit = report["edit"]
@@ -84,6 +85,7 @@ def test_table_is_printed_and_picture_is_written(run: Path, printed: str, rows: 
     assert "missing" in rows["clip_direction"]
 
 
+@pytest.mark.slow
 def test_clip_rows_are_measured_if_weights_are_installed(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

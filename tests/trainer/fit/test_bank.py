@@ -125,6 +125,7 @@ def test_joint_training_resumes_to_the_same_bits() -> None:
 # ---- runs
 
 
+@pytest.mark.slow
 def test_joint_network_is_finished_and_matches_the_recording(folder: Path, alongside: RunResult) -> None:
     field = alongside.report["field"]
     assert field["kind"] == "neural"

@@ -199,6 +199,7 @@ def test_warp_is_deterministic_and_restored_from_saved_state() -> None:
     assert torch.equal(back.warps[0].carry(rows, offsets), first.warps[0].carry(rows, offsets))
 
 
+@pytest.mark.slow
 def test_path_of_a_bend_has_exact_ends_and_a_half_bend_between() -> None:
     case = body()
     rows, crops, boxes, _ = pictured(case, bent(case), (1.0,))

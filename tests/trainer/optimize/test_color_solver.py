@@ -212,6 +212,7 @@ def test_partial_change_becomes_a_mask(profile: str) -> None:
     assert "color map of degree 1 + mask" in model.line
 
 
+@pytest.mark.slow
 def test_pattern_gets_a_residual_with_only_useful_bands() -> None:
     scene = dense_ball(1500, bands=3)
     side = (scene.means[:, :1] > 0).float()
@@ -237,6 +238,7 @@ def test_pattern_gets_a_residual_with_only_useful_bands() -> None:
     assert bands_of(turned, most=1) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("turning", "spare"), [(0.1, 0.0), (1.0, 0.0), (1.0, 3e-4)])
 def test_only_members_that_need_them_have_functions_beyond_dc(turning: float, spare: float) -> None:
     scene = dense_ball(1500, bands=3)
@@ -285,6 +287,7 @@ def test_band_is_added_for_the_path_if_the_end_has_no_error(turned: bool, most: 
     assert ("with a residual of 4, on the way too" in thinner.line) == (most == 4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("bend", "asked"), [("straight", set()), ("bent", {0.25, 0.5, 0.75}), ("late", {0.5, 0.75})]
 )

@@ -193,6 +193,7 @@ def test_same_seed_finds_the_same_bits() -> None:
     assert torch.equal(kept.capture_state()["motions"], first["motions"])
 
 
+@pytest.mark.slow
 def test_wide_search_finds_a_shift_of_three_sizes() -> None:
     case = small("arms")
     pivots = arm_pivots(case)

@@ -187,6 +187,7 @@ def distance_traveled(weights: OptimizeOptions) -> float:
     return float(recolored(weights)[-1].offsets.abs().mean())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("progressive", ["decay", "growth"])
 def test_sum_over_members_restrains_an_edit_more_than_the_mean(progressive: Progressive) -> None:
     free = distance_traveled(paying())

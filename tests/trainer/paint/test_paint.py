@@ -139,6 +139,7 @@ def test_paint_does_not_show_through_a_thin_wall() -> None:
     assert psnr(after, before, shown) > 24.0  # the bars differ from the wall by 12 dB
 
 
+@pytest.mark.slow
 def test_decal_lies_on_the_surface_from_the_sides_too(tmp_path: Path) -> None:
     scene = wall(count=20_000, size=0.035, rough=0.01)
     logo = np.zeros((32, 32, 4), np.uint8)

@@ -192,6 +192,7 @@ def seen_from(z: float, size: int = 160) -> Camera:
     return Camera(viewmat, intrinsics(0.6, size, size), size, size)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("region", ["changed", "all"])
 @pytest.mark.parametrize("gap", [0.01, 0.05, 0.2])
 def test_paint_on_a_thin_sheet_is_invisible_from_behind(tmp_path: Path, gap: float, region: str) -> None:

@@ -58,6 +58,7 @@ def cameras(demo: DemoScene) -> list[Camera]:
 # ---------------------------------------------------------------------------------------------- exact masks
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", ["head", "legs", "scarf", "plinth", "grass"])
 def test_masks_of_a_part_lift_back_to_the_part(demo: DemoScene, cameras: list[Camera], part: str) -> None:
     member = demo.labels == demo.label_names.index(part)

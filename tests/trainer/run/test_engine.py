@@ -131,6 +131,7 @@ def case() -> Small:
     return small("scarf", 400, 2, 32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["color", "style", "geometry"])
 def test_no_step_transfers_data_to_or_from_the_gpu(case: Small, card: Card, kind: str) -> None:
     moved = []

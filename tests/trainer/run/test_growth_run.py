@@ -96,6 +96,7 @@ def hat(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_hat_is_grown_and_nothing_outside_changes(hat: Path) -> None:
     plain, grown = (open_run(hat / name) for name in ("plain", "grown"))
     assert "chosen: geometry with growth" in (hat / "grown" / "log.txt").read_text(encoding="utf-8")

@@ -209,6 +209,7 @@ def paint(path: Path, image: Tensor, view: View) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("removal", ["auto", "never"])
 def test_picture_of_the_background_is_a_removal(scene_file: Path, tmp_path: Path, removal: str) -> None:
     _, rest, setup = case()

@@ -53,22 +53,22 @@ def test_run_killed_at_any_write_resumes_to_the_same_bits(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "options",
+    ("count", "options"),
     [
-        {"save_every": 0.2},
-        {"save_every": 0, "kind": "geometry", "group_steps": 12},
-        {"save_every": 0, "field": "neural", "preset": "paper", "quick": True},
+        (16, {"save_every": 0.2}),
+        (8, {"save_every": 0, "kind": "geometry", "group_steps": 12}),
+        (4, {"save_every": 0, "field": "neural", "size": "tiny", "preset": "paper", "quick": True}),
     ],
     ids=["color", "parts", "joint"],
 )
-def test_runs_killed_at_sixteen_moments_resume_to_the_same_bits(
-    bear_folder: Path, tmp_path: Path, options: dict[str, object]
+def test_runs_killed_at_random_moments_resume_to_the_same_bits(
+    bear_folder: Path, tmp_path: Path, count: int, options: dict[str, object]
 ) -> None:
     killed(bear_folder, tmp_path, [], **options)
     expected = bits(tmp_path / OUT)
     shutil.rmtree(tmp_path / OUT)
     draw = random.Random(11)
-    moments = [draw.choice((float(draw.randint(1, 60)), draw.uniform(0.2, 4.0))) for _ in range(16)]
+    moments = [draw.choice((float(draw.randint(1, 60)), draw.uniform(0.2, 4.0))) for _ in range(count)]
     killed(bear_folder, tmp_path, moments, **options)
     assert bits(tmp_path / OUT) == expected
 
@@ -266,6 +266,7 @@ def test_saved_region_of_another_scene_is_a_one_line_error(bear_folder: Path, ch
         train(replace(small_run(bear_folder), resume=True), quiet=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("broken", ["gone", "truncated"])
 @pytest.mark.usefixtures("stopped")
 def test_lost_edited_view_is_edited_again(bear_folder: Path, uninterrupted: Path, broken: str) -> None:

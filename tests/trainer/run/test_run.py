@@ -55,6 +55,7 @@ def copy_of(run: RunResult, folder: Path) -> Path:
     return shutil.copytree(run.folder.root, folder / run.folder.root.name)
 
 
+@pytest.mark.slow
 def test_report_picture_ends_with_curves(done: RunResult) -> None:
     with Image.open(done.folder.root / "report.png") as picture:
         last = np.asarray(picture.convert("RGB"), dtype=int)[-200:]
@@ -75,6 +76,7 @@ def test_slider_is_closer_to_the_editor_than_two_keyframes(done: RunResult) -> N
         assert between["psnr"] > between["keyframes2"] + 4.0, s
 
 
+@pytest.mark.slow
 def test_figure_from_a_single_held_out_view_is_labeled(
     folder: Path, done: RunResult, capsys: pytest.CaptureFixture[str]
 ) -> None:

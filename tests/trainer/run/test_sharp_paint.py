@@ -88,6 +88,7 @@ def test_run_stopped_at_its_discs_resumes_to_the_same_bits(
     assert resumed.gdf.read_bytes() == lettered.gdf.read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fills", [True, False])
 def test_fill_below_discs_stays_and_gaps_between_letters_are_restored(
     place: Path, fills: bool, monkeypatch: pytest.MonkeyPatch
@@ -116,6 +117,7 @@ def test_fill_below_discs_stays_and_gaps_between_letters_are_restored(
     assert (float((bases[0].sh0 - recolored.sh0).abs().max()) < 1e-4) is fills
 
 
+@pytest.mark.slow
 def test_change_reproduced_by_recoloring_adds_nothing(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = load_ply(place / "wall.ply")
     colors = scene.sh0 - 0.5 * torch.exp(-4 * scene.means.square().sum(dim=1, keepdim=True))

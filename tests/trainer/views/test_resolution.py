@@ -51,6 +51,7 @@ def test_color_edit_is_viewed_from_level_to_above(dense: bool, lowest: float, hi
     assert highest - 10.0 <= float(rises.max()) <= highest + 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("editor", ["recolor:#3060d0", "stripes:#20a040"])
 def test_edited_picture_does_not_depend_on_the_other_views(tmp_path: Path, editor: str) -> None:
     write_bear(tmp_path)

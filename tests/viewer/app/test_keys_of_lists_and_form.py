@@ -176,6 +176,7 @@ def test_escape_closes_only_the_list(form: Rig) -> None:
     assert not form.main_view.work.form_open
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["menu", "list", "question", "form"])
 def test_no_shortcut_acts_while_a_menu_or_form_is_open(hand: Rig, what: str) -> None:
     if what in ("list", "form"):

@@ -119,6 +119,7 @@ def test_failing_request_does_not_end_the_window(
         assert "BrokenError: in a request" in message(window).text, request
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", DRAWN)
 def test_failing_part_of_a_frame_leaves_the_others_unchanged(
     window: application.App, part: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -91,6 +91,7 @@ def small_screen() -> Iterator[str]:
         yield name
 
 
+@pytest.mark.slow
 @pytest.mark.window
 @pytest.mark.gl
 def test_real_window_is_no_larger_than_the_screen(small_screen: str) -> None:

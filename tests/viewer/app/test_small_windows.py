@@ -27,6 +27,7 @@ def windows(name: str) -> list[imgui.internal.Window]:
     return [window for window in found if name in window.name and window.active]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("points", [SMALLEST, (800, 600), (1280, 800)])
 @pytest.mark.parametrize("kind", ["open", "save", "leave", "overwrite", "restore", "replace"])
 def test_every_question_fits_the_window_with_many_recent_files(points: tuple[int, int], kind: str) -> None:

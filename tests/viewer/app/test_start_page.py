@@ -72,6 +72,7 @@ def type_keys(hand: Rig, *keys: imgui.Key) -> None:
     hand.settle()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bundle", [*EXAMPLE_TITLES], ids=lambda path: path.name.partition(".")[0])
 def test_example_opens_with_its_edits(window: application.App, bundle: Path, tmp_path: Path) -> None:
     window.main_view.request(WithText("example", str(bundle)))

@@ -359,6 +359,7 @@ def view_first(screen: str, *words: object) -> tuple[int, list[str]]:
     return ran.returncode, ran.stderr.splitlines()
 
 
+@pytest.mark.slow
 @pytest.mark.window
 @pytest.mark.gl
 def test_window_opens_before_slow_imports(screen: str, tmp_path: Path) -> None:

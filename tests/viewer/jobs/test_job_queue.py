@@ -98,6 +98,7 @@ def wait(queue: JobQueue, until: str = "") -> list[QueuedTask]:
     return ended
 
 
+@pytest.mark.slow
 def test_runs_train_in_order_and_a_failure_is_one_line(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     arguments = EditOrder.arguments
     smaller = ["--views=3", "--image-size=48", "--steps=8", "--stages=1"]  # smaller than in the window

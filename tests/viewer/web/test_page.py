@@ -163,6 +163,7 @@ def page_order(opened: Opened, scene: Gaussians) -> np.ndarray:
     return np.array([rows[row.tobytes()] for row in means])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degree", [0, 1])
 def test_page_computes_every_attribute_like_compose_for_every_rule(
     open_page: Any, tmp_path: Path, degree: int
@@ -260,6 +261,7 @@ def test_page_pictures_match_the_cpu_engine(
         assert psnr(picture, cpu_picture(stack, opened.camera(), strengths)) >= least
 
 
+@pytest.mark.slow
 def test_mouse_orbits_pans_zooms_and_sets_the_pivot(open_page: Any, bear_page: tuple[Path, Stack]) -> None:
     opened = ready(open_page(bear_page[0]))
     mouse = opened.tab.mouse
@@ -419,6 +421,7 @@ def test_page_keeps_only_the_values_of_members_in_memory(open_page: Any, tmp_pat
     assert used < before + levels + 2.5e6, "what came is 2.4 MB more"
 
 
+@pytest.mark.slow
 def test_large_scene_is_sorted_by_a_worker_if_the_policy_allows_it(
     open_page: Any, bear_page: tuple[Path, Stack], tmp_path: Path
 ) -> None:

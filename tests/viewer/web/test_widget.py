@@ -143,6 +143,7 @@ def bear_widget(*strengths: float, height: int = 300) -> Widget:
     return Widget(bear().scene, layers, height=height)
 
 
+@pytest.mark.slow
 def test_values_set_in_python_draw_like_the_cpu_engine(show: Any) -> None:
     widget = bear_widget(0.0, 0.0)
     cells = show(widget)
@@ -232,6 +233,7 @@ def test_widget_hidden_for_a_frame_comes_back_up_to_date(show: Any) -> None:
     assert psnr(cells.picture(), before) > 90
 
 
+@pytest.mark.slow
 def test_widgets_are_independent_and_release_their_context(show: Any) -> None:
     cells = show(bear_widget(0.0, 0.0), bear_widget(1.0, 1.0))
     before = cells.picture(1)
@@ -247,6 +249,7 @@ def test_widgets_are_independent_and_release_their_context(show: Any) -> None:
     assert cells.complaints == []
 
 
+@pytest.mark.slow
 def test_widget_takes_keys_and_wheel_only_after_a_click(show: Any) -> None:
     cells = show(bear_widget(1.0, 1.0))
     cells.tab.evaluate(
@@ -318,6 +321,7 @@ def test_scene_in_training_is_shown_as_it_is() -> None:
     assert (shown == expected).all()
 
 
+@pytest.mark.slow
 def test_invalid_values_from_python_are_ignored(show: Any) -> None:
     """Another program may send such values to the same model."""
     widget = bear_widget(0.5, 0.5)
