@@ -123,6 +123,9 @@ def different_examples() -> list[Example]:
     found: dict[tuple[str, ...], Example] = {}
     for example in command_examples():
         words = [PLACEHOLDERS.get(word, word) for word in example.words]
+        if words[:2] == ["progdf", "demo"] and "--size" in words:  # `shrink_demo` has one size
+            at = words.index("--size")
+            words[at : at + 2] = cheap_options(["progdf", "demo"])[:2]
         found.setdefault(tuple(sorted(words + cheap_options(words))), example)
     return list(found.values())
 
