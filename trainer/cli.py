@@ -1,4 +1,4 @@
-"""Entry points of the trainer's commands, with options made from dataclasses."""
+"""Entry points of the trainer's commands. Each parses its command line into a dataclass of options."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def train(argv: Sequence[str]) -> int:
 
 
 def batch(argv: Sequence[str]) -> int:
-    """Run `progdf batch`; return 0 if all succeeded, 2 if nothing was started for an error, 3 if some jobs
+    """Run `progdf batch`; return 0 if all jobs succeeded, 2 if an error prevented the start, 3 if some jobs
     failed."""
     options = parse_options(BatchOptions, argv, "progdf batch")
     from trainer.batch.run import batch as run
@@ -55,7 +55,7 @@ def evaluate(argv: Sequence[str]) -> int:
 
 
 def train_options(argv: Sequence[str]) -> TrainOptions:
-    """Return the options of a command line: its own values, then its preset's, then the defaults."""
+    """Parse a command line. Its own values override those of its preset, which override the defaults."""
     options = parse_options(TrainOptions, argv, "progdf train")
     if options.preset == "default":
         return options

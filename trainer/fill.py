@@ -3,9 +3,11 @@
 A hole in a view is a connected component of pixels of the object without an opaque background, and with an
 opaque boundary. An object in front of an empty background leaves no hole. Alpha, inverse depth and color,
 weighted by alpha, are continued from the boundary as a membrane (∇² = 0, which the inverse depth of a plane
-fulfills). No point of a hole may lie where some view saw another surface, or nothing, before the removal.
+fulfills). No point of a hole may lie where some view showed another surface, or empty space, before the
+removal.
 
-The largest hole of any view becomes discs, then the largest of the remaining ones, until they are small.
+The view with the largest hole is filled with discs, then that with the largest remaining one, until all holes
+are small. Views with a given picture come first.
 """
 
 from __future__ import annotations
@@ -33,15 +35,15 @@ _BLOCKS = (8, 4, 2, 1)  # side of a disc's square in pixels, as large as the col
 _COLOR_TOLERANCE = 2 / 255  # maximum color range within a disc
 _WIDTH = 0.7  # standard deviation of a disc, as a share of the side
 _THICKNESS = 0.1  # thickness of a disc, as a share of its width
-_OPACITY_LOGIT = 5.0
+_OPACITY_LOGIT = 5.0  # opacity logit of a disc
 _MIN_COSINE = 0.3  # limits the stretching of slanted discs
 _MIN_HOLE_SHARE = 0.01  # share of the region's pixels; smaller holes are irregularities of the boundary
-_MAX_VIEWS = 12
+_MAX_VIEWS = 12  # maximum number of views whose holes become discs
 _REACH_PX = 4.0  # maximum distance of a point from a surface that still belongs to it
 
 
 Front = tuple[Camera, Tensor, Tensor]
-"""Camera; visible depth (camera z, infinite without a surface); mask of the region there. [H,W] each"""
+"""Camera of a view; visible depth (camera z, infinite without a surface); mask of the region. [H,W] each"""
 
 
 @dataclass(frozen=True)
@@ -77,8 +79,10 @@ def fill_holes(
     Args:
         scene: the original
         rest: the remaining scene
-        views: views of the original with the removed region's mask; areas that no view sees may be filled
-        pictures: by view name, pictures whose colors replace those of the boundary. [H,W,3]
+        views: views of the original with the removed region's mask; only areas hidden in all of them are
+            filled
+        pictures: by view name, pictures of the finished edit, whose colors the discs take instead of those of
+            the boundary. [H,W,3]
     """
     picture_colors = pictures or {}
     seen = [(view.camera, _visible_depth(scene, view.camera), view.mask > 0.5) for view in views]
@@ -134,7 +138,10 @@ def find_hole(rest: Gaussians, view: View, seen: Sequence[Front]) -> Hole:
 
 
 def _closed_pieces(unknown: Tensor, alpha: Tensor) -> Tensor:
-    """Return the components of unknown pixels that are open in part, with an opaque boundary. [H,W] bool"""
+    """Return the pixels of the components of `unknown` that are holes. [H,W] bool
+
+    A hole has an opaque boundary and at least one pixel with an alpha below 0.5.
+    """
     pieces, count = ndimage.label(unknown.numpy(), np.ones((3, 3)))
     opaque = (alpha >= _OPAQUE).numpy()
     closed = np.zeros(count + 1, bool)
@@ -204,7 +211,7 @@ def place_discs(hole: Hole, like: Gaussians, colors: Tensor) -> Gaussians:
     rays = torch.stack([(x + side / 2 - cx) / fx, (y + side / 2 - cy) / fy, torch.ones_like(x)], dim=1)
     a = across[rows, columns] * fx
     b = down[rows, columns] * fy
-    # at the center of the disc, which lies between pixels for an even side
+    # inverse depth at the center of the disc, which lies between pixels if the side is even
     half = side / 2 - (parts[:, 2] // 2).double() - 0.5
     inverse = hole.inverse_depth.double()[rows, columns] + half * (a / fx + b / fy)
     z = 1.0 / inverse.clamp_min(1e-12)
@@ -277,11 +284,10 @@ def _unproject(camera: Camera, pixels: Tensor, inverse_depth: Tensor) -> Tensor:
 
 
 def _unseen(points: Tensor, seen: Sequence[Front], own: Camera) -> Tensor:
-    """Return the points that no view saw, nor saw through, as the region or a nearer surface occluded them.
-    [P] bool
+    """Return the points that no view showed, as a surface or as empty space, before the removal. [P] bool
 
-    `own`: camera of the points' pixels, whose size determines the tolerance of a point's distance from a
-    surface
+    Such a point is outside every picture, or occluded by the region or a nearer surface. `own` is the camera
+    from whose pixels the points were made: the tolerance is in its pixels.
     """
     unseen = torch.ones(len(points), dtype=torch.bool)
     reach = _REACH_PX * (points - own.position.double()).norm(dim=1) / float(own.K[0, 0])

@@ -6,9 +6,9 @@
 
 If one color map can represent the edit, the answer is a grade, 3.gdf beside 3.png, for every strength and
 camera. Otherwise it is the editor's own picture of the view. The editor "grade" only requests the region's
-main colors. A request is skipped if a later one has arrived. A prompt is painted by `model`, and again with
-another `seed`. With `seed` -1 nothing is painted; `note` names the model and device, and `models` the models
-on this machine. The process ends with its input.
+main colors. A request is skipped if a later one has arrived. `model` paints a prompt; another `seed` gives
+another painting. With `seed` -1 nothing is painted; `note` names the model and device, and `models` the
+models on this machine. The process ends when its input ends.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class PreviewOptions:
 class PreviewRequest(msgspec.Struct, frozen=True):
     """Requested edit: output path, region, editor, and viewing camera.
 
-    `viewmat` is relative to the origin of the scene, which window and child process load alike.
+    `viewmat` is relative to the scene's origin, which is the same in the window and in this process.
     """
 
     number: int
@@ -95,7 +95,7 @@ class PreviewAnswer(msgspec.Struct):
 
 
 class Previewer:
-    """Grades and pictures of one scene. Data that consecutive requests share is cached.
+    """Maker of the previews of one scene. Data that consecutive requests share is cached.
 
     Args:
         path: the scene's file
@@ -211,7 +211,7 @@ def serve(argv: Sequence[str]) -> int:
 
 
 def answer(previewer: Previewer, line: str) -> PreviewAnswer:
-    """Write the requested output. The answer reports failures."""
+    """Write the requested output and return the answer, which also reports failures."""
     try:
         request = msgspec.json.decode(line, type=PreviewRequest)
     except msgspec.MsgspecError as error:
@@ -231,7 +231,8 @@ def answer(previewer: Previewer, line: str) -> PreviewAnswer:
         write_image(Path(request.out), previewer.picture(request))
         return PreviewAnswer(request.number, follows=previewer.follows(request))
     except (ProgdfError, OSError) as error:
-        models = models_here() if request.editor.startswith("instruct:") else []  # others to choose from
+        # after a failed prompt the user can choose another model
+        models = models_here() if request.editor.startswith("instruct:") else []
         return PreviewAnswer(request.number, " ".join(str(error).split()), models=models)
 
 

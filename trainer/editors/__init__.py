@@ -36,7 +36,7 @@ from .style import check_style, style
 
 
 def _text_check(check: Callable[[str], object]) -> Callable[[str, EditorOptions], object]:
-    """Return a check of the text alone as a check of text and options."""
+    """Return a check with the signature of `EditorRow.check` that ignores the options."""
     return lambda what, options: check(what)
 
 
@@ -134,11 +134,11 @@ EDITORS = {
         run="removed",
     ),
 }
-"""The editors, one row each, by the word before the colon."""
+"""Rows of the editors, by the word before the colon in `--editor`."""
 
 
 def check_editor(spec: str) -> tuple[str, str]:
-    """Split `KIND:WHAT` into its two parts. Nothing is read or rendered.
+    """Split `KIND:WHAT`, the value of `--editor`, into its two parts. Nothing is read or rendered.
 
     Raises:
         ProgdfError: the kind is unknown.

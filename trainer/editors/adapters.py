@@ -27,7 +27,7 @@ from .mixed_steps import MixedSteps, euler_scheduler
 
 _SIDE_MULTIPLE_PX = 32  # pixels; a multiple of every pipeline's autoencoder and patch size
 _MIN_SIDE_PX = 64  # pixels; smallest side of a painted picture
-_MAX_CPU_PARAMETERS = 2e9  # parameters; painting with a larger model on a CPU takes days
+_MAX_CPU_PARAMETERS = 2e9  # parameters; a larger model takes hours per picture on a CPU
 # Memory beside the weights, in bytes. FLUX.1-dev takes 36.2 GB at 1024² with 31.4 GB of weights, klein 20 GB
 # with 16 GB.
 _WORKING_BYTES = 1e9  # at any size
@@ -46,12 +46,12 @@ class Adapter:
     guidance: float | None
     image_guidance: float | None = None
     guidance_word: str = "guidance_scale"  # keyword of the guidance argument
-    size: int = 1024  # side of a square of the area that the model was trained on, pixels
+    size: int = 1024  # side of a square with the area of the model's training pictures, pixels
     # Stable Diffusion family: weights in float16 (float32 on a CPU) instead of bfloat16; CLIP is the only
     # text encoder.
     is_stable: bool = False
-    is_fixed: bool = False  # the pipeline always paints at that area
-    encodes_alone: bool = True  # the prompt is encoded without the picture
+    is_fixed: bool = False  # the pipeline always paints at the area of `size`²
+    encodes_alone: bool = True  # the prompt can be encoded without the picture
     passes: int = 1  # network calls per step
     references: int = 0  # number of reference pictures that one call accepts beside the view
     is_gated: bool = False  # the weights need a login and an accepted license
@@ -86,7 +86,14 @@ class Adapter:
         guidance: float | None,
         image_guidance: float | None,
     ) -> dict[str, object]:
-        """Return the keyword arguments of a call that are in `known`, all except `generator`."""
+        """Return the keyword arguments of a call, all except `generator`.
+
+        Args:
+            known: parameters of the pipeline; optional arguments that are not among them are left out
+            prompt: the instruction
+            pictures: the view's own first, then references
+            steps, guidance, image_guidance: as in `Adapter`
+        """
         width, height = pictures[0].size  # size of the view
         values = {
             "num_inference_steps": steps,
@@ -151,14 +158,14 @@ class PipelineRequest:
     steps: int
     guidance: float | None
     image_guidance: float | None
-    size: int  # side of a square of the painted area, pixels
+    size: int  # side of a square with the painted area, pixels
     seed: int
     quantize: str
 
     def ask(self, pictures: Sequence[Tensor], seed: int) -> dict[str, object]:
-        """Return the arguments of a call.
+        """Return the arguments of a call for the view's picture and its references. [H,W,3] 0..1 each
 
-        Every call with one seed starts from the same noise, so that details that the prompt leaves open agree
+        Calls with the same seed start from the same noise, so that details that the prompt leaves open agree
         between views.
         """
         import diffusers
@@ -245,7 +252,7 @@ def memory_need(adapter: Adapter, sizes: Mapping[str, int], quantize: str, size:
         adapter: adapter of the pipeline
         sizes: number of parameters by component
         quantize: see `EditorOptions.quantize`
-        size: side of a square of the painted area, pixels
+        size: side of a square with the painted area, pixels
 
     Returns:
         bytes with all components on the GPU; bytes with one component at a time
@@ -307,8 +314,8 @@ def place(request: PipelineRequest, device: Device) -> DevicePlan:
     """Return the device and precision of the request's pipeline.
 
     Raises:
-        ProgdfError: weights or a package are missing, or the model is too large for a CPU and `device` is
-            not "cpu".
+        ProgdfError: weights or a package are missing; or there is no GPU, and the model is quantized, or too
+            large for a CPU while `device` is not "cpu".
     """
     model = request.model
     adapter = request.adapter

@@ -20,7 +20,7 @@ from trainer.views.view import RegionThumbnail, View
 class EditorInput:
     """Arguments from which an editor is made."""
 
-    what: str  # the text after the colon
+    what: str  # the text after the colon in `--editor`
     scene: Gaussians  # the original
     region: Region
     views: Sequence[View]
@@ -62,7 +62,10 @@ def editor_strengths(editor: ImageEditor, stages: int) -> tuple[float, ...]:
 
 
 def confines_edit(editor: ImageEditor, kind: Kind) -> bool:
-    """Return True if changes outside the region are reverted: unless the edit moves parts."""
+    """Return True if the run must revert changes outside the region.
+
+    That is the case if the editor can cause such changes and the edit moves no parts.
+    """
     return kind != "geometry" and not editor.is_confined
 
 
@@ -71,17 +74,17 @@ class PastingEditor(ImageEditor, Protocol):
 
     @property
     def view(self) -> View:
-        """The view in which the paint is given."""
+        """View in which the paint is given."""
         ...
 
     @property
     def paint(self) -> PaintedView:
-        """Target of that view."""
+        """Paint of that view, as the target of the surface discs."""
         ...
 
 
 RunKind = Literal["trained", "pasted", "removed", "trained or removed"]
-"""Kinds of run. The content of the pictures decides "trained or removed"."""
+"""Kinds of run. For "trained or removed", the content of the pictures decides between the two."""
 
 
 @dataclass(frozen=True)
@@ -93,19 +96,19 @@ class EditorRow:
     # checks the text after the colon and the options before a new run, without reading the scene
     check: Callable[[str, EditorOptions], object] | None = None
     per_view: bool = False  # edits each view on its own, so nothing makes the views agree
-    external: bool = False  # pictures made elsewhere, which exist only at the supplied strengths
-    knows_kind: bool = True  # False if it cannot tell which attributes its pictures change
+    external: bool = False  # its pictures are made by another program, at fixed strengths
+    knows_kind: bool = True  # False if its pictures may change color, style or geometry
     color_function: bool = False  # maps each color to another color, independent of its position
     slow_strengths: bool = False  # runs a model for every strength, so previews must not request them
     run: RunKind = "trained"
     is_parallel: bool = False  # edits views in parallel threads; others run a network or use all cores
-    paints_members: bool = False  # its state per view has a color for every member
+    paints_members: bool = False  # it holds a color of every member for each view, which takes memory
     is_manual: bool = False  # set by eye, so a draft is kept whatever its error
-    model: Callable[[], str] | None = None  # returns the default of --model; None: no generative model
+    model: Callable[[], str] | None = None  # returns the default of `--model`; None: no generative model
     image_size: int = 0  # longer side of its views, pixels; 0 is the default
     files: Callable[[str], tuple[Path, ...]] = lambda what: ()  # picture files that its text names
     sets_views: bool = False  # the views of the run are those of its files
-    cameras: Callable[[str], Path | None] = lambda what: None  # cameras found beside its pictures
+    cameras: Callable[[str], Path | None] = lambda what: None  # camera file beside its pictures, if any
     options: tuple[str, ...] = ()  # fields of `EditorOptions` that apply to it, besides the common ones
     note: Callable[[str], str] = lambda what: ""  # warning before its views are edited; "" if none
     remedy: str = "correct them"  # advice if its views disagree

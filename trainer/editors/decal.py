@@ -24,12 +24,12 @@ from trainer.views.view import BACKGROUND, View, make_view, with_near_plane
 
 from .base import EditorInput
 
-_MAX_DECAL_SIDE_PX = 512  # longer side of a decal; the view of a larger decal is shrunk
+_MAX_DECAL_SIDE_PX = 512  # maximum longer side of a decal; the view is shrunk until its decal fits
 
 
 @dataclass(frozen=True)
 class DecalPlacement:
-    """Position, size and rotation of a decal in a picture."""
+    """Position, size and rotation of a decal in the camera's picture."""
 
     x: float  # center, pixels
     y: float
@@ -126,14 +126,14 @@ class DecalEditor:
 
     scene: Gaussians
     view: View  # the camera's view
-    drawn: Tensor  # the decal where it lies on the surface: premultiplied colors and alpha. [H,W,4]
+    drawn: Tensor  # the part of the decal on the surface: premultiplied colors and alpha. [H,W,4]
     kind: EditKind = "color"
     stages: tuple[float, ...] = ()
     is_confined: bool = False
 
     @property
     def paint(self) -> PaintedView:
-        """Target of the camera's own view."""
+        """Decal in the camera's view, as the target of the surface discs."""
         return PaintedView(self.view.camera, self.edit(self.view, 1.0), self.drawn)
 
     def edit(self, view: View, strength: float) -> Tensor:
@@ -147,7 +147,7 @@ class DecalEditor:
 def decal(given: EditorInput) -> DecalEditor:
     """Return the editor of `decal:LOGO.png` with `--at` and `--camera`.
 
-    The decal covers the region where the region is opaque in the camera's view.
+    The decal is visible only on pixels of the camera's view where the region is opaque.
 
     Raises:
         ProgdfError: the picture, its placement or its camera is invalid, or the decal does not lie on the

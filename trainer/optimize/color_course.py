@@ -37,15 +37,15 @@ class StrengthSchedule:
     finished: Target
     # evaluator at any other strength; None: no strength can be added
     look: Callable[[float], ColorEvaluator] | None = None
-    ask: Callable[[Sequence[float]], Sequence[Target]] | None = None  # makes targets at further strengths
+    # makes targets at further strengths
+    ask: Callable[[Sequence[float]], Sequence[Target]] | None = None
 
     def extend(self, known: Mapping[float, tuple[Tensor, float]]) -> bool:
         """Add a strength in the middle of every interval where it pays. Return False if none is added.
 
         A strength pays if it reduces the error of the whole trajectory (geometric mean over the strengths) by
-        at least 5 %. The error now is that of `smooth_course` in the middle. The expected error of a solution
-        there follows from the errors at both ends of the interval, as the difference of a solution lies half
-        way between those of its neighbors.
+        at least 5 %. The current error is that of the interpolation in the middle (`smooth_course`). The
+        expected error of a solution there is the square of the mean of the root errors at both ends.
 
         Args:
             known: strength → solution [M,B,3] and its error; includes strengths 0 and 1
@@ -82,9 +82,9 @@ class StrengthSchedule:
 def thin_model(model: Model, solver: Solver, targets: Sequence[Target], steps: int, spare: float) -> Model:
     """Return the model with only those functions beyond DC that members need at the given strengths.
 
-    If the finished edit has no visible error, the next larger number of bands is tried first, for the other
-    strengths. Then the half that contributes least to the pictures is removed, and the remainder is solved
-    again. This repeats while the error grows by at most 5 %.
+    If the finished edit has no visible error, the next larger number of functions is tried first, for the
+    other strengths. Then the half of the functions that contributes least to the pictures is removed, and the
+    remainder is solved again. This repeats while the error grows by at most 5 %.
 
     Args:
         model: model of the finished edit
@@ -120,7 +120,7 @@ def thin_model(model: Model, solver: Solver, targets: Sequence[Target], steps: i
 
     best, min_error = refine([stage.strength * model.residual for stage, _ in targets], steps)
     tried = list(model.tried)
-    suffix = ", on the way too" if len(targets) > 1 else ""
+    suffix = ", also at other strengths" if len(targets) > 1 else ""
     if richer:
         refined, error = refine([pad(one, (0, 0, 0, richer - model.bands)) for one in best], steps)
         tried.append((f"with a residual of {richer}{suffix}", decibels(error / len(targets))))
@@ -137,7 +137,7 @@ def thin_model(model: Model, solver: Solver, targets: Sequence[Target], steps: i
             break
         thinner, error = refine(halved, min(GAIN_WINDOW_STEPS, steps - 1))
         total = float(thinner[-1].any(dim=2).float().sum(dim=1).mean())
-        tried.append((f"{total:.1f} of these a Gaussian{suffix}", decibels(error / len(targets))))
+        tried.append((f"{total:.1f} of these per Gaussian{suffix}", decibels(error / len(targets))))
     starts_by_strength = {stage.strength: one for (stage, _), one in zip(targets, best, strict=True)}
     return replace(model, residual=best[-1], begun=starts_by_strength, tried=tried)
 
@@ -151,9 +151,9 @@ def solve(
     on_step: OnStep,
     steps: int,
 ) -> Iterator[ParameterSnapshot]:
-    """Solve for the strengths of a course and yield a snapshot with its map for each.
+    """Solve for the strengths of a schedule and yield a snapshot with its map for each.
 
-    The course is extended as needed. Every solution starts from the interpolation of its neighbors.
+    The schedule is extended as needed. Every solution starts from the interpolation of its neighbors.
 
     Args:
         solver: training views

@@ -13,7 +13,7 @@ views also decide when a strength has had enough steps.
 A small number of pictures (`trainer.optimize.ties`) leaves most members undetermined. Then:
 
 - neighbors on one surface have similar residuals;
-- members that hardly shine through others are not solved for if only one picture shows them;
+- members that are almost hidden in every picture are not solved for unless they are large in two of them;
 - the distance over which a residual spreads before it fades into the map is chosen on held-out tiles of the
   pictures.
 """
@@ -86,10 +86,10 @@ class Model:
     residual: Tensor  # residual of the finished edit with b = 0, 1, 4 or 9 functions. [M,b,3]
     mask: Tensor | None  # see `GradeForm.mask`
     error: float  # mean squared error of the finished edit in held-out views; smaller errors are not pursued
-    tried: Sequence[tuple[str, float]]  # candidates and their errors on held-out views, dB
+    tried: Sequence[tuple[str, float]]  # name of each candidate, and its PSNR on held-out views, dB
     steps: int  # steps of all candidates
     most_bands: int  # see `choose_model`; 1 if there are few pictures
-    begun: Mapping[float, Tensor] = field(default_factory=dict)  # initial residual at that strength
+    begun: Mapping[float, Tensor] = field(default_factory=dict)  # strength → initial residual. [M,b,3]
 
     @property
     def bands(self) -> int:
@@ -169,8 +169,8 @@ class Solver:
 
     views: Sequence[ColorView]  # training views
     original: Tensor  # raw member rows, packed. [M,C]
-    # Bound of the curvature among each member's lowest bands: the sum over pixels of w·m, with m the member's
-    # own weight, times the products of the basis. [M,b,b]
+    # Upper bound of the curvature among each member's lowest bands: the sum over pixels of the member's
+    # weight times the total weight of all members, times the products of its basis values. [M,b,b]
     weights: Tensor
     maps: MapFit
     share: Tensor  # each member's share of the map (the mask), 0..1. [M]
@@ -184,11 +184,9 @@ class Solver:
         return member_bands(self.original)
 
     def fit_map(self, degree: int, targets: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-        """Return the map of a degree that fits these pictures best, and its change of the members.
+        """Return the map of a degree that fits these pictures best, and the change of the members by it.
 
-        [K,3], [M,B,3]
-
-        Degree 0 is the identity.
+        Degree 0 is the identity. -> [K,3], [M,B,3]
         """
         table = self.maps.solve(degree, targets) if degree else identity_map(1)
         return table, self.map_offsets(degree, table)
@@ -255,7 +253,7 @@ class Solver:
         """Solve for the residual of the members' lowest bands. Return it and the number of steps.
 
         The method is preconditioned conjugate gradients (Polak and Ribière). Every step evaluates the clamps
-        anew.
+        again.
 
         Args:
             mapped: change by the map. [M,B,3]
@@ -265,7 +263,7 @@ class Solver:
             judge: evaluator on held-out views; the best residual there is returned, and steps end when they
                 gain little there (see `MIN_GAIN_SHARE`) or the remaining error is invisible. None: take all
                 steps
-            floor: held-out error that counts as 0, see `Model.error`; `LEVEL` always does
+            floor: held-out error below which no gain is sought, see `Model.error`; at least `LEVEL`
             hold: see `Model.hold`
             tell: called after each step
         """
@@ -463,7 +461,7 @@ class _ModelSearch:
             alone: error of the best map alone
         """
         errors_without_mask = {one.bands: one.error for one in sorted(self.tried, key=lambda one: -one.error)}
-        # a mask costs one byte, DC three: expect a third of its gain
+        # a mask costs one byte and DC three, so a mask must bring a third of DC's gain (as a ratio)
         max_error = alone * (errors_without_mask.get(1, alone) / alone) ** (1 / 3)
         tried = [best]
         mask_holds: tuple[float, ...] = (_RESIDUAL_RIDGE,)
@@ -568,11 +566,9 @@ def solve_again(
 def _solve_whole(
     solver: Solver, best: _Candidate, targets: Sequence[Tensor], steps: int, spreads: bool
 ) -> tuple[Solver, Tensor]:
-    """Solve for a candidate with all pixels instead of the trial's part.
+    """Solve for a candidate with all pixels instead of the trial's part of them.
 
-    Return the solver with its mask and the residual.
-
-    [M,1,3]
+    Return the solver, with its mask if any, and the residual [M,1,3].
     """
     if best.mask_hold:
         solver = solver.guess_mask(best.change, spreads, best.mask_hold).improve_mask(targets)

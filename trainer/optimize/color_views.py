@@ -37,13 +37,13 @@ _MAP_RIDGE = 1e-6  # share of the diagonal of a map's normal equations, for regi
 # weight, relative to the pixels, of the prior that holds a map to the affine map at members' colors
 _MAP_PRIOR_WEIGHT = 1e-2
 _SHIFT_PRIOR_SHARE = 1e-2  # share of that weight; holds the affine map to a constant shift
-# share of the evidence; shares are scaled so that this much of it lies at or below 1
+# masks are scaled so that members with this share of the evidence have a share of at most 1
 _MASK_EVIDENCE_SHARE = 0.98
 _MAX_MASK_STEPS = 16  # maximum number of gradient steps
 _MIN_MASK_GAIN = 0.01  # minimum share of the error that a step must remove
 # step lengths to try, in units of the inverse curvature bound
 _MASK_STEP_LENGTHS = (4.0, 2.0, 1.0, 0.5, 0.25)
-_MASK_RIDGE = 0.01  # share of a typical curvature, for hardly visible members
+_MASK_RIDGE = 0.01  # share of the mean curvature; shortens the steps of hardly visible members
 
 OMITTED_WEIGHT = 0.5 / 255.0
 """Total weight per pixel that may be omitted. No color with this weight is visible in 8 bits."""
@@ -112,7 +112,7 @@ class ColorView:
         return float(((image - target).abs().pow(power) * self.share).sum())
 
     def halves(self) -> tuple[ColorView, ColorView]:
-        """Return two views with the two colors of a checkerboard of tiles."""
+        """Return two views that count the even and the odd tiles of a checkerboard."""
         side = max(1, max(self.size) // _TILES_PER_SIDE)
         rows = self.pixels // self.size[1] // side
         columns = self.pixels % self.size[1] // side
@@ -143,8 +143,8 @@ def _compare(shown: Array, others: Array, target: Array, counts: Array, passed: 
 def add_colors(basis: Array, offsets: Array, colors: Array) -> None:
     """Add Σ basis · offset to the colors. [M,B], [M,b,3], [M,3] float32
 
-    Torch's sums fragment the heap by 0.2 GB for 200 000 members: glibc before 2.38 does not reuse holes of
-    the exact size for aligned memory.
+    It replaces sums of torch, which fragment the heap by 0.2 GB for 200 000 members: glibc before 2.38 does
+    not reuse holes of the exact size for aligned memory.
     """
     for m in range(len(colors)):
         for c in range(3):
@@ -197,14 +197,14 @@ def color_views(crops: Sequence[CropScene], original: Tensor, every: int = 1) ->
 class MapFit:
     """Pixels of the views as monomials of the region's drawn colors.
 
-    The picture of a map is linear in them.
+    The picture of a map is linear in the map's coefficients.
     """
 
     design: Tensor  # weight of every monomial in each pixel. [P,20] float64
     original: Tensor  # pixels before the edit, unclamped. [P,3] float64
     pixels: Sequence[Tensor]  # indices into each view's box, one view after another. [p] int64
     normal: Tensor  # normal matrix of the pixels. [20,20] float64
-    # normal matrix of all members' colors, hidden ones included, scaled to its weight. [20,20] float64
+    # normal matrix of all members' colors, hidden ones included, with the prior's weight. [20,20] float64
     held: Tensor
 
     def picture(self, table: Tensor) -> Tensor:
@@ -316,7 +316,7 @@ def improve_mask(
 ) -> Tensor:
     """Return the members' shares of a map that fit the pictures better. [M] -> [M]
 
-    The method is projected gradient descent with a step size per member, from its own weight.
+    The method is projected gradient descent with a step size per member, from its own curvature.
 
     Args:
         views: training views

@@ -38,14 +38,16 @@ GROUP_STEPS = 120
 """Steps of the group stage per strength if parts move as wholes."""
 
 # The members' own learning rate is a share of this many part sizes. After the motion of the parts, a color
-# change remains. Steps are shorter if it is below both `_FULL_STEP_CHANGE` (mean over the pixels that still
-# change) and the share `_FULL_STEP_REMAINDER` of the whole change (docs/lab/experiments.md, Parts that move).
+# change remains. Steps are shorter if it is below `_FULL_STEP_CHANGE` (mean over the pixels that still
+# change) or below the share `_FULL_STEP_REMAINDER` of the whole change (docs/lab/experiments.md, Parts that
+# move).
 _EXTENT_IN_PART_SIZES = 7.0  # extent of the learning rates, in mean part sizes
 _FULL_STEP_CHANGE = 0.065  # remaining mean color change from which steps have full length
 _FULL_STEP_REMAINDER = 0.28  # remaining share of the change from which steps have full length
 
 _MAX_PARTS_ERROR = 0.1  # share of the distance that may remain for a motion by whole parts to be accepted
-# share of the parts' distance that control points may leave: they cost more and are less stable
+# Control points must leave at most this share of the distance that whole parts leave: they cost more and are
+# less stable.
 _MAX_WARP_ERROR = 0.9
 
 

@@ -2,8 +2,8 @@
 
 Cloned members would have to travel to the new object and smear on the way. Rows are therefore seeded where
 the pictures need them: at pixels sampled in proportion to their error, each at the nearest depth of its ray
-at which the other views have its color too. Seeded rows are trained with the members from the original on,
-and fade in at their final position: their opacity rises linearly with the slider.
+at which the other views show its color too. Seeded rows are trained together with the members from the start.
+They fade in at their final position: their opacity rises linearly with the slider.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _MIN_COLOR_ERROR = 2 / 255  # color difference below which a pixel counts as cor
 def seed_rows(
     setup: TrainingSetup, views: Sequence[View], targets: Sequence[Tensor], count: int, seed: int
 ) -> Gaussians:
-    """Return rows seeded where the scene differs most from the edit, as they are at strength 0.
+    """Return rows seeded where the scene differs most from the edit, with their opacity at strength 0.
 
     Args:
         setup: scene and region
@@ -171,7 +171,7 @@ def place_seeds(stage: TargetStage, count: int) -> TargetStage:
 
 
 def add_rows(trajectory: Trajectory, rows: Gaussians) -> Trajectory:
-    """Add rows, given as they are at strength 1, to a trajectory of the region's members."""
+    """Add rows, given with their opacity at strength 1, to a trajectory of the region's members."""
     if not len(rows):
         return trajectory
     below = (0, 0, 0, len(rows))

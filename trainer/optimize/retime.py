@@ -31,10 +31,10 @@ def resolve_slider(slider: Slider, strengths: Sequence[float]) -> Slider:
 
 
 def record(snapshots: Sequence[ParameterSnapshot], end: Tensor, strengths: Sequence[float]) -> Trajectory:
-    """Build a trajectory with slider values even in time.
+    """Build a trajectory with slider values proportional to the optimizer's steps.
 
     Args:
-        snapshots: in order, in half precision; the original is added before them
+        snapshots: in order, in half precision; a recording of the original is added before them
         end: the last offsets in full precision. [M,C] float32
         strengths: strengths requested from the editor, one per stage
     """
@@ -105,9 +105,9 @@ def retime(
 
     Change is measured by the chord between pictures. Arc length summed over recordings would count jitter.
     Each pass samples the trajectory at even slider values, measures the chords between the samples and
-    stretches the slider accordingly. Chords are as long as a user's steps. Shorter ones count jitter that no
-    step shows (a recolored robot's 20 steps: smallest over largest 0.71 instead of 0.66; a bear's scarf 0.93
-    instead of 0.76, its hands 0.85).
+    stretches the slider accordingly. A chord spans one of 20 even slider steps, as a user makes them. Shorter
+    chords count jitter that is invisible in such steps (a recolored robot's 20 steps: smallest over largest
+    change 0.71 instead of 0.66; a bear's scarf 0.93 instead of 0.76, its hands 0.85).
 
     Args:
         trajectory: recordings with any slider values
@@ -147,9 +147,9 @@ def straight_recordings(
 ) -> list[int]:
     """Return the recordings without jitter: those that lengthen the path by at most `detour`.
 
-    The worst recording is removed first, then its neighbors are measured again. The ends of the stages always
-    stay. A gentle curve keeps its recordings. On a recolored robot this gains 0.7 dB on average against the
-    editor's own pictures between the stages, with a third of the recordings.
+    The recording with the largest detour is removed first, then its neighbors are measured again. The ends of
+    the stages always stay. A gentle curve keeps its recordings. On a recolored robot this gains 0.7 dB on
+    average against the editor's own pictures between the stages, with a third of the recordings.
 
     Args:
         trajectory: as recorded

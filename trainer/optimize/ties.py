@@ -26,7 +26,7 @@ class Ties:
     """Ties between neighbors on one surface, whose residuals should be similar."""
 
     graph: csr_matrix  # Laplacian. [M,M]
-    clear: Tensor  # members clearly visible in some view; others follow only their surface. [M] bool
+    clear: Tensor  # members that are not almost hidden in every view (`HIDDEN`). [M] bool
 
     def of(self, rows: Tensor) -> csr_matrix:
         """Return the Laplacian of the ties among some members. [M] bool -> [M,M] float32"""
@@ -41,9 +41,9 @@ class Ties:
 
         Args:
             residual: [M,b,3]
-            weights: weights of the members, in sums of a member's ties; 0: the residual is meaningless.
-                [M]
-            ridge: pull to 0 in the same unit
+            weights: weights of the members' residuals, where 1 is about the sum of a member's ties; 0: the
+                residual is ignored. [M]
+            ridge: weight that pulls every residual to 0, in the same unit
         """
         weight = weights.double().numpy()[:, None]
         system = csr_matrix(self.graph + diags(weight[:, 0] + ridge))
@@ -57,16 +57,16 @@ class Ties:
 
 
 def surface_ties(scene: Gaussians, members: Tensor, cameras: Sequence[Camera]) -> Ties:
-    """Return the ties of a region's members, with the members that some camera sees clearly."""
+    """Return the ties of a region's members; the cameras tell the covered and the almost hidden ones."""
     masks = [torch.ones(camera.height, camera.width) for camera in cameras]
     clear = gather(scene, cameras, masks).clearness[members] >= HIDDEN
     return Ties(surface_graph(scene[members], covered_rows(scene, cameras)[members]), clear)
 
 
 def surface_graph(scene: Gaussians, covered: Tensor) -> csr_matrix:
-    """Return the Laplacian of the ties between neighbors on one surface, with a mean sum of about 1. [N,N]
+    """Return the Laplacian of the ties between neighbors on one surface. [N,N]
 
-    `covered`: see `covered_rows`; ties do not pass through their covering Gaussians. [N] bool
+    The ties of a Gaussian add up to about 1. `covered`: see `SurfaceVote`. [N] bool
     """
     count = len(scene)
     if count < 3:

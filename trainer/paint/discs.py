@@ -1,8 +1,8 @@
 """Conversion of painted pixels to thin discs on the surface, and projection of paint to other cameras.
 
-Splats are drawn in the order of their centers. A large Gaussian whose center is nearer than a disc covers it,
-although its own surface lies behind. Such a Gaussian is moved back along its ray and grows with the distance,
-which preserves its outline in the painted view (docs/method.md 3).
+Splats are drawn in the order of their centers. A large Gaussian with a nearer center than a disc covers the
+disc, even where the surface of the Gaussian lies behind it. Such a Gaussian is moved back along its ray and
+grows with the distance, which preserves its outline in the painted view (docs/method.md 3).
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ The border is needed because Gaussians drawn there were moved.
 _CELL_SIDES_PX = (16, 8, 4, 2, 1)  # pixels; sides of the rectangles that share a disc
 _PIXEL_SPREAD = 0.28  # standard deviation of a single pixel's disc, in pixels
 _MERGED_SPREAD = 0.6  # standard deviation of a merged rectangle's disc, as a share of its sides
-# pixels²; share of the engine's blur of 0.3 that counts as a disc's error; solved colors undo the rest
+# pixels²; part of the engine's blur (0.3) that counts as an error of a disc; the solved colors undo the rest
 _BLUR_PX2 = 0.1
 _DEPTH_OFFSET_PX = 0.5  # pixels; discs lie deeper by this, as nearer neighbors cover them
 _RELIEF_PX = 1.25  # pixels per unit of color; discs lie deeper than darker neighbors, see `_rise_beside`
@@ -55,12 +55,12 @@ _THICKNESS_PX = 0.1  # pixels; standard deviation across the disc
 _MIN_COSINE = 0.3
 _MEDIAN_PX = 9  # pixels; window of the median filter of depths
 _SMOOTHING_PX = 3.0  # pixels; standard deviation of the Gaussian filter of depths
-# pixels of median slope; a smoothed depth that differs more from the median crosses an edge
+# multiple of the median depth change per pixel; smoothing that alters a depth by more crossed an edge
 _SAME_SURFACE_PX = 4.0
-_MIN_LIGHT = 0.005  # share of a pixel; a Gaussian that takes less light from a disc is ignored
-# standard deviations of the light's depths within which a Gaussian belongs to the surface
+_MIN_LIGHT = 0.005  # blending weight in a pixel; Gaussians with less need not move
+# Gaussians within this many standard deviations of the blended depth belong to the surface
 _REACH_DEVIATIONS = 4.0
-# share of the reach; a moved row nearer than this counts as behind, apart from rounding
+# share of the reach; a Gaussian that needs to move by less is already behind, apart from rounding
 _SETTLED_SHARE = 1e-3
 _MAX_CLEARING_ROUNDS = 12  # maximum number of rounds that move occluding Gaussians behind the discs
 _MARGIN_PX = 16  # pixels; margin around the paint in which the surface is evaluated
@@ -71,7 +71,7 @@ _NEWTON_STEPS = 8  # Newton steps per pixel of the projection
 
 @dataclass(frozen=True)
 class PaintedView:
-    """Target of one painted view."""
+    """Painted view that surface discs have to reproduce."""
 
     camera: Camera
     picture: Tensor  # painted view over the run's background. [H,W,3] 0..1
@@ -85,10 +85,10 @@ class PaintedView:
 
 @dataclass(frozen=True)
 class Discs:
-    """Gaussians to add, and the rows that are moved behind them."""
+    """Surface discs to add, and the rows of the scene that are moved behind them."""
 
     added: Gaussians  # state at strength 1
-    moved: Tensor  # rows of the scene that lie in front of the discs, ascending. [M] int64
+    moved: Tensor  # rows of the scene that had to move, ascending. [M] int64
     scene: Gaussians  # scene with these rows moved
 
 
@@ -101,8 +101,8 @@ def place_discs(
         scene: the original
         paint: see `PaintedView`
         flat: maximum root mean square color error of one disc over its pixels, 0..1
-        gap: distance in pixels between a disc and the Gaussians moved behind it. Those are wide, so they
-            are visible from the sides too
+        gap: distance in pixels between a disc and the Gaussians moved behind it. The moved Gaussians are wide
+            and therefore also visible from the side
         cleared: the scene after the moves for other paint
     """
     camera = paint.camera
@@ -210,7 +210,10 @@ def _shapes() -> Iterator[tuple[int, int]]:
 
 
 def _box_means(values: Array, height: int, width: int) -> Array:
-    """Return the means of the rectangles that begin at each pixel; 0 beyond the border. [H,W,C] -> [H,W,C]"""
+    """Return the means of the rectangles with their top left at each pixel; values beyond the border are 0.
+
+    [H,W,C] -> [H,W,C]
+    """
     rows, columns = values.shape[:2]
     sums = np.pad(values, ((1, height), (1, width), (0, 0))).cumsum(axis=0).cumsum(axis=1)
     low = sums[:rows]
@@ -221,7 +224,9 @@ def _box_means(values: Array, height: int, width: int) -> Array:
 
 
 def _disc_error(image: Array, height: int, width: int) -> Array:
-    """Return the mean squared error of discs with the mean color of the rectangles that begin at each pixel.
+    """Return the mean squared error of discs for the rectangles with their top left at each pixel.
+
+    A disc has the mean color of its rectangle.
 
     [H,W,3] -> [H,W]
     """
@@ -292,7 +297,7 @@ def _discs(camera: Camera, cells: Array, surface: Array, picture: Tensor) -> tup
 
 
 def _rise_beside(cells: Array, picture: Tensor) -> Array:
-    """Return the brightness of cells above the darkest adjacent pixel, the maximum over their pixels.
+    """Return how much brighter each cell is than the darkest adjacent pixel: the maximum over its pixels.
 
     [B] 0..1
 
@@ -324,9 +329,9 @@ def _rows_before(
 ) -> tuple[Tensor, Tensor]:
     """Return surface rows with centers in front of the depths `behind` [H,W], and their depth factors.
 
-    Gaussians more than `reach` in front, world units, occlude the paint as they occlude the surface, and
-    stay. So do Gaussians with most of their weight in another of the `pieces` [H,W] of the surface, although
-    they extend across an edge.
+    Gaussians more than `reach` (world units) in front stay, as they occlude the paint like the surface.
+    Gaussians with most of their weight in another one of the surface's `pieces` [H,W] stay too, even if they
+    extend across the edge between the pieces.
 
     Returns:
         indices [M] int64; factors by which their depths grow [M]
@@ -368,7 +373,7 @@ def _main_pieces(
 
 
 def _thickness(scene: Gaussians, camera: Camera, mask: NDArray[np.bool_]) -> float:
-    """Return the typical standard deviation of the depths of the light, world units, at least one pixel."""
+    """Return the median standard deviation of blended depths in the mask, world units, at least one pixel."""
     axis = camera.viewmat[2].double()
     depths = scene.means.double() @ axis[:3] + axis[3]
     z = (depths - depths.median()).float()
@@ -392,7 +397,7 @@ def _move_back(scene: Gaussians, camera: Camera, rows: Tensor, factors: Tensor) 
 
 
 def faint(added: Gaussians) -> Gaussians:
-    """Return added rows as they are at strength 0."""
+    """Return added rows with their opacity at strength 0."""
     return replace(added, logit_opacities=torch.full((len(added),), ADDED_LOGIT))
 
 

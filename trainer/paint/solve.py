@@ -25,8 +25,9 @@ from .discs import PaintedView
 
 _CG_STEPS = 40  # conjugate gradient steps per round
 _CLAMP_ROUNDS = 3  # rounds; between them, colors below black are set to black
-_SCENE_RIDGE = 0.05  # in units of a pixel; ridge that holds a row of the scene to its own color
-_DISC_RIDGE = 0.02  # in units of a pixel; ridge that holds a disc to the painted color
+# Ridge of the least squares, in pixels: a weight of 1 counts as much as one fully covered pixel.
+_SCENE_RIDGE = 0.05  # holds a row of the scene to its own color
+_DISC_RIDGE = 0.02  # holds a disc to the painted color
 _MIN_MARGIN_PX = 32  # pixels; minimum margin around the paint in which colors are solved for
 
 
@@ -84,9 +85,9 @@ def solve_colors(
 def _least_squares(
     maps: Sequence[ColorMap], targets: Sequence[Tensor], lowest: Tensor, held: Tensor
 ) -> Tensor:
-    """Solve for color changes, at least `lowest`, by conjugate gradients.
+    """Solve for color changes, at least `lowest`, by conjugate gradients; `held` is the ridge.
 
-    [h,w,3] each, [M,3], [M,1] -> [M,3]
+    targets [h,w,3] each, lowest [M,3], held [M,1] -> [M,3]
     """
 
     def gradient(images: Sequence[Tensor]) -> Tensor:

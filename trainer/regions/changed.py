@@ -42,21 +42,25 @@ LIFTED_AT = 512
 """Longer side in pixels at which masks are lifted; a smaller one would lose small Gaussians."""
 
 _SHIFT_TOLERANCE_PX = 1  # a changed pixel must differ from every rendered pixel within this distance
-_CHANGED_COLOR = 0.05  # smallest color change if the saving is unknown, and beside larger changes
-_BLOCK_PX = 17  # a 16-pixel JPEG block with subsampled chroma, around its center
+# color difference that counts as a change in a shifted or noisy picture, in a small piece, and near larger
+# changes
+_CHANGED_COLOR = 0.05
+_BLOCK_PX = 17  # pixels; contains a JPEG block with subsampled chroma (16 pixels) around its center
 _SOFT_EDGE_PX = 8  # width of a soft edge, at the lifting size
 _MIN_WIDTH_PX = 2  # narrower changes are noise
 _MAX_GAP_PX = 5  # wider gaps stay open
 _MAX_HOLE_SHARE = 0.002  # share of the picture; smaller holes in the change are closed
 _MIN_CHANGED_SHARE = 0.5  # share of a member's visible weight, in changed pixels
 _COVERED_CLEARNESS = 0.5  # below it, more than half of the visible color belongs to occluders
-_BOUNDARY_PX = 3.0  # maximum excess width of a mask; half the depth of thinner pieces
+_BOUNDARY_PX = 3.0  # pixels; width of a mask's boundary, at most half of its depth in thin pieces
 _MIN_INNER_SHARE = 0.1  # share of a piece's visible weight inside that boundary; a piece with less is a stray
-_BOUNDARY_SHARE = 0.3  # share of a member's visible weight on the boundary, from which its surface decides
-_NEGLIGIBLE_SHARE = 1e-3  # share of the largest piece's inner weight
-_OUTLIER_COLOR_DISTANCE = 0.06  # color distance from nearly all visible members
-_VOTED_SCORE_MARGIN = 0.001  # distance above the minimum score
-_OUTLIER_SHARE = 0.01  # share of the visible members, which may lie on the boundary
+_BOUNDARY_SHARE = 0.3  # share of a member's visible weight on the boundary; with more, its surface decides
+_NEGLIGIBLE_SHARE = 1e-3  # share of the largest piece's inner weight; a piece with less is a stray
+# A hidden member stays if its score exceeds the minimum by the margin, or if at least this share of the
+# visible members lies within the color distance. Fewer similar ones may be part of the boundary.
+_OUTLIER_COLOR_DISTANCE = 0.06
+_VOTED_SCORE_MARGIN = 0.001
+_OUTLIER_SHARE = 0.01
 
 
 def changed_region(
@@ -140,14 +144,14 @@ def find_change(
     exceeds = difference > bound
     if not exceeds.any():
         return torch.zeros(exceeds.shape[:2], dtype=torch.bool)
-    # saved paint causes ringing, so only pixels with half of the largest difference nearby count as paint
+    # saving makes paint ring, so a pixel counts as paint only from half of the largest difference nearby
     painted = (exceeds & (difference >= 0.5 * _local_maximum(difference))).any(axis=2)[..., None]
     painted_original = np.where(painted, picture_values, exact)
     bound = np.maximum(
         bound,
         _local_maximum(np.abs(_smooth(save(torch.from_numpy(painted_original)).numpy() - painted_original))),
     )
-    # slight differences beside strong paint are its soft edge
+    # slight differences beside strong paint belong to its soft edge and do not count
     scale = max(1.0, max(exceeds.shape[:2]) / LIFTED_AT)
     edge_width = 1 + 2 * round(_SOFT_EDGE_PX * scale)
     opening = np.ones((round(_MIN_WIDTH_PX * scale),) * 2)
@@ -208,8 +212,10 @@ def _local_maximum(apart: np.ndarray, pixels: int = _BLOCK_PX) -> np.ndarray:
 
 
 def _shrink_mask(changed: Tensor, camera: Camera) -> Tensor:
-    """Return a camera's pixels with any change. Their boundary is too wide, see `_BOUNDARY_PX`. [H,W] ->
-    [h,w] bool"""
+    """Return the pixels of a camera that contain any change; a mask slightly too wide (see `_BOUNDARY_PX`).
+
+    [H,W] -> [h,w] bool
+    """
     share = interpolate(changed[None, None].float(), size=(camera.height, camera.width), mode="area")[0, 0]
     return share > 0.0
 
@@ -284,8 +290,10 @@ def _vote_on_boundary(
 
 
 def _hidden(evidence: Evidence) -> Tensor:
-    """Return the Gaussians that are almost hidden in the mean of the views, not only in the best one. [N]
-    bool"""
+    """Return the Gaussians that are almost hidden on average over the views. [N] bool
+
+    `Evidence.clearness` is that of the best view instead.
+    """
     return evidence.weight < HIDDEN * bare_weight(evidence.opacities) * evidence.pixels.clamp_min(1.0)
 
 

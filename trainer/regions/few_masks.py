@@ -1,4 +1,4 @@
-"""Cleanup of a region from a small number of rough masks: strays and loose pieces go, holes are filled.
+"""Cleanup of a region from a small number of rough masks: strays are removed and holes are filled.
 
 Many masks outvote each other's mistakes. With a small number, background that a single view shows inside its
 mask would be selected, such as a tree behind a bear.
@@ -17,10 +17,10 @@ from progdf.scene.neighbors import join_pairs, nearest_rows
 from progdf.terminal import format_count
 
 FEW = 8
-"""Maximum number of masks for cleaning; with exact masks from 12 views, it would cost a thin scarf's edge."""
+"""Maximum number of masks with cleanup. With exact masks of 12 views it would remove a thin scarf's edge."""
 
 _LINK_NEIGHBORS = 8
-"""Nearest neighbors of a member that it may be linked to."""
+"""Number of nearest neighbors that a member may be linked to."""
 _LINK_REACH = 2.5
 """Maximum distance of linked members, in median distances to the eighth neighbor."""
 _LINK_SIGMAS = 2.0
@@ -30,7 +30,7 @@ _MIN_PIECE = 0.1
 """Minimum size of a connected surface, as a share of the largest; smaller ones are strays."""
 
 _HOLE_NEIGHBORS = 12
-"""Nearest neighbors that decide on a hole."""
+"""Number of nearest neighbors that decide on a hole."""
 _HOLE_SHARE = 0.75
 """Minimum share of members among the neighbors of a hole."""
 _HOLE_ROUNDS = 3
@@ -44,7 +44,7 @@ def drop_strays(
     views_inside: Tensor,
     say: Callable[[str], None] | None = None,
 ) -> Tensor:
-    """Return the members of large connected surfaces that lie inside two masks, if two views see them.
+    """Return the members on large connected surfaces. If two views see a member, two masks must contain it.
 
     Args:
         scene: N Gaussians
@@ -60,7 +60,7 @@ def drop_strays(
     _report(
         say,
         int(member.sum()) - int(confirmed.sum()),
-        "inside one mask only, where two views see it, left to what surrounds them",
+        "inside only one mask although two views see them: their surroundings decide",
     )
     if not bool(confirmed.any()):
         return confirmed
@@ -75,14 +75,14 @@ def drop_strays(
     result[rows[large]] = True
     dropped = int((~large).sum())
     pieces = int((weight >= _MIN_PIECE * weight.max()).sum())
-    _report(say, dropped, f"apart from the {format_count(pieces, 'largest connected surface')}, left out")
+    _report(say, dropped, f"not on the {format_count(pieces, 'largest connected surface')}: removed")
     return result
 
 
 def find_holes(
     scene: Gaussians, member: Tensor, views_outside: Tensor, say: Callable[[str], None] | None = None
 ) -> Tensor:
-    """Return the Gaussians to add: surrounded by members, and not visible outside the masks in two views.
+    """Return the Gaussians to add: surrounded by members, and outside the mask in at most one view.
 
     Args:
         scene: N Gaussians
@@ -108,12 +108,12 @@ def find_holes(
     for _ in range(_HOLE_ROUNDS):
         filled[rows[filled[near].double().mean(dim=1) >= _HOLE_SHARE]] = True
     holes = (filled & ~member).nonzero()[:, 0]
-    _report(say, len(holes), "in holes of it, added")
+    _report(say, len(holes), "in holes of the region: added")
     return holes
 
 
 def connected_pieces(gaussians: Gaussians) -> np.ndarray:
-    """Return the number of the connected piece of each of P Gaussians. [P] int"""
+    """Return the index of the connected piece that each of P Gaussians belongs to. [P] int"""
     count = len(gaussians)
     if count < 2:
         return np.zeros(count, np.int64)

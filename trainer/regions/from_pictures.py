@@ -84,7 +84,8 @@ def _mask(path: Path, camera: Camera, bent: bool) -> Tensor:
 CHANGED = "changed"
 """Name of the region found in changed pictures."""
 
-_STROKE_COLOR = 0.25  # minimum color difference of a stroke from the render, and of its hue from gray
+# minimum color difference between a stroke and the render, and between its main channel and the other two
+_STROKE_COLOR = 0.25
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,8 @@ class RegionRequest:
     """Request for a region from pictures."""
 
     options: RegionOptions
-    views: TrainingViewOptions  # limits the segmented images; without cameras, as many closer views are added
+    # cameras and number of the segmented views; without cameras, the same number of closer views is added
+    views: TrainingViewOptions
     cache: Callable[[], Path]  # creates and returns the folder for segmentation masks
     quiet: bool = False  # no progress on the screen
     say: Callable[[str], None] | None = None  # receives log lines about the masks

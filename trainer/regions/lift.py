@@ -110,14 +110,14 @@ def lift_masks(
         name: the region's name
         rule: see `score`
         threshold: minimum score of a member, 0 to 1; None is the rule's own, see `THRESHOLDS`
-        say: receives log lines on the cleaning of a small number of masks, see `few_masks`
+        say: receives log lines on the cleanup of a region from a small number of masks, see `few_masks`
 
     Returns:
         The members, and the score of every Gaussian. Members are those with `score` ≥ threshold. The score is
         the rule's for Gaussians that the views decide. For the others it is the share of the surrounding
         surface that belongs to members (see `surface.SurfaceVote`), scaled so that half of it is the
-        threshold. If the views decide on no member, there is none. Under the rule `paper` the score alone
-        decides, without surface and cleaning.
+        threshold. If the views decide on no member, the region is empty. Under the rule `paper` the score
+        alone decides, without surface and cleanup.
 
     The accuracy of rules and thresholds against exact labels is in docs/lab/experiments.md, Regions from
     masks.
@@ -141,7 +141,7 @@ def lift_evidence(
 ) -> Region:
     """Return the region of gathered evidence, see `lift_masks`.
 
-    `few`: clean the region, for a small number of masks
+    `few`: clean up the region, as there is a small number of masks
     """
     scores = score(evidence, rule)
     if rule == "paper":
@@ -149,7 +149,7 @@ def lift_evidence(
     rows = undecided_rows(evidence, least).nonzero()[:, 0]
     member = (scores >= least).index_fill(0, rows, False)
     if few:
-        # surroundings decide Gaussians that a rough mask edge cuts, and those inside only one of two masks
+        # surroundings decide on Gaussians that a rough mask's edge cuts, and on those inside only one mask
         mixed = (scores > min(_MIXED_SHARES[0], least)) & (scores < least)
         single = member & (evidence.views >= 2) & (evidence.views_inside < 2)
         member = drop_strays(scene, member, evidence.views, evidence.views_inside, say)

@@ -20,13 +20,13 @@ from progdf.threads import threads
 
 _NEIGHBORS = 96  # nearest neighbors that vote
 _ROUNDS = 100  # propagation rounds of the vote
-_MIN_LIKELIHOOD = 1e-4  # all weaker neighbors together are a thousandth of a vote
-_BATCH_ROWS = 1 << 16  # limits memory
+_MIN_LIKELIHOOD = 1e-4  # weaker neighbors do not vote; all of them together are less than 0.01 of a vote
+_BATCH_ROWS = 1 << 16  # rows processed at once; limits memory
 
 # Standard deviations within one surface. The bear's parts lift back with IoU 0.977 to 0.999. The worst part
 # has 0.905 without the normals, 0.871 without the sizes, and 0.957 without the planes. Colors and distance
-# gain nothing there, but in other scenes parts may not differ in size. The first three may be 1.5 times as
-# large.
+# gain nothing there, but in other scenes parts may not differ in size. The first three deviations can be 1.5
+# times as large without harm.
 _UNIT_NEIGHBOR = 8  # the distance to this neighbor is the unit of the next two
 _SIGMA_DISTANCE = 2.0
 _SIGMA_OFF_PLANE = 0.5
@@ -49,7 +49,8 @@ class SurfaceVote:
 
     Args:
         scene: N Gaussians
-        covered: see `covered_rows`; these have no neighbors across their occluders
+        covered: see `covered_rows`. Covered and uncovered Gaussians are neighbors only if a continuous
+            surface may connect them. [N] bool
     """
 
     def __init__(self, scene: Gaussians, covered: Tensor | None = None) -> None:
@@ -160,7 +161,10 @@ def _is_continuous(scene: Gaussians, rows: Tensor, near: Tensor, distances: Tens
 
 
 def _off_plane(scene: Gaussians, rows: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
-    """Return distances from each other's planes in world units, and cosines between these. [Q,k] each"""
+    """Return, per pair, the distance of either center from the other's plane, and the cosine of the planes.
+
+    The larger distance counts, in world units. [Q,k] each
+    """
     normals = normals_of(scene)
     across = scene.means[near] - scene.means[rows, None]
     off_plane = torch.maximum(

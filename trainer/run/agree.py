@@ -6,18 +6,18 @@ and no scene can show contradicting views. Two strategies make the views agree:
 - A model that takes reference images paints one view first (the anchor), then one from every other side, then
   all others. Each gets two references: the render of the scene with the members' colors fitted to the anchors
   so far, and the first anchor itself.
-- A model that takes a single image sweeps. Each next view starts from the render of the scene as fitted to
-  the views so far.
+- A model that takes a single image paints the views in a sweep: each starts from a render of the scene with
+  the members' colors fitted to the views so far.
 
 Consensus rounds follow. Colors are fitted to all views (`robust_colors`), and each view is painted again
 starting from their render, conditioned on its own original. The start determines the content; the remaining
 denoising is free.
 
-A model shifts and scales its answers slightly. `register` reverts that. An answer that moved farther is
-painted again with another seed, then left out.
+A model shifts and scales its outputs slightly. `register` reverts that. An output that moved farther is
+painted again with another seed, and left out if that moved too far as well.
 
-RUN/views/painted/anchor/VIEW.png   the first one is the anchor; if it is painted over by hand, all
-                                    views follow it when the run is started again
+RUN/views/painted/anchor/VIEW.png   the first one is the anchor; if the user paints over it, all views follow
+                                    it when the run is started again
 RUN/views/painted/reference|sweep|round_1/VIEW.png   the other views; the consensus rounds
 
 Measured gains: docs/lab/experiments.md, Views that agree.
@@ -161,7 +161,7 @@ class Fit:
     """Changes of the members' colors that agree best with all views."""
 
     setup: TrainingSetup
-    colors: Tensor  # [M,3]
+    colors: Tensor  # change of each member's color, sRGB. [M,3]
 
     def render(self, camera: Camera) -> Tensor:
         """Return a render of the scene with these changes. [H,W,3]"""
@@ -206,9 +206,9 @@ class AgreedEditor:
 def painting_order(setup: TrainingSetup, side: float = SIDE) -> tuple[list[View], int]:
     """Return all views in painting order, and the number of anchors, which come first.
 
-    The first anchor shows most of the region and most detail, as fronts do. The next ones are the farthest
-    from all before, until every training view is within `side` of an anchor. The other views follow, nearest
-    to an anchor first.
+    The first anchor shows most of the region and most detail, as the front of a figure does. Each next anchor
+    is the training view farthest from all anchors so far, until every training view is within `side` of one,
+    in radians. The other views follow, nearest to an anchor first.
     """
     views = setup.views
     train = len(setup.train)
@@ -239,7 +239,7 @@ def _visible_detail(setup: TrainingSetup, camera: Camera) -> float:
 
 
 class _PaintingLoop:
-    """Pictures of all views so far.
+    """Loop that paints the views and holds their pictures so far.
 
     Args:
         easel: paints and caches the views
@@ -353,7 +353,8 @@ def agree_views(
     follows = easel.painter.references > 0
     views, anchors = painting_order(setup, SIDE if follows else math.pi)
     rounds = 1 if follows else 2
-    order = f"{anchors} first, {len(views) - anchors} after these" if follows else "each after those before"
+    followers = f"{len(views) - anchors} views that follow"
+    order = f"{anchors} anchors, {followers}" if follows else "one view after another"
     repeats = "once" if rounds == 1 else "twice"
     calls = len(views) * (1 + rounds)
     log.say(f"{calls} pictures to paint: {order}, then all {repeats} more to make them agree")
@@ -368,7 +369,7 @@ def agree_views(
             loop.sweep(views)
         if not any(view.camera.name in loop.pictures for view in setup.train):
             raise ProgdfError(
-                f"the model moves all that it paints by more than {MAX_MOVED:.0%}; use another --model"
+                f"the model shifts or scales every picture by more than {MAX_MOVED:.0%}; use another --model"
             )
         before = loop.fine_energy()
         for number in range(rounds):
@@ -409,7 +410,7 @@ def make_run_editor(
         (camera,) = with_near_plane([fit_size(found, painter.request.size)], setup.scene)
         view = make_view(setup.scene, setup.region, camera, setup.background)
         if not bool((view.mask > 0.0).any()):
-            raise ProgdfError(f"{settings.anchor} shows nothing of the region; take it from elsewhere")
+            raise ProgdfError(f"{settings.anchor} does not show the region; take it from another position")
         approved = view, read_picture(settings.anchor, size=(camera.width, camera.height))
     agreed = agree_views(easel, setup, editor, log, approved)
     return agreed, agreed.figures

@@ -84,7 +84,7 @@ def select_region(
     """Return the region that resolved options name, and lines for the log.
 
     Raises:
-        ProgdfError: see `parse_region`; or the cameras do not show the scene.
+        ProgdfError: see `parse_region`; or the cameras are invalid or probably in another frame.
     """
 
     def select() -> tuple[Region, list[str]]:

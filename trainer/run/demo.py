@@ -44,7 +44,11 @@ from trainer.options import (
 from trainer.store.state import StateFolder
 
 Paint = Callable[[Tensor, Camera, Callable[[tuple[str, ...]], Tensor]], Tensor]
+"""Function that paints on a picture [H,W,3]: picture, camera, coverage of named parts [H,W] -> picture."""
+
 STRENGTHS = (0.0, 0.25, 0.5, 0.75, 1.0)
+"""Strengths at which sliders.png and hero.png show the edits."""
+
 MAX_GAUSSIANS = 5_000_000
 """Maximum of --size, the size of large trained scenes."""
 _HERO_HEIGHT = 400  # pixels
@@ -58,8 +62,7 @@ class DemoEdit:
     name: str
     parts: tuple[str, ...] = ()
     editor: str = ""
-    # makes the changed picture that the edit is trained on, whose region is detected:
-    # picture, its camera, coverage of named parts per pixel -> picture
+    # makes the changed picture that the edit is trained on; the region is then found from the picture
     paint: Paint | None = None
 
 
@@ -131,7 +134,7 @@ class DemoOptions:
     """Make a scene, train edits of it, write pictures, and open the window if there is a display."""
 
     scene: Literal["bear", "room"] = "bear"
-    """Bear in the grass to look at from all sides, or room to stand in."""
+    """Scene to make: a bear in the grass, shown from all sides, or a room, shown from inside."""
     size: Annotated[int | None, absent_option("COUNT", "24000 for the bear, 40000 for the room")] = None
     """Number of Gaussians."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("demo")
@@ -208,7 +211,7 @@ def write_scene(folder: Path, scene: DemoScene) -> None:
 
 
 def write_pictures(folder: Path, scene: DemoScene, gdfs: Mapping[str, Gdf], view: int) -> list[Path]:
-    """Render the effect of the sliders: each slider alone, one in large, and the edit made from one picture.
+    """Render the effect of the sliders: each slider alone, one enlarged, and the edit made from one picture.
 
     Args:
         folder: contains scene.ply and receives the pictures
@@ -274,7 +277,7 @@ def _train_edits(options: DemoOptions, show: DemoPlan, scene: DemoScene) -> dict
             train(replace(runs[edit.name], resume=resumes))
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
-                f"what is done is kept in {options.out}; give the same command again to go on"
+                f"the finished part is in {options.out}; repeat the command to continue"
             ) from None
     return {edit.name: _gdf_path(options.out, edit) for edit in show.edits}
 

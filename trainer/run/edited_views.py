@@ -218,9 +218,9 @@ def edit_views(
         views: all views
         strengths: requested strengths
         folder: folder of the pictures
-        is_confined: revert changes outside the region, to which members would be pulled otherwise
+        is_confined: revert changes outside the region; otherwise members would move to reproduce them
         advance: reports progress
-        course: returns the editor's path for a view, see `edit_course`
+        course: returns a view's function from strength to edited view, see `edit_course`
     """
 
     def edit(request: Sequence[tuple[float, int]]) -> list[Tensor]:

@@ -59,9 +59,7 @@ _KEYS_OF_REPORT_ONLY = (
 )
 DEFAULTS = to_json(BLANK)
 
-_LPIPS_AREA = (
-    "each view's box around all that shows the region or that the editor changes, at least 64 pixels"
-)
+_LPIPS_AREA = "each view's box around the region and all edited pixels, at least 64 pixels per side"
 
 
 @dataclass(frozen=True)
@@ -305,7 +303,7 @@ def _write_run(
     paint: PaintReproduction | None,
     log: RunLog,
 ) -> RunResult:
-    """Write all files and log their content."""
+    """Write the files of the run and log its main figures."""
     # the .gdf holds the options separately, stays small, and is identical for identical training
     gdf = replace(gdf, report={k: v for k, v in report.items() if k not in _KEYS_OF_REPORT_ONLY})
     result = replace(write_result(folder, gdf, report, picture), trajectory=trajectory)
@@ -369,7 +367,10 @@ def end_rows(setup: TrainingSetup, trajectory: Trajectory) -> Tensor:
 
 
 def exactness(scene: Gaussians, gdf: Gdf, end: Tensor) -> tuple[float, float]:
-    """Return the largest raw differences: at s = 1 from the recorded end, and outside the region."""
+    """Return the largest difference of the edit at s = 1 from the recorded end, and outside the region.
+
+    Both are differences of raw parameters. The second is the change of Gaussians that must not change.
+    """
     outside = ~gdf.region.mask
     finished = edited_scene(scene, gdf)
     members = torch.cat([gdf.region.members, torch.arange(len(scene), len(finished))])

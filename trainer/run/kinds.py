@@ -1,4 +1,4 @@
-"""Trial runs that choose what to train for pictures edited elsewhere.
+"""Trial runs that choose which attributes to train for pictures that another program edited.
 
 A picture does not tell whether its edit recolors, paints, bends or moves. The wrong choice tears parts that
 should bend, or freezes parts that should be painted. Therefore all kinds are tried for a few steps, on views
@@ -42,11 +42,12 @@ _COLOR_ALLOWANCE_DB = 0.2  # colors alone may be worse by this than all attribut
 _MIN_GEOMETRY_GAIN = 0.8
 """Minimum gain of moving, as a share of the gain of painting in dB, to choose moving.
 
-A moved part that is painted instead looks torn at a similar PSNR. Moving gains 0.2 to 0.4 of it on painted
-edits, and 0.85 to 1.2 on a pulled mouth.
+A moved part that is painted instead looks torn at a similar PSNR. Moving has 0.2 to 0.4 of the gain of
+painting on painted edits, and 0.85 to 1.2 of it on a pulled mouth.
 """
 _MIN_GROWTH_GAIN = 0.1  # share of the error that growth must remove
-_REPAINTED_SHARE = 0.3  # share of changed pixels outside the region if a tool repainted the whole picture
+# share of changed pixels outside the region above which the whole picture counts as repainted
+_REPAINTED_SHARE = 0.3
 
 
 @dataclass(frozen=True)
@@ -120,7 +121,7 @@ class Trial:
         tried = ", ".join(f"{approach} {psnr:.1f}" for approach, psnr in self.psnrs.items())
         note = "" if self.chosen.grow else f" ({self.chosen.said} skips the trial)"
         if not self.chosen.grow and any(candidate.grow for candidate in self.psnrs):
-            note = ": growth would not take a tenth of the error away, or takes the place of what moves"
+            note = ": growth removes less than 10 % of the error, or replaces parts that move"
         return (
             f"trial run of {self.steps} steps with L1 on small views, PSNR in held-out views: unedited "
             f"{self.unedited:.1f}, {tried} dB; chosen: {self.chosen}{note}"

@@ -49,11 +49,11 @@ TRIAL_ANGLES_DEG = (-30, -15, 0, 15, 30)
 _GAPS_PX = (4.0, 1.0)  # tried distances between discs and the Gaussians pushed behind them
 _DISC_COLOR_RMS = 0.015  # maximum RMS color error of a disc over its pixels
 _SPILL_COLOR = 1 / 255  # smallest color change beside the paint that counts as caused by pushed Gaussians
-_MIN_SPILL_WEIGHT_PX = 0.5  # smallest blended weight in such pixels from which a Gaussian may change color
+_MIN_SPILL_WEIGHT_PX = 0.5  # with a larger sum of weights in such pixels, a Gaussian may change its color
 _MISSED_COLOR = 0.05  # color error from which a painted pixel counts as missed by recoloring
 _ROUNDING_COLOR = 1.5 / 255  # two 8-bit images may differ by this much through rounding
 _ERROR_SIGMA_PX = 2.0  # sigma of the Gaussian filter over the squared error
-_VISIBILITY_STEPS = 12  # steps in strength between which the visible change is measured
+_VISIBILITY_STEPS = 12  # number of steps along the path at which the visible change is measured
 _OPACITY_CHANNEL = 10  # column of a packed row, see `attribute_slices`
 
 
@@ -74,7 +74,7 @@ class DiscLayout:
 
 
 def lay_discs(scene: Gaussians, paints: Sequence[PaintedView], gap: float) -> DiscLayout:
-    """Convert painted pixels to discs, for each picture in the areas that no previous picture shows.
+    """Convert painted pixels to discs. Each picture adds discs only where earlier pictures added none.
 
     Args:
         scene: the scene under the discs
@@ -208,7 +208,8 @@ def paint_gdf(
         scene: the original
         paints: the painted views of the discs
         name: name of the layer
-        recolored: recolor of the remaining scene. The discs lie on its full edit, or on a reduced share of it
+        recolored: recolor below the discs, which are fitted to its full edit or to a reduced share of it;
+            None if the discs lie on the original
     """
     members = torch.unique(torch.cat([laid.rows, recolored.region.members])) if recolored else laid.rows
     score = torch.zeros(len(scene)) if recolored is None else recolored.region.score.clone()
@@ -323,7 +324,7 @@ def sharpen(
     discs = group_digits(len(laid.added))
     log.say(
         f"{pixels} painted pixels are finer than the Gaussians; {discs} discs reach {own_db[1]} dB instead "
-        f"of {own_db[0]} by recoloring, and {side_db[1]} instead of {side_db[0]} from their sides: "
+        f"of {own_db[0]} by recoloring, and {side_db[1]} instead of {side_db[0]} from the sides: "
         + ("added" if improves else "not added")
     )
     return paint_gdf(laid, scene, paints, recolored.name, recolored) if improves else None

@@ -31,7 +31,7 @@ Pictures = Mapping[float, Sequence[Tensor]]
 def boxed_pictures(
     pictures: Sequence[Tensor], views: Sequence[View], engine: str = "cpu"
 ) -> Sequence[Tensor]:
-    """Return the content of the views' boxes in whole pictures, on the engine's device. [h,w,3] each"""
+    """Crop whole pictures to the boxes of their views, on the engine's device. [H,W,3] -> [h,w,3] each"""
     device = engine_device(engine)
     pairs = zip(pictures, views, strict=False)
     return stored_pictures(crop(picture, view.box).to(device) for picture, view in pairs)
@@ -56,8 +56,8 @@ def shrink_view(
     """Return a view at the size of a smaller camera, for cheap renders.
 
     Returns:
-        The scene in its box; a function that shrinks pictures of the view to it; and the share of each pixel
-        that counts, as region or edited. [h,w,1]
+        The scene in the box of the smaller view; a function that shrinks a picture of the view to that box;
+        and the share of each pixel that is edited or belongs to the region. [h,w,1]
     """
     scale_x = camera.width / view.camera.width
     scale_y = camera.height / view.camera.height

@@ -50,7 +50,7 @@ From more cameras, the best spread ones are selected without rendering.
 
 _MAX_TILT = 45.0  # degrees between the up axes of cameras and scene, as cameras are usually held level
 
-_SMALL_SHARE = 0.25  # share of a picture; the median view of a scene usually fills more
+_SMALL_SHARE = 0.25  # share of a picture; a scene usually fills more in the median view
 
 _MIN_COVER = 0.25
 """Minimum visible area of the region, as a share of the median view's; views with less are dropped."""
@@ -59,11 +59,13 @@ _MIN_COVER = 0.25
 def load_given_cameras(options: TrainingViewOptions, scene: Gaussians) -> SceneCameras:
     """Return the cameras of --cameras in the scene's frame; none if the option is not given.
 
-    Adds a note if their mean up axis is more than 45° off the scene's and the scene's shape leaves no doubt.
+    Adds a note if their mean up axis is tilted by more than 45° against the scene's, and the scene's shape
+    leaves no doubt about its up axis.
 
     Cameras of a nerfstudio dataset without its dataparser_transforms.json are refused if they are tilted like
-    this, even against a doubtful up axis, and the median camera shows the scene in less than a quarter of its
-    picture. Both together indicate nerfstudio's frame, which is rotated and scaled.
+    this, even if the scene's up axis is doubtful, and the median camera shows the scene in less than a
+    quarter of its picture. Both together indicate nerfstudio's frame, which is rotated and scaled.
+    `--cameras-anyway` skips both checks.
 
     Raises:
         ProgdfError: see `load_scene_cameras`; or the cameras are probably in another frame.
@@ -140,7 +142,7 @@ def choose_views(
     """Return up to `count` views that cover the region from as many sides as the cameras do.
 
     Args:
-        scene: the scene in front of the cameras
+        scene: the original
         region: the region to cover
         cameras: any number in any order; the choice hardly depends on the order
         count: maximum number of views, ≥ 1
@@ -264,7 +266,10 @@ def _measure_visibility(
 
 
 def _relative_visibility(weights: Tensor) -> Tensor:
-    """Return each sample's visibility, 1 from that of the median view that shows it. [V,S] -> 0 to 1"""
+    """Return each sample's weight as a share of its weight in the median view that shows it, at most 1.
+
+    [V,S] -> [V,S] 0 to 1
+    """
     typical = torch.where(weights > 0, weights, torch.nan).nanmedian(dim=0).values.nan_to_num(1.0)
     return (weights / typical.clamp_min(1e-9)).clamp_max(1.0)
 
@@ -274,7 +279,7 @@ _MAX_AREA = 20.0
 
 
 def visible_area(gaussians: Gaussians) -> Tensor:
-    """Return opacity times the two longer axes, clamped so that no huge Gaussian dominates. [N] float64"""
+    """Return opacity × longest axis × middle axis, clamped so that no huge Gaussian dominates. [N] float64"""
     _, middle, long = gaussians.scales.sort(dim=1).values.double().unbind(1)
     areas = gaussians.opacities.double() * middle * long
     return areas.clamp_max(_MAX_AREA * float(areas.mean()))

@@ -108,7 +108,7 @@ class CropScene:
     background: Tensor  # rgb. [3]
     original: Tensor  # the unedited picture, not clamped. [h,w,3]
     live: Tensor | None = None  # pixels to draw, others are the original's; None: all. [h,w,1] bool
-    still: bool = False  # only the members' colors ever differ
+    still: bool = False  # only the members' colors may differ from the original's
     engine: str = "cpu"  # rasterizer, on the device of the Gaussians
 
     @property
@@ -166,8 +166,8 @@ class CropScene:
 
     @cached_property
     def _linear(self) -> tuple[ColorMap, Tensor]:
-        """Linear model for constant geometry: each member's weight in each pixel, and the image of all
-        others."""
+        """Linear model for constant geometry: each member's weight in each pixel, and the image of all other
+        Gaussians."""
         weight_map = color_map(self.gaussians, self.camera, self.box, self.rows, self.engine)
         return weight_map, self.original - weight_map.picture(self.gaussians.colors[self.rows])
 
@@ -200,8 +200,8 @@ def crop_scene(
         camera: the whole view
         box: the pixels to render
         background: rgb. [3]
-        still: only colors will change. Then only tiles with members are drawn (`live_tiles`), without
-            gradients by a linear map of the members' colors
+        still: only colors will change. Then only tiles with members are drawn (`live_tiles`), and renders
+            without gradients use a linear map of the members' colors
         engine: rasterizer
     """
     device = scene.means.device

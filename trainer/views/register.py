@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate
 
-_MAX_MISFIT_RATIO = 0.8  # required misfit after/before registration; noise alone gains a little
+_MAX_MISFIT_RATIO = 0.8  # maximum ratio of the misfits after and before; noise alone gains a little
 _MIN_TEXTURE = 0.01  # standard deviation of color; smoother areas match at any position
 _TUKEY = 4.685  # in standard deviations; 95 % of the efficiency of least squares under normal noise
 

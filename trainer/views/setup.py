@@ -57,12 +57,12 @@ PICTURE_SIZE = 512
 """Maximum longer side of a changed picture in training, pixels."""
 
 _MAX_GLANCES = 8
-"""Number of thumbnails; fewer for a large scene, so that a draft of a million Gaussians takes seconds.
+"""Maximum number of thumbnails. A large scene gets fewer, so that its draft takes seconds.
 
 With up to 24 no draft improves by 0.1 dB.
 """
 _GLANCE_SIZE = 192
-"""Longer side of a thumbnail, pixels; smaller ones mix the region's colors with each other and others."""
+"""Longer side of a thumbnail, pixels; smaller ones mix the region's colors with each other and the rest."""
 _MAX_GLANCE_GAUSSIANS = 3_000_000  # rendered in all thumbnails together
 
 
@@ -106,14 +106,14 @@ class TrainingSetup:
 
     @property
     def judged_on(self) -> str:
-        """Description of `judging` for use beside a figure, which points out a single view."""
+        """Description of `judging` for use beside a figure; it stresses that a held-out view is alone."""
         if not self.held_out:
             return "training views"
         return f"{len(self.held_out)} held-out views" if len(self.held_out) > 1 else "one held-out view alone"
 
 
 def check_given_cameras(options: TrainingViewOptions, scene: Gaussians) -> None:
-    """Raise a ProgdfError if the cameras of --cameras do not show the scene."""
+    """Raise a ProgdfError if the cameras of --cameras are invalid or probably in another frame."""
     load_given_cameras(options, scene)
 
 
@@ -166,8 +166,8 @@ def make_training_setup(options: TrainingViewOptions, scene: Gaussians, region: 
         notes.append(choice.line())
     if any(view.camera.lens for view in choice.views):
         notes.append(
-            "the cameras have lenses that bend photographs, the views here are straight: "
-            "edited copies of photographs go in with --editor photographs:EDITED,ORIGINALS"
+            "the cameras have lens distortion and the training views have none; give edited copies of "
+            "photographs with --editor photographs:EDITED,ORIGINALS"
         )
     return TrainingSetup(scene, region, train, held_out, background, notes, up)
 
@@ -203,13 +203,13 @@ def _rig_views(
     aside: int,
     background: Tensor,
 ) -> tuple[ViewChoice, list[View], list[View]]:
-    """Return gapless training views of a rig, and held-out views halfway between neighbors.
+    """Return the choice of training views from a rig, these views, and held-out views between them.
 
     Args:
         scene, region: target of the cameras
-        rig: number -> that many cameras
-        count, aside: numbers of training and held-out views; up to 1.5 times as many cameras if some see
-            nothing
+        rig: returns a rig with the given number of cameras
+        count, aside: numbers of training and held-out views; if some cameras do not see the region, the rig
+            gets up to 1.5 times as many
         background: rgb. [3]
     """
     cameras = rig(count)

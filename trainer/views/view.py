@@ -24,13 +24,14 @@ from progdf.sh import basis, shade
 from progdf.threads import map_threads
 
 BACKGROUND = (1.0, 1.0, 1.0)
+"""Background of the views, rgb, 0 to 1."""
 
 INSIDE = (
-    "looks like a scene to stand inside, which cameras around it cannot show; give its own with --cameras "
-    "(cameras.json, transforms.json or a COLMAP folder), or make some: progdf view, look around, F4 keeps "
-    "each view"
+    "looks like a scene to stand inside, which cameras around it cannot show; give cameras with --cameras "
+    "(cameras.json, transforms.json or a COLMAP folder), or make some: open progdf view, look around, and "
+    "press F4 to keep each view"
 )
-"""Message for such a scene without cameras, after its name."""
+"""Message, after the scene's name, for a scene that surrounds the viewer and has no cameras."""
 
 
 BACKGROUND_NAMES = ("white", "black", "checker")
@@ -213,8 +214,8 @@ def region_rig(
 ) -> list[Camera]:  # fmt: skip
     """Return the orbit rig of the scene, aimed at the region and zoomed in on it.
 
-    The cameras stand where those of the whole scene would, so nothing new occludes the region. The region
-    fills about 80 to 50 % of their pictures, in an order that leaves no gap among the near ones either. A
+    The cameras have the positions of a rig for the whole scene, so nothing new occludes the region. The
+    region fills 80 to 50 % of their pictures, in an order that also leaves no gap between the nearer views. A
     hand that is 3 % of the scene is trained on as many pixels as the whole body.
 
     Args:

@@ -260,7 +260,7 @@ def test_text_edit_trains_in_stages_and_resumes_to_the_same_bits(
     assert len(result.report["trajectory"]["stages"]) == 4
     log = result.folder.log.read_text(encoding="utf-8")
     assert "network calls per picture" in log
-    assert "12 pictures to paint: each after those before, then all twice more" in log
+    assert "12 pictures to paint: one view after another, then all twice more" in log
     assert re.search(r"a style edit at strength .*, 1$", log, re.MULTILINE)
     assert {"unexplained", "unexplained_fine", "contrast", "left_out"} < set(result.report["agreement"])
 
@@ -304,7 +304,9 @@ def test_run_follows_the_anchor_and_refuses_a_changed_anchor(pix2pix: str, tmp_p
     away = replace(camera, viewmat=torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])) @ camera.viewmat)
     to_picture(painted).save(anchor, pnginfo=camera_chunk(away))
     other = with_values(text_run(tmp_path, klein, "away"), anchor=anchor)
-    with pytest.raises(ProgdfError, match=r"anchor\.png shows nothing of the region; take it from elsewhere"):
+    with pytest.raises(
+        ProgdfError, match=r"anchor\.png does not show the region; take it from another position"
+    ):
         train(other, quiet=True)
     with pytest.raises(ProgdfError, match="accepts no reference pictures and cannot follow --anchor"):
         train(with_values(text_run(tmp_path, pix2pix, "alone"), anchor=anchor), quiet=True)

@@ -284,7 +284,7 @@ def test_band_is_added_for_the_path_if_the_end_has_no_error(turned: bool, most: 
     assert model.error <= LEVEL
     thinner = thin_model(model, solver, [half, end], 40, 0.0)
     assert thinner.bands == (4 if turned and most == 4 else 1)
-    assert ("with a residual of 4, on the way too" in thinner.line) == (most == 4)
+    assert ("with a residual of 4, also at other strengths" in thinner.line) == (most == 4)
 
 
 @pytest.mark.slow

@@ -30,7 +30,7 @@ def test_gaussian_inside_one_of_two_masks_is_no_member() -> None:
     kept = drop_strays(scene, torch.ones(100, dtype=torch.bool), views, inside, messages.append)
     assert kept.nonzero()[:, 0].tolist() == [*range(40), *range(60, 100)]
     assert messages == [
-        "the masks: 20 Gaussians inside one mask only, where two views see it, left to what surrounds them"
+        "the masks: 20 Gaussians inside only one mask although two views see them: their surroundings decide"
     ]
 
 
@@ -41,7 +41,7 @@ def test_larger_background_seen_by_one_view_is_dropped() -> None:
     messages: list[str] = []
     kept = drop_strays(scene, torch.ones(500, dtype=torch.bool), views, views, messages.append)
     assert torch.equal(kept, near)
-    assert messages == ["the masks: 400 Gaussians apart from the 1 largest connected surface, left out"]
+    assert messages == ["the masks: 400 Gaussians not on the 1 largest connected surface: removed"]
 
 
 def test_two_separate_pieces_are_both_kept() -> None:
@@ -60,7 +60,7 @@ def test_hole_is_filled_unless_two_views_see_through_it() -> None:
     outside[78] = 2.0
     messages: list[str] = []
     assert find_holes(scene, member, outside, messages.append).tolist() == [65]
-    assert messages == ["the masks: 1 Gaussian in holes of it, added"]
+    assert messages == ["the masks: 1 Gaussian in holes of the region: added"]
 
 
 def test_empty_region_stays_empty() -> None:

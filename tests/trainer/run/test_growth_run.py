@@ -171,7 +171,7 @@ def test_unprofitable_growth_adds_nothing_and_keeps_the_file(tmp_path: Path) -> 
     for name, share in (("plain", 0.0), ("grown", 0.5)):
         train(with_values(replace(options, out=tmp_path / name), grow=share))
     log = (tmp_path / "grown" / "log.txt").read_text(encoding="utf-8")
-    assert "growth would not take a tenth of the error away, or takes the place of what moves" in log
+    assert "growth removes less than 10 % of the error, or replaces parts that move" in log
     files = [(tmp_path / name / "edit.gdf").read_bytes() for name in ("plain", "grown")]
     assert files[0] == files[1]
 

@@ -110,7 +110,7 @@ def test_growth_wins_with_a_tenth_less_error_unless_something_moves() -> None:
     # growth would fade in an object that only moves
     moved = Trial(60, {FREE: 17.0, IN_PARTS: 28.0, GROWN: 29.5}, 14.0)
     assert moved.chosen == IN_PARTS
-    assert "growth would not take a tenth of the error away, or takes the place of what moves" in moved.line()
+    assert "growth removes less than 10 % of the error, or replaces parts that move" in moved.line()
     assert moved.figures() == Trial(60, {FREE: 17.0, IN_PARTS: 28.0}, 14.0).figures()
 
 

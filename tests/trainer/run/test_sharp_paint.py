@@ -62,7 +62,7 @@ def test_letters_on_a_picture_are_as_sharp_as_painted(place: Path, lettered: Run
     assert bits(compose_layers(scene, [Layer(gdf, 0.0)])[: len(scene)]) == bits(scene)
     log = lettered.folder.log.read_text()
     assert "painted pixels are finer than the Gaussians" in log
-    assert " from their sides: added" in log
+    assert " from the sides: added" in log
     assert "warning" not in log
     assert lettered.report["edit"]["psnr_to_views"] > 30.0
 
@@ -139,7 +139,7 @@ def test_discs_that_are_worse_from_the_sides_are_not_added(
 
     monkeypatch.setattr("trainer.run.paint.place_discs", lift)
     done = train(options(place, save(place, "lifted", letters(wall()).picture), "lifted"), quiet=True)
-    assert " from their sides: not added" in done.folder.log.read_text()
+    assert " from the sides: not added" in done.folder.log.read_text()
     assert load_gdf(done.gdf, load_ply(place / "wall.ply")).added is None
 
 
