@@ -64,7 +64,7 @@ class Values(dict[str, Any]):
         super().update(getattr(self._widget, self._trait))
 
     def _refuse(self, *_: Any) -> Any:
-        raise RefusedError(f"entries of {self._trait} cannot be added or removed; set the value of one")
+        raise RefusedError(f"entries of {self._trait} cannot be added or removed; set an existing entry")
 
     __delitem__ = pop = popitem = clear = setdefault = _refuse
 

@@ -110,7 +110,7 @@ def fly(
 
 
 def pivot_on(camera: ViewCamera, point: Vec3, radius: float) -> ViewCamera:
-    """Rotate the view to `point` with the eye fixed, and make it the pivot (double click)."""
+    """Rotate the view to `point` with the eye fixed, and make the point the pivot (double click)."""
     turned = look_from(camera, eye(camera), point)
     return _keep_finite(replace(turned, distance=_clamp_distance(turned.distance, radius)), camera)
 

@@ -94,7 +94,7 @@ INSIDE_FOV = 60.0
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounding sphere of the bulk that the camera frames, world units, radius > 0."""
+    """Bounding sphere of the bulk of a scene or region, world units, radius > 0."""
 
     center: Vec3 = (0.0, 0.0, 0.0)
     radius: float = 1.0

@@ -126,7 +126,7 @@ def _find_segment(frames: Sequence[int], frame: float) -> tuple[int, float]:
 
 
 def _slope(points: Sequence[Point], i: int) -> float:
-    """Return the slope per frame at a point: 0 at the ends, at turning points and beside other easings."""
+    """Return the slope per frame at a point: 0 at the ends, at turning points and next to other easings."""
     if not 0 < i < len(points) - 1 or points[i - 1][1] != "smooth" or points[i][1] != "smooth":
         return 0.0
     (a, _, x), (b, _, y), (c, _, z) = points[i - 1 : i + 2]

@@ -54,7 +54,7 @@ class ViewpointOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class RenderOptions:
-    """Write a picture of a scene under its edits, without a window."""
+    """Write a picture of a scene with its edits, without a window."""
 
     stack: OmitArgPrefixes[StackOptions]
     out: Annotated[Path, word("FILE", aliases=["-o"])]
@@ -79,13 +79,13 @@ class RenderOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions:
-    """Write a scene under its edits for other programs or as a web page, or a grade as a .cube file."""
+    """Write a scene with its edits for other programs or as a web page, or a grade as a .cube file."""
 
     stack: OmitArgPrefixes[StackOptions]
     out: Annotated[Path, word("FILE", aliases=["-o"])]
     """Output: a 3DGS scene, a .html page, a .progdf.zip or a .cube; formats: see docs/formats.md."""
     frames: Annotated[int | None, word("N", "one file")] = None
-    """Number of steps from the original to the strengths, or of --timeline frames; a .usdc: time samples."""
+    """Number of files (.usdc: time samples) from the original to the strengths, or over the --timeline."""
     timeline: Switch = False
     """Write one scene per frame of the session's timeline, without its camera."""
     glb_axes: GlbAxes = "LUF"
@@ -103,7 +103,7 @@ class ExportOptions:
 
 
 class Named(Protocol):
-    """Edit, or layer of an edit."""
+    """Edit or layer, identified by its name."""
 
     @property
     def name(self) -> str:
@@ -115,7 +115,7 @@ class OpenStack:
     """Opened scene and edits, and their drawing state."""
 
     document: Document
-    view: ViewState  # for a scene without a camera, which the command chooses
+    view: ViewState  # drawing state; for a scene, the command sets the camera
     session: Path | None = None  # the session's file; None for a scene
     snapshots: tuple[SliderSnapshot, ...] = ()
     up_option: str = "auto"  # an axis, or "auto"
@@ -136,7 +136,7 @@ class OpenStack:
         return (*(path for path in files if path is not None), *self.document.gdf_paths)
 
     def layer(self, name: str) -> str:
-        """Return the layer of this name, or of the edit of this name, as a session may rename layers."""
+        """Return the name of the layer of this name, else of this edit's layer (sessions rename layers)."""
         named = {self.document.gdfs[layer.gdf].name: layer.name for layer in self.view.layers}
         return name if name in named.values() else named.get(name, name)
 
@@ -158,7 +158,7 @@ def open_stack(stack: StackOptions, drawing: DrawingOptions | None = None, unset
     if stack.scene.is_file() and kind_of(stack.scene) == "session":
         return _open_session(stack, drawing)
     paths: dict[str, Path] = {}
-    for path in stack.gdfs:  # a session may hold one twice
+    for path in stack.gdfs:  # only a session may contain an edit twice
         first = paths.setdefault(os.path.realpath(path), path)
         if first is not path:
             again = "" if first == path else f", first as {first}"

@@ -1,4 +1,4 @@
-"""Options of a scene under its edits and of its drawing, and the parser. Fast to import."""
+"""Options of a scene with its edits, drawing options, and the parser. Fast to import."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ Switch = Annotated[bool, word(absent=_switch)]
 
 @dataclass(frozen=True, kw_only=True)
 class StackOptions:
-    """A scene under a stack of edits."""
+    """Scene with a stack of edits."""
 
     scene: Annotated[Path, Positional, word("SCENE", _scene)]
     """Scene: .ply, .spz, .splat, .ksplat, .sog, .glb or .gltf; or a session, also as --session FILE."""
     gdfs: Annotated[tuple[Path, ...], Positional, word("EDIT.gdf", "the scene alone")] = ()
     """Edits of this scene, the lowest layer first; also .cube files, which change colors everywhere."""
     region: Annotated[tuple[str, ...], UseAppendAction, word("NAME=REGION")] = ()
-    """Apply a grade, of any scene, or a .cube file to this region: all, or as for `progdf train`."""
+    """Apply a grade (of any scene) or a .cube file to this region: all, or as for `progdf train`."""
     set: Annotated[tuple[str, ...], UseAppendAction, word("NAME=S")] = ()
     """Strength of an edit, 0 to 1; repeatable. Defaults: see docs/cli.md."""
     gain: Annotated[tuple[str, ...], UseAppendAction, word("NAME:KIND=G")] = ()
@@ -76,7 +76,7 @@ class DrawingOptions:
 def parse(kind: type[Any], argv: Sequence[str], command: str) -> Any:
     """Parse the options of a command.
 
-    `--session FILE` is FILE as the scene; `--split` and `--difference` without a number get their defaults.
+    `--session FILE` equals FILE as the scene. `--split` and `--difference` without a number get a default.
 
     Raises:
         ProgdfError: an option is missing, unknown or of the wrong kind.

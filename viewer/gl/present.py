@@ -59,9 +59,9 @@ class Presenter:
 
 
 class ScreenCopy:
-    """Byte copy of a picture in CPU memory, beside a framebuffer.
+    """Copy of a picture as bytes, which is copied to a framebuffer instead of being drawn.
 
-    Software GL copies it ten times faster than it draws it.
+    Software GL copies a picture ten times faster than it draws one.
 
     Args:
         ctx: GL context
@@ -90,7 +90,7 @@ class ScreenCopy:
             framebuffer.scissor = (self.left, 0, *self.size)
         self.ctx.copy_framebuffer(framebuffer, self._framebuffer)
         if self.left:
-            framebuffer.scissor = None  # type: ignore[assignment]  # its annotation forgets None
+            framebuffer.scissor = None  # type: ignore[assignment]  # its annotation lacks None
 
     def release(self) -> None:
         self._framebuffer.release()

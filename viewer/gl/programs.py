@@ -31,19 +31,19 @@ def load_program(
             varyings=varyings,
         )
     except moderngl.Error as error:
-        raise ShaderError(_first_line(str(error), vertex, fragment, sources)) from None
+        raise ShaderError(_readable_log(str(error), vertex, fragment, sources)) from None
 
 
-def _first_line(log: str, vertex: str, fragment: str | None, sources: list[Source]) -> str:
+def _readable_log(log: str, vertex: str, fragment: str | None, sources: list[Source]) -> str:
     """Return the driver's log with its file numbers replaced by names."""
     stage = sources[-1] if "fragment_shader" in log else sources[0]
-    complaints = []
+    errors = []
     for line in log.splitlines():
         for pattern in _LOCATIONS:
             match = pattern.match(line.strip())
             if match and int(match["file"]) < len(stage.files):
                 name = stage.files[int(match["file"])]
-                complaints.append(f"shaders/{name}:{match['line']}: {match['text']}")
+                errors.append(f"shaders/{name}:{match['line']}: {match['text']}")
                 break
     names = vertex if fragment is None else f"{vertex} + {fragment}"
-    return "\n".join([f"{names} does not compile with this driver", *(complaints or [log.strip()])])
+    return "\n".join([f"{names} does not compile with this driver", *(errors or [log.strip()])])

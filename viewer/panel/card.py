@@ -82,12 +82,12 @@ def _gain(layer: LayerState, kind: str, moves: bool, active: bool, ui: UiContext
     return layer if new == value else with_slider_value(layer, kind, new)
 
 
-TOGGLE_PX = 20.0
-THUMBNAIL_PX = 24.0
+TOGGLE_PX = 20.0  # side of a toggle, at 1×
+THUMBNAIL_PX = 24.0  # side of a thumbnail, at 1×
 CARD_PX = 66.0  # height of a card with the gap to the next one, at 1×
 COMPACT_PX = 7.0  # padding of a compact row, at 1×
-SLIDER_PX = 92.0  # width of its slider
-SLIM_PX = 16.0  # height of its slider
+SLIDER_PX = 92.0  # width of the slider in a compact row or a group row, at 1×
+SLIM_PX = 16.0  # height of this slider, at 1×
 _MENU = "menu of a layer"
 _MENU_ITEMS = (
     *("rename", "duplicate", "replace", "again", "", "remove", ""),
@@ -95,7 +95,7 @@ _MENU_ITEMS = (
     *("group", "select_layers", "reset_all"),
 )
 _LAYER_ACTIONS = ("rename", "duplicate", "replace", "again", "remove", "limit_to_selection", "select_painted")
-"""Actions that receive the layer's index. The others apply to all selected layers."""
+"""Actions that receive the layer's index. All other actions of the menu apply to the selected layers."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class CardTouch:
     touched: bool = False  # the layer becomes the focused one, unless `press` changes that
     drag: str = ""  # drag of its name, see `grip`
     press: str = ""  # one of `layer_selection.PRESSES`; "" if no button was pressed
-    named: bool = False  # the button is down on the name
+    named: bool = False  # the mouse button is held down on the name
 
 
 def draw_card(
@@ -219,7 +219,7 @@ def _menu(
 
     Args:
         row: data of its .gdf
-        several: number of layers selected with it, 0 for this one alone
+        several: number of selected layers, this one included; 0 or 1 for this one alone
     """
     with menu(_MENU, ui) as is_open:
         off = []
@@ -271,8 +271,8 @@ def _head(
     ui: UiContext,
     actions: list[Action],
 ) -> tuple[Workspace, CardTouch]:
-    """Draw visibility, thumbnail, name and toggles. Reserve space for the number; it is drawn once the
-    slider has its value."""
+    """Draw visibility, thumbnail, name and toggles. Reserve space for the strength, which is drawn after the
+    slider."""
     scale = ui.scale
     compact = is_compact(work)
     layer = work.view.layers[index]
@@ -314,8 +314,8 @@ def _head(
 
 
 def _toggles(work: Workspace, index: int, over: bool, ui: UiContext, actions: list[Action]) -> None:
-    """Draw the buttons for menu, brush, details, lock and solo. Without hover, show only lock and solo
-    that are on."""
+    """Draw the buttons for menu, brush, details, lock and solo. Without hover, draw only an
+    active lock or solo."""
     view = work.view
     layer = work.view.layers[index]
     side = TOGGLE_PX * ui.scale

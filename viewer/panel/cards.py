@@ -47,7 +47,7 @@ from viewer.ui.widgets import (
 from . import slider
 from .card import COMPACT_PX, SLIDER_PX, SLIM_PX, draw_card
 
-MASTER_PX = 20.0  # height of its slider, at 1×
+MASTER_PX = 20.0  # height of the slider for several layers, at 1×
 SEARCH_THRESHOLD = 6
 """Number of layers above which the search field is shown."""
 _BUTTONS = ("group", "reset")
@@ -65,7 +65,7 @@ def draw_search(work: Workspace, ui: UiContext) -> str:
         imgui.set_keyboard_focus_here()
     flags = imgui.InputTextFlags_.escape_clears_all.value | imgui.InputTextFlags_.auto_select_all.value
     _, text = imgui.input_text_with_hint("##search", "Search by name, region, group", work.search, flags)
-    tip(f"Only layers with all these words ({shortcut('search')}). Esc: show all")
+    tip(f"Show only layers with all these words ({shortcut('search')}). Esc: show all")
     if work.search:
         imgui.same_line(0.0, gap)
         if icon_button("clear", Icon.CLOSE, ui):
@@ -101,7 +101,7 @@ def draw_selection(state: ViewState, chosen: Sequence[int], ui: UiContext, actio
     with inert(all(state.layers[i].locked for i in chosen)):
         at = imgui.get_cursor_screen_pos()
         room = imgui.get_content_region_avail().x - number - 8.0 * ui.scale
-        help_ = "Strength of the strongest selected layer; the others keep their proportion"
+        help_ = "Strength of the strongest selected layer; the others keep their proportions"
         new = slider.draw(
             "##master",
             value,
@@ -136,7 +136,7 @@ def draw_group(
         arrow = Icon.FOLDED if folded else Icon.UNFOLDED
         if icon_button("fold", arrow, ui, side=imgui.get_frame_height()):
             state = toggle_collapsed(state, group.name)
-        tip("Show or hide its layers")
+        tip("Expand or collapse the group")
         imgui.same_line(0.0, 0.0)
         if icon_button("eye", Icon.SHOWN if group.enabled else Icon.HIDDEN, ui, dim=not group.enabled):
             state = change_group(state, group.name, lambda old: replace(old, enabled=not old.enabled))
@@ -160,7 +160,7 @@ def draw_group(
             group.enabled,
             height=SLIM_PX,
             default=LayerGroup.strength,
-            help_="Factor for the strengths of its layers. Double-click: reset to 1",
+            help_="Factor on the strengths of its layers. Double-click: reset to 1",
         )
         number_at = (imgui.get_item_rect_max().x + 6.0 * scale, corner[1])
         color = u32(PALETTE.text if group.enabled else PALETTE.dim)
@@ -206,12 +206,12 @@ def _group_name(
     return corner, gesture
 
 
-HEADING_PX = 34.0  # height above the cards, at 1×
+HEADING_PX = 34.0  # height of the heading above the cards, at 1×
 _DRAGS = ("dragged", "dropped")
 INSET_PX = 10.0  # indentation of a group's layers, at 1×
 BLEND_TITLES = {"normalized": "Average", "sum": "Add", "over": "Over", "adjust": "Adjust"}
 BLEND_HELP = {
-    "normalized": "Overlapping edits are averaged by weight; never more than a full edit.",
+    "normalized": "Overlapping edits are averaged by weight, never more than one full edit.",
     "sum": "Overlapping edits add up.",
     "over": "An edit covers those below it, in proportion to its change.",
     "adjust": "Like Over, but color edits change the colors below: darkened stripes stay stripes.",
@@ -226,7 +226,7 @@ class _Row:
     bottom: float
     layers: tuple[int, ...]  # indices in `ViewState.layers` that are dragged with it
     group: str  # the group's name, or that of its layer's group
-    heads: bool = False  # the row is that of a group
+    heads: bool = False  # it is the row of a group
 
 
 def draw_heading(work: Workspace, ui: UiContext, actions: list[Action]) -> Workspace:
@@ -246,7 +246,7 @@ def draw_heading(work: Workspace, ui: UiContext, actions: list[Action]) -> Works
     imgui.same_line(0.0, 4.0 * ui.scale)
     if icon_button("about layers", Icon.MENU, ui):
         imgui.open_popup("about layers")
-    tip("Where edits overlap, overshoot, rows")
+    tip("Blend rule, overshoot, compact rows")
     with menu("about layers", ui) as is_open:
         return replace(work, view=_choose_rules(work, ui, actions)) if is_open else work
 
@@ -279,7 +279,7 @@ def draw(
 
     Args:
         rows: one per .gdf, indexed by `LayerState.gdf`
-        thumbnails: GL names of their pictures in the same order, 0 before one is drawn
+        thumbnails: GL names of the thumbnails of the edits in the same order, 0 before one is drawn
         reveal: scroll to the focused layer, and to partly visible selected ones
     """
     if not (work.view.layers or work.jobs or work.form_open):
@@ -351,7 +351,7 @@ def draw(
 
 
 def _group(state: ViewState, name: str, ui: UiContext, actions: list[Action]) -> tuple[ViewState, str]:
-    """Draw the row of a group, see `draw_group`; add a group that only its layers name."""
+    """Draw the row of a group, see `draw_group`; add the group to the state if it is missing."""
     group = next((group for group in state.groups if group.name == name), LayerGroup(name))
     if group not in state.groups:
         state = replace(state, groups=(*state.groups, group))
@@ -387,12 +387,12 @@ def _drag(
 def _nearest_gap(
     state: ViewState, rows: Sequence[_Row], layers: Sequence[int], whole: bool, mouse: float
 ) -> tuple[float, int, str]:
-    """Return the nearest drop target: the line's height, the number of layers below, and the joined group.
+    """Return the nearest drop target: y of its line, number of layers below it, and the joined group.
 
     Args:
         layers: the dragged layers
-        whole: they are dragged as a group; groups do not nest
-        mouse: height of the pointer, window pixels
+        whole: the layers are dragged as a group; groups do not nest
+        mouse: y of the pointer, window pixels
     """
     groups = {state.layers[i].group for i in layers}
     gap = imgui.get_style().item_spacing.y / 2

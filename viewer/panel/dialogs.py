@@ -106,7 +106,7 @@ class DialogResult:
 
 
 def draw(dialog: Dialog, pressed: Sequence[str], ui: UiContext, area: Area) -> DialogResult:
-    """Draw the dialog and take its answer.
+    """Draw the dialog and return its result.
 
     Args:
         pressed: chords pressed in this frame
@@ -139,7 +139,7 @@ def draw(dialog: Dialog, pressed: Sequence[str], ui: UiContext, area: Area) -> D
 
 
 def _content(dialog: Dialog, pressed: Sequence[str], ui: UiContext, bottom: float) -> DialogResult:
-    """Draw the content of a dialog. `bottom`: limit of its lower edge, window pixels"""
+    """Draw the content of a dialog. `bottom`: limit of its lower edge, window pixels."""
     with imgui_ctx.push_font(ui.fonts.bold, 0.0):
         imgui.text(TITLES[dialog.kind])
     wrapped_text(_HINTS[dialog.kind].format(escape_text(Path(dialog.text).name)), PALETTE.dim)
@@ -147,7 +147,7 @@ def _content(dialog: Dialog, pressed: Sequence[str], ui: UiContext, bottom: floa
     if "Escape" in pressed:
         return DialogResult(None)
     if dialog.chosen and dialog.kind in _DELIVERS:
-        dialog = replace(dialog, text=dialog.chosen, chosen="")  # there may be more options to choose
+        dialog = replace(dialog, text=dialog.chosen, chosen="")  # the user may still change other options
     if dialog.chosen:
         return _submit(dialog, dialog.chosen)
     if dialog.kind in _CHOICES:
@@ -330,7 +330,7 @@ def obstacle() -> str:
 class Browser:
     """System file dialog next to one of our dialogs, one at a time.
 
-    `close` it before dropping it: otherwise the library waits for the user.
+    Call `close` before discarding it: otherwise the library waits for the user.
     """
 
     def __init__(self) -> None:
@@ -342,7 +342,7 @@ class Browser:
         return self._dialog is not None
 
     def open(self, dialog: Dialog, near: Path) -> Dialog:
-        """Open the system dialog; return our dialog with a notice, or with the reason why there is none.
+        """Open the system dialog; return our dialog with a notice, or the reason why it cannot open.
 
         Args:
             dialog: a dialog with a path field
@@ -365,7 +365,7 @@ class Browser:
     def poll(self, dialog: Dialog | None) -> Dialog | None:
         """Return our dialog after a poll of the system dialog, with the chosen file if any. Does not wait."""
         if self._dialog is None or dialog is None or not dialog.choosing:
-            self.close()  # the dialog was answered without it
+            self.close()  # our dialog was answered meanwhile
             return dialog
         if not self._dialog.ready(0):
             return dialog

@@ -50,16 +50,16 @@ from viewer.ui.widgets import (
     wrapped_text,
 )
 
-COLUMN_PX = 90.0
-_CURVE_PX = 92.0
-_MAX_POINTS = 6
-_MIN_GAP = 0.02
+COLUMN_PX = 90.0  # start of the control in a row, at 1×
+_CURVE_PX = 92.0  # height of a curve, at 1×
+_MAX_POINTS = 6  # largest number of points of a curve
+_MIN_GAP = 0.02  # smallest difference in lightness between two points of a curve
 _GRADES = {
-    "exposure": "Stops of light: −1 is half of it, 1 twice as much",
+    "exposure": "Stops: −1 halves the light, 1 doubles it",
     "temperature": "From blue to amber light",
     "tint": "From green to magenta light",
     "contrast": "Contrast around middle gray",
-    "saturation": "−1 is gray, 1 twice the chroma",
+    "saturation": "−1 is gray, 1 doubles the chroma",
     "black": "Colors this dark become black",
     "white": "Colors this bright become white",
 }
@@ -70,14 +70,13 @@ def draw(work: Workspace, count: int, ui: UiContext, actions: list[Action]) -> W
 
     Args:
         count: number of Gaussians in the scene
-        preview: state of the preview
     """
     if not work.form_open:
         return work
     with card(_NAME, PALETTE.card_focused, ui, nav=True):
         storage = imgui.get_state_storage()
         listed = imgui.get_id("a list is open")
-        # otherwise an open list handles Enter and Escape
+        # an open list handles Enter and Escape itself
         mine = imgui.is_window_focused() and not storage.get_bool(listed)
         closes = mine and imgui.is_key_pressed(imgui.Key.escape, False)
         trains = mine and any(imgui.is_key_pressed(key, False) for key in _ENTER)
@@ -160,9 +159,9 @@ def _region_title(region: str, selection: SelectionState, count: int) -> str:
         case "selection":
             return f"Selection  ·  {group_digits(selection.count)}"
         case "changed":
-            return "Where they differ"
+            return "Where pictures differ"
         case "typed":
-            return "Typed…"
+            return "Custom…"
     return f"{region}  ·  {group_digits(sizes.get(region, 0))}"
 
 
@@ -183,7 +182,7 @@ def _region(form: NewEdit, selection: SelectionState, count: int, column: float,
     form = form if pressed is None else replace(form, region=offered[pressed], error="")
     if form.region == TYPED:
         form = replace(form, typed_region=_text_row("", "sphere:0,0,0,1", form.typed_region, column))
-        tip("labels:FILE.npy:ID, box:…, sphere:X,Y,Z,RADIUS, file:ROWS.npy; join by + -")
+        tip("labels:FILE.npy:ID, box:…, sphere:X,Y,Z,RADIUS, file:ROWS.npy; combine with + and -")
     return form
 
 
@@ -218,11 +217,11 @@ def _settings(form: NewEdit, preview: PreviewState, column: float, ui: UiContext
             imgui.set_next_item_width(-1.0)
             changed, (red, green, blue) = imgui.color_edit3("##color", list(form.color), hex_only)
             form = replace(form, color=(red, green, blue)) if changed else form
-            paths = {False: "Straight", True: "Hues"}
-            help_ = "Path to the color: straight, or around the color wheel"
+            paths = {False: "Direct", True: "Hues"}
+            help_ = "Path to the color: nearly straight, or around the color wheel"
             form = replace(form, through_hues=choice_row("Path", paths, form.through_hues, column, ui, help_))
         case "amount":
-            help_ = "Share of light to remove"
+            help_ = "Share of the light to remove"
             label("Amount", column)
             form = replace(form, amount=value_slider("##Amount", form.amount, (0.05, 0.98), "%.2f", 0.7, ui))
             tip(help_)
@@ -242,7 +241,7 @@ def _settings(form: NewEdit, preview: PreviewState, column: float, ui: UiContext
             form = _model(form, preview, column, ui)
         case "pictures":
             form = replace(form, pictures=_text_row("Pictures", "A.png, B.png", form.pictures, column))
-            taken = f"One or a few pictures taken here ({shortcut('take_view')})"
+            taken = f"One or more pictures taken here ({shortcut('take_view')})"
             tip(f"{taken} and edited in any program")
         case "folder":
             form = replace(form, folder=_text_row("Folder", "FOLDER", form.folder, column))
@@ -251,7 +250,7 @@ def _settings(form: NewEdit, preview: PreviewState, column: float, ui: UiContext
 
 
 def _palette(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
-    """Draw the region's main colors. Each can be changed, and the user can pick one in the picture."""
+    """Draw the region's main colors, each with its new color, and the button to pick one in the picture."""
     label("Palette", column)
     flags = imgui.ColorEditFlags_
     side = imgui.get_frame_height()
@@ -268,7 +267,7 @@ def _palette(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
             form = replace(form, picked=i)
         if imgui.is_item_clicked(1):
             pairs[i] = source, source
-        tip(f"{source} becomes {new_color}; right-click: reset" if source != target else f"{source} stays")
+        tip(f"{source} becomes {new_color}; right-click: reset" if source != target else f"{source} is kept")
         if source != target:  # original color, in a corner
             low = (x, y + side)
             corner = u32((*parse_color(source).tolist(), 1.0))
@@ -292,8 +291,8 @@ def _palette(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
 def _curve(curve: str, column: float, ui: UiContext) -> str:
     """Draw a curve from original to new lightness and return it. A press adds a point and drags it.
 
-    By keyboard, Space selects the next point, after the last one a new one in the widest gap. The arrow keys
-    move it.
+    By keyboard, Space selects the next point. After the last point, it adds one in the widest gap. The arrow
+    keys move the selected point.
     """
     label("Curve", column)
     tall = _CURVE_PX * ui.scale
@@ -365,7 +364,7 @@ def _model(form: NewEdit, preview: PreviewState, column: float, ui: UiContext) -
 
 
 def _anchor(form: NewEdit, preview: PreviewState, column: float) -> tuple[NewEdit, str]:
-    """Draw the anchor picture that all views follow: paint it, repaint it, or edit it ("paint_over")."""
+    """Draw the buttons for the anchor picture that all views follow: generate, or edit ("paint_over")."""
     label("Anchor", column)
     half = 0.5 * (imgui.get_content_region_avail().x - imgui.get_style().item_spacing.x)
     with inert(bool(form.obstacle) or preview.busy):
@@ -382,8 +381,8 @@ def _anchor(form: NewEdit, preview: PreviewState, column: float) -> tuple[NewEdi
 
 
 def _style(form: NewEdit, preview: PreviewState, ui: UiContext) -> NewEdit:
-    """Draw a button for every style, with a thumbnail of this view once it is painted. The styles that
-    look most alike from all sides come first."""
+    """Draw a button for every style, with a thumbnail of this view once it is painted. The most consistent
+    styles, `BEST_STYLES`, come first."""
     small(f"Painting {form.style}", PALETTE.text)
     gap = 2.0 * ui.scale
     canvas = imgui.get_window_draw_list()
@@ -406,7 +405,7 @@ def _style(form: NewEdit, preview: PreviewState, ui: UiContext) -> NewEdit:
             canvas.add_image_rounded(image, low, high, (left, top), (right, foot), white, 3.0 * ui.scale)
         if number == form.style:
             canvas.add_rect(low, high, u32(PALETTE.accent), 3.0 * ui.scale, 2.0 * ui.scale)
-        best = "; looks alike from all sides" if number in BEST_STYLES else ""
+        best = "; consistent from all sides" if number in BEST_STYLES else ""
         tip(f"Painting {number}{best}")
     return form
 
@@ -415,7 +414,7 @@ def _preview(form: NewEdit, preview: PreviewState, column: float, ui: UiContext)
     """Draw the preview's visibility and strength, and its state."""
     if not form.choice.pictured:
         if form.choice.setting == "folder":
-            small("No preview: this editor is too slow", PALETTE.dim)
+            small("No preview: the views are already edited", PALETTE.dim)
         if form.choice.setting == "pictures" and preview.text:
             wrapped_text(preview.text, PALETTE.error if preview.failed else PALETTE.dim)
         return form
@@ -423,7 +422,7 @@ def _preview(form: NewEdit, preview: PreviewState, column: float, ui: UiContext)
     side = imgui.get_frame_height()
     if icon_button("preview", Icon.SHOWN if form.preview else Icon.HIDDEN, ui, dim=not form.preview):
         form = replace(form, preview=not form.preview)
-    tip("Show the edited original in this view before training")
+    tip("Preview the edit in this view before training")
     imgui.same_line(column + side)
     with inert(not form.preview):
         strength = value_slider("##strength", form.strength, (0.0, 1.0), "%.2f", 1.0, ui)

@@ -1,4 +1,4 @@
-"""Pages drawn over the window: the start page, a preview image, the fields of a delivery."""
+"""Start page, the image that covers the picture, and the fields of a picture or film to render."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ from viewer.ui.widgets import (
 )
 
 COMMANDS = ("open", "demo", "quit", "full_screen", "window_picture", "help", "palette", "unfocus", "about")
-"""Requests that are available on the start page."""
-CARD_PX = 168.0
+"""Commands that are available on the start page."""
+CARD_PX = 168.0  # approximate width of a recent file's card, at 1×
 GAP_PX = 16.0
 MARGIN_PX = 28.0
 SIDE_PX = 264.0
@@ -111,7 +111,7 @@ def _head(wide: float, tall: float, ui: UiContext) -> list[Action]:
     y = begin.y + _TITLE_PX * scale
     button = imgui.ImVec2(136.0 * scale, 34.0 * scale)
     frame = imgui.ImVec2(wide, tall or 58.0 * scale)
-    # one line: the margin around the button
+    # margin around the button of a field of one line
     text = imgui.calc_text_size(DROP_TEXT)
     side = (frame.y - button.y) / 2
     middle = x + (frame.x - button.x) / 2, y + frame.y / 2
@@ -140,7 +140,7 @@ def _head(wide: float, tall: float, ui: UiContext) -> list[Action]:
 
 
 def _grid(files: Sequence[StartFile], wide: float, room: float, own: bool, ui: UiContext) -> list[Action]:
-    """Draw cards of `wide` pixels and return the requested actions. `own`: the user can remove the cards"""
+    """Draw cards of `wide` pixels and return the requested actions. `own`: the user can remove the cards."""
     actions = list[Action]()
     gap = GAP_PX * ui.scale
     across = max(int((room + gap + 1.0) // (wide + gap)), 1)
@@ -215,7 +215,7 @@ def folder_name(path: Path) -> str:
 
 
 def _dashed_frame(size: imgui.ImVec2, ui: UiContext) -> None:
-    """Draw the dashed frame that invites to drop files; the whole window accepts them."""
+    """Draw the dashed frame of the drop field. The whole window accepts dropped files."""
     scale = ui.scale
     dash = 7.0 * ui.scale
     x, y = imgui.get_cursor_screen_pos()
@@ -239,7 +239,7 @@ def _dashed_frame(size: imgui.ImVec2, ui: UiContext) -> None:
 def draw_cover(
     cover: Cover, view: ViewState, size: tuple[int, int], area: overlay.Area, ui: UiContext
 ) -> None:
-    """Draw the picture if camera and size match and no comparison is on."""
+    """Draw the cover image while the view has its camera and size and no comparison is on."""
     if (cover.camera, cover.size) != (view.camera, size) or view.compare.mode != "off":
         return
     corners = (0.0, 0.0), (area.width, area.height)
@@ -251,7 +251,7 @@ _COLUMN_PX = 100.0
 
 
 def draw_fields(kind: str, path: str, options: DeliverOptions, ui: UiContext) -> tuple[str, DeliverOptions]:
-    """Draw the fields and return the path with the suffix of its format, and the changed options.
+    """Draw the fields. Return the path with the suffix of the chosen format, and the changed options.
 
     Args:
         kind: "picture" or "film"

@@ -22,7 +22,7 @@ from viewer.ui.context import BEHIND, FIXED, PALETTE, SMALL_PX, Icon, UiContext,
 from . import card, cards, new_edit_form, snapshot_cards, training_cards
 
 MENU_ID = "main menu"
-MAX_PX = 360.0
+MAX_PX = 360.0  # maximum width of a file name in the menu, at 1×
 _MENU_ACTIONS = ("", "save", "save_as", "take_view", "hide_strays", "", "palette", "help", "about", "quit")
 _MAX_RECENT = 6
 _SHARE_ACTIONS = ("export", "export_page", "render_picture", "render_film", "picture")
@@ -81,7 +81,7 @@ def draw(
     wide = width(work.layout, ui)
     imgui.set_next_window_pos((display.x - wide, 0.0))
     imgui.set_next_window_size((wide, display.y))
-    # the cleared framebuffer is its background: software GL takes a millisecond to fill that once more
+    # the cleared framebuffer is its background: software GL takes a millisecond to fill it again
     imgui.get_background_draw_list().push_clip_rect((0.0, 0.0), (display.x - wide, display.y))
     flags = imgui.WindowFlags_.no_scroll_with_mouse.value | imgui.WindowFlags_.no_background.value
     imgui.begin("panel", None, FIXED | BEHIND | flags | ui.nav_flags("panel"))

@@ -14,17 +14,17 @@ from imgui_bundle import imgui
 from viewer.ui.context import PALETTE, Rgba, u32
 from viewer.ui.widgets import is_entered, is_released, key_step, tip
 
-HEIGHT_PX = 20.0  # at 1×, same as its text field, so that typing moves nothing
+HEIGHT_PX = 20.0  # at 1×; also the height of its text field, so that opening it moves nothing
 RADIUS_PX = 7.0  # radius of the handle, at 1×
-FINE = 0.1
+FINE = 0.1  # factor on the movement of a drag with Shift
 DEFAULT = 0.0
 """Strength of the original; a double click resets to it."""
 TIP = "Double-click: reset to 0. Ctrl+click: type a value. Shift+drag: fine adjustment."
 
 
 def parse_strength(text: str, most: float = 1.0) -> float | None:
-    """Parse a typed strength ("0.7", "70%", ",7") and clamp it to 0..`most`; return None if it is no
-    number."""
+    """Parse a typed strength ("0.7", "70%", ",7") and clamp it to 0..`most`; return None if it is
+    not a number."""
     cleaned = text.strip().replace(",", ".")
     percent = cleaned.endswith("%")
     try:

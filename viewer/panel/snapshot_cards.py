@@ -1,4 +1,4 @@
-"""Snapshots in the panel: thumbnails that restore a state, and the two that are compared."""
+"""Snapshots in the panel: thumbnails that restore a state, and the choice of the two to compare."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _MENU = "menu of a snapshot"
 
 
 def _menu(index: int, name: str) -> tuple[tuple[str, Action | None, str], ...]:
-    """Return the menu of a snapshot. The original cannot be renamed or moved."""
+    """Return the menu of a snapshot. The original cannot be renamed, moved or deleted."""
     compare = (
         ("Use as A", ChooseSnapshot("a", name), ""),
         ("Use as B", ChooseSnapshot("b", name), ""),
@@ -88,7 +88,7 @@ def _pair(cards: _Cards, compared: bool, ui: UiContext, actions: list[Action]) -
         imgui.set_next_item_width(wide)
         label = f"{slot.upper()}   {cards.names[chosen]}"
         room = wide - side - 2 * imgui.get_style().frame_padding.x
-        help_ = f"Snapshot {slot.upper()}, at the {'left' if slot == 'a' else 'right'} of a comparison"
+        help_ = f"Snapshot {slot.upper()}, on the {'left' if slot == 'a' else 'right'} of a comparison"
         shown = widgets.elide(label, room)
         pressed = widgets.drop_down(f"##snapshot {slot}", shown, cards.names, chosen, ui, help_)
         if pressed is not None:
@@ -96,7 +96,7 @@ def _pair(cards: _Cards, compared: bool, ui: UiContext, actions: list[Action]) -
 
 
 def _card(index: int, cards: _Cards, wide: float, ui: UiContext, actions: list[Action]) -> None:
-    """Draw a picture with its name and its menu."""
+    """Draw the thumbnail of a snapshot with its name and menu."""
     name = cards.names[index]
     badge = ""
     if index == cards.a:
@@ -110,7 +110,7 @@ def _card(index: int, cards: _Cards, wide: float, ui: UiContext, actions: list[A
             actions.append(OnItem("restore", index))
         hovered = imgui.is_item_hovered()
         widgets.tip(
-            "Restore. Right-click: rename, A, B, reorder, delete"
+            "Restore. Right-click: rename, compare, reorder, delete"
             if index
             else "Restore the original: all sliders at 0"
         )

@@ -1,6 +1,6 @@
 """Timeline along the lower edge of the picture: keyframes and playhead to drag, rows, and settings.
 
-It changes no state: it returns commands of `timeline.ACTIONS`, like keyboard input.
+It changes no state: it returns commands, like keyboard input.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from viewer.ui.overlay import Area
 from viewer.ui.widgets import elide, hint, icon_button, icon_row, inert, is_released, plate, tip
 
 HEIGHT_PX = 46.0  # height of the bar, at 1×
-ROW_PX = 33.0  # height of its second line
+ROW_PX = 33.0  # height of the second line of a narrow bar
 TRACK_PX = 20.0  # height of a row of keyframes
 _MAX_SHARE = 0.35  # maximum height of the rows, as a share of the picture's height
 ROOMY_PX = 640.0  # a narrower bar has its settings in a second line
-SETTINGS_PX = 293.0
-BUTTONS_PX = 143.0
+SETTINGS_PX = 293.0  # width of the settings
+BUTTONS_PX = 143.0  # width of the buttons
 _KEY_PX = 5.0  # half the size of a key
 _GRIP_PX = 8.0  # distance within which the mouse grabs a key
 _CURVE_PX = 3.0  # distance between two points of a curve
@@ -54,7 +54,7 @@ class _Ruler:
     player: Player
     keys: Mapping[RowKey, Keyframe]  # keys of each row, see `split_keys`
     start: float  # x of frame 0, window pixels
-    span: float  # distance from there to the last frame
+    span: float  # distance from frame 0 to the last frame, window pixels
     ui: UiContext
 
     @property
@@ -146,7 +146,7 @@ def _buttons(timeline: Timeline, player: Player, actions: list[Action], ui: UiCo
     items = (
         ("play", icon, "" if can_play else "Set at least two keyframes to play"),
         ("key", icons.ICON_FA_DIAMOND, "Replaces the current one" if here else ""),
-        ("drop_key", icons.ICON_FA_TRASH_CAN, "The chosen keyframes" if chosen else ""),
+        ("drop_key", icons.ICON_FA_TRASH_CAN, "The selected keyframes" if chosen else ""),
     )
     off = []
     if not can_play:
@@ -173,7 +173,7 @@ def _settings(work: Workspace, ruler: _Ruler, actions: list[Action]) -> None:
             easing = (ruler.keys[min(chosen)] if chosen else key_before(timeline, ruler.frame)).easing
         if imgui.button(f"{easing.capitalize()}##easing", (58.0 * ui.scale, 0.0)):
             actions.append(Plain("easing"))
-    hint("easing", "Chosen keyframes first")
+    hint("easing", "Of the selected keyframes, if any")
     imgui.same_line(0.0, gap)
     if icon_button("ping_pong", icons.ICON_FA_RIGHT_LEFT, ui, dim=not timeline.ping_pong):
         actions.append(Plain("ping_pong"))
@@ -219,7 +219,7 @@ def _drag(
     ruler: _Ruler,
     actions: list[Action],
 ) -> int | None:
-    """Drag the keys under the mouse, with Ctrl copies of them, otherwise the playhead.
+    """Drag the keys under the mouse, copies of them with Ctrl, or else the playhead.
 
     Returns:
         Frame of the keys under the mouse, None without any.

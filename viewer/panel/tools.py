@@ -116,7 +116,7 @@ Value = TypeVar("Value")
 
 
 class _Bar:
-    """Layout that places items beside each other and breaks the line at its end."""
+    """Layout that places items on a line and wraps them at its end."""
 
     def __init__(self, limit: float, ui: UiContext) -> None:
         self.limit = limit  # end of the line, window pixels
@@ -131,7 +131,7 @@ class _Bar:
     def segments(
         self, name: str, options: dict[Value, str], current: Value, help_: str, action: str = ""
     ) -> Value:
-        """Draw a choice of a few values and return the chosen one."""
+        """Draw a row of joined buttons and return the chosen value."""
         wide = sum(imgui.calc_text_size(text).x + 14.0 * self.ui.scale for text in options.values())
         self.follow(wide)
         pressed = choice(name, options, current, self.ui, wide)
@@ -168,7 +168,7 @@ class _Bar:
 def draw_options(
     work: Workspace, area: Area, ui: UiContext, actions: list[Action]
 ) -> tuple[Workspace, float]:
-    """Draw the bar above the picture with the options of the active tool and the actions for the selection.
+    """Draw the bar at the top of the picture: options of the active tool, and actions for the selection.
 
     Returns:
         The changed workspace; the y of the bar's lower edge, 0 if there is none.
@@ -178,7 +178,7 @@ def draw_options(
         return work, 0.0
     left = (TOOLBAR_PX + 2 * EDGE_PX) * ui.scale
     right = area.width - EDGE_PX * ui.scale
-    narrow = area.width < NARROW_PX * ui.scale  # otherwise it leaves the axes free
+    narrow = area.width < NARROW_PX * ui.scale  # a wider picture has room for the bar beside the axes
     bar = _Bar(right - (0.0 if narrow else view_width(view, area, ui)) - EDGE_PX * ui.scale, ui)
     with plate("options", (left, EDGE_PX * ui.scale), ui):
         imgui.push_style_var(imgui.StyleVar_.item_spacing, (EDGE_PX * ui.scale, EDGE_PX * ui.scale))
@@ -224,8 +224,8 @@ def _select_options(tool: SelectTool, bar: _Bar) -> SelectTool:
     modes = dict(zip(SELECT_MODES, ("New", "Add", "Subtract", "Intersect"), strict=True))
     help_ = f"Effect on the current selection.\n{MODES}"
     if tool.tool == "scribble":
-        modes = {"new": "On it", "subtract": "Beside it"}
-        help_ = "Position of the next stroke: on the object, or beside it (Ctrl)"
+        modes = {"new": "Object", "subtract": "Background"}
+        help_ = "The next stroke marks the object, or the background (Ctrl)"
     tool = replace(tool, mode=bar.segments("mode", modes, tool.mode, help_))
     if tool.tool not in ("sphere", "flood", "scribble"):
         through = bar.segments("depth", _DEPTHS, tool.through, "", "select_through")
@@ -236,7 +236,7 @@ def _select_options(tool: SelectTool, bar: _Bar) -> SelectTool:
         radius = bar.slider("Radius", tool.radius, ends, SelectTool.radius, help_, "%.0f px")
         tool = replace(tool, radius=radius)
     if tool.tool in ("flood", "color"):
-        help_ = f"Maximum difference to the clicked color ({_SIZE_KEYS}). It updates the last click"
+        help_ = f"Maximum difference from the clicked color ({_SIZE_KEYS}). A change updates the last click"
         tolerance = bar.slider("Tolerance", tool.tolerance, (0.01, 1.0), SelectTool.tolerance, help_)
         tool = replace(tool, tolerance=tolerance)
     return tool
@@ -278,7 +278,7 @@ def _brush_options(view: ViewState, focus: int | None, bar: _Bar, actions: list[
     """Draw the options of the brush."""
     brush = view.brush
     modes = {"add": "Add", "erase": "Erase", "smooth": "Smooth"}
-    help_ = "While painting, Ctrl inverts and Shift smooths"
+    help_ = "While painting, Ctrl swaps Add and Erase, and Shift smooths"
     brush = replace(brush, mode=bar.segments("mode", modes, brush.mode, help_, "brush_mode"))
     ends = (SMALLEST_PX, LARGEST_PX)
     help_ = f"Brush radius ({_SIZE_KEYS})"
@@ -289,7 +289,7 @@ def _brush_options(view: ViewState, focus: int | None, bar: _Bar, actions: list[
     flow = bar.slider("Flow", brush.flow, (0.0, 1.0), Brush.flow, help_)
     value = brush.value
     if brush.mode == "add":
-        value = bar.slider("Value", value, (0.0, 1.0), Brush.value, "Share of the edit that Add paints")
+        value = bar.slider("Value", value, (0.0, 1.0), Brush.value, "Weight that Add paints, 0 to 1")
     through = bar.segments("depth", _DEPTHS, brush.through, "", "brush_through")
     help_ = "Tint parts with less than the full edit, or color all weights from blue (0) to yellow (1)"
     kinds = {False: "Tint", True: "Colors"}
@@ -400,7 +400,7 @@ def _word(name: str, text: str, bright: bool, ui: UiContext) -> bool:
 
 
 def _choose_comparison(compare: Comparison, snapshots: bool, ui: UiContext) -> Comparison:
-    if imgui.menu_item("Edited alone", "", compare.mode == "off")[0]:
+    if imgui.menu_item("Edited only", "", compare.mode == "off")[0]:
         compare = replace(compare, mode="off")
     for mode in _COMPARISONS:
         if menu_item(mode, compare.mode == mode):
@@ -413,7 +413,7 @@ def _choose_comparison(compare: Comparison, snapshots: bool, ui: UiContext) -> C
                 compare, against=against, mode="split" if compare.mode == "off" else compare.mode
             )
         if not is_available:
-            tip("There is no snapshot")
+            tip("Add a snapshot first")
     if compare.mode == "difference":
         ends = 1.0, MAX_AMPLIFIED
         gain = value_slider("##amplify", compare.amplify, ends, "Gain × %.0f", Comparison.amplify, ui)
@@ -442,7 +442,7 @@ def view_width(view: ViewState, area: Area, ui: UiContext) -> float:
 
 def draw_view(view: ViewState, area: Area, foot: float, ui: UiContext, actions: list[Action]) -> ViewState:
     """Draw the buttons under the axes: frame, home, and the view settings. `foot`: lower edge of the
-    options bar"""
+    options bar, window pixels."""
     top = max(overlay.axes_height(view, area, ui), EDGE_PX * ui.scale)
     if top < foot and area.width < NARROW_PX * ui.scale:
         return view  # the options bar covers it

@@ -1,4 +1,4 @@
-"""Jobs at the bottom of the panel, training and deliveries: a strip that unfolds to one card per job."""
+"""Training, export and render jobs at the bottom of the panel: a strip that unfolds to one card per job."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from viewer.state.workspace import JobCard
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, Rgba, UiContext, u32
 from viewer.ui.widgets import card, elide, menu_items, right_edge, small, tip, wrapped_text
 
-BAR_PX = 5.0
-STRIP_PX = 28.0
+BAR_PX = 5.0  # height of a progress bar, at 1×
+STRIP_PX = 28.0  # height of the strip, at 1×
 _MENU = "menu of a training"
 _DISCARD = "Discard…"
-_NOTHING_WRITTEN = "Nothing is written"
+_NOTHING_WRITTEN = "No file will be written"
 
 
 def height(jobs: Sequence[JobCard], ui: UiContext) -> float:
@@ -202,21 +202,21 @@ def _status_text(job: JobCard) -> str:
             return "Saving the state" if job.training else _NOTHING_WRITTEN
         case "done":
             return ""
-    return f"{100 * job.share:.0f} % is done" if job.share else "Can be resumed"
+    return f"{100 * job.share:.0f} % done" if job.share else "Can be resumed"
 
 
 _STOP_HELP = "Stop; the run can be resumed later"
 _CANCEL = ("Cancel", "stop_run", "Remove it from the queue")
-_CLOSE = ("Close", "close_run", "Remove the card; the files stay")
+_CLOSE = ("Close", "close_run", "Remove the card; files are kept")
 _BUTTONS = {
     ("running", True): (("Stop", "stop_run", _STOP_HELP),),
     ("running", False): (("Stop", "stop_run", _NOTHING_WRITTEN),),
     ("queued", True): (_CANCEL,),
     ("queued", False): (_CANCEL,),
-    ("stopped", True): (("Resume", "resume_run", "Resume the run"),),
-    ("failed", True): (("Retry", "resume_run", "Try again"),),
+    ("stopped", True): (("Resume", "resume_run", "Continue from the saved progress"),),
+    ("failed", True): (("Retry", "resume_run", "Start again, from the saved progress if there is any"),),
     ("failed", False): (_CLOSE,),
     ("done", True): (_CLOSE,),
     ("done", False): (("Show in folder", "show_file", ""), ("Copy path", "copy_path", ""), _CLOSE),
 }
-"""Text, action and tooltip of the buttons, by status and by whether the job is a training."""
+"""Text, action and tooltip of the buttons. Keys: status, and True for a training."""

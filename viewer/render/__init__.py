@@ -1,1 +1,1 @@
-"""From state to pixels."""
+"""Rendering of the state: engine, renderers, dynamic resolution, highlights, picking."""

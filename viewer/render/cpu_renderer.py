@@ -29,8 +29,8 @@ from .ground_grid import CLEAR, Lines
 BAND = 300_000
 """Number of Gaussians per additional band of a full picture.
 
-Bands make parts of the picture visible early and can be cancelled sooner when motion begins. Each band costs
-a pass over all Gaussians.
+Bands show parts of the picture early, and let it be canceled sooner when motion begins. Each band costs a
+pass over all Gaussians.
 """
 MAX_BANDS = 5  # largest number of bands
 MIN_ROWS = 64  # approximate smallest height of a band, px

@@ -34,7 +34,7 @@ BUDGETS = 20_000, 50_000, 500_000
 """Limits on the number of Gaussians in a picture during motion: smallest, initial, largest."""
 
 MOVING_MS = 20.0, 27.0
-"""Target range for the time of a picture during motion, in ms, slightly less than its frame.
+"""Target range of the drawing time of a picture during motion, in ms. A frame takes slightly longer.
 
 Outside the range, the next picture has fewer or more Gaussians.
 """
@@ -43,31 +43,31 @@ ERROR_LIMITS_PX2 = (0.25, 4.0, 64.0)
 """Smallest, initial and largest limit of the pyramid's merging error of a node, pixels²."""
 
 FINE_ERROR = 9e-4
-"""Target mean squared error of a picture during motion (30.5 dB), so that the following ones have 30 dB.
+"""Target mean squared error of a picture during motion (30.5 dB), so that later ones keep 30 dB.
 
 The error limit that achieves it is measured whenever a full picture follows one drawn during motion.
 """
 
 FINE_MS = 6.0, 7.5
-"""Times of a picture during motion, in ms: below the first it gets finer, above the second coarser again.
+"""Limits of a picture's drawing time in ms: below the first, the next one is finer, above the second coarser.
 
-With the window's own time a frame has 12 ms.
+With the time of the window itself, a frame takes 12 ms.
 """
 
 SLOW_MS = 40.0
-"""Longest time of a picture before "auto" halves its sides, in ms: 25 pictures per second."""
+"""Drawing time in ms above which "auto" halves width and height: 25 pictures per second."""
 
 REST_S = 0.06
 """Time without input before the full picture is begun, in seconds. Drawing it does not block the window."""
 
 POLL_S = 0.01
-"""Interval for polling whether it is done, in seconds."""
+"""Interval for polling the full picture, in seconds."""
 
 SLOW_SCENE_GAUSSIANS = 150_000
 """Number of Gaussians from which CPU pictures are assumed to be slow before the first one is measured."""
 
 JUMP_MS = 100.0
-"""Longest time of a single picture after a click or a key, in ms, before it is drawn in the background."""
+"""Drawing time in ms above which a picture after a click or a key is drawn in the background."""
 
 COARSE_PIXELS = 2
 """Number of window pixels per pixel of a coarse picture, along each axis."""
@@ -211,8 +211,8 @@ class LiveScene:
         self._scene = scene
         self._highlights: Array | None = None  # rgb and share, 0 to 1; None for no highlights. [N,4]
         self._budget = BUDGETS[1]
-        self._finest = ERROR_LIMITS_PX2[1]
-        self._max_finest = ERROR_LIMITS_PX2[1]
+        self._finest = ERROR_LIMITS_PX2[1]  # error limit of the next picture in motion, pixels²
+        self._max_finest = ERROR_LIMITS_PX2[1]  # its largest value, see `measure`
         self._limit = 0.0  # error limit of the last picture in motion, pixels²; 0 if it had all Gaussians
         self._pyramid: Future[Pyramid] | None = None
         # outdated rows of the pyramid: 0 up to date, 1 colors only, 2 more. [N] uint8

@@ -162,7 +162,7 @@ class ViewEngine:
         camera: Camera | None = None,
         pixels: int = 1,
     ) -> Image:
-        """Render the picture as an array: upper row first, linear as drawn, not clamped.
+        """Render the picture as an array: upper row first, not clamped.
 
         Args:
             view: state to draw

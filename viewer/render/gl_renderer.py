@@ -123,14 +123,14 @@ class GlRenderer:
         return live.draw_fewer(draw, camera, pixels)
 
     def prepare(self, camera: Camera, background: Vec3) -> bool:
-        """Begin a slow picture in the background. Return whether `draw` can return it at once.
+        """Begin a slow picture in the background. Return whether `draw` can finish it at once.
 
-        Any other call cancels the pending picture.
+        Any other call cancels the pending picture. With OpenGL no picture is slow.
         """
         return True
 
     def follow(self, last: object) -> bool:
-        """Take over another renderer's picture until there is a new one. Return whether there was one."""
+        """Take over another renderer's picture until the next draw. Return False if it is not possible."""
         return False
 
     def pixels(self) -> Image:

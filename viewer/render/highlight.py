@@ -16,7 +16,7 @@ from viewer.state.view_state import ViewState
 from viewer.state.workspace import Pointed
 
 RAMP_SHARE = 0.75
-"""Share of the color ramp in a member's color. The remainder keeps its shape recognizable."""
+"""Share of the color ramp in a member's color. The remainder keeps the shading recognizable."""
 
 THIN_TINT_SHARE = 0.2
 """Share of the thin tint at weight 0, falling to 0 at weight 1, so that the result stays visible."""

@@ -148,11 +148,11 @@ def _alphas(
 
 
 PREPARE_MIN_GAUSSIANS = 100_000
-"""Number of Gaussians below which nothing is prepared ahead, as on demand it takes about 0.1 s."""
+"""Number of Gaussians below which no surface is prepared ahead, as it takes only about 0.1 s on demand."""
 
 
 class Surfaces:
-    """Cache of the surface of the picture at rest."""
+    """Cache of the surface of the still picture."""
 
     def __init__(self) -> None:
         self._key: object = None

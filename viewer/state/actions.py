@@ -62,7 +62,8 @@ def toggle_snapshots(view: ViewState) -> ViewState:
 
 
 def end_at_edit(before: Workspace, after: Workspace) -> Workspace:
-    """End a comparison of snapshots if `after` changes layers, so that the change is visible."""
+    """End a comparison of snapshots if `after` changes layers, groups or the blend rule, so that this is
+    visible."""
     view_before = before.view
     view = after.view
     edited = (view.layers, view.groups, view.blend) != (
@@ -81,7 +82,7 @@ FEATHER = 0.1
 
 
 def perform(workspace: Workspace, action: Action, facts: SceneFacts, aspect: float = 1.0) -> Workspace:
-    """Return the workspace after a command. Unknown commands become requests to the window.
+    """Return the workspace after a command. Commands without a handler here become requests to the window.
 
     Args:
         action: the command
@@ -91,7 +92,7 @@ def perform(workspace: Workspace, action: Action, facts: SceneFacts, aspect: flo
     if action == Plain("invert"):
         action = Plain("paint_invert" if workspace.view.brush.active else "select_invert")
     name = action.name
-    if name in ("focus", "press_layer", "unfocus"):  # focusing a layer deselects the keys
+    if name in ("focus", "press_layer", "unfocus"):  # focusing a layer deselects the timeline keys
         workspace = replace(workspace, player=replace(workspace.player, chosen=frozenset()))
     if name in ("frame", "home"):
         return (_frame if name == "frame" else _home)(workspace, facts, aspect)
@@ -114,7 +115,7 @@ def perform(workspace: Workspace, action: Action, facts: SceneFacts, aspect: flo
 
 
 def _edit_again(workspace: Workspace, index: int, facts: SceneFacts) -> Workspace:
-    """Fill the form with the settings of a layer's edit, if one of the form's editors made it."""
+    """Open the form with the settings of a layer's edit, if one of the form's editors made it."""
     layer = workspace.view.layers[index]
     regions = workspace.view.selection.regions
     row = facts.rows[layer.gdf]
@@ -156,7 +157,7 @@ OF_EDITS = {"again": _edit_again, "limit_to_selection": _limit_paint, "select_pa
 
 
 def _frame(workspace: Workspace, facts: SceneFacts, aspect: float) -> Workspace:
-    """Frame the selection, the focused layer or the scene's subject. The view direction is unchanged."""
+    """Frame the selection, else the focused layer, else the scene. The view direction is unchanged."""
     fit = facts.fit
     selected = workspace.view.selection
     if selected.count:
@@ -177,7 +178,7 @@ def _home(workspace: Workspace, facts: SceneFacts, aspect: float) -> Workspace:
 
 
 def _view_from(workspace: Workspace, name: str) -> Workspace:
-    """Look from a named side or along an axis, see `viewer.camera.views.NAMED_VIEWS`."""
+    """Look from a named side or from the end of an axis, see `viewer.camera.views.look_at_view`."""
     return with_camera(workspace, look_at_view(workspace.view.camera, name))
 
 
@@ -193,7 +194,7 @@ def _toggle(workspace: Workspace, number: int) -> Workspace:
 
 
 def _select_slider(workspace: Workspace, by: int, facts: SceneFacts) -> Workspace:
-    """Select the next slider of the focused layer. A gain's slider is unfolded so that it is visible."""
+    """Select the next (1) or previous (−1) slider of the focused layer. For a gain, unfold the details."""
     if workspace.focus is None:
         return workspace
     view = workspace.view
@@ -207,7 +208,7 @@ def _select_slider(workspace: Workspace, by: int, facts: SceneFacts) -> Workspac
 
 
 def _rename(workspace: Workspace, index: int | None) -> Workspace:
-    """Edit the name of a layer in a text field (default: the focused layer)."""
+    """Open the text field for the name of a layer (default: the focused layer)."""
     return replace(workspace, renaming=workspace.focus if index is None else index)
 
 
@@ -280,7 +281,7 @@ def _resize(workspace: Workspace, times: float) -> Workspace:
 
 
 def _close_or_unfocus(workspace: Workspace, _: None) -> Workspace:
-    """Close or deactivate the first active item: key list, brush, tool, form, multi-selection, focus."""
+    """Close the first active one, in this order: key list, brush, tool, form, multi-selection, focus."""
     if workspace.help:
         return replace(workspace, help=False)
     if workspace.view.brush.active:
@@ -317,7 +318,7 @@ def _toggle_cards(workspace: Workspace, _: None) -> Workspace:
 
 
 def _next_value(workspace: Workspace, name: str, values: Sequence[str]) -> Workspace:
-    """Set an attribute of the view to the value that follows its current one."""
+    """Set an attribute of the view to the next of `values`, cyclically."""
     changes: dict[str, Any] = {name: following(values, getattr(workspace.view, name))}
     return replace(workspace, view=replace(workspace.view, **changes))
 
@@ -333,7 +334,7 @@ def _go_to_entry(workspace: Workspace, past: History) -> Workspace:
 def _perform_on_timeline(workspace: Workspace, action: Action) -> Workspace:
     view, player = timeline.perform(workspace.view, workspace.player, action)
     past = history.follow_look(workspace.past, workspace.view, view)
-    if loses_strengths(workspace, view):  # a separate entry, or part of the edit of the keys
+    if loses_strengths(workspace, view):  # undo restores them: by a separate entry, or with the keys
         if action.name not in ("move_keys", "clone_keys"):
             past = history.record(past, view, workspace.snapshots)
     elif past.present.edit.layers == workspace.view.layers:
@@ -376,7 +377,7 @@ def _choose_snapshot(workspace: Workspace, action: ChooseSnapshot) -> Workspace:
 def _move_keyboard_focus(workspace: Workspace, by: float) -> Workspace:
     """Move the keyboard focus to the next or previous part of the window.
 
-    The picture follows the last part.
+    The picture comes after the last part and before the first one.
     """
     places = ("", *PLACES)
     at = (places.index(workspace.keyboard) + int(by)) % len(places)
@@ -397,7 +398,7 @@ def _new_edit(workspace: Workspace, _: None) -> Workspace:
 
 
 GLIDES = ("frame", "home", "look")
-"""Names of the commands that move the camera, which the window animates as a glide."""
+"""Names of the commands whose camera move is animated as a glide."""
 ACTIONS: dict[str, Callable[[Workspace, Any], Workspace]] = {
     "focus": _focus,
     "unfocus": _close_or_unfocus,
@@ -465,4 +466,4 @@ ACTIONS: dict[str, Callable[[Workspace, Any], Workspace]] = {
     "new_edit": _new_edit,
     "panel": lambda w, _: replace(w, view=replace(w.view, panel=not w.view.panel)),
 }
-"""Function of each other command; it receives the command's `argument`."""
+"""Handlers of all other commands; each receives the workspace and the command's `argument`."""

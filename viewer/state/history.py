@@ -15,12 +15,12 @@ from viewer.camera.view_camera import Vec3, ViewCamera, with_up
 from .selection import SelectionState
 from .view_state import Blend, Comparison, LayerGroup, LayerState, SnapshotPair, Timeline, ViewState
 
-LONGEST = 1000  # maximum entries; each takes a few hundred bytes, or some kilobytes with a selection
+LONGEST = 1000  # maximum number of entries; each takes a few hundred bytes, with a selection some kilobytes
 
 
 @dataclass(frozen=True)
 class Edit:
-    """Part of the state that undo restores."""
+    """Edits, timeline and selection that an undo entry restores."""
 
     layers: tuple[LayerState, ...]
     blend: Blend
@@ -33,7 +33,7 @@ class Edit:
 
 @dataclass(frozen=True)
 class ViewSettings:
-    """View settings that the user changes."""
+    """View settings that an undo entry restores if the user has changed them."""
 
     up: Vec3 = ViewCamera.up
     fov_y: float = ViewCamera.fov_y
@@ -100,7 +100,7 @@ def record(history: History, state: ViewState, snapshots: tuple[Any, ...] = ()) 
     if step == present:
         return history if seen == history.seen else replace(history, seen=seen)
     if history.past and _only_compares(history.past[-1], present) and _only_compares(present, step):
-        *past, before = history.past  # switching comparisons back and forth leaves no trail
+        *past, before = history.past  # switching comparisons back and forth adds no entries
         return History(step, tuple(past) if step == before else history.past, seen=seen)
     return History(step, (*history.past, present)[-LONGEST:], seen=seen)
 
@@ -118,7 +118,7 @@ def merge(history: History) -> History:
 def follow_playhead(history: History, before: ViewState, after: ViewState) -> History:
     """Update the present entry with strengths that the playhead moved.
 
-    No entry is made, and gestures in progress stay unrecorded.
+    This adds no entry, and gestures in progress stay unrecorded.
     """
     if after.layers == before.layers:
         return history

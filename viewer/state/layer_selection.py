@@ -26,10 +26,10 @@ from .view_state import LayerState, ViewState
 from .workspace import Workspace
 
 PRESSES = ("one", "keep", "toggle", "range")
-"""Effects of a press on a card.
+"""Effects of a press on the card of a layer.
 
-"one" selects it alone, "keep" selects it alone unless it is one of several, "toggle" (Ctrl) adds or removes
-it, "range" (Shift) selects all cards from the focus to it.
+"one" selects the layer alone, "keep" selects it alone unless it is already selected, "toggle" (Ctrl) adds or
+removes it, "range" (Shift) selects all listed layers from the focused one to it.
 """
 
 
@@ -68,7 +68,7 @@ def press(workspace: Workspace, action: PressLayer) -> Workspace:
 
 
 def select_layers(workspace: Workspace, group: str | None = None) -> Workspace:
-    """Select all layers of a group, or all layers. If the focus is not among them, focus the topmost one."""
+    """Select all layers of a group, or all layers. If none of them is focused, focus the topmost."""
     layers = workspace.view.layers
     chosen = [i for i, layer in enumerate(layers) if not group or layer.group == group]
     if not chosen:
@@ -133,7 +133,7 @@ def nudge(workspace: Workspace, by: float) -> Workspace:
 
 
 def reset(workspace: Workspace, everything: bool) -> Workspace:
-    """Reset strengths to 0 and gains to 1 of the selected layers, or of all layers and groups.
+    """Reset the selected layers, or all layers and groups: strengths to 0, gains and group strengths to 1.
 
     Locked layers are unchanged.
     """

@@ -95,7 +95,7 @@ def move_layers(view: ViewState, indices: Collection[int], at: int, group: str =
     Args:
         view: the state
         indices: layers to move
-        at: insert them above those of the `at` lowest layers that do not move
+        at: gap to insert them into: the number of layers below it before the move
         group: group that they join, or "" for none; a group whose layers all move stays a group
     """
     remaining = [layer for i, layer in enumerate(view.layers) if i not in indices]
@@ -110,7 +110,7 @@ def move_layers(view: ViewState, indices: Collection[int], at: int, group: str =
 
 
 def step_layers(view: ViewState, indices: Collection[int], by: int) -> ViewState:
-    """Move layers past the next one above (1) or below (−1), up to the ends of the stack.
+    """Move layers past the next layer above (1) or below (−1). At the end of the stack nothing changes.
 
     Layers that end up between two layers of a group join it. Layers that move away from their group leave it.
     Whole groups move past whole groups.

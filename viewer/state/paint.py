@@ -35,8 +35,8 @@ class Stroke:
     """Brush stroke in progress."""
 
     before: Floats  # initial weights, 0 to 1. [M]
-    # x and y of each member in the picture, px, and f·log(depth), so that distances match the apparent ones;
-    # NaN for members that the brush cannot reach. [M,3]
+    # x, y and focal length · log(depth) of each member, px, so that depth differences count like distances in
+    # the picture; NaN for members that the brush cannot reach. [M,3]
     places: Floats
     reached: Floats  # largest brush influence so far, 0 to 1. [M]
     mode: str = "erase"  # one of `BRUSH_MODES`
@@ -61,7 +61,7 @@ def softness(share: float) -> float:
 
 
 def encode(weights: Floats) -> str:
-    """Encode weights (0 to 1) as the text stored in states and sessions; `FULL` if all are 1. [M]"""
+    """Encode weights [M] (0 to 1) as the text stored in states and sessions; `FULL` if all are 1."""
     levels = np.round(np.clip(weights, 0.0, 1.0) * 255.0).astype(np.uint8)
     if (levels == 255).all():
         return FULL

@@ -25,7 +25,7 @@ from progdf.scene.selection import Mask, combine
 from .commands import Action, OnItem, SelectRegion
 
 SUFFIX = ".region.npy"
-"""File name suffix of a region, after its name."""
+"""Suffix of a region's file name, after the region's name."""
 LONGEST_NAME = 60  # characters in the name of a region
 MAX_REGIONS = 1000
 """Largest number of regions of a scene, few enough to draw and save at once."""
@@ -51,7 +51,7 @@ COLORS: tuple[Color, ...] = (
 class NamedRegion:
     """Selection saved under a name."""
 
-    name: str  # no two regions share one
+    name: str  # unique among the regions
     path: Path  # file of its rows, for `progdf train --region file:PATH`
     members: bytes  # its packed mask
     count: Annotated[int, Meta(ge=0)]  # number of its members
@@ -199,7 +199,7 @@ def free_name(state: SelectionState, text: str, is_taken: Callable[[str], bool] 
 
 
 def add_region(state: SelectionState, name: str, path: Path) -> SelectionState:
-    """Add the selection as a region. It stays selected.
+    """Add the selection as a region. The selection is unchanged.
 
     Raises:
         ProgdfError: there are already `MAX_REGIONS`.

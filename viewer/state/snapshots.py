@@ -75,7 +75,10 @@ def with_original(snapshots: Sequence[SliderSnapshot], view: ViewState) -> tuple
 
 
 def restore(view: ViewState, snapshot: SliderSnapshot) -> ViewState:
-    """Restore a snapshot in `view`. Edits opened since then stay in the stack at strength 0."""
+    """Restore a snapshot in `view`. Edits opened since then stay in the stack at strength 0.
+
+    The camera, the timeline and the selection are unchanged.
+    """
     known = {layer.gdf for layer in snapshot.edit.layers}
     later = tuple(replace(layer, strength=0.0, group="") for layer in view.layers if layer.gdf not in known)
     restored = replace(history.apply_edit(view, snapshot.edit), pair=view.pair)
@@ -85,7 +88,10 @@ def restore(view: ViewState, snapshot: SliderSnapshot) -> ViewState:
 
 
 def pair_of(snapshots: Sequence[SliderSnapshot], pair: SnapshotPair) -> tuple[int, int]:
-    """Return the indices of A and B in `snapshots` (the original first). Unnamed ones are the last two."""
+    """Return the indices of A and B in `snapshots` (the original first).
+
+    A side without a name is the last snapshot but one (A) or the last one (B).
+    """
     places = {snapshot.name: i for i, snapshot in reversed(list(enumerate(snapshots)))}
     return places.get(pair.a, max(len(snapshots) - 2, 0)), places.get(pair.b, len(snapshots) - 1)
 

@@ -52,7 +52,7 @@ def keys_at(timeline: Timeline, frame: int) -> list[RowKey]:
 def with_key(timeline: Timeline, frame: int, view: ViewState, rows: Sequence[int] | None = None) -> Timeline:
     """Set a key at a frame from the camera and strengths of `view`.
 
-    A key that is already there is replaced and passes on its easing.
+    It replaces an existing key. Its easing is that of the replaced key, else of the key before.
 
     Args:
         timeline: the timeline
@@ -104,7 +104,7 @@ def key_before(timeline: Timeline, frame: int) -> Keyframe:
 
 
 def set_length(timeline: Timeline, length: int) -> Timeline:
-    """Set the last frame, clamped to the last key (so that no key is lost) to `MAX_FRAME`."""
+    """Set the last frame, at most `MAX_FRAME`. It stays at or after the last key, so that no key is lost."""
     last = timeline.keys[-1].frame if timeline.keys else 0
     return replace(timeline, length=max(1, last, min(length, MAX_FRAME)))
 
@@ -115,7 +115,7 @@ def with_fps(timeline: Timeline, fps: int) -> Timeline:
 
 
 def neighbor(timeline: Timeline, frame: int, step: int) -> int:
-    """Return the frame of the next (step 1) or previous (−1) key, or else the end of the timeline."""
+    """Return the frame of the next (step 1) or previous (−1) key, else the last or first frame."""
     frames = [key.frame for key in timeline.keys]
     if step > 0:
         return min((f for f in frames if f > frame), default=timeline.length)
@@ -278,7 +278,7 @@ def _step_frames(timeline: Timeline, frame: int, backwards: bool, steps: int) ->
 
 
 def _key(view: ViewState, player: Player, row: int | None) -> tuple[Timeline, Player]:
-    """Set a key at the playhead for the named row, or for all rows."""
+    """Set a key at the playhead in the given row, or in all rows."""
     rows = None if row is None else [row]
     return with_key(view.timeline, player.frame, view, rows), replace(player, shown=True)
 

@@ -1,4 +1,4 @@
-"""State of the moment: what lies over the picture and follows the pointer. It is neither undone nor saved."""
+"""Transient state: overlays on the picture, tool pointer, recent files. It is neither undone nor saved."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Gizmo:
 
     @property
     def is_moved(self) -> bool:
-        """True if the selection is not at its original position."""
+        """True if the selection has been moved, rotated or scaled."""
         return not np.allclose(self.matrix, np.eye(4), atol=1e-9)
 
 
@@ -69,26 +69,23 @@ class KeyPointer:
     """Pointer of a tool when it is moved by keys."""
 
     at: tuple[float, float] | None = None  # in the window; None while the mouse moves it
-    down: bool = False  # keys pressed the button
+    down: bool = False  # a key holds its button down
 
 
 @dataclass(frozen=True)
 class StartFile:
-    """File on the start page: a recently opened scene or session, or an example.
-
-    `texture`: GL name of its picture, 0 for none; `missing`: the file no longer exists
-    """
+    """File on the start page: a recently opened scene or session, or an example."""
 
     path: Path  # an example's bundle file
-    texture: int = 0
-    title: str = ""  # empty: the file's name
+    texture: int = 0  # GL name of its picture, 0 for none
+    title: str = ""  # "" for the file's name
     line: str = ""  # text below the title
-    missing: bool = False
+    missing: bool = False  # the file no longer exists
 
 
 @dataclass(frozen=True)
 class Transient:
-    """State of the moment."""
+    """Transient state of the window."""
 
     cover: Cover | None = None  # image drawn over the picture
     preview: PreviewState = PreviewState()  # state of the preview of a new edit

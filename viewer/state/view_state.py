@@ -50,7 +50,7 @@ class LayerState:
     """Layer: an edit, given by its index in the engine's list, and its strength and options."""
 
     gdf: int  # index into the engine's edits
-    name: str  # no two layers of a stack share one
+    name: str  # unique in the stack
     strength: Strength = 0.0  # 0 to 1, or to `OVERSHOOT` with overshoot on
     enabled: bool = True  # visibility; `solo` takes precedence
     gains: Gains = Gains()  # share of each kind of change, 0 to 1
@@ -64,7 +64,7 @@ class LayerState:
 class LayerGroup:
     """Group of layers with a common visibility and strength."""
 
-    name: str  # no two groups share one
+    name: str  # unique among the groups
     enabled: bool = True  # visibility; soloed layers are visible regardless
     strength: Share = 1.0  # factor on the strengths of its layers
 
@@ -143,7 +143,7 @@ class ViewState:
     layers: tuple[LayerState, ...] = ()
     blend: Blend = "adjust"
     background: tuple[Share, Share, Share] = (1.0, 1.0, 1.0)
-    panel: bool = True
+    panel: bool = True  # show the panel and all overlays
     compare: Comparison = Comparison()
     overshoot: bool = False  # extend sliders to `OVERSHOOT`, which extrapolates
     unfolded: tuple[int, ...] = ()  # edits (`LayerState.gdf`) whose gains are visible
@@ -163,7 +163,7 @@ class ViewState:
 
 
 def on_another_scene(view: ViewState, camera: ViewCamera) -> ViewState:
-    """Return the view of another scene, seen by `camera`, with the settings of the window.
+    """Return a view of another scene from `camera`, with the window's settings of `view`.
 
     All other attributes belong to the scene and are reset, including attributes added to `ViewState` later.
     """

@@ -57,13 +57,13 @@ class SceneFacts:
     count: int  # number of drawn rows: Gaussians of the scene and of its edits
     bounds: Bounds  # bounds of the bulk of the scene
     rows: Sequence[LayerRow]  # one per .gdf, indexed by `LayerState.gdf`
-    added: int = 0  # number of these that edits added
+    added: int = 0  # number of Gaussians in `count` that edits added
     origin: Origin = ZERO  # world position of the scene's coordinate origin, see `Gaussians.origin`
-    fit: Fit = keep_camera  # camera of `frame` without a selection or focused layer
-    # camera of `frame` for a selection
+    fit: Fit = keep_camera  # framing of the scene, for the command `frame`
+    # framing of a selection, for the command `frame`
     fit_members: Callable[[ViewCamera, float, Mask], ViewCamera] = lambda camera, *_: camera
-    home: Fit = keep_camera  # first camera for the up axis of the given camera
-    # both are computed on first use; scribble strokes spread over `scribbles`
+    home: Fit = keep_camera  # first view, for the up axis of the given camera
+    # computed on first use: for changes of the selection, and for scribble strokes
     neighborhood: Callable[[], Neighborhood] = _no_facts
     scribbles: Callable[[], Scribbles] = _no_facts
 
@@ -91,7 +91,7 @@ class Dialog:
     notice: str = ""  # one line about the desktop's file dialog, "" for none
     choosing: bool = False  # whether the desktop's file dialog is open
     chosen: str = ""  # file chosen in it
-    error: str = ""  # reason why the path was rejected, in one line; "" if it was not tried
+    error: str = ""  # reason why the path was rejected, in one line; "" for none
     options: DeliverOptions | None = None  # options of the requested picture or film
 
 
@@ -157,7 +157,7 @@ class Workspace:
     history: bool | None = None  # state of the history list: True when it opens, then False, None if closed
     message: Message | None = None  # line at the bottom of the picture
     snapshots: tuple[SliderSnapshot, ...] = ()  # without the original
-    # last saved state, see `saved_state`; None before the first
+    # last saved state, see `saved_state`; None before `mark_saved`
     saved: tuple[Edit, tuple[SliderSnapshot, ...]] | None = None
     dialog: Dialog | None = None  # the open dialog
     requests: tuple[Action, ...] = ()  # pending work that only the window can do
@@ -176,7 +176,7 @@ class Workspace:
 
 
 class Store:
-    """Holder of the window's workspace. The parts of the window read and replace it here alone."""
+    """Holder of the window's workspace. The parts of the window read and replace it only here."""
 
     def __init__(self, workspace: Workspace) -> None:
         self._workspace = workspace

@@ -41,7 +41,7 @@ class Palette:
     dim: Rgba = _rgb(0xA6ACB6)
     faint: Rgba = _rgb(0x868D98)
     accent: Rgba = _rgb(ACCENT)
-    ink: Rgba = _rgb(0x14161A)  # on the accent
+    ink: Rgba = _rgb(0x14161A)  # text on the accent
     handle: Rgba = _rgb(0xF2F4F7)
     error: Rgba = _rgb(0xF08674)
     warning: Rgba = _rgb(0xE0A44A)
@@ -117,7 +117,7 @@ class Fonts:
 
 
 class UiContext:
-    """One imgui context. Make it current before drawing; `close` it when done.
+    """imgui context with its fonts and scale. Make it current before drawing; `close` it when done.
 
     Args:
         scale: window pixels per design pixel, ≥ 0.5; 1 on an ordinary screen
@@ -142,11 +142,11 @@ class UiContext:
         imgui.set_current_context(self.context)
 
     def nav_flags(self, name: str) -> int:
-        """Return window flags for a part of the window that let keyboard navigation in or keep it out."""
+        """Return window flags that allow keyboard navigation only in the part that has the keyboard."""
         return 0 if self.keyboard == name else imgui.WindowFlags_.no_nav.value
 
     def child_flags(self, name: str) -> int:
-        """Return flags for a scrolling child that let keyboard navigation cross its edge."""
+        """Return flags for a scrolling child of this part that let keyboard navigation cross its edge."""
         return imgui.ChildFlags_.nav_flattened.value if self.keyboard == name else 0
 
     def take_keyboard(self, name: str) -> None:

@@ -1,6 +1,6 @@
 """Table of all commands with their keys, table of mouse drags, and translation of input into actions.
 
-Menus, tooltips, the list of keys and the command palette are built from it.
+Menus, tooltips, the list of keys and the command palette are built from the table of commands.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ class Command:
     """Action of `actions.perform` with the texts and keys that the user sees."""
 
     id: str  # text form of the action, see `parse_action`; also its name in the keys file
-    name: str  # used everywhere, also as the accessible name of its icon
-    keys: str = ""  # chords separated by blanks: modifiers in the order Ctrl, Shift, Alt, then the key's name
+    name: str  # shown in menus, tooltips, the list of keys and the palette
+    keys: str = ""  # chords separated by spaces: modifiers in the order Ctrl, Shift, Alt, then the key's name
     help: str = ""  # text of the tooltip below the name
     repeats: bool = False  # repeats while the key is held
     types: bool = False  # opens a text field
-    row: str = ""  # text for several commands in the list of keys; `JOINED` for the rest of them
-    listed: str = ""  # its keys there, if they are too many
-    in_hand: bool = False  # for an active tool or decal, whose keys have priority
+    row: str = ""  # text of a row of several commands in the list of keys; `JOINED` for the later ones
+    listed: str = ""  # keys shown there instead of `keys`
+    in_hand: bool = False  # for an active tool or decal; its keys then have priority
 
     @property
     def action(self) -> Action:
@@ -52,6 +52,7 @@ FLY_KEYS = {"W": (0, 0, 1), "S": (0, 0, -1), "A": (-1, 0, 0), "D": (1, 0, 0), "Q
 """Physical keys (positions on a US keyboard) → right, up, ahead."""
 
 NUDGES = (("", 0.01), ("Shift+", 0.10), ("Ctrl+", 0.001))
+"""Modifier of an arrow key, and its step of a slider."""
 
 
 JOINED = "-"
@@ -95,7 +96,7 @@ def _steps(action: str, what: str, modifier: str = "", repeats: bool = False) ->
 def _zooms() -> Iterator[Command]:
     yield Command("zoom:1.1", "Larger interface", "Ctrl+= Ctrl+Shift+=")
     yield Command("zoom:0.9091", "Smaller interface", "Ctrl+-")
-    yield Command("zoom:0", "Interface as at first", "Ctrl+0")
+    yield Command("zoom:0", "Reset interface size", "Ctrl+0")
 
 
 MODES = "Shift adds, Ctrl subtracts, both intersect"
@@ -130,14 +131,14 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("cards", "Compact rows", "Alt+G"),
         Command("rename", "Rename…", "Enter", types=True),
         Command("duplicate", "Duplicate", "Ctrl+D"),
-        Command("replace", "Replace…", "", "Replace it by another edit"),
+        Command("replace", "Replace…", "", "Replace its edit by another one"),
         Command("again", "Again with other settings", "", "Open the form with the settings of this edit"),
         Command("remove", "Delete", "Ctrl+Delete"),
-        Command("limit_to_selection", "Limit to the selection", "", "Set its paint to 0 elsewhere"),
+        Command("limit_to_selection", "Limit to the selection", "", "Set the paint outside it to 0"),
         Command(
-            "select_painted", "Select affected part", "", "Its region, or where its paint is 0.5 or more"
+            "select_painted", "Select affected part", "", "Its region, without parts whose paint is below 0.5"
         ),
-        Command("move:-1", "Move up", "Alt+Up", "The top layer lies on top", row="Move up, down"),
+        Command("move:-1", "Move up", "Alt+Up", "Higher layers are applied later", row="Move up, down"),
         Command("move:1", "Move down", "Alt+Down", row=JOINED),
         Command("select_layers", "Select all layers", "Ctrl+Alt+A"),
         Command("group", "New group", "Ctrl+G", "With its own strength", row="Group; Shift ungroups"),
@@ -152,21 +153,25 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("unfocus", "Leave tool, deselect", "Escape"),
         Command("undo", "Undo", "Ctrl+Z", repeats=True),
         Command("redo", "Redo", "Ctrl+Shift+Z Ctrl+Y", repeats=True),
-        Command("copy_keys", "Copy keyframes", "Ctrl+C", "The chosen keyframes", row="Copy, paste keys"),
+        Command("copy_keys", "Copy keyframes", "Ctrl+C", "The selected keyframes", row="Copy, paste keys"),
         Command("paste_keys", "Paste keyframes", "Ctrl+V", "At the playhead", row=JOINED),
         Command("history", "History…", "Ctrl+Alt+Z", "All changes; click one to return to it"),
     ),
     "Brush": (
         Command("brush", "Paint strength", "B", "Left-drag over the selected layer"),
         Command("brush_mode", "Erase, smooth, add", "X"),
-        Command("brush_through", "Front or through", "Shift+B", "The front surface, or everything behind it"),
+        Command(
+            "brush_through", "Front or through", "Shift+B", "The front surface, or also everything behind it"
+        ),
         Command("brush_weights", "Weights as colors", "C"),
         Command("brush_radius:0.8", "Smaller", "[", repeats=True, row="Radius, or tolerance"),
         Command("brush_radius:1.25", "Larger", "]", repeats=True, row=JOINED),
         Command("brush_softness:-0.1", "Harder", "Shift+[", repeats=True, row="Harder, softer"),
         Command("brush_softness:0.1", "Softer", "Shift+]", repeats=True, row=JOINED),
-        Command("paint_clear", "Clear the paint", "Backspace", "All to 0", row="Clear paint; Shift fills"),
-        Command("paint_fill", "Fill with paint", "Shift+Backspace", "All to 1", row=JOINED),
+        Command(
+            "paint_clear", "Clear the paint", "Backspace", "Weights to 0", row="Clear paint; Shift fills"
+        ),
+        Command("paint_fill", "Fill with paint", "Shift+Backspace", "Weights to 1", row=JOINED),
         Command("paint_invert", "Invert the paint", "", "Swap painted and unpainted parts"),
         Command("paint_feather", "Feather the paint", "Shift+X", "Soften its edges; repeat for more"),
     ),
@@ -175,27 +180,29 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("select_tool:lasso", "Lasso", "L", MODES),
         Command("select_tool:polygon", "Polygon", "P", _CORNERS),
         Command("select_tool:brush", "Selection brush", "U", MODES),
-        Command("select_tool:scribble", "Scribble", "Shift+U", "Strokes on an object, and beside it (Ctrl)"),
+        Command("select_tool:scribble", "Scribble", "Shift+U", "Strokes on object and background (Ctrl)"),
         Command("select_tool:sphere", "Sphere", "Shift+R", f"Drag from its center on a surface. {MODES}"),
-        Command("select_tool:flood", "Connected and alike", "J", f"Click a surface. {MODES}"),
-        Command("select_tool:color", "Everything alike", "I", f"Click a color. {MODES}"),
-        *_row("← → ↑ ↓", "Tool's pointer; Shift far", _points()),
+        Command(
+            "select_tool:flood", "Flood selection", "J", f"Click: connected splats of similar color. {MODES}"
+        ),
+        Command("select_tool:color", "Color selection", "I", f"Click: all splats of similar color. {MODES}"),
+        *_row("← → ↑ ↓", "Tool pointer; Shift far", _points()),
         Command(
             "point_press",
-            "Press, or let go",
+            "Press or release",
             "Space Enter Shift+Space Ctrl+Space Ctrl+Shift+Space",
             "Like the mouse button: corners, clicks, or a drag until pressed again",
-            row="Tool: press, let go",
+            row="Tool: press, release",
             listed="Space Enter",
             in_hand=True,
         ),
         Command("select_through", "Front or through", "N", "The front surface, or also everything behind it"),
         Command("select_all", "Select everything", "Ctrl+A", row="All; Shift nothing"),
         Command("select_none", "Select nothing", "Ctrl+Shift+A", row=JOINED),
-        Command("invert", "Invert", "Ctrl+I", "Select everything else; while painting, the paint"),
+        Command("invert", "Invert", "Ctrl+I", "Select everything else; while painting, invert the paint"),
         Command("select_shrink", "Shrink", "Ctrl+[", "Remove its border", repeats=True, row="Shrink, grow"),
         Command("select_grow", "Grow", "Ctrl+]", "Add the neighbors", repeats=True, row=JOINED),
-        Command("select_smooth", "Smooth", "", "Straighten the border, drop strays, fill holes"),
+        Command("select_smooth", "Smooth", "", "Smooth the border, remove isolated splats, fill holes"),
         Command("select_refine", "Refine", "", "Align the edge with color and depth edges"),
         Command("select_largest", "Largest part", "", "Keep only the largest connected part"),
         Command("hide_selected", "Hide selection", "Ctrl+H", row="Hide; Shift isolates"),
@@ -204,7 +211,7 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("remove_selected", "Remove selection", "Alt+Delete", "Add a layer that removes it"),
         Command("move_selected", "Move selection", "Alt+M", "Add a layer that moves, rotates and scales it"),
         Command("duplicate_selected", "Copy selection", "Alt+D", "Add a layer with a copy to place"),
-        Command("hide_strays", "Hide strays", "", "Floaters that the capture left in empty space"),
+        Command("hide_strays", "Hide strays", "", "Floaters, needles, giants and invisible splats"),
     ),
     "Timeline": (
         Command("play", "Play or pause", "Space"),
@@ -214,7 +221,7 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         *_row("Shift+, .", "Previous, next keyframe", _steps("jump", "keyframe", "Shift+")),
         Command("easing", "Smooth, linear, hold", "Shift+K", "From the keyframe at or before the playhead"),
         Command("ping_pong", "Ping-pong", "Alt+K", row="Ping-pong; Ctrl auto-key"),
-        Command("auto_key", "Auto-key", "Ctrl+Alt+K", "A dragged slider gets a keyframe", row=JOINED),
+        Command("auto_key", "Auto-key", "Ctrl+Alt+K", "A changed slider gets a keyframe", row=JOINED),
         Command(
             "timeline", "Timeline", "T", "Animate the camera and the strengths", row="Timeline; Alt its rows"
         ),
@@ -227,7 +234,7 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("keys_file", "Change keys…", "", "Open the file with the keys of all commands"),
         Command("picture", "Save picture", "F2", "As shown on screen, as PNG"),
         Command("paint_view", "Paint over this view…", "", "In your painting program; each save is shown"),
-        Command("take_view", "Take this view", "Ctrl+F2", "Without edits, for editing elsewhere"),
+        Command("take_view", "Take this view", "Ctrl+F2", "Without edits, to be edited elsewhere"),
         Command("window_picture", "Save whole window", "Shift+F2", "As PNG"),
         Command("camera", "Save view as camera", "F4"),
         Command("snapshot", "Add snapshot", "F5", "Store the sliders", row="Snapshot; Shift compares"),
@@ -246,13 +253,13 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("dynamic_resolution", "Dynamic resolution", "Shift+F10", "Auto, on, off"),
         *_row("Ctrl + − 0", "Interface size", _zooms()),
         Command(
-            "next_place:1", "Keyboard to next part", "F6 Tab", "Esc leaves it", row="Keys to panel, tools"
+            "next_place:1", "Focus next part", "F6 Tab", "By keyboard; Esc leaves it", row="Keyboard focus"
         ),
-        Command("next_place:-1", "Keyboard to part before", "Shift+F6 Shift+Tab", row=JOINED),
+        Command("next_place:-1", "Focus previous part", "Shift+F6 Shift+Tab", row=JOINED),
         Command("reduced_motion", "Reduced motion", "", "The camera jumps instead of gliding"),
         Command("full_screen", "Full screen", "F11"),
         Command("panel", "Panel", "F12", "Show or hide the panel and all overlays"),
-        Command("demo", "Try the demo", "", "Create a scene and train four edits: one to two minutes"),
+        Command("demo", "Train the demo", "", "Create a scene and train four edits: one to two minutes"),
         Command("about", "About"),
         Command("quit", "Quit", "Ctrl+Q"),
     ),
@@ -432,10 +439,9 @@ NO_KEYS = Keys()
 
 
 def has_reached_imgui(press: Press) -> bool:
-    """Return whether imgui has processed the input before this key. It spreads text and keys over several
-    frames.
+    """Return whether imgui has processed all input that precedes this key.
 
-    A key handled earlier would overtake text typed before it.
+    imgui spreads text and keys over several frames. A key handled earlier would overtake text typed before.
     """
     waiting = imgui.get_current_context().input_events_queue
     return waiting.empty() or waiting[0].event_id > press.event_id
@@ -525,7 +531,7 @@ def is_flying(keys: Keys) -> bool:
 
 
 def fly_by_keys(camera: ViewCamera, keys: Keys, seconds: float, radius: float) -> ViewCamera:
-    """Return the camera after flying by the held keys."""
+    """Return the camera after flying for `seconds` by the held keys; `radius`: the scene's, world units."""
     io = imgui.get_io()
     right, up, ahead = (sum(FLY_KEYS[key][i] for key in keys.fly) for i in range(3))
     pace = 0.1 if io.key_alt else 1.0

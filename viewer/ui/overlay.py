@@ -159,7 +159,7 @@ _AWAY_DIMMING = 0.35  # share of its color that an end loses when it points away
 
 @dataclass(frozen=True)
 class _End:
-    """End of an axis on screen, in window pixels, and its direction towards the camera, −1..1."""
+    """End of an axis on screen, in window pixels, and its nearness to the camera, −1 to 1."""
 
     name: str
     x: float

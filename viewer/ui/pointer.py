@@ -36,8 +36,8 @@ class PointerContext:
     area: Area  # the part of the window that shows the picture
     ui: UiContext  # fonts and scale
     now: float  # seconds on the main view's clock
-    surfaces: Surfaces  # surfaces computed ahead
-    # side by side, the picture that contains the mouse, or did at the start of its drag: 0 left, 1 right
+    surfaces: Surfaces  # surfaces computed in the background
+    # side by side: half of the picture under the mouse, or under the start of its drag; 0 left, 1 right
     half: int = 0
 
     @property

@@ -95,7 +95,7 @@ def inert(when: bool) -> Iterator[None]:
 def card(
     name: str, color: Rgba, ui: UiContext, nav: bool = False, padding: tuple[float, float] = (10.0, 8.0)
 ) -> Iterator[None]:
-    """Draw the enclosed items on a card of their height. `nav`: the keyboard navigates within it"""
+    """Draw the enclosed items on a card of their height. `nav`: the keyboard navigates within it."""
     imgui.push_style_color(imgui.Col_.child_bg, color)
     imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(*padding) * ui.scale)
     child = imgui.ChildFlags_
@@ -117,7 +117,7 @@ def plate(
     pad: float = 8.0,
     size: imgui.ImVec2Like | None = None,
 ) -> Iterator[None]:
-    """Draw the enclosed items on a plate over the picture. `size` None fits the content"""
+    """Draw the enclosed items on a plate over the picture. `size` None fits the content."""
     imgui.set_next_window_pos(at, 0, pivot)
     imgui.set_next_window_size(size or (0.0, 0.0))
     imgui.push_style_color(imgui.Col_.window_bg, PALETTE.scrim)
@@ -362,13 +362,13 @@ def grip(ui: UiContext) -> str:
 
 
 def is_entered() -> bool:
-    """Return whether the keyboard has just pressed the last item."""
+    """Return whether a key has just pressed the last item."""
     return bool(imgui.get_current_context().nav_activate_id == imgui.get_item_id() != 0)
 
 
 def key_step(less: imgui.Key, more: imgui.Key) -> float:
-    """Return the step by two arrow keys for the last item, which has the keyboard; the same step as for
-    the focused layer."""
+    """Return the step of the last item, which has the keyboard, by two arrow keys. `NUDGES` has the step
+    sizes."""
     io = imgui.get_io()
     step = 0.0
     for key, sign in ((less, -1.0), (more, 1.0)):
@@ -406,7 +406,7 @@ def value_slider(
 
     Ctrl+click opens a text field, a double click resets to `default`, and arrow keys move a focused field. A
     range with a positive lower end is logarithmic. A new value is rounded to two decimals. `wide`: window
-    pixels, 0 for the rest of the line
+    pixels, 0 for the rest of the line.
     """
     logarithmic = ends[0] > 0.0
     context = imgui.get_current_context()
@@ -452,7 +452,7 @@ def choice(
 ) -> T | None:
     """Draw a row of joined buttons; return the chosen value, or None.
 
-    `options` maps values to texts. `wide`: window pixels, 0 for the rest of the line
+    `options` maps values to texts. `wide`: window pixels, 0 for the rest of the line.
     """
     gap = 2.0 * ui.scale
     room = (wide or imgui.get_content_region_avail().x) - gap * (len(options) - 1)

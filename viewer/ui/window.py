@@ -43,7 +43,7 @@ class DoubleClicks:
 
         Args:
             time: when the window received it, seconds of any clock
-            unheard: seconds of drawing before that; the press may be older by this much
+            unheard: seconds without event handling before that; the press may be older by this much
             event_id: index of the press in imgui's input events
         """
         self._waiting.append((event_id, time - self._last - unheard <= LONGEST_S))
@@ -87,10 +87,10 @@ KEY_NAMES = {
 
 
 class Window:
-    """Window with an interface, created by a splash.
+    """Window of the interface.
 
     Args:
-        splash: drawn again during long waits
+        splash: opened the window, and is drawn again during long waits
     """
 
     def __init__(self, splash: Splash) -> None:
@@ -211,7 +211,7 @@ class Window:
         return keys
 
     def point(self, at: tuple[float, float] | None) -> None:
-        """Move the mouse to the pointer moved by keys, if the system allows it."""
+        """Move the mouse to `at`, the tool pointer that keys have moved, if the system allows it."""
         if at not in (None, self._pointed):
             glfw.set_cursor_pos(self.handle, *at)
         self._pointed = at
@@ -286,7 +286,7 @@ def interruptible() -> Iterator[None]:
 
 
 def key_name(key: int, scancode: int) -> str:
-    """Return the name of a glfw key in `controls`: letters by the keyboard layout, others by position."""
+    """Return the name of a glfw key in `keys.NAMES`: letters by the keyboard layout, others by position."""
     name = KEY_NAMES.get(key, "")
     if len(name) == 1 and name.isalpha():
         label = glfw.get_key_name(key, scancode) or ""
