@@ -29,7 +29,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "region": ("trainer.cli:region", "show or save the Gaussians that a region selects"),
     "views": ("trainer.cli:views", "write views of a scene to draw masks or edits on"),
     "fit": ("trainer.cli:fit", "refit a field to a recorded trajectory"),
-    "evaluate": ("trainer.cli:evaluate", "measure a run as papers do"),
+    "evaluate": ("trainer.cli:evaluate", "measure a run with the metrics of papers"),
     "view": ("viewer.commands.view:main", "open the window: splats, layers, sliders"),
     "render": ("viewer.commands.render:render", "write a picture, a sweep or a sheet without a window"),
     "rebind": ("progdf.cli.rebind:main", "carry an edit over to the same scene in another file or format"),
@@ -38,18 +38,18 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "info": ("progdf.cli.info:main", "show the contents of a scene or .gdf, repairs, strays and errors"),
 }
 HIDDEN = {"preview": "trainer.preview:serve"}
-"""Internal commands that the window runs → entry points."""
+"""Internal commands, which the window runs → their entry points."""
 
 
 def _usage() -> str:
     lines = ["usage: progdf COMMAND …   (progdf COMMAND --help lists its options)", ""]
-    lines += [f"  {name:<9}{what}" for name, (_, what) in COMMANDS.items()]
+    lines += [f"  {name:<9}{summary}" for name, (_, summary) in COMMANDS.items()]
     return "\n".join(lines)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status, see `run_guarded`."""
-    if argv is None:  # own process; torch and numba create 500 000 permanent objects
+    if argv is None:  # run as the program; torch and numba create 500 000 permanent objects
         gc.set_threshold(5_000)  # fewer collections during imports save 0.3 s
         atexit.register(gc.freeze)  # no collection at exit saves 0.7 s
     return run_guarded(_run, list(sys.argv[1:] if argv is None else argv))
@@ -111,7 +111,7 @@ def _drop_unwritable_output() -> None:
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
-        except (OSError, ValueError):  # ValueError: it is closed
+        except (OSError, ValueError):  # ValueError: the stream is closed
             with suppress(OSError, ValueError):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
@@ -159,7 +159,7 @@ def _save_traceback() -> str:
 
 
 def _check_current_folder() -> None:
-    """Raise ProgdfError if the current folder was removed, as torch's libraries would abort the process."""
+    """Raise ProgdfError if the current folder was removed; torch's libraries would abort the process."""
     try:
         os.getcwd()
     except FileNotFoundError:
@@ -167,7 +167,7 @@ def _check_current_folder() -> None:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
-    """Raise KeyboardInterrupt: SIGTERM and a closed terminal end a command as Ctrl+C does, with a hint."""
+    """Raise KeyboardInterrupt, so that SIGTERM and a closed terminal end a command as Ctrl+C does."""
     raise KeyboardInterrupt
 
 
@@ -184,7 +184,7 @@ def _open_standard_streams() -> None:
     sys.stdout = sys.stdout or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
     sys.stderr = sys.stderr or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # a terminal that knows no “…” gets an escape
+        if isinstance(stream, io.TextIOWrapper):  # a terminal that cannot encode “…” gets an escape sequence
             stream.reconfigure(errors="backslashreplace")
 
 

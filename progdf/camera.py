@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-_MAX_LENS_RADIUS = 4.0  # largest radius at which a lens is checked for folding back, at a distance of 1 (76°)
-_LENS_SAMPLES = 4096  # radii that are checked
+_MAX_LENS_RADIUS = 4.0  # largest checked ray radius, on the plane one unit before the camera (76°)
+_LENS_SAMPLES = 4096  # number of radii that are checked for folding back
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Lens:
         )
 
     def valid_radius(self) -> float:
-        """Return the radius up to which the distortion is monotone. Beyond it the formula folds back."""
+        """Return the ray radius beyond which the distortion formula folds back; inf if that is beyond 76°."""
         r = torch.linspace(0.0, _MAX_LENS_RADIUS, _LENS_SAMPLES, dtype=torch.float64)
         slope = 1 + r**2 * (3 * self.k1 + r**2 * (5 * self.k2 + r**2 * 7 * self.k3))
         folded = (slope <= 0).nonzero()
@@ -100,9 +100,12 @@ NEAR = 0.01
 
 
 RIGID_TOLERANCE = 4e-4
-"""Largest entry of R Rᵀ − I of a viewmat with rotation R: the margin of `rasterize.cpu.forward.extents`."""
+"""Largest accepted entry of R Rᵀ − I, with R the rotation of a viewmat.
 
-_OBLIQUE_TOLERANCE = 1e-6  # largest skew, as a share of the focal length; no engine reads it
+See the margin in `rasterize.cpu.forward.extents`.
+"""
+
+_OBLIQUE_TOLERANCE = 1e-6  # largest accepted skew, as a share of the focal length; engines ignore it
 
 
 @dataclass(frozen=True)
@@ -123,8 +126,8 @@ class Camera:
     lens: Lens | None = None
     # near plane of a training, world units, see `bounds.near_plane`
     near: float = NEAR
-    # the pixels are samples of an image this many times as large, whose smaller pixels blur Gaussians less;
-    # for trainings only, ignored by OpenGL
+    # supersampling: the pixels are sampled from an image this many times as large, so the 2D blur of Gaussians
+    # is narrower by this factor; for trainings only, ignored by OpenGL
     sampling: float = 1.0
 
     def __post_init__(self) -> None:
@@ -200,7 +203,7 @@ def _cross(a: Sequence[float], b: Sequence[float]) -> tuple[float, float, float]
 
 
 def _check_intrinsics(K: list[list[float]]) -> None:
-    """Raise ValueError for focal lengths that are not positive, and for entries that no engine reads."""
+    """Raise ValueError for focal lengths that are not positive, skew, or another last row than [0, 0, 1]."""
     fx = K[0][0]
     fy = K[1][1]
     if fx <= 0 or fy <= 0:

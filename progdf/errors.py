@@ -73,8 +73,8 @@ _COMMAND_LINE = re.compile(
 def without_commands(line: str) -> str:
     """Return an error or a warning without command line instructions, for a window.
 
-    The problem stays, with options written without dashes. Each remedy keeps the alternatives before its
-    first command line instruction.
+    The description of the problem stays, with options written without dashes. Each remedy keeps the
+    alternatives before its first command line instruction.
     """
     problem, *remedies = line.split("; ")
     parts = [_COMMAND_LINE.sub(_without_command, problem)]

@@ -111,7 +111,7 @@ class Gaussians:
 
         Args:
             rows: row indices, unique. [M] int64
-            packed: new raw values, as `pack` gives them; with C = 14 shN is unchanged. [M,C]
+            packed: new raw values in the form of `pack`; with C = 14, shN is unchanged. [M,C]
         """
         changed: dict[str, Any] = {}
         for name, channels in attribute_slices(packed.shape[1]).items():

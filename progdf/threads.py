@@ -41,7 +41,7 @@ one_thread = partial(_torch_threads, 1)
 """Context manager and decorator that limits torch to one thread."""
 
 all_threads = partial(_torch_threads, 0)
-"""Context manager and decorator that lets torch use its initial number of threads, for baked networks."""
+"""Context manager and decorator that lets torch use its initial number of threads, for baking networks."""
 
 
 def set_threads(count: int | None) -> None:

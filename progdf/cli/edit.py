@@ -40,8 +40,8 @@ class EditOptions:
     """Remove, move, rotate, scale or copy parts of a scene, as a new scene or as an edit with a slider.
 
     The scene file itself is never changed. REGION is written as for progdf train, except for forms that need
-    pictures. Numbers follow its last colon. All regions refer to the scene in the file. Overlapping regions
-    are scaled, then rotated, then moved. Cleaning comes last.
+    pictures. The numbers of an option follow the last colon. All regions refer to the scene in the file.
+    Overlapping regions are scaled, then rotated, then moved. Cleaning comes last.
     """
 
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
@@ -53,11 +53,11 @@ class EditOptions:
     delete: Annotated[Specs, absent_option("REGION")] = ()
     """Remove the Gaussians of the region; holes, shadows and reflections stay."""
     scale: Annotated[Specs, absent_option("REGION:FACTOR")] = ()
-    """Scale the region about the mean of its centers, by 0.001 to 1000."""
+    """Scale the region about the mean of its centers; FACTOR: 0.001 to 1000."""
     rotate: Annotated[Specs, absent_option("REGION:AXIS,DEGREES")] = ()
     """Rotate the region about the mean of its centers; AXIS: x, y, z or a vector; −360 to 360 degrees."""
     move: Annotated[Specs, absent_option("REGION:DX,DY,DZ")] = ()
-    """Move the region, world units."""
+    """Move the region by an offset in world units."""
     duplicate: Annotated[Specs, absent_option("REGION:DX,DY,DZ")] = ()
     """Add a copy of the region, moved by an offset in world units."""
     glb_axes: GlbAxes = "LUF"
@@ -134,7 +134,7 @@ def _describe(step: Step) -> str:
 
 
 def _read_steps(options: EditOptions) -> list[Callable[[Gaussians], Step]]:
-    """Return functions that create the steps for a scene, in their order.
+    """Return functions that create the steps for a scene, in the order of execution.
 
     Raises:
         ProgdfError: the numbers of an option are invalid, or a region is invalid for any scene.

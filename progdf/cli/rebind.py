@@ -62,7 +62,7 @@ class Match:
     rows: Rows  # row of A for each row of B. [N] int64
     matched: float  # share of B's rows that match in position and color, 0 to 1
     once: float  # share of B's rows whose row of A is used only once, 0 to 1
-    # median, p95: distance between the two, in median sizes of A's Gaussians
+    # median, p95: distance between matched Gaussians, in units of the median size of A's Gaussians
     median: float
     p95: float
 
@@ -204,6 +204,6 @@ def _assign_rows(candidates: Rows, costs: NDArray[np.float64], count: int) -> Ro
 
 
 def _colors(scene: Gaussians) -> NDArray[np.float32]:
-    """Return the colors of band 0, clamped to 0 to 1, as some formats store no others. [N,3]"""
+    """Return the colors of band 0, clamped to 0 to 1, because some formats store only these. [N,3]"""
     rgb: NDArray[np.float32] = sh0_to_rgb(scene.sh0).clamp(0.0, 1.0).numpy()
     return rgb

@@ -39,7 +39,7 @@ ColorFunction = Callable[[Strength], Tensor]
 _MIN_CHROMA = 0.015  # smallest chroma of a target with a hue
 _CAST_CHROMA = 0.1  # chroma of white under the bluest and the most amber light, as a share of its lightness
 _MIDDLE_GRAY = 0.5646  # lightness of 18 % gray, the fixed point of contrast
-_MAX_GAIN = 3.0  # brighter targets lift a dark part instead of amplifying its noise further
+_MAX_GAIN = 3.0  # largest gain of lightness; beyond it an offset lifts dark parts, without more noise
 
 
 def parse_color(text: str) -> Tensor:

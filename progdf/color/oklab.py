@@ -26,7 +26,7 @@ _LAB_FROM_LMS = (
     (1.9779984951, -2.4285922050, 0.4505937099),
     (0.0259040371, 0.7827717662, -0.8086757660),
 )
-_GAMUT_SLACK = 1e-3  # less than a third of an 8-bit step
+_GAMUT_SLACK = 1e-3  # accepted excess over the sRGB range; less than a third of an 8-bit step
 
 
 @cache
@@ -98,8 +98,8 @@ class Bend:
 
     bow: float  # weight of the path along the hue circle, 0 (straight) to 1
     direction: float  # 1 or −1: sense of rotation of nearly opposite hues, the same for the whole region
-    # Angles between a hue and the opposite of the other, radians. Up to `whole` a color rotates in
-    # `direction`. From `none` on it takes its own shorter path. Between them the two paths mix.
+    # Limits on the arc of a color in `direction`, as its excess over π, radians. Up to `whole` the color
+    # rotates in `direction`. From `none` on it takes the shorter arc. Between them the two paths mix.
     whole: float
     none: float
     fade: bool = False  # straight in sRGB instead, like a cross-fade of pictures

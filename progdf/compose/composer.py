@@ -226,7 +226,7 @@ class Composer:
         largest = 0.0
         for name in names:
             after = self._after[name]
-            total = np.full((len(rows), after.shape[1]), -0.0, np.float32)  # adding to −0 leaves every bit
+            total = np.full((len(rows), after.shape[1]), -0.0, np.float32)  # −0 + x keeps the bits of x
             for part in parts:
                 bases = self._bases[part.edit].get(name)
                 gain = part.layer.gain(name)

@@ -30,7 +30,7 @@ _VISIBLE_OPACITY = 0.2  # opacity, 0 to 1
 _VISIBLE_MOVE = 0.05  # movement, in sizes of the region
 _VISIBLE_GROWTH = 0.4  # log-scale
 _VISIBLE_ROTATION = 0.4  # change of a quaternion, as a share of its length
-_SHARE_OF_LARGEST = 0.5  # share of an edit's own large changes from which a change hides all below
+_SHARE_OF_LARGEST = 0.5  # a change of this share of the edit's large changes hides all layers below
 _MAX_SAMPLED_MEMBERS = 100_000  # members that are sampled to find an edit's large changes
 
 
@@ -154,7 +154,8 @@ def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "norm
         0, and all rows at strength 0 keep their bytes. One layer at strength 1 gives exactly Θ0 + Δ(1).
 
     Raises:
-        ProgdfError: an edit belongs to another scene, a strength is not a number, the blend rule is unknown.
+        ProgdfError: an edit belongs to another scene, a strength is not a number, or the blend rule is
+            unknown.
         ValueError: weights do not fit.
     """
     check_first_argument("compose_layers(scene, layers)", scene, Gaussians)

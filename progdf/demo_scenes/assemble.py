@@ -134,9 +134,7 @@ def mix(under: Tensor, over: Tensor, share: Tensor) -> Tensor:
 
 
 _PROBES = 600  # samples that estimate the visible share of a part
-_MAX_SAMPLES_PER_GAUSSIAN = (
-    10_000  # samples per visible Gaussian; a part with fewer visible ones is misplaced
-)
+_MAX_SAMPLES_PER_GAUSSIAN = 10_000  # samples per visible Gaussian; a part that needs more is misplaced
 
 
 @dataclass(frozen=True)
@@ -269,7 +267,7 @@ def _place_gaussians(
     across = across / across.norm(dim=1, keepdim=True).clamp_min(1e-6)
     frame = torch.stack([along, across, torch.linalg.cross(along, across)], dim=2)
 
-    # flat Gaussians are larger to cover the area of those that stand
+    # flat Gaussians are larger, to also cover the area under the standing ones
     flat = torch.tensor(pelt.flat) * h / (1 - pelt.standing) ** 0.5
     hair = torch.tensor(pelt.hair) * h + torch.tensor([pelt.length, 0.0, 0.0])
     scales = torch.where(up > 0, hair, flat) * torch.exp(0.12 * torch.randn(n, 3, generator=random))

@@ -175,7 +175,10 @@ def ellipsoid(
     casts_shadow: bool = True,
     clears: float = 0.0,
 ) -> Part:
-    """Return an ellipsoid, rotated by `turn` degrees about x, then y, then z; see `Part` for the others."""
+    """Return an ellipsoid, rotated by `turn` degrees about x, then y, then z.
+
+    For the other arguments see `Part`.
+    """
     matrix = rotation_matrix(turn) @ torch.diag(torch.tensor(radii))
     return Part(
         name,

@@ -134,7 +134,7 @@ class Part:
     center: Tensor  # position of the shape's origin, world units. [3]
     matrix: Tensor  # local to world directions: rotation times stretch. [3,3]
     weight: float = 1.0  # Gaussians per area, relative to other parts
-    # Gaussians per area by local radius along the profile, relative; None is uniform
+    # function from local radii to relative numbers of Gaussians per area; None is uniform
     density: Callable[[Tensor], Tensor] | None = None
     # blocks the key light, with the shadow of an ellipsoid
     casts_shadow: bool = True
@@ -249,7 +249,7 @@ def _area_element(matrix: Tensor, spot: Tensor, step: Tensor, angle: Tensor) -> 
 
 
 def _spread(density: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the positions of quantiles of a histogram, in bins, and the share of each one's bin."""
+    """Return the positions of quantiles in a histogram, in bins, and the shares of the bins they lie in."""
     portions = density.double() / density.double().sum()
     edges = torch.cat([portions.new_zeros(1), portions.cumsum(0)])
     bins = (torch.searchsorted(edges, shares, right=True) - 1).clamp(0, len(portions) - 1)

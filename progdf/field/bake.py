@@ -26,7 +26,7 @@ TOLERANCE = 0.01
 
 _NODES_PER_BIN = 4
 _NODES_PER_BIN_LARGE = 2  # nodes per bin of a large network
-_LARGE_NETWORK = 100_000  # numbers of a network; above this, fewer nodes keep loading fast
+_LARGE_NETWORK = 100_000  # weights of a network; a larger one has fewer nodes, so that it loads fast
 _EDGE_WIDTH = 1e-5  # strength between the two nodes at the edge of hard bins
 
 
@@ -38,7 +38,7 @@ def bake_form(form: NeuralForm, rows: Tensor) -> BakedField:
         rows: raw values of the members before the edit, packed. [M,≥14]
 
     Raises:
-        ValueError: the number of Gaussians differs, or a number of the network is not usable.
+        ValueError: the number of Gaussians differs, or an offset of the network is not finite.
     """
     network = form.network
     plan = form.plan
@@ -73,7 +73,7 @@ def bake_network(
         network: trained network
         rows: raw values of the members before the edit, packed. [M,≥14]
         truth: recorded offsets at any strength. They show how much of the network's error at the end occurs
-            at smaller strengths. None: in proportion to its trajectory
+            at smaller strengths. None: the error grows in proportion to its trajectory
         render: renders some views; None omits the error in decibels
         tolerance: see `TOLERANCE`
     """

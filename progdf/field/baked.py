@@ -2,8 +2,8 @@
 
 Every kind of field (separable, keyframes, neural, grade) is converted to this form when it is loaded. Basis 0
 is the full offset with a_0(0) = 0 and a_0(1) = 1. All others vanish at both ends. So s = 0 is the original,
-and s = 1 the decoded basis 0 without any rounding: in float32 the recorded end, in integers by definition the
-end.
+and s = 1 is exactly the decoded basis 0. Stored in float32, it equals the recorded end. Stored in integers,
+it defines the end.
 """
 
 from __future__ import annotations
@@ -27,11 +27,13 @@ class Segment(NamedTuple):
     """Position between two knots."""
 
     right: int  # index of the right knot, 1..S−1; the left knot precedes it
-    share: float  # position from the left knot, 0, to the right one, exactly 1; outside all knots beyond 0..1
+    share: float  # 0 at the left knot, exactly 1 at the right one; outside 0..1 beyond all knots
 
 
 def find_segment(knots: Tensor, x: float) -> Segment:
-    """Return the segment that contains `x`, at a knot the one left of it. The outer segments are unbounded.
+    """Return the segment that contains `x`. A knot belongs to the segment on its left.
+
+    The outer segments are unbounded.
 
     Args:
         knots: ascending, at least 2. [S]
@@ -70,7 +72,7 @@ MAX_RANK = 16
 """Maximum number of bases, beside the full offset, of a baked network, and of a grade's residual."""
 
 _MIN_KNOT_DISTANCE = 1 / 80
-"""Distance to a field's knot below which a remap's knot is not worth a row of coefficients."""
+"""Smallest distance from a remap's knot to the field's knots at which it adds a row of coefficients."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,7 @@ class AttributeBases:
 
     end_offset: Tensor  # basis 0, the offset at s = 1, in stored form. [M,c] int8, int16 or float32
     residual_basis: Tensor  # bases 1..R in stored form. [R,M,c] int8, float16 or float32
-    scale: Tensor  # raw-space value of one unit, per basis, from 0, and channel. [1+R,c] float32
+    scale: Tensor  # raw-space value of one stored unit, per basis (0 first) and channel. [1+R,c] float32
     coefficients: Tensor  # a_k at the knots; row 0 all 0, the last row 1, 0, …, 0. [S,1+R] float32
 
     def __post_init__(self) -> None:
@@ -217,7 +219,7 @@ def lattice_side(points: int) -> int:
 
 
 def identity_map(degree: int, points: int = 0) -> Tensor:
-    """Return the map that changes no color. points: size of a lattice; [K,3]"""
+    """Return the map that changes no color. `points`: number of points of a lattice. [K,3]"""
     if degree == LATTICE:
         return lattice_colors(lattice_side(points))
     table = torch.zeros(MONOMIALS[degree], 3)
@@ -236,7 +238,7 @@ class GradeForm:
     degree: int  # degree of the map, 1 to 3, or `LATTICE`
     knots: Tensor  # strengths at which the map is given, ascending from 0 to 1. [S] float32
     table: Tensor  # the map at each knot; the identity at the first. [S,K,3] float32
-    residual: Tensor  # bases of the lowest B bands, in stored form. [R,M,3B] int8
+    residual: Tensor  # bases for the B SH functions of the lowest bands, as stored. [R,M,3B] int8
     scale: Tensor  # value of one unit of the bases. [R,3B] float32
     coefficients: Tensor  # coefficients of the bases at each knot; 0 at the first. [S,R] float32
     remap: SliderRemap = field(default_factory=identity_remap)  # from these knots to the slider
@@ -293,7 +295,8 @@ class GradeForm:
     def packed_levels(self) -> dict[str, Tensor]:
         """Data per member in stored form, see `deflate`. [B] uint8 each
 
-        It holds the levels, a bit mask of the functions that have levels, and the mask.
+        "residual" holds the nonzero levels, "functions" a bit per member and SH function that has levels, and
+        "mask" the share of the map.
         """
         packed = dict[str, Tensor]()
         if len(self.residual):
@@ -330,10 +333,10 @@ class BakedField:
 
     kind: str  # "grade", "separable", "keyframes" or "neural"
     knots: Tensor  # strengths at which the coefficients are given, ascending, first 0, last 1. [S] float32
-    attributes: Mapping[str, AttributeBases]  # by name, see `ATTRIBUTES`; absent if it does not change
+    attributes: Mapping[str, AttributeBases]  # by name, see `ATTRIBUTES`; unchanged attributes are absent
     channels: int  # width of a packed row: 14, or 14 + 3K when shN changes
     recorded: tuple[float, ...] = ()  # strengths of the recorded snapshots, for the slider's ticks
-    origin: NeuralForm | GradeForm | None = None  # source it was baked from, which a file stores instead
+    origin: NeuralForm | GradeForm | None = None  # form it was baked from, which a file stores instead
 
     def __post_init__(self) -> None:
         check_tensor("knots", self.knots, (None,), torch.float32)
@@ -410,8 +413,8 @@ class BakedField:
 def remap_slider(field: BakedField, remap: SliderRemap) -> BakedField:
     """Return the field under another slider.
 
-    Its knots move, and one is added where the remap bends far from any. No basis changes, so the bytes per
-    member and both ends stay the same, bit for bit.
+    Its knots move, and a knot is added where the remap bends far from all of them. No basis changes, so the
+    bytes per member and both ends stay the same, bit for bit.
 
     Args:
         field: any field but a network, whose slider is learned. A grade must not have a remap yet
@@ -428,7 +431,7 @@ def remap_slider(field: BakedField, remap: SliderRemap) -> BakedField:
     knots = torch.cat([old, remap.old[far]]).sort().values
     moved = remap(knots).float()
     distinct = torch.ones(len(knots), dtype=torch.bool)
-    distinct[1:] = moved.diff() > 0  # single precision may close a gap
+    distinct[1:] = moved.diff() > 0  # in float32 two knots may coincide
     distinct[:-1] &= moved[:-1] < 1.0
     distinct[-1] = True
     attributes = {

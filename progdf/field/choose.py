@@ -48,7 +48,7 @@ MAX_ADDED_ERROR_SHARE = 0.1
 def allowed_error(own: float, added: float = MAX_ADDED_ERROR_SHARE) -> float:
     """Return the mean squared error that a field may add to an edit's own error.
 
-    An own error of at least `LEVEL` may grow by the share `added`. A smaller one may grow to (1 + added) ·
+    An error of at least `LEVEL` may grow by the share `added`. A smaller error may grow to (1 + added) ·
     `LEVEL`, because 8 bits hardly show it.
     """
     return (1.0 + added) * max(own, LEVEL) - own
@@ -85,7 +85,7 @@ class Field(Protocol):
         ...
 
     def offsets(self, s: float) -> Tensor:
-        """Return packed raw-space offsets. [M,C] float32"""
+        """Return packed raw-space offsets at strength `s`. [M,C] float32"""
         ...
 
 
@@ -119,12 +119,12 @@ def sample_strengths() -> tuple[float, ...]:
 
 
 class FieldEvaluator:
-    """Renders fields and decides if they are accepted.
+    """Evaluator that renders fields and decides whether they are accepted.
 
     With the editor's own pictures, a field may add at most `allowed_error` to the trajectory's error against
     them. This limit applies to all pictures together and to the finished edit alone. The mean error against
-    the trajectory over the slider must stay below it too. Without such pictures, the worst PSNR against the
-    trajectory decides.
+    the trajectory over the slider must stay below this limit too. Without such pictures, the worst PSNR
+    against the trajectory decides.
 
     Args:
         strengths: strengths of the snapshots. [T]
@@ -327,9 +327,9 @@ def _fit_ranks(
 ) -> Candidate:
     """Return the field with these ranks.
 
-    Rendered errors choose the bases. If that field is not accepted, parameter errors choose them instead if
-    better. Rendered errors are the better guide, except for parts that move far: there, straightening an
-    attribute changes more than a sum of effects can express.
+    Rendered errors choose the bases. If that field is not accepted, bases chosen by parameter errors are
+    tried too, and the better field is returned. Rendered errors are the better guide, except for parts that
+    move far: there, straightening an attribute changes more than a sum of effects can express.
     """
     candidates = []
     ticks = tuple(strengths.tolist())
@@ -369,7 +369,7 @@ class RenderedTrajectories:
     """Rendered effect of straightening each attribute."""
 
     trajectories: Mapping[str, AttributeTrajectory]  # by attribute
-    gram: Tensor  # inner products of these changes over pixels and channels. [A,T,A,T] float64
+    gram: Tensor  # inner products of the rendered changes over pixels and channels. [A,T,A,T] float64
     values: int  # number of values summed by each inner product
     channels: int  # width of a packed row
 

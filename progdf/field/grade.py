@@ -4,10 +4,10 @@ At each knot of the slider the map is a polynomial of the drawn color q = clamp(
 color' = Σ_k c_k m_k(q), with m_k the monomials up to the degree. The map of a .cube file is linear between
 the points of its lattice, on q = clamp(SH color, 0, 1).
 
-The mapped colors are spherical harmonics of the members. They are computed from the scene's own when the
-field is loaded. So a file stores only some hundred numbers, and any renderer of Gaussians draws the result. A
-pattern adds a mask: one byte per Gaussian, the share of the map that it takes. The remainder of single
-Gaussians is a residual of their lowest bands, stored in a small number of int8 bases.
+The mapped colors are spherical harmonics of the members. They are computed from the scene's coefficients when
+the field is loaded. So a file stores only a few hundred numbers, and any renderer of Gaussians draws the
+result. A pattern adds a mask: one byte per Gaussian, the share of the map that it takes. The remainder per
+Gaussian is a residual of the lowest bands, stored in a small number of int8 bases.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ from .separable import fit_course
 MAX_COLOR = 1.5
 """Upper limit of the map's input. No screen shows brighter colors."""
 
-_FIRST_BAND = BASE_CHANNELS - 3  # column of a packed row, see `attribute_slices`; the others follow
-_DIRECTIONS = 32  # directions in which a member's color is mapped; twice the functions of three bands
-_CHUNK_MEMBERS = 1 << 11  # members at once
+_FIRST_BAND = BASE_CHANNELS - 3  # column of band 0 in a packed row; the higher bands follow
+_DIRECTIONS = 32  # directions in which a member's color is mapped; twice the 16 SH functions of degree 3
+_CHUNK_MEMBERS = 1 << 11  # members that are mapped at once
 MAX_RESIDUALS = MAX_RANK // 2
 """Maximum number of residual bases to try. Each may be stored as two."""
 
 RESIDUAL_STEPS = tuple(2.0 ** (i / 8) for i in range(-8, 25))
-"""Step sizes of a residual's levels to try. At 1, nearly all members fit into 8 bits."""
+"""Step sizes to try for a residual's levels. At step size 1, nearly all members fit into 8 bits."""
 
 _FITTING_SHARE = 0.999  # share of the members that fit into 8 bits: outliers must not coarsen all levels
 
@@ -69,7 +69,7 @@ def monomials(colors: Tensor, degree: int) -> Tensor:
 
 @cache
 def sphere(degree: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Return SH functions in even directions of the sphere, and their pseudoinverse. [D,B], [B,D] float32"""
+    """Return SH functions in evenly spread directions, and their pseudoinverse. [D,B], [B,D] float32"""
     index = torch.arange(_DIRECTIONS, dtype=torch.float64) + 0.5
     z = 1 - 2 * index / _DIRECTIONS
     angle = math.pi * (1 + math.sqrt(5)) * index
@@ -86,7 +86,7 @@ def map_colors(sh: Tensor, table: Tensor, degree: int) -> Tensor:
     rounds, and 48 directions, gain 0.01 dB.) The identity returns all coefficients unchanged, bit for bit.
 
     Args:
-        sh: coefficients of M members, B bands. [M,B,3]
+        sh: coefficients of B SH functions for M members. [M,B,3]
         table: the map. [K,3]
         degree: degree of the map
 
@@ -136,7 +136,7 @@ def _map_chunk(sh: Tensor, table: Tensor, degree: int) -> Tensor:
 
 
 def member_bands(rows: Tensor) -> Tensor:
-    """Return the bands of packed rows that are drawn. [M,14+3K] -> [M,B,3]"""
+    """Return the SH coefficients of packed rows that are drawn, B ≤ 16. [M,14+3K] -> [M,B,3]"""
     return rows[:, _FIRST_BAND:].reshape(len(rows), -1, 3)[:, :16].contiguous()
 
 
@@ -248,7 +248,7 @@ def lattice_form(table: Tensor) -> GradeForm:
 
 
 def map_alone(form: GradeForm, members: int) -> GradeForm:
-    """Return the map of a grade without residual, for this number of members of any scene."""
+    """Return the map of a grade without residual, for the given number of members of any scene."""
     return replace(map_form(form.knots, form.degree, form.table, members), remap=form.remap)
 
 

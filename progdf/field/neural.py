@@ -1,11 +1,11 @@
 """Neural field of ProGDF (AAAI 2025): a small network gives the offset of every Gaussian along the slider.
 
 The paper's network receives an encoded position and the control signal H(s), and outputs the offset. Two
-Gaussians at one position then cannot move differently, and 6 M numbers are spent on information that the
-position does not contain. ProGDF Studio's own form stores the recorded end, which s = 1 needs exactly anyway.
-The network only describes how the trajectory bends away from the straight line. A Gaussian's appearance and
-its end are inputs. The scene and the file already contain them, so they cost no bytes. A short learned code
-per Gaussian carries the remainder.
+Gaussians at the same position then cannot move differently, and 6 million numbers are spent on information
+that the position does not contain. ProGDF Studio's own form stores the recorded end, which s = 1 needs
+exactly anyway. The network only describes how the trajectory bends away from the straight line. A Gaussian's
+appearance and its end are inputs. The scene and the file already contain them, so they cost no bytes. A short
+learned code per Gaussian carries the remainder.
 
     paper:  Δ_i(s) = g(s) · spread · f(γ(x_i), H(s))                             g(0) = 0
     own:    Δ_i(s) = s · end_i + 4 s (1 − s) · spread · f(γ(x_i), look_i, end_i, code_i, H(s))

@@ -2,7 +2,8 @@
 
 The direct loss compares offsets, in units of their attribute's spread. It is weighted by the visibility of
 the Gaussian and by the attribute's effect on pictures, and needs no rendering. The paper's loss compares
-renders of a random snapshot. Weighting by the effect on pictures gains 3.5 dB (robot recolored, 33 after 29).
+renders of a random snapshot. Weighting by the effect on pictures gains 3.5 dB (robot recolored: 33 dB instead
+of 29).
 """
 
 from __future__ import annotations
@@ -282,9 +283,10 @@ def _initial_frame(shape: NeuralShape, rows: Tensor) -> dict[str, Tensor]:
 
 
 def _initial_weights(shape: NeuralShape, draws: torch.Generator) -> dict[str, Tensor]:
-    """Return initial weights (He et al.
+    """Return initial weights (He initialization, 2015).
 
-    2015). The heads are 0, so the field starts as its simplest trajectory.
+    The heads are 0. So the field starts as the straight line to the end ("own"), or as no change
+    ("position").
     """
     weights = {}
     for name, size in shape.weights().items():

@@ -7,8 +7,8 @@ are bases 1..R, stored as int8. The coefficients are then solved for the bases a
 a_k(s) is linear between the snapshots. A cubic gains nothing at the number of snapshots that a run records
 (docs/lab/experiments.md, Separable fields).
 
-`course_field` stores an edit whose trajectory is known in full, without training. The baseline is snapshots
-with linear interpolation between them; with all snapshots it equals the recording bit for bit.
+`course_field` stores an edit whose trajectory is known in full, without training. `fit_keyframes`, the
+baseline, interpolates linearly between snapshots; with all snapshots it equals the recording bit for bit.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class AttributeTrajectory:
         """Return the smallest number of bases within the tolerance.
 
         Args:
-            tolerance: root mean square of the remainder, as a share of the trajectory's own
+            tolerance: root mean square of the remainder, as a share of the trajectory's RMS
         """
         allowed = tolerance**2 * float(self.offsets.double().square().sum())
         power = torch.linalg.eigvalsh(self.gram).flip(0).clamp(min=0)
@@ -300,7 +300,7 @@ def opacity_course(start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def keyframe_rows(strengths: Tensor, count: int) -> list[int]:
-    """Return the snapshots that `fit_keyframes` keeps, ascending. [T]"""
+    """Return the indices of the snapshots that `fit_keyframes` keeps, ascending. strengths: [T]"""
     if count >= len(strengths):
         return list(range(len(strengths)))
     even = torch.linspace(0, 1, count, dtype=strengths.dtype)
@@ -338,7 +338,7 @@ def fit_keyframes(
     inner = selected.half() if torch.equal(selected.half().float(), selected) else selected
     for name, columns in moving_attributes(offsets).items():
         full = offsets[-1, :, columns].contiguous()
-        units = torch.ones(1 + len(inner), full.shape[1])  # any other size would round the halves
+        units = torch.ones(1 + len(inner), full.shape[1])  # any other scale would round half precision
         attributes[name] = AttributeBases(full, inner[:, :, columns], units, table.clone())
     ticks = strengths.tolist() if recorded is None else recorded
     return BakedField("keyframes", strengths[rows].float(), attributes, offsets.shape[2], tuple(ticks))

@@ -41,7 +41,7 @@ class Trajectory:
     # strength requested from the editor for each stage; its slider value is `s[stage_ends]`
     strengths: tuple[float, ...]
     # for an edit of colors by a map of the region and a residual of the lowest bands: the map of each
-    # recording but the first [S-1,K,3], and the number of bands
+    # recording but the first [S-1,K,3], and the number of SH functions of the residual: 0, 1, 4 or 9
     maps: Tensor | None = None
     bands: int = 0
     mask: Tensor | None = None  # share of the maps per member, see `GradeForm.mask`. [M] uint8
@@ -109,7 +109,7 @@ def save_trajectory(
 
 
 def load_trajectory(path: Path) -> tuple[Trajectory, dict[str, Tensor], dict[str, Any]]:
-    """Read a file of `save_trajectory`: trajectory, extra tensors, about.
+    """Read a file of `save_trajectory`; return the trajectory, the extra tensors and `about`.
 
     Raises:
         ProgdfError: the file is absent, damaged or not a trajectory file.

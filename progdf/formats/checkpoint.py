@@ -112,7 +112,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
         columns[column] = tensor
         has_logit_colors |= parts[0] == "features_dc"
     refused = variant_fields(others)
-    refused |= {name: "corrections of colors" for name in others if _COLOR_MODULE.search(name)}
+    refused |= {name: "color corrections" for name in others if _COLOR_MODULE.search(name)}
     honored = {name for name in others if name in _TRAINING_STATE}
     ignored = check_fields(path, others, honored, refused, EXPORT)
     missing = [name for name in ("means", "quats", "scales", "opacities", "sh0") if name not in columns]
@@ -210,7 +210,7 @@ def _load_weights(path: Path) -> Any:
         raise open_error(path, error) from None
     except Exception as error:  # torch raises errors of many types for an inconsistent pickle
         reason = " ".join(str(error).split())[:120] or type(error).__name__
-        raise damage_error(path, f"its table of tensors does not add up ({reason})") from None
+        raise damage_error(path, f"its table of tensors is inconsistent ({reason})") from None
 
 
 def _read_pickle(path: Path) -> bytes:

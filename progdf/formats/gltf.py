@@ -322,7 +322,7 @@ class _PrimitivePlan:
 
     @property
     def width(self) -> int:
-        """Count of numbers per Gaussian."""
+        """Number of values per Gaussian."""
         return 11 + 3 * (len(self.columns) - len(_ATTRIBUTE_TYPES))
 
 
@@ -400,7 +400,7 @@ class _Reader:
                 counts = f"{positions.count} of POSITION and {accessor.count} of {column}"
                 raise damage_error(file.path, f"{name} has {counts}")
             if accessor.bufferView is not None:
-                file.view_bytes(accessor.bufferView)  # counts as stored
+                file.view_bytes(accessor.bufferView)  # adds an external buffer to `stored_bytes`
         extra = [column for column in attributes if column.startswith(EXTENSION) and column not in columns]
         self.ignored.update(dict.fromkeys(escape_text(column)[:60] for column in extra))
         return _PrimitivePlan(

@@ -41,13 +41,13 @@ MAX_JSON_VALUES = 2_000_000
 """Largest number of values in the JSON. A parsed value takes up to 100 bytes of memory."""
 
 MAX_EXPANSION = 16
-"""Largest ratio of decoded bytes to file size. Repeated meshes and byte-to-float decoding need some."""
+"""Largest ratio of decoded bytes to file size. Repeated meshes and byte-to-float decoding raise it."""
 
 MIN_DECODED_BYTES = 64 << 20
 """Decoded bytes that are always allowed, however small the file is."""
 
 BYTES_PER_DRAW = 16 << 10
-"""Bytes that each additional part counts, on top of its rows. They bound the time for many tiny parts."""
+"""Decoded bytes that each additional part adds beside its rows, to bound the time for many tiny parts."""
 
 _MESHOPT = ("EXT_meshopt_compression", "KHR_meshopt_compression")
 DECOMPRESS = "decompress it with `gltf-transform copy in.glb out.glb`"

@@ -36,7 +36,7 @@ INVISIBLE_LOGIT = -30.0
 
 MIN_QUAT = 1e-6  # length; a shorter quaternion counts as no rotation
 _MAX_SAMPLE_ROWS = 10_000
-"""Rows in the even sample for finding the origin. The median of such a sample is off by 1 % of the extent."""
+"""Number of evenly spaced rows for finding the origin. Their median is off by 1 % of the extent."""
 
 UNIT_TOLERANCE = 1e-6
 """Deviation from unit length up to which a quaternion stays unchanged, so saved scenes reload exactly."""
@@ -262,7 +262,7 @@ class LoadReport:
             (self.bad_opacities, "NaN opacity"),
             (self.bad_colors, "NaN or infinite color"),
         )
-        hidden = ", ".join(f"{group_digits(rows)} with {what}" for rows, what in reasons if rows)
+        hidden = ", ".join(f"{group_digits(rows)} with {reason}" for rows, reason in reasons if rows)
         phrases = (
             (self.hidden, f"made invisible: {hidden}"),
             (self.bad_sh, "with NaN or infinite SH coefficients, which were set to 0"),

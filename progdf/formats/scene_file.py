@@ -335,7 +335,7 @@ def _convert(source: Path, kind: str, target: Path, to: str) -> str:
     try:
         result = native_child.run((memory, output, factor * seconds), 2 * factor * seconds, *words)
     except subprocess.TimeoutExpired:
-        return f"did not answer within {2 * factor * seconds} s"
+        return f"did not finish within {2 * factor * seconds} s"
     if result.returncode or not target.is_file():
         return _failure_reason(result.returncode, result.stderr)
     return ""
@@ -345,9 +345,9 @@ def save_scene(path: Path, scene: Gaussians, glb_axes: Axes = "LUF") -> ReadBack
     """Write a scene in the format given by the name's ending; the file appears complete or not at all.
 
     The file is read back and compared before it appears. A .ply is exact. The other formats are smaller, or
-    serve other programs:
+    for other programs:
 
-        .compressed.ply   16 bytes per Gaussian, 1 per SH coefficient; in Morton order: chunks share a range
+        .compressed.ply   16 bytes per Gaussian, 1 per SH coefficient; in Morton order (chunks share a range)
         .spz, .sog        8 bits and less; .spz and .usdc are rotated to y up, as readers expect
         .splat            32 bytes, without SH bands
         .glb, .usdc       float32, KHR_gaussian_splatting and ParticleField3DGaussianSplat

@@ -29,7 +29,7 @@ from . import header
 from .header import SceneFingerprint
 
 _FINGERPRINTS: MutableMapping[Tensor, tuple[tuple[int, Origin] | None, str]] = WeakIdKeyDictionary()
-"""Cache by means tensor, while it exists: its version with the scene's origin, and its hash."""
+"""Cache: means tensor → its version and the scene's origin, and the hash. Entries end with their tensor."""
 ANY_SCENE = SceneFingerprint(0, "")
 """Fingerprint of a grade that is bound to no scene."""
 _MAX_OFFSET = 1e18
@@ -62,7 +62,7 @@ class Gdf:
     # B Gaussians that the scene does not have, at strength 0, where they are invisible; they are the last B
     # members of the field, see `progdf.compose.added`
     added: Gaussians | None = None
-    from_others: int = 0  # number of last members that other edits add, see `extend`
+    from_others: int = 0  # number of members, the last ones, that other edits add; see `extend`
 
     def __post_init__(self) -> None:
         if (self.field.attributes or self.added is not None) and self.field.members != self.members:
@@ -184,7 +184,7 @@ def load_gdf(
     """Load an edit, and bake it if the file stores a network or a grade. Baking needs the scene.
 
     Args:
-        path: a .gdf file, or a .cube file, which is a grade of no scene
+        path: a .gdf file, or a .cube file, which is a grade bound to no scene
         scene: the scene that the edit must belong to; None to skip the check
         scene_name: name of the scene in messages
         place: function from the stored edit to the region that a grade is applied to; a result of None means

@@ -39,7 +39,7 @@ FORMAT = 7
 """Version of the file format."""
 
 MAX_GAUSSIANS = 1 << 26
-"""Largest scene that a header may state. The score of a larger one would take gigabytes."""
+"""Largest number of Gaussians that a header may state. The score of more would take gigabytes."""
 
 _MAX_HEADER = 1 << 24  # bytes; a report takes a few kB, and 100 MB of JSON could take 1 GB when parsed
 _METADATA = "progdf"  # only metadata key; safetensors writes several keys in varying order

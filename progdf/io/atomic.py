@@ -103,9 +103,9 @@ def write_files_together(folder: Path) -> Iterator[Path]:
 
     Guarantee: if the block raises, or the process ends within it, `folder` is unchanged. After the block all
     files are new. A new folder appears by one rename. In an existing folder, one rename marks the set as
-    complete, and from then on it is only moved forward. A single interrupt does not stop the moves. If the
-    process is killed between two moves, each file is complete, either old or new. The next write of this
-    program in `folder` moves the remaining files.
+    complete, and from then on the moves are finished, never undone. A single interrupt does not stop the
+    moves. If the process is killed between two moves, each file is complete, either old or new. The next
+    write of this program in `folder` moves the remaining files.
 
     Raises:
         ProgdfError: the folder cannot be created or written, or a folder has the name of a file.
@@ -230,7 +230,10 @@ def _copy_into(target: Path) -> Iterator[Path]:
 
 
 def is_portable(name: str) -> bool:
-    """Return whether a file name is valid on every system, also with an ending. Windows is the strictest."""
+    """Return whether a file name is valid on every system, with or without an ending.
+
+    Windows is the strictest.
+    """
     return not (_DEVICE_NAME.fullmatch(name) or set('<>:"/\\|?*') & set(name) or name.endswith((".", " ")))
 
 

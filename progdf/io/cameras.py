@@ -126,7 +126,7 @@ def camera_files(path: str | os.PathLike[str]) -> tuple[Path, ...]:
 
 
 def holds_cameras(path: str | os.PathLike[str]) -> bool:
-    """Return whether a folder has cameras or a file belongs to a COLMAP model. Other files are not opened."""
+    """Return whether a path is a folder with cameras or a file of a COLMAP model. No other file is opened."""
     file = Path(path)
     if os.path.isdir(file):
         return bool(_sources_in(file))
@@ -182,7 +182,7 @@ def camera_search_folder(path: Path) -> Path:
 
 
 def _find_source(path: str | os.PathLike[str]) -> _Source:
-    """Return the file or model of a path. A file of a model stands for the model in the same form."""
+    """Return the file or model of a path. A file of a COLMAP model gives the model in the file's form."""
     file = Path(path)
     if os.path.isdir(file):
         return _search_folder(file)

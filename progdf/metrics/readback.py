@@ -75,7 +75,7 @@ def compare(
     """
     if len(read) != len(written):
         raise ProgdfError(
-            f"{path} was not written: {len(read)} of {format_count(len(written))} come back from it; "
+            f"{path} was not written: only {len(read)} of {format_count(len(written))} can be read back; "
             "write a .ply"
         )
     before = written.world_means

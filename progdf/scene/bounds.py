@@ -16,7 +16,8 @@ _MAX_SAMPLED_ROWS = 100_000  # rows; a larger scene is sampled evenly
 _LONG_TAIL_RATIO = 5.0  # ratio of the 97th percentile to the median of the distances from the middle
 _CEILING_COVER = 0.8  # smallest share of the plan's occupied cells under a ceiling
 
-# Gaussians in a ceiling, relative to the slab below it: 5 in a room whose walls continue below, 1 in a head
+# smallest ratio of Gaussians in a ceiling to those in the slab below it: 5 in a room whose walls continue
+# below, 1 in a head
 _CEILING_DENSITY_RATIO = 2.0
 _MIN_CELLS = 16  # smallest number of occupied plan cells for a ceiling
 _MIN_GAUSSIANS = 64  # Gaussians; fewer do not define a shape

@@ -17,7 +17,7 @@ from .point_tree import PointTree
 from .scribbles import Scribbles
 from .selection import Floats, Mask, alike_in_color, base_colors
 
-_STEP_NEIGHBORS = 8  # neighbors that one grow or shrink step looks at
+_STEP_NEIGHBORS = 8  # neighbors that one grow or shrink step checks
 _VOTING_NEIGHBORS = 24  # neighbors that vote when smoothing
 _LINKED_NEIGHBORS = 8  # neighbors that a Gaussian may be connected with
 _MAX_NEIGHBOR_DISTANCE = (
@@ -33,7 +33,7 @@ class Neighborhood:
     """k-d tree over the centers of a scene. Building it takes about 1 s for a million Gaussians.
 
     Args:
-        scene: Gaussians; centers that are not finite count as at the origin
+        scene: Gaussians; centers that are not finite are treated as the origin
     """
 
     def __init__(self, scene: Gaussians) -> None:
@@ -137,7 +137,7 @@ class Neighborhood:
         return int(rows[0, 0])
 
     def _near(self, rows: NDArray[np.int64], k: int) -> tuple[NDArray[np.int64], Mask]:
-        """Return the k nearest others of some Gaussians [M,k], and a mask of those within reach [M,k]."""
+        """Return the k nearest other Gaussians of each row [M,k], and a mask of those within reach [M,k]."""
         k = min(k, len(self._points) - 1)
         if not len(rows) or k < 1:
             return np.zeros((len(rows), 0), np.int64), np.zeros((len(rows), 0), bool)
@@ -163,7 +163,7 @@ class Neighborhood:
 def _distances(
     points: NDArray[np.float64], to: NDArray[np.int64], rows: NDArray[np.int64], most: float
 ) -> NDArray[np.float64]:
-    """Return the distance from each of some rows to the nearest of others, infinite beyond `most`. [R]"""
+    """Return the distance from each point of `rows` to the nearest of `to`, infinite beyond `most`. [R]"""
     distances = PointTree(points[to], 1).query(points[rows], 1, within=most)[0]
     return distances[:, 0]
 
@@ -208,7 +208,8 @@ def nearest_rows(points: Tensor, rows: Tensor, k: int, workers: int = 1) -> tupl
     positions = points.double().numpy()
     distances, neighbors = PointTree(positions, k + 1).query(positions[rows.numpy()], k + 1, workers=workers)
     dropped = neighbors == rows.numpy()[:, None]
-    dropped[~dropped.any(axis=1), -1] = True  # over k equal points, not including the point itself
+    # where more than k points are equal, the point itself may be absent from the results
+    dropped[~dropped.any(axis=1), -1] = True
     others = ~dropped
     return (
         torch.from_numpy(neighbors[others].reshape(len(rows), k)),

@@ -50,7 +50,7 @@ def orbit_rig(
         count: number of cameras, ≥ 1
         width, height: image size in pixels
         fov_y: vertical field of view, radians
-        up: world direction that is up, [3]; None guesses it, see `guess_up`
+        up: world direction that is up, [3]; None estimates it, see `guess_up`
         elevations: lowest and highest, −89 to 89 degrees above the horizon; negative ones are below it
         distance: distance from the center in radii, for a field of view of 60° along the image's shorter
             side. Other fields of view move the cameras so that the scene keeps its size in the image

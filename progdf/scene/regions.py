@@ -285,7 +285,7 @@ def parse_region(
             say(f"the region is empty after {sign}{shorten(part)}")
         region = joined
     if not len(region):
-        raise ProgdfError(f"region '{shorten(spec)}' holds no Gaussian; the scene reaches {_extent(scene)}")
+        raise ProgdfError(f"region '{shorten(spec)}' holds no Gaussian; the scene spans {_extent(scene)}")
     return Region(name or spec.strip(), region.members, region.score)
 
 

@@ -3,11 +3,13 @@
 nerfstudio trains in its own frame. `dataparser_transforms.json` holds the transform of a point from the
 dataset's world: x' = scale · (R x + t). R rotates the camera poses, and camera centers transform like points.
 A transforms.json may be in a third frame (`applied_transform`). nerfstudio writes the transform from the
-dataset's world; older files hold the one from transforms.json. Its frame has z up, which tells the two apart.
+dataset's world; older files hold the one from transforms.json. nerfstudio's own frame has z up, which tells
+the two kinds of file apart.
 
 The check renders the scene at a small size through some cameras. A camera sees the scene if it covers at
 least 1/256 of the picture, a square of 1/16 of its sides. At least half of the cameras must see the scene. If
-cameras look at other parts of a larger capture, it suffices that three see it large.
+cameras look at other parts of a larger capture, it suffices that the scene covers a tenth of the picture in
+three of them.
 """
 
 from __future__ import annotations
@@ -71,7 +73,8 @@ class SceneCameras:
 
     cameras: list[Camera]
     notes: tuple[str, ...] = ()  # lines that name the chosen frame
-    lacks_transforms: bool = False  # from a nerfstudio dataset whose dataparser_transforms.json was not found
+    # true for cameras of a nerfstudio dataset without a dataparser_transforms.json
+    lacks_transforms: bool = False
 
 
 @dataclass(frozen=True)

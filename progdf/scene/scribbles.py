@@ -1,9 +1,9 @@
 """Selection of an object from strokes on it and strokes beside it, by a random walker.
 
-A Gaussian belongs to the strokes that a random walk from it more probably reaches first (Grady, Random Walks
-for Image Segmentation, 2006). Steps to near neighbors of like color are more probable. Distances and color
-differences are measured in those usual between neighbors of this scene. (Scales chosen by cross-validation
-over strokes are no better: docs/lab/experiments.md, Regions from strokes.)
+A Gaussian belongs to the kind of stroke that a random walk from it is more likely to reach first (Grady,
+Random Walks for Image Segmentation, 2006). Steps to near neighbors of like color are more probable. Distances
+and color differences are measured in units of their medians between neighbors. (Scales chosen by
+cross-validation over strokes are no better: docs/lab/experiments.md, Regions from strokes.)
 
 The probabilities solve a linear system with one unknown per Gaussian, by conjugate gradients. The
 preconditioner is one multigrid cycle over groups of neighbors (Notay, An Aggregation-Based Algebraic

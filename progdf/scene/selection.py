@@ -1,7 +1,7 @@
 """Selection tools of the window: shapes drawn over a picture, a ball, a color, and set operations.
 
 A selection is a boolean mask over the scene. Shapes are tested against the projected centers of Gaussians
-(`project_centers`). `front_surface` tells the Gaussians on the visible surface from those behind it.
+(`project_centers`). `front_surface` separates the Gaussians on the visible surface from those behind it.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _DEPTH_DOWNSCALE = 4  # factor by which the depth render of the front surface is
 # 0.85 of the visible part with a multiple of 1, and 0.94 with 3.
 _DEPTH_TOLERANCE = 0.01
 _EXTENT_TOLERANCE = 3.0
-_MIN_COVERAGE = 0.05  # cells with less opacity in all are background
+_MIN_COVERAGE = 0.05  # cells with less total opacity are background
 _MAX_CELLS = 1024  # cells per side of the grid in which a polygon is filled
 
 

@@ -202,7 +202,8 @@ class _Neighborhoods:
         self._extents = extents
         self._is_member = np.zeros(len(points), bool)
         self._spacing = np.full(len(points), np.nan)  # distance of the 16th neighbor; NaN: unknown
-        self._touches = np.zeros(len(points), bool)  # any of the farther 8 neighbors; valid where spacing is
+        # true: touches one of the farther 8 neighbors; valid if spacing is known
+        self._touches = np.zeros(len(points), bool)
         self.members: Rows = np.zeros(0, np.int64)
 
     def set_members(self, is_member: Mask) -> None:
@@ -261,9 +262,10 @@ class _Neighborhoods:
         return rows[~self._touches[rows]]
 
     def _is_enclosed(self) -> Mask:
-        """Return a mask of members that reach over half of their neighbors, by rows near in tree order. [M]
+        """Return a mask of members whose extent contains over half of their neighbors, without a search. [M]
 
-        It finds 3 of 4 such members, in a twentieth of the time of all searches.
+        Only rows near each other in tree order are compared. That finds 3 of 4 such members, in 5 % of the
+        time of searching all neighbors.
         """
         order = self._tree.order
         enclosed = np.zeros(len(order), bool)
@@ -273,7 +275,8 @@ class _Neighborhoods:
             block = order[first : start + _BLOCK + _WINDOW]
             rows = self.members[block]
             columns = np.ascontiguousarray(self._points[rows].T)
-            squares = (self._extents[rows] ** 2 * (1.0 - 1e-5)).astype(np.float32)  # less than rounding
+            # reduced by more than float32 rounding
+            squares = (self._extents[rows] ** 2 * (1.0 - 1e-5)).astype(np.float32)
             count = np.zeros(len(rows), np.int8)
             for step in range(1, min(_WINDOW, len(rows) - 1) + 1):
                 x, y, z = columns[:, step:] - columns[:, :-step]

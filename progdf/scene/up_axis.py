@@ -101,8 +101,8 @@ _MAX_SAMPLED_ROWS = 20_000
 """Number of Gaussians in the even, deterministic sample."""
 
 _SNAP_COSINE = math.cos(math.radians(5.0))
-"""Cosine of 5°. A ground normal this close to an axis counts as that axis, as captured floors are bent by as
-much."""
+"""Cosine of 5°. A ground normal this close to an axis counts as that axis, because captured floors
+are bent by up to this angle."""
 
 
 @dataclass(frozen=True)

@@ -4,9 +4,9 @@ A .splat has rows of 32 bytes without a header: float32 positions and linear sca
 opacity and rotation.
 
 A .ksplat has a header of 4096 bytes, a header of 1024 bytes per section, then the sections: the centers of
-buckets, and rows. Level 0 stores float32. Levels 1 and 2 store positions as shares of their bucket, and half
-floats. SH coefficients of level 2 are bytes. Colors and opacities are bytes. SH coefficients are stored band
-by band, channel-major within a band.
+buckets, and rows. Level 0 stores float32. Levels 1 and 2 store positions as shares of their bucket's size,
+and other numbers as half floats. SH coefficients of level 2 are bytes. Colors and opacities are bytes. SH
+coefficients are stored band by band, channel-major within a band.
 """
 
 from __future__ import annotations

@@ -113,7 +113,7 @@ def read_table(path: Path) -> dict[str, Any] | None:
         return None
     if len(content) > _MAX_META_BYTES:
         raise damage_error(
-            path, f"it has a {META} of more than {_MAX_META_BYTES >> 20} MB, others have some kB"
+            path, f"it has a {META} of more than {_MAX_META_BYTES >> 20} MB; usual ones have some kB"
         )
     is_known = isinstance(table, dict) and "means" in table and "quats" in table
     return table if is_known else None

@@ -1,8 +1,9 @@
 """Kernel: gradients of the inputs from the sums of all intersections, in float64 and in a fixed order.
 
 With σ = ½|Lᵀd|² and e = Lᵀd (that is u, v), a change δΣ of the 2D covariance changes σ by −½ eᵀ(Lᵀ δΣ L)e,
-and a move δm of the center by −eᵀLᵀδm. So the moments Σg·e and Σg·eeᵀ suffice. Lᵀ meets the 2D axes M =
-J·W·R·S in the product LᵀM, which does not cancel for needles if it is written with a cross product.
+and a move δm of the center by −eᵀLᵀδm. So the moments Σg·e and Σg·eeᵀ suffice. The 2D axes
+M = J·W·R·S only enter as the product LᵀM, which does not cancel for needles if it is written with a cross
+product.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ CAMERA = 16
 """Length of the camera's gradient: viewmat rows 0..2 (12), then fx, fy, cx, cy."""
 
 BLOCK = 1024
-"""Gaussians whose shares of the camera's gradient are summed first.
+"""Number of Gaussians per partial sum of the camera's gradient.
 
 A fixed size keeps the bits equal for every number of threads.
 """
@@ -54,7 +55,7 @@ A fixed size keeps the bits equal for every number of threads.
 
 @kernel()
 def fill_basis_gradient(degree: int, x: float, y: float, z: float, slopes: Array) -> None:
-    """Compute the derivatives of the basis functions by x, y and z.
+    """Compute the derivatives of the basis functions with respect to x, y and z.
 
     slopes: out, [16,3] float64, zero on entry
     """

@@ -79,8 +79,8 @@ BEGIN, START, STOP, U_PEAK, V, TOP = (np.uint64(TILE_H * field) for field in ran
 """Fields of a splat's spans, one number per row of the tile.
 
 - BEGIN: first column, from the tile's left edge
-- START, STOP: first column and one past the last, from the column nearest to the row's peak. The span is
-  empty unless STOP is greater than START
+- START, STOP: first column and one past the last, relative to the column nearest to the row's peak. The span
+  is empty unless STOP is greater than START
 - U_PEAK: u at that column, so that u = u_peak + l11 · (column − peak)
 - V: v
 - TOP: log2 of alpha where u is 0
@@ -139,7 +139,7 @@ def tile_corner(camera: Pinhole, tile: int) -> tuple[int, int]:
 
 @kernel(inline=True)
 def tile_bounds(camera: Pinhole, x: int, y: int, bounds: Array) -> None:
-    """Compute left, top, right, bottom of a tile's part in the window, from the tile's first pixel (x, y)."""
+    """Compute left, top, right, bottom of a tile's part in the window, relative to its first pixel (x, y)."""
     bounds[0], bounds[1] = max(0, camera.window[0] - x), max(0, camera.window[1] - y)
     bounds[2], bounds[3] = min(TILE_W, camera.window[2] - x), min(TILE_H, camera.window[3] - y)
 

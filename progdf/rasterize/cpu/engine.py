@@ -141,8 +141,8 @@ def _share(kernel: Callable[[int, int], _T], count: int, block: int, most: int) 
 def _keep_freed_memory() -> None:
     """Free one large block once. glibc then retains blocks up to this size, the largest that it ever retains.
 
-    Otherwise every pass returns its memory to the system and takes it again page by page, a fifth of the time
-    at 20 000 Gaussians. The block is never touched, so it costs nothing on any platform.
+    Otherwise every pass returns its memory to the system and takes it again page by page, which is a fifth of
+    the time at 20 000 Gaussians. The block is never touched, so it costs nothing on any platform.
     """
     np.empty((32 << 20) - (64 << 10), np.uint8)
 

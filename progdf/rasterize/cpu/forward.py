@@ -80,7 +80,7 @@ class Splats(NamedTuple):
     means2d: Array  # centers in pixels; 0 if the Gaussian cannot be drawn. [N,2] float32
     depths: Array  # camera z; 0 likewise. [N] float32
     visible: Array  # true for a splat; elsewhere the next two are not set. [N] bool
-    shapes: Array  # the columns above. [N,8] float64
+    shapes: Array  # columns `MX` to `EXTENT_Y`. [N,8] float64
     colors: Array  # rgb, and opacity with antialiasing. [N,4] float32
 
 

@@ -130,9 +130,8 @@ _SLICES_PER_BIT = 2.0**-19  # depth slices per unit in the last place of a float
 _SHADOW_DEPTH_RATIO = 2.0 ** (-1 / 32)  # depth factor, half a slice nearer: a surface must not shadow itself
 _CHUNK_LEVELS = 4  # upper levels of the tree whose nodes are chunks for the threads
 _PREFETCH_ROWS = 8  # rows to prefetch ahead, because they lie far apart in memory
-_MAX_DARKENING = math.exp(
-    0.5 * MAX_OPTICAL_DEPTH
-)  # multiple of the threshold above which no shadow helps a node
+# largest factor by which occlusion reduces the error of a node
+_MAX_DARKENING = math.exp(0.5 * MAX_OPTICAL_DEPTH)
 _MIN_WEIGHT = 1e-30
 _MAX_WEIGHT = 1e30
 _MAX_TRIALS = 12  # cuts per threshold search

@@ -138,7 +138,7 @@ DAMAGES: dict[str, tuple[Callable[[bytes], bytes], str]] = {
     "cut": (lambda pickled: pickled[: len(pickled) // 2], "is damaged: its pickle breaks off"),
     "empty": (lambda pickled: b"", "is damaged: its pickle breaks off"),
     "noise": (lambda pickled: b"\xff" * 40, "is damaged: its pickle breaks off"),
-    "nothing": (lambda pickled: b"\x80\x02.", "is damaged: its table of tensors does not add up"),
+    "nothing": (lambda pickled: b"\x80\x02.", "is damaged: its table of tensors is inconsistent"),
     "no such file": (lambda pickled: pickled.replace(b"\x01\0\0\x000", b"\x01\0\0\0Z"), "damaged"),
     "more rows": (lambda pickled: pickled.replace(b"K\x0cK\x03\x86", b"M\xff\xffK\x03\x86"), "is damaged"),
     "protocol 4": (lambda pickled: b"\x80\x04" + pickled[2:], "uses pickle protocol 4"),

@@ -223,7 +223,7 @@ def test_reader_that_crashes_hangs_or_is_missing_is_reported_in_one_line(
     monkeypatch.setattr(formats, "TIME_LIMIT_S", (1, 0.0))
     for body, said in (
         ("import os; os.kill(os.getpid(), 11)", "crashed (SIGSEGV)"),
-        ("import time; time.sleep(60)", "did not answer within 2 s"),
+        ("import time; time.sleep(60)", "did not finish within 2 s"),
         ("raise SystemExit(3)", "reported nothing"),
         (
             "import sys; sys.stderr.write('bad \\x1b[2J\\nworse \\x1b]0;x\\x07'); sys.exit(3)",

@@ -184,7 +184,7 @@ def refusal(spec: str, scene: Gaussians) -> str:
         ("box:1,2,3,4,5,six", "6 numbers"),
         ("sphere:0,0,0,nan", "4 numbers"),
         ("sphere:0,0,0,-1", "positive"),
-        ("sphere:99,99,99,1", "the scene reaches x"),
+        ("sphere:99,99,99,1", "the scene spans x"),
         ("all-all", "holds no Gaussian"),
         ("labels:nowhere.npy:1", "nowhere.npy does not exist"),
         ("labels:nowhere.npy", "has no label"),

@@ -150,5 +150,5 @@ def test_region_drawn_over_a_picture_is_the_same(moved: Moved, cameras: list[Cam
 
 def test_empty_region_error_gives_world_coordinates(moved: Moved) -> None:
     x = survey(moved.near).box[0] + moved.by[0]
-    with pytest.raises(ProgdfError, match=rf"the scene reaches x {int(x)}\.\d+ to "):
+    with pytest.raises(ProgdfError, match=rf"the scene spans x {int(x)}\.\d+ to "):
         parse_region("box:0,0,0,1,1,1", moved.far)
