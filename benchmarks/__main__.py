@@ -103,7 +103,7 @@ def main(argv: Sequence[str]) -> int:
     if options.scenes and options.what and not set(drawing) & set(options.what):
         raise ProgdfError(f"--scenes are for {', '.join(drawing)}; use python -m benchmarks viewer")
     if options.seconds is not None and options.what and "window" not in options.what:
-        raise ProgdfError("--seconds is how long the window is dragged; use python -m benchmarks window")
+        raise ProgdfError("--seconds is the duration of the drag; use python -m benchmarks window")
     # before an hour of measuring
     for folder in (options.json and options.json.parent, options.plots):
         if folder is not None and not folder.is_dir():

@@ -1,4 +1,4 @@
-"""The benchmark `edits`: finished runs beside simpler methods, at many slider values and from far views.
+"""The benchmark `edits`: finished runs compared with simpler methods, at many slider values and in far views.
 
 The slider is compared with two keyframes, retimed like it, and with a cross-fade of the rendered ends. The
 benchmark takes measurements too slow for the report of each run: 101 slider values, and views far from the
@@ -127,10 +127,10 @@ def slider_table(opened: Sequence[OpenedRun]) -> Table:
                 "2 keyframes": f"{baseline['psnr_mean']:.1f} / {baseline['psnr_worst']:.1f}",
                 f"worst of {VALUES} values": f"{min(_against_recording(run, reporting, inner)):.1f}",
                 "far views, mean / worst of 13": mean_worst(_against_recording(run, far, samples)),
-                **_from_elsewhere(run, far),
+                **_in_far_views(run, far),
             }
         )
-    title = "Fields against their recordings, and edits from elsewhere"
+    title = "Fields against their recordings, and edits in far views"
     return Table.of("slider values", title, rows, SLIDER_NOTE)
 
 
@@ -157,14 +157,14 @@ def worst_places(run: OpenedRun) -> dict[str, str]:
 
 
 def _editor_pictures(run: OpenedRun, views: Sequence[View], strengths: Sequence[float]) -> Pictures:
-    """Return the editor's pictures, see `editor_pictures`; none if it edits views one by one."""
+    """Return the editor's pictures, see `editor_pictures`; none if the editor edits views one by one."""
     if editor_row(run.run.record.plan.editor).per_view:
         return {}
     return editor_pictures(run.run, run.setup.views, views, strengths)
 
 
 def far_evaluator(run: OpenedRun) -> Evaluator:
-    """Prepare far views, with the editor's pictures of them if it can make any."""
+    """Prepare an evaluator on far views, with the editor's pictures of them if the editor can make any."""
     scene = run.setup.scene
     region = run.setup.region
     setup = run.setup
@@ -207,7 +207,7 @@ def _against_recording(run: OpenedRun, views: Evaluator, values: Sequence[float]
     ]
 
 
-def _from_elsewhere(run: OpenedRun, far: Evaluator) -> dict[str, str]:
+def _in_far_views(run: OpenedRun, far: Evaluator) -> dict[str, str]:
     """Compare the shipped field at 1 and between, and two keyframes between, with the editor's pictures."""
     headings = "far views: to the editor's pictures at 1", "between, mean / worst", "2 keyframes, between"
     if not far.edited:

@@ -52,8 +52,8 @@ from .courses import edit_of, known_edit, milliseconds, processor_milliseconds
 from .table import Table, Wall
 from .training import Point, edit_of_task, save_plot, tasks
 
-STEPS = 12  # of conjugate gradients for a residual at each strength
-RANKS = (0, 1, 2)  # of the residual
+STEPS = 12  # steps of conjugate gradients for a residual at each strength
+RANKS = (0, 1, 2)  # ranks of the residual
 
 TARGETS = (40.0, 50.0, 60.0)
 """Targets of separable fields, worst PSNR to the recording, dB."""
@@ -64,10 +64,10 @@ MAX_MEMBERS = 10_000
 NETWORK = NeuralSettings("tiny", steps=1000)  # the trained network
 PAPERS = NeuralSettings("paper", "position")  # the paper's network, timed untrained
 
-MOVED = "big ears"  # the motion
-MOVING = 12_000  # Gaussians of its bear
-SIDE = 160  # pixels of its views
-SNAPSHOTS = 33  # of its recording
+MOVED = "big ears"  # measured motion, one of `bear_edits`
+MOVING = 12_000  # Gaussians of the bear in motion
+SIDE = 160  # side of the views of the motion, pixels
+SNAPSHOTS = 33  # snapshots of the motion's recording
 
 CLOUDS = ((3_000, 30_000), (30_000, 100_000), (100_000, 100_000))
 """Members and Gaussians of the scenes on which a slider step is timed."""
@@ -195,7 +195,7 @@ def color_forms(name: str, edit: RegretEdit) -> list[Form]:
     network = trained_network(edit.original, knots, recording, edit.weights, NETWORK, NETWORK.steps)
     label = f"network ({NETWORK.size}), {NETWORK.steps} steps"
     measure("network", label, network.bytes_per_member, network.bind(edit.original), began)
-    chosen = f"{automatic.name.partition(': ')[2]}: what a run ships"
+    chosen = f"{automatic.name.partition(': ')[2]}: shipped by a run"
     chosen_kind = f"grade of degree {model.degree}"
     if model.mask is not None:
         chosen_kind = f"masked {chosen_kind}"
@@ -365,12 +365,12 @@ def _compose_row(scene: Gaussians, edit: Gdf, single: Gdf) -> dict[str, str]:
         Wall("copying, ms"): f"{took['copy']:.3f}",
         "compose, processor ms": f"{took['plain']:.1f}",
         Wall("Composer 1 thread, ms"): f"{took['1']:.3f}",
-        "of the processor, ms": f"{took['processor']:.3f}",
+        "processor time, ms": f"{took['processor']:.3f}",
         Wall("2 threads, ms"): f"{took['2']:.3f}",
-        Wall("of these for one member"): f"{took['one']:.3f}",
+        Wall("2 threads, one member"): f"{took['one']:.3f}",
         Wall("ratio to copying, 1 / 2 threads"): " / ".join(ratios),
         "largest difference": f"{difference:g}",
-        "the paper's network asked, processor ms": f"{answer:.0f}",
+        "the paper's network, processor ms": f"{answer:.0f}",
     }
 
 

@@ -1,8 +1,8 @@
-"""The benchmark `networks`: fully trained networks beside the shipped field.
+"""The benchmark `networks`: fully trained networks compared with the shipped field.
 
-A network is trained on the recorded offsets like a network of its size in `progdf fit --field neural`. Its
-own output and its baked field are both evaluated and timed. Trained networks are saved in RUN/networks, so
-that an interrupted benchmark resumes.
+A network is trained on the recorded offsets like a network of the same size in `progdf fit --field neural`.
+Its own output and its baked field are both evaluated and timed. Trained networks are saved in RUN/networks,
+so that an interrupted benchmark resumes.
 
     python -m benchmarks networks --runs RUN …
 """
@@ -55,16 +55,16 @@ MAX_TRAINING_S = 600.0
 """Largest processor time for training a network, seconds; others are timed untrained."""
 
 ROUNDS = 15
-"""Timed slider steps."""
+"""Number of timed slider steps."""
 
 
 NOTE = (
     "PSNR against the recording, at 13 slider values, in held-out views not used for any choice, over the "
     "pixels that show the region or that the edit changes. A training step samples all members, at most "
     "2048 (6 M: 1024). Networks that would train for more than ten minutes on one core are timed untrained. "
-    f"ms: median processor time of {ROUNDS} slider steps on one thread, all fields in turns. Asked: "
-    "evaluating the network only; baked: a step of the viewer with all new attributes. The paper gives 20 ms "
-    "on a V100 for its own network, which cannot be checked here."
+    f"ms: median processor time of {ROUNDS} slider steps on one thread, all fields in turns. Network "
+    "itself: evaluation of the network only; baked: a step of the viewer with all new attributes. The "
+    "paper gives 20 ms on a V100 for its own network, which cannot be checked here."
 )
 
 
@@ -72,10 +72,10 @@ NOTE = (
 class TrainedNetwork:
     """One network of one edit."""
 
-    network: NeuralField  # as it is stored
-    baked: BakedField  # as the viewer shows it
-    steps: int  # of training, 0 where it would take too long
-    seconds: float  # of processor time that they took
+    network: NeuralField  # in stored form
+    baked: BakedField  # form that the viewer evaluates
+    steps: int  # training steps; 0 if the training would take too long
+    seconds: float  # processor time of these steps
 
 
 def tables(runs: Sequence[Path] = ()) -> list[Table]:
@@ -137,14 +137,14 @@ def _rows(run: Path, course: KnownTrajectory) -> list[dict[str, str]]:
                 "bytes a Gaussian, no header": f"{field.bytes_per_member:.0f}",
                 "steps": str(network.steps) if network and trained else "-",
                 "processor s to fit": f"{seconds[name]:.1f}" if trained else "-",
-                "as it answers: mean / worst, dB": mean_worst(course.judge.curve(asked[name]))
+                "network itself: mean / worst, dB": mean_worst(course.judge.curve(asked[name]))
                 if network and trained
                 else "-",
                 "baked: mean / worst, dB": mean_worst(course.judge.curve(field)) if trained else "-",
-                "asked: ms a slider step": "-" if step is None else f"{step:.2f}",
+                "network itself: ms a slider step": "-" if step is None else f"{step:.2f}",
                 "µs a Gaussian": "-" if step is None else f"{1e3 * step / len(course.members):.1f}",
                 "baked: ms a slider step": f"{composed:.3f}",
-                "asked / baked": "-" if step is None else f"{step / composed:.0f}×",
+                "network / baked": "-" if step is None else f"{step / composed:.0f}×",
             }
         )
     return rows

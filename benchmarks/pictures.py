@@ -56,7 +56,7 @@ EDITS = (
 RIG = 36  # cameras
 SIZE = 256  # pixels of the compared pictures
 LARGE = 512  # pixels of the given pictures
-STEPS = 100  # of conjugate gradients
+STEPS = 100  # steps of conjugate gradients
 GIVEN = ((0,), (9,), (0, 18), (0, 9, 18, 27))
 """Sets of given pictures, by their index in the rig; 0 is the front."""
 
@@ -80,7 +80,7 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
     rows = [row for path in scenes for edit, part in EDITS for row in _rows(path, edit, part)]
     degrees = (f"{begin + (begin > 0)}-{end}°, dB" for begin, end in pairwise(DEGREES))
     columns = ("scene, edit", "pictures", *degrees, "s")
-    return [Table("pictures", "One picture and a few", columns, tuple(rows), NOTE)]
+    return [Table("pictures", "Edits from one picture and from a few", columns, tuple(rows), NOTE)]
 
 
 def _rows(path: Path, edit: str, part: str) -> list[tuple[str, ...]]:

@@ -5,7 +5,7 @@ tiles have 16x16 pixels, and every Gaussian listed for a tile is evaluated at ev
 Gaussians whose square of three standard deviations of the longer axis touches it, as published (Kerbl 2023).
 Both take turns in one process, on one thread each and on two.
 
-The warp engine is measured on a CUDA card if there is one, else on the CPU device for its errors.
+The warp engine is measured on a CUDA GPU if there is one, otherwise on the CPU, for its errors only.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def draw(
 
 
 def _settle(tensor: Tensor) -> None:
-    """Wait for the queued work of a CUDA card."""
+    """Wait for the queued work of a CUDA GPU."""
     if tensor.is_cuda:
         torch.cuda.synchronize()
 
@@ -233,10 +233,10 @@ def tables() -> list[Table]:
                 "threads": str(duel.threads),
                 Wall("forward (ms)"): _spread(duel.forward),
                 Wall("forward + backward (ms)"): _spread(duel.both),
-                "of the processor (ms)": f"{statistics.median(duel.processor):.1f}",
+                "processor time (ms)": f"{statistics.median(duel.processor):.1f}",
                 Wall("tiled torch (ms)"): baseline or _spread(duel.torch),
                 "ratio": baseline or f"{duel.ratio:.0f}×",
-                "plain version, of the processor (ms)": f"{result.plain:.0f}",
+                "plain version, processor time (ms)": f"{result.plain:.0f}",
                 "image error": f"{result.image_error:.1e}",
                 "worst gradient error": f"{result.gradient_errors[worst]:.1e} ({worst})"
                 if worst
@@ -294,9 +294,9 @@ def list_table(cases: Sequence[RasterCase], rounds: int = 9) -> Table:
         "Gaussians",
         "pixels",
         "weights left out",
-        "listed, of the processor (ms)",
+        "listed, processor time (ms)",
         "listed without these (ms)",
-        "picture and gradient, of the processor (ms)",
+        "picture and gradient, processor time (ms)",
         "picture and gradient without these (ms)",
         "largest difference",
         "its bound",
@@ -310,10 +310,10 @@ def list_table(cases: Sequence[RasterCase], rounds: int = 9) -> Table:
 
 
 def warp_tables(cases: Sequence[RasterCase] | None = None, rounds: int = 5) -> list[Table]:
-    """Measure the warp engine on this machine's card, or on the CPU, where only its errors are meaningful.
+    """Measure the warp engine on this machine's GPU, or on the CPU, where only its errors are meaningful.
 
     Args:
-        cases: clouds and image sizes; None: `CARD_CASES` with a card, else `WARP_CASES`
+        cases: clouds and image sizes; None: `CARD_CASES` with a GPU, else `WARP_CASES`
         rounds: measured rounds, after one that is not counted; the median is reported
     """
     device = engine_device("warp")
@@ -357,16 +357,16 @@ def warp_tables(cases: Sequence[RasterCase] | None = None, rounds: int = 5) -> l
         "pixels",
         Wall("forward (ms)"),
         Wall("forward + backward (ms)"),
-        "of the processor (ms)",
+        "processor time (ms)",
         "image error",
         "worst gradient error",
-        "cpu engine, of the processor (ms)",
+        "cpu engine, processor time (ms)",
         "its image error",
         "its worst gradient error",
     )
     note = (
-        "Median and range, after the card has finished. Processor time: forward and backward, on one thread. "
-        "Errors are against the reference in float64, and on a card (200 000 and 1 000 000 Gaussians) "
+        "Median and range, after the GPU has finished. Processor time: forward and backward, on one thread. "
+        "Errors are against the reference in float64, and on a GPU (200 000 and 1 000 000 Gaussians) "
         "against the cpu engine. A step is a whole training step: rendering, L1, LPIPS every second step, "
         "gradients, Adam. Warp's CPU device runs the same kernels one thread after another, for tests only."
     )

@@ -21,7 +21,7 @@ BUSY = 0.05
 """Share of the cores used by other processes above which wall times are meaningless."""
 
 _SPIN_S = 0.3  # seconds of one load measurement
-_LOAD_MEASUREMENTS = 3  # the lowest counts
+_LOAD_MEASUREMENTS = 3  # load measurements, of which the lowest counts
 
 
 class Wall(str):

@@ -143,7 +143,7 @@ def tables(scenes: Sequence[Path] = (), plot: Path | None = None) -> list[Table]
             ]
             for task, runs in found.items()
         }
-        save_plot(panels, "seconds of the processor", plot)
+        save_plot(panels, "processor time, s", plot)
     return [table(found)]
 
 
@@ -208,7 +208,7 @@ def save_plot(panels: Mapping[str, Sequence[Point]], across: str, path: Path) ->
         axes.spines[:].set_visible(False)
         max_x = max(point.x for point in points)
         axes.set_xlim(-0.03 * max_x, 1.08 * max_x)
-        if min(point.x for point in points) == 0.0:  # bytes, from 0 to some hundred
+        if min(point.x for point in points) == 0.0:  # bytes, from 0 to a few hundred
             axes.set_xscale("symlog", linthresh=1.0)
             axes.xaxis.set_major_formatter(lambda x, _: f"{x:g}")
             axes.set_xlim(-0.2, 1.5 * max_x)

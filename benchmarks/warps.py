@@ -82,7 +82,7 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
     return [
         Table(
             "warps",
-            "Edits that are not in the model's own family",
+            "Edits outside the model's own family",
             (
                 "edit",
                 "members",

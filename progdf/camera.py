@@ -126,8 +126,8 @@ class Camera:
     lens: Lens | None = None
     # near plane of a training, world units, see `bounds.near_plane`
     near: float = NEAR
-    # supersampling: the pixels are sampled from an image this many times as large, so the 2D blur of Gaussians
-    # is narrower by this factor; for trainings only, ignored by OpenGL
+    # supersampling: the pixels are sampled from an image this many times as large, so the 2D blur of
+    # Gaussians is narrower by this factor; for trainings only, ignored by OpenGL
     sampling: float = 1.0
 
     def __post_init__(self) -> None:

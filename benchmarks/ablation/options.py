@@ -10,7 +10,7 @@ import tyro
 
 @dataclass(frozen=True)
 class AblateOptions:
-    """Train finished runs again without one part of the method, or with another, and compare the results.
+    """Train finished runs again, each time with one part of the method left out or replaced; compare results.
 
     Finished variants are saved in RUN/ablation. An interrupted ablation resumes, and --only adds to it.
     """

@@ -55,7 +55,7 @@ from ..table import Table
 
 MEASURED = (0.12, 0.38, 0.64, 0.88, 1.0)
 """Strengths at which fields are compared with the editor's pictures."""
-STAGES = (8, 4, 2)  # swept numbers of even strengths
+STAGES = (8, 4, 2)  # swept numbers of evenly spaced strengths
 STEPS = (5, 12, 24)  # swept steps of conjugate gradients per strength, without early stopping
 BANDS = (0, 1, 4, 9)  # swept numbers of SH functions of the residual
 VIEWS = (20, 30, 60)  # swept numbers of views, with the best SH functions of the run's own views
@@ -67,7 +67,8 @@ NEAR = 0.3
 NOTE = (
     f"dB against the editor's pictures at strength {', '.join(f'{s:g}' for s in MEASURED)}, in "
     f"{REPORTING - 1} rig views not used for training or choice, over the pixels that show the region. "
-    "Mean: of the end and the mean between, each limited to that of one 8-bit level (48.1 dB). Seconds: "
+    "Mean: average of the PSNR at 1 and the mean PSNR at the other strengths, each limited to 48.1 dB, the "
+    "PSNR of one 8-bit level. Seconds: "
     "processor time on one thread, for the pictures, their weights, the model, the solution and the choice "
     "of the field. The sweep solves each strength once, starting from the solution of the full edit; smaller "
     "numbers of strengths are subsets."
@@ -97,7 +98,7 @@ class Result:
 
     @property
     def mean(self) -> float:
-        """Mean of the PSNR at 1 and the mean PSNR between, dB, each limited to that of one 8-bit level."""
+        """Average of the PSNR at 1 and the mean PSNR at the other strengths, each at most 48.1 dB."""
         *between, end = (min(psnr, decibels(LEVEL)) for psnr in self.psnrs)
         return (end + sum(between) / len(between)) / 2
 
@@ -185,16 +186,16 @@ class RegretEdit:
         max_steps = iterations(OptimizeOptions().steps)
         for snapshot in solve(solver, model, course, snapshots, state, lambda step, left: None, max_steps):
             snapshots.append(snapshot)
-        spent = time.process_time() - began - waited - self.seconds  # it prepared the views itself
+        # `measure` adds `self.seconds`, but this run has prepared its views itself
+        spent = time.process_time() - began - waited - self.seconds
         strengths, snapshots = course.sort_recordings(snapshots)
         steps = ", ".join(f"{snapshot.means.get(TAKEN, 0):.0f}" for snapshot in snapshots)
         at = ", ".join(f"{s:g}" for s in strengths)
         tables = [snapshot.table for snapshot in snapshots if snapshot.table is not None]
         offsets = [snapshot.offsets for snapshot in snapshots]
         views = len(self.setup.held_out) + len(solver.views)
-        spent -= (
-            (1.0 - views / len(self.setup.views)) * (len(snapshots) - 1) * self.a_strength
-        )  # pictures not needed
+        # without the pictures that the automatic choice does not need
+        spent -= (1.0 - views / len(self.setup.views)) * (len(snapshots) - 1) * self.a_strength
         name = f"automatic: {views} views, {len(strengths)} strengths, {model.bands} SH"
         result = self.measure(name, judge, strengths, model.bands, tables, offsets, spent, model.mask)
         return model, strengths, f"{model.line}; strengths {at} in {steps} steps", result
@@ -279,7 +280,7 @@ class RegretEdit:
         return Result(name, psnrs, seconds, chosen.bytes_per_member)
 
     def judge(self) -> Evaluator:
-        """Prepare an evaluator of views that are not used for training, of the same size."""
+        """Prepare an evaluator on views of the same size that are not used for training."""
         assert self.setup.up is not None
         camera = self.setup.train[0].camera
         size = max(camera.width, camera.height)
@@ -291,7 +292,7 @@ class RegretEdit:
         return self.evaluator(views, edited)
 
     def evaluator(self, views: Sequence[View], edited: dict[float, list[Tensor]]) -> Evaluator:
-        """Prepare an evaluator of views with their edited pictures."""
+        """Prepare an evaluator on views with their edited pictures."""
         channels = self.original.shape[1]
         return make_evaluator(self.scene, self.region, views, edited, self.setup.background, channels, True)
 
@@ -346,6 +347,6 @@ def run_regret(options: RegretOptions) -> Table:
         f"Regret {best.mean - automatic.mean:.2f} dB to {best.name}. The cheapest within {NEAR:g} dB of that "
         f"is {fast.name}; the automatic one takes {automatic.seconds / fast.seconds:.2f} times as long."
     )
-    columns = ("what", "dB", "mean", "s", "bytes a Gaussian")
+    columns = ("options", "dB", "mean", "s", "bytes a Gaussian")
     title = f"{options.scene.stem} ({len(region)} members, SH {scene.sh_degree}), {options.editor}"
     return Table("regret", title, columns, tuple(r.cells for r in results), f"{summary} {NOTE}")

@@ -63,7 +63,7 @@ def run_plan(run: FinishedRun) -> TrainOptions:
 
 
 def make_ablation_setup(run: FinishedRun, plan: TrainOptions, kind: EditKind, quick: bool) -> AblationSetup:
-    """Load the run's views and edited views; for a draft, an even subset of them.
+    """Load the run's views and edited views; for a draft, evenly spaced ones of them.
 
     Args:
         run: the finished run

@@ -27,8 +27,8 @@ class Outcome:
     psnr: float = 0.0
     ssim: float = 0.0
     lpips: float = 0.0
-    # slider value 0.25, 0.5 or 0.75 → PSNR against the editor's picture there or nearby, dB; only values with
-    # one
+    # slider value 0.25, 0.5 or 0.75 → PSNR against the editor's picture there or nearby, dB; values without
+    # such a picture are absent
     between: Mapping[str, float] | None = None
     uniformity: float = 0.0  # smallest over largest visible change of twenty equal steps, 0 to 1
     # t50, t90: slider value at which half and nine tenths of the change are reached

@@ -17,7 +17,7 @@ from typing import Any
 
 from progdf.errors import ProgdfError
 
-PATIENCE_S = 120.0
+PATIENCE_S = 120.0  # limit of waiting for the window to open or close
 PROGRAMS = ("Xvfb", "xdotool")
 _FIRST_DISPLAY = 1000
 _DISPLAYS = 50_000
@@ -67,13 +67,13 @@ class Opened:
         """Wait for the next line and read its figures.
 
         Raises:
-            ProgdfError: the window closed before.
+            ProgdfError: the window has closed.
         """
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
         if not line:
             assert self.process.stderr is not None
-            errors = self.process.stderr.read().strip().splitlines() or ["it said nothing"]
+            errors = self.process.stderr.read().strip().splitlines() or ["no error message"]
             raise ProgdfError(f"the window closed while it was measured: {errors[-1]}; try `progdf view`")
         self.figures |= json.loads(line)
 
@@ -92,21 +92,21 @@ class Opened:
         self.xdotool("windowfocus", self.name)
 
     def processor_s(self) -> float:
-        """Return the processor time of all its threads, seconds."""
+        """Return the processor time of all threads of the window, seconds."""
         if sys.platform == "win32":
             raise NotImplementedError("Xvfb is not for Windows")
         numbers = Path(f"/proc/{self.process.pid}/stat").read_text("utf-8").rpartition(")")[2].split()
         return (int(numbers[11]) + int(numbers[12])) / os.sysconf("SC_CLK_TCK")
 
     def memory_mb(self) -> float:
-        """Return its resident memory, MB of 1e6 bytes."""
+        """Return the resident memory of the window, MB of 1e6 bytes."""
         if sys.platform == "win32":
             raise NotImplementedError("Xvfb is not for Windows")
         pages = int(Path(f"/proc/{self.process.pid}/statm").read_text("ascii").split()[1])
         return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
     def close(self) -> None:
-        """End it like Ctrl+C in a terminal, and read its last figures.
+        """End the window like Ctrl+C in a terminal, and read its last figures.
 
         Raises:
             ProgdfError: the process does not end in time.
@@ -135,7 +135,7 @@ def window(
         screen: name of the display, from `display`
         arguments: arguments of `progdf view`
         size: window size, pixels
-        folder: working directory, also for its list of recent files
+        folder: working directory, which also holds the list of recent files
         leave: close the window after the first picture is on the screen
 
     Raises:

@@ -40,11 +40,11 @@ from . import display as bench_display
 from .mouse import SIZE, Mouse
 from .scenes import COPIES, RENDERERS, copies, scenes_of
 
-WARM_UP = 2
-STEPS = 20
-STARTS = 3
-KEPT = 4
-MIN_STEPS = 3
+WARM_UP = 2  # frames before the measured ones
+STEPS = 20  # measured frames of an orbit
+STARTS = 3  # measured starts of the program
+KEPT = 4  # frames of an orbit whose pictures are checked
+MIN_STEPS = 3  # smallest number of measured frames
 TURN_S = 20.0  # limit for all frames of one orbit, but at least `MIN_STEPS` frames are measured
 STARTS_S = 30.0  # limit for all measured starts
 
@@ -133,7 +133,7 @@ def measure_turning(
             _open(mice[way], path, way)
             empty.release()
             first = mice[way].engine
-            opened_s[way] = _open(mice[way], path, way)  # now the window has drawn before
+            opened_s[way] = _open(mice[way], path, way)  # the window has drawn before
             first.release()
             held.callback(mice[way].engine.release)
         full = _turn(mice, steps)
@@ -144,8 +144,8 @@ def measure_turning(
             mouse.release()
         coarse = _turn(mice, steps)
         for way, mouse in mice.items():
-            wrong = sum(not np.array_equal(image, _draw_anew(mouse, view)) for view, image in full[way].kept)
-            errors = [_psnr(image, _draw_anew(mouse, view)) for view, image in coarse[way].kept]
+            wrong = sum(not np.array_equal(image, _draw_again(mouse, view)) for view, image in full[way].kept)
+            errors = [_psnr(image, _draw_again(mouse, view)) for view, image in coarse[way].kept]
             results.append(
                 OrbitTimes(
                     count=mouse.main_view.facts.count,
@@ -196,13 +196,13 @@ def frames_table(turnings: Sequence[OrbitTimes], starts: Sequence[Start], render
                 "drawn by": RENDERERS[result.way],
                 Wall("sort and draw, ms"): f"{np.median(result.draws_ms):.1f}",
                 Wall("whole frame p50 / p95, ms"): f"**{p50:.1f}** / {p95:.1f}",
-                "of the processor, ms": f"{result.processor_ms:.1f}",
-                "the same drawn afresh": f"{result.checked - result.wrong} of {result.checked}",
+                "processor time, ms": f"{result.processor_ms:.1f}",
+                "identical when redrawn": f"{result.checked - result.wrong} of {result.checked}",
                 Wall("first picture of an opened file, s"): f"{result.opened_s:.2f}",
                 Wall("of `progdf view`, s (imports)"): "-"
                 if start is None
                 else f"{start.first_s:.2f} ({start.imports_s:.2f})",
-                "memory by then, MB": "-" if start is None else f"{start.memory_mb:.0f}",
+                "peak memory until then, MB": "-" if start is None else f"{start.memory_mb:.0f}",
             }
         )
     return Table.of(
@@ -228,7 +228,7 @@ def coarse_table(turnings: Sequence[OrbitTimes], renderer: str) -> Table:
                 Wall("frame in full, ms"): f"{full:.1f}",
                 Wall("coarse, ms"): f"{coarse:.1f}",
                 Wall("ratio"): f"{full / coarse:.1f}×",
-                "of the processor, ms: full / coarse": " / ".join(
+                "processor time, ms: full / coarse": " / ".join(
                     f"{ms:.1f}" for ms in (result.processor_ms, result.coarse_processor_ms)
                 ),
                 Wall("PSNR while moving, dB"): f"{result.coarse_db:.1f}",
@@ -290,11 +290,11 @@ def _turn(mice: Mapping[str, Mouse], steps: int) -> dict[str, _Turned]:
 
 
 def affordable_steps(steps: int, one_s: float) -> int:
-    """Return how many of `steps` fit into `TURN_S` at `one_s` seconds each, at least `MIN_STEPS`."""
+    """Return the number of `steps` that fit into `TURN_S` at `one_s` seconds each, at least `MIN_STEPS`."""
     return min(steps, max(MIN_STEPS, int(TURN_S / max(one_s, 1e-9))))
 
 
-def _draw_anew(mouse: Mouse, view: ViewState) -> NDArray[np.uint8]:
+def _draw_again(mouse: Mouse, view: ViewState) -> NDArray[np.uint8]:
     """Draw `view` in full with a new engine."""
     main_view = mouse.main_view
     engine = mouse.engine
@@ -320,7 +320,7 @@ def _at_rest(mouse: Mouse) -> int:
     view = mouse.main_view.work.view
     mouse.release()
     mouse.settle()
-    return int(np.abs(sharp.astype(int) - _draw_anew(mouse, view)).max())
+    return int(np.abs(sharp.astype(int) - _draw_again(mouse, view)).max())
 
 
 def _psnr(image: NDArray[np.uint8], target: NDArray[np.uint8]) -> float:

@@ -37,13 +37,13 @@ from .mouse import Mouse
 from .scenes import copies, scenes_of
 from .training import Training, begin_training
 
-SIZE = (980, 800)
-STEPS = 60
-TURN_PX = 10.0
-WARM_UP = 3
+SIZE = (980, 800)  # pixels
+STEPS = 60  # measured frames of an orbit
+TURN_PX = 10.0  # mouse movement from one frame to the next, pixels
+WARM_UP = 3  # frames before the measured ones
 MILLION = 1_000_000
-JUDGED = 6
-TRAINED = 24_000
+JUDGED = 6  # frames of an orbit that are compared with the full picture
+TRAINED = 24_000  # Gaussians of the background training
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _POLL_INTERVAL_S = 0.02
 _SETTLE_S = 3.0  # duration of drawing after a click or a lasso
@@ -98,7 +98,7 @@ def measure(
     steps: int = STEPS,
     size: tuple[int, int] = SIZE,
 ) -> InteractionTimes:
-    """Measure a window that shows `scene`, with dynamic resolution on and at times beside a training."""
+    """Measure a window that shows `scene`, with dynamic resolution; some frames run beside a training."""
     engine = ViewEngine(ctx, scene, (), "cpu")
     view = ViewState(first_camera(scene), dynamic_resolution="on")
     with Mouse(ctx, engine, scene, (), view, size) as mouse:
@@ -170,14 +170,14 @@ def table(results: Sequence[InteractionTimes]) -> Table:
                 "Gaussians": group_digits(result.count),
                 Wall("picture in full"): f"{result.full:.0f}",
                 Wall("frame while turning p50 / p95"): f"**{alone[0]:.0f}** / {alone[1]:.0f}",
-                "of the processor": f"{result.processor:.0f}",
+                "processor time": f"{result.processor:.0f}",
                 Wall("beside a training"): f"{beside[0]:.0f} / {beside[1]:.0f}",
                 Wall("sharp after (longest frame)"): f"{result.sharp:.0f} ({result.meanwhile:.0f})",
                 Wall("click"): f"{result.click:.0f}",
-                Wall("lasso let go"): f"{result.lasso:.0f}",
+                Wall("lasso released"): f"{result.lasso:.0f}",
                 Wall("PSNR while turning, dB"): f"{result.db:.1f}",
                 Wall("luminance while turning"): f"{100 * result.luminance:+.2f} %",
-                "pyramid, s of the processor": f"{result.build:.2f}",
+                "pyramid, processor s": f"{result.build:.2f}",
                 "its memory, of the scene's": f"{result.memory:.2f}",
             }
         )

@@ -159,7 +159,7 @@ def table(films: Sequence[Film]) -> Table:
     """Make a table with one row per film."""
     return Table.of(
         "popping",
-        f"Films of moving pictures, {SIZE[0]}×{SIZE[1]}: what changes from frame to frame, of 255",
+        f"Films of moving pictures, {SIZE[0]}×{SIZE[1]}: changes from frame to frame, of 255",
         [
             {
                 "path": film.title,
@@ -167,7 +167,7 @@ def table(films: Sequence[Film]) -> Table:
                 "limit, pixels²": f"{film.limit:.1f}",
                 "sharp film": f"{film.sharp:.2f}",
                 "moving film": f"{film.moving:.2f}",
-                "what changes apart": f"{film.apart:.2f}",
+                "difference of the changes": f"{film.apart:.2f}",
                 "blocks: 99th percentile": f"{film.blocks:.1f}",
                 "of all Gaussians in as few pixels": f"{film.halved:.1f}",
                 "PSNR, the worst frame, dB": f"{film.db:.1f}",

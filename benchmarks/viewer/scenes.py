@@ -24,12 +24,12 @@ SIZES = (31_000, 125_000)
 """Numbers of Gaussians of the default bears."""
 
 COPIES = 4
-"""Copies of the largest scene that make up an even larger one."""
+"""Number of copies of the largest scene that make up an even larger one."""
 
 RENDERERS = {"gl": "OpenGL", "cpu": "CPU"}
 """Renderers, from `engine.DRAWS`, with their names in tables."""
 
-RANKS = 3
+RANKS = 3  # bases beside the full offset
 # share of the scene's radius
 _EDIT_SHIFT = 0.003
 _COPY_JITTER = 0.002

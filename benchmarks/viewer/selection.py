@@ -40,7 +40,7 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
     rows = tuple((name, *(f"{times[name]:.0f}" for times in columns)) for name in columns[0])
     heads = tuple(group_digits(len(scene)) for scene in opened)
     note = f"Processor time in ms, median of {TIMES}, picture of {SIZE[0]}×{SIZE[1]}. {machine()}."
-    return [Table("select", "A selection by hand", ("of Gaussians", *heads), rows, note)]
+    return [Table("select", "Manual selections", ("operation / Gaussians", *heads), rows, note)]
 
 
 def measure(scene: Gaussians) -> dict[str, float]:
@@ -66,7 +66,7 @@ def measure(scene: Gaussians) -> dict[str, float]:
     works: dict[str, Callable[[], object]] = {
         "lasso, through": lambda: lasso(True),
         "lasso, front surface, at once": lambda: lasso(False),
-        "lasso, front surface, looked at ahead": lambda: lasso(False, prepared),
+        "lasso, front surface prepared ahead": lambda: lasso(False, prepared),
         "a step of the brush": lambda: shapes.inside_stroke(centers.points, outline[:2], 40.0),
         "colors": lambda: shapes.base_colors(scene),
         "flood": lambda: grow_along_surface(near, colors, np.array([seed]), colors[seed], 0.08),

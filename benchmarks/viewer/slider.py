@@ -34,8 +34,8 @@ from viewer.state.view_state import LayerState, ViewState
 from .mouse import SIZE, Mouse, slider_at
 from .scenes import RENDERERS, edit_for, scenes_of
 
-WARM_UP = 2
-STEPS = 24
+WARM_UP = 2  # slider steps before the measured ones
+STEPS = 24  # measured slider steps
 PARTS = "compose", "upload", "sort", "draw"
 
 

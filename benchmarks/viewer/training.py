@@ -47,7 +47,7 @@ class Training:
 
 @contextmanager
 def begin_training(scene: Gaussians, *effort: str) -> Iterator[Training]:
-    """Start a training of `scene`, and yield it at its first steps.
+    """Start a training of `scene`, and yield it once its first steps are done.
 
     Args:
         scene: the scene, which is the region too
@@ -68,7 +68,7 @@ def begin_training(scene: Gaussians, *effort: str) -> Iterator[Training]:
             began = time.monotonic()
             while _STARTED not in child.log.read_text("utf-8"):
                 if child.status is not None or time.monotonic() - began > _START_TIMEOUT_S:
-                    raise ProgdfError(f"the training beside did not start: {child.error()}")
+                    raise ProgdfError(f"the background training did not start: {child.error()}")
                 time.sleep(_POLL_INTERVAL_S)
             yield Training(child)
         finally:

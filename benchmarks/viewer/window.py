@@ -1,8 +1,7 @@
 """The benchmark `window`: load of the idle window, and memory leaks while a slider is dragged.
 
-`progdf view` runs in a separate process on a virtual display, with input from xdotool. The measurements come
-from the
-system: processor time over wall time, and resident memory after each back-and-forth drag.
+`progdf view` runs in a separate process on a virtual display, with input from xdotool. The system
+provides the measurements: processor time over wall time, and resident memory after each back-and-forth drag.
 
     python -m benchmarks window
 """
@@ -29,11 +28,11 @@ from .display import Opened
 from .mouse import slider_at
 from .scenes import edit_for, scenes_of
 
-IDLE_S = 10.0
-DRAG_S = 60.0
-MEMBERS = 3_000
-SETTLED_S = 1.5
-_MAX_WAIT_S = 60.0  # for the window to become idle
+IDLE_S = 10.0  # duration of the measurement of the idle window
+DRAG_S = 60.0  # duration of the drag
+MEMBERS = 3_000  # Gaussians that the edit changes
+SETTLED_S = 1.5  # the window is idle if it uses no processor time for this long
+_MAX_WAIT_S = 60.0  # limit of waiting for the window to become idle
 _SWEEP_STEPS = 40
 """Mouse steps of one sweep, one about every 1/60 s."""
 
@@ -131,10 +130,10 @@ def table(idles: Sequence[Idle], dragging: Dragging, count: int) -> Table:
     return Table(
         "window",
         "The window itself: idle, and dragged for long",
-        ("what", "load", "memory, MB", "MB a minute, second half"),
+        ("state", "load", "memory, MB", "MB a minute, second half"),
         tuple(rows),
         f"`progdf view` of {count} Gaussians, an edit of {MEMBERS} members, {SIZE[0]}×{SIZE[1]} on a virtual "
-        "display, moved by xdotool. Idle: processor time of all threads over that of the wall, ten seconds.",
+        "display, moved by xdotool. Idle: processor time of all threads over wall time, in ten seconds.",
     )
 
 
