@@ -29,6 +29,8 @@ THREADS = 1
 
 _MAX_BYTES = 1 << 24  # largest catalogue
 MAX_JOBS = 100_000
+"""Maximum number of jobs in a catalogue."""
+
 _LIST_OF = {"scenes": "[[scenes]]", "edits": "[[scenes.edits]]"}
 _EXCLUDED_OPTIONS = ("out", "resume", "scene", "name")  # a catalogue sets these in other ways
 

@@ -1,4 +1,4 @@
-"""Parallel jobs on Ray, or one after another without it; lost jobs are restarted elsewhere."""
+"""Parallel jobs on Ray, or one after another without it; jobs of lost workers are restarted."""
 
 from __future__ import annotations
 
@@ -347,8 +347,8 @@ def batch(options: BatchOptions) -> int:
     """Run `progdf batch`.
 
     Returns:
-        0 if all jobs are done, 2 if some cannot be trained (one line each; nothing was started), 3 if some
-        failed.
+        0 if all jobs are done, 2 if nothing was started because some cannot be trained (one line each), 3 if
+        some failed.
 
     Raises:
         ProgdfError: the catalogue or the folder cannot be used.
@@ -361,7 +361,7 @@ def batch(options: BatchOptions) -> int:
         raise ProgdfError(f"{options.out} holds a batch; add --resume to continue it")
     selected = [job for job in jobs if _is_selected(job, options.only)]
     if not selected and not faults:
-        raise ProgdfError("no job matches; --dry-run lists them")
+        raise ProgdfError("no job matches --only; --dry-run without --only lists all jobs")
     finished = [job for job in jobs if _is_finished(job)]
     finished_keys = {job.key for job in finished}
     found = _found_rows(finished, rows)
@@ -422,7 +422,7 @@ def _run_batch(
     pool: Pool,
     screen: Screen,
 ) -> None:
-    """Run the tasks and rewrite batch.csv and batch.html as they end, in at most a twentieth of the time."""
+    """Run the tasks and rewrite batch.csv and batch.html as they end, in at most 5 % of the time."""
 
     def tell(event: str, task: Task, reason: str) -> None:
         screen.event(event, job=task.key, attempt=task.attempt, reason=reason)

@@ -1,6 +1,6 @@
 """Adapters for the diffusers pipelines that edit pictures: arguments, loading and placement in GPU memory.
 
-Weights are gigabytes. They are read from this machine and never downloaded without a request.
+Weights take gigabytes. They are read from this machine and never downloaded.
 """
 
 from __future__ import annotations
@@ -333,7 +333,7 @@ def place(request: PipelineRequest, device: Device) -> DevicePlan:
                 f"--model {SMALL_MODEL}, or add --device cpu"
             )
         if request.quantize != "off":
-            raise ProgdfError("--quantize nf4 needs a graphics card; leave it out")
+            raise ProgdfError("--quantize nf4 needs a GPU; leave it out")
         return DevicePlan("cpu", torch.float32 if adapter.is_stable else torch.bfloat16)
     memory = gpu_memory()
     assert memory is not None

@@ -163,9 +163,8 @@ def _cost_rows(opened: OpenedRun) -> list[MeasureRow]:
 class SliderPath:
     """Measures of a slider in 20 equal steps."""
 
-    evenness: (
-        float  # smallest over largest visible change of a step, like `uniformity` in report.json, 0 to 1
-    )
+    # smallest over largest visible change of a step, like `uniformity` in report.json, 0 to 1
+    evenness: float
     monotone: float  # share of the steps that move away from the original, by visible change, 0 to 1
     steps: tuple[float, ...]  # LPIPS between neighboring slider values. [20]
     from_original: tuple[float, ...]  # LPIPS from slider value 0, at the 21 values

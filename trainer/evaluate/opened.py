@@ -42,7 +42,7 @@ class RunTime:
 class RunTrajectory:
     """The trajectory of a run."""
 
-    slider: str = ""  # "even" or "linear"
+    slider: str = ""  # "even", "stages" or "time", see `resolve_slider`
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """Draft of a color edit: a single color map, fitted in a second before training starts.
 
 An editor that maps every color to another one, independent of position, is nearly a color map itself. A small
-number of views and some thousand of their pixels are then enough for a slider, until training has found the
-residuals of single Gaussians. Views that the map was not fitted to decide if it represents the edit.
+number of views and 1500 of their pixels are then enough for a slider, until training has found the residuals
+of single Gaussians. Test views, to which the map is not fitted, decide if it represents the edit.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def draft_views(options: TrainingViewOptions, scene: Gaussians, region: Region) 
 
 
 def _glance_view(scene: Gaussians, region: Region, glance: RegionThumbnail) -> tuple[View, ColorView]:
-    """Return a thumbnail of the region as views of one pixel row."""
+    """Return a thumbnail as a view and a color view whose pixels form one row."""
     background = torch.tensor(BACKGROUND)
     drawn = glance.map.picture(glance.colors.clamp_min(0.0))
     others = (1.0 - glance.mask[:, None]) * background
@@ -114,10 +114,10 @@ def _error(picture: Tensor, expected: Tensor) -> float:
 
 
 def draft_grade(views: DraftViews, options: EditorOptions, name: str) -> Gdf | None:
-    """Fit the closest grade to an edit, at strengths with even visible change; its field is not baked.
+    """Fit the closest grade to an edit, at strengths with even visible change. Its field is not baked.
 
-    `draft` in its report has the map's degree and its PSNR at strength 1 against the editor's pictures of the
-    test views, dB.
+    The entry `draft` of its report has the map's degree, and its PSNR at strength 1 against the editor's
+    pictures of the test views, dB.
 
     Returns:
         The grade; None if the editor is not a function of color, or if the grade leaves more than

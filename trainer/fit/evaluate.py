@@ -131,7 +131,7 @@ def make_evaluator(
         edited: strength → the editor's whole pictures of these views. [H,W,3]
         background: rgb. [3]
         channels: width of a packed row
-        still: only colors will move, see `crop_scene`
+        still: only colors will change, see `crop_scene`
     """
     if edited:
         views = [v.widen([pictures[i] for pictures in edited.values()]) for i, v in enumerate(views)]

@@ -45,7 +45,8 @@ THINNING_ERROR_SHARE = 0.025
 
 _PATH_VIEWS = 3  # views on which a path is chosen
 _PATH_GAIN_DB = 0.5  # a curved path must be better by this: it takes several times the bytes
-_HALF_STRENGTHS = (0.3, 0.4, 0.5, 0.6, 0.7)  # a path is compared at the best of these
+# slider values at which a path is compared with the editor's picture at 0.5; the best one counts
+_HALF_STRENGTHS = (0.3, 0.4, 0.5, 0.6, 0.7)
 
 
 def choose_path(
@@ -62,7 +63,7 @@ def choose_path(
         setup: scene, region, and held-out views; the views that fields are chosen on decide
         editor: the editor of the views; None if it makes no picture of strength 0.5
         in_parts: connected parts were moved rigidly
-        retimed: retimes the slider of a trajectory; called only if the recorded path may be kept
+        retimed: returns a trajectory with its slider retimed; called only if the recorded path may be kept
     """
     if in_parts:
         return retimed(trajectory), "as the parts move"
@@ -196,9 +197,10 @@ def fit_grades(
 
 
 def field_evaluator(trajectory: Trajectory, views: Evaluator, target: float | None) -> FieldEvaluator:
-    """Return the test of a field against the editor's pictures of these views, or against a target in dB.
+    """Return an evaluator that tests a field against the editor's pictures of these views.
 
-    The editor's pictures are compared at every strength that has some.
+    The pictures are compared at every strength that has some. With a `target` in dB, the field is tested
+    against the recordings instead.
     """
     edited = {s: views.count(views.edited[e]) for s, e in trajectory.stage_strengths if e in views.edited}
     course = trajectory.s, trajectory.offsets, views.counted_pixels, trajectory.at
@@ -237,7 +239,7 @@ def expected_renders(trajectory: Trajectory, kind: FieldKind) -> int:
 def evaluate_field(
     trajectory: Trajectory, reporting: Evaluator, field: BakedField, target: float | None
 ) -> Fitted:
-    """Measure an existing field, a network's, beside the same baselines."""
+    """Measure the field of a network beside the same baselines."""
     evaluator = field_evaluator(trajectory, reporting, target)
     network = evaluator.candidate(field, field.kind)
     why = f"a network was requested{'; none' if network.excess > 1.0 else ' and'} {evaluator.wanted}"
@@ -296,7 +298,7 @@ def visibility(
 
 
 def may_have_idle_attributes(trajectory: Trajectory) -> bool:
-    """Return True if attributes could be dropped: not for a grade, nor if only the base colors move."""
+    """Return True if attributes could be dropped. A grade has none, nor has an edit of base colors only."""
     if trajectory.maps is not None:
         return False
     return not only_recolors(trajectory.offsets) or trajectory.end.shape[1] > BASE_CHANNELS
@@ -305,7 +307,7 @@ def may_have_idle_attributes(trajectory: Trajectory) -> bool:
 def drop_idle_attributes(
     trajectory: Trajectory, evaluator: Evaluator, prunes: bool = True
 ) -> tuple[Trajectory, dict[str, float]]:
-    """Remove attributes whose movement is not visible.
+    """Remove attributes whose change is not visible.
 
     All removed attributes together cost less than 0.1 dB against the edited views.
 

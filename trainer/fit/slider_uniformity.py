@@ -44,8 +44,8 @@ STEPS = 20
 
 _EDITOR_VIEWS = 3  # views of the editor's pictures
 _FIELD_VIEWS = 6  # views of the field
-_COSTLY_STEPS = 8  # steps in the anchor view if each picture runs a model
-_STARTS_PER_STEP = 2  # offsets at which a step may start
+_COSTLY_STEPS = 8  # steps, in one view, if each picture runs a model
+_STARTS_PER_STEP = 2  # number of evenly spaced offsets within a step at which measured steps start
 _SPREAD_PASSES = 3  # passes that respace the strengths; the best one counts
 _RENDER_ROUNDS = 2  # renders of all strengths
 _JUMP_SHARE = 0.7  # with this share of the change in one step, strengths in between are unreliable

@@ -26,7 +26,7 @@ _MAX_SAMPLES = 512  # maximum number of Gaussians whose spacing is measured
 _REACH_IN_SPACINGS = 2.5  # spacings; wider gaps separate parts
 _CELLS_PER_REACH = 2.0  # cells per reach, so that any two Gaussians of a cell are neighbors (√3 / 2 < 1)
 _BLURS_PX = (9, 21)  # pixels; box blurs of the near search
-# shares of the box's longer side; attract a part over three times its size
+# widths of the box blurs, as shares of the box's longer side; they attract a part over three times its size
 _WIDE_BLUR_SHARES = (0.4, 0.2, 0.1)
 # share of a wide search's steps with wide blurs only, shifts three times as fast and no rotation
 _WIDE_STEP_SHARE = 0.4
@@ -124,9 +124,9 @@ class GroupSearch:
     def find(self, targets: Sequence[Tensor], start: Motion, on_step: OnStep | None = None) -> Motion:
         """Return the motion of the parts that brings the views closest to their targets.
 
-        A near search starts at full sharpness. If a quarter of the distance remains, a wide search runs too.
-        The wide search finds positions farther away, but can miss close ones (docs/lab/experiments.md, Parts
-        that move).
+        A near search starts at full sharpness. If more than a quarter of the distance remains, a wide search
+        runs too. The wide search finds positions farther away, but can miss close ones
+        (docs/lab/experiments.md, Parts that move).
 
         Args:
             targets: edited box of each view. [h,w,3] each

@@ -39,8 +39,8 @@ DAMPING = 1e-3  # share of the first step's curvature; barely visible members ke
 class Agreement:
     """Agreement of the edited views with one scene."""
 
-    psnr: float  # PSNR of the best colors on held-out views, over pixels that show the region or change, dB
-    unexplained: float  # share of the change's energy there that these colors leave, 0 is best
+    psnr: float  # PSNR of the best colors on held-out views, over pixels of the region or the change, dB
+    unexplained: float  # share of the change's energy there that these colors do not reproduce, 0 is best
     # the same share of the fine part, which varies within 9 pixels at half size
     unexplained_fine: float = 0.0
     # fine energy of the pictures relative to that before they were made to agree; 1 if they were not
@@ -89,8 +89,8 @@ class ViewChange:
     """One view's box at a smaller size: its scene, its change, and the evaluated pixels."""
 
     scene: CropScene
-    change: Tensor
-    counts: Tensor
+    change: Tensor  # edited minus original picture, times `counts`. [h,w,3]
+    counts: Tensor  # 1 in evaluated pixels, else 0; times the root of the weight in a fit. [h,w,1]
 
     def render(self, colors: Tensor) -> Tensor:
         """Render changes of the members' colors in the evaluated pixels. [M,3] -> [h,w,3]"""
@@ -101,7 +101,7 @@ class ViewChange:
         return drawn.image * self.counts
 
     def residual(self, colors: Tensor) -> float:
-        """Return the share of the change's energy that these colors leave. [M,3] -> 0 is best"""
+        """Return the share of the change's energy that these colors do not reproduce. [M,3] -> 0 is best"""
         with torch.no_grad():
             missing = (self.change - self.render(colors)).square().sum()
         return float(missing / self.change.square().sum().clamp_min(1e-12))

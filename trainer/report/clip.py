@@ -22,9 +22,10 @@ from progdf.errors import ProgdfError
 from trainer.store.pretrained import BROKEN, keep_quiet, missing_weights
 
 CLIP_MODEL = "openai/clip-vit-large-patch14"
-"""CLIP model whose figures papers compare."""
+"""CLIP model that papers report figures of."""
 
 EXTRA = "pip install progdf-studio[clip]"
+"""Remedy for a missing package, for messages."""
 
 ROUNDING = 1e-5
 """Largest distance between unit-length features of the same input. A text and its copy in one batch differ by

@@ -1,4 +1,4 @@
-"""Curves over a common axis, drawn by matplotlib at their own size."""
+"""Plots of curves over a common axis, drawn by matplotlib at their final size in pixels."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
+# colors, sRGB 0 to 255: background, title, labels, grid lines, and the curves in order
 PAPER = (250, 249, 246)
 INK = (38, 36, 34)
 PALE = (118, 113, 107)

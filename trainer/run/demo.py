@@ -277,7 +277,7 @@ def _train_edits(options: DemoOptions, show: DemoPlan, scene: DemoScene) -> dict
             train(replace(runs[edit.name], resume=resumes))
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
-                f"the finished part is in {options.out}; repeat the command to continue"
+                f"the progress is saved in {options.out}; repeat the command to continue"
             ) from None
     return {edit.name: _gdf_path(options.out, edit) for edit in show.edits}
 

@@ -79,7 +79,7 @@ def paste_decal(options: TrainOptions, setup: TrainingSetup, folder: RunFolder, 
     log.say(
         f"{added} Gaussians added for {pixels} painted pixels, {moved} of the scene moved behind them; "
         f"{view_psnr} dB in the decal's own view, {figures['ring']} dB in the {RING} pixels around it, "
-        f"{side_psnrs['-30']} and {side_psnrs['+30']} dB from 30° to its sides"
+        f"{side_psnrs['-30']} and {side_psnrs['+30']} dB from 30° to either side"
     )
     log.say(result.line)
     return result

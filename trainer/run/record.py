@@ -50,7 +50,7 @@ class RunRecord:
     def __post_init__(self) -> None:
         columns = [self.losses.get(name, []) for name in ("step", "left")]
         if not all(columns) or len({len(column) for column in self.losses.values()}) > 1:
-            raise ValueError("its losses do not fit each other")
+            raise ValueError("its losses differ in length")
         check_name(self.plan.name)
 
 
@@ -99,8 +99,8 @@ def reopen_run(root: Path, scene: Path | None = None) -> FinishedRun:
     folder = RunFolder(root)
     if not folder.trajectory.is_file():
         raise ProgdfError(
-            f"{root} holds no trajectory.safetensors; give a folder that progdf train finished, "
-            "and of an edit that was trained: a removal has none"
+            f"{root} holds no trajectory.safetensors; give the folder of a finished training "
+            "(removals and decals are not trained)"
         )
     trajectory, extra, about = load_trajectory(folder.trajectory)
     try:
@@ -114,7 +114,7 @@ def reopen_run(root: Path, scene: Path | None = None) -> FinishedRun:
         if len(score) != len(gaussians):
             raise ProgdfError(
                 f"{path} has {len(gaussians)} Gaussians, the run's scene had {len(score)}; "
-                "give that one with --scene"
+                "give the run's scene with --scene"
             )
         region = Region(record.plan.name, members, score)
         rows = len(region) + (0 if trajectory.added is None else len(trajectory.added))

@@ -178,7 +178,7 @@ def _painted_views(options: TrainOptions, setup: TrainingSetup) -> tuple[list[Vi
 
 
 def _views_around(options: TrainOptions, setup: TrainingSetup) -> TrainingSetup:
-    """Return views from all sides besides those of the pictures; only the latter if there are no others."""
+    """Return a setup with views from all sides; the given setup, with the pictures' views, if none exist."""
     try:
         return make_training_setup(replace(options.views, pictures=()), setup.scene, setup.region)
     except ProgdfError:

@@ -27,6 +27,7 @@ from trainer.resolve import count_threads, recorded_options, resolve
 from trainer.store.run_folder import RunFolder, begin_log, remove_leftovers
 
 _VERSION = 7  # version of the saved state; 7: with few pictures, training chooses how to constrain their mask
+# environment variables that select the kernels of numba and of the linear algebra libraries
 _SWITCHES = (
     "NUMBA_CPU_FEATURES", "MKL_ENABLE_INSTRUCTIONS", "MKL_CBWR", "OPENBLAS_CORETYPE", "ONEDNN_MAX_CPU_ISA",
 )  # fmt: skip
@@ -57,9 +58,9 @@ def load_region(out: Path) -> Region | None:
         name = saved.values["name"]
         score = saved.tensors["score"]
         if score.dtype != torch.float32 or score.ndim != 1 or not bool(((score >= 0) & (score <= 1)).all()):
-            raise ValueError("the score is none")
+            raise ValueError("the score is invalid")
         if not isinstance(name, str):
-            raise TypeError("the name is none")
+            raise TypeError("the name is not a text")
         return Region(name, saved.tensors["members"], score)
 
 
@@ -89,7 +90,9 @@ def decide_resume(folder: RunFolder, options: TrainOptions, region: Region, coun
     requested = _identity(plan, threads)
     if resume and saved is not None:
         if saved.version != requested.version:
-            raise ProgdfError(f"another version of progdf began {folder.root}; train again in another folder")
+            raise ProgdfError(
+                f"{folder.root} was started by another version of progdf; train again in another folder"
+            )
         remedy = "give --resume the run's own options, or train again in another folder"
         _check_plan(folder, saved.plan, plan, remedy)
         remedy = "restore it and continue with --resume, or train again in another folder"
@@ -108,7 +111,7 @@ def decide_resume(folder: RunFolder, options: TrainOptions, region: Region, coun
             change = f"the processor was {saved.processor} and is {requested.processor}"
             notes.append(f"{change}: the last bits may differ, the quality does not")
         if saved.threads != threads:
-            notes.append(f"{saved.threads} threads, as the run began with, for the same bits")
+            notes.append(f"using {saved.threads} threads as at the start of the run, for the same bits")
         return ResumeDecision("go on", saved.threads, tuple(notes))
     if saved is not None and (step := _saved_step(folder)):
         raise ProgdfError(
@@ -138,12 +141,12 @@ def find_run(options: TrainOptions) -> Literal["nothing", "stopped", "finished"]
 
 @contextmanager
 def explain_stop(folder: RunFolder) -> Iterator[None]:
-    """Raise errors that stop a run again, as one line with the affected file and how to resume."""
+    """Convert an error that stops a run to one line with the affected file and the way to resume."""
     try:
         yield
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
-            f"what is done is kept in {folder.root}; give the same command with --resume to go on"
+            f"the progress is saved in {folder.root}; repeat the command with --resume to continue"
         ) from None
     except (OSError, ProgdfError) as error:
         full = disk_full(error)
@@ -164,7 +167,7 @@ def _file_of(error: OSError) -> str:
 
 @contextmanager
 def check_exists(folder: RunFolder) -> Iterator[None]:
-    """Report if the run's folder was removed during the run."""
+    """Raise a ProgdfError with a clear message if the run's folder was removed during the run."""
     try:
         yield
     except (OSError, ProgdfError) as error:
@@ -174,7 +177,7 @@ def check_exists(folder: RunFolder) -> Iterator[None]:
 
 
 class _Identity(msgspec.Struct):
-    """Everything that determines a run's result bit for bit, as stored in run.json; hashes for files."""
+    """Everything that determines a run's result bit for bit, as stored in run.json; files by their hashes."""
 
     plan: TrainOptions
     scene: str

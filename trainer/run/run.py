@@ -1,4 +1,4 @@
-"""Training run: draft, views, and one of the kinds of run, which are trained, pasted and removed."""
+"""Training run: write a draft, render the views, then train the edit, paste paint or remove the region."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def _prepare_views(
 def _write_draft(
     options: TrainOptions, scene: Gaussians, region: Region, folder: RunFolder, log: RunLog
 ) -> None:
-    """Write a first slider with only a grade, if a grade can represent the edit."""
+    """Write draft.gdf, a grade for use during training, if a grade can represent the edit."""
     if folder.draft == folder.gdf(options.name) or not editor_row(options.editor).color_function:
         return
     folder.draft.unlink(missing_ok=True)

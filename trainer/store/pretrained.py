@@ -113,7 +113,7 @@ def weights_here(folder: Path) -> int:
 
 
 def gpu_memory() -> tuple[int, int] | None:
-    """Return the free and total bytes of the graphics card that torch uses; None without a card."""
+    """Return the free and total bytes of the GPU that torch uses; None without a GPU."""
     if not torch.cuda.is_available():
         return None
     gc.collect()  # memory of a previous network counts as free
@@ -122,5 +122,5 @@ def gpu_memory() -> tuple[int, int] | None:
 
 
 def model_device(choice: str = "auto") -> str:
-    """Return the device for pretrained networks: "cuda" if `choice` is "auto" and torch has a card."""
+    """Return the device for pretrained networks: "cuda" if `choice` is "auto" and torch finds a GPU."""
     return "cuda" if choice == "auto" and torch.cuda.is_available() else "cpu"

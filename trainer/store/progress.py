@@ -25,7 +25,7 @@ Advance = Callable[[int, str], None]
 
 STAGES = {
     "views": "",
-    "try kinds": "Choosing what moves",
+    "try kinds": "Choosing the kind of edit",
     "edit": "Editing views",
     "weights": "",
     "model": "",
@@ -265,7 +265,7 @@ def _escape(text: str) -> str:
 
 
 def release_memory() -> None:
-    """Return freed memory to the system if the process has grown by a tenth since the last call.
+    """Return freed memory to the system if the process has grown by 10 % since the last call.
 
     glibc keeps freed blocks that lie between used ones: 0.8 GB after the views of 200 000 members.
     """

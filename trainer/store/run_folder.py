@@ -1,11 +1,11 @@
 """The run folder: its layout, the check that a folder belongs to the edit, and pictures of views.
 
-RUN/draft.gdf                                    a color grade only, until NAME.gdf exists
+RUN/draft.gdf                                    a color grade for use until NAME.gdf exists
 RUN/NAME.gdf  trajectory.safetensors  cameras.json  report.json  report.png  log.txt
 RUN/views/original|mask|final/VIEW.png           the view before the edit, the region's mask, after the edit
 RUN/views/edited/VIEW.png, edited/0.25/VIEW.png  the editor's pictures at strength 1 and at other strengths
 RUN/views/painted/…                              pictures of a learned editor, see editors/cache.py
-RUN/segmented/PROMPT/VIEW.png                    masks of text:"…"; a folder for masks:DIR
+RUN/segmented/PROMPT/VIEW.png                    masks of text:"…"; the folder can be used as masks:DIR
 RUN/state/…                                      saved state of a stopped run, see state.py
 RUN/run.lock                                     locked during training
 """
@@ -39,6 +39,7 @@ from progdf.threads import map_threads
 from .state import StateFolder
 
 PICTURES_LIST = "pictures.txt"
+"""Name of the file that lists the pictures that the program wrote into a folder."""
 
 
 def read_pictures_list(folder: Path) -> list[str]:
@@ -94,7 +95,7 @@ def _write(folder: Path, lines: Iterable[str]) -> None:
     atomic.write_file(folder / PICTURES_LIST, "".join(f"{line}\n" for line in lines))
 
 
-_SIGNATURE = "progdf train"
+_SIGNATURE = "progdf train"  # start of log.txt, which marks a run folder
 _LOCK_WAIT_S = 1.0  # a window that checks whether a run is locked holds the lock briefly
 
 
@@ -292,7 +293,9 @@ def read_run_cameras(folder: RunFolder, held_out: Iterable[str], origin: Origin)
     names = [camera.name for camera in cameras]
     for name in names:
         if not is_view_name(name):
-            raise ProgdfError(f"{folder.cameras} has a camera named '{name}', which names no view; {remedy}")
+            raise ProgdfError(
+                f"{folder.cameras} has a camera named '{name}', not a valid view name; {remedy}"
+            )
         if names.count(name) > 1:
             raise ProgdfError(f"{folder.cameras} has {names.count(name)} cameras named {name}; {remedy}")
     originals = [

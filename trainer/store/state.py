@@ -116,8 +116,8 @@ def _writer() -> ThreadPoolExecutor:
 class StateFolder:
     """The folder RUN/state.
 
-    A short part that repeats bit for bit need not be saved while it runs: `save` its result at the end, and
-    `load` it when the run resumes (None: not finished yet).
+    A short part of a run that gives the same bits when repeated need not be saved while it runs: `save` its
+    result at the end, and `load` it when the run resumes (None: not finished yet).
     """
 
     path: Path
@@ -331,7 +331,7 @@ class PeriodicSave:
 
 
 def generator(state: Tensor) -> torch.Generator:
-    """Return a random generator in the state of a `get_state()`. [n] uint8"""
+    """Return a random generator in a state from `Generator.get_state()`. [n] uint8"""
     restored = torch.Generator()
     restored.set_state(state)
     return restored

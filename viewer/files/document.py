@@ -61,7 +61,7 @@ class Document:
 
     @property
     def gdfs(self) -> tuple[Gdf, ...]:
-        """Edits, extended to that scene."""
+        """Edits, extended to the rows of `scene`."""
         return self._extension[1]
 
     @cached_property

@@ -34,7 +34,7 @@ from viewer.state.selection import NamedRegion, SelectionState, unpack
 CAMERAS = ".cameras.json"  # suffix of a file of cameras
 
 REQUESTS = ("picture", "take_view", "window_picture")
-"""Requests that the main view handles."""
+"""Names of the export requests that the main view handles."""
 
 
 def folder_of(scene: Path | None) -> Path:

@@ -35,7 +35,7 @@ def is_listed(path: Path) -> bool:
 
 
 def read_recent(missing: bool = False) -> tuple[Path, ...]:
-    """Return the recent files that exist, with `missing` also the others. Empty if the list is unreadable."""
+    """Return the recent files that exist; with `missing`, missing ones too. Empty for an unreadable list."""
     try:
         lines = (state_folder() / "recent.txt").read_text("utf-8", "surrogateescape").splitlines()
         known = [path for path in map(Path, lines) if is_listed(path)]
@@ -185,7 +185,7 @@ def open_in_program(path: Path) -> bool:
 
 
 def parse_path(text: str) -> Path:
-    """Parse a typed path and expand `~`. The home of an unknown user is taken literally.
+    """Parse a typed path and expand `~`. The `~USER` of an unknown user stays as it is.
 
     Raises:
         ProgdfError: the text is not a valid file name.

@@ -2,8 +2,8 @@
 
 As a program, python -P -m viewer.jobs.child [--talks] COMMAND …, this module runs a command with a parent
 watchdog. The command is interrupted when its standard input closes. The window holds the other end, so the
-command never outlives the window, however that ended. A command with --talks reads its input itself and ends
-with it.
+command never outlives the window, however the window ends. A command with --talks reads its input itself and
+ends when the input ends.
 """
 
 from __future__ import annotations
@@ -156,7 +156,7 @@ def main() -> int:
     """Run the child and return the exit status of its command."""
     talks = sys.argv[1:2] == [_TALKS]
     if not talks:
-        # a window started by `&` in a script ignores SIGINT, and its child could not be stopped
+        # a window started by `&` in a script ignores SIGINT, and its child would inherit that
         signal.signal(signal.SIGINT, signal.default_int_handler)
         threading.Thread(target=_watch_parent, daemon=True).start()
     from progdf.__main__ import main as run

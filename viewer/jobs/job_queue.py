@@ -1,6 +1,6 @@
 """Queue of child processes: one training run at a time, and deliveries (exports, pictures, films).
 
-Children are polled and never waited for.
+Children are polled. Only `JobQueue.close` waits for them.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ POLL_S = 0.3
 """Seconds between two checks for ended children."""
 
 PROGRESS_INTERVAL_S = 1.0
-"""Seconds between two reads of their progress; the window redraws their cards at each."""
+"""Seconds between two reads of the jobs' progress; the window redraws their cards at each."""
 
 
 _COUNT = re.compile(r"^((?:frame )?(\d+)(?:/| of )(\d+)(?:: [^:\n]+)?)", re.MULTILINE)
-"""Start of a progress line: the current frame, or edit of the demo, and the total."""
+"""Start of a progress line: the number of the current frame (or of the demo's edit), and the total."""
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ The trainer is another program (`progdf train`). This module knows only its comm
     SCENE.edits/NAME.train.log     its output
     SCENE.edits/NAME.train.lock    locked by the window that has it in its queue: it alone writes these files
     SCENE.edits/NAME.region.npy    the selection that it edits
-    SCENE.edits/NAME.draft.gdf     a grade alone, its layer until it is packed; kept, as sessions may name it
-    SCENE.edits/NAME.packed.gdf    the trained edit, its layer until it is evaluated; kept as well
+    SCENE.edits/NAME.draft.gdf     a grade: the layer's file until the edit is packed; kept for sessions
+    SCENE.edits/NAME.packed.gdf    the packed edit: the layer's file until it is evaluated; kept for sessions
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from progdf.region import Region
 
 from .child import Progress
 
+# suffixes of the files beside a run's folder
 ORDER = ".train.json"
 LOG = ".train.log"
 WINDOW_LOCK = ".train.lock"
@@ -62,7 +63,7 @@ class EditOrder:
     name: str  # name of the layer
     region: str  # value of `progdf train --region`
     editor: str  # value of `progdf train --editor`
-    quick: bool = True  # a draft
+    quick: bool = True  # train with --quick
     threads: int = 0  # CPU threads; 0 for all
     model: str = ""  # diffusion model for a sentence; "" selects one that fits
     anchor: str = ""  # file of a painted picture that all views follow, "" for none
@@ -191,8 +192,10 @@ class EditOrder:
         return None
 
     def recorded_edit(self, recording: Path, scene: Gaussians) -> Gdf | None:
-        """Return a recording as an edit of the scene, at strength 1 the current state; None while it is
-        written."""
+        """Return a recording as an edit of the scene that ends in the recorded state at strength 1.
+
+        None while the file is being written, or if it belongs to another scene.
+        """
         try:
             tensors, _ = read_tensors(self.out / "state" / "region.safetensors")
             offsets = read_tensors(recording)[0]["offsets"].float()
@@ -257,7 +260,7 @@ def stopped_orders(folder: Path, scene: Path) -> Iterator[EditOrder]:
 
 
 def takes_files(folder: Path) -> bool:
-    """Return whether a folder is writable. Root could also write into folders that are read-only for all."""
+    """Return whether a folder is writable. Folders that are read-only for all count as read-only for root."""
     try:
         return bool(folder.stat().st_mode & 0o222) and os.access(folder, os.W_OK)
     except OSError:

@@ -106,7 +106,7 @@ def _tag(draw: ImageDraw.ImageDraw, x: float, side: str, text: str, size: tuple[
 
 
 class Comparer:
-    """Drawing of a view with its comparison, in place of the engine.
+    """Renderer of a view with its comparison, used in place of the engine.
 
     Args:
         engine: draws the edited scene; owned by the caller

@@ -45,6 +45,7 @@ from shaders import load_source
 DRAWN_SH = (0, 3, 8, 15)
 """Number of SH coefficients above the first, by degree."""
 LEVELS = {"i1": 127, "i2": 32767}
+"""Largest quantization level by type of array."""
 _MAX_SEGMENT = 1 << 12  # members composed at once, which limits memory
 _MIN_AXIS_SHARE = 1e-4  # share of the scene's spread: a smaller axis is below a pixel in any picture
 _UNSEEN_LOGIT = -1e3  # logit of a Gaussian that is not drawn
@@ -119,7 +120,7 @@ def pack(
     degree: int,
     more: Mapping[str, Any],
 ) -> Packed:
-    """Return the container of a scene and of edits that add no more Gaussians to it.
+    """Return the container of a scene and its edits. The scene already has the rows that the edits add.
 
     Args:
         scene: the original with the rows that edits add
@@ -353,12 +354,12 @@ def _numbers(tensor: Tensor) -> Any:
 
 
 MODULES = ("camera", "data", "grade", "compose", "sort", "renderer", "state", "panel", "input", "main")
-"""Modules of `src`, each after its imports; then follows the module for the page's host."""
+"""Modules of `src`, each after its imports. The module of the page's host, `start` or `widget`, follows."""
 STAGES = ("web.vert", "splat.frag", "present.vert", "present.frag", "stretch.frag")
 MAIL_LIMIT_BYTES = 25e6
 """Size limit of attachments in mail, bytes."""
 HOST = 100e6
-"""Size limit of common hosts, bytes."""
+"""Size limit of common web hosts, bytes."""
 
 _IMPORT = re.compile(r"^import .*?;\n", re.MULTILINE | re.DOTALL)
 _LINK = re.compile(r"https?://[^\s<>\"']+[^\s<>\"'.,;:)]")

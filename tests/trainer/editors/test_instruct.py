@@ -359,7 +359,7 @@ def test_components_on_the_gpu_in_turn_paint_the_same_picture(
 
 def test_four_bit_weights_need_their_package_and_a_gpu(pix2pix: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("trainer.editors.adapters.find_spec", lambda package: package)
-    with pytest.raises(ProgdfError, match="needs a graphics card"):
+    with pytest.raises(ProgdfError, match="nf4 needs a GPU"):
         editor_of(settings_of(pix2pix, quantize="nf4"))
     monkeypatch.setattr("trainer.editors.adapters.find_spec", lambda package: None)
     with pytest.raises(ProgdfError, match=r"pip install progdf-studio\[quantize\]"):

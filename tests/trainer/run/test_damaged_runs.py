@@ -69,7 +69,7 @@ CAMERA_CHANGES: dict[str, tuple[Callable[[list[dict[str, Any]]], object], str]] 
     "one less": (lambda cameras: cameras.pop(), "lacks the camera of the run's view"),
     "one twice": (lambda cameras: cameras.append(cameras[0]), "has 2 cameras named"),
     "another name": (lambda cameras: cameras[0].update(name="other"), "lacks the camera of the run's view"),
-    "a name that leads elsewhere": (lambda cameras: cameras[0].update(name="../x"), "which names no view"),
+    "a name that leads elsewhere": (lambda cameras: cameras[0].update(name="../x"), "not a valid view name"),
 }
 
 

@@ -201,13 +201,13 @@ def test_run_of_another_version_is_not_resumed(bear_folder: Path) -> None:
     identity = json.loads(about.read_text(encoding="utf-8"))
     del identity["version"]
     about.write_text(json.dumps(identity), encoding="utf-8")
-    with pytest.raises(ProgdfError, match="another version of progdf began run; train again"):
+    with pytest.raises(ProgdfError, match="run was started by another version of progdf; train again"):
         train(replace(small_run(bear_folder), resume=True), quiet=True)
 
 
 @pytest.mark.usefixtures("stopped")
 def test_resumed_run_keeps_its_number_of_threads(bear_folder: Path, uninterrupted: Path) -> None:
-    assert "1 threads, as the run began with" in gone_on(bear_folder, uninterrupted, threads=2)
+    assert "using 1 threads as at the start of the run" in gone_on(bear_folder, uninterrupted, threads=2)
     assert torch.get_num_threads() == 1
 
 
