@@ -50,8 +50,8 @@ class Finding:
 
     key: str  # key of the job
     fault: str = ""  # reason why it cannot be trained, in one line
-    gaussians: int = 0  # number in the scene
-    members: int = 0  # number in the region; 0 if a network has to find it
+    gaussians: int = 0  # number of Gaussians in the scene
+    members: int = 0  # number of Gaussians in the region; 0 if a network has to find it
 
 
 @cache

@@ -89,7 +89,7 @@ class MixedSteps:
         is continuous at strength 0.
 
         Args:
-            ask: returns the arguments of a call for its pictures, with the same noise each time
+            ask: returns the arguments of a call for given pictures, with the same noise each time
             pictures: the view's own first, then references
             source: result at strength 0
             strength, softness: see `InstructEditor.paint`
@@ -163,7 +163,7 @@ class MixedSteps:
         """Return the prediction that leads from a sample straight to the source."""
         latents = self.latents if self._source is None else self._source
         assert latents is not None
-        # image planes of a UNet: the picture's come first, unscaled as in the autoencoder
+        # latents of a UNet are planes: those of the picture come first, unscaled as in the autoencoder
         if sample.ndim == 4:
             is_scaled = getattr(self.pipeline, "is_cosxl_edit", False)
             scale = 1.0 if is_scaled else self.pipeline.vae.config.scaling_factor

@@ -154,7 +154,7 @@ def draft_grade(views: DraftViews, options: EditorOptions, name: str) -> Gdf | N
 
 
 def _drawn_error(views: DraftViews, table: Tensor, degree: int, expected: Tensor) -> float:
-    """Return the error of the map stored in the members' spherical harmonics, as in a scene."""
+    """Return the error in the test views if the map changes the members' SH coefficients, not pixels."""
     judged = views.judged
     seen = views.judged.seen
     scene = views.scene[views.region.members[seen]]

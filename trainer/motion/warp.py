@@ -351,7 +351,10 @@ class WarpSearch:
 
 
 def disagreement(control: ControlPoints, motion: WarpMotion) -> Tensor:
-    """Return the mean squared error of neighbors' predicted positions of each other, in squared spacings."""
+    """Return by how much neighboring control points disagree, in squared spacings.
+
+    It is the mean squared distance of a moved control point from its position under a neighbor's map.
+    """
     if not len(control.links):
         return motion.shift.new_zeros(())
     a, b = control.links.unbind(1)

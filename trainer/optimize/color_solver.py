@@ -320,7 +320,7 @@ class Solver:
             else:
                 if direction is preconditioned:
                     break
-                direction = preconditioned  # the direction belongs to other clamps: restart
+                direction = preconditioned  # the direction was found under other clamps: restart
                 continue
             previous = preconditioned
             power = _inner(gradient.descent, preconditioned)

@@ -24,7 +24,7 @@ _MIN_GAP = 1e-4  # minimum distance of neighboring slider values
 
 
 def resolve_slider(slider: Slider, strengths: Sequence[float]) -> Slider:
-    """Return the meaning of slider values for these stage strengths."""
+    """Return `slider`, with "auto" replaced by "stages" for several stage strengths, else by "even"."""
     if slider != "auto":
         return slider
     return "stages" if len(strengths) > 1 else "even"

@@ -57,7 +57,7 @@ class Ties:
 
 
 def surface_ties(scene: Gaussians, members: Tensor, cameras: Sequence[Camera]) -> Ties:
-    """Return the ties of a region's members; the cameras tell the covered and the almost hidden ones."""
+    """Return the ties of a region's members. Covered and almost hidden members are found from the cameras."""
     masks = [torch.ones(camera.height, camera.width) for camera in cameras]
     clear = gather(scene, cameras, masks).clearness[members] >= HIDDEN
     return Ties(surface_graph(scene[members], covered_rows(scene, cameras)[members]), clear)

@@ -373,7 +373,10 @@ def _main_pieces(
 
 
 def _thickness(scene: Gaussians, camera: Camera, mask: NDArray[np.bool_]) -> float:
-    """Return the median standard deviation of blended depths in the mask, world units, at least one pixel."""
+    """Return the thickness of the visible surface in the mask, world units, at least the size of a pixel.
+
+    It is the median over the pixels of the standard deviation of the depths that are blended in a pixel.
+    """
     axis = camera.viewmat[2].double()
     depths = scene.means.double() @ axis[:3] + axis[3]
     z = (depths - depths.median()).float()

@@ -61,7 +61,7 @@ _SIDES = ((20.0, 15.0), (110.0, 15.0), (200.0, 15.0), (290.0, 15.0))  # azimuth 
 
 
 def show(options: ShowRegionOptions) -> list[str]:
-    """Write the requested output; return log lines, the last with the region's count.
+    """Write the requested output; return log lines, the last with the region's number of Gaussians.
 
     Raises:
         ProgdfError: invalid scene, region or camera, or an output that is neither .png nor .npy.

@@ -51,7 +51,7 @@ from trainer.views.view import View, render_view
 from .paint import sharpen
 from .record import RunRecord, render_edited_views, reopen_run
 
-_RANK_VIEWS = 4  # number of training views that the fit of a field is tested in
+_RANK_VIEWS = 4  # number of training views on which the rank of a field is chosen
 _VISIBILITY_STRIDE = 2  # every second training view measures the visibility of the members
 _KEYS_OF_REPORT_ONLY = (
     *("plan", "time", "memory_mb", "curves", "views", "pictures"),

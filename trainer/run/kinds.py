@@ -270,7 +270,10 @@ def _try_approach(
     small: Evaluator,
     steps: int,
 ) -> float:
-    """Return the PSNR in the held-out views, dB. `seeds`: number of added members, which come last"""
+    """Train an approach for some steps; return its PSNR in the held-out views, dB.
+
+    `seeds`: number of added members, which come last
+    """
     training = small.only([i for i in range(len(small.crops)) if i % 3 != 1])
     original = small.original
     crops = training.crops

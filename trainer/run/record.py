@@ -128,7 +128,7 @@ def reopen_run(root: Path, scene: Path | None = None) -> FinishedRun:
 
 
 def render_run_views(run: FinishedRun) -> TrainingSetup:
-    """Render the run's views. Their boxes hold the region, without changes that an edit may cause beside it.
+    """Render the run's views. Their boxes contain the region, but not the edit's changes outside of it.
 
     Raises:
         ProgdfError: cameras.json does not match the run's pictures, see `read_run_cameras`.

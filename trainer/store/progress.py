@@ -288,7 +288,7 @@ _STATUS_FILE = Path("/proc/self/status")
 def peak_mb() -> float:
     """Return the peak resident memory of the process (VmHWM), MB of 2²⁰ bytes; 0 if unknown.
 
-    Linux does not use `getrusage`: its figure starts at the parent's memory when this process was started.
+    `getrusage` is not used on Linux: its figure starts at the parent's memory when this process was started.
     """
     if sys.platform == "win32":
         return 0.0

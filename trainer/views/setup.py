@@ -63,7 +63,7 @@ With up to 24 no draft improves by 0.1 dB.
 """
 _GLANCE_SIZE = 192
 """Longer side of a thumbnail, pixels; smaller ones mix the region's colors with each other and the rest."""
-_MAX_GLANCE_GAUSSIANS = 3_000_000  # rendered in all thumbnails together
+_MAX_GLANCE_GAUSSIANS = 3_000_000  # maximum number of Gaussians rendered in all thumbnails together
 
 
 @dataclass(frozen=True)

@@ -240,9 +240,9 @@ def region_sphere(scene: Gaussians, region: Region) -> tuple[Tensor, float]:
 
 
 def frame_sphere(camera: Camera, center: Tensor, radius: float, share: float, up: Tensor) -> Camera:
-    """Return a camera at the same position with a square picture that a sphere fills to a share from 0 to 1.
+    """Return the camera turned to a sphere, with a square picture.
 
-    `up`: world direction, [3]
+    The sphere's diameter fills a share of the picture's side, 0 to 1. `up`: world direction, [3]
     """
     distance = float((camera.position - center).norm())
     fov = 2 * math.asin(min(0.7, radius / (share * max(distance, radius))))

@@ -41,7 +41,7 @@ _TALKS = "--talks"
 class Progress:
     """Progress of a command; the trainer writes it to RUN/state/progress.json."""
 
-    share: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0  # share of the whole run
+    share: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0  # finished share of the whole run
     label: str = ""  # current step, "" while it starts
     loss: str = ""  # loss of the training, "" without one
     seconds: Annotated[float, Meta(ge=0.0, le=1e9)] = 0.0  # time spent on a run in all its sessions

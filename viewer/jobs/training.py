@@ -7,8 +7,10 @@ The trainer is another program (`progdf train`). This module knows only its comm
     SCENE.edits/NAME.train.log     its output
     SCENE.edits/NAME.train.lock    locked by the window that has it in its queue: it alone writes these files
     SCENE.edits/NAME.region.npy    the selection that it edits
-    SCENE.edits/NAME.draft.gdf     a grade: the layer's file until the edit is packed; kept for sessions
-    SCENE.edits/NAME.packed.gdf    the packed edit: the layer's file until it is evaluated; kept for sessions
+    SCENE.edits/NAME.draft.gdf     a grade: the layer's file until the edit is packed
+    SCENE.edits/NAME.packed.gdf    the packed edit: the layer's file until the edit is evaluated
+
+The last two stay, because a session may refer to them.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ _VIDEO_FILTER = (
 )
 """Filter that converts to these colors. Newer encoders read the tags from frames, older ones from options."""
 
-_WEBP_QUALITY = 85  # 0 to 100; without visible blocks in a still
+_WEBP_QUALITY = 85  # 0 to 100; a paused frame shows no blocks
 _PALETTE_REACH = 8  # levels: Pillow finds the nearest palette color in steps of 4
 ANIMATIONS = (".gif", ".webp", VIDEO)
 _OPAQUE_FORMATS = (".gif", VIDEO)  # a .gif has no partial transparency

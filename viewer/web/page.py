@@ -239,7 +239,7 @@ def _order(scene: Gaussians, groups: NDArray[np.int64]) -> NDArray[np.int64]:
 def _segments(
     groups: NDArray[np.int64], order: NDArray[np.int64], gdfs: Sequence[Gdf]
 ) -> list[tuple[int, list[int]]]:
-    """Return the lengths of runs of members with the same edits, at most `_MAX_SEGMENT`, with these edits."""
+    """Return the runs of members with the same edits: length, at most `_MAX_SEGMENT`, and these edits."""
     starts = np.flatnonzero((np.diff(groups, prepend=-1) != 0) | (np.arange(len(groups)) % _MAX_SEGMENT == 0))
     inside = [np.isin(order[starts], gdf.region.members.numpy()) for gdf in gdfs]
     edits = [[i for i, there in enumerate(inside) if there[k]] for k in range(len(starts))]
