@@ -142,7 +142,7 @@ def picture_paths(what: str) -> tuple[Path, ...]:
     if len(paths) > MAX_PICTURES:
         raise ProgdfError(
             f"pictures: takes at most {MAX_PICTURES} pictures, not {len(paths)}; "
-            "give more as folder:DIR, of views that --cameras has"
+            "give more as folder:DIR, with their cameras in --cameras"
         )
     return paths
 

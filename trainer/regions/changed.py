@@ -111,8 +111,8 @@ def changed_region(
         share = sum(float(mask.float().mean()) for mask in masks) / len(masks)
         strays = len(candidates) - len(region)
         say(
-            f"changed: {100 * share:.1f} % of the pictures differ; {format_count(len(region))} show it"
-            + (f" ({format_count(strays)} beside it left out)" if strays else "")
+            f"changed: {100 * share:.1f} % of the pixels differ; {format_count(len(region))} selected"
+            + (f" ({format_count(strays)} removed as strays)" if strays else "")
         )
     return region
 

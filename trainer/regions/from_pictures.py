@@ -246,7 +246,7 @@ def _mask_folder(kind: str, text: str, request: RegionRequest) -> tuple[Path, Pa
         raise ProgdfError(f"{kind}: needs a folder; write {kind}:DIR with a mask for each camera in DIR")
     folder = Path(text).expanduser()
     if not folder.is_dir():
-        raise ProgdfError(f"{folder} is not a folder; give the one that holds a mask for each view")
+        raise ProgdfError(f"{folder} is not a folder; give the folder with the masks of the views")
     beside = folder / "cameras.json"
     if beside.is_file():
         return folder, beside

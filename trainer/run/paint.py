@@ -193,7 +193,7 @@ def choose_discs(
         errors = ", ".join(f"{decibels(error):.1f} dB with {laid.gap:g} px" for error, laid in candidates)
         log.say(
             f"occluding Gaussians move {best[1].gap:g} px behind the paint; tried: {errors} (in the paint "
-            f"and {RING} px around it, from the painted view and up to {max(TRIAL_ANGLES_DEG)}° to its sides)"
+            f"and {RING} px around it, from the painted view and up to {max(TRIAL_ANGLES_DEG)}° beside it)"
         )
     return best[1]
 

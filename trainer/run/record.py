@@ -99,8 +99,8 @@ def reopen_run(root: Path, scene: Path | None = None) -> FinishedRun:
     folder = RunFolder(root)
     if not folder.trajectory.is_file():
         raise ProgdfError(
-            f"{root} holds no trajectory.safetensors; give the folder of a finished training "
-            "(removals and decals are not trained)"
+            f"{root} holds no trajectory.safetensors; give a folder that progdf train finished "
+            "(removals and decals have no trajectory)"
         )
     trajectory, extra, about = load_trajectory(folder.trajectory)
     try:

@@ -159,7 +159,7 @@ def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder
     gdf = replace(gdf, options=differences(report["plan"], DEFAULTS), report=about)
     result = write_result(folder, gdf, report, picture)
     psnr_list = ", ".join(f"{psnr:.1f} dB on {name}" for name, psnr in errors.items())
-    log.say(f"PSNR to a render without the region, in its pixels of views without fill: {psnr_list}")
+    log.say(f"PSNR to a render of the filled scene without the region, at the region's pixels: {psnr_list}")
     log.say(f"{result.line}; shadows and reflections stay")
     return result
 

@@ -39,7 +39,7 @@ def rendered_cameras(paths: Sequence[Path], given: Sequence[Camera], origin: Ori
         if abs(width * camera.height / (height * camera.width) - 1) > _MAX_ASPECT_ERROR:
             raise ProgdfError(
                 f"{path} is {width}x{height} pixels, it was rendered with {camera.width}x{camera.height}; "
-                "keep the proportions, and crop nothing"
+                "keep the proportions and do not crop it"
             )
         cameras.append(camera)
     return cameras

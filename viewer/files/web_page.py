@@ -206,8 +206,8 @@ def _slider_layers(view: ViewState, names: str | None) -> set[str]:
         return known
     chosen = {name.strip() for name in names.split(",") if name.strip()}
     for name in sorted(chosen - known):
-        names = f"are {', '.join(sorted(known))}" if known else "is none"
-        raise ProgdfError(f"--layers {name}: there is no layer of that name; there {names}")
+        names = f"the layers are {', '.join(sorted(known))}" if known else "there are no layers"
+        raise ProgdfError(f"--layers {name}: there is no layer of that name; {names}")
     return chosen
 
 

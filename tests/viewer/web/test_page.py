@@ -602,7 +602,7 @@ def test_failed_page_export_is_one_line_and_keeps_the_old_file(
     out.write_text("earlier")
     (tmp_path / "broken.session.json").write_text('{"view": [1, ')
     bad: list[tuple[list[str], str]] = [
-        ([scene, *edits, "--layers", "hat"], "no layer of that name; there are ears, scarf"),
+        ([scene, *edits, "--layers", "hat"], "no layer of that name; the layers are ears, scarf"),
         ([scene, "-o", str(tmp_path / "page.ply"), "--title", "x"], "not a web page"),
         ([str(tmp_path / "broken.session.json")], "broken.session.json"),
     ]
