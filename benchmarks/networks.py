@@ -30,7 +30,7 @@ from progdf.field import (
     fit_keyframes,
 )
 from progdf.field.baked import NeuralForm
-from progdf.field.neural_fit import NeuralFit, train_network
+from progdf.field.neural_fit import NeuralFit, rendered_importance, train_network
 from progdf.field.separable import moving_attributes
 from progdf.gaussians import Gaussians, pack
 from progdf.gdf.file import Gdf, load_gdf, save_gdf
@@ -38,7 +38,6 @@ from progdf.io.atomic import make_folder
 from progdf.rasterize import set_threads
 from progdf.terminal import group_digits
 from trainer.fit.fit import stored_numbers
-from trainer.fit.network import rendered_importance
 
 from .courses import KnownTrajectory, edit_of, processor_milliseconds
 from .recorded_runs import recorded_edit

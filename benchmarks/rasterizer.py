@@ -390,7 +390,7 @@ def _step_time(case: RasterCase, steps: int) -> float:
     )
     rows = pack(raw, with_shN=False)
     target = crop.original.clamp(0.0, 1.0).flip(2)
-    options = OptimizeOptions(perceptual_weight=0.3, sharpness="off")
+    options = OptimizeOptions(perceptual_weight=0.3)
     settings = PgsSettings(learning_rates("style", rows.shape[1], 1.0), ramp=0.0, reach=0.0)
     ends: list[float] = []
     stages = [TargetStage(1.0, [target], steps)]

@@ -27,7 +27,7 @@ from trainer.editors import make_editor
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.optimize.groups import GROUP_STEPS, Groups, group_stage
 from trainer.optimize.losses import Objective, erode, perceptual_loss
-from trainer.optimize.pgs import TargetStage, optimize, pgs_settings
+from trainer.optimize.pgs import TargetStage, learning_rates, optimize, pgs_settings
 from trainer.options import EditorOptions, OptimizeOptions, RegionOptions, TrainingViewOptions, TrainOptions
 from trainer.resolve import resolve, resolve_kind
 from trainer.run.kinds import Approach, approaches, try_approaches
@@ -163,7 +163,8 @@ def _train(
     if groups is not None:
         stages = groups.to_stages(original, crops, stages)
         extent = groups.extent
-    settings = pgs_settings(optimization, True, original.shape[1], extent, 1)
+    rates = learning_rates(approach.kind, original.shape[1], extent)
+    settings = pgs_settings(optimization, rates, 1)
     inside = [erode(crop(view.mask, view.box)) for view in setup.train]
     objective = Objective(perceptual_loss()[0], optimization, inside)
     *_, last = optimize(original, crops, probe_views(setup), stages, objective, settings)

@@ -23,12 +23,8 @@ EditKind = Literal["color", "style", "geometry"]
 Kind = Literal["auto", "color", "style", "geometry"]
 Slider = Literal["auto", "even", "stages", "time"]
 """Meaning of slider values; auto becomes one of the others (`resolve_slider`)."""
-Rates = Literal["kind", "3dgs", "gaussian-editor"]
-Progressive = Literal["decay", "growth", "off"]
-Sharpness = Literal["kind", "hinge", "paper", "off"]
 Solver = Literal["descent", "colors"]
 FieldLoss = Literal["parameters", "pictures"]
-Over = Literal["mean", "sum"]
 LiftRule = Literal["share", "paper"]
 Bands = Literal["auto", "on", "off"]
 Preset = Literal["default", "paper"]
@@ -150,28 +146,13 @@ class OptimizeOptions:
     """View-dependent color (SH bands 1 to 3): train, and keep if worth 0.1 dB (on, auto), or skip (off)."""
     perceptual_weight: Annotated[float | None, absent_option("FLOAT", "by the kind of edit")] = None
     """Weight of LPIPS beside L1, 0 or more; by default 0.3 for style and geometry (paper: 1)."""
-    progressive: Progressive = "off"
-    """Progressive constraint of the paper (eq. 5), relaxed (decay) or tightened (growth) over time."""
-    progressive_over: Over = "mean"
-    """Reduction of the progressive constraint over the members' squared steps: mean or sum."""
-    rates: Rates = "kind"
-    """Learning rates: by the kind of edit, of 3DGS, or of GaussianEditor."""
     slider: Slider = "auto"
     """Slider values: equal visible steps (even), editor strengths (stages), or optimizer time (time)."""
     grow: float = 0.0
     """Gaussians that may be added for new parts, such as a hat, as a share of the region's, 0 to 1."""
     engine: Engine = "auto"
     """Rasterizer for training: cpu, warp (CUDA, extra gpu), or auto."""
-    perceptual_every: Fixed[int] = 2  # interval between evaluations of LPIPS, in steps
-    # Sharpness term of the renders: a hinge at the target's sharpness, or the printed term, whose gradient is
-    # zero except at the boundary pixels.
-    sharpness: Fixed[Sharpness] = "kind"
-    # The paper's training: Adam without a floor, the same rate for all steps and stages, recordings every 100
-    # steps with their jitter, losses over whole pictures, no dropped attributes, a jointly trained network.
-    as_printed: Fixed[bool] = False
     color_solver: Fixed[bool] = True  # solve color edits over all views at once, if possible
-    ema: Fixed[bool] = True  # record a running mean of the parameters instead of the iterates
-    target_ramp: Fixed[bool] = True  # fade a stage's target from the last stage's pictures to its own
     seed: Fixed[int] = 0  # order of the views
     solver: Fixed[Solver] = "descent"  # set once the kind is known, see `resolve_kind`
 
@@ -188,7 +169,6 @@ class FieldOptions:
     """neural: train on the recorded offsets, or on renders with the losses of the paper."""
     target_psnr: Annotated[float | None, absent_option("FLOAT", "a tenth of the edit's own error")] = None
     """Minimum PSNR of the field to the trajectory, dB, instead of auto's rule; lower gives smaller files."""
-    as_printed: Fixed[bool] = False  # network with positions only, hard bins of the slider, and no codes
     draft: Fixed[bool] = False  # train a network for a third of its steps
     seed: Fixed[int] = 0  # seed of the network's weights and samples
 
@@ -219,7 +199,7 @@ class TrainOptions:
     region: RegionOptions
     editor: EditorOptions
     preset: Preset = "default"
-    """Defaults of the options below: paper is the paper's trainer, in the readings that work."""
+    """Method, and defaults of the options below: paper is the paper's trainer, in the readings that work."""
     name: Annotated[str, absent_option("STR", "the folder's name")] = ""
     """Name of the layer and of the .gdf file."""
     views: TrainingViewOptions = TrainingViewOptions()
@@ -256,26 +236,18 @@ PRESETS: Mapping[Preset, Mapping[str, Mapping[str, Any]]] = {
             "stages": 1,
             "group_steps": 0,
             "perceptual_weight": 1.0,
-            "progressive": "decay",
-            "progressive_over": "mean",
             "sh": "off",
             "slider": "time",
-            "rates": "gaussian-editor",
-            "perceptual_every": 1,
-            "sharpness": "paper",
-            "as_printed": True,
             "color_solver": False,
-            "ema": False,
-            "target_ramp": False,
         },
-        "field": {"field": "neural", "size": "paper", "field_loss": "pictures", "as_printed": True},
+        "field": {"field": "neural", "size": "paper", "field_loss": "pictures"},
     },
 }
-"""Values of options that belong together, by part. Options on the command line override them."""
+"""Values of options that belong to a method, by part. Options on the command line override them."""
 
 
 def apply_preset(options: TrainOptions, preset: Preset) -> TrainOptions:
-    """Return the options with a preset's values in its fields; use `replace` for deviations."""
+    """Return the options with a preset and its values in the fields; use `replace` for deviations."""
     parts = {part: replace(getattr(options, part), **values) for part, values in PRESETS[preset].items()}
     return replace(options, preset=preset, **parts)
 

@@ -37,7 +37,6 @@ from .options import (
     OptimizeOptions,
     Preset,
     RegionOptions,
-    Sharpness,
     TrainOptions,
     check_ranges,
 )
@@ -46,7 +45,6 @@ BLANK = TrainOptions(Path(), Path(), RegionOptions(""), EditorOptions(""))
 """Options of an empty command line."""
 
 PERCEPTUAL_WEIGHT: Mapping[EditKind, float] = {"color": 0.1, "style": 0.3, "geometry": 0.3}
-SHARPNESS: Mapping[EditKind, Sharpness] = {"color": "off", "style": "hinge", "geometry": "off"}
 STAGES: Mapping[EditKind, int] = {"color": MAX_STAGES, "style": 1, "geometry": MAX_STAGES}
 COSTLY_STAGES: Mapping[EditKind, int] = {"color": 4, "style": 4, "geometry": 1}
 """Stages for editors that paint each strength anew. Intermediate pictures of moving parts show them twice."""
@@ -113,7 +111,7 @@ def resolve(options: TrainOptions) -> TrainOptions:
 
 def recorded_options(options: TrainOptions) -> TrainOptions:
     """Return resolved options without the output folder and the settings that do not affect the result."""
-    return replace(options, out=Path(), preset="default", quick=False, threads=0, resume=False)
+    return replace(options, out=Path(), quick=False, threads=0, resume=False)
 
 
 def resolve_kind(
@@ -130,16 +128,8 @@ def resolve_kind(
         grow: maximum number of added rows, as a share of the members; found by a trial run
     """
     optimize = options.optimize
-    sharpness = SHARPNESS[kind] if optimize.sharpness == "kind" else optimize.sharpness
-    solves_colors = (
-        kind == "color"  # only colors change, and no option needs a descent view by view
-        and optimize.color_solver
-        and optimize.rates == "kind"
-        and optimize.progressive == "off"
-        and sharpness == "off"
-        and not optimize.perceptual_weight
-        and not optimize.as_printed
-    )
+    # only colors change, and no option needs a descent view by view
+    solves_colors = kind == "color" and optimize.color_solver and not optimize.perceptual_weight
     weight = optimize.perceptual_weight
     stages = optimize.stages
     if not stages:
@@ -156,7 +146,6 @@ def resolve_kind(
         # only a color edit may leave the SH bands unchanged
         sh="on" if optimize.sh == "auto" and kind != "color" else optimize.sh,
         perceptual_weight=PERCEPTUAL_WEIGHT[kind] if weight is None else weight,
-        sharpness=sharpness,
         solver="colors" if solves_colors else "descent",
         engine="cpu" if solves_colors else optimize.engine,  # colors took an H100 1.4 to 2.4 times as long
     )

@@ -25,7 +25,8 @@ from progdf.io.atomic import atomic_write, make_folder
 from progdf.io.images import read_picture, write_image
 from progdf.io.json_values import decode_json, to_json
 from trainer.fit.fit import drop_idle_attributes
-from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
+from trainer.methods import METHODS
+from trainer.optimize.losses import Perceptual, perceptual_loss
 from trainer.optimize.retime import smooth_course
 from trainer.options import TrainOptions
 from trainer.report.report import SHOWN, best_view, editor_strip, strip
@@ -35,7 +36,7 @@ from trainer.run.training import optimize_members, retime_trajectory
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder, lock_folder, write_json
 from trainer.store.state import StateFolder, interrupt_on_signals
-from trainer.views.boxes import Pictures, whole_views
+from trainer.views.boxes import Pictures
 
 from .judge import fit_variant, with_figures
 from .options import AblateOptions
@@ -142,7 +143,8 @@ def _run_variant(root: Path, variant: Variant, seed: int, shared: AblationSetup,
     plan = variant.plan(shared.plan, seed)
     perceptual = perceptual_loss()[0]
     optimization = resolve_kind(plan, shared.kind, plan.optimize.group_steps or 0)
-    objective = describe_loss(optimization, perceptual.name)
+    with variant.patched():
+        objective = METHODS[plan.preset].describe_loss(optimization, perceptual.name)
     outcome = Outcome(variant.name, variant.what, variant.of, objective=objective)
     state = _state(root, variant, seed, shared)
     log = RunLog(folder / "log.txt", quiet)
@@ -189,7 +191,8 @@ def _record(
 ) -> Trajectory:
     """Optimize a variant and return its trajectory."""
     optimization = resolve_kind(plan, shared.kind, plan.optimize.group_steps or 0)
-    setup = whole_views(shared.setup) if optimization.as_printed else shared.setup
+    method = METHODS[plan.preset]
+    setup = method.box_views(shared.setup, shared.edited)
     with _count_processor_seconds(state), log.stage("optimize"):
         trajectory, *_ = optimize_members(
             plan,
@@ -201,8 +204,8 @@ def _record(
             log,
         )
     choosing, _ = shared.evaluators(trajectory.offsets)[0].halves()
-    trajectory, _ = drop_idle_attributes(smooth_course(trajectory), choosing, not optimization.as_printed)
-    return retime_trajectory(trajectory, setup, optimization, log)
+    trajectory, _ = drop_idle_attributes(smooth_course(trajectory), choosing, method.cleans)
+    return retime_trajectory(trajectory, setup, optimization.slider, method.cleans, log)
 
 
 def _targets(variant: Variant, plan: TrainOptions, shared: AblationSetup) -> Pictures:

@@ -12,12 +12,13 @@ from progdf.field.baked import identity_remap, interpolate_at
 from progdf.field.trajectory import Trajectory
 from progdf.metrics.slider import slider_statistics
 from trainer.fit.fit import fit_field
-from trainer.fit.network import PART as NETWORK
 from trainer.fit.network import fit_network
 from trainer.fit.slider_uniformity import equalize_slider
+from trainer.methods import METHODS
 from trainer.optimize.losses import Perceptual
 from trainer.optimize.retime import resolve_slider
 from trainer.options import FieldOptions, TrainOptions
+from trainer.paper.network import PART as NETWORK
 from trainer.report.measures import against_editor
 from trainer.report.report import SHOWN
 from trainer.store.progress import RunLog
@@ -48,8 +49,18 @@ def fit_variant(
         setup = shared.setup
         weights = shared.weights
         begun = state.load(NETWORK)
+        settings = METHODS[plan.preset].network_settings(plan.field)
         field = fit_network(
-            trajectory, setup, seen, reporting, weights, plan.field, perceptual, log, begun=begun
+            trajectory,
+            setup,
+            seen,
+            reporting,
+            weights,
+            plan.field,
+            settings,
+            perceptual=perceptual,
+            log=log,
+            begun=begun,
         ).field
     else:
         options = FieldOptions(target_psnr=shared.plan.field.target_psnr)

@@ -1,6 +1,6 @@
 """Variants of the method for `python -m benchmarks ablate`: without one of its parts, or with another.
 
-A variant differs from the variant named by `of` in one value of the plan or one patch of the trainer's
+A variant differs from the variant named by `of` in one value of the plan, or in patches of the trainer's
 modules. The reference is the run itself, the same edit by gradient descent over the views if the run solves
 for colors, the paper's preset, or that preset with our field in place of its network.
 """
@@ -19,11 +19,17 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from trainer.editors import editor_row
-from trainer.optimize import losses
 from trainer.optimize.groups import GROUP_STEPS
+from trainer.optimize.losses import SHARPNESS_WEIGHT, laplacian
+from trainer.optimize.pgs import LEARNING_RATES
 from trainer.optimize.retime import resolve_slider
-from trainer.options import PRESETS, EditKind, FieldOptions, OptimizeOptions, TrainOptions
+from trainer.options import PRESETS, EditKind, FieldOptions, OptimizeOptions, Preset, TrainOptions
+from trainer.paper import losses as paper_losses
+from trainer.paper.descent import RATE_FACTORS, RATES_3DGS
+from trainer.paper.losses import Exponent, Over
 from trainer.resolve import resolve_kind
+
+from .objectives import PrintedSharpness, ProgressiveDecay, ProgressiveGrowth, ProgressiveSum
 
 BASE = "base"
 LINEAR = "2-keyframes"
@@ -32,7 +38,10 @@ DESCENT = "descent"
 PAPER = "paper"
 PAPER_PGS = "paper-pgs"
 
-Resolved = tuple[OptimizeOptions, FieldOptions | None, tuple[tuple[str, object], ...]]
+_DESCENT_FOLDER = "trainer.optimize"
+_PAPER_FOLDER = "trainer.paper"
+
+Resolved = tuple[Preset, OptimizeOptions, FieldOptions | None, tuple[tuple[str, object], ...]]
 """Everything that determines a variant's result, apart from the inputs shared by all variants of a run."""
 
 _T = TypeVar("_T")
@@ -103,9 +112,9 @@ _PAPER_STEPS = PRESETS["paper"]["optimize"]["steps"] / OptimizeOptions.steps
 
 
 def _as_printed() -> Mapping[str, Any]:
-    """Return the paper's options of optimization and field that differ from ours, except the steps."""
+    """Return the paper's preset with its options of optimization and field that differ, except the steps."""
     parts = {"optimize": OptimizeOptions, "field": FieldOptions}
-    return {
+    return {"preset": "paper"} | {
         f"{part}.{name}": value
         for part, kind in parts.items()
         for name, value in PRESETS["paper"][part].items()
@@ -113,34 +122,38 @@ def _as_printed() -> Mapping[str, Any]:
     }
 
 
-def _patched(name: str, what: str, path: str, value: object, of: str = BASE) -> Variant:
-    """Make a variant with one object of the trainer's modules replaced."""
-    return Variant(name, what, of=of, patches={path: value})
-
-
 def _other(name: str, what: str, part: str, value: object, of: str = BASE) -> Variant:
     """Make a variant with another value of the optimization."""
     return Variant(name, what, {f"optimize.{part}": value}, of)
 
 
-_PGS = "trainer.optimize.pgs"
-_EPSILON = "trainer.optimize.pgs.EPSILON"
+def _descended(name: str, what: str, path: str, value: object, of: str = DESCENT) -> Variant:
+    """Make a variant with another part of our descent. `path`: below trainer.optimize"""
+    return Variant(name, what, of=of, patches={f"{_DESCENT_FOLDER}.{path}": value})
 
 
-_LOSSES = "trainer.optimize.losses"
+def _reading(name: str, what: str, path: str, value: object, of: str = PAPER_PGS) -> Variant:
+    """Make a variant with another reading of the paper. `path`: below trainer.paper"""
+    return Variant(name, what, of=of, patches={f"{_PAPER_FOLDER}.{path}": value})
 
 
-def _signed(image: Tensor, *_: object) -> Tensor:
+_ALL_3DGS = dict.fromkeys(LEARNING_RATES, RATES_3DGS)
+_NO_FACTORS = dict.fromkeys(RATE_FACTORS, 1.0)
+_SHARP_ALWAYS = dict.fromkeys(LEARNING_RATES, SHARPNESS_WEIGHT["style"])
+
+
+def _signed(image: Tensor) -> Tensor:
     """Return the signed L_render; its gradient is 0 except at the boundary of the picture."""
-    return -losses.laplacian(image.mean(dim=2)).mean()
+    return -laplacian(image.mean(dim=2)).mean()
 
 
-def _magnitude(image: Tensor, *_: object) -> Tensor:
-    return -losses.laplacian(image.mean(dim=2)).abs().mean()
+def _magnitude(image: Tensor) -> Tensor:
+    return -laplacian(image.mean(dim=2)).abs().mean()
 
 
-def _absolute_change(moved: Tensor, previous: Tensor, step: int, grows: bool, *_: object) -> Tensor:
-    factor: float = 0.05 * 1.1 ** ((step if grows else -step) / 50)
+def _absolute_change(moved: Tensor, previous: Tensor, step: int, exponent: Exponent, over: Over) -> Tensor:
+    signed_step = step if exponent == "growth" else -step
+    factor: float = 0.05 * 1.1 ** (signed_step / 50)
     return factor * (moved - previous.detach()).abs().sum()
 
 
@@ -157,27 +170,25 @@ VARIANTS = (
     _other("no-sh", "view-dependent color unchanged", "sh", "off"),
     _other("with-sh", "view-dependent color trained in any case", "sh", "on"),
     Variant("plain-clamps", "plain clamps: no gradient back into the range", patches=_PLAIN_CLAMPS),
-    _patched(
+    Variant(
         "no-pruning",
         "attributes without visible benefit kept",
-        "trainer.fit.fit._MIN_ATTRIBUTE_GAIN_DB",
-        -math.inf,
+        patches={"trainer.fit.fit._MIN_ATTRIBUTE_GAIN_DB": -math.inf},
     ),
     _other("no-groups", "no rigid motion of parts first", "group_steps", 0),
     _other(DESCENT, "gradient descent instead of solving for colors", "color_solver", False),
     _other("descent-one-target", "no stages", "stages", 1, DESCENT),
-    _other("rates-3dgs", "the learning rates of 3DGS", "rates", "3dgs", DESCENT),
-    _patched("no-damping", "barely visible members not damped", _EPSILON, 0.0, DESCENT),
-    _other("no-interpolation", "a stage's own target from its first step", "target_ramp", False, DESCENT),
-    _patched("no-slowing", "no short steps at a stage's end", f"{_PGS}._decay", lambda *_: 1.0, DESCENT),
-    _patched(
-        "no-sizing",
-        "step size independent of a stage's path length",
-        f"{_PGS}.REFERENCE_CHANGE",
-        0.0,
-        DESCENT,
+    _descended("rates-3dgs", "the learning rates of 3DGS", "pgs.LEARNING_RATES", _ALL_3DGS),
+    _descended("no-damping", "barely visible members not damped", "pgs.EPSILON", 0.0),
+    Variant(
+        "no-interpolation",
+        "a stage's own target from its first step",
+        of=DESCENT,
+        patches={f"{_DESCENT_FOLDER}.pgs.RAMP_SHARE": 0.0, f"{_DESCENT_FOLDER}.pgs.SINGLE_RAMP_SHARE": 0.0},
     ),
-    _other("no-running-mean", "iterates recorded without averaging", "ema", False, DESCENT),
+    _descended("no-slowing", "no short steps at a stage's end", "pgs._decay", lambda *_: 1.0),
+    _descended("no-sizing", "step size independent of a stage's path length", "pgs.REFERENCE_CHANGE", 0.0),
+    _descended("no-running-mean", "iterates recorded without averaging", "pgs.SMOOTHING", 0.0),
     Variant(
         "descent-plain-clamps",
         "plain clamps: no gradient back into the range",
@@ -185,46 +196,52 @@ VARIANTS = (
         patches=_PLAIN_CLAMPS,
     ),
     _other("no-lpips", "L1 only", "perceptual_weight", 0.0, DESCENT),
-    _other("sharpness-off", "no L_render", "sharpness", "off", DESCENT),
-    _other("sharpness-hinge", "L_render: as sharp as the target", "sharpness", "hinge", DESCENT),
-    _other("sharpness-paper", "L_render of the paper", "sharpness", "paper", DESCENT),
-    _other("progressive-off", "no progressive constraint", "progressive", "off", DESCENT),
-    _other("progressive-growth", "the constraint tightening", "progressive", "growth", DESCENT),
-    _other("progressive-decay", "the constraint loosening", "progressive", "decay", DESCENT),
-    _other("growth-sum", "over all members' sum", "progressive_over", "sum", "progressive-growth"),
+    _descended("sharpness-off", "no L_render", "losses.SHARPNESS_WEIGHT", {}),
+    _descended(
+        "sharpness-hinge", "L_render: as sharp as the target", "losses.SHARPNESS_WEIGHT", _SHARP_ALWAYS
+    ),
+    _descended("sharpness-paper", "L_render of the paper", "pgs.Objective", PrintedSharpness),
+    _descended("progressive-growth", "the constraint tightening", "pgs.Objective", ProgressiveGrowth),
+    _descended("progressive-decay", "the constraint loosening", "pgs.Objective", ProgressiveDecay),
+    _descended("growth-sum", "over all members' sum", "pgs.Objective", ProgressiveSum, "progressive-growth"),
     Variant(PAPER, "the paper's preset with its network", _as_printed(), longer=_PAPER_STEPS),
-    _patched(
+    _reading(
         "paper-gdf-no-sharpness",
         "no L_render in the network's loss",
-        "trainer.fit.network.sharpness",
-        lambda *_: torch.zeros(()),
+        "losses.FIELD_SHARPNESS_WEIGHT",
+        0.0,
         PAPER,
     ),
     Variant(PAPER_PGS, "our field in place of the network", {"field.field": "auto"}, PAPER),
-    _other("paper-no-sharpness", "no L_render", "sharpness", "off", PAPER_PGS),
-    _patched("paper-signed", "L_render signed, as printed", f"{_LOSSES}.sharpness", _signed, PAPER_PGS),
-    _patched("paper-magnitude", "L_render of magnitudes", f"{_LOSSES}.sharpness", _magnitude, PAPER_PGS),
-    _other("paper-progressive-off", "no progressive constraint", "progressive", "off", PAPER_PGS),
-    _other("paper-growth", "the constraint tightening, as printed", "progressive", "growth", PAPER_PGS),
-    _other("paper-sum", "the constraint over all members' sum", "progressive_over", "sum", PAPER_PGS),
-    _patched(
+    _reading("paper-no-sharpness", "no L_render", "losses.SHARPNESS_WEIGHT", 0.0),
+    _reading("paper-signed", "L_render signed, as printed", "losses.sharpness", _signed),
+    _reading("paper-magnitude", "L_render of magnitudes", "losses.sharpness", _magnitude),
+    _reading("paper-progressive-off", "no progressive constraint", "losses.PROGRESSIVE_WEIGHT", 0.0),
+    _reading("paper-growth", "the constraint tightening, as printed", "losses.EXPONENT", "growth"),
+    _reading("paper-sum", "the constraint over all members' sum", "losses.OVER", "sum"),
+    _reading(
         "paper-absolutes",
         "the constraint as a sum of absolute values",
-        f"{_LOSSES}.progressive_change",
+        "losses.progressive_change",
         _absolute_change,
-        PAPER_PGS,
     ),
     Variant(
         "paper-weights",
         "L1 and LPIPS with ten times the weight, as in GaussianEditor",
         of=PAPER_PGS,
         patches={
-            f"{_LOSSES}.PROGRESSIVE_WEIGHT": losses.PROGRESSIVE_WEIGHT / 10,
-            f"{_LOSSES}.SHARPNESS_WEIGHT": {"paper": losses.SHARPNESS_WEIGHT["paper"] / 10},
+            f"{_PAPER_FOLDER}.losses.PROGRESSIVE_WEIGHT": paper_losses.PROGRESSIVE_WEIGHT / 10,
+            f"{_PAPER_FOLDER}.losses.SHARPNESS_WEIGHT": paper_losses.SHARPNESS_WEIGHT / 10,
         },
     ),
-    _other("paper-rates-3dgs", "the learning rates of 3DGS", "rates", "3dgs", PAPER_PGS),
-    _other("paper-sum-3dgs", "the learning rates of 3DGS, too", "rates", "3dgs", "paper-sum"),
+    _reading("paper-rates-3dgs", "the learning rates of 3DGS", "descent.RATE_FACTORS", _NO_FACTORS),
+    _reading(
+        "paper-sum-3dgs",
+        "the learning rates of 3DGS, too",
+        "descent.RATE_FACTORS",
+        _NO_FACTORS,
+        "paper-sum",
+    ),
 )
 
 _BY_NAME = {variant.name: variant for variant in VARIANTS}
@@ -248,6 +265,7 @@ def differing_variants(plan: TrainOptions, kind: EditKind, stages: int, sh_degre
         *(() if equalized else (EQUAL,)),
         *(() if sh_degree > 0 else ("no-sh", "with-sh")),
         *(("no-interpolation", "no-sizing") if kind == "geometry" else ("no-groups",)),
+        *(("sharpness-hinge",) if kind in SHARPNESS_WEIGHT else ("sharpness-off",)),
     }
     seen: list[Resolved] = []
     found = []
@@ -261,7 +279,7 @@ def differing_variants(plan: TrainOptions, kind: EditKind, stages: int, sh_degre
 
 def is_seeded(variant: Variant, plan: TrainOptions, kind: EditKind) -> bool:
     """Return True if a seed changes a variant; solving for colors uses all views at once and no seed."""
-    optimization, network, _ = _resolve(variant, plan, kind, 1)
+    _, optimization, network, _ = _resolve(variant, plan, kind, 1)
     return network is not None or optimization.solver == "descent"
 
 
@@ -289,9 +307,11 @@ def _resolve(variant: Variant, own: TrainOptions, kind: EditKind, stages: int) -
     optimization = replace(resolve_kind(plan, kind, groups), slider=slider, color_solver=True)
     changes = (*_all_patches(variant).items(), *([(EQUAL, True)] if variant.name == EQUAL else []))
     if optimization.solver != "descent":
-        optimization = replace(optimization, perceptual_weight=0.0, target_ramp=True, ema=True)
-        changes = tuple(change for change in changes if not change[0].startswith((_PGS, _EPSILON)))
-    return optimization, plan.field if plan.field.field == "neural" else None, changes
+        optimization = replace(optimization, perceptual_weight=0.0)
+    unused = _DESCENT_FOLDER if plan.preset == "paper" else _PAPER_FOLDER
+    changes = tuple(change for change in changes if not change[0].startswith(unused))
+    network = plan.field if plan.field.field == "neural" else None
+    return plan.preset, optimization, network, changes
 
 
 def _all_patches(variant: Variant) -> Mapping[str, object]:

@@ -19,7 +19,7 @@ from torch.nn.functional import linear
 
 from . import neural
 from .neural import LAYOUT, Bins, Inputs, NeuralField, NeuralShape, Size
-from .separable import channel_weights, quantize_bases
+from .separable import channel_weights, moving_attributes, quantize_bases
 
 
 class PictureLoss(Protocol):
@@ -313,3 +313,26 @@ def train_network(
         loss = fit.step(strengths, offsets, factor, pictures)
         if on_step is not None:
             on_step(done + 1, loss)
+
+
+def rendered_importance(offsets: Tensor, render: Callable[[Tensor], Tensor]) -> dict[str, float]:
+    """Return the visible effect of an error in each attribute at half strength; the values sum to 1.
+
+    The error is proportional to the attribute's spread (root mean square of its offsets).
+
+    Args:
+        offsets: offsets along the slider. [T,M,C]
+        render: renders the pixels of some views. [M,C] -> [P,3]
+    """
+    draws = torch.Generator().manual_seed(0)
+    middle = offsets[len(offsets) // 2].float()
+    importance = {}
+    with torch.no_grad():
+        expected = render(middle)
+        for name, columns in moving_attributes(offsets).items():
+            spread = float(offsets[1:, :, columns].float().square().mean().sqrt())
+            moved = middle.clone()
+            moved[:, columns] += 0.1 * spread * torch.randn(moved[:, columns].shape, generator=draws)
+            importance[name] = float((render(moved) - expected).square().mean()) if len(expected) else 1.0
+    total = sum(importance.values())
+    return {name: value / total if total > 0 else 1.0 / len(importance) for name, value in importance.items()}

@@ -72,7 +72,7 @@ def _names(options: TrainOptions, *about: object) -> set[str]:
 def test_ablation_lists_only_variants_that_change_the_run(options: TrainOptions) -> None:
     color = _names(options, "color", 4, 1)
     assert {"base", "2-keyframes", "one-target", "no-sh", "slider-stages", "descent", "paper"} <= color
-    assert not {"progressive-off", "sharpness-off", "slider-even", "no-groups"} & color
+    assert not {"sharpness-off", "slider-even", "no-groups"} & color
     descended = _names(with_values(options, perceptual_weight=0.1), "color", 4, 1)
     assert "no-lpips" in descended
     assert not {"descent", "descent-one-target", "descent-plain-clamps"} & descended, "it descends anyway"
@@ -84,9 +84,11 @@ def test_ablation_lists_only_variants_that_change_the_run(options: TrainOptions)
     assert not {"no-sizing", "no-interpolation"} & geometry
     assert not {"one-target", "slider-stages"} & _names(options, "color", 1, 1)
     assert "no-sh" not in _names(options, "color", 4, 0)
-    without = with_values(options, perceptual_weight=0.0, progressive="growth")
+    without = with_values(options, perceptual_weight=0.0)
     assert "no-lpips" not in _names(without, "style", 4, 1)
-    assert "progressive-off" in _names(without, "color", 4, 1)
+    printed = _names(apply_preset(options, "paper"), "color", 4, 1)
+    assert "paper-growth" in printed
+    assert not {"descent", "rates-3dgs", "progressive-decay"} & printed, "parts of our descent"
     pinned = with_values(options, slider="stages")
     assert "equal-strengths" not in _names(pinned, "color", 4, 1), "where no strengths are chosen"
 
@@ -94,14 +96,14 @@ def test_ablation_lists_only_variants_that_change_the_run(options: TrainOptions)
 @pytest.mark.parametrize("variant", VARIANTS, ids=lambda variant: variant.name)
 def test_variant_differs_from_its_base_in_one_plan_value(variant: Variant, options: TrainOptions) -> None:
     """Allow only `paper` to differ in many values. It is the preset except for scene, views and steps."""
-    own = with_values(options, sh="auto", progressive="decay", perceptual_weight=0.1)
+    own = with_values(options, sh="auto", perceptual_weight=0.1)
     other = next(one for one in VARIANTS if one.name == variant.of)
     now = plan_values(variant.plan(resolve(own)))
     then = plan_values(other.plan(resolve(own)))
     differ = {path for path in now if now[path] != then[path]}
     if variant.name == "paper":
         preset = plan_values(resolve(apply_preset(own, "paper")))
-        parts = ("optimize.", "field.")
+        parts = ("preset", "optimize.", "field.")
         differing = {path for path in now if path.startswith(parts) and now[path] != preset[path]}
         assert differing == {"optimize.steps"}
         assert now["field.size"] == "paper"
@@ -113,9 +115,11 @@ def test_variant_differs_from_its_base_in_one_plan_value(variant: Variant, optio
         assert len(variant.changes) == 1 or (variant.patches and not differ)
 
 
-@pytest.mark.parametrize("part", ["color_solver", "ema", "target_ramp"])
+@pytest.mark.parametrize(
+    "part", ["EPSILON", "LEARNING_RATES", "RAMP_SHARE", "REFERENCE_CHANGE", "SMOOTHING", "_decay"]
+)
 def test_every_refinement_has_a_variant_without_it(part: str) -> None:
-    assert any(variant.changes == {f"optimize.{part}": False} for variant in VARIANTS)
+    assert any(f"trainer.optimize.pgs.{part}" in variant.patches for variant in VARIANTS)
 
 
 @pytest.mark.parametrize("variant", [v for v in VARIANTS if v.patches], ids=lambda variant: variant.name)

@@ -1,4 +1,4 @@
-"""Loss terms of the optimizer: L1, a perceptual term, a progressive term and sharpness.
+"""Loss terms of the descent view by view: L1, a perceptual term and sharpness.
 
 L_edit of ProGDF (AAAI 2025, eq. 4) is L1 + LPIPS between render and edited view (weights: docs/method.md 3).
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -16,7 +16,7 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 
 from progdf.errors import ProgdfError
 from progdf.metrics.lpips import Features, Lpips
-from trainer.options import OptimizeOptions, Over, Sharpness
+from trainer.options import Kind, OptimizeOptions
 
 _LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601
 
@@ -110,52 +110,16 @@ def perceptual_loss() -> tuple[Perceptual, str]:
         return GradientL1(), f"training with gradient L1 in place of LPIPS: {error}"
 
 
-def progressive_change(
-    moved: Tensor,
-    previous: Tensor,
-    step: int,
-    grows: bool,
-    over: Over = "mean",
-    alpha: float = 0.05,
-    beta: float = 1.1,
-) -> Tensor:
-    """Return the paper's progressive constraint (eq. 5): L_prog = α·β^(±t/50)·Σ‖ΔΘ‖², without its λ2. []
+def sharpness(image: Tensor, target: Tensor, inside: Tensor | None = None) -> Tensor:
+    """Return the sharpness that the render lacks: max(0, S(target) − S(image)). []
 
-    ΔΘ is the change of a member's raw parameters by the last step. The paper does not state the norm or the
-    number of members: docs/lab/experiments.md, The progressive constraint.
-
-    Args:
-        moved: offsets of the members. [M,C]
-        previous: one step earlier. [M,C]
-        step: t
-        grows: True for the printed exponent +t/50, which forces shorter and shorter steps; False for −t/50,
-            which relaxes the constraint
-        over: mean or sum over the members
-        alpha, beta: constants of the paper
-    """
-    period = 50.0
-    factor: float = alpha * beta ** ((step if grows else -step) / period)
-    change = (moved - previous.detach()).square().sum()
-    return factor * (change / len(moved) if over == "mean" else change)
-
-
-def sharpness(
-    image: Tensor, target: Tensor, form: Literal["hinge", "paper"], inside: Tensor | None = None
-) -> Tensor:
-    """Return the paper's L_render. []
-
-    "paper" is −(∇²R)², the mean over the whole picture. The printed −∇²R is signed, and its sum cancels
-    except at the border of the picture. "hinge" stops at the target's sharpness: max(0, S(target) −
-    S(image)), with S the mean of |∇²Y| inside the region and Y the luma.
+    S is the mean of |∇²Y| inside the region, and Y the luma.
 
     Args:
         image: the render. [h,w,3]
         target: its target. [h,w,3]
-        form: see above
-        inside: pixels that count for "hinge"; None: all. [h,w] bool
+        inside: pixels that count; None: all. [h,w] bool
     """
-    if form == "paper":
-        return -laplacian(image.mean(dim=2)).square().mean()
     weights = torch.ones_like(image[1:-1, 1:-1, 0]) if inside is None else inside[1:-1, 1:-1].to(image.dtype)
     count = weights.sum().clamp_min(1.0)
 
@@ -187,10 +151,10 @@ A term is None in recordings whose steps did not compute it.
 """
 
 
-PROGRESSIVE_WEIGHT = 5.0
-"""λ2 of the paper: weight of the progressive constraint."""
-SHARPNESS_WEIGHT: Mapping[Sharpness, float] = {"hinge": 0.1, "paper": 1.0}
-"""λ3 of the paper: weight of the sharpness term, by its form."""
+PERCEPTUAL_EVERY = 2
+"""Interval between evaluations of LPIPS, in steps."""
+SHARPNESS_WEIGHT: Mapping[Kind, float] = {"style": 0.1}
+"""Weight of the sharpness term by kind of edit; other kinds have no such term."""
 
 
 def describe_loss(options: OptimizeOptions, perceptual: str) -> str:
@@ -204,14 +168,9 @@ def describe_loss(options: OptimizeOptions, perceptual: str) -> str:
         return "squared error, all views at once"
     terms = ["L1"]
     if options.perceptual_weight:
-        frequency = f" every {options.perceptual_every} steps" if options.perceptual_every > 1 else ""
-        terms.append(f"{options.perceptual_weight:g} {perceptual}{frequency}")
-    if options.progressive in ("decay", "growth"):
-        terms.append(
-            f"{PROGRESSIVE_WEIGHT:g} progressive ({options.progressive}, {options.progressive_over})"
-        )
-    if options.sharpness in SHARPNESS_WEIGHT:
-        terms.append(f"{SHARPNESS_WEIGHT[options.sharpness]:g} sharpness ({options.sharpness})")
+        terms.append(f"{options.perceptual_weight:g} {perceptual} every {PERCEPTUAL_EVERY} steps")
+    if options.kind in SHARPNESS_WEIGHT:
+        terms.append(f"{SHARPNESS_WEIGHT[options.kind]:g} sharpness (hinge)")
     return " + ".join(terms)
 
 
@@ -236,7 +195,7 @@ class Objective:
         perceptual: distance whose targets are cached until the stage ends
         options: terms and their weights relative to an L1 of 1, fully resolved
         inside: per training view, the region in its box without its border; sharpness is measured there.
-            Not needed if sharpness is off. [h,w] bool each
+            None: in the whole box. [h,w] bool each
     """
 
     def __init__(
@@ -254,19 +213,13 @@ class Objective:
         """Return the weighted terms of this step. [] each"""
         options = self._options
         terms = {"l1": l1(moment.image, moment.target)}
-        if options.perceptual_weight and moment.arrived and moment.local % options.perceptual_every == 0:
+        if options.perceptual_weight and moment.arrived and moment.local % PERCEPTUAL_EVERY == 0:
             distance = self._perceptual(moment.image, moment.target, moment.view)
             terms["perceptual"] = options.perceptual_weight * distance
-        if options.progressive in ("decay", "growth"):
-            grows = options.progressive == "growth"
-            change = progressive_change(
-                moment.moved, moment.previous, moment.step, grows, options.progressive_over
-            )
-            terms["progressive"] = PROGRESSIVE_WEIGHT * change
-        if options.sharpness == "hinge" or options.sharpness == "paper":
+        if options.kind in SHARPNESS_WEIGHT:
             inside = self._inside[moment.view] if self._inside is not None else None
-            lost = sharpness(moment.image, moment.target, options.sharpness, inside)
-            terms["sharpness"] = SHARPNESS_WEIGHT[options.sharpness] * lost
+            lost = sharpness(moment.image, moment.target, inside)
+            terms["sharpness"] = SHARPNESS_WEIGHT[options.kind] * lost
         return terms
 
 

@@ -15,22 +15,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import msgspec
 import torch
 from torch import Tensor
 
-from progdf.gaussians import BASE_CHANNELS, attribute_slices
+from progdf.gaussians import attribute_slices
 from progdf.io.json_values import convert_json, to_json
-from trainer.options import OptimizeOptions
+from trainer.options import Kind, OptimizeOptions
 from trainer.store.state import Saved, generator
+from trainer.views.boxes import probe_views
 from trainer.views.crops import CropScene, render_all
+from trainer.views.setup import TrainingSetup
+from trainer.views.view import crop
 
-from .losses import Moment, Objective, TermMeans, l1, total_loss
+from .losses import Moment, Objective, Perceptual, TermMeans, erode, l1, total_loss
 
 EPSILON = 0.1
 """Raised ε of Adam, as a share of the root mean square of an attribute's gradient."""
+
+ADAM_EPSILON = 1e-15
+"""ε of Adam before it is raised."""
+SMOOTHING = 0.9
+"""Weight of the previous value in the running mean of the parameters, which is recorded."""
 
 _COUNT_FIELDS = ("step", "stage", "local")
 _ROW_FIELDS = ("moved", "previous", "average", "first", "second")
@@ -88,45 +96,53 @@ class PgsState:
             self._queue = torch.randperm(count, generator=self._order).tolist()
         return self._queue[-1]
 
-    def descend(
-        self,
-        gradient: Tensor,
-        rates: Tensor,
-        length: float,
-        raised: bool,
-        smoothing: float,
-        growth: float = math.inf,
-    ) -> None:
-        """Take one step of Adam (Kingma and Ba 2015) with a rate per column, and advance to the next view.
+    def descend(self, gradient: Tensor, rates: Tensor, length: float, growth: float = math.inf) -> None:
+        """Take one step of Adam with a rate per column, and advance to the next view.
 
         Adam ignores the magnitude of gradients, so a hardly visible member would wander as far as a fully
         visible one. A tenth of the attribute's typical gradient, added to ε, keeps it in place
-        (docs/lab/experiments.md, Rates and steps).
+        (docs/lab/experiments.md, Rates and steps). The running mean starts exactly at the original.
 
         Args:
             gradient: gradient of the loss by `moved`. [M,C]
             rates: learning rate of each column. [C]
             length: factor to all rates
-            raised: raise ε as above; False is Adam as published
-            smoothing: weight of the running mean's previous value; the mean starts exactly at the original
             growth: maximum factor by which a member may grow
+        """
+        mean, spread = self.moments(gradient)
+        floor = torch.full_like(rates, ADAM_EPSILON)
+        slices = attribute_slices(len(rates))
+        for columns in slices.values():
+            floor[columns] += EPSILON * spread[:, columns].square().mean().sqrt()
+        self.move(length * (rates * mean / (spread + floor)))
+        if growth < math.inf:
+            with torch.no_grad():
+                self.moved[:, slices["log_scales"]].clamp_(max=math.log(growth))
+        smoothing = min(SMOOTHING, (self.step + 1) / (self.step + 10))
+        self.average.lerp_(self.moved.detach(), 1.0 - smoothing)
+        self.advance()
+
+    def moments(self, gradient: Tensor) -> tuple[Tensor, Tensor]:
+        """Update Adam's moments (Kingma and Ba 2015).
+
+        Return the unbiased mean and root mean square of the gradient. [M,C] each
         """
         done = self.step + 1
         self.first.lerp_(gradient, 0.1)
         self.second.lerp_(gradient.square(), 0.001)
         mean = self.first / (1 - 0.9**done)
         spread = (self.second / (1 - 0.999**done)).sqrt()
-        floor = torch.full_like(rates, 1e-15)
-        if raised:
-            for columns in attribute_slices(len(rates)).values():
-                floor[columns] += EPSILON * spread[:, columns].square().mean().sqrt()
+        return mean, spread
+
+    def move(self, change: Tensor) -> None:
+        """Subtract a change from the offsets. [M,C]"""
         with torch.no_grad():
             self.previous.copy_(self.moved)
-            self.moved -= length * (rates * mean / (spread + floor))
-            if growth < math.inf:
-                self.moved[:, attribute_slices(len(rates))["log_scales"]].clamp_(max=math.log(growth))
-        self.average.lerp_(self.moved.detach(), 1.0 - min(smoothing, (self.step + 1) / (self.step + 10)))
-        self.step = done
+            self.moved -= change
+
+    def advance(self) -> None:
+        """Count the step, and advance to the next view."""
+        self.step = self.step + 1
         self.local = self.local + 1
         self._queue.pop()
 
@@ -171,27 +187,9 @@ def _bit_patterns(rows: Tensor) -> Tensor:
     return rows.detach().view(torch.int32)
 
 
-LEARNING_RATES: Mapping[str, Mapping[str, float]] = {
-    # 3DGS (Kerbl 2023) for a scene of extent 1
-    "3dgs": {
-        "means": 1.6e-4,
-        "log_scales": 5e-3,
-        "quats": 1e-3,
-        "logit_opacities": 5e-2,
-        "sh0": 2.5e-3,
-        "shN": 1.25e-4,
-    },
-    # the same rates as multiplied by GaussianEditor's scripts of 1500 steps (Chen 2024)
-    "gaussian-editor": {
-        "means": 8e-4,
-        "log_scales": 1e-2,
-        "quats": 2e-3,
-        "logit_opacities": 1e-1,
-        "sh0": 1.25e-2,
-        "shN": 6.25e-4,
-    },
-    # By kind of edit: rates that converge within a few hundred steps (docs/method.md 3). A color edit leaves
-    # the geometry unchanged, which is 1.4 dB better and saves 11 floats per Gaussian.
+LEARNING_RATES: Mapping[Kind, Mapping[str, float]] = {
+    # Rates that converge within a few hundred steps (docs/method.md 3). A color edit leaves the geometry
+    # unchanged, which is 1.4 dB better and saves 11 floats per Gaussian.
     "color": {"sh0": 7.5e-2, "shN": 3.75e-3},
     "style": {
         "means": 3.2e-4,
@@ -220,6 +218,10 @@ REFERENCE_CHANGE = 0.16
 """Change of a channel within a stage for which the rates are tuned (see `PgsSettings.reach`)."""
 DECAY_SHARE = 0.35
 """Final share of a stage's steps over which the learning rate falls (see `PgsSettings.fall`)."""
+RAMP_SHARE = 0.6
+"""Share of a stage's steps over which its target is blended, see `PgsSettings.ramp`."""
+SINGLE_RAMP_SHARE = 0.9
+"""The same for a single stage, approached slowly: fast steps cause speckles of all colors half way."""
 SNAPSHOTS = 32
 """Approximate number of recordings over all stages."""
 
@@ -229,52 +231,35 @@ class PgsSettings:
     """Settings of the members' descent."""
 
     rates: Tensor  # learning rate of each column of a packed row, raw units. [C]
-    raised: bool = True  # raise Adam's ε to keep hardly visible members in place, see `PgsState.descend`
-    ramp: float = 0.6  # share of a stage's steps over which its target is blended from the last stage's
-    fall: float = (
-        DECAY_SHARE  # final share of a stage's steps over which the rate falls to a tenth; 0: constant
-    )
+    # share of a stage's steps over which its target is blended from the last stage's
+    ramp: float = RAMP_SHARE
+    # final share of a stage's steps over which the rate falls to a tenth; 0: constant
+    fall: float = DECAY_SHARE
     # Change that 95 % of the changing pixels stay below. Smaller changes get smaller steps, down to a
     # quarter, larger ones larger steps, up to 1.5 times; 0: the same for all. Steps larger than the change
     # needs become random walks where the views do not resolve single Gaussians: close up, these are speckles
     # of all colors.
     reach: float = REFERENCE_CHANGE
-    smoothing: float = 0.9  # weight of the recorded running mean's previous value; 0: raw iterates
     growth: float = math.inf  # maximum growth of a Gaussian beyond its stage's placement
     snapshots: int = SNAPSHOTS  # approximate number of recordings over all stages
-    every: int = 0  # record at this interval of steps; 0: by visible change
     seed: int = 0  # seed of the view order
 
 
-def pgs_settings(
-    options: OptimizeOptions, bands: bool, channels: int, extent: float, stages: int
-) -> PgsSettings:
+def pgs_settings(options: OptimizeOptions, rates: Tensor, stages: int) -> PgsSettings:
     """Return the settings of a run's descent.
 
     Args:
         options: fully resolved, see `trainer.resolve.resolve_kind`
-        bands: train the SH bands beyond DC
-        channels: columns of a packed row
-        extent: size of the moving object, world units
+        rates: learning rate of each column. [C]
         stages: number of strengths to optimize towards
     """
     recolors = options.kind != "geometry"
-    printed = options.as_printed
-    rates = learning_rates(options.kind if options.rates == "kind" else options.rates, channels, extent)
-    if not bands:
-        rates[BASE_CHANNELS:] = 0.0
-    # A single target is approached slowly: fast steps cause speckles of all colors half way.
-    ramp = 0.9 if stages == 1 else 0.6
-    fall = 1.0 if stages == 1 else DECAY_SHARE
+    ramp = SINGLE_RAMP_SHARE if stages == 1 else RAMP_SHARE
     return PgsSettings(
         rates,
-        raised=not printed,
-        ramp=ramp if recolors and options.target_ramp else 0.0,
-        fall=0.0 if printed else fall,
-        reach=REFERENCE_CHANGE if recolors and not printed else 0.0,
-        smoothing=0.9 if options.ema else 0.0,
-        # a run too short for the paper's interval still records four times
-        every=min(100, max(1, options.steps // 4)) if printed else 0,
+        ramp=ramp if recolors else 0.0,
+        fall=1.0 if stages == 1 else DECAY_SHARE,
+        reach=REFERENCE_CHANGE if recolors else 0.0,
         growth=MAX_GROWTH if options.group_steps else math.inf,
         seed=options.seed,
     )
@@ -311,18 +296,71 @@ OnStep = Callable[[int, float], None]
 """Callback after every step: steps done, running mean of the L1 distance from the finished edit."""
 
 
-def learning_rates(kind: str, channels: int, extent: float) -> Tensor:
-    """Return the learning rate of every column of a packed row, [C].
+def learning_rates(kind: Kind, channels: int, extent: float) -> Tensor:
+    """Return the learning rate of every column of a packed row for a kind of edit. [C]
 
     Args:
-        kind: kind of edit, or source of rates for all attributes; see `LEARNING_RATES`
+        kind: attributes that move, see `LEARNING_RATES`
         channels: columns of a packed row
         extent: size of the moving object, world units
     """
-    rates = torch.zeros(channels)
+    return rates_per_column(LEARNING_RATES[kind], channels, extent)
+
+
+def rates_per_column(rates: Mapping[str, float], channels: int, extent: float) -> Tensor:
+    """Return the learning rate of every column of a packed row. [C]
+
+    Args:
+        rates: rate of each attribute that moves; the means' is for an object of extent 1
+        channels: columns of a packed row
+        extent: size of the moving object, world units
+    """
+    column_rates = torch.zeros(channels)
     for name, columns in attribute_slices(channels).items():
-        rates[columns] = LEARNING_RATES[kind].get(name, 0.0) * (extent if name == "means" else 1.0)
-    return rates
+        column_rates[columns] = rates.get(name, 0.0) * (extent if name == "means" else 1.0)
+    return column_rates
+
+
+def rated_attributes(rates: Tensor) -> list[str]:
+    """Return the attributes with a learning rate above 0. [C]"""
+    slices = attribute_slices(len(rates))
+    return [name for name, columns in slices.items() if bool((rates[columns] > 0).any())]
+
+
+@dataclass(frozen=True)
+class DescentTask:
+    """Inputs of a run's descent that do not depend on its method."""
+
+    options: OptimizeOptions  # fully resolved, see `trainer.resolve.resolve_kind`
+    setup: TrainingSetup  # scene, members and views, with the rows that the edit adds
+    rates: Tensor  # learning rate of each column of a packed row. [C]
+    original: Tensor  # raw member rows, packed. [M,C]
+    crops: Sequence[CropScene]  # training views, in the order of the stages' targets
+    stages: Sequence[TargetStage]  # strengths ascending
+    perceptual: Perceptual
+    adds_rows: bool = False  # the last members are rows that the edit adds
+
+
+def descend(task: DescentTask, state: PgsState, on_step: OnStep) -> Iterator[ParameterSnapshot]:
+    """Optimize the members of a run, from a state that is changed in place, and yield recordings."""
+    options = task.options
+    settings = pgs_settings(options, task.rates, len(task.stages))
+    if (
+        task.adds_rows
+    ):  # they have their stage's opacity from its first step, which a blended target contradicts
+        settings = replace(settings, ramp=0.0)
+    device = task.original.device
+    inside = [erode(crop(view.mask, view.box)).to(device) for view in task.setup.train]
+    return optimize(
+        task.original,
+        task.crops,
+        probe_views(task.setup, engine=options.engine),
+        task.stages,
+        Objective(task.perceptual, options, inside),
+        settings,
+        on_step=on_step,
+        state=state,
+    )
 
 
 def optimize(
@@ -353,9 +391,8 @@ def optimize(
     Raises:
         FloatingPointError: the loss or its gradient is not finite; the state is that of the previous step.
     """
-    slices = attribute_slices(original.shape[1])
     rates = settings.rates.to(original.device)
-    moving = {name for name, columns in slices.items() if bool((settings.rates[columns] > 0).any())}
+    moving = rated_attributes(settings.rates)
     state = PgsState(original, settings.seed) if state is None else state
     if not state.step:
         state.pictures = render_all(probes, original)
@@ -374,15 +411,15 @@ def optimize(
             moment = Moment(
                 image, target, view, state.step, state.local, share >= 1.0, state.moved, state.previous
             )
-            gradient = _gradient(objective, moment, state, stages[-1].targets[view])
+            gradient = loss_gradient(objective.terms(moment), image, state, stages[-1].targets[view])
             length = size * _decay(settings.fall, state.local, stage.steps)
-            state.descend(gradient, rates, length, settings.raised, settings.smoothing, settings.growth)
+            state.descend(gradient, rates, length, settings.growth)
 
             last = state.local == stage.steps
-            if last or (state.step % settings.every == 0 if settings.every else state.local % 2):
+            if last or state.local % 2:
                 offsets = stage.place(state.average)
                 pictures = render_all(probes, original + offsets, moving)
-                if last or settings.every or _mean_distance(pictures, state.pictures) >= spacing:
+                if last or _mean_distance(pictures, state.pictures) >= spacing:
                     state.pictures = pictures
                     yield ParameterSnapshot(state.step, last, offsets.clone(), state.means.read())
             if on_step is not None:
@@ -398,12 +435,18 @@ def _step_size(stage: TargetStage, before: Sequence[Tensor], reach: float) -> fl
     return min(1.5, max(0.25, p95_change(stage.targets, before) / reach)) if reach > 0 else 1.0
 
 
-def _gradient(objective: Objective, moment: Moment, state: PgsState, finished: Tensor) -> Tensor:
-    """Return the gradient of the loss by the members' offsets [M,C].
+def loss_gradient(terms: Mapping[str, Tensor], image: Tensor, state: PgsState, finished: Tensor) -> Tensor:
+    """Return the gradient of the loss by the members' offsets [M,C]. Record its terms in the state.
 
-    Record its terms and the distance to `finished`.
+    Args:
+        terms: weighted terms of the loss. [] each
+        image: the render. [h,w,3]
+        state: state of the descent
+        finished: the same view of the finished edit. [h,w,3]
+
+    Raises:
+        FloatingPointError: the loss or its gradient is not finite.
     """
-    terms = objective.terms(moment)
     loss = total_loss(terms)
     if not math.isfinite(float(loss.detach())):
         raise FloatingPointError(f"the loss is {float(loss.detach())} at step {state.step}")
@@ -413,7 +456,7 @@ def _gradient(objective: Objective, moment: Moment, state: PgsState, finished: T
     assert gradient is not None
     if not math.isfinite(float(gradient.sum())):
         raise FloatingPointError(f"the loss has no finite gradient at step {state.step}")
-    left = float(l1(moment.image.detach(), finished))
+    left = float(l1(image.detach(), finished))
     state.means.add({name: float(term.detach()) for name, term in terms.items()} | {"left": left})
     state.running = left if math.isnan(state.running) else 0.95 * state.running + 0.05 * left
     return gradient

@@ -142,7 +142,7 @@ class EditedViews:
         self._log.expect(expected_work(self._setup, optimization, len(strengths)))
         if self.requests_strengths:
             strengths = (1.0,)
-        elif not optimization.as_printed and resolve_slider(optimization.slider, strengths) == "even":
+        elif resolve_slider(optimization.slider, strengths) == "even":
             strengths = equalized_strengths(editor, spec, views, strengths)
         self._edit(strengths, views)
         _check_change(self._pictures, self._setup, spec)

@@ -26,9 +26,10 @@ from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.fit.fit import Fitted, evaluate_field, expected_renders, fit_field, fit_grades, visibility
 from trainer.fit.network import NetworkFit, fit_network
 from trainer.fit.slider_uniformity import equalize_slider
+from trainer.methods import METHODS
 from trainer.optimize.losses import Perceptual, perceptual_loss
 from trainer.optimize.retime import resolve_slider
-from trainer.options import FieldOptions, FitOptions, TextOptions, TrainOptions, with_values
+from trainer.options import FitOptions, TextOptions, TrainOptions, with_values
 from trainer.regions.from_pictures import CHANGED
 from trainer.report.measures import (
     PaintReproduction,
@@ -105,7 +106,7 @@ def finish_run(
         evaluator = load_evaluator(folder, grown, setup.judging, trajectory)
         _, reporting = evaluator.halves()
         fitted, network = _fit_field(
-            options.field, grown, evaluator, trajectory, perceptual, log, folder, begun=begun
+            options, grown, evaluator, trajectory, perceptual, log, folder, begun=begun
         )
     with log.stage("even"):
         slider = resolve_slider(options.optimize.slider, trajectory.strengths)
@@ -209,7 +210,7 @@ def _choice_line(fitted: Fitted, size: float, recordings: int, views: int) -> st
 
 
 def _fit_field(
-    options: FieldOptions,
+    plan: TrainOptions,
     setup: TrainingSetup,
     evaluator: Evaluator,
     trajectory: Trajectory,
@@ -219,6 +220,7 @@ def _fit_field(
     begun: Saved | None,
 ) -> tuple[Fitted, NetworkFit | None]:
     """Fit the requested field; also return the network fit if the field is a network."""
+    options = plan.field
     choosing, reporting = evaluator.halves()
     if len(setup.held_out) == 1:
         log.say("only one view is held out, so the field is both chosen and reported on it")
@@ -235,8 +237,18 @@ def _fit_field(
     rank_views = setup.train[:: max(1, len(setup.train) // _RANK_VIEWS)][:_RANK_VIEWS]
     if options.field == "neural":
         rank_evaluator = load_evaluator(folder, setup, rank_views, trajectory)
+        settings = METHODS[plan.preset].network_settings(options)
         network = fit_network(
-            trajectory, setup, rank_evaluator, reporting, weights, options, perceptual, log, begun=begun
+            trajectory,
+            setup,
+            rank_evaluator,
+            reporting,
+            weights,
+            options,
+            settings,
+            perceptual=perceptual,
+            log=log,
+            begun=begun,
         )
         return evaluate_field(trajectory, reporting, network.field, options.target_psnr), network
     with log.looks("fit the field", expected_renders(trajectory, options.field)) as count_view:
@@ -431,7 +443,6 @@ def refit(options: FitOptions, quiet: bool = False) -> RunResult:
         recorded_plan = run.record.plan
         field = replace(
             options.field,
-            as_printed=recorded_plan.field.as_printed,
             draft=recorded_plan.field.draft,
             seed=recorded_plan.field.seed,
         )

@@ -21,6 +21,7 @@ from progdf.scene.bounds import scene_sphere
 from trainer.editors import editor_row
 from trainer.editors.base import ImageEditor, confines_edit
 from trainer.fit.evaluate import Evaluator
+from trainer.methods import METHODS
 from trainer.optimize.groups import GROUP_STEPS, group_stage
 from trainer.optimize.growth import place_seeds, seed_rows
 from trainer.optimize.losses import GradientL1, Objective
@@ -149,6 +150,8 @@ def choose_approach(
 ) -> tuple[Approach, dict[str, Any] | None]:
     """Return the approach set by plan and editor, or found by a trial run, and the trial's figures.
 
+    A method that moves all attributes in any case needs no trial: geometry does not confine the edit.
+
     Args:
         options: resolved options
         setup: the training views
@@ -171,6 +174,9 @@ def choose_approach(
         edited = [view.confine(picture) for view, picture in zip(setup.train, edited, strict=True)]
     if all(torch.equal(picture, view.image) for picture, view in zip(edited, setup.train, strict=True)):
         return candidates[0], None
+    if not METHODS[options.preset].kinds_differ and not optimize.grow:
+        moving = [candidate for candidate in candidates if candidate.kind == "geometry"]
+        return (moving or candidates)[0], None
     with log.steps("try kinds", len(candidates)) as advance:
         trial = try_approaches(options, setup, edited, candidates, advance)
     log.say(trial.line())
@@ -286,8 +292,8 @@ def _try_approach(
     else:
         resolved = resolve_kind(with_values(options, steps=steps), way.kind, 0)
         extent = 2.0 * scene_sphere(setup.scene[setup.region.members])[1]
-        settings = pgs_settings(resolved, True, original.shape[1], extent, 1)
-        settings = replace(settings, smoothing=0.9, every=0, snapshots=1)
+        rates = METHODS[options.preset].learning_rates(way.kind, original.shape[1], extent)
+        settings = replace(pgs_settings(resolved, rates, 1), snapshots=1)
         if seeds:
             stage = place_seeds(stage, seeds)
             settings = replace(settings, ramp=0.0)

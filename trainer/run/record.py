@@ -16,10 +16,10 @@ from progdf.formats.scene_file import load_scene, scene_file
 from progdf.gaussians import Gaussians
 from progdf.io.json_values import convert_json, to_json
 from progdf.region import Region
+from trainer.methods import METHODS
 from trainer.options import EditKind, TrainOptions
 from trainer.resolve import check_name
 from trainer.store.run_folder import RunFolder, read_run_cameras, read_views
-from trainer.views.boxes import whole_views, widen_views
 from trainer.views.setup import TrainingSetup
 from trainer.views.view import make_view, with_near_plane
 
@@ -148,14 +148,11 @@ def render_run_views(run: FinishedRun) -> TrainingSetup:
 
 
 def render_edited_views(run: FinishedRun) -> TrainingSetup:
-    """Render the run's views, with training views whose boxes hold all changes of the edit, as in training.
+    """Render the run's views, with the boxes that the training views had in training.
 
     See `render_run_views`.
     """
     setup = render_run_views(run)
-    if run.record.plan.optimize.as_printed:
-        return whole_views(setup)
     cameras = [view.camera for view in setup.train]
-    return widen_views(
-        setup, {s: read_views(run.folder, "edited", cameras, s) for s in run.trajectory.strengths}
-    )
+    edited = {s: read_views(run.folder, "edited", cameras, s) for s in run.trajectory.strengths}
+    return METHODS[run.record.plan.preset].box_views(setup, edited)

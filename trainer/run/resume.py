@@ -237,14 +237,14 @@ def _saved_identity(folder: RunFolder) -> _Identity | None:
 def plan_difference(was: TrainOptions, now: TrainOptions) -> str:
     """Return a description of one differing value, as in "--steps 24, not 40"; "" if none differs.
 
-    Options given on the command line come first.
+    The preset comes first, as it explains other differences, then the other options of the command line.
     """
     pairs = zip(flat_values(was), flat_values(now), strict=True)
     compared = ((name, typed, _plain(name, a), _plain(name, b)) for (name, typed, a), (*_, b) in pairs)
     differing = [value for value in compared if value[2] != value[3]]
     if not differing:
         return ""
-    name, typed, before, after = min(differing, key=lambda value: not value[1])
+    name, typed, before, after = min(differing, key=lambda value: (value[0] != "preset", not value[1]))
     option = "--" + name.replace("_", "-") if typed else name.replace("_", " ")
     return f"{option} {_spell_value(before)}, not {_spell_value(after)}"
 

@@ -12,11 +12,12 @@ from progdf.field.trajectory import Trajectory
 from progdf.io.cameras import save_cameras
 from trainer.editors import editor_row
 from trainer.fit.fit import choose_path, drop_idle_attributes, may_have_idle_attributes
-from trainer.fit.network import PART as NETWORK
+from trainer.methods import METHODS
 from trainer.optimize.growth import fade_in
-from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
+from trainer.optimize.losses import Perceptual, perceptual_loss
 from trainer.optimize.retime import smooth_course
 from trainer.options import TrainOptions
+from trainer.paper.network import PART as NETWORK
 from trainer.report.agreement import measure_agreement
 from trainer.resolve import recorded_options
 from trainer.store.progress import RunLog
@@ -24,7 +25,6 @@ from trainer.store.run_folder import (
     RunFolder,
     remove_stale_views,
 )
-from trainer.views.boxes import whole_views, widen_views
 from trainer.views.setup import TrainingSetup
 from trainer.views.view import BACKGROUND
 
@@ -54,7 +54,7 @@ def train_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder,
         # if more strengths may be requested, the boxes must not depend on which of them exist already
         strengths = (1.0,) if views.requests_strengths else edited
         train_edits = {s: edited[s][: len(setup.train)] for s in strengths}
-        setup = whole_views(setup) if options.optimize.as_printed else widen_views(setup, train_edits)
+        setup = METHODS[options.preset].box_views(setup, train_edits)
     if views.optimization.solver == "colors":  # small sums: torch's threads spun for 100 s on 16 cores
         torch.set_num_threads(1)
     recorded = folder.state.load("recorded")
@@ -135,7 +135,8 @@ def _record(
 ) -> tuple[Trajectory, dict[str, Any]]:
     """Optimize, and return the trajectory on its slider and the figures for the run's record."""
     optimization = views.optimization
-    objective = describe_loss(optimization, perceptual.name)
+    method = METHODS[options.preset]
+    objective = method.describe_loss(optimization, perceptual.name)
     log.say(f"loss: {objective}")
     if options.optimize.group_steps and optimization.kind != "geometry":
         log.say(f"--group-steps: without effect on this {optimization.kind} edit, whose loss is {objective}")
@@ -149,21 +150,22 @@ def _record(
         costs: dict[str, float] = {}
         if may_have_idle_attributes(trajectory):
             choosing, _ = load_evaluator(folder, setup, setup.judging, trajectory).halves()
-            prunes = not optimization.as_printed
-            trajectory, costs = drop_idle_attributes(trajectory, choosing, prunes)
+            trajectory, costs = drop_idle_attributes(trajectory, choosing, method.cleans)
         count = len(trajectory)
         reason = ""
+        retimed = partial(
+            retime_trajectory, setup=setup, slider=optimization.slider, cleans=method.cleans, log=log
+        )
         has_one_target = len(trajectory.strengths) == 1
-        if has_one_target and not optimization.as_printed and options.field.field != "neural":
+        if has_one_target and method.cleans and options.field.field != "neural":
             # external pictures may be gone by now and have no intermediate strengths; generative models
             # edited only strength 1
             row = editor_row(options.editor)
             painter = None if row.external or row.slow_strengths else views.editor
-            retimed = partial(retime_trajectory, setup=setup, optimization=optimization, log=log)
             moves_groups = bool(optimization.group_steps)
             trajectory, reason = choose_path(trajectory, setup, painter, moves_groups, retimed)
         else:
-            trajectory = retime_trajectory(trajectory, setup, optimization, log)
+            trajectory = retimed(trajectory)
         trajectory = fade_in(trajectory)
     cost_text = f"; dB without each attribute: {costs}" if costs else ""
     log.say(f"kept {len(trajectory)} of {count} recordings{cost_text}")

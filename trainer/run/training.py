@@ -22,7 +22,7 @@ from progdf.metrics.image import LEVEL
 from progdf.rasterize.engines import engine_device
 from progdf.scene.bounds import scene_sphere
 from progdf.terminal import format_count
-from trainer.fit.network import JointTraining, begin_joint_training, save_network
+from trainer.methods import METHODS
 from trainer.optimize.color_course import STEPS, StrengthSchedule, Target, solve, thin_model
 from trainer.optimize.color_solver import (
     Model,
@@ -36,11 +36,12 @@ from trainer.optimize.color_solver import (
 from trainer.optimize.color_views import MAX_ERROR_SHARE, ColorEvaluator, ColorView, color_views
 from trainer.optimize.groups import Groups, group_path, group_stage, restore_groups
 from trainer.optimize.growth import add_rows, place_seeds, removal_costs, seed_rows
-from trainer.optimize.losses import Losses, Objective, Perceptual, erode, loss_table
-from trainer.optimize.pgs import OnStep, ParameterSnapshot, PgsState, TargetStage, optimize, pgs_settings
+from trainer.optimize.losses import Losses, Perceptual, loss_table
+from trainer.optimize.pgs import SNAPSHOTS, DescentTask, OnStep, ParameterSnapshot, PgsState, TargetStage
 from trainer.optimize.retime import record, retime, select_recordings, straight_recordings
 from trainer.optimize.ties import surface_ties
-from trainer.options import MAX_STAGES, OptimizeOptions, TrainingViewOptions, TrainOptions
+from trainer.options import MAX_STAGES, OptimizeOptions, Slider, TrainingViewOptions, TrainOptions
+from trainer.paper.network import JointTraining, save_network
 from trainer.store.progress import RunLog, release_memory
 from trainer.store.run_folder import LazySequence
 from trainer.store.state import PeriodicSave, Resumable, Saved, StateFolder, defer_signals
@@ -48,7 +49,7 @@ from trainer.views.boxes import Pictures, boxed_pictures, probe_views
 from trainer.views.choose import split_held_out
 from trainer.views.crops import CropScene, crop_scene, moving_attributes, only_recolors, render_all
 from trainer.views.setup import TrainingSetup
-from trainer.views.view import View, crop
+from trainer.views.view import View
 
 
 class _RecordingValues(TypedDict):
@@ -171,7 +172,8 @@ def optimize_members(
         card = torch.cuda.get_device_name(device) if device.type == "cuda" else "the CPU, in place of a card"
         log.say(f"warp renders the training steps on {card}")
     original = pack(scene[members], with_shN=scene.sh_degree > 0).to(device)
-    still = optimization.kind == "color" and optimization.rates == "kind"
+    method = METHODS[options.preset]
+    still = only_recolors(method.learning_rates(optimization.kind, original.shape[1], 1.0))
     crops = _crops(setup, still, engine)
     stages = _stages(optimization, setup, edited)
     groups = None
@@ -179,26 +181,30 @@ def optimize_members(
         groups = _groups(optimization, original, crops, stages, folder, log)
         stages = groups.to_stages(original, crops, stages)
     extent = 2.0 * scene_sphere(scene[members])[1] if groups is None else groups.extent
-    settings = pgs_settings(optimization, optimization.sh != "off", original.shape[1], extent, len(stages))
+    rates = method.learning_rates(optimization.kind, original.shape[1], extent)
+    if optimization.sh == "off":
+        rates[BASE_CHANNELS:] = 0.0
     member_count = len(members)
     seeds = _make_or_load_seeds(setup, optimization, edited, folder) if optimization.grow else None
     if seeds is not None:
         setup = setup.extend(seeds)
-        settings = replace(settings, ramp=0.0)
         original = torch.cat([original, pack(seeds, with_shN=scene.sh_degree > 0).to(device)])
         crops = _crops(setup, still, engine)
         stages = [place_seeds(s, len(seeds)) for s in stages]
-    state = PgsState(original, settings.seed)
+    state = PgsState(original, optimization.seed)
     recordings = Recordings(folder, original.shape, None)
-    inside = [erode(crop(view.mask, view.box)).to(device) for view in setup.train]
-    objective = Objective(perceptual, optimization, inside)
-    probes = probe_views(setup, engine=engine)
-    descend = partial(optimize, original, crops, probes, stages, objective, settings, state=state)
-    joint = None
-    if optimization.as_printed and options.field.field == "neural":
-        joint = begin_joint_training(
-            options.field, optimization, setup, settings.rates, stages, crops, perceptual
-        )
+    task = DescentTask(
+        options=optimization,
+        setup=setup,
+        rates=rates,
+        original=original,
+        crops=crops,
+        stages=stages,
+        perceptual=perceptual,
+        adds_rows=seeds is not None,
+    )
+    descend = partial(method.descend, task, state)
+    joint = method.begin_network(options.field, task)
     all_snapshots = _record_snapshots(
         descend, sum(stage.steps for stage in stages), state, recordings, joint, folder, log
     )
@@ -208,7 +214,7 @@ def optimize_members(
         stage_ends = [snapshot for snapshot in all_snapshots if snapshot.ends_stage]
         offsets = [*(snapshot.offsets.float() for snapshot in stage_ends[:-1]), end]
         snapshots = group_path(
-            original, groups, offsets, [snapshot.step for snapshot in stage_ends], settings.snapshots
+            original, groups, offsets, [snapshot.step for snapshot in stage_ends], SNAPSHOTS
         )
     trajectory = record(snapshots, end[:member_count], list(edited))
     effort: dict[str, Any] = {"strengths": list(edited)}
@@ -473,14 +479,15 @@ def _make_or_load_seeds(
 
 
 def retime_trajectory(
-    trajectory: Trajectory, setup: TrainingSetup, optimization: OptimizeOptions, log: RunLog
+    trajectory: Trajectory, setup: TrainingSetup, slider: Slider, cleans: bool, log: RunLog
 ) -> Trajectory:
     """Remove jitter and assign slider values by the visible change. Every recording is rendered once.
 
     Args:
         trajectory: the recordings
         setup: scene, region, views
-        optimization: determines the meaning of slider values, and whether jitter is retained
+        slider: meaning of slider values
+        cleans: remove jitter
         log: log of the run
     """
     moving = moving_attributes(trajectory.end)
@@ -492,8 +499,8 @@ def retime_trajectory(
             images = render_all(probes, original + trajectory.node(i), moving)
             pictures.append(torch.cat([image.flatten() for image in images]))
             advance(i + 1, "recordings")
-    if not optimization.as_printed and trajectory.maps is None:
+    if cleans and trajectory.maps is None:
         nodes = straight_recordings(trajectory, pictures)
         trajectory = select_recordings(trajectory, nodes)
         pictures = [pictures[i] for i in nodes]
-    return retime(trajectory, pictures, optimization.slider)
+    return retime(trajectory, pictures, slider)

@@ -43,13 +43,6 @@ def widen_views(setup: TrainingSetup, edited: Pictures) -> TrainingSetup:
     return replace(setup, train=views)
 
 
-def whole_views(setup: TrainingSetup) -> TrainingSetup:
-    """Return the setup with training views whose boxes are the whole picture."""
-    return replace(
-        setup, train=[replace(v, box=(0, 0, v.camera.width, v.camera.height)) for v in setup.train]
-    )
-
-
 def shrink_view(
     setup: TrainingSetup, view: View, edited: Tensor, camera: Camera
 ) -> tuple[CropScene, Callable[[Tensor], Tensor], Tensor]:

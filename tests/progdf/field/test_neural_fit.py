@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from progdf.field import NeuralSettings, bake_network
-from progdf.field.neural_fit import NeuralFit, train_network
+from progdf.field.neural_fit import NeuralFit, rendered_importance, train_network
 from tests.helpers.edits import curved_trajectory
 from tests.helpers.networks import MEMBERS, SHORT, fit_neural, members, rows, scene, smooth_trajectory
 
@@ -159,3 +159,10 @@ def test_fit_adopts_the_outputs_of_attributes_that_still_move() -> None:
     expected = first.field().bind(rows()).offsets(0.5)[:, 11:14]
     found = second.field().bind(rows()).offsets(0.5)[:, 11:14]
     assert torch.allclose(found, expected, atol=2e-3 * float(expected.abs().max()))
+
+
+def test_importance_is_the_rendered_change() -> None:
+    _, offsets = curved_trajectory(30, moving=("means", "sh0"))
+    found = rendered_importance(offsets, lambda moved: moved[:, 11:14])
+    assert found["sh0"] > 0.999
+    assert sum(found.values()) == pytest.approx(1.0)

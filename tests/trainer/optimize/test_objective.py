@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import get_args
 
 import pytest
 import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.gaussians import pack
 from progdf.metrics.lpips import Lpips
 from tests.helpers.count import Count
-from tests.helpers.trained import WHITE, small
-from trainer.editors import make_editor
 from trainer.optimize.losses import (
     GradientL1,
     LpipsLoss,
@@ -25,14 +21,10 @@ from trainer.optimize.losses import (
     erode,
     l1,
     loss_table,
-    progressive_change,
     sharpness,
     total_loss,
 )
-from trainer.optimize.pgs import ParameterSnapshot, PgsSettings, TargetStage, learning_rates, optimize
-from trainer.options import EditorOptions, OptimizeOptions, Over, Progressive
-from trainer.views.crops import crop_scene
-from trainer.views.view import crop
+from trainer.options import OptimizeOptions
 
 
 def noise(*shape: int, seed: int = 0) -> Tensor:
@@ -53,7 +45,7 @@ def paying(perceptual_weight: float = 0.1, **more: object) -> OptimizeOptions:
     return replace(OptimizeOptions(), perceptual_weight=perceptual_weight, **more)  # type: ignore[arg-type]
 
 
-ALL_TERMS = paying(0.3, perceptual_every=1, progressive="decay", sharpness="hinge")
+ALL_TERMS = paying(0.3, kind="style")
 
 
 # ---- gradients
@@ -66,24 +58,12 @@ def test_l1_and_gradient_l1_match_finite_differences() -> None:
         assert torch.autograd.gradcheck(lambda x, measure=measure: measure(x, target), image)
 
 
-@pytest.mark.parametrize("form", ["hinge", "paper"])
-def test_sharpness_gradient_matches_finite_differences(form: str) -> None:
+def test_sharpness_gradient_matches_finite_differences() -> None:
     image = 0.5 * noise(8, 9, 3)
     target = noise(8, 9, 3, seed=1)
     inside = noise(8, 9, seed=3) > 0.3
-    assert float(sharpness(image, target, "hinge", inside)) > 0, "the hinge is open"
-    assert torch.autograd.gradcheck(
-        lambda x: sharpness(x, target, form, inside),  # type: ignore[arg-type]
-        image.requires_grad_(),
-    )
-
-
-@pytest.mark.parametrize("grows", [False, True])
-@pytest.mark.parametrize("over", get_args(Over))
-def test_progressive_gradient_matches_finite_differences(grows: bool, over: Over) -> None:
-    moved = noise(5, 14).requires_grad_()
-    previous = noise(5, 14, seed=1)
-    assert torch.autograd.gradcheck(lambda x: progressive_change(x, previous, 70, grows, over), moved)
+    assert float(sharpness(image, target, inside)) > 0, "the hinge is open"
+    assert torch.autograd.gradcheck(lambda x: sharpness(x, target, inside), image.requires_grad_())
 
 
 def test_lpips_gradient_matches_finite_differences() -> None:
@@ -112,15 +92,14 @@ def test_lpips_gradient_matches_finite_differences() -> None:
 
 def test_loss_is_the_sum_of_its_named_terms() -> None:
     terms = Objective(GradientL1(), ALL_TERMS).terms(moment())
-    assert list(terms) == ["l1", "perceptual", "progressive", "sharpness"]
+    assert list(terms) == ["l1", "perceptual", "sharpness"]
     assert float(total_loss(terms).detach()) == pytest.approx(sum(float(x.detach()) for x in terms.values()))
 
 
 def test_weights_scale_their_terms_and_leave_l1_unchanged(monkeypatch: pytest.MonkeyPatch) -> None:
     now = moment(image=0.5 * noise(8, 9, 3))
     single = Objective(GradientL1(), ALL_TERMS).terms(now)
-    monkeypatch.setattr("trainer.optimize.losses.PROGRESSIVE_WEIGHT", 10.0)
-    monkeypatch.setattr("trainer.optimize.losses.SHARPNESS_WEIGHT", {"hinge": 0.2})
+    monkeypatch.setattr("trainer.optimize.losses.SHARPNESS_WEIGHT", {"style": 0.2})
     double = Objective(GradientL1(), replace(ALL_TERMS, perceptual_weight=0.6)).terms(now)
     for name, value in single.items():
         assert float(value.detach()) > 0
@@ -128,10 +107,10 @@ def test_weights_scale_their_terms_and_leave_l1_unchanged(monkeypatch: pytest.Mo
         assert float(double[name].detach()) == pytest.approx(factor * float(value.detach())), name
 
 
-def test_perceptual_term_is_computed_every_n_steps_at_the_stage_target() -> None:
-    objective = Objective(GradientL1(), paying(perceptual_every=3))
-    paid = ["perceptual" in objective.terms(moment(local=local)) for local in range(6)]
-    assert paid == [True, False, False, True, False, False]
+def test_perceptual_term_is_computed_every_second_step_at_the_stage_target() -> None:
+    objective = Objective(GradientL1(), paying())
+    paid = ["perceptual" in objective.terms(moment(local=local)) for local in range(4)]
+    assert paid == [True, False, True, False]
     assert "perceptual" not in objective.terms(moment(local=0, arrived=False))
 
 
@@ -149,59 +128,8 @@ def test_new_stage_forgets_the_targets_of_the_last() -> None:
 def test_loss_description_names_the_active_terms() -> None:
     assert describe_loss(paying(), "gradient-l1") == "L1 + 0.1 gradient-l1 every 2 steps"
     assert describe_loss(ALL_TERMS, "lpips-vgg") == (
-        "L1 + 0.3 lpips-vgg + 5 progressive (decay, mean) + 0.1 sharpness (hinge)"
+        "L1 + 0.3 lpips-vgg every 2 steps + 0.1 sharpness (hinge)"
     )
-
-
-# ---- the progressive constraint
-
-
-def test_progressive_change_is_the_printed_sum_or_the_member_mean() -> None:
-    moved = noise(5, 14)
-    previous = noise(5, 14, seed=1)
-    squares = (moved - previous).square().sum(dim=1)
-    lengths: dict[Over, Tensor] = {"sum": squares.sum(), "mean": squares.mean()}
-    for over, length in lengths.items():
-        for step in (0, 50, 600):
-            grown, decayed = (
-                progressive_change(moved, previous, step, grows, over) for grows in (True, False)
-            )
-            assert float(grown) == pytest.approx(0.05 * 1.1 ** (step / 50) * float(length))
-            assert float(decayed) == pytest.approx(0.05 * 1.1 ** (-step / 50) * float(length))
-
-
-def recolored(weights: OptimizeOptions, steps: int = 30, **more: object) -> list[ParameterSnapshot]:
-    """Return the recordings of a short recoloring of a small bear."""
-    case = small("body")
-    editor = make_editor(EditorOptions("recolor:#3060d0"), case.scene, case.region, case.views)
-    original = pack(case.scene[case.region.members], with_shN=True)
-    crops = [crop_scene(case.scene, case.region.members, v.camera, v.box, WHITE) for v in case.views]
-    stage = TargetStage(1.0, [crop(editor.edit(v, 1.0), v.box) for v in case.views], steps)
-    settings = PgsSettings(learning_rates("color", original.shape[1], 1.0), ramp=0.0)
-    settings = replace(settings, **more)  # type: ignore[arg-type]
-    return list(optimize(original, crops, crops[:1], [stage], Objective(GradientL1(), weights), settings))
-
-
-def distance_traveled(weights: OptimizeOptions) -> float:
-    """Return the mean absolute offset at the end of a short recoloring."""
-    return float(recolored(weights)[-1].offsets.abs().mean())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("progressive", ["decay", "growth"])
-def test_sum_over_members_restrains_an_edit_more_than_the_mean(progressive: Progressive) -> None:
-    free = distance_traveled(paying())
-    mean, total = (
-        distance_traveled(paying(progressive=progressive, progressive_over=over)) for over in get_args(Over)
-    )
-    assert 5 * total < mean < free
-
-
-def test_frozen_edit_is_recorded_at_fixed_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("trainer.optimize.losses.PROGRESSIVE_WEIGHT", 1e4)
-    frozen = paying(progressive="growth", progressive_over="sum")
-    assert [found.step for found in recolored(frozen, every=8, smoothing=0.0)] == [8, 16, 24, 30]
-    assert len(recolored(frozen)) < 4 < len(recolored(paying())), "else by what is seen"
 
 
 # ---- sharpness
@@ -210,9 +138,9 @@ def test_frozen_edit_is_recorded_at_fixed_steps(monkeypatch: pytest.MonkeyPatch)
 def test_hinge_is_zero_if_the_render_is_as_sharp_as_its_target() -> None:
     texture = noise(20, 20, 3)
     soft = texture.mean(dim=(0, 1)).expand_as(texture)
-    assert float(sharpness(texture, texture, "hinge")) == 0.0
-    assert float(sharpness(texture, soft, "hinge")) == 0.0
-    assert float(sharpness(soft, texture, "hinge")) > 0.1
+    assert float(sharpness(texture, texture)) == 0.0
+    assert float(sharpness(texture, soft)) == 0.0
+    assert float(sharpness(soft, texture)) > 0.1
 
 
 def test_hinge_covers_only_the_mask() -> None:
@@ -221,31 +149,21 @@ def test_hinge_covers_only_the_mask() -> None:
     soft[:, 10:] = 0.5
     left = torch.zeros(20, 20, dtype=torch.bool)
     left[:, :8] = True
-    assert float(sharpness(soft, texture, "hinge", left)) == 0.0
-    assert float(sharpness(soft, texture, "hinge", ~left)) > 0.0
-
-
-def test_paper_sharpness_acts_inside_the_picture_and_rewards_contrast() -> None:
-    """Guard against signed Laplacians, whose sum telescopes to the border; that of squares does not."""
-    image = noise(20, 20, 3).requires_grad_()
-    lost = sharpness(image, image.detach(), "paper")
-    lost.backward()
-    assert image.grad is not None
-    assert float(image.grad[2:-2, 2:-2].abs().max()) > 1e-3
-    assert float(sharpness(2 * image, image, "paper").detach()) == pytest.approx(4 * float(lost.detach()))
+    assert float(sharpness(soft, texture, left)) == 0.0
+    assert float(sharpness(soft, texture, ~left)) > 0.0
 
 
 def test_descending_the_hinge_restores_lost_sharpness() -> None:
     target = noise(24, 24, 3)
     image = (0.25 * target + 0.75 * target.mean()).requires_grad_()
     optimizer = torch.optim.SGD([image], lr=20.0)
-    before = float(sharpness(image, target, "hinge").detach())
+    before = float(sharpness(image, target).detach())
     for _ in range(40):
         optimizer.zero_grad()
-        loss = sharpness(image, target, "hinge")
+        loss = sharpness(image, target)
         loss.backward()
         optimizer.step()
-    assert float(sharpness(image, target, "hinge").detach()) < 0.1 * before
+    assert float(sharpness(image, target).detach()) < 0.1 * before
 
 
 def test_erosion_shrinks_the_mask_except_at_the_picture_border() -> None:

@@ -141,7 +141,7 @@ def test_no_step_transfers_data_to_or_from_the_gpu(case: Small, card: Card, kind
         crop_scene(scene, case.region.members, v.camera, v.box, WHITE, engine="warp") for v in case.views
     ]
     targets = [crop_.original.clamp(0.0, 1.0).flip(2) for crop_ in crops]
-    objective = Objective(perceptual_loss()[0], OptimizeOptions(perceptual_weight=0.3, sharpness="hinge"))
+    objective = Objective(perceptual_loss()[0], OptimizeOptions(perceptual_weight=0.3, kind="style"))
     rates = learning_rates(kind, original.shape[1], 1.0)
     for steps in (1, 1, 2):
         before = card.moved
@@ -155,7 +155,7 @@ def test_saved_state_is_restored_to_the_gpu(card: Card) -> None:
     rows = torch.rand(5, 14).to(CARD)
     state = PgsState(rows)
     state.view(3)
-    state.descend(torch.rand(5, 14).to(CARD), torch.ones(14).to(CARD), 0.1, True, 0.9)
+    state.descend(torch.rand(5, 14).to(CARD), torch.ones(14).to(CARD), 0.1)
     state.pictures = [torch.rand(4, 4, 3).to(CARD)]
     saved = state.capture_state()
     kept = replace(saved, tensors={name: tensor.detach().cpu() for name, tensor in saved.tensors.items()})

@@ -18,7 +18,8 @@ from tests.helpers.trained import WHITE, Small, quick_options, small
 from trainer.editors import make_editor
 from trainer.options import EditorOptions, TrainOptions, with_values
 from trainer.resolve import resolve
-from trainer.run.kinds import Approach, Trial, approaches, try_approaches
+from trainer.run.kinds import Approach, Trial, approaches, choose_approach, try_approaches
+from trainer.store.progress import RunLog
 from trainer.views.setup import TrainingSetup
 
 COLOR = Approach("color")
@@ -63,6 +64,15 @@ def test_recolor_given_as_pictures_is_a_color_edit() -> None:
     trial = try_approaches(asked(), setup(case), pictures, [COLOR, STYLE, FREE, IN_PARTS])
     assert trial.chosen == COLOR
     assert trial.psnrs[COLOR] > trial.psnrs[FREE] + 2
+
+
+def test_paper_preset_moves_all_attributes_without_a_trial(tmp_path: Path) -> None:
+    case = scarf()
+    editor = make_editor(EditorOptions("recolor:#3060d0"), case.scene, case.region, case.views)
+    options = with_values(asked(), preset="paper", group_steps=0)
+    log = RunLog(tmp_path / "log.txt", quiet=True)
+    assert choose_approach(options, setup(case), editor, log) == (FREE, None)
+    log.close()
 
 
 def test_moved_part_is_a_geometry_edit_in_parts() -> None:

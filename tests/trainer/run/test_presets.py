@@ -14,7 +14,8 @@ import trainer.run.run
 from progdf.errors import ProgdfError
 from progdf.io.json_values import convert_json, to_json
 from trainer.cli import train_options
-from trainer.optimize.pgs import pgs_settings
+from trainer.methods import METHODS
+from trainer.optimize.losses import describe_loss
 from trainer.options import (
     PRESETS,
     EditKind,
@@ -38,8 +39,8 @@ def planned(kind: EditKind, *more: str, group_steps: int = 0) -> OptimizeOptions
     return resolve_kind(resolve(asked(*more)), kind, group_steps)
 
 
-def test_every_preset_exists_and_the_default_changes_nothing() -> None:
-    assert set(PRESETS) == set(get_args(Preset))
+def test_every_preset_has_a_method_and_the_default_changes_nothing() -> None:
+    assert set(PRESETS) == set(METHODS) == set(get_args(Preset))
     assert asked("--preset", "default") == asked()
 
 
@@ -58,7 +59,7 @@ def test_preset_sets_exactly_its_values(preset: Preset) -> None:
 
 @pytest.mark.parametrize("preset", [name for name in PRESETS if name != "default"])
 def test_preset_values_can_be_given_on_the_command_line(preset: Preset) -> None:
-    fixed = {"perceptual_every", "sharpness", "as_printed", "color_solver", "ema", "target_ramp"}
+    fixed = {"color_solver"}
     values = {name: value for part in PRESETS[preset].values() for name, value in part.items()}
     words = [w for n, v in values.items() if n not in fixed for w in (f"--{n.replace('_', '-')}", str(v))]
     assert with_values(asked(*words), **{n: values[n] for n in fixed}, preset=preset) == asked(
@@ -71,7 +72,7 @@ def test_command_line_overrides_the_preset_in_any_order() -> None:
     after = asked("--preset", "paper", "--steps", "300")
     assert before == after
     assert before.optimize.steps == 300
-    assert before.optimize.progressive == "decay"
+    assert before.optimize.slider == "time"
 
 
 def test_explicit_default_overrides_the_preset() -> None:
@@ -83,21 +84,21 @@ def test_paper_preset_can_leave_out_its_network() -> None:
     assert plan.field.field == "auto"
 
 
-def test_paper_preset_can_use_progressive_growth() -> None:
-    assert planned("style", "--preset", "paper", "--progressive", "growth").progressive == "growth"
-
-
 def test_default_loss_weights_depend_on_the_kind() -> None:
     color, style, geometry = (planned(kind) for kind in ("color", "style", "geometry"))
     assert (color.perceptual_weight, style.perceptual_weight, geometry.perceptual_weight) == (0.1, 0.3, 0.3)
-    assert (color.sharpness, style.sharpness, geometry.sharpness) == ("off", "hinge", "off")
+    assert [describe_loss(found, "LPIPS").endswith("(hinge)") for found in (color, style, geometry)] == [
+        False,
+        True,
+        False,
+    ]
 
 
 def test_color_solver_is_used_unless_a_descent_option_is_given() -> None:
     assert planned("color").solver == "colors"
     assert planned("color", "--perceptual-weight", "0").solver == "colors"
     assert planned("style").solver == "descent"
-    for words in (("--perceptual-weight", "0.1"), ("--progressive", "decay"), ("--preset", "paper")):
+    for words in (("--perceptual-weight", "0.1"), ("--preset", "paper")):
         assert planned("color", *words).solver == "descent"
 
 
@@ -122,31 +123,12 @@ def test_group_steps_apply_only_to_geometry() -> None:
     assert planned("color", group_steps=9).group_steps == 0
 
 
-def test_color_edit_keeps_geometry_except_with_plain_rates() -> None:
-    ours = pgs_settings(planned("color"), True, 23, 1.0, 4).rates
-    to_json = pgs_settings(planned("color", "--preset", "paper"), True, 23, 1.0, 4).rates
+def test_color_edit_keeps_geometry_except_with_the_paper_preset() -> None:
+    ours = METHODS["default"].learning_rates("color", 23, 1.0)
+    printed = METHODS["paper"].learning_rates("color", 23, 1.0)
     assert torch.equal(ours[:11], torch.zeros(11))
-    assert float(to_json[:11].min()) > 0
-    assert float(ours[11]) > 5 * float(to_json[11])
-
-
-def test_paper_rates_are_3dgs_rates_scaled_as_in_gaussian_editor() -> None:
-    to_json, multiplied = (
-        pgs_settings(planned("color", "--preset", "paper", *words), True, 14, 1.0, 1).rates
-        for words in (("--rates", "3dgs"), ())
-    )
-    factors = [5.0] * 3 + [2.0] * 8 + [5.0] * 3  # means; log-scales, quaternion, opacity; color
-    assert torch.allclose(multiplied / to_json, torch.tensor(factors))
-
-
-@pytest.mark.parametrize(("part", "changes"), [("target_ramp", "ramp"), ("ema", "smoothing")])
-def test_each_refinement_of_descent_can_be_disabled_alone(part: str, changes: str) -> None:
-    without = resolve_kind(with_values(resolve(asked()), **{part: False}), "style", 0)
-    whole = vars(pgs_settings(planned("style"), True, 14, 1.0, 4))
-    less = vars(pgs_settings(without, True, 14, 1.0, 4))
-    assert torch.equal(whole.pop("rates"), less.pop("rates"))
-    assert {name for name in whole if whole[name] != less[name]} == {changes}
-    assert not less[changes]
+    assert float(printed[:11].min()) > 0
+    assert float(ours[11]) > 5 * float(printed[11])
 
 
 def test_color_solver_can_be_disabled() -> None:
@@ -177,7 +159,7 @@ def test_plan_difference_names_the_first_differing_option() -> None:
     assert plan_difference(plan, resolve(asked("--steps", "40", "--stages", "2"))) == "--steps 800, not 40"
     assert plan_difference(plan, resolve(asked("--views", "9"))) == "--views by default, not 9"
     paper = resolve(asked("--preset", "paper", "--views", "9"))
-    assert plan_difference(resolve(asked("--views", "9")), paper) == "--lift-rule share, not paper"
+    assert plan_difference(resolve(asked("--views", "9")), paper) == "--preset default, not paper"
     here = resolve(replace(asked(), scene=Path.cwd() / "scene.ply"))
     assert plan_difference(plan, here) == "", "the same file"
 

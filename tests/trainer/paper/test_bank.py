@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 import trainer.run.run
-from progdf.errors import ProgdfError
 from progdf.field import neural_fit
 from progdf.field.neural_fit import NeuralFit, NeuralSettings
 from progdf.field.trajectory import load_trajectory
@@ -19,9 +18,9 @@ from progdf.formats.ply import load_ply
 from progdf.gdf.file import load_gdf
 from tests.helpers.edits import curved_trajectory
 from tests.helpers.trained import quick_options
-from trainer.fit.network import JointTraining, MemoryBank, rendered_importance
 from trainer.options import FitOptions, with_values
-from trainer.resolve import check_field_options, check_options
+from trainer.paper.descent import RATE_FACTORS
+from trainer.paper.network import JointTraining, MemoryBank
 from trainer.run.finish import refit
 from trainer.run.run import RunResult
 
@@ -33,6 +32,9 @@ def short_fits() -> Iterator[None]:
         patch.setattr(neural_fit, "EFFORT", {"tiny": (200, 256, 5e-3)})
         patch.setattr("trainer.fit.network.EFFORT", neural_fit.EFFORT)
         patch.setattr("trainer.fit.network.PICTURE_STEPS", 20)
+        # colors alone, fast enough for 60 steps
+        factors = dict.fromkeys(RATE_FACTORS, 0.0) | {"sh0": 30.0}
+        patch.setattr("trainer.paper.descent.RATE_FACTORS", factors)
         yield
 
 
@@ -40,7 +42,8 @@ def train_jointly(folder: Path, out: str, resume: bool = False) -> RunResult:
     """Train a short run whose position network is trained jointly with the members."""
     settings = {"steps": 60, "stages": 2, "views": 5, "image_size": 56, "field": "neural", "name": "joint"}
     bending = "recolor:#30a050"  # its path differs from the line between two keyframes
-    options = quick_options(folder, out, **settings, editor=bending, as_printed=True, resume=resume)
+    method = {"preset": "paper", "color_solver": False}
+    options = quick_options(folder, out, **settings, **method, editor=bending, resume=resume)
     return trainer.run.run.train(options, quiet=True)
 
 
@@ -184,30 +187,3 @@ def test_refit_trains_a_network_on_the_recording(folder: Path, alongside: RunRes
 
 def _end(result: RunResult, folder: Path) -> Tensor:
     return load_gdf(result.gdf, load_ply(folder / "scene.ply")).field.offsets(1.0)
-
-
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        ({"size": "small"}, "--size does not apply to --field auto; add --field neural"),
-        (
-            {"field_loss": "pictures", "field": "separable"},
-            "--field-loss does not apply to --field separable",
-        ),
-    ],
-)
-def test_unused_network_options_are_refused(folder: Path, changed: dict[str, object], message: str) -> None:
-    with pytest.raises(ProgdfError, match=message):
-        check_options(quick_options(folder, **changed))
-
-
-def test_refit_checks_its_options_too(folder: Path) -> None:
-    with pytest.raises(ProgdfError, match="--size does not apply"):
-        check_field_options(with_values(FitOptions(folder), size="small").field)
-
-
-def test_importance_is_the_rendered_change() -> None:
-    _, offsets = curved_trajectory(30, moving=("means", "sh0"))
-    found = rendered_importance(offsets, lambda moved: moved[:, 11:14])
-    assert found["sh0"] > 0.999
-    assert sum(found.values()) == pytest.approx(1.0)

@@ -14,13 +14,16 @@ from progdf.gaussians import ATTRIBUTES, pack
 from progdf.gdf.file import load_gdf
 from tests.helpers.trained import WHITE, quick_options, small, train
 from trainer.cli import train_options
-from trainer.fit.network import RenderedLoss, network_settings
-from trainer.optimize.losses import GradientL1, describe_loss, l1
-from trainer.optimize.pgs import pgs_settings
+from trainer.methods import METHODS
+from trainer.optimize.losses import GradientL1, l1
+from trainer.optimize.pgs import rates_per_column
 from trainer.options import TrainOptions, apply_preset, with_values
+from trainer.paper.descent import RATE_FACTORS, RATES_3DGS, learning_rates, recording_interval, whole_views
+from trainer.paper.losses import RenderedLoss, describe_loss
 from trainer.resolve import resolve, resolve_kind
 from trainer.run.run import RunResult
 from trainer.views.crops import crop_scene, moving_attributes
+from trainer.views.setup import TrainingSetup
 
 
 def plan(*more: str, region: str = "all") -> TrainOptions:
@@ -56,13 +59,19 @@ def test_pgs_has_the_printed_loss_for_every_kind_of_edit() -> None:
         assert 1500 <= found.steps <= 2000
 
 
-def test_pgs_is_the_plain_3dgs_optimizer_and_records_every_100_steps() -> None:
-    found = resolve_kind(plan(), "color", 0)
-    settings = pgs_settings(found, found.sh != "off", 23, 1.0, 1)
-    assert bool((settings.rates[:14] > 0).all()), "all attributes are free"
-    assert not bool(settings.rates[14:].any()), "three color channels only"
-    assert (settings.raised, settings.ramp, settings.fall, settings.reach) == (False, 0.0, 0.0, 0.0)
-    assert (settings.smoothing, settings.every) == (0.0, 100)
+def test_pgs_frees_all_attributes_and_records_every_100_steps() -> None:
+    assert bool((learning_rates("color", 23, 1.0) > 0).all()), "all attributes are free"
+    assert resolve_kind(plan(), "color", 0).sh == "off", "three color channels only"
+    assert recording_interval(resolve_kind(plan(), "color", 0).steps) == 100
+
+
+def test_rates_are_3dgs_rates_scaled_as_in_gaussian_editor() -> None:
+    multiplied = learning_rates("color", 14, 1.0)
+    factors = [5.0] * 3 + [2.0] * 8 + [5.0] * 3  # means; log-scales, quaternion, opacity; color
+    plain = rates_per_column(RATES_3DGS, 14, 1.0)
+    assert torch.allclose(multiplied / plain, torch.tensor(factors))
+    assert RATE_FACTORS.keys() == RATES_3DGS.keys()
+    assert learning_rates("geometry", 14, 1.0).equal(multiplied), "the same for all kinds"
 
 
 def test_paper_uses_at_most_96_views_and_a_time_slider() -> None:
@@ -70,7 +79,7 @@ def test_paper_uses_at_most_96_views_and_a_time_slider() -> None:
 
 
 def test_field_is_a_position_network_with_hard_bins_fitted_to_pictures() -> None:
-    network = network_settings(plan().field)
+    network = METHODS[plan().preset].network_settings(plan().field)
     assert (network.size, network.inputs, network.bins, network.code) == ("paper", "position", "hard", 0)
     assert plan().field.field_loss == "pictures"
 
@@ -96,9 +105,15 @@ def test_field_loss_is_the_printed_sum() -> None:
     assert float(loss(found, recorded, 1)) == pytest.approx(float(printed), rel=1e-6)
 
 
-def test_losses_cover_whole_pictures(folder: Path, run: RunResult, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert plan().optimize.as_printed
-    assert not quick_options(folder).optimize.as_printed
+def test_losses_cover_whole_pictures() -> None:
+    case = small("scarf")
+    setup = TrainingSetup(case.scene, case.region, list(case.views), [], WHITE)
+    for view in whole_views(setup, {}).train:
+        assert view.box == (0, 0, view.camera.width, view.camera.height)
+    assert METHODS["paper"].box_views is whole_views
+
+
+def test_report_names_the_printed_loss(run: RunResult) -> None:
     assert run.report["objective"] == (
         f"L1 + 1 {run.report['edit']['perceptual']} + 5 progressive (decay, mean) + 1 sharpness (paper)"
     )
