@@ -327,6 +327,26 @@ def test_files_have_a_limited_number_of_lines(sources: dict[Path, str]) -> None:
     assert not long, f"more than {MAX_LINES} lines: {long}"
 
 
+def preset_tests(source: str, where: str) -> list[str]:
+    """Return the comparisons with the preset "paper", as `where:line`."""
+    return [
+        f"{where}:{node.lineno}"
+        for node in ast.walk(parse(source))
+        if isinstance(node, ast.Compare) and re.search(r"preset\b.*'paper'", ast.unparse(node))
+    ]
+
+
+def test_trainer_dispatches_by_preset_only_through_its_table(sources: dict[Path, str]) -> None:
+    asking = [
+        line
+        for path, source in sources.items()
+        if path.parts[0] == "trainer"
+        for line in preset_tests(source, path.as_posix())
+    ]
+    assert not asking, f"give `METHODS` of trainer/methods.py another field: {asking}"
+    assert preset_tests('if plan.preset == "paper":\n    pass\n', "x.py") == ["x.py:1"]
+
+
 def test_page_does_not_import_the_window(sources: dict[Path, str]) -> None:
     """Check that the page needs only the library and the shaders, so that a notebook can show it too."""
     graph = import_graph(sources)

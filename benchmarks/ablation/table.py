@@ -37,7 +37,7 @@ class Outcome:
     bytes_per_member: float = 0.0  # of the field
     # processor time of the optimization, including a jointly trained network
     seconds: float = 0.0
-    objective: str = ""  # the loss, in words
+    objective: str = ""  # the loss in words, without terms that the variant replaces or adds
     failed: str = ""  # reason if there are no figures, else ""
 
     @property
