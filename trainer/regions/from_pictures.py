@@ -166,7 +166,7 @@ def region_kinds(request: RegionRequest) -> dict[str, Kind]:
 
 
 def region_checks(request: RegionRequest) -> dict[str, Check]:
-    """Return the checks of these kinds before the scene is loaded, for `check_region`."""
+    """Return the checks that run before the scene is loaded, by kind of region, for `check_region`."""
 
     def of_text(text: str) -> None:
         _prompt(text)

@@ -22,7 +22,7 @@ from progdf.errors import ProgdfError
 from trainer.store.pretrained import BROKEN, keep_quiet, missing_weights
 
 CLIP_MODEL = "openai/clip-vit-large-patch14"
-"""CLIP model that papers report figures of."""
+"""CLIP model for which papers report figures."""
 
 EXTRA = "pip install progdf-studio[clip]"
 """Remedy for a missing package, for messages."""

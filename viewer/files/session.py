@@ -350,7 +350,7 @@ def session_of(path: Path) -> Path | None:
 
 
 def is_discarded(path: Path) -> bool:
-    """Return whether the name is that of discarded work."""
+    """Return whether the file's name marks it as discarded work."""
     return ".discarded" in path.name and session_of(path) is not None
 
 
