@@ -104,7 +104,7 @@ def main(argv: Sequence[str]) -> int:
         raise ProgdfError(f"--scenes are for {', '.join(drawing)}; use python -m benchmarks viewer")
     if options.seconds is not None and options.what and "window" not in options.what:
         raise ProgdfError("--seconds is the duration of the drag; use python -m benchmarks window")
-    # before an hour of measuring
+    # checked before an hour of measuring
     for folder in (options.json and options.json.parent, options.plots):
         if folder is not None and not folder.is_dir():
             raise ProgdfError(f"the folder {folder} does not exist; create it first")
@@ -140,7 +140,8 @@ def main(argv: Sequence[str]) -> int:
         for table in finished:
             print(table.markdown() + "\n", flush=True)
         tables += finished
-        for page in options.markdown if finished else ():  # now, as the next benchmark may take long
+        # the pages are filled after every benchmark, because the next one may take long
+        for page in options.markdown if finished else ():
             filled = put_tables(page.read_text(encoding="utf-8"), finished)
             with atomic_write(page) as temporary_file:
                 temporary_file.write_text(filled, encoding="utf-8")

@@ -68,7 +68,10 @@ def recolor_edit(target: Tensor) -> AnalyticEdit:
 
 
 def stripes_edit(target: Tensor, axis: Tensor, period: float) -> AnalyticEdit:
-    """Make a stripes edit across `axis` [3] with `period` in world units and the color `target` [3] sRGB."""
+    """Make an edit that paints stripes across `axis` [3], `period` world units apart.
+
+    `target`: color at strength 1, sRGB. [3]
+    """
 
     def change(part: Gaussians, strength: float) -> Gaussians:
         course = color.recolor_course(sh0_to_rgb(part.sh0), target, _own_color(part))

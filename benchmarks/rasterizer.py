@@ -3,7 +3,7 @@
 The cpu engine is compared with a plain tiled renderer in torch, float32, differentiated by autograd. Its
 tiles have 16x16 pixels, and every Gaussian listed for a tile is evaluated at every pixel. A tile lists the
 Gaussians whose square of three standard deviations of the longer axis touches it, as published (Kerbl 2023).
-Both take turns in one process, on one thread each and on two.
+The two renderers take turns in one process, on one thread each and on two.
 
 The warp engine is measured on a CUDA GPU if there is one, otherwise on the CPU, for its errors only.
 """

@@ -43,7 +43,7 @@ OPTION_SETS = ("", "--quick", "--steps 40", "--views 12", "--stages 4", "--prese
 BEAR = 12_000
 """Number of Gaussians of the bear, whose scarf is striped."""
 
-_MARKERS = "os^DvPX*<>"  # one per kind in a plot
+_MARKERS = "os^DvPX*<>"  # marker of each kind in a plot
 
 STRIPES = "stripes:#20a040"  # for the scarf
 BLUE = "recolor:#3060d0"  # for label 1 of a given scene

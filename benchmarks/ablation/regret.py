@@ -154,7 +154,7 @@ class RegretEdit:
         return [crop(picture, view.box) for picture, view in pairs]
 
     def aside(self, s: float) -> list[Tensor]:
-        """Return the whole edited pictures of the views for the choice."""
+        """Return the edited pictures, not cropped, of the views on which the field is chosen."""
         return list(split_held_out(self.picture(s)[len(self.setup.train) :])[0])
 
     def automatic(self, judge: Evaluator) -> tuple[Model, Sequence[float], str, Result]:

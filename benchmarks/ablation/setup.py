@@ -50,7 +50,7 @@ class AblationSetup:
     digest: str  # hash of all inputs except the plan
 
     def evaluators(self, offsets: Tensor) -> tuple[Evaluator, Evaluator]:
-        """Return the evaluators of held-out views and of `seen` for such offsets. [T,M,C]"""
+        """Return the evaluators of held-out views and of `seen` that suit these offsets. [T,M,C]"""
         return self.still if only_recolors(offsets) else (self.evaluator, self.seen)
 
 

@@ -87,7 +87,7 @@ def main(argv: Sequence[str]) -> int:
     )
     if match.matched < _MIN_MATCHED:
         is_rotated = match_scenes(a, rotate_about_x(b)).matched >= _MIN_MATCHED
-        fault = "is that scene after half a turn about x" if is_rotated else "is another scene"
+        fault = "is the same scene rotated by 180° about x" if is_rotated else "is another scene"
         raise ProgdfError(
             f"{options.target} {fault}: {match.matched:.0%} of its Gaussians are found in {options.source}, "
             f"{_MIN_MATCHED:.0%} are needed; give the same scene"

@@ -118,7 +118,7 @@ _DRAWN_COEFFICIENTS = 16  # SH coefficients that are drawn (degree 3)
 
 
 def edited_scene(scene: Gaussians, gdf: Gdf, strength: float = 1.0) -> Gaussians:
-    """Return the scene under one edit, with the rows that it adds after its own."""
+    """Return the scene under one edit, with the rows that the edit adds after the scene's own."""
     return compose_layers(scene, [Layer(gdf, strength)])
 
 
@@ -217,7 +217,8 @@ class _LayerMembers:
     members: Tensor | slice  # member indices; a slice if all members are included. [m] int64
     rows: Tensor | slice  # positions among the changed rows; a slice if these are all of them. [m] int64
     weights: Tensor  # weights of these members. [m] float32
-    # coverage of the layers below, by kind of change; empty for blend rules without an order. [M] float32
+    # share of lower layers that this layer hides, see `coverage`; empty for rules without an order. [M]
+    # float32
     coverage: Mapping[str, Tensor]
 
     def add(self, total: Tensor, name: str, hides: bool) -> None:

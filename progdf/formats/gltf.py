@@ -267,7 +267,7 @@ def _ignored_parts(file: GltfFile, placements: list[Placement]) -> Iterator[str]
             f" and {len(mixed_meshes) - 1} more" if mixed_meshes[1:] else ""
         )
     if tables.animations:
-        yield "animations (the scene at rest is read)"
+        yield "animations (the rest pose is read)"
     for name in tables.extensionsUsed:
         if name not in _SUPPORTED_EXTENSIONS:
             yield escape_text(name)[:80]

@@ -203,7 +203,7 @@ def _check_members(path: Path, archive: zipfile.ZipFile) -> list[zipfile.ZipInfo
     unpacked = sum(member.file_size for member in members)
     if unpacked > MAX_EXPANSION * max(path.stat().st_size, 1 << 20):
         raise ProgdfError(
-            f"{path} is not a bundle: it would be unpacked to far more than it can hold; export it again"
+            f"{path} is not a bundle: it unpacks to more than {MAX_EXPANSION} times its size; export it again"
         )
     return members
 

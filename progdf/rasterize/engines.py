@@ -309,7 +309,7 @@ def check_intersections(splats: int, pairs: int) -> None:
     """Refuse a view with more than `MAX_INTERSECTIONS` (Gaussian, tile) pairs.
 
     Raises:
-        ProgdfError: it has more.
+        ProgdfError: the view has more.
     """
     if pairs > MAX_INTERSECTIONS:
         raise ProgdfError(

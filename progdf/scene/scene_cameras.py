@@ -53,7 +53,7 @@ _CHECK_SIZE_PX = 96  # longer side of the renders of the check, pixels
 _FIRST_COUNT = 8  # cameras that are checked first
 _MAX_COUNT = 48  # cameras that are checked if the first ones do not decide
 _MIN_SHARE = 1 / 256  # smallest share of the picture: 16 x 16 of the 256 x 256 pixels of a training view
-_LARGE_SHARE = 0.1  # share of the picture from which the camera is aimed at the scene
+_LARGE_SHARE = 0.1  # smallest share of the picture for a camera that is aimed at the scene
 _LARGE_COUNT = 3  # cameras that must see the scene large: the smallest number for a training
 
 _Number = Annotated[float, msgspec.Meta(gt=-3e38, lt=3e38)]

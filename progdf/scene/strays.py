@@ -46,7 +46,7 @@ _WINDOW = 16  # rows before and after in tree order that are compared first
 _BLOCK = 20_000  # rows compared at once, which fit the processor's cache
 _CHUNK = 200_000  # searches at once, which take 55 MB
 _VIEWS = 8  # views of `picture_difference`
-_VIEW_PX = 384  # their width and height, pixels
+_VIEW_PX = 384  # width and height of these views, pixels
 _BACKGROUND = (0.5, 0.5, 0.5)  # background that shows both black and white fog
 
 

@@ -194,7 +194,10 @@ def _mean_camera_up(cameras: Sequence[Camera]) -> Tensor | None:
 
 
 def _snap(direction: Tensor, cosine: float) -> Tensor:
-    """Return the axis within an angle, given by its cosine, of a direction; else the direction itself. [3]"""
+    """Return the nearest axis if the cosine of its angle to `direction` exceeds `cosine`, else `direction`.
+
+    direction: unit length. [3]
+    """
     axis = direction.abs().argmax()
     if float(direction.abs()[axis]) <= cosine:
         return direction

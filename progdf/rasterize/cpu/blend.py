@@ -122,7 +122,7 @@ def new_scratch() -> TileScratch:
 
 @kernel(fast=True, inline=True)
 def exp2(x: Vector) -> Vector:
-    """Return 2^x for -126 ≤ x ≤ 0. Other lanes are undefined."""
+    """Return 2^x for -126 ≤ x ≤ 0. Lanes outside this range are undefined."""
     n = truncate(x)
     f = x - n
     p = _E4 + f * (_E5 + f * _E6)

@@ -485,7 +485,7 @@ def test_material_extensions_are_only_listed(tmp_path: Path) -> None:
     builder.tables["extensionsUsed"] += ["KHR_materials_unlit", "MSFT_lod"]
     builder.tables["animations"] = [{}]
     report = load_scene_with_report(builder.write(tmp_path / "a.glb"))[1]
-    assert "animations (the scene at rest is read), KHR_materials_unlit, MSFT_lod" in report.lines()[1]
+    assert "animations (the rest pose is read), KHR_materials_unlit, MSFT_lod" in report.lines()[1]
 
 
 def test_compressed_view_without_a_fallback_is_refused_by_name(tmp_path: Path) -> None:

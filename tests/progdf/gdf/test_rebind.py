@@ -115,7 +115,10 @@ def test_other_scene_is_refused_and_a_half_turn_is_named(
 ) -> None:
     a, edit, *_ = stack.save(tmp_path)
     moved = replace(stack.scene, means=stack.scene.means + torch.tensor([0.3, 0.0, 0.0]))
-    for scene, message in ((moved, "is another scene"), (rotate_about_x(stack.scene), "half a turn about x")):
+    for scene, message in (
+        (moved, "is another scene"),
+        (rotate_about_x(stack.scene), "rotated by 180° about x"),
+    ):
         save_ply(tmp_path / "other.ply", scene)
         words = ["--from", str(a), "--to", str(tmp_path / "other.ply"), "-o", str(tmp_path / "new.gdf")]
         assert main(["rebind", str(edit), *words]) == 2
