@@ -59,7 +59,14 @@ def read_record(about: Mapping[str, Any]) -> RunRecord:
 
     Raises:
         ValueError: it is not a record, or damaged.
+        ProgdfError: the run is of a version that recorded the paper's preset as options.
     """
+    optimize = about.get("plan", {}).get("optimize", {}) if isinstance(about.get("plan"), Mapping) else {}
+    if isinstance(optimize, Mapping) and optimize.get("as_printed"):
+        raise ProgdfError(
+            "the run was trained by an older version with --preset paper, which cannot be read any more; "
+            "train it again"
+        )
     return convert_json(about, RunRecord)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from progdf.errors import ProgdfError
 from progdf.field.trajectory import load_trajectory
 from progdf.formats.ply import load_ply
 from progdf.gaussians import ATTRIBUTES, pack
@@ -21,6 +22,7 @@ from trainer.options import TrainOptions, apply_preset, with_values
 from trainer.paper.descent import RATE_FACTORS, RATES_3DGS, learning_rates, recording_interval, whole_views
 from trainer.paper.losses import RenderedLoss, describe_loss
 from trainer.resolve import resolve, resolve_kind
+from trainer.run.record import read_record
 from trainer.run.run import RunResult
 from trainer.views.crops import crop_scene, moving_attributes
 from trainer.views.setup import TrainingSetup
@@ -140,3 +142,8 @@ def test_network_is_not_trained_after_the_recording(
     shape = origin.network.shape
     assert (shape.hard, shape.inputs, shape.code) == (True, "position", 0)
     assert bool(origin.network.tensors["heads.weight"].any()), "but beside PGS"
+
+
+def test_run_of_an_older_version_with_the_preset_is_refused() -> None:
+    with pytest.raises(ProgdfError, match="older version with --preset paper, .* train it again"):
+        read_record({"plan": {"optimize": {"as_printed": True}}})
