@@ -145,5 +145,5 @@ def test_network_is_not_trained_after_the_recording(
 
 
 def test_run_of_an_older_version_with_the_preset_is_refused() -> None:
-    with pytest.raises(ProgdfError, match="older version with --preset paper, .* train it again"):
+    with pytest.raises(ProgdfError, match=r"older version with --preset paper, .* train it again"):
         read_record({"plan": {"optimize": {"as_printed": True}}})

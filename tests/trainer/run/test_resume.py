@@ -57,7 +57,7 @@ def test_run_killed_at_any_write_resumes_to_the_same_bits(
     [
         (16, {"save_every": 0.2}),
         (8, {"save_every": 0, "kind": "geometry", "group_steps": 12}),
-        (4, {"save_every": 0, "field": "neural", "size": "tiny", "preset": "paper", "quick": True}),
+        (4, {"save_every": 0, "field": "neural", "field_loss": "pictures", "preset": "paper"}),
     ],
     ids=["color", "parts", "joint"],
 )
