@@ -60,7 +60,7 @@ def timeline(hand: Rig) -> None:
     """Show a film of three keys: the edits fade in while the camera orbits. The playhead is between keys."""
     start = hand.main_view.work.view
     bare = tuple(replace(layer, strength=0.0) for layer in start.layers)
-    hand.main_view.change(replace(start, layers=bare))
+    hand.main_view.store.change(replace(start, layers=bare))
     hand.key("K")
     for frames, turn, first in ((32, 40.0, 1.0), (30, 30.0, 0.0)):
         for _ in range(frames):
@@ -71,7 +71,7 @@ def timeline(hand: Rig) -> None:
             for i, layer in enumerate(view.layers)
         )
         turned = replace(view.camera, azimuth=view.camera.azimuth + turn)
-        hand.main_view.change(replace(view, layers=layers, camera=turned))
+        hand.main_view.store.change(replace(view, layers=layers, camera=turned))
         hand.key("K")
     for _ in range(38):
         hand.key(",")
@@ -82,7 +82,7 @@ def _set_strengths(hand: Rig, strengths: Sequence[float]) -> None:
     """Set the first edits to these strengths."""
     view = hand.main_view.work.view
     layers = (replace(layer, strength=s) for layer, s in zip(view.layers, strengths, strict=False))
-    hand.main_view.change(replace(view, layers=tuple(layers)))
+    hand.main_view.store.change(replace(view, layers=tuple(layers)))
     hand.settle()
 
 
@@ -111,7 +111,7 @@ def selected(hand: Rig) -> None:
         hand.release()
         view = hand.main_view.work.view
         kept = selection.add_region(view.selection, "head", Path("head.region.npy"))
-        hand.main_view.change(replace(view, selection=kept))
+        hand.main_view.store.change(replace(view, selection=kept))
         hand.modifier(imgui.Key.mod_ctrl)
 
 

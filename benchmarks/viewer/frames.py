@@ -138,7 +138,7 @@ def measure_turning(
             held.callback(mice[way].engine.release)
         full = _turn(mice, steps)
         for mouse in mice.values():
-            mouse.main_view.change(replace(mouse.main_view.work.view, dynamic_resolution="on"))
+            mouse.main_view.store.change(replace(mouse.main_view.work.view, dynamic_resolution="on"))
             mouse.grip_picture()
             mouse.learn_detail()
             mouse.release()
@@ -300,7 +300,7 @@ def _draw_again(mouse: Mouse, view: ViewState) -> NDArray[np.uint8]:
     engine = mouse.engine
     new = ViewEngine(main_view.context, engine.scene, (), engine.draws_with)
     main_view.set_engine(new, main_view.facts)
-    main_view.change(replace(view, dynamic_resolution="off"))
+    main_view.store.change(replace(view, dynamic_resolution="off"))
     mouse.frame()
     picture = mouse.picture()
     main_view.set_engine(engine, main_view.facts)
@@ -310,7 +310,7 @@ def _draw_again(mouse: Mouse, view: ViewState) -> NDArray[np.uint8]:
 
 def _at_rest(mouse: Mouse) -> int:
     """Return the largest difference from the full picture after the mouse stops with its button held."""
-    mouse.main_view.change(replace(mouse.main_view.work.view, dynamic_resolution="on"))
+    mouse.main_view.store.change(replace(mouse.main_view.work.view, dynamic_resolution="on"))
     mouse.grip_picture()
     mouse.turn(TURN_PX)
     if mouse.main_view.canvas.pixels == 1:

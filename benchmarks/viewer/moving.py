@@ -131,7 +131,7 @@ def measure(
         mouse.frame(seconds=1.0)
         click = max(mouse.press(), mouse.release(), mouse.frame(), _rest(mouse, time.perf_counter()))
         current = mouse.main_view.work.view
-        mouse.main_view.change(replace(current, select=replace(current.select, tool="lasso")))
+        mouse.main_view.store.change(replace(current, select=replace(current.select, tool="lasso")))
         _rest(mouse, time.perf_counter())
         middle = (size[0] / 2, size[1] / 2)
         radius = 0.25 * min(size)

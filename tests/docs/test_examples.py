@@ -249,7 +249,7 @@ def test_documented_window_opens(
         check_example(example, monkeypatch, capsys)
     (app,) = opened
     gdfs = sum(word.endswith(".gdf") for word in typed_words(example))
-    assert len(app.document.gdfs) == max(gdfs, "--session" in example.words)
+    assert len(app.documents.get().gdfs) == max(gdfs, "--session" in example.words)
 
 
 @pytest.mark.parametrize("example", _params(MAKE))

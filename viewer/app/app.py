@@ -3,47 +3,36 @@
 from __future__ import annotations
 
 import time
-import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
-import torch
 from imgui_bundle import imgui
 
-from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.terminal import escape_text
 from progdf.threads import one_thread
-from viewer.camera.view_camera import first_camera
 from viewer.files import exports, user_files
-from viewer.files.document import Document
+from viewer.files.document import Document, DocumentStore, LiveLayers
 from viewer.files.session import WindowSession
-from viewer.render.engine import ViewEngine, draws_with
+from viewer.render.engine import ViewEngine, draw_once, draws_with
 from viewer.state import workspace
 from viewer.state.commands import Action, Plain, argument
 from viewer.state.snapshots import SliderSnapshot
-from viewer.state.view_state import LayerState, ViewState
+from viewer.state.view_state import ViewState
 from viewer.ui.keys import bind
 from viewer.ui.splash import TITLE, Splash
 from viewer.ui.window import Window, interruptible
 
-from .application import LOG, attempt, error_details, error_line, log_error
-from .deliver import DeliverActions
-from .file_actions import FileActions
 from .main_view import MainView
-from .preview import PreviewActions
-from .start import StartActions, UpActions
-from .tidy import StrayActions, TidyActions
-from .training import JobActions
+from .messages import LOG, ErrorReporter, attempt, log_error
+from .parts.assembly import make_parts
 
 _Made = TypeVar("_Made")
 
-REPEAT_MESSAGE_S = 10.0
-"""Seconds until an error that repeats in every frame is shown again."""
 RETRY_S = 1.0
 """Seconds until the next poll of a part whose last poll raised an error."""
 
@@ -68,7 +57,7 @@ def run(splash: Splash, opens: Callable[[], Opened], draw: str = "auto") -> int:
         ProgdfError: see `opens`.
     """
     with interruptible(), ThreadPoolExecutor(2) as workers:
-        draws = workers.submit(_draw_once) if draws_with(splash.context, draw) == "cpu" else None
+        draws = workers.submit(draw_once) if draws_with(splash.context, draw) == "cpu" else None
         opened, session = splash.wait(workers.submit(opens), "Opening …")
         if draws is not None:
             splash.wait(draws, "Preparing to draw …")
@@ -77,25 +66,16 @@ def run(splash: Splash, opens: Callable[[], Opened], draw: str = "auto") -> int:
             app.main_view.restart(opened.view, opened.snapshots)
             app.bind_keys()
             if opened.warning:
-                app.main_view.show_message(opened.warning, error=True)
-            app.file_actions.offer_autosave()
+                app.main_view.messages.show(opened.warning, error=True)
+            app.parts.file_actions.offer_autosave()
             app.loop()
         finally:
             app.close()
     return 0
 
 
-def _draw_once() -> None:
-    """Draw a small picture, which loads the kernels, or compiles them the first time on a machine."""
-    corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
-    quats = torch.eye(4)[:1].expand(8, 4)
-    none = corners[:, None, :][:, :0]
-    scene = Gaussians(corners, quats, corners - 2.0, corners[:, 0], corners, none)
-    ViewEngine(None, scene).image(ViewState(camera=first_camera(scene)), (32, 24))
-
-
 class App:
-    """Window with its main view and engine. Its `file_actions` handle the files."""
+    """Window with its main view, its engine and its parts."""
 
     def __init__(
         self,
@@ -106,10 +86,10 @@ class App:
         draw: str = "auto",
     ) -> None:
         self.window = window
-        self.document = document
         self.context = window.context
         self._draw = draw
         self.engine = self._engine(document)
+        self.documents = DocumentStore(document, self._show)
         self.main_view = MainView(
             self.context,
             self.engine,
@@ -119,111 +99,72 @@ class App:
             exports.folder_of(document.path),
         )
         self.store = self.main_view.store
-        self.file_actions = FileActions(self, session)
-        self.jobs = JobActions(
-            self,
-            lambda form: self.preview.draft(form),
-            lambda form: self.preview.anchor(form),
-            lambda path: self.preview.follow_anchor(path),
+        self.parts = make_parts(
+            main_view=self.main_view,
+            documents=self.documents,
+            open_document=self.open_document,
+            wait_for=self.wait_for,
+            leave=self.leave,
+            session=session,
         )
-        self.deliver = DeliverActions(self, self.jobs.queue)
-        self.start = StartActions(self, self.context, self.jobs.queue)
-        self.up = UpActions(self)
-        self.preview = PreviewActions(self, self.context, self.jobs.region_spec)
-        self.strays = StrayActions(self)
-        self.tidy = TidyActions(self)
-        jobs = self.jobs, self.deliver, self.start, self.preview
-        by_part = [part.requests for part in (self.file_actions, *jobs, self.strays, self.tidy)]
-        self.requests = {name: act for acts in by_part for name, act in acts.items()}
+        self._errors = ErrorReporter(
+            self.main_view.messages, lambda: self.main_view.frames, self.parts.file_actions.keep_work
+        )
+        self.requests = self.parts.requests
         self.requests["full_screen"] = lambda _: window.toggle_full_screen()
-        self.requests["quit"] = lambda _: None if self.jobs.holds_window() else self.file_actions.leave()
+        self.requests["quit"] = lambda _: self._quit()
         self.is_closed = False
         self._waits = False  # a splash is visible
         self._title = ""
         self._layout = user_files.read_layout()
         self.store.replace(replace(self.store.get(), layout=self._layout))
-        # by place: frame number of the last failure, time of its last message
-        self._failures: dict[str, tuple[int, float]] = {}
-        self.main_view.report = self.report
+        self.main_view.report = self._errors.report
         self.dropped: list[Path] = []
         self.failure: BaseException | None = None
         self.last = time.perf_counter()
         window.listen(self.main_view.wake, self._queue_dropped, self._redraw)
 
     def close(self) -> None:
-        with ExitStack() as parts:  # every part is closed, even if another one raises
+        with ExitStack() as closed:  # every part is closed, even if another one raises
             for close in (self.engine.release, self.main_view.close, imgui.backends.glfw_shutdown):
-                parts.callback(close)
-            parts.callback(self.main_view.ui.make_current)
-            parts.callback(self.file_actions.release)
-            for part in (self.jobs, self.strays, self.preview, self.start):
-                parts.callback(part.close)
+                closed.callback(close)
+            closed.callback(self.main_view.ui.make_current)
+            for close in reversed(self.parts.closers):
+                closed.callback(close)
             self._keep_picture()
 
     def bind_keys(self) -> None:
         """Bind the keys that the user assigned to commands. Errors are shown in a message and logged."""
         bind({})
-        with self._guard():
+        with self._errors.guard():
             if problems := bind(user_files.read_keys()):
                 where = user_files.keys_file()
                 more = len(problems) - 1
                 log_error("\n".join([f"{where}:", *problems]))
                 text = f"{where.name}: {problems[0]}" + (f", and {more} more in {LOG}" if more else "")
-                self.main_view.show_message(text, error=True)
-
-    def report(self, error: Exception) -> None:
-        """Show an error raised by a part of the loop as a message.
-
-        An internal error is also logged, and unsaved work is written to its recovery file at once.
-        """
-        where = repr(
-            (type(error), [(at.filename, at.lineno) for at in traceback.extract_tb(error.__traceback__)])
-        )
-        frame = self.main_view.frames
-        now = time.perf_counter()
-        before, shown_at = self._failures.get(where, (-2, 0.0))
-        repeats = frame - before <= 1 and now - shown_at < REPEAT_MESSAGE_S
-        self._failures[where] = frame, shown_at if repeats else now
-        if repeats:
-            return  # an error that repeats in every frame requests no further frame
-        line = error_line(error)
-        details = ""
-        if not line:
-            details = error_details(error)
-            if before < 0:
-                log_error(details)
-            summary = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-            line = f"Internal error ({summary[:200]}); {self.file_actions.keep_work()}"
-        self.main_view.show_message(line, True, details)
-
-    @contextmanager
-    def _guard(self) -> Iterator[None]:
-        try:
-            yield
-        except Exception as error:
-            self.report(error)
+                self.main_view.messages.show(text, error=True)
 
     def loop(self) -> None:
         """Draw frames while something changes; otherwise wait for events."""
         while not self.is_closed:
             waits = [wait for wait in self._wait_times() if wait is not None]
-            with self._guard():
+            with self._errors.guard():
                 # while it opens, events stay in the window system's queue, and no typed letter is lost
                 if not self.main_view.opening:
                     self.window.wait(min(waits, default=None))
             if self.failure is not None:
                 raise self.failure
             for path in self.take_dropped():
-                with self._guard():
-                    self.open(path)
+                with self._errors.guard():
+                    self.parts.file_actions.open(path)
             if self.window.closing and not self.is_closed:
                 self.window.stay_open()
-                self.main_view.request(Plain("quit"))
-            with self._guard():
+                self.main_view.messages.request(Plain("quit"))
+            with self._errors.guard():
                 if self.main_view.is_due():
                     self.draw()
-        with self._guard():
-            self.file_actions.on_close()
+        with self._errors.guard():
+            self.parts.file_actions.on_close()
 
     def draw(self) -> None:
         """Draw one frame of the latest state; do nothing while the window is minimized."""
@@ -246,24 +187,20 @@ class App:
 
     def handle(self, request: Action) -> None:
         """Perform one of `requests`, which need the whole window."""
-        with self._guard():
-            attempt(self.main_view, lambda: self.requests[request.name](argument(request)))
+        with self._errors.guard():
+            attempt(self.main_view.messages, lambda: self.requests[request.name](argument(request)))
 
     def _wait_times(self) -> tuple[float | None, ...]:
         """Return the seconds until each part must be polled again; None means never."""
-        # first, because a chosen file or a finished training wakes the main view
-        parts = (self.jobs, self.preview, self.start, self.strays)
-        looks = [self._look(part.poll) for part in parts]
         return (
-            self._look(self.file_actions.poll_dialog),
-            *looks,
-            self._look(lambda: self.up.poll(self.file_actions.path)),
+            # first, because a chosen file or a finished training wakes the main view
+            *(self._look(poll) for poll in self.parts.polls),
             self._look(self.main_view.next_frame_delay),
-            self._look(lambda: self.file_actions.autosave(time.perf_counter())),
+            self._look(lambda: self.parts.file_actions.autosave(time.perf_counter())),
         )
 
     def _look(self, poll: Callable[[], float | None]) -> float | None:
-        with self._guard():
+        with self._errors.guard():
             return poll()
         return RETRY_S
 
@@ -271,7 +208,7 @@ class App:
         if self._waits:
             return
         try:
-            with self._guard():
+            with self._errors.guard():
                 self.draw()
         except BaseException as failure:  # glfw would only print it
             self.failure = failure
@@ -284,10 +221,6 @@ class App:
         paths = self.dropped
         self.dropped = []
         return paths
-
-    def open(self, path: Path) -> None:
-        """Open a dropped or chosen file according to its content."""
-        self.file_actions.open(path)
 
     def wait_for(self, work: Callable[[], _Made], text: str) -> _Made:
         """Run `work` in another thread, show `text` in the window meanwhile, and return the result.
@@ -313,19 +246,12 @@ class App:
             self.window.take_keys()  # typed at the splash
             self.main_view.wake()
 
-    def show(
-        self, document: Document, live: tuple[Gdf, ...] = (), layers: tuple[LayerState, ...] = ()
-    ) -> None:
-        """Draw the same scene with other edits from now on. The caller updates the state.
-
-        Args:
-            live: edits in training
-            layers: layers that show these edits on top
-        """
-        facts = self.main_view.facts if document is self.document else document.facts()
+    def _show(self, document: Document, live: tuple[Gdf, ...], layers: LiveLayers) -> None:
+        """Draw a document from now on; nothing changes if that fails."""
+        is_known = document is self.documents.get()
+        facts = self.main_view.facts if is_known else document.facts()
         engine = self._engine(document, live)
         self.engine.release()
-        self.document = document
         self.engine = engine
         self.main_view.set_engine(engine, facts, layers)
 
@@ -336,29 +262,24 @@ class App:
 
         Training and exports of the old scene go on in the background. If anything fails, nothing changes.
         """
-        facts = document.facts()
-        engine = self._engine(document)
         self._keep_picture()
-        self.engine.release()
-        self.document = document
-        self.engine = engine
-        self.main_view.set_engine(engine, facts)
+        self.documents.replace(document)
         self.main_view.restart(view, snapshots)
         self.main_view.pictures = exports.folder_of(document.path)
-        for part in (self.jobs, self.preview, self.up, self.tidy):
-            part.leave_scene()
+        self.parts.leave_scene()
 
     def _keep_picture(self) -> None:
         """Store a picture of the current view for the start page."""
         view = self.main_view.work.view
-        self.start.keep_picture(self.engine, view, self.document.path, self.file_actions.path)
+        session = self.parts.file_actions.path
+        self.parts.start.keep_picture(self.engine, view, self.documents.get().path, session)
 
     def _rename(self) -> None:
         """Update the title bar and store a changed layout.
 
         The title names the open session or scene; a dot marks unsaved changes.
         """
-        path = self.file_actions.path
+        path = self.parts.file_actions.path
         main_view = self.main_view
         name = escape_text(path.name.removesuffix(".session.json")) if path else ""
         if name != main_view.work.session:
@@ -367,7 +288,7 @@ class App:
         if main_view.work.layout != self._layout and not imgui.is_mouse_down(0):
             self._layout = main_view.work.layout
             user_files.keep_layout(self._layout)
-        title = _window_title(name or self.document.title, self.file_actions.has_unsaved)
+        title = _window_title(name or self.documents.get().title, self.parts.file_actions.has_unsaved)
         if title != self._title:
             self.window.rename(title)
             self._title = title
@@ -375,6 +296,11 @@ class App:
     def _engine(self, document: Document, live: tuple[Gdf, ...] = ()) -> ViewEngine:
         shown = replace(document, edits=(*document.edits, *live)) if live else document
         return ViewEngine(self.context, shown.scene, shown.gdfs, self._draw)
+
+    def _quit(self) -> None:
+        """Close the window, after a question if jobs run or changes are unsaved."""
+        if not self.parts.jobs.holds_window():
+            self.parts.file_actions.leave()
 
     def leave(self) -> None:
         """Close the window without a question."""

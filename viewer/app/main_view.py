@@ -28,7 +28,7 @@ from viewer.state.layers import add_layer
 from viewer.state.snapshots import SliderSnapshot, compare_sides
 from viewer.state.transient import Decal, Gizmo, KeyPointer, PreviewState
 from viewer.state.view_state import LayerState, ViewState
-from viewer.state.workspace import PLACES, Dialog, SceneFacts, Store, Workspace, with_transient
+from viewer.state.workspace import PLACES, SceneFacts, Store, Workspace, with_transient
 from viewer.ui import overlay
 from viewer.ui.context import UiContext
 from viewer.ui.keys import (
@@ -48,6 +48,7 @@ from viewer.ui.pointer import PointerContext
 from . import interface, mouse, select_tool
 from .canvas import Canvas
 from .handles import decal_takes_mouse, draw_decal, draw_gizmo, gizmo_takes_mouse, place_decal
+from .messages import Messages
 from .mouse import MouseTool
 
 SETTLE_FRAMES = 3  # imgui needs a frame or two until hovering and layout follow an event
@@ -129,7 +130,11 @@ class MainView:
         self.surfaces = Surfaces()
         self.ui = UiContext(scale)
         imgui.backends.opengl3_init("#version 330")
-        self.store = Store(workspace.new_workspace(view))
+        self._pace = FramePacer()
+        self.wake = self._pace.wake
+        self._clock = 0.0
+        self.store = Store(workspace.new_workspace(view), self.wake)
+        self.messages = Messages(self.store, lambda: self._clock)
         self.frames = 0  # number of frames drawn
         self._tool = MouseTool()
         # the layer shown in the panel, and whether several are selected
@@ -138,20 +143,13 @@ class MainView:
         self._held = False  # an item of the interface was active in the last frame, by mouse or keyboard
         self._popups = 0, 0  # number of open popups at the start of the last frame and of this one
         self._half = 0  # picture under the mouse if two are side by side: 0 left, 1 right
-        self._clock = 0.0
         self._pending = PendingKeys()
         self._resting = False
-        self._pace = FramePacer()
-        self.wake = self._pace.wake
 
     @property
     def work(self) -> Workspace:
         """State of the window."""
         return self.store.get()
-
-    @work.setter
-    def work(self, work: Workspace) -> None:
-        self.store.replace(work)
 
     def rest(self) -> None:
         """Stop drawing until the next frame, as the window is minimized."""
@@ -176,13 +174,8 @@ class MainView:
         self.surfaces.drop()
         self.engine = engine
         self.facts = facts
-        self.work = with_transient(self.work, live=live)
+        self.store.replace(with_transient(self.work, live=live))
         self.canvas = Canvas(self.context, engine, self.canvas)
-        self.wake()
-
-    def change(self, view: ViewState) -> None:
-        """Set a new state from outside the window; changes of edits can be undone."""
-        self.work = workspace.record_undo(replace(self.work, view=view))
         self.wake()
 
     def restart(self, view: ViewState, snapshots: tuple[SliderSnapshot, ...] = ()) -> None:
@@ -190,8 +183,8 @@ class MainView:
         picture."""
         old = self.work.transient
         transient = replace(old, cover=None, preview=PreviewState(), gizmo=None)
-        self.work = replace(
-            workspace.new_workspace(view, snapshots), layout=self.work.layout, transient=transient
+        self.store.replace(
+            replace(workspace.new_workspace(view, snapshots), layout=self.work.layout, transient=transient)
         )
         self._tool = MouseTool()
         self.wake()
@@ -219,13 +212,6 @@ class MainView:
         """
         return self.next_frame_delay() == 0.0 or not self.canvas.awaits_picture()
 
-    def show_message(
-        self, text: str, error: bool = False, details: str = "", button: tuple[str, Action] | None = None
-    ) -> None:
-        """Show one line at the bottom of the picture for a while, with a button (label and command)."""
-        self.work = workspace.with_message(self.work, text, self._clock, error, details, button=button)
-        self.wake()
-
     def frame(self, screen: moderngl.Framebuffer, seconds: float, keys: Keys = NO_KEYS) -> None:
         """Handle the input in imgui's io, and draw.
 
@@ -240,7 +226,7 @@ class MainView:
         self._pace.step(seconds)
         self._resting = False
         with self._guard():
-            self.work = workspace.advance(self.work, seconds)
+            self.store.replace(workspace.advance(self.work, seconds))
         imgui.backends.opengl3_new_frame()
         imgui.new_frame()
         with self._guard():
@@ -262,7 +248,7 @@ class MainView:
         """Handle an error without an application: show user-facing errors, raise internal ones."""
         if not isinstance(error, ProgdfError):
             raise error
-        self.show_message(str(error), error=True)
+        self.messages.show(str(error), error=True)
 
     def _update(self, keys: Keys, seconds: float) -> None:
         """Update the workspace from the user's input."""
@@ -272,11 +258,11 @@ class MainView:
         self._held = bool(imgui.is_any_item_active())
         held = self._held or self._tool.drag is not None
         if not (held or is_repeating(keys) or is_flying(self._keys)):
-            self.work = workspace.record_undo(self.work)
+            self.store.replace(workspace.record_undo(self.work))
         if self.work.view.layers != before.view.layers:
-            self.work = replace(self.work, before=False)
+            self.store.replace(replace(self.work, before=False))
         if self.work != before:
-            self.work = actions.end_at_edit(before, self.work)
+            self.store.replace(actions.end_at_edit(before, self.work))
             self.wake()
 
     def _draw_picture(self, screen: moderngl.Framebuffer) -> None:
@@ -313,10 +299,11 @@ class MainView:
         asks = self._takes_keys()
         self._follow_keyboard(asks)
         if not asks:
-            gesture, self.work, self._keys = select_tool.take_keys(
+            gesture, work, self._keys = select_tool.take_keys(
                 self._tool.gesture, self.work, self._pointer(), self._keys
             )
             self._tool = replace(self._tool, gesture=gesture)
+            self.store.replace(work)
         self._point_by_keys(asks)
         if asks:  # no key is a shortcut or flies
             self._keys = Keys(self._keys.pressed)
@@ -333,7 +320,7 @@ class MainView:
             return
         if is_flying(self._keys):
             flown = fly_by_keys(self.work.view.camera, self._keys, seconds, self.facts.bounds.radius)
-            self.work = workspace.with_camera(self.work, flown)
+            self.store.replace(workspace.with_camera(self.work, flown))
         if self.work.view.panel:
             several = len(layer_selection.selected_layers(self.work)) > 1
             reveal = self._revealed != (self.work.focus, several)
@@ -342,7 +329,7 @@ class MainView:
                 if missing:
                     self.wake()
                 compared = self.canvas.comparer.labels(self.work.view), self.work.before
-                self.work = interface.panels(self.work, self._pointer(), pictures, reveal, compared)
+                self.store.replace(interface.panels(self.work, self._pointer(), pictures, reveal, compared))
             self._revealed = self.work.focus, several
         held = self._tool.drag is None and self._move_gizmo()
         if not off and not held:  # else the right button was only pressed to cancel the drag
@@ -351,7 +338,8 @@ class MainView:
             pointer = self._pointer()
             self._tool = MouseTool()
             with self._guard():
-                self._tool, self.work = mouse.handle_mouse(tool, self.work, pointer)
+                self._tool, work = mouse.handle_mouse(tool, self.work, pointer)
+                self.store.replace(work)
 
     def _point_by_keys(self, asks: bool) -> None:
         """Move the pointer of the active tool by keys."""
@@ -363,10 +351,10 @@ class MainView:
             clicks = decal or picks or work.view.select.tool in select_tool.CLICKED
             if not (asks or self.at_start or imgui.get_io().want_text_input):
                 held, self._keys = mouse.point_by_keys(held, self._keys, self._pointer(), clicks)
-                self.work = with_transient(work, pointer=held)
+                self.store.replace(with_transient(work, pointer=held))
         elif held.at or held.down:
             mouse.let_go(held)
-            self.work = with_transient(work, pointer=KeyPointer())
+            self.store.replace(with_transient(work, pointer=KeyPointer()))
 
     def _follow_keyboard(self, asks: bool) -> None:
         """Restrict the keys while a part of the window has the keyboard.
@@ -380,7 +368,7 @@ class MainView:
             pressed = {press.chord for press in self._keys.pressed}
             leaves = "Escape" in pressed and not self._held
             if leaves or any(imgui.is_mouse_clicked(button) for button in range(3)):
-                self.work = replace(self.work, keyboard="")
+                self.store.replace(replace(self.work, keyboard=""))
             left = [
                 p for p in self._keys.pressed if p.chord.startswith("Ctrl+") or re.search(r"F\d", p.chord)
             ]
@@ -407,19 +395,18 @@ class MainView:
             keep = "lay_decal"
             moved, asked = draw_decal(gizmo, self._pointer())
             takes_mouse = decal_takes_mouse()
-        self.work = with_transient(self.work, gizmo=moved)
+        self.store.replace(with_transient(self.work, gizmo=moved))
         if "Escape" in pressed or "Enter" in pressed:
             asked = "put_back" if "Escape" in pressed else keep
         if asked:
-            self.request(Plain(asked))
+            self.messages.request(Plain(asked))
         if isinstance(moved, Gizmo) and moved.using:
             self.wake()
         return takes_mouse
 
-    @property
     def decal_place(self) -> tuple[Path, Camera, str] | None:
-        """File of the decal being placed, the camera from which it is placed, and its position in that
-        picture."""
+        """Return the file of the decal being placed, the camera from which it is placed, and its position in
+        that picture."""
         decal = self.work.transient.gizmo
         if not isinstance(decal, Decal):
             return None
@@ -433,14 +420,15 @@ class MainView:
 
     def _cancel_drag(self) -> None:
         """Restore the state from before the drag and end the drag."""
-        self.work, self._tool = mouse.cancel_drag(self._tool, self.work), MouseTool()
-        self.work = with_transient(self.work, pointer=mouse.let_go(self.work.transient.pointer))
+        self.store.replace(mouse.cancel_drag(self._tool, self.work))
+        self._tool = MouseTool()
+        self.store.replace(with_transient(self.work, pointer=mouse.let_go(self.work.transient.pointer)))
         imgui.internal.clear_active_id()
         self._keys = replace(self._keys, pressed=())
 
     def _perform(self, action: Action) -> None:
         with self._guard():
-            self.work = interface.perform_actions(self.work, [action], self._pointer())
+            self.store.replace(interface.perform_actions(self.work, [action], self._pointer()))
 
     def _pointer(self) -> PointerContext:
         """Return the context of the pointer: scene, area and displayed view."""
@@ -499,7 +487,7 @@ class MainView:
         over = max(self._popups) > 1  # a list over the dialog takes its keys
         pressed = [] if over else [press.chord for press in self._keys.pressed]
         with self._guard():
-            self.work = interface.draw_dialog(self.work, pointer, pressed)
+            self.store.replace(interface.draw_dialog(self.work, pointer, pressed))
         original = self.work.before
         with self._guard():
             cover = self.work.transient.cover
@@ -509,10 +497,10 @@ class MainView:
             overlay.draw_frame(self.work.view.safe_frame, frame, pointer.area, self.ui)
         with self._guard():
             offered = pages.COMMANDS if self.at_start else [a for a, c in COMMANDS.items() if not c.in_hand]
-            self.work = interface.draw_lists(self.work, pointer, offered, pressed)
+            self.store.replace(interface.draw_lists(self.work, pointer, offered, pressed))
         labels = self.canvas.comparer.labels(self.work.view)
         at = self.work.transient.pointer.at
-        self.work = interface.over_picture(self.work, pointer, self._tool, labels, original, at)
+        self.store.replace(interface.over_picture(self.work, pointer, self._tool, labels, original, at))
         gone = (before.dialog, self.work.dialog), (before.message, self.work.message)
         if any(was is not None and now is None for was, now in gone):
             self.wake()
@@ -522,30 +510,28 @@ class MainView:
         """Width and height of the picture on screen, in pixels."""
         return self._pointer().size
 
-    def ask(self, dialog: Dialog) -> None:
-        """Open a dialog over the picture."""
-        self.work = replace(self.work, dialog=dialog)
-        self.wake()
-
-    def request(self, request: Action) -> None:
-        """Add a request that the window performs after the next frame."""
-        self.work = replace(self.work, requests=(*self.work.requests, request))
-        self.wake()
-
     def take_requests(self) -> tuple[Action, ...]:
         """Return the pending requests of the window and clear them."""
         requests = self.work.requests
-        self.work = replace(self.work, requests=())
+        self.store.replace(replace(self.work, requests=()))
         return requests
+
+    def save_original(self, folder: Path, name: str) -> Path:
+        """Write the picture on screen without edits into a folder; return its path, which begins with `name`.
+
+        Raises:
+            ProgdfError: see `exports.picture`.
+        """
+        return self.canvas.save_original(folder, name, self.work.view, self.picture_size)
 
     def _save_files(self, screen: moderngl.Framebuffer) -> None:
         """Serve the requests for files that need only the main view."""
         served = [request for request in self.work.requests if request.name in exports.REQUESTS]
         unserved = tuple(request for request in self.work.requests if request not in served)
-        self.work = replace(self.work, requests=unserved)
+        self.store.replace(replace(self.work, requests=unserved))
         for request in served:
             with self._guard():
-                self.show_message(self._save(request.name, screen))
+                self.messages.show(self._save(request.name, screen))
 
     def _save(self, request: str, screen: moderngl.Framebuffer) -> str:
         title = self.facts.title
@@ -556,6 +542,6 @@ class MainView:
             whole = round(display.x * density.x), round(display.y * density.y)
             return f"Saved {exports.picture(self.pictures, title, read_rgb(screen, whole))}"
         if request == "take_view":
-            taken = self.canvas.save_original(self.pictures, title, self.work.view, self._pointer().size)
+            taken = self.save_original(self.pictures, title)
             return f"Saved {taken}. Edit it in any program and drop it here."
         return self.canvas.save(self.pictures, title, view, self._pointer().size)

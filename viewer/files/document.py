@@ -23,8 +23,9 @@ from progdf.region import Region
 from progdf.scene.neighbors import Neighborhood
 from progdf.terminal import escape_text
 from progdf.threads import all_threads
-from viewer.camera.view_camera import SceneUp, bounds_of, find_scene_up, first_camera, fit, fit_all
+from viewer.camera.view_camera import Bounds, SceneUp, bounds_of, find_scene_up, first_camera, fit, fit_all
 from viewer.state.facts import layer_rows
+from viewer.state.view_state import LayerState
 from viewer.state.workspace import SceneFacts
 
 _Value = TypeVar("_Value")
@@ -70,6 +71,11 @@ class Document:
         return find_scene_up(self.original, self.edits, path=self.path)
 
     @cached_property
+    def bounds(self) -> Bounds:
+        """Bounds of the bulk of the original."""
+        return bounds_of(self.original)
+
+    @cached_property
     def stored_camera(self) -> Camera | None:
         """Camera stored in the scene's file, which defines the first view."""
         return None if self.path is None else stored_view(self.path, self.original.origin).camera
@@ -83,7 +89,7 @@ class Document:
             title=self.title,
             count=len(scene),
             added=len(scene) - len(self.original),
-            bounds=bounds_of(self.original),
+            bounds=self.bounds,
             origin=scene.origin,
             rows=layer_rows(scene, self.gdfs, added),
             fit=lambda camera, aspect: fit_all(camera, self.original, aspect),
@@ -97,6 +103,11 @@ class Document:
         )
 
     @property
+    def is_empty(self) -> bool:
+        """True if no scene is open, so that the start page is visible."""
+        return not self.title
+
+    @property
     def file(self) -> Path:
         """File of the scene. Raises ProgdfError if there is none."""
         if self.path is None:
@@ -106,6 +117,41 @@ class Document:
     def free_name(self, name: str) -> str:
         """Return `name`, with a number if another edit has it."""
         return _free_name(name, self.edits)
+
+
+LiveLayers = tuple[LayerState, ...]
+"""Layers of the edits in training, on top of the document's."""
+
+
+class DocumentStore:
+    """Holder of the open document. The parts of the window read and replace it only here.
+
+    Args:
+        document: the first document
+        draw: draws a document with its live edits and their layers from now on; if it raises, the document
+            stays
+    """
+
+    def __init__(
+        self, document: Document, draw: Callable[[Document, tuple[Gdf, ...], LiveLayers], None]
+    ) -> None:
+        self._document = document
+        self._draw = draw
+
+    def get(self) -> Document:
+        """Return the open document."""
+        return self._document
+
+    def replace(self, document: Document, live: tuple[Gdf, ...] = (), layers: LiveLayers = ()) -> None:
+        """Set and draw the document from now on. The caller updates the state.
+
+        Args:
+            document: the new document, often with the same scene and other edits
+            live: edits in training or preview
+            layers: layers that show these edits on top
+        """
+        self._draw(document, live, layers)
+        self._document = document
 
 
 def _once(make: Callable[[], _Value]) -> Callable[[], _Value]:

@@ -10,6 +10,7 @@ import filecmp
 import os
 import re
 import stat
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -23,12 +24,14 @@ from PIL.PngImagePlugin import PngInfo
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.gaussians import ZERO, Origin
-from progdf.io.atomic import atomic_write, pictures_folder
+from progdf.io.atomic import atomic_write, make_folder, pictures_folder
 from progdf.io.cameras import kind_of_cameras, load_cameras, save_cameras
 from progdf.io.session import SUFFIX
 from progdf.io.tensors import save_npy
+from progdf.scene.regions import check_region
 from viewer.jobs.training import edits_folder, takes_files
 from viewer.state import selection
+from viewer.state.forms import ALL, CHANGED, SELECTION, TYPED, NewEdit
 from viewer.state.selection import NamedRegion, SelectionState, unpack
 
 CAMERAS = ".cameras.json"  # suffix of a file of cameras
@@ -88,6 +91,40 @@ def camera(source: Path, viewpoint: Camera, origin: Origin = ZERO) -> tuple[Path
     number = 1 + max((int(c.name[5:]) for c in cameras if re.fullmatch(r"view_\d{1,9}", c.name)), default=-1)
     save_cameras(path, [*cameras, replace(viewpoint, name=f"view_{number:03d}")], origin)
     return path, len(cameras) + 1
+
+
+_REGION_KINDS = ("masks", "photomasks", "text", "changed")
+"""Kinds of regions, besides those that every command supports."""
+
+
+def region_option(form: NewEdit, folder: Path, state: SelectionState, total: int, name: str = "") -> str:
+    """Return a form's region as a value of `progdf train --region`; write a file if needed.
+
+    Args:
+        form: names the region
+        folder: folder of the file
+        state: the selection and the regions
+        total: number of Gaussians in the scene
+        name: name of the file; without one, a hash of the region names it, so that a reader can reuse the
+            region it has loaded
+
+    Raises:
+        ProgdfError: it cannot be read or written.
+    """
+    if form.region in (ALL, CHANGED):
+        return form.region
+    if form.region == TYPED:
+        spec = form.typed_region.strip()
+        check_region(spec, {kind: lambda _: None for kind in _REGION_KINDS})
+        return spec
+    region = {region.name: region for region in state.regions}.get(form.region)
+    if form.region != SELECTION and region is None:
+        raise ProgdfError(f"the region {form.region} was deleted; choose another one")
+    members = state.members if region is None else region.members
+    make_folder(folder)
+    path = folder / f"{name or f'{zlib.crc32(members):08x}'}{selection.SUFFIX}"
+    write_region(NamedRegion(name, path, members, state.count), total)
+    return f"file:{path}"
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import moderngl
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from progdf.camera import Camera
@@ -21,7 +22,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.scene.bounds import near_plane
-from viewer.camera.view_camera import Vec3, bounds_of, half_camera, to_camera
+from viewer.camera.view_camera import Vec3, bounds_of, first_camera, half_camera, to_camera
 from viewer.state.layers import visible_layers
 from viewer.state.paint import layer_of
 from viewer.state.view_state import ViewState
@@ -288,3 +289,12 @@ def _edits(view: ViewState) -> _Edits:
     """Return the effective layers. Changes of invisible layers and layers at strength 0 cause no work."""
     layers = tuple((l.gdf, l.strength, l.gains, l.paint) for l in visible_layers(view) if l.strength != 0.0)
     return _Edits(layers, view.blend) if layers else _Edits()
+
+
+def draw_once() -> None:
+    """Draw a small picture, which loads the kernels, or compiles them the first time on a machine."""
+    corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
+    quats = torch.eye(4)[:1].expand(8, 4)
+    none = corners[:, None, :][:, :0]
+    scene = Gaussians(corners, quats, corners - 2.0, corners[:, 0], corners, none)
+    ViewEngine(None, scene).image(ViewState(camera=first_camera(scene)), (32, 24))

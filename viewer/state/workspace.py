@@ -176,10 +176,16 @@ class Workspace:
 
 
 class Store:
-    """Holder of the window's workspace. The parts of the window read and replace it only here."""
+    """Holder of the window's workspace. The parts of the window read and replace it only here.
 
-    def __init__(self, workspace: Workspace) -> None:
+    Args:
+        workspace: the first state
+        wake: requests frames that show a change made outside a frame
+    """
+
+    def __init__(self, workspace: Workspace, wake: Callable[[], None] = lambda: None) -> None:
         self._workspace = workspace
+        self.wake = wake
 
     def get(self) -> Workspace:
         """Return the current workspace."""
@@ -188,6 +194,11 @@ class Store:
     def replace(self, workspace: Workspace) -> None:
         """Set the workspace from now on."""
         self._workspace = workspace
+
+    def change(self, view: ViewState) -> None:
+        """Set a new view and request frames; a change of its edits becomes an undo entry."""
+        self.replace(record_undo(replace(self._workspace, view=view)))
+        self.wake()
 
 
 def new_workspace(view: ViewState, snapshots: tuple[SliderSnapshot, ...] = ()) -> Workspace:

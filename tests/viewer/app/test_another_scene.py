@@ -72,7 +72,7 @@ def test_another_scene_opens_while_the_old_one_is_in_use(
     window: application.App, tmp_path: Path, tool: str
 ) -> None:
     main_view = window.main_view
-    main_view.change(all_in_use(main_view.work.view, len(bear().scene)))
+    main_view.store.change(all_in_use(main_view.work.view, len(bear().scene)))
     if tool != "brush":
         press(window, {"box": "R", "polygon": "P", "flood": "J"}[tool])
     for place in (
@@ -85,9 +85,9 @@ def test_another_scene_opens_while_the_old_one_is_in_use(
         if tool in ("polygon", "flood"):
             imgui.get_io().add_mouse_button_event(0, False)
         window.draw()
-    main_view.work = mark_saved(replace(main_view.work, pointed=("region", 0), form_open=True))
-    window.open(tmp_path / "half.ply")
-    assert len(window.document.scene) == 700
+    main_view.store.replace(mark_saved(replace(main_view.work, pointed=("region", 0), form_open=True)))
+    window.parts.file_actions.open(tmp_path / "half.ply")
+    assert len(window.documents.get().scene) == 700
     for place in ((200.0, 300.0), (240.0, 360.0)):
         imgui.get_io().add_mouse_pos_event(*place)
         main_view.wake()
@@ -107,8 +107,8 @@ def test_another_scene_opens_while_the_old_one_is_in_use(
 def test_scene_that_cannot_be_opened_keeps_the_old_one(
     window: application.App, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    window.main_view.change(all_in_use(window.main_view.work.view, len(bear().scene)))
-    window.main_view.work = mark_saved(window.main_view.work)
+    window.main_view.store.change(all_in_use(window.main_view.work.view, len(bear().scene)))
+    window.main_view.store.replace(mark_saved(window.main_view.work))
     before = window.main_view.work.view
     engine = window.engine
 
@@ -116,10 +116,10 @@ def test_scene_that_cannot_be_opened_keeps_the_old_one(
         raise OSError(28, "No space left on device", "half.ply")
 
     monkeypatch.setattr(window, "_engine", no_engine)
-    window.open(tmp_path / "half.ply")
+    window.parts.file_actions.open(tmp_path / "half.ply")
     window.draw()
     assert (window.main_view.work.view, window.engine) == (before, engine)
-    assert window.document.path == tmp_path / "bear.ply"
+    assert window.documents.get().path == tmp_path / "bear.ply"
 
 
 @pytest.mark.gl
@@ -129,7 +129,7 @@ def test_session_restores_its_selection_without_an_active_tool(tmp_path: Path) -
     view = all_in_use(replace(first_view(bear(), 0.5, 0.5), select=SelectTool("box")), len(bear().scene))
     session.save(folder / "all.session.json", WindowSession(opened, view))
     with null_app(opened, first_view(bear(), 0.5, 0.5), folder) as app:
-        app.open(folder / "all.session.json")
+        app.parts.file_actions.open(folder / "all.session.json")
         press(app, "F")
         shown = app.main_view.work.view
         assert (shown.selection.count, shown.overshoot) == (view.selection.count, True)

@@ -200,7 +200,7 @@ def test_keys_file_is_created_complete_and_read_on_start(
     opened: list[str] = []
     monkeypatch.setattr(webbrowser, "open", opened.append)
     with null_app(opened_document(bear_files(tmp_path)), first_view(bear(), 0.5, 0.5), tmp_path) as app:
-        app.main_view.request(Plain("keys_file"))
+        app.main_view.messages.request(Plain("keys_file"))
         app.draw()
         path = state_folder() / "keys.json"
         assert opened == [path.as_uri()]
@@ -270,7 +270,7 @@ def fits_its_columns(hand: Rig) -> bool:
 def test_message_of_several_lines_stays_below_the_key_list(times: int) -> None:
     with rig(None, SMALLEST) as hand:
         hand.key("F1")
-        hand.main_view.show_message("a line that is long enough to be wrapped " * times)
+        hand.main_view.messages.show("a line that is long enough to be wrapped " * times)
         hand.frame(3)
         topics_window = shown(hand)
         message = imgui.internal.find_window_by_name("message")

@@ -148,7 +148,7 @@ def grips_key(hand: Rig, x: float, y: float) -> bool:
     before = hand.main_view.work
     hand.drag((x, y), (x + 40.0, y))
     moved = hand.main_view.work.view.timeline.keys[1].frame != 36
-    hand.main_view.work = before
+    hand.main_view.store.replace(before)
     hand.settle()
     return moved
 

@@ -46,8 +46,8 @@ def in_hand(app: App) -> Decal:
 def test_decal_follows_the_pointer_and_scales_with_the_wheel(logo: Path) -> None:
     with rig(first_view(bear())) as hand:
         camera = hand.main_view.work.view.camera
-        hand.main_view.work = with_transient(
-            hand.main_view.work, gizmo=load_decal(hand.main_view.context, logo)
+        hand.main_view.store.replace(
+            with_transient(hand.main_view.work, gizmo=load_decal(hand.main_view.context, logo))
         )
         hand.io.add_mouse_pos_event(200.0, 300.0)
         hand.frame(2)
@@ -72,8 +72,8 @@ def test_enter_places_the_decal_at_its_position(
     app: App, logo: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     orders: list[EditOrder] = []
-    monkeypatch.setattr(app.jobs.queue, "add", orders.append)
-    app.open(logo)
+    monkeypatch.setattr(app.parts.jobs.queue, "add", orders.append)
+    app.parts.file_actions.open(logo)
     app.draw()
     x, y = app.main_view.picture_size
     press(app, "Enter")
@@ -88,7 +88,7 @@ def test_enter_places_the_decal_at_its_position(
 
 
 def test_decal_corners_turn_counterclockwise(app: App, logo: Path) -> None:
-    app.open(logo)
+    app.parts.file_actions.open(logo)
     decal = in_hand(app)
     texture, size = decal.texture, decal.texture_size
     flat = decal_corners(Decal(logo, texture, size, 80.0, 0.0, (100.0, 100.0)))

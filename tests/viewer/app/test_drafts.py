@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,11 +20,11 @@ from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.ui_rig import bear, first_view
 from tests.viewer.app.test_studio import Trainer, request, turn
 from viewer.app import app as application
-from viewer.app import preview
+from viewer.app.parts import preview
 from viewer.camera.view_camera import to_camera
 from viewer.files import user_files
 from viewer.files.session import open_session
-from viewer.jobs import job_queue
+from viewer.jobs import job_queue, preview_process
 from viewer.state import paint
 from viewer.state.commands import OnItem, Plain
 from viewer.state.forms import EDITORS, SHEET_COLUMNS, SHEET_PX, STYLE_ORDER
@@ -40,23 +40,25 @@ class Previews:
     grade: Path | None = None
     asked = 0
 
-    def __init__(self, scene: Path) -> None:
+    def __init__(self, scene: Path, _: Callable[[], None]) -> None:
         self.folder = scene.parent
         self._number = 0
-        self._answers: list[preview.Preview] = []
+        self._answers: list[preview_process.Preview] = []
 
-    def ask(self, _: str, request: preview._Request, camera: Camera) -> int:
+    def ask(self, _: str, request: preview_process.PreviewInputs, camera: Camera) -> int:
         type(self).asked += 1
         self._number += 1
         if request.seed < 0:
-            self._answers.append(preview.Preview(self._number, note="tiny on the CPU", models=("a/tiny",)))
+            self._answers.append(
+                preview_process.Preview(self._number, note="tiny on the CPU", models=("a/tiny",))
+            )
             return self._number
         pixels = np.zeros((4, 4, 3), np.uint8) if self.grade is None else None
         follows = request.model != "a/tiny"
-        self._answers.append(preview.Preview(self._number, pixels, self.grade, follows=follows))
+        self._answers.append(preview_process.Preview(self._number, pixels, self.grade, follows=follows))
         return self._number
 
-    def take(self) -> preview.Preview | None:
+    def take(self) -> preview_process.Preview | None:
         return self._answers.pop() if self._answers else None
 
     def close(self) -> None:
@@ -84,14 +86,14 @@ def window(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[applicat
 
 def with_form(app: application.App, **changes: object) -> None:
     work = app.main_view.work
-    app.main_view.work = replace(work, form=replace(work.form, **changes))  # type: ignore[arg-type]
+    app.main_view.store.replace(replace(work, form=replace(work.form, **changes)))  # type: ignore[arg-type]
     for _ in range(3):
         turn(app)
 
 
 def opened(app: application.App, **changes: object) -> None:
     work = app.main_view.work  # set before the form opens, as the name field takes the keys then
-    app.main_view.work = replace(work, form=replace(work.form, name="blue"))
+    app.main_view.store.replace(replace(work, form=replace(work.form, name="blue")))
     press(app, "Ctrl+N")
     with_form(app, **changes)
 
@@ -111,9 +113,9 @@ def test_grade_is_a_live_layer_driven_by_the_form(window: application.App) -> No
     assert Previews.asked == 1, "neither the strength nor the camera asks for another"
     work = window.main_view.work
     selecting = replace(work.view, select=replace(work.view.select, tool="lasso"))
-    window.main_view.work = replace(work, view=selecting)
+    window.main_view.store.replace(replace(work, view=selecting))
     assert not window.main_view._displayed_view().select.tool, "a selection would hide the colors"
-    window.main_view.work = work
+    window.main_view.store.replace(work)
     with_form(window, color=(1.0, 0.0, 0.0))
     assert (Previews.asked, len(window.main_view.work.transient.live)) == (2, 1)
     with_form(window, preview=False)
@@ -126,10 +128,10 @@ def test_color_drag_shows_every_grade_and_requests_the_newest_next(
     requested = []
     waits = []
 
-    def ask(self: Previews, region: str, request: preview._Request, _: Camera) -> int:
+    def ask(self: Previews, region: str, request: preview_process.PreviewInputs, _: Camera) -> int:
         self._number += 1
         requested.append(request.editor)
-        waits.append((self, preview.Preview(self._number, grade=Previews.grade, made="grade")))
+        waits.append((self, preview_process.Preview(self._number, grade=Previews.grade, made="grade")))
         return self._number
 
     def answer() -> None:
@@ -164,13 +166,13 @@ def test_manual_grade_gets_the_main_colors_of_its_region(
 ) -> None:
     requested = []
 
-    def ask(self: Previews, region: str, request: preview._Request, _: Camera) -> int:
+    def ask(self: Previews, region: str, request: preview_process.PreviewInputs, _: Camera) -> int:
         self._number += 1
         requested.append(request.editor)
-        answer = preview.Preview(self._number, grade=Previews.grade, made="grade")
+        answer = preview_process.Preview(self._number, grade=Previews.grade, made="grade")
         if request.editor == "grade":
             colors = ("#7eae44", f"#0000{self._number:02x}")
-            answer = preview.Preview(self._number, made="palette", palette=colors)
+            answer = preview_process.Preview(self._number, made="palette", palette=colors)
         self._answers.append(answer)
         return self._number
 
@@ -194,7 +196,7 @@ def test_styles_are_previewed_one_after_the_other(
 ) -> None:
     requested: list[tuple[str, bool]] = []
 
-    def ask(self: Previews, region: str, request: preview._Request, camera: Camera) -> int:
+    def ask(self: Previews, region: str, request: preview_process.PreviewInputs, camera: Camera) -> int:
         self._number += 1
         small = (camera.width, camera.height) == SHEET_PX
         requested.append((request.editor, small))
@@ -202,7 +204,7 @@ def test_styles_are_previewed_one_after_the_other(
             (camera.height, camera.width, 3), 9 * int(request.editor.partition(":")[2]), np.uint8
         )
         failed = "no" if requested[-1] == ("style:3", True) else ""
-        answer = preview.Preview(self._number, pixels if not failed else None, error=failed)
+        answer = preview_process.Preview(self._number, pixels if not failed else None, error=failed)
         self._answers.append(answer)
         return self._number
 
@@ -215,8 +217,8 @@ def test_styles_are_previewed_one_after_the_other(
     shown = window.main_view.work.transient.preview
     assert shown.styles == {*STYLE_ORDER} - {3}, "what cannot be painted stays a number"
     assert not shown.failed
-    assert window.preview._sheet is not None
-    (width, height), pixels = SHEET_PX, np.frombuffer(window.preview._sheet.read(alignment=1), np.uint8)
+    assert window.parts.preview._sheet is not None
+    (width, height), pixels = SHEET_PX, np.frombuffer(window.parts.preview._sheet.read(alignment=1), np.uint8)
     tiles = pixels.reshape(-1, height, SHEET_COLUMNS, width, 3)[:, height // 2, :, width // 2, 0].flatten()
     expected = [0 if number == 3 else 9 * number for number in STYLE_ORDER]
     assert tiles[: len(STYLE_ORDER)].tolist() == expected, "each in its place"
@@ -224,7 +226,7 @@ def test_styles_are_previewed_one_after_the_other(
     assert requested[27:] == [("style:14", False)], "another strength is another picture, and the same sheet"
     work = window.main_view.work
     camera = replace(work.view.camera, azimuth=work.view.camera.azimuth + 20.0)
-    window.main_view.work = replace(work, view=replace(work.view, camera=camera))
+    window.main_view.store.replace(replace(work, view=replace(work.view, camera=camera)))
     for _ in range(3):
         turn(window)
     assert requested[28:30] == [("style:14", False), order[0]], "another view is painted anew"
@@ -299,20 +301,20 @@ def test_trained_edit_replaces_its_draft_and_nothing_else(
         0.6,
         (),
     )
-    assert window.document.facts().rows[0].draft
+    assert window.documents.get().facts().rows[0].draft
     view = window.main_view.work.view
-    weights = paint.encode(np.linspace(0, 1, len(window.document.gdfs[0].region), dtype=np.float32))
+    weights = paint.encode(np.linspace(0, 1, len(window.documents.get().gdfs[0].region), dtype=np.float32))
     touched = replace(layer(window), strength=0.3, paint=weights, locked=True)
-    window.main_view.change(replace(view, layers=(touched,)))
+    window.main_view.store.change(replace(view, layers=(touched,)))
     past = window.main_view.work.past
     before = window.engine.image(window.main_view.work.view, (32, 24))
     assert before.any()
     Trainer.ended = 0
     turn(window)
     assert (layer(window), window.main_view.work.past) == (touched, past)
-    (path,) = window.document.gdf_paths
+    (path,) = window.documents.get().gdf_paths
     assert path.name == "blue.gdf"
-    assert not window.document.facts().rows[0].draft
+    assert not window.documents.get().facts().rows[0].draft
     press(window, "Ctrl+Z")
     assert layer(window).strength == 0.6
     press(window, "Ctrl+Z", "Ctrl+Shift+Z")
@@ -325,7 +327,7 @@ def test_draft_of_a_failed_training_stays_until_deleted(window: application.App)
     Trainer.ended = 2
     Trainer.line = "the disk is full"
     turn(window)
-    (job,) = window.jobs.queue.jobs
+    (job,) = window.parts.jobs.queue.jobs
     request(window, OnItem("discard_run", job.number))
     assert layer(window).name == "blue"
     press(window, "Ctrl+Delete")
@@ -348,14 +350,14 @@ def test_session_saved_with_a_draft_opens_with_the_trained_edit(
 ) -> None:
     opened(window, strength=0.6)
     request(window, Plain("train"))
-    window.file_actions.save(tmp_path / "bear.session.json")
+    window.parts.file_actions.save(tmp_path / "bear.session.json")
     saved = open_session(tmp_path / "bear.session.json")
     assert [path.name for path in saved.document.gdf_paths] == ["blue.draft.gdf"]
     Trainer.ended = 0
     turn(window)
-    window.open(tmp_path / "bear.session.json")
+    window.parts.file_actions.open(tmp_path / "bear.session.json")
     turn(window)
-    assert [path.name for path in window.document.gdf_paths] == ["blue.gdf"]
+    assert [path.name for path in window.documents.get().gdf_paths] == ["blue.gdf"]
     assert layer(window).strength == 0.6
 
 
@@ -363,11 +365,11 @@ def test_draft_of_the_run_becomes_the_layer_without_a_preview(window: applicatio
     opened(window, preview=False)
     request(window, Plain("train"))
     assert window.main_view.work.view.layers == ()
-    (job,) = window.jobs.queue.jobs
+    (job,) = window.parts.jobs.queue.jobs
     job.task.out.mkdir(parents=True)
     (job.task.out / "draft.gdf").write_bytes((Previews.grade or Path()).read_bytes())
     turn(window)
     assert (layer(window).name, layer(window).strength) == ("blue", 1.0)
     Trainer.ended = 0
     turn(window)
-    assert [path.name for path in window.document.gdf_paths] == ["blue.gdf"]
+    assert [path.name for path in window.documents.get().gdf_paths] == ["blue.gdf"]

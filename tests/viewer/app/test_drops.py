@@ -53,7 +53,7 @@ def test_dropped_edit_becomes_the_top_layer_and_can_be_undone(
 ) -> None:
     gdf = bear().gdfs[1]
     save_gdf(tmp_path / "ears.gdf", gdf)
-    opened.open(tmp_path / "ears.gdf")
+    opened.parts.file_actions.open(tmp_path / "ears.gdf")
     opened.draw()
     layers = opened.main_view.work.view.layers
     assert [(layer.name, layer.strength) for layer in layers] == [("scarf", 0.5), ("ears", 1.0)]
@@ -67,20 +67,20 @@ def test_dropped_color_table_applies_to_selection_scene_or_region(
     opened: application.App, tmp_path: Path
 ) -> None:
     write_cube(tmp_path / "look.cube", lattice_colors(5).flip(1), "look")
-    opened.open(tmp_path / "look.cube")
+    opened.parts.file_actions.open(tmp_path / "look.cube")
     view = opened.main_view.work.view
-    mask = np.arange(len(opened.document.scene)) % 4 == 0
-    opened.main_view.change(replace(view, selection=selection.select(view.selection, mask)))
-    opened.open(tmp_path / "look.cube")
+    mask = np.arange(len(opened.documents.get().scene)) % 4 == 0
+    opened.main_view.store.change(replace(view, selection=selection.select(view.selection, mask)))
+    opened.parts.file_actions.open(tmp_path / "look.cube")
     opened.draw()
     layers = opened.main_view.work.view.layers
     assert [layer.name for layer in layers] == ["scarf", "look", "look-2"]
-    total = len(opened.document.scene)
+    total = len(opened.documents.get().scene)
     some = int(mask.sum())
     assert [row.count for row in opened.main_view.facts.rows][1:] == [total, some]
     assert [row.region for row in opened.main_view.facts.rows][1:] == ["all", "selection"]
     opened.handle(ReplaceEdit(0, str(tmp_path / "look.cube")))
-    assert opened.document.gdfs[-1].region == opened.document.gdfs[0].region
+    assert opened.documents.get().gdfs[-1].region == opened.documents.get().gdfs[0].region
 
 
 @pytest.mark.gl
@@ -92,7 +92,7 @@ def test_dropped_picture_fills_the_form_and_restores_its_camera(
     image = np.zeros((300, 400, 3), np.uint8)
     taken = to_camera(replace(before, azimuth=before.azimuth + 20.0), 400, 300)
     picture = exports.picture(tmp_path, "helmet", image, camera_chunk(taken))
-    opened.open(picture)
+    opened.parts.file_actions.open(picture)
     opened.draw()
     assert main_view.work.form_open
     assert main_view.work.form.pictures == str(picture)
@@ -101,7 +101,7 @@ def test_dropped_picture_fills_the_form_and_restores_its_camera(
         ("worn", camera_chunk(taken, ["scarf"]), "shows edits (scarf)"),
         ("lost", None, "has no stored camera"),
     ):
-        opened.open(exports.picture(tmp_path, name, image, carried))
+        opened.parts.file_actions.open(exports.picture(tmp_path, name, image, carried))
         assert main_view.work.message is not None
         assert line in main_view.work.message.text
         assert main_view.work.form.pictures == str(picture)
@@ -110,7 +110,7 @@ def test_dropped_picture_fills_the_form_and_restores_its_camera(
 @pytest.mark.gl
 def test_dropped_scene_replaces_the_old_one(opened: application.App, tmp_path: Path) -> None:
     save_ply(tmp_path / "half.ply", bear().scene[:700])
-    opened.open(tmp_path / "half.ply")
+    opened.parts.file_actions.open(tmp_path / "half.ply")
     opened.draw()
     assert opened.main_view.facts.count == 700
     assert opened.main_view.work.view.layers == ()
@@ -127,7 +127,7 @@ def test_broken_dropped_file_is_one_line_and_changes_nothing(opened: application
     (tmp_path / "torn.ply").write_bytes(b"ply\nformat")
     (tmp_path / "notes.txt").write_text("hello")
     for name in ("other.gdf", "torn.ply", "notes.txt", "absent.gdf"):
-        opened.open(tmp_path / name)
+        opened.parts.file_actions.open(tmp_path / name)
         opened.draw()
         message = opened.main_view.work.message
         assert message is not None
@@ -147,7 +147,7 @@ def test_glfw_delivers_dropped_files_to_the_next_loop_turn(opened: application.A
     drop(opened.window.handle, len(names), names)
     assert opened.main_view.next_frame_delay() == 0.0, "the loop wakes"
     for path in opened.take_dropped():
-        opened.open(path)
+        opened.parts.file_actions.open(path)
     opened.draw()
     assert opened.main_view.work.message is not None
     assert "torn.ply" in opened.main_view.work.message.text

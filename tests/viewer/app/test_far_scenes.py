@@ -87,8 +87,10 @@ def test_f4_saves_world_cameras_that_restore_the_view(window: application.App, t
     far = load_cameras(tmp_path / "far.cameras.json")[0]
     assert np.abs(far.position.numpy() - FAR).max() < 20.0
     before = window.main_view.work.view.camera
-    window.main_view.work = workspace.with_camera(window.main_view.work, replace(before, azimuth=200.0))
-    window.open(tmp_path / "far.cameras.json")
+    window.main_view.store.replace(
+        workspace.with_camera(window.main_view.work, replace(before, azimuth=200.0))
+    )
+    window.parts.file_actions.open(tmp_path / "far.cameras.json")
     found = window.main_view.work.view.camera
     assert torch.allclose(to_camera(found, 64, 48).viewmat, to_camera(before, 64, 48).viewmat, atol=1e-4)
 
@@ -106,7 +108,9 @@ def test_picture_carries_a_world_camera_that_restores_the_view(
     shown = to_camera(before, *Image.open(picture).size)
     assert torch.allclose(find_picture_camera(picture, origin=FAR).viewmat, shown.viewmat, atol=1e-6)
     if key == "Ctrl+F2":
-        window.main_view.work = workspace.with_camera(window.main_view.work, replace(before, azimuth=200.0))
-        window.open(picture)
+        window.main_view.store.replace(
+            workspace.with_camera(window.main_view.work, replace(before, azimuth=200.0))
+        )
+        window.parts.file_actions.open(picture)
         found = window.main_view.work.view.camera
         assert torch.allclose(to_camera(found, 64, 48).viewmat, to_camera(before, 64, 48).viewmat, atol=1e-4)

@@ -81,9 +81,9 @@ def test_ctrl_s_asks_for_a_path_once_and_then_saves_there(window: application.Ap
     assert (folder / "bear.session.json").is_file()
     assert "Saved" in message(window)
     press(window, "Shift+Left")
-    assert window.file_actions.has_unsaved
+    assert window.parts.file_actions.has_unsaved
     press(window, "Ctrl+S")
-    assert not window.file_actions.has_unsaved
+    assert not window.parts.file_actions.has_unsaved
     again = session.open_session(folder / "bear.session.json")
     assert again.view.layers == window.main_view.work.view.layers
 
@@ -107,7 +107,7 @@ def test_typed_path_is_opened(window: application.App, saved: Path) -> None:
         window.draw()
     press(window, "Enter")
     assert window.main_view.work.view == full_view()
-    assert window.file_actions.path == saved
+    assert window.parts.file_actions.path == saved
     assert [s.name for s in window.main_view.work.snapshots] == ["1"]
 
 
@@ -134,16 +134,16 @@ def test_discarding_closes_and_writes_nothing(window: application.App, folder: P
 
 @pytest.mark.gl
 def test_unsaved_work_is_autosaved_until_it_is_saved(window: application.App, folder: Path) -> None:
-    assert window.file_actions.autosave(0.0) is None, "nothing to lose"
+    assert window.parts.file_actions.autosave(0.0) is None, "nothing to lose"
     press(window, "Shift+Left")
-    waits = window.file_actions.autosave(10.0)
+    waits = window.parts.file_actions.autosave(10.0)
     assert waits == session.AUTOSAVE_S
     beside = folder / "bear.autosave.session.json"
     assert not beside.exists()
-    assert window.file_actions.autosave(10.0 + session.AUTOSAVE_S) is None
+    assert window.parts.file_actions.autosave(10.0 + session.AUTOSAVE_S) is None
     assert session.open_session(beside).view.layers == window.main_view.work.view.layers
-    assert window.file_actions.autosave(99.0) is None, "the same again is not written again"
-    window.file_actions.save(folder / "bear.session.json")
+    assert window.parts.file_actions.autosave(99.0) is None, "the same again is not written again"
+    window.parts.file_actions.save(folder / "bear.session.json")
     assert not beside.exists()
 
 
@@ -151,12 +151,12 @@ def test_unsaved_work_is_autosaved_until_it_is_saved(window: application.App, fo
 def test_autosave_opens_as_unsaved_work_of_its_session(window: application.App, folder: Path) -> None:
     press(window, "Shift+Left")
     beside = left_over(window, folder)
-    window.file_actions.save(folder / "bear.session.json")
-    window.open(folder / "bear.session.json")
+    window.parts.file_actions.save(folder / "bear.session.json")
+    window.parts.file_actions.open(folder / "bear.session.json")
     assert question(window) == Dialog("restore", str(beside))
     press(window, "R")
-    assert window.file_actions.path == folder / "bear.session.json"
-    assert window.file_actions.has_unsaved
+    assert window.parts.file_actions.path == folder / "bear.session.json"
+    assert window.parts.file_actions.has_unsaved
     assert window.main_view.work.view.layers[-1].strength == pytest.approx(0.4)
     press(window, "Ctrl+S")
     assert not beside.exists(), "saved, it has done its work"
@@ -164,8 +164,8 @@ def test_autosave_opens_as_unsaved_work_of_its_session(window: application.App, 
 
 def left_over(window: application.App, folder: Path) -> Path:
     """Leave an autosave of the present work as after a crash, unknown to the window."""
-    window.file_actions.autosave(0.0)
-    window.file_actions.autosave(session.AUTOSAVE_S)
+    window.parts.file_actions.autosave(0.0)
+    window.parts.file_actions.autosave(session.AUTOSAVE_S)
     beside = folder / "bear.autosave.session.json"
     kept = beside.read_bytes()
     window.handle(Plain("discard"))
@@ -180,16 +180,16 @@ def test_new_autosave_never_replaces_a_leftover_autosave(window: application.App
     press(window, "Shift+Left")
     beside = left_over(window, folder)
     kept = beside.read_bytes()
-    window.file_actions.offer_autosave()
+    window.parts.file_actions.offer_autosave()
     assert question(window).kind == "restore"
     assert beside not in window.main_view.work.transient.recent
     press(window, "Escape", "Shift+Left")
-    window.file_actions.autosave(100.0)
-    window.file_actions.autosave(100.0 + session.AUTOSAVE_S)
+    window.parts.file_actions.autosave(100.0)
+    window.parts.file_actions.autosave(100.0 + session.AUTOSAVE_S)
     assert beside.read_bytes() == kept
     own = [path for path in folder.glob("*.autosave*") if path != beside]
     assert [session.open_session(path).view.layers for path in own] == [window.main_view.work.view.layers]
-    window.file_actions.offer_autosave()
+    window.parts.file_actions.offer_autosave()
     assert window.main_view.work.dialog is None, "it asks once"
     press(window, "Ctrl+Q", "D")
     assert not own[0].exists()
@@ -202,28 +202,28 @@ def test_last_three_discarded_works_are_kept_as_files(window: application.App, f
     for _ in range(session.MAX_DISCARDED + 2):
         press(window, "Shift+Left")
         left_over_now = folder / "bear.autosave.session.json"
-        window.file_actions.autosave(0.0)
-        window.file_actions.autosave(session.AUTOSAVE_S)
+        window.parts.file_actions.autosave(0.0)
+        window.parts.file_actions.autosave(session.AUTOSAVE_S)
         strengths.append(window.main_view.work.view.layers[-1].strength)
-        window.file_actions.offer_autosave()
+        window.parts.file_actions.offer_autosave()
         assert window.main_view.work.dialog is None, "its own autosave is nothing that was left"
         window.handle(WithText("discard_autosave", str(left_over_now)))
-        window.file_actions.session_autosave = session.SessionAutosave()
+        window.parts.file_actions.session_autosave = session.SessionAutosave()
     kept = sorted(folder.glob("bear.discarded*"), key=lambda path: path.stat().st_mtime_ns)
     assert len(kept) == session.MAX_DISCARDED
     found = [session.open_session(path).view.layers[-1].strength for path in kept]
     assert sorted(found) == sorted(strengths[-session.MAX_DISCARDED :])
     window.handle(Plain("discard"))
-    window.open(kept[-1])
-    assert window.file_actions.path is None, "saving it asks where"
-    assert window.file_actions.has_unsaved
+    window.parts.file_actions.open(kept[-1])
+    assert window.parts.file_actions.path is None, "saving it asks where"
+    assert window.parts.file_actions.has_unsaved
 
 
 @pytest.mark.gl
 def test_unnamed_work_is_not_saved_over_an_existing_session(window: application.App, folder: Path) -> None:
-    window.file_actions.save(folder / "bear.session.json")
+    window.parts.file_actions.save(folder / "bear.session.json")
     yesterday = (folder / "bear.session.json").read_bytes()
-    window.file_actions.path = None  # the next day, starting from the scene
+    window.parts.file_actions.path = None  # the next day, starting from the scene
     press(window, "Shift+Left", "Ctrl+S")
     assert question(window).text == str(folder / "bear-2.session.json")
     press(window, "Enter")
@@ -280,12 +280,12 @@ def test_duplicated_replaced_and_deleted_layers_are_saved(window: application.Ap
     press(window, "Ctrl+Shift+Z", "3", "Ctrl+Delete")
     assert layers() == [("ears-2", 3), ("ears", 1)]
     shown = window.engine.gaussians(window.main_view.work.view).means.clone()
-    window.file_actions.save(folder / "two")
+    window.parts.file_actions.save(folder / "two")
     (folder / "edits" / "scarf.gdf").unlink()
     again = session.open_session(folder / "two.session.json")
     assert [(layer.name, layer.gdf) for layer in again.view.layers] == [("ears-2", 1), ("ears", 0)]
     assert len(again.document.gdfs) == 2
-    window.file_actions.open(folder / "two.session.json")
+    window.parts.file_actions.open(folder / "two.session.json")
     assert torch.equal(window.engine.gaussians(window.main_view.work.view).means, shown)
 
 
@@ -306,14 +306,14 @@ def test_files_are_recognized_by_content_not_by_name(
     window: application.App, folder: Path, saved: Path
 ) -> None:
     saved.rename(folder / "session.txt")
-    window.open(folder / "session.txt")
+    window.parts.file_actions.open(folder / "session.txt")
     assert window.main_view.work.view == full_view(), message(window)
     (folder / "edits" / "scarf.gdf").rename(folder / "scarf.bin")
-    window.open(folder / "scarf.bin")
+    window.parts.file_actions.open(folder / "scarf.bin")
     assert [layer.name for layer in window.main_view.work.view.layers][-1] == "scarf-2", message(window)
     window.handle(Plain("discard"))
     (folder / "bear.ply").rename(folder / "scene.dat")
-    window.open(folder / "scene.dat")
+    window.parts.file_actions.open(folder / "scene.dat")
     assert window.main_view.facts.title == "scene.dat", message(window)
 
 
@@ -321,7 +321,7 @@ def test_files_are_recognized_by_content_not_by_name(
 def test_dropped_camera_file_sets_the_view(window: application.App, folder: Path) -> None:
     camera = bear().demo.cameras[2]
     save_cameras(folder / "cameras.json", [camera])
-    window.open(folder / "cameras.json")
+    window.parts.file_actions.open(folder / "cameras.json")
     shown = to_camera(window.main_view.work.view.camera, camera.width, camera.height)
     assert np.abs(shown.viewmat.numpy() - camera.viewmat.numpy()).max() < 1e-4
     assert np.abs(shown.K.numpy() - camera.K.numpy()).max() < 1e-2
@@ -331,7 +331,7 @@ def test_dropped_camera_file_sets_the_view(window: application.App, folder: Path
 def test_scene_dropped_on_unsaved_work_asks_first(window: application.App, folder: Path) -> None:
     save_ply(folder / "half.ply", bear().scene[:700])
     press(window, "Shift+Left")
-    window.open(folder / "half.ply")
+    window.parts.file_actions.open(folder / "half.ply")
     window.draw()
     assert window.main_view.facts.title == "bear.ply"
     press(window, "D")
@@ -343,7 +343,7 @@ def test_scene_dropped_on_unsaved_work_asks_first(window: application.App, folde
 @pytest.mark.gl
 def test_session_of_another_scene_changes_nothing(window: application.App, folder: Path, saved: Path) -> None:
     before = window.main_view.work.view
-    window.open(spoilt(saved, "scene", "sha256", value="0" * 64))
+    window.parts.file_actions.open(spoilt(saved, "scene", "sha256", value="0" * 64))
     assert window.main_view.work.view == before
     assert "saved with another version of bear.ply" in message(window)
 
@@ -382,7 +382,7 @@ def test_failed_save_asks_again_with_the_typed_path(window: application.App, fol
     before = window.main_view.work.view
     assert dialog.text == typed
     assert "gone does not exist" in dialog.error
-    assert window.file_actions.has_unsaved
+    assert window.parts.file_actions.has_unsaved
     press(window, "V", "Shift+Left")
     assert window.main_view.work.view == before, "keys are no shortcuts meanwhile"
     by_hand(window, *[imgui.Key.end] * 2, *[imgui.Key.backspace] * len(".session.json"), text="-2")
@@ -398,7 +398,7 @@ def test_failed_save_asks_again_with_the_typed_path(window: application.App, fol
 @pytest.mark.gl
 def test_quit_waits_until_the_save_succeeds(window: application.App, folder: Path) -> None:
     (folder / "kept").mkdir()
-    window.file_actions.save(folder / "kept" / "bear")
+    window.parts.file_actions.save(folder / "kept" / "bear")
     (folder / "kept").rename(folder / "away")
     press(window, "Shift+Left", "Ctrl+Q", "S")
     assert "kept does not exist" in question(window).error
@@ -408,7 +408,7 @@ def test_quit_waits_until_the_save_succeeds(window: application.App, folder: Pat
     (folder / "away").rename(folder / "kept")
     press(window, "Enter")
     assert window.is_closed
-    assert not window.file_actions.has_unsaved
+    assert not window.parts.file_actions.has_unsaved
 
 
 @pytest.mark.gl
@@ -434,11 +434,11 @@ def test_impossible_path_is_one_line(window: application.App, name: str) -> None
 
 
 def test_f4_saves_each_view_as_a_camera_beside_the_session(window: application.App, folder: Path) -> None:
-    assert window.document.path is not None
-    kept = folder / f"{window.document.path.stem}.cameras.json"
+    assert window.documents.get().path is not None
+    kept = folder / f"{window.documents.get().path.stem}.cameras.json"
     for azimuth in (10.0, 70.0):
         camera = replace(window.main_view.work.view.camera, azimuth=azimuth)
-        window.main_view.work = workspace.with_camera(window.main_view.work, camera)
+        window.main_view.store.replace(workspace.with_camera(window.main_view.work, camera))
         press(window, "F4")
         assert kept.name in message(window)
     found = load_cameras(kept)
@@ -450,8 +450,8 @@ def test_f4_saves_each_view_as_a_camera_beside_the_session(window: application.A
 
 
 def test_f4_does_not_overwrite_a_foreign_camera_file(window: application.App, folder: Path) -> None:
-    assert window.document.path is not None
-    theirs = folder / f"{window.document.path.stem}.cameras.json"
+    assert window.documents.get().path is not None
+    theirs = folder / f"{window.documents.get().path.stem}.cameras.json"
     theirs.write_text("[]")
     press(window, "F4")
     assert theirs.read_text() == "[]"
@@ -474,7 +474,7 @@ def test_pictures_are_never_saved_to_the_current_folder(
     locked = tmp_path_factory.mktemp("locked")
     save_ply(locked / "half.ply", bear().scene[:700])
     locked.chmod(0o555)
-    window.open(locked / "half.ply")
+    window.parts.file_actions.open(locked / "half.ply")
     press(window, "F2", "Ctrl+F2", "Ctrl+E")
     assert sorted(path.name for path in own.iterdir()) == ["half_001.png", "half_002.png"]
     assert question(window).text == str(own / "half_edited.ply")

@@ -151,7 +151,7 @@ def test_flood_tool_picks_the_middle_of_the_picture_by_enter(hand: Rig) -> None:
 def test_question_is_answered_by_tab_and_enter(hand: Rig) -> None:
     options = DeliverOptions(640, 480)
     for chords, width in ((("Enter",), 640), ((*["Tab"] * 8, "Enter"), 853)):  # the eighth is 16:9
-        hand.main_view.ask(Dialog("render_picture", "view.png", options=options))
+        hand.main_view.messages.ask(Dialog("render_picture", "view.png", options=options))
         hand.settle()
         for chord in chords:
             strike(hand, chord)
@@ -166,7 +166,9 @@ def test_question_is_answered_by_tab_and_enter(hand: Rig) -> None:
 def test_camera_jumps_with_reduced_motion(hand: Rig) -> None:
     for on in (False, True):
         work = hand.main_view.work
-        hand.main_view.work = replace(work, layout=replace(work.layout, reduced_motion=on), glide=None)
+        hand.main_view.store.replace(
+            replace(work, layout=replace(work.layout, reduced_motion=on), glide=None)
+        )
         hand.main_view._perform(WithText("look", "top") if on else WithText("look", "right"))
         assert (hand.main_view.work.glide is None) == on
         hand.settle()

@@ -186,7 +186,7 @@ def test_no_shortcut_acts_while_a_menu_or_form_is_open(hand: Rig, what: str) -> 
     if what == "menu":
         hand.click(WINDOW[0] - 24.0, 24.0)
     if what == "question":
-        hand.main_view.ask(Dialog("about", "1.0"))
+        hand.main_view.messages.ask(Dialog("about", "1.0"))
         hand.frame(2)
     left_alone = ("Escape", "Enter", "Tab", "Shift+Tab", "Up", "Down", "Left", "Right", "Space", "Shift+F2")
     for chord in KEYS:
@@ -228,7 +228,7 @@ def test_arrows_open_and_close_submenus(hand: Rig) -> None:
 
 def test_escape_and_enter_in_a_list_keep_the_question_open(hand: Rig) -> None:
     options = DeliverOptions(moves="scarf", can_move=("timeline", "scarf", "ears"))
-    hand.main_view.ask(Dialog("render_film", "film.mp4", options=options))
+    hand.main_view.messages.ask(Dialog("render_film", "film.mp4", options=options))
     hand.frame(4)
     dialog = next(w for w in imgui.get_current_context().windows if w.name == "##dialog")
     place = dialog.pos.x + 300.0, dialog.pos.y + 167.0

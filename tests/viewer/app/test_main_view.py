@@ -128,7 +128,7 @@ def test_picture_that_cannot_be_saved_is_one_line(tmp_path: Path) -> None:
 
 
 def test_messages_disappear_by_themselves(hand: Rig) -> None:
-    hand.main_view.show_message("hello")
+    hand.main_view.messages.show("hello")
     hand.settle()
     assert hand.main_view.next_frame_delay() is not None
     hand.main_view.frame(hand.screen, 7.0)

@@ -30,9 +30,11 @@ def opened(tmp_path: Path) -> Iterator[application.App]:
 
 
 def test_title_and_recent_files_show_such_a_name(opened: application.App, tmp_path: Path) -> None:
-    assert opened.document.title == "b\\udce4r.ply"
+    assert opened.documents.get().title == "b\\udce4r.ply"
     press(opened, "Ctrl+O")
-    assert opened.main_view.work.transient.recent == (opened.document.path,) == user_files.read_recent()
+    assert (
+        opened.main_view.work.transient.recent == (opened.documents.get().path,) == user_files.read_recent()
+    )
 
 
 def test_saving_a_session_explains_that_it_cannot_name_the_file(opened: application.App) -> None:
@@ -47,7 +49,7 @@ def test_saving_a_session_explains_that_it_cannot_name_the_file(opened: applicat
 
 
 def test_message_with_such_a_name_is_shown(opened: application.App, tmp_path: Path) -> None:
-    opened.open(tmp_path / os.fsdecode(b"no\xff.gdf"))
+    opened.parts.file_actions.open(tmp_path / os.fsdecode(b"no\xff.gdf"))
     opened.draw()
     message = opened.main_view.work.message
     assert message is not None

@@ -46,7 +46,7 @@ class Desktop:
     def until_answered(self) -> None:
         """Run the window's loop while the dialog is open; no wait exceeds the polling interval."""
         end = time.monotonic() + 60.0
-        while self.app.file_actions.poll_dialog() is not None:
+        while self.app.parts.file_actions.poll_dialog() is not None:
             assert time.monotonic() < end
             time.sleep(0.01)
             self.app.draw()
@@ -85,7 +85,7 @@ def test_file_chosen_in_the_native_dialog_is_opened(desktop: Desktop) -> None:
     press(desktop.app, "Ctrl+O", "Ctrl+B")
     desktop.until_answered()
     assert desktop.app.main_view.work.dialog is None
-    assert [gdf.name for gdf in desktop.app.document.gdfs] == ["scarf", "ears"]
+    assert [gdf.name for gdf in desktop.app.documents.get().gdfs] == ["scarf", "ears"]
     assert "--file-selection" in desktop.asked
     assert str(desktop.folder / "work") in desktop.asked, "it begins beside the scene"
 
@@ -97,7 +97,7 @@ def test_path_chosen_in_the_native_dialog_is_saved_to(desktop: Desktop) -> None:
     desktop.until_answered()
     assert "--save" in desktop.asked
     assert session.open_session(there).view.layers == desktop.app.main_view.work.view.layers
-    assert not desktop.app.file_actions.has_unsaved
+    assert not desktop.app.parts.file_actions.has_unsaved
 
 
 def test_canceled_native_dialog_keeps_the_typed_path(desktop: Desktop) -> None:
@@ -118,14 +118,14 @@ def test_window_stays_responsive_and_escape_closes_the_dialog(
     frames = desktop.app.main_view.frames
     pid = desktop.folder / "pid"
     while not (pid.is_file() and pid.read_text().strip()):
-        assert desktop.app.file_actions.poll_dialog() == dialogs.POLL_S
+        assert desktop.app.parts.file_actions.poll_dialog() == dialogs.POLL_S
         time.sleep(0.01)
     assert question(desktop).choosing
     press(desktop.app, "Ctrl+B")
     assert desktop.app.main_view.frames > frames, "nothing waits for the person"
     press(desktop.app, "Escape")
     assert desktop.app.main_view.work.dialog is None
-    assert desktop.app.file_actions.poll_dialog() is None
+    assert desktop.app.parts.file_actions.poll_dialog() is None
     assert not alive(int(pid.read_text()))
 
 
@@ -135,7 +135,7 @@ def test_closing_the_window_closes_the_native_dialog(desktop: Desktop) -> None:
     pid = desktop.folder / "pid"
     while not (pid.is_file() and pid.read_text().strip()):
         time.sleep(0.01)
-    desktop.app.file_actions.release()
+    desktop.app.parts.file_actions.release()
     assert not alive(int(pid.read_text()))
 
 
@@ -162,7 +162,7 @@ def test_missing_dialog_program_is_explained_beside_the_path_field(
     assert "; type the path" in dialogs.obstacle()
     assert "\n" not in dialogs.obstacle()
     assert not question(desktop).choosing
-    assert desktop.app.file_actions.poll_dialog() is None
+    assert desktop.app.parts.file_actions.poll_dialog() is None
     path = Path(question(desktop).text)
     press(desktop.app, "Enter")
     assert path.is_file()
@@ -171,7 +171,7 @@ def test_missing_dialog_program_is_explained_beside_the_path_field(
 @pytest.mark.parametrize("kind", ["open", "save"])
 def test_browse_button_requests_the_native_dialog(kind: str) -> None:
     with rig(points=(900, 640)) as hand:
-        hand.main_view.ask(Dialog(kind, "/tmp/x"))
+        hand.main_view.messages.ask(Dialog(kind, "/tmp/x"))
         hand.settle()
         x = (900 - 300) / 2 + 260 - 16 - 18
         for y in range(60, 320, 8):

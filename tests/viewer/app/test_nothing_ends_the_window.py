@@ -16,8 +16,8 @@ from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app import app as application
-from viewer.app import interface, mouse
-from viewer.app.application import LOG
+from viewer.app import interface, messages, mouse
+from viewer.app.messages import LOG
 from viewer.files import exports, session
 from viewer.panel import card, cards, snapshot_cards, timeline_bar, tools
 from viewer.state import actions, selection, timeline
@@ -113,8 +113,8 @@ def test_failing_request_does_not_end_the_window(
     window.requests = dict.fromkeys(window.requests, raises(BrokenError("in a request")))
     monkeypatch.setattr(window.main_view, "_save", raises(BrokenError("in a request")))
     for request in (*window.requests, *exports.REQUESTS):
-        window.main_view.work = replace(window.main_view.work, message=None)
-        window.main_view.request(Plain(request))
+        window.main_view.store.replace(replace(window.main_view.work, message=None))
+        window.main_view.messages.request(Plain(request))
         turns(window, 2)
         assert "BrokenError: in a request" in message(window).text, request
 
@@ -131,13 +131,13 @@ def test_failing_part_of_a_frame_leaves_the_others_unchanged(
     assert f"BrokenError: {part}" in message(window).text
     assert message(window).details.count(part) >= 1
     assert log(tmp_path).count("Traceback") == 1, "once, however often it fails"
-    window.main_view.work = replace(window.main_view.work, message=None)
+    window.main_view.store.replace(replace(window.main_view.work, message=None))
     turns(window)
     assert window.main_view.work.message is None, "its cross takes the message away"
-    monkeypatch.setattr(application, "REPEAT_MESSAGE_S", 0.0)
+    monkeypatch.setattr(messages, "REPEAT_MESSAGE_S", 0.0)
     turns(window, 2)
     assert f"BrokenError: {part}" in message(window).text, "and after a while it is said again"
-    monkeypatch.setattr(application, "REPEAT_MESSAGE_S", 10.0)
+    monkeypatch.setattr(messages, "REPEAT_MESSAGE_S", 10.0)
     drawn = window.main_view.frames
     while (wait := window.main_view.next_frame_delay()) == 0.0:
         window.draw()
@@ -146,7 +146,7 @@ def test_failing_part_of_a_frame_leaves_the_others_unchanged(
     press(window, "F1", "Left")
     assert window.main_view.work.view.layers[-1].strength < strength, "keys do what they did"
     monkeypatch.undo()
-    window.main_view.work = replace(window.main_view.work, message=None)
+    window.main_view.store.replace(replace(window.main_view.work, message=None))
     turns(window)
     assert window.main_view.work.message is None, "imgui is as it was"
 
@@ -172,7 +172,7 @@ def test_failing_picture_keeps_the_panel_and_undo(
 def test_failing_job_is_polled_again(
     window: application.App, part: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(getattr(window, part), "poll", raises(BrokenError("a job")))
+    monkeypatch.setattr(getattr(window.parts, part), "poll", raises(BrokenError("a job")))
     waits = turns(window)
     assert "BrokenError: a job" in message(window).text
     assert all(wait is not None and wait <= application.RETRY_S for wait in waits)
@@ -188,7 +188,7 @@ def test_user_error_is_one_line_without_a_log(
             "a.ply cannot be read or written: No space left on device",
         ),
     ):
-        monkeypatch.setattr(window.jobs, "poll", raises(error))
+        monkeypatch.setattr(window.parts.jobs, "poll", raises(error))
         turns(window)
         assert (message(window).text, message(window).details) == (line, "")
     assert not (state_folder() / LOG).exists()
@@ -198,7 +198,7 @@ def test_error_saves_unsaved_work_and_details_can_be_copied(
     window: application.App, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     press(window, "Shift+Left")
-    window.report(BrokenError("at last"))
+    window.main_view.report(BrokenError("at last"))
     kept = tmp_path / "bear.autosave.session.json"
     assert session.open_session(kept).view.layers == window.main_view.work.view.layers
     assert message(window).text == f"Internal error (BrokenError: at last); unsaved work is kept in {kept}"
@@ -215,5 +215,5 @@ def test_error_saves_unsaved_work_and_details_can_be_copied(
 def test_failed_emergency_save_is_reported(window: application.App, monkeypatch: pytest.MonkeyPatch) -> None:
     press(window, "Shift+Left")
     monkeypatch.setattr(session, "save", raises(OSError(28, "No space left on device")))
-    window.report(BrokenError("at last"))
+    window.main_view.report(BrokenError("at last"))
     assert "unsaved work could not be kept" in message(window).text

@@ -145,9 +145,9 @@ def test_guessed_up_axis_is_reported_until_the_user_sets_it(tmp_path: Path) -> N
         line = message()
         assert line is not None
         assert line.text.startswith("Guessed −Y as up in cloud.ply")
-        app.main_view.work = replace(app.main_view.work, message=None)
+        app.main_view.store.replace(replace(app.main_view.work, message=None))
         camera = with_up(app.main_view.work.view.camera, (0.0, 0.0, 1.0))
-        app.main_view.change(replace(app.main_view.work.view, camera=camera))
+        app.main_view.store.change(replace(app.main_view.work.view, camera=camera))
         app._wait_times()
         assert find_up(cloud.scene).name == "+z", "what is chosen in the popover is remembered"
         press(app, "Ctrl+Z")
@@ -158,12 +158,12 @@ def test_guessed_up_axis_is_reported_until_the_user_sets_it(tmp_path: Path) -> N
         shutil.move(tmp_path / "cloud.ply", tmp_path / "other.ply")
         found = find_up(load(tmp_path / "other.ply").scene)
         assert (found.name, found.certain) == ("+z", True), "a training, which reads the file itself, agrees"
-        app.main_view.work = replace(app.main_view.work, message=None)
-        app.open(tmp_path / "other.ply")
+        app.main_view.store.replace(replace(app.main_view.work, message=None))
+        app.parts.file_actions.open(tmp_path / "other.ply")
         app._wait_times()
         assert message() is None
         assert app.main_view.work.view.camera.up == (0.0, 0.0, 1.0)
         save_ply(tmp_path / "cloud.ply", random_gaussians(50, scale=0.2))
-        app.open(tmp_path / "cloud.ply")
+        app.parts.file_actions.open(tmp_path / "cloud.ply")
         app._wait_times()
         assert message() is not None

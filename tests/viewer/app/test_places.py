@@ -165,17 +165,21 @@ def test_jobs_strip_opens_by_click_and_once_by_a_failure(hand: Rig) -> None:
             "jobs" in w.name and "/card_" in w.name and w.active for w in imgui.get_current_context().windows
         )
 
-    hand.main_view.work = replace(
-        hand.main_view.work, jobs=(JobCard(1, "Rendering film.mp4", Path("/scenes/film.mp4"), "running"),)
+    hand.main_view.store.replace(
+        replace(
+            hand.main_view.work, jobs=(JobCard(1, "Rendering film.mp4", Path("/scenes/film.mp4"), "running"),)
+        )
     )
     assert cards() == 0
     hand.click(*strip)
     assert cards() == 1
     hand.click(*strip)
     assert cards() == 0
-    hand.main_view.work = replace(
-        hand.main_view.work,
-        jobs=(JobCard(1, "Rendering film.mp4", Path("/scenes/film.mp4"), "failed", error="no room"),),
+    hand.main_view.store.replace(
+        replace(
+            hand.main_view.work,
+            jobs=(JobCard(1, "Rendering film.mp4", Path("/scenes/film.mp4"), "failed", error="no room"),),
+        )
     )
     assert cards() == 1
     hand.click(*strip)
@@ -197,7 +201,7 @@ def test_card_shows_its_toggles_only_while_hovered(hand: Rig) -> None:
 def test_session_name_is_shown_in_the_window_and_the_panel(tmp_path: Path) -> None:
     with null_app(opened_document(bear_files(tmp_path)), ViewState(), tmp_path) as app:
         assert (app.main_view.work.session, app._title) == ("", "bear.ply – ProGDF Studio")
-        app.file_actions.save(tmp_path / "two looks.session.json")
+        app.parts.file_actions.save(tmp_path / "two looks.session.json")
         press(app, "F5")
         assert app.main_view.work.session == "two looks"
         assert app._title == "• two looks – ProGDF Studio"

@@ -33,11 +33,13 @@ def windows(name: str) -> list[imgui.internal.Window]:
 def test_every_question_fits_the_window_with_many_recent_files(points: tuple[int, int], kind: str) -> None:
     with rig(first_view(bear(), 0.5, 0.5), points) as hand:
         name = "a_scene_with_a_rather_long_name_indeed"
-        hand.main_view.work = with_transient(
-            hand.main_view.work,
-            recent=tuple(Path(f"/scenes/{name}_{i}.ply") for i in range(user_files.MAX_RECENT)),
+        hand.main_view.store.replace(
+            with_transient(
+                hand.main_view.work,
+                recent=tuple(Path(f"/scenes/{name}_{i}.ply") for i in range(user_files.MAX_RECENT)),
+            )
         )
-        hand.main_view.ask(
+        hand.main_view.messages.ask(
             Dialog(kind, f"/scenes/{name}.session.json", error="it cannot be read", notice="type it")
         )
         hand.frame(4)
@@ -85,7 +87,7 @@ def test_home_view_is_upright_and_framed_for_any_up_axis() -> None:
 
 def turned_by_hand(hand: Rig, up: tuple[float, float, float]) -> None:
     camera = with_up(hand.main_view.work.view.camera, up)
-    hand.main_view.work = workspace.with_camera(hand.main_view.work, replace(camera, azimuth=70.0))
+    hand.main_view.store.replace(workspace.with_camera(hand.main_view.work, replace(camera, azimuth=70.0)))
 
 
 def test_home_view_uses_the_first_camera_with_the_same_up_axis() -> None:

@@ -18,7 +18,7 @@ from tests.helpers.null_app import null_app
 from tests.helpers.ui_rig import Rig, bear
 from viewer.app import app as application
 from viewer.app.main_view import MainView
-from viewer.app.start import EXAMPLE_TITLES
+from viewer.app.parts.start import EXAMPLE_TITLES
 from viewer.files import document as documents
 from viewer.files.document import empty
 from viewer.files.user_files import describe_age, keep_thumbnail, read_recent, remember_recent
@@ -57,7 +57,7 @@ def hand() -> Iterator[Rig]:
     main_view = MainView(context, engine, document.facts(), ViewState())
     recent = (StartFile(Path("/scenes/bear.ply")), StartFile(Path("/scenes/gone.ply"), missing=True))
     examples = tuple(StartFile(path) for path in EXAMPLE_TITLES)
-    main_view.work = with_transient(main_view.work, start_files=recent, examples=examples)
+    main_view.store.replace(with_transient(main_view.work, start_files=recent, examples=examples))
     yield Rig(main_view, (900, 640), 1.0)
     main_view.close()
     engine.release()
@@ -75,16 +75,16 @@ def type_keys(hand: Rig, *keys: imgui.Key) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("bundle", [*EXAMPLE_TITLES], ids=lambda path: path.name.partition(".")[0])
 def test_example_opens_with_its_edits(window: application.App, bundle: Path, tmp_path: Path) -> None:
-    window.main_view.request(WithText("example", str(bundle)))
+    window.main_view.messages.request(WithText("example", str(bundle)))
     turn(window)
     turn(window)
     assert not window.main_view.at_start
     layers = window.main_view.work.view.layers
     assert len(layers) >= 3
     assert any(layer.strength > 0.0 for layer in layers), "and shows one"
-    assert window.document.path is not None
-    assert window.document.path.is_relative_to(tmp_path), "a copy of the user's own"
-    assert not window.file_actions.has_unsaved
+    assert window.documents.get().path is not None
+    assert window.documents.get().path.is_relative_to(tmp_path), "a copy of the user's own"
+    assert not window.parts.file_actions.has_unsaved
 
 
 def test_examples_are_complete_and_small() -> None:
@@ -133,7 +133,7 @@ def test_missing_file_is_marked_and_can_be_removed(tmp_path: Path) -> None:
         assert gone.line.startswith("Moved?")
         assert here.line.startswith("just now  ·  ")
         assert app.main_view.work.transient.recent == (files[0],), "questions offer what is there"
-        app.main_view.request(WithText("forget_file", str(gone.path)))
+        app.main_view.messages.request(WithText("forget_file", str(gone.path)))
         turn(app)
         turn(app)
         assert [file.path for file in app.main_view.work.transient.start_files] == [files[0]]
@@ -175,8 +175,8 @@ def test_splash_is_shown_while_a_scene_is_read(
     monkeypatch.setattr(documents, "load", load_slowly)
     monkeypatch.setattr(Splash, "draw", splash)
     begun = time.perf_counter()
-    window.open(tmp_path / "bear.ply")
-    assert window.document.title == "bear.ply"
+    window.parts.file_actions.open(tmp_path / "bear.ply")
+    assert window.documents.get().title == "bear.ply"
     assert len(shown) >= 3
     assert shown[0] < 0.3
 

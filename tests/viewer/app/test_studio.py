@@ -26,9 +26,9 @@ from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app import app as application
-from viewer.app.preview import PAINT_TEXT
+from viewer.app.parts.preview import PAINT_TEXT
 from viewer.camera.view_camera import first_camera
-from viewer.files import user_files
+from viewer.files import exports, user_files
 from viewer.files.document import empty
 from viewer.files.session import open_session
 from viewer.files.user_files import load_thumbnail
@@ -81,8 +81,8 @@ def window(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[applicat
     with null_app(
         replace(opened_document(folder), edits=(), gdf_paths=()), first_view(bear()), folder
     ) as app:
-        app.main_view.work = replace(
-            app.main_view.work, form=replace(app.main_view.work.form, preview=False, name="blue")
+        app.main_view.store.replace(
+            replace(app.main_view.work, form=replace(app.main_view.work.form, preview=False, name="blue"))
         )
         yield app
 
@@ -94,7 +94,7 @@ def turn(app: application.App) -> None:
 
 
 def request(app: application.App, action: Action) -> None:
-    app.main_view.request(action)
+    app.main_view.messages.request(action)
     app.draw()
     turn(app)
 
@@ -104,7 +104,7 @@ def test_trained_edit_becomes_a_layer_at_full_strength(window: application.App) 
     assert window.main_view.work.form_open
     request(window, Plain("train"))
     assert not window.main_view.work.form_open
-    (job,) = window.jobs.queue.jobs
+    (job,) = window.parts.jobs.queue.jobs
     assert (job.status, job.task.name) == ("running", "blue")
     assert "--editor=recolor:#3061d1" in Trainer.said
     Trainer.ended = 0
@@ -118,11 +118,11 @@ def test_trained_edit_becomes_a_layer_at_full_strength(window: application.App) 
 
 def test_selection_is_the_region_of_a_new_edit(window: application.App) -> None:
     view = window.main_view.work.view
-    total = len(window.document.scene)
+    total = len(window.documents.get().scene)
     mask = selection.unpack(selection.EMPTY_MASK, total).copy()
     mask[[3, 7]] = True
     chosen = selection.select(view.selection, mask)
-    window.main_view.work = replace(window.main_view.work, view=replace(view, selection=chosen))
+    window.main_view.store.replace(replace(window.main_view.work, view=replace(view, selection=chosen)))
     press(window, "Ctrl+N")
     assert window.main_view.work.form.region == SELECTION
     request(window, Plain("train"))
@@ -136,23 +136,22 @@ def test_selection_is_the_region_of_a_new_edit(window: application.App) -> None:
 def test_changed_selection_is_a_new_file_for_the_preview(window: application.App, tmp_path: Path) -> None:
     """The preview process reads a file once, so a reused name would show the first selection."""
     view = window.main_view.work.view
-    total = len(window.document.scene)
+    total = len(window.documents.get().scene)
     specs = []
     for row in (3, 7, 3):
         mask = np.zeros(total, bool)
         mask[row] = True
         chosen = selection.select(view.selection, mask)
-        window.main_view.work = replace(window.main_view.work, view=replace(view, selection=chosen))
         form = replace(window.main_view.work.form, region=SELECTION)
-        specs.append(window.jobs.region_spec(form, tmp_path))
-        assert parse_region(specs[-1], window.document.scene).members.tolist() == [row]
+        specs.append(exports.region_option(form, tmp_path, chosen, total))
+        assert parse_region(specs[-1], window.documents.get().scene).members.tolist() == [row]
     assert specs[0] == specs[2] != specs[1]
 
 
 def test_invalid_edit_is_reported_in_the_form(window: application.App) -> None:
     press(window, "Ctrl+N")
     form = replace(window.main_view.work.form, region=TYPED, typed_region="cube:1")
-    window.main_view.work = replace(window.main_view.work, form=form)
+    window.main_view.store.replace(replace(window.main_view.work, form=form))
     request(window, Plain("train"))
     assert window.main_view.work.form_open
     assert window.main_view.work.form.error.startswith("unknown region 'cube:1'")
@@ -161,7 +160,7 @@ def test_invalid_edit_is_reported_in_the_form(window: application.App) -> None:
 
 def test_packed_edit_replaces_the_draft_while_it_is_measured(window: application.App) -> None:
     request(window, Plain("train"))
-    (job,) = window.jobs.queue.jobs
+    (job,) = window.parts.jobs.queue.jobs
     order = job.task
     packed = job.task.out / "draft.gdf"
     packed.parent.mkdir(parents=True)
@@ -169,20 +168,20 @@ def test_packed_edit_replaces_the_draft_while_it_is_measured(window: application
     save_gdf(packed, replace(scarf, instruction="a draft"))
     turn(window)
     (layer,) = window.main_view.work.view.layers
-    assert window.document.edits[layer.gdf].instruction == "a draft"
+    assert window.documents.get().edits[layer.gdf].instruction == "a draft"
     before = order.draft.read_bytes()
     save_gdf(packed, replace(scarf, instruction="packed"))
     os.utime(packed, ns=(order.draft.stat().st_mtime_ns + 1_000_000,) * 2)
-    window.jobs._live_due = 0.0
+    window.parts.jobs._live_due = 0.0
     turn(window)
-    assert [edit.instruction for edit in window.document.edits] == ["packed"]
+    assert [edit.instruction for edit in window.documents.get().edits] == ["packed"]
     assert window.main_view.work.view.layers == (layer,), "the layer stays as it is"
     assert order.draft.read_bytes() == before, "a film of it and a saved session name it"
     turn(window)
     assert window.main_view.work.view.layers == (layer,), "no recording beside it"
     save_gdf(order.result, replace(scarf, instruction="measured"))
-    window.jobs._end(replace(job, status="done"))
-    assert [edit.instruction for edit in window.document.edits] == ["measured"]
+    window.parts.jobs._end(replace(job, status="done"))
+    assert [edit.instruction for edit in window.documents.get().edits] == ["measured"]
 
 
 def test_view_painted_in_another_program_is_shown_on_every_save(
@@ -239,7 +238,7 @@ def test_failed_training_is_one_line_with_its_log(window: application.App) -> No
     Trainer.ended = 2
     Trainer.line = "the disk is full"
     turn(window)
-    (job,) = window.jobs.queue.jobs
+    (job,) = window.parts.jobs.queue.jobs
     assert (job.status, job.error) == ("failed", "the disk is full")
     assert window.main_view.work.message is None, "its card says it, and nothing else"
     request(window, OnItem("run_log", job.number))
@@ -252,7 +251,7 @@ def test_failed_training_is_one_line_with_its_log(window: application.App) -> No
 
 def test_training_is_discarded_only_after_a_question(window: application.App) -> None:
     request(window, Plain("train"))
-    (job,) = window.jobs.queue.jobs
+    (job,) = window.parts.jobs.queue.jobs
     state = job.task.out / "state"
     state.mkdir(parents=True)
     (state / "run.json").touch()
@@ -276,7 +275,7 @@ def test_training_is_discarded_only_after_a_question(window: application.App) ->
 
 def test_run_locked_by_another_window_is_left_alone(window: application.App) -> None:
     request(window, Plain("train"))
-    (job,) = window.jobs.queue.jobs
+    (job,) = window.parts.jobs.queue.jobs
     (job.task.out / "state").mkdir(parents=True)
     (job.task.out / "state" / "run.json").touch()
     request(window, OnItem("stop_run", job.number))
@@ -318,7 +317,7 @@ def test_scene_export_runs_the_command(window: application.App, tmp_path: Path) 
     assert [job.status for job in window.main_view.work.jobs] == ["running"]
     Trainer.ended = 0
     turn(window)
-    (job,) = window.jobs.queue.jobs
+    (job,) = window.parts.jobs.queue.jobs
     assert job.status == "done", "it stays until it is closed"
     request(window, OnItem("copy_path", job.number))
     assert imgui.get_clipboard_text() == str(tmp_path / "bear_edited.ply")
@@ -386,13 +385,13 @@ def test_start_page_is_shown_until_a_scene_is_opened(tmp_path: Path) -> None:
         assert app.main_view.at_start
         press(app, "Ctrl+N", "V")
         assert not app.main_view.work.form_open, "keys of a scene do nothing here"
-        app.open(folder / "edits" / "scarf.gdf")
+        app.parts.file_actions.open(folder / "edits" / "scarf.gdf")
         assert app.main_view.work.message is not None
         assert app.main_view.work.message.text == "scarf.gdf belongs to a scene; open that first"
-        app.open(folder / "bear.ply")
+        app.parts.file_actions.open(folder / "bear.ply")
         turn(app)
         assert not app.main_view.at_start
-        assert app.main_view.work.view.camera.distance == first_camera(app.document.scene).distance
+        assert app.main_view.work.view.camera.distance == first_camera(app.documents.get().scene).distance
         press(app, "Ctrl+N")
         assert app.main_view.work.form_open
     assert load_thumbnail(folder / "bear.ply") is not None, "for the next start page"
@@ -410,7 +409,7 @@ def test_demo_card_counts_edits_and_each_draft_becomes_one_layer(
     scarf = state_folder() / "demo" / "scarf"
     with null_app(empty(), ViewState(), tmp_path) as app:
         request(app, Plain("demo"))
-        (job,) = app.jobs.queue.jobs
+        (job,) = app.parts.jobs.queue.jobs
         assert job.progress.share == 0.0
         (scarf / "state").mkdir(parents=True)
         shutil.copy(files / "bear.ply", demo / "scene.ply")
@@ -422,9 +421,9 @@ def test_demo_card_counts_edits_and_each_draft_becomes_one_layer(
                 turn(app)
             view = app.main_view.work.view
             assert [(layer.name, layer.strength) for layer in view.layers] == [("scarf", strength)]
-            assert app.document.gdf_paths == (scarf / name,)
-            app.main_view.change(replace(view, layers=(replace(view.layers[0], strength=0.3),)))
-        (job,) = app.jobs.queue.jobs
+            assert app.documents.get().gdf_paths == (scarf / name,)
+            app.main_view.store.change(replace(view, layers=(replace(view.layers[0], strength=0.3),)))
+        (job,) = app.parts.jobs.queue.jobs
         assert (job.progress.label, job.progress.share) == ("1 of 4: scarf", 0.0)
         Trainer.ended = 0
 
@@ -433,7 +432,7 @@ def test_jobs_of_another_scene_continue_and_name_their_scene(window: application
     save_ply(tmp_path / "half.ply", bear().scene[:700])
     request(window, Plain("train"))
     press(window, "Ctrl+E", "Enter")
-    window.open(tmp_path / "half.ply")
+    window.parts.file_actions.open(tmp_path / "half.ply")
     turn(window)
     job, delivery = window.main_view.work.jobs
     assert (job.status, job.elsewhere, delivery.elsewhere) == ("running", "bear.ply", "bear.ply")
@@ -442,7 +441,7 @@ def test_jobs_of_another_scene_continue_and_name_their_scene(window: application
     turn(window)
     turn(window)
     assert window.main_view.work.jobs == (), "what failed is the scene's"
-    window.open(tmp_path / "bear.ply")
+    window.parts.file_actions.open(tmp_path / "bear.ply")
     turn(window)
     job, delivery = window.main_view.work.jobs
     assert (job.status, job.elsewhere) == ("failed", "")
@@ -456,14 +455,14 @@ def test_edit_of_another_scene_is_rebound_from_its_message(window: application.A
     out = tmp_path / "foreign-rebound.gdf"
     save_gdf(foreign, replace(scarf, scene=fingerprint(moved)))
     save_ply(tmp_path / "moved.ply", moved)
-    window.open(foreign)
+    window.parts.file_actions.open(foreign)
     message = window.main_view.work.message
     assert message is not None
     assert (message.text, message.button[0]) == ("foreign.gdf was made for another scene", "Rebind…")
     request(window, message.button[1])
     dialog = window.main_view.work.dialog
     assert dialog is not None
-    window.main_view.ask(replace(dialog, text=str(tmp_path / "moved.ply")))
+    window.main_view.messages.ask(replace(dialog, text=str(tmp_path / "moved.ply")))
     press(window, "Enter")
     turn(window)
     scenes = (f"--from={tmp_path / 'moved.ply'}", f"--to={tmp_path / 'bear.ply'}")

@@ -11,8 +11,8 @@ import pytest
 
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.app.main_view import MainView
-from viewer.app.start import EXAMPLE_TITLES
-from viewer.app.training import job_card
+from viewer.app.parts.start import EXAMPLE_TITLES
+from viewer.app.parts.training import job_card
 from viewer.files.document import empty
 from viewer.jobs.child import Progress
 from viewer.jobs.job_queue import Delivery, QueuedTask
@@ -46,7 +46,7 @@ def test_screenshot_of_the_start_page_with_recent_files(screenshot: Compare) -> 
         for i, name in enumerate(names)
     )
     examples = tuple(StartFile(path, texture.glo, *about) for path, about in EXAMPLE_TITLES.items())
-    main_view.work = with_transient(main_view.work, start_files=recent, examples=examples)
+    main_view.store.replace(with_transient(main_view.work, start_files=recent, examples=examples))
     try:
         screenshot("ui_start_page", Rig(main_view, SMALLEST, 1.0).image())
     finally:
@@ -57,7 +57,7 @@ def test_screenshot_of_the_start_page_with_recent_files(screenshot: Compare) -> 
 
 def test_screenshot_of_the_menu(screenshot: Compare) -> None:
     with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
-        hand.main_view.work = with_transient(hand.main_view.work, recent=(Path("/scenes/bear.ply"),))
+        hand.main_view.store.replace(with_transient(hand.main_view.work, recent=(Path("/scenes/bear.ply"),)))
         hand.click(999.0, 20.0)
         hand.move(880.0, 400.0)
         hand.frame(3)
@@ -69,7 +69,7 @@ def test_screenshot_of_the_new_edit_form(screenshot: Compare) -> None:
         form = NewEdit(
             TYPED, "sphere:0,0,0,1", editor=6, name="painted", error="the region holds no Gaussian"
         )
-        hand.main_view.work = replace(hand.main_view.work, form=form)
+        hand.main_view.store.replace(replace(hand.main_view.work, form=form))
         hand.key("Ctrl+N")
         screenshot("ui_new_edit", hand.image()[:, 700:])
 
@@ -87,9 +87,11 @@ def test_screenshot_of_run_cards_and_a_film(screenshot: Compare) -> None:
     film = Delivery("Rendering film.mp4", Path("/scenes/film.mp4"), (), Path("film.log"), Path("bear.ply"))
     frames = Progress(30 / 96, "frame 30 of 96")
     with rig(first_view(bear(), 0.7), SMALLEST) as hand:
-        hand.main_view.work = replace(
-            hand.main_view.work,
-            jobs=tuple(map(job_card, (*jobs, QueuedTask(5, film, "running", frames, 10.0)))),
+        hand.main_view.store.replace(
+            replace(
+                hand.main_view.work,
+                jobs=tuple(map(job_card, (*jobs, QueuedTask(5, film, "running", frames, 10.0)))),
+            )
         )
         hand.settle()
         hand.frame(3)
@@ -99,7 +101,7 @@ def test_screenshot_of_run_cards_and_a_film(screenshot: Compare) -> None:
 def test_screenshot_of_the_film_question(screenshot: Compare) -> None:
     with rig(first_view(bear(), 0.7), SMALLEST) as hand:
         options = DeliverOptions(1280, 720, moves="scarf", can_move=("scarf",))
-        hand.main_view.ask(Dialog("render_film", "/scenes/bear_edited.mp4", options=options))
+        hand.main_view.messages.ask(Dialog("render_film", "/scenes/bear_edited.mp4", options=options))
         hand.frame(4)
         screenshot("ui_film", hand.image()[:420, :720])
 
@@ -110,7 +112,9 @@ def test_screenshot_of_two_failures_with_whole_buttons(screenshot: Compare) -> N
     jobs = tuple(QueuedTask(number, replace(film), "failed", error=line) for number in (1, 2))
     with rig(first_view(bear(), 0.7), MINIMUM_SIZE_PX) as hand:
         for count in (1, 2):
-            hand.main_view.work = replace(hand.main_view.work, jobs=tuple(map(job_card, jobs[:count])))
+            hand.main_view.store.replace(
+                replace(hand.main_view.work, jobs=tuple(map(job_card, jobs[:count])))
+            )
             hand.main_view.wake()
             hand.settle()
         screenshot("ui_failures", hand.image()[:, 330:])
@@ -127,13 +131,13 @@ def test_second_click_on_the_stop_button_resumes(software_gpu: None) -> None:
     order = EditOrder(Path("bear.ply"), Path("/scenes/bear.edits/blue"), "blue", "all", "recolor:#3060d0")
     running = QueuedTask(1, order, "running", Progress(0.45, "Training", "0.0114"), 20.0)
     with rig(first_view(bear(), 0.7), SMALLEST) as hand:
-        hand.main_view.work = replace(hand.main_view.work, jobs=(job_card(running),))
+        hand.main_view.store.replace(replace(hand.main_view.work, jobs=(job_card(running),)))
         hand.settle()
         hand.click(SMALLEST[0] - 150.0, SMALLEST[1] - 55.0)  # opens the strip of jobs
         hand.settle()
 
         def asked(job: QueuedTask, x: float, y: float) -> tuple[str, ...]:
-            hand.main_view.work = replace(hand.main_view.work, jobs=(job_card(job),))
+            hand.main_view.store.replace(replace(hand.main_view.work, jobs=(job_card(job),)))
             hand.settle()
             hand.click(x, y)
             return hand.main_view.take_requests()

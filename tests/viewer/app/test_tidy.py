@@ -32,7 +32,7 @@ def app(folder: Path) -> Iterator[App]:
         mask = np.zeros(app.main_view.facts.count, bool)
         mask[bear().demo.members("scarf")] = True
         view = app.main_view.work.view
-        app.main_view.change(replace(view, selection=selection.select(view.selection, mask)))
+        app.main_view.store.change(replace(view, selection=selection.select(view.selection, mask)))
         yield app
 
 
@@ -64,8 +64,8 @@ def test_moved_selection_follows_the_gizmo_and_can_be_canceled(app: App) -> None
     assert gizmo is not None
     matrix = np.eye(4)
     matrix[:3, 3] = 0.5, 0.25, -0.125
-    app.main_view.work = with_transient(app.main_view.work, gizmo=replace(gizmo, matrix=matrix))
-    app.main_view.request(Plain("place"))
+    app.main_view.store.replace(with_transient(app.main_view.work, gizmo=replace(gizmo, matrix=matrix)))
+    app.main_view.messages.request(Plain("place"))
     app.draw()
     app.draw()
     assert [layer.name for layer in app.main_view.work.transient.live] == ["moved"]
@@ -73,7 +73,7 @@ def test_moved_selection_follows_the_gizmo_and_can_be_canceled(app: App) -> None
     assert app.main_view.work.transient.gizmo is None
     assert not app.main_view.work.transient.live
     press(app, "Alt+M")
-    app.main_view.work = with_transient(app.main_view.work, gizmo=replace(gizmo, matrix=matrix))
+    app.main_view.store.replace(with_transient(app.main_view.work, gizmo=replace(gizmo, matrix=matrix)))
     press(app, "Enter")
     members = bear().demo.members("scarf")
     means = app.engine.gaussians(app.main_view.work.view).means[members] - bear().scene.means[members]
@@ -95,22 +95,22 @@ def test_copy_has_rows_that_are_counted_selected_saved_and_exported(
     assert facts.rows[top(app)].added == len(members)
     view = app.main_view.work.view
     view = replace(view, selection=selection.hide(view.selection, np.ones(facts.count, bool)))
-    app.main_view.change(view)
+    app.main_view.store.change(view)
     app.draw()
     path = folder / "work.session.json"
-    session.save(path, WindowSession(app.document, view))
+    session.save(path, WindowSession(app.documents.get(), view))
     again = session.open_session(path)
     assert again.view.selection == view.selection
     assert again.view.layers == view.layers
     without = replace(view, layers=view.layers[:-1])
-    session.save(path, WindowSession(app.document, without))
+    session.save(path, WindowSession(app.documents.get(), without))
     kept = session.open_session(path)
     assert len(kept.document.scene) == len(scene)
     assert selection.unpack(kept.view.selection.hidden, len(scene)).all()
-    copy = app.document.gdf_paths[-1]
+    copy = app.documents.get().gdf_paths[-1]
     for strength, count in (("0", len(scene)), ("1", len(scene) + len(members))):
         out = folder / f"out{strength}.ply"
-        words = [f"--set={app.document.edits[-1].name}={strength}", f"-o={out}"]
+        words = [f"--set={app.documents.get().edits[-1].name}={strength}", f"-o={out}"]
         export([str(folder / "bear.ply"), str(copy), *words])
         assert len(load_ply(out)) == count
     assert bits(load_ply(folder / "out0.ply")) == bits(load_ply(folder / "bear.ply"))

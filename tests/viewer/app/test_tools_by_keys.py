@@ -102,8 +102,10 @@ def test_decal_is_placed_by_keys(tmp_path: Path) -> None:
     pixels[10:30, 20:60] = 200, 30, 30, 255
     Image.fromarray(pixels).save(tmp_path / "logo.png")
     with rig(first_view(bear()), WINDOW) as hand:
-        hand.main_view.work = with_transient(
-            hand.main_view.work, gizmo=load_decal(hand.main_view.context, tmp_path / "logo.png")
+        hand.main_view.store.replace(
+            with_transient(
+                hand.main_view.work, gizmo=load_decal(hand.main_view.context, tmp_path / "logo.png")
+            )
         )
         for chord in WAY:
             hand.key(chord)

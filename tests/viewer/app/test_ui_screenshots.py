@@ -76,7 +76,7 @@ def test_screenshot_of_more_layers_than_fit(screenshot: Compare) -> None:
 def test_screenshot_of_the_key_list_and_a_message(screenshot: Compare) -> None:
     with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
         hand.key("F1")
-        hand.main_view.show_message(
+        hand.main_view.messages.show(
             "shirt.gdf was made for another scene: it has 41 203 Gaussians, bear.ply has 1 500", True
         )
         hand.settle()
@@ -130,10 +130,12 @@ def test_screenshot_of_snapshots_and_a_question(screenshot: Compare) -> None:
         for chord in ("F5", *["Shift+Left"] * 5, "F5"):
             hand.key(chord)
         hand.frame(5)
-        hand.main_view.work = with_transient(
-            hand.main_view.work, recent=(Path("/scenes/bear.ply"), Path("/scenes/edits/scarf.gdf"))
+        hand.main_view.store.replace(
+            with_transient(
+                hand.main_view.work, recent=(Path("/scenes/bear.ply"), Path("/scenes/edits/scarf.gdf"))
+            )
         )
-        hand.main_view.ask(Dialog("open"))
+        hand.main_view.messages.ask(Dialog("open"))
         hand.frame(3)
         screenshot("ui_snapshots", hand.image())
 
@@ -189,7 +191,7 @@ def test_screenshot_of_axes_and_the_ground_grid(screenshot: Compare) -> None:
     view = replace(first_view(bear()), axes=True, grid=True, background=(0.11, 0.11, 0.12))
     view = replace(view, selection=selection.isolate(head, len(bear().scene)))
     with rig(view, SMALLEST) as hand:
-        hand.main_view.show_message("Saved bear.session.json")
+        hand.main_view.messages.show("Saved bear.session.json")
         hand.move(651.0, 53.0)
         hand.frame(3)
         screenshot("ui_orientation", hand.image())

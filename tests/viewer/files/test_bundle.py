@@ -92,7 +92,7 @@ def test_files_with_the_same_name_get_numbers(tmp_path: Path) -> None:
 
 def test_window_opens_a_bundle(bundle: Path) -> None:
     with null_app(empty(), ViewState(), bundle.parent) as app:
-        app.open(bundle)
+        app.parts.file_actions.open(bundle)
         assert [layer.name for layer in app.main_view.work.view.layers] == ["ears → gold", "scarf"]
 
 

@@ -165,14 +165,14 @@ def test_window_reports_rejected_regions_and_saves_them_again(
     (tmp_path / "victim.txt").write_bytes(b"mine")
     file = foreign_session(folder, "../victim.txt")
     with null_app(opened_document(folder), first_view(bear()), tmp_path) as app:
-        app.file_actions.open(file)
+        app.parts.file_actions.open(file)
         message = app.main_view.work.message
         assert message is not None
         assert "region r0 (../victim.txt), not a .region.npy file in the session's folder" in message.text
         app.handle(Plain("save"))
         assert (folder / "r0.region.npy").exists()
         (tmp_path / "elsewhere").mkdir()
-        app.file_actions.save(tmp_path / "elsewhere" / "moved")
+        app.parts.file_actions.save(tmp_path / "elsewhere" / "moved")
         assert (tmp_path / "elsewhere" / "r0.region.npy").exists(), "a session that is saved has its regions"
         assert session.open_session(tmp_path / "elsewhere" / "moved.session.json").warning == ""
     assert (tmp_path / "victim.txt").read_bytes() == b"mine"
@@ -189,9 +189,9 @@ def test_window_saves_a_region_beside_the_scene_and_in_the_session(tmp_path: Pat
         work = app.main_view.work
         assert [region.name for region in work.view.selection.regions] == ["coat"]
         assert (tmp_path / "coat.region.npy").exists()
-        assert app.file_actions.has_unsaved
+        assert app.parts.file_actions.has_unsaved
         (tmp_path / "coat.region.npy").unlink()
-        app.file_actions.save(tmp_path / "work")
+        app.parts.file_actions.save(tmp_path / "work")
         assert (tmp_path / "coat.region.npy").exists(), "a session that is saved has its regions"
-        app.file_actions.open(tmp_path / "work.session.json")
+        app.parts.file_actions.open(tmp_path / "work.session.json")
         assert app.main_view.work.view.selection == work.view.selection

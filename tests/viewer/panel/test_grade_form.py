@@ -26,7 +26,7 @@ LEFT = WINDOW[0] - panel.WIDTH_PX + 12.0 + 10.0 + new_edit_form.COLUMN_PX
 @pytest.fixture
 def hand() -> Iterator[Rig]:
     with rig(first_view(bear(), 0.0, 0.0), WINDOW) as opened:
-        opened.main_view.work = replace(opened.main_view.work, form=FORM, form_open=True)
+        opened.main_view.store.replace(replace(opened.main_view.work, form=FORM, form_open=True))
         opened.frame(3)
         yield opened
 
@@ -80,7 +80,7 @@ def test_swatch_opens_a_picker_and_right_click_resets_its_color(hand: Rig) -> No
     y = 202.0
     x = LEFT + 4.0
     moved = ((COLORS[0], "#3060d0"), *FORM.palette[1:])
-    hand.main_view.work = replace(hand.main_view.work, form=replace(form(hand), palette=moved))
+    hand.main_view.store.replace(replace(hand.main_view.work, form=replace(form(hand), palette=moved)))
     hand.frame(2)
     hand.move(x, y)
     hand.press(1)
@@ -93,7 +93,7 @@ def test_swatch_opens_a_picker_and_right_click_resets_its_color(hand: Rig) -> No
 
 def test_picking_a_color_adds_it_to_the_palette_only(hand: Rig) -> None:
     before = hand.main_view.work
-    hand.main_view.work = replace(before, form=replace(FORM, picks=True))
+    hand.main_view.store.replace(replace(before, form=replace(FORM, picks=True)))
     hand.frame(2)
     x = (WINDOW[0] - panel.WIDTH_PX) / 2
     y = 0.33 * WINDOW[1]

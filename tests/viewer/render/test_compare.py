@@ -105,7 +105,7 @@ def test_difference_is_amplified_and_reports_the_psnr(hand: Rig) -> None:
     assert (hand.picture()[BANNER:] == 0).mean() > 0.5
     found = psnr(torch.from_numpy(edited), torch.from_numpy(original))
     assert hand.main_view.canvas.comparer.psnr == pytest.approx(found, abs=1e-6)
-    hand.main_view.change(replace(view, compare=replace(view.compare, amplify=16.0)))
+    hand.main_view.store.change(replace(view, compare=replace(view.compare, amplify=16.0)))
     hand.settle()
     assert hand.picture()[BANNER:].astype(int).sum() > 1.5 * expected[BANNER:].sum()
 
@@ -184,10 +184,10 @@ def test_y_shows_two_pictures_that_orbit_together_and_allow_picking(hand: Rig, t
     assert np.abs(sides[0] - images[0][BANNER:, :165]).max() <= 0.51
     assert np.abs(sides[1] - images[1][BANNER:, 5:]).max() <= 0.51
     assert np.abs(images[0] - images[1]).max() > 60
-    hand.main_view.work = replace(hand.main_view.work, focus=None)
+    hand.main_view.store.replace(replace(hand.main_view.work, focus=None))
     hand.click(262.0, 262.0)
     assert hand.main_view.work.focus is not None, "the scarf in the right half"
-    hand.main_view.work = replace(hand.main_view.work, focus=None)
+    hand.main_view.store.replace(replace(hand.main_view.work, focus=None))
     hand.click(92.0, 262.0)
     assert hand.main_view.work.focus is not None, "and in the left one"
     hand.main_view.pictures, shown = tmp_path, hand.picture()

@@ -180,7 +180,7 @@ def test_slow_picture_is_drawn_beside_the_window_loop(hand: Rig, monkeypatch: py
     monkeypatch.setattr(dynamic_resolution, "JUMP_MS", 0.0)
     before = hand.picture()
     with not_done(hand, monkeypatch):
-        hand.main_view.change(replace(hand.main_view.work.view, background=(0.2, 0.3, 0.4)))
+        hand.main_view.store.change(replace(hand.main_view.work.view, background=(0.2, 0.3, 0.4)))
         hand.frame()
         assert (hand.picture() == before).all(), "the last picture stays"
         hand.settle()
@@ -193,7 +193,7 @@ def test_slow_picture_is_drawn_beside_the_window_loop(hand: Rig, monkeypatch: py
     other = ViewEngine(hand.main_view.context, new.scene, (), "cpu")
     hand.main_view.set_engine(other, hand.main_view.facts)
     with not_done(hand, monkeypatch):
-        hand.main_view.change(replace(hand.main_view.work.view, layers=()))
+        hand.main_view.store.change(replace(hand.main_view.work.view, layers=()))
         hand.frame()
         assert (hand.picture() == old).all(), "also that of another engine, as while an edit is trained"
     settle_sharply(hand)

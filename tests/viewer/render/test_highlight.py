@@ -189,12 +189,12 @@ def test_selection_tint_is_off_while_the_form_changes_the_picture(hand: Rig) -> 
 
     def is_tinted(tool: str, form_open: bool = True) -> bool:
         work = replace(main_view.work, view=replace(view, select=SelectTool(tool)), form_open=form_open)
-        main_view.work = work
+        main_view.store.replace(work)
         hand.frame(2)
         return main_view.engine.highlight is not None
 
     assert is_tinted("")
-    main_view.work = with_transient(main_view.work, live=(LayerState(0, "what the form says", 1.0),))
+    main_view.store.replace(with_transient(main_view.work, live=(LayerState(0, "what the form says", 1.0),)))
     assert not is_tinted("")
     assert not is_tinted("lasso"), "it is the form that changes the picture"
     hand.move(300.0, 300.0)

@@ -201,8 +201,8 @@ def test_undo_of_the_up_axis_keeps_layers_and_shows_a_message() -> None:
     with rig(first_view(bear(), 0.5, 0.5), (900, 640)) as hand:
         hand.key("Shift+Left")
         before = hand.main_view.work.view
-        hand.main_view.work = replace(
-            hand.main_view.work, view=replace(before, camera=with_up(before.camera, TILTED))
+        hand.main_view.store.replace(
+            replace(hand.main_view.work, view=replace(before, camera=with_up(before.camera, TILTED)))
         )
         hand.frame()
         hand.key("Ctrl+Z")

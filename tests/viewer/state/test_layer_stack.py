@@ -423,7 +423,7 @@ def test_top_card_is_the_top_layer(hand: Rig) -> None:
     assert hand.main_view.work.focus == 0
     hand.key("Alt+Up")
     assert names(hand) == ["ears", "scarf"]
-    hand.main_view.change(add_layer(hand.main_view.work.view, 0, "new"))
+    hand.main_view.store.change(add_layer(hand.main_view.work.view, 0, "new"))
     hand.settle()
     click(hand, LEFT + 100, HEAD)
     assert layers(hand)[hand.main_view.work.focus or 0].name == "new"

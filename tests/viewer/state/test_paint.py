@@ -184,8 +184,10 @@ def test_feathering_softens_painted_edges_and_keeps_full_paint(hand: Rig) -> Non
     hand.key("Shift+X")
     assert hand.main_view.work.view.layers[0].paint == paint.FULL
     x, y = scarf_on_screen(hand)
-    hand.main_view.work = replace(
-        hand.main_view.work, view=replace(hand.main_view.work.view, brush=replace(ERASE, softness=0.0))
+    hand.main_view.store.replace(
+        replace(
+            hand.main_view.work, view=replace(hand.main_view.work.view, brush=replace(ERASE, softness=0.0))
+        )
     )
     hand.drag((x - 15, y), (x + 15, y))
     hard = weights(hand)

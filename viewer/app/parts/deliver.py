@@ -11,15 +11,16 @@ from progdf import __version__
 from progdf.errors import ProgdfError
 from progdf.formats.scene_file import WRITTEN_SUFFIXES
 from progdf.io.bundle import BUNDLE
-from viewer.app.application import Application, Requests, failure_line
+from viewer.app.messages import Messages, Requests, failure_line
 from viewer.files import exports, session
+from viewer.files.document import DocumentStore
 from viewer.files.user_files import parse_path
 from viewer.jobs.job_queue import Delivery, JobQueue
 from viewer.jobs.training import free_path
 from viewer.state import timeline
 from viewer.state.forms import ALL_SLIDERS, TURNTABLE, DeliverOptions, picture_size
 from viewer.state.view_state import Comparison, ViewState
-from viewer.state.workspace import Dialog
+from viewer.state.workspace import Dialog, Store
 
 SUFFIXES = {"export": ".ply", "export_page": ".html", "render_picture": ".png", "render_film": ".mp4"}
 """Suffix of the output file, per dialog."""
@@ -29,20 +30,25 @@ class DeliverActions:
     """Dialogs for exports, pictures and films, and their commands.
 
     Args:
-        app: the window
+        store: state of the window
+        documents: the open document
+        messages: messages to the user
         queue: runs the commands
     """
 
-    def __init__(self, app: Application, queue: JobQueue) -> None:
-        self._app = app
-        self._store = app.store
+    def __init__(
+        self, *, store: Store, documents: DocumentStore, messages: Messages, queue: JobQueue
+    ) -> None:
+        self._store = store
+        self._documents = documents
+        self._messages = messages
         self._queue = queue
         self._options: dict[str, DeliverOptions] = {}  # the last options of each dialog, preset in the next
 
     @property
     def requests(self) -> Requests:
         """Handlers for the dialogs of `SUFFIXES`, for their output, and for rebinding an edit."""
-        ask, version = self._app.main_view.ask, sys.version.split()[0]
+        ask, version = self._messages.ask, sys.version.split()[0]
         return {
             **{name: partial(self._ask, name) for name in SUFFIXES},
             "deliver": self._deliver,
@@ -53,16 +59,14 @@ class DeliverActions:
 
     def _deliver(self, kind: str) -> None:
         """Queue the delivery; an error stays in the dialog."""
-        main_view = self._app.main_view
         if (dialog := self._store.get().dialog) is not None:
             error = failure_line(lambda: self._start(kind, dialog))
             after = replace(dialog, error=error) if error else None
             self._store.replace(replace(self._store.get(), dialog=after))
-            main_view.wake()
+            self._store.wake()
 
     def _ask(self, name: str, _: None) -> None:
-        path = self._app.document.file
-        main_view = self._app.main_view
+        path = self._documents.get().file
         view = self._store.get().view
         focus = self._store.get().focus
         options = self._options.get(name, DeliverOptions())
@@ -83,12 +87,12 @@ class DeliverActions:
         folder = exports.folder_of(path)
         written = self._written()
         free = free_path(folder, f"{path.stem}_edited", suffix, lambda out: out.exists() or out in written)
-        main_view.ask(Dialog(name, str(free), options=options))
+        self._messages.ask(Dialog(name, str(free), options=options))
 
     def _rebind(self, file: str, source: str) -> None:
         """Queue a rebind of an edit from the scene at `source` to the open scene."""
         edit = Path(file)
-        scene = self._app.document.file.resolve()
+        scene = self._documents.get().file.resolve()
         out = free_path(edit.parent, f"{edit.stem}-rebound", edit.suffix)
         words = ("rebind", str(edit), f"--from={parse_path(source)}", f"--to={scene}", f"--out={out}")
         log = self._queue.folder / f"rebind{len(list(self._queue.folder.iterdir()))}.log"
@@ -108,7 +112,7 @@ class DeliverActions:
         exists = f"{out.name} exists; give another name, or press again to replace it"
         if out.exists() and dialog.error != exists:
             raise ProgdfError(exists)
-        document = self._app.document
+        document = self._documents.get()
         view = replace(self._store.get().view, compare=Comparison())
         if kind == "render_film" and options.moves != "timeline":
             view = _film(view, options)

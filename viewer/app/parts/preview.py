@@ -6,38 +6,31 @@ picture over the view.
 
 from __future__ import annotations
 
-import contextlib
-import itertools
-import tempfile
-import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
 
 import moderngl
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from progdf.camera import Camera
-from progdf.errors import ProgdfError, without_commands
+from progdf.errors import ProgdfError
 from progdf.gdf.file import Gdf, load_gdf
 from progdf.io.atomic import make_folder
 from progdf.io.cameras import save_cameras
-from progdf.io.json_values import convert_json, decode_json, to_json
-from viewer.app.application import Application, Requests, error_line
-from viewer.camera.view_camera import Vec3, ViewCamera, to_camera
-from viewer.files import user_files
+from viewer.app.messages import Messages, Requests, error_line
+from viewer.camera.view_camera import ViewCamera, to_camera
+from viewer.files import exports, user_files
+from viewer.files.document import DocumentStore
 from viewer.jobs import training
-from viewer.jobs.child import Child
+from viewer.jobs.preview_process import PreviewChild, PreviewInputs
 from viewer.state.forms import EDITORS, NO_CHANGE, SHEET_COLUMNS, SHEET_PX, STYLE_ORDER, NewEdit, with_picture
 from viewer.state.transient import Cover, PreviewState
 from viewer.state.view_state import LayerState
-from viewer.state.workspace import with_transient
+from viewer.state.workspace import Store, with_transient
 from viewer.ui.window import wake_window
 
 LONGEST_SIDE = 960
@@ -51,116 +44,6 @@ WATCH_S = 0.5
 PAINT_TEXT = "Paint in the other program and save. The saved picture appears here."
 IDLE_TIMEOUT_S = 120.0
 """Time without an open form after which the preview process ends, in seconds."""
-
-
-@dataclass(frozen=True)
-class _Request:
-    """Inputs that determine a preview."""
-
-    region: str
-    editor: str
-    strength: float
-    camera: ViewCamera
-    size: tuple[int, int]  # size of the view, pixels
-    background: Vec3
-    model: str = ""  # diffusion model, for a sentence
-    seed: int = 0  # random seed, for a sentence; -1 asks only for the available models
-
-    @property
-    def of_all_views(self) -> tuple[str, str]:
-        """Region and editor, which determine a grade in every view."""
-        return self.region, self.editor
-
-    @property
-    def kind(self) -> tuple[str, str]:
-        """Region and editor family. A change of either makes the running preview obsolete."""
-        return self.region, self.editor.partition(":")[0]
-
-
-@dataclass(frozen=True)
-class Preview:
-    """Answer to a request: a picture, a grade's file, a palette, a note or an error."""
-
-    number: int  # -1: the process has ended, or its output cannot be read
-    pixels: Any = None  # the picture. [H,W,3] uint8
-    grade: Path | None = None
-    error: str = ""
-    made: Literal["picture", "grade", "note", "palette"] = "picture"
-    note: str = ""  # description of the model for a sentence
-    models: tuple[str, ...] = ()  # models on this machine
-    follows: bool = False  # the edit of a sentence can follow this picture
-    palette: tuple[str, ...] = ()  # main colors of the region, #rrggbb
-
-
-class PreviewChild:
-    """Preview process of one scene, which answers the latest request. `close` it.
-
-    Args:
-        scene: file of the scene
-
-    Raises:
-        OSError: the process cannot be started.
-    """
-
-    def __init__(self, scene: Path) -> None:
-        self._folder = tempfile.TemporaryDirectory(prefix="progdf-preview-")
-        self._numbers = itertools.count(1)
-        self._answers: deque[str] = deque()
-        self._child = Child(["preview", str(scene)], self.folder / "log.txt", talks=True)
-        threading.Thread(target=self._listen, daemon=True).start()
-
-    @property
-    def folder(self) -> Path:
-        """Folder of the pictures and of the files that requests name."""
-        return Path(self._folder.name)
-
-    def ask(self, region: str, request: _Request, camera: Camera) -> int:
-        """Request a grade or a picture and return the request's number."""
-        number = next(self._numbers)
-        values = to_json(request) | {"number": number, "out": str(self._picture(number)), "region": region}
-        values |= {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist()}
-        values |= {"width": camera.width, "height": camera.height}
-        self._child.send(msgspec.json.encode(values).decode())
-        return number
-
-    def take(self) -> Preview | None:
-        """Return the last answer since the previous call, or the error of an ended process. Does not wait."""
-        line = None
-        while self._answers:
-            line = self._answers.popleft()
-        if line is None:
-            ended = self._child.status is not None
-            return (
-                Preview(-1, error=without_commands(self._child.error()) or "the preview ended")
-                if ended
-                else None
-            )
-        try:
-            answer = convert_json(decode_json(line), Preview)
-            if answer.error or answer.made in ("note", "palette"):
-                return replace(answer, error=without_commands(answer.error))
-            if answer.made == "grade":
-                return replace(answer, grade=self._picture(answer.number).with_suffix(".gdf"))
-            with Image.open(self._picture(answer.number)) as picture:
-                return replace(answer, pixels=np.asarray(picture.convert("RGB")))
-        except (OSError, ValueError) as error:
-            return Preview(-1, error=f"the preview cannot be read: {error}")
-
-    def close(self) -> None:
-        """End the process."""
-        self._child.kill()  # it has no state to save
-        self._child.close()
-        with contextlib.suppress(OSError):
-            self._folder.cleanup()
-
-    def _picture(self, number: int) -> Path:
-        return self.folder / f"{number % 8}.png"
-
-    def _listen(self) -> None:
-        with contextlib.suppress(OSError, ValueError):
-            for line in self._child.output:
-                self._answers.append(line.decode("utf-8", "replace"))
-                wake_window()
 
 
 @dataclass(frozen=True)
@@ -187,33 +70,45 @@ class PreviewActions:
     window.
 
     Args:
-        app: the window
+        store: state of the window
+        documents: the open document
+        messages: messages to the user
         context: the GL context
-        region: returns a form's region as an option of `progdf train`; writes needed files into the folder
+        picture_size: returns width and height of the picture on screen, in pixels
+        save_original: writes the picture on screen without edits into a folder; returns its path
     """
 
     def __init__(
-        self, app: Application, context: moderngl.Context, region: Callable[[NewEdit, Path], str]
+        self,
+        *,
+        store: Store,
+        documents: DocumentStore,
+        messages: Messages,
+        context: moderngl.Context,
+        picture_size: Callable[[], tuple[int, int]],
+        save_original: Callable[[Path, str], Path],
     ) -> None:
-        self._app = app
-        self._store = app.store
+        self._store = store
+        self._documents = documents
+        self._messages = messages
         self._context = context
-        self._region = region
+        self._picture_size = picture_size
+        self._save_original = save_original
         self._child: PreviewChild | None = None
         self._texture: moderngl.Texture | None = None
-        self._sent: _Request | None = None
+        self._sent: PreviewInputs | None = None
         self._number = 0  # number of the sent request
         self._outstanding = False  # no answer to it yet
-        self._seen: _Request | None = None  # request at the last poll
+        self._seen: PreviewInputs | None = None  # request at the last poll
         self._seen_at = self._used_at = 0.0
         self._broken = False  # the process cannot be started, or has ended
-        self._grade: tuple[_Request, Gdf, Path] | None = None  # live grade: request, edit, file
+        self._grade: tuple[PreviewInputs, Gdf, Path] | None = None  # live grade: request, edit, file
         self._pose: tuple[int, ViewCamera, tuple[int, int]] | None = None  # `asks`, camera, size
-        self._painted: tuple[_Request, NDArray[np.uint8]] | None = None  # a sentence's picture
+        self._painted: tuple[PreviewInputs, NDArray[np.uint8]] | None = None  # a sentence's picture
         self._sent_at = 0.0
         self._palette_of = ""  # region of the form's palette
         self._sheet: moderngl.Texture | None = None  # thumbnails in every style
-        self._sheet_of: _Request | None = None  # the painted view
+        self._sheet_of: PreviewInputs | None = None  # the painted view
         self._tiles: frozenset[int] = frozenset()  # styles painted in this view
         self._drawn: frozenset[int] = frozenset()  # styles in the sheet, also of an earlier view
         self._tile = -1  # the requested style
@@ -231,7 +126,7 @@ class PreviewActions:
             self._end_live()
             return self._follow(self._painting)
         now = time.monotonic()
-        scene = self._app.document.path
+        scene = self._documents.get().path
         request = self._request()
         if request is None or scene is None:
             self._show("", None)
@@ -243,7 +138,7 @@ class PreviewActions:
         self._used_at = now
         if self._child is None and not self._broken:
             try:
-                self._child = PreviewChild(scene)
+                self._child = PreviewChild(scene, wake_window)
             except OSError as error:
                 self._broken = True
                 self._show(f"No preview: {error.strerror or error}", None, failed=True)
@@ -276,16 +171,15 @@ class PreviewActions:
         Raises:
             ProgdfError: the scene has no file, or the picture cannot be written.
         """
-        main_view = self._app.main_view
-        scene = self._app.document.file
+        scene = self._documents.get().file
         self._end_live()
         camera = self._store.get().view.camera
-        size = main_view.picture_size
+        size = self._picture_size()
         folder = training.edits_folder(scene)
         make_folder(folder)
-        path = main_view.canvas.save_original(folder, scene.stem, self._store.get().view, size)
+        path = self._save_original(folder, scene.stem)
         beside = path.with_name(f"{path.stem}.camera.json")  # a program may drop the picture's metadata
-        save_cameras(beside, [to_camera(camera, *size)], self._app.document.scene.origin)
+        save_cameras(beside, [to_camera(camera, *size)], self._documents.get().scene.origin)
         form = with_picture(self._store.get().form, path, further=False)
         self._store.replace(replace(self._store.get(), form=form, form_open=True))
         self._open_painter(path, camera, size, None)
@@ -302,7 +196,7 @@ class PreviewActions:
         self._painting = PreviewedView(path, camera, size, _file_state(path))
         self._show(PAINT_TEXT, cover)
         if not user_files.open_in_program(path):
-            self._app.main_view.show_message(f"No program for pictures was found. Open {path} in yours.")
+            self._messages.show(f"No program for pictures was found. Open {path} in yours.")
 
     def _is_painting(self, painted: PreviewedView) -> bool:
         """Return whether the form uses the picture that is being painted."""
@@ -329,7 +223,7 @@ class PreviewActions:
         else:
             cover = Cover(self._upload(pixels), painted.camera, painted.size, "Painted")
             self._show("This is the saved picture. Train makes it an edit.", cover)
-            self._app.main_view.wake()
+            self._store.wake()
         return WATCH_S
 
     def anchor(self, form: NewEdit) -> tuple[NDArray[np.uint8], Camera] | None:
@@ -364,10 +258,10 @@ class PreviewActions:
                 texture.release()
         self._texture = self._sheet = None
 
-    def _request(self) -> _Request | None:
+    def _request(self) -> PreviewInputs | None:
         """Return the request for the form and the view; None for no preview."""
         work = self._store.get()
-        size = self._app.main_view.picture_size
+        size = self._picture_size()
         form = work.form
         view = work.view
         of_sentence = form.choice.setting == "sentence"
@@ -376,7 +270,7 @@ class PreviewActions:
             return None
         region = f"{form.region}|{form.typed_region}|{hash(view.selection.members)}"
         if form.choice.setting == "grade" and self._palette_of != region:
-            return _Request(region, "grade", 1.0, ViewCamera(), size, view.background)
+            return PreviewInputs(region, "grade", 1.0, ViewCamera(), size, view.background)
         if form.obstacle:
             return None
         if of_sentence:  # a diffusion model is slow: its picture keeps the view of the request
@@ -384,15 +278,18 @@ class PreviewActions:
                 self._pose = form.asks, view.camera, size
             _, camera, size = self._pose
             seed = form.asks - 1
-            return _Request(region, form.spec, 1.0, camera, size, view.background, form.model, seed)
-        return _Request(region, form.spec, round(form.strength, 2), view.camera, size, view.background)
+            return PreviewInputs(region, form.spec, 1.0, camera, size, view.background, form.model, seed)
+        return PreviewInputs(region, form.spec, round(form.strength, 2), view.camera, size, view.background)
 
-    def _send(self, request: _Request, child: PreviewChild) -> None:
+    def _send(self, request: PreviewInputs, child: PreviewChild) -> None:
+        work = self._store.get()
         self._sent, self._sent_at = request, time.monotonic()
         scale = min(1.0, LONGEST_SIDE / max(request.size))
         width, height = (max(round(side * scale), 1) for side in request.size)
         try:
-            region = self._region(self._store.get().form, child.folder)
+            region = exports.region_option(
+                work.form, child.folder, work.view.selection, len(self._documents.get().original)
+            )
         except (ProgdfError, OSError) as error:
             self._outstanding = False
             self._show(error_line(error), None, failed=True)
@@ -400,12 +297,12 @@ class PreviewActions:
         self._number = child.ask(region, request, to_camera(request.camera, width, height))
         self._outstanding = True
         self._region_sent = region
-        cover = self._store.get().transient.cover
+        cover = work.transient.cover
         in_place = cover is not None and (cover.camera, cover.size) == (request.camera, request.size)
         text = "Looking for models …" if request.seed < 0 else "Drawing …"
         self._show("" if in_place or self._grade else text, cover)
 
-    def _ask_painting(self, request: _Request, child: PreviewChild) -> None:
+    def _ask_painting(self, request: PreviewInputs, child: PreviewChild) -> None:
         """Request the next thumbnail of the sheet: this view in one style. The form's own preview has
         priority."""
         view = replace(request, editor="", strength=1.0)
@@ -437,9 +334,9 @@ class PreviewActions:
         store = self._store
         preview = store.get().transient.preview._replace(sheet=int(self._sheet.glo), styles=self._drawn)
         store.replace(with_transient(store.get(), preview=preview))
-        self._app.main_view.wake()
+        self._store.wake()
 
-    def _take(self, child: PreviewChild, now: _Request) -> None:
+    def _take(self, child: PreviewChild, now: PreviewInputs) -> None:
         """Show the answer of the process unless the region or the editor family has changed since."""
         answer = child.take()
         if answer is None:
@@ -462,11 +359,11 @@ class PreviewActions:
             if all(source == target for source, target in work.form.palette):
                 form = replace(work.form, palette=tuple((color, color) for color in answer.palette))
                 self._store.replace(replace(work, form=form))
-            self._app.main_view.wake()
+            self._store.wake()
         elif answer.note and answer.grade is None:
             self._show(answer.note, None, models=answer.models)
         elif answer.grade is not None:
-            gdf = load_gdf(answer.grade, self._app.document.original)
+            gdf = load_gdf(answer.grade, self._documents.get().original)
             self._grade = self._sent, gdf, answer.grade
             # remove the preview of the previous color
             self._store.replace(with_transient(self._store.get(), live=()))
@@ -488,14 +385,13 @@ class PreviewActions:
                     text = "Example only: this model cannot follow a picture"
             texture = self._upload(answer.pixels)
             self._show(text, Cover(texture, self._sent.camera, self._sent.size, name))
-            self._app.main_view.wake()
+            self._store.wake()
 
     def _show_live(self) -> None:
         """Show the grade as a layer on top, at the form's strength."""
         if self._grade is None:
             return
-        main_view = self._app.main_view
-        document = self._app.document
+        document = self._documents.get()
         layers = self._store.get().view.layers
         name = self._store.get().form.layer_name
         solo = any(layer.solo for layer in layers)
@@ -503,14 +399,14 @@ class PreviewActions:
         live = (LayerState(len(document.gdfs), name, strength, solo=solo),)
         shown = self._store.get().transient.live
         if not shown:
-            self._app.show(document, (self._grade[1],), live)
+            self._documents.replace(document, (self._grade[1],), live)
         elif shown != live:
             self._store.replace(with_transient(self._store.get(), live=live))
-            main_view.wake()
+            self._store.wake()
 
     def _end_live(self) -> None:
         if self._grade is not None and self._store.get().transient.live:
-            self._app.show(self._app.document)
+            self._documents.replace(self._documents.get())
         self._grade = None
 
     def _upload(self, pixels: NDArray[np.uint8]) -> int:
@@ -534,7 +430,7 @@ class PreviewActions:
         state = PreviewState(text, failed, self._outstanding, painted, available_models, sheet, self._drawn)
         if (work.transient.cover, work.transient.preview) != (cover, state):
             self._store.replace(with_transient(work, cover=cover, preview=state))
-            self._app.main_view.wake()
+            self._store.wake()
 
     def _end(self) -> None:
         if self._child is not None:

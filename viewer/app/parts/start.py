@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,10 +18,11 @@ from progdf.io.atomic import make_folder, read_file, state_folder, write_file
 from progdf.io.bundle import BUNDLE
 from progdf.io.session import sha256
 from progdf.scene import up_axis
-from viewer.app.application import Application, Requests, attempt
-from viewer.app.file_actions import EditActions
+from viewer.app.messages import Messages, Requests, attempt
+from viewer.app.parts.edits import EditActions
 from viewer.camera.view_camera import Vec3
 from viewer.files import user_files
+from viewer.files.document import DocumentStore
 from viewer.gl.present import picture_texture
 from viewer.jobs.job_queue import Delivery, JobQueue
 from viewer.panel.pages import folder_name
@@ -29,7 +31,7 @@ from viewer.render.engine import ViewEngine
 from viewer.state import history
 from viewer.state.transient import StartFile
 from viewer.state.view_state import Comparison, ViewState
-from viewer.state.workspace import with_transient
+from viewer.state.workspace import Store, with_transient
 
 POLL_S = 0.5
 EXAMPLES = Path(viewer.__file__).parent / "examples"
@@ -48,19 +50,35 @@ class StartActions:
     """Recent files with thumbnails, and the demo, whose edits appear one by one.
 
     Args:
-        app: the window
+        store: state of the window
+        documents: the open document
+        messages: messages to the user
+        edits: adds the edits of the demo as layers
+        open_file: opens a file according to its content
         context: the GL context
         queue: runs the demo's command
     """
 
-    def __init__(self, app: Application, context: moderngl.Context, queue: JobQueue) -> None:
-        self._app = app
-        self._store = app.store
+    def __init__(
+        self,
+        *,
+        store: Store,
+        documents: DocumentStore,
+        messages: Messages,
+        edits: EditActions,
+        open_file: Callable[[Path], None],
+        context: moderngl.Context,
+        queue: JobQueue,
+    ) -> None:
+        self._store = store
+        self._documents = documents
+        self._messages = messages
+        self._edits = edits
+        self._open_file = open_file
         self._context = context
         self._queue = queue
         self._textures: dict[Path, moderngl.Texture | None] = {}
         self._demo: Path | None = None  # its folder while it is being made
-        self._edits = EditActions(app)
         self._added: dict[Path, tuple[Path, int]] = {}  # per edit folder: the open file and its time in ns
 
     @property
@@ -78,18 +96,18 @@ class StartActions:
         if self._demo is None:
             return None
         scene = self._demo / "scene.ply"
-        opened = self._app.document.path
+        opened = self._documents.get().path
         if opened is not None and opened.resolve() != scene:
             self._demo = None  # the user has opened another scene
             return None
         if opened is None and scene.is_file():
-            self._app.open(scene)
+            self._open_file(scene)
             work = self._store.get()
             view = replace(work.view, background=SKY)
             self._store.replace(replace(work, view=view, past=history.begin(view)))
-        folders = sorted(file.parent for file in self._demo.glob("*/*.gdf") if self._app.document.path)
+        folders = sorted(file.parent for file in self._demo.glob("*/*.gdf") if self._documents.get().path)
         for folder in dict.fromkeys(folders):
-            attempt(self._app.main_view, partial(self._show_edit, folder))
+            attempt(self._messages, partial(self._show_edit, folder))
         if not self._queue.busy(Delivery):
             self._demo = None
         return POLL_S
@@ -123,7 +141,7 @@ class StartActions:
         words = ("demo", "--quick", "--no-window", f"--out={folder}")
         log = self._queue.folder / "demo.log"
         self._queue.add(Delivery("Demo: four edits", folder, words, log, folder / "scene.ply"))
-        self._app.main_view.show_message("Making the demo's scene …")
+        self._messages.show("Making the demo's scene …")
 
     def _show_edit(self, folder: Path) -> None:
         """Show an edit of the demo: its draft first, then the finished file."""
@@ -144,12 +162,11 @@ class StartActions:
         copy = folder / Path(bundle).name
         if not copy.exists():
             write_file(copy, read_file(Path(bundle)))
-        self._app.open(copy)
+        self._open_file(copy)
 
     def _publish(self) -> None:
         """Update the files of the start page while it is open."""
-        main_view = self._app.main_view
-        if not main_view.at_start:
+        if not self._documents.get().is_empty:
             return
         recent = []
         for path in user_files.read_recent(missing=True):
@@ -163,7 +180,7 @@ class StartActions:
         updated = with_transient(work, start_files=tuple(recent), examples=tuple(examples))
         if updated != work:
             self._store.replace(updated)
-            main_view.wake()
+            self._store.wake()
 
     def _texture(self, path: Path) -> int:
         if path not in self._textures:
@@ -180,12 +197,15 @@ class UpActions:
     """Notice of a guessed up axis, and storage of the axis that the user sets.
 
     Args:
-        app: the window
+        store: state of the window
+        documents: the open document
+        messages: messages to the user
     """
 
-    def __init__(self, app: Application) -> None:
-        self._app = app
-        self._store = app.store
+    def __init__(self, *, store: Store, documents: DocumentStore, messages: Messages) -> None:
+        self._store = store
+        self._documents = documents
+        self._messages = messages
         self._looked = False  # the scene has been checked
         self._up: Vec3 | None = None  # the user's up axis at the last poll
 
@@ -195,8 +215,7 @@ class UpActions:
         Args:
             session: the open session, which stores the up axis
         """
-        main_view = self._app.main_view
-        document = self._app.document
+        document = self._documents.get()
         # The axis set by the user, also by undo; a film, a picture or a snapshot may move the camera.
         up = self._store.get().past.present.look.up
         before = self._up
@@ -209,7 +228,7 @@ class UpActions:
         if guess and up == document.detected_up.direction and self._store.get().message is None:
             name = up_axis.direction_name(torch.tensor(up)).upper().replace("-", "−")
             where = "Change it under the axes: Up axis."
-            main_view.show_message(f"Guessed {name} as up in {document.title}. {where}")
+            self._messages.show(f"Guessed {name} as up in {document.title}. {where}")
         self._looked = True
 
     def leave_scene(self) -> None:

@@ -1,0 +1,154 @@
+"""Assembly of the window's parts: each receives exactly the collaborators that it needs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from viewer.app.main_view import MainView
+from viewer.app.messages import Requests
+from viewer.files.document import DocumentStore
+
+from .deliver import DeliverActions
+from .edits import EditActions
+from .file_actions import FileActions, OpenDocument, WaitFor
+from .pictures import PictureActions
+from .preview import PreviewActions
+from .start import StartActions, UpActions
+from .strays import StrayActions
+from .tidy import TidyActions
+from .training import JobActions
+
+
+@dataclass(frozen=True)
+class WindowParts:
+    """Parts of one window."""
+
+    file_actions: FileActions
+    preview: PreviewActions
+    jobs: JobActions
+    deliver: DeliverActions
+    start: StartActions
+    up: UpActions
+    strays: StrayActions
+    tidy: TidyActions
+
+    @property
+    def requests(self) -> Requests:
+        """Handlers of the requests of all parts, by name."""
+        parts = (
+            self.file_actions,
+            self.jobs,
+            self.deliver,
+            self.start,
+            self.preview,
+            self.strays,
+            self.tidy,
+        )
+        return {name: act for part in parts for name, act in part.requests.items()}
+
+    @property
+    def polls(self) -> tuple[Callable[[], float | None], ...]:
+        """Functions that poll a part and return the seconds until the next poll, None for never."""
+        parts = (self.jobs, self.preview, self.start, self.strays)
+        return (
+            *(part.poll for part in parts),
+            self.file_actions.poll_dialog,
+            lambda: self.up.poll(self.file_actions.path),
+        )
+
+    @property
+    def closers(self) -> tuple[Callable[[], None], ...]:
+        """Functions that free the resources of a part, in the order of their calls."""
+        parts = (self.start, self.preview, self.strays, self.jobs)
+        return (*(part.close for part in parts), self.file_actions.release)
+
+    def leave_scene(self) -> None:
+        """Reset the state of the old scene after another one was opened."""
+        for part in (self.jobs, self.preview, self.up, self.tidy):
+            part.leave_scene()
+
+
+def make_parts(
+    *,
+    main_view: MainView,
+    documents: DocumentStore,
+    open_document: OpenDocument,
+    wait_for: WaitFor,
+    leave: Callable[[], None],
+    session: Path | None,
+) -> WindowParts:
+    """Return the parts of a window.
+
+    Args:
+        main_view: the window's content, whose state the parts share
+        documents: the open document
+        open_document: replaces the open scene by another
+        wait_for: runs work in another thread while the window shows a text
+        leave: closes the window without a question
+        session: the session's file; None before it has one
+    """
+    store = main_view.store
+    messages = main_view.messages
+
+    def picture_size() -> tuple[int, int]:
+        return main_view.picture_size
+
+    edits = EditActions(store=store, documents=documents, messages=messages)
+    pictures = PictureActions(
+        store=store,
+        documents=documents,
+        messages=messages,
+        context=main_view.context,
+        picture_size=picture_size,
+    )
+    file_actions = FileActions(
+        store=store,
+        documents=documents,
+        messages=messages,
+        edits=edits,
+        pictures=pictures,
+        open_document=open_document,
+        wait_for=wait_for,
+        leave=leave,
+        path=session,
+    )
+    preview = PreviewActions(
+        store=store,
+        documents=documents,
+        messages=messages,
+        context=main_view.context,
+        picture_size=picture_size,
+        save_original=main_view.save_original,
+    )
+    jobs = JobActions(
+        store=store,
+        documents=documents,
+        messages=messages,
+        edits=edits,
+        open_file=file_actions.open,
+        decal_place=main_view.decal_place,
+        draft=preview.draft,
+        anchor=preview.anchor,
+        follow=preview.follow_anchor,
+    )
+    start = StartActions(
+        store=store,
+        documents=documents,
+        messages=messages,
+        edits=edits,
+        open_file=file_actions.open,
+        context=main_view.context,
+        queue=jobs.queue,
+    )
+    return WindowParts(
+        file_actions=file_actions,
+        preview=preview,
+        jobs=jobs,
+        deliver=DeliverActions(store=store, documents=documents, messages=messages, queue=jobs.queue),
+        start=start,
+        up=UpActions(store=store, documents=documents, messages=messages),
+        strays=StrayActions(store=store, documents=documents, messages=messages),
+        tidy=TidyActions(store=store, documents=documents, edits=edits),
+    )

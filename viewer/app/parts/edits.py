@@ -1,0 +1,144 @@
+"""Changes of the layer stack from files: edits are added, finished, duplicated and replaced."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from progdf.errors import ProgdfError
+from progdf.gdf.file import Gdf, fingerprint, load_gdf
+from progdf.region import Region, from_mask
+from progdf.threads import all_threads
+from viewer.app.messages import Messages
+from viewer.files.document import DocumentStore
+from viewer.files.user_files import parse_path
+from viewer.state import selection
+from viewer.state.facts import describe_applied
+from viewer.state.layers import add_layer, duplicate_layer, replace_edit
+from viewer.state.view_state import ViewState
+from viewer.state.workspace import Store, focus_layer
+
+
+class EditActions:
+    """Changes of the layer stack that can be undone.
+
+    Args:
+        store: state of the window
+        documents: the open document
+        messages: messages to the user
+    """
+
+    def __init__(self, *, store: Store, documents: DocumentStore, messages: Messages) -> None:
+        self._store = store
+        self._documents = documents
+        self._messages = messages
+
+    def add(self, path: Path, name: str = "", strength: float = 1.0, deselect: bool = False) -> None:
+        """Add an edit on top, see `add_layer`.
+
+        A grade of another scene, or of none, is applied to the selection, or everywhere if nothing is
+        selected.
+
+        Args:
+            name: name of the layer, "" for the edit's name
+
+        Raises:
+            ProgdfError: the file is missing or broken, or it is not a grade and was made for another scene.
+        """
+        before = self._store.get().view
+        scene = self._documents.get().original
+        selected = selection.unpack(before.selection.members, len(scene)).copy()
+        where, mask = ("selection", selected) if selected.any() else ("all", np.ones(len(scene), bool))
+        gdf = self._load(path, from_mask(where, torch.from_numpy(mask)))
+        gdf = replace(gdf, name=name or gdf.name)
+        if deselect:
+            before = replace(before, selection=selection.select_none(before.selection))
+        view = add_layer(before, self._open(gdf, path), gdf.name, strength)
+        self._apply(view, len(view.layers) - 1)
+
+    def finish(self, draft: Path, path: Path) -> bool:
+        """Replace a draft by its trained edit in every layer and history entry; return True if a layer uses
+        it.
+
+        The state does not change: strength, gains, paint, order, selection and undo history stay.
+
+        Raises:
+            ProgdfError: see `add`.
+        """
+        document = self._documents.get()
+        view = self._store.get().view
+        drafts = [i for i, known in enumerate(document.gdf_paths) if known == draft]
+        if not drafts:
+            return False
+        gdf = self._load(path, document.edits[drafts[0]].region)
+        gdfs = list(document.edits)
+        paths = list(document.gdf_paths)
+        for i in drafts:
+            if not torch.equal(gdf.region.members, gdfs[i].region.members):
+                return False
+            gdfs[i] = replace(gdf, name=gdfs[i].name)
+            paths[i] = path
+        self._documents.replace(replace(document, edits=tuple(gdfs), gdf_paths=tuple(paths)))
+        return any(layer.gdf in drafts for layer in view.layers)
+
+    def duplicate(self, index: int) -> None:
+        """Add a copy of a layer above it, with its own edit, as the timeline and undo distinguish edits."""
+        document = self._documents.get()
+        view = self._store.get().view
+        gdf = view.layers[index].gdf
+        path = document.gdf_paths[gdf] if gdf < len(document.gdf_paths) else None
+        self._apply(duplicate_layer(view, index, self._open(document.edits[gdf], path)), index + 1)
+
+    def replace(self, layer: int | None, path: str) -> None:
+        """Replace a layer's edit; a grade of another scene, or of none, takes the layer's region.
+
+        Raises:
+            ProgdfError: see `add`.
+        """
+        view = self._store.get().view
+        index = self.layer(layer)
+        file = parse_path(path)
+        gdf = self._load(file, self._documents.get().edits[view.layers[index].gdf].region)
+        self._apply(replace_edit(view, index, self._open(gdf, file), gdf.name), index)
+
+    def layer(self, index: int | None) -> int:
+        """Return the layer of a request: the given index, or the focused layer for None.
+
+        Raises:
+            ProgdfError: there is no such layer.
+        """
+        work = self._store.get()
+        chosen = work.focus if index is None else index
+        if chosen is None or not 0 <= chosen < len(work.view.layers):
+            raise ProgdfError("no layer is selected; click one first")
+        return chosen
+
+    def _load(self, path: Path, region: Region) -> Gdf:
+        """Load an edit of the scene, or a grade of another scene applied to a region."""
+        scene = self._documents.get().original
+
+        def place(stored: Gdf) -> Region | None:
+            return region if stored.field.kind == "grade" and stored.scene != fingerprint(scene) else None
+
+        with all_threads():
+            gdf = load_gdf(path, scene, place=place)
+        if note := describe_applied(gdf):
+            self._messages.show(note)
+        return gdf
+
+    def _open(self, gdf: Gdf, path: Path | None) -> int:
+        """Open one more edit and return its index."""
+        document = self._documents.get()
+        renamed = replace(gdf, name=document.free_name(gdf.name))
+        has_paths = path is not None and len(document.gdf_paths) == len(document.edits)
+        paths = (*document.gdf_paths, path) if has_paths and path is not None else ()
+        self._documents.replace(replace(document, edits=(*document.edits, renamed), gdf_paths=paths))
+        return len(document.edits)
+
+    def _apply(self, view: ViewState, focus: int) -> None:
+        """Set the changed stack and focus one layer."""
+        self._store.change(view)
+        self._store.replace(focus_layer(self._store.get(), focus))

@@ -1,0 +1,86 @@
+"""Strays of a capture: found in another thread and hidden, on request."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+
+from progdf.gaussians import Gaussians
+from progdf.metrics.image import NO_DIFFERENCE
+from progdf.scene.strays import Strays, clean, find_strays, picture_difference
+from progdf.terminal import group_digits
+from viewer.app.messages import Messages, Requests
+from viewer.files.document import DocumentStore
+from viewer.state import selection
+from viewer.state.workspace import Store
+from viewer.ui.keys import shortcut
+
+_POLL_S = 0.1
+
+
+class StrayActions:
+    """Search for strays, which are then hidden, on request. `close` it with the window.
+
+    Strays are Gaussians that a capture leaves outside the scene's surfaces.
+
+    Args:
+        store: state of the window
+        documents: the open document
+        messages: messages to the user
+    """
+
+    def __init__(self, *, store: Store, documents: DocumentStore, messages: Messages) -> None:
+        self._store = store
+        self._documents = documents
+        self._messages = messages
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="strays")
+        self._search: Future[tuple[Strays, float]] | None = None
+        self._scene: Gaussians | None = None  # the scene being searched
+
+    @property
+    def requests(self) -> Requests:
+        """Handlers of the requests about strays, by name."""
+        return {"hide_strays": self._begin}
+
+    def _begin(self, _: None) -> None:
+        """Start the search for strays, which takes seconds."""
+        if self._search is None:
+            self._scene = self._documents.get().original
+            self._search = self._worker.submit(_search, self._scene)
+            self._messages.show("Looking for strays …")
+
+    def poll(self) -> float | None:
+        """Hide the strays found; return the seconds until the next poll, None for never."""
+        if self._search is None:
+            return None
+        if not self._search.done():
+            return _POLL_S
+        search = self._search
+        self._search = None
+        if self._scene is self._documents.get().original:  # else another scene was opened meanwhile
+            self._hide(*search.result())
+        return None
+
+    def close(self) -> None:
+        """Cancel a search that is still running."""
+        self._worker.shutdown(wait=False, cancel_futures=True)
+
+    def _hide(self, strays: Strays, db: float) -> None:
+        count = len(self._documents.get().scene)
+        if not len(strays.rows):
+            self._messages.show("No strays found")
+            return
+        view = self._store.get().view
+        mask = np.zeros(count, bool)
+        mask[strays.rows] = True
+        self._store.change(replace(view, selection=selection.hide(view.selection, mask)))
+        change = "no pixel differs" if db >= NO_DIFFERENCE else f"{db:.1f} dB to the earlier pictures"
+        hid = f"Hid {group_digits(len(strays.rows))} strays ({strays.describe()})"
+        self._messages.show(f"{hid}: {change}; {shortcut('show_all')} shows them")
+
+
+def _search(scene: Gaussians) -> tuple[Strays, float]:
+    strays = find_strays(scene)
+    return strays, picture_difference(scene, clean(scene, strays))[0] if len(strays.rows) else NO_DIFFERENCE
