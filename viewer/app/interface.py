@@ -22,7 +22,6 @@ from viewer.ui.pointer import PointerContext
 from viewer.ui.widgets import elide, menu, search_field
 
 from . import mouse, select_tool
-from .mouse import MouseTool
 
 MOUSE_HELP = (
     ("Left drag", "Orbit"),
@@ -309,18 +308,14 @@ def draw_pill(
 def over_picture(
     work: Workspace,
     pointer: PointerContext,
-    held: MouseTool,
     labels: Labels,
     original: bool,
-    at: tuple[float, float] | None,
 ) -> Workspace:
     """Draw the brush, the comparison, the keys and the message, which disappears after its time.
 
     Args:
-        held: the active mouse drag
         labels: labels of the comparison on screen
         original: the original is visible
-        at: pointer position set by keys
     """
     area = pointer.area
     ui = pointer.ui
@@ -329,13 +324,14 @@ def over_picture(
     on_axes = not io.want_capture_mouse and bool(overlay.axis_under(view, area, ui))
     if view.brush.active and not (io.want_capture_mouse or io.key_alt or on_axes):
         tools.draw_ring(view, ui)
-    overlay.draw_axes(view, area, on_axes or held.drag == overlay.AXES_DRAG, ui)
-    select_tool.draw_strokes(held.strokes, work, pointer)
-    select_tool.draw_gesture(held.gesture, view, ui, pointer.left)
+    overlay.draw_axes(view, area, on_axes or work.transient.tool.drag == overlay.AXES_DRAG, ui)
+    select_tool.draw_strokes(work, pointer)
+    select_tool.draw_gesture(work.transient.tool.gesture, view, ui, pointer.left)
+    at = work.transient.pointer.at
     if at is not None:
         overlay.draw_cross(at, ui)
     if not original:
-        mouse.draw_comparison(view, area, mouse.grips_divider(held, view, pointer), ui)
+        mouse.draw_comparison(view, area, mouse.grips_divider(work, pointer), ui)
     if not view.panel and (original or view.compare.mode != "off"):
         work = draw_pill(work, pointer, (labels, original), 0.0)[0]
     free = imgui.get_io().display_size

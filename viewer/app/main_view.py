@@ -26,7 +26,7 @@ from viewer.state import actions, layer_selection, timeline, workspace
 from viewer.state.commands import Action, Plain, WithValue
 from viewer.state.layers import add_layer
 from viewer.state.snapshots import SliderSnapshot, compare_sides
-from viewer.state.transient import Decal, Gizmo, KeyPointer, PreviewState
+from viewer.state.transient import Decal, Gizmo, KeyPointer, MouseTool, PreviewState
 from viewer.state.view_state import LayerState, ViewState
 from viewer.state.workspace import PLACES, SceneFacts, Store, Workspace, with_transient
 from viewer.ui import overlay
@@ -49,7 +49,6 @@ from . import interface, mouse, select_tool
 from .canvas import Canvas
 from .handles import decal_takes_mouse, draw_decal, draw_gizmo, gizmo_takes_mouse, place_decal
 from .messages import Messages
-from .mouse import MouseTool
 
 SETTLE_FRAMES = 3  # imgui needs a frame or two until hovering and layout follow an event
 LINGER_S = 0.65
@@ -136,7 +135,6 @@ class MainView:
         self.store = Store(workspace.new_workspace(view), self.wake)
         self.messages = Messages(self.store, lambda: self._clock)
         self.frames = 0  # number of frames drawn
-        self._tool = MouseTool()
         # the layer shown in the panel, and whether several are selected
         self._revealed = (self.work.focus, False)
         self._keys = NO_KEYS  # keys of the current frame
@@ -182,11 +180,10 @@ class MainView:
         """Set a new state and snapshots, with an empty undo history, no active drag and nothing over the
         picture."""
         old = self.work.transient
-        transient = replace(old, cover=None, preview=PreviewState(), gizmo=None)
+        transient = replace(old, cover=None, preview=PreviewState(), gizmo=None, tool=MouseTool())
         self.store.replace(
             replace(workspace.new_workspace(view, snapshots), layout=self.work.layout, transient=transient)
         )
-        self._tool = MouseTool()
         self.wake()
 
     def next_frame_delay(self) -> float | None:
@@ -256,7 +253,7 @@ class MainView:
         self._keys = self._pending.take(keys)
         self._handle_input(seconds)
         self._held = bool(imgui.is_any_item_active())
-        held = self._held or self._tool.drag is not None
+        held = self._held or self.work.transient.tool.drag is not None
         if not (held or is_repeating(keys) or is_flying(self._keys)):
             self.store.replace(workspace.record_undo(self.work))
         if self.work.view.layers != before.view.layers:
@@ -293,16 +290,13 @@ class MainView:
         return overlay.Area(max(display.x - wide, 1.0), max(display.y, 1.0))
 
     def _handle_input(self, seconds: float) -> None:
-        off = cancels_drag(self._keys, self._held, self._tool.drag)
+        off = cancels_drag(self._keys, self._held, self.work.transient.tool.drag)
         if off:
             self._cancel_drag()
         asks = self._takes_keys()
         self._follow_keyboard(asks)
         if not asks:
-            gesture, work, self._keys = select_tool.take_keys(
-                self._tool.gesture, self.work, self._pointer(), self._keys
-            )
-            self._tool = replace(self._tool, gesture=gesture)
+            work, self._keys = select_tool.take_keys(self.work, self._pointer(), self._keys)
             self.store.replace(work)
         self._point_by_keys(asks)
         if asks:  # no key is a shortcut or flies
@@ -331,15 +325,13 @@ class MainView:
                 compared = self.canvas.comparer.labels(self.work.view), self.work.before
                 self.store.replace(interface.panels(self.work, self._pointer(), pictures, reveal, compared))
             self._revealed = self.work.focus, several
-        held = self._tool.drag is None and self._move_gizmo()
+        held = self.work.transient.tool.drag is None and self._move_gizmo()
         if not off and not held:  # else the right button was only pressed to cancel the drag
-            # dropped if it raises
-            tool = self._tool
+            work = self.work
             pointer = self._pointer()
-            self._tool = MouseTool()
+            self.store.replace(with_transient(work, tool=MouseTool()))  # the drag ends if it raises
             with self._guard():
-                self._tool, work = mouse.handle_mouse(tool, self.work, pointer)
-                self.store.replace(work)
+                self.store.replace(mouse.handle_mouse(work, pointer))
 
     def _point_by_keys(self, asks: bool) -> None:
         """Move the pointer of the active tool by keys."""
@@ -420,9 +412,8 @@ class MainView:
 
     def _cancel_drag(self) -> None:
         """Restore the state from before the drag and end the drag."""
-        self.store.replace(mouse.cancel_drag(self._tool, self.work))
-        self._tool = MouseTool()
-        self.store.replace(with_transient(self.work, pointer=mouse.let_go(self.work.transient.pointer)))
+        work = mouse.cancel_drag(self.work)
+        self.store.replace(with_transient(work, pointer=mouse.let_go(work.transient.pointer)))
         imgui.internal.clear_active_id()
         self._keys = replace(self._keys, pressed=())
 
@@ -433,7 +424,7 @@ class MainView:
     def _pointer(self) -> PointerContext:
         """Return the context of the pointer: scene, area and displayed view."""
         area = self._area()
-        if self._tool.drag is None:
+        if self.work.transient.tool.drag is None:
             self._half = int(2 * imgui.get_io().mouse_pos.x >= area.width)
         return PointerContext(
             self.engine,
@@ -461,7 +452,7 @@ class MainView:
             view = add_layer(view, layer.gdf, layer.name, layer.strength)
         # the live edit is theirs, not from training
         moved = self.work.form_open or transient.gizmo is not None
-        if transient.live and moved and self._tool.gesture is None:
+        if transient.live and moved and transient.tool.gesture is None:
             view = replace(view, select=replace(view.select, tool=""))
         return view
 
@@ -475,7 +466,11 @@ class MainView:
 
     def _is_held(self) -> bool:
         """Return True if the user's input or a playing film moves the picture."""
-        if self._tool.drag is not None or imgui.is_any_item_active() or imgui.get_io().mouse_wheel:
+        if (
+            self.work.transient.tool.drag is not None
+            or imgui.is_any_item_active()
+            or imgui.get_io().mouse_wheel
+        ):
             return True
         moves = self.work.player.playing or self.work.glide is not None
         return moves or is_flying(self._keys) or is_repeating(self._keys)
@@ -499,8 +494,7 @@ class MainView:
             offered = pages.COMMANDS if self.at_start else [a for a, c in COMMANDS.items() if not c.in_hand]
             self.store.replace(interface.draw_lists(self.work, pointer, offered, pressed))
         labels = self.canvas.comparer.labels(self.work.view)
-        at = self.work.transient.pointer.at
-        self.store.replace(interface.over_picture(self.work, pointer, self._tool, labels, original, at))
+        self.store.replace(interface.over_picture(self.work, pointer, labels, original))
         gone = (before.dialog, self.work.dialog), (before.message, self.work.message)
         if any(was is not None and now is None for was, now in gone):
             self.wake()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from imgui_bundle import imgui
 
@@ -14,10 +14,9 @@ from viewer.render.picking import layer_at, seen_at, surface_point
 from viewer.state import paint, workspace
 from viewer.state.commands import MovePointer
 from viewer.state.layers import with_paint
-from viewer.state.paint import Stroke
-from viewer.state.transient import KeyPointer
-from viewer.state.view_state import Brush, SelectTool, ViewState
-from viewer.state.workspace import Workspace
+from viewer.state.transient import KeyPointer, MouseTool
+from viewer.state.view_state import ViewState
+from viewer.state.workspace import Workspace, with_tool, with_transient
 from viewer.ui import overlay
 from viewer.ui.context import PALETTE, UiContext, u32
 from viewer.ui.keys import TOOL_KEYS, Keys, any_button_down, has_pending_input, modifier, started_drag
@@ -25,7 +24,6 @@ from viewer.ui.overlay import Area
 from viewer.ui.pointer import PointerContext
 
 from . import select_tool
-from .select_tool import Click, Gesture, Strokes
 
 REACH_PX = 8.0  # at 1×: the mouse grips the divider within this distance
 DIVIDER = "divider"
@@ -73,23 +71,6 @@ def _knob(x: float, y: float, held: bool, ui: UiContext) -> None:
 
 
 CLICK_PX = 3.0  # at 1×: a press that moves no further is a click
-
-
-@dataclass(frozen=True)
-class MouseTool:
-    """Active mouse drag and gesture."""
-
-    # one of `keys.DRAGS`, `DIVIDER`, `PAINT_DRAG`, `SELECT_DRAG` or `AXES_DRAG`; None without a drag
-    drag: str | None = None
-    stroke: Stroke | None = None  # brush stroke, from its first drag on
-    gesture: Gesture | None = None  # gesture of a selection tool; for a polygon also between its clicks
-    # the last click of a tool that selects by one click, while it follows the tool's tolerance
-    click: Click | None = None
-    strokes: tuple[Strokes, ...] = ()  # strokes that a tool spreads, one entry per change
-    divider: float = 0.5  # divider before the drag, fraction of the picture's width
-    axis: str = ""  # the pressed end of an axis, of `AXES`, or another part of the axes
-    # settings of the selection tool and the brush before a button was pressed
-    settings: tuple[SelectTool, Brush] | None = None
 
 
 def point_by_keys(
@@ -140,61 +121,63 @@ def let_go(held: KeyPointer) -> KeyPointer:
     return replace(held, down=False)
 
 
-def handle_mouse(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[MouseTool, Workspace]:
+def handle_mouse(work: Workspace, pointer: PointerContext) -> Workspace:
     """Handle the mouse input of this frame from imgui's io."""
-    io = imgui.get_io()
-    tool, work = _drag(tool, work, pointer)
-    click, work = select_tool.adjust(tool.click, work, pointer)
-    tool = replace(tool, click=click)
+    work = _handle_release(select_tool.adjust(_drag(work, pointer), pointer), pointer)
+    return work if imgui.get_io().want_capture_mouse else _handle_press(work, pointer)
+
+
+def _handle_release(work: Workspace, pointer: PointerContext) -> Workspace:
+    """End the drag of a released button."""
+    tool = work.transient.tool
     if imgui.is_mouse_released(0) and tool.drag in ("orbit", "look") and not _has_traveled(pointer.ui):
         work = _focus_picked_layer(work, pointer)
     if tool.drag == select_tool.SELECT_DRAG and imgui.is_mouse_released(0) and tool.gesture is not None:
-        strokes = tool.strokes
-        held = tool.gesture
-        if held.tool == "scribble":
-            strokes, work = select_tool.spread(strokes, held, work, pointer)
-        gesture, work = select_tool.release(held, work, pointer)
-        tool = replace(tool, gesture=gesture, strokes=strokes)
+        work = select_tool.release(tool.gesture, work, pointer)
     if tool.drag == overlay.AXES_DRAG and imgui.is_mouse_released(0) and not _has_traveled(pointer.ui):
         work = _look_along(work, tool.axis)
-    if not any_button_down():
-        tool = replace(tool, drag=None, settings=(work.view.select, work.view.brush))
-    if io.want_capture_mouse:
-        return tool, work
-    if grips_divider(tool, work.view, pointer):
+    if any_button_down():
+        return work
+    return with_tool(work, drag=None, settings=(work.view.select, work.view.brush))
+
+
+def _handle_press(work: Workspace, pointer: PointerContext) -> Workspace:
+    """Begin the drag or gesture of a pressed button, or zoom by the wheel."""
+    io = imgui.get_io()
+    if grips_divider(work, pointer):
         imgui.set_mouse_cursor(imgui.MouseCursor_.resize_ew.value)
         if imgui.is_mouse_clicked(0):
-            return replace(tool, drag=DIVIDER, divider=work.view.compare.divider), work
+            return with_tool(work, drag=DIVIDER, divider=work.view.compare.divider)
     axis = overlay.axis_under(work.view, pointer.area, pointer.ui)
     plain = not io.key_alt
     if axis and imgui.is_mouse_clicked(0):
-        return replace(tool, drag=overlay.AXES_DRAG, axis=axis), work
+        return with_tool(work, drag=overlay.AXES_DRAG, axis=axis)
     if work.form_open and work.form.picks and plain and imgui.is_mouse_clicked(0):
-        return replace(tool, drag=select_tool.SELECT_DRAG), select_tool.pick_color(work, pointer)
+        return with_tool(select_tool.pick_color(work, pointer), drag=select_tool.SELECT_DRAG)
     if work.view.brush.active and plain and imgui.is_mouse_clicked(0):
-        return _begin_stroke(tool, work, pointer)
+        return _begin_stroke(work, pointer)
     if work.view.select.tool in ("flood", "color") and plain and imgui.is_mouse_clicked(0):
-        click, work = select_tool.click(work, pointer)
-        return MouseTool(select_tool.SELECT_DRAG, click=click), work
+        return select_tool.click(work, pointer)
     if work.view.select.tool and plain and imgui.is_mouse_clicked(0):
-        gesture, work = select_tool.press(tool.gesture, work, pointer)
-        return replace(tool, drag=select_tool.SELECT_DRAG, gesture=gesture), work
+        return with_tool(select_tool.press(work, pointer), drag=select_tool.SELECT_DRAG)
     camera = work.view.camera
     if imgui.is_mouse_double_clicked(0):
-        return tool, workspace.with_camera(work, _pick_pivot(camera, pointer))
-    tool = replace(tool, drag=started_drag(camera.mode) or tool.drag)
+        return workspace.with_camera(work, _pick_pivot(camera, pointer))
+    if drag := started_drag(camera.mode):
+        work = with_tool(work, drag=drag)
     if io.mouse_wheel:
         work = workspace.with_camera(work, controls.zoom(camera, io.mouse_wheel, pointer.facts.bounds.radius))
-    return tool, work
+    return work
 
 
-def cancel_drag(tool: MouseTool, work: Workspace) -> Workspace:
-    """Restore the state from before the drag.
+def cancel_drag(work: Workspace) -> Workspace:
+    """End the drag and restore the state from before it.
 
     Edits come back from the undo history. Settings of the tools and the divider are not edits and come back
-    from `tool`.
+    from the `MouseTool`.
     """
-    work = workspace.cancel_drag(work)
+    tool = work.transient.tool
+    work = with_transient(workspace.cancel_drag(work), tool=MouseTool())
     if tool.settings is not None:
         select, brush_settings = tool.settings
         work = replace(work, view=replace(work.view, select=select, brush=brush_settings))
@@ -203,10 +186,12 @@ def cancel_drag(tool: MouseTool, work: Workspace) -> Workspace:
     return replace(work, view=place_divider(work.view, tool.divider))
 
 
-def grips_divider(tool: MouseTool, view: ViewState, pointer: PointerContext) -> bool:
+def grips_divider(work: Workspace, pointer: PointerContext) -> bool:
     """Return True if the divider of a split is dragged or under the mouse."""
-    if tool.drag is not None:
-        return tool.drag == DIVIDER
+    view = work.view
+    drag = work.transient.tool.drag
+    if drag is not None:
+        return drag == DIVIDER
     mouse = imgui.get_io().mouse_pos
     area = pointer.area
     within = abs(mouse.x - view.compare.divider * area.width) <= REACH_PX * pointer.ui.scale
@@ -214,58 +199,57 @@ def grips_divider(tool: MouseTool, view: ViewState, pointer: PointerContext) -> 
     return view.compare.mode == "split" and within and not over
 
 
-def _drag(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[MouseTool, Workspace]:
+def _drag(work: Workspace, pointer: PointerContext) -> Workspace:
     """Apply this frame's mouse movement to the active drag."""
     io = imgui.get_io()
+    tool = work.transient.tool
     scale = pointer.ui.scale
     dx = io.mouse_delta.x / scale
     dy = io.mouse_delta.y / scale
     if tool.drag == DIVIDER:
-        return tool, replace(work, view=place_divider(work.view, io.mouse_pos.x / pointer.area.width))
+        return replace(work, view=place_divider(work.view, io.mouse_pos.x / pointer.area.width))
     if tool.drag == tools.PAINT_DRAG:
-        return _paint(tool, work, pointer)
+        return _paint(work, pointer)
     if tool.drag == select_tool.SELECT_DRAG:
-        if tool.gesture is None:
-            return tool, work
-        gesture, work = select_tool.follow(tool.gesture, work, pointer)
-        return replace(tool, gesture=gesture), work
+        return work if tool.gesture is None else select_tool.follow(tool.gesture, work, pointer)
     if tool.drag == overlay.AXES_DRAG:
         camera = work.view.camera
         turned = controls.orbit(camera, dx, dy) if _has_traveled(pointer.ui) else camera
-        return tool, workspace.with_camera(work, turned)
+        return workspace.with_camera(work, turned)
     if tool.drag and (dx or dy):
         # also if the button went up within this frame: a slow frame must not lose the end of a drag
         height = pointer.scale * pointer.area.height / scale
         radius = pointer.facts.bounds.radius
         lens = pointer.shown.camera.fov_y  # a safe frame widens the view beyond the camera's own angle
         camera = controls.drag(replace(work.view.camera, fov_y=lens), tool.drag, dx, dy, height, radius)
-        return tool, workspace.with_camera(work, replace(camera, fov_y=work.view.camera.fov_y))
-    return tool, work
+        return workspace.with_camera(work, replace(camera, fov_y=work.view.camera.fov_y))
+    return work
 
 
-def _begin_stroke(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[MouseTool, Workspace]:
+def _begin_stroke(work: Workspace, pointer: PointerContext) -> Workspace:
     """Begin a brush stroke on the focused layer, or show why it cannot be painted."""
     reason = tools.paint_obstacle(work.view, work.focus)
     if reason or work.focus is None:
-        return tool, workspace.with_message(work, f"Cannot paint: {reason}", pointer.now, error=True)
+        return workspace.with_message(work, f"Cannot paint: {reason}", pointer.now, error=True)
     layer = work.view.layers[work.focus]
     brush = work.view.brush
     mode = paint.mode_while(brush.mode, modifier())
     gdf = pointer.engine.gdfs[layer.gdf]
     stroke = paint.begin_stroke(layer.paint, gdf, pointer.surface, brush.through, mode)
-    return _paint(MouseTool(tools.PAINT_DRAG, stroke), work, pointer)
+    return _paint(with_transient(work, tool=MouseTool(tools.PAINT_DRAG, stroke)), pointer)
 
 
-def _paint(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[MouseTool, Workspace]:
+def _paint(work: Workspace, pointer: PointerContext) -> Workspace:
     """Extend the brush stroke to the cursor and show the result at once."""
     view = work.view
     focus = work.focus
-    if tool.stroke is None or focus is None:
-        return tool, work
+    begun_stroke = work.transient.tool.stroke
+    if begun_stroke is None or focus is None:
+        return work
     density = imgui.get_io().display_framebuffer_scale.x * pointer.ui.scale
-    stroke = paint.extend_stroke(tool.stroke, *pointer.cursor, view.brush, density)
+    stroke = paint.extend_stroke(begun_stroke, *pointer.cursor, view.brush, density)
     painted = with_paint(view, focus, paint.apply_stroke(stroke, view.brush, density))
-    return replace(tool, stroke=stroke), replace(work, view=painted)
+    return with_tool(replace(work, view=painted), stroke=stroke)
 
 
 def _has_traveled(ui: UiContext) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -14,7 +14,6 @@ from progdf.color.oklab import oklab_to_srgb
 from progdf.scene.neighbors import Neighborhood, grow_along_surface
 from progdf.scene.scribbles import Rows
 from progdf.scene.selection import (
-    Centers,
     Mask,
     Surface,
     alike_in_color,
@@ -26,12 +25,12 @@ from progdf.scene.selection import (
     inside_stroke,
     project_centers,
 )
-from viewer.camera.view_camera import Vec3
 from viewer.render.picking import PixelGaussians, seen_at, surface_point
 from viewer.state import history, selection
 from viewer.state.forms import with_color
+from viewer.state.transient import Brushed, Click, Gesture, MouseTool, Point, Strokes
 from viewer.state.view_state import ViewState
-from viewer.state.workspace import Workspace, original
+from viewer.state.workspace import Workspace, original, with_tool, with_transient
 from viewer.ui.context import PALETTE, UiContext, u32
 from viewer.ui.keys import Keys
 from viewer.ui.pointer import PointerContext
@@ -40,58 +39,6 @@ _STROKE_PX = 4.0  # at 1×: half a stroke's width
 _MAX_PLACES = 16  # sampled positions
 _MAX_DOTS = 300  # dots
 _MIN_SEED_SHARE = 0.1  # a seed contributes at least this fraction of a pixel's color
-
-Point = tuple[float, float]
-
-
-@dataclass(frozen=True)
-class Brushed:
-    """Gaussians that a brush can reach, and those it has touched."""
-
-    centers: Centers  # centers of all Gaussians
-    reachable: Mask  # Gaussians that are not occluded, or all. [N]
-    touched: Mask  # Gaussians touched so far. [N]
-
-
-@dataclass(frozen=True)
-class Gesture:
-    """Selection gesture in progress."""
-
-    tool: str  # one of `SELECT_TOOLS`
-    mode: str  # one of `SELECT_MODES`
-    before: bytes  # selection before the gesture, packed
-    path: tuple[Point, ...]  # pointer positions, pixels of the picture; the corners of a polygon
-    brushed: Brushed | None = None  # state of a brush
-    center: Vec3 | None = None  # center of a sphere, world units
-    scale: float = 0.0  # world units per pixel at the center
-
-    @property
-    def radius(self) -> float:
-        """Radius of a sphere, world units."""
-        return self.scale * float(np.hypot(*np.subtract(self.path[-1], self.path[0])))
-
-
-@dataclass(frozen=True)
-class Strokes:
-    """Scribbles on an object and next to it."""
-
-    on: Rows  # Gaussians under strokes on the object
-    beside: Rows  # Gaussians under strokes next to it
-    after: bytes  # selection afterwards, packed
-
-
-@dataclass(frozen=True)
-class Click:
-    """Click of "flood" or "color", which follows its tolerance until something else is selected."""
-
-    tool: str  # "flood" or "color"
-    mode: str  # one of `SELECT_MODES`
-    before: bytes  # selection before the click, packed
-    at: Point  # pixels of the picture
-    surface: Surface  # surface of the scene on screen at the click
-    options: tuple[float, bool]  # tolerance and depth of the last selection
-    after: bytes  # selection afterwards, packed
-    recorded: bytes  # selection in the undo history, packed
 
 
 def begin(tool: str, mode: str, before: bytes, at: Point, surface: Surface, through: bool) -> Gesture | None:
@@ -119,7 +66,7 @@ def begin(tool: str, mode: str, before: bytes, at: Point, surface: Surface, thro
 
 
 def extend(gesture: Gesture, at: Point, radius: float) -> Gesture:
-    """Return the gesture after a move of the pointer.
+    """Return the gesture after a move of the pointer, an equal one if nothing changes.
 
     Args:
         radius: radius of a brush, pixels of the picture
@@ -129,7 +76,8 @@ def extend(gesture: Gesture, at: Point, radius: float) -> Gesture:
     if gesture.brushed is not None:
         brushed = gesture.brushed
         touched = inside_stroke(brushed.centers.points, (gesture.path[-1], at), radius) & brushed.reachable
-        gesture = replace(gesture, brushed=replace(brushed, touched=brushed.touched | touched))
+        if (touched & ~brushed.touched).any():
+            gesture = replace(gesture, brushed=replace(brushed, touched=brushed.touched | touched))
     return gesture if at == gesture.path[-1] else replace(gesture, path=(*gesture.path, at))
 
 
@@ -192,8 +140,6 @@ SELECT_DRAG = "select"
 _TRAVEL_PX = 3.0  # at 1×: a press that moves no further is a click
 _CLOSE_PX = 9.0  # at 1×: a click within this distance of a polygon's first corner closes it
 
-Held = tuple[Gesture | None, Workspace]
-
 
 def mode(chosen: str) -> str:
     """Return the mode that combines with the old selection: Shift adds, Ctrl subtracts, both intersect."""
@@ -203,24 +149,25 @@ def mode(chosen: str) -> str:
     return "subtract" if io.key_ctrl else chosen
 
 
-def press(gesture: Gesture | None, work: Workspace, pointer: PointerContext) -> Held:
+def press(work: Workspace, pointer: PointerContext) -> Workspace:
     """Handle a press of the left button over the picture."""
     view = work.view
     tool = work.view.select
+    gesture = work.transient.tool.gesture
     at = pointer.cursor
     if gesture is not None and gesture.tool == "polygon" == tool.tool:
         if imgui.is_mouse_double_clicked(0) or _is_near(gesture, pointer):
             return finish(gesture, work, pointer)
-        return replace(gesture, path=(*gesture.path, at)), work
+        return with_tool(work, gesture=replace(gesture, path=(*gesture.path, at)))
     begun_at = begin(tool.tool, mode(tool.mode), view.selection.members, at, pointer.surface, tool.through)
-    return (None, work) if begun_at is None else follow(begun_at, work, pointer)
+    return with_tool(work, gesture=None) if begun_at is None else follow(begun_at, work, pointer)
 
 
 CLICKED = ("flood", "color", "polygon")
 """Tools that need only clicks."""
 
 
-def click(work: Workspace, pointer: PointerContext) -> tuple[Click, Workspace]:
+def click(work: Workspace, pointer: PointerContext) -> Workspace:
     """Select similar Gaussians at a click of the left button over the picture."""
     tool = work.view.select
     before = work.view.selection.members
@@ -228,24 +175,27 @@ def click(work: Workspace, pointer: PointerContext) -> tuple[Click, Workspace]:
         tool.tool, mode(tool.mode), before, pointer.cursor, pointer.surface, (0.0, False), before, before
     )
     new_click, work = _click(new_click, work, pointer)
-    return replace(new_click, recorded=new_click.after), work
+    new_click = replace(new_click, recorded=new_click.after)
+    return with_transient(work, tool=MouseTool(SELECT_DRAG, click=new_click))
 
 
-def adjust(click: Click | None, work: Workspace, pointer: PointerContext) -> tuple[Click | None, Workspace]:
+def adjust(work: Workspace, pointer: PointerContext) -> Workspace:
     """Repeat the last click if its tolerance or depth has changed, merged into one change for undo.
 
-    Returns None as the click if the tool or the selection has changed since.
+    Drop the click if the tool or the selection has changed since.
     """
     tool = work.view.select
+    click = work.transient.tool.click
     if click is None or (tool.tool, work.view.selection.members) != (click.tool, click.after):
-        return None, work
+        return with_tool(work, click=None)
     past = work.past
     if past.past and past.present.edit.selection.members == click.after != click.recorded:
         if past.past[-1].edit.selection.members == click.recorded != click.before:
             work = replace(work, past=history.merge(past))
         click = replace(click, recorded=click.after)
-    same = click.options == (tool.tolerance, tool.through)
-    return (click, work) if same else _click(click, work, pointer)
+    if click.options != (tool.tolerance, tool.through):
+        click, work = _click(click, work, pointer)
+    return with_tool(work, click=click)
 
 
 def _click(click: Click, work: Workspace, pointer: PointerContext) -> tuple[Click, Workspace]:
@@ -257,44 +207,47 @@ def _click(click: Click, work: Workspace, pointer: PointerContext) -> tuple[Clic
     return replace(click, options=options, after=work.view.selection.members), work
 
 
-def follow(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Held:
+def follow(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Workspace:
     """Extend the gesture while the button is down; brush and sphere select at once."""
     if gesture.tool == "polygon":
-        return gesture, work
+        return with_tool(work, gesture=gesture)
     density = imgui.get_io().display_framebuffer_scale.x * pointer.ui.scale
     radius = _STROKE_PX if gesture.tool == "scribble" else work.view.select.radius
     gesture = extend(gesture, pointer.cursor, radius * density)
     if gesture.tool in ("brush", "sphere"):
         work = _apply(gesture, work, _selected_rows(gesture, work, pointer), pointer)
-    return gesture, work
+    return with_tool(work, gesture=gesture)
 
 
-def release(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Held:
+def release(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Workspace:
     """Handle the release of the left button; a polygon waits for its next corner."""
-    return (gesture, work) if gesture.tool == "polygon" else finish(gesture, work, pointer)
+    if gesture.tool == "polygon":
+        return work
+    if gesture.tool == "scribble":
+        work = spread(gesture, work, pointer)
+    return finish(gesture, work, pointer)
 
 
-def finish(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Held:
+def finish(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Workspace:
     """Finish the gesture. A click in place of a shape deselects in mode "new" and changes nothing in the
     others."""
+    work = with_tool(work, gesture=None)
     if gesture.tool not in ("box", "lasso", "polygon"):
-        return None, work
+        return work
     low = map(min, zip(*gesture.path, strict=True))
     high = map(max, zip(*gesture.path, strict=True))
     small = max(b - a for a, b in zip(low, high, strict=True)) <= _TRAVEL_PX * pointer.ui.scale
     if not small:
-        return None, _apply(gesture, work, _selected_rows(gesture, work, pointer), pointer)
-    return None, _with(work, selection.select_none(work.view.selection)) if gesture.mode == "new" else work
+        return _apply(gesture, work, _selected_rows(gesture, work, pointer), pointer)
+    return _with(work, selection.select_none(work.view.selection)) if gesture.mode == "new" else work
 
 
-def spread(
-    strokes: tuple[Strokes, ...], gesture: Gesture, work: Workspace, pointer: PointerContext
-) -> tuple[tuple[Strokes, ...], Workspace]:
+def spread(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Workspace:
     """Finish a scribble: select the Gaussians closer to the strokes on the object than to those next to it.
 
     Strokes count until something else is selected, and again if undo restores their selection.
     """
-    on, beside = strokes_of(strokes, work) or (np.zeros(0, np.int64),) * 2
+    on, beside = strokes_of(work) or (np.zeros(0, np.int64),) * 2
     touched = np.zeros(0, np.int64) if gesture.brushed is None else np.flatnonzero(gesture.brushed.touched)
     path = gesture.path[:: len(gesture.path) // _MAX_PLACES + 1]
     places = (seen_at(pointer.surface.scene, pointer.surface.camera, *at) for at in path)
@@ -309,30 +262,31 @@ def spread(
     if len(on) and len(beside):
         mask = pointer.facts.scribbles().select(on, beside)
     work = _with(work, selection.select(work.view.selection, mask))
-    return (*strokes, Strokes(on, beside, work.view.selection.members)), work
+    strokes = Strokes(on, beside, work.view.selection.members)
+    return with_tool(work, strokes=(*work.transient.tool.strokes, strokes))
 
 
-def strokes_of(strokes: tuple[Strokes, ...], work: Workspace) -> tuple[Rows, Rows] | None:
+def strokes_of(work: Workspace) -> tuple[Rows, Rows] | None:
     """Return the rows, on the object and next to it, of the strokes that led to the selection, or None."""
-    made = (each for each in reversed(strokes) if each.after == work.view.selection.members)
+    strokes = reversed(work.transient.tool.strokes)
+    made = (each for each in strokes if each.after == work.view.selection.members)
     return next(((each.on, each.beside) for each in made), None)
 
 
-def take_keys(
-    gesture: Gesture | None, work: Workspace, pointer: PointerContext, keys: Keys
-) -> tuple[Gesture | None, Workspace, Keys]:
+def take_keys(work: Workspace, pointer: PointerContext, keys: Keys) -> tuple[Workspace, Keys]:
     """Handle Enter, which closes a polygon in progress, and Escape, which drops it; return unused keys."""
     pressed = [press.chord for press in keys.pressed]
+    gesture = work.transient.tool.gesture
     if gesture is None or gesture.tool != "polygon" or imgui.get_io().want_text_input:
-        return gesture, work, keys
+        return work, keys
     if work.view.select.tool != "polygon":
-        return None, work, keys
+        return with_tool(work, gesture=None), keys
     if "Enter" in pressed:
-        gesture, work = finish(gesture, work, pointer)
+        work = finish(gesture, work, pointer)
     elif "Escape" in pressed:
-        gesture = None
+        work = with_tool(work, gesture=None)
     unused = tuple(press for press in keys.pressed if press.chord not in ("Enter", "Escape"))
-    return gesture, work, replace(keys, pressed=unused)
+    return work, replace(keys, pressed=unused)
 
 
 def _is_near(gesture: Gesture, pointer: PointerContext) -> bool:
@@ -360,9 +314,9 @@ _HALO = 3.0
 _LINE = 1.25
 
 
-def draw_strokes(strokes: tuple[Strokes, ...], work: Workspace, pointer: PointerContext) -> None:
+def draw_strokes(work: Workspace, pointer: PointerContext) -> None:
     """Draw the strokes as dots, green on the object and red next to it, from any camera."""
-    rows = strokes_of(strokes, work) if work.view.select.tool == "scribble" else None
+    rows = strokes_of(work) if work.view.select.tool == "scribble" else None
     if rows is None:
         return
     density = imgui.get_io().display_framebuffer_scale

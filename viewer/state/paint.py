@@ -30,7 +30,7 @@ FULL = ""
 Floats = NDArray[np.float32]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Stroke:
     """Brush stroke in progress."""
 
@@ -140,6 +140,9 @@ def extend_stroke(stroke: Stroke, x: float, y: float, brush: Brush, density: flo
         x, y: position in the picture, px
         brush: the brush, with its radius in pixels at 1×
         density: pixels of the picture per pixel at 1×
+
+    Returns:
+        The stroke; the same object if the brush rests and reaches nothing new.
     """
     here = np.array([x, y], np.float32)
     there = here if stroke.last is None else np.array(stroke.last, np.float32)
@@ -149,7 +152,10 @@ def extend_stroke(stroke: Stroke, x: float, y: float, brush: Brush, density: flo
     away = np.linalg.norm(places - there - along[:, None] * motion, axis=1) / (brush.radius * density)
     fall = np.clip((1.0 - away) / max(brush.softness, 1e-3), 0.0, 1.0)
     touch = np.nan_to_num(fall * fall * (3.0 - 2.0 * fall)).astype(np.float32)
-    return replace(stroke, reached=np.maximum(stroke.reached, touch), last=(x, y))
+    reached = np.maximum(stroke.reached, touch)
+    if stroke.last == (x, y) and np.array_equal(reached, stroke.reached):
+        return stroke
+    return replace(stroke, reached=reached, last=(x, y))
 
 
 def apply_stroke(stroke: Stroke, brush: Brush, density: float = 1.0) -> str:

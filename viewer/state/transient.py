@@ -1,4 +1,4 @@
-"""Transient state: overlays on the picture, tool pointer, recent files. It is neither undone nor saved."""
+"""Transient state: overlays on the picture, the pointer with its tool, recent files. Never undone or saved."""
 
 from __future__ import annotations
 
@@ -9,9 +9,12 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from viewer.camera.view_camera import ViewCamera
+from progdf.scene.scribbles import Rows
+from progdf.scene.selection import Centers, Mask, Surface
+from viewer.camera.view_camera import Vec3, ViewCamera
 
-from .view_state import LayerState
+from .paint import Stroke
+from .view_state import Brush, LayerState, SelectTool
 
 
 @dataclass(frozen=True)
@@ -72,6 +75,76 @@ class KeyPointer:
     down: bool = False  # a key holds its button down
 
 
+Point = tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Brushed:
+    """Gaussians that a brush can reach, and those it has touched."""
+
+    centers: Centers  # centers of all Gaussians
+    reachable: Mask  # Gaussians that are not occluded, or all. [N]
+    touched: Mask  # Gaussians touched so far. [N]
+
+
+@dataclass(frozen=True)
+class Gesture:
+    """Selection gesture in progress."""
+
+    tool: str  # one of `SELECT_TOOLS`
+    mode: str  # one of `SELECT_MODES`
+    before: bytes  # selection before the gesture, packed
+    path: tuple[Point, ...]  # pointer positions, pixels of the picture; the corners of a polygon
+    brushed: Brushed | None = None  # state of a brush
+    center: Vec3 | None = None  # center of a sphere, world units
+    scale: float = 0.0  # world units per pixel at the center
+
+    @property
+    def radius(self) -> float:
+        """Radius of a sphere, world units."""
+        return self.scale * float(np.hypot(*np.subtract(self.path[-1], self.path[0])))
+
+
+@dataclass(frozen=True, eq=False)
+class Strokes:
+    """Scribbles on an object and next to it."""
+
+    on: Rows  # Gaussians under strokes on the object
+    beside: Rows  # Gaussians under strokes next to it
+    after: bytes  # selection afterwards, packed
+
+
+@dataclass(frozen=True)
+class Click:
+    """Click of "flood" or "color", which follows its tolerance until something else is selected."""
+
+    tool: str  # "flood" or "color"
+    mode: str  # one of `SELECT_MODES`
+    before: bytes  # selection before the click, packed
+    at: Point  # pixels of the picture
+    surface: Surface  # surface of the scene on screen at the click
+    options: tuple[float, bool]  # tolerance and depth of the last selection
+    after: bytes  # selection afterwards, packed
+    recorded: bytes  # selection in the undo history, packed
+
+
+@dataclass(frozen=True)
+class MouseTool:
+    """Mouse drag and gesture in progress, and the last clicks and strokes of the selection tools."""
+
+    # one of `keys.DRAGS`, `DIVIDER`, `PAINT_DRAG`, `SELECT_DRAG` or `AXES_DRAG`; None without a drag
+    drag: str | None = None
+    stroke: Stroke | None = None  # brush stroke, from its first drag on
+    gesture: Gesture | None = None  # gesture of a selection tool; for a polygon also between its clicks
+    # the last click of a tool that selects by one click, while it follows the tool's tolerance
+    click: Click | None = None
+    strokes: tuple[Strokes, ...] = ()  # strokes that a tool spreads, one entry per change
+    divider: float = 0.5  # divider before the drag, fraction of the picture's width
+    axis: str = ""  # the pressed end of an axis, of `AXES`, or another part of the axes
+    # settings of the selection tool and the brush before a button was pressed
+    settings: tuple[SelectTool, Brush] | None = None
+
+
 @dataclass(frozen=True)
 class StartFile:
     """File on the start page: a recently opened scene or session, or an example."""
@@ -92,6 +165,7 @@ class Transient:
     live: tuple[LayerState, ...] = ()  # edits in training, on top of the layer stack
     gizmo: Gizmo | Decal | None = None  # handles of a selection being moved, or a decal being placed
     pointer: KeyPointer = KeyPointer()  # pointer of the active tool
+    tool: MouseTool = MouseTool()  # drag and gesture of the mouse
     recent: tuple[Path, ...] = ()  # recently opened files, for menu and dialogs; the last one first
     start_files: tuple[StartFile, ...] = ()  # recently opened files, for the start page
     examples: tuple[StartFile, ...] = ()  # examples on the start page

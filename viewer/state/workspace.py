@@ -229,6 +229,11 @@ def with_transient(workspace: Workspace, **changes: Any) -> Workspace:
     return replace(workspace, transient=replace(workspace.transient, **changes))
 
 
+def with_tool(workspace: Workspace, **changes: Any) -> Workspace:
+    """Return the workspace with these attributes of the drag and gesture of the mouse."""
+    return with_transient(workspace, tool=replace(workspace.transient.tool, **changes))
+
+
 def original(view: ViewState) -> ViewState:
     """Return the view without any edit or comparison."""
     layers = tuple(replace(layer, enabled=False, solo=False) for layer in view.layers)

@@ -120,7 +120,11 @@ def test_escape_cancels_a_polygon_first_and_then_the_tool(hand: Rig) -> None:
     hand.key("P")
     for corner in LASSO:
         hand.click(*corner)
+    gesture = hand.main_view.work.transient.tool.gesture
+    assert gesture is not None
+    assert len(gesture.path) == len(LASSO), "the state shows the polygon between its clicks"
     hand.key("Escape")
+    assert hand.main_view.work.transient.tool.gesture is None
     assert hand.main_view.work.view.select.tool == "polygon"
     hand.click(300, 420)
     hand.key("Enter")

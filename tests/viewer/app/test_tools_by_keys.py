@@ -97,6 +97,20 @@ def test_tool_works_by_keys_as_by_mouse(tool: str) -> None:
     assert views[0] == views[1]
 
 
+@pytest.mark.parametrize("tool", ["R", "L", "U", "Shift+U", "Shift+R", "B"])
+def test_resting_tool_requests_no_frames(tool: str) -> None:
+    with rig(replace(first_view(bear(), 0.7, 0.7), select=SelectTool(through=True)), WINDOW) as hand:
+        hand.key("2")
+        hand.key(tool)
+        hand.move(*MIDDLE)
+        hand.press()
+        hand.move(MIDDLE[0] + 30.0, MIDDLE[1])
+        hand.frame(12)
+        assert hand.main_view.work.transient.tool.drag is not None
+        assert hand.main_view.next_frame_delay() != 0.0
+        hand.release()
+
+
 def test_decal_is_placed_by_keys(tmp_path: Path) -> None:
     pixels = np.zeros((40, 80, 4), np.uint8)
     pixels[10:30, 20:60] = 200, 30, 30, 255
