@@ -34,7 +34,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "render": ("viewer.commands.render:render", "write a picture, a sweep or a sheet without a window"),
     "rebind": ("progdf.cli.rebind:main", "carry an edit over to the same scene in another file or format"),
     "edit": ("progdf.cli.edit:main", "change or clean a scene by hand"),
-    "export": ("viewer.commands.render:export", "write the edited scene as a 3DGS .ply file"),
+    "export": ("viewer.commands.export:export", "write the edited scene as a 3DGS .ply file"),
     "info": ("progdf.cli.info:main", "show the contents of a scene or .gdf, repairs, strays and errors"),
 }
 HIDDEN = {"preview": "trainer.preview:serve"}

@@ -29,7 +29,7 @@ def main(argv: Sequence[str]) -> int:
     options: ViewOptions = parse(ViewOptions, argv, "progdf view")
 
     def opens() -> Any:
-        from .options import open_view
+        from .open_stack import open_view
 
         return open_view(options.stack, options.drawing)
 

@@ -7,7 +7,8 @@ nothing, a change of color sorts nothing, and the same state draws nothing.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import moderngl
@@ -29,7 +30,7 @@ from viewer.state.view_state import ViewState
 
 from .cpu_renderer import CpuRenderer
 from .dynamic_resolution import DrawnView, FrameTimings, drawn_size
-from .gl_renderer import GlRenderer, Image, back_to_front, is_software
+from .gl_renderer import GlRenderer, Image, back_to_front, headless_context, is_software
 from .ground_grid import GroundPlane, Lines, grid_lines, ground_plane
 from .highlight import Highlight, highlight_colors
 
@@ -289,6 +290,34 @@ def _edits(view: ViewState) -> _Edits:
     """Return the effective layers. Changes of invisible layers and layers at strength 0 cause no work."""
     layers = tuple((l.gdf, l.strength, l.gains, l.paint) for l in visible_layers(view) if l.strength != 0.0)
     return _Edits(layers, view.blend) if layers else _Edits()
+
+
+@contextmanager
+def headless_engine(scene: Gaussians, gdfs: Sequence[Gdf], draws: str) -> Iterator[ViewEngine]:
+    """Create an engine for pictures without a window; "auto" works without OpenGL if there is none.
+
+    Args:
+        scene: the original
+        gdfs: its edits
+        draws: one of `DRAWS`
+
+    Raises:
+        ProgdfError: "gl", and there is no OpenGL.
+    """
+    ctx = None
+    if draws != "cpu":
+        try:
+            ctx = headless_context()
+        except ProgdfError:
+            if draws == "gl":
+                raise
+    engine = ViewEngine(ctx, scene, gdfs, draws)
+    try:
+        yield engine
+    finally:
+        engine.release()
+        if ctx is not None:
+            ctx.release()
 
 
 def draw_once() -> None:

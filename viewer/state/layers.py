@@ -46,6 +46,11 @@ def visible_edits(view: ViewState) -> list[str]:
     return [layer.name for layer in visible_layers(view) if layer.strength > 0.0]
 
 
+def describe_strengths(view: ViewState) -> str:
+    """Return the visible layers with their strengths as text."""
+    return ", ".join(f"{layer.name} {layer.strength:g}" for layer in visible_layers(view)) or "no edits"
+
+
 def largest_strength(view: ViewState) -> float:
     """Return the upper end of the strength sliders: 1, or `OVERSHOOT` if overshoot is on."""
     return OVERSHOOT if view.overshoot else 1.0

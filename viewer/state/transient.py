@@ -1,4 +1,4 @@
-"""Transient state: overlays on the picture, the pointer with its tool, recent files. Never undone or saved."""
+"""Transient state: overlays on the picture, pointer and tool, recent files. It is neither undone nor saved."""
 
 from __future__ import annotations
 

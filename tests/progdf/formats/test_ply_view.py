@@ -23,7 +23,8 @@ from tests.helpers.ply_files import scene_of, sharp_elements, table_of, write
 from tests.helpers.refused import refusal
 from tests.helpers.scenes import ball
 from viewer.camera.view_camera import eye, first_camera, to_camera
-from viewer.commands.options import DrawingOptions, StackOptions, open_stack, open_view
+from viewer.commands.open_stack import open_stack, open_view
+from viewer.commands.stack_options import DrawingOptions, StackOptions
 from viewer.files.document import load
 
 

@@ -26,7 +26,8 @@ from tests.helpers.stacks import bear_stack
 from trainer.options import TrainingViewOptions
 from trainer.views.setup import make_training_setup
 from viewer.camera.view_camera import first_camera
-from viewer.commands.options import RenderOptions, open_stack
+from viewer.commands.open_stack import open_stack
+from viewer.commands.options import RenderOptions
 from viewer.files import session
 
 MINUS_Y = [0.0, -1.0, 0.0]

@@ -16,7 +16,7 @@ from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import opened_document
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app.app import App
-from viewer.commands.render import export
+from viewer.commands.export import export
 from viewer.files import session
 from viewer.files.session import WindowSession
 from viewer.state import selection

@@ -23,9 +23,9 @@ from progdf.io.cameras import camera_in_picture, load_cameras, read_camera, save
 from progdf.rasterize import render
 from tests.helpers.stacks import Stack, bear_stack
 from viewer.camera.view_camera import ViewCamera
-from viewer.commands.options import stack_layers
-from viewer.commands.render import fit_camera, parse_orbit
+from viewer.commands.open_stack import stack_layers
 from viewer.commands.stack_options import StackOptions
+from viewer.commands.viewpoint import fit_camera, parse_orbit
 from viewer.files.document import load_edits
 from viewer.pictures import film
 

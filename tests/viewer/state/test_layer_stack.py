@@ -20,7 +20,7 @@ from progdf.gaussians import ATTRIBUTES
 from tests.helpers.stacks import Stack, bear_stack
 from tests.helpers.ui_rig import HEAD, Rig, bear, first_view, rig
 from viewer.camera.view_camera import ViewCamera, eye, to_camera
-from viewer.commands.options import stack_layers
+from viewer.commands.open_stack import stack_layers
 from viewer.commands.stack_options import StackOptions
 from viewer.panel import card, panel
 from viewer.panel.slider import parse_strength
