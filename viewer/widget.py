@@ -28,7 +28,8 @@ from .files.web_page import PageOptions, camera_json, first_state, picture, writ
 from .state.layers import largest_strength
 from .state.paint import encode
 from .state.view_state import LayerState, ViewState
-from .web.page import PageTexts, build_widget, pack
+from .web.container import pack
+from .web.page import PageTexts, build_widget
 
 try:
     import anywidget
@@ -78,7 +79,7 @@ class Widget(anywidget.AnyWidget):
 
     _esm = build_widget()
     _markup = traitlets.Unicode().tag(sync=True)
-    scene = traitlets.Bytes(help="scene data for the browser, see `viewer.web.page.pack`").tag(sync=True)
+    scene = traitlets.Bytes(help="scene data for the browser, see `viewer.web.container.pack`").tag(sync=True)
     strengths = traitlets.Dict(help="slider values by layer name; omitted layers are unchanged").tag(
         sync=True
     )

@@ -43,7 +43,7 @@ from tests.helpers.scenes import orbit_camera, random_gaussians
 from tests.helpers.sessions import bear_files, saved_session
 from tests.helpers.stacks import recording_of
 from trainer.store.state import StateFolder
-from viewer.files import exports, session
+from viewer.files import region_files, session
 from viewer.state.selection import SelectionState, add_region, select
 
 SECONDS = 10  # time limit of one input
@@ -75,8 +75,8 @@ def use_session(path: Path) -> None:
     state = opened.view.selection
     total = len(opened.document.scene)
     for i, region in enumerate(state.regions):
-        exports.region_file(region, total)
-        state = exports.rename_region(state, i, f"{region.name} {i}", total)
+        region_files.region_file(region, total)
+        state = region_files.rename_region(state, i, f"{region.name} {i}", total)
     assert others() == before
 
 

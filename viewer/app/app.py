@@ -23,12 +23,11 @@ from viewer.state import workspace
 from viewer.state.commands import Action, Plain, argument
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import ViewState
-from viewer.ui.keys import bind
 from viewer.ui.splash import TITLE, Splash
 from viewer.ui.window import Window, interruptible
 
 from .main_view import MainView
-from .messages import LOG, ErrorReporter, attempt, log_error
+from .messages import ErrorReporter, attempt
 from .parts.assembly import make_parts
 
 _Made = TypeVar("_Made")
@@ -64,7 +63,8 @@ def run(splash: Splash, opens: Callable[[], Opened], draw: str = "auto") -> int:
         app = App(Window(splash), opened.document, opened.view, session, draw=draw)
         try:
             app.main_view.restart(opened.view, opened.snapshots)
-            app.bind_keys()
+            with app.errors.guard():
+                app.parts.file_actions.bind_keys()
             if opened.warning:
                 app.main_view.messages.show(opened.warning, error=True)
             app.parts.file_actions.offer_autosave()
@@ -107,7 +107,7 @@ class App:
             leave=self.leave,
             session=session,
         )
-        self._errors = ErrorReporter(
+        self.errors = ErrorReporter(
             self.main_view.messages, lambda: self.main_view.frames, self.parts.file_actions.keep_work
         )
         self.requests = self.parts.requests
@@ -118,7 +118,7 @@ class App:
         self._title = ""
         self._layout = user_files.read_layout()
         self.store.replace(replace(self.store.get(), layout=self._layout))
-        self.main_view.report = self._errors.report
+        self.main_view.report = self.errors.report
         self.dropped: list[Path] = []
         self.failure: BaseException | None = None
         self.last = time.perf_counter()
@@ -133,37 +133,26 @@ class App:
                 closed.callback(close)
             self._keep_picture()
 
-    def bind_keys(self) -> None:
-        """Bind the keys that the user assigned to commands. Errors are shown in a message and logged."""
-        bind({})
-        with self._errors.guard():
-            if problems := bind(user_files.read_keys()):
-                where = user_files.keys_file()
-                more = len(problems) - 1
-                log_error("\n".join([f"{where}:", *problems]))
-                text = f"{where.name}: {problems[0]}" + (f", and {more} more in {LOG}" if more else "")
-                self.main_view.messages.show(text, error=True)
-
     def loop(self) -> None:
         """Draw frames while something changes; otherwise wait for events."""
         while not self.is_closed:
             waits = [wait for wait in self._wait_times() if wait is not None]
-            with self._errors.guard():
+            with self.errors.guard():
                 # while it opens, events stay in the window system's queue, and no typed letter is lost
                 if not self.main_view.opening:
                     self.window.wait(min(waits, default=None))
             if self.failure is not None:
                 raise self.failure
             for path in self.take_dropped():
-                with self._errors.guard():
+                with self.errors.guard():
                     self.parts.file_actions.open(path)
             if self.window.closing and not self.is_closed:
                 self.window.stay_open()
                 self.main_view.messages.request(Plain("quit"))
-            with self._errors.guard():
+            with self.errors.guard():
                 if self.main_view.is_due():
                     self.draw()
-        with self._errors.guard():
+        with self.errors.guard():
             self.parts.file_actions.on_close()
 
     def draw(self) -> None:
@@ -187,7 +176,7 @@ class App:
 
     def handle(self, request: Action) -> None:
         """Perform one of `requests`, which need the whole window."""
-        with self._errors.guard():
+        with self.errors.guard():
             attempt(self.main_view.messages, lambda: self.requests[request.name](argument(request)))
 
     def _wait_times(self) -> tuple[float | None, ...]:
@@ -200,7 +189,7 @@ class App:
         )
 
     def _look(self, poll: Callable[[], float | None]) -> float | None:
-        with self._errors.guard():
+        with self.errors.guard():
             return poll()
         return RETRY_S
 
@@ -208,7 +197,7 @@ class App:
         if self._waits:
             return
         try:
-            with self._errors.guard():
+            with self.errors.guard():
                 self.draw()
         except BaseException as failure:  # glfw would only print it
             self.failure = failure

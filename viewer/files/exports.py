@@ -1,17 +1,9 @@
-"""Files that the window exports: pictures, cameras, and regions for `progdf train`.
-
-A region is NAME.region.npy, the rows of a selection. Sessions may come from untrusted sources. Therefore only
-regular files with that suffix in the folders of `region_folders` are ever written or removed.
-"""
+"""Files that the window exports: pictures and cameras."""
 
 from __future__ import annotations
 
-import filecmp
-import os
 import re
-import stat
-import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -26,13 +18,9 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import ZERO, Origin
 from progdf.io.atomic import atomic_write, make_folder, pictures_folder
 from progdf.io.cameras import kind_of_cameras, load_cameras, save_cameras
+from progdf.io.picture_camera import camera_chunk
 from progdf.io.session import SUFFIX
-from progdf.io.tensors import save_npy
-from progdf.scene.regions import check_region
-from viewer.jobs.training import edits_folder, takes_files
-from viewer.state import selection
-from viewer.state.forms import ALL, CHANGED, SELECTION, TYPED, NewEdit
-from viewer.state.selection import NamedRegion, SelectionState, unpack
+from viewer.jobs.training import takes_files
 
 CAMERAS = ".cameras.json"  # suffix of a file of cameras
 
@@ -93,38 +81,33 @@ def camera(source: Path, viewpoint: Camera, origin: Origin = ZERO) -> tuple[Path
     return path, len(cameras) + 1
 
 
-_REGION_KINDS = ("masks", "photomasks", "text", "changed")
-"""Kinds of regions, besides those that every command supports."""
-
-
-def region_option(form: NewEdit, folder: Path, state: SelectionState, total: int, name: str = "") -> str:
-    """Return a form's region as a value of `progdf train --region`; write a file if needed.
+def painted_picture(path: Path, pixels: NDArray[np.uint8], viewpoint: Camera, origin: Origin) -> None:
+    """Save a painted picture with its camera, so that an edit can follow it.
 
     Args:
-        form: names the region
-        folder: folder of the file
-        state: the selection and the regions
-        total: number of Gaussians in the scene
-        name: name of the file; without one, a hash of the region names it, so that a reader can reuse the
-            region it has loaded
+        path: .png file
+        pixels: the picture. [H,W,3]
+        viewpoint: its camera
+        origin: origin of the scene that the camera is relative to
 
     Raises:
-        ProgdfError: it cannot be read or written.
+        ProgdfError: the file cannot be written.
     """
-    if form.region in (ALL, CHANGED):
-        return form.region
-    if form.region == TYPED:
-        spec = form.typed_region.strip()
-        check_region(spec, {kind: lambda _: None for kind in _REGION_KINDS})
-        return spec
-    region = {region.name: region for region in state.regions}.get(form.region)
-    if form.region != SELECTION and region is None:
-        raise ProgdfError(f"the region {form.region} was deleted; choose another one")
-    members = state.members if region is None else region.members
-    make_folder(folder)
-    path = folder / f"{name or f'{zlib.crc32(members):08x}'}{selection.SUFFIX}"
-    write_region(NamedRegion(name, path, members, state.count), total)
-    return f"file:{path}"
+    make_folder(path.parent)
+    with atomic_write(path) as temporary_file:
+        Image.fromarray(pixels).save(temporary_file, "PNG", pnginfo=camera_chunk(viewpoint, origin=origin))
+
+
+def single_camera(path: Path, viewpoint: Camera, origin: Origin) -> Path:
+    """Save one camera as NAME.camera.json beside a file or run NAME; return its path.
+
+    Raises:
+        ProgdfError: the file cannot be written.
+    """
+    make_folder(path.parent)
+    camera_file = path.with_name(f"{path.name}.camera.json")
+    save_cameras(camera_file, [viewpoint], origin)
+    return camera_file
 
 
 @contextmanager
@@ -145,134 +128,3 @@ def free_path(folder: Path, stem: str, suffix: str) -> Path:
         if not path.exists():
             return path
         number += 1
-
-
-def keep_region(state: SelectionState, name: str, folder: Path, total: int) -> SelectionState:
-    """Save the selection as a region, with a file in a folder.
-
-    Args:
-        state: the selection and the regions
-        name: name of the region; it gets a number if a region or a file already has it
-        folder: folder of the file
-        total: number of Gaussians in the scene
-
-    Raises:
-        ProgdfError: nothing is selected, there are too many regions, or the folder cannot be written to.
-    """
-    if not state.count:
-        raise ProgdfError("nothing is selected; select something first")
-    path = _free_region_path(state, name, folder)
-    state = selection.add_region(state, path.name.removesuffix(selection.SUFFIX), path)
-    write_region(state.regions[-1], total)
-    return state
-
-
-def rename_region(state: SelectionState, index: int, name: str, total: int) -> SelectionState:
-    """Rename a region and its file. An invalid index changes nothing.
-
-    Raises:
-        ProgdfError: the file cannot be written.
-    """
-    if not 0 <= index < len(state.regions):
-        return state
-    region = state.regions[index]
-    path = _free_region_path(
-        selection.change_region(state, index, None), name, region.path.parent, region.path
-    )
-    write_region(replace(region, path=path), total)
-    removes = path != region.path and _is_region_file(region.path) and region.path.exists()
-    # a file with other rows does not belong to this region, even if the session names it
-    if removes and filecmp.cmp(region.path, path, shallow=False):
-        region.path.unlink()
-    return selection.change_region(
-        state, index, replace(region, name=path.name.removesuffix(selection.SUFFIX), path=path)
-    )
-
-
-def region_file(region: NamedRegion, total: int) -> Path:
-    """Return the path of the region's file, written again if it is missing.
-
-    Raises:
-        ProgdfError: the file cannot be written.
-    """
-    if not region.path.exists():
-        write_region(region, total)
-    return region.path
-
-
-def write_region(region: NamedRegion, total: int) -> None:
-    """Write the rows of a region. [M] int64
-
-    Raises:
-        ProgdfError: the folder does not exist or cannot be written to, or the path is not valid for a region.
-    """
-    if not _is_region_file(region.path):
-        raise ProgdfError(
-            f"{region.path} is not a regular file that ends in {selection.SUFFIX}; "
-            "rename the region to give it one"
-        )
-    save_npy(region.path, np.flatnonzero(unpack(region.members, total)).astype(np.int64))
-
-
-def region_folders(session: Path, scene: Path) -> tuple[Path, ...]:
-    """Return the folders that may hold a session's region files: its own, and those of edits of its scene."""
-    edits = edits_folder(scene)
-    scene = scene.resolve()
-    # not resolved, as the folder of edits itself may be a symbolic link to elsewhere
-    beside = scene.with_name(f"{scene.stem}.edits")
-    return session.resolve().parent, beside, edits.parent.resolve() / edits.name
-
-
-def claim_regions(state: SelectionState, folders: Sequence[Path]) -> SelectionState:
-    """Move regions with disallowed paths to new paths in the first folder. Their files are not written yet.
-
-    Args:
-        state: the selection and the regions
-        folders: allowed folders, at any depth; symbolic links that lead out of them are not allowed
-    """
-    for i, region in enumerate(state.regions):
-        if not _is_inside(region.path, folders):
-            path = _free_region_path(selection.change_region(state, i, None), region.name, folders[0])
-            named = replace(region, name=path.name.removesuffix(selection.SUFFIX), path=path)
-            state = selection.change_region(state, i, named)
-    return state
-
-
-def _is_inside(path: Path, folders: Sequence[Path]) -> bool:
-    """Return whether a region's path is allowed: in an existing folder below one of `folders`."""
-    try:
-        parent = Path(os.path.realpath(path.parent))
-        return (
-            os.path.isdir(parent)
-            and any(parent.is_relative_to(folder) for folder in folders)
-            and _is_region_file(path)
-        )
-    except ValueError:  # a NUL in the name
-        return False
-
-
-def _is_region_file(path: Path) -> bool:
-    """Return whether the path has a region's suffix and is a regular file, or does not exist.
-
-    Links are neither.
-    """
-    try:
-        return path.name.endswith(selection.SUFFIX) and stat.S_ISREG(os.lstat(path).st_mode)
-    except FileNotFoundError:
-        return True
-    except (OSError, ValueError):  # not a valid file name
-        return False
-
-
-def _free_region_path(state: SelectionState, name: str, folder: Path, current: Path | None = None) -> Path:
-    """Return a path in `folder` that no region and no other file uses."""
-
-    def path(free: str) -> Path:
-        return folder / f"{free}{selection.SUFFIX}"
-
-    others = {region.path for region in state.regions}
-
-    def is_taken(free: str) -> bool:
-        return path(free) in others or (path(free) != current and os.path.lexists(path(free)))
-
-    return path(selection.free_name(state, name, is_taken))

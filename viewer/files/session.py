@@ -35,15 +35,12 @@ from progdf.io.session import (
 from progdf.region import Region, from_mask
 from progdf.terminal import escape_text
 from viewer.camera.view_camera import Vec3, move_camera
-from viewer.state import paint
-from viewer.state.selection import SUFFIX as REGION_SUFFIX
-from viewer.state.selection import check as check_selection
-from viewer.state.selection import pack, take_rows, unpack
+from viewer.state import paint, selection
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.timeline import split_keys
 from viewer.state.view_state import LayerState, Timeline, ViewState
 
-from . import document, exports
+from . import document, region_files
 from .document import Document
 
 _log = logging.getLogger(__name__)
@@ -113,7 +110,7 @@ def _edit_ref(gdf: Gdf, path: Path, folder: Path) -> EditRef:
         return EditRef(file.file, file.sha256)
     mask = np.zeros(gdf.scene.count, bool)
     mask[gdf.region.members.numpy()] = True
-    return EditRef(file.file, file.sha256, gdf.region.name, pack(mask))
+    return EditRef(file.file, file.sha256, gdf.region.name, selection.pack(mask))
 
 
 def open_session(path: Path) -> WindowSession:
@@ -130,19 +127,19 @@ def open_session(path: Path) -> WindowSession:
         edit = file.edits[index]
         if not edit.members:
             return None
-        return from_mask(edit.region, torch.from_numpy(unpack(edit.members, len(scene)).copy()))
+        return from_mask(edit.region, torch.from_numpy(selection.unpack(edit.members, len(scene)).copy()))
 
     opened = document.load(scene, gdfs, place)
     x, y, z = opened.scene.origin
     view, snapshots = _move(file.view, file.snapshots, (-x, -y, -z))
-    check_selection(view.selection, len(opened.scene))
+    selection.check(view.selection, len(opened.scene))
     named = view.selection.regions
     folder = path.resolve().parent
     view = _with_region_paths(view, lambda region: Path(os.path.normpath(folder / region)))
     for layer in (*view.layers, *(layer for s in snapshots for layer in s.edit.layers)):
         gdf = opened.gdfs[layer.gdf]
         paint.decode(layer.paint, len(gdf.region), gdf.from_others)  # raises if the weights do not fit
-    claimed = exports.claim_regions(view.selection, exports.region_folders(path, scene))
+    claimed = region_files.claim_regions(view.selection, region_files.region_folders(path, scene))
     moved = [
         f"{old.name:.60} ({str(old.path)[:80]})"
         for old, resolved, new in zip(named, view.selection.regions, claimed.regions, strict=True)
@@ -159,7 +156,7 @@ def open_session(path: Path) -> WindowSession:
     if moved:
         more = f" and {len(moved) - 1} more" if len(moved) > 1 else ""
         warning = escape_text(
-            f"{path.name}: invalid path of region {moved[0]}{more}, not a {REGION_SUFFIX} file "
+            f"{path.name}: invalid path of region {moved[0]}{more}, not a {selection.SUFFIX} file "
             "in the session's folder; save the session to write it there"
         )
         _log.warning(warning)
@@ -239,7 +236,7 @@ def prune(session: WindowSession) -> WindowSession:
         count = len(opened.original)
         members = [gdf.region.members.numpy() for gdf in added]
         rows = np.concatenate([np.arange(count), *(own[own >= count] for own in members)])
-        view = replace(view, selection=take_rows(view.selection, len(opened.scene), rows))
+        view = replace(view, selection=selection.take_rows(view.selection, len(opened.scene), rows))
         session = replace(session, view=view)
     if len(used) == len(opened.edits):
         return session

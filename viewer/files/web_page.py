@@ -22,7 +22,8 @@ from viewer.state import history, snapshots, timeline
 from viewer.state.layers import largest_strength, visible_layers
 from viewer.state.paint import decode, layer_of
 from viewer.state.view_state import LayerState, Timeline, ViewState
-from viewer.web.page import DRAWN_SH, HOST, MAIL_LIMIT_BYTES, PageTexts, build_page, pack
+from viewer.web.container import DRAWN_SH, pack
+from viewer.web.page import HOST, MAIL_LIMIT_BYTES, PageTexts, build_page
 
 from .document import Document
 

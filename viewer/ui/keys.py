@@ -513,7 +513,7 @@ def cancels_drag(keys: Keys, held: bool, drag: str | None) -> bool:
 
     Args:
         held: an item of the interface was active in the last frame; imgui releases it on Escape
-        drag: drag on the picture, see `mouse.MouseTool`; camera drags are not canceled
+        drag: drag on the picture, see `transient.MouseTool`; camera drags are not canceled
     """
     io = imgui.get_io()
     buttons = imgui.MouseButton_

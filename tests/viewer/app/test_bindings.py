@@ -206,12 +206,12 @@ def test_keys_file_is_created_complete_and_read_on_start(
         assert opened == [path.as_uri()]
         assert [*json.loads(path.read_text())] == [*COMMANDS]
         before = dict(KEYS)
-        app.bind_keys()
+        app.parts.file_actions.bind_keys()
         assert before == KEYS, "as it was made it changes nothing"
         assert app.main_view.work.message is not None
         assert app.main_view.work.message.text.startswith("Keys are read from")
         path.write_text('{"grid": "F8", "undo": 3, "nothing": "F9"}')
-        app.bind_keys()
+        app.parts.file_actions.bind_keys()
         message = 'keys.json: undo: keys are written as "F6" or ["F6", "Ctrl+B"], and 1 more in window.log'
         assert app.main_view.work.message.text == message
         assert "nothing: there is no such command" in (state_folder() / "window.log").read_text()
@@ -221,7 +221,7 @@ def test_keys_file_is_created_complete_and_read_on_start(
         assert app.main_view.work.view.grid
         for damaged in ("{", "[1]", "\xff"):
             path.write_bytes(damaged.encode("latin-1"))
-            app.bind_keys()
+            app.parts.file_actions.bind_keys()
             assert "keys.json is damaged" in app.main_view.work.message.text
             assert before == KEYS
 

@@ -28,7 +28,7 @@ from tests.helpers.ui_rig import bear, first_view
 from viewer.app import app as application
 from viewer.app.parts.preview import PAINT_TEXT
 from viewer.camera.view_camera import first_camera
-from viewer.files import exports, user_files
+from viewer.files import region_files, user_files
 from viewer.files.document import empty
 from viewer.files.session import open_session
 from viewer.files.user_files import load_thumbnail
@@ -143,7 +143,7 @@ def test_changed_selection_is_a_new_file_for_the_preview(window: application.App
         mask[row] = True
         chosen = selection.select(view.selection, mask)
         form = replace(window.main_view.work.form, region=SELECTION)
-        specs.append(exports.region_option(form, tmp_path, chosen, total))
+        specs.append(region_files.region_option(form, tmp_path, chosen, total))
         assert parse_region(specs[-1], window.documents.get().scene).members.tolist() == [row]
     assert specs[0] == specs[2] != specs[1]
 

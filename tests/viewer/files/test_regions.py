@@ -14,7 +14,7 @@ from progdf.scene.regions import parse_region
 from tests.helpers.null_app import null_app
 from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.ui_rig import bear, first_view
-from viewer.files import exports, session
+from viewer.files import region_files, session
 from viewer.files.session import WindowSession
 from viewer.state import selection
 from viewer.state.commands import Plain, Rename, WithText
@@ -30,7 +30,7 @@ def chosen() -> SelectionState:
 
 
 def test_saved_region_can_be_trained_by_progdf(chosen: SelectionState, tmp_path: Path) -> None:
-    kept = exports.keep_region(chosen, "jacket", tmp_path, TOTAL)
+    kept = region_files.keep_region(chosen, "jacket", tmp_path, TOTAL)
     assert [(region.name, region.count) for region in kept.regions] == [("jacket", MASK.sum())]
     found = parse_region(f"file:{tmp_path}/jacket.region.npy", bear().scene)
     assert found.members.tolist() == np.flatnonzero(MASK).tolist()
@@ -39,8 +39,8 @@ def test_saved_region_can_be_trained_by_progdf(chosen: SelectionState, tmp_path:
 
 def test_new_region_never_replaces_a_file(chosen: SelectionState, tmp_path: Path) -> None:
     (tmp_path / "jacket.region.npy").write_bytes(b"somebody else's")
-    kept = exports.keep_region(
-        exports.keep_region(chosen, "jacket", tmp_path, TOTAL), "jacket", tmp_path, TOTAL
+    kept = region_files.keep_region(
+        region_files.keep_region(chosen, "jacket", tmp_path, TOTAL), "jacket", tmp_path, TOTAL
     )
     assert [region.name for region in kept.regions] == ["jacket-2", "jacket-3"]
     assert (tmp_path / "jacket.region.npy").read_bytes() == b"somebody else's"
@@ -49,20 +49,20 @@ def test_new_region_never_replaces_a_file(chosen: SelectionState, tmp_path: Path
 def test_renaming_a_region_moves_its_file_and_undo_restores_it(
     chosen: SelectionState, tmp_path: Path
 ) -> None:
-    kept = exports.keep_region(chosen, "jacket", tmp_path, TOTAL)
-    renamed = exports.rename_region(kept, 0, "coat", TOTAL)
+    kept = region_files.keep_region(chosen, "jacket", tmp_path, TOTAL)
+    renamed = region_files.rename_region(kept, 0, "coat", TOTAL)
     assert [path.name for path in tmp_path.iterdir()] == ["coat.region.npy"]
     assert (renamed.regions[0].name, renamed.regions[0].path) == ("coat", tmp_path / "coat.region.npy")
-    assert exports.rename_region(renamed, 0, "coat", TOTAL) == renamed
-    assert exports.region_file(kept.regions[0], TOTAL).exists(), "the state before knows what was in it"
+    assert region_files.rename_region(renamed, 0, "coat", TOTAL) == renamed
+    assert region_files.region_file(kept.regions[0], TOTAL).exists(), "the state before knows what was in it"
     assert np.load(kept.regions[0].path).tolist() == np.flatnonzero(MASK).tolist()
 
 
 def test_saving_a_region_needs_a_selection_and_a_folder(chosen: SelectionState, tmp_path: Path) -> None:
     with pytest.raises(ProgdfError, match="nothing is selected"):
-        exports.keep_region(SelectionState(), "jacket", tmp_path, TOTAL)
+        region_files.keep_region(SelectionState(), "jacket", tmp_path, TOTAL)
     with pytest.raises(ProgdfError, match="does not exist"):
-        exports.keep_region(chosen, "jacket", tmp_path / "gone", TOTAL)
+        region_files.keep_region(chosen, "jacket", tmp_path / "gone", TOTAL)
 
 
 def foreign_session(folder: Path, *paths: str) -> Path:
@@ -129,8 +129,8 @@ def test_third_party_session_changes_nothing_outside_its_folder(tmp_path: Path) 
     state = opened.view.selection
     assert f"region r0 (../victim.txt) and {len(paths) - 1} more, not a .region.npy file" in opened.warning
     for i, region in enumerate(state.regions):
-        exports.region_file(region, TOTAL)
-        state = exports.rename_region(state, i, f"renamed {i}", TOTAL)
+        region_files.region_file(region, TOTAL)
+        state = region_files.rename_region(state, i, f"renamed {i}", TOTAL)
     after = contents(outside)
     new_files = {name: after.pop(name) for name in set(after) - set(before)}
     assert after == before
@@ -149,9 +149,9 @@ def test_region_files_in_the_session_folders_are_kept(tmp_path: Path) -> None:
 
 
 def test_rename_keeps_a_file_with_other_rows(chosen: SelectionState, tmp_path: Path) -> None:
-    kept = exports.keep_region(chosen, "jacket", tmp_path, TOTAL)
+    kept = region_files.keep_region(chosen, "jacket", tmp_path, TOTAL)
     np.save(tmp_path / "jacket.region.npy", np.arange(3))
-    exports.rename_region(kept, 0, "coat", TOTAL)
+    region_files.rename_region(kept, 0, "coat", TOTAL)
     assert np.load(tmp_path / "jacket.region.npy").tolist() == [0, 1, 2]
 
 

@@ -15,8 +15,8 @@ from .edits import EditActions
 from .file_actions import FileActions, OpenDocument, WaitFor
 from .pictures import PictureActions
 from .preview import PreviewActions
-from .start import StartActions, UpActions
-from .strays import StrayActions
+from .scene_checks import StrayActions, UpActions
+from .start import StartActions
 from .tidy import TidyActions
 from .training import JobActions
 

@@ -15,22 +15,20 @@ from progdf.cli.info import kind_of
 from progdf.errors import ProgdfError
 from progdf.io.bundle import BUNDLE, unpack_bundle
 from progdf.io.picture_files import ENDINGS
-from viewer.app.messages import Messages, Requests, attempt, error_details, failure_line, log_error
+from viewer.app.messages import LOG, Messages, Requests, attempt, error_details, failure_line, log_error
 from viewer.app.parts.edits import EditActions
 from viewer.app.parts.pictures import PictureActions
 from viewer.camera.view_camera import ViewCamera, first_camera
-from viewer.files import document as documents
-from viewer.files import exports, session
-from viewer.files.document import Document, DocumentStore
+from viewer.files import document, region_files, session
 from viewer.files.session import SessionAutosave, WindowSession, session_file
-from viewer.files.user_files import parse_path, read_recent, remember_recent, write_keys
+from viewer.files.user_files import keys_file, parse_path, read_keys, read_recent, remember_recent, write_keys
 from viewer.panel import dialogs
 from viewer.state import workspace
 from viewer.state.commands import Action, Plain, Rename, WithText
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import ViewState, on_another_scene
 from viewer.state.workspace import Dialog, Store, with_transient
-from viewer.ui.keys import COMMANDS
+from viewer.ui.keys import COMMANDS, bind
 
 _Made = TypeVar("_Made")
 
@@ -41,7 +39,7 @@ class WaitFor(Protocol):
     def __call__(self, work: Callable[[], _Made], text: str) -> _Made: ...
 
 
-OpenDocument = Callable[[Document, ViewState, tuple[SliderSnapshot, ...]], None]
+OpenDocument = Callable[[document.Document, ViewState, tuple[SliderSnapshot, ...]], None]
 """Function that replaces the open scene by another, with its view and snapshots."""
 
 
@@ -64,7 +62,7 @@ class FileActions:
         self,
         *,
         store: Store,
-        documents: DocumentStore,
+        documents: document.DocumentStore,
         messages: Messages,
         edits: EditActions,
         pictures: PictureActions,
@@ -119,6 +117,19 @@ class FileActions:
             "keys_file": self._open_keys,
         }
 
+    def bind_keys(self) -> None:
+        """Bind the keys that the user assigned to commands; show and log errors."""
+        bind({})
+        attempt(self._messages, self._bind_user_keys)
+
+    def _bind_user_keys(self) -> None:
+        if problems := bind(read_keys()):
+            where = keys_file()
+            more = len(problems) - 1
+            log_error("\n".join([f"{where}:", *problems]))
+            text = f"{where.name}: {problems[0]}" + (f", and {more} more in {LOG}" if more else "")
+            self._messages.show(text, error=True)
+
     def _open_keys(self, _: None) -> None:
         """Open the file of key bindings in its default program; create it with all keys if it is missing."""
         keys = {name: command.keys.split() for name, command in COMMANDS.items()}
@@ -169,7 +180,7 @@ class FileActions:
         self._claim_regions(path)
         self._write(path)
         for region in self._store.get().view.selection.regions:
-            exports.region_file(region, len(self._documents.get().original))
+            region_files.region_file(region, len(self._documents.get().original))
         self.session_autosave.drop()
         self.path = path
         self._store.replace(workspace.mark_saved(self._store.get()))
@@ -283,8 +294,8 @@ class FileActions:
         self.offer_autosave()
 
     def _open_scene(self, path: Path) -> None:
-        def load() -> tuple[Document, ViewCamera]:
-            opened = documents.load(path)
+        def load() -> tuple[document.Document, ViewCamera]:
+            opened = document.load(path)
             up = opened.detected_up.direction
             return opened, first_camera(opened.scene, up=up, stored=opened.stored_camera)
 
@@ -301,7 +312,7 @@ class FileActions:
         folder = (self.path or opened.path or Path()).resolve().parent
         view = self._store.get().view
         total = len(opened.original)
-        selection = exports.keep_region(view.selection, name, folder, total)
+        selection = region_files.keep_region(view.selection, name, folder, total)
         self._store.change(replace(view, selection=selection))
         line = f"Region '{selection.regions[-1].name}' saved"
         self._messages.show(line, button=("New edit", Plain("new_edit")))
@@ -309,7 +320,7 @@ class FileActions:
     def _rename_region(self, action: Rename) -> None:
         view = self._store.get().view
         total = len(self._documents.get().original)
-        renamed = exports.rename_region(view.selection, action.index, action.text, total)
+        renamed = region_files.rename_region(view.selection, action.index, action.text, total)
         self._store.change(replace(view, selection=renamed))
 
     def _claim_regions(self, path: Path) -> None:
@@ -317,8 +328,8 @@ class FileActions:
         scene = self._documents.get().path
         view = self._store.get().view
         if scene is not None and view.selection.regions:
-            folders = exports.region_folders(path, scene)
-            self._store.change(replace(view, selection=exports.claim_regions(view.selection, folders)))
+            folders = region_files.region_folders(path, scene)
+            self._store.change(replace(view, selection=region_files.claim_regions(view.selection, folders)))
 
     def _write(self, path: Path) -> None:
         session.save(path, self._session())

@@ -20,10 +20,9 @@ from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.gdf.file import Gdf, load_gdf
 from progdf.io.atomic import make_folder
-from progdf.io.cameras import save_cameras
 from viewer.app.messages import Messages, Requests, error_line
 from viewer.camera.view_camera import ViewCamera, to_camera
-from viewer.files import exports, user_files
+from viewer.files import exports, region_files, user_files
 from viewer.files.document import DocumentStore
 from viewer.jobs import training
 from viewer.jobs.preview_process import PreviewChild, PreviewInputs
@@ -178,8 +177,9 @@ class PreviewActions:
         folder = training.edits_folder(scene)
         make_folder(folder)
         path = self._save_original(folder, scene.stem)
-        beside = path.with_name(f"{path.stem}.camera.json")  # a program may drop the picture's metadata
-        save_cameras(beside, [to_camera(camera, *size)], self._documents.get().scene.origin)
+        # a program may drop the picture's metadata
+        origin = self._documents.get().scene.origin
+        exports.single_camera(path.with_suffix(""), to_camera(camera, *size), origin)
         form = with_picture(self._store.get().form, path, further=False)
         self._store.replace(replace(self._store.get(), form=form, form_open=True))
         self._open_painter(path, camera, size, None)
@@ -287,7 +287,7 @@ class PreviewActions:
         scale = min(1.0, LONGEST_SIDE / max(request.size))
         width, height = (max(round(side * scale), 1) for side in request.size)
         try:
-            region = exports.region_option(
+            region = region_files.region_option(
                 work.form, child.folder, work.view.selection, len(self._documents.get().original)
             )
         except (ProgdfError, OSError) as error:

@@ -1,4 +1,4 @@
-"""Start page: recent files with thumbnails, the demo, and the up axis of a newly opened scene."""
+"""Start page: recent files with thumbnails, the examples and the demo."""
 
 from __future__ import annotations
 
@@ -9,18 +9,14 @@ from functools import partial
 from pathlib import Path
 
 import moderngl
-import torch
 
-import viewer
 from progdf.demo_scenes import SKY
 from progdf.errors import ProgdfError
 from progdf.io.atomic import make_folder, read_file, state_folder, write_file
 from progdf.io.bundle import BUNDLE
 from progdf.io.session import sha256
-from progdf.scene import up_axis
 from viewer.app.messages import Messages, Requests, attempt
 from viewer.app.parts.edits import EditActions
-from viewer.camera.view_camera import Vec3
 from viewer.files import user_files
 from viewer.files.document import DocumentStore
 from viewer.gl.present import picture_texture
@@ -34,7 +30,7 @@ from viewer.state.view_state import Comparison, ViewState
 from viewer.state.workspace import Store, with_transient
 
 POLL_S = 0.5
-EXAMPLES = Path(viewer.__file__).parent / "examples"
+EXAMPLES = Path(__file__).parents[2] / "examples"
 EXAMPLE_TITLES = {
     EXAMPLES / f"{name}{BUNDLE}": about
     for name, about in {
@@ -191,46 +187,3 @@ class StartActions:
             self._textures[path] = picture_texture(self._context, pixels) if pixels is not None else None
         texture = self._textures[path]
         return int(texture.glo) if texture is not None else 0
-
-
-class UpActions:
-    """Notice of a guessed up axis, and storage of the axis that the user sets.
-
-    Args:
-        store: state of the window
-        documents: the open document
-        messages: messages to the user
-    """
-
-    def __init__(self, *, store: Store, documents: DocumentStore, messages: Messages) -> None:
-        self._store = store
-        self._documents = documents
-        self._messages = messages
-        self._looked = False  # the scene has been checked
-        self._up: Vec3 | None = None  # the user's up axis at the last poll
-
-    def poll(self, session: Path | None) -> None:
-        """Check the open scene and its up axis.
-
-        Args:
-            session: the open session, which stores the up axis
-        """
-        document = self._documents.get()
-        # The axis set by the user, also by undo; a film, a picture or a snapshot may move the camera.
-        up = self._store.get().past.present.look.up
-        before = self._up
-        self._up = up
-        if document.path is None:
-            return
-        if self._looked and up != before:
-            up_axis.remember_chosen_up(document.scene, up)
-        guess = not (self._looked or session or document.detected_up.certain)
-        if guess and up == document.detected_up.direction and self._store.get().message is None:
-            name = up_axis.direction_name(torch.tensor(up)).upper().replace("-", "−")
-            where = "Change it under the axes: Up axis."
-            self._messages.show(f"Guessed {name} as up in {document.title}. {where}")
-        self._looked = True
-
-    def leave_scene(self) -> None:
-        """Check the next scene anew."""
-        self._looked = False

@@ -12,16 +12,13 @@ from pathlib import Path
 import numpy as np
 from imgui_bundle import imgui
 from numpy.typing import NDArray
-from PIL import Image
 
 from progdf.camera import Camera
-from progdf.io.atomic import atomic_write, make_folder, read_file, write_file
-from progdf.io.cameras import save_cameras
-from progdf.io.picture_camera import camera_chunk
+from progdf.io.atomic import read_file, write_file
 from progdf.terminal import format_duration
 from viewer.app.messages import Messages, Requests, attempt, failure_line
 from viewer.app.parts.edits import EditActions
-from viewer.files import exports
+from viewer.files import exports, region_files
 from viewer.files.document import DocumentStore
 from viewer.jobs import training
 from viewer.jobs.job_queue import Delivery, JobQueue, QueuedTask
@@ -184,7 +181,7 @@ class JobActions:
         out = training.free_run(training.edits_folder(scene), form.layer_name)
         document = self._documents.get()
         state = self._store.get().view.selection
-        region = exports.region_option(form, out.parent, state, len(document.original), out.name)
+        region = region_files.region_option(form, out.parent, state, len(document.original), out.name)
         threads = training.spare_threads()
         model = anchor = ""
         if form.choice.setting == "sentence":
@@ -221,9 +218,7 @@ class JobActions:
         path, camera, at = placed
         name = replace(NewEdit(), name=path.stem).layer_name
         out = training.free_run(training.edits_folder(scene), name)
-        make_folder(out.parent)
-        camera_file = out.with_name(f"{out.name}.camera.json")
-        save_cameras(camera_file, [camera], self._documents.get().scene.origin)
+        camera_file = exports.single_camera(out, camera, self._documents.get().scene.origin)
         order = EditOrder(
             scene.resolve(),
             out,
@@ -260,11 +255,9 @@ class JobActions:
         taken = None if form.anchor else self._anchor(form)
         if taken is None:
             return form.anchor
-        make_folder(run.parent)
         path = run.with_name(f"{run.name}.anchor.png")
-        chunk = camera_chunk(taken[1], origin=self._documents.get().scene.origin)
-        with atomic_write(path) as temporary_file:
-            Image.fromarray(taken[0]).save(temporary_file, "PNG", pnginfo=chunk)
+        pixels, camera = taken
+        exports.painted_picture(path, pixels, camera, self._documents.get().scene.origin)
         return str(path)
 
     def _paint_over(self, _: None) -> None:

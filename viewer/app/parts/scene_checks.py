@@ -1,17 +1,21 @@
-"""Strays of a capture: found in another thread and hidden, on request."""
+"""Checks of the open scene: strays are hidden on request, and a guessed up axis is reported."""
 
 from __future__ import annotations
 
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import torch
 
 from progdf.gaussians import Gaussians
 from progdf.metrics.image import NO_DIFFERENCE
+from progdf.scene import up_axis
 from progdf.scene.strays import Strays, clean, find_strays, picture_difference
 from progdf.terminal import group_digits
 from viewer.app.messages import Messages, Requests
+from viewer.camera.view_camera import Vec3
 from viewer.files.document import DocumentStore
 from viewer.state import selection
 from viewer.state.workspace import Store
@@ -84,3 +88,46 @@ class StrayActions:
 def _search(scene: Gaussians) -> tuple[Strays, float]:
     strays = find_strays(scene)
     return strays, picture_difference(scene, clean(scene, strays))[0] if len(strays.rows) else NO_DIFFERENCE
+
+
+class UpActions:
+    """Notice of a guessed up axis, and storage of the axis that the user sets.
+
+    Args:
+        store: state of the window
+        documents: the open document
+        messages: messages to the user
+    """
+
+    def __init__(self, *, store: Store, documents: DocumentStore, messages: Messages) -> None:
+        self._store = store
+        self._documents = documents
+        self._messages = messages
+        self._looked = False  # the scene has been checked
+        self._up: Vec3 | None = None  # the user's up axis at the last poll
+
+    def poll(self, session: Path | None) -> None:
+        """Check the open scene and its up axis.
+
+        Args:
+            session: the open session, which stores the up axis
+        """
+        document = self._documents.get()
+        # The axis set by the user, also by undo; a film, a picture or a snapshot may move the camera.
+        up = self._store.get().past.present.look.up
+        before = self._up
+        self._up = up
+        if document.path is None:
+            return
+        if self._looked and up != before:
+            up_axis.remember_chosen_up(document.scene, up)
+        guess = not (self._looked or session or document.detected_up.certain)
+        if guess and up == document.detected_up.direction and self._store.get().message is None:
+            name = up_axis.direction_name(torch.tensor(up)).upper().replace("-", "−")
+            where = "Change it under the axes: Up axis."
+            self._messages.show(f"Guessed {name} as up in {document.title}. {where}")
+        self._looked = True
+
+    def leave_scene(self) -> None:
+        """Check the next scene anew."""
+        self._looked = False

@@ -1,0 +1,339 @@
+"""Container of a web page: a scene and its edits as the arrays that the page's script reads.
+
+The page reads a container (src/data.js): the length of its header, the header (JSON), and its arrays. An
+array is stored channel by channel, split into planes of equal-weight bytes, which gzip compresses better.
+Members of edits come first. Members of the same edits are adjacent, so that a slider uploads few runs of
+rows, and neighbors in space are close together.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from progdf.compose.reference import coverage
+from progdf.errors import ProgdfError
+from progdf.field.baked import AttributeBases, GradeForm
+from progdf.field.grade import sphere
+from progdf.field.separable import quantize_bases
+from progdf.formats.packed.compressed_ply import morton_order
+from progdf.gaussians import ATTRIBUTES, Gaussians
+from progdf.gdf.file import UNSEEN_LOGIT, Gdf
+
+DRAWN_SH = (0, 3, 8, 15)
+"""Number of SH coefficients above the first, by degree."""
+LEVELS = {"i1": 127, "i2": 32767}
+"""Largest quantization level by type of array."""
+_MAX_SEGMENT = 1 << 12  # members composed at once, which limits memory
+_MIN_AXIS_SHARE = 1e-4  # share of the scene's spread: a smaller axis is below a pixel in any picture
+_UNSEEN_LOGIT = -1e3  # logit of a Gaussian that is not drawn
+_MAX_OPACITY = 1 - 1 / 512  # 8-bit opacities are clipped to 1 − _MAX_OPACITY … _MAX_OPACITY
+
+
+@dataclass
+class Arrays:
+    """Arrays of a container, in the order in which they were added."""
+
+    parts: list[bytes] = field(default_factory=list)
+    size: int = 0
+
+    def add(self, values: NDArray[Any], **more: Any) -> dict[str, Any]:
+        """Append an array [n] or [n,c]; return its header entry."""
+        table = np.ascontiguousarray(_table(values).T)
+        table = table.astype(table.dtype.newbyteorder("<"))
+        planes = table.reshape(-1, 1).view(np.uint8).T.tobytes()
+        kind = f"{table.dtype.kind}{table.dtype.itemsize}"
+        record = {"at": self.size, "type": kind, "rows": len(values), "width": len(table), **more}
+        self.parts.append(planes)
+        self.size += len(planes)
+        return record
+
+    def add_levels(
+        self, values: NDArray[Any], kind: str, curve: str = ""
+    ) -> tuple[dict[str, Any], NDArray[Any]]:
+        """Append numbers quantized between the minimum and maximum of each channel. [n,c] float
+
+        Args:
+            kind: key of `LEVELS`
+            curve: "log" for signed logarithms (1 + |x|), "logit" for opacities
+
+        Returns:
+            Its header entry, and the values that the page decodes.
+        """
+        table = _table(values).astype(np.float64)
+        if curve == "log":
+            table = np.sign(table) * np.log1p(np.abs(table))
+        some = table if len(table) else np.zeros((1, table.shape[1]))
+        low = some.min(axis=0)
+        high = some.max(axis=0)
+        zero = (low + high) / 2
+        max_level = LEVELS[kind]
+        step = np.where(high > low, (high - low) / (2 * max_level), 1.0)
+        levels = np.round((table - zero) / step).astype(f"<{kind}")
+        decoded = zero + step * levels
+        if curve == "log":
+            decoded = np.sign(decoded) * np.expm1(np.abs(decoded))
+        elif curve == "logit":
+            decoded = np.log(decoded / (1 - decoded))
+        return self.add(levels, scale=step.tolist(), zero=zero.tolist(), curve=curve), decoded
+
+
+def _table(values: NDArray[Any]) -> NDArray[Any]:
+    """Reshape [n] or [n,…] to [n,c]."""
+    return values.reshape(len(values), math.prod(values.shape[1:]))
+
+
+@dataclass(frozen=True)
+class Packed:
+    """Content of a page."""
+
+    data: bytes  # the container
+    scene: Gaussians  # the original as decoded by the page, in the scene's order; omitted rows are invisible
+
+
+def pack(
+    scene: Gaussians,
+    gdfs: Sequence[Gdf],
+    quality: str,
+    degree: int,
+    more: Mapping[str, Any],
+) -> Packed:
+    """Return the container of a scene and its edits. The scene already has the rows that the edits add.
+
+    Args:
+        scene: the original with the rows that edits add
+        gdfs: its edits
+        quality: "exact", float32 and the numbers of the edits' files, or "compact", 8 and 16 bits
+        degree: retained degree of the spherical harmonics, 0 to 3
+        more: other header entries; "paints" holds pairs of an edit and the weights of its members [M]
+
+    Raises:
+        ProgdfError: there is no such quality.
+    """
+    if quality not in ("exact", "compact"):
+        raise ProgdfError(f"unknown quality '{quality}'; use exact or compact")
+    scene, kept = _finite(scene), min(DRAWN_SH[degree], scene.shN.shape[1])
+    groups = _groups(len(scene), [gdf.region.members.numpy() for gdf in gdfs])
+    seen = (groups > 0) | (scene.logit_opacities.numpy() >= UNSEEN_LOGIT)
+    order = _order(scene, groups)
+    order = order[seen[order]]
+    count = int((groups[order] > 0).sum())
+    place = np.full(len(scene), -1, np.int64)
+    place[order] = np.arange(len(order))
+    inside = [_ascending(place[gdf.region.members.numpy()]) for gdf in gdfs]
+    arrays = Arrays()
+    exact = quality == "exact"
+    attributes, decoded_scene = _scene(arrays, scene, gdfs, order, count, kept, exact)
+    overlaps = len(gdfs) > 1 and sum(map(len, inside)) > count
+    paints = []
+    for edit, weights in more["paints"]:
+        levels = np.round(weights[inside[edit]].numpy() * 255).astype("<i2")
+        paints.append(arrays.add(levels, scale=[1 / 255], zero=[0.0]))
+    header = {
+        **more,
+        "paints": paints,
+        "count": len(order),
+        "members": count,
+        "segments": _segments(groups[order[:count]], order, gdfs),
+        "sh": kept,
+        "antialiased": scene.antialiased,
+        "attributes": attributes,
+        "edits": [
+            _edit(arrays, scene, gdf, rows, kept, exact, overlaps)
+            for gdf, rows in zip(gdfs, inside, strict=True)
+        ],
+        "sphere": [
+            _numbers(part.flatten()) for part in sphere(math.isqrt(kept + 1) - 1, torch.device("cpu"))
+        ],
+    }
+    text = json.dumps(header, ensure_ascii=True, allow_nan=False, separators=(",", ":")).encode()
+    return Packed(len(text).to_bytes(4, "little") + text + b"".join(arrays.parts), decoded_scene)
+
+
+def _scene(
+    arrays: Arrays,
+    scene: Gaussians,
+    gdfs: Sequence[Gdf],
+    order: NDArray[np.int64],
+    count: int,
+    kept: int,
+    exact: bool,
+) -> tuple[dict[str, Any], Gaussians]:
+    """Append the attributes, the first `count` rows separately; return their entries and the decoded
+    scene."""
+    moved = {name for gdf in gdfs for name in gdf.field.attributes}
+    attributes: dict[str, Any] = {}
+    changed: dict[str, Any] = {"shN": torch.zeros_like(scene.shN)}
+    changed["logit_opacities"] = torch.full_like(scene.logit_opacities, _UNSEEN_LOGIT)
+    rows = torch.from_numpy(order)
+    for name in ATTRIBUTES:
+        old = getattr(scene, name).detach().float()
+        values = _table((old[:, :kept] if name == "shN" else old)[rows].numpy())
+        if not values.shape[1]:
+            continue
+        parts = values[:count], values[count:]
+        done = [
+            _scene_part(arrays, name, part, exact, first and name in moved)
+            for part, first in zip(parts, (True, False), strict=True)
+        ]
+        attributes[name] = [record for record, _ in done]
+        new = torch.from_numpy(np.concatenate([numbers for _, numbers in done])).float()
+        table = changed.setdefault(name, old.clone())
+        if name == "shN":
+            table[rows, :kept] = new.reshape(len(order), kept, 3)
+        else:
+            table[rows] = new.reshape(len(order), *old.shape[1:])
+    return attributes, replace(scene, **changed)
+
+
+def _finite(scene: Gaussians) -> Gaussians:
+    """Return the scene with finite numbers. Rows with others, which no engine draws, become invisible."""
+    flat = {name: torch.from_numpy(_table(getattr(scene, name).detach().numpy())) for name in ATTRIBUTES}
+    flat["log_scales"] = flat["log_scales"].clamp(min=-1e4)
+    unseen = ~torch.cat(list(flat.values()), dim=1).isfinite().all(dim=1)
+    changed: dict[str, Any] = {name: table.nan_to_num(0.0, 0.0, 0.0) for name, table in flat.items()}
+    changed["logit_opacities"] = changed["logit_opacities"].masked_fill(unseen[:, None], _UNSEEN_LOGIT)
+    return replace(scene, **{name: changed[name].reshape(getattr(scene, name).shape) for name in ATTRIBUTES})
+
+
+def _groups(count: int, regions: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
+    """Return a number per row that is equal for rows of the same edits, 0 without any. [N]"""
+    groups = np.zeros(count + 1, np.int64)  # one extra row, dropped below
+    for members in regions:
+        groups *= 2
+        groups[members] += 1
+        groups = np.unique(groups, return_inverse=True)[1]
+    return groups[:-1]
+
+
+def _order(scene: Gaussians, groups: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the rows in the page's order: members first, grouped by their edits, then by Morton code."""
+    if not len(scene):
+        return np.zeros(0, np.int64)
+    order = morton_order(scene.means.sign() * scene.means.abs().log1p()).numpy()
+    return order[np.argsort(-groups[order], kind="stable")]
+
+
+def _segments(
+    groups: NDArray[np.int64], order: NDArray[np.int64], gdfs: Sequence[Gdf]
+) -> list[tuple[int, list[int]]]:
+    """Return the runs of members with the same edits: length, at most `_MAX_SEGMENT`, and these edits."""
+    starts = np.flatnonzero((np.diff(groups, prepend=-1) != 0) | (np.arange(len(groups)) % _MAX_SEGMENT == 0))
+    inside = [np.isin(order[starts], gdf.region.members.numpy()) for gdf in gdfs]
+    edits = [[i for i, there in enumerate(inside) if there[k]] for k in range(len(starts))]
+    return list(zip(np.diff(starts, append=len(groups)).tolist(), edits, strict=True))
+
+
+def _ascending(places: NDArray[np.int64]) -> Tensor:
+    """Return the members on the page, in its order; the others have the position −1."""
+    present = np.flatnonzero(places >= 0)
+    return torch.from_numpy(present[np.argsort(places[present])])
+
+
+def _scene_part(
+    arrays: Arrays, name: str, values: NDArray[Any], exact: bool, moves: bool
+) -> tuple[dict[str, Any], NDArray[Any]]:
+    """Append rows of an attribute: float32, or 16 bits if an edit changes it and it is not a color, else 8
+    bits."""
+    if exact:
+        return arrays.add(values.astype(np.float32)), values
+    if name == "means":
+        return arrays.add_levels(values, "i2", "log")
+    if moves and name not in ("sh0", "shN"):
+        return arrays.add_levels(values, "i2")
+    if name == "quats":
+        values = values / np.maximum(np.abs(values).max(axis=1, keepdims=True), 1e-30)
+        levels = np.round(values * 127).astype(np.int8)
+        return arrays.add(levels, scale=[1.0] * 4, zero=[0.0] * 4), levels
+    if name == "logit_opacities":
+        opacity = 1 / (1 + np.exp(-np.clip(values.astype(np.float64), -40, 40)))
+        return arrays.add_levels(np.clip(opacity, 1 - _MAX_OPACITY, _MAX_OPACITY), "i1", "logit")
+    if name == "log_scales" and len(values):
+        values = np.maximum(values, values.max(axis=1).mean() + math.log(_MIN_AXIS_SHARE))
+    return arrays.add_levels(values, "i1")
+
+
+def _edit(
+    arrays: Arrays,
+    scene: Gaussians,
+    gdf: Gdf,
+    order: Tensor,
+    kept: int,
+    exact: bool,
+    overlaps: bool,
+) -> dict[str, Any]:
+    """Append the arrays of an edit, with its members in this order; return its header entry."""
+    form = gdf.field.origin
+    widths = {"shN": 3 * kept}
+    record: dict[str, Any] = {
+        "name": gdf.name,
+        "recorded": list(gdf.field.recorded),
+        "knots": _numbers(gdf.field.knots),
+        "attributes": {
+            name: _bases(arrays, name, bases, order, widths.get(name, bases.end_offset.shape[1]), exact)
+            for name, bases in gdf.field.attributes.items()
+            if widths.get(name, 1)
+        },
+    }
+    if overlaps:
+        shares = {kind: share[order].numpy() for kind, share in coverage(scene, gdf).items()}
+        record["coverage"] = {
+            kind: arrays.add(share) if exact else arrays.add_levels(share, "i1")[0]
+            for kind, share in shares.items()
+        }
+        record["grade"] = _grade(arrays, form, order, kept) if isinstance(form, GradeForm) else None
+    return record
+
+
+def _bases(
+    arrays: Arrays, name: str, bases: AttributeBases, order: Tensor, width: int, exact: bool
+) -> dict[str, Any]:
+    """Append one attribute of an edit, its first `width` channels; return its header entry."""
+    end = bases.end_offset[order, :width]
+    scale = bases.scale[:, :width].clone()
+    residual = bases.residual_basis[:, order, :width].float()
+    if end.dtype == torch.float32 and not exact:
+        levels, unit = quantize_bases((end * scale[0])[None], torch.int8 if name == "shN" else torch.int16)
+        end = levels[0]
+        scale[0] = unit[0]
+    if bases.residual_basis.dtype == torch.int8:
+        residual = bases.residual_basis[:, order, :width]
+    elif not exact:
+        residual, unit = quantize_bases(residual, torch.int8)
+        scale[1:] *= unit
+    return {
+        "end": arrays.add(end.numpy()),
+        "residual": [arrays.add(basis.numpy()) for basis in residual],
+        "scale": _numbers(scale),
+        "coefficients": _numbers(bases.coefficients),
+    }
+
+
+def _grade(arrays: Arrays, form: GradeForm, order: Tensor, kept: int) -> dict[str, Any]:
+    """Append the map of a grade, for colors that lower layers have changed; return its header entry."""
+    width = min(form.residual.shape[2], 3 + 3 * kept)
+    return {
+        "degree": form.degree,
+        "knots": _numbers(form.knots),
+        "table": [arrays.add(table.numpy()) for table in form.table],
+        "residual": [arrays.add(basis[order, :width].numpy()) for basis in form.residual],
+        "scale": _numbers(form.scale[:, :width]),
+        "coefficients": _numbers(form.coefficients),
+        "old": form.remap.old.tolist(),
+        "new": form.remap.new.tolist(),
+        "share": arrays.add(form.share[order].numpy()) if form.mask is not None else None,
+    }
+
+
+def _numbers(tensor: Tensor) -> Any:
+    """Return float32 numbers with the fewest digits that identify them, nested like the tensor."""
+    values = tensor.numpy()
+    return [_numbers(row) for row in tensor] if values.ndim > 1 else [float(str(x)) for x in values]
