@@ -1,4 +1,4 @@
-"""Transient state: overlays on the picture, pointer and tool, recent files. It is neither undone nor saved."""
+"""Transient state: overlays, pointer with its tool, recent files. It is neither undone nor saved."""
 
 from __future__ import annotations
 
