@@ -75,7 +75,7 @@ class EditorOptions:
 
     editor: str
     """Editor of the views, such as recolor:#3060d0, style:14 or instruct:"a golden bear" (docs/cli.md)."""
-    model: Annotated[str, absent_option("STR", "what is here and fits")] = ""
+    model: Annotated[str, absent_option("STR", "a model on this machine that fits")] = ""
     """instruct: id or folder of a diffusers pipeline (docs/cli.md)."""
     guidance: Annotated[str, absent_option("NUMBER[,NUMBER]", "the model's own")] = ""
     """instruct: guidance of the text and, after a comma, of the image if supported (paper: 7.5,1.5)."""
@@ -88,7 +88,7 @@ class EditorOptions:
     quantize: Quantize = "off"
     """instruct: nf4 loads large parts in 4 bits, with a quarter of the memory and a small loss."""
     device: Device = "auto"
-    """instruct: auto is the graphics card, or the CPU for small models; cpu is the CPU for any model."""
+    """instruct: auto is the GPU, or the CPU for small models; cpu is the CPU for any model."""
     fill: Annotated[Fill | None, absent_option("{none,picture,surface}", "by the editor")] = None
     """remove, pictures: source to fill holes from: the picture, the surface around them, or none."""
     removal: Removal = "auto"
@@ -177,9 +177,9 @@ class FieldOptions:
 class TextOptions:
     """Texts for CLIP; fit and evaluate use the run's own by default."""
 
-    text_before: Annotated[str, absent_option("STR", "none; of fit and evaluate the run's own")] = ""
+    text_before: Annotated[str, absent_option("STR", "none; the run's own for fit and evaluate")] = ""
     """Text of the views before the edit, such as "a bear", for CLIP directional similarity (ViT-L/14)."""
-    text_after: Annotated[str, absent_option("STR", "none; of fit and evaluate the run's own")] = ""
+    text_after: Annotated[str, absent_option("STR", "none; the run's own for fit and evaluate")] = ""
     """Text of the views after the edit, such as "a golden bear": a description, never an instruction."""
     asked: Fixed[bool] = False  # a text was given; an instruction alone does not request the measure
 
@@ -199,7 +199,7 @@ class TrainOptions:
     region: RegionOptions
     editor: EditorOptions
     preset: Preset = "default"
-    """Method, and defaults of the options below: paper is the paper's trainer, in the readings that work."""
+    """Training method and option defaults; paper is the paper's trainer, in the readings that work."""
     name: Annotated[str, absent_option("STR", "the folder's name")] = ""
     """Name of the layer and of the .gdf file."""
     views: TrainingViewOptions = TrainingViewOptions()
@@ -323,7 +323,7 @@ class ShowRegionOptions:
     """Show the region of a scene, or save it as a file for --region file:MEMBERS.npy."""
 
     scene: tyro.conf.Positional[Path]
-    """Scene, a 3DGS .ply file."""
+    """Scene: .ply (also compressed), .spz, .splat, .ksplat, .sog, .glb or .gltf."""
     spec: tyro.conf.Positional[str]
     """Region, as for progdf train --region: box:…, lasso:…, masks:DIR, file:MEMBERS.npy, …"""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
@@ -353,7 +353,7 @@ class WriteViewsOptions:
     """
 
     scene: tyro.conf.Positional[Path]
-    """Scene, a 3DGS .ply file."""
+    """Scene: .ply (also compressed), .spz, .splat, .ksplat, .sog, .glb or .gltf."""
     out: Path
     """Folder for original/NAME.png and cameras.json."""
     cameras: Annotated[Path | None, absent_option("PATH", "a rig around the scene")] = None

@@ -45,20 +45,27 @@ BLANK = TrainOptions(Path(), Path(), RegionOptions(""), EditorOptions(""))
 """Options of an empty command line."""
 
 PERCEPTUAL_WEIGHT: Mapping[EditKind, float] = {"color": 0.1, "style": 0.3, "geometry": 0.3}
+"""Default of --perceptual-weight by kind of edit."""
 STAGES: Mapping[EditKind, int] = {"color": MAX_STAGES, "style": 1, "geometry": MAX_STAGES}
+"""Default of --stages by kind of edit."""
 COSTLY_STAGES: Mapping[EditKind, int] = {"color": 4, "style": 4, "geometry": 1}
-"""Stages for editors that paint each strength anew. Intermediate pictures of moving parts show them twice."""
+"""The same for editors that run a model for every strength.
+
+Their intermediate pictures of moving parts show the parts twice, so geometry has one stage.
+"""
 
 STAGE_STEPS = 40
 """Minimum number of steps per stage.
 
-With fewer, each view is used once or twice, and the next target starts before this one is reached. Then
-`QUICK_STAGES` stages are used (docs/lab/experiments.md, Stages).
+With fewer, each view is used once or twice, and the next target starts before the current one is reached.
+Then at most `QUICK_STAGES` stages are used (docs/lab/experiments.md, Stages).
 """
+
+# maximum numbers with --quick
 QUICK_STEPS = 240
 QUICK_STAGES = 4
 QUICK_VIEWS = 12
-_MAX_STEPS = 1_000_000  # hours on any machine
+_MAX_STEPS = 1_000_000  # takes hours on any machine
 _MAX_NAME_BYTES = 255  # accepted by every file system
 _MIN_VIEW_PX = 32  # longer side of a view
 
@@ -147,7 +154,7 @@ def resolve_kind(
         sh="on" if optimize.sh == "auto" and kind != "color" else optimize.sh,
         perceptual_weight=PERCEPTUAL_WEIGHT[kind] if weight is None else weight,
         solver="colors" if solves_colors else "descent",
-        engine="cpu" if solves_colors else optimize.engine,  # colors took an H100 1.4 to 2.4 times as long
+        engine="cpu" if solves_colors else optimize.engine,  # on an H100 colors took 1.4 to 2.4 times as long
     )
 
 
@@ -215,10 +222,10 @@ def _check_editor_options(editor: EditorOptions, optimize: OptimizeOptions) -> N
     if row.sets_views and optimize.kind not in ("auto", "color"):
         raise ProgdfError(
             f"--kind {optimize.kind} does not apply to pictures: few views do not show the depth of a part; "
-            "give more as folder:DIR, of views that --cameras has"
+            "give more as folder:DIR, with their cameras in --cameras"
         )
     if row.run == "removed" and not editor.text and editor.fill == "picture":
-        raise ProgdfError("--fill picture needs a picture of what was behind; write --editor remove:A.png")
+        raise ProgdfError("--fill picture needs a picture of the background; write --editor remove:A.png")
     if optimize.grow and not row.per_view:
         kinds = [kind for kind, other in EDITORS.items() if other.per_view]
         raise ProgdfError(f"--grow does not apply to {editor.family}; it is for {' and '.join(kinds)}")

@@ -67,7 +67,7 @@ class PgsState:
         previous: the offsets one step earlier. [M,C]
         average: their running mean, which is recorded. [M,C]
         first, second: Adam's moments. [M,C]
-        pictures: the probes at the last recording. [h,w,3] each; empty before the first step
+        pictures: renders of the probes at the last recording. [h,w,3] each; empty before the first step
         step: steps done
         stage, local: index of the stage, and steps done in it
         running: running mean of the L1 distance from the finished edit; NaN before the first step
@@ -235,12 +235,12 @@ class PgsSettings:
     ramp: float = RAMP_SHARE
     # final share of a stage's steps over which the rate falls to a tenth; 0: constant
     fall: float = DECAY_SHARE
-    # Change that 95 % of the changing pixels stay below. Smaller changes get smaller steps, down to a
-    # quarter, larger ones larger steps, up to 1.5 times; 0: the same for all. Steps larger than the change
-    # needs become random walks where the views do not resolve single Gaussians: close up, these are speckles
-    # of all colors.
+    # Reference for the change of a stage, in 95 % of the changing pixels (`p95_change`). Steps are shorter if
+    # the change is smaller, down to a quarter, and longer if it is larger, up to 1.5 times; 0: the same for
+    # all. Steps that are too long become random walks where the views do not resolve single Gaussians: close
+    # up, these are speckles of all colors.
     reach: float = REFERENCE_CHANGE
-    growth: float = math.inf  # maximum growth of a Gaussian beyond its stage's placement
+    growth: float = math.inf  # maximum factor by which a Gaussian grows beyond its stage's placement
     snapshots: int = SNAPSHOTS  # approximate number of recordings over all stages
     seed: int = 0  # seed of the view order
 
@@ -345,9 +345,8 @@ def descend(task: DescentTask, state: PgsState, on_step: OnStep) -> Iterator[Par
     """Optimize the members of a run, from a state that is changed in place, and yield recordings."""
     options = task.options
     settings = pgs_settings(options, task.rates, len(task.stages))
-    if (
-        task.adds_rows
-    ):  # they have their stage's opacity from its first step, which a blended target contradicts
+    # added rows have their stage's opacity from its first step, which a blended target contradicts
+    if task.adds_rows:
         settings = replace(settings, ramp=0.0)
     device = task.original.device
     inside = [erode(crop(view.mask, view.box)).to(device) for view in task.setup.train]

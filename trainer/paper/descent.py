@@ -44,7 +44,7 @@ RATE_FACTORS: Mapping[str, float] = {
 """Factors of GaussianEditor's scripts of 1500 steps (Chen 2024) to these rates; the paper states no rates."""
 RECORDING_INTERVAL_STEPS = 100
 """Interval between recordings, in steps."""
-_MIN_RECORDINGS = 4  # of a run that is too short for this interval
+_MIN_RECORDINGS = 4  # minimum number of recordings of a run; a short one has a shorter interval
 
 
 def learning_rates(kind: Kind, channels: int, extent: float) -> Tensor:

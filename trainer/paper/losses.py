@@ -27,6 +27,7 @@ EXPONENT: Exponent = "decay"
 """Reading of the exponent: −t/s, as the text says (decay), or +t/s, as printed (growth)."""
 OVER: Over = "mean"
 """Reading of the norm: the mean of the members' squared steps, or their sum."""
+# α, β and the period of the progressive constraint (eq. 5)
 _ALPHA = 0.05
 _BETA = 1.1
 _PERIOD_STEPS = 50.0
@@ -76,7 +77,7 @@ def describe_loss(options: OptimizeOptions, perceptual: str) -> str:
 
 
 class PaperObjective:
-    """L_PGS = L_edit + 5 L_prog + L_render over whole pictures, with L_edit = L1 + LPIPS at every step.
+    """Objective over whole pictures: L_PGS = L_edit + 5 L_prog + L_render, with L_edit = L1 + LPIPS.
 
     Args:
         perceptual: distance whose targets are cached until the stage ends
@@ -105,7 +106,7 @@ class PaperObjective:
 
 @dataclass(frozen=True)
 class RenderedLoss:
-    """L_GDF = L_pred + L_render; a `PictureLoss`.
+    """Loss of the network: L_GDF = L_pred + L_render. It implements `PictureLoss`.
 
     L_pred is L1 + LPIPS between the renders of Θ0 + GDF(s) and of the snapshot at s. L_render is −(∇²R)² of
     the former render.

@@ -27,7 +27,7 @@ from .losses import RenderedLoss
 PART = "network"
 """Name of the saved part with a jointly trained network, after the trajectory is recorded."""
 MAX_SNAPSHOTS = 64
-"""Snapshots that a bank keeps; beyond that, the one closest to its neighbors on the slider is dropped."""
+"""Maximum number of snapshots in a bank. Above it, the one nearest to its neighbors is dropped."""
 
 
 class MemoryBank:
@@ -100,7 +100,7 @@ class JointTraining:
         self._offsets = self.bank.offsets
 
     def strength(self, step: int) -> float:
-        """Return the provisional slider value of a PGS step, linear in time within its stage."""
+        """Return the provisional slider value of a PGS step, linear in the steps of its stage."""
         return float(interpolate_at(self._after, self._at, step))
 
     def add(self, step: int, offsets: Tensor) -> None:

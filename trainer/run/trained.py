@@ -167,7 +167,7 @@ def _record(
         else:
             trajectory = retimed(trajectory)
         trajectory = fade_in(trajectory)
-    cost_text = f"; dB without each attribute: {costs}" if costs else ""
+    cost_text = f"; dB lost without each attribute: {costs}" if costs else ""
     log.say(f"kept {len(trajectory)} of {count} recordings{cost_text}")
     if reason:
         log.say(f"between original and edit: {reason}")

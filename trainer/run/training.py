@@ -122,7 +122,7 @@ _PIXELS_PER_UNKNOWN = (MAX_ERROR_SHARE - 0.5) / (1.0 - MAX_ERROR_SHARE)
 
 
 Optimized = tuple[Trajectory, Losses, Mapping[str, Any]]
-"""Trajectory, even in time; loss terms and distance to the edit per recording; effort for report.json."""
+"""Trajectory, see `record`; loss terms and distance to the edit per recording; effort for report.json."""
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ def optimize_members(
     engine = optimization.engine
     device = engine_device(optimization.engine)
     if engine == "warp":
-        card = torch.cuda.get_device_name(device) if device.type == "cuda" else "the CPU, in place of a card"
+        card = torch.cuda.get_device_name(device) if device.type == "cuda" else "the CPU instead of a GPU"
         log.say(f"warp renders the training steps on {card}")
     original = pack(scene[members], with_shN=scene.sh_degree > 0).to(device)
     method = METHODS[options.preset]
@@ -244,8 +244,8 @@ def plan_colors(
         setup: scene, region, and views whose boxes hold the edit
         edited: strength → the whole edited views
         between: source of further strengths; None: only those of `edited`
-        options: view options. A small number of pictures calls for ties, see `surface_ties`. If the number of
-            views is open, every other view is solved for, provided the remaining error is not visible
+        options: view options. Changed pictures require ties, see `surface_ties`. If the number of views is
+            open, only every other view is used, provided that the remaining error is not visible
         log: log of the run
         target_psnr: see `FieldOptions`
     """
@@ -311,7 +311,7 @@ def plan_colors(
     log.say(f"{model.line}, on {evaluated_on}")
     if ties is not None:
         unseen_count = len(original) - int(solver.asked[:, 0].sum())
-        log.say(f"{unseen_count} members are in no picture; they follow the color map and their surface")
+        log.say(f"{unseen_count} members are almost hidden; they follow the color map and their surface")
     return solver.only(model.residual), model, course
 
 
@@ -466,7 +466,7 @@ def _groups(
 def _make_or_load_seeds(
     setup: TrainingSetup, optimization: OptimizeOptions, edited: Pictures, folder: StateFolder
 ) -> Gaussians | None:
-    """Return the rows to add, or restore them from the saved state; None if there are none."""
+    """Return the rows to add, made now or restored from the saved state; None if there are none."""
     saved = folder.load("seeds")
     finished = edited[max(edited)]
     if saved is None:
