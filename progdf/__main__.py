@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status, see `run_guarded`."""
     if argv is None:  # run as the program; torch and numba create 500 000 permanent objects
         gc.set_threshold(5_000)  # fewer collections during imports save 0.3 s
-        atexit.register(gc.freeze)  # no collection at exit saves 0.7 s
+        atexit.register(gc.freeze)  # skipping the collection at exit saves 0.7 s
     return run_guarded(_run, list(sys.argv[1:] if argv is None else argv))
 
 

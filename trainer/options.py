@@ -84,7 +84,7 @@ class EditorOptions:
     edit_size: Annotated[int | None, absent_option("INT", "the model's own")] = None
     """style: longer side of the paintings; instruct: side of the painted square; 32 to 4096 pixels."""
     anchor: Annotated[Path | None, absent_option("PNG", "the model paints one")] = None
-    """instruct: painted picture of one view, taken in the window (Ctrl+F2), that all views follow."""
+    """instruct: picture of one view (Ctrl+F2), edited by you, used as the reference of all views."""
     quantize: Quantize = "off"
     """instruct: nf4 loads large parts in 4 bits, with a quarter of the memory and a small loss."""
     device: Device = "auto"
@@ -207,7 +207,7 @@ class TrainOptions:
     field: FieldOptions = FieldOptions()
     texts: TextOptions = TextOptions()
     quick: bool = False
-    """Draft in a third of the time: 240 steps, 12 views, and 4 stages unless colors are solved for."""
+    """Draft in a third of the time: 240 steps and 12 views; 4 stages if the color solver is not used."""
     seed: int = 0
     """Random seed, 0 to 2³² − 1; the same seed gives the same files."""
     threads: int = 0
@@ -379,7 +379,7 @@ class BatchOptions:
     out: Path
     """Folder of the batch: runs in OUT/SCENE/NAME/, summary in OUT/batch.html and batch.csv."""
     workers: int = 0
-    """Parallel jobs (0: as many as the cores allow; 1 without Ray, progdf-studio[cluster])."""
+    """Parallel jobs (0: as many as the cores allow); more than 1 needs Ray, progdf-studio[cluster]."""
     address: Annotated[str, absent_option("HOST:PORT|auto", "a cluster of this machine's cores")] = ""
     """Running Ray cluster, whose machines share OUT and the scenes."""
     resume: bool = False

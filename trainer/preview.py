@@ -169,7 +169,7 @@ class Previewer:
         return self._painter(request).note
 
     def follows(self, request: PreviewRequest) -> bool:
-        """Return True if the editor paints a prompt with a model that can follow a picture."""
+        """Return True if the editor's model takes a prompt and a reference picture."""
         paints = editor_row(EditorOptions(request.editor)).model is not None
         return paints and self._painter(request).references > 0
 

@@ -217,9 +217,9 @@ def _targets(variant: Variant, plan: TrainOptions, shared: AblationSetup) -> Pic
 
 @contextmanager
 def _count_processor_seconds(state: StateFolder) -> Iterator[None]:
-    """Save the processor time of the block with the state, over all sessions.
+    """Save the block's processor time, summed over all calls, in the state.
 
-    The time is not changed once the block has finished in an earlier session.
+    A block that finished in an earlier call keeps its time.
     """
     saved = state.load("processor")
     begun = time.process_time()

@@ -115,7 +115,7 @@ class Mouse:
 
     def learn_detail(self) -> None:
         """Orbit the picture and stop, so that the renderer calibrates its level of detail."""
-        for _ in range(2):  # OpenGL starts to build its pyramid at the first moving picture
+        for _ in range(2):  # the first turn makes the OpenGL renderer start its LOD pyramid
             self.turn(1.0)
             self.wait_pyramid()
         self.wait_sharp()

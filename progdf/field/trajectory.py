@@ -62,7 +62,7 @@ class Trajectory:
 
     @property
     def map_course(self) -> tuple[int, Tensor]:
-        """Degree of the maps, and the map of each recording, the identity first. [S,K,3]"""
+        """Degree of the maps, and the map of each recording; that of the original is the identity. [S,K,3]"""
         assert self.maps is not None
         degree = next(d for d, count in MONOMIALS.items() if count == self.maps.shape[1])
         return degree, torch.cat([identity_map(degree)[None], self.maps])

@@ -50,7 +50,7 @@ _MODEL_FILES = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
 
 @dataclass(frozen=True)
 class CameraReport:
-    """Notes on the reading of a camera file."""
+    """Notes collected while a camera file is read."""
 
     notes: tuple[str, ...]  # one line each, such as the choice among several COLMAP models
     ignored: tuple[str, ...]  # fields of the file that are not read

@@ -332,7 +332,7 @@ def _check_labels(path: Path, picture: Image.Image) -> None:
     hues.discard((4, 4, 4))
     if len(hues) > 1:
         raise ProgdfError(
-            f"{path} has {len(hues)} colors beside gray, like a label map; save one object as white on black"
+            f"{path} has {len(hues)} colors besides gray, like a label map; save one object as white on black"
         )
 
 

@@ -39,7 +39,7 @@ class RenderOptions:
     viewpoint: OmitArgPrefixes[ViewpointOptions] = ViewpointOptions()
     drawing: OmitArgPrefixes[DrawingOptions] = DrawingOptions()
     alpha: Switch = False
-    """Make the background transparent: a .png, or a film as .webp or folder."""
+    """Make the background transparent; write a picture as .png, a film as .webp or a folder."""
     sweep: Annotated[str | None, word("NAME|all", "a still picture")] = None
     """Animate this edit's slider from 0 to 1 and back, or all sliders in turn."""
     turntable: Annotated[str | None, word("SECONDS", "a still picture")] = None

@@ -166,7 +166,7 @@ def open_session(path: Path) -> WindowSession:
 def _move(
     view: ViewState, snapshots: tuple[SliderSnapshot, ...], by: Vec3
 ) -> tuple[ViewState, tuple[SliderSnapshot, ...]]:
-    """Translate all cameras, as sessions store them in world coordinates."""
+    """Translate all cameras by `by`. Sessions store cameras in world coordinates."""
     moved = tuple(replace(snapshot, camera=move_camera(snapshot.camera, by)) for snapshot in snapshots)
     timeline = _move_keys(view.timeline, by)
     return replace(view, camera=move_camera(view.camera, by), timeline=timeline), moved

@@ -85,7 +85,7 @@ class DynamicResolution:
     pixels: int = 1  # window pixels per drawn pixel along each axis: 1 or `COARSE_PIXELS`
     # time of the next full picture, seconds on the main view's clock; None while the picture is full
     rest_at: float | None = None
-    # times of the last two full pictures, as a single one may have been delayed
+    # render times of the last two full pictures, ms; two, as a single one may have been delayed
     camera_ms: tuple[float, ...] = ()
     slider_ms: tuple[float, ...] = ()  # the same for the last two slider steps of this drag
     # time of the last coarse picture; slider steps that take no longer at full resolution stay full

@@ -78,7 +78,7 @@ class Brush:
     softness: Share = 0.5  # share of the radius over which its influence fades, 0 to 1
     mode: Annotated[str, one_of(BRUSH_MODES)] = "erase"  # one of `BRUSH_MODES`
     through: bool = False  # also affects members behind the front surface
-    # color the members of the focused layer by weight; else only a thin tint marks weights below 1
+    # color the members of the focused layer by weight; if False, a faint tint marks weights below 1
     weights: bool = False
     flow: Share = 1.0  # share of the way to its target weight that a stroke covers, 0 to 1
     value: Share = 1.0  # target weight of "add", 0 to 1

@@ -81,6 +81,6 @@ def test_label_map_is_refused(tmp_path: Path) -> None:
     colors[:4] = (0, 128, 0)
     Image.fromarray(colors).save(tmp_path / "m.png")
     with pytest.raises(
-        ProgdfError, match=r"m\.png has 2 colors beside gray.*; save one object as white on black"
+        ProgdfError, match=r"m\.png has 2 colors besides gray.*; save one object as white on black"
     ):
         read_mask(tmp_path / "m.png", (32, 24))
