@@ -58,8 +58,9 @@ test-cpus: setup extras window
 	  echo "with $$cpu"; env $$cpu $(PYTEST) $(TESTS) || failed="$$failed $$cpu"; done; \
 	test -z "$$failed" || { echo "failed with$$failed"; exit 1; }
 
+# Add SEARCH=--hypothesis-profile=search for new random examples.
 test-all: setup extras window browser
-	$(PYTEST) -m '' --hypothesis-profile=search
+	$(PYTEST) -m '' $(SEARCH)
 
 # With the extras, so that types are checked against the same packages everywhere; for each system, as each has
 # modules and names that others lack. One cache a system, so that a second run takes seconds.

@@ -143,6 +143,7 @@ class RayPool:
         self._folder = "" if address else tempfile.mkdtemp(prefix="progdf-ray-")
         own = {"num_cpus": cpus, "object_store_memory": _STORE_BYTES, "_temp_dir": self._folder}
         where: dict[str, Any] = {"address": address} if address else {**own, "include_dashboard": False}
+        before = signal.getsignal(signal.SIGTERM)
         try:
             ray.init(log_to_driver=False, logging_level="error", **where)
         except Exception as error:  # Ray raises a bare Exception if its start takes too long
@@ -150,6 +151,9 @@ class RayPool:
             hint = "; if the cluster requires a token, set RAY_AUTH_MODE=token" if address else ""
             reason = str(error).partition("\n")[0] or type(error).__name__
             raise ProgdfError(f"Ray cannot be used ({reason}){hint}") from error
+        finally:
+            if signal.getsignal(signal.SIGTERM) is not before:
+                signal.signal(signal.SIGTERM, before)  # Ray's own handler would end the batch without a word
         self._checked_at = 0.0
         self._cpus = 0
         machines = [node["Resources"] for node in ray.nodes() if node["Alive"]]

@@ -68,7 +68,7 @@ class EditOrder:
     quick: bool = True  # train with --quick
     threads: int = 0  # CPU threads; 0 for all
     model: str = ""  # diffusion model for a sentence; "" selects one that fits
-    anchor: str = ""  # file of a painted picture that all views follow, "" for none
+    anchor: str = ""  # file of an edited picture that is the reference of all views, "" for none
     at: str = ""  # for a decal: its position in the camera's picture
     camera: str = ""  # file of that camera
 

@@ -364,7 +364,7 @@ def _model(form: NewEdit, preview: PreviewState, column: float, ui: UiContext) -
 
 
 def _anchor(form: NewEdit, preview: PreviewState, column: float) -> tuple[NewEdit, str]:
-    """Draw the buttons for the anchor picture that all views follow: generate, or edit ("paint_over")."""
+    """Draw the buttons for the anchor, the reference of all views: generate, or edit ("paint_over")."""
     label("Anchor", column)
     half = 0.5 * (imgui.get_content_region_avail().x - imgui.get_style().item_spacing.x)
     with inert(bool(form.obstacle) or preview.busy):

@@ -135,7 +135,7 @@ def test_single_wrong_row_is_named(keeps_rows: bool) -> None:
     bounds = torch.full((60, 3), 1e-3, dtype=torch.float64)
     with pytest.raises(ProgdfError, match=r"[xyz] of Gaussian \d+ is .* and comes back as"):
         compare("a.spz", scene, wrong, bounds, keeps_rows)
-    with pytest.raises(ProgdfError, match="59 of 60 Gaussians come back"):
+    with pytest.raises(ProgdfError, match="only 59 of 60 Gaussians can be read back"):
         compare("a.spz", scene, wrong[:59], bounds, keeps_rows)
 
 

@@ -296,10 +296,12 @@ def test_workers_train_jobs_in_parallel(tmp_path: Path) -> None:
     write_bear(tmp_path)
     sizes: dict[str, object] = {"views": 4, "image_size": 48, "steps": 24, "stages": 2}
     jobs = [BatchJob(part, quick_options(tmp_path, part, part, **sizes)) for part in ("scarf", "ears")]
+    before = signal.getsignal(signal.SIGTERM)
     assert {(row.job, row.status) for row in run(jobs, workers=2)} == {
         ("scarf", "done"),
         ("ears", "done"),
     }
+    assert signal.getsignal(signal.SIGTERM) == before, "Ray would replace it"
 
 
 @pytest.mark.slow

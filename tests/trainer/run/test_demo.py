@@ -201,7 +201,7 @@ def test_stopped_demo_resumes_and_otherwise_starts_over(
     monkeypatch.setattr(trainer.run.run, "train", train)
     monkeypatch.setattr(trainer.run.resume, "find_run", lambda options: here[options.out.name])
     arguments = ["--size", str(SIZE), "--out", str(tmp_path / "demo"), "--no-window"]
-    with pytest.raises(KeyboardInterrupt, match="give the same command again to go on"):
+    with pytest.raises(KeyboardInterrupt, match="repeat the command to continue"):
         demo.main(arguments)
     assert asked == [("scarf", True), ("gold", True)]
     here["gold"] = "nothing"

@@ -189,7 +189,7 @@ def test_removal_is_a_regular_run(scene_file: Path, tmp_path: Path) -> None:
     assert "shadows and reflections stay" in (out / "log.txt").read_text()
     again = train(replace(options_of(scene_file, out), resume=True), quiet=True)
     assert again.gdf == result.gdf
-    with pytest.raises(ProgdfError, match="a removal has none"):
+    with pytest.raises(ProgdfError, match="removals and decals have no trajectory"):
         evaluate(EvaluateOptions(out))
 
 

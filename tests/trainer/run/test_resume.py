@@ -86,7 +86,7 @@ def test_ctrl_c_saves_the_state_and_exits_130_with_instructions(
     assert main(words(bear_folder)) == 130
     last = capsys.readouterr().err.splitlines()[-1]
     assert last.startswith("progdf: interrupted; ")
-    assert last.endswith("give the same command with --resume to go on")
+    assert last.endswith("repeat the command with --resume to continue")
     assert saved_step() == 10
     assert "continuing at step 10 of 24" in gone_on(bear_folder, uninterrupted)
 

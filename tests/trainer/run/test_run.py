@@ -270,7 +270,7 @@ def test_interrupted_run_leaves_the_earlier_edit_intact(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(training, "solve", interrupt)
-    with pytest.raises(KeyboardInterrupt, match="with --resume to go on"):
+    with pytest.raises(KeyboardInterrupt, match="with --resume to continue"):
         train(options, quiet=True)
     assert (root / brief.gdf.name).read_bytes() == kept
     assert not [path for path in root.rglob("*") if path.name.startswith(".")]
