@@ -33,7 +33,7 @@ pytest.register_assert_rewrite(
     "tests.helpers.ply_files", "tests.helpers.refused", "tests.helpers.stopped_runs"
 )
 
-# `make test` uses the same examples everywhere, and `make test-all` searches for new ones. A busy machine may
+# The same examples everywhere; the profile "search" draws new ones. A busy machine may
 # take long for each example
 settings.register_profile("same", derandomize=True, deadline=None)
 settings.register_profile("search", derandomize=False, print_blob=True, deadline=None)
