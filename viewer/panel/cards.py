@@ -10,6 +10,7 @@ from itertools import pairwise
 from imgui_bundle import imgui, imgui_ctx
 
 from progdf.compose.reference import BLENDS
+from progdf.terminal import format_count
 from viewer.state.commands import Action, Plain, PressLayer, Rename, WithText, WithValue
 from viewer.state.facts import LayerRow
 from viewer.state.layer_selection import filter_layers, master_strength, selected_layers
@@ -187,7 +188,8 @@ def _group_name(
     if gesture == "clicked":
         actions.append(select)
     hovered = imgui.is_item_hovered()
-    tip(f"{group.name}, {count} layers\nClick to select them, drag to reorder, double-click to rename")
+    about = f"{group.name}, {format_count(count, 'layer')}"
+    tip(f"{about}\nClick to select, drag to reorder, double-click to rename")
     if hovered and imgui.is_mouse_double_clicked(imgui.MouseButton_.left.value):
         start_naming()
     if imgui.is_item_clicked(imgui.MouseButton_.right.value):

@@ -29,6 +29,7 @@ from viewer.state.timeline import (
 from viewer.state.view_state import MAX_FPS, MAX_FRAME, Keyframe, Timeline
 from viewer.state.workspace import Workspace
 from viewer.ui.context import PALETTE, ROW_COLORS, SMALL_PX, Icon, Rgba, UiContext, u32
+from viewer.ui.keys import shortcut
 from viewer.ui.overlay import Area
 from viewer.ui.widgets import elide, hint, icon_button, icon_row, inert, is_released, plate, tip
 
@@ -372,10 +373,11 @@ def _paint(
     )
     _paint_keys(ruler, here, line, under, p.handle)
     if not timeline.keys:
-        hint = "Press K to insert a keyframe"
+        chord = shortcut("key")
+        text = f"Press {chord} to insert a keyframe" if chord else "No keyframes yet"
         size = SMALL_PX * scale
         at = (round(start + 40.0 * scale), round(line - size - 3.0 * scale))
-        canvas.add_text(ui.fonts.regular, size, at, u32(p.dim), hint)
+        canvas.add_text(ui.fonts.regular, size, at, u32(p.dim), text)
     x = round(ruler.x(ruler.frame)) + 0.5
     canvas.add_line((x, top - 2.0 * scale), (x, line), u32(p.accent), 1.5 * scale)
     canvas.add_triangle_filled(

@@ -75,7 +75,13 @@ _OPERATIONS = (
 )
 COLUMN_PX = 88.0  # at 1×: start of the control in a row
 _DEPTHS = {False: "Front", True: "Through"}
-_SIZE_KEYS = f"{shortcut('brush_radius:0.8')} and {shortcut('brush_radius:1.25')}"
+_SIZE_ACTIONS = ("brush_radius:0.8", "brush_radius:1.25")  # also change the tolerance of a click
+
+
+def _with_chords(text: str, *actions: str) -> str:
+    """Return a text with the chords of actions in parentheses, such as "Brush radius ([ and ])"."""
+    chords = [chord for chord in map(shortcut, actions) if chord]
+    return f"{text} ({' and '.join(chords)})" if chords else text
 
 
 def _open_below(share: float, ui: UiContext) -> None:
@@ -232,11 +238,12 @@ def _select_options(tool: SelectTool, bar: _Bar) -> SelectTool:
         tool = replace(tool, through=through)
     if tool.tool == "brush":
         ends = (SMALLEST_PX, LARGEST_PX)
-        help_ = f"Brush radius ({_SIZE_KEYS})"
+        help_ = _with_chords("Brush radius", *_SIZE_ACTIONS)
         radius = bar.slider("Radius", tool.radius, ends, SelectTool.radius, help_, "%.0f px")
         tool = replace(tool, radius=radius)
     if tool.tool in ("flood", "color"):
-        help_ = f"Maximum difference from the clicked color ({_SIZE_KEYS}). A change updates the last click"
+        help_ = _with_chords("Maximum difference from the clicked color", *_SIZE_ACTIONS)
+        help_ += ". A change updates the last click"
         tolerance = bar.slider("Tolerance", tool.tolerance, (0.01, 1.0), SelectTool.tolerance, help_)
         tool = replace(tool, tolerance=tolerance)
     return tool
@@ -265,7 +272,8 @@ WHOLE = ("paint_clear", "paint_fill", "paint_invert", "paint_feather")
 def paint_obstacle(view: ViewState, focus: int | None) -> str:
     """Return the reason why the brush cannot paint, in one line; "" if it can."""
     if focus is None or focus >= len(view.layers):
-        return "no layer is selected; click one, or press 1–9"
+        first = shortcut("focus:1")
+        return "no layer is selected; click one" + (f", or press {first} for the first" if first else "")
     layer = view.layers[focus]
     if layer.locked:
         return f"{layer.name} is locked; press {shortcut('lock')} to unlock it"
@@ -281,9 +289,9 @@ def _brush_options(view: ViewState, focus: int | None, bar: _Bar, actions: list[
     help_ = "While painting, Ctrl swaps Add and Erase, and Shift smooths"
     brush = replace(brush, mode=bar.segments("mode", modes, brush.mode, help_, "brush_mode"))
     ends = (SMALLEST_PX, LARGEST_PX)
-    help_ = f"Brush radius ({_SIZE_KEYS})"
+    help_ = _with_chords("Brush radius", *_SIZE_ACTIONS)
     radius = bar.slider("Radius", brush.radius, ends, Brush.radius, help_, "%.0f px")
-    help_ = f"Brush softness ({shortcut('brush_softness:-0.1')} and ])"
+    help_ = _with_chords("Brush softness", "brush_softness:-0.1", "brush_softness:0.1")
     softness = bar.slider("Softness", brush.softness, (0.0, 1.0), Brush.softness, help_)
     help_ = "Effect of one stroke; repeated strokes increase it"
     flow = bar.slider("Flow", brush.flow, (0.0, 1.0), Brush.flow, help_)

@@ -14,12 +14,15 @@ from imgui_bundle import imgui
 
 from progdf.io.atomic import state_folder
 from tests.helpers.null_app import null_app, press
+from tests.helpers.scenes import random_gaussians
 from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from tests.viewer.app.test_keys_of_lists_and_form import strike, type_text
 from viewer.app import interface
+from viewer.camera.view_camera import first_camera
 from viewer.files import exports
 from viewer.files.document import empty
+from viewer.panel.tools import paint_obstacle
 from viewer.state import actions, selection, timeline
 from viewer.state.commands import Plain
 from viewer.state.view_state import ViewState
@@ -168,6 +171,16 @@ def test_bound_keys_replace_defaults_and_are_taken_from_others() -> None:
     assert "Quit" not in rows
     assert bind({}) == []
     assert shortcut("snapshot") == "F5"
+
+
+@pytest.mark.usefixtures("own_keys")
+def test_message_names_the_bound_key_or_none() -> None:
+    view = ViewState(first_camera(random_gaussians(20)))
+    assert paint_obstacle(view, None) == "no layer is selected; click one, or press 1 for the first"
+    assert bind({"focus:1": "Alt+9"}) == []
+    assert paint_obstacle(view, None).endswith("or press Alt+9 for the first")
+    assert bind({"focus:1": ""}) == []
+    assert paint_obstacle(view, None) == "no layer is selected; click one"
 
 
 WRONG = {
