@@ -5,7 +5,7 @@ set -euo pipefail
 progdf=$(realpath "$1") demo=$(realpath "$2") out=$(realpath -m "$3")
 export DISPLAY=:97
 folder=$(mktemp -d)
-Xvfb "$DISPLAY" -screen 0 1280x800x24 >/dev/null 2>&1 &
+Xvfb "$DISPLAY" -screen 0 1280x800x24 -noreset >/dev/null 2>&1 &
 screen=$!
 trap 'kill "$screen"; rm -rf "$folder"' EXIT
 sleep 1

@@ -42,8 +42,9 @@ def display(width: int = 1400, height: int = 900) -> Iterator[str]:
     receive, send = os.pipe()
     # a number per process: servers that search for a free one at the same time may find the same
     own = (f":{_FIRST_DISPLAY + os.getpid() % _DISPLAYS}", "-displayfd", str(send))
-    # -r turns key repeat off: on a busy machine a key may stay down long enough to repeat
-    command = ["Xvfb", *own, "-screen", "0", f"{width}x{height}x24", "-nolisten", "tcp", "-r"]
+    # -r turns key repeat off: on a busy machine a key may stay down long enough to repeat. -noreset: else the
+    # server starts over when its last client leaves, as xdotool does, and refuses a window at that moment
+    command = ["Xvfb", *own, "-screen", "0", f"{width}x{height}x24", "-nolisten", "tcp", "-r", "-noreset"]
     server = subprocess.Popen(command, pass_fds=[send], stderr=subprocess.DEVNULL)
     os.close(send)
     try:
