@@ -1,8 +1,10 @@
 """Edits that remove, move or copy regions. Their path over strengths is known, so nothing is trained.
 
-    remove      opacity falls to 0, linearly in opacity
+    remove      a region fades out, until no engine draws it
     transform   a region is translated, rotated and scaled about the mean of its centers, along an arc
     duplicate   a transformed copy of a region fades in as added rows
+
+Fading is even in pictures (see `progdf.fade`), or linear in opacity, which needs no pictures.
 
 Each is an edit with a slider, a `Gdf`. `bake` applies the same steps to a scene permanently.
 """
@@ -17,6 +19,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from progdf.camera import Camera
+from progdf.fade import fading_course
 from progdf.field.baked import interpolate_at
 from progdf.field.separable import course_field, opacity_course
 from progdf.gaussians import Gaussians, attribute_slices, concatenate, pack
@@ -72,6 +76,7 @@ def tidy(
     name: str,
     instruction: str = "",
     added: Gaussians | None = None,
+    cameras: Sequence[Camera] | None = None,
 ) -> Gdf:
     """Return the steps as one edit: strength 0 is the scene, strength 1 the result of all steps.
 
@@ -82,6 +87,8 @@ def tidy(
         name: name of the layer
         instruction: text stored in the .gdf
         added: further rows to add, as they are at strength 1
+        cameras: views in which fading is even; empty: cameras around the fading Gaussians; None: opacities
+            change linearly, which is fast
 
     Returns:
         Edit of all removed or moved Gaussians. Copies are its added rows.
@@ -98,13 +105,14 @@ def tidy(
     bands = scene.sh_degree > 0 and any(_rotates(step) for step in steps)
     rows = pack(scene[members], with_shN=bands)
     added = _copies(scene, steps, added)
-    start = rows[:, _OPACITY_COLUMN]
     end = _end_logits(scene, steps)[members]
+    start_scene = scene
     if added is not None:
         end = torch.cat([end, added.logit_opacities])
         added = replace(added, logit_opacities=torch.full_like(added.logit_opacities, ADDED_LOGIT))
-        start = torch.cat([start, added.logit_opacities])
-    opacity_knots, logits = opacity_course(start, end)
+        start_scene = concatenate([scene, added])
+    affected = torch.cat([members, torch.arange(len(scene), len(start_scene))])
+    opacity_knots, logits = _opacity_course(start_scene, affected, end, cameras)
     motions = [step.motion for step in steps if step.does == "transform" and step.motion is not None]
     count = max(1, *(math.ceil(_motion_size(motion) / _KNOT_SPACING) for motion in motions)) if motions else 1
     knots = torch.linspace(0.0, 1.0, 1 + count)
@@ -116,6 +124,26 @@ def tidy(
         offsets[i, :, _OPACITY_COLUMN] = interpolate_at(opacity_knots, logits, s)
     field = course_field(knots, offsets)
     return Gdf(name, region, field, fingerprint(scene), instruction, added=added)
+
+
+def _opacity_course(
+    scene: Gaussians, rows: Tensor, end: Tensor, cameras: Sequence[Camera] | None
+) -> tuple[Tensor, Tensor]:
+    """Return knots [S] and the offsets of the rows' logits from the scene's at them. [S,M]
+
+    Args:
+        scene: all Gaussians at strength 0, with the added ones
+        rows: the affected ones. [M]
+        end: their logits at strength 1. [M]
+        cameras: see `tidy`
+    """
+    fades = end != scene.logit_opacities[rows]
+    if cameras is None or not bool(fades.any()):
+        return opacity_course(scene.logit_opacities[rows], end)
+    knots, course = fading_course(scene, rows[fades], end[fades], cameras)
+    offsets = torch.zeros(len(knots), len(rows))
+    offsets[:, fades] = course
+    return knots, offsets
 
 
 def bake(scene: Gaussians, steps: Sequence[Step]) -> Gaussians:

@@ -110,7 +110,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _write_edit(options: EditOptions, scene: Gaussians, steps: Sequence[Step]) -> int:
-    gdf = tidy(scene, steps, options.out.stem, _instruction(options))
+    gdf = tidy(scene, steps, options.out.stem, _instruction(options), cameras=())
     save_gdf(options.out, gdf)
     print_line("; ".join(_describe(step) for step in steps))
     print_line(

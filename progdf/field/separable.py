@@ -245,8 +245,10 @@ def _fit_attribute(offsets: Tensor, weights: Tensor, rank: int, basis_type: torc
 
 _TRAJECTORY_TOLERANCE = 0.003  # RMS error of the factoring, as a share of the trajectory's own RMS
 _MAX_TRAJECTORY_RANK = 8
-_OPACITY_KNOTS = (0.0, 0.002, 0.005, 0.01, 0.02, 0.04, 0.07, 0.11, 0.17, 0.25, 0.35)
+_RISE = torch.tensor((0.0, 0.002, 0.005, 0.01, 0.02, 0.04, 0.07, 0.11, 0.17, 0.25, 0.35), dtype=torch.float64)
 """Strengths at which a logit bends most if opacity rises from 0. Mirrored for an opacity that falls to 0."""
+OPACITY_KNOTS = torch.cat([_RISE, torch.tensor([0.5], dtype=torch.float64), 1.0 - _RISE.flip(0)])
+"""Knots for the logits of opacities that rise from 0 or fall to 0, from 0 to 1. [S] float64"""
 
 
 def course_field(knots: Tensor, offsets: Tensor) -> BakedField:
@@ -290,13 +292,11 @@ def opacity_course(start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         Knots [S], and the offset of each logit from `start` at them [S,M], exact at both ends.
     """
-    rise = torch.tensor(_OPACITY_KNOTS, dtype=torch.float64)
-    knots = torch.cat([rise, torch.tensor([0.5], dtype=torch.float64), 1.0 - rise.flip(0)])
-    opacity = torch.lerp(start.double().sigmoid(), end.double().sigmoid(), knots[:, None])
+    opacity = torch.lerp(start.double().sigmoid(), end.double().sigmoid(), OPACITY_KNOTS[:, None])
     offsets = (opacity.logit() - start.double()).float()
     offsets[0] = 0.0
     offsets[-1] = end.float() - start.float()
-    return knots.float(), offsets
+    return OPACITY_KNOTS.float(), offsets
 
 
 def keyframe_rows(strengths: Tensor, count: int) -> list[int]:

@@ -281,6 +281,12 @@ def alpha_weights(gaussians: Gaussians, camera: Camera, mask: Tensor, engine: st
         return get_engine(engine).alpha_weights(activated, RasterView.of(camera, activated), mask)
 
 
+def bare_weight(opacities: Tensor) -> Tensor:
+    """Return the mean α of unoccluded Gaussians over the ellipse {α ≥ 1/255}. [N] -> [N]"""
+    bare = (opacities - ALPHA_MIN) / (opacities / ALPHA_MIN).clamp_min(1.001).log()
+    return bare.clamp_min(1e-6)
+
+
 def color_map(
     gaussians: ActivatedGaussians,
     camera: Camera,

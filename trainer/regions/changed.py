@@ -26,6 +26,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.io.images import saving_loss
 from progdf.rasterize import alpha_weights
+from progdf.rasterize.engines import bare_weight
 from progdf.region import Region
 from progdf.scene.point_tree import PointTree
 from progdf.sh import sh0_to_rgb
@@ -35,7 +36,7 @@ from trainer.store.run_folder import quantize_image
 from trainer.views.view import fit_size, with_near_plane
 
 from .few_masks import FEW, connected_pieces
-from .lift import HIDDEN, Evidence, bare_weight, gather, lift_evidence
+from .lift import HIDDEN, Evidence, gather, lift_evidence
 from .surface import SurfaceVote, covered_rows
 
 LIFTED_AT = 512

@@ -11,7 +11,7 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.rasterize import alpha_weights
-from progdf.rasterize.engines import ALPHA_MIN
+from progdf.rasterize.engines import bare_weight
 from progdf.region import Region
 from trainer.options import LiftRule
 
@@ -46,12 +46,6 @@ class Evidence:
     views: Tensor  # number of views that show it with a clearness above `HIDDEN`. [N]
     views_inside: Tensor  # number of these with more than half of its contribution inside the mask. [N]
     opacities: Tensor  # σ. [N]
-
-
-def bare_weight(opacities: Tensor) -> Tensor:
-    """Return the mean α of unoccluded Gaussians over the ellipse {α ≥ 1/255}. [N] -> [N]"""
-    bare = (opacities - ALPHA_MIN) / (opacities / ALPHA_MIN).clamp_min(1.001).log()
-    return bare.clamp_min(1e-6)
 
 
 def gather(scene: Gaussians, cameras: Sequence[Camera], masks: Sequence[Tensor]) -> Evidence:

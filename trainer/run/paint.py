@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from scipy import ndimage
 from torch import Tensor
@@ -15,6 +14,7 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.compose.reference import edited_scene
 from progdf.errors import ProgdfError
+from progdf.fade import linear_remap
 from progdf.field.baked import interpolate_at
 from progdf.field.separable import course_field, opacity_course
 from progdf.gaussians import BASE_CHANNELS, Gaussians, concatenate, pack
@@ -53,7 +53,6 @@ _MIN_SPILL_WEIGHT_PX = 0.5  # with a larger sum of weights in such pixels, a Gau
 _MISSED_COLOR = 0.05  # color error from which a painted pixel counts as missed by recoloring
 _ROUNDING_COLOR = 1.5 / 255  # two 8-bit images may differ by this much through rounding
 _ERROR_SIGMA_PX = 2.0  # sigma of the Gaussian filter over the squared error
-_VISIBILITY_STEPS = 12  # number of steps along the path at which the visible change is measured
 _OPACITY_CHANNEL = 10  # column of a packed row, see `attribute_slices`
 
 
@@ -268,14 +267,7 @@ def _linear_visibility_knots(
         now = concatenate([moved, replace(faint_discs, logit_opacities=logits)])
         return render(now, paint.camera, BACKGROUND, crop=box).image[painted]
 
-    first = look_at(0.0)
-    last = look_at(1.0)
-    change = last - first
-    samples = np.linspace(0.0, 1.0, _VISIBILITY_STEPS + 1)
-    shares = [float(((look_at(g) - first) * change).sum() / change.square().sum()) for g in samples[1:-1]]
-    visible = np.maximum.accumulate(np.clip([0.0, *shares, 1.0], 0.0, 1.0))
-    visible = 0.98 * visible + 0.02 * samples  # strictly ascending
-    return torch.from_numpy(np.interp(steps.double().numpy(), samples, visible)).float()
+    return linear_remap(look_at)(steps.double()).float()
 
 
 def sharpen(

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
+import torch
 from torch import Tensor
 
 from progdf.compose.reference import edited_scene
@@ -17,6 +19,7 @@ from progdf.gdf.file import Gdf
 from progdf.io.images import contact_sheet
 from progdf.io.json_values import to_json
 from progdf.metrics.image import decibels
+from progdf.metrics.slider import visible_change
 from progdf.scene.strays import with_strays
 from progdf.terminal import format_count
 from progdf.tidy import Step, tidy
@@ -34,7 +37,7 @@ from .finish import DEFAULTS, RunResult, differences, write_result
 
 _TOLERANCE = 0.05  # color tolerance of equal pixels; also the mask value from which a pixel counts as region
 _MIN_PAINT = 2 / 255  # smallest color change that counts as paint
-_STRENGTH_STEPS = 20  # steps between strengths 0 and 1 in which the opacities are compared
+_JUDGED_STRENGTHS = (0.25, 0.5, 0.75, 0.9)  # strengths at which the visible change is measured
 
 
 def is_removal(options: TrainOptions, setup: TrainingSetup, log: RunLog) -> bool:
@@ -130,15 +133,18 @@ def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder
         f"{format_count(rows_added)} from {format_count(fill.views, 'view')} ({kind})"
     )
     with log.stage("report"):
-        gdf = tidy(scene, [Step("remove", region)], options.name, options.editor.editor, fill.rows)
+        cameras = [view.camera for view in around.train]
+        steps = [Step("remove", region)]
+        gdf = tidy(scene, steps, options.name, options.editor.editor, fill.rows, cameras)
         removed = remaining if fill.rows is None else concatenate([remaining, fill.rows])
         judging = around.judging
         errors = _measure(edited_scene(scene, gdf), removed, judging)
+        fading = _measure_fading(scene, gdf, judging)
         report = {
             "edit": {"psnr_to_views": min(errors.values()), "psnr_by_background": errors},
             "removal": {
                 "members": len(region),
-                "opacity_off_linear": round(_max_deviation_from_linear(scene, gdf), 4),
+                **fading,
                 "fill": kind,
                 "rows_added": rows_added,
                 "filled_from_views": fill.views,
@@ -158,8 +164,11 @@ def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder
     about = {name: report[name] for name in ("edit", "removal")}
     gdf = replace(gdf, options=differences(report["plan"], DEFAULTS), report=about)
     result = write_result(folder, gdf, report, picture)
-    psnr_list = ", ".join(f"{psnr:.1f} dB on {name}" for name, psnr in errors.items())
-    log.say(f"PSNR to a render of the filled scene without the region, at the region's pixels: {psnr_list}")
+    shares = ", ".join(f"{100 * share:.0f} % at {s}" for s, share in fading["visible_change"].items())
+    log.say(
+        f"visible change in {around.judged_on}: {shares}; at 0.5 a pixel differs by "
+        f"{fading['pixel_deviation']:.3f} on average from the mean of its ends"
+    )
     log.say(f"{result.line}; shadows and reflections stay")
     return result
 
@@ -198,17 +207,32 @@ def _measure(edited: Gaussians, reference: Gaussians, views: Sequence[View]) -> 
     return {name: round(decibels(error / max(1, count)), 2) for name, error in errors.items()}
 
 
-def _max_deviation_from_linear(scene: Gaussians, gdf: Gdf) -> float:
-    """Return the largest deviation of the region's summed opacity from a straight line, as a share of the
-    sum."""
-    members = gdf.region.members
-    total = float(scene.opacities[members].sum())
-    deviations = [0.0]
-    for i in range(1, _STRENGTH_STEPS + 1):
-        s = i / _STRENGTH_STEPS
-        current = edited_scene(scene, gdf, s).opacities[members].sum()
-        deviations.append(abs(float(current) / total - (1.0 - s)))
-    return max(deviations)
+def _measure_fading(scene: Gaussians, gdf: Gdf, views: Sequence[View]) -> dict[str, Any]:
+    """Return the evenness of the fading over the views and `BACKGROUND_NAMES`, for report.json.
+
+    The visible change at some strengths is a share of that at 1. The deviation of a pixel at strength 0.5 is
+    its largest color difference from the mean of its colors at 0 and 1, over the pixels that the edit
+    changes.
+    """
+
+    def pictures(strength: float) -> list[Tensor]:
+        edited = edited_scene(scene, gdf, strength)
+        return [image for view in views for image in on_backgrounds(edited, view.camera)]
+
+    first = pictures(0.0)
+    last = pictures(1.0)
+    between = {strength: pictures(strength) for strength in _JUDGED_STRENGTHS}
+    whole = visible_change(first, last)
+    changes = dict[str, float]()
+    for strength, now in between.items():
+        changes[f"{strength:g}"] = round(visible_change(first, now) / whole, 3) if whole else strength
+    deviations = []
+    for a, b, now in zip(first, last, between[0.5], strict=True):
+        changed = (a - b).abs().amax(dim=2) > _MIN_PAINT
+        deviations.append((now - 0.5 * (a + b)).abs().amax(dim=2)[changed])
+    pixels = torch.cat(deviations)
+    mean = round(float(pixels.mean()), 4) if len(pixels) else 0.0
+    return {"visible_change": changes, "pixel_deviation": mean}
 
 
 def _picture_error(

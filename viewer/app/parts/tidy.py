@@ -119,6 +119,6 @@ class TidyActions:
         make_folder(self._folder)
         name = document.free_name(_NAMES[does])
         path = free_path(self._folder, name, ".gdf")
-        gdf = tidy(document.original, steps, name, _INSTRUCTIONS[does])
+        gdf = tidy(document.original, steps, name, _INSTRUCTIONS[does], cameras=())
         save_gdf(path, gdf)
         self._edits.add(path, name, deselect=True)
