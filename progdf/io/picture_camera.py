@@ -1,7 +1,7 @@
-"""Cameras of rendered pictures: embedded in the .png when rendering, recovered after external editing.
+"""Cameras of rendered pictures: in the .png and in a file beside it, recovered after external editing.
 
 Many programs keep the text chunk with the camera when they save a picture. If a program drops it, or writes
-another format, the camera comes from a file beside the picture, or from a given camera of the same name.
+another format, the camera comes from the file beside the picture, or from a given camera of the same name.
 """
 
 from __future__ import annotations
@@ -19,13 +19,22 @@ from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.gaussians import ZERO, Origin
 
-from .cameras import PICTURE_KEY, camera_in_picture, cameras_to_json, load_cameras
+from .cameras import (
+    PICTURE_KEY,
+    camera_in_picture,
+    cameras_to_json,
+    kind_of_cameras,
+    load_cameras,
+    save_cameras,
+)
 from .images import picture_text
 from .json_values import decode_json
 from .picture_files import name_key, split_path
 
 UP_KEY = "progdf:up"
 """Key of the .png text chunk with the up axis of the scene."""
+CAMERA_SUFFIX = ".camera.json"
+"""Suffix of the file with the camera of a picture, after the picture's stem."""
 EDITS_KEY = "progdf:edits"
 """Key of the .png text chunk with the names of the visible edits."""
 
@@ -51,6 +60,39 @@ def camera_chunk(
     if edits:
         info.add_itxt(EDITS_KEY, ", ".join(edits))
     return info
+
+
+def camera_file(path: str | os.PathLike[str]) -> Path:
+    """Return the path of A.camera.json beside a picture A.png."""
+    return Path(path).with_name(f"{Path(path).stem}{CAMERA_SUFFIX}")
+
+
+def check_camera_file(path: str | os.PathLike[str]) -> None:
+    """Raise ProgdfError if `save_picture_camera` would overwrite anything but one saved camera."""
+    beside = camera_file(path)
+    if not beside.exists():
+        return
+    if kind_of_cameras(beside) != "own":
+        raise ProgdfError(f"{beside} is not a saved camera; move it, or choose another name for the picture")
+    count = len(load_cameras(beside, ZERO))
+    if count != 1:
+        raise ProgdfError(f"{beside} holds {count} cameras; move it, or choose another name for the picture")
+
+
+def save_picture_camera(path: str | os.PathLike[str], camera: Camera, origin: Origin = ZERO) -> None:
+    """Write the camera of a picture A.png to A.camera.json beside it. A pipe or a device gets none.
+
+    Args:
+        path: the picture
+        camera: its camera, relative to `origin`
+        origin: origin of the scene; the file stores the camera in the world
+
+    Raises:
+        ProgdfError: see `check_camera_file`, or the file cannot be written.
+    """
+    if Path(path).is_file():
+        check_camera_file(path)
+        save_cameras(camera_file(path), [camera], origin)
 
 
 def edits_in_picture(path: str | os.PathLike[str]) -> str:
@@ -91,7 +133,7 @@ def find_picture_camera(
     """
     path = Path(path)
     camera = camera_in_picture(path, origin)
-    beside = path.with_name(f"{path.stem}.camera.json")
+    beside = camera_file(path)
     if camera is None and beside.is_file():
         cameras = load_cameras(beside, origin)
         if len(cameras) != 1:

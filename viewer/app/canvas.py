@@ -11,7 +11,7 @@ import moderngl
 import numpy as np
 
 from progdf.errors import ProgdfError
-from progdf.io.picture_camera import camera_chunk
+from progdf.io.picture_camera import camera_chunk, save_picture_camera
 from viewer.camera.view_camera import to_camera
 from viewer.files import exports
 from viewer.gl.present import picture_texture
@@ -184,8 +184,8 @@ class Canvas:
         return f"Saved {exports.picture(folder, title, pixels, chunk)}"
 
     def save_original(self, folder: Path, title: str, view: ViewState, size: tuple[int, int]) -> Path:
-        """Write the picture of the whole scene without edits, to be edited in another program; return its
-        path.
+        """Write the picture of the whole scene without edits, and its camera beside it, to be edited in
+        another program; return the picture's path.
 
         Raises:
             ProgdfError: see `exports.picture`.
@@ -193,8 +193,11 @@ class Canvas:
         view = original(view)
         view = replace(view, selection=replace(view.selection, hidden=EMPTY_MASK))
         camera = to_camera(view.camera, *size)
-        chunk = camera_chunk(camera, (), self.comparer.engine.scene.origin, view.camera.up)
-        return exports.picture(folder, title, to_pixels(self.image(view, size)), chunk)
+        origin = self.comparer.engine.scene.origin
+        chunk = camera_chunk(camera, (), origin, view.camera.up)
+        path = exports.picture(folder, title, to_pixels(self.image(view, size)), chunk)
+        save_picture_camera(path, camera, origin)  # a program may drop the picture's metadata
+        return path
 
     def thumbnails(self, work: Workspace, rows: Sequence[LayerRow]) -> tuple[Pictures, bool]:
         """Return the thumbnails of the snapshots, the original first, and of the edits; True if any is

@@ -12,7 +12,7 @@ from PIL import Image
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.io.atomic import atomic_write, check_not_an_input
-from progdf.io.picture_camera import camera_chunk
+from progdf.io.picture_camera import camera_chunk, check_camera_file, save_picture_camera
 from progdf.terminal import print_line
 from progdf.threads import one_thread
 from viewer.camera import view_camera
@@ -55,6 +55,8 @@ def render(argv: Sequence[str]) -> int:
     saved = None if opened.session is None else view.camera
     stored = opened.document.stored_camera
     camera = choose_camera(options.viewpoint, scene, gdfs, saved, opened.up, stored)
+    if _is_single(options, view):
+        check_camera_file(options.out)
     swept = _swept_layers(options, opened)
     if films:
         viewpoint = options.viewpoint
@@ -103,19 +105,20 @@ def _render_still(
         picture = Image.fromarray(film.transparent_image(engine, view, camera))
         with atomic_write(options.out) as temporary_file:
             picture.save(temporary_file, pnginfo=camera_chunk(camera, visible_edits(view), origin, opened.up))
+        save_picture_camera(options.out, camera, origin)
         return ""
     comparer = Comparer(engine, engine.ctx)
     comparer.sides = compare_sides(opened.snapshots, view)
     view = comparer.sides.right if comparer.sides else view
     try:
         image = comparer.image(view, camera=camera)
-        # a comparison cannot be edited and trained on
-        single = view.compare.mode == "off"
+        single = _is_single(options, view)
         carried = camera_chunk(camera, visible_edits(view), origin, opened.up) if single else None
         labelled = Image.fromarray(draw_labels(image, view.compare, comparer.labels(view)))
         with atomic_write(options.out) as temporary_file:
             labelled.save(temporary_file, pnginfo=carried)
-        if view.compare.mode == "off":
+        if single:
+            save_picture_camera(options.out, camera, origin)
             return ""
         if comparer.sides is None:
             return f"PSNR of edited against original {comparer.psnr:.2f} dB"
@@ -134,6 +137,12 @@ def _comparison(options: RenderOptions, saved: Comparison) -> Comparison:
         problem = f"--difference must be between 1 and {MAX_AMPLIFIED:g}, got {amplify}"
         return Comparison("difference", amplify=parse_number(amplify, 1.0, MAX_AMPLIFIED, problem))
     return saved
+
+
+def _is_single(options: RenderOptions, view: ViewState) -> bool:
+    """Return whether the output is one picture of one camera, which can be edited and trained on."""
+    is_film = options.sweep is not None or options.timeline or options.turntable is not None
+    return not is_film and options.sheet is None and view.compare.mode == "off"
 
 
 def _check_output(options: RenderOptions) -> None:

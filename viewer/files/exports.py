@@ -18,7 +18,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import ZERO, Origin
 from progdf.io.atomic import atomic_write, make_folder, pictures_folder
 from progdf.io.cameras import kind_of_cameras, load_cameras, save_cameras
-from progdf.io.picture_camera import camera_chunk
+from progdf.io.picture_camera import CAMERA_SUFFIX, camera_chunk, save_picture_camera
 from progdf.io.session import SUFFIX
 from viewer.jobs.training import takes_files
 
@@ -82,7 +82,7 @@ def camera(source: Path, viewpoint: Camera, origin: Origin = ZERO) -> tuple[Path
 
 
 def painted_picture(path: Path, pixels: NDArray[np.uint8], viewpoint: Camera, origin: Origin) -> None:
-    """Save a painted picture with its camera, so that an edit can follow it.
+    """Save a painted picture with its camera, in the picture and beside it, so that an edit can follow it.
 
     Args:
         path: .png file
@@ -96,6 +96,7 @@ def painted_picture(path: Path, pixels: NDArray[np.uint8], viewpoint: Camera, or
     make_folder(path.parent)
     with atomic_write(path) as temporary_file:
         Image.fromarray(pixels).save(temporary_file, "PNG", pnginfo=camera_chunk(viewpoint, origin=origin))
+    save_picture_camera(path, viewpoint, origin)
 
 
 def single_camera(path: Path, viewpoint: Camera, origin: Origin) -> Path:
@@ -105,7 +106,7 @@ def single_camera(path: Path, viewpoint: Camera, origin: Origin) -> Path:
         ProgdfError: the file cannot be written.
     """
     make_folder(path.parent)
-    camera_file = path.with_name(f"{path.name}.camera.json")
+    camera_file = path.with_name(f"{path.name}{CAMERA_SUFFIX}")
     save_cameras(camera_file, [viewpoint], origin)
     return camera_file
 

@@ -15,7 +15,7 @@ from PIL.PngImagePlugin import PngInfo
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.io.cameras import PICTURE_KEY, camera_in_picture, cameras_to_json, load_cameras, save_cameras
-from progdf.io.picture_camera import camera_chunk, find_picture_camera
+from progdf.io.picture_camera import camera_chunk, find_picture_camera, save_picture_camera
 from tests.helpers.camera_tables import some_cameras
 from tests.helpers.refused import refusal
 
@@ -65,6 +65,26 @@ def test_camera_file_beside_the_picture_replaces_the_text(tmp_path: Path) -> Non
     assert_same(find_picture_camera(path), camera)
     saved(path, other)  # the camera in the picture has priority
     assert_same(find_picture_camera(path), other)
+
+
+def test_saved_camera_beside_the_picture_is_found_again(tmp_path: Path) -> None:
+    camera, other = some_cameras()[:2]
+    path = saved(tmp_path / "A.jpg", None)
+    save_picture_camera(path, other)
+    save_picture_camera(path, camera)
+    assert_same(find_picture_camera(path), camera)
+
+
+def test_only_one_saved_camera_is_overwritten(tmp_path: Path) -> None:
+    path = saved(tmp_path / "A.png", None)
+    beside = tmp_path / "A.camera.json"
+    save_cameras(beside, some_cameras()[:2])
+    with pytest.raises(ProgdfError, match=r"A\.camera\.json holds 2 cameras; move it"):
+        save_picture_camera(path, some_cameras()[0])
+    beside.write_text("[]")
+    with pytest.raises(ProgdfError, match=r"A\.camera\.json is not a saved camera; move it"):
+        save_picture_camera(path, some_cameras()[0])
+    assert beside.read_text() == "[]"
 
 
 def test_jpeg_takes_the_given_camera_of_its_name(tmp_path: Path) -> None:

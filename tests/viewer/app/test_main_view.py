@@ -11,6 +11,7 @@ import torch
 from imgui_bundle import imgui
 from PIL import Image
 
+from progdf.io.cameras import load_cameras
 from progdf.io.picture_camera import edits_in_picture, find_picture_camera
 from tests.helpers.ui_rig import BACKGROUND, Rig, rig
 from viewer.camera.view_camera import to_camera
@@ -110,10 +111,11 @@ def test_view_saved_for_painting_shows_the_whole_original(tmp_path: Path) -> Non
         hand.drag(hand.slider(0, 0.0), hand.slider(0, 1.0))
         for key in ("Ctrl+A", "Ctrl+H", "Ctrl+F2"):
             hand.key(key)
-        (taken,) = tmp_path.iterdir()
+        beside, taken = sorted(tmp_path.iterdir())
         assert np.array_equal(np.asarray(Image.open(taken)), original)
         assert edits_in_picture(taken) == ""
-        find_picture_camera(taken)
+        assert beside.name == "bear_001.camera.json"
+        assert torch.equal(load_cameras(beside)[0].viewmat, find_picture_camera(taken).viewmat)
 
 
 def test_picture_that_cannot_be_saved_is_one_line(tmp_path: Path) -> None:

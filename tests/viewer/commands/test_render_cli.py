@@ -75,9 +75,24 @@ def test_picture_is_reused_as_camera(run: Run, stack: Stack) -> None:
     assert (load_cameras("a.png")[0].width, load_cameras("a.png")[0].name) == (64, "a")
 
 
+def test_render_writes_its_camera_beside_the_picture(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    for alpha in ((), ("--alpha",)):
+        assert run("render", "bear.ply", "--orbit", "20,10", "-o", "own.png", *alpha, *SMALL) == 0
+        carried = camera_in_picture("own.png")
+        assert carried is not None
+        (beside,) = load_cameras("own.camera.json")
+        assert torch.equal(beside.viewmat, carried.viewmat)
+        assert torch.equal(beside.K, carried.K)
+    save_cameras("own.camera.json", [beside, beside])
+    capsys.readouterr()
+    assert run("render", "bear.ply", "--orbit", "20,10", "-o", "own.png", *SMALL) == 2
+    assert "own.camera.json holds 2 cameras" in capsys.readouterr().err
+
+
 def test_comparison_carries_no_camera(run: Run) -> None:
     assert run("render", "bear.ply", "scarf.gdf", "--split", *SMALL, "-o", "c.png") == 0
     assert camera_in_picture("c.png") is None
+    assert not Path("c.camera.json").exists()
 
 
 @pytest.mark.gl

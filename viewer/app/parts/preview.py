@@ -22,7 +22,7 @@ from progdf.gdf.file import Gdf, load_gdf
 from progdf.io.atomic import make_folder
 from viewer.app.messages import Messages, Requests, error_line
 from viewer.camera.view_camera import ViewCamera, to_camera
-from viewer.files import exports, region_files, user_files
+from viewer.files import region_files, user_files
 from viewer.files.document import DocumentStore
 from viewer.jobs import training
 from viewer.jobs.preview_process import PreviewChild, PreviewInputs
@@ -177,9 +177,6 @@ class PreviewActions:
         folder = training.edits_folder(scene)
         make_folder(folder)
         path = self._save_original(folder, scene.stem)
-        # a program may drop the picture's metadata
-        origin = self._documents.get().scene.origin
-        exports.single_camera(path.with_suffix(""), to_camera(camera, *size), origin)
         form = with_picture(self._store.get().form, path, further=False)
         self._store.replace(replace(self._store.get(), form=form, form_open=True))
         self._open_painter(path, camera, size, None)
