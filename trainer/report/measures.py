@@ -107,6 +107,8 @@ COMPARED = "keyframes2"
 """Baseline whose curves are shown beside the field's: the most obvious alternative."""
 
 _ROUNDING_DIFFERENCE = 1.5 / 255  # color difference of two images due to rounding to 8 bits
+REPRODUCED_SHARE = 0.9
+"""Share of the paint, 0 to 1, from which an edit of pictures counts as a success."""
 _PAINT_DIFFERENCE = 0.05  # color difference of a painted pixel if the file format is unknown, as in `changed`
 _RECORDING_SAMPLES = 6  # recordings at which the field is compared
 CLIP_STRENGTHS = tuple(i / 10 for i in range(11))  # slider values of the CLIP curve
@@ -317,14 +319,17 @@ class PaintReproduction:
 
     @property
     def warning(self) -> str:
-        """One-line warning with the share and the reasons; "" if no loss is visible and nothing was removed.
+        """`summary` if less than `REPRODUCED_SHARE` was reproduced or the paint removes something, else "".
 
-        A loss is visible if it is as strong as the smallest detectable change, or larger than half of a
-        fainter change.
+        A loss that is not visible is no reason for a warning.
         """
-        is_visible = self.missing > _PAINT_DIFFERENCE or self.reached < 0.5
-        if not self.pixels or not (is_visible or self.removes):
-            return ""
+        is_short = self._is_visible and self.reached < REPRODUCED_SHARE
+        return self.summary if self.pixels and (is_short or self.removes) else ""
+
+    @property
+    def summary(self) -> str:
+        """One line with the share and the reasons of a visible loss."""
+        is_visible = self._is_visible
         reasons = []
         if self.removes:
             reasons.append(
@@ -336,10 +341,15 @@ class PaintReproduction:
             reasons.append(f"{counts}; the detail is finer than the Gaussians")
         return f"{self.share}: {'; '.join(reasons)}" if reasons else self.share
 
+    @property
+    def _is_visible(self) -> bool:
+        """True if the loss is as strong as the smallest detectable change, or half of a fainter change."""
+        return self.missing > _PAINT_DIFFERENCE or self.reached < 0.5
+
     def figures(self) -> dict[str, Any]:
         """Return the figures for report.json."""
         rounded = {"reached": _round4(self.reached), "missing": _round4(self.missing)}
-        return {**asdict(self), **rounded, "warning": self.warning}
+        return {**asdict(self), **rounded, "summary": self.summary, "warning": self.warning}
 
 
 def measure_paint(

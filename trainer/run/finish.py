@@ -332,7 +332,7 @@ def _write_run(
     each = report["file"]["bytes_per_gaussian"]
     log.say(f"{result.line}, {each:.0f} bytes per Gaussian in total")
     if paint is not None:
-        log.say(f"warning: {paint.warning}" if paint.warning else paint.share)
+        log.say(f"warning: {paint.warning}" if paint.warning else paint.summary)
     return result
 
 

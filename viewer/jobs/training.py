@@ -47,11 +47,13 @@ PACKED = ".packed.gdf"
 
 
 class _Paint(msgspec.Struct):
-    warning: str = ""  # reason why little of the paint was reproduced, "" if enough was
+    pixels: int = 0  # number of painted pixels
+    summary: str = ""  # the reproduced share of the paint, one line
+    warning: str = ""  # the same if too little was reproduced, "" if enough was
 
 
 class _Report(msgspec.Struct):
-    """Part of RUN/report.json: the warnings of a finished run on painted pictures."""
+    """Part of RUN/report.json: the result of a finished run on painted pictures."""
 
     paint: _Paint | None = None
 
@@ -179,11 +181,20 @@ class EditOrder:
 
     def warning(self) -> str:
         """Return the warning of the finished run, "" for none."""
+        return self._paint().warning
+
+    def summary(self) -> str:
+        """Return the reproduced share of the paint in one line, "" for a run without painted pictures."""
+        paint = self._paint()
+        return paint.summary if paint.pixels else ""
+
+    def _paint(self) -> _Paint:
+        """Return the result of the finished run on painted pictures."""
         try:
             report = read_json(self.out / "report.json", _Report)
         except ProgdfError:
-            return ""
-        return report.paint.warning if report.paint is not None else ""
+            return _Paint()
+        return report.paint or _Paint()
 
     def newest_recording(self) -> Path | None:
         """Return the file of the last saved recording; None if there is none."""

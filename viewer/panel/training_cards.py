@@ -31,7 +31,7 @@ def height(jobs: Sequence[JobCard], ui: UiContext) -> float:
 
 
 def draw(jobs: Sequence[JobCard], ui: UiContext, actions: list[Action]) -> None:
-    """Draw the strip and its unfolded cards; a new failure unfolds it."""
+    """Draw the strip and its unfolded cards; a new failure or poor result unfolds it."""
     listed = _visible_jobs(jobs)
     storage = imgui.get_state_storage()
     if not listed:
@@ -39,7 +39,7 @@ def draw(jobs: Sequence[JobCard], ui: UiContext, actions: list[Action]) -> None:
     is_open = imgui.get_id(_OPEN_SLOT)
     seen = imgui.get_id("seen failure")
     tall = imgui.get_id(_HEIGHT_SLOT)
-    failed = max((job.number for job in listed if _is_failed(job)), default=0)
+    failed = max((job.number for job in listed if _calls_for_attention(job)), default=0)
     unseen = failed > storage.get_int(seen)
     if unseen:
         storage.set_bool(is_open, True)
@@ -75,7 +75,18 @@ def _visible_jobs(jobs: Sequence[JobCard]) -> list[JobCard]:
 
 
 def _is_failed(job: JobCard) -> bool:
-    return job.status == "failed" or bool(job.warning)
+    return job.status == "failed"
+
+
+def _calls_for_attention(job: JobCard) -> bool:
+    return _is_failed(job) or bool(job.warning)
+
+
+def _status_color(job: JobCard, otherwise: Rgba) -> Rgba:
+    """Return the color of a job's status: red for a failure, amber for a poor result."""
+    if _is_failed(job):
+        return PALETTE.error
+    return PALETTE.warning if job.warning else otherwise
 
 
 def _strip(jobs: Sequence[JobCard], is_open: bool, ui: UiContext) -> bool:
@@ -88,9 +99,7 @@ def _strip(jobs: Sequence[JobCard], is_open: bool, ui: UiContext) -> bool:
     (x, y), dot = imgui.get_cursor_screen_pos(), 4.0 * ui.scale
     pressed = imgui.invisible_button("strip", (imgui.get_content_region_avail().x, tall))
     tip("Show or hide the cards of all jobs")
-    color = PALETTE.accent if job.status == "running" else PALETTE.dim
-    if _is_failed(job):
-        color = PALETTE.error
+    color = _status_color(job, PALETTE.accent if job.status == "running" else PALETTE.dim)
     imgui.get_window_draw_list().add_circle_filled((x + dot, y + tall / 2), dot, u32(color))
     end = (f"+{len(jobs) - 1}   " if len(jobs) > 1 else "") + (Icon.UNFOLDED if is_open else Icon.RAISED)
     left = job.seconds_left
@@ -109,7 +118,6 @@ def _strip(jobs: Sequence[JobCard], is_open: bool, ui: UiContext) -> bool:
 
 def _card(job: JobCard, ui: UiContext) -> list[Action]:
     """Draw name, status, progress and buttons of a job, and its menu; return the requested actions."""
-    failed = _is_failed(job)
     word = _status(job)
     with card("card", PALETTE.card, ui):
         right = right_edge()
@@ -119,9 +127,9 @@ def _card(job: JobCard, ui: UiContext) -> list[Action]:
         about = f"{job.name}\n{job.training}\n" if job.training else ""
         tip(f"{about}{job.out}")
         imgui.same_line(right - wide)
-        imgui.text_colored(PALETTE.error if failed else PALETTE.dim, word)
+        imgui.text_colored(_status_color(job, PALETTE.dim), word)
         color = PALETTE.accent if job.status == "running" else PALETTE.faint
-        _bar(job.share, PALETTE.error if failed else color, ui)
+        _bar(job.share, _status_color(job, color), ui)
         menu = bool(about) and job.status != "queued"
         actions = _foot(job, right, menu, ui)
         right_click = imgui.is_mouse_clicked(imgui.MouseButton_.right.value) and imgui.is_window_hovered()
@@ -164,8 +172,8 @@ def _foot(job: JobCard, right: float, menu: bool, ui: UiContext) -> list[str]:
     with imgui_ctx.push_font(None, SMALL_PX):
         around = 2 * imgui.get_style().frame_padding.x
         widths = [imgui.calc_text_size(text).x + around for text, _, _ in buttons]
-    if _is_failed(job):
-        wrapped_text(job.error or job.warning, PALETTE.error)
+    if _calls_for_attention(job):
+        wrapped_text(job.error or job.warning, _status_color(job, PALETTE.text))
         small(" ", PALETTE.dim)
     else:
         line = _status_text(job)

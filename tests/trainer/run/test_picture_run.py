@@ -143,6 +143,14 @@ def test_detail_finer_than_the_gaussians_is_reported_with_counts() -> None:
     )
 
 
+def test_loss_of_a_tenth_is_a_success_with_its_reason() -> None:
+    done = PaintReproduction(0.98, 0.08, 2074, 457, False)
+    assert done.warning == ""
+    assert done.summary.startswith("98 % of the paint was reproduced: 457 Gaussians")
+    assert PaintReproduction(0.89, 0.08, 2074, 457, False).warning
+    assert PaintReproduction(0.98, 0.01, 2074, 457, True).warning, "what should be removed is still there"
+
+
 def test_weak_paint_warns_if_most_of_it_is_missing() -> None:
     assert PaintReproduction(0.49, 0.01, 100, 90, False).warning
     assert not PaintReproduction(0.51, 0.01, 100, 90, False).warning

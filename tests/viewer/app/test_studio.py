@@ -184,6 +184,25 @@ def test_packed_edit_replaces_the_draft_while_it_is_measured(window: application
     assert [edit.instruction for edit in window.documents.get().edits] == ["measured"]
 
 
+@pytest.mark.parametrize(("warning", "card"), [("", False), ("41 % of the paint was reproduced", True)])
+def test_reproduced_share_of_paint_is_in_the_message_or_on_a_card(
+    window: application.App, warning: str, card: bool
+) -> None:
+    request(window, Plain("train"))
+    (job,) = window.parts.jobs.queue.jobs
+    paint = {"pixels": 9, "summary": warning or "98 % of the paint was reproduced", "warning": warning}
+    job.task.out.mkdir(parents=True)
+    (job.task.out / "report.json").write_text(json.dumps({"paint": paint}))
+    Trainer.ended = 0
+    turn(window)
+    message = window.main_view.work.message
+    assert message is not None
+    ending = "" if card else ". 98 % of the paint was reproduced"
+    assert message.text == f"{job.task.name} is ready{ending}"
+    assert not message.error
+    assert [shown.warning for shown in window.main_view.work.jobs] == [warning] * card
+
+
 def test_view_painted_in_another_program_is_shown_on_every_save(
     window: application.App, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -297,7 +297,8 @@ class JobActions:
             self._live = None
             if not any(self._edits.finish(path, task.result) for path in (task.draft, task.packed_edit)):
                 self._open_file(task.result)
-            self._messages.show(f"{task.name} is ready")
+            summary = "" if job.warning else task.summary()  # its card shows the warning
+            self._messages.show(f"{task.name} is ready. {summary}" if summary else f"{task.name} is ready")
             return
         if self._live is not None:
             self._live = None
