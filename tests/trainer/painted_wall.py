@@ -11,7 +11,8 @@ from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.rasterize import render
 from trainer.paint.discs import PaintedView, composite_over
-from trainer.run.paint import DiscLayout, lay_discs, paint_gdf
+from trainer.paint.surface import find_surface
+from trainer.run.paint import DiscLayout, lay_discs, make_goal, paint_gdf
 from trainer.views.view import BACKGROUND
 
 SIDE = 128
@@ -58,9 +59,10 @@ def letters(scene: Gaussians) -> PaintedView:
 def paint_on(scene: Gaussians, painted: torch.Tensor) -> PaintedView:
     """Return the wall with the pixels of `painted` in dark blue. [H,W] bool"""
     drawn = painted[..., None] * torch.tensor([0.1, 0.15, 0.5, 1.0])
-    return PaintedView(CAMERA, composite_over(picture(scene), drawn), drawn)
+    surface = find_surface(scene, CAMERA, painted.numpy())
+    return PaintedView(CAMERA, composite_over(picture(scene), drawn), drawn, surface)
 
 
 def edit_of(scene: Gaussians, paint: PaintedView) -> tuple[Gdf, DiscLayout]:
-    laid = lay_discs(scene, [paint], 4.0)
+    laid = lay_discs(make_goal(scene, [paint]), 4.0)
     return paint_gdf(laid, scene, [paint], "letters", None), laid

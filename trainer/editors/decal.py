@@ -19,7 +19,8 @@ from progdf.io.images import open_picture
 from progdf.rasterize.engines import render_depth
 from progdf.scene.regions import read_numbers
 from trainer.options import EditKind, EditorOptions
-from trainer.paint.discs import MIN_ALPHA, OPAQUE, PaintedView, composite_over, project_paint, sample_image
+from trainer.paint.discs import MIN_ALPHA, PaintedView, composite_over, project_paint, sample_image
+from trainer.paint.surface import OPAQUE, PaintSurface, find_surface
 from trainer.views.view import BACKGROUND, View, make_view, with_near_plane
 
 from .base import EditorInput
@@ -127,6 +128,7 @@ class DecalEditor:
     scene: Gaussians
     view: View  # the camera's view
     drawn: Tensor  # the part of the decal on the surface: premultiplied colors and alpha. [H,W,4]
+    surface: PaintSurface  # the surface under it
     kind: EditKind = "color"
     stages: tuple[float, ...] = ()
     is_confined: bool = False
@@ -134,13 +136,13 @@ class DecalEditor:
     @property
     def paint(self) -> PaintedView:
         """Decal in the camera's view, as the target of the surface discs."""
-        return PaintedView(self.view.camera, self.edit(self.view, 1.0), self.drawn)
+        return PaintedView(self.view.camera, self.edit(self.view, 1.0), self.drawn, self.surface)
 
     def edit(self, view: View, strength: float) -> Tensor:
         """See `ImageEditor.edit`."""
         drawn = self.drawn
         if view is not self.view:
-            drawn = project_paint(self.scene, self.view.camera, drawn, view.camera)
+            drawn = project_paint(self.scene, self.surface, drawn, view.camera)
         return composite_over(view.image, strength * drawn)
 
 
@@ -167,11 +169,13 @@ def decal(given: EditorInput) -> DecalEditor:
     (camera,) = with_near_plane([camera], scene)
     view = make_view(scene, region, camera, torch.tensor(BACKGROUND))
     drawn = draw_decal(Path(given.what).expanduser(), place, camera)
-    alpha = render_depth(scene, camera).alpha
+    seen = render_depth(scene, camera)
+    alpha = seen.alpha
     drawn = drawn * ((alpha > OPAQUE) & (view.mask > 0.5 * alpha))[..., None]
     if not bool((drawn[..., 3] > MIN_ALPHA).any()):
         raise ProgdfError(
             f"{given.what} does not lie on an opaque part of the region '{region.name}'; "
             "give another position with --at"
         )
-    return DecalEditor(scene, view, drawn)
+    surface = find_surface(scene, camera, (drawn[..., 3] > MIN_ALPHA).numpy(), seen)
+    return DecalEditor(scene, view, drawn, surface)

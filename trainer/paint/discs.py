@@ -24,15 +24,14 @@ from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import ADDED_LOGIT
 from progdf.quaternions import matrix_quats
-from progdf.rasterize import render
 from progdf.rasterize.cpu.engine import ListedWeights
-from progdf.rasterize.engines import Depth, activate, color_map, render_depth
+from progdf.rasterize.engines import activate, color_map, render_depth
 from progdf.sh import rgb_to_sh0
+
+from .surface import MIN_COSINE, PaintSurface, light_thickness
 
 Array = NDArray[np.float64]
 
-OPAQUE = 0.97
-"""Minimum opacity of a pixel that has a surface."""
 DISC_LOGIT = 4.0
 """Opacity logit of a disc at strength 1."""
 MIN_ALPHA = 1 / 255
@@ -51,12 +50,6 @@ _BLUR_PX2 = 0.1
 _DEPTH_OFFSET_PX = 0.5  # pixels; discs lie deeper by this, as nearer neighbors cover them
 _RELIEF_PX = 1.25  # pixels per unit of color; discs lie deeper than darker neighbors, see `_rise_beside`
 _THICKNESS_PX = 0.1  # pixels; standard deviation across the disc
-# cosine between normal and ray; steeper discs face the camera, and steeper depth steps separate surfaces
-_MIN_COSINE = 0.3
-_MEDIAN_PX = 9  # pixels; window of the median filter of depths
-_SMOOTHING_PX = 3.0  # pixels; standard deviation of the Gaussian filter of depths
-# multiple of the median depth change per pixel; smoothing that alters a depth by more crossed an edge
-_SAME_SURFACE_PX = 4.0
 _MIN_LIGHT = 0.005  # blending weight in a pixel; Gaussians with less need not move
 # Gaussians within this many standard deviations of the blended depth belong to the surface
 _REACH_DEVIATIONS = 4.0
@@ -65,7 +58,8 @@ _SETTLED_SHARE = 1e-3
 _MAX_CLEARING_ROUNDS = 12  # maximum number of rounds that move occluding Gaussians behind the discs
 _MARGIN_PX = 16  # pixels; margin around the paint in which the surface is evaluated
 _MAX_GRID_POINTS = 20_000  # maximum number of surface points for projection; the surface is flat between them
-_DEPTH_TOLERANCE = 0.02  # share of the depth; points this far in front of the surface belong to it
+# thicknesses of the light within a pixel; Gaussians this far in front of the paint belong to its surface
+_SAME_SURFACE_THICKNESSES = 2.0
 _NEWTON_STEPS = 8  # Newton steps per pixel of the projection
 
 
@@ -76,6 +70,7 @@ class PaintedView:
     camera: Camera
     picture: Tensor  # painted view over the run's background. [H,W,3] 0..1
     drawn: Tensor  # paint on the surface: premultiplied colors and alpha. [H,W,4]
+    surface: PaintSurface  # surface under the paint
 
     @property
     def mask(self) -> Tensor:
@@ -107,61 +102,29 @@ def place_discs(
     """
     camera = paint.camera
     cleared = scene if cleared is None else cleared
-    depth = render_depth(scene, camera)
-    opaque = (depth.alpha > OPAQUE).numpy()
-    surface, even, pieces = _paint_surface(depth, camera)
+    surface = paint.surface
+    opaque = surface.opaque
     mask = ndimage.binary_dilation(paint.mask.numpy() & opaque, iterations=BORDER_PX) & opaque
     if not mask.any():
         return Discs(scene[:0], torch.zeros(0, dtype=torch.int64), cleared)
-    cells = merge_pixels(paint.picture.numpy(), mask, flat, even)
-    added, depths = _discs(camera, cells, surface, paint.picture)
+    cells = merge_pixels(paint.picture.numpy(), mask, flat, surface.is_continuous)
+    added, depths = _discs(cells, surface, paint.picture)
     added = replace(
         added,
         shN=torch.zeros(len(added), *scene.shN.shape[1:]),
         antialiased=scene.antialiased,
         origin=scene.origin,
     )
-    behind = surface + (_DEPTH_OFFSET_PX + gap) * float(np.median(depths)) / float(camera.K[0, 0])
-    reach = float((behind - surface).max()) + _REACH_DEVIATIONS * _thickness(scene, camera, mask)
+    behind = surface.depth + (_DEPTH_OFFSET_PX + gap) * float(np.median(depths)) / float(camera.K[0, 0])
+    reach = float((behind - surface.depth).max()) + _REACH_DEVIATIONS * surface.thickness
     moved = torch.zeros(len(scene), dtype=torch.bool)
     for _ in range(_MAX_CLEARING_ROUNDS):  # Gaussians behind the moved ones become visible
-        rows, factors = _rows_before(cleared, camera, behind, mask, reach, pieces)
+        rows, factors = _rows_before(cleared, camera, behind, mask, reach, surface.pieces)
         if not len(rows):
             break
         cleared = _move_back(cleared, camera, rows, factors)
         moved = moved.index_fill(0, rows, True)
     return Discs(added, moved.nonzero()[:, 0], cleared)
-
-
-def _paint_surface(seen: Depth, camera: Camera) -> tuple[Array, NDArray[np.bool_], NDArray[np.int32]]:
-    """Return depths for paint, True where the surface is continuous, and the index of its pieces. [H,W] each
-
-    The surface is continuous where its depth changes less from pixel to pixel than that of the steepest disc.
-    Depths blended across an edge are replaced by those of one side.
-    """
-    surface = smooth_depth(seen.depth.numpy(), (seen.alpha > OPAQUE).numpy())
-    steepest = surface / float(camera.K[0, 0]) * (1 - _MIN_COSINE**2) ** 0.5 / _MIN_COSINE
-    down, right = (np.abs(np.diff(surface, axis=axis, append=surface.take([-1], axis))) for axis in (0, 1))
-    is_continuous = np.maximum(down, right) < steepest
-    distance, nearest = ndimage.distance_transform_edt(~is_continuous, return_indices=True)
-    surface = np.where(distance <= _MEDIAN_PX, surface[tuple(nearest)], surface)
-    return surface, is_continuous, ndimage.label(is_continuous)[0][tuple(nearest)]
-
-
-def smooth_depth(depth: NDArray[np.float32], opaque: NDArray[np.bool_]) -> Array:
-    """Return denoised depths with edges preserved.
-
-    Pixels without a surface take the nearest depth. [H,W] each
-    """
-    if not opaque.any():
-        return depth.astype(np.float64)
-    nearest = ndimage.distance_transform_edt(~opaque, return_distances=False, return_indices=True)
-    filled = depth.astype(np.float64)[tuple(nearest)]
-    median = ndimage.median_filter(filled, _MEDIAN_PX)
-    smooth = ndimage.gaussian_filter(median, _SMOOTHING_PX)
-    slope = np.hypot(*np.gradient(median))
-    is_flat = np.abs(smooth - median) <= _SAME_SURFACE_PX * np.median(slope[opaque]) + 1e-9
-    return cast(Array, np.where(is_flat, smooth, median))
 
 
 def merge_pixels(
@@ -253,27 +216,25 @@ def _disc_error(image: Array, height: int, width: int) -> Array:
     return cast(Array, area * (seen[..., 3] + (color * (color - 2 * seen[..., :3])).sum(axis=2)) / 3)
 
 
-def _discs(camera: Camera, cells: Array, surface: Array, picture: Tensor) -> tuple[Gaussians, Array]:
-    """Return discs that fill cells of the picture on its surface, and their depths. [B,4], [H,W], [H,W,3]"""
+def _discs(cells: Array, surface: PaintSurface, picture: Tensor) -> tuple[Gaussians, Array]:
+    """Return discs that fill cells of the picture on its surface, and their depths. [B,4], _, [H,W,3]"""
+    camera = surface.camera
     x, y, width, height = cells.T
     K = camera.K.double().numpy()
     c2w = camera.c2w.double().numpy()
     focal = np.array([K[0, 0], K[1, 1]])
     middle = K[:2, 2]
 
-    def sample(values: Array) -> Array:
-        return cast(Array, ndimage.map_coordinates(values, [y - 0.5, x - 0.5], order=1, mode="nearest"))
-
-    slopes = [sample(ndimage.gaussian_filter1d(surface, 1.0, axis=axis, order=1)) for axis in (1, 0)]
+    slopes = surface.slopes[:, y.astype(np.int64), x.astype(np.int64)]  # not blended across an edge
     rays = np.stack([*((np.stack([x, y], 1) - middle) / focal).T, np.ones_like(x)], axis=1)
-    depth = sample(surface)
+    depth = ndimage.map_coordinates(surface.depth, [y - 0.5, x - 0.5], order=1, mode="nearest")
     pixel = depth / focal[0]
     placed = depth + (_DEPTH_OFFSET_PX + _RELIEF_PX * _rise_beside(cells, picture)) * pixel
     right, down = (_step(rays, depth, slope, axis, focal) for axis, slope in enumerate(slopes))
     normal = np.cross(right, down)
     length = np.linalg.norm(rays, axis=1, keepdims=True)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    is_steep = np.abs((normal * rays).sum(axis=1, keepdims=True)) < _MIN_COSINE * length
+    is_steep = np.abs((normal * rays).sum(axis=1, keepdims=True)) < MIN_COSINE * length
     normal = np.where(is_steep, rays / length, normal)
     sides = []  # steps in the disc's plane that span one cell in the picture
     for axis, side in enumerate((width, height)):
@@ -325,7 +286,7 @@ def _rows_before(
     behind: Array,
     mask: NDArray[np.bool_],
     reach: float,
-    pieces: NDArray[np.int32],
+    pieces: NDArray[np.int64],
 ) -> tuple[Tensor, Tensor]:
     """Return surface rows with centers in front of the depths `behind` [H,W], and their depth factors.
 
@@ -372,21 +333,6 @@ def _main_pieces(
     return cast(NDArray[np.int64], csr_array((weights, (owner, piece)), shape=size).argmax(axis=1))
 
 
-def _thickness(scene: Gaussians, camera: Camera, mask: NDArray[np.bool_]) -> float:
-    """Return the thickness of the visible surface in the mask, world units, at least the size of a pixel.
-
-    It is the median over the pixels of the standard deviation of the depths that are blended in a pixel.
-    """
-    axis = camera.viewmat[2].double()
-    depths = scene.means.double() @ axis[:3] + axis[3]
-    z = (depths - depths.median()).float()
-    colors = torch.stack([z, z.square(), torch.ones_like(z)], dim=1)
-    mean, square, total = render(scene, camera, (0.0, 0.0, 0.0), colors=colors).image[mask].double().unbind(1)
-    variance = square / total - (mean / total).square()
-    pixel = float(depths.median()) / float(camera.K[0, 0])
-    return max(pixel, float(variance.clamp_min(0.0).sqrt().median()))
-
-
 def _move_back(scene: Gaussians, camera: Camera, rows: Tensor, factors: Tensor) -> Gaussians:
     """Return the scene with rows scaled about the camera's center, which preserves their outlines."""
     position = camera.position.double()
@@ -415,32 +361,28 @@ def composite_over(image: Tensor, drawn: Tensor) -> Tensor:
     return image * (1.0 - drawn[..., 3:]) + drawn[..., :3]
 
 
-def project_paint(scene: Gaussians, own: Camera, drawn: Tensor, camera: Camera) -> Tensor:
-    """Project paint from the surface that one camera sees to another camera.
+def project_paint(scene: Gaussians, under: PaintSurface, drawn: Tensor, camera: Camera) -> Tensor:
+    """Project paint from its surface to another camera.
 
     Args:
         scene: scene with the surface
-        own: camera of the painted picture
+        under: the surface, as the camera of the painted picture sees it
         drawn: premultiplied colors and alpha. [H,W,4]
         camera: the other camera
 
     Returns:
         premultiplied colors and alpha at the other camera's size. [h,w,4]
     """
+    own = under.camera
     result = torch.zeros(camera.height, camera.width, 4)
     rows, columns = (drawn[..., 3] > 0).nonzero().T.numpy()
     if not len(rows):
         return result
     left = max(0, columns.min() - _MARGIN_PX)
     top = max(0, rows.min() - _MARGIN_PX)
-    window = (
-        left,
-        top,
-        min(own.width, columns.max() + _MARGIN_PX + 1),
-        min(own.height, rows.max() + _MARGIN_PX + 1),
-    )
-    seen = render_depth(scene, own, crop=window)
-    surface, _, _ = _paint_surface(seen, own)
+    right = min(own.width, columns.max() + _MARGIN_PX + 1)
+    bottom = min(own.height, rows.max() + _MARGIN_PX + 1)
+    surface = under.depth[top:bottom, left:right]
     step = max(1, round(math.sqrt(surface.size / _MAX_GRID_POINTS)))
     y, x = np.mgrid[: surface.shape[0] : step, : surface.shape[1] : step]
     K = own.K.double().numpy()
@@ -470,8 +412,13 @@ def project_paint(scene: Gaussians, own: Camera, drawn: Tensor, camera: Camera) 
     rows, columns = np.mgrid[box[1] : box[3], box[0] : box[2]] + 0.5
     maps = np.stack([u, v, ux, uy, vx, vy, x, y, depth, front.astype(float)])
     positions = torch.from_numpy(_invert(maps, columns, rows))
-    front_depth = render_depth(scene, camera, crop=(box[0], box[1], box[2], box[3])).depth
-    visible = positions[..., 2] <= front_depth * (1.0 + _DEPTH_TOLERANCE)
+    window = (box[0], box[1], box[2], box[3])
+    front_depth = render_depth(scene, camera, crop=window).depth
+    is_painted = (positions[..., 2] > 0).numpy()
+    if not is_painted.any():
+        return result
+    thickness = light_thickness(scene, camera, is_painted, window)
+    visible = positions[..., 2] <= front_depth + _SAME_SURFACE_THICKNESSES * thickness
     projected = sample_image(drawn, positions[..., 0], positions[..., 1])
     result[box[1] : box[3], box[0] : box[2]] = projected * visible[..., None]
     return result

@@ -8,7 +8,7 @@ account for both.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -21,14 +21,25 @@ from progdf.sh import C0
 from progdf.threads import one_thread
 from trainer.views.view import BACKGROUND, crop, seen_colors
 
-from .discs import PaintedView
-
 _CG_STEPS = 40  # conjugate gradient steps per round
 _CLAMP_ROUNDS = 3  # rounds; between them, colors below black are set to black
 # Ridge of the least squares, in pixels: a weight of 1 counts as much as one fully covered pixel.
 _SCENE_RIDGE = 0.05  # holds a row of the scene to its own color
-_DISC_RIDGE = 0.02  # holds a disc to the painted color
+_DISC_RIDGE = 0.1  # holds a disc to the painted color
+_OWN_IMPORTANCE = 16.0  # importance of the painted pictures' errors, relative to those of other views
+_BEHIND_IMPORTANCE = 4.0  # importance of views from behind, which stand for those of the sides
 _MIN_MARGIN_PX = 32  # pixels; minimum margin around the paint in which colors are solved for
+
+
+@dataclass(frozen=True)
+class ExpectedView:
+    """View of the paint, with its expected image and the pixels to compare."""
+
+    camera: Camera
+    degrees: float  # rotation from the picture's camera; 0 is the picture itself
+    expected: Tensor  # the view with the paint projected onto the surface. [H,W,3]
+    covered: Tensor  # the painted pixels. [H,W] bool
+    around: Tensor  # the ring around them. [H,W] bool
 
 
 def box_of(painted: Tensor, camera: Camera) -> Crop:
@@ -48,15 +59,16 @@ def box_of(painted: Tensor, camera: Camera) -> Crop:
 
 
 def solve_colors(
-    scene: Gaussians, rows: Tensor, added: Gaussians, paints: Sequence[PaintedView]
+    scene: Gaussians, rows: Tensor, added: Gaussians, views: Sequence[ExpectedView], behind: Tensor
 ) -> tuple[Gaussians, Gaussians]:
-    """Return the scene and the added rows with the colors that reproduce all painted pictures best.
+    """Return the scene and the added rows with the colors that reproduce all views of the paint best.
 
     Args:
         scene: with the moved rows at their new positions
         rows: rows of the scene that may change beside the added ones. [M] int64
         added: see `Discs`
-        paints: painted views of one object
+        views: the painted pictures, and views from other sides
+        behind: how visible the rows are from behind, pixels; it holds them to their own colors. [M]
     """
     joined = concatenate([scene, added])
     count = len(rows)
@@ -64,17 +76,21 @@ def solve_colors(
     activated = activate(joined)
     maps = list[ColorMap]()
     missing = list[Tensor]()
+    importance = list[float]()
     lowest = torch.full((len(free), 3), -torch.inf)
-    for paint in paints:
-        box = box_of(paint.mask, paint.camera)
-        colors = seen_colors(joined, paint.camera)
-        rendered = render(joined, paint.camera, BACKGROUND, colors=colors, crop=box).image
-        maps.append(color_map(activated, paint.camera, box, free))
-        missing.append(crop(paint.picture, box) - rendered)
+    for view in views:
+        if not bool(view.covered.any()):
+            continue
+        box = box_of(view.covered, view.camera)
+        colors = seen_colors(joined, view.camera)
+        rendered = render(joined, view.camera, BACKGROUND, colors=colors, crop=box).image
+        maps.append(color_map(activated, view.camera, box, free))
+        importance.append(1.0 if view.degrees else _OWN_IMPORTANCE)
+        missing.append(crop(view.expected, box) - rendered)
         lowest = torch.maximum(lowest, -colors[free])
     ridge = torch.full((len(free), 1), _DISC_RIDGE)
-    ridge[:count] = _SCENE_RIDGE
-    change = _least_squares(maps, missing, lowest, ridge) / C0
+    ridge[:count] = _SCENE_RIDGE + _BEHIND_IMPORTANCE * behind[:, None]
+    change = _least_squares(maps, missing, importance, lowest, ridge) / C0
     return (
         replace(scene, sh0=scene.sh0.index_add(0, rows, change[:count])),
         replace(added, sh0=added.sh0 + change[count:]),
@@ -83,15 +99,22 @@ def solve_colors(
 
 @one_thread()
 def _least_squares(
-    maps: Sequence[ColorMap], targets: Sequence[Tensor], lowest: Tensor, held: Tensor
+    maps: Sequence[ColorMap],
+    targets: Sequence[Tensor],
+    importance: Sequence[float],
+    lowest: Tensor,
+    held: Tensor,
 ) -> Tensor:
     """Solve for color changes, at least `lowest`, by conjugate gradients; `held` is the ridge.
 
-    targets [h,w,3] each, lowest [M,3], held [M,1] -> [M,3]
+    targets [h,w,3] with their importance each, lowest [M,3], held [M,1] -> [M,3]
     """
 
     def gradient(images: Sequence[Tensor]) -> Tensor:
-        parts = (weights.gradient(image) for weights, image in zip(maps, images, strict=True))
+        parts = (
+            share * weights.gradient(image)
+            for weights, image, share in zip(maps, images, importance, strict=True)
+        )
         return torch.stack(list(parts)).sum(dim=0)
 
     def normal(colors: Tensor) -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,13 +16,11 @@ from progdf.errors import ProgdfError
 from progdf.fade import linear_remap
 from progdf.field.baked import interpolate_at
 from progdf.field.separable import course_field, opacity_course
-from progdf.gaussians import BASE_CHANNELS, Gaussians, concatenate, pack
-from progdf.gdf.file import Gdf, fingerprint
+from progdf.gaussians import BASE_CHANNELS, Gaussians, attribute_slices, concatenate, pack
+from progdf.gdf.file import ADDED_LOGIT, Gdf, fingerprint
 from progdf.io.images import picture_size
 from progdf.metrics.image import decibels
-from progdf.quaternions import rotate_vectors
 from progdf.rasterize import alpha_weights, render
-from progdf.rasterize.engines import render_depth
 from progdf.region import Region
 from progdf.terminal import group_digits
 from trainer.editors.pictures import read_edit
@@ -36,14 +33,15 @@ from trainer.paint.discs import (
     place_discs,
     project_paint,
 )
-from trainer.paint.solve import box_of, solve_colors
+from trainer.paint.solve import ExpectedView, box_of, solve_colors
+from trainer.paint.surface import find_surface, orbit
 from trainer.store.progress import RunLog
 from trainer.views.view import BACKGROUND, View, crop, make_view, render_view
 
 RING = 15
 """Width of the ring around the paint that must stay unchanged, pixels."""
 
-TRIAL_ANGLES_DEG = (-30, -15, 0, 15, 30)
+TRIAL_ANGLES_DEG = (-60, -30, 0, 30, 60)
 """Angles of the views around the paint that choose the gap, degrees."""
 
 _GAPS_PX = (4.0, 1.0)  # tried distances between discs and the Gaussians pushed behind them
@@ -53,6 +51,12 @@ _MIN_SPILL_WEIGHT_PX = 0.5  # with a larger sum of weights in such pixels, a Gau
 _MISSED_COLOR = 0.05  # color error from which a painted pixel counts as missed by recoloring
 _ROUNDING_COLOR = 1.5 / 255  # two 8-bit images may differ by this much through rounding
 _ERROR_SIGMA_PX = 2.0  # sigma of the Gaussian filter over the squared error
+_BEHIND_DEG = (150.0, 180.0, 210.0)  # angles of the views that see the surface from behind
+_BURIED_SHARE = 0.5  # share of a Gaussian's visible weight under the paint from which discs replace it
+_GEOMETRY = ("means", "log_scales")  # attributes of the moves behind the discs
+_COUNTING_ALPHA = 0.1  # opacity of discs while their overlap is counted
+# position on the path from which all moved Gaussians lie behind the discs, and replaced ones fade
+_CLEARED_AT = 0.25
 _OPACITY_CHANNEL = 10  # column of a packed row, see `attribute_slices`
 
 
@@ -72,14 +76,51 @@ class DiscLayout:
         return concatenate([self.ended, self.added])
 
 
-def lay_discs(scene: Gaussians, paints: Sequence[PaintedView], gap: float) -> DiscLayout:
-    """Convert painted pixels to discs. Each picture adds discs only where earlier pictures added none.
+@dataclass(frozen=True)
+class PaintGoal:
+    """Paint on a scene, and the views that the painted scene has to match."""
+
+    scene: Gaussians  # the scene under the discs
+    paints: Sequence[PaintedView]  # painted views of one object
+    views: Sequence[ExpectedView]  # these views, and views rotated around the paint
+    buried: Tensor  # Gaussians mostly visible where the paint is; discs replace them. [N] bool
+    behind: Tensor  # each Gaussian's largest sum of weights in views from behind, pixels. [N]
+
+
+def make_goal(scene: Gaussians, paints: Sequence[PaintedView]) -> PaintGoal:
+    """Return the goal of paint on a scene.
 
     Args:
         scene: the scene under the discs
         paints: painted views of one object
+    """
+    views = views_around_paint(scene, paints, TRIAL_ANGLES_DEG)
+    inside = torch.zeros(len(scene))
+    beside = torch.zeros(len(scene))
+    for view in views:
+        weights = alpha_weights(scene, view.camera, view.covered)
+        inside += weights[:, 0]
+        beside += weights[:, 2] - weights[:, 0]
+    behind = torch.zeros(len(scene))
+    for paint in paints:
+        pivot = paint.surface.pivot(paint.mask.numpy())
+        for angle in _BEHIND_DEG:
+            camera = orbit(paint.camera, pivot, angle)
+            weights = alpha_weights(scene, camera, torch.zeros_like(paint.mask))
+            behind = torch.maximum(behind, weights[:, 2])
+    seen = inside + beside + len(views) * behind
+    return PaintGoal(scene, paints, views, inside > _BURIED_SHARE * seen, behind)
+
+
+def lay_discs(goal: PaintGoal, gap: float) -> DiscLayout:
+    """Convert painted pixels to discs. Each picture adds discs only where earlier pictures added none.
+
+    Args:
+        goal: the paint
         gap: see `place_discs`
     """
+    scene = goal.scene
+    paints = goal.paints
     cleared = scene
     added = scene[:0]
     changed = torch.zeros(len(scene), dtype=torch.bool)
@@ -106,25 +147,22 @@ def lay_discs(scene: Gaussians, paints: Sequence[PaintedView], gap: float) -> Di
         crop(spill, box)[:] = (after - before).abs().amax(dim=2) > _SPILL_COLOR
         spill_weight = alpha_weights(cleared, paint.camera, spill & torch.from_numpy(beside))[:, 0]
         changed |= spill_weight > _MIN_SPILL_WEIGHT_PX
+    joined = concatenate([cleared, added])
+    for view in goal.views:
+        if view.degrees:  # from aside, Gaussians beside and below the discs cover them
+            weights = alpha_weights(joined, view.camera, view.covered)[: len(scene), 0]
+            changed |= weights > _MIN_SPILL_WEIGHT_PX
     rows = changed.nonzero()[:, 0]
-    ended, added = solve_colors(cleared, rows, added, paints)
+    faded = changed & goal.buried
+    logits = torch.where(faded, ADDED_LOGIT, cleared.logit_opacities)
+    cleared = replace(cleared, logit_opacities=logits)
+    ended, added = solve_colors(cleared, rows, added, goal.views, goal.behind[rows])
     return DiscLayout(scene, ended, rows, added, gap)
-
-
-@dataclass(frozen=True)
-class PaintView:
-    """View around the paint, with its expected image and the pixels to compare."""
-
-    camera: Camera
-    degrees: float  # rotation from the picture's camera; 0 is the picture itself
-    expected: Tensor  # the view with the paint projected onto the surface. [H,W,3]
-    covered: Tensor  # the painted pixels. [H,W] bool
-    around: Tensor  # the ring around them. [H,W] bool
 
 
 def views_around_paint(
     scene: Gaussians, paints: Sequence[PaintedView], degrees: Sequence[float]
-) -> list[PaintView]:
+) -> list[ExpectedView]:
     """Return views rotated around the paint, with their expected images.
 
     Args:
@@ -135,25 +173,25 @@ def views_around_paint(
     background = torch.tensor(BACKGROUND)
     views = []
     for paint in paints:
-        pivot = _pivot(scene, paint)
+        pivot = paint.surface.pivot(paint.mask.numpy())
         for angle in degrees:
             camera = orbit(paint.camera, pivot, angle) if angle else paint.camera
             if angle:
                 expected = render_view(scene, camera, background).clamp(0.0, 1.0)
                 covered = torch.zeros(expected.shape[:2], dtype=torch.bool)
                 for other in paints:
-                    projected = project_paint(scene, other.camera, other.drawn, camera)
+                    projected = project_paint(scene, other.surface, other.drawn, camera)
                     expected = composite_over(expected, projected)
                     covered = covered | (projected[..., 3] > 0)
             else:
                 expected = paint.picture
                 covered = paint.mask
             grown = ndimage.binary_dilation(covered.numpy(), iterations=RING)
-            views.append(PaintView(camera, angle, expected, covered, torch.from_numpy(grown) & ~covered))
+            views.append(ExpectedView(camera, angle, expected, covered, torch.from_numpy(grown) & ~covered))
     return views
 
 
-def _mean_square_error(finished: Gaussians, looks: Sequence[PaintView]) -> float:
+def _mean_square_error(finished: Gaussians, looks: Sequence[ExpectedView]) -> float:
     """Return the mean squared color error at and around the paint, over all views."""
     error = pixels = 0.0
     for view in looks:
@@ -167,15 +205,11 @@ def _mean_square_error(finished: Gaussians, looks: Sequence[PaintView]) -> float
     return error / max(1.0, pixels)
 
 
-def choose_discs(
-    scene: Gaussians, paints: Sequence[PaintedView], looks: Sequence[PaintView], log: RunLog | None
-) -> DiscLayout:
+def choose_discs(goal: PaintGoal, log: RunLog | None) -> DiscLayout:
     """Return the discs with the gap that reproduces the paint best, in its own views and from the sides.
 
     Args:
-        scene: the scene under the discs
-        paints: painted views of one object
-        looks: see `views_around_paint`
+        goal: the paint
         log: log of the run
 
     Raises:
@@ -183,12 +217,14 @@ def choose_discs(
     """
     candidates = list[tuple[float, DiscLayout]]()
     for gap in _GAPS_PX:
-        laid = lay_discs(scene, paints, gap)
+        laid = lay_discs(goal, gap)
         if not len(laid.added):
             raise ProgdfError("nothing is painted where the picture is opaque; paint on the scene")
-        candidates.append((_mean_square_error(laid.end, looks), laid))
+        candidates.append((_mean_square_error(laid.end, goal.views), laid))
     best = min(candidates, key=lambda one: one[0])
     if log is not None:
+        for paint in goal.paints:
+            log.say(f"surface under the paint: {paint.surface.describe()}")
         errors = ", ".join(f"{decibels(error):.1f} dB with {laid.gap:g} px" for error, laid in candidates)
         log.say(
             f"occluding Gaussians move {best[1].gap:g} px behind the paint; tried: {errors} (in the paint "
@@ -217,18 +253,18 @@ def paint_gdf(
     bands = channels > BASE_CHANNELS
     base = laid.scene
     start = faint(laid.added)
-    change = pack(laid.ended[members], with_shN=bands) - pack(base[members], with_shN=bands)
-    steps, logit_rise = opacity_course(start.logit_opacities, torch.full((len(start),), DISC_LOGIT))
-    disc_knots = _linear_visibility_knots(laid, paints, steps, logit_rise)
+    path = _disc_path(laid, paints, bands)
+    disc_knots = _linear_visibility_knots(laid, paints, path)
     knots = disc_knots
+    inside = torch.searchsorted(members, laid.rows)
     recolor_end = torch.zeros(len(members), channels)
     if recolored is not None:
         knots = torch.unique(torch.cat([disc_knots, recolored.field.knots]))
         recolor_end = pack(base[members], with_shN=bands) - pack(scene[members], with_shN=bands)
     offsets = torch.zeros(len(knots), len(members) + len(start), channels)
     for k, s in enumerate(knots.tolist()):
-        offsets[k, : len(members)] = interpolate_at(disc_knots, steps, s) * change
-        offsets[k, len(members) :, _OPACITY_CHANNEL] = interpolate_at(disc_knots, logit_rise, s)
+        offsets[k, inside] = interpolate_at(disc_knots, path.rows, s)
+        offsets[k, len(members) :, _OPACITY_CHANNEL] = interpolate_at(disc_knots, path.rise, s)
     if recolored is not None:
         offsets[:, : len(members)] += _scaled_recolor_offsets(recolored, members, recolor_end, knots)
     field = course_field(knots, offsets)
@@ -250,24 +286,95 @@ def _scaled_recolor_offsets(recolored: Gdf, members: Tensor, end: Tensor, knots:
     return paths
 
 
-def _linear_visibility_knots(
-    laid: DiscLayout, paints: Sequence[PaintedView], steps: Tensor, rise: Tensor
-) -> Tensor:
-    """Return the strengths for the knots of a straight path, so that its visible change is linear. [S]"""
+@dataclass(frozen=True)
+class _DiscPath:
+    """Path from the original to the discs, before its visible change is linear."""
+
+    steps: Tensor  # positions on the path, ascending from 0 to 1. [S]
+    rows: Tensor  # packed offsets of the changed rows. [S,M,C]
+    rise: Tensor  # offsets of the discs' logits. [S,A]
+
+
+def _overlap(added: Gaussians, paints: Sequence[PaintedView]) -> Tensor:
+    """Return how many discs cover each disc's center in the painted pictures, by their footprints. [A]
+
+    Discs are drawn faint, so that the logarithm of their transmittance counts all that cover a pixel.
+    """
+    faint_alpha = torch.tensor(_COUNTING_ALPHA)
+    counted = replace(added, logit_opacities=torch.full((len(added),), float(faint_alpha.logit())))
+    white = torch.ones(len(added), 3)
+    overlap = torch.ones(len(added))
+    for paint in paints:
+        camera = paint.camera
+        light = render(counted, camera, (0.0, 0.0, 0.0), colors=white).image[..., 0]
+        count = (1.0 - light.double()).log() / (1.0 - faint_alpha.double()).log()
+        inside = added.means.double() @ camera.viewmat[:3, :3].double().T + camera.viewmat[:3, 3].double()
+        pixels = (inside / inside[:, 2:]) @ camera.K.double().T
+        columns = pixels[:, 0].long().clamp(0, camera.width - 1)
+        rows = pixels[:, 1].long().clamp(0, camera.height - 1)
+        overlap = torch.maximum(overlap, count[rows, columns].float())
+    return overlap
+
+
+def _even_rise(start: Tensor, end: Tensor, overlap: Tensor, steps: Tensor) -> Tensor:
+    """Return offsets of logits for which the opacity of overlapping discs together is linear. [S,A]
+
+    Args:
+        start, end: logits at the ends of the path. [A]
+        overlap: see `_overlap`. [A]
+        steps: positions on the path, ascending from 0 to 1. [S]
+    """
+    covered = 1.0 - (1.0 - end.double().sigmoid()) ** overlap.double()
+    opacity = 1.0 - (1.0 - steps[:, None].double() * covered) ** (1.0 / overlap.double())
+    offsets = (opacity.clamp_min(1e-12).logit() - start.double()).clamp_min(0.0).float()
+    offsets[-1] = end - start
+    return offsets
+
+
+def _disc_path(laid: DiscLayout, paints: Sequence[PaintedView], with_shN: bool) -> _DiscPath:
+    """Return the path of a layout.
+
+    Gaussians move behind the discs first, while the discs are faint. Then the Gaussians that discs replace
+    fade.
+    """
+    start = faint(laid.added).logit_opacities
+    end = torch.full((len(laid.added),), DISC_LOGIT)
+    steps = opacity_course(start, end)[0]
+    rise = _even_rise(start, end, _overlap(laid.added, paints), steps)
+    before = pack(laid.scene[laid.rows], with_shN=with_shN)
+    after = pack(laid.ended[laid.rows], with_shN=with_shN)
+    change = after - before
+    shares = steps[:, None].expand(-1, change.shape[1]).clone()
+    slices = attribute_slices(change.shape[1])
+    for name in _GEOMETRY:
+        shares[:, slices[name]] = (steps / _CLEARED_AT).clamp_max(1.0)[:, None]
+    rows = shares[:, None] * change
+    fading = ((steps - _CLEARED_AT) / (1.0 - _CLEARED_AT)).clamp_min(0.0)
+    first = before[:, _OPACITY_CHANNEL].double().sigmoid()
+    last = after[:, _OPACITY_CHANNEL].double().sigmoid()
+    opacities = torch.lerp(first, last, fading[:, None].double())
+    rows[..., _OPACITY_CHANNEL] = (opacities.logit() - first.logit()).float()
+    rows[0] = 0.0
+    rows[-1] = change
+    return _DiscPath(steps, rows, rise)
+
+
+def _linear_visibility_knots(laid: DiscLayout, paints: Sequence[PaintedView], path: _DiscPath) -> Tensor:
+    """Return the strengths for the knots of a path, so that its visible change is linear. [S]"""
     paint = paints[0]
     box = box_of(paint.mask, paint.camera)
     painted = crop(paint.mask, box)
-    start = pack(laid.scene[laid.rows])
-    pushed = pack(laid.ended[laid.rows]) - start
+    with_shN = path.rows.shape[2] > BASE_CHANNELS
+    start = pack(laid.scene[laid.rows], with_shN=with_shN)
     faint_discs = faint(laid.added)
 
     def look_at(g: float) -> Tensor:
-        logits = faint_discs.logit_opacities + interpolate_at(steps, rise, g)
-        moved = laid.scene.replace_rows(laid.rows, start + g * pushed)
+        logits = faint_discs.logit_opacities + interpolate_at(path.steps, path.rise, g)
+        moved = laid.scene.replace_rows(laid.rows, start + interpolate_at(path.steps, path.rows, g))
         now = concatenate([moved, replace(faint_discs, logit_opacities=logits)])
         return render(now, paint.camera, BACKGROUND, crop=box).image[painted]
 
-    return linear_remap(look_at)(steps.double()).float()
+    return linear_remap(look_at)(path.steps.double()).float()
 
 
 def sharpen(
@@ -303,12 +410,12 @@ def sharpen(
     reverted = scene.replace_rows(members, rows + unpainted_shares[:, None] * recolored.field.offsets(1.0))
     # revert the recolor of painted members if that is better beside the paint, as between letters
     base = min((end, reverted), key=lambda one: sum(_error_beside(one, paint) for paint in paints))
-    views = views_around_paint(base, paints, TRIAL_ANGLES_DEG)
+    goal = make_goal(base, paints)
     try:
-        laid = choose_discs(base, paints, views, log)
+        laid = choose_discs(goal, log)
     except ProgdfError:
         return None
-    groups = [[look for look in views if (look.degrees != 0) is aside] for aside in (False, True)]
+    groups = [[look for look in goal.views if (look.degrees != 0) is aside] for aside in (False, True)]
     errors = [[_mean_square_error(one, group) for one in (end, laid.end)] for group in groups]
     improves = errors[0][1] < errors[0][0] and errors[1][1] <= errors[1][0]
     own_db, side_db = ([round(decibels(error), 1) for error in pair] for pair in errors)
@@ -338,28 +445,5 @@ def _missed_paint(end: Gaussians, view: View, target: Tensor) -> tuple[PaintedVi
     )
     sharp = changed & torch.from_numpy(ndimage.binary_dilation(missed, iterations=BORDER_PX))
     drawn = torch.cat([target, torch.ones_like(target[..., :1])], dim=2) * sharp[..., None]
-    return PaintedView(view.camera, target, drawn), changed
-
-
-def _pivot(scene: Gaussians, paint: PaintedView) -> Tensor:
-    """Return the surface point under the painted pixel nearest to the center of the paint. [3]"""
-    camera = paint.camera
-    pixels = paint.mask.nonzero()
-    row, column = pixels[int((pixels - pixels.float().mean(dim=0)).norm(dim=1).argmin())].tolist()
-    depth = render_depth(scene, camera, crop=(column, row, column + 1, row + 1)).depth[0, 0].double()
-    K = camera.K.double()
-    c2w = camera.c2w.double()
-    ray = torch.stack([(column + 0.5 - K[0, 2]) / K[0, 0], (row + 0.5 - K[1, 2]) / K[1, 1], torch.ones(())])
-    return c2w[:3, :3] @ (depth * ray) + c2w[:3, 3]
-
-
-def orbit(camera: Camera, pivot: Tensor, degrees: float) -> Camera:
-    """Return the camera rotated around the vertical image axis through a pivot."""
-    c2w = camera.c2w.double()
-    axis = c2w[:3, 1]
-    half = 0.5 * math.radians(degrees)
-    rotation = torch.cat([torch.tensor([math.cos(half)]).double(), math.sin(half) * axis])
-    rotated_c2w = torch.eye(4, dtype=torch.float64)
-    rotated_c2w[:3, :3] = rotate_vectors(c2w[:3, :3].T, rotation[None]).T
-    rotated_c2w[:3, 3] = pivot.double() + rotate_vectors(c2w[:3, 3] - pivot.double(), rotation)
-    return replace(camera, viewmat=torch.linalg.inv(rotated_c2w).float(), name=f"decal{degrees:+.0f}")
+    surface = find_surface(end, view.camera, sharp.numpy())
+    return PaintedView(view.camera, target, drawn, surface), changed

@@ -27,7 +27,7 @@ from trainer.views.setup import TrainingSetup
 from trainer.views.view import BACKGROUND, render_view
 
 from .finish import RunResult, write_result
-from .paint import RING, TRIAL_ANGLES_DEG, choose_discs, paint_gdf, views_around_paint
+from .paint import RING, choose_discs, make_goal, paint_gdf, views_around_paint
 from .resume import picture_digests
 
 TURNS = (-45, -30, -15, 0, 15, 30, 45)
@@ -105,7 +105,7 @@ def train_decal(editor: PastingEditor, scene: Gaussians, name: str, log: RunLog 
         log: log of the run
     """
     paints = [editor.paint]
-    laid = choose_discs(scene, paints, views_around_paint(scene, paints, TRIAL_ANGLES_DEG), log)
+    laid = choose_discs(make_goal(scene, paints), log)
     gdf = paint_gdf(laid, scene, paints, name, None)
     edited = edited_scene(scene, gdf)
     background = torch.tensor(BACKGROUND)

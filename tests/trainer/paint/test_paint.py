@@ -26,7 +26,8 @@ from trainer.editors.base import EditorInput
 from trainer.editors.decal import DecalEditor, decal, parse_place
 from trainer.options import EditorOptions
 from trainer.paint.discs import merge_pixels, place_discs
-from trainer.run.paint import choose_discs, orbit
+from trainer.paint.surface import orbit
+from trainer.run.paint import choose_discs, make_goal
 from trainer.run.pasted import train_decal
 from trainer.views.view import BACKGROUND
 
@@ -104,7 +105,7 @@ def test_unpainted_picture_and_paint_off_the_surface_add_nothing() -> None:
     assert not len(discs.added)
     assert discs.scene is small
     with pytest.raises(ProgdfError, match="opaque"):
-        choose_discs(small, [paint_on(small, beyond)], [], None)
+        choose_discs(make_goal(small, [paint_on(small, beyond)]), None)
 
 
 @pytest.mark.parametrize("seed", range(3))

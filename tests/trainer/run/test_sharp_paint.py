@@ -22,9 +22,10 @@ from tests.helpers.trained import train
 from tests.trainer.painted_wall import CAMERA, letters, paint_on, picture, wall
 from trainer.evaluate.command import evaluate
 from trainer.options import EditorOptions, EvaluateOptions, RegionOptions, TrainOptions, with_values
-from trainer.paint.discs import composite_over, place_discs, project_paint
+from trainer.paint.discs import MIN_ALPHA, PaintedView, composite_over, place_discs, project_paint
+from trainer.paint.surface import find_surface, orbit
 from trainer.run.finish import RunResult
-from trainer.run.paint import DiscLayout, choose_discs, lay_discs, orbit
+from trainer.run.paint import DiscLayout, PaintGoal, choose_discs, lay_discs, make_goal
 from trainer.views.view import BACKGROUND, render_view
 
 
@@ -96,9 +97,9 @@ def test_fill_below_discs_stays_and_gaps_between_letters_are_restored(
     """Keep the base that matches the picture beside the sharp paint; the sides show it below the paint."""
     bases = list[Gaussians]()
 
-    def choose(base: Gaussians, *rest: Any) -> DiscLayout:
-        bases.append(base)
-        return choose_discs(base, *rest)
+    def choose(goal: PaintGoal, *rest: Any) -> DiscLayout:
+        bases.append(goal.scene)
+        return choose_discs(goal, *rest)
 
     monkeypatch.setattr("trainer.run.paint.choose_discs", choose)
     scene = load_ply(place / "wall.ply")
@@ -137,7 +138,11 @@ def test_discs_that_are_worse_from_the_sides_are_not_added(
         toward = 0.5 * (CAMERA.position - discs.added.means)
         return replace(discs, added=replace(discs.added, means=discs.added.means + toward))
 
+    def keep_colors(scene: Gaussians, rows: torch.Tensor, added: Gaussians, *_: object) -> object:
+        return scene, added
+
     monkeypatch.setattr("trainer.run.paint.place_discs", lift)
+    monkeypatch.setattr("trainer.run.paint.solve_colors", keep_colors)
     done = train(options(place, save(place, "lifted", letters(wall()).picture), "lifted"), quiet=True)
     assert " from the sides: not added" in done.folder.log.read_text()
     assert load_gdf(done.gdf, load_ply(place / "wall.ply")).added is None
@@ -149,14 +154,15 @@ def test_two_pictures_of_one_stripe_share_one_set_of_rows() -> None:
     stripe[40:90, 58:66] = True
     first = paint_on(scene, stripe)
     camera = orbit(CAMERA, torch.zeros(3), 20.0)
-    seen = project_paint(scene, CAMERA, first.drawn, camera)
+    seen = project_paint(scene, first.surface, first.drawn, camera)
     image = composite_over(render_view(scene, camera, torch.tensor(BACKGROUND)).clamp(0, 1), seen)
-    second = replace(first, camera=camera, picture=image, drawn=seen)
-    alone, both = (lay_discs(scene, paints, 4.0) for paints in ([first], [first, second]))
+    surface = find_surface(scene, camera, (seen[..., 3] > MIN_ALPHA).numpy())
+    second = PaintedView(camera, image, seen, surface)
+    alone, both = (lay_discs(make_goal(scene, paints), 4.0) for paints in ([first], [first, second]))
     assert len(both.added) <= 1.05 * len(alone.added)
     other = torch.zeros_like(stripe)
     other[40:90, 30:38] = True
-    apart = lay_discs(scene, [first, paint_on(scene, other)], 4.0)
+    apart = lay_discs(make_goal(scene, [first, paint_on(scene, other)]), 4.0)
     assert len(apart.added) > 1.8 * len(alone.added)
     for paint in (first, second):
         shown = render_view(both.end, paint.camera, torch.tensor(BACKGROUND)).clamp(0, 1)
