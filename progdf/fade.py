@@ -21,10 +21,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
+from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
 from progdf.camera import Camera, intrinsics, look_at
-from progdf.field.baked import SliderRemap, interpolate
+from progdf.field.baked import SliderRemap, identity_remap, interpolate_at
 from progdf.field.separable import OPACITY_KNOTS
 from progdf.gaussians import Gaussians
 from progdf.rasterize.engines import ALPHA_MIN, alpha_weights, bare_weight, render
@@ -33,8 +34,12 @@ from progdf.scene.bounds import near_plane, scene_sphere
 _MIN_TRANSMITTANCE = 1e-3  # keeps the course of a hidden Gaussian finite
 _PROBE_OPACITY = 1.5 * ALPHA_MIN  # opacity at which a Gaussian that appears is drawn, but hides little
 _MEASURED_STEPS = 12  # steps along the path at which the visible change is measured
+_PLACES = torch.linspace(0.0, 1.0, _MEASURED_STEPS + 1, dtype=torch.float64)
+_PATH_KNOTS = torch.cat([OPACITY_KNOTS, _PLACES]).unique()  # type: ignore[no-untyped-call]
+"""Knots of the path in its own time, from 0 to 1. [S] float64"""
+_SAMPLES_PER_STEP = 4  # samples of the measured curve per step, for the piecewise linear remap
 _MIN_PROGRESS = 0.02  # share of the path's own time in the new strengths, which keeps these ascending
-_MEASURED_VIEWS = 6  # maximum number of views in which the visible change is measured
+_MEASURED_VIEWS = 12  # maximum number of views in which the visible change is measured
 _MAX_GAUSSIANS = 5_000_000  # Gaussians drawn in all their pictures, if cameras are made: about a second
 _AROUND_VIEWS = 12  # cameras around a group of Gaussians
 _AROUND_PX = 128  # width and height of their pictures, pixels
@@ -66,8 +71,8 @@ def fading_course(
         replace(group, logit_opacities=group.logit_opacities.maximum(end))
     )
     at_start, at_end = _transmittances(group, end, views)
-    before = (1.0 - OPACITY_KNOTS[:, None]) * at_start.double()
-    remaining = before / (before + OPACITY_KNOTS[:, None] * at_end.double())
+    before = (1.0 - _PATH_KNOTS[:, None]) * at_start.double()
+    remaining = before / (before + _PATH_KNOTS[:, None] * at_end.double())
     opacities = torch.lerp(end_logits.sigmoid(), start_logits.sigmoid(), remaining)
     logits = opacities.logit().float()
     logits[0] = group.logit_opacities
@@ -82,11 +87,11 @@ def fading_course(
     measured = views[:: max(1, len(views) // count)][:count]
 
     def picture_at(place: float) -> Tensor:
-        now = interpolate(torch.tensor([place]).double(), OPACITY_KNOTS, logits.double())[0].float()
+        now = interpolate_at(_PATH_KNOTS, logits, place)
         opacity = drawn.logit_opacities.index_copy(0, drawn_rows, now)
         return _draw(replace(drawn, logit_opacities=opacity), measured)
 
-    knots = linear_remap(picture_at)(OPACITY_KNOTS).float()
+    knots = linear_remap(picture_at)(_PATH_KNOTS).float()
     offsets = logits - group.logit_opacities
     offsets[0] = 0.0
     offsets[-1] = end.float() - group.logit_opacities
@@ -101,14 +106,17 @@ def linear_remap(seen: Callable[[float], Tensor]) -> SliderRemap:
     Args:
         seen: position on the path, 0 to 1 -> pixels of any fixed shape
     """
-    places = torch.linspace(0.0, 1.0, _MEASURED_STEPS + 1, dtype=torch.float64)
     first = seen(0.0)
-    distances = torch.tensor([float((seen(float(at)) - first).abs().mean()) for at in places[1:]])
+    distances = torch.tensor([float((seen(float(at)) - first).abs().mean()) for at in _PLACES[1:]])
     if not float(distances[-1]) > 0.0:
-        return SliderRemap(places, places)
+        return identity_remap()
     shares = (distances.double() / float(distances[-1])).clamp(0.0, 1.0)
     visible = torch.cat([shares.new_zeros(1), shares]).cummax(dim=0).values
-    return SliderRemap(places, torch.lerp(visible, places, _MIN_PROGRESS))
+    fine = torch.linspace(0.0, 1.0, _SAMPLES_PER_STEP * _MEASURED_STEPS + 1, dtype=torch.float64)
+    curve = torch.from_numpy(PchipInterpolator(_PLACES.numpy(), visible.numpy())(fine.numpy()))
+    curve[0] = 0.0
+    curve[-1] = 1.0
+    return SliderRemap(fine, torch.lerp(curve.clamp(0.0, 1.0), fine, _MIN_PROGRESS))
 
 
 def cameras_around(group: Gaussians) -> list[Camera]:

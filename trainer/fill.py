@@ -72,7 +72,11 @@ class Fill:
 
 
 def fill_holes(
-    scene: Gaussians, rest: Gaussians, views: Sequence[View], pictures: Mapping[str, Tensor] | None = None
+    scene: Gaussians,
+    rest: Gaussians,
+    views: Sequence[View],
+    pictures: Mapping[str, Tensor] | None = None,
+    close: bool = True,
 ) -> Fill:
     """Close the holes of a removal.
 
@@ -83,6 +87,7 @@ def fill_holes(
             filled
         pictures: by view name, pictures of the finished edit, whose colors the discs take instead of those of
             the boundary. [H,W,3]
+        close: False only counts the holes
     """
     picture_colors = pictures or {}
     seen = [(view.camera, _visible_depth(scene, view.camera), view.mask > 0.5) for view in views]
@@ -91,7 +96,7 @@ def fill_holes(
     filled = rest
     discs = list[Gaussians]()
     min_pixels = [_MIN_HOLE_SHARE * float((view.mask > _MIN_REGION_WEIGHT).sum()) for view in views]
-    open_views = {i for i, hole in enumerate(holes) if hole.pixels > min_pixels[i]}
+    open_views = {i for i, hole in enumerate(holes) if close and hole.pixels > min_pixels[i]}
     while open_views and len(discs) < _MAX_VIEWS:
         # views with a given picture come first, as their colors are known
         best = max(open_views, key=lambda i: (views[i].camera.name in picture_colors, holes[i].pixels, -i))

@@ -5,8 +5,9 @@ The path over strengths is known in closed form, so nothing is optimized. Holes 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -20,6 +21,7 @@ from progdf.io.images import contact_sheet
 from progdf.io.json_values import to_json
 from progdf.metrics.image import decibels
 from progdf.metrics.slider import visible_change
+from progdf.region import Region, from_mask
 from progdf.scene.strays import with_strays
 from progdf.terminal import format_count
 from progdf.tidy import Step, tidy
@@ -27,11 +29,12 @@ from trainer.editors import editor_row
 from trainer.editors.pictures import picture_background, read_edit, strengths_of
 from trainer.fill import Fill, fill_holes
 from trainer.options import TrainOptions
+from trainer.regions.remains import find_remains, remaining_share
 from trainer.resolve import recorded_options
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder, write_views
 from trainer.views.setup import TrainingSetup, make_training_setup
-from trainer.views.view import BACKGROUND_NAMES, View, on_backgrounds, render_view
+from trainer.views.view import BACKGROUND, BACKGROUND_NAMES, View, make_view, on_backgrounds, render_view
 
 from .finish import DEFAULTS, RunResult, differences, write_result
 
@@ -111,39 +114,45 @@ def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder
         log: log of the run
     """
     scene = setup.scene
-    selected = len(setup.region)
-    setup = replace(setup, region=with_strays(scene, setup.region))
-    region = setup.region
-    remaining = scene[~setup.region.mask]
-    if len(region) > selected:
-        log.say(f"{format_count(len(region) - selected, 'Gaussian')} left floating are removed too")
+    named = setup.region
     with log.stage("fill"):
         painted, pictures = _painted_views(options, setup)
         around = setup if not options.views.pictures else _views_around(options, setup)
         kind = options.editor.fill or ("picture" if pictures else "surface")
         views = [*painted, *(view for view in around.train if view.camera.name not in pictures)]
-        fill = Fill(None, 0, 0, 0)
-        if kind != "none" and len(remaining):
-            fill = fill_holes(scene, remaining, views, pictures if kind == "picture" else None)
+        fill_pictures = pictures if kind == "picture" else None
+        close = partial(_attempt, scene, views=views, pictures=fill_pictures, close=kind != "none")
+        removal = _remove_whole(scene, named, around.train, close, log)
+        fill = removal.fill
+        removed = removal.scene
+        remains = remaining_share(scene, removed, around.views)
+        remains_of_named = remaining_share(scene, scene[~named.mask], around.views)
     rows_added = 0 if fill.rows is None else len(fill.rows)
     log.say(
-        f"holes: not filled, as requested ({kind})"
+        f"left of its visible pixels, same surface and color: {100 * remains:.2f} % "
+        f"({100 * remains_of_named:.2f} % without the region alone)"
+    )
+    counted = f"holes: {fill.before} pixels in {format_count(len(views), 'view')}"
+    log.say(
+        f"{counted}; not filled, as requested"
         if kind == "none"
-        else f"holes: {fill.before} pixels in {format_count(len(views), 'view')}, {fill.after} after "
-        f"{format_count(rows_added)} from {format_count(fill.views, 'view')} ({kind})"
+        else f"{counted}, {fill.after} after {format_count(rows_added)} from "
+        f"{format_count(fill.views, 'view')} ({kind})"
     )
     with log.stage("report"):
         cameras = [view.camera for view in around.train]
-        steps = [Step("remove", region)]
+        steps = [Step("remove", removal.region)]
         gdf = tidy(scene, steps, options.name, options.editor.editor, fill.rows, cameras)
-        removed = remaining if fill.rows is None else concatenate([remaining, fill.rows])
         judging = around.judging
         errors = _measure(edited_scene(scene, gdf), removed, judging)
         fading = _measure_fading(scene, gdf, judging)
         report = {
             "edit": {"psnr_to_views": min(errors.values()), "psnr_by_background": errors},
             "removal": {
-                "members": len(region),
+                "members": len(removal.region),
+                "remains_added": len(removal.region) - len(named),
+                "remaining_share": round(remains, 5),
+                "remaining_share_of_named": round(remains_of_named, 5),
                 **fading,
                 "fill": kind,
                 "rows_added": rows_added,
@@ -171,6 +180,82 @@ def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder
     )
     log.say(f"{result.line}; shadows and reflections stay")
     return result
+
+
+@dataclass(frozen=True)
+class Removal:
+    """Removed region and the scene that remains."""
+
+    region: Region  # all removed Gaussians
+    fill: Fill
+    scene: Gaussians  # the scene at strength 1, with filled holes
+
+
+def _attempt(
+    scene: Gaussians,
+    region: Region,
+    views: Sequence[View],
+    pictures: Mapping[str, Tensor] | None,
+    close: bool,
+) -> Removal:
+    """Remove a region and fill the holes.
+
+    Args:
+        scene: the original
+        region: the Gaussians to remove
+        views: views with any mask
+        pictures: see `fill_holes`
+        close: False only counts the holes
+    """
+    rest = scene[~region.mask]
+    if not len(rest):
+        return Removal(region, Fill(None, 0, 0, 0), rest)
+    background = torch.tensor(BACKGROUND)
+    masked = [make_view(scene, region, view.camera, background) for view in views]
+    fill = fill_holes(scene, rest, masked, pictures, close)
+    return Removal(region, fill, rest if fill.rows is None else concatenate([rest, fill.rows]))
+
+
+def _remove_whole(
+    scene: Gaussians,
+    named: Region,
+    views: Sequence[View],
+    attempt: Callable[[Region], Removal],
+    log: RunLog,
+) -> Removal:
+    """Remove the named region with what belongs to it: strays and remains. Logs them.
+
+    Remains that the region hid completely may also be the surface below it. They go if the holes that this
+    opens are closed as well as without.
+
+    Args:
+        scene: the original
+        named: the named region
+        views: views of the original with the region's mask
+        attempt: removes a region and fills its holes
+        log: log of the run
+    """
+    whole = with_strays(scene, named)
+    if len(whole) > len(named):
+        log.say(f"also removed: {format_count(len(whole) - len(named), 'Gaussian')} left floating")
+    remains = find_remains(scene, whole, views)
+    mask = whole.mask.index_fill(0, remains.seen, True)
+    if len(remains.seen):
+        log.say(
+            f"also removed: {format_count(len(remains.seen), 'Gaussian')} around the region, visible only "
+            "where it is and joined to it by touch and color"
+        )
+    removal = attempt(from_mask(named.name, mask))
+    if not len(remains.hidden):
+        return removal
+    larger = attempt(from_mask(named.name, mask.index_fill(0, remains.hidden, True)))
+    is_closed = larger.fill.after <= removal.fill.after
+    decision = "also removed" if is_closed else "kept"
+    log.say(
+        f"{decision}: {format_count(len(remains.hidden), 'Gaussian')} hidden by the region, in its color; "
+        f"{larger.fill.after} pixels of holes remain without them, {removal.fill.after} with them"
+    )
+    return larger if is_closed else removal
 
 
 def _painted_views(options: TrainOptions, setup: TrainingSetup) -> tuple[list[View], Mapping[str, Tensor]]:
@@ -227,9 +312,9 @@ def _measure_fading(scene: Gaussians, gdf: Gdf, views: Sequence[View]) -> dict[s
     for strength, now in between.items():
         changes[f"{strength:g}"] = round(visible_change(first, now) / whole, 3) if whole else strength
     deviations = []
-    for a, b, now in zip(first, last, between[0.5], strict=True):
+    for a, b, mid in zip(first, last, between[0.5], strict=True):
         changed = (a - b).abs().amax(dim=2) > _MIN_PAINT
-        deviations.append((now - 0.5 * (a + b)).abs().amax(dim=2)[changed])
+        deviations.append((mid - 0.5 * (a + b)).abs().amax(dim=2)[changed])
     pixels = torch.cat(deviations)
     mean = round(float(pixels.mean()), 4) if len(pixels) else 0.0
     return {"visible_change": changes, "pixel_deviation": mean}

@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -185,6 +186,7 @@ def test_removal_is_a_regular_run(scene_file: Path, tmp_path: Path) -> None:
     assert report["removal"]["rows_added"] == len(gdf.added)
     assert report["removal"]["visible_change"]["0.5"] == pytest.approx(0.5, abs=0.05)
     assert min(report["edit"]["psnr_by_background"].values()) > 50.0
+    assert report["removal"]["remaining_share"] < 0.01
     assert (out / "report.png").is_file()
     assert "shadows and reflections stay" in (out / "log.txt").read_text()
     again = train(replace(options_of(scene_file, out), resume=True), quiet=True)
@@ -265,6 +267,23 @@ def test_gaussians_left_floating_are_removed_with_the_region(scene_file: Path, t
     assert (
         len(with_strays(concatenate([rest, far]), from_mask("none", torch.zeros(len(rest) + 1).bool()))) == 0
     )
+
+
+def test_missed_part_of_the_region_is_removed_with_it(tmp_path: Path) -> None:
+    scene, rest, _ = case()
+    labels = torch.arange(len(scene)) >= len(rest)
+    labels[len(rest) :: 15] = False
+    np.save(tmp_path / "labels.npy", labels.numpy().astype(np.uint8))
+    save_ply(tmp_path / "scene.ply", scene)
+    options = options_of(tmp_path / "scene.ply", tmp_path / "gone")
+    options = replace(options, region=RegionOptions(f"labels:{tmp_path / 'labels.npy'}:1"))
+    result = train(options, quiet=True)
+    report = json.loads((tmp_path / "gone" / "report.json").read_text())
+    assert report["removal"]["remaining_share"] < 0.25 * report["removal"]["remaining_share_of_named"]
+    gdf = load_gdf(result.gdf, load_ply(tmp_path / "scene.ply"))
+    missed = (~labels[len(rest) :]).nonzero()[:, 0] + len(rest)
+    assert int(torch.isin(missed, gdf.region.members).sum()) > 0.95 * len(missed)
+    assert int((gdf.region.members < len(rest)).sum()) == 0
 
 
 def test_removal_with_another_picture_is_another_run(scene_file: Path, tmp_path: Path) -> None:
