@@ -22,7 +22,7 @@ from trainer.optimize.color_solver import add_bands, choose_model, make_solver, 
 from trainer.optimize.color_views import color_views
 from trainer.optimize.losses import GradientL1, Objective
 from trainer.optimize.pgs import PgsSettings, TargetStage, learning_rates
-from trainer.optimize.ties import surface_ties
+from trainer.optimize.ties import Ties, surface_ties
 from trainer.options import EditorOptions, OptimizeOptions, RegionOptions, TrainOptions, with_values
 from trainer.run.finish import RunResult
 from trainer.views.choose import choose_views
@@ -72,10 +72,16 @@ def course(case: Small, steps: int = 40, **more: object) -> Optimization:
     )
 
 
-def edit_few(scene: Gaussians, members: Tensor, crops: list[CropScene], targets: list[Tensor]) -> Tensor:
+def edit_few(
+    scene: Gaussians,
+    members: Tensor,
+    crops: list[CropScene],
+    targets: list[Tensor],
+    ties: Ties | None = None,
+) -> Tensor:
     """Return the change of the members' lowest bands from a small number of pictures. [M,B,3]"""
     original = pack(scene[members], with_shN=scene.sh_degree > 0)
-    ties = surface_ties(scene, members, [some.camera for some in crops])
+    ties = ties or surface_ties(scene, members, [some.camera for some in crops])
     solver = make_solver(color_views(crops, original), original, ties)
     solver, model = choose_model(solver, split_solver(solver, targets), targets, 100, 1)
     return add_bands(solver.fit_map(model.degree, targets)[1], model.residual)

@@ -217,6 +217,7 @@ class Solver:
                 mean
                 + self.ties.spread((share - mean)[:, None, None], confidence, hold / _TIE_WEIGHT)[:, 0, 0]
             )
+            share = self.ties.limit(share)
         return self.with_mask(share.clamp(0.0, 1.0))
 
     def improve_mask(self, targets: Sequence[Tensor]) -> Solver:
@@ -281,7 +282,7 @@ class Solver:
         residual, further = self._descend(
             mapped, spread * free, targets, ridge, steps, tell, held_out_error, floor
         )
-        return torch.where(free, residual, spread), taken + further
+        return torch.where(free, residual, self.ties.limit(spread)), taken + further
 
     def _descend(
         self,
@@ -410,6 +411,7 @@ def make_solver(views: Sequence[ColorView], original: Tensor, ties: Ties | None 
         scaled_ties = ties.of(solved) * np.float32(_TIE_WEIGHT * float(weights[solved, 0, 0].mean()))
         free = solved[:, None].expand_as(free)
     share = original.new_ones(len(original))
+    share = share if ties is None else ties.limit(share)
     return Solver(views, original, weights, fit_maps(views, share), share, ties, free, scaled_ties)
 
 
@@ -537,6 +539,8 @@ def choose_model(
         best = search.try_masks(best, alone)
     chosen = best.solver
     residual = best.residual
+    if solver.ties is not None and solver.ties.reach is not None and best.degree:
+        best = replace(best, mask_hold=_TIED_RIDGES[0])
     if few:  # members that no picture shows follow the map, masked or not
         chosen, residual = _solve_whole(solver, best, targets, steps, degrees != (0,))
     mask = (chosen.share * 255.0).round().to(torch.uint8) if best.mask_hold else None

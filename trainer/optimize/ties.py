@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -13,7 +14,10 @@ from torch import Tensor
 
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
+from progdf.terminal import format_count
+from trainer.regions.from_pictures import CHANGED
 from trainer.regions.lift import HIDDEN, gather
+from trainer.regions.reach import drop_unsupported, find_fade, surface_reach
 from trainer.regions.surface import covered_rows, surface_likeness
 
 _MIN_LIKENESS = 5e-3  # minimum share of a member's total likeness: most of its neighbors are hardly alike
@@ -27,11 +31,55 @@ class Ties:
 
     graph: csr_matrix  # Laplacian. [M,M]
     clear: Tensor  # members that are not almost hidden in every view (`HIDDEN`). [M] bool
+    covered: Tensor | None = None  # members behind a surface, see `covered_rows`; None: none. [M] bool
+    # share of the change that each member may take, see `trainer.regions.reach`; None: all of it. [M] 0..1
+    reach: Tensor | None = None
+
+    @property
+    def links(self) -> csr_matrix:
+        """Ties between different members, ≥ 0. [M,M]"""
+        return csr_matrix(diags(self.graph.diagonal()) - self.graph)
+
+    def limit(self, values: Tensor) -> Tensor:
+        """Return values of the members scaled by `reach`. [M,…]"""
+        if self.reach is None:
+            return values
+        return self.reach.view(-1, *[1] * (values.ndim - 1)) * values
+
+    def end_at_pictures(
+        self,
+        scene: Gaussians,
+        members: Tensor,
+        cameras: Sequence[Camera],
+        changes: Sequence[Tensor],
+    ) -> tuple[Ties, str]:
+        """Return the ties of an edit that ends where its pictures end, and the decision as a log line.
+
+        Args:
+            scene: the original
+            members: rows of the region. [M] int64
+            cameras: cameras of the pictures
+            changes: difference of each picture to the original. [H,W,3] each
+        """
+        visible = self.clear if self.covered is None else self.clear & ~self.covered
+        links = self.links
+        fade = find_fade(scene, members, cameras, changes)
+        sources = drop_unsupported(links, visible)
+        reach = surface_reach(links, scene.means[members], sources, fade.width)
+        reason = "the paint ends at outlines"
+        if fade.border_px:
+            reason = f"the paint's own border is {fade.border_px:.0f} pixels wide"
+        unchanged = format_count(int((reach == 0.0).sum()), "member")
+        line = (
+            f"the edit ends {fade.width:.3g} units beyond the border of what the pictures show ({reason}); "
+            f"{unchanged} beyond keep their color; name the region to color all of it"
+        )
+        return replace(self, clear=self.clear & (reach > 0.0), reach=reach), line
 
     def of(self, rows: Tensor) -> csr_matrix:
         """Return the Laplacian of the ties among some members. [M] bool -> [M,M] float32"""
         among = diags(rows.double().numpy())
-        links = among @ (diags(self.graph.diagonal()) - self.graph) @ among
+        links = among @ self.links @ among
         return csr_matrix(diags(np.asarray(links.sum(axis=1)).ravel()) - links, dtype=np.float32)
 
     def spread(self, residual: Tensor, weights: Tensor, ridge: float) -> Tensor:
@@ -56,11 +104,21 @@ class Ties:
         return torch.from_numpy(np.stack(columns, axis=1)).to(residual).view_as(residual)
 
 
+def is_carried_on(region: str) -> bool:
+    """Return True if an edit from pictures continues over its whole region by the color map.
+
+    A named region is a request to color all of it. The region `changed` is found from the pictures, so its
+    edit ends where the pictures end (`Ties.end_at_pictures`).
+    """
+    return re.match(rf"\s*{CHANGED}\b", region) is None
+
+
 def surface_ties(scene: Gaussians, members: Tensor, cameras: Sequence[Camera]) -> Ties:
     """Return the ties of a region's members. Covered and almost hidden members are found from the cameras."""
     masks = [torch.ones(camera.height, camera.width) for camera in cameras]
     clear = gather(scene, cameras, masks).clearness[members] >= HIDDEN
-    return Ties(surface_graph(scene[members], covered_rows(scene, cameras)[members]), clear)
+    covered = covered_rows(scene, cameras)[members]
+    return Ties(surface_graph(scene[members], covered), clear, covered)
 
 
 def surface_graph(scene: Gaussians, covered: Tensor) -> csr_matrix:

@@ -39,7 +39,7 @@ from trainer.optimize.growth import add_rows, place_seeds, removal_costs, seed_r
 from trainer.optimize.losses import Losses, Perceptual, loss_table
 from trainer.optimize.pgs import SNAPSHOTS, DescentTask, OnStep, ParameterSnapshot, PgsState, TargetStage
 from trainer.optimize.retime import record, retime, select_recordings, straight_recordings
-from trainer.optimize.ties import surface_ties
+from trainer.optimize.ties import is_carried_on, surface_ties
 from trainer.options import MAX_STAGES, OptimizeOptions, Slider, TrainingViewOptions, TrainOptions
 from trainer.paper.network import JointTraining, save_network
 from trainer.store.progress import RunLog, release_memory
@@ -161,7 +161,14 @@ def optimize_members(
     """
     if optimization.solver == "colors":
         plan = plan_colors(
-            optimization, setup, edited, between, options.views, log, options.field.target_psnr
+            optimization,
+            setup,
+            edited,
+            between,
+            options.views,
+            log,
+            options.field.target_psnr,
+            is_carried_on(options.region.region),
         )
         return _solve(*plan, iterations(optimization.steps), folder, log)
     scene = setup.scene
@@ -236,6 +243,7 @@ def plan_colors(
     options: TrainingViewOptions,
     log: RunLog,
     target_psnr: float | None = None,
+    carries_on: bool = True,
 ) -> tuple[Solver, Model, StrengthSchedule]:
     """Solve for the finished edit, then choose the model size and the strengths to solve for next.
 
@@ -248,6 +256,7 @@ def plan_colors(
             open, only every other view is used, provided that the remaining error is not visible
         log: log of the run
         target_psnr: see `FieldOptions`
+        carries_on: see `is_carried_on`; without effect if there are many views
     """
     scene = setup.scene
     members = setup.region.members
@@ -279,6 +288,10 @@ def plan_colors(
         drawn = draw(train)
         aside = draw(held_out) if held_out else drawn
         ties = surface_ties(scene, members, [view.camera for view in train]) if few else None
+        if ties is not None and not carries_on:
+            changes = [picture - view.image for view, picture in zip(train, edited[1.0], strict=False)]
+            ties, end_line = ties.end_at_pictures(scene, members, [view.camera for view in train], changes)
+            log.say(end_line)
     with log.stage("model"):
         finished = target(1.0, edited[1.0])
         solver = make_solver(drawn, original, ties)
@@ -309,7 +322,7 @@ def plan_colors(
     if ties is not None:
         evaluated_on = "held-out squares of the pictures"
     log.say(f"{model.line}, on {evaluated_on}")
-    if ties is not None:
+    if ties is not None and carries_on:
         unseen_count = len(original) - int(solver.asked[:, 0].sum())
         log.say(f"{unseen_count} members are almost hidden; they follow the color map and their surface")
     return solver.only(model.residual), model, course
