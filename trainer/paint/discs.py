@@ -326,7 +326,7 @@ def _rows_before(
 
 
 def _main_pieces(
-    owner: NDArray[np.int32], piece: NDArray[np.int32], weights: NDArray[np.float32], count: int
+    owner: NDArray[np.int32], piece: NDArray[np.int64], weights: NDArray[np.float32], count: int
 ) -> NDArray[np.int64]:
     """Return the piece of the surface in which each row has most weight. -> [N]"""
     size = (count, int(piece.max()) + 1)

@@ -26,6 +26,7 @@ MIN_SAMPLES = 12
 _REWEIGHTINGS = 8  # iterations of robust least squares
 _SPLINE_CELLS = (2, 4, 8)  # cells of the B-splines along the longer side of the paint
 _BEND_SHARE = 1e-3  # weight of the splines' bending, as a share of the squared residuals
+_PLANES_NAMES = {1: "a plane", 2: "2 planes that meet in an edge", 3: "3 planes that meet in a corner"}
 _EDGE_DIRECTIONS = 6  # tried directions of an edge between planes
 _DIFFERENCE = 1e-4  # step of numeric derivatives in normalized image coordinates
 _SAMPLES_PER_TERM = 8  # smallest number of samples per coefficient of a spline
@@ -92,16 +93,12 @@ class Planes:
     @property
     def name(self) -> str:
         """See `SurfaceModel`."""
-        count = len(self.coefficients)
-        return (
-            "a plane"
-            if count == 1
-            else f"{count} planes that meet in {'an edge' if count == 2 else 'a corner'}"
-        )
+        return _PLANES_NAMES[len(self.coefficients)]
 
     def _values(self, x: Array, y: Array) -> Array:
-        a, b, c = self.coefficients.T.reshape(3, -1, *([1] * np.ndim(x)))
-        values: Array = a + b * x + c * y
+        a, b, c = self.coefficients.T
+        values: Array = np.add.outer(a, np.zeros_like(x))
+        values += np.multiply.outer(b, x) + np.multiply.outer(c, y)
         return values
 
     def inverse_depth(self, x: Array, y: Array) -> Array:
@@ -113,7 +110,8 @@ class Planes:
     def part(self, x: Array, y: Array) -> Parts:
         """See `SurfaceModel`."""
         values = self._values(x, y)
-        return values.argmin(axis=0) if self.is_convex else values.argmax(axis=0)
+        visible: Parts = values.argmin(axis=0) if self.is_convex else values.argmax(axis=0)
+        return visible
 
     def gradient(self, x: Array, y: Array) -> tuple[Array, Array]:
         """See `SurfaceModel`."""
@@ -165,7 +163,8 @@ class Spline:
         columns = _spline_basis(flat_x, self.box[0], self.box[2], shape[0])
         rows = _spline_basis(flat_y, self.box[1], self.box[3], shape[1])
         raised = np.einsum("ni,ij,nj->n", rows, self.heights, columns)
-        return self.plane.inverse_depth(x, y) + raised.reshape(x.shape)
+        values: Array = self.plane.inverse_depth(x, y) + raised.reshape(x.shape)
+        return values
 
     def part(self, x: Array, y: Array) -> Parts:
         """See `SurfaceModel`."""
