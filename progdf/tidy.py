@@ -24,7 +24,7 @@ from progdf.fade import fading_course
 from progdf.field.baked import interpolate_at
 from progdf.field.separable import course_field, opacity_course
 from progdf.gaussians import Gaussians, attribute_slices, concatenate, pack
-from progdf.gdf.file import ADDED_LOGIT, Gdf, fingerprint
+from progdf.gdf.file import ADDED_LOGIT, Gdf, anchor_added, fingerprint
 from progdf.region import Region, from_mask
 from progdf.similarity import Motion, make_parts, move_rows
 
@@ -86,7 +86,7 @@ def tidy(
             original
         name: name of the layer
         instruction: text stored in the .gdf
-        added: further rows to add, as they are at strength 1
+        added: further rows to add, as they are at strength 1; they follow the surface below them
         cameras: views in which fading is even; empty: cameras around the fading Gaussians; None: opacities
             change linearly, which is fast
 
@@ -104,6 +104,7 @@ def tidy(
     members = region.members
     bands = scene.sh_degree > 0 and any(_rotates(step) for step in steps)
     rows = pack(scene[members], with_shN=bands)
+    fill_count = 0 if added is None else len(added)
     added = _copies(scene, steps, added)
     end = _end_logits(scene, steps)[members]
     start_scene = scene
@@ -123,7 +124,10 @@ def tidy(
         offsets[i, : len(members)] = _rows_at(scene, members, steps, bands, s) - rows if s else 0.0
         offsets[i, :, _OPACITY_COLUMN] = interpolate_at(opacity_knots, logits, s)
     field = course_field(knots, offsets)
-    return Gdf(name, region, field, fingerprint(scene), instruction, added=added)
+    gdf = Gdf(name, region, field, fingerprint(scene), instruction, added=added)
+    if added is None or not fill_count:
+        return gdf
+    return anchor_added(gdf, scene, free=len(added) - fill_count)
 
 
 def _opacity_course(

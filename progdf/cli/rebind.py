@@ -22,7 +22,7 @@ from progdf.field.baked import AttributeBases, BakedField
 from progdf.field.separable import fit_bands
 from progdf.formats.scene_file import load_scene, rotate_about_x, scene_name
 from progdf.gaussians import BASE_CHANNELS, Gaussians
-from progdf.gdf.file import Gdf, fingerprint, load_gdf, save_gdf
+from progdf.gdf.file import Gdf, anchor_added, fingerprint, load_gdf, save_gdf
 from progdf.io.atomic import check_not_an_input
 from progdf.region import Region
 from progdf.scene.point_tree import PointTree
@@ -171,13 +171,17 @@ def rebind_edit(gdf: Gdf, a: Gaussians, b: Gaussians, match: Match) -> Gdf:
         recorded=gdf.field.recorded,
     )
     quality = {"matched": match.matched, "one_to_one": match.once, "median": match.median, "p95": match.p95}
-    return replace(
+    rebound = replace(
         gdf,
         region=Region(gdf.region.name, rows, gdf.region.score[of_a]),
         field=field,
         scene=fingerprint(b),
         report={**gdf.report, "rebound": quality},
+        anchors=None,
     )
+    if gdf.anchors is None:
+        return rebound
+    return anchor_added(rebound, b, gdf.anchors.pushes, gdf.anchors.free)
 
 
 def _assign_rows(candidates: Rows, costs: NDArray[np.float64], count: int) -> Rows:

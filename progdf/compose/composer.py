@@ -8,7 +8,7 @@ one attribute.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -24,8 +24,18 @@ from progdf.rasterize.cpu.jit import kernel
 from progdf.threads import run_chunks
 
 from .added import extend
+from .follow import (
+    FOLLOWED,
+    Followers,
+    carry_pushed,
+    carry_rows,
+    find_followers,
+    pack_shapes,
+    state_scene,
+    unpack_shapes,
+)
 from .layers import KINDS, ORDERED, Effects, Layer, changed_edits, check_numbers, check_weights, effects_of
-from .reference import changed_rows, coverage
+from .reference import Coverage, changed_rows, coverage
 
 Floats = NDArray[np.float32]
 Rows = NDArray[np.int64]
@@ -91,6 +101,7 @@ class _Plan(NamedTuple):
 
     rows: Rows  # ascending. [U]
     parts: Mapping[int, tuple[Rows, Rows]]  # by edit: its members among the rows, and their positions. [m]
+    followers: Rows  # indices of the following rows among them, see `Followers`
 
 
 class _LayerSlice(NamedTuple):
@@ -110,22 +121,29 @@ class Composer:
     Args:
         scene: the original, float32, which is never modified
         gdfs: every edit that may appear in the stack; their added rows come after the scene's own
+        covers: `coverage`, or its values from another scene
 
     Raises:
         ProgdfError: an edit was made for another scene.
     """
 
-    def __init__(self, scene: Gaussians, gdfs: Sequence[Gdf]) -> None:
+    def __init__(self, scene: Gaussians, gdfs: Sequence[Gdf], covers: Coverage = coverage) -> None:
         scene, extended = extend(scene, gdfs)
         self._scene = scene
         self._gdfs = extended
         self._given = tuple(gdfs)  # kept alive, so that no other edit gets the same id
         self._index = {id(gdf): i for edits in (gdfs, extended) for i, gdf in enumerate(edits)}
+        self._coverage: dict[int, Mapping[str, Tensor]] = {}
         self._members = [gdf.region.members.numpy() for gdf in extended]
         self._bases = [
             {name: _Bases.of(bases) for name, bases in gdf.field.attributes.items()} for gdf in extended
         ]
         moving = {name for bases in self._bases for name in bases}
+        self._covers = covers
+        followers = find_followers(extended, len(scene))
+        self._surface = None if followers is None else _Surface(scene, extended, followers, self._coverage_of)
+        if followers is not None:
+            moving.update(FOLLOWED)
         before = {name: getattr(scene, name).detach().float() for name in ATTRIBUTES if name in moving}
         after: dict[str, Any] = {name: values.clone() for name, values in before.items()}
         self.gaussians = replace(scene, **after)
@@ -133,7 +151,6 @@ class Composer:
         width = {name: math.prod(values.shape[1:]) for name, values in before.items()}
         self._before = {name: values.reshape(-1, width[name]).numpy() for name, values in before.items()}
         self._after = {name: values.view(-1, width[name]).numpy() for name, values in after.items()}
-        self._coverage: dict[int, Mapping[str, Tensor]] = {}
         self._meets: dict[tuple[int, int], bool] = {}
         self._effects = Effects()
         self._plans: dict[frozenset[int], _Plan] = {}
@@ -166,16 +183,29 @@ class Composer:
         plan = self._plan(changed)
         moving = {name for edit in plan.parts for name in self._bases[edit]}
         names = tuple(name for name in self._before if name in moving)
+        surface = self._surface
+        if surface is None or not len(plan.followers):
+            return Change(plan.rows, names, self._write(stack, blend, plan, names))
+        last = surface.restore(self.gaussians, plan.followers, moving)
+        moved = self._write(stack, blend, plan, names)
+        carried = surface.carry(self.gaussians, plan.followers, last, stack, blend)
+        names = tuple(name for name in self._before if name in moving or name in FOLLOWED)
+        return Change(plan.rows, names, max(moved, carried))
+
+    def _write(
+        self, stack: Sequence[tuple[int, Layer]], blend: str, plan: _Plan, names: Sequence[str]
+    ) -> float:
+        """Write the rows of a plan without following; return the largest movement of a center."""
         active = [layer for _, layer in stack]
         if blend == "adjust" and self._maps_others(stack):
-            return Change(plan.rows, names, self._write_adjusted(active, plan.rows, names))
+            return self._write_adjusted(active, plan.rows, names)
         parts = [self._part(plan, edit, layer) for edit, layer in stack if edit in plan.parts]
         count = 1 + len(plan.rows) // CHUNK
         cuts = [len(plan.rows) * part // count for part in range(count + 1)]
         moves = run_chunks(
             lambda chunk: self._rewrite(plan.rows, parts, names, blend, cuts[chunk], cuts[chunk + 1]), count
         )
-        return Change(plan.rows, names, math.sqrt(max(moves)))
+        return math.sqrt(max(moves))
 
     def _maps_others(self, stack: Sequence[tuple[int, Layer]]) -> bool:
         """Return whether a grade lies over Gaussians of a lower layer and maps their colors."""
@@ -257,18 +287,23 @@ class Composer:
             if len(self._plans) >= 32:  # only a few are in use during a drag
                 self._plans.clear()
             chosen = [self._members[edit] for edit in changed]
+            if self._surface is not None:
+                chosen += [rows for edit in changed if len(rows := self._surface.dependents(edit))]
             rows = chosen[0] if len(chosen) == 1 else np.unique(np.concatenate(chosen))
             parts = {}
             for edit, members in enumerate(self._members):
                 _, members_at, at = np.intersect1d(members, rows, assume_unique=True, return_indices=True)
                 if len(members_at):
                     parts[edit] = members_at, at
-            self._plans[changed] = _Plan(rows, parts)
+            followers = np.zeros(0, np.int64)
+            if self._surface is not None:
+                followers = np.flatnonzero(np.isin(self._surface.followers.rows, rows))
+            self._plans[changed] = _Plan(rows, parts, followers)
         return self._plans[changed]
 
     def _coverage_of(self, edit: int) -> Mapping[str, Tensor]:
         if edit not in self._coverage:
-            self._coverage[edit] = coverage(self._scene, self._gdfs[edit])
+            self._coverage[edit] = self._covers(self._scene, self._gdfs[edit])
         return self._coverage[edit]
 
     def _check_weights(self, layers: Sequence[Layer]) -> None:
@@ -287,6 +322,133 @@ class Composer:
             raise ValueError(
                 f"{gdf.name} is not one of the composer's edits; give it to Composer first"
             ) from None
+
+
+class _Surface:
+    """States of the rows that others follow, see `Followers`, composed like a scene of their own.
+
+    Args:
+        scene: the extended scene
+        gdfs: its edits
+        followers: see `find_followers`
+        coverage_of: function from the index of an edit to its coverage
+    """
+
+    def __init__(
+        self,
+        scene: Gaussians,
+        gdfs: Sequence[Gdf],
+        followers: Followers,
+        coverage_of: Callable[[int], Mapping[str, Tensor]],
+    ) -> None:
+        self.followers = followers
+        self._scene = scene
+        states, self._gdfs = state_scene(scene, gdfs, followers)
+        self._index = {id(gdf): edit for edit, gdf in enumerate(self._gdfs)}
+        self._coverage_of = coverage_of
+        self._composer = Composer(states, self._gdfs, self._covers)
+        self._before = pack_shapes(states)
+        self._rows = torch.from_numpy(followers.rows)
+        self._anchors = torch.from_numpy(followers.anchors)
+        self._weights = torch.from_numpy(followers.weights)
+        self._uncarried = scene.means[self._rows].clone()  # centers before following, from the last update
+        self._dependents: dict[int, Rows] = {}
+        self._sliced: dict[
+            int, tuple[Tensor, int, Tensor]
+        ] = {}  # by edit: weights, their version, and a part
+
+    def dependents(self, edit: int) -> Rows:
+        """Return `Followers.dependents`, cached."""
+        if edit not in self._dependents:
+            self._dependents[edit] = self.followers.dependents(edit)
+        return self._dependents[edit]
+
+    def restore(self, gaussians: Gaussians, index: Rows, moving: Collection[str]) -> Tensor:
+        """Write the rows as they are without following, before the composer rewrites them.
+
+        Args:
+            gaussians: the composed scene; updated in place
+            index: indices of the rows, see `Followers`. [F]
+            moving: attributes that the composer rewrites in these rows
+
+        Returns:
+            Their centers in the last picture. [F,3]
+        """
+        rows = self._rows[index]
+        last = gaussians.means[rows]
+        gaussians.means[rows] = self._uncarried[index]  # the composer measures the movement
+        for name in FOLLOWED:
+            if name not in moving:
+                getattr(gaussians, name)[rows] = getattr(self._scene, name)[rows].float()
+        return last
+
+    def carry(
+        self,
+        gaussians: Gaussians,
+        index: Rows,
+        last: Tensor,
+        stack: Sequence[tuple[int, Layer]],
+        blend: str,
+    ) -> float:
+        """Write the rows that follow; return the largest movement of a center.
+
+        Args:
+            gaussians: the composed scene, in which no row follows another; updated in place
+            index: indices of the rows to write, see `Followers`. [F]
+            last: their centers in the last picture. [F,3]
+            stack: active layers with the index of their edit, lowest first
+            blend: one of `BLENDS`
+        """
+        followers = self.followers
+        rows = self._rows[index]
+        self._uncarried[index] = gaussians.means[rows]
+        active = {edit for edit, _ in stack}
+        is_active = np.isin(followers.edits, list(active))
+        is_active |= (followers.edits < 0) & bool(active & followers.pushing)
+        index = index[is_active[index]]
+        if len(index) and active - followers.pushing:
+            layers = [self._layer(edit, layer) for edit, layer in stack if len(followers.changed[edit][0])]
+            self._composer.update(layers, blend)
+            self._write(gaussians, index[followers.edits[index] >= 0], is_pushed=False)
+            self._write(gaussians, index[followers.edits[index] < 0], is_pushed=True)
+        steps = (gaussians.means[rows] - last).square().sum(dim=1)
+        return math.sqrt(float(steps.max())) if len(steps) else 0.0
+
+    def _write(self, gaussians: Gaussians, index: Rows, is_pushed: bool) -> None:
+        """Write added rows, or pushed rows."""
+        if not len(index):
+            return
+        states = self._composer.gaussians
+        rows = self._rows[index]
+        anchors = self._anchors[index]
+        composed = pack_shapes(gaussians, rows)
+        if is_pushed:
+            at = anchors[:, 0]
+            paint = pack_shapes(states, torch.from_numpy(self.followers.own[index]))
+            shapes = carry_pushed(composed, paint, self._before[at], pack_shapes(states, at))
+        else:
+            after = pack_shapes(states)
+            shapes = carry_rows(composed, self._before[anchors], after[anchors], self._weights[index])
+        for name, values in unpack_shapes(shapes).items():
+            getattr(gaussians, name)[rows] = values
+
+    def _layer(self, edit: int, layer: Layer) -> Layer:
+        """Return a layer restricted to the states."""
+        weights = layer.weights
+        if weights is None:
+            return replace(layer, gdf=self._gdfs[edit])
+        known = self._sliced.get(edit)
+        if known is None or known[0] is not weights or known[1] != weights._version:
+            part = weights[torch.from_numpy(self.followers.changed[edit][1])]
+            known = weights, weights._version, part
+            self._sliced[edit] = known
+        return replace(layer, gdf=self._gdfs[edit], weights=known[2])
+
+    def _covers(self, _: Gaussians, gdf: Gdf) -> Mapping[str, Tensor]:
+        """Return the coverage that an edit of the states has in the scene."""
+        edit = self._index[id(gdf)]
+        members = torch.from_numpy(self.followers.changed[edit][1])
+        return {kind: share[members] for kind, share in self._coverage_of(edit).items()}
 
 
 def _between(part: _LayerSlice, first: int, last: int) -> _LayerSlice:

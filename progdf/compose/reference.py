@@ -22,6 +22,7 @@ from progdf.gdf.file import Gdf
 from progdf.sh import C0
 
 from .added import extend
+from .follow import carry_pushed, carry_rows, changes_shape, pack_shapes, unpack_shapes
 from .layers import BLENDS, KINDS, ORDERED, Gains, Layer, check_layers
 
 # changes that are clearly visible
@@ -140,6 +141,9 @@ def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "norm
       than from the map lies over the lower layers to that extent, see `map_share`. So dark gaps between
       stripes stay dark.
 
+    Added rows follow the surface below them when other layers move, scale or fade it, see
+    `progdf.compose.follow`.
+
     In Σ m s and 1 − m s c, s is clamped to 0 to 1. A strength above 1 exaggerates its own edit without
     dimming the others.
 
@@ -167,10 +171,59 @@ def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "norm
     active = [layer for layer in layers if layer.active]
     if not active or not len(scene):
         return scene
-    rows, changed = changed_rows(scene, active, blend)
+    return _follow(scene, _compose(scene, active, blend), active, blend)
+
+
+def _compose(scene: Gaussians, layers: Sequence[Layer], blend: str) -> Gaussians:
+    """Return the scene under active layers, in which no row follows another."""
+    if not layers:
+        return scene
+    rows, changed = changed_rows(scene, layers, blend)
     return replace(
         scene, **{name: getattr(scene, name).index_copy(0, rows, new) for name, new in changed.items()}
     )
+
+
+def _follow(scene: Gaussians, composed: Gaussians, layers: Sequence[Layer], blend: str) -> Gaussians:
+    """Return the composed scene with added rows on the surface as other layers change it.
+
+    See `progdf.compose.follow`.
+
+    Args:
+        scene: the original with the rows that edits add
+        composed: the scene under the layers, in which no row follows another
+        layers: active layers of converted edits
+        blend: one of `BLENDS`
+    """
+    edits = {id(layer.gdf): layer.gdf for layer in layers}
+    pushing = {key for key, gdf in edits.items() if gdf.anchors is not None and gdf.anchors.pushes}
+    others = [layer for layer in layers if id(layer.gdf) not in pushing and changes_shape(layer.gdf)]
+    if not others or all(gdf.anchors is None for gdf in edits.values()):
+        return composed
+    shapes = pack_shapes(composed)
+    before = pack_shapes(scene)
+    pushed = torch.zeros(len(scene), dtype=torch.bool)
+    for key in pushing:
+        pushed[edits[key].region.members] = True
+    rows = pushed.nonzero()[:, 0]
+    surface = pack_shapes(_compose(scene, others, blend), rows)
+    paint = pack_shapes(_compose(scene, [layer for layer in layers if id(layer.gdf) in pushing], blend), rows)
+    shapes[rows] = carry_pushed(shapes[rows], paint, before[rows], surface)
+    for gdf in edits.values():
+        anchors = gdf.anchors
+        if anchors is None or not len(anchors):
+            continue
+        changing = [layer for layer in others if layer.gdf is not gdf]
+        after = pack_shapes(_compose(scene, changing, blend))
+        rows = gdf.region.members[-len(anchors) :]
+        at = anchors.rows
+        shapes[rows] = carry_rows(shapes[rows], before[at], after[at], anchors.weights.double())
+    changed = {
+        name: new.to(getattr(scene, name).dtype)
+        for name, new in unpack_shapes(shapes).items()
+        if not torch.equal(new, getattr(composed, name))
+    }
+    return replace(composed, **changed)
 
 
 def changed_rows(

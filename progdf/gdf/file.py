@@ -26,6 +26,7 @@ from progdf.io.atomic import read_file, write_error, write_file
 from progdf.region import Region, whole_scene
 
 from . import header
+from .anchors import Anchors, choose_anchors, join_free
 from .header import SceneFingerprint
 
 _FINGERPRINTS: MutableMapping[Tensor, tuple[tuple[int, Origin] | None, str]] = WeakIdKeyDictionary()
@@ -37,6 +38,8 @@ _MAX_OFFSET = 1e18
 _MAX_OFFSETS = {"log_scales": 80.0}
 """Largest offset of attributes with another limit. e^80 fits into float32, also times any scene's scale."""
 
+_SHAPE = ("log_scales", "quats", "logit_opacities")
+_SURFACE = ("means", *_SHAPE)  # attributes that decide on which Gaussians an added row lies
 UNSEEN_LOGIT = -math.log(254.0)
 """Opacity logit of 1/255. Renderers skip Gaussians below it."""
 ADDED_LOGIT = -6.0
@@ -62,6 +65,8 @@ class Gdf:
     # B Gaussians that the scene does not have, at strength 0, where they are invisible; they are the last B
     # members of the field, see `progdf.compose.added`
     added: Gaussians | None = None
+    anchors: Anchors | None = None  # rows of the scene on which the added rows lie; None: they follow nothing
+    anchors_found: bool = False  # the anchors were chosen on load, as the file's format has none
     from_others: int = 0  # number of members, the last ones, that other edits add; see `extend`
 
     def __post_init__(self) -> None:
@@ -72,9 +77,22 @@ class Gdf:
             )
         if self.added is not None:
             _check_added(self.added)
+        if self.anchors is not None:
+            self._check_anchors(self.anchors)
         if len(self.region.score) != self.scene.count:
             raise ValueError(
                 f"the region's score has {len(self.region.score)} rows, the scene {self.scene.count}"
+            )
+
+    def _check_anchors(self, anchors: Anchors) -> None:
+        """Raise ValueError if the anchors do not fit the added rows or the scene."""
+        if self.added is not None and len(anchors) != len(self.added):
+            raise ValueError(f"{len(anchors)} added rows have anchors, {len(self.added)} are added")
+        if len(anchors) > self.members:
+            raise ValueError(f"{len(anchors)} rows have anchors, the edit has {self.members} members")
+        if len(anchors) and int(anchors.rows.max()) >= self.scene.count:
+            raise ValueError(
+                f"row {int(anchors.rows.max())} is an anchor, the scene has {self.scene.count} rows"
             )
 
     @property
@@ -153,6 +171,7 @@ def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
     field, tensors = header.pack_field(gdf.field)
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     tensors |= header.pack_region(gdf.region) | header.pack_added(gdf.added)
+    tensors |= header.pack_anchors(gdf.anchors)
     broken = _find_non_finite(tensors)
     if broken:
         raise ValueError(f"{broken} of {gdf.name} has a number that is not finite")
@@ -167,6 +186,8 @@ def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
         report=dict(gdf.report),
         added=gdf.members - len(gdf.region),
         added_origin=ZERO if gdf.added is None else gdf.added.origin,
+        anchored=gdf.anchors is not None,
+        pushes=gdf.anchors is not None and gdf.anchors.pushes,
     )
     content = header.pack_file(head, tensors)
     try:
@@ -202,6 +223,8 @@ def load_gdf(
         if region is not None or gdf.scene == ANY_SCENE:
             return apply_grade(gdf, scene, whole_scene(scene) if region is None else region)
         verify(gdf, scene, name, scene_name)
+        if gdf.anchors_found:
+            gdf = replace(anchor_added(gdf, scene, _only_pushes(gdf)), anchors_found=True)
     form = gdf.field.origin
     if form is None:
         return gdf
@@ -219,6 +242,43 @@ def load_gdf(
         return replace(gdf, field=replace(baked, recorded=gdf.field.recorded))
     except (ValueError, RuntimeError) as error:
         raise header.contradiction_error(name, error) from error
+
+
+def anchor_added(gdf: Gdf, scene: Gaussians, pushes: bool = False, free: int = 0) -> Gdf:
+    """Return the edit with its added rows anchored to the scene's surface, see `progdf.gdf.anchors`.
+
+    Args:
+        gdf: an edit of the scene that adds rows; any other is returned unchanged
+        scene: the original
+        pushes: see `Anchors.pushes`
+        free: number of added rows, the last ones, that follow nothing, such as copies
+    """
+    added = gdf.added
+    if added is None:
+        return gdf
+    members = len(gdf.region)
+    parts = {}
+    offsets = {name: bases.end for name, bases in gdf.field.attributes.items() if name in _SURFACE}
+    for name, change in offsets.items():
+        old: Tensor = getattr(scene, name).float()
+        new = old[gdf.region.members] + change[:members].reshape(-1, *old.shape[1:])
+        parts[name] = old.index_copy(0, gdf.region.members, new)
+    to_scene = torch.tensor(added.origin, dtype=torch.float64) - torch.tensor(
+        scene.origin, dtype=torch.float64
+    )
+    means = (added.means.double() + to_scene).float()
+    if "means" in offsets:
+        means = means + offsets["means"][members:]
+    end = replace(scene, **parts) if parts else scene
+    chosen = choose_anchors(end, means[: len(means) - free], UNSEEN_LOGIT, pushes)
+    return replace(gdf, anchors=join_free(chosen, free), anchors_found=False)
+
+
+def _only_pushes(gdf: Gdf) -> bool:
+    """Return whether an edit only moves its members, as paint does, see `Anchors.pushes`."""
+    members = len(gdf.region)
+    shape = [bases.end[:members] for name, bases in gdf.field.attributes.items() if name in _SHAPE]
+    return not any(bool(change.any()) for change in shape)
 
 
 def apply_grade(gdf: Gdf, scene: Gaussians, region: Region) -> Gdf:
@@ -295,6 +355,8 @@ def _unpack(head: header.GdfHeader, tensors: Mapping[str, Tensor]) -> Gdf:
         options=head.options,
         report=head.report,
         added=header.unpack_added(head, tensors),
+        anchors=header.unpack_anchors(head, tensors),
+        anchors_found=header.is_before_anchors(head) and bool(head.report),
     )
 
 

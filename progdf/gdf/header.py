@@ -35,7 +35,9 @@ from progdf.io.json_values import convert_json, decode_json
 from progdf.io.tensors import check_tensor, inflate
 from progdf.region import Region
 
-FORMAT = 7
+from .anchors import MAX_ANCHORS, Anchors
+
+FORMAT = 8
 """Version of the file format."""
 
 MAX_GAUSSIANS = 1 << 26
@@ -47,6 +49,7 @@ _BASES_TENSORS = ("end_offset", "residual_basis", "scale", "coefficients")  # te
 _GRADE_TENSORS = ("knots", "table", "residual", "scale", "coefficients")  # tensors of `GradeForm`
 _PACKED_SUFFIX = ".packed"  # ending of compressed per-member tensors, see `GradeForm.packed_levels`
 _ADDED_PREFIX = "added."
+_ANCHORED_FORMAT = 8  # first format that stores anchors of added rows
 _NETWORK_PREFIX = "network."
 _END_CORRECTION_PREFIX = "end_correction."
 _OLDEST_FORMAT = 3  # oldest format that is read
@@ -92,6 +95,8 @@ class GdfHeader(msgspec.Struct, frozen=True):
     report: dict[str, Any]
     added: Annotated[int, msgspec.Meta(ge=0)] = 0  # rows that the scene does not have, see `Gdf.added`
     added_origin: Origin = ZERO
+    anchored: bool = False  # the added rows have anchors, see `Gdf.anchors`
+    pushes: bool = False  # see `Anchors.pushes`
     format: int = FORMAT
     sha256: str = ""
 
@@ -284,6 +289,31 @@ def unpack_added(header: GdfHeader, tensors: Mapping[str, Tensor]) -> Gaussians 
     if len(added) != header.added:
         raise ValueError(f"the header has {header.added} added rows, the tensors {len(added)}")
     return added
+
+
+def pack_anchors(anchors: Anchors | None) -> dict[str, Tensor]:
+    """Return the tensors of anchors by their names in the file."""
+    if anchors is None:
+        return {}
+    return {"anchors.rows": anchors.rows.int(), "anchors.weights": anchors.weights}
+
+
+def unpack_anchors(header: GdfHeader, tensors: Mapping[str, Tensor]) -> Anchors | None:
+    """Return the anchors, or None; the inverse of `pack_anchors`.
+
+    Raises:
+        ValueError, KeyError: the tensors are no anchors of the added rows.
+    """
+    if not header.anchored:
+        return None
+    rows = tensors["anchors.rows"]
+    check_tensor("anchors.rows", rows, (header.added, MAX_ANCHORS), torch.int32)
+    return Anchors(rows.long(), tensors["anchors.weights"], header.pushes)
+
+
+def is_before_anchors(header: GdfHeader) -> bool:
+    """Return whether the file is of a format without anchors, although it adds rows."""
+    return header.format < _ANCHORED_FORMAT and header.added > 0
 
 
 def pack_region(region: Region) -> dict[str, Tensor]:

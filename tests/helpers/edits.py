@@ -14,7 +14,7 @@ from progdf.field.choose import Render
 from progdf.field.grade import bake_grade, fit_grade
 from progdf.field.separable import course_field, opacity_course, quantize_bases
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, attribute_slices, pack
-from progdf.gdf.file import ADDED_LOGIT, Gdf, fingerprint
+from progdf.gdf.file import ADDED_LOGIT, Gdf, anchor_added, fingerprint
 from progdf.region import Region
 from tests.helpers.draws import Draws
 from tests.helpers.scenes import random_gaussians
@@ -103,6 +103,24 @@ def growing(scene: Gaussians, members: torch.Tensor, count: int, seed: int, name
     offsets[:, :, attribute_slices(14)["logit_opacities"]] = opacity[..., None]
     offsets[:, :, :3] = knots[:, None, None] * draws.normal(len(start), 3)
     return replace(edit_of(scene, members, curved_field(len(members)), name), **grown(offsets, knots, added))
+
+
+def painted(scene: Gaussians, count: int, seed: int, name: str = "logo", pushed: int = 30) -> Gdf:
+    """Return an edit that pushes and tints some rows and adds `count` rows, which are anchored like paint."""
+    draws = Draws(seed)
+    members = some_rows(scene, pushed, seed)
+    added = added_rows(count, seed, scene.sh_degree)
+    start = torch.cat([scene.logit_opacities[members], added.logit_opacities])
+    end = torch.cat([start[:pushed], draws.normal(count) + 3.0])
+    knots, opacity = opacity_course(start, end)
+    columns = attribute_slices(14)
+    offsets = torch.zeros(len(knots), len(start), 14)
+    offsets[:, :, columns["logit_opacities"]] = opacity[..., None]
+    moved = pushed // 2
+    offsets[:, :moved, columns["means"]] = knots[:, None, None] * 0.1 * draws.normal(moved, 3)
+    offsets[:, :pushed, columns["sh0"]] = knots[:, None, None] * draws.normal(pushed, 3)
+    edit = replace(edit_of(scene, members, curved_field(pushed), name), **grown(offsets, knots, added))
+    return anchor_added(edit, scene, pushes=True)
 
 
 def grown(offsets: torch.Tensor, knots: torch.Tensor, added: Gaussians) -> dict[str, object]:

@@ -16,7 +16,7 @@ from progdf.errors import ProgdfError
 from progdf.field.baked import BakedField, identity_remap
 from progdf.field.trajectory import Trajectory, load_trajectory
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
-from progdf.gdf.file import Gdf, fingerprint, load_gdf, save_gdf
+from progdf.gdf.file import Gdf, anchor_added, fingerprint, load_gdf, save_gdf
 from progdf.io.images import write_image
 from progdf.io.json_values import convert_json, decode_json, to_json
 from progdf.terminal import file_size, format_count
@@ -169,7 +169,8 @@ def _build_gdf(options: TrainOptions, setup: TrainingSetup, field: BakedField, a
     scene_print = fingerprint(setup.scene)
     instruction = options.editor.editor
     rows = added if len(added) else None
-    return Gdf(options.name, setup.region, field, scene_print, instruction, changed_options, added=rows)
+    gdf = Gdf(options.name, setup.region, field, scene_print, instruction, changed_options, added=rows)
+    return anchor_added(gdf, setup.scene)
 
 
 def _view_figures(setup: TrainingSetup, evaluator: Evaluator) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from progdf.fade import linear_remap
 from progdf.field.baked import interpolate_at
 from progdf.field.separable import course_field, opacity_course
 from progdf.gaussians import BASE_CHANNELS, Gaussians, attribute_slices, concatenate, pack
-from progdf.gdf.file import ADDED_LOGIT, Gdf, fingerprint
+from progdf.gdf.file import ADDED_LOGIT, Gdf, anchor_added, fingerprint
 from progdf.io.images import picture_size
 from progdf.metrics.image import decibels
 from progdf.rasterize import alpha_weights, render
@@ -270,8 +270,10 @@ def paint_gdf(
     field = course_field(knots, offsets)
     if recolored is not None:
         field = replace(field, recorded=recolored.field.recorded)
-        return replace(recolored, region=Region(name, members, score), field=field, added=start)
-    return Gdf(name, Region(name, members, score), field, fingerprint(scene), added=start)
+        gdf = replace(recolored, region=Region(name, members, score), field=field, added=start, anchors=None)
+    else:
+        gdf = Gdf(name, Region(name, members, score), field, fingerprint(scene), added=start)
+    return anchor_added(gdf, scene, pushes=True)
 
 
 def _scaled_recolor_offsets(recolored: Gdf, members: Tensor, end: Tensor, knots: Tensor) -> Tensor:

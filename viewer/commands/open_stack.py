@@ -22,7 +22,7 @@ from viewer.camera.view_camera import Vec3, find_scene_up, first_camera, with_up
 from viewer.files import document, session
 from viewer.files.document import Document
 from viewer.state import layers as stacks
-from viewer.state.facts import describe_applied
+from viewer.state.facts import describe_loaded
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import OVERSHOOT, LayerState, Timeline, ViewState
 
@@ -110,7 +110,7 @@ def open_stack(stack: StackOptions, drawing: DrawingOptions | None = None, unset
     opened = document.load(stack.scene, stack.gdfs, _placing(stack.region))
     for text in stack.region:
         check_edit(text.partition("=")[0], opened.gdfs, "--region")
-    notes = [note for gdf in opened.gdfs if (note := describe_applied(gdf))]
+    notes = [note for gdf in opened.gdfs if (note := describe_loaded(gdf))]
     for note in notes:
         _log.warning(note)
     layers = stack_layers(opened.gdfs, stack, unset)

@@ -17,6 +17,7 @@ from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.rasterize import render
 from progdf.sh import sh0_to_rgb
+from progdf.terminal import format_count
 from viewer.camera.view_camera import Bounds, Fit, ViewCamera, bounds_of, fit, keep_camera, to_camera
 
 Rgb = tuple[float, float, float]
@@ -150,8 +151,14 @@ def draw_thumbnail(scene: Gaussians, gdf: Gdf, camera: ViewCamera) -> NDArray[np
     return pixels
 
 
-def describe_applied(gdf: Gdf) -> str:
-    """Return one line on the omitted parts of a grade applied to another region, or "" if there are none."""
+def describe_loaded(gdf: Gdf) -> str:
+    """Return one line on a loaded edit that differs from its file, or "" if it does not.
+
+    A grade applied to another region omits parts. Added rows of an older file get anchors.
+    """
+    if gdf.anchors_found:
+        rows = format_count(gdf.members - len(gdf.region), "added Gaussian")
+        return f"{gdf.name}: its file has no anchors, so its {rows} follow the nearest surface"
     parts = gdf.report.get("left_out") if gdf.applied else ""
     left_out = f"without its {parts}, which fits only the scene it was trained on"
     return f"{gdf.name} on {gdf.region.name}: {left_out}" if parts else ""

@@ -19,6 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from progdf.compose.follow import FOLLOWED, find_followers, state_scene
 from progdf.compose.reference import coverage
 from progdf.errors import ProgdfError
 from progdf.field.baked import AttributeBases, GradeForm
@@ -147,9 +148,10 @@ def pack(
         "antialiased": scene.antialiased,
         "attributes": attributes,
         "edits": [
-            _edit(arrays, scene, gdf, rows, kept, exact, overlaps)
+            _edit(arrays, gdf, rows, kept, exact, coverage(scene, gdf) if overlaps else None)
             for gdf, rows in zip(gdfs, inside, strict=True)
         ],
+        "surface": _surface(arrays, scene, gdfs, place, inside, exact),
         "sphere": [
             _numbers(part.flatten()) for part in sphere(math.isqrt(kept + 1) - 1, torch.device("cpu"))
         ],
@@ -170,6 +172,8 @@ def _scene(
     """Append the attributes, the first `count` rows separately; return their entries and the decoded
     scene."""
     moved = {name for gdf in gdfs for name in gdf.field.attributes}
+    if any(gdf.anchors is not None for gdf in gdfs):
+        moved.update(FOLLOWED)
     attributes: dict[str, Any] = {}
     changed: dict[str, Any] = {"shN": torch.zeros_like(scene.shN)}
     changed["logit_opacities"] = torch.full_like(scene.logit_opacities, _UNSEEN_LOGIT)
@@ -192,6 +196,64 @@ def _scene(
         else:
             table[rows] = new.reshape(len(order), *old.shape[1:])
     return attributes, replace(scene, **changed)
+
+
+def _surface(
+    arrays: Arrays,
+    scene: Gaussians,
+    gdfs: Sequence[Gdf],
+    place: NDArray[np.int64],
+    inside: Sequence[Tensor],
+    exact: bool,
+) -> dict[str, Any] | None:
+    """Append the rows that follow others, and the states of those; return their header entry.
+
+    The states (see `progdf.compose.follow`) are stored like a scene of their own, with restricted edits.
+
+    Args:
+        arrays: the container's arrays
+        scene: the extended scene
+        gdfs: its edits
+        place: position of each row on the page. [N]
+        inside: members of each edit in the page's order. [M] each
+        exact: store float32
+    """
+    followers = find_followers(gdfs, len(scene))
+    if followers is None:
+        return None
+    states, parts = state_scene(scene, gdfs, followers)
+    groups = _groups(len(states), [part.region.members.numpy() for part in parts])
+    order = np.argsort(-groups, kind="stable")
+    at = np.empty(len(order), np.int64)
+    at[order] = np.arange(len(order))
+    attributes = {}
+    for name in FOLLOWED:
+        values = _table(getattr(states, name).detach().float()[torch.from_numpy(order)].numpy())
+        attributes[name] = [_scene_part(arrays, name, values, exact, True)[0]]
+    edits = []
+    picks = []
+    for gdf, part, members, (_, index) in zip(gdfs, parts, inside, followers.changed, strict=True):
+        rows = _ascending(at[part.region.members.numpy()])
+        covered = {kind: share[torch.from_numpy(index)] for kind, share in coverage(scene, gdf).items()}
+        shape = {kind: share for kind, share in covered.items() if kind in ("geometry", "opacity")}
+        edits.append(_edit(arrays, part, rows, 0, exact, shape))
+        page = np.empty(len(members), np.int64)
+        page[members.numpy()] = np.arange(len(members))
+        picks.append(arrays.add(page[index[rows.numpy()]].astype(np.int32)))
+    own = np.where(followers.own < 0, -1, at[followers.own])
+    table = np.column_stack([place[followers.rows], followers.edits, own, at[followers.anchors]])
+    return {
+        "members": len(order),
+        "segments": _segments(groups[order], order, parts),
+        "sh": 0,
+        "attributes": attributes,
+        "edits": edits,
+        "sphere": [],
+        "picks": picks,
+        "followers": arrays.add(table.astype(np.int32)),
+        "weights": arrays.add(followers.weights.astype(np.float32)),
+        "pushing": sorted(followers.pushing),
+    }
 
 
 def _finite(scene: Gaussians) -> Gaussians:
@@ -263,14 +325,16 @@ def _scene_part(
 
 def _edit(
     arrays: Arrays,
-    scene: Gaussians,
     gdf: Gdf,
     order: Tensor,
     kept: int,
     exact: bool,
-    overlaps: bool,
+    shares: Mapping[str, Tensor] | None,
 ) -> dict[str, Any]:
-    """Append the arrays of an edit, with its members in this order; return its header entry."""
+    """Append the arrays of an edit, with its members in this order; return its header entry.
+
+    `shares` is its coverage if another edit lies on its rows, see `coverage`.
+    """
     form = gdf.field.origin
     widths = {"shN": 3 * kept}
     record: dict[str, Any] = {
@@ -283,11 +347,11 @@ def _edit(
             if widths.get(name, 1)
         },
     }
-    if overlaps:
-        shares = {kind: share[order].numpy() for kind, share in coverage(scene, gdf).items()}
+    if shares is not None:
+        covered = {kind: share[order].numpy() for kind, share in shares.items()}
         record["coverage"] = {
             kind: arrays.add(share) if exact else arrays.add_levels(share, "i1")[0]
-            for kind, share in shares.items()
+            for kind, share in covered.items()
         }
         record["grade"] = _grade(arrays, form, order, kept) if isinstance(form, GradeForm) else None
     return record

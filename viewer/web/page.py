@@ -25,7 +25,19 @@ from progdf.color.edits import hex_color
 from progdf.io.images import to_picture
 from shaders import load_source
 
-MODULES = ("camera", "data", "grade", "compose", "sort", "renderer", "state", "panel", "input", "main")
+MODULES = (
+    "camera",
+    "data",
+    "grade",
+    "follow",
+    "compose",
+    "sort",
+    "renderer",
+    "state",
+    "panel",
+    "input",
+    "main",
+)
 """Modules of `src`, each after its imports. The module of the page's host, `start` or `widget`, follows."""
 STAGES = ("web.vert", "splat.frag", "present.vert", "present.frag", "stretch.frag")
 MAIL_LIMIT_BYTES = 25e6

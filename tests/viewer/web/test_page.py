@@ -23,10 +23,10 @@ from progdf.compose.reference import compose_layers
 from progdf.field.baked import GradeForm, SliderRemap, identity_map, lattice_colors
 from progdf.field.grade import bake_grade
 from progdf.gaussians import ATTRIBUTES, Gaussians, pack
-from progdf.gdf.file import Gdf, load_gdf, save_gdf
+from progdf.gdf.file import Gdf, anchor_added, load_gdf, save_gdf
 from progdf.rasterize import render
 from tests.helpers.draws import Draws
-from tests.helpers.edits import curved_field, edit_of, growing, some_rows
+from tests.helpers.edits import curved_field, edit_of, growing, painted, some_rows
 from tests.helpers.scenes import random_gaussians
 from tests.helpers.sessions import bear_files, full_view, saved_session
 from tests.helpers.stacks import Stack, many_edits
@@ -175,6 +175,8 @@ def test_page_computes_every_attribute_like_compose_for_every_rule(
         edit_of(scene, some_rows(scene, 150, 2), curved_field(150, 2, 14 + 3 * len(scene.shN[0])), "shirt"),
         graded(scene, "warm", 2, 3),
         graded(scene, "table", 0, 4),
+        painted(scene, 20, 9),
+        anchor_added(growing(scene, some_rows(scene, 40, 6), 15, 6, "grown"), scene),
     ]
     document, view = document_of(scene, gdfs)
     write_page(tmp_path / "page.html", document, view, (), PageOptions(quality="exact"))
@@ -189,8 +191,8 @@ def test_page_computes_every_attribute_like_compose_for_every_rule(
         ([Layer(g, s)], "adjust") for g in document.gdfs for s in (1.0, 0.0)
     ]
     stacks += [
-        ([random_layer(document.gdfs[i], draws) for i in draws.order(4).tolist()], blend)
-        for blend in BLENDS * 4
+        ([random_layer(document.gdfs[i], draws) for i in draws.order(len(gdfs)).tolist()], blend)
+        for blend in BLENDS * 6
     ]
     stacks.append(([Layer(document.gdfs[1], 0.1), Layer(document.gdfs[2], 0.8)], "adjust"))  # few are black
     for number, (layers, blend) in enumerate(stacks):
@@ -216,7 +218,7 @@ def test_page_computes_every_attribute_like_compose_for_every_rule(
                 continue
             numbers = getattr(plain, name)[torch.from_numpy(order[:count])].numpy()
             page = np.asarray(after[name], np.float32).reshape(numbers.shape)
-            if number < 8:  # one layer at an endpoint
+            if number < 2 * len(gdfs):  # one layer at an endpoint
                 assert page.tobytes() == numbers.tobytes(), (name, number)
             else:
                 assert np.abs(page - numbers).max() <= 1e-6 * max(1.0, np.abs(numbers).max()), (name, blend)

@@ -16,7 +16,7 @@ from viewer.app.messages import Messages
 from viewer.files.document import DocumentStore
 from viewer.files.user_files import parse_path
 from viewer.state import selection
-from viewer.state.facts import describe_applied
+from viewer.state.facts import describe_loaded
 from viewer.state.layers import add_layer, duplicate_layer, replace_edit
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import Store, focus_layer
@@ -125,7 +125,7 @@ class EditActions:
 
         with all_threads():
             gdf = load_gdf(path, scene, place=place)
-        if note := describe_applied(gdf):
+        if note := describe_loaded(gdf):
             self._messages.show(note)
         return gdf
 

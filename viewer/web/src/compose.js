@@ -1,6 +1,7 @@
 // The scene under a stack of edits, members only; same results as progdf/compose/reference.py. Rows of the same
 // edits are adjacent and composed together, as a segment.
 
+import { FOLLOWED, Surface } from "./follow.js";
 import { GradedColors, findSegment } from "./grade.js";
 
 export const WIDTHS = { means: 3, log_scales: 3, quats: 4, logit_opacities: 1, sh0: 3 };
@@ -61,7 +62,8 @@ export class Composer {
     this.widths = { ...WIDTHS, shN: 3 * header.sh };
     this.before = {};
     this.after = {};
-    this.moving = new Set(this.edits.flatMap((edit) => Object.keys(edit.attributes)));
+    const follows = header.surface || header.followers;
+    this.moving = new Set([...this.edits.flatMap((edit) => Object.keys(edit.attributes)), ...(follows ? FOLLOWED : [])]);
     for (const name of this.moving) {
       for (const each of [name, PARTNERS[name]]) {
         if (!each || this.before[each]) continue;
@@ -73,9 +75,14 @@ export class Composer {
     }
     const known = this.edits.map(() => 0);  // members of the previous segments
     let first = 0, most = 0;
+    this.surface = header.surface
+      ? new Surface(header.surface, container, new Composer(container.within(header.surface))) : null;
+    const following = Array.from({ length: this.surface?.count ?? 0 }, (_, f) => f);
     this.segments = header.segments.map(([rows, edits]) => {
-      const names = [...this.moving].filter((name) => edits.some((edit) => this.edits[edit].attributes[name]));
-      const segment = { first, rows, names, members: {}, effects: [], maps: [] };
+      const followers = following.filter((f) => this.surface.row(f) >= first && this.surface.row(f) < first + rows);
+      const names = [...this.moving].filter((name) =>
+        (followers.length && FOLLOWED.includes(name)) || edits.some((edit) => this.edits[edit].attributes[name]));
+      const segment = { first, rows, names, followers, members: {}, effects: [], maps: [] };
       for (const edit of edits) {
         segment.members[edit] = known[edit];
         known[edit] += rows;
@@ -95,12 +102,14 @@ export class Composer {
       ({ ...layer, effect: JSON.stringify([layer.edit, layer.strength, layer.gains, layer.paint]) }));
     const ranges = [], names = new Set(), again = blend !== this.blend;
     this.blend = blend;
+    const surfaceMoved = this.surface?.update(active, blend);
     for (const segment of this.segments) {
       const stack = active.filter((layer) => layer.edit in segment.members), { effects, first, rows } = segment;
       let same = 0;
       if (!again) while (same < stack.length && stack[same].effect === effects[same]) same++;
-      if (same === stack.length && same === effects.length) continue;
+      if (same === stack.length && same === effects.length && !(surfaceMoved && segment.followers.length)) continue;
       this.#compose(segment, stack, same);
+      for (const f of segment.followers) this.surface.carry(this.after, f);
       segment.effects = stack.map((layer) => layer.effect);
       for (const name of segment.names) names.add(name);
       if (ranges.at(-1)?.[1] === first) ranges.at(-1)[1] = first + rows;

@@ -18,10 +18,15 @@ export async function inflate(text) {
 }
 
 export class Container {
-  constructor(bytes) {
-    const length = new DataView(bytes.buffer, bytes.byteOffset).getUint32(0, true);
-    this.header = JSON.parse(new TextDecoder().decode(bytes.subarray(4, 4 + length)));
+  constructor(bytes, header = null) {
+    const length = header ? -4 : new DataView(bytes.buffer, bytes.byteOffset).getUint32(0, true);
+    this.header = header ?? JSON.parse(new TextDecoder().decode(bytes.subarray(4, 4 + length)));
     this.bytes = bytes.subarray(4 + length);
+  }
+
+  // Returns a container with the same arrays and another header.
+  within(header) {
+    return new Container(this.bytes, header);
   }
 
   // Returns a whole array as stored, row by row.

@@ -1,0 +1,112 @@
+// Rows that follow the surface on which they lie; same results as progdf/compose/follow.py.
+
+export const FOLLOWED = ["means", "log_scales", "quats", "logit_opacities"];
+const GEOMETRY = FOLLOWED.slice(0, 3), OPACITY = FOLLOWED.slice(3);
+const SIZES = { means: 3, log_scales: 3, quats: 4, logit_opacities: 1 };
+const ENTRY = 7;  // numbers per following row: row, edit, its own state, four states of anchors
+const MIN_DRAWN_OPACITY = 1 / 255, MIN_OPACITY = 1e-30;
+
+export class Surface {
+  // `states`: composer of the rows that others follow.
+  constructor(record, container, states) {
+    this.states = states;
+    this.picks = record.picks.map((part) => container.stored(part));
+    this.table = container.stored(record.followers);
+    this.weights = container.real(record.weights);
+    this.pushing = record.pushing;
+    this.count = record.followers.rows;
+    this.painted = {};  // weights of the states' members, by edit and paint
+    this.edits = new Set(this.pushing);
+    for (let f = 0; f < this.count; f++) this.edits.add(this.table[ENTRY * f + 1]);
+  }
+
+  row(f) {
+    return this.table[ENTRY * f];
+  }
+
+  // Composes the states. Returns whether any has changed.
+  update(active, blend) {
+    this.active = new Set(active.map((layer) => layer.edit));
+    this.pushed = this.pushing.some((edit) => this.active.has(edit));
+    if (![...this.active].some((edit) => this.edits.has(edit))) return false;
+    const layers = active.filter((layer) => this.picks[layer.edit].length).map((layer) => {
+      if (!layer.weights) return layer;
+      const key = `${layer.edit}/${layer.paint}`;
+      this.painted[key] ??= Float32Array.from(this.picks[layer.edit], (member) => layer.weights[member]);
+      return { ...layer, weights: this.painted[key] };
+    });
+    return this.states.update(layers, blend) !== null;
+  }
+
+  // Writes a following row into the arrays of `target`, which hold it as it is without following.
+  carry(target, f) {
+    const [row, edit, own, ...anchors] = this.table.subarray(ENTRY * f, ENTRY * f + ENTRY);
+    if (edit < 0 ? !this.pushed : !this.active.has(edit)) return;
+    const { before, after } = this.states, used = anchors.flatMap((state, k) => {
+      const weight = this.weights[4 * f + k];
+      return weight > 0 ? [{ old: at(before, state), now: at(after, state), weight }] : [];
+    });
+    const to = at(target, row), from = own < 0 ? to : at(after, own);
+    for (const [names, follow] of [[GEOMETRY, carryGeometry], [OPACITY, carryOpacity]]) {
+      const differs = (a, b) => names.some((name) => a[name].some((x, c) => x !== b[name][c]));
+      if (!used.some(({ old, now }) => differs(old, now))) continue;
+      if (own < 0 || differs(from, used[0].old)) follow(to, from, used);
+      else for (const name of names) to[name].set(used[0].now[name]);
+    }
+  }
+}
+
+// Returns the numbers of a row.
+function at(arrays, row) {
+  return Object.fromEntries(FOLLOWED.map((name) => {
+    const width = SIZES[name];
+    return [name, arrays[name].subarray(row * width, (row + 1) * width)];
+  }));
+}
+
+function carryGeometry(to, from, anchors) {
+  const turn = [0, 0, 0, 0], pivot = [0, 0, 0], target = [0, 0, 0];
+  let logScale = 0, first = null;
+  for (const { old, now, weight } of anchors) {
+    const each = multiply(normalized(now.quats), conjugate(normalized(old.quats)));
+    first ??= each;
+    const sign = each.reduce((sum, q, c) => sum + q * first[c], 0) < 0 ? -1 : 1;
+    for (let c = 0; c < 4; c++) turn[c] += weight * sign * each[c];
+    for (let c = 0; c < 3; c++) {
+      pivot[c] += weight * old.means[c];
+      target[c] += weight * now.means[c];
+      logScale += (weight * (now.log_scales[c] - old.log_scales[c])) / 3;
+    }
+  }
+  const q = normalized(turn), scale = Math.exp(logScale);
+  const arm = [0, ...pivot.map((p, c) => from.means[c] - p)];
+  const turned = multiply(multiply(q, arm), conjugate(q));
+  to.quats.set(multiply(q, from.quats));
+  for (let c = 0; c < 3; c++) {
+    to.means[c] = target[c] + scale * turned[c + 1];
+    to.log_scales[c] = from.log_scales[c] + logScale;
+  }
+}
+
+function carryOpacity(to, from, anchors) {
+  const drawn = ({ logit_opacities: [logit] }) => Math.max(sigmoid(logit) - MIN_DRAWN_OPACITY, 0);
+  const visible = (each) => anchors.reduce((sum, anchor) => sum + anchor.weight * drawn(anchor[each]), 0);
+  const before = visible("old"), ratio = before > 0 ? visible("now") / before : 1;
+  const opacity = Math.max(sigmoid(from.logit_opacities[0]) * ratio, MIN_OPACITY);
+  to.logit_opacities[0] = ratio < 1 ? Math.log(opacity) - Math.log1p(-opacity) : from.logit_opacities[0];
+}
+
+const sigmoid = (x) => 1 / (1 + Math.exp(-x));
+const conjugate = ([w, x, y, z]) => [w, -x, -y, -z];
+
+function normalized(q) {
+  const length = Math.hypot(...q);
+  return length > 0 ? Array.from(q, (x) => x / length) : [1, 0, 0, 0];
+}
+
+function multiply([aw, ax, ay, az], [bw, bx, by, bz]) {
+  return [
+    aw * bw - ax * bx - ay * by - az * bz, aw * bx + ax * bw + ay * bz - az * by,
+    aw * by - ax * bz + ay * bw + az * bx, aw * bz + ax * by - ay * bx + az * bw,
+  ];
+}
