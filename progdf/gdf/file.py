@@ -38,8 +38,7 @@ _MAX_OFFSET = 1e18
 _MAX_OFFSETS = {"log_scales": 80.0}
 """Largest offset of attributes with another limit. e^80 fits into float32, also times any scene's scale."""
 
-_SHAPE = ("log_scales", "quats", "logit_opacities")
-_SURFACE = ("means", *_SHAPE)  # attributes that decide on which Gaussians an added row lies
+_SURFACE = ("means", "log_scales", "quats", "logit_opacities")  # attributes that decide on the anchors
 UNSEEN_LOGIT = -math.log(254.0)
 """Opacity logit of 1/255. Renderers skip Gaussians below it."""
 ADDED_LOGIT = -6.0
@@ -224,7 +223,9 @@ def load_gdf(
             return apply_grade(gdf, scene, whole_scene(scene) if region is None else region)
         verify(gdf, scene, name, scene_name)
         if gdf.anchors_found:
-            gdf = replace(anchor_added(gdf, scene, _only_pushes(gdf)), anchors_found=True)
+            gdf = replace(
+                anchor_added(gdf, scene, pushes=gdf.report.get("paint") is not None), anchors_found=True
+            )
     form = gdf.field.origin
     if form is None:
         return gdf
@@ -272,13 +273,6 @@ def anchor_added(gdf: Gdf, scene: Gaussians, pushes: bool = False, free: int = 0
     end = replace(scene, **parts) if parts else scene
     chosen = choose_anchors(end, means[: len(means) - free], UNSEEN_LOGIT, pushes)
     return replace(gdf, anchors=join_free(chosen, free), anchors_found=False)
-
-
-def _only_pushes(gdf: Gdf) -> bool:
-    """Return whether an edit only moves its members, as paint does, see `Anchors.pushes`."""
-    members = len(gdf.region)
-    shape = [bases.end[:members] for name, bases in gdf.field.attributes.items() if name in _SHAPE]
-    return not any(bool(change.any()) for change in shape)
 
 
 def apply_grade(gdf: Gdf, scene: Gaussians, region: Region) -> Gdf:
