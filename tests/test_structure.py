@@ -284,6 +284,7 @@ ORIGIN_AT = {
     "cameras_to_json": 2,
     "camera_chunk": 2,
     "find_picture_camera": 2,
+    "stored_picture_camera": 2,
     "save_picture_camera": 2,
     "picture_cameras": 2,
     "rendered_cameras": 2,

@@ -115,7 +115,25 @@ def up_in_picture(path: str | os.PathLike[str]) -> object:
 def find_picture_camera(
     path: str | os.PathLike[str], given: Sequence[Camera] = (), origin: Origin = ZERO
 ) -> Camera:
-    """Return the camera of a picture.
+    """Return the camera of a picture, see `stored_picture_camera`.
+
+    Raises:
+        ProgdfError: the file is not a picture, the camera is invalid, or no camera or several are found.
+    """
+    path = Path(path)
+    camera = stored_picture_camera(path, given, origin)
+    if camera is None:
+        raise ProgdfError(
+            f"{path} has no stored camera; put {camera_file(path).name} beside it, or give a camera named "
+            f"{path.stem} with --cameras (such as the .png written by progdf render)"
+        )
+    return camera
+
+
+def stored_picture_camera(
+    path: str | os.PathLike[str], given: Sequence[Camera] = (), origin: Origin = ZERO
+) -> Camera | None:
+    """Return the camera of a picture, None if there is none.
 
     The first of these is used: the camera embedded in the picture, the camera in A.camera.json beside A.png,
     or the given camera with the name of the picture.
@@ -129,7 +147,7 @@ def find_picture_camera(
         The camera, named like the picture, with the size of the rendering and without a lens.
 
     Raises:
-        ProgdfError: the file is not a picture, the camera is invalid, or no camera or several are found.
+        ProgdfError: the file is not a picture, the camera is invalid, or several cameras are found.
     """
     path = Path(path)
     camera = camera_in_picture(path, origin)
@@ -144,10 +162,7 @@ def find_picture_camera(
         if len(named) > 1:
             raise ProgdfError(f"{len(named)} cameras are named {path.stem}; give {beside.name} beside {path}")
         if not named:
-            raise ProgdfError(
-                f"{path} has no stored camera; put {beside.name} beside it, or give a camera named "
-                f"{path.stem} with --cameras (such as the .png written by progdf render)"
-            )
+            return None
         camera = named[0]
     return replace(camera, name=path.stem, lens=None)  # renderings are undistorted
 

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import logging
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from progdf.camera import Camera
 from progdf.gaussians import ZERO, Gaussians
 from progdf.io.atomic import read_file
 from progdf.io.cameras import load_cameras
 from progdf.io.json_values import check_text
+from progdf.io.picture_camera import camera_file, stored_picture_camera
 from progdf.rasterize.engines import get_engine
 from progdf.region import Region
 from progdf.scene.regions import check_region, parse_region
+from progdf.scene.taken_views import find_taken_view
 from trainer.editors import check_editor, check_new_editor, editor_row
 from trainer.options import TrainOptions, flat_values
 from trainer.regions.from_pictures import RegionRequest, region_checks, region_kinds
@@ -26,6 +30,8 @@ from trainer.views.picture_cameras import picture_cameras
 from trainer.views.setup import check_given_cameras
 
 from .resume import load_region
+
+_log = logging.getLogger(__name__)
 
 
 def check_command(options: TrainOptions) -> None:
@@ -53,12 +59,23 @@ def check_command(options: TrainOptions) -> None:
         load_cameras(views.cameras, ZERO)
     if views.pictures:
         cameras = [] if views.cameras is None else load_cameras(views.cameras, ZERO)
+        _find_cameras(views.pictures, cameras, options.scene)
         picture_cameras(views.pictures, cameras, ZERO)
     if not options.resume or load_region(options.out) is None:
         check_region(options.region.region, region_checks(region_request(options, quiet=True)))
     is_new = not folder.root.is_dir() or not any(folder.root.iterdir())
     if is_new or (editor_row(options.editor).slow_strengths and not options.resume):
         check_new_editor(replace(options.editor, cache=folder.paintings))
+
+
+def _find_cameras(pictures: Sequence[Path], cameras: Sequence[Camera], scene: Path) -> None:
+    """Find pictures without a camera among the views taken in the window; write their cameras beside them."""
+    for path in pictures:
+        if stored_picture_camera(path, cameras, ZERO) is None:
+            found = find_taken_view(path, scene)
+            if found is not None:
+                line = "%s shows a view taken in the window (%s); wrote %s"
+                _log.warning(line, path, found.agreement, camera_file(path))
 
 
 def region_request(

@@ -10,6 +10,7 @@ from pathlib import Path
 import moderngl
 import numpy as np
 
+from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.io.picture_camera import camera_chunk, save_picture_camera
 from viewer.camera.view_camera import to_camera
@@ -31,6 +32,14 @@ from viewer.ui.context import PALETTE
 
 SIZE = (168, 126)
 """Width and height of a thumbnail, in pixels."""
+
+
+RememberView = Callable[[Pixels, Camera, Sequence[str]], None]
+"""Function that remembers a saved picture, its camera and the names of the visible edits."""
+
+
+def forget_view(_image: Pixels, _camera: Camera, _edits: Sequence[str]) -> None:
+    """Remember nothing: the scene has no file."""
 
 
 class Thumbnails:
@@ -165,11 +174,14 @@ class Canvas:
         """Return the picture at full resolution; see `Comparer.image`. [H,W,3]"""
         return self.comparer.image(view, size)
 
-    def save(self, folder: Path, title: str, view: ViewState, size: tuple[int, int]) -> str:
+    def save(
+        self, folder: Path, title: str, view: ViewState, size: tuple[int, int], remember: RememberView
+    ) -> str:
         """Write the picture of a view with its camera; return a line with the path.
 
         Args:
             folder: target folder; the file's name begins with `title`
+            remember: receives the picture, unless it is a comparison
 
         Raises:
             ProgdfError: see `exports.picture`.
@@ -180,23 +192,34 @@ class Canvas:
             return f"Saved {exports.picture(folder, title, pixels)}"
         camera = to_camera(view.camera, image.shape[1], image.shape[0])
         origin = self.comparer.engine.scene.origin
-        chunk = camera_chunk(camera, visible_edits(view), origin, view.camera.up)
-        return f"Saved {exports.picture(folder, title, pixels, chunk)}"
+        edits = visible_edits(view)
+        chunk = camera_chunk(camera, edits, origin, view.camera.up)
+        path = exports.picture(folder, title, pixels, chunk)
+        remember(pixels, camera, edits)
+        return f"Saved {path}"
 
-    def save_original(self, folder: Path, title: str, view: ViewState, size: tuple[int, int]) -> Path:
+    def original(self, view: ViewState, size: tuple[int, int]) -> Pixels:
+        """Return the picture of the whole scene without edits. [H,W,3]"""
+        view = original(view)
+        view = replace(view, selection=replace(view.selection, hidden=EMPTY_MASK))
+        return to_pixels(self.image(view, size))
+
+    def save_original(
+        self, folder: Path, title: str, view: ViewState, size: tuple[int, int], remember: RememberView
+    ) -> Path:
         """Write the picture of the whole scene without edits, and its camera beside it, to be edited in
         another program; return the picture's path.
 
         Raises:
             ProgdfError: see `exports.picture`.
         """
-        view = original(view)
-        view = replace(view, selection=replace(view.selection, hidden=EMPTY_MASK))
         camera = to_camera(view.camera, *size)
         origin = self.comparer.engine.scene.origin
         chunk = camera_chunk(camera, (), origin, view.camera.up)
-        path = exports.picture(folder, title, to_pixels(self.image(view, size)), chunk)
+        pixels = self.original(view, size)
+        path = exports.picture(folder, title, pixels, chunk)
         save_picture_camera(path, camera, origin)  # a program may drop the picture's metadata
+        remember(pixels, camera, ())
         return path
 
     def thumbnails(self, work: Workspace, rows: Sequence[LayerRow]) -> tuple[Pictures, bool]:

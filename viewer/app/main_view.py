@@ -20,6 +20,7 @@ from progdf.errors import ProgdfError
 from viewer.files import exports
 from viewer.gl.present import read_rgb
 from viewer.panel import new_edit_form, pages, panel, timeline_bar
+from viewer.pictures.film import Pixels
 from viewer.render.engine import ViewEngine
 from viewer.render.picking import Surfaces
 from viewer.state import actions, layer_selection, timeline, workspace
@@ -46,7 +47,7 @@ from viewer.ui.keys import (
 from viewer.ui.pointer import PointerContext
 
 from . import interface, mouse, select_tool
-from .canvas import Canvas
+from .canvas import Canvas, RememberView, forget_view
 from .handles import decal_takes_mouse, draw_decal, draw_gizmo, gizmo_takes_mouse, place_decal
 from .messages import Messages
 
@@ -126,6 +127,7 @@ class MainView:
         self.pictures = pictures
         self.canvas = Canvas(context, engine)
         self.report: Callable[[Exception], None] = self._report  # receives the errors of a part of a frame
+        self.remember: RememberView = forget_view  # receives the saved pictures of single views
         self.surfaces = Surfaces()
         self.ui = UiContext(scale)
         imgui.backends.opengl3_init("#version 330")
@@ -516,7 +518,11 @@ class MainView:
         Raises:
             ProgdfError: see `exports.picture`.
         """
-        return self.canvas.save_original(folder, name, self.work.view, self.picture_size)
+        return self.canvas.save_original(folder, name, self.work.view, self.picture_size, self.remember)
+
+    def original_picture(self) -> Pixels:
+        """Return the picture on screen without edits. [H,W,3]"""
+        return self.canvas.original(self.work.view, self.picture_size)
 
     def _save_files(self, screen: moderngl.Framebuffer) -> None:
         """Serve the requests for files that need only the main view."""
@@ -538,4 +544,4 @@ class MainView:
         if request == "take_view":
             taken = self.save_original(self.pictures, title)
             return f"Saved {taken}. Edit it in any program and drop it here."
-        return self.canvas.save(self.pictures, title, view, self._pointer().size)
+        return self.canvas.save(self.pictures, title, view, self._pointer().size, self.remember)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from logging.handlers import RotatingFileHandler
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 from progdf import __version__
 from progdf.errors import ProgdfError, without_commands
@@ -51,6 +51,15 @@ class Messages:
         work = self._store.get()
         self._store.replace(replace(work, requests=(*work.requests, request)))
         self._store.wake()
+
+
+_Made = TypeVar("_Made")
+
+
+class WaitFor(Protocol):
+    """Function that runs work in another thread while the window shows a text, and returns its result."""
+
+    def __call__(self, work: Callable[[], _Made], text: str) -> _Made: ...
 
 
 Requests = dict[str, Callable[[Any], object]]

@@ -44,6 +44,7 @@ TITLES = {
     "render_picture": "Render picture",
     "render_film": "Render film",
     "about": "About",
+    "match": "Is it this view?",
 }
 _HINTS = {
     "save": "A .session.json file. The scene and its edits stay where they are.",
@@ -61,6 +62,7 @@ _HINTS = {
     "export_page": "One .html file with these sliders, snapshots and film, which any browser opens.",
     "render_picture": "This view at any size, with the same vertical field of view.",
     "render_film": "Renders in the background; the panel shows the progress.",
+    "match": "{} carries no camera. This is the nearest view, but too little of it agrees.",
     "about": "Edit a trained 3D Gaussian Splatting scene once, then drag a slider through it.",
 }
 _SUBMIT = {
@@ -93,6 +95,7 @@ _CHOICES = {
     "delivery": (_Button("Keep waiting", ("Enter",)), _Button("Stop and quit", ("S",))),
     "log": (_Button("Close", ("Enter",)),),
     "about": (_Button("Close", ("Enter",)),),
+    "match": (_Button("Use it", ("Enter",)), _Button("No", ("N",))),
     "restore": (_Button("Restore", ("Enter", "R")), _Button("Discard", ("D",)), _Button("Later")),
 }
 
@@ -145,7 +148,7 @@ def _content(dialog: Dialog, pressed: Sequence[str], ui: UiContext, bottom: floa
     wrapped_text(_HINTS[dialog.kind].format(escape_text(Path(dialog.text).name)), PALETTE.dim)
     imgui.dummy((0.0, 2.0 * ui.scale))
     if "Escape" in pressed:
-        return DialogResult(None)
+        return DialogResult(None, _requests(dialog, "No"))
     if dialog.chosen and dialog.kind in _DELIVERS:
         dialog = replace(dialog, text=dialog.chosen, chosen="")  # the user may still change other options
     if dialog.chosen:
@@ -256,6 +259,10 @@ def _requests(dialog: Dialog, button: str) -> tuple[Action, ...]:
             return (Plain("drop_and_quit"),)
         case "discard_run", "Discard" if dialog.item is not None:
             return (OnItem("discard_run", dialog.item),)
+        case "match", "Use it":
+            return (WithText("use_view", dialog.text),)
+        case "match", "No":
+            return (Plain("keep_view"),)
         case "restore", "Restore":
             return (WithText("restore_autosave", dialog.text),)
         case "restore", "Discard":

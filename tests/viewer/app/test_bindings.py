@@ -53,7 +53,7 @@ INTERNAL = {
     *("press_layer", "master", "rename_group", "restore", "forget", "name_snapshot"),
     *("move_snapshot", "choose_snapshot", "region", "show_region", "forget_region"),
     *("select_invert", "choose_keys", "move_keys", "clone_keys"),
-    *("seek", "length", "fps", "go_to", "example", "forget_file"),
+    *("seek", "length", "fps", "go_to", "example", "forget_file", "use_view", "keep_view"),
 }
 """Actions of buttons, questions and drags that need an argument, so the command palette omits them."""
 

@@ -20,7 +20,7 @@ from progdf.__main__ import main
 from progdf.formats.ply import save_ply
 from progdf.gdf.file import fingerprint, save_gdf
 from progdf.io.atomic import state_folder
-from progdf.io.picture_camera import find_picture_camera
+from progdf.io.picture_camera import camera_file, find_picture_camera
 from progdf.scene.regions import parse_region
 from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import bear_files, opened_document
@@ -182,6 +182,57 @@ def test_packed_edit_replaces_the_draft_while_it_is_measured(window: application
     save_gdf(order.result, replace(scarf, instruction="measured"))
     window.parts.jobs._end(replace(job, status="done"))
     assert [edit.instruction for edit in window.documents.get().edits] == ["measured"]
+
+
+def take_view(window: application.App) -> Path:
+    """Take the view of the window; return its picture as a cropped JPEG of another name, painted over."""
+    folder = window.main_view.pictures
+    press(window, "Ctrl+F2")
+    (taken,) = folder.glob("*_001.png")
+    picture = Image.open(taken).convert("RGB")
+    picture.paste((250, 0, 250), (10, 10, 90, 60))
+    changed = folder / "from elsewhere.jpg"
+    picture.crop((0, 0, picture.width - 40, picture.height - 30)).save(changed, quality=85)
+    return changed
+
+
+def test_picture_without_a_camera_is_found_among_taken_views(window: application.App, tmp_path: Path) -> None:
+    window.main_view.pictures = tmp_path
+    before = window.main_view.work.view.camera
+    changed = take_view(window)
+    window.main_view.store.change(
+        replace(window.main_view.work.view, camera=replace(before, azimuth=before.azimuth + 70.0))
+    )
+    turn(window)
+    window.parts.file_actions.open(changed)
+    turn(window)
+    work = window.main_view.work
+    assert work.dialog is None
+    assert work.form_open
+    assert work.form.pictures == str(changed)
+    assert work.message is not None
+    assert work.message.text.startswith("Found the view of from elsewhere.jpg: ")
+    assert work.view.camera.azimuth == pytest.approx(before.azimuth, abs=0.01)
+    assert find_picture_camera(changed).width == Image.open(changed).width
+
+
+@pytest.mark.parametrize("answer", ["use_view", "keep_view"])
+def test_unknown_picture_asks_for_its_view(window: application.App, tmp_path: Path, answer: str) -> None:
+    unknown = tmp_path / "unknown.png"
+    Image.effect_noise((90, 70), 90).save(unknown)
+    before = window.main_view.work.view.camera
+    window.parts.file_actions.open(unknown)
+    turn(window)
+    dialog = window.main_view.work.dialog
+    assert dialog is not None
+    assert (dialog.kind, dialog.text) == ("match", str(unknown))
+    assert not window.main_view.work.form_open
+    request(window, WithText("use_view", str(unknown)) if answer == "use_view" else Plain("keep_view"))
+    assert window.main_view.work.form_open == (answer == "use_view")
+    assert camera_file(unknown).exists() == (answer == "use_view")
+    if answer == "keep_view":
+        assert window.main_view.work.view.camera == before
+        assert "unknown.camera.json" in window.main_view.work.message.text
 
 
 @pytest.mark.parametrize(("warning", "card"), [("", False), ("41 % of the paint was reproduced", True)])

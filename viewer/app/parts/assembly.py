@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from viewer.app.main_view import MainView
-from viewer.app.messages import Requests
+from viewer.app.messages import Requests, WaitFor
 from viewer.files.document import DocumentStore
 
 from .deliver import DeliverActions
 from .edits import EditActions
-from .file_actions import FileActions, OpenDocument, WaitFor
+from .file_actions import FileActions, OpenDocument
 from .pictures import PictureActions
 from .preview import PreviewActions
 from .scene_checks import StrayActions, UpActions
@@ -26,6 +26,7 @@ class WindowParts:
     """Parts of one window."""
 
     file_actions: FileActions
+    pictures: PictureActions
     preview: PreviewActions
     jobs: JobActions
     deliver: DeliverActions
@@ -39,6 +40,7 @@ class WindowParts:
         """Handlers of the requests of all parts, by name."""
         parts = (
             self.file_actions,
+            self.pictures,
             self.jobs,
             self.deliver,
             self.start,
@@ -102,7 +104,10 @@ def make_parts(
         messages=messages,
         context=main_view.context,
         picture_size=picture_size,
+        original=main_view.original_picture,
+        wait_for=wait_for,
     )
+    main_view.remember = pictures.remember
     file_actions = FileActions(
         store=store,
         documents=documents,
@@ -144,6 +149,7 @@ def make_parts(
     )
     return WindowParts(
         file_actions=file_actions,
+        pictures=pictures,
         preview=preview,
         jobs=jobs,
         deliver=DeliverActions(store=store, documents=documents, messages=messages, queue=jobs.queue),

@@ -9,13 +9,21 @@ import webbrowser
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol, TypeVar
 
 from progdf.cli.info import kind_of
 from progdf.errors import ProgdfError
 from progdf.io.bundle import BUNDLE, unpack_bundle
 from progdf.io.picture_files import ENDINGS
-from viewer.app.messages import LOG, Messages, Requests, attempt, error_details, failure_line, log_error
+from viewer.app.messages import (
+    LOG,
+    Messages,
+    Requests,
+    WaitFor,
+    attempt,
+    error_details,
+    failure_line,
+    log_error,
+)
 from viewer.app.parts.edits import EditActions
 from viewer.app.parts.pictures import PictureActions
 from viewer.camera.view_camera import ViewCamera, first_camera
@@ -29,15 +37,6 @@ from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import ViewState, on_another_scene
 from viewer.state.workspace import Dialog, Store, with_transient
 from viewer.ui.keys import COMMANDS, bind
-
-_Made = TypeVar("_Made")
-
-
-class WaitFor(Protocol):
-    """Function that runs work in another thread while the window shows a text, and returns its result."""
-
-    def __call__(self, work: Callable[[], _Made], text: str) -> _Made: ...
-
 
 OpenDocument = Callable[[document.Document, ViewState, tuple[SliderSnapshot, ...]], None]
 """Function that replaces the open scene by another, with its view and snapshots."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,14 +11,22 @@ import moderngl
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.io.cameras import load_cameras
-from progdf.io.picture_camera import edits_in_picture, find_picture_camera
+from progdf.io.picture_camera import (
+    camera_file,
+    edits_in_picture,
+    save_picture_camera,
+    stored_picture_camera,
+)
+from progdf.scene.match_views import view_thumbnail
+from progdf.scene.taken_views import FoundView, TakenView, find_view, remember_view, taken_views
 from viewer.app.handles import is_decal, load_decal
-from viewer.app.messages import Messages
-from viewer.camera.view_camera import from_camera, to_camera
+from viewer.app.messages import Messages, Requests, WaitFor
+from viewer.camera.view_camera import ViewCamera, from_camera, to_camera
 from viewer.files import exports
 from viewer.files.document import DocumentStore
+from viewer.pictures.film import Pixels
 from viewer.state.forms import with_picture
-from viewer.state.workspace import Store, with_camera, with_transient
+from viewer.state.workspace import Dialog, Store, with_camera, with_transient
 from viewer.ui.keys import shortcut
 
 
@@ -31,6 +39,8 @@ class PictureActions:
         messages: messages to the user
         context: the GL context of decals
         picture_size: returns width and height of the picture on screen, in pixels
+        original: returns the picture on screen without edits, at its full size
+        wait_for: runs work in another thread while the window shows a text
     """
 
     def __init__(
@@ -41,12 +51,28 @@ class PictureActions:
         messages: Messages,
         context: moderngl.Context,
         picture_size: Callable[[], tuple[int, int]],
+        original: Callable[[], Pixels],
+        wait_for: WaitFor,
     ) -> None:
         self._store = store
         self._documents = documents
         self._messages = messages
         self._context = context
         self._picture_size = picture_size
+        self._original = original
+        self._wait_for = wait_for
+        self._asked: tuple[Path, Camera, ViewCamera] | None = None  # picture, nearest camera, view before
+
+    @property
+    def requests(self) -> Requests:
+        """Handlers of the answers to "Is it this view?", by name. `use_view` names the picture."""
+        return {"use_view": lambda _: self._use_view(), "keep_view": lambda _: self._keep_view()}
+
+    def remember(self, image: Pixels, camera: Camera, edits: Sequence[str]) -> None:
+        """Remember a view that was taken of the open scene, to find pictures that lost their camera."""
+        document = self._documents.get()
+        if document.path is not None:
+            remember_view(document.path, image, camera, edits, document.scene.origin)
 
     def look_through(self, path: Path) -> None:
         """Move the view to the first camera of a file.
@@ -74,17 +100,77 @@ class PictureActions:
         """Put an edited picture into the form of a new edit, and move the view to its camera.
 
         Raises:
-            ProgdfError: it is not a picture, its camera is not found, or it was taken with edits on.
+            ProgdfError: it is not a picture, its camera is invalid, or it was taken with edits on.
         """
-        camera = find_picture_camera(path, origin=self._documents.get().scene.origin)
+        camera = stored_picture_camera(path, origin=self._documents.get().scene.origin)
+        if camera is None:
+            self._search_view(path)
+            return
         if edits := edits_in_picture(path):
-            raise ProgdfError(
-                f"{path.name} shows edits ({edits}); take a view without edits with {shortcut('take_view')}"
-            )
+            raise ProgdfError(f"{path.name} {_with_edits(edits)}")
+        self._fill_form(path, camera)
+
+    def _fill_form(self, path: Path, camera: Camera) -> None:
         self._take_camera(camera)
         work = self._store.get()
         form = with_picture(work.form, path, work.form_open)
         self._store.replace(replace(work, form=form, form_open=True))
+
+    def _search_view(self, path: Path) -> None:
+        """Find the view that a picture without a camera shows, among the taken ones and the current view.
+
+        If none is certain, move the view to the nearest one and ask.
+
+        Raises:
+            ProgdfError: it is not a picture, its camera cannot be written, or it was taken with edits on.
+        """
+        document = self._documents.get()
+        origin = document.scene.origin
+        before = self._store.get().view.camera
+        original = self._original()
+        camera = to_camera(before, original.shape[1], original.shape[0])
+        current = TakenView(view_thumbnail(original), camera)
+
+        def search() -> FoundView | None:
+            taken = [] if document.path is None else taken_views(document.path, origin)
+            return find_view(path, [current, *taken])
+
+        found = self._wait_for(search, f"Searching the view of {path.name} …")
+        if found is None:
+            raise ProgdfError(f"{path.name} carries no camera; take a view with {shortcut('take_view')}")
+        if found.match.certain and found.view.edits:
+            raise ProgdfError(f"{path.name} {_with_edits(found.view.edits)}")
+        if found.match.certain:
+            save_picture_camera(path, found.camera, origin)
+            self._fill_form(path, found.camera)
+            self._messages.show(f"Found the view of {path.name}: {found.agreement}")
+            return
+        self._asked = (path, found.camera, before)
+        self._take_camera(found.camera)
+        self._messages.ask(Dialog("match", str(path)))
+
+    def _use_view(self) -> None:
+        """Take the nearest view as that of the picture.
+
+        Raises:
+            ProgdfError: its camera cannot be written beside the picture.
+        """
+        if self._asked is not None:
+            path, camera, _ = self._asked
+            self._asked = None
+            save_picture_camera(path, camera, self._documents.get().scene.origin)
+            self._fill_form(path, camera)
+
+    def _keep_view(self) -> None:
+        """Return to the view before the question, and tell how a picture gets its camera."""
+        if self._asked is not None:
+            path, _, before = self._asked
+            self._asked = None
+            self._store.replace(with_camera(self._store.get(), before))
+            self._messages.show(
+                f"{path.name} has no view. Turn the scene to its view and drop it again, "
+                f"or put {camera_file(path).name} beside it."
+            )
 
     def keep_camera(self, session: Path | None) -> None:
         """Add the view on screen to the cameras stored next to the session, or next to the scene.
@@ -102,3 +188,8 @@ class PictureActions:
         work = self._store.get()
         view_camera = from_camera(work.view.camera, camera, self._documents.get().bounds)
         self._store.replace(with_camera(work, view_camera))
+
+
+def _with_edits(edits: str) -> str:
+    """Return the end of the error about a picture that was taken with edits on."""
+    return f"shows edits ({edits}); take a view without edits with {shortcut('take_view')}"
