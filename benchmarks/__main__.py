@@ -43,6 +43,7 @@ BENCHES: dict[str, str] = {
     "window": "benchmarks.viewer.window:tables",
     "warps": "benchmarks.warps:tables",
     "pictures": "benchmarks.pictures:tables",
+    "spill": "benchmarks.spill:tables",
 }
 
 PAGE = ("training", "field", "viewer", "rasterize", "warp", "moving", "popping", "frames", "hard")
@@ -99,7 +100,18 @@ def main(argv: Sequence[str]) -> int:
     trained = ("edits", "networks")
     if options.runs and options.what and not set(trained) & set(options.what):
         raise ProgdfError(f"--runs are for {', '.join(trained)}; use python -m benchmarks {trained[0]}")
-    drawing = (*plotted, "viewer", "select", "frames", "moving", "popping", "window", "warps", "pictures")
+    drawing = (
+        *plotted,
+        "viewer",
+        "select",
+        "frames",
+        "moving",
+        "popping",
+        "window",
+        "warps",
+        "pictures",
+        "spill",
+    )
     if options.scenes and options.what and not set(drawing) & set(options.what):
         raise ProgdfError(f"--scenes are for {', '.join(drawing)}; use python -m benchmarks viewer")
     if options.seconds is not None and options.what and "window" not in options.what:
