@@ -27,13 +27,12 @@ from .added import extend
 from .follow import (
     FOLLOWED,
     Followers,
-    carry_pushed,
-    carry_rows,
     find_followers,
     pack_shapes,
     state_scene,
     unpack_shapes,
 )
+from .follow_kernel import carry_fast
 from .layers import KINDS, ORDERED, Effects, Layer, changed_edits, check_numbers, check_weights, effects_of
 from .reference import Coverage, changed_rows, coverage
 
@@ -347,10 +346,8 @@ class _Surface:
         self._index = {id(gdf): edit for edit, gdf in enumerate(self._gdfs)}
         self._coverage_of = coverage_of
         self._composer = Composer(states, self._gdfs, self._covers)
-        self._before = pack_shapes(states)
+        self._before = pack_shapes(states).numpy()
         self._rows = torch.from_numpy(followers.rows)
-        self._anchors = torch.from_numpy(followers.anchors)
-        self._weights = torch.from_numpy(followers.weights)
         self._uncarried = scene.means[self._rows].clone()  # centers before following, from the last update
         self._dependents: dict[int, Rows] = {}
         self._sliced: dict[
@@ -420,15 +417,14 @@ class _Surface:
             return
         states = self._composer.gaussians
         rows = self._rows[index]
-        anchors = self._anchors[index]
-        composed = pack_shapes(gaussians, rows)
+        shapes = pack_shapes(gaussians, rows)
+        own = shapes.clone()
         if is_pushed:
-            at = anchors[:, 0]
-            paint = pack_shapes(states, torch.from_numpy(self.followers.own[index]))
-            shapes = carry_pushed(composed, paint, self._before[at], pack_shapes(states, at))
-        else:
-            after = pack_shapes(states)
-            shapes = carry_rows(composed, self._before[anchors], after[anchors], self._weights[index])
+            own = pack_shapes(states, torch.from_numpy(self.followers.own[index]))
+        anchors = self.followers.anchors[index]
+        weights = self.followers.weights[index]
+        both = self._before, pack_shapes(states).numpy()
+        carry_fast(shapes.numpy(), own.numpy(), both, anchors, weights, is_pushed)
         for name, values in unpack_shapes(shapes).items():
             getattr(gaussians, name)[rows] = values
 

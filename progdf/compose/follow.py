@@ -81,7 +81,7 @@ def find_followers(gdfs: Sequence[Gdf], count: int) -> Followers | None:
     """
     members = [gdf.region.members.numpy() for gdf in gdfs]
     shaping = [edit for edit, gdf in enumerate(gdfs) if changes_shape(gdf)]
-    pushing = [edit for edit in shaping if (anchors := gdfs[edit].anchors) is not None and anchors.pushes]
+    pushing = [edit for edit in shaping if (found := gdfs[edit].anchors) is not None and found.pushes]
     others = [edit for edit in shaping if edit not in pushing]
     builder = _Builder(members, count)
     for edit, gdf in enumerate(gdfs):
@@ -168,10 +168,11 @@ class _Builder:
                     index.append(at[found])
                 first += len(rows)
             changed.append((np.concatenate(states), np.concatenate(index)))
-        rows, edits, anchors, weights, own = zip(*self._parts, strict=True)
+        parts = list(zip(*self._parts, strict=True))
+        following, edits, anchors, weights, own = parts
         return Followers(
-            np.concatenate(rows),
-            np.concatenate([np.full(len(part), edit) for part, edit in zip(rows, edits, strict=True)]),
+            np.concatenate(following),
+            np.concatenate([np.full(len(part), edit) for part, edit in zip(following, edits, strict=True)]),
             np.concatenate(anchors),
             np.concatenate(weights),
             np.concatenate(own),

@@ -218,7 +218,7 @@ def _follow(scene: Gaussians, composed: Gaussians, layers: Sequence[Layer], blen
         rows = gdf.region.members[-len(anchors) :]
         at = anchors.rows
         shapes[rows] = carry_rows(shapes[rows], before[at], after[at], anchors.weights.double())
-    changed = {
+    changed: dict[str, Any] = {
         name: new.to(getattr(scene, name).dtype)
         for name, new in unpack_shapes(shapes).items()
         if not torch.equal(new, getattr(composed, name))

@@ -258,7 +258,7 @@ def anchor_added(gdf: Gdf, scene: Gaussians, pushes: bool = False, free: int = 0
     if added is None:
         return gdf
     members = len(gdf.region)
-    parts = {}
+    parts: dict[str, Any] = {}
     offsets = {name: bases.end for name, bases in gdf.field.attributes.items() if name in _SURFACE}
     for name, change in offsets.items():
         old: Tensor = getattr(scene, name).float()
