@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -205,7 +206,7 @@ def _descend(
     target: Plane, template: Plane, values: NDArray[np.floating], outlier: float
 ) -> NDArray[np.floating]:
     """Return center and width of a template in a picture, in pixels, by robust Gauss-Newton steps. [3]"""
-    gradients = np.stack(np.gradient(target))
+    gradients: Any = np.gradient(target)
     across, down = _grid(template.shape)
     for _ in range(_MAX_STEPS):
         at: tuple[Plane, Plane] = (
