@@ -135,8 +135,10 @@ def half(object_pixels: Tensor) -> Tensor:
 def soft_stroke(object_pixels: Tensor) -> Tensor:
     """Return the paint's opacity: a soft round brush on the right of the object. [H,W] -> [H,W]"""
     rows, columns = object_pixels.nonzero().double().unbind(1)
-    top, bottom = rows.quantile(0.05), rows.quantile(0.95)
-    left, right = columns.quantile(0.05), columns.quantile(0.95)
+    top = rows.quantile(0.05)
+    bottom = rows.quantile(0.95)
+    left = columns.quantile(0.05)
+    right = columns.quantile(0.95)
     y, x = torch.meshgrid(*(torch.arange(n).double() for n in object_pixels.shape), indexing="ij")
     radius = 0.35 * torch.maximum(bottom - top, right - left)
     distance = ((y - 0.5 * (top + bottom)).square() + (x - (0.2 * left + 0.8 * right)).square()).sqrt()

@@ -476,7 +476,8 @@ def test_pictures_are_never_saved_to_the_current_folder(
     locked.chmod(0o555)
     window.parts.file_actions.open(locked / "half.ply")
     press(window, "F2", "Ctrl+F2", "Ctrl+E")
-    assert sorted(path.name for path in own.iterdir()) == ["half_001.png", "half_002.png"]
+    names = sorted(path.name for path in own.iterdir())
+    assert names == ["half_001.png", "half_002.camera.json", "half_002.png"]
     assert question(window).text == str(own / "half_edited.ply")
     assert [*here.iterdir()] == []
     locked.chmod(0o755)
