@@ -91,6 +91,8 @@ class PaintSurface:
 
     def describe(self) -> str:
         """Return the models of the painted pieces as one line."""
+        if not self.fits:
+            return "the smoothed depth of its view, as the paint is too small for a model"
         return "; ".join(fit.describe() for fit in self.fits)
 
 

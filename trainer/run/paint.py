@@ -192,15 +192,17 @@ def views_around_paint(
 
 
 def _mean_square_error(finished: Gaussians, looks: Sequence[ExpectedView]) -> float:
-    """Return the mean squared color error at and around the paint, over all views."""
+    """Return the squared color error of whole views, per pixel at and around the paint.
+
+    Discs that float away from the paint count too, wherever they are seen.
+    """
     error = pixels = 0.0
     for view in looks:
         compared = view.covered | view.around
         if not bool(compared.any()):
             continue
-        box = box_of(compared, view.camera)
-        image = render(finished, view.camera, BACKGROUND, crop=box).image.clamp(0.0, 1.0)
-        error += float((image - crop(view.expected, box))[crop(compared, box)].square().sum())
+        image = render(finished, view.camera, BACKGROUND).image.clamp(0.0, 1.0)
+        error += float((image - view.expected).square().sum())
         pixels += 3 * int(compared.sum())
     return error / max(1.0, pixels)
 
@@ -227,8 +229,8 @@ def choose_discs(goal: PaintGoal, log: RunLog | None) -> DiscLayout:
             log.say(f"surface under the paint: {paint.surface.describe()}")
         errors = ", ".join(f"{decibels(error):.1f} dB with {laid.gap:g} px" for error, laid in candidates)
         log.say(
-            f"occluding Gaussians move {best[1].gap:g} px behind the paint; tried: {errors} (in the paint "
-            f"and {RING} px around it, from the painted view and up to {max(TRIAL_ANGLES_DEG)}° beside it)"
+            f"occluding Gaussians move {best[1].gap:g} px behind the paint; tried: {errors} (the painted "
+            f"view and views up to {max(TRIAL_ANGLES_DEG)}° beside it, per pixel in the paint and {RING} px around it)"
         )
     return best[1]
 

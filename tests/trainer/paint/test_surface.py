@@ -100,6 +100,14 @@ def test_nothing_painted_has_no_model() -> None:
     assert surface.thickness == 0.0
 
 
+def test_paint_too_small_for_a_model_lies_at_the_smoothed_depth() -> None:
+    painted = np.zeros((SIDE, SIDE), bool)
+    painted[60:62, 60:62] = True
+    surface = find_surface(wall(), CAMERA, painted)
+    assert surface.fits == ()
+    assert "too small for a model" in surface.describe()
+
+
 def test_thickness_is_the_spread_of_the_light() -> None:
     scene = wall(rough=0.0)
     all_pixels = np.ones((SIDE, SIDE), bool)

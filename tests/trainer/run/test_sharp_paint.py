@@ -135,14 +135,10 @@ def test_discs_that_are_worse_from_the_sides_are_not_added(
 ) -> None:
     def lift(scene: Gaussians, paint: object, *rest: object) -> object:
         discs = place_discs(scene, paint, *rest)  # type: ignore[arg-type]
-        toward = 0.5 * (CAMERA.position - discs.added.means)
+        toward = 0.2 * (CAMERA.position - discs.added.means)
         return replace(discs, added=replace(discs.added, means=discs.added.means + toward))
 
-    def keep_colors(scene: Gaussians, rows: torch.Tensor, added: Gaussians, *_: object) -> object:
-        return scene, added
-
     monkeypatch.setattr("trainer.run.paint.place_discs", lift)
-    monkeypatch.setattr("trainer.run.paint.solve_colors", keep_colors)
     done = train(options(place, save(place, "lifted", letters(wall()).picture), "lifted"), quiet=True)
     assert " from the sides: not added" in done.folder.log.read_text()
     assert load_gdf(done.gdf, load_ply(place / "wall.ply")).added is None
