@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol
 
@@ -27,6 +27,8 @@ _REWEIGHTINGS = 8  # iterations of robust least squares
 _SPLINE_CELLS = (2, 4, 8)  # cells of the B-splines along the longer side of the paint
 _BEND_SHARE = 1e-3  # weight of the splines' bending, as a share of the squared residuals
 _PLANES_NAMES = {1: "a plane", 2: "2 planes that meet in an edge", 3: "3 planes that meet in a corner"}
+_ROUNDINGS = (0.1, 0.3, 1.0)  # tried roundings of edges, as shares of the spread between the planes
+_ROUNDING_STEPS = 3  # Gauss-Newton steps, from the planes of a sharp edge
 _EDGE_DIRECTIONS = 6  # tried directions of an edge between planes
 _DIFFERENCE = 1e-4  # step of numeric derivatives in normalized image coordinates
 _SAMPLES_PER_TERM = 8  # smallest number of samples per coefficient of a spline
@@ -85,38 +87,72 @@ class SurfaceModel(Protocol):
 
 @dataclass(frozen=True)
 class Planes:
-    """Planes that meet in convex edges (the farthest is visible) or concave ones (the nearest)."""
+    """Planes that meet in convex edges (the farthest is visible) or concave ones (the nearest).
+
+    A rounded edge is the smooth minimum or maximum of the planes.
+    """
 
     coefficients: Array  # inverse depth a + b x + c y of each plane. [K,3]
     is_convex: bool = True
+    rounding: float = 0.0  # difference of inverse depths below which an edge is rounded; 0: sharp
 
     @property
     def name(self) -> str:
         """See `SurfaceModel`."""
-        return _PLANES_NAMES[len(self.coefficients)]
+        name = _PLANES_NAMES[len(self.coefficients)]
+        return f"{name}, rounded" if self.rounding else name
 
-    def _values(self, x: Array, y: Array) -> Array:
+    def values(self, x: Array, y: Array) -> Array:
+        """Return the inverse depth of each plane. [K,...]"""
         a, b, c = self.coefficients.T
         values: Array = np.add.outer(a, np.zeros_like(x))
         values += np.multiply.outer(b, x) + np.multiply.outer(c, y)
         return values
 
-    def inverse_depth(self, x: Array, y: Array) -> Array:
-        """See `SurfaceModel`."""
-        values = self._values(x, y)
-        chosen: Array = values.min(axis=0) if self.is_convex else values.max(axis=0)
-        return chosen
+    def shares(self, x: Array, y: Array) -> Array:
+        """Return the share of each plane in the surface's gradient; 0 and 1 for sharp edges. [K,...]"""
+        values = self.values(x, y)
+        if not self.rounding:
+            planes = np.arange(len(values)).reshape(-1, *np.ones(np.ndim(x), int))
+            return np.asarray(planes == self._visible(values), np.float64)
+        exponents = self._exponents(values)
+        weights = np.exp(exponents - exponents.max(axis=0))
+        return np.asarray(weights / weights.sum(axis=0), np.float64)
 
-    def part(self, x: Array, y: Array) -> Parts:
-        """See `SurfaceModel`."""
-        values = self._values(x, y)
+    def _exponents(self, values: Array) -> Array:
+        sign = -1.0 if self.is_convex else 1.0
+        exponents: Array = sign * values / self.rounding
+        return exponents
+
+    def _visible(self, values: Array) -> Parts:
         visible: Parts = values.argmin(axis=0) if self.is_convex else values.argmax(axis=0)
         return visible
 
+    def inverse_depth(self, x: Array, y: Array) -> Array:
+        """See `SurfaceModel`."""
+        values = self.values(x, y)
+        if not self.rounding:
+            chosen: Array = values.min(axis=0) if self.is_convex else values.max(axis=0)
+            return chosen
+        smooth: Array = self.rounding * np.logaddexp.reduce(self._exponents(values), axis=0)
+        return -smooth if self.is_convex else smooth
+
+    def part(self, x: Array, y: Array) -> Parts:
+        """See `SurfaceModel`."""
+        if self.rounding:
+            return np.zeros(np.shape(x), np.int64)
+        return self._visible(self.values(x, y))
+
+    def visible_plane(self, x: Array, y: Array) -> Parts:
+        """Return the index of the plane that is visible, or nearest to the rounded surface."""
+        return self._visible(self.values(x, y))
+
     def gradient(self, x: Array, y: Array) -> tuple[Array, Array]:
         """See `SurfaceModel`."""
-        part = self.part(x, y)
-        return self.coefficients[part, 1], self.coefficients[part, 2]
+        shares = self.shares(x, y)
+        by_x: Array = np.tensordot(self.coefficients[:, 1], shares, 1)
+        by_y: Array = np.tensordot(self.coefficients[:, 2], shares, 1)
+        return by_x, by_y
 
 
 @dataclass(frozen=True)
@@ -261,11 +297,44 @@ def fit_planes(samples: Samples, count: int = 1, is_convex: bool = True) -> Plan
         found = _fit_divided(samples, division, count, is_convex)
         if found is None:
             continue
-        error = float(np.abs(samples.residuals(found)).mean())
+        error = _mean_distance(samples, found)
+        if error < lowest:
+            best = found
+            lowest = error
+    return _round_edges(samples, best)
+
+
+def _mean_distance(samples: Samples, model: SurfaceModel) -> float:
+    """Return the mean distance of samples from a model, in pixels."""
+    return float(np.abs(samples.residuals(model)).mean())
+
+
+def _round_edges(samples: Samples, sharp: Planes) -> Planes:
+    """Return the planes with the edges' rounding that fits the samples best, from sharp to a smooth bend."""
+    values = sharp.values(samples.x, samples.y)
+    spread = float((values.max(axis=0) - values.min(axis=0)).std())
+    best = sharp
+    lowest = _mean_distance(samples, sharp)
+    for share in _ROUNDINGS:
+        found = _fit_rounded(samples, replace(sharp, rounding=share * spread))
+        error = _mean_distance(samples, found)
         if error < lowest:
             best = found
             lowest = error
     return best
+
+
+def _fit_rounded(samples: Samples, start: Planes) -> Planes:
+    """Fit planes with rounded edges by Gauss-Newton steps."""
+    planes = start
+    terms = _linear_terms(samples.x, samples.y)
+    for _ in range(_ROUNDING_STEPS):
+        shares = planes.shares(samples.x, samples.y)
+        jacobian = (shares.T[:, :, None] * terms[:, None, :]).reshape(len(samples), -1)
+        flat = planes.coefficients.ravel()
+        wanted = samples.inverse - planes.inverse_depth(samples.x, samples.y) + jacobian @ flat
+        planes = replace(planes, coefficients=_robust(jacobian, samples, wanted).reshape(-1, 3))
+    return planes
 
 
 def _divisions(samples: Samples, count: int) -> Iterator[Parts]:
@@ -291,7 +360,7 @@ def _fit_divided(samples: Samples, division: Parts, count: int, is_convex: bool)
         if min(len(part) for part in parts) < MIN_SAMPLES:
             return None
         planes = Planes(np.array([_robust(_linear_terms(p.x, p.y), p) for p in parts]), is_convex)
-        visible = planes.part(samples.x, samples.y)
+        visible = planes.visible_plane(samples.x, samples.y)
         if np.array_equal(visible, division):
             break
         division = visible

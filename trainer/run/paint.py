@@ -229,8 +229,9 @@ def choose_discs(goal: PaintGoal, log: RunLog | None) -> DiscLayout:
             log.say(f"surface under the paint: {paint.surface.describe()}")
         errors = ", ".join(f"{decibels(error):.1f} dB with {laid.gap:g} px" for error, laid in candidates)
         log.say(
-            f"occluding Gaussians move {best[1].gap:g} px behind the paint; tried: {errors} (the painted "
-            f"view and views up to {max(TRIAL_ANGLES_DEG)}° beside it, per pixel in the paint and {RING} px around it)"
+            f"occluding Gaussians move {best[1].gap:g} px behind the paint; tried: {errors} "
+            f"(painted view and views up to {max(TRIAL_ANGLES_DEG)}° beside it, per pixel in the paint and "
+            f"{RING} px around it)"
         )
     return best[1]
 

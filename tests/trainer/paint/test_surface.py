@@ -31,6 +31,10 @@ def edge(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.minimum(0.5 + 0.4 * x, 0.52 - 0.5 * x + 0.1 * y)
 
 
+def round_edge(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return -0.02 * np.logaddexp(-(0.5 + 0.4 * x) / 0.02, -(0.52 - 0.5 * x + 0.1 * y) / 0.02)
+
+
 def bowl(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return 0.5 - 1.2 * x**2 - 0.8 * y**2 + 0.1 * x
 
@@ -61,6 +65,17 @@ def test_simplest_model_within_the_noise_is_found(shape: object, name: str, seed
     assert float(np.sqrt((error_px**2).mean())) < NOISE_PX
 
 
+@pytest.mark.parametrize(("shape", "is_rounded"), [(edge, False), (round_edge, True)])
+def test_edges_are_as_sharp_as_the_samples(shape: object, is_rounded: bool) -> None:
+    model = fit_planes(samples(shape), 2)
+    x, y = np.meshgrid(np.linspace(-0.25, 0.25, 40), np.linspace(-0.25, 0.25, 40))
+    true = shape(x, y)  # type: ignore[operator]
+    error_px = np.abs(model.inverse_depth(x, y) / true - 1.0) * FOCAL
+    assert model.rounding > 0.0 or not is_rounded
+    assert float(error_px.max()) < 2.0 * NOISE_PX
+    assert float(np.sqrt((error_px**2).mean())) < 0.4 * NOISE_PX
+
+
 def test_plane_is_found_to_a_fraction_of_the_noise() -> None:
     model = fit_planes(samples(plane))
     x, y = np.meshgrid(np.linspace(-0.3, 0.3, 30), np.linspace(-0.3, 0.3, 30))
@@ -72,7 +87,13 @@ def test_gradients_are_those_of_the_inverse_depth() -> None:
     some = samples(bowl)
     x, y = np.random.default_rng(1).uniform(-0.2, 0.2, (2, 50))
     box = (-0.3, -0.3, 0.3, 0.3)
-    for model in (fit_planes(some), fit_planes(some, 2), fit_quadric(some), fit_spline(some, 2, box)):
+    for model in (
+        fit_planes(some),
+        fit_planes(samples(edge), 2),
+        fit_planes(some, 2),
+        fit_quadric(some),
+        fit_spline(some, 2, box),
+    ):
         by_x, by_y = model.gradient(x, y)
         step = 1e-5
         near = model.part(x - step, y - step) == model.part(x + step, y + step)
