@@ -217,7 +217,7 @@ def _disc_error(image: Array, height: int, width: int) -> Array:
 
 
 def _discs(cells: Array, surface: PaintSurface, picture: Tensor) -> tuple[Gaussians, Array]:
-    """Return discs that fill cells of the picture on its surface, and their depths. [B,4], _, [H,W,3]"""
+    """Return discs that fill cells of the picture on its surface, and their depths. [B,4] and [H,W,3]"""
     camera = surface.camera
     x, y, width, height = cells.T
     K = camera.K.double().numpy()

@@ -40,9 +40,8 @@ OPAQUE = 0.97
 MEDIAN_PX = 9
 """Window of the median filter of depths, pixels."""
 _SMOOTHING_PX = 3.0  # standard deviation of the Gaussian filter of depths, pixels
-_SAME_SURFACE_SLOPES = (
-    4.0  # median slopes; a smoothed depth that differs more from the median crosses an edge
-)
+# median slopes; a smoothed depth that differs more from the median crosses an edge
+_SAME_SURFACE_SLOPES = 4.0
 MIN_COSINE = 0.3
 """Cosine between normal and ray; steeper discs face the camera, and steeper depth steps separate surfaces."""
 
@@ -67,8 +66,8 @@ class SurfaceFit:
     def describe(self) -> str:
         """Return the model, its residual and the thickness of the surface as text."""
         return (
-            f"{self.model.name}, {self.residual_px:.1f} px from the depths of Gaussians that scatter by "
-            f"{self.thickness_px:.1f} px"
+            f"{self.model.name}; the scene's depth deviates from it by {self.residual_px:.1f} px, and the "
+            f"light of one pixel spreads over {self.thickness_px:.1f} px of depth"
         )
 
 
@@ -93,7 +92,7 @@ class PaintSurface:
         """Return the models of the painted pieces as one line."""
         if not self.fits:
             return "the smoothed depth of its view, as the paint is too small for a model"
-        return "; ".join(fit.describe() for fit in self.fits)
+        return "; and ".join(fit.describe() for fit in self.fits)
 
 
 def smooth_depth(depth: NDArray[np.float32], opaque: Mask) -> Array:

@@ -129,8 +129,8 @@ def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder
         remains_of_named = remaining_share(scene, scene[~named.mask], around.views)
     rows_added = 0 if fill.rows is None else len(fill.rows)
     log.say(
-        f"left of its visible pixels, same surface and color: {100 * remains:.2f} % "
-        f"({100 * remains_of_named:.2f} % without the region alone)"
+        f"{100 * remains:.2f} % of the region's visible pixels still show its surface and color "
+        f"({100 * remains_of_named:.2f} % if only the named region is removed)"
     )
     counted = f"holes: {fill.before} pixels in {format_count(len(views), 'view')}"
     log.say(
@@ -243,7 +243,7 @@ def _remove_whole(
     if len(remains.seen):
         log.say(
             f"also removed: {format_count(len(remains.seen), 'Gaussian')} around the region, visible only "
-            "where it is and joined to it by touch and color"
+            "in its pixels, that touch it and have its color"
         )
     removal = attempt(from_mask(named.name, mask))
     if not len(remains.hidden):
@@ -252,8 +252,8 @@ def _remove_whole(
     is_closed = larger.fill.after <= removal.fill.after
     decision = "also removed" if is_closed else "kept"
     log.say(
-        f"{decision}: {format_count(len(remains.hidden), 'Gaussian')} hidden by the region, in its color; "
-        f"{larger.fill.after} pixels of holes remain without them, {removal.fill.after} with them"
+        f"{decision}: {format_count(len(remains.hidden), 'Gaussian')} of the region's color that it hides; "
+        f"holes have {larger.fill.after} pixels without them and {removal.fill.after} with them"
     )
     return larger if is_closed else removal
 
