@@ -8,7 +8,7 @@ one attribute.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -20,19 +20,25 @@ from torch import Tensor
 from progdf.field.baked import AttributeBases, Segment, find_segment
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import Gdf
-from progdf.rasterize.cpu.jit import kernel
 from progdf.threads import run_chunks
 
 from .added import extend
+from .compose_kernel import add_offsets, write_rows
 from .follow import (
     FOLLOWED,
     Followers,
     find_followers,
     pack_shapes,
     state_scene,
-    unpack_shapes,
 )
-from .follow_kernel import carry_fast
+from .follow_kernel import (
+    Shapes,
+    carry_fast,
+    gather_shapes,
+    measure_motions,
+    release_centers,
+    rest_motions,
+)
 from .layers import KINDS, ORDERED, Effects, Layer, changed_edits, check_numbers, check_weights, effects_of
 from .reference import Coverage, changed_rows, coverage
 
@@ -42,7 +48,7 @@ Rows = NDArray[np.int64]
 CHUNK = 16_384
 """Rows per task of a thread: few enough for the L2 cache, and enough to be worth a thread."""
 
-_BLOCK_MEMBERS = 512  # members whose offsets are summed at once
+_CARRIED_ROWS = 2_048  # rows that follow, per task of a thread
 
 _NO_VALUES = np.zeros(0, np.float32)  # stands for weights that are all 1, and for coverage that is all 0
 
@@ -95,12 +101,21 @@ class _Bases(NamedTuple):
         return used, row[bases, None] * self.scale[bases]
 
 
-class _Plan(NamedTuple):
-    """Rows and members to rewrite when some edits change."""
+class _Members(NamedTuple):
+    """Rows, and the members of each edit among them."""
 
     rows: Rows  # ascending. [U]
     parts: Mapping[int, tuple[Rows, Rows]]  # by edit: its members among the rows, and their positions. [m]
-    followers: Rows  # indices of the following rows among them, see `Followers`
+
+
+class _Plan(NamedTuple):
+    """Rows and members to rewrite when some edits change."""
+
+    rows: Rows  # all rows that may change, ascending. [U]
+    colors: _Members  # members of the changed edits
+    shapes: _Members  # those whose shape is written, without pushed rows if they are most of them
+    followers: Rows  # indices of the following rows, see `Followers`. [F]
+    added: Rows  # indices of the added rows among them that the changed edits change. [G]
 
 
 class _LayerSlice(NamedTuple):
@@ -180,29 +195,51 @@ class Composer:
         if not changed:
             return Change(np.zeros(0, np.int64), (), 0.0)
         plan = self._plan(changed)
-        moving = {name for edit in plan.parts for name in self._bases[edit]}
+        # weights are summed by kind of change, so that a change reaches all attributes of its kinds
+        kinds = {KINDS[name] for edit in changed for name in self._bases[edit]}
+        moving = {name for edit in plan.colors.parts for name in self._bases[edit] if KINDS[name] in kinds}
         names = tuple(name for name in self._before if name in moving)
         surface = self._surface
         if surface is None or not len(plan.followers):
-            return Change(plan.rows, names, self._write(stack, blend, plan, names))
-        last = surface.restore(self.gaussians, plan.followers, moving)
-        moved = self._write(stack, blend, plan, names)
-        carried = surface.carry(self.gaussians, plan.followers, last, stack, blend)
+            return Change(plan.rows, names, self._write(stack, blend, plan.colors, names))
+        shapes = self._shapes()
+        surface.release(shapes, plan.added)
+        if plan.shapes is plan.colors:
+            moved = self._write(stack, blend, plan.colors, names)
+        else:
+            colors = tuple(name for name in names if name not in FOLLOWED)
+            shaped = tuple(name for name in names if name in FOLLOWED)
+            self._write(stack, blend, plan.colors, colors)
+            moved = self._write(stack, blend, plan.shapes, shaped)
+        carried = surface.carry(shapes, plan.followers, plan.added, stack, blend)
         names = tuple(name for name in self._before if name in moving or name in FOLLOWED)
         return Change(plan.rows, names, max(moved, carried))
 
+    def _shapes(self) -> Shapes:
+        """Return the followed attributes of `gaussians`, which are updated in place. [N,c] each"""
+        means, log_scales, quats, logits = (
+            self._after[name]
+            if name in self._after
+            else getattr(self.gaussians, name).float().reshape(len(self._scene), -1).numpy()
+            for name in FOLLOWED
+        )
+        return means, log_scales, quats, logits
+
     def _write(
-        self, stack: Sequence[tuple[int, Layer]], blend: str, plan: _Plan, names: Sequence[str]
+        self, stack: Sequence[tuple[int, Layer]], blend: str, members: _Members, names: Sequence[str]
     ) -> float:
-        """Write the rows of a plan without following; return the largest movement of a center."""
+        """Write rows without following; return the largest movement of a center."""
+        rows = members.rows
+        if not len(rows) or not names:
+            return 0.0
         active = [layer for _, layer in stack]
         if blend == "adjust" and self._maps_others(stack):
-            return self._write_adjusted(active, plan.rows, names)
-        parts = [self._part(plan, edit, layer) for edit, layer in stack if edit in plan.parts]
-        count = 1 + len(plan.rows) // CHUNK
-        cuts = [len(plan.rows) * part // count for part in range(count + 1)]
+            return self._write_adjusted(active, rows, names)
+        parts = [self._part(members, edit, layer) for edit, layer in stack if edit in members.parts]
+        count = 1 + len(rows) // CHUNK
+        cuts = [len(rows) * part // count for part in range(count + 1)]
         moves = run_chunks(
-            lambda chunk: self._rewrite(plan.rows, parts, names, blend, cuts[chunk], cuts[chunk + 1]), count
+            lambda chunk: self._rewrite(rows, parts, names, blend, cuts[chunk], cuts[chunk + 1]), count
         )
         return math.sqrt(max(moves))
 
@@ -269,16 +306,16 @@ class Composer:
                 selection = part.at, part.members, part.weights
                 stored = (bases.end, bases.residual)
                 scale = np.float32(gain)
-                _add_offsets(total, selection, stored, used, factors, scale, hidden, covered)
+                add_offsets(total, selection, stored, used, factors, scale, hidden, covered)
             weight_sum = weight_sums.get(KINDS[name], _NO_VALUES)
-            moved = _finish(after, self._before[name], rows, total, weight_sum, name == "means")
+            moved = write_rows(after, self._before[name], rows, total, weight_sum, name == "means")
             largest = max(largest, moved)
         return largest
 
-    def _part(self, plan: _Plan, edit: int, layer: Layer) -> _LayerSlice:
+    def _part(self, members: _Members, edit: int, layer: Layer) -> _LayerSlice:
         weights = _NO_VALUES if layer.weights is None else layer.weights.detach().float().numpy()
         segment = find_segment(layer.gdf.field.knots, layer.strength)
-        return _LayerSlice(layer, edit, segment, *plan.parts[edit], weights)
+        return _LayerSlice(layer, edit, segment, *members.parts[edit], weights)
 
     def _plan(self, changed: frozenset[int]) -> _Plan:
         """Return the members of the changed edits, and the members of other edits in the same rows."""
@@ -286,19 +323,37 @@ class Composer:
             if len(self._plans) >= 32:  # only a few are in use during a drag
                 self._plans.clear()
             chosen = [self._members[edit] for edit in changed]
-            if self._surface is not None:
-                chosen += [rows for edit in changed if len(rows := self._surface.dependents(edit))]
             rows = chosen[0] if len(chosen) == 1 else np.unique(np.concatenate(chosen))
-            parts = {}
-            for edit, members in enumerate(self._members):
-                _, members_at, at = np.intersect1d(members, rows, assume_unique=True, return_indices=True)
-                if len(members_at):
-                    parts[edit] = members_at, at
-            followers = np.zeros(0, np.int64)
+            members = self._members_in(rows)
+            nothing = np.zeros(0, np.int64)
+            plan = _Plan(rows, members, members, nothing, nothing)
             if self._surface is not None:
-                followers = np.flatnonzero(np.isin(self._surface.followers.rows, rows))
-            self._plans[changed] = _Plan(rows, parts, followers)
+                plan = self._plan_followers(self._surface, plan, changed)
+            self._plans[changed] = plan
         return self._plans[changed]
+
+    def _members_in(self, rows: Rows) -> _Members:
+        """Return rows with the members of every edit among them."""
+        parts = {}
+        for edit, members in enumerate(self._members):
+            _, members_at, at = np.intersect1d(members, rows, assume_unique=True, return_indices=True)
+            if len(members_at):
+                parts[edit] = members_at, at
+        return _Members(rows, parts)
+
+    def _plan_followers(self, surface: _Surface, plan: _Plan, changed: frozenset[int]) -> _Plan:
+        """Return the plan extended by the rows that follow the changed edits."""
+        followers = surface.followers
+        dependents = [rows for edit in changed if len(rows := surface.dependents(edit))]
+        rows = np.unique(np.concatenate([plan.rows, *dependents])) if dependents else plan.rows
+        index = np.flatnonzero(np.isin(followers.rows, rows))
+        pushed = followers.rows[index[followers.edits[index] < 0]]
+        shapes = plan.colors
+        # leaving out a few rows would only break the runs of consecutive members
+        if 2 * len(pushed) > len(plan.rows):
+            shapes = self._members_in(plan.rows[~np.isin(plan.rows, pushed)])
+        added = index[np.isin(followers.edits[index], list(changed))]
+        return _Plan(rows, plan.colors, shapes, index, added)
 
     def _coverage_of(self, edit: int) -> Mapping[str, Tensor]:
         if edit not in self._coverage:
@@ -326,6 +381,9 @@ class Composer:
 class _Surface:
     """States of the rows that others follow, see `Followers`, composed like a scene of their own.
 
+    Only this class writes the attributes in `FOLLOWED` of pushed rows. Those of added rows are first written
+    by the composer, without following.
+
     Args:
         scene: the extended scene
         gdfs: its edits
@@ -341,14 +399,17 @@ class _Surface:
         coverage_of: Callable[[int], Mapping[str, Tensor]],
     ) -> None:
         self.followers = followers
-        self._scene = scene
         states, self._gdfs = state_scene(scene, gdfs, followers)
         self._index = {id(gdf): edit for edit, gdf in enumerate(self._gdfs)}
         self._coverage_of = coverage_of
         self._composer = Composer(states, self._gdfs, self._covers)
+        rows = torch.from_numpy(followers.rows)
+        self._own = pack_shapes(scene, rows).numpy()  # the rows without following. [F,11]
+        self._drawn = scene.means[rows].float().numpy()  # their centers in the last picture. [F,3]
         self._before = pack_shapes(states).numpy()
-        self._rows = torch.from_numpy(followers.rows)
-        self._uncarried = scene.means[self._rows].clone()  # centers before following, from the last update
+        self._motions = rest_motions(self._before)
+        self._is_anchor = np.zeros(len(states), bool)
+        self._is_anchor[followers.anchors] = True
         self._dependents: dict[int, Rows] = {}
         self._sliced: dict[
             int, tuple[Tensor, int, Tensor]
@@ -360,73 +421,56 @@ class _Surface:
             self._dependents[edit] = self.followers.dependents(edit)
         return self._dependents[edit]
 
-    def restore(self, gaussians: Gaussians, index: Rows, moving: Collection[str]) -> Tensor:
-        """Write the rows as they are without following, before the composer rewrites them.
+    def release(self, shapes: Shapes, index: Rows) -> None:
+        """Write the centers of added rows as they are without following, before the composer moves them.
 
         Args:
-            gaussians: the composed scene; updated in place
+            shapes: the composed scene, see `Composer._shapes`; updated in place
             index: indices of the rows, see `Followers`. [F]
-            moving: attributes that the composer rewrites in these rows
-
-        Returns:
-            Their centers in the last picture. [F,3]
         """
-        rows = self._rows[index]
-        last = gaussians.means[rows]
-        gaussians.means[rows] = self._uncarried[index]  # the composer measures the movement
-        for name in FOLLOWED:
-            if name not in moving:
-                getattr(gaussians, name)[rows] = getattr(self._scene, name)[rows].float()
-        return last
+        release_centers(shapes[0], index, self.followers.rows, self._own)
 
     def carry(
         self,
-        gaussians: Gaussians,
+        shapes: Shapes,
         index: Rows,
-        last: Tensor,
+        added: Rows,
         stack: Sequence[tuple[int, Layer]],
         blend: str,
     ) -> float:
         """Write the rows that follow; return the largest movement of a center.
 
         Args:
-            gaussians: the composed scene, in which no row follows another; updated in place
+            shapes: the composed scene, see `Composer._shapes`; updated in place
             index: indices of the rows to write, see `Followers`. [F]
-            last: their centers in the last picture. [F,3]
+            added: indices of the added rows among them that the composer has written. [G]
             stack: active layers with the index of their edit, lowest first
             blend: one of `BLENDS`
         """
         followers = self.followers
-        rows = self._rows[index]
-        self._uncarried[index] = gaussians.means[rows]
-        active = {edit for edit, _ in stack}
-        is_active = np.isin(followers.edits, list(active))
-        is_active |= (followers.edits < 0) & bool(active & followers.pushing)
-        index = index[is_active[index]]
-        if len(index) and active - followers.pushing:
-            layers = [self._layer(edit, layer) for edit, layer in stack if len(followers.changed[edit][0])]
-            self._composer.update(layers, blend)
-            self._write(gaussians, index[followers.edits[index] >= 0], is_pushed=False)
-            self._write(gaussians, index[followers.edits[index] < 0], is_pushed=True)
-        steps = (gaussians.means[rows] - last).square().sum(dim=1)
-        return math.sqrt(float(steps.max())) if len(steps) else 0.0
-
-    def _write(self, gaussians: Gaussians, index: Rows, is_pushed: bool) -> None:
-        """Write added rows, or pushed rows."""
-        if not len(index):
-            return
-        states = self._composer.gaussians
-        rows = self._rows[index]
-        shapes = pack_shapes(gaussians, rows)
-        own = shapes.clone()
-        if is_pushed:
-            own = pack_shapes(states, torch.from_numpy(self.followers.own[index]))
-        anchors = self.followers.anchors[index]
-        weights = self.followers.weights[index]
-        both = self._before, pack_shapes(states).numpy()
-        carry_fast(shapes.numpy(), own.numpy(), both, anchors, weights, is_pushed)
-        for name, values in unpack_shapes(shapes).items():
-            getattr(gaussians, name)[rows] = values
+        layers = [self._layer(edit, layer) for edit, layer in stack if len(followers.changed[edit][0])]
+        changed = self._composer.update(layers, blend).rows
+        states = self._composer._shapes()
+        measure_motions(self._motions, changed[self._is_anchor[changed]], self._before, states)
+        gather_shapes(self._own, added, shapes, followers.rows)
+        follows = np.zeros(len(followers.changed) + 1, bool)
+        follows[[0, *(edit + 1 for edit, _ in stack)]] = True
+        table = followers.rows, followers.edits, followers.own, followers.anchors, followers.weights
+        count = 1 + len(index) // _CARRIED_ROWS
+        cuts = [len(index) * part // count for part in range(count + 1)]
+        moves = run_chunks(
+            lambda chunk: carry_fast(
+                shapes,
+                (self._own, self._drawn),
+                index[cuts[chunk] : cuts[chunk + 1]],
+                table,
+                follows,
+                (self._before, states),
+                self._motions,
+            ),
+            count,
+        )
+        return math.sqrt(max(moves))
 
     def _layer(self, edit: int, layer: Layer) -> Layer:
         """Return a layer restricted to the states."""
@@ -466,125 +510,3 @@ def _weight_sum(parts: Sequence[_LayerSlice], kind: str, count: int) -> Floats:
         weights = part.weights[part.members] if len(part.weights) else np.float32(1.0)
         sums[part.at] += weights * np.float32(part.layer.clamped_strength)
     return np.maximum(sums, np.float32(1.0))
-
-
-@kernel(cache=True, allocates=True)
-def _add_offsets(
-    total: Floats,
-    part: tuple[Rows, Rows, Floats],
-    stored: tuple[NDArray[Any], NDArray[Any]],
-    used: Rows,
-    factors: Floats,
-    gain: np.float32,
-    hidden: np.float32,
-    covered: Floats,
-) -> None:
-    """Compute total ← total · (1 − m hidden c) + m gain Δ for one layer and attribute, see `compose_layers`.
-
-    Args:
-        total: sums so far, updated in place. [U,c]
-        part: positions of the layer's members in `total` [m], their member indices [m], and the weights of
-            all members [M], or [0] if all are 1
-        stored: end and residual bases. [M,c], [R,M,c]
-        used, factors: see `_Bases.factors`. [U], [1+U,c] or none
-        hidden, covered: share of lower layers that is hidden at coverage 1, and the coverage c [M], or [0] if
-            it is 0 everywhere
-    """
-    (at, members, weights), (end, residual_levels) = part, stored
-    one = np.float32(1.0)
-    width = total.shape[1]
-    offsets = np.zeros(
-        _BLOCK_MEMBERS * width, np.float32
-    )  # of a block of members, which stay in the L1 cache
-    tiles = np.empty((len(factors), _BLOCK_MEMBERS * width), np.float32)
-    for k in range(len(factors)):
-        for i in range(min(_BLOCK_MEMBERS, len(at))):
-            for c in range(width):
-                tiles[k, i * width + c] = factors[k, c]
-    ends = end.reshape(-1)
-    sums = total.reshape(-1)
-    for first in range(0, len(at), _BLOCK_MEMBERS):
-        count = min(_BLOCK_MEMBERS, len(at) - first)
-        low = members[first]
-        row = at[first]
-        if members[first + count - 1] - low == count - 1:  # consecutive members: contiguous in memory
-            for k in range(len(factors)):
-                tile = tiles[k]
-                if k == 0:
-                    run = ends[low * width : (low + count) * width]
-                    for j in range(count * width):
-                        offsets[j] = tile[j] * np.float32(run[j])
-                else:
-                    levels = residual_levels[used[k - 1]].reshape(-1)[low * width : (low + count) * width]
-                    for j in range(count * width):
-                        offsets[j] += tile[j] * np.float32(levels[j])
-        else:
-            for k in range(len(factors)):
-                for i in range(count):
-                    for c in range(width):
-                        j = i * width + c
-                        if k == 0:
-                            offsets[j] = factors[0, c] * np.float32(end[members[first + i], c])
-                        else:
-                            level = residual_levels[used[k - 1], members[first + i], c]
-                            offsets[j] += factors[k, c] * np.float32(level)
-        if len(weights) == 0 and len(covered) == 0 and at[first + count - 1] - row == count - 1:
-            run = sums[row * width : (row + count) * width]
-            for j in range(count * width):
-                run[j] += gain * offsets[j]
-            continue
-        for i in range(count):
-            row = at[first + i]
-            member = members[first + i]
-            weight = one
-            if len(weights):
-                weight = weights[member]
-                if weight == 0.0:
-                    continue
-            for c in range(width):
-                if len(covered):
-                    total[row, c] *= one - (weight * hidden) * covered[member]
-                total[row, c] += (weight * gain) * offsets[i * width + c]
-
-
-@kernel(cache=True, allocates=True)
-def _finish(
-    after: Floats, before: Floats, rows: Rows, total: Floats, weight_sum: Floats, measure: bool
-) -> float:
-    """Compute after ← before + total / weight_sum in some rows; return the largest squared movement.
-
-    Args:
-        after, before: attribute values, `after` is updated in place. [N,c]
-        rows: rows to write. [U]
-        total: sums, overwritten. [U,c]
-        weight_sum: at least 1; [0] if all are 1. [U]
-        measure: compute the movement of a center; otherwise the result is 0
-    """
-    largest = np.float32(0.0)
-    width = total.shape[1]
-    for first in range(0, len(rows), _BLOCK_MEMBERS):
-        count = min(_BLOCK_MEMBERS, len(rows) - first)
-        if len(weight_sum):
-            for i in range(first, first + count):
-                for c in range(width):
-                    total[i, c] /= weight_sum[i]
-        if measure:
-            for i in range(first, first + count):
-                row = rows[i]
-                step = np.float32(0.0)
-                for c in range(3):
-                    moved = before[row, c] + total[i, c] - after[row, c]
-                    step += moved * moved
-                largest = max(largest, step)
-        row = rows[first]
-        if rows[first + count - 1] - row == count - 1:
-            new_run = after[row : row + count].reshape(-1)
-            old_run = before[row : row + count].reshape(-1)
-            own_run = total[first : first + count].reshape(-1)
-            for j in range(count * width):
-                new_run[j] = old_run[j] + own_run[j]
-            continue
-        for i in range(first, first + count):
-            for c in range(width):
-                after[rows[i], c] = before[rows[i], c] + total[i, c]
-    return float(largest)

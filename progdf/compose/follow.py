@@ -269,16 +269,15 @@ def carry_rows(own: Tensor, before: Tensor, after: Tensor, weights: Tensor) -> T
     )
 
 
-def carry_pushed(composed: Tensor, own: Tensor, before: Tensor, after: Tensor) -> Tensor:
+def carry_pushed(own: Tensor, before: Tensor, after: Tensor) -> Tensor:
     """Return pushed rows that follow their own row under the other edits.
 
     Args:
-        composed: the rows under all edits, kept where the other edits change nothing. [F,11]
         own: the rows under paint alone. [F,11]
         before, after: the rows in the original and under the other edits. [F,11]
 
     Returns:
-        [F,11] float32. Where paint changes nothing, these are the rows under the other edits.
+        [F,11] float32. Where one of the two changes nothing, these are the rows under the other.
     """
     weights = torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64).expand(len(own), 4)
     carried = carry_rows(own, before[:, None].expand(-1, 4, -1), after[:, None].expand(-1, 4, -1), weights)
@@ -287,7 +286,7 @@ def carry_pushed(composed: Tensor, own: Tensor, before: Tensor, after: Tensor) -
         is_pushed = (own[:, columns] != before[:, columns]).any(dim=1, keepdim=True)
         is_moved = (after[:, columns] != before[:, columns]).any(dim=1, keepdim=True)
         both = torch.where(is_pushed, carried[:, columns], after[:, columns])
-        parts.append(torch.where(is_moved, both, composed[:, columns]))
+        parts.append(torch.where(is_moved, both, own[:, columns]))
     return torch.cat(parts, dim=1)
 
 

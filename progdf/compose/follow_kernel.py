@@ -1,4 +1,7 @@
-"""Fast version of `carry_rows` and `carry_pushed` in `progdf.compose.follow`, for dragging sliders."""
+"""Fast version of `carry_rows` and `carry_pushed` in `progdf.compose.follow`, for dragging sliders.
+
+The motion of a state is measured once, when it changes, and then applied to all rows that lie on it.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,16 @@ from progdf.rasterize.cpu.jit import kernel
 Floats = NDArray[np.float32]
 Rows = NDArray[np.int64]
 Quat = tuple[float, float, float, float]
+Shapes = tuple[Floats, Floats, Floats, Floats]
+"""Followed attributes of a scene: means, log-scales, quaternions and opacity logits. [N,3|3|4|1]"""
+Doubles = NDArray[np.float64]
+Motions = tuple[NDArray[np.bool_], Doubles, Doubles, Doubles, Doubles]
+"""Change of each state from the original to the composed scene.
+
+Geometry or opacity differs [E,2]; turn, a unit quaternion, and mean change of the log-scales [E,5]; center
+before and after [E,2,3]; the turn as a matrix, times the scale [E,3,3]; opacity above the least that is
+drawn, before and after [E,2].
+"""
 
 _MIN_DRAWN_OPACITY = 1 / 255  # as in `follow`
 _MIN_OPACITY = 1e-30
@@ -53,108 +66,276 @@ def _differs(a: Floats, i: int, b: Floats, j: int, first: int, last: int) -> boo
 
 
 @kernel(cache=True)
-def carry_fast(
-    shapes: Floats,
-    own: Floats,
-    states: tuple[Floats, Floats],
-    anchors: Rows,
-    weights: NDArray[np.float64],
-    pushed: bool,
-) -> None:
-    """Write rows that follow their anchors.
+def release_centers(means: Floats, index: Rows, rows: Rows, own: Floats) -> None:
+    """Write the centers of following rows as they are without following.
 
     Args:
-        shapes: the rows under all edits, as of `pack_shapes`; updated in place. [F,11]
-        own: the rows under their own edit, or under paint alone. [F,11]
-        states: all states in the original and under the other edits. [E,11] each
-        anchors: states of the anchors. [F,4]
-        weights: their weights, sum 1. [F,4]
-        pushed: the rows are pushed ones, whose anchor is their own row
+        means: centers of the scene, updated in place. [N,3]
+        index: indices of the rows to write. [G]
+        rows: rows of the scene that follow. [F]
+        own: the rows without following, as of `pack_shapes`. [F,11]
     """
+    for i in index:
+        for c in range(3):
+            means[rows[i], c] = own[i, c]
+
+
+@kernel(cache=True)
+def gather_shapes(own: Floats, index: Rows, shapes: Shapes, rows: Rows) -> None:
+    """Copy following rows from a scene.
+
+    Args:
+        own: shapes of the following rows, as of `pack_shapes`; updated in place. [F,11]
+        index: indices of those to copy. [G]
+        shapes: followed attributes of the scene. [N,c] each
+        rows: rows of the scene that follow. [F]
+    """
+    for i in index:
+        _copy_row(own, i, shapes, rows[i])
+
+
+@kernel(inline=True)
+def _copy_row(own: Floats, i: int, shapes: Shapes, row: int) -> None:
+    """Copy one row of a scene to a table."""
+    means, log_scales, quats, logits = shapes
+    for c in range(3):
+        own[i, c] = means[row, c]
+        own[i, 3 + c] = log_scales[row, c]
+    for c in range(4):
+        own[i, 6 + c] = quats[row, c]
+    own[i, 10] = logits[row, 0]
+
+
+def rest_motions(before: Floats) -> Motions:
+    """Return the motions of states that are as in the original. [E,11]"""
+    count = len(before)
+    moves = np.zeros((count, 2), np.bool_)
+    turns = np.zeros((count, 5))
+    turns[:, 0] = 1.0
+    means = np.repeat(before[:, None, :3], 2, axis=1).astype(np.float64)
+    opacities = 1.0 / (1.0 + np.exp(-before[:, 10].astype(np.float64)))
+    visible = np.maximum(opacities - _MIN_DRAWN_OPACITY, 0.0)
+    matrices = np.repeat(np.eye(3)[None], count, axis=0)
+    return moves, turns, means, matrices, np.repeat(visible[:, None], 2, axis=1)
+
+
+@kernel(cache=True)
+def measure_motions(motions: Motions, index: Rows, before: Floats, after: Shapes) -> None:
+    """Update the motions of states that have changed.
+
+    Args:
+        motions: motions of all states, updated in place
+        index: the changed states. [e]
+        before: states in the original, as of `pack_shapes`. [E,11]
+        after: states under the other edits. [E,c] each
+    """
+    moves, turns, centers, matrices, visible = motions
+    means, log_scales, quats, logits = after
+    for state in index:
+        differs = False
+        for c in range(3):
+            differs |= before[state, c] != means[state, c] or before[state, 3 + c] != log_scales[state, c]
+        for c in range(4):
+            differs |= before[state, 6 + c] != quats[state, c]
+        moves[state, 0] = differs
+        turn = (1.0, 0.0, 0.0, 0.0)
+        growth = 0.0
+        if differs:
+            w, x, y, z = _normalize(
+                float(before[state, 6]),
+                float(before[state, 7]),
+                float(before[state, 8]),
+                float(before[state, 9]),
+            )
+            new = _normalize(
+                float(quats[state, 0]), float(quats[state, 1]), float(quats[state, 2]), float(quats[state, 3])
+            )
+            turn = _multiply(new, (w, -x, -y, -z))
+            for c in range(3):
+                growth += (float(log_scales[state, c]) - float(before[state, 3 + c])) / 3.0
+        turns[state, 0] = turn[0]
+        turns[state, 1] = turn[1]
+        turns[state, 2] = turn[2]
+        turns[state, 3] = turn[3]
+        turns[state, 4] = growth
+        _write_matrix(matrices[state], turn, math.exp(growth))
+        for c in range(3):
+            centers[state, 1, c] = means[state, c]
+        moves[state, 1] = before[state, 10] != logits[state, 0]
+        visible[state, 1] = visible[state, 0]
+        if moves[state, 1]:
+            visible[state, 1] = max(_sigmoid(logits[state, 0]) - _MIN_DRAWN_OPACITY, 0.0)
+
+
+@kernel(inline=True)
+def _write_matrix(matrix: Doubles, q: Quat, scale: float) -> None:
+    """Write the rotation matrix of a unit quaternion, times a scale. [3,3]"""
+    w, x, y, z = q
+    matrix[0, 0] = scale * (1.0 - 2.0 * (y * y + z * z))
+    matrix[0, 1] = scale * 2.0 * (x * y - w * z)
+    matrix[0, 2] = scale * 2.0 * (x * z + w * y)
+    matrix[1, 0] = scale * 2.0 * (x * y + w * z)
+    matrix[1, 1] = scale * (1.0 - 2.0 * (x * x + z * z))
+    matrix[1, 2] = scale * 2.0 * (y * z - w * x)
+    matrix[2, 0] = scale * 2.0 * (x * z - w * y)
+    matrix[2, 1] = scale * 2.0 * (y * z + w * x)
+    matrix[2, 2] = scale * (1.0 - 2.0 * (x * x + y * y))
+
+
+@kernel(cache=True)
+def carry_fast(
+    shapes: Shapes,
+    kept: tuple[Floats, Floats],
+    index: Rows,
+    table: tuple[Rows, Rows, Rows, Rows, Doubles],
+    follows: NDArray[np.bool_],
+    states: tuple[Floats, Shapes],
+    motions: Motions,
+) -> float:
+    """Write rows that follow their anchors; return the largest squared movement of a center.
+
+    Args:
+        shapes: followed attributes of the scene, updated in place. [N,c] each
+        kept: following rows without following [F,11], of which pushed ones are updated in place; and their
+            centers in the last picture, updated in place. [F,3]
+        index: indices of the rows to write. [f]
+        table: rows, edits, own states, anchors and weights, see `Followers`. [F], [F], [F], [F,4], [F,4]
+        follows: by edit + 1: its rows follow; the first is for pushed rows
+        states: states in the original [E,11], and composed. [E,c] each
+        motions: motions of the states
+    """
+    own, drawn = kept
+    rows, edits, own_states, anchors, weights = table
     before, after = states
-    for i in range(len(shapes)):
-        moves = False
-        fades = False
-        for k in range(4):
-            if weights[i, k] > 0.0:
-                state = anchors[i, k]
-                moves |= _differs(before, state, after, state, 0, 10)
-                fades |= before[state, 10] != after[state, 10]
+    moves, _, _, _, visible = motions
+    means, log_scales, quats, logits = shapes
+    largest = 0.0
+    for i in index:
         first = anchors[i, 0]
-        if moves and pushed and not _differs(own, i, before, first, 0, 10):
-            for c in range(10):
-                shapes[i, c] = after[first, c]
-        elif moves:
-            _carry_geometry(shapes, own, before, after, anchors, weights, i)
-        if fades and pushed and own[i, 10] == before[first, 10]:
-            shapes[i, 10] = after[first, 10]
+        pushed = own_states[i] >= 0
+        if pushed:
+            _copy_row(own, i, after, own_states[i])
+        is_moved = False
+        fades = False
+        if follows[edits[i] + 1]:
+            for k in range(4):
+                if weights[i, k] > 0.0:
+                    is_moved |= moves[anchors[i, k], 0]
+                    fades |= moves[anchors[i, k], 1]
+        row = rows[i]
+        if not is_moved:
+            _write_geometry(shapes, row, own, i)
+        elif pushed and not _differs(own, i, before, first, 0, 10):
+            for c in range(3):
+                means[row, c] = after[0][first, c]
+                log_scales[row, c] = after[1][first, c]
+            for c in range(4):
+                quats[row, c] = after[2][first, c]
+        elif pushed:
+            _carry_with(shapes, row, own, i, first, motions)
+        else:
+            _carry_geometry(shapes, row, own, i, anchors, weights, motions)
+        logit = own[i, 10]
+        if fades and pushed and logit == before[first, 10]:
+            logit = after[3][first, 0]
         elif fades:
-            visible = 0.0
+            old = 0.0
             remaining = 0.0
             for k in range(4):
-                state = anchors[i, k]
-                visible += weights[i, k] * max(_sigmoid(before[state, 10]) - _MIN_DRAWN_OPACITY, 0.0)
-                remaining += weights[i, k] * max(_sigmoid(after[state, 10]) - _MIN_DRAWN_OPACITY, 0.0)
-            shapes[i, 10] = own[i, 10]
-            if visible > 0.0 and remaining < visible:
-                opacity = max(_sigmoid(own[i, 10]) * (remaining / visible), _MIN_OPACITY)
-                shapes[i, 10] = math.log(opacity) - math.log1p(-opacity)
+                old += weights[i, k] * visible[anchors[i, k], 0]
+                remaining += weights[i, k] * visible[anchors[i, k], 1]
+            if old > 0.0 and remaining < old:
+                opacity = max(_sigmoid(logit) * (remaining / old), _MIN_OPACITY)
+                logit = np.float32(math.log(opacity) - math.log1p(-opacity))
+        logits[row, 0] = logit
+        step = 0.0
+        for c in range(3):
+            step += (means[row, c] - drawn[i, c]) ** 2
+            drawn[i, c] = means[row, c]
+        largest = max(largest, step)
+    return largest
+
+
+@kernel(inline=True)
+def _write_geometry(shapes: Shapes, row: int, own: Floats, i: int) -> None:
+    """Write the geometry of a row of the scene from a table."""
+    means, log_scales, quats, _ = shapes
+    for c in range(3):
+        means[row, c] = own[i, c]
+        log_scales[row, c] = own[i, 3 + c]
+    for c in range(4):
+        quats[row, c] = own[i, 6 + c]
+
+
+@kernel(inline=True)
+def _carry_with(shapes: Shapes, row: int, own: Floats, i: int, state: int, motions: Motions) -> None:
+    """Write the geometry of row `i` of the table, which has a single anchor."""
+    means, log_scales, quats, _ = shapes
+    _, turns, centers, matrices, _ = motions
+    x = own[i, 0] - centers[state, 0, 0]
+    y = own[i, 1] - centers[state, 0, 1]
+    z = own[i, 2] - centers[state, 0, 2]
+    for c in range(3):
+        arm = matrices[state, c, 0] * x + matrices[state, c, 1] * y + matrices[state, c, 2] * z
+        means[row, c] = centers[state, 1, c] + arm
+        log_scales[row, c] = own[i, 3 + c] + turns[state, 4]
+    turn = (turns[state, 0], turns[state, 1], turns[state, 2], turns[state, 3])
+    quat = _multiply(turn, (float(own[i, 6]), float(own[i, 7]), float(own[i, 8]), float(own[i, 9])))
+    quats[row, 0] = quat[0]
+    quats[row, 1] = quat[1]
+    quats[row, 2] = quat[2]
+    quats[row, 3] = quat[3]
 
 
 @kernel()
 def _carry_geometry(
-    shapes: Floats,
+    shapes: Shapes,
+    row: int,
     own: Floats,
-    before: Floats,
-    after: Floats,
-    anchors: Rows,
-    weights: NDArray[np.float64],
     i: int,
+    anchors: Rows,
+    weights: Doubles,
+    motions: Motions,
 ) -> None:
-    """Write the geometry of row `i`; arguments as of `carry_fast`."""
+    """Write the geometry of row `i` of the table; arguments as of `carry_fast`."""
+    means, log_scales, quats, _ = shapes
+    _, turns, centers, _, _ = motions
     tw = tx = ty = tz = 0.0
     px = py = pz = 0.0
     nx = ny = nz = 0.0
     growth = 0.0
-    base = (1.0, 0.0, 0.0, 0.0)
+    base = turns[anchors[i, 0]]
     for k in range(4):
-        state = anchors[i, k]
         weight = weights[i, k]
-        old = _normalize(
-            float(before[state, 6]), float(before[state, 7]), float(before[state, 8]), float(before[state, 9])
-        )
-        new = _normalize(
-            float(after[state, 6]), float(after[state, 7]), float(after[state, 8]), float(after[state, 9])
-        )
-        turn = _multiply(new, (old[0], -old[1], -old[2], -old[3]))
-        if k == 0:
-            base = turn
-        sign = weight
-        if turn[0] * base[0] + turn[1] * base[1] + turn[2] * base[2] + turn[3] * base[3] < 0.0:
-            sign = -weight
-        tw += sign * turn[0]
-        tx += sign * turn[1]
-        ty += sign * turn[2]
-        tz += sign * turn[3]
-        px += weight * before[state, 0]
-        py += weight * before[state, 1]
-        pz += weight * before[state, 2]
-        nx += weight * after[state, 0]
-        ny += weight * after[state, 1]
-        nz += weight * after[state, 2]
-        for c in range(3, 6):
-            growth += weight * (float(after[state, c]) - float(before[state, c])) / 3.0
+        if weight > 0.0:
+            state = anchors[i, k]
+            turn = turns[state]
+            sign = weight
+            if turn[0] * base[0] + turn[1] * base[1] + turn[2] * base[2] + turn[3] * base[3] < 0.0:
+                sign = -weight
+            tw += sign * turn[0]
+            tx += sign * turn[1]
+            ty += sign * turn[2]
+            tz += sign * turn[3]
+            growth += weight * turn[4]
+            center = centers[state]
+            px += weight * center[0, 0]
+            py += weight * center[0, 1]
+            pz += weight * center[0, 2]
+            nx += weight * center[1, 0]
+            ny += weight * center[1, 1]
+            nz += weight * center[1, 2]
     q = _normalize(tw, tx, ty, tz)
     arm = (0.0, float(own[i, 0]) - px, float(own[i, 1]) - py, float(own[i, 2]) - pz)
     turned = _multiply(_multiply(q, arm), (q[0], -q[1], -q[2], -q[3]))
     scale = math.exp(growth)
     quat = _multiply(q, (float(own[i, 6]), float(own[i, 7]), float(own[i, 8]), float(own[i, 9])))
-    shapes[i, 0] = nx + scale * turned[1]
-    shapes[i, 1] = ny + scale * turned[2]
-    shapes[i, 2] = nz + scale * turned[3]
-    for c in range(3, 6):
-        shapes[i, c] = own[i, c] + growth
-    shapes[i, 6] = quat[0]
-    shapes[i, 7] = quat[1]
-    shapes[i, 8] = quat[2]
-    shapes[i, 9] = quat[3]
+    means[row, 0] = nx + scale * turned[1]
+    means[row, 1] = ny + scale * turned[2]
+    means[row, 2] = nz + scale * turned[3]
+    for c in range(3):
+        log_scales[row, c] = own[i, 3 + c] + growth
+    quats[row, 0] = quat[0]
+    quats[row, 1] = quat[1]
+    quats[row, 2] = quat[2]
+    quats[row, 3] = quat[3]

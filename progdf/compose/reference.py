@@ -208,7 +208,7 @@ def _follow(scene: Gaussians, composed: Gaussians, layers: Sequence[Layer], blen
     rows = pushed.nonzero()[:, 0]
     surface = pack_shapes(_compose(scene, others, blend), rows)
     paint = pack_shapes(_compose(scene, [layer for layer in layers if id(layer.gdf) in pushing], blend), rows)
-    shapes[rows] = carry_pushed(shapes[rows], paint, before[rows], surface)
+    shapes[rows] = carry_pushed(paint, before[rows], surface)
     for gdf in edits.values():
         anchors = gdf.anchors
         if anchors is None or not len(anchors):

@@ -49,9 +49,9 @@ export class Surface {
     const to = at(target, row), from = own < 0 ? to : at(after, own);
     for (const [names, follow] of [[GEOMETRY, carryGeometry], [OPACITY, carryOpacity]]) {
       const differs = (a, b) => names.some((name) => a[name].some((x, c) => x !== b[name][c]));
-      if (!used.some(({ old, now }) => differs(old, now))) continue;
-      if (own < 0 || differs(from, used[0].old)) follow(to, from, used);
-      else for (const name of names) to[name].set(used[0].now[name]);
+      const moves = used.some(({ old, now }) => differs(old, now));
+      if (moves && (own < 0 || differs(from, used[0].old))) follow(to, from, used);
+      else for (const name of names) to[name].set((moves ? used[0].now : from)[name]);
     }
   }
 }
