@@ -15,6 +15,7 @@ from typing import Any, Literal, SupportsFloat
 import torch
 from PIL.Image import Image
 
+from progdf.compose.layer_paint import encode
 from progdf.compose.layers import Layer, check_layers
 from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, Gaussians
@@ -26,7 +27,6 @@ from .camera.view_camera import LARGEST_SIDE, ViewCamera, first_camera
 from .files.document import Document
 from .files.web_page import PageOptions, camera_json, first_state, picture, write_page
 from .state.layers import largest_strength
-from .state.paint import encode
 from .state.view_state import LayerState, ViewState
 from .web.container import pack
 from .web.page import PageTexts, build_widget

@@ -75,8 +75,13 @@ def _coverage_of_sizes(size: Tensor, floor: float) -> Tensor:
     return smoothstep(size / max(floor, _SHARE_OF_LARGEST * largest)).float()
 
 
+def color_coverage(change: Tensor) -> Tensor:
+    """Return the coverage of colors for changes of SH coefficients, see `coverage`. [M,B,3] -> [M]"""
+    return _coverage_of_sizes(C0 * change.norm(dim=1).amax(dim=1), _VISIBLE_COLOR)
+
+
 def _color_change(field: BakedField) -> Tensor:
-    changes = [field.attributes[name].end for name in ("sh0", "shN") if name in field.attributes]
+    changes = [field.attributes[name].end for name in _COLORS if name in field.attributes]
     if not changes:
         return torch.zeros(0)
     together = torch.cat([change.reshape(len(change), -1, 3) for change in changes], dim=1)

@@ -24,7 +24,13 @@ from progdf.gaussians import ZERO, Origin
 from progdf.io.atomic import atomic_write, state_folder
 from progdf.io.cameras import camera_in_picture
 from progdf.io.images import flatten_onto, open_picture, picture_size
-from progdf.io.picture_camera import camera_chunk, edits_in_picture, save_picture_camera
+from progdf.io.picture_camera import (
+    PictureLayers,
+    camera_chunk,
+    edits_in_picture,
+    layers_in_picture,
+    save_picture_camera,
+)
 
 from .match_views import ViewMatch, match_views, matched_camera, view_thumbnail
 
@@ -41,6 +47,19 @@ class TakenView:
     image: NDArray[np.uint8]  # thumbnail. [H,W,3]
     camera: Camera  # at the size of the taken picture
     edits: str = ""  # names of the visible edits, "" for the original
+    layers: PictureLayers | None = None  # the visible edits as layers; None if a file is unknown
+
+    def checked_layers(self, picture: str) -> PictureLayers | None:
+        """Return the layers for the metadata of a picture that shows this view; None for the original.
+
+        Raises:
+            ProgdfError: the view shows edits whose files are unknown; the message names the picture.
+        """
+        if self.edits and self.layers is None:
+            raise ProgdfError(
+                f"{picture} shows edits ({self.edits}) whose files are unknown; take a view without them"
+            )
+        return self.layers
 
 
 @dataclass(frozen=True)
@@ -58,7 +77,12 @@ class FoundView:
 
 
 def remember_view(
-    scene: Path, image: NDArray[np.uint8], camera: Camera, edits: Sequence[str] = (), origin: Origin = ZERO
+    scene: Path,
+    image: NDArray[np.uint8],
+    camera: Camera,
+    edits: Sequence[str] = (),
+    origin: Origin = ZERO,
+    layers: PictureLayers | None = None,
 ) -> None:
     """Remember a view that was taken of a scene. Write errors are ignored.
 
@@ -68,6 +92,7 @@ def remember_view(
         camera: its camera, relative to `origin`
         edits: names of the visible edits
         origin: origin of the scene
+        layers: see `TakenView.layers`
     """
     folder = _folder(scene)
     with contextlib.suppress(OSError, ProgdfError):
@@ -76,7 +101,7 @@ def remember_view(
         number = int(files[-1].stem) + 1 if files else 1
         path = folder / f"{number:06d}.png"
         with atomic_write(path) as temporary_file:
-            chunk = camera_chunk(camera, edits, origin)
+            chunk = camera_chunk(camera, edits, origin, layers=layers)
             Image.fromarray(view_thumbnail(image)).save(temporary_file, "PNG", pnginfo=chunk)
         for old in [*files, path][:-MAX_VIEWS]:
             old.unlink(missing_ok=True)
@@ -94,7 +119,11 @@ def taken_views(scene: Path, origin: Origin = ZERO) -> list[TakenView]:
             camera = camera_in_picture(path, origin)
             if camera is not None:
                 image = np.asarray(flatten_onto(open_picture(path), "white"))
-                views.append(TakenView(image, camera, edits_in_picture(path)))
+                edits = edits_in_picture(path)
+                layers = None
+                with contextlib.suppress(ProgdfError):
+                    layers = layers_in_picture(path)
+                views.append(TakenView(image, camera, edits, layers))
     return views
 
 
@@ -123,14 +152,13 @@ def find_taken_view(path: Path, scene: Path) -> FoundView | None:
         The view; None if the picture shows none of them for certain.
 
     Raises:
-        ProgdfError: the file is not a picture, its camera cannot be written, or the view shows edits.
+        ProgdfError: the file is not a picture, its camera cannot be written, or the view shows edits
+            whose files are unknown.
     """
     found = find_view(path, taken_views(scene, ZERO))
     if found is None or not found.match.certain:
         return None
-    if found.view.edits:
-        raise ProgdfError(f"{path} shows edits ({found.view.edits}); take a view without edits")
-    save_picture_camera(path, found.camera, ZERO)
+    save_picture_camera(path, found.camera, ZERO, found.view.checked_layers(str(path)))
     return found
 
 

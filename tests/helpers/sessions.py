@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from progdf.compose import layer_paint
 from progdf.compose.layers import Gains
 from tests.helpers.ui_rig import bear, first_view
 from viewer.files import document, session
 from viewer.files.session import WindowSession
-from viewer.state import paint, snapshots
+from viewer.state import snapshots
 from viewer.state.view_state import Comparison, Keyframe, LayerGroup, SnapshotPair, Timeline, ViewState
 
 
@@ -21,7 +22,7 @@ def full_view() -> ViewState:
     """Return a view in which every value differs from its default."""
     view = first_view(bear(), 0.25, 0.75)
     ears = bear().gdfs[1].region
-    painted = paint.encode(np.linspace(0, 1, len(ears)))
+    painted = layer_paint.encode(np.linspace(0, 1, len(ears)))
     layers = (
         replace(
             view.layers[1],

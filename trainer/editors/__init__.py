@@ -174,7 +174,7 @@ def check_new_editor(options: EditorOptions) -> None:
 
 def make_editor(
     options: EditorOptions, scene: Gaussians, region: Region, views: Sequence[View],
-    glances: Callable[[], Sequence[RegionThumbnail]] = list,
+    glances: Callable[[], Sequence[RegionThumbnail]] = list, seen: Gaussians | None = None,
 ) -> ImageEditor:  # fmt: skip
     """Return the editor that the options name (see `EditorInput`).
 
@@ -182,4 +182,4 @@ def make_editor(
         ProgdfError: the editor cannot be made.
     """
     row = editor_row(options)
-    return row.make(EditorInput(options.text, scene, region, views, options, glances))
+    return row.make(EditorInput(options.text, scene, region, views, options, glances, seen))

@@ -28,6 +28,7 @@ class EditorInput:
     # Small samples of the region, independent of the views. If there are none, the region's color is computed
     # from the views.
     glances: Callable[[], Sequence[RegionThumbnail]] = list
+    seen: Gaussians | None = None  # the scene that edited pictures show; None: `scene`
 
 
 class ImageEditor(Protocol):

@@ -46,6 +46,7 @@ STEP = 1 / 255
 """Color difference that 8-bit rounding on another machine can cause."""
 
 _MAX_SHIFT_PX = 2  # pixels; a program may have shifted the picture by this much
+_BLOCK_PX = 17  # pixels; contains a JPEG block with subsampled chroma around its center
 STILL = 0.4  # a shift is rated by this quantile of the differences; an edit may change the other pixels
 _EDGE_CONTRAST = 0.02  # color difference of neighboring pixels at an edge; flat areas match at any shift
 # share of the unshifted error that a shift must beat: noise alone favors one shift a little
@@ -90,7 +91,10 @@ def pictures(given: EditorInput) -> PicturesEditor:
                 raise ProgdfError(f"{path} is missing; every picture needs a file for each strength")
     images = {
         view.camera.name: {0.0: view.image}
-        | {s: read_edit(given.scene, view.camera, view.image, path) for s, path in by_strength.items()}
+        | {
+            s: read_edit(given.scene, view.camera, view.image, path, given.seen)
+            for s, path in by_strength.items()
+        }
         for view, by_strength in zip(given.views, paths_by_strength, strict=True)
     }
     bends = {}
@@ -107,17 +111,32 @@ def pictures(given: EditorInput) -> PicturesEditor:
     return PicturesEditor(images, bends, tuple(sorted({*between, *stages})))
 
 
-def read_edit(scene: Gaussians, camera: Camera, image: Tensor, path: Path) -> Tensor:
+def read_edit(
+    scene: Gaussians, camera: Camera, image: Tensor, path: Path, seen: Gaussians | None = None
+) -> Tensor:
     """Return the view `image` of a camera with the change of a picture applied. [H,W,3]
 
     The change is measured at the picture's own size and then shrunk. A shrunk picture differs from a small
     render wherever the scene has fine detail.
 
+    Args:
+        scene: scene of the view
+        camera: camera of the view
+        image: the view. [H,W,3]
+        path: the picture
+        seen: the scene that the picture shows, if it is another: the view takes painted pixels whole
+
     Raises:
         ProgdfError: the picture is broken.
     """
-    original, picture = read_change(scene, path, camera.resize(*picture_size(path)))
+    full_camera = camera.resize(*picture_size(path))
+    original, picture = read_change(scene if seen is None else seen, path, full_camera)
     change = undo_shift(original, picture) - original
+    if seen is not None:
+        loss = (saving_loss(path)(original) - original).abs().amax(dim=2).numpy()
+        bound = torch.from_numpy(ndimage.maximum_filter(loss, _BLOCK_PX)) + STEP
+        painted = change.abs().amax(dim=2, keepdim=True) > bound[..., None]
+        change = change + painted * (original - read_change(scene, path, full_camera)[0])
     return (image + shrink_image(change, (camera.height, camera.width))).clamp(0.0, 1.0)
 
 

@@ -70,6 +70,7 @@ def changed_region(
     cameras: Sequence[Camera],
     threshold: float | None = None,
     say: Callable[[str], None] | None = None,
+    seen: Gaussians | None = None,
 ) -> Region:
     """Return the region of the members that are visible where the pictures differ from the scene.
 
@@ -79,6 +80,7 @@ def changed_region(
         cameras: their cameras, at the rendered size
         threshold: minimum share of a member's visible weight in changed pixels; None: half
         say: receives a log line
+        seen: the scene that the pictures show; None: the original
 
     Raises:
         ProgdfError: a picture cannot be read, or no picture differs.
@@ -87,7 +89,7 @@ def changed_region(
     masks = []
     small_cameras = []
     for path, camera in zip(paths, cameras, strict=True):
-        change = find_change(*read_change(scene, path, camera), saving_loss(path))
+        change = find_change(*read_change(scene if seen is None else seen, path, camera), saving_loss(path))
         small_cameras.append(fit_size(camera.resize(change.shape[1], change.shape[0]), LIFTED_AT))
         masks.append(_close_gaps(_shrink_mask(change, small_cameras[-1])))
     if not any(bool(mask.any()) for mask in masks):

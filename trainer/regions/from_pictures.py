@@ -18,7 +18,6 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import ZERO, Gaussians
 from progdf.io.cameras import load_cameras, save_cameras
 from progdf.io.images import read_mask
-from progdf.io.picture_camera import edits_in_picture
 from progdf.io.picture_files import PictureFolder
 from progdf.region import Region, from_mask
 from progdf.scene.bounds import is_surrounding
@@ -32,6 +31,7 @@ from trainer.editors.pictures import picture_paths, read_change
 from trainer.options import VIEWS, RegionOptions, TrainingViewOptions
 from trainer.store.pretrained import last_model
 from trainer.views.choose import load_given_cameras
+from trainer.views.lower_layers import check_lower_layers, open_lower_layers
 from trainer.views.picture_cameras import rendered_cameras
 from trainer.views.view import (
     BACKGROUND,
@@ -156,12 +156,7 @@ def region_kinds(request: RegionRequest) -> dict[str, Kind]:
         "photomasks": lambda text, scene: from_folder(text, scene, bent=True),
         "text": from_text,
         "scribbles": lambda text, scene: _scribbles_region(text, scene, request),
-        CHANGED: lambda text, scene: changed_region(
-            scene,
-            *_changed_pictures(text, request, scene),
-            request.options.lift_threshold,
-            request.say,
-        ),
+        CHANGED: lambda text, scene: _find_changed(text, request, scene),
     }
 
 
@@ -177,8 +172,18 @@ def region_checks(request: RegionRequest) -> dict[str, Check]:
         "photomasks": lambda text: load_cameras(_mask_folder("photomasks", text, request)[1], ZERO),
         "text": of_text,
         "scribbles": lambda text: _scribble_pictures(text, request),
-        CHANGED: lambda text: _changed_pictures(text, request),
+        CHANGED: lambda text: check_lower_layers(_changed_pictures(text, request)[0], request.views.scene),
     }
+
+
+def _find_changed(text: str, request: RegionRequest, scene: Gaussians) -> Region:
+    """Return the region that changed pictures show."""
+    paths, cameras = _changed_pictures(text, request, scene)
+    lower = open_lower_layers(paths, request.views.scene, scene)
+    threshold = request.options.lift_threshold
+    if lower is None:
+        return changed_region(scene, paths, cameras, threshold, request.say)
+    return changed_region(lower.base, paths, cameras, threshold, request.say, lower.seen)
 
 
 def _changed_pictures(
@@ -190,13 +195,6 @@ def _changed_pictures(
         raise ProgdfError(
             "changed needs pictures: use it with --editor pictures:A.png, or name them, changed:A.png,B.png"
         )
-    for path in paths:
-        edits = edits_in_picture(path)
-        if edits:
-            raise ProgdfError(
-                f"{path} was taken with edits on ({edits}), which would count as changed; take the view "
-                "without them, or name the region with --region"
-            )
     return paths, _taken_from(paths, request, scene)
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,9 +18,12 @@ from progdf.field.baked import SliderRemap
 from progdf.field.choose import sample_strengths
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import Gaussians
+from progdf.gdf.file import Gdf
+from progdf.metrics.image import decibels
 from progdf.metrics.slider import Pictures, SliderStatistics, slider_statistics
 from progdf.rasterize import alpha_weights, render
 from progdf.terminal import format_count, group_digits
+from trainer.editors.pictures import read_edit
 from trainer.fit.evaluate import Evaluator
 from trainer.fit.fit import Fitted, choice_figures, field_figures, stored_numbers
 from trainer.optimize.losses import Perceptual
@@ -28,6 +32,8 @@ from trainer.views.setup import TrainingSetup
 from trainer.views.view import View, render_view
 
 from .clip import CLIP_MODEL, Clip, direction, load_clip, same_features
+
+_PAINTED_COLOR = 2 / 255  # smallest color difference that counts as paint
 
 
 @dataclass(frozen=True)
@@ -405,3 +411,37 @@ def _shows_behind(
     return bare & torch.from_numpy(open_[pieces]) | (
         (picture - removed).abs().amax(dim=2) < _PAINT_DIFFERENCE
     )
+
+
+def measure_above(
+    setup: TrainingSetup, gdf: Gdf, files: Sequence[Path], say: Callable[[str], None]
+) -> dict[str, Any]:
+    """Measure an edit above the layers that its pictures show; return the figures for report.json.
+
+    Args:
+        setup: views of the pictures, in their order
+        gdf: edit of the original
+        files: the pictures
+        say: receives the result as a log line
+    """
+    lower = setup.lower
+    if lower is None:
+        return {}
+    edited = lower.compose(gdf)
+    errors = {"painted": 0.0, "rest": 0.0}
+    counts = {"painted": 0, "rest": 0}
+    for view, file in zip(setup.train, files, strict=True):
+        before = render_view(lower.seen, view.camera, setup.background).clamp(0.0, 1.0)
+        target = read_edit(lower.seen, view.camera, before, file)
+        image = render_view(edited, view.camera, setup.background).clamp(0.0, 1.0)
+        painted = (target - before).abs().amax(dim=2) > _PAINTED_COLOR
+        for name, pixels in (("painted", painted), ("rest", ~painted)):
+            errors[name] += float((image - target)[pixels].double().square().sum())
+            counts[name] += 3 * int(pixels.sum())
+    found = {name: round(decibels(error / max(1, counts[name])), 2) for name, error in errors.items()}
+    say(
+        f"above {lower.layers} (blend {lower.layers.blend}): {found['painted']} dB to the picture where it "
+        f"is painted, {found['rest']} dB elsewhere"
+    )
+    strengths = {layer.name: layer.strength for layer in lower.layers.layers}
+    return {"lower_layers": {"strengths": strengths, "blend": lower.layers.blend, "psnr": found}}

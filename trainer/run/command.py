@@ -8,11 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from progdf.camera import Camera
+from progdf.errors import ProgdfError
 from progdf.gaussians import ZERO, Gaussians
 from progdf.io.atomic import read_file
 from progdf.io.cameras import load_cameras
 from progdf.io.json_values import check_text
-from progdf.io.picture_camera import camera_file, stored_picture_camera
+from progdf.io.picture_camera import camera_file, layers_in_picture, stored_picture_camera
 from progdf.rasterize.engines import get_engine
 from progdf.region import Region
 from progdf.scene.regions import check_region, parse_region
@@ -26,6 +27,7 @@ from trainer.store.run_folder import (
     check_folder,
     open_run_folder,
 )
+from trainer.views.lower_layers import check_lower_layers
 from trainer.views.picture_cameras import picture_cameras
 from trainer.views.setup import check_given_cameras
 
@@ -61,6 +63,11 @@ def check_command(options: TrainOptions) -> None:
         cameras = [] if views.cameras is None else load_cameras(views.cameras, ZERO)
         _find_cameras(views.pictures, cameras, options.scene)
         picture_cameras(views.pictures, cameras, ZERO)
+        check_lower_layers(views.pictures, options.scene)
+    elif editor_row(options.editor).run == "removed":
+        for path in editor_row(options.editor).files(options.editor.text):
+            if (shown := layers_in_picture(path)) is not None:
+                raise ProgdfError(f"{path} shows edits ({shown}); take the view without them")
     if not options.resume or load_region(options.out) is None:
         check_region(options.region.region, region_checks(region_request(options, quiet=True)))
     is_new = not folder.root.is_dir() or not any(folder.root.iterdir())

@@ -38,6 +38,7 @@ from trainer.report.measures import (
     expected_measures,
     figures,
     measure,
+    measure_above,
     measure_paint,
 )
 from trainer.report.report import report_picture
@@ -125,9 +126,9 @@ def finish_run(
         gdf = _build_gdf(options, setup, field, grown.scene[len(scene) :])
         pairs = zip(options.views.pictures, setup.train, strict=False)
         pictures = {path: view.camera for path, view in pairs}
-        sharpened = sharpen(scene, gdf, pictures, options.region.region != CHANGED, log)
+        sharpened = sharpen(scene, gdf, pictures, options.region.region != CHANGED, log, setup.seen)
         # the viewer displays the draft during the measurements
-        save_gdf(folder.draft, gdf if sharpened is None else sharpened)
+        save_gdf(folder.draft, _on_original(gdf if sharpened is None else sharpened, setup))
         with log.looks("measure the edit", expected_measures(trajectory)) as count_view:
             judges = replace(evaluator, looked=count_view), replace(reporting, looked=count_view)
             measured = measure(judges, trajectory, fitted, field, remap, perceptual, clip)
@@ -146,6 +147,7 @@ def finish_run(
     if sharpened is not None:
         write_finals(setup, edited, folder, log)
     paint = _measure_paint(folder, setup, options.views.pictures, edited)
+    gdf = _on_original(gdf, setup)
     measures = figures(measured, endpoint, outside)
     if network is not None:
         measures["field"] |= network.figures()
@@ -155,6 +157,7 @@ def finish_run(
         "trajectory": _trajectory_figures(shipped, slider, record),
         **_record_figures(record),
         "paint": paint.figures() if paint is not None else None,
+        **measure_above(setup, gdf, options.views.pictures, log.say),
         "time": {**(_earlier_seconds(folder) if log.refits else {}), **log.rounded_seconds()},
         "memory_mb": log.peak_mb(),
         "plan": to_json(options),
@@ -171,6 +174,11 @@ def _build_gdf(options: TrainOptions, setup: TrainingSetup, field: BakedField, a
     rows = added if len(added) else None
     gdf = Gdf(options.name, setup.region, field, scene_print, instruction, changed_options, added=rows)
     return anchor_added(gdf, setup.scene)
+
+
+def _on_original(gdf: Gdf, setup: TrainingSetup) -> Gdf:
+    """Return an edit of the setup's scene as an edit of the original."""
+    return gdf if setup.lower is None else setup.lower.rebase(gdf)
 
 
 def _view_figures(setup: TrainingSetup, evaluator: Evaluator) -> dict[str, Any]:

@@ -383,7 +383,12 @@ def _linear_visibility_knots(laid: DiscLayout, paints: Sequence[PaintedView], pa
 
 
 def sharpen(
-    scene: Gaussians, recolored: Gdf, pictures: Mapping[Path, Camera], is_named: bool, log: RunLog
+    scene: Gaussians,
+    recolored: Gdf,
+    pictures: Mapping[Path, Camera],
+    is_named: bool,
+    log: RunLog,
+    seen: Gaussians | None = None,
 ) -> Gdf | None:
     """Return the edit with discs for paint finer than the Gaussians; None if there is none, or discs are no
     better.
@@ -394,6 +399,7 @@ def sharpen(
         pictures: changed pictures and the cameras used in training
         is_named: the user named the region, so paint stays inside it
         log: log of the run
+        seen: see `read_edit`
     """
     end = edited_scene(scene, recolored)
     paints = list[PaintedView]()
@@ -401,7 +407,7 @@ def sharpen(
     background = torch.tensor(BACKGROUND)
     for path, camera in pictures.items():
         view = make_view(scene, recolored.region, camera.resize(*picture_size(path)), background)
-        target = read_edit(scene, view.camera, view.image, path)
+        target = read_edit(scene, view.camera, view.image, path, seen)
         target = (view if is_named else view.with_painted([target])).confine(target)
         paint, changed = _missed_paint(end, view, target)
         weights += torch.stack([alpha_weights(scene, view.camera, m)[:, 0] for m in (paint.mask, changed)], 1)

@@ -46,6 +46,7 @@ class RunRecord:
     up: Mapping[str, Any] | None  # the up axis, and the reason for it
     effort: Mapping[str, Any] = field(default_factory=dict)  # chosen strengths, steps, model
     pictures: Mapping[str, str] = field(default_factory=dict)  # paths of changed pictures -> their hashes
+    lower: str = ""  # layers that the changed pictures show, see `LowerLayers`; "" for none
 
     def __post_init__(self) -> None:
         columns = [self.losses.get(name, []) for name in ("step", "left")]
@@ -101,7 +102,8 @@ def reopen_run(root: Path, scene: Path | None = None) -> FinishedRun:
         scene: current path of the scene, if it has moved
 
     Raises:
-        ProgdfError: the folder is not a finished run, or its scene is missing or different.
+        ProgdfError: the folder is not a finished run, its scene is missing or different, or it was trained
+            over other layers.
     """
     folder = RunFolder(root)
     if not folder.trajectory.is_file():
@@ -112,6 +114,11 @@ def reopen_run(root: Path, scene: Path | None = None) -> FinishedRun:
     trajectory, extra, about = load_trajectory(folder.trajectory)
     try:
         record = read_record(about)
+        if record.lower:
+            raise ProgdfError(
+                f"{root} was trained over other layers ({record.lower}), so it cannot be fitted or evaluated "
+                "alone; train it again"
+            )
         members = extra["members"]
         score = extra["score"]
         path = scene or record.scene

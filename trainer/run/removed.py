@@ -91,7 +91,7 @@ def vanished_share(setup: TrainingSetup, options: TrainOptions) -> float:
     remaining = setup.scene[~setup.region.mask]
     change = behind = 0.0
     for view, path in zip(setup.train, options.views.pictures, strict=True):
-        target = read_edit(scene, view.camera, view.image, path)
+        target = read_edit(scene, view.camera, view.image, path, setup.seen)
         background = picture_background(scene, path, view.camera)
         original, without_region = (
             render_view(gaussians, view.camera, background).clamp(0, 1) for gaussians in (scene, remaining)
@@ -172,6 +172,7 @@ def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder
     folder.trajectory.unlink(missing_ok=True)  # left by an earlier run that recolored
     about = {name: report[name] for name in ("edit", "removal")}
     gdf = replace(gdf, options=differences(report["plan"], DEFAULTS), report=about)
+    gdf = gdf if setup.lower is None else setup.lower.rebase(gdf)
     result = write_result(folder, gdf, report, picture)
     shares = ", ".join(f"{100 * share:.0f} % at {s}" for s, share in fading["visible_change"].items())
     log.say(
@@ -267,7 +268,7 @@ def _painted_views(options: TrainOptions, setup: TrainingSetup) -> tuple[list[Vi
         setup = make_training_setup(replace(options.views, pictures=paths), setup.scene, setup.region)
     pairs = list(zip(setup.train, paths, strict=True))
     return [view for view, _ in pairs], {
-        v.camera.name: read_edit(setup.scene, v.camera, v.image, path) for v, path in pairs
+        v.camera.name: read_edit(setup.scene, v.camera, v.image, path, setup.seen) for v, path in pairs
     }
 
 

@@ -26,6 +26,7 @@ from trainer.store.run_folder import (
     write_views,
 )
 from trainer.store.state import interrupt_on_signals
+from trainer.views.lower_layers import open_lower_layers
 from trainer.views.setup import TrainingSetup, make_training_setup
 
 from .command import check_command, select_region
@@ -53,6 +54,8 @@ def train(options: TrainOptions, quiet: bool = False, shared: LastValueCache | N
     check_command(options)
     use_threads(options.threads)
     scene = shared.get("scene", options.scene.resolve(), lambda: load_scene(options.scene))
+    lower = open_lower_layers(options.views.pictures, options.scene, scene)
+    base = scene if lower is None else lower.base
     region = load_region(options.out) if options.resume else None
     notes = list[str]()
     if region is None:
@@ -75,8 +78,11 @@ def train(options: TrainOptions, quiet: bool = False, shared: LastValueCache | N
             use_threads(session.threads)
             with check_exists(folder), folder.state.writing():
                 if session.does == "start":
-                    _write_draft(options, scene, region, folder, log)
-                setup = _prepare_views(options, scene, region, folder, shared, log)
+                    _write_draft(options, base, region, folder, log)
+                setup = _prepare_views(options, base, region, folder, shared, log)
+                if lower is not None:
+                    log.say(f"the pictures show {lower.layers}: only the difference to them is trained")
+                setup = replace(setup, lower=lower)
                 run = remove_region if is_removal(options, setup, log) else train_region
                 result = run(options, setup, folder, log)
             folder.state.end()

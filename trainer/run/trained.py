@@ -97,6 +97,7 @@ def _save_trajectory(
         agreement=agreement,
         up=setup.up.to_json() if setup.up is not None else None,
         pictures=picture_digests(options),
+        lower="" if setup.lower is None else str(setup.lower.layers),
         **outcome,
     )
     save_recording(folder, setup.region, trajectory, record)

@@ -30,6 +30,7 @@ from .choose import (
     sample_members,
     split_views,
 )
+from .lower_layers import LowerLayers
 from .picture_cameras import picture_cameras
 from .view import (
     BACKGROUND,
@@ -70,13 +71,19 @@ _MAX_GLANCE_GAUSSIANS = 3_000_000  # maximum number of Gaussians rendered in all
 class TrainingSetup:
     """Scene, region, and views of a run, with notes on them."""
 
-    scene: Gaussians  # the original
+    scene: Gaussians  # the original, or `LowerLayers.base`
     region: Region  # members that may change
     train: Sequence[View] = ()  # views to train on
     held_out: Sequence[View] = ()  # views to measure with; empty if there are too few views, see `judging`
     background: Tensor = field(default_factory=lambda: torch.tensor(BACKGROUND))  # rgb. [3]
     notes: Sequence[str] = ()  # lines for the log
     up: UpAxis | None = None  # the axis that is up
+    lower: LowerLayers | None = None  # layers that changed pictures show; None: the original
+
+    @property
+    def seen(self) -> Gaussians | None:
+        """The scene that changed pictures show; None: `scene`."""
+        return self.lower.seen if self.lower is not None and self.lower.paints else None
 
     @property
     def views(self) -> list[View]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
-from progdf.io.picture_camera import camera_chunk, save_picture_camera
+from progdf.io.picture_camera import PictureLayers, camera_chunk, save_picture_camera
 from viewer.camera.view_camera import to_camera
 from viewer.files import exports
 from viewer.gl.present import picture_texture
@@ -27,19 +27,30 @@ from viewer.state.layers import visible_edits
 from viewer.state.selection import EMPTY_MASK
 from viewer.state.snapshots import SliderSnapshot, restore, with_original
 from viewer.state.view_state import Comparison, ViewState
-from viewer.state.workspace import Pointed, Workspace, original
+from viewer.state.workspace import Pointed, Workspace
 from viewer.ui.context import PALETTE
 
 SIZE = (168, 126)
 """Width and height of a thumbnail, in pixels."""
 
 
-RememberView = Callable[[Pixels, Camera, Sequence[str]], None]
-"""Function that remembers a saved picture, its camera and the names of the visible edits."""
+RememberView = Callable[[Pixels, Camera, Sequence[str], PictureLayers | None], None]
+"""Function that remembers a saved picture, its camera, and the names and layers of the visible edits."""
 
 
-def forget_view(_image: Pixels, _camera: Camera, _edits: Sequence[str]) -> None:
+def forget_view(
+    _image: Pixels, _camera: Camera, _edits: Sequence[str], _layers: PictureLayers | None
+) -> None:
     """Remember nothing: the scene has no file."""
+
+
+LayersOf = Callable[[ViewState], PictureLayers | None]
+"""Function that returns the visible layers of a view, see `exports.picture_layers`."""
+
+
+def no_layers(_view: ViewState) -> PictureLayers | None:
+    """Return no layers: the edits have no files."""
+    return None
 
 
 class Thumbnails:
@@ -175,12 +186,19 @@ class Canvas:
         return self.comparer.image(view, size)
 
     def save(
-        self, folder: Path, title: str, view: ViewState, size: tuple[int, int], remember: RememberView
+        self,
+        folder: Path,
+        title: str,
+        view: ViewState,
+        size: tuple[int, int],
+        layers: PictureLayers | None,
+        remember: RememberView,
     ) -> str:
         """Write the picture of a view with its camera; return a line with the path.
 
         Args:
             folder: target folder; the file's name begins with `title`
+            layers: the visible edits, see `camera_chunk`
             remember: receives the picture, unless it is a comparison
 
         Raises:
@@ -193,33 +211,40 @@ class Canvas:
         camera = to_camera(view.camera, image.shape[1], image.shape[0])
         origin = self.comparer.engine.scene.origin
         edits = visible_edits(view)
-        chunk = camera_chunk(camera, edits, origin, view.camera.up)
+        chunk = camera_chunk(camera, edits, origin, view.camera.up, layers)
         path = exports.picture(folder, title, pixels, chunk)
-        remember(pixels, camera, edits)
+        remember(pixels, camera, edits, layers)
         return f"Saved {path}"
 
-    def original(self, view: ViewState, size: tuple[int, int]) -> Pixels:
-        """Return the picture of the whole scene without edits. [H,W,3]"""
-        view = original(view)
-        view = replace(view, selection=replace(view.selection, hidden=EMPTY_MASK))
-        return to_pixels(self.image(view, size))
+    def whole(self, view: ViewState, size: tuple[int, int]) -> Pixels:
+        """Return the picture of the whole scene with the visible edits, not compared. [H,W,3]"""
+        selection = replace(view.selection, hidden=EMPTY_MASK)
+        return to_pixels(self.image(replace(view, selection=selection, compare=Comparison()), size))
 
-    def save_original(
-        self, folder: Path, title: str, view: ViewState, size: tuple[int, int], remember: RememberView
+    def save_whole(
+        self,
+        folder: Path,
+        title: str,
+        view: ViewState,
+        size: tuple[int, int],
+        layers: PictureLayers | None,
+        remember: RememberView,
     ) -> Path:
-        """Write the picture of the whole scene without edits, and its camera beside it, to be edited in
-        another program; return the picture's path.
+        """Write the picture of the whole scene, and its camera and layers beside it, to be edited in another
+        program; return the picture's path. See `save`.
 
         Raises:
             ProgdfError: see `exports.picture`.
         """
         camera = to_camera(view.camera, *size)
         origin = self.comparer.engine.scene.origin
-        chunk = camera_chunk(camera, (), origin, view.camera.up)
-        pixels = self.original(view, size)
+        edits = visible_edits(view)
+        chunk = camera_chunk(camera, edits, origin, view.camera.up, layers)
+        pixels = self.whole(view, size)
         path = exports.picture(folder, title, pixels, chunk)
-        save_picture_camera(path, camera, origin)  # a program may drop the picture's metadata
-        remember(pixels, camera, ())
+        # a program may drop the picture's metadata
+        save_picture_camera(path, camera, origin, layers)
+        remember(pixels, camera, edits, layers)
         return path
 
     def thumbnails(self, work: Workspace, rows: Sequence[LayerRow]) -> tuple[Pictures, bool]:

@@ -6,6 +6,7 @@ real input.
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
@@ -47,7 +48,7 @@ from viewer.ui.keys import (
 from viewer.ui.pointer import PointerContext
 
 from . import interface, mouse, select_tool
-from .canvas import Canvas, RememberView, forget_view
+from .canvas import Canvas, LayersOf, RememberView, forget_view, no_layers
 from .handles import decal_takes_mouse, draw_decal, draw_gizmo, gizmo_takes_mouse, place_decal
 from .messages import Messages
 
@@ -128,6 +129,7 @@ class MainView:
         self.canvas = Canvas(context, engine)
         self.report: Callable[[Exception], None] = self._report  # receives the errors of a part of a frame
         self.remember: RememberView = forget_view  # receives the saved pictures of single views
+        self.layers_of: LayersOf = no_layers  # returns the layers of a view for a picture's metadata
         self.surfaces = Surfaces()
         self.ui = UiContext(scale)
         imgui.backends.opengl3_init("#version 330")
@@ -518,11 +520,22 @@ class MainView:
         Raises:
             ProgdfError: see `exports.picture`.
         """
-        return self.canvas.save_original(folder, name, self.work.view, self.picture_size, self.remember)
+        view = workspace.original(self.work.view)
+        return self.canvas.save_whole(folder, name, view, self.picture_size, None, self.remember)
+
+    def save_edited(self, folder: Path, name: str) -> Path:
+        """Write the picture on screen with the visible layers and their strengths, see `save_original`.
+
+        Raises:
+            ProgdfError: see `exports.picture`, or a visible edit has no file that the picture can name.
+        """
+        view = self.work.view
+        layers = self.layers_of(view)
+        return self.canvas.save_whole(folder, name, view, self.picture_size, layers, self.remember)
 
     def original_picture(self) -> Pixels:
         """Return the picture on screen without edits. [H,W,3]"""
-        return self.canvas.original(self.work.view, self.picture_size)
+        return self.canvas.whole(workspace.original(self.work.view), self.picture_size)
 
     def _save_files(self, screen: moderngl.Framebuffer) -> None:
         """Serve the requests for files that need only the main view."""
@@ -544,4 +557,7 @@ class MainView:
         if request == "take_view":
             taken = self.save_original(self.pictures, title)
             return f"Saved {taken}. Edit it in any program and drop it here."
-        return self.canvas.save(self.pictures, title, view, self._pointer().size, self.remember)
+        layers = None
+        with contextlib.suppress(ProgdfError):  # the picture has the names of the edits alone
+            layers = self.layers_of(view)
+        return self.canvas.save(self.pictures, title, view, self._pointer().size, layers, self.remember)

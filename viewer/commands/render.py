@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 from collections.abc import Sequence
@@ -17,6 +18,7 @@ from progdf.terminal import print_line
 from progdf.threads import one_thread
 from viewer.camera import view_camera
 from viewer.camera.view_camera import ViewCamera, bounds_of
+from viewer.files import exports
 from viewer.pictures import film
 from viewer.pictures.compare import Comparer, draw_labels
 from viewer.render.engine import ViewEngine, headless_engine
@@ -101,11 +103,15 @@ def _render_still(
 ) -> str:
     """Write one picture with the comparison of `view`; return a line about the comparison."""
     origin = opened.document.scene.origin
+    layers = None
+    with contextlib.suppress(ProgdfError):  # the picture has the names of the edits alone
+        layers = exports.picture_layers(opened.document, view)
     if options.alpha:
         picture = Image.fromarray(film.transparent_image(engine, view, camera))
+        chunk = camera_chunk(camera, visible_edits(view), origin, opened.up, layers)
         with atomic_write(options.out) as temporary_file:
-            picture.save(temporary_file, pnginfo=camera_chunk(camera, visible_edits(view), origin, opened.up))
-        save_picture_camera(options.out, camera, origin)
+            picture.save(temporary_file, pnginfo=chunk)
+        save_picture_camera(options.out, camera, origin, layers)
         return ""
     comparer = Comparer(engine, engine.ctx)
     comparer.sides = compare_sides(opened.snapshots, view)
@@ -113,12 +119,12 @@ def _render_still(
     try:
         image = comparer.image(view, camera=camera)
         single = _is_single(options, view)
-        carried = camera_chunk(camera, visible_edits(view), origin, opened.up) if single else None
+        carried = camera_chunk(camera, visible_edits(view), origin, opened.up, layers) if single else None
         labelled = Image.fromarray(draw_labels(image, view.compare, comparer.labels(view)))
         with atomic_write(options.out) as temporary_file:
             labelled.save(temporary_file, pnginfo=carried)
         if single:
-            save_picture_camera(options.out, camera, origin)
+            save_picture_camera(options.out, camera, origin, layers)
             return ""
         if comparer.sides is None:
             return f"PSNR of edited against original {comparer.psnr:.2f} dB"

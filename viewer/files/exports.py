@@ -18,9 +18,19 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import ZERO, Origin
 from progdf.io.atomic import atomic_write, make_folder, pictures_folder
 from progdf.io.cameras import kind_of_cameras, load_cameras, save_cameras
-from progdf.io.picture_camera import CAMERA_SUFFIX, camera_chunk, save_picture_camera
-from progdf.io.session import SUFFIX
+from progdf.io.picture_camera import (
+    CAMERA_SUFFIX,
+    PictureLayer,
+    PictureLayers,
+    camera_chunk,
+    save_picture_camera,
+)
+from progdf.io.session import SUFFIX, relative_name, sha256
 from viewer.jobs.training import takes_files
+from viewer.state.layers import visible_layers
+from viewer.state.view_state import ViewState
+
+from .document import Document
 
 CAMERAS = ".cameras.json"  # suffix of a file of cameras
 
@@ -55,6 +65,38 @@ def picture(folder: Path, title: str, image: NDArray[np.uint8], info: PngInfo | 
         with atomic_write(path) as temporary_file:
             Image.fromarray(image).save(temporary_file, pnginfo=info)
         return path.resolve()
+
+
+def picture_layers(opened: Document, view: ViewState) -> PictureLayers | None:
+    """Return the visible layers for the metadata of a picture; None for the original.
+
+    Raises:
+        ProgdfError: a layer has no file, or is a grade on a chosen region, which a picture cannot name.
+    """
+    scene = opened.path
+    found = []
+    for layer in visible_layers(view):
+        if layer.strength == 0.0:
+            continue
+        if scene is None or not 0 <= layer.gdf < len(opened.gdf_paths):
+            raise ProgdfError(f"{layer.name} has no file yet; hide it, or wait until it is trained")
+        if opened.edits[layer.gdf].applied:
+            raise ProgdfError(f"{layer.name} is a grade on a chosen region, not named in a picture; hide it")
+        path = opened.gdf_paths[layer.gdf]
+        gains = layer.gains
+        found.append(
+            PictureLayer(
+                layer.name,
+                relative_name(path, scene.resolve().parent),
+                sha256(path.resolve()),
+                layer.strength,
+                gains.geometry,
+                gains.opacity,
+                gains.color,
+                layer.paint,
+            )
+        )
+    return PictureLayers(view.blend, tuple(found)) if found else None
 
 
 def camera(source: Path, viewpoint: Camera, origin: Origin = ZERO) -> tuple[Path, int]:

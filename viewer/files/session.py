@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from progdf.compose import layer_paint
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
@@ -35,7 +36,7 @@ from progdf.io.session import (
 from progdf.region import Region, from_mask
 from progdf.terminal import escape_text
 from viewer.camera.view_camera import Vec3, move_camera
-from viewer.state import paint, selection
+from viewer.state import selection
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.timeline import split_keys
 from viewer.state.view_state import LayerState, Timeline, ViewState
@@ -138,7 +139,7 @@ def open_session(path: Path) -> WindowSession:
     view = _with_region_paths(view, lambda region: Path(os.path.normpath(folder / region)))
     for layer in (*view.layers, *(layer for s in snapshots for layer in s.edit.layers)):
         gdf = opened.gdfs[layer.gdf]
-        paint.decode(layer.paint, len(gdf.region), gdf.from_others)  # raises if the weights do not fit
+        layer_paint.decode(layer.paint, len(gdf.region), gdf.from_others)  # raises if the weights do not fit
     claimed = region_files.claim_regions(view.selection, region_files.region_folders(path, scene))
     moved = [
         f"{old.name:.60} ({str(old.path)[:80]})"
@@ -227,9 +228,9 @@ def prune(session: WindowSession) -> WindowSession:
     def paint_left(layer: LayerState) -> str:
         """Return the paint, limited to the remaining rows if the edit covers the whole scene."""
         gdf = opened.gdfs[layer.gdf]
-        weights = paint.decode(layer.paint, len(gdf.region), gdf.from_others)
+        weights = layer_paint.decode(layer.paint, len(gdf.region), gdf.from_others)
         whole = weights is not None and len(weights) == len(opened.scene) > len(rows)
-        return paint.encode(weights[rows].numpy()) if whole and weights is not None else layer.paint
+        return layer_paint.encode(weights[rows].numpy()) if whole and weights is not None else layer.paint
 
     if opened.scene is not opened.original:  # convert masks to the rows of the remaining edits
         added = [opened.gdfs[gdf] for gdf in used if opened.edits[gdf].added is not None]

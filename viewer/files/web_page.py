@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 import torch
 
 from progdf.cli.options import absent_option
+from progdf.compose.layer_paint import decode, layer_of
 from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
@@ -20,7 +21,6 @@ from progdf.rasterize import render
 from viewer.camera.view_camera import ViewCamera, bounds_of, to_camera
 from viewer.state import history, snapshots, timeline
 from viewer.state.layers import largest_strength, visible_layers
-from viewer.state.paint import decode, layer_of
 from viewer.state.view_state import LayerState, Timeline, ViewState
 from viewer.web.container import DRAWN_SH, pack
 from viewer.web.page import HOST, MAIL_LIMIT_BYTES, PageTexts, build_page

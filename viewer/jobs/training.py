@@ -33,6 +33,7 @@ from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, fingerprint
 from progdf.io import atomic
 from progdf.io.json_values import convert_json, read_json, to_json
+from progdf.io.picture_camera import layers_in_picture
 from progdf.io.tensors import read_tensors
 from progdf.region import Region
 
@@ -110,6 +111,17 @@ class EditOrder:
     def is_begun(self) -> bool:
         """True if the run has saved a state that it can resume from."""
         return os.path.isfile(self.out / "state" / "run.json")  # False if it may not be read
+
+    @property
+    def paints_over_layers(self) -> bool:
+        """True if its pictures show other layers, to which its recordings are relative."""
+        kind, _, files = self.editor.partition(":")
+        if kind != "pictures":
+            return False
+        names = [files] if os.path.isfile(files) else files.split(",")
+        with contextlib.suppress(ProgdfError):
+            return any(layers_in_picture(name) is not None for name in names)
+        return False
 
     @property
     def is_locked(self) -> bool:

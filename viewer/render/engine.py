@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from progdf.camera import Camera
 from progdf.compose.composer import Composer
+from progdf.compose.layer_paint import layer_of
 from progdf.compose.layers import Gains, Layer
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
@@ -25,7 +26,6 @@ from progdf.gdf.file import Gdf
 from progdf.scene.bounds import near_plane
 from viewer.camera.view_camera import Vec3, bounds_of, first_camera, half_camera, to_camera
 from viewer.state.layers import visible_layers
-from viewer.state.paint import layer_of
 from viewer.state.view_state import ViewState
 
 from .cpu_renderer import CpuRenderer

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from progdf.compose import layer_paint
 from progdf.gdf.file import Gdf
-from viewer.state import paint
 from viewer.state.layers import is_visible
 from viewer.state.selection import EMPTY_MASK, Color, unpack
 from viewer.state.view_state import ViewState
@@ -38,7 +38,7 @@ class Highlight:
 
     # edit whose members are colored by weight (a `LayerState.gdf`), or None
     gdf: int | None = None
-    paint: str = paint.FULL  # its weights, from `paint.encode`
+    paint: str = layer_paint.FULL  # its weights, from `layer_paint.encode`
     thin: bool = False  # only a thin tint over weights below 1
     # packed masks, their colors and shares of 255; later ones cover earlier ones
     tinted: tuple[tuple[bytes, Color, int], ...] = ()
@@ -111,7 +111,7 @@ def highlight_colors(highlight: Highlight, gdfs: Sequence[Gdf], total: int) -> B
         total: N
 
     Raises:
-        ProgdfError: see `paint.decode` and `unpack`.
+        ProgdfError: see `layer_paint.decode` and `unpack`.
     """
     colors = np.zeros((total, 4), np.uint8)
     hidden = unpack(highlight.hidden, total)
@@ -126,7 +126,7 @@ def highlight_colors(highlight: Highlight, gdfs: Sequence[Gdf], total: int) -> B
     if highlight.gdf is not None:
         gdf = gdfs[highlight.gdf]
         members = gdf.region.members.numpy()
-        decoded = paint.decode(highlight.paint, len(members), gdf.from_others)
+        decoded = layer_paint.decode(highlight.paint, len(members), gdf.from_others)
         weights = np.ones(len(members), np.float32) if decoded is None else decoded.numpy()
         colors[members, :3] = ramp_colors(weights)
         shares = THIN_TINT_SHARE * (1.0 - weights) if highlight.thin else np.full_like(weights, RAMP_SHARE)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from progdf.compose import layer_paint
 from progdf.compose.layers import BLENDS
 from viewer.camera import controls
 from viewer.camera.view_camera import FARTHEST
@@ -137,16 +138,16 @@ def _limit_paint(workspace: Workspace, index: int, facts: SceneFacts) -> Workspa
     if not view.selection.count:
         return workspace
     weights = selection.unpack(view.selection.members, facts.count)[row.members].astype(np.float32)
-    painted = paint.decode(view.layers[index].paint, row.count, row.from_others)
+    painted = layer_paint.decode(view.layers[index].paint, row.count, row.from_others)
     weights = weights if painted is None else weights * painted.numpy()
-    return replace(workspace, view=with_paint(view, index, paint.encode(weights)))
+    return replace(workspace, view=with_paint(view, index, layer_paint.encode(weights)))
 
 
 def _select_painted(workspace: Workspace, index: int, facts: SceneFacts) -> Workspace:
     """Select the members of a layer whose paint is at least 0.5, or all members if it is not painted."""
     view = workspace.view
     row = facts.rows[workspace.view.layers[index].gdf]
-    painted = paint.decode(view.layers[index].paint, row.count, row.from_others)
+    painted = layer_paint.decode(view.layers[index].paint, row.count, row.from_others)
     mask = np.zeros(facts.count, bool)
     mask[row.members if painted is None else row.members[painted.numpy() >= 0.5]] = True
     return replace(workspace, view=replace(view, selection=selection.select(view.selection, mask)))
@@ -232,7 +233,7 @@ def _repaint(workspace: Workspace, how: str, facts: SceneFacts) -> Workspace:
         if how == "paint_invert":
             return with_paint(view, index, paint.invert(layer.paint, row.count, row.from_others))
         uniform = np.full(row.count, how == "paint_fill", np.float32)
-        return with_paint(view, index, paint.encode(uniform))
+        return with_paint(view, index, layer_paint.encode(uniform))
 
     return change_focused(workspace, change)
 

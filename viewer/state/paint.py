@@ -6,28 +6,15 @@ on the number of pointer events along the path.
 
 from __future__ import annotations
 
-import base64
-import binascii
-import zlib
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
-from torch import Tensor
 
-from progdf.compose.layers import Gains, Layer
-from progdf.errors import ProgdfError
+from progdf.compose.layer_paint import FULL, Floats, decode, encode
 from progdf.gdf.file import Gdf
 from progdf.scene.selection import Surface
 
 from .view_state import LARGEST_PX, SMALLEST_PX, Brush
-
-FULL = ""
-"""Paint of an unpainted layer: weight 1 everywhere."""
-
-Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,53 +45,6 @@ def radius(pixels: float) -> float:
 def softness(share: float) -> float:
     """Clamp a softness to 0 to 1 and round it to 0.001."""
     return min(1.0, max(0.0, round(share, 3)))
-
-
-def encode(weights: Floats) -> str:
-    """Encode weights [M] (0 to 1) as the text stored in states and sessions; `FULL` if all are 1."""
-    levels = np.round(np.clip(weights, 0.0, 1.0) * 255.0).astype(np.uint8)
-    if (levels == 255).all():
-        return FULL
-    return base64.b64encode(zlib.compress(levels.tobytes(), 1)).decode()
-
-
-@lru_cache(maxsize=48)  # the composer compares weights by identity
-def decode(paint: str, members: int, from_others: int = 0) -> Tensor | None:
-    """Decode the weight of every member.
-
-    Args:
-        paint: text from `encode`
-        members: M
-        from_others: number of members, at the end, that other edits add; those added after painting get
-            weight 1
-
-    Returns:
-        [M] float32, 0 to 1, or None for `FULL`.
-
-    Raises:
-        ProgdfError: the text is damaged, or has more than M or fewer than M − `from_others` weights.
-    """
-    if paint == FULL:
-        return None
-    unpacker = zlib.decompressobj()
-    try:
-        levels = unpacker.decompress(base64.b64decode(paint, validate=True), members + 1)
-    except (ValueError, binascii.Error, zlib.error):
-        raise ProgdfError("the painted weights of a layer are damaged; paint it again") from None
-    if not members - from_others <= len(levels) <= members:
-        raise ProgdfError(f"a layer's painted weights do not fit its {members} members; paint it again")
-    return torch.from_numpy(
-        np.frombuffer(levels.ljust(members, b"\xff"), np.uint8).astype(np.float32) / 255.0
-    )
-
-
-def layer_of(gdf: Gdf, strength: float, gains: Gains, paint: str) -> Layer:
-    """Build the composer's layer, with the painted weights.
-
-    Raises:
-        ProgdfError: see `decode`.
-    """
-    return Layer(gdf, strength, True, gains, decode(paint, len(gdf.region), gdf.from_others))
 
 
 def begin_stroke(paint: str, gdf: Gdf, surface: Surface, through: bool, mode: str = "erase") -> Stroke:

@@ -56,7 +56,7 @@ class LayerState:
     gains: Gains = Gains()  # share of each kind of change, 0 to 1
     solo: bool = False  # if any layer is soloed, only soloed layers are visible
     locked: bool = False  # protects strength, gains and paint
-    paint: str = ""  # weight per member, from `paint.encode`; empty is 1 everywhere
+    paint: str = ""  # weight per member, from `layer_paint.encode`; empty is 1 everywhere
     group: str = ""  # name of its group, "" for none; the layers of a group are adjacent
 
 

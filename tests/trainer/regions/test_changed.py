@@ -84,7 +84,7 @@ def test_picture_with_edits_is_refused_before_the_scene_is_read(tmp_path: Path) 
     case = small("body", count=6, image_size=160)
     carried = camera_chunk(case.views[0].camera, ["jacket", "gold"])
     to_picture(case.views[0].image).save(tmp_path / "A.png", pnginfo=carried)
-    with pytest.raises(ProgdfError, match=r"A.png was taken with edits on \(jacket, gold\).* without them"):
+    with pytest.raises(ProgdfError, match=r"A.png shows edits \(jacket, gold\) without naming their files"):
         check_region("changed", region_checks(settings([tmp_path / "A.png"], tmp_path)))
 
 

@@ -13,6 +13,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from progdf.camera import Camera
+from progdf.compose import layer_paint
 from progdf.gdf.file import load_gdf, save_gdf
 from progdf.io.picture_camera import find_picture_camera
 from tests.helpers.null_app import null_app, press
@@ -25,7 +26,6 @@ from viewer.camera.view_camera import to_camera
 from viewer.files import user_files
 from viewer.files.session import open_session
 from viewer.jobs import job_queue, preview_process
-from viewer.state import paint
 from viewer.state.commands import OnItem, Plain
 from viewer.state.forms import EDITORS, SHEET_COLUMNS, SHEET_PX, STYLE_ORDER
 from viewer.state.layers import visible_layers
@@ -303,7 +303,8 @@ def test_trained_edit_replaces_its_draft_and_nothing_else(
     )
     assert window.documents.get().facts().rows[0].draft
     view = window.main_view.work.view
-    weights = paint.encode(np.linspace(0, 1, len(window.documents.get().gdfs[0].region), dtype=np.float32))
+    count = len(window.documents.get().gdfs[0].region)
+    weights = layer_paint.encode(np.linspace(0, 1, count, dtype=np.float32))
     touched = replace(layer(window), strength=0.3, paint=weights, locked=True)
     window.main_view.store.change(replace(view, layers=(touched,)))
     past = window.main_view.work.past

@@ -10,18 +10,22 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from PIL import Image
 
+from progdf.compose.layers import Gains
+from progdf.compose.picture_layers import find_layer_files
 from progdf.field.baked import lattice_colors
 from progdf.formats.cube import write_cube
 from progdf.formats.ply import save_ply
 from progdf.gdf.file import save_gdf
-from progdf.io.picture_camera import camera_chunk
+from progdf.io.picture_camera import camera_chunk, layers_in_picture
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app import app as application
 from viewer.camera.view_camera import to_camera
-from viewer.files import exports
+from viewer.files import exports, user_files
+from viewer.pictures.film import to_pixels
 from viewer.state import selection
-from viewer.state.commands import ReplaceEdit
+from viewer.state.commands import Plain, ReplaceEdit
 
 
 @pytest.fixture
@@ -100,8 +104,59 @@ def test_dropped_picture_fills_the_form_and_restores_its_camera(
     worn = exports.picture(tmp_path, "worn", image, camera_chunk(taken, ["scarf"]))
     opened.parts.file_actions.open(worn)
     assert main_view.work.message is not None
-    assert "shows edits (scarf)" in main_view.work.message.text
+    assert "shows edits (scarf) without naming their files" in main_view.work.message.text
     assert main_view.work.form.pictures == str(picture)
+
+
+def with_files(opened: application.App, folder: Path) -> None:
+    """Save the scene and its edit, and open them from these files."""
+    document = opened.documents.get()
+    save_ply(folder / "bear.ply", bear().scene)
+    save_gdf(folder / "scarf.gdf", bear().gdfs[0])
+    opened.documents.replace(replace(document, path=folder / "bear.ply", gdf_paths=(folder / "scarf.gdf",)))
+
+
+@pytest.mark.gl
+def test_painting_over_saves_the_visible_layers_and_their_strengths(
+    opened: application.App, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    painted = list[Path]()
+    with_files(opened, tmp_path)
+    monkeypatch.setattr(user_files, "open_in_program", lambda path: painted.append(path) or True)
+    view = opened.main_view.work.view
+    layers = (replace(view.layers[0], strength=0.6, gains=Gains(color=0.5)),)
+    opened.main_view.store.change(replace(view, layers=layers))
+    opened.handle(Plain("paint_view"))
+    (path,) = painted
+    found = layers_in_picture(path)
+    assert found is not None
+    assert (found.blend, str(found)) == (view.blend, "scarf 0.6")
+    assert (found.layers[0].color, found.layers[0].geometry) == (0.5, 1.0)
+    scene = opened.documents.get().path
+    assert find_layer_files(found, path, scene) == [opened.documents.get().gdf_paths[0].resolve()]
+    size = opened.main_view.picture_size
+    shown = to_pixels(opened.main_view.canvas.image(opened.main_view.work.view, size))
+    assert np.array_equal(np.asarray(Image.open(path).convert("RGB")), shown)
+    Image.open(path).convert("RGB").save(path)  # a program that drops the metadata
+    assert layers_in_picture(path) == found
+    opened.parts.file_actions.open(path)
+    assert opened.main_view.work.form.pictures == str(path)
+    find_layer_files(found, path, scene)[0].write_bytes(b"retrained")
+    opened.parts.file_actions.open(path)
+    assert opened.main_view.work.message is not None
+    assert "shows other versions of" in opened.main_view.work.message.text
+
+
+@pytest.mark.gl
+def test_layer_without_a_file_must_be_hidden_before_painting_over(
+    opened: application.App, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(user_files, "open_in_program", lambda _: pytest.fail("nothing was saved"))
+    with_files(opened, tmp_path)
+    opened.documents.replace(replace(opened.documents.get(), gdf_paths=()))
+    opened.handle(Plain("paint_view"))
+    assert opened.main_view.work.message is not None
+    assert "scarf has no file yet; hide it" in opened.main_view.work.message.text
 
 
 @pytest.mark.gl

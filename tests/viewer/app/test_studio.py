@@ -20,7 +20,7 @@ from progdf.__main__ import main
 from progdf.formats.ply import save_ply
 from progdf.gdf.file import fingerprint, save_gdf
 from progdf.io.atomic import state_folder
-from progdf.io.picture_camera import camera_file, find_picture_camera
+from progdf.io.picture_camera import camera_file, find_picture_camera, layers_in_picture
 from progdf.scene.regions import parse_region
 from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import bear_files, opened_document
@@ -297,6 +297,7 @@ def test_view_painted_in_another_program_is_shown_on_every_save(
     save(taken)
     assert window.main_view.work.transient.cover is not None
     assert find_picture_camera(path).height == size[1], "though the program dropped what the picture carried"
+    assert layers_in_picture(path) is None, "no layer is visible"
     request(window, Plain("train"))
     assert f"--editor=pictures:{path}" in Trainer.said
     turn(window)

@@ -13,6 +13,7 @@ from PIL import Image
 
 from progdf.__main__ import main
 from progdf.cli.info import kind_of
+from progdf.compose.layer_paint import encode
 from progdf.errors import ProgdfError
 from progdf.formats.ply import save_ply
 from progdf.io.json_values import to_json
@@ -24,7 +25,6 @@ from viewer.camera.view_camera import eye, from_camera, to_camera
 from viewer.files import session
 from viewer.files.session import WindowSession
 from viewer.state import selection
-from viewer.state.paint import encode
 from viewer.state.selection import SelectionState
 from viewer.state.view_state import Comparison, SnapshotPair
 

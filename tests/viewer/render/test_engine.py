@@ -13,6 +13,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from progdf.compose.layer_paint import decode, encode
 from progdf.compose.reference import Gains, Layer, compose_layers
 from progdf.errors import ProgdfError
 from progdf.field.baked import BakedField
@@ -29,7 +30,6 @@ from viewer.render import engine as engine_module
 from viewer.render.dynamic_resolution import FrameTimings
 from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import is_software
-from viewer.state.paint import decode, encode
 from viewer.state.view_state import LayerState, ViewState
 
 SIZE = (96, 72)

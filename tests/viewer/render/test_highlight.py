@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from progdf.compose import layer_paint
 from progdf.gaussians import Gaussians
 from progdf.sh import C0
 from tests.helpers.stacks import Stack
@@ -17,7 +18,7 @@ from tests.helpers.ui_rig import HEAD, TRACK, Rig, bear, first_view, rig
 from viewer.render import highlight
 from viewer.render.engine import ViewEngine
 from viewer.render.highlight import Highlight
-from viewer.state import paint, selection
+from viewer.state import selection
 from viewer.state.selection import SelectionState
 from viewer.state.view_state import Brush, Comparison, LayerState, SelectTool, ViewState
 from viewer.state.workspace import with_transient
@@ -28,10 +29,10 @@ SCARF = 0
 
 def half_painted() -> str:
     """Return paint for the scarf that rises from 0 to 1 along its members."""
-    return paint.encode(np.linspace(0, 1, len(bear().gdfs[SCARF].region), dtype=np.float32))
+    return layer_paint.encode(np.linspace(0, 1, len(bear().gdfs[SCARF].region), dtype=np.float32))
 
 
-def view(strength: float = 1.0, painted: str = paint.FULL) -> ViewState:
+def view(strength: float = 1.0, painted: str = layer_paint.FULL) -> ViewState:
     first = first_view(bear(), strength, 0.5)
     return replace(first, layers=(replace(first.layers[0], paint=painted), *first.layers[1:]))
 
@@ -120,8 +121,8 @@ def test_painting_and_sliding_leave_no_residue(ctx: moderngl.Context, draw: str)
     weights = np.ones(len(bear().gdfs[SCARF].region), np.float32)
     for step in range(12):
         weights[rng.integers(len(weights), size=9)] = rng.random()
-        painted = paint.encode(weights)
-        engine.highlight = Highlight(step % 5 == 4, painted if step % 5 < 4 else paint.FULL)
+        painted = layer_paint.encode(weights)
+        engine.highlight = Highlight(step % 5 == 4, painted if step % 5 < 4 else layer_paint.FULL)
         state = view(float(rng.choice([0.0, 0.3, 1.0])), painted)
         found = shown(engine, state, ctx)
         fresh = ViewEngine(ctx, bear().scene, bear().gdfs, draw)
@@ -221,9 +222,9 @@ def test_visible_regions_keep_their_colors_below_the_selection() -> None:
 
 def test_weights_are_highlighted_while_painting_a_visible_layer() -> None:
     out = replace(view(), brush=Brush(active=True))
-    assert highlight.requested_highlight(out, 0) == Highlight(0, paint.FULL, thin=True)
+    assert highlight.requested_highlight(out, 0) == Highlight(0, layer_paint.FULL, thin=True)
     colors = replace(out, brush=Brush(active=True, weights=True))
-    assert highlight.requested_highlight(colors, 0) == Highlight(0, paint.FULL)
+    assert highlight.requested_highlight(colors, 0) == Highlight(0, layer_paint.FULL)
     for without in (
         view(),
         replace(out, compare=Comparison("split")),

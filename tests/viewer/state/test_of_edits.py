@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from progdf.compose import layer_paint
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
-from viewer.state import paint, selection
+from viewer.state import selection
 from viewer.state.actions import perform
 from viewer.state.commands import OnItem, Plain
 from viewer.state.forms import ALL, TYPED
@@ -79,12 +80,12 @@ def test_layer_is_limited_to_the_selection_and_can_be_reduced_again(hand: Rig) -
     half = row.members[::2]
     third = row.members[::3]
     work = perform(selecting(work, half, facts.count), OnItem("limit_to_selection", SCARF), facts)
-    weights = paint.decode(work.view.layers[SCARF].paint, row.count)
+    weights = layer_paint.decode(work.view.layers[SCARF].paint, row.count)
     assert weights is not None
     assert row.members[weights.numpy() == 1.0].tolist() == half.tolist()
-    assert work.view.layers[EARS].paint == paint.FULL
+    assert work.view.layers[EARS].paint == layer_paint.FULL
     work = perform(selecting(work, third, facts.count), OnItem("limit_to_selection", SCARF), facts)
-    weights = paint.decode(work.view.layers[SCARF].paint, row.count)
+    weights = layer_paint.decode(work.view.layers[SCARF].paint, row.count)
     assert weights is not None
     assert row.members[weights.numpy() == 1.0].tolist() == row.members[::6].tolist()
 
@@ -100,6 +101,6 @@ def test_select_painted_selects_the_painted_members(hand: Rig) -> None:
 
     assert selected(work) == row.members.tolist(), "all of its region where nothing is painted"
     weights = np.linspace(0.0, 1.0, row.count, dtype=np.float32)
-    layers = (replace(work.view.layers[SCARF], paint=paint.encode(weights)), work.view.layers[EARS])
+    layers = (replace(work.view.layers[SCARF], paint=layer_paint.encode(weights)), work.view.layers[EARS])
     half = row.members[np.round(255 * weights) >= 127.5]
     assert selected(replace(work, view=replace(work.view, layers=layers))) == half.tolist()

@@ -12,6 +12,7 @@ import torch
 from imgui_bundle import imgui
 
 from progdf.camera import Camera
+from progdf.compose import layer_paint
 from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
 from progdf.scene.selection import Surface
@@ -42,7 +43,7 @@ def hand() -> Iterator[Rig]:
 
 
 def weights(hand: Rig, layer: int = 0) -> np.ndarray:
-    found = paint.decode(hand.main_view.work.view.layers[layer].paint, len(bear().gdfs[layer].region))
+    found = layer_paint.decode(hand.main_view.work.view.layers[layer].paint, len(bear().gdfs[layer].region))
     return np.ones(len(bear().gdfs[layer].region)) if found is None else found.numpy()
 
 
@@ -59,27 +60,27 @@ def scarf_on_screen(hand: Rig) -> tuple[float, float]:
 
 def test_paint_round_trips_within_a_255th_and_full_paint_is_empty() -> None:
     drawn = torch.rand(300, generator=torch.Generator().manual_seed(0)).numpy()
-    found = paint.decode(paint.encode(drawn), 300)
+    found = layer_paint.decode(layer_paint.encode(drawn), 300)
     assert found is not None
     assert np.abs(found.numpy() - drawn).max() <= 0.5 / 255 + 1e-6
-    assert paint.encode(np.ones(300, np.float32)) == paint.FULL
-    assert paint.decode(paint.FULL, 300) is None
+    assert layer_paint.encode(np.ones(300, np.float32)) == layer_paint.FULL
+    assert layer_paint.decode(layer_paint.FULL, 300) is None
 
 
 @pytest.mark.parametrize(
-    "text", ["no base64!", "AAAA", *(paint.encode(np.zeros(n, np.float32)) for n in (4, 7))]
+    "text", ["no base64!", "AAAA", *(layer_paint.encode(np.zeros(n, np.float32)) for n in (4, 7))]
 )
 def test_damaged_paint_is_refused_in_one_line(text: str) -> None:
     with pytest.raises(ProgdfError, match="paint it again"):
-        paint.decode(text, 5)
+        layer_paint.decode(text, 5)
 
 
 def test_paint_may_lack_only_rows_that_other_edits_add() -> None:
-    found = paint.decode(paint.encode(np.zeros(5, np.float32)), 7, 2)
+    found = layer_paint.decode(layer_paint.encode(np.zeros(5, np.float32)), 7, 2)
     assert found is not None
     assert found.tolist() == [0.0] * 5 + [1.0] * 2
     with pytest.raises(ProgdfError, match="do not fit its 7 members; paint it again"):
-        paint.decode(paint.encode(np.zeros(4, np.float32)), 7, 2)
+        layer_paint.decode(layer_paint.encode(np.zeros(4, np.float32)), 7, 2)
 
 
 def test_brush_is_full_inside_and_fades_to_its_radius() -> None:
@@ -100,7 +101,7 @@ def test_stroke_does_not_depend_on_the_number_of_events() -> None:
 
 
 def result(stroke: Stroke, brush: Brush = ERASE, mode: str = "erase") -> np.ndarray:
-    found = paint.decode(paint.apply_stroke(replace(stroke, mode=mode), brush), len(stroke.before))
+    found = layer_paint.decode(paint.apply_stroke(replace(stroke, mode=mode), brush), len(stroke.before))
     return np.ones(len(stroke.before)) if found is None else found.numpy()
 
 
@@ -121,10 +122,10 @@ def test_flow_scales_the_stroke_and_value_is_the_target_of_add() -> None:
 
 
 def test_inverting_paint_twice_restores_it() -> None:
-    some = paint.encode(np.array([0.0, 0.2, 1.0], np.float32))
-    assert paint.decode(paint.invert(some, 3), 3).tolist() == pytest.approx([1.0, 0.8, 0.0], abs=0.003)
+    some = layer_paint.encode(np.array([0.0, 0.2, 1.0], np.float32))
+    assert layer_paint.decode(paint.invert(some, 3), 3).tolist() == pytest.approx([1.0, 0.8, 0.0], abs=0.003)
     assert paint.invert(paint.invert(some, 3), 3) == some
-    assert paint.invert(paint.invert(paint.FULL, 3), 3) == paint.FULL
+    assert paint.invert(paint.invert(layer_paint.FULL, 3), 3) == layer_paint.FULL
 
 
 def test_ctrl_i_inverts_the_paint_of_the_layer_as_one_undo_entry(hand: Rig) -> None:
@@ -182,7 +183,7 @@ def test_neighbor_mean_stays_in_range_and_ignores_the_grid_offset() -> None:
 
 def test_feathering_softens_painted_edges_and_keeps_full_paint(hand: Rig) -> None:
     hand.key("Shift+X")
-    assert hand.main_view.work.view.layers[0].paint == paint.FULL
+    assert hand.main_view.work.view.layers[0].paint == layer_paint.FULL
     x, y = scarf_on_screen(hand)
     hand.main_view.store.replace(
         replace(
@@ -232,8 +233,8 @@ def test_front_brush_skips_hidden_members_and_through_brush_does_not(hand: Rig) 
     gdf = bear().gdfs[0]
     scene = bear().scene
     surface = Surface(scene, camera_of(hand))
-    front = paint.begin_stroke(paint.FULL, gdf, surface, through=False)
-    through = paint.begin_stroke(paint.FULL, gdf, surface, through=True)
+    front = paint.begin_stroke(layer_paint.FULL, gdf, surface, through=False)
+    through = paint.begin_stroke(layer_paint.FULL, gdf, surface, through=True)
     assert not np.isnan(through.places).any()
     hidden = np.isnan(front.places[:, 0])
     assert 0.2 < hidden.mean() < 0.8, "a scarf goes around the neck"
@@ -260,7 +261,7 @@ def test_stroke_removes_the_edit_there_as_one_undo_entry(hand: Rig) -> None:
     )
     assert np.abs(hand.picture().astype(int) - before).max() > 20
     hand.key("Ctrl+Z")
-    assert hand.main_view.work.view.layers[0].paint == paint.FULL
+    assert hand.main_view.work.view.layers[0].paint == layer_paint.FULL
 
 
 def test_locked_hidden_or_missing_layer_is_not_painted(hand: Rig) -> None:
@@ -292,23 +293,23 @@ def test_brush_keys_match_the_brush_controls(hand: Rig) -> None:
     hand.key("Backspace")
     assert weights(hand).max() == 0.0
     hand.key("Shift+Backspace")
-    assert hand.main_view.work.view.layers[0].paint == paint.FULL
-    assert hand.main_view.work.past.past[0].edit.layers[0].paint == paint.FULL
+    assert hand.main_view.work.view.layers[0].paint == layer_paint.FULL
+    assert hand.main_view.work.past.past[0].edit.layers[0].paint == layer_paint.FULL
 
 
 def test_paint_survives_rows_added_and_removed_by_another_edit() -> None:
     scene = random_gaussians(90, seed=2, sh_degree=1)
     drawn = np.linspace(0, 0.8, 90, dtype=np.float32)
     edits = whole_grade(scene), growing(scene, some_rows(scene, 10, 1), 25, 7)
-    layers = (LayerState(0, "dark", paint=paint.encode(drawn)),)
+    layers = (LayerState(0, "dark", paint=layer_paint.encode(drawn)),)
     document = Document("s", scene, edits, gdf_paths=(Path("dark.gdf"), Path("hat.gdf")))
-    with_hat = paint.layer_of(document.gdfs[0], 1.0, layers[0].gains, layers[0].paint).weights
+    with_hat = layer_paint.layer_of(document.gdfs[0], 1.0, layers[0].gains, layers[0].paint).weights
     assert with_hat is not None
     assert with_hat.tolist() == pytest.approx([*drawn, *np.ones(25)], abs=0.003)
     for gdf, count in zip(document.gdfs, (89, 34), strict=True):  # the hat's own rows are painted with it
         with pytest.raises(ProgdfError, match="paint it again"):
-            paint.layer_of(gdf, 1.0, layers[0].gains, paint.encode(np.zeros(count, np.float32)))
-    wider = replace(layers[0], paint=paint.encode(with_hat.numpy()))
+            layer_paint.layer_of(gdf, 1.0, layers[0].gains, layer_paint.encode(np.zeros(count, np.float32)))
+    wider = replace(layers[0], paint=layer_paint.encode(with_hat.numpy()))
     pruned = prune(WindowSession(document, ViewState(layers=(wider,))))
     assert pruned.view.layers == layers
     assert len(pruned.document.scene) == 90

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from viewer.app.main_view import MainView
 from viewer.app.messages import Requests, WaitFor
+from viewer.files import exports
 from viewer.files.document import DocumentStore
 
 from .deliver import DeliverActions
@@ -108,6 +109,7 @@ def make_parts(
         wait_for=wait_for,
     )
     main_view.remember = pictures.remember
+    main_view.layers_of = lambda view: exports.picture_layers(documents.get(), view)
     file_actions = FileActions(
         store=store,
         documents=documents,
@@ -125,7 +127,7 @@ def make_parts(
         messages=messages,
         context=main_view.context,
         picture_size=picture_size,
-        save_original=main_view.save_original,
+        save_edited=main_view.save_edited,
     )
     jobs = JobActions(
         store=store,

@@ -9,11 +9,13 @@ from pathlib import Path
 import moderngl
 
 from progdf.camera import Camera
+from progdf.compose.picture_layers import find_layer_files
 from progdf.errors import ProgdfError
 from progdf.io.cameras import load_cameras
 from progdf.io.picture_camera import (
+    PictureLayers,
     camera_file,
-    edits_in_picture,
+    layers_in_picture,
     save_picture_camera,
     stored_picture_camera,
 )
@@ -61,18 +63,21 @@ class PictureActions:
         self._picture_size = picture_size
         self._original = original
         self._wait_for = wait_for
-        self._asked: tuple[Path, Camera, ViewCamera] | None = None  # picture, nearest camera, view before
+        # picture, nearest view, view before
+        self._asked: tuple[Path, FoundView, ViewCamera] | None = None
 
     @property
     def requests(self) -> Requests:
         """Handlers of the answers to "Is it this view?", by name. `use_view` names the picture."""
         return {"use_view": lambda _: self._use_view(), "keep_view": lambda _: self._keep_view()}
 
-    def remember(self, image: Pixels, camera: Camera, edits: Sequence[str]) -> None:
+    def remember(
+        self, image: Pixels, camera: Camera, edits: Sequence[str], layers: PictureLayers | None
+    ) -> None:
         """Remember a view that was taken of the open scene, to find pictures that lost their camera."""
         document = self._documents.get()
         if document.path is not None:
-            remember_view(document.path, image, camera, edits, document.scene.origin)
+            remember_view(document.path, image, camera, edits, document.scene.origin, layers)
 
     def look_through(self, path: Path) -> None:
         """Move the view to the first camera of a file.
@@ -100,14 +105,16 @@ class PictureActions:
         """Put an edited picture into the form of a new edit, and move the view to its camera.
 
         Raises:
-            ProgdfError: it is not a picture, its camera is invalid, or it was taken with edits on.
+            ProgdfError: it is not a picture, its camera is invalid, or it shows edits whose files are
+                missing.
         """
         camera = stored_picture_camera(path, origin=self._documents.get().scene.origin)
         if camera is None:
             self._search_view(path)
             return
-        if edits := edits_in_picture(path):
-            raise ProgdfError(f"{path.name} {_with_edits(edits)}")
+        layers = layers_in_picture(path)
+        if layers is not None:
+            find_layer_files(layers, path, self._documents.get().path)
         self._fill_form(path, camera)
 
     def _fill_form(self, path: Path, camera: Camera) -> None:
@@ -122,7 +129,8 @@ class PictureActions:
         If none is certain, move the view to the nearest one and ask.
 
         Raises:
-            ProgdfError: it is not a picture, its camera cannot be written, or it was taken with edits on.
+            ProgdfError: it is not a picture, its camera cannot be written, or it shows edits whose files are
+                unknown.
         """
         document = self._documents.get()
         origin = document.scene.origin
@@ -138,14 +146,12 @@ class PictureActions:
         found = self._wait_for(search, f"Searching the view of {path.name} …")
         if found is None:
             raise ProgdfError(f"{path.name} carries no camera; take a view with {shortcut('take_view')}")
-        if found.match.certain and found.view.edits:
-            raise ProgdfError(f"{path.name} {_with_edits(found.view.edits)}")
         if found.match.certain:
-            save_picture_camera(path, found.camera, origin)
+            save_picture_camera(path, found.camera, origin, found.view.checked_layers(path.name))
             self._fill_form(path, found.camera)
             self._messages.show(f"Found the view of {path.name}: {found.agreement}")
             return
-        self._asked = (path, found.camera, before)
+        self._asked = (path, found, before)
         self._take_camera(found.camera)
         self._messages.ask(Dialog("match", str(path)))
 
@@ -153,13 +159,15 @@ class PictureActions:
         """Take the nearest view as that of the picture.
 
         Raises:
-            ProgdfError: its camera cannot be written beside the picture.
+            ProgdfError: its camera cannot be written beside the picture, or it shows edits whose files are
+                unknown.
         """
         if self._asked is not None:
-            path, camera, _ = self._asked
+            path, found, _ = self._asked
             self._asked = None
-            save_picture_camera(path, camera, self._documents.get().scene.origin)
-            self._fill_form(path, camera)
+            layers = found.view.checked_layers(path.name)
+            save_picture_camera(path, found.camera, self._documents.get().scene.origin, layers)
+            self._fill_form(path, found.camera)
 
     def _keep_view(self) -> None:
         """Return to the view before the question, and tell how a picture gets its camera."""
@@ -188,8 +196,3 @@ class PictureActions:
         work = self._store.get()
         view_camera = from_camera(work.view.camera, camera, self._documents.get().bounds)
         self._store.replace(with_camera(work, view_camera))
-
-
-def _with_edits(edits: str) -> str:
-    """Return the end of the error about a picture that was taken with edits on."""
-    return f"shows edits ({edits}); take a view without edits with {shortcut('take_view')}"

@@ -74,7 +74,7 @@ class PreviewActions:
         messages: messages to the user
         context: the GL context
         picture_size: returns width and height of the picture on screen, in pixels
-        save_original: writes the picture on screen without edits into a folder; returns its path
+        save_edited: writes the picture on screen with its visible layers into a folder; returns its path
     """
 
     def __init__(
@@ -85,14 +85,14 @@ class PreviewActions:
         messages: Messages,
         context: moderngl.Context,
         picture_size: Callable[[], tuple[int, int]],
-        save_original: Callable[[Path, str], Path],
+        save_edited: Callable[[Path, str], Path],
     ) -> None:
         self._store = store
         self._documents = documents
         self._messages = messages
         self._context = context
         self._picture_size = picture_size
-        self._save_original = save_original
+        self._save_edited = save_edited
         self._child: PreviewChild | None = None
         self._texture: moderngl.Texture | None = None
         self._sent: PreviewInputs | None = None
@@ -165,10 +165,10 @@ class PreviewActions:
         return POLL_S if self._outstanding or request != self._sent else None
 
     def _paint_view(self, _: None) -> None:
-        """Save a picture of this view of the original, open it in another program and add it to the form.
+        """Save a picture of this view, open it in another program and add it to the form.
 
         Raises:
-            ProgdfError: the scene has no file, or the picture cannot be written.
+            ProgdfError: the scene or a visible edit has no file, or the picture cannot be written.
         """
         scene = self._documents.get().file
         self._end_live()
@@ -176,7 +176,7 @@ class PreviewActions:
         size = self._picture_size()
         folder = training.edits_folder(scene)
         make_folder(folder)
-        path = self._save_original(folder, scene.stem)
+        path = self._save_edited(folder, scene.stem)
         form = with_picture(self._store.get().form, path, further=False)
         self._store.replace(replace(self._store.get(), form=form, form_open=True))
         self._open_painter(path, camera, size, None)

@@ -341,7 +341,7 @@ class JobActions:
             attempt(self._messages, partial(self._add_draft, order, packed))
             return
         recording = order.newest_recording()
-        if recording is None or recording == self._live:
+        if recording is None or recording == self._live or order.paints_over_layers:
             return
         begun = time.monotonic()
         document = self._documents.get()
