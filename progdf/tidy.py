@@ -24,6 +24,7 @@ from progdf.fade import fading_course
 from progdf.field.baked import interpolate_at
 from progdf.field.separable import course_field, opacity_course
 from progdf.gaussians import Gaussians, attribute_slices, concatenate, pack
+from progdf.gdf.anchors import free_anchors
 from progdf.gdf.file import ADDED_LOGIT, Gdf, anchor_added, fingerprint
 from progdf.region import Region, from_mask
 from progdf.similarity import Motion, make_parts, move_rows
@@ -44,6 +45,7 @@ class Step:
     does: Operation
     region: Region
     motion: Motion | None = None  # motion of the region as one part; None: no motion
+    copied: Gaussians | None = None  # Gaussians to duplicate in place of the region's own
 
     def move(self, rows: Tensor, share: float) -> Tensor:
         """Return packed raw rows after a share, 0 to 1, of the motion. [M,C] float64 -> [M,C]"""
@@ -77,6 +79,7 @@ def tidy(
     instruction: str = "",
     added: Gaussians | None = None,
     cameras: Sequence[Camera] | None = None,
+    leaves_paint: bool = False,
 ) -> Gdf:
     """Return the steps as one edit: strength 0 is the scene, strength 1 the result of all steps.
 
@@ -89,6 +92,7 @@ def tidy(
         added: further rows to add, as they are at strength 1; they follow the surface below them
         cameras: views in which fading is even; empty: cameras around the fading Gaussians; None: opacities
             change linearly, which is fast
+        leaves_paint: rows that other edits add on the regions stay as they are
 
     Returns:
         Edit of all removed or moved Gaussians. Copies are its added rows.
@@ -125,9 +129,10 @@ def tidy(
         offsets[i, :, _OPACITY_COLUMN] = interpolate_at(opacity_knots, logits, s)
     field = course_field(knots, offsets)
     gdf = Gdf(name, region, field, fingerprint(scene), instruction, added=added)
-    if added is None or not fill_count:
-        return gdf
-    return anchor_added(gdf, scene, free=len(added) - fill_count)
+    added_count = 0 if added is None else len(added)
+    if fill_count:
+        return anchor_added(gdf, scene, leaves_paint, free=added_count - fill_count)
+    return replace(gdf, anchors=free_anchors(added_count, pushes=True)) if leaves_paint else gdf
 
 
 def _opacity_course(
@@ -189,7 +194,7 @@ def _copies(scene: Gaussians, steps: Sequence[Step], added: Gaussians | None = N
     parts = [] if added is None else [added]
     for step in steps:
         if step.does == "duplicate":
-            part = scene[step.region.members]
+            part = scene[step.region.members] if step.copied is None else step.copied
             rows = pack(part, with_shN=scene.sh_degree > 0)
             parts.append(part.replace_rows(torch.arange(len(part)), step.move(rows.double(), 1.0)))
     return concatenate(parts) if parts else None

@@ -90,6 +90,22 @@ def _append_rows(scene: Gaussians, added: tuple[Gaussians, ...]) -> Gaussians:
     return concatenate(parts)
 
 
+def rows_on(gdf: Gdf, mask: Tensor) -> Tensor:
+    """Return the rows that an edit adds on some rows of the scene, such as paint on an object.
+
+    Args:
+        gdf: an edit, converted by `extend`
+        mask: rows of the extended scene. [N] bool
+
+    Returns:
+        Rows of the extended scene, sorted. [A] int64
+    """
+    if gdf.anchors is None:
+        return gdf.region.members[:0]
+    members = gdf.region.members
+    return members[len(members) - len(gdf.anchors) :][gdf.anchors.lie_on(mask)]
+
+
 def remaining_rows(scene: Gaussians, composed: Gaussians) -> Tensor:
     """Return the rows of a composed scene to save, without removed Gaussians and invisible added ones.
 

@@ -26,6 +26,7 @@ MAX_ANCHORS = 4
 """Largest number of anchors of a row."""
 WEIGHT_SUM_TOLERANCE = 1e-4
 """Largest deviation of the sum of a row's weights from 1."""
+_MIN_LYING_WEIGHT = 0.5  # share of its anchors' weight on rows on which a row lies
 _CANDIDATES = 16  # nearest Gaussians of which the anchors are chosen
 _SPACING_NEIGHBOR = 4  # its distance is the local spacing
 _CHUNK = 1 << 14  # rows that are anchored at once
@@ -42,8 +43,9 @@ class Anchors:
 
     rows: Tensor  # rows of the scene; those with weight 0 have no meaning. [B,4] int64
     weights: Tensor  # 0 to 1, sum 1 per row; all 0 if the row follows nothing, as in a copy. [B,4] float32
-    # True if the edit moves its own members only out of the way of the added rows, as paint does. Rows of
-    # other edits do not follow that change. It is carried along like the added rows.
+    # True if rows of other edits do not follow this edit's change of its own members: paint moves them only
+    # out of its way, or the user removes or moves an object without its paint. The change is carried along
+    # like the added rows.
     pushes: bool = False
 
     def __post_init__(self) -> None:
@@ -72,6 +74,16 @@ class Anchors:
         """Number of rows that follow nothing."""
         return int((self.weights.sum(dim=1) == 0.0).sum())
 
+    def lie_on(self, mask: Tensor) -> Tensor:
+        """Return the rows that lie on some rows of the scene, by at least half of their weight. [N] -> [B]"""
+        return (self.weights * mask[self.rows]).sum(dim=1) >= _MIN_LYING_WEIGHT
+
+
+def free_anchors(count: int, pushes: bool = False) -> Anchors:
+    """Return the anchors of rows that follow nothing; see `Anchors.pushes`."""
+    rows = torch.zeros(count, MAX_ANCHORS, dtype=torch.int64)
+    return Anchors(rows, torch.zeros(count, MAX_ANCHORS), pushes)
+
 
 def join_free(anchors: Anchors, free: int) -> Anchors:
     """Return the anchors followed by rows that follow nothing.
@@ -83,9 +95,9 @@ def join_free(anchors: Anchors, free: int) -> Anchors:
     Returns:
         Anchors of B + F rows.
     """
-    rows = torch.cat([anchors.rows, anchors.rows.new_zeros(free, MAX_ANCHORS)])
-    weights = torch.cat([anchors.weights, anchors.weights.new_zeros(free, MAX_ANCHORS)])
-    return Anchors(rows, weights, anchors.pushes)
+    others = free_anchors(free)
+    rows = torch.cat([anchors.rows, others.rows])
+    return Anchors(rows, torch.cat([anchors.weights, others.weights]), anchors.pushes)
 
 
 def choose_anchors(end: Gaussians, means: Tensor, unseen_logit: float, pushes: bool = False) -> Anchors:

@@ -261,6 +261,7 @@ def spread(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Worksp
     mask[on] = True  # the only known Gaussians before a stroke next to the object
     if len(on) and len(beside):
         mask = pointer.facts.scribbles().select(on, beside)
+    mask = mask | pointer.facts.paint_on(work.view, mask)
     work = _with(work, selection.select(work.view.selection, mask))
     strokes = Strokes(on, beside, work.view.selection.members)
     return with_tool(work, strokes=(*work.transient.tool.strokes, strokes))
@@ -302,6 +303,7 @@ def _selected_rows(gesture: Gesture, work: Workspace, pointer: PointerContext) -
 
 def _apply(gesture: Gesture | Click, work: Workspace, mask: Mask, pointer: PointerContext) -> Workspace:
     before = selection.unpack(gesture.before, pointer.facts.count)
+    mask = mask | pointer.facts.paint_on(work.view, mask)
     return _with(work, selection.select(work.view.selection, combine(before, mask, gesture.mode)))
 
 

@@ -53,6 +53,7 @@ def region_option(form: NewEdit, folder: Path, state: SelectionState, total: int
     if form.region != SELECTION and region is None:
         raise ProgdfError(f"the region {form.region} was deleted; choose another one")
     members = state.members if region is None else region.members
+    check_members(members, total)
     make_folder(folder)
     path = folder / f"{name or f'{zlib.crc32(members):08x}'}{selection.SUFFIX}"
     write_region(NamedRegion(name, path, members, state.count), total)
@@ -73,10 +74,22 @@ def keep_region(state: SelectionState, name: str, folder: Path, total: int) -> S
     """
     if not state.count:
         raise ProgdfError("nothing is selected; select something first")
+    check_members(state.members, total)
     path = _free_region_path(state, name, folder)
     state = selection.add_region(state, path.name.removesuffix(selection.SUFFIX), path)
     write_region(state.regions[-1], total)
     return state
+
+
+def check_members(members: bytes, total: int) -> None:
+    """Raise ProgdfError if a selection has only Gaussians that edits add, as no edit can refer to these.
+
+    Args:
+        members: packed mask of the selection
+        total: number of Gaussians in the scene
+    """
+    if members != selection.EMPTY_MASK and not unpack(members, total).any():
+        raise ProgdfError("only paint is selected, which no edit can change; select what it lies on as well")
 
 
 def rename_region(state: SelectionState, index: int, name: str, total: int) -> SelectionState:

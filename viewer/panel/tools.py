@@ -70,7 +70,9 @@ _TOOLS = (
 )
 _OPERATIONS = (
     *("select_grow", "select_shrink"),
-    *("select_smooth", "select_largest", "invert", "select_none", "hide_selected", "isolate"),
+    *("select_smooth", "select_largest", "invert", "select_none"),
+    *("select_with_paint", "select_without_paint", "select_paint"),
+    *("hide_selected", "isolate"),
     *("remove_selected", "move_selected", "duplicate_selected"),
 )
 COLUMN_PX = 88.0  # at 1×: start of the control in a row
@@ -218,7 +220,7 @@ def _selection(view: ViewState, bar: _Bar, actions: list[Action]) -> Pointed | N
             bar.button("select_refine", actions)
             bar.follow(imgui.get_frame_height())
             more_button("more", _OPERATIONS, bar.ui, actions)
-            tip("Grow, shrink, smooth, invert, hide, remove, move, copy")
+            tip("Grow, shrink, smooth, invert, paint on it, hide, remove, move, copy")
             _save(len(view.selection.regions), bar, actions)
     if view.selection.hidden:
         bar.button("show_hidden", actions, f"{Icon.HIDDEN}  ")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -100,9 +101,11 @@ def perform(workspace: Workspace, action: Action, facts: SceneFacts, aspect: flo
     if name in ("paint_clear", "paint_fill", "paint_invert", "paint_feather"):
         return _repaint(workspace, name, facts)
     if name in selection.CHANGES:
-        state = workspace.view.selection
-        changed = selection.change(state, action, facts.count, facts.neighborhood)
-        return replace(workspace, view=replace(workspace.view, selection=changed))
+        view = workspace.view
+        changed = selection.change(
+            view.selection, action, facts.count, facts.neighborhood, partial(facts.paint_on, view)
+        )
+        return replace(workspace, view=replace(view, selection=changed))
     if name in OF_EDITS:
         at = action.index if isinstance(action, OnItem) else workspace.focus
         return workspace if at is None else OF_EDITS[name](workspace, at, facts)
@@ -150,6 +153,7 @@ def _select_painted(workspace: Workspace, index: int, facts: SceneFacts) -> Work
     painted = layer_paint.decode(view.layers[index].paint, row.count, row.from_others)
     mask = np.zeros(facts.count, bool)
     mask[row.members if painted is None else row.members[painted.numpy() >= 0.5]] = True
+    mask |= facts.paint_on(view, mask)
     return replace(workspace, view=replace(view, selection=selection.select(view.selection, mask)))
 
 

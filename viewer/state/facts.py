@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from progdf.compose.added import rows_on
 from progdf.compose.layers import KINDS
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
@@ -37,6 +38,10 @@ _THUMBNAIL_DISTANCE = 0.7  # camera distance as a share of the framing distance
 Thumbnail = Callable[[ViewCamera], NDArray[np.uint8]]
 
 
+def _no_rows(_: NDArray[np.bool_]) -> NDArray[np.int64]:
+    return np.zeros(0, np.int64)
+
+
 @dataclass(frozen=True)
 class LayerRow:
     """Facts about one .gdf that the panel shows."""
@@ -59,6 +64,8 @@ class LayerRow:
     draft: bool = False  # a preliminary grade until training ends
     added: int = 0  # number of members that are not in the original scene
     from_others: int = 0  # number of its last members that other edits add
+    # returns the rows that it adds on some rows of the drawn scene, see `rows_on`. [N] bool -> [A] int64
+    rows_on: Callable[[NDArray[np.bool_]], NDArray[np.int64]] = field(default=_no_rows, compare=False)
     # renders its thumbnail, see `draw_thumbnail`
     thumbnail: Thumbnail = field(default=lambda _: np.zeros((48, 48, 3), np.uint8), compare=False)
 
@@ -95,6 +102,7 @@ def _row(scene: Gaussians, gdf: Gdf, gdfs: Sequence[Gdf], added: int) -> LayerRo
         draft="draft" in gdf.report,
         added=added,
         from_others=gdf.from_others,
+        rows_on=lambda mask: rows_on(gdf, torch.tensor(mask)).numpy(),
         thumbnail=partial(draw_thumbnail, scene, gdf),
     )
 

@@ -9,8 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from progdf.compose.layer_paint import FULL, Floats, decode, encode
+from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.scene.selection import Surface
 
@@ -45,6 +48,33 @@ def radius(pixels: float) -> float:
 def softness(share: float) -> float:
     """Clamp a softness to 0 to 1 and round it to 0.001."""
     return min(1.0, max(0.0, round(share, 3)))
+
+
+def erase_rows(paint: str, gdf: Gdf, scene: Gaussians, mask: NDArray[np.bool_]) -> str:
+    """Return a layer's paint with weight 0 for some of the rows that its edit adds.
+
+    Gaussians that the edit moves out of the way of such a row get weight 0 too, and so return to their place.
+
+    Args:
+        paint: paint of the layer
+        gdf: its edit, extended to the rows of the scene
+        scene: the scene with the rows that edits add
+        mask: rows to erase. [N] bool
+    """
+    members = gdf.region.members.numpy()
+    added_count = 0 if gdf.anchors is None else len(gdf.anchors)
+    own_count = len(members) - added_count
+    erased = mask[members[own_count:]]
+    if not erased.any():
+        return paint
+    decoded = decode(paint, len(members), gdf.from_others)
+    weights = np.ones(len(members), np.float32) if decoded is None else decoded.numpy().copy()
+    weights[own_count:][erased] = 0.0
+    if gdf.anchors is not None and gdf.anchors.pushes and own_count:
+        means = scene.means.numpy()[members]
+        _, nearest = cKDTree(means[own_count:], balanced_tree=False).query(means[:own_count])
+        weights[:own_count][erased[nearest]] = 0.0
+    return encode(weights)
 
 
 def begin_stroke(paint: str, gdf: Gdf, surface: Surface, through: bool, mode: str = "erase") -> Stroke:

@@ -22,7 +22,7 @@ from progdf.io.atomic import is_portable, numbered_names
 from progdf.scene.neighbors import Neighborhood
 from progdf.scene.selection import Mask, combine
 
-from .commands import Action, OnItem, SelectRegion
+from .commands import Action, OnItem, Plain, SelectRegion
 
 SUFFIX = ".region.npy"
 """Suffix of a region's file name, after the region's name."""
@@ -132,7 +132,11 @@ def show_all(state: SelectionState) -> SelectionState:
 
 
 def change(
-    state: SelectionState, action: Action, total: int, neighborhood: Callable[[], Neighborhood]
+    state: SelectionState,
+    action: Action,
+    total: int,
+    neighborhood: Callable[[], Neighborhood],
+    paint_on: Callable[[Mask], Mask] = np.zeros_like,
 ) -> SelectionState:
     """Apply one of `CHANGES`.
 
@@ -141,6 +145,7 @@ def change(
         action: the command; its name is one of `CHANGES`
         total: number of Gaussians in the scene
         neighborhood: returns the neighborhood of the scene, computed on first use
+        paint_on: returns the paint that lies on a mask. [N] -> [N]
     """
     mask = unpack(state.members, total)
     match action:
@@ -148,7 +153,8 @@ def change(
             region = _region(state, index)
             if region is None:
                 return state
-            return select(state, combine(mask, unpack(region.members, total), mode))
+            members = unpack(region.members, total)
+            return select(state, combine(mask, members | paint_on(members), mode))
         case OnItem("show_region", index):
             region = _region(state, index)
             if region is None:
@@ -156,10 +162,20 @@ def change(
             return change_region(state, index, replace(region, visible=not region.visible))
         case OnItem("forget_region", index):
             return change_region(state, index, None)
+        case Plain("select_with_paint"):
+            return select(state, mask | paint_on(mask))
+        case Plain("select_without_paint"):
+            return select(state, mask & ~paint_on(np.ones_like(mask)))
+        case Plain("select_paint"):
+            only = (mask | paint_on(mask)) & paint_on(np.ones_like(mask))
+            return select(state, only) if only.any() else state
     if action.name in _CHANGES:
         return _CHANGES[action.name](state, mask)
     change_mask = CHANGES_BY_NEIGHBORS[action.name]
-    return select(state, change_mask(neighborhood(), mask)) if state.count else state
+    if not state.count:
+        return state
+    changed = change_mask(neighborhood(), mask)
+    return select(state, changed | paint_on(changed))
 
 
 def _region(state: SelectionState, index: int) -> NamedRegion | None:
@@ -181,8 +197,9 @@ _CHANGES: dict[str, Callable[[SelectionState, Mask], SelectionState]] = {
     "isolate": lambda state, mask: isolate(state, len(mask)),
     "show_hidden": lambda state, _: show_all(state),
 }
+_PAINT_CHANGES = ("select_with_paint", "select_without_paint", "select_paint")
 _REGION_CHANGES = ("region", "show_region", "forget_region")
-CHANGES = (*_CHANGES, *_REGION_CHANGES, *CHANGES_BY_NEIGHBORS)
+CHANGES = (*_CHANGES, *_PAINT_CHANGES, *_REGION_CHANGES, *CHANGES_BY_NEIGHBORS)
 """Names of the commands on the selection. The file of a removed region is kept."""
 
 

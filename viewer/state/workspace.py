@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from msgspec import Meta
 
 from progdf.gaussians import ZERO, Origin
@@ -66,6 +67,13 @@ class SceneFacts:
     # computed on first use: for changes of the selection, and for scribble strokes
     neighborhood: Callable[[], Neighborhood] = _no_facts
     scribbles: Callable[[], Scribbles] = _no_facts
+
+    def paint_on(self, view: ViewState, mask: Mask) -> Mask:
+        """Return the rows that the view's layers add on some rows, such as paint on an object. [N] -> [N]"""
+        paint = np.zeros_like(mask)
+        for gdf in {layer.gdf for layer in view.layers if layer.gdf < len(self.rows)}:
+            paint[self.rows[gdf].rows_on(mask)] = True
+        return paint
 
 
 @dataclass(frozen=True)

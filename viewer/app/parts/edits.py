@@ -51,7 +51,9 @@ class EditActions:
         before = self._store.get().view
         scene = self._documents.get().original
         selected = selection.unpack(before.selection.members, len(scene)).copy()
-        where, mask = ("selection", selected) if selected.any() else ("all", np.ones(len(scene), bool))
+        where, mask = "all", np.ones(len(scene), bool)
+        if before.selection.count:
+            where, mask = "selection", selected
         gdf = self._load(path, from_mask(where, torch.from_numpy(mask)))
         gdf = replace(gdf, name=name or gdf.name)
         if deselect:

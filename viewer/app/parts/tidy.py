@@ -2,30 +2,94 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
+from progdf.compose.added import rows_on
+from progdf.compose.layer_paint import layer_of
+from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
-from progdf.gdf.file import save_gdf
+from progdf.gaussians import Gaussians
+from progdf.gdf.file import UNSEEN_LOGIT, save_gdf
 from progdf.io.atomic import make_folder
 from progdf.region import Region, from_mask
 from progdf.tidy import Step, similarity, tidy
 from viewer.app.handles import gizmo_step
 from viewer.app.messages import Requests
 from viewer.app.parts.edits import EditActions
-from viewer.files.document import DocumentStore
+from viewer.files.document import Document, DocumentStore
 from viewer.jobs.training import edits_folder, free_path
-from viewer.state import selection
+from viewer.state import paint, selection
+from viewer.state.layers import visible_layers, with_paint
 from viewer.state.transient import Gizmo
-from viewer.state.view_state import LayerState
+from viewer.state.view_state import LayerState, ViewState
 from viewer.state.workspace import Store, with_transient
 
 _NAMES = {"remove": "removed", "transform": "moved", "duplicate": "copy"}
 _INSTRUCTIONS = {"remove": "remove", "transform": "move", "duplicate": "copy"}
+
+
+@dataclass(frozen=True)
+class _Selected:
+    """Selected Gaussians of the scene, and selected paint."""
+
+    region: Region  # Gaussians of the original
+    leaves_paint: bool  # paint lies on them, and none of it is selected
+    loose_paint: NDArray[np.bool_]  # selected paint that lies on other Gaussians. [N]
+    # returns the Gaussians of a copy: those of the original, with the selected paint as it is now
+    copied: Callable[[], Gaussians]
+
+
+def select_parts(document: Document, view: ViewState) -> _Selected:
+    """Return the selected Gaussians, and the selected paint.
+
+    Raises:
+        ProgdfError: nothing is selected.
+    """
+    count = len(document.original)
+    mask = selection.unpack(view.selection.members, len(document.scene))
+    if not mask.any():
+        raise ProgdfError("nothing is selected; select a part of the scene first")
+    own = mask.copy()
+    own[count:] = False
+    painting = {layer.gdf for layer in view.layers}
+    lying = np.zeros_like(own)
+    for gdf in painting:
+        lying[rows_on(document.gdfs[gdf], torch.from_numpy(own)).numpy()] = True
+    paint_rows = mask & ~own
+    return _Selected(
+        region=from_mask("selection", torch.from_numpy(own[:count].copy())),
+        leaves_paint=bool(lying.any()) and not bool((lying & mask).any()),
+        loose_paint=paint_rows & ~lying,
+        copied=cache(partial(_copy_source, document, view, own, paint_rows)),
+    )
+
+
+def _copy_source(
+    document: Document, view: ViewState, own: NDArray[np.bool_], paint_rows: NDArray[np.bool_]
+) -> Gaussians:
+    """Return selected Gaussians of the original, and selected paint, under the layers that paint it.
+
+    Args:
+        document: the open document
+        view: its layers
+        own, paint_rows: selected Gaussians of the original, and selected paint. [N]
+    """
+    layers = []
+    for layer in visible_layers(view):
+        gdf = document.gdfs[layer.gdf]
+        if gdf.anchors is not None and paint_rows[gdf.region.members.numpy()].any():
+            layers.append(layer_of(gdf, layer.strength, layer.gains, layer.paint))
+    painted = compose_layers(document.scene, layers, view.blend)
+    drawn = (painted.logit_opacities >= UNSEEN_LOGIT).numpy()
+    return painted[torch.from_numpy(np.flatnonzero(own | (paint_rows & drawn)))]
 
 
 class TidyActions:
@@ -41,7 +105,7 @@ class TidyActions:
         self._store = store
         self._documents = documents
         self._edits = edits
-        self._region: Region | None = None  # the region being moved
+        self._selected: _Selected | None = None  # the Gaussians being moved or copied
         self._folder = Path()  # folder of new edits
 
     @property
@@ -58,37 +122,58 @@ class TidyActions:
 
     def leave_scene(self) -> None:
         """Drop the handles when another scene opens."""
-        self._region = None
+        self._selected = None
         self._set_gizmo(None)
 
     def _begin(self, does: str) -> None:
-        scene = self._documents.get().original
-        self._folder = edits_folder(self._documents.get().file)
-        mask = selection.unpack(self._store.get().view.selection.members, len(scene))
-        if not mask.any():
-            raise ProgdfError("nothing is selected; select a part of the scene first")
-        region = from_mask("selection", torch.from_numpy(mask.copy()))
+        document = self._documents.get()
+        self._folder = edits_folder(document.file)
+        selected = select_parts(document, self._store.get().view)
         if does == "remove":
-            self._add(does, [Step("remove", region)])
+            self._remove(selected)
             return
-        center = scene.means[region.members].double().mean(dim=0)
+        if does == "transform" and not len(selected.region):
+            raise ProgdfError("only paint is selected, which moves with its object; copy it, or select both")
         kind: Literal["transform", "duplicate"] = "duplicate" if does == "duplicate" else "transform"
-        self._region = region
+        moved = document.original[selected.region.members]
+        if kind == "duplicate":
+            moved = selected.copied()
+        center = moved.means.double().mean(dim=0)
+        self._selected = selected
         at = (float(center[0]), float(center[1]), float(center[2]))
         self._set_gizmo(Gizmo(kind, at, np.eye(4)))
         self._store.wake()
 
+    def _remove(self, selected: _Selected) -> None:
+        """Add a layer that removes the selection, and erase selected paint that lies elsewhere."""
+        document = self._documents.get()
+        view = self._store.get().view
+        for index, layer in enumerate(view.layers):
+            gdf = document.gdfs[layer.gdf]
+            painted = paint.erase_rows(layer.paint, gdf, document.scene, selected.loose_paint)
+            if painted != layer.paint and layer.locked:
+                raise ProgdfError(f"{layer.name} is locked; unlock it to erase its paint")
+            view = with_paint(view, index, painted)
+        if not len(selected.region):
+            view = replace(view, selection=selection.select_none(view.selection))
+        self._store.change(view)
+        if len(selected.region):
+            self._add("remove", [Step("remove", selected.region)], selected.leaves_paint)
+
     def _steps(self) -> list[Step]:
         gizmo = self._store.get().transient.gizmo
-        if not isinstance(gizmo, Gizmo) or self._region is None:
+        selected = self._selected
+        if not isinstance(gizmo, Gizmo) or selected is None:
             return []
-        return [Step(gizmo.does, self._region, similarity(*gizmo_step(gizmo)))]
+        copied = selected.copied() if gizmo.does == "duplicate" else None
+        return [Step(gizmo.does, selected.region, similarity(*gizmo_step(gizmo)), copied)]
 
     def _place(self, _: None) -> None:
         """Show the moved selection at the position of the handles."""
         if steps := self._steps():
             document = self._documents.get()
-            gdf = tidy(document.original, steps, _NAMES[steps[0].does])
+            leaves_paint = self._selected is not None and self._selected.leaves_paint
+            gdf = tidy(document.original, steps, _NAMES[steps[0].does], leaves_paint=leaves_paint)
             live = (LayerState(len(document.edits), gdf.name, 1.0),)
             self._documents.replace(document, (gdf,), live)
 
@@ -96,29 +181,29 @@ class TidyActions:
         gizmo = self._store.get().transient.gizmo
         steps = self._steps()
         if isinstance(gizmo, Gizmo) and steps and (gizmo.does == "duplicate" or gizmo.is_moved):
-            self._add(steps[0].does, steps)
+            self._add(steps[0].does, steps, self._selected is not None and self._selected.leaves_paint)
         self._end()
 
     def _put_back(self, _: None) -> None:
-        moved = self._region is not None
+        moved = self._selected is not None
         self._end()
         if moved:
             self._documents.replace(self._documents.get())
 
     def _end(self) -> None:
-        self._region = None
+        self._selected = None
         self._set_gizmo(None)
         self._store.wake()
 
     def _set_gizmo(self, gizmo: Gizmo | None) -> None:
         self._store.replace(with_transient(self._store.get(), gizmo=gizmo))
 
-    def _add(self, does: str, steps: Sequence[Step]) -> None:
+    def _add(self, does: str, steps: Sequence[Step], leaves_paint: bool) -> None:
         """Write the edit and add it as a layer on top."""
         document = self._documents.get()
         make_folder(self._folder)
         name = document.free_name(_NAMES[does])
         path = free_path(self._folder, name, ".gdf")
-        gdf = tidy(document.original, steps, name, _INSTRUCTIONS[does], cameras=())
+        gdf = tidy(document.original, steps, name, _INSTRUCTIONS[does], cameras=(), leaves_paint=leaves_paint)
         save_gdf(path, gdf)
         self._edits.add(path, name, deselect=True)
