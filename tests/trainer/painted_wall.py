@@ -10,8 +10,8 @@ from progdf.camera import Camera, intrinsics, look_at
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.rasterize import render
+from progdf.surface.find import find_surface
 from trainer.paint.discs import PaintedView, composite_over
-from trainer.paint.surface import find_surface
 from trainer.run.paint import DiscLayout, lay_discs, make_goal, paint_gdf
 from trainer.views.view import BACKGROUND
 

@@ -18,9 +18,9 @@ from progdf.io.cameras import load_cameras
 from progdf.io.images import open_picture
 from progdf.rasterize.engines import render_depth
 from progdf.scene.regions import read_numbers
+from progdf.surface.find import OPAQUE, PaintSurface, find_surface
 from trainer.options import EditKind, EditorOptions
 from trainer.paint.discs import MIN_ALPHA, PaintedView, composite_over, project_paint, sample_image
-from trainer.paint.surface import OPAQUE, PaintSurface, find_surface
 from trainer.views.view import BACKGROUND, View, make_view, with_near_plane
 
 from .base import EditorInput

@@ -27,8 +27,7 @@ from progdf.quaternions import matrix_quats
 from progdf.rasterize.cpu.engine import ListedWeights
 from progdf.rasterize.engines import activate, color_map, render_depth
 from progdf.sh import rgb_to_sh0
-
-from .surface import MIN_COSINE, PaintSurface, light_thickness
+from progdf.surface.find import MIN_COSINE, PaintSurface, light_thickness
 
 Array = NDArray[np.float64]
 

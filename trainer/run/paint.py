@@ -22,6 +22,7 @@ from progdf.io.images import picture_size
 from progdf.metrics.image import decibels
 from progdf.rasterize import alpha_weights, render
 from progdf.region import Region
+from progdf.surface.find import find_surface, orbit
 from progdf.terminal import group_digits
 from trainer.editors.pictures import read_edit
 from trainer.paint.discs import (
@@ -34,7 +35,6 @@ from trainer.paint.discs import (
     project_paint,
 )
 from trainer.paint.solve import ExpectedView, box_of, solve_colors
-from trainer.paint.surface import find_surface, orbit
 from trainer.store.progress import RunLog
 from trainer.views.view import BACKGROUND, View, crop, make_view, render_view
 

@@ -16,12 +16,12 @@ from pathlib import Path
 import moderngl
 from imgui_bundle import imgui
 
-from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from viewer.files import exports
 from viewer.gl.present import read_rgb
 from viewer.panel import new_edit_form, pages, panel, timeline_bar
 from viewer.pictures.film import Pixels
+from viewer.render.decal_surfaces import DecalSurfaces
 from viewer.render.engine import ViewEngine
 from viewer.render.picking import Surfaces
 from viewer.state import actions, layer_selection, timeline, workspace
@@ -49,7 +49,8 @@ from viewer.ui.pointer import PointerContext
 
 from . import interface, mouse, select_tool
 from .canvas import Canvas, LayersOf, RememberView, forget_view, no_layers
-from .handles import decal_takes_mouse, draw_decal, draw_gizmo, gizmo_takes_mouse, place_decal
+from .decal import REST_S, DecalPlace, decal_takes_mouse, draw_decal, draw_ghost, place_decal
+from .handles import draw_gizmo, gizmo_takes_mouse
 from .messages import Messages
 
 SETTLE_FRAMES = 3  # imgui needs a frame or two until hovering and layout follow an event
@@ -99,6 +100,7 @@ class FramePacer:
 
 
 FLIGHT_S = 1 / 60  # seconds between frames while flying
+SURFACE_POLL_S = 0.05  # seconds between frames while the surface under a decal is computed
 
 
 class MainView:
@@ -131,6 +133,7 @@ class MainView:
         self.remember: RememberView = forget_view  # receives the saved pictures of single views
         self.layers_of: LayersOf = no_layers  # returns the layers of a view for a picture's metadata
         self.surfaces = Surfaces()
+        self.decal_surfaces = DecalSurfaces()
         self.ui = UiContext(scale)
         imgui.backends.opengl3_init("#version 330")
         self._pace = FramePacer()
@@ -164,6 +167,7 @@ class MainView:
         imgui.backends.opengl3_shutdown()
         self.ui.close()
         self.surfaces.drop()
+        self.decal_surfaces.drop()
         self.canvas.release()
 
     def set_engine(self, engine: ViewEngine, facts: SceneFacts, live: tuple[LayerState, ...] = ()) -> None:
@@ -174,6 +178,8 @@ class MainView:
         """
         self.canvas.release()
         self.surfaces.drop()
+        if engine.scene is not self.engine.scene:
+            self.decal_surfaces.drop()
         self.engine = engine
         self.facts = facts
         self.store.replace(with_transient(self.work, live=live))
@@ -200,10 +206,21 @@ class MainView:
             waits.append(0.0)
         if self.work.message is not None:
             waits.append(max(self.work.message.until - self._clock, 0.0))
+        waits += self._decal_waits()
         sharpens = self.canvas.next_frame_delay(self._clock)
         waits += [] if sharpens is None else [sharpens]
         film = timeline.next_frame_delay(self.work.player, self.work.view.timeline)
         return self._pace.next_frame_delay(waits if film is None else [*waits, film])
+
+    def _decal_waits(self) -> list[float]:
+        """Return the seconds until the decal being placed needs a frame; empty for none."""
+        decal = self.work.transient.gizmo
+        if not isinstance(decal, Decal):
+            return []
+        if self.decal_surfaces.is_busy:
+            return [SURFACE_POLL_S]
+        rests = decal.frame is not None and not decal.surface
+        return [max(decal.laid_at + REST_S - self._clock, 0.0)] if rests else []
 
     def is_due(self) -> bool:
         """Return True if a frame would show anything new.
@@ -342,6 +359,8 @@ class MainView:
         work = self.work
         held = work.transient.pointer
         decal = isinstance(work.transient.gizmo, Decal)
+        if decal and "Enter" in [press.chord for press in self._keys.pressed]:
+            return  # it sets the decal where it is, see `_move_gizmo`
         picks = work.form_open and work.form.picks
         if decal or picks or work.view.select.tool or work.view.brush.active:
             clicks = decal or picks or work.view.select.tool in select_tool.CLICKED
@@ -378,6 +397,8 @@ class MainView:
 
     def _move_gizmo(self) -> bool:
         """Move the handles or the decal with the mouse; return True if they take the mouse."""
+        for ghost in self.work.transient.ghosts:
+            draw_ghost(ghost, self._pointer())
         gizmo = self.work.transient.gizmo
         if gizmo is None:
             return False
@@ -388,9 +409,9 @@ class MainView:
             moved, asked = draw_gizmo(gizmo, self._pointer())
             takes_mouse = gizmo_takes_mouse(moved)
         else:
-            keep = "lay_decal"
-            moved, asked = draw_decal(gizmo, self._pointer())
-            takes_mouse = decal_takes_mouse()
+            keep = "lay_decal" if gizmo.placed else ""
+            moved, asked = draw_decal(gizmo, self._pointer(), self.decal_surfaces, "Enter" in pressed)
+            takes_mouse = decal_takes_mouse(moved, self._pointer())
         self.store.replace(with_transient(self.work, gizmo=moved))
         if "Escape" in pressed or "Enter" in pressed:
             asked = "put_back" if "Escape" in pressed else keep
@@ -400,13 +421,16 @@ class MainView:
             self.wake()
         return takes_mouse
 
-    def decal_place(self) -> tuple[Path, Camera, str] | None:
-        """Return the file of the decal being placed, the camera from which it is placed, and its position in
-        that picture."""
+    def decal_place(self) -> DecalPlace | None:
+        """Return the decal being placed, the camera that projects it, and its position in that picture.
+
+        Raises:
+            ProgdfError: there is no surface under the decal.
+        """
         decal = self.work.transient.gizmo
         if not isinstance(decal, Decal):
             return None
-        return decal.path, *place_decal(decal, self._pointer())
+        return decal, *place_decal(decal)
 
     def _takes_keys(self) -> bool:
         """Return True if a dialog, list, menu or form takes all keys, or Escape has just closed one."""

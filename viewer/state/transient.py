@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from progdf.scene.scribbles import Rows
 from progdf.scene.selection import Centers, Mask, Surface
+from viewer.camera.decal_warp import DecalFrame, DecalMesh
 from viewer.camera.view_camera import Vec3, ViewCamera
 
 from .paint import Stroke
@@ -55,6 +56,9 @@ class Gizmo:
         return not np.allclose(self.matrix, np.eye(4), atol=1e-9)
 
 
+DecalGrip = Literal["", "move", "scale", "rotate"]
+
+
 @dataclass(frozen=True)
 class Decal:
     """Picture with transparency and its placement in the window."""
@@ -62,9 +66,27 @@ class Decal:
     path: Path
     texture: int  # GL name
     texture_size: tuple[int, int]  # pixels
-    size: float = 0.0  # longer side, window pixels; 0 before the first frame
+    opaque: Mask = field(compare=False)  # pixels of the texture that are not transparent. [H,W]
+    size: float = 0.0  # longer side, window pixels while it follows the pointer; 0 before the first frame
     angle: float = 0.0  # degrees, counterclockwise
     at: tuple[float, float] | None = None  # center, window pixels; None before the first frame
+    level: bool = True  # angles count from the world's up axis, not from the picture's
+    frame: DecalFrame | None = None  # on the surface; None where there is none
+    mesh: DecalMesh | None = None  # its points on the surface; None while they are unknown
+    surface: str = ""  # description of that surface
+    placed: bool = False  # handles move it
+    grip: DecalGrip = ""  # handle that the mouse drags
+    laid_for: object = field(default=None, compare=False)  # camera and placement of the mesh
+    laid_at: float = field(default=0.0, compare=False)  # when the mesh was laid, on the window's clock
+
+
+@dataclass(frozen=True)
+class DecalGhost:
+    """Decal in training, drawn until its layer replaces it."""
+
+    run: Path  # folder of the run
+    texture: int  # GL name
+    mesh: DecalMesh
 
 
 @dataclass(frozen=True)
@@ -164,6 +186,7 @@ class Transient:
     preview: PreviewState = PreviewState()  # state of the preview of a new edit
     live: tuple[LayerState, ...] = ()  # edits in training, on top of the layer stack
     gizmo: Gizmo | Decal | None = None  # handles of a selection being moved, or a decal being placed
+    ghosts: tuple[DecalGhost, ...] = ()  # decals in training
     pointer: KeyPointer = KeyPointer()  # pointer of the active tool
     tool: MouseTool = MouseTool()  # drag and gesture of the mouse
     recent: tuple[Path, ...] = ()  # recently opened files, for menu and dialogs; the last one first

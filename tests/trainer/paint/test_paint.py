@@ -20,13 +20,13 @@ from progdf.metrics.image import psnr
 from progdf.quaternions import rotate_vectors
 from progdf.rasterize import render
 from progdf.region import whole_scene
+from progdf.surface.find import orbit
 from tests.helpers.edits import bits
 from tests.trainer.painted_wall import CAMERA, SIDE, edit_of, letters, paint_on, picture, wall
 from trainer.editors.base import EditorInput
 from trainer.editors.decal import DecalEditor, decal, parse_place
 from trainer.options import EditorOptions
 from trainer.paint.discs import merge_pixels, place_discs
-from trainer.paint.surface import orbit
 from trainer.run.paint import choose_discs, make_goal
 from trainer.run.pasted import train_decal
 from trainer.views.view import BACKGROUND

@@ -17,13 +17,13 @@ from progdf.gdf.file import load_gdf
 from progdf.io.images import to_picture
 from progdf.io.picture_camera import camera_chunk
 from progdf.metrics.image import psnr
+from progdf.surface.find import find_surface, orbit
 from tests.helpers.edits import bits
 from tests.helpers.trained import train
 from tests.trainer.painted_wall import CAMERA, letters, paint_on, picture, wall
 from trainer.evaluate.command import evaluate
 from trainer.options import EditorOptions, EvaluateOptions, RegionOptions, TrainOptions, with_values
 from trainer.paint.discs import MIN_ALPHA, PaintedView, composite_over, place_discs, project_paint
-from trainer.paint.surface import find_surface, orbit
 from trainer.run.finish import RunResult
 from trainer.run.paint import DiscLayout, PaintGoal, choose_discs, lay_discs, make_goal
 from trainer.views.view import BACKGROUND, render_view

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
-from viewer.app.handles import load_decal
+from viewer.app.decal import load_decal
 from viewer.state.commands import Plain
 from viewer.state.transient import Decal
 from viewer.state.view_state import SelectTool
@@ -126,6 +126,8 @@ def test_decal_is_placed_by_keys(tmp_path: Path) -> None:
         assert isinstance(hand.main_view.work.transient.gizmo, Decal)
         assert hand.main_view.work.transient.gizmo.at == places(MIDDLE, WAY)[-1]
         hand.key("Space")
+        assert hand.main_view.work.transient.gizmo.placed
+        hand.key("Enter")
         assert Plain("lay_decal") in hand.main_view.take_requests()
 
 

@@ -21,7 +21,7 @@ from progdf.io.picture_camera import (
 )
 from progdf.scene.match_views import view_thumbnail
 from progdf.scene.taken_views import FoundView, TakenView, find_view, remember_view, taken_views
-from viewer.app.handles import is_decal, load_decal
+from viewer.app.decal import is_decal, load_decal
 from viewer.app.messages import Messages, Requests, WaitFor
 from viewer.camera.view_camera import ViewCamera, from_camera, to_camera
 from viewer.files import exports

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from progdf.camera import Camera
 from progdf.io.atomic import read_file, write_file
 from progdf.terminal import format_duration
+from viewer.app.decal import DecalPlace
 from viewer.app.messages import Messages, Requests, attempt, failure_line
 from viewer.app.parts.edits import EditActions
 from viewer.files import exports, region_files
@@ -26,6 +27,7 @@ from viewer.jobs.training import EditOrder
 from viewer.state.commands import Plain
 from viewer.state.forms import ALL, CHANGED, SELECTION, NewEdit
 from viewer.state.selection import EMPTY_MASK, SUFFIX, add_region, free_name
+from viewer.state.transient import DecalGhost
 from viewer.state.view_state import LayerState
 from viewer.state.workspace import Dialog, JobCard, Store, with_transient
 
@@ -76,7 +78,7 @@ class JobActions:
         messages: messages to the user
         edits: adds drafts and results as layers
         open_file: opens a file according to its content
-        decal_place: returns file, camera and position of the decal being placed, see `MainView.decal_place`
+        decal_place: returns the decal being placed with camera and position, see `MainView.decal_place`
         draft: returns the file of a grade that previews the form
         anchor: returns the picture of one view that the form's sentence should follow
         follow: opens that picture's file in another program and shows the saved result
@@ -90,7 +92,7 @@ class JobActions:
         messages: Messages,
         edits: EditActions,
         open_file: Callable[[Path], None],
-        decal_place: Callable[[], tuple[Path, Camera, str] | None],
+        decal_place: Callable[[], DecalPlace | None],
         draft: Callable[[NewEdit], Path | None] = lambda _: None,
         anchor: Callable[[NewEdit], tuple[NDArray[np.uint8], Camera] | None] = lambda _: None,
         follow: Callable[[Path], None] = lambda _: None,
@@ -215,7 +217,8 @@ class JobActions:
         self._store.replace(with_transient(self._store.get(), gizmo=None))
         if placed is None or scene is None:
             return
-        path, camera, at = placed
+        decal, camera, at = placed
+        path = decal.path
         name = replace(NewEdit(), name=path.stem).layer_name
         out = training.free_run(training.edits_folder(scene), name)
         camera_file = exports.single_camera(out, camera, self._documents.get().scene.origin)
@@ -231,6 +234,10 @@ class JobActions:
             camera=str(camera_file),
         )
         self.queue.add(order)
+        if decal.mesh is not None:
+            ghost = DecalGhost(out, decal.texture, decal.mesh)
+            ghosts = (*self._store.get().transient.ghosts, ghost)
+            self._store.replace(with_transient(self._store.get(), ghosts=ghosts))
 
     def _add_draft(self, order: EditOrder, draft: Path, strength: float = 1.0) -> None:
         """Add a grade as the layer that the trained edit replaces later.
@@ -363,3 +370,8 @@ class JobActions:
         if jobs != self._store.get().jobs:
             self._store.replace(replace(self._store.get(), jobs=jobs))
             self._store.wake()
+        busy = {job.task.out for job in self.queue.jobs if job.busy and job.task.scene == self._scene}
+        ghosts = self._store.get().transient.ghosts
+        kept = tuple(ghost for ghost in ghosts if ghost.run in busy)
+        if kept != ghosts:
+            self._store.replace(with_transient(self._store.get(), ghosts=kept))

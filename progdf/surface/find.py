@@ -21,7 +21,7 @@ from progdf.quaternions import rotate_vectors
 from progdf.rasterize import render
 from progdf.rasterize.engines import Crop, Depth, render_depth
 
-from .surface_models import (
+from .models import (
     MIN_SAMPLES,
     Array,
     Mask,
@@ -48,8 +48,8 @@ MIN_COSINE = 0.3
 _NEARBY_DEG = (-15.0, -7.5, 7.5, 15.0)  # rotations of the nearby views, around both image axes
 _SAMPLES_PER_VIEW = 300  # largest number of samples of one view
 _BLOCKS = 4  # left-out blocks along each side of the paint
-# deviations, or thicknesses if that is more, within which a pixel belongs to a fitted surface
-_SAME_SURFACE_DEVIATIONS = 4.0
+SAME_SURFACE_DEVIATIONS = 4.0
+"""Deviations, or thicknesses if that is more, within which a pixel belongs to a fitted surface."""
 _AROUND_PX = 16  # pixels; width of the border around the paint in which the model replaces the depth
 _MIN_PIECE_SHARE = 0.02  # share of the paint; smaller pieces are noise
 
@@ -93,6 +93,14 @@ class PaintSurface:
         if not self.fits:
             return "the smoothed depth of its view, as the paint is too small for a model"
         return "; and ".join(fit.describe() for fit in self.fits)
+
+    def summary(self) -> str:
+        """Return the models of the painted pieces and the scatter of the scene around them as short text."""
+        if not self.fits:
+            return "the smoothed depth"
+        names = " and ".join(fit.model.name for fit in self.fits)
+        scatter = max(fit.residual_px for fit in self.fits)
+        return f"{names}; the scene scatters by {scatter:.0f} px around it"
 
 
 def smooth_depth(depth: NDArray[np.float32], opaque: Mask) -> Array:
@@ -201,16 +209,26 @@ def light_thickness(scene: Gaussians, camera: Camera, mask: Mask, window: Crop |
     Returns:
         the deviation, world units
     """
+    mean, spread, _ = light_moments(scene, camera, window)
+    pixel = float(np.median(mean[mask])) / float(camera.K[0, 0])
+    return max(pixel, float(np.median(spread[mask])))
+
+
+def light_moments(scene: Gaussians, camera: Camera, window: Crop | None = None) -> tuple[Array, Array, Array]:
+    """Return mean and standard deviation of the depths of the light within each pixel, and the opacity.
+
+    Depths are camera z, world units. [H,W] each
+    """
     axis = camera.viewmat[2].double()
     depths = scene.means.double() @ axis[:3] + axis[3]
-    z = (depths - depths.median()).float()
+    middle = depths.median() if len(depths) else torch.zeros(())
+    z = (depths - middle).float()
     colors = torch.stack([z, z.square(), torch.ones_like(z)], dim=1)
-    light = render(scene, camera, (0.0, 0.0, 0.0), colors=colors, crop=window).image[mask].double()
-    mean, square, total = light.unbind(1)
+    light = render(scene, camera, (0.0, 0.0, 0.0), colors=colors, crop=window).image.double()
+    first, second, total = light.unbind(2)
     visible = total.clamp_min(1e-6)
-    variance = square / visible - (mean / visible).square()
-    pixel = float((mean / visible).median() + depths.median()) / float(camera.K[0, 0])
-    return max(pixel, float(variance.clamp_min(0.0).sqrt().median()))
+    variance = (second / visible - (first / visible).square()).clamp_min(0.0)
+    return (first / visible + middle).numpy(), variance.sqrt().numpy(), total.numpy()
 
 
 @dataclass(frozen=True)
@@ -267,7 +285,7 @@ def _fit_pieces(
         chosen = fit_surface(_inside(samples, camera, start), thickness_px)
         if chosen is None:
             break
-        limit = _SAME_SURFACE_DEVIATIONS * max(chosen[1], thickness_px)
+        limit = SAME_SURFACE_DEVIATIONS * max(chosen[1], thickness_px)
         same = start | remaining & (_distance_px(chosen[0], x, y, local.depth, focal) <= limit)
         if same.sum() > start.sum():
             chosen = fit_surface(_inside(samples, camera, same), thickness_px) or chosen

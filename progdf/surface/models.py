@@ -237,7 +237,7 @@ def model_makers(samples: Samples) -> Iterator[Sequence[ModelMaker]]:
     yield [partial(fit_planes, count=3, is_convex=convex) for convex in (True, False)]
     for cells in _SPLINE_CELLS:
         if len(samples) >= _SAMPLES_PER_TERM * (cells + 3) ** 2:
-            yield [partial(fit_spline, cells=cells, box=_box_of(samples))]
+            yield [partial(fit_spline, cells=cells, box=box_of(samples))]
 
 
 def deviation(residuals: Array) -> float:
@@ -372,7 +372,8 @@ def fit_quadric(samples: Samples) -> Quadric:
     return Quadric(_robust(_quadratic_terms(samples.x, samples.y), samples))
 
 
-def _box_of(samples: Samples) -> tuple[float, float, float, float]:
+def box_of(samples: Samples) -> tuple[float, float, float, float]:
+    """Return the smallest x and y and the largest x and y of samples."""
     return tuple(  # type: ignore[return-value]
         float(edge(values)) for edge in (np.min, np.max) for values in (samples.x, samples.y)
     )

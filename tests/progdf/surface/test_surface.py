@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from progdf.surface.find import find_surface, fit_surface, light_thickness
+from progdf.surface.models import Samples, fit_planes, fit_quadric, fit_spline
 from tests.trainer.painted_wall import CAMERA, SIDE, wall
-from trainer.paint.surface import find_surface, fit_surface, light_thickness
-from trainer.paint.surface_models import Samples, fit_planes, fit_quadric, fit_spline
 
 FOCAL = 600.0
 NOISE_PX = 3.0

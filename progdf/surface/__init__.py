@@ -1,0 +1,1 @@
+"""Smooth surfaces fitted to the depth that a camera sees."""

@@ -1,0 +1,161 @@
+"""Surfaces under a decal, computed in another thread: the depth of the view, and the training's surface."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
+
+from progdf.camera import Camera
+from progdf.gaussians import Gaussians
+from progdf.surface.find import PaintSurface, find_surface
+from progdf.surface.footprint import DepthPicture, depth_picture
+from progdf.threads import StoppedError, stopped_by
+from viewer.camera.decal_warp import (
+    DecalFrame,
+    DecalMesh,
+    Mask,
+    decal_camera,
+    is_hidden,
+    painted_pixels,
+    warp_on_surface,
+)
+
+from .picking import run_in_background
+
+_T = TypeVar("_T")
+
+_DISTANCES = (1.0, 0.5, 0.25)  # tried distances of the projecting camera, shares of the viewer's
+_TRIAL_PX = 64  # longer side of the picture that shows what hides a decal
+
+
+@dataclass(frozen=True)
+class LaidDecal:
+    """Decal on the surface that training finds."""
+
+    surface: PaintSurface
+    mesh: DecalMesh
+
+
+class _Latest(Generic[_T]):
+    """Last result of a computation in another thread. A newer request replaces a waiting one."""
+
+    def __init__(self) -> None:
+        self._key: object = None
+        self._value: _T | None = None
+        self._pending: object = None  # key of the computation in progress
+        self._stop = threading.Event()
+
+    def get(self, key: object, make: Callable[[], _T]) -> _T | None:
+        """Return the result for a key; None while it is computed."""
+        if key != self._key:
+            self.drop()
+            self._key = key
+            self._pending = key
+            self._stop = threading.Event()
+            run_in_background(self._compute, key, make, self._stop)
+        return self._value
+
+    def finish(self, key: object, make: Callable[[], _T]) -> _T:
+        """Return the result for a key; compute it at once if needed."""
+        value = self._value if key == self._key else None
+        if value is None:
+            value = make()
+            self.drop()
+            self._key = key
+            self._value = value
+        return value
+
+    @property
+    def is_busy(self) -> bool:
+        """True if a requested result is missing."""
+        return self._pending is not None
+
+    def drop(self) -> None:
+        """Cancel the computation and forget the result."""
+        self._stop.set()
+        self._key = self._value = self._pending = None
+
+    def _compute(self, key: object, make: Callable[[], _T], stop: threading.Event) -> None:
+        if stop.is_set():
+            return
+        try:
+            with stopped_by(stop), suppress(StoppedError):
+                value = make()
+                if key is self._key:
+                    self._value = value
+        finally:
+            if key is self._pending:
+                self._pending = None
+
+
+class DecalSurfaces:
+    """Cache of the surfaces under the decal being placed. `drop` it with the scene."""
+
+    def __init__(self) -> None:
+        self._depth = _Latest[DepthPicture]()
+        self._laid = _Latest[LaidDecal]()
+
+    def depth(self, scene: Gaussians, camera: Camera, at_once: bool = False) -> DepthPicture | None:
+        """Return the depth picture of a camera; None while it is computed.
+
+        Args:
+            scene: the original; it must not change
+            camera: camera of the picture
+            at_once: wait for it
+        """
+        key = (camera.viewmat.numpy().tobytes(), camera.K.numpy().tobytes(), camera.width, camera.height)
+
+        def make() -> DepthPicture:
+            return depth_picture(scene, camera)
+
+        return self._depth.finish(key, make) if at_once else self._depth.get(key, make)
+
+    def laid(
+        self, scene: Gaussians, frame: DecalFrame, shape: tuple[int, int], opaque: Mask, near: float
+    ) -> LaidDecal | None:
+        """Return a decal on the surface that training finds; None while it is computed.
+
+        Args:
+            scene: the original; it must not change
+            frame: frame of the decal
+            shape: width and height of its picture
+            opaque: pixels of its picture that are not transparent. [h,w]
+            near: near plane, world units
+        """
+
+        def make() -> LaidDecal:
+            camera = replace(decal_camera(frame, shape)[0], near=near)
+            surface = find_surface(scene, camera, painted_pixels(frame, camera, opaque))
+            return LaidDecal(surface, warp_on_surface(frame, shape, surface))
+
+        return self._laid.get(frame, make)
+
+    @property
+    def is_busy(self) -> bool:
+        """True if a result is being computed."""
+        return self._depth.is_busy or self._laid.is_busy
+
+    def drop(self) -> None:
+        """Cancel all computations."""
+        self._depth.drop()
+        self._laid.drop()
+
+
+def unhidden_frame(
+    scene: Gaussians, frame: DecalFrame, shape: tuple[int, int], mesh: DecalMesh, near: float
+) -> DecalFrame:
+    """Return the frame with the farthest camera from which nothing hides the decal.
+
+    If something hides it from all of them, the frame is unchanged.
+    """
+    for share in _DISTANCES:
+        tried = replace(frame, distance=share * frame.distance)
+        camera = decal_camera(tried, shape)[0]
+        shrink = _TRIAL_PX / max(camera.width, camera.height)
+        small = camera.resize(round(camera.width * shrink), round(camera.height * shrink))
+        if not is_hidden(mesh, tried, depth_picture(scene, replace(small, near=near))):
+            return tried
+    return frame
