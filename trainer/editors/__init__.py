@@ -20,6 +20,7 @@ from .adapters import default_model
 from .base import EditorInput, EditorRow, ImageEditor
 from .decal import check_decal, decal
 from .instruct import IMAGE_SIZE, check_instruct, instruct
+from .paint import check_paint, paint
 from .pictures import (
     folder,
     folder_cameras,
@@ -103,6 +104,13 @@ EDITORS = {
         check_decal,
         files=lambda what: (Path(what),),
         options=("at", "camera"),
+        run="pasted",
+    ),
+    "paint": EditorRow(
+        paint,
+        "paint:A.png,B.png",
+        check_paint,
+        files=picture_paths,
         run="pasted",
     ),
     "style": EditorRow(

@@ -71,16 +71,21 @@ def confines_edit(editor: ImageEditor, kind: Kind) -> bool:
 
 
 class PastingEditor(ImageEditor, Protocol):
-    """Editor that pastes paint onto the surface that one view shows. Its row has the run "pasted"."""
+    """Editor that pastes paint onto the surface that views show. Its row has the run "pasted"."""
 
     @property
     def view(self) -> View:
-        """View in which the paint is given."""
+        """View of the first paint, in which the edit is measured."""
         ...
 
     @property
-    def paint(self) -> PaintedView:
-        """Paint of that view, as the target of the surface discs."""
+    def paints(self) -> Sequence[PaintedView]:
+        """Paint of each view, as the targets of the surface discs."""
+        ...
+
+    @property
+    def finds_colors(self) -> bool:
+        """True if colors of the scene's Gaussians replace discs where they are at least as good."""
         ...
 
 

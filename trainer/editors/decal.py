@@ -132,11 +132,13 @@ class DecalEditor:
     kind: EditKind = "color"
     stages: tuple[float, ...] = ()
     is_confined: bool = False
+    finds_colors = False
+    """See `PastingEditor`."""
 
     @property
-    def paint(self) -> PaintedView:
+    def paints(self) -> list[PaintedView]:
         """Decal in the camera's view, as the target of the surface discs."""
-        return PaintedView(self.view.camera, self.edit(self.view, 1.0), self.drawn, self.surface)
+        return [PaintedView(self.view.camera, self.edit(self.view, 1.0), self.drawn, self.surface)]
 
     def edit(self, view: View, strength: float) -> Tensor:
         """See `ImageEditor.edit`."""

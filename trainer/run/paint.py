@@ -161,7 +161,10 @@ def lay_discs(goal: PaintGoal, gap: float) -> DiscLayout:
 
 
 def views_around_paint(
-    scene: Gaussians, paints: Sequence[PaintedView], degrees: Sequence[float]
+    scene: Gaussians,
+    paints: Sequence[PaintedView],
+    degrees: Sequence[float],
+    around: Sequence[PaintedView] | None = None,
 ) -> list[ExpectedView]:
     """Return views rotated around the paint, with their expected images.
 
@@ -169,10 +172,11 @@ def views_around_paint(
         scene: the scene under the paint
         paints: painted views of one object
         degrees: rotation angles of each camera; 0 is the picture itself
+        around: the paints whose cameras are rotated; None for all
     """
     background = torch.tensor(BACKGROUND)
     views = []
-    for paint in paints:
+    for paint in paints if around is None else around:
         pivot = paint.surface.pivot(paint.mask.numpy())
         for angle in degrees:
             camera = orbit(paint.camera, pivot, angle) if angle else paint.camera
@@ -191,7 +195,7 @@ def views_around_paint(
     return views
 
 
-def _mean_square_error(finished: Gaussians, looks: Sequence[ExpectedView]) -> float:
+def mean_square_error(finished: Gaussians, looks: Sequence[ExpectedView]) -> float:
     """Return the squared color error of whole views, per pixel at and around the paint.
 
     Discs that float away from the paint count too, wherever they are seen.
@@ -222,7 +226,7 @@ def choose_discs(goal: PaintGoal, log: RunLog | None) -> DiscLayout:
         laid = lay_discs(goal, gap)
         if not len(laid.added):
             raise ProgdfError("nothing is painted where the picture is opaque; paint on the scene")
-        candidates.append((_mean_square_error(laid.end, goal.views), laid))
+        candidates.append((mean_square_error(laid.end, goal.views), laid))
     best = min(candidates, key=lambda one: one[0])
     if log is not None:
         for paint in goal.paints:
@@ -234,6 +238,35 @@ def choose_discs(goal: PaintGoal, log: RunLog | None) -> DiscLayout:
             f"{RING} px around it)"
         )
     return best[1]
+
+
+@dataclass(frozen=True)
+class Recolor:
+    """Paint as colors of the scene's Gaussians."""
+
+    ended: Gaussians  # the scene at strength 1
+    rows: Tensor  # indices of the Gaussians that change. [M] int64
+
+
+def recolor_paint(goal: PaintGoal) -> Recolor:
+    """Return the colors of the visible Gaussians under the paint that reproduce it best, without discs."""
+    scene = goal.scene
+    weights = torch.zeros(len(scene))
+    for view in goal.views:
+        weights = torch.maximum(weights, alpha_weights(scene, view.camera, view.covered)[:, 0])
+    rows = (weights > _MIN_SPILL_WEIGHT_PX).nonzero()[:, 0]
+    ended, _ = solve_colors(scene, rows, scene[:0], goal.views, goal.behind[rows])
+    return Recolor(ended, rows)
+
+
+def recolor_gdf(recolored: Recolor, scene: Gaussians, name: str) -> Gdf:
+    """Return the edit that ends in these colors. Colors, and so pictures, are linear in the strength."""
+    rows = recolored.rows
+    offsets = pack(recolored.ended[rows], with_shN=False) - pack(scene[rows], with_shN=False)
+    field = course_field(torch.tensor([0.0, 1.0]), torch.stack([torch.zeros_like(offsets), offsets]))
+    score = torch.zeros(len(scene))
+    score[rows] = 1.0
+    return Gdf(name, Region(name, rows, score), field, fingerprint(scene))
 
 
 def paint_gdf(
@@ -427,7 +460,7 @@ def sharpen(
     except ProgdfError:
         return None
     groups = [[look for look in goal.views if (look.degrees != 0) is aside] for aside in (False, True)]
-    errors = [[_mean_square_error(one, group) for one in (end, laid.end)] for group in groups]
+    errors = [[mean_square_error(one, group) for one in (end, laid.end)] for group in groups]
     improves = errors[0][1] < errors[0][0] and errors[1][1] <= errors[1][0]
     own_db, side_db = ([round(decibels(error), 1) for error in pair] for pair in errors)
     pixels = group_digits(sum(int(one.mask.sum()) for one in paints))

@@ -1,9 +1,8 @@
-"""Pasted edit: paint of one view as discs on the surface. Nothing is trained."""
+"""Pasted edit: paint of views as discs on the surface. Nothing is trained."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, cast
 
 import torch
@@ -15,9 +14,9 @@ from progdf.gdf.file import Gdf
 from progdf.io.cameras import save_cameras
 from progdf.io.images import contact_sheet
 from progdf.io.json_values import to_json
-from progdf.metrics.image import psnr
+from progdf.metrics.image import decibels, psnr
 from progdf.terminal import group_digits
-from trainer.editors import make_editor
+from trainer.editors import editor_row, make_editor
 from trainer.editors.base import PastingEditor
 from trainer.options import TrainOptions
 from trainer.resolve import recorded_options
@@ -27,7 +26,16 @@ from trainer.views.setup import TrainingSetup
 from trainer.views.view import BACKGROUND, render_view
 
 from .finish import RunResult, write_result
-from .paint import RING, choose_discs, make_goal, paint_gdf, views_around_paint
+from .paint import (
+    RING,
+    choose_discs,
+    make_goal,
+    mean_square_error,
+    paint_gdf,
+    recolor_gdf,
+    recolor_paint,
+    views_around_paint,
+)
 from .resume import picture_digests
 
 TURNS = (-45, -30, -15, 0, 15, 30, 45)
@@ -49,8 +57,10 @@ def paste_decal(options: TrainOptions, setup: TrainingSetup, folder: RunFolder, 
     view = editor.view
     with log.stage("fit"):
         painted = train_decal(editor, scene, options.name, log)
-    decal = f"decal:{Path(options.editor.text).name}"
+    names = ",".join(path.name for path in editor_row(options.editor).files(options.editor.text))
+    instruction = f"{options.editor.family}:{names}"
     figures = painted.figures
+    log.say(painted.choice)
     name = view.camera.name
     view_psnr = figures["own"]
     side_psnrs = figures["turned"]
@@ -74,11 +84,11 @@ def paste_decal(options: TrainOptions, setup: TrainingSetup, folder: RunFolder, 
     }
     rows = [painted.expected, painted.shown]
     sheet = contact_sheet(rows, ["projected", "the edit"], labels, title, notes=notes)
-    result = write_result(folder, replace(painted.gdf, instruction=decal, report=about), report, sheet)
+    result = write_result(folder, replace(painted.gdf, instruction=instruction, report=about), report, sheet)
     added, pixels, moved = (group_digits(figures[name]) for name in ("added", "pixels", "moved"))
     log.say(
         f"{added} Gaussians added for {pixels} painted pixels, {moved} of the scene moved behind them; "
-        f"{view_psnr} dB in the decal's own view, {figures['ring']} dB in the {RING} pixels around it, "
+        f"{view_psnr} dB in the own view, {figures['ring']} dB in the {RING} pixels around it, "
         f"{side_psnrs['-30']} and {side_psnrs['+30']} dB from 30° to either side"
     )
     log.say(result.line)
@@ -90,13 +100,14 @@ class Painted:
     """Edit that adds discs, and its measured quality."""
 
     gdf: Gdf
+    choice: str  # line that says how the paint was made
     figures: dict[str, Any]  # for report.json
     expected: list[Tensor]  # expected images of the views of `TURNS`. [H,W,3] each
     shown: list[Tensor]  # renders of the edit in these views. [H,W,3] each
 
 
 def train_decal(editor: PastingEditor, scene: Gaussians, name: str, log: RunLog | None = None) -> Painted:
-    """Return the edit of a decal, measured in its own view and from the sides.
+    """Return the edit of a decal or of paint, measured in its first view and from the sides.
 
     Args:
         editor: see `PastingEditor`
@@ -104,12 +115,25 @@ def train_decal(editor: PastingEditor, scene: Gaussians, name: str, log: RunLog 
         name: name of the layer
         log: log of the run
     """
-    paints = [editor.paint]
-    laid = choose_discs(make_goal(scene, paints), log)
+    paints = editor.paints
+    goal = make_goal(scene, paints)
+    laid = choose_discs(goal, log)
     gdf = paint_gdf(laid, scene, paints, name, None)
+    choice = "the paint is made of discs"
+    if editor.finds_colors:
+        recolored = recolor_paint(goal)
+        colors_error = mean_square_error(recolored.ended, goal.views)
+        discs_error = mean_square_error(laid.end, goal.views)
+        better = "colors of the scene's Gaussians" if colors_error <= discs_error else "discs"
+        if colors_error <= discs_error:
+            gdf = recolor_gdf(recolored, scene, name)
+        choice = (
+            f"the paint is made of {better}: {decibels(colors_error):.1f} dB by colors, "
+            f"{decibels(discs_error):.1f} dB by discs, in the painted views and from their sides"
+        )
     edited = edited_scene(scene, gdf)
     background = torch.tensor(BACKGROUND)
-    views = views_around_paint(scene, paints, TURNS)
+    views = views_around_paint(scene, paints, TURNS, paints[:1])
     images = [render_view(edited, look.camera, background).clamp(0.0, 1.0) for look in views]
     errors = [
         round(psnr(image, look.expected, look.covered), 2) if bool(look.covered.any()) else None
@@ -117,11 +141,11 @@ def train_decal(editor: PastingEditor, scene: Gaussians, name: str, log: RunLog 
     ]
     middle = TURNS.index(0)
     figures = {
-        "pixels": int(paints[0].mask.sum()),
+        "pixels": sum(int(paint.mask.sum()) for paint in paints),
         "added": 0 if gdf.added is None else len(gdf.added),
         "moved": len(gdf.region),
         "own": errors[middle],
         "ring": round(psnr(images[middle], views[middle].expected, views[middle].around), 2),
         "turned": {f"{degrees:+d}": error for degrees, error in zip(TURNS, errors, strict=True)},
     }
-    return Painted(gdf, figures, [look.expected for look in views], images)
+    return Painted(gdf, choice, figures, [look.expected for look in views], images)

@@ -21,7 +21,7 @@ from viewer.ui.keys import COMMANDS, JOINED, TOPICS, Command, chords, find_comma
 from viewer.ui.pointer import PointerContext
 from viewer.ui.widgets import elide, menu, search_field
 
-from . import mouse, select_tool
+from . import color_tool, mouse, select_tool
 
 MOUSE_HELP = (
     ("Left drag", "Orbit"),
@@ -324,6 +324,8 @@ def over_picture(
     on_axes = not io.want_capture_mouse and bool(overlay.axis_under(view, area, ui))
     if view.brush.active and not (io.want_capture_mouse or io.key_alt or on_axes):
         tools.draw_ring(view, ui)
+    if view.color_brush.tool and not (io.want_capture_mouse or on_axes):
+        color_tool.draw_tip(work, pointer)
     overlay.draw_axes(view, area, on_axes or work.transient.tool.drag == overlay.AXES_DRAG, ui)
     select_tool.draw_strokes(work, pointer)
     select_tool.draw_gesture(work.transient.tool.gesture, view, ui, pointer.left)

@@ -23,6 +23,7 @@ from viewer.panel import new_edit_form, pages, panel, timeline_bar
 from viewer.pictures.film import Pixels
 from viewer.render.decal_surfaces import DecalSurfaces
 from viewer.render.engine import ViewEngine
+from viewer.render.paint_overlay import PaintOverlay
 from viewer.render.picking import Surfaces
 from viewer.state import actions, layer_selection, timeline, workspace
 from viewer.state.commands import Action, Plain, WithValue
@@ -47,7 +48,7 @@ from viewer.ui.keys import (
 )
 from viewer.ui.pointer import PointerContext
 
-from . import interface, mouse, select_tool
+from . import color_tool, interface, mouse, select_tool
 from .canvas import Canvas, LayersOf, RememberView, forget_view, no_layers
 from .decal import REST_S, DecalPlace, decal_takes_mouse, draw_decal, draw_ghost, place_decal
 from .handles import draw_gizmo, gizmo_takes_mouse
@@ -100,7 +101,7 @@ class FramePacer:
 
 
 FLIGHT_S = 1 / 60  # seconds between frames while flying
-SURFACE_POLL_S = 0.05  # seconds between frames while the surface under a decal is computed
+SURFACE_POLL_S = 0.05  # seconds between frames while the surface under a decal or paint is computed
 
 
 class MainView:
@@ -134,6 +135,7 @@ class MainView:
         self.layers_of: LayersOf = no_layers  # returns the layers of a view for a picture's metadata
         self.surfaces = Surfaces()
         self.decal_surfaces = DecalSurfaces()
+        self.paint = PaintOverlay(context)
         self.ui = UiContext(scale)
         imgui.backends.opengl3_init("#version 330")
         self._pace = FramePacer()
@@ -168,6 +170,7 @@ class MainView:
         self.ui.close()
         self.surfaces.drop()
         self.decal_surfaces.drop()
+        self.paint.release()
         self.canvas.release()
 
     def set_engine(self, engine: ViewEngine, facts: SceneFacts, live: tuple[LayerState, ...] = ()) -> None:
@@ -180,6 +183,7 @@ class MainView:
         self.surfaces.drop()
         if engine.scene is not self.engine.scene:
             self.decal_surfaces.drop()
+        self.paint.surfaces.drop()
         self.engine = engine
         self.facts = facts
         self.store.replace(with_transient(self.work, live=live))
@@ -190,7 +194,9 @@ class MainView:
         """Set a new state and snapshots, with an empty undo history, no active drag and nothing over the
         picture."""
         old = self.work.transient
-        transient = replace(old, cover=None, preview=PreviewState(), gizmo=None, tool=MouseTool())
+        transient = replace(
+            old, cover=None, preview=PreviewState(), gizmo=None, tool=MouseTool(), clone=None, drying=()
+        )
         self.store.replace(
             replace(workspace.new_workspace(view, snapshots), layout=self.work.layout, transient=transient)
         )
@@ -209,6 +215,7 @@ class MainView:
         waits += self._decal_waits()
         sharpens = self.canvas.next_frame_delay(self._clock)
         waits += [] if sharpens is None else [sharpens]
+        waits += [SURFACE_POLL_S] if self.paint.pending else []
         film = timeline.next_frame_delay(self.work.player, self.work.view.timeline)
         return self._pace.next_frame_delay(waits if film is None else [*waits, film])
 
@@ -362,7 +369,7 @@ class MainView:
         if decal and "Enter" in [press.chord for press in self._keys.pressed]:
             return  # it sets the decal where it is, see `_move_gizmo`
         picks = work.form_open and work.form.picks
-        if decal or picks or work.view.select.tool or work.view.brush.active:
+        if decal or picks or work.view.select.tool or work.view.brush.active or work.view.color_brush.tool:
             clicks = decal or picks or work.view.select.tool in select_tool.CLICKED
             if not (asks or self.at_start or imgui.get_io().want_text_input):
                 held, self._keys = mouse.point_by_keys(held, self._keys, self._pointer(), clicks)
@@ -462,7 +469,8 @@ class MainView:
             self.ui,
             self._clock,
             self.surfaces,
-            self._half,
+            self.paint,
+            half=self._half,
         )
 
     def _displayed_view(self) -> ViewState:
@@ -512,6 +520,8 @@ class MainView:
         with self._guard():
             self.store.replace(interface.draw_dialog(self.work, pointer, pressed))
         original = self.work.before
+        with self._guard():
+            color_tool.draw(self.work, pointer)
         with self._guard():
             cover = self.work.transient.cover
             if cover is not None and not original:

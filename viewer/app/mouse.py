@@ -23,7 +23,7 @@ from viewer.ui.keys import TOOL_KEYS, Keys, any_button_down, has_pending_input, 
 from viewer.ui.overlay import Area
 from viewer.ui.pointer import PointerContext
 
-from . import select_tool
+from . import color_tool, select_tool
 
 REACH_PX = 8.0  # at 1×: the mouse grips the divider within this distance
 DIVIDER = "divider"
@@ -131,14 +131,19 @@ def _handle_release(work: Workspace, pointer: PointerContext) -> Workspace:
     """End the drag of a released button."""
     tool = work.transient.tool
     if imgui.is_mouse_released(0) and tool.drag in ("orbit", "look") and not _has_traveled(pointer.ui):
-        work = _focus_picked_layer(work, pointer)
+        if work.view.color_brush.tool:
+            work = color_tool.pick(work, pointer)
+        else:
+            work = _focus_picked_layer(work, pointer)
+    if tool.drag == color_tool.COLOR_DRAG and imgui.is_mouse_released(0):
+        work = color_tool.release(work, pointer)
     if tool.drag == select_tool.SELECT_DRAG and imgui.is_mouse_released(0) and tool.gesture is not None:
         work = select_tool.release(tool.gesture, work, pointer)
     if tool.drag == overlay.AXES_DRAG and imgui.is_mouse_released(0) and not _has_traveled(pointer.ui):
         work = _look_along(work, tool.axis)
     if any_button_down():
         return work
-    return with_tool(work, drag=None, settings=(work.view.select, work.view.brush))
+    return with_tool(work, drag=None, settings=(work.view.select, work.view.brush, work.view.color_brush))
 
 
 def _handle_press(work: Workspace, pointer: PointerContext) -> Workspace:
@@ -156,6 +161,8 @@ def _handle_press(work: Workspace, pointer: PointerContext) -> Workspace:
         return with_tool(select_tool.pick_color(work, pointer), drag=select_tool.SELECT_DRAG)
     if work.view.brush.active and plain and imgui.is_mouse_clicked(0):
         return _begin_stroke(work, pointer)
+    if work.view.color_brush.tool and plain and imgui.is_mouse_clicked(0):
+        return color_tool.press(work, pointer)
     if work.view.select.tool in ("flood", "color") and plain and imgui.is_mouse_clicked(0):
         return select_tool.click(work, pointer)
     if work.view.select.tool and plain and imgui.is_mouse_clicked(0):
@@ -179,8 +186,8 @@ def cancel_drag(work: Workspace) -> Workspace:
     tool = work.transient.tool
     work = with_transient(workspace.cancel_drag(work), tool=MouseTool())
     if tool.settings is not None:
-        select, brush_settings = tool.settings
-        work = replace(work, view=replace(work.view, select=select, brush=brush_settings))
+        select, brush, color_brush = tool.settings
+        work = replace(work, view=replace(work.view, select=select, brush=brush, color_brush=color_brush))
     if tool.drag != DIVIDER:
         return work
     return replace(work, view=place_divider(work.view, tool.divider))
@@ -210,6 +217,8 @@ def _drag(work: Workspace, pointer: PointerContext) -> Workspace:
         return replace(work, view=place_divider(work.view, io.mouse_pos.x / pointer.area.width))
     if tool.drag == tools.PAINT_DRAG:
         return _paint(work, pointer)
+    if tool.drag == color_tool.COLOR_DRAG:
+        return color_tool.follow(work, pointer)
     if tool.drag == select_tool.SELECT_DRAG:
         return work if tool.gesture is None else select_tool.follow(tool.gesture, work, pointer)
     if tool.drag == overlay.AXES_DRAG:

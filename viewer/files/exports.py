@@ -128,7 +128,7 @@ def painted_picture(path: Path, pixels: NDArray[np.uint8], viewpoint: Camera, or
 
     Args:
         path: .png file
-        pixels: the picture. [H,W,3]
+        pixels: the picture, with or without transparency. [H,W,3 or 4]
         viewpoint: its camera
         origin: origin of the scene that the camera is relative to
 

@@ -33,6 +33,7 @@ from progdf.io.session import (
     verify_files,
     write_session,
 )
+from progdf.painting.strokes import unpack
 from progdf.region import Region, from_mask
 from progdf.terminal import escape_text
 from viewer.camera.view_camera import Vec3, move_camera
@@ -134,6 +135,8 @@ def open_session(path: Path) -> WindowSession:
     x, y, z = opened.scene.origin
     view, snapshots = _move(file.view, file.snapshots, (-x, -y, -z))
     selection.check(view.selection, len(opened.scene))
+    for picture in view.painted:
+        unpack(picture.pixels, *picture.size, picture.box)  # raises if it is damaged
     named = view.selection.regions
     folder = path.resolve().parent
     view = _with_region_paths(view, lambda region: Path(os.path.normpath(folder / region)))
@@ -151,6 +154,7 @@ def open_session(path: Path) -> WindowSession:
         view,
         selection=claimed,
         brush=replace(view.brush, active=False),
+        color_brush=replace(view.color_brush, tool=""),
         select=replace(view.select, tool=""),
     )
     warning = ""
@@ -170,7 +174,9 @@ def _move(
     """Translate all cameras by `by`. Sessions store cameras in world coordinates."""
     moved = tuple(replace(snapshot, camera=move_camera(snapshot.camera, by)) for snapshot in snapshots)
     timeline = _move_keys(view.timeline, by)
-    return replace(view, camera=move_camera(view.camera, by), timeline=timeline), moved
+    painted = tuple(replace(one, camera=move_camera(one.camera, by)) for one in view.painted)
+    camera = move_camera(view.camera, by)
+    return replace(view, camera=camera, timeline=timeline, painted=painted), moved
 
 
 def _move_keys(timeline: Timeline, by: Vec3) -> Timeline:

@@ -20,6 +20,7 @@ from viewer.state.view_state import (
     SELECT_MODES,
     SMALLEST_PX,
     Brush,
+    ColorBrush,
     Comparison,
     SelectTool,
     ViewState,
@@ -66,6 +67,7 @@ _TOOLS = (
         ("select_tool:flood", Icon.FLOOD),
         ("select_tool:color", Icon.COLOR),
     ),
+    (("paint_tool:color", Icon.COLOR_BRUSH), ("paint_tool:clone", Icon.CLONE)),
     (("brush", Icon.BRUSH), ("decal", Icon.DECAL), ("move_selected", Icon.MOVE)),
 )
 _OPERATIONS = (
@@ -77,6 +79,7 @@ _OPERATIONS = (
 )
 COLUMN_PX = 88.0  # at 1×: start of the control in a row
 _DEPTHS = {False: "Front", True: "Through"}
+_SOFTNESS_ACTIONS = ("brush_softness:-0.1", "brush_softness:0.1")
 _SIZE_ACTIONS = ("brush_radius:0.8", "brush_radius:1.25")  # also change the tolerance of a click
 
 
@@ -98,6 +101,8 @@ def draw_toolbar(view: ViewState, area: Area, ui: UiContext, actions: list[Actio
     active_tool: Action = WithText("navigate", view.camera.mode)
     if view.select.tool:
         active_tool = WithText("select_tool", view.select.tool)
+    elif view.color_brush.tool:
+        active_tool = WithText("paint_tool", view.color_brush.tool)
     elif view.brush.active:
         active_tool = Plain("brush")
     off = {"brush": not view.layers, "move_selected": not view.selection.count}
@@ -182,7 +187,8 @@ def draw_options(
         The changed workspace; the y of the bar's lower edge, 0 if there is none.
     """
     view = work.view
-    if not (view.select.tool or view.brush.active or view.selection.count or view.selection.hidden):
+    has_tool = view.select.tool or view.brush.active or view.color_brush.tool
+    if not (has_tool or view.painted or view.selection.count or view.selection.hidden):
         return work, 0.0
     left = (TOOLBAR_PX + 2 * EDGE_PX) * ui.scale
     right = area.width - EDGE_PX * ui.scale
@@ -191,7 +197,9 @@ def draw_options(
     with plate("options", (left, EDGE_PX * ui.scale), ui):
         imgui.push_style_var(imgui.StyleVar_.item_spacing, (EDGE_PX * ui.scale, EDGE_PX * ui.scale))
         imgui.align_text_to_frame_padding()
-        if view.brush.active:
+        if view.color_brush.tool or (view.painted and not has_tool):
+            view = replace(view, color_brush=_color_options(view, bar, actions))
+        elif view.brush.active:
             imgui.text("Paint")
             view = _brush_options(view, work.focus, bar, actions)
         elif view.select.tool:
@@ -199,7 +207,8 @@ def draw_options(
             view = replace(view, select=_select_options(view.select, bar))
         else:
             imgui.dummy((0.0, imgui.get_frame_height()))
-        pointed = None if view.brush.active else _selection(view, bar, actions)
+        paints = view.brush.active or view.color_brush.tool or view.painted
+        pointed = None if paints and not view.select.tool else _selection(view, bar, actions)
         foot = imgui.get_window_pos().y + imgui.get_window_size().y
         imgui.pop_style_var()
     return replace(work, view=view, pointed=work.pointed or pointed), foot
@@ -293,7 +302,7 @@ def _brush_options(view: ViewState, focus: int | None, bar: _Bar, actions: list[
     ends = (SMALLEST_PX, LARGEST_PX)
     help_ = _with_chords("Brush radius", *_SIZE_ACTIONS)
     radius = bar.slider("Radius", brush.radius, ends, Brush.radius, help_, "%.0f px")
-    help_ = _with_chords("Brush softness", "brush_softness:-0.1", "brush_softness:0.1")
+    help_ = _with_chords("Brush softness", *_SOFTNESS_ACTIONS)
     softness = bar.slider("Softness", brush.softness, (0.0, 1.0), Brush.softness, help_)
     help_ = "Effect of one stroke; repeated strokes increase it"
     flow = bar.slider("Flow", brush.flow, (0.0, 1.0), Brush.flow, help_)
@@ -316,6 +325,38 @@ def _brush_options(view: ViewState, focus: int | None, bar: _Bar, actions: list[
     return replace(view, brush=changed)
 
 
+def _color_options(view: ViewState, bar: _Bar, actions: list[Action]) -> ColorBrush:
+    """Draw the options of the color brush or the clone stamp, and the buttons for all paint."""
+    brush = view.color_brush
+    if brush.tool:
+        imgui.text("Clone" if brush.tool == "clone" else "Color")
+        if brush.tool == "color":
+            bar.follow(imgui.get_frame_height())
+            picker = imgui.ColorEditFlags_.no_inputs.value | imgui.ColorEditFlags_.no_alpha.value
+            changed, (red, green, blue) = imgui.color_edit3("##paint color", list(brush.color), picker)
+            tip("Color. Alt+click the picture to take a color from it")
+            brush = replace(brush, color=(red, green, blue)) if changed else brush
+        modes = {False: "Paint" if brush.tool == "color" else "Stamp", True: "Erase"}
+        help_ = "Erase removes paint that is not a layer yet"
+        if brush.tool == "clone":
+            help_ += ". Alt+click sets the source of the stamp"
+        brush = replace(brush, erases=bar.segments("paint mode", modes, brush.erases, help_, "brush_mode"))
+        ends = (SMALLEST_PX, LARGEST_PX)
+        help_ = _with_chords("Brush radius", *_SIZE_ACTIONS)
+        radius = bar.slider("Size", brush.radius, ends, ColorBrush.radius, help_, "%.0f px")
+        help_ = _with_chords("Share of the radius with full color", *_SOFTNESS_ACTIONS)
+        hardness = bar.slider("Hardness", brush.hardness, (0.0, 1.0), ColorBrush.hardness, help_)
+        help_ = "Opacity of one stroke; repeated strokes increase it"
+        flow = bar.slider("Flow", brush.flow, (0.0, 1.0), ColorBrush.flow, help_)
+        brush = replace(brush, radius=radius, hardness=hardness, flow=flow)
+    else:
+        imgui.text("Paint that is not a layer yet")
+    with inert(not view.painted):
+        bar.button("finish_paint", actions)
+        bar.button("discard_paint", actions)
+    return brush
+
+
 def _legend(bar: _Bar) -> None:
     """Draw the color ramp of the weights with its end values."""
     wide = 96.0 * bar.ui.scale
@@ -335,12 +376,21 @@ def _legend(bar: _Bar) -> None:
 
 
 def draw_ring(view: ViewState, ui: UiContext) -> None:
-    """Draw the brush at the cursor: its edge, and the circle within which it has full effect."""
-    brush = view.brush
+    """Draw the brush of painted strength at the cursor."""
+    draw_circles(view.brush.radius, 1.0 - view.brush.softness, ui)
+
+
+def draw_circles(radius_px: float, hardness: float, ui: UiContext) -> None:
+    """Draw a brush at the cursor: its edge, and the circle within which it has full effect.
+
+    Args:
+        radius_px: pixels at 1×
+        hardness: share of the radius with full effect, 0 to 1
+    """
     mouse = imgui.get_mouse_pos()
     canvas = imgui.get_background_draw_list()
-    radius = brush.radius * ui.scale
-    inner = radius * (1.0 - brush.softness)
+    radius = radius_px * ui.scale
+    inner = radius * hardness
     for size, alpha in ((radius, 1.0), (inner, 0.45)):
         if size > 2.0 * ui.scale:
             canvas.add_circle(mouse, size, u32((0.0, 0.0, 0.0, 0.5 * alpha)), 0, 3.0 * ui.scale)

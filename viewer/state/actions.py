@@ -32,7 +32,7 @@ from .layers import (
     with_overshoot,
     with_paint,
 )
-from .view_state import BRUSH_MODES, FRAMES, RESOLUTION_MODES, ViewState, following
+from .view_state import BRUSH_MODES, FRAMES, PAINT_TOOLS, RESOLUTION_MODES, ViewState, following
 from .workspace import (
     MAX_ZOOM,
     MIN_ZOOM,
@@ -246,20 +246,55 @@ def _toggle_tool(workspace: Workspace, tool: str) -> Workspace:
     """Activate a selection tool, or deactivate it if it is active. The brush is deactivated."""
     view = workspace.view
     new_tool = "" if view.select.tool == tool else tool
+    view = _without_tools(view)
+    return replace(workspace, view=replace(view, select=replace(view.select, tool=new_tool)))
+
+
+def _toggle_paint_tool(workspace: Workspace, tool: str) -> Workspace:
+    """Activate the color brush or the clone stamp, or deactivate it if it is active."""
+    if tool not in PAINT_TOOLS:
+        return workspace
+    new_tool = "" if workspace.view.color_brush.tool == tool else tool
+    view = _without_tools(workspace.view)
+    return replace(workspace, view=replace(view, color_brush=replace(view.color_brush, tool=new_tool)))
+
+
+def _without_tools(view: ViewState) -> ViewState:
+    """Return the view with no active brush or selection tool."""
     return replace(
-        workspace,
-        view=replace(
-            view, select=replace(view.select, tool=new_tool), brush=replace(view.brush, active=False)
-        ),
+        view,
+        select=replace(view.select, tool=""),
+        brush=replace(view.brush, active=False),
+        color_brush=replace(view.color_brush, tool=""),
     )
+
+
+def _change_color_brush(workspace: Workspace, **changes: Any) -> Workspace:
+    view = workspace.view
+    return replace(workspace, view=replace(view, color_brush=replace(view.color_brush, **changes)))
+
+
+def _switch_mode(workspace: Workspace, _: None) -> Workspace:
+    """Switch the color brush between painting and erasing, or the brush of strengths to its next mode."""
+    brush = workspace.view.color_brush
+    if brush.tool:
+        return _change_color_brush(workspace, erases=not brush.erases)
+    return _change_brush(workspace, mode=following(BRUSH_MODES, workspace.view.brush.mode))
+
+
+def _soften(workspace: Workspace, by: float) -> Workspace:
+    """Change the softness of the active brush by a share of its radius."""
+    view = workspace.view
+    if view.color_brush.tool:
+        hardness = 1.0 - paint.softness(1.0 - view.color_brush.hardness + by)
+        return _change_color_brush(workspace, hardness=round(hardness, 3))
+    return _change_brush(workspace, softness=paint.softness(view.brush.softness + by))
 
 
 def _navigate(workspace: Workspace, mode: str) -> Workspace:
     """Switch to orbit or fly mode and deactivate the brush and the selection tool."""
-    workspace = _change_brush(workspace, active=False)
-    select = replace(workspace.view.select, tool="")
     camera = replace(workspace.view.camera, mode=mode)
-    return with_camera(replace(workspace, view=replace(workspace.view, select=select)), camera)
+    return with_camera(replace(workspace, view=_without_tools(workspace.view)), camera)
 
 
 def _zoom(workspace: Workspace, times: float) -> Workspace:
@@ -269,13 +304,15 @@ def _zoom(workspace: Workspace, times: float) -> Workspace:
 
 
 def _toggle_brush(workspace: Workspace, _: None) -> Workspace:
-    view = replace(workspace.view, select=replace(workspace.view.select, tool=""))
-    return _change_brush(replace(workspace, view=view), active=not view.brush.active)
+    is_active = workspace.view.brush.active
+    return _change_brush(replace(workspace, view=_without_tools(workspace.view)), active=not is_active)
 
 
 def _resize(workspace: Workspace, times: float) -> Workspace:
     """Scale the radius of the brush or of the active selection tool, or the tool's color tolerance."""
     view = workspace.view
+    if view.color_brush.tool:
+        return _change_color_brush(workspace, radius=paint.radius(view.color_brush.radius * times))
     if not view.select.tool:
         return _change_brush(workspace, radius=paint.radius(view.brush.radius * times))
     if view.select.tool in ("flood", "color"):
@@ -291,6 +328,8 @@ def _close_or_unfocus(workspace: Workspace, _: None) -> Workspace:
         return replace(workspace, help=False)
     if workspace.view.brush.active:
         return _change_brush(workspace, active=False)
+    if workspace.view.color_brush.tool:
+        return _change_color_brush(workspace, tool="")
     tool = workspace.view.select.tool
     if tool:
         return _toggle_tool(workspace, tool)
@@ -433,11 +472,13 @@ ACTIONS: dict[str, Callable[[Workspace, Any], Workspace]] = {
         w, view=replace(w.view, select=replace(w.view.select, through=not w.view.select.through))
     ),
     "brush": _toggle_brush,
-    "brush_mode": lambda w, _: _change_brush(w, mode=following(BRUSH_MODES, w.view.brush.mode)),
+    "brush_mode": _switch_mode,
     "brush_weights": lambda w, _: _change_brush(w, weights=not w.view.brush.weights),
     "brush_through": lambda w, _: _change_brush(w, through=not w.view.brush.through),
     "brush_radius": _resize,
-    "brush_softness": lambda w, by: _change_brush(w, softness=paint.softness(w.view.brush.softness + by)),
+    "brush_softness": _soften,
+    "paint_tool": _toggle_paint_tool,
+    "discard_paint": lambda w, _: replace(w, view=replace(w.view, painted=())),
     "overshoot": lambda w, _: replace(w, view=with_overshoot(w.view, not w.view.overshoot)),
     "snapshot": lambda w, _: replace(w, snapshots=snapshots.take(w.snapshots, w.view)),
     "restore": _restore,

@@ -13,7 +13,16 @@ from typing import Any
 from viewer.camera.view_camera import Vec3, ViewCamera, with_up
 
 from .selection import SelectionState
-from .view_state import Blend, Comparison, LayerGroup, LayerState, SnapshotPair, Timeline, ViewState
+from .view_state import (
+    Blend,
+    Comparison,
+    LayerGroup,
+    LayerState,
+    PaintedPicture,
+    SnapshotPair,
+    Timeline,
+    ViewState,
+)
 
 LONGEST = 1000  # maximum number of entries; each takes a few hundred bytes, with a selection some kilobytes
 
@@ -29,6 +38,7 @@ class Edit:
     selection: SelectionState = SelectionState()
     groups: tuple[LayerGroup, ...] = ()
     pair: SnapshotPair = SnapshotPair()
+    painted: tuple[PaintedPicture, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -214,6 +224,7 @@ _EDIT_LABELS = {
     "blend": "blend rule",
     "overshoot": "overshoot",
     "pair": "snapshot pair",
+    "painted": "painting",
 }
 _VIEW_LABELS = {
     "background": "background",

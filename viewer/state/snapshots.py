@@ -77,13 +77,17 @@ def with_original(snapshots: Sequence[SliderSnapshot], view: ViewState) -> tuple
 def restore(view: ViewState, snapshot: SliderSnapshot) -> ViewState:
     """Restore a snapshot in `view`. Edits opened since then stay in the stack at strength 0.
 
-    The camera, the timeline and the selection are unchanged.
+    The camera, the timeline, the selection and unfinished paint are unchanged.
     """
     known = {layer.gdf for layer in snapshot.edit.layers}
     later = tuple(replace(layer, strength=0.0, group="") for layer in view.layers if layer.gdf not in known)
     restored = replace(history.apply_edit(view, snapshot.edit), pair=view.pair)
     return replace(
-        restored, layers=(*restored.layers, *later), timeline=view.timeline, selection=view.selection
+        restored,
+        layers=(*restored.layers, *later),
+        timeline=view.timeline,
+        selection=view.selection,
+        painted=view.painted,
     )
 
 
@@ -112,9 +116,10 @@ def choose(view: ViewState, slot: str, name: str) -> ViewState:
 
 
 def _snapshot_edit(view: ViewState) -> history.Edit:
-    """Return the edit that a snapshot stores: all but the timeline, the selection and the compared pair."""
+    """Return the edit that a snapshot stores: all but the timeline, the selection, the compared pair and
+    unfinished paint."""
     edit = history.edit_of(view)
-    return replace(edit, timeline=Timeline(), selection=SelectionState(), pair=SnapshotPair())
+    return replace(edit, timeline=Timeline(), selection=SelectionState(), pair=SnapshotPair(), painted=())
 
 
 def _next_name(snapshots: Sequence[SliderSnapshot]) -> str:

@@ -9,13 +9,15 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from progdf.painting.projection import ViewSurface
+from progdf.painting.strokes import ColorStroke
 from progdf.scene.scribbles import Rows
 from progdf.scene.selection import Centers, Mask, Surface
 from viewer.camera.decal_warp import DecalFrame, DecalMesh
 from viewer.camera.view_camera import Vec3, ViewCamera
 
 from .paint import Stroke
-from .view_state import Brush, LayerState, SelectTool
+from .view_state import Brush, ColorBrush, LayerState, PaintedPicture, SelectTool
 
 
 @dataclass(frozen=True)
@@ -150,21 +152,50 @@ class Click:
     recorded: bytes  # selection in the undo history, packed
 
 
+@dataclass(frozen=True, eq=False)
+class ColorDrag:
+    """Stroke of the color brush or the clone stamp in progress, and its view."""
+
+    stroke: ColorStroke
+    camera: ViewCamera
+    size: tuple[int, int]  # width and height, pixels
+    surface: ViewSurface  # visible surface of the view
+
+
+@dataclass(frozen=True)
+class CloneSource:
+    """Source of the clone stamp: a place on the surface, and its distance from the stroke in one view."""
+
+    point: Vec3  # world units
+    offset: Point | None = None  # from the stroke to the source, pixels; None before the first stroke
+    camera: ViewCamera | None = None  # view of the offset
+
+
+@dataclass(frozen=True)
+class DryingPaint:
+    """Paint that becomes a layer. It stays on screen until the layer is there."""
+
+    out: Path  # folder of the run
+    painted: tuple[PaintedPicture, ...]
+
+
 @dataclass(frozen=True)
 class MouseTool:
     """Mouse drag and gesture in progress, and the last clicks and strokes of the selection tools."""
 
-    # one of `keys.DRAGS`, `DIVIDER`, `PAINT_DRAG`, `SELECT_DRAG` or `AXES_DRAG`; None without a drag
+    # one of `keys.DRAGS`, `DIVIDER`, `PAINT_DRAG`, `COLOR_DRAG`, `SELECT_DRAG` or `AXES_DRAG`; None without a
+    # drag
     drag: str | None = None
     stroke: Stroke | None = None  # brush stroke, from its first drag on
+    coloring: ColorDrag | None = None  # stroke of the color brush or the clone stamp
     gesture: Gesture | None = None  # gesture of a selection tool; for a polygon also between its clicks
     # the last click of a tool that selects by one click, while it follows the tool's tolerance
     click: Click | None = None
     strokes: tuple[Strokes, ...] = ()  # strokes that a tool spreads, one entry per change
     divider: float = 0.5  # divider before the drag, fraction of the picture's width
     axis: str = ""  # the pressed end of an axis, of `AXES`, or another part of the axes
-    # settings of the selection tool and the brush before a button was pressed
-    settings: tuple[SelectTool, Brush] | None = None
+    # settings of the selection tool and the brushes before a button was pressed
+    settings: tuple[SelectTool, Brush, ColorBrush] | None = None
 
 
 @dataclass(frozen=True)
@@ -189,6 +220,8 @@ class Transient:
     ghosts: tuple[DecalGhost, ...] = ()  # decals in training
     pointer: KeyPointer = KeyPointer()  # pointer of the active tool
     tool: MouseTool = MouseTool()  # drag and gesture of the mouse
+    clone: CloneSource | None = None  # source of the clone stamp
+    drying: tuple[DryingPaint, ...] = ()  # paint that becomes layers
     recent: tuple[Path, ...] = ()  # recently opened files, for menu and dialogs; the last one first
     start_files: tuple[StartFile, ...] = ()  # recently opened files, for the start page
     examples: tuple[StartFile, ...] = ()  # examples on the start page

@@ -10,6 +10,7 @@ from msgspec import Meta
 
 from progdf.compose.layers import BLENDS, Gains
 from progdf.io.json_values import one_of
+from progdf.painting.strokes import MAX_SIDE_PX
 from viewer.camera.view_camera import SHAPES, ViewCamera
 from viewer.camera.views import EASINGS
 
@@ -22,6 +23,9 @@ OVERSHOOT = 1.2
 BRUSH_MODES = ("add", "erase", "smooth")
 SMALLEST_PX = 4.0  # smallest radius of a brush, pixels at 1×
 LARGEST_PX = 400.0  # largest radius of a brush, pixels at 1×
+PAINT_TOOLS = ("color", "clone")
+MAX_PAINTED = 16
+"""Largest number of views that can be painted before the paint becomes a layer."""
 SELECT_TOOLS = ("box", "lasso", "polygon", "brush", "scribble", "sphere", "flood", "color")
 SELECT_MODES = ("new", "add", "subtract", "intersect")
 COMPARE_MODES = ("off", "beside", "split", "difference")
@@ -42,6 +46,8 @@ Blend = Annotated[str, one_of(BLENDS)]
 Frame = Annotated[int, Meta(ge=0)]
 Length = Annotated[int, Meta(ge=1, le=MAX_FRAME)]
 Fps = Annotated[int, Meta(ge=1, le=MAX_FPS)]
+Side = Annotated[int, Meta(ge=1, le=MAX_SIDE_PX)]
+Edge = Annotated[int, Meta(ge=0, le=MAX_SIDE_PX)]
 Easing = Annotated[str, one_of(EASINGS)]
 
 
@@ -82,6 +88,28 @@ class Brush:
     weights: bool = False
     flow: Share = 1.0  # share of the way to its target weight that a stroke covers, 0 to 1
     value: Share = 1.0  # target weight of "add", 0 to 1
+
+
+@dataclass(frozen=True)
+class ColorBrush:
+    """Brush that paints colors on the visible surface, and the clone stamp."""
+
+    tool: Annotated[str, one_of(("", *PAINT_TOOLS))] = ""  # one of `PAINT_TOOLS`, "" for none
+    erases: bool = False  # strokes erase paint
+    radius: Annotated[float, Meta(ge=SMALLEST_PX, le=LARGEST_PX)] = 20.0  # pixels at 1×
+    hardness: Share = 0.8  # share of the radius with full influence, 0 to 1
+    flow: Share = 1.0  # influence of one stroke, 0 to 1
+    color: tuple[Share, Share, Share] = (0.85, 0.18, 0.18)  # sRGB, 0 to 1
+
+
+@dataclass(frozen=True)
+class PaintedPicture:
+    """Paint on the scene in one view, as straight RGBA that is packed by `progdf.painting.strokes.pack`."""
+
+    camera: ViewCamera
+    size: tuple[Side, Side]  # width and height, pixels
+    box: tuple[Edge, Edge, Edge, Edge]  # packed pixels: left, top, right and bottom
+    pixels: bytes
 
 
 @dataclass(frozen=True)
@@ -148,6 +176,9 @@ class ViewState:
     overshoot: bool = False  # extend sliders to `OVERSHOOT`, which extrapolates
     unfolded: tuple[int, ...] = ()  # edits (`LayerState.gdf`) whose gains are visible
     brush: Brush = Brush()
+    color_brush: ColorBrush = ColorBrush()
+    # paint that is not a layer yet, a picture per view; later ones cover earlier ones
+    painted: Annotated[tuple[PaintedPicture, ...], Meta(max_length=MAX_PAINTED)] = ()
     timeline: Timeline = Timeline()
     # one of `RESOLUTION_MODES`: when the window draws motion at a lower resolution
     dynamic_resolution: Annotated[str, one_of(RESOLUTION_MODES)] = "auto"

@@ -175,6 +175,12 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("paint_invert", "Invert the paint", "", "Swap painted and unpainted parts"),
         Command("paint_feather", "Feather the paint", "Shift+X", "Soften its edges; repeat for more"),
     ),
+    "Color": (
+        Command("paint_tool:color", "Color brush", "Alt+B", "Paint on the surface; Alt+click picks a color"),
+        Command("paint_tool:clone", "Clone stamp", "Alt+C", "Alt+click sets the source to copy from"),
+        Command("finish_paint", "Done painting", "Alt+Enter", "Turn the paint into a layer with a slider"),
+        Command("discard_paint", "Discard paint", "", "Remove all paint that is not a layer yet"),
+    ),
     "Select": (
         Command("select_tool:box", "Box", "R", MODES),
         Command("select_tool:lasso", "Lasso", "L", MODES),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,13 @@ from imgui_bundle import imgui
 
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
+from progdf.painting.projection import ViewSurface, is_apart, view_surface
 from progdf.scene.selection import Surface
 from viewer.camera.view_camera import ViewCamera, half_camera, half_scale, to_camera
 from viewer.render.engine import ViewEngine
+from viewer.render.paint_overlay import PaintOverlay, surface_key
 from viewer.render.picking import PREPARE_MIN_GAUSSIANS, Surfaces, run_in_background
+from viewer.state.layers import is_visible
 from viewer.state.selection import EMPTY_MASK, unpack
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import SceneFacts
@@ -37,6 +41,7 @@ class PointerContext:
     ui: UiContext  # fonts and scale
     now: float  # seconds on the main view's clock
     surfaces: Surfaces  # surfaces computed in the background
+    paint: PaintOverlay  # unfinished paint over the picture
     # side by side: half of the picture under the mouse, or under the start of its drag; 0 left, 1 right
     half: int = 0
 
@@ -91,6 +96,8 @@ class PointerContext:
     def look_ahead(self) -> None:
         """Compute in another thread the data of a still picture that the active tool will need."""
         tool = self.shown.select.tool
+        if self.shown.color_brush.tool:
+            self.known_surface(self.shown.camera, self.size, request=True)
         if self.facts.count < PREPARE_MIN_GAUSSIANS or not (tool or self.shown.brush.active):
             return
         another = self.surfaces.look(self._surface_key, self._copy_surface, tool in ("flood", "color"))
@@ -98,16 +105,60 @@ class PointerContext:
             run_in_background(self.facts.neighborhood if tool == "flood" else self.facts.scribbles)
 
     @property
-    def _surface_key(self) -> object:
-        camera = self.camera(self.shown.camera)
+    def scene_key(self) -> object:
+        """Key of the scene on screen, without the camera."""
         view = self.shown
-        key = camera.viewmat.numpy().tobytes(), camera.K.numpy().tobytes(), camera.width, camera.height
-        return self.engine, view.layers, view.blend, view.selection.hidden, key
+        return self.engine, view.layers, view.blend, view.selection.hidden
 
-    def _copy_surface(self) -> Surface:
-        """Return the surface of a copy of the scene, which later strengths do not change."""
+    def view_surface(self, camera: ViewCamera, size: tuple[int, int]) -> ViewSurface:
+        """Return the visible surface of the scene in a view of this size, pixels."""
+        view = to_camera(camera, *size)
+        key = surface_key(self.scene_key, view)
+        return self.paint.surfaces.get(key, lambda: view_surface(self.scene, view))
+
+    def recent_surface(self, camera: ViewCamera, size: tuple[int, int]) -> ViewSurface:
+        """Return a surface of the view that was visible before the current motion, if one is known."""
+        recent = self.paint.surfaces.recent(surface_key(None, to_camera(camera, *size)))
+        return recent or self.view_surface(camera, size)
+
+    def is_moved_at_cursor(self) -> bool:
+        """Return True if visible layers move or remove the surface of the original at the cursor."""
+        layers = [layer for layer in self.shown.layers if is_visible(self.shown, layer) and layer.strength]
+        kinds = {kind for layer in layers for kind in self.facts.rows[layer.gdf].kinds}
+        if kinds <= {"color"}:
+            return False
+        shown = self.view_surface(self.shown.camera, self.size)
+        view = to_camera(self.shown.camera, *self.size)
+        key = surface_key((self.engine, "original"), view)
+        scene = self.engine.scene
+        surface = self.paint.surfaces.get(key, lambda: view_surface(scene, view))
+        x = min(max(int(self.cursor[0]), 0), view.width - 1)
+        y = min(max(int(self.cursor[1]), 0), view.height - 1)
+        return is_apart(shown, surface, x, y)
+
+    def known_surface(
+        self, camera: ViewCamera, size: tuple[int, int], request: bool = False
+    ) -> ViewSurface | None:
+        """Return that surface if it is known; `request`: else compute it in another thread."""
+        view = to_camera(camera, *size)
+        key = surface_key(self.scene_key, view)
+        known = self.paint.surfaces.peek(key)
+        self.paint.pending = request and known is None
+        if self.paint.pending and self.paint.surfaces.is_awaited(key):
+            self.paint.surfaces.request(key, partial(view_surface, self._copy_scene(), view))
+        return known
+
+    @property
+    def _surface_key(self) -> object:
+        return surface_key(self.scene_key, self.camera(self.shown.camera))
+
+    def _copy_scene(self) -> Gaussians:
+        """Return a copy of the scene that later strengths do not change."""
         scene = self.scene
         if self.shown.layers:
             copies: dict[str, Any] = {name: getattr(scene, name).clone() for name in _SURFACE}
             scene = replace(scene, **copies)
-        return Surface(scene, self.camera(self.shown.camera))
+        return scene
+
+    def _copy_surface(self) -> Surface:
+        return Surface(self._copy_scene(), self.camera(self.shown.camera))

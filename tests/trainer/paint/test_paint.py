@@ -90,7 +90,7 @@ def test_gaussians_moved_back_keep_their_outline_in_the_view() -> None:
 def test_hidden_gaussians_do_not_cover_the_paint(tmp_path: Path) -> None:
     scene = wall(count=20_000, size=0.035, rough=0.01)
     logo = np.full((32, 32, 4), (200, 30, 40, 255), np.uint8)
-    discs = place_discs(scene, make(put(tmp_path, logo), scene).paint, 0.03, 4.0)
+    discs = place_discs(scene, make(put(tmp_path, logo), scene).paints[0], 0.03, 4.0)
     assert float(discs.scene.means[discs.moved, 2].min()) > float(discs.added.means[:, 2].max())
 
 
@@ -158,8 +158,8 @@ def test_transparent_pixels_leave_the_scene_unchanged(tmp_path: Path) -> None:
     logo = np.full((30, 30, 4), 255, np.uint8)
     logo[:, 15:, 3] = 0
     editor = make(put(tmp_path, logo), scene)
-    assert not bool(editor.paint.mask[:, 70:].any())
-    assert bool(editor.paint.mask[:, 50:60].any())
+    assert not bool(editor.paints[0].mask[:, 70:].any())
+    assert bool(editor.paints[0].mask[:, 50:60].any())
     logo[..., 3] = 0
     with pytest.raises(ProgdfError, match="is fully transparent"):
         make(put(tmp_path, logo), scene)

@@ -14,6 +14,7 @@ from viewer.files.document import DocumentStore
 from .deliver import DeliverActions
 from .edits import EditActions
 from .file_actions import FileActions, OpenDocument
+from .painting import PaintingActions
 from .pictures import PictureActions
 from .preview import PreviewActions
 from .scene_checks import StrayActions, UpActions
@@ -35,6 +36,7 @@ class WindowParts:
     up: UpActions
     strays: StrayActions
     tidy: TidyActions
+    painting: PaintingActions
 
     @property
     def requests(self) -> Requests:
@@ -48,13 +50,14 @@ class WindowParts:
             self.preview,
             self.strays,
             self.tidy,
+            self.painting,
         )
         return {name: act for part in parts for name, act in part.requests.items()}
 
     @property
     def polls(self) -> tuple[Callable[[], float | None], ...]:
         """Functions that poll a part and return the seconds until the next poll, None for never."""
-        parts = (self.jobs, self.preview, self.start, self.strays)
+        parts = (self.jobs, self.painting, self.preview, self.start, self.strays)
         return (
             *(part.poll for part in parts),
             self.file_actions.poll_dialog,
@@ -159,4 +162,5 @@ def make_parts(
         up=UpActions(store=store, documents=documents, messages=messages),
         strays=StrayActions(store=store, documents=documents, messages=messages),
         tidy=TidyActions(store=store, documents=documents, edits=edits),
+        painting=PaintingActions(store=store, documents=documents, messages=messages, queue=jobs.queue),
     )

@@ -1,0 +1,232 @@
+"""Projection of paint along the visible surface of a scene, from the view where it was painted to others.
+
+Each painted pixel is a point on the surface, at the depth that the view shows there. Points are drawn as
+small squares, the nearest last. This is fast enough for a turning camera and needs no new Gaussians.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from progdf.camera import Camera
+from progdf.gaussians import Gaussians
+from progdf.rasterize import render
+
+from .strokes import Floats, Pixels, painted_box
+
+OPAQUE = 0.5
+"""Opacity from which a pixel has a surface."""
+
+_SAME_SURFACE_DEVIATIONS = 2.0  # paint this far behind the blended depth lies on the visible surface
+_MEDIAN_PX = 9  # window of the median of depths, pixels
+_SMOOTH_SIGMA_PX = 5.0  # sigma of the Gaussian filter over depths, pixels
+# size of a square relative to the distance of neighboring points, so that rounding leaves no holes
+_SQUARE_OVERLAP = 1.4
+_MAX_SQUARE_PX = 12  # largest side of a square, pixels
+_HIDDEN_COSINE = -0.1  # points that face away by more than this are hidden; normals are noisy
+
+
+@dataclass(frozen=True, eq=False)
+class ViewSurface:
+    """Visible surface of a scene in one view."""
+
+    camera: Camera
+    depth: Floats  # blended camera z, world units; infinite where there is no surface. [H,W]
+    deviation: Floats  # standard deviation of the depths of the light within a pixel, world units. [H,W]
+    opacity: Floats  # 0 where there is no surface. [H,W]
+
+
+@dataclass(frozen=True, eq=False)
+class PaintPoints:
+    """Painted pixels as points on the surface."""
+
+    positions: Floats  # world units. [P,3]
+    normals: Floats  # towards the camera that sees them, unit length. [P,3]
+    spacings: Floats  # distance of neighboring points, world units. [P]
+    colors: Pixels  # straight RGBA. [P,4]
+    places: NDArray[np.intp]  # row and column of each point in its own view. [2,P]
+
+
+def view_surface(scene: Gaussians, camera: Camera) -> ViewSurface:
+    """Return the visible surface of a scene.
+
+    Args:
+        scene: the scene on screen
+        camera: the view
+    """
+    axis = camera.viewmat[2].float()
+    depths = scene.means @ axis[:3] + axis[3]
+    in_front = depths[depths.isfinite() & (depths > camera.near)]
+    middle = float(in_front.median()) if len(in_front) else 0.0  # squares of differences keep their digits
+    z = torch.nan_to_num(depths - middle, 0.0, 0.0, 0.0)
+    colors = torch.stack([z, z.square(), torch.ones_like(z)], dim=1)
+    with torch.no_grad():
+        light = render(scene, camera, (0.0, 0.0, 0.0), colors=colors).image.numpy()
+    opacity = light[..., 2]
+    is_surface = opacity >= OPAQUE
+    total = np.maximum(opacity, OPAQUE)
+    mean = light[..., 0] / total
+    variance = np.maximum(light[..., 1] / total - mean * mean, 0.0)
+    depth = np.where(is_surface, mean + np.float32(middle), np.float32(np.inf))
+    return ViewSurface(
+        camera, depth, np.sqrt(variance), np.where(is_surface, opacity, 0.0).astype(np.float32)
+    )
+
+
+def paint_points(pixels: Pixels, surface: ViewSurface) -> PaintPoints:
+    """Return the painted pixels of a view as points on its surface. Paint on the background is left out.
+
+    Args:
+        pixels: straight RGBA. [H,W,4]
+        surface: surface of the view in which it was painted, of the same size
+    """
+    left, top, right, bottom = painted_box(pixels)
+    margin = _MEDIAN_PX
+    left = max(left - margin, 0)
+    top = max(top - margin, 0)
+    part = np.s_[top : bottom + margin, left : right + margin]
+    depth = surface.depth[part]
+    is_surface = np.isfinite(depth)
+    is_painted = is_surface & (pixels[part][..., 3] > 0)
+    rows, columns = np.nonzero(is_painted)
+    if not len(rows):
+        none = np.zeros((0, 3), np.float32)
+        return PaintPoints(none, none, none[:, 0], np.zeros((0, 4), np.uint8), np.zeros((2, 0), np.intp))
+    nearest = ndimage.distance_transform_edt(~is_surface, return_distances=False, return_indices=True)
+    smooth = depth[tuple(nearest)]
+    for window in ((1, _MEDIAN_PX), (_MEDIAN_PX, 1)):
+        smooth = ndimage.median_filter(smooth, window, mode="nearest")
+    rounded = ndimage.gaussian_filter(smooth, _SMOOTH_SIGMA_PX, mode="nearest")
+    # within the light's own depth, differences are noise; beyond it, they are edges
+    is_noise = np.abs(rounded - smooth) <= surface.deviation[part]
+    smooth = np.where(is_noise, rounded, smooth)
+    places = _unproject(rounded, surface.camera, left, top)
+    along_rows, along_columns = np.gradient(places, axis=(0, 1)) if min(rounded.shape) > 1 else (places,) * 2
+    normals = np.cross(along_rows, along_columns)[rows, columns]
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+    positions = _unproject(smooth, surface.camera, left, top)[rows, columns]
+    eye = np.linalg.inv(surface.camera.viewmat.double().numpy())[:3, 3].astype(np.float32)
+    towards = np.einsum("ij,ij->i", normals, eye - positions)
+    normals[towards < 0.0] *= -1.0
+    spacings = smooth[rows, columns] / np.float32(_focal_px(surface.camera))
+    where = np.stack([rows + top, columns + left])
+    return PaintPoints(positions, normals, spacings, pixels[where[0], where[1]], where)
+
+
+def draw_points(points: PaintPoints, camera: Camera, surface: ViewSurface | None) -> Pixels:
+    """Draw points in a view. The nearest point covers the others.
+
+    Args:
+        points: see `paint_points`
+        camera: the view
+        surface: its surface, which hides paint behind it; None while it is unknown
+
+    Returns:
+        straight RGBA. [H,W,4]
+    """
+    image = np.zeros((camera.height, camera.width, 4), np.uint8)
+    across, down, depths = _project(points.positions, camera)
+    eye = np.linalg.inv(camera.viewmat.double().numpy())[:3, 3].astype(np.float32)
+    to_eye = eye - points.positions
+    facing = np.einsum("ij,ij->i", points.normals, to_eye)
+    shown = (depths > camera.near) & (facing > _HIDDEN_COSINE * np.linalg.norm(to_eye, axis=1))
+    shown &= (across >= 0.0) & (across < camera.width) & (down >= 0.0) & (down < camera.height)
+    if surface is not None:
+        shown &= _is_visible(across, down, depths, shown, surface)
+    rows = np.flatnonzero(shown)
+    rows = rows[np.argsort(-depths[rows], kind="stable")]
+    if not len(rows):
+        return image
+    sides = np.ceil(_SQUARE_OVERLAP * points.spacings[rows] * _focal_px(camera) / depths[rows])
+    sides = np.minimum(sides, _MAX_SQUARE_PX)
+    lefts = np.floor(across[rows] - 0.5 * (sides - 1.0)).astype(np.intp)
+    tops = np.floor(down[rows] - 0.5 * (sides - 1.0)).astype(np.intp)
+    colors = points.colors[rows]
+    flat = image.reshape(-1, 4).view(np.uint32)[:, 0]
+    packed = np.ascontiguousarray(colors).view(np.uint32)[:, 0]
+    largest = int(sides.max())
+    for y in range(largest):
+        for x in range(largest):
+            columns = lefts + x
+            lines = tops + y
+            inside = (max(x, y) < sides) & (columns >= 0) & (columns < camera.width)
+            inside &= (lines >= 0) & (lines < camera.height)
+            flat[lines[inside] * camera.width + columns[inside]] = packed[inside]
+    return image
+
+
+def project_coverage(coverage: Floats, surface: ViewSurface, points: PaintPoints) -> Floats:
+    """Return the influence that a stroke in one view has on paint of another view.
+
+    Args:
+        coverage: influence of the stroke on each pixel of its view, 0 to 1. [H,W]
+        surface: surface of the stroke's view
+        points: the paint of the other view. [P]
+
+    Returns:
+        influence on each point, 0 where the stroke's view does not show it. [P]
+    """
+    camera = surface.camera
+    across, down, depths = _project(points.positions, camera)
+    shown = depths > camera.near
+    shown &= (across >= 0.0) & (across < camera.width) & (down >= 0.0) & (down < camera.height)
+    shown &= _is_visible(across, down, depths, shown, surface)
+    influence = np.zeros(len(points.positions), np.float32)
+    influence[shown] = coverage[down[shown].astype(np.intp), across[shown].astype(np.intp)]
+    return influence
+
+
+def is_apart(one: ViewSurface, other: ViewSurface, column: int, row: int) -> bool:
+    """Return True if two surfaces of one view differ at a pixel by more than the thickness of their light."""
+    depths = one.depth[row, column], other.depth[row, column]
+    if not np.isfinite(depths).all():
+        return bool(np.isfinite(depths).any())
+    pixel = depths[0] / _focal_px(one.camera)
+    thickness = max(one.deviation[row, column], other.deviation[row, column], pixel)
+    return bool(abs(depths[0] - depths[1]) > _SAME_SURFACE_DEVIATIONS * thickness)
+
+
+def _is_visible(
+    across: Floats, down: Floats, depths: Floats, inside: NDArray[np.bool_], surface: ViewSurface
+) -> NDArray[np.bool_]:
+    """Return the points that lie on the visible surface, not behind it or beside it. [P]"""
+    columns = np.where(inside, across, 0.0).astype(np.intp)
+    rows = np.where(inside, down, 0.0).astype(np.intp)
+    pixel = depths / np.float32(_focal_px(surface.camera))
+    tolerance = _SAME_SURFACE_DEVIATIONS * np.maximum(surface.deviation[rows, columns], pixel)
+    depth = surface.depth[rows, columns]
+    return np.asarray(np.isfinite(depth) & (depths <= depth + tolerance))
+
+
+def _project(positions: Floats, camera: Camera) -> tuple[Floats, Floats, Floats]:
+    """Return columns and rows in pixels, and depths, of points [P,3]. [P] each"""
+    viewmat = camera.viewmat.float().numpy()
+    K = camera.K.float().numpy()
+    x, y, z = viewmat[:3, :3] @ positions.T + viewmat[:3, 3:]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = np.where(z > 0.0, np.float32(1.0) / z, np.float32(0.0))
+    return x * inverse * K[0, 0] + K[0, 2], y * inverse * K[1, 1] + K[1, 2], z
+
+
+def _unproject(depth: Floats, camera: Camera, left: int, top: int) -> Floats:
+    """Return the world positions of the pixels of a part of a view. [h,w] -> [h,w,3]"""
+    K = camera.K.double().numpy()
+    height, width = depth.shape
+    x = (np.arange(width) + (left + 0.5 - K[0, 2])) / K[0, 0]
+    y = ((np.arange(height) + (top + 0.5 - K[1, 2])) / K[1, 1])[:, None]
+    rays = np.stack(np.broadcast_arrays(x, y, np.ones((1, 1))), axis=-1)
+    to_world = np.linalg.inv(camera.viewmat.double().numpy())
+    points = (rays * depth[..., None]) @ to_world[:3, :3].T + to_world[:3, 3]
+    positions: Floats = points.astype(np.float32)
+    return positions
+
+
+def _focal_px(camera: Camera) -> float:
+    """Return the mean focal length, pixels."""
+    return math.sqrt(float(camera.K[0, 0]) * float(camera.K[1, 1]))
