@@ -31,6 +31,7 @@ Preset = Literal["default", "paper"]
 Quantize = Literal["off", "nf4"]
 Fill = Literal["none", "picture", "surface"]
 Removal = Literal["auto", "never", "always"]
+CarryOn = Literal["auto", "never", "always"]
 Device = Literal["auto", "cpu"]
 Engine = Literal["auto", "cpu", "warp"]
 
@@ -93,6 +94,8 @@ class EditorOptions:
     """remove, pictures: source to fill holes from: the picture, the surface around them, or none."""
     removal: Removal = "auto"
     """pictures: remove the region instead of recoloring it (always, never, or as the picture suggests)."""
+    carry_on: CarryOn = "auto"
+    """pictures: color parts that no picture shows by the color map (always, never, or if it fits: auto)."""
     seed: Fixed[int] = 0  # seed of the noise, the same in every view
     cache: Fixed[Path | None] = None  # folder for painted pictures; None saves none
     at: Annotated[str, absent_option("X,Y,SIZE[,ANGLE]", "none")] = ""

@@ -180,7 +180,10 @@ class RegretEdit:
         between = StrengthSource(edit, look)
         with TemporaryDirectory() as folder, closing(RunLog(Path(folder) / "log.txt", quiet=True)) as log:
             options = OptimizeOptions(), self.setup, finished, between, TrainingViewOptions(), log
-            solver, model, course = plan_colors(*options)
+            plan = plan_colors(*options)
+        solver = plan.solver
+        model = plan.model
+        course = plan.course
         snapshots = list[ParameterSnapshot]()
         state = PgsState(self.original)
         max_steps = iterations(OptimizeOptions().steps)

@@ -95,7 +95,7 @@ EDITORS = {
         external=True,
         files=picture_paths,
         sets_views=True,
-        options=("fill", "removal"),
+        options=("fill", "removal", "carry_on"),
         run="trained or removed",
     ),
     "decal": EditorRow(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -15,7 +14,6 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.terminal import format_count
-from trainer.regions.from_pictures import CHANGED
 from trainer.regions.lift import HIDDEN, gather
 from trainer.regions.reach import drop_unsupported, find_fade, surface_reach
 from trainer.regions.surface import covered_rows, surface_likeness
@@ -72,7 +70,7 @@ class Ties:
         unchanged = format_count(int((reach == 0.0).sum()), "member")
         line = (
             f"the edit ends {fade.width:.3g} units beyond the border of what the pictures show ({reason}); "
-            f"{unchanged} beyond keep their color; name the region to color all of it"
+            f"{unchanged} beyond keep their color"
         )
         return replace(self, clear=self.clear & (reach > 0.0), reach=reach), line
 
@@ -102,15 +100,6 @@ class Ties:
             for column in values.T
         ]
         return torch.from_numpy(np.stack(columns, axis=1)).to(residual).view_as(residual)
-
-
-def is_carried_on(region: str) -> bool:
-    """Return True if an edit from pictures continues over its whole region by the color map.
-
-    A named region is a request to color all of it. The region `changed` is found from the pictures, so its
-    edit ends where the pictures end (`Ties.end_at_pictures`).
-    """
-    return re.match(rf"\s*{CHANGED}\b", region) is None
 
 
 def surface_ties(scene: Gaussians, members: Tensor, cameras: Sequence[Camera]) -> Ties:

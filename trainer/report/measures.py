@@ -26,6 +26,7 @@ from progdf.terminal import format_count, group_digits
 from trainer.editors.pictures import read_edit
 from trainer.fit.evaluate import Evaluator
 from trainer.fit.fit import Fitted, choice_figures, field_figures, stored_numbers
+from trainer.optimize.carry_on import draw_behind
 from trainer.optimize.losses import Perceptual
 from trainer.options import TextOptions
 from trainer.views.setup import TrainingSetup
@@ -445,3 +446,26 @@ def measure_above(
     )
     strengths = {layer.name: layer.strength for layer in lower.layers.layers}
     return {"lower_layers": {"strengths": strengths, "blend": lower.layers.blend, "psnr": found}}
+
+
+def carry_figures(
+    setup: TrainingSetup, trajectory: Trajectory, effort: Mapping[str, Any], behind: Path
+) -> dict[str, Any]:
+    """Return the decision on parts that no picture shows, see `CarryDecision`, for report.json.
+
+    If the color map may be carried on but is not, write a picture of it from behind.
+
+    Args:
+        setup: scene, region and the views of the pictures
+        trajectory: the recordings, with their color maps
+        effort: figures of the training
+        behind: file of the picture
+    """
+    behind.unlink(missing_ok=True)
+    decision = effort.get("carry_on")
+    if decision is None:
+        return {}
+    degree = effort["degree"]
+    if decision["offered"] and degree and trajectory.maps is not None:
+        draw_behind(setup, trajectory.maps[-1], degree, behind)
+    return {"carry_on": decision}

@@ -34,6 +34,7 @@ from trainer.regions.from_pictures import CHANGED
 from trainer.report.measures import (
     PaintReproduction,
     against_editor,
+    carry_figures,
     clip_curve,
     expected_measures,
     figures,
@@ -157,6 +158,7 @@ def finish_run(
         "trajectory": _trajectory_figures(shipped, slider, record),
         **_record_figures(record),
         "paint": paint.figures() if paint is not None else None,
+        **carry_figures(setup, trajectory, record.effort, folder.behind),
         **measure_above(setup, gdf, options.views.pictures, log.say),
         "time": {**(_earlier_seconds(folder) if log.refits else {}), **log.rounded_seconds()},
         "memory_mb": log.peak_mb(),

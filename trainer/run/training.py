@@ -23,6 +23,7 @@ from progdf.rasterize.engines import engine_device
 from progdf.scene.bounds import scene_sphere
 from progdf.terminal import format_count
 from trainer.methods import METHODS
+from trainer.optimize.carry_on import CarryDecision, CarryRequest, make_tied_solver
 from trainer.optimize.color_course import STEPS, StrengthSchedule, Target, solve, thin_model
 from trainer.optimize.color_solver import (
     Model,
@@ -39,8 +40,13 @@ from trainer.optimize.growth import add_rows, place_seeds, removal_costs, seed_r
 from trainer.optimize.losses import Losses, Perceptual, loss_table
 from trainer.optimize.pgs import SNAPSHOTS, DescentTask, OnStep, ParameterSnapshot, PgsState, TargetStage
 from trainer.optimize.retime import record, retime, select_recordings, straight_recordings
-from trainer.optimize.ties import is_carried_on, surface_ties
-from trainer.options import MAX_STAGES, OptimizeOptions, Slider, TrainingViewOptions, TrainOptions
+from trainer.options import (
+    MAX_STAGES,
+    OptimizeOptions,
+    Slider,
+    TrainingViewOptions,
+    TrainOptions,
+)
 from trainer.paper.network import JointTraining, save_network
 from trainer.store.progress import RunLog, release_memory
 from trainer.store.run_folder import LazySequence
@@ -168,9 +174,9 @@ def optimize_members(
             options.views,
             log,
             options.field.target_psnr,
-            is_carried_on(options.region.region),
+            CarryRequest(options.editor.carry_on, options.region.region),
         )
-        return _solve(*plan, iterations(optimization.steps), folder, log)
+        return _solve(plan, iterations(optimization.steps), folder, log)
     scene = setup.scene
     members = setup.region.members
     engine = optimization.engine
@@ -235,6 +241,16 @@ def optimize_members(
     return trajectory, loss_table([(snapshot.step, snapshot.means) for snapshot in all_snapshots]), effort
 
 
+@dataclass(frozen=True)
+class ColorPlan:
+    """Solver and model of a color edit, and the strengths to solve for."""
+
+    solver: Solver
+    model: Model
+    course: StrengthSchedule
+    carry_on: CarryDecision | None  # decision on parts that no picture shows; None if there are many views
+
+
 def plan_colors(
     optimization: OptimizeOptions,
     setup: TrainingSetup,
@@ -243,8 +259,8 @@ def plan_colors(
     options: TrainingViewOptions,
     log: RunLog,
     target_psnr: float | None = None,
-    carries_on: bool = True,
-) -> tuple[Solver, Model, StrengthSchedule]:
+    carry_on: CarryRequest | None = None,
+) -> ColorPlan:
     """Solve for the finished edit, then choose the model size and the strengths to solve for next.
 
     Args:
@@ -252,11 +268,11 @@ def plan_colors(
         setup: scene, region, and views whose boxes hold the edit
         edited: strength → the whole edited views
         between: source of further strengths; None: only those of `edited`
-        options: view options. Changed pictures require ties, see `surface_ties`. If the number of views is
-            open, only every other view is used, provided that the remaining error is not visible
+        options: view options. Changed pictures require `make_tied_solver`. If the number of views is open,
+            only every other view is used, provided that the remaining error is not visible
         log: log of the run
         target_psnr: see `FieldOptions`
-        carries_on: see `is_carried_on`; without effect if there are many views
+        carry_on: request for the parts that no picture shows; without effect if there are many views
     """
     scene = setup.scene
     members = setup.region.members
@@ -287,16 +303,17 @@ def plan_colors(
     with log.stage("weights"):
         drawn = draw(train)
         aside = draw(held_out) if held_out else drawn
-        ties = surface_ties(scene, members, [view.camera for view in train]) if few else None
-        if ties is not None and not carries_on:
-            changes = [picture - view.image for view, picture in zip(train, edited[1.0], strict=False)]
-            ties, end_line = ties.end_at_pictures(scene, members, [view.camera for view in train], changes)
-            log.say(end_line)
+    decision = None
     with log.stage("model"):
         finished = target(1.0, edited[1.0])
-        solver = make_solver(drawn, original, ties)
         targets = finished[0].targets
-        trial = (solver, finished[1]) if ties is None else split_solver(solver, targets)
+        if few:
+            solver, decision = make_tied_solver(
+                carry_on or CarryRequest(), setup, drawn, targets, edited[1.0], log.say
+            )
+        else:
+            solver = make_solver(drawn, original)
+        trial = split_solver(solver, targets) if few else (solver, finished[1])
         solver, model = choose_model(
             solver, trial, targets, max_iterations, 1 if optimization.sh == "off" else 9
         )
@@ -319,13 +336,10 @@ def plan_colors(
     evaluated_on = "held-out views" if held_out else "all views, as none is held out"
     if len(train) < count:
         log.say(f"solving for {len(train)} of {count} views; the others would make no visible difference")
-    if ties is not None:
+    if few:
         evaluated_on = "held-out squares of the pictures"
     log.say(f"{model.line}, on {evaluated_on}")
-    if ties is not None and carries_on:
-        unseen_count = len(original) - int(solver.asked[:, 0].sum())
-        log.say(f"{unseen_count} members are almost hidden; they follow the color map and their surface")
-    return solver.only(model.residual), model, course
+    return ColorPlan(solver.only(model.residual), model, course, decision)
 
 
 def pixel_stride(setup: TrainingSetup) -> int:
@@ -338,10 +352,11 @@ def pixel_stride(setup: TrainingSetup) -> int:
     return next((stride for stride in (4, 2) if region_pixels >= stride * _PIXELS_PER_UNKNOWN * unknowns), 1)
 
 
-def _solve(
-    solver: Solver, model: Model, course: StrengthSchedule, most_steps: int, folder: StateFolder, log: RunLog
-) -> Optimized:
+def _solve(plan: ColorPlan, most_steps: int, folder: StateFolder, log: RunLog) -> Optimized:
     """Solve for colors over all views at once."""
+    solver = plan.solver
+    model = plan.model
+    course = plan.course
     state = PgsState(solver.original)
     recordings = Recordings(folder, solver.original.shape, model)
     solve_course = partial(solve, solver, model, course, recordings.made, state, steps=most_steps)
@@ -364,6 +379,8 @@ def _solve(
         "views": len(solver.views),
     }
     trajectory = replace(trajectory, maps=maps, bands=model.bands, mask=model.mask)
+    if plan.carry_on is not None:
+        effort["carry_on"] = plan.carry_on.figures()
     return trajectory, loss_table(rows), effort | model.figures()
 
 

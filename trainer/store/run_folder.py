@@ -124,6 +124,11 @@ class RunFolder:
         return self.root / "report.json"
 
     @property
+    def behind(self) -> Path:
+        """Picture from behind of the edit as it could be carried on, with its camera; may be absent."""
+        return self.root / "behind.png"
+
+    @property
     def picture(self) -> Path:
         """Figures of the run as a picture."""
         return self.root / "report.png"

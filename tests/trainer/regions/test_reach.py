@@ -15,7 +15,7 @@ from progdf.camera import Camera, intrinsics, look_at
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.sh import rgb_to_sh0
 from tests.helpers.trained import WHITE, edit_few
-from trainer.optimize.ties import is_carried_on, surface_ties
+from trainer.optimize.ties import surface_ties
 from trainer.regions.reach import border_half_width, drop_unsupported, surface_reach
 from trainer.views.crops import crop_scene
 from trainer.views.view import render_view
@@ -151,8 +151,3 @@ def test_other_thing_behind_keeps_its_color() -> None:
     change = change_of(both, torch.ones(SIDE, SIDE), carries_on=False)
     inner_back = torch.cat([torch.zeros(len(near), dtype=torch.bool), azimuth(behind).abs() > 110])
     assert float(change[inner_back].max()) < 0.02 * float(change.max())
-
-
-def test_only_a_named_region_is_colored_whole() -> None:
-    assert not any(map(is_carried_on, ("changed", " changed:A.png", "changed|refine")))
-    assert all(map(is_carried_on, ("all", "labels:l.npy:1", "masks:changed")))
