@@ -27,9 +27,13 @@ from .compose_kernel import add_offsets, write_rows
 from .follow import (
     FOLLOWED,
     Followers,
+    banded_followers,
+    changes_shape,
     find_followers,
+    mean_quats,
     pack_shapes,
     state_scene,
+    turn_bands,
 )
 from .follow_kernel import (
     Shapes,
@@ -116,6 +120,8 @@ class _Plan(NamedTuple):
     shapes: _Members  # those whose shape is written, without pushed rows if they are most of them
     followers: Rows  # indices of the following rows, see `Followers`. [F]
     added: Rows  # indices of the added rows among them that the changed edits change. [G]
+    banded: Rows  # indices of following rows with higher SH bands that may change. [B]
+    recolored: Rows  # those of them that the changed edits change
 
 
 class _LayerSlice(NamedTuple):
@@ -156,8 +162,9 @@ class Composer:
         self._covers = covers
         followers = find_followers(extended, len(scene))
         self._surface = None if followers is None else _Surface(scene, extended, followers, self._coverage_of)
-        if followers is not None:
+        if self._surface is not None:
             moving.update(FOLLOWED)
+            moving.update(("shN",) if len(self._surface.banded) else ())
         before = {name: getattr(scene, name).detach().float() for name in ATTRIBUTES if name in moving}
         after: dict[str, Any] = {name: values.clone() for name, values in before.items()}
         self.gaussians = replace(scene, **after)
@@ -200,7 +207,7 @@ class Composer:
         moving = {name for edit in plan.colors.parts for name in self._bases[edit] if KINDS[name] in kinds}
         names = tuple(name for name in self._before if name in moving)
         surface = self._surface
-        if surface is None or not len(plan.followers):
+        if surface is None or not (len(plan.followers) or len(plan.banded)):
             return Change(plan.rows, names, self._write(stack, blend, plan.colors, names))
         shapes = self._shapes()
         surface.release(shapes, plan.added)
@@ -212,7 +219,12 @@ class Composer:
             self._write(stack, blend, plan.colors, colors)
             moved = self._write(stack, blend, plan.shapes, shaped)
         carried = surface.carry(shapes, plan.followers, plan.added, stack, blend)
-        names = tuple(name for name in self._before if name in moving or name in FOLLOWED)
+        moving.update(FOLLOWED)
+        if len(plan.banded):
+            recolored = plan.recolored if "shN" in moving else plan.recolored[:0]
+            surface.turn(self._after["shN"], plan.banded, recolored)
+            moving.add("shN")
+        names = tuple(name for name in self._before if name in moving)
         return Change(plan.rows, names, max(moved, carried))
 
     def _shapes(self) -> Shapes:
@@ -326,7 +338,7 @@ class Composer:
             rows = chosen[0] if len(chosen) == 1 else np.unique(np.concatenate(chosen))
             members = self._members_in(rows)
             nothing = np.zeros(0, np.int64)
-            plan = _Plan(rows, members, members, nothing, nothing)
+            plan = _Plan(rows, members, members, nothing, nothing, nothing, nothing)
             if self._surface is not None:
                 plan = self._plan_followers(self._surface, plan, changed)
             self._plans[changed] = plan
@@ -347,13 +359,17 @@ class Composer:
         dependents = [rows for edit in changed if len(rows := surface.dependents(edit))]
         rows = np.unique(np.concatenate([plan.rows, *dependents])) if dependents else plan.rows
         index = np.flatnonzero(np.isin(followers.rows, rows))
+        banded = index[np.isin(index, surface.banded)]
+        recolored = banded[np.isin(followers.rows[banded], plan.rows)]
+        if not any(changes_shape(self._gdfs[edit]) for edit in changed):
+            index = index[:0]
         pushed = followers.rows[index[followers.edits[index] < 0]]
         shapes = plan.colors
         # leaving out a few rows would only break the runs of consecutive members
         if 2 * len(pushed) > len(plan.rows):
             shapes = self._members_in(plan.rows[~np.isin(plan.rows, pushed)])
         added = index[np.isin(followers.edits[index], list(changed))]
-        return _Plan(rows, plan.colors, shapes, index, added)
+        return _Plan(rows, plan.colors, shapes, index, added, banded, recolored)
 
     def _coverage_of(self, edit: int) -> Mapping[str, Tensor]:
         if edit not in self._coverage:
@@ -410,6 +426,10 @@ class _Surface:
         self._motions = rest_motions(self._before)
         self._is_anchor = np.zeros(len(states), bool)
         self._is_anchor[followers.anchors] = True
+        self._follows = np.ones(len(gdfs) + 1, bool)  # by edit + 1: its rows follow; the first: pushed rows
+        self.banded = banded_followers(scene, gdfs, followers)
+        """Indices of the following rows with higher SH bands. [B]"""
+        self._bands = scene.shN[rows].float()  # bands of the rows without following. [F,K,3]
         self._dependents: dict[int, Rows] = {}
         self._sliced: dict[
             int, tuple[Tensor, int, Tensor]
@@ -453,8 +473,8 @@ class _Surface:
         states = self._composer._shapes()
         measure_motions(self._motions, changed[self._is_anchor[changed]], self._before, states)
         gather_shapes(self._own, added, shapes, followers.rows)
-        follows = np.zeros(len(followers.changed) + 1, bool)
-        follows[[0, *(edit + 1 for edit, _ in stack)]] = True
+        self._follows[1:] = False
+        self._follows[[edit + 1 for edit, _ in stack]] = True
         table = followers.rows, followers.edits, followers.own, followers.anchors, followers.weights
         count = 1 + len(index) // _CARRIED_ROWS
         cuts = [len(index) * part // count for part in range(count + 1)]
@@ -464,13 +484,32 @@ class _Surface:
                 (self._own, self._drawn),
                 index[cuts[chunk] : cuts[chunk + 1]],
                 table,
-                follows,
+                self._follows,
                 (self._before, states),
                 self._motions,
             ),
             count,
         )
         return math.sqrt(max(moves))
+
+    def turn(self, bands: Floats, index: Rows, recolored: Rows) -> None:
+        """Turn the higher SH bands of following rows.
+
+        Args:
+            bands: bands of the composed scene, updated in place. [N,3K]
+            index: indices of the rows to write. [B]
+            recolored: those of them that the composer has written
+        """
+        followers = self.followers
+        width = self._bands.shape[1:]
+        self._bands[recolored] = torch.from_numpy(bands[followers.rows[recolored]]).reshape(-1, *width)
+        moves, turns, *_ = self._motions
+        anchors = followers.anchors[index]
+        weights = followers.weights[index]
+        is_moved = (moves[anchors, 0] & (weights > 0)).any(axis=1) & self._follows[followers.edits[index] + 1]
+        mean = mean_quats(torch.from_numpy(turns[anchors, :4]), torch.from_numpy(weights)[..., None])
+        turned = turn_bands(self._bands[index], mean, torch.from_numpy(is_moved))
+        bands[followers.rows[index]] = turned.flatten(1).numpy()
 
     def _layer(self, edit: int, layer: Layer) -> Layer:
         """Return a layer restricted to the states."""

@@ -7,10 +7,11 @@ which nothing is drawn). A row with center x, rotation q, log-scales l and opaci
 
     x' = a' + s R (x − a),   q' = R q,   l' = l + log s,   o' = o · min(1, v' / v)
 
-A rigid motion of all anchors is thus the row's motion. The other layers are all but the row's own and those
-that paint: paint only pushes Gaussians out of its way, see `Anchors.pushes`. A pushed Gaussian that other
-layers change too is carried along in the same way, with its own row as its only anchor. Colors are not
-followed.
+A rigid motion of all anchors is thus the row's motion. R also turns the higher SH bands of the row, which
+grown rows have; discs of paint have none. The other layers are all but the row's own and those that paint:
+paint only pushes Gaussians out of its way, see `Anchors.pushes`. A pushed Gaussian that other
+layers change too is carried along in the same way, with its own row as its only anchor. Changes of color are
+not followed.
 
 Rows whose anchors keep all bits keep theirs.
 """
@@ -30,6 +31,7 @@ from progdf.gaussians import BASE_CHANNELS, Gaussians
 from progdf.gdf.file import Gdf, fingerprint
 from progdf.quaternions import multiply_quats, normalize_quats, rotate_vectors
 from progdf.region import Region
+from progdf.sh import rotation_change
 
 FOLLOWED = ("means", "log_scales", "quats", "logit_opacities")
 """Attributes that follow the surface, in the order of `pack_shapes`."""
@@ -99,6 +101,17 @@ def find_followers(gdfs: Sequence[Gdf], count: int) -> Followers | None:
     weights[:, 0] = 1.0
     builder.add(pushed, -1, anchors, weights, tuple(others), tuple(pushing))
     return builder.finish(frozenset(pushing))
+
+
+def banded_followers(scene: Gaussians, gdfs: Sequence[Gdf], followers: Followers) -> Rows:
+    """Return the indices of the following added rows that have higher SH bands at any strength. [B]"""
+    has_bands = (scene.shN != 0).flatten(1).any(dim=1).numpy()
+    for gdf in gdfs:
+        bases = gdf.field.attributes.get("shN")
+        if gdf.anchors is not None and bases is not None:
+            moves = (bases.end_offset != 0).any(dim=1) | (bases.residual_basis != 0).any(dim=2).any(dim=0)
+            has_bands[gdf.region.members[moves].numpy()] = True
+    return np.flatnonzero(has_bands[followers.rows] & (followers.edits >= 0))
 
 
 class _Builder:
@@ -269,6 +282,35 @@ def carry_rows(own: Tensor, before: Tensor, after: Tensor, weights: Tensor) -> T
     )
 
 
+def turn_bands(bands: Tensor, turns: Tensor, moves: Tensor) -> Tensor:
+    """Return the higher SH bands of rows that turn with their anchors.
+
+    Args:
+        bands: the rows' bands under their own edit. [F,K,3]
+        turns: mean turns of their anchors, unit quaternions. [F,4]
+        moves: rows with an anchor that moves; others keep all bits. [F] bool
+
+    Returns:
+        [F,K,3] float32
+    """
+    rows = moves & (bands != 0).flatten(1).any(dim=1)
+    own = bands[rows].double()
+    turned = bands.clone()
+    turned[rows] = (own + rotation_change(own, turns[rows])).float()
+    return turned
+
+
+def anchor_turns(before: Tensor, after: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the mean turn of anchors, and whether the geometry of any differs; arguments as of `carry_rows`.
+
+    Returns:
+        [F,4] float64 and [F] bool.
+    """
+    differs = (before != after) & (weights > 0)[..., None]
+    moves = differs[..., _GEOMETRY].flatten(1).any(dim=1)
+    return _mean_turn(before[..., _QUATS].double(), after[..., _QUATS].double(), weights[..., None]), moves
+
+
 def carry_pushed(own: Tensor, before: Tensor, after: Tensor) -> Tensor:
     """Return pushed rows that follow their own row under the other edits.
 
@@ -299,6 +341,11 @@ def _mean_turn(old: Tensor, new: Tensor, share: Tensor) -> Tensor:
     """Return the weighted mean of rotations as unit quaternions. [F,4,4], [F,4,4], [F,4,1] -> [F,4]"""
     conjugate = normalize_quats(old) * old.new_tensor([1.0, -1.0, -1.0, -1.0])
     turns = multiply_quats(normalize_quats(new).flatten(0, 1), conjugate.flatten(0, 1)).reshape(old.shape)
+    return mean_quats(turns, share)
+
+
+def mean_quats(turns: Tensor, share: Tensor) -> Tensor:
+    """Return the weighted mean of unit quaternions. [F,4,4], [F,4,1] -> [F,4]"""
     # q and −q are the same rotation
     heaviest = turns[:, :1]
     aligned = torch.where((turns * heaviest).sum(dim=2, keepdim=True) < 0, -turns, turns)

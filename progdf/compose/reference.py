@@ -22,7 +22,15 @@ from progdf.gdf.file import Gdf
 from progdf.sh import C0
 
 from .added import extend
-from .follow import carry_pushed, carry_rows, changes_shape, pack_shapes, unpack_shapes
+from .follow import (
+    anchor_turns,
+    carry_pushed,
+    carry_rows,
+    changes_shape,
+    pack_shapes,
+    turn_bands,
+    unpack_shapes,
+)
 from .layers import BLENDS, KINDS, ORDERED, Gains, Layer, check_layers
 
 # changes that are clearly visible
@@ -206,6 +214,7 @@ def _follow(scene: Gaussians, composed: Gaussians, layers: Sequence[Layer], blen
     if not others or all(gdf.anchors is None for gdf in edits.values()):
         return composed
     shapes = pack_shapes(composed)
+    bands = composed.shN.float().clone()
     before = pack_shapes(scene)
     pushed = torch.zeros(len(scene), dtype=torch.bool)
     for key in pushing:
@@ -222,10 +231,12 @@ def _follow(scene: Gaussians, composed: Gaussians, layers: Sequence[Layer], blen
         after = pack_shapes(_compose(scene, changing, blend))
         rows = gdf.region.members[-len(anchors) :]
         at = anchors.rows
-        shapes[rows] = carry_rows(shapes[rows], before[at], after[at], anchors.weights.double())
+        weights = anchors.weights.double()
+        shapes[rows] = carry_rows(shapes[rows], before[at], after[at], weights)
+        bands[rows] = turn_bands(bands[rows], *anchor_turns(before[at], after[at], weights))
     changed: dict[str, Any] = {
         name: new.to(getattr(scene, name).dtype)
-        for name, new in unpack_shapes(shapes).items()
+        for name, new in {**unpack_shapes(shapes), "shN": bands}.items()
         if not torch.equal(new, getattr(composed, name))
     }
     return replace(composed, **changed)

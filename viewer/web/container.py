@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from progdf.compose.follow import FOLLOWED, find_followers, state_scene
+from progdf.compose.follow import FOLLOWED, banded_followers, find_followers, state_scene
 from progdf.compose.reference import coverage
 from progdf.errors import ProgdfError
 from progdf.field.baked import AttributeBases, GradeForm
@@ -253,6 +253,7 @@ def _surface(
         "followers": arrays.add(table.astype(np.int32)),
         "weights": arrays.add(followers.weights.astype(np.float32)),
         "pushing": sorted(followers.pushing),
+        "banded": len(banded_followers(scene, gdfs, followers)) > 0,
     }
 
 

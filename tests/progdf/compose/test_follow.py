@@ -25,6 +25,7 @@ from progdf.gdf.anchors import Anchors, choose_anchors
 from progdf.gdf.file import UNSEEN_LOGIT, Gdf, anchor_added, load_gdf, save_gdf
 from progdf.quaternions import multiply_quats, rotate_vectors, turn_quats
 from progdf.region import from_mask, whole_scene
+from progdf.sh import rotation_change
 from progdf.tidy import Step, similarity, tidy
 from tests.helpers.draws import Draws
 from tests.helpers.edits import added_rows, bits, curved_field, edit_of, growing, painted, some_rows
@@ -198,6 +199,28 @@ def test_composer_follows_like_compose_and_reports_every_change(scene: Gaussians
         steps = (after - before)[:, :3].norm(dim=1)
         assert float(steps.max()) <= change.largest_move + 1e-5
     assert followed > 20
+
+
+def test_bands_of_grown_rows_turn_with_the_object() -> None:
+    scene = random_gaussians(COUNT, seed=5, sh_degree=3)
+    added = replace(opaque_rows(), shN=Draws(4).normal(DISCS, 15, 3))
+    empty = from_mask("none", torch.zeros(COUNT, dtype=torch.bool))
+    hat = tidy(scene, [Step("remove", empty)], "hat", added=added)
+    layers = [Layer(hat, 1.0), Layer(moved(scene), 1.0)]
+    turn = turn_quats(torch.tensor([TURN], dtype=torch.float64)).expand(DISCS, 4)
+    expected = added.shN.double() + rotation_change(added.shN.double(), turn)
+    both = compose_layers(scene, layers)
+    # a move is stored in 16 bits
+    torch.testing.assert_close(both.shN[COUNT:].double(), expected, atol=2e-3, rtol=0)
+    composer = Composer(scene, [hat, moved(scene)])
+    composer.update([Layer(hat, 1.0)])
+    assert torch.equal(composer.gaussians.shN[COUNT:], added.shN)
+    composer = Composer(scene, [layer.gdf for layer in layers])
+    change = composer.update(layers)
+    assert "shN" in change.attributes
+    torch.testing.assert_close(composer.gaussians.shN, both.shN, atol=1e-6, rtol=1e-6)
+    composer.update([layers[0], replace(layers[1], strength=0.0)])
+    assert torch.equal(composer.gaussians.shN[COUNT:], added.shN)
 
 
 def test_dragging_the_paint_needs_no_new_depth_order(scene: Gaussians) -> None:

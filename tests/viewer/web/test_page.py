@@ -164,7 +164,7 @@ def page_order(opened: Opened, scene: Gaussians) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("degree", [0, 1])
+@pytest.mark.parametrize("degree", [0, 1, 3])
 def test_page_computes_every_attribute_like_compose_for_every_rule(
     open_page: Any, tmp_path: Path, degree: int
 ) -> None:

@@ -63,7 +63,8 @@ export class Composer {
     this.before = {};
     this.after = {};
     const follows = header.surface || header.followers;
-    this.moving = new Set([...this.edits.flatMap((edit) => Object.keys(edit.attributes)), ...(follows ? FOLLOWED : [])]);
+    const followed = header.surface?.banded && header.sh ? [...FOLLOWED, "shN"] : FOLLOWED;
+    this.moving = new Set([...this.edits.flatMap((edit) => Object.keys(edit.attributes)), ...(follows ? followed : [])]);
     for (const name of this.moving) {
       for (const each of [name, PARTNERS[name]]) {
         if (!each || this.before[each]) continue;
@@ -76,12 +77,15 @@ export class Composer {
     const known = this.edits.map(() => 0);  // members of the previous segments
     let first = 0, most = 0;
     this.surface = header.surface
-      ? new Surface(header.surface, container, new Composer(container.within(header.surface))) : null;
+      ? new Surface(
+        header.surface, container, new Composer(container.within(header.surface)),
+        Math.sqrt(header.sh + 1) - 1, header.sphere[1],
+      ) : null;
     const following = Array.from({ length: this.surface?.count ?? 0 }, (_, f) => f);
     this.segments = header.segments.map(([rows, edits]) => {
       const followers = following.filter((f) => this.surface.row(f) >= first && this.surface.row(f) < first + rows);
       const names = [...this.moving].filter((name) =>
-        (followers.length && FOLLOWED.includes(name)) || edits.some((edit) => this.edits[edit].attributes[name]));
+        (followers.length && followed.includes(name)) || edits.some((edit) => this.edits[edit].attributes[name]));
       const segment = { first, rows, names, followers, members: {}, effects: [], maps: [] };
       for (const edit of edits) {
         segment.members[edit] = known[edit];

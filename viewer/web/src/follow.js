@@ -4,12 +4,20 @@ export const FOLLOWED = ["means", "log_scales", "quats", "logit_opacities"];
 const GEOMETRY = FOLLOWED.slice(0, 3), OPACITY = FOLLOWED.slice(3);
 const SIZES = { means: 3, log_scales: 3, quats: 4, logit_opacities: 1 };
 const ENTRY = 7;  // numbers per following row: row, edit, its own state, four states of anchors
+const C1 = 0.4886025119029199;
+const C2 = [1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396];
+const C3 = [
+  -0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154, -0.4570457994644658,
+  1.445305721320277, -0.5900435899266435,
+];
 const MIN_DRAWN_OPACITY = 1 / 255, MIN_OPACITY = 1e-30;
 
 export class Surface {
-  // `states`: composer of the rows that others follow.
-  constructor(record, container, states) {
+  // `states`: composer of the rows that others follow; `degree`: SH degree of the page; `inverse`: matrix from the
+  // colors in the directions of a page's header to SH functions.
+  constructor(record, container, states, degree, inverse) {
     this.states = states;
+    this.turnBands = record.banded && degree > 0 ? bandTurner(degree, inverse) : null;
     this.picks = record.picks.map((part) => container.stored(part));
     this.table = container.stored(record.followers);
     this.weights = container.real(record.weights);
@@ -50,7 +58,10 @@ export class Surface {
     for (const [names, follow] of [[GEOMETRY, carryGeometry], [OPACITY, carryOpacity]]) {
       const differs = (a, b) => names.some((name) => a[name].some((x, c) => x !== b[name][c]));
       const moves = used.some(({ old, now }) => differs(old, now));
-      if (moves && (own < 0 || differs(from, used[0].old))) follow(to, from, used);
+      if (moves && (own < 0 || differs(from, used[0].old))) {
+        const turn = follow(to, from, used);
+        if (turn && own < 0 && this.turnBands) this.turnBands(target.shN, row, turn);
+      }
       else for (const name of names) to[name].set((moves ? used[0].now : from)[name]);
     }
   }
@@ -64,6 +75,7 @@ function at(arrays, row) {
   }));
 }
 
+// Writes the geometry, and returns the turn as a unit quaternion.
 function carryGeometry(to, from, anchors) {
   const turn = [0, 0, 0, 0], pivot = [0, 0, 0], target = [0, 0, 0];
   let logScale = 0, first = null;
@@ -86,6 +98,46 @@ function carryGeometry(to, from, anchors) {
     to.means[c] = target[c] + scale * turned[c + 1];
     to.log_scales[c] = from.log_scales[c] + logScale;
   }
+  return q;
+}
+
+// Returns a function that turns the higher SH bands of a row of shN by a unit quaternion. The bands follow from the
+// colors that they show in directions that are turned back, see progdf/sh.py.
+function bandTurner(degree, inverse) {
+  const bands = (degree + 1) ** 2, count = inverse.length / bands, golden = Math.PI * (1 + Math.sqrt(5));
+  const directions = Array.from({ length: count }, (_, j) => {
+    const z = 1 - (2 * j + 1) / count, radius = Math.sqrt(1 - z * z), angle = golden * (j + 0.5);
+    return [0, radius * Math.cos(angle), radius * Math.sin(angle), z];
+  });
+  const width = 3 * (bands - 1), sums = new Float64Array(width), color = [0, 0, 0];
+  return (shN, row, q) => {
+    const own = shN.subarray(row * width, (row + 1) * width);
+    if (own.every((x) => x === 0)) return;
+    sums.fill(0);
+    directions.forEach((direction, j) => {
+      const [, x, y, z] = multiply(multiply(conjugate(q), direction), q);
+      const functions = higherFunctions(degree, x, y, z);
+      color.fill(0);
+      for (let k = 0, i = 0; k < bands - 1; k++) for (let c = 0; c < 3; c++, i++) color[c] += functions[k] * own[i];
+      for (let k = 1, i = 0; k < bands; k++) {
+        for (let c = 0; c < 3; c++, i++) sums[i] += inverse[k * count + j] * color[c];
+      }
+    });
+    own.set(sums);
+  };
+}
+
+// Returns the values of the SH functions of bands 1 to `degree`, as in progdf/sh.py.
+function higherFunctions(degree, x, y, z) {
+  const values = [-C1 * y, C1 * z, -C1 * x], xx = x * x, yy = y * y, zz = z * z;
+  if (degree > 1) values.push(C2[0] * x * y, C2[1] * y * z, C2[2] * (2 * zz - xx - yy), C2[3] * x * z, C2[4] * (xx - yy));
+  if (degree > 2) {
+    values.push(
+      C3[0] * y * (3 * xx - yy), C3[1] * x * y * z, C3[2] * y * (4 * zz - xx - yy), C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
+      C3[4] * x * (4 * zz - xx - yy), C3[5] * z * (xx - yy), C3[6] * x * (xx - 3 * yy),
+    );
+  }
+  return values;
 }
 
 function carryOpacity(to, from, anchors) {
