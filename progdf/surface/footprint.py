@@ -6,7 +6,7 @@ predicting left-out parts. Here one depth picture per camera is enough.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,13 +25,17 @@ from .models import (
     SurfaceModel,
     box_of,
     deviation,
+    divisions,
     fit_planes,
     fit_quadric,
     fit_spline,
+    linear_terms,
+    mean_distance,
 )
 
 _SAMPLES_PER_SIDE = 18  # samples along each side of the footprint's box
 _CENTER_PX = 4  # half the window around the pointer that must show a surface
+_EDGE_STEPS = 6  # reweightings of an edge
 _SPLINE_CELLS = 4  # cells along the longer side of the most complex model
 
 
@@ -64,7 +68,7 @@ def depth_picture(scene: Gaussians, camera: Camera) -> DepthPicture:
 
 
 def fit_footprint(picture: DepthPicture, column: float, row: float, radius_px: float) -> Footprint | None:
-    """Return the surface under a disc: a plane, a quadric or a B-spline, the first that fits.
+    """Return the surface under a disc: a plane; a quadric or an edge; or a B-spline. The first that fits.
 
     A model fits if the mean distance of the samples is at most the thickness of the surface.
 
@@ -117,16 +121,55 @@ def _mean_plane(samples: Samples) -> Array:
 
 def _simplest_model(samples: Samples, plane: Planes, thickness_px: float) -> tuple[SurfaceModel, float]:
     """Return the first model that fits, and the robust deviation of the samples from it in pixels."""
-    model: SurfaceModel = plane
-    makers: tuple[Callable[[], SurfaceModel], ...] = (
-        lambda: fit_quadric(samples),
-        lambda: fit_spline(samples, _SPLINE_CELLS, box_of(samples)),
-    )
-    for make in makers:
-        if float(np.abs(samples.residuals(model)).mean()) <= thickness_px:
-            break
-        model = make()
+    models: list[SurfaceModel] = [plane]
+    if mean_distance(samples, plane) > thickness_px:
+        models = [fit_quadric(samples), fit_edge(samples)]
+    model = min(models, key=lambda tried: mean_distance(samples, tried))
+    if mean_distance(samples, model) > thickness_px:
+        model = fit_spline(samples, _SPLINE_CELLS, box_of(samples))
     return model, deviation(samples.residuals(model))
+
+
+def fit_edge(samples: Samples) -> Planes:
+    """Fit two planes that meet in a sharp convex edge.
+
+    `fit_planes` is the plain version. Here division, planes and weights change together in each step.
+    """
+    best = fit_planes(samples)
+    lowest = math.inf
+    unit = samples.focal / samples.inverse
+    terms = linear_terms(samples.x, samples.y) * unit[:, None]
+    wanted = samples.inverse * unit
+    for division in divisions(samples, 2):
+        planes = _descend_to_edge(samples, terms, wanted, division)
+        if planes is not None and mean_distance(samples, planes) < lowest:
+            best = planes
+            lowest = mean_distance(samples, planes)
+    return best
+
+
+def _descend_to_edge(samples: Samples, terms: Array, wanted: Array, division: Parts) -> Planes | None:
+    """Return the edge that a division of the samples leads to; None if one side loses its samples."""
+    planes = None
+    weights = np.ones(len(samples))
+    for _ in range(_EDGE_STEPS):
+        sides = [division == side for side in (0, 1)]
+        if min(int(side.sum()) for side in sides) < MIN_SAMPLES:
+            return None
+        planes = Planes(np.array([_weighted_plane(terms[s], wanted[s], weights[s]) for s in sides]))
+        residuals = samples.residuals(planes)
+        spread = max(deviation(residuals), 1e-3)
+        weights = 1.0 / (1.0 + (residuals / (2.0 * spread)) ** 2)
+        division = planes.visible_plane(samples.x, samples.y)
+    return planes
+
+
+def _weighted_plane(terms: Array, wanted: Array, weights: Array) -> Array:
+    """Return the coefficients of weighted least squares. [S,3], [S], [S] -> [3]"""
+    left = terms.T * weights
+    normal = left @ terms
+    normal[np.diag_indices(3)] += 1e-10 * np.trace(normal)
+    return np.asarray(np.linalg.solve(normal, left @ wanted), np.float64)
 
 
 def _nearest_depth(picture: DepthPicture, column: float, row: float) -> float | None:

@@ -278,7 +278,8 @@ def _robust(
     return coefficients
 
 
-def _linear_terms(x: Array, y: Array) -> Array:
+def linear_terms(x: Array, y: Array) -> Array:
+    """Return 1, x and y of samples. [S,3]"""
     return np.stack([np.ones_like(x), x, y], axis=1)
 
 
@@ -288,23 +289,23 @@ def _quadratic_terms(x: Array, y: Array) -> Array:
 
 def fit_planes(samples: Samples, count: int = 1, is_convex: bool = True) -> Planes:
     """Fit planes that meet in edges, from several first divisions of the samples."""
-    first = Planes(_robust(_linear_terms(samples.x, samples.y), samples)[None])
+    first = Planes(_robust(linear_terms(samples.x, samples.y), samples)[None])
     if count == 1:
         return first
     best = first
     lowest = math.inf
-    for division in _divisions(samples, count):
+    for division in divisions(samples, count):
         found = _fit_divided(samples, division, count, is_convex)
         if found is None:
             continue
-        error = _mean_distance(samples, found)
+        error = mean_distance(samples, found)
         if error < lowest:
             best = found
             lowest = error
     return _round_edges(samples, best)
 
 
-def _mean_distance(samples: Samples, model: SurfaceModel) -> float:
+def mean_distance(samples: Samples, model: SurfaceModel) -> float:
     """Return the mean distance of samples from a model, in pixels."""
     return float(np.abs(samples.residuals(model)).mean())
 
@@ -314,10 +315,10 @@ def _round_edges(samples: Samples, sharp: Planes) -> Planes:
     values = sharp.values(samples.x, samples.y)
     spread = float((values.max(axis=0) - values.min(axis=0)).std())
     best = sharp
-    lowest = _mean_distance(samples, sharp)
+    lowest = mean_distance(samples, sharp)
     for share in _ROUNDINGS:
         found = _fit_rounded(samples, replace(sharp, rounding=share * spread))
-        error = _mean_distance(samples, found)
+        error = mean_distance(samples, found)
         if error < lowest:
             best = found
             lowest = error
@@ -327,7 +328,7 @@ def _round_edges(samples: Samples, sharp: Planes) -> Planes:
 def _fit_rounded(samples: Samples, start: Planes) -> Planes:
     """Fit planes with rounded edges by Gauss-Newton steps."""
     planes = start
-    terms = _linear_terms(samples.x, samples.y)
+    terms = linear_terms(samples.x, samples.y)
     for _ in range(_ROUNDING_STEPS):
         shares = planes.shares(samples.x, samples.y)
         jacobian = (shares.T[:, :, None] * terms[:, None, :]).reshape(len(samples), -1)
@@ -337,7 +338,7 @@ def _fit_rounded(samples: Samples, start: Planes) -> Planes:
     return planes
 
 
-def _divisions(samples: Samples, count: int) -> Iterator[Parts]:
+def divisions(samples: Samples, count: int) -> Iterator[Parts]:
     """Yield divisions of the samples into parts: stripes or sectors in several directions. [S] each"""
     x = samples.x - np.median(samples.x)
     y = samples.y - np.median(samples.y)
@@ -359,7 +360,7 @@ def _fit_divided(samples: Samples, division: Parts, count: int, is_convex: bool)
         parts = [samples.select(division == k) for k in range(count)]
         if min(len(part) for part in parts) < MIN_SAMPLES:
             return None
-        planes = Planes(np.array([_robust(_linear_terms(p.x, p.y), p) for p in parts]), is_convex)
+        planes = Planes(np.array([_robust(linear_terms(p.x, p.y), p) for p in parts]), is_convex)
         visible = planes.visible_plane(samples.x, samples.y)
         if np.array_equal(visible, division):
             break

@@ -9,8 +9,9 @@ The trainer is another program (`progdf train`). This module knows only its comm
     SCENE.edits/NAME.region.npy    the selection that it edits
     SCENE.edits/NAME.draft.gdf     a grade: the layer's file until the edit is packed
     SCENE.edits/NAME.packed.gdf    the packed edit: the layer's file until the edit is evaluated
+    SCENE.edits/NAME.kept.gdf      the newest recording of a stopped run that was kept as a layer
 
-The last two stay, because a session may refer to them.
+The last three stay, because a session may refer to them.
 """
 
 from __future__ import annotations
@@ -45,6 +46,7 @@ LOG = ".train.log"
 WINDOW_LOCK = ".train.lock"
 DRAFT = ".draft.gdf"
 PACKED = ".packed.gdf"
+KEPT = ".kept.gdf"
 
 
 class _Paint(msgspec.Struct):
@@ -101,6 +103,16 @@ class EditOrder:
     def packed_edit(self) -> Path:
         """File of the packed edit, while it is evaluated; may be absent."""
         return self._beside(PACKED)
+
+    @property
+    def kept_edit(self) -> Path:
+        """File of the recording that was kept as a layer; may be absent."""
+        return self._beside(KEPT)
+
+    @property
+    def drafts(self) -> tuple[Path, ...]:
+        """Files of layers that the trained edit replaces; each may be absent."""
+        return self.draft, self.packed_edit, self.kept_edit
 
     @property
     def log(self) -> Path:
@@ -251,7 +263,7 @@ def free_run(folder: Path, name: str) -> Path:
     """Return a free folder for a run of this name: NAME, or NAME-2 if something has that name."""
 
     def is_taken(run: Path) -> bool:
-        return any(run.with_name(run.name + suffix).exists() for suffix in ("", ORDER, DRAFT, PACKED))
+        return any(run.with_name(run.name + suffix).exists() for suffix in ("", ORDER, DRAFT, PACKED, KEPT))
 
     return free_path(folder, name, is_taken=is_taken)
 
@@ -266,7 +278,7 @@ def free_path(
 def finished_edit(draft: Path) -> Path | None:
     """Return the edit trained from a draft after a session was saved with the draft; None if there is
     none."""
-    name = draft.name.removesuffix(DRAFT).removesuffix(PACKED)
+    name = draft.name.removesuffix(DRAFT).removesuffix(PACKED).removesuffix(KEPT)
     result = draft.with_name(name) / f"{name}.gdf"
     return result if name != draft.name and os.path.isfile(result) else None
 

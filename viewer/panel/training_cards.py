@@ -167,6 +167,8 @@ def _bar(share: float, color: Rgba, ui: UiContext) -> None:
 def _foot(job: JobCard, right: float, menu: bool, ui: UiContext) -> list[str]:
     """Draw the current step, or the error, and the buttons at the right."""
     buttons = list(_BUTTONS.get((job.status, bool(job.training)), ()))
+    if job.keepable:
+        buttons.insert(0, _KEEP)
     if menu:
         buttons.append((Icon.MENU, _MENU, "Log, discard (right-click)"))
     with imgui_ctx.push_font(None, SMALL_PX):
@@ -214,6 +216,7 @@ def _status_text(job: JobCard) -> str:
 
 
 _STOP_HELP = "Stop; the run can be resumed later"
+_KEEP = ("Keep as it is", "keep_run", "Make a layer of the last recording; Resume can still finish it")
 _CANCEL = ("Cancel", "stop_run", "Remove it from the queue")
 _CLOSE = ("Close", "close_run", "Remove the card; files are kept")
 _BUTTONS = {

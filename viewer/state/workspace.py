@@ -121,6 +121,7 @@ class JobCard:
     seconds_left: float | None = None  # None before there is an estimate
     error: str = ""  # one line about a failure
     warning: str = ""  # one line about a poor result
+    keepable: bool = False  # its newest recording can become a layer
     elsewhere: str = ""  # name of its scene while another one is open
 
 

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from progdf.surface.find import find_surface
-from progdf.surface.footprint import DepthPicture, depth_picture, fit_footprint
+from progdf.surface.footprint import DepthPicture, depth_picture, fit_edge, fit_footprint
+from progdf.surface.models import fit_planes, mean_distance
+from tests.progdf.surface.test_surface import edge, samples
 from tests.trainer.painted_wall import CAMERA, SIDE, wall
 
 COLUMNS, ROWS = np.meshgrid(np.arange(SIDE) + 0.5, np.arange(SIDE) + 0.5)
@@ -41,6 +43,15 @@ def test_direction_of_an_edge_lies_between_its_sides() -> None:
     found = fit_footprint(picture_of(np.minimum(0.4 + 0.4 * X, 0.4 - 0.4 * X)), 64.0, 64.0, 30.0)
     assert found is not None
     assert abs(float(found.normal @ CAMERA.viewmat[0, :3].double().numpy())) < 0.05
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_fast_edge_fits_like_the_plain_one(seed: int) -> None:
+    noisy = samples(edge, seed)
+    fast = mean_distance(noisy, fit_edge(noisy))
+    plain = mean_distance(noisy, fit_planes(noisy, 2))
+    assert fast == pytest.approx(plain, rel=0.02)
+    assert fast < 0.6 * mean_distance(noisy, fit_planes(noisy)), "one plane does not fit"
 
 
 def test_place_without_a_surface_has_no_footprint() -> None:

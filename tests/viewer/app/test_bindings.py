@@ -50,7 +50,7 @@ INTERNAL = {
     *("train", "paint_over", "stop_run", "resume_run", "ask_discard", "discard_run", "close_run", "run_log"),
     *("show_file", "copy_path", "deliver", "stop_and_quit", "drop_and_quit", "rebind", "rebind_from"),
     *("replace_by", "place", "keep_placed", "put_back", "lay_decal", "save_region", "rename_region"),
-    *("press_layer", "master", "rename_group", "restore", "forget", "name_snapshot"),
+    *("press_layer", "master", "rename_group", "restore", "forget", "name_snapshot", "keep_run"),
     *("move_snapshot", "choose_snapshot", "region", "show_region", "forget_region"),
     *("select_invert", "choose_keys", "move_keys", "clone_keys"),
     *("seek", "length", "fps", "go_to", "example", "forget_file", "use_view", "keep_view"),

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from imgui_bundle import imgui
 from PIL import Image
 
@@ -25,6 +26,7 @@ from progdf.scene.regions import parse_region
 from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.ui_rig import bear, first_view
+from trainer.store.run_folder import RunFolder
 from viewer.app import app as application
 from viewer.app.parts.preview import PAINT_TEXT
 from viewer.camera.view_camera import first_camera
@@ -342,6 +344,55 @@ def test_training_is_discarded_only_after_a_question(window: application.App) ->
     turn(window)
     assert window.main_view.work.jobs == ()
     assert not job.task.out.exists()
+
+
+def record(out: Path, count: int, scene_size: int) -> torch.Tensor:
+    """Save a run of two members with its recordings; return the offsets of the last one. [2,14]"""
+    state = RunFolder(out).state
+    state.path.mkdir(parents=True)
+    (state.path / "run.json").touch()
+    members = torch.tensor([1, 5])
+    score = torch.zeros(scene_size).index_fill(0, members, 1.0)
+    state.save("region", {"members": members, "score": score}, {"name": "blue"})
+    offsets = torch.zeros(2, 14)
+    offsets[:, -3:] = 0.25
+    for index in range(count):
+        state.save("recordings", {"offsets": (offsets * (index + 1)).half()}, {}, index)
+    return offsets * count
+
+
+def test_stopped_training_can_be_kept_as_it_is(window: application.App) -> None:
+    request(window, Plain("train"))
+    (job,) = window.parts.jobs.queue.jobs
+    offsets = record(job.task.out, 2, len(window.documents.get().original))
+    assert not window.main_view.work.jobs[0].keepable, "it still runs"
+    request(window, OnItem("stop_run", job.number))
+    turn(window)
+    assert window.main_view.work.jobs[0].keepable
+    request(window, OnItem("keep_run", job.number))
+    (layer,) = window.main_view.work.view.layers
+    assert (layer.name, layer.strength) == ("blue", 1.0)
+    document = window.documents.get()
+    assert document.gdf_paths == (job.task.kept_edit,)
+    assert torch.allclose(document.edits[0].field.offsets(1.0), offsets, atol=2e-3)
+    assert not window.main_view.work.jobs[0].keepable, "it is a layer"
+    request(window, OnItem("discard_run", job.number))
+    assert job.task.kept_edit.is_file()
+    press(window, "Ctrl+Z")
+    assert window.main_view.work.view.layers == ()
+
+
+def test_stopped_training_without_recordings_has_nothing_to_keep(window: application.App) -> None:
+    request(window, Plain("train"))
+    (job,) = window.parts.jobs.queue.jobs
+    record(job.task.out, 0, 10)
+    request(window, OnItem("stop_run", job.number))
+    turn(window)
+    assert not window.main_view.work.jobs[0].keepable
+    request(window, OnItem("keep_run", job.number))
+    message = window.main_view.work.message
+    assert message is not None
+    assert message.text == "blue has recorded no usable edit yet; resume it"
 
 
 def test_run_locked_by_another_window_is_left_alone(window: application.App) -> None:

@@ -14,6 +14,8 @@ from imgui_bundle import imgui
 from numpy.typing import NDArray
 
 from progdf.camera import Camera
+from progdf.errors import ProgdfError
+from progdf.gdf.file import save_gdf
 from progdf.io.atomic import read_file, write_file
 from progdf.terminal import format_duration
 from viewer.app.decal import DecalPlace
@@ -45,13 +47,21 @@ def is_newer(file: Path, other: Path) -> bool:
         return False
 
 
+def is_keepable(order: EditOrder) -> bool:
+    """Return whether a run has a recording that is not a layer yet."""
+    recording = order.newest_recording()
+    return recording is not None and not is_newer(order.kept_edit, recording)
+
+
 def job_card(job: QueuedTask) -> JobCard:
     """Return a job as the panel shows it."""
     task = job.task
     training = ""
     starting = "Starting"
+    keepable = False
     if isinstance(task, EditOrder):
         training = f"{task.editor} on {task.region}"
+        keepable = job.status == "stopped" and is_keepable(task)
         if task.region == CHANGED:
             starting = "Finding the changes"
     return JobCard(
@@ -66,6 +76,7 @@ def job_card(job: QueuedTask) -> JobCard:
         seconds_left=job.seconds_left,
         error=job.error,
         warning=job.warning,
+        keepable=keepable,
     )
 
 
@@ -124,6 +135,7 @@ class JobActions:
             "lay_decal": self._lay_decal,
             "stop_run": queue.stop,
             "resume_run": queue.resume,
+            "keep_run": self._keep_run,
             "ask_discard": self._ask_discard,
             "discard_run": queue.discard,
             "close_run": queue.dismiss,
@@ -285,6 +297,25 @@ class JobActions:
         else:
             self.queue.discard(job.number)
 
+    def _keep_run(self, number: int) -> None:
+        """Make a layer of the newest recording of a stopped run. A resumed run replaces it by its result.
+
+        Raises:
+            ProgdfError: no recording is readable, or the layer's file cannot be written.
+        """
+        order = self.queue.job(number).task
+        if not isinstance(order, EditOrder):
+            return
+        recording = order.newest_recording()
+        edit = None
+        if recording is not None:
+            edit = order.recorded_edit(recording, self._documents.get().original)
+        if edit is None:
+            raise ProgdfError(f"{order.name} has recorded no usable edit yet; resume it")
+        save_gdf(order.kept_edit, edit)
+        if not any(self._edits.finish(path, order.kept_edit) for path in order.drafts):
+            self._edits.add(order.kept_edit, order.name)
+
     def _end(self, job: QueuedTask) -> None:
         """Handle the end of a job: add or replace the layer, or show a message."""
         task = job.task
@@ -302,7 +333,7 @@ class JobActions:
             return
         if job.status == "done" and self._scene == task.scene:  # the result replaces the recordings
             self._live = None
-            if not any(self._edits.finish(path, task.result) for path in (task.draft, task.packed_edit)):
+            if not any(self._edits.finish(path, task.result) for path in task.drafts):
                 self._open_file(task.result)
             summary = "" if job.warning else task.summary()  # its card shows the warning
             self._messages.show(f"{task.name} is ready. {summary}" if summary else f"{task.name} is ready")
@@ -339,7 +370,7 @@ class JobActions:
             return
         live = self._store.get().transient.live
         packed = order.out / "draft.gdf"
-        layers = {order.draft, order.packed_edit}.intersection(self._documents.get().gdf_paths)
+        layers = set(order.drafts).intersection(self._documents.get().gdf_paths)
         if order.draft in layers and is_newer(packed, order.draft):
             attempt(self._messages, partial(self._take_packed, order, packed))
         if layers or (live and live != self._live_layers):
@@ -363,7 +394,9 @@ class JobActions:
     def _publish(self) -> None:
         """Publish the jobs of this scene and the busy jobs of others to the panel."""
         jobs = tuple(
-            replace(job_card(job), elsewhere="" if job.task.scene == self._scene else job.task.scene.name)
+            job_card(job)
+            if job.task.scene == self._scene
+            else replace(job_card(job), elsewhere=job.task.scene.name, keepable=False)
             for job in self.queue.jobs
             if job.task.scene == self._scene or job.busy
         )
