@@ -113,6 +113,34 @@ def fit_footprint(picture: DepthPicture, column: float, row: float, radius_px: f
     return Footprint(model, center, towards @ viewmat[:3, :3], 1.0 / inverse, limit_px)
 
 
+def near_surface(picture: DepthPicture, column: float, row: float, size_px: float) -> Mask:
+    """Return the pixels of a picture that a decal may cover: at most its size away from its tangent plane.
+
+    What is farther behind or in front is another thing.
+
+    Args:
+        picture: depth picture
+        column, row: center of the decal, pixels
+        size_px: its longer side, pixels
+
+    Returns:
+        The opaque ones of these pixels; all opaque pixels if the center shows no surface. [H,W]
+    """
+    found = fit_footprint(picture, column, row, 0.5 * size_px)
+    if found is None:
+        return picture.opaque
+    K = picture.camera.K.double().numpy()
+    viewmat = picture.camera.viewmat.double().numpy()
+    height, width = picture.depth.shape
+    x = (np.arange(width) + 0.5 - K[0, 2]) / K[0, 0]
+    y = (np.arange(height)[:, None] + 0.5 - K[1, 2]) / K[1, 1]
+    normal = viewmat[:3, :3] @ found.normal
+    center = viewmat[:3, :3] @ found.center + viewmat[:3, 3]
+    apart = picture.depth * (normal[0] * x + normal[1] * y + normal[2]) - normal @ center
+    size = size_px * found.depth / K[0, 0]
+    return np.asarray(picture.opaque & (np.abs(apart) <= size))
+
+
 def _mean_plane(samples: Samples) -> Array:
     """Return the least-squares plane a + b x + c y, to which all sides of an edge contribute. [3]"""
     terms = np.stack([np.ones(len(samples)), samples.x, samples.y], axis=1)

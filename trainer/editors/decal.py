@@ -19,6 +19,7 @@ from progdf.io.images import open_picture
 from progdf.rasterize.engines import render_depth
 from progdf.scene.regions import read_numbers
 from progdf.surface.find import OPAQUE, PaintSurface, find_surface
+from progdf.surface.footprint import depth_picture, near_surface
 from trainer.options import EditKind, EditorOptions
 from trainer.paint.discs import MIN_ALPHA, PaintedView, composite_over, project_paint, sample_image
 from trainer.views.view import BACKGROUND, View, make_view, with_near_plane
@@ -151,7 +152,8 @@ class DecalEditor:
 def decal(given: EditorInput) -> DecalEditor:
     """Return the editor of `decal:LOGO.png` with `--at` and `--camera`.
 
-    The decal is visible only on pixels of the camera's view where the region is opaque.
+    The decal is visible only on pixels of the camera's view where the region is opaque and at most the
+    decal's size away from the surface under its center.
 
     Raises:
         ProgdfError: the picture, its placement or its camera is invalid, or the decal does not lie on the
@@ -173,7 +175,8 @@ def decal(given: EditorInput) -> DecalEditor:
     drawn = draw_decal(Path(given.what).expanduser(), place, camera)
     seen = render_depth(scene, camera)
     alpha = seen.alpha
-    drawn = drawn * ((alpha > OPAQUE) & (view.mask > 0.5 * alpha))[..., None]
+    near = near_surface(depth_picture(scene, camera), place.x, place.y, place.size)
+    drawn = drawn * ((alpha > OPAQUE) & (view.mask > 0.5 * alpha) & torch.from_numpy(near))[..., None]
     if not bool((drawn[..., 3] > MIN_ALPHA).any()):
         raise ProgdfError(
             f"{given.what} does not lie on an opaque part of the region '{region.name}'; "

@@ -140,7 +140,7 @@ def train_decal(editor: PastingEditor, scene: Gaussians, name: str, log: RunLog 
         for image, look in zip(images, views, strict=True)
     ]
     middle = TURNS.index(0)
-    figures = {
+    figures: dict[str, Any] = {
         "pixels": sum(int(paint.mask.sum()) for paint in paints),
         "added": 0 if gdf.added is None else len(gdf.added),
         "moved": len(gdf.region),

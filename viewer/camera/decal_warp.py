@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from progdf.camera import Camera
-from progdf.surface.find import PaintSurface
+from progdf.surface.find import MIN_COSINE, PaintSurface
 from progdf.surface.footprint import DepthPicture, Footprint
 
 from .view_camera import Vec3
@@ -62,6 +62,7 @@ class DecalMesh:
 
     points: Floats  # world units, from the upper left corner. [R,C,3]
     shown: Mask  # points on the surface. [R,C]
+    joined: Mask  # cells that cross no step between two surfaces. [R-1,C-1]
 
 
 def upright_on(normal: Vec3, up: Vec3, view_up: Vec3, level: bool) -> Vec3:
@@ -164,7 +165,8 @@ def warp_on_footprint(
     share = np.where(found, before / np.where(found, before - after, 1.0), 0.0)
     step = np.where(found, steps[first[0]] + share * (steps[1] - steps[0]), 1.0)
     points = eye + step[..., None] * (flat - eye)
-    return DecalMesh(points, found & _is_surface(points, picture, footprint.limit_px))
+    shown = found & _is_surface(points, picture, footprint.limit_px)
+    return DecalMesh(points, shown, _cells_of_one_surface(points, flat))
 
 
 def _is_surface(points: Floats, picture: DepthPicture, limit_px: float) -> Mask:
@@ -180,8 +182,17 @@ def _is_surface(points: Floats, picture: DepthPicture, limit_px: float) -> Mask:
     return np.asarray(outside | (picture.opaque[at] & near))
 
 
-def warp_on_surface(frame: DecalFrame, shape: tuple[int, int], surface: PaintSurface) -> DecalMesh:
-    """Project a decal onto the surface that training finds from the decal's camera."""
+def warp_on_surface(
+    frame: DecalFrame, shape: tuple[int, int], surface: PaintSurface, near: Mask
+) -> DecalMesh:
+    """Project a decal onto the surface that training finds from the decal's camera.
+
+    Args:
+        frame: frame of the decal
+        shape: width and height of its picture
+        surface: the surface
+        near: pixels of the camera that the decal may cover, see `near_surface`. [H,W]
+    """
     flat = plane_points(frame, shape)
     pixels, _ = project(flat, surface.camera)
     height, width = surface.depth.shape
@@ -190,7 +201,17 @@ def warp_on_surface(frame: DecalFrame, shape: tuple[int, int], surface: PaintSur
     eye = np.array(frame.center) + frame.distance * np.array(frame.normal)
     share = surface.depth[rows, columns] / frame.distance
     points = eye + share[..., None] * (flat - eye)
-    return DecalMesh(points, surface.opaque[rows, columns])
+    return DecalMesh(points, near[rows, columns], _cells_of_one_surface(points, flat))
+
+
+def _cells_of_one_surface(points: Floats, flat: Floats) -> Mask:
+    """Return the cells no steeper than the steepest disc. [R,C,3] each -> [R-1,C-1]"""
+    stretch = [
+        np.linalg.norm(np.diff(points, axis=axis), axis=2) / np.linalg.norm(np.diff(flat, axis=axis), axis=2)
+        for axis in (0, 1)
+    ]
+    down, across = (sides <= 1.0 / MIN_COSINE for sides in stretch)
+    return np.asarray(down[:, 1:] & down[:, :-1] & across[1:] & across[:-1])
 
 
 def visible_cells(mesh: DecalMesh, camera: Camera) -> tuple[Floats, Mask]:
@@ -201,7 +222,7 @@ def visible_cells(mesh: DecalMesh, camera: Camera) -> tuple[Floats, Mask]:
     across = pixels[:-1, 1:] - pixels[:-1, :-1]
     down = pixels[1:, :-1] - pixels[:-1, :-1]
     faces = across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0] > 0
-    return pixels, whole & faces
+    return pixels, whole & faces & mesh.joined
 
 
 def painted_pixels(frame: DecalFrame, camera: Camera, opaque: Mask) -> Mask:

@@ -11,7 +11,7 @@ from typing import Generic, TypeVar
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.surface.find import PaintSurface, find_surface
-from progdf.surface.footprint import DepthPicture, depth_picture
+from progdf.surface.footprint import DepthPicture, depth_picture, near_surface
 from progdf.threads import StoppedError, stopped_by
 from viewer.camera.decal_warp import (
     DecalFrame,
@@ -114,7 +114,7 @@ class DecalSurfaces:
         return self._depth.finish(key, make) if at_once else self._depth.get(key, make)
 
     def laid(
-        self, scene: Gaussians, frame: DecalFrame, shape: tuple[int, int], opaque: Mask, near: float
+        self, scene: Gaussians, frame: DecalFrame, shape: tuple[int, int], opaque: Mask, near_plane: float
     ) -> LaidDecal | None:
         """Return a decal on the surface that training finds; None while it is computed.
 
@@ -123,13 +123,15 @@ class DecalSurfaces:
             frame: frame of the decal
             shape: width and height of its picture
             opaque: pixels of its picture that are not transparent. [h,w]
-            near: near plane, world units
+            near_plane: near plane of the view, world units
         """
 
         def make() -> LaidDecal:
-            camera = replace(decal_camera(frame, shape)[0], near=near)
-            surface = find_surface(scene, camera, painted_pixels(frame, camera, opaque))
-            return LaidDecal(surface, warp_on_surface(frame, shape, surface))
+            camera = replace(decal_camera(frame, shape)[0], near=near_plane)
+            center = (camera.width / 2, camera.height / 2)
+            near = near_surface(depth_picture(scene, camera), *center, frame.size_px)
+            surface = find_surface(scene, camera, near & painted_pixels(frame, camera, opaque))
+            return LaidDecal(surface, warp_on_surface(frame, shape, surface, near))
 
         return self._laid.get(frame, make)
 

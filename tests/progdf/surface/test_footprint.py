@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from progdf.surface.find import find_surface
-from progdf.surface.footprint import DepthPicture, depth_picture, fit_edge, fit_footprint
+from progdf.surface.footprint import DepthPicture, depth_picture, fit_edge, fit_footprint, near_surface
 from progdf.surface.models import fit_planes, mean_distance
 from tests.progdf.surface.test_surface import edge, samples
 from tests.trainer.painted_wall import CAMERA, SIDE, wall
@@ -52,6 +52,19 @@ def test_fast_edge_fits_like_the_plain_one(seed: int) -> None:
     plain = mean_distance(noisy, fit_planes(noisy, 2))
     assert fast == pytest.approx(plain, rel=0.02)
     assert fast < 0.6 * mean_distance(noisy, fit_planes(noisy)), "one plane does not fit"
+
+
+def test_decal_covers_only_what_is_near_its_plane() -> None:
+    inverse = np.where(COLUMNS < 80, 0.4 + 0.1 * Y, 0.2)
+    near = near_surface(picture_of(inverse), 60.0, 64.0, 30.0)
+    assert near[:, :80].all()
+    assert not near[:, 80:].any(), "another thing twice as far away"
+    assert near_surface(picture_of(inverse), -5.0, 64.0, 30.0).all(), "the center shows no surface"
+
+
+def test_grazing_plane_is_covered_as_a_whole() -> None:
+    steep = 0.4 - 0.7 * Y
+    assert near_surface(picture_of(steep), 64.0, 64.0, 60.0)[20:, :].all()
 
 
 def test_place_without_a_surface_has_no_footprint() -> None:

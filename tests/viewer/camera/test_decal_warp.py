@@ -12,6 +12,7 @@ import torch
 from PIL import Image
 
 from progdf.camera import Camera, intrinsics, look_at
+from progdf.surface.find import PaintSurface
 from progdf.surface.footprint import DepthPicture, fit_footprint
 from trainer.editors.decal import draw_decal, parse_place
 from viewer.camera.decal_warp import (
@@ -25,6 +26,7 @@ from viewer.camera.decal_warp import (
     vec3,
     visible_cells,
     warp_on_footprint,
+    warp_on_surface,
 )
 
 SIDE = 200
@@ -95,6 +97,22 @@ def test_training_draws_the_decal_where_its_ghost_is(tmp_path: Path) -> None:
     for x, y in places:
         assert np.hypot(columns + 0.5 - x, rows + 0.5 - y).min() < 1.5, "corners of the visible part"
     assert painted.sum() == pytest.approx(0.25 * 2 * 60**2 / 4, rel=0.1)
+
+
+def test_cells_across_a_step_are_not_drawn() -> None:
+    frame, _ = laid()
+    camera, _ = decal_camera(frame, SHAPE)
+    depth = np.full((camera.height, camera.width), frame.distance)
+    depth[:, camera.width // 2 :] += 0.5
+    opaque = np.ones(depth.shape, bool)
+    surface = PaintSurface(
+        camera, depth, np.zeros((2, *depth.shape)), opaque, opaque.astype(int), opaque, 0.0
+    )
+    stepped = warp_on_surface(frame, SHAPE, surface, opaque)
+    assert stepped.shown.all()
+    assert (~stepped.joined).any(axis=0).sum() == 1, "one column of cells crosses the step"
+    half = warp_on_surface(frame, SHAPE, surface, depth < frame.distance + 0.25)
+    assert half.shown.mean() == pytest.approx(0.5, abs=0.05)
 
 
 def test_cells_that_face_away_are_not_drawn() -> None:
