@@ -131,8 +131,11 @@ def tidy(
     gdf = Gdf(name, region, field, fingerprint(scene), instruction, added=added)
     added_count = 0 if added is None else len(added)
     if fill_count:
-        return anchor_added(gdf, scene, leaves_paint, free=added_count - fill_count)
-    return replace(gdf, anchors=free_anchors(added_count, pushes=True)) if leaves_paint else gdf
+        gdf = anchor_added(gdf, scene, free=added_count - fill_count)
+    if not leaves_paint:
+        return gdf
+    anchors = free_anchors(added_count) if gdf.anchors is None else gdf.anchors
+    return replace(gdf, anchors=replace(anchors, leaves_paint=True))
 
 
 def _opacity_course(

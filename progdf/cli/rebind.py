@@ -181,7 +181,11 @@ def rebind_edit(gdf: Gdf, a: Gaussians, b: Gaussians, match: Match) -> Gdf:
     )
     if gdf.anchors is None:
         return rebound
-    return anchor_added(rebound, b, gdf.anchors.pushes, gdf.anchors.free)
+    found = anchor_added(rebound, b, gdf.anchors.pushes, gdf.anchors.free)
+    if found.anchors is None:
+        return found
+    kept = replace(found.anchors, rim=gdf.anchors.rim, leaves_paint=gdf.anchors.leaves_paint)
+    return replace(found, anchors=kept)
 
 
 def _assign_rows(candidates: Rows, costs: NDArray[np.float64], count: int) -> Rows:

@@ -15,6 +15,20 @@ Rows = NDArray[np.int64]
 _BLOCK_MEMBERS = 512  # members whose offsets are summed at once
 
 
+@kernel(cache=True)
+def keep_larger(largest: Floats, push: Floats) -> None:
+    """Replace rows by those of `push` that are at least as long. [U,c] each"""
+    for i in range(len(largest)):
+        old = np.float32(0.0)
+        new = np.float32(0.0)
+        for c in range(largest.shape[1]):
+            old += largest[i, c] * largest[i, c]
+            new += push[i, c] * push[i, c]
+        if new >= old:
+            for c in range(largest.shape[1]):
+                largest[i, c] = push[i, c]
+
+
 @kernel(cache=True, allocates=True)
 def add_offsets(
     total: Floats,

@@ -8,8 +8,8 @@ one attribute.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,28 +23,23 @@ from progdf.gdf.file import Gdf
 from progdf.threads import run_chunks
 
 from .added import extend
-from .compose_kernel import add_offsets, write_rows
-from .follow import (
-    FOLLOWED,
-    Followers,
-    banded_followers,
-    changes_shape,
-    find_followers,
-    mean_quats,
-    pack_shapes,
-    state_scene,
-    turn_bands,
+from .compose_kernel import add_offsets, keep_larger, write_rows
+from .follow import FOLLOWED, changes_shape, find_followers
+from .follow_kernel import Shapes
+from .layers import (
+    KINDS,
+    ORDERED,
+    Change,
+    Effects,
+    Layer,
+    changed_edits,
+    check_numbers,
+    check_weights,
+    effects_of,
 )
-from .follow_kernel import (
-    Shapes,
-    carry_fast,
-    gather_shapes,
-    measure_motions,
-    release_centers,
-    rest_motions,
-)
-from .layers import KINDS, ORDERED, Effects, Layer, changed_edits, check_numbers, check_weights, effects_of
+from .overlap import ARRANGED, find_paint
 from .reference import Coverage, changed_rows, coverage
+from .states import PaintOrder, Surface
 
 Floats = NDArray[np.float32]
 Rows = NDArray[np.int64]
@@ -52,23 +47,7 @@ Rows = NDArray[np.int64]
 CHUNK = 16_384
 """Rows per task of a thread: few enough for the L2 cache, and enough to be worth a thread."""
 
-_CARRIED_ROWS = 2_048  # rows that follow, per task of a thread
-
 _NO_VALUES = np.zeros(0, np.float32)  # stands for weights that are all 1, and for coverage that is all 0
-
-
-@dataclass(frozen=True)
-class Change:
-    """Rows and attributes that an update changed."""
-
-    rows: Rows  # sorted indices of all Gaussians that may differ from before. [M]
-    attributes: tuple[str, ...]  # names from `gaussians.ATTRIBUTES` that may differ in these rows
-    largest_move: float  # largest movement of a center since the last update, world units
-
-    @property
-    def means_moved(self) -> bool:
-        """True if the depth order may have changed."""
-        return self.largest_move > 0
 
 
 class _Bases(NamedTuple):
@@ -116,12 +95,13 @@ class _Plan(NamedTuple):
     """Rows and members to rewrite when some edits change."""
 
     rows: Rows  # all rows that may change, ascending. [U]
-    colors: _Members  # members of the changed edits
+    colors: _Members  # members of the changed edits, and the rows of paint that depend on them
     shapes: _Members  # those whose shape is written, without pushed rows if they are most of them
     followers: Rows  # indices of the following rows, see `Followers`. [F]
     added: Rows  # indices of the added rows among them that the changed edits change. [G]
     banded: Rows  # indices of following rows with higher SH bands that may change. [B]
     recolored: Rows  # those of them that the changed edits change
+    arranged: Rows  # indices of the rows of paint among them, see `PaintRows`. [K]
 
 
 class _LayerSlice(NamedTuple):
@@ -161,10 +141,16 @@ class Composer:
         moving = {name for bases in self._bases for name in bases}
         self._covers = covers
         followers = find_followers(extended, len(scene))
-        self._surface = None if followers is None else _Surface(scene, extended, followers, self._coverage_of)
-        if self._surface is not None:
+        self._surface = None
+        if followers is not None:
+            self._surface = Surface(scene, extended, followers, self._coverage_of, Composer)
             moving.update(FOLLOWED)
             moving.update(("shN",) if len(self._surface.banded) else ())
+        paint = find_paint(scene, extended)
+        self._paint = None
+        if paint is not None:
+            self._paint = PaintOrder(scene, extended, paint, self._coverage_of, Composer)
+            moving.update(ARRANGED)
         before = {name: getattr(scene, name).detach().float() for name in ATTRIBUTES if name in moving}
         after: dict[str, Any] = {name: values.clone() for name, values in before.items()}
         self.gaussians = replace(scene, **after)
@@ -205,12 +191,18 @@ class Composer:
         # weights are summed by kind of change, so that a change reaches all attributes of its kinds
         kinds = {KINDS[name] for edit in changed for name in self._bases[edit]}
         moving = {name for edit in plan.colors.parts for name in self._bases[edit] if KINDS[name] in kinds}
+        arranged = () if self._paint is None else self._paint.names(changed, plan.arranged)
+        moving.update(arranged)
         names = tuple(name for name in self._before if name in moving)
         surface = self._surface
         if surface is None or not (len(plan.followers) or len(plan.banded)):
-            return Change(plan.rows, names, self._write(stack, blend, plan.colors, names))
-        shapes = self._shapes()
+            last = self._release(plan.arranged, arranged)
+            moved = self._write(stack, blend, plan.colors, names)
+            moved = max(moved, self._arrange(stack, blend, plan.arranged, arranged, last))
+            return Change(plan.rows, names, moved)
+        shapes = self.shapes()
         surface.release(shapes, plan.added)
+        last = self._release(plan.arranged, arranged)
         if plan.shapes is plan.colors:
             moved = self._write(stack, blend, plan.colors, names)
         else:
@@ -218,6 +210,7 @@ class Composer:
             shaped = tuple(name for name in names if name in FOLLOWED)
             self._write(stack, blend, plan.colors, colors)
             moved = self._write(stack, blend, plan.shapes, shaped)
+        moved = max(moved, self._arrange(stack, blend, plan.arranged, arranged, last))
         carried = surface.carry(shapes, plan.followers, plan.added, stack, blend)
         moving.update(FOLLOWED)
         if len(plan.banded):
@@ -227,7 +220,47 @@ class Composer:
         names = tuple(name for name in self._before if name in moving)
         return Change(plan.rows, names, max(moved, carried))
 
-    def _shapes(self) -> Shapes:
+    def _release(self, arranged: Rows, names: Collection[str]) -> Floats:
+        """Write centers of paint as they are without the order of layers; return the last ones. [K,3]
+
+        Args:
+            arranged: see `_Plan`. [K]
+            names: attributes of these rows that are written
+        """
+        if self._paint is None or "means" not in names:
+            return np.zeros((0, 3), np.float32)
+        rows = self._paint.paint.rows[arranged]
+        means = self._after["means"]
+        last: Floats = means[rows]
+        means[rows] = self._before["means"][rows]
+        return last
+
+    def _arrange(
+        self,
+        stack: Sequence[tuple[int, Layer]],
+        blend: str,
+        arranged: Rows,
+        names: Collection[str],
+        last: Floats,
+    ) -> float:
+        """Put the rows of paint into the order of layers; return the largest movement of a center.
+
+        Args:
+            stack: active layers with the index of their edit, lowest first
+            blend: one of `BLENDS`
+            arranged: see `_Plan`. [K]
+            names: attributes to write
+            last: centers in the last picture. [K,3] or [0,3]
+        """
+        if self._paint is None or not names:
+            return 0.0
+        self._paint.arrange(self._after, stack, blend, arranged, names)
+        if not len(last):
+            return 0.0
+        steps = self._after["means"][self._paint.paint.rows[arranged]] - last
+        return math.sqrt(float(np.square(steps).sum(axis=1).max(initial=0.0)))
+
+    def shapes(self) -> Shapes:
         """Return the followed attributes of `gaussians`, which are updated in place. [N,c] each"""
         means, log_scales, quats, logits = (
             self._after[name]
@@ -305,10 +338,14 @@ class Composer:
         for name in names:
             after = self._after[name]
             total = np.full((len(rows), after.shape[1]), -0.0, np.float32)  # −0 + x keeps the bits of x
+            pushing = []
             for part in parts:
                 bases = self._bases[part.edit].get(name)
                 gain = part.layer.gain(name)
                 if bases is None or gain == 0:
+                    continue
+                if KINDS[name] in part.layer.pushed_kinds:
+                    pushing.append(part)
                     continue
                 used, factors = bases.factors(part.segment)
                 covered = (
@@ -320,9 +357,38 @@ class Composer:
                 scale = np.float32(gain)
                 add_offsets(total, selection, stored, used, factors, scale, hidden, covered)
             weight_sum = weight_sums.get(KINDS[name], _NO_VALUES)
+            if pushing:
+                total = self._add_pushes(total, pushing, name, weight_sum)
+                weight_sum = _NO_VALUES
             moved = write_rows(after, self._before[name], rows, total, weight_sum, name == "means")
             largest = max(largest, moved)
         return largest
+
+    def _add_pushes(
+        self, total: Floats, parts: Sequence[_LayerSlice], name: str, weight_sum: Floats
+    ) -> Floats:
+        """Return the blended sums and the largest change by paint. [U,c]
+
+        Args:
+            total: sums of the other layers; overwritten. [U,c]
+            parts: members of layers that push them, lowest layer first
+            name: attribute
+            weight_sum: divisors of the sums; [0] if all are 1. [U]
+        """
+        if len(weight_sum):
+            total /= weight_sum[:, None]
+        largest = np.full(total.shape, -0.0, np.float32)
+        for part in parts:
+            push = np.full(total.shape, -0.0, np.float32)
+            bases = self._bases[part.edit][name]
+            used, factors = bases.factors(part.segment)
+            selection = part.at, part.members, part.weights
+            stored = (bases.end, bases.residual)
+            scale = np.float32(part.layer.gain(name))
+            add_offsets(push, selection, stored, used, factors, scale, np.float32(0.0), _NO_VALUES)
+            keep_larger(largest, push)
+        total += largest
+        return total
 
     def _part(self, members: _Members, edit: int, layer: Layer) -> _LayerSlice:
         weights = _NO_VALUES if layer.weights is None else layer.weights.detach().float().numpy()
@@ -335,10 +401,15 @@ class Composer:
             if len(self._plans) >= 32:  # only a few are in use during a drag
                 self._plans.clear()
             chosen = [self._members[edit] for edit in changed]
+            if self._paint is not None:
+                chosen += [found for edit in changed if len(found := self._paint.dependents(edit))]
             rows = chosen[0] if len(chosen) == 1 else np.unique(np.concatenate(chosen))
             members = self._members_in(rows)
             nothing = np.zeros(0, np.int64)
-            plan = _Plan(rows, members, members, nothing, nothing, nothing, nothing)
+            arranged = nothing
+            if self._paint is not None:
+                arranged = np.flatnonzero(np.isin(self._paint.paint.rows, rows, assume_unique=True))
+            plan = _Plan(rows, members, members, nothing, nothing, nothing, nothing, arranged)
             if self._surface is not None:
                 plan = self._plan_followers(self._surface, plan, changed)
             self._plans[changed] = plan
@@ -350,10 +421,10 @@ class Composer:
         for edit, members in enumerate(self._members):
             _, members_at, at = np.intersect1d(members, rows, assume_unique=True, return_indices=True)
             if len(members_at):
-                parts[edit] = members_at, at
+                parts[edit] = np.ascontiguousarray(members_at), np.ascontiguousarray(at)
         return _Members(rows, parts)
 
-    def _plan_followers(self, surface: _Surface, plan: _Plan, changed: frozenset[int]) -> _Plan:
+    def _plan_followers(self, surface: Surface, plan: _Plan, changed: frozenset[int]) -> _Plan:
         """Return the plan extended by the rows that follow the changed edits."""
         followers = surface.followers
         dependents = [rows for edit in changed if len(rows := surface.dependents(edit))]
@@ -368,8 +439,9 @@ class Composer:
         # leaving out a few rows would only break the runs of consecutive members
         if 2 * len(pushed) > len(plan.rows):
             shapes = self._members_in(plan.rows[~np.isin(plan.rows, pushed)])
-        added = index[np.isin(followers.edits[index], list(changed))]
-        return _Plan(rows, plan.colors, shapes, index, added, banded, recolored)
+        rewritten = changed if self._paint is None else self._paint.partners(changed)
+        added = index[np.isin(followers.edits[index], list(rewritten))]
+        return _Plan(rows, plan.colors, shapes, index, added, banded, recolored, plan.arranged)
 
     def _coverage_of(self, edit: int) -> Mapping[str, Tensor]:
         if edit not in self._coverage:
@@ -394,142 +466,6 @@ class Composer:
             ) from None
 
 
-class _Surface:
-    """States of the rows that others follow, see `Followers`, composed like a scene of their own.
-
-    Only this class writes the attributes in `FOLLOWED` of pushed rows. Those of added rows are first written
-    by the composer, without following.
-
-    Args:
-        scene: the extended scene
-        gdfs: its edits
-        followers: see `find_followers`
-        coverage_of: function from the index of an edit to its coverage
-    """
-
-    def __init__(
-        self,
-        scene: Gaussians,
-        gdfs: Sequence[Gdf],
-        followers: Followers,
-        coverage_of: Callable[[int], Mapping[str, Tensor]],
-    ) -> None:
-        self.followers = followers
-        states, self._gdfs = state_scene(scene, gdfs, followers)
-        self._index = {id(gdf): edit for edit, gdf in enumerate(self._gdfs)}
-        self._coverage_of = coverage_of
-        self._composer = Composer(states, self._gdfs, self._covers)
-        rows = torch.from_numpy(followers.rows)
-        self._own = pack_shapes(scene, rows).numpy()  # the rows without following. [F,11]
-        self._drawn = scene.means[rows].float().numpy()  # their centers in the last picture. [F,3]
-        self._before = pack_shapes(states).numpy()
-        self._motions = rest_motions(self._before)
-        self._is_anchor = np.zeros(len(states), bool)
-        self._is_anchor[followers.anchors] = True
-        self._follows = np.ones(len(gdfs) + 1, bool)  # by edit + 1: its rows follow; the first: pushed rows
-        self.banded = banded_followers(scene, gdfs, followers)
-        """Indices of the following rows with higher SH bands. [B]"""
-        self._bands = scene.shN[rows].float()  # bands of the rows without following. [F,K,3]
-        self._dependents: dict[int, Rows] = {}
-        self._sliced: dict[
-            int, tuple[Tensor, int, Tensor]
-        ] = {}  # by edit: weights, their version, and a part
-
-    def dependents(self, edit: int) -> Rows:
-        """Return `Followers.dependents`, cached."""
-        if edit not in self._dependents:
-            self._dependents[edit] = self.followers.dependents(edit)
-        return self._dependents[edit]
-
-    def release(self, shapes: Shapes, index: Rows) -> None:
-        """Write the centers of added rows as they are without following, before the composer moves them.
-
-        Args:
-            shapes: the composed scene, see `Composer._shapes`; updated in place
-            index: indices of the rows, see `Followers`. [F]
-        """
-        release_centers(shapes[0], index, self.followers.rows, self._own)
-
-    def carry(
-        self,
-        shapes: Shapes,
-        index: Rows,
-        added: Rows,
-        stack: Sequence[tuple[int, Layer]],
-        blend: str,
-    ) -> float:
-        """Write the rows that follow; return the largest movement of a center.
-
-        Args:
-            shapes: the composed scene, see `Composer._shapes`; updated in place
-            index: indices of the rows to write, see `Followers`. [F]
-            added: indices of the added rows among them that the composer has written. [G]
-            stack: active layers with the index of their edit, lowest first
-            blend: one of `BLENDS`
-        """
-        followers = self.followers
-        layers = [self._layer(edit, layer) for edit, layer in stack if len(followers.changed[edit][0])]
-        changed = self._composer.update(layers, blend).rows
-        states = self._composer._shapes()
-        measure_motions(self._motions, changed[self._is_anchor[changed]], self._before, states)
-        gather_shapes(self._own, added, shapes, followers.rows)
-        self._follows[1:] = False
-        self._follows[[edit + 1 for edit, _ in stack]] = True
-        table = followers.rows, followers.edits, followers.own, followers.anchors, followers.weights
-        count = 1 + len(index) // _CARRIED_ROWS
-        cuts = [len(index) * part // count for part in range(count + 1)]
-        moves = run_chunks(
-            lambda chunk: carry_fast(
-                shapes,
-                (self._own, self._drawn),
-                index[cuts[chunk] : cuts[chunk + 1]],
-                table,
-                self._follows,
-                (self._before, states),
-                self._motions,
-            ),
-            count,
-        )
-        return math.sqrt(max(moves))
-
-    def turn(self, bands: Floats, index: Rows, recolored: Rows) -> None:
-        """Turn the higher SH bands of following rows.
-
-        Args:
-            bands: bands of the composed scene, updated in place. [N,3K]
-            index: indices of the rows to write. [B]
-            recolored: those of them that the composer has written
-        """
-        followers = self.followers
-        width = self._bands.shape[1:]
-        self._bands[recolored] = torch.from_numpy(bands[followers.rows[recolored]]).reshape(-1, *width)
-        moves, turns, *_ = self._motions
-        anchors = followers.anchors[index]
-        weights = followers.weights[index]
-        is_moved = (moves[anchors, 0] & (weights > 0)).any(axis=1) & self._follows[followers.edits[index] + 1]
-        mean = mean_quats(torch.from_numpy(turns[anchors, :4]), torch.from_numpy(weights)[..., None])
-        turned = turn_bands(self._bands[index], mean, torch.from_numpy(is_moved))
-        bands[followers.rows[index]] = turned.flatten(1).numpy()
-
-    def _layer(self, edit: int, layer: Layer) -> Layer:
-        """Return a layer restricted to the states."""
-        weights = layer.weights
-        if weights is None:
-            return replace(layer, gdf=self._gdfs[edit])
-        known = self._sliced.get(edit)
-        if known is None or known[0] is not weights or known[1] != weights._version:
-            part = weights[torch.from_numpy(self.followers.changed[edit][1])]
-            known = weights, weights._version, part
-            self._sliced[edit] = known
-        return replace(layer, gdf=self._gdfs[edit], weights=known[2])
-
-    def _covers(self, _: Gaussians, gdf: Gdf) -> Mapping[str, Tensor]:
-        """Return the coverage that an edit of the states has in the scene."""
-        edit = self._index[id(gdf)]
-        members = torch.from_numpy(self.followers.changed[edit][1])
-        return {kind: share[members] for kind, share in self._coverage_of(edit).items()}
-
-
 def _between(part: _LayerSlice, first: int, last: int) -> _LayerSlice:
     """Return a part restricted to the rows from `first` to `last`, with positions relative to `first`."""
     begin, end = np.searchsorted(part.at, (first, last))
@@ -540,7 +476,7 @@ def _between(part: _LayerSlice, first: int, last: int) -> _LayerSlice:
 
 def _weight_sum(parts: Sequence[_LayerSlice], kind: str, count: int) -> Floats:
     """Return max(1, Σ m s) over the layers with a kind of change; empty if it is 1 everywhere. [U]"""
-    parts = [part for part in parts if kind in part.layer.kinds]
+    parts = [part for part in parts if kind in part.layer.blended_kinds]
     # slightly below 1, because float32 sums may round up to more than 1
     if sum(part.layer.clamped_strength for part in parts) <= 1 - 1e-6:
         return _NO_VALUES

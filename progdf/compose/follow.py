@@ -19,22 +19,27 @@ Rows whose anchors keep all bits keep theirs.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from progdf.field.baked import AttributeBases, BakedField
+from progdf.field.baked import AttributeBases, BakedField, GradeForm
 from progdf.gaussians import BASE_CHANNELS, Gaussians
+from progdf.gdf.anchors import Anchors
 from progdf.gdf.file import Gdf, fingerprint
 from progdf.quaternions import multiply_quats, normalize_quats, rotate_vectors
 from progdf.region import Region
 from progdf.sh import rotation_change
 
+from .overlap import PaintRows, tints_rim
+
 FOLLOWED = ("means", "log_scales", "quats", "logit_opacities")
 """Attributes that follow the surface, in the order of `pack_shapes`."""
+COLORS = ("sh0", "shN")
+"""Attributes that decide on the colors of rims."""
 _MEANS = slice(0, 3)
 _LOG_SCALES = slice(3, 6)
 _QUATS = slice(6, 10)
@@ -74,6 +79,38 @@ def changes_shape(gdf: Gdf) -> bool:
     return any(name in FOLLOWED for name in gdf.field.attributes)
 
 
+def carries_others(gdf: Gdf) -> bool:
+    """Return whether rows of other edits follow an edit's change of its own members."""
+    return gdf.anchors is None or gdf.anchors.carries_others
+
+
+def find_rims(gdfs: Sequence[Gdf], count: int, paint: PaintRows) -> Followers | None:
+    """Return the rows whose colors repeat the surface beside the paint; None if there are none.
+
+    Their states show the colors of the surface under the other edits.
+
+    Args:
+        gdfs: edits of an extended scene
+        count: number of rows of this scene
+        paint: see `find_paint`
+    """
+    members = [gdf.region.members.numpy() for gdf in gdfs]
+    tinting = [edit for edit, gdf in enumerate(gdfs) if tints_rim(gdf)]
+    builder = _Builder(members, count)
+    for edit in np.unique(paint.edits).tolist():
+        found = gdfs[edit].anchors
+        if found is None:
+            continue
+        mine = (paint.edits == edit) & (paint.rim > 0)
+        at = paint.members[mine] - (len(members[edit]) - len(found))
+        changing = tuple(other for other in tinting if other != edit)
+        anchors = found.rows.numpy()[at]
+        weights = found.weights.double().numpy()[at]
+        touched = (builder.rows_of(changing)[anchors] & (weights > 0)).any(axis=1)
+        builder.add(paint.rows[mine][touched], edit, anchors[touched], weights[touched], changing)
+    return builder.finish(frozenset())
+
+
 def find_followers(gdfs: Sequence[Gdf], count: int) -> Followers | None:
     """Return the rows that can follow the changes of other edits; None if there are none.
 
@@ -83,7 +120,7 @@ def find_followers(gdfs: Sequence[Gdf], count: int) -> Followers | None:
     """
     members = [gdf.region.members.numpy() for gdf in gdfs]
     shaping = [edit for edit, gdf in enumerate(gdfs) if changes_shape(gdf)]
-    pushing = [edit for edit in shaping if (found := gdfs[edit].anchors) is not None and found.pushes]
+    pushing = [edit for edit in shaping if not carries_others(gdfs[edit])]
     others = [edit for edit in shaping if edit not in pushing]
     builder = _Builder(members, count)
     for edit, gdf in enumerate(gdfs):
@@ -195,13 +232,16 @@ class _Builder:
         )
 
 
-def state_scene(scene: Gaussians, gdfs: Sequence[Gdf], followers: Followers) -> tuple[Gaussians, list[Gdf]]:
-    """Return the states as a scene of their own, and the edits restricted to it and to shape and opacity.
+def state_scene(
+    scene: Gaussians, gdfs: Sequence[Gdf], followers: Followers, names: Sequence[str] = FOLLOWED
+) -> tuple[Gaussians, list[Gdf]]:
+    """Return the states as a scene of their own, and the edits restricted to it and to some attributes.
 
     Args:
         scene: the extended scene
         gdfs: its edits
         followers: see `find_followers`
+        names: the attributes
 
     Returns:
         E Gaussians, one per state, and the edits, of which some have no members.
@@ -216,14 +256,27 @@ def state_scene(scene: Gaussians, gdfs: Sequence[Gdf], followers: Followers) -> 
                 bases.end_offset[at], bases.residual_basis[:, at], bases.scale, bases.coefficients
             )
             for name, bases in gdf.field.attributes.items()
-            if name in FOLLOWED
+            if name in names
         }
         score = torch.zeros(len(states))
         score[members] = 1.0
         region = Region(gdf.region.name, torch.from_numpy(members), score)
-        field = BakedField("separable", gdf.field.knots, attributes, BASE_CHANNELS)
-        parts.append(Gdf(gdf.name, region, field, scene_print))
+        channels = gdf.field.channels if "shN" in names else BASE_CHANNELS
+        form = gdf.field.origin
+        grade = _part_of_grade(form, at) if "sh0" in names and isinstance(form, GradeForm) else None
+        kind = "separable" if grade is None else "grade"
+        field = BakedField(kind, gdf.field.knots, attributes, channels, origin=grade)
+        pushes = None
+        if gdf.anchors is not None:
+            pushes = Anchors(torch.zeros(0, 4, dtype=torch.int64), torch.zeros(0, 4), gdf.anchors.pushes)
+        parts.append(Gdf(gdf.name, region, field, scene_print, anchors=pushes))
     return states, parts
+
+
+def _part_of_grade(form: GradeForm, members: Tensor) -> GradeForm:
+    """Return a grade of some of its members."""
+    mask = None if form.mask is None else form.mask[members]
+    return replace(form, residual=form.residual[:, members], mask=mask)
 
 
 def pack_shapes(gaussians: Gaussians, rows: Tensor | slice = slice(None)) -> Tensor:

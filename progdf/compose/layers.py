@@ -8,9 +8,12 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from progdf.errors import ProgdfError
+from progdf.gdf.anchors import NOTHING
 from progdf.gdf.file import Gdf
 
 BLENDS = ("normalized", "sum", "over", "adjust")
@@ -68,6 +71,16 @@ class Layer:
         """Kinds of change that the edit makes, see `KINDS`."""
         return frozenset(KINDS[name] for name in self.gdf.field.attributes)
 
+    @property
+    def pushed_kinds(self) -> frozenset[str]:
+        """Kinds of change that only make way for the paint of the edit, see `Anchors.pushes`."""
+        return NOTHING if self.gdf.anchors is None else self.gdf.anchors.pushes
+
+    @property
+    def blended_kinds(self) -> frozenset[str]:
+        """Kinds of change that take part in the blend rule."""
+        return self.kinds - self.pushed_kinds
+
     def gain(self, attribute: str) -> float:
         """Return the gain of an attribute."""
         return float(getattr(self.gains, KINDS[attribute]))
@@ -109,10 +122,24 @@ def check_weights(layer: Layer) -> None:
         raise ValueError(f"weights of {layer.gdf.name} has a number outside 0 to 1")
 
 
+@dataclass(frozen=True)
+class Change:
+    """Rows and attributes that an update changed."""
+
+    rows: NDArray[np.int64]  # sorted indices of all Gaussians that may differ from before. [M]
+    attributes: tuple[str, ...]  # names from `gaussians.ATTRIBUTES` that may differ in these rows
+    largest_move: float  # largest movement of a center since the last update, world units
+
+    @property
+    def means_moved(self) -> bool:
+        """True if the depth order may have changed."""
+        return self.largest_move > 0
+
+
 Effect = tuple[tuple[float, Gains, Tensor | None, int, int], ...]
 """Effect of an edit, per layer: strength, gains, weights, their version, and position in the stack.
 
-The position is 0 under blend rules without an order.
+The position is 0 for layers without an order: those that are not paint, under some blend rules.
 """
 
 
@@ -129,7 +156,7 @@ def effects_of(stack: Sequence[tuple[int, Layer]], blend: str) -> Effects:
     effects: dict[int, Effect] = {}
     for index, (edit, layer) in enumerate(stack):
         version = -1 if layer.weights is None else layer.weights._version
-        order = index if blend in ORDERED else 0
+        order = index if blend in ORDERED or layer.pushed_kinds else 0
         entry = (layer.strength, layer.gains, layer.weights, version, order)
         effects[edit] = (*effects.get(edit, ()), entry)
     return Effects(blend, effects)

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -24,6 +25,7 @@ from progdf.sh import C0
 from .added import extend
 from .follow import (
     anchor_turns,
+    carries_others,
     carry_pushed,
     carry_rows,
     changes_shape,
@@ -32,6 +34,7 @@ from .follow import (
     unpack_shapes,
 )
 from .layers import BLENDS, KINDS, ORDERED, Gains, Layer, check_layers
+from .overlap import ARRANGED, arrange, find_paint, paint_layers, tints_rim
 
 # changes that are clearly visible
 _VISIBLE_COLOR = 0.1  # sRGB, 0 to 1
@@ -154,8 +157,11 @@ def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "norm
       than from the map lies over the lower layers to that extent, see `map_share`. So dark gaps between
       stripes stay dark.
 
-    Added rows follow the surface below them when other layers move, scale or fade it, see
-    `progdf.compose.follow`.
+    Paint makes way for its discs by changes of the scene's Gaussians (see `Anchors.pushes`). These take no
+    part in the rule. The largest such change of a Gaussian is added to the result of the other layers.
+
+    A layer of paint covers the layers of paint below it, see `progdf.compose.overlap`. Added rows follow the
+    surface below them when other layers move, scale or fade it, see `progdf.compose.follow`.
 
     In Σ m s and 1 − m s c, s is clamped to 0 to 1. A strength above 1 exaggerates its own edit without
     dimming the others.
@@ -184,7 +190,8 @@ def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "norm
     active = [layer for layer in layers if layer.active]
     if not active or not len(scene):
         return scene
-    return _follow(scene, _compose(scene, active, blend), active, blend)
+    composed = _arrange(scene, _compose(scene, active, blend), active, blend)
+    return _follow(scene, composed, active, blend)
 
 
 def _compose(scene: Gaussians, layers: Sequence[Layer], blend: str) -> Gaussians:
@@ -195,6 +202,47 @@ def _compose(scene: Gaussians, layers: Sequence[Layer], blend: str) -> Gaussians
     return replace(
         scene, **{name: getattr(scene, name).index_copy(0, rows, new) for name, new in changed.items()}
     )
+
+
+def _arrange(scene: Gaussians, composed: Gaussians, layers: Sequence[Layer], blend: str) -> Gaussians:
+    """Return the composed scene with layers of paint in their order, see `progdf.compose.overlap`.
+
+    Args:
+        scene: the original with the rows that edits add
+        composed: the scene under the layers, without the order of paint
+        layers: active layers of converted edits
+        blend: one of `BLENDS`
+    """
+    edits = list({id(layer.gdf): layer.gdf for layer in layers}.values())
+    paint = find_paint(scene, edits)
+    if paint is None:
+        return composed
+    index = {id(gdf): edit for edit, gdf in enumerate(edits)}
+    tints = np.zeros((len(paint), 3))
+    for edit in np.unique(paint.edits).tolist():
+        anchors = edits[edit].anchors
+        changing = [layer for layer in layers if tints_rim(layer.gdf) and layer.gdf is not edits[edit]]
+        if anchors is None or not changing:
+            continue
+        after = _compose(scene, changing, blend)
+        mine = paint.edits == edit
+        at = torch.from_numpy(paint.members[mine]) - (len(edits[edit].region) - len(anchors))
+        change = (after.sh0 - scene.sh0)[anchors.rows[at]].double().reshape(len(at), -1, 3)
+        tints[mine] = (anchors.weights[at][..., None] * change).sum(dim=1).numpy()
+    values = {name: getattr(composed, name).float().clone() for name in ARRANGED}
+    arrange(
+        paint,
+        paint_layers([(index[id(layer.gdf)], layer) for layer in layers]),
+        tints,
+        {name: each.numpy() for name, each in values.items()},
+        np.arange(len(paint)),
+    )
+    changed: dict[str, Any] = {
+        name: new.to(getattr(scene, name).dtype)
+        for name, new in values.items()
+        if not torch.equal(new, getattr(composed, name))
+    }
+    return replace(composed, **changed)
 
 
 def _follow(scene: Gaussians, composed: Gaussians, layers: Sequence[Layer], blend: str) -> Gaussians:
@@ -209,7 +257,7 @@ def _follow(scene: Gaussians, composed: Gaussians, layers: Sequence[Layer], blen
         blend: one of `BLENDS`
     """
     edits = {id(layer.gdf): layer.gdf for layer in layers}
-    pushing = {key for key, gdf in edits.items() if gdf.anchors is not None and gdf.anchors.pushes}
+    pushing = {key for key, gdf in edits.items() if not carries_others(gdf)}
     others = [layer for layer in layers if id(layer.gdf) not in pushing and changes_shape(layer.gdf)]
     if not others or all(gdf.anchors is None for gdf in edits.values()):
         return composed
@@ -218,7 +266,9 @@ def _follow(scene: Gaussians, composed: Gaussians, layers: Sequence[Layer], blen
     before = pack_shapes(scene)
     pushed = torch.zeros(len(scene), dtype=torch.bool)
     for key in pushing:
-        pushed[edits[key].region.members] = True
+        anchors = edits[key].anchors
+        members = edits[key].region.members
+        pushed[members[: len(members) - (0 if anchors is None else len(anchors))]] = True
     rows = pushed.nonzero()[:, 0]
     surface = pack_shapes(_compose(scene, others, blend), rows)
     paint = pack_shapes(_compose(scene, [layer for layer in layers if id(layer.gdf) in pushing], blend), rows)
@@ -259,10 +309,11 @@ def changed_rows(
     rows, parts = _parts(scene, layers, blend, covers)
     weight_sums = {kind: torch.zeros(len(rows)) for kind in KINDS.values()}  # Σ m s
     for part in parts:
-        for kind in part.layer.kinds:
+        for kind in part.layer.blended_kinds:
             weight_sums[kind][part.rows] += part.weights * part.layer.clamped_strength
 
-    adjusted = _adjusted_colors(scene, rows, parts) if blend == "adjust" else {}
+    blended = [part for part in parts if not part.pushes("sh0")]
+    adjusted = _adjusted_colors(scene, rows, blended) if blend == "adjust" else {}
     changed: dict[str, Any] = {}
     for name in ATTRIBUTES:
         movers = [part for part in parts if part.moves(name)]
@@ -271,9 +322,13 @@ def changed_rows(
         old: Tensor = getattr(scene, name)
         total = adjusted.get(name, torch.full((len(rows), old[0].numel()), NEGATIVE_ZERO))
         for part in movers if name not in adjusted else ():
-            part.add(total, name, hides=blend in ORDERED)
+            if not part.pushes(name):
+                part.add(total, name, hides=blend in ORDERED)
         if blend == "normalized":
             total = total / weight_sums[KINDS[name]].clamp(min=1.0)[:, None]
+        pushing = [part for part in movers if part.pushes(name)]
+        if pushing:
+            total = total + _largest_push(pushing, name, total)
         changed[name] = old[rows] + total.reshape(-1, *old.shape[1:]).to(old.dtype)
     return rows, changed
 
@@ -301,9 +356,31 @@ class _LayerMembers:
         offsets = self.layer.gdf.field.attribute_offsets(name, self.layer.strength)[self.members]
         total[self.rows] = below + weight * gain * offsets
 
+    def pushes(self, attribute: str) -> bool:
+        """Return whether the layer changes an attribute only to make way for its paint."""
+        return KINDS[attribute] in self.layer.pushed_kinds
+
     def moves(self, attribute: str) -> bool:
         """Return whether the layer changes an attribute."""
         return attribute in self.layer.gdf.field.attributes and self.layer.gain(attribute) != 0
+
+
+def _largest_push(parts: Sequence[_LayerMembers], name: str, total: Tensor) -> Tensor:
+    """Return the largest change by paint in each row; of equal ones, that of the upper layer. [U,c]
+
+    Args:
+        parts: members of layers that push them, lowest layer first
+        name: attribute
+        total: sums of the other layers. [U,c]
+    """
+    largest = torch.full_like(total, NEGATIVE_ZERO)
+    for part in parts:
+        offsets = part.layer.gdf.field.attribute_offsets(name, part.layer.strength)[part.members]
+        push = part.weights[:, None] * part.layer.gain(name) * offsets
+        below = largest[part.rows]
+        is_larger = push.square().sum(dim=1) >= below.square().sum(dim=1)
+        largest[part.rows] = torch.where(is_larger[:, None], push, below)
+    return largest
 
 
 def _adjusted_colors(scene: Gaussians, rows: Tensor, parts: Sequence[_LayerMembers]) -> dict[str, Tensor]:

@@ -12,7 +12,7 @@ removes is no candidate.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -26,6 +26,10 @@ MAX_ANCHORS = 4
 """Largest number of anchors of a row."""
 WEIGHT_SUM_TOLERANCE = 1e-4
 """Largest deviation of the sum of a row's weights from 1."""
+NOTHING: frozenset[str] = frozenset()
+"""No kind of change."""
+PUSHED_SHAPE = frozenset({"geometry", "opacity"})
+"""Kinds of change by which paint over a recolor makes way for its added rows."""
 _MIN_LYING_WEIGHT = 0.5  # share of its anchors' weight on rows on which a row lies
 _CANDIDATES = 16  # nearest Gaussians of which the anchors are chosen
 _SPACING_NEIGHBOR = 4  # its distance is the local spacing
@@ -43,10 +47,15 @@ class Anchors:
 
     rows: Tensor  # rows of the scene; those with weight 0 have no meaning. [B,4] int64
     weights: Tensor  # 0 to 1, sum 1 per row; all 0 if the row follows nothing, as in a copy. [B,4] float32
-    # True if rows of other edits do not follow this edit's change of its own members: paint moves them only
-    # out of its way, or the user removes or moves an object without its paint. The change is carried along
-    # like the added rows.
-    pushes: bool = False
+    # Kinds of change (see `progdf.compose.layers.KINDS`) that the edit makes to its own members only to make
+    # way for the added rows, as paint does. Rows of other edits do not follow them.
+    pushes: frozenset[str] = NOTHING
+    # share of each added row's color that repeats the surface beside the paint, 0 to 1; None if all are 0.
+    # [B] float32
+    rim: Tensor | None = None
+    # True if rows of other edits stay where they are although this edit changes what they lie on, as when the
+    # user moves an object without its paint
+    leaves_paint: bool = False
 
     def __post_init__(self) -> None:
         shape = (len(self.rows), MAX_ANCHORS)
@@ -62,12 +71,21 @@ class Anchors:
             raise ValueError("an anchor is a negative row")
         if not bool((self.weights >= 0.0).all()):  # also refuses NaN
             raise ValueError("a weight of an anchor is negative or not a number")
+        if self.rim is not None and self.rim.shape != self.rows.shape[:1]:
+            raise ValueError(f"anchors.rim is {list(self.rim.shape)}, expected {[len(self.rows)]}")
+        if self.rim is not None and not bool(((self.rim >= 0.0) & (self.rim <= 1.0)).all()):
+            raise ValueError("a share of a rim is not between 0 and 1")
         sums = self.weights.double().sum(dim=1)
         if not bool((((sums - 1.0).abs() <= WEIGHT_SUM_TOLERANCE) | (sums == 0.0)).all()):
             raise ValueError("the weights of a row's anchors do not sum up to 1")
 
     def __len__(self) -> int:
         return len(self.rows)
+
+    @property
+    def carries_others(self) -> bool:
+        """True if rows of other edits follow the edit's change of its own members."""
+        return not self.pushes and not self.leaves_paint
 
     @property
     def free(self) -> int:
@@ -79,10 +97,10 @@ class Anchors:
         return (self.weights * mask[self.rows]).sum(dim=1) >= _MIN_LYING_WEIGHT
 
 
-def free_anchors(count: int, pushes: bool = False) -> Anchors:
-    """Return the anchors of rows that follow nothing; see `Anchors.pushes`."""
+def free_anchors(count: int) -> Anchors:
+    """Return the anchors of rows that follow nothing."""
     rows = torch.zeros(count, MAX_ANCHORS, dtype=torch.int64)
-    return Anchors(rows, torch.zeros(count, MAX_ANCHORS), pushes)
+    return Anchors(rows, torch.zeros(count, MAX_ANCHORS))
 
 
 def join_free(anchors: Anchors, free: int) -> Anchors:
@@ -97,10 +115,13 @@ def join_free(anchors: Anchors, free: int) -> Anchors:
     """
     others = free_anchors(free)
     rows = torch.cat([anchors.rows, others.rows])
-    return Anchors(rows, torch.cat([anchors.weights, others.weights]), anchors.pushes)
+    rim = None if anchors.rim is None else torch.cat([anchors.rim, anchors.rim.new_zeros(free)])
+    return replace(anchors, rows=rows, weights=torch.cat([anchors.weights, others.weights]), rim=rim)
 
 
-def choose_anchors(end: Gaussians, means: Tensor, unseen_logit: float, pushes: bool = False) -> Anchors:
+def choose_anchors(
+    end: Gaussians, means: Tensor, unseen_logit: float, pushes: frozenset[str] = NOTHING
+) -> Anchors:
     """Choose the anchors of added rows; see the module docstring.
 
     Args:

@@ -26,7 +26,7 @@ from progdf.io.atomic import read_file, write_error, write_file
 from progdf.region import Region, whole_scene
 
 from . import header
-from .anchors import Anchors, choose_anchors, join_free
+from .anchors import NOTHING, PUSHED_SHAPE, Anchors, choose_anchors, join_free
 from .header import SceneFingerprint
 
 _FINGERPRINTS: MutableMapping[Tensor, tuple[tuple[int, Origin] | None, str]] = WeakIdKeyDictionary()
@@ -186,7 +186,9 @@ def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
         added=gdf.members - len(gdf.region),
         added_origin=ZERO if gdf.added is None else gdf.added.origin,
         anchored=gdf.anchors is not None,
-        pushes=gdf.anchors is not None and gdf.anchors.pushes,
+        pushes=[] if gdf.anchors is None else sorted(gdf.anchors.pushes),
+        rim=gdf.anchors is not None and gdf.anchors.rim is not None,
+        leaves_paint=gdf.anchors is not None and gdf.anchors.leaves_paint,
     )
     content = header.pack_file(head, tensors)
     try:
@@ -223,9 +225,8 @@ def load_gdf(
             return apply_grade(gdf, scene, whole_scene(scene) if region is None else region)
         verify(gdf, scene, name, scene_name)
         if gdf.anchors_found:
-            gdf = replace(
-                anchor_added(gdf, scene, pushes=gdf.report.get("paint") is not None), anchors_found=True
-            )
+            pushes = NOTHING if gdf.report.get("paint") is None else PUSHED_SHAPE
+            gdf = replace(anchor_added(gdf, scene, pushes), anchors_found=True)
     form = gdf.field.origin
     if form is None:
         return gdf
@@ -245,7 +246,7 @@ def load_gdf(
         raise header.contradiction_error(name, error) from error
 
 
-def anchor_added(gdf: Gdf, scene: Gaussians, pushes: bool = False, free: int = 0) -> Gdf:
+def anchor_added(gdf: Gdf, scene: Gaussians, pushes: frozenset[str] = NOTHING, free: int = 0) -> Gdf:
     """Return the edit with its added rows anchored to the scene's surface, see `progdf.gdf.anchors`.
 
     Args:

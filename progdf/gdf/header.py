@@ -35,9 +35,9 @@ from progdf.io.json_values import convert_json, decode_json
 from progdf.io.tensors import check_tensor, inflate
 from progdf.region import Region
 
-from .anchors import MAX_ANCHORS, Anchors
+from .anchors import MAX_ANCHORS, PUSHED_SHAPE, Anchors
 
-FORMAT = 8
+FORMAT = 9
 """Version of the file format."""
 
 MAX_GAUSSIANS = 1 << 26
@@ -50,6 +50,7 @@ _GRADE_TENSORS = ("knots", "table", "residual", "scale", "coefficients")  # tens
 _PACKED_SUFFIX = ".packed"  # ending of compressed per-member tensors, see `GradeForm.packed_levels`
 _ADDED_PREFIX = "added."
 _ANCHORED_FORMAT = 8  # first format that stores anchors of added rows
+_KINDS = ("geometry", "opacity", "color")  # kinds of change, see `progdf.compose.layers.KINDS`
 _NETWORK_PREFIX = "network."
 _END_CORRECTION_PREFIX = "end_correction."
 _OLDEST_FORMAT = 3  # oldest format that is read
@@ -96,7 +97,10 @@ class GdfHeader(msgspec.Struct, frozen=True):
     added: Annotated[int, msgspec.Meta(ge=0)] = 0  # rows that the scene does not have, see `Gdf.added`
     added_origin: Origin = ZERO
     anchored: bool = False  # the added rows have anchors, see `Gdf.anchors`
-    pushes: bool = False  # see `Anchors.pushes`
+    # kinds of change, see `Anchors.pushes`; in format 8, True stands for geometry and opacity
+    pushes: bool | list[str] = []
+    leaves_paint: bool = False  # see `Anchors.leaves_paint`
+    rim: bool = False  # the added rows have shares of a rim, see `Anchors.rim`
     format: int = FORMAT
     sha256: str = ""
 
@@ -295,7 +299,10 @@ def pack_anchors(anchors: Anchors | None) -> dict[str, Tensor]:
     """Return the tensors of anchors by their names in the file."""
     if anchors is None:
         return {}
-    return {"anchors.rows": anchors.rows.int(), "anchors.weights": anchors.weights}
+    tensors = {"anchors.rows": anchors.rows.int(), "anchors.weights": anchors.weights}
+    if anchors.rim is not None:
+        tensors["anchors.rim"] = (anchors.rim * 255).round().to(torch.uint8)
+    return tensors
 
 
 def unpack_anchors(header: GdfHeader, tensors: Mapping[str, Tensor]) -> Anchors | None:
@@ -308,7 +315,17 @@ def unpack_anchors(header: GdfHeader, tensors: Mapping[str, Tensor]) -> Anchors 
         return None
     rows = tensors["anchors.rows"]
     check_tensor("anchors.rows", rows, (header.added, MAX_ANCHORS), torch.int32)
-    return Anchors(rows.long(), tensors["anchors.weights"], header.pushes)
+    rim = None
+    if header.rim:
+        check_tensor("anchors.rim", tensors["anchors.rim"], (header.added,), torch.uint8)
+        rim = tensors["anchors.rim"].float() / 255
+    pushes = header.pushes
+    if isinstance(pushes, bool):
+        pushes = sorted(PUSHED_SHAPE) if pushes else []
+    unknown = set(pushes) - set(_KINDS)
+    if unknown:
+        raise ValueError(f"unknown kind of change {min(unknown)}")
+    return Anchors(rows.long(), tensors["anchors.weights"], frozenset(pushes), rim, header.leaves_paint)
 
 
 def is_before_anchors(header: GdfHeader) -> bool:

@@ -14,6 +14,7 @@ from progdf.field.choose import Render
 from progdf.field.grade import bake_grade, fit_grade
 from progdf.field.separable import course_field, opacity_course, quantize_bases
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, attribute_slices, pack
+from progdf.gdf.anchors import PUSHED_SHAPE
 from progdf.gdf.file import ADDED_LOGIT, Gdf, anchor_added, fingerprint
 from progdf.region import Region
 from tests.helpers.draws import Draws
@@ -120,7 +121,14 @@ def painted(scene: Gaussians, count: int, seed: int, name: str = "logo", pushed:
     offsets[:, :moved, columns["means"]] = knots[:, None, None] * 0.1 * draws.normal(moved, 3)
     offsets[:, :pushed, columns["sh0"]] = knots[:, None, None] * draws.normal(pushed, 3)
     edit = replace(edit_of(scene, members, curved_field(pushed), name), **grown(offsets, knots, added))
-    return anchor_added(edit, scene, pushes=True)
+    return anchor_added(edit, scene, PUSHED_SHAPE | {"color"})
+
+
+def rimmed(gdf: Gdf, seed: int) -> Gdf:
+    """Return paint with random shares of a rim."""
+    anchors = gdf.anchors
+    assert anchors is not None
+    return replace(gdf, anchors=replace(anchors, rim=Draws(seed).uniform(len(anchors))))
 
 
 def grown(offsets: torch.Tensor, knots: torch.Tensor, added: Gaussians) -> dict[str, object]:

@@ -10,6 +10,7 @@ from torch import Tensor
 from progdf.camera import Camera, intrinsics, look_at
 from progdf.field.separable import course_field, opacity_course
 from progdf.gaussians import Gaussians, attribute_slices, concatenate
+from progdf.gdf.anchors import PUSHED_SHAPE
 from progdf.gdf.file import ADDED_LOGIT, Gdf, anchor_added, fingerprint
 from progdf.region import Region, from_mask
 from progdf.sh import rgb_to_sh0
@@ -85,7 +86,7 @@ def _paint(scene: Gaussians) -> Gdf:
     offsets[:, : len(members), 1] = knots[:, None] * PUSH
     field = course_field(knots, offsets)
     region = from_mask("logo", below)
-    return anchor_added(Gdf("logo", region, field, fingerprint(scene), added=discs), scene, pushes=True)
+    return anchor_added(Gdf("logo", region, field, fingerprint(scene), added=discs), scene, PUSHED_SHAPE)
 
 
 def six_cameras(size: int = 72) -> list[Camera]:

@@ -41,7 +41,9 @@ BORDER_PX = 2
 The border is needed because Gaussians drawn there were moved.
 """
 
-_CELL_SIDES_PX = (16, 8, 4, 2, 1)  # pixels; sides of the rectangles that share a disc
+# Sides of the rectangles that share a disc, pixels. Splats are drawn in the order of their centers. From
+# aside, larger discs would cut through discs of other layers and through the Gaussians behind them.
+_CELL_SIDES_PX = (4, 2, 1)
 _PIXEL_SPREAD = 0.28  # standard deviation of a single pixel's disc, in pixels
 _MERGED_SPREAD = 0.6  # standard deviation of a merged rectangle's disc, as a share of its sides
 # pixels²; part of the engine's blur (0.3) that counts as an error of a disc; the solved colors undo the rest
@@ -82,6 +84,7 @@ class Discs:
     """Surface discs to add, and the rows of the scene that are moved behind them."""
 
     added: Gaussians  # state at strength 1
+    rim: Tensor  # share of each disc that lies beside the paint, 0 to 1. [B]
     moved: Tensor  # rows of the scene that had to move, ascending. [M] int64
     scene: Gaussians  # scene with these rows moved
 
@@ -105,7 +108,7 @@ def place_discs(
     opaque = surface.opaque
     mask = ndimage.binary_dilation(paint.mask.numpy() & opaque, iterations=BORDER_PX) & opaque
     if not mask.any():
-        return Discs(scene[:0], torch.zeros(0, dtype=torch.int64), cleared)
+        return Discs(scene[:0], torch.zeros(0), torch.zeros(0, dtype=torch.int64), cleared)
     cells = merge_pixels(paint.picture.numpy(), mask, flat, surface.is_continuous)
     added, depths = _discs(cells, surface, paint.picture)
     added = replace(
@@ -123,7 +126,7 @@ def place_discs(
             break
         cleared = _move_back(cleared, camera, rows, factors)
         moved = moved.index_fill(0, rows, True)
-    return Discs(added, moved.nonzero()[:, 0], cleared)
+    return Discs(added, _share_beside(cells, paint.drawn[..., 3]), moved.nonzero()[:, 0], cleared)
 
 
 def merge_pixels(
@@ -254,6 +257,16 @@ def _discs(cells: Array, surface: PaintSurface, picture: Tensor) -> tuple[Gaussi
         torch.zeros(len(x), 0, 3),
     )
     return discs, placed
+
+
+def _share_beside(cells: Array, alpha: Tensor) -> Tensor:
+    """Return one minus the mean alpha of the paint over each cell. [B,4], [H,W] -> [B] float32"""
+    low, high = ((cells[:, :2] + side * cells[:, 2:]).astype(int) for side in (-0.5, 0.5))
+    paint = alpha.double().numpy()
+    boxes = zip(low.tolist(), high.tolist(), strict=True)
+    means = [paint[top:bottom, left:right].mean() for (left, top), (right, bottom) in boxes]
+    levels = (255 * (1.0 - torch.tensor(means, dtype=torch.float32))).round()  # as stored
+    return levels / 255
 
 
 def _rise_beside(cells: Array, picture: Tensor) -> Array:

@@ -17,6 +17,7 @@ from progdf.fade import linear_remap
 from progdf.field.baked import interpolate_at
 from progdf.field.separable import course_field, opacity_course
 from progdf.gaussians import BASE_CHANNELS, Gaussians, attribute_slices, concatenate, pack
+from progdf.gdf.anchors import PUSHED_SHAPE
 from progdf.gdf.file import ADDED_LOGIT, Gdf, anchor_added, fingerprint
 from progdf.io.images import picture_size
 from progdf.metrics.image import decibels
@@ -68,6 +69,7 @@ class DiscLayout:
     ended: Gaussians  # this scene with occluding Gaussians pushed behind the discs
     rows: Tensor  # indices of the Gaussians that change. [M] int64
     added: Gaussians  # the discs at strength 1
+    rim: Tensor  # share of each disc that lies beside the paint, 0 to 1. [A]
     gap: float  # distance between discs and pushed Gaussians, pixels
 
     @property
@@ -123,6 +125,7 @@ def lay_discs(goal: PaintGoal, gap: float) -> DiscLayout:
     paints = goal.paints
     cleared = scene
     added = scene[:0]
+    rim = torch.zeros(0)
     changed = torch.zeros(len(scene), dtype=torch.bool)
     for paint in paints:
         unseen_paint = paint
@@ -136,6 +139,7 @@ def lay_discs(goal: PaintGoal, gap: float) -> DiscLayout:
         discs = place_discs(scene, unseen_paint, _DISC_COLOR_RMS, gap, cleared)
         cleared = discs.scene
         added = concatenate([added, discs.added])
+        rim = torch.cat([rim, discs.rim])
         changed[discs.moved] = True
     for paint in paints:
         box = box_of(paint.mask, paint.camera)
@@ -157,7 +161,7 @@ def lay_discs(goal: PaintGoal, gap: float) -> DiscLayout:
     logits = torch.where(faded, ADDED_LOGIT, cleared.logit_opacities)
     cleared = replace(cleared, logit_opacities=logits)
     ended, added = solve_colors(cleared, rows, added, goal.views, goal.behind[rows])
-    return DiscLayout(scene, ended, rows, added, gap)
+    return DiscLayout(scene, ended, rows, added, rim, gap)
 
 
 def views_around_paint(
@@ -309,7 +313,9 @@ def paint_gdf(
         gdf = replace(recolored, region=Region(name, members, score), field=field, added=start, anchors=None)
     else:
         gdf = Gdf(name, Region(name, members, score), field, fingerprint(scene), added=start)
-    return anchor_added(gdf, scene, pushes=True)
+    pushes = PUSHED_SHAPE if recolored is not None else PUSHED_SHAPE | {"color"}
+    gdf = anchor_added(gdf, scene, pushes)
+    return gdf if gdf.anchors is None else replace(gdf, anchors=replace(gdf.anchors, rim=laid.rim))
 
 
 def _scaled_recolor_offsets(recolored: Gdf, members: Tensor, end: Tensor, knots: Tensor) -> Tensor:

@@ -19,7 +19,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from progdf.compose.follow import FOLLOWED, banded_followers, find_followers, state_scene
+from progdf.compose.follow import (
+    COLORS,
+    FOLLOWED,
+    Followers,
+    banded_followers,
+    find_followers,
+    find_rims,
+    state_scene,
+)
+from progdf.compose.layers import KINDS
+from progdf.compose.overlap import ARRANGED, find_paint
 from progdf.compose.reference import coverage
 from progdf.errors import ProgdfError
 from progdf.field.baked import AttributeBases, GradeForm
@@ -152,9 +162,8 @@ def pack(
             for gdf, rows in zip(gdfs, inside, strict=True)
         ],
         "surface": _surface(arrays, scene, gdfs, place, inside, exact),
-        "sphere": [
-            _numbers(part.flatten()) for part in sphere(math.isqrt(kept + 1) - 1, torch.device("cpu"))
-        ],
+        "paint": _paint(arrays, scene, gdfs, place, inside, kept, exact),
+        "sphere": _sphere(kept),
     }
     text = json.dumps(header, ensure_ascii=True, allow_nan=False, separators=(",", ":")).encode()
     return Packed(len(text).to_bytes(4, "little") + text + b"".join(arrays.parts), decoded_scene)
@@ -174,6 +183,7 @@ def _scene(
     moved = {name for gdf in gdfs for name in gdf.field.attributes}
     if any(gdf.anchors is not None for gdf in gdfs):
         moved.update(FOLLOWED)
+        moved.update(ARRANGED)
     attributes: dict[str, Any] = {}
     changed: dict[str, Any] = {"shN": torch.zeros_like(scene.shN)}
     changed["logit_opacities"] = torch.full_like(scene.logit_opacities, _UNSEEN_LOGIT)
@@ -221,22 +231,111 @@ def _surface(
     followers = find_followers(gdfs, len(scene))
     if followers is None:
         return None
-    states, parts = state_scene(scene, gdfs, followers)
+    states = _states(
+        arrays, scene, gdfs, place, inside, followers=followers, names=FOLLOWED, kept=0, exact=exact
+    )
+    return {**states, "banded": len(banded_followers(scene, gdfs, followers)) > 0}
+
+
+def _paint(
+    arrays: Arrays,
+    scene: Gaussians,
+    gdfs: Sequence[Gdf],
+    place: NDArray[np.int64],
+    inside: Sequence[Tensor],
+    kept: int,
+    exact: bool,
+) -> dict[str, Any] | None:
+    """Append what the order of painted layers needs, see `progdf.compose.overlap`; return its header entry.
+
+    Args:
+        arrays: the container's arrays
+        scene: the extended scene
+        gdfs: its edits
+        place: position of each row on the page. [N]
+        inside: members of each edit in the page's order. [M] each
+        kept: number of SH coefficients above the first
+        exact: store float32
+    """
+    paint = find_paint(scene, gdfs)
+    if paint is None:
+        return None
+    members = np.empty(len(paint), np.int32)
+    for edit in np.unique(paint.edits).tolist():
+        page = np.empty(len(inside[edit]), np.int32)
+        page[inside[edit].numpy()] = np.arange(len(page))
+        mine = paint.edits == edit
+        members[mine] = page[paint.members[mine]]
+    pairs = []
+    for (upper, lower), pair in paint.pairs.items():
+        parts = {name: arrays.add(_small(values)) for name, values in vars(pair).items()}
+        pairs.append({"upper": upper, "lower": lower, **parts})
+    found = find_rims(gdfs, len(scene), paint)
+    tints = None
+    if found is not None:
+        tints = _states(
+            arrays, scene, gdfs, place, inside, followers=found, names=COLORS, kept=kept, exact=exact
+        )
+    return {
+        "rows": arrays.add(place[paint.rows].astype(np.int32)),
+        "edits": arrays.add(paint.edits.astype(np.int32)),
+        "members": arrays.add(members),
+        "rim": arrays.add(_small(paint.rim)),
+        "outward": arrays.add(_small(paint.outward)),
+        "pairs": pairs,
+        "tints": tints,
+    }
+
+
+def _small(values: NDArray[Any]) -> NDArray[Any]:
+    """Return numbers in 32 bits."""
+    return values.astype(np.int32 if values.dtype == np.int64 else np.float32)
+
+
+def _states(
+    arrays: Arrays,
+    scene: Gaussians,
+    gdfs: Sequence[Gdf],
+    place: NDArray[np.int64],
+    inside: Sequence[Tensor],
+    followers: Followers,
+    names: Sequence[str],
+    kept: int,
+    exact: bool,
+) -> dict[str, Any]:
+    """Append states and the rows that need them, see `Followers`; return their header entry.
+
+    Args:
+        arrays: the container's arrays
+        scene: the extended scene
+        gdfs: its edits
+        place: position of each row on the page. [N]
+        inside: members of each edit in the page's order. [M] each
+        followers: the rows
+        names: attributes of the states
+        kept: number of SH coefficients above the first
+        exact: store float32
+    """
+    states, parts = state_scene(scene, gdfs, followers, names)
     groups = _groups(len(states), [part.region.members.numpy() for part in parts])
     order = np.argsort(-groups, kind="stable")
     at = np.empty(len(order), np.int64)
     at[order] = np.arange(len(order))
     attributes = {}
-    for name in FOLLOWED:
-        values = _table(getattr(states, name).detach().float()[torch.from_numpy(order)].numpy())
+    for name in names:
+        old = getattr(states, name).detach().float()
+        values = _table((old[:, :kept] if name == "shN" else old)[torch.from_numpy(order)].numpy())
+        if not values.shape[1]:
+            continue
         attributes[name] = [_scene_part(arrays, name, values, exact, True)[0]]
     edits = []
     picks = []
     for gdf, part, members, (_, index) in zip(gdfs, parts, inside, followers.changed, strict=True):
         rows = _ascending(at[part.region.members.numpy()])
         covered = {kind: share[torch.from_numpy(index)] for kind, share in coverage(scene, gdf).items()}
-        shape = {kind: share for kind, share in covered.items() if kind in ("geometry", "opacity")}
-        edits.append(_edit(arrays, part, rows, 0, exact, shape))
+        kinds = {"map", *(KINDS[name] for name in names)}
+        shares = {kind: share for kind, share in covered.items() if kind in kinds}
+        edits.append(_edit(arrays, part, rows, kept, exact, shares))
         page = np.empty(len(members), np.int64)
         page[members.numpy()] = np.arange(len(members))
         picks.append(arrays.add(page[index[rows.numpy()]].astype(np.int32)))
@@ -245,16 +344,20 @@ def _surface(
     return {
         "members": len(order),
         "segments": _segments(groups[order], order, parts),
-        "sh": 0,
+        "sh": kept,
         "attributes": attributes,
         "edits": edits,
-        "sphere": [],
+        "sphere": _sphere(kept),
         "picks": picks,
         "followers": arrays.add(table.astype(np.int32)),
         "weights": arrays.add(followers.weights.astype(np.float32)),
         "pushing": sorted(followers.pushing),
-        "banded": len(banded_followers(scene, gdfs, followers)) > 0,
     }
+
+
+def _sphere(kept: int) -> list[Any]:
+    """Return the directions and weights at which a page grades colors of some SH coefficients."""
+    return [_numbers(part.flatten()) for part in sphere(math.isqrt(kept + 1) - 1, torch.device("cpu"))]
 
 
 def _finite(scene: Gaussians) -> Gaussians:
@@ -341,6 +444,7 @@ def _edit(
     record: dict[str, Any] = {
         "name": gdf.name,
         "recorded": list(gdf.field.recorded),
+        "pushes": [] if gdf.anchors is None else sorted(gdf.anchors.pushes),
         "knots": _numbers(gdf.field.knots),
         "attributes": {
             name: _bases(arrays, name, bases, order, widths.get(name, bases.end_offset.shape[1]), exact)

@@ -30,6 +30,7 @@ MODULES = (
     "data",
     "grade",
     "follow",
+    "paint",
     "compose",
     "sort",
     "renderer",

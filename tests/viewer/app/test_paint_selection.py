@@ -174,7 +174,7 @@ def test_object_is_removed_without_its_paint(desk: Desk) -> None:
     document = desk.documents.get()
     loaded = load_gdf(document.gdf_paths[1], document.original)
     assert loaded.anchors is not None
-    assert loaded.anchors.pushes, "the file keeps this"
+    assert loaded.anchors.leaves_paint, "the file keeps this"
 
 
 def test_removed_paint_is_erased_and_what_it_pushed_returns(desk: Desk) -> None:

@@ -26,7 +26,7 @@ from progdf.gaussians import ATTRIBUTES, Gaussians, pack
 from progdf.gdf.file import Gdf, anchor_added, load_gdf, save_gdf
 from progdf.rasterize import render
 from tests.helpers.draws import Draws
-from tests.helpers.edits import curved_field, edit_of, growing, painted, some_rows
+from tests.helpers.edits import curved_field, edit_of, growing, painted, rimmed, some_rows
 from tests.helpers.scenes import random_gaussians
 from tests.helpers.sessions import bear_files, full_view, saved_session
 from tests.helpers.stacks import Stack, many_edits
@@ -175,7 +175,8 @@ def test_page_computes_every_attribute_like_compose_for_every_rule(
         edit_of(scene, some_rows(scene, 150, 2), curved_field(150, 2, 14 + 3 * len(scene.shN[0])), "shirt"),
         graded(scene, "warm", 2, 3),
         graded(scene, "table", 0, 4),
-        painted(scene, 20, 9),
+        rimmed(painted(scene, 20, 9), 1),
+        rimmed(painted(scene, 40, 12, "heart"), 2),
         anchor_added(growing(scene, some_rows(scene, 40, 6), 15, 6, "grown"), scene),
     ]
     document, view = document_of(scene, gdfs)

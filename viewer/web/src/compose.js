@@ -2,6 +2,7 @@
 // edits are adjacent and composed together, as a segment.
 
 import { FOLLOWED, Surface } from "./follow.js";
+import { ARRANGED, PaintOrder } from "./paint.js";
 import { GradedColors, findSegment } from "./grade.js";
 
 export const WIDTHS = { means: 3, log_scales: 3, quats: 4, logit_opacities: 1, sh0: 3 };
@@ -27,6 +28,7 @@ class Edit {
       };
     }
     this.kinds = new Set(Object.keys(record.attributes).map((name) => KINDS[name]));
+    this.pushes = new Set(record.pushes);  // kinds of change that make way for paint
     this.coverage = {};
     for (const [kind, part] of Object.entries(record.coverage ?? {})) this.coverage[kind] = container.real(part);
     this.grade = record.grade && {
@@ -62,9 +64,11 @@ export class Composer {
     this.widths = { ...WIDTHS, shN: 3 * header.sh };
     this.before = {};
     this.after = {};
-    const follows = header.surface || header.followers;
+    this.moving = new Set(this.edits.flatMap((edit) => Object.keys(edit.attributes)));
+    const follows = header.surface || (header.followers && header.attributes.means);
     const followed = header.surface?.banded && header.sh ? [...FOLLOWED, "shN"] : FOLLOWED;
-    this.moving = new Set([...this.edits.flatMap((edit) => Object.keys(edit.attributes)), ...(follows ? followed : [])]);
+    for (const name of follows ? followed : []) this.moving.add(name);
+    for (const name of header.paint ? ARRANGED : []) this.moving.add(name);
     for (const name of this.moving) {
       for (const each of [name, PARTNERS[name]]) {
         if (!each || this.before[each]) continue;
@@ -81,12 +85,17 @@ export class Composer {
         header.surface, container, new Composer(container.within(header.surface)),
         Math.sqrt(header.sh + 1) - 1, header.sphere[1],
       ) : null;
+    const { paint } = header;
+    this.paint = paint
+      ? new PaintOrder(paint, container, paint.tints && new Composer(container.within(paint.tints))) : null;
     const following = Array.from({ length: this.surface?.count ?? 0 }, (_, f) => f);
     this.segments = header.segments.map(([rows, edits]) => {
       const followers = following.filter((f) => this.surface.row(f) >= first && this.surface.row(f) < first + rows);
+      const paints = this.paint?.touches(first, rows);
       const names = [...this.moving].filter((name) =>
-        (followers.length && followed.includes(name)) || edits.some((edit) => this.edits[edit].attributes[name]));
-      const segment = { first, rows, names, followers, members: {}, effects: [], maps: [] };
+        (paints && ARRANGED.includes(name)) || (followers.length && followed.includes(name)) ||
+        edits.some((edit) => this.edits[edit].attributes[name]));
+      const segment = { first, rows, names, followers, paints, members: {}, effects: [], maps: [] };
       for (const edit of edits) {
         segment.members[edit] = known[edit];
         known[edit] += rows;
@@ -106,19 +115,23 @@ export class Composer {
       ({ ...layer, effect: JSON.stringify([layer.edit, layer.strength, layer.gains, layer.paint]) }));
     const ranges = [], names = new Set(), again = blend !== this.blend;
     this.blend = blend;
-    const surfaceMoved = this.surface?.update(active, blend);
+    const surfaceMoved = this.surface?.update(active, blend), paintMoved = this.paint?.update(active, blend);
+    const redone = [];
     for (const segment of this.segments) {
       const stack = active.filter((layer) => layer.edit in segment.members), { effects, first, rows } = segment;
       let same = 0;
       if (!again) while (same < stack.length && stack[same].effect === effects[same]) same++;
-      if (same === stack.length && same === effects.length && !(surfaceMoved && segment.followers.length)) continue;
+      const depends = (surfaceMoved && segment.followers.length) || (paintMoved && segment.paints);
+      if (same === stack.length && same === effects.length && !depends) continue;
       this.#compose(segment, stack, same);
-      for (const f of segment.followers) this.surface.carry(this.after, f);
+      redone.push(segment);
       segment.effects = stack.map((layer) => layer.effect);
       for (const name of segment.names) names.add(name);
       if (ranges.at(-1)?.[1] === first) ranges.at(-1)[1] = first + rows;
       else ranges.push([first, first + rows]);
     }
+    this.paint?.arrange(this.after, redone);
+    for (const { followers } of redone) for (const f of followers) this.surface.carry(this.after, f);
     return ranges.length ? { ranges, names: [...names] } : null;
   }
 
@@ -147,14 +160,41 @@ export class Composer {
       const width = this.widths[name], total = totals[name];
       const before = this.before[name].subarray(first * width, (first + rows) * width);
       if (divisors) for (let j = 0; j < total.length; j++) total[j] /= divisors[Math.floor(j / width)];
+      this.#push(segment, stack, name, total);
       for (let j = 0; j < total.length; j++) total[j] += before[j];
     }
+  }
+
+  // Adds the largest change by which a layer makes way for its paint.
+  #push(segment, stack, name, total) {
+    const { rows } = segment, width = this.widths[name], kind = KINDS[name];
+    const pushing = stack.filter(({ edit, gains }) =>
+      this.edits[edit].pushes.has(kind) && this.edits[edit].attributes[name] && gains[kind] !== 0);
+    if (!pushing.length) return;
+    const largest = new Float32Array(total.length).fill(-0);
+    const [offsets, levels] = this.scratch.map((numbers) => numbers.subarray(0, rows * width));
+    for (const layer of pushing) {
+      const member = segment.members[layer.edit], gain = fround(layer.gains[kind]);
+      this.edits[layer.edit].offsets(name, layer.strength, member * width, offsets, levels);
+      for (let i = 0; i < rows; i++) {
+        const factor = (layer.weights ? layer.weights[member + i] : 1) * gain;
+        let before = 0, now = 0;
+        for (let j = i * width; j < (i + 1) * width; j++) {
+          offsets[j] *= factor;
+          now += offsets[j] ** 2;
+          before += largest[j] ** 2;
+        }
+        if (now >= before) for (let j = i * width; j < (i + 1) * width; j++) largest[j] = offsets[j];
+      }
+    }
+    for (let j = 0; j < total.length; j++) total[j] += largest[j];
   }
 
   #add(segment, stack, at, totals) {
     const layer = stack[at], edit = this.edits[layer.edit], member = segment.members[layer.edit], { rows } = segment;
     const { weights } = layer, held = clampedStrength(layer);
-    const moved = segment.names.filter((name) => edit.attributes[name] && layer.gains[KINDS[name]] !== 0);
+    const moved = segment.names.filter((name) =>
+      edit.attributes[name] && layer.gains[KINDS[name]] !== 0 && !edit.pushes.has(KINDS[name]));
     const colors = moved.filter((name) => KINDS[name] === "color");
     const hides = at > 0 && (this.blend === "over" || this.blend === "adjust");
     const map = hides && this.blend === "adjust" && edit.grade && colors.length
@@ -180,7 +220,8 @@ export class Composer {
 
   // Prepares a grade above other layers: the rows that they changed, their summed bands, and the graded colors.
   #graded(segment, stack, at, colors, totals) {
-    const layer = stack[at], edit = this.edits[layer.edit], below = stack.slice(0, at), { first } = segment;
+    const layer = stack[at], edit = this.edits[layer.edit], { first } = segment;
+    const below = stack.slice(0, at).filter((each) => !this.edits[each.edit].pushes.has("color"));
     const key = [...below.map((each) => each.effect), JSON.stringify(layer.paint), ...colors].join();
     if (segment.maps[at]?.key === key && segment.maps[at].edit === edit) return segment.maps[at];
     const weightOf = (each, i) => each.weights?.[segment.members[each.edit] + i] ?? 1, rows = [];
@@ -222,7 +263,8 @@ export class Composer {
 
   // Returns max(1, Σ m s) over the layers with this kind of change; null if it is 1 everywhere.
   #divisors({ rows, members }, all, kind) {
-    const stack = all.filter((layer) => this.edits[layer.edit].kinds.has(kind));
+    const blends = ({ kinds, pushes }) => kinds.has(kind) && !pushes.has(kind);
+    const stack = all.filter((layer) => blends(this.edits[layer.edit]));
     if (stack.reduce((sum, layer) => sum + Math.min(layer.strength, 1), 0) <= 1 - 1e-6) return null;
     const sums = new Float32Array(rows);
     for (const layer of stack) {

@@ -10,7 +10,8 @@ const C3 = [
   -0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154, -0.4570457994644658,
   1.445305721320277, -0.5900435899266435,
 ];
-const MIN_DRAWN_OPACITY = 1 / 255, MIN_OPACITY = 1e-30;
+export const MIN_OPACITY = 1e-30;
+const MIN_DRAWN_OPACITY = 1 / 255;
 
 export class Surface {
   // `states`: composer of the rows that others follow; `degree`: SH degree of the page; `inverse`: matrix from the

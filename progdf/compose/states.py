@@ -1,0 +1,309 @@
+"""States of rows on which other rows depend, composed beside the scene by `Composer`.
+
+The rows are those that follow a surface (`progdf.compose.follow`), and those of painted layers
+(`progdf.compose.overlap`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from progdf.gaussians import Gaussians
+from progdf.gdf.file import Gdf
+from progdf.threads import run_chunks
+
+from .follow import (
+    COLORS,
+    FOLLOWED,
+    Followers,
+    banded_followers,
+    find_rims,
+    mean_quats,
+    pack_shapes,
+    state_scene,
+    turn_bands,
+)
+from .follow_kernel import (
+    Shapes,
+    carry_fast,
+    gather_shapes,
+    measure_motions,
+    release_centers,
+    rest_motions,
+)
+from .layers import Change, Layer
+from .overlap import ARRANGED, PaintRows, arrange, paint_layers
+from .reference import Coverage
+
+Floats = NDArray[np.float32]
+Rows = NDArray[np.int64]
+
+_CARRIED_ROWS = 2_048  # rows that follow, per task of a thread
+
+
+class StateComposer(Protocol):
+    """The part of `Composer` that composes states."""
+
+    gaussians: Gaussians
+
+    def update(self, layers: Sequence[Layer], blend: str = "normalized") -> Change:
+        """Set `gaussians` to the scene under some layers."""
+
+    def shapes(self) -> Shapes:
+        """Return the followed attributes of `gaussians`."""
+
+
+MakeComposer = Callable[[Gaussians, Sequence[Gdf], Coverage], StateComposer]
+"""Constructor of `Composer`."""
+
+
+class States:
+    """States of rows that other rows need, see `Followers`, composed like a scene of their own.
+
+    Args:
+        scene: the extended scene
+        gdfs: its edits
+        followers: the rows and their states
+        coverage_of: function from the index of an edit to its coverage
+        names: attributes of the states that are composed
+        make: constructor of the composer
+    """
+
+    def __init__(
+        self,
+        scene: Gaussians,
+        gdfs: Sequence[Gdf],
+        followers: Followers,
+        coverage_of: Callable[[int], Mapping[str, Tensor]],
+        names: Sequence[str],
+        make: MakeComposer,
+    ) -> None:
+        self.followers = followers
+        self.before, self._gdfs = state_scene(scene, gdfs, followers, names)
+        self._index = {id(gdf): edit for edit, gdf in enumerate(self._gdfs)}
+        self._coverage_of = coverage_of
+        self.composer = make(self.before, self._gdfs, self._covers)
+        self._sliced: dict[
+            int, tuple[Tensor, int, Tensor]
+        ] = {}  # by edit: weights, their version, and a part
+
+    def update(self, stack: Sequence[tuple[int, Layer]], blend: str) -> Rows:
+        """Compose the states; return those that may have changed."""
+        changed = self.followers.changed
+        layers = [self._layer(edit, layer) for edit, layer in stack if len(changed[edit][0])]
+        return self.composer.update(layers, blend).rows
+
+    def _layer(self, edit: int, layer: Layer) -> Layer:
+        """Return a layer restricted to the states."""
+        weights = layer.weights
+        if weights is None:
+            return replace(layer, gdf=self._gdfs[edit])
+        known = self._sliced.get(edit)
+        if known is None or known[0] is not weights or known[1] != weights._version:
+            part = weights[torch.from_numpy(self.followers.changed[edit][1])]
+            known = weights, weights._version, part
+            self._sliced[edit] = known
+        return replace(layer, gdf=self._gdfs[edit], weights=known[2])
+
+    def _covers(self, _: Gaussians, gdf: Gdf) -> Mapping[str, Tensor]:
+        """Return the coverage that an edit of the states has in the scene."""
+        edit = self._index[id(gdf)]
+        members = torch.from_numpy(self.followers.changed[edit][1])
+        return {kind: share[members] for kind, share in self._coverage_of(edit).items()}
+
+
+class Surface:
+    """States of the rows that others follow, see `Followers`, composed like a scene of their own.
+
+    Only this class writes the attributes in `FOLLOWED` of pushed rows. Those of added rows are first written
+    by the composer, without following.
+
+    Args:
+        scene: the extended scene
+        gdfs: its edits
+        followers: see `find_followers`
+        coverage_of: function from the index of an edit to its coverage
+        make: constructor of the composer of the states
+    """
+
+    def __init__(
+        self,
+        scene: Gaussians,
+        gdfs: Sequence[Gdf],
+        followers: Followers,
+        coverage_of: Callable[[int], Mapping[str, Tensor]],
+        make: MakeComposer,
+    ) -> None:
+        self.followers = followers
+        self._states = States(scene, gdfs, followers, coverage_of, FOLLOWED, make)
+        states = self._states.before
+        rows = torch.from_numpy(followers.rows)
+        self._own = pack_shapes(scene, rows).numpy()  # the rows without following. [F,11]
+        self._drawn = scene.means[rows].float().numpy()  # their centers in the last picture. [F,3]
+        self._before = pack_shapes(states).numpy()
+        self._motions = rest_motions(self._before)
+        self._is_anchor = np.zeros(len(states), bool)
+        self._is_anchor[followers.anchors] = True
+        self._follows = np.ones(len(gdfs) + 1, bool)  # by edit + 1: its rows follow; the first: pushed rows
+        self.banded = banded_followers(scene, gdfs, followers)
+        """Indices of the following rows with higher SH bands. [B]"""
+        self._bands = scene.shN[rows].float()  # bands of the rows without following. [F,K,3]
+        self._dependents: dict[int, Rows] = {}
+
+    def dependents(self, edit: int) -> Rows:
+        """Return `Followers.dependents`, cached."""
+        if edit not in self._dependents:
+            self._dependents[edit] = self.followers.dependents(edit)
+        return self._dependents[edit]
+
+    def release(self, shapes: Shapes, index: Rows) -> None:
+        """Write the centers of added rows as they are without following, before the composer moves them.
+
+        Args:
+            shapes: the composed scene, see `Composer.shapes`; updated in place
+            index: indices of the rows, see `Followers`. [F]
+        """
+        release_centers(shapes[0], index, self.followers.rows, self._own)
+
+    def carry(
+        self,
+        shapes: Shapes,
+        index: Rows,
+        added: Rows,
+        stack: Sequence[tuple[int, Layer]],
+        blend: str,
+    ) -> float:
+        """Write the rows that follow; return the largest movement of a center.
+
+        Args:
+            shapes: the composed scene, see `Composer.shapes`; updated in place
+            index: indices of the rows to write, see `Followers`. [F]
+            added: indices of the added rows among them that the composer has written. [G]
+            stack: active layers with the index of their edit, lowest first
+            blend: one of `BLENDS`
+        """
+        followers = self.followers
+        changed = self._states.update(stack, blend)
+        states = self._states.composer.shapes()
+        measure_motions(self._motions, changed[self._is_anchor[changed]], self._before, states)
+        gather_shapes(self._own, added, shapes, followers.rows)
+        self._follows[1:] = False
+        self._follows[[edit + 1 for edit, _ in stack]] = True
+        table = followers.rows, followers.edits, followers.own, followers.anchors, followers.weights
+        count = 1 + len(index) // _CARRIED_ROWS
+        cuts = [len(index) * part // count for part in range(count + 1)]
+        moves = run_chunks(
+            lambda chunk: carry_fast(
+                shapes,
+                (self._own, self._drawn),
+                index[cuts[chunk] : cuts[chunk + 1]],
+                table,
+                self._follows,
+                (self._before, states),
+                self._motions,
+            ),
+            count,
+        )
+        return math.sqrt(max(moves))
+
+    def turn(self, bands: Floats, index: Rows, recolored: Rows) -> None:
+        """Turn the higher SH bands of following rows.
+
+        Args:
+            bands: bands of the composed scene, updated in place. [N,3K]
+            index: indices of the rows to write. [B]
+            recolored: those of them that the composer has written
+        """
+        followers = self.followers
+        width = self._bands.shape[1:]
+        self._bands[recolored] = torch.from_numpy(bands[followers.rows[recolored]]).reshape(-1, *width)
+        moves, turns, *_ = self._motions
+        anchors = followers.anchors[index]
+        weights = followers.weights[index]
+        is_moved = (moves[anchors, 0] & (weights > 0)).any(axis=1) & self._follows[followers.edits[index] + 1]
+        mean = mean_quats(torch.from_numpy(turns[anchors, :4]), torch.from_numpy(weights)[..., None])
+        turned = turn_bands(self._bands[index], mean, torch.from_numpy(is_moved))
+        bands[followers.rows[index]] = turned.flatten(1).numpy()
+
+
+class PaintOrder:
+    """Rows of painted layers that depend on other layers, with what `arrange` needs.
+
+    Args:
+        scene: the extended scene
+        gdfs: its edits
+        paint: see `find_paint`
+        coverage_of: function from the index of an edit to its coverage
+        make: constructor of the composer of the states
+    """
+
+    def __init__(
+        self,
+        scene: Gaussians,
+        gdfs: Sequence[Gdf],
+        paint: PaintRows,
+        coverage_of: Callable[[int], Mapping[str, Tensor]],
+        make: MakeComposer,
+    ) -> None:
+        self.paint = paint
+        self._painted = frozenset(np.unique(paint.edits).tolist())
+        self._tints = np.zeros((len(paint), 3))
+        found = find_rims(gdfs, len(scene), paint)
+        self._states = None if found is None else States(scene, gdfs, found, coverage_of, COLORS, make)
+
+    def names(self, changed: Collection[int], rows: Rows) -> Collection[str]:
+        """Return the attributes of rows of paint to write when some edits change."""
+        if not len(rows):
+            return ()
+        return ARRANGED if self.paint.pairs and not self._painted.isdisjoint(changed) else ("sh0",)
+
+    def partners(self, changed: frozenset[int]) -> frozenset[int]:
+        """Return the changed edits, and the painted ones whose place in the order depends on them."""
+        return changed.union(*(self.paint.partners(edit) for edit in changed & self._painted))
+
+    def dependents(self, edit: int) -> Rows:
+        """Return the rows that may change with an edit, besides its members. Sorted"""
+        chosen = []
+        if edit in self._painted:
+            partners = list(self.paint.partners(edit) - {edit})
+            chosen.append(self.paint.rows[np.isin(self.paint.edits, partners)])
+        if self._states is not None:
+            chosen.append(self._states.followers.dependents(edit))
+        return np.unique(np.concatenate(chosen)) if chosen else np.zeros(0, np.int64)
+
+    def arrange(
+        self,
+        values: Mapping[str, Floats],
+        stack: Sequence[tuple[int, Layer]],
+        blend: str,
+        rows: Rows,
+        names: Collection[str],
+    ) -> None:
+        """Put rows of paint into the order of layers.
+
+        Args:
+            values: attributes of the composed scene; updated in place. [N,c] each
+            stack: active layers with the index of their edit, lowest first
+            blend: one of `BLENDS`
+            rows: indices of the rows to write, see `PaintRows`. [K]
+            names: attributes to write
+        """
+        if self._states is not None and len(self._states.update(stack, blend)):
+            self._measure_tints(self._states)
+        arrange(self.paint, paint_layers(stack), self._tints, values, rows, names)
+
+    def _measure_tints(self, states: States) -> None:
+        """Measure how other layers change the colors of the anchors of rims."""
+        followers = states.followers
+        change = states.composer.gaussians.sh0 - states.before.sh0.float()
+        changes = change.reshape(-1, 3).double().numpy()
+        tints = (followers.weights[..., None] * changes[followers.anchors]).sum(axis=1)
+        self._tints[np.searchsorted(self.paint.rows, followers.rows)] = tints
