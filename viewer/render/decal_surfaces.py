@@ -60,13 +60,17 @@ class _Latest(Generic[_T]):
 
     def finish(self, key: object, make: Callable[[], _T]) -> _T:
         """Return the result for a key; compute it at once if needed."""
-        value = self._value if key == self._key else None
-        if value is None:
+        value = self._value
+        if value is None or not self.has(key):
             value = make()
             self.drop()
             self._key = key
             self._value = value
         return value
+
+    def has(self, key: object) -> bool:
+        """Return True if the result for a key is available."""
+        return key == self._key and self._value is not None
 
     @property
     def is_busy(self) -> bool:
@@ -107,6 +111,8 @@ class DecalSurfaces:
             at_once: wait for it
         """
         key = (camera.viewmat.numpy().tobytes(), camera.K.numpy().tobytes(), camera.width, camera.height)
+        if not self._depth.has(key):
+            self._laid.drop()  # the pointer must not wait for it
 
         def make() -> DepthPicture:
             return depth_picture(scene, camera)
