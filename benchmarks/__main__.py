@@ -40,13 +40,14 @@ BENCHES: dict[str, str] = {
     "frames": "benchmarks.viewer.frames:tables",
     "moving": "benchmarks.viewer.moving:tables",
     "popping": "benchmarks.viewer.popping:tables",
+    "painting": "benchmarks.viewer.painting:tables",
     "window": "benchmarks.viewer.window:tables",
     "warps": "benchmarks.warps:tables",
     "pictures": "benchmarks.pictures:tables",
     "spill": "benchmarks.spill:tables",
 }
 
-PAGE = ("training", "field", "viewer", "rasterize", "warp", "moving", "popping", "frames", "hard")
+PAGE = ("training", "field", "viewer", "rasterize", "warp", "moving", "popping", "painting", "frames", "hard")
 """Benchmarks of docs/speed-and-error.md."""
 
 ROOT = Path(__file__).parents[1]
@@ -107,6 +108,7 @@ def main(argv: Sequence[str]) -> int:
         "frames",
         "moving",
         "popping",
+        "painting",
         "window",
         "warps",
         "pictures",

@@ -120,6 +120,16 @@ class Mouse:
             self.wait_pyramid()
         self.wait_sharp()
 
+    def rest(self, seconds: float) -> None:
+        """Draw the frames that are due without input, for this long."""
+        began = time.perf_counter()
+        while time.perf_counter() - began < seconds:
+            wait = self.main_view.next_frame_delay()
+            if wait is None:
+                return
+            time.sleep(min(wait, seconds))
+            self.frame(seconds=max(wait, _FRAME_S), event=False)
+
     def settle(self) -> None:
         """Draw frames until no further one is due immediately."""
         while self.main_view.next_frame_delay() == 0.0:

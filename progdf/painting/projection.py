@@ -7,7 +7,7 @@ small squares, the nearest last. This is fast enough for a turning camera and ne
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from scipy import ndimage
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.rasterize import render
+from progdf.surface.find import find_surface
 
 from .strokes import Floats, Pixels, painted_box
 
@@ -24,6 +25,7 @@ OPAQUE = 0.5
 """Opacity from which a pixel has a surface."""
 
 _SAME_SURFACE_DEVIATIONS = 2.0  # paint this far behind the blended depth lies on the visible surface
+_NEAR_PX = 5  # window of the largest deviation near a pixel, pixels
 _MEDIAN_PX = 9  # window of the median of depths, pixels
 _SMOOTH_SIGMA_PX = 5.0  # sigma of the Gaussian filter over depths, pixels
 # size of a square relative to the distance of neighboring points, so that rounding leaves no holes
@@ -38,8 +40,10 @@ class ViewSurface:
 
     camera: Camera
     depth: Floats  # blended camera z, world units; infinite where there is no surface. [H,W]
-    deviation: Floats  # standard deviation of the depths of the light within a pixel, world units. [H,W]
+    # standard deviation of the depths of the light within a pixel, the largest near it, world units. [H,W]
+    deviation: Floats
     opacity: Floats  # 0 where there is no surface. [H,W]
+    is_model: bool = False  # the depth is that of a smooth model
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +78,21 @@ def view_surface(scene: Gaussians, camera: Camera) -> ViewSurface:
     mean = light[..., 0] / total
     variance = np.maximum(light[..., 1] / total - mean * mean, 0.0)
     depth = np.where(is_surface, mean + np.float32(middle), np.float32(np.inf))
-    return ViewSurface(
-        camera, depth, np.sqrt(variance), np.where(is_surface, opacity, 0.0).astype(np.float32)
-    )
+    deviation = ndimage.maximum_filter(np.sqrt(variance), _NEAR_PX)
+    return ViewSurface(camera, depth, deviation, np.where(is_surface, opacity, 0.0).astype(np.float32))
+
+
+def fitted_surface(scene: Gaussians, seen: ViewSurface, painted: NDArray[np.bool_]) -> ViewSurface:
+    """Return the surface of a view with the depth of the model that discs of this paint will lie on.
+
+    Args:
+        scene: the scene on screen
+        seen: surface that the view shows
+        painted: painted pixels. [H,W]
+    """
+    model = find_surface(scene, seen.camera, painted)
+    depth = np.where(np.isfinite(seen.depth), model.depth, np.inf).astype(np.float32)
+    return replace(seen, depth=depth, is_model=True)
 
 
 def paint_points(pixels: Pixels, surface: ViewSurface) -> PaintPoints:
@@ -100,12 +116,12 @@ def paint_points(pixels: Pixels, surface: ViewSurface) -> PaintPoints:
         return PaintPoints(none, none, none[:, 0], np.zeros((0, 4), np.uint8), np.zeros((2, 0), np.intp))
     nearest = ndimage.distance_transform_edt(~is_surface, return_distances=False, return_indices=True)
     smooth = depth[tuple(nearest)]
-    for window in ((1, _MEDIAN_PX), (_MEDIAN_PX, 1)):
+    for window in () if surface.is_model else ((1, _MEDIAN_PX), (_MEDIAN_PX, 1)):
         smooth = ndimage.median_filter(smooth, window, mode="nearest")
     rounded = ndimage.gaussian_filter(smooth, _SMOOTH_SIGMA_PX, mode="nearest")
     # within the light's own depth, differences are noise; beyond it, they are edges
     is_noise = np.abs(rounded - smooth) <= surface.deviation[part]
-    smooth = np.where(is_noise, rounded, smooth)
+    smooth = np.where(is_noise & (not surface.is_model), rounded, smooth)
     places = _unproject(rounded, surface.camera, left, top)
     along_rows, along_columns = np.gradient(places, axis=(0, 1)) if min(rounded.shape) > 1 else (places,) * 2
     normals = np.cross(along_rows, along_columns)[rows, columns]
@@ -117,6 +133,18 @@ def paint_points(pixels: Pixels, surface: ViewSurface) -> PaintPoints:
     spacings = smooth[rows, columns] / np.float32(_focal_px(surface.camera))
     where = np.stack([rows + top, columns + left])
     return PaintPoints(positions, normals, spacings, pixels[where[0], where[1]], where)
+
+
+def thin_points(points: PaintPoints) -> PaintPoints:
+    """Return a quarter of the points, of every second row and column, as larger squares."""
+    kept = ~(points.places & 1).any(axis=0)
+    return PaintPoints(
+        points.positions[kept],
+        points.normals[kept],
+        2.0 * points.spacings[kept],
+        points.colors[kept],
+        points.places[:, kept],
+    )
 
 
 def draw_points(points: PaintPoints, camera: Camera, surface: ViewSurface | None) -> Pixels:

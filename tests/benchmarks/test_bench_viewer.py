@@ -15,7 +15,7 @@ import torch
 from benchmarks import __main__ as front
 from benchmarks.table import Table
 from benchmarks.viewer import frames as bench_frames
-from benchmarks.viewer import moving, popping
+from benchmarks.viewer import moving, painting, popping
 from benchmarks.viewer import slider as bench
 from benchmarks.viewer import window as bench_window
 from benchmarks.viewer.display import missing_tools
@@ -301,3 +301,15 @@ def test_unmeasurable_benchmarks_are_skipped_unless_named(
     assert "window is not measured: nothing here" in capsys.readouterr().err
     with pytest.raises(ProgdfError, match="nothing here"):
         front.main(["window"])
+
+
+@pytest.mark.gl
+def test_painting_benchmark_measures_a_stroke(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(painting, "DABS", 3)
+    monkeypatch.setattr(painting, "TURNS", 2)
+    monkeypatch.setattr(painting, "_REST_S", 0.2)
+    ctx = headless_context()
+    times = painting.measure(ctx, bear(600).gaussians, 12.0, SIZE)
+    ctx.release()
+    assert (len(times.dabs), len(times.turning)) == (3, 2)
+    assert min(*times.dabs, *times.turning, times.press, times.release) > 0.0

@@ -22,7 +22,9 @@ from progdf.gdf.file import ADDED_LOGIT, Gdf, anchor_added, fingerprint
 from progdf.io.images import picture_size
 from progdf.metrics.image import decibels
 from progdf.rasterize import alpha_weights, render
+from progdf.rasterize.engines import activate, color_map
 from progdf.region import Region
+from progdf.sh import rgb_to_sh0
 from progdf.surface.find import find_surface, orbit
 from progdf.terminal import group_digits
 from trainer.editors.pictures import read_edit
@@ -49,6 +51,7 @@ _GAPS_PX = (4.0, 1.0)  # tried distances between discs and the Gaussians pushed 
 _DISC_COLOR_RMS = 0.015  # maximum RMS color error of a disc over its pixels
 _SPILL_COLOR = 1 / 255  # smallest color change beside the paint that counts as caused by pushed Gaussians
 _MIN_SPILL_WEIGHT_PX = 0.5  # with a larger sum of weights in such pixels, a Gaussian may change its color
+_MIN_PAINT_WEIGHT_PX = 1e-3  # with a smaller weight in painted pixels, a Gaussian keeps its color
 _MISSED_COLOR = 0.05  # color error from which a painted pixel counts as missed by recoloring
 _ROUNDING_COLOR = 1.5 / 255  # two 8-bit images may differ by this much through rounding
 _ERROR_SIGMA_PX = 2.0  # sigma of the Gaussian filter over the squared error
@@ -253,14 +256,36 @@ class Recolor:
 
 
 def recolor_paint(goal: PaintGoal) -> Recolor:
-    """Return the colors of the visible Gaussians under the paint that reproduce it best, without discs."""
+    """Return the colors of the visible Gaussians under the paint that reproduce it, without discs.
+
+    Each color lies between the Gaussian's own and the mean of its paint, so that no other hue appears.
+    """
     scene = goal.scene
     weights = torch.zeros(len(scene))
     for view in goal.views:
         weights = torch.maximum(weights, alpha_weights(scene, view.camera, view.covered)[:, 0])
     rows = (weights > _MIN_SPILL_WEIGHT_PX).nonzero()[:, 0]
-    ended, _ = solve_colors(scene, rows, scene[:0], goal.views, goal.behind[rows])
+    solved, _ = solve_colors(scene, rows, scene[:0], goal.views, goal.behind[rows])
+    paint, weights = _mean_colors(goal, rows)
+    towards = (rgb_to_sh0(paint) - scene.sh0[rows]) * (weights > _MIN_PAINT_WEIGHT_PX)
+    change = solved.sh0[rows] - scene.sh0[rows]
+    shares = (change * towards).sum(dim=1) / towards.square().sum(dim=1).clamp_min(1e-12)
+    ended = replace(scene, sh0=scene.sh0.index_add(0, rows, shares.clamp(0.0, 1.0)[:, None] * towards))
     return Recolor(ended, rows)
+
+
+def _mean_colors(goal: PaintGoal, rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the mean color of the painted pixels in which each Gaussian is visible, and its weight there,
+    pixels. [M,3] each"""
+    scene = goal.scene
+    activated = activate(scene)
+    sums = torch.zeros(len(rows), 3)
+    weights = torch.zeros(len(rows), 3)
+    for paint in goal.paints:
+        seen = color_map(activated, paint.camera, (0, 0, paint.camera.width, paint.camera.height), rows)
+        sums += seen.gradient(paint.drawn[..., :3].contiguous())
+        weights += seen.gradient(paint.drawn[..., 3:].expand(-1, -1, 3).contiguous())
+    return sums / weights.clamp_min(_MIN_PAINT_WEIGHT_PX), weights
 
 
 def recolor_gdf(recolored: Recolor, scene: Gaussians, name: str) -> Gdf:

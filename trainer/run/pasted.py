@@ -86,9 +86,11 @@ def paste_decal(options: TrainOptions, setup: TrainingSetup, folder: RunFolder, 
     sheet = contact_sheet(rows, ["projected", "the edit"], labels, title, notes=notes)
     result = write_result(folder, replace(painted.gdf, instruction=instruction, report=about), report, sheet)
     added, pixels, moved = (group_digits(figures[name]) for name in ("added", "pixels", "moved"))
+    made = f"{added} Gaussians added for {pixels} painted pixels, {moved} of the scene moved behind them"
+    if painted.gdf.added is None:
+        made = f"{moved} Gaussians recolored for {pixels} painted pixels"
     log.say(
-        f"{added} Gaussians added for {pixels} painted pixels, {moved} of the scene moved behind them; "
-        f"{view_psnr} dB in the own view, {figures['ring']} dB in the {RING} pixels around it, "
+        f"{made}; {view_psnr} dB in the own view, {figures['ring']} dB in the {RING} pixels around it, "
         f"{side_psnrs['-30']} and {side_psnrs['+30']} dB from 30° to either side"
     )
     log.say(result.line)

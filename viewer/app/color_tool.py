@@ -64,6 +64,7 @@ def press(work: Workspace, pointer: PointerContext) -> Workspace:
     reason = obstacle(work, pointer)
     if reason:
         return with_message(work, f"Cannot paint: {reason}", pointer.now, error=True)
+    pointer.paint.fits.stop()
     view = work.view
     camera = pointer.shown.camera
     surface = pointer.view_surface(camera, pointer.size)
@@ -111,8 +112,8 @@ def release(work: Workspace, pointer: PointerContext) -> Workspace:
     painted = list[PaintedPicture]()
     for picture in work.view.painted:
         if not is_in_view(picture, drag.camera, drag.size):
-            of = pointer.view_surface(picture.camera, picture.size)
-            left = erase_under(picture, stroke.coverage, drag.surface, of)
+            under = pointer.paint_surface(picture)
+            left = erase_under(picture, stroke.coverage, drag.surface, under)
             painted += [left] if _has_paint(left) else []
     own = packed_picture(drag.camera, drag.size, stroke.pixels)
     painted += [own] if _has_paint(own) else []
@@ -148,7 +149,7 @@ def picture_with_paint(work: Workspace, pointer: PointerContext) -> Pixels:
     if not work.view.painted:
         return picture
     visible = pointer.view_surface(camera, pointer.size)
-    above = paint_in_view(work.view.painted, camera, pointer.size, pointer.view_surface, visible)
+    above = paint_in_view(work.view.painted, camera, pointer.size, pointer.paint_surface, visible)
     return composite_over_picture(picture, above)
 
 
@@ -203,7 +204,7 @@ def draw(work: Workspace, pointer: PointerContext) -> None:
     held = imgui.is_any_item_active() or (work.transient.tool.drag is not None and drag is None)
     moves = held or work.glide is not None or work.player.playing
     visible = pointer.known_surface(camera, pointer.size, request=not moves)
-    surface_of = pointer.recent_surface if moves else pointer.view_surface
+    surface_of = pointer.recent_surface if moves else pointer.paint_surface
     texture = pointer.paint.texture(
         painted, drag, camera, pointer.size, (pointer.scene_key, moves), surface_of, visible
     )

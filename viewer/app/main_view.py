@@ -100,6 +100,7 @@ class FramePacer:
         return min(waits, default=None)
 
 
+FIT_POLL_S = 0.25  # seconds between frames while a model of the surface under paint is computed
 FLIGHT_S = 1 / 60  # seconds between frames while flying
 SURFACE_POLL_S = 0.05  # seconds between frames while the surface under a decal or paint is computed
 
@@ -183,7 +184,7 @@ class MainView:
         self.surfaces.drop()
         if engine.scene is not self.engine.scene:
             self.decal_surfaces.drop()
-        self.paint.surfaces.drop()
+        self.paint.drop()
         self.engine = engine
         self.facts = facts
         self.store.replace(with_transient(self.work, live=live))
@@ -216,6 +217,7 @@ class MainView:
         sharpens = self.canvas.next_frame_delay(self._clock)
         waits += [] if sharpens is None else [sharpens]
         waits += [SURFACE_POLL_S] if self.paint.pending else []
+        waits += [FIT_POLL_S] if self.paint.fits.is_busy else []
         film = timeline.next_frame_delay(self.work.player, self.work.view.timeline)
         return self._pace.next_frame_delay(waits if film is None else [*waits, film])
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import lru_cache
 
 import moderngl
@@ -22,6 +23,7 @@ from progdf.painting.projection import (
     draw_points,
     paint_points,
     project_coverage,
+    thin_points,
 )
 from progdf.painting.strokes import (
     NO_BOX,
@@ -35,6 +37,7 @@ from progdf.painting.strokes import (
     painted_box,
     unpack,
 )
+from progdf.threads import StoppedError, stopped_by
 from viewer.camera.view_camera import ViewCamera, to_camera
 from viewer.state.transient import ColorDrag
 from viewer.state.view_state import PaintedPicture
@@ -42,8 +45,8 @@ from viewer.state.view_state import PaintedPicture
 from .picking import run_in_background
 
 Size = tuple[int, int]
-SurfaceOf = Callable[[ViewCamera, Size], ViewSurface]
-"""Function that returns the visible surface of the scene on screen in a view of this size."""
+SurfaceOf = Callable[[PaintedPicture], ViewSurface]
+"""Function that returns the surface under a painted picture."""
 
 _MAX_SURFACES = 20  # surfaces kept, a few megabytes each; a painted view needs one
 
@@ -108,6 +111,71 @@ class SceneSurfaces:
             self._requested = None
 
 
+class FittedSurfaces:
+    """Cache of the model surfaces under painted pictures, computed in another thread, one at a time."""
+
+    def __init__(self) -> None:
+        self._known: OrderedDict[tuple[object, PaintedPicture], ViewSurface] = OrderedDict()
+        self._recent: dict[PaintedPicture, ViewSurface] = {}  # the last model of each picture
+        self._requested: object = None  # key of the model in preparation
+        self._stop = threading.Event()
+        self.is_busy = False
+        """True while a model is computed."""
+        self.count = 0
+        """Number of models computed so far."""
+
+    def get(self, scene: object, picture: PaintedPicture) -> ViewSurface | None:
+        """Return the model under a picture on a scene, None if it is unknown."""
+        return self._known.get((scene, picture))
+
+    def is_requested(self, scene: object, picture: PaintedPicture) -> bool:
+        """Return True if the model is in preparation, or could not be computed."""
+        return self._requested == (scene, picture)
+
+    def recent(self, picture: PaintedPicture) -> ViewSurface | None:
+        """Return the last model under a picture, whatever the strengths were."""
+        return self._recent.get(picture)
+
+    def request(self, scene: object, picture: PaintedPicture, make: Callable[[], ViewSurface]) -> None:
+        """Compute a model in another thread, in place of the one in preparation."""
+        self.stop()
+        key = (scene, picture)
+        self._requested = key
+        self._stop = threading.Event()
+        self.is_busy = True
+        run_in_background(self._compute, key, make, self._stop)
+
+    def stop(self) -> None:
+        """Stop the computation: a stroke needs the processor."""
+        self._stop.set()
+        self._requested = None
+        self.is_busy = False
+
+    def _compute(
+        self, key: tuple[object, PaintedPicture], make: Callable[[], ViewSurface], stop: threading.Event
+    ) -> None:
+        if stop.is_set():
+            return
+        try:
+            with stopped_by(stop), suppress(StoppedError):
+                surface = make()
+                if key == self._requested and not stop.is_set():
+                    self._known[key] = surface
+                    while len(self._known) > _MAX_SURFACES:
+                        self._known.popitem(last=False)
+                    self._recent = {picture: one for (_, picture), one in list(self._known.items())}
+                    self.count += 1
+        finally:
+            if key == self._requested:
+                self.is_busy = False
+
+    def drop(self) -> None:
+        """Forget all models, as another scene is open."""
+        self.stop()
+        self._known.clear()
+        self._recent = {}
+
+
 class PaintOverlay:
     """Texture with the paint of the view on screen. `release` it with the window.
 
@@ -119,6 +187,8 @@ class PaintOverlay:
         self._ctx = ctx
         self.surfaces = SceneSurfaces()
         """Surfaces of the scene on screen."""
+        self.fits = FittedSurfaces()
+        """Models of the surface under painted pictures."""
         self.pending = False
         """True while the surface of the view on screen is computed."""
         self._texture: moderngl.Texture | None = None
@@ -144,10 +214,10 @@ class PaintOverlay:
             camera: the view
             size: its width and height, pixels
             scene: key of the scene on screen
-            surface_of: returns the surfaces of painted views
-            visible: surface of this view, None while it is unknown
+            surface_of: returns the surface under a painted picture
+            visible: surface of this view, None while it is unknown, as in motion; paint is then coarser
         """
-        key = (tuple(painted), drag is not None, camera, size, scene, visible is not None)
+        key = (tuple(painted), drag is not None, camera, size, scene, visible is not None, self.fits.count)
         others = painted
         if drag is not None:
             others = [one for one in painted if not is_in_view(one, camera, size)]
@@ -176,7 +246,7 @@ class PaintOverlay:
         if stroke is not None:
             if pixels[..., 3].any():
                 pixels = erase(pixels, stroke.coverage[part])
-            pixels = composite(pixels, stroke.pixels[part])
+            pixels = composite_part(pixels, stroke.pixels[part])
         viewport = (left, top, right - left, bottom - top)
         self._texture.write(np.ascontiguousarray(pixels).tobytes(), viewport=viewport)
 
@@ -188,7 +258,12 @@ class PaintOverlay:
     def release(self) -> None:
         """Free the texture."""
         self._release_texture()
+        self.drop()
+
+    def drop(self) -> None:
+        """Forget all surfaces, as another scene is open."""
         self.surfaces.drop()
+        self.fits.drop()
 
 
 def changed_box(before: ColorStroke | None, after: ColorStroke | None) -> Box:
@@ -222,16 +297,23 @@ def paint_in_view(
 ) -> Pixels:
     """Return all paint as a view shows it. Arguments as in `PaintOverlay.texture`. [H,W,4] straight RGBA"""
     target = to_camera(camera, *size)
-    image = np.zeros((size[1], size[0], 4), np.uint8)
+    image: Pixels | None = None
     for picture in painted:
         if is_in_view(picture, camera, size):
             above = pixels_of(picture)
         else:
-            points = _points(picture, surface_of(picture.camera, picture.size))
+            points = _points(picture, surface_of(picture), coarse=visible is None)
             above = draw_points(points, target, visible)
-        box = painted_box(above)
-        part = np.s_[box[1] : box[3], box[0] : box[2]]
-        image[part] = composite(image[part], above[part])
+        image = composite_part(image, above) if image is not None else above
+    return np.zeros((size[1], size[0], 4), np.uint8) if image is None else image
+
+
+def composite_part(below: Pixels, above: Pixels) -> Pixels:
+    """Composite straight RGBA over straight RGBA, in time proportional to the painted box. [h,w,4] each"""
+    left, top, right, bottom = painted_box(above)
+    part = np.s_[top:bottom, left:right]
+    image = below.copy()
+    image[part] = composite(below[part], above[part])
     return image
 
 
@@ -263,7 +345,10 @@ def packed_picture(camera: ViewCamera, size: Size, pixels: Pixels) -> PaintedPic
 
 
 @lru_cache(maxsize=_MAX_SURFACES)
-def _points(picture: PaintedPicture, surface: ViewSurface) -> PaintPoints:
+def _points(picture: PaintedPicture, surface: ViewSurface, coarse: bool = False) -> PaintPoints:
+    """Return the paint of a picture as points; `coarse`: a quarter of them, for motion."""
+    if coarse:
+        return thin_points(_points(picture, surface))
     return paint_points(pixels_of(picture), surface)
 
 

@@ -12,15 +12,15 @@ from imgui_bundle import imgui
 
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
-from progdf.painting.projection import ViewSurface, is_apart, view_surface
+from progdf.painting.projection import ViewSurface, fitted_surface, is_apart, view_surface
 from progdf.scene.selection import Surface
 from viewer.camera.view_camera import ViewCamera, half_camera, half_scale, to_camera
 from viewer.render.engine import ViewEngine
-from viewer.render.paint_overlay import PaintOverlay, surface_key
+from viewer.render.paint_overlay import PaintOverlay, pixels_of, surface_key
 from viewer.render.picking import PREPARE_MIN_GAUSSIANS, Surfaces, run_in_background
 from viewer.state.layers import is_visible
 from viewer.state.selection import EMPTY_MASK, unpack
-from viewer.state.view_state import ViewState
+from viewer.state.view_state import PaintedPicture, ViewState
 from viewer.state.workspace import SceneFacts
 
 from .context import UiContext
@@ -98,6 +98,7 @@ class PointerContext:
         tool = self.shown.select.tool
         if self.shown.color_brush.tool:
             self.known_surface(self.shown.camera, self.size, request=True)
+        self.fit_paint()
         if self.facts.count < PREPARE_MIN_GAUSSIANS or not (tool or self.shown.brush.active):
             return
         another = self.surfaces.look(self._surface_key, self._copy_surface, tool in ("flood", "color"))
@@ -116,10 +117,29 @@ class PointerContext:
         key = surface_key(self.scene_key, view)
         return self.paint.surfaces.get(key, lambda: view_surface(self.scene, view))
 
-    def recent_surface(self, camera: ViewCamera, size: tuple[int, int]) -> ViewSurface:
-        """Return a surface of the view that was visible before the current motion, if one is known."""
-        recent = self.paint.surfaces.recent(surface_key(None, to_camera(camera, *size)))
-        return recent or self.view_surface(camera, size)
+    def paint_surface(self, picture: PaintedPicture) -> ViewSurface:
+        """Return the surface under a painted picture: its model if it is known, else the view's depth."""
+        fitted = self.paint.fits.get(self.scene_key, picture)
+        return fitted or self.view_surface(picture.camera, picture.size)
+
+    def recent_surface(self, picture: PaintedPicture) -> ViewSurface:
+        """Return that surface, or the last known one, which takes no time during motion."""
+        view = to_camera(picture.camera, *picture.size)
+        recent = self.paint.fits.recent(picture) or self.paint.surfaces.recent(surface_key(None, view))
+        return recent or self.view_surface(picture.camera, picture.size)
+
+    def fit_paint(self) -> None:
+        """Compute the model of the surface under a painted picture in another thread, if one is missing."""
+        fits = self.paint.fits
+        for picture in self.shown.painted:
+            if fits.get(self.scene_key, picture) is None:
+                view = to_camera(picture.camera, *picture.size)
+                seen = self.paint.surfaces.peek(surface_key(self.scene_key, view))
+                if seen is not None and not fits.is_requested(self.scene_key, picture):
+                    scene = self._copy_scene()
+                    painted = pixels_of(picture)[..., 3] > 0
+                    fits.request(self.scene_key, picture, partial(fitted_surface, scene, seen, painted))
+                return
 
     def is_moved_at_cursor(self) -> bool:
         """Return True if visible layers move or remove the surface of the original at the cursor."""

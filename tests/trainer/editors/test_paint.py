@@ -15,12 +15,13 @@ from progdf.gaussians import Gaussians
 from progdf.io.picture_camera import save_picture_camera
 from progdf.metrics.image import psnr
 from progdf.region import whole_scene
+from progdf.sh import rgb_to_sh0
 from progdf.surface.find import orbit
 from tests.trainer.painted_wall import CAMERA, SIDE, picture, wall
 from trainer.editors.base import EditorInput
 from trainer.editors.paint import PaintEditor, check_paint, paint
 from trainer.options import EditorOptions
-from trainer.run.paint import PaintGoal, make_goal, mean_square_error, recolor_gdf, recolor_paint
+from trainer.run.paint import make_goal, mean_square_error, recolor_gdf, recolor_paint
 from trainer.run.pasted import train_decal
 
 
@@ -69,7 +70,19 @@ def test_colors_are_linear_in_the_strength(tmp_path: Path) -> None:
     half, full = (picture(edited_scene(scene, gdf, s)) for s in (0.5, 1.0))
     assert float((half - 0.5 * (picture(scene) + full)).abs().max()) < 0.02
     assert mean_square_error(recolored.ended, goal.views) < mean_square_error(scene, goal.views)
-    assert isinstance(goal, PaintGoal)
+
+
+def test_recolored_gaussians_lie_between_their_color_and_the_paint(tmp_path: Path) -> None:
+    scene = wall()
+    goal = make_goal(scene, make(scene, put(tmp_path / "a.png")).paints)
+    ended = recolor_paint(goal).ended
+    red = rgb_to_sh0(torch.tensor([200.0, 30.0, 40.0]) / 255.0)
+    change = ended.sh0 - scene.sh0
+    shares = change / (red - scene.sh0)
+    assert float(shares.min()) > -1e-3
+    assert float(shares.max()) < 1.001
+    assert float((shares - shares.mean(dim=1, keepdim=True)).abs().max()) < 2e-3
+    assert float(shares.max()) > 0.5
 
 
 def test_pictures_without_paint_are_refused(tmp_path: Path) -> None:
