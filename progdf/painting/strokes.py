@@ -151,6 +151,8 @@ def composite(below: Pixels, above: Pixels) -> Pixels:
     """Composite straight RGBA over straight RGBA. [h,w,4] each"""
     if not above[..., 3].any():
         return below
+    if not below[..., 3].any():
+        return above
     return paint_over(
         below,
         above[..., :3].astype(np.float32) / 255.0,

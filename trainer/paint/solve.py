@@ -22,6 +22,7 @@ from progdf.threads import one_thread
 from trainer.views.view import BACKGROUND, crop, seen_colors
 
 _CG_STEPS = 40  # conjugate gradient steps per round
+_SHARE_STEPS = 100  # gradient steps for shares
 _CLAMP_ROUNDS = 3  # rounds; between them, colors below black are set to black
 # Ridge of the least squares, in pixels: a weight of 1 counts as much as one fully covered pixel.
 _SCENE_RIDGE = 0.05  # holds a row of the scene to its own color
@@ -95,6 +96,60 @@ def solve_colors(
         replace(scene, sh0=scene.sh0.index_add(0, rows, change[:count])),
         replace(added, sh0=added.sh0 + change[count:]),
     )
+
+
+@one_thread()
+def solve_shares(
+    scene: Gaussians, rows: Tensor, changes: Tensor, views: Sequence[ExpectedView], behind: Tensor
+) -> Tensor:
+    """Return the shares of given color changes, 0 to 1, that reproduce all views of the paint best.
+
+    Args:
+        scene: the scene
+        rows: rows that may change. [M] int64
+        changes: full change of each row's color. [M,3]
+        views: the painted pictures, and views from other sides
+        behind: how visible the rows are from behind, pixels; it holds them to their own colors. [M]
+
+    Returns:
+        [M]
+    """
+    activated = activate(scene)
+    maps = list[ColorMap]()
+    missing = list[Tensor]()
+    importance = list[float]()
+    for view in views:
+        if not bool(view.covered.any()):
+            continue
+        box = box_of(view.covered, view.camera)
+        rendered = render(scene, view.camera, BACKGROUND, colors=seen_colors(scene, view.camera), crop=box)
+        maps.append(color_map(activated, view.camera, box, rows))
+        importance.append(1.0 if view.degrees else _OWN_IMPORTANCE)
+        missing.append(crop(view.expected, box) - rendered.image)
+    ridge = (_SCENE_RIDGE + _BEHIND_IMPORTANCE * behind) * changes.square().sum(dim=1)
+
+    def gradient(images: Sequence[Tensor], along: Tensor) -> Tensor:
+        total = torch.zeros(len(rows))
+        for weights, image, share in zip(maps, images, importance, strict=True):
+            total += share * (along * weights.gradient(image)).sum(dim=1)
+        return total
+
+    # the sums of the rows of the normal matrix bound its eigenvalues
+    sizes = changes.abs()
+    bound = gradient([weights.picture(sizes) for weights in maps], sizes) + ridge
+    step = 1.0 / bound.clamp_min(1e-12)
+    shares = torch.zeros(len(rows))
+    ahead = shares
+    momentum = 1.0
+    for _ in range(_SHARE_STEPS):  # projected gradients with Nesterov's momentum
+        colors = ahead[:, None] * changes
+        residuals = [goal - weights.picture(colors) for weights, goal in zip(maps, missing, strict=True)]
+        new = (ahead + step * (gradient(residuals, changes) - ridge * ahead)).clamp(0.0, 1.0)
+        next_momentum = 0.5 * (1.0 + (1.0 + 4.0 * momentum**2) ** 0.5)
+        ahead = new + (momentum - 1.0) / next_momentum * (new - shares)
+        shares = new
+        momentum = next_momentum
+    return shares
 
 
 @one_thread()

@@ -24,7 +24,7 @@ from progdf.metrics.image import decibels
 from progdf.rasterize import alpha_weights, render
 from progdf.rasterize.engines import activate, color_map
 from progdf.region import Region
-from progdf.sh import rgb_to_sh0
+from progdf.sh import C0, rgb_to_sh0
 from progdf.surface.find import find_surface, orbit
 from progdf.terminal import group_digits
 from trainer.editors.pictures import read_edit
@@ -37,7 +37,7 @@ from trainer.paint.discs import (
     place_discs,
     project_paint,
 )
-from trainer.paint.solve import ExpectedView, box_of, solve_colors
+from trainer.paint.solve import ExpectedView, box_of, solve_colors, solve_shares
 from trainer.store.progress import RunLog
 from trainer.views.view import BACKGROUND, View, crop, make_view, render_view
 
@@ -265,12 +265,10 @@ def recolor_paint(goal: PaintGoal) -> Recolor:
     for view in goal.views:
         weights = torch.maximum(weights, alpha_weights(scene, view.camera, view.covered)[:, 0])
     rows = (weights > _MIN_SPILL_WEIGHT_PX).nonzero()[:, 0]
-    solved, _ = solve_colors(scene, rows, scene[:0], goal.views, goal.behind[rows])
     paint, weights = _mean_colors(goal, rows)
     towards = (rgb_to_sh0(paint) - scene.sh0[rows]) * (weights > _MIN_PAINT_WEIGHT_PX)
-    change = solved.sh0[rows] - scene.sh0[rows]
-    shares = (change * towards).sum(dim=1) / towards.square().sum(dim=1).clamp_min(1e-12)
-    ended = replace(scene, sh0=scene.sh0.index_add(0, rows, shares.clamp(0.0, 1.0)[:, None] * towards))
+    shares = solve_shares(scene, rows, C0 * towards, goal.views, goal.behind[rows])
+    ended = replace(scene, sh0=scene.sh0.index_add(0, rows, shares[:, None] * towards))
     return Recolor(ended, rows)
 
 

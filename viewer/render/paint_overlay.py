@@ -10,8 +10,9 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import moderngl
 import numpy as np
@@ -143,7 +144,8 @@ class FittedSurfaces:
         self._requested = key
         self._stop = threading.Event()
         self.is_busy = True
-        run_in_background(self._compute, key, make, self._stop)
+        # not the other background work's thread: a fit stops only between its renders
+        _fit_worker().submit(self._compute, key, make, self._stop)
 
     def stop(self) -> None:
         """Stop the computation: a stroke needs the processor."""
@@ -342,6 +344,11 @@ def packed_picture(camera: ViewCamera, size: Size, pixels: Pixels) -> PaintedPic
     """Return the painted picture of a view from its straight RGBA [H,W,4]."""
     box = painted_box(pixels)
     return PaintedPicture(camera, size, box, pack(pixels, box))
+
+
+@cache
+def _fit_worker() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(1, thread_name_prefix="fit")
 
 
 @lru_cache(maxsize=_MAX_SURFACES)
