@@ -71,6 +71,10 @@ class Delivery:
     def discard(self) -> None:
         """Remove nothing: the command writes all or nothing."""
 
+    def offer(self) -> str:
+        """Return no offer."""
+        return ""
+
     def warning(self) -> str:
         """Return no warning."""
         return ""
@@ -87,6 +91,7 @@ class QueuedTask:
     seconds: float = 0.0  # running time of this session
     error: str = ""  # one line about a failure
     warning: str = ""  # one line about a poor result
+    offer: str = ""  # one line about a possible continuation
     resumes: bool = False  # it continues a stopped run
     began_at: float = 0.0  # share done at the start of this session
 
@@ -271,7 +276,8 @@ class JobQueue:
             self._unlock(job)
         if status == 0 and job.task.result.exists():
             warning = without_commands(job.task.warning())
-            return self._change(replace(job, status="done", progress=Progress(1.0), warning=warning))
+            done = replace(job, status="done", progress=Progress(1.0), warning=warning)
+            return self._change(replace(done, offer=job.task.offer()))
         if job.status == "stopping" and begun:
             return self._change(replace(job, status="stopped", resumes=True))
         if job.status == "stopping":  # nothing was done yet

@@ -37,6 +37,7 @@ from progdf.io.json_values import convert_json, read_json, to_json
 from progdf.io.picture_camera import layers_in_picture
 from progdf.io.tensors import read_tensors
 from progdf.region import Region
+from progdf.terminal import group_digits
 
 from .child import Progress
 
@@ -55,10 +56,17 @@ class _Paint(msgspec.Struct):
     warning: str = ""  # the same if too little was reproduced, "" if enough was
 
 
+class _CarryOn(msgspec.Struct):
+    offered: bool = False  # the color map may continue over parts that no picture shows
+    explained: float = 0.0  # share of the visible change that it explains, 0 to 1
+    unchanged: int = 0  # Gaussians of the region that no picture shows
+
+
 class _Report(msgspec.Struct):
     """Part of RUN/report.json: the result of a finished run on painted pictures."""
 
     paint: _Paint | None = None
+    carry_on: _CarryOn | None = None
 
 
 @dataclass(frozen=True)
@@ -76,12 +84,15 @@ class EditOrder:
     anchor: str = ""  # file of an edited picture that is the reference of all views, "" for none
     at: str = ""  # for a decal: its position in the camera's picture
     camera: str = ""  # file of that camera
+    carry_on: str = ""  # value of `progdf train --carry-on`, "" for its default
+    replaces: str = ""  # file of the edit whose layer the result replaces, "" for a new layer
 
     def arguments(self, resumes: bool = False) -> list[str]:
         """Return the command-line arguments after `progdf`."""
         words = ["train", str(self.scene), f"--out={self.out}", f"--region={self.region}"]
         words += [f"--editor={self.editor}", f"--name={self.name}", f"--threads={self.threads}"]
         given = {"model": self.model, "anchor": self.anchor, "at": self.at, "camera": self.camera}
+        given["carry-on"] = self.carry_on
         words += [f"--{name}={value}" for name, value in given.items() if value]
         if self.quick:
             words.append("--quick")
@@ -212,13 +223,30 @@ class EditOrder:
         paint = self._paint()
         return paint.summary if paint.pixels else ""
 
+    def offer(self) -> str:
+        """Return a line about the continuation that the finished run offers, "" for none."""
+        found = self._report().carry_on
+        if found is None or not found.offered:
+            return ""
+        return (
+            f"One color map explains {100 * found.explained:.0f} % of the change. It can continue over "
+            f"{group_digits(found.unchanged)} splats that the picture does not show. That is a guess."
+        )
+
+    @property
+    def behind(self) -> Path:
+        """Picture from behind of the offered continuation, with its camera; may be absent."""
+        return self.out / "behind.png"
+
     def _paint(self) -> _Paint:
         """Return the result of the finished run on painted pictures."""
+        return self._report().paint or _Paint()
+
+    def _report(self) -> _Report:
         try:
-            report = read_json(self.out / "report.json", _Report)
+            return read_json(self.out / "report.json", _Report)
         except ProgdfError:
-            return _Paint()
-        return report.paint or _Paint()
+            return _Report()
 
     def newest_recording(self) -> Path | None:
         """Return the file of the last saved recording; None if there is none."""

@@ -379,7 +379,8 @@ def _details(work: Workspace, index: int, row: LayerRow) -> str:
         for i, layer in enumerate(work.view.layers)
         if i != index and layer.gdf < len(row.shared) and (count := row.shared[layer.gdf])
     )
-    return "\n".join((about, *shares))
+    sources = (row.sources,) if row.sources else ()
+    return "\n".join((about, *sources, *shares))
 
 
 def _about(work: Workspace, index: int, row: LayerRow, ui: UiContext) -> Workspace:

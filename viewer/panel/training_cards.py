@@ -70,8 +70,8 @@ _HEIGHT_SLOT = "height of the jobs"
 
 
 def _visible_jobs(jobs: Sequence[JobCard]) -> list[JobCard]:
-    """Return the jobs that have a card. A trained edit is a layer and needs none."""
-    return [job for job in jobs if job.status != "done" or job.warning or not job.training]
+    """Return the jobs that have a card. A trained edit is a layer and needs none, unless it offers more."""
+    return [job for job in jobs if job.status != "done" or job.warning or job.offer or not job.training]
 
 
 def _is_failed(job: JobCard) -> bool:
@@ -79,7 +79,7 @@ def _is_failed(job: JobCard) -> bool:
 
 
 def _calls_for_attention(job: JobCard) -> bool:
-    return _is_failed(job) or bool(job.warning)
+    return _is_failed(job) or bool(job.warning or job.offer)
 
 
 def _status_color(job: JobCard, otherwise: Rgba) -> Rgba:
@@ -169,13 +169,16 @@ def _foot(job: JobCard, right: float, menu: bool, ui: UiContext) -> list[str]:
     buttons = list(_BUTTONS.get((job.status, bool(job.training)), ()))
     if job.keepable:
         buttons.insert(0, _KEEP)
+    if job.offer:
+        buttons = [*_OFFER_BUTTONS, *buttons]
     if menu:
         buttons.append((Icon.MENU, _MENU, "Log, discard (right-click)"))
     with imgui_ctx.push_font(None, SMALL_PX):
         around = 2 * imgui.get_style().frame_padding.x
         widths = [imgui.calc_text_size(text).x + around for text, _, _ in buttons]
     if _calls_for_attention(job):
-        wrapped_text(job.error or job.warning, _status_color(job, PALETTE.text))
+        lines = [job.error or job.warning, job.offer]
+        wrapped_text("\n".join(line for line in lines if line), _status_color(job, PALETTE.text))
         small(" ", PALETTE.dim)
     else:
         line = _status_text(job)
@@ -219,6 +222,10 @@ _STOP_HELP = "Stop; the run can be resumed later"
 _KEEP = ("Keep as it is", "keep_run", "Make a layer of the last recording; Resume can still finish it")
 _CANCEL = ("Cancel", "stop_run", "Remove it from the queue")
 _CLOSE = ("Close", "close_run", "Remove the card; files are kept")
+_OFFER_BUTTONS = (
+    ("Continue all around", "carry_on", "Train again; the parts that the picture does not show follow it"),
+    ("From behind", "look_behind", "Show the continued edit from behind"),
+)
 _BUTTONS = {
     ("running", True): (("Stop", "stop_run", _STOP_HELP),),
     ("running", False): (("Stop", "stop_run", _NOTHING_WRITTEN),),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -18,7 +18,7 @@ from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.rasterize import render
 from progdf.sh import sh0_to_rgb
-from progdf.terminal import format_count
+from progdf.terminal import format_count, group_digits
 from viewer.camera.view_camera import Bounds, Fit, ViewCamera, bounds_of, fit, keep_camera, to_camera
 
 Rgb = tuple[float, float, float]
@@ -63,6 +63,7 @@ class LayerRow:
     members: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64), compare=False)
     draft: bool = False  # a preliminary grade until training ends
     added: int = 0  # number of members that are not in the original scene
+    sources: str = ""  # its part from a picture and its part that is a guess, one line; "" without pictures
     from_others: int = 0  # number of its last members that other edits add
     # returns the rows that it adds on some rows of the drawn scene, see `rows_on`. [N] bool -> [A] int64
     rows_on: Callable[[NDArray[np.bool_]], NDArray[np.int64]] = field(default=_no_rows, compare=False)
@@ -101,10 +102,26 @@ def _row(scene: Gaussians, gdf: Gdf, gdfs: Sequence[Gdf], added: int) -> LayerRo
         members=members.numpy(),
         draft="draft" in gdf.report,
         added=added,
+        sources=_sources(gdf),
         from_others=gdf.from_others,
         rows_on=lambda mask: rows_on(gdf, torch.tensor(mask)).numpy(),
         thumbnail=partial(draw_thumbnail, scene, gdf),
     )
+
+
+def _sources(gdf: Gdf) -> str:
+    """Return `LayerRow.sources` of an edit from pictures, see report.json."""
+    found = gdf.report.get("carry_on")
+    if not isinstance(found, Mapping):
+        return ""
+    shown, guessed, unchanged = (
+        group_digits(count) if isinstance(count := found.get(name), int) and count else ""
+        for name in ("from_pictures", "guessed", "unchanged")
+    )
+    parts = [f"{shown or 0} splats from the picture"]
+    parts += [f"{guessed} a guess by its color map"] if guessed else []
+    parts += [f"{unchanged} not in it keep their color"] if unchanged else []
+    return ", ".join(parts)
 
 
 def _shared_count(gdf: Gdf, other: Gdf) -> int:

@@ -122,6 +122,7 @@ class JobCard:
     error: str = ""  # one line about a failure
     warning: str = ""  # one line about a poor result
     keepable: bool = False  # its newest recording can become a layer
+    offer: str = ""  # one line about a possible continuation of the edit
     elsewhere: str = ""  # name of its scene while another one is open
 
 

@@ -21,7 +21,7 @@ from progdf.__main__ import main
 from progdf.formats.ply import save_ply
 from progdf.gdf.file import fingerprint, save_gdf
 from progdf.io.atomic import state_folder
-from progdf.io.picture_camera import camera_file, find_picture_camera, layers_in_picture
+from progdf.io.picture_camera import camera_chunk, camera_file, find_picture_camera, layers_in_picture
 from progdf.scene.regions import parse_region
 from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import bear_files, opened_document
@@ -29,7 +29,7 @@ from tests.helpers.ui_rig import bear, first_view
 from trainer.store.run_folder import RunFolder
 from viewer.app import app as application
 from viewer.app.parts.preview import PAINT_TEXT
-from viewer.camera.view_camera import first_camera
+from viewer.camera.view_camera import first_camera, to_camera
 from viewer.files import region_files, user_files
 from viewer.files.document import empty
 from viewer.files.session import open_session
@@ -254,6 +254,67 @@ def test_reproduced_share_of_paint_is_in_the_message_or_on_a_card(
     assert message.text == f"{job.task.name} is ready{ending}"
     assert not message.error
     assert [shown.warning for shown in window.main_view.work.jobs] == [warning] * card
+
+
+def finish_with_offer(window: application.App) -> int:
+    """Train an edit whose report offers to continue; return the number of its job."""
+    request(window, Plain("train"))
+    (job,) = window.parts.jobs.queue.jobs
+    out = job.task.out
+    out.mkdir(parents=True)
+    found = {"offered": True, "explained": 0.974, "unchanged": 1249}
+    (out / "report.json").write_text(json.dumps({"carry_on": found}))
+    camera = to_camera(replace(window.main_view.work.view.camera, azimuth=160.0), 160, 120)
+    Image.new("RGB", (160, 120), (10, 90, 200)).save(out / "behind.png", pnginfo=camera_chunk(camera))
+    Trainer.ended = 0
+    turn(window)
+    Trainer.ended = None
+    return job.number
+
+
+def test_edit_from_one_picture_offers_to_continue_all_around(window: application.App) -> None:
+    number = finish_with_offer(window)
+    (card,) = window.main_view.work.jobs
+    assert card.offer == (
+        "One color map explains 97 % of the change. It can continue over 1 249 splats that the picture does "
+        "not show. That is a guess."
+    )
+    view = window.main_view.work.view
+    (layer,) = view.layers
+    window.main_view.store.change(replace(view, layers=(replace(layer, strength=0.7),)))
+    request(window, OnItem("carry_on", number))
+    assert "--carry-on=always" in Trainer.said
+    assert "--name=blue all around" in Trainer.said
+    (job,) = window.parts.jobs.queue.jobs
+    job.task.out.mkdir()
+    save_gdf(job.task.out / "draft.gdf", bear().gdfs[0])
+    turn(window)
+    assert len(window.main_view.work.view.layers) == 1, "no second layer while it trains"
+    Trainer.ended = 0
+    turn(window)
+    (continued,) = window.main_view.work.view.layers
+    assert window.documents.get().gdf_paths[continued.gdf] == job.task.result
+    assert continued.strength == 0.7
+    assert window.main_view.work.jobs == ()
+    press(window, "Ctrl+Z")
+    (before,) = window.main_view.work.view.layers
+    assert window.documents.get().gdf_paths[before.gdf].parent.name == "blue"
+
+
+def test_continued_edit_is_shown_from_behind_until_the_view_moves(window: application.App) -> None:
+    number = finish_with_offer(window)
+    request(window, OnItem("look_behind", number))
+    cover = window.main_view.work.transient.cover
+    assert cover is not None
+    assert cover.name == "Continued all around"
+    assert cover.camera == window.main_view.work.view.camera
+    assert cover.camera.azimuth == pytest.approx(160.0, abs=0.01)
+    turn(window)
+    assert window.main_view.work.transient.cover == cover
+    view = window.main_view.work.view
+    window.main_view.store.change(replace(view, camera=replace(view.camera, azimuth=10.0)))
+    turn(window)
+    assert window.main_view.work.transient.cover is None
 
 
 def test_view_painted_in_another_program_is_shown_on_every_save(

@@ -106,6 +106,19 @@ class EditActions:
         gdf = self._load(file, self._documents.get().edits[view.layers[index].gdf].region)
         self._apply(replace_edit(view, index, self._open(gdf, file), gdf.name), index)
 
+    def replace_file(self, old: Path, new: Path) -> bool:
+        """Replace the edit of the layer that uses a file by that of another; return True if there is one.
+
+        Raises:
+            ProgdfError: see `add`.
+        """
+        paths = self._documents.get().gdf_paths
+        for index, layer in enumerate(self._store.get().view.layers):
+            if layer.gdf < len(paths) and paths[layer.gdf].resolve() == old.resolve():
+                self.replace(index, str(new))
+                return True
+        return False
+
     def layer(self, index: int | None) -> int:
         """Return the layer of a request: the given index, or the focused layer for None.
 

@@ -20,8 +20,10 @@ from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.gdf.file import Gdf, load_gdf
 from progdf.io.atomic import make_folder
+from progdf.io.images import open_picture
+from progdf.io.picture_camera import find_picture_camera
 from viewer.app.messages import Messages, Requests, error_line
-from viewer.camera.view_camera import ViewCamera, to_camera
+from viewer.camera.view_camera import ViewCamera, from_camera, to_camera
 from viewer.files import region_files, user_files
 from viewer.files.document import DocumentStore
 from viewer.jobs import training
@@ -29,7 +31,7 @@ from viewer.jobs.preview_process import PreviewChild, PreviewInputs
 from viewer.state.forms import EDITORS, NO_CHANGE, SHEET_COLUMNS, SHEET_PX, STYLE_ORDER, NewEdit, with_picture
 from viewer.state.transient import Cover, PreviewState
 from viewer.state.view_state import LayerState
-from viewer.state.workspace import Store, with_transient
+from viewer.state.workspace import Store, with_camera, with_transient
 from viewer.ui.window import wake_window
 
 LONGEST_SIDE = 960
@@ -113,6 +115,7 @@ class PreviewActions:
         self._tile = -1  # the requested style
         self._region_sent = ""  # region in the process's format
         self._painting: PreviewedView | None = None
+        self._behind: Cover | None = None  # picture of a continued edit, until the view moves
 
     @property
     def requests(self) -> Requests:
@@ -128,7 +131,9 @@ class PreviewActions:
         scene = self._documents.get().path
         request = self._request()
         if request is None or scene is None:
-            self._show("", None)
+            if self._behind is not None and self._behind.camera != self._store.get().view.camera:
+                self._behind = None
+            self._show("", self._behind)
             self._end_live()
             self._broken = False
             if self._child is not None and now - self._used_at > IDLE_TIMEOUT_S:
@@ -186,6 +191,25 @@ class PreviewActions:
         if self._pose is not None and self._painted is not None:
             height, width = self._painted[1].shape[:2]
             self._open_painter(path, self._pose[1], (width, height), self._store.get().transient.cover)
+
+    def look_behind(self, path: Path) -> None:
+        """Turn the view to the camera of a picture, and show the picture there until the view moves.
+
+        Raises:
+            ProgdfError: the picture cannot be read, or has no camera.
+        """
+        document = self._documents.get()
+        camera = find_picture_camera(path, origin=document.scene.origin)
+        picture = open_picture(path).convert("RGB")
+        work = self._store.get()
+        width, height = size = self._picture_size()
+        shown = round(picture.height * width / height), picture.height
+        whole = Image.new("RGB", shown, "white")
+        whole.paste(picture, ((shown[0] - picture.width) // 2, 0))
+        view_camera = from_camera(work.view.camera, camera, document.bounds)
+        self._behind = Cover(self._upload(np.asarray(whole)), view_camera, size, "Continued all around")
+        self._store.replace(with_camera(replace(work, form_open=False), view_camera))
+        self._show("", self._behind)
 
     def _open_painter(
         self, path: Path, camera: ViewCamera, size: tuple[int, int], cover: Cover | None

@@ -48,9 +48,11 @@ def is_newer(file: Path, other: Path) -> bool:
 
 
 def is_keepable(order: EditOrder) -> bool:
-    """Return whether a run has a recording that is not a layer yet."""
+    """Return whether a run has a recording that is not a layer yet, and may become one."""
     recording = order.newest_recording()
-    return recording is not None and not is_newer(order.kept_edit, recording)
+    if recording is None or order.paints_over_layers:
+        return False
+    return not is_newer(order.kept_edit, recording)
 
 
 def job_card(job: QueuedTask) -> JobCard:
@@ -77,6 +79,7 @@ def job_card(job: QueuedTask) -> JobCard:
         error=job.error,
         warning=job.warning,
         keepable=keepable,
+        offer=job.offer,
     )
 
 
@@ -93,6 +96,7 @@ class JobActions:
         draft: returns the file of a grade that previews the form
         anchor: returns the picture of one view that the form's sentence should follow
         follow: opens that picture's file in another program and shows the saved result
+        look_behind: turns the view to the camera of a picture and shows it there
     """
 
     def __init__(
@@ -107,6 +111,7 @@ class JobActions:
         draft: Callable[[NewEdit], Path | None] = lambda _: None,
         anchor: Callable[[NewEdit], tuple[NDArray[np.uint8], Camera] | None] = lambda _: None,
         follow: Callable[[Path], None] = lambda _: None,
+        look_behind: Callable[[Path], None] = lambda _: None,
     ) -> None:
         self._store = store
         self._documents = documents
@@ -117,6 +122,7 @@ class JobActions:
         self._draft = draft
         self._anchor = anchor
         self._follow = follow
+        self._look_behind = look_behind
         self.queue = JobQueue()
         self._scene: Path | None = None
         self._followed = False  # the scene's stopped runs are in the queue
@@ -139,6 +145,8 @@ class JobActions:
             "ask_discard": self._ask_discard,
             "discard_run": queue.discard,
             "close_run": queue.dismiss,
+            "carry_on": self._carry_on,
+            "look_behind": self._show_behind,
             "show_file": lambda number: webbrowser.open(queue.job(number).task.out.parent.as_uri()),
             "copy_path": lambda number: imgui.set_clipboard_text(str(queue.job(number).task.out)),
             "run_log": self._show_log,
@@ -162,6 +170,28 @@ class JobActions:
                 self.queue.stop(job.number)
         if kind is EditOrder:
             self._messages.show("Saving the training state …")
+
+    def _carry_on(self, number: int) -> None:
+        """Queue a finished run again, continued over the parts that its picture does not show.
+
+        The result replaces the layer of the first run.
+        """
+        task = self.queue.job(number).task
+        if isinstance(task, EditOrder):
+            out = training.free_run(task.out.parent, f"{task.name} all around")
+            replaced = str(task.result)
+            self.queue.add(replace(task, out=out, name=out.name, carry_on="always", replaces=replaced))
+            self.queue.dismiss(number)
+
+    def _show_behind(self, number: int) -> None:
+        """Show the picture of the continued edit from behind.
+
+        Raises:
+            ProgdfError: it cannot be read.
+        """
+        task = self.queue.job(number).task
+        if isinstance(task, EditOrder):
+            self._look_behind(task.behind)
 
     def _show_log(self, number: int) -> None:
         self._messages.ask(Dialog("log", str(self.queue.job(number).task.log)))
@@ -319,7 +349,7 @@ class JobActions:
     def _end(self, job: QueuedTask) -> None:
         """Handle the end of a job: add or replace the layer, or show a message."""
         task = job.task
-        if job.status == "done" and not job.warning and isinstance(task, EditOrder):
+        if job.status == "done" and not (job.warning or job.offer) and isinstance(task, EditOrder):
             self.queue.dismiss(job.number)
         # with the panel, its card shows the error
         if job.status == "failed" and not self._store.get().view.panel:
@@ -333,7 +363,7 @@ class JobActions:
             return
         if job.status == "done" and self._scene == task.scene:  # the result replaces the recordings
             self._live = None
-            if not any(self._edits.finish(path, task.result) for path in task.drafts):
+            if not self._take_result(task):
                 self._open_file(task.result)
             summary = "" if job.warning else task.summary()  # its card shows the warning
             self._messages.show(f"{task.name} is ready. {summary}" if summary else f"{task.name} is ready")
@@ -343,6 +373,12 @@ class JobActions:
             self._documents.replace(self._documents.get())
         if job.status == "done":
             self._messages.show(f"{task.name} is ready: {task.result}")
+
+    def _take_result(self, task: EditOrder) -> bool:
+        """Replace the layer of a draft, or of the run that is continued; return True if there is one."""
+        if task.replaces and self._edits.replace_file(Path(task.replaces), task.result):
+            return True
+        return any(self._edits.finish(path, task.result) for path in task.drafts)
 
     def leave_scene(self) -> None:
         """Reset the state of the old scene. Its runs continue, and their cards name that scene."""
@@ -366,7 +402,7 @@ class JobActions:
         """Show the newest recording of the run, within the time budget `LIVE_SHARE`."""
         orders = (job.task for job in self.queue.jobs if job.status == "running")
         order = next((task for task in orders if isinstance(task, EditOrder)), None)
-        if order is None or order.scene != self._scene or now < self._live_due:
+        if order is None or order.scene != self._scene or now < self._live_due or order.replaces:
             return
         live = self._store.get().transient.live
         packed = order.out / "draft.gdf"
