@@ -117,7 +117,7 @@ class FittedSurfaces:
 
     def __init__(self) -> None:
         self._known: OrderedDict[tuple[object, PaintedPicture], ViewSurface] = OrderedDict()
-        self._recent: dict[PaintedPicture, ViewSurface] = {}  # the last model of each picture
+        self._recent: dict[tuple[ViewCamera, Size], ViewSurface] = {}  # the last model in each view
         self._requested: object = None  # key of the model in preparation
         self._stop = threading.Event()
         self.is_busy = False
@@ -134,8 +134,11 @@ class FittedSurfaces:
         return self._requested == (scene, picture)
 
     def recent(self, picture: PaintedPicture) -> ViewSurface | None:
-        """Return the last model under a picture, whatever the strengths were."""
-        return self._recent.get(picture)
+        """Return the last model in the view of a picture, whatever the strengths and the strokes were.
+
+        Beside the paint that it was made for, it has the smoothed depth of the view.
+        """
+        return self._recent.get((picture.camera, picture.size))
 
     def request(self, scene: object, picture: PaintedPicture, make: Callable[[], ViewSurface]) -> None:
         """Compute a model in another thread, in place of the one in preparation."""
@@ -165,7 +168,8 @@ class FittedSurfaces:
                     self._known[key] = surface
                     while len(self._known) > _MAX_SURFACES:
                         self._known.popitem(last=False)
-                    self._recent = {picture: one for (_, picture), one in list(self._known.items())}
+                    known = list(self._known.items())
+                    self._recent = {(picture.camera, picture.size): one for (_, picture), one in known}
                     self.count += 1
         finally:
             if key == self._requested:

@@ -118,8 +118,13 @@ class PointerContext:
         return self.paint.surfaces.get(key, lambda: view_surface(self.scene, view))
 
     def paint_surface(self, picture: PaintedPicture) -> ViewSurface:
-        """Return the surface under a painted picture: its model if it is known, else the view's depth."""
+        """Return the surface under a painted picture.
+
+        This is its model, or that of earlier strokes in its view, or else the view's depth.
+        """
         fitted = self.paint.fits.get(self.scene_key, picture)
+        if fitted is None and not self.shown.layers:  # no strength has changed the surface
+            fitted = self.paint.fits.recent(picture)
         return fitted or self.view_surface(picture.camera, picture.size)
 
     def recent_surface(self, picture: PaintedPicture) -> ViewSurface:

@@ -9,22 +9,25 @@ from typing import cast
 
 import numpy as np
 import pytest
+import torch
 from imgui_bundle import imgui
 from PIL import Image
 
 from progdf.errors import ProgdfError
 from progdf.formats.scene_file import save_scene
+from progdf.gaussians import Gaussians
 from progdf.io.picture_camera import find_picture_camera
+from progdf.painting.projection import fitted_surface, view_surface
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.app.messages import Messages
 from viewer.app.parts.painting import PaintingActions
-from viewer.camera.view_camera import ViewCamera
+from viewer.camera.view_camera import ViewCamera, to_camera
 from viewer.files.document import Document, DocumentStore
 from viewer.files.document import load as load_document
 from viewer.files.session import WindowSession, open_session, save
 from viewer.jobs.job_queue import JobQueue, QueuedTask
 from viewer.jobs.training import EditOrder
-from viewer.render.paint_overlay import packed_picture, pixels_of
+from viewer.render.paint_overlay import _fit_worker, packed_picture, pixels_of
 from viewer.state.actions import perform
 from viewer.state.commands import Plain
 from viewer.state.transient import DryingPaint
@@ -317,3 +320,45 @@ def test_session_keeps_paint(tmp_path: Path) -> None:
     save(path, WindowSession(opened, replace(view, painted=(damaged,))))
     with pytest.raises(ProgdfError, match="a painted picture is damaged"):
         open_session(path)
+
+
+def test_model_of_the_surface_replaces_the_depth_of_a_view(hand: Rig) -> None:
+    hand.drag(START, END)
+    (picture,) = painted(hand)
+    view = hand.main_view
+    pointer = view._pointer()
+    fits = view.paint.fits
+    fits.drop()
+    seen = pointer.view_surface(picture.camera, picture.size)
+    assert not pointer.paint_surface(picture).is_model
+    fits.request(pointer.scene_key, picture, lambda: replace(seen, is_model=True))
+    _fit_worker().submit(int).result()
+    assert not fits.is_busy
+    assert pointer.paint_surface(picture).is_model
+    later = replace(picture, pixels=b"later")
+    assert pointer.paint_surface(later).is_model, "until it has its own"
+    fits.drop()
+    assert not pointer.paint_surface(picture).is_model
+
+
+@pytest.mark.slow
+def test_model_of_a_flat_surface_is_flat() -> None:
+    random = np.random.default_rng(0)
+    count = 4000
+    means = np.column_stack([random.uniform(-1.5, 1.5, (count, 2)), 0.03 * random.standard_normal(count)])
+    scene = Gaussians(
+        torch.tensor(means, dtype=torch.float32),
+        torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        torch.full((count, 3), -2.7),
+        torch.full((count,), 3.0),
+        torch.zeros(count, 3),
+        torch.zeros(count, 0, 3),
+    )
+    camera = to_camera(ViewCamera(distance=3.0, elevation=0.0), 96, 96)
+    seen = view_surface(scene, camera)
+    assert np.isfinite(seen.depth[30:66, 30:66]).all()
+    painted = np.zeros((96, 96), bool)
+    painted[34:62, 34:62] = True
+    model = fitted_surface(scene, seen, painted)
+    assert model.is_model
+    assert np.ptp(model.depth[34:62, 34:62]) < 0.5 * np.ptp(seen.depth[34:62, 34:62])
