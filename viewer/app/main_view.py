@@ -368,8 +368,8 @@ class MainView:
         work = self.work
         held = work.transient.pointer
         decal = isinstance(work.transient.gizmo, Decal)
-        if decal and "Enter" in [press.chord for press in self._keys.pressed]:
-            return  # it sets the decal where it is, see `_move_gizmo`
+        if work.transient.gizmo is not None and "Enter" in [press.chord for press in self._keys.pressed]:
+            return  # it keeps the decal or the handles where they are, see `_move_gizmo`
         picks = work.form_open and work.form.picks
         if decal or picks or work.view.select.tool or work.view.brush.active or work.view.color_brush.tool:
             clicks = decal or picks or work.view.select.tool in select_tool.CLICKED
