@@ -332,8 +332,9 @@ class MainView:
         if asks:  # no key is a shortcut or flies
             self._keys = Keys(self._keys.pressed)
         for command in requested_commands(self._keys):
-            if self.at_start and command.id not in pages.COMMANDS:
-                continue
+            placing = command.id == "rename" and self.work.transient.gizmo is not None
+            if placing or (self.at_start and command.id not in pages.COMMANDS):
+                continue  # Enter keeps the handles
             # window_picture saves the open window and changes nothing
             if not asks or command.id == "window_picture":
                 self._perform(command.action)

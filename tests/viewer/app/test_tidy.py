@@ -75,6 +75,7 @@ def test_moved_selection_follows_the_gizmo_and_can_be_canceled(app: App) -> None
     press(app, "R", "Alt+M")  # Enter keeps the result also while a selection tool is active
     app.main_view.store.replace(with_transient(app.main_view.work, gizmo=replace(gizmo, matrix=matrix)))
     press(app, "Enter")
+    assert app.main_view.work.renaming is None
     members = bear().demo.members("scarf")
     means = app.engine.gaussians(app.main_view.work.view).means[members] - bear().scene.means[members]
     assert torch.allclose(means, torch.tensor(matrix[:3, 3]).float(), atol=1e-4)
