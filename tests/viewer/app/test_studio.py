@@ -453,7 +453,17 @@ def test_stopped_training_without_recordings_has_nothing_to_keep(window: applica
     request(window, OnItem("keep_run", job.number))
     message = window.main_view.work.message
     assert message is not None
-    assert message.text == "blue has recorded no usable edit yet; resume it"
+    assert message.text == "blue has no recording that is not a layer yet; resume it"
+
+
+def test_stopped_training_with_a_draft_keeps_that(window: application.App) -> None:
+    request(window, Plain("train"))
+    (job,) = window.parts.jobs.queue.jobs
+    record(job.task.out, 1, len(window.documents.get().original))
+    job.task.draft.touch()
+    request(window, OnItem("stop_run", job.number))
+    turn(window)
+    assert not window.main_view.work.jobs[0].keepable, "a recording may be of a lower strength than the draft"
 
 
 def test_run_locked_by_another_window_is_left_alone(window: application.App) -> None:

@@ -48,9 +48,13 @@ def is_newer(file: Path, other: Path) -> bool:
 
 
 def is_keepable(order: EditOrder) -> bool:
-    """Return whether a run has a recording that is not a layer yet, and may become one."""
+    """Return whether a run has a recording that is not a layer yet, and may become one.
+
+    A draft stays anyway. A run that replaces the layer of another one leaves that layer.
+    """
     recording = order.newest_recording()
-    if recording is None or order.paints_over_layers:
+    has_layer = order.draft.exists() or order.packed_edit.exists() or bool(order.replaces)
+    if recording is None or has_layer or order.paints_over_layers:
         return False
     return not is_newer(order.kept_edit, recording)
 
@@ -338,12 +342,12 @@ class JobActions:
             return
         recording = order.newest_recording()
         edit = None
-        if recording is not None:
+        if recording is not None and is_keepable(order):
             edit = order.recorded_edit(recording, self._documents.get().original)
         if edit is None:
-            raise ProgdfError(f"{order.name} has recorded no usable edit yet; resume it")
+            raise ProgdfError(f"{order.name} has no recording that is not a layer yet; resume it")
         save_gdf(order.kept_edit, edit)
-        if not any(self._edits.finish(path, order.kept_edit) for path in order.drafts):
+        if not self._edits.finish(order.kept_edit, order.kept_edit):
             self._edits.add(order.kept_edit, order.name)
 
     def _end(self, job: QueuedTask) -> None:
