@@ -17,10 +17,11 @@ from tests.helpers.ui_rig import bear, first_view
 from viewer.app import app as application
 from viewer.files import session
 from viewer.files.session import WindowSession
+from viewer.render.paint_overlay import packed_picture
 from viewer.state import selection
 from viewer.state.selection import NamedRegion, SelectionState, pack
 from viewer.state.transient import PreviewState
-from viewer.state.view_state import Brush, SelectTool, SnapshotPair, ViewState, on_another_scene
+from viewer.state.view_state import Brush, ColorBrush, SelectTool, SnapshotPair, ViewState, on_another_scene
 from viewer.state.workspace import mark_saved, new_workspace
 
 OF_THE_WINDOW = {
@@ -54,6 +55,8 @@ def window(tmp_path: Path) -> Iterator[application.App]:
 def test_new_scene_keeps_only_the_window_settings() -> None:
     view = all_in_use(full_view(), len(bear().scene))
     view = replace(view, panel=False, grid=True, select=SelectTool("flood"), overshoot=True)
+    picture = packed_picture(view.camera, (2, 2), np.full((2, 2, 4), 255, np.uint8))
+    view = replace(view, color_brush=ColorBrush("clone"), painted=(picture,))
     view = replace(view, dynamic_resolution="on", pair=SnapshotPair("1", "2"), safe_frame="1:1")
     plain = ViewState()
     changed = {
