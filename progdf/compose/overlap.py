@@ -16,14 +16,17 @@ each other, whatever the order of the layers. For a layer of paint above another
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import permutations
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from progdf.field.baked import BakedField
 from progdf.gaussians import Gaussians
 from progdf.gdf.anchors import NOTHING
 from progdf.gdf.file import Gdf
@@ -35,7 +38,6 @@ ARRANGED = ("means", "logit_opacities", "sh0")
 """Attributes that the order of painted layers changes."""
 
 _CLEARANCE_THICKNESSES = 10.0  # distance between the rows of two layers, in thicknesses of a disc
-_FADE_POWER = 8  # power of the upper layer's strength by which covered rows fade
 _BLUR_THICKNESSES = 5.5  # standard deviation of a renderer's blur (0.3 px²), in thicknesses of a disc
 _REACH_DEVIATIONS = 3.0  # extent of a disc, in standard deviations
 _CORNER_DEVIATIONS = 1.5  # points at which the coverage of a row is measured, in its standard deviations
@@ -44,9 +46,12 @@ _COVERED = (0.5, 0.95)  # least and full coverage at which a row fades
 _SCATTER_QUANTILE = 0.9  # quantile of the pushed Gaussians' movements; surfaces within it are the same one
 _NEAREST_PUSHED = 8  # pushed Gaussians whose movement gives the direction of the painted picture
 _POINTS_AT_ONCE = 1 << 14  # limits the memory
+_MAX_REMEMBERED = 64  # entries of a cache
 
 Floats = NDArray[np.float64]
 Rows = NDArray[np.int64]
+Result = TypeVar("Result")
+_Cache = dict[tuple[int, ...], tuple[tuple[BakedField, ...], Result]]  # results by the ids of their fields
 
 
 @dataclass(frozen=True)
@@ -75,6 +80,7 @@ class PaintRows:
     rim: Floats  # see `Anchors.rim`. [A]
     outward: Floats  # unit vectors from the surface towards the painted picture's camera. [A,3]
     pairs: Mapping[tuple[int, int], Overlap]  # by the indices of the upper and the lower edit
+    spans: Mapping[int, slice]  # by edit: its rows, which are adjacent
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -112,6 +118,10 @@ class _Sheet:
     scatter: float  # distance from the surface within which Gaussians were pushed, world units
 
 
+_SHEETS: _Cache[_Sheet] = {}
+_OVERLAPS: _Cache[Overlap | None] = {}
+
+
 def find_paint(scene: Gaussians, gdfs: Sequence[Gdf]) -> PaintRows | None:
     """Return the rows of paint that depend on other layers; None if there are none.
 
@@ -123,11 +133,14 @@ def find_paint(scene: Gaussians, gdfs: Sequence[Gdf]) -> PaintRows | None:
     if not paints:
         return None
     counts = {edit: _added_count(gdfs[edit]) for edit in paints}
-    sheets = {edit: _sheet(scene, gdfs[edit]) for edit in paints} if len(paints) > 1 else {}
+    sheets = {}
+    for edit in paints if len(paints) > 1 else ():
+        sheets[edit] = _remembered(_SHEETS, (gdfs[edit].field,), partial(_sheet, scene, gdfs[edit]))
     pairs = {}
     used = {edit: np.zeros(counts[edit], bool) for edit in paints}
     for upper, lower in permutations(paints, 2):
-        found = _overlap(sheets[upper], sheets[lower])
+        find = partial(_overlap, sheets[upper], sheets[lower])
+        found = _remembered(_OVERLAPS, (gdfs[upper].field, gdfs[lower].field), find)
         if found is not None:
             pairs[upper, lower] = found
             used[upper][found.over] = True
@@ -136,12 +149,14 @@ def find_paint(scene: Gaussians, gdfs: Sequence[Gdf]) -> PaintRows | None:
             used[lower][found.hidden] = True
     rims = {edit: _rim(gdfs[edit]) for edit in paints}
     parts = []
+    spans = {}
     index = {}
     first = 0
     for edit in sorted(paints, key=lambda edit: int(gdfs[edit].region.members[-1])):
         chosen = np.flatnonzero(used[edit] | (rims[edit] > 0))
         index[edit] = np.full(counts[edit], -1)
         index[edit][chosen] = first + np.arange(len(chosen))
+        spans[edit] = slice(first, first + len(chosen))
         first += len(chosen)
         members = len(gdfs[edit].region.members) - counts[edit] + chosen
         outward = sheets[edit].outward[chosen] if edit in sheets else np.zeros((len(chosen), 3))
@@ -160,7 +175,20 @@ def find_paint(scene: Gaussians, gdfs: Sequence[Gdf]) -> PaintRows | None:
         )
         for (upper, lower), pair in pairs.items()
     }
-    return PaintRows(rows, edits, members, rim, outward, placed)
+    return PaintRows(rows, edits, members, rim, outward, placed, spans)
+
+
+def _remembered(cache: _Cache[Result], fields: tuple[BakedField, ...], make: Callable[[], Result]) -> Result:
+    """Return the result for some fields, from the cache if it is there.
+
+    A layer that is added to a stack, or taken from it, leaves the overlaps of the others as they are.
+    """
+    key = tuple(map(id, fields))
+    if key not in cache:
+        while len(cache) >= _MAX_REMEMBERED:
+            cache.pop(next(iter(cache)))
+        cache[key] = fields, make()
+    return cache[key][1]
 
 
 def is_paint(gdf: Gdf) -> bool:
@@ -207,7 +235,7 @@ def _rim(gdf: Gdf) -> Floats:
 def arrange(
     paint: PaintRows,
     layers: Sequence[PaintLayer],
-    tints: Floats | None,
+    tints: Floats,
     values: Mapping[str, NDArray[np.float32]],
     rewritten: Rows,
     names: Collection[str] = ARRANGED,
@@ -217,24 +245,28 @@ def arrange(
     Args:
         paint: see `find_paint`
         layers: active layers of paint, lowest first
-        tints: change of the SH coefficients of degree 0 that other layers make to the anchors of the rows;
-            None: no change. [A,3]
+        tints: change of the SH coefficients of degree 0 that other layers make to the anchors of the rows.
+            [A,3]
         values: attributes of all rows, those of `rewritten` rows without the order of layers; updated in
             place. [N,…]
         rewritten: indices of the rows to change. The others already have their place in the order. [K]
         names: attributes to change
     """
+    if not paint.pairs and not tints.any():
+        return
     opacity = np.zeros(len(paint))
     risen = np.zeros(len(paint))
     kept = np.ones(len(paint))
     own = values["sh0"].reshape(-1, 3)[paint.rows].astype(np.float64)
-    beside = own if tints is None else own + tints  # colors of the surface beside the paint
+    beside = own + tints  # colors of the surface beside the paint
     color = own.copy()  # colors in the order of layers
-    if paint.pairs:
-        changes = np.zeros(len(paint), bool)
-        changes[rewritten] = True
+    # rows that are not rewritten already have their colors
+    rim = np.zeros((len(paint), 1))
+    rim[rewritten, 0] = paint.rim[rewritten]
     for position, layer in enumerate(layers):
-        mine = paint.edits == layer.edit
+        if layer.edit not in paint.spans:
+            continue
+        mine = paint.spans[layer.edit]
         opacity[mine] = layer.strength
         if layer.weights is not None:
             opacity[mine] *= layer.weights[paint.members[mine]]
@@ -245,10 +277,8 @@ def arrange(
             risen[pair.over] = np.maximum(risen[pair.over], pair.rise + risen[pair.under])
             share = (pair.cover * opacity[pair.under])[:, None]
             beside[pair.over] += share * (color[pair.under] - beside[pair.over])
-            kept[pair.hidden] *= 1.0 - pair.share * opacity[pair.above] ** _FADE_POWER
-        # rows that are not rewritten already have their colors
-        fresh = mine if not paint.pairs else mine & changes
-        color[fresh] += paint.rim[fresh, None] * (beside[fresh] - own[fresh])
+            kept[pair.hidden] *= 1.0 - pair.share * _eighth_power(opacity[pair.above])
+        color[mine] += rim[mine] * (beside[mine] - own[mine])
     active = opacity[rewritten] != 0.0
     at = rewritten[active]
     if "sh0" in names:
@@ -266,6 +296,13 @@ def arrange(
         logits[paint.rows[fading]] = np.log(visible) - np.log1p(-visible)
 
 
+def _eighth_power(strength: Floats) -> Floats:
+    """Return the power by which covered rows fade, as in the module docstring."""
+    square = strength * strength
+    fourth = square * square
+    return fourth * fourth
+
+
 def _sheet(scene: Gaussians, gdf: Gdf) -> _Sheet:
     """Return the discs of a painted edit of the extended scene."""
     count = len(gdf.region.members) - _added_count(gdf)
@@ -280,11 +317,11 @@ def _sheet(scene: Gaussians, gdf: Gdf) -> _Sheet:
     axes = rotation_matrices(normalize_quats(end["quats"])).numpy()
     moves = ends["means"][:count].double().numpy() if "means" in ends else np.zeros((count, 3))
     lengths = np.linalg.norm(moves, axis=1)
-    pushed = lengths > 0
+    starts = scene.means[gdf.region.members[:count]].double().numpy()
+    pushed = (lengths > 0) & np.isfinite(starts).all(axis=1)
     if pushed.any():
-        places = scene.means[gdf.region.members[:count]].double().numpy()[pushed]
         number = min(_NEAREST_PUSHED, int(pushed.sum()))
-        nearest = cKDTree(places).query(points, list(range(1, number + 1)))[1]
+        nearest = cKDTree(starts[pushed]).query(points, list(range(1, number + 1)))[1]
         outward = -(moves[pushed] / lengths[pushed, None])[nearest].mean(axis=1)
         scatter = float(np.quantile(lengths[pushed], _SCATTER_QUANTILE))
     else:
