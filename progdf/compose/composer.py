@@ -98,7 +98,7 @@ class _Plan(NamedTuple):
     colors: _Members  # members of the changed edits, and the rows of paint that depend on them
     shapes: _Members  # those whose shape is written, without pushed rows if they are most of them
     followers: Rows  # indices of the following rows, see `Followers`. [F]
-    added: Rows  # indices of the added rows among them that the changed edits change. [G]
+    added: Rows  # indices of the added rows among them whose shape without following is written. [G]
     banded: Rows  # indices of following rows with higher SH bands that may change. [B]
     recolored: Rows  # those of them that the changed edits change
     arranged: Rows  # indices of the rows of paint among them, see `PaintRows`. [K]
@@ -440,7 +440,8 @@ class Composer:
         if 2 * len(pushed) > len(plan.rows):
             shapes = self._members_in(plan.rows[~np.isin(plan.rows, pushed)])
         rewritten = changed if self._paint is None else self._paint.partners(changed)
-        added = index[np.isin(followers.edits[index], list(rewritten))]
+        written = np.isin(followers.edits[index], list(rewritten)) & np.isin(followers.rows[index], plan.rows)
+        added = index[written]
         return _Plan(rows, plan.colors, shapes, index, added, banded, recolored, plan.arranged)
 
     def _coverage_of(self, edit: int) -> Mapping[str, Tensor]:

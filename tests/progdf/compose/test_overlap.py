@@ -161,6 +161,24 @@ def flat_wall() -> Gaussians:
     )
 
 
+def test_paint_beside_upper_paint_follows_a_surface_that_moves_at_the_same_time() -> None:
+    wall = flat_wall()
+    upper = flat_paint("upper", 0.03, (0.9, 0.1, 0.1))
+    lower = flat_paint("lower", 0.045, (0.1, 0.1, 0.9))
+    assert lower.added is not None
+    shifted = lower.added.means + torch.tensor([0.9, 0.0, 0.0])
+    lower = replace(lower, added=replace(lower.added, means=shifted))
+    everything = from_mask("all", torch.ones(len(wall), dtype=torch.bool))
+    motion = similarity((0.1, 0, 0.2), (0.3, 0, 0.2), 1.3)
+    moved = tidy(wall, [Step("transform", everything, motion)], "move")
+    composer = Composer(wall, [lower, upper, moved])
+    for strength in (1.0, 0.7, 0.4):
+        layers = [Layer(lower, 1.0), Layer(upper, strength), Layer(moved, strength)]
+        composer.update(layers)
+        plain = pack(compose_layers(wall, layers), True)
+        torch.testing.assert_close(pack(composer.gaussians, True), plain, atol=1e-5, rtol=1e-5)
+
+
 def seen_from(scene: Gaussians, degrees: float) -> torch.Tensor:
     """Return the color in the middle of a picture from aside. [3]"""
     angle = math.radians(degrees)
