@@ -50,7 +50,7 @@ def softness(share: float) -> float:
     return min(1.0, max(0.0, round(share, 3)))
 
 
-def erase_rows(paint: str, gdf: Gdf, scene: Gaussians, mask: NDArray[np.bool_]) -> str:
+def erase_rows(paint: str, gdf: Gdf, scene: Gaussians, original_count: int, mask: NDArray[np.bool_]) -> str:
     """Return a layer's paint with weight 0 for some of the rows that its edit adds.
 
     Gaussians that the edit moves out of the way of such a row get weight 0 too, and so return to their place.
@@ -59,11 +59,15 @@ def erase_rows(paint: str, gdf: Gdf, scene: Gaussians, mask: NDArray[np.bool_]) 
         paint: paint of the layer
         gdf: its edit, extended to the rows of the scene
         scene: the scene with the rows that edits add
+        original_count: number of its Gaussians without these rows
         mask: rows to erase. [N] bool
     """
     members = gdf.region.members.numpy()
-    added_count = 0 if gdf.anchors is None else len(gdf.anchors)
-    own_count = len(members) - added_count
+    own_count = len(members)
+    if gdf.anchors is not None:
+        own_count -= len(gdf.anchors)
+    elif not gdf.from_others:  # rows without anchors, as in a copy
+        own_count -= int((members >= original_count).sum())
     erased = mask[members[own_count:]]
     if not erased.any():
         return paint

@@ -239,3 +239,40 @@ def test_copy_without_visible_paint_has_none(desk: Desk) -> None:
     added = desk.documents.get().edits[1].added
     assert added is not None
     assert len(added) == len(desk.box.box)
+
+
+def copied_box(desk: Desk) -> Mask:
+    """Copy the painted box to the side and return the rows of the copy."""
+    desk.select(desk.box_mask | desk.paint_mask)
+    desk.tidy.requests["duplicate_selected"](None)
+    desk.keep_at(0.0, 0.0, -3.0)
+    document = desk.documents.get()
+    rows = document.gdfs[1].region.members.numpy()
+    mask = np.zeros(len(document.scene), bool)
+    mask[rows] = True
+    return mask & (np.arange(len(mask)) >= len(document.original))
+
+
+def test_copy_is_copied_and_removed(desk: Desk) -> None:
+    copy = copied_box(desk)
+    count = len(copy)
+    desk.select(copy)
+    desk.tidy.requests["duplicate_selected"](None)
+    desk.keep_at(2.0, 0.0, 0.0)
+    again = desk.composed()[count:]
+    step = again.means - desk.composed().means[torch.from_numpy(np.flatnonzero(copy))]
+    torch.testing.assert_close(step, torch.tensor([2.0, 0.0, 0.0]).expand_as(step), atol=1e-5, rtol=0)
+    desk.select(np.append(copy, np.zeros(len(again), bool)))
+    desk.tidy.requests["remove_selected"](None)
+    drawn = (desk.composed().logit_opacities >= UNSEEN_LOGIT).numpy()
+    assert not drawn[:count][copy].any()
+    assert drawn[:count][~copy].all()
+    assert drawn[count:].all(), "the second copy stays"
+
+
+def test_copy_of_invisible_paint_alone_is_refused(desk: Desk) -> None:
+    desk.store.change(replace(desk.view, layers=(replace(desk.view.layers[0], strength=0.0),)))
+    desk.select(desk.paint_mask)
+    with pytest.raises(ProgdfError, match="hidden or at strength 0"):
+        desk.tidy.requests["duplicate_selected"](None)
+    assert desk.store.get().transient.gizmo is None

@@ -80,12 +80,12 @@ def _copy_source(
     Args:
         document: the open document
         view: its layers
-        own, paint_rows: selected Gaussians of the original, and selected paint. [N]
+        own, paint_rows: selected Gaussians of the original, and selected rows that edits add. [N]
     """
     layers = []
     for layer in visible_layers(view):
         gdf = document.gdfs[layer.gdf]
-        if gdf.anchors is not None and paint_rows[gdf.region.members.numpy()].any():
+        if not gdf.from_others and paint_rows[gdf.region.members.numpy()].any():
             layers.append(layer_of(gdf, layer.strength, layer.gains, layer.paint))
     painted = compose_layers(document.scene, layers, view.blend)
     drawn = (painted.logit_opacities >= UNSEEN_LOGIT).numpy()
@@ -138,6 +138,8 @@ class TidyActions:
         moved = document.original[selected.region.members]
         if kind == "duplicate":
             moved = selected.copied()
+        if not len(moved):
+            raise ProgdfError("the selected paint is hidden or at strength 0; show its layer to copy it")
         center = moved.means.double().mean(dim=0)
         self._selected = selected
         at = (float(center[0]), float(center[1]), float(center[2]))
@@ -148,9 +150,10 @@ class TidyActions:
         """Add a layer that removes the selection, and erase selected paint that lies elsewhere."""
         document = self._documents.get()
         view = self._store.get().view
+        count = len(document.original)
         for index, layer in enumerate(view.layers):
             gdf = document.gdfs[layer.gdf]
-            painted = paint.erase_rows(layer.paint, gdf, document.scene, selected.loose_paint)
+            painted = paint.erase_rows(layer.paint, gdf, document.scene, count, selected.loose_paint)
             if painted != layer.paint and layer.locked:
                 raise ProgdfError(f"{layer.name} is locked; unlock it to erase its paint")
             view = with_paint(view, index, painted)
