@@ -11,6 +11,7 @@ import torch
 from imgui_bundle import imgui
 
 from progdf.camera import Camera
+from progdf.compose.layers import KINDS
 from progdf.gaussians import Gaussians
 from progdf.painting.projection import ViewSurface, fitted_surface, is_apart, view_surface
 from progdf.scene.selection import Surface
@@ -149,7 +150,8 @@ class PointerContext:
     def is_moved_at_cursor(self) -> bool:
         """Return True if visible layers move or remove the surface of the original at the cursor."""
         layers = [layer for layer in self.shown.layers if is_visible(self.shown, layer) and layer.strength]
-        kinds = {kind for layer in layers for kind in self.facts.rows[layer.gdf].kinds}
+        # the edits of the engine: a live edit has no facts
+        kinds = {KINDS[name] for layer in layers for name in self.engine.gdfs[layer.gdf].field.attributes}
         if kinds <= {"color"}:
             return False
         shown = self.view_surface(self.shown.camera, self.size)

@@ -27,11 +27,12 @@ from viewer.files.document import load as load_document
 from viewer.files.session import WindowSession, open_session, save
 from viewer.jobs.job_queue import JobQueue, QueuedTask
 from viewer.jobs.training import EditOrder
+from viewer.render.engine import ViewEngine
 from viewer.render.paint_overlay import _fit_worker, packed_picture, pixels_of
 from viewer.state.actions import perform
 from viewer.state.commands import Plain
 from viewer.state.transient import DryingPaint
-from viewer.state.view_state import ColorBrush, PaintedPicture, ViewState
+from viewer.state.view_state import ColorBrush, LayerState, PaintedPicture, ViewState
 from viewer.state.workspace import JobStatus, Store, new_workspace, record_undo
 
 START = (170.0, 260.0)
@@ -63,6 +64,17 @@ def test_stroke_paints_the_surface(hand: Rig) -> None:
     hand.move(400.0, 40.0)
     hand.settle()
     assert hand.image()[260, 200].tolist() == [255, 0, 0]
+
+
+def test_stroke_begins_while_a_training_is_shown(hand: Rig) -> None:
+    view = hand.main_view
+    edits = bear().gdfs
+    engine = ViewEngine(view.context, bear().scene, (*edits, replace(edits[0], name="training")), "cpu")
+    view.set_engine(engine, view.facts, (LayerState(len(edits), "training", 0.01),))
+    hand.settle()
+    hand.drag(START, END)
+    assert len(painted(hand)) == 1
+    engine.release()
 
 
 def test_stroke_beside_the_scene_paints_nothing(hand: Rig) -> None:
