@@ -95,7 +95,7 @@ class EditorOptions:
     removal: Removal = "auto"
     """pictures: remove the region instead of recoloring it (always, never, or as the picture suggests)."""
     carry_on: CarryOn = "auto"
-    """pictures: color parts that no picture shows by the color map (always, never, or if it fits: auto)."""
+    """pictures: apply the color map to parts that no picture shows (always, never, auto: if it fits)."""
     seed: Fixed[int] = 0  # seed of the noise, the same in every view
     cache: Fixed[Path | None] = None  # folder for painted pictures; None saves none
     at: Annotated[str, absent_option("X,Y,SIZE[,ANGLE]", "none")] = ""

@@ -1,4 +1,4 @@
-"""Layers that a picture shows: found from its metadata, and composed again."""
+"""Layers that a picture shows: their files, found by its metadata, and the scene that they compose."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""States of rows on which other rows depend, composed beside the scene by `Composer`.
+"""Rows that depend on the composed state of other rows, updated by `Composer`.
 
-The rows are those that follow a surface (`progdf.compose.follow`), and those of painted layers
+The dependent rows are those that follow a surface (`progdf.compose.follow`), and those of painted layers
 (`progdf.compose.overlap`).
 """
 
@@ -66,7 +66,7 @@ MakeComposer = Callable[[Gaussians, Sequence[Gdf], Coverage], StateComposer]
 
 
 class States:
-    """States of rows that other rows need, see `Followers`, composed like a scene of their own.
+    """States of the rows on which other rows depend, see `Followers`, composed like a scene of their own.
 
     Args:
         scene: the extended scene
@@ -235,7 +235,7 @@ class Surface:
 
 
 class PaintOrder:
-    """Rows of painted layers that depend on other layers, with what `arrange` needs.
+    """Rows of painted layers that depend on other layers, with the inputs of `arrange`.
 
     Args:
         scene: the extended scene

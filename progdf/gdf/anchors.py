@@ -53,7 +53,7 @@ class Anchors:
     # share of each added row's color that repeats the surface beside the paint, 0 to 1; None if all are 0.
     # [B] float32
     rim: Tensor | None = None
-    # True if rows of other edits stay where they are although this edit changes what they lie on, as when the
+    # True if rows of other edits stay in place although this edit changes the surface below them, as when the
     # user moves an object without its paint
     leaves_paint: bool = False
 

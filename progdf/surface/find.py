@@ -95,12 +95,12 @@ class PaintSurface:
         return "; and ".join(fit.describe() for fit in self.fits)
 
     def summary(self) -> str:
-        """Return the models of the painted pieces and the scatter of the scene around them as short text."""
+        """Return the models of the painted pieces and the deviation of the scene's depth as short text."""
         if not self.fits:
             return "the smoothed depth"
         names = " and ".join(fit.model.name for fit in self.fits)
         scatter = max(fit.residual_px for fit in self.fits)
-        return f"{names}; the scene scatters by {scatter:.0f} px around it"
+        return f"{names}; the scene's depth deviates by {scatter:.0f} px"
 
 
 def smooth_depth(depth: NDArray[np.float32], opaque: Mask) -> Array:

@@ -1,7 +1,7 @@
 """Surface under a small part of one picture, fast enough to follow the pointer.
 
-`find_surface` is the plain version: it renders views around the paint and chooses among more models by
-predicting left-out parts. Here one depth picture per camera is enough.
+`find_surface` is the plain version. It renders views around the paint, and chooses among more models by their
+prediction of left-out parts. This version needs one depth picture per camera.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ class PaintLayer:
 
 @dataclass(frozen=True)
 class PaintEditor:
-    """Editor that lays the paint of all pictures on the surface. Later pictures cover earlier ones."""
+    """Editor that places the paint of all pictures on the surface. Later pictures cover earlier ones."""
 
     scene: Gaussians
     layers: Sequence[PaintLayer]

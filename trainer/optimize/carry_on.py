@@ -4,7 +4,7 @@ An edit from a few pictures either ends where the pictures end, or its color map
 region. The second is a guess. It is judged in two steps:
 
 1. Share of the visible change that one color map explains, on held-out tiles of the pictures. Below a half,
-   the map is nearer to the original than to the picture, as if only a part of a color was painted.
+   the map is nearer to the original than to the picture, for example if only a part of a color was painted.
 2. Views from behind, in which the map alone recolors the region. They are compared with the picture: no
    speckle of changed and unchanged pixels beyond that of the picture, and no chroma outside the hull of the
    original and the painted colors. If unseen members change almost nothing there, there is nothing to carry
@@ -93,7 +93,7 @@ class BehindJudgement:
     def obstacle(self) -> str:
         """Reason against the carried edit; "" if there is none."""
         if self.reach < MIN_REACH:
-            return "nothing of it would be visible from behind"
+            return "the map would change almost nothing from behind"
         if self.speckle > self.speckle_in_picture + MAX_SPECKLE:
             return (
                 f"from behind {100 * self.speckle:.0f} % of the region would be speckled "
@@ -120,9 +120,9 @@ class CarryDecision:
 
     @property
     def obstacle(self) -> str:
-        """Reason why the map should not be carried on; "" if it may."""
+        """Reason why the map is not used for them; "" if there is none."""
         if self.explained < MIN_EXPLAINED:
-            return f"one color map explains {100 * self.explained:.0f} % of the visible change"
+            return f"less than {100 * MIN_EXPLAINED:.0f} % of the visible change is explained"
         return "" if self.behind is None else self.behind.obstacle
 
     @property
@@ -162,7 +162,7 @@ def make_tied_solver(
     edited: Sequence[Tensor],
     say: Callable[[str], None],
 ) -> tuple[Solver, CarryDecision]:
-    """Return the solver for a few pictures, which reaches as far as decided, and the decision.
+    """Return the solver for a few pictures, limited to the decided extent, and the decision.
 
     Args:
         request: see `CarryRequest`
@@ -223,11 +223,11 @@ def decide_carry_on(
     if choice != "auto":
         return replace(decision, carries=choice == "always", reason=f"--carry-on {choice}")
     if is_found(request.region):
-        reason = decision.obstacle or "--carry-on always would continue it"
+        reason = decision.obstacle or "the map passed the test, so --carry-on always can continue it"
         return replace(decision, reason=f"the region is found from the picture; {reason}")
     if decision.obstacle:
         return replace(decision, reason=decision.obstacle)
-    return replace(decision, carries=True, reason="no speckle or new colors from behind")
+    return replace(decision, carries=True, reason="no speckle and no new colors from behind")
 
 
 def _explained_share(solver: Solver, targets: Sequence[Tensor]) -> tuple[float, int]:

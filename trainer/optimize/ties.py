@@ -69,8 +69,8 @@ class Ties:
             reason = f"the paint's own border is {fade.border_px:.0f} pixels wide"
         unchanged = format_count(int((reach == 0.0).sum()), "member")
         line = (
-            f"the edit ends {fade.width:.3g} units beyond the border of what the pictures show ({reason}); "
-            f"{unchanged} beyond keep their color"
+            f"the edit ends {fade.width:.3g} units beyond the parts that the pictures show ({reason}); "
+            f"{unchanged} farther away keep their color"
         )
         return replace(self, clear=self.clear & (reach > 0.0), reach=reach), line
 

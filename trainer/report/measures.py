@@ -441,8 +441,8 @@ def measure_above(
             counts[name] += 3 * int(pixels.sum())
     found = {name: round(decibels(error / max(1, counts[name])), 2) for name, error in errors.items()}
     say(
-        f"above {lower.layers} (blend {lower.layers.blend}): {found['painted']} dB to the picture where it "
-        f"is painted, {found['rest']} dB elsewhere"
+        f"above {lower.layers} (blend {lower.layers.blend}): {found['painted']} dB where the "
+        f"picture is painted, {found['rest']} dB elsewhere"
     )
     strengths = {layer.name: layer.strength for layer in lower.layers.layers}
     return {"lower_layers": {"strengths": strengths, "blend": lower.layers.blend, "psnr": found}}

@@ -1,4 +1,4 @@
-"""Discs for paint finer than the Gaussians: decals, and the remainder after recoloring to pictures."""
+"""Discs for paint finer than the Gaussians: decals, brushed paint, and the remainder after recoloring."""
 
 from __future__ import annotations
 

@@ -90,7 +90,7 @@ def paste_decal(options: TrainOptions, setup: TrainingSetup, folder: RunFolder, 
     if painted.gdf.added is None:
         made = f"{moved} Gaussians recolored for {pixels} painted pixels"
     log.say(
-        f"{made}; {view_psnr} dB in the own view, {figures['ring']} dB in the {RING} pixels around it, "
+        f"{made}; {view_psnr} dB in its own view, {figures['ring']} dB in the {RING} pixels around it, "
         f"{side_psnrs['-30']} and {side_psnrs['+30']} dB from 30° to either side"
     )
     log.say(result.line)
@@ -131,7 +131,7 @@ def train_decal(editor: PastingEditor, scene: Gaussians, name: str, log: RunLog 
             gdf = recolor_gdf(recolored, scene, name)
         choice = (
             f"the paint is made of {better}: {decibels(colors_error):.1f} dB by colors, "
-            f"{decibels(discs_error):.1f} dB by discs, in the painted views and from their sides"
+            f"{decibels(discs_error):.1f} dB by discs, in the painted views and from the sides"
         )
     edited = edited_scene(scene, gdf)
     background = torch.tensor(BACKGROUND)
@@ -153,6 +153,7 @@ def train_decal(editor: PastingEditor, scene: Gaussians, name: str, log: RunLog 
     asides = [error for degrees, error in zip(TURNS, errors, strict=True) if abs(degrees) == 30 and error]
     if asides:
         figures["summary"] = (
-            f"It reaches {errors[middle]:.0f} dB from its front, {min(asides):.0f} dB from 30° aside"
+            f"It matches the picture to {errors[middle]:.0f} dB from the front and to {min(asides):.0f} dB "
+            "from 30° to the side"
         )
     return Painted(gdf, choice, figures, [look.expected for look in views], images)

@@ -81,7 +81,9 @@ def train(options: TrainOptions, quiet: bool = False, shared: LastValueCache | N
                     _write_draft(options, base, region, folder, log)
                 setup = _prepare_views(options, base, region, folder, shared, log)
                 if lower is not None:
-                    log.say(f"the pictures show {lower.layers}: only the difference to them is trained")
+                    log.say(
+                        f"the pictures show {lower.layers}: only the difference from these layers is trained"
+                    )
                 setup = replace(setup, lower=lower)
                 run = remove_region if is_removal(options, setup, log) else train_region
                 result = run(options, setup, folder, log)

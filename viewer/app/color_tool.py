@@ -44,7 +44,7 @@ def obstacle(work: Workspace, pointer: PointerContext) -> str:
     """Return the reason why a stroke cannot begin here, in one line; "" if it can."""
     view = work.view
     if view.compare.mode != "off":
-        return f"two pictures are compared; leave that with {shortcut(view.compare.mode) or 'Esc'}"
+        return f"two pictures are compared; end this with {shortcut(view.compare.mode) or 'Esc'}"
     if work.before:
         return f"the original is shown; press {shortcut('before')}"
     camera = pointer.shown.camera
@@ -55,12 +55,14 @@ def obstacle(work: Workspace, pointer: PointerContext) -> str:
     if brush.tool == "clone" and not brush.erases and work.transient.clone is None:
         return "the clone stamp has no source; Alt+click the place to copy from"
     if not brush.erases and pointer.is_moved_at_cursor():
-        return "a layer moves or removes the surface here; hide it, as paint lies on the original"
+        return (
+            "a layer moves or removes the surface here; hide this layer, because paint lies on the original"
+        )
     return ""
 
 
 def press(work: Workspace, pointer: PointerContext) -> Workspace:
-    """Begin a stroke at the cursor, or show why that is not possible."""
+    """Begin a stroke at the cursor, or show the reason why it is not possible."""
     reason = obstacle(work, pointer)
     if reason:
         return with_message(work, f"Cannot paint: {reason}", pointer.now, error=True)
@@ -76,7 +78,7 @@ def press(work: Workspace, pointer: PointerContext) -> Workspace:
     elif view.color_brush.tool == "clone":
         work, offset = _clone_offset(work, pointer)
         if offset is None:
-            text = "Cannot paint: the source of the clone stamp is not in this view; Alt+click another"
+            text = "Cannot paint: the source of the clone stamp is not in this view; Alt+click a new one"
             return with_message(work, text, pointer.now, error=True)
         colors = _colors_at(picture_with_paint(work, pointer), offset)
     stroke = begin_stroke(before, surface.opacity, colors)

@@ -1,4 +1,4 @@
-"""Decal in the window: it follows the pointer on the surface; after a click, handles change it."""
+"""Placement of a decal: it follows the pointer on the surface; after a click, handles change it."""
 
 from __future__ import annotations
 
@@ -309,7 +309,7 @@ def _hint(decal: Decal, surfaces: DecalSurfaces) -> str:
         state = "Finding the surface …" if surfaces.is_busy else "No surface here"
     else:
         state = size_text(decal.frame)
-    return f"{state}   Click: set. Wheel: size. Shift+wheel: rotate, with Ctrl in steps. Esc: cancel"
+    return f"{state}   Click: place. Wheel: size. Shift+wheel: rotate, with Ctrl in steps. Esc: cancel"
 
 
 def size_text(frame: DecalFrame) -> str:

@@ -1,4 +1,4 @@
-"""Decal on a surface: its frame, the camera that projects it in training, and its warped ghost.
+"""Decal on a surface: its frame, the camera that projects it in training, and its warped preview (ghost).
 
 A decal is projected along the normal of the surface under its center, as training does with the same camera.
 """

@@ -81,7 +81,7 @@ def picture_layers(opened: Document, view: ViewState) -> PictureLayers | None:
         if scene is None or not 0 <= layer.gdf < len(opened.gdf_paths):
             raise ProgdfError(f"{layer.name} has no file yet; hide it, or wait until it is trained")
         if opened.edits[layer.gdf].applied:
-            raise ProgdfError(f"{layer.name} is a grade on a chosen region, not named in a picture; hide it")
+            raise ProgdfError(f"a picture cannot store {layer.name}, a grade on a chosen region; hide it")
         path = opened.gdf_paths[layer.gdf]
         gains = layer.gains
         found.append(

@@ -89,7 +89,7 @@ def check_members(members: bytes, total: int) -> None:
         total: number of Gaussians in the scene
     """
     if members != selection.EMPTY_MASK and not unpack(members, total).any():
-        raise ProgdfError("only paint is selected, which no edit can change; select what it lies on as well")
+        raise ProgdfError("only paint is selected, and no edit can change it; select its object too")
 
 
 def rename_region(state: SelectionState, index: int, name: str, total: int) -> SelectionState:

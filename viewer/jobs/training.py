@@ -229,8 +229,8 @@ class EditOrder:
         if found is None or not found.offered:
             return ""
         return (
-            f"One color map explains {100 * found.explained:.0f} % of the change. It can continue over "
-            f"{group_digits(found.unchanged)} splats that the picture does not show. That is a guess."
+            f"One color map explains {100 * found.explained:.0f} % of the change. It can also color "
+            f"{group_digits(found.unchanged)} splats that the picture does not show, as a guess."
         )
 
     @property

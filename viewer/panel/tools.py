@@ -229,7 +229,7 @@ def _selection(view: ViewState, bar: _Bar, actions: list[Action]) -> Pointed | N
             bar.button("select_refine", actions)
             bar.follow(imgui.get_frame_height())
             more_button("more", _OPERATIONS, bar.ui, actions)
-            tip("Grow, shrink, smooth, invert, paint on it, hide, remove, move, copy")
+            tip("Grow, shrink, smooth, invert, paint on the object, hide, remove, move, copy")
             _save(len(view.selection.regions), bar, actions)
     if view.selection.hidden:
         bar.button("show_hidden", actions, f"{Icon.HIDDEN}  ")

@@ -70,7 +70,7 @@ _HEIGHT_SLOT = "height of the jobs"
 
 
 def _visible_jobs(jobs: Sequence[JobCard]) -> list[JobCard]:
-    """Return the jobs that have a card. A trained edit is a layer and needs none, unless it offers more."""
+    """Return the jobs that have a card. A finished edit needs one only if it offers to continue."""
     return [job for job in jobs if job.status != "done" or job.warning or job.offer or not job.training]
 
 
@@ -219,11 +219,15 @@ def _status_text(job: JobCard) -> str:
 
 
 _STOP_HELP = "Stop; the run can be resumed later"
-_KEEP = ("Keep as it is", "keep_run", "Make a layer of the last recording; Resume can still finish it")
+_KEEP = ("Keep as it is", "keep_run", "Make a layer of the newest recording; Resume can still finish the run")
 _CANCEL = ("Cancel", "stop_run", "Remove it from the queue")
 _CLOSE = ("Close", "close_run", "Remove the card; files are kept")
 _OFFER_BUTTONS = (
-    ("Continue all around", "carry_on", "Train again; the parts that the picture does not show follow it"),
+    (
+        "Continue all around",
+        "carry_on",
+        "Train again, with the color map on parts that the picture does not show",
+    ),
     ("From behind", "look_behind", "Show the continued edit from behind"),
 )
 _BUTTONS = {

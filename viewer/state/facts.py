@@ -119,8 +119,8 @@ def _sources(gdf: Gdf) -> str:
         for name in ("from_pictures", "guessed", "unchanged")
     )
     parts = [f"{shown or 0} splats from the picture"]
-    parts += [f"{guessed} a guess by its color map"] if guessed else []
-    parts += [f"{unchanged} not in it keep their color"] if unchanged else []
+    parts += [f"{guessed} guessed by its color map"] if guessed else []
+    parts += [f"{unchanged} not in it and unchanged"] if unchanged else []
     return ", ".join(parts)
 
 

@@ -173,7 +173,7 @@ class CloneSource:
 
 @dataclass(frozen=True)
 class DryingPaint:
-    """Paint that becomes a layer. It stays on screen until the layer is there."""
+    """Paint in training. It stays on screen until its layer is ready."""
 
     out: Path  # folder of the run
     painted: tuple[PaintedPicture, ...]

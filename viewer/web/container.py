@@ -246,7 +246,7 @@ def _paint(
     kept: int,
     exact: bool,
 ) -> dict[str, Any] | None:
-    """Append what the order of painted layers needs, see `progdf.compose.overlap`; return its header entry.
+    """Append the data for the order of painted layers, see `progdf.compose.overlap`; return its header entry.
 
     Args:
         arrays: the container's arrays

@@ -276,8 +276,8 @@ def test_edit_from_one_picture_offers_to_continue_all_around(window: application
     number = finish_with_offer(window)
     (card,) = window.main_view.work.jobs
     assert card.offer == (
-        "One color map explains 97 % of the change. It can continue over 1 249 splats that the picture does "
-        "not show. That is a guess."
+        "One color map explains 97 % of the change. It can also color 1 249 splats that the picture does "
+        "not show, as a guess."
     )
     view = window.main_view.work.view
     (layer,) = view.layers

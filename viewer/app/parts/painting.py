@@ -1,4 +1,4 @@
-"""Direct painting: finished paint becomes a layer, and stays on screen until the layer is there."""
+"""Paint of the color brush: it becomes a layer, and stays on screen until the layer is ready."""
 
 from __future__ import annotations
 

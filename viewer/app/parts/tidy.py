@@ -133,7 +133,7 @@ class TidyActions:
             self._remove(selected)
             return
         if does == "transform" and not len(selected.region):
-            raise ProgdfError("only paint is selected, which moves with its object; copy it, or select both")
+            raise ProgdfError("only paint is selected, and it moves with its object; copy it, or select both")
         kind: Literal["transform", "duplicate"] = "duplicate" if does == "duplicate" else "transform"
         moved = document.original[selected.region.members]
         if kind == "duplicate":
