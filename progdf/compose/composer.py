@@ -273,7 +273,7 @@ class Composer:
     def _write(
         self, stack: Sequence[tuple[int, Layer]], blend: str, members: _Members, names: Sequence[str]
     ) -> float:
-        """Write rows without following; return the largest movement of a center."""
+        """Write rows before they follow their anchors; return the largest movement of a center."""
         rows = members.rows
         if not len(rows) or not names:
             return 0.0

@@ -300,7 +300,7 @@ def carry_rows(own: Tensor, before: Tensor, after: Tensor, weights: Tensor) -> T
     """Return rows that follow their anchors, see the module docstring; colors are not among the columns.
 
     Args:
-        own: the rows under their own edit, as of `pack_shapes`. [F,11]
+        own: the rows under their own edit, packed by `pack_shapes`. [F,11]
         before, after: anchors in the original and under the other edits. [F,4,11]
         weights: weights of the anchors, sum 1. [F,4] float64
 
@@ -354,7 +354,7 @@ def turn_bands(bands: Tensor, turns: Tensor, moves: Tensor) -> Tensor:
 
 
 def anchor_turns(before: Tensor, after: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the mean turn of anchors, and whether the geometry of any differs; arguments as of `carry_rows`.
+    """Return the mean turn of anchors, and whether the geometry of any differs; arguments as in `carry_rows`.
 
     Returns:
         [F,4] float64 and [F] bool.

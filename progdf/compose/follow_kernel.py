@@ -67,13 +67,13 @@ def _differs(a: Floats, i: int, b: Floats, j: int, first: int, last: int) -> boo
 
 @kernel(cache=True)
 def release_centers(means: Floats, index: Rows, rows: Rows, own: Floats) -> None:
-    """Write the centers of following rows as they are without following.
+    """Write the centers of following rows before they follow their anchors.
 
     Args:
         means: centers of the scene, updated in place. [N,3]
         index: indices of the rows to write. [G]
         rows: rows of the scene that follow. [F]
-        own: the rows without following, as of `pack_shapes`. [F,11]
+        own: the rows before they follow, packed by `pack_shapes`. [F,11]
     """
     for i in index:
         for c in range(3):
@@ -85,7 +85,7 @@ def gather_shapes(own: Floats, index: Rows, shapes: Shapes, rows: Rows) -> None:
     """Copy following rows from a scene.
 
     Args:
-        own: shapes of the following rows, as of `pack_shapes`; updated in place. [F,11]
+        own: shapes of the following rows, packed by `pack_shapes`; updated in place. [F,11]
         index: indices of those to copy. [G]
         shapes: followed attributes of the scene. [N,c] each
         rows: rows of the scene that follow. [F]
@@ -126,7 +126,7 @@ def measure_motions(motions: Motions, index: Rows, before: Floats, after: Shapes
     Args:
         motions: motions of all states, updated in place
         index: the changed states. [e]
-        before: states in the original, as of `pack_shapes`. [E,11]
+        before: states in the original, packed by `pack_shapes`. [E,11]
         after: states under the other edits. [E,c] each
     """
     moves, turns, centers, matrices, visible = motions
@@ -196,7 +196,7 @@ def carry_fast(
 
     Args:
         shapes: followed attributes of the scene, updated in place. [N,c] each
-        kept: following rows without following [F,11], of which pushed ones are updated in place; and their
+        kept: following rows before they follow [F,11], of which pushed ones are updated in place; and their
             centers in the last picture, updated in place. [F,3]
         index: indices of the rows to write. [f]
         table: rows, edits, own states, anchors and weights, see `Followers`. [F], [F], [F], [F,4], [F,4]
@@ -297,7 +297,7 @@ def _carry_geometry(
     weights: Doubles,
     motions: Motions,
 ) -> None:
-    """Write the geometry of row `i` of the table; arguments as of `carry_fast`."""
+    """Write the geometry of row `i` of the table; arguments as in `carry_fast`."""
     means, log_scales, quats, _ = shapes
     _, turns, centers, _, _ = motions
     tw = tx = ty = tz = 0.0

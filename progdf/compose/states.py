@@ -146,7 +146,7 @@ class Surface:
         self._states = States(scene, gdfs, followers, coverage_of, FOLLOWED, make)
         states = self._states.before
         rows = torch.from_numpy(followers.rows)
-        self._own = pack_shapes(scene, rows).numpy()  # the rows without following. [F,11]
+        self._own = pack_shapes(scene, rows).numpy()  # the rows before they follow. [F,11]
         self._drawn = scene.means[rows].float().numpy()  # their centers in the last picture. [F,3]
         self._before = pack_shapes(states).numpy()
         self._motions = rest_motions(self._before)
@@ -155,7 +155,7 @@ class Surface:
         self._follows = np.ones(len(gdfs) + 1, bool)  # by edit + 1: its rows follow; the first: pushed rows
         self.banded = banded_followers(scene, gdfs, followers)
         """Indices of the following rows with higher SH bands. [B]"""
-        self._bands = scene.shN[rows].float()  # bands of the rows without following. [F,K,3]
+        self._bands = scene.shN[rows].float()  # bands of the rows before they follow. [F,K,3]
         self._dependents: dict[int, Rows] = {}
 
     def dependents(self, edit: int) -> Rows:
@@ -165,7 +165,7 @@ class Surface:
         return self._dependents[edit]
 
     def release(self, shapes: Shapes, index: Rows) -> None:
-        """Write the centers of added rows as they are without following, before the composer moves them.
+        """Write the centers of added rows before they follow, ahead of the update by the composer.
 
         Args:
             shapes: the composed scene, see `Composer.shapes`; updated in place

@@ -197,9 +197,9 @@ def _colors_at(picture: Pixels, offset: Point) -> Floats:
 
 def draw(work: Workspace, pointer: PointerContext) -> None:
     """Draw all paint over the picture; a comparison and the original are shown without it."""
-    drying = tuple(picture for paint in work.transient.drying for picture in paint.painted)
+    pending = tuple(picture for paint in work.transient.pending for picture in paint.painted)
     drag = work.transient.tool.coloring
-    painted = (*drying, *work.view.painted)
+    painted = (*pending, *work.view.painted)
     if work.view.compare.mode != "off" or work.before or not (painted or drag):
         return
     camera = pointer.shown.camera

@@ -196,7 +196,7 @@ class MainView:
         picture."""
         old = self.work.transient
         transient = replace(
-            old, cover=None, preview=PreviewState(), gizmo=None, tool=MouseTool(), clone=None, drying=()
+            old, cover=None, preview=PreviewState(), gizmo=None, tool=MouseTool(), clone=None, pending=()
         )
         self.store.replace(
             replace(workspace.new_workspace(view, snapshots), layout=self.work.layout, transient=transient)

@@ -172,7 +172,7 @@ class CloneSource:
 
 
 @dataclass(frozen=True)
-class DryingPaint:
+class PendingPaint:
     """Paint in training. It stays on screen until its layer is ready."""
 
     out: Path  # folder of the run
@@ -221,7 +221,7 @@ class Transient:
     pointer: KeyPointer = KeyPointer()  # pointer of the active tool
     tool: MouseTool = MouseTool()  # drag and gesture of the mouse
     clone: CloneSource | None = None  # source of the clone stamp
-    drying: tuple[DryingPaint, ...] = ()  # paint that becomes layers
+    pending: tuple[PendingPaint, ...] = ()  # paint whose layers are not ready yet
     recent: tuple[Path, ...] = ()  # recently opened files, for menu and dialogs; the last one first
     start_files: tuple[StartFile, ...] = ()  # recently opened files, for the start page
     examples: tuple[StartFile, ...] = ()  # examples on the start page

@@ -31,7 +31,7 @@ from viewer.render.engine import ViewEngine
 from viewer.render.paint_overlay import _fit_worker, packed_picture, pixels_of
 from viewer.state.actions import perform
 from viewer.state.commands import Plain
-from viewer.state.transient import DryingPaint
+from viewer.state.transient import PendingPaint
 from viewer.state.view_state import ColorBrush, LayerState, PaintedPicture, ViewState
 from viewer.state.workspace import JobStatus, Store, new_workspace, record_undo
 
@@ -246,8 +246,8 @@ class Easel:
     jobs: Jobs
 
     @property
-    def drying(self) -> tuple[DryingPaint, ...]:
-        return self.store.get().transient.drying
+    def pending(self) -> tuple[PendingPaint, ...]:
+        return self.store.get().transient.pending
 
 
 @pytest.fixture
@@ -283,16 +283,16 @@ def test_done_writes_the_paint_with_its_cameras_and_queues_a_run(easel: Easel) -
         assert find_picture_camera(path).width == 60
     view = easel.store.get().view
     assert (view.painted, view.color_brush.tool) == ((), "")
-    assert [paint.painted for paint in easel.drying] == [before]
+    assert [paint.painted for paint in easel.pending] == [before]
 
 
 def test_paint_stays_until_its_layer_is_ready(easel: Easel) -> None:
     easel.part.requests["finish_paint"](None)
     assert easel.part.poll() is not None
-    assert easel.drying
+    assert easel.pending
     easel.jobs.end("done")
     assert easel.part.poll() is None
-    assert not easel.drying
+    assert not easel.pending
     assert easel.store.get().view.painted == ()
 
 
@@ -306,7 +306,7 @@ def test_paint_of_a_failed_or_discarded_run_comes_back(easel: Easel, status: Job
         easel.jobs.end(status)
     easel.part.poll()
     assert easel.store.get().view.painted == before
-    assert not easel.drying
+    assert not easel.pending
 
 
 def test_done_without_paint_is_refused(easel: Easel) -> None:

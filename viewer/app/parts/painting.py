@@ -16,7 +16,7 @@ from viewer.jobs.job_queue import JobQueue
 from viewer.jobs.training import EditOrder
 from viewer.render.paint_overlay import pixels_of
 from viewer.state.forms import ALL, NewEdit
-from viewer.state.transient import DryingPaint
+from viewer.state.transient import PendingPaint
 from viewer.state.view_state import PaintedPicture
 from viewer.state.workspace import Store, with_transient
 
@@ -72,8 +72,8 @@ class PaintingActions:
         )
         self._queue.add(order)
         view = replace(work.view, painted=(), color_brush=replace(work.view.color_brush, tool=""))
-        drying = (*work.transient.drying, DryingPaint(out, painted))
-        self._store.replace(with_transient(work, drying=drying))
+        pending = (*work.transient.pending, PendingPaint(out, painted))
+        self._store.replace(with_transient(work, pending=pending))
         self._store.change(view)
         self._messages.show(f"Making {out.name}; the paint stays on screen until its layer is ready")
 
@@ -92,12 +92,12 @@ class PaintingActions:
 
     def poll(self) -> float | None:
         """Remove paint whose layer is ready, and return paint whose run has failed or was discarded."""
-        drying = self._store.get().transient.drying
-        if not drying:
+        pending = self._store.get().transient.pending
+        if not pending:
             return None
         status = {job.task.out: job.status for job in self._queue.jobs}
-        left = list[DryingPaint]()
-        for paint in drying:
+        left = list[PendingPaint]()
+        for paint in pending:
             now = status.get(paint.out)
             if now is None and not _is_trained(paint.out):
                 now = "failed"
@@ -105,12 +105,12 @@ class PaintingActions:
                 self._put_back(paint)
             elif now not in (None, "done"):
                 left.append(paint)
-        if len(left) < len(drying):
-            self._store.replace(with_transient(self._store.get(), drying=tuple(left)))
+        if len(left) < len(pending):
+            self._store.replace(with_transient(self._store.get(), pending=tuple(left)))
             self._store.wake()
         return POLL_S if left else None
 
-    def _put_back(self, paint: DryingPaint) -> None:
+    def _put_back(self, paint: PendingPaint) -> None:
         """Return paint to the brush, unless something else was painted meanwhile."""
         view = self._store.get().view
         if not view.painted:
