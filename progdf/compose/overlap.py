@@ -135,12 +135,12 @@ def find_paint(scene: Gaussians, gdfs: Sequence[Gdf]) -> PaintRows | None:
     counts = {edit: _added_count(gdfs[edit]) for edit in paints}
     sheets = {}
     for edit in paints if len(paints) > 1 else ():
-        sheets[edit] = _remembered(_SHEETS, (gdfs[edit].field,), partial(_sheet, scene, gdfs[edit]))
+        sheets[edit] = _look_up(_SHEETS, (gdfs[edit].field,), partial(_sheet, scene, gdfs[edit]))
     pairs = {}
     used = {edit: np.zeros(counts[edit], bool) for edit in paints}
     for upper, lower in permutations(paints, 2):
         find = partial(_overlap, sheets[upper], sheets[lower])
-        found = _remembered(_OVERLAPS, (gdfs[upper].field, gdfs[lower].field), find)
+        found = _look_up(_OVERLAPS, (gdfs[upper].field, gdfs[lower].field), find)
         if found is not None:
             pairs[upper, lower] = found
             used[upper][found.over] = True
@@ -178,7 +178,7 @@ def find_paint(scene: Gaussians, gdfs: Sequence[Gdf]) -> PaintRows | None:
     return PaintRows(rows, edits, members, rim, outward, placed, spans)
 
 
-def _remembered(cache: _Cache[Result], fields: tuple[BakedField, ...], make: Callable[[], Result]) -> Result:
+def _look_up(cache: _Cache[Result], fields: tuple[BakedField, ...], make: Callable[[], Result]) -> Result:
     """Return the result for some fields, from the cache if it is there.
 
     A layer that is added to a stack, or taken from it, leaves the overlaps of the others as they are.
