@@ -18,6 +18,7 @@ from imgui_bundle import imgui
 from PIL import Image
 
 from progdf.__main__ import main
+from progdf.compose import layer_paint
 from progdf.formats.ply import save_ply
 from progdf.gdf.file import fingerprint, save_gdf
 from progdf.io.atomic import state_folder
@@ -281,7 +282,9 @@ def test_edit_from_one_picture_offers_to_continue_all_around(window: application
     )
     view = window.main_view.work.view
     (layer,) = view.layers
-    window.main_view.store.change(replace(view, layers=(replace(layer, strength=0.7),)))
+    members = len(window.documents.get().gdfs[layer.gdf].region)
+    painted = layer_paint.encode(np.linspace(0, 1, members, dtype=np.float32))
+    window.main_view.store.change(replace(view, layers=(replace(layer, strength=0.7, paint=painted),)))
     request(window, OnItem("carry_on", number))
     assert "--carry-on=always" in Trainer.said
     assert "--name=blue all around" in Trainer.said
@@ -295,6 +298,7 @@ def test_edit_from_one_picture_offers_to_continue_all_around(window: application
     (continued,) = window.main_view.work.view.layers
     assert window.documents.get().gdf_paths[continued.gdf] == job.task.result
     assert continued.strength == 0.7
+    assert continued.paint == painted, "both edits have the same members"
     assert window.main_view.work.jobs == ()
     press(window, "Ctrl+Z")
     (before,) = window.main_view.work.view.layers

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from viewer.files.document import DocumentStore
 from viewer.files.user_files import parse_path
 from viewer.state import selection
 from viewer.state.facts import describe_loaded
-from viewer.state.layers import add_layer, duplicate_layer, replace_edit
+from viewer.state.layers import add_layer, change_layer, duplicate_layer, replace_edit
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import Store, focus_layer
 
@@ -109,13 +110,23 @@ class EditActions:
     def replace_file(self, old: Path, new: Path) -> bool:
         """Replace the edit of the layer that uses a file by that of another; return True if there is one.
 
+        Painted strengths of the layer stay if both edits have the same members.
+
         Raises:
             ProgdfError: see `add`.
         """
-        paths = self._documents.get().gdf_paths
-        for index, layer in enumerate(self._store.get().view.layers):
+        document = self._documents.get()
+        paths = document.gdf_paths
+        view = self._store.get().view
+        for index, layer in enumerate(view.layers):
             if layer.gdf < len(paths) and paths[layer.gdf].resolve() == old.resolve():
-                self.replace(index, str(new))
+                before = document.edits[layer.gdf]
+                gdf = self._load(new, before.region)
+                changed = replace_edit(view, index, self._open(gdf, new), gdf.name)
+                same = torch.equal(gdf.region.members, before.region.members)
+                if same and gdf.members == before.members:
+                    changed = change_layer(changed, index, partial(replace, paint=layer.paint))
+                self._apply(changed, index)
                 return True
         return False
 
