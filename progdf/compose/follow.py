@@ -28,7 +28,7 @@ from torch import Tensor
 
 from progdf.field.baked import AttributeBases, BakedField, GradeForm
 from progdf.gaussians import BASE_CHANNELS, Gaussians
-from progdf.gdf.anchors import Anchors
+from progdf.gdf.anchors import free_anchors
 from progdf.gdf.file import Gdf, fingerprint
 from progdf.quaternions import multiply_quats, normalize_quats, rotate_vectors
 from progdf.region import Region
@@ -268,7 +268,9 @@ def state_scene(
         field = BakedField(kind, gdf.field.knots, attributes, channels, origin=grade)
         pushes = None
         if gdf.anchors is not None:
-            pushes = Anchors(torch.zeros(0, 4, dtype=torch.int64), torch.zeros(0, 4), gdf.anchors.pushes)
+            pushes = replace(
+                free_anchors(0), pushes=gdf.anchors.pushes, leaves_paint=gdf.anchors.leaves_paint
+            )
         parts.append(Gdf(gdf.name, region, field, scene_print, anchors=pushes))
     return states, parts
 

@@ -25,6 +25,7 @@ from .follow import (
     FOLLOWED,
     Followers,
     banded_followers,
+    changes_shape,
     find_rims,
     mean_quats,
     pack_shapes,
@@ -255,6 +256,7 @@ class PaintOrder:
     ) -> None:
         self.paint = paint
         self._painted = frozenset(np.unique(paint.edits).tolist())
+        self._shaping = frozenset(edit for edit, gdf in enumerate(gdfs) if changes_shape(gdf))
         self._tints = np.zeros((len(paint), 3))
         found = find_rims(gdfs, len(scene), paint)
         self._states = None if found is None else States(scene, gdfs, found, coverage_of, COLORS, make)
@@ -263,7 +265,7 @@ class PaintOrder:
         """Return the attributes of rows of paint to write when some edits change."""
         if not len(rows):
             return ()
-        return ARRANGED if self.paint.pairs and not self._painted.isdisjoint(changed) else ("sh0",)
+        return ARRANGED if self.paint.pairs and not self._shaping.isdisjoint(changed) else ("sh0",)
 
     def partners(self, changed: frozenset[int]) -> frozenset[int]:
         """Return the changed edits, and the painted ones whose place in the order depends on them."""
@@ -276,8 +278,18 @@ class PaintOrder:
             partners = list(self.paint.partners(edit) - {edit})
             chosen.append(self.paint.rows[np.isin(self.paint.edits, partners)])
         if self._states is not None:
-            chosen.append(self._states.followers.dependents(edit))
+            chosen.append(self._with_upper(self._states.followers.dependents(edit)))
         return np.unique(np.concatenate(chosen)) if chosen else np.zeros(0, np.int64)
+
+    def _with_upper(self, rows: Rows) -> Rows:
+        """Return rows of paint, and the rows above them, whose rims take their colors."""
+        below = np.isin(self.paint.rows, rows)
+        count = -1
+        while count < below.sum():
+            count = int(below.sum())
+            for pair in self.paint.pairs.values():
+                below[pair.over[below[pair.under]]] = True
+        return self.paint.rows[below]
 
     def arrange(
         self,

@@ -84,6 +84,44 @@ def test_composer_orders_paint_like_compose_and_reports_every_change(scene: Gaus
     assert arranged > 20
 
 
+@pytest.mark.parametrize("name", ["shirt", "leaves"])
+def test_composer_changes_one_layer_at_a_time_like_compose(scene: Gaussians, name: str) -> None:
+    motion = similarity((1, 0, 2), (0.2, 0, 0), 0.7)
+    half = Step("transform", from_mask("half", scene.means[:, 0] > 0), motion)
+    front = Step("transform", from_mask("front", scene.means[:, 1] > 0), motion)
+    changed = {
+        "shirt": edit_of(scene, some_rows(scene, 90, 3), curved_field(90, 3), "shirt"),
+        "leaves": tidy(scene, [front], "leaves", leaves_paint=True),
+    }[name]
+    paints = [rimmed(painted(scene, 45, seed, f"paint {seed}"), seed) for seed in (9, 12)]
+    below = [*paints, tidy(scene, [half], "move")]
+    composer = Composer(scene, [*below, changed])
+    for strength in (0.6, 1.0, 0.2):
+        layers = [*(Layer(gdf, 0.6) for gdf in below), Layer(changed, strength)]
+        composer.update(layers)
+        plain = pack(compose_layers(scene, layers), True)
+        torch.testing.assert_close(pack(composer.gaussians, True), plain, atol=1e-5, rtol=1e-5)
+
+
+def test_rim_above_a_tinted_rim_changes_with_it() -> None:
+    wall = flat_wall()
+    lower = rimmed(flat_paint("lower", 0.03, (0.1, 0.1, 0.9)), 1)
+    upper = rimmed(flat_paint("upper", 0.045, (0.9, 0.1, 0.1)), 2)
+    assert upper.anchors is not None
+    alone = torch.zeros_like(upper.anchors.weights)
+    alone[:, 0] = 1.0
+    elsewhere = replace(upper.anchors, rows=torch.zeros_like(upper.anchors.rows), weights=alone)
+    upper = replace(upper, anchors=elsewhere)
+    rows = torch.arange(1, len(wall))
+    tint = edit_of(wall, rows, curved_field(len(rows), 2, moving=("sh0",)), "tint")
+    composer = Composer(wall, [lower, upper, tint])
+    for strength in (0.5, 1.0):
+        layers = [Layer(lower, 1.0), Layer(upper, 1.0), Layer(tint, strength)]
+        composer.update(layers)
+        plain = pack(compose_layers(wall, layers), True)
+        torch.testing.assert_close(pack(composer.gaussians, True), plain, atol=1e-5, rtol=1e-5)
+
+
 def test_paint_takes_no_part_in_the_average(scene: Gaussians) -> None:
     logo = painted(scene, 20, 9)
     rows = logo.region.members
