@@ -263,15 +263,19 @@ def arrange(
     # rows that are not rewritten already have their colors
     rim = np.zeros((len(paint), 1))
     rim[rewritten, 0] = paint.rim[rewritten]
-    for position, layer in enumerate(layers):
-        if layer.edit not in paint.spans:
-            continue
+    layers = [layer for layer in layers if layer.edit in paint.spans]
+    for layer in layers:
         mine = paint.spans[layer.edit]
-        opacity[mine] = layer.strength
+        visible = np.full(mine.stop - mine.start, layer.strength)
         if layer.weights is not None:
-            opacity[mine] *= layer.weights[paint.members[mine]]
-        for lower in layers[:position]:
-            pair = paint.pairs.get((layer.edit, lower.edit))
+            visible *= layer.weights[paint.members[mine]]
+        # of two layers of one edit, the stronger one shows, see `Anchors.pushes`
+        opacity[mine] = np.maximum(opacity[mine], visible)
+    order = list(dict.fromkeys(layer.edit for layer in reversed(layers)))[::-1]
+    for position, edit in enumerate(order):
+        mine = paint.spans[edit]
+        for lower in order[:position]:
+            pair = paint.pairs.get((edit, lower))
             if pair is None:
                 continue
             risen[pair.over] = np.maximum(risen[pair.over], pair.rise + risen[pair.under])

@@ -82,7 +82,7 @@ def test_region_palette_is_returned_and_a_grade_reports_its_error(scene: Path, t
 def test_failed_request_is_one_line_and_the_next_succeeds(scene: Path, tmp_path: Path) -> None:
     previewer = Previewer(scene, tmp_path / "kept")
     assert "holds no Gaussian" in answer(previewer, request(1, tmp_path, region="sphere:99,99,99,1")).error
-    assert "unknown editor" in answer(previewer, request(2, tmp_path, editor="paint:1")).error
+    assert "unknown editor" in answer(previewer, request(2, tmp_path, editor="sketch:1")).error
     assert answer(previewer, "no JSON").number == -1
     assert answer(previewer, request(3, tmp_path)).error == ""
 

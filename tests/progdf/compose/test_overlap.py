@@ -144,6 +144,15 @@ def test_largest_push_of_several_layers_holds(scene: Gaussians, blend: str) -> N
         assert torch.equal(getattr(both, name)[rows], getattr(alone, name)[rows])
 
 
+def test_stronger_one_of_two_layers_of_an_edit_covers_the_paint_below() -> None:
+    lower = flat_paint("lower", 0.05, (0.9, 0.1, 0.1))
+    upper = flat_paint("upper", 0.03, (0.1, 0.1, 0.9))
+    wall = flat_wall()
+    once = compose_layers(wall, [Layer(lower, 1.0), Layer(upper, 1.0)])
+    twice = compose_layers(wall, [Layer(lower, 1.0), Layer(upper, 1.0), Layer(upper, 0.3)])
+    assert bits(once) == bits(twice)
+
+
 def test_rim_takes_the_color_of_the_surface_as_far_as_it_repeats_it(scene: Gaussians) -> None:
     logo = painted(scene, 20, 9)
     anchors = logo.anchors

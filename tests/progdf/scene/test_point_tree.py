@@ -106,6 +106,14 @@ def test_all_nearest_neighbor_searches_use_point_trees() -> None:
         for path in (ROOT / package).rglob("*.py")
         if "scipy.spatial import" in path.read_text("utf-8")
     }
-    # anchors.py drops equal positions; parts.py joins the centroids of cells, which never share a position
-    expected = {"progdf/gdf/anchors.py", "progdf/scene/point_tree.py", "trainer/motion/parts.py"}
+    # anchors.py drops equal positions; parts.py joins the centroids of cells, which never share a position.
+    # overlap.py and paint.py search among discs of paint, which lie apart; carry_on.py finds a hull of colors
+    expected = {
+        "progdf/compose/overlap.py",
+        "progdf/gdf/anchors.py",
+        "progdf/scene/point_tree.py",
+        "trainer/motion/parts.py",
+        "trainer/optimize/carry_on.py",
+        "viewer/state/paint.py",
+    }
     assert users == expected

@@ -30,7 +30,7 @@ FAULTS = {
     "a curve that falls back": ({"--editor": "grade:curve=.5:.2+.3:.4"}, "write FROM:TO+FROM:TO"),
     "a curve of one number": ({"--editor": "grade:curve=.5"}, "the curve is '.5'"),
     "a grade beyond its range": ({"--editor": "grade:exposure=nan"}, "exposure is 'nan'; write -5 to 5"),
-    "no such editor": ({"--editor": "paint:#fff"}, "unknown editor 'paint'"),
+    "no such editor": ({"--editor": "sketch:#fff"}, "unknown editor 'sketch'"),
     "no folder of edited views": ({"--editor": "folder:nowhere"}, "nowhere is not a folder"),
     "no folder of photographs": ({"--editor": "photographs:nowhere"}, "nowhere is not a folder"),
     "no such style": ({"--editor": "style:99"}, "unknown style '99'; use style:N"),

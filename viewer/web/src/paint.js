@@ -50,17 +50,21 @@ export class PaintOrder {
     const own = Float64Array.from({ length: 3 * count }, (_, j) => sh0[3 * rows[Math.floor(j / 3)] + (j % 3)]);
     const beside = own.slice(), color = own.slice();
     this.#tint(beside);
-    this.layers.forEach((layer, position) => {
+    for (const layer of this.layers) {
       const strength = Math.min(Math.max(layer.strength, 0), 1) * Math.min(Math.abs(layer.gains.opacity), 1);
       for (let i = 0; i < count; i++) {
-        if (edits[i] === layer.edit) opacity[i] = strength * (layer.weights ? layer.weights[members[i]] : 1);
+        if (edits[i] !== layer.edit) continue;
+        opacity[i] = Math.max(opacity[i], strength * (layer.weights ? layer.weights[members[i]] : 1));
       }
-      for (const lower of this.layers.slice(0, position)) {
-        const pair = this.pairs.find((each) => each.upper === layer.edit && each.lower === lower.edit);
+    }
+    const order = this.layers.map((layer) => layer.edit).filter((edit, i, all) => all.lastIndexOf(edit) === i);
+    order.forEach((upper, position) => {
+      for (const lower of order.slice(0, position)) {
+        const pair = this.pairs.find((each) => each.upper === upper && each.lower === lower);
         if (pair) cover(pair, { opacity, risen, kept, beside, color });
       }
       for (let i = 0; i < count; i++) {
-        if (edits[i] !== layer.edit || !isRewritten[i]) continue;
+        if (edits[i] !== upper || !isRewritten[i]) continue;
         for (let j = 3 * i; j < 3 * i + 3; j++) color[j] += rim[i] * (beside[j] - own[j]);
       }
     });
