@@ -141,7 +141,7 @@ def read_edit(
 
 
 def picture_paths(what: str) -> tuple[Path, ...]:
-    """Return the paths of `pictures:A.png[,B.png…]`.
+    """Return the paths of pictures that are listed as `A.png[,B.png…]`, as in `pictures:` and `paint:`.
 
     Raises:
         ProgdfError: a picture is missing, two have the same name, or there are more than `MAX_PICTURES`.
@@ -150,18 +150,18 @@ def picture_paths(what: str) -> tuple[Path, ...]:
     paths = tuple(Path(name).expanduser() for name in names)
     for name, path in zip(names, paths, strict=True):
         if not name:
-            raise ProgdfError("pictures: needs a picture; write pictures:A.png,B.png")
+            raise ProgdfError("the name of a picture is missing; list pictures as A.png,B.png")
         if not path.is_file():
             reason = "is a folder" if path.is_dir() else "does not exist"
-            raise ProgdfError(f"{path} {reason}; give the pictures that were changed, pictures:A.png,B.png")
+            raise ProgdfError(f"{path} {reason}; list pictures as A.png,B.png")
     stems = [path.stem for path in paths]
     for stem in stems:
         if stems.count(stem) > 1:
             raise ProgdfError(f"two pictures are named {stem}; name them differently")
     if len(paths) > MAX_PICTURES:
         raise ProgdfError(
-            f"pictures: takes at most {MAX_PICTURES} pictures, not {len(paths)}; "
-            "give more as folder:DIR, with their cameras in --cameras"
+            f"at most {MAX_PICTURES} pictures can be listed, not {len(paths)}; "
+            "give more changed pictures as folder:DIR, with their cameras in --cameras"
         )
     return paths
 

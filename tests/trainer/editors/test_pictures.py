@@ -121,18 +121,21 @@ def test_invalid_picture_list_is_a_one_line_error(tmp_path: Path) -> None:
     (tmp_path / "B").mkdir()
     Image.new("RGB", (4, 4)).save(tmp_path / "B" / "A.jpg")
     for what, message in (
-        ("", "needs a picture; write"),
-        (f"{tmp_path}/A.png,", "needs a picture; write"),
-        (f"{tmp_path}/C.png", "does not exist; give"),
-        (f"{tmp_path}", "is a folder; give"),
+        ("", "name of a picture is missing; list"),
+        (f"{tmp_path}/A.png,", "name of a picture is missing; list"),
+        (f"{tmp_path}/C.png", "does not exist; list"),
+        (f"{tmp_path}", "is a folder; list"),
         (f"{tmp_path}/A.png,{tmp_path}/B/A.jpg", "two pictures are named A; name"),
     ):
         with pytest.raises(ProgdfError, match=message):
             check_new_editor(EditorOptions(f"pictures:{what}"))
+    with pytest.raises(ProgdfError) as refused:
+        check_new_editor(EditorOptions(f"paint:{tmp_path}/C.png"))
+    assert "pictures:" not in str(refused.value), "another editor was asked for"
     many = [tmp_path / f"{i}.png" for i in range(33)]
     for path in many:
         path.touch()
-    with pytest.raises(ProgdfError, match="at most 32 pictures, not 33; give"):
+    with pytest.raises(ProgdfError, match="at most 32 pictures can be listed, not 33; give"):
         picture_paths(",".join(str(path) for path in many))
 
 
