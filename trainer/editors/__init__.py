@@ -94,6 +94,7 @@ EDITORS = {
         _text_check(picture_paths),
         external=True,
         files=picture_paths,
+        shows_scene=True,
         sets_views=True,
         options=("fill", "removal", "carry_on"),
         run="trained or removed",
@@ -111,6 +112,7 @@ EDITORS = {
         "paint:A.png,B.png",
         check_paint,
         files=picture_paths,
+        shows_scene=True,
         run="pasted",
     ),
     "style": EditorRow(

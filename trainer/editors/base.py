@@ -113,6 +113,7 @@ class EditorRow:
     model: Callable[[], str] | None = None  # returns the default of `--model`; None: no generative model
     image_size: int = 0  # longer side of its views, pixels; 0 is the default
     files: Callable[[str], tuple[Path, ...]] = lambda what: ()  # picture files that its text names
+    shows_scene: bool = False  # its files are pictures of the scene with its layers
     sets_views: bool = False  # the views of the run are those of its files
     cameras: Callable[[str], Path | None] = lambda what: None  # camera file beside its pictures, if any
     options: tuple[str, ...] = ()  # fields of `EditorOptions` that apply to it, besides the common ones

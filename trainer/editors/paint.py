@@ -17,9 +17,9 @@ from progdf.io.images import open_picture
 from progdf.rasterize.engines import render_depth
 from progdf.surface.find import OPAQUE, PaintSurface, find_surface
 from trainer.options import EditKind, EditorOptions
-from trainer.paint.discs import MIN_ALPHA, PaintedView, composite_over, project_paint
+from trainer.paint.discs import MIN_ALPHA, PaintedView, composite_over, cover_view, project_paint
 from trainer.views.picture_cameras import picture_cameras
-from trainer.views.view import BACKGROUND, View, make_view, shrink_image, with_near_plane
+from trainer.views.view import BACKGROUND, View, make_view, render_view, shrink_image, with_near_plane
 
 from .base import EditorInput
 from .pictures import picture_paths
@@ -42,6 +42,7 @@ class PaintEditor:
 
     scene: Gaussians
     layers: Sequence[PaintLayer]
+    seen: Gaussians | None = None  # see `EditorInput`
     kind: EditKind = "color"
     stages: tuple[float, ...] = ()
     is_confined: bool = False
@@ -56,20 +57,31 @@ class PaintEditor:
     @property
     def paints(self) -> list[PaintedView]:
         """Paint of each view, as the target of the surface discs."""
-        return [
-            PaintedView(layer.view.camera, self.edit(layer.view, 1.0), layer.drawn, layer.surface)
-            for layer in self.layers
-        ]
+        paints = []
+        for layer in self.layers:
+            view = layer.view
+            below = None
+            if self.seen is not None:
+                below = render_view(self.seen, view.camera, torch.tensor(BACKGROUND)).clamp(0.0, 1.0)
+            picture, _ = cover_view(view.image, below, self._drawn(view))
+            paints.append(PaintedView(view.camera, picture, layer.drawn, layer.surface))
+        return paints
 
     def edit(self, view: View, strength: float) -> Tensor:
         """See `ImageEditor.edit`."""
         image = view.image
-        for layer in self.layers:
-            drawn = layer.drawn
-            if view is not layer.view:
-                drawn = project_paint(self.scene, layer.surface, drawn, view.camera)
+        for drawn in self._drawn(view):
             image = composite_over(image, strength * drawn)
         return image
+
+    def _drawn(self, view: View) -> list[Tensor]:
+        """Return the paint of each layer in a view: premultiplied colors and alpha. [H,W,4] each"""
+        return [
+            layer.drawn
+            if view is layer.view
+            else project_paint(self.scene, layer.surface, layer.drawn, view.camera)
+            for layer in self.layers
+        ]
 
 
 def check_paint(what: str, options: EditorOptions) -> None:
@@ -109,7 +121,7 @@ def paint(given: EditorInput) -> PaintEditor:
         raise ProgdfError(
             f"no paint lies on an opaque part of the region '{given.region.name}'; paint on the scene"
         )
-    return PaintEditor(scene, layers)
+    return PaintEditor(scene, layers, given.seen)
 
 
 def _shrink(camera: Camera, rgba: Tensor) -> tuple[Camera, Tensor]:

@@ -8,7 +8,7 @@ grows with the distance, which preserves its outline in the painted view (docs/m
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import cast
 
@@ -371,6 +371,28 @@ def sample_image(image: Tensor, x: Tensor, y: Tensor) -> Tensor:
 def composite_over(image: Tensor, drawn: Tensor) -> Tensor:
     """Composite premultiplied colors and alpha over a picture. [H,W,3], [H,W,4] -> [H,W,3]"""
     return image * (1.0 - drawn[..., 3:]) + drawn[..., :3]
+
+
+def cover_view(image: Tensor, below: Tensor | None, drawn: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """Composite paint over a view; return the picture and its painted pixels.
+
+    Args:
+        image: view of the scene. [H,W,3]
+        below: what is visible under the paint and the border of its discs, if it is another picture. [H,W,3]
+        drawn: premultiplied colors and alpha, the lowest first. [H,W,4] each
+
+    Returns:
+        [H,W,3] and [H,W] bool
+    """
+    covered = torch.zeros(image.shape[:2], dtype=torch.bool)
+    for paint in drawn:
+        covered = covered | (paint[..., 3] > 0)
+    if below is not None:
+        grown = torch.from_numpy(ndimage.binary_dilation(covered.numpy(), iterations=BORDER_PX))
+        image = torch.where(grown[..., None], below, image)
+    for paint in drawn:
+        image = composite_over(image, paint)
+    return image, covered
 
 
 def project_paint(scene: Gaussians, under: PaintSurface, drawn: Tensor, camera: Camera) -> Tensor:

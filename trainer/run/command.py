@@ -63,16 +63,26 @@ def check_command(options: TrainOptions) -> None:
         cameras = [] if views.cameras is None else load_cameras(views.cameras, ZERO)
         _find_cameras(views.pictures, cameras, options.scene)
         picture_cameras(views.pictures, cameras, ZERO)
-        check_lower_layers(views.pictures, options.scene)
     elif editor_row(options.editor).run == "removed":
         for path in editor_row(options.editor).files(options.editor.text):
             if (shown := layers_in_picture(path)) is not None:
                 raise ProgdfError(f"{path} shows edits ({shown}); take the view without them")
+    check_lower_layers(shown_pictures(options), options.scene)
     if not options.resume or load_region(options.out) is None:
         check_region(options.region.region, region_checks(region_request(options, quiet=True)))
     is_new = not folder.root.is_dir() or not any(folder.root.iterdir())
     if is_new or (editor_row(options.editor).slow_strengths and not options.resume):
         check_new_editor(replace(options.editor, cache=folder.paintings))
+
+
+def shown_pictures(options: TrainOptions) -> tuple[Path, ...]:
+    """Return the pictures of the scene, whose paint lies above the layers that they show.
+
+    Args:
+        options: resolved options
+    """
+    row = editor_row(options.editor)
+    return row.files(options.editor.text) if row.shows_scene else ()
 
 
 def _find_cameras(pictures: Sequence[Path], cameras: Sequence[Camera], scene: Path) -> None:

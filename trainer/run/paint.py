@@ -32,7 +32,7 @@ from trainer.paint.discs import (
     BORDER_PX,
     DISC_LOGIT,
     PaintedView,
-    composite_over,
+    cover_view,
     faint,
     place_discs,
     project_paint,
@@ -92,14 +92,15 @@ class PaintGoal:
     behind: Tensor  # each Gaussian's largest sum of weights in views from behind, pixels. [N]
 
 
-def make_goal(scene: Gaussians, paints: Sequence[PaintedView]) -> PaintGoal:
+def make_goal(scene: Gaussians, paints: Sequence[PaintedView], below: Gaussians | None = None) -> PaintGoal:
     """Return the goal of paint on a scene.
 
     Args:
         scene: the scene under the discs
         paints: painted views of one object
+        below: see `views_around_paint`
     """
-    views = views_around_paint(scene, paints, TRIAL_ANGLES_DEG)
+    views = views_around_paint(scene, paints, TRIAL_ANGLES_DEG, below=below)
     inside = torch.zeros(len(scene))
     beside = torch.zeros(len(scene))
     for view in views:
@@ -172,6 +173,8 @@ def views_around_paint(
     paints: Sequence[PaintedView],
     degrees: Sequence[float],
     around: Sequence[PaintedView] | None = None,
+    below: Gaussians | None = None,
+    shows_pictures: bool = True,
 ) -> list[ExpectedView]:
     """Return views rotated around the paint, with their expected images.
 
@@ -180,6 +183,8 @@ def views_around_paint(
         paints: painted views of one object
         degrees: rotation angles of each camera; 0 is the picture itself
         around: the paints whose cameras are rotated; None for all
+        below: the scene that is visible under the paint and the border of its discs; None for `scene`
+        shows_pictures: expect the painted picture at 0 degrees; otherwise the paint over `scene` there too
     """
     background = torch.tensor(BACKGROUND)
     views = []
@@ -187,13 +192,16 @@ def views_around_paint(
         pivot = paint.surface.pivot(paint.mask.numpy())
         for angle in degrees:
             camera = orbit(paint.camera, pivot, angle) if angle else paint.camera
-            if angle:
-                expected = render_view(scene, camera, background).clamp(0.0, 1.0)
-                covered = torch.zeros(expected.shape[:2], dtype=torch.bool)
+            if angle or not shows_pictures:
+                image = render_view(scene, camera, background).clamp(0.0, 1.0)
+                under = None if below is None else render_view(below, camera, background).clamp(0.0, 1.0)
+                drawn = []
                 for other in paints:
-                    projected = project_paint(scene, other.surface, other.drawn, camera)
-                    expected = composite_over(expected, projected)
-                    covered = covered | (projected[..., 3] > 0)
+                    is_own = other is paint and not angle
+                    drawn.append(
+                        other.drawn if is_own else project_paint(scene, other.surface, other.drawn, camera)
+                    )
+                expected, covered = cover_view(image, under, drawn)
             else:
                 expected = paint.picture
                 covered = paint.mask

@@ -22,12 +22,14 @@ from trainer.options import TrainOptions
 from trainer.resolve import recorded_options
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder, write_views
+from trainer.views.lower_layers import LowerLayers
 from trainer.views.setup import TrainingSetup
 from trainer.views.view import BACKGROUND, render_view
 
 from .finish import RunResult, write_result
 from .paint import (
     RING,
+    TRIAL_ANGLES_DEG,
     choose_discs,
     make_goal,
     mean_square_error,
@@ -53,10 +55,11 @@ def paste_decal(options: TrainOptions, setup: TrainingSetup, folder: RunFolder, 
     """
     scene = setup.scene
     with log.stage("edit"):
-        editor = cast(PastingEditor, make_editor(options.editor, scene, setup.region, ()))
+        given = make_editor(options.editor, scene, setup.region, (), seen=setup.seen)
+        editor = cast(PastingEditor, given)
     view = editor.view
     with log.stage("fit"):
-        painted = train_decal(editor, scene, options.name, log)
+        painted = train_decal(editor, scene, options.name, log, setup.lower)
     names = ",".join(path.name for path in editor_row(options.editor).files(options.editor.text))
     instruction = f"{options.editor.family}:{names}"
     figures = painted.figures
@@ -108,34 +111,45 @@ class Painted:
     shown: list[Tensor]  # renders of the edit in these views. [H,W,3] each
 
 
-def train_decal(editor: PastingEditor, scene: Gaussians, name: str, log: RunLog | None = None) -> Painted:
+def train_decal(
+    editor: PastingEditor,
+    scene: Gaussians,
+    name: str,
+    log: RunLog | None = None,
+    lower: LowerLayers | None = None,
+) -> Painted:
     """Return the edit of a decal or of paint, measured in its first view and from the sides.
 
     Args:
         editor: see `PastingEditor`
-        scene: the original
+        scene: the original, or `LowerLayers.base`
         name: name of the layer
         log: log of the run
+        lower: layers that the painted pictures show; None: the original
     """
     paints = editor.paints
-    goal = make_goal(scene, paints)
+    seen = scene if lower is None else lower.seen
+    goal = make_goal(scene, paints, seen if len(seen) > len(scene) else None)
     laid = choose_discs(goal, log)
-    gdf = paint_gdf(laid, scene, paints, name, None)
+    gdf, edited = _above(lower, scene, paint_gdf(laid, scene, paints, name, None))
     choice = "the paint is made of discs"
     if editor.finds_colors:
-        recolored = recolor_paint(goal)
-        colors_error = mean_square_error(recolored.ended, goal.views)
-        discs_error = mean_square_error(laid.end, goal.views)
+        expected = goal.views
+        if lower is not None:
+            expected = views_around_paint(seen, paints, TRIAL_ANGLES_DEG, shows_pictures=False)
+        recolored, recolored_scene = _above(lower, scene, recolor_gdf(recolor_paint(goal), scene, name))
+        colors_error = mean_square_error(recolored_scene, expected)
+        discs_error = mean_square_error(edited, expected)
         better = "colors of the scene's Gaussians" if colors_error <= discs_error else "discs"
         if colors_error <= discs_error:
-            gdf = recolor_gdf(recolored, scene, name)
+            gdf = recolored
+            edited = recolored_scene
         choice = (
             f"the paint is made of {better}: {decibels(colors_error):.1f} dB by colors, "
             f"{decibels(discs_error):.1f} dB by discs, in the painted views and from the sides"
         )
-    edited = edited_scene(scene, gdf)
     background = torch.tensor(BACKGROUND)
-    views = views_around_paint(scene, paints, TURNS, paints[:1])
+    views = views_around_paint(seen, paints, TURNS, paints[:1], shows_pictures=lower is None)
     images = [render_view(edited, look.camera, background).clamp(0.0, 1.0) for look in views]
     errors = [
         round(psnr(image, look.expected, look.covered), 2) if bool(look.covered.any()) else None
@@ -157,3 +171,11 @@ def train_decal(editor: PastingEditor, scene: Gaussians, name: str, log: RunLog 
             "from 30° to the side"
         )
     return Painted(gdf, choice, figures, [look.expected for look in views], images)
+
+
+def _above(lower: LowerLayers | None, scene: Gaussians, gdf: Gdf) -> tuple[Gdf, Gaussians]:
+    """Return an edit of `LowerLayers.base` as an edit of the original, and the scene under all layers."""
+    if lower is None:
+        return gdf, edited_scene(scene, gdf)
+    gdf = lower.rebase(gdf)
+    return gdf, lower.compose(gdf)

@@ -29,12 +29,14 @@ from trainer.store.state import interrupt_on_signals
 from trainer.views.lower_layers import open_lower_layers
 from trainer.views.setup import TrainingSetup, make_training_setup
 
-from .command import check_command, select_region
+from .command import check_command, select_region, shown_pictures
 from .finish import RunResult, load_result
 from .pasted import paste_decal
 from .removed import is_removal, remove_region
 from .resume import check_exists, decide_resume, explain_stop, load_region
 from .trained import train_region
+
+_LOWER = "the pictures show {}: only the difference from these layers is trained"
 
 
 def train(options: TrainOptions, quiet: bool = False, shared: LastValueCache | None = None) -> RunResult:
@@ -54,7 +56,7 @@ def train(options: TrainOptions, quiet: bool = False, shared: LastValueCache | N
     check_command(options)
     use_threads(options.threads)
     scene = shared.get("scene", options.scene.resolve(), lambda: load_scene(options.scene))
-    lower = open_lower_layers(options.views.pictures, options.scene, scene)
+    lower = open_lower_layers(shown_pictures(options), options.scene, scene)
     base = scene if lower is None else lower.base
     region = load_region(options.out) if options.resume else None
     notes = list[str]()
@@ -69,7 +71,9 @@ def train(options: TrainOptions, quiet: bool = False, shared: LastValueCache | N
             for note in (*session.notes, *notes):
                 log.say(note)
             if editor_row(options.editor).run == "pasted":  # takes seconds, so it is not resumed
-                setup = TrainingSetup(scene, region)
+                setup = TrainingSetup(base, region, lower=lower)
+                if lower is not None:
+                    log.say(_LOWER.format(lower.layers))
                 result = paste_decal(options, setup, folder, log)
                 folder.state.end()
                 return result
@@ -81,9 +85,7 @@ def train(options: TrainOptions, quiet: bool = False, shared: LastValueCache | N
                     _write_draft(options, base, region, folder, log)
                 setup = _prepare_views(options, base, region, folder, shared, log)
                 if lower is not None:
-                    log.say(
-                        f"the pictures show {lower.layers}: only the difference from these layers is trained"
-                    )
+                    log.say(_LOWER.format(lower.layers))
                 setup = replace(setup, lower=lower)
                 run = remove_region if is_removal(options, setup, log) else train_region
                 result = run(options, setup, folder, log)

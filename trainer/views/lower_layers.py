@@ -65,7 +65,8 @@ class LowerLayers:
 
         Colors: with the blend rules that hide lower layers by the coverage c, the sum of the lower changes B
         becomes (1 − c) B. The edit adds s c B, so that B stays whole at every strength s. Geometry and
-        opacity are moved back along the lower layers, which carry them forward again.
+        opacity are moved back along the lower layers, which carry them forward again. Every rule keeps B
+        whole under colors that only make way for discs, see `Anchors.pushes`.
 
         Args:
             gdf: edit of `base`
@@ -85,7 +86,8 @@ class LowerLayers:
         offsets[:, :count, _SHAPE_COLUMNS] = _pushes_on_original(offsets[:, :count], before, below)
         edit = self._move_added(edit)
         lower = (below - before)[:, _FIRST_COLOR_COLUMN:]
-        if self.layers.blend != "sum" and bool(lower.any()):
+        blends = gdf.anchors is None or "color" not in gdf.anchors.pushes
+        if blends and self.layers.blend != "sum" and bool(lower.any()):
             change = offsets[-1, :, _FIRST_COLOR_COLUMN:]
             share = _hidden_share(change.reshape(len(change), -1, 3), lower.reshape(count, -1, 3))
             kept = share[:, None] * lower

@@ -54,11 +54,7 @@ def obstacle(work: Workspace, pointer: PointerContext) -> str:
     brush = view.color_brush
     if brush.tool == "clone" and not brush.erases and work.transient.clone is None:
         return "the clone stamp has no source; Alt+click the place to copy from"
-    if not brush.erases and pointer.is_moved_at_cursor():
-        return (
-            "a layer moves or removes the surface here; hide this layer, because paint lies on the original"
-        )
-    return ""
+    return "" if brush.erases else pointer.unpaintable_at_cursor()
 
 
 def press(work: Workspace, pointer: PointerContext) -> Workspace:

@@ -123,7 +123,13 @@ def camera(source: Path, viewpoint: Camera, origin: Origin = ZERO) -> tuple[Path
     return path, len(cameras) + 1
 
 
-def painted_picture(path: Path, pixels: NDArray[np.uint8], viewpoint: Camera, origin: Origin) -> None:
+def painted_picture(
+    path: Path,
+    pixels: NDArray[np.uint8],
+    viewpoint: Camera,
+    origin: Origin,
+    layers: PictureLayers | None = None,
+) -> None:
     """Save a painted picture with its camera, in the picture and beside it, so that an edit can follow it.
 
     Args:
@@ -131,14 +137,16 @@ def painted_picture(path: Path, pixels: NDArray[np.uint8], viewpoint: Camera, or
         pixels: the picture, with or without transparency. [H,W,3 or 4]
         viewpoint: its camera
         origin: origin of the scene that the camera is relative to
+        layers: layers under the paint, see `picture_layers`
 
     Raises:
         ProgdfError: the file cannot be written.
     """
     make_folder(path.parent)
+    info = camera_chunk(viewpoint, origin=origin, layers=layers)
     with atomic_write(path) as temporary_file:
-        Image.fromarray(pixels).save(temporary_file, "PNG", pnginfo=camera_chunk(viewpoint, origin=origin))
-    save_picture_camera(path, viewpoint, origin)
+        Image.fromarray(pixels).save(temporary_file, "PNG", pnginfo=info)
+    save_picture_camera(path, viewpoint, origin, layers)
 
 
 def single_camera(path: Path, viewpoint: Camera, origin: Origin) -> Path:

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import torch
 from imgui_bundle import imgui
+from numpy.typing import NDArray
 
 from progdf.camera import Camera
-from progdf.compose.layers import KINDS
 from progdf.gaussians import Gaussians
 from progdf.painting.projection import ViewSurface, fitted_surface, is_apart, view_surface
 from progdf.scene.selection import Surface
@@ -147,21 +147,44 @@ class PointerContext:
                     fits.request(self.scene_key, picture, partial(fitted_surface, scene, seen, painted))
                 return
 
-    def is_moved_at_cursor(self) -> bool:
-        """Return True if visible layers move or remove the surface of the original at the cursor."""
-        layers = [layer for layer in self.shown.layers if is_visible(self.shown, layer) and layer.strength]
-        # the edits of the engine: a live edit has no facts
-        kinds = {KINDS[name] for layer in layers for name in self.engine.gdfs[layer.gdf].field.attributes}
-        if kinds <= {"color"}:
-            return False
-        shown = self.view_surface(self.shown.camera, self.size)
-        view = to_camera(self.shown.camera, *self.size)
-        key = surface_key((self.engine, "original"), view)
-        scene = self.engine.scene
-        surface = self.paint.surfaces.get(key, lambda: view_surface(scene, view))
-        x = min(max(int(self.cursor[0]), 0), view.width - 1)
-        y = min(max(int(self.cursor[1]), 0), view.height - 1)
-        return is_apart(shown, surface, x, y)
+    def unpaintable_at_cursor(self) -> str:
+        """Return the reason why the visible surface at the cursor cannot hold paint; "" if it can.
+
+        Paint lies on the scene's own Gaussians, as the layers move them, and on lower paint.
+        """
+        view = self.shown
+        hides = view.selection.hidden != EMPTY_MASK
+        added = self._added_surface()
+        if not hides and not added.any():
+            return ""
+        shown = self.view_surface(view.camera, self.size)
+        camera = to_camera(view.camera, *self.size)
+
+        def make() -> ViewSurface:
+            scene = self.engine.gaussians(view)
+            removed = torch.from_numpy(np.where(added, np.float32(-np.inf), np.float32(0.0)))
+            return view_surface(replace(scene, logit_opacities=scene.logit_opacities + removed), camera)
+
+        paintable = self.paint.surfaces.get(surface_key((self.scene_key, "paintable"), camera), make)
+        x = min(max(int(self.cursor[0]), 0), camera.width - 1)
+        y = min(max(int(self.cursor[1]), 0), camera.height - 1)
+        if not is_apart(shown, paintable, x, y):
+            return ""
+        if hides:
+            return "hidden Gaussians lie here; show all, because paint cannot lie below them"
+        return "a layer added this surface, as a copy or a fill does; paint lies only on the scene's own"
+
+    def _added_surface(self) -> NDArray[np.bool_]:
+        """Return the drawn rows that visible layers add, except for paint. [N]"""
+        mask = np.zeros(len(self.engine.composer.gaussians), bool)
+        own_count = self.facts.count - self.facts.added
+        for layer in self.shown.layers:
+            gdf = self.engine.gdfs[layer.gdf]
+            is_paint = gdf.anchors is not None and bool(gdf.anchors.pushes)
+            if is_visible(self.shown, layer) and layer.strength and not is_paint and not gdf.from_others:
+                members = gdf.region.members.numpy()
+                mask[members[members >= own_count]] = True
+        return mask
 
     def known_surface(
         self, camera: ViewCamera, size: tuple[int, int], request: bool = False

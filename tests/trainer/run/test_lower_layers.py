@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from progdf.compose.layers import Layer
 from progdf.compose.picture_layers import compose_picture, find_layer_files, open_picture_layers
@@ -15,7 +17,8 @@ from progdf.errors import ProgdfError
 from progdf.field.separable import course_field
 from progdf.formats.ply import load_ply, save_ply
 from progdf.gaussians import BASE_CHANNELS, ZERO, Gaussians
-from progdf.gdf.file import Gdf, fingerprint, load_gdf, save_gdf
+from progdf.gdf.anchors import free_anchors
+from progdf.gdf.file import ADDED_LOGIT, Gdf, fingerprint, load_gdf, save_gdf
 from progdf.io.images import to_picture
 from progdf.io.picture_camera import (
     PictureLayer,
@@ -163,6 +166,55 @@ def test_paint_on_a_moved_object_is_where_it_was_painted(place: Path) -> None:
     assert psnr(picture(see(place, layers, gdf)), image, bars) > 28.0
     home = compose_layers(scene, [Layer(gdf)])
     assert psnr(picture(home), image, bars) < 20.0, "the paint goes home with the object"
+
+
+@pytest.mark.slow
+def test_brushed_paint_covers_seen_layers_and_leaves_them(place: Path) -> None:
+    scene = load_ply(place / "wall.ply")
+    red = brush(place, "first", layers_of(place / "blue.gdf"), (200, 30, 40, 255), (slice(52, 76),) * 2)
+    shown = PictureLayers("adjust", (*layers_of(place / "blue.gdf").layers, *layers_of(red, 0.7).layers))
+    upper = brush(place, "second", shown, (30, 160, 60, 128), (slice(64, 90),) * 2)
+    below = picture(see(place, shown))
+    expected = below.clone()
+    inside = torch.zeros(SIDE, SIDE, dtype=torch.bool)
+    inside[64:90, 64:90] = True
+    expected[inside] = torch.lerp(below[inside], torch.tensor([30.0, 160.0, 60.0]) / 255.0, 128 / 255)
+    found = picture(see(place, shown, load_gdf(upper, scene)))
+    assert psnr(found, expected, inside) > 30.0
+    assert psnr(found, below, ~inside) > 38.0, "the lower layers stay"
+
+
+def brush(
+    place: Path, name: str, layers: PictureLayers, color: tuple[int, ...], box: tuple[slice, ...]
+) -> Path:
+    """Train a rectangle of paint over layers; return its edit, beside the scene."""
+    pixels = np.zeros((SIDE, SIDE, 4), np.uint8)
+    pixels[box] = color
+    path = place / f"{name}.png"
+    Image.fromarray(pixels).save(path, pnginfo=camera_chunk(CAMERA, layers=layers))
+    command = TrainOptions(
+        place / "wall.ply", place / name, RegionOptions("sphere:0,0,0,9"), EditorOptions(f"paint:{path}")
+    )
+    edit = train(with_values(command, threads=1), quiet=True).gdf
+    return edit.rename(place / edit.name)
+
+
+def test_colors_that_make_way_for_discs_leave_lower_colors_whole(place: Path) -> None:
+    layers = layers_of(place / "blue.gdf")
+    lower = open_lower_layers([paint(place, "way", layers)], place / "wall.ply", load_ply(place / "wall.ply"))
+    assert lower is not None
+    region = from_mask("new", lower.base.means[:, 1] > -0.5)
+    offsets = torch.zeros(2, len(region) + 1, BASE_CHANNELS)
+    offsets[1, :, 11:] = 0.2
+    anchors = replace(free_anchors(1), pushes=frozenset({"geometry", "opacity", "color"}))
+    field = course_field(torch.tensor([0.0, 1.0]), offsets)
+    base = lower.base
+    added = replace(base[:1], logit_opacities=torch.full((1,), ADDED_LOGIT))
+    edit = Gdf("new", region, field, fingerprint(base), added=added, anchors=anchors)
+    change = lower.compose(lower.rebase(edit)).sh0[: len(base)] - base.sh0
+    expected = torch.zeros_like(change)
+    expected[region.members] = 0.2
+    assert torch.allclose(change, expected, atol=1e-4)
 
 
 def test_missing_or_changed_layer_is_refused_by_name(place: Path, tmp_path: Path) -> None:

@@ -16,7 +16,8 @@ from PIL import Image
 from progdf.errors import ProgdfError
 from progdf.formats.scene_file import save_scene
 from progdf.gaussians import Gaussians
-from progdf.io.picture_camera import find_picture_camera
+from progdf.gdf.file import save_gdf
+from progdf.io.picture_camera import find_picture_camera, layers_in_picture
 from progdf.painting.projection import fitted_surface, view_surface
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.app.messages import Messages
@@ -252,9 +253,16 @@ class Easel:
 
 @pytest.fixture
 def easel(tmp_path: Path) -> Easel:
-    """Return the part with paint in two views."""
-    document = Document("bear.ply", bear().scene, path=tmp_path / "bear.ply")
-    view = painting(ColorBrush("color"))
+    return make_easel(tmp_path)
+
+
+def make_easel(folder: Path, layers: tuple[LayerState, ...] = ()) -> Easel:
+    """Return the part with paint in two views. All layers have the edit blue.gdf."""
+    edits = bear().gdfs[:1]
+    save_gdf(folder / "blue.gdf", edits[0])
+    files = (folder / "blue.gdf",)
+    document = Document("bear.ply", bear().scene, edits, folder / "bear.ply", files)
+    view = replace(painting(ColorBrush("color")), layers=layers)
     pixels = np.zeros((40, 60, 4), np.uint8)
     pixels[10:20, 5:30] = (10, 20, 30, 255)
     turned = replace(view.camera, azimuth=view.camera.azimuth + 30.0)
@@ -284,6 +292,27 @@ def test_done_writes_the_paint_with_its_cameras_and_queues_a_run(easel: Easel) -
     view = easel.store.get().view
     assert (view.painted, view.color_brush.tool) == ((), "")
     assert [paint.painted for paint in easel.pending] == [before]
+
+
+def test_done_names_the_layers_below_the_paint(tmp_path: Path) -> None:
+    bench = make_easel(tmp_path, (LayerState(0, "blue", 0.5), LayerState(1, "hidden", 1.0, False)))
+    bench.part.requests["finish_paint"](None)
+    order = bench.jobs.jobs[0].task
+    assert isinstance(order, EditOrder)
+    for name in order.editor.removeprefix("paint:").split(","):
+        layers = layers_in_picture(name)
+        assert layers is not None
+        assert str(layers) == "blue 0.5"
+        assert layers.layers[0].file == "blue.gdf"
+
+
+def test_done_over_a_layer_without_a_file_keeps_the_paint(tmp_path: Path) -> None:
+    bench = make_easel(tmp_path, (LayerState(7, "training", 1.0),))
+    before = bench.store.get().view.painted
+    with pytest.raises(ProgdfError, match="training has no file yet; hide it"):
+        bench.part.requests["finish_paint"](None)
+    assert bench.store.get().view.painted == before
+    assert not bench.jobs.jobs
 
 
 def test_paint_stays_until_its_layer_is_ready(easel: Easel) -> None:

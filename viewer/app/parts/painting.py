@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from progdf.errors import ProgdfError
+from progdf.io.picture_camera import PictureLayers
 from viewer.app.messages import Messages, Requests
 from viewer.camera.view_camera import to_camera
 from viewer.files import exports
@@ -49,10 +50,10 @@ class PaintingActions:
         return {"finish_paint": lambda _: self._finish()}
 
     def _finish(self) -> None:
-        """Queue a run that lays the paint on the surface.
+        """Queue a run that lays the paint on the surface, above the visible layers.
 
         Raises:
-            ProgdfError: nothing is painted, or the pictures cannot be written.
+            ProgdfError: nothing is painted, a visible layer has no file, or the pictures cannot be written.
         """
         work = self._store.get()
         painted = work.view.painted
@@ -60,7 +61,8 @@ class PaintingActions:
             raise ProgdfError("nothing is painted; paint on the scene with the color brush first")
         scene = self._documents.get().file
         out = training.free_run(training.edits_folder(scene), replace(NewEdit(), name=_NAME).layer_name)
-        files = self._write(painted, out)
+        layers = exports.picture_layers(self._documents.get(), work.view)
+        files = self._write(painted, layers, out)
         order = EditOrder(
             scene.resolve(),
             out,
@@ -77,8 +79,10 @@ class PaintingActions:
         self._store.change(view)
         self._messages.show(f"Making {out.name}; the paint stays on screen until its layer is ready")
 
-    def _write(self, painted: Sequence[PaintedPicture], out: Path) -> list[Path]:
-        """Write paint with transparency beside a run, and its cameras; return the paths."""
+    def _write(
+        self, painted: Sequence[PaintedPicture], layers: PictureLayers | None, out: Path
+    ) -> list[Path]:
+        """Write paint with transparency beside a run, and its cameras and layers; return the paths."""
         origin = self._documents.get().scene.origin
         files = [out.with_name(f"{out.name}.view-{i + 1}.png").resolve() for i in range(len(painted))]
         if len(files) > 1 and any("," in str(path) for path in files):
@@ -87,7 +91,7 @@ class PaintingActions:
             )
         for path, picture in zip(files, painted, strict=True):
             camera = to_camera(picture.camera, *picture.size)
-            exports.painted_picture(path, pixels_of(picture), camera, origin)
+            exports.painted_picture(path, pixels_of(picture), camera, origin, layers)
         return files
 
     def poll(self) -> float | None:
