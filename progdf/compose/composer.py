@@ -38,8 +38,9 @@ from .layers import (
     effects_of,
 )
 from .overlap import ARRANGED, find_paint
+from .paint_order import PaintOrder
 from .reference import Coverage, changed_rows, coverage
-from .states import PaintOrder, Surface
+from .states import Surface
 
 Floats = NDArray[np.float32]
 Rows = NDArray[np.int64]
@@ -47,6 +48,7 @@ Rows = NDArray[np.int64]
 CHUNK = 16_384
 """Rows per task of a thread: few enough for the L2 cache, and enough to be worth a thread."""
 
+_NO_ROWS = np.zeros(0, np.int64)
 _NO_VALUES = np.zeros(0, np.float32)  # stands for weights that are all 1, and for coverage that is all 0
 
 
@@ -95,13 +97,14 @@ class _Plan(NamedTuple):
     """Rows and members to rewrite when some edits change."""
 
     rows: Rows  # all rows that may change, ascending. [U]
-    colors: _Members  # members of the changed edits, and the rows of paint that depend on them
+    colors: _Members  # members of the changed edits
     shapes: _Members  # those whose shape is written, without pushed rows if they are most of them
-    followers: Rows  # indices of the following rows, see `Followers`. [F]
-    added: Rows  # indices of the added rows among them whose shape without following is written. [G]
-    banded: Rows  # indices of following rows with higher SH bands that may change. [B]
-    recolored: Rows  # those of them that the changed edits change
-    arranged: Rows  # indices of the rows of paint among them, see `PaintRows`. [K]
+    followers: Rows = _NO_ROWS  # indices of the following rows, see `Followers`. [F]
+    added: Rows = _NO_ROWS  # indices of the added rows among them whose own shape is written. [G]
+    banded: Rows = _NO_ROWS  # indices of following rows with higher SH bands that may change. [B]
+    recolored: Rows = _NO_ROWS  # those of them that the changed edits change
+    painted: Rows = _NO_ROWS  # indices of the rows of paint among the members, see `PaintRows`. [K]
+    arranged: Rows = _NO_ROWS  # indices of all rows of paint that may change. [L]
 
 
 class _LayerSlice(NamedTuple):
@@ -191,18 +194,18 @@ class Composer:
         # weights are summed by kind of change, so that a change reaches all attributes of its kinds
         kinds = {KINDS[name] for edit in changed for name in self._bases[edit]}
         moving = {name for edit in plan.colors.parts for name in self._bases[edit] if KINDS[name] in kinds}
+        names = tuple(name for name in self._before if name in moving)
         arranged = () if self._paint is None else self._paint.names(changed, plan.arranged)
         moving.update(arranged)
-        names = tuple(name for name in self._before if name in moving)
         surface = self._surface
         if surface is None or not (len(plan.followers) or len(plan.banded)):
-            last = self._release(plan.arranged, arranged)
+            self._release(plan.painted, arranged)
             moved = self._write(stack, blend, plan.colors, names)
-            moved = max(moved, self._arrange(stack, blend, plan.arranged, arranged, last))
-            return Change(plan.rows, names, moved)
+            moved += self._arrange(stack, blend, plan, names, arranged)
+            return Change(plan.rows, tuple(name for name in self._before if name in moving), moved)
         shapes = self.shapes()
         surface.release(shapes, plan.added)
-        last = self._release(plan.arranged, arranged)
+        self._release(plan.painted, arranged)
         if plan.shapes is plan.colors:
             moved = self._write(stack, blend, plan.colors, names)
         else:
@@ -210,7 +213,7 @@ class Composer:
             shaped = tuple(name for name in names if name in FOLLOWED)
             self._write(stack, blend, plan.colors, colors)
             moved = self._write(stack, blend, plan.shapes, shaped)
-        moved = max(moved, self._arrange(stack, blend, plan.arranged, arranged, last))
+        moved += self._arrange(stack, blend, plan, names, arranged)
         carried = surface.carry(shapes, plan.followers, plan.added, stack, blend)
         moving.update(FOLLOWED)
         if len(plan.banded):
@@ -220,45 +223,37 @@ class Composer:
         names = tuple(name for name in self._before if name in moving)
         return Change(plan.rows, names, max(moved, carried))
 
-    def _release(self, arranged: Rows, names: Collection[str]) -> Floats:
-        """Write centers of paint as they are without the order of layers; return the last ones. [K,3]
+    def _release(self, painted: Rows, arranged: Collection[str]) -> None:
+        """Write centers of paint as they are without the order of layers, ahead of `_write`.
 
         Args:
-            arranged: see `_Plan`. [K]
-            names: attributes of these rows that are written
+            painted: see `_Plan`. [K]
+            arranged: attributes that `_arrange` will write
         """
-        if self._paint is None or "means" not in names:
-            return np.zeros((0, 3), np.float32)
-        rows = self._paint.paint.rows[arranged]
-        means = self._after["means"]
-        last: Floats = means[rows]
-        means[rows] = self._before["means"][rows]
-        return last
+        if self._paint is not None and "means" in arranged:
+            self._paint.release(self._after["means"], painted)
 
     def _arrange(
         self,
         stack: Sequence[tuple[int, Layer]],
         blend: str,
-        arranged: Rows,
-        names: Collection[str],
-        last: Floats,
+        plan: _Plan,
+        written: Collection[str],
+        arranged: Collection[str],
     ) -> float:
-        """Put the rows of paint into the order of layers; return the largest movement of a center.
+        """Put the rows of paint into the order of layers; return the largest change of a row's height.
 
         Args:
             stack: active layers with the index of their edit, lowest first
             blend: one of `BLENDS`
-            arranged: see `_Plan`. [K]
-            names: attributes to write
-            last: centers in the last picture. [K,3] or [0,3]
+            plan: the rows
+            written: attributes that `_write` has written
+            arranged: attributes to write
         """
-        if self._paint is None or not names:
+        if self._paint is None or not arranged:
             return 0.0
-        self._paint.arrange(self._after, stack, blend, arranged, names)
-        if not len(last):
-            return 0.0
-        steps = self._after["means"][self._paint.paint.rows[arranged]] - last
-        return math.sqrt(float(np.square(steps).sum(axis=1).max(initial=0.0)))
+        index = plan.painted, plan.arranged
+        return self._paint.arrange(self._after, stack, blend, index, (written, arranged))
 
     def shapes(self) -> Shapes:
         """Return the followed attributes of `gaussians`, which are updated in place. [N,c] each"""
@@ -401,15 +396,10 @@ class Composer:
             if len(self._plans) >= 32:  # only a few are in use during a drag
                 self._plans.clear()
             chosen = [self._members[edit] for edit in changed]
+            members = self._members_in(chosen[0] if len(chosen) == 1 else np.unique(np.concatenate(chosen)))
+            plan = _Plan(members.rows, members, members)
             if self._paint is not None:
-                chosen += [found for edit in changed if len(found := self._paint.dependents(edit))]
-            rows = chosen[0] if len(chosen) == 1 else np.unique(np.concatenate(chosen))
-            members = self._members_in(rows)
-            nothing = np.zeros(0, np.int64)
-            arranged = nothing
-            if self._paint is not None:
-                arranged = np.flatnonzero(np.isin(self._paint.paint.rows, rows, assume_unique=True))
-            plan = _Plan(rows, members, members, nothing, nothing, nothing, nothing, arranged)
+                plan = _plan_paint(self._paint, plan, changed)
             if self._surface is not None:
                 plan = self._plan_followers(self._surface, plan, changed)
             self._plans[changed] = plan
@@ -431,18 +421,20 @@ class Composer:
         rows = np.unique(np.concatenate([plan.rows, *dependents])) if dependents else plan.rows
         index = np.flatnonzero(np.isin(followers.rows, rows))
         banded = index[np.isin(index, surface.banded)]
-        recolored = banded[np.isin(followers.rows[banded], plan.rows)]
+        recolored = banded[np.isin(followers.rows[banded], plan.colors.rows)]
         if not any(changes_shape(self._gdfs[edit]) for edit in changed):
             index = index[:0]
         pushed = followers.rows[index[followers.edits[index] < 0]]
         shapes = plan.colors
         # leaving out a few rows would only break the runs of consecutive members
-        if 2 * len(pushed) > len(plan.rows):
-            shapes = self._members_in(plan.rows[~np.isin(plan.rows, pushed)])
+        if 2 * len(pushed) > len(shapes.rows):
+            shapes = self._members_in(shapes.rows[~np.isin(shapes.rows, pushed)])
         rewritten = changed if self._paint is None else self._paint.partners(changed)
         written = np.isin(followers.edits[index], list(rewritten)) & np.isin(followers.rows[index], plan.rows)
         added = index[written]
-        return _Plan(rows, plan.colors, shapes, index, added, banded, recolored, plan.arranged)
+        return plan._replace(
+            rows=rows, shapes=shapes, followers=index, added=added, banded=banded, recolored=recolored
+        )
 
     def _coverage_of(self, edit: int) -> Mapping[str, Tensor]:
         if edit not in self._coverage:
@@ -465,6 +457,16 @@ class Composer:
             raise ValueError(
                 f"{gdf.name} is not one of the composer's edits; give it to Composer first"
             ) from None
+
+
+def _plan_paint(paint: PaintOrder, plan: _Plan, changed: frozenset[int]) -> _Plan:
+    """Return the plan extended by the rows of paint that depend on the changed edits."""
+    dependents = [found for edit in changed if len(found := paint.dependents(edit))]
+    rows = np.unique(np.concatenate([plan.rows, *dependents])) if dependents else plan.rows
+    painted, arranged = (
+        np.flatnonzero(np.isin(paint.paint.rows, chosen, assume_unique=True)) for chosen in (plan.rows, rows)
+    )
+    return plan._replace(rows=rows, painted=painted, arranged=arranged)
 
 
 def _between(part: _LayerSlice, first: int, last: int) -> _LayerSlice:

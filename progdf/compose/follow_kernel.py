@@ -66,18 +66,19 @@ def _differs(a: Floats, i: int, b: Floats, j: int, first: int, last: int) -> boo
 
 
 @kernel(cache=True)
-def release_centers(means: Floats, index: Rows, rows: Rows, own: Floats) -> None:
-    """Write the centers of following rows before they follow their anchors.
+def release_rows(shapes: Shapes, index: Rows, rows: Rows, own: Floats) -> None:
+    """Write following rows as they are before they follow their anchors.
 
     Args:
-        means: centers of the scene, updated in place. [N,3]
+        shapes: followed attributes of the scene, updated in place. [N,c] each
         index: indices of the rows to write. [G]
         rows: rows of the scene that follow. [F]
         own: the rows before they follow, packed by `pack_shapes`. [F,11]
     """
+    logits = shapes[3]
     for i in index:
-        for c in range(3):
-            means[rows[i], c] = own[i, c]
+        _write_geometry(shapes, rows[i], own, i)
+        logits[rows[i], 0] = own[i, 10]
 
 
 @kernel(cache=True)

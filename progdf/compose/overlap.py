@@ -11,12 +11,12 @@ each other, whatever the order of the layers. For a layer of paint above another
 - Rows at its rim repeat the colors beside the paint. They take the colors that are there now: those of the
   lower paint, and those of recolored Gaussians below.
 
-`compose_layers` and `Composer` both call `find_paint` and `arrange`.
+`compose_layers` and `Composer` both call `find_paint`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import permutations
@@ -46,6 +46,8 @@ _COVERED = (0.5, 0.95)  # least and full coverage at which a row fades
 _SCATTER_QUANTILE = 0.9  # quantile of the pushed Gaussians' movements; surfaces within it are the same one
 _NEAREST_PUSHED = 8  # pushed Gaussians whose movement gives the direction of the painted picture
 _POINTS_AT_ONCE = 1 << 14  # limits the memory
+MIN_OPACITY = 1e-30
+"""Opacity of a row that is covered completely, which keeps its logit finite."""
 _MAX_REMEMBERED = 64  # entries of a cache
 
 Floats = NDArray[np.float64]
@@ -237,67 +239,101 @@ def arrange(
     layers: Sequence[PaintLayer],
     tints: Floats,
     values: Mapping[str, NDArray[np.float32]],
-    rewritten: Rows,
-    names: Collection[str] = ARRANGED,
 ) -> None:
     """Move, fade and recolor the rows of paint by the order of the layers.
+
+    `progdf.compose.paint_order.PaintOrder` computes the same values for the rows that a slider changes.
 
     Args:
         paint: see `find_paint`
         layers: active layers of paint, lowest first
         tints: change of the SH coefficients of degree 0 that other layers make to the anchors of the rows.
             [A,3]
-        values: attributes of all rows, those of `rewritten` rows without the order of layers; updated in
-            place. [N,…]
-        rewritten: indices of the rows to change. The others already have their place in the order. [K]
-        names: attributes to change
+        values: attributes of all rows without the order of layers; updated in place. [N,…]
     """
-    if not paint.pairs and not tints.any():
-        return
+    opacity = opacities(paint, layers)
+    order = paint_order(paint, layers)
+    risen, kept = _heights(paint, order, opacity)
+    colors = values["sh0"].reshape(-1, 3)
+    own = colors[paint.rows].astype(np.float64)
+    mixed = _rim_colors(paint, order, opacity, own, own + tints)
+    active = opacity != 0.0
+    recolored = active & (mixed != own).any(axis=1)
+    colors[paint.rows[recolored]] = mixed[recolored]
+    higher = active & (risen > 0.0)
+    step = risen[higher, None] * paint.outward[higher]
+    values["means"][paint.rows[higher]] += step.astype(np.float32)
+    fading = active & (kept < 1.0)
+    logits = values["logit_opacities"].reshape(-1)
+    visible = kept[fading] / (1.0 + np.exp(-logits[paint.rows[fading]].astype(np.float64)))
+    visible = np.maximum(visible, MIN_OPACITY)
+    logits[paint.rows[fading]] = np.log(visible) - np.log1p(-visible)
+
+
+def opacities(paint: PaintRows, layers: Sequence[PaintLayer]) -> Floats:
+    """Return the strength at which each row of paint shows, 0 to 1. [A]
+
+    Of two layers of one edit, the stronger one shows, see `Anchors.pushes`.
+    """
     opacity = np.zeros(len(paint))
+    for layer in layers:
+        if layer.edit not in paint.spans:
+            continue
+        mine = paint.spans[layer.edit]
+        visible: float | Floats = layer.strength
+        if layer.weights is not None:
+            visible = layer.strength * layer.weights[paint.members[mine]].astype(np.float64)
+        opacity[mine] = np.maximum(opacity[mine], visible)
+    return opacity
+
+
+def paint_order(paint: PaintRows, layers: Sequence[PaintLayer]) -> tuple[int, ...]:
+    """Return the edits with rows of paint, in the order of their uppermost layers, lowest first."""
+    upper_first = dict.fromkeys(layer.edit for layer in reversed(layers) if layer.edit in paint.spans)
+    return tuple(upper_first)[::-1]
+
+
+def overlaps_below(paint: PaintRows, order: Sequence[int], edit: int) -> list[Overlap]:
+    """Return the overlaps of an edit with the edits below it, lowest first."""
+    lower = order[: order.index(edit)]
+    return [paint.pairs[edit, each] for each in lower if (edit, each) in paint.pairs]
+
+
+def _heights(paint: PaintRows, order: Sequence[int], opacity: Floats) -> tuple[Floats, Floats]:
+    """Return the distance by which each row rises, and the factor of its opacity. [A], [A]"""
     risen = np.zeros(len(paint))
     kept = np.ones(len(paint))
-    own = values["sh0"].reshape(-1, 3)[paint.rows].astype(np.float64)
-    beside = own + tints  # colors of the surface beside the paint
-    color = own.copy()  # colors in the order of layers
-    # rows that are not rewritten already have their colors
-    rim = np.zeros((len(paint), 1))
-    rim[rewritten, 0] = paint.rim[rewritten]
-    layers = [layer for layer in layers if layer.edit in paint.spans]
-    for layer in layers:
-        mine = paint.spans[layer.edit]
-        visible = np.full(mine.stop - mine.start, layer.strength)
-        if layer.weights is not None:
-            visible *= layer.weights[paint.members[mine]]
-        # of two layers of one edit, the stronger one shows, see `Anchors.pushes`
-        opacity[mine] = np.maximum(opacity[mine], visible)
-    order = list(dict.fromkeys(layer.edit for layer in reversed(layers)))[::-1]
-    for position, edit in enumerate(order):
-        mine = paint.spans[edit]
-        for lower in order[:position]:
-            pair = paint.pairs.get((edit, lower))
-            if pair is None:
-                continue
+    for edit in order:
+        for pair in overlaps_below(paint, order, edit):
             risen[pair.over] = np.maximum(risen[pair.over], pair.rise + risen[pair.under])
+            kept[pair.hidden] *= 1.0 - pair.share * _eighth_power(opacity[pair.above])
+    return risen, kept
+
+
+def _rim_colors(
+    paint: PaintRows, order: Sequence[int], opacity: Floats, own: Floats, beside: Floats
+) -> Floats:
+    """Return the colors of the rows, of which rims take those beside the paint.
+
+    Args:
+        paint: see `find_paint`
+        order: edits, lowest first
+        opacity: see `opacities`. [A]
+        own: colors without the order of layers. [A,3]
+        beside: colors of the surface beside the paint; overwritten. [A,3]
+
+    Returns:
+        [A,3]
+    """
+    color = own.copy()
+    rim = paint.rim[:, None]
+    for edit in order:
+        for pair in overlaps_below(paint, order, edit):
             share = (pair.cover * opacity[pair.under])[:, None]
             beside[pair.over] += share * (color[pair.under] - beside[pair.over])
-            kept[pair.hidden] *= 1.0 - pair.share * _eighth_power(opacity[pair.above])
+        mine = paint.spans[edit]
         color[mine] += rim[mine] * (beside[mine] - own[mine])
-    active = opacity[rewritten] != 0.0
-    at = rewritten[active]
-    if "sh0" in names:
-        moved = at[(color[at] != own[at]).any(axis=1)]
-        values["sh0"].reshape(-1, 3)[paint.rows[moved]] = color[moved]
-    if "means" in names:
-        higher = at[risen[at] > 0]
-        step = risen[higher, None] * paint.outward[higher]
-        values["means"][paint.rows[higher]] += step.astype(np.float32)
-    if "logit_opacities" in names:
-        fading = at[kept[at] < 1]
-        logits = values["logit_opacities"].reshape(-1)
-        visible = kept[fading] / (1.0 + np.exp(-logits[paint.rows[fading]].astype(np.float64)))
-        visible = np.maximum(visible, 1e-30)
-        logits[paint.rows[fading]] = np.log(visible) - np.log1p(-visible)
+    return color
 
 
 def _eighth_power(strength: Floats) -> Floats:

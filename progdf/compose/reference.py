@@ -235,7 +235,6 @@ def _arrange(scene: Gaussians, composed: Gaussians, layers: Sequence[Layer], ble
         paint_layers([(index[id(layer.gdf)], layer) for layer in layers]),
         tints,
         {name: each.numpy() for name, each in values.items()},
-        np.arange(len(paint)),
     )
     changed: dict[str, Any] = {
         name: new.to(getattr(scene, name).dtype)

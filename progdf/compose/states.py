@@ -1,13 +1,13 @@
 """Rows that depend on the composed state of other rows, updated by `Composer`.
 
-The dependent rows are those that follow a surface (`progdf.compose.follow`), and those of painted layers
-(`progdf.compose.overlap`).
+The dependent rows are those that follow a surface (`progdf.compose.follow`), and the rims of painted layers
+(`progdf.compose.paint_order`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Protocol
 
@@ -21,12 +21,9 @@ from progdf.gdf.file import Gdf
 from progdf.threads import run_chunks
 
 from .follow import (
-    COLORS,
     FOLLOWED,
     Followers,
     banded_followers,
-    changes_shape,
-    find_rims,
     mean_quats,
     pack_shapes,
     state_scene,
@@ -37,11 +34,10 @@ from .follow_kernel import (
     carry_fast,
     gather_shapes,
     measure_motions,
-    release_centers,
+    release_rows,
     rest_motions,
 )
 from .layers import Change, Layer
-from .overlap import ARRANGED, PaintRows, arrange, paint_layers
 from .reference import Coverage
 
 Floats = NDArray[np.float32]
@@ -166,13 +162,13 @@ class Surface:
         return self._dependents[edit]
 
     def release(self, shapes: Shapes, index: Rows) -> None:
-        """Write the centers of added rows before they follow, ahead of the update by the composer.
+        """Write added rows as they are before they follow, ahead of the update by the composer.
 
         Args:
             shapes: the composed scene, see `Composer.shapes`; updated in place
             index: indices of the rows, see `Followers`. [F]
         """
-        release_centers(shapes[0], index, self.followers.rows, self._own)
+        release_rows(shapes, index, self.followers.rows, self._own)
 
     def carry(
         self,
@@ -233,89 +229,3 @@ class Surface:
         mean = mean_quats(torch.from_numpy(turns[anchors, :4]), torch.from_numpy(weights)[..., None])
         turned = turn_bands(self._bands[index], mean, torch.from_numpy(is_moved))
         bands[followers.rows[index]] = turned.flatten(1).numpy()
-
-
-class PaintOrder:
-    """Rows of painted layers that depend on other layers, with the inputs of `arrange`.
-
-    Args:
-        scene: the extended scene
-        gdfs: its edits
-        paint: see `find_paint`
-        coverage_of: function from the index of an edit to its coverage
-        make: constructor of the composer of the states
-    """
-
-    def __init__(
-        self,
-        scene: Gaussians,
-        gdfs: Sequence[Gdf],
-        paint: PaintRows,
-        coverage_of: Callable[[int], Mapping[str, Tensor]],
-        make: MakeComposer,
-    ) -> None:
-        self.paint = paint
-        self._painted = frozenset(np.unique(paint.edits).tolist())
-        self._shaping = frozenset(edit for edit, gdf in enumerate(gdfs) if changes_shape(gdf))
-        self._tints = np.zeros((len(paint), 3))
-        found = find_rims(gdfs, len(scene), paint)
-        self._states = None if found is None else States(scene, gdfs, found, coverage_of, COLORS, make)
-
-    def names(self, changed: Collection[int], rows: Rows) -> Collection[str]:
-        """Return the attributes of rows of paint to write when some edits change."""
-        if not len(rows):
-            return ()
-        return ARRANGED if self.paint.pairs and not self._shaping.isdisjoint(changed) else ("sh0",)
-
-    def partners(self, changed: frozenset[int]) -> frozenset[int]:
-        """Return the changed edits, and the painted ones whose place in the order depends on them."""
-        return changed.union(*(self.paint.partners(edit) for edit in changed & self._painted))
-
-    def dependents(self, edit: int) -> Rows:
-        """Return the rows that may change with an edit, besides its members. Sorted"""
-        chosen = []
-        if edit in self._painted:
-            partners = list(self.paint.partners(edit) - {edit})
-            chosen.append(self.paint.rows[np.isin(self.paint.edits, partners)])
-        if self._states is not None:
-            chosen.append(self._with_upper(self._states.followers.dependents(edit)))
-        return np.unique(np.concatenate(chosen)) if chosen else np.zeros(0, np.int64)
-
-    def _with_upper(self, rows: Rows) -> Rows:
-        """Return rows of paint, and the rows above them, whose rims take their colors."""
-        below = np.isin(self.paint.rows, rows)
-        count = -1
-        while count < below.sum():
-            count = int(below.sum())
-            for pair in self.paint.pairs.values():
-                below[pair.over[below[pair.under]]] = True
-        return self.paint.rows[below]
-
-    def arrange(
-        self,
-        values: Mapping[str, Floats],
-        stack: Sequence[tuple[int, Layer]],
-        blend: str,
-        rows: Rows,
-        names: Collection[str],
-    ) -> None:
-        """Put rows of paint into the order of layers.
-
-        Args:
-            values: attributes of the composed scene; updated in place. [N,c] each
-            stack: active layers with the index of their edit, lowest first
-            blend: one of `BLENDS`
-            rows: indices of the rows to write, see `PaintRows`. [K]
-            names: attributes to write
-        """
-        if self._states is not None and len(self._states.update(stack, blend)):
-            self._measure_tints(self._states)
-        arrange(self.paint, paint_layers(stack), self._tints, values, rows, names)
-
-    def _measure_tints(self, states: States) -> None:
-        """Measure how other layers change the colors of the anchors of rims."""
-        followers = states.followers
-        change = states.composer.gaussians.sh0 - states.before.sh0.float()
-        changes = change.reshape(-1, 3).double().numpy()
-        tints = (followers.weights[..., None] * changes[followers.anchors]).sum(axis=1)
-        self._tints[np.searchsorted(self.paint.rows, followers.rows)] = tints

@@ -103,6 +103,19 @@ def test_composer_changes_one_layer_at_a_time_like_compose(scene: Gaussians, nam
         torch.testing.assert_close(pack(composer.gaussians, True), plain, atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.parametrize("dragged", [0, 1, 2])
+def test_dragged_paint_on_a_moving_and_fading_surface_is_like_compose(scene: Gaussians, dragged: int) -> None:
+    below = edit_of(scene, some_rows(scene, 200, 3), curved_field(200, 3), "below")
+    paints = [rimmed(painted(scene, 45, seed, f"paint {seed}"), seed) for seed in (9, 12, 14)]
+    composer = Composer(scene, [*paints, below])
+    for strength in (0.3, 0.9, 1.0, 0.0, 0.6):
+        strengths = [strength if index == dragged else 0.9 for index in range(len(paints))]
+        layers = [Layer(below, 0.8), *map(Layer, paints, strengths)]
+        composer.update(layers)
+        plain = pack(compose_layers(scene, layers), True)
+        torch.testing.assert_close(pack(composer.gaussians, True), plain, atol=1e-5, rtol=1e-5)
+
+
 def test_rim_above_a_tinted_rim_changes_with_it() -> None:
     wall = flat_wall()
     lower = rimmed(flat_paint("lower", 0.03, (0.1, 0.1, 0.9)), 1)
