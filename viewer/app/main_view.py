@@ -29,7 +29,7 @@ from viewer.state import actions, layer_selection, timeline, workspace
 from viewer.state.commands import Action, Plain, WithValue
 from viewer.state.layers import add_layer
 from viewer.state.snapshots import SliderSnapshot, compare_sides
-from viewer.state.transient import Decal, Gizmo, KeyPointer, MouseTool, PreviewState
+from viewer.state.transient import Decal, DecalGhost, Gizmo, KeyPointer, MouseTool, PreviewState
 from viewer.state.view_state import LayerState, ViewState
 from viewer.state.workspace import PLACES, SceneFacts, Store, Workspace, with_transient
 from viewer.ui import overlay
@@ -408,7 +408,8 @@ class MainView:
     def _move_gizmo(self) -> bool:
         """Move the handles or the decal with the mouse; return True if they take the mouse."""
         for ghost in self.work.transient.ghosts:
-            draw_ghost(ghost, self._pointer())
+            if isinstance(ghost, DecalGhost):
+                draw_ghost(ghost, self._pointer())
         gizmo = self.work.transient.gizmo
         if gizmo is None:
             return False
@@ -526,9 +527,8 @@ class MainView:
         with self._guard():
             color_tool.draw(self.work, pointer)
         with self._guard():
-            cover = self.work.transient.cover
-            if cover is not None and not original:
-                pages.draw_cover(cover, self.work.view, pointer.size, pointer.area, self.ui)
+            if not original:
+                pages.draw_cover(self.work, pointer.size, pointer.area, self.ui)
         if (frame := self._frame()) is not None:
             overlay.draw_frame(self.work.view.safe_frame, frame, pointer.area, self.ui)
         with self._guard():

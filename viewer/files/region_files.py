@@ -63,11 +63,16 @@ def region_option(form: NewEdit, folder: Path, state: SelectionState, total: int
 def keep_region(state: SelectionState, name: str, folder: Path, total: int) -> SelectionState:
     """Save the selection as a region, with a file in a folder.
 
+    A region of an edit with the same Gaussians gets the name and stands among the saved ones.
+
     Args:
         state: the selection and the regions
         name: name of the region; it gets a number if a region or a file already has it
         folder: folder of the file
         total: number of Gaussians in the scene
+
+    Returns:
+        The new state; the given one if a saved region has the same Gaussians.
 
     Raises:
         ProgdfError: nothing is selected, there are too many regions, or the folder cannot be written to.
@@ -75,6 +80,12 @@ def keep_region(state: SelectionState, name: str, folder: Path, total: int) -> S
     if not state.count:
         raise ProgdfError("nothing is selected; select something first")
     check_members(state.members, total)
+    equal = selection.equal_region(state, state.members, total)
+    if equal is not None:
+        if not state.regions[equal].edit:
+            return state
+        state = rename_region(state, equal, name, total)
+        return selection.change_region(state, equal, replace(state.regions[equal], edit=""))
     path = _free_region_path(state, name, folder)
     state = selection.add_region(state, path.name.removesuffix(selection.SUFFIX), path)
     write_region(state.regions[-1], total)

@@ -66,7 +66,7 @@ _GRADES = {
 
 
 def draw(work: Workspace, count: int, ui: UiContext, actions: list[Action]) -> Workspace:
-    """Draw the form if it is open. Tab moves through it, Enter trains, Escape closes it.
+    """Draw the form if it is open. Tab moves through it, Ctrl+Enter trains, Escape closes it.
 
     Args:
         count: number of Gaussians in the scene
@@ -79,10 +79,8 @@ def draw(work: Workspace, count: int, ui: UiContext, actions: list[Action]) -> W
         # an open list handles Enter and Escape itself
         mine = imgui.is_window_focused() and not storage.get_bool(listed)
         closes = mine and imgui.is_key_pressed(imgui.Key.escape, False)
-        trains = mine and any(imgui.is_key_pressed(key, False) for key in _ENTER)
-        if mine and not imgui.get_io().want_text_input:
-            for key in _ENTER:  # keep Enter from pressing buttons and opening lists
-                imgui.internal.set_key_owner(key, listed)
+        asks = work.dialog is not None or storage.get_bool(listed)
+        trains = not asks and imgui.get_io().key_ctrl and imgui.is_key_pressed(imgui.Key.enter, False)
         if closes:  # skip the fields, which would undo the typing
             actions.append(Plain("new_edit"))
         else:
@@ -97,7 +95,8 @@ def draw(work: Workspace, count: int, ui: UiContext, actions: list[Action]) -> W
 
 
 _NAME = "new edit"
-_ENTER = (imgui.Key.enter, imgui.Key.keypad_enter)
+TRAIN_KEYS = "Ctrl+Enter"
+"""Chord of the Train button while the form is open."""
 
 
 def has_keyboard() -> bool:
@@ -144,7 +143,7 @@ def _content(work: Workspace, count: int, ui: UiContext) -> tuple[NewEdit, str]:
     if error:
         wrapped_text(error, PALETTE.error)
     with inert(bool(form.obstacle)):
-        if accent_button(f"{Icon.TRAIN}  Train", imgui.ImVec2(-1.0, 0.0)):
+        if accent_button(f"{Icon.TRAIN}  Train", imgui.ImVec2(-1.0, 0.0), TRAIN_KEYS):
             action = "train"
     tip(form.obstacle or f"Train the edit; it becomes a layer with a slider. {_effort(form)}")
     return form, action

@@ -15,8 +15,8 @@ from progdf.terminal import escape_text
 from viewer.camera.view_camera import LARGEST_SIDE, SHAPES
 from viewer.state.commands import Action, Plain, WithText
 from viewer.state.forms import FORMATS, FPS, SIDES, DeliverOptions, film_title, picture_size
-from viewer.state.transient import Cover, StartFile
-from viewer.state.view_state import ViewState
+from viewer.state.transient import StartFile
+from viewer.state.workspace import Workspace
 from viewer.ui import overlay
 from viewer.ui.context import BEHIND, FIXED, PALETTE, SMALL_PX, Icon, UiContext, u32
 from viewer.ui.widgets import (
@@ -236,12 +236,13 @@ def _dashed_frame(size: imgui.ImVec2, ui: UiContext) -> None:
             canvas.add_line(begin, end, ink, 1.5 * scale)
 
 
-def draw_cover(
-    cover: Cover, view: ViewState, size: tuple[int, int], area: overlay.Area, ui: UiContext
-) -> None:
-    """Draw the cover image while the view has its camera and size and no comparison is on."""
-    if (cover.camera, cover.size) != (view.camera, size) or view.compare.mode != "off":
+def draw_cover(work: Workspace, size: tuple[int, int], area: overlay.Area, ui: UiContext) -> None:
+    """Draw the first cover image of the view's camera and size, unless a comparison is on."""
+    view = work.view
+    matching = [cover for cover in work.transient.covers if (cover.camera, cover.size) == (view.camera, size)]
+    if not matching or view.compare.mode != "off":
         return
+    cover = matching[0]
     corners = (0.0, 0.0), (area.width, area.height)
     imgui.get_background_draw_list().add_image(imgui.ImTextureRef(cover.texture), *corners)
     overlay.banner(cover.name, area, ui)

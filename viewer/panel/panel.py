@@ -15,7 +15,7 @@ from viewer.state import history
 from viewer.state.commands import Action, OnItem, Plain, Rename, SelectRegion, WithText
 from viewer.state.layer_selection import selected_layers
 from viewer.state.selection import NamedRegion
-from viewer.state.workspace import UNSAVED, Layout, SceneFacts, Workspace, has_unsaved
+from viewer.state.workspace import REGIONS_OF_EDITS, UNSAVED, Layout, SceneFacts, Workspace, has_unsaved
 from viewer.ui import widgets
 from viewer.ui.context import BEHIND, FIXED, PALETTE, SMALL_PX, Icon, UiContext, u32
 
@@ -191,17 +191,21 @@ def _region_menu(index: int) -> tuple[tuple[str, Action | None, str], ...]:
 
 
 def _regions(work: Workspace, ui: UiContext, actions: list[Action]) -> Workspace:
-    """Draw the section "Regions" with a row for each region, if there are any."""
-    regions = work.view.selection.regions
-    layout = work.layout
-    if not regions:
-        return work
-    layout = widgets.section("Regions", layout, ui)
-    for i, region in enumerate(regions if "Regions" not in layout.folded else ()):
-        with imgui_ctx.push_id(f"region {i}"):
-            if _row(i, region, ui, actions):
-                work = replace(work, pointed=work.pointed or ("region", i))
-    return replace(work, layout=layout)
+    """Draw a section with the regions saved by hand, and one with those that trainings made."""
+    regions = list(enumerate(work.view.selection.regions))
+    saved = [(i, region) for i, region in regions if not region.edit]
+    of_edits = [(i, region) for i, region in regions if region.edit]
+    for name, listed in (("Regions", saved), (REGIONS_OF_EDITS, of_edits)):
+        if not listed:
+            continue
+        work = replace(work, layout=widgets.section(name, work.layout, ui))
+        if name in work.layout.folded:
+            continue
+        for i, region in listed:
+            with imgui_ctx.push_id(f"region {i}"):
+                if _row(i, region, ui, actions):
+                    work = replace(work, pointed=work.pointed or ("region", i))
+    return work
 
 
 def _row(index: int, region: NamedRegion, ui: UiContext, actions: list[Action]) -> bool:

@@ -121,14 +121,18 @@ def perform(workspace: Workspace, action: Action, facts: SceneFacts, aspect: flo
 def _edit_again(workspace: Workspace, index: int, facts: SceneFacts) -> Workspace:
     """Open the form with the settings of a layer's edit, if one of the form's editors made it."""
     layer = workspace.view.layers[index]
-    regions = workspace.view.selection.regions
     row = facts.rows[layer.gdf]
     form = with_settings(replace(workspace.form, name=layer.name, error=""), row.instruction)
     if form is None:
         return workspace
-    matching_regions = [region.name for region in regions if row.region_spec == f"file:{region.path}"]
-    if matching_regions or row.region_spec in (ALL, CHANGED):
-        form = replace(form, region=matching_regions[0] if matching_regions else row.region_spec)
+    mask = np.zeros(facts.count, bool)
+    mask[row.members] = True
+    known = workspace.view.selection
+    equal = selection.equal_region(known, selection.pack(mask), facts.count)
+    if row.region_spec in (ALL, CHANGED):
+        form = replace(form, region=row.region_spec)
+    elif equal is not None:
+        form = replace(form, region=known.regions[equal].name)
     elif row.region_spec:
         form = replace(form, region=TYPED, typed_region=row.region_spec)
     return replace(workspace, form=form, form_open=True, form_opening=True)

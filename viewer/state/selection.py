@@ -57,6 +57,7 @@ class NamedRegion:
     count: Annotated[int, Meta(ge=0)]  # number of its members
     color: Color = COLORS[0]  # color of its swatch and tint
     visible: bool = False  # whether the picture shows its tint
+    edit: str = ""  # name of the edit that was trained on it, if training made the region
 
 
 @dataclass(frozen=True)
@@ -215,8 +216,23 @@ def free_name(state: SelectionState, text: str, is_taken: Callable[[str], bool] 
     return next(free for free in numbered_names(name) if not (free.lower() in taken or is_taken(free)))
 
 
-def add_region(state: SelectionState, name: str, path: Path) -> SelectionState:
+def equal_region(state: SelectionState, members: bytes, total: int) -> int | None:
+    """Return the index of the region with the same Gaussians as a packed mask, None if there is none."""
+    mask = unpack(members, total)
+    for index, region in enumerate(state.regions):
+        if np.array_equal(unpack(region.members, total), mask):
+            return index
+    return None
+
+
+def add_region(state: SelectionState, name: str, path: Path, edit: str = "") -> SelectionState:
     """Add the selection as a region. The selection is unchanged.
+
+    Args:
+        state: the selection and the regions
+        name: name of the region, unique
+        path: file of its rows
+        edit: name of the edit that is trained on it, if it is not saved by hand
 
     Raises:
         ProgdfError: there are already `MAX_REGIONS`.
@@ -224,7 +240,7 @@ def add_region(state: SelectionState, name: str, path: Path) -> SelectionState:
     if len(state.regions) >= MAX_REGIONS:
         raise ProgdfError(f"there are already {MAX_REGIONS} regions (the maximum); delete some first")
     color = COLORS[len(state.regions) % len(COLORS)]
-    region = NamedRegion(name, path, state.members, state.count, color)
+    region = NamedRegion(name, path, state.members, state.count, color, edit=edit)
     return replace(state, regions=(*state.regions, region))
 
 

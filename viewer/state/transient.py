@@ -83,6 +83,14 @@ class Decal:
 
 
 @dataclass(frozen=True)
+class PreviewGhost:
+    """Preview of an edit in training, drawn in its view until the edit has a layer."""
+
+    run: Path  # folder of the run
+    cover: Cover
+
+
+@dataclass(frozen=True)
 class DecalGhost:
     """Decal in training, drawn until its layer replaces it."""
 
@@ -217,7 +225,7 @@ class Transient:
     preview: PreviewState = PreviewState()  # state of the preview of a new edit
     live: tuple[LayerState, ...] = ()  # edits in training, on top of the layer stack
     gizmo: Gizmo | Decal | None = None  # handles of a selection being moved, or a decal being placed
-    ghosts: tuple[DecalGhost, ...] = ()  # decals in training
+    ghosts: tuple[DecalGhost | PreviewGhost, ...] = ()  # edits in training that have no layer yet
     pointer: KeyPointer = KeyPointer()  # pointer of the active tool
     tool: MouseTool = MouseTool()  # drag and gesture of the mouse
     clone: CloneSource | None = None  # source of the clone stamp
@@ -225,3 +233,9 @@ class Transient:
     recent: tuple[Path, ...] = ()  # recently opened files, for menu and dialogs; the last one first
     start_files: tuple[StartFile, ...] = ()  # recently opened files, for the start page
     examples: tuple[StartFile, ...] = ()  # examples on the start page
+
+    @property
+    def covers(self) -> tuple[Cover, ...]:
+        """Images to draw over the picture in their views, the most important one first."""
+        ghosts = [ghost.cover for ghost in reversed(self.ghosts) if isinstance(ghost, PreviewGhost)]
+        return tuple(ghosts) if self.cover is None else (self.cover, *ghosts)

@@ -130,13 +130,17 @@ Pointed = tuple[str, int]
 """Panel item under the mouse: "layer" or "region" and its index, or ("selection", 0)."""
 
 
+REGIONS_OF_EDITS = "Regions of edits"
+"""Section of the panel with the regions that trainings made, folded at first."""
+
+
 @dataclass(frozen=True)
 class Layout:
     """Layout of the window, saved between sessions."""
 
     zoom: Annotated[float, Meta(ge=MIN_ZOOM, le=MAX_ZOOM)] = 1.0  # scale of the interface
     panel_px: Annotated[float, Meta(ge=NARROWEST_PX, le=WIDEST_PX)] = 300.0  # panel width, pixels at 1×
-    folded: tuple[str, ...] = ()  # folded sections of the panel
+    folded: tuple[str, ...] = (REGIONS_OF_EDITS,)  # folded sections of the panel
     reduced_motion: bool = False  # the camera jumps instead of gliding
 
     def with_panel(self, wide: float) -> Layout:

@@ -132,13 +132,20 @@ def plate(
     imgui.end()
 
 
-def accent_button(text: str, size: imgui.ImVec2Like) -> bool:
-    """Draw the button of the most likely action; return True if it was pressed."""
+def accent_button(text: str, size: imgui.ImVec2Like, chord: str = "") -> bool:
+    """Draw the button of the most likely action, and its keys at the right; return True if it was pressed."""
     col = imgui.Col_
     colors = {col.button: PALETTE.accent, col.button_hovered: PALETTE.handle, col.text: PALETTE.ink}
     for slot, color in colors.items():
         imgui.push_style_color(slot, color)
     pressed = imgui.button(text, size)
+    if chord:
+        padding = imgui.get_style().frame_padding
+        with imgui_ctx.push_font(None, SMALL_PX):
+            wide, tall = imgui.calc_text_size(chord)
+            high, low = imgui.get_item_rect_min(), imgui.get_item_rect_max()
+            at = (low.x - wide - padding.x, (high.y + low.y - tall) / 2)
+            imgui.get_window_draw_list().add_text(at, u32(PALETTE.ink), chord)
     imgui.pop_style_color(len(colors))
     return bool(pressed)
 

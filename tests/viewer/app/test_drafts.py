@@ -245,6 +245,31 @@ def test_preview_without_a_grade_shows_the_picture_of_the_editor(window: applica
     assert window.main_view.work.transient.live == ()
 
 
+def test_preview_stays_in_its_view_until_the_edit_has_a_layer(window: application.App) -> None:
+    opened(window)
+    Previews.grade = None
+    with_form(window, editor=2)
+    preview = window.main_view.work.transient.cover
+    assert preview is not None
+    request(window, Plain("train"))
+    transient = window.main_view.work.transient
+    assert transient.cover is None
+    (ghost,) = transient.covers
+    assert (ghost.texture, ghost.camera, ghost.size) == (preview.texture, preview.camera, preview.size)
+    assert "training" in ghost.name
+    press(window, "Ctrl+N")
+    with_form(window, editor=2, strength=0.5)
+    covers = window.main_view.work.transient.covers
+    assert [cover is ghost for cover in covers] == [False, True], "the next preview lies over it"
+    window.main_view.store.replace(replace(window.main_view.work, form_open=False))
+    turn(window)
+    assert window.main_view.work.transient.covers == (ghost,)
+    Trainer.ended = 0
+    turn(window)
+    assert window.main_view.work.transient.covers == ()
+    assert len(window.main_view.work.view.layers) == 1
+
+
 def test_prompt_is_painted_on_request_and_the_edit_follows_it(
     window: application.App, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -76,14 +76,23 @@ def form(hand: Rig) -> Rig:
     return hand
 
 
-def test_opened_form_takes_typed_text_and_enter_starts_training(form: Rig) -> None:
+def test_opened_form_takes_typed_text_and_ctrl_enter_starts_training(form: Rig) -> None:
     before = form.main_view.work.view
     type_text(form, "red jacket")
     assert form.main_view.work.form.name == "red jacket"
     assert form.main_view.work.view == before, "no letter was a shortcut"
     strike(form, "Enter")
+    work = form.main_view.work
+    assert (work.form.name, work.form_open, work.renaming) == ("red jacket", True, None)
+    assert form.main_view.take_requests() == (), "Enter only commits the name"
+    strike(form, "Ctrl+Enter")
     assert form.main_view.take_requests() == (Plain("train"),)
-    assert form.main_view.work.renaming is None
+
+
+def test_ctrl_enter_trains_after_a_click_on_the_picture(form: Rig) -> None:
+    form.click(300.0, 300.0)
+    strike(form, "Ctrl+Enter")
+    assert form.main_view.take_requests() == (Plain("train"),)
 
 
 def test_escape_closes_the_form_and_keeps_the_typed_name(form: Rig) -> None:
@@ -96,7 +105,7 @@ def test_escape_closes_the_form_and_keeps_the_typed_name(form: Rig) -> None:
     assert not form.main_view.work.view.layers[1].enabled, "shortcuts are back"
 
 
-def test_tab_moves_through_the_form_and_enter_always_trains(form: Rig) -> None:
+def test_tab_moves_through_the_form_and_ctrl_enter_always_trains(form: Rig) -> None:
     seen = []
     for _ in range(30):
         seen.append(imgui.get_current_context().nav_id)
@@ -105,9 +114,7 @@ def test_tab_moves_through_the_form_and_enter_always_trains(form: Rig) -> None:
     assert form.main_view.work.active_slider == "strength"
     strike(form, "Shift+Tab")
     assert imgui.get_current_context().nav_id in seen
-    quick = form.main_view.work.form.quick
-    strike(form, "Enter")
-    assert form.main_view.work.form.quick == quick
+    strike(form, "Ctrl+Enter")
     assert form.main_view.take_requests() == (Plain("train"),)
 
 

@@ -230,6 +230,20 @@ def test_copy_has_the_selected_paint(desk: Desk, box: bool, paint: bool) -> None
     assert bool((copy.logit_opacities > 5.0).all())
 
 
+def test_copy_of_a_moved_object_is_at_its_new_place(desk: Desk) -> None:
+    rows = np.flatnonzero(desk.box_mask[: len(desk.documents.get().original)])
+    desk.select(desk.box_mask | desk.paint_mask)
+    desk.tidy.requests["move_selected"](None)
+    desk.keep_at(0.5, 0.0, 0.0)
+    moved = desk.composed()
+    desk.select(desk.box_mask | desk.paint_mask)
+    desk.tidy.requests["duplicate_selected"](None)
+    desk.keep_at(0.0, 0.0, -3.0)
+    copy = desk.composed()[len(moved) :]
+    expected = moved.means[torch.from_numpy(rows)] + torch.tensor([0.0, 0.0, -3.0])
+    torch.testing.assert_close(copy.means[: len(rows)], expected, atol=1e-4, rtol=0)
+
+
 def test_copy_without_visible_paint_has_none(desk: Desk) -> None:
     off = replace(desk.view.layers[0], enabled=False)
     desk.store.change(replace(desk.view, layers=(off,)))
@@ -273,6 +287,6 @@ def test_copy_is_copied_and_removed(desk: Desk) -> None:
 def test_copy_of_invisible_paint_alone_is_refused(desk: Desk) -> None:
     desk.store.change(replace(desk.view, layers=(replace(desk.view.layers[0], strength=0.0),)))
     desk.select(desk.paint_mask)
-    with pytest.raises(ProgdfError, match="hidden or at strength 0"):
+    with pytest.raises(ProgdfError, match="the layers hide all that is selected"):
         desk.tidy.requests["duplicate_selected"](None)
     assert desk.store.get().transient.gizmo is None

@@ -117,6 +117,21 @@ def test_copy_has_rows_that_are_counted_selected_saved_and_exported(
     assert bits(load_ply(folder / "out0.ply")) == bits(load_ply(folder / "bear.ply"))
 
 
+def test_copy_has_the_colors_that_layers_give_it(app: App) -> None:
+    ears = app.documents.get().gdfs[1].region.members
+    mask = np.zeros(app.main_view.facts.count, bool)
+    mask[ears.numpy()] = True
+    view = app.main_view.work.view
+    app.main_view.store.change(replace(view, selection=selection.select(view.selection, mask)))
+    seen = app.engine.gaussians(view)
+    press(app, "Alt+D", "Enter")
+    copy = app.engine.gaussians(app.main_view.work.view)[
+        torch.arange(len(bear().scene), len(seen) + len(ears))
+    ]
+    assert not torch.equal(seen.sh0[ears], bear().scene.sh0[ears])
+    torch.testing.assert_close(copy.sh0, seen.sh0[ears], atol=1e-5, rtol=0)
+
+
 def test_tidy_actions_need_a_selection(app: App) -> None:
     press(app, "Ctrl+Shift+A", "Alt+Delete")
     message = app.main_view.work.message

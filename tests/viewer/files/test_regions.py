@@ -39,11 +39,22 @@ def test_saved_region_can_be_trained_by_progdf(chosen: SelectionState, tmp_path:
 
 def test_new_region_never_replaces_a_file(chosen: SelectionState, tmp_path: Path) -> None:
     (tmp_path / "jacket.region.npy").write_bytes(b"somebody else's")
-    kept = region_files.keep_region(
-        region_files.keep_region(chosen, "jacket", tmp_path, TOTAL), "jacket", tmp_path, TOTAL
-    )
+    once = region_files.keep_region(chosen, "jacket", tmp_path, TOTAL)
+    kept = region_files.keep_region(selection.select(once, ~MASK), "jacket", tmp_path, TOTAL)
     assert [region.name for region in kept.regions] == ["jacket-2", "jacket-3"]
     assert (tmp_path / "jacket.region.npy").read_bytes() == b"somebody else's"
+
+
+def test_equal_regions_are_one(chosen: SelectionState, tmp_path: Path) -> None:
+    once = region_files.keep_region(chosen, "jacket", tmp_path, TOTAL)
+    assert region_files.keep_region(once, "coat", tmp_path, TOTAL) == once
+    of_edit = selection.add_region(chosen, "blue", tmp_path / "blue.region.npy", edit="blue")
+    kept = region_files.keep_region(of_edit, "coat", tmp_path, TOTAL)
+    assert [(region.name, region.edit, region.path.name) for region in kept.regions] == [
+        ("coat", "", "coat.region.npy")
+    ]
+    found = parse_region(f"file:{kept.regions[0].path}", bear().scene)
+    assert found.members.tolist() == np.flatnonzero(MASK).tolist()
 
 
 def test_renaming_a_region_moves_its_file_and_undo_restores_it(

@@ -51,9 +51,12 @@ def test_again_opens_the_form_with_the_settings_of_the_edit(hand: Rig) -> None:
     assert form.form.name == work.view.layers[SCARF].name
     everywhere = perform(work, OnItem("again", SCARF), of_edit(facts, "night:0.40", "all")).form
     assert (everywhere.region, everywhere.spec) == (ALL, "night:0.40")
-    regions = (NamedRegion("hands", Path("/scenes/hands.region.npy"), b"", 3),)
+    rows = facts.rows[work.view.layers[SCARF].gdf].members
+    mask = np.zeros(facts.count, bool)
+    mask[rows] = True
+    regions = (NamedRegion("hands", Path("/scenes/hands.region.npy"), selection.pack(mask), len(rows)),)
     view = replace(work.view, selection=replace(work.view.selection, regions=regions))
-    named = of_edit(facts, "tint:#ff0000", "file:/scenes/hands.region.npy")
+    named = of_edit(facts, "tint:#ff0000", "file:/scenes/blue.region.npy")
     assert perform(replace(work, view=view), OnItem("again", SCARF), named).form.region == "hands"
 
 

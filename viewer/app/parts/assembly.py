@@ -142,6 +142,7 @@ def make_parts(
         draft=preview.draft,
         anchor=preview.anchor,
         follow=preview.follow_anchor,
+        leave_ghost=preview.leave_ghost,
         look_behind=preview.look_behind,
     )
     start = StartActions(

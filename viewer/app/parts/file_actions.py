@@ -33,6 +33,7 @@ from viewer.files.user_files import keys_file, parse_path, read_keys, read_recen
 from viewer.panel import dialogs
 from viewer.state import workspace
 from viewer.state.commands import Action, Plain, Rename, WithText
+from viewer.state.selection import equal_region
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import ViewState, on_another_scene
 from viewer.state.workspace import Dialog, Store, with_transient
@@ -313,7 +314,10 @@ class FileActions:
         total = len(opened.original)
         selection = region_files.keep_region(view.selection, name, folder, total)
         self._store.change(replace(view, selection=selection))
-        line = f"Region '{selection.regions[-1].name}' saved"
+        index = equal_region(selection, selection.members, total)
+        kept = selection.regions[-1 if index is None else index].name
+        known = selection == view.selection
+        line = f"The selection is already the region '{kept}'" if known else f"Region '{kept}' saved"
         self._messages.show(line, button=("New edit", Plain("new_edit")))
 
     def _rename_region(self, action: Rename) -> None:

@@ -29,7 +29,7 @@ from viewer.files.document import DocumentStore
 from viewer.jobs import training
 from viewer.jobs.preview_process import PreviewChild, PreviewInputs
 from viewer.state.forms import EDITORS, NO_CHANGE, SHEET_COLUMNS, SHEET_PX, STYLE_ORDER, NewEdit, with_picture
-from viewer.state.transient import Cover, PreviewState
+from viewer.state.transient import Cover, PreviewGhost, PreviewState
 from viewer.state.view_state import LayerState
 from viewer.state.workspace import Store, with_camera, with_transient
 from viewer.ui.window import wake_window
@@ -116,6 +116,7 @@ class PreviewActions:
         self._region_sent = ""  # region in the process's format
         self._painting: PreviewedView | None = None
         self._behind: Cover | None = None  # picture of a continued edit, until the view moves
+        self._ghosts: dict[Path, moderngl.Texture] = {}  # pictures of previews in training, by run
 
     @property
     def requests(self) -> Requests:
@@ -124,6 +125,7 @@ class PreviewActions:
 
     def poll(self) -> float | None:
         """Request the preview and show an answer; return the seconds until the next poll, None for never."""
+        self._free_ghosts()
         if self._painting is not None and self._is_painting(self._painting):
             self._end_live()
             return self._follow(self._painting)
@@ -263,6 +265,24 @@ class PreviewActions:
             return None
         return self._grade[2] if request.of_all_views == self._grade[0].of_all_views else None
 
+    def leave_ghost(self, run: Path) -> None:
+        """Keep the form's picture on screen for a run, until its edit has a layer."""
+        work = self._store.get()
+        cover = work.transient.cover
+        if cover is None or self._texture is None or cover is self._behind:
+            return
+        self._ghosts[run] = self._texture
+        self._texture = None
+        ghost = PreviewGhost(run, replace(cover, name=f"{cover.name} · {run.name} is training"))
+        ghosts = (*work.transient.ghosts, ghost)
+        self._store.replace(with_transient(work, cover=None, ghosts=ghosts))
+
+    def _free_ghosts(self) -> None:
+        """Free the pictures of previews whose edits have layers."""
+        shown = {ghost.run for ghost in self._store.get().transient.ghosts}
+        for run in self._ghosts.keys() - shown:
+            self._ghosts.pop(run).release()
+
     def leave_scene(self) -> None:
         """End the process of the closed scene."""
         self._end()
@@ -274,10 +294,11 @@ class PreviewActions:
     def close(self) -> None:
         """End the process and release the textures."""
         self._end()
-        for texture in (self._texture, self._sheet):
+        for texture in (self._texture, self._sheet, *self._ghosts.values()):
             if texture is not None:
                 texture.release()
         self._texture = self._sheet = None
+        self._ghosts = {}
 
     def _request(self) -> PreviewInputs | None:
         """Return the request for the form and the view; None for no preview."""

@@ -43,7 +43,7 @@ class _Selected:
     region: Region  # Gaussians of the original
     leaves_paint: bool  # paint lies on them, and none of it is selected
     loose_paint: NDArray[np.bool_]  # selected paint that lies on other Gaussians. [N]
-    # returns the Gaussians of a copy: those of the original, with the selected paint as it is now
+    # returns the Gaussians of a copy: the selected ones and their paint, as the visible layers show them
     copied: Callable[[], Gaussians]
 
 
@@ -75,7 +75,10 @@ def select_parts(document: Document, view: ViewState) -> _Selected:
 def _copy_source(
     document: Document, view: ViewState, own: NDArray[np.bool_], paint_rows: NDArray[np.bool_]
 ) -> Gaussians:
-    """Return selected Gaussians of the original, and selected paint, under the layers that paint it.
+    """Return the selected Gaussians and the selected paint under the visible layers.
+
+    Rows that the layers hide are left out, and so are layers whose paint lies on the object without being
+    selected.
 
     Args:
         document: the open document
@@ -85,11 +88,15 @@ def _copy_source(
     layers = []
     for layer in visible_layers(view):
         gdf = document.gdfs[layer.gdf]
-        if not gdf.from_others and paint_rows[gdf.region.members.numpy()].any():
+        lying = rows_on(gdf, torch.from_numpy(own)).numpy()
+        stays = len(lying) > 0 and not paint_rows[lying].any()  # its paint is not copied
+        if not stays:
             layers.append(layer_of(gdf, layer.strength, layer.gains, layer.paint))
-    painted = compose_layers(document.scene, layers, view.blend)
-    drawn = (painted.logit_opacities >= UNSEEN_LOGIT).numpy()
-    return painted[torch.from_numpy(np.flatnonzero(own | (paint_rows & drawn)))]
+    composed = compose_layers(document.scene, layers, view.blend)
+    is_drawn = (composed.logit_opacities >= UNSEEN_LOGIT).numpy()
+    is_as_before = (composed.logit_opacities == document.scene.logit_opacities).numpy()
+    copied = own & (is_drawn | is_as_before) | paint_rows & is_drawn
+    return composed[torch.from_numpy(np.flatnonzero(copied))]
 
 
 class TidyActions:
@@ -139,7 +146,7 @@ class TidyActions:
         if kind == "duplicate":
             moved = selected.copied()
         if not len(moved):
-            raise ProgdfError("the selected paint is hidden or at strength 0; show its layer to copy it")
+            raise ProgdfError("the layers hide all that is selected; show it to copy it")
         center = moved.means.double().mean(dim=0)
         self._selected = selected
         at = (float(center[0]), float(center[1]), float(center[2]))

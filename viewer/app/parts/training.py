@@ -28,7 +28,7 @@ from viewer.jobs.job_queue import Delivery, JobQueue, QueuedTask
 from viewer.jobs.training import EditOrder
 from viewer.state.commands import Plain
 from viewer.state.forms import ALL, CHANGED, SELECTION, NewEdit
-from viewer.state.selection import EMPTY_MASK, SUFFIX, add_region, free_name
+from viewer.state.selection import SUFFIX, add_region, equal_region, free_name, select_none
 from viewer.state.transient import DecalGhost
 from viewer.state.view_state import LayerState
 from viewer.state.workspace import Dialog, JobCard, Store, with_transient
@@ -100,6 +100,7 @@ class JobActions:
         draft: returns the file of a grade that previews the form
         anchor: returns the picture of one view that the form's sentence should follow
         follow: opens that picture's file in another program and shows the saved result
+        leave_ghost: keeps the preview on screen for a run, until its edit has a layer
         look_behind: turns the view to the camera of a picture and shows it there
     """
 
@@ -115,6 +116,7 @@ class JobActions:
         draft: Callable[[NewEdit], Path | None] = lambda _: None,
         anchor: Callable[[NewEdit], tuple[NDArray[np.uint8], Camera] | None] = lambda _: None,
         follow: Callable[[Path], None] = lambda _: None,
+        leave_ghost: Callable[[Path], None] = lambda _: None,
         look_behind: Callable[[Path], None] = lambda _: None,
     ) -> None:
         self._store = store
@@ -126,6 +128,7 @@ class JobActions:
         self._draft = draft
         self._anchor = anchor
         self._follow = follow
+        self._leave_ghost = leave_ghost
         self._look_behind = look_behind
         self.queue = JobQueue()
         self._scene: Path | None = None
@@ -249,12 +252,16 @@ class JobActions:
         self.queue.add(order)
         if (draft := self._draft(form)) is not None:
             attempt(self._messages, partial(self._add_draft, order, draft, form.strength))
+        else:
+            self._leave_ghost(out)
         if form.region == SELECTION:  # its selection becomes a region: the highlight would hide the edit
             view = self._store.get().view
-            name = free_name(view.selection, out.name)
-            path = out.with_name(f"{out.name}{SUFFIX}")
-            selection = replace(add_region(view.selection, name, path), members=EMPTY_MASK, count=0)
-            self._store.change(replace(view, selection=selection))
+            selection = view.selection
+            if equal_region(selection, selection.members, len(document.scene)) is None:
+                name = free_name(selection, out.name)
+                path = out.with_name(f"{out.name}{SUFFIX}")
+                selection = add_region(selection, name, path, edit=out.name)
+            self._store.change(replace(view, selection=select_none(selection)))
 
     def _lay_decal(self, _: None) -> None:
         """Queue the placed decal with its camera and its position in the picture."""
@@ -443,8 +450,10 @@ class JobActions:
         if jobs != self._store.get().jobs:
             self._store.replace(replace(self._store.get(), jobs=jobs))
             self._store.wake()
-        busy = {job.task.out for job in self.queue.jobs if job.busy and job.task.scene == self._scene}
+        layers = set(self._documents.get().gdf_paths)
+        runs = [job.task for job in self.queue.jobs if job.busy and job.task.scene == self._scene]
+        waiting = {run.out for run in runs if isinstance(run, EditOrder) and layers.isdisjoint(run.drafts)}
         ghosts = self._store.get().transient.ghosts
-        kept = tuple(ghost for ghost in ghosts if ghost.run in busy)
+        kept = tuple(ghost for ghost in ghosts if ghost.run in waiting)
         if kept != ghosts:
             self._store.replace(with_transient(self._store.get(), ghosts=kept))
