@@ -1,4 +1,4 @@
-"""Kernels of the order of painted layers: fast versions of the steps of `arrange` in `overlap`."""
+"""Kernels of the order of painted layers: their coverage, and the steps of `arrange` in `overlap`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,13 @@ Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
+MIN_WEIGHT = 0.05
+"""Opacity of a disc at a point; below it, the disc is beside the point."""
 _MIN_OPACITY = 1e-30  # as in `overlap`
+_MAX_WEIGHT = 0.999  # keeps the transmittance above 0
+
+Cells = tuple[Rows, tuple[int, int, int], Doubles, float]
+"""First disc of each cell of a grid, numbers of cells, lower corner, and side of a cell."""
 
 
 @kernel(cache=True)
@@ -231,3 +237,76 @@ def write_logits(
             visible = max(factor / (1.0 + math.exp(-float(logit))), _MIN_OPACITY)
             logit = np.float32(math.log(visible / (1.0 - visible)))
         logits[rows[i], 0] = logit
+
+
+@kernel(inline=True)
+def _cell_range(value: float, low: float, cell: float, count: int) -> tuple[int, int]:
+    """Return the first cell along an axis that can hold neighbors of a value, and the end of the range."""
+    at = (value - low) / cell
+    if not (-1.0 <= at <= count + 1.0):
+        return 0, 0
+    index = math.floor(at)
+    return max(index - 1, 0), min(index + 2, count)
+
+
+@kernel(cache=True)
+def cover_points(
+    sheet: tuple[Doubles, Rows],
+    cells: Cells,
+    points: Doubles,
+    outward: Doubles,
+    distance: float,
+    enough: float,
+    found: tuple[Doubles, Doubles, Doubles, Rows],
+) -> None:
+    """Add the coverage of points by discs, see `measure_cover`.
+
+    Args:
+        sheet: discs, sorted by their cells: center, normal, both wide axes over their standard deviations,
+            outward direction, opacity [b,16]; and their indices [b]
+        cells: the grid
+        points, outward: points and directions away from their surface. [P,3] each
+        distance: largest distance of a point from a disc's plane
+        enough: coverage above which further discs are left out
+        found: transmittance, greatest height, greatest weight and its disc; updated in place. [P] each
+    """
+    discs, ids = sheet
+    starts, shape, low, cell = cells
+    passing, height, most, under = found
+    limit = -2.0 * math.log(MIN_WEIGHT)
+    for p in range(len(points)):
+        x = points[p, 0]
+        y = points[p, 1]
+        z = points[p, 2]
+        first_x, end_x = _cell_range(x, low[0], cell, shape[0])
+        first_y, end_y = _cell_range(y, low[1], cell, shape[1])
+        first_z, end_z = _cell_range(z, low[2], cell, shape[2])
+        if end_z <= first_z:
+            continue
+        for cx in range(first_x, end_x):
+            for cy in range(first_y, end_y):
+                if 1.0 - passing[p] >= enough:
+                    break
+                column = (cx * shape[1] + cy) * shape[2]
+                for j in range(starts[column + first_z], starts[column + end_z]):
+                    disc = discs[j]
+                    ax = disc[0] - x
+                    ay = disc[1] - y
+                    az = disc[2] - z
+                    if abs(disc[3] * ax + disc[4] * ay + disc[5] * az) > distance:
+                        continue
+                    u = disc[6] * ax + disc[7] * ay + disc[8] * az
+                    v = disc[9] * ax + disc[10] * ay + disc[11] * az
+                    squared = u * u + v * v
+                    if squared >= limit:
+                        continue
+                    facing = disc[12] * outward[p, 0] + disc[13] * outward[p, 1] + disc[14] * outward[p, 2]
+                    weight = disc[15] * math.exp(-0.5 * squared)
+                    if facing <= 0.0 or weight <= MIN_WEIGHT:
+                        continue
+                    passing[p] *= 1.0 - min(weight, _MAX_WEIGHT)
+                    above = ax * outward[p, 0] + ay * outward[p, 1] + az * outward[p, 2]
+                    height[p] = max(height[p], above)
+                    if weight > most[p] or (weight == most[p] and ids[j] > under[p]):
+                        most[p] = weight
+                        under[p] = ids[j]

@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import safetensors.torch
 import torch
@@ -15,6 +16,7 @@ from progdf.compose.added import extend
 from progdf.compose.composer import Composer
 from progdf.compose.layers import BLENDS, Gains, Layer
 from progdf.compose.overlap import find_paint
+from progdf.compose.paint_sheets import Sheet, find_sheet, make_grids, measure_cover
 from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
 from progdf.field.separable import course_field
@@ -28,6 +30,7 @@ from progdf.tidy import Step, similarity, tidy
 from tests.helpers.draws import Draws
 from tests.helpers.edits import bits, curved_field, edit_of, painted, rimmed, some_rows, whole_grade
 from tests.helpers.fuzz_changes import header_of, signed_gdf
+from tests.helpers.plain_cover import measure_cover as measure_cover_plainly
 from tests.helpers.scenes import random_gaussians
 
 COUNT = 300
@@ -237,6 +240,45 @@ def test_paint_beside_upper_paint_follows_a_surface_that_moves_at_the_same_time(
         composer.update(layers)
         plain = pack(compose_layers(wall, layers), True)
         torch.testing.assert_close(pack(composer.gaussians, True), plain, atol=1e-5, rtol=1e-5)
+
+
+def sheet_of(gdf: Gdf) -> Sheet:
+    """Return the discs of paint on a wall."""
+    extended, converted = extend(flat_wall(), [gdf])
+    return find_sheet(extended, converted[0])
+
+
+@pytest.mark.parametrize("distance", [0.02, 0.5])
+def test_coverage_by_discs_is_that_of_the_plain_measure(distance: float) -> None:
+    draws = Draws(4)
+    flat = sheet_of(flat_paint("flat", 0.03, (0.9, 0.1, 0.1)))
+    size = np.exp(4.0 * draws.uniform(len(flat.points), 1).numpy() - 2.0)
+    opacity = draws.uniform(len(flat.points)).double().numpy()
+    sheet = replace(flat, scales=flat.scales * size, opacity=opacity)
+    far = torch.tensor([[30.0, 0.0, 0.0], [0.0, 0.0, -40.0], [math.nan, 0.0, 0.0]]).double()
+    scattered = 1.2 * (2.0 * draws.uniform(500, 3).double() - 1.0) * torch.tensor([1.0, 1.0, 0.1])
+    points = torch.cat([scattered, torch.from_numpy(flat.points), far]).numpy()
+    outward = np.where(draws.uniform(len(points), 1).numpy() < 0.9, flat.outward[0], -flat.outward[0])
+    finite = np.isfinite(points).all(axis=1)
+    plain = measure_cover_plainly(sheet, points[finite], outward[finite], distance)
+    grids = make_grids(sheet, distance)
+    fast = measure_cover(grids, points, outward, distance)
+    for found, expected in zip(fast, plain, strict=True):
+        np.testing.assert_allclose(found[finite], expected, atol=1e-12)
+    assert fast[0][-1] == 0.0
+    early = measure_cover(grids, points, outward, distance, enough=0.9)[0][finite]
+    np.testing.assert_allclose(np.minimum(early, 0.9), np.minimum(plain[0], 0.9), atol=1e-12)
+
+
+def test_moved_discs_of_one_field_have_their_own_overlap() -> None:
+    upper = flat_paint("upper", 0.045, (0.9, 0.1, 0.1))
+    lower = flat_paint("lower", 0.03, (0.1, 0.1, 0.9))
+    assert lower.added is not None
+    away = lower.added.means + torch.tensor([9.0, 0.0, 0.0])
+    for means, meets in ((lower.added.means, True), (away, False)):
+        stack = [upper, replace(lower, added=replace(lower.added, means=means))]
+        paint = find_paint(*extend(flat_wall(), stack))
+        assert (paint is not None and bool(paint.pairs)) == meets
 
 
 def seen_from(scene: Gaussians, degrees: float) -> torch.Tensor:
