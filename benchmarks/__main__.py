@@ -45,6 +45,7 @@ BENCHES: dict[str, str] = {
     "warps": "benchmarks.warps:tables",
     "pictures": "benchmarks.pictures:tables",
     "spill": "benchmarks.spill:tables",
+    "recolors": "benchmarks.colors.recolors:tables",
 }
 
 PAGE = ("training", "field", "viewer", "rasterize", "warp", "moving", "popping", "painting", "frames", "hard")
@@ -66,7 +67,7 @@ class BenchOptions:
     runs: tuple[Path, ...] = ()
     """Finished run folders for `edits` and `networks`."""
     plots: Path | None = None
-    """Folder in which `training` and `field` also draw their errors as training.png and field.png."""
+    """Folder in which `training`, `field` and `recolors` draw training.png, field.png and recolors.jpg."""
     scenes: tuple[Path, ...] = ()
     """Scene files to measure, in place of the demo scenes or beside them (docs/benchmarks.md)."""
     seconds: float | None = None
@@ -95,14 +96,15 @@ def main(argv: Sequence[str]) -> int:
                 f"unknown benchmark '{name}'; use one of "
                 f"{', '.join((*BENCHES, 'page', 'ablate', 'sliders', 'regret'))}"
             )
-    plotted = ("training", "field")
+    charted = ("training", "field")
+    plotted = (*charted, "recolors")
     if options.plots and options.what and not set(plotted) & set(options.what):
         raise ProgdfError(f"--plots are for {', '.join(plotted)}; use python -m benchmarks {plotted[0]}")
     trained = ("edits", "networks")
     if options.runs and options.what and not set(trained) & set(options.what):
         raise ProgdfError(f"--runs are for {', '.join(trained)}; use python -m benchmarks {trained[0]}")
     drawing = (
-        *plotted,
+        *charted,
         "viewer",
         "select",
         "frames",
@@ -113,6 +115,7 @@ def main(argv: Sequence[str]) -> int:
         "warps",
         "pictures",
         "spill",
+        "recolors",
     )
     if options.scenes and options.what and not set(drawing) & set(options.what):
         raise ProgdfError(f"--scenes are for {', '.join(drawing)}; use python -m benchmarks viewer")
@@ -128,11 +131,11 @@ def main(argv: Sequence[str]) -> int:
         if not page.is_file():
             raise ProgdfError(f"{page} does not exist; check the name and the folder")
     arguments: dict[str, dict[str, object]] = {name: {"runs": options.runs} for name in trained}
-    with_scenes = plotted if options.what[: len(PAGE)] == PAGE else drawing
+    with_scenes = charted if options.what[: len(PAGE)] == PAGE else drawing
     arguments |= {name: {"scenes": options.scenes} for name in with_scenes}
     if options.plots:
         for name in plotted:
-            arguments[name]["plot"] = options.plots / f"{name}.png"
+            arguments.setdefault(name, {})["plot"] = options.plots / f"{name}.png"
     if options.seconds is not None:
         arguments["window"]["seconds"] = options.seconds
     tables: list[Table] = []

@@ -233,10 +233,10 @@ def _ear_roots(means: Tensor) -> Tensor:
     return torch.stack(roots)
 
 
-def _own_color(part: Gaussians) -> Tensor:
-    """Return the typical color, with Gaussians weighted by opacity and area. [3]"""
+def _own_color(part: Gaussians) -> color.RegionColor:
+    """Return the measured color, with Gaussians weighted by opacity and area."""
     _, middle, long = part.scales.sort(dim=1).values.unbind(1)
-    return color.typical_color(sh0_to_rgb(part.sh0), part.opacities * middle * long)
+    return color.measure_color(sh0_to_rgb(part.sh0), part.opacities * middle * long)
 
 
 def _nearest(means: Tensor, pivots: Tensor) -> Tensor:

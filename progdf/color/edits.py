@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import torch
@@ -31,7 +31,15 @@ from .oklab import (
     smoothstep,
     srgb_to_oklab,
 )
-from .palette import Curve, are_alike, bend_lightness, chroma_factor, shift_palette
+from .palette import (
+    Curve,
+    are_alike,
+    bend_lightness,
+    chroma_factor,
+    measure_palette,
+    shift_palette,
+)
+from .shading import Shading, measure_shading, nearest_lightness, relight, weighted_quantiles
 
 ColorFunction = Callable[[Strength], Tensor]
 """Function from a strength to colors [...,3]: the path of an edit."""
@@ -39,7 +47,9 @@ ColorFunction = Callable[[Strength], Tensor]
 _MIN_CHROMA = 0.015  # smallest chroma of a target with a hue
 _CAST_CHROMA = 0.1  # chroma of white under the bluest and the most amber light, as a share of its lightness
 _MIDDLE_GRAY = 0.5646  # lightness of 18 % gray, the fixed point of contrast
-_MAX_GAIN = 3.0  # largest gain of lightness; beyond it an offset lifts dark parts, without more noise
+_TINT_SHARE = 0.7  # share of hue and chroma that a tint takes from its color
+_MOON_SHARE = 0.75  # share of hue and chroma that night takes from the moonlight
+_MOONLIGHT = (0.35, 0.50, 0.85)  # sRGB
 
 
 def parse_color(text: str) -> Tensor:
@@ -63,11 +73,7 @@ def hex_color(color: Sequence[float]) -> str:
 
 @one_thread()  # the order of a large sum, and so its rounding, depends on the number of threads
 def typical_color(rgb: Tensor, weights: Tensor | None = None) -> Tensor:
-    """Return the weighted mean color, averaged in OKLab. [...,3], [...] or None -> [3]
-
-    Compute it once over the whole region (all views, all members) and pass it to every `recolor_course`
-    there. The edit is then the same function of color in each view.
-    """
+    """Return the weighted mean color, averaged in OKLab. [...,3], [...] or None -> [3]"""
     lab = srgb_to_oklab(rgb.clamp(0, 1)).reshape(-1, 3)
     w = torch.ones_like(lab[:, 0]) if weights is None else weights.reshape(-1).to(lab.dtype)
     total = w.sum()
@@ -75,57 +81,86 @@ def typical_color(rgb: Tensor, weights: Tensor | None = None) -> Tensor:
     return oklab_to_srgb(mean).clamp(0, 1)
 
 
+@dataclass(frozen=True)
+class RegionColor:
+    """Measured color of a region, to which color edits of the region are relative."""
+
+    color: Tensor  # typical color, sRGB 0 to 1. [3]
+    shading: Shading  # of its colors
+
+    def describe(self) -> str:
+        """Return the color and the limit of its highlights as words for the log."""
+        return f"typical color {hex_color(self.color.tolist())}, {self.shading.describe()}"
+
+
+def measure_color(rgb: Tensor, weights: Tensor | None = None) -> RegionColor:
+    """Measure the typical color and the shading of a region. [...,3], [...] or None
+
+    The typical color is the median in OKLab. Compute it once over the whole region (all views, all members)
+    and pass it to every edit there. The edit is then the same function of color in each view.
+    """
+    lab = srgb_to_oklab(rgb.clamp(0, 1)).reshape(-1, 3)
+    shares = torch.ones_like(lab[:, 0]) if weights is None else weights.reshape(-1).to(lab)
+    shading = measure_shading(lab[:, 0], shares)
+    if not float(shares.sum()) > 0:
+        return RegionColor(oklab_to_srgb(lab.new_tensor([shading.typical, 0.0, 0.0])).clamp(0, 1), shading)
+    a, b = (weighted_quantiles(lab[:, i], shares, (0.5,))[0] for i in (1, 2))
+    return RegionColor(oklab_to_srgb(lab.new_tensor([shading.typical, a, b])).clamp(0, 1), shading)
+
+
 def recolor_course(
-    rgb: Tensor, target: Tensor, reference: Tensor, path: ColorPath = "bowed"
+    rgb: Tensor, target: Tensor, source: RegionColor, path: ColorPath = "bowed"
 ) -> ColorFunction:
     """Return the path from colors to those of `recolor_fully`, which keeps the shading.
 
     Args:
         rgb: sRGB colors, 0 to 1. A part outside, possible for SH colors, fades with the strength. [...,3]
-        target: color of `reference` at strength 1, sRGB 0 to 1. [3]
-        reference: typical color of the region, see `typical_color`. [3]
+        target: color of `source` at strength 1, sRGB 0 to 1. [3]
+        source: measured color of the region, see `measure_color`
         path: shape of the path, see `bend_of`
     """
-    bend = bend_of(_as_tensor(reference, rgb), _as_tensor(target, rgb), path)
-    return color_path(rgb, recolor_fully(rgb, target, reference), bend)
+    bend = bend_of(_as_tensor(source.color, rgb), _as_tensor(target, rgb), path)
+    return color_path(rgb, recolor_fully(rgb, target, source), bend)
 
 
-def recolor_fully(rgb: Tensor, target: Tensor, reference: Tensor) -> Tensor:
+def recolor_fully(rgb: Tensor, target: Tensor, source: RegionColor) -> Tensor:
     """Recolor at full strength. [...,3] -> [...,3], 0 to 1
 
-    The lightness is scaled so that `reference` becomes `target`, and the chroma follows the lightness. The
-    hue is the target's, or unchanged if the target is gray. A dark source is lifted.
+    The typical color of `source` becomes `target`, as new paint in the same light (see `relight`). The hue is
+    the target's, or unchanged if the target is gray.
     """
-    lab = srgb_to_oklab(rgb.clamp(0, 1))
-    new_l, new_a, new_b = srgb_to_oklab(_as_tensor(target, rgb))
-    new_c = torch.hypot(new_a, new_b)
-    ref_l = srgb_to_oklab(_as_tensor(reference, rgb))[0]
-    lightness = _relight(lab[..., 0], ref_l.clamp(0.02, 0.98), new_l.clamp(0.02, 0.98))
-    # chroma in proportion to lightness is the same surface in less light; near white the gamut limits it
-    chroma = new_c * (lightness / new_l.clamp_min(0.02)).clamp(0, 1)
-    hue = torch.atan2(new_b, new_a) if new_c >= _MIN_CHROMA else hue_of(lab)
-    return fit_gamut(torch.stack([lightness, chroma * torch.cos(hue), chroma * torch.sin(hue)], dim=-1))
-
-
-def tint_course(rgb: Tensor, target: Tensor, reference: Tensor, path: ColorPath = "bowed") -> ColorFunction:
-    """Return the path from colors to those of `tint_fully`, a wash with a color.
-
-    The lightness is unchanged, and hue and chroma move most of the way to the target's. For the arguments see
-    `recolor_course`. `reference` only determines the bend of the path.
-    """
-    bend = bend_of(_as_tensor(reference, rgb), _as_tensor(target, rgb), path)
-    return color_path(rgb, tint_fully(rgb, target), bend)
-
-
-def tint_fully(rgb: Tensor, target: Tensor, share: float = 0.7) -> Tensor:
-    """Tint at full strength: move hue and chroma by `share` to the target. [...,3] -> [...,3], 0 to 1"""
     lab = srgb_to_oklab(rgb.clamp(0, 1))
     goal = srgb_to_oklab(_as_tensor(target, rgb))
-    lightness = lab[..., :1]
-    fade = torch.minimum(
-        lightness / goal[0].clamp_min(0.02), (1 - lightness) / (1 - goal[0]).clamp_min(0.02)
-    ).clamp(0, 1)
-    return fit_gamut(torch.cat([lightness, torch.lerp(lab[..., 1:], goal[1:] * fade, share)], dim=-1))
+    new_chroma = torch.hypot(goal[1], goal[2])
+    relit = relight(lab[..., 0], source.shading, goal)
+    chroma = new_chroma * relit.chroma
+    hue = torch.atan2(goal[2], goal[1]) if new_chroma >= _MIN_CHROMA else hue_of(lab)
+    return fit_gamut(torch.stack([relit.lightness, chroma * torch.cos(hue), chroma * torch.sin(hue)], dim=-1))
+
+
+def tint_course(rgb: Tensor, target: Tensor, source: RegionColor, path: ColorPath = "bowed") -> ColorFunction:
+    """Return the path from colors to those of `tint_fully`, a wash with a color.
+
+    For the arguments see `recolor_course`.
+    """
+    bend = bend_of(_as_tensor(source.color, rgb), _as_tensor(target, rgb), path)
+    return color_path(rgb, tint_fully(rgb, target, source), bend)
+
+
+def tint_fully(rgb: Tensor, target: Tensor, source: RegionColor) -> Tensor:
+    """Tint at full strength: move hue and chroma most of the way to the target's. [...,3] -> [...,3], 0 to 1
+
+    The lightness is unchanged where sRGB has the tint. If it lacks the tinted typical color, as for white,
+    that moves to the nearest lightness at which sRGB has it, and the shading follows.
+    """
+    lab = srgb_to_oklab(rgb.clamp(0, 1))
+    goal = srgb_to_oklab(_as_tensor(target, rgb))
+    own = srgb_to_oklab(_as_tensor(source.color, rgb))
+    washed = torch.lerp(own[1:], goal[1:], _TINT_SHARE)
+    lightness = nearest_lightness(source.shading.typical, washed)
+    relit = relight(lab[..., 0], source.shading, torch.cat([goal.new_tensor([lightness]), washed]))
+    ab = torch.lerp(lab[..., 1:], goal[1:] * relit.chroma[..., None], _TINT_SHARE)
+    return fit_gamut(torch.cat([relit.lightness[..., None], ab], dim=-1))
 
 
 def darken(rgb: Tensor, strength: Strength = 1.0, stops: float = 3.0) -> Tensor:
@@ -139,8 +174,17 @@ def darken(rgb: Tensor, strength: Strength = 1.0, stops: float = 3.0) -> Tensor:
 
 def night_course(rgb: Tensor, stops: float = 3.0) -> ColorFunction:
     """Return the path to moonlight: `darken`, with colors that fade to a cool blue as in dim light."""
-    bluer = color_path(rgb, tint_fully(rgb, rgb.new_tensor([0.35, 0.50, 0.85]), share=0.75), STRAIGHT)
+    bluer = color_path(rgb, _in_moonlight(rgb), STRAIGHT)
     return lambda strength: darken(bluer(strength), strength, stops)
+
+
+def _in_moonlight(rgb: Tensor) -> Tensor:
+    """Shift colors to the blue of moonlight, less near black and white. [...,3] -> [...,3], 0 to 1"""
+    lab = srgb_to_oklab(rgb.clamp(0, 1))
+    moon = srgb_to_oklab(rgb.new_tensor(_MOONLIGHT))
+    lightness = lab[..., :1]
+    fade = torch.minimum(lightness / moon[0], (1 - lightness) / (1 - moon[0])).clamp(0, 1)
+    return fit_gamut(torch.cat([lightness, torch.lerp(lab[..., 1:], moon[1:] * fade, _MOON_SHARE)], dim=-1))
 
 
 GRADE_RANGES: dict[str, tuple[float, float, float]] = {
@@ -169,6 +213,8 @@ class ColorGrade:
     palette: tuple[tuple[Tensor, Tensor], ...] = ()  # source and target colors, sRGB [3], see `shift_palette`
     palette_curves: tuple[Curve, ...] = ()  # lightness curves near each source; empty, or one per source
     curve: Curve = ()  # lightness curve for all colors
+    # measured shading of each source, see `measure_grade`; empty: without highlights
+    palette_shadings: tuple[Shading, ...] = ()
 
     @property
     def is_neutral(self) -> bool:
@@ -252,6 +298,15 @@ def number_of(text: str) -> float:
         return math.nan
 
 
+def measure_grade(grade: ColorGrade, rgb: Tensor, weights: Tensor) -> ColorGrade:
+    """Return the grade with the shading of its palette measured in a region's colors. [N,3], [N]"""
+    if not grade.palette:
+        return grade
+    sources = srgb_to_oklab(torch.stack([source for source, _ in grade.palette]))
+    lab = srgb_to_oklab(rgb.clamp(0, 1)).reshape(-1, 3)
+    return replace(grade, palette_shadings=measure_palette(lab, weights.reshape(-1), sources))
+
+
 def grade_course(rgb: Tensor, grade: ColorGrade) -> ColorFunction:
     """Return the path from colors to those of `grade_fully`, straight in OKLab."""
     return color_path(rgb, grade_fully(rgb, grade), STRAIGHT)
@@ -271,7 +326,7 @@ def grade_fully(rgb: Tensor, grade: ColorGrade) -> Tensor:
     if grade.palette:
         sources, targets = (srgb_to_oklab(torch.stack(colors)) for colors in zip(*grade.palette, strict=True))
         lab = srgb_to_oklab(rgb.clamp(0, 1))
-        rgb = fit_gamut(shift_palette(lab, sources, targets, grade.palette_curves))
+        rgb = fit_gamut(shift_palette(lab, sources, targets, grade.palette_curves, grade.palette_shadings))
     levels = ((rgb.clamp(0, 1) - value["black"]) / (value["white"] - value["black"])).clamp(0, 1)
     lab = srgb_to_oklab(levels) * 2.0 ** (value["exposure"] / 3)  # homogeneous of degree 1/3 in linear light
     lightness = lab[..., 0].clamp(0, 1)
@@ -315,14 +370,3 @@ def stripe_profile(turns: Tensor, width: float = 0.5, softness: float = 0.08) ->
 
 def _as_tensor(color: Tensor, rgb: Tensor) -> Tensor:
     return color.to(rgb).clamp(0, 1)
-
-
-def _relight(lightness: Tensor, reference: Tensor, goal: Tensor) -> Tensor:
-    """Scale lightness so that `reference` becomes `goal`. Brightening bends towards white and never clips."""
-    gain = goal / reference
-    below = (goal + (lightness - reference) * gain.clamp_max(_MAX_GAIN)).clamp_min(0)
-    slope = gain.clamp(1.0, _MAX_GAIN) * (1 - reference) / (1 - goal)
-    x = ((lightness - reference) / (1 - reference)).clamp(0, 1)
-    # hyperbola from (reference, goal), with the gain as its slope there, to (1, 1)
-    above = goal + (1 - goal) * slope * x / (1 + (slope - 1) * x)
-    return torch.where((lightness > reference) & (gain > 1), above, below).clamp(0, 1)

@@ -1,13 +1,14 @@
 """Main colors of a region, and a color map that moves source colors to target colors.
 
-The map moves a color x by Σ_i w_i(x) f_i(x) (t_i − p_i), in OKLab, for sources p_i and targets t_i. The
+The map moves a color x by Σ_i w_i(x) f_i(x) (t_i(x) − p_i(x)), in OKLab, for sources p_i and targets t_i. The
 weights w_i are an interpolation by Gaussian kernels (Chang et al., Palette-based Photo Recoloring, SIGGRAPH
 2015). A weight is 1 at its own source and 0 at the others. So every source becomes its target exactly, and a
 source whose target is itself is unchanged. The weights of several sources sum to 1, so each color follows the
 sources near it. With a single source, colors far from it are unchanged.
 
-f_i reduces the shift of colors darker than the source, as in less light, and of nearly white colors. The
-curve of each source bends the lightness by the same weights.
+The shift of a color lighter or darker than the source is that of new paint in the same light, see `shading`.
+f_i is 1, and falls to 0 for highlights as far as they lack the source's own color. The curve of each source
+bends the lightness by the same weights.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
 from .oklab import oklab_to_srgb, srgb_to_oklab
+from .shading import Shading, measure_shading, relight
 
 COLORS = 5
 """Default number of main colors."""
@@ -27,12 +29,15 @@ MIN_SOURCE_DISTANCE = 0.02
 """Smallest kernel distance of two sources; closer sources count as one color."""
 
 _LIGHTNESS_FACTOR = 0.5  # factor on lightness differences, because shading is not another color
-_WHITE_MARGIN = 0.15  # distance from white, in lightness, at which the shift of a color begins to fade
 _KERNEL_WIDTH_SHARE = (
     0.5  # standard deviation of the kernel, as a share of the mean distance to the nearest source
 )
 _MIN_KERNEL_WIDTH = 0.04  # smallest standard deviation of the kernel
-_SINGLE_KERNEL_WIDTH = 0.08  # standard deviation of the kernel of a single source
+_SINGLE_KERNEL_WIDTH = 0.045  # standard deviation of the kernel of a single gray source, in hue and chroma
+_CHROMA_WIDTH_SHARE = 0.3  # addition to its square: that of this share of the source's chroma
+_SHADOW_WIDTH = 0.08  # standard deviation of this kernel in lightness, below the source's shading
+_SHADING_REACH = 0.16  # lightness below a single source within which its shading is measured
+_CAST_CHROMA = 0.03  # chroma that colored light gives a white surface
 _ITERATIONS = 20  # iterations of k-means
 _CELL_SIDE = 0.04  # side of the cells in which colors are counted
 _MIN_SHARE = 0.003  # smallest share of the visible area for a main color
@@ -91,7 +96,13 @@ def are_alike(a: Tensor, b: Tensor) -> bool:
     )
 
 
-def shift_palette(lab: Tensor, sources: Tensor, targets: Tensor, curves: Sequence[Curve] = ()) -> Tensor:
+def shift_palette(
+    lab: Tensor,
+    sources: Tensor,
+    targets: Tensor,
+    curves: Sequence[Curve] = (),
+    shadings: Sequence[Shading] = (),
+) -> Tensor:
     """Map colors so that sources become targets, all in OKLab. [...,3], [k,3], [k,3] -> [...,3]
 
     The result may lie outside the gamut.
@@ -101,38 +112,116 @@ def shift_palette(lab: Tensor, sources: Tensor, targets: Tensor, curves: Sequenc
         sources: source colors, at least `MIN_SOURCE_DISTANCE` apart. [k,3]
         targets: target colors. [k,3]
         curves: lightness curve near each source, applied after the shift; empty, or k
+        shadings: measured shading of each source, see `measure_palette`; empty: without highlights
     """
-    kernel_sources = _kernel_space(sources.double())
-    colors = _kernel_space(lab.reshape(-1, 3).double())
-    source_distances = torch.cdist(kernel_sources, kernel_sources)
-    color_distances = torch.cdist(colors, kernel_sources)
-    width = _SINGLE_KERNEL_WIDTH
-    if len(kernel_sources) > 1:
-        nearest = (source_distances + torch.eye(len(kernel_sources)) * source_distances.max()).amin(dim=1)
-        width = max(_MIN_KERNEL_WIDTH, _KERNEL_WIDTH_SHARE * float(nearest.mean()))
-        color_distances = (
-            color_distances.square() - color_distances.square().amin(dim=1, keepdim=True)
-        ).sqrt()  # a common factor, which cancels
-
-    def kernel(distances: Tensor) -> Tensor:
-        return torch.exp(-0.5 * (distances / width).square())
-
-    weights = (kernel(color_distances) @ torch.linalg.inv(kernel(source_distances))).clamp_min(0.0)
-    if len(kernel_sources) > 1:
-        weights = weights / weights.sum(dim=1, keepdim=True)
-    lightness = lab.reshape(-1, 3)[:, :1].double()
-    source_lightness = sources[:, 0].double()
-    dark_fade = lightness / source_lightness.clamp_min(1e-3)
-    bright_fade = (1 - lightness) / (1 - source_lightness).clamp(1e-3, _WHITE_MARGIN)
-    fade = torch.minimum(dark_fade, bright_fade)
-    moved = (weights * fade.clamp(0, 1)) @ (targets - sources).double()
+    colors = lab.reshape(-1, 3).double()
+    shadings = shadings or [Shading(float(source[0])) for source in sources]
+    weights = source_weights(colors, sources.double(), shadings)
+    moved = torch.zeros_like(colors)
+    for i, shading in enumerate(shadings):
+        shift = _paint_shift(
+            colors, sources[i].double(), targets[i].double(), shading, is_single=len(sources) == 1
+        )
+        moved += weights[:, i : i + 1] * shift
     shifted: Tensor = lab + moved.to(lab).reshape(lab.shape)
     if not any(curves):
         return shifted
     before = shifted[..., :1].clamp(0, 1)
-    changes = torch.cat([bend_lightness(before, curve) - before for curve in curves], dim=-1)
+    changes = torch.cat([bend_lightness(before, with_highlights(curve)) - before for curve in curves], dim=-1)
     after = before + (weights.to(lab).reshape(changes.shape) * changes).sum(dim=-1, keepdim=True)
     return torch.cat([after, shifted[..., 1:] * chroma_factor(before, after)], dim=-1)
+
+
+def source_weights(colors: Tensor, sources: Tensor, shadings: Sequence[Shading] = ()) -> Tensor:
+    """Return the weight of each source at each color, ≥ 0. OKLab [N,3], [k,3] -> [N,k]
+
+    Args:
+        colors: OKLab colors. [N,3]
+        sources: source colors, OKLab. [k,3]
+        shadings: measured shading of each source; empty for a single source: any shading
+    """
+    if len(sources) == 1:
+        return _single_weight(colors, sources[0], shadings[0] if shadings else Shading(float(sources[0, 0])))
+    kernel_sources = _kernel_space(sources)
+    source_distances = torch.cdist(kernel_sources, kernel_sources)
+    squared = torch.cdist(_kernel_space(colors), kernel_sources).square()
+    squared = squared - squared.amin(dim=1, keepdim=True)  # a common factor, which cancels
+    nearest = (source_distances + torch.eye(len(kernel_sources)) * source_distances.max()).amin(dim=1)
+    width = max(_MIN_KERNEL_WIDTH, _KERNEL_WIDTH_SHARE * float(nearest.mean()))
+    kernel = torch.exp(-0.5 * squared / width**2)
+    source_kernel = torch.exp(-0.5 * (source_distances / width).square())
+    weights: Tensor = (kernel @ torch.linalg.inv(source_kernel)).clamp_min(0.0)
+    return weights / weights.sum(dim=1, keepdim=True)
+
+
+def _single_weight(colors: Tensor, source: Tensor, shading: Shading) -> Tensor:
+    """Return the weight of a single source: 1 on its surface in any light. OKLab [N,3], [3] -> [N,1]
+
+    It falls with the distance from the source's hue and chroma, scaled to the color's lightness, and with the
+    distance below the range of its shading.
+    """
+    own_ab = relight(colors[:, 0], shading, source).chroma[:, None] * source[1:]
+    aside = colors[:, 1:] - _presence(colors, own_ab)[:, None] * own_ab
+    below = (shading.shadow - colors[:, 0]).clamp_min(0.0)
+    variance = _SINGLE_KERNEL_WIDTH**2 + (_CHROMA_WIDTH_SHARE * float(source[1:].norm())) ** 2
+    squared = aside.square().sum(dim=1) / variance + (below / _SHADOW_WIDTH).square()
+    return torch.exp(-0.5 * squared)[:, None]
+
+
+def measure_palette(lab: Tensor, weights: Tensor, sources: Tensor) -> tuple[Shading, ...]:
+    """Measure the shading of each source in the colors of a region, by their weight for the source.
+
+    Args:
+        lab: OKLab colors of the region. [N,3]
+        weights: visible area of each color, ≥ 0. [N]
+        sources: source colors, OKLab. [k,3]
+    """
+    near = [
+        Shading(float(lightness), shadow=float(lightness) - _SHADING_REACH) for lightness in sources[:, 0]
+    ]
+    shares = source_weights(lab.double(), sources.double(), near) * weights[:, None].double()
+    return tuple(
+        measure_shading(lab[:, 0], shares[:, i], float(source[0])) for i, source in enumerate(sources)
+    )
+
+
+def _paint_shift(colors: Tensor, source: Tensor, target: Tensor, shading: Shading, is_single: bool) -> Tensor:
+    """Return the shift of colors if the paint of one source becomes the target. OKLab [N,3] -> [N,3]"""
+    lightness = colors[:, 0]
+    old = relight(lightness, shading, source)
+    new = relight(lightness, shading, target)
+    own_ab = old.chroma[:, None] * source[1:]
+    shift = torch.cat(
+        [(new.lightness - old.lightness)[:, None], new.chroma[:, None] * target[1:] - own_ab], dim=1
+    )
+    presence = _presence(colors, own_ab)
+    if is_single:
+        return presence[:, None] * shift
+    above = (lightness - shading.highlight) / max(1.0 - shading.highlight, 1e-6)
+    fade = 1.0 - above.clamp(0, 1) * (1.0 - presence)
+    return fade[:, None] * shift
+
+
+def _presence(colors: Tensor, own_ab: Tensor) -> Tensor:
+    """Return the share of a surface's own color in colors, 0 to 1. OKLab [N,3], [N,2] -> [N]
+
+    A white highlight on a colored surface has none of it. On a white surface, every gray has all of it.
+    """
+    floor = _CAST_CHROMA**2
+    share = ((colors[:, 1:] * own_ab).sum(dim=1) + floor) / (own_ab.square().sum(dim=1) + floor)
+    return share.clamp(0, 1)
+
+
+def with_highlights(curve: Curve) -> Curve:
+    """Return the curve with an end at white that adds the light above its last point.
+
+    Above the last point (x, y) of a surface's curve, its end adds as much light to y as white has above x.
+    A curve with a point at 1, and an empty curve, are unchanged.
+    """
+    if not curve or curve[-1][0] >= 1.0:
+        return curve
+    x, y = curve[-1]
+    return (*curve, (1.0, min(1.0, (y**3 + 1.0 - x**3) ** (1 / 3))))
 
 
 def chroma_factor(before: Tensor, after: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from progdf.camera import Camera, intrinsics, look_at
-from progdf.color.edits import parse_color, recolor_fully, stripe_profile, typical_color
+from progdf.color.edits import measure_color, parse_color, recolor_fully, stripe_profile
 from progdf.color.oklab import smoothstep
 from progdf.errors import ProgdfError
 
@@ -319,7 +319,7 @@ def paint_panda(picture: Tensor, camera: Camera, cover: Callable[[tuple[str, ...
 def _wash(picture: Tensor, share: Tensor, color: str) -> Tensor:
     """Recolor by a share, 0 to 1, per pixel. [H,W,3], [H,W] -> [H,W,3]"""
     share = (1.5 * share).clamp(0, 1)  # otherwise the old color would remain at soft edges
-    washed = recolor_fully(picture, parse_color(color), typical_color(picture, share))
+    washed = recolor_fully(picture, parse_color(color), measure_color(picture, share))
     return torch.lerp(picture, washed, share[..., None])
 
 

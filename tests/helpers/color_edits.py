@@ -1,4 +1,4 @@
-"""Color edits at one strength. The default reference is the typical color of the input."""
+"""Color edits at one strength. The default source is the measured color of the input."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ def recolor(
     rgb: Tensor,
     target: Tensor,
     strength: Strength = 1.0,
-    reference: Tensor | None = None,
+    source: edits.RegionColor | None = None,
     path: ColorPath = "bowed",
 ) -> Tensor:
-    own = edits.typical_color(rgb) if reference is None else reference
+    own = edits.measure_color(rgb) if source is None else source
     return edits.recolor_course(rgb, target, own, path)(strength)
 
 
 def tint(rgb: Tensor, target: Tensor, strength: Strength = 1.0) -> Tensor:
-    return edits.tint_course(rgb, target, edits.typical_color(rgb))(strength)
+    return edits.tint_course(rgb, target, edits.measure_color(rgb))(strength)
 
 
 def stripes(rgb: Tensor, pattern: Tensor, target: Tensor, strength: Strength) -> Tensor:

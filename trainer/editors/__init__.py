@@ -185,6 +185,7 @@ def check_new_editor(options: EditorOptions) -> None:
 def make_editor(
     options: EditorOptions, scene: Gaussians, region: Region, views: Sequence[View],
     glances: Callable[[], Sequence[RegionThumbnail]] = list, seen: Gaussians | None = None,
+    say: Callable[[str], object] = str,
 ) -> ImageEditor:  # fmt: skip
     """Return the editor that the options name (see `EditorInput`).
 
@@ -192,4 +193,4 @@ def make_editor(
         ProgdfError: the editor cannot be made.
     """
     row = editor_row(options)
-    return row.make(EditorInput(options.text, scene, region, views, options, glances, seen))
+    return row.make(EditorInput(options.text, scene, region, views, options, glances, seen, say))

@@ -29,6 +29,7 @@ class EditorInput:
     # from the views.
     glances: Callable[[], Sequence[RegionThumbnail]] = list
     seen: Gaussians | None = None  # the scene that edited pictures show; None: `scene`
+    say: Callable[[str], object] = str  # receives the lines for the run's log; by default they are dropped
 
 
 class ImageEditor(Protocol):

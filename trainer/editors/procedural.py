@@ -72,7 +72,7 @@ class StripesEditor(ProceduralEditor):
     members: Tensor  # rows of the region. [M] int64
     pattern: Tensor  # stripe coverage of each member, 0..1. [M]
     target: Tensor  # stripe color, sRGB 0..1. [3]
-    typical: Tensor  # typical color of the region, sRGB 0..1. [3]
+    source: color.RegionColor  # measured color of the region
     path: ColorPath = "bowed"  # see `bend_of`
 
     def paint(self, rgb: Tensor) -> color.ColorFunction:
@@ -80,9 +80,10 @@ class StripesEditor(ProceduralEditor):
 
         The paint removes most of the original texture's contrast.
         """
-        flattened = torch.lerp(rgb, self.typical.expand_as(rgb), (_STRIPE_COVERAGE * self.pattern)[:, None])
-        painted = color.recolor_fully(flattened, self.target, self.typical)
-        bend = bend_of(self.typical, self.target, self.path)
+        typical = self.source.color
+        flattened = torch.lerp(rgb, typical.expand_as(rgb), (_STRIPE_COVERAGE * self.pattern)[:, None])
+        painted = color.recolor_fully(flattened, self.target, self.source)
+        bend = bend_of(typical, self.target, self.path)
         return lambda strength: interpolate_colors(rgb, painted, strength * self.pattern, bend)
 
     def course(self, view: View) -> Callable[[float], Tensor]:
@@ -138,15 +139,15 @@ def edit_course(editor: ImageEditor, view: View) -> Callable[[float], Tensor]:
 def recolor(given: EditorInput) -> ColorEditor:
     """Return the editor of `recolor:#rrggbb[,path=hue]`: another color with the same shading."""
     target, path = paint_of(given.what)
-    typical = region_color(given)
-    return ColorEditor(lambda rgb: color.recolor_course(rgb, target, typical, path))
+    source = region_color(given)
+    return ColorEditor(lambda rgb: color.recolor_course(rgb, target, source, path))
 
 
 def tint(given: EditorInput) -> ColorEditor:
-    """Return the editor of `tint:#rrggbb[,path=hue]`: a wash of color with the same lightness."""
+    """Return the editor of `tint:#rrggbb[,path=hue]`: a wash of color, at about the same lightness."""
     target, path = paint_of(given.what)
-    typical = region_color(given)
-    return ColorEditor(lambda rgb: color.tint_course(rgb, target, typical, path))
+    source = region_color(given)
+    return ColorEditor(lambda rgb: color.tint_course(rgb, target, source, path))
 
 
 def darken(given: EditorInput) -> ColorEditor:
@@ -167,6 +168,10 @@ def night(given: EditorInput) -> ColorEditor:
 def grade(given: EditorInput) -> ColorEditor:
     """Return the editor of `grade:exposure=0.5,#8a5a2b=#2b5a8a,curve=0.3:0.2` (see `parse_grade`)."""
     requested = color.parse_grade(given.what)
+    if requested.palette:
+        requested = color.measure_grade(requested, *region_samples(given))
+        for (source, _), shading in zip(requested.palette, requested.palette_shadings, strict=True):
+            given.say(f"{color.hex_color(source.tolist())} in the region: {shading.describe()}")
     return ColorEditor(lambda rgb: color.grade_course(rgb, requested))
 
 
@@ -202,13 +207,20 @@ def stripe_frame(points: Tensor) -> tuple[Tensor, float, float]:
     return axis, period, 0.5 - float(low[longest]) / period
 
 
-def region_color(given: EditorInput) -> Tensor:
-    """Return the region's typical color. [3]
+def region_color(given: EditorInput) -> color.RegionColor:
+    """Return the region's measured color, and log it.
 
     It does not depend on the edited view, so that the edit is one function of color in all views.
     """
+    measured = color.measure_color(*region_samples(given))
+    given.say(f"region: {measured.describe()}")
+    return measured
+
+
+def region_samples(given: EditorInput) -> tuple[Tensor, Tensor]:
+    """Return colors of the region and their share of a pixel. [N,3], [N]"""
     pairs = [(sample, sample.mask > 0.0) for sample in given.glances() or given.views]
-    return color.typical_color(
+    return (
         torch.cat([sample.inside[visible] for sample, visible in pairs]),
         torch.cat([sample.mask[visible] for sample, visible in pairs]),
     )

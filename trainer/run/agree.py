@@ -398,7 +398,7 @@ def make_run_editor(
     """
     settings = replace(options.editor, cache=folder.paintings)
     glances = partial(render_thumbnails, options.views, setup.scene, setup.region)
-    editor = make_editor(settings, setup.scene, setup.region, setup.views, glances, setup.seen)
+    editor = make_editor(settings, setup.scene, setup.region, setup.views, glances, setup.seen, log.say)
     if editor_row(settings).model is None:
         return editor, {}
     painter = cast(InstructEditor, editor)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
 from imgui_bundle import imgui, imgui_ctx
 
 from progdf.color.edits import GRADE_RANGES, hex_color, parse_color
-from progdf.color.palette import bend_lightness
+from progdf.color.palette import Curve, bend_lightness, with_highlights
 from viewer.state.commands import Action, Plain
 from viewer.state.forms import (
     ALL,
@@ -231,7 +232,7 @@ def _settings(form: NewEdit, preview: PreviewState, column: float, ui: UiContext
                 label(name.capitalize(), column)
                 grade.append(value_slider(f"##{name}", value, (low, high), "%.2f", neutral, ui))
                 tip(_GRADES[name])
-            form = replace(form, grade=tuple(grade), curve=_curve(form.curve, column, ui))
+            form = replace(form, grade=tuple(grade), curve=_curve(form.curve, column, ui, tuple))
         case "style":
             label("Style", column)
             form = _style(form, preview, ui)
@@ -277,7 +278,7 @@ def _palette(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
         if imgui.begin_popup(f"color {i}"):
             picker_flags = flags.display_hex.value | flags.no_side_preview.value
             changed, chosen = imgui.color_picker3("##picker", parse_color(new_color).tolist(), picker_flags)
-            parts = hex_color(chosen) if changed else new_color, _curve(curve, column, ui)
+            parts = hex_color(chosen) if changed else new_color, _curve(curve, column, ui, with_highlights)
             pairs[i] = source, "/".join(filter(None, parts))
             imgui.end_popup()
         imgui.same_line(0.0, 2.0 * ui.scale)
@@ -287,8 +288,10 @@ def _palette(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
     return replace(form, palette=tuple(pairs), picks=picks)
 
 
-def _curve(curve: str, column: float, ui: UiContext) -> str:
+def _curve(curve: str, column: float, ui: UiContext, ended: Callable[[Curve], Curve]) -> str:
     """Draw a curve from original to new lightness and return it. A press adds a point and drags it.
+
+    `ended` returns the curve as it is applied, with its end at white.
 
     By keyboard, Space selects the next point. After the last point, it adds one in the widest gap. The arrow
     keys move the selected point.
@@ -319,7 +322,7 @@ def _curve(curve: str, column: float, ui: UiContext) -> str:
         ends = [0.0, *(across for across, _ in points), 1.0]
         widest = max(range(len(points) + 1), key=lambda i: ends[i + 1] - ends[i])
         middle = torch.tensor((ends[widest] + ends[widest + 1]) / 2)
-        at = float(middle), float(bend_lightness(middle, points))
+        at = float(middle), float(bend_lightness(middle, ended(tuple(points))))
         near = chosen + 1 if chosen + 1 < len(points) else -1
     if imgui.is_item_clicked(1) or (keyed and imgui.is_key_pressed(key.delete)):
         points = [point for i, point in enumerate(points) if i != near]
@@ -342,7 +345,7 @@ def _curve(curve: str, column: float, ui: UiContext) -> str:
     canvas.add_rect_filled(imgui.ImVec2(x, y), imgui.ImVec2(x + wide, y + tall), u32(p.field), 4.0 * ui.scale)
     canvas.add_line(imgui.ImVec2(x, y + tall), imgui.ImVec2(x + wide, y), u32(p.chosen), ui.scale)
     steps = [i / 48 for i in range(49)]
-    bent = bend_lightness(torch.tensor(steps), points).tolist()
+    bent = bend_lightness(torch.tensor(steps), ended(tuple(points))).tolist()
     line = [imgui.ImVec2(x + wide * s, y + tall * (1.0 - l)) for s, l in zip(steps, bent, strict=True)]
     canvas.add_polyline([*line], u32(p.handle), 1.5 * ui.scale, 0)
     for i, (across, up) in enumerate(points):

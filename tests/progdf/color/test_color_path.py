@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from progdf.color import edits as color
-from progdf.color.edits import parse_color
+from progdf.color.edits import measure_color, parse_color
 from progdf.color.oklab import ColorPath, bend_of, interpolate_colors, oklab_to_srgb, srgb_to_oklab
 from tests.helpers.color_edits import recolor
 
@@ -32,7 +32,7 @@ BIT = 2 / 255  # two channels closer than this are equal
 @pytest.mark.parametrize("name", PAIRS)
 def test_every_strength_lies_between_both_ends(name: str) -> None:
     start, end = (parse_color(text) for text in PAIRS[name])
-    colors = recolor(start.expand(21, 3), end, STRENGTHS, reference=start)
+    colors = recolor(start.expand(21, 3), end, STRENGTHS, source=measure_color(start))
     lab = srgb_to_oklab(colors)
     detour = ((lab - lab[0]).norm(dim=1) + (lab - lab[-1]).norm(dim=1)) / (lab[-1] - lab[0]).norm()
     assert float(detour.max()) <= 1.10
@@ -51,15 +51,16 @@ def test_every_strength_lies_between_both_ends(name: str) -> None:
 @pytest.mark.parametrize("name", PAIRS)
 def test_color_path_has_exact_ends_and_even_steps(name: str) -> None:
     start, end = (parse_color(text) for text in PAIRS[name])
-    colors = recolor(start.expand(21, 3), end, STRENGTHS, reference=start)
+    source = measure_color(start)
+    colors = recolor(start.expand(21, 3), end, STRENGTHS, source=source)
     assert torch.equal(colors[0], start)
-    assert torch.equal(colors[-1], color.recolor_fully(start.expand(21, 3), end, start)[-1])
+    assert torch.equal(colors[-1], color.recolor_fully(start.expand(21, 3), end, source)[-1])
     steps = srgb_to_oklab(colors).diff(dim=0).norm(dim=1)
     assert float(steps.max()) < 2.5 * float(steps.min())
 
 
 def test_hue_path_follows_the_hue_circle_and_keeps_chroma() -> None:
-    lab = srgb_to_oklab(recolor(ORANGE.expand(21, 3), BLUE, STRENGTHS, ORANGE, path="hue"))
+    lab = srgb_to_oklab(recolor(ORANGE.expand(21, 3), BLUE, STRENGTHS, measure_color(ORANGE), path="hue"))
     hue = torch.rad2deg(torch.atan2(lab[10, 2], lab[10, 1]))
     assert 130 < float(hue) < 200, "over green"
     chroma = lab[:, 1:].norm(dim=1)
@@ -79,7 +80,7 @@ def hues(lightness: float, chroma: float, count: int = 360) -> Tensor:
 def test_neighboring_hues_stay_neighbors_along_the_path(reference: str, path: ColorPath) -> None:
     circle = hues(0.65, 0.11)
     for s in (0.25, 0.5, 0.75):
-        recolored = recolor(circle, BLUE, s, parse_color(reference), path)
+        recolored = recolor(circle, BLUE, s, measure_color(parse_color(reference)), path)
         apart = (recolored - recolored.roll(1, dims=0)).abs().amax(dim=1)
         # one degree of hue is up to 0.008 before the edit, and a few times that where two paths part
         assert float(apart.max()) < (0.03 if path == "bowed" else 0.07)
@@ -91,7 +92,7 @@ def test_region_around_the_opposite_hue_takes_one_direction() -> None:
     angle = opposite + torch.deg2rad(torch.linspace(-15, 15, 31))
     region = oklab_to_srgb(torch.stack([torch.full((31,), 0.65), 0.12 * angle.cos(), 0.12 * angle.sin()], 1))
     for reference in region[[7, 23]]:
-        half = srgb_to_oklab(recolor(region, BLUE, 0.5, reference))
+        half = srgb_to_oklab(recolor(region, BLUE, 0.5, measure_color(reference)))
         hue = torch.atan2(half[:, 2], half[:, 1])
         assert float((hue - hue.mean()).abs().max()) < math.radians(30)
         assert float(hue.mean().abs()) < math.radians(60), "by way of rose, as green is nobody's half"
@@ -99,7 +100,9 @@ def test_region_around_the_opposite_hue_takes_one_direction() -> None:
 
 def test_near_gray_colors_stay_dull_during_a_hue_change() -> None:
     for s in (0.2, 0.4, 0.6, 0.8):
-        warm, cool = recolor(torch.tensor([[0.70, 0.68, 0.66], [0.66, 0.68, 0.70]]), BLUE, s, ORANGE)
+        warm, cool = recolor(
+            torch.tensor([[0.70, 0.68, 0.66], [0.66, 0.68, 0.70]]), BLUE, s, measure_color(ORANGE)
+        )
         assert float((warm - cool).abs().max()) < 0.06, "they were neighbors and stay so"
 
 
@@ -107,7 +110,7 @@ def test_near_gray_colors_stay_dull_during_a_hue_change() -> None:
 @pytest.mark.parametrize("path", ["bowed", "hue"])
 def test_hues_near_the_target_take_their_own_short_path(s: float, path: ColorPath) -> None:
     eyes = torch.tensor([[0.10, 0.70, 0.85], [0.15, 0.60, 0.95], [0.25, 0.45, 0.95]])  # cyan to blue
-    recolored = recolor(eyes, BLUE, s, ORANGE, path)
+    recolored = recolor(eyes, BLUE, s, measure_color(ORANGE), path)
     assert bool((recolored[:, 2] > recolored[:, 0] + 0.2).all()), "no orange fleck on the way to blue"
     assert bool((recolored[:, 2] > recolored[:, 1]).all())
 

@@ -60,7 +60,8 @@ def test_each_color_moves_fully_with_its_nearest_palette_color() -> None:
     lab = srgb_to_oklab(torch.stack([LAWN, BEAR, STONE, blue, color.parse_color("#a8d860")]))
     targets = torch.stack([lab[3], lab[1], lab[2]])
     lime = shift_palette(lab[4:], lab[:3], targets)[0]
-    assert torch.allclose(lime - lab[4], lab[3] - lab[0], atol=0.02)
+    light = lab[4, 0] / lab[0, 0]
+    assert torch.allclose(lime - lab[4], light * (lab[3] - lab[0]), atol=0.02)
 
 
 def test_single_palette_color_moves_near_colors_and_leaves_far_ones() -> None:
@@ -124,6 +125,14 @@ def test_curve_of_one_color_bends_only_nearby_colors() -> None:
     straight = color.ColorGrade(palette=held, palette_curves=(((0.5, 0.5),), (), ()))
     assert straight.is_neutral
     assert torch.allclose(color.grade_fully(colors, straight), colors, atol=2e-3)
+
+
+def test_measured_grade_keeps_its_parsed_curves() -> None:
+    parsed = color.parse_grade("#7eae44=#4474ae/0.3:0.2,curve=0.5:0.4")
+    measured = color.measure_grade(parsed, scene({500: LAWN}), torch.ones(500))
+    assert measured.palette_curves == parsed.palette_curves == (((0.3, 0.2),),)
+    assert measured.curve == parsed.curve == ((0.5, 0.4),)
+    assert len(measured.palette_shadings) == 1
 
 
 def test_curve_of_one_color_has_no_steps() -> None:
