@@ -374,15 +374,18 @@ class Composer:
             total /= weight_sum[:, None]
         largest = np.full(total.shape, -0.0, np.float32)
         for part in parts:
-            push = np.full(total.shape, -0.0, np.float32)
+            # a single push is the largest one
+            push = total if len(parts) == 1 else np.full(total.shape, -0.0, np.float32)
             bases = self._bases[part.edit][name]
             used, factors = bases.factors(part.segment)
             selection = part.at, part.members, part.weights
             stored = (bases.end, bases.residual)
             scale = np.float32(part.layer.gain(name))
             add_offsets(push, selection, stored, used, factors, scale, np.float32(0.0), _NO_VALUES)
-            keep_larger(largest, push)
-        total += largest
+            if push is not total:
+                keep_larger(largest, push)
+        if len(parts) > 1:
+            total += largest
         return total
 
     def _part(self, members: _Members, edit: int, layer: Layer) -> _LayerSlice:

@@ -26,6 +26,13 @@ before and after [E,2,3]; the turn as a matrix, times the scale [E,3,3]; opacity
 drawn, before and after [E,2].
 """
 
+Blends = tuple[Doubles, NDArray[np.bool_]]
+"""Mean motion of the anchors of each added row, which is measured when one of them changes.
+
+Matrix and shift of the affine map of the center, turn as a unit quaternion, mean change of the log-scales,
+and factor of the opacity [F,18]; geometry or opacity of an anchor differs [F,2].
+"""
+
 _MIN_DRAWN_OPACITY = 1 / 255  # as in `follow`
 _MIN_OPACITY = 1e-30
 
@@ -120,6 +127,11 @@ def rest_motions(before: Floats) -> Motions:
     return moves, turns, means, matrices, np.repeat(visible[:, None], 2, axis=1)
 
 
+def rest_blends(count: int) -> Blends:
+    """Return the blends of rows whose anchors are as in the original."""
+    return np.zeros((count, 18)), np.zeros((count, 2), np.bool_)
+
+
 @kernel(cache=True)
 def measure_motions(motions: Motions, index: Rows, before: Floats, after: Shapes) -> None:
     """Update the motions of states that have changed.
@@ -192,6 +204,8 @@ def carry_fast(
     follows: NDArray[np.bool_],
     states: tuple[Floats, Shapes],
     motions: Motions,
+    blends: Blends,
+    touched: NDArray[np.bool_],
 ) -> float:
     """Write rows that follow their anchors; return the largest squared movement of a center.
 
@@ -204,6 +218,8 @@ def carry_fast(
         follows: by edit + 1: its rows follow; the first is for pushed rows
         states: states in the original [E,11], and composed. [E,c] each
         motions: motions of the states
+        blends: mean motions of the anchors of added rows; updated in place
+        touched: states whose motion has changed. [E], or [0] without any
     """
     own, drawn = kept
     rows, edits, own_states, anchors, weights = table
@@ -216,13 +232,16 @@ def carry_fast(
         pushed = own_states[i] >= 0
         if pushed:
             _copy_row(own, i, after, own_states[i])
+        elif len(touched):
+            for k in range(4):
+                if weights[i, k] > 0.0 and touched[anchors[i, k]]:
+                    _blend(blends, i, anchors, weights, motions)
+                    break
         is_moved = False
         fades = False
         if follows[edits[i] + 1]:
-            for k in range(4):
-                if weights[i, k] > 0.0:
-                    is_moved |= moves[anchors[i, k], 0]
-                    fades |= moves[anchors[i, k], 1]
+            is_moved = moves[first, 0] if pushed else blends[1][i, 0]
+            fades = moves[first, 1] if pushed else blends[1][i, 1]
         row = rows[i]
         if not is_moved:
             _write_geometry(shapes, row, own, i)
@@ -235,18 +254,16 @@ def carry_fast(
         elif pushed:
             _carry_with(shapes, row, own, i, first, motions)
         else:
-            _carry_geometry(shapes, row, own, i, anchors, weights, motions)
+            _carry_geometry(shapes, row, own, i, blends[0])
         logit = own[i, 10]
         if fades and pushed and logit == before[first, 10]:
             logit = after[3][first, 0]
         elif fades:
-            old = 0.0
-            remaining = 0.0
-            for k in range(4):
-                old += weights[i, k] * visible[anchors[i, k], 0]
-                remaining += weights[i, k] * visible[anchors[i, k], 1]
-            if old > 0.0 and remaining < old:
-                opacity = max(_sigmoid(logit) * (remaining / old), _MIN_OPACITY)
+            ratio = blends[0][i, 17]
+            if pushed:
+                ratio = _opacity_ratio(visible[first, 0], visible[first, 1])
+            if ratio < 1.0:
+                opacity = max(_sigmoid(logit) * ratio, _MIN_OPACITY)
                 logit = np.float32(math.log(opacity) - math.log1p(-opacity))
         logits[row, 0] = logit
         step = 0.0
@@ -288,28 +305,53 @@ def _carry_with(shapes: Shapes, row: int, own: Floats, i: int, state: int, motio
     quats[row, 3] = quat[3]
 
 
-@kernel()
-def _carry_geometry(
-    shapes: Shapes,
-    row: int,
-    own: Floats,
-    i: int,
-    anchors: Rows,
-    weights: Doubles,
-    motions: Motions,
-) -> None:
-    """Write the geometry of row `i` of the table; arguments as in `carry_fast`."""
+@kernel(inline=True)
+def _opacity_ratio(old: float, remaining: float) -> float:
+    """Return the factor by which opacity above the least that is drawn falls; 1 if it does not."""
+    if old > 0.0 and remaining < old:
+        return remaining / old
+    return 1.0
+
+
+@kernel(inline=True)
+def _carry_geometry(shapes: Shapes, row: int, own: Floats, i: int, blends: Doubles) -> None:
+    """Write the geometry of row `i` of the table, moved by the blend of its anchors' motions."""
     means, log_scales, quats, _ = shapes
-    _, turns, centers, _, _ = motions
+    x = float(own[i, 0])
+    y = float(own[i, 1])
+    z = float(own[i, 2])
+    for c in range(3):
+        moved = blends[i, 3 * c] * x + blends[i, 3 * c + 1] * y + blends[i, 3 * c + 2] * z
+        means[row, c] = moved + blends[i, 9 + c]
+        log_scales[row, c] = own[i, 3 + c] + blends[i, 16]
+    turn = (blends[i, 12], blends[i, 13], blends[i, 14], blends[i, 15])
+    quat = _multiply(turn, (float(own[i, 6]), float(own[i, 7]), float(own[i, 8]), float(own[i, 9])))
+    quats[row, 0] = quat[0]
+    quats[row, 1] = quat[1]
+    quats[row, 2] = quat[2]
+    quats[row, 3] = quat[3]
+
+
+@kernel()
+def _blend(blends: Blends, i: int, anchors: Rows, weights: Doubles, motions: Motions) -> None:
+    """Measure the mean motion of the anchors of row `i` of the table; arguments as in `carry_fast`."""
+    blend = blends[0][i]
+    moves, turns, centers, _, visible = motions
     tw = tx = ty = tz = 0.0
     px = py = pz = 0.0
     nx = ny = nz = 0.0
     growth = 0.0
+    old = 0.0
+    remaining = 0.0
+    is_moved = False
+    fades = False
     base = turns[anchors[i, 0]]
     for k in range(4):
         weight = weights[i, k]
         if weight > 0.0:
             state = anchors[i, k]
+            is_moved |= moves[state, 0]
+            fades |= moves[state, 1]
             turn = turns[state]
             sign = weight
             if turn[0] * base[0] + turn[1] * base[1] + turn[2] * base[2] + turn[3] * base[3] < 0.0:
@@ -326,17 +368,19 @@ def _carry_geometry(
             nx += weight * center[1, 0]
             ny += weight * center[1, 1]
             nz += weight * center[1, 2]
+            old += weight * visible[state, 0]
+            remaining += weight * visible[state, 1]
     q = _normalize(tw, tx, ty, tz)
-    arm = (0.0, float(own[i, 0]) - px, float(own[i, 1]) - py, float(own[i, 2]) - pz)
-    turned = _multiply(_multiply(q, arm), (q[0], -q[1], -q[2], -q[3]))
-    scale = math.exp(growth)
-    quat = _multiply(q, (float(own[i, 6]), float(own[i, 7]), float(own[i, 8]), float(own[i, 9])))
-    means[row, 0] = nx + scale * turned[1]
-    means[row, 1] = ny + scale * turned[2]
-    means[row, 2] = nz + scale * turned[3]
-    for c in range(3):
-        log_scales[row, c] = own[i, 3 + c] + growth
-    quats[row, 0] = quat[0]
-    quats[row, 1] = quat[1]
-    quats[row, 2] = quat[2]
-    quats[row, 3] = quat[3]
+    matrix = blend[:9].reshape(3, 3)
+    _write_matrix(matrix, q, math.exp(growth))
+    blend[9] = nx - (matrix[0, 0] * px + matrix[0, 1] * py + matrix[0, 2] * pz)
+    blend[10] = ny - (matrix[1, 0] * px + matrix[1, 1] * py + matrix[1, 2] * pz)
+    blend[11] = nz - (matrix[2, 0] * px + matrix[2, 1] * py + matrix[2, 2] * pz)
+    blend[12] = q[0]
+    blend[13] = q[1]
+    blend[14] = q[2]
+    blend[15] = q[3]
+    blend[16] = growth
+    blend[17] = _opacity_ratio(old, remaining)
+    blends[1][i, 0] = is_moved
+    blends[1][i, 1] = fades

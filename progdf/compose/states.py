@@ -35,6 +35,7 @@ from .follow_kernel import (
     gather_shapes,
     measure_motions,
     release_rows,
+    rest_blends,
     rest_motions,
 )
 from .layers import Change, Layer
@@ -147,6 +148,8 @@ class Surface:
         self._drawn = scene.means[rows].float().numpy()  # their centers in the last picture. [F,3]
         self._before = pack_shapes(states).numpy()
         self._motions = rest_motions(self._before)
+        self._blends = rest_blends(len(followers.rows))
+        self._touched = np.zeros(len(states), bool)  # states whose motion has changed in this update
         self._is_anchor = np.zeros(len(states), bool)
         self._is_anchor[followers.anchors] = True
         self._follows = np.ones(len(gdfs) + 1, bool)  # by edit + 1: its rows follow; the first: pushed rows
@@ -190,7 +193,10 @@ class Surface:
         followers = self.followers
         changed = self._states.update(stack, blend)
         states = self._states.composer.shapes()
-        measure_motions(self._motions, changed[self._is_anchor[changed]], self._before, states)
+        moved = changed[self._is_anchor[changed]]
+        measure_motions(self._motions, moved, self._before, states)
+        self._touched[moved] = True
+        touched = self._touched if len(moved) else self._touched[:0]
         gather_shapes(self._own, added, shapes, followers.rows)
         self._follows[1:] = False
         self._follows[[edit + 1 for edit, _ in stack]] = True
@@ -206,9 +212,12 @@ class Surface:
                 self._follows,
                 (self._before, states),
                 self._motions,
+                self._blends,
+                touched,
             ),
             count,
         )
+        self._touched[moved] = False
         return math.sqrt(max(moves))
 
     def turn(self, bands: Floats, index: Rows, recolored: Rows) -> None:
