@@ -29,7 +29,7 @@ LiftRule = Literal["share", "paper"]
 Bands = Literal["auto", "on", "off"]
 Preset = Literal["default", "paper"]
 Quantize = Literal["off", "nf4"]
-Fill = Literal["none", "picture", "surface"]
+Fill = Literal["none", "picture", "smooth", "surface"]
 Removal = Literal["auto", "never", "always"]
 CarryOn = Literal["auto", "never", "always"]
 Device = Literal["auto", "cpu"]
@@ -90,8 +90,8 @@ class EditorOptions:
     """instruct: nf4 loads large parts in 4 bits, with a quarter of the memory and a small loss."""
     device: Device = "auto"
     """instruct: auto is the GPU, or the CPU for small models; cpu is the CPU for any model."""
-    fill: Annotated[Fill | None, absent_option("{none,picture,surface}", "by the editor")] = None
-    """remove, pictures: source to fill holes from: the picture, the surface around them, or none."""
+    fill: Annotated[Fill | None, absent_option("{none,picture,smooth,surface}", "by the editor")] = None
+    """remove, pictures: fill holes from the picture, the surface around them (smooth: no texture), or not."""
     removal: Removal = "auto"
     """pictures: remove the region instead of recoloring it (always, never, or as the picture suggests)."""
     carry_on: CarryOn = "auto"

@@ -46,6 +46,7 @@ The border is needed because Gaussians drawn there were moved.
 _CELL_SIDES_PX = (4, 2, 1)
 _PIXEL_SPREAD = 0.28  # standard deviation of a single pixel's disc, in pixels
 _MERGED_SPREAD = 0.6  # standard deviation of a merged rectangle's disc, as a share of its sides
+_COVER_SPREADS = (0.56, 0.7)  # the same two for discs with nothing behind them
 # pixels²; part of the engine's blur (0.3) that counts as an error of a disc; the solved colors undo the rest
 _BLUR_PX2 = 0.1
 _DEPTH_OFFSET_PX = 0.5  # pixels; discs lie deeper by this, as nearer neighbors cover them
@@ -111,12 +112,7 @@ def place_discs(
         return Discs(scene[:0], torch.zeros(0), torch.zeros(0, dtype=torch.int64), cleared)
     cells = merge_pixels(paint.picture.numpy(), mask, flat, surface.is_continuous)
     added, depths = _discs(cells, surface, paint.picture)
-    added = replace(
-        added,
-        shN=torch.zeros(len(added), *scene.shN.shape[1:]),
-        antialiased=scene.antialiased,
-        origin=scene.origin,
-    )
+    added = _like(added, scene)
     behind = surface.depth + (_DEPTH_OFFSET_PX + gap) * float(np.median(depths)) / float(camera.K[0, 0])
     reach = float((behind - surface.depth).max()) + _REACH_DEVIATIONS * surface.thickness
     moved = torch.zeros(len(scene), dtype=torch.bool)
@@ -127,6 +123,30 @@ def place_discs(
         cleared = _move_back(cleared, camera, rows, factors)
         moved = moved.index_fill(0, rows, True)
     return Discs(added, _share_beside(cells, paint.drawn[..., 3]), moved.nonzero()[:, 0], cleared)
+
+
+def cover_pixels(
+    scene: Gaussians, surface: PaintSurface, picture: Tensor, mask: NDArray[np.bool_], flat: float
+) -> Gaussians:
+    """Return discs that show pixels of a picture on its surface, wide enough to leave no gap between them.
+
+    No row of the scene moves.
+
+    Args:
+        scene: scene that provides the number of SH bands and the origin
+        surface: surface of the picture
+        picture: [H,W,3]
+        mask: pixels to cover, at least one. [H,W]
+        flat: see `place_discs`
+    """
+    cells = merge_pixels(picture.numpy(), mask, flat, surface.is_continuous)
+    return _like(_discs(cells, surface, picture, _COVER_SPREADS)[0], scene)
+
+
+def _like(added: Gaussians, scene: Gaussians) -> Gaussians:
+    """Return discs with the SH bands, the filter and the origin of a scene."""
+    bands = torch.zeros(len(added), *scene.shN.shape[1:])
+    return replace(added, shN=bands, antialiased=scene.antialiased, origin=scene.origin)
 
 
 def merge_pixels(
@@ -218,8 +238,16 @@ def _disc_error(image: Array, height: int, width: int) -> Array:
     return cast(Array, area * (seen[..., 3] + (color * (color - 2 * seen[..., :3])).sum(axis=2)) / 3)
 
 
-def _discs(cells: Array, surface: PaintSurface, picture: Tensor) -> tuple[Gaussians, Array]:
-    """Return discs that fill cells of the picture on its surface, and their depths. [B,4] and [H,W,3]"""
+def _discs(
+    cells: Array,
+    surface: PaintSurface,
+    picture: Tensor,
+    spreads: tuple[float, float] = (_PIXEL_SPREAD, _MERGED_SPREAD),
+) -> tuple[Gaussians, Array]:
+    """Return discs that fill cells of the picture on its surface, and their depths. [B,4] and [H,W,3]
+
+    `spreads`: standard deviations along a side of one pixel, in pixels, and of more, as a share of the side.
+    """
     camera = surface.camera
     x, y, width, height = cells.T
     K = camera.K.double().numpy()
@@ -243,7 +271,7 @@ def _discs(cells: Array, surface: PaintSurface, picture: Tensor) -> tuple[Gaussi
         step = np.zeros_like(rays)
         step[:, axis] = placed / focal[axis]
         step -= rays * ((normal * step).sum(axis=1) / (normal * rays).sum(axis=1))[:, None]
-        sides.append(step * (side * np.where(side > 1, _MERGED_SPREAD, _PIXEL_SPREAD))[:, None])
+        sides.append(step * (side * np.where(side > 1, spreads[1], spreads[0]))[:, None])
     axes, scales, _ = np.linalg.svd(np.stack(sides, axis=2), full_matrices=True)
     axes[:, :, 2] *= np.linalg.det(axes)[:, None]
     means = (rays * placed[:, None]) @ c2w[:3, :3].T + c2w[:3, 3]

@@ -27,14 +27,14 @@ from progdf.terminal import format_count
 from progdf.tidy import Step, tidy
 from trainer.editors import editor_row
 from trainer.editors.pictures import picture_background, read_edit, strengths_of
-from trainer.fill import Fill, fill_holes
+from trainer.fill.holes import Fill, fill_holes, region_weight, visible_depth
 from trainer.options import TrainOptions
 from trainer.regions.remains import find_remains, remaining_share
 from trainer.resolve import recorded_options
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder, write_views
 from trainer.views.setup import TrainingSetup, make_training_setup
-from trainer.views.view import BACKGROUND, BACKGROUND_NAMES, View, make_view, on_backgrounds, render_view
+from trainer.views.view import BACKGROUND_NAMES, View, on_backgrounds, render_view
 
 from .finish import DEFAULTS, RunResult, differences, write_result
 
@@ -115,15 +115,25 @@ def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder
     """
     scene = setup.scene
     named = setup.region
-    with log.stage("fill"):
+    log.expect({"fill": 2.0, "measure the edit": 1.0})
+    with log.stage("fill"), log.steps("fill", 4) as advance:
+        advance(0, "")
         painted, pictures = _painted_views(options, setup)
         around = setup if not options.views.pictures else _views_around(options, setup)
         kind = options.editor.fill or ("picture" if pictures else "surface")
         views = [*painted, *(view for view in around.train if view.camera.name not in pictures)]
         fill_pictures = pictures if kind == "picture" else None
-        close = partial(_attempt, scene, views=views, pictures=fill_pictures, close=kind != "none")
+        depths = [visible_depth(scene, view.camera) for view in views]
+        is_filled = kind != "none"
+        close = partial(_attempt, scene, views=views, pictures=fill_pictures, close=is_filled, depths=depths)
         removal = _remove_whole(scene, named, around.train, close, log)
+        advance(2, "")
+        if kind == "surface" and removal.fill.rows is not None:
+            removal = close(removal.region, is_textured=True)
+        advance(3, "")
         fill = removal.fill
+        for note in fill.notes:
+            log.say(note)
         removed = removal.scene
         remains = remaining_share(scene, removed, around.views)
         remains_of_named = remaining_share(scene, scene[~named.mask], around.views)
@@ -155,6 +165,7 @@ def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder
                 "remaining_share_of_named": round(remains_of_named, 5),
                 **fading,
                 "fill": kind,
+                "fill_notes": list(fill.notes),
                 "rows_added": rows_added,
                 "filled_from_views": fill.views,
                 "hole_pixels": fill.before,
@@ -198,6 +209,8 @@ def _attempt(
     views: Sequence[View],
     pictures: Mapping[str, Tensor] | None,
     close: bool,
+    depths: Sequence[Tensor],
+    is_textured: bool = False,
 ) -> Removal:
     """Remove a region and fill the holes.
 
@@ -207,13 +220,13 @@ def _attempt(
         views: views with any mask
         pictures: see `fill_holes`
         close: False only counts the holes
+        depths, is_textured: see `fill_holes`
     """
     rest = scene[~region.mask]
     if not len(rest):
         return Removal(region, Fill(None, 0, 0, 0), rest)
-    background = torch.tensor(BACKGROUND)
-    masked = [make_view(scene, region, view.camera, background) for view in views]
-    fill = fill_holes(scene, rest, masked, pictures, close)
+    masked = [replace(view, mask=region_weight(scene, region, view.camera)) for view in views]
+    fill = fill_holes(scene, rest, masked, pictures, close, is_textured, depths)
     return Removal(region, fill, rest if fill.rows is None else concatenate([rest, fill.rows]))
 
 

@@ -25,6 +25,7 @@ Advance = Callable[[int, str], None]
 
 STAGES = {
     "views": "",
+    "fill": "Filling the hole",
     "try kinds": "Choosing the kind of edit",
     "edit": "Editing views",
     "weights": "",

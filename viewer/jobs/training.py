@@ -49,6 +49,8 @@ DRAFT = ".draft.gdf"
 PACKED = ".packed.gdf"
 KEPT = ".kept.gdf"
 
+_FILLED = " filled"  # end of the name of a run that fills the hole of a removal
+
 
 class _Paint(msgspec.Struct):
     pixels: int = 0  # number of painted pixels
@@ -99,6 +101,11 @@ class EditOrder:
         if resumes:
             words.append("--resume")
         return words
+
+    @property
+    def fills(self) -> bool:
+        """True if it fills the hole of a removal."""
+        return self.editor == "remove" and bool(self.replaces)
 
     @property
     def result(self) -> Path:
@@ -294,6 +301,18 @@ def free_run(folder: Path, name: str) -> Path:
         return any(run.with_name(run.name + suffix).exists() for suffix in ("", ORDER, DRAFT, PACKED, KEPT))
 
     return free_path(folder, name, is_taken=is_taken)
+
+
+def filled_run(removal: Path) -> Path:
+    """Return a free folder for the run that fills the hole of a removal, beside its file."""
+    return free_run(removal.parent, f"{removal.stem}{_FILLED}")
+
+
+def unfilled_edit(filled: Path) -> Path | None:
+    """Return the file of the removal whose hole an edit fills; None if it is missing."""
+    name, is_filled, _ = filled.parent.name.rpartition(_FILLED)
+    removal = filled.parent.with_name(f"{name}.gdf")
+    return removal if is_filled and os.path.isfile(removal) else None
 
 
 def free_path(

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from imgui_bundle import imgui, imgui_ctx
 
+from progdf.terminal import format_duration
 from viewer.state.commands import Action, OnItem, Plain, WithText
 from viewer.state.facts import LayerRow
 from viewer.state.forms import NewEdit, with_settings
@@ -88,6 +89,7 @@ CARD_PX = 66.0  # height of a card with the gap to the next one, at 1×
 COMPACT_PX = 7.0  # padding of a compact row, at 1×
 SLIDER_PX = 92.0  # width of the slider in a compact row or a group row, at 1×
 SLIM_PX = 16.0  # height of this slider, at 1×
+_BUSY = ("queued", "running", "stopping")  # states of a job that will fill a hole
 _MENU = "menu of a layer"
 _MENU_ITEMS = (
     *("rename", "duplicate", "replace", "again", "", "remove", ""),
@@ -168,6 +170,8 @@ def draw_card(
         _number(number_at, strength, active, compact)
         if strength != layer.strength:  # building a new state is slow, and most cards do not change
             work = _change_layer(work, index, lambda old: replace(old, strength=strength))
+        if focused and row.hole:
+            actions += _fill_box(work, index, row)
         if layer.gdf in work.view.unfolded:
             work = _about(work, index, row, ui)
             active_slider = work.active_slider if focused else None
@@ -193,6 +197,22 @@ def draw_card(
             _focus_bar(clip, p.accent if focused else p.faint, scale)
     imgui.pop_id()
     return work, replace(touch, touched=touched or bool(press), press=press)
+
+
+def _fill_box(work: Workspace, index: int, row: LayerRow) -> list[Action]:
+    """Draw the check box that fills the hole of a removal, with the progress; return the requested action."""
+    gdf = work.view.layers[index].gdf
+    job = next((job for job in work.jobs if job.fills == gdf and job.status in _BUSY), None)
+    text = f"Fill the hole (about {format_duration(row.fill_seconds)})"
+    if row.hole == "filled":
+        text = "Fill the hole"
+    elif job is not None:
+        left = "" if job.seconds_left is None else f", {format_duration(job.seconds_left)} left"
+        text = f"Filling the hole: {100 * job.share:.0f} %{left}"
+    with inert(work.view.layers[index].locked or (job is not None and job.status == "stopping")):
+        pressed, _ = imgui.checkbox(f"{text}##hole", row.hole == "filled" or job is not None)
+    tip("Continue the surface around it, with its texture (extra fill). The hole stays until it is done")
+    return [OnItem("fill_hole", index)] if pressed else []
 
 
 def _change_layer(work: Workspace, index: int, change: Callable[[LayerState], LayerState]) -> Workspace:

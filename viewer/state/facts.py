@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -34,6 +34,14 @@ Larger regions are subsampled at a constant stride, so that drawing takes a frac
 _THUMBNAIL_GRAY = 56  # background of a thumbnail, 0 to 255
 _THUMBNAIL_DISTANCE = 0.7  # camera distance as a share of the framing distance
 
+
+FILL_BASE_S = 12.0
+"""Seconds to fill a hole in a small scene, rounded up; measured on two cores."""
+FILL_S_PER_MILLION = 150.0
+"""Further seconds per million Gaussians of the scene."""
+
+Hole = Literal["", "open", "filled"]
+"""State of the hole that a removal leaves; "" for other edits."""
 
 Thumbnail = Callable[[ViewCamera], NDArray[np.uint8]]
 
@@ -64,6 +72,8 @@ class LayerRow:
     draft: bool = False  # a preliminary grade until training ends
     added: int = 0  # number of members that are not in the original scene
     sources: str = ""  # its part from a picture and its part that is a guess, one line; "" without pictures
+    hole: Hole = ""
+    fill_seconds: float = 0.0  # estimated time to fill the hole
     from_others: int = 0  # number of its last members that other edits add
     # returns the rows that it adds on some rows of the drawn scene, see `rows_on`. [N] bool -> [A] int64
     rows_on: Callable[[NDArray[np.bool_]], NDArray[np.int64]] = field(default=_no_rows, compare=False)
@@ -103,10 +113,22 @@ def _row(scene: Gaussians, gdf: Gdf, gdfs: Sequence[Gdf], added: int) -> LayerRo
         draft="draft" in gdf.report,
         added=added,
         sources=_sources(gdf),
+        hole=_hole(gdf),
+        fill_seconds=FILL_BASE_S + FILL_S_PER_MILLION * len(scene) / 1e6,
         from_others=gdf.from_others,
         rows_on=lambda mask: rows_on(gdf, torch.tensor(mask)).numpy(),
         thumbnail=partial(draw_thumbnail, scene, gdf),
     )
+
+
+def _hole(gdf: Gdf) -> Hole:
+    """Return the state of a removal's hole. A removal that keeps the paint on its region has no state."""
+    if gdf.instruction != "remove" or not len(gdf.region):
+        return ""
+    if "removal" in gdf.report:  # made by `progdf train`, which has filled it
+        return "filled"
+    leaves_paint = gdf.anchors is not None and gdf.anchors.leaves_paint
+    return "" if leaves_paint or gdf.added is not None else "open"
 
 
 def _sources(gdf: Gdf) -> str:

@@ -124,6 +124,7 @@ class JobCard:
     keepable: bool = False  # its newest recording can become a layer
     offer: str = ""  # one line about a possible continuation of the edit
     elsewhere: str = ""  # name of its scene while another one is open
+    fills: int | None = None  # `LayerState.gdf` of the removal whose hole it fills
 
 
 Pointed = tuple[str, int]

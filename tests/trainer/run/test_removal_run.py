@@ -27,7 +27,8 @@ from progdf.region import Region, from_mask
 from progdf.scene.strays import with_strays
 from progdf.sh import rgb_to_sh0
 from trainer.evaluate.command import evaluate
-from trainer.fill import Hole, fill_holes, find_hole, membrane, place_discs
+from trainer.fill.holes import Hole, fill_holes, find_hole, place_discs
+from trainer.fill.membrane import membrane
 from trainer.options import (
     EditorOptions,
     EvaluateOptions,

@@ -28,7 +28,15 @@ from viewer.jobs.job_queue import Delivery, JobQueue, QueuedTask
 from viewer.jobs.training import EditOrder
 from viewer.state.commands import Plain
 from viewer.state.forms import ALL, CHANGED, SELECTION, NewEdit
-from viewer.state.selection import SUFFIX, add_region, equal_region, free_name, select_none
+from viewer.state.selection import (
+    SUFFIX,
+    NamedRegion,
+    add_region,
+    equal_region,
+    free_name,
+    pack,
+    select_none,
+)
 from viewer.state.transient import DecalGhost
 from viewer.state.view_state import LayerState
 from viewer.state.workspace import Dialog, JobCard, Store, with_transient
@@ -136,6 +144,7 @@ class JobActions:
         self._live: Path | None = None  # the recording on screen
         self._live_layers: tuple[LayerState, ...] = ()  # its layers
         self._live_due = 0.0
+        self._discarded: set[int] = set()  # jobs to discard once they have stopped
         self._quits: type | None = None  # quit once no task of this class is busy
 
     @property
@@ -153,6 +162,7 @@ class JobActions:
             "discard_run": queue.discard,
             "close_run": queue.dismiss,
             "carry_on": self._carry_on,
+            "fill_hole": self._fill_hole,
             "look_behind": self._show_behind,
             "show_file": lambda number: webbrowser.open(queue.job(number).task.out.parent.as_uri()),
             "copy_path": lambda number: imgui.set_clipboard_text(str(queue.job(number).task.out)),
@@ -189,6 +199,54 @@ class JobActions:
             replaced = str(task.result)
             self.queue.add(replace(task, out=out, name=out.name, carry_on="always", replaces=replaced))
             self.queue.dismiss(number)
+
+    def _fill_hole(self, index: int) -> None:
+        """Fill the hole of a removal, stop its filling, or take the fill away.
+
+        The removal stays as it is until the fill replaces it.
+
+        Raises:
+            ProgdfError: a file is missing or cannot be written.
+        """
+        document = self._documents.get()
+        gdf_index = self._store.get().view.layers[self._edits.layer(index)].gdf
+        path = document.gdf_paths[gdf_index] if gdf_index < len(document.gdf_paths) else None
+        if path is None:
+            raise ProgdfError("this removal has no file; remove the selection again")
+        for job in self.queue.jobs:
+            if (
+                job.busy
+                and isinstance(job.task, EditOrder)
+                and job.task.fills
+                and job.task.replaces == str(path)
+            ):
+                self._discarded.add(job.number)
+                self.queue.stop(job.number)
+                return
+        gdf = document.edits[gdf_index]
+        if "removal" in gdf.report:
+            unfilled = training.unfilled_edit(path)
+            if unfilled is None:
+                raise ProgdfError(
+                    "the removal without the fill has no file; undo, or remove the selection again"
+                )
+            self._edits.replace_file(path, unfilled)
+            return
+        out = training.filled_run(path)
+        mask = gdf.region.mask.numpy()
+        members = NamedRegion(out.name, out.with_name(f"{out.name}{SUFFIX}"), pack(mask), len(gdf.region))
+        region_files.write_region(members, len(document.original))
+        order = EditOrder(
+            document.file.resolve(),
+            out,
+            out.name,
+            region=f"file:{members.path}",
+            editor="remove",
+            quick=False,
+            threads=training.spare_threads(),
+            replaces=str(path),
+        )
+        self.queue.add(order)
 
     def _show_behind(self, number: int) -> None:
         """Show the picture of the continued edit from behind.
@@ -360,6 +418,11 @@ class JobActions:
     def _end(self, job: QueuedTask) -> None:
         """Handle the end of a job: add or replace the layer, or show a message."""
         task = job.task
+        if job.number in self._discarded and job.status == "stopped":
+            self._discarded.discard(job.number)
+            if any(listed.number == job.number for listed in self.queue.jobs):
+                self.queue.discard(job.number)
+            return
         if job.status == "done" and not (job.warning or job.offer) and isinstance(task, EditOrder):
             self.queue.dismiss(job.number)
         # with the panel, its card shows the error
@@ -372,6 +435,9 @@ class JobActions:
             elif job.status == "done":
                 self._messages.show(f"Wrote {task.out}")
             return
+        if job.status == "done" and task.fills:
+            self._take_fill(task)
+            return
         if job.status == "done" and self._scene == task.scene:  # the result replaces the recordings
             self._live = None
             if not self._take_result(task):
@@ -383,6 +449,13 @@ class JobActions:
             self._live = None
             self._documents.replace(self._documents.get())
         if job.status == "done":
+            self._messages.show(f"{task.name} is ready: {task.result}")
+
+    def _take_fill(self, task: EditOrder) -> None:
+        """Replace a removal by the filled one, if it is still a layer."""
+        if self._scene == task.scene and self._edits.replace_file(Path(task.replaces), task.result):
+            self._messages.show("The hole is filled")
+        else:
             self._messages.show(f"{task.name} is ready: {task.result}")
 
     def _take_result(self, task: EditOrder) -> bool:
@@ -438,10 +511,19 @@ class JobActions:
         cost = time.monotonic() - begun
         self._live_due = now + max(LIVE_EVERY_S, cost / LIVE_SHARE)
 
+    def _filled_edit(self, task: EditOrder | Delivery) -> int | None:
+        """Return the index of the removal whose hole a task fills; None for other tasks."""
+        if not isinstance(task, EditOrder) or not task.fills:
+            return None
+        view = self._store.get().view
+        paths = self._documents.get().gdf_paths
+        used = (layer.gdf for layer in view.layers if layer.gdf < len(paths))
+        return next((gdf for gdf in used if str(paths[gdf]) == task.replaces), None)
+
     def _publish(self) -> None:
         """Publish the jobs of this scene and the busy jobs of others to the panel."""
         jobs = tuple(
-            job_card(job)
+            replace(job_card(job), fills=self._filled_edit(job.task))
             if job.task.scene == self._scene
             else replace(job_card(job), elsewhere=job.task.scene.name, keepable=False)
             for job in self.queue.jobs

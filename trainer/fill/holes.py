@@ -8,26 +8,41 @@ removal.
 
 The view with the largest hole is filled with discs, then that with the largest remaining one, until all holes
 are small. Views with a given picture come first.
+
+Where the ground around a hole has visible texture, the texture continues (`trainer.fill.ground`,
+`trainer.fill.texture`). Elsewhere, and without the extra `fill`, the membrane closes the hole.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
 from scipy import ndimage
-from scipy.sparse import coo_matrix
-from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians, concatenate
 from progdf.quaternions import matrix_quats
 from progdf.rasterize.engines import render_depth
-from progdf.sh import rgb_to_sh0
-from trainer.views.view import View, render_colors, seen_colors
+from progdf.region import Region
+from progdf.sh import rgb_to_sh0, sh0_to_rgb
+from trainer.paint.discs import cover_pixels
+from trainer.paint.solve import ExpectedView, solve_colors
+from trainer.views.view import BACKGROUND, View, render_colors, render_view, seen_colors
+
+from .ground import REACH_PX, Ground, view_ground
+from .membrane import membrane
+from .texture import (
+    VISIBLE_CONTRAST,
+    area_to_fill,
+    can_continue_texture,
+    continue_texture,
+    texture_contrast,
+)
 
 _OPAQUE = 0.9  # alpha of an opaque boundary pixel; also the minimum share of such pixels in a boundary
 _MIN_REGION_WEIGHT = 0.05  # weight of the region in a removed pixel; its soft edge occludes too
@@ -38,8 +53,9 @@ _THICKNESS = 0.1  # thickness of a disc, as a share of its width
 _OPACITY_LOGIT = 5.0  # opacity logit of a disc
 _MIN_COSINE = 0.3  # limits the stretching of slanted discs
 _MIN_HOLE_SHARE = 0.01  # share of the region's pixels; smaller holes are irregularities of the boundary
+_FLAT_SHARE = 0.1  # maximum color error of one disc of a texture, as a share of the texture's contrast
+_CLAMP_PX = 3  # pixels; a disc takes no color beyond those of the texture in this window
 _MAX_VIEWS = 12  # maximum number of views whose holes become discs
-_REACH_PX = 4.0  # maximum distance of a point from a surface that still belongs to it
 
 
 Front = tuple[Camera, Tensor, Tensor]
@@ -69,6 +85,7 @@ class Fill:
     views: int  # number of views with discs
     before: int  # pixels of holes in all views
     after: int  # remaining pixels of holes in all views
+    notes: tuple[str, ...] = ()  # lines for the log
 
 
 def fill_holes(
@@ -77,6 +94,8 @@ def fill_holes(
     views: Sequence[View],
     pictures: Mapping[str, Tensor] | None = None,
     close: bool = True,
+    is_textured: bool = False,
+    depths: Sequence[Tensor] | None = None,
 ) -> Fill:
     """Close the holes of a removal.
 
@@ -88,32 +107,97 @@ def fill_holes(
         pictures: by view name, pictures of the finished edit, whose colors the discs take instead of those of
             the boundary. [H,W,3]
         close: False only counts the holes
+        is_textured: continue the texture of the ground where it is visible
+        depths: `visible_depth` of the scene in each view, if it is known. [H,W] each
     """
     picture_colors = pictures or {}
-    seen = [(view.camera, _visible_depth(scene, view.camera), view.mask > 0.5) for view in views]
+    if depths is None:
+        depths = [visible_depth(scene, view.camera) for view in views]
+    seen = [(view.camera, depth, view.mask > 0.5) for view, depth in zip(views, depths, strict=True)]
     holes = [find_hole(rest, view, seen) for view in views]
     before = sum(hole.pixels for hole in holes)
     filled = rest
     discs = list[Gaussians]()
+    notes = list[str]()
     min_pixels = [_MIN_HOLE_SHARE * float((view.mask > _MIN_REGION_WEIGHT).sum()) for view in views]
     open_views = {i for i, hole in enumerate(holes) if close and hole.pixels > min_pixels[i]}
     while open_views and len(discs) < _MAX_VIEWS:
         # views with a given picture come first, as their colors are known
         best = max(open_views, key=lambda i: (views[i].camera.name in picture_colors, holes[i].pixels, -i))
-        rows = place_discs(holes[best], rest, picture_colors.get(views[best].camera.name, holes[best].colors))
-        trial = concatenate([filled, rows])
-        pairs = zip(views, holes, strict=True)
-        closed = [find_hole(trial, view, seen) if old.pixels else old for view, old in pairs]
-        gain = sum(hole.pixels for hole in holes) - sum(hole.pixels for hole in closed)
+        picture = picture_colors.get(views[best].camera.name)
+        attempts = list[Gaussians]()
+        if is_textured and picture is None:
+            textured, note = _textured_discs(filled, holes[best], seen)
+            notes += [note] if note else []
+            attempts += [] if textured is None else [textured]
+        attempts.append(place_discs(holes[best], rest, holes[best].colors if picture is None else picture))
         open_views.discard(best)
-        # discs off the surface open as many pixels in other views as they close
-        if 2 * gain > holes[best].pixels:
-            discs.append(rows)
-            filled = trial
-            holes = closed
-            open_views = {i for i in open_views if holes[i].pixels > min_pixels[i]}
+        for rows in attempts:
+            trial = concatenate([filled, rows])
+            pairs = zip(views, holes, strict=True)
+            closed = [find_hole(trial, view, seen) if old.pixels else old for view, old in pairs]
+            gain = sum(hole.pixels for hole in holes) - sum(hole.pixels for hole in closed)
+            # discs off the surface open as many pixels in other views as they close
+            if 2 * gain > holes[best].pixels:
+                discs.append(rows)
+                filled = trial
+                holes = closed
+                open_views = {i for i in open_views if holes[i].pixels > min_pixels[i]}
+                break
     after = sum(hole.pixels for hole in holes)
-    return Fill(concatenate(discs) if discs else None, len(discs), before, after)
+    return Fill(concatenate(discs) if discs else None, len(discs), before, after, tuple(notes))
+
+
+def _textured_discs(rest: Gaussians, hole: Hole, seen: Sequence[Front]) -> tuple[Gaussians | None, str]:
+    """Return discs that continue the texture around a hole, and a line for the log.
+
+    There are none if the ground has no visible texture, if too little of it is visible, or without the extra
+    `fill`.
+    """
+    unseen = partial(_unseen, seen=seen, own=hole.camera)
+    ground = view_ground(rest, hole.camera, hole.mask, hole.inverse_depth, unseen)
+    if ground is None:
+        return None, ""
+    contrast = texture_contrast(ground.image, ground.hole, ground.known)
+    height, width = ground.hole.shape
+    about = f"ground around the hole: {ground.name}, texture contrast {contrast:.3f} in OKLab"
+    if contrast < VISIBLE_CONTRAST:
+        return None, f"{about} (not visible below {VISIBLE_CONTRAST}): filled smoothly"
+    if ground.known.sum() < ground.hole.sum():
+        return None, f"{about}: filled smoothly, as less of the ground is visible than is missing"
+    if not can_continue_texture():
+        return None, f"{about}: filled smoothly; pip install 'progdf-studio[fill]' continues the texture"
+    picture = continue_texture(ground.image, ground.hole, ground.known)
+    rows = _lay_texture(ground, picture, _FLAT_SHARE * contrast)
+    return rows, f"{about}: continued over {int(ground.hole.sum())} of {width}x{height} pixels"
+
+
+def _lay_texture(ground: Ground, picture: Tensor, flat: float) -> Gaussians:
+    """Return discs that show the continued texture, with the colors that reproduce it.
+
+    Args:
+        ground: see `Ground`
+        picture: its texture with the hole filled. [H,W,3]
+        flat: maximum root mean square color error of one disc, 0 to 1
+    """
+    eye = ground.camera
+    area = area_to_fill(ground.hole, ground.known)
+    mask = torch.from_numpy(area)
+    discs = cover_pixels(ground.rows, ground.surface, picture, area, flat)
+    around = render_view(ground.rows, eye, torch.tensor(BACKGROUND))
+    expected = torch.where(mask[..., None], picture, around)
+    view = ExpectedView(eye, 0.0, expected, mask, mask)
+    nothing = torch.zeros(0)
+    solved = solve_colors(ground.rows, nothing.long(), discs, [view], nothing)[1]
+    # discs at the edge are partly hidden, so their solution may exceed the colors of the texture
+    places = solved.means @ eye.viewmat[:3, :3].T + eye.viewmat[:3, 3]
+    columns, rows = (places @ eye.K.T / places[:, 2:])[:, :2].long().unbind(1)
+    at = rows.clamp(0, eye.height - 1), columns.clamp(0, eye.width - 1)
+    window = (_CLAMP_PX, _CLAMP_PX, 1)
+    low = torch.from_numpy(ndimage.minimum_filter(picture.numpy(), window))[at]
+    high = torch.from_numpy(ndimage.maximum_filter(picture.numpy(), window))[at]
+    colors = sh0_to_rgb(solved.sh0).clamp(low, high)
+    return replace(solved, sh0=rgb_to_sh0(colors))
 
 
 def find_hole(rest: Gaussians, view: View, seen: Sequence[Front]) -> Hole:
@@ -158,43 +242,6 @@ def _closed_pieces(unknown: Tensor, alpha: Tensor) -> Tensor:
         is_open = bool((alpha[window].numpy()[piece] < 0.5).any())
         closed[number] = is_open and bool(boundary.any()) and opaque[window][boundary].mean() > _OPAQUE
     return torch.from_numpy(closed[pieces])
-
-
-def membrane(values: Tensor, unknown: Tensor) -> Tensor:
-    """Continue values into unknown pixels smoothly: each becomes the mean of its four neighbors.
-
-    Args:
-        values: [H,W,C]
-        unknown: [H,W] bool; values are constant across the picture's edge
-
-    Returns:
-        [H,W,C]; known values are unchanged
-    """
-    mask = unknown.numpy()
-    known = values.double().numpy()
-    index = np.full(mask.shape, -1)
-    index[mask] = np.arange(mask.sum())
-    count = int(mask.sum())
-    # pixels without a connection to known ones become 0, as no view shows their surface
-    diagonal = np.full(count, 1e-9)
-    right = np.zeros((count, known.shape[2]))
-    rows = []
-    columns = []
-    for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
-        neighbor = np.roll(index, step, axis)
-        inside = np.ones(mask.shape, bool)
-        inside[(0 if step > 0 else -1,) if axis == 0 else (slice(None), 0 if step > 0 else -1)] = False
-        pixels = mask & inside
-        diagonal[index[pixels]] += 1
-        right[index[pixels & (neighbor < 0)]] += np.roll(known, step, axis)[pixels & (neighbor < 0)]
-        rows.append(index[pixels & (neighbor >= 0)])
-        columns.append(neighbor[pixels & (neighbor >= 0)])
-    i = np.concatenate([*rows, np.arange(count)])
-    j = np.concatenate([*columns, np.arange(count)])
-    entries = np.concatenate([-np.ones(len(i) - count), diagonal])
-    result = known.copy()
-    result[mask] = splu(coo_matrix((entries, (i, j)), (count, count)).tocsc()).solve(right)
-    return torch.from_numpy(result).to(values.dtype)
 
 
 def place_discs(hole: Hole, like: Gaussians, colors: Tensor) -> Gaussians:
@@ -272,7 +319,16 @@ def _split_squares(mask: Tensor, colors: Tensor) -> Tensor:
     return torch.tensor(parts, dtype=torch.int64).reshape(-1, 3)
 
 
-def _visible_depth(scene: Gaussians, camera: Camera) -> Tensor:
+def region_weight(scene: Gaussians, region: Region, camera: Camera) -> Tensor:
+    """Return the blended weight of the region in a view, see `View.mask`. [H,W]"""
+    member = torch.zeros(len(scene), 1)
+    member[region.members] = 1.0
+    weights = member.expand(-1, 3).contiguous()
+    return render_colors(scene, weights, camera, torch.zeros(3))[..., 0].clamp(0.0, 1.0)
+
+
+def visible_depth(scene: Gaussians, camera: Camera) -> Tensor:
+    """Return the depth of the visible surface, camera z; infinite without one. [H,W]"""
     with torch.no_grad():
         drawn = render_depth(scene, camera)
     return drawn.depth.masked_fill(drawn.alpha <= 0.5, torch.inf)
@@ -295,7 +351,7 @@ def _unseen(points: Tensor, seen: Sequence[Front], own: Camera) -> Tensor:
     from whose pixels the points were made: the tolerance is in its pixels.
     """
     unseen = torch.ones(len(points), dtype=torch.bool)
-    reach = _REACH_PX * (points - own.position.double()).norm(dim=1) / float(own.K[0, 0])
+    reach = REACH_PX * (points - own.position.double()).norm(dim=1) / float(own.K[0, 0])
     for camera, front, region in seen:
         camera_points = points @ camera.viewmat[:3, :3].double().T + camera.viewmat[:3, 3].double()
         x, y, w = (camera_points @ camera.K.double().T).unbind(1)

@@ -1,0 +1,1 @@
+"""Filling of the holes that a removed region leaves: smooth patches, or texture that continues."""
