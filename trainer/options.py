@@ -197,7 +197,7 @@ class TrainOptions:
 
     scene: tyro.conf.Positional[Path]
     """Scene: .ply (also compressed), .spz, .splat, .ksplat, .sog, .glb or .gltf."""
-    out: Path
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder of the run; created if needed."""
     region: RegionOptions
     editor: EditorOptions
@@ -357,7 +357,7 @@ class WriteViewsOptions:
 
     scene: tyro.conf.Positional[Path]
     """Scene: .ply (also compressed), .spz, .splat, .ksplat, .sog, .glb or .gltf."""
-    out: Path
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for original/NAME.png and cameras.json."""
     cameras: Annotated[Path | None, absent_option("PATH", "a rig around the scene")] = None
     """cameras.json, transforms.json or COLMAP folder; without it, a rig around the scene."""
@@ -379,7 +379,7 @@ class BatchOptions:
 
     catalogue: tyro.conf.Positional[Path]
     """TOML: [defaults], [[scenes]] with a path, [[scenes.edits]] with a name, [sweep]; see docs/cli.md."""
-    out: Path
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder of the batch: runs in OUT/SCENE/NAME/, summary in OUT/batch.html and batch.csv."""
     workers: int = 0
     """Parallel jobs (0: as many as the cores allow); more than 1 needs Ray, progdf-studio[cluster]."""
