@@ -141,6 +141,7 @@ class Composer:
         self._bases = [
             {name: _Bases.of(bases) for name, bases in gdf.field.attributes.items()} for gdf in extended
         ]
+        self._leaves_paint = [gdf.anchors is not None and gdf.anchors.leaves_paint for gdf in extended]
         moving = {name for bases in self._bases for name in bases}
         self._covers = covers
         followers = find_followers(extended, len(scene))
@@ -193,6 +194,8 @@ class Composer:
         plan = self._plan(changed)
         # weights are summed by kind of change, so that a change reaches all attributes of its kinds
         kinds = {KINDS[name] for edit in changed for name in self._bases[edit]}
+        if any(self._leaves_paint[edit] for edit in changed):  # Gaussians return from below their paint
+            kinds = set(KINDS.values())
         moving = {name for edit in plan.colors.parts for name in self._bases[edit] if KINDS[name] in kinds}
         names = tuple(name for name in self._before if name in moving)
         arranged = () if self._paint is None else self._paint.names(changed, plan.arranged)
@@ -353,14 +356,15 @@ class Composer:
                 add_offsets(total, selection, stored, used, factors, scale, hidden, covered)
             weight_sum = weight_sums.get(KINDS[name], _NO_VALUES)
             if pushing:
-                total = self._add_pushes(total, pushing, name, weight_sum)
+                kept = _kept_pushes(parts, len(rows))
+                total = self._add_pushes(total, pushing, name, weight_sum, kept)
                 weight_sum = _NO_VALUES
             moved = write_rows(after, self._before[name], rows, total, weight_sum, name == "means")
             largest = max(largest, moved)
         return largest
 
     def _add_pushes(
-        self, total: Floats, parts: Sequence[_LayerSlice], name: str, weight_sum: Floats
+        self, total: Floats, parts: Sequence[_LayerSlice], name: str, weight_sum: Floats, kept: Floats
     ) -> Floats:
         """Return the blended sums and the largest change by paint. [U,c]
 
@@ -369,22 +373,25 @@ class Composer:
             parts: members of layers that push them, lowest layer first
             name: attribute
             weight_sum: divisors of the sums; [0] if all are 1. [U]
+            kept: share of the changes by paint that remains; [0] if all do. [U]
         """
         if len(weight_sum):
             total /= weight_sum[:, None]
         largest = np.full(total.shape, -0.0, np.float32)
+        is_direct = len(parts) == 1 and not len(kept)  # a single push is the largest one
         for part in parts:
-            # a single push is the largest one
-            push = total if len(parts) == 1 else np.full(total.shape, -0.0, np.float32)
+            push = total if is_direct else np.full(total.shape, -0.0, np.float32)
             bases = self._bases[part.edit][name]
             used, factors = bases.factors(part.segment)
             selection = part.at, part.members, part.weights
             stored = (bases.end, bases.residual)
             scale = np.float32(part.layer.gain(name))
             add_offsets(push, selection, stored, used, factors, scale, np.float32(0.0), _NO_VALUES)
-            if push is not total:
+            if not is_direct:
                 keep_larger(largest, push)
-        if len(parts) > 1:
+        if len(kept):
+            largest *= kept[:, None]
+        if not is_direct:
             total += largest
         return total
 
@@ -478,6 +485,21 @@ def _between(part: _LayerSlice, first: int, last: int) -> _LayerSlice:
     if (first, begin, end) == (0, 0, len(part.at)):
         return part
     return part._replace(members=part.members[begin:end], at=part.at[begin:end] - first)
+
+
+def _kept_pushes(parts: Sequence[_LayerSlice], count: int) -> Floats:
+    """Return the share of the changes by paint that remains in each row, see `changed_rows`.
+
+    Empty if all do. [U]
+    """
+    leaving = [part for part in parts if part.layer.leaves_paint]
+    if not leaving:
+        return _NO_VALUES
+    kept = np.ones(count, np.float32)
+    for part in leaving:
+        weights = part.weights[part.members] if len(part.weights) else np.float32(1.0)
+        kept[part.at] *= np.float32(1.0) - weights * np.float32(part.layer.clamped_strength)
+    return kept
 
 
 def _weight_sum(parts: Sequence[_LayerSlice], kind: str, count: int) -> Floats:

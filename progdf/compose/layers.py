@@ -77,6 +77,11 @@ class Layer:
         return NOTHING if self.gdf.anchors is None else self.gdf.anchors.pushes
 
     @property
+    def leaves_paint(self) -> bool:
+        """True if the paint of other edits stays behind, see `Anchors.leaves_paint`."""
+        return self.gdf.anchors is not None and self.gdf.anchors.leaves_paint
+
+    @property
     def blended_kinds(self) -> frozenset[str]:
         """Kinds of change that take part in the blend rule."""
         return self.kinds - self.pushed_kinds

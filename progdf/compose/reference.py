@@ -158,7 +158,8 @@ def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "norm
       stripes stay dark.
 
     Paint makes way for its discs by changes of the scene's Gaussians (see `Anchors.pushes`). These take no
-    part in the rule. The largest such change of a Gaussian is added to the result of the other layers.
+    part in the rule. The largest such change of a Gaussian is added to the result of the other layers. It
+    vanishes by the strength of a layer that moves or removes the Gaussian without its paint.
 
     A layer of paint covers the layers of paint below it, see `progdf.compose.overlap`. Added rows follow the
     surface below them when other layers move, scale or fade it, see `progdf.compose.follow`.
@@ -327,7 +328,7 @@ def changed_rows(
             total = total / weight_sums[KINDS[name]].clamp(min=1.0)[:, None]
         pushing = [part for part in movers if part.pushes(name)]
         if pushing:
-            total = total + _largest_push(pushing, name, total)
+            total = total + _largest_push(pushing, name, total) * _kept_pushes(parts, len(rows))
         changed[name] = old[rows] + total.reshape(-1, *old.shape[1:]).to(old.dtype)
     return rows, changed
 
@@ -380,6 +381,18 @@ def _largest_push(parts: Sequence[_LayerMembers], name: str, total: Tensor) -> T
         is_larger = push.square().sum(dim=1) >= below.square().sum(dim=1)
         largest[part.rows] = torch.where(is_larger[:, None], push, below)
     return largest
+
+
+def _kept_pushes(parts: Sequence[_LayerMembers], count: int) -> Tensor:
+    """Return the share of the changes by paint that remains in each row. [U,1]
+
+    Rows that are moved or removed without their paint return to their own state, by the strength of this.
+    """
+    kept = torch.ones(count)
+    for part in parts:
+        if part.layer.leaves_paint:
+            kept[part.rows] *= 1 - part.weights * torch.tensor(part.layer.clamped_strength)
+    return kept[:, None]
 
 
 def _adjusted_colors(scene: Gaussians, rows: Tensor, parts: Sequence[_LayerMembers]) -> dict[str, Tensor]:

@@ -445,6 +445,7 @@ def _edit(
         "name": gdf.name,
         "recorded": list(gdf.field.recorded),
         "pushes": [] if gdf.anchors is None else sorted(gdf.anchors.pushes),
+        "leaves_paint": gdf.anchors is not None and gdf.anchors.leaves_paint,
         "knots": _numbers(gdf.field.knots),
         "attributes": {
             name: _bases(arrays, name, bases, order, widths.get(name, bases.end_offset.shape[1]), exact)

@@ -78,4 +78,14 @@ def test_object_moved_without_its_paint_leaves_it_in_place(painted: PaintedBox) 
     alone = compose_layers(painted.scene, [Layer(painted.paint)])
     both = compose_layers(painted.scene, [Layer(painted.paint), Layer(move)])
     assert torch.equal(both.means[count:], alone.means[count:])
-    assert not torch.equal(both.means[:count], alone.means[:count])
+    moved = compose_layers(painted.scene, [Layer(move)])
+    for name in ("means", "logit_opacities", "sh0"):
+        error = getattr(both, name)[:count] - getattr(moved, name)[:count]
+        assert float(error.abs().max()) < 1e-5, "the object has its own surface again"
+    composer = Composer(painted.scene, [painted.paint, move])
+    for strength in (1.0, 0.4, 0.0, 0.7):
+        layers = [Layer(painted.paint, 0.8), Layer(move, strength)]
+        composer.update(layers)
+        expected = compose_layers(painted.scene, layers)
+        for name in ("means", "log_scales", "logit_opacities", "sh0"):
+            assert torch.allclose(getattr(composer.gaussians, name), getattr(expected, name), atol=1e-5)

@@ -23,6 +23,7 @@ from progdf.compose.reference import compose_layers
 from progdf.field.baked import GradeForm, SliderRemap, identity_map, lattice_colors
 from progdf.field.grade import bake_grade
 from progdf.gaussians import ATTRIBUTES, Gaussians, pack
+from progdf.gdf.anchors import free_anchors
 from progdf.gdf.file import Gdf, anchor_added, load_gdf, save_gdf
 from progdf.rasterize import render
 from tests.helpers.draws import Draws
@@ -137,6 +138,13 @@ def graded(scene: Gaussians, name: str, degree: int, seed: int) -> Gdf:
     return edit_of(scene, rows, bake_grade(form, pack(scene[rows], True)), name)
 
 
+def leaving_paint(scene: Gaussians) -> Gdf:
+    """Return an edit that moves Gaussians without their paint."""
+    rows = some_rows(scene, 200, 8)
+    edit = edit_of(scene, rows, curved_field(200, 8, 14 + 3 * len(scene.shN[0])), "leaves")
+    return replace(edit, anchors=replace(free_anchors(0), leaves_paint=True))
+
+
 def document_of(scene: Gaussians, gdfs: Sequence[Gdf]) -> tuple[Document, ViewState]:
     layers = tuple(LayerState(i, gdf.name) for i, gdf in enumerate(gdfs))
     return Document("scene.ply", scene, tuple(gdfs)), ViewState(camera=first_camera(scene), layers=layers)
@@ -178,6 +186,7 @@ def test_page_computes_every_attribute_like_compose_for_every_rule(
         rimmed(painted(scene, 20, 9), 1),
         rimmed(painted(scene, 40, 12, "heart"), 2),
         anchor_added(growing(scene, some_rows(scene, 40, 6), 15, 6, "grown"), scene),
+        leaving_paint(scene),
     ]
     document, view = document_of(scene, gdfs)
     write_page(tmp_path / "page.html", document, view, (), PageOptions(quality="exact"))

@@ -29,6 +29,7 @@ class Edit {
     }
     this.kinds = new Set(Object.keys(record.attributes).map((name) => KINDS[name]));
     this.pushes = new Set(record.pushes);  // kinds of change that make way for paint
+    this.leavesPaint = record.leaves_paint;  // it moves or removes rows without their paint
     this.coverage = {};
     for (const [kind, part] of Object.entries(record.coverage ?? {})) this.coverage[kind] = container.real(part);
     this.grade = record.grade && {
@@ -80,14 +81,10 @@ export class Composer {
     }
     const known = this.edits.map(() => 0);  // members of the previous segments
     let first = 0, most = 0;
-    this.surface = header.surface
-      ? new Surface(
-        header.surface, container, new Composer(container.within(header.surface)),
-        Math.sqrt(header.sh + 1) - 1, header.sphere[1],
-      ) : null;
-    const { paint } = header;
-    this.paint = paint
-      ? new PaintOrder(paint, container, paint.tints && new Composer(container.within(paint.tints))) : null;
+    const states = header.surface && new Composer(container.within(header.surface));
+    this.surface = states && new Surface(header.surface, container, states, Math.sqrt(header.sh + 1) - 1, this.sphere[1]);
+    const tints = header.paint?.tints && new Composer(container.within(header.paint.tints));
+    this.paint = header.paint ? new PaintOrder(header.paint, container, tints) : null;
     const following = Array.from({ length: this.surface?.count ?? 0 }, (_, f) => f);
     this.segments = header.segments.map(([rows, edits]) => {
       const followers = following.filter((f) => this.surface.row(f) >= first && this.surface.row(f) < first + rows);
@@ -156,8 +153,7 @@ export class Composer {
     for (const name of names) {
       const kind = KINDS[name];
       if (shares && !(kind in sums)) sums[kind] = this.#divisors(segment, stack, kind);
-      const divisors = sums[kind];
-      const width = this.widths[name], total = totals[name];
+      const divisors = sums[kind], width = this.widths[name], total = totals[name];
       const before = this.before[name].subarray(first * width, (first + rows) * width);
       if (divisors) for (let j = 0; j < total.length; j++) total[j] /= divisors[Math.floor(j / width)];
       this.#push(segment, stack, name, total);
@@ -186,6 +182,11 @@ export class Composer {
         }
         if (now >= before) for (let j = i * width; j < (i + 1) * width; j++) largest[j] = offsets[j];
       }
+    }
+    for (const layer of stack.filter(({ edit }) => this.edits[edit].leavesPaint)) {
+      const held = clampedStrength(layer), member = segment.members[layer.edit];
+      const weight = (j) => layer.weights?.[member + Math.floor(j / width)] ?? 1;
+      for (let j = 0; j < total.length; j++) largest[j] *= 1 - held * weight(j);
     }
     for (let j = 0; j < total.length; j++) total[j] += largest[j];
   }
@@ -263,8 +264,7 @@ export class Composer {
 
   // Returns max(1, Σ m s) over the layers with this kind of change; null if it is 1 everywhere.
   #divisors({ rows, members }, all, kind) {
-    const blends = ({ kinds, pushes }) => kinds.has(kind) && !pushes.has(kind);
-    const stack = all.filter((layer) => blends(this.edits[layer.edit]));
+    const stack = all.filter(({ edit }) => this.edits[edit].kinds.has(kind) && !this.edits[edit].pushes.has(kind));
     if (stack.reduce((sum, layer) => sum + Math.min(layer.strength, 1), 0) <= 1 - 1e-6) return null;
     const sums = new Float32Array(rows);
     for (const layer of stack) {
