@@ -29,7 +29,7 @@ from viewer.camera.decal_warp import (
 )
 from viewer.camera.view_camera import axes
 from viewer.render.decal_surfaces import DecalSurfaces, unhidden_frame
-from viewer.state.transient import Decal, DecalGhost, DecalGrip
+from viewer.state.transient import Decal, DecalGhost, DecalGrip, Transient
 from viewer.ui import overlay
 from viewer.ui.context import PALETTE, u32
 from viewer.ui.pointer import PointerContext
@@ -63,19 +63,42 @@ def is_decal(path: Path) -> bool:
     return bool(isinstance(low, int) and isinstance(high, int) and low < 255 and high > 0)
 
 
-def load_decal(context: moderngl.Context, path: Path) -> Decal:
-    """Load a picture as a decal.
+class DecalTextures:
+    """Pictures of decals as GL textures.
 
-    Raises:
-        ProgdfError: it cannot be read.
+    Args:
+        context: the GL context of the textures
     """
-    picture = open_picture(path).convert("RGBA")
-    picture.thumbnail((_MAX_TEXTURE_PX, _MAX_TEXTURE_PX))
-    pixels = np.asarray(picture)
-    texture = context.texture(picture.size, 4, pixels.tobytes(), alignment=1)
-    texture.build_mipmaps()
-    texture.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
-    return Decal(path, int(texture.glo), picture.size, pixels[..., 3] > 255 * _MIN_ALPHA)
+
+    def __init__(self, context: moderngl.Context) -> None:
+        self._context = context
+        self._textures: dict[int, moderngl.Texture] = {}  # by GL name
+
+    def __len__(self) -> int:
+        return len(self._textures)
+
+    def load(self, path: Path) -> Decal:
+        """Load a picture as a decal.
+
+        Raises:
+            ProgdfError: it cannot be read.
+        """
+        picture = open_picture(path).convert("RGBA")
+        picture.thumbnail((_MAX_TEXTURE_PX, _MAX_TEXTURE_PX))
+        pixels = np.asarray(picture)
+        texture = self._context.texture(picture.size, 4, pixels.tobytes(), alignment=1)
+        texture.build_mipmaps()
+        texture.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
+        self._textures[int(texture.glo)] = texture
+        return Decal(path, int(texture.glo), picture.size, pixels[..., 3] > 255 * _MIN_ALPHA)
+
+    def keep(self, transient: Transient) -> None:
+        """Free the textures of decals that are neither placed nor trained any more."""
+        used = {ghost.texture for ghost in transient.ghosts if isinstance(ghost, DecalGhost)}
+        if isinstance(transient.gizmo, Decal):
+            used.add(transient.gizmo.texture)
+        for name in self._textures.keys() - used:
+            self._textures.pop(name).release()
 
 
 def draw_decal(
@@ -155,9 +178,11 @@ def decal_takes_mouse(decal: Decal, pointer: PointerContext) -> bool:
     return bool(decal.grip) or (_is_over(pointer) and _grip_under(decal, pointer) != "")
 
 
-def draw_ghost(ghost: DecalGhost, pointer: PointerContext) -> None:
-    """Draw a decal that is being trained."""
-    draw_mesh(ghost.texture, ghost.mesh, pointer)
+def draw_ghosts(transient: Transient, pointer: PointerContext) -> None:
+    """Draw the decals that are being trained."""
+    for ghost in transient.ghosts:
+        if isinstance(ghost, DecalGhost):
+            draw_mesh(ghost.texture, ghost.mesh, pointer)
 
 
 def draw_mesh(texture: int, mesh: DecalMesh, pointer: PointerContext) -> None:

@@ -29,7 +29,7 @@ from viewer.state import actions, layer_selection, timeline, workspace
 from viewer.state.commands import Action, Plain, WithValue
 from viewer.state.layers import add_layer
 from viewer.state.snapshots import SliderSnapshot, compare_sides
-from viewer.state.transient import Decal, DecalGhost, Gizmo, KeyPointer, MouseTool, PreviewState
+from viewer.state.transient import Decal, Gizmo, KeyPointer, MouseTool, PreviewState
 from viewer.state.view_state import LayerState, ViewState
 from viewer.state.workspace import PLACES, SceneFacts, Store, Workspace, with_transient
 from viewer.ui import overlay
@@ -50,7 +50,7 @@ from viewer.ui.pointer import PointerContext
 
 from . import color_tool, interface, mouse, select_tool
 from .canvas import Canvas, LayersOf, RememberView, forget_view, no_layers
-from .decal import REST_S, DecalPlace, decal_takes_mouse, draw_decal, draw_ghost, place_decal
+from .decal import REST_S, DecalPlace, decal_takes_mouse, draw_decal, draw_ghosts, place_decal
 from .handles import draw_gizmo, gizmo_takes_mouse
 from .messages import Messages
 
@@ -407,25 +407,24 @@ class MainView:
 
     def _move_gizmo(self) -> bool:
         """Move the handles or the decal with the mouse; return True if they take the mouse."""
-        for ghost in self.work.transient.ghosts:
-            if isinstance(ghost, DecalGhost):
-                draw_ghost(ghost, self._pointer())
         gizmo = self.work.transient.gizmo
+        pressed = [press.chord for press in self._keys.pressed]
+        moved: Gizmo | Decal | None = gizmo
+        asked = ""
+        takes_mouse = False
+        with self._guard():  # Escape also leaves handles that cannot be drawn
+            draw_ghosts(self.work.transient, self._pointer())
+            if isinstance(gizmo, Gizmo):
+                moved, asked = draw_gizmo(gizmo, self._pointer())
+                takes_mouse = gizmo_takes_mouse(moved)
+            elif gizmo is not None:
+                moved, asked = draw_decal(gizmo, self._pointer(), self.decal_surfaces, "Enter" in pressed)
+                takes_mouse = decal_takes_mouse(moved, self._pointer())
         if gizmo is None:
             return False
-        pressed = [press.chord for press in self._keys.pressed]
-        moved: Gizmo | Decal
-        if isinstance(gizmo, Gizmo):
-            keep = "keep_placed"
-            moved, asked = draw_gizmo(gizmo, self._pointer())
-            takes_mouse = gizmo_takes_mouse(moved)
-        else:
-            keep = "lay_decal" if gizmo.placed else ""
-            moved, asked = draw_decal(gizmo, self._pointer(), self.decal_surfaces, "Enter" in pressed)
-            takes_mouse = decal_takes_mouse(moved, self._pointer())
         self.store.replace(with_transient(self.work, gizmo=moved))
         if "Escape" in pressed or "Enter" in pressed:
-            asked = "put_back" if "Escape" in pressed else keep
+            asked = "put_back" if "Escape" in pressed else gizmo.enter_request
         if asked:
             self.messages.request(Plain(asked))
         if isinstance(moved, Gizmo) and moved.using:

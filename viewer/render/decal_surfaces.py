@@ -28,6 +28,7 @@ from .picking import run_in_background
 _T = TypeVar("_T")
 
 _DISTANCES = (1.0, 0.5, 0.25)  # tried distances of the projecting camera, shares of the viewer's
+_MAX_SIDE_PX = 512  # longer side of the decal in its camera's picture, as in training
 _TRIAL_PX = 64  # longer side of the picture that shows what hides a decal
 
 
@@ -37,6 +38,24 @@ class LaidDecal:
 
     surface: PaintSurface
     mesh: DecalMesh
+
+
+@dataclass(frozen=True, eq=False)
+class _Inputs:
+    """Inputs of a computation. Scene and pixels are compared by identity, as they never change."""
+
+    scene: Gaussians
+    opaque: Mask | None
+    others: tuple[object, ...]
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, _Inputs):
+            return NotImplemented
+        same = self.scene is other.scene and self.opaque is other.opaque
+        return same and self.others == other.others
+
+    def __hash__(self) -> int:
+        return hash(self.others)
 
 
 class _Latest(Generic[_T]):
@@ -110,7 +129,8 @@ class DecalSurfaces:
             camera: camera of the picture
             at_once: wait for it
         """
-        key = (camera.viewmat.numpy().tobytes(), camera.K.numpy().tobytes(), camera.width, camera.height)
+        lens = camera.viewmat.numpy().tobytes(), camera.K.numpy().tobytes()
+        key = _Inputs(scene, None, (*lens, camera.width, camera.height))
         if not self._depth.has(key):
             self._laid.drop()  # the pointer must not wait for it
 
@@ -133,13 +153,14 @@ class DecalSurfaces:
         """
 
         def make() -> LaidDecal:
-            camera = replace(decal_camera(frame, shape)[0], near=near_plane)
+            small = replace(frame, pixel=max(frame.pixel, frame.size / _MAX_SIDE_PX))
+            camera = replace(decal_camera(small, shape)[0], near=near_plane)
             center = (camera.width / 2, camera.height / 2)
-            near = near_surface(depth_picture(scene, camera), *center, frame.size_px)
-            surface = find_surface(scene, camera, near & painted_pixels(frame, camera, opaque))
+            near = near_surface(depth_picture(scene, camera), *center, small.size_px)
+            surface = find_surface(scene, camera, near & painted_pixels(small, camera, opaque))
             return LaidDecal(surface, warp_on_surface(frame, shape, surface, near))
 
-        return self._laid.get(frame, make)
+        return self._laid.get(_Inputs(scene, opaque, (frame, shape, near_plane)), make)
 
     @property
     def is_busy(self) -> bool:

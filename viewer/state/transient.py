@@ -57,6 +57,11 @@ class Gizmo:
         """True if the selection has been moved, rotated or scaled."""
         return not np.allclose(self.matrix, np.eye(4), atol=1e-9)
 
+    @property
+    def enter_request(self) -> str:
+        """Name of the request that Enter makes."""
+        return "keep_placed"
+
 
 DecalGrip = Literal["", "move", "scale", "rotate"]
 
@@ -80,6 +85,11 @@ class Decal:
     grip: DecalGrip = ""  # handle that the mouse drags
     laid_for: object = field(default=None, compare=False)  # camera and placement of the mesh
     laid_at: float = field(default=0.0, compare=False)  # when the mesh was laid, on the window's clock
+
+    @property
+    def enter_request(self) -> str:
+        """Name of the request that Enter makes; "" before the decal is placed."""
+        return "lay_decal" if self.placed else ""
 
 
 @dataclass(frozen=True)

@@ -12,15 +12,18 @@ import pytest
 from imgui_bundle import imgui
 from PIL import Image
 
+from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.io.cameras import load_cameras
+from progdf.threads import StoppedError
 from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from trainer.editors.decal import parse_place
 from viewer.app.app import App
-from viewer.app.decal import decal_corners, is_decal, load_decal, outline
+from viewer.app.decal import DecalTextures, decal_corners, is_decal, outline
 from viewer.jobs.training import EditOrder
+from viewer.render.decal_surfaces import DecalSurfaces
 from viewer.state.commands import Plain
 from viewer.state.transient import Decal
 from viewer.state.workspace import with_transient
@@ -62,7 +65,7 @@ def middle(hand: Rig) -> tuple[float, float]:
 def rig_with(logo: Path) -> Iterator[Rig]:
     """Open the bear with the decal at the pointer, in the middle of the picture."""
     with rig(first_view(bear())) as hand:
-        decal = load_decal(hand.main_view.context, logo)
+        decal = DecalTextures(hand.main_view.context).load(logo)
         hand.main_view.store.replace(with_transient(hand.main_view.work, gizmo=decal))
         hand.move(*middle(hand))
         at_once(hand)
@@ -193,6 +196,54 @@ def test_ghost_stays_until_its_run_ends(app: App, logo: Path, monkeypatch: pytes
     app.parts.jobs.queue.jobs = ()
     app.parts.jobs.poll()
     assert app.main_view.work.transient.ghosts == ()
+
+
+def test_texture_of_a_decal_is_freed_with_it(app: App, logo: Path) -> None:
+    pictures = app.parts.pictures
+    app.parts.file_actions.open(logo)
+    pictures.poll()
+    assert len(pictures.decals) == 1
+    app.main_view.store.replace(with_transient(app.main_view.work, gizmo=None))
+    pictures.poll()
+    assert len(pictures.decals) == 0
+
+
+def test_escape_leaves_a_decal_that_cannot_be_drawn(
+    app: App, logo: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise ProgdfError("no surface")
+
+    app.parts.file_actions.open(logo)
+    monkeypatch.setattr("viewer.app.main_view.draw_decal", fail)
+    app.draw()
+    assert in_hand(app)
+    press(app, "Escape")
+    app.draw()
+    assert app.main_view.work.transient.gizmo is None
+
+
+def test_surface_is_found_once_per_decal_in_a_bounded_picture(
+    logo: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sides = []
+
+    def find(_: object, camera: Camera, painted: object) -> None:
+        sides.append(max(camera.width, camera.height))
+        raise StoppedError
+
+    monkeypatch.setattr("viewer.render.decal_surfaces.find_surface", find)
+    monkeypatch.setattr("viewer.render.decal_surfaces.run_in_background", lambda work, *given: work(*given))
+    with rig_with(logo) as hand:
+        decal = shown(hand)
+        assert decal.frame is not None
+        frame = replace(decal.frame, pixel=decal.frame.size / 6000.0)
+        scene = bear().scene
+        surfaces = DecalSurfaces()
+        for opaque in (decal.opaque, decal.opaque, decal.opaque.copy()):
+            surfaces.laid(scene, frame, decal.texture_size, opaque, 0.01)
+    assert len(sides) == 2
+    assert max(sides) < 900
 
 
 def test_decal_off_the_surface_is_refused(app: App, logo: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
-from viewer.app.decal import load_decal
+from viewer.app.decal import DecalTextures
 from viewer.state.commands import Plain
 from viewer.state.transient import Decal
 from viewer.state.view_state import SelectTool
@@ -118,7 +118,7 @@ def test_decal_is_placed_by_keys(tmp_path: Path) -> None:
     with rig(first_view(bear()), WINDOW) as hand:
         hand.main_view.store.replace(
             with_transient(
-                hand.main_view.work, gizmo=load_decal(hand.main_view.context, tmp_path / "logo.png")
+                hand.main_view.work, gizmo=DecalTextures(hand.main_view.context).load(tmp_path / "logo.png")
             )
         )
         for chord in WAY:

@@ -57,7 +57,7 @@ class WindowParts:
     @property
     def polls(self) -> tuple[Callable[[], float | None], ...]:
         """Functions that poll a part and return the seconds until the next poll, None for never."""
-        parts = (self.jobs, self.painting, self.preview, self.start, self.strays)
+        parts = (self.jobs, self.painting, self.pictures, self.preview, self.start, self.strays)
         return (
             *(part.poll for part in parts),
             self.file_actions.poll_dialog,

@@ -21,7 +21,7 @@ from progdf.io.picture_camera import (
 )
 from progdf.scene.match_views import view_thumbnail
 from progdf.scene.taken_views import FoundView, TakenView, find_view, remember_view, taken_views
-from viewer.app.decal import is_decal, load_decal
+from viewer.app.decal import DecalTextures, is_decal
 from viewer.app.messages import Messages, Requests, WaitFor
 from viewer.camera.view_camera import ViewCamera, from_camera, to_camera
 from viewer.files import exports
@@ -59,7 +59,8 @@ class PictureActions:
         self._store = store
         self._documents = documents
         self._messages = messages
-        self._context = context
+        self.decals = DecalTextures(context)
+        """Textures of decals."""
         self._picture_size = picture_size
         self._original = original
         self._wait_for = wait_for
@@ -70,6 +71,10 @@ class PictureActions:
     def requests(self) -> Requests:
         """Handlers of the answers to "Is it this view?", by name. `use_view` names the picture."""
         return {"use_view": lambda _: self._use_view(), "keep_view": lambda _: self._keep_view()}
+
+    def poll(self) -> None:
+        """Free the textures of decals that are no longer on screen."""
+        self.decals.keep(self._store.get().transient)
 
     def remember(
         self, image: Pixels, camera: Camera, edits: Sequence[str], layers: PictureLayers | None
@@ -95,7 +100,7 @@ class PictureActions:
             ProgdfError: see `edit_picture`.
         """
         if is_decal(path) and self._documents.get().path is not None:
-            decal = load_decal(self._context, path)
+            decal = self.decals.load(path)
             self._store.replace(with_transient(self._store.get(), gizmo=decal))
             self._store.wake()
         else:
