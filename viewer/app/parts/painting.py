@@ -43,6 +43,8 @@ class PaintingActions:
         self._documents = documents
         self._messages = messages
         self._queue = queue
+        # paint in training and its scene, also of scenes that are not open, see `poll`
+        self._pending: list[tuple[Path | None, PendingPaint]] = []
 
     @property
     def requests(self) -> Requests:
@@ -74,8 +76,9 @@ class PaintingActions:
         )
         self._queue.add(order)
         view = replace(work.view, painted=(), color_brush=replace(work.view.color_brush, tool=""))
-        pending = (*work.transient.pending, PendingPaint(out, painted))
-        self._store.replace(with_transient(work, pending=pending))
+        paint = PendingPaint(out, painted)
+        self._pending.append((self._documents.get().path, paint))
+        self._store.replace(with_transient(work, pending=(*work.transient.pending, paint)))
         self._store.change(view)
         self._messages.show(f"Making {out.name}; the paint stays on screen until its layer is ready")
 
@@ -95,22 +98,27 @@ class PaintingActions:
         return files
 
     def poll(self) -> float | None:
-        """Remove paint whose layer is ready, and return paint whose run has failed or was discarded."""
-        pending = self._store.get().transient.pending
-        if not pending:
+        """Remove paint whose layer is ready, and return paint whose run has failed or was discarded.
+
+        Paint of a scene that is not open is kept for it.
+        """
+        if not self._pending:
             return None
+        scene = self._documents.get().path
         status = {job.task.out: job.status for job in self._queue.jobs}
-        left = list[PendingPaint]()
-        for paint in pending:
+        left = list[tuple[Path | None, PendingPaint]]()
+        for its_scene, paint in self._pending:
             now = status.get(paint.out)
             if now is None and not _is_trained(paint.out):
                 now = "failed"
-            if now == "failed":
+            if now == "failed" and its_scene == scene:
                 self._put_back(paint)
             elif now not in (None, "done"):
-                left.append(paint)
-        if len(left) < len(pending):
-            self._store.replace(with_transient(self._store.get(), pending=tuple(left)))
+                left.append((its_scene, paint))
+        self._pending = left
+        shown = tuple(paint for its_scene, paint in left if its_scene == scene)
+        if shown != self._store.get().transient.pending:
+            self._store.replace(with_transient(self._store.get(), pending=shown))
             self._store.wake()
         return POLL_S if left else None
 
