@@ -98,7 +98,7 @@ def fit_footprint(picture: DepthPicture, column: float, row: float, radius_px: f
     )
     thickness_px = float(np.median(picture.thickness[rows, columns])) * focal / near
     plane = fit_planes(samples)
-    model, error_px = _simplest_model(samples, plane, max(thickness_px, 1.0))
+    model, error_px = simplest_model(samples, plane, max(thickness_px, 1.0))
     x = np.array([(column - K[0, 2]) / K[0, 0]])
     y = np.array([(row - K[1, 2]) / K[1, 1]])
     inverse = float(model.inverse_depth(x, y)[0])
@@ -147,8 +147,14 @@ def _mean_plane(samples: Samples) -> Array:
     return np.asarray(np.linalg.lstsq(terms, samples.inverse, rcond=None)[0], np.float64)
 
 
-def _simplest_model(samples: Samples, plane: Planes, thickness_px: float) -> tuple[SurfaceModel, float]:
-    """Return the first model that fits, and the robust deviation of the samples from it in pixels."""
+def simplest_model(samples: Samples, plane: Planes, thickness_px: float) -> tuple[SurfaceModel, float]:
+    """Return the first model that fits, and the robust deviation of the samples from it in pixels.
+
+    Args:
+        samples: points of the surface, at least `MIN_SAMPLES`
+        plane: their plane, see `fit_planes`
+        thickness_px: standard deviation of the depths of the light within a pixel, pixels
+    """
     models: list[SurfaceModel] = [plane]
     if mean_distance(samples, plane) > thickness_px:
         models = [fit_quadric(samples), fit_edge(samples)]

@@ -24,6 +24,7 @@ from progdf.painting.projection import (
     draw_points,
     paint_points,
     project_coverage,
+    quick_surface,
     thin_points,
 )
 from progdf.painting.strokes import (
@@ -117,7 +118,8 @@ class FittedSurfaces:
 
     def __init__(self) -> None:
         self._known: OrderedDict[tuple[object, PaintedPicture], ViewSurface] = OrderedDict()
-        self._recent: dict[tuple[ViewCamera, Size], ViewSurface] = {}  # the last model in each view
+        # the last model in each view, and its paint
+        self._recent: dict[tuple[ViewCamera, Size], tuple[PaintedPicture, ViewSurface]] = {}
         self._requested: object = None  # key of the model in preparation
         self._stop = threading.Event()
         self.is_busy = False
@@ -136,9 +138,10 @@ class FittedSurfaces:
     def recent(self, picture: PaintedPicture) -> ViewSurface | None:
         """Return the last model in the view of a picture, whatever the strengths and the strokes were.
 
-        Beside the paint that it was made for, it has the smoothed depth of the view.
+        Paint that is not among these strokes lies on its quick model, see `quick_surface`.
         """
-        return self._recent.get((picture.camera, picture.size))
+        recent = self._recent.get((picture.camera, picture.size))
+        return None if recent is None else quick_under(picture, recent[1], recent[0])
 
     def request(self, scene: object, picture: PaintedPicture, make: Callable[[], ViewSurface]) -> None:
         """Compute a model in another thread, in place of the one in preparation."""
@@ -169,7 +172,9 @@ class FittedSurfaces:
                     while len(self._known) > _MAX_SURFACES:
                         self._known.popitem(last=False)
                     known = list(self._known.items())
-                    self._recent = {(picture.camera, picture.size): one for (_, picture), one in known}
+                    self._recent = {
+                        (picture.camera, picture.size): (picture, one) for (_, picture), one in known
+                    }
                     self.count += 1
         finally:
             if key == self._requested:
@@ -361,6 +366,23 @@ def _points(picture: PaintedPicture, surface: ViewSurface, coarse: bool = False)
     if coarse:
         return thin_points(_points(picture, surface))
     return paint_points(pixels_of(picture), surface)
+
+
+@lru_cache(maxsize=_MAX_SURFACES)
+def quick_under(
+    picture: PaintedPicture, seen: ViewSurface, known: PaintedPicture | None = None
+) -> ViewSurface:
+    """Return the surface of a view with quick models under a painted picture, see `quick_surface`.
+
+    Args:
+        picture: the paint
+        seen: surface of its view
+        known: part of the paint for which the surface already has the model
+    """
+    painted = pixels_of(picture)[..., 3] > 0
+    if known is not None:
+        painted &= pixels_of(known)[..., 3] == 0
+    return quick_surface(seen, painted)
 
 
 def surface_key(scene: object, camera: Camera) -> object:

@@ -17,7 +17,7 @@ from progdf.painting.projection import ViewSurface, fitted_surface, is_apart, vi
 from progdf.scene.selection import Surface
 from viewer.camera.view_camera import ViewCamera, half_camera, half_scale, to_camera
 from viewer.render.engine import ViewEngine
-from viewer.render.paint_overlay import PaintOverlay, pixels_of, surface_key
+from viewer.render.paint_overlay import PaintOverlay, pixels_of, quick_under, surface_key
 from viewer.render.picking import PREPARE_MIN_GAUSSIANS, Surfaces, run_in_background
 from viewer.state.layers import is_visible
 from viewer.state.selection import EMPTY_MASK, unpack
@@ -121,18 +121,21 @@ class PointerContext:
     def paint_surface(self, picture: PaintedPicture) -> ViewSurface:
         """Return the surface under a painted picture.
 
-        This is its model, or that of earlier strokes in its view, or else the view's depth.
+        This is its model, or that of earlier strokes in its view. Until it is computed, it is a quick model.
         """
         fitted = self.paint.fits.get(self.scene_key, picture)
         if fitted is None and not self.shown.layers:  # no strength has changed the surface
             fitted = self.paint.fits.recent(picture)
-        return fitted or self.view_surface(picture.camera, picture.size)
+        return fitted or quick_under(picture, self.view_surface(picture.camera, picture.size))
 
     def recent_surface(self, picture: PaintedPicture) -> ViewSurface:
         """Return that surface, or the last known one, which takes no time during motion."""
         view = to_camera(picture.camera, *picture.size)
-        recent = self.paint.fits.recent(picture) or self.paint.surfaces.recent(surface_key(None, view))
-        return recent or self.view_surface(picture.camera, picture.size)
+        fitted = self.paint.fits.recent(picture)
+        if fitted is not None:
+            return fitted
+        seen = self.paint.surfaces.recent(surface_key(None, view))
+        return quick_under(picture, seen or self.view_surface(picture.camera, picture.size))
 
     def fit_paint(self) -> None:
         """Compute the model of the surface under a painted picture in another thread, if one is missing."""
