@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 from imgui_bundle import imgui
+from numpy.typing import NDArray
 
 from progdf.painting.strokes import (
     BrushTip,
@@ -33,6 +35,8 @@ from viewer.state.workspace import Workspace, with_message, with_tool, with_tran
 from viewer.ui.context import PALETTE, UiContext, u32
 from viewer.ui.keys import shortcut
 from viewer.ui.pointer import PointerContext
+
+_Number = TypeVar("_Number", np.uint8, np.float32)
 
 COLOR_DRAG = "color"
 """Name of the left drag while the color brush or the clone stamp is active, in addition to `keys.DRAGS`."""
@@ -68,6 +72,7 @@ def press(work: Workspace, pointer: PointerContext) -> Workspace:
     surface = pointer.view_surface(camera, pointer.size)
     own = next((one for one in view.painted if is_in_view(one, camera, pointer.size)), None)
     before = np.zeros((pointer.size[1], pointer.size[0], 4), np.uint8) if own is None else pixels_of(own)
+    reachable = surface.opacity
     colors: Floats | None = np.array(view.color_brush.color, np.float32)
     if view.color_brush.erases:
         colors = None
@@ -76,8 +81,11 @@ def press(work: Workspace, pointer: PointerContext) -> Workspace:
         if offset is None:
             text = "Cannot paint: the source of the clone stamp is not in this view; Alt+click a new one"
             return with_message(work, text, pointer.now, error=True)
-        colors = _colors_at(picture_with_paint(work, pointer), offset)
-    stroke = begin_stroke(before, surface.opacity, colors)
+        copied = shift_picture(picture_with_paint(work, pointer), offset)
+        colors = copied.astype(np.float32) / np.float32(255.0)
+        # the background is not copied onto the surface
+        reachable = reachable * shift_picture(surface.opacity, offset)
+    stroke = begin_stroke(before, reachable, colors)
     drag = ColorDrag(stroke, camera, pointer.size, surface)
     return follow(with_transient(work, tool=MouseTool(COLOR_DRAG, coloring=drag)), pointer)
 
@@ -182,13 +190,16 @@ def _project(source: CloneSource, pointer: PointerContext) -> Point | None:
     return at if 0.0 <= at[0] < camera.width and 0.0 <= at[1] < camera.height else None
 
 
-def _colors_at(picture: Pixels, offset: Point) -> Floats:
-    """Return the colors at an offset from each pixel; outside the picture, those of its border. [H,W,3]"""
-    height, width = picture.shape[:2]
-    rows = (np.arange(height) + int(offset[1])).clip(0, height - 1)
-    columns = (np.arange(width) + int(offset[0])).clip(0, width - 1)
-    colors: Floats = picture[rows][:, columns].astype(np.float32) / np.float32(255.0)
-    return colors
+def shift_picture(values: NDArray[_Number], offset: Point) -> NDArray[_Number]:
+    """Return the values at an offset from each pixel; 0 outside the picture. [H,W,…]"""
+    height, width = values.shape[:2]
+    rows = np.arange(height) + int(offset[1])
+    columns = np.arange(width) + int(offset[0])
+    in_rows = (rows >= 0) & (rows < height)
+    in_columns = (columns >= 0) & (columns < width)
+    result = np.zeros_like(values)
+    result[np.ix_(in_rows, in_columns)] = values[np.ix_(rows[in_rows], columns[in_columns])]
+    return result
 
 
 def draw(work: Workspace, pointer: PointerContext) -> None:

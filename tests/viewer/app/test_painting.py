@@ -18,8 +18,10 @@ from progdf.formats.scene_file import save_scene
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import save_gdf
 from progdf.io.picture_camera import find_picture_camera, layers_in_picture
-from progdf.painting.projection import fitted_surface, view_surface
+from progdf.painting.projection import fitted_surface, quick_surface, view_surface
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
+from tests.trainer.painted_wall import CAMERA as WALL_CAMERA
+from tests.trainer.painted_wall import wall
 from viewer.app.messages import Messages
 from viewer.app.parts.painting import PaintingActions
 from viewer.camera.view_camera import ViewCamera, to_camera
@@ -32,9 +34,9 @@ from viewer.render.engine import ViewEngine
 from viewer.render.paint_overlay import _fit_worker, packed_picture, pixels_of
 from viewer.state.actions import perform
 from viewer.state.commands import Plain
-from viewer.state.transient import PendingPaint
+from viewer.state.transient import CloneSource, PendingPaint
 from viewer.state.view_state import ColorBrush, LayerState, PaintedPicture, ViewState
-from viewer.state.workspace import JobStatus, Store, new_workspace, record_undo
+from viewer.state.workspace import JobStatus, Store, new_workspace, record_undo, with_transient
 
 START = (170.0, 260.0)
 END = (230.0, 260.0)
@@ -185,6 +187,22 @@ def test_clone_stamp_copies_from_its_source() -> None:
         assert np.abs(pixels[260, 210, :3].astype(int) - copied).max() <= 2
 
 
+def test_clone_stamp_copies_no_background() -> None:
+    with rig(painting(ColorBrush("clone", radius=10.0, hardness=1.0))) as hand:
+        work = hand.main_view.work
+        camera = to_camera(work.view.camera, *hand.main_view.picture_size)
+        K = camera.K.double().numpy()
+        ray = np.array([(20.0 - K[0, 2]) / K[0, 0], (150.0 - K[1, 2]) / K[1, 1], 1.0])
+        beside = camera.c2w.double().numpy() @ np.array([*(3.0 * ray), 1.0])
+        source = CloneSource((float(beside[0]), float(beside[1]), float(beside[2])))
+        hand.main_view.store.replace(with_transient(work, clone=source))
+        hand.drag((200.0, 260.0), (210.0, 260.0))
+        assert painted(hand) == ()
+        message = hand.main_view.work.message
+        assert message is not None
+        assert message.text.startswith("Nothing was painted")
+
+
 def test_comparison_refuses_strokes(hand: Rig) -> None:
     hand.key("Y")
     hand.drag(START, END)
@@ -245,6 +263,7 @@ class Easel:
     part: PaintingActions
     store: Store
     jobs: Jobs
+    documents: DocumentStore
 
     @property
     def pending(self) -> tuple[PendingPaint, ...]:
@@ -276,7 +295,7 @@ def make_easel(folder: Path, layers: tuple[LayerState, ...] = ()) -> Easel:
         messages=Messages(store, lambda: 0.0),
         queue=cast(JobQueue, jobs),
     )
-    return Easel(part, store, jobs)
+    return Easel(part, store, jobs, documents)
 
 
 def test_done_writes_the_paint_with_its_cameras_and_queues_a_run(easel: Easel) -> None:
@@ -338,10 +357,37 @@ def test_paint_of_a_failed_or_discarded_run_comes_back(easel: Easel, status: Job
     assert not easel.pending
 
 
+def test_failed_paint_waits_for_its_scene(easel: Easel) -> None:
+    before = easel.store.get().view.painted
+    own = easel.documents.get()
+    easel.part.requests["finish_paint"](None)
+    easel.documents.replace(replace(own, path=own.file.with_name("other.ply")))
+    easel.store.replace(with_transient(easel.store.get(), pending=()))
+    easel.jobs.end("failed")
+    easel.part.poll()
+    assert easel.store.get().view.painted == ()
+    assert easel.pending == ()
+    easel.documents.replace(own)
+    easel.part.poll()
+    assert easel.store.get().view.painted == before
+
+
 def test_done_without_paint_is_refused(easel: Easel) -> None:
     easel.store.change(replace(easel.store.get().view, painted=()))
     with pytest.raises(ProgdfError, match="nothing is painted"):
         easel.part.requests["finish_paint"](None)
+
+
+def test_quick_surface_is_near_the_model_and_smoother_than_the_depth() -> None:
+    scene = wall()
+    seen = view_surface(scene, WALL_CAMERA)
+    painted = np.zeros(seen.depth.shape, bool)
+    painted[40:90, 40:90] = True
+    focal = float(WALL_CAMERA.K[0, 0])
+    plain = fitted_surface(scene, seen, painted).depth[painted]
+    quick = quick_surface(seen, painted).depth[painted]
+    assert np.abs(quick / plain - 1.0).max() * focal < 1.0
+    assert np.abs(seen.depth[painted] / plain - 1.0).max() * focal > 1.5
 
 
 def test_session_keeps_paint(tmp_path: Path) -> None:
@@ -371,15 +417,18 @@ def test_model_of_the_surface_replaces_the_depth_of_a_view(hand: Rig) -> None:
     fits = view.paint.fits
     fits.drop()
     seen = pointer.view_surface(picture.camera, picture.size)
-    assert not pointer.paint_surface(picture).is_model
-    fits.request(pointer.scene_key, picture, lambda: replace(seen, is_model=True))
+    model = replace(seen, depth=1.01 * seen.depth, is_model=True)
+    quick = pointer.paint_surface(picture)
+    fits.request(pointer.scene_key, picture, lambda: model)
     _fit_worker().submit(int).result()
     assert not fits.is_busy
-    assert pointer.paint_surface(picture).is_model
-    later = replace(picture, pixels=b"later")
-    assert pointer.paint_surface(later).is_model, "until it has its own"
+    assert pointer.paint_surface(picture) is model
+    pixels = pixels_of(picture).copy()
+    pixels[300:310, 200:220] = 255
+    later = pointer.paint_surface(packed_picture(picture.camera, picture.size, pixels))
+    assert later.depth[260, 200] == model.depth[260, 200], "earlier strokes keep their model"
     fits.drop()
-    assert not pointer.paint_surface(picture).is_model
+    assert pointer.paint_surface(picture) is quick
 
 
 @pytest.mark.slow
