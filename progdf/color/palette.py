@@ -20,7 +20,7 @@ import torch
 from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
-from .oklab import oklab_to_srgb, srgb_to_oklab
+from .oklab import oklab_to_srgb, smoothstep, srgb_to_oklab
 from .shading import Shading, measure_shading, relight
 
 COLORS = 5
@@ -33,11 +33,12 @@ _KERNEL_WIDTH_SHARE = (
     0.5  # standard deviation of the kernel, as a share of the mean distance to the nearest source
 )
 _MIN_KERNEL_WIDTH = 0.04  # smallest standard deviation of the kernel
-_SINGLE_KERNEL_WIDTH = 0.045  # standard deviation of the kernel of a single gray source, in hue and chroma
+_SINGLE_KERNEL_WIDTH = 0.055  # standard deviation of the kernel of a single gray source, in hue and chroma
 _CHROMA_WIDTH_SHARE = 0.3  # addition to its square: that of this share of the source's chroma
 _SHADOW_WIDTH = 0.08  # standard deviation of this kernel in lightness, below the source's shading
 _SHADING_REACH = 0.16  # lightness below a single source within which its shading is measured
-_CAST_CHROMA = 0.03  # chroma that colored light gives a white surface
+_CAST_CHROMA = 0.04  # chroma that colored light gives a white surface
+_COLORED_CHROMA = 0.12  # chroma from which a surface is clearly colored
 _ITERATIONS = 20  # iterations of k-means
 _CELL_SIDE = 0.04  # side of the cells in which colors are counted
 _MIN_SHARE = 0.003  # smallest share of the visible area for a main color
@@ -205,11 +206,12 @@ def _paint_shift(colors: Tensor, source: Tensor, target: Tensor, shading: Shadin
 def _presence(colors: Tensor, own_ab: Tensor) -> Tensor:
     """Return the share of a surface's own color in colors, 0 to 1. OKLab [N,3], [N,2] -> [N]
 
-    A white highlight on a colored surface has none of it. On a white surface, every gray has all of it.
+    A white highlight on a colored surface has none of it. On a nearly white surface, every gray has all.
     """
-    floor = _CAST_CHROMA**2
-    share = ((colors[:, 1:] * own_ab).sum(dim=1) + floor) / (own_ab.square().sum(dim=1) + floor)
-    return share.clamp(0, 1)
+    energy = own_ab.square().sum(dim=1)
+    share = (colors[:, 1:] * own_ab).sum(dim=1) / energy.clamp_min(1e-6)
+    is_colored = smoothstep(energy.sqrt(), _CAST_CHROMA, _COLORED_CHROMA)
+    return 1.0 - is_colored * (1.0 - share.clamp(0, 1))
 
 
 def with_highlights(curve: Curve) -> Curve:

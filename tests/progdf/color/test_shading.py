@@ -69,6 +69,18 @@ def test_brightest_white_takes_the_color() -> None:
         assert brightest[1:].norm() > 0.75 * chroma
 
 
+def test_white_in_warm_and_cool_light_is_one_surface() -> None:
+    """The colored light of the scene does not split a white cloth into a recolored and a pale part."""
+    light = torch.linspace(0.75, 1.0, 200)[:, None]
+    warm = light * color.parse_color("#f8eedd")
+    cool = light * color.parse_color("#f0f2f8")
+    grade = color.ColorGrade(palette=((color.parse_color("#f8eedd"), TARGETS[0]),))
+    rgb = torch.cat([warm, cool])
+    lab = srgb_to_oklab(color.grade_fully(rgb, color.measure_grade(grade, rgb, torch.ones(400))))
+    chroma = lab[:, 1:].norm(dim=1)
+    assert chroma[200:].median() > 0.65 * chroma[:200].median()
+
+
 def test_highlights_of_a_dark_surface_stay_white() -> None:
     dark = surface("#202022", 0.1, 1)
     rgb = torch.cat([dark, torch.tensor([[1.0, 1.0, 1.0], [0.98, 0.98, 0.98]])])
