@@ -127,7 +127,7 @@ class TrainingViewOptions:
     views: int = 0
     """Number of edited views, 3 to 96, a fifth of them held out (0: 30; color edits 40 or 48)."""
     image_size: int = 0
-    """Longer side of the views in pixels, 32 to 2048 (0: 256; instruct 512)."""
+    """Longer side of the views in pixels, 32 to 2048 (0: by the region's detail; instruct 512)."""
     dense: Fixed[bool] = True  # more views for color edits, unless each is painted separately
     pictures: Fixed[tuple[Path, ...]] = ()  # changed pictures, whose cameras are the views, all to train on
     scene: Fixed[Path | None] = None  # scene file, beside which cameras may define the up axis

@@ -51,6 +51,18 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     return math.inf if error == 0 else -10 * math.log10(error)
 
 
+def edge_weights(image: Tensor) -> Tensor:
+    """Return the length of the color gradient at each pixel, by differences to the pixels left and above.
+
+    As weights of an error they emphasize outlines and letters, of which a mean over pixels shows little.
+    [H,W,3] -> [H,W]
+    """
+    squares = torch.zeros_like(image[..., 0])
+    squares[:, 1:] += image.diff(dim=1).square().sum(dim=2)
+    squares[1:] += image.diff(dim=0).square().sum(dim=2)
+    return squares.sqrt()
+
+
 def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     """Return the structural similarity (Wang et al. 2004) with an 11 px Gaussian window; differentiable.
 

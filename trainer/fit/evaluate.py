@@ -14,7 +14,7 @@ from torch import Tensor
 
 from progdf.field import BakedField
 from progdf.gaussians import Gaussians, pack
-from progdf.metrics.image import decibels, ssim
+from progdf.metrics.image import decibels, edge_weights, ssim
 from progdf.metrics.slider import Pictures
 from progdf.region import Region
 from trainer.optimize.losses import Perceptual
@@ -62,6 +62,18 @@ class Evaluator:
             error += float((a[pixels] - b[pixels]).double().square().sum())
             count += 3 * int(pixels.sum())
         return error / max(count, 1)
+
+    def edge_psnr(self, pictures: Sequence[Tensor], expected: Sequence[Tensor]) -> float:
+        """Return the PSNR over the evaluated pixels, weighted by the expected gradients, dB.
+
+        The same as `psnr` if the expected pictures have no edges.
+        """
+        error = total = 0.0
+        for a, b, pixels in zip(pictures, expected, self.pixels, strict=True):
+            weights = edge_weights(b)[pixels].double()
+            error += float(((a[pixels] - b[pixels]).double().square().mean(dim=1) * weights).sum())
+            total += float(weights.sum())
+        return decibels(error / total) if total else self.psnr(pictures, expected)
 
     def ssim(self, pictures: Sequence[Tensor], expected: Sequence[Tensor]) -> float:
         """Return the SSIM over the evaluated pixels of all views, at most 1."""

@@ -31,6 +31,7 @@ _MAX_UNEXPLAINED = 0.4  # midway between edits that agree and edits that do not,
 _MAX_UNEXPLAINED_FINE = 0.5  # calm styles leave up to 0.47, stripes of random phase 0.55 and more
 _MIN_CONTRAST = 0.8  # washed-out views agree, but have lost fine contrast
 _INVISIBLE_ERROR_DB = 28.0  # smaller errors are not visible, whatever their share of a faint change
+_COMPARED_BOX_PX = 70  # strokes of the same size on the region are the same share in larger views
 _CG_STEPS = 6  # steps of conjugate gradients
 DAMPING = 1e-3  # share of the first step's curvature; barely visible members keep their color
 
@@ -41,7 +42,7 @@ class Agreement:
 
     psnr: float  # PSNR of the best colors on held-out views, over pixels of the region or the change, dB
     unexplained: float  # share of the change's energy there that these colors do not reproduce, 0 is best
-    # the same share of the fine part, which varies within 9 pixels at half size
+    # the same share of the fine part, which varies within 9 pixels of the shrunk view
     unexplained_fine: float = 0.0
     # fine energy of the pictures relative to that before they were made to agree; 1 if they were not
     contrast: float = 1.0
@@ -187,8 +188,14 @@ def robust_colors(seen: Sequence[ViewChange], members: int) -> Tensor:
     return fit_colors([view.weigh(float(w)) for view, w in zip(seen, weights, strict=True)], members)
 
 
-def view_change(setup: TrainingSetup, view: View, edited: Tensor, shrink: int = 2) -> ViewChange:
-    """Return the change of a view at a fraction of its size. [H,W,3]"""
+def view_change(setup: TrainingSetup, view: View, edited: Tensor, shrink: int | None = None) -> ViewChange:
+    """Return the change of a view at a fraction of its size. [H,W,3]
+
+    `shrink`: divisor of the size; None: at least 2, and the box's longer side has about `_COMPARED_BOX_PX`
+    """
+    if shrink is None:
+        x0, y0, x1, y1 = view.box
+        shrink = max(2, round(max(x1 - x0, y1 - y0) / _COMPARED_BOX_PX))
     camera = view.camera.resize(max(1, view.camera.width // shrink), max(1, view.camera.height // shrink))
     scene, small, share = shrink_view(setup, view, edited, camera)
     counting = (share > 0.5).float()

@@ -148,6 +148,7 @@ class Measured:
     at_recordings: float  # worst PSNR of the field at the recordings, dB
     # "slider" and the compared baseline against the editor's pictures, at the editor's strengths
     editor: Mapping[str, ErrorCurve]
+    edge_psnr: float  # PSNR of the full edit at the edges of the editor's pictures, dB
     perceptual: str  # name of the perceptual distance
     clip: Direction  # see `Direction`
 
@@ -194,6 +195,7 @@ def measure(
         slider=slider,
         at_recordings=worst,
         editor=drawn,
+        edge_psnr=evaluator.edge_psnr(evaluator.course(shipped)(1.0), evaluator.edited[stages[-1][1]]),
         perceptual=perceptual.name,
         clip=clip,
     )
@@ -267,6 +269,7 @@ def figures(measured: Measured, endpoint_error: float, outside_change: float) ->
         },
         "edit": {
             "psnr_to_views": round(drawn.psnr[-1], 2),
+            "edge_psnr_to_views": round(measured.edge_psnr, 2),
             "ssim_to_views": _round4(drawn.ssim[-1]),
             "lpips_to_views": _round4(drawn.lpips[-1]),
             "perceptual": measured.perceptual,

@@ -334,7 +334,8 @@ def _write_run(
         folder.draft.unlink(missing_ok=True)
     edit = report["edit"]
     log.say(
-        f"{setup.judged_on}: {edit['psnr_to_views']} dB, {edit['perceptual']} {edit['lpips_to_views']}"
+        f"{setup.judged_on}: {edit['psnr_to_views']} dB, at edges {edit['edge_psnr_to_views']} dB, "
+        f"{edit['perceptual']} {edit['lpips_to_views']}"
         + "".join(
             f"; s={float(s):.3g} {e['psnr']} dB (2 keyframes {e['keyframes2']})"
             for s, e in report["between"].items()

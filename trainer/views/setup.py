@@ -32,6 +32,7 @@ from .choose import (
 )
 from .lower_layers import LowerLayers
 from .picture_cameras import picture_cameras
+from .size import SizeLimits, choose_view_size
 from .view import (
     BACKGROUND,
     INSIDE,
@@ -46,7 +47,15 @@ from .view import (
 )
 
 SIZE = 256
-"""Default longer side of the views, pixels."""
+"""Default longer side of the views of given cameras, pixels."""
+
+SIZE_LIMITS = {True: SizeLimits(160, 16_000), False: SizeLimits(SIZE, 32_000)}
+"""Limits of the views' size in a rig, for dense color edits and for others, whose steps draw single views.
+
+They bound the time of a run (docs/lab/experiments.md, Views).
+"""
+
+_SIZING_VIEWS = 5  # cameras of the rig in which the region's detail is measured
 
 SAMPLING = math.sqrt(2.0)
 """Sampling rate of the cameras of a color edit.
@@ -145,13 +154,19 @@ def make_training_setup(options: TrainingViewOptions, scene: Gaussians, region: 
 
     default_count = COLOR_VIEWS[scene.sh_degree > 1] if options.dense else VIEWS
     views = options.views or default_count
+    elevations = HALF_SPHERE if options.dense else ELEVATIONS
     size = options.image_size or SIZE
+    notes = [*found.notes, f"up is {up.name}, {up.reason}"]
+    if options.cameras is None and not options.image_size:
+        rig = with_near_plane(region_rig(scene, region, _SIZING_VIEWS, SIZE, up.direction, elevations), scene)
+        chosen = choose_view_size(scene, region, rig, SIZE_LIMITS[options.dense])
+        size = chosen.side
+        notes.append(chosen.line())
 
     def cameras_of(count: int) -> list[Camera]:
         if options.cameras is not None:
             fitted = [fit_size(camera, size) for camera in given]
         else:
-            elevations = HALF_SPHERE if options.dense else ELEVATIONS
             fitted = region_rig(scene, region, count, size, up.direction, elevations)
         if options.dense:
             fitted = [replace(camera, sampling=SAMPLING) for camera in fitted]
@@ -168,7 +183,6 @@ def make_training_setup(options: TrainingViewOptions, scene: Gaussians, region: 
     else:
         choice = choose_views(scene, region, cameras_of(views), views, background)
         train, held_out = split_views(choice, min(held_out_count, max(1, len(choice.views) // 5)))
-    notes = [*found.notes, f"up is {up.name}, {up.reason}"]
     if len(choice.views) < choice.offered:
         notes.append(choice.line())
     if any(view.camera.lens for view in choice.views):

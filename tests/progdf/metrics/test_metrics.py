@@ -18,7 +18,7 @@ from torch.nn.functional import avg_pool2d, interpolate
 
 from progdf.errors import ProgdfError
 from progdf.metrics import lpips
-from progdf.metrics.image import psnr, ssim
+from progdf.metrics.image import edge_weights, psnr, ssim
 from progdf.metrics.lpips import Lpips
 from progdf.metrics.slider import Pictures, slider_statistics, visible_change
 
@@ -48,6 +48,21 @@ def test_psnr_of_a_constant_error_is_its_size_in_decibels() -> None:
 
 def test_psnr_of_equal_pictures_is_infinite() -> None:
     assert psnr(picture(), picture()) == math.inf
+
+
+def test_edge_weights_find_errors_at_outlines() -> None:
+    image = torch.zeros(20, 30, 3)
+    image[:, 15:] = 1.0
+    weights = edge_weights(image)
+    assert weights.nonzero()[:, 1].unique().tolist() == [15]
+    assert float(weights.max()) == pytest.approx(math.sqrt(3))
+    at_edge = image.clone()
+    at_edge[:, 15] -= 0.1
+    beside = image.clone()
+    beside[:, 5] += 0.1
+    assert psnr(at_edge, image) == pytest.approx(psnr(beside, image))
+    assert psnr(at_edge, image, weights) == pytest.approx(20.0, abs=1e-4)
+    assert psnr(beside, image, weights) == math.inf
 
 
 def test_psnr_is_limited_to_the_mask() -> None:

@@ -169,7 +169,7 @@ def test_report_has_its_documented_keys(done: RunResult) -> None:
         "baselines": {"keyframes2", "keyframes4"},
         "slider": {"monotone", "uniformity", "largest_jump", "t50", "t90"},
         "between": {f"{s:g}" for s in done.report["trajectory"]["stages_at"][:-1]},
-        "edit": {"psnr_to_views", "lpips_to_views", "perceptual", "clip_direction"},
+        "edit": {"psnr_to_views", "edge_psnr_to_views", "lpips_to_views", "perceptual", "clip_direction"},
         "curves": {"against_trajectory", "against_editor", "change", "clip_direction"},
         "time": {"views", "edit", "optimize", "fit", "total"},
         "plan": {"scene", "editor", "optimize", "field"},

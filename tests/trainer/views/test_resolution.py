@@ -10,13 +10,21 @@ import torch
 
 from progdf.io.cameras import save_cameras
 from progdf.region import Region
+from progdf.scene.bounds import scene_sphere
 from progdf.scene.orbit_rig import orbit_rig
 from tests.helpers.demo_scenes import bear
 from tests.helpers.trained import quick_options, train, write_bear
 from trainer.options import EditorOptions, TrainingViewOptions
 from trainer.resolve import resolve
 from trainer.run.training import pixel_stride
-from trainer.views.setup import SAMPLING, SIZE, TrainingSetup, make_training_setup, render_thumbnails
+from trainer.views.setup import (
+    SAMPLING,
+    SIZE_LIMITS,
+    TrainingSetup,
+    make_training_setup,
+    render_thumbnails,
+)
+from trainer.views.size import MAX_SIDE_PX
 
 
 def setup_of(count: int = 400, bands: int = 3, **said: object) -> TrainingSetup:
@@ -31,8 +39,15 @@ def test_color_edit_gets_more_views_and_given_values_are_kept() -> None:
     assert [len(setup_of(dense=dense).train) for dense in (True, False)] == [34, 24]
     assert [len(setup_of(bands=bands).train) for bands in (0, 8)] == [34, 42]
     assert len(setup_of(views=7).train) == 6
-    sizes = [setup_of(views=5, image_size=size).train[0].camera.width for size in (0, 40)]
-    assert sizes == [SIZE, 40]
+    assert setup_of(views=5, image_size=40).train[0].camera.width == 40
+
+
+@pytest.mark.parametrize("dense", [True, False])
+def test_rig_has_the_chosen_size_and_names_it_in_the_notes(dense: bool) -> None:
+    setup = setup_of(views=5, dense=dense)
+    side = setup.train[0].camera.width
+    assert SIZE_LIMITS[dense].min_side <= side <= MAX_SIDE_PX
+    assert any(note.startswith(f"views of {side} pixels") for note in setup.notes)
 
 
 @pytest.mark.parametrize(("dense", "sampling"), [(True, SAMPLING), (False, 1.0)])
@@ -44,8 +59,9 @@ def test_color_edit_is_sampled_for_larger_pictures(dense: bool, sampling: float)
 @pytest.mark.parametrize(("dense", "lowest", "highest"), [(True, 0.0, 89.0), (False, 5.0, 60.0)])
 def test_color_edit_is_viewed_from_level_to_above(dense: bool, lowest: float, highest: float) -> None:
     setup = setup_of(views=60, dense=dense, up="+y")
-    ahead = torch.stack([view.camera.viewmat[2, :3] for view in setup.views])
-    rises = -ahead[:, 1].asin().rad2deg()
+    center, _ = scene_sphere(setup.scene)
+    back = torch.stack([view.camera.position - center for view in setup.views])
+    rises = torch.nn.functional.normalize(back, dim=1)[:, 1].asin().rad2deg()
     assert lowest - 0.1 <= float(rises.min()) <= lowest + 2.0
     # even in area; the highest of 60 views is at 80°
     assert highest - 10.0 <= float(rises.max()) <= highest + 0.1
@@ -104,7 +120,7 @@ def test_dense_views_are_only_for_solved_color_edits() -> None:
 
 
 @pytest.mark.parametrize(
-    ("members", "bands", "every"), [(4000, 0, 1), (1500, 0, 2), (500, 0, 4), (500, 3, 2)]
+    ("members", "bands", "every"), [(4000, 0, 1), (2000, 0, 2), (500, 0, 4), (700, 3, 2)]
 )
 def test_fewer_pixels_are_solved_if_many_show_each_number(members: int, bands: int, every: int) -> None:
     setup = setup_of(members, bands, views=5, image_size=160)
