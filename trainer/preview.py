@@ -2,13 +2,14 @@
 
     {"number": 3, "out": "3.png", "region": "all", "editor": "recolor:#3060d0", "strength": 0.7,
      "background": [1, 1, 1], "viewmat": [[…]], "K": [[…]], "width": 640, "height": 480}
-    {"number": 3, "error": "", "made": "grade", "note": "", "models": []}
+    {"number": 3, "error": "", "made": "grade", "note": "trains close to this", "near": "close", "models": []}
 
 If one color map can represent the edit, the answer is a grade, 3.gdf beside 3.png, for every strength and
 camera. Otherwise it is the editor's own picture of the view. The editor "grade" only requests the region's
-main colors. A request is skipped if a later one has arrived. `model` paints a prompt; another `seed` gives
-another painting. With `seed` -1 nothing is painted; `note` names the model and device, and `models` the
-models on this machine. The process ends when its input ends.
+main colors. If a picture's request has `estimate`, an answer "near" follows: it states how near the training
+will come to the picture. A request is skipped if a later one has arrived. `model` paints a prompt; another
+`seed` gives another painting. With `seed` -1 nothing is painted; `note` names the model and device, and
+`models` the models on this machine. The process ends when its input ends.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import queue
 import sys
 import tempfile
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -45,8 +46,29 @@ from trainer.editors.instruct import InstructEditor, instruct
 from trainer.fit.draft import DraftViews, draft_grade, draft_views
 from trainer.options import EditorOptions, RegionOptions, TrainingViewOptions
 from trainer.regions.from_pictures import RegionRequest, region_kinds
-from trainer.views.setup import render_thumbnails
+from trainer.report.agreement import measure_agreement
+from trainer.views.setup import make_training_setup, render_thumbnails
 from trainer.views.view import View, make_view, with_near_plane
+
+Nearness = Literal["", "close", "roughly", "far"]
+"""Expected difference of the trained edit from its preview; "" if it is not known."""
+
+NEAR_NOTES: Mapping[Nearness, str] = {
+    "": "",
+    "close": "trains close to this",
+    "roughly": "trains roughly like this",
+    "far": "will not look like this",
+}
+"""Notes in the form of a new edit."""
+
+CLOSE_DB = 28.0
+"""PSNR of the draft from which differences to the preview are hardly visible."""
+ROUGH_DB = 22.0
+"""PSNR of a draft of colors from which the trained edit resembles its preview."""
+
+# views in which the agreement of an editor is estimated, and their longer side in pixels
+_ESTIMATE_VIEWS = 8
+_ESTIMATE_SIDE_PX = 112
 
 _Row3 = tuple[float, float, float]
 _Row4 = tuple[float, float, float, float]
@@ -79,6 +101,7 @@ class PreviewRequest(msgspec.Struct, frozen=True):
     height: _Side
     model: str = ""
     seed: int = 0
+    estimate: bool = False  # also answer how near the training will come to a picture
 
 
 class PreviewAnswer(msgspec.Struct):
@@ -87,8 +110,9 @@ class PreviewAnswer(msgspec.Struct):
 
     number: int
     error: str = ""
-    made: Literal["picture", "grade", "note", "palette"] = "picture"
+    made: Literal["picture", "grade", "note", "palette", "near"] = "picture"
     note: str = ""
+    near: Nearness = ""  # for a grade and an estimate
     models: list[str] = msgspec.field(default_factory=list)
     follows: bool = False  # training on the prompt can follow this picture
     palette: list[str] = msgspec.field(default_factory=list)  # the region's main colors, #rrggbb
@@ -109,6 +133,7 @@ class Previewer:
         self._region = lru_cache(maxsize=4)(self._find_region)
         self._view = lru_cache(maxsize=2)(self._make_view)
         self._editor = lru_cache(maxsize=2)(self._make_editor)
+        self._nearness = lru_cache(maxsize=64)(self._estimate)
         self._draft: tuple[str, DraftViews | None] = "", None  # region of the last draft, and its views
 
     def grade(self, request: PreviewRequest) -> Gdf | None:
@@ -151,7 +176,9 @@ class Previewer:
             ProgdfError: invalid region or editor.
         """
         # cache key of region, background and camera
-        seen = msgspec.structs.replace(request, number=0, out="", editor="", strength=0.0, model="", seed=0)
+        seen = msgspec.structs.replace(
+            request, number=0, out="", editor="", strength=0.0, model="", seed=0, estimate=False
+        )
         view = self._view(seen)
         if not bool((view.mask > 0.0).any()):
             return view.image
@@ -159,6 +186,38 @@ class Previewer:
             request.editor, model=request.model, seed=max(0, request.seed), cache=self._cache
         )
         return self._editor(options, seen).edit(view, request.strength)
+
+    def nearness(self, request: PreviewRequest) -> Nearness:
+        """Estimate how near the training will come to the picture of an editor that paints views quickly.
+
+        It is the error of the best colors for a few small edited views (`measure_agreement`).
+
+        Raises:
+            ProgdfError: invalid region or editor.
+        """
+        row = editor_row(EditorOptions(request.editor))
+        if row.external or row.slow_strengths or row.run != "trained":
+            return ""
+        return self._nearness(request.region, request.editor)
+
+    def _estimate(self, spec: str, editor: str) -> Nearness:
+        region = self._region(spec)
+        size = TrainingViewOptions(
+            scene=self._path, views=_ESTIMATE_VIEWS, image_size=_ESTIMATE_SIDE_PX, dense=False
+        )
+        try:
+            setup = make_training_setup(size, self.scene, region)
+        except ProgdfError:  # a scene that surrounds its cameras has no rig
+            return ""
+        options = EditorOptions(editor)
+        glances = partial(render_thumbnails, size, self.scene, region)
+        painter = make_editor(options, self.scene, region, setup.views, glances)
+        edited = [painter.edit(view, 1.0) for view in setup.views]
+        count = len(setup.train)
+        found = measure_agreement(setup, edited[:count], edited[count:] or edited)
+        if found.psnr >= CLOSE_DB:
+            return "close"
+        return "roughly" if found.agree else "far"
 
     def note(self, request: PreviewRequest) -> str:
         """Return a note on the model that would paint a prompt, its device and its memory.
@@ -197,6 +256,13 @@ class Previewer:
         return make_editor(options, self.scene, region, [self._view(seen)], glances)
 
 
+def draft_nearness(psnr: float) -> Nearness:
+    """Return how near the training comes to a draft with this PSNR to the exact colors, dB."""
+    if psnr >= CLOSE_DB:
+        return "close"
+    return "roughly" if psnr >= ROUGH_DB else "far"
+
+
 def serve(argv: Sequence[str]) -> int:
     """Run `progdf preview`; return 0 at the end of its input. Raises ProgdfError for an invalid scene."""
     options = parse_options(PreviewOptions, argv, "progdf preview")
@@ -205,9 +271,18 @@ def serve(argv: Sequence[str]) -> int:
         lines: queue.SimpleQueue[str] = queue.SimpleQueue()
         threading.Thread(target=_read_lines, args=(lines,), daemon=True).start()
         while line := newest_line(lines):
-            sys.stdout.write(msgspec.json.encode(answer(previewer, line)).decode() + "\n")
-            sys.stdout.flush()
+            made = answer(previewer, line)
+            _write(made)
+            if made.made == "picture" and not made.error and lines.empty():
+                later = estimate(previewer, line)
+                if later is not None:
+                    _write(later)
     return 0
+
+
+def _write(made: PreviewAnswer) -> None:
+    sys.stdout.write(msgspec.json.encode(made).decode() + "\n")
+    sys.stdout.flush()
 
 
 def answer(previewer: Previewer, line: str) -> PreviewAnswer:
@@ -222,18 +297,31 @@ def answer(previewer: Previewer, line: str) -> PreviewAnswer:
         draft = previewer.grade(request)
         if draft is not None:
             save_gdf(Path(request.out).with_suffix(".gdf"), draft)
-            about = draft.report["draft"]
-            return PreviewAnswer(
-                request.number, made="grade", note=f"{about['psnr']:.0f} dB to the exact colors"
-            )
+            near = draft_nearness(draft.report["draft"]["psnr"])
+            return PreviewAnswer(request.number, made="grade", note=NEAR_NOTES[near], near=near)
         if request.seed < 0:
-            return PreviewAnswer(request.number, "", "note", previewer.note(request), models_here())
+            note = previewer.note(request)
+            return PreviewAnswer(request.number, made="note", note=note, models=models_here())
         write_image(Path(request.out), previewer.picture(request))
         return PreviewAnswer(request.number, follows=previewer.follows(request))
     except (ProgdfError, OSError) as error:
         # after a failed prompt the user can choose another model
         models = models_here() if request.editor.startswith("instruct:") else []
         return PreviewAnswer(request.number, " ".join(str(error).split()), models=models)
+
+
+def estimate(previewer: Previewer, line: str) -> PreviewAnswer | None:
+    """Return the answer that follows a picture; None if it is not requested or not known."""
+    request = msgspec.json.decode(line, type=PreviewRequest)
+    if not request.estimate:
+        return None
+    try:
+        near = previewer.nearness(request)
+    except ProgdfError:  # the preview itself reports the failure
+        return None
+    if not near:
+        return None
+    return PreviewAnswer(request.number, made="near", note=NEAR_NOTES[near], near=near)
 
 
 def _read_lines(lines: queue.SimpleQueue[str]) -> None:

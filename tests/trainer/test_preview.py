@@ -17,7 +17,7 @@ from progdf.gdf.file import load_gdf
 from progdf.io.images import read_picture
 from tests.helpers.demo_scenes import bear
 from tests.helpers.tiny_pipelines import tiny_instruct_pix2pix
-from trainer.preview import Previewer, answer, newest_line
+from trainer.preview import NEAR_NOTES, Previewer, answer, draft_nearness, estimate, newest_line
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_color_edit_is_answered_with_a_grade(scene: Path, tmp_path: Path) -> Non
         assert not (tmp_path / f"{number}.png").exists()
 
 
-def test_region_palette_is_returned_and_a_grade_reports_its_error(scene: Path, tmp_path: Path) -> None:
+def test_palette_is_returned_and_a_grade_states_how_near_it_trains(scene: Path, tmp_path: Path) -> None:
     previewer = Previewer(scene, tmp_path / "kept")
     response = answer(previewer, request(1, tmp_path, editor="grade"))
     assert (response.error, response.made) == ("", "palette")
@@ -72,7 +72,8 @@ def test_region_palette_is_returned_and_a_grade_reports_its_error(scene: Path, t
     spec = "grade:" + ",".join([f"{response.palette[0]}=#3060d0", *response.palette[1:]])
     graded = answer(previewer, request(2, tmp_path, editor=spec))
     assert (graded.error, graded.made) == ("", "grade")
-    assert graded.note.endswith("dB to the exact colors")
+    assert graded.near in ("close", "roughly", "far")
+    assert graded.note == NEAR_NOTES[graded.near]
     assert (
         "holds no Gaussian"
         in answer(previewer, request(3, tmp_path, editor="grade", region="sphere:99,99,99,1")).error
@@ -100,6 +101,23 @@ def test_painting_does_not_depend_on_the_window_background(scene: Path, tmp_path
         assert answer(Previewer(scene, kept), line).error == ""
         made.append((kept / "view.png").read_bytes())
     assert made[0] == made[1] == made[2]
+
+
+@pytest.mark.parametrize(("psnr", "near"), [(35.0, "close"), (25.0, "roughly"), (15.0, "far")])
+def test_larger_draft_error_is_stated_as_less_near(psnr: float, near: str) -> None:
+    assert draft_nearness(psnr) == near
+
+
+def test_estimate_follows_a_picture_if_requested(scene: Path, tmp_path: Path) -> None:
+    previewer = Previewer(scene, tmp_path / "kept")
+    stripes = {"editor": "stripes:#3060d0"}
+    assert estimate(previewer, request(1, tmp_path, **stripes)) is None
+    later = estimate(previewer, request(2, tmp_path, estimate=True, **stripes))
+    assert later is not None
+    assert (later.number, later.made, later.note) == (2, "near", NEAR_NOTES[later.near])
+    assert later.near in ("close", "roughly")  # the same stripes in every view
+    wrong = request(3, tmp_path, estimate=True, region="sphere:99,99,99,1", **stripes)
+    assert estimate(previewer, wrong) is None
 
 
 def test_failed_request_is_one_line_and_the_next_succeeds(scene: Path, tmp_path: Path) -> None:

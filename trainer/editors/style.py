@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -145,6 +146,7 @@ def style(given: EditorInput) -> StyleEditor:
     return StyleEditor(paint, recipe, PictureCache(given.options.cache), paper)
 
 
+@lru_cache(maxsize=4)  # a preview paints the same region from many cameras
 def paint_side(scene: Gaussians, region: Region) -> int:
     """Return the longer side at which a region is painted, pixels, from its visible detail.
 

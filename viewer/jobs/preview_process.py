@@ -36,6 +36,7 @@ class PreviewInputs:
     background: Vec3
     model: str = ""  # diffusion model, for a sentence
     seed: int = 0  # random seed, for a sentence; -1 asks only for the available models
+    estimate: bool = False  # also ask how near the training will come to a picture
 
     @property
     def of_all_views(self) -> tuple[str, str]:
@@ -56,8 +57,9 @@ class Preview:
     pixels: Any = None  # the picture. [H,W,3] uint8
     grade: Path | None = None
     error: str = ""
-    made: Literal["picture", "grade", "note", "palette"] = "picture"
-    note: str = ""  # description of the model for a sentence
+    made: Literal["picture", "grade", "note", "palette", "near"] = "picture"
+    note: str = ""  # description of the model for a sentence, or of `near`
+    near: str = ""  # expected difference of the trained edit: close, roughly or far; "" if not known
     models: tuple[str, ...] = ()  # models on this machine
     follows: bool = False  # the edit of a sentence can follow this picture
     palette: tuple[str, ...] = ()  # main colors of the region, #rrggbb
@@ -110,7 +112,7 @@ class PreviewChild:
             )
         try:
             answer = convert_json(decode_json(line), Preview)
-            if answer.error or answer.made in ("note", "palette"):
+            if answer.error or answer.made in ("note", "palette", "near"):
                 return replace(answer, error=without_commands(answer.error))
             if answer.made == "grade":
                 return replace(answer, grade=self._picture(answer.number).with_suffix(".gdf"))

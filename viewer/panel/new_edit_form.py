@@ -66,6 +66,9 @@ _GRADES = {
 }
 
 
+_NEAR_COLORS = {"close": PALETTE.success, "roughly": PALETTE.warning, "far": PALETTE.error}
+
+
 def draw(work: Workspace, count: int, ui: UiContext, actions: list[Action]) -> Workspace:
     """Draw the form if it is open. Tab moves through it, Ctrl+Enter trains, Escape closes it.
 
@@ -433,7 +436,10 @@ def _preview(form: NewEdit, preview: PreviewState, column: float, ui: UiContext)
     if form.preview and preview.failed:
         wrapped_text(preview.text, PALETTE.error)
     else:
-        small(preview.text or " ", PALETTE.dim)  # always one line, so that nothing below moves
+        # always one line, so that nothing below moves
+        small(preview.text or " ", _NEAR_COLORS.get(preview.near, PALETTE.dim))
+        if preview.near:
+            tip("Expected difference of the trained edit from this preview, measured on small views")
     return form
 
 

@@ -40,6 +40,7 @@ class PreviewState(NamedTuple):
     models: tuple[str, ...] = ()  # models installed on this machine
     sheet: int = 0  # GL name of the texture with the style previews of this view, see `SHEET_PX`
     styles: frozenset[int] = frozenset()  # styles available in it
+    near: str = ""  # expected difference of the trained edit: close, roughly or far; "" if not known
 
 
 @dataclass(frozen=True)

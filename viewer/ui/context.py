@@ -43,6 +43,7 @@ class Palette:
     accent: Rgba = _rgb(ACCENT)
     ink: Rgba = _rgb(0x14161A)  # text on the accent
     handle: Rgba = _rgb(0xF2F4F7)
+    success: Rgba = _rgb(0x7FC08A)
     error: Rgba = _rgb(0xF08674)
     warning: Rgba = _rgb(0xE0A44A)
     warning_dark: Rgba = _rgb(0x6E5632)

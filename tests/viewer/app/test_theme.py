@@ -16,7 +16,7 @@ TICK = 4.0
 PAIRS = (
     *[("text", ground, TEXT) for ground in (*GROUNDS, *FIELDS, "field_active", "chosen")],
     *[("dim", ground, TEXT) for ground in (*GROUNDS, "field")],
-    *[(color, ground, TEXT) for color in ("error", "warning") for ground in GROUNDS],
+    *[(color, ground, TEXT) for color in ("error", "warning", "success") for ground in GROUNDS],
     *[("handle", ground, TEXT) for ground in ("chosen", "field")],
     ("ink", "accent", TEXT),
     ("ink", "handle", TEXT),
@@ -60,6 +60,6 @@ def test_accent_is_the_only_color_besides_warnings() -> None:
     colored = {
         name
         for name, color in vars(PALETTE).items()
-        if max(color[:3]) - min(color[:3]) > 0.09 and not name.startswith(("warning", "error"))
+        if max(color[:3]) - min(color[:3]) > 0.09 and not name.startswith(("warning", "error", "success"))
     }
     assert colored == {"accent"}

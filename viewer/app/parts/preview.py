@@ -99,6 +99,7 @@ class PreviewActions:
         self._texture: moderngl.Texture | None = None
         self._sent: PreviewInputs | None = None
         self._number = 0  # number of the sent request
+        self._view_number = 0  # number of the last request for the view itself
         self._outstanding = False  # no answer to it yet
         self._seen: PreviewInputs | None = None  # request at the last poll
         self._seen_at = self._used_at = 0.0
@@ -321,7 +322,8 @@ class PreviewActions:
             _, camera, size = self._pose
             seed = form.asks - 1
             return PreviewInputs(region, form.spec, 1.0, camera, size, view.background, form.model, seed)
-        return PreviewInputs(region, form.spec, round(form.strength, 2), view.camera, size, view.background)
+        strength = round(form.strength, 2)
+        return PreviewInputs(region, form.spec, strength, view.camera, size, view.background, estimate=True)
 
     def _send(self, request: PreviewInputs, child: PreviewChild) -> None:
         work = self._store.get()
@@ -337,6 +339,7 @@ class PreviewActions:
             self._show(error_line(error), None, failed=True)
             return
         self._number = child.ask(region, request, to_camera(request.camera, width, height))
+        self._view_number = self._number
         self._outstanding = True
         self._region_sent = region
         cover = work.transient.cover
@@ -354,7 +357,7 @@ class PreviewActions:
             self._sheet_of, self._tiles = view, frozenset()
         missing = next((style for style in STYLE_ORDER if style not in self._tiles), None)
         if missing is not None:
-            painted = replace(view, editor=f"style:{missing}")
+            painted = replace(view, editor=f"style:{missing}", estimate=False)
             self._number = child.ask(self._region_sent, painted, to_camera(view.camera, *SHEET_PX))
             self._tile = missing
             self._outstanding = True
@@ -402,6 +405,9 @@ class PreviewActions:
                 form = replace(work.form, palette=tuple((color, color) for color in answer.palette))
                 self._store.replace(replace(work, form=form))
             self._store.wake()
+        elif answer.made == "near":
+            if answer.number == self._view_number:
+                self._show(answer.note.capitalize(), self._store.get().transient.cover, near=answer.near)
         elif answer.note and answer.grade is None:
             self._show(answer.note, None, models=answer.models)
         elif answer.grade is not None:
@@ -409,7 +415,7 @@ class PreviewActions:
             self._grade = self._sent, gdf, answer.grade
             # remove the preview of the previous color
             self._store.replace(with_transient(self._store.get(), live=()))
-            self._show(f"Live: {answer.note}", None)
+            self._show(f"Live: {answer.note}", None, near=answer.near)
         elif answer.pixels is not None:
             kind, _, argument = self._sent.editor.partition(":")
             title = next(choice.title for choice in EDITORS if choice.kind == kind)
@@ -462,14 +468,21 @@ class PreviewActions:
         return int(self._texture.glo)
 
     def _show(
-        self, text: str, cover: Cover | None, failed: bool = False, models: tuple[str, ...] | None = None
+        self,
+        text: str,
+        cover: Cover | None,
+        failed: bool = False,
+        models: tuple[str, ...] | None = None,
+        near: str = "",
     ) -> None:
         """Set the picture over the view and the preview's state in the form."""
         work = self._store.get()
         available_models = work.transient.preview.models if models is None else models
         painted = self._painted is not None and self._painted[0] == self._request()
         sheet = 0 if self._sheet is None else int(self._sheet.glo)
-        state = PreviewState(text, failed, self._outstanding, painted, available_models, sheet, self._drawn)
+        state = PreviewState(
+            text, failed, self._outstanding, painted, available_models, sheet, self._drawn, near
+        )
         if (work.transient.cover, work.transient.preview) != (cover, state):
             self._store.replace(with_transient(work, cover=cover, preview=state))
             self._store.wake()
