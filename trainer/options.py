@@ -129,6 +129,7 @@ class TrainingViewOptions:
     image_size: int = 0
     """Longer side of the views in pixels, 32 to 2048 (0: by the region's detail; instruct 512)."""
     dense: Fixed[bool] = True  # more views for color edits, unless each is painted separately
+    fills: Fixed[bool] = True  # the region fills the views of a rig; False leaves room for moving parts
     pictures: Fixed[tuple[Path, ...]] = ()  # changed pictures, whose cameras are the views, all to train on
     scene: Fixed[Path | None] = None  # scene file, beside which cameras may define the up axis
 

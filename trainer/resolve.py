@@ -98,6 +98,7 @@ def resolve(options: TrainOptions) -> TrainOptions:
             options.views,
             cameras=options.views.cameras or row.cameras(text),
             views=min(views or QUICK_VIEWS, QUICK_VIEWS) if quick else views,
+            fills=row.run == "trained" and row.knows_kind and not row.external,
             dense=not quick and not row.per_view and options.optimize.color_solver,
             image_size=options.views.image_size or row.image_size,
             pictures=pictures,

@@ -157,7 +157,7 @@ def paint_side(scene: Gaussians, region: Region) -> int:
     up = guess_up(scene)
     if is_surrounding(scene, up):
         return least  # cameras around it do not show it
-    cameras = with_near_plane(region_rig(scene, region, _SIZING_VIEWS, most, up), scene)
+    cameras = with_near_plane(region_rig(scene, region, _SIZING_VIEWS, most, up, fills=True), scene)
     return min(most, choose_view_size(scene, region, cameras, SizeLimits(least, most * most)).side)
 
 

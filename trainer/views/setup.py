@@ -47,7 +47,7 @@ from .view import (
 )
 
 SIZE = 256
-"""Default longer side of the views of given cameras, pixels."""
+"""Default longer side of the views if it is not chosen by the region's detail, pixels."""
 
 SIZE_LIMITS = {True: SizeLimits(160, 16_000), False: SizeLimits(SIZE, 32_000)}
 """Limits of the views' size in a rig, for dense color edits and for others, whose steps draw single views.
@@ -157,8 +157,9 @@ def make_training_setup(options: TrainingViewOptions, scene: Gaussians, region: 
     elevations = HALF_SPHERE if options.dense else ELEVATIONS
     size = options.image_size or SIZE
     notes = [*found.notes, f"up is {up.name}, {up.reason}"]
-    if options.cameras is None and not options.image_size:
-        rig = with_near_plane(region_rig(scene, region, _SIZING_VIEWS, SIZE, up.direction, elevations), scene)
+    if options.cameras is None and options.fills and not options.image_size:
+        rig = region_rig(scene, region, _SIZING_VIEWS, SIZE, up.direction, elevations, fills=True)
+        rig = with_near_plane(rig, scene)
         chosen = choose_view_size(scene, region, rig, SIZE_LIMITS[options.dense])
         size = chosen.side
         notes.append(chosen.line())
@@ -167,7 +168,7 @@ def make_training_setup(options: TrainingViewOptions, scene: Gaussians, region: 
         if options.cameras is not None:
             fitted = [fit_size(camera, size) for camera in given]
         else:
-            fitted = region_rig(scene, region, count, size, up.direction, elevations)
+            fitted = region_rig(scene, region, count, size, up.direction, elevations, options.fills)
         if options.dense:
             fitted = [replace(camera, sampling=SAMPLING) for camera in fitted]
         return with_near_plane(name_cameras(fitted), scene)

@@ -250,13 +250,13 @@ Its multiples, with the rig's azimuths and elevations, fill three dimensions eve
 
 def region_rig(
     scene: Gaussians, region: Region, count: int, image_size: int, up: Tensor | None = None,
-    elevations: tuple[float, float] = (5.0, 60.0),
+    elevations: tuple[float, float] = (5.0, 60.0), fills: bool = False,
 ) -> list[Camera]:  # fmt: skip
     """Return the orbit rig of the scene, aimed at the region and zoomed in on it.
 
-    The cameras have the positions of a rig for the whole scene, so nothing new occludes the region. The
-    region's box fills 95 to 75 % of their pictures (`frame_box`), in an order that also leaves no gap between
-    the nearer views. A hand that is 3 % of the scene is trained on as many pixels as the whole body.
+    The cameras have the positions of a rig for the whole scene, so nothing new occludes the region. A hand
+    that is 3 % of the scene is trained on as many pixels as the whole body. The region's bounding sphere
+    fills 80 to 50 % of the pictures, in an order that also leaves no gap between the nearer views.
 
     Args:
         scene: see `orbit_rig`
@@ -265,14 +265,25 @@ def region_rig(
         image_size: both sides in pixels
         up: world up direction, [3]; None guesses it
         elevations: see `orbit_rig`
+        fills: the region's box fills 95 to 75 % of the pictures instead (`frame_box`), for edits that stay
+            inside the region and need none of its surroundings
     """
     up = guess_up(scene) if up is None else up
     rig = orbit_rig(scene, count, image_size, image_size, up=up, elevations=elevations)
+    steps = [(0.5 + i / _PLASTIC) % 1.0 for i in range(count)]
+    if not fills:
+        center, radius = region_sphere(scene, region)
+        return [
+            frame_sphere(camera, center, radius, 0.8 - 0.3 * step, up)
+            for camera, step in zip(rig, steps, strict=True)
+        ]
     members = region.members[:: -(-len(region) // _MAX_FRAMED)]
     means = scene.means[members]
     extent = float(scene.scales[members].amax(dim=1).median())
-    shares = (0.95 - 0.2 * ((0.5 + i / _PLASTIC) % 1.0) for i in range(count))
-    return [frame_box(camera, means, extent, next(shares), up) for camera in rig]
+    return [
+        frame_box(camera, means, extent, 0.95 - 0.2 * step, up)
+        for camera, step in zip(rig, steps, strict=True)
+    ]
 
 
 def frame_box(camera: Camera, means: Tensor, extent: float, share: float, up: Tensor) -> Camera:

@@ -68,7 +68,7 @@ def test_edits_consistent_across_views_agree(spec: str) -> None:
     assert found.psnr > 22
 
 
-@pytest.mark.parametrize("period", [13, 26, 52])
+@pytest.mark.parametrize("period", [9, 18, 36])
 def test_stripes_painted_differently_in_every_view_disagree(period: float) -> None:
     found = judged(stripes_of_its_own(period, seed=1))
     assert not found.agree

@@ -31,7 +31,9 @@ def shell(scale: float, count: int = 3000) -> Gaussians:
 
 def size_of(scene: Gaussians, limit: int = LARGE) -> ViewSize:
     region = Region("all", torch.arange(len(scene)), torch.ones(len(scene)))
-    return choose_view_size(scene, region, region_rig(scene, region, 3, 64), SizeLimits(LEAST, limit))
+    return choose_view_size(
+        scene, region, region_rig(scene, region, 3, 64, fills=True), SizeLimits(LEAST, limit)
+    )
 
 
 def test_finer_gaussians_get_larger_views() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from progdf.errors import ProgdfError
 from progdf.io.images import write_image
 from progdf.rasterize import render
 from progdf.region import from_mask
+from progdf.scene.bounds import scene_sphere
 from tests.helpers.scenes import ball, concatenate, front_camera, one_gaussian
 from tests.helpers.trained import small
 from trainer.editors import check_new_editor, make_editor
@@ -208,6 +210,21 @@ def test_picture_below_64_pixels_is_all_box() -> None:
     assert region_box(torch.ones(40, 50)) == (0, 0, 50, 40)
 
 
+def test_rig_fills_half_to_four_fifths_of_the_picture() -> None:
+    scene = ball(400)
+    region = from_mask("piece", (scene.means - torch.tensor([0.3, 0.0, 0.0])).norm(dim=1) < 0.25)
+    center, radius = scene_sphere(scene[region.members])
+    radius += float(scene.scales[region.members].amax(dim=1).median())
+    shares = []
+    for camera in region_rig(scene, region, 24, 100):
+        distance = float((camera.position - center).norm())
+        shares.append(0.02 * float(camera.K[0, 0]) * math.tan(math.asin(radius / distance)))
+        ahead = camera.viewmat[:3, :3] @ center + camera.viewmat[:3, 3]
+        torch.testing.assert_close(ahead[:2], torch.zeros(2), atol=1e-5, rtol=0)
+    for some in (shares, shares[:12], shares[12:]):
+        assert sorted(some) == pytest.approx(np.linspace(0.5, 0.8, len(some)), abs=0.07)
+
+
 @pytest.mark.parametrize("shape", [(0.25, 0.25, 0.25), (0.4, 0.05, 0.1), (0.08, 0.3, 0.08)])
 def test_rig_fills_most_of_the_picture_with_the_region(shape: tuple[float, float, float]) -> None:
     scene = ball(20000)
@@ -215,7 +232,7 @@ def test_rig_fills_most_of_the_picture_with_the_region(shape: tuple[float, float
     region = from_mask("piece", offset.abs().amax(dim=1) < 1.0)
     scene = replace(scene, log_scales=torch.full_like(scene.means, -9.0))
     shares = []
-    for camera in region_rig(scene, region, 24, 100):
+    for camera in region_rig(scene, region, 24, 100, fills=True):
         positions = scene.means[region.members] @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
         pixels = positions @ camera.K.T
         pixels = pixels[:, :2] / pixels[:, 2:]
