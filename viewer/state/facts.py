@@ -37,7 +37,7 @@ _THUMBNAIL_DISTANCE = 0.7  # camera distance as a share of the framing distance
 
 FILL_BASE_S = 12.0
 """Seconds to fill a hole in a small scene, rounded up; measured on two cores."""
-FILL_S_PER_MILLION = 150.0
+FILL_S_PER_MILLION = 200.0
 """Further seconds per million Gaussians of the scene."""
 
 Hole = Literal["", "open", "filled"]
