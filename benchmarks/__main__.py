@@ -37,6 +37,7 @@ BENCHES: dict[str, str] = {
     "networks": "benchmarks.networks:tables",
     "viewer": "benchmarks.viewer.slider:tables",
     "select": "benchmarks.viewer.selection:tables",
+    "subject": "benchmarks.viewer.subject:tables",
     "frames": "benchmarks.viewer.frames:tables",
     "moving": "benchmarks.viewer.moving:tables",
     "popping": "benchmarks.viewer.popping:tables",
@@ -67,7 +68,7 @@ class BenchOptions:
     runs: tuple[Path, ...] = ()
     """Finished run folders for `edits` and `networks`."""
     plots: Path | None = None
-    """Folder in which `training`, `field` and `recolors` draw training.png, field.png and recolors.jpg."""
+    """Folder in which `training`, `field`, `recolors` and `subject` draw NAME.png, or recolors.jpg."""
     scenes: tuple[Path, ...] = ()
     """Scene files to measure, in place of the demo scenes or beside them (docs/benchmarks.md)."""
     seconds: float | None = None
@@ -97,7 +98,7 @@ def main(argv: Sequence[str]) -> int:
                 f"{', '.join((*BENCHES, 'page', 'ablate', 'sliders', 'regret'))}"
             )
     charted = ("training", "field")
-    plotted = (*charted, "recolors")
+    plotted = (*charted, "recolors", "subject")
     if options.plots and options.what and not set(plotted) & set(options.what):
         raise ProgdfError(f"--plots are for {', '.join(plotted)}; use python -m benchmarks {plotted[0]}")
     trained = ("edits", "networks")

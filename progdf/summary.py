@@ -5,20 +5,18 @@ from __future__ import annotations
 import base64
 import html
 import io
-import math
 from contextlib import suppress
 from dataclasses import replace
 
 import torch
 from PIL import Image
 
-from progdf.camera import Camera, intrinsics, look_at
 from progdf.compose.layers import KINDS
 from progdf.field.baked import BakedField
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import Gdf
 from progdf.rasterize import render
-from progdf.scene.subject import best_azimuth_offset, fit_camera, is_room, room_viewpoint, subject_rows
+from progdf.scene.subject import first_view
 from progdf.scene.up_axis import guess_up
 from progdf.terminal import escape_text, file_size, format_count
 
@@ -73,7 +71,8 @@ def _still(scene: Gaussians) -> str:
         return ""
     with torch.no_grad():
         scene = scene.to("cpu", torch.float32)
-        camera = _first_camera(scene[:: -(-len(scene) // _MAX_SAMPLED_ROWS)])
+        sample = scene[:: -(-len(scene) // _MAX_SAMPLED_ROWS)]
+        camera = first_view(sample, guess_up(sample), _SIZE)
         drawn = render(scene, camera, (0.0, 0.0, 0.0), engine="cpu")
     alpha = 1 - drawn.transmittance[..., None]
     pixels = torch.cat([drawn.image / alpha.clamp_min(1e-6), alpha], dim=2).clamp(0, 1) * 255
@@ -82,15 +81,6 @@ def _still(scene: Gaussians) -> str:
     width, height = _SIZE
     source = f"data:image/webp;base64,{base64.b64encode(file.getvalue()).decode()}"
     return f"<img alt='' width={width} height={height} src='{source}'>"
-
-
-def _first_camera(scene: Gaussians) -> Camera:
-    """Return the first camera of the viewer: slightly above the subject's front, or inside a room."""
-    up = guess_up(scene)
-    if is_room(scene, up):
-        return Camera(look_at(*room_viewpoint(scene, up), up), intrinsics(math.radians(60.0), *_SIZE), *_SIZE)
-    turn = 20.0 + best_azimuth_offset(scene[subject_rows(scene, up)], up, 20.0, 15.0)
-    return fit_camera(scene, up, (turn, 15.0), _SIZE, math.radians(45.0), 0.72)
 
 
 def _chart(shown: BakedField | Gdf) -> str:

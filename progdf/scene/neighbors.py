@@ -104,15 +104,20 @@ class Neighborhood:
 
     def largest_part(self, mask: Mask) -> Mask:
         """Return the connected part with the most members; an empty mask stays empty. [N]"""
-        rows = np.flatnonzero(mask)
+        rows, part = self.touching_parts(mask)
         largest = np.zeros_like(mask)
+        if len(rows):
+            largest[rows[part == np.bincount(part).argmax()]] = True
+        return largest
+
+    def touching_parts(self, mask: Mask) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the rows of a mask [M] and the index of the connected part of each [M]."""
+        rows = np.flatnonzero(mask)
         if not len(rows):
-            return largest
+            return rows, rows
         tree = PointTree(self._points[rows], _LINKED_NEIGHBORS + 1)
         start, end = self._links(tree, rows, np.arange(len(rows)))
-        part = join_pairs(start, end, len(rows))
-        largest[rows[part == np.bincount(part).argmax()]] = True
-        return largest
+        return rows, join_pairs(start, end, len(rows))
 
     def connected_part(self, mask: Mask, seeds: NDArray[np.int64]) -> Mask:
         """Return the part of `mask` that is connected within it with any of the rows `seeds` in it. [N]"""

@@ -13,6 +13,8 @@
             | 'front:' CAMERA                    Gaussians on the surface that the camera sees
             | 'color:' #rrggbb[,tolerance]       Gaussians of like color
             | 'flood:' x,y,z[,tolerance]         like color, connected with the Gaussian nearest to a point
+            | 'flood:' CAMERA ':' x,y[,tolerance]   like the color of a pixel, connected with its Gaussians
+            | 'subject' [':' CAMERA]             object in the middle of a view; the scene's first view
             | KIND ':' …                         further kinds that the caller supports, e.g. masks:, text:
             | 'changed'                          if the caller supports edited pictures
     STEP    = ('grow' | 'shrink' | 'smooth') [':' TIMES] | 'largest' | 'refine' [':' PERCENT]
@@ -57,10 +59,15 @@ from progdf.terminal import format_count, format_place, shorten
 from . import selection
 from .neighbors import RIM_PERCENT, Neighborhood, grow_along_surface
 from .selection import Mask
+from .subject import first_view, select_subject
+from .up_axis import guess_up
 
 TOLERANCE = 0.08
 """Default tolerance of a color, as a distance in OKLab. On a black jacket 0.08 selects the leather, and 0.1
 also the hair."""
+
+FIRST_VIEW_PX = (640, 480)
+"""Width and height of the view of `subject` without a camera, as `progdf render` draws it; pixels."""
 
 MAX_TIMES = 100
 """Largest number of repetitions of a step."""
@@ -82,10 +89,20 @@ def read_part(kind: str, argument: str) -> PartSelector:
         code, tolerance = _with_tolerance(kind, argument, 1, "#rrggbb[,tolerance]")
         lab = _oklab(argument, code[0])
         return lambda scene: selection.alike_in_color(selection.base_colors(scene), lab, tolerance)
+    if kind == "flood" and ":" in argument:
+        form = "CAMERA:x,y[,tolerance]"
+        camera_text, _, text = argument.rpartition(":")
+        camera_of = _camera(kind, camera_text, form)
+        words, tolerance = _with_tolerance(kind, text, 2, form)
+        x, y = _final_numbers(kind, argument, ",".join(words), form)
+        return lambda scene: _flood_from_pixel(scene, camera_of(scene), (x, y), tolerance)
     if kind == "flood":
         words, tolerance = _with_tolerance(kind, argument, 3, "x,y,z[,tolerance]")
         x, y, z = _final_numbers(kind, argument, ",".join(words), "x,y,z[,tolerance]")
         return lambda scene: _flood(scene, (x, y, z), tolerance)
+    if kind == "subject":
+        view_of = _camera(kind, argument, "CAMERA") if argument else _first_view
+        return lambda scene: _subject(scene, view_of(scene))
     if kind == "front":
         camera_of = _camera(kind, argument, "CAMERA")
         return lambda scene: _front(scene, camera_of(scene))
@@ -157,6 +174,27 @@ def _flood(scene: Gaussians, point: tuple[float, float, float], tolerance: float
     return grow_along_surface(neighborhood, colors, np.array([seed]), colors[seed], tolerance)
 
 
+def _flood_from_pixel(scene: Gaussians, camera: Camera, at: tuple[float, float], tolerance: float) -> Mask:
+    nothing = np.zeros(len(scene), bool)
+    if not (0 <= at[0] < camera.width and 0 <= at[1] < camera.height):
+        return nothing
+    rows, shares = selection.rows_at_pixel(scene, camera, *at)
+    if not len(rows):
+        return nothing
+    colors = selection.shown_colors(scene, camera, _front(scene, camera))
+    color = selection.pixel_color(scene, camera, *at)
+    seeds = selection.main_rows(rows, shares)
+    return grow_along_surface(Neighborhood(scene), colors, seeds, color, tolerance)
+
+
+def _subject(scene: Gaussians, camera: Camera) -> Mask:
+    return select_subject(scene, Neighborhood(scene), camera, guess_up(scene))
+
+
+def _first_view(scene: Gaussians) -> Camera:
+    return first_view(scene, guess_up(scene), FIRST_VIEW_PX)
+
+
 def _camera(kind: str, text: str, form: str) -> Callable[[Gaussians], Camera]:
     """Check that a camera can be read; return a function that gives it relative to a scene."""
     if not text:
@@ -213,7 +251,7 @@ _SHAPE_FORMS = {
     "brush": ("radius,x,y,…", 3, 1),
 }
 
-PARTS = (*_SHAPE_FORMS, "front", "color", "flood")
+PARTS = (*_SHAPE_FORMS, "front", "color", "flood", "subject")
 """Kinds of parts that are drawn or picked in the window."""
 STEPS: dict[str, Callable[[Neighborhood, Mask], Mask]] = {
     "grow": Neighborhood.grow,
@@ -238,8 +276,8 @@ _SIGNS = {"+": union, "-": difference, "&": intersection}
 _NO_KINDS: Mapping[str, Kind] = {}
 _NO_CHECKS: Mapping[str, Check] = {}
 
-KINDS_WITHOUT_ARGUMENT = ("changed",)
-"""Kinds without a colon and a text."""
+KINDS_WITHOUT_ARGUMENT = ("changed", "subject")
+"""Kinds that need no colon and no text."""
 
 
 def parse_region(

@@ -19,7 +19,8 @@ from PIL import Image, ImageDraw
 from progdf.camera import Camera
 from progdf.color.oklab import srgb_to_oklab
 from progdf.gaussians import Gaussians
-from progdf.rasterize import render
+from progdf.rasterize import alpha_weights, render
+from progdf.rasterize.engines import Rendering
 from progdf.sh import sh0_to_rgb
 from progdf.threads import StoppedError, stopped_by
 
@@ -36,6 +37,8 @@ _DEPTH_DOWNSCALE = 4  # factor by which the depth render of the front surface is
 _DEPTH_TOLERANCE = 0.01
 _EXTENT_TOLERANCE = 3.0
 _MIN_COVERAGE = 0.05  # cells with less total opacity are background
+_SHOWN_PX = 640  # longer side of the picture in which the colors of Gaussians are measured, pixels
+_MIN_SEED_SHARE = 0.1  # a seed contributes at least this fraction of a pixel's color
 _MAX_CELLS = 1024  # cells per side of the grid in which a polygon is filled
 
 
@@ -147,6 +150,62 @@ def base_colors(scene: Gaussians) -> Floats:
     return colors
 
 
+def shown_colors(scene: Gaussians, camera: Camera, front: Mask) -> Floats:
+    """Return the color that each Gaussian shows: the mean of the pixels that it draws, OKLab. [N,3]
+
+    In a pixel many Gaussians blend, so that their own colors may be far from the color on screen. Gaussians
+    behind the front surface or outside the picture keep their own color, see `base_colors`.
+
+    Args:
+        scene: the scene on screen
+        camera: the viewing camera
+        front: Gaussians on its front surface, see `front_surface`. [N]
+    """
+    colors = base_colors(scene)
+    scale = min(1.0, _SHOWN_PX / max(camera.width, camera.height))
+    small = camera.resize(*(max(1, round(side * scale)) for side in (camera.width, camera.height)))
+    with torch.no_grad():
+        picture = srgb_to_oklab(_uncovered(render(scene, small, (0.0, 0.0, 0.0)))).float()
+        for channel in range(3):
+            # the mask is 0 to 1; a and b are -0.5 to 0.5
+            offset = 0.5 if channel else 0.0
+            weights = alpha_weights(scene, small, (picture[..., channel] + offset).clamp(0.0, 1.0))
+            total = weights[:, 2]
+            shown = (weights[:, 0] / total.clamp_min(1e-9) - offset).float().numpy()
+            colors[:, channel] = np.where(front & (total > 0).numpy(), shown, colors[:, channel])
+    return colors
+
+
+def pixel_color(scene: Gaussians, camera: Camera, x: float, y: float) -> Floats:
+    """Return the rendered color at a position inside the picture, OKLab. [3]"""
+    column = int(x)
+    row = int(y)
+    with torch.no_grad():
+        pixel = render(scene, camera, (0.0, 0.0, 0.0), crop=(column, row, column + 1, row + 1))
+        color: Floats = srgb_to_oklab(_uncovered(pixel))[0, 0].float().numpy()
+    return color
+
+
+def rows_at_pixel(scene: Gaussians, camera: Camera, x: float, y: float) -> tuple[NDArray[np.int64], Floats]:
+    """Return the Gaussians that a pixel inside the picture shows [M], and their shares of its color [M]."""
+    mask = torch.zeros(camera.height, camera.width)
+    mask[int(y), int(x)] = 1.0
+    shares = alpha_weights(scene, camera, mask)[:, 0].float().numpy()
+    rows = np.flatnonzero(shares)
+    return rows, shares[rows]
+
+
+def main_rows(rows: NDArray[np.int64], shares: NDArray[np.floating]) -> NDArray[np.int64]:
+    """Return the Gaussians that contribute most to the color of a pixel. [M], [M], M ≥ 1 -> [K]"""
+    return rows[shares >= min(_MIN_SEED_SHARE, float(shares.max()))]
+
+
+def _uncovered(drawn: Rendering) -> torch.Tensor:
+    """Return the color of a rendering on black without the background, 0 to 1. [H,W,3]"""
+    alpha = (1.0 - drawn.transmittance[..., None]).clamp_min(1e-6)
+    return (drawn.image / alpha).clamp(0.0, 1.0)
+
+
 def alike_in_color(colors: Floats, color: ArrayLike, tolerance: float) -> Mask:
     """Select the colors [N,3] within `tolerance` of a color [3], in OKLab. [N]
 
@@ -226,9 +285,11 @@ class Surface:
 
     @property
     def colors(self) -> Floats:
-        """View-independent colors, OKLab, see `base_colors`. [N,3]"""
+        """Colors in the picture, OKLab, see `shown_colors`. [N,3]"""
         with self._lock:
-            self._colors = base_colors(self.scene) if self._colors is None else self._colors
+            if self._colors is None:
+                self._front = self._whole_front()
+                self._colors = shown_colors(self.scene, self.camera, self._front)
             return self._colors
 
     def front(self, rows: NDArray[np.int64]) -> Mask:
@@ -237,6 +298,11 @@ class Surface:
             if self._front is not None:
                 return self._front[rows]
             return front_surface(self.scene, self.camera, self.centers, rows)
+
+    def _whole_front(self) -> Mask:
+        if self._front is not None:
+            return self._front
+        return front_surface(self.scene, self.camera, self.centers)
 
     def in_front(self, mask: Mask) -> Mask:
         """Return the part of a mask that lies on the front surface. [N]"""
@@ -248,8 +314,7 @@ class Surface:
     def prepare(self, colors: bool = False) -> None:
         """Compute the whole front surface, and optionally the colors, in advance. `drop` cancels it."""
         with self._lock, stopped_by(self._stop), suppress(StoppedError):
-            if self._front is None:
-                self._front = front_surface(self.scene, self.camera, self.centers)
+            self._front = self._whole_front()
             if colors and not self._stop.is_set():
                 _ = self.colors
 

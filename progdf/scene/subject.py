@@ -1,23 +1,36 @@
-"""Subject of a scene and the camera that frames it.
+"""Subject of a scene, the camera that frames it, and the selection of the subject of a view.
 
-The subject is the group of objects that stand on the ground, without the ground and without far floaters. A
-ground is a smooth surface under most of the scene, wider than the objects on it. Objects are measured in
-cells of space, so that neither a lawn's many blades nor a sky's few giants decide.
+The subject of a scene is the group of objects that stand on the ground, without the ground and without far
+floaters. A ground is a smooth surface under most of the scene, wider than the objects on it. Objects are
+measured in cells of space, so that neither a lawn's many blades nor a sky's few giants decide.
+
+The subject of a view is the one object in its middle, see `select_subject`.
 """
 
 from __future__ import annotations
 
+import logging
 import math
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 from torch import Tensor
 
 from progdf.camera import Camera, intrinsics, look_at
+from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
+from progdf.rasterize import alpha_weights
+from progdf.terminal import format_count
 
 from .bounds import front_direction, has_ceiling, has_long_tail, quantile
-from .neighbors import join_pairs
+from .neighbors import Neighborhood, join_pairs
+from .point_tree import PointTree
+from .scribbles import Rows
+from .selection import Mask
+
+_log = logging.getLogger(__name__)
 
 _MAX_SAMPLED_ROWS = 60_000  # Gaussians; larger scenes are sampled evenly
 _MIN_GAUSSIANS = 64  # Gaussians; fewer do not define a shape
@@ -42,6 +55,19 @@ _CELLS_ACROSS = 32  # cells of space along the longest side of the scene
 # Share of the largest object's cells; smaller objects are tufts or strays. The toy robot's hands fill 0.11 of
 # its body's, the largest tuft of its ground 0.03.
 _MIN_OBJECT_SHARE = 0.06
+
+_FIRST_AZIMUTH_DEG = 20.0
+_FIRST_ELEVATION_DEG = 15.0
+_FIRST_FOV_DEG = 45.0  # vertical
+_ROOM_FOV_DEG = 60.0  # vertical, inside a room
+_FIRST_FILLED = 0.72  # share of the first picture's width or height that the subject fills
+
+_VIEW_PX = 160  # longer side of the picture in which the middle of a view is measured, pixels
+_MIDDLE_SPREAD = 0.5  # standard deviation of the weight of the middle, in half shorter sides of the picture
+_BORDER_SHARE = 0.03  # width of a picture's border, in shorter sides
+_MIN_MIDDLE_SHARE = 1 / 256  # smallest share of the weighted middle for a subject, a sixteenth of its sides
+_MAX_SUPPORTS = 3  # supports on top of each other, such as a rug, a table and a tray
+_MIN_RIM_SHARE = 0.8  # smallest share of the cells around the objects in which their support goes on
 
 
 def subject_rows(scene: Gaussians, up: Tensor) -> Tensor:
@@ -121,6 +147,213 @@ def fit_camera(
     radius = 2 * float(subject.log_scales.amax(dim=1).median().exp())
     eye = fit_eye(subject.means, radius, axes, (tangent * size[0] / size[1], tangent)).float()
     return Camera(look_at(eye, eye - back, up), intrinsics(fov, *size), *size)
+
+
+def first_view(scene: Gaussians, up: Tensor, size: tuple[int, int]) -> Camera:
+    """Return the first camera of a scene: slightly above the subject's front, or inside a room.
+
+    Args:
+        scene: a scene of at least one Gaussian
+        up: world direction that is up. [3]
+        size: width and height, pixels
+    """
+    if is_room(scene, up):
+        K = intrinsics(math.radians(_ROOM_FOV_DEG), *size)
+        return Camera(look_at(*room_viewpoint(scene, up), up), K, *size)
+    subject = scene[subject_rows(scene, up)]
+    turn = _FIRST_AZIMUTH_DEG + best_azimuth_offset(subject, up, _FIRST_AZIMUTH_DEG, _FIRST_ELEVATION_DEG)
+    fov = math.radians(_FIRST_FOV_DEG)
+    return fit_camera(scene, up, (turn, _FIRST_ELEVATION_DEG), size, fov, _FIRST_FILLED)
+
+
+def select_subject(scene: Gaussians, neighborhood: Neighborhood, camera: Camera, up: Tensor) -> Mask:
+    """Select the object in the middle of a view: no networks, no strokes, nothing set by hand.
+
+    1. The object: of the connected groups that stand on the ground, the one with the largest visible share of
+       the view's middle. A support under it, such as a plinth or a table, is removed like the ground.
+    2. Its rim: a random walk from the object and from the ground decides every Gaussian, see `Scribbles`.
+    3. Hovering parts, which touch neither, join the object if they are nearer to it than to the background,
+       by at most its radius.
+
+    Without a ground the whole scene is the object. If such a scene has a far background, the walk starts from
+    the middle and from the border of the view.
+
+    Args:
+        scene: N Gaussians as they are drawn
+        neighborhood: neighborhood of the same N Gaussians, at any strength of their edits
+        camera: the view
+        up: world direction that is up. [3]
+
+    Returns:
+        Mask. [N]
+
+    Raises:
+        ProgdfError: the scene is a room, or nothing stands in the middle of the view.
+    """
+    empty = ProgdfError("no subject in the middle of the view; turn the view to an object")
+    if not len(scene):
+        raise empty
+    if is_room(scene, up):
+        raise ProgdfError("a room has no single subject; select with Scribble, or name a point with flood:")
+    size = max(camera.width, camera.height)
+    small = camera.resize(*(max(1, round(side * _VIEW_PX / size)) for side in (camera.width, camera.height)))
+    middle, border = _middle_and_border(small)
+    weights = alpha_weights(scene, small, middle).numpy()
+    in_middle = weights[:, 0]
+    solid, near, ground = _solid_near_and_ground(scene, up)
+    if ground is not None:
+        on, beside, reason = _object_on_ground(scene, up, near, ground, in_middle)
+        beside = np.union1d(beside, np.setdiff1d(solid, near))
+    elif has_long_tail(scene.means[solid]):
+        on = near[2 * in_middle[near] > weights[near, 2]]
+        at_border = alpha_weights(scene, small, border).numpy()
+        beside = np.flatnonzero(2 * at_border[:, 0] > at_border[:, 2])
+        beside = np.setdiff1d(np.union1d(beside, np.setdiff1d(solid, near)), on)
+        reason = "no ground, but a far background"
+    else:
+        on = solid
+        beside = np.zeros(0, np.int64)
+        reason = "no ground and no background"
+    share = float(in_middle[on].sum() / middle.sum())
+    if share < _MIN_MIDDLE_SHARE:
+        raise empty
+    mask = neighborhood.scribbles.select(on, beside)
+    mask = _with_hovering_parts(scene, neighborhood, mask, beside)
+    line = "subject: %s, %s; it covers %.0f %% of the middle of the view"
+    _log.info(line, format_count(int(mask.sum())), reason, 100 * share)
+    return mask
+
+
+def _middle_and_border(camera: Camera) -> tuple[Tensor, Tensor]:
+    """Return weights of a picture's pixels: a bell around its middle, and its border. [H,W] each"""
+    shorter = min(camera.width, camera.height)
+    x = torch.arange(camera.width) + 0.5 - camera.width / 2
+    y = torch.arange(camera.height) + 0.5 - camera.height / 2
+    squared_radius = (x.square() + y[:, None].square()) / (0.5 * shorter) ** 2
+    border = torch.ones(camera.height, camera.width)
+    width = max(1, round(_BORDER_SHARE * shorter))
+    border[width:-width, width:-width] = 0.0
+    return torch.exp(-0.5 * squared_radius / _MIDDLE_SPREAD**2), border
+
+
+def _solid_near_and_ground(scene: Gaussians, up: Tensor) -> tuple[Rows, Rows, tuple[Mask, Mask] | None]:
+    """Return the solid rows of a sample, those without far background, and their `_split_ground`."""
+    rows = _sample(scene)
+    solid = rows[scene.opacities[rows] > _MIN_SOLID_OPACITY]
+    if len(solid) < _MIN_GAUSSIANS:
+        return rows.numpy(), rows.numpy(), None
+    near = _without_background(scene, solid)
+    parts = _split_ground(*_heights_and_plan(scene.means[near], up))
+    ground = None if parts is None else (parts[0].numpy(), parts[1].numpy())
+    return solid.numpy(), near.numpy(), ground
+
+
+def _object_on_ground(
+    scene: Gaussians, up: Tensor, near: Rows, ground: tuple[Mask, Mask], in_middle: NDArray[np.floating]
+) -> tuple[Rows, Rows, str]:
+    """Return the rows of the object in the middle of a view, those of the ground, and the reason as text.
+
+    Args:
+        scene: N Gaussians
+        up: world direction that is up. [3]
+        near: solid rows. [M]
+        ground: masks of the rows that stand, and of the ground between them. [M] each
+        in_middle: visible weight of each Gaussian in the middle of the view. [N]
+    """
+    standing = near[ground[0]]
+    beside = near[ground[1]]
+    reason = "on a ground"
+    for supports in range(_MAX_SUPPORTS + 1):
+        height, plan = _heights_and_plan(scene.means[standing], up)
+        groups = _object_of_rows(torch.cat([plan, height[:, None]], dim=1)).numpy()
+        standing = standing[groups == np.bincount(groups, in_middle[standing]).argmax()]
+        if supports == _MAX_SUPPORTS or len(standing) < _MIN_GAUSSIANS:
+            break
+        parts = _split_support(*_heights_and_plan(scene.means[standing], up))
+        if parts is None:
+            break
+        visible = in_middle[standing]
+        if 2 * visible[parts[0].numpy()].sum() <= visible.sum():
+            break  # the view shows the support itself, or strays above a lid
+        beside = np.concatenate([beside, standing[parts[1].numpy()]])
+        standing = standing[parts[0].numpy()]
+        reason = f"on {format_count(supports + 1, 'support')} on a ground"
+    return standing, beside, reason
+
+
+def _split_support(height: Tensor, plan: Tensor) -> tuple[Tensor, Tensor] | None:
+    """Return the rows above a support of an object, and the rows of the support's free surface. [R] bool each
+
+    A support is the object's widest level, wider than everything above it and on all sides of it.
+
+    Args:
+        height, plan: see `_heights_and_plan`
+
+    Returns:
+        The two masks; None without a support.
+    """
+    cell = _plan_cells(plan)
+    low, high = (float(quantile(height, share)) for share in (_GROUND_QUANTILE, 1.0))
+    levels = torch.arange(low, high, _STANDING_HEIGHT).tolist()
+    areas = [int(_covered_cells(cell[(height - level).abs() <= _STANDING_HEIGHT]).sum()) for level in levels]
+    if not areas:
+        return None
+    level = levels[int(np.argmax(areas))]
+    above = height > level + _STANDING_HEIGHT
+    surface = (height - level).abs() <= _STANDING_HEIGHT
+    wide = _covered_cells(cell[surface])
+    covered = _covered_cells(cell[above])
+    around = binary_dilation(covered, np.ones((3, 3))) & ~covered
+    is_support = (
+        int(above.sum()) >= _MIN_GAUSSIANS
+        and covered.sum() <= _MAX_COVERED_CELLS * wide.sum()
+        and (wide & around).sum() >= _MIN_RIM_SHARE * around.sum()
+    )
+    return (above, surface & ~torch.from_numpy(covered.ravel())[cell]) if is_support else None
+
+
+def _plan_cells(plan: Tensor) -> Tensor:
+    """Return each row's cell of the plan. [R,2] -> [R] int64"""
+    cells = ((plan + 1.0) * 0.5 * _PLAN_CELLS).long().clamp(0, _PLAN_CELLS - 1)
+    return cells[:, 0] * _PLAN_CELLS + cells[:, 1]
+
+
+def _covered_cells(cell: Tensor) -> Mask:
+    """Return the cells of the plan that hold a row. [R] -> [C,C]"""
+    counts = torch.bincount(cell, minlength=_PLAN_CELLS**2)
+    return (counts > 0).reshape(_PLAN_CELLS, _PLAN_CELLS).numpy()
+
+
+def _with_hovering_parts(scene: Gaussians, neighborhood: Neighborhood, mask: Mask, beside: Rows) -> Mask:
+    """Return a selection with the parts that touch neither it nor the background, but are nearer to it. [N]
+
+    Args:
+        scene: N Gaussians
+        neighborhood: see `select_subject`
+        mask: the selection. [N]
+        beside: rows of the background
+    """
+    rows, parts = neighborhood.touching_parts(~mask)
+    inside = np.flatnonzero(mask)
+    if not (len(rows) and len(inside)):
+        return mask
+    count = int(parts.max()) + 1
+    tied = np.zeros(count, bool)
+    tied[parts[np.isin(rows, beside)]] = True
+    free = ~tied[parts]
+    rows = rows[free]
+    parts = parts[free]
+    points = scene.means.double().nan_to_num().numpy()
+    radius = float(np.sqrt(points[inside].var(axis=0).sum()))
+    gaps = np.full(count, np.inf)
+    np.minimum.at(gaps, parts, PointTree(points[inside], 1).query(points[rows], 1)[0][:, 0])
+    others = np.full(count, np.inf)
+    if len(beside):
+        np.minimum.at(others, parts, PointTree(points[beside], 1).query(points[rows], 1)[0][:, 0])
+    joins = (gaps < others) & (gaps <= radius)
+    joined = mask.copy()
+    joined[rows[joins[parts]]] = True
+    return joined
 
 
 def is_room(scene: Gaussians, up: Tensor) -> bool:
@@ -251,10 +484,20 @@ def _heights_and_plan(means: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
 
 def _rows_above_ground(height: Tensor, plan: Tensor) -> Tensor | None:
     """Return the rows that stand above a ground. [R], [R,2] -> [R] bool; None if there is no ground."""
-    cells = ((plan + 1.0) * 0.5 * _PLAN_CELLS).long().clamp(0, _PLAN_CELLS - 1)
-    taken, cell, counts = torch.unique(
-        cells[:, 0] * _PLAN_CELLS + cells[:, 1], return_inverse=True, return_counts=True
-    )
+    parts = _split_ground(height, plan)
+    return None if parts is None else parts[0]
+
+
+def _split_ground(height: Tensor, plan: Tensor) -> tuple[Tensor, Tensor] | None:
+    """Return the rows above a ground, and those of the ground in cells without them. [R] bool each
+
+    Args:
+        height, plan: see `_heights_and_plan`
+
+    Returns:
+        The two masks; None if there is no ground.
+    """
+    taken, cell, counts = torch.unique(_plan_cells(plan), return_inverse=True, return_counts=True)
     form = _monomials(plan)
     if len(taken) < form.shape[1]:
         return None
@@ -271,7 +514,7 @@ def _rows_above_ground(height: Tensor, plan: Tensor) -> Tensor | None:
         and float((above[lowest].abs() < _STANDING_HEIGHT).float().mean()) >= _MIN_GROUND_CELLS
         and float(covered.float().mean()) <= _MAX_COVERED_CELLS
     )
-    return standing if on_ground else None
+    return (standing, ~standing & ~covered[cell]) if on_ground else None
 
 
 def _fit_ground(low: Tensor, form: Tensor) -> Tensor:
@@ -303,14 +546,25 @@ def _monomials(plan: Tensor) -> Tensor:
 
 def _rows_of_large_objects(places: Tensor) -> Tensor:
     """Return the rows of large connected objects. [R,3] -> [R] bool, at least one"""
+    boxes, box, objects = _cells_of_space(places)
+    size = torch.zeros(len(boxes)).index_add(0, objects, torch.ones(len(boxes)))
+    return (size[objects] >= _MIN_OBJECT_SHARE * size.max())[box]
+
+
+def _object_of_rows(places: Tensor) -> Tensor:
+    """Return the connected object of each row. [R,3] -> [R] int64"""
+    _, box, objects = _cells_of_space(places)
+    return objects[box]
+
+
+def _cells_of_space(places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the occupied cells [B], the cell of each row [R] and the connected object of each cell [B]."""
     low, high = (torch.stack([quantile(c, q) for c in places.unbind(1)]) for q in (0.01, 0.99))
     side = float((high - low).amax().clamp_min(1e-9)) / _CELLS_ACROSS
     span = 2 * _CELLS_ACROSS + 2
     keys = ((places - low) / side + 0.5 * _CELLS_ACROSS).clamp(0, span - 3).long() + 1
     boxes, box = torch.unique((keys[:, 0] * span + keys[:, 1]) * span + keys[:, 2], return_inverse=True)
-    objects = _connected_cells(boxes, span)
-    size = torch.zeros(len(boxes)).index_add(0, objects, torch.ones(len(boxes)))
-    return (size[objects] >= _MIN_OBJECT_SHARE * size.max())[box]
+    return boxes, box, _connected_cells(boxes, span)
 
 
 def _connected_cells(boxes: Tensor, span: int) -> Tensor:

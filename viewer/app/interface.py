@@ -9,17 +9,18 @@ from itertools import zip_longest
 
 from imgui_bundle import imgui, imgui_ctx
 
+from progdf.errors import ProgdfError
 from viewer.panel import dialogs, panel, timeline_bar, tools
 from viewer.pictures.compare import Labels
 from viewer.state import history, workspace
 from viewer.state.actions import GLIDES, perform
-from viewer.state.commands import Action, OnItem
+from viewer.state.commands import Action, OnItem, Plain
 from viewer.state.workspace import Workspace
 from viewer.ui import overlay
 from viewer.ui.context import FIXED, PALETTE, SMALL_PX, UiContext, u32
 from viewer.ui.keys import COMMANDS, JOINED, TOPICS, Command, chords, find_commands, is_changed, shortcut
 from viewer.ui.pointer import PointerContext
-from viewer.ui.widgets import elide, menu, search_field
+from viewer.ui.widgets import elide, group_digits, menu, search_field
 
 from . import color_tool, mouse, select_tool
 
@@ -275,7 +276,7 @@ def panels(
     actions = []
     above = replace(area, height=area.height - timeline_bar.height(work, area, ui))
     tools.draw_toolbar(work.view, above, ui, actions)
-    work, foot = tools.draw_options(work, above, ui, actions)
+    work, foot = tools.draw_options(work, above, ui, actions, select_tool.next_step(work))
     work = replace(work, view=tools.draw_view(work.view, above, foot, ui, actions))
     work, asked = draw_pill(work, pointer, compared, foot)
     return perform_actions(work, [*actions, *asked], pointer)
@@ -366,9 +367,14 @@ def perform_actions(work: Workspace, actions: Sequence[Action], pointer: Pointer
     """Perform the actions of keys and buttons, see `perform`. An undo shows the name of the undone change."""
     for action in actions:
         before = work
-        work = perform(work, action, pointer.facts, pointer.area.width / pointer.area.height)
         name = action.name
-        if name in GLIDES and not work.layout.reduced_motion:
+        if name == "select_subject":
+            work = _select_subject(work, pointer)
+            continue
+        work = perform(work, action, pointer.facts, pointer.area.width / pointer.area.height)
+        if name == "select_refine":
+            work = _ask_if_doubled(before, work, pointer)
+        elif name in GLIDES and not work.layout.reduced_motion:
             work = workspace.glide_from(work, before.view.camera)
         elif name == "reduced_motion":
             text = f"Reduced motion is {'on' if work.layout.reduced_motion else 'off'}"
@@ -385,6 +391,29 @@ def perform_actions(work: Workspace, actions: Sequence[Action], pointer: Pointer
             entry = history.describe_entry(work.past, len(work.past.past))
             work = workspace.with_message(work, f"Back to: {entry}", pointer.now, seconds=UNDO_S)
     return work
+
+
+MAX_REFINE_GROWTH = 2.0
+"""Largest factor by which Refine enlarges a selection without a question."""
+
+
+def _select_subject(work: Workspace, pointer: PointerContext) -> Workspace:
+    """Select the object in the middle of the picture, or show the reason why there is none."""
+    try:
+        return select_tool.select_in_middle(work, pointer)
+    except ProgdfError as error:
+        return workspace.with_message(work, str(error), pointer.now, error=True)
+
+
+def _ask_if_doubled(before: Workspace, work: Workspace, pointer: PointerContext) -> Workspace:
+    """Return the workspace after Refine; a much larger selection is offered by a button instead."""
+    count = before.view.selection.count
+    refined = work.view.selection.count
+    if refined <= MAX_REFINE_GROWTH * count:
+        return work
+    text = f"Refine would enlarge the selection from {group_digits(count)} to {group_digits(refined)} splats"
+    button = ("Enlarge", Plain("refine_anyway"))
+    return workspace.with_message(before, text, pointer.now, button=button)
 
 
 UNDO_S = 2.0

@@ -23,9 +23,11 @@ from progdf.scene.selection import (
     inside_polygon,
     inside_rectangle,
     inside_stroke,
-    project_centers,
+    main_rows,
+    pixel_color,
 )
-from viewer.render.picking import PixelGaussians, seen_at, surface_point
+from progdf.scene.subject import select_subject
+from viewer.render.picking import seen_at, surface_point
 from viewer.state import history, selection
 from viewer.state.forms import with_color
 from viewer.state.transient import Brushed, Click, Gesture, MouseTool, Point, Strokes
@@ -37,8 +39,6 @@ from viewer.ui.pointer import PointerContext
 
 _STROKE_PX = 4.0  # at 1×: half a stroke's width
 _MAX_PLACES = 16  # sampled positions
-_MAX_DOTS = 300  # dots
-_MIN_SEED_SHARE = 0.1  # a seed contributes at least this fraction of a pixel's color
 
 
 def begin(tool: str, mode: str, before: bytes, at: Point, surface: Surface, through: bool) -> Gesture | None:
@@ -120,18 +120,13 @@ def rows_at_click(
     if seen is None:
         return None
     colors = surface.colors
-    color = np.average(colors[seen.rows], axis=0, weights=seen.shares)
-    seeds = _seeds(seen)
+    color = pixel_color(surface.scene, surface.camera, *at)
+    seeds = main_rows(seen.rows, seen.shares)
     if tool == "flood":
         return grow_along_surface(neighborhood(), colors, seeds, color, tolerance)
     mask = alike_in_color(colors, color, tolerance)
     mask[seeds] = True
     return mask if through else surface.in_front(mask)
-
-
-def _seeds(seen: PixelGaussians) -> np.ndarray:
-    """Return the Gaussians that contribute most to the color of a pixel."""
-    return seen.rows[seen.shares >= min(_MIN_SEED_SHARE, float(seen.shares.max()))]
 
 
 SELECT_DRAG = "select"
@@ -242,6 +237,19 @@ def finish(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Worksp
     return _with(work, selection.select_none(work.view.selection)) if gesture.mode == "new" else work
 
 
+def select_in_middle(work: Workspace, pointer: PointerContext) -> Workspace:
+    """Select the object in the middle of the picture, in the mode that the keys or the tool choose.
+
+    Raises:
+        ProgdfError: see `select_subject`.
+    """
+    up = torch.tensor(work.view.camera.up)
+    surface = pointer.surface
+    mask = select_subject(surface.scene, pointer.facts.neighborhood(), surface.camera, up)
+    mask = mask | pointer.facts.paint_on(work.view, mask)
+    return _with(work, selection.select(work.view.selection, mask))
+
+
 def spread(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Workspace:
     """Finish a scribble: select the Gaussians closer to the strokes on the object than to those next to it.
 
@@ -252,7 +260,9 @@ def spread(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Worksp
     path = gesture.path[:: len(gesture.path) // _MAX_PLACES + 1]
     places = (seen_at(pointer.surface.scene, pointer.surface.camera, *at) for at in path)
     # large Gaussians are visible where their centers are not
-    rows = np.concatenate([touched, *(_seeds(seen) for seen in places if seen is not None)])
+    rows = np.concatenate(
+        [touched, *(main_rows(seen.rows, seen.shares) for seen in places if seen is not None)]
+    )
     if gesture.mode == "subtract":
         beside = np.union1d(beside, rows)
     else:
@@ -272,6 +282,17 @@ def strokes_of(work: Workspace) -> tuple[Rows, Rows] | None:
     strokes = reversed(work.transient.tool.strokes)
     made = (each for each in strokes if each.after == work.view.selection.members)
     return next(((each.on, each.beside) for each in made), None)
+
+
+def next_step(work: Workspace) -> str:
+    """Return the next step of a scribble that has only one kind of stroke, "" for none."""
+    strokes = strokes_of(work)
+    if work.view.select.tool != "scribble" or strokes is None:
+        return ""
+    on, beside = strokes
+    if len(on) and not len(beside):
+        return "Now stroke the background (Ctrl)"
+    return "Now stroke the object" if len(beside) and not len(on) else ""
 
 
 def take_keys(work: Workspace, pointer: PointerContext, keys: Keys) -> tuple[Workspace, Keys]:
@@ -317,18 +338,18 @@ _LINE = 1.25
 
 
 def draw_strokes(work: Workspace, pointer: PointerContext) -> None:
-    """Draw the strokes as dots, green on the object and red next to it, from any camera."""
+    """Draw the strokes as dots on the visible surface, green on the object and red next to it.
+
+    They are hidden under a preview or another image, and while the picture moves.
+    """
     rows = strokes_of(work) if work.view.select.tool == "scribble" else None
-    if rows is None:
+    moves = work.transient.tool.drag is not None or work.glide is not None
+    if rows is None or moves or work.transient.cover is not None:
         return
     density = imgui.get_io().display_framebuffer_scale
     canvas = imgui.get_background_draw_list()
-    camera = pointer.camera(work.view.camera)
-    scene = pointer.scene
-    for some, color in zip(rows, (_ON_COLOR, _BESIDE_COLOR), strict=True):
-        some = some[:: len(some) // _MAX_DOTS + 1]
-        at = project_centers(scene[torch.from_numpy(some)], camera).points
-        for x, y in at[np.isfinite(at).all(axis=1)].tolist():
+    for at, color in zip(pointer.visible_dots(rows), (_ON_COLOR, _BESIDE_COLOR), strict=True):
+        for x, y in at.tolist():
             center = ((x + pointer.left) / density.x, y / density.y)
             canvas.add_circle_filled(center, 2.0 * pointer.ui.scale, u32(color))
 

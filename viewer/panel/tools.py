@@ -66,6 +66,7 @@ _TOOLS = (
         ("select_tool:sphere", Icon.SPHERE),
         ("select_tool:flood", Icon.FLOOD),
         ("select_tool:color", Icon.COLOR),
+        ("select_subject", Icon.SUBJECT),
     ),
     (("paint_tool:color", Icon.COLOR_BRUSH), ("paint_tool:clone", Icon.CLONE)),
     (("brush", Icon.BRUSH), ("decal", Icon.DECAL), ("move_selected", Icon.MOVE)),
@@ -179,9 +180,16 @@ class _Bar:
 
 
 def draw_options(
-    work: Workspace, area: Area, ui: UiContext, actions: list[Action]
+    work: Workspace, area: Area, ui: UiContext, actions: list[Action], tip_text: str = ""
 ) -> tuple[Workspace, float]:
     """Draw the bar at the top of the picture: options of the active tool, and actions for the selection.
+
+    Args:
+        work: the workspace
+        area: the picture
+        ui: fonts and scale
+        actions: receives the commands of pressed buttons
+        tip_text: next step with the active tool, "" for none
 
     Returns:
         The changed workspace; the y of the bar's lower edge, 0 if there is none.
@@ -205,6 +213,10 @@ def draw_options(
         elif view.select.tool:
             imgui.text(view.select.tool.capitalize())
             view = replace(view, select=_select_options(view.select, bar))
+            if tip_text:
+                bar.follow(imgui.calc_text_size(tip_text).x)
+                imgui.align_text_to_frame_padding()
+                imgui.text_colored(imgui.ImVec4(*PALETTE.accent), tip_text)
         else:
             imgui.dummy((0.0, imgui.get_frame_height()))
         paints = view.brush.active or view.color_brush.tool or view.painted

@@ -18,7 +18,7 @@ from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.rasterize import reference
 from progdf.rasterize.engines import ALPHA_MAX, ALPHA_MIN, RasterView, activate
-from progdf.scene.selection import Surface
+from progdf.scene.selection import Floats, Mask, Surface
 from viewer.camera.view_camera import Vec3
 from viewer.state.layers import is_visible
 from viewer.state.view_state import ViewState
@@ -158,6 +158,20 @@ class Surfaces:
         self._key: object = None
         self._surface: Surface | None = None
         self._colors = False
+        self._dots_key: object = None
+        self._dots = (np.zeros((0, 2), np.float32), np.zeros(0, bool))
+
+    def dots(self, key: object, find: Callable[[], tuple[Floats, Mask]]) -> tuple[Floats, Mask]:
+        """Return the positions of a picture's dots [M,2] and a mask of the visible ones [M], found once.
+
+        Args:
+            key: identifies the picture and the dots
+            find: returns the two
+        """
+        if key != self._dots_key:
+            self._dots = find()
+            self._dots_key = key
+        return self._dots
 
     def at(self, key: object) -> Surface | None:
         """Return the surface of a picture if it is prepared or in preparation, else None."""

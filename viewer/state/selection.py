@@ -189,6 +189,7 @@ CHANGES_BY_NEIGHBORS: dict[str, Callable[[Neighborhood, Mask], Mask]] = {
     "select_smooth": Neighborhood.smooth,
     "select_largest": Neighborhood.largest_part,
     "select_refine": Neighborhood.refine,
+    "refine_anyway": Neighborhood.refine,
 }
 _CHANGES: dict[str, Callable[[SelectionState, Mask], SelectionState]] = {
     "select_all": lambda state, mask: select(state, np.ones_like(mask)),

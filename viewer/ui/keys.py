@@ -192,6 +192,7 @@ TOPICS: dict[str, tuple[Command, ...]] = {
             "select_tool:flood", "Flood selection", "J", f"Click: connected splats of similar color. {MODES}"
         ),
         Command("select_tool:color", "Color selection", "I", f"Click: all splats of similar color. {MODES}"),
+        Command("select_subject", "Select subject", "Shift+J", "The object in the middle of the view"),
         *_row("← → ↑ ↓", "Tool pointer; Shift far", _points()),
         Command(
             "point_press",

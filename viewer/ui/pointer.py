@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.painting.projection import ViewSurface, fitted_surface, is_apart, view_surface
-from progdf.scene.selection import Surface
+from progdf.scene.scribbles import Rows
+from progdf.scene.selection import Floats, Mask, Surface
 from viewer.camera.view_camera import ViewCamera, half_camera, half_scale, to_camera
 from viewer.render.engine import ViewEngine
 from viewer.render.paint_overlay import PaintOverlay, pixels_of, quick_under, surface_key
@@ -27,6 +28,7 @@ from viewer.state.workspace import SceneFacts
 from .context import UiContext
 from .overlay import Area
 
+_MAX_DOTS = 300  # dots of a stroke
 _SURFACE = ("means", "quats", "log_scales", "logit_opacities", "sh0")
 """Attributes of a scene that `Surface` and picking read."""
 
@@ -93,6 +95,20 @@ class PointerContext:
     def surface(self) -> Surface:
         """Surface of the picture for tools; valid until another strength is drawn."""
         return self.surfaces.at(self._surface_key) or Surface(self.scene, self.camera(self.shown.camera))
+
+    def visible_dots(self, strokes: tuple[Rows, Rows]) -> tuple[Floats, Floats]:
+        """Return the positions of two strokes' Gaussians on the front surface, pixels. [M,2], [K,2]"""
+        thinned = [rows[:: len(rows) // _MAX_DOTS + 1] for rows in strokes]
+        rows = np.concatenate(thinned)
+        key = self._surface_key, rows.tobytes()
+
+        def find() -> tuple[Floats, Mask]:
+            surface = self.surface
+            return surface.centers.points[rows], surface.front(rows)
+
+        points, front = self.surfaces.dots(key, find)
+        first = len(thinned[0])
+        return points[:first][front[:first]], points[first:][front[first:]]
 
     def look_ahead(self) -> None:
         """Compute in another thread the data of a still picture that the active tool will need."""
