@@ -165,7 +165,7 @@ def shown_colors(scene: Gaussians, camera: Camera, front: Mask) -> Floats:
     scale = min(1.0, _SHOWN_PX / max(camera.width, camera.height))
     small = camera.resize(*(max(1, round(side * scale)) for side in (camera.width, camera.height)))
     with torch.no_grad():
-        picture = srgb_to_oklab(_uncovered(render(scene, small, (0.0, 0.0, 0.0)))).float()
+        picture = srgb_to_oklab(_opaque_colors(render(scene, small, (0.0, 0.0, 0.0)))).float()
         for channel in range(3):
             # the mask is 0 to 1; a and b are -0.5 to 0.5
             offset = 0.5 if channel else 0.0
@@ -182,7 +182,7 @@ def pixel_color(scene: Gaussians, camera: Camera, x: float, y: float) -> Floats:
     row = int(y)
     with torch.no_grad():
         pixel = render(scene, camera, (0.0, 0.0, 0.0), crop=(column, row, column + 1, row + 1))
-        color: Floats = srgb_to_oklab(_uncovered(pixel))[0, 0].float().numpy()
+        color: Floats = srgb_to_oklab(_opaque_colors(pixel))[0, 0].float().numpy()
     return color
 
 
@@ -200,7 +200,7 @@ def main_rows(rows: NDArray[np.int64], shares: NDArray[np.floating]) -> NDArray[
     return rows[shares >= min(_MIN_SEED_SHARE, float(shares.max()))]
 
 
-def _uncovered(drawn: Rendering) -> torch.Tensor:
+def _opaque_colors(drawn: Rendering) -> torch.Tensor:
     """Return the color of a rendering on black without the background, 0 to 1. [H,W,3]"""
     alpha = (1.0 - drawn.transmittance[..., None]).clamp_min(1e-6)
     return (drawn.image / alpha).clamp(0.0, 1.0)

@@ -15,7 +15,7 @@ import torch
 from benchmarks import __main__ as front
 from benchmarks.table import Table
 from benchmarks.viewer import frames as bench_frames
-from benchmarks.viewer import moving, painting, popping
+from benchmarks.viewer import moving, painting, popping, subject
 from benchmarks.viewer import slider as bench
 from benchmarks.viewer import window as bench_window
 from benchmarks.viewer.display import missing_tools
@@ -313,3 +313,14 @@ def test_painting_benchmark_measures_a_stroke(monkeypatch: pytest.MonkeyPatch) -
     ctx.release()
     assert (len(times.dabs), len(times.turning)) == (3, 2)
     assert min(*times.dabs, *times.turning, times.press, times.release) > 0.0
+
+
+def test_subject_table_has_an_overlap_per_view(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(subject, "bear", lambda: bear(6000))
+    monkeypatch.setattr(subject, "SIZE", (160, 100))
+    (table,) = subject.tables(plot=tmp_path / "subject.png")
+    assert len(table.rows) == 1
+    assert all(float(cell) > 0.9 for cell in table.rows[0][2 : 2 + len(subject.VIEWS)])
+    assert (tmp_path / "subject.png").is_file()
+    with pytest.raises(ProgdfError, match="labels"):
+        subject.tables([tmp_path / "scene.ply"])
