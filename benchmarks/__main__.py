@@ -117,6 +117,7 @@ def main(argv: Sequence[str]) -> int:
         "pictures",
         "spill",
         "recolors",
+        "subject",
     )
     if options.scenes and options.what and not set(drawing) & set(options.what):
         raise ProgdfError(f"--scenes are for {', '.join(drawing)}; use python -m benchmarks viewer")
