@@ -53,7 +53,7 @@ TOOLBAR_PX = 40.0  # width at 1×
 EDGE_PX = 8.0  # distance from the picture's edges
 NARROW_PX = 560.0  # below this picture width the options may cover the axes
 _SIDE_PX = 32.0  # size of a button
-_MIN_PX = 22.0  # minimum size of a button, in a low window
+_MIN_PX = 20.0  # minimum size of a button, in a low window
 _PAD_PX = 4.0  # padding around the buttons
 _TOOLS = (
     (("navigate:orbit", Icon.ORBIT), ("navigate:fly", Icon.FLY)),
