@@ -15,7 +15,7 @@ from progdf.gdf.file import Gdf
 
 from .follow import COLORS, changes_shape, find_rims
 from .layers import Layer
-from .overlap import ARRANGED, Overlap, PaintRows, opacities, overlaps_below, paint_layers, paint_order
+from .overlap import ARRANGED, PaintRows, opacities, overlaps_below, paint_layers, paint_order
 from .overlap_kernel import (
     add_tints,
     color_rims,
@@ -30,6 +30,7 @@ from .overlap_kernel import (
     write_colors,
     write_logits,
 )
+from .paint_sheets import Overlap
 from .states import MakeComposer, States
 
 Floats = NDArray[np.float32]
