@@ -26,11 +26,12 @@ before and after [E,2,3]; the turn as a matrix, times the scale [E,3,3]; opacity
 drawn, before and after [E,2].
 """
 
-Blends = tuple[Doubles, NDArray[np.bool_]]
+Blends = tuple[Doubles, NDArray[np.bool_], NDArray[np.bool_]]
 """Mean motion of the anchors of each added row, which is measured when one of them changes.
 
 Matrix and shift of the affine map of the center, turn as a unit quaternion, mean change of the log-scales,
-and factor of the opacity [F,18]; geometry or opacity of an anchor differs [F,2].
+and factor of the opacity [F,18]; geometry or opacity of an anchor differs [F,2]; states whose motion has
+changed in this update [E], or [0] without any.
 """
 
 _MIN_DRAWN_OPACITY = 1 / 255  # as in `follow`
@@ -127,7 +128,7 @@ def rest_motions(before: Floats) -> Motions:
     return moves, turns, means, matrices, np.repeat(visible[:, None], 2, axis=1)
 
 
-def rest_blends(count: int) -> Blends:
+def rest_blends(count: int) -> tuple[Doubles, NDArray[np.bool_]]:
     """Return the blends of rows whose anchors are as in the original."""
     return np.zeros((count, 18)), np.zeros((count, 2), np.bool_)
 
@@ -205,7 +206,6 @@ def carry_fast(
     states: tuple[Floats, Shapes],
     motions: Motions,
     blends: Blends,
-    touched: NDArray[np.bool_],
 ) -> float:
     """Write rows that follow their anchors; return the largest squared movement of a center.
 
@@ -219,8 +219,8 @@ def carry_fast(
         states: states in the original [E,11], and composed. [E,c] each
         motions: motions of the states
         blends: mean motions of the anchors of added rows; updated in place
-        touched: states whose motion has changed. [E], or [0] without any
     """
+    touched = blends[2]
     own, drawn = kept
     rows, edits, own_states, anchors, weights = table
     before, after = states

@@ -212,8 +212,7 @@ class Surface:
                 self._follows,
                 (self._before, states),
                 self._motions,
-                self._blends,
-                touched,
+                (*self._blends, touched),
             ),
             count,
         )
