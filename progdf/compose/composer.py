@@ -304,15 +304,22 @@ class Composer:
         return self._meets[pair]
 
     def _write_adjusted(self, layers: Sequence[Layer], rows: Rows, names: Sequence[str]) -> float:
-        """Write rows with the reference implementation; return the largest movement of a center."""
+        """Write rows with the reference implementation; return the largest movement of a center.
+
+        Other rows are left as they are, because they may follow their anchors or lie in the order of paint.
+        """
         covers = {id(gdf): self._coverage_of(edit) for edit, gdf in enumerate(self._gdfs)}
         at, new = changed_rows(self._scene, layers, "adjust", lambda _, gdf: covers[id(gdf)])
+        changed = at.numpy()
+        is_written = np.isin(changed, rows, assume_unique=True)
+        written = changed[is_written]
         largest = 0.0
         for name in names:
             before = self._after[name][rows]
             self._after[name][rows] = self._before[name][rows]
             if name in new:
-                self._after[name][at.numpy()] = new[name].float().reshape(len(at), -1).numpy()
+                values = new[name].float().reshape(len(at), -1).numpy()
+                self._after[name][written] = values[is_written]
             if name == "means":
                 steps = np.square(self._after[name][rows] - before).sum(axis=1)
                 largest = math.sqrt(float(steps.max(initial=0.0)))

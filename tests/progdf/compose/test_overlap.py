@@ -106,6 +106,28 @@ def test_composer_changes_one_layer_at_a_time_like_compose(scene: Gaussians, nam
         torch.testing.assert_close(pack(composer.gaussians, True), plain, atol=1e-5, rtol=1e-5)
 
 
+def test_adjust_leaves_rows_of_unchanged_layers_on_their_surface(scene: Gaussians) -> None:
+    paints = [rimmed(painted(scene, 45, seed, f"paint {seed}"), seed) for seed in (9, 12)]
+    everything = from_mask("all", torch.ones(COUNT, dtype=torch.bool))
+    motion = similarity((1, 0, 2), (0.2, 0, 0), 0.7)
+    below = [
+        edit_of(scene, some_rows(scene, 120, 2), curved_field(120, 2, moving=("sh0",)), "tint"),
+        whole_grade(scene),
+        tidy(scene, [Step("transform", everything, motion)], "move"),
+    ]
+    composer = Composer(scene, [*paints, *below])
+    for strength in (0.6, 0.9, 0.2):
+        layers = [*(Layer(gdf, 0.6) for gdf in below), Layer(paints[0], 0.6), Layer(paints[1], strength)]
+        before = pack(composer.gaussians, True)
+        change = composer.update(layers, "adjust")
+        after = pack(composer.gaussians, True)
+        none = [Layer(gdf, 0.0) for gdf in [*paints, *below]]
+        plain = pack(compose_layers(scene, [*none, *layers], "adjust"), True)
+        torch.testing.assert_close(after, plain, atol=1e-5, rtol=1e-5)
+        changed = (after != before).any(dim=1).nonzero()[:, 0].tolist()
+        assert set(changed) <= set(change.rows.tolist())
+
+
 @pytest.mark.parametrize("dragged", [0, 1, 2])
 def test_dragged_paint_on_a_moving_and_fading_surface_is_like_compose(scene: Gaussians, dragged: int) -> None:
     below = edit_of(scene, some_rows(scene, 200, 3), curved_field(200, 3), "below")
