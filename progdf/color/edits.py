@@ -83,10 +83,10 @@ def typical_color(rgb: Tensor, weights: Tensor | None = None) -> Tensor:
 
 @dataclass(frozen=True)
 class RegionColor:
-    """Measured color of a region, to which color edits of the region are relative."""
+    """Measured color of a region. Color edits of the region are relative to it."""
 
     color: Tensor  # typical color, sRGB 0 to 1. [3]
-    shading: Shading  # of its colors
+    shading: Shading  # lightness range of all colors of the region
 
     def describe(self) -> str:
         """Return the color and the limit of its highlights as words for the log."""
@@ -94,17 +94,22 @@ class RegionColor:
 
 
 def measure_color(rgb: Tensor, weights: Tensor | None = None) -> RegionColor:
-    """Measure the typical color and the shading of a region. [...,3], [...] or None
+    """Measure the typical color and the shading of a region.
 
     The typical color is the median in OKLab. Compute it once over the whole region (all views, all members)
     and pass it to every edit there. The edit is then the same function of color in each view.
+
+    Args:
+        rgb: colors of the region, sRGB 0 to 1. [...,3]
+        weights: visible area of each color, ≥ 0; None if all are equal. [...]
     """
     lab = srgb_to_oklab(rgb.clamp(0, 1)).reshape(-1, 3)
     shares = torch.ones_like(lab[:, 0]) if weights is None else weights.reshape(-1).to(lab)
     shading = measure_shading(lab[:, 0], shares)
     if not float(shares.sum()) > 0:
         return RegionColor(oklab_to_srgb(lab.new_tensor([shading.typical, 0.0, 0.0])).clamp(0, 1), shading)
-    a, b = (weighted_quantiles(lab[:, i], shares, (0.5,))[0] for i in (1, 2))
+    a = weighted_quantiles(lab[:, 1], shares, (0.5,))[0]
+    b = weighted_quantiles(lab[:, 2], shares, (0.5,))[0]
     return RegionColor(oklab_to_srgb(lab.new_tensor([shading.typical, a, b])).clamp(0, 1), shading)
 
 
@@ -150,8 +155,8 @@ def tint_course(rgb: Tensor, target: Tensor, source: RegionColor, path: ColorPat
 def tint_fully(rgb: Tensor, target: Tensor, source: RegionColor) -> Tensor:
     """Tint at full strength: move hue and chroma most of the way to the target's. [...,3] -> [...,3], 0 to 1
 
-    The lightness is unchanged where sRGB has the tint. If it lacks the tinted typical color, as for white,
-    that moves to the nearest lightness at which sRGB has it, and the shading follows.
+    The lightness is unchanged where sRGB has the tint. If sRGB lacks the tinted typical color, as for white,
+    the typical color moves to the nearest lightness at which sRGB has it. The other lightness follows it.
     """
     lab = srgb_to_oklab(rgb.clamp(0, 1))
     goal = srgb_to_oklab(_as_tensor(target, rgb))
@@ -299,7 +304,13 @@ def number_of(text: str) -> float:
 
 
 def measure_grade(grade: ColorGrade, rgb: Tensor, weights: Tensor) -> ColorGrade:
-    """Return the grade with the shading of its palette measured in a region's colors. [N,3], [N]"""
+    """Return the grade with the shading of its source colors, measured in a region.
+
+    Args:
+        grade: the grade; without a palette, it is returned unchanged
+        rgb: colors of the region, sRGB 0 to 1. [N,3]
+        weights: visible area of each color, ≥ 0. [N]
+    """
     if not grade.palette:
         return grade
     sources = srgb_to_oklab(torch.stack([source for source, _ in grade.palette]))

@@ -6,9 +6,9 @@ weights w_i are an interpolation by Gaussian kernels (Chang et al., Palette-base
 source whose target is itself is unchanged. The weights of several sources sum to 1, so each color follows the
 sources near it. With a single source, colors far from it are unchanged.
 
-The shift of a color lighter or darker than the source is that of new paint in the same light, see `shading`.
-f_i is 1, and falls to 0 for highlights as far as they lack the source's own color. The curve of each source
-bends the lightness by the same weights.
+A color that is lighter or darker than the source shifts like new paint in the same light, see `shading`. f_i
+is 1 for diffuse colors. For highlights it falls to the share of the source's own color in them. With a single
+source it is this share for all colors. The curve of each source bends the lightness by the same weights.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ _KERNEL_WIDTH_SHARE = (
 )
 _MIN_KERNEL_WIDTH = 0.04  # smallest standard deviation of the kernel
 _SINGLE_KERNEL_WIDTH = 0.055  # standard deviation of the kernel of a single gray source, in hue and chroma
-_CHROMA_WIDTH_SHARE = 0.3  # addition to its square: that of this share of the source's chroma
-_SHADOW_WIDTH = 0.08  # standard deviation of this kernel in lightness, below the source's shading
+_CHROMA_WIDTH_SHARE = 0.3  # further deviation for colored sources, as a share of the source's chroma
+_SHADOW_WIDTH = 0.08  # deviation of the kernel of a single source in lightness, below its shading
 _SHADING_REACH = 0.16  # lightness below a single source within which its shading is measured
-_CAST_CHROMA = 0.04  # chroma that colored light gives a white surface
+_WHITE_CHROMA = 0.04  # chroma up to which a surface may be white in colored light
 _COLORED_CHROMA = 0.12  # chroma from which a surface is clearly colored
 _ITERATIONS = 20  # iterations of k-means
 _CELL_SIDE = 0.04  # side of the cells in which colors are counted
@@ -139,7 +139,7 @@ def source_weights(colors: Tensor, sources: Tensor, shadings: Sequence[Shading] 
     Args:
         colors: OKLab colors. [N,3]
         sources: source colors, OKLab. [k,3]
-        shadings: measured shading of each source; empty for a single source: any shading
+        shadings: measured shading of each source; only used for a single source
     """
     if len(sources) == 1:
         return _single_weight(colors, sources[0], shadings[0] if shadings else Shading(float(sources[0, 0])))
@@ -158,8 +158,8 @@ def source_weights(colors: Tensor, sources: Tensor, shadings: Sequence[Shading] 
 def _single_weight(colors: Tensor, source: Tensor, shading: Shading) -> Tensor:
     """Return the weight of a single source: 1 on its surface in any light. OKLab [N,3], [3] -> [N,1]
 
-    It falls with the distance from the source's hue and chroma, scaled to the color's lightness, and with the
-    distance below the range of its shading.
+    It falls with the distance from the source's hue and chroma, whose chroma is scaled to the color's
+    lightness. It also falls with the distance below the range of the source's shading.
     """
     own_ab = relight(colors[:, 0], shading, source).chroma[:, None] * source[1:]
     aside = colors[:, 1:] - _presence(colors, own_ab)[:, None] * own_ab
@@ -170,12 +170,17 @@ def _single_weight(colors: Tensor, source: Tensor, shading: Shading) -> Tensor:
 
 
 def measure_palette(lab: Tensor, weights: Tensor, sources: Tensor) -> tuple[Shading, ...]:
-    """Measure the shading of each source in the colors of a region, by their weight for the source.
+    """Measure the shading of each source from the colors of a region.
+
+    Each color counts by its visible area times its weight for the source, see `source_weights`.
 
     Args:
         lab: OKLab colors of the region. [N,3]
         weights: visible area of each color, ≥ 0. [N]
         sources: source colors, OKLab. [k,3]
+
+    Returns:
+        One shading per source; its typical lightness is the source's.
     """
     near = [
         Shading(float(lightness), shadow=float(lightness) - _SHADING_REACH) for lightness in sources[:, 0]
@@ -206,19 +211,19 @@ def _paint_shift(colors: Tensor, source: Tensor, target: Tensor, shading: Shadin
 def _presence(colors: Tensor, own_ab: Tensor) -> Tensor:
     """Return the share of a surface's own color in colors, 0 to 1. OKLab [N,3], [N,2] -> [N]
 
-    A white highlight on a colored surface has none of it. On a nearly white surface, every gray has all.
+    It is 0 for a white highlight on a colored surface, and 1 for every gray on a nearly white surface.
     """
     energy = own_ab.square().sum(dim=1)
     share = (colors[:, 1:] * own_ab).sum(dim=1) / energy.clamp_min(1e-6)
-    is_colored = smoothstep(energy.sqrt(), _CAST_CHROMA, _COLORED_CHROMA)
+    is_colored = smoothstep(energy.sqrt(), _WHITE_CHROMA, _COLORED_CHROMA)
     return 1.0 - is_colored * (1.0 - share.clamp(0, 1))
 
 
 def with_highlights(curve: Curve) -> Curve:
-    """Return the curve with an end at white that adds the light above its last point.
+    """Return the curve of a source color with an end for highlights.
 
-    Above the last point (x, y) of a surface's curve, its end adds as much light to y as white has above x.
-    A curve with a point at 1, and an empty curve, are unchanged.
+    With the last point (x, y), the end maps white to y plus the linear light that white has above x. A curve
+    with a point at 1, and an empty curve, are unchanged.
     """
     if not curve or curve[-1][0] >= 1.0:
         return curve

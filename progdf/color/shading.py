@@ -3,12 +3,11 @@
 A color is the surface's own color in more or less light, plus highlights in the color of the light (the
 dichromatic reflection model, Shafer 1985). New paint keeps both parts:
 
-- Diffuse lightness is scaled, as in the same light. The slope falls where the region's own range of
-  lightness would exceed white, or the gamut at the paint's chroma.
-- Highlights start above the region's own range of diffuse lightness. They add the same light to the new
-  color.
+- Diffuse lightness is scaled, as in the same light. The scale of lighter parts is smaller if the region's
+  range of lightness would otherwise exceed white, or the gamut at the paint's chroma.
+- Highlights start above the region's range of diffuse lightness. They add the same light to the new color.
 
-So white paint, whose range reaches white, has no highlights that would stay white.
+The range of white paint reaches white. It therefore has no highlights that would stay white.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ Of normally distributed lightness, a kink of this ratio keeps a correlation of 0
 
 _FENCE = 1.5  # interquartile ranges above the upper quartile at which outliers begin (Tukey's fence)
 _EPSILON = 1e-3  # smallest lightness and lightness range, against division by 0
-_BISECTIONS = 12  # to 2e-4 of lightness
+_BISECTIONS = 12  # steps to an accuracy of 2e-4 in lightness
 _GAMUT_TOLERANCE = 1e-3  # accepted excess over the sRGB range
 
 
@@ -134,8 +133,13 @@ def _diffuse_part(lightness: Tensor, shading: Shading) -> Tensor:
 def paint_lightness(shading: Shading, lightness: float) -> float:
     """Return the lightness of a paint on a surface, within the range that leaves room for the shading.
 
-    White paint leaves room for the surface's lighter parts. Black paint is at least `BLACK_PAINT`, unless the
-    surface is darker.
+    White paint is darkened so far that the surface's lighter parts stay distinct. Black paint is at least
+    `BLACK_PAINT`, unless the surface is darker.
+
+    Args:
+        shading: measured range of the surface
+        lightness: chosen OKLab lightness of the paint, 0 to 1
+
     """
     start = max(shading.typical, _EPSILON)
     room = max(shading.highlight, start) - start
@@ -145,7 +149,13 @@ def paint_lightness(shading: Shading, lightness: float) -> float:
 
 
 def _slopes(shading: Shading, goal: float, paint: Tensor) -> tuple[float, float]:
-    """Return the slopes of the new lightness below and above the typical one."""
+    """Return the slopes of the new lightness over the old, below and above the typical lightness.
+
+    Args:
+        shading: measured range of the surface
+        goal: lightness that the typical one becomes, 0 to 1
+        paint: OKLab color of the paint. [3]
+    """
     start = max(shading.typical, _EPSILON)
     gain = goal / start
     room = max(shading.highlight - start, _EPSILON)
@@ -159,7 +169,7 @@ def _slopes(shading: Shading, goal: float, paint: Tensor) -> tuple[float, float]
 def brightest_lightness(lightness: float, ab: Tensor) -> float:
     """Return the largest lightness from `lightness` on at which sRGB has the chroma and hue `ab`. [2]
 
-    If sRGB has not this color at `lightness`, the result is `lightness`.
+    If sRGB does not have this color at `lightness`, the result is `lightness`.
     """
     return _last_inside(lightness, 1.0, ab)
 
@@ -167,7 +177,7 @@ def brightest_lightness(lightness: float, ab: Tensor) -> float:
 def nearest_lightness(lightness: float, ab: Tensor) -> float:
     """Return the lightness nearest to `lightness` at which sRGB has the chroma and hue `ab`. [2]
 
-    If there is none, the result is the lightness at which sRGB has most of that chroma.
+    If there is none, the result is the lightness at which the color exceeds the sRGB range least.
     """
     steps = torch.linspace(0, 1, 512)
     excess = _excess(steps, ab)
@@ -180,6 +190,7 @@ def nearest_lightness(lightness: float, ab: Tensor) -> float:
 
 
 def _last_inside(low: float, high: float, ab: Tensor) -> float:
+    """Return the largest lightness from `low` to `high` at which sRGB has the chroma and hue `ab`. [2]"""
     if float(_excess(torch.tensor([high]), ab)) <= _GAMUT_TOLERANCE:
         return high
     for _ in range(_BISECTIONS):

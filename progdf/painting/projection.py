@@ -28,7 +28,7 @@ OPAQUE = 0.5
 
 _SAME_SURFACE_DEVIATIONS = 2.0  # paint this far behind the blended depth lies on the visible surface
 _QUICK_SAMPLES = 400  # pixels to which a quick model is fitted
-_EXPLAINED_SHARE = 0.9  # share of these pixels that the model must explain
+_EXPLAINED_SHARE = 0.9  # smallest share of these pixels that a model must explain
 _NEAR_PX = 5  # window of the largest deviation near a pixel, pixels
 _MEDIAN_PX = 9  # window of the median of depths, pixels
 _SMOOTH_SIGMA_PX = 5.0  # sigma of the Gaussian filter over depths, pixels
@@ -104,7 +104,7 @@ def quick_surface(seen: ViewSurface, painted: NDArray[np.bool_]) -> ViewSurface:
 
     `fitted_surface` is the plain version. It also uses the depths of views around the paint, and chooses the
     models by their prediction of left-out parts. Here each connected part of the paint has one model, which
-    is fitted to the view's own depths. Parts that one model does not explain have their smoothed depth.
+    is fitted to the view's own depths. If that model does not explain a part, its smoothed depth is used.
 
     Args:
         seen: surface that the view shows
@@ -118,13 +118,13 @@ def quick_surface(seen: ViewSurface, painted: NDArray[np.bool_]) -> ViewSurface:
             max(rows.start - _MEDIAN_PX, 0) : rows.stop + _MEDIAN_PX,
             max(columns.start - _MEDIAN_PX, 0) : columns.stop + _MEDIAN_PX,
         ]
-        mine = (parts[part] == label) & np.isfinite(seen.depth[part])
-        depth[part][mine] = _quick_depth(seen, part, mine & is_painted[part])[mine]
+        inside = (parts[part] == label) & np.isfinite(seen.depth[part])
+        depth[part][inside] = _quick_depth(seen, part, inside & is_painted[part])[inside]
     return replace(seen, depth=depth, is_model=True)
 
 
 def _quick_depth(seen: ViewSurface, part: tuple[slice, slice], painted: NDArray[np.bool_]) -> Floats:
-    """Return the depth of a part of a view by one model of its painted pixels, or smoothed. [h,w]
+    """Return the depth of a part of a view, by one model of its painted pixels or smoothed. [h,w]
 
     Args:
         seen: see `quick_surface`
@@ -158,7 +158,7 @@ def _quick_depth(seen: ViewSurface, part: tuple[slice, slice], painted: NDArray[
 
 
 def _smooth_depth(depth: Floats, deviation: Floats) -> Floats:
-    """Return depths without noise. Differences beyond the light's own depth are edges and remain. [h,w]
+    """Return depths without noise; steps beyond the depth range of the light are edges and remain. [h,w]
 
     Args:
         depth: infinite where there is no surface; the nearest depth is used there. [h,w]
@@ -173,7 +173,7 @@ def _smooth_depth(depth: Floats, deviation: Floats) -> Floats:
 
 
 def _fill_depth(depth: Floats) -> Floats:
-    """Return depths with the nearest one where there is no surface. [h,w]"""
+    """Return depths in which pixels without a surface have the depth of the nearest pixel with one. [h,w]"""
     nearest = ndimage.distance_transform_edt(~np.isfinite(depth), return_distances=False, return_indices=True)
     filled: Floats = depth[tuple(nearest)]
     return filled
