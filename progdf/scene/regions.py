@@ -11,10 +11,10 @@
             | 'lasso:' CAMERA ':' x,y,x,y,x,y,…     corners of a polygon, pixels
             | 'brush:' CAMERA ':' radius,x,y,…      points of a stroke, pixels
             | 'front:' CAMERA                    Gaussians on the surface that the camera sees
-            | 'color:' #rrggbb[,tolerance]       Gaussians of like color
-            | 'flood:' x,y,z[,tolerance]         like color, connected with the Gaussian nearest to a point
-            | 'flood:' CAMERA ':' x,y[,tolerance]   like the color of a pixel, connected with its Gaussians
-            | 'subject' [':' CAMERA]             object in the middle of a view; the scene's first view
+            | 'color:' #rrggbb[,tolerance]       Gaussians of similar color
+            | 'flood:' x,y,z[,tolerance]         similar color, connected with the Gaussian nearest to a point
+            | 'flood:' CAMERA ':' x,y[,tolerance]   color of a pixel, connected with the Gaussians in it
+            | 'subject' [':' CAMERA]             object in the middle of a view, by default the scene's first
             | KIND ':' …                         further kinds that the caller supports, e.g. masks:, text:
             | 'changed'                          if the caller supports edited pictures
     STEP    = ('grow' | 'shrink' | 'smooth') [':' TIMES] | 'largest' | 'refine' [':' PERCENT]
@@ -175,6 +175,7 @@ def _flood(scene: Gaussians, point: tuple[float, float, float], tolerance: float
 
 
 def _flood_from_pixel(scene: Gaussians, camera: Camera, at: tuple[float, float], tolerance: float) -> Mask:
+    """Select the connected Gaussians that show the color of a pixel; none for a pixel outside the picture."""
     nothing = np.zeros(len(scene), bool)
     if not (0 <= at[0] < camera.width and 0 <= at[1] < camera.height):
         return nothing

@@ -151,9 +151,9 @@ def base_colors(scene: Gaussians) -> Floats:
 
 
 def shown_colors(scene: Gaussians, camera: Camera, front: Mask) -> Floats:
-    """Return the color that each Gaussian shows: the mean of the pixels that it draws, OKLab. [N,3]
+    """Return the color on screen of each Gaussian: the mean color of its pixels by its weight, OKLab. [N,3]
 
-    In a pixel many Gaussians blend, so that their own colors may be far from the color on screen. Gaussians
+    Many Gaussians blend in a pixel, so their own colors may differ much from the color on screen. Gaussians
     behind the front surface or outside the picture keep their own color, see `base_colors`.
 
     Args:
@@ -187,7 +187,7 @@ def pixel_color(scene: Gaussians, camera: Camera, x: float, y: float) -> Floats:
 
 
 def rows_at_pixel(scene: Gaussians, camera: Camera, x: float, y: float) -> tuple[NDArray[np.int64], Floats]:
-    """Return the Gaussians that a pixel inside the picture shows [M], and their shares of its color [M]."""
+    """Return the Gaussians visible in a pixel of the picture, and their shares of its color. [M], [M]"""
     mask = torch.zeros(camera.height, camera.width)
     mask[int(y), int(x)] = 1.0
     shares = alpha_weights(scene, camera, mask)[:, 0].float().numpy()
@@ -300,6 +300,7 @@ class Surface:
             return front_surface(self.scene, self.camera, self.centers, rows)
 
     def _whole_front(self) -> Mask:
+        """Return the mask of all Gaussians on the front surface. [N]"""
         if self._front is not None:
             return self._front
         return front_surface(self.scene, self.camera, self.centers)

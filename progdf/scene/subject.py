@@ -65,7 +65,7 @@ _FIRST_FILLED = 0.72  # share of the first picture's width or height that the su
 _VIEW_PX = 160  # longer side of the picture in which the middle of a view is measured, pixels
 _MIDDLE_SPREAD = 0.5  # standard deviation of the weight of the middle, in half shorter sides of the picture
 _BORDER_SHARE = 0.03  # width of a picture's border, in shorter sides
-_MIN_MIDDLE_SHARE = 1 / 256  # smallest share of the weighted middle for a subject, a sixteenth of its sides
+_MIN_MIDDLE_SHARE = 1 / 256  # smallest share of a subject in the weighted middle: a 16th of each side
 _MAX_SUPPORTS = 3  # supports on top of each other, such as a rug, a table and a tray
 _MIN_RIM_SHARE = 0.8  # smallest share of the cells around the objects in which their support goes on
 
@@ -167,13 +167,13 @@ def first_view(scene: Gaussians, up: Tensor, size: tuple[int, int]) -> Camera:
 
 
 def select_subject(scene: Gaussians, neighborhood: Neighborhood, camera: Camera, up: Tensor) -> Mask:
-    """Select the object in the middle of a view: no networks, no strokes, nothing set by hand.
+    """Select the object in the middle of a view, without networks and strokes.
 
-    1. The object: of the connected groups that stand on the ground, the one with the largest visible share of
-       the view's middle. A support under it, such as a plinth or a table, is removed like the ground.
-    2. Its rim: a random walk from the object and from the ground decides every Gaussian, see `Scribbles`.
-    3. Hovering parts, which touch neither, join the object if they are nearer to it than to the background,
-       by at most its radius.
+    1. Object: of the connected groups that stand on the ground, the one with the largest visible share of the
+       view's middle. A support under it, such as a plinth or a table, is removed like the ground.
+    2. Boundary: a random walk from the object and from the ground decides every Gaussian, see `Scribbles`.
+    3. Hovering parts: parts that touch neither join the object if they are nearer to it than to the
+       background, and at most its radius away.
 
     Without a ground the whole scene is the object. If such a scene has a far background, the walk starts from
     the middle and from the border of the view.
@@ -190,9 +190,9 @@ def select_subject(scene: Gaussians, neighborhood: Neighborhood, camera: Camera,
     Raises:
         ProgdfError: the scene is a room, or nothing stands in the middle of the view.
     """
-    empty = ProgdfError("no subject in the middle of the view; turn the view to an object")
+    no_subject = ProgdfError("no subject in the middle of the view; turn the view to an object")
     if not len(scene):
-        raise empty
+        raise no_subject
     if is_room(scene, up):
         raise ProgdfError("a room has no single subject; select with Scribble, or name a point with flood:")
     size = max(camera.width, camera.height)
@@ -216,7 +216,7 @@ def select_subject(scene: Gaussians, neighborhood: Neighborhood, camera: Camera,
         reason = "no ground and no background"
     share = float(in_middle[on].sum() / middle.sum())
     if share < _MIN_MIDDLE_SHARE:
-        raise empty
+        raise no_subject
     mask = neighborhood.scribbles.select(on, beside)
     mask = _with_hovering_parts(scene, neighborhood, mask, beside)
     line = "subject: %s, %s; it covers %.0f %% of the middle of the view"
@@ -225,7 +225,7 @@ def select_subject(scene: Gaussians, neighborhood: Neighborhood, camera: Camera,
 
 
 def _middle_and_border(camera: Camera) -> tuple[Tensor, Tensor]:
-    """Return weights of a picture's pixels: a bell around its middle, and its border. [H,W] each"""
+    """Return weights of a picture's pixels: a Gaussian around its middle, and 1 on its border. [H,W] each"""
     shorter = min(camera.width, camera.height)
     x = torch.arange(camera.width) + 0.5 - camera.width / 2
     y = torch.arange(camera.height) + 0.5 - camera.height / 2
@@ -325,7 +325,10 @@ def _covered_cells(cell: Tensor) -> Mask:
 
 
 def _with_hovering_parts(scene: Gaussians, neighborhood: Neighborhood, mask: Mask, beside: Rows) -> Mask:
-    """Return a selection with the parts that touch neither it nor the background, but are nearer to it. [N]
+    """Return a selection extended by near parts that touch neither it nor the background. [N]
+
+    Such a part joins if it is nearer to the selection than to the background, and at most the selection's
+    radius away.
 
     Args:
         scene: N Gaussians
