@@ -380,7 +380,7 @@ class Composer:
             parts: members of layers that push them, lowest layer first
             name: attribute
             weight_sum: divisors of the sums; [0] if all are 1. [U]
-            kept: share of the changes by paint that remains; [0] if all do. [U]
+            kept: share of the changes by paint that remains, 0 to 1. [U]; [0] if all of them remain
         """
         if len(weight_sum):
             total /= weight_sum[:, None]
@@ -480,9 +480,8 @@ def _plan_paint(paint: PaintOrder, plan: _Plan, changed: frozenset[int]) -> _Pla
     """Return the plan extended by the rows of paint that depend on the changed edits."""
     dependents = [found for edit in changed if len(found := paint.dependents(edit))]
     rows = np.unique(np.concatenate([plan.rows, *dependents])) if dependents else plan.rows
-    painted, arranged = (
-        np.flatnonzero(np.isin(paint.paint.rows, chosen, assume_unique=True)) for chosen in (plan.rows, rows)
-    )
+    painted = np.flatnonzero(np.isin(paint.paint.rows, plan.rows, assume_unique=True))
+    arranged = np.flatnonzero(np.isin(paint.paint.rows, rows, assume_unique=True))
     return plan._replace(rows=rows, painted=painted, arranged=arranged)
 
 
@@ -495,9 +494,9 @@ def _between(part: _LayerSlice, first: int, last: int) -> _LayerSlice:
 
 
 def _kept_pushes(parts: Sequence[_LayerSlice], count: int) -> Floats:
-    """Return the share of the changes by paint that remains in each row, see `changed_rows`.
+    """Return the share of the changes by paint that remains in each row. [U]; [0] if all of them remain
 
-    Empty if all do. [U]
+    `_kept_pushes` of `progdf.compose.reference` is the plain version.
     """
     leaving = [part for part in parts if part.layer.leaves_paint]
     if not leaving:

@@ -41,7 +41,7 @@ def copy_rows(values: Floats, rows: Rows, own: Floats, index: Rows) -> None:
 def copy_colors(values: Floats, rows: Rows, own: Floats, color: Doubles, index: Rows) -> None:
     """Copy colors of paint from the scene; the arguments are as in `copy_rows`.
 
-    `color`: colors in the order of layers, which become the same. [A,3]
+    `color`: colors in the order of layers; updated in place to the same colors. [A,3]
     """
     for i in index:
         for c in range(3):
@@ -65,13 +65,13 @@ def restore_centers(means: Floats, rows: Rows, own: Floats, risen: Doubles, inde
 def add_tints(
     tints: Doubles, index: Rows, anchors: Rows, weights: Doubles, before: Floats, after: Floats
 ) -> None:
-    """Write the change of color of the surface beside the rows of rims.
+    """Write the color change of the surface beside rows of paint at a rim.
 
     Args:
         tints: change of each row of paint, updated in place. [A,3]
         index: indices of the rows to write. [F]
-        anchors, weights: states of their anchors, and weights. [F,4]
-        before, after: colors of the states in the original, and composed. [E,3]
+        anchors, weights: states of their anchors, and the weights of these. [F,4] each
+        before, after: colors of the states in the original, and composed. [E,3] each
     """
     for f in range(len(index)):
         for c in range(3):
@@ -190,7 +190,7 @@ def write_centers(
         rows: rows of the scene. [A]
         index: indices of the rows that may change. [K]
         own: centers without the order of layers. [A,3]
-        heights: distance by which each row rises; and by which it has risen, updated in place. [A] each
+        heights: distance by which each row rises; and that in the last picture, updated in place. [A] each
         outward: see `PaintRows`. [A,3]
         opacity: see `opacities`. [A]
     """
@@ -223,7 +223,7 @@ def write_logits(
         rows: rows of the scene. [A]
         index: indices of the rows that may change. [K]
         own: logits without the order of layers. [A,1]
-        factors: factor of the opacity of each row; and the last one, updated in place. [A] each
+        factors: factor of the opacity of each row; and the last such factor, updated in place. [A] each
         opacity: see `opacities`. [A]
     """
     kept, last = factors

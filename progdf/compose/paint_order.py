@@ -40,7 +40,7 @@ Rows = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class _RimOverlap:
-    """The part of an `Overlap` whose upper rows are rims."""
+    """Part of an `Overlap` whose upper rows are rims; the fields are as there."""
 
     over: Rows  # [R]
     under: Rows  # [R]
@@ -50,8 +50,8 @@ class _RimOverlap:
 class PaintOrder:
     """Rows of painted layers that depend on other layers, in their order; fast version of `arrange`.
 
-    It keeps the rows as they are without the order of layers. So the composer writes a row only if its own
-    edit changes.
+    It stores the rows as they are without the order of layers. The composer therefore writes a row only if
+    the row's own edit changes.
 
     Args:
         scene: the extended scene
@@ -103,7 +103,7 @@ class PaintOrder:
         return changed.union(*(self.paint.partners(edit) for edit in changed & self._painted))
 
     def dependents(self, edit: int) -> Rows:
-        """Return the rows that may change with an edit, besides its members. Sorted"""
+        """Return the rows of the scene, sorted, that may change with an edit besides its members."""
         chosen = []
         if edit in self._painted:
             partners = list(self.paint.partners(edit) - {edit})
@@ -173,7 +173,7 @@ class PaintOrder:
         return write_centers(values["means"], at, rows, self._means, heights, self.paint.outward, opacity)
 
     def _read(self, values: Mapping[str, Floats], written: Rows, names: Collection[str]) -> None:
-        """Keep the rows that the composer has written, without the order of layers."""
+        """Copy the rows that the composer has written, which are without the order of layers."""
         rows = self.paint.rows
         if not len(written):
             return

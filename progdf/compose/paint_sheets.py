@@ -28,7 +28,7 @@ _BLUR_THICKNESSES = 5.5  # standard deviation of a renderer's blur (0.3 px²), i
 _REACH_DEVIATIONS = 3.0  # extent of a disc, in standard deviations
 _WEIGHT_DEVIATIONS = float(np.sqrt(-2.0 * np.log(MIN_WEIGHT)))  # beyond it, a disc is beside a point
 _CORNER_DEVIATIONS = 1.5  # points at which the coverage of a row is measured, in its standard deviations
-_COVERED = (0.5, 0.95)  # least and full coverage at which a row fades
+_COVERED = (0.5, 0.95)  # coverage at which a row begins to fade, and at which it is gone
 _SCATTER_QUANTILE = 0.9  # quantile of the pushed Gaussians' movements; surfaces within it are the same one
 _NEAREST_PUSHED = 8  # pushed Gaussians whose movement gives the direction of the painted picture
 _CELLS_PER_DISC = 16  # limits the memory of a grid
@@ -54,7 +54,7 @@ class Overlap:
     rise: Floats  # distance by which the row has to rise to be above the lower layer. [P]
     hidden: Rows  # rows of the lower layer that the upper one covers. [H]
     above: Rows  # row of the upper layer that is most visible there. [H]
-    share: Floats  # share of them that fades below the upper layer at strength 1. [H]
+    share: Floats  # share of their opacity that fades below the upper layer at strength 1. [H]
 
 
 @dataclass(frozen=True)
@@ -64,8 +64,8 @@ class Sheet:
     points: Floats  # centers. [B,3]
     axes: Floats  # columns are the axes. [B,3,3]
     scales: Floats  # standard deviations along the axes. [B,3]
-    opacity: Floats  # [B]
-    outward: Floats  # [B,3]
+    opacity: Floats  # 0 to 1. [B]
+    outward: Floats  # directions away from the surface. [B,3]
     scatter: float  # distance from the surface within which Gaussians were pushed, world units
     key: bytes  # digest of all numbers on which the sheet depends
 
@@ -105,7 +105,7 @@ def find_sheet(scene: Gaussians, gdf: Gdf) -> Sheet:
 def find_overlap(upper: Sheet, lower: Sheet) -> Overlap | None:
     """Return the overlap of a layer above another, from the cache if it is there; None if they do not meet.
 
-    Its rows are indices of the rows that each edit adds.
+    Rows of the result are indices of the rows that each edit adds.
     """
     return _look_up(_OVERLAPS, upper.key + lower.key, partial(measure_overlap, upper, lower))
 
@@ -122,7 +122,7 @@ def _digest(name: str, parts: Sequence[Tensor]) -> bytes:
 def _look_up(cache: dict[bytes, Result], key: bytes, make: Callable[[], Result]) -> Result:
     """Return a result, from the cache if it is there.
 
-    A layer that is added to a stack, or taken from it, leaves the overlaps of the others as they are.
+    Adding a layer to a stack, or removing one, does not change the overlaps of the others.
     """
     if key not in cache:
         while len(cache) >= _MAX_REMEMBERED:
@@ -260,8 +260,8 @@ def make_grids(sheet: Sheet, distance: float) -> list[Grid]:
     discs = np.concatenate([*columns, sheet.outward, sheet.opacity[:, None]], axis=1)
     classes = np.floor(np.log2(np.maximum(scales[:, 2], 1e-30)))
     grids = []
-    for one in np.unique(classes):
-        ids = np.flatnonzero(classes == one)
+    for size_class in np.unique(classes):
+        ids = np.flatnonzero(classes == size_class)
         reach = _WEIGHT_DEVIATIONS * float(wide[ids, 1].max())
         grids.append(_make_grid(discs[ids], ids, float(np.hypot(reach, distance))))
     return grids

@@ -159,7 +159,7 @@ def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "norm
 
     Paint makes way for its discs by changes of the scene's Gaussians (see `Anchors.pushes`). These take no
     part in the rule. The largest such change of a Gaussian is added to the result of the other layers. It
-    vanishes by the strength of a layer that moves or removes the Gaussian without its paint.
+    fades in proportion to the strength of a layer that moves or removes the Gaussian without its paint.
 
     A layer of paint covers the layers of paint below it, see `progdf.compose.overlap`. Added rows follow the
     surface below them when other layers move, scale or fade it, see `progdf.compose.follow`.
@@ -386,7 +386,8 @@ def _largest_push(parts: Sequence[_LayerMembers], name: str, total: Tensor) -> T
 def _kept_pushes(parts: Sequence[_LayerMembers], count: int) -> Tensor:
     """Return the share of the changes by paint that remains in each row. [U,1]
 
-    Rows that are moved or removed without their paint return to their own state, by the strength of this.
+    Rows that a layer moves or removes without their paint return to their own state, in proportion to its
+    strength.
     """
     kept = torch.ones(count)
     for part in parts:
