@@ -1,9 +1,9 @@
 """Ground around a hole as a texture: the fitted surface of the remaining scene, rendered straight on.
 
-1. A plane through the hole's boundary gives the camera: it looks along the plane's normal, with the hole in
-   the middle and its long side along a picture's side.
-2. The simplest model of `progdf.surface` that predicts left-out samples around the hole is the surface.
-3. Only Gaussians at this surface are rendered, so that objects in front hide none of it.
+1. Fit a plane through the hole's boundary. A camera looks along its normal, with the hole in the middle and
+   the hole's long side along a side of the picture.
+2. Fit the surface: the simplest model of `progdf.surface` that predicts left-out samples around the hole.
+3. Render the ground without the Gaussians in front of this surface, so that they hide none of it.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ REACH_PX = 4.0
 """Largest distance, in pixels of a view, of a point from a surface that still belongs to it."""
 
 MAX_SIDE_PX = 448
-"""Largest side of the texture, pixels; bounds the time of the inpainting to some seconds."""
+"""Largest longer side of the texture, pixels; it limits the inpainting to some seconds."""
 
 _MIN_SIDE_PX = 96  # smallest longer side of the texture, pixels
-_DISTANCE_SIDES = 2.0  # camera distance, as a multiple of the longer side: the perspective is weak
+_DISTANCE_SIDES = 2.0  # camera distance, as a multiple of the longer side; far, for a weak perspective
 _OPAQUE_SHARE = 0.5  # alpha of a pixel of the ground, as a share of the typical alpha around the hole
-_ANGLE_STEP_DEG = 3  # tried rotations of the picture
+_ANGLE_STEP_DEG = 3  # step of the tried rotations of the picture, degrees
 _PIXEL_DEVIATIONS = 0.6  # side of a pixel, in standard deviations of a typical Gaussian
-_MIN_HOLE_PX = 16  # smaller holes of the texture stay as they are
+_MIN_HOLE_PX = 16  # pixels; smaller holes of the texture stay as they are
 _MAX_SAMPLES = 2000  # largest number of samples of the surface
 
 
@@ -50,12 +50,12 @@ _MAX_SAMPLES = 2000  # largest number of samples of the surface
 class Ground:
     """Texture of the ground around a hole."""
 
-    rows: Gaussians  # Gaussians of the ground
+    rows: Gaussians  # Gaussians at or behind the surface
     surface: PaintSurface  # fitted surface in the straight camera; opaque inside the hole too
-    image: Tensor  # color of the ground, unmixed from the background. [H,W,3] 0..1
+    image: Tensor  # color of the ground without the background, 0 to 1. [H,W,3]
     known: Mask  # pixels that show the ground. [H,W]
     hole: Mask  # pixels to fill. [H,W]
-    name: str  # fitted model
+    name: str  # name of the fitted model
 
     @property
     def camera(self) -> Camera:
@@ -73,7 +73,7 @@ def view_ground(
         camera: view with the hole
         hole: pixels of the hole. [H,W] bool
         inverse_depth: 1 / camera z of the ground, continued into the hole. [H,W]
-        unseen: returns the points that no view saw through or past. [P,3] float64 -> [P] bool
+        unseen: function that returns the points that no view saw through or past. [P,3] float64 -> [P] bool
     """
     straight = straight_camera(rest, camera, hole, inverse_depth)
     if straight is None:
@@ -120,6 +120,9 @@ def straight_camera(
         camera: view with the hole
         hole: pixels of the hole. [H,W] bool
         inverse_depth: 1 / camera z of the ground, continued into the hole. [H,W]
+
+    Returns:
+        The camera, and the points in world coordinates [P,3] float64; None without enough samples.
     """
     mask = hole.numpy()
     width_px = max(4, round(0.25 * float(mask.sum()) ** 0.5))
@@ -152,7 +155,8 @@ def straight_camera(
     longer = 2.0 * half.max()
     pixel = min(max(pixel, longer / MAX_SIDE_PX), longer / _MIN_SIDE_PX)
     size = np.maximum(np.ceil(2.0 * half / pixel), 16).astype(int)
-    width, height = int(size[0]), int(size[1])
+    width = int(size[0])
+    height = int(size[1])
     focal = float(distance / pixel)
     K = torch.tensor([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]])
     straight = Camera(torch.from_numpy(viewmat).float(), K, width, height)
@@ -175,7 +179,7 @@ def _tight_frame(points: Array, forward: Array) -> Array:
 
 
 def _typical_deviation(rest: Gaussians, viewmat: Array, half: Array, distance: float) -> float:
-    """Return the median standard deviation across the surface of the Gaussians around the hole."""
+    """Return the median standard deviation of the Gaussians around the hole along their middle axis, or 0."""
     places = rest.means.double().numpy() @ viewmat[:3, :3].T + viewmat[:3, 3]
     inside = (np.abs(places[:, :2]) <= half).all(axis=1) & (np.abs(places[:, 2] - distance) <= half.min())
     inside &= rest.opacities.numpy() > 0.1
@@ -202,6 +206,7 @@ def _coordinates(camera: Camera) -> tuple[Array, Array]:
 
 
 def _image_samples(camera: Camera, inverse_depth: Array, mask: Mask) -> Samples:
+    """Return the pixels of a mask with a positive inverse depth as samples. [H,W], [H,W]"""
     x, y = _coordinates(camera)
     mask = mask & (inverse_depth > 0)
     return Samples(x[mask], y[mask], inverse_depth[mask], float(camera.K[0, 0]))
@@ -218,9 +223,8 @@ def _splat(points: Tensor, eye: Camera) -> Mask:
     mask[rows[valid], columns[valid]] = True
     spacing = (eye.width * eye.height / max(1, len(points))) ** 0.5
     reach = max(1, round(spacing))
-    return np.asarray(ndimage.binary_closing(np.pad(mask, reach), iterations=reach))[
-        reach:-reach, reach:-reach
-    ]
+    closed = np.asarray(ndimage.binary_closing(np.pad(mask, reach), iterations=reach))
+    return closed[reach:-reach, reach:-reach]
 
 
 def _around(seen: Depth, hole: Mask) -> Mask:
@@ -232,7 +236,7 @@ def _around(seen: Depth, hole: Mask) -> Mask:
 
 
 def _samples(seen: Depth, eye: Camera, around: Mask) -> Samples:
-    """Return samples of the surface around the hole, evenly chosen."""
+    """Return up to `_MAX_SAMPLES` samples of the surface around the hole, chosen at random."""
     depth = np.where(around, seen.depth.double().numpy(), 1.0)
     samples = _image_samples(eye, np.where(around, 1.0 / depth, 0.0), around)
     chosen = np.zeros(len(samples), bool)
@@ -241,13 +245,13 @@ def _samples(seen: Depth, eye: Camera, around: Mask) -> Samples:
 
 
 def _thickness_px(scene: Gaussians, eye: Camera, around: Mask) -> float:
-    """Return the typical depth range of the light within a pixel, in pixels at its depth, at least 1."""
+    """Return the typical spread of depths within a pixel, as pixels at this depth, at least 1."""
     mean, spread, _ = light_moments(scene, eye)
     return max(1.0, float(np.median(spread[around] / mean[around])) * float(eye.K[0, 0]))
 
 
 def _rows_at(scene: Gaussians, eye: Camera, model: SurfaceModel, limit_px: float) -> Tensor:
-    """Return the rows at most `limit_px` pixels in front of the surface. [N] bool"""
+    """Return the rows that are behind the surface, or at most `limit_px` pixels in front of it. [N] bool"""
     places = (scene.means @ eye.viewmat[:3, :3].T + eye.viewmat[:3, 3]).double().numpy()
     z = np.maximum(places[:, 2], 1e-9)
     inverse = model.inverse_depth(places[:, 0] / z, places[:, 1] / z)
@@ -287,7 +291,7 @@ def _known_and_missing(alpha: NDArray[np.float32], hole: Mask) -> tuple[Mask, Ma
 
 
 def _reach_px(camera: Camera, inverse_depth: Tensor, surface: PaintSurface) -> int:
-    """Return the distance of a view's tolerance for its surfaces, in pixels of the texture."""
+    """Return `REACH_PX` of a view as a distance in pixels of the texture, at least 1."""
     eye = surface.camera
     world = REACH_PX / (float(inverse_depth.median()) * float(camera.K[0, 0]))
     return max(1, round(world * float(eye.K[0, 0]) / float(np.median(surface.depth))))

@@ -9,8 +9,8 @@ removal.
 The view with the largest hole is filled with discs, then that with the largest remaining one, until all holes
 are small. Views with a given picture come first.
 
-Where the ground around a hole has visible texture, the texture continues (`trainer.fill.ground`,
-`trainer.fill.texture`). Elsewhere, and without the extra `fill`, the membrane closes the hole.
+If the ground around a hole has visible texture, the texture continues (`trainer.fill.ground`,
+`trainer.fill.texture`). Otherwise, and without the extra `fill`, the membrane closes the hole.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ _OPACITY_LOGIT = 5.0  # opacity logit of a disc
 _MIN_COSINE = 0.3  # limits the stretching of slanted discs
 _MIN_HOLE_SHARE = 0.01  # share of the region's pixels; smaller holes are irregularities of the boundary
 _FLAT_SHARE = 0.1  # maximum color error of one disc of a texture, as a share of the texture's contrast
-_CLAMP_PX = 3  # pixels; a disc takes no color beyond those of the texture in this window
+_CLAMP_PX = 3  # pixels; a disc's color stays in the range of the texture's colors in this window
 _MAX_VIEWS = 12  # maximum number of views whose holes become discs
 
 
@@ -107,8 +107,8 @@ def fill_holes(
         pictures: by view name, pictures of the finished edit, whose colors the discs take instead of those of
             the boundary. [H,W,3]
         close: False only counts the holes
-        is_textured: continue the texture of the ground where it is visible
-        depths: `visible_depth` of the scene in each view, if it is known. [H,W] each
+        is_textured: continue the texture of the ground if it is visible
+        depths: `visible_depth` of the scene in each view; None computes it. [H,W] each
     """
     picture_colors = pictures or {}
     if depths is None:
@@ -128,9 +128,12 @@ def fill_holes(
         attempts = list[Gaussians]()
         if is_textured and picture is None:
             textured, note = _textured_discs(filled, holes[best], seen)
-            notes += [note] if note else []
-            attempts += [] if textured is None else [textured]
-        attempts.append(place_discs(holes[best], rest, holes[best].colors if picture is None else picture))
+            if note:
+                notes.append(note)
+            if textured is not None:
+                attempts.append(textured)
+        colors = holes[best].colors if picture is None else picture
+        attempts.append(place_discs(holes[best], rest, colors))
         open_views.discard(best)
         for rows in attempts:
             trial = concatenate([filled, rows])
@@ -151,7 +154,7 @@ def fill_holes(
 def _textured_discs(rest: Gaussians, hole: Hole, seen: Sequence[Front]) -> tuple[Gaussians | None, str]:
     """Return discs that continue the texture around a hole, and a line for the log.
 
-    There are none if the ground has no visible texture, if too little of it is visible, or without the extra
+    There are no discs if the ground has no visible texture or is too little visible, or without the extra
     `fill`.
     """
     unseen = partial(_unseen, seen=seen, own=hole.camera)
@@ -178,7 +181,7 @@ def _lay_texture(ground: Ground, picture: Tensor, flat: float) -> Gaussians:
     Args:
         ground: see `Ground`
         picture: its texture with the hole filled. [H,W,3]
-        flat: maximum root mean square color error of one disc, 0 to 1
+        flat: maximum root mean square color error of one disc, sRGB 0 to 1
     """
     eye = ground.camera
     area = area_to_fill(ground.hole, ground.known)
@@ -320,7 +323,7 @@ def _split_squares(mask: Tensor, colors: Tensor) -> Tensor:
 
 
 def region_weight(scene: Gaussians, region: Region, camera: Camera) -> Tensor:
-    """Return the blended weight of the region in a view, see `View.mask`. [H,W]"""
+    """Return the blended weight of the region in a view, 0 to 1, see `View.mask`. [H,W]"""
     member = torch.zeros(len(scene), 1)
     member[region.members] = 1.0
     weights = member.expand(-1, 3).contiguous()
@@ -328,7 +331,7 @@ def region_weight(scene: Gaussians, region: Region, camera: Camera) -> Tensor:
 
 
 def visible_depth(scene: Gaussians, camera: Camera) -> Tensor:
-    """Return the depth of the visible surface, camera z; infinite without one. [H,W]"""
+    """Return the depth of the visible surface, camera z in world units; infinite without one. [H,W]"""
     with torch.no_grad():
         drawn = render_depth(scene, camera)
     return drawn.depth.masked_fill(drawn.alpha <= 0.5, torch.inf)

@@ -1,10 +1,10 @@
 """Texture continued into a hole of a picture: shift maps, then one gradient-domain solve.
 
-1. OpenCV's shift maps (extra `fill`) copy every missing pixel from a visible one, in Lab, with seams where
-   the copies agree best.
-2. The source of each copied pixel is recovered from the result, as the copies are exact.
-3. The colors whose differences between neighbors are closest to those of the sources, with the visible pixels
-   as they are, have no seam in tone: one sparse least-squares problem.
+1. OpenCV's shift maps (extra `fill`) copy every missing pixel from a visible one, in Lab. Their seams run
+   where the copies agree best.
+2. Recover the source of each copied pixel from the result. This is possible because the copies are exact.
+3. Solve one sparse least-squares problem for the final colors. The differences between neighbors come as
+   close as possible to those at the sources, and visible pixels are fixed. This removes seams in tone.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ from progdf.surface.models import Array, Mask
 from .membrane import membrane
 
 VISIBLE_CONTRAST = 0.02
-"""OKLab; about the smallest visible difference. Grounds of less contrast are filled smoothly."""
+"""Contrast in OKLab from which texture continues, about the smallest visible difference."""
 
-_DIRT_PX = 3  # pixels around the hole whose color is mixed with the removed region
-_RECOVERY_PX = 5  # window in which a copied pixel and its source agree
+_MIXED_PX = 3  # width of the border around the hole whose color is mixed with the removed region, pixels
+_RECOVERY_PX = 5  # window in which a copied pixel and its source are compared, pixels
 _MAX_SHIFTS = 200  # largest number of shifts to recover
-_MIN_SHIFT_PX = 8  # rarer shifts are coincidences
-_MIN_PIECE_PX = 9  # smaller pieces without a source are continued smoothly
-_RING_PX = 6  # pixels around a piece that are compared
-_WEAK = 0.01  # weight of a difference that no source shows
-_COLOR_TIE = 1e-3  # weight of the copied colors beside that of their differences
-_STEPS = ((0, 1), (1, 0))
+_MIN_SHIFT_COUNT = 8  # pixels; shifts of fewer pixels are coincidences
+_MIN_PIECE_PX = 9  # pixels; smaller pieces without a source are filled smoothly
+_RING_PX = 6  # width of the compared ring around a piece, pixels
+_UNKNOWN_WEIGHT = 0.01  # weight of a difference that no source has
+_COLOR_WEIGHT = 1e-3  # weight of the copied colors; that of their differences is 1
+_STEPS = ((0, 1), (1, 0))  # to the right neighbor, and to the lower one
 _CORNERS = [(r, g, b) for r in (0, 1) for g in (0, 1) for b in (0, 1)]  # of the RGB cube
 
 
 def can_continue_texture() -> bool:
-    """Return True if the extra `fill` is installed."""
+    """Return True if OpenCV with its contributed modules (extra `fill`) is installed."""
     if find_spec("cv2") is None:
         return False
     import cv2
@@ -52,8 +52,8 @@ def can_continue_texture() -> bool:
 def texture_contrast(image: Tensor, hole: Mask, known: Mask) -> float:
     """Return the contrast of the ground's texture around a hole, in OKLab.
 
-    It is the root mean square difference of the colors from those that a smooth patch of the hole's size
-    could have.
+    It is the root mean square difference of the colors from their own blur, whose standard deviation is half
+    the hole's radius. A smooth patch in the hole could not have these differences.
 
     Args:
         image: [H,W,3], 0 to 1
@@ -62,8 +62,8 @@ def texture_contrast(image: Tensor, hole: Mask, known: Mask) -> float:
     """
     lab = srgb_to_oklab(image).double().numpy()
     radius = float(ndimage.distance_transform_edt(np.pad(hole, 1)).max())
-    clean = known & ~ndimage.binary_dilation(hole, iterations=_DIRT_PX)
-    near = clean & ndimage.binary_dilation(hole, iterations=_DIRT_PX + max(4, round(2 * radius)))
+    clean = known & ~ndimage.binary_dilation(hole, iterations=_MIXED_PX)
+    near = clean & ndimage.binary_dilation(hole, iterations=_MIXED_PX + max(4, round(2 * radius)))
     if not near.any():
         return 0.0
     weight = ndimage.gaussian_filter(clean.astype(float), 0.5 * radius)
@@ -76,12 +76,15 @@ def texture_contrast(image: Tensor, hole: Mask, known: Mask) -> float:
 
 
 def continue_texture(image: Tensor, hole: Mask, known: Mask) -> Tensor:
-    """Return the picture with the hole filled by texture of its surroundings. Needs the extra `fill`.
+    """Return the picture with the hole filled by texture of its surroundings. It needs the extra `fill`.
 
     Args:
         image: [H,W,3], 0 to 1
         hole: pixels to fill. [H,W]
         known: visible pixels, the only sources. [H,W]
+
+    Returns:
+        Pixels outside `area_to_fill` are unchanged. [H,W,3], 0 to 1
     """
     filled = area_to_fill(hole, known)
     sources = known & ~filled
@@ -89,17 +92,17 @@ def continue_texture(image: Tensor, hole: Mask, known: Mask) -> Tensor:
     colors = image.double().numpy().copy()
     exact = filled & (source[0] >= 0)
     colors[exact] = colors[source[0][exact], source[1][exact]]
-    lost = filled & ~exact
-    if lost.any():
-        colors = membrane(torch.from_numpy(colors), torch.from_numpy(lost)).numpy()
+    without_source = filled & ~exact
+    if without_source.any():
+        colors = membrane(torch.from_numpy(colors), torch.from_numpy(without_source)).numpy()
     return torch.from_numpy(_remove_seams(colors, filled, sources, source)).float().clamp(0.0, 1.0)
 
 
 def _copy_sources(image: Tensor, filled: Mask, sources: Mask) -> NDArray[np.int64]:
     """Return row and column of the visible pixel that each filled pixel copies; −1 for none. [2,H,W]
 
-    Shift maps leave pixels empty for which none of their shifts leads to a source. Each piece of them is
-    copied as a whole from the place whose surroundings agree best.
+    Shift maps leave pixels empty if none of their shifts leads to a source. Each connected piece of such
+    pixels is copied as a whole, from the position whose surroundings agree best.
     """
     copied = _shift_map(image, filled, sources)
     origin = _recover_sources(copied, _to_lab(image), filled, sources)
@@ -121,7 +124,9 @@ def _copy_sources(image: Tensor, filled: Mask, sources: Mask) -> NDArray[np.int6
 
 
 def _best_copy(colors: Array, piece: Mask, valid: Mask, sources: Mask) -> tuple[int, int] | None:
-    """Return the shift to the sources whose surroundings agree best with those of a piece; None without any.
+    """Return the shift (rows, columns) to the sources whose surroundings agree best with those of a piece.
+
+    None if no shift leads to sources alone.
 
     Args:
         colors: [H,W,3]
@@ -130,7 +135,8 @@ def _best_copy(colors: Array, piece: Mask, valid: Mask, sources: Mask) -> tuple[
         sources: pixels that may be copied. [H,W]
     """
     rows, columns = np.nonzero(ndimage.binary_dilation(piece, iterations=_RING_PX))
-    top, left = rows.min(), columns.min()
+    top = rows.min()
+    left = columns.min()
     box = np.s_[top : rows.max() + 1, left : columns.max() + 1]
     inside = piece[box].astype(float)
     ring = (valid & ndimage.binary_dilation(piece, iterations=_RING_PX))[box].astype(float)
@@ -155,14 +161,15 @@ def _correlate(picture: Array, window: Array) -> Array:
 
 
 def area_to_fill(hole: Mask, known: Mask) -> Mask:
-    """Return the hole with the pixels at its edge, whose color is mixed with the region. [H,W]"""
-    edge = ndimage.binary_dilation(hole, np.ones((3, 3)), iterations=_DIRT_PX)
+    """Return the hole with the pixels at its edge, whose color is mixed with the region. [H,W] bool"""
+    edge = ndimage.binary_dilation(hole, np.ones((3, 3)), iterations=_MIXED_PX)
     clean = known & ~edge
-    gap = ndimage.binary_dilation(clean, np.ones((3, 3)), iterations=_DIRT_PX)
+    gap = ndimage.binary_dilation(clean, np.ones((3, 3)), iterations=_MIXED_PX)
     return np.asarray(hole | (edge & (known | gap)))
 
 
 def _to_lab(image: Tensor) -> NDArray[np.uint8]:
+    """Convert a picture, 0 to 1, to OpenCV's 8-bit Lab. [H,W,3]"""
     import cv2
 
     pixels = (255.0 * image.clamp(0.0, 1.0)).round().byte().numpy()
@@ -193,8 +200,8 @@ def _recover_sources(
 ) -> NDArray[np.int64]:
     """Return row and column of the source of each filled pixel; −1 where it is not found. [2,H,W]
 
-    A shift is a candidate if many pixels equal the visible pixel there. Each pixel takes the candidate that
-    most of its neighbors agree with.
+    A shift is a candidate if many filled pixels equal the visible pixel at it. Each pixel takes the candidate
+    with which most of its neighbors agree.
     """
     height, width = filled.shape
     source = np.full((2, height, width), -1)
@@ -204,10 +211,10 @@ def _recover_sources(
         from_rows = rows + down
         from_columns = columns + right
         inside = (from_rows >= 0) & (from_rows < height) & (from_columns >= 0) & (from_columns < width)
-        r, c = rows[inside], columns[inside]
-        fr, fc = from_rows[inside], from_columns[inside]
+        to = rows[inside], columns[inside]
+        origin = from_rows[inside], from_columns[inside]
         equal = np.zeros((height, width), np.float32)
-        equal[r, c] = sources[fr, fc] & (copied[r, c] == lab[fr, fc]).all(axis=1)
+        equal[to] = sources[origin] & (copied[to] == lab[origin]).all(axis=1)
         agreement = np.where(equal > 0, ndimage.uniform_filter(equal, _RECOVERY_PX), 0.0)
         better = agreement > found
         found[better] = agreement[better]
@@ -240,7 +247,7 @@ def _candidate_shifts(
     return [
         (int(a), int(b))
         for (a, b), n in zip(distinct[ranked], counts[ranked], strict=True)
-        if n >= _MIN_SHIFT_PX
+        if n >= _MIN_SHIFT_COUNT
     ]
 
 
@@ -275,8 +282,8 @@ def _remove_seams(colors: Array, filled: Mask, sources: Mask, source: NDArray[np
     rows, columns = np.nonzero(sources)
     origin[0][sources] = rows
     origin[1][sources] = columns
-    diagonal = np.full(count, _COLOR_TIE)
-    right = _COLOR_TIE * colors[filled]
+    diagonal = np.full(count, _COLOR_WEIGHT)
+    right = _COLOR_WEIGHT * colors[filled]
     entries = list[tuple[NDArray[np.int64], NDArray[np.int64], Array]]()
     for down, across in _STEPS:
         p = np.s_[: height - down, : width - across]
@@ -321,7 +328,7 @@ def _source_step(
 ) -> tuple[Array, Array]:
     """Return the color differences from pixels a to their neighbors b, and their weights. [E,3] and [E]
 
-    They are those of the sources. Across a seam it is the mean of the differences at both sources.
+    The differences are those of the sources. Across a seam, the mean of both sources is used.
     """
     height, width = sources.shape
     total = np.zeros((len(a[0]), 3))
@@ -335,4 +342,4 @@ def _source_step(
         valid[valid] = sources[next_r[valid], next_c[valid]]
         total[valid] += sign * (colors[next_r[valid], next_c[valid]] - colors[r[valid], c[valid]])
         count[valid] += 1
-    return total / np.maximum(count, 1.0)[:, None], np.where(count > 0, 1.0, _WEAK)
+    return total / np.maximum(count, 1.0)[:, None], np.where(count > 0, 1.0, _UNKNOWN_WEIGHT)
