@@ -47,12 +47,13 @@ from .view import (
 )
 
 SIZE = 256
-"""Default longer side of the views if it is not chosen by the region's detail, pixels."""
+"""Default longer side of views whose size does not follow the region's detail, pixels."""
 
 SIZE_LIMITS = {True: SizeLimits(160, 16_000), False: SizeLimits(SIZE, 32_000)}
-"""Limits of the views' size in a rig, for dense color edits and for others, whose steps draw single views.
+"""Limits of the views' size in a rig, by `TrainingViewOptions.dense`.
 
-They bound the time of a run (docs/lab/experiments.md, Views).
+Color edits that are solved for are dense. Other edits are optimized view by view. The limits bound the time
+of a run (docs/lab/experiments.md, Views).
 """
 
 _SIZING_VIEWS = 5  # cameras of the rig in which the region's detail is measured

@@ -19,10 +19,10 @@ MAX_SIDE_PX = 768
 """Largest longer side of the views, if it is chosen."""
 
 MIN_WIDTH_PX = 1.0
-"""Width that views give to the smallest visible Gaussians: two standard deviations, pixels."""
+"""Width of the smallest visible Gaussians in views that show all detail: two standard deviations, pixels."""
 
 PIXELS_PER_MEMBER = 1.5
-"""Pixels of the mean view per visible Gaussian, which are affordable for any number of Gaussians.
+"""Pixels of the region in the mean view, per visible Gaussian, that are always allowed.
 
 The time of a run grows with the Gaussians too (docs/lab/experiments.md, Views).
 """
@@ -30,7 +30,7 @@ The time of a run grows with the Gaussians too (docs/lab/experiments.md, Views).
 _SMALL_SHARE = 0.1  # share of the visible weight that counts as the smallest Gaussians
 _COMPARED_SIDE_PX = 128  # size of the pictures in which the region is measured
 _SIDE_STEP_PX = 16  # sizes are multiples of this
-_MIN_WEIGHT_PX = 0.25  # blended weight of a visible Gaussian in such a picture, pixels
+_MIN_WEIGHT_PX = 0.25  # smallest blended weight of a visible Gaussian in such a picture, pixels
 
 
 @dataclass(frozen=True)
@@ -42,18 +42,18 @@ class ViewSize:
 
     def line(self) -> str:
         """Return the log line on the size."""
-        width = f"the smallest tenth of the visible Gaussians is {MIN_WIDTH_PX:g} pixel wide in {self.needed}"
+        need = f"the region's detail needs {self.needed}"
         if self.side < self.needed:
-            return f"views of {self.side} pixels, a limit of time; {width} (--image-size {self.needed})"
-        return f"views of {self.side} pixels; {width}"
+            return f"views of {self.side} pixels to limit the time; {need} (--image-size {self.needed})"
+        return f"views of {self.side} pixels; {need}"
 
 
 @dataclass(frozen=True)
 class SizeLimits:
     """Limits of the size of the views."""
 
-    min_side: int  # longer side, pixels
-    # pixels that show the region in the mean view; more if there are many Gaussians, see `PIXELS_PER_MEMBER`
+    min_side: int  # smallest longer side, pixels
+    # maximum pixels of the region in the mean view; more for many Gaussians, see `PIXELS_PER_MEMBER`
     region_pixels: int
 
 
@@ -66,7 +66,10 @@ def choose_view_size(
         scene: the original
         region: the region to show
         cameras: at least one, framed like the views; their size is ignored
-        limits: limits of the size
+        limits: limits of the size; `MAX_SIDE_PX` is another one
+
+    Returns:
+        The size; its sides are multiples of 16 pixels.
     """
     found = map_threads(lambda camera: _measure(scene, region, camera), cameras)
     sides = sorted(detail.side for detail in found if detail.cover > 0)
@@ -87,6 +90,7 @@ class _Detail:
 
 
 def _round_side(side: float) -> int:
+    """Return the nearest multiple of the size step, at least one step, pixels."""
     return max(1, round(side / _SIDE_STEP_PX)) * _SIDE_STEP_PX
 
 

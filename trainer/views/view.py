@@ -73,13 +73,13 @@ class View:
         return torch.lerp(self.image, edited, (self.mask[..., None] / 0.2).clamp(0.0, 1.0))
 
     def cut_out(self, paper: Tensor | None = None) -> Tensor:
-        """Return the region without its surroundings, over a neutral picture. [H,W,3]
+        """Return the region without its surroundings. [H,W,3]
 
-        A network that sees a whole picture paints the region differently on every background. This picture
-        depends on the region alone (docs/lab/experiments.md, Editors that agree, or do not).
+        A network that receives the whole picture paints the region differently on every background. The
+        result depends on the region alone (docs/lab/experiments.md, Editors that agree, or do not).
 
         Args:
-            paper: color behind the region, rgb [3]; None: the region's own colors, continued outwards
+            paper: sRGB color behind the region; None: the region's own colors, continued outwards. [3]
         """
         behind = continue_colors(self.inside, self.mask) if paper is None else paper
         return torch.lerp(behind.expand_as(self.inside), self.inside, self.mask[..., None])
@@ -106,14 +106,15 @@ def shrink_image(image: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def continue_colors(colors: Tensor, weights: Tensor) -> Tensor:
-    """Return weighted colors continued to all pixels, blurred the more the farther (pull-push).
+    """Continue weighted colors to all pixels, with more blur at larger distances (pull-push).
 
     Args:
         colors: [H,W,3]
-        weights: 0 leaves a pixel to its neighbors, 1 counts it fully. [H,W] 0 to 1
+        weights: weight of each pixel, 0 to 1; pixels of weight 0 take the colors of others. [H,W]
 
     Returns:
-        The mean color around each pixel, over the smallest neighborhood with weight. [H,W,3]
+        Pixels of weight 1 are unchanged. Others mix their color with the mean over the smallest surrounding
+        square that has weight. [H,W,3]
     """
     weight = weights[None, None]
     levels = [((colors * weights[..., None]).permute(2, 0, 1)[None], weight)]
@@ -238,8 +239,8 @@ def region_box(mask: Tensor, margin: int = 6, least: float = 0.5 * _SEEN) -> Cro
 
 _FRAMED_SHARE = 0.97  # share of a region's means along each axis that its box holds
 _MAX_FRAMED = 10_000  # members that determine the box; more are sampled evenly
-_AIMS = 2  # at the middle of the means, then at the middle of the box
-_MAX_SLOPE = 0.98  # tangent of half the widest field of view
+_AIMS = 2  # passes: aim at the middle of the means, then at the middle of the box
+_MAX_HALF_FOV_TAN = 0.98  # tangent of half the widest field of view
 
 _PLASTIC = 1.324718
 """Plastic number, the root of x³ = x + 1.
@@ -265,8 +266,8 @@ def region_rig(
         image_size: both sides in pixels
         up: world up direction, [3]; None guesses it
         elevations: see `orbit_rig`
-        fills: the region's box fills 95 to 75 % of the pictures instead (`frame_box`), for edits that stay
-            inside the region and need none of its surroundings
+        fills: True for edits that stay inside the region and need no surroundings. The longer side of the
+            region's box then fills 95 to 75 % of the pictures, see `frame_box`
     """
     up = guess_up(scene) if up is None else up
     rig = orbit_rig(scene, count, image_size, image_size, up=up, elevations=elevations)
@@ -287,17 +288,17 @@ def region_rig(
 
 
 def frame_box(camera: Camera, means: Tensor, extent: float, share: float, up: Tensor) -> Camera:
-    """Return the camera turned to Gaussians, with a square picture.
+    """Return the camera turned to Gaussians and zoomed in on them, with a square picture.
 
-    The longer side of their box, which holds 97 % of the means along each axis of the picture, fills a share
-    of the picture's side.
+    Their box holds 97 % of the means along each axis of the picture. Its longer side fills a share of the
+    picture's side.
 
     Args:
-        camera: its position and its smaller side are kept
-        means: [M,3]
-        extent: distance around the means that is in the box too, world units
-        share: 0 to 1
-        up: world direction, [3]
+        camera: its position and its shorter side are kept
+        means: centers of the Gaussians. [M,3]
+        extent: margin of the box around the means, world units
+        share: share of the picture's side that the box fills, above 0, at most 1
+        up: world direction that is up. [3]
     """
     side = min(camera.width, camera.height)
     target = means.median(dim=0).values
@@ -314,7 +315,7 @@ def frame_box(camera: Camera, means: Tensor, extent: float, share: float, up: Te
         half = max(high_x - low_x, high_y - low_y) / 2 + margin
         ray = torch.tensor([(low_x + high_x) / 2, (low_y + high_y) / 2, 1.0])
         target = camera.position + viewmat[:3, :3].T @ ray
-    fov = 2 * math.atan(min(_MAX_SLOPE, half / share))
+    fov = 2 * math.atan(min(_MAX_HALF_FOV_TAN, half / share))
     return replace(camera, viewmat=viewmat, K=intrinsics(fov, side, side), width=side, height=side)
 
 

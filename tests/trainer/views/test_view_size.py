@@ -64,7 +64,7 @@ def test_time_limits_the_size_and_the_log_names_the_needed_one() -> None:
     assert LEAST <= limited.side < free.side
     assert limited.needed == free.needed
     assert f"--image-size {free.needed}" in limited.line()
-    assert "a limit" not in size_of(shell(0.02)).line()
+    assert "limit" not in size_of(shell(0.02)).line()
 
 
 def test_size_stays_in_its_range() -> None:
