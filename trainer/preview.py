@@ -6,10 +6,10 @@
 
 If one color map can represent the edit, the answer is a grade, 3.gdf beside 3.png, for every strength and
 camera. Otherwise it is the editor's own picture of the view. The editor "grade" only requests the region's
-main colors. If a picture's request has `estimate`, an answer "near" follows: it states how near the training
-will come to the picture. A request is skipped if a later one has arrived. `model` paints a prompt; another
-`seed` gives another painting. With `seed` -1 nothing is painted; `note` names the model and device, and
-`models` the models on this machine. The process ends when its input ends.
+main colors. If the request of a picture has `estimate`, an answer "near" follows: it estimates how close
+training will come to the picture. A request is skipped if a later one has arrived. `model` paints a prompt;
+another `seed` gives another painting. With `seed` -1 nothing is painted; `note` names the model and device,
+and `models` the models on this machine. The process ends when its input ends.
 """
 
 from __future__ import annotations
@@ -62,13 +62,12 @@ NEAR_NOTES: Mapping[Nearness, str] = {
 """Notes in the form of a new edit."""
 
 CLOSE_DB = 28.0
-"""PSNR of the draft from which differences to the preview are hardly visible."""
+"""Smallest estimated PSNR at which differences from the preview are hardly visible."""
 ROUGH_DB = 22.0
-"""PSNR of a draft of colors from which the trained edit resembles its preview."""
+"""Smallest PSNR of a draft at which the trained edit resembles its preview."""
 
-# views in which the agreement of an editor is estimated, and their longer side in pixels
-_ESTIMATE_VIEWS = 8
-_ESTIMATE_SIDE_PX = 112
+_ESTIMATE_VIEWS = 8  # edited views of an estimate
+_ESTIMATE_SIDE_PX = 112  # their longer side, pixels
 
 _Row3 = tuple[float, float, float]
 _Row4 = tuple[float, float, float, float]
@@ -101,7 +100,7 @@ class PreviewRequest(msgspec.Struct, frozen=True):
     height: _Side
     model: str = ""
     seed: int = 0
-    estimate: bool = False  # also answer how near the training will come to a picture
+    estimate: bool = False  # also estimate how close training will come to a picture
 
 
 class PreviewAnswer(msgspec.Struct):
@@ -188,9 +187,10 @@ class Previewer:
         return self._editor(options, seen).edit(view, request.strength)
 
     def nearness(self, request: PreviewRequest) -> Nearness:
-        """Estimate how near the training will come to the picture of an editor that paints views quickly.
+        """Estimate how close training will come to the editor's picture; "" for editors that are too slow.
 
-        It is the error of the best colors for a few small edited views (`measure_agreement`).
+        The estimate is the error of the best colors for a few small edited views (`measure_agreement`). It is
+        "" too for editors of external pictures, and for scenes that surround their cameras.
 
         Raises:
             ProgdfError: invalid region or editor.
@@ -257,7 +257,7 @@ class Previewer:
 
 
 def draft_nearness(psnr: float) -> Nearness:
-    """Return how near the training comes to a draft with this PSNR to the exact colors, dB."""
+    """Return the expected difference of training from a preview, by the PSNR of a draft in dB."""
     if psnr >= CLOSE_DB:
         return "close"
     return "roughly" if psnr >= ROUGH_DB else "far"
@@ -281,6 +281,7 @@ def serve(argv: Sequence[str]) -> int:
 
 
 def _write(made: PreviewAnswer) -> None:
+    """Write an answer to standard output as a line of JSON."""
     sys.stdout.write(msgspec.json.encode(made).decode() + "\n")
     sys.stdout.flush()
 

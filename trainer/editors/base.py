@@ -29,7 +29,7 @@ class EditorInput:
     # from the views.
     glances: Callable[[], Sequence[RegionThumbnail]] = list
     seen: Gaussians | None = None  # the scene that edited pictures show; None: `scene`
-    say: Callable[[str], object] = str  # receives the lines for the run's log; by default they are dropped
+    say: Callable[[str], object] = str  # receives lines for the run's log; the default drops them
 
 
 class ImageEditor(Protocol):
@@ -114,7 +114,7 @@ class EditorRow:
     model: Callable[[], str] | None = None  # returns the default of `--model`; None: no generative model
     image_size: int = 0  # longer side of its views, pixels; 0 is the default
     files: Callable[[str], tuple[Path, ...]] = lambda what: ()  # picture files that its text names
-    shows_scene: bool = False  # its files are pictures of the scene with its layers
+    shows_scene: bool = False  # its files are pictures of the scene, which may show layers
     sets_views: bool = False  # the views of the run are those of its files
     cameras: Callable[[str], Path | None] = lambda what: None  # camera file beside its pictures, if any
     options: tuple[str, ...] = ()  # fields of `EditorOptions` that apply to it, besides the common ones

@@ -144,7 +144,7 @@ def recolor(given: EditorInput) -> ColorEditor:
 
 
 def tint(given: EditorInput) -> ColorEditor:
-    """Return the editor of `tint:#rrggbb[,path=hue]`: a wash of color, at about the same lightness."""
+    """Return the editor of `tint:#rrggbb[,path=hue]`: a wash of color that keeps lightness where sRGB can."""
     target, path = paint_of(given.what)
     source = region_color(given)
     return ColorEditor(lambda rgb: color.tint_course(rgb, target, source, path))
@@ -218,7 +218,7 @@ def region_color(given: EditorInput) -> color.RegionColor:
 
 
 def region_samples(given: EditorInput) -> tuple[Tensor, Tensor]:
-    """Return colors of the region and their share of a pixel. [N,3], [N]"""
+    """Return the colors of the region's pixels, and the region's share of each pixel, 0 to 1. [N,3], [N]"""
     pairs = [(sample, sample.mask > 0.0) for sample in given.glances() or given.views]
     return (
         torch.cat([sample.inside[visible] for sample, visible in pairs]),

@@ -38,11 +38,11 @@ STYLES = 26
 CONSISTENT_STYLES = (14, 23, 20, 7, 12, 0)
 """Styles with the most consistent results across views, best first."""
 
-# these dark styles paint large patches, whose places are consistent across views only on white paper
+# dark styles with large patches; the patches are at the same places in all views only over white
 _WHITE_PAPER_STYLES = frozenset((7, 23))
 
 PAINT_SIDE_RANGE_PX = (256, 768)
-"""Smallest and largest longer side of a painting, if it is chosen."""
+"""Smallest and largest longer side of a painting whose size follows the region's detail."""
 
 _SIZING_VIEWS = 3  # cameras around the region in which its detail is measured
 _TEXTURE_PX = 9  # pixels; variation within this distance is texture
@@ -57,7 +57,9 @@ class StyleEditor:
     paint: Callable[[Tensor], Tensor]
     recipe: Recipe  # all inputs of the painting except its source
     kept: PictureCache  # cache of paintings
-    paper: Tensor | None = None  # color around the region; None: its own colors, continued outwards. [3]
+    paper: Tensor | None = (
+        None  # color around the region, sRGB; None: its own colors, continued outwards. [3]
+    )
     kind: EditKind = "style"
     is_confined: bool = True
     stages: tuple[float, ...] = ()
@@ -151,14 +153,15 @@ def paint_side(scene: Gaussians, region: Region) -> int:
     """Return the longer side at which a region is painted, pixels, from its visible detail.
 
     It is the same for every camera. Strokes therefore have the same size on the object in the preview and in
-    the training, and are not finer than the Gaussians that must show them.
+    training. They are not finer than the Gaussians that reproduce them.
     """
-    least, most = PAINT_SIDE_RANGE_PX
+    min_side, max_side = PAINT_SIDE_RANGE_PX
     up = guess_up(scene)
     if is_surrounding(scene, up):
-        return least  # cameras around it do not show it
-    cameras = with_near_plane(region_rig(scene, region, _SIZING_VIEWS, most, up, fills=True), scene)
-    return min(most, choose_view_size(scene, region, cameras, SizeLimits(least, most * most)).side)
+        return min_side  # cameras around the scene do not show it
+    cameras = with_near_plane(region_rig(scene, region, _SIZING_VIEWS, max_side, up, fills=True), scene)
+    limits = SizeLimits(min_side, max_side**2)
+    return min(max_side, choose_view_size(scene, region, cameras, limits).side)
 
 
 def _paint_size(size: tuple[int, int], longer: int) -> tuple[int, int]:

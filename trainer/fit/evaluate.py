@@ -66,7 +66,7 @@ class Evaluator:
     def edge_psnr(self, pictures: Sequence[Tensor], expected: Sequence[Tensor]) -> float:
         """Return the PSNR over the evaluated pixels, weighted by the expected gradients, dB.
 
-        The same as `psnr` if the expected pictures have no edges.
+        It is the same as `psnr` if the expected pictures have no edges.
         """
         error = total = 0.0
         for a, b, pixels in zip(pictures, expected, self.pixels, strict=True):

@@ -46,7 +46,7 @@ The border is needed because Gaussians drawn there were moved.
 _CELL_SIDES_PX = (4, 2, 1)
 _PIXEL_SPREAD = 0.28  # standard deviation of a single pixel's disc, in pixels
 _MERGED_SPREAD = 0.6  # standard deviation of a merged rectangle's disc, as a share of its sides
-_COVER_SPREADS = (0.56, 0.7)  # the same two for discs with nothing behind them
+_COVER_SPREADS = (0.56, 0.7)  # both spreads, for discs with nothing behind them
 # pixels²; part of the engine's blur (0.3) that counts as an error of a disc; the solved colors undo the rest
 _BLUR_PX2 = 0.1
 _DEPTH_OFFSET_PX = 0.5  # pixels; discs lie deeper by this, as nearer neighbors cover them
@@ -133,9 +133,9 @@ def cover_pixels(
     No row of the scene moves.
 
     Args:
-        scene: scene that provides the number of SH bands and the origin
-        surface: surface of the picture
-        picture: [H,W,3]
+        scene: scene from which the number of SH bands, the filter and the origin are taken
+        surface: surface of the picture, in its camera
+        picture: colors to show, 0 to 1. [H,W,3]
         mask: pixels to cover, at least one. [H,W]
         flat: see `place_discs`
     """
@@ -246,7 +246,7 @@ def _discs(
 ) -> tuple[Gaussians, Array]:
     """Return discs that fill cells of the picture on its surface, and their depths. [B,4] and [H,W,3]
 
-    `spreads`: standard deviations along a side of one pixel, in pixels, and of more, as a share of the side.
+    `spreads`: standard deviation along a side of one pixel, pixels; and along a longer side, as its share
     """
     camera = surface.camera
     x, y, width, height = cells.T
@@ -406,8 +406,8 @@ def cover_view(image: Tensor, below: Tensor | None, drawn: Sequence[Tensor]) -> 
 
     Args:
         image: view of the scene. [H,W,3]
-        below: what is visible under the paint and the border of its discs, if it is another picture. [H,W,3]
-        drawn: premultiplied colors and alpha, the lowest first. [H,W,4] each
+        below: picture that is visible under the paint and the border of its discs; None for `image`. [H,W,3]
+        drawn: paints as premultiplied colors and alpha, the lowest first. [H,W,4] each
 
     Returns:
         [H,W,3] and [H,W] bool

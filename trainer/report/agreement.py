@@ -31,7 +31,7 @@ _MAX_UNEXPLAINED = 0.4  # midway between edits that agree and edits that do not,
 _MAX_UNEXPLAINED_FINE = 0.5  # calm styles leave up to 0.47, stripes of random phase 0.55 and more
 _MIN_CONTRAST = 0.8  # washed-out views agree, but have lost fine contrast
 _INVISIBLE_ERROR_DB = 28.0  # smaller errors are not visible, whatever their share of a faint change
-_COMPARED_BOX_PX = 70  # strokes of the same size on the region are the same share in larger views
+_COMPARED_BOX_PX = 70  # longer side of the compared region's box, so that strokes have one size in all views
 _CG_STEPS = 6  # steps of conjugate gradients
 DAMPING = 1e-3  # share of the first step's curvature; barely visible members keep their color
 
@@ -191,7 +191,8 @@ def robust_colors(seen: Sequence[ViewChange], members: int) -> Tensor:
 def view_change(setup: TrainingSetup, view: View, edited: Tensor, shrink: int | None = None) -> ViewChange:
     """Return the change of a view at a fraction of its size. [H,W,3]
 
-    `shrink`: divisor of the size; None: at least 2, and the box's longer side has about `_COMPARED_BOX_PX`
+    `shrink`: divisor of the size; None: the longer side of the region's box becomes about `_COMPARED_BOX_PX`
+    pixels, but the divisor is at least 2
     """
     if shrink is None:
         x0, y0, x1, y1 = view.box

@@ -76,7 +76,7 @@ def check_command(options: TrainOptions) -> None:
 
 
 def shown_pictures(options: TrainOptions) -> tuple[Path, ...]:
-    """Return the pictures of the scene, whose paint lies above the layers that they show.
+    """Return the editor's pictures of the scene, whose paint lies above the layers that they show.
 
     Args:
         options: resolved options

@@ -183,8 +183,9 @@ def views_around_paint(
         paints: painted views of one object
         degrees: rotation angles of each camera; 0 is the picture itself
         around: the paints whose cameras are rotated; None for all
-        below: the scene that is visible under the paint and the border of its discs; None for `scene`
-        shows_pictures: expect the painted picture at 0 degrees; otherwise the paint over `scene` there too
+        below: scene that is visible under the paint and the border of its discs; None for `scene`
+        shows_pictures: True: the expected image at 0 degrees is the painted picture; False: it is the paint
+            over `scene`, as at other angles
     """
     background = torch.tensor(BACKGROUND)
     views = []

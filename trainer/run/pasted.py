@@ -125,7 +125,7 @@ def train_decal(
         scene: the original, or `LowerLayers.base`
         name: name of the layer
         log: log of the run
-        lower: layers that the painted pictures show; None: the original
+        lower: layers that the painted pictures show; None if they show the original
     """
     paints = editor.paints
     seen = scene if lower is None else lower.seen
@@ -174,7 +174,7 @@ def train_decal(
 
 
 def _above(lower: LowerLayers | None, scene: Gaussians, gdf: Gdf) -> tuple[Gdf, Gaussians]:
-    """Return an edit of `LowerLayers.base` as an edit of the original, and the scene under all layers."""
+    """Return an edit of `LowerLayers.base` as an edit of the original, and the scene with all layers."""
     if lower is None:
         return gdf, edited_scene(scene, gdf)
     gdf = lower.rebase(gdf)
