@@ -68,7 +68,7 @@ class BenchOptions:
     runs: tuple[Path, ...] = ()
     """Finished run folders for `edits` and `networks`."""
     plots: Path | None = None
-    """Folder in which `training`, `field`, `recolors` and `subject` draw NAME.png, or recolors.jpg."""
+    """Folder for the pictures of `training`, `field` and `subject` (.png) and `recolors` (.jpg)."""
     scenes: tuple[Path, ...] = ()
     """Scene files to measure, in place of the demo scenes or beside them (docs/benchmarks.md)."""
     seconds: float | None = None
