@@ -83,7 +83,7 @@ def press(work: Workspace, pointer: PointerContext) -> Workspace:
             return with_message(work, text, pointer.now, error=True)
         copied = shift_picture(picture_with_paint(work, pointer), offset)
         colors = copied.astype(np.float32) / np.float32(255.0)
-        # the background is not copied onto the surface
+        # the background of the source is not copied
         reachable = reachable * shift_picture(surface.opacity, offset)
     stroke = begin_stroke(before, reachable, colors)
     drag = ColorDrag(stroke, camera, pointer.size, surface)
@@ -191,7 +191,7 @@ def _project(source: CloneSource, pointer: PointerContext) -> Point | None:
 
 
 def shift_picture(values: NDArray[_Number], offset: Point) -> NDArray[_Number]:
-    """Return the values at an offset from each pixel; 0 outside the picture. [H,W,…]"""
+    """Return the value at an offset (x, y) from each pixel, pixels; 0 outside the picture. [H,W,…]"""
     height, width = values.shape[:2]
     rows = np.arange(height) + int(offset[1])
     columns = np.arange(width) + int(offset[0])

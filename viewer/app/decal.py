@@ -64,7 +64,7 @@ def is_decal(path: Path) -> bool:
 
 
 class DecalTextures:
-    """Pictures of decals as GL textures.
+    """GL textures of the pictures of decals.
 
     Args:
         context: the GL context of the textures
@@ -93,7 +93,7 @@ class DecalTextures:
         return Decal(path, int(texture.glo), picture.size, pixels[..., 3] > 255 * _MIN_ALPHA)
 
     def keep(self, transient: Transient) -> None:
-        """Free the textures of decals that are neither placed nor trained any more."""
+        """Free the textures of decals that are neither being placed nor in training."""
         used = {ghost.texture for ghost in transient.ghosts if isinstance(ghost, DecalGhost)}
         if isinstance(transient.gizmo, Decal):
             used.add(transient.gizmo.texture)

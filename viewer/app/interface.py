@@ -394,11 +394,11 @@ def perform_actions(work: Workspace, actions: Sequence[Action], pointer: Pointer
 
 
 MAX_REFINE_GROWTH = 2.0
-"""Largest factor by which Refine enlarges a selection without a question."""
+"""Largest factor by which Refine enlarges a selection without asking."""
 
 
 def _select_subject(work: Workspace, pointer: PointerContext) -> Workspace:
-    """Select the object in the middle of the picture, or show the reason why there is none."""
+    """Select the object in the middle of the picture, or show the reason if there is none."""
     try:
         return select_tool.select_in_middle(work, pointer)
     except ProgdfError as error:
@@ -406,7 +406,7 @@ def _select_subject(work: Workspace, pointer: PointerContext) -> Workspace:
 
 
 def _ask_if_doubled(before: Workspace, work: Workspace, pointer: PointerContext) -> Workspace:
-    """Return the workspace after Refine; a much larger selection is offered by a button instead."""
+    """Return the workspace after Refine, or the one before with a question if the selection doubled."""
     count = before.view.selection.count
     refined = work.view.selection.count
     if refined <= MAX_REFINE_GROWTH * count:

@@ -238,7 +238,7 @@ def finish(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Worksp
 
 
 def select_in_middle(work: Workspace, pointer: PointerContext) -> Workspace:
-    """Select the object in the middle of the picture, in the mode that the keys or the tool choose.
+    """Replace the selection by the object in the middle of the picture, with its paint.
 
     Raises:
         ProgdfError: see `select_subject`.
@@ -285,14 +285,16 @@ def strokes_of(work: Workspace) -> tuple[Rows, Rows] | None:
 
 
 def next_step(work: Workspace) -> str:
-    """Return the next step of a scribble that has only one kind of stroke, "" for none."""
+    """Return the instruction for the next stroke if a scribble has only one kind of stroke, else ""."""
     strokes = strokes_of(work)
     if work.view.select.tool != "scribble" or strokes is None:
         return ""
     on, beside = strokes
     if len(on) and not len(beside):
         return "Now stroke the background (Ctrl)"
-    return "Now stroke the object" if len(beside) and not len(on) else ""
+    if len(beside) and not len(on):
+        return "Now stroke the object"
+    return ""
 
 
 def take_keys(work: Workspace, pointer: PointerContext, keys: Keys) -> tuple[Workspace, Keys]:
@@ -340,7 +342,7 @@ _LINE = 1.25
 def draw_strokes(work: Workspace, pointer: PointerContext) -> None:
     """Draw the strokes as dots on the visible surface, green on the object and red next to it.
 
-    They are hidden under a preview or another image, and while the picture moves.
+    They are not drawn under a preview or another image, or while the picture moves.
     """
     rows = strokes_of(work) if work.view.select.tool == "scribble" else None
     moves = work.transient.tool.drag is not None or work.glide is not None

@@ -63,7 +63,7 @@ def region_option(form: NewEdit, folder: Path, state: SelectionState, total: int
 def keep_region(state: SelectionState, name: str, folder: Path, total: int) -> SelectionState:
     """Save the selection as a region, with a file in a folder.
 
-    A region of an edit with the same Gaussians gets the name and stands among the saved ones.
+    If training made a region of the same Gaussians, it gets the name and becomes a saved region.
 
     Args:
         state: the selection and the regions
@@ -72,7 +72,7 @@ def keep_region(state: SelectionState, name: str, folder: Path, total: int) -> S
         total: number of Gaussians in the scene
 
     Returns:
-        The new state; the given one if a saved region has the same Gaussians.
+        The new state; the given state if a saved region already has the same Gaussians.
 
     Raises:
         ProgdfError: nothing is selected, there are too many regions, or the folder cannot be written to.

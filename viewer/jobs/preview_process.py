@@ -36,7 +36,7 @@ class PreviewInputs:
     background: Vec3
     model: str = ""  # diffusion model, for a sentence
     seed: int = 0  # random seed, for a sentence; -1 asks only for the available models
-    estimate: bool = False  # also ask how near the training will come to a picture
+    estimate: bool = False  # also request an estimate of how close training will come to a picture
 
     @property
     def of_all_views(self) -> tuple[str, str]:

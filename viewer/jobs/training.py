@@ -104,7 +104,7 @@ class EditOrder:
 
     @property
     def fills(self) -> bool:
-        """True if it fills the hole of a removal."""
+        """True for a run that fills the hole of a removal."""
         return self.editor == "remove" and bool(self.replaces)
 
     @property
@@ -309,7 +309,7 @@ def filled_run(removal: Path) -> Path:
 
 
 def unfilled_edit(filled: Path) -> Path | None:
-    """Return the file of the removal whose hole an edit fills; None if it is missing."""
+    """Return the file of the unfilled removal that a filled one replaced; None if it is missing."""
     name, is_filled, _ = filled.parent.name.rpartition(_FILLED)
     removal = filled.parent.with_name(f"{name}.gdf")
     return removal if is_filled and os.path.isfile(removal) else None

@@ -200,18 +200,19 @@ def draw_card(
 
 
 def _fill_box(work: Workspace, index: int, row: LayerRow) -> list[Action]:
-    """Draw the check box that fills the hole of a removal, with the progress; return the requested action."""
+    """Draw the check box that fills the hole of a removal; return its action if it was pressed."""
     gdf = work.view.layers[index].gdf
     job = next((job for job in work.jobs if job.fills == gdf and job.status in _BUSY), None)
     text = f"Fill the hole (about {format_duration(row.fill_seconds)})"
+    is_stopping = job is not None and job.status == "stopping"
     if row.hole == "filled":
         text = "Fill the hole"
     elif job is not None:
         left = "" if job.seconds_left is None else f", {format_duration(job.seconds_left)} left"
         text = f"Filling the hole: {100 * job.share:.0f} %{left}"
-    with inert(work.view.layers[index].locked or (job is not None and job.status == "stopping")):
+    with inert(work.view.layers[index].locked or is_stopping):
         pressed, _ = imgui.checkbox(f"{text}##hole", row.hole == "filled" or job is not None)
-    tip("Continue the surface around it, with its texture (extra fill). The hole stays until it is done")
+    tip("Continue the surface around the hole, with its texture if the extra fill is installed")
     return [OnItem("fill_hole", index)] if pressed else []
 
 

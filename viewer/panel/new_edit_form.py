@@ -66,7 +66,7 @@ _GRADES = {
 }
 
 
-_NEAR_COLORS = {"close": PALETTE.success, "roughly": PALETTE.warning, "far": PALETTE.error}
+_NEAR_COLORS = {"close": PALETTE.success, "roughly": PALETTE.warning, "far": PALETTE.error}  # of the estimate
 
 
 def draw(work: Workspace, count: int, ui: UiContext, actions: list[Action]) -> Workspace:
@@ -294,7 +294,7 @@ def _palette(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
 def _curve(curve: str, column: float, ui: UiContext, ended: Callable[[Curve], Curve]) -> str:
     """Draw a curve from original to new lightness and return it. A press adds a point and drags it.
 
-    `ended` returns the curve as it is applied, with its end at white.
+    `ended` returns the curve as it is applied, including its value at white.
 
     By keyboard, Space selects the next point. After the last point, it adds one in the widest gap. The arrow
     keys move the selected point.
@@ -439,7 +439,7 @@ def _preview(form: NewEdit, preview: PreviewState, column: float, ui: UiContext)
         # always one line, so that nothing below moves
         small(preview.text or " ", _NEAR_COLORS.get(preview.near, PALETTE.dim))
         if preview.near:
-            tip("Expected difference of the trained edit from this preview, measured on small views")
+            tip("Expected difference of the trained edit from this preview, estimated in a few views")
     return form
 
 

@@ -237,7 +237,7 @@ def _dashed_frame(size: imgui.ImVec2, ui: UiContext) -> None:
 
 
 def draw_cover(work: Workspace, size: tuple[int, int], area: overlay.Area, ui: UiContext) -> None:
-    """Draw the first cover image of the view's camera and size, unless a comparison is on."""
+    """Draw the first cover image with the view's camera and size, unless a comparison is on."""
     view = work.view
     matching = [cover for cover in work.transient.covers if (cover.camera, cover.size) == (view.camera, size)]
     if not matching or view.compare.mode != "off":

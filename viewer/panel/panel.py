@@ -191,7 +191,7 @@ def _region_menu(index: int) -> tuple[tuple[str, Action | None, str], ...]:
 
 
 def _regions(work: Workspace, ui: UiContext, actions: list[Action]) -> Workspace:
-    """Draw a section with the regions saved by hand, and one with those that trainings made."""
+    """Draw the sections of saved regions and of regions that training made; empty ones are left out."""
     regions = list(enumerate(work.view.selection.regions))
     saved = [(i, region) for i, region in regions if not region.edit]
     of_edits = [(i, region) for i, region in regions if region.edit]

@@ -189,7 +189,7 @@ def draw_options(
         area: the picture
         ui: fonts and scale
         actions: receives the commands of pressed buttons
-        tip_text: next step with the active tool, "" for none
+        tip_text: instruction for the next step with the active tool, "" for none
 
     Returns:
         The changed workspace; the y of the bar's lower edge, 0 if there is none.

@@ -28,7 +28,7 @@ from .picking import run_in_background
 _T = TypeVar("_T")
 
 _DISTANCES = (1.0, 0.5, 0.25)  # tried distances of the projecting camera, shares of the viewer's
-_MAX_SIDE_PX = 512  # longer side of the decal in its camera's picture, as in training
+_MAX_SIDE_PX = 512  # largest longer side of the decal in its camera's picture, pixels; as in training
 _TRIAL_PX = 64  # longer side of the picture that shows what hides a decal
 
 
@@ -42,11 +42,11 @@ class LaidDecal:
 
 @dataclass(frozen=True, eq=False)
 class _Inputs:
-    """Inputs of a computation. Scene and pixels are compared by identity, as they never change."""
+    """Inputs of a computation. The scene and the mask are compared by identity, as they never change."""
 
     scene: Gaussians
-    opaque: Mask | None
-    others: tuple[object, ...]
+    opaque: Mask | None  # opaque pixels of the decal. [H,W]
+    others: tuple[object, ...]  # further inputs, compared by value
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, _Inputs):

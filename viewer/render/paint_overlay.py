@@ -118,7 +118,7 @@ class FittedSurfaces:
 
     def __init__(self) -> None:
         self._known: OrderedDict[tuple[object, PaintedPicture], ViewSurface] = OrderedDict()
-        # the last model in each view, and its paint
+        # paint of each view whose model was computed last, and this model
         self._recent: dict[tuple[ViewCamera, Size], tuple[PaintedPicture, ViewSurface]] = {}
         self._requested: object = None  # key of the model in preparation
         self._stop = threading.Event()
@@ -138,7 +138,7 @@ class FittedSurfaces:
     def recent(self, picture: PaintedPicture) -> ViewSurface | None:
         """Return the last model in the view of a picture, whatever the strengths and the strokes were.
 
-        Paint that is not among these strokes lies on its quick model, see `quick_surface`.
+        Paint that was added after this model lies on a quick model, see `quick_surface`.
         """
         recent = self._recent.get((picture.camera, picture.size))
         return None if recent is None else quick_under(picture, recent[1], recent[0])
@@ -377,7 +377,7 @@ def quick_under(
     Args:
         picture: the paint
         seen: surface of its view
-        known: part of the paint for which the surface already has the model
+        known: part of the paint for which `seen` already is the model; None for none
     """
     painted = pixels_of(picture)[..., 3] > 0
     if known is not None:

@@ -166,7 +166,7 @@ class Surfaces:
 
         Args:
             key: identifies the picture and the dots
-            find: returns the two
+            find: function that returns both
         """
         if key != self._dots_key:
             self._dots = find()

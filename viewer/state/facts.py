@@ -36,9 +36,9 @@ _THUMBNAIL_DISTANCE = 0.7  # camera distance as a share of the framing distance
 
 
 FILL_BASE_S = 12.0
-"""Seconds to fill a hole in a small scene, rounded up; measured on two cores."""
+"""Estimate of the seconds to fill a hole in a small scene, for two processor cores."""
 FILL_S_PER_MILLION = 200.0
-"""Further seconds per million Gaussians of the scene."""
+"""Estimate of the further seconds per million Gaussians of the scene."""
 
 Hole = Literal["", "open", "filled"]
 """State of the hole that a removal leaves; "" for other edits."""
@@ -73,7 +73,7 @@ class LayerRow:
     added: int = 0  # number of members that are not in the original scene
     sources: str = ""  # its part from a picture and its part that is a guess, one line; "" without pictures
     hole: Hole = ""
-    fill_seconds: float = 0.0  # estimated time to fill the hole
+    fill_seconds: float = 0.0  # estimated seconds to fill the hole
     from_others: int = 0  # number of its last members that other edits add
     # returns the rows that it adds on some rows of the drawn scene, see `rows_on`. [N] bool -> [A] int64
     rows_on: Callable[[NDArray[np.bool_]], NDArray[np.int64]] = field(default=_no_rows, compare=False)
@@ -122,10 +122,10 @@ def _row(scene: Gaussians, gdf: Gdf, gdfs: Sequence[Gdf], added: int) -> LayerRo
 
 
 def _hole(gdf: Gdf) -> Hole:
-    """Return the state of a removal's hole. A removal that keeps the paint on its region has no state."""
+    """Return the state of a removal's hole; "" if it leaves paint behind, and for other edits."""
     if gdf.instruction != "remove" or not len(gdf.region):
         return ""
-    if "removal" in gdf.report:  # made by `progdf train`, which has filled it
+    if "removal" in gdf.report:  # made by `progdf train`, which fills holes
         return "filled"
     leaves_paint = gdf.anchors is not None and gdf.anchors.leaves_paint
     return "" if leaves_paint or gdf.added is not None else "open"

@@ -57,7 +57,7 @@ class NamedRegion:
     count: Annotated[int, Meta(ge=0)]  # number of its members
     color: Color = COLORS[0]  # color of its swatch and tint
     visible: bool = False  # whether the picture shows its tint
-    edit: str = ""  # name of the edit that was trained on it, if training made the region
+    edit: str = ""  # name of the edit for whose training the region was made; "" for a saved region
 
 
 @dataclass(frozen=True)
@@ -218,7 +218,7 @@ def free_name(state: SelectionState, text: str, is_taken: Callable[[str], bool] 
 
 
 def equal_region(state: SelectionState, members: bytes, total: int) -> int | None:
-    """Return the index of the region with the same Gaussians as a packed mask, None if there is none."""
+    """Return the index of the region with the same Gaussians as a packed mask; None if there is none."""
     mask = unpack(members, total)
     for index, region in enumerate(state.regions):
         if np.array_equal(unpack(region.members, total), mask):
@@ -233,7 +233,7 @@ def add_region(state: SelectionState, name: str, path: Path, edit: str = "") -> 
         state: the selection and the regions
         name: name of the region, unique
         path: file of its rows
-        edit: name of the edit that is trained on it, if it is not saved by hand
+        edit: name of the edit for whose training the region is made; "" for a saved region
 
     Raises:
         ProgdfError: there are already `MAX_REGIONS`.

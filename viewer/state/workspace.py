@@ -132,7 +132,7 @@ Pointed = tuple[str, int]
 
 
 REGIONS_OF_EDITS = "Regions of edits"
-"""Section of the panel with the regions that trainings made, folded at first."""
+"""Section of the panel with the regions that training made, folded at first."""
 
 
 @dataclass(frozen=True)

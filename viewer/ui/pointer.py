@@ -28,7 +28,7 @@ from viewer.state.workspace import SceneFacts
 from .context import UiContext
 from .overlay import Area
 
-_MAX_DOTS = 300  # dots of a stroke
+_MAX_DOTS = 300  # largest number of dots per kind of stroke
 _SURFACE = ("means", "quats", "log_scales", "logit_opacities", "sh0")
 """Attributes of a scene that `Surface` and picking read."""
 
@@ -97,7 +97,7 @@ class PointerContext:
         return self.surfaces.at(self._surface_key) or Surface(self.scene, self.camera(self.shown.camera))
 
     def visible_dots(self, strokes: tuple[Rows, Rows]) -> tuple[Floats, Floats]:
-        """Return the positions of two strokes' Gaussians on the front surface, pixels. [M,2], [K,2]"""
+        """Return the visible dots of both kinds of strokes, pixels of the picture. [M,2], [K,2]"""
         thinned = [rows[:: len(rows) // _MAX_DOTS + 1] for rows in strokes]
         rows = np.concatenate(thinned)
         key = self._surface_key, rows.tobytes()
@@ -137,7 +137,8 @@ class PointerContext:
     def paint_surface(self, picture: PaintedPicture) -> ViewSurface:
         """Return the surface under a painted picture.
 
-        This is its model, or that of earlier strokes in its view. Until it is computed, it is a quick model.
+        It is the model of this paint, or that of earlier strokes in its view. Until one is computed, it is a
+        quick model.
         """
         fitted = self.paint.fits.get(self.scene_key, picture)
         if fitted is None and not self.shown.layers:  # no strength has changed the surface
@@ -145,7 +146,7 @@ class PointerContext:
         return fitted or quick_under(picture, self.view_surface(picture.camera, picture.size))
 
     def recent_surface(self, picture: PaintedPicture) -> ViewSurface:
-        """Return that surface, or the last known one, which takes no time during motion."""
+        """Return the last known surface under a painted picture, which takes little time during motion."""
         view = to_camera(picture.camera, *picture.size)
         fitted = self.paint.fits.recent(picture)
         if fitted is not None:
@@ -169,7 +170,7 @@ class PointerContext:
     def unpaintable_at_cursor(self) -> str:
         """Return the reason why the visible surface at the cursor cannot hold paint; "" if it can.
 
-        Paint lies on the scene's own Gaussians, as the layers move them, and on lower paint.
+        Paint can lie on the scene's own Gaussians, also where layers move them, and on lower paint.
         """
         view = self.shown
         hides = view.selection.hidden != EMPTY_MASK
@@ -190,11 +191,11 @@ class PointerContext:
         if not is_apart(shown, paintable, x, y):
             return ""
         if hides:
-            return "hidden Gaussians lie here; show all, because paint cannot lie below them"
-        return "a layer added this surface, as a copy or a fill does; paint lies only on the scene's own"
+            return "hidden splats lie here; show all splats first"
+        return "a copy, a fill or grown splats lie here; paint only lies on the scene's own splats"
 
     def _added_surface(self) -> NDArray[np.bool_]:
-        """Return the drawn rows that visible layers add, except for paint. [N]"""
+        """Return the mask of the rows that visible layers add, except paint. [N]"""
         mask = np.zeros(len(self.engine.composer.gaussians), bool)
         own_count = self.facts.count - self.facts.added
         for layer in self.shown.layers:

@@ -133,7 +133,7 @@ def plate(
 
 
 def accent_button(text: str, size: imgui.ImVec2Like, chord: str = "") -> bool:
-    """Draw the button of the most likely action, and its keys at the right; return True if it was pressed."""
+    """Draw the button of the main action, with its keys at the right; return True if it was pressed."""
     col = imgui.Col_
     colors = {col.button: PALETTE.accent, col.button_hovered: PALETTE.handle, col.text: PALETTE.ink}
     for slot, color in colors.items():

@@ -287,6 +287,6 @@ def test_copy_is_copied_and_removed(desk: Desk) -> None:
 def test_copy_of_invisible_paint_alone_is_refused(desk: Desk) -> None:
     desk.store.change(replace(desk.view, layers=(replace(desk.view.layers[0], strength=0.0),)))
     desk.select(desk.paint_mask)
-    with pytest.raises(ProgdfError, match="the layers hide all that is selected"):
+    with pytest.raises(ProgdfError, match="the layers hide everything that is selected"):
         desk.tidy.requests["duplicate_selected"](None)
     assert desk.store.get().transient.gizmo is None

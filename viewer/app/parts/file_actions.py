@@ -315,9 +315,10 @@ class FileActions:
         selection = region_files.keep_region(view.selection, name, folder, total)
         self._store.change(replace(view, selection=selection))
         index = equal_region(selection, selection.members, total)
-        kept = selection.regions[-1 if index is None else index].name
-        known = selection == view.selection
-        line = f"The selection is already the region '{kept}'" if known else f"Region '{kept}' saved"
+        kept_name = selection.regions[-1 if index is None else index].name
+        line = f"Region '{kept_name}' saved"
+        if selection == view.selection:
+            line = f"The selection is already saved as the region '{kept_name}'"
         self._messages.show(line, button=("New edit", Plain("new_edit")))
 
     def _rename_region(self, action: Rename) -> None:

@@ -43,7 +43,7 @@ class PaintingActions:
         self._documents = documents
         self._messages = messages
         self._queue = queue
-        # paint in training and its scene, also of scenes that are not open, see `poll`
+        # paint in training with the file of its scene, which need not be open, see `poll`
         self._pending: list[tuple[Path | None, PendingPaint]] = []
 
     @property
@@ -100,7 +100,7 @@ class PaintingActions:
     def poll(self) -> float | None:
         """Remove paint whose layer is ready, and return paint whose run has failed or was discarded.
 
-        Paint of a scene that is not open is kept for it.
+        Paint of a scene that is not open is kept until that scene is opened.
         """
         if not self._pending:
             return None

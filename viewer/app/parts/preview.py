@@ -267,7 +267,7 @@ class PreviewActions:
         return self._grade[2] if request.of_all_views == self._grade[0].of_all_views else None
 
     def leave_ghost(self, run: Path) -> None:
-        """Keep the form's picture on screen for a run, until its edit has a layer."""
+        """Keep the form's picture in its view until the edit of a run has a layer."""
         work = self._store.get()
         cover = work.transient.cover
         if cover is None or self._texture is None or cover is self._behind:
@@ -279,7 +279,7 @@ class PreviewActions:
         self._store.replace(with_transient(work, cover=None, ghosts=ghosts))
 
     def _free_ghosts(self) -> None:
-        """Free the pictures of previews whose edits have layers."""
+        """Free the pictures of previews that are no longer shown."""
         shown = {ghost.run for ghost in self._store.get().transient.ghosts}
         for run in self._ghosts.keys() - shown:
             self._ghosts.pop(run).release()

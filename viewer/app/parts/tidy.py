@@ -43,7 +43,7 @@ class _Selected:
     region: Region  # Gaussians of the original
     leaves_paint: bool  # paint lies on them, and none of it is selected
     loose_paint: NDArray[np.bool_]  # selected paint that lies on other Gaussians. [N]
-    # returns the Gaussians of a copy: the selected ones and their paint, as the visible layers show them
+    # returns the Gaussians of a copy: the selected ones and their selected paint, under the visible layers
     copied: Callable[[], Gaussians]
 
 
@@ -77,26 +77,27 @@ def _copy_source(
 ) -> Gaussians:
     """Return the selected Gaussians and the selected paint under the visible layers.
 
-    Rows that the layers hide are left out, and so are layers whose paint lies on the object without being
-    selected.
+    Rows that the layers hide are left out. Layers whose paint lies on the object but is not selected are not
+    applied.
 
     Args:
         document: the open document
         view: its layers
-        own, paint_rows: selected Gaussians of the original, and selected rows that edits add. [N]
+        own, paint_rows: selected Gaussians of the original, and selected rows that edits add. [N] each
     """
     layers = []
     for layer in visible_layers(view):
         gdf = document.gdfs[layer.gdf]
-        lying = rows_on(gdf, torch.from_numpy(own)).numpy()
-        stays = len(lying) > 0 and not paint_rows[lying].any()  # its paint is not copied
-        if not stays:
+        paint_on_object = rows_on(gdf, torch.from_numpy(own)).numpy()
+        is_left_behind = len(paint_on_object) > 0 and not paint_rows[paint_on_object].any()
+        if not is_left_behind:
             layers.append(layer_of(gdf, layer.strength, layer.gains, layer.paint))
     composed = compose_layers(document.scene, layers, view.blend)
     is_drawn = (composed.logit_opacities >= UNSEEN_LOGIT).numpy()
-    is_as_before = (composed.logit_opacities == document.scene.logit_opacities).numpy()
-    copied = own & (is_drawn | is_as_before) | paint_rows & is_drawn
-    return composed[torch.from_numpy(np.flatnonzero(copied))]
+    keeps_opacity = (composed.logit_opacities == document.scene.logit_opacities).numpy()
+    copied_own = own & (is_drawn | keeps_opacity)
+    copied_paint = paint_rows & is_drawn
+    return composed[torch.from_numpy(np.flatnonzero(copied_own | copied_paint))]
 
 
 class TidyActions:
@@ -146,7 +147,7 @@ class TidyActions:
         if kind == "duplicate":
             moved = selected.copied()
         if not len(moved):
-            raise ProgdfError("the layers hide all that is selected; show it to copy it")
+            raise ProgdfError("the layers hide everything that is selected; make it visible to copy it")
         center = moved.means.double().mean(dim=0)
         self._selected = selected
         at = (float(center[0]), float(center[1]), float(center[2]))

@@ -108,7 +108,7 @@ class JobActions:
         draft: returns the file of a grade that previews the form
         anchor: returns the picture of one view that the form's sentence should follow
         follow: opens that picture's file in another program and shows the saved result
-        leave_ghost: keeps the preview on screen for a run, until its edit has a layer
+        leave_ghost: keeps the preview on screen until the edit of a run has a layer
         look_behind: turns the view to the camera of a picture and shows it there
     """
 
@@ -201,9 +201,9 @@ class JobActions:
             self.queue.dismiss(number)
 
     def _fill_hole(self, index: int) -> None:
-        """Fill the hole of a removal, stop its filling, or take the fill away.
+        """Toggle the fill of a removal's hole: fill it, stop the filling, or take the fill away.
 
-        The removal stays as it is until the fill replaces it.
+        The removal stays unfilled until the filled one replaces it.
 
         Raises:
             ProgdfError: a file is missing or cannot be written.
