@@ -1,9 +1,9 @@
 """The benchmark `recolors`: materials of all brightnesses recolored to six colors, judged in OKLab.
 
-Each material is a lit ball, made here: diffuse light, texture and highlights. Recolor, tint and a grade of
-its typical color are applied by the functions of training and previews. Every ball should get the median hue
-and chroma of the chosen color, keep its shading, and show no part of another hue. `--scenes` adds regions of
-scenes, and `--plots` draws the balls as a sheet.
+Each material is rendered as a lit ball with diffuse light, texture and highlights. Recolor, tint and a grade
+of its typical color are applied by the functions of training and previews. Every ball should get the hue and
+chroma of the chosen color in the median, keep its shading, and have no pixel of another hue. `--scenes` adds
+regions of scenes. `--plots` draws all balls as one picture.
 
     python -m benchmarks recolors --plots assets
 """
@@ -54,7 +54,7 @@ NOTE = (
 )
 
 _PAGE = 0.5  # value of the sheet's background
-_REGION_SHARE = 0.9  # share of a pixel by the region from which its color is judged
+_REGION_SHARE = 0.9  # smallest share of the region in a judged pixel
 _LIGHT = (-0.45, -0.6, 0.66)  # direction to the light; x right, y down, z to the camera
 _AMBIENT = 0.35  # share of diffuse light without a direction
 _HIGHLIGHT = 0.01  # linear light from which a pixel has a highlight
@@ -67,10 +67,10 @@ class Material:
 
     albedo: tuple[float, float, float]
     texture: float  # standard deviation of the albedo's texture, as a share
-    grain_px: float  # size of the texture
-    gloss: float = 0.0  # light of the highlight
+    grain_px: float  # sigma of the texture's blur, pixels
+    gloss: float = 0.0  # linear light of the highlight, 1 is white
     sharpness: float = 40.0  # exponent of the highlight
-    mirror: float = 0.0  # share of the reflected surroundings
+    mirror: float = 0.0  # share of reflected surroundings, 0 to 1
 
 
 MATERIALS = {
@@ -103,7 +103,15 @@ class Verdict:
 
 
 def ball(material: Material, side: int = SIDE_PX) -> tuple[Tensor, Tensor, Tensor]:
-    """Return a picture of a lit ball, sRGB; its pixels; those without a highlight. [H,W,3], [H,W] bool"""
+    """Render a lit ball.
+
+    Args:
+        material: surface of the ball
+        side: side of the picture, pixels
+
+    Returns:
+        The picture, sRGB 0 to 1 [H,W,3]; the ball's pixels, and those without a highlight [H,W] bool each.
+    """
     axis = (np.arange(side) + 0.5) / side * 2.2 - 1.1
     x, y = np.meshgrid(axis, axis)
     radius = np.hypot(x, y)
@@ -149,8 +157,8 @@ def expected_ab(rgb: Tensor, target: Tensor, edit: str) -> Tensor:
 def judge(before: Tensor, after: Tensor, goals: Tensor, diffuse: Tensor) -> Verdict:
     """Judge a recolored region.
 
-    A pixel is off hue if no color between the hues of the goals, gray included, is within a just noticeable
-    difference.
+    A pixel has the right hue if it is within a just noticeable difference of a color with a hue between those
+    of the goals, or of gray.
 
     Args:
         before: original colors of the region, sRGB. [N,3]

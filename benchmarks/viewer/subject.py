@@ -34,7 +34,7 @@ PICTURE_PX = (320, 200)  # width and height of a view in the sheet, pixels
 LABELS_SUFFIX = "_labels.npy"
 """End of the file of labels beside a scene; its subject has the labels above 0."""
 _SUPPORTS = ("plinth", "grass")  # parts of the demo scene that are not its subject
-_TINT = torch.tensor([1.0, 0.55, 0.05])
+_TINT = torch.tensor([1.0, 0.55, 0.05])  # color of the selection in the pictures, sRGB
 _DIMMED = 0.35  # brightness of Gaussians outside the selection
 
 
@@ -43,10 +43,10 @@ class SubjectView:
     """View relative to the first one of a scene."""
 
     name: str
-    turn: float = 0.0  # degrees to the left
-    rise: float = 0.0  # degrees up
-    shift: tuple[float, float] = (0.0, 0.0)  # of the subject's middle, in heights of the picture
-    distance: float = 1.0  # in distances of the first view
+    turn: float = 0.0  # added azimuth, degrees
+    rise: float = 0.0  # added elevation, degrees
+    shift: tuple[float, float] = (0.0, 0.0)  # shift of the pivot, right and up, in heights of the picture
+    distance: float = 1.0  # camera distance, as a multiple of the first view's
 
 
 VIEWS = (
@@ -65,7 +65,7 @@ def tables(scenes: Sequence[Path] = (), plot: Path | None = None) -> list[Table]
         plot: file of a sheet of pictures with the selections, one row per scene
 
     Raises:
-        ProgdfError: a file is missing or broken.
+        ProgdfError: a file is missing or invalid.
     """
     rows = []
     sheet = []

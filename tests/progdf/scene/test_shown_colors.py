@@ -69,7 +69,7 @@ def test_pixel_lists_its_gaussians_with_their_shares() -> None:
     assert 0.5 < shares.sum() <= 1.0
 
 
-def test_flood_from_a_pixel_takes_what_looks_alike(tmp_path: Path) -> None:
+def test_flood_from_a_pixel_selects_its_color_on_screen(tmp_path: Path) -> None:
     scene = speckled_sheet()
     save_cameras(tmp_path / "view.json", [camera()])
     chosen = parse_region(f"flood:{tmp_path}/view.json:30,48,0.1", scene).mask.numpy()
