@@ -1,6 +1,6 @@
-"""Discs of painted layers, and the parts in which the discs of two layers lie on each other.
+"""Discs of painted layers, and the overlaps of two layers.
 
-All measures are those at strength 1. They do not change with the sliders.
+All values are those at strength 1, so they do not change with the sliders.
 """
 
 from __future__ import annotations

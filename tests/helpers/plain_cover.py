@@ -8,10 +8,10 @@ from scipy.spatial import cKDTree
 
 from progdf.compose.paint_sheets import Sheet
 
-MIN_WEIGHT = 0.05
-REACH_DEVIATIONS = 3.0
-BLUR_THICKNESSES = 5.5
-POINTS_AT_ONCE = 1 << 14
+MIN_WEIGHT = 0.05  # opacity of a disc at a point; below it, the disc is beside the point
+REACH_DEVIATIONS = 3.0  # extent of a disc, in standard deviations
+BLUR_THICKNESSES = 5.5  # standard deviation of a renderer's blur, in thicknesses of a disc
+POINTS_AT_ONCE = 1 << 14  # limits the memory
 
 Floats = NDArray[np.float64]
 Rows = NDArray[np.int64]
@@ -39,8 +39,8 @@ def measure_cover(
     under = np.zeros(len(points), np.int64)
     size = sheet.scales.max(axis=1)
     classes = np.floor(np.log2(np.maximum(size, 1e-30))).astype(int)  # so that a point has few neighbors
-    for one in np.unique(classes):
-        members = np.flatnonzero(classes == one)
+    for size_class in np.unique(classes):
+        members = np.flatnonzero(classes == size_class)
         blur = BLUR_THICKNESSES * float(np.max(sheet.scales[members].min(axis=1)))
         reach = REACH_DEVIATIONS * float(np.hypot(size[members].max(), blur))
         tree = cKDTree(sheet.points[members])
@@ -53,7 +53,10 @@ def measure_cover(
             owner = begin + np.repeat(np.arange(len(lists)), counts)
             weight, apart = _weights(sheet, disc, points[owner], outward[owner], distance)
             seen = weight > MIN_WEIGHT
-            disc, owner, weight, apart = disc[seen], owner[seen], weight[seen], apart[seen]
+            disc = disc[seen]
+            owner = owner[seen]
+            weight = weight[seen]
+            apart = apart[seen]
             np.add.at(light, owner, np.log1p(-np.minimum(weight, 0.999)))
             np.maximum.at(height, owner, apart)
             order = np.argsort(weight, kind="stable")
