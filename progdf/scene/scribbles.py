@@ -71,7 +71,7 @@ class Scribbles:
         both = on & beside
         on &= ~both
         beside &= ~both
-        if not on.any():
+        if not on.any() or self._count == 1:
             return on
         return self._levels.chances(on, beside) > 0.5
 

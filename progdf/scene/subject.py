@@ -293,12 +293,9 @@ def _split_support(height: Tensor, plan: Tensor) -> tuple[Tensor, Tensor] | None
         The two masks; None without a support.
     """
     cell = _plan_cells(plan)
-    low, high = (float(quantile(height, share)) for share in (_GROUND_QUANTILE, 1.0))
-    levels = torch.arange(low, high, _STANDING_HEIGHT).tolist()
-    areas = [int(_covered_cells(cell[(height - level).abs() <= _STANDING_HEIGHT]).sum()) for level in levels]
-    if not areas:
+    level = _widest_level(height, cell)
+    if level is None:
         return None
-    level = levels[int(np.argmax(areas))]
     above = height > level + _STANDING_HEIGHT
     surface = (height - level).abs() <= _STANDING_HEIGHT
     wide = _covered_cells(cell[surface])
@@ -310,6 +307,27 @@ def _split_support(height: Tensor, plan: Tensor) -> tuple[Tensor, Tensor] | None
         and (wide & around).sum() >= _MIN_RIM_SHARE * around.sum()
     )
     return (above, surface & ~torch.from_numpy(covered.ravel())[cell]) if is_support else None
+
+
+def _widest_level(height: Tensor, cell: Tensor) -> float | None:
+    """Return the height at which rows cover most cells of the plan; None if all heights are equal. [R], [R]
+
+    Empty levels are skipped, as a thin thing is many thousand times as high as wide.
+    """
+    low, high = (float(quantile(height, share)) for share in (_GROUND_QUANTILE, 1.0))
+    order = height.argsort()
+    ascending = height[order].double().numpy()
+    cells = cell[order].numpy()
+    steps = np.unique(np.floor((ascending[ascending >= low] - low) / _STANDING_HEIGHT))
+    steps = np.union1d(steps, steps + 1.0)
+    levels = low + _STANDING_HEIGHT * steps
+    levels = levels[levels < high]
+    if not len(levels):
+        return None
+    starts = np.searchsorted(ascending, levels - _STANDING_HEIGHT)
+    ends = np.searchsorted(ascending, levels + _STANDING_HEIGHT, side="right")
+    areas = [len(np.unique(cells[start:end])) for start, end in zip(starts, ends, strict=True)]
+    return float(levels[int(np.argmax(areas))])
 
 
 def _plan_cells(plan: Tensor) -> Tensor:

@@ -97,6 +97,23 @@ def test_object_without_surroundings_is_selected_whole() -> None:
     assert found.mean() > 0.99
 
 
+def test_scene_of_one_gaussian_is_its_own_subject() -> None:
+    alone = replace(random_gaussians(1, seed=1), means=torch.zeros(1, 3), logit_opacities=torch.tensor([4.0]))
+    assert select_subject(alone, Neighborhood(alone), first_view(alone, UP, SIZE), UP).all()
+
+
+def test_object_much_higher_than_wide_is_found_quickly() -> None:
+    floor, labels = balls_on_a_floor()
+    is_line = labels == 1
+    means = floor.means.clone()
+    means[is_line] = torch.tensor([0.0, 1.0, 0.0]) * torch.linspace(0.0, 1.0, int(is_line.sum()))[:, None]
+    kept = torch.from_numpy(np.flatnonzero(labels < 2))
+    scene = replace(floor, means=means)[kept]
+    view = view_of((0.0, 0.5, 0.0), (0.0, 1.5, 4.0))
+    found = select_subject(scene, Neighborhood(scene), view, UP)
+    assert found[is_line[labels < 2]].mean() > 0.8
+
+
 def test_room_and_empty_view_give_one_line() -> None:
     inside = room(3000).gaussians
     with pytest.raises(ProgdfError, match="a room has no single subject"):
