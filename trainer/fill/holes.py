@@ -166,7 +166,8 @@ def _textured_discs(rest: Gaussians, hole: Hole, seen: Sequence[Front]) -> tuple
     about = f"ground around the hole: {ground.name}, texture contrast {contrast:.3f} in OKLab"
     if contrast < VISIBLE_CONTRAST:
         return None, f"{about} (not visible below {VISIBLE_CONTRAST}): filled smoothly"
-    if ground.known.sum() < ground.hole.sum():
+    clean = ground.known & ~area_to_fill(ground.hole, ground.known)
+    if clean.sum() < ground.hole.sum():
         return None, f"{about}: filled smoothly, as less of the ground is visible than is missing"
     if not can_continue_texture():
         return None, f"{about}: filled smoothly; pip install 'progdf-studio[fill]' continues the texture"

@@ -9,8 +9,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -42,10 +40,10 @@ _CORNERS = [(r, g, b) for r in (0, 1) for g in (0, 1) for b in (0, 1)]  # of the
 
 def can_continue_texture() -> bool:
     """Return True if OpenCV with its contributed modules (extra `fill`) is installed."""
-    if find_spec("cv2") is None:
+    try:
+        import cv2
+    except ImportError:  # also if a library of the system is missing
         return False
-    import cv2
-
     return hasattr(cv2, "xphoto")  # absent in OpenCV without contrib
 
 
@@ -104,6 +102,8 @@ def _copy_sources(image: Tensor, filled: Mask, sources: Mask) -> NDArray[np.int6
     Shift maps leave pixels empty if none of their shifts leads to a source. Each connected piece of such
     pixels is copied as a whole, from the position whose surroundings agree best.
     """
+    if not sources.any():
+        return np.full((2, *filled.shape), -1)
     copied = _shift_map(image, filled, sources)
     origin = _recover_sources(copied, _to_lab(image), filled, sources)
     missing = filled & (origin[0] < 0)
@@ -232,12 +232,14 @@ def _candidate_shifts(
     whole_sources = ndimage.binary_erosion(sources, np.ones((3, 3)))
     whole_fills = ndimage.binary_erosion(filled, np.ones((3, 3)))
     codes = of_sources[whole_sources]
+    if not len(codes):  # all sources are narrow
+        return []
     places = np.argwhere(whole_sources)
     order = codes.argsort(kind="stable")
     codes = codes[order]
     unique, first, count = np.unique(codes, return_index=True, return_counts=True)
     wanted = of_copies[whole_fills]
-    at = np.searchsorted(unique, wanted).clip(max=max(0, len(unique) - 1))
+    at = np.searchsorted(unique, wanted).clip(max=len(unique) - 1)
     known = (unique[at] == wanted) & (count[at] == 1)
     shifts = places[order[first[at[known]]]] - np.argwhere(whole_fills)[known]
     if not len(shifts):

@@ -126,6 +126,19 @@ def test_edge_of_the_hole_is_no_steeper_than_the_texture() -> None:
     assert across[rim].mean() < 1.3 * own.mean()
 
 
+@needs_extra
+@pytest.mark.parametrize("visible", ["stripes", "rim"])
+def test_ground_without_whole_patches_is_filled(visible: str) -> None:
+    image = dots(60, 72)
+    hole = middle_hole(60, 72)
+    known = np.zeros_like(hole)
+    known[:, ::2] = True
+    if visible == "rim":
+        known = ndimage.binary_dilation(hole, iterations=3)
+    filled = continue_texture(image, hole, known & ~hole)
+    assert bool(filled.isfinite().all())
+
+
 def splats(means: Tensor, size: float, rgb: Tensor) -> Gaussians:
     """Return opaque discs that lie flat."""
     frame = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
