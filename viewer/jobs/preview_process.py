@@ -99,10 +99,8 @@ class PreviewChild:
         return number
 
     def take(self) -> Preview | None:
-        """Return the last answer since the previous call, or the error of an ended process. Does not wait."""
-        line = None
-        while self._answers:
-            line = self._answers.popleft()
+        """Return the next answer, or the error of an ended process; None without one. Does not wait."""
+        line = self._answers.popleft() if self._answers else None
         if line is None:
             ended = self._child.status is not None
             return (

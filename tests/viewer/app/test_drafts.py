@@ -15,7 +15,7 @@ from PIL.PngImagePlugin import PngInfo
 from progdf.camera import Camera
 from progdf.compose import layer_paint
 from progdf.gdf.file import load_gdf, save_gdf
-from progdf.io.picture_camera import find_picture_camera
+from progdf.io.picture_camera import camera_chunk, find_picture_camera
 from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.ui_rig import bear, first_view
@@ -268,6 +268,25 @@ def test_preview_stays_in_its_view_until_the_edit_has_a_layer(window: applicatio
     turn(window)
     assert window.main_view.work.transient.covers == ()
     assert len(window.main_view.work.view.layers) == 1
+
+
+def test_picture_from_behind_ends_with_the_next_preview(window: application.App, tmp_path: Path) -> None:
+    Previews.grade = None
+    path = tmp_path / "behind.png"
+    camera = to_camera(replace(window.main_view.work.view.camera, azimuth=160.0), 160, 120)
+    Image.new("RGB", (160, 120), (10, 90, 200)).save(path, pnginfo=camera_chunk(camera))
+    window.parts.preview.look_behind(path)
+    turn(window)
+    behind = window.main_view.work.transient.cover
+    assert behind is not None
+    opened(window)
+    with_form(window, editor=2)
+    preview = window.main_view.work.transient.cover
+    assert preview is not None
+    assert preview.camera == behind.camera
+    window.main_view.store.replace(replace(window.main_view.work, form_open=False))
+    turn(window)
+    assert window.main_view.work.transient.cover is None, "its texture shows another picture now"
 
 
 def test_prompt_is_painted_on_request_and_the_edit_follows_it(

@@ -27,7 +27,7 @@ from viewer.camera.view_camera import ViewCamera, from_camera, to_camera
 from viewer.files import region_files, user_files
 from viewer.files.document import DocumentStore
 from viewer.jobs import training
-from viewer.jobs.preview_process import PreviewChild, PreviewInputs
+from viewer.jobs.preview_process import Preview, PreviewChild, PreviewInputs
 from viewer.state.forms import EDITORS, NO_CHANGE, SHEET_COLUMNS, SHEET_PX, STYLE_ORDER, NewEdit, with_picture
 from viewer.state.transient import Cover, PreviewGhost, PreviewState
 from viewer.state.view_state import LayerState
@@ -289,6 +289,9 @@ class PreviewActions:
         self._end()
         self._grade = None
         self._painting = None
+        self._painted = None
+        self._pose = None
+        self._behind = None
         self._palette_of = ""
         self._broken = False
 
@@ -382,10 +385,12 @@ class PreviewActions:
         self._store.wake()
 
     def _take(self, child: PreviewChild, now: PreviewInputs) -> None:
-        """Show the answer of the process unless the region or the editor family has changed since."""
-        answer = child.take()
-        if answer is None:
-            return
+        """Show the answers of the process."""
+        while self._child is child and (answer := child.take()) is not None:
+            self._show_answer(answer, now)
+
+    def _show_answer(self, answer: Preview, now: PreviewInputs) -> None:
+        """Show an answer unless the region or the editor family has changed since."""
         if answer.number in (self._number, -1):
             self._outstanding = False
         if self._tile >= 0 and answer.number == self._number:
@@ -458,6 +463,8 @@ class PreviewActions:
         self._grade = None
 
     def _upload(self, pixels: NDArray[np.uint8]) -> int:
+        """Write a picture to the texture of the cover, and return its GL name. Earlier covers end."""
+        self._behind = None
         size = pixels.shape[1], pixels.shape[0]
         if self._texture is None or self._texture.size != size:
             if self._texture is not None:
