@@ -312,7 +312,7 @@ def _split_support(height: Tensor, plan: Tensor) -> tuple[Tensor, Tensor] | None
 def _widest_level(height: Tensor, cell: Tensor) -> float | None:
     """Return the height at which rows cover most cells of the plan; None if all heights are equal. [R], [R]
 
-    Empty levels are skipped, as a thin thing is many thousand times as high as wide.
+    Empty levels are skipped. A thin object can be many thousand times as high as wide, with as many levels.
     """
     low, high = (float(quantile(height, share)) for share in (_GROUND_QUANTILE, 1.0))
     order = height.argsort()
