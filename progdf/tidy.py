@@ -1,7 +1,8 @@
-"""Edits that remove, move or copy regions. Their path over strengths is known, so nothing is trained.
+"""Edits that remove, move, pull or copy regions. Their path over strengths is known, so nothing is trained.
 
     remove      a region fades out, until no engine draws it
     transform   a region is translated, rotated and scaled about the mean of its centers, along an arc
+    pull        points of a region are dragged, and the rest follows rigidly (see `progdf.pull`)
     duplicate   a transformed copy of a region fades in as added rows
 
 Fading is even in pictures (see `progdf.fade`), or linear in opacity, which needs no pictures.
@@ -26,6 +27,7 @@ from progdf.field.separable import course_field, opacity_course
 from progdf.gaussians import Gaussians, attribute_slices, concatenate, pack
 from progdf.gdf.anchors import free_anchors
 from progdf.gdf.file import ADDED_LOGIT, Gdf, anchor_added, fingerprint
+from progdf.pull.course import PullCourse
 from progdf.region import Region, from_mask
 from progdf.similarity import Motion, make_parts, move_rows
 
@@ -35,7 +37,7 @@ _KNOT_SPACING = 1 / 8
 _OPACITY_COLUMN = attribute_slices(14)["logit_opacities"].start
 
 
-Operation = Literal["remove", "transform", "duplicate"]
+Operation = Literal["remove", "transform", "duplicate", "pull"]
 
 
 @dataclass(frozen=True)
@@ -46,9 +48,12 @@ class Step:
     region: Region
     motion: Motion | None = None  # motion of the region as one part; None: no motion
     copied: Gaussians | None = None  # Gaussians to duplicate in place of the region's own
+    course: PullCourse | None = None  # course of a pull, the first step of its Gaussians
 
     def move(self, rows: Tensor, share: float) -> Tensor:
         """Return packed raw rows after a share, 0 to 1, of the motion. [M,C] float64 -> [M,C]"""
+        if self.course is not None:
+            return rows + self.course.offsets_at(share)
         if self.motion is None or not len(rows):
             return rows
         motion = Motion(*(share * part.double() for part in vars(self.motion).values()))
@@ -121,6 +126,9 @@ def tidy(
     motions = [step.motion for step in steps if step.does == "transform" and step.motion is not None]
     count = max(1, *(math.ceil(_motion_size(motion) / _KNOT_SPACING) for motion in motions)) if motions else 1
     knots = torch.linspace(0.0, 1.0, 1 + count)
+    for step in steps:
+        if step.course is not None:
+            knots = torch.cat([knots, step.course.strengths]).unique()  # type: ignore[no-untyped-call]
     if bool(logits.any()):
         knots = torch.cat([knots, opacity_knots]).unique()  # type: ignore[no-untyped-call]
     offsets = rows.new_zeros(len(knots), len(end), rows.shape[1])
@@ -173,7 +181,7 @@ def bake(scene: Gaussians, steps: Sequence[Step]) -> Gaussians:
 
 
 def _rotates(step: Step) -> bool:
-    return step.motion is not None and bool(step.motion.turn.any())
+    return step.course is not None or (step.motion is not None and bool(step.motion.turn.any()))
 
 
 def _motion_size(motion: Motion) -> float:
@@ -186,7 +194,7 @@ def _rows_at(scene: Gaussians, members: Tensor, steps: Sequence[Step], bands: bo
     rows = pack(scene[members], with_shN=bands)
     moved = rows.double()
     for step in steps:
-        if step.does == "transform":
+        if step.does in ("transform", "pull"):
             index = torch.searchsorted(members, step.region.members)
             moved[index] = step.move(moved[index], share)
     return moved.to(rows.dtype)

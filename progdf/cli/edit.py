@@ -6,6 +6,7 @@ import math
 import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial, reduce
 from pathlib import Path
 from typing import Annotated
 
@@ -21,6 +22,8 @@ from progdf.gdf.file import save_gdf
 from progdf.io.atomic import check_not_an_input
 from progdf.io.json_values import check_text
 from progdf.metrics.image import NO_DIFFERENCE
+from progdf.pull.course import Handle, pull
+from progdf.region import union
 from progdf.scene.regions import check_region, parse_region, read_numbers
 from progdf.scene.strays import clean, find_strays, picture_difference
 from progdf.similarity import Motion
@@ -37,11 +40,11 @@ MAX_SCALE = 1000.0
 
 @dataclass(frozen=True)
 class EditOptions:
-    """Remove, move, rotate, scale or copy parts of a scene, as a new scene or as an edit with a slider.
+    """Remove, move, pull, rotate, scale or copy parts of a scene, as a new scene or as an edit with a slider.
 
     The scene file itself is never changed. REGION is written as for progdf train, except for forms that need
     pictures. The numbers of an option follow the last colon. All regions refer to the scene in the file.
-    Overlapping regions are scaled, then rotated, then moved. Cleaning comes last.
+    Overlapping regions are pulled, then scaled, then rotated, then moved. Cleaning comes last.
     """
 
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
@@ -58,6 +61,10 @@ class EditOptions:
     """Rotate the region about the mean of its centers; AXIS: x, y, z or a vector; −360 to 360 degrees."""
     move: Annotated[Specs, absent_option("REGION:DX,DY,DZ")] = ()
     """Move the region by an offset in world units."""
+    pull: Annotated[Specs, absent_option("REGION:X,Y,Z,DX,DY,DZ[,FALLOFF]")] = ()
+    """Pull a point of the region; the rest follows rigidly, within a radius FALLOFF or all of it."""
+    hold: Annotated[Specs, absent_option("REGION")] = ()
+    """Hold the region in place while others are pulled."""
     duplicate: Annotated[Specs, absent_option("REGION:DX,DY,DZ")] = ()
     """Add a copy of the region, moved by an offset in world units."""
     glb_axes: GlbAxes = "LUF"
@@ -72,7 +79,10 @@ def main(argv: Sequence[str]) -> int:
     """
     options = parse_options(EditOptions, argv, "progdf edit")
     makes_edit = options.out.suffix.lower() == ".gdf"
+    pulls = _read_pulls(options)
     step_makers = _read_steps(options)
+    if pulls is not None:
+        step_makers = [pulls, *step_makers]
     if not options.clean and not step_makers:
         raise ProgdfError(
             "no change is requested; add at least one option, for example --clean or --delete REGION"
@@ -122,15 +132,16 @@ def _write_edit(options: EditOptions, scene: Gaussians, steps: Sequence[Step]) -
 def _instruction(options: EditOptions) -> str:
     """Return the step options as typed, which the edit stores as its instruction."""
     parts = ["edit"]
-    for name in ("delete", "scale", "rotate", "move", "duplicate"):
+    for name in ("delete", "pull", "hold", "scale", "rotate", "move", "duplicate"):
         parts += [f"--{name} {spec}" for spec in getattr(options, name)]
     return " ".join(parts)
 
 
 def _describe(step: Step) -> str:
     """Return a description of a step for the user: region, number of Gaussians and action."""
-    action = {"remove": "removed", "transform": "transformed", "duplicate": "copied"}[step.does]
-    return f"{shorten(step.region.name)}: {format_count(len(step.region))} {action}"
+    actions = {"remove": "removed", "transform": "transformed", "duplicate": "copied", "pull": "pulled"}
+    text = f"{shorten(step.region.name)}: {format_count(len(step.region))} {actions[step.does]}"
+    return text if step.course is None else f"{text} ({step.course.describe()})"
 
 
 def _read_steps(options: EditOptions) -> list[Callable[[Gaussians], Step]]:
@@ -157,6 +168,41 @@ def _read_steps(options: EditOptions) -> list[Callable[[Gaussians], Step]]:
             step_makers.append(_maker("duplicate" if name == "duplicate" else "transform", spec, motion))
     step_makers += [_maker("remove", spec, None) for spec in options.delete]
     return step_makers
+
+
+def _read_pulls(options: EditOptions) -> Callable[[Gaussians], Step] | None:
+    """Return a function that creates the one step of all pulls; None without pulls.
+
+    Raises:
+        ProgdfError: as for `_read_steps`.
+    """
+    parsed = []
+    for text in options.pull:
+        spec, _, typed = text.rpartition(":")
+        numbers = read_numbers(typed)
+        if len(numbers) not in (6, 7) or not spec or not all(number > 0 for number in numbers[6:]):
+            raise ProgdfError(
+                f"'{shorten(text)}' has no usable numbers at its end; "
+                "write --pull REGION:X,Y,Z,DX,DY,DZ[,FALLOFF] with a radius above 0"
+            )
+        parsed.append((spec, numbers))
+    for spec in [*(spec for spec, _ in parsed), *options.hold]:
+        check_region(spec)
+    if options.hold and not parsed:
+        raise ProgdfError("--hold has nothing to hold against; add --pull REGION:X,Y,Z,DX,DY,DZ")
+    return partial(_pull_step, parsed, options.hold) if parsed else None
+
+
+def _pull_step(parsed: Sequence[tuple[str, list[float]]], holds: Sequence[str], scene: Gaussians) -> Step:
+    handles = []
+    for spec, numbers in parsed:
+        x, y, z = (value - origin for value, origin in zip(numbers[:3], scene.origin, strict=True))
+        shift = (numbers[3], numbers[4], numbers[5])
+        falloff = numbers[6] if len(numbers) > 6 else None
+        handles.append(Handle(parse_region(spec, scene, say=print_line), (x, y, z), shift, falloff))
+    held = [parse_region(spec, scene, say=print_line) for spec in holds]
+    course = pull(scene, handles, reduce(union, held) if held else None)
+    return Step("pull", course.region, course=course)
 
 
 def _maker(does: Operation, spec: str, motion: Motion | None) -> Callable[[Gaussians], Step]:

@@ -249,6 +249,21 @@ def test_edit_command_writes_a_slider(ply: Path, tmp_path: Path) -> None:
     assert torch.allclose(means, expected, atol=ROUNDING)
 
 
+@pytest.mark.parametrize("form", ["ply", "gdf"])
+def test_edit_command_pulls_a_point(ply: Path, tmp_path: Path, form: str) -> None:
+    out = tmp_path / f"pulled.{form}"
+    scene = load_ply(ply)
+    target = scene.means[scene.means[:, 0].argmax()]
+    point = ",".join(str(value) for value in target.tolist())
+    pull = f"all:{point},0.3,-0.1,0"
+    assert main(["edit", str(ply), "--pull", pull, "--hold", LEFT, "-o", str(out)]) == 0
+    edited = load_ply(out) if form == "ply" else at(scene, load_gdf(out, scene), 1.0)
+    left = scene.means[:, 0] < 0
+    row = int(scene.means[:, 0].argmax())
+    assert torch.equal(edited.means[left], scene.means[left])
+    assert torch.allclose(edited.means[row], target + torch.tensor([0.3, -0.1, 0.0]), atol=0.02)
+
+
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -268,6 +283,15 @@ def test_edit_command_writes_a_slider(ply: Path, tmp_path: Path) -> None:
         ["--rotate", "all:0,0,0,90"],
         ["--rotate", "all:y,1e9"],
         ["--rotate", "all:y"],
+        ["--pull", "all:1,2,3"],
+        ["--pull", "all:0,0,3,0,0,nan"],
+        ["--pull", "all:0,0,3,0,0,0"],
+        ["--pull", "all:0,0,3,0,0,1e6"],
+        ["--pull", "all:0,0,3,1,0,0,0"],
+        ["--pull", "all:50,0,3,1,0,0"],
+        ["--pull", "sphere:90,0,0,1:0,0,3,1,0,0"],
+        ["--pull", "all:0,0,3,1,0,0", "--hold", "all"],
+        ["--hold", "all"],
         ["--scale", "all:0"],
         ["--scale", "all:-1"],
         ["--scale", "all:1e9"],

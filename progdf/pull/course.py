@@ -1,0 +1,290 @@
+"""Course of a pull: the region at several strengths along the handles' paths, each solved on its own.
+
+A blend of both ends would shrink parts that turn. Here rigid parts stay rigid at every strength. A handle
+that turns with its surroundings moves on an arc, otherwise on a straight line.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.sparse import csr_array
+from torch import Tensor
+
+from progdf.errors import ProgdfError
+from progdf.field.baked import interpolate_at
+from progdf.gaussians import Gaussians, pack
+from progdf.quaternions import matrix_turns
+from progdf.region import Region, from_mask
+from progdf.scene.point_tree import PointTree
+
+from .follow import bind, follow, rest_frames
+from .graph import MAX_NODES, Floats, Mask, NodeGraph, Rows, build_graph
+from .solve import Pose, Solver
+
+MAX_PULL = 100.0
+"""Largest pull, in diagonals of the scene."""
+_TOUCH_SIGMAS = 3.0  # standard deviations; a point on the region is at most so far from a Gaussian
+_HELD_BELOW = 0.01  # falloff; nodes with less are held
+_SPRING = 8.0  # stiffness of the falloff's springs, in edges per squared radius
+_TRIAL_STRENGTHS = 4  # strengths of the solve that finds how far the handles turn
+_KNOT_SPACING = 1 / 8  # rotation, radians, or log-stretch of the nodes between two strengths
+_LARGEST_SHARE = 0.99  # quantile of the nodes' rotations that counts
+_MIN_STRENGTHS = 4
+_MAX_STRENGTHS = 24
+_MOVED = 1e-4  # node spacings; Gaussians that move less are unchanged
+
+
+@dataclass(frozen=True)
+class Handle:
+    """A point of a region and its displacement."""
+
+    region: Region  # the point pulls these Gaussians
+    point: tuple[float, float, float]  # position relative to the origin of the scene, world units
+    pull: tuple[float, float, float]  # displacement, world units
+    falloff: float | None = None  # radius of the influence, world units; None: all that is connected
+
+
+@dataclass(frozen=True)
+class PullCourse:
+    """Offsets of a pulled region at several strengths."""
+
+    region: Region  # the M Gaussians that move
+    strengths: Tensor  # from 0 to 1. [S]
+    offsets: Tensor  # packed offsets from the scene, with higher bands if the scene has any. [S,M,C]
+    node_count: int
+    stretches: Tensor  # length of each edge at strength 1 per length at rest. [E]
+
+    def offsets_at(self, strength: float) -> Tensor:
+        """Return the packed offsets at a strength, linear between the solved ones. [M,C]"""
+        return interpolate_at(self.strengths, self.offsets, strength)
+
+    def describe(self) -> str:
+        """Return the number of nodes and strengths, and the stretch of the edges, for the user."""
+        text = f"{self.node_count} nodes, solved at {len(self.strengths) - 1} strengths"
+        if not len(self.stretches):
+            return text
+        low, high = self.stretches.quantile(torch.tensor([0.01, 0.99], dtype=self.stretches.dtype)).tolist()
+        return f"{text}, lengths times {low:.2f} to {high:.2f}"
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Graph and solver of a pull."""
+
+    members: Rows  # rows of the scene that the graph covers. [M]
+    graph: NodeGraph
+    solver: Solver
+    blends: csr_array  # weights of the nodes in each handle. [H,n]
+    points: Floats  # [H,3]
+    pulls: Floats  # [H,3]
+
+
+def pull(
+    scene: Gaussians, handles: Sequence[Handle], hold: Region | None = None, max_nodes: int = MAX_NODES
+) -> PullCourse:
+    """Return the course of pulled points.
+
+    Args:
+        scene: the original
+        handles: at least one
+        hold: Gaussians that stay as they are, bit for bit
+        max_nodes: target number of nodes of the graph
+
+    Raises:
+        ProgdfError: a point is not on its region or is held, or a pull is out of range.
+    """
+    problem = _make_problem(scene, handles, hold, max_nodes)
+    strengths, poses = _solve_course(problem)
+    graph = problem.graph
+    kept = np.ones(len(scene), bool)
+    if hold is not None:
+        kept[hold.members.numpy()] = False
+    moved_nodes = np.zeros(len(graph), bool)
+    for pose in poses:
+        moved_nodes |= np.abs(pose.positions - graph.positions).max(axis=1) > _MOVED * graph.spacing
+    points = scene.means.detach().double().numpy()[problem.members]
+    binding = bind(graph, points, graph.node_of)
+    moves = (binding @ moved_nodes.astype(float) > 0.0) & kept[problem.members]
+    members = problem.members[moves]
+    binding = csr_array(binding[np.flatnonzero(moves)])
+    raw = pack(scene[torch.from_numpy(members)], with_shN=scene.sh_degree > 0).detach()
+    rows = raw.double()
+    frames = rest_frames(rows)
+    offsets = torch.zeros(len(strengths), *raw.shape)
+    for i, pose in enumerate(poses, start=1):
+        packed, frames = follow(rows, binding, graph, pose, problem.solver.gradients(pose), frames)
+        offsets[i] = (packed - rows).float()
+    mask = torch.zeros(len(scene), dtype=torch.bool)
+    mask[torch.from_numpy(members)] = True
+    name = " + ".join(dict.fromkeys(handle.region.name for handle in handles))
+    stretches = torch.from_numpy(problem.solver.stretches(poses[-1]))
+    return PullCourse(
+        from_mask(name, mask), torch.from_numpy(strengths).float(), offsets, len(graph), stretches
+    )
+
+
+def _make_problem(
+    scene: Gaussians, handles: Sequence[Handle], hold: Region | None, max_nodes: int
+) -> _Problem:
+    means = scene.means.detach().double().numpy()
+    nearest = np.array([_check_handle(scene, means, handle) for handle in handles])
+    points = np.array([handle.point for handle in handles], np.float64)
+    members = _reachable_rows(means, handles)
+    graph = build_graph(scene[torch.from_numpy(members)], max_nodes)
+    held_members = np.zeros(len(members), bool)
+    if hold is not None:
+        held_members = np.isin(members, hold.members.numpy())
+    at = np.searchsorted(members, nearest)
+    for handle, row in zip(handles, at, strict=True):
+        if held_members[row]:
+            raise ProgdfError(f"the point {_world(scene, handle)} is held; pull a point outside --hold")
+    nodes = graph.node_of[at]
+    blends = bind(graph, points, nodes)
+    counts = np.bincount(graph.node_of, minlength=len(graph))
+    held = 2 * np.bincount(graph.node_of, held_members, minlength=len(graph)) >= counts
+    weights = _falloff_weights(graph, handles)
+    held |= weights < _HELD_BELOW
+    held |= ~np.isin(graph.part, graph.part[nodes])
+    held[nodes] = False
+    solver = Solver(graph, blends, points, held, _springs(graph, handles, weights))
+    pulls = np.array([handle.pull for handle in handles], np.float64)
+    return _Problem(members, graph, solver, blends, points, pulls)
+
+
+def _check_handle(scene: Gaussians, means: Floats, handle: Handle) -> int:
+    """Return the row of the region's Gaussian that is nearest to a handle's point.
+
+    Raises:
+        ProgdfError: the point is not on the region, or a number is out of range.
+    """
+    numbers = [*handle.point, *handle.pull, handle.falloff or 0.0]
+    if not all(math.isfinite(number) for number in numbers):
+        raise ProgdfError("a number of a pull is not finite")
+    rows = handle.region.members.numpy()
+    if not len(rows):
+        raise ProgdfError(f"the pulled region {handle.region.name} holds no Gaussian")
+    largest = scene.scales.detach().double().amax(dim=1).numpy()
+    extent = means.max(axis=0) - means.min(axis=0)
+    diagonal = float(np.linalg.norm(extent)) + 2.0 * _TOUCH_SIGMAS * float(np.median(largest))
+    length = float(np.linalg.norm(handle.pull))
+    if length == 0.0:
+        raise ProgdfError(f"the pull of the point {_world(scene, handle)} is 0; write how far it goes")
+    if length > MAX_PULL * diagonal:
+        raise ProgdfError(
+            f"a pull of {length:g} is more than {MAX_PULL:g} times the scene's diagonal of {diagonal:.3g}; "
+            "pull less far"
+        )
+    distance, found = PointTree(means[rows], 1).query(np.array([handle.point]), 1)
+    row = int(rows[found[0, 0]])
+    allowed = max(_TOUCH_SIGMAS * float(largest[row]), _point_spacing(means[rows]))
+    if float(distance[0, 0]) > allowed or (handle.falloff is not None and distance[0, 0] >= handle.falloff):
+        there = ",".join(f"{value:.4g}" for value in means[row] + np.array(scene.origin))
+        raise ProgdfError(
+            f"the point {_world(scene, handle)} is {distance[0, 0]:.3g} from its region's Gaussians; "
+            f"write a point on it, such as {there}"
+        )
+    return row
+
+
+def _point_spacing(points: Floats) -> float:
+    """Return the size of a part with as many points as a node has, from the extent of all."""
+    extent = float(np.linalg.norm(points.max(axis=0) - points.min(axis=0)))
+    return extent / math.sqrt(max(1, min(MAX_NODES, len(points))))
+
+
+def _world(scene: Gaussians, handle: Handle) -> str:
+    return ",".join(f"{value:.6g}" for value in np.array(handle.point) + np.array(scene.origin))
+
+
+def _reachable_rows(means: Floats, handles: Sequence[Handle]) -> Rows:
+    """Return the sorted rows that the pulls can move: the regions, up to the falloff of each handle. [M]"""
+    covered: Mask = np.zeros(len(means), bool)
+    for handle in handles:
+        rows = handle.region.members.numpy()
+        if handle.falloff is not None:
+            rows = rows[np.linalg.norm(means[rows] - np.array(handle.point), axis=1) <= handle.falloff]
+        covered[rows] = True
+    return np.flatnonzero(covered)
+
+
+def _falloff_weights(graph: NodeGraph, handles: Sequence[Handle]) -> Floats:
+    """Return the influence of the handles on each node, 0 to 1, by Blender's smooth falloff. [n]"""
+    weights = np.zeros(len(graph))
+    for handle in handles:
+        if handle.falloff is None:
+            return np.ones(len(graph))
+        distance = np.linalg.norm(graph.positions - np.array(handle.point), axis=1)
+        share = (1.0 - distance / handle.falloff).clip(0.0, 1.0)
+        weights = np.maximum(weights, share * share * (3.0 - 2.0 * share))
+    return weights
+
+
+def _springs(graph: NodeGraph, handles: Sequence[Handle], weights: Floats) -> Floats:
+    """Return springs that hold the nodes as the falloff decreases, independent of the nodes' spacing. [n]"""
+    radii = [handle.falloff for handle in handles if handle.falloff is not None]
+    if len(radii) < len(handles):
+        return np.zeros(len(graph))
+    degree = np.bincount(graph.starts, minlength=len(graph))
+    safe = np.maximum(weights, _HELD_BELOW)
+    springs: Floats = _SPRING * (graph.spacing / min(radii)) ** 2 * degree * (1.0 - safe) / safe
+    return springs
+
+
+def _solve_course(problem: _Problem) -> tuple[Floats, list[Pose]]:
+    """Return the strengths [S] with 0, and the poses at all but the first."""
+    straight = np.zeros_like(problem.pulls)
+    trial = _solve_along(problem, straight, np.linspace(0.0, 1.0, 1 + _TRIAL_STRENGTHS))[-1]
+    blended = (problem.blends @ trial.rotations.reshape(-1, 9)).reshape(-1, 3, 3)
+    turns = matrix_turns(torch.from_numpy(blended)).numpy()
+    angles = matrix_turns(torch.from_numpy(trial.rotations)).norm(dim=1)
+    largest = float(angles.quantile(_LARGEST_SHARE))
+    stretches = problem.solver.stretches(trial)
+    if len(stretches):
+        largest = max(largest, float(np.quantile(np.abs(np.log(stretches.clip(1e-6))), _LARGEST_SHARE)))
+    count = min(max(math.ceil(largest / _KNOT_SPACING), _MIN_STRENGTHS), _MAX_STRENGTHS)
+    strengths = np.linspace(0.0, 1.0, 1 + count)
+    return strengths, _solve_along(problem, turns, strengths)
+
+
+def _solve_along(problem: _Problem, turns: Floats, strengths: Floats) -> list[Pose]:
+    """Return the poses at all strengths but the first, for handles that turn on their way. turns: [H,3]"""
+    last = problem.solver.rest()
+    start = last
+    poses = []
+    for strength in strengths[1:]:
+        pose = problem.solver.solve(problem.points + path(problem.pulls, turns, float(strength)), start)
+        onward = pose.rotations @ np.swapaxes(last.rotations, 1, 2) @ pose.rotations
+        start = Pose(2.0 * pose.positions - last.positions, onward)  # the same step once more
+        last = pose
+        poses.append(pose)
+    return poses
+
+
+def path(pulls: Floats, turns: Floats, strength: float) -> Floats:
+    """Return displacements on screw motions, which are arcs, or straight lines without a turn. [H,3]
+
+    Args:
+        pulls: displacements at strength 1. [H,3]
+        turns: rotation vectors of the whole way, shorter than 2π. [H,3]
+        strength: 0 to 1
+    """
+    velocities = np.linalg.solve(_screw(turns), pulls[:, :, None])
+    displaced: Floats = (_screw(strength * turns) @ velocities)[:, :, 0] * strength
+    return displaced
+
+
+def _screw(turns: Floats) -> Floats:
+    """Return the matrices from the velocity of a screw motion to its displacement. [H,3] -> [H,3,3]"""
+    angle = np.maximum(np.linalg.norm(turns, axis=1), 1e-6)[:, None, None]
+    x, y, z = turns.T
+    zero = np.zeros(len(turns))
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    first = (1.0 - np.cos(angle)) / angle**2
+    second = (angle - np.sin(angle)) / angle**3
+    matrices: Floats = np.eye(3) + first * cross + second * (cross @ cross)
+    return matrices
