@@ -33,15 +33,15 @@ _HELD_BELOW = 0.01  # falloff; nodes with less are held
 _SPRING = 8.0  # stiffness of the falloff's springs, in edges per squared radius
 _TRIAL_STRENGTHS = 4  # strengths of the solve that finds how far the handles turn
 _KNOT_SPACING = 1 / 8  # rotation, radians, or log-stretch of the nodes between two strengths
-_LARGEST_SHARE = 0.99  # quantile of the nodes' rotations that counts
-_MIN_STRENGTHS = 4
-_MAX_STRENGTHS = 24
-_MOVED = 1e-4  # node spacings; Gaussians that move less are unchanged
+_LARGEST_SHARE = 0.99  # quantile of the nodes' rotations and log-stretches that counts as the largest
+_MIN_STRENGTHS = 4  # smallest number of solved strengths
+_MAX_STRENGTHS = 24  # largest number of solved strengths
+_MOVED = 1e-4  # smallest movement of a node that counts, in node spacings
 
 
 @dataclass(frozen=True)
 class Handle:
-    """A point of a region and its displacement."""
+    """Point of a region and its displacement."""
 
     region: Region  # the point pulls these Gaussians
     point: tuple[float, float, float]  # position relative to the origin of the scene, world units
