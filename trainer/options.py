@@ -46,6 +46,8 @@ MAX_THREADS = 1024
 """Maximum of --threads, more than any machine has."""
 LARGEST_SEED = 2**32 - 1
 """Largest seed that every random number generator accepts."""
+LARGEST_VIEW_PX = 2048
+"""Largest longer side of the views, pixels."""
 VIEWS = 30
 """Default number of edited views."""
 COLOR_VIEWS = (40, 48)

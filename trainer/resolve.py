@@ -27,6 +27,7 @@ from trainer.options import EditKind
 
 from .options import (
     LARGEST_SEED,
+    LARGEST_VIEW_PX,
     MAX_STAGES,
     MAX_THREADS,
     PRESETS,
@@ -170,7 +171,7 @@ def check_options(options: TrainOptions) -> None:
     optimize = options.optimize
     check_ranges(
         ("--views", options.views.views or VIEWS, 3, 96),
-        ("--image-size", options.views.image_size or _MIN_VIEW_PX, _MIN_VIEW_PX, 2048),
+        ("--image-size", options.views.image_size or _MIN_VIEW_PX, _MIN_VIEW_PX, LARGEST_VIEW_PX),
         ("--stages", optimize.stages, 0, 16),
         ("--group-steps", optimize.group_steps, 0, 10_000),
         ("--grow", optimize.grow, 0, 1),

@@ -6,6 +6,7 @@ All values are those at strength 1, so they do not change with the sliders.
 from __future__ import annotations
 
 import hashlib
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -33,7 +34,7 @@ _SCATTER_QUANTILE = 0.9  # quantile of the pushed Gaussians' movements; surfaces
 _NEAREST_PUSHED = 8  # pushed Gaussians whose movement gives the direction of the painted picture
 _CELLS_PER_DISC = 16  # limits the memory of a grid
 _POINTS_AT_ONCE = 2_048  # points per task of a thread
-_MAX_REMEMBERED = 64  # entries of a cache
+_MAX_REMEMBERED = 512  # entries of a cache; twenty layers have 380 pairs
 _SHAPES = ("means", "log_scales", "quats", "logit_opacities")
 
 Floats = NDArray[np.float64]
@@ -82,6 +83,7 @@ class Grid:
     cell: float  # side of a cell, which is at least the distance at which a disc can cover a point
 
 
+_LOCK = threading.Lock()  # of the caches: windows and exports make composers in several threads
 _SHEETS: dict[bytes, Sheet] = {}
 _OVERLAPS: dict[bytes, Overlap | None] = {}
 
@@ -124,11 +126,15 @@ def _look_up(cache: dict[bytes, Result], key: bytes, make: Callable[[], Result])
 
     Adding a layer to a stack, or removing one, does not change the overlaps of the others.
     """
-    if key not in cache:
-        while len(cache) >= _MAX_REMEMBERED:
+    with _LOCK:
+        if key in cache:
+            return cache[key]
+    result = make()
+    with _LOCK:
+        cache[key] = result
+        while len(cache) > _MAX_REMEMBERED:
             cache.pop(next(iter(cache)))
-        cache[key] = make()
-    return cache[key]
+    return result
 
 
 def _make_sheet(scene: Gaussians, gdf: Gdf, key: bytes) -> Sheet:

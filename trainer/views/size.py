@@ -14,6 +14,7 @@ from progdf.gaussians import Gaussians
 from progdf.rasterize import alpha_weights
 from progdf.region import Region
 from progdf.threads import map_threads
+from trainer.options import LARGEST_VIEW_PX
 
 MAX_SIDE_PX = 768
 """Largest longer side of the views, if it is chosen."""
@@ -44,7 +45,8 @@ class ViewSize:
         """Return the log line on the size."""
         need = f"the region's detail needs {self.needed}"
         if self.side < self.needed:
-            return f"views of {self.side} pixels to limit the time; {need} (--image-size {self.needed})"
+            largest = min(self.needed, LARGEST_VIEW_PX)
+            return f"views of {self.side} pixels to limit the time; {need} (--image-size {largest})"
         return f"views of {self.side} pixels; {need}"
 
 

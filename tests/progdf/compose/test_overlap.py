@@ -12,6 +12,7 @@ import safetensors.torch
 import torch
 
 from progdf.camera import Camera, intrinsics, look_at
+from progdf.compose import paint_sheets
 from progdf.compose.added import extend
 from progdf.compose.composer import Composer
 from progdf.compose.layers import BLENDS, Gains, Layer
@@ -301,6 +302,17 @@ def test_moved_discs_of_one_field_have_their_own_overlap() -> None:
         stack = [upper, replace(lower, added=replace(lower.added, means=means))]
         paint = find_paint(*extend(flat_wall(), stack))
         assert (paint is not None and bool(paint.pairs)) == meets
+
+
+def test_overlaps_of_many_layers_are_measured_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    stack = [flat_paint(f"layer {i}", 0.03 + 0.002 * i, (0.9, 0.1, 0.1)) for i in range(9)]
+    extended, converted = extend(flat_wall(), stack)
+    first = find_paint(extended, converted)
+    assert first is not None
+    monkeypatch.setattr(paint_sheets, "measure_overlap", lambda *_: pytest.fail("measured again"))
+    again = find_paint(extended, converted)
+    assert again is not None
+    assert again.pairs.keys() == first.pairs.keys()
 
 
 def seen_from(scene: Gaussians, degrees: float) -> torch.Tensor:

@@ -11,6 +11,7 @@ import torch
 from progdf.gaussians import Gaussians
 from progdf.region import Region
 from tests.helpers.demo_scenes import bear
+from trainer.options import LARGEST_VIEW_PX
 from trainer.views.size import MAX_SIDE_PX, SizeLimits, ViewSize, choose_view_size
 from trainer.views.view import region_rig
 
@@ -65,6 +66,12 @@ def test_time_limits_the_size_and_the_log_names_the_needed_one() -> None:
     assert limited.needed == free.needed
     assert f"--image-size {free.needed}" in limited.line()
     assert "limit" not in size_of(shell(0.02)).line()
+
+
+def test_log_names_a_size_that_the_command_accepts() -> None:
+    size = size_of(shell(0.0001))
+    assert size.needed > LARGEST_VIEW_PX
+    assert f"(--image-size {LARGEST_VIEW_PX})" in size.line()
 
 
 def test_size_stays_in_its_range() -> None:
