@@ -243,8 +243,10 @@ def _fit_attribute(offsets: Tensor, weights: Tensor, rank: int, basis_type: torc
     return store_attribute(trajectory, principal_modes(trajectory.gram)[:, :rank], basis_type)
 
 
-_TRAJECTORY_TOLERANCE = 0.003  # RMS error of the factoring, as a share of the trajectory's own RMS
+_TRAJECTORY_TOLERANCE = 0.001  # RMS error of the factoring, as a share of the trajectory's own RMS
 _MAX_TRAJECTORY_RANK = 8
+_COURSE_BASIS_TYPES = {"means": torch.float16, "log_scales": torch.float16, "quats": torch.float16}
+"""Storage types of a course's bases; others are int8, of which a step is half a pixel where a thing turns."""
 _RISE = torch.tensor((0.0, 0.002, 0.005, 0.01, 0.02, 0.04, 0.07, 0.11, 0.17, 0.25, 0.35), dtype=torch.float64)
 """Strengths at which a logit bends most if opacity rises from 0. Mirrored for an opacity that falls to 0."""
 OPACITY_KNOTS = torch.cat([_RISE, torch.tensor([0.5], dtype=torch.float64), 1.0 - _RISE.flip(0)])
@@ -267,20 +269,23 @@ def course_field(knots: Tensor, offsets: Tensor) -> BakedField:
         values = offsets[:, :, columns].clone()
         stored = quantize_bases(values[-1:], torch.int16)
         values[-1] = decode_bases(*stored)[0]
-        attributes[name] = fit_course(values, stored)
+        attributes[name] = fit_course(values, stored, _COURSE_BASIS_TYPES.get(name, torch.int8))
     return BakedField("separable", knots.float(), attributes, offsets.shape[2], ())
 
 
-def fit_course(offsets: Tensor, stored: tuple[Tensor, Tensor] | None = None) -> AttributeBases:
-    """Fit the fewest bases that reproduce an attribute's trajectory with at most 0.3 % RMS error.
+def fit_course(
+    offsets: Tensor, stored: tuple[Tensor, Tensor] | None = None, basis_type: torch.dtype = torch.int8
+) -> AttributeBases:
+    """Fit the fewest bases that reproduce an attribute's trajectory with at most 0.1 % RMS error.
 
     Args:
         offsets: offsets at the knots. [S,M,c]
         stored: stored form of the last row, see `quantize_bases`
+        basis_type: storage type of bases 1..R: int8, float16 or float32
     """
     fitted = fit_amplitude(offsets, torch.ones_like(offsets[0]), stored)
     rank = min(fitted.needed_rank(_TRAJECTORY_TOLERANCE), _MAX_TRAJECTORY_RANK)
-    return store_attribute(fitted, principal_modes(fitted.gram)[:, :rank])
+    return store_attribute(fitted, principal_modes(fitted.gram)[:, :rank], basis_type)
 
 
 def opacity_course(start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:

@@ -28,7 +28,7 @@ BLACK = (0.0, 0.0, 0.0)
 WHITE = (1.0, 1.0, 1.0)
 TURN = (0.3, -1.1, 0.4)
 ROUNDING = 1 / 255
-"""One 8-bit step. Ends are stored in 16 bits of the longest path, intermediate offsets to 1/300."""
+"""One 8-bit step. Ends are stored in 16 bits of the longest path, intermediate offsets to 1/1000."""
 
 
 COUNT = 384
@@ -159,6 +159,19 @@ def test_rotation_follows_an_arc_even_for_a_full_turn() -> None:
         assert float((now[:, [0, 2]].norm(dim=1) - radius).abs().max()) < 0.01 * float(radius.max())
     half = at(scene, gdf, 0.5).means[region.members] - center
     assert torch.allclose(half[:, 0], -(means - center)[:, 0], atol=0.01)
+
+
+@pytest.mark.parametrize("degrees", [90.0, 137.0])
+def test_stored_arc_is_within_half_a_pixel_of_512(degrees: float) -> None:
+    scene = scene_of()
+    motion = similarity(turn=(0.0, math.radians(degrees), 0.0))
+    step = Step("transform", whole_scene(scene), motion)
+    gdf = tidy(scene, [step], "turned")
+    rows = pack(scene, with_shN=True).double()
+    extent = float((scene.means.amax(dim=0) - scene.means.amin(dim=0)).max())
+    for s in (0.3, 0.5, 0.8):
+        error = at(scene, gdf, s).means - step.move(rows, s)[:, :3]
+        assert float(error.norm(dim=1).max()) < 0.5 * extent / 512
 
 
 @pytest.mark.parametrize("degree", [0, 2])
