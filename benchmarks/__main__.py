@@ -33,6 +33,7 @@ BENCHES: dict[str, str] = {
     "warp": "benchmarks.rasterizer:warp_tables",
     "hard": "benchmarks.rasterizer:hard_tables",
     "field": "benchmarks.field:tables",
+    "order": "benchmarks.paint_order:tables",
     "edits": "benchmarks.edits:tables",
     "networks": "benchmarks.networks:tables",
     "viewer": "benchmarks.viewer.slider:tables",
@@ -49,7 +50,10 @@ BENCHES: dict[str, str] = {
     "recolors": "benchmarks.colors.recolors:tables",
 }
 
-PAGE = ("training", "field", "viewer", "rasterize", "warp", "moving", "popping", "painting", "frames", "hard")
+PAGE = (
+    *("training", "field", "order", "viewer", "rasterize"),
+    *("warp", "moving", "popping", "painting", "frames", "hard"),
+)
 """Benchmarks of docs/speed-and-error.md."""
 
 ROOT = Path(__file__).parents[1]
