@@ -189,10 +189,14 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("select_tool:scribble", "Scribble", "Shift+U", "Strokes on object and background (Ctrl)"),
         Command("select_tool:sphere", "Sphere", "Shift+R", f"Drag from its center on a surface. {MODES}"),
         Command(
-            "select_tool:flood", "Flood selection", "J", f"Click: connected splats of similar color. {MODES}"
+            "select_tool:flood",
+            "Flood selection",
+            "J",
+            f"Click: connected splats of similar color. {MODES}",
+            row="Flood; Shift the subject",
         ),
+        Command("select_subject", "Select subject", "Shift+J", "The object in the middle", row=JOINED),
         Command("select_tool:color", "Color selection", "I", f"Click: all splats of similar color. {MODES}"),
-        Command("select_subject", "Select subject", "Shift+J", "The object in the middle of the view"),
         *_row("← → ↑ ↓", "Tool pointer; Shift far", _points()),
         Command(
             "point_press",

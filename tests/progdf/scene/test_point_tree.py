@@ -107,9 +107,10 @@ def test_all_nearest_neighbor_searches_use_point_trees() -> None:
         if "scipy.spatial import" in path.read_text("utf-8")
     }
     # anchors.py drops equal positions; parts.py joins the centroids of cells, which never share a position.
-    # overlap.py and paint.py search among discs of paint, which lie apart; carry_on.py finds a hull of colors
+    # paint_sheets.py and paint.py search among discs of paint, which lie apart; carry_on.py finds a hull of
+    # colors
     expected = {
-        "progdf/compose/overlap.py",
+        "progdf/compose/paint_sheets.py",
         "progdf/gdf/anchors.py",
         "progdf/scene/point_tree.py",
         "trainer/motion/parts.py",

@@ -54,7 +54,7 @@ INTERNAL = {
     *("move_snapshot", "choose_snapshot", "region", "show_region", "forget_region"),
     *("select_invert", "choose_keys", "move_keys", "clone_keys"),
     *("seek", "length", "fps", "go_to", "example", "forget_file", "use_view", "keep_view"),
-    *("carry_on", "look_behind"),
+    *("carry_on", "look_behind", "refine_anyway", "fill_hole"),
 }
 """Actions of buttons, questions and drags that need an argument, so the command palette omits them."""
 
@@ -66,7 +66,7 @@ def test_every_action_is_a_command_or_internal(tmp_path: Path) -> None:
     everything |= {*actions.ACTIONS, *timeline.ACTIONS, *actions.OF_EDITS, *selection.CHANGES}
     everything |= {"frame", "home", "invert"}
     everything |= {"paint_clear", "paint_fill", "paint_invert", "paint_feather"}
-    everything |= {"next_slider", "point", "point_press"}
+    everything |= {"next_slider", "point", "point_press", "select_subject"}
     named = {command.action.name for command in COMMANDS.values()}
     assert named | INTERNAL == everything
     assert not named & INTERNAL
