@@ -33,7 +33,7 @@ BENCHES: dict[str, str] = {
     "warp": "benchmarks.rasterizer:warp_tables",
     "hard": "benchmarks.rasterizer:hard_tables",
     "field": "benchmarks.field:tables",
-    "order": "benchmarks.paint_order:tables",
+    "order": "benchmarks.layers.paint_order:tables",
     "edits": "benchmarks.edits:tables",
     "networks": "benchmarks.networks:tables",
     "viewer": "benchmarks.viewer.slider:tables",

@@ -17,6 +17,8 @@ from pathlib import Path
 
 import torch
 
+from benchmarks.courses import edit_of, milliseconds
+from benchmarks.table import Table
 from progdf.compose.added import extend
 from progdf.compose.composer import Composer
 from progdf.compose.layers import Layer
@@ -26,9 +28,6 @@ from progdf.field.separable import course_field
 from progdf.gaussians import Gaussians, pack
 from progdf.gdf.anchors import PUSHED_SHAPE
 from progdf.gdf.file import ADDED_LOGIT, Gdf, anchor_added
-
-from .courses import edit_of, milliseconds
-from .table import Table
 
 SIDE = 300
 """Gaussians along a side of the wall."""
