@@ -157,8 +157,9 @@ class Previewer:
         views = self._views(request)
         if views is None:
             return []
-        row = views.fitted.row
-        colors = find_palette(row.inside.reshape(-1, 3), row.mask.reshape(-1))
+        visible = [(sample, sample.mask > 0.0) for sample in views.glances]
+        rgb = torch.cat([sample.inside[pixels] for sample, pixels in visible])
+        colors = find_palette(rgb, torch.cat([sample.mask[pixels] for sample, pixels in visible]))
         return [hex_color(color) for color in colors.tolist()]
 
     def _views(self, request: PreviewRequest) -> DraftViews | None:

@@ -36,6 +36,7 @@ from .palette import (
     are_alike,
     bend_lightness,
     chroma_factor,
+    find_shades,
     measure_palette,
     shift_palette,
 )
@@ -220,6 +221,9 @@ class ColorGrade:
     curve: Curve = ()  # lightness curve for all colors
     # measured shading of each source, see `measure_grade`; empty: without highlights
     palette_shadings: tuple[Shading, ...] = ()
+    palette_shades: tuple[
+        Tensor, ...
+    ] = ()  # OKLab colors that move with each source; empty, or one per source
 
     @property
     def is_neutral(self) -> bool:
@@ -304,7 +308,7 @@ def number_of(text: str) -> float:
 
 
 def measure_grade(grade: ColorGrade, rgb: Tensor, weights: Tensor) -> ColorGrade:
-    """Return the grade with the shading of its source colors, measured in a region.
+    """Return the grade with shading and shades of its source colors, measured in a region.
 
     Args:
         grade: the grade; without a palette, it is returned unchanged
@@ -315,7 +319,10 @@ def measure_grade(grade: ColorGrade, rgb: Tensor, weights: Tensor) -> ColorGrade
         return grade
     sources = srgb_to_oklab(torch.stack([source for source, _ in grade.palette]))
     lab = srgb_to_oklab(rgb.clamp(0, 1)).reshape(-1, 3)
-    return replace(grade, palette_shadings=measure_palette(lab, weights.reshape(-1), sources))
+    areas = weights.reshape(-1)
+    shades = find_shades(rgb.reshape(-1, 3), areas, sources)
+    shadings = measure_palette(lab, areas, sources, shades)
+    return replace(grade, palette_shadings=shadings, palette_shades=shades)
 
 
 def grade_course(rgb: Tensor, grade: ColorGrade) -> ColorFunction:
@@ -337,7 +344,10 @@ def grade_fully(rgb: Tensor, grade: ColorGrade) -> Tensor:
     if grade.palette:
         sources, targets = (srgb_to_oklab(torch.stack(colors)) for colors in zip(*grade.palette, strict=True))
         lab = srgb_to_oklab(rgb.clamp(0, 1))
-        rgb = fit_gamut(shift_palette(lab, sources, targets, grade.palette_curves, grade.palette_shadings))
+        shifted = shift_palette(
+            lab, sources, targets, grade.palette_curves, grade.palette_shadings, grade.palette_shades
+        )
+        rgb = fit_gamut(shifted)
     levels = ((rgb.clamp(0, 1) - value["black"]) / (value["white"] - value["black"])).clamp(0, 1)
     lab = srgb_to_oklab(levels) * 2.0 ** (value["exposure"] / 3)  # homogeneous of degree 1/3 in linear light
     lightness = lab[..., 0].clamp(0, 1)

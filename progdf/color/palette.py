@@ -4,7 +4,8 @@ The map moves a color x by Σ_i w_i(x) f_i(x) (t_i(x) − p_i(x)), in OKLab, for
 weights w_i are an interpolation by Gaussian kernels (Chang et al., Palette-based Photo Recoloring, SIGGRAPH
 2015). A weight is 1 at its own source and 0 at the others. So every source becomes its target exactly, and a
 source whose target is itself is unchanged. The weights of several sources sum to 1, so each color follows the
-sources near it. With a single source, colors far from it are unchanged.
+sources near it. With a single source, colors far from it are unchanged. A source moves all shades of its
+surface that are not sources themselves: w_i is the sum of their weights.
 
 A color that is lighter or darker than the source shifts like new paint in the same light, see `shading`. f_i
 is 1 for diffuse colors. For highlights it falls to the share of the source's own color in them. With a single
@@ -22,13 +23,8 @@ from torch import Tensor
 
 from .oklab import oklab_to_srgb, smoothstep, srgb_to_oklab
 from .shading import Shading, measure_shading, relight
+from .surfaces import COLORS, MIN_SOURCE_DISTANCE, WHITE_CHROMA, find_surfaces, kernel_space
 
-COLORS = 5
-"""Default number of main colors."""
-MIN_SOURCE_DISTANCE = 0.02
-"""Smallest kernel distance of two sources; closer sources count as one color."""
-
-_LIGHTNESS_FACTOR = 0.5  # factor on lightness differences, because shading is not another color
 _KERNEL_WIDTH_SHARE = (
     0.5  # standard deviation of the kernel, as a share of the mean distance to the nearest source
 )
@@ -37,11 +33,7 @@ _SINGLE_KERNEL_WIDTH = 0.055  # standard deviation of the kernel of a single gra
 _CHROMA_WIDTH_SHARE = 0.3  # further deviation for colored sources, as a share of the source's chroma
 _SHADOW_WIDTH = 0.08  # deviation of the kernel of a single source in lightness, below its shading
 _SHADING_REACH = 0.16  # lightness below a single source within which its shading is measured
-_WHITE_CHROMA = 0.04  # chroma up to which a surface may be white in colored light
 _COLORED_CHROMA = 0.12  # chroma from which a surface is clearly colored
-_ITERATIONS = 20  # iterations of k-means
-_CELL_SIDE = 0.04  # side of the cells in which colors are counted
-_MIN_SHARE = 0.003  # smallest share of the visible area for a main color
 _CURVE_STEPS = 1024  # linear pieces of a tabulated curve
 
 Curve = tuple[tuple[float, float], ...]
@@ -52,48 +44,27 @@ An empty curve changes nothing.
 
 
 def find_palette(rgb: Tensor, weights: Tensor, count: int = COLORS) -> Tensor:
-    """Return the main colors by k-means in OKLab, in descending order of area.
+    """Return the main color of each surface, in descending order of area; see `progdf.color.surfaces`.
 
     Args:
         rgb: sRGB colors, 0 to 1. [N,3]
         weights: visible area of each color, ≥ 0. [N]
-        count: largest number of colors
+        count: largest number of main colors, shades of one surface included
 
     Returns:
         sRGB colors [k,3], k ≤ `count`; [0,3] if all weights are 0.
     """
-    is_visible = weights > 0
-    colors = _kernel_space(srgb_to_oklab(rgb[is_visible].clamp(0, 1)).double())
-    weights = weights[is_visible].double()
-    if not len(colors):
+    surfaces = find_surfaces(rgb, weights, count)
+    if not surfaces:
         return rgb.new_zeros(0, 3)
-    cells, own = torch.unique((colors / _CELL_SIDE).round(), dim=0, return_inverse=True)
-    shares = weights.new_zeros(len(cells)).index_add_(0, own, weights)
-    colors = torch.zeros_like(cells).index_add_(0, own, weights[:, None] * colors) / shares[:, None]
-    roots = shares.sqrt()  # distinct colors count for more than their area, such as a scarf beside a lawn
-    centers = colors[int(shares.argmax())][None]
-    while len(centers) < min(count, len(colors)):  # add the cell with the largest weighted error
-        errors = roots * torch.cdist(colors, centers).amin(dim=1).square()
-        centers = torch.cat([centers, colors[int(errors.argmax())][None]])
-    for _ in range(_ITERATIONS):
-        nearest = torch.cdist(colors, centers).argmin(dim=1)
-        sums = torch.zeros_like(centers).index_add_(0, nearest, roots[:, None] * colors)
-        totals = roots.new_zeros(len(centers)).index_add_(0, nearest, roots)[:, None]
-        centers = torch.where(totals > 0, sums / totals.clamp_min(1e-12), centers)
-    covered = shares.new_zeros(len(centers)).index_add_(0, nearest, shares)
-    main: list[int] = []
-    for i in covered.argsort(descending=True).tolist():
-        is_distinct = all(float((centers[i] - centers[j]).norm()) >= 2 * MIN_SOURCE_DISTANCE for j in main)
-        if is_distinct and float(covered[i]) >= _MIN_SHARE * float(shares.sum()):
-            main.append(i)
-    return oklab_to_srgb(centers[main] / _kernel_space(centers.new_ones(3))).clamp(0, 1).to(rgb)
+    colors = torch.stack([surface.color for surface in surfaces])
+    return oklab_to_srgb(colors).clamp(0, 1).to(rgb)
 
 
 def are_alike(a: Tensor, b: Tensor) -> bool:
     """Return whether two sRGB colors [3] are too close to be separate sources."""
     return (
-        float((_kernel_space(srgb_to_oklab(a)) - _kernel_space(srgb_to_oklab(b))).norm())
-        < MIN_SOURCE_DISTANCE
+        float((kernel_space(srgb_to_oklab(a)) - kernel_space(srgb_to_oklab(b))).norm()) < MIN_SOURCE_DISTANCE
     )
 
 
@@ -103,6 +74,7 @@ def shift_palette(
     targets: Tensor,
     curves: Sequence[Curve] = (),
     shadings: Sequence[Shading] = (),
+    shades: Sequence[Tensor] = (),
 ) -> Tensor:
     """Map colors so that sources become targets, all in OKLab. [...,3], [k,3], [k,3] -> [...,3]
 
@@ -114,10 +86,11 @@ def shift_palette(
         targets: target colors. [k,3]
         curves: lightness curve near each source, applied after the shift; empty, or k
         shadings: measured shading of each source, see `measure_palette`; empty: without highlights
+        shades: colors that move with each source, see `find_shades`; empty, or k. [s,3] each
     """
     colors = lab.reshape(-1, 3).double()
     shadings = shadings or [Shading(float(source[0])) for source in sources]
-    weights = source_weights(colors, sources.double(), shadings)
+    weights = source_weights(colors, sources.double(), shadings, shades)
     moved = torch.zeros_like(colors)
     for i, shading in enumerate(shadings):
         shift = _paint_shift(
@@ -133,25 +106,30 @@ def shift_palette(
     return torch.cat([after, shifted[..., 1:] * chroma_factor(before, after)], dim=-1)
 
 
-def source_weights(colors: Tensor, sources: Tensor, shadings: Sequence[Shading] = ()) -> Tensor:
+def source_weights(
+    colors: Tensor, sources: Tensor, shadings: Sequence[Shading] = (), shades: Sequence[Tensor] = ()
+) -> Tensor:
     """Return the weight of each source at each color, ≥ 0. OKLab [N,3], [k,3] -> [N,k]
 
     Args:
         colors: OKLab colors. [N,3]
         sources: source colors, OKLab. [k,3]
         shadings: measured shading of each source; only used for a single source
+        shades: further colors at which the weight of each source is 1; empty, or k. [s,3] each
     """
     if len(sources) == 1:
         return _single_weight(colors, sources[0], shadings[0] if shadings else Shading(float(sources[0, 0])))
-    kernel_sources = _kernel_space(sources)
+    owners = torch.tensor([*range(len(sources)), *(i for i, own in enumerate(shades) for _ in own)])
+    kernel_sources = kernel_space(torch.cat([sources, *(own.to(sources) for own in shades)]))
     source_distances = torch.cdist(kernel_sources, kernel_sources)
-    squared = torch.cdist(_kernel_space(colors), kernel_sources).square()
+    squared = torch.cdist(kernel_space(colors), kernel_sources).square()
     squared = squared - squared.amin(dim=1, keepdim=True)  # a common factor, which cancels
     nearest = (source_distances + torch.eye(len(kernel_sources)) * source_distances.max()).amin(dim=1)
     width = max(_MIN_KERNEL_WIDTH, _KERNEL_WIDTH_SHARE * float(nearest.mean()))
     kernel = torch.exp(-0.5 * squared / width**2)
     source_kernel = torch.exp(-0.5 * (source_distances / width).square())
-    weights: Tensor = (kernel @ torch.linalg.inv(source_kernel)).clamp_min(0.0)
+    parts: Tensor = (kernel @ torch.linalg.inv(source_kernel)).clamp_min(0.0)
+    weights = torch.zeros_like(parts[:, : len(sources)]).index_add_(1, owners, parts)
     return weights / weights.sum(dim=1, keepdim=True)
 
 
@@ -169,7 +147,38 @@ def _single_weight(colors: Tensor, source: Tensor, shading: Shading) -> Tensor:
     return torch.exp(-0.5 * squared)[:, None]
 
 
-def measure_palette(lab: Tensor, weights: Tensor, sources: Tensor) -> tuple[Shading, ...]:
+def find_shades(rgb: Tensor, weights: Tensor, sources: Tensor) -> tuple[Tensor, ...]:
+    """Return the shades that move with each source: main colors of its surface that are no sources.
+
+    A single source has none, because it changes its surface in any light.
+
+    Args:
+        rgb: sRGB colors of the region, 0 to 1. [N,3]
+        weights: visible area of each color, ≥ 0. [N]
+        sources: source colors, OKLab. [k,3]
+
+    Returns:
+        OKLab colors of each source. [s,3] each, s ≥ 0
+    """
+    shades = [sources[:0] for _ in sources]
+    if len(sources) == 1:
+        return tuple(shades)
+    for surface in find_surfaces(rgb, weights):
+        colors = surface.shades.to(sources)
+        distances = torch.cdist(kernel_space(colors), kernel_space(sources))
+        is_same = distances < 2 * MIN_SOURCE_DISTANCE
+        owners = is_same.any(dim=0)  # the sources on this surface
+        if not bool(owners.any()):
+            continue
+        nearest = torch.where(owners, distances, torch.inf).argmin(dim=1)
+        for i in owners.nonzero()[:, 0].tolist():
+            shades[i] = torch.cat([shades[i], colors[(nearest == i) & ~is_same.any(dim=1)]])
+    return tuple(shades)
+
+
+def measure_palette(
+    lab: Tensor, weights: Tensor, sources: Tensor, shades: Sequence[Tensor] = ()
+) -> tuple[Shading, ...]:
     """Measure the shading of each source from the colors of a region.
 
     Each color counts by its visible area times its weight for the source, see `source_weights`.
@@ -178,6 +187,7 @@ def measure_palette(lab: Tensor, weights: Tensor, sources: Tensor) -> tuple[Shad
         lab: OKLab colors of the region. [N,3]
         weights: visible area of each color, ≥ 0. [N]
         sources: source colors, OKLab. [k,3]
+        shades: colors that move with each source, see `find_shades`; empty, or k. [s,3] each
 
     Returns:
         One shading per source; its typical lightness is the source's.
@@ -185,7 +195,7 @@ def measure_palette(lab: Tensor, weights: Tensor, sources: Tensor) -> tuple[Shad
     near = [
         Shading(float(lightness), shadow=float(lightness) - _SHADING_REACH) for lightness in sources[:, 0]
     ]
-    shares = source_weights(lab.double(), sources.double(), near) * weights[:, None].double()
+    shares = source_weights(lab.double(), sources.double(), near, shades) * weights[:, None].double()
     return tuple(
         measure_shading(lab[:, 0], shares[:, i], float(source[0])) for i, source in enumerate(sources)
     )
@@ -215,7 +225,7 @@ def _presence(colors: Tensor, own_ab: Tensor) -> Tensor:
     """
     energy = own_ab.square().sum(dim=1)
     share = (colors[:, 1:] * own_ab).sum(dim=1) / energy.clamp_min(1e-6)
-    is_colored = smoothstep(energy.sqrt(), _WHITE_CHROMA, _COLORED_CHROMA)
+    is_colored = smoothstep(energy.sqrt(), WHITE_CHROMA, _COLORED_CHROMA)
     return 1.0 - is_colored * (1.0 - share.clamp(0, 1))
 
 
@@ -255,8 +265,3 @@ def bend_lightness(lightness: Tensor, curve: Sequence[tuple[float, float]]) -> T
     position = lightness.clamp(0, 1) * _CURVE_STEPS
     below = position.floor().long().clamp_max(_CURVE_STEPS - 1)
     return torch.lerp(steps[below], steps[below + 1], position - below)
-
-
-def _kernel_space(lab: Tensor) -> Tensor:
-    """Convert OKLab to the space of kernel distances, with scaled lightness. [...,3] -> [...,3]"""
-    return lab * lab.new_tensor([_LIGHTNESS_FACTOR, 1.0, 1.0])
