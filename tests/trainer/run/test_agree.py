@@ -113,14 +113,7 @@ def test_views_that_follow_one_picture_show_one_edit(kind: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "kind",
-    [
-        # to be mended: 29.3 dB since recolors keep the shading of white and views frame the region's box
-        pytest.param("hue", marks=pytest.mark.xfail(reason="29.3 dB instead of 30 with the new recolor")),
-        "stripes",
-    ],
-)
+@pytest.mark.parametrize("kind", ["hue", "stripes"])
 def test_ideal_editor_is_reduced_to_one_edit_of_many(kind: str, tmp_path: Path) -> None:
     sizes = (24, 20, 6000, 96)
     seeds = range(3)
