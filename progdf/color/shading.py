@@ -6,6 +6,8 @@ dichromatic reflection model, Shafer 1985). New paint keeps both parts:
 - Diffuse lightness is scaled, as in the same light. The scale of lighter parts is smaller if the region's
   range of lightness would otherwise exceed white, or the gamut at the paint's chroma.
 - Highlights start above the region's range of diffuse lightness. They add the same light to the new color.
+  Paint with less distance to white gets less: a highlight covers at most the same share of this distance. So
+  a pale patch of the surface stays pale, and only white becomes white.
 
 The range of white paint reaches white. It therefore has no highlights that would stay white.
 """
@@ -113,13 +115,32 @@ def relight(lightness: Tensor, shading: Shading, paint: Tensor) -> Relit:
     diffuse = _diffuse_part(lightness, shading)
     offset = diffuse - shading.typical
     painted = goal + torch.where(offset < 0, below, above) * offset
+    painted = torch.where(offset > 0, torch.minimum(painted, _towards_white(offset, shading, goal)), painted)
     # light adds up in linear light, of which the lightness is the cube root
     added = (lightness**3 - diffuse**3).clamp_min(0.0)
+    added *= ((1.0 - painted**3) / (1.0 - diffuse**3).clamp_min(_EPSILON)).clamp(0.0, 1.0)
     total = (painted.clamp_min(0.0) ** 3 + added) ** (1 / 3)
     chroma = painted.clamp_min(0.0) / goal * (painted / total.clamp_min(_EPSILON)).clamp(0, 1) ** 2
     is_highlight = added > 0
     total = torch.where(is_highlight, total, painted).clamp(0, 1)
     return Relit(total, torch.where(is_highlight, chroma, (painted / goal).clamp_min(0.0)))
+
+
+def _towards_white(offset: Tensor, shading: Shading, goal: float) -> Tensor:
+    """Return the largest lightness of new paint at lightnesses above the typical one. [...] -> [...]
+
+    It begins with the slope of the same light and bends so that only white becomes white. It is never below
+    a straight line to white, so it bounds no paint that is darker than the surface.
+
+    Args:
+        offset: difference from the typical lightness, ≥ 0. [...]
+        shading: measured range of the surface
+        goal: lightness that the typical one becomes, 0 to 1
+    """
+    start = max(shading.typical, _EPSILON)
+    share = offset / max(1.0 - start, _EPSILON)
+    steepness = max(goal / start * (1.0 - start) / max(1.0 - goal, _EPSILON), 1.0)
+    return goal + (1.0 - goal) * steepness * share / (1.0 + (steepness - 1.0) * share)
 
 
 def _diffuse_part(lightness: Tensor, shading: Shading) -> Tensor:

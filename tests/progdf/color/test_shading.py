@@ -91,6 +91,18 @@ def test_highlights_of_a_dark_surface_stay_white() -> None:
         assert lab[:2000, 1:].norm(dim=1).min() > 0.05, "the surface is blue up to its highlights"
 
 
+@pytest.mark.parametrize("target", ["#a8a010", "#18a0b0", "#e07b1a", "#f4b8c8"])
+def test_pale_patch_of_a_dark_surface_stays_pale(target: str) -> None:
+    fur = surface("#7e5834", 0.12, 5)
+    patch = surface("#e8d2a0", 0.03, 6)[:120]
+    paint = color.parse_color(target)
+    edited = srgb_to_oklab(color.recolor_fully(torch.cat([fur, patch]), paint, color.measure_color(fur)))
+    pale = edited[len(fur) :]
+    assert float(pale[:, 0].amax()) < 0.99, "it is not white, as the patch was not"
+    assert float(pale[:, 0].median()) > float(edited[: len(fur), 0].median()) + 0.05
+    assert float(pale[:, 1:].norm(dim=1).median()) > 0.2 * float(srgb_to_oklab(paint)[1:].norm()), "a tint"
+
+
 @pytest.mark.parametrize("shading", [Shading(0.93, 0.99, 0.8), Shading(0.2, 0.35), Shading(0.6, 0.9, 0.3)])
 def test_relit_lightness_is_continuous_and_rises(shading: Shading) -> None:
     ramp = torch.linspace(0, 1, 2001).double()
