@@ -73,7 +73,7 @@ class PullCourse:
 
 
 @dataclass(frozen=True)
-class _Problem:
+class Problem:
     """Graph and solver of a pull."""
 
     members: Rows  # rows of the scene that the graph covers. [M]
@@ -98,7 +98,10 @@ def pull(
     Raises:
         ProgdfError: a point is not on its region or is held, or a pull is out of range.
     """
-    problem = _make_problem(scene, handles, hold, max_nodes)
+    for handle in handles:
+        if not any(handle.pull):
+            raise ProgdfError(f"the pull of the point {_world(scene, handle)} is 0; write how far it goes")
+    problem = make_problem(scene, handles, hold, max_nodes)
     strengths, poses = _solve_course(problem)
     graph = problem.graph
     kept = np.ones(len(scene), bool)
@@ -128,9 +131,16 @@ def pull(
     )
 
 
-def _make_problem(
-    scene: Gaussians, handles: Sequence[Handle], hold: Region | None, max_nodes: int
-) -> _Problem:
+def make_problem(
+    scene: Gaussians, handles: Sequence[Handle], hold: Region | None, max_nodes: int = MAX_NODES
+) -> Problem:
+    """Return the graph and the factorized solver of some handles.
+
+    Args: see `pull`. A handle may have no displacement.
+
+    Raises:
+        ProgdfError: see `pull`.
+    """
     means = scene.means.detach().double().numpy()
     nearest = np.array([_check_handle(scene, means, handle) for handle in handles])
     points = np.array([handle.point for handle in handles], np.float64)
@@ -153,7 +163,7 @@ def _make_problem(
     held[nodes] = False
     solver = Solver(graph, blends, points, held, _springs(graph, handles, weights))
     pulls = np.array([handle.pull for handle in handles], np.float64)
-    return _Problem(members, graph, solver, blends, points, pulls)
+    return Problem(members, graph, solver, blends, points, pulls)
 
 
 def _check_handle(scene: Gaussians, means: Floats, handle: Handle) -> int:
@@ -172,8 +182,6 @@ def _check_handle(scene: Gaussians, means: Floats, handle: Handle) -> int:
     extent = means.max(axis=0) - means.min(axis=0)
     diagonal = float(np.linalg.norm(extent)) + 2.0 * _TOUCH_SIGMAS * float(np.median(largest))
     length = float(np.linalg.norm(handle.pull))
-    if length == 0.0:
-        raise ProgdfError(f"the pull of the point {_world(scene, handle)} is 0; write how far it goes")
     if length > MAX_PULL * diagonal:
         raise ProgdfError(
             f"a pull of {length:g} is more than {MAX_PULL:g} times the scene's diagonal of {diagonal:.3g}; "
@@ -235,7 +243,7 @@ def _springs(graph: NodeGraph, handles: Sequence[Handle], weights: Floats) -> Fl
     return springs
 
 
-def _solve_course(problem: _Problem) -> tuple[Floats, list[Pose]]:
+def _solve_course(problem: Problem) -> tuple[Floats, list[Pose]]:
     """Return the strengths [S] with 0, and the poses at all but the first."""
     straight = np.zeros_like(problem.pulls)
     trial = _solve_along(problem, straight, np.linspace(0.0, 1.0, 1 + _TRIAL_STRENGTHS))[-1]
@@ -251,7 +259,7 @@ def _solve_course(problem: _Problem) -> tuple[Floats, list[Pose]]:
     return strengths, _solve_along(problem, turns, strengths)
 
 
-def _solve_along(problem: _Problem, turns: Floats, strengths: Floats) -> list[Pose]:
+def _solve_along(problem: Problem, turns: Floats, strengths: Floats) -> list[Pose]:
     """Return the poses at all strengths but the first, for handles that turn on their way. turns: [H,3]"""
     last = problem.solver.rest()
     start = last

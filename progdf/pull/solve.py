@@ -75,15 +75,16 @@ class Solver:
         rotations = np.broadcast_to(np.eye(3), (len(self._graph), 3, 3)).copy()
         return Pose(self._graph.positions.copy(), rotations)
 
-    def solve(self, targets: Floats, start: Pose) -> Pose:
+    def solve(self, targets: Floats, start: Pose, rounds: int = _MAX_ROUNDS) -> Pose:
         """Return the pose with the handles at some positions.
 
         Args:
             targets: positions of the handles. [H,3]
             start: pose for similar targets, the warm start
+            rounds: largest number of rounds; a live drag takes few at a time
         """
         pose = start
-        for _ in range(_MAX_ROUNDS):
+        for _ in range(rounds):
             positions = self._solve_positions(targets, pose)
             rotations = nearest_rotations(self._products(positions), pose.rotations, _ROTATION_STEPS)
             moved = float(np.abs(positions - pose.positions).max())
