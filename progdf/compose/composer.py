@@ -166,6 +166,14 @@ class Composer:
         self._effects = Effects()
         self._plans: dict[frozenset[int], _Plan] = {}
         self._checked: list[tuple[torch.Tensor, int]] = []  # weights and their versions
+        self._touched: set[int] = set()  # edits whose offsets were written in place
+
+    def touch(self, gdf: Gdf) -> None:
+        """Let the next update read the offsets of an edit again, after they were written in place.
+
+        The offsets are float32, as an edit in progress has them.
+        """
+        self._touched.add(self._edit_of(gdf))
 
     def update(self, layers: Sequence[Layer], blend: str = "normalized") -> Change:
         """Set `gaussians` to the scene under `layers`, equal to `compose_layers(scene, layers, blend)`.
@@ -188,7 +196,8 @@ class Composer:
         self._check_weights([layer for _, layer in stack])
         before = self._effects
         self._effects = effects_of(stack, blend)
-        changed = changed_edits(before, self._effects)
+        changed = changed_edits(before, self._effects) | (self._touched & {edit for edit, _ in stack})
+        self._touched.clear()
         if not changed:
             return Change(np.zeros(0, np.int64), (), 0.0)
         plan = self._plan(changed)

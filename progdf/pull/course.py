@@ -78,6 +78,7 @@ class Problem:
 
     members: Rows  # rows of the scene that the graph covers. [M]
     graph: NodeGraph
+    held: Mask  # nodes that stay in place. [n]
     solver: Solver
     blends: csr_array  # weights of the nodes in each handle. [H,n]
     points: Floats  # [H,3]
@@ -163,7 +164,7 @@ def make_problem(
     held[nodes] = False
     solver = Solver(graph, blends, points, held, _springs(graph, handles, weights))
     pulls = np.array([handle.pull for handle in handles], np.float64)
-    return Problem(members, graph, solver, blends, points, pulls)
+    return Problem(members, graph, held, solver, blends, points, pulls)
 
 
 def _check_handle(scene: Gaussians, means: Floats, handle: Handle) -> int:

@@ -30,6 +30,52 @@ from viewer.state.view_state import Comparison, ViewState
 from viewer.state.workspace import Pointed, Workspace
 from viewer.ui.context import PALETTE
 
+SETTLE_FRAMES = 3  # imgui needs a frame or two until hovering and layout follow an event
+LINGER_S = 0.65
+"""Seconds until the tooltip of a still mouse opens: a little more than imgui's own two delays."""
+
+
+class FramePacer:
+    """Counter of frames and idle seconds since the last event."""
+
+    def __init__(self) -> None:
+        self._unsettled = SETTLE_FRAMES
+        self._rest_left: float | None = LINGER_S  # None: the tooltip has had its frames
+
+    def wake(self) -> None:
+        """Restart the counters after an event."""
+        self._unsettled = SETTLE_FRAMES
+        self._rest_left = LINGER_S
+
+    def rest(self) -> None:
+        """Stop requesting frames while the window is minimized."""
+        self._unsettled = 0
+        self._rest_left = None
+
+    def step(self, seconds: float) -> None:
+        """Begin a frame, `seconds` after the last one."""
+        if self._unsettled > 0:
+            self._unsettled -= 1
+        elif self._rest_left is not None:
+            self._rest_left -= seconds
+            if self._rest_left <= 0.0:
+                # imgui advances the delay in this frame, opens the tooltip invisibly in the next one to
+                # measure it, and shows it in the one after
+                self._unsettled = SETTLE_FRAMES
+                self._rest_left = None
+
+    def next_frame_delay(self, others: Sequence[float]) -> float | None:
+        """Return the seconds until the next frame is due without an event; None if none is due.
+
+        Args:
+            others: seconds until other parts need a frame
+        """
+        if self._unsettled > 0:
+            return 0.0
+        waits = [*others] if self._rest_left is None else [*others, self._rest_left]
+        return min(waits, default=None)
+
+
 SIZE = (168, 126)
 """Width and height of a thumbnail, in pixels."""
 
@@ -134,7 +180,7 @@ class Canvas:
         screen.use()
         screen.clear(*PALETTE.panel)
         aim = (view.camera, size)
-        edits = (view.layers, view.blend, view.background)
+        edits = (view.layers, view.blend, view.background, self.comparer.engine.version)
         turned = aim != self._last[0]
         slid = edits != self._last[1]
         self._last = (aim, edits)

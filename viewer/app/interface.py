@@ -15,6 +15,7 @@ from viewer.pictures.compare import Labels
 from viewer.state import history, workspace
 from viewer.state.actions import GLIDES, perform
 from viewer.state.commands import Action, OnItem, Plain
+from viewer.state.transient import Pull
 from viewer.state.workspace import Workspace
 from viewer.ui import overlay
 from viewer.ui.context import FIXED, PALETTE, SMALL_PX, UiContext, u32
@@ -22,7 +23,7 @@ from viewer.ui.keys import COMMANDS, JOINED, TOPICS, Command, chords, find_comma
 from viewer.ui.pointer import PointerContext
 from viewer.ui.widgets import elide, group_digits, menu, search_field
 
-from . import color_tool, mouse, select_tool
+from . import color_tool, mouse, pull_tool, select_tool
 
 MOUSE_HELP = (
     ("Left drag", "Orbit"),
@@ -275,7 +276,7 @@ def panels(
         work = perform_actions(work, requested, pointer)
     actions = []
     above = replace(area, height=area.height - timeline_bar.height(work, area, ui))
-    tools.draw_toolbar(work.view, above, ui, actions)
+    tools.draw_toolbar(work.view, above, ui, actions, isinstance(work.transient.gizmo, Pull))
     work, foot = tools.draw_options(work, above, ui, actions, select_tool.next_step(work))
     work = replace(work, view=tools.draw_view(work.view, above, foot, ui, actions))
     work, asked = draw_pill(work, pointer, compared, foot)
@@ -328,6 +329,8 @@ def over_picture(
     if view.color_brush.tool and not (io.want_capture_mouse or on_axes):
         color_tool.draw_tip(work, pointer)
     overlay.draw_axes(view, area, on_axes or work.transient.tool.drag == overlay.AXES_DRAG, ui)
+    if isinstance(work.transient.gizmo, Pull) and not original:
+        pull_tool.draw_marks(work.transient.gizmo, pointer)
     select_tool.draw_strokes(work, pointer)
     select_tool.draw_gesture(work.transient.tool.gesture, view, ui, pointer.left)
     at = work.transient.pointer.at

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
@@ -29,7 +29,7 @@ from viewer.state import actions, layer_selection, timeline, workspace
 from viewer.state.commands import Action, Plain, WithValue
 from viewer.state.layers import add_layer
 from viewer.state.snapshots import SliderSnapshot, compare_sides
-from viewer.state.transient import Decal, Gizmo, KeyPointer, MouseTool, PreviewState
+from viewer.state.transient import Decal, Gizmo, KeyPointer, MouseTool, PreviewState, Pull
 from viewer.state.view_state import LayerState, ViewState
 from viewer.state.workspace import PLACES, SceneFacts, Store, Workspace, with_transient
 from viewer.ui import overlay
@@ -48,57 +48,11 @@ from viewer.ui.keys import (
 )
 from viewer.ui.pointer import PointerContext
 
-from . import color_tool, interface, mouse, select_tool
-from .canvas import Canvas, LayersOf, RememberView, forget_view, no_layers
+from . import color_tool, interface, mouse, pull_tool, select_tool
+from .canvas import Canvas, FramePacer, LayersOf, RememberView, forget_view, no_layers
 from .decal import REST_S, DecalPlace, decal_takes_mouse, draw_decal, draw_ghosts, place_decal
 from .handles import draw_gizmo, gizmo_takes_mouse
 from .messages import Messages
-
-SETTLE_FRAMES = 3  # imgui needs a frame or two until hovering and layout follow an event
-LINGER_S = 0.65
-"""Seconds until the tooltip of a still mouse opens: a little more than imgui's own two delays."""
-
-
-class FramePacer:
-    """Counter of frames and idle seconds since the last event."""
-
-    def __init__(self) -> None:
-        self._unsettled = SETTLE_FRAMES
-        self._rest_left: float | None = LINGER_S  # None: the tooltip has had its frames
-
-    def wake(self) -> None:
-        """Restart the counters after an event."""
-        self._unsettled = SETTLE_FRAMES
-        self._rest_left = LINGER_S
-
-    def rest(self) -> None:
-        """Stop requesting frames while the window is minimized."""
-        self._unsettled = 0
-        self._rest_left = None
-
-    def step(self, seconds: float) -> None:
-        """Begin a frame, `seconds` after the last one."""
-        if self._unsettled > 0:
-            self._unsettled -= 1
-        elif self._rest_left is not None:
-            self._rest_left -= seconds
-            if self._rest_left <= 0.0:
-                # imgui advances the delay in this frame, opens the tooltip invisibly in the next one to
-                # measure it, and shows it in the one after
-                self._unsettled = SETTLE_FRAMES
-                self._rest_left = None
-
-    def next_frame_delay(self, others: Sequence[float]) -> float | None:
-        """Return the seconds until the next frame is due without an event; None if none is due.
-
-        Args:
-            others: seconds until other parts need a frame
-        """
-        if self._unsettled > 0:
-            return 0.0
-        waits = [*others] if self._rest_left is None else [*others, self._rest_left]
-        return min(waits, default=None)
-
 
 FIT_POLL_S = 0.25  # seconds between frames while a model of the surface under paint is computed
 FLIGHT_S = 1 / 60  # seconds between frames while flying
@@ -327,6 +281,7 @@ class MainView:
         self._follow_keyboard(asks)
         if not asks:
             work, self._keys = select_tool.take_keys(self.work, self._pointer(), self._keys)
+            work, self._keys = pull_tool.take_keys(work, self._keys)
             self.store.replace(work)
         self._point_by_keys(asks)
         if asks:  # no key is a shortcut or flies
@@ -372,7 +327,7 @@ class MainView:
         if work.transient.gizmo is not None and "Enter" in [press.chord for press in self._keys.pressed]:
             return  # it keeps the decal or the handles where they are, see `_move_gizmo`
         picks = work.form_open and work.form.picks
-        if decal or picks or work.view.select.tool or work.view.brush.active or work.view.color_brush.tool:
+        if isinstance(work.transient.gizmo, Decal | Pull) or not pull_tool.is_free(work):
             clicks = decal or picks or work.view.select.tool in select_tool.CLICKED
             if not (asks or self.at_start or imgui.get_io().want_text_input):
                 held, self._keys = mouse.point_by_keys(held, self._keys, self._pointer(), clicks)
@@ -409,7 +364,7 @@ class MainView:
         """Move the handles or the decal with the mouse; return True if they take the mouse."""
         gizmo = self.work.transient.gizmo
         pressed = [press.chord for press in self._keys.pressed]
-        moved: Gizmo | Decal | None = gizmo
+        moved = gizmo
         asked = ""
         takes_mouse = False
         with self._guard():  # Escape also leaves handles that cannot be drawn
@@ -417,6 +372,8 @@ class MainView:
             if isinstance(gizmo, Gizmo):
                 moved, asked = draw_gizmo(gizmo, self._pointer())
                 takes_mouse = gizmo_takes_mouse(moved)
+            elif isinstance(gizmo, Pull):
+                moved, asked, takes_mouse = pull_tool.update(gizmo, self.work, self._pointer(), pressed)
             elif gizmo is not None:
                 moved, asked = draw_decal(gizmo, self._pointer(), self.decal_surfaces, "Enter" in pressed)
                 takes_mouse = decal_takes_mouse(moved, self._pointer())
@@ -424,10 +381,10 @@ class MainView:
             return False
         self.store.replace(with_transient(self.work, gizmo=moved))
         if "Escape" in pressed or "Enter" in pressed:
-            asked = "put_back" if "Escape" in pressed else gizmo.enter_request
+            asked = gizmo.escape_request if "Escape" in pressed else gizmo.enter_request
         if asked:
             self.messages.request(Plain(asked))
-        if isinstance(moved, Gizmo) and moved.using:
+        if moved != gizmo or (isinstance(moved, Gizmo) and moved.using):
             self.wake()
         return takes_mouse
 
@@ -510,6 +467,9 @@ class MainView:
             or imgui.is_any_item_active()
             or imgui.get_io().mouse_wheel
         ):
+            return True
+        pull = self.work.transient.gizmo
+        if isinstance(pull, Pull) and pull.drag is not None:
             return True
         moves = self.work.player.playing or self.work.glide is not None
         return moves or is_flying(self._keys) or is_repeating(self._keys)

@@ -53,7 +53,7 @@ TOOLBAR_PX = 40.0  # width at 1×
 EDGE_PX = 8.0  # distance from the picture's edges
 NARROW_PX = 560.0  # below this picture width the options may cover the axes
 _SIDE_PX = 32.0  # size of a button
-_MIN_PX = 20.0  # minimum size of a button, in a low window
+_MIN_PX = 18.0  # minimum size of a button, in a low window
 _PAD_PX = 4.0  # padding around the buttons
 _TOOLS = (
     (("navigate:orbit", Icon.ORBIT), ("navigate:fly", Icon.FLY)),
@@ -69,7 +69,7 @@ _TOOLS = (
         ("select_subject", Icon.SUBJECT),
     ),
     (("paint_tool:color", Icon.COLOR_BRUSH), ("paint_tool:clone", Icon.CLONE)),
-    (("brush", Icon.BRUSH), ("decal", Icon.DECAL), ("move_selected", Icon.MOVE)),
+    (("brush", Icon.BRUSH), ("decal", Icon.DECAL), ("move_selected", Icon.MOVE), ("pull", Icon.PULL)),
 )
 _OPERATIONS = (
     *("select_grow", "select_shrink"),
@@ -97,8 +97,18 @@ def _open_below(share: float, ui: UiContext) -> None:
     imgui.set_next_window_pos(at, 0, (share, 0.0))
 
 
-def draw_toolbar(view: ViewState, area: Area, ui: UiContext, actions: list[Action]) -> None:
-    """Draw the toolbar along the left edge of the picture; `area`: the picture without the timeline."""
+def draw_toolbar(
+    view: ViewState, area: Area, ui: UiContext, actions: list[Action], pulls: bool = False
+) -> None:
+    """Draw the toolbar along the left edge of the picture.
+
+    Args:
+        view: the state
+        area: the picture without the timeline
+        ui: fonts and scale
+        actions: receives the commands of pressed buttons
+        pulls: the Pull tool is active
+    """
     active_tool: Action = WithText("navigate", view.camera.mode)
     if view.select.tool:
         active_tool = WithText("select_tool", view.select.tool)
@@ -106,6 +116,8 @@ def draw_toolbar(view: ViewState, area: Area, ui: UiContext, actions: list[Actio
         active_tool = WithText("paint_tool", view.color_brush.tool)
     elif view.brush.active:
         active_tool = Plain("brush")
+    elif pulls:
+        active_tool = Plain("pull")
     off = {"brush": not view.layers, "move_selected": not view.selection.count}
     count = sum(map(len, _TOOLS))
     gap = 6.0 * ui.scale

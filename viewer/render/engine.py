@@ -43,6 +43,7 @@ class _Edits:
 
     layers: tuple[tuple[int, float, Gains, str], ...] = ()
     blend: str = ""
+    version: int = -1  # see `ViewEngine.touch`; −1 for the current state
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,8 @@ class ViewEngine:
         """Times of the last picture."""
         self.near = near_plane(bounds_of(scene).radius)
         """Near plane, world units: nothing is drawn at or below this depth."""
+        self.version = 0
+        """Number of changes of the offsets of edits in progress, see `touch`."""
         self._edits = _Edits()
         self.order: NDArray[np.uint32] = np.zeros(0, np.uint32)
         """Rows from back to front, if the renderer needs them."""
@@ -186,6 +189,33 @@ class ViewEngine:
         """Return the edited scene. Valid until the engine draws other strengths; copy it to keep it."""
         self._compose(_edits(view))
         return self.composer.gaussians
+
+    def adopt(self, composer: Composer, gdfs: Sequence[Gdf]) -> None:
+        """Compose with another composer of the same rows, without drawing or uploading the whole scene again.
+
+        The last edit in `gdfs` may be an edit in progress, as may the last one before.
+
+        Args:
+            composer: composer of the scene with `gdfs`
+            gdfs: the edits, indexed by `LayerState.gdf`; those that both composers have keep their index
+        """
+        common = min(len(gdfs), len(self.gdfs))
+        same = [i for i in range(common) if gdfs[i] is self.gdfs[i]]
+        kept = tuple(layer for layer in self._edits.layers if layer[0] in same)
+        edits = _Edits(kept, self._edits.blend) if kept else _Edits()
+        self._compose(edits)
+        self.gdfs = tuple(gdfs)
+        self.composer = composer
+        composer.update(self._stack(edits), edits.blend or "normalized")
+        self._picture = None
+        self.version += 1
+
+    def touch(self, gdf: Gdf) -> None:
+        """Draw an edit in progress again, whose offsets were written in place."""
+        self.composer.touch(gdf)
+        self._edits = replace(self._edits, version=self.version)
+        self._picture = None
+        self.version += 1
 
     def release(self) -> None:
         """Release the GL objects. The context belongs to the caller."""

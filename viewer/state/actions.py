@@ -273,6 +273,13 @@ def _without_tools(view: ViewState) -> ViewState:
     )
 
 
+def _start_pull(workspace: Workspace, _: None) -> Workspace:
+    """Deactivate the other tools and request the Pull tool, or its end."""
+    return replace(
+        workspace, view=_without_tools(workspace.view), requests=(*workspace.requests, Plain("pull"))
+    )
+
+
 def _change_color_brush(workspace: Workspace, **changes: Any) -> Workspace:
     view = workspace.view
     return replace(workspace, view=replace(view, color_brush=replace(view.color_brush, **changes)))
@@ -482,6 +489,7 @@ ACTIONS: dict[str, Callable[[Workspace, Any], Workspace]] = {
     "brush_radius": _resize,
     "brush_softness": _soften,
     "paint_tool": _toggle_paint_tool,
+    "pull": _start_pull,
     "discard_paint": lambda w, _: replace(w, view=replace(w.view, painted=())),
     "overshoot": lambda w, _: replace(w, view=with_overshoot(w.view, not w.view.overshoot)),
     "snapshot": lambda w, _: replace(w, snapshots=snapshots.take(w.snapshots, w.view)),

@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from progdf.gdf.file import Gdf
 from progdf.painting.projection import ViewSurface
 from progdf.painting.strokes import ColorStroke
 from progdf.scene.scribbles import Rows
@@ -63,6 +64,11 @@ class Gizmo:
         """Name of the request that Enter makes."""
         return "keep_placed"
 
+    @property
+    def escape_request(self) -> str:
+        """Name of the request that Escape makes."""
+        return "put_back"
+
 
 DecalGrip = Literal["", "move", "scale", "rotate"]
 
@@ -92,6 +98,80 @@ class Decal:
         """Name of the request that Enter makes; "" before the decal is placed."""
         return "lay_decal" if self.placed else ""
 
+    @property
+    def escape_request(self) -> str:
+        """Name of the request that Escape makes."""
+        return "put_back"
+
+
+Point = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class PullHandle:
+    """Handle of a pull: a point of the surface and its displacement."""
+
+    point: Vec3  # position without the pull, world units
+    pull: Vec3 = (0.0, 0.0, 0.0)  # displacement, world units
+
+    @property
+    def target(self) -> Vec3:
+        """Position with the pull, world units."""
+        (x, y, z), (dx, dy, dz) = self.point, self.pull
+        return x + dx, y + dy, z + dz
+
+
+@dataclass(frozen=True)
+class PullPose:
+    """Handles and held points of a pull."""
+
+    handles: tuple[PullHandle, ...] = ()
+    pins: tuple[Vec3, ...] = ()  # points that stay in place, without the pull, world units
+
+
+PullAxis = Literal["", "x", "y", "z"]
+
+
+@dataclass(frozen=True)
+class PullDrag:
+    """Drag of a handle in progress."""
+
+    index: int  # of the handle
+    start: Vec3  # position of the handle at the press, world units
+    grab: Point  # from the handle to the pointer, pixels of the picture
+    normal: Vec3  # normal of the surface at the handle
+    before: PullPose  # the pose before the press
+    axis: PullAxis = ""  # world axis that the handle stays on; "" for the plane of the view
+    is_new: bool = False  # the press created the handle, which becomes a pin if it does not move
+    moved: bool = False  # the pointer moved further than a click
+
+
+@dataclass(frozen=True)
+class Pull:
+    """Pull tool with its handles."""
+
+    radius: float  # radius of the influence around each handle, world units
+    whole: bool = False  # the pull reaches all that is connected, regardless of the radius
+    holds_selection: bool = False  # the selection stays in place; if False, only the selection moves
+    pose: PullPose = PullPose()
+    past: tuple[PullPose, ...] = ()  # earlier poses that undo returns to
+    future: tuple[PullPose, ...] = ()  # undone poses, the next one last
+    drag: PullDrag | None = None
+    hovered: Vec3 | None = None  # point of the surface under the pointer, world units
+    hovered_for: object = field(default=None, compare=False)  # pointer and picture of that point
+    status: str = ""  # progress, or the reason why the pull cannot be shown; one line
+    edit: Gdf | None = field(default=None, compare=False)  # the edit in progress, on screen
+
+    @property
+    def enter_request(self) -> str:
+        """Name of the request that Enter makes."""
+        return "keep_pull"
+
+    @property
+    def escape_request(self) -> str:
+        """Name of the request that Escape makes; "" while it only ends a drag."""
+        return "" if self.drag else "leave_pull"
+
 
 @dataclass(frozen=True)
 class PreviewGhost:
@@ -116,9 +196,6 @@ class KeyPointer:
 
     at: tuple[float, float] | None = None  # in the window; None while the mouse moves it
     down: bool = False  # a key holds its button down
-
-
-Point = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +312,8 @@ class Transient:
     cover: Cover | None = None  # image drawn over the picture
     preview: PreviewState = PreviewState()  # state of the preview of a new edit
     live: tuple[LayerState, ...] = ()  # edits in training, on top of the layer stack
-    gizmo: Gizmo | Decal | None = None  # handles of a selection being moved, or a decal being placed
+    # handles of a selection being moved, a decal being placed, or the Pull tool
+    gizmo: Gizmo | Decal | Pull | None = None
     ghosts: tuple[DecalGhost | PreviewGhost, ...] = ()  # edits in training that have no layer yet
     pointer: KeyPointer = KeyPointer()  # pointer of the active tool
     tool: MouseTool = MouseTool()  # drag and gesture of the mouse

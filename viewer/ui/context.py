@@ -99,6 +99,7 @@ class Icon:
     FLY = icons.ICON_FA_PAPER_PLANE
     DECAL = icons.ICON_FA_STAMP
     MOVE = icons.ICON_FA_UP_DOWN_LEFT_RIGHT
+    PULL = icons.ICON_FA_HAND_BACK_FIST
     SOLO = icons.ICON_FA_STAR
     SAVE = icons.ICON_FA_FLOPPY_DISK
     SHARE = icons.ICON_FA_ARROW_UP_FROM_BRACKET

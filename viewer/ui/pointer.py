@@ -126,7 +126,7 @@ class PointerContext:
     def scene_key(self) -> object:
         """Key of the scene on screen, without the camera."""
         view = self.shown
-        return self.engine, view.layers, view.blend, view.selection.hidden
+        return self.engine, self.engine.version, view.layers, view.blend, view.selection.hidden
 
     def view_surface(self, camera: ViewCamera, size: tuple[int, int]) -> ViewSurface:
         """Return the visible surface of the scene in a view of this size, pixels."""

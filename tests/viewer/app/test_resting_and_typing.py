@@ -8,7 +8,7 @@ import pytest
 from imgui_bundle import imgui
 
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
-from viewer.app import main_view as pace
+from viewer.app import canvas as pace
 from viewer.ui.keys import Keys, Press, next_event_id
 
 pytestmark = pytest.mark.gl

@@ -10,6 +10,7 @@ from viewer.app.main_view import MainView
 from viewer.app.messages import Requests, WaitFor
 from viewer.files import exports
 from viewer.files.document import DocumentStore
+from viewer.ui.window import wake_window
 
 from .deliver import DeliverActions
 from .edits import EditActions
@@ -17,6 +18,7 @@ from .file_actions import FileActions, OpenDocument
 from .painting import PaintingActions
 from .pictures import PictureActions
 from .preview import PreviewActions
+from .pulling import PullActions
 from .scene_checks import StrayActions, UpActions
 from .start import StartActions
 from .tidy import TidyActions
@@ -37,6 +39,7 @@ class WindowParts:
     strays: StrayActions
     tidy: TidyActions
     painting: PaintingActions
+    pulling: PullActions
 
     @property
     def requests(self) -> Requests:
@@ -51,13 +54,14 @@ class WindowParts:
             self.strays,
             self.tidy,
             self.painting,
+            self.pulling,
         )
         return {name: act for part in parts for name, act in part.requests.items()}
 
     @property
     def polls(self) -> tuple[Callable[[], float | None], ...]:
         """Functions that poll a part and return the seconds until the next poll, None for never."""
-        parts = (self.jobs, self.painting, self.pictures, self.preview, self.start, self.strays)
+        parts = (self.jobs, self.painting, self.pictures, self.preview, self.start, self.strays, self.pulling)
         return (
             *(part.poll for part in parts),
             self.file_actions.poll_dialog,
@@ -67,12 +71,12 @@ class WindowParts:
     @property
     def closers(self) -> tuple[Callable[[], None], ...]:
         """Functions that free the resources of a part, in the order of their calls."""
-        parts = (self.start, self.preview, self.strays, self.jobs)
+        parts = (self.start, self.preview, self.strays, self.jobs, self.pulling)
         return (*(part.close for part in parts), self.file_actions.release)
 
     def leave_scene(self) -> None:
         """Reset the state of the old scene after another one was opened."""
-        for part in (self.jobs, self.preview, self.up, self.tidy):
+        for part in (self.jobs, self.preview, self.up, self.tidy, self.pulling):
             part.leave_scene()
 
 
@@ -165,4 +169,12 @@ def make_parts(
         strays=StrayActions(store=store, documents=documents, messages=messages),
         tidy=TidyActions(store=store, documents=documents, edits=edits),
         painting=PaintingActions(store=store, documents=documents, messages=messages, queue=jobs.queue),
+        pulling=PullActions(
+            store=store,
+            documents=documents,
+            messages=messages,
+            edits=edits,
+            engine=lambda: main_view.engine,
+            wake=wake_window,
+        ),
     )

@@ -1,0 +1,150 @@
+"""Live pull: the same problem as the course, solved a few rounds at a time while handles are dragged.
+
+The graph and the factorization are computed once for a set of handles. Each step starts from the last pose,
+so it is fast for small movements. Its result is the end of an edit in progress, whose offsets are replaced in
+place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.sparse import csr_array
+from torch import Tensor
+
+from progdf.field.baked import AttributeBases, BakedField
+from progdf.gaussians import Gaussians, attribute_slices, pack
+from progdf.gdf.file import Gdf, fingerprint
+from progdf.region import Region, from_mask
+
+from .course import Handle, make_problem
+from .follow import bind, follow, rest_frames
+from .graph import MAX_NODES, Floats, Rows, build_graph
+
+_SETTLED_SHARE = 1e-3
+"""Movement of a node in a step below which the pose counts as settled, in node spacings."""
+_CHANGED = ("means", "log_scales", "quats", "shN")  # attributes that a pull changes
+
+
+@dataclass(frozen=True)
+class LiveStep:
+    """Result of one step."""
+
+    pulls: Floats  # displacements of the handles. [H,3]
+    offsets: Tensor  # packed offsets of the members from the scene. [M,C] float32
+    is_settled: bool  # further steps with the same displacements change nothing visible
+
+
+class LivePull:
+    """Pull of some handles that is solved step by step.
+
+    The constructor takes up to seconds for large regions. Use one object in one thread at a time.
+
+    Args:
+        scene: the scene as it is without the pull
+        handles: at least one; their displacements are ignored
+        hold: Gaussians that stay as they are
+        max_nodes: target number of nodes of the graph
+
+    Raises:
+        ProgdfError: see `progdf.pull.course.pull`.
+    """
+
+    def __init__(
+        self,
+        scene: Gaussians,
+        handles: Sequence[Handle],
+        hold: Region | None = None,
+        max_nodes: int = MAX_NODES,
+    ) -> None:
+        self._problem = make_problem(scene, handles, hold, max_nodes)
+        graph = self._problem.graph
+        rows = self._problem.members
+        moves = np.ones(len(rows), bool)
+        if hold is not None:
+            moves = ~np.isin(rows, hold.members.numpy())
+        points = scene.means.detach().double().numpy()[rows]
+        binding = bind(graph, points, graph.node_of)
+        moves &= binding @ (~self._problem.held).astype(float) > 0.0
+        self.members: Rows = rows[moves]
+        """Gaussians that can move, ascending. [M]"""
+        self._binding = csr_array(binding[np.flatnonzero(moves)])
+        self._rows = pack(scene[torch.from_numpy(self.members)], with_shN=scene.sh_degree > 0).double()
+        self._frames = rest_frames(self._rows)
+        self._pose = self._problem.solver.rest()
+
+    @property
+    def channels(self) -> int:
+        """Width of a packed row, C."""
+        return self._rows.shape[1]
+
+    @property
+    def node_count(self) -> int:
+        """Number of nodes of the graph."""
+        return len(self._problem.graph)
+
+    def step(self, pulls: Floats, rounds: int) -> LiveStep:
+        """Solve some rounds for displacements of the handles.
+
+        Args:
+            pulls: finite displacements, world units. [H,3]
+            rounds: number of rounds, at least 1
+        """
+        problem = self._problem
+        pose = problem.solver.solve(problem.points + pulls, self._pose, rounds)
+        moved = float(np.abs(pose.positions - self._pose.positions).max(initial=0.0))
+        self._pose = pose
+        gradients = problem.solver.gradients(pose)
+        packed, self._frames = follow(self._rows, self._binding, problem.graph, pose, gradients, self._frames)
+        return LiveStep(
+            pulls.copy(), (packed - self._rows).float(), moved <= _SETTLED_SHARE * problem.graph.spacing
+        )
+
+
+def edit_in_progress(scene: Gaussians, members: Rows, channels: int, name: str) -> Gdf:
+    """Return an edit of some Gaussians without offsets yet, see `write_offsets`.
+
+    Args:
+        scene: the scene with the rows that other edits add
+        members: rows of the scene, ascending. [M]
+        channels: width of a packed row
+        name: name of the layer
+    """
+    slices = attribute_slices(channels)
+    bases = {}
+    for attribute in _CHANGED:
+        if attribute in slices:
+            width = slices[attribute].stop - slices[attribute].start
+            bases[attribute] = AttributeBases(
+                torch.zeros(len(members), width),
+                torch.zeros(0, len(members), width),
+                torch.ones(1, width),
+                torch.tensor([[0.0], [1.0]]),
+            )
+    mask = torch.zeros(len(scene), dtype=torch.bool)
+    mask[torch.from_numpy(members)] = True
+    field = BakedField("keyframes", torch.tensor([0.0, 1.0]), bases, channels)
+    return Gdf(name, from_mask(name, mask), field, fingerprint(scene))
+
+
+def write_offsets(edit: Gdf, offsets: Tensor) -> None:
+    """Replace the offsets of an edit in progress in place. [M,C]"""
+    slices = attribute_slices(edit.field.channels)
+    for attribute, bases in edit.field.attributes.items():
+        bases.end_offset.copy_(offsets[:, slices[attribute]])
+
+
+def connected_rows(scene: Gaussians, rows: Rows) -> Rows:
+    """Return the Gaussians that are connected with some of them, in ascending order.
+
+    Args:
+        scene: the Gaussians. [N]
+        rows: indices. [K]
+    """
+    graph = build_graph(scene)
+    parts = graph.part[graph.node_of]
+    connected: Rows = np.flatnonzero(np.isin(parts, parts[rows]))
+    return connected

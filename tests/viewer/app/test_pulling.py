@@ -1,0 +1,226 @@
+"""The Pull tool: press and drag, layers by Enter, undo, pins and limits."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from imgui_bundle import imgui
+
+from tests.helpers.edits import bits
+from tests.helpers.null_app import null_app, press
+from tests.helpers.sessions import opened_document
+from tests.helpers.ui_rig import bear, first_view
+from viewer.app.app import App
+from viewer.camera.decal_warp import project
+from viewer.camera.view_camera import to_camera
+from viewer.state import selection
+from viewer.state.transient import Pull
+from viewer.state.workspace import with_transient
+from viewer.ui.glfw_library import glfw
+
+pytestmark = pytest.mark.gl
+
+
+@pytest.fixture
+def app(folder: Path) -> Iterator[App]:
+    with null_app(opened_document(folder), first_view(bear()), folder) as app:
+        yield app
+
+
+def pull_of(app: App) -> Pull:
+    pull = app.main_view.work.transient.gizmo
+    assert isinstance(pull, Pull)
+    return pull
+
+
+def place_of(app: App, row: int) -> tuple[float, float]:
+    """Return the window position of a Gaussian."""
+    camera = to_camera(app.main_view.work.view.camera, *app.main_view.picture_size)
+    means = app.engine.gaussians(app.main_view.work.view).means[row].double().numpy()
+    x, y = project(means, camera)[0].tolist()
+    density = imgui.get_io().display_framebuffer_scale
+    return x / density.x, y / density.y
+
+
+def on_scarf(app: App) -> tuple[float, float]:
+    """Return the middle of the scarf, which no part of the interface covers."""
+    rows = bear().demo.members("scarf")
+    x, y = np.mean([place_of(app, int(row)) for row in rows], axis=0).tolist()
+    return round(x), round(y)
+
+
+def frame(app: App) -> None:
+    app.main_view.wake()
+    app.draw()
+    app.parts.pulling.settle()
+    app.draw()
+
+
+def move(app: App, x: float, y: float) -> None:
+    glfw.set_cursor_pos(app.window.handle, x, y)
+    frame(app)
+
+
+def button(app: App, down: bool) -> None:
+    imgui.get_io().add_mouse_button_event(0, down)
+    frame(app)
+
+
+def drag(app: App, start: tuple[float, float], by: tuple[float, float]) -> None:
+    move(app, *start)
+    button(app, True)
+    for share in (0.5, 1.0):
+        move(app, start[0] + share * by[0], start[1] + share * by[1])
+    button(app, False)
+
+
+def means(app: App) -> torch.Tensor:
+    return app.engine.gaussians(app.main_view._displayed_view()).means[: len(bear().scene)].clone()
+
+
+def test_surface_follows_the_pointer_and_enter_makes_a_layer(app: App) -> None:
+    original = bits(bear().scene)
+    before = means(app)
+    press(app, "Shift+P")
+    drag(app, on_scarf(app), (30.0, -20.0))
+    (handle,) = pull_of(app).pose.handles
+    assert np.linalg.norm(handle.pull) > 0.0
+    assert [layer.name for layer in app.main_view.work.transient.live] == ["pulled"]
+    moved = means(app) - before
+    nearest = int((before - torch.tensor(handle.point)).norm(dim=1).argmin())
+    torch.testing.assert_close(moved[nearest], torch.tensor(handle.pull), atol=0.05, rtol=0.2)
+    far = (before - torch.tensor(handle.point)).norm(dim=1) > pull_of(app).radius
+    assert not moved[far].any()
+    live = means(app)
+    press(app, "Enter")
+    app.parts.pulling.settle()
+    app.draw()
+    layer = app.main_view.work.view.layers[-1]
+    assert (layer.name, layer.strength) == ("pulled", 1.0)
+    assert app.main_view.work.transient.gizmo is None
+    assert not app.main_view.work.transient.live
+    size = float(np.linalg.norm(handle.pull))
+    assert float((means(app) - live).norm(dim=1).max()) < 0.1 * size
+    press(app, "Ctrl+Z")
+    assert torch.equal(means(app), before)
+    assert bits(app.documents.get().original) == original
+
+
+def test_escape_ends_the_drag_and_then_the_tool(app: App) -> None:
+    before = means(app)
+    press(app, "Shift+P")
+    start = on_scarf(app)
+    move(app, *start)
+    button(app, True)
+    move(app, start[0] + 30.0, start[1])
+    assert not torch.equal(means(app), before)
+    press(app, "Escape")
+    frame(app)
+    assert not pull_of(app).pose.handles
+    assert torch.equal(means(app), before)
+    button(app, False)
+    drag(app, start, (0.0, -25.0))
+    press(app, "Escape")
+    frame(app)
+    assert app.main_view.work.transient.gizmo is None
+    assert torch.equal(means(app), before)
+    assert not app.main_view.work.view.layers
+
+
+def test_drags_are_undone_and_redone_one_by_one(app: App) -> None:
+    press(app, "Shift+P")
+    start = on_scarf(app)
+    drag(app, start, (20.0, 0.0))
+    first = pull_of(app).pose
+    drag(app, (start[0] + 20.0, start[1]), (0.0, -15.0))
+    (handle,) = pull_of(app).pose.handles
+    assert handle.point == first.handles[0].point
+    assert handle.pull != first.handles[0].pull
+    press(app, "Ctrl+Z")
+    assert pull_of(app).pose == first
+    press(app, "Ctrl+Z")
+    assert not pull_of(app).pose.handles
+    press(app, "Ctrl+Shift+Z", "Ctrl+Y")
+    assert pull_of(app).pose.handles == (handle,)
+
+
+def test_axis_keys_and_alt_restrict_the_drag(app: App) -> None:
+    press(app, "Shift+P")
+    start = on_scarf(app)
+    move(app, *start)
+    button(app, True)
+    press(app, "X")
+    move(app, start[0] + 30.0, start[1] - 30.0)
+    pull = np.array(pull_of(app).pose.handles[0].pull)
+    assert pull[0] != 0.0
+    assert np.allclose(pull[1:], 0.0, atol=1e-9)
+    press(app, "X")
+    imgui.get_io().add_key_event(imgui.Key.mod_alt, True)
+    frame(app)
+    drag_state = pull_of(app).drag
+    assert drag_state is not None
+    pull = np.array(pull_of(app).pose.handles[0].pull)
+    imgui.get_io().add_key_event(imgui.Key.mod_alt, False)
+    button(app, False)
+    assert np.linalg.norm(np.cross(pull, drag_state.normal)) < 1e-6 * max(np.linalg.norm(pull), 1e-9)
+
+
+def test_wheel_changes_the_radius_over_the_surface_and_zooms_beside_it(app: App) -> None:
+    press(app, "Shift+P")
+    radius = pull_of(app).radius
+    camera = app.main_view.work.view.camera
+    move(app, *on_scarf(app))
+    imgui.get_io().add_mouse_wheel_event(0.0, 2.0)
+    frame(app)
+    assert pull_of(app).radius == pytest.approx(1.21 * radius)
+    assert app.main_view.work.view.camera == camera
+    move(app, 80.0, 150.0)
+    imgui.get_io().add_mouse_wheel_event(0.0, 1.0)
+    frame(app)
+    assert app.main_view.work.view.camera != camera
+
+
+def test_click_pins_and_shift_click_frees(app: App) -> None:
+    press(app, "Shift+P")
+    start = on_scarf(app)
+    move(app, *start)
+    button(app, True)
+    button(app, False)
+    assert len(pull_of(app).pose.pins) == 1
+    assert not pull_of(app).pose.handles
+    imgui.get_io().add_key_event(imgui.Key.mod_shift, True)
+    frame(app)
+    button(app, True)
+    button(app, False)
+    imgui.get_io().add_key_event(imgui.Key.mod_shift, False)
+    assert not pull_of(app).pose.pins
+    frame(app)
+
+
+def test_selection_limits_or_holds(app: App) -> None:
+    mask = np.zeros(app.main_view.facts.count, bool)
+    mask[bear().demo.members("scarf")] = True
+    view = app.main_view.work.view
+    app.main_view.store.change(replace(view, selection=selection.select(view.selection, mask)))
+    before = means(app)
+    press(app, "Shift+P")
+    app.main_view.store.replace(with_transient(app.main_view.work, gizmo=replace(pull_of(app), whole=True)))
+    drag(app, on_scarf(app), (25.0, 0.0))
+    moved = (means(app) != before).any(dim=1)
+    assert moved.any()
+    assert not moved[~torch.from_numpy(mask[: len(moved)])].any()
+
+
+def test_layer_of_a_pull_is_in_the_session(app: App, folder: Path) -> None:
+    press(app, "Shift+P")
+    drag(app, on_scarf(app), (25.0, 0.0))
+    press(app, "Enter")
+    app.parts.pulling.settle()
+    (path,) = [path for path in app.documents.get().gdf_paths if path.stem == "pulled"]
+    assert path.is_file()
+    assert app.documents.get().gdfs[app.main_view.work.view.layers[-1].gdf].instruction == "pull"

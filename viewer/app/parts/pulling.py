@@ -1,0 +1,505 @@
+"""Pulls in the window: the scene follows the handles of the Pull tool, and Enter makes a layer with a slider.
+
+Graphs are built, and steps solved, in other threads. The window shows the newest finished step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import wait as wait_for
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from progdf.compose.composer import Composer
+from progdf.compose.layer_paint import layer_of
+from progdf.compose.layers import Layer
+from progdf.compose.reference import compose_layers, coverage
+from progdf.errors import ProgdfError
+from progdf.gaussians import Gaussians
+from progdf.gdf.file import Gdf, save_gdf
+from progdf.io.atomic import make_folder
+from progdf.pull.course import Handle, pull
+from progdf.pull.live import LivePull, LiveStep, connected_rows, edit_in_progress, write_offsets
+from progdf.region import Region, from_mask
+from progdf.scene.point_tree import PointTree
+from progdf.threads import one_thread
+from progdf.tidy import Step, tidy
+from viewer.app.messages import Messages, Requests, error_line
+from viewer.app.parts.edits import EditActions
+from viewer.camera.view_camera import Vec3
+from viewer.files.document import DocumentStore
+from viewer.jobs.training import edits_folder, free_path
+from viewer.render.engine import ViewEngine
+from viewer.state import selection
+from viewer.state.layers import visible_layers
+from viewer.state.transient import Pull, PullPose
+from viewer.state.view_state import LayerState
+from viewer.state.workspace import Store, with_transient
+
+_NAME = "pulled"
+_FIRST_RADIUS = 0.15  # radius of the influence at first, in radii of what can be pulled
+_ROUNDS = 6  # rounds of the solver per step while a handle is dragged
+_FIRST_ROUNDS = 60  # rounds before the first step is shown
+_PATIENCE_S = 0.012  # time that a frame waits for its step, so that fast steps show in the same frame
+_PIN_GAUSSIANS = 48  # Gaussians that a pin holds
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Inputs of a live pull. Displacements are not part of it."""
+
+    engine: ViewEngine
+    gdfs: tuple[Gdf, ...] = field(compare=False)  # the engine's edits without the edit in progress
+    layers: tuple[LayerState, ...]  # visible layers
+    blend: str
+    limit: bytes  # packed mask of the Gaussians that may move, `EMPTY_MASK` for all
+    hidden: bytes  # packed mask of the hidden Gaussians
+    held: bytes  # packed mask of the Gaussians that stay in place
+    points: tuple[Vec3, ...]  # points of the handles, without the pull
+    pins: tuple[Vec3, ...]
+    radius: float | None  # radius of the influence; None: all that is connected
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    """Live pull with its edit in progress, and a composer that includes it."""
+
+    problem: _Problem
+    live: LivePull
+    edit: Gdf
+    composer: Composer
+
+
+class _Bases:
+    """Scene under the layers below a pull, and its parts. The last ones are cached."""
+
+    def __init__(self) -> None:
+        self._key: object = None
+        self._scene: Gaussians | None = None
+        self._parts: dict[object, NDArray[np.int64]] = {}
+
+    def scene(self, problem: _Problem, count: int) -> Gaussians:
+        """Return the scene's own Gaussians under the visible layers. [N]"""
+        key = (problem.engine, problem.layers, problem.blend)
+        if self._scene is None or self._key != key:
+            scene = compose_layers(problem.engine.scene, _stack(problem), problem.blend)
+            self._scene = scene if len(scene) == count else scene[torch.arange(count)]
+            self._key = key
+            self._parts.clear()
+        return self._scene
+
+    def connected_part(self, scene: Gaussians, mask: NDArray[np.bool_], rows: NDArray[np.int64]) -> Region:
+        """Return the part of a mask that is connected with some rows."""
+        key = (mask.tobytes(), rows.tobytes())
+        if key not in self._parts:
+            allowed = np.flatnonzero(mask)
+            start = np.searchsorted(allowed, rows).clip(max=len(allowed) - 1)
+            found = connected_rows(scene[torch.from_numpy(allowed)], start)
+            self._parts[key] = allowed[found]
+        part = np.zeros(len(mask), bool)
+        part[self._parts[key]] = True
+        return from_mask(_NAME, torch.from_numpy(part))
+
+
+class PullActions:
+    """The Pull tool's effect on the scene.
+
+    Args:
+        store: state of the window
+        documents: the open document
+        messages: messages to the user
+        edits: adds the finished pull as a layer
+        engine: returns the engine that draws the window
+        wake: ends the window's wait for events; callable from any thread
+    """
+
+    def __init__(
+        self,
+        *,
+        store: Store,
+        documents: DocumentStore,
+        messages: Messages,
+        edits: EditActions,
+        engine: Callable[[], ViewEngine],
+        wake: Callable[[], None],
+    ) -> None:
+        self._store = store
+        self._documents = documents
+        self._messages = messages
+        self._edits = edits
+        self._engine = engine
+        self._wake = wake
+        self._builder = ThreadPoolExecutor(1, thread_name_prefix="pull graph")
+        self._stepper = ThreadPoolExecutor(1, thread_name_prefix="pull step")
+        self._bases = _Bases()
+        self._preparing: tuple[_Problem, Future[_Prepared]] | None = None
+        self._refused: _Problem | None = None  # it cannot be solved
+        self._prepared: _Prepared | None = None
+        self._base: tuple[ViewEngine, Composer, tuple[Gdf, ...]] | None = None  # without the pull
+        self._stepping: Future[LiveStep] | None = None
+        self._solved: LiveStep | None = None
+        self._keeping: tuple[Path, str, Pull, Future[None]] | None = None
+
+    @property
+    def requests(self) -> Requests:
+        """Handlers of the requests about pulls, by name."""
+        return {
+            "pull": lambda _: self._toggle(),
+            "keep_pull": lambda _: self._keep(),
+            "leave_pull": lambda _: self._leave(),
+        }
+
+    def leave_scene(self) -> None:
+        """Drop the pull when another scene opens."""
+        self._preparing = self._keeping = self._base = None
+        self._forget()
+        self._set(None)
+
+    def close(self) -> None:
+        """Stop the threads."""
+        self._builder.shutdown(wait=False, cancel_futures=True)
+        self._stepper.shutdown(wait=False, cancel_futures=True)
+
+    def poll(self) -> float | None:
+        """Start work for the current handles and show finished work."""
+        self._finish_keeping()
+        pull = self._pull
+        if pull is None:
+            if self._keeping is None and self._prepared is not None:
+                self._clear()
+            return None
+        problem = self._problem(pull)
+        if self._base is not None and self._base[0] is not self._engine():
+            self._forget()  # another document is drawn, without the pull
+        if problem is None:
+            if self._prepared is not None:
+                self._clear()
+            self._report("")
+            return None
+        self._take_prepared(problem)
+        self._prepare(problem, pull)
+        self._step(pull)
+        return None
+
+    def settle(self) -> None:
+        """Wait until the window shows the pull of the current handles."""
+        while True:
+            self.poll()
+            running = [self._preparing[1]] if self._preparing else []
+            steps = [self._stepping] if self._stepping else []
+            kept = [self._keeping[3]] if self._keeping else []
+            if not running and not steps and not kept:
+                return
+            wait_for([*running, *steps, *kept])
+
+    @property
+    def _pull(self) -> Pull | None:
+        gizmo = self._store.get().transient.gizmo
+        return gizmo if isinstance(gizmo, Pull) else None
+
+    def _set(self, pull: Pull | None) -> None:
+        work = self._store.get()
+        if pull is not None or isinstance(work.transient.gizmo, Pull):
+            self._store.replace(with_transient(work, gizmo=pull))
+            self._store.wake()
+
+    def _report(self, status: str) -> None:
+        pull = self._pull
+        if pull is not None and pull.status != status:
+            self._set(replace(pull, status=status))
+
+    def _toggle(self) -> None:
+        if self._pull is not None:
+            self._leave()
+            return
+        if self._keeping is not None:
+            raise ProgdfError("the last pull becomes a layer; wait until it is finished")
+        document = self._documents.get()
+        if document.is_empty:
+            raise ProgdfError("no scene is open; open one first")
+        state = self._store.get().view.selection
+        mask = selection.unpack(state.members, len(document.scene))[: len(document.original)]
+        size = document.bounds.radius
+        if mask.any():
+            means = document.original.means[torch.from_numpy(mask.copy())].double()
+            size = float((means - means.mean(dim=0)).norm(dim=1).quantile(0.9))
+        self._set(Pull(max(_FIRST_RADIUS * size, 1e-9)))
+
+    def _leave(self) -> None:
+        self._set(None)
+        if self._keeping is None:
+            self._clear()
+
+    def _problem(self, pull: Pull) -> _Problem | None:
+        """Return the inputs of the pull; None without handles."""
+        if not pull.pose.handles:
+            return None
+        engine = self._engine()
+        base = self._base
+        gdfs = engine.gdfs if base is None or base[0] is not engine else base[2]
+        view = self._store.get().view
+        selected = view.selection.members if view.selection.count else selection.EMPTY_MASK
+        holds = pull.holds_selection
+        layers = tuple(
+            LayerState(layer.gdf, "", layer.strength, gains=layer.gains, paint=layer.paint)
+            for layer in visible_layers(view)
+            if layer.strength
+        )
+        return _Problem(
+            engine=engine,
+            gdfs=gdfs,
+            layers=layers,
+            blend=view.blend,
+            limit=selection.EMPTY_MASK if holds else selected,
+            hidden=view.selection.hidden,
+            held=selected if holds else selection.EMPTY_MASK,
+            points=tuple(handle.point for handle in pull.pose.handles),
+            pins=pull.pose.pins,
+            radius=None if pull.whole else pull.radius,
+        )
+
+    def _prepare(self, problem: _Problem, pull: Pull) -> None:
+        """Begin to build the graph of a problem unless it is known; a running build ends first."""
+        known = self._prepared is not None and self._prepared.problem == problem
+        if known or self._preparing is not None or problem == self._refused:
+            return
+        count = len(self._documents.get().original)
+        future = self._builder.submit(_prepare, self._bases, problem, _pulls(pull), count)
+        future.add_done_callback(lambda _: self._wake())
+        self._preparing = problem, future
+        if self._prepared is None:
+            self._report("Preparing …")
+
+    def _take_prepared(self, problem: _Problem) -> None:
+        """Show a finished graph, also of an earlier radius, as long as its handles are the current ones."""
+        if self._preparing is None or not self._preparing[1].done():
+            return
+        built, future = self._preparing
+        self._preparing = None
+        if built.engine is not problem.engine or built.points != problem.points:
+            return
+        try:
+            prepared = future.result()
+        except Exception as error:
+            line = error_line(error)
+            self._refused = built
+            self._report(line)
+            if not line:
+                raise
+            return
+        if self._stepping is not None:
+            wait_for([self._stepping])
+            self._stepping = None
+        engine = self._engine()
+        if self._base is None:
+            self._base = engine, engine.composer, engine.gdfs
+        engine.adopt(prepared.composer, (*self._base[2], prepared.edit))
+        self._prepared = prepared
+        self._solved = None
+        self._show_layer(len(self._base[2]))
+        self._report("")
+        pull = self._pull
+        if pull is not None:
+            self._set(replace(pull, edit=prepared.edit))
+
+    def _show_layer(self, index: int) -> None:
+        """Show the edit in progress above the other live edits."""
+        work = self._store.get()
+        others = tuple(layer for layer in work.transient.live if layer.gdf < index)
+        live = (*others, LayerState(index, _NAME, 1.0))
+        self._store.replace(with_transient(work, live=live))
+        self._store.wake()
+
+    def _step(self, pull: Pull) -> None:
+        """Show a finished step and begin the next one if the handles have moved on."""
+        prepared = self._prepared
+        if prepared is None:
+            return
+        self._take_step(prepared)
+        handles = pull.pose.handles
+        if prepared.problem.points != tuple(handle.point for handle in handles):
+            return
+        pulls = _pulls(pull)
+        solved = self._solved
+        is_done = solved is not None and solved.is_settled and np.array_equal(solved.pulls, pulls)
+        if self._stepping is not None or is_done:
+            return
+        self._stepping = self._stepper.submit(_solve, prepared.live, pulls)
+        wait_for([self._stepping], _PATIENCE_S)
+        if self._stepping.done():
+            self._take_step(prepared)
+            self._wake()
+        else:
+            self._stepping.add_done_callback(lambda _: self._wake())
+
+    def _take_step(self, prepared: _Prepared) -> None:
+        if self._stepping is None or not self._stepping.done():
+            return
+        future = self._stepping
+        self._stepping = None
+        self._solved = future.result()
+        write_offsets(prepared.edit, self._solved.offsets)
+        self._engine().touch(prepared.edit)
+        self._store.wake()
+
+    def _clear(self) -> None:
+        """Draw the scene without the pull."""
+        if self._stepping is not None:
+            wait_for([self._stepping])
+        base = self._base
+        if base is not None and base[0] is self._engine():
+            base[0].adopt(base[1], base[2])
+            work = self._store.get()
+            live = tuple(layer for layer in work.transient.live if layer.gdf < len(base[2]))
+            self._store.replace(with_transient(work, live=live))
+        self._forget()
+        self._store.wake()
+
+    def _forget(self) -> None:
+        """Forget the edit in progress, which is not drawn any more."""
+        self._base = self._prepared = self._solved = self._stepping = self._refused = None
+        pull = self._pull
+        if pull is not None and pull.edit is not None:
+            self._set(replace(pull, edit=None))
+
+    def _keep(self) -> None:
+        """Begin to make the layer in another thread."""
+        pull = self._pull
+        problem = None if pull is None else self._problem(pull)
+        if pull is None or problem is None or not any(any(handle.pull) for handle in pull.pose.handles):
+            self._leave()
+            return
+        document = self._documents.get()
+        folder = edits_folder(document.file)
+        make_folder(folder)
+        name = document.free_name(_NAME)
+        path = free_path(folder, name, ".gdf")
+        original = document.original
+        future = self._builder.submit(_make_layer, self._bases, problem, pull.pose, original, name, path)
+        future.add_done_callback(lambda _: self._wake())
+        self._keeping = path, name, pull, future
+        self._set(None)
+        self._messages.show(f"Making {name} …")
+
+    def _finish_keeping(self) -> None:
+        """Add a finished layer in place of the edit in progress."""
+        if self._keeping is None or not self._keeping[3].done():
+            return
+        path, name, pull, future = self._keeping
+        self._keeping = None
+        if future.exception() is not None:
+            self._set(pull)
+        else:
+            self._clear()
+        future.result()  # raises its error
+        self._edits.add(path, name, deselect=True)
+        self._messages.show(f"{name} is ready; drag its slider")
+
+
+def _pulls(pull: Pull) -> NDArray[np.float64]:
+    """Return the displacements of the handles. [H,3]"""
+    return np.array([handle.pull for handle in pull.pose.handles], np.float64).reshape(-1, 3)
+
+
+def _stack(problem: _Problem) -> list[Layer]:
+    return [
+        layer_of(problem.gdfs[layer.gdf], layer.strength, layer.gains, layer.paint)
+        for layer in problem.layers
+    ]
+
+
+@one_thread()
+def _prepare(bases: _Bases, problem: _Problem, pulls: NDArray[np.float64], count: int) -> _Prepared:
+    """Build the graph, the edit in progress near its first pose, and its composer.
+
+    Args:
+        bases: cache of the scene under the layers
+        problem: what is pulled
+        pulls: displacements of the handles. [H,3]
+        count: number of the scene's own Gaussians
+
+    Raises:
+        ProgdfError: a handle is held, or is not on the part.
+    """
+    scene = bases.scene(problem, count)
+    handles, hold = _handles(bases, problem, scene, PullPose())
+    live = LivePull(scene, handles, hold)
+    first = live.step(pulls, _FIRST_ROUNDS)
+    drawn = problem.engine.scene
+    edit = edit_in_progress(drawn, live.members, live.channels, _NAME)
+
+    write_offsets(edit, first.offsets)
+
+    def covers(scene: Gaussians, gdf: Gdf) -> dict[str, torch.Tensor]:
+        covered = dict(coverage(scene, gdf))
+        if gdf.field is edit.field:  # it adds to the layers below, and hides nothing of them
+            covered = {kind: torch.zeros_like(values) for kind, values in covered.items()}
+        return covered
+
+    composer = Composer(drawn, (*problem.gdfs, edit), covers)
+    composer.update(_stack(problem), problem.blend)
+    return _Prepared(problem, live, edit, composer)
+
+
+@one_thread()
+def _solve(live: LivePull, pulls: NDArray[np.float64]) -> LiveStep:
+    return live.step(pulls, _ROUNDS)
+
+
+@one_thread()
+def _make_layer(
+    bases: _Bases, problem: _Problem, pose: PullPose, original: Gaussians, name: str, path: Path
+) -> None:
+    """Solve the whole course and write it as an edit, as `progdf edit --pull` does."""
+    scene = bases.scene(problem, len(original))
+    handles, hold = _handles(bases, problem, scene, pose)
+    course = pull(scene, handles, hold)
+    save_gdf(path, tidy(original, [Step("pull", course.region, course=course)], name, "pull"))
+
+
+def _handles(
+    bases: _Bases, problem: _Problem, scene: Gaussians, pose: PullPose
+) -> tuple[list[Handle], Region | None]:
+    """Return the handles and the held region of a problem.
+
+    Args:
+        pose: displacements of the handles; without handles, all are 0
+    """
+    count = len(scene)
+    mask = np.ones(count, bool)
+    if problem.limit != selection.EMPTY_MASK:
+        mask = _own(problem.limit, problem, count)
+    if problem.hidden != selection.EMPTY_MASK:
+        mask &= ~_own(problem.hidden, problem, count)
+    if not mask.any():
+        raise ProgdfError("the selection has no Gaussian of the scene; select a part, or nothing")
+    means = scene.means.double().numpy()
+    allowed = np.flatnonzero(mask)
+    tree = PointTree(means[allowed], _PIN_GAUSSIANS)
+    region = from_mask(_NAME, torch.from_numpy(mask))
+    if problem.radius is None:
+        nearest = allowed[tree.query(np.array(problem.points), 1)[1][:, 0]]
+        region = bases.connected_part(scene, mask, nearest)
+    pulls = [handle.pull for handle in pose.handles] or [(0.0, 0.0, 0.0)] * len(problem.points)
+    handles = [
+        Handle(region, point, pull, problem.radius) for point, pull in zip(problem.points, pulls, strict=True)
+    ]
+    held = np.zeros(count, bool)
+    if problem.held != selection.EMPTY_MASK:
+        held |= _own(problem.held, problem, count)
+    if problem.pins:
+        near = tree.query(np.array(problem.pins), min(_PIN_GAUSSIANS, len(allowed)))[1]
+        held[allowed[near.ravel()]] = True
+    hold = from_mask("held", torch.from_numpy(held)) if held.any() else None
+    return handles, hold
+
+
+def _own(packed: bytes, problem: _Problem, count: int) -> NDArray[np.bool_]:
+    """Return a packed mask for the scene's own Gaussians. [N]"""
+    own: NDArray[np.bool_] = selection.unpack(packed, len(problem.engine.scene))[:count].copy()
+    return own
