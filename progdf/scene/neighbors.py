@@ -1,18 +1,21 @@
-"""Selection tools based on nearest neighbors: grow, shrink, smooth, refine, and connected parts."""
+"""Selection tools based on nearest neighbors: grow, shrink, smooth, refine, connected parts and cells."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from progdf.gaussians import Gaussians
 
+from .bounds import quantile
 from .point_tree import PointTree
 from .scribbles import Scribbles
 from .selection import Floats, Mask, alike_in_color, base_colors
@@ -25,6 +28,11 @@ _MAX_NEIGHBOR_DISTANCE = (
 )
 _TOUCH_FACTOR = 1.0  # two Gaussians touch within this many times the sum of their longest standard deviations
 RIM_PERCENT = 35  # default width of the uncertain band outside a selection, % of its radius
+_SPACING_SAMPLE = 2_000  # places whose neighbors are searched
+_SPACING_NEIGHBORS = 4  # neighbors within the spacing of a place
+_SPACING_QUANTILE = 0.9  # share of the places that have so many
+_CELLS_ACROSS = 32  # cells of space along the longest side of an object
+_CELL_SPAN = 2 * _CELLS_ACROSS + 2  # cells along each side of the grid, with half an object on both sides
 _CORE_DEPTH_SHARE = 0.6  # share of the depth at `_DEPTH_QUANTILE`; members that lie deeper stay selected
 _DEPTH_QUANTILE = 0.95  # quantile of the members' depths, at most the width of the band; small in thin parts
 
@@ -220,3 +228,66 @@ def nearest_rows(points: Tensor, rows: Tensor, k: int, workers: int = 1) -> tupl
         torch.from_numpy(neighbors[others].reshape(len(rows), k)),
         torch.from_numpy(distances[others].reshape(len(rows), k)),
     )
+
+
+def typical_spacing(places: Tensor) -> float:
+    """Return the distance within which most places have a few neighbors. [R,3], at least two"""
+    rows = torch.linspace(0, len(places) - 1, min(len(places), _SPACING_SAMPLE)).long()
+    _, distances = nearest_rows(places, rows, _SPACING_NEIGHBORS)
+    return float(distances[:, -1].quantile(_SPACING_QUANTILE))
+
+
+@dataclass(frozen=True)
+class CellGrid:
+    """Cells of space in and around an object."""
+
+    low: Tensor  # corner of the object. [3]
+    side: float  # size of a cell
+
+    @classmethod
+    def around(cls, places: Tensor, spacing: float = 0.0) -> CellGrid:
+        """Return cells that are a share of an object's extent, and not smaller than a spacing. [R,3]"""
+        low, high = (torch.stack([quantile(c, q) for c in places.unbind(1)]) for q in (0.01, 0.99))
+        side = float((high - low).amax().clamp_min(1e-9)) / _CELLS_ACROSS
+        return cls(low, max(side, spacing))
+
+    def find_objects(self, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the connected objects of places; cells that touch, corners included, are one object. [R,3]
+
+        Returns:
+            Occupied cells, ascending, [B], the cell of each place [R], and the object of each cell [B].
+        """
+        cells, cell_of_place = torch.unique(self._keys(places), return_inverse=True)
+        steps = torch.tensor([-1, 0, 1])
+        touching = ((steps[:, None, None] * _CELL_SPAN + steps[:, None]) * _CELL_SPAN + steps).flatten()
+        around = cells[:, None] + touching
+        found = torch.searchsorted(cells, around).clamp_max(len(cells) - 1)
+        cell, neighbor = (cells[found] == around).nonzero(as_tuple=True)
+        objects = join_pairs(cell.numpy(), found[cell, neighbor].numpy(), len(cells))
+        return cells, cell_of_place, torch.from_numpy(objects)
+
+    def outside(self, places: Tensor, object_places: Tensor) -> Mask:
+        """Return the places outside an object that no cell of it touches. [N,3], [R,3] -> [N]
+
+        A cell is outside unless cells of the object lie on both sides of it along two of the three axes.
+        """
+        occupied = np.zeros((_CELL_SPAN,) * 3, bool)
+        occupied.ravel()[self._keys(object_places).numpy()] = True
+        touched = binary_dilation(occupied, np.ones((3, 3, 3)))
+        axes_inside = np.sum([_between(touched, axis) for axis in range(3)], axis=0)
+        outside: Mask = (axes_inside < 2).ravel()[self._keys(places).numpy()]
+        return outside
+
+    def _keys(self, places: Tensor) -> Tensor:
+        """Return the key of each place's cell; places far outside share the cells at the border. [R]"""
+        cells = (places - self.low) / self.side + 0.5 * _CELLS_ACROSS
+        cells = cells.clamp(0, _CELL_SPAN - 3).long() + 1
+        return (cells[:, 0] * _CELL_SPAN + cells[:, 1]) * _CELL_SPAN + cells[:, 2]
+
+
+def _between(occupied: Mask, axis: int) -> Mask:
+    """Return the cells with an occupied cell on both sides along an axis. [C,C,C]"""
+    before = np.logical_or.accumulate(occupied, axis)
+    after = np.flip(np.logical_or.accumulate(np.flip(occupied, axis), axis), axis)
+    between: Mask = before & after
+    return between

@@ -25,7 +25,7 @@ from progdf.rasterize import alpha_weights
 from progdf.terminal import format_count
 
 from .bounds import front_direction, has_ceiling, has_long_tail, quantile
-from .neighbors import Neighborhood, join_pairs
+from .neighbors import CellGrid, Neighborhood, typical_spacing
 from .point_tree import PointTree
 from .scribbles import Rows
 from .selection import Mask
@@ -51,7 +51,6 @@ _OCCLUSION_SAMPLE = 8_000  # Gaussians that are tested for occlusion
 _MIN_CLEARANCE = 0.2  # smallest distance of the eye to any Gaussian in a room, in half widths of the room
 _MIN_VISIBILITY_RATIO = 1.5  # a first picture leaves the front if another side shows this many times as much
 
-_CELLS_ACROSS = 32  # cells of space along the longest side of the scene
 # Share of the largest object's cells; smaller objects are tufts or strays. The toy robot's hands fill 0.11 of
 # its body's, the largest tuft of its ground 0.03.
 _MIN_OBJECT_SHARE = 0.06
@@ -175,8 +174,8 @@ def select_subject(scene: Gaussians, neighborhood: Neighborhood, camera: Camera,
     3. Hovering parts: parts that touch neither join the object if they are nearer to it than to the
        background, and at most its radius away.
 
-    Without a ground the whole scene is the object. If such a scene has a far background, the walk starts from
-    the middle and from the border of the view.
+    Without a ground, the object is the connected group of solid Gaussians in the middle of the view. If such
+    a scene has a far background, the walk starts from the middle and from the border of the view.
 
     Args:
         scene: N Gaussians as they are drawn
@@ -211,8 +210,7 @@ def select_subject(scene: Gaussians, neighborhood: Neighborhood, camera: Camera,
         beside = np.setdiff1d(np.union1d(beside, np.setdiff1d(solid, near)), on)
         reason = "no ground, but a far background"
     else:
-        on = solid
-        beside = np.zeros(0, np.int64)
+        on, beside = _object_and_floaters(scene, solid, in_middle)
         reason = "no ground and no background"
     share = float(in_middle[on].sum() / middle.sum())
     if share < _MIN_MIDDLE_SHARE:
@@ -265,7 +263,9 @@ def _object_on_ground(
     reason = "on a ground"
     for supports in range(_MAX_SUPPORTS + 1):
         height, plan = _heights_and_plan(scene.means[standing], up)
-        groups = _object_of_rows(torch.cat([plan, height[:, None]], dim=1)).numpy()
+        places = torch.cat([plan, height[:, None]], dim=1)
+        _, cell_of_row, objects = CellGrid.around(places).find_objects(places)
+        groups = objects[cell_of_row].numpy()
         standing = standing[groups == np.bincount(groups, in_middle[standing]).argmax()]
         if supports == _MAX_SUPPORTS or len(standing) < _MIN_GAUSSIANS:
             break
@@ -279,6 +279,28 @@ def _object_on_ground(
         standing = standing[parts[0].numpy()]
         reason = f"on {format_count(supports + 1, 'support')} on a ground"
     return standing, beside, reason
+
+
+def _object_and_floaters(scene: Gaussians, solid: Rows, in_middle: NDArray[np.floating]) -> tuple[Rows, Rows]:
+    """Return the solid rows of the object in the middle of a view, and the rows apart from it.
+
+    Rows apart are solid rows of other objects, and haze in cells of space that no solid row touches.
+
+    Args:
+        scene: N Gaussians, without a ground and a far background
+        solid: solid rows
+        in_middle: visible weight of each Gaussian in the middle of the view. [N]
+    """
+    places = scene.means[solid]
+    if len(solid) < _MIN_GAUSSIANS:
+        return solid, np.zeros(0, np.int64)
+    grid = CellGrid.around(places, typical_spacing(places))
+    _, cell_of_row, objects = grid.find_objects(places)
+    groups = objects[cell_of_row].numpy()
+    is_object = groups == np.bincount(groups, in_middle[solid]).argmax()
+    on = solid[is_object]
+    outside = np.flatnonzero(grid.outside(scene.means, scene.means[on]))
+    return on, np.union1d(solid[~is_object], outside)
 
 
 def _split_support(height: Tensor, plan: Tensor) -> tuple[Tensor, Tensor] | None:
@@ -567,31 +589,6 @@ def _monomials(plan: Tensor) -> Tensor:
 
 def _rows_of_large_objects(places: Tensor) -> Tensor:
     """Return the rows of large connected objects. [R,3] -> [R] bool, at least one"""
-    boxes, box, objects = _cells_of_space(places)
+    boxes, box, objects = CellGrid.around(places).find_objects(places)
     size = torch.zeros(len(boxes)).index_add(0, objects, torch.ones(len(boxes)))
     return (size[objects] >= _MIN_OBJECT_SHARE * size.max())[box]
-
-
-def _object_of_rows(places: Tensor) -> Tensor:
-    """Return the connected object of each row. [R,3] -> [R] int64"""
-    _, box, objects = _cells_of_space(places)
-    return objects[box]
-
-
-def _cells_of_space(places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the occupied cells [B], the cell of each row [R] and the connected object of each cell [B]."""
-    low, high = (torch.stack([quantile(c, q) for c in places.unbind(1)]) for q in (0.01, 0.99))
-    side = float((high - low).amax().clamp_min(1e-9)) / _CELLS_ACROSS
-    span = 2 * _CELLS_ACROSS + 2
-    keys = ((places - low) / side + 0.5 * _CELLS_ACROSS).clamp(0, span - 3).long() + 1
-    boxes, box = torch.unique((keys[:, 0] * span + keys[:, 1]) * span + keys[:, 2], return_inverse=True)
-    return boxes, box, _connected_cells(boxes, span)
-
-
-def _connected_cells(boxes: Tensor, span: int) -> Tensor:
-    """Return each cell's object; cells that touch, corners included, are one. [B] ascending -> [B]"""
-    steps = torch.tensor([-1, 0, 1])
-    around = boxes[:, None] + ((steps[:, None, None] * span + steps[:, None]) * span + steps).flatten()
-    box = torch.searchsorted(boxes, around).clamp_max(len(boxes) - 1)
-    cell, side = (boxes[box] == around).nonzero(as_tuple=True)
-    return torch.from_numpy(join_pairs(cell.numpy(), box[cell, side].numpy(), len(boxes)))

@@ -14,7 +14,7 @@ from progdf.camera import Camera, intrinsics, look_at
 from progdf.demo_scenes.bear import bear
 from progdf.demo_scenes.room import room
 from progdf.errors import ProgdfError
-from progdf.gaussians import Gaussians
+from progdf.gaussians import Gaussians, concatenate
 from progdf.scene.neighbors import Neighborhood
 from progdf.scene.regions import check_region, parse_region
 from progdf.scene.subject import first_view, select_subject
@@ -133,3 +133,28 @@ def test_region_language_knows_the_subject() -> None:
     chosen = parse_region("subject", scene).mask.numpy()
     assert overlap(chosen, truth > 0) > 0.4
     assert not chosen[truth == 0].mean() > 0.05
+
+
+def test_haze_around_an_object_without_a_ground_is_not_selected() -> None:
+    scene, labels = balls_on_a_floor()
+    ball = scene[torch.from_numpy(labels == 1)]
+    around = 3.0 * torch.nn.functional.normalize(
+        torch.randn(len(ball), 3, generator=torch.manual_seed(1)), dim=1
+    )
+    inside = ball.means.mean(dim=0) + 0.05 * around
+    haze = replace(ball, means=around, logit_opacities=torch.full((len(ball),), -3.0))
+    core = replace(haze, means=inside)
+    whole = concatenate([ball, haze, core])
+    selected = select_subject(whole, Neighborhood(whole), view_of((-1.0, 0.5, 0.0), (-1.0, 1.2, 4.0)), UP)
+    assert selected[: len(ball)].all()
+    assert not selected[len(ball) : 2 * len(ball)].any()
+    assert selected[2 * len(ball) :].all()
+
+
+@pytest.mark.parametrize(("x", "label"), [(-1.0, 1), (1.2, 2)])
+def test_middle_of_the_view_chooses_between_objects_without_a_ground(x: float, label: int) -> None:
+    scene, labels = balls_on_a_floor()
+    rows = np.isin(labels, [1, 2])
+    balls = scene[torch.from_numpy(rows)]
+    selected = select_subject(balls, Neighborhood(balls), view_of((x, 0.5, 0.0), (x, 1.2, 4.0)), UP)
+    np.testing.assert_array_equal(selected, labels[rows] == label)
