@@ -30,6 +30,7 @@ from progdf.field.separable import OPACITY_KNOTS
 from progdf.gaussians import Gaussians
 from progdf.rasterize.engines import ALPHA_MIN, alpha_weights, bare_weight, render
 from progdf.scene.bounds import near_plane, scene_sphere
+from progdf.threads import map_threads, stream_threads
 
 _MIN_TRANSMITTANCE = 1e-3  # keeps the course of a hidden Gaussian finite
 _PROBE_OPACITY = 1.5 * ALPHA_MIN  # opacity at which a Gaussian that appears is drawn, but hides little
@@ -145,10 +146,14 @@ def front_transmittance(gaussians: Gaussians, cameras: Sequence[Camera]) -> Tens
     """
     bare = bare_weight(gaussians.opacities)
     best = torch.full((len(gaussians),), -1.0)
-    for camera in cameras:
+
+    def look(camera: Camera) -> Tensor:
         weights = alpha_weights(gaussians, camera, torch.ones(camera.height, camera.width))
         mean = (weights[:, 2] / weights[:, 3].clamp_min(1.0)).float()
-        best = torch.maximum(best, torch.where(weights[:, 3] > 0, mean / bare, -1.0))
+        return torch.where(weights[:, 3] > 0, mean / bare, -1.0)
+
+    for transmittance in stream_threads(look, cameras):
+        best = torch.maximum(best, transmittance)
     return torch.where(best < 0.0, 1.0, best).clamp(_MIN_TRANSMITTANCE, 1.0)
 
 
@@ -175,11 +180,12 @@ def _transmittances(group: Gaussians, end: Tensor, cameras: Sequence[Camera]) ->
 
 def _draw(gaussians: Gaussians, cameras: Sequence[Camera]) -> Tensor:
     """Return the pixels of all views, on black and on white. [P]"""
-    pictures = []
-    for camera in cameras:
+
+    def draw(camera: Camera) -> Tensor:
         with torch.no_grad():
             drawn = render(gaussians, camera, (0.0, 0.0, 0.0))
         on_black = drawn.image.clamp(0.0, 1.0)
         on_white = (drawn.image + drawn.transmittance[..., None]).clamp(0.0, 1.0)
-        pictures += [on_black.flatten(), on_white.flatten()]
-    return torch.cat(pictures)
+        return torch.cat([on_black.flatten(), on_white.flatten()])
+
+    return torch.cat(map_threads(draw, cameras))

@@ -23,6 +23,8 @@ _T = TypeVar("_T")
 MAX_THREADS = torch.get_num_threads()
 """Initial number of threads of torch."""
 
+_ITEMS_PER_THREAD = 2  # items of `stream_threads` that are computed together, per thread
+
 _thread_count: int | None = None
 _local = threading.local()
 
@@ -124,6 +126,13 @@ def run_chunks(kernel: Callable[[int], _T], chunks: int) -> list[_T]:
 def map_threads(work: Callable[[_A], _T], items: Sequence[_A]) -> list[_T]:
     """Return `work(item)` of every item, on the threads of the cpu engine; bit-identical for any number."""
     return run_chunks(lambda index: work(items[index]), len(items))
+
+
+def stream_threads(work: Callable[[_A], _T], items: Sequence[_A]) -> Iterator[_T]:
+    """Yield the results of `map_threads` in order, a few at a time, for results too large to keep all."""
+    count = _ITEMS_PER_THREAD * threads()
+    for start in range(0, len(items), count):
+        yield from map_threads(work, items[start : start + count])
 
 
 @cache

@@ -37,6 +37,10 @@ REACH_PX = 4.0
 MAX_SIDE_PX = 448
 """Largest longer side of the texture, pixels; it limits the inpainting to some seconds."""
 
+RING_SHARE = 0.25
+"""Width of the ring around a hole that decides its plane, as a share of the root of the hole's area."""
+
+_MIN_RING_PX = 4  # smallest width of this ring, pixels
 _MIN_SIDE_PX = 96  # smallest longer side of the texture, pixels
 _DISTANCE_SIDES = 2.0  # camera distance, as a multiple of the longer side; far, for a weak perspective
 _OPAQUE_SHARE = 0.5  # alpha of a pixel of the ground, as a share of the typical alpha around the hole
@@ -125,7 +129,7 @@ def straight_camera(
         The camera, and the points in world coordinates [P,3] float64; None without enough samples.
     """
     mask = hole.numpy()
-    width_px = max(4, round(0.25 * float(mask.sum()) ** 0.5))
+    width_px = max(_MIN_RING_PX, round(RING_SHARE * float(mask.sum()) ** 0.5))
     ring = ndimage.binary_dilation(mask, iterations=width_px)
     samples = _image_samples(camera, inverse_depth.double().numpy(), ring)
     if len(samples) < MIN_SAMPLES:

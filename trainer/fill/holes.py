@@ -15,26 +15,38 @@ If the ground around a hole has visible texture, the texture continues (`trainer
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy import ndimage
 from torch import Tensor
 
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians, concatenate
 from progdf.quaternions import matrix_quats
-from progdf.rasterize.engines import render_depth
+from progdf.rasterize.engines import render, render_depth
 from progdf.region import Region
 from progdf.sh import rgb_to_sh0, sh0_to_rgb
+from progdf.threads import map_threads
 from trainer.paint.discs import cover_pixels
 from trainer.paint.solve import ExpectedView, solve_colors
-from trainer.views.view import BACKGROUND, View, render_colors, render_view, seen_colors
+from trainer.views.view import (
+    BACKGROUND,
+    View,
+    crop,
+    region_box,
+    render_colors,
+    render_view,
+    seen_colors,
+)
 
-from .ground import REACH_PX, Ground, view_ground
+from .ground import REACH_PX, RING_SHARE, Ground, view_ground
 from .membrane import membrane
 from .texture import (
     VISIBLE_CONTRAST,
@@ -68,13 +80,22 @@ class Hole:
 
     camera: Camera
     mask: Tensor  # [H,W] bool
-    inverse_depth: Tensor  # 1 / camera z, inside the mask. [H,W]
-    colors: Tensor  # rgb, 0 to 1. [H,W,3]
+    inverse_depth: Tensor  # 1 / camera z, inside the mask and around it; 0 elsewhere. [H,W]
 
     @property
     def pixels(self) -> int:
         """Number of pixels."""
         return int(self.mask.sum())
+
+
+@dataclass(frozen=True)
+class OpenHoles:
+    """Holes that a removal opens, before they are filled."""
+
+    rest: Gaussians  # the remaining scene
+    views: Sequence[View]  # views of the original with the removed region's mask
+    seen: Sequence[Front]  # depth of these views before the removal
+    holes: Sequence[Hole]  # hole in each view
 
 
 @dataclass(frozen=True)
@@ -88,35 +109,46 @@ class Fill:
     notes: tuple[str, ...] = ()  # lines for the log
 
 
-def fill_holes(
-    scene: Gaussians,
-    rest: Gaussians,
-    views: Sequence[View],
-    pictures: Mapping[str, Tensor] | None = None,
-    close: bool = True,
-    is_textured: bool = False,
-    depths: Sequence[Tensor] | None = None,
-) -> Fill:
-    """Close the holes of a removal.
+def find_holes(
+    scene: Gaussians, rest: Gaussians, views: Sequence[View], depths: Sequence[Tensor] | None = None
+) -> OpenHoles:
+    """Find the holes that a removal opens.
 
     Args:
         scene: the original
         rest: the remaining scene
         views: views of the original with the removed region's mask; only areas hidden in all of them are
-            filled
+            holes
+        depths: `visible_depth` of the scene in each view; None computes it. [H,W] each
+    """
+    if not len(rest):
+        return OpenHoles(rest, (), (), ())
+    if depths is None:
+        depths = map_threads(lambda view: visible_depth(scene, view.camera), views)
+    seen = [(view.camera, depth, view.mask > 0.5) for view, depth in zip(views, depths, strict=True)]
+    return OpenHoles(rest, views, seen, map_threads(lambda view: find_hole(rest, view, seen), views))
+
+
+def fill_holes(
+    opened: OpenHoles,
+    pictures: Mapping[str, Tensor] | None = None,
+    close: bool = True,
+    is_textured: bool = False,
+) -> Fill:
+    """Close the holes of a removal.
+
+    Args:
+        opened: the holes
         pictures: by view name, pictures of the finished edit, whose colors the discs take instead of those of
             the boundary. [H,W,3]
         close: False only counts the holes
         is_textured: continue the texture of the ground if it is visible
-        depths: `visible_depth` of the scene in each view; None computes it. [H,W] each
     """
     picture_colors = pictures or {}
-    if depths is None:
-        depths = [visible_depth(scene, view.camera) for view in views]
-    seen = [(view.camera, depth, view.mask > 0.5) for view, depth in zip(views, depths, strict=True)]
-    holes = [find_hole(rest, view, seen) for view in views]
+    views = opened.views
+    holes = list(opened.holes)
     before = sum(hole.pixels for hole in holes)
-    filled = rest
+    filled = opened.rest
     discs = list[Gaussians]()
     notes = list[str]()
     min_pixels = [_MIN_HOLE_SHARE * float((view.mask > _MIN_REGION_WEIGHT).sum()) for view in views]
@@ -125,20 +157,10 @@ def fill_holes(
         # views with a given picture come first, as their colors are known
         best = max(open_views, key=lambda i: (views[i].camera.name in picture_colors, holes[i].pixels, -i))
         picture = picture_colors.get(views[best].camera.name)
-        attempts = list[Gaussians]()
-        if is_textured and picture is None:
-            textured, note = _textured_discs(filled, holes[best], seen)
-            if note:
-                notes.append(note)
-            if textured is not None:
-                attempts.append(textured)
-        colors = holes[best].colors if picture is None else picture
-        attempts.append(place_discs(holes[best], rest, colors))
         open_views.discard(best)
-        for rows in attempts:
+        for rows in _discs_for(opened, filled, holes[best], picture, is_textured, notes):
             trial = concatenate([filled, rows])
-            pairs = zip(views, holes, strict=True)
-            closed = [find_hole(trial, view, seen) if old.pixels else old for view, old in pairs]
+            closed = _holes_with(trial, opened, holes)
             gain = sum(hole.pixels for hole in holes) - sum(hole.pixels for hole in closed)
             # discs off the surface open as many pixels in other views as they close
             if 2 * gain > holes[best].pixels:
@@ -149,6 +171,51 @@ def fill_holes(
                 break
     after = sum(hole.pixels for hole in holes)
     return Fill(concatenate(discs) if discs else None, len(discs), before, after, tuple(notes))
+
+
+def _holes_with(trial: Gaussians, opened: OpenHoles, holes: Sequence[Hole]) -> list[Hole]:
+    """Return the holes that remain with added discs; views without a hole have none.
+
+    Args:
+        trial: the remaining scene with the discs
+        opened: the holes before
+        holes: the holes of the last accepted discs
+    """
+
+    def look(index: int) -> Hole:
+        if not holes[index].pixels:
+            return holes[index]
+        return find_hole(trial, opened.views[index], opened.seen)
+
+    return map_threads(look, range(len(holes)))
+
+
+def _discs_for(
+    opened: OpenHoles,
+    filled: Gaussians,
+    hole: Hole,
+    picture: Tensor | None,
+    is_textured: bool,
+    notes: list[str],
+) -> Iterator[Gaussians]:
+    """Yield discs that fill a hole, the best first: with texture if requested and visible, then smooth ones.
+
+    Args:
+        opened: the holes
+        filled: the remaining scene with the discs so far
+        hole: the hole to fill
+        picture: colors of the view, which replace those of the boundary; None if not given. [H,W,3]
+        is_textured: continue the texture of the ground
+        notes: lines for the log, to which one is added
+    """
+    if is_textured and picture is None:
+        textured, note = _textured_discs(filled, hole, opened.seen)
+        if note:
+            notes.append(note)
+        if textured is not None:
+            yield textured
+    colors = continued_colors(opened.rest, hole) if picture is None else picture
+    yield place_discs(hole, opened.rest, colors)
 
 
 def _textured_discs(rest: Gaussians, hole: Hole, seen: Sequence[Front]) -> tuple[Gaussians | None, str]:
@@ -213,21 +280,39 @@ def find_hole(rest: Gaussians, view: View, seen: Sequence[Front]) -> Hole:
         seen: visible depth of all views before the removal
     """
     camera = view.camera
+    removed = view.mask > _MIN_REGION_WEIGHT
+    mask = torch.zeros_like(removed)
+    depth = torch.zeros_like(view.mask)
+    if not bool(removed.any()):
+        return Hole(camera, mask, depth)
+    # the boundary of a hole, and the ring around it in which `view_ground` fits a plane, lie inside the box
+    margin = 2 + math.ceil(RING_SHARE * float(removed.sum()) ** 0.5)
+    box = region_box(view.mask, margin, _MIN_REGION_WEIGHT)
+    x0, y0, x1, y1 = box
     z = (rest.means @ camera.viewmat[2, :3] + camera.viewmat[2, 3]).clamp_min(camera.near)
     inverse = torch.stack([1.0 / z, torch.ones_like(z), torch.zeros_like(z)], dim=1)
-    black = torch.zeros(3)
-    planes = render_colors(rest, inverse, camera, black)[..., :2]
-    known = torch.cat([planes, render_colors(rest, seen_colors(rest, camera), camera, black)], dim=2)
-    unknown = (view.mask > _MIN_REGION_WEIGHT) & (known[..., 1] < _OPAQUE)
-    if not bool(unknown.any()):
-        return Hole(camera, unknown, known[..., 0], known[..., 2:])
-    mask = _closed_pieces(unknown, known[..., 1])
-    surface = membrane(known, mask)
-    alpha = surface[..., 1].clamp_min(1e-6)[..., None]
-    inverse = (surface / alpha)[..., 0]
-    colors = (surface / alpha)[..., 2:].clamp(0.0, 1.0)
-    mask[mask.clone()] = _unseen(_unproject(camera, mask.nonzero(), inverse[mask]), seen, camera)
-    return Hole(camera, mask, inverse, colors)
+    known = render_colors(rest, inverse, camera, torch.zeros(3), box)[..., :2]
+    unknown = crop(removed, box) & (known[..., 1] < _OPAQUE)
+    closed = _closed_pieces(unknown, known[..., 1])
+    if not bool(closed.any()):
+        return Hole(camera, mask, depth)
+    surface = membrane(known, closed)
+    inside = surface[..., 0] / surface[..., 1].clamp_min(1e-6)
+    pixels = closed.nonzero() + torch.tensor([y0, x0])
+    closed[closed.clone()] = _unseen(_unproject(camera, pixels, inside[closed]), seen, camera)
+    mask[y0:y1, x0:x1] = closed
+    depth[y0:y1, x0:x1] = inside
+    return Hole(camera, mask, depth)
+
+
+def continued_colors(rest: Gaussians, hole: Hole) -> Tensor:
+    """Return the colors of a view, continued into a hole from its boundary. [H,W,3], 0 to 1"""
+    camera = hole.camera
+    with torch.no_grad():
+        drawn = render(rest, camera, (0.0, 0.0, 0.0), colors=seen_colors(rest, camera))
+    alpha = (1.0 - drawn.transmittance)[..., None]
+    surface = membrane(torch.cat([drawn.image, alpha], dim=2), hole.mask)
+    return (surface[..., :3] / surface[..., 3:].clamp_min(1e-6)).clamp(0.0, 1.0)
 
 
 def _closed_pieces(unknown: Tensor, alpha: Tensor) -> Tensor:
@@ -257,7 +342,7 @@ def place_discs(hole: Hole, like: Gaussians, colors: Tensor) -> Gaussians:
         like: scene that provides the number of SH bands and the origin
         colors: rgb, 0 to 1. [H,W,3]
     """
-    parts = _split_squares(hole.mask, colors)
+    parts = split_squares(hole.mask, colors)
     y, x, side = parts.double().unbind(1)
     camera = hole.camera
     middle = (parts[:, :2] + parts[:, 2:] // 2).long()
@@ -288,7 +373,7 @@ def place_discs(hole: Hole, like: Gaussians, colors: Tensor) -> Gaussians:
     scales = torch.stack([width, width / cosine, _THICKNESS * width], dim=1)
     rotation = camera.viewmat[:3, :3].double().T
     means = (rays * z[:, None] - camera.viewmat[:3, 3].double()) @ rotation.T
-    rgb = torch.stack([colors[r : r + s, c : c + s].mean(dim=(0, 1)) for r, c, s in parts.tolist()])
+    rgb = _square_means(parts, colors)
     count = len(parts)
     return Gaussians(
         means.float(),
@@ -302,25 +387,44 @@ def place_discs(hole: Hole, like: Gaussians, colors: Tensor) -> Gaussians:
     )
 
 
-def _split_squares(mask: Tensor, colors: Tensor) -> Tensor:
+def _square_means(parts: Tensor, colors: Tensor) -> Tensor:
+    """Return the mean color of each square, see `split_squares`. [P,3], [H,W,3] -> [P,3]"""
+    means = colors.new_zeros(len(parts), 3)
+    for length in _BLOCKS:
+        own = parts[:, 2] == length
+        steps = torch.arange(length)
+        rows = parts[own, 0, None, None] + steps[:, None]
+        columns = parts[own, 1, None, None] + steps
+        means[own] = colors[rows, columns].mean(dim=(1, 2))
+    return means
+
+
+def split_squares(mask: Tensor, colors: Tensor) -> Tensor:
     """Return squares that tile a mask, as large as colors and edge allow: first row, first column, side.
     [P,3]"""
     depth = ndimage.distance_transform_cdt(np.pad(mask.numpy(), 1), "chessboard")[1:-1, 1:-1]
     free = mask.numpy().copy()
-    image = colors.numpy()
     parts = []
     for side in _BLOCKS:
-        inner = depth > side // 2  # a large disc extends beyond its square but must stay inside the hole
-        for row in range(0, mask.shape[0] - side + 1, side):
-            for column in range(0, mask.shape[1] - side + 1, side):
-                part = slice(row, row + side), slice(column, column + side)
-                if free[part].all() and (
-                    side == 1
-                    or (inner[part].all() and np.ptp(image[part], axis=(0, 1)).max() <= _COLOR_TOLERANCE)
-                ):
-                    free[part] = False
-                    parts.append((row, column, side))
-    return torch.tensor(parts, dtype=torch.int64).reshape(-1, 3)
+        fits = _squares(free, side).all(axis=(2, 3))
+        if side > 1:
+            # a large disc extends beyond its square but must stay inside the hole
+            fits &= _squares(depth > side // 2, side).all(axis=(2, 3))
+            ranges = np.ptp(_squares(colors.numpy(), side), axis=(2, 3)).max(axis=2)
+            fits &= ranges <= _COLOR_TOLERANCE
+        found = np.argwhere(fits) * side
+        parts.append(np.column_stack([found, np.full(len(found), side)]))
+        taken = np.repeat(np.repeat(fits, side, axis=0), side, axis=1)
+        free[: taken.shape[0], : taken.shape[1]] &= ~taken
+    return torch.from_numpy(np.concatenate(parts).astype(np.int64))
+
+
+def _squares(values: NDArray[Any], side: int) -> NDArray[Any]:
+    """Return the whole squares of a grid. [H,W,...] -> [H//side,W//side,side,side,...]"""
+    rows = values.shape[0] // side
+    columns = values.shape[1] // side
+    cut = values[: rows * side, : columns * side]
+    return cut.reshape(rows, side, columns, side, *values.shape[2:]).swapaxes(1, 2)
 
 
 def region_weight(scene: Gaussians, region: Region, camera: Camera) -> Tensor:

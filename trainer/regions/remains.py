@@ -27,6 +27,7 @@ from progdf.rasterize.engines import render_depth
 from progdf.region import Region
 from progdf.scene.point_tree import PointTree
 from progdf.sh import sh0_to_rgb
+from progdf.threads import map_threads, stream_threads
 from trainer.views.view import View, render_view
 
 _REGION_WEIGHT = (
@@ -63,12 +64,15 @@ def find_remains(scene: Gaussians, region: Region, views: Sequence[View]) -> Rem
     inside = torch.zeros(len(rest), dtype=torch.float64)
     after = torch.zeros(len(rest), dtype=torch.float64)
     before = torch.zeros(len(rest), dtype=torch.float64)
-    for view in views:
+
+    def weigh(view: View) -> tuple[Tensor, Tensor]:
         mask = grown_mask(view)
-        weights = alpha_weights(rest, view.camera, mask)
+        return alpha_weights(rest, view.camera, mask), alpha_weights(scene, view.camera, mask)[remaining, 2]
+
+    for weights, original in stream_threads(weigh, views):
         inside += weights[:, 0]
         after += weights[:, 2]
-        before += alpha_weights(scene, view.camera, mask)[remaining, 2]
+        before += original
     is_candidate = (after > 0) & (inside >= _MIN_INSIDE * after)
     candidates = remaining[is_candidate]
     anchors = remaining[(after > 0) & ~is_candidate]
@@ -93,10 +97,9 @@ def remaining_share(scene: Gaussians, removed: Gaussians, views: Sequence[View])
         removed: the scene after the removal
         views: views of the original with the region's mask
     """
-    pixels = 0
-    left = 0
     background = torch.ones(3)
-    for view in views:
+
+    def count(view: View) -> tuple[int, int]:
         shown = view.mask > _OPAQUE
         before = render_depth(scene, view.camera).depth
         after = render_depth(removed, view.camera)
@@ -104,9 +107,10 @@ def remaining_share(scene: Gaussians, removed: Gaussians, views: Sequence[View])
         stands = (after.alpha > _OPAQUE) & (after.depth <= reach * before)
         image = render_view(removed, view.camera, background).clamp(0.0, 1.0)
         is_same = (image - view.image).abs().amax(dim=2) < _COLOR_TOLERANCE
-        pixels += int(shown.sum())
-        left += int((shown & stands & is_same).sum())
-    return left / max(1, pixels)
+        return int(shown.sum()), int((shown & stands & is_same).sum())
+
+    counts = map_threads(count, views)
+    return sum(left for _, left in counts) / max(1, sum(pixels for pixels, _ in counts))
 
 
 def _join(scene: Gaussians, candidates: Tensor, members: Tensor, anchors: Tensor) -> Tensor:

@@ -24,10 +24,11 @@ from progdf.metrics.slider import visible_change
 from progdf.region import Region, from_mask
 from progdf.scene.strays import with_strays
 from progdf.terminal import format_count
+from progdf.threads import map_threads
 from progdf.tidy import Step, tidy
 from trainer.editors import editor_row
 from trainer.editors.pictures import picture_background, read_edit, strengths_of
-from trainer.fill.holes import Fill, fill_holes, region_weight, visible_depth
+from trainer.fill.holes import Fill, OpenHoles, fill_holes, find_holes, region_weight, visible_depth
 from trainer.options import TrainOptions
 from trainer.regions.remains import find_remains, remaining_share
 from trainer.resolve import recorded_options
@@ -123,20 +124,20 @@ def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder
         kind = options.editor.fill or ("picture" if pictures else "surface")
         views = [*painted, *(view for view in around.train if view.camera.name not in pictures)]
         fill_pictures = pictures if kind == "picture" else None
-        depths = [visible_depth(scene, view.camera) for view in views]
-        is_filled = kind != "none"
-        close = partial(_attempt, scene, views=views, pictures=fill_pictures, close=is_filled, depths=depths)
-        removal = _remove_whole(scene, named, around.train, close, log)
+        depths = map_threads(lambda view: visible_depth(scene, view.camera), views)
+        close = partial(fill_holes, pictures=fill_pictures, close=kind != "none")
+        attempt = partial(_attempt, scene, views=views, depths=depths, close=close)
+        removal = _remove_whole(scene, named, around.train, attempt, log)
         advance(2, "")
         if kind == "surface" and removal.fill.rows is not None:
-            removal = close(removal.region, is_textured=True)
+            removal = replace(removal, fill=close(removal.opened, is_textured=True))
         advance(3, "")
         fill = removal.fill
         for note in fill.notes:
             log.say(note)
         removed = removal.scene
-        remains = remaining_share(scene, removed, around.views)
-        remains_of_named = remaining_share(scene, scene[~named.mask], around.views)
+        remains = remaining_share(scene, removed, around.judging)
+        remains_of_named = remaining_share(scene, scene[~named.mask], around.judging)
     rows_added = 0 if fill.rows is None else len(fill.rows)
     log.say(
         f"{100 * remains:.2f} % of the region's visible pixels still show its surface and color "
@@ -178,7 +179,8 @@ def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder
             "plan": to_json(recorded_options(options)),
         }
         picture = _contact_sheet(scene, gdf, judging, f"{options.name}: {options.editor.editor}")
-    finals = {view.camera.name: render_view(removed, view.camera, setup.background) for view in setup.views}
+    drawn = map_threads(lambda view: render_view(removed, view.camera, setup.background), setup.views)
+    finals = {view.camera.name: image for view, image in zip(setup.views, drawn, strict=True)}
     write_views(folder, "final", finals)
     folder.trajectory.unlink(missing_ok=True)  # left by an earlier run that recolored
     about = {name: report[name] for name in ("edit", "removal")}
@@ -199,18 +201,22 @@ class Removal:
     """Removed region and the scene that remains."""
 
     region: Region  # all removed Gaussians
+    opened: OpenHoles
     fill: Fill
-    scene: Gaussians  # the scene at strength 1, with filled holes
+
+    @property
+    def scene(self) -> Gaussians:
+        """The scene at strength 1, with filled holes."""
+        rest = self.opened.rest
+        return rest if self.fill.rows is None else concatenate([rest, self.fill.rows])
 
 
 def _attempt(
     scene: Gaussians,
     region: Region,
     views: Sequence[View],
-    pictures: Mapping[str, Tensor] | None,
-    close: bool,
     depths: Sequence[Tensor],
-    is_textured: bool = False,
+    close: Callable[[OpenHoles], Fill],
 ) -> Removal:
     """Remove a region and fill the holes.
 
@@ -218,16 +224,13 @@ def _attempt(
         scene: the original
         region: the Gaussians to remove
         views: views with any mask
-        pictures: see `fill_holes`
-        close: False only counts the holes
-        depths, is_textured: see `fill_holes`
+        depths: see `find_holes`
+        close: fills the holes
     """
-    rest = scene[~region.mask]
-    if not len(rest):
-        return Removal(region, Fill(None, 0, 0, 0), rest)
-    masked = [replace(view, mask=region_weight(scene, region, view.camera)) for view in views]
-    fill = fill_holes(scene, rest, masked, pictures, close, is_textured, depths)
-    return Removal(region, fill, rest if fill.rows is None else concatenate([rest, fill.rows]))
+    masks = map_threads(lambda view: region_weight(scene, region, view.camera), views)
+    masked = [replace(view, mask=mask) for view, mask in zip(views, masks, strict=True)]
+    opened = find_holes(scene, scene[~region.mask], masked, depths)
+    return Removal(region, opened, close(opened))
 
 
 def _remove_whole(

@@ -18,7 +18,7 @@ from progdf.region import from_mask
 from progdf.sh import rgb_to_sh0
 from trainer.fill import holes, texture
 from trainer.fill.ground import view_ground
-from trainer.fill.holes import Fill, fill_holes
+from trainer.fill.holes import Fill, fill_holes, find_holes
 from trainer.fill.membrane import membrane
 from trainer.fill.texture import (
     VISIBLE_CONTRAST,
@@ -178,7 +178,7 @@ def case(has_dots: bool) -> tuple[Gaussians, Gaussians, TrainingSetup]:
 @cache
 def textured_fill() -> Fill:
     scene, rest, setup = case(True)
-    return fill_holes(scene, rest, setup.train, is_textured=True)
+    return fill_holes(find_holes(scene, rest, setup.train), is_textured=True)
 
 
 def views_around() -> list[Camera]:
@@ -207,15 +207,15 @@ def test_dotted_cloth_continues_under_a_removed_block_from_all_sides() -> None:
     fill = textured_fill()
     assert fill.after < 0.05 * fill.before
     assert any("continued over" in note for note in fill.notes)
-    smooth = hole_error(fill_holes(scene, rest, setup.train).rows)
+    smooth = hole_error(fill_holes(find_holes(scene, rest, setup.train)).rows)
     textured = hole_error(fill.rows)
     assert min(new - old for new, old in zip(textured, smooth, strict=True)) > 1.5, (textured, smooth)
 
 
 def test_flat_cloth_is_filled_smoothly() -> None:
     scene, rest, setup = case(False)
-    fill = fill_holes(scene, rest, setup.train, is_textured=True)
-    smooth = fill_holes(scene, rest, setup.train)
+    fill = fill_holes(find_holes(scene, rest, setup.train), is_textured=True)
+    smooth = fill_holes(find_holes(scene, rest, setup.train))
     assert fill.rows is not None
     assert smooth.rows is not None
     assert torch.equal(fill.rows.means, smooth.rows.means)
@@ -225,8 +225,8 @@ def test_flat_cloth_is_filled_smoothly() -> None:
 def test_missing_extra_is_named_and_the_fill_is_smooth(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(holes, "can_continue_texture", lambda: False)
     scene, rest, setup = case(True)
-    fill = fill_holes(scene, rest, setup.train, is_textured=True)
-    smooth = fill_holes(scene, rest, setup.train)
+    fill = fill_holes(find_holes(scene, rest, setup.train), is_textured=True)
+    smooth = fill_holes(find_holes(scene, rest, setup.train))
     assert fill.rows is not None
     assert smooth.rows is not None
     assert torch.equal(fill.rows.sh0, smooth.rows.sh0)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 from torch import Tensor
 
 from progdf.compose.reference import Layer, compose_layers
@@ -27,7 +28,7 @@ from progdf.region import Region, from_mask
 from progdf.scene.strays import with_strays
 from progdf.sh import rgb_to_sh0
 from trainer.evaluate.command import evaluate
-from trainer.fill.holes import Hole, fill_holes, find_hole, place_discs
+from trainer.fill.holes import Hole, fill_holes, find_hole, find_holes, place_discs, split_squares
 from trainer.fill.membrane import membrane
 from trainer.options import (
     EditorOptions,
@@ -113,7 +114,7 @@ def test_membrane_continues_a_plane_and_is_flat_at_the_edge() -> None:
 
 def test_unseen_hole_is_closed_like_the_surface_around_it() -> None:
     scene, rest, setup = case()
-    fill = fill_holes(scene, rest, setup.train)
+    fill = fill_holes(find_holes(scene, rest, setup.train))
     assert fill.rows is not None
     assert fill.after < 0.05 * fill.before
     done = concatenate([rest, fill.rows])
@@ -147,19 +148,44 @@ def test_flat_parts_of_a_hole_need_few_rows(fine: bool) -> None:
     mask = torch.zeros(128, 128, dtype=torch.bool)
     mask[10:110, 10:110] = True
     colors = fine * torch.rand(128, 128, 3, generator=torch.Generator().manual_seed(1))
-    rows = place_discs(Hole(camera, mask, torch.full((128, 128), 0.5), colors), case()[1], colors)
+    rows = place_discs(Hole(camera, mask, torch.full((128, 128), 0.5)), case()[1], colors)
     drawn = render(rows, camera, (1.0, 1.0, 1.0))
     assert float(drawn.transmittance[mask].mean()) < 0.02
     assert len(rows) == 10_000 if fine else len(rows) < 1000
+
+
+def plain_split_squares(mask: Tensor, colors: Tensor) -> list[tuple[int, int, int]]:
+    depth = ndimage.distance_transform_cdt(np.pad(mask.numpy(), 1), "chessboard")[1:-1, 1:-1]
+    free = mask.numpy().copy()
+    parts = []
+    for side in (8, 4, 2, 1):
+        for row in range(0, mask.shape[0] - side + 1, side):
+            for column in range(0, mask.shape[1] - side + 1, side):
+                part = slice(row, row + side), slice(column, column + side)
+                is_inner = side == 1 or bool((depth[part] > side // 2).all())
+                is_even = side == 1 or float(np.ptp(colors.numpy()[part], axis=(0, 1)).max()) <= 2 / 255
+                if free[part].all() and is_inner and is_even:
+                    free[part] = False
+                    parts.append((row, column, side))
+    return parts
+
+
+def test_squares_of_a_hole_equal_those_of_plain_loops() -> None:
+    y, x = torch.meshgrid(torch.arange(53), torch.arange(46), indexing="ij")
+    mask = ((x - 24).square() + (y - 27).square() < 400) & ~((x > 30) & (y < 20))
+    colors = torch.where(
+        x[..., None] < 20, 0.5, torch.rand(53, 46, 3, generator=torch.Generator().manual_seed(2))
+    )
+    assert split_squares(mask, colors).tolist() == [list(part) for part in plain_split_squares(mask, colors)]
 
 
 def test_object_before_an_empty_background_leaves_no_hole() -> None:
     scene, rest, _ = case()
     region = from_mask("table", torch.arange(len(scene)) < len(rest))
     setup = make_training_setup(TrainingViewOptions(views=12, image_size=96), scene, region)
-    assert fill_holes(scene, post(), setup.train).rows is None
+    assert fill_holes(find_holes(scene, post(), setup.train)).rows is None
     solid, whole, around = case(-1.0)
-    assert fill_holes(solid, whole, around.train).rows is None  # no hole
+    assert fill_holes(find_holes(solid, whole, around.train)).rows is None  # no hole
 
 
 @pytest.fixture(scope="module")

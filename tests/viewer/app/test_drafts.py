@@ -328,7 +328,7 @@ def test_prompt_is_painted_on_request_and_the_edit_follows_it(
     turn(window)
     assert window.main_view.work.transient.cover.name == "Painted", "what was saved lies over the view"
     with_form(window, asks=1, model="a/tiny", anchor="")
-    assert "cannot follow a picture" in window.main_view.work.transient.preview.text
+    assert "follows no picture" in window.main_view.work.transient.preview.text
     assert not window.main_view.work.transient.preview.painted
     with_form(window, asks=1, model="", anchor=str(anchor))
     request(window, Plain("train"))

@@ -430,12 +430,12 @@ class PreviewActions:
             self._painted = None
             if kind == "instruct":
                 name = f"Anchor: {argument}"
-                text = "The edit will follow this picture"
+                text = "Training follows this picture; no estimate for prompts"
                 if answer.follows:
                     self._painted = self._sent, answer.pixels
                 else:
                     name = f"Example: {argument}"
-                    text = "Example only: this model cannot follow a picture"
+                    text = "Example only, as this model follows no picture; no estimate for prompts"
             texture = self._upload(answer.pixels)
             self._show(text, Cover(texture, self._sent.camera, self._sent.size, name))
             self._store.wake()
