@@ -136,7 +136,9 @@ def tidy(
         offsets[i, : len(members)] = _rows_at(scene, members, steps, bands, s) - rows if s else 0.0
         offsets[i, :, _OPACITY_COLUMN] = interpolate_at(opacity_knots, logits, s)
     field = course_field(knots, offsets)
-    gdf = Gdf(name, region, field, fingerprint(scene), instruction, added=added)
+    # a pull deforms what is seen, so changes by lower layers stay
+    adds = all(step.does == "pull" for step in steps)
+    gdf = Gdf(name, region, field, fingerprint(scene), instruction, added=added, adds=adds)
     added_count = 0 if added is None else len(added)
     if fill_count:
         gdf = anchor_added(gdf, scene, free=added_count - fill_count)

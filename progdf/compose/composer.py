@@ -173,7 +173,10 @@ class Composer:
 
         The offsets are float32, as an edit in progress has them.
         """
-        self._touched.add(self._edit_of(gdf))
+        edit = self._edit_of(gdf)
+        self._touched.add(edit)
+        if self._surface is not None:
+            self._surface.touch(edit, self._gdfs[edit])
 
     def update(self, layers: Sequence[Layer], blend: str = "normalized") -> Change:
         """Set `gaussians` to the scene under `layers`, equal to `compose_layers(scene, layers, blend)`.

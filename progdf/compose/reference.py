@@ -59,19 +59,22 @@ def coverage(scene: Gaussians, gdf: Gdf) -> Mapping[str, Tensor]:
     - "geometry": the largest of the movement / 0.05 of the region's size, the change of a log-scale / 0.4,
       and the rotation |Δq| / 0.4 |q|; floor 1
 
-    Coverage is not stored. It follows from the offsets at strength 1, and so is defined for every .gdf.
+    Coverage is not stored. It follows from the offsets at strength 1, and so is defined for every .gdf. An
+    edit that adds to lower ones (see `Gdf.adds`) hides nothing.
 
     Returns:
         Kind (see `layers.KINDS`) -> c, 0 to 1. A grade also has "map", see `map_share`. [M] float32
     """
     members = gdf.region.members
     field = gdf.field
+    moved = {KINDS[name] for name in field.attributes}
+    if gdf.adds:
+        return {kind: torch.zeros(len(members)) for kind in moved}
     sizes = {
         "color": (_color_change(field), _VISIBLE_COLOR),
         "opacity": (_opacity_change(scene, members, field), _VISIBLE_OPACITY),
         "geometry": (_shape_change(scene, members, field), 1.0),
     }
-    moved = {KINDS[name] for name in field.attributes}
     covered = {
         kind: _coverage_of_sizes(size, floor) for kind, (size, floor) in sizes.items() if kind in moved
     }

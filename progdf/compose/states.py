@@ -55,6 +55,9 @@ class StateComposer(Protocol):
     def update(self, layers: Sequence[Layer], blend: str = "normalized") -> Change:
         """Set `gaussians` to the scene under some layers."""
 
+    def touch(self, gdf: Gdf) -> None:
+        """Let the next update read the offsets of an edit again."""
+
     def shapes(self) -> Shapes:
         """Return the followed attributes of `gaussians`."""
 
@@ -98,6 +101,16 @@ class States:
         changed = self.followers.changed
         layers = [self._layer(edit, layer) for edit, layer in stack if len(changed[edit][0])]
         return self.composer.update(layers, blend).rows
+
+    def touch(self, edit: int, gdf: Gdf) -> None:
+        """Copy the offsets of an edit, which were written in place."""
+        at = torch.from_numpy(self.followers.changed[edit][1])
+        if not len(at):
+            return
+        part = self._gdfs[edit]
+        for name, bases in part.field.attributes.items():
+            bases.end_offset.copy_(gdf.field.attributes[name].end_offset[at])
+        self.composer.touch(part)
 
     def _layer(self, edit: int, layer: Layer) -> Layer:
         """Return a layer restricted to the states."""
@@ -163,6 +176,10 @@ class Surface:
         if edit not in self._dependents:
             self._dependents[edit] = self.followers.dependents(edit)
         return self._dependents[edit]
+
+    def touch(self, edit: int, gdf: Gdf) -> None:
+        """Copy the offsets of an edit, which were written in place."""
+        self._states.touch(edit, gdf)
 
     def release(self, shapes: Shapes, index: Rows) -> None:
         """Write added rows as they are before they follow, ahead of the update by the composer.

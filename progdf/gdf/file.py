@@ -66,6 +66,7 @@ class Gdf:
     added: Gaussians | None = None
     anchors: Anchors | None = None  # rows of the scene on which the added rows lie; None: they follow nothing
     anchors_found: bool = False  # the anchors were chosen on load, as the file's format has none
+    adds: bool = False  # its changes add to those of lower layers and never hide them, as a pull's do
     from_others: int = 0  # number of members, the last ones, that other edits add; see `extend`
 
     def __post_init__(self) -> None:
@@ -189,6 +190,7 @@ def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
         pushes=[] if gdf.anchors is None else sorted(gdf.anchors.pushes),
         rim=gdf.anchors is not None and gdf.anchors.rim is not None,
         leaves_paint=gdf.anchors is not None and gdf.anchors.leaves_paint,
+        adds=gdf.adds,
     )
     content = header.pack_file(head, tensors)
     try:
@@ -352,6 +354,7 @@ def _unpack(head: header.GdfHeader, tensors: Mapping[str, Tensor]) -> Gdf:
         added=header.unpack_added(head, tensors),
         anchors=header.unpack_anchors(head, tensors),
         anchors_found=header.is_before_anchors(head) and bool(head.report),
+        adds=head.adds,
     )
 
 

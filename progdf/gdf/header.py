@@ -100,6 +100,7 @@ class GdfHeader(msgspec.Struct, frozen=True):
     # kinds of change, see `Anchors.pushes`; in format 8, True stands for geometry and opacity
     pushes: bool | list[str] = []
     leaves_paint: bool = False  # see `Anchors.leaves_paint`
+    adds: bool = False  # see `Gdf.adds`
     rim: bool = False  # the added rows have shares of a rim, see `Anchors.rim`
     format: int = FORMAT
     sha256: str = ""

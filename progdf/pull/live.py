@@ -127,7 +127,7 @@ def edit_in_progress(scene: Gaussians, members: Rows, channels: int, name: str) 
     mask = torch.zeros(len(scene), dtype=torch.bool)
     mask[torch.from_numpy(members)] = True
     field = BakedField("keyframes", torch.tensor([0.0, 1.0]), bases, channels)
-    return Gdf(name, from_mask(name, mask), field, fingerprint(scene))
+    return Gdf(name, from_mask(name, mask), field, fingerprint(scene), adds=True)
 
 
 def write_offsets(edit: Gdf, offsets: Tensor) -> None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from progdf.compose.composer import Composer
 from progdf.compose.layer_paint import layer_of
 from progdf.compose.layers import Layer
-from progdf.compose.reference import compose_layers, coverage
+from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, save_gdf
@@ -434,15 +434,10 @@ def _prepare(bases: _Bases, problem: _Problem, pulls: NDArray[np.float64], count
     edit = edit_in_progress(drawn, live.members, live.channels, _NAME)
 
     write_offsets(edit, first.offsets)
-
-    def covers(scene: Gaussians, gdf: Gdf) -> dict[str, torch.Tensor]:
-        covered = dict(coverage(scene, gdf))
-        if gdf.field is edit.field:  # it adds to the layers below, and hides nothing of them
-            covered = {kind: torch.zeros_like(values) for kind, values in covered.items()}
-        return covered
-
-    composer = Composer(drawn, (*problem.gdfs, edit), covers)
-    composer.update(_stack(problem), problem.blend)
+    composer = Composer(drawn, (*problem.gdfs, edit))
+    stack = _stack(problem)
+    for layers in ([*stack, Layer(edit)], stack):  # the first one compiles and plans the steps to come
+        composer.update(layers, problem.blend)
     return _Prepared(problem, live, edit, composer)
 
 
