@@ -43,6 +43,7 @@ BENCHES: dict[str, str] = {
     "moving": "benchmarks.viewer.moving:tables",
     "popping": "benchmarks.viewer.popping:tables",
     "painting": "benchmarks.viewer.painting:tables",
+    "dragging": "benchmarks.viewer.dragging:tables",
     "window": "benchmarks.viewer.window:tables",
     "warps": "benchmarks.warps:tables",
     "pictures": "benchmarks.pictures:tables",
@@ -52,7 +53,7 @@ BENCHES: dict[str, str] = {
 
 PAGE = (
     *("training", "field", "order", "viewer", "rasterize"),
-    *("warp", "moving", "popping", "painting", "frames", "hard"),
+    *("warp", "moving", "popping", "painting", "dragging", "frames", "hard"),
 )
 """Benchmarks of docs/speed-and-error.md."""
 
@@ -116,6 +117,7 @@ def main(argv: Sequence[str]) -> int:
         "moving",
         "popping",
         "painting",
+        "dragging",
         "window",
         "warps",
         "pictures",

@@ -7,6 +7,7 @@ place.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,7 +19,7 @@ from torch import Tensor
 from progdf.field.baked import AttributeBases, BakedField
 from progdf.gaussians import Gaussians, attribute_slices, pack
 from progdf.gdf.file import Gdf, fingerprint
-from progdf.region import Region, from_mask
+from progdf.region import Region, from_mask, whole_scene
 
 from .course import Handle, make_problem
 from .follow import bind, follow, rest_frames
@@ -36,6 +37,7 @@ class LiveStep:
     pulls: Floats  # displacements of the handles. [H,3]
     offsets: Tensor  # packed offsets of the members from the scene. [M,C] float32
     is_settled: bool  # further steps with the same displacements change nothing visible
+    milliseconds: float  # time that the step took
 
 
 class LivePull:
@@ -72,7 +74,7 @@ class LivePull:
         self.members: Rows = rows[moves]
         """Gaussians that can move, ascending. [M]"""
         self._binding = csr_array(binding[np.flatnonzero(moves)])
-        self._rows = pack(scene[torch.from_numpy(self.members)], with_shN=scene.sh_degree > 0).double()
+        self._rows = pack(scene[torch.from_numpy(self.members)], with_shN=scene.sh_degree > 0).float()
         self._frames = rest_frames(self._rows)
         self._pose = self._problem.solver.rest()
 
@@ -93,14 +95,20 @@ class LivePull:
             pulls: finite displacements, world units. [H,3]
             rounds: number of rounds, at least 1
         """
+        began = time.perf_counter()
         problem = self._problem
         pose = problem.solver.solve(problem.points + pulls, self._pose, rounds)
         moved = float(np.abs(pose.positions - self._pose.positions).max(initial=0.0))
         self._pose = pose
         gradients = problem.solver.gradients(pose)
-        packed, self._frames = follow(self._rows, self._binding, problem.graph, pose, gradients, self._frames)
+        moved_rows, self._frames = follow(
+            self._rows, self._binding, problem.graph, pose, gradients, self._frames
+        )
         return LiveStep(
-            pulls.copy(), (packed - self._rows).float(), moved <= _SETTLED_SHARE * problem.graph.spacing
+            pulls.copy(),
+            moved_rows.float().sub_(self._rows),
+            moved <= _SETTLED_SHARE * problem.graph.spacing,
+            1e3 * (time.perf_counter() - began),
         )
 
 
@@ -135,6 +143,24 @@ def write_offsets(edit: Gdf, offsets: Tensor) -> None:
     slices = attribute_slices(edit.field.channels)
     for attribute, bases in edit.field.attributes.items():
         bases.end_offset.copy_(offsets[:, slices[attribute]])
+
+
+def warm_up() -> None:
+    """Load the kernels of a live pull, or compile them the first time on a machine."""
+    corners = torch.cartesian_prod(*[torch.linspace(-1.0, 1.0, 4)] * 3)
+    count = len(corners)
+    quats = torch.eye(4)[:1].expand(count, 4)
+    scene = Gaussians(
+        means=corners,
+        quats=quats,
+        log_scales=corners - 2.0,
+        logit_opacities=corners[:, 0],
+        sh0=corners,
+        shN=torch.zeros(count, 3, 3),
+    )
+    x, y, z = corners[0].tolist()
+    handle = Handle(whole_scene(scene), (x, y, z), (0.0, 0.0, 0.0))
+    LivePull(scene, [handle]).step(np.array([[0.1, 0.0, 0.0]]), 1)
 
 
 def connected_rows(scene: Gaussians, rows: Rows) -> Rows:

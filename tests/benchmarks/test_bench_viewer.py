@@ -14,8 +14,8 @@ import torch
 
 from benchmarks import __main__ as front
 from benchmarks.table import Table
+from benchmarks.viewer import dragging, moving, painting, popping, subject
 from benchmarks.viewer import frames as bench_frames
-from benchmarks.viewer import moving, painting, popping, subject
 from benchmarks.viewer import slider as bench
 from benchmarks.viewer import window as bench_window
 from benchmarks.viewer.display import missing_tools
@@ -313,6 +313,18 @@ def test_painting_benchmark_measures_a_stroke(monkeypatch: pytest.MonkeyPatch) -
     ctx.release()
     assert (len(times.dabs), len(times.turning)) == (3, 2)
     assert min(*times.dabs, *times.turning, times.press, times.release) > 0.0
+
+
+@pytest.mark.gl
+def test_dragging_benchmark_measures_a_pull(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dragging, "EVENTS", 3)
+    monkeypatch.setattr(dragging, "WARM_UP", 1)
+    ctx = headless_context()
+    times = dragging.measure(ctx, bear(600).gaussians, 300, SIZE)
+    ctx.release()
+    assert 0 < times.members <= 300
+    assert (len(times.events), len(times.steps), len(times.draw)) == (3, 3, 3)
+    assert min(*times.events, *times.steps, *times.draw, times.preparation) > 0.0
 
 
 def test_subject_table_has_an_overlap_per_view(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -107,6 +107,7 @@ class App:
             leave=self.leave,
             session=session,
         )
+        self.main_view.follow_input = self.parts.pulling.follow
         self.errors = ErrorReporter(
             self.main_view.messages, lambda: self.main_view.frames, self.parts.file_actions.keep_work
         )

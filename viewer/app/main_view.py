@@ -87,6 +87,7 @@ class MainView:
         self.canvas = Canvas(context, engine)
         self.report: Callable[[Exception], None] = self._report  # receives the errors of a part of a frame
         self.remember: RememberView = forget_view  # receives the saved pictures of single views
+        self.follow_input: Callable[[], object] = lambda: None  # starts work on the input of a frame
         self.layers_of: LayersOf = no_layers  # returns the layers of a view for a picture's metadata
         self.surfaces = Surfaces()
         self.decal_surfaces = DecalSurfaces()
@@ -212,6 +213,8 @@ class MainView:
         imgui.new_frame()
         with self._guard():
             self._update(keys, seconds)
+        with self._guard():
+            self.follow_input()
         with self._guard():
             self._draw_picture(screen)
         with self._guard():

@@ -5,6 +5,7 @@ Graphs are built, and steps solved, in other threads. The window shows the newes
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import wait as wait_for
@@ -24,7 +25,14 @@ from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, save_gdf
 from progdf.io.atomic import make_folder
 from progdf.pull.course import Handle, pull
-from progdf.pull.live import LivePull, LiveStep, connected_rows, edit_in_progress, write_offsets
+from progdf.pull.live import (
+    LivePull,
+    LiveStep,
+    connected_rows,
+    edit_in_progress,
+    warm_up,
+    write_offsets,
+)
 from progdf.region import Region, from_mask
 from progdf.scene.point_tree import PointTree
 from progdf.threads import one_thread
@@ -43,9 +51,10 @@ from viewer.state.workspace import Store, with_transient
 
 _NAME = "pulled"
 _FIRST_RADIUS = 0.15  # radius of the influence at first, in radii of what can be pulled
-_ROUNDS = 6  # rounds of the solver per step while a handle is dragged
+_ROUNDS = 24  # rounds of the solver per step while a handle is dragged
 _FIRST_ROUNDS = 60  # rounds before the first step is shown
 _PATIENCE_S = 0.012  # time that a frame waits for its step, so that fast steps show in the same frame
+_REST_S = 0.05  # time without input until a pose that has not settled is solved further
 _PIN_GAUSSIANS = 48  # Gaussians that a pin holds
 
 
@@ -143,6 +152,7 @@ class PullActions:
         self._base: tuple[ViewEngine, Composer, tuple[Gdf, ...]] | None = None  # without the pull
         self._stepping: Future[LiveStep] | None = None
         self._solved: LiveStep | None = None
+        self._solved_at = 0.0  # time of the last step, seconds
         self._keeping: tuple[Path, str, Pull, Future[None]] | None = None
 
     @property
@@ -183,17 +193,34 @@ class PullActions:
             return None
         self._take_prepared(problem)
         self._prepare(problem, pull)
-        self._step(pull)
-        return None
+        return self._step(pull)
+
+    def follow(self) -> None:
+        """Start work for a handle that is being dragged, and wait shortly for its result, before drawing."""
+        pull = self._pull
+        if pull is not None and pull.drag is not None:
+            self.poll()
+
+    @property
+    def last_step(self) -> LiveStep | None:
+        """Step on screen, if there is one."""
+        return self._solved
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Number of Gaussians that the handles can move, and number of nodes; zeros without a graph."""
+        prepared = self._prepared
+        return (0, 0) if prepared is None else (len(prepared.live.members), prepared.live.node_count)
 
     def settle(self) -> None:
         """Wait until the window shows the pull of the current handles."""
         while True:
-            self.poll()
+            self._solved_at = 0.0
+            wait = self.poll()
             running = [self._preparing[1]] if self._preparing else []
             steps = [self._stepping] if self._stepping else []
             kept = [self._keeping[3]] if self._keeping else []
-            if not running and not steps and not kept:
+            if wait is None and not running and not steps and not kept:
                 return
             wait_for([*running, *steps, *kept])
 
@@ -229,6 +256,7 @@ class PullActions:
             means = document.original.means[torch.from_numpy(mask.copy())].double()
             size = float((means - means.mean(dim=0)).norm(dim=1).quantile(0.9))
         self._set(Pull(max(_FIRST_RADIUS * size, 1e-9)))
+        self._builder.submit(warm_up)
 
     def _leave(self) -> None:
         self._set(None)
@@ -315,27 +343,34 @@ class PullActions:
         self._store.replace(with_transient(work, live=live))
         self._store.wake()
 
-    def _step(self, pull: Pull) -> None:
-        """Show a finished step and begin the next one if the handles have moved on."""
+    def _step(self, pull: Pull) -> float | None:
+        """Show a finished step and begin the next one.
+
+        Returns:
+            Seconds until the next look, None for never.
+        """
         prepared = self._prepared
         if prepared is None:
-            return
+            return None
         self._take_step(prepared)
         handles = pull.pose.handles
         if prepared.problem.points != tuple(handle.point for handle in handles):
-            return
+            return None
         pulls = _pulls(pull)
         solved = self._solved
-        is_done = solved is not None and solved.is_settled and np.array_equal(solved.pulls, pulls)
-        if self._stepping is not None or is_done:
-            return
+        is_current = solved is not None and np.array_equal(solved.pulls, pulls)
+        if self._stepping is not None or (is_current and solved is not None and solved.is_settled):
+            return None
+        rest = self._solved_at + _REST_S - time.perf_counter()
+        if is_current and rest > 0.0:
+            return rest  # the next movement need not wait for this step
         self._stepping = self._stepper.submit(_solve, prepared.live, pulls)
         wait_for([self._stepping], _PATIENCE_S)
         if self._stepping.done():
             self._take_step(prepared)
-            self._wake()
-        else:
-            self._stepping.add_done_callback(lambda _: self._wake())
+            return _REST_S
+        self._stepping.add_done_callback(lambda _: self._wake())
+        return None
 
     def _take_step(self, prepared: _Prepared) -> None:
         if self._stepping is None or not self._stepping.done():
@@ -343,6 +378,7 @@ class PullActions:
         future = self._stepping
         self._stepping = None
         self._solved = future.result()
+        self._solved_at = time.perf_counter()
         write_offsets(prepared.edit, self._solved.offsets)
         self._engine().touch(prepared.edit)
         self._store.wake()
@@ -477,7 +513,7 @@ def _handles(
     allowed = np.flatnonzero(mask)
     tree = PointTree(means[allowed], _PIN_GAUSSIANS)
     region = from_mask(_NAME, torch.from_numpy(mask))
-    if problem.radius is None:
+    if problem.radius is None and problem.limit == selection.EMPTY_MASK:
         nearest = allowed[tree.query(np.array(problem.points), 1)[1][:, 0]]
         region = bases.connected_part(scene, mask, nearest)
     pulls = [handle.pull for handle in pose.handles] or [(0.0, 0.0, 0.0)] * len(problem.points)
