@@ -142,8 +142,12 @@ def tidy(
     added_count = 0 if added is None else len(added)
     if fill_count:
         gdf = anchor_added(gdf, scene, free=added_count - fill_count)
-    if not leaves_paint:
-        return gdf
+    return leave_paint(gdf) if leaves_paint else gdf
+
+
+def leave_paint(gdf: Gdf) -> Gdf:
+    """Return the edit with the paint of other edits on its regions unchanged, see `Anchors.leaves_paint`."""
+    added_count = 0 if gdf.added is None else len(gdf.added)
     anchors = free_anchors(added_count) if gdf.anchors is None else gdf.anchors
     return replace(gdf, anchors=replace(anchors, leaves_paint=True))
 

@@ -29,11 +29,19 @@ COLORS = 5
 MIN_SOURCE_DISTANCE = 0.02
 """Smallest kernel distance of two sources; closer sources count as one color."""
 WHITE_CHROMA = 0.04
-"""Chroma up to which a surface may be white in colored light."""
+"""Chroma up to which a surface may be white in colored light.
+
+White in CIE daylight of 5 200 to 8 500 K, from direct sun to an overcast sky, has it in a picture that is
+balanced for 6 500 K.
+"""
 EVEN_SEPARATION = 0.75
 """Share of the variance that the best division into two explains for evenly distributed values."""
 LIGHTING_RATIO = 4.0
-"""Ratio of the light on the lit and the shaded side of a surface; photographers rarely exceed it."""
+"""Largest ratio of the light on the lit and the shaded side of one surface.
+
+It is two stops, the contrast of a portrait with one lamp and fill light. A larger step within one paint is
+seen as another surface.
+"""
 
 _LIGHTNESS_FACTOR = 0.5  # factor on lightness differences, because shading is not another color
 _ITERATIONS = 20  # iterations of k-means

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from progdf.color import edits as color
-from progdf.color.oklab import ColorPath, bend_of, interpolate_colors, path_of
+from progdf.color.oklab import ColorPath, bend_of, interpolate_colors, oklab_to_srgb, path_of
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from trainer.options import EditKind
@@ -170,8 +170,13 @@ def grade(given: EditorInput) -> ColorEditor:
     requested = color.parse_grade(given.what)
     if requested.palette:
         requested = color.measure_grade(requested, *region_samples(given))
-        for (source, _), shading in zip(requested.palette, requested.palette_shadings, strict=True):
-            given.say(f"{color.hex_color(source.tolist())} in the region: {shading.describe()}")
+        found = zip(requested.palette, requested.palette_shadings, requested.palette_shades, strict=True)
+        for (source, _), shading, shades in found:
+            line = f"{color.hex_color(source.tolist())} in the region: {shading.describe()}"
+            if len(shades):
+                names = [color.hex_color(shade.tolist()) for shade in oklab_to_srgb(shades)]
+                line = f"{line}; shades of the same surface move with it: {', '.join(names)}"
+            given.say(line)
     return ColorEditor(lambda rgb: color.grade_course(rgb, requested))
 
 

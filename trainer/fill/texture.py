@@ -19,12 +19,13 @@ from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from progdf.color.oklab import srgb_to_oklab
+from progdf.color.shading import JND
 from progdf.surface.models import Array, Mask
 
 from .membrane import membrane
 
-VISIBLE_CONTRAST = 0.02
-"""Contrast in OKLab from which texture continues, about the smallest visible difference."""
+VISIBLE_CONTRAST = JND
+"""Contrast in OKLab from which texture continues: a just noticeable difference."""
 
 _MIXED_PX = 3  # width of the border around the hole whose color is mixed with the removed region, pixels
 _RECOVERY_PX = 5  # window in which a copied pixel and its source are compared, pixels

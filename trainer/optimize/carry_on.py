@@ -50,10 +50,16 @@ MIN_EXPLAINED = 0.5
 original."""
 
 MAX_SPECKLE = 0.05
-"""Maximum share of the region's pixels that may be speckle behind, beyond that of the picture."""
+"""Maximum share of the region's pixels that may be speckle behind, beyond that of the picture.
+
+It is about one odd pixel in every window of the median, from which speckle looks like a texture.
+"""
 
 MAX_NEW_COLORS = 0.01
-"""Maximum share of the changed pixels behind that may have a new color."""
+"""Maximum share of the changed pixels behind that may have a new color.
+
+As one patch, its side is a tenth of the region's: the smallest patch that is noticed as a spot.
+"""
 
 HULL_MARGIN = 1 / 3
 """Distance outside the hull up to which a color counts as known, as a share of the painted change.
@@ -62,7 +68,10 @@ Recolors of objects from one picture reach 0.30, because the other sides are bri
 """
 
 MIN_REACH = 0.1
-"""Minimum number of pixels behind that unseen members change, as a share of the painted pixels."""
+"""Minimum number of pixels behind that unseen members change, as a share of the painted pixels.
+
+Fewer are a border around the painted area, which the picture's own edit fades out over.
+"""
 
 BEHIND_DEG = (120.0, 180.0, 240.0)
 """Angles of the judged views around the region, degrees; the middle one is straight from behind."""

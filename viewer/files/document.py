@@ -114,6 +114,12 @@ class Document:
             raise ProgdfError("the scene has no file yet; open one first")
         return self.path
 
+    def edit_of(self, path: Path) -> Gdf | None:
+        """Return the edit with this file; None if there is none."""
+        files = [file.resolve() for file in self.gdf_paths]
+        path = path.resolve()
+        return self.edits[files.index(path)] if path in files else None
+
     def free_name(self, name: str) -> str:
         """Return `name`, with a number if another edit has it."""
         return _free_name(name, self.edits)

@@ -212,7 +212,10 @@ def _fill_box(work: Workspace, index: int, row: LayerRow) -> list[Action]:
         text = f"Filling the hole: {100 * job.share:.0f} %{left}"
     with inert(work.view.layers[index].locked or is_stopping):
         pressed, _ = imgui.checkbox(f"{text}##hole", row.hole == "filled" or job is not None)
-    tip("Continue the surface around the hole, with its texture if the extra fill is installed")
+    tip(
+        "Continue the surface around the hole, with its texture if the extra fill is installed. The fill has "
+        "the scene's own colors: recolored surroundings do not recolor it"
+    )
     return [OnItem("fill_hole", index)] if pressed else []
 
 

@@ -122,13 +122,12 @@ def _row(scene: Gaussians, gdf: Gdf, gdfs: Sequence[Gdf], added: int) -> LayerRo
 
 
 def _hole(gdf: Gdf) -> Hole:
-    """Return the state of a removal's hole; "" if it leaves paint behind, and for other edits."""
+    """Return the state of a removal's hole; "" for other edits."""
     if gdf.instruction != "remove" or not len(gdf.region):
         return ""
     if "removal" in gdf.report:  # made by `progdf train`, which fills holes
         return "filled"
-    leaves_paint = gdf.anchors is not None and gdf.anchors.leaves_paint
-    return "" if leaves_paint or gdf.added is not None else "open"
+    return "" if gdf.added is not None else "open"
 
 
 def _sources(gdf: Gdf) -> str:

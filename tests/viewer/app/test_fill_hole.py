@@ -13,7 +13,7 @@ import torch
 from progdf.errors import ProgdfError
 from progdf.gdf.file import Gdf, load_gdf, save_gdf
 from progdf.region import from_mask
-from progdf.tidy import Step, tidy
+from progdf.tidy import Step, leave_paint, tidy
 from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.ui_rig import bear, first_view
@@ -128,5 +128,19 @@ def test_only_removals_have_a_hole() -> None:
     keeps_paint = tidy(scene, [Step("remove", region)], "a", "remove", leaves_paint=True)
     other = tidy(scene, [Step("remove", region)], "a", "recolor:#ff0000")
     rows = layer_rows(scene, [removed, filled(), keeps_paint, other])
-    assert [row.hole for row in rows] == ["open", "filled", "", ""]
+    assert [row.hole for row in rows] == ["open", "filled", "open", ""]
     assert 5.0 < rows[0].fill_seconds < 60.0
+
+
+def test_filled_removal_leaves_paint_where_the_removal_did(window: application.App) -> None:
+    (layer,) = window.main_view.work.view.layers
+    document = window.documents.get()
+    painted = leave_paint(document.edits[layer.gdf])
+    window.documents.replace(replace(document, edits=(painted,)))
+    request(window, OnItem("fill_hole", 0))
+    Trainer.ended = 0
+    turn(window)
+    filled_edit = shown(window)
+    assert filled_edit.added is not None
+    assert filled_edit.anchors is not None
+    assert filled_edit.anchors.leaves_paint

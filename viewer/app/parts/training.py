@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
-from progdf.gdf.file import save_gdf
+from progdf.gdf.file import load_gdf, save_gdf
 from progdf.io.atomic import read_file, write_file
 from progdf.terminal import format_duration
+from progdf.tidy import leave_paint
 from viewer.app.decal import DecalPlace
 from viewer.app.messages import Messages, Requests, attempt, failure_line
 from viewer.app.parts.edits import EditActions
@@ -452,7 +453,14 @@ class JobActions:
             self._messages.show(f"{task.name} is ready: {task.result}")
 
     def _take_fill(self, task: EditOrder) -> None:
-        """Replace a removal by the filled one, if it is still a layer."""
+        """Replace a removal by the filled one, if it is still a layer.
+
+        The filled one leaves paint where the removal did.
+        """
+        document = self._documents.get()
+        removal = document.edit_of(Path(task.replaces)) if self._scene == task.scene else None
+        if removal is not None and removal.anchors is not None and removal.anchors.leaves_paint:
+            save_gdf(task.result, leave_paint(load_gdf(task.result, document.original)))
         if self._scene == task.scene and self._edits.replace_file(Path(task.replaces), task.result):
             self._messages.show("The hole is filled")
         else:
