@@ -22,7 +22,7 @@ from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
 from .oklab import oklab_to_srgb, smoothstep, srgb_to_oklab
-from .shading import Shading, measure_shading, relight
+from .shading import JND, Shading, measure_shading, relight
 from .surfaces import COLORS, MIN_SOURCE_DISTANCE, WHITE_CHROMA, find_surfaces, kernel_space
 
 _KERNEL_WIDTH_SHARE = (
@@ -33,8 +33,8 @@ _SINGLE_KERNEL_WIDTH = 0.055  # standard deviation of the kernel of a single gra
 _CHROMA_WIDTH_SHARE = 0.3  # further deviation for colored sources, as a share of the source's chroma
 _SHADOW_WIDTH = 0.08  # deviation of the kernel of a single source in lightness, below its shading
 _SHADING_REACH = 0.16  # lightness below a single source within which its shading is measured
-# chroma from which a surface has a color of its own: white has 0.11 under a clear blue sky (20 000 K) and 0.12
-# under a lamp (3 400 K), in a picture that is balanced for daylight
+# chroma from which a surface has a color of its own: in a picture that is balanced for daylight, white has
+# 0.11 under a clear blue sky (20 000 K) and 0.12 under a lamp (3 400 K)
 _COLORED_CHROMA = 0.12
 _CURVE_STEPS = 1024  # linear pieces of a tabulated curve
 
@@ -204,14 +204,23 @@ def measure_palette(
 
 
 def _paint_shift(colors: Tensor, source: Tensor, target: Tensor, shading: Shading, is_single: bool) -> Tensor:
-    """Return the shift of colors if the paint of one source becomes the target. OKLab [N,3] -> [N,3]"""
+    """Return the shift of colors if the paint of one source becomes the target. OKLab [N,3] -> [N,3]
+
+    The difference of a color from the source's hue stays. On a nearly white source it is the color of the
+    light, so darker paint has less of it. Paint of another hue has none of it, as in a recolor: it would
+    change the hue, and white in cool light would become salmon instead of orange.
+    """
     lightness = colors[:, 0]
     old = relight(lightness, shading, source)
     new = relight(lightness, shading, target)
     own_ab = old.chroma[:, None] * source[1:]
-    shift = torch.cat(
-        [(new.lightness - old.lightness)[:, None], new.chroma[:, None] * target[1:] - own_ab], dim=1
-    )
+    is_white = 1.0 - smoothstep(own_ab.norm(dim=1), WHITE_CHROMA, _COLORED_CHROMA)
+    is_repainted = smoothstep((target - source)[1:].norm(), JND, WHITE_CHROMA)
+    dimming = chroma_factor(old.lightness, new.lightness)
+    lost = is_white * (1.0 - (1.0 - is_repainted) * dimming)
+    light_ab = lost[:, None] * (colors[:, 1:] - own_ab)
+    shift_ab = new.chroma[:, None] * target[1:] - own_ab - light_ab
+    shift = torch.cat([(new.lightness - old.lightness)[:, None], shift_ab], dim=1)
     presence = _presence(colors, own_ab)
     if is_single:
         return presence[:, None] * shift

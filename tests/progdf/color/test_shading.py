@@ -81,6 +81,27 @@ def test_white_in_warm_and_cool_light_is_one_surface() -> None:
     assert chroma[200:].median() > 0.65 * chroma[:200].median()
 
 
+@pytest.mark.parametrize("target", TARGETS)
+def test_changed_white_swatch_has_one_hue_in_warm_and_cool_light(target: torch.Tensor) -> None:
+    light = torch.linspace(0.8, 1.0, 200)[:, None]
+    warm = light * color.parse_color("#e9d5b6")
+    cool = light * color.parse_color("#ebe9e9")
+    dots = light * color.parse_color("#373336")
+    swatch = color.parse_color("#dac5ab")
+    dark = color.parse_color("#373336")
+    grade = color.ColorGrade(palette=((swatch, target), (dark, dark)))
+    rgb = torch.cat([warm, cool, dots])
+    lab = srgb_to_oklab(color.grade_fully(rgb, color.measure_grade(grade, rgb, torch.ones(600))))
+    goal = srgb_to_oklab(target)[1:]
+    ray = goal / goal.norm().clamp_min(1e-6)
+    for half in (lab[:200, 1:], lab[200:400, 1:]):
+        aside = half - (half @ ray)[:, None] * ray
+        assert aside.norm(dim=1).median() < JND
+    unchanged = color.ColorGrade(palette=((swatch, swatch), (dark, dark)))
+    same = color.grade_fully(rgb, color.measure_grade(unchanged, rgb, torch.ones(600)))
+    assert torch.allclose(same, rgb, atol=1e-5), "colored light stays on an unchanged swatch"
+
+
 def test_highlights_of_a_dark_surface_stay_white() -> None:
     dark = surface("#202022", 0.1, 1)
     rgb = torch.cat([dark, torch.tensor([[1.0, 1.0, 1.0], [0.98, 0.98, 0.98]])])
