@@ -40,7 +40,7 @@ _PATH_KNOTS = torch.cat([OPACITY_KNOTS, _PLACES]).unique()  # type: ignore[no-un
 """Knots of the path in its own time, from 0 to 1. [S] float64"""
 _SAMPLES_PER_STEP = 4  # samples of the measured curve per step, for the piecewise linear remap
 _MIN_PROGRESS = 0.02  # share of the path's own time in the new strengths, which keeps these ascending
-_MEASURED_VIEWS = 12  # maximum number of views in which the visible change is measured
+_MEASURED_VIEWS = 6  # maximum number of views in which the visible change is measured
 _MAX_GAUSSIANS = 5_000_000  # Gaussians drawn in all their pictures, if cameras are made: about a second
 _AROUND_VIEWS = 12  # cameras around a group of Gaussians
 _AROUND_PX = 128  # width and height of their pictures, pixels

@@ -50,6 +50,8 @@ LARGEST_VIEW_PX = 2048
 """Largest longer side of the views, pixels."""
 VIEWS = 30
 """Default number of edited views."""
+REMOVAL_VIEWS = 24
+"""Default number of views of a removal, in which holes are found and measured."""
 COLOR_VIEWS = (40, 48)
 """Default number of views of a color edit: up to SH degree 1, and above (docs/lab/experiments.md, Views)."""
 

@@ -80,8 +80,8 @@ def resolve(options: TrainOptions) -> TrainOptions:
     check_options(options)
     quick = options.quick
     optimize = options.optimize
-    views = options.views.views
     row = editor_row(options.editor)
+    views = options.views.views or row.views
     text = options.editor.text
     stages = min(optimize.stages, QUICK_STAGES) if quick else optimize.stages
     texts = options.texts

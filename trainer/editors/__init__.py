@@ -13,7 +13,7 @@ from progdf.color.edits import parse_grade
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.region import Region
-from trainer.options import EditorOptions
+from trainer.options import REMOVAL_VIEWS, EditorOptions
 from trainer.views.view import RegionThumbnail, View
 
 from .adapters import default_model
@@ -142,6 +142,7 @@ EDITORS = {
         files=removal_pictures,
         options=("fill",),
         run="removed",
+        views=REMOVAL_VIEWS,
     ),
 }
 """Rows of the editors, by the word before the colon in `--editor`."""

@@ -113,6 +113,7 @@ class EditorRow:
     is_manual: bool = False  # set by eye, so a draft is kept whatever its error
     model: Callable[[], str] | None = None  # returns the default of `--model`; None: no generative model
     image_size: int = 0  # longer side of its views, pixels; 0 is the default
+    views: int = 0  # number of its views; 0 is the default
     files: Callable[[str], tuple[Path, ...]] = lambda what: ()  # picture files that its text names
     shows_scene: bool = False  # its files are pictures of the scene, which may show layers
     sets_views: bool = False  # the views of the run are those of its files

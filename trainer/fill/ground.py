@@ -34,7 +34,7 @@ from trainer.views.view import render_colors, seen_colors
 REACH_PX = 4.0
 """Largest distance, in pixels of a view, of a point from a surface that still belongs to it."""
 
-MAX_SIDE_PX = 448
+MAX_SIDE_PX = 336
 """Largest longer side of the texture, pixels; it limits the inpainting to some seconds."""
 
 RING_SHARE = 0.25

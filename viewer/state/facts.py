@@ -35,9 +35,9 @@ _THUMBNAIL_GRAY = 56  # background of a thumbnail, 0 to 255
 _THUMBNAIL_DISTANCE = 0.7  # camera distance as a share of the framing distance
 
 
-FILL_BASE_S = 12.0
+FILL_BASE_S = 8.0
 """Estimate of the seconds to fill a hole in a small scene, for two processor cores."""
-FILL_S_PER_MILLION = 200.0
+FILL_S_PER_MILLION = 100.0
 """Estimate of the further seconds per million Gaussians of the scene."""
 
 Hole = Literal["", "open", "filled"]
