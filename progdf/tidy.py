@@ -1,7 +1,7 @@
 """Edits that remove, move, pull or copy regions. Their path over strengths is known, so nothing is trained.
 
     remove      a region fades out, until no engine draws it
-    transform   a region is translated, rotated and scaled about the mean of its centers, along an arc
+    transform   a region is translated, rotated, stretched and mirrored about a pivot, along an arc
     pull        points of a region are dragged, and the rest follows rigidly (see `progdf.pull`)
     duplicate   a transformed copy of a region fades in as added rows
 
@@ -23,13 +23,13 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.fade import fading_course
 from progdf.field.baked import interpolate_at
-from progdf.field.separable import course_field, opacity_course
+from progdf.field.separable import course_field, fit_keyframes, opacity_course
 from progdf.gaussians import Gaussians, attribute_slices, concatenate, pack
 from progdf.gdf.anchors import free_anchors
 from progdf.gdf.file import ADDED_LOGIT, Gdf, anchor_added, fingerprint
 from progdf.pull.course import PullCourse
 from progdf.region import Region, from_mask
-from progdf.similarity import Motion, make_parts, move_rows
+from progdf.similarity import GEOMETRY, AffineMotion, continue_axes, transform_rows
 
 # Rotation (radians) or log-scale between two knots. The chord of such an arc deviates by 1/500 of its radius,
 # or 0.5 pixels for an object of 512 pixels.
@@ -46,7 +46,7 @@ class Step:
 
     does: Operation
     region: Region
-    motion: Motion | None = None  # motion of the region as one part; None: no motion
+    motion: AffineMotion | None = None  # motion of the region as one part; None: no motion
     copied: Gaussians | None = None  # Gaussians to duplicate in place of the region's own
     course: PullCourse | None = None  # course of a pull, the first step of its Gaussians
 
@@ -54,27 +54,30 @@ class Step:
         """Return packed raw rows after a share, 0 to 1, of the motion. [M,C] float64 -> [M,C]"""
         if self.course is not None:
             return rows + self.course.offsets_at(share)
-        if self.motion is None or not len(rows):
-            return rows
-        motion = Motion(*(share * part.double() for part in vars(self.motion).values()))
-        return move_rows(rows, make_parts(rows, torch.zeros(len(rows), dtype=torch.int64)), motion)
+        return rows if self.motion is None else transform_rows(rows, self.motion, share)
 
 
 def similarity(
     shift: Sequence[float] = (0.0, 0.0, 0.0), turn: Sequence[float] = (0.0, 0.0, 0.0), scale: float = 1.0
-) -> Motion:
-    """Return the motion of a whole region.
+) -> AffineMotion:
+    """Return the motion of a whole region about the mean of its centers.
 
     Args:
         shift: translation of its center, world units. [3]
         turn: axis times angle in radians, which may exceed a full turn. [3]
         scale: scale factor, > 0
     """
-    return Motion(
-        torch.tensor([shift], dtype=torch.float64),
-        torch.tensor([math.log(scale)], dtype=torch.float64),
-        torch.tensor([turn], dtype=torch.float64),
+    return AffineMotion(
+        torch.tensor(shift, dtype=torch.float64),
+        torch.tensor(turn, dtype=torch.float64),
+        math.log(scale) * torch.eye(3, dtype=torch.float64),
     )
+
+
+def mirror(axis: int) -> AffineMotion:
+    """Return the motion that mirrors a whole region about the mean of its centers; `axis`: 0 to 2."""
+    still = torch.zeros(3, dtype=torch.float64)
+    return AffineMotion(still, still, torch.zeros(3, 3, dtype=torch.float64), axis)
 
 
 def tidy(
@@ -85,6 +88,7 @@ def tidy(
     added: Gaussians | None = None,
     cameras: Sequence[Camera] | None = None,
     leaves_paint: bool = False,
+    only_end: bool = False,
 ) -> Gdf:
     """Return the steps as one edit: strength 0 is the scene, strength 1 the result of all steps.
 
@@ -98,6 +102,7 @@ def tidy(
         cameras: views in which fading is even; empty: cameras around the fading Gaussians; None: opacities
             change linearly, which is fast
         leaves_paint: rows that other edits add on the regions stay as they are
+        only_end: the edit is for strength 1, a preview that takes little time
 
     Returns:
         Edit of all removed or moved Gaussians. Copies are its added rows.
@@ -123,21 +128,25 @@ def tidy(
         start_scene = concatenate([scene, added])
     affected = torch.cat([members, torch.arange(len(scene), len(start_scene))])
     opacity_knots, logits = _opacity_course(start_scene, affected, end, cameras)
-    motions = [step.motion for step in steps if step.does == "transform" and step.motion is not None]
-    count = max(1, *(math.ceil(_motion_size(motion) / _KNOT_SPACING) for motion in motions)) if motions else 1
-    knots = torch.linspace(0.0, 1.0, 1 + count)
+    knots = torch.tensor([0.0, 1.0])
     for step in steps:
+        if step.does == "transform" and step.motion is not None and not only_end:
+            knots = torch.cat([knots, step.motion.strengths(_KNOT_SPACING)]).unique()  # type: ignore[no-untyped-call]
         if step.course is not None:
             knots = torch.cat([knots, step.course.strengths]).unique()  # type: ignore[no-untyped-call]
-    if bool(logits.any()):
+    if bool(logits.any()) and not only_end:
         knots = torch.cat([knots, opacity_knots]).unique()  # type: ignore[no-untyped-call]
     offsets = rows.new_zeros(len(knots), len(end), rows.shape[1])
     for i, s in enumerate(knots.tolist()):
         offsets[i, : len(members)] = _rows_at(scene, members, steps, bands, s) - rows if s else 0.0
+    if any(step.motion is not None and not step.motion.is_similar for step in steps):
+        shapes = rows[:, GEOMETRY] + offsets[:, : len(members), GEOMETRY]
+        shapes = _continue_shapes(shapes.double(), knots, steps)
+        offsets[1:, : len(members), GEOMETRY] = (shapes - rows[:, GEOMETRY])[1:].float()
+    for i, s in enumerate(knots.tolist()):
         offsets[i, :, _OPACITY_COLUMN] = interpolate_at(opacity_knots, logits, s)
-    field = course_field(knots, offsets)
-    # a pull deforms what is seen, so changes by lower layers stay
-    adds = all(step.does == "pull" for step in steps)
+    field = fit_keyframes(knots, offsets, 2) if only_end else course_field(knots, offsets)
+    adds = all(_adds(step) for step in steps)
     gdf = Gdf(name, region, field, fingerprint(scene), instruction, added=added, adds=adds)
     added_count = 0 if added is None else len(added)
     if fill_count:
@@ -150,6 +159,18 @@ def leave_paint(gdf: Gdf) -> Gdf:
     added_count = 0 if gdf.added is None else len(gdf.added)
     anchors = free_anchors(added_count) if gdf.anchors is None else gdf.anchors
     return replace(gdf, anchors=replace(anchors, leaves_paint=True))
+
+
+def _continue_shapes(shapes: Tensor, knots: Tensor, steps: Sequence[Step]) -> Tensor:
+    """Return the geometry of the members at the knots, with principal axes in the order of the knots before.
+
+    After the flat state half way through a mirror, the axes lead to those at the end, which turn like all
+    others of the region. [S,M,10] -> [S,M,10]
+    """
+    if all(step.motion is None or step.motion.mirror is None for step in steps):
+        return continue_axes(shapes)
+    middle = int((knots <= 0.5).sum())
+    return torch.cat([continue_axes(shapes[:middle]), continue_axes(shapes[middle:].flip(0)).flip(0)])
 
 
 def _opacity_course(
@@ -186,13 +207,15 @@ def bake(scene: Gaussians, steps: Sequence[Step]) -> Gaussians:
     return remaining if added is None else concatenate([remaining, added])
 
 
+def _adds(step: Step) -> bool:
+    """Return True if changes by lower layers stay: a pull deforms what is seen, and a shift carries it along."""
+    return step.does == "pull" or (
+        step.does == "transform" and step.motion is not None and step.motion.is_shift
+    )
+
+
 def _rotates(step: Step) -> bool:
-    return step.course is not None or (step.motion is not None and bool(step.motion.turn.any()))
-
-
-def _motion_size(motion: Motion) -> float:
-    """Return the larger of the angle, in radians, and the magnitude of the log-scale."""
-    return max(float(motion.turn.norm()), float(motion.log_scale.abs()))
+    return step.course is not None or (step.motion is not None and step.motion.turns_colors)
 
 
 def _rows_at(scene: Gaussians, members: Tensor, steps: Sequence[Step], bands: bool, share: float) -> Tensor:

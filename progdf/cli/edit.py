@@ -26,9 +26,9 @@ from progdf.pull.course import Handle, pull
 from progdf.region import union
 from progdf.scene.regions import check_region, parse_region, read_numbers
 from progdf.scene.strays import clean, find_strays, picture_difference
-from progdf.similarity import Motion
+from progdf.similarity import AffineMotion, affine_motion
 from progdf.terminal import format_count, group_digits, print_line, shorten
-from progdf.tidy import Operation, Step, bake, similarity, tidy
+from progdf.tidy import Operation, Step, bake, mirror, similarity, tidy
 
 from .options import absent_option, parse_options
 
@@ -44,7 +44,7 @@ class EditOptions:
 
     The scene file itself is never changed. REGION is written as for progdf train, except for forms that need
     pictures. The numbers of an option follow the last colon. All regions refer to the scene in the file.
-    Overlapping regions are pulled, then scaled, then rotated, then moved. Cleaning comes last.
+    Overlapping regions are pulled, then mirrored, scaled, rotated and moved. Cleaning comes last.
     """
 
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
@@ -55,8 +55,10 @@ class EditOptions:
     """Remove floaters, needles, giants and invisible Gaussians; for a scene output only."""
     delete: Annotated[Specs, absent_option("REGION")] = ()
     """Remove the Gaussians of the region; holes, shadows and reflections stay."""
-    scale: Annotated[Specs, absent_option("REGION:FACTOR")] = ()
-    """Scale the region about the mean of its centers; FACTOR: 0.001 to 1000."""
+    mirror: Annotated[Specs, absent_option("REGION:AXIS")] = ()
+    """Mirror the region about the mean of its centers; AXIS: x, y or z."""
+    scale: Annotated[Specs, absent_option("REGION:FACTOR|FX,FY,FZ")] = ()
+    """Scale the region about the mean of its centers, per axis with three factors; 0.001 to 1000."""
     rotate: Annotated[Specs, absent_option("REGION:AXIS,DEGREES")] = ()
     """Rotate the region about the mean of its centers; AXIS: x, y, z or a vector; −360 to 360 degrees."""
     move: Annotated[Specs, absent_option("REGION:DX,DY,DZ")] = ()
@@ -132,7 +134,7 @@ def _write_edit(options: EditOptions, scene: Gaussians, steps: Sequence[Step]) -
 def _instruction(options: EditOptions) -> str:
     """Return the step options as typed, which the edit stores as its instruction."""
     parts = ["edit"]
-    for name in ("delete", "pull", "hold", "scale", "rotate", "move", "duplicate"):
+    for name in ("delete", "pull", "hold", "mirror", "scale", "rotate", "move", "duplicate"):
         parts += [f"--{name} {spec}" for spec in getattr(options, name)]
     return " ".join(parts)
 
@@ -150,7 +152,8 @@ def _read_steps(options: EditOptions) -> list[Callable[[Gaussians], Step]]:
     Raises:
         ProgdfError: the numbers of an option are invalid, or a region is invalid for any scene.
     """
-    forms: tuple[tuple[str, str, Callable[[str], Motion | None]], ...] = (
+    forms: tuple[tuple[str, str, Callable[[str], AffineMotion | None]], ...] = (
+        ("mirror", "AXIS", _parse_mirror),
         ("scale", "FACTOR", _parse_scale),
         ("rotate", "AXIS,DEGREES", _parse_rotation),
         ("move", "DX,DY,DZ", _parse_shift),
@@ -205,24 +208,32 @@ def _pull_step(parsed: Sequence[tuple[str, list[float]]], holds: Sequence[str], 
     return Step("pull", course.region, course=course)
 
 
-def _maker(does: Operation, spec: str, motion: Motion | None) -> Callable[[Gaussians], Step]:
+def _maker(does: Operation, spec: str, motion: AffineMotion | None) -> Callable[[Gaussians], Step]:
     check_region(spec)
     return lambda scene: Step(does, parse_region(spec, scene, say=print_line), motion)
 
 
-def _parse_shift(text: str) -> Motion | None:
+def _parse_shift(text: str) -> AffineMotion | None:
     numbers = read_numbers(text)
     return similarity(shift=numbers) if len(numbers) == 3 else None
 
 
-def _parse_scale(text: str) -> Motion | None:
-    numbers = read_numbers(text)
-    if len(numbers) != 1 or not 1 / MAX_SCALE <= numbers[0] <= MAX_SCALE:
+def _parse_mirror(text: str) -> AffineMotion | None:
+    axis = text.strip().lower()
+    return mirror("xyz".index(axis)) if axis in ("x", "y", "z") else None
+
+
+def _parse_scale(text: str) -> AffineMotion | None:
+    factors = read_numbers(text)
+    if len(factors) not in (1, 3) or not all(1 / MAX_SCALE <= factor <= MAX_SCALE for factor in factors):
         return None
-    return similarity(scale=numbers[0])
+    if len(factors) == 1:
+        return similarity(scale=factors[0])
+    still = torch.zeros(3, dtype=torch.float64)
+    return affine_motion(torch.diag(torch.tensor(factors, dtype=torch.float64)), still)
 
 
-def _parse_rotation(text: str) -> Motion | None:
+def _parse_rotation(text: str) -> AffineMotion | None:
     axis, _, degrees = text.rpartition(",")
     axes = {"x": "1,0,0", "y": "0,1,0", "z": "0,0,1"}
     direction = read_numbers(axes.get(axis.strip().lower(), axis))

@@ -20,7 +20,7 @@ from progdf.quaternions import rotation_matrices, turn_quats
 from progdf.rasterize import render
 from progdf.rasterize.engines import ALPHA_MIN
 from progdf.region import Region, from_mask, whole_scene
-from progdf.similarity import Motion
+from progdf.similarity import AffineMotion
 from progdf.tidy import Step, bake, similarity, tidy
 from tests.helpers.scenes import front_camera, orbit_camera, random_gaussians
 
@@ -123,12 +123,12 @@ def test_strength_zero_is_the_scene_and_other_rows_never_change(does: str) -> No
     assert torch.equal(picture(start, WHITE, front_camera()), picture(scene, WHITE, front_camera()))
 
 
-def moved_camera(camera: Camera, center: Tensor, motion: Motion) -> Camera:
+def moved_camera(camera: Camera, center: Tensor, motion: AffineMotion) -> Camera:
     """Return the camera that sees the moved scene as `camera` sees the original. `motion` must not scale."""
-    turn = rotation_matrices(turn_quats(motion.turn))[0]
+    turn = rotation_matrices(turn_quats(motion.turn[None]))[0]
     # x' = c + t + R (x − c), so that x = Rᵀ (x' − c − t) + c
     back = turn.T
-    offset = center - turn.T @ (center + motion.shift[0])
+    offset = center - turn.T @ (center + motion.shift)
     view = camera.viewmat.double().clone()
     view[:3, 3] = view[:3, :3] @ offset + view[:3, 3]
     view[:3, :3] = view[:3, :3] @ back
@@ -140,7 +140,7 @@ def test_scene_and_camera_moved_alike_give_the_same_picture(share: float) -> Non
     scene = scene_of(degree=3)
     motion = similarity((0.4, -0.2, 0.3), TURN)
     gdf = tidy(scene, [Step("transform", whole_scene(scene), motion)], "moved")
-    part = Motion(*(share * value for value in vars(motion).values()))
+    part = replace(motion, shift=share * motion.shift, turn=share * motion.turn)
     camera = front_camera(64, 48, 50.0)
     seen = picture(at(scene, gdf, share), BLACK, moved_camera(camera, scene.means.double().mean(0), part))
     # without rotated SH, colors would be off by more than 0.1
@@ -263,6 +263,17 @@ def test_edit_command_writes_a_slider(ply: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("form", ["ply", "gdf"])
+def test_edit_command_mirrors_and_scales_along_axes(ply: Path, tmp_path: Path, form: str) -> None:
+    scene = load_ply(ply)
+    out = tmp_path / f"mirrored.{form}"
+    assert main(["edit", str(ply), "--mirror", "all:X", "--scale", "all:1,2,0.5", "-o", str(out)]) == 0
+    edited = load_ply(out) if form == "ply" else at(scene, load_gdf(out, scene), 1.0)
+    center = scene.means.mean(dim=0)
+    expected = center + (scene.means - center) * torch.tensor([-1.0, 2.0, 0.5])
+    assert torch.allclose(edited.means, expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("form", ["ply", "gdf"])
 def test_edit_command_pulls_a_point(ply: Path, tmp_path: Path, form: str) -> None:
     out = tmp_path / f"pulled.{form}"
     scene = load_ply(ply)
@@ -306,6 +317,10 @@ def test_edit_command_pulls_a_point(ply: Path, tmp_path: Path, form: str) -> Non
         ["--pull", "all:0,0,3,1,0,0", "--hold", "all"],
         ["--hold", "all"],
         ["--scale", "all:0"],
+        ["--scale", "all:1,2"],
+        ["--scale", "all:1,2,0"],
+        ["--mirror", "all:w"],
+        ["--mirror", "all"],
         ["--scale", "all:-1"],
         ["--scale", "all:1e9"],
         ["--scale", "labels:x.npy:3"],

@@ -9,49 +9,101 @@ import numpy as np
 from imgui_bundle import imgui
 from imgui_bundle.imguizmo import im_guizmo
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from viewer.camera.view_camera import to_camera
-from viewer.state.transient import Gizmo
+from viewer.render.decal_surfaces import DecalSurfaces
+from viewer.state.transient import Gizmo, Pivot, Snap, Transform
+from viewer.state.workspace import Workspace, with_transient
+from viewer.ui.keys import Keys
 from viewer.ui.pointer import PointerContext
-from viewer.ui.widgets import accent_button, plate
+from viewer.ui.widgets import accent_button, choice, choice_row, label, plate, tip
+
+from . import select_tool, typed
 
 _OPERATION = im_guizmo.OPERATION
+_KEYS_HELP = """G, R or S moves, rotates or scales; then X, Y or Z (Shift: a plane), then a number.
+Enter or a click takes it, Esc or a right click undoes it"""
+_PIVOT_HELP = "Fixed point of rotations, scales and mirrors. Pointer: under the mouse when R or S is pressed"
+_SNAP_HELP = """Ground: the base stays on the ground.
+Surface: after G, the base follows the surface under the mouse, aligned with its normal"""
+_PIVOTS: dict[Pivot, str] = {"center": "Center", "base": "Base", "pointer": "Pointer"}
+_SNAPS: dict[Snap, str] = {"off": "Off", "ground": "Ground", "surface": "Surface"}
+_COLUMN_PX = 64.0  # at 1×: start of the fields
+_FIELD_PX = 72.0  # width of a field
+_BUTTON_PX = 72.0
+_STEPS_PER_RADIUS = 500.0  # pixels of a drag that move the part by the radius of the scene
 _HANDLES = _OPERATION(_OPERATION.translate | _OPERATION.rotate | _OPERATION.scaleu)
 
 
-def draw_gizmo(gizmo: Gizmo, pointer: PointerContext) -> tuple[Gizmo, str]:
-    """Draw the handles; return them after this frame's mouse input, and the request, "" for none."""
+def take_keys(work: Workspace, pointer: PointerContext, keys: Keys) -> tuple[Workspace, Keys]:
+    """Handle the keys of the handles and of the selection tool; return the unused keys."""
+    gizmo = work.transient.gizmo
+    if isinstance(gizmo, Gizmo):
+        if imgui.get_io().want_text_input:  # Enter and Escape end the field
+            return work, replace(keys, pressed=(), fly=frozenset())
+        moved, keys = typed.take_keys(gizmo, keys, pointer)
+        if moved is not gizmo:
+            work = with_transient(work, gizmo=moved)
+    return select_tool.take_keys(work, pointer, keys)
+
+
+def draw_gizmo(gizmo: Gizmo, pointer: PointerContext, surfaces: DecalSurfaces) -> tuple[Gizmo, str]:
+    """Draw the handles; return them after this frame's mouse input, and the request, "" for none.
+
+    Args:
+        gizmo: the handles
+        pointer: the view
+        surfaces: cache of the surface to snap to
+    """
     size = pointer.size
     camera = to_camera(pointer.shown.camera, *size)
     flip = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL looks along −z
     view = flip @ camera.viewmat.double().numpy()
     place = np.eye(4)
     place[:3, 3] = gizmo.center
+    pivot = np.eye(4)
+    pivot[:3, 3] = gizmo.pivot_at
     im_guizmo.begin_frame()
     im_guizmo.set_drawlist(imgui.get_background_draw_list())
     im_guizmo.set_rect(0.0, 0.0, pointer.area.width, pointer.area.height)
-    model = _columns(place @ gizmo.matrix)
+    im_guizmo.enable(gizmo.typed is None)
+    moved = typed.follow(gizmo, pointer, surfaces)
+    model = _columns(place @ moved.matrix @ pivot)
     projection = _columns(_projection(pointer.shown.camera.fov_y, size[0] / size[1], pointer.engine.near))
-    im_guizmo.manipulate(_columns(view), projection, _HANDLES, im_guizmo.MODE.world, model)
-    moved = np.linalg.inv(place) @ np.array(model.values, np.float64).reshape(4, 4).T
+    im_guizmo.manipulate(
+        _columns(view), projection, _HANDLES, im_guizmo.MODE.world, model, None, _steps(gizmo)
+    )
     using = bool(im_guizmo.is_using())
-    matrix = moved if using or gizmo.using else gizmo.matrix
-    request = "place" if gizmo.using and not using else _buttons(gizmo, pointer)
-    return replace(gizmo, matrix=matrix, using=using), request
+    if not using:  # while it is used, ImGuizmo counts every handle as under the mouse
+        moved = replace(moved, grip=_grip())
+    if using or gizmo.using:
+        world = np.array(model.values, np.float64).reshape(4, 4).T
+        moved = replace(moved, matrix=np.linalg.inv(place) @ world @ np.linalg.inv(pivot))
+    moved, request = _draw_panel(moved, pointer)
+    if moved.snap == "ground" and not np.array_equal(moved.matrix, gizmo.matrix):
+        moved = typed.on_ground(moved)
+    if moved.typed is not None and not imgui.get_io().want_capture_mouse:
+        if imgui.is_mouse_clicked(0):
+            moved = replace(moved, typed=None)
+        elif imgui.is_mouse_clicked(1):
+            moved = typed.undo(moved)
+    is_changed = not np.array_equal(moved.matrix, gizmo.shown)
+    if not using and (is_changed or gizmo.using):
+        moved = replace(moved, shown=moved.matrix)
+        request = request or "place"
+    return replace(moved, using=using), request
 
 
-def gizmo_takes_mouse(gizmo: Gizmo) -> bool:
-    """Return True if the mouse is over a handle or drags one."""
-    return gizmo.using or bool(im_guizmo.is_over())
+def gizmo_takes_mouse(before: Gizmo, after: Gizmo) -> bool:
+    """Return True if the mouse is over a handle or drags one, or gives or ends a transform by keys.
 
-
-def gizmo_step(gizmo: Gizmo) -> tuple[list[float], list[float], float]:
-    """Return translation, rotation (axis times radians) and scale of the selection."""
-    linear = gizmo.matrix[:3, :3]
-    scale = max(abs(float(np.linalg.det(linear))) ** (1 / 3), 1e-6)
-    rotation = Rotation.from_matrix(linear / scale).as_rotvec()
-    return gizmo.matrix[:3, 3].tolist(), rotation.tolist(), scale
+    Args:
+        before, after: the handles before and after this frame
+    """
+    if before.typed is not None:
+        ends = imgui.is_mouse_clicked(0) or imgui.is_mouse_clicked(1)
+        return ends or not before.typed.text
+    return after.using or bool(im_guizmo.is_over())
 
 
 def _columns(matrix: NDArray[np.float64]) -> im_guizmo.Matrix16:
@@ -70,14 +122,89 @@ def _projection(fov_y: float, aspect: float, near: float) -> NDArray[np.float64]
     return projection
 
 
-def _buttons(gizmo: Gizmo, pointer: PointerContext) -> str:
-    """Draw the buttons that keep or cancel the change at the top of the picture."""
-    scale = pointer.ui.scale
-    at = (pointer.area.width / 2, 14.0 * scale)
-    with plate("placing", at, pointer.ui, (0.5, 0.0)):
+def _grip() -> Transform:
+    """Return the transform of the handle under the mouse."""
+    if im_guizmo.is_over(_OPERATION.rotate):
+        return "rotate"
+    return "scale" if im_guizmo.is_over(_OPERATION.scaleu) else "move"
+
+
+def _steps(gizmo: Gizmo) -> im_guizmo.Matrix3 | None:
+    """Return the step of the dragged handle while Ctrl is held: 15°, or a factor of 0.1; None for none."""
+    if not imgui.get_io().key_ctrl or gizmo.grip == "move":
+        return None
+    step = typed.ANGLE_STEP_DEG if gizmo.grip == "rotate" else typed.SCALE_STEP
+    return im_guizmo.Matrix3([step] * 3)
+
+
+def _draw_panel(gizmo: Gizmo, pointer: PointerContext) -> tuple[Gizmo, str]:
+    """Draw the fields and the buttons at the top of the picture; return the handles and a request."""
+    ui = pointer.ui
+    at = (pointer.area.width / 2, 14.0 * ui.scale)
+    column = _COLUMN_PX * ui.scale
+    with plate("placing", at, ui, (0.5, 0.0)):
         imgui.align_text_to_frame_padding()
-        imgui.text("Copy" if gizmo.does == "duplicate" else "Move")
+        name = "Copy" if gizmo.does == "duplicate" else "Move"
+        if gizmo.typed is not None:
+            name = typed.describe(gizmo.typed, gizmo.matrix, pointer.shown.unit)
+        imgui.text(name)
+        tip(_KEYS_HELP)
+        button = _BUTTON_PX * ui.scale
+        imgui.same_line(column + 3 * _FIELD_PX * ui.scale - 2 * button)
+        request = "keep_placed" if accent_button("Keep", (button, 0.0)) else ""
         imgui.same_line()
-        request = "keep_placed" if accent_button("Keep", (72.0 * scale, 0.0)) else ""
-        imgui.same_line()
-        return "put_back" if imgui.button("Cancel", (72.0 * scale, 0.0)) else request
+        if imgui.button("Cancel", (button, 0.0)):
+            request = "put_back"
+        gizmo = _draw_fields(gizmo, pointer)
+        chosen = choice_row("Pivot", _PIVOTS, gizmo.pivot, column, ui, _PIVOT_HELP)
+        if chosen != gizmo.pivot:
+            gizmo = typed.with_pivot(gizmo, chosen)
+        snap = choice_row("Snap", _SNAPS, gizmo.snap, column, ui, _SNAP_HELP)
+        if snap != gizmo.snap:
+            gizmo = replace(gizmo, snap=snap)
+            if snap == "ground":
+                gizmo = typed.on_ground(gizmo)
+        label("Mirror", column)
+        axis = choice("mirror", {0: "X", 1: "Y", 2: "Z"}, None, ui)
+        tip("Mirror at the plane through the pivot, across this axis of the world")
+        if axis is not None:
+            gizmo = typed.mirrored(gizmo, axis)
+    return gizmo, request
+
+
+def _draw_fields(gizmo: Gizmo, pointer: PointerContext) -> Gizmo:
+    """Draw the fields of position, rotation and scale; return the handles after a change."""
+    before = typed.fields_of(gizmo)
+    origin = np.add(gizmo.center, pointer.facts.origin)
+    unit = pointer.shown.unit
+    step = unit * pointer.facts.bounds.radius / _STEPS_PER_RADIUS
+    scale = pointer.ui.scale
+    shown = unit * (before.position + origin)
+    typed_position = _field("Position", shown, step, "%.4g", scale)
+    position = before.position if typed_position is shown else typed_position / unit - origin
+    tip("Position of the pivot in units of the scene. Drag, or double-click and type")
+    angles = _field("Rotation", before.angles, 0.5, "%.4g°", scale)
+    tip("Rotation about X, then Y, then Z, in degrees. Drag, or double-click and type")
+    factors = _field("Scale", before.scale, 0.01, "%.4g", scale)
+    tip("Factors along the part's own axes; a negative one mirrors. Drag, or double-click and type")
+    after = typed.Fields(position, angles, factors)
+    if all(np.array_equal(a, b) for a, b in zip(vars(before).values(), vars(after).values(), strict=True)):
+        return gizmo
+    return replace(typed.with_fields(gizmo, before, after), typed=None)
+
+
+def _field(
+    name: str, values: NDArray[np.float64], speed: float, form: str, scale: float
+) -> NDArray[np.float64]:
+    """Draw three fields in a row; return their values. [3]"""
+    label(name, _COLUMN_PX * scale)
+    imgui.set_next_item_width(3 * _FIELD_PX * scale)
+    given = values.tolist()
+    changed, numbers = imgui.drag_float3(f"##{name}", given, speed, 0.0, 0.0, form)
+    if not changed:
+        return values
+    new = values.copy()
+    for i, number in enumerate(numbers):
+        if np.float32(number) != np.float32(given[i]):
+            new[i] = float(str(np.float32(number)))  # the shortest decimal that imgui's number stands for
+    return new

@@ -23,7 +23,7 @@ from viewer.ui.keys import COMMANDS, JOINED, TOPICS, Command, chords, find_comma
 from viewer.ui.pointer import PointerContext
 from viewer.ui.widgets import elide, group_digits, menu, search_field
 
-from . import color_tool, mouse, pull_tool, select_tool
+from . import color_tool, measure, mouse, pull_tool, select_tool
 
 MOUSE_HELP = (
     ("Left drag", "Orbit"),
@@ -276,11 +276,18 @@ def panels(
         work = perform_actions(work, requested, pointer)
     actions = []
     above = replace(area, height=area.height - timeline_bar.height(work, area, ui))
-    tools.draw_toolbar(work.view, above, ui, actions, isinstance(work.transient.gizmo, Pull))
+    tools.draw_toolbar(work.view, above, ui, actions, _active_tool(work))
     work, foot = tools.draw_options(work, above, ui, actions, select_tool.next_step(work))
     work = replace(work, view=tools.draw_view(work.view, above, foot, ui, actions))
     work, asked = draw_pill(work, pointer, compared, foot)
     return perform_actions(work, [*actions, *asked], pointer)
+
+
+def _active_tool(work: Workspace) -> str:
+    """Return the command of the active tool that is no part of the view; "" for none."""
+    if isinstance(work.transient.gizmo, Pull):
+        return "pull"
+    return "measure" if work.transient.measure is not None else ""
 
 
 def draw_pill(
@@ -331,6 +338,7 @@ def over_picture(
     overlay.draw_axes(view, area, on_axes or work.transient.tool.drag == overlay.AXES_DRAG, ui)
     if isinstance(work.transient.gizmo, Pull) and not original:
         pull_tool.draw_marks(work.transient.gizmo, pointer)
+    measure.draw(work, pointer)
     select_tool.draw_strokes(work, pointer)
     select_tool.draw_gesture(work.transient.tool.gesture, view, ui, pointer.left)
     at = work.transient.pointer.at

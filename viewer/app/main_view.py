@@ -48,10 +48,9 @@ from viewer.ui.keys import (
 )
 from viewer.ui.pointer import PointerContext
 
-from . import color_tool, interface, mouse, pull_tool, select_tool
+from . import color_tool, handles, interface, mouse, pull_tool, select_tool
 from .canvas import Canvas, FramePacer, LayersOf, RememberView, forget_view, no_layers
 from .decal import REST_S, DecalPlace, decal_takes_mouse, draw_decal, draw_ghosts, place_decal
-from .handles import draw_gizmo, gizmo_takes_mouse
 from .messages import Messages
 
 FIT_POLL_S = 0.25  # seconds between frames while a model of the surface under paint is computed
@@ -283,7 +282,7 @@ class MainView:
         asks = self._takes_keys()
         self._follow_keyboard(asks)
         if not asks:
-            work, self._keys = select_tool.take_keys(self.work, self._pointer(), self._keys)
+            work, self._keys = handles.take_keys(self.work, self._pointer(), self._keys)
             work, self._keys = pull_tool.take_keys(work, self._keys)
             self.store.replace(work)
         self._point_by_keys(asks)
@@ -373,8 +372,8 @@ class MainView:
         with self._guard():  # Escape also leaves handles that cannot be drawn
             draw_ghosts(self.work.transient, self._pointer())
             if isinstance(gizmo, Gizmo):
-                moved, asked = draw_gizmo(gizmo, self._pointer())
-                takes_mouse = gizmo_takes_mouse(moved)
+                moved, asked = handles.draw_gizmo(gizmo, self._pointer(), self.decal_surfaces)
+                takes_mouse = handles.gizmo_takes_mouse(gizmo, moved)
             elif isinstance(gizmo, Pull):
                 moved, asked, takes_mouse = pull_tool.update(gizmo, self.work, self._pointer(), pressed)
             elif gizmo is not None:

@@ -23,7 +23,7 @@ from viewer.ui.keys import TOOL_KEYS, Keys, any_button_down, has_pending_input, 
 from viewer.ui.overlay import Area
 from viewer.ui.pointer import PointerContext
 
-from . import color_tool, select_tool
+from . import color_tool, measure, select_tool
 
 REACH_PX = 8.0  # at 1×: the mouse grips the divider within this distance
 DIVIDER = "divider"
@@ -167,6 +167,8 @@ def _handle_press(work: Workspace, pointer: PointerContext) -> Workspace:
         return select_tool.click(work, pointer)
     if work.view.select.tool and plain and imgui.is_mouse_clicked(0):
         return with_tool(select_tool.press(work, pointer), drag=select_tool.SELECT_DRAG)
+    if measure.is_measuring(work) and plain and imgui.is_mouse_clicked(0):
+        return measure.click(work, pointer)
     camera = work.view.camera
     if imgui.is_mouse_double_clicked(0):
         return workspace.with_camera(work, _pick_pivot(camera, pointer))

@@ -12,8 +12,9 @@ from imgui_bundle import imgui
 from viewer.camera.view_camera import Vec3, ViewCamera, axes, with_up
 from viewer.pictures.compare import Labels
 from viewer.render import highlight
-from viewer.state.commands import Action, Plain, WithText
+from viewer.state.commands import Action, Plain, WithText, WithValue
 from viewer.state.layers import is_visible
+from viewer.state.transient import Measure
 from viewer.state.view_state import (
     LARGEST_PX,
     MAX_AMPLIFIED,
@@ -68,6 +69,7 @@ _TOOLS = (
         ("select_tool:color", Icon.COLOR),
         ("select_subject", Icon.SUBJECT),
     ),
+    (("measure", Icon.MEASURE),),
     (("paint_tool:color", Icon.COLOR_BRUSH), ("paint_tool:clone", Icon.CLONE)),
     (("brush", Icon.BRUSH), ("decal", Icon.DECAL), ("move_selected", Icon.MOVE), ("pull", Icon.PULL)),
 )
@@ -97,9 +99,7 @@ def _open_below(share: float, ui: UiContext) -> None:
     imgui.set_next_window_pos(at, 0, (share, 0.0))
 
 
-def draw_toolbar(
-    view: ViewState, area: Area, ui: UiContext, actions: list[Action], pulls: bool = False
-) -> None:
+def draw_toolbar(view: ViewState, area: Area, ui: UiContext, actions: list[Action], tool: str = "") -> None:
     """Draw the toolbar along the left edge of the picture.
 
     Args:
@@ -107,7 +107,7 @@ def draw_toolbar(
         area: the picture without the timeline
         ui: fonts and scale
         actions: receives the commands of pressed buttons
-        pulls: the Pull tool is active
+        tool: command of the active tool that is no part of the view, "" for none
     """
     active_tool: Action = WithText("navigate", view.camera.mode)
     if view.select.tool:
@@ -116,8 +116,8 @@ def draw_toolbar(
         active_tool = WithText("paint_tool", view.color_brush.tool)
     elif view.brush.active:
         active_tool = Plain("brush")
-    elif pulls:
-        active_tool = Plain("pull")
+    elif tool:
+        active_tool = Plain(tool)
     off = {"brush": not view.layers, "move_selected": not view.selection.count}
     count = sum(map(len, _TOOLS))
     gap = 6.0 * ui.scale
@@ -208,7 +208,8 @@ def draw_options(
     """
     view = work.view
     has_tool = view.select.tool or view.brush.active or view.color_brush.tool
-    if not (has_tool or view.painted or view.selection.count or view.selection.hidden):
+    measure = None if has_tool else work.transient.measure
+    if not (has_tool or measure or view.painted or view.selection.count or view.selection.hidden):
         return work, 0.0
     left = (TOOLBAR_PX + 2 * EDGE_PX) * ui.scale
     right = area.width - EDGE_PX * ui.scale
@@ -217,7 +218,9 @@ def draw_options(
     with plate("options", (left, EDGE_PX * ui.scale), ui):
         imgui.push_style_var(imgui.StyleVar_.item_spacing, (EDGE_PX * ui.scale, EDGE_PX * ui.scale))
         imgui.align_text_to_frame_padding()
-        if view.color_brush.tool or (view.painted and not has_tool):
+        if measure is not None:
+            _measure_options(measure, view.unit, bar, actions)
+        elif view.color_brush.tool or (view.painted and not has_tool):
             view = replace(view, color_brush=_color_options(view, bar, actions))
         elif view.brush.active:
             imgui.text("Paint")
@@ -282,6 +285,28 @@ def _select_options(tool: SelectTool, bar: _Bar) -> SelectTool:
         tolerance = bar.slider("Tolerance", tool.tolerance, (0.01, 1.0), SelectTool.tolerance, help_)
         tool = replace(tool, tolerance=tolerance)
     return tool
+
+
+def _measure_options(measure: Measure, unit: float, bar: _Bar, actions: list[Action]) -> None:
+    """Draw the distance and the field for its true length."""
+    imgui.text("Measure")
+    distance = measure.distance
+    if distance is None:
+        text = "Click the second point" if measure.points else "Click two points of the surface"
+        bar.follow(imgui.calc_text_size(text).x)
+        imgui.text_colored(imgui.ImVec4(*PALETTE.accent), text)
+        return
+    text = f"Distance {distance * unit:.5g}, true length"
+    wide = 96.0 * bar.ui.scale
+    bar.follow(imgui.calc_text_size(text).x + wide)
+    imgui.text(text)
+    imgui.same_line()
+    imgui.set_next_item_width(wide)
+    enters = imgui.InputTextFlags_.enter_returns_true.value
+    entered, length = imgui.input_double("##true length", distance * unit, 0.0, 0.0, "%.6g", enters)
+    tip("Type the true length and press Enter: the window shows lengths in its unit.\nFiles keep world units")
+    if entered and length > 0.0:
+        actions.append(WithValue("true_length", length))
 
 
 def _save(regions: int, bar: _Bar, actions: list[Action]) -> None:

@@ -5,6 +5,7 @@ Commands that only the window can perform (write a file, go full screen) are app
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -32,6 +33,7 @@ from .layers import (
     with_overshoot,
     with_paint,
 )
+from .transient import Measure
 from .view_state import BRUSH_MODES, FRAMES, PAINT_TOOLS, RESOLUTION_MODES, ViewState, following
 from .workspace import (
     MAX_ZOOM,
@@ -45,6 +47,7 @@ from .workspace import (
     loses_strengths,
     with_camera,
     with_layers_of,
+    with_transient,
 )
 
 
@@ -280,6 +283,21 @@ def _start_pull(workspace: Workspace, _: None) -> Workspace:
     )
 
 
+def _toggle_measure(workspace: Workspace, _: None) -> Workspace:
+    """Activate the measure tool, or deactivate it if it is active. Other tools are deactivated."""
+    measure = Measure() if workspace.transient.measure is None else None
+    return with_transient(replace(workspace, view=_without_tools(workspace.view)), measure=measure)
+
+
+def _set_unit(workspace: Workspace, true_length: float) -> Workspace:
+    """Set the true length of the measured distance, which sets the unit of length."""
+    measure = workspace.transient.measure
+    distance = None if measure is None else measure.distance
+    if not distance or not math.isfinite(true_length / distance) or true_length <= 0.0:
+        return workspace
+    return replace(workspace, view=replace(workspace.view, unit=true_length / distance))
+
+
 def _change_color_brush(workspace: Workspace, **changes: Any) -> Workspace:
     view = workspace.view
     return replace(workspace, view=replace(view, color_brush=replace(view.color_brush, **changes)))
@@ -334,7 +352,7 @@ def _resize(workspace: Workspace, times: float) -> Workspace:
 
 
 def _close_or_unfocus(workspace: Workspace, _: None) -> Workspace:
-    """Close the first active one, in this order: key list, brush, tool, form, multi-selection, focus."""
+    """Close the first active one, in this order: key list, brush, tool, measure, form, layers, focus."""
     if workspace.help:
         return replace(workspace, help=False)
     if workspace.view.brush.active:
@@ -344,6 +362,8 @@ def _close_or_unfocus(workspace: Workspace, _: None) -> Workspace:
     tool = workspace.view.select.tool
     if tool:
         return _toggle_tool(workspace, tool)
+    if workspace.transient.measure is not None:
+        return _toggle_measure(workspace, None)
     if workspace.form_open:
         return replace(workspace, form_open=False)
     if len(layer_selection.selected_layers(workspace)) > 1:
@@ -490,6 +510,8 @@ ACTIONS: dict[str, Callable[[Workspace, Any], Workspace]] = {
     "brush_softness": _soften,
     "paint_tool": _toggle_paint_tool,
     "pull": _start_pull,
+    "measure": _toggle_measure,
+    "true_length": _set_unit,
     "discard_paint": lambda w, _: replace(w, view=replace(w.view, painted=())),
     "overshoot": lambda w, _: replace(w, view=with_overshoot(w.view, not w.view.overshoot)),
     "snapshot": lambda w, _: replace(w, snapshots=snapshots.take(w.snapshots, w.view)),

@@ -52,6 +52,7 @@ class ViewSettings:
     grid: bool = False
     axes: bool = True
     safe_frame: str = ""
+    unit: float = 1.0
     dynamic_resolution: str = ViewState.dynamic_resolution
 
 
@@ -232,6 +233,7 @@ _VIEW_LABELS = {
     "grid": "ground grid",
     "axes": "axes",
     "safe_frame": "safe frame",
+    "unit": "unit of length",
     "dynamic_resolution": "dynamic resolution",
 }
 """Labels of the `ViewSettings` that are attributes of `ViewState`."""

@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.painting.projection import ViewSurface
 from progdf.painting.strokes import ColorStroke
@@ -44,6 +45,34 @@ class PreviewState(NamedTuple):
     near: str = ""  # expected difference of the trained edit: close, roughly or far; "" if not known
 
 
+Transform = Literal["move", "rotate", "scale"]
+
+
+@dataclass(frozen=True)
+class TypedTransform:
+    """Transform that a key began. A typed number or the mouse gives its value until a click or Enter."""
+
+    does: Transform
+    start: NDArray[np.float64] = field(compare=False)  # matrix of the handles before it. [4,4]
+    axes: str = ""  # world axes, such as "X", or "YZ" for a plane; "" for all, or for the view's axis
+    text: str = ""  # typed numbers, one per axis, separated by tabs; "" while the mouse gives the value
+    mouse: tuple[float, float] | None = None  # where the mouse was at the start, window pixels
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedPart:
+    """Geometry of the selection being placed, and its surroundings."""
+
+    points: NDArray[np.float64]  # centers of some of its Gaussians, from the center of all. [P,3]
+    up: Vec3  # unit vector
+    ground: float  # height of the ground along `up`, in the scene's coordinates
+    rest: Gaussians  # the scene without the selection
+
+
+Pivot = Literal["center", "base", "pointer"]
+Snap = Literal["off", "ground", "surface"]
+
+
 @dataclass(frozen=True)
 class Gizmo:
     """Handles around the selection being moved."""
@@ -53,6 +82,15 @@ class Gizmo:
     # from the original to the current position, about the center; world axes. [4,4]
     matrix: NDArray[np.float64] = field(compare=False)
     using: bool = False  # the mouse drags a handle
+    grip: Transform = "move"  # transform of the handle that the mouse drags, or is over
+    typed: TypedTransform | None = None  # transform by keys in progress
+    # matrix of the last picture, in which the selection has moved. [4,4]
+    shown: NDArray[np.float64] = field(default_factory=lambda: np.eye(4), compare=False)
+    pivot: Pivot = "center"  # fixed point of rotations and scales; "pointer": as a key begins them
+    pivot_at: Vec3 = (0.0, 0.0, 0.0)  # that point of the selection, from its center before the motion
+    snap: Snap = "off"  # what the base of the selection is placed on
+    angles: tuple[float, float, float] = (0.0, 0.0, 0.0)  # typed rotation about X, Y and Z, degrees
+    part: PlacedPart | None = field(default=None, compare=False)
 
     @property
     def is_moved(self) -> bool:
@@ -171,6 +209,18 @@ class Pull:
     def escape_request(self) -> str:
         """Name of the request that Escape makes; "" while it only ends a drag."""
         return "" if self.drag else "leave_pull"
+
+
+@dataclass(frozen=True)
+class Measure:
+    """Measured points of the surface."""
+
+    points: tuple[Vec3, ...] = ()  # at most two, in the scene's coordinates
+
+    @property
+    def distance(self) -> float | None:
+        """Distance of the two points, world units; None without two."""
+        return float(np.linalg.norm(np.subtract(*self.points))) if len(self.points) == 2 else None
 
 
 @dataclass(frozen=True)
@@ -314,6 +364,7 @@ class Transient:
     live: tuple[LayerState, ...] = ()  # edits in training, on top of the layer stack
     # handles of a selection being moved, a decal being placed, or the Pull tool
     gizmo: Gizmo | Decal | Pull | None = None
+    measure: Measure | None = None  # points of the measure tool while it is active
     ghosts: tuple[DecalGhost | PreviewGhost, ...] = ()  # edits in training that have no layer yet
     pointer: KeyPointer = KeyPointer()  # pointer of the active tool
     tool: MouseTool = MouseTool()  # drag and gesture of the mouse

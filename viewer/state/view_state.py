@@ -41,6 +41,7 @@ RESOLUTION_MODES = ("auto", "on", "off")
 """Values of `ViewState.dynamic_resolution`: if it saves time, always, never."""
 
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
+Unit = Annotated[float, Meta(gt=0.0, le=1e12)]
 Strength = Annotated[float, Meta(ge=0.0, le=OVERSHOOT)]
 Blend = Annotated[str, one_of(BLENDS)]
 Frame = Annotated[int, Meta(ge=0)]
@@ -191,6 +192,8 @@ class ViewState:
     groups: tuple[LayerGroup, ...] = ()  # layer groups, in no particular order
     collapsed: tuple[str, ...] = ()  # names of the groups that are collapsed in the panel
     cards: Annotated[str, one_of(CARD_MODES)] = "auto"  # one of `CARD_MODES`
+    # true length of a world unit, by which the window shows and reads lengths; files keep world units
+    unit: Unit = 1.0
 
 
 def on_another_scene(view: ViewState, camera: ViewCamera) -> ViewState:

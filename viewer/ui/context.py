@@ -97,6 +97,7 @@ class Icon:
     CLOSE = icons.ICON_FA_XMARK
     ORBIT = icons.ICON_FA_ARROWS_SPIN
     FLY = icons.ICON_FA_PAPER_PLANE
+    MEASURE = icons.ICON_FA_RULER
     DECAL = icons.ICON_FA_STAMP
     MOVE = icons.ICON_FA_UP_DOWN_LEFT_RIGHT
     PULL = icons.ICON_FA_HAND_BACK_FIST

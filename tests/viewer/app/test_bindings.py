@@ -54,7 +54,7 @@ INTERNAL = {
     *("move_snapshot", "choose_snapshot", "region", "show_region", "forget_region"),
     *("select_invert", "choose_keys", "move_keys", "clone_keys"),
     *("seek", "length", "fps", "go_to", "example", "forget_file", "use_view", "keep_view"),
-    *("carry_on", "look_behind", "refine_anyway", "fill_hole", "keep_pull", "leave_pull"),
+    *("carry_on", "look_behind", "refine_anyway", "fill_hole", "true_length", "keep_pull", "leave_pull"),
 }
 """Actions of buttons, questions and drags that need an argument, so the command palette omits them."""
 

@@ -20,18 +20,21 @@ from progdf.gaussians import Gaussians
 from progdf.gdf.file import UNSEEN_LOGIT, save_gdf
 from progdf.io.atomic import make_folder
 from progdf.region import Region, from_mask
-from progdf.tidy import Step, similarity, tidy
-from viewer.app.handles import gizmo_step
+from progdf.scene.subject import ground_height
+from progdf.similarity import AffineMotion, affine_motion
+from progdf.tidy import Step, tidy
 from viewer.app.messages import Requests
 from viewer.app.parts.edits import EditActions
+from viewer.camera.view_camera import Vec3
 from viewer.files.document import Document, DocumentStore
 from viewer.jobs.training import edits_folder, free_path
 from viewer.state import paint, selection
 from viewer.state.layers import visible_layers, with_paint
-from viewer.state.transient import Gizmo
+from viewer.state.transient import Gizmo, PlacedPart
 from viewer.state.view_state import LayerState, ViewState
 from viewer.state.workspace import Store, with_transient
 
+_MAX_POINTS = 5000  # points of a part that decide on its base
 _NAMES = {"remove": "removed", "transform": "moved", "duplicate": "copy"}
 _INSTRUCTIONS = {"remove": "remove", "transform": "move", "duplicate": "copy"}
 
@@ -100,6 +103,37 @@ def _copy_source(
     return composed[torch.from_numpy(np.flatnonzero(copied_own | copied_paint))]
 
 
+def _motion(gizmo: Gizmo) -> AffineMotion:
+    """Return the motion of the selection that the handles show, about their pivot."""
+    linear = torch.from_numpy(gizmo.matrix[:3, :3].copy())
+    offset = torch.tensor(gizmo.pivot_at, dtype=torch.float64)
+    moved = linear @ offset + torch.from_numpy(gizmo.matrix[:3, 3].copy())
+    pivot = torch.tensor(gizmo.center, dtype=torch.float64) + offset
+    return affine_motion(linear, moved - offset, pivot)
+
+
+def _placed_part(moved: Gaussians, document: Document, selected: Region, up: Vec3) -> PlacedPart:
+    """Return the geometry of the moved Gaussians.
+
+    Args:
+        moved: the Gaussians to move or copy
+        document: the open document
+        selected: the selection, which does not count as surroundings
+        up: up axis of the view
+    """
+    means = moved.means.double()
+    some = means[:: len(means) // _MAX_POINTS + 1]
+    x, y, z = torch.nn.functional.normalize(torch.tensor(up, dtype=torch.float64), dim=0).tolist()
+    unit = (x, y, z)
+    scene = document.original
+    logits = scene.logit_opacities.clone()
+    logits[selected.members] = -torch.inf
+    rest = replace(scene, logit_opacities=logits)
+    return PlacedPart(
+        (some - means.mean(dim=0)).numpy(), unit, ground_height(scene, torch.tensor(unit).float()), rest
+    )
+
+
 class TidyActions:
     """Layers that remove, move or copy the selection.
 
@@ -129,9 +163,9 @@ class TidyActions:
         }
 
     def leave_scene(self) -> None:
-        """Drop the handles when another scene opens."""
+        """Drop the handles and measured points when another scene opens."""
         self._selected = None
-        self._set_gizmo(None)
+        self._store.replace(with_transient(self._store.get(), gizmo=None, measure=None))
 
     def _begin(self, does: str) -> None:
         document = self._documents.get()
@@ -151,7 +185,8 @@ class TidyActions:
         center = moved.means.double().mean(dim=0)
         self._selected = selected
         at = (float(center[0]), float(center[1]), float(center[2]))
-        self._set_gizmo(Gizmo(kind, at, np.eye(4)))
+        part = _placed_part(moved, document, selected.region, self._store.get().view.camera.up)
+        self._set_gizmo(Gizmo(kind, at, np.eye(4), part=part))
         self._store.wake()
 
     def _remove(self, selected: _Selected) -> None:
@@ -177,14 +212,15 @@ class TidyActions:
         if not isinstance(gizmo, Gizmo) or selected is None:
             return []
         copied = selected.copied() if gizmo.does == "duplicate" else None
-        return [Step(gizmo.does, selected.region, similarity(*gizmo_step(gizmo)), copied)]
+        return [Step(gizmo.does, selected.region, _motion(gizmo), copied)]
 
     def _place(self, _: None) -> None:
         """Show the moved selection at the position of the handles."""
         if steps := self._steps():
             document = self._documents.get()
             leaves_paint = self._selected is not None and self._selected.leaves_paint
-            gdf = tidy(document.original, steps, _NAMES[steps[0].does], leaves_paint=leaves_paint)
+            name = _NAMES[steps[0].does]
+            gdf = tidy(document.original, steps, name, leaves_paint=leaves_paint, only_end=True)
             live = (LayerState(len(document.edits), gdf.name, 1.0),)
             self._documents.replace(document, (gdf,), live)
 
