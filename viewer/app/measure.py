@@ -19,7 +19,7 @@ def is_measuring(work: Workspace) -> bool:
     """Return True if clicks measure: the tool is active and no other one is."""
     view = work.view
     other = view.select.tool or view.brush.active or view.color_brush.tool
-    return work.transient.measure is not None and not other
+    return work.transient.measure is not None and work.transient.gizmo is None and not other
 
 
 def click(work: Workspace, pointer: PointerContext) -> Workspace:
