@@ -168,7 +168,7 @@ def _draw_panel(gizmo: Gizmo, pointer: PointerContext) -> tuple[Gizmo, str]:
         axis = choice("mirror", {0: "X", 1: "Y", 2: "Z"}, None, ui)
         tip("Mirror at the plane through the pivot, across this axis of the world")
         if axis is not None:
-            gizmo = typed.mirrored(gizmo, axis)
+            gizmo = typed.mirror_part(gizmo, axis)
     return gizmo, request
 
 

@@ -263,7 +263,7 @@ def _base(part: PlacedPart, linear: Floats) -> float:
     return float(np.quantile(heights, _BASE_SHARE))
 
 
-def mirrored(gizmo: Gizmo, axis: int) -> Gizmo:
+def mirror_part(gizmo: Gizmo, axis: int) -> Gizmo:
     """Mirror the part at the plane through the pivot, perpendicular to a world axis, 0 to 2."""
     flip = np.eye(3)
     flip[axis, axis] = -1.0
@@ -371,13 +371,13 @@ def describe(typed: TypedTransform, matrix: Floats, unit: float = 1.0) -> str:
         typed_text = "  ".join(part or "0" for part in f"{typed.text}_".split("\t"))
         words.append(typed_text)
     else:
-        words.append(_measured(typed, matrix, unit))
+        words.append(_mouse_value_text(typed, matrix, unit))
     if typed.does == "rotate":
         words[-1] += "°"
     return " ".join(words)
 
 
-def _measured(typed: TypedTransform, matrix: Floats, unit: float) -> str:
+def _mouse_value_text(typed: TypedTransform, matrix: Floats, unit: float) -> str:
     """Return the value that the mouse gives."""
     step = matrix @ np.linalg.inv(typed.start)
     if typed.does == "move":
