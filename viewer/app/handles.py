@@ -88,7 +88,8 @@ def draw_gizmo(gizmo: Gizmo, pointer: PointerContext, surfaces: DecalSurfaces) -
         elif imgui.is_mouse_clicked(1):
             moved = typed.undo(moved)
     is_changed = not np.array_equal(moved.matrix, gizmo.shown)
-    if not using and (is_changed or gizmo.using):
+    is_live = gizmo.does == "transform"  # a copy is shown where its handles are released
+    if (is_changed and (is_live or not using)) or (gizmo.using and not using):
         moved = replace(moved, shown=moved.matrix)
         request = request or "place"
     return replace(moved, using=using), request

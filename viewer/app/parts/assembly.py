@@ -167,7 +167,7 @@ def make_parts(
         start=start,
         up=UpActions(store=store, documents=documents, messages=messages),
         strays=StrayActions(store=store, documents=documents, messages=messages),
-        tidy=TidyActions(store=store, documents=documents, edits=edits),
+        tidy=TidyActions(store=store, documents=documents, edits=edits, engine=lambda: main_view.engine),
         painting=PaintingActions(store=store, documents=documents, messages=messages, queue=jobs.queue),
         pulling=PullActions(
             store=store,

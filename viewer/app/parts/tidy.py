@@ -16,9 +16,10 @@ from progdf.compose.added import rows_on
 from progdf.compose.layer_paint import layer_of
 from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
-from progdf.gaussians import Gaussians
-from progdf.gdf.file import UNSEEN_LOGIT, save_gdf
+from progdf.gaussians import Gaussians, pack
+from progdf.gdf.file import UNSEEN_LOGIT, Gdf, save_gdf
 from progdf.io.atomic import make_folder
+from progdf.pull.live import edit_in_progress, write_offsets
 from progdf.region import Region, from_mask
 from progdf.scene.subject import ground_height
 from progdf.similarity import AffineMotion, affine_motion
@@ -28,6 +29,7 @@ from viewer.app.parts.edits import EditActions
 from viewer.camera.view_camera import Vec3
 from viewer.files.document import Document, DocumentStore
 from viewer.jobs.training import edits_folder, free_path
+from viewer.render.engine import ViewEngine
 from viewer.state import paint, selection
 from viewer.state.layers import visible_layers, with_paint
 from viewer.state.transient import Gizmo, PlacedPart
@@ -141,14 +143,24 @@ class TidyActions:
         store: state of the window
         documents: the open document
         edits: adds the finished edit as a layer
+        engine: returns the engine that draws the window; None without a window
     """
 
-    def __init__(self, *, store: Store, documents: DocumentStore, edits: EditActions) -> None:
+    def __init__(
+        self,
+        *,
+        store: Store,
+        documents: DocumentStore,
+        edits: EditActions,
+        engine: Callable[[], ViewEngine] | None = None,
+    ) -> None:
+        self._engine = engine
         self._store = store
         self._documents = documents
         self._edits = edits
         self._selected: _Selected | None = None  # the Gaussians being moved or copied
         self._folder = Path()  # folder of new edits
+        self._live: Gdf | None = None  # preview of a move whose offsets can be written in place
 
     @property
     def requests(self) -> Requests:
@@ -164,7 +176,7 @@ class TidyActions:
 
     def leave_scene(self) -> None:
         """Drop the handles and measured points when another scene opens."""
-        self._selected = None
+        self._selected = self._live = None
         self._store.replace(with_transient(self._store.get(), gizmo=None, measure=None))
 
     def _begin(self, does: str) -> None:
@@ -218,11 +230,39 @@ class TidyActions:
         """Show the moved selection at the position of the handles."""
         if steps := self._steps():
             document = self._documents.get()
+            if steps[0].does == "transform" and not visible_layers(self._store.get().view):
+                self._place_alone(document, steps[0])
+                return
             leaves_paint = self._selected is not None and self._selected.leaves_paint
             name = _NAMES[steps[0].does]
             gdf = tidy(document.original, steps, name, leaves_paint=leaves_paint, only_end=True)
             live = (LayerState(len(document.edits), gdf.name, 1.0),)
             self._documents.replace(document, (gdf,), live)
+
+    def _place_alone(self, document: Document, step: Step) -> None:
+        """Show the moved selection of a scene without visible layers; only its offsets are written again."""
+        scene = document.original
+        members = step.region.members
+        rows = pack(scene[members], with_shN=scene.sh_degree > 0)
+        offsets = step.move(rows.double(), 1.0).to(rows.dtype) - rows
+        live = self._live
+        engine = None if self._engine is None else self._engine()
+        is_drawn = (
+            live is not None
+            and engine is not None
+            and len(engine.gdfs) > 0
+            and engine.gdfs[-1].field is live.field
+            and torch.equal(live.region.members, members)
+        )
+        if live is not None and engine is not None and is_drawn:
+            write_offsets(live, offsets)
+            engine.touch(engine.gdfs[-1])
+            self._store.wake()
+            return
+        gdf = edit_in_progress(scene, members.numpy(), rows.shape[1], _NAMES[step.does])
+        write_offsets(gdf, offsets)
+        self._documents.replace(document, (gdf,), (LayerState(len(document.edits), gdf.name, 1.0),))
+        self._live = gdf
 
     def _keep(self, _: None) -> None:
         gizmo = self._store.get().transient.gizmo
@@ -238,7 +278,7 @@ class TidyActions:
             self._documents.replace(self._documents.get())
 
     def _end(self) -> None:
-        self._selected = None
+        self._selected = self._live = None
         self._set_gizmo(None)
         self._store.wake()
 
