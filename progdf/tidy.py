@@ -208,10 +208,10 @@ def bake(scene: Gaussians, steps: Sequence[Step]) -> Gaussians:
 
 
 def _adds(step: Step) -> bool:
-    """Return True if changes by lower layers stay: a pull deforms what is seen, and a shift carries it along."""
-    return step.does == "pull" or (
-        step.does == "transform" and step.motion is not None and step.motion.is_shift
-    )
+    """Return True if changes by lower layers stay, as those below pulls and shifts do."""
+    if step.does == "pull":
+        return True
+    return step.does == "transform" and step.motion is not None and step.motion.is_shift
 
 
 def _rotates(step: Step) -> bool:

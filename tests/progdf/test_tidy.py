@@ -174,6 +174,18 @@ def test_stored_arc_is_within_half_a_pixel_of_512(degrees: float) -> None:
         assert float(error.norm(dim=1).max()) < 0.5 * extent / 512
 
 
+@pytest.mark.parametrize("blend", ["over", "adjust"])
+def test_shift_takes_the_shapes_of_lower_layers_along(blend: str) -> None:
+    scene = scene_of()
+    everything = whole_scene(scene)
+    scale = tidy(scene, [Step("transform", everything, similarity(turn=TURN, scale=0.7))], "scaled")
+    shift = tidy(scene, [Step("transform", everything, similarity((0.5, 0.0, -0.2)))], "moved")
+    below = compose_layers(scene, [Layer(scale)], blend)
+    both = compose_layers(scene, [Layer(scale), Layer(shift, 0.5)], blend)
+    assert torch.allclose(both.means, below.means + torch.tensor([0.25, 0.0, -0.1]), atol=1e-3)
+    assert torch.equal(both.log_scales, below.log_scales)
+
+
 @pytest.mark.parametrize("degree", [0, 2])
 def test_copy_in_place_is_the_region_twice(degree: int) -> None:
     scene = scene_of(degree)
