@@ -11,6 +11,7 @@ from imgui_bundle.imguizmo import im_guizmo
 from numpy.typing import NDArray
 
 from viewer.camera.view_camera import to_camera
+from viewer.panel import tools
 from viewer.render.decal_surfaces import DecalSurfaces
 from viewer.state.transient import Gizmo, Pivot, Snap, Transform
 from viewer.state.workspace import Workspace, with_transient
@@ -141,9 +142,9 @@ def _steps(gizmo: Gizmo) -> im_guizmo.Matrix3 | None:
 def _draw_panel(gizmo: Gizmo, pointer: PointerContext) -> tuple[Gizmo, str]:
     """Draw the fields and the buttons at the top of the picture; return the handles and a request."""
     ui = pointer.ui
-    at = (pointer.area.width / 2, 14.0 * ui.scale)
+    at = ((tools.TOOLBAR_PX + 2 * tools.EDGE_PX) * ui.scale, tools.EDGE_PX * ui.scale)
     column = _COLUMN_PX * ui.scale
-    with plate("placing", at, ui, (0.5, 0.0)):
+    with plate("placing", at, ui):
         imgui.align_text_to_frame_padding()
         name = "Copy" if gizmo.does == "duplicate" else "Move"
         if gizmo.typed is not None:

@@ -320,8 +320,11 @@ def fields_of(gizmo: Gizmo) -> Fields:
     position = pivot_of(gizmo, gizmo.matrix)
     angles = np.array(gizmo.angles)
     stretch = Rotation.from_euler("xyz", angles, degrees=True).as_matrix().T @ linear
-    is_symmetric = np.abs(stretch - stretch.T).max() <= _SAME_SHAPE * np.abs(stretch).max()
-    if is_symmetric and (np.linalg.eigvalsh(stretch) < 0.0).sum() <= 1:  # the last angles still hold
+    smallest = _SAME_SHAPE * np.abs(stretch).max()
+    negative = (np.linalg.eigvalsh((stretch + stretch.T) / 2.0) < 0.0).sum()
+    is_mirrored = negative == 1 and np.abs(stretch - np.diag(stretch.diagonal())).max() <= smallest
+    is_stretched = negative == 0 and np.abs(stretch - stretch.T).max() <= smallest
+    if is_mirrored or is_stretched:  # the last angles still hold
         return Fields(position, angles, stretch.diagonal().copy())
     motion = affine_motion(torch.from_numpy(linear.copy()), torch.zeros(3))
     scale = torch.linalg.matrix_exp(motion.stretch).diagonal().numpy().copy()

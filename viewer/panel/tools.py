@@ -14,7 +14,7 @@ from viewer.pictures.compare import Labels
 from viewer.render import highlight
 from viewer.state.commands import Action, Plain, WithText, WithValue
 from viewer.state.layers import is_visible
-from viewer.state.transient import Measure
+from viewer.state.transient import Gizmo, Measure
 from viewer.state.view_state import (
     LARGEST_PX,
     MAX_AMPLIFIED,
@@ -207,6 +207,8 @@ def draw_options(
         The changed workspace; the y of the bar's lower edge, 0 if there is none.
     """
     view = work.view
+    if isinstance(work.transient.gizmo, Gizmo):  # the panel of the handles is here
+        return work, 0.0
     has_tool = view.select.tool or view.brush.active or view.color_brush.tool
     measure = None if has_tool else work.transient.measure
     if not (has_tool or measure or view.painted or view.selection.count or view.selection.hidden):
