@@ -151,12 +151,6 @@ def _draw_panel(gizmo: Gizmo, pointer: PointerContext) -> tuple[Gizmo, str]:
             name = typed.describe(gizmo.typed, gizmo.matrix, pointer.shown.unit)
         imgui.text(name)
         tip(_KEYS_HELP)
-        button = _BUTTON_PX * ui.scale
-        imgui.same_line(column + 3 * _FIELD_PX * ui.scale - 2 * button)
-        request = "keep_placed" if accent_button("Keep", (button, 0.0)) else ""
-        imgui.same_line()
-        if imgui.button("Cancel", (button, 0.0)):
-            request = "put_back"
         gizmo = _draw_fields(gizmo, pointer)
         chosen = choice_row("Pivot", _PIVOTS, gizmo.pivot, column, ui, _PIVOT_HELP)
         if chosen != gizmo.pivot:
@@ -171,6 +165,12 @@ def _draw_panel(gizmo: Gizmo, pointer: PointerContext) -> tuple[Gizmo, str]:
         tip("Mirror at the plane through the pivot, across this axis of the world")
         if axis is not None:
             gizmo = typed.mirror_part(gizmo, axis)
+        button = _BUTTON_PX * ui.scale
+        imgui.set_cursor_pos_x(column)
+        request = "keep_placed" if accent_button("Keep", (button, 0.0)) else ""
+        imgui.same_line()
+        if imgui.button("Cancel", (button, 0.0)):
+            request = "put_back"
     return gizmo, request
 
 
