@@ -286,7 +286,7 @@ def transform_rows(rows: Tensor, motion: AffineMotion, share: float = 1.0) -> Te
         shN = bands.reshape(len(bands), -1, 3)
         bands = torch.lerp(shN, half_turn(shN, (parity[0], parity[1], parity[2])), share).flatten(1)
     turn = turn_quats(share * motion.turn[None])
-    bands = bands + band_change(bands, turn, torch.zeros(len(rows), dtype=torch.int64))
+    bands = bands + _turned_change(bands, turn)
     moved = pivot + share * motion.shift + (means - pivot) @ motion.linear(share).T
     mirrored = quats
     if bool((signs < 0.0).any()):
@@ -303,6 +303,16 @@ def transform_rows(rows: Tensor, motion: AffineMotion, share: float = 1.0) -> Te
     stretched, axes = _stretch_axes(log_scales, mirrored, stretch)
     axes = multiply_quats(turn, axes)
     return torch.cat([moved, stretched, axes, rows[:, APPEARANCE], bands], dim=1)
+
+
+def _turned_change(bands: Tensor, turn: Tensor) -> Tensor:
+    """Return the change of packed higher bands by one rotation. [M,3K], [1,4] -> [M,3K]"""
+    count = bands.shape[1] // 3
+    if not count:
+        return torch.zeros_like(bands)
+    matrix = rotation_change(torch.eye(count, dtype=bands.dtype)[None], turn)[0]
+    by_band = bands.reshape(-1, count, 3).transpose(0, 1).reshape(count, -1)
+    return (matrix @ by_band).reshape(count, -1, 3).transpose(0, 1).flatten(1)
 
 
 def _stretch_axes(log_scales: Tensor, quats: Tensor, stretch: Tensor) -> tuple[Tensor, Tensor]:

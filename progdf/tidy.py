@@ -185,7 +185,9 @@ def _opacity_course(
         cameras: see `tidy`
     """
     fades = end != scene.logit_opacities[rows]
-    if cameras is None or not bool(fades.any()):
+    if not bool(fades.any()):
+        return torch.tensor([0.0, 1.0]), torch.zeros(2, len(rows))
+    if cameras is None:
         return opacity_course(scene.logit_opacities[rows], end)
     knots, course = fading_course(scene, rows[fades], end[fades], cameras)
     offsets = torch.zeros(len(knots), len(rows))
