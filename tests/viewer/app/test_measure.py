@@ -78,7 +78,7 @@ def test_true_length_sets_the_unit_and_undo_restores_it() -> None:
 def test_click_beside_the_scene_measures_nothing() -> None:
     with rig(first_view(bear()), WINDOW) as hand:
         hand.key("Shift+M")
-        hand.click(60.0, 600.0)
+        hand.click(150.0, 75.0)
         assert hand.main_view.work.transient.measure == Measure()
 
 

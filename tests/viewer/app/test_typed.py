@@ -93,7 +93,7 @@ def test_typed_keys_give_exactly_the_transform(app: App, text: str) -> None:
     np.testing.assert_allclose(matrix[:3, :3], linear, atol=1e-15)
     np.testing.assert_allclose(matrix[:3, 3], shift, atol=1e-15)
     center = before.mean(dim=0)
-    expected = center + torch.tensor(shift) + (before - center) @ torch.from_numpy(linear).T
+    expected = center + torch.tensor(shift) + (before - center) @ torch.from_numpy(linear).double().T
     torch.testing.assert_close(means(app).double(), expected, atol=2e-5, rtol=0)
     if gizmo_of(app).typed is not None:
         strike(app, "Enter")
