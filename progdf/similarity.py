@@ -231,7 +231,8 @@ class AffineMotion:
         flip = torch.ones(3, dtype=torch.float64)
         if self.mirror is not None:
             flip[self.mirror] = 1.0 - 2.0 * share
-        return turned @ torch.linalg.matrix_exp(share * self.stretch) * flip
+        stretched: Tensor = torch.linalg.matrix_exp(share * self.stretch)
+        return turned @ (stretched * flip)
 
 
 def affine_motion(linear: Tensor, shift: Tensor, pivot: Tensor | None = None) -> AffineMotion:
