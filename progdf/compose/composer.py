@@ -20,6 +20,7 @@ from torch import Tensor
 from progdf.field.baked import AttributeBases, Segment, find_segment
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import Gdf
+from progdf.gdf.texture import ColorSplit, Split, color_split
 from progdf.threads import run_chunks
 
 from .added import extend
@@ -35,7 +36,10 @@ from .layers import (
     changed_edits,
     check_numbers,
     check_weights,
+    color_factors,
+    disc_changes,
     effects_of,
+    needs_split,
 )
 from .overlap import ARRANGED, find_paint
 from .paint_order import PaintOrder
@@ -125,18 +129,29 @@ class Composer:
         scene: the original, float32, which is never modified
         gdfs: every edit that may appear in the stack; their added rows come after the scene's own
         covers: `coverage`, or its values from another scene
+        split: `color_split`, or its values from another scene
 
     Raises:
         ProgdfError: an edit was made for another scene.
     """
 
-    def __init__(self, scene: Gaussians, gdfs: Sequence[Gdf], covers: Coverage = coverage) -> None:
+    def __init__(
+        self,
+        scene: Gaussians,
+        gdfs: Sequence[Gdf],
+        covers: Coverage = coverage,
+        split: Split = color_split,
+    ) -> None:
         scene, extended = extend(scene, gdfs)
         self._scene = scene
         self._gdfs = extended
         self._given = tuple(gdfs)  # kept alive, so that no other edit gets the same id
         self._index = {id(gdf): i for edits in (gdfs, extended) for i, gdf in enumerate(edits)}
         self._coverage: dict[int, Mapping[str, Tensor]] = {}
+        self._split = split
+        self._splits: dict[int, ColorSplit | None] = {}
+        self._color_bases: dict[tuple[int, str], _Bases] = {}
+        self._repainted: frozenset[int] = frozenset()  # edits whose discs have other colors than trained
         self._members = [gdf.region.members.numpy() for gdf in extended]
         self._bases = [
             {name: _Bases.of(bases) for name, bases in gdf.field.attributes.items()} for gdf in extended
@@ -144,17 +159,20 @@ class Composer:
         self._leaves_paint = [gdf.anchors is not None and gdf.anchors.leaves_paint for gdf in extended]
         moving = {name for bases in self._bases for name in bases}
         self._covers = covers
+        known = self._coverage_of, self._split_of
         followers = find_followers(extended, len(scene))
         self._surface = None
         if followers is not None:
-            self._surface = Surface(scene, extended, followers, self._coverage_of, Composer)
+            self._surface = Surface(scene, extended, followers, known, Composer)
             moving.update(FOLLOWED)
             moving.update(("shN",) if len(self._surface.banded) else ())
         paint = find_paint(scene, extended)
         self._paint = None
         if paint is not None:
-            self._paint = PaintOrder(scene, extended, paint, self._coverage_of, Composer)
+            self._paint = PaintOrder(scene, extended, paint, known, Composer)
             moving.update(ARRANGED)
+        if any(gdf.paints for gdf in extended):
+            moving.add("sh0")  # gains change the colors of discs
         before = {name: getattr(scene, name).detach().float() for name in ATTRIBUTES if name in moving}
         after: dict[str, Any] = {name: values.clone() for name, values in before.items()}
         self.gaussians = replace(scene, **after)
@@ -209,6 +227,10 @@ class Composer:
         if any(self._leaves_paint[edit] for edit in changed):  # Gaussians return from below their paint
             kinds = set(KINDS.values())
         moving = {name for edit in plan.colors.parts for name in self._bases[edit] if KINDS[name] in kinds}
+        repainted = frozenset(edit for edit, layer in stack if layer.gdf.paints and needs_split(layer))
+        if changed & (repainted | self._repainted):
+            moving.add("sh0")
+        self._repainted = repainted
         names = tuple(name for name in self._before if name in moving)
         arranged = () if self._paint is None else self._paint.names(changed, plan.arranged)
         moving.update(arranged)
@@ -291,12 +313,25 @@ class Composer:
         if blend == "adjust" and self._maps_others(stack):
             return self._write_adjusted(active, rows, names)
         parts = [self._part(members, edit, layer) for edit, layer in stack if edit in members.parts]
+        for edit in {part.edit for part in parts if needs_split(part.layer)}:
+            self._split_of(edit)  # ahead of the threads
         count = 1 + len(rows) // CHUNK
         cuts = [len(rows) * part // count for part in range(count + 1)]
         moves = run_chunks(
             lambda chunk: self._rewrite(rows, parts, names, blend, cuts[chunk], cuts[chunk + 1]), count
         )
+        if "sh0" in names:
+            self._color_discs(stack, members)
         return math.sqrt(max(moves))
+
+    def _color_discs(self, stack: Sequence[tuple[int, Layer]], members: _Members) -> None:
+        """Change the colors of painted discs by the gains of their layers, see `disc_changes`."""
+        splits = [self._split_of(edit) if needs_split(layer) else None for edit, layer in stack]
+        for gdf, change in disc_changes([layer for _, layer in stack], splits):
+            index, at = members.parts[self._index[id(gdf)]]
+            first = len(gdf.region) - len(change)
+            is_disc = index >= first
+            self._after["sh0"][members.rows[at[is_disc]]] += change.numpy()[index[is_disc] - first]
 
     def _maps_others(self, stack: Sequence[tuple[int, Layer]]) -> bool:
         """Return whether a grade lies over Gaussians of a lower layer and maps their colors."""
@@ -321,7 +356,13 @@ class Composer:
         Other rows are left as they are, because they may follow their anchors or lie in the order of paint.
         """
         covers = {id(gdf): self._coverage_of(edit) for edit, gdf in enumerate(self._gdfs)}
-        at, new = changed_rows(self._scene, layers, "adjust", lambda _, gdf: covers[id(gdf)])
+        at, new = changed_rows(
+            self._scene,
+            layers,
+            "adjust",
+            lambda _, gdf: covers[id(gdf)],
+            lambda _, gdf: self._split_of(self._index[id(gdf)]),
+        )
         changed = at.numpy()
         is_written = np.isin(changed, rows, assume_unique=True)
         written = changed[is_written]
@@ -358,21 +399,18 @@ class Composer:
             pushing = []
             for part in parts:
                 bases = self._bases[part.edit].get(name)
-                gain = part.layer.gain(name)
-                if bases is None or gain == 0:
+                factors = color_factors(part.layer, name, self._splits.get(part.edit))
+                if bases is None or factors == (0.0, 0.0):
                     continue
                 if KINDS[name] in part.layer.pushed_kinds:
                     pushing.append(part)
                     continue
-                used, factors = bases.factors(part.segment)
                 covered = (
                     self._coverage_of(part.edit)[KINDS[name]].numpy() if blend in ORDERED else _NO_VALUES
                 )
-                hidden = np.float32(part.layer.clamped_strength) * np.float32(min(abs(gain), 1.0))
-                selection = part.at, part.members, part.weights
-                stored = (bases.end, bases.residual)
-                scale = np.float32(gain)
-                add_offsets(total, selection, stored, used, factors, scale, hidden, covered)
+                gain = min(abs(part.layer.gain(name)), 1.0)
+                hidden = np.float32(part.layer.clamped_strength) * np.float32(gain)
+                self._add(total, part, name, factors, hidden, covered)
             weight_sum = weight_sums.get(KINDS[name], _NO_VALUES)
             if pushing:
                 kept = _kept_pushes(parts, len(rows))
@@ -381,6 +419,44 @@ class Composer:
             moved = write_rows(after, self._before[name], rows, total, weight_sum, name == "means")
             largest = max(largest, moved)
         return largest
+
+    def _add(
+        self,
+        total: Floats,
+        part: _LayerSlice,
+        name: str,
+        gains: tuple[float, float],
+        hidden: np.float32,
+        covered: Floats,
+    ) -> None:
+        """Add a layer's offsets of one attribute and their color part; hide the layers below.
+
+        Args:
+            total: sums so far, updated in place. [U,c]
+            part: the layer's members
+            name: attribute
+            gains: see `color_factors`
+            hidden, covered: see `add_offsets`
+        """
+        bases = [self._bases[part.edit][name], self._color_part(part.edit, name) if gains[1] else None]
+        for each, gain in zip(bases, gains, strict=True):
+            if each is None:
+                continue
+            used, factors = each.factors(part.segment)
+            selection = part.at, part.members, part.weights
+            stored = (each.end, each.residual)
+            add_offsets(total, selection, stored, used, factors, np.float32(gain), hidden, covered)
+            hidden = np.float32(0.0)
+            covered = _NO_VALUES
+
+    def _color_part(self, edit: int, name: str) -> _Bases | None:
+        """Return the bases of an edit's color apart from its texture; None if this attribute has none."""
+        split = self._splits.get(edit)
+        if split is None or split.color is None or name not in split.color.attributes:
+            return None
+        if (edit, name) not in self._color_bases:
+            self._color_bases[edit, name] = _Bases.of(split.color.attributes[name])
+        return self._color_bases[edit, name]
 
     def _add_pushes(
         self, total: Floats, parts: Sequence[_LayerSlice], name: str, weight_sum: Floats, kept: Floats
@@ -400,12 +476,8 @@ class Composer:
         is_direct = len(parts) == 1 and not len(kept)  # a single push is the largest one
         for part in parts:
             push = total if is_direct else np.full(total.shape, -0.0, np.float32)
-            bases = self._bases[part.edit][name]
-            used, factors = bases.factors(part.segment)
-            selection = part.at, part.members, part.weights
-            stored = (bases.end, bases.residual)
-            scale = np.float32(part.layer.gain(name))
-            add_offsets(push, selection, stored, used, factors, scale, np.float32(0.0), _NO_VALUES)
+            factors = color_factors(part.layer, name, self._splits.get(part.edit))
+            self._add(push, part, name, factors, np.float32(0.0), _NO_VALUES)
             if not is_direct:
                 keep_larger(largest, push)
         if len(kept):
@@ -469,6 +541,12 @@ class Composer:
         if edit not in self._coverage:
             self._coverage[edit] = self._covers(self._scene, self._gdfs[edit])
         return self._coverage[edit]
+
+    def _split_of(self, edit: int) -> ColorSplit | None:
+        """Return `color_split` of an edit. It is computed when a layer's gains first divide its color."""
+        if edit not in self._splits:
+            self._splits[edit] = self._split(self._scene, self._gdfs[edit])
+        return self._splits[edit]
 
     def _check_weights(self, layers: Sequence[Layer]) -> None:
         """Check weights that are new or were modified, see `check_weights`."""

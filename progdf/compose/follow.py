@@ -26,7 +26,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from progdf.field.baked import AttributeBases, BakedField, GradeForm
+from progdf.field.baked import BakedField, GradeForm
 from progdf.gaussians import BASE_CHANNELS, Gaussians
 from progdf.gdf.anchors import free_anchors
 from progdf.gdf.file import Gdf, fingerprint
@@ -251,13 +251,7 @@ def state_scene(
     parts = []
     for gdf, (members, index) in zip(gdfs, followers.changed, strict=True):
         at = torch.from_numpy(index)
-        attributes = {
-            name: AttributeBases(
-                bases.end_offset[at], bases.residual_basis[:, at], bases.scale, bases.coefficients
-            )
-            for name, bases in gdf.field.attributes.items()
-            if name in names
-        }
+        attributes = {name: bases.take(at) for name, bases in gdf.field.attributes.items() if name in names}
         score = torch.zeros(len(states))
         score[members] = 1.0
         region = Region(gdf.region.name, torch.from_numpy(members), score)

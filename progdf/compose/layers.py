@@ -15,6 +15,7 @@ from torch import Tensor
 from progdf.errors import ProgdfError
 from progdf.gdf.anchors import NOTHING
 from progdf.gdf.file import Gdf
+from progdf.gdf.texture import ColorSplit
 
 BLENDS = ("normalized", "sum", "over", "adjust")
 """Blend rules for layers that share a Gaussian, see `progdf.compose.reference.compose_layers`."""
@@ -30,8 +31,11 @@ KINDS = {
     "sh0": "color",
     "shN": "color",
 }
-"""Kind of change for each attribute, which is the name of its gain."""
+"""Kind of change for each attribute, which is the name of its gain. Colors have a second gain, `texture`."""
 
+
+MAX_TEXTURE = 2.0
+"""Largest gain of texture. Gains above 1 exaggerate it."""
 
 _Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 
@@ -42,7 +46,8 @@ class Gains:
 
     geometry: _Share = 1.0
     opacity: _Share = 1.0
-    color: _Share = 1.0
+    color: _Share = 1.0  # of the map of the region's colors, see `progdf.gdf.texture`
+    texture: Annotated[float, msgspec.Meta(ge=0.0, le=MAX_TEXTURE)] = 1.0  # of the remaining change of color
 
 
 @dataclass(frozen=True)
@@ -89,6 +94,52 @@ class Layer:
     def gain(self, attribute: str) -> float:
         """Return the gain of an attribute."""
         return float(getattr(self.gains, KINDS[attribute]))
+
+
+def color_factors(layer: Layer, name: str, split: ColorSplit | None) -> tuple[float, float]:
+    """Return the factors of a layer's offsets of an attribute, and of their color part.
+
+    Args:
+        layer: the layer
+        name: attribute
+        split: see `color_split`; it may be None if the gains of color and texture are equal
+    """
+    gains = layer.gains
+    if KINDS[name] != "color" or split is None:
+        return layer.gain(name), 0.0
+    return gains.texture, 0.0 if split.color is None else gains.color - gains.texture
+
+
+def needs_split(layer: Layer) -> bool:
+    """Return whether the gains of a layer divide its color from its texture."""
+    repainted = layer.gdf.paints and (layer.gains.color, layer.gains.texture) != (1.0, 1.0)
+    return layer.gains.color != layer.gains.texture or repainted
+
+
+def disc_changes(layers: Sequence[Layer], splits: Sequence[ColorSplit | None]) -> list[tuple[Gdf, Tensor]]:
+    """Return the changes that gains make to the discs of painted layers: the edit, and band 0. [B,3]
+
+    Of two layers of one edit, the stronger one shows, see `progdf.compose.overlap`.
+
+    Args:
+        layers: active layers, lowest first
+        splits: see `color_split`; None where `needs_split` is false
+    """
+    strongest: dict[int, tuple[float, Layer, ColorSplit | None]] = {}
+    for layer, split in zip(layers, splits, strict=True):
+        if not layer.gdf.paints:
+            continue
+        opacity = layer.clamped_strength * min(abs(layer.gains.opacity), 1.0)
+        known = strongest.get(id(layer.gdf))
+        if known is None or opacity >= known[0]:
+            strongest[id(layer.gdf)] = opacity, layer, split
+    changes = []
+    for _, layer, split in strongest.values():
+        if split is not None and split.discs is not None:
+            color, texture = layer.gains.color, layer.gains.texture
+            change = (texture - 1.0) * split.discs.change + (color - texture) * split.discs.color
+            changes.append((layer.gdf, change))
+    return changes
 
 
 def check_layers(layers: Sequence[Layer], blend: str) -> None:

@@ -83,7 +83,7 @@ def find_paint(scene: Gaussians, gdfs: Sequence[Gdf]) -> PaintRows | None:
         scene: the extended scene
         gdfs: its edits
     """
-    paints = [edit for edit, gdf in enumerate(gdfs) if is_paint(gdf)]
+    paints = [edit for edit, gdf in enumerate(gdfs) if gdf.paints]
     if not paints:
         return None
     counts = {edit: added_count(gdfs[edit]) for edit in paints}
@@ -131,11 +131,6 @@ def find_paint(scene: Gaussians, gdfs: Sequence[Gdf]) -> PaintRows | None:
     return PaintRows(rows, edits, members, rim, outward, placed, spans)
 
 
-def is_paint(gdf: Gdf) -> bool:
-    """Return whether an edit of an extended scene adds rows of paint."""
-    return gdf.anchors is not None and bool(gdf.anchors.pushes) and len(gdf.anchors) > 0
-
-
 def tints_rim(gdf: Gdf) -> bool:
     """Return whether an edit changes colors below the rims of other edits' paint.
 
@@ -153,7 +148,7 @@ def paint_layers(stack: Sequence[tuple[int, Layer]]) -> list[PaintLayer]:
     """
     layers = []
     for edit, layer in stack:
-        if is_paint(layer.gdf):
+        if layer.gdf.paints:
             weights = None if layer.weights is None else layer.weights.float().numpy()
             gain = min(abs(layer.gains.opacity), 1.0)
             layers.append(PaintLayer(edit, layer.clamped_strength * gain, weights))

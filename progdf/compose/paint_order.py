@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
@@ -31,7 +30,7 @@ from .overlap_kernel import (
     write_logits,
 )
 from .paint_sheets import Overlap
-from .states import MakeComposer, States
+from .states import Known, MakeComposer, States
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -57,7 +56,7 @@ class PaintOrder:
         scene: the extended scene
         gdfs: its edits
         paint: see `find_paint`
-        coverage_of: function from the index of an edit to its coverage
+        known: values of the edits in the scene
         make: constructor of the composer of the states
     """
 
@@ -66,7 +65,7 @@ class PaintOrder:
         scene: Gaussians,
         gdfs: Sequence[Gdf],
         paint: PaintRows,
-        coverage_of: Callable[[int], Mapping[str, Tensor]],
+        known: Known,
         make: MakeComposer,
     ) -> None:
         self.paint = paint
@@ -89,7 +88,7 @@ class PaintOrder:
         found = find_rims(gdfs, len(scene), paint)
         self._states = None
         if found is not None:
-            self._states = States(scene, gdfs, found, coverage_of, COLORS, make)
+            self._states = States(scene, gdfs, found, known, COLORS, make)
             self._tinted = np.searchsorted(paint.rows, found.rows)  # indices of the rows that have states
 
     def names(self, changed: Collection[int], rows: Rows) -> Collection[str]:

@@ -109,6 +109,6 @@ def compose_picture(
     composed = []
     for layer in stack:
         state = layer.state
-        gains = Gains(state.geometry, state.opacity, state.color)
+        gains = Gains(state.geometry, state.opacity, state.color, state.texture)
         composed.append(layer_of(edits[id(layer.gdf)], state.strength, gains, state.paint))
     return compose_layers(extended, composed, blend)

@@ -20,6 +20,7 @@ from progdf.field.baked import BakedField, GradeForm
 from progdf.field.grade import adjust_colors, map_share
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import Gdf
+from progdf.gdf.texture import ColorSplit, Split, color_split
 from progdf.sh import C0
 
 from .added import extend
@@ -33,7 +34,17 @@ from .follow import (
     turn_bands,
     unpack_shapes,
 )
-from .layers import BLENDS, KINDS, ORDERED, Gains, Layer, check_layers
+from .layers import (
+    BLENDS,
+    KINDS,
+    ORDERED,
+    Gains,
+    Layer,
+    check_layers,
+    color_factors,
+    disc_changes,
+    needs_split,
+)
 from .overlap import ARRANGED, arrange, find_paint, paint_layers, tints_rim
 
 # changes that are clearly visible
@@ -159,6 +170,9 @@ def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "norm
       edit as trained, and darkened stripes stay stripes. A member whose change comes more from the residual
       than from the map lies over the lower layers to that extent, see `map_share`. So dark gaps between
       stripes stay dark.
+
+    A color change has a gain for the map of the region's colors and one for the remainder, its texture, see
+    `progdf.gdf.texture`. In "over" |g| is the gain of color: texture alone hides no lower layer.
 
     Paint makes way for its discs by changes of the scene's Gaussians (see `Anchors.pushes`). These take no
     part in the rule. The largest such change of a Gaussian is added to the result of the other layers. It
@@ -296,7 +310,11 @@ def _follow(scene: Gaussians, composed: Gaussians, layers: Sequence[Layer], blen
 
 
 def changed_rows(
-    scene: Gaussians, layers: Sequence[Layer], blend: str, covers: Coverage = coverage
+    scene: Gaussians,
+    layers: Sequence[Layer],
+    blend: str,
+    covers: Coverage = coverage,
+    split: Split = color_split,
 ) -> tuple[Tensor, dict[str, Any]]:
     """Return the rows that `compose_layers` changes and their new values, without a copy of the scene.
 
@@ -305,11 +323,12 @@ def changed_rows(
         layers: active layers, at least one, checked
         blend: one of `BLENDS`
         covers: `coverage`, or a cached version of it
+        split: `color_split`, or a cached version of it
 
     Returns:
         Sorted rows [U] int64, and the new values of each changed attribute [U,...].
     """
-    rows, parts = _parts(scene, layers, blend, covers)
+    rows, parts = _parts(scene, layers, blend, covers, split)
     weight_sums = {kind: torch.zeros(len(rows)) for kind in KINDS.values()}  # Σ m s
     for part in parts:
         for kind in part.layer.blended_kinds:
@@ -320,7 +339,8 @@ def changed_rows(
     changed: dict[str, Any] = {}
     for name in ATTRIBUTES:
         movers = [part for part in parts if part.moves(name)]
-        if not movers:
+        discs = disc_changes(layers, [part.split for part in parts]) if name == "sh0" else []
+        if not movers and not discs:
             continue
         old: Tensor = getattr(scene, name)
         total = adjusted.get(name, torch.full((len(rows), old[0].numel()), NEGATIVE_ZERO))
@@ -333,6 +353,11 @@ def changed_rows(
         if pushing:
             total = total + _largest_push(pushing, name, total) * _kept_pushes(parts, len(rows))
         changed[name] = old[rows] + total.reshape(-1, *old.shape[1:]).to(old.dtype)
+        for gdf, change in discs:
+            painted = gdf.region.members[-len(change) :]
+            at = torch.searchsorted(rows, painted).clamp(max=len(rows) - 1)
+            found = rows[at] == painted  # rows of weight 0 are absent
+            changed[name][at[found]] += change[found].reshape(-1, *old.shape[1:]).to(old.dtype)
     return rows, changed
 
 
@@ -347,17 +372,39 @@ class _LayerMembers:
     # share of lower layers that this layer hides, see `coverage`; empty for rules without an order. [M]
     # float32
     coverage: Mapping[str, Tensor]
+    split: ColorSplit | None = None  # color and texture of the edit, if the layer's gains divide them
 
     def add(self, total: Tensor, name: str, hides: bool) -> None:
         """Add the layer's offsets of one attribute to the sums. [U,c]"""
-        weight = self.weights[:, None]
-        gain = self.layer.gain(name)
         below = total[self.rows]
         if hides:
-            hidden = torch.tensor(self.layer.clamped_strength) * torch.tensor(min(abs(gain), 1.0))
-            below = below * (1 - weight * hidden * self.coverage[KINDS[name]][self.members, None])
-        offsets = self.layer.gdf.field.attribute_offsets(name, self.layer.strength)[self.members]
-        total[self.rows] = below + weight * gain * offsets
+            gain = min(abs(self.layer.gain(name)), 1.0)
+            hidden = torch.tensor(self.layer.clamped_strength) * torch.tensor(gain)
+            below = below * (
+                1 - self.weights[:, None] * hidden * self.coverage[KINDS[name]][self.members, None]
+            )
+        total[self.rows] = self.add_offsets(below, name)
+
+    def add_offsets(self, below: Tensor, name: str) -> Tensor:
+        """Return sums of these members plus the layer's offsets of one attribute times its gains. [m,c]"""
+        weight = self.weights[:, None]
+        strength = self.layer.strength
+        factor, color_factor = color_factors(self.layer, name, self.split)
+        offsets = self.layer.gdf.field.attribute_offsets(name, strength)[self.members]
+        total = below + weight * factor * offsets
+        if self.split is not None and self.split.color is not None and color_factor != 0.0:
+            color = self.split.color
+            if name in color.attributes:
+                total = total + weight * color_factor * color.attribute_offsets(name, strength)[self.members]
+        return total
+
+    def grade_shares(self, form: GradeForm) -> tuple[Tensor, float]:
+        """Return the shares of a grade's map for all members [M], and of its residual."""
+        gain = self.layer.gains.color
+        if self.split is None:
+            return gain * form.share, gain
+        texture = self.layer.gains.texture
+        return texture * form.share + (gain - texture) * self.split.map_share, texture
 
     def pushes(self, attribute: str) -> bool:
         """Return whether the layer changes an attribute only to make way for its paint."""
@@ -365,7 +412,8 @@ class _LayerMembers:
 
     def moves(self, attribute: str) -> bool:
         """Return whether the layer changes an attribute."""
-        return attribute in self.layer.gdf.field.attributes and self.layer.gain(attribute) != 0
+        factors = color_factors(self.layer, attribute, self.split)
+        return attribute in self.layer.gdf.field.attributes and factors != (0.0, 0.0)
 
 
 def _largest_push(parts: Sequence[_LayerMembers], name: str, total: Tensor) -> Tensor:
@@ -378,8 +426,8 @@ def _largest_push(parts: Sequence[_LayerMembers], name: str, total: Tensor) -> T
     """
     largest = torch.full_like(total, NEGATIVE_ZERO)
     for part in parts:
-        offsets = part.layer.gdf.field.attribute_offsets(name, part.layer.strength)[part.members]
-        push = part.weights[:, None] * part.layer.gain(name) * offsets
+        zero = torch.full_like(total[part.rows], NEGATIVE_ZERO)
+        push = part.add_offsets(zero, name)
         below = largest[part.rows]
         is_larger = push.square().sum(dim=1) >= below.square().sum(dim=1)
         largest[part.rows] = torch.where(is_larger[:, None], push, below)
@@ -418,10 +466,9 @@ def _adjusted_colors(scene: Gaussians, rows: Tensor, parts: Sequence[_LayerMembe
                 for n in names
             ]
             members = torch.arange(len(part.layer.gdf.region))[part.members][is_touched]
-            change = adjust_colors(
-                form, torch.cat(sh, dim=1)[:, :_DRAWN_COEFFICIENTS], members, part.layer.strength
-            )
-            factor = part.weights[is_touched, None, None] * part.layer.gain("sh0")
+            drawn = torch.cat(sh, dim=1)[:, :_DRAWN_COEFFICIENTS]
+            change = adjust_colors(form, drawn, members, part.layer.strength, part.grade_shares(form))
+            factor = part.weights[is_touched, None, None]
             share = part.coverage["map"][members, None]
             for name, bands in zip(names, (change[:, :1], change[:, 1:]), strict=False):
                 sums = total[name][part.rows]
@@ -434,7 +481,7 @@ def _adjusted_colors(scene: Gaussians, rows: Tensor, parts: Sequence[_LayerMembe
 
 
 def _parts(
-    scene: Gaussians, layers: Sequence[Layer], blend: str, covers: Coverage
+    scene: Gaussians, layers: Sequence[Layer], blend: str, covers: Coverage, split: Split
 ) -> tuple[Tensor, list[_LayerMembers]]:
     """Return the sorted rows of the scene that change, [U] int64, and each layer's members in them."""
     chosen: list[tuple[Tensor | slice, Tensor]] = []  # members and their weights
@@ -456,6 +503,7 @@ def _parts(
             _ALL_ROWS if len(layer_rows) == len(rows) else position[layer_rows],
             weights,
             covers(scene, layer.gdf) if blend in ORDERED else {},
+            split(scene, layer.gdf) if needs_split(layer) else None,
         )
         for layer, layer_rows, (members, weights) in zip(layers, reached, chosen, strict=True)
     ]

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
+from progdf.gdf.texture import ColorSplit, Split
 from progdf.threads import run_chunks
 
 from .follow import (
@@ -62,8 +63,10 @@ class StateComposer(Protocol):
         """Return the followed attributes of `gaussians`."""
 
 
-MakeComposer = Callable[[Gaussians, Sequence[Gdf], Coverage], StateComposer]
+MakeComposer = Callable[[Gaussians, Sequence[Gdf], Coverage, Split], StateComposer]
 """Constructor of `Composer`."""
+Known = tuple[Callable[[int], Mapping[str, Tensor]], Callable[[int], ColorSplit | None]]
+"""Functions from the index of an edit to its coverage, and to its color apart from its texture."""
 
 
 class States:
@@ -73,7 +76,7 @@ class States:
         scene: the extended scene
         gdfs: its edits
         followers: the rows and their states
-        coverage_of: function from the index of an edit to its coverage
+        known: values of the edits in the scene
         names: attributes of the states that are composed
         make: constructor of the composer
     """
@@ -83,15 +86,15 @@ class States:
         scene: Gaussians,
         gdfs: Sequence[Gdf],
         followers: Followers,
-        coverage_of: Callable[[int], Mapping[str, Tensor]],
+        known: Known,
         names: Sequence[str],
         make: MakeComposer,
     ) -> None:
         self.followers = followers
         self.before, self._gdfs = state_scene(scene, gdfs, followers, names)
         self._index = {id(gdf): edit for edit, gdf in enumerate(self._gdfs)}
-        self._coverage_of = coverage_of
-        self.composer = make(self.before, self._gdfs, self._covers)
+        self._coverage_of, self._split_of = known
+        self.composer = make(self.before, self._gdfs, self._covers, self._split)
         self._sliced: dict[
             int, tuple[Tensor, int, Tensor]
         ] = {}  # by edit: weights, their version, and a part
@@ -130,6 +133,12 @@ class States:
         members = torch.from_numpy(self.followers.changed[edit][1])
         return {kind: share[members] for kind, share in self._coverage_of(edit).items()}
 
+    def _split(self, _: Gaussians, gdf: Gdf) -> ColorSplit | None:
+        """Return the color and the texture that an edit of the states has in the scene."""
+        edit = self._index[id(gdf)]
+        found = self._split_of(edit)
+        return None if found is None else found.take(torch.from_numpy(self.followers.changed[edit][1]))
+
 
 class Surface:
     """States of the rows that others follow, see `Followers`, composed like a scene of their own.
@@ -141,7 +150,7 @@ class Surface:
         scene: the extended scene
         gdfs: its edits
         followers: see `find_followers`
-        coverage_of: function from the index of an edit to its coverage
+        known: values of the edits in the scene
         make: constructor of the composer of the states
     """
 
@@ -150,11 +159,11 @@ class Surface:
         scene: Gaussians,
         gdfs: Sequence[Gdf],
         followers: Followers,
-        coverage_of: Callable[[int], Mapping[str, Tensor]],
+        known: Known,
         make: MakeComposer,
     ) -> None:
         self.followers = followers
-        self._states = States(scene, gdfs, followers, coverage_of, FOLLOWED, make)
+        self._states = States(scene, gdfs, followers, known, FOLLOWED, make)
         states = self._states.before
         rows = torch.from_numpy(followers.rows)
         self._own = pack_shapes(scene, rows).numpy()  # the rows before they follow. [F,11]

@@ -101,6 +101,11 @@ class AttributeBases:
         """Offset at s = 1, raw space. [M,c] float32"""
         return self.end_offset.float() * self.scale[0]
 
+    def take(self, members: Tensor) -> AttributeBases:
+        """Return the bases of some members. [m] int64"""
+        end = self.end_offset[members]
+        return AttributeBases(end, self.residual_basis[:, members], self.scale, self.coefficients)
+
     @property
     def label(self) -> str:
         """Storage form, as in "int8 + 2": the type of the end, and the number of further bases."""

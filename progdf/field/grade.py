@@ -182,7 +182,13 @@ def bake_grade(form: GradeForm, rows: Tensor, mapped: Tensor | None = None) -> B
     return baked if form.remap.is_identity else remap_slider(baked, form.remap)
 
 
-def adjust_colors(form: GradeForm, sh: Tensor, members: Tensor | slice, s: float) -> Tensor:
+def adjust_colors(
+    form: GradeForm,
+    sh: Tensor,
+    members: Tensor | slice,
+    s: float,
+    shares: tuple[Tensor, float] | None = None,
+) -> Tensor:
     """Return the change by a grade at strength `s`, applied to colors that other layers have changed.
 
     Args:
@@ -190,6 +196,7 @@ def adjust_colors(form: GradeForm, sh: Tensor, members: Tensor | slice, s: float
         sh: coefficients of these members in the layers below. [m,B,3]
         members: indices of these members in the grade
         s: slider value; beyond 1 the last segment continues
+        shares: shares of the map for all members [M], and of the residual; None: those of the grade
 
     Returns:
         [m,B,3]; exactly 0 at 0, and the map and residual of the file at 1
@@ -199,9 +206,10 @@ def adjust_colors(form: GradeForm, sh: Tensor, members: Tensor | slice, s: float
         change = share * (map_colors(sh, form.table[right], LATTICE) - sh)
     else:
         change = map_colors(sh, map_at(form, s), form.degree) - sh
-    change = form.share[members, None, None] * change
-    if len(form.residual):
-        row = torch.lerp(form.coefficients[right - 1], form.coefficients[right], share)
+    map_shares, residual_share = (form.share, 1.0) if shares is None else shares
+    change = map_shares[members, None, None] * change
+    if len(form.residual) and residual_share:
+        row = residual_share * torch.lerp(form.coefficients[right - 1], form.coefficients[right], share)
         residual = (form.residual[:, members] * (row[:, None] * form.scale)[:, None]).sum(dim=0)
         change[:, : residual.shape[1] // 3] += residual.reshape(len(sh), -1, 3)
     return change

@@ -100,6 +100,11 @@ class Gdf:
         """Number of members of the field: the region's members and the added rows."""
         return len(self.region) + (0 if self.added is None else len(self.added))
 
+    @property
+    def paints(self) -> bool:
+        """True if the edit adds discs of paint, for which the scene's Gaussians make way."""
+        return self.anchors is not None and bool(self.anchors.pushes) and len(self.anchors) > 0
+
 
 def _check_added(added: Gaussians) -> None:
     """Raise ValueError if an added row is visible at strength 0, or has numbers beyond the limits."""

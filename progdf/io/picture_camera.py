@@ -57,6 +57,7 @@ class PictureLayer(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
     geometry: _Share = 1.0  # gains
     opacity: _Share = 1.0
     color: _Share = 1.0
+    texture: Annotated[float, msgspec.Meta(ge=0.0, le=2.0)] = 1.0
     paint: str = ""  # painted weights, see `progdf.compose.layer_paint`
 
 

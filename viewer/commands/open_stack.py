@@ -182,8 +182,8 @@ def stack_layers(gdfs: Sequence[Gdf], stack: StackOptions, unset: float = 0.0) -
     strengths = parse_strengths(gdfs, stack.set, OVERSHOOT if stack.overshoot else 1.0)
     layers = {g.name: LayerState(i, g.name, strengths.get(g.name, unset)) for i, g in enumerate(gdfs)}
     for text in stack.gain:
-        name, kind, gain = _parse_gain(text, gdfs)
-        layers[name] = stacks.with_slider_value(layers[name], kind, gain)
+        name, kind, gain = _parse_gain(text, gdfs, stack.overshoot)
+        layers[name] = stacks.with_slider_value(layers[name], kind, gain, max(1.0, gain))
     for name in stack.solo:
         check_edit(name, gdfs, "--solo")
         layers[name] = replace(layers[name], solo=True)
@@ -221,7 +221,7 @@ def check_edit(name: str, edits: Sequence[Named], option: str) -> str:
     raise ProgdfError(f"{option} {name}: there is no edit of that name; there {names}")
 
 
-def _parse_gain(text: str, gdfs: Sequence[Gdf]) -> tuple[str, str, float]:
+def _parse_gain(text: str, gdfs: Sequence[Gdf], overshoot: bool) -> tuple[str, str, float]:
     """Return name, kind and number of `NAME:KIND=G`."""
     kinds = stacks.SLIDERS[1:]
     layer, equals, number = text.rpartition("=")
@@ -232,8 +232,9 @@ def _parse_gain(text: str, gdfs: Sequence[Gdf]) -> tuple[str, str, float]:
     check_edit(name, gdfs, "--gain")
     if kind not in kinds:
         raise ProgdfError(f"--gain {text}: there is no gain '{kind}'; the gains are {', '.join(kinds)}")
-    problem = f"--gain {text}: the gain '{number}' is not a number from 0 to 1"
-    return name, kind, parse_number(number, 0.0, 1.0, problem)
+    upper = stacks.largest_value(ViewState(overshoot=overshoot), kind)
+    problem = f"--gain {text}: the gain '{number}' is not a number from 0 to {upper:g}"
+    return name, kind, parse_number(number, 0.0, upper, problem)
 
 
 def parse_number(text: str, low: float, high: float, problem: str) -> float:

@@ -52,11 +52,11 @@ class StackOptions:
     set: Annotated[tuple[str, ...], UseAppendAction, word("NAME=S")] = ()
     """Strength of an edit, 0 to 1; repeatable. Defaults: see docs/cli.md."""
     gain: Annotated[tuple[str, ...], UseAppendAction, word("NAME:KIND=G")] = ()
-    """Gain of one kind of change, 0 to 1: geometry, opacity or color."""
+    """Gain of one kind of change, 0 to 1: geometry, opacity, color or texture."""
     solo: Annotated[tuple[str, ...], UseAppendAction, word("NAME")] = ()
     """Show this edit alone; repeatable."""
     overshoot: Switch = False
-    """Allow strengths up to 1.2, which extrapolate past the trained range."""
+    """Allow strengths up to 1.2 and gains of texture up to 2, which extrapolate."""
     blend: Annotated[Blend | None, word("{normalized,sum,over,adjust}", "the session's, else adjust")] = None
     """Blend rule for edits that share Gaussians."""
 

@@ -93,6 +93,7 @@ def picture_layers(opened: Document, view: ViewState) -> PictureLayers | None:
                 gains.geometry,
                 gains.opacity,
                 gains.color,
+                gains.texture,
                 layer.paint,
             )
         )

@@ -141,6 +141,10 @@ def first_state(
     sliders = _slider_layers(view, options.layers)
     stacks = [view.layers, *(each.edit.layers for each in kept)]
     needed = {l.gdf for stack in stacks for l in stack if l.strength > 0.0 or l.name in sliders}
+    divided = {l.gdf for stack in stacks for l in stack if l.gains.color != l.gains.texture}
+    repainted = {
+        l.gdf for stack in stacks for l in stack if l.gains.color != 1.0 and document.gdfs[l.gdf].paints
+    }
     edits = sorted(needed | {gdf for key in view.timeline.keys for gdf, s in key.strengths if s > 0.0})
 
     def layer(state: LayerState) -> dict[str, Any]:
@@ -178,6 +182,7 @@ def first_state(
         "snapshots": [{"name": each.name, **stack(each.camera, each.edit)} for each in kept],
         "timeline": _film(view.timeline, edits),
         "paints": paints,
+        "split": [i for i, gdf in enumerate(edits) if gdf in divided | repainted],
     }
     return stage, edits
 

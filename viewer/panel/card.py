@@ -15,6 +15,7 @@ from viewer.state.layers import (
     SLIDERS,
     change_layer,
     largest_strength,
+    largest_value,
     rename_layer,
     slider_value,
     toggle_solo,
@@ -51,10 +52,19 @@ from . import slider
 GAINS = SLIDERS[1:]
 
 
-def draw_details(layer: LayerState, row: LayerRow, active_slider: str | None, ui: UiContext) -> LayerState:
+_GAIN_TIPS = {
+    "color": "How much of the color change is applied, apart from its texture",
+    "texture": "How much of the texture is applied: strokes, patterns and details of the color change",
+}
+
+
+def draw_details(
+    view: ViewState, layer: LayerState, row: LayerRow, active_slider: str | None, ui: UiContext
+) -> LayerState:
     """Draw the gains and return the changed layer.
 
     Args:
+        view: state of the view
         layer: the layer to show and change
         row: data of its .gdf
         active_slider: slider that the arrow keys move; None if another layer is focused
@@ -62,12 +72,24 @@ def draw_details(layer: LayerState, row: LayerRow, active_slider: str | None, ui
     """
     with inert(layer.locked):
         for kind in GAINS:
-            layer = _gain(layer, kind, kind in row.kinds, kind == active_slider, ui)
+            layer = _gain(layer, kind, row.kinds, kind == active_slider, largest_value(view, kind), ui)
     return layer
 
 
-def _gain(layer: LayerState, kind: str, moves: bool, active: bool, ui: UiContext) -> LayerState:
-    """Draw one gain as a slider and return the changed layer."""
+def _gain(
+    layer: LayerState, kind: str, kinds: frozenset[str], active: bool, upper: float, ui: UiContext
+) -> LayerState:
+    """Draw one gain as a slider and return the changed layer.
+
+    Args:
+        layer: the layer
+        kind: the gain
+        kinds: gains that have an effect
+        active: the arrow keys move the slider
+        upper: upper end of the slider
+        ui: fonts and scale
+    """
+    moves = kind in kinds
     if active:
         imgui.push_style_color(imgui.Col_.text_disabled, PALETTE.accent)
     label(kind.capitalize(), 84.0 * ui.scale)
@@ -75,12 +97,15 @@ def _gain(layer: LayerState, kind: str, moves: bool, active: bool, ui: UiContext
         imgui.pop_style_color()
     with inert(not moves):
         value = slider_value(layer, kind)
-        new = value_slider(f"##{kind}", value, (0.0, 1.0), "%.2f", 1.0, ui)
+        new = value_slider(f"##{kind}", value, (0.0, upper), "%.2f", 1.0, ui)
     if moves:
-        tip(f"How much of the {kind} change is applied (Tab, then arrow keys). Double-click: reset to 1")
+        about = _GAIN_TIPS.get(kind, f"How much of the {kind} change is applied")
+        tip(f"{about} (Tab, then arrow keys). Double-click: reset to 1")
+    elif kind == "texture" and "color" in kinds:
+        tip("This edit changes colors evenly. It has no texture")
     else:
         tip(f"This edit does not change the {kind}")
-    return layer if new == value else with_slider_value(layer, kind, new)
+    return layer if new == value else with_slider_value(layer, kind, new, upper)
 
 
 TOGGLE_PX = 20.0  # side of a toggle, at 1×
@@ -175,7 +200,7 @@ def draw_card(
         if layer.gdf in work.view.unfolded:
             work = _about(work, index, row, ui)
             active_slider = work.active_slider if focused else None
-            unfolded = draw_details(work.view.layers[index], row, active_slider, ui)
+            unfolded = draw_details(work.view, work.view.layers[index], row, active_slider, ui)
             work = _change_layer(work, index, lambda _: unfolded)
             if compact:
                 imgui.dummy((0.0, 2.0 * scale))

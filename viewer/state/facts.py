@@ -16,6 +16,7 @@ from progdf.compose.added import rows_on
 from progdf.compose.layers import KINDS
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
+from progdf.gdf.texture import has_texture
 from progdf.rasterize import render
 from progdf.sh import sh0_to_rgb
 from progdf.terminal import format_count, group_digits
@@ -61,7 +62,9 @@ class LayerRow:
     bounds: Bounds  # bounds of the bulk of its members
     # number of Gaussians shared with each edit, in the order of the edits (with itself: all)
     shared: tuple[int, ...] = ()
-    kinds: frozenset[str] = frozenset(KINDS.values())  # the gains of `Gains` that have an effect
+    kinds: frozenset[str] = frozenset(
+        (*KINDS.values(), "texture")
+    )  # the gains of `Gains` that have an effect
     # centers of its members in the original, world units. [M,3] float32
     points: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32), compare=False)
     fit: Fit = keep_camera  # returns the camera that frames its members
@@ -104,7 +107,7 @@ def _row(scene: Gaussians, gdf: Gdf, gdfs: Sequence[Gdf], added: int) -> LayerRo
         instruction=gdf.instruction,
         bounds=bounds_of(scene[members]),
         shared=tuple(_shared_count(gdf, other) for other in gdfs),
-        kinds=frozenset(KINDS[name] for name in gdf.field.attributes),
+        kinds=_kinds(gdf),
         points=scene.means[members].numpy(),
         fit=lambda camera, aspect: fit(camera, scene[members], aspect),
         region=gdf.region.name,
@@ -119,6 +122,16 @@ def _row(scene: Gaussians, gdf: Gdf, gdfs: Sequence[Gdf], added: int) -> LayerRo
         rows_on=lambda mask: rows_on(gdf, torch.tensor(mask)).numpy(),
         thumbnail=partial(draw_thumbnail, scene, gdf),
     )
+
+
+def _kinds(gdf: Gdf) -> frozenset[str]:
+    """Return the gains that have an effect on an edit."""
+    kinds = {KINDS[name] for name in gdf.field.attributes}
+    if gdf.paints:
+        kinds.add("color")
+    if has_texture(gdf):
+        kinds.add("texture")
+    return frozenset(kinds)
 
 
 def _hole(gdf: Gdf) -> Hole:

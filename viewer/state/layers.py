@@ -9,9 +9,11 @@ import re
 from collections.abc import Callable, Collection
 from dataclasses import replace
 
+from progdf.compose.layers import MAX_TEXTURE
+
 from .view_state import OVERSHOOT, LayerGroup, LayerState, ViewState
 
-SLIDERS = ("strength", "geometry", "opacity", "color")
+SLIDERS = ("strength", "geometry", "opacity", "color", "texture")
 """Sliders that the arrow keys can move: the strength and the gains."""
 
 LONGEST_NAME = 60  # characters in the name of a layer, group or snapshot
@@ -56,6 +58,13 @@ def largest_strength(view: ViewState) -> float:
     return OVERSHOOT if view.overshoot else 1.0
 
 
+def largest_value(view: ViewState, slider: str) -> float:
+    """Return the upper end of one of `SLIDERS`. With overshoot, texture reaches `MAX_TEXTURE`."""
+    if slider == "strength":
+        return largest_strength(view)
+    return MAX_TEXTURE if view.overshoot and slider == "texture" else 1.0
+
+
 def change_layer(view: ViewState, index: int, change: Callable[[LayerState], LayerState]) -> ViewState:
     """Return `view` with one layer changed. An invalid index changes nothing."""
     if not 0 <= index < len(view.layers):
@@ -68,13 +77,14 @@ def change_layer(view: ViewState, index: int, change: Callable[[LayerState], Lay
 def with_slider_value(layer: LayerState, slider: str, value: float, upper: float = 1.0) -> LayerState:
     """Return the layer with its strength or a gain set to `value`, unless it is locked.
 
-    Gains are clamped to 0 to 1, a strength to 0 to `upper`.
+    The value is clamped to 0 to `upper`, see `largest_value`.
     """
     if layer.locked:
         return layer
+    value = min(upper, max(0.0, value))
     if slider == "strength":
-        return replace(layer, strength=min(upper, max(0.0, value)))
-    return replace(layer, gains=replace(layer.gains, **{slider: min(1.0, max(0.0, value))}))
+        return replace(layer, strength=value)
+    return replace(layer, gains=replace(layer.gains, **{slider: value}))
 
 
 def slider_value(layer: LayerState, slider: str) -> float:
@@ -87,9 +97,8 @@ def nudge_slider(view: ViewState, index: int, slider: str, by: float) -> ViewSta
 
     def step(layer: LayerState) -> LayerState:
         # rounded, so that steps forward and back return to the initial number
-        return with_slider_value(
-            layer, slider, round(slider_value(layer, slider) + by, 6), largest_strength(view)
-        )
+        value = round(slider_value(layer, slider) + by, 6)
+        return with_slider_value(layer, slider, value, largest_value(view, slider))
 
     return change_layer(view, index, step)
 
@@ -221,12 +230,16 @@ def show_all(view: ViewState) -> ViewState:
 
 
 def with_overshoot(view: ViewState, on: bool) -> ViewState:
-    """Switch overshoot on or off. Off clamps strengths to 1."""
+    """Switch overshoot on or off. Off clamps strengths and the gains of texture to 1."""
     view = replace(view, overshoot=on)
-    upper = largest_strength(view)
-    return replace(
-        view, layers=tuple(replace(layer, strength=min(layer.strength, upper)) for layer in view.layers)
-    )
+    return replace(view, layers=tuple(_within_limits(view, layer) for layer in view.layers))
+
+
+def _within_limits(view: ViewState, layer: LayerState) -> LayerState:
+    """Return a layer with its sliders clamped to their ranges. Locked layers are clamped, too."""
+    strength = min(layer.strength, largest_strength(view))
+    texture = min(layer.gains.texture, largest_value(view, "texture"))
+    return replace(layer, strength=strength, gains=replace(layer.gains, texture=texture))
 
 
 def toggle_details(view: ViewState, index: int) -> ViewState:

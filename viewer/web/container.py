@@ -32,12 +32,13 @@ from progdf.compose.layers import KINDS
 from progdf.compose.overlap import ARRANGED, find_paint
 from progdf.compose.reference import coverage
 from progdf.errors import ProgdfError
-from progdf.field.baked import AttributeBases, GradeForm
+from progdf.field.baked import AttributeBases, BakedField, GradeForm
 from progdf.field.grade import sphere
 from progdf.field.separable import quantize_bases
 from progdf.formats.packed.compressed_ply import morton_order
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import UNSEEN_LOGIT, Gdf
+from progdf.gdf.texture import ColorSplit, color_split
 
 DRAWN_SH = (0, 3, 8, 15)
 """Number of SH coefficients above the first, by degree."""
@@ -124,7 +125,8 @@ def pack(
         gdfs: its edits
         quality: "exact", float32 and the numbers of the edits' files, or "compact", 8 and 16 bits
         degree: retained degree of the spherical harmonics, 0 to 3
-        more: other header entries; "paints" holds pairs of an edit and the weights of its members [M]
+        more: other header entries; "paints" holds pairs of an edit and the weights of its members [M], and
+            "split" the edits of layers whose gains divide color and texture
 
     Raises:
         ProgdfError: there is no such quality.
@@ -144,6 +146,7 @@ def pack(
     exact = quality == "exact"
     attributes, decoded_scene = _scene(arrays, scene, gdfs, order, count, kept, exact)
     overlaps = len(gdfs) > 1 and sum(map(len, inside)) > count
+    splits = {edit: color_split(scene, gdfs[edit]) for edit in more["split"]}
     paints = []
     for edit, weights in more["paints"]:
         levels = np.round(weights[inside[edit]].numpy() * 255).astype("<i2")
@@ -151,6 +154,7 @@ def pack(
     header = {
         **more,
         "paints": paints,
+        "split": sorted(splits),
         "count": len(order),
         "members": count,
         "segments": _segments(groups[order[:count]], order, gdfs),
@@ -158,11 +162,19 @@ def pack(
         "antialiased": scene.antialiased,
         "attributes": attributes,
         "edits": [
-            _edit(arrays, gdf, rows, kept, exact, coverage(scene, gdf) if overlaps else None)
-            for gdf, rows in zip(gdfs, inside, strict=True)
+            _edit(
+                arrays,
+                gdf,
+                rows,
+                kept,
+                exact,
+                shares=coverage(scene, gdf) if overlaps else None,
+                split=splits.get(edit),
+            )
+            for edit, (gdf, rows) in enumerate(zip(gdfs, inside, strict=True))
         ],
         "surface": _surface(arrays, scene, gdfs, place, inside, exact),
-        "paint": _paint(arrays, scene, gdfs, place, inside, kept, exact),
+        "paint": _paint(arrays, scene, gdfs, place, inside, kept=kept, exact=exact, splits=splits),
         "sphere": _sphere(kept),
     }
     text = json.dumps(header, ensure_ascii=True, allow_nan=False, separators=(",", ":")).encode()
@@ -232,7 +244,16 @@ def _surface(
     if followers is None:
         return None
     states = _states(
-        arrays, scene, gdfs, place, inside, followers=followers, names=FOLLOWED, kept=0, exact=exact
+        arrays,
+        scene,
+        gdfs,
+        place,
+        inside,
+        followers=followers,
+        names=FOLLOWED,
+        kept=0,
+        exact=exact,
+        splits={},
     )
     return {**states, "banded": len(banded_followers(scene, gdfs, followers)) > 0}
 
@@ -245,6 +266,7 @@ def _paint(
     inside: Sequence[Tensor],
     kept: int,
     exact: bool,
+    splits: Mapping[int, ColorSplit | None],
 ) -> dict[str, Any] | None:
     """Append the data for the order of painted layers, see `progdf.compose.overlap`; return its header entry.
 
@@ -256,6 +278,7 @@ def _paint(
         inside: members of each edit in the page's order. [M] each
         kept: number of SH coefficients above the first
         exact: store float32
+        splits: color and texture of edits
     """
     paint = find_paint(scene, gdfs)
     if paint is None:
@@ -274,7 +297,16 @@ def _paint(
     tints = None
     if found is not None:
         tints = _states(
-            arrays, scene, gdfs, place, inside, followers=found, names=COLORS, kept=kept, exact=exact
+            arrays,
+            scene,
+            gdfs,
+            place,
+            inside,
+            followers=found,
+            names=COLORS,
+            kept=kept,
+            exact=exact,
+            splits=splits,
         )
     return {
         "rows": arrays.add(place[paint.rows].astype(np.int32)),
@@ -302,6 +334,7 @@ def _states(
     names: Sequence[str],
     kept: int,
     exact: bool,
+    splits: Mapping[int, ColorSplit | None],
 ) -> dict[str, Any]:
     """Append states and the rows that need them, see `Followers`; return their header entry.
 
@@ -315,6 +348,7 @@ def _states(
         names: attributes of the states
         kept: number of SH coefficients above the first
         exact: store float32
+        splits: color and texture of edits
     """
     states, parts = state_scene(scene, gdfs, followers, names)
     groups = _groups(len(states), [part.region.members.numpy() for part in parts])
@@ -330,12 +364,15 @@ def _states(
         attributes[name] = [_scene_part(arrays, name, values, exact, True)[0]]
     edits = []
     picks = []
-    for gdf, part, members, (_, index) in zip(gdfs, parts, inside, followers.changed, strict=True):
+    for edit, (_, index) in enumerate(followers.changed):
+        gdf, part, members = gdfs[edit], parts[edit], inside[edit]
+        split = splits.get(edit)
         rows = _ascending(at[part.region.members.numpy()])
         covered = {kind: share[torch.from_numpy(index)] for kind, share in coverage(scene, gdf).items()}
         kinds = {"map", *(KINDS[name] for name in names)}
         shares = {kind: share for kind, share in covered.items() if kind in kinds}
-        edits.append(_edit(arrays, part, rows, kept, exact, shares))
+        of_states = None if split is None else split.take(torch.from_numpy(index))
+        edits.append(_edit(arrays, part, rows, kept, exact, shares, of_states))
         page = np.empty(len(members), np.int64)
         page[members.numpy()] = np.arange(len(members))
         picks.append(arrays.add(page[index[rows.numpy()]].astype(np.int32)))
@@ -434,25 +471,30 @@ def _edit(
     kept: int,
     exact: bool,
     shares: Mapping[str, Tensor] | None,
+    split: ColorSplit | None,
 ) -> dict[str, Any]:
-    """Append the arrays of an edit, with its members in this order; return its header entry.
+    """Append the arrays of an edit; return its header entry.
 
-    `shares` is its coverage if another edit lies on its rows, see `coverage`.
+    Args:
+        arrays: the container's arrays
+        gdf: the edit
+        order: its members in the order of the page. [m]
+        kept: number of SH coefficients above the first
+        exact: store float32
+        shares: its coverage if another edit lies on its rows, see `coverage`
+        split: its color apart from its texture, if the gains of a layer divide them
     """
     form = gdf.field.origin
-    widths = {"shN": 3 * kept}
     record: dict[str, Any] = {
         "name": gdf.name,
         "recorded": list(gdf.field.recorded),
         "pushes": [] if gdf.anchors is None else sorted(gdf.anchors.pushes),
         "leaves_paint": gdf.anchors is not None and gdf.anchors.leaves_paint,
         "knots": _numbers(gdf.field.knots),
-        "attributes": {
-            name: _bases(arrays, name, bases, order, widths.get(name, bases.end_offset.shape[1]), exact)
-            for name, bases in gdf.field.attributes.items()
-            if widths.get(name, 1)
-        },
+        "attributes": _attributes(arrays, gdf.field, order, kept, exact),
     }
+    if split is not None:
+        record["split"] = _split(arrays, split, len(gdf.region), order, kept, exact)
     if shares is not None:
         covered = {kind: share[order].numpy() for kind, share in shares.items()}
         record["coverage"] = {
@@ -461,6 +503,32 @@ def _edit(
         }
         record["grade"] = _grade(arrays, form, order, kept) if isinstance(form, GradeForm) else None
     return record
+
+
+def _attributes(
+    arrays: Arrays, field: BakedField, order: Tensor, kept: int, exact: bool
+) -> dict[str, dict[str, Any]]:
+    """Append the attributes of a field, see `_edit`; return their header entries."""
+    widths = {"shN": 3 * kept}
+    return {
+        name: _bases(arrays, name, bases, order, widths.get(name, bases.end_offset.shape[1]), exact)
+        for name, bases in field.attributes.items()
+        if widths.get(name, 1)
+    }
+
+
+def _split(
+    arrays: Arrays, split: ColorSplit, members: int, order: Tensor, kept: int, exact: bool
+) -> dict[str, Any]:
+    """Append the color of an edit apart from its texture, see `_edit`; return its header entry."""
+    discs = None
+    if split.discs is not None:
+        discs = []
+        for values in (split.discs.change, split.discs.color):
+            rows = torch.nn.functional.pad(values, (0, 0, members - len(values), 0))[order].numpy()
+            discs.append(arrays.add(rows) if exact else arrays.add_levels(rows, "i2")[0])
+    color = {} if split.color is None else _attributes(arrays, split.color, order, kept, exact)
+    return {"color": color, "map_share": split.map_share, "discs": discs}
 
 
 def _bases(

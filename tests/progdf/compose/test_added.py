@@ -87,7 +87,7 @@ def test_composer_matches_the_reference_on_random_stacks(scene: Gaussians, blend
                 gdfs[i],
                 float(draws.uniform(1)) * 1.2,
                 enabled=float(draws.uniform(1)) < 0.8,
-                gains=Gains(*draws.uniform(3).tolist()) if float(draws.uniform(1)) < 0.3 else Gains(),
+                gains=Gains(*draws.uniform(4).tolist()) if float(draws.uniform(1)) < 0.3 else Gains(),
                 weights=draws.uniform(gdfs[i].members) if float(draws.uniform(1)) < 0.4 else None,
             )
             for i in order

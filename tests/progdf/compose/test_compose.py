@@ -99,7 +99,8 @@ def test_weights_scale_the_change(scene: Gaussians, shirt: Gdf) -> None:
 def test_gains_scale_only_their_own_kind_of_attribute(scene: Gaussians, shirt: Gdf) -> None:
     whole = change(scene, compose_layers(scene, [Layer(shirt, 0.6)]))
     found = change(
-        scene, compose_layers(scene, [Layer(shirt, 0.6, gains=Gains(geometry=0.5, opacity=0.0, color=2.0))])
+        scene,
+        compose_layers(scene, [Layer(shirt, 0.6, gains=Gains(0.5, opacity=0.0, color=2.0, texture=2.0))]),
     )
     slices = attribute_slices(whole.shape[1])
     for names, gain in ((("means", "log_scales", "quats"), 0.5), (("logit_opacities",), 0.0), (COLOR, 2.0)):
@@ -192,7 +193,9 @@ def test_over_hides_as_much_of_a_kind_as_its_gain(scene: Gaussians, shirt: Gdf) 
     top = striped(scene, shirt)
     below = compose_layers(scene, [Layer(shirt, 1.0)])
     for gain in (0.0, 0.5):
-        stacked = compose_layers(scene, [Layer(shirt, 1.0), Layer(top, 1.0, gains=Gains(color=gain))], "over")
+        stacked = compose_layers(
+            scene, [Layer(shirt, 1.0), Layer(top, 1.0, gains=Gains(color=gain, texture=gain))], "over"
+        )
         stripe = shirt.region.members[1::2]
         expected = torch.lerp(below.sh0[stripe], scene.sh0[stripe] + 1.0, gain)
         assert torch.allclose(stacked.sh0[stripe], expected, atol=1e-6)
@@ -278,7 +281,7 @@ def random_stack(rng: np.random.Generator, wardrobe: list[Gdf], order: np.ndarra
         )
         if weights is not None:
             weights[torch.from_numpy(rng.random(len(weights)) < 0.3)] = 0.0
-        gains = Gains(*(float(gain) for gain in rng.choice([0.0, 1.0, 0.5], 3)))
+        gains = Gains(*(float(gain) for gain in rng.choice([0.0, 1.0, 0.5], 4)))
         strength = float(rng.choice([0.0, 1.0, 0.5, 1.2, rng.random()]))
         layers.append(Layer(gdf, strength, bool(rng.random() < 0.9), gains, weights))
     return layers
@@ -449,7 +452,7 @@ def test_composer_refuses_an_unknown_edit(scene: Gaussians, shirt: Gdf, hat: Gdf
 def test_every_attribute_has_a_gain(scene: Gaussians) -> None:
     everything = curved_field(len(scene), 1, 14 + 9)
     edit = edit_of(scene, torch.arange(len(scene)), everything)
-    mute = compose_layers(scene, [Layer(edit, 0.5, gains=Gains(0.0, 0.0, 0.0))])
+    mute = compose_layers(scene, [Layer(edit, 0.5, gains=Gains(0.0, 0.0, 0.0, 0.0))])
     assert set(everything.attributes) == set(ATTRIBUTES)
     assert bits(mute) == bits(scene)
 

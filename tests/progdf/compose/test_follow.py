@@ -184,7 +184,7 @@ def test_composer_follows_like_compose_and_reports_every_change(scene: Gaussians
                 gdfs[i],
                 float(draws.uniform(1)) * 1.2,
                 enabled=float(draws.uniform(1)) < 0.7,
-                gains=Gains(*draws.uniform(3).tolist()) if float(draws.uniform(1)) < 0.3 else Gains(),
+                gains=Gains(*draws.uniform(4).tolist()) if float(draws.uniform(1)) < 0.3 else Gains(),
                 weights=draws.uniform(gdfs[i].members) if float(draws.uniform(1)) < 0.4 else None,
             )
             for i in draws.order(len(gdfs)).tolist()

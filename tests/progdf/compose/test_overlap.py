@@ -68,7 +68,7 @@ def test_composer_orders_paint_like_compose_and_reports_every_change(scene: Gaus
                 gdfs[i],
                 float(draws.uniform(1)) * 1.2,
                 enabled=float(draws.uniform(1)) < 0.7,
-                gains=Gains(*draws.uniform(3).tolist()) if float(draws.uniform(1)) < 0.3 else Gains(),
+                gains=Gains(*draws.uniform(4).tolist()) if float(draws.uniform(1)) < 0.3 else Gains(),
                 weights=draws.uniform(len(converted[i].region)) if float(draws.uniform(1)) < 0.4 else None,
             )
             for i in draws.order(len(gdfs)).tolist()

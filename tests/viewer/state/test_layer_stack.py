@@ -179,16 +179,20 @@ def test_keys_do_everything_that_the_cards_do(hand: Rig) -> None:
 def test_alt_arrows_select_the_gains_that_the_edit_has(hand: Rig) -> None:
     hand.key("2")
     hand.key("Alt+Right")
-    assert hand.main_view.work.active_slider == "color", "a change of color has no other gain"
+    assert hand.main_view.work.active_slider == "color", (
+        "a change of color moves neither geometry nor opacity"
+    )
     assert hand.main_view.work.view.unfolded == (0,)
     hand.key("Shift+Left")
     assert layers(hand)[0].gains == Gains(color=0.9)
     assert hand.strengths == [0.5, 0.5]
     hand.key("Alt+Right")
+    assert hand.main_view.work.active_slider == "texture"
+    hand.key("Alt+Right")
     assert hand.main_view.work.active_slider == "strength"
     hand.key("1")
-    hand.key("Alt+Left")
-    hand.key("Alt+Left")
+    for _ in range(3):
+        hand.key("Alt+Left")
     assert hand.main_view.work.active_slider == "geometry"
 
 
@@ -340,7 +344,7 @@ def test_layer_rows_count_shared_members_and_list_gain_kinds() -> None:
     rows = layer_rows(stack.scene, (stack.gdfs[0], stack.gdfs[1], stack.gdfs[0]))
     scarf, ears = (len(gdf.region) for gdf in stack.gdfs)
     assert [row.shared for row in rows] == [(scarf, 0, scarf), (0, ears, 0), (scarf, 0, scarf)]
-    assert [row.kinds for row in rows[:2]] == [{"color"}, {"color", "geometry"}]
+    assert [row.kinds for row in rows[:2]] == [{"color", "texture"}, {"color", "geometry", "texture"}]
 
 
 def test_thumbnail_of_a_large_region_uses_a_part_of_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -151,9 +151,9 @@ def document_of(scene: Gaussians, gdfs: Sequence[Gdf]) -> tuple[Document, ViewSt
 
 
 def random_layer(gdf: Gdf, draws: Draws) -> Layer:
-    gains = Gains(*draws.uniform(3).tolist()) if float(draws.uniform(1)) < 0.4 else Gains()
+    gains = Gains(*draws.uniform(4).tolist()) if float(draws.uniform(1)) < 0.4 else Gains()
     weights = draws.uniform(gdf.members) if float(draws.uniform(1)) < 0.4 else None
-    return Layer(gdf, float(draws.uniform(1)) * 1.2, gains=gains, weights=weights)
+    return Layer(gdf, float(draws.uniform(1)) * 1.5 - 0.3, gains=gains, weights=weights)
 
 
 RUN = """([layers, blend]) => {
@@ -189,6 +189,8 @@ def test_page_computes_every_attribute_like_compose_for_every_rule(
         leaving_paint(scene),
     ]
     document, view = document_of(scene, gdfs)
+    divided = tuple(replace(layer, gains=Gains(color=0.5)) for layer in view.layers)
+    view = replace(view, layers=divided)  # so that the page has the textures
     write_page(tmp_path / "page.html", document, view, (), PageOptions(quality="exact"))
     opened = ready(open_page(tmp_path / "page.html"))
     assert opened.complaints == []
@@ -211,12 +213,11 @@ def test_page_computes_every_attribute_like_compose_for_every_rule(
             edit = next(i for i, gdf in enumerate(document.gdfs) if gdf is layer.gdf)
             at = np.argsort(place[layer.gdf.region.members.numpy()])
             weights = None if layer.weights is None else layer.weights.numpy()[at].tolist()
-            gains = {kind: getattr(layer.gains, kind) for kind in ("geometry", "opacity", "color")}
             sent.append(
                 {
                     "edit": edit,
                     "strength": layer.strength,
-                    "gains": gains,
+                    "gains": asdict(layer.gains),
                     "weights": weights,
                     "paint": number,
                 }
@@ -565,7 +566,7 @@ def test_snapshot_on_the_page_matches_the_window(open_page: Any, tmp_path: Path)
                 strength=round(float(draws.uniform(1)), 3),
                 enabled=float(draws.uniform(1)) < 0.7,
                 solo=alone < 0.4 and i == 3,
-                gains=Gains(*draws.uniform(3).tolist()),
+                gains=Gains(*draws.uniform(4).tolist()),
                 group="pair" if i in (1, 3) else "",
             )
             for i in draws.order(4).tolist()

@@ -16,17 +16,21 @@ const { fround } = Math;
 class Edit {
   constructor(container, record) {
     const read = (part) => part.map((row) => Float32Array.from(row));
+    const readAll = (parts) => Object.fromEntries(Object.entries(parts).map(([name, bases]) => [name, {
+      stored: [bases.end, ...bases.residual].map((part) => container.stored(part)),
+      scale: read(bases.scale),
+      coefficients: read(bases.coefficients),
+    }]));
     this.name = record.name;
     this.recorded = record.recorded;
     this.knots = Float32Array.from(record.knots);
-    this.attributes = {};
-    for (const [name, bases] of Object.entries(record.attributes)) {
-      this.attributes[name] = {
-        stored: [bases.end, ...bases.residual].map((part) => container.stored(part)),
-        scale: read(bases.scale),
-        coefficients: read(bases.coefficients),
-      };
-    }
+    this.attributes = readAll(record.attributes);
+    // Color apart from texture, see progdf/gdf/texture.py; null if no layer needs it or the edit has no texture.
+    this.split = record.split && {
+      bases: readAll(record.split.color),
+      mapShare: record.split.map_share,
+      discs: record.split.discs?.map((part) => container.real(part)),
+    };
     this.kinds = new Set(Object.keys(record.attributes).map((name) => KINDS[name]));
     this.pushes = new Set(record.pushes);  // kinds of change that make way for paint
     this.leavesPaint = record.leaves_paint;  // it moves or removes rows without their paint
@@ -40,9 +44,29 @@ class Edit {
     };
   }
 
-  // Computes the edit's offsets for an attribute from `first` on. `levels`: scratch of the same size, for its bases.
-  offsets(name, strength, first, out, levels) {
-    const { stored, scale, coefficients } = this.attributes[name];
+  // Returns the factors of the edit's offsets of a kind, and of their color part.
+  factors(kind, gains) {
+    if (kind !== "color" || !this.split) return [gains[kind], 0];
+    return [gains.texture, this.split.bases.sh0 ? gains.color - gains.texture : 0];
+  }
+
+  // Returns whether gains leave a kind of change.
+  moves(kind, gains) {
+    return this.factors(kind, gains).some((factor) => factor !== 0);
+  }
+
+  // Computes offsets of an attribute from `first` on; returns their factor. `scratch`: two arrays of the same size.
+  weighted(name, { strength, gains }, first, out, scratch) {
+    const [factor, part] = this.factors(KINDS[name], gains), color = part && this.split.bases[name];
+    this.offsets(this.attributes[name], strength, first, out, scratch[0]);
+    if (!color) return fround(factor);
+    this.offsets(color, strength, first, scratch[1], scratch[0]);
+    for (let j = 0; j < out.length; j++) out[j] = factor * out[j] + part * scratch[1][j];
+    return 1;
+  }
+
+  // Computes offsets from bases from `first` on. `levels`: scratch of the same size, for the bases.
+  offsets({ stored, scale, coefficients }, strength, first, out, levels) {
     const [right, share] = findSegment(this.knots, strength);
     const low = coefficients[right - 1], high = coefficients[right];
     out.fill(-0);
@@ -70,6 +94,7 @@ export class Composer {
     const followed = header.surface?.banded && header.sh ? [...FOLLOWED, "shN"] : FOLLOWED;
     for (const name of follows ? followed : []) this.moving.add(name);
     for (const name of header.paint ? ARRANGED : []) this.moving.add(name);
+    if (this.edits.some((edit) => edit.split?.discs)) this.moving.add("sh0");
     for (const name of this.moving) {
       for (const each of [name, PARTNERS[name]]) {
         if (!each || this.before[each]) continue;
@@ -91,6 +116,7 @@ export class Composer {
       const paints = this.paint?.touches(first, rows);
       const names = [...this.moving].filter((name) =>
         (paints && ARRANGED.includes(name)) || (followers.length && followed.includes(name)) ||
+        (name === "sh0" && edits.some((edit) => this.edits[edit].split?.discs)) ||
         edits.some((edit) => this.edits[edit].attributes[name]));
       const segment = { first, rows, names, followers, paints, members: {}, effects: [], maps: [] };
       for (const edit of edits) {
@@ -101,7 +127,7 @@ export class Composer {
       most = Math.max(most, ...names.map((name) => rows * this.widths[name]));
       return segment;
     });
-    this.scratch = [new Float32Array(most), new Float32Array(most)];
+    this.scratch = [new Float32Array(most), new Float32Array(most), new Float32Array(most)];
     this.blend = "";
   }
 
@@ -159,19 +185,33 @@ export class Composer {
       this.#push(segment, stack, name, total);
       for (let j = 0; j < total.length; j++) total[j] += before[j];
     }
+    if (totals.sh0) this.#colorDiscs(segment, stack, totals.sh0);
+  }
+
+  // Changes the colors of painted discs by the gains of their layers; of two layers of one edit, the stronger one shows.
+  #colorDiscs({ rows, members }, stack, total) {
+    const opacity = (layer) => clampedStrength(layer) * Math.min(Math.abs(layer.gains.opacity), 1);
+    for (const layer of stack) {
+      const [change, color] = this.edits[layer.edit].split?.discs ?? [], { gains } = layer;
+      const own = stack.filter(({ edit }) => edit === layer.edit);
+      if (!change || own.findLast((each) => own.every((one) => opacity(one) <= opacity(each))) !== layer) continue;
+      for (let j = 0, at = 3 * members[layer.edit]; j < 3 * rows; j++, at++) {
+        total[j] += (gains.texture - 1) * change[at] + (gains.color - gains.texture) * color[at];
+      }
+    }
   }
 
   // Adds the largest change by which a layer makes way for its paint.
   #push(segment, stack, name, total) {
     const { rows } = segment, width = this.widths[name], kind = KINDS[name];
     const pushing = stack.filter(({ edit, gains }) =>
-      this.edits[edit].pushes.has(kind) && this.edits[edit].attributes[name] && gains[kind] !== 0);
+      this.edits[edit].pushes.has(kind) && this.edits[edit].attributes[name] && this.edits[edit].moves(kind, gains));
     if (!pushing.length) return;
     const largest = new Float32Array(total.length).fill(-0);
-    const [offsets, levels] = this.scratch.map((numbers) => numbers.subarray(0, rows * width));
+    const [offsets, ...scratch] = this.scratch.map((numbers) => numbers.subarray(0, rows * width));
     for (const layer of pushing) {
-      const member = segment.members[layer.edit], gain = fround(layer.gains[kind]);
-      this.edits[layer.edit].offsets(name, layer.strength, member * width, offsets, levels);
+      const member = segment.members[layer.edit];
+      const gain = this.edits[layer.edit].weighted(name, layer, member * width, offsets, scratch);
       for (let i = 0; i < rows; i++) {
         const factor = (layer.weights ? layer.weights[member + i] : 1) * gain;
         let before = 0, now = 0;
@@ -195,17 +235,17 @@ export class Composer {
     const layer = stack[at], edit = this.edits[layer.edit], member = segment.members[layer.edit], { rows } = segment;
     const { weights } = layer, held = clampedStrength(layer);
     const moved = segment.names.filter((name) =>
-      edit.attributes[name] && layer.gains[KINDS[name]] !== 0 && !edit.pushes.has(KINDS[name]));
+      edit.attributes[name] && edit.moves(KINDS[name], layer.gains) && !edit.pushes.has(KINDS[name]));
     const colors = moved.filter((name) => KINDS[name] === "color");
     const hides = at > 0 && (this.blend === "over" || this.blend === "adjust");
     const map = hides && this.blend === "adjust" && edit.grade && colors.length
       ? this.#graded(segment, stack, at, colors, totals) : null;
     for (const name of moved) {
-      const kind = KINDS[name], gain = fround(layer.gains[kind]), width = this.widths[name], total = totals[name];
-      const [offsets, levels] = this.scratch.map((numbers) => numbers.subarray(0, rows * width));
-      edit.offsets(name, layer.strength, member * width, offsets, levels);
+      const kind = KINDS[name], width = this.widths[name], total = totals[name];
+      const [offsets, ...scratch] = this.scratch.map((numbers) => numbers.subarray(0, rows * width));
+      const gain = edit.weighted(name, layer, member * width, offsets, scratch);
       const covered = hides ? edit.coverage[kind].subarray(member, member + rows) : null;
-      const hidden = held * fround(Math.min(Math.abs(gain), 1));
+      const hidden = held * fround(Math.min(Math.abs(layer.gains[kind]), 1));
       if (!weights && !covered) for (let j = 0; j < total.length; j++) total[j] += gain * offsets[j];
       else {
         for (let i = 0, j = 0; i < rows; i++) {
@@ -247,12 +287,13 @@ export class Composer {
   }
 
   #adjust(layer, edit, member, colors, totals, { rows, width, sums, graded }) {
-    const change = graded.at(layer.strength), gain = layer.gains.color;
+    const { color, texture } = layer.gains, { split } = edit;
+    const change = graded.at(layer.strength, color, split ? texture : color, split?.mapShare);
     let from = 0;
     for (const name of colors) {
       const w = this.widths[name], total = totals[name];
       for (let k = 0; k < rows.length; k++) {
-        const i = rows[k], factor = (layer.weights ? layer.weights[member + i] : 1) * gain;
+        const i = rows[k], factor = layer.weights ? layer.weights[member + i] : 1;
         const share = edit.coverage.map[member + i];
         for (let c = 0, j = i * w, at = k * width + from; c < w; c++, j++, at++) {
           total[j] += share * (sums[at] + factor * change[at] - total[j]);
@@ -265,7 +306,7 @@ export class Composer {
   // Returns max(1, Σ m s) over the layers with this kind of change; null if it is 1 everywhere.
   #divisors({ rows, members }, all, kind) {
     const stack = all.filter(({ edit }) => this.edits[edit].kinds.has(kind) && !this.edits[edit].pushes.has(kind));
-    if (stack.reduce((sum, layer) => sum + Math.min(layer.strength, 1), 0) <= 1 - 1e-6) return null;
+    if (stack.reduce((sum, layer) => sum + clampedStrength(layer), 0) <= 1 - 1e-6) return null;
     const sums = new Float32Array(rows);
     for (const layer of stack) {
       const held = clampedStrength(layer), member = members[layer.edit];

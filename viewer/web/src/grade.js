@@ -73,8 +73,8 @@ export class GradedColors {
   }
 
   // Returns the change at a strength, [m,B,3], valid until the next call. The first call caches no knots, as the
-  // layers below may be moving.
-  at(strength) {
+  // layers below may be moving. `color`, `texture`: gains; `mean`: share of the map that is color.
+  at(strength, color, texture, mean = 1) {
     const { grade, change, sh, members } = this, straight = grade.degree === 0;
     const at = strength < 1 ? interpolate(strength, grade.new, grade.old) : strength;
     const [right, share] = findSegment(grade.knots, at), width = 3 * this.bands;
@@ -91,15 +91,16 @@ export class GradedColors {
       else for (let j = 0; j < sh.length; j++) change[j] = part * to.change[j];
       for (let i = 0; i < members.length; i++) if (to.black[i] || from?.black[i]) this.#map(table, i, change);
     }
-    if (straight || grade.share) {
+    if (straight || grade.share || color !== 1 || texture !== 1) {
       for (let i = 0, j = 0; i < members.length; i++) {
-        const part = (straight ? share : 1) * (grade.share ? grade.share[members[i]] : 1);
+        const own = texture * (grade.share ? grade.share[members[i]] : 1) + (color - texture) * mean;
+        const part = (straight ? share : 1) * own;
         for (const end = j + width; j < end; j++) change[j] *= part;
       }
     }
     const row = lerpAll(grade.coefficients[right - 1], grade.coefficients[right], share);
     grade.residual.forEach((basis, k) => {
-      const units = Float64Array.from(grade.scale[k], (unit) => unit * row[k]), own = units.length;
+      const units = Float64Array.from(grade.scale[k], (unit) => texture * unit * row[k]), own = units.length;
       for (let i = 0; i < members.length; i++) {
         for (let c = 0, j = i * width, from = members[i] * own; c < own; c++) change[j + c] += basis[from + c] * units[c];
       }
