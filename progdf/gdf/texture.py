@@ -8,7 +8,8 @@ map makes, the layer adds
 - A grade has both parts. M is its map. If the map has a mask, M takes the mean of the mask for all
   members, because a pattern is texture. A grade without mask and residual has no texture.
 - For all other edits, M is the polynomial of the members' own colors that fits Δ best at every strength, by
-  weighted least squares. The fit is linear in Δ, so M has the coefficients of Δ over the strength.
+  weighted least squares. The fit is linear in Δ, so M has the coefficients of Δ over the strength. Higher SH
+  bands follow the derivative of the map.
 - The discs of a painted layer have a fixed color p. Their change is p − b, where b is the color of the
   surface below them, and their map is fitted separately. Recolored Gaussians of the scene that only make
   way for discs are texture.
@@ -24,8 +25,8 @@ import torch
 from torch import Tensor
 
 from progdf.field.baked import AttributeBases, BakedField, GradeForm
-from progdf.field.grade import MAX_COLOR, bake_grade, map_alone, member_bands, monomials, sphere
-from progdf.field.separable import fit_bands, quantize_bases
+from progdf.field.grade import MAX_COLOR, bake_grade, map_alone, monomials
+from progdf.field.separable import quantize_bases
 from progdf.gaussians import Gaussians, pack
 from progdf.sh import C0, sh0_to_rgb
 
@@ -33,9 +34,8 @@ from .anchors import Anchors
 from .file import Gdf
 
 MAP_DEGREE = 2
-"""Degree of a fitted map, as a grade's. A cubic explains at most 1 % more of a style."""
+"""Degree of a fitted map: ten monomials per channel."""
 _RANK_TOLERANCE = 1e-9  # share of the largest eigenvalue below which monomials of the colors are dependent
-_CHUNK_MEMBERS = 1 << 11  # members that are mapped at once
 
 
 @dataclass(frozen=True)
@@ -117,19 +117,20 @@ def _fit_color(scene: Gaussians, gdf: Gdf) -> BakedField:
     weights = _visible_areas(scene, members)
     weights[own:] = 0.0
     moved = field.attributes["sh0"]
-    bands = member_bands(pack(scene[members], with_shN="shN" in field.attributes))
-    inputs = map_inputs(bands)
+    colors = _drawn_colors(scene.sh0[members])
+    inputs = monomials(colors, MAP_DEGREE) / C0
     stored = torch.cat([moved.end_offset[None].float(), moved.residual_basis.float()])
     offsets = stored * moved.scale[:, None]
-    tables = [fit_map(inputs[0], target, weights) for target in offsets]
-    mapped = torch.stack([torch.einsum("bkm,kc->mbc", inputs, table) for table in tables])
+    tables = [fit_map(inputs, target, weights) for target in offsets]
+    mapped = torch.stack([inputs.T @ table for table in tables])
     mapped[:, own:] = 0.0
-    end = mapped[0, :, 0].contiguous()
-    levels, unit = quantize_bases(mapped[1:, :, 0], torch.int8)
+    levels, unit = quantize_bases(mapped[1:], torch.int8)
     scale = torch.cat([torch.ones(1, 3), unit])
-    attributes = {"sh0": AttributeBases(end, levels, scale, moved.coefficients)}
+    attributes = {"sh0": AttributeBases(mapped[0], levels, scale, moved.coefficients)}
     if "shN" in field.attributes:
-        higher = fit_bands(mapped[:, :, 1:].flatten(2), field.attributes["shN"].end_offset.shape[1])
+        bands = scene.shN[members].float()
+        higher = torch.stack([(bands @ slopes(colors, table)).flatten(1) for table in tables])
+        higher[:, own:] = 0.0
         levels, unit = quantize_bases(higher, torch.int8)
         attributes["shN"] = AttributeBases(levels[0], levels[1:], unit, moved.coefficients)
     return BakedField("separable", field.knots, attributes, field.channels)
@@ -144,29 +145,44 @@ def _split_discs(scene: Gaussians, members: Tensor, anchors: Anchors | None) -> 
     below = (anchors.weights[..., None] * colors[anchors.rows]).sum(dim=1)
     change = colors[rows] - below
     change[anchors.weights.sum(dim=1) == 0.0] = 0.0  # such discs lie on nothing
-    inputs = map_inputs(below[:, None])[0]
+    inputs = monomials(_drawn_colors(below), MAP_DEGREE) / C0
     table = fit_map(inputs, change, _visible_areas(scene, rows))
     return DiscColors(change, inputs.T @ table)
 
 
-def map_inputs(bands: Tensor) -> Tensor:
-    """Return the monomials of the members' drawn colors, as SH functions. [M,B,3] -> [B,K,M]"""
-    if bands.shape[1] == 1:
-        colors = sh0_to_rgb(bands[:, 0]).T.clamp(0.0, MAX_COLOR)
-        return (monomials(colors, MAP_DEGREE) / C0)[None]
-    values, inverse = sphere(round(bands.shape[1] ** 0.5) - 1, bands.device)
-    parts = []
-    for chunk in torch.split(bands.movedim(2, 0), _CHUNK_MEMBERS, dim=1):
-        colors = (chunk @ values.T + 0.5).clamp(0.0, MAX_COLOR)
-        parts.append(monomials(colors, MAP_DEGREE) @ inverse.T)
-    return torch.cat(parts, dim=1).movedim(2, 0)
+def slopes(colors: Tensor, table: Tensor) -> Tensor:
+    """Return the derivative of a fitted map: the change of each output channel by each input channel.
+
+    Args:
+        colors: drawn colors, see `_drawn_colors`. [3,M]
+        table: coefficients of the map, see `fit_map`. [K,3]
+
+    Returns:
+        [M,3,3], input channel first. 0 where the color is beyond the limits of the map
+    """
+    red, green, blue = colors
+    zero = torch.zeros_like(red)
+    one = torch.ones_like(red)
+    terms = [
+        [zero, one, zero, zero, 2 * red, zero, zero, green, zero, blue],
+        [zero, zero, one, zero, zero, 2 * green, zero, red, blue, zero],
+        [zero, zero, zero, one, zero, zero, 2 * blue, zero, green, red],
+    ]
+    inside = ((colors > 0.0) & (colors < MAX_COLOR)).T[..., None]
+    derivative = torch.stack([torch.stack(row, dim=1) @ table for row in terms], dim=1)
+    return derivative * inside
+
+
+def _drawn_colors(sh0: Tensor) -> Tensor:
+    """Return the colors of SH band 0 within the limits of a map. [M,…] -> [3,M]"""
+    return sh0_to_rgb(sh0.float().reshape(-1, 3)).T.clamp(0.0, MAX_COLOR)
 
 
 def fit_map(inputs: Tensor, change: Tensor, weights: Tensor) -> Tensor:
     """Return the coefficients of the map that fits a color change best, by weighted least squares.
 
     Args:
-        inputs: monomials of the members' colors, see `map_inputs`. [K,M]
+        inputs: monomials of the members' drawn colors, in units of SH band 0. [K,M]
         change: change of SH band 0. [M,3]
         weights: visibility of an error in each member, ≥ 0. [M]
 

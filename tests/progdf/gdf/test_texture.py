@@ -13,11 +13,11 @@ from progdf.compose.composer import Composer
 from progdf.compose.layers import BLENDS, Gains, Layer
 from progdf.compose.reference import compose_layers
 from progdf.field.baked import GradeForm
-from progdf.field.grade import bake_grade, map_alone
+from progdf.field.grade import bake_grade, map_alone, monomials
 from progdf.field.separable import course_field
 from progdf.gaussians import Gaussians, pack
 from progdf.gdf.file import Gdf
-from progdf.gdf.texture import color_split, fit_map, has_texture, map_inputs
+from progdf.gdf.texture import color_split, fit_map, has_texture, slopes
 from progdf.sh import C0
 from tests.helpers.draws import Draws
 from tests.helpers.edits import bits, curved_field, edit_of, grade_of, painted, rimmed, some_rows
@@ -103,13 +103,25 @@ def test_map_of_colors_has_no_texture_and_is_fitted_at_every_strength(scene: Gau
 
 def test_fitted_map_has_the_least_weighted_error(scene: Gaussians) -> None:
     draws = Draws(5)
-    inputs = map_inputs(scene.sh0[:, None].reshape(-1, 1, 3))[0]
+    inputs = monomials((C0 * scene.sh0.reshape(-1, 3).T + 0.5).clamp(0.0, 1.5), 2)
     change = draws.normal(len(scene), 3)
     weights = draws.uniform(len(scene)).double()
     table = fit_map(inputs, change, weights)
     error = (change - inputs.T @ table).double()
     gradient = inputs.double() @ (weights[:, None] * error)
     assert float(gradient.abs().max()) < 1e-3 * float((inputs.double().abs() * weights).sum(dim=1).max())
+
+
+def test_slopes_are_the_derivative_of_the_map() -> None:
+    draws = Draws(6)
+    colors = 0.2 + 0.6 * draws.uniform(3, 20).double()
+    table = draws.normal(10, 3).double()
+    found = slopes(colors, table)
+    for channel in range(3):
+        step = torch.zeros(3, 1, dtype=torch.float64)
+        step[channel] = 1e-6
+        change = (monomials(colors + step, 2) - monomials(colors - step, 2)).T @ table / 2e-6
+        torch.testing.assert_close(found[:, channel], change, atol=1e-6, rtol=1e-6)
 
 
 def test_grade_without_mask_and_residual_has_no_texture(scene: Gaussians) -> None:
