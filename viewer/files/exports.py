@@ -90,11 +90,11 @@ def picture_layers(opened: Document, view: ViewState) -> PictureLayers | None:
                 relative_name(path, scene.resolve().parent),
                 sha256(path.resolve()),
                 layer.strength,
-                gains.geometry,
-                gains.opacity,
-                gains.color,
-                gains.texture,
-                layer.paint,
+                geometry=gains.geometry,
+                opacity=gains.opacity,
+                color=gains.color,
+                texture=gains.texture,
+                paint=layer.paint,
             )
         )
     return PictureLayers(view.blend, tuple(found)) if found else None
