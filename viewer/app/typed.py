@@ -34,7 +34,7 @@ _DIGITS = {**{str(i): str(i) for i in range(10)}, **{f"Num{i}": str(i) for i in 
 _POINTS = (".", ",", "Num.")
 _MAX_DIGITS = 16  # longest typed number
 _SNAP_PX = 12.0  # radius of the surface whose normal a part is aligned with, at 1×
-_BASE_SHARE = 0.02  # share of the Gaussians' centers below the base; strays lie lower
+_BASE_SHARE = 0.005  # share of the Gaussians' centers below the base; strays lie lower
 _SAME_SHAPE = 1e-9  # relative difference of matrices that counts as none
 _MIN_SINE = 0.05  # sine of the angle between the line of sight and an axis or plane below which it is edge-on
 

@@ -167,7 +167,7 @@ def base_height(gizmo: Gizmo) -> float:
     part = gizmo.part
     assert part is not None
     world = part.points @ gizmo.matrix[:3, :3].T + gizmo.matrix[:3, 3] + gizmo.center
-    return float(np.quantile(world @ np.array(part.up), 0.02))
+    return float(np.quantile(world @ np.array(part.up), typed._BASE_SHARE))
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -189,7 +189,7 @@ def test_snap_to_surface_aligns_the_up_axis_with_the_normal(seed: int) -> None:
     point = np.array([1.0, 2.0, 3.0])
     matrix = typed.on_surface(part, gizmo.center, gizmo.matrix, point, normal)
     world = part.points @ matrix[:3, :3].T + matrix[:3, 3] + gizmo.center
-    assert np.quantile((world - point) @ normal, 0.02) == pytest.approx(0.0, abs=1e-12)
+    assert np.quantile((world - point) @ normal, typed._BASE_SHARE) == pytest.approx(0.0, abs=1e-12)
     turn = matrix[:3, :3] @ np.linalg.inv(gizmo.matrix[:3, :3])
     np.testing.assert_allclose(turn @ np.array(part.up), normal, atol=1e-12)
 
