@@ -27,6 +27,9 @@ from .graph import MAX_NODES, Floats, Rows, build_graph
 
 _SETTLED_SHARE = 1e-3
 """Movement of a node in a step below which the pose counts as settled, in node spacings."""
+MAX_GRIP_POINTS = 12
+"""Largest number of points that move with a handle of a soft pull."""
+_GRIP_SHARE = 0.35  # radius around a handle that moves with it, as a share of its radius of influence
 _CHANGED = ("means", "log_scales", "quats", "shN")  # attributes that a pull changes
 
 
@@ -143,6 +146,36 @@ def write_offsets(edit: Gdf, offsets: Tensor) -> None:
     slices = attribute_slices(edit.field.channels)
     for attribute, bases in edit.field.attributes.items():
         bases.end_offset.copy_(offsets[:, slices[attribute]])
+
+
+def grip_points(scene: Gaussians, point: tuple[float, float, float], rows: Rows, radius: float) -> Floats:
+    """Return points around a handle that move with it, so that a soft pull has a round top and no spike.
+
+    They are well spread over the Gaussians within a share of the radius that are connected with the handle.
+
+    Args:
+        scene: the Gaussians. [N]
+        point: the handle
+        rows: Gaussians that may move. [M]
+        radius: radius of the influence
+
+    Returns:
+        The handle's point and up to `MAX_GRIP_POINTS` − 1 others. [K,3]
+    """
+    means = scene.means.detach().double().numpy()
+    first = np.array(point)
+    distance = np.linalg.norm(means[rows] - first, axis=1)
+    near = rows[distance <= _GRIP_SHARE * radius]
+    points = [first]
+    if len(near) > 1:
+        seed = np.array([int(np.linalg.norm(means[near] - first, axis=1).argmin())])
+        near = near[connected_rows(scene[torch.from_numpy(near)], seed)]
+    away = np.linalg.norm(means[near] - first, axis=1)
+    while len(points) < min(MAX_GRIP_POINTS, len(near)):
+        farthest = means[near[int(away.argmax())]]
+        points.append(farthest)
+        away = np.minimum(away, np.linalg.norm(means[near] - farthest, axis=1))
+    return np.stack(points)
 
 
 def warm_up() -> None:

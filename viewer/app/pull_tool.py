@@ -434,7 +434,7 @@ def _outline(places: list[tuple[float, float]], ui: UiContext) -> None:
     closed = imgui.ImDrawFlags_.closed.value
     corners = [imgui.ImVec2(x, y) for x, y in places]
     for color, width in ((_OUTLINE_COLOR, 3.0), (PALETTE.handle, 1.25)):
-        canvas.add_polyline(corners, u32(color), width * ui.scale, closed)
+        canvas.add_polyline([*corners], u32(color), width * ui.scale, closed)
 
 
 def _draw_line(drag: PullDrag, pointer: PointerContext) -> None:
@@ -447,5 +447,6 @@ def _draw_line(drag: PullDrag, pointer: PointerContext) -> None:
     ends = [vec3(start + sign * length * np.array(direction)) for sign in (-1.0, 1.0)]
     places = _places(ends, pointer)
     if len(places) == 2:
+        first, last = places
         color = (*_AXIS_COLORS[drag.axis], 0.9) if drag.axis else (*PALETTE.handle[:3], 0.9)
-        imgui.get_background_draw_list().add_line(*places, u32(color), 1.5 * pointer.ui.scale)
+        imgui.get_background_draw_list().add_line(first, last, u32(color), 1.5 * pointer.ui.scale)

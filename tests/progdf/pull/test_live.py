@@ -13,7 +13,14 @@ from progdf.compose.reference import compose_layers
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.pull.course import Handle, pull
-from progdf.pull.live import LivePull, connected_rows, edit_in_progress, write_offsets
+from progdf.pull.live import (
+    MAX_GRIP_POINTS,
+    LivePull,
+    connected_rows,
+    edit_in_progress,
+    grip_points,
+    write_offsets,
+)
 from progdf.region import Region, whole_scene
 from progdf.tidy import Step, similarity, tidy
 from tests.helpers.edits import painted
@@ -122,6 +129,18 @@ def test_finished_pull_adds_to_a_moved_and_recolored_scene() -> None:
     after = compose_layers(scene, [Layer(moved), Layer(gdf)], "adjust")
     expected = below.means[course.region.members] + course.offsets[-1][:, :3]
     torch.testing.assert_close(after.means[course.region.members], expected, atol=1e-3, rtol=0)
+
+
+def test_grip_points_are_spread_around_the_handle() -> None:
+    scene = bar()
+    points = grip_points(scene, tip(scene), np.arange(len(scene)), 1.0)
+    assert 1 < len(points) <= MAX_GRIP_POINTS
+    assert tuple(points[0]) == tip(scene)
+    away = np.linalg.norm(points - points[0], axis=1)
+    assert away.max() <= 0.35
+    assert away[1:].min() > 0.05
+    alone = grip_points(scene, tip(scene), np.arange(len(scene)), 1e-6)
+    assert len(alone) == 1
 
 
 def test_connected_rows_leave_other_things_out() -> None:

@@ -11,6 +11,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import wait as wait_for
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,6 +31,7 @@ from progdf.pull.live import (
     LiveStep,
     connected_rows,
     edit_in_progress,
+    grip_points,
     warm_up,
     write_offsets,
 )
@@ -74,11 +76,21 @@ class _Problem:
     radius: float | None  # radius of the influence; None: all that is connected
 
 
+@dataclass(frozen=True, eq=False)
+class _Constraints:
+    """Constrained points of a problem, and the held region."""
+
+    handles: tuple[Handle, ...]  # without displacements. [K]
+    owners: NDArray[np.int64]  # index of the tool's handle that each point moves with. [K]
+    hold: Region | None
+
+
 @dataclass(frozen=True)
 class _Prepared:
     """Live pull with its edit in progress, and a composer that includes it."""
 
     problem: _Problem
+    owners: NDArray[np.int64]  # index of the tool's handle that each point of the pull moves with. [K]
     live: LivePull
     edit: Gdf
     composer: Composer
@@ -217,12 +229,16 @@ class PullActions:
         while True:
             self._solved_at = 0.0
             wait = self.poll()
-            running = [self._preparing[1]] if self._preparing else []
-            steps = [self._stepping] if self._stepping else []
-            kept = [self._keeping[3]] if self._keeping else []
-            if wait is None and not running and not steps and not kept:
+            running = list[Future[Any]]()
+            if self._preparing is not None:
+                running.append(self._preparing[1])
+            if self._stepping is not None:
+                running.append(self._stepping)
+            if self._keeping is not None:
+                running.append(self._keeping[3])
+            if wait is None and not running:
                 return
-            wait_for([*running, *steps, *kept])
+            wait_for(running)
 
     @property
     def _pull(self) -> Pull | None:
@@ -356,7 +372,7 @@ class PullActions:
         handles = pull.pose.handles
         if prepared.problem.points != tuple(handle.point for handle in handles):
             return None
-        pulls = _pulls(pull)
+        pulls = _pulls(pull)[prepared.owners]
         solved = self._solved
         is_current = solved is not None and np.array_equal(solved.pulls, pulls)
         if self._stepping is not None or (is_current and solved is not None and solved.is_settled):
@@ -463,9 +479,9 @@ def _prepare(bases: _Bases, problem: _Problem, pulls: NDArray[np.float64], count
         ProgdfError: a handle is held, or is not on the part.
     """
     scene = bases.scene(problem, count)
-    handles, hold = _handles(bases, problem, scene, PullPose())
-    live = LivePull(scene, handles, hold)
-    first = live.step(pulls, _FIRST_ROUNDS)
+    constraints = _constraints(bases, problem, scene)
+    live = LivePull(scene, constraints.handles, constraints.hold)
+    first = live.step(pulls[constraints.owners], _FIRST_ROUNDS)
     drawn = problem.engine.scene
     edit = edit_in_progress(drawn, live.members, live.channels, _NAME)
 
@@ -474,7 +490,7 @@ def _prepare(bases: _Bases, problem: _Problem, pulls: NDArray[np.float64], count
     stack = _stack(problem)
     for layers in ([*stack, Layer(edit)], stack):  # the first one compiles and plans the steps to come
         composer.update(layers, problem.blend)
-    return _Prepared(problem, live, edit, composer)
+    return _Prepared(problem, constraints.owners, live, edit, composer)
 
 
 @one_thread()
@@ -488,19 +504,18 @@ def _make_layer(
 ) -> None:
     """Solve the whole course and write it as an edit, as `progdf edit --pull` does."""
     scene = bases.scene(problem, len(original))
-    handles, hold = _handles(bases, problem, scene, pose)
-    course = pull(scene, handles, hold)
+    constraints = _constraints(bases, problem, scene)
+    handles = [
+        replace(handle, pull=pose.handles[owner].pull)
+        for handle, owner in zip(constraints.handles, constraints.owners.tolist(), strict=True)
+        if any(pose.handles[owner].pull)
+    ]
+    course = pull(scene, handles, constraints.hold)
     save_gdf(path, tidy(original, [Step("pull", course.region, course=course)], name, "pull"))
 
 
-def _handles(
-    bases: _Bases, problem: _Problem, scene: Gaussians, pose: PullPose
-) -> tuple[list[Handle], Region | None]:
-    """Return the handles and the held region of a problem.
-
-    Args:
-        pose: displacements of the handles; without handles, all are 0
-    """
+def _constraints(bases: _Bases, problem: _Problem, scene: Gaussians) -> _Constraints:
+    """Return the constrained points and the held region of a problem."""
     count = len(scene)
     mask = np.ones(count, bool)
     if problem.limit != selection.EMPTY_MASK:
@@ -516,18 +531,26 @@ def _handles(
     if problem.radius is None and problem.limit == selection.EMPTY_MASK:
         nearest = allowed[tree.query(np.array(problem.points), 1)[1][:, 0]]
         region = bases.connected_part(scene, mask, nearest)
-    pulls = [handle.pull for handle in pose.handles] or [(0.0, 0.0, 0.0)] * len(problem.points)
-    handles = [
-        Handle(region, point, pull, problem.radius) for point, pull in zip(problem.points, pulls, strict=True)
-    ]
     held = np.zeros(count, bool)
     if problem.held != selection.EMPTY_MASK:
         held |= _own(problem.held, problem, count)
     if problem.pins:
         near = tree.query(np.array(problem.pins), min(_PIN_GAUSSIANS, len(allowed)))[1]
         held[allowed[near.ravel()]] = True
+    movable = np.flatnonzero(mask & ~held)
+    handles = list[Handle]()
+    owners = list[int]()
+    for index, point in enumerate(problem.points):
+        grips = np.array([point])
+        if problem.radius is not None:
+            grips = grip_points(scene, point, movable, problem.radius)
+        for x, y, z in grips.tolist():
+            away = float(np.linalg.norm(np.array([x, y, z]) - np.array(point)))
+            falloff = None if problem.radius is None else problem.radius - away
+            handles.append(Handle(region, (x, y, z), (0.0, 0.0, 0.0), falloff))
+            owners.append(index)
     hold = from_mask("held", torch.from_numpy(held)) if held.any() else None
-    return handles, hold
+    return _Constraints(tuple(handles), np.array(owners), hold)
 
 
 def _own(packed: bytes, problem: _Problem, count: int) -> NDArray[np.bool_]:
