@@ -53,7 +53,7 @@ BENCHES: dict[str, str] = {
 
 PAGE = (
     *("training", "field", "order", "viewer", "rasterize"),
-    *("warp", "moving", "popping", "painting", "dragging", "frames", "hard"),
+    *("warp", "moving", "popping", "painting", "frames", "hard"),
 )
 """Benchmarks of docs/speed-and-error.md."""
 
