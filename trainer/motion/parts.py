@@ -33,7 +33,8 @@ _WIDE_STEP_SHARE = 0.4
 _RATES = (0.06, 0.03, 0.03)  # step of shift in part sizes, of log-scale, of rotation in radians
 # share of the initial distance that may remain before the near search counts as failed
 _FAILED_SEARCH_SHARE = 0.25
-_MOVING_ATTRIBUTES = ("means", "log_scales", "quats")
+MOVING_ATTRIBUTES = ("means", "log_scales", "quats")
+"""Attributes that motion changes."""
 _AVERAGED_STEP_SHARE = 0.25  # final share of the steps over which the numbers are averaged
 
 OnStep = Callable[[int, float], None]
@@ -195,7 +196,7 @@ def view_distance(scene: CropScene, rows: Tensor, target: Tensor, wide: bool = F
 
     Blurred pictures attract a part to a position that it does not overlap yet.
     """
-    image = scene.render(rows, _MOVING_ATTRIBUTES)
+    image = scene.render(rows, MOVING_ATTRIBUTES)
     difference = image - target
     loss = difference.new_zeros(()) if wide else difference.abs().mean()
     longer = max(scene.size)

@@ -16,7 +16,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Protocol, Self
 
 import torch
 from torch import Tensor
@@ -150,6 +150,7 @@ class MemberMaps:
     shift: Tensor  # b. [M,3]
     turn: Tensor  # unit quaternion. [M,4]
     growth: Tensor  # growth of the log-scales, along the member's axes. [M,3]
+    axes_turn: Tensor | None = None  # rotation of the axes, unit quaternion; None: that of the map. [M,4]
 
     def carry(self, original: Tensor, offsets: Tensor) -> Tensor:
         """Convert offsets within the moved frames to offsets from the original. Differentiable.
@@ -165,18 +166,20 @@ class MemberMaps:
         moved = [
             (self.matrix @ means[..., None])[..., 0] + self.shift,
             log_scales + self.growth,
-            multiply_quats(self.turn, quats),
+            multiply_quats(self.turn if self.axes_turn is None else self.axes_turn, quats),
         ]
         return offsets_to(torch.cat(moved, dim=1), original, offsets, self.turn)
 
     def carry_back(self, original: Tensor, offsets: Tensor) -> Tensor:
         """Invert `carry`. [M,C] -> [M,C]"""
         means, log_scales, quats = split_geometry(original[:, GEOMETRY] + offsets[:, GEOMETRY])
-        back = self.turn * self.turn.new_tensor([1.0, -1.0, -1.0, -1.0])
+        conjugate = self.turn.new_tensor([1.0, -1.0, -1.0, -1.0])
+        back = conjugate * self.turn
+        axes_back = back if self.axes_turn is None else conjugate * self.axes_turn
         local = [
             torch.linalg.solve(self.matrix, (means - self.shift)[..., None])[..., 0],
             log_scales - self.growth,
-            multiply_quats(back, quats),
+            multiply_quats(axes_back, quats),
         ]
         return offsets_to(torch.cat(local, dim=1), original, offsets, back)
 
@@ -378,6 +381,14 @@ class RegionMotion(Protocol):
         """Invert `carry`. [M,C] -> [M,C]"""
         ...
 
+    def rest(self) -> Self:
+        """Return the placement that moves nothing."""
+        ...
+
+    def interpolate(self, other: Self, share: float) -> Self:
+        """Return the placement at a share of the way to another one."""
+        ...
+
     def lines(self) -> list[str]:
         """Return the log lines about the motion."""
         ...
@@ -397,6 +408,14 @@ class PartsPlacement:
     def carry_back(self, original: Tensor, offsets: Tensor) -> Tensor:
         """See `RegionMotion`."""
         return local_offsets(original, offsets, self.parts, self.motion)
+
+    def rest(self) -> PartsPlacement:
+        """See `RegionMotion`."""
+        return PartsPlacement(self.parts, self.parts.rest_motion())
+
+    def interpolate(self, other: PartsPlacement, share: float) -> PartsPlacement:
+        """See `RegionMotion`."""
+        return PartsPlacement(self.parts, interpolate_motion(self.motion, other.motion, share))
 
     def lines(self) -> list[str]:
         """Return the motion of each part, in units of its size."""
@@ -426,6 +445,14 @@ class WarpPlacement:
         """See `RegionMotion`."""
         return map_members(original, self.control, self.motion).carry_back(original, offsets)
 
+    def rest(self) -> WarpPlacement:
+        """See `RegionMotion`."""
+        return WarpPlacement(self.control, rest_warp(self.control))
+
+    def interpolate(self, other: WarpPlacement, share: float) -> WarpPlacement:
+        """See `RegionMotion`."""
+        return WarpPlacement(self.control, interpolate_warp(self.motion, other.motion, share))
+
     def lines(self) -> list[str]:
         """Return the motion of the control points, in units of their spacing."""
         shift = self.motion.shift.norm(dim=1) / self.control.spacing
@@ -436,12 +463,3 @@ class WarpPlacement:
             f"spacing, rotated by up to {math.degrees(float(turn.max())):.0f} degrees, stretched "
             f"{math.exp(float(stretch.min())):.2f} to {math.exp(float(stretch.max())):.2f} times"
         ]
-
-
-def interpolate_placement(a: RegionMotion, b: RegionMotion, share: float) -> RegionMotion:
-    """Interpolate two placements of the same kind."""
-    if isinstance(a, PartsPlacement) and isinstance(b, PartsPlacement):
-        return PartsPlacement(a.parts, interpolate_motion(a.motion, b.motion, share))
-    assert isinstance(a, WarpPlacement)
-    assert isinstance(b, WarpPlacement)
-    return WarpPlacement(a.control, interpolate_warp(a.motion, b.motion, share))

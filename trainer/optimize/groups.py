@@ -19,15 +19,16 @@ from torch import Tensor
 
 from progdf.gaussians import attribute_slices
 from progdf.similarity import Motion, Parts, make_parts
-from trainer.motion.parts import GroupSearch, OnStep, connected_parts
+from trainer.motion.node_search import NodeSearch
+from trainer.motion.nodes import NodeMotion, NodePlacement, place_nodes, rest_nodes
+from trainer.motion.parts import GroupSearch, OnStep, connected_parts, mean_distance
 from trainer.motion.warp import (
+    LEVELS,
     PartsPlacement,
     RegionMotion,
     WarpMotion,
     WarpPlacement,
     WarpSearch,
-    interpolate_placement,
-    rest_warp,
     warp_of_parts,
 )
 from trainer.views.crops import CropScene, render_all
@@ -49,6 +50,11 @@ _MAX_PARTS_ERROR = 0.1  # share of the distance that may remain for a motion by 
 # Control points must leave at most this share of the distance that whole parts leave: they cost more and are
 # less stable.
 _MAX_WARP_ERROR = 0.9
+# Nodes must leave at most this share of the distance that the others leave.
+_MAX_NODES_ERROR = 0.9
+# Share of the members' own steps within the frames of nodes. Longer steps lose what the nodes found
+# (docs/benchmarks.md, Parts that move smoothly).
+_NODE_STEP_SHARE = 0.3
 
 
 @dataclass(frozen=True)
@@ -59,6 +65,7 @@ class Groups:
     motions: tuple[Motion, ...]  # motions of the parts, one per stage
     # motions of control points, one per stage; empty if parts move as wholes
     warps: tuple[WarpPlacement, ...] = ()
+    nodes: tuple[NodePlacement, ...] = ()  # motions of nodes, one per stage, which replace the others
 
     @property
     def extent(self) -> float:
@@ -68,14 +75,13 @@ class Groups:
     @property
     def placements(self) -> tuple[RegionMotion, ...]:
         """Motion at the end of each stage."""
-        return self.warps or tuple(PartsPlacement(self.parts, motion) for motion in self.motions)
+        rigid = tuple(PartsPlacement(self.parts, motion) for motion in self.motions)
+        return self.nodes or self.warps or rigid
 
     @property
     def rest(self) -> RegionMotion:
         """Motion at the start of the first stage."""
-        if self.warps:
-            return WarpPlacement(self.warps[0].control, rest_warp(self.warps[0].control))
-        return PartsPlacement(self.parts, self.parts.rest_motion())
+        return self.placements[0].rest()
 
     def to_stages(
         self, original: Tensor, crops: Sequence[CropScene], stages: Sequence[TargetStage]
@@ -92,6 +98,8 @@ class Groups:
             total, _ = mean_visible_change(stage.targets, before)
             remaining, left = mean_visible_change(stage.targets, moved)
             length = min(1.0, left / _FULL_STEP_CHANGE, remaining / (_FULL_STEP_REMAINDER * max(total, 1e-9)))
+            if self.nodes:
+                length *= _NODE_STEP_SHARE
             staged.append(replace(stage, place=carried, length=max(0.02, length)))
             before = stage.targets
         return staged
@@ -101,12 +109,16 @@ class Groups:
         return self.placements[-1].lines()
 
     def capture_state(self) -> dict[str, Tensor]:
-        """Return the part of each member [M], motions [T,P,7] and warps [T,C,12], for `restore_groups`."""
+        """Return the part of each member [M] and motions of parts [T,P,7], control points [T,C,12] and nodes
+        [T,n,6], for `restore_groups`."""
         motions = [torch.cat([m.shift, m.log_scale[:, None], m.turn], dim=1) for m in self.motions]
         state = {"part": self.parts.part, "motions": torch.stack(motions)}
         if self.warps:
             warps = [torch.cat([w.motion.shift, w.motion.turn, w.motion.stretch], dim=1) for w in self.warps]
             state["warps"] = torch.stack(warps)
+        if self.nodes:
+            nodes = [torch.cat([n.motion.positions, n.motion.turn], dim=1) for n in self.nodes]
+            state["nodes"] = torch.stack(nodes)
         return state
 
 
@@ -152,7 +164,12 @@ def group_stage(
     left = search.distance(targets[-1], motions[-1])
     if left <= _MAX_PARTS_ERROR * search.distance(targets[-1], parts.rest_motion()):
         return groups
-    return bend_groups(groups, search, targets, strengths or range(1, len(targets) + 1), step_done)
+    strengths = strengths or range(1, len(targets) + 1)
+    groups = bend_groups(groups, search, targets, strengths, step_done)
+    moving = NodeSearch(original, crops, steps)
+    if len(moving.nodes) <= LEVELS[-1]:  # no finer than the control points
+        return groups
+    return move_nodes(groups, moving, targets, strengths, step_done)
 
 
 def restore_groups(original: Tensor, saved: Mapping[str, Tensor]) -> Groups:
@@ -165,7 +182,11 @@ def restore_groups(original: Tensor, saved: Mapping[str, Tensor]) -> Groups:
         warps = tuple(
             WarpPlacement(control, WarpMotion(w[:, :3], w[:, 3:6], w[:, 6:])) for w in saved["warps"]
         )
-    return Groups(make_parts(original, saved["part"]), motions, warps)
+    nodes: tuple[NodePlacement, ...] = ()
+    if "nodes" in saved:
+        graph = NodeSearch(original, ()).nodes
+        nodes = tuple(NodePlacement(graph, NodeMotion(n[:, :3], n[:, 3:])) for n in saved["nodes"])
+    return Groups(make_parts(original, saved["part"]), motions, warps, nodes)
 
 
 def bend_groups(
@@ -204,6 +225,42 @@ def bend_groups(
     return replace(groups, warps=tuple(WarpPlacement(control, motion) for motion in motions))
 
 
+def move_nodes(
+    groups: Groups,
+    moving: NodeSearch,
+    targets: Sequence[Sequence[Tensor]],
+    strengths: Sequence[float],
+    on_step: Callable[[int, int, float], None],
+) -> Groups:
+    """Move the nodes of a deformation graph, from rest or from the motion of `groups`.
+
+    Args:
+        groups: parts or control points, moved
+        moving: search for the motion of the nodes
+        targets, strengths, on_step: see `bend_groups`
+
+    Returns:
+        The groups with nodes, or `groups` if nodes are not clearly closer to the finished edit.
+    """
+    original = moving.original
+    graph = moving.nodes
+    motions = list[NodeMotion]()
+    for stage, pictures in enumerate(targets):
+        done = partial(on_step, stage)
+        if stage:
+            further = strengths[stage] / strengths[stage - 1]
+            motions.append(moving.find_next(pictures, motions[-1], further, done))
+        else:
+            found = place_nodes(original, graph, groups.placements[0])
+            start = min((rest_nodes(graph), found), key=lambda motion: moving.distance(targets[0], motion))
+            motions.append(moving.find(pictures, start, on_step=done))
+    offsets = groups.placements[-1].carry(original, torch.zeros_like(original))
+    left = mean_distance(moving.crops, original + offsets, targets[-1])
+    if moving.distance(targets[-1], motions[-1]) > _MAX_NODES_ERROR * left:
+        return groups
+    return replace(groups, nodes=tuple(NodePlacement(graph, motion) for motion in motions))
+
+
 def group_path(
     original: Tensor, groups: Groups, ends: Sequence[Tensor], steps: Sequence[int], count: int
 ) -> list[ParameterSnapshot]:
@@ -229,7 +286,7 @@ def group_path(
         next_own = after.carry_back(original, end)
         for i in range(1, each):
             share = i / each
-            halfway = interpolate_placement(placement, after, share)
+            halfway = placement.interpolate(after, share)
             offsets = halfway.carry(original, torch.lerp(own, next_own, share))
             done = start_step + round(share * (step - start_step))
             placements.append(ParameterSnapshot(done, False, offsets.half().cpu(), {}))

@@ -37,8 +37,8 @@ from trainer.views.crops import CropScene, crop_scene
 from trainer.views.setup import TrainingSetup, make_training_setup
 from trainer.views.view import View, crop
 
-from .analytic_edits import AnalyticEdit, column_warps, smile_warp
-from .table import Table
+from ..analytic_edits import AnalyticEdit, column_warps, smile_warp
+from ..table import Table
 
 STEPS = 240
 VIEWS = 15
@@ -97,8 +97,8 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
             tuple(rows),
             f"PSNR in held-out views over the evaluated pixels, dB; {STEPS} steps towards the full edit, "
             f"{VIEWS} views of {SIZE} pixels, a fifth of them held out. free: members only; parts, free: "
-            "rigid motions of connected parts first, as before; bent: by control points, before and after "
-            "the members' own steps; seconds: processor time, free, then bent and free.",
+            "rigid motions of connected parts first; bent: by control points or nodes, before and after the "
+            "members' own steps; seconds: processor time, free, then bent and free.",
         )
     ]
 
@@ -137,11 +137,11 @@ def _row(options: TrainOptions, case: WarpCase) -> tuple[str, ...]:
     begun = time.process_time()
     groups = group_stage(original, crops, [targets], GROUP_STEPS)
     searched = time.process_time() - begun
-    parts, _ = trained(grouped, replace(groups, warps=()))
-    if not groups.warps:
+    parts, _ = trained(grouped, replace(groups, warps=(), nodes=()))
+    if not groups.warps and not groups.nodes:
         seconds_text = f"{free_seconds:.0f}"
         return case.name, str(len(original)), unedited, free, parts, "", "", str(trial.chosen), seconds_text
-    bent = _psnr(judge, groups.warps[0].carry(original, nothing))
+    bent = _psnr(judge, groups.placements[0].carry(original, nothing))
     both, both_seconds = trained(grouped, groups)
     seconds_text = f"{free_seconds:.0f}, {searched + both_seconds:.0f}"
     return case.name, str(len(original)), unedited, free, parts, bent, both, str(trial.chosen), seconds_text
