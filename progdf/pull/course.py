@@ -30,13 +30,13 @@ MAX_PULL = 100.0
 """Largest pull, in diagonals of the scene."""
 _TOUCH_SIGMAS = 3.0  # standard deviations; a point on the region is at most so far from a Gaussian
 _HELD_BELOW = 0.01  # falloff; nodes with less are held
-_SPRING = 8.0  # stiffness of the falloff's springs, in edges per squared radius
+_FALLOFF_STIFFNESS = 8.0  # stiffness of the falloff's springs, in edges per squared radius
 _TRIAL_STRENGTHS = 4  # strengths of the solve that finds how far the handles turn
 _KNOT_SPACING = 1 / 8  # rotation, radians, or log-stretch of the nodes between two strengths
 _LARGEST_SHARE = 0.99  # quantile of the nodes' rotations and log-stretches that counts as the largest
 _MIN_STRENGTHS = 4  # smallest number of solved strengths
 _MAX_STRENGTHS = 24  # largest number of solved strengths
-_MOVED = 1e-4  # smallest movement of a node that counts, in node spacings
+_STILL_NODE_SPACINGS = 1e-4  # a node that moves less, in node spacings, stays
 
 
 @dataclass(frozen=True)
@@ -110,19 +110,20 @@ def pull(
         kept[hold.members.numpy()] = False
     moved_nodes = np.zeros(len(graph), bool)
     for pose in poses:
-        moved_nodes |= np.abs(pose.positions - graph.positions).max(axis=1) > _MOVED * graph.spacing
+        moved_nodes |= (
+            np.abs(pose.positions - graph.positions).max(axis=1) > _STILL_NODE_SPACINGS * graph.spacing
+        )
     points = scene.means.detach().double().numpy()[problem.members]
     binding = bind(graph, points, graph.node_of)
     moves = (binding @ moved_nodes.astype(float) > 0.0) & kept[problem.members]
     members = problem.members[moves]
     binding = csr_array(binding[np.flatnonzero(moves)])
-    raw = pack(scene[torch.from_numpy(members)], with_shN=scene.sh_degree > 0).detach()
-    rows = raw.double()
-    frames = rest_frames(rows)
+    raw = pack(scene[torch.from_numpy(members)], with_shN=scene.sh_degree > 0).detach().float()
+    frames = rest_frames(raw)
     offsets = torch.zeros(len(strengths), *raw.shape)
     for i, pose in enumerate(poses, start=1):
-        packed, frames = follow(rows, binding, graph, pose, problem.solver.gradients(pose), frames)
-        offsets[i] = (packed - rows).float()
+        packed, frames = follow(raw, binding, graph, pose, problem.solver.gradients(pose), frames)
+        offsets[i] = packed - raw
     mask = torch.zeros(len(scene), dtype=torch.bool)
     mask[torch.from_numpy(members)] = True
     name = " + ".join(dict.fromkeys(handle.region.name for handle in handles))
@@ -240,7 +241,7 @@ def _springs(graph: NodeGraph, handles: Sequence[Handle], weights: Floats) -> Fl
         return np.zeros(len(graph))
     degree = np.bincount(graph.starts, minlength=len(graph))
     safe = np.maximum(weights, _HELD_BELOW)
-    springs: Floats = _SPRING * (graph.spacing / min(radii)) ** 2 * degree * (1.0 - safe) / safe
+    springs: Floats = _FALLOFF_STIFFNESS * (graph.spacing / min(radii)) ** 2 * degree * (1.0 - safe) / safe
     return springs
 
 

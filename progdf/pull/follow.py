@@ -2,12 +2,17 @@
 
 Each Gaussian is bound to the nodes near it, but only to its own node and those connected with it. Its mean
 moves by the blend of their affine maps. Its covariance takes the blended gradient G, as G Σ Gᵀ. The principal
-axes are continued from the last strength, so that the slider interpolates like axes.
+axes are continued from the last strength, so that the slider interpolates like axes. Its higher bands take
+the blend of the nodes' rotations, as quaternions.
+
+The work is done by `progdf.pull.follow_kernel`, on all threads.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import torch
@@ -15,18 +20,21 @@ from scipy.sparse import csr_array
 from torch import Tensor
 
 from progdf.gaussians import BASE_CHANNELS, attribute_slices
-from progdf.quaternions import matrix_quats, normalize_quats, rotation_matrices
-from progdf.similarity import band_change
+from progdf.quaternions import normalize_quats, rotation_matrices
+from progdf.sh import basis, spread_directions
+from progdf.threads import run_chunks
 
+from .follow_kernel import NODE_WIDTH, Bands, Singles, follow_rows, write_nodes
 from .graph import Floats, NodeGraph, Rows
-from .solve import Pose, nearest_rotations
+from .solve import Pose
 
 MAX_STRETCH = 3.0
 """Largest factor by which a Gaussian grows or shrinks; more shows as hairs."""
 _BOUND_NODES = 6  # nodes that a Gaussian follows
-_CHUNK = 1 << 16  # Gaussians that are bound at once
-_JACOBI_SWEEPS = 4
-_PAIRS = ((0, 1), (0, 2), (1, 2))
+_BIND_CHUNK = 1 << 16  # Gaussians that are bound at once
+_FOLLOW_CHUNK = 1 << 11  # Gaussians that a thread moves at once
+_LEAST_SQUARE = 1e-30  # squared relative scale; keeps logarithms finite
+_SPREAD_DIRECTIONS = 20  # size of the even lattice from which the directions of a band are taken
 _COLUMNS = attribute_slices(BASE_CHANNELS)
 
 
@@ -34,9 +42,10 @@ _COLUMNS = attribute_slices(BASE_CHANNELS)
 class Frames:
     """Principal axes of M Gaussians at one strength, the start for the next."""
 
-    axes: Floats  # columns are axes. [M,3,3]
-    quats: Floats  # their quaternions wxyz, with the lengths in the scene. [M,4]
-    rotations: Floats  # rotations from the original. [M,3,3]
+    # axes times scales at rest relative to the largest, least squared scale, log of the largest. [M,11]
+    halves: Singles
+    turns: Singles  # rotation of the columns of G R S that makes them orthogonal. [M,9]
+    quats: Singles  # quaternions wxyz of the axes, with the lengths in the scene. [M,4]
 
 
 def bind(graph: NodeGraph, points: Floats, nodes: Rows) -> csr_array:
@@ -49,8 +58,8 @@ def bind(graph: NodeGraph, points: Floats, nodes: Rows) -> csr_array:
     """
     table = _neighbor_table(graph)
     parts = [
-        _bind_chunk(graph, points[first : first + _CHUNK], table[nodes[first : first + _CHUNK]])
-        for first in range(0, len(points), _CHUNK)
+        _bind_chunk(graph, points[first : first + _BIND_CHUNK], table[nodes[first : first + _BIND_CHUNK]])
+        for first in range(0, len(points), _BIND_CHUNK)
     ]
     found = np.concatenate([part[0] for part in parts])
     weights = np.concatenate([part[1] for part in parts])
@@ -89,107 +98,83 @@ def _bind_chunk(graph: NodeGraph, points: Floats, candidates: Rows) -> tuple[Row
 
 def rest_frames(rows: Tensor) -> Frames:
     """Return the principal axes of packed raw rows at strength 0. [M,C]"""
-    raw = rows[:, _COLUMNS["quats"]].double()
-    axes = rotation_matrices(normalize_quats(raw)).numpy()
-    identity = np.broadcast_to(np.eye(3), axes.shape)
-    return Frames(axes, raw.numpy(), identity)
+    quats = rows[:, _COLUMNS["quats"]]
+    log_scales = rows[:, _COLUMNS["log_scales"]].double()
+    largest = log_scales.amax(dim=1, keepdim=True)
+    axes = rotation_matrices(normalize_quats(quats.double())) * (log_scales - largest).exp()[:, None, :]
+    floor = (2.0 * (log_scales.amin(dim=1, keepdim=True) - largest)).exp() / MAX_STRETCH**4
+    floor = floor.clamp_min(_LEAST_SQUARE)
+    halves = torch.cat([axes.flatten(1), floor, largest], dim=1).float().numpy()
+    turns = np.tile(np.eye(3, dtype=np.float32).ravel(), (len(rows), 1))
+    return Frames(halves, turns, np.ascontiguousarray(quats.float().numpy()))
 
 
 def follow(
-    rows: Tensor, binding: csr_array, graph: NodeGraph, pose: Pose, gradients: Floats, last: Frames
+    rows: Tensor,
+    binding: csr_array,
+    graph: NodeGraph,
+    pose: Pose,
+    gradients: Floats,
+    last: Frames,
+    out: Tensor | None = None,
 ) -> tuple[Tensor, Frames]:
     """Return packed raw rows that follow the nodes, and their axes.
 
     Args:
-        rows: raw rows at rest. [M,C] float64
+        rows: raw rows at rest. [M,C]; float32 needs no conversion
         binding: weights of the nodes. [M,n]
         graph: deformation graph with n nodes
         pose: deformed nodes
         gradients: their deformation gradients. [n,3,3]
         last: axes at a similar pose
+        out: rows of an earlier call to overwrite, contiguous. [M,C] float32
+
+    Returns:
+        Rows [M,C] float32 and their axes.
     """
-    means = rows[:, _COLUMNS["means"]].numpy()
-    shifts = pose.positions - np.einsum("nij,nj->ni", gradients, graph.positions)
-    table = np.concatenate(
-        [gradients.reshape(-1, 9), shifts, _limit_stretch(gradients).reshape(-1, 9)], axis=1
+    count = len(rows)
+    raw = np.ascontiguousarray(rows.detach().float().numpy())
+    packed = torch.empty(raw.shape) if out is None else out
+    center = graph.positions.mean(axis=0)
+    table = np.zeros((len(graph), NODE_WIDTH), np.float32)
+    write_nodes(
+        np.ascontiguousarray(gradients, np.float64),
+        graph.positions,
+        np.ascontiguousarray(pose.positions, np.float64),
+        center,
+        MAX_STRETCH,
+        table,
     )
-    blended = binding @ table
-    moved = np.einsum("mij,mj->mi", blended[:, :9].reshape(-1, 3, 3), means) + blended[:, 9:12]
-    gradient = blended[:, 12:].reshape(-1, 3, 3)
-    rotations = nearest_rotations(gradient, last.rotations, steps=4)
-    axes, log_scales = _stretch_axes(rows, gradient, last)
-    quats = _continued_quats(axes, last.quats)
-    bands = rows[:, BASE_CHANNELS:]
-    turned = bands + band_change(bands, matrix_quats(torch.from_numpy(rotations)))
-    packed = torch.cat(
-        [
-            torch.from_numpy(moved),
-            torch.from_numpy(log_scales),
-            torch.from_numpy(quats),
-            rows[:, _COLUMNS["quats"].stop : BASE_CHANNELS],
-            turned,
-        ],
-        dim=1,
+    weights = (
+        binding.indptr.astype(np.int32, copy=False),
+        binding.indices.astype(np.int32, copy=False),
+        binding.data.astype(np.float32, copy=False),
     )
-    return packed, Frames(axes, quats, rotations)
+    frames = (np.empty((count, 9), np.float32), np.empty((count, 4), np.float32))
+    degree = min(3, math.isqrt((raw.shape[1] - BASE_CHANNELS) // 3 + 1) - 1)
+    bands = (_band_samples(1), _band_samples(2), _band_samples(3))
+    moved = packed.numpy()
+
+    def move(chunk: int) -> None:
+        first = chunk * _FOLLOW_CHUNK
+        part = (first, min(first + _FOLLOW_CHUNK, count), degree)
+        follow_rows(
+            raw, weights, table.ravel(), center.astype(np.float32), last.halves, (last.turns, last.quats),
+            frames, bands, moved, part,
+        )  # fmt: skip
+
+    run_chunks(move, -(-count // _FOLLOW_CHUNK))
+    return packed, Frames(last.halves, *frames)
 
 
-def _limit_stretch(gradients: Floats) -> Floats:
-    """Return gradients with singular values limited to 1 / MAX_STRETCH to MAX_STRETCH. [n,3,3]"""
-    left, values, right = np.linalg.svd(gradients)
-    bounded: Floats = (left * values.clip(1.0 / MAX_STRETCH, MAX_STRETCH)[:, None, :]) @ right
-    return bounded
-
-
-def _stretch_axes(rows: Tensor, gradient: Floats, last: Frames) -> tuple[Floats, Floats]:
-    """Return axes [M,3,3] and log-scales [M,3] of G Σ Gᵀ, with the axes nearest to the last ones.
-
-    The scales are computed relative to each Gaussian's largest one, so that tiny and huge ones stay in range.
-    """
-    log_scales = rows[:, _COLUMNS["log_scales"]].numpy()
-    largest = log_scales.max(axis=1, keepdims=True)
-    original = rotation_matrices(normalize_quats(rows[:, _COLUMNS["quats"]])).numpy()
-    half = gradient @ (original * np.exp(log_scales - largest)[:, None, :])
-    # cyclic Jacobi rotations of at most 45° from the last axes, which keep their order
-    axes = last.axes
-    local = np.swapaxes(axes, 1, 2) @ half
-    matrix = local @ np.swapaxes(local, 1, 2)
-    for _ in range(_JACOBI_SWEEPS):
-        for i, j in _PAIRS:
-            turn = _jacobi(matrix[:, i, i], matrix[:, j, j], matrix[:, i, j])
-            axes = _turn_columns(axes, turn, i, j)
-            matrix = _turn_columns(matrix, turn, i, j)
-            matrix = np.swapaxes(_turn_columns(np.swapaxes(matrix, 1, 2), turn, i, j), 1, 2)
-    values = np.einsum("mii->mi", matrix)
-    floor = np.exp(2.0 * (log_scales.min(axis=1, keepdims=True) - largest)) / MAX_STRETCH**4
-    return axes, largest + 0.5 * np.log(np.maximum(values, np.maximum(floor, 1e-300)))
-
-
-def _jacobi(first: Floats, second: Floats, mixed: Floats) -> tuple[Floats, Floats]:
-    """Return cosine and sine of the smaller rotation that removes the mixed entry. [M] each"""
-    difference = second - first
-    small = np.abs(mixed) <= 1e-16 * (first + second)
-    safe = np.where(small, 1.0, mixed)
-    ratio = difference / (2.0 * safe)
-    tangent = np.where(ratio < 0.0, -1.0, 1.0) / (np.abs(ratio) + np.sqrt(1.0 + ratio * ratio))
-    tangent = np.where(small, 0.0, tangent)
-    cosine = 1.0 / np.sqrt(1.0 + tangent * tangent)
-    return cosine, tangent * cosine
-
-
-def _turn_columns(matrices: Floats, turn: tuple[Floats, Floats], i: int, j: int) -> Floats:
-    cosine, sine = turn
-    turned = matrices.copy()
-    turned[:, :, i] = cosine[:, None] * matrices[:, :, i] - sine[:, None] * matrices[:, :, j]
-    turned[:, :, j] = sine[:, None] * matrices[:, :, i] + cosine[:, None] * matrices[:, :, j]
-    return turned
-
-
-def _continued_quats(axes: Floats, last: Floats) -> Floats:
-    """Return the quaternions of axes with the lengths and the sign of the last ones. [M,4]"""
-    quats = matrix_quats(torch.from_numpy(axes)).numpy()
-    length = np.linalg.norm(last, axis=1, keepdims=True)
-    length = np.where(length > 0.0, length, 1.0)
-    sign = np.where((quats * last).sum(axis=1, keepdims=True) < 0.0, -1.0, 1.0)
-    continued: Floats = quats * sign * length
-    return continued
+@cache
+def _band_samples(degree: int) -> Bands:
+    """Return directions of a band, and the matrix from colors along them to its coefficients."""
+    count = 2 * degree + 1
+    directions = spread_directions(_SPREAD_DIRECTIONS)[:count]
+    values = basis(degree, directions)[:, degree * degree :]
+    inverse = torch.linalg.inv(values)
+    return (
+        np.ascontiguousarray(directions.float().numpy().ravel()),
+        np.ascontiguousarray(inverse.float().numpy().ravel()),
+    )

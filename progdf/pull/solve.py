@@ -4,6 +4,8 @@ The energy is Σ |x_j − x_i − R_i (p_j − p_i)|² over all edges, with unkn
 steps alternate: rotations for given positions, node by node; and positions for given rotations, a linear
 system whose factorization stays the same for the whole course.
 
+The rounds are accelerated, see `progdf.pull.solve_kernel`.
+
 A handle constrains a point of the surface, which is a blend of the nodes near it, so that no node sticks out.
 A falloff adds springs to the rest positions, which are stiff at its radius. Held nodes are eliminated.
 """
@@ -13,15 +15,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.sparse.linalg import splu
 
+from . import solve_kernel
 from .graph import Floats, Mask, NodeGraph, Rows
 
+DRAG_ROUNDS = 12
+"""Rounds of a step while a handle is dragged; the next steps continue them."""
+_MAX_ROUNDS = 500
 _HANDLE_STIFFNESS = 1e5  # edges; the error of a handle's position is about 1 / 1e5 of its pull
-_ROTATION_STEPS = 3  # iterations of the rotations between two linear solves, warm-started
-_MAX_ROUNDS = 200
-_SETTLED = 1e-4  # node spacings; the solve ends if no node moves farther in a round
+_SETTLED_SHARE = 2e-5  # of the free nodes' diagonal; a round that moves no coordinate farther is the last
 _GRADIENT_PRIOR = 0.05  # weight of the rotation in a node's gradient, as a share of its edges' squares
 
 
@@ -48,27 +53,41 @@ class Solver:
         self, graph: NodeGraph, blends: csr_array, points: Floats, held: Mask, springs: Floats
     ) -> None:
         self._graph = graph
-        self._free: Rows = np.flatnonzero(~held)
+        free: Rows = np.flatnonzero(~held)
         self._held: Rows = np.flatnonzero(held)
         count = len(graph)
-        self._to_products, self._to_right = _edge_maps(graph)
-        squares = self._products(graph.positions)
+        first = np.concatenate([[0], np.cumsum(np.bincount(graph.starts, minlength=count))])
+        arms = np.ascontiguousarray(graph.arms)
+        self._rest = np.ascontiguousarray(graph.positions)
+        self._edges = (_rows(first), _rows(graph.ends), arms, np.ascontiguousarray(springs, np.float64))
+        squares = self._products(self._rest)
         prior = _GRADIENT_PRIOR * np.trace(squares, axis1=1, axis2=2)
         self._prior = np.maximum(prior, 1e-12 * graph.spacing**2)
         self._inverse_squares = np.linalg.inv(squares + self._prior[:, None, None] * np.eye(3))
         # a handle is at Σ w (x + G (point − p)), where G is linear in the positions and rotations
-        self._steering = self._arm_weights(blends, points)
-        self._handles = csr_array(blends + self._steering @ self._to_products)
-        self._steering = csr_array(self._steering @ diags_array(np.repeat(self._prior, 3)))
+        steering = self._arm_weights(blends, points)
+        handles = csr_array(blends + steering @ _to_products(graph))
+        steering = csr_array(steering @ diags_array(np.repeat(self._prior, 3)))
+        self._handles = (_sparse(handles), _sparse(steering))
         edges = np.ones(len(graph.starts))
         adjacency = csr_array((edges, (graph.starts, graph.ends)), shape=(count, count))
         degree = np.bincount(graph.starts, minlength=count)
-        pinned = _HANDLE_STIFFNESS * (self._handles.T @ self._handles)
+        pinned = _HANDLE_STIFFNESS * (handles.T @ handles)
         system = csr_array(diags_array(degree + springs) - adjacency + pinned)
-        self._springs = springs
-        inner = csc_array(system[self._free][:, self._free])
-        self._factor = splu(inner, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-        self._to_held = csr_array(system[self._free][:, self._held])
+        inner = csc_array(system[free][:, free])
+        factor = splu(inner, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+        self._factor = (
+            _sparse(csc_array(factor.L)),
+            _sparse(csc_array(factor.U)),
+            _rows(factor.perm_r),
+            _rows(factor.perm_c),
+        )
+        to_held = csr_array(system[free])
+        to_held.data[~held[to_held.indices]] = 0.0
+        to_held.eliminate_zeros()
+        self._nodes = (_rows(free), _sparse(to_held))
+        extent = np.ptp(graph.positions[free], axis=0) if len(free) else np.zeros(3)
+        self._tolerance = _SETTLED_SHARE * max(float(np.linalg.norm(extent)), graph.spacing)
 
     def rest(self) -> Pose:
         """Return the pose in which no node has moved."""
@@ -83,14 +102,19 @@ class Solver:
             start: pose for similar targets, the warm start
             rounds: largest number of rounds; a live drag takes few at a time
         """
-        pose = start
-        for _ in range(rounds):
-            positions = self._solve_positions(targets, pose)
-            rotations = nearest_rotations(self._products(positions), pose.rotations, _ROTATION_STEPS)
-            moved = float(np.abs(positions - pose.positions).max())
-            pose = Pose(positions, rotations)
-            if moved <= _SETTLED * self._graph.spacing:
-                break
+        pose = Pose(
+            np.array(start.positions, np.float64, order="C"), np.array(start.rotations, np.float64, order="C")
+        )
+        pose.positions[self._held] = self._rest[self._held]
+        solve_kernel.settle(
+            self._edges,
+            self._factor,
+            self._nodes,
+            (*self._handles, np.ascontiguousarray(targets, np.float64), _HANDLE_STIFFNESS),
+            self._rest,
+            (pose.positions, pose.rotations),
+            (rounds, self._tolerance),
+        )
         return pose
 
     def gradients(self, pose: Pose) -> Floats:
@@ -109,15 +133,6 @@ class Solver:
         stretches: Floats = moved / np.maximum(np.linalg.norm(graph.arms, axis=1), 1e-12 * graph.spacing)
         return stretches
 
-    def _solve_positions(self, targets: Floats, pose: Pose) -> Floats:
-        rest = self._graph.positions
-        columns = np.swapaxes(pose.rotations, 1, 2).reshape(-1, 3)
-        right = self._to_right @ columns + self._springs[:, None] * rest
-        right = right + _HANDLE_STIFFNESS * (self._handles.T @ (targets - self._steering @ columns))
-        positions = rest.copy()
-        positions[self._free] = self._factor.solve(right[self._free] - self._to_held @ rest[self._held])
-        return positions
-
     def _arm_weights(self, blends: csr_array, points: Floats) -> csr_array:
         """Return the weights w Q⁻¹ (point − p) of the nodes' edge products in each handle. [H,3n]
 
@@ -133,18 +148,26 @@ class Solver:
 
     def _products(self, positions: Floats) -> Floats:
         """Return Σ (x_j − x_i) (p_j − p_i)ᵀ over the edges of each node. [n,3] -> [n,3,3]"""
-        transposed = (self._to_products @ positions).reshape(-1, 3, 3)
-        products: Floats = np.swapaxes(transposed, 1, 2)
+        products: Floats = solve_kernel.edge_products(self._edges, np.ascontiguousarray(positions))
         return products
 
 
-def _edge_maps(graph: NodeGraph) -> tuple[csr_array, csr_array]:
-    """Return the matrices of the two sums over edges that each round computes.
+def nearest_rotations(matrices: Floats, start: Floats) -> Floats:
+    """Return the rotations nearest to matrices, by Newton's method from a warm start.
 
-    Returns:
-        Matrix from positions to the transposed products of `Solver._products`. [3n,n]
-        Matrix from the columns of the rotations to Σ ½ (R_i + R_j) (p_i − p_j). [n,3n]
+    A direction in which a matrix is zero keeps the rotation of the warm start.
+
+    Args:
+        matrices: [n,3,3]
+        start: rotations, at less than 180° from the result. [n,3,3]
     """
+    rotations: Floats = np.array(np.broadcast_to(start, matrices.shape), np.float64, order="C")
+    solve_kernel.nearest_rotations_fast(np.ascontiguousarray(matrices, np.float64), rotations)
+    return rotations
+
+
+def _to_products(graph: NodeGraph) -> csr_array:
+    """Return the matrix from positions to the transposed products of `Solver._products`. [3n,n]"""
     count = len(graph)
     arms = graph.arms.ravel()
     coordinates = np.tile(np.arange(3), len(graph.starts))
@@ -152,54 +175,14 @@ def _edge_maps(graph: NodeGraph) -> tuple[csr_array, csr_array]:
     ends = np.repeat(graph.ends, 3)
     rows = 3 * starts + coordinates
     to_products = csr_array((arms, (rows, ends)), shape=(3 * count, count))
-    to_products = to_products - csr_array((arms, (rows, starts)), shape=(3 * count, count))
-    shape = (count, 3 * count)
-    to_right = csr_array((-0.5 * arms, (starts, 3 * ends + coordinates)), shape=shape)
-    to_right = to_right + csr_array((-0.5 * arms, (starts, rows)), shape=shape)
-    return csr_array(to_products), csr_array(to_right)
+    return csr_array(to_products - csr_array((arms, (rows, starts)), shape=(3 * count, count)))
 
 
-def nearest_rotations(matrices: Floats, start: Floats, steps: int) -> Floats:
-    """Return the rotations nearest to matrices, iterated from a warm start (Müller and others 2016).
-
-    A direction in which a matrix is zero keeps the rotation of the warm start.
-
-    Args:
-        matrices: [n,3,3]
-        start: rotations, at less than 180° from the result. [n,3,3]
-        steps: number of iterations
-    """
-    rotations = start
-    size = np.maximum(np.abs(matrices).max(axis=(1, 2)), 1e-30)
-    scaled = matrices / size[:, None, None]
-    for _ in range(steps):
-        # Σ over columns of their cross products, the antisymmetric part of M Rᵀ
-        mixed = scaled @ np.swapaxes(rotations, 1, 2)
-        torque = np.stack(
-            [
-                mixed[:, 2, 1] - mixed[:, 1, 2],
-                mixed[:, 0, 2] - mixed[:, 2, 0],
-                mixed[:, 1, 0] - mixed[:, 0, 1],
-            ],
-            axis=1,
-        )
-        work = np.abs(np.einsum("nii->n", mixed))
-        rotations = _rotations(torque / (work + 1e-9)[:, None]) @ rotations
-    return rotations
+def _rows(values: NDArray[np.int64] | NDArray[np.int32]) -> NDArray[np.int32]:
+    return np.ascontiguousarray(values, np.int32)
 
 
-def _rotations(turns: Floats) -> Floats:
-    """Convert rotation vectors to matrices, by Rodrigues' formula. [n,3] -> [n,3,3]"""
-    angle = np.linalg.norm(turns, axis=1)
-    safe = np.maximum(angle, 1e-12)
-    cross = np.zeros((len(turns), 3, 3))
-    cross[:, 0, 1] = -turns[:, 2]
-    cross[:, 0, 2] = turns[:, 1]
-    cross[:, 1, 0] = turns[:, 2]
-    cross[:, 1, 2] = -turns[:, 0]
-    cross[:, 2, 0] = -turns[:, 1]
-    cross[:, 2, 1] = turns[:, 0]
-    first = (np.sin(safe) / safe)[:, None, None]
-    second = ((1.0 - np.cos(safe)) / safe**2)[:, None, None]
-    rotations: Floats = np.eye(3) + first * cross + second * (cross @ cross)
-    return rotations
+def _sparse(matrix: csr_array | csc_array) -> solve_kernel.Sparse:
+    """Return the arrays of a sparse matrix for the kernels, with sorted indices."""
+    matrix.sort_indices()
+    return _rows(matrix.indptr), _rows(matrix.indices), np.ascontiguousarray(matrix.data, np.float64)

@@ -170,7 +170,12 @@ def _source_version() -> str:
     digest = hashlib.sha256(numba.__version__.encode())
     package = Path(__file__).parents[2]
     for path in sorted(
-        [*package.glob("rasterize/**/*.py"), *package.glob("compose/*.py"), package / "sh.py"]
+        [
+            *package.glob("rasterize/**/*.py"),
+            *package.glob("compose/*.py"),
+            *package.glob("pull/*_kernel.py"),
+            package / "sh.py",
+        ]
     ):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
@@ -216,6 +221,10 @@ def truncate(value: Vector) -> Vector:
 
 def ldexp(value: Vector, exponent: Vector) -> Vector:
     """Return value · 2^exponent for integer exponents and results that are normal numbers."""
+
+
+def sqrt(value: Vector) -> Vector:
+    """Return the square root of each lane; NaN below 0."""
 
 
 class _VectorType(types.Type):  # type: ignore[misc]
@@ -294,6 +303,12 @@ def _ldexp(b: ir.IRBuilder, value: ir.Value, exponent: ir.Value) -> ir.Value:
     return b.bitcast(b.add(b.bitcast(value, _INTS), shift), _FLOATS)
 
 
+def _sqrt(b: ir.IRBuilder, value: ir.Value) -> ir.Value:
+    kind = ir.FunctionType(_FLOATS, [_FLOATS])
+    function = cgutils.get_or_insert_function(b.module, kind, f"llvm.sqrt.v{WIDTH}f32")
+    return b.call(function, [value])
+
+
 for _pair in ((_vector, _vector), (_vector, _single), (_single, _vector)):
     _define(operator.add, _pair, _vector, lambda b, x, y: b.fadd(x, y))
     _define(operator.iadd, _pair, _vector, lambda b, x, y: b.fadd(x, y))
@@ -310,6 +325,7 @@ _define(broadcast, (_single,), _vector, lambda b, x: x)
 _define(lane_indices, (), _vector, lambda b: ir.Constant(_FLOATS, [float(lane) for lane in range(WIDTH)]))
 _define(lane_sums, (_vector,) * WIDTH, _vector, _lane_sums)
 _define(lane_sum, (_vector,), _single, _lane_sum)
+_define(sqrt, (_vector,), _vector, _sqrt)
 _define(truncate, (_vector,), _vector, lambda b, x: b.sitofp(b.fptosi(x, _INTS), _FLOATS))
 _define(ldexp, (_vector, _vector), _vector, _ldexp)
 

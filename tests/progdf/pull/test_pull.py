@@ -243,14 +243,14 @@ def test_covariances_take_the_affine_gradient() -> None:
     points = scene.means.double().numpy()
     gradient = np.array([[1.8, 0.3, 0.0], [0.0, 0.8, 0.1], [0.0, 0.0, 1.1]])
     gradients: Floats = np.broadcast_to(gradient, (len(graph), 3, 3)).copy()
-    pose = Pose(graph.positions @ gradient.T, nearest_rotations(gradients, np.eye(3)[None], 20))
+    pose = Pose(graph.positions @ gradient.T, nearest_rotations(gradients, np.eye(3)[None]))
     rows = pack(scene, with_shN=True).double()
     binding = bind(graph, points, graph.node_of)
     packed, _ = follow(rows, binding, graph, pose, gradients, rest_frames(rows))
     stretched = scene.replace_rows(torch.arange(len(scene)), packed).to(dtype=torch.float64)
     matrix = torch.from_numpy(gradient)
     expected = matrix @ covariances(scene) @ matrix.T
-    assert torch.allclose(stretched.means, scene.means.double() @ matrix.T, atol=1e-6)
+    assert torch.allclose(stretched.means, scene.means.double() @ matrix.T, atol=1e-5)
     assert float((covariances(stretched) - expected).abs().max()) < 1e-4 * float(expected.abs().max())
 
 
@@ -261,7 +261,7 @@ def test_rotations_are_the_polar_factors() -> None:
     stretch = np.eye(3) + 0.2 * generator.normal(size=(40, 3, 3))
     stretch = stretch @ np.swapaxes(stretch, 1, 2)
     identity = np.broadcast_to(np.eye(3), rotations.shape)
-    found = nearest_rotations(rotations @ stretch, identity, 60)
+    found = nearest_rotations(rotations @ stretch, identity)
     assert np.allclose(found, rotations, atol=1e-6)
 
 

@@ -1,0 +1,537 @@
+"""Kernels of Gaussians that follow nodes: eight Gaussians at once, in vectors of float32.
+
+The axes of G Σ Gᵀ are the left singular vectors of G R S, for a Gaussian's axes R and scales S. One-sided
+Jacobi rotations find them. They multiply columns, so a thin disc keeps its thickness in float32. They start
+from the rotations of the last strength, so the axes keep their order.
+
+The color of a band along 2l + 1 directions determines its coefficients. A rotation evaluates the band at the
+directions rotated back.
+
+Reference implementation: tests/helpers/plain_pull.py.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from progdf.rasterize.cpu.jit import Number, Vector, broadcast, kernel, load, select, sqrt, store
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+Rows = NDArray[np.int32]
+Weights = tuple[Rows, Rows, Singles]
+"""First entry of each Gaussian [M+1], nodes and weights of the entries."""
+Bands = tuple[Singles, Singles]
+"""Directions of a band [(2l+1)·3], and the matrix from colors along them to coefficients [(2l+1)²]."""
+
+NODE_WIDTH = 32
+"""Numbers per node: G − I [9], shift [3], limited G [9], nothing [3], quaternion [4], nothing [4]."""
+_LANES = 8
+# numbers of eight Gaussians in the scratch memory of `follow_rows`
+_GRADIENT = 12  # blended motion of nodes, as in `NODE_WIDTH`, from 0 on
+_QUAT = 24
+_SPARE = 32
+_MATRIX = 36  # columns that are made orthogonal, then axes; later the rotation of the bands
+_RIGHT = 45  # rotation of the columns
+_HALF = 54
+_LAST_RIGHT = 63
+_LAST_QUAT = 72
+_FLOOR = 76  # least squared scale
+_SQUARES = 77
+_NEW_QUAT = 80
+_COLORS = 90
+_BASIS = 115
+_BASIS_AT_REST = 125
+_ROW = 210
+_BAND_START = 14
+_SWEEPS = 4  # of one-sided Jacobi rotations
+_NODE_SWEEPS = 8  # the same for nodes, which start from nothing
+_C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
+_C3 = (-0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154, 1.445305721320277)
+_ORTHOGONAL_SQUARE = np.float32(4e-14)  # squared cosine of columns that are orthogonal up to rounding
+_TINY = np.float32(1e-30)
+
+
+@kernel(cache=True, allocates=True)
+def write_nodes(
+    gradients: Floats, rest: Floats, moved: Floats, center: Floats, max_stretch: float, table: Singles
+) -> None:
+    """Write the motions of nodes, from which those of Gaussians are blended.
+
+    Args:
+        gradients: deformation gradients. [n,3,3]
+        rest, moved: positions. [n,3] each
+        center: the shifts are for points relative to it. [3]
+        max_stretch: limit of the singular values, and of their inverses
+        table: motions, see `NODE_WIDTH`. [n,32]
+    """
+    columns = np.empty((3, 3))
+    right = np.empty((3, 3))
+    rotation = np.empty((3, 3))
+    lengths = np.empty(3)
+    for node in range(len(gradients)):
+        gradient = gradients[node]
+        columns[:] = gradient
+        right[:] = 0.0
+        for r in range(3):
+            right[r, r] = 1.0
+        for _ in range(_NODE_SWEEPS):
+            for i in range(2):
+                for j in range(i + 1, 3):
+                    _orthogonalize(columns, right, i, j)
+        for c in range(3):
+            lengths[c] = math.sqrt(columns[0, c] ** 2 + columns[1, c] ** 2 + columns[2, c] ** 2)
+        least = 0
+        if lengths[1] < lengths[least]:
+            least = 1
+        if lengths[2] < lengths[least]:
+            least = 2
+        a = (least + 1) % 3
+        b = (least + 2) % 3
+        for c in (a, b):
+            scale = 1.0 / max(lengths[c], 1e-150)
+            for r in range(3):
+                columns[r, c] *= scale
+        # the least direction completes a rotation, also of a reflected or flat gradient
+        for r in range(3):
+            s = (r + 1) % 3
+            t = (r + 2) % 3
+            columns[r, least] = columns[s, a] * columns[t, b] - columns[t, a] * columns[s, b]
+        rotation[:] = 0.0
+        entry = table[node]
+        for r in range(3):
+            for c in range(3):
+                at_rest = 1.0 if r == c else 0.0
+                limited = 0.0
+                for k in range(3):
+                    value = min(max(lengths[k], 1.0 / max_stretch), max_stretch)
+                    limited += columns[r, k] * value * right[c, k]
+                    rotation[r, c] += columns[r, k] * right[c, k]
+                entry[3 * r + c] = gradient[r, c] - at_rest
+                entry[12 + 3 * r + c] = limited
+        for r in range(3):
+            shift = moved[node, r] - rest[node, r]
+            for c in range(3):
+                arm = rest[node, c] - center[c]
+                shift -= gradient[r, c] * arm
+                if r == c:
+                    shift += arm
+            entry[9 + r] = shift
+        _write_quat(rotation, entry)
+
+
+@kernel()
+def _orthogonalize(columns: Floats, right: Floats, i: int, j: int) -> None:
+    """Make two columns [3,3] orthogonal; `right` [3,3] takes the same rotation."""
+    first = columns[0, i] ** 2 + columns[1, i] ** 2 + columns[2, i] ** 2
+    second = columns[0, j] ** 2 + columns[1, j] ** 2 + columns[2, j] ** 2
+    mixed = columns[0, i] * columns[0, j] + columns[1, i] * columns[1, j] + columns[2, i] * columns[2, j]
+    difference = second - first
+    divisor = abs(difference) + math.sqrt(difference * difference + 4.0 * mixed * mixed)
+    if divisor > 0.0:
+        tangent = 2.0 * mixed / divisor
+        if difference < 0.0:
+            tangent = -tangent
+        cosine = 1.0 / math.sqrt(1.0 + tangent * tangent)
+        sine = tangent * cosine
+        for r in range(3):
+            x = columns[r, i]
+            y = columns[r, j]
+            columns[r, i] = cosine * x - sine * y
+            columns[r, j] = sine * x + cosine * y
+            x = right[r, i]
+            y = right[r, j]
+            right[r, i] = cosine * x - sine * y
+            right[r, j] = sine * x + cosine * y
+
+
+@kernel()
+def _write_quat(m: Floats, entry: Singles) -> None:
+    """Write the quaternion wxyz of a rotation [3,3] into the entry of a node."""
+    w = 1.0 + m[0, 0] + m[1, 1] + m[2, 2]
+    x = 1.0 + m[0, 0] - m[1, 1] - m[2, 2]
+    y = 1.0 - m[0, 0] + m[1, 1] - m[2, 2]
+    z = 1.0 - m[0, 0] - m[1, 1] + m[2, 2]
+    if w >= max(x, y, z):
+        x = m[2, 1] - m[1, 2]
+        y = m[0, 2] - m[2, 0]
+        z = m[1, 0] - m[0, 1]
+    elif x >= max(y, z):
+        w = m[2, 1] - m[1, 2]
+        y = m[0, 1] + m[1, 0]
+        z = m[0, 2] + m[2, 0]
+    elif y >= z:
+        w = m[0, 2] - m[2, 0]
+        x = m[0, 1] + m[1, 0]
+        z = m[1, 2] + m[2, 1]
+    else:
+        w = m[1, 0] - m[0, 1]
+        x = m[0, 2] + m[2, 0]
+        y = m[1, 2] + m[2, 1]
+    length = math.sqrt(w * w + x * x + y * y + z * z)
+    entry[24] = w / length
+    entry[25] = x / length
+    entry[26] = y / length
+    entry[27] = z / length
+
+
+@kernel(inline=True)
+def _at(index: int) -> Number:
+    """Return the index of the first lane of a number in the scratch memory."""
+    return np.uint64(index * _LANES)
+
+
+@kernel()
+def _blend_node_motions(weights: Weights, table: Singles, member: int, lane: int, buffer: Singles) -> None:
+    """Write the blended motion of a Gaussian into one lane of the buffer's numbers 0 to 31."""
+    first, nodes, shares = weights
+    a = broadcast(np.float32(0.0))
+    b = a
+    c = a
+    d = a
+    start = first[member]
+    base = nodes[start] * NODE_WIDTH + 24
+    for k in range(start, first[member + 1]):
+        at = nodes[k] * NODE_WIDTH
+        share = shares[k]
+        a = a + share * load(table, np.uint64(at))
+        b = b + share * load(table, np.uint64(at + 8))
+        c = c + share * load(table, np.uint64(at + 16))
+        cosine = np.float32(0.0)
+        for i in range(4):
+            cosine += table[at + 24 + i] * table[base + i]
+        if cosine < np.float32(0.0):
+            share = -share
+        d = d + share * load(table, np.uint64(at + 24))
+    spare = _at(_SPARE)
+    store(buffer, spare, a)
+    store(buffer, spare + np.uint64(8), b)
+    store(buffer, spare + np.uint64(16), c)
+    store(buffer, spare + np.uint64(24), d)
+    for i in range(28):
+        buffer[i * _LANES + lane] = buffer[_SPARE * _LANES + i]
+
+
+@kernel()
+def _jacobi(buffer: Singles, first: int, second: int) -> None:
+    """Make two columns of the matrix orthogonal; `_RIGHT` takes the same rotation."""
+    x0 = load(buffer, _at(_MATRIX + first))
+    x1 = load(buffer, _at(_MATRIX + 3 + first))
+    x2 = load(buffer, _at(_MATRIX + 6 + first))
+    y0 = load(buffer, _at(_MATRIX + second))
+    y1 = load(buffer, _at(_MATRIX + 3 + second))
+    y2 = load(buffer, _at(_MATRIX + 6 + second))
+    mixed = x0 * y0 + x1 * y1 + x2 * y2
+    first_square = x0 * x0 + x1 * x1 + x2 * x2
+    second_square = y0 * y0 + y1 * y1 + y2 * y2
+    difference = second_square - first_square
+    size = select(difference < np.float32(0.0), np.float32(0.0) - difference, difference)
+    twice = np.float32(2.0) * mixed
+    divisor = size + sqrt(difference * difference + twice * twice) + _TINY
+    tangent = twice / divisor
+    tangent = select(difference < np.float32(0.0), np.float32(0.0) - tangent, tangent)
+    is_orthogonal = mixed * mixed <= _ORTHOGONAL_SQUARE * first_square * second_square
+    tangent = select(is_orthogonal, np.float32(0.0), tangent)
+    cosine = np.float32(1.0) / sqrt(np.float32(1.0) + tangent * tangent)
+    sine = tangent * cosine
+    store(buffer, _at(_MATRIX + first), cosine * x0 - sine * y0)
+    store(buffer, _at(_MATRIX + 3 + first), cosine * x1 - sine * y1)
+    store(buffer, _at(_MATRIX + 6 + first), cosine * x2 - sine * y2)
+    store(buffer, _at(_MATRIX + second), sine * x0 + cosine * y0)
+    store(buffer, _at(_MATRIX + 3 + second), sine * x1 + cosine * y1)
+    store(buffer, _at(_MATRIX + 6 + second), sine * x2 + cosine * y2)
+    for r in range(3):
+        x = load(buffer, _at(_RIGHT + 3 * r + first))
+        y = load(buffer, _at(_RIGHT + 3 * r + second))
+        store(buffer, _at(_RIGHT + 3 * r + first), cosine * x - sine * y)
+        store(buffer, _at(_RIGHT + 3 * r + second), sine * x + cosine * y)
+
+
+@kernel()
+def _product(buffer: Singles, left: int, right: int, result: int) -> None:
+    """Set a matrix in the buffer to the product of two others, all [3,3]."""
+    for r in range(3):
+        a = load(buffer, _at(left + 3 * r))
+        b = load(buffer, _at(left + 3 * r + 1))
+        c = load(buffer, _at(left + 3 * r + 2))
+        for k in range(3):
+            total = a * load(buffer, _at(right + k))
+            total = total + b * load(buffer, _at(right + 3 + k))
+            total = total + c * load(buffer, _at(right + 6 + k))
+            store(buffer, _at(result + 3 * r + k), total)
+
+
+@kernel()
+def _stretch_axes(buffer: Singles) -> None:
+    """Compute the axes and squared relative scales of G R S, from the last rotation of its columns."""
+    _product(buffer, _GRADIENT, _HALF, _RIGHT)
+    _product(buffer, _RIGHT, _LAST_RIGHT, _MATRIX)
+    for k in range(9):
+        store(buffer, _at(_RIGHT + k), load(buffer, _at(_LAST_RIGHT + k)))
+    for _ in range(_SWEEPS):
+        _jacobi(buffer, 0, 1)
+        _jacobi(buffer, 0, 2)
+        _jacobi(buffer, 1, 2)
+    floor = load(buffer, _at(_FLOOR))
+    for k in range(3):
+        x = load(buffer, _at(_MATRIX + k))
+        y = load(buffer, _at(_MATRIX + 3 + k))
+        z = load(buffer, _at(_MATRIX + 6 + k))
+        square = x * x + y * y + z * z
+        store(buffer, _at(_SQUARES + k), select(square < floor, floor, square))
+        factor = np.float32(1.0) / sqrt(square + _TINY)
+        store(buffer, _at(_MATRIX + k), factor * x)
+        store(buffer, _at(_MATRIX + 3 + k), factor * y)
+        store(buffer, _at(_MATRIX + 6 + k), factor * z)
+    # the third axis completes a rotation, also of a reflected gradient, with the sign it had if it can
+    a = load(buffer, _at(_MATRIX))
+    b = load(buffer, _at(_MATRIX + 3))
+    c = load(buffer, _at(_MATRIX + 6))
+    d = load(buffer, _at(_MATRIX + 1))
+    e = load(buffer, _at(_MATRIX + 4))
+    f = load(buffer, _at(_MATRIX + 7))
+    _write_axes_quat(buffer, a, b, c, d, e, f, b * f - c * e, c * d - a * f, a * e - b * d)
+
+
+@kernel()
+def _write_axes_quat(
+    buffer: Singles, a: Vector, b: Vector, c: Vector, d: Vector, e: Vector, f: Vector, g: Vector, h: Vector,
+    i: Vector,
+) -> None:  # fmt: skip
+    """Write the quaternion of axes abc, def and ghi with the sign and length of the last one."""
+    one = np.float32(1.0)
+    w = one + a + e + i
+    x = one + a - e - i
+    y = one - a + e - i
+    z = one - a - e + i
+    qw = w
+    qx = f - h
+    qy = g - c
+    qz = b - d
+    best = w
+    larger = x > best
+    best = select(larger, x, best)
+    nw = select(larger, f - h, qw)
+    nx = select(larger, x, qx)
+    ny = select(larger, b + d, qy)
+    nz = select(larger, g + c, qz)
+    larger = y > best
+    best = select(larger, y, best)
+    nw = select(larger, g - c, nw)
+    nx = select(larger, b + d, nx)
+    ny = select(larger, y, ny)
+    nz = select(larger, f + h, nz)
+    larger = z > best
+    nw = select(larger, b - d, nw)
+    nx = select(larger, g + c, nx)
+    ny = select(larger, f + h, ny)
+    nz = select(larger, z, nz)
+    lw = load(buffer, _at(_LAST_QUAT))
+    lx = load(buffer, _at(_LAST_QUAT + 1))
+    ly = load(buffer, _at(_LAST_QUAT + 2))
+    lz = load(buffer, _at(_LAST_QUAT + 3))
+    square = lw * lw + lx * lx + ly * ly + lz * lz
+    length = select(square > np.float32(0.0), sqrt(square), broadcast(one))
+    factor = length / sqrt(nw * nw + nx * nx + ny * ny + nz * nz + _TINY)
+    cosine = nw * lw + nx * lx + ny * ly + nz * lz
+    factor = select(cosine < np.float32(0.0), np.float32(0.0) - factor, factor)
+    store(buffer, _at(_NEW_QUAT), factor * nw)
+    store(buffer, _at(_NEW_QUAT + 1), factor * nx)
+    store(buffer, _at(_NEW_QUAT + 2), factor * ny)
+    store(buffer, _at(_NEW_QUAT + 3), factor * nz)
+
+
+@kernel()
+def _band(degree: int, x: Vector, y: Vector, z: Vector, buffer: Singles, at: int) -> None:
+    """Write the basis functions of one band along a direction, see `progdf.sh.basis`."""
+    xx = x * x
+    yy = y * y
+    zz = z * z
+    if degree == 1:
+        store(buffer, _at(at), np.float32(-0.4886025119029199) * y)
+        store(buffer, _at(at + 1), np.float32(0.4886025119029199) * z)
+        store(buffer, _at(at + 2), np.float32(-0.4886025119029199) * x)
+    elif degree == 2:
+        store(buffer, _at(at), np.float32(_C2[0]) * x * y)
+        store(buffer, _at(at + 1), np.float32(_C2[1]) * y * z)
+        store(buffer, _at(at + 2), np.float32(_C2[2]) * (np.float32(2.0) * zz - xx - yy))
+        store(buffer, _at(at + 3), np.float32(_C2[3]) * x * z)
+        store(buffer, _at(at + 4), np.float32(_C2[4]) * (xx - yy))
+    else:
+        store(buffer, _at(at), np.float32(_C3[0]) * y * (np.float32(3.0) * xx - yy))
+        store(buffer, _at(at + 1), np.float32(_C3[1]) * x * y * z)
+        store(buffer, _at(at + 2), np.float32(_C3[2]) * y * (np.float32(4.0) * zz - xx - yy))
+        polar = np.float32(2.0) * zz - np.float32(3.0) * (xx + yy)
+        store(buffer, _at(at + 3), np.float32(_C3[3]) * z * polar)
+        store(buffer, _at(at + 4), np.float32(_C3[2]) * x * (np.float32(4.0) * zz - xx - yy))
+        store(buffer, _at(at + 5), np.float32(_C3[4]) * z * (xx - yy))
+        store(buffer, _at(at + 6), np.float32(_C3[0]) * x * (xx - np.float32(3.0) * yy))
+
+
+@kernel(inline=True)
+def _rest_basis_start(degree: int) -> int:
+    """Return the number of the basis functions of a band along its directions at rest."""
+    if degree == 1:
+        return _BASIS_AT_REST
+    if degree == 2:
+        return _BASIS_AT_REST + 9
+    return _BASIS_AT_REST + 34
+
+
+@kernel()
+def _write_basis_at_rest(degree: int, bands: Bands, buffer: Singles) -> None:
+    """Write the basis functions of a band along its directions at rest."""
+    directions = bands[0]
+    count = 2 * degree + 1
+    at_rest = _rest_basis_start(degree)
+    for j in range(count):
+        x = broadcast(directions[3 * j])
+        y = broadcast(directions[3 * j + 1])
+        z = broadcast(directions[3 * j + 2])
+        _band(degree, x, y, z, buffer, at_rest + j * count)
+
+
+@kernel()
+def _turn_band(degree: int, bands: Bands, buffer: Singles) -> None:
+    """Rotate one band of the packed rows; the identity changes no bit."""
+    directions, inverse = bands
+    count = 2 * degree + 1
+    at_rest = _rest_basis_start(degree)
+    offset = _ROW + _BAND_START + 3 * (degree * degree - 1)
+    for j in range(count):
+        dx = directions[3 * j]
+        dy = directions[3 * j + 1]
+        dz = directions[3 * j + 2]
+        x = (
+            load(buffer, _at(_MATRIX)) * dx
+            + load(buffer, _at(_MATRIX + 3)) * dy
+            + load(buffer, _at(_MATRIX + 6)) * dz
+        )
+        y = (
+            load(buffer, _at(_MATRIX + 1)) * dx
+            + load(buffer, _at(_MATRIX + 4)) * dy
+            + load(buffer, _at(_MATRIX + 7)) * dz
+        )
+        z = (
+            load(buffer, _at(_MATRIX + 2)) * dx
+            + load(buffer, _at(_MATRIX + 5)) * dy
+            + load(buffer, _at(_MATRIX + 8)) * dz
+        )
+        _band(degree, x, y, z, buffer, _BASIS)
+        for color in range(3):
+            total = broadcast(np.float32(0.0))
+            for k in range(count):
+                change = load(buffer, _at(_BASIS + k)) - load(buffer, _at(at_rest + j * count + k))
+                total = total + change * load(buffer, _at(offset + 3 * k + color))
+            store(buffer, _at(_COLORS + 3 * j + color), total)
+    for k in range(count):
+        for color in range(3):
+            total = load(buffer, _at(offset + 3 * k + color))
+            for j in range(count):
+                total = total + inverse[k * count + j] * load(buffer, _at(_COLORS + 3 * j + color))
+            store(buffer, _at(offset + 3 * k + color), total)
+
+
+@kernel()
+def _write_rotation(buffer: Singles) -> None:
+    """Write the rotation matrix of the blended quaternion, which need not be normalized."""
+    w = load(buffer, _at(_QUAT))
+    x = load(buffer, _at(_QUAT + 1))
+    y = load(buffer, _at(_QUAT + 2))
+    z = load(buffer, _at(_QUAT + 3))
+    two = np.float32(2.0) / (w * w + x * x + y * y + z * z + _TINY)
+    one = np.float32(1.0)
+    store(buffer, _at(_MATRIX), one - two * (y * y + z * z))
+    store(buffer, _at(_MATRIX + 1), two * (x * y - w * z))
+    store(buffer, _at(_MATRIX + 2), two * (x * z + w * y))
+    store(buffer, _at(_MATRIX + 3), two * (x * y + w * z))
+    store(buffer, _at(_MATRIX + 4), one - two * (x * x + z * z))
+    store(buffer, _at(_MATRIX + 5), two * (y * z - w * x))
+    store(buffer, _at(_MATRIX + 6), two * (x * z - w * y))
+    store(buffer, _at(_MATRIX + 7), two * (y * z + w * x))
+    store(buffer, _at(_MATRIX + 8), one - two * (x * x + y * y))
+
+
+@kernel(cache=True, allocates=True)
+def follow_rows(
+    rows: Singles,
+    weights: Weights,
+    table: Singles,
+    center: Singles,
+    halves: Singles,
+    last: tuple[Singles, Singles],
+    frames: tuple[Singles, Singles],
+    bands: tuple[Bands, Bands, Bands],
+    result: Singles,
+    part: tuple[int, int, int],
+) -> None:
+    """Write the packed raw rows that follow the nodes, for a part of the M Gaussians.
+
+    Args:
+        rows: raw rows at rest. [M,C]
+        weights: weights of the nodes
+        table: motions of the nodes, see `write_nodes`, flattened. [32n]
+        center: point to which the shifts of the nodes refer. [3]
+        halves: axes times scales, relative to each Gaussian's largest scale. [M,9]
+        last: rotations of the columns [M,9] and quaternions [M,4] at a similar pose
+        frames: the same at this pose; written
+        bands: directions and matrices of bands 1, 2 and 3
+        result: raw rows; written. [M,C]
+        part: first Gaussian, end, and SH degree that rotates, 0 to 3
+    """
+    begin, end, degree = part
+    width = rows.shape[1]
+    buffer = np.zeros((_ROW + width) * _LANES, np.float32)
+    if degree > 0:
+        _write_basis_at_rest(1, bands[0], buffer)
+    if degree > 1:
+        _write_basis_at_rest(2, bands[1], buffer)
+    if degree > 2:
+        _write_basis_at_rest(3, bands[2], buffer)
+    for start in range(begin, end, _LANES):
+        lanes = min(_LANES, end - start)
+        for lane in range(_LANES):
+            member = start + min(lane, lanes - 1)
+            _blend_node_motions(weights, table, member, lane, buffer)
+            for k in range(9):
+                buffer[(_HALF + k) * _LANES + lane] = halves[member, k]
+                buffer[(_LAST_RIGHT + k) * _LANES + lane] = last[0][member, k]
+            for k in range(4):
+                buffer[(_LAST_QUAT + k) * _LANES + lane] = last[1][member, k]
+            buffer[_FLOOR * _LANES + lane] = halves[member, 9]
+            for c in range(width):
+                buffer[(_ROW + c) * _LANES + lane] = rows[member, c]
+        x = load(buffer, _at(_ROW)) - center[0]
+        y = load(buffer, _at(_ROW + 1)) - center[1]
+        z = load(buffer, _at(_ROW + 2)) - center[2]
+        for r in range(3):
+            step = load(buffer, _at(9 + r))
+            step = step + load(buffer, _at(3 * r)) * x
+            step = step + load(buffer, _at(3 * r + 1)) * y
+            step = step + load(buffer, _at(3 * r + 2)) * z
+            store(buffer, _at(_ROW + r), load(buffer, _at(_ROW + r)) + step)
+        _stretch_axes(buffer)
+        for lane in range(lanes):
+            for k in range(9):
+                frames[0][start + lane, k] = buffer[(_RIGHT + k) * _LANES + lane]
+            for k in range(4):
+                frames[1][start + lane, k] = buffer[(_NEW_QUAT + k) * _LANES + lane]
+        if degree > 0:
+            _write_rotation(buffer)
+            _turn_band(1, bands[0], buffer)
+        if degree > 1:
+            _turn_band(2, bands[1], buffer)
+        if degree > 2:
+            _turn_band(3, bands[2], buffer)
+        for lane in range(lanes):
+            member = start + lane
+            for c in range(width):
+                result[member, c] = buffer[(_ROW + c) * _LANES + lane]
+            for k in range(3):
+                square = buffer[(_SQUARES + k) * _LANES + lane]
+                result[member, 3 + k] = halves[member, 10] + np.float32(0.5) * math.log(square)
+            for k in range(4):
+                result[member, 6 + k] = buffer[(_NEW_QUAT + k) * _LANES + lane]

@@ -1,0 +1,359 @@
+"""Kernels of the solver: rotations, sums over edges, the factorized system, and Anderson acceleration.
+
+A round computes the rotations for given positions and then the positions for given rotations. It is a
+fixed-point map of the positions, and its differences x ↦ g(x) − x of earlier rounds predict where it settles
+(Anderson acceleration, Peng and others 2018). A round whose difference has grown starts the history anew.
+
+Reference implementation: tests/helpers/plain_pull.py, which repeats the rounds without acceleration.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from progdf.rasterize.cpu.jit import kernel
+
+Floats = NDArray[np.float64]
+Rows = NDArray[np.int32]
+Sparse = tuple[Rows, Rows, Floats]
+"""Matrix by rows, or by columns: first entry of each row [n+1], columns of the entries, their values."""
+Graph = tuple[Rows, Rows, Floats, Floats]
+"""First edge of each node [n+1], ends [E] and arms [E,3] of the edges, stiffness of the springs [n]."""
+Factor = tuple[Sparse, Sparse, Rows, Rows]
+"""Lower factor by columns, diagonal first; upper factor by columns, diagonal last; both permutations.
+
+Row i of the system is row `rows[i]` of the factors, and its solution is entry `columns[i]` of theirs.
+"""
+Handles = tuple[Sparse, Sparse, Floats, float]
+"""Weights of the nodes [H,n] and of the columns of their rotations [H,3n], targets [H,3], and stiffness."""
+
+HISTORY = 6
+"""Rounds that predict the next one."""
+_ROTATION_STEPS = 8  # largest number of Newton steps of a rotation
+_ROTATION_TOLERANCE = 1e-20  # squared angle, radians²; smaller steps end the iteration
+_GROWTH_LIMIT = 2.0  # factor by which the difference may grow before the history starts anew
+_RIDGE = 1e-10  # share of the squared differences that keeps the prediction's system regular
+
+
+@kernel(inline=True)
+def _rotate(rotation: Floats, x: float, y: float, z: float) -> None:
+    """Multiply a rotation [3,3] in place by a rotation vector, from the left."""
+    angle = math.sqrt(x * x + y * y + z * z)
+    half = 0.5 * angle
+    factor = 0.5
+    if half > 1e-6:
+        factor = math.sin(half) / angle
+    w = math.cos(half)
+    length = math.sqrt(w * w + factor * factor * angle * angle)
+    w /= length
+    x *= factor / length
+    y *= factor / length
+    z *= factor / length
+    for c in range(3):
+        a = rotation[0, c]
+        b = rotation[1, c]
+        d = rotation[2, c]
+        rotation[0, c] = (1 - 2 * (y * y + z * z)) * a + 2 * (x * y - w * z) * b + 2 * (x * z + w * y) * d
+        rotation[1, c] = 2 * (x * y + w * z) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z - w * x) * d
+        rotation[2, c] = 2 * (x * z - w * y) * a + 2 * (y * z + w * x) * b + (1 - 2 * (x * x + y * y)) * d
+
+
+@kernel()
+def nearest_rotation(matrix: Floats, rotation: Floats) -> None:
+    """Turn a rotation into the one nearest to a matrix. Both [3,3]; the rotation is updated in place.
+
+    The trace of Rᵀ M grows by Newton steps where it is concave, otherwise by steps of Müller and others
+    (2016).
+    Directions in which the matrix is zero keep the rotation.
+    """
+    size = 0.0
+    for i in range(3):
+        for j in range(3):
+            size = max(size, abs(matrix[i, j]))
+    if not size > 1e-150:
+        return
+    for _ in range(_ROTATION_STEPS):
+        m00 = m11 = m22 = 0.0
+        xy = yx = xz = zx = yz = zy = 0.0
+        for c in range(3):
+            a = matrix[0, c] / size
+            b = matrix[1, c] / size
+            d = matrix[2, c] / size
+            m00 += a * rotation[0, c]
+            m11 += b * rotation[1, c]
+            m22 += d * rotation[2, c]
+            xy += a * rotation[1, c]
+            yx += b * rotation[0, c]
+            xz += a * rotation[2, c]
+            zx += d * rotation[0, c]
+            yz += b * rotation[2, c]
+            zy += d * rotation[1, c]
+        tx = zy - yz
+        ty = xz - zx
+        tz = yx - xy
+        # the Hessian tr(H) I − H with the symmetric part H, and a ridge for free directions
+        work = abs(m00) + abs(m11) + abs(m22)
+        ridge = 1e-9 * work + 1e-12
+        h00 = m11 + m22 + ridge
+        h11 = m00 + m22 + ridge
+        h22 = m00 + m11 + ridge
+        h01 = -0.5 * (xy + yx)
+        h02 = -0.5 * (xz + zx)
+        h12 = -0.5 * (yz + zy)
+        c00 = h11 * h22 - h12 * h12
+        c01 = h02 * h12 - h01 * h22
+        c02 = h01 * h12 - h02 * h11
+        determinant = h00 * c00 + h01 * c01 + h02 * c02
+        is_concave = h00 > 0.0 and h00 * h11 - h01 * h01 > 0.0 and determinant > 0.0
+        x = tx / (work + 1e-9)
+        y = ty / (work + 1e-9)
+        z = tz / (work + 1e-9)
+        if is_concave:
+            c11 = h00 * h22 - h02 * h02
+            c12 = h01 * h02 - h00 * h12
+            c22 = h00 * h11 - h01 * h01
+            nx = (c00 * tx + c01 * ty + c02 * tz) / determinant
+            ny = (c01 * tx + c11 * ty + c12 * tz) / determinant
+            nz = (c02 * tx + c12 * ty + c22 * tz) / determinant
+            if nx * nx + ny * ny + nz * nz < 1.0:
+                x = nx
+                y = ny
+                z = nz
+        _rotate(rotation, x, y, z)
+        if x * x + y * y + z * z < _ROTATION_TOLERANCE:
+            break
+
+
+@kernel()
+def _edge_product(graph: Graph, positions: Floats, i: int, product: Floats) -> None:
+    """Set a product [3,3] to Σ (x_j − x_i) (p_j − p_i)ᵀ over the edges of node i. positions: [n,3]"""
+    first, ends, arms, _ = graph
+    product[:] = 0.0
+    for e in range(first[i], first[i + 1]):
+        j = ends[e]
+        for r in range(3):
+            length = positions[j, r] - positions[i, r]
+            for c in range(3):
+                product[r, c] += length * arms[e, c]
+
+
+@kernel(cache=True, allocates=True)
+def edge_products(graph: Graph, positions: Floats) -> Floats:
+    """Return the products of all nodes, see `_edge_product`. [n,3] -> [n,3,3]"""
+    count = len(positions)
+    products = np.empty((count, 3, 3))
+    for i in range(count):
+        _edge_product(graph, positions, i, products[i])
+    return products
+
+
+@kernel(allocates=True)
+def _fit_rotations(graph: Graph, rest: Floats, positions: Floats, rotations: Floats) -> float:
+    """Update the rotations for the positions; return the energy of the edges and springs."""
+    product = np.empty((3, 3))
+    first, ends, arms, springs = graph
+    energy = 0.0
+    for i in range(len(rest)):
+        _edge_product(graph, positions, i, product)
+        nearest_rotation(product, rotations[i])
+        for r in range(3):
+            energy += 0.5 * springs[i] * (positions[i, r] - rest[i, r]) ** 2
+            for c in range(3):
+                energy -= 0.5 * rotations[i, r, c] * product[r, c]
+            for e in range(first[i], first[i + 1]):
+                step = positions[ends[e], r] - positions[i, r]
+                energy += 0.25 * (step * step + arms[e, r] * arms[e, r])
+    return energy
+
+
+@kernel(cache=True)
+def nearest_rotations_fast(matrices: Floats, rotations: Floats) -> None:
+    """Turn rotations into those nearest to matrices, in place. Both [n,3,3]"""
+    for i in range(len(matrices)):
+        nearest_rotation(matrices[i], rotations[i])
+
+
+@kernel()
+def _right_side(graph: Graph, handles: Handles, rest: Floats, rotations: Floats, right: Floats) -> None:
+    """Set the right side of the linear system from the rotations, springs and handles. right: [n,3]"""
+    first, ends, arms, springs = graph
+    handle_nodes, steering, targets, stiffness = handles
+    for i in range(len(rest)):
+        for r in range(3):
+            total = springs[i] * rest[i, r]
+            for e in range(first[i], first[i + 1]):
+                j = ends[e]
+                for c in range(3):
+                    total -= 0.5 * (rotations[i, r, c] + rotations[j, r, c]) * arms[e, c]
+            right[i, r] = total
+    for h in range(len(targets)):
+        for r in range(3):
+            missing = targets[h, r]
+            for k in range(steering[0][h], steering[0][h + 1]):
+                column = steering[1][k]
+                missing -= steering[2][k] * rotations[column // 3, r, column % 3]
+            for k in range(handle_nodes[0][h], handle_nodes[0][h + 1]):
+                right[handle_nodes[1][k], r] += stiffness * handle_nodes[2][k] * missing
+
+
+@kernel()
+def _solve_factored(factor: Factor, vectors: Floats) -> None:
+    """Solve the factorized system for four right sides, in the order of its factors, in place. [f,4]"""
+    lower, upper, _, _ = factor
+    first, rows, values = lower
+    for j in range(len(vectors)):
+        for k in range(first[j] + 1, first[j + 1]):
+            i = rows[k]
+            for c in range(4):
+                vectors[i, c] -= values[k] * vectors[j, c]
+    first, rows, values = upper
+    for j in range(len(vectors) - 1, -1, -1):
+        last = first[j + 1] - 1
+        for c in range(4):
+            vectors[j, c] /= values[last]
+        for k in range(first[j], last):
+            i = rows[k]
+            for c in range(4):
+                vectors[i, c] -= values[k] * vectors[j, c]
+
+
+@kernel()
+def _predict(differences: Floats, gram: Floats, weights: Floats, count: int) -> None:
+    """Set the weights [count] with the least squares Σ weights · columns = newest difference.
+
+    The Gram matrix [count,count+1] holds the products of the columns, and with the newest difference last.
+    """
+    for k in range(count):
+        gram[k, k] += _RIDGE * gram[k, k] + 1e-300
+    for k in range(count):
+        for i in range(k + 1, count):
+            factor = gram[i, k] / gram[k, k]
+            for j in range(k, count + 1):
+                gram[i, j] -= factor * gram[k, j]
+    for k in range(count - 1, -1, -1):
+        total = gram[k, count]
+        for j in range(k + 1, count):
+            total -= gram[k, j] * weights[j]
+        weights[k] = total / gram[k, k]
+
+
+@kernel(cache=True, allocates=True)
+def settle(
+    graph: Graph,
+    factor: Factor,
+    nodes: tuple[Rows, Sparse],
+    handles: Handles,
+    rest: Floats,
+    pose: tuple[Floats, Floats],
+    limits: tuple[int, float],
+) -> tuple[int, float]:
+    """Repeat rounds until the nodes settle; return their number and the movement in the last one.
+
+    Args:
+        graph: edges and springs of the n nodes
+        factor: factors of the system of the f free nodes
+        nodes: the free nodes [f], and the columns of the system that belong to held nodes. [f,n]
+        handles: handles and their targets
+        rest: positions at rest. [n,3]
+        pose: positions [n,3] and rotations [n,3,3] to start from; updated in place
+        limits: largest number of rounds, and movement of a coordinate in a round that counts as settled
+    """
+    positions, rotations = pose
+    free, to_held = nodes
+    max_rounds, tolerance = limits
+    row_order = factor[2]
+    column_order = factor[3]
+    count = len(free)
+    size = 3 * count
+    right = np.empty((len(rest), 3))
+    packed = np.zeros((count, 4))
+    mapped = np.empty(size)
+    difference = np.empty(size)
+    last_mapped = np.empty(size)
+    last_difference = np.empty(size)
+    mapped_steps = np.empty((HISTORY, size))
+    difference_steps = np.empty((HISTORY, size))
+    products = np.zeros((HISTORY, HISTORY))
+    gram = np.empty((HISTORY, HISTORY + 1))
+    weights = np.empty(HISTORY)
+    history = -1  # steps in the history; −1 before the first round
+    used = 0  # steps that predicted the positions
+    last_length = 0.0
+    last_energy = 0.0
+    last_rotations = rotations.copy()
+    largest = 0.0
+    held_right = np.zeros((count, 3))
+    for f in range(count):
+        for k in range(to_held[0][f], to_held[0][f + 1]):
+            for c in range(3):
+                held_right[f, c] += to_held[2][k] * rest[to_held[1][k], c]
+    for i in range(max_rounds):
+        energy = _fit_rotations(graph, rest, positions, rotations)
+        if used and energy > last_energy:
+            for f in range(count):
+                for c in range(3):
+                    positions[free[f], c] = last_mapped[3 * f + c]
+            rotations[:] = last_rotations
+            history = -1
+            energy = _fit_rotations(graph, rest, positions, rotations)
+        last_energy = energy
+        last_rotations[:] = rotations
+        _right_side(graph, handles, rest, rotations, right)
+        for f in range(count):
+            for c in range(3):
+                packed[row_order[f], c] = right[free[f], c] - held_right[f, c]
+        _solve_factored(factor, packed)
+        largest = 0.0
+        length = 0.0
+        for f in range(count):
+            for c in range(3):
+                value = packed[column_order[f], c]
+                step = value - positions[free[f], c]
+                mapped[3 * f + c] = value
+                difference[3 * f + c] = step
+                length += step * step
+                largest = max(largest, abs(step))
+        if largest <= tolerance or i == max_rounds - 1:
+            for f in range(count):
+                for c in range(3):
+                    positions[free[f], c] = mapped[3 * f + c]
+            return i + 1, largest
+        if history >= 0 and length > _GROWTH_LIMIT * _GROWTH_LIMIT * last_length:
+            history = -1
+        if history >= 0:
+            slot = history % HISTORY
+            for k in range(size):
+                mapped_steps[slot, k] = mapped[k] - last_mapped[k]
+                difference_steps[slot, k] = difference[k] - last_difference[k]
+            history += 1
+            used = min(history, HISTORY)
+            for j in range(used):
+                total = 0.0
+                for k in range(size):
+                    total += difference_steps[slot, k] * difference_steps[j, k]
+                products[slot, j] = total
+                products[j, slot] = total
+            for j in range(used):
+                total = 0.0
+                for k in range(size):
+                    total += difference_steps[j, k] * difference[k]
+                gram[j, used] = total
+                for k in range(used):
+                    gram[j, k] = products[j, k]
+            _predict(difference, gram, weights, used)
+        else:
+            history = 0
+            used = 0
+        last_length = length
+        last_mapped[:] = mapped
+        last_difference[:] = difference
+        for j in range(used):
+            for k in range(size):
+                mapped[k] -= weights[j] * mapped_steps[j, k]
+        for f in range(count):
+            for c in range(3):
+                positions[free[f], c] = mapped[3 * f + c]
+    return max_rounds, largest
