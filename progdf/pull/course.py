@@ -12,13 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, vstack
 from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.field.baked import interpolate_at
 from progdf.gaussians import Gaussians, pack
-from progdf.quaternions import matrix_turns
+from progdf.quaternions import matrix_turns, rotation_matrices, turn_quats
 from progdf.region import Region, from_mask
 from progdf.scene.point_tree import PointTree
 
@@ -28,6 +28,10 @@ from .solve import Pose, Solver
 
 MAX_PULL = 100.0
 """Largest pull, in diagonals of the scene."""
+MAX_HANDLE_SCALE = 100.0
+"""Largest scale of a handle, and largest inverse."""
+Point = tuple[float, float, float]
+_MIN_FRAME_NODES = 3  # connected nodes; fewer cannot be turned or scaled
 _TOUCH_SIGMAS = 3.0  # standard deviations; a point on the region is at most so far from a Gaussian
 _HELD_BELOW = 0.01  # falloff; nodes with less are held
 _FALLOFF_STIFFNESS = 8.0  # stiffness of the falloff's springs, in edges per squared radius
@@ -41,12 +45,24 @@ _STILL_NODE_SPACINGS = 1e-4  # a node that moves less, in node spacings, stays
 
 @dataclass(frozen=True)
 class Handle:
-    """Point of a region and its displacement."""
+    """Point of a region, its displacement, and the rotation and scale of the surface around it."""
 
     region: Region  # the point pulls these Gaussians
-    point: tuple[float, float, float]  # position relative to the origin of the scene, world units
-    pull: tuple[float, float, float]  # displacement, world units
+    point: Point  # position relative to the origin of the scene, world units
+    pull: Point  # displacement, world units
     falloff: float | None = None  # radius of the influence, world units; None: all that is connected
+    turn: Point | None = None  # axis times angle in radians, below 2π; None: the surface rotates freely
+    scale: float = 1.0  # above 0; other than 1 without a turn: the surface does not rotate
+
+    @property
+    def is_framed(self) -> bool:
+        """True if the handle also gives the rotation and scale of the surface around it."""
+        return self.turn is not None or self.scale != 1.0
+
+    @property
+    def moves(self) -> bool:
+        """True if the handle moves, turns or scales anything."""
+        return any(self.pull) or any(self.turn or ()) or self.scale != 1.0
 
 
 @dataclass(frozen=True)
@@ -80,13 +96,42 @@ class Problem:
     graph: NodeGraph
     held: Mask  # nodes that stay in place. [n]
     solver: Solver
-    blends: csr_array  # weights of the nodes in each handle. [H,n]
-    points: Floats  # [H,3]
-    pulls: Floats  # [H,3]
+    blends: csr_array  # weights of the nodes in each constrained point, the handles' points first. [P,n]
+    points: Floats  # constrained points at rest. [P,3]
+    owners: Rows  # handle of each constrained point; −1: pinned. [P]
+    pulls: Floats  # displacements of the handles. [H,3]
+    turns: Floats  # their rotation vectors, NaN if free. [H,3]
+    scales: Floats  # [H]
+
+    def targets(self, pulls: Floats, turns: Floats, scales: Floats) -> Floats:
+        """Return the positions of the constrained points. [P,3]
+
+        Args:
+            pulls: displacements of the handles. [H,3]
+            turns: rotation vectors of the surfaces around them, without effect if free. [H,3]
+            scales: factors of these surfaces, without effect if free. [H]
+        """
+        moving = self.owners >= 0
+        owners = self.owners[moving]
+        centers = self.points[: len(pulls)]
+        rotations = rotation_matrices(turn_quats(torch.from_numpy(turns))).numpy()
+        arms = self.points[moving] - centers[owners]
+        turned = scales[owners, None] * np.einsum("pij,pj->pi", rotations[owners], arms)
+        targets = self.points.copy()
+        targets[moving] = centers[owners] + pulls[owners] + turned
+        return targets
+
+    def targets_at(self, strength: float, turns: Floats) -> Floats:
+        """Return the targets on the way, for rotation vectors of the handles at strength 1. [H,3] -> [P,3]"""
+        return self.targets(path(self.pulls, turns, strength), strength * turns, self.scales**strength)
 
 
 def pull(
-    scene: Gaussians, handles: Sequence[Handle], hold: Region | None = None, max_nodes: int = MAX_NODES
+    scene: Gaussians,
+    handles: Sequence[Handle],
+    hold: Region | None = None,
+    max_nodes: int = MAX_NODES,
+    pins: Sequence[Point] = (),
 ) -> PullCourse:
     """Return the course of pulled points.
 
@@ -95,14 +140,14 @@ def pull(
         handles: at least one
         hold: Gaussians that stay as they are, bit for bit
         max_nodes: target number of nodes of the graph
+        pins: points of the surface that stay, while it may rotate around them
 
     Raises:
         ProgdfError: a point is not on its region or is held, or a pull is out of range.
     """
-    for handle in handles:
-        if not any(handle.pull):
-            raise ProgdfError(f"the pull of the point {_world(scene, handle)} is 0; write how far it goes")
-    problem = make_problem(scene, handles, hold, max_nodes)
+    if not any(handle.moves for handle in handles):
+        raise ProgdfError(f"the pull of the point {_world(scene, handles[0])} is 0; write how far it goes")
+    problem = make_problem(scene, handles, hold, max_nodes, pins)
     strengths, poses = _solve_course(problem)
     graph = problem.graph
     kept = np.ones(len(scene), bool)
@@ -134,7 +179,11 @@ def pull(
 
 
 def make_problem(
-    scene: Gaussians, handles: Sequence[Handle], hold: Region | None, max_nodes: int = MAX_NODES
+    scene: Gaussians,
+    handles: Sequence[Handle],
+    hold: Region | None,
+    max_nodes: int = MAX_NODES,
+    pins: Sequence[Point] = (),
 ) -> Problem:
     """Return the graph and the factorized solver of some handles.
 
@@ -156,16 +205,77 @@ def make_problem(
         if held_members[row]:
             raise ProgdfError(f"the point {_world(scene, handle)} is held; pull a point outside --hold")
     nodes = graph.node_of[at]
-    blends = bind(graph, points, nodes)
     counts = np.bincount(graph.node_of, minlength=len(graph))
     held = 2 * np.bincount(graph.node_of, held_members, minlength=len(graph)) >= counts
     weights = _falloff_weights(graph, handles)
     held |= weights < _HELD_BELOW
     held |= ~np.isin(graph.part, graph.part[nodes])
     held[nodes] = False
+    pinned = _pinned_rows(means, members, pins)
+    pinned = pinned[~held[graph.node_of[pinned[:, 1]]]]
+    pin_points = np.array(pins, np.float64).reshape(-1, 3)[pinned[:, 0]]
+    blends = bind(graph, np.concatenate([points, pin_points]), np.append(nodes, graph.node_of[pinned[:, 1]]))
+    owners = np.append(np.arange(len(handles)), np.full(len(pinned), -1))
+    points = np.concatenate([points, pin_points])
+    blends, points, owners = _add_frames(scene, graph, handles, blends, points, owners)
     solver = Solver(graph, blends, points, held, _springs(graph, handles, weights))
     pulls = np.array([handle.pull for handle in handles], np.float64)
-    return Problem(members, graph, held, solver, blends, points, pulls)
+    free = (math.nan, math.nan, math.nan)
+    turns = [handle.turn or (0.0, 0.0, 0.0) if handle.is_framed else free for handle in handles]
+    scales = np.array([handle.scale for handle in handles], np.float64)
+    return Problem(members, graph, held, solver, blends, points, owners, pulls, np.array(turns), scales)
+
+
+def _pinned_rows(means: Floats, members: Rows, pins: Sequence[Point]) -> Rows:
+    """Return the pins on members, and the index of the nearest member of each. [K,2]
+
+    Raises:
+        ProgdfError: a number is not finite.
+    """
+    if not len(pins):
+        return np.zeros((0, 2), np.int64)
+    points = np.array(pins, np.float64)
+    if not np.isfinite(points).all():
+        raise ProgdfError("a number of a pin is not finite")
+    nearest = PointTree(means, 1).query(points, 1)[1][:, 0]
+    on_members = np.flatnonzero(np.isin(nearest, members))
+    return np.stack([on_members, np.searchsorted(members, nearest[on_members])], axis=1)
+
+
+def _add_frames(
+    scene: Gaussians,
+    graph: NodeGraph,
+    handles: Sequence[Handle],
+    blends: csr_array,
+    points: Floats,
+    owners: Rows,
+) -> tuple[csr_array, Floats, Rows]:
+    """Add the nodes around handles that turn or scale to the constrained points.
+
+    Raises:
+        ProgdfError: too few nodes are connected with such a handle.
+    """
+    parts = [blends]
+    positions = [points]
+    all_owners = [owners]
+    sizes = np.bincount(graph.part)
+    for index, handle in enumerate(handles):
+        if not handle.is_framed:
+            continue
+        row = blends[[index]].tocoo()
+        nodes = row.coords[1][row.data > 0.0].astype(np.int64)
+        if sizes[graph.part[nodes[0]]] < _MIN_FRAME_NODES:
+            raise ProgdfError(
+                f"too few Gaussians are connected with {_world(scene, handle)} to turn or scale it; "
+                "pull it without a turn, or use --rotate and --scale"
+            )
+        frame = csr_array(
+            (np.ones(len(nodes)), (np.arange(len(nodes)), nodes)), shape=(len(nodes), len(graph))
+        )
+        parts.append(frame)
+        positions.append(graph.positions[nodes])
+        all_owners.append(np.full(len(nodes), index))
+    return csr_array(vstack(parts)), np.concatenate(positions), np.concatenate(all_owners)
 
 
 def _check_handle(scene: Gaussians, means: Floats, handle: Handle) -> int:
@@ -174,9 +284,15 @@ def _check_handle(scene: Gaussians, means: Floats, handle: Handle) -> int:
     Raises:
         ProgdfError: the point is not on the region, or a number is out of range.
     """
-    numbers = [*handle.point, *handle.pull, handle.falloff or 0.0]
+    numbers = [*handle.point, *handle.pull, *(handle.turn or ()), handle.scale, handle.falloff or 0.0]
     if not all(math.isfinite(number) for number in numbers):
         raise ProgdfError("a number of a pull is not finite")
+    if math.hypot(*(handle.turn or (0.0,))) >= 2.0 * math.pi:
+        raise ProgdfError("a handle turns by less than 360°")
+    if not 1.0 / MAX_HANDLE_SCALE <= handle.scale <= MAX_HANDLE_SCALE:
+        raise ProgdfError(
+            f"a handle scales by {1.0 / MAX_HANDLE_SCALE:g} to {MAX_HANDLE_SCALE:g}, not {handle.scale:g}"
+        )
     rows = handle.region.members.numpy()
     if not len(rows):
         raise ProgdfError(f"the pulled region {handle.region.name} holds no Gaussian")
@@ -247,12 +363,14 @@ def _springs(graph: NodeGraph, handles: Sequence[Handle], weights: Floats) -> Fl
 
 def _solve_course(problem: Problem) -> tuple[Floats, list[Pose]]:
     """Return the strengths [S] with 0, and the poses at all but the first."""
-    straight = np.zeros_like(problem.pulls)
+    is_free = np.isnan(problem.turns)
+    straight = np.where(is_free, 0.0, problem.turns)
     trial = _solve_along(problem, straight, np.linspace(0.0, 1.0, 1 + _TRIAL_STRENGTHS))[-1]
-    blended = (problem.blends @ trial.rotations.reshape(-1, 9)).reshape(-1, 3, 3)
-    turns = matrix_turns(torch.from_numpy(blended)).numpy()
+    blended = (problem.blends[: len(straight)] @ trial.rotations.reshape(-1, 9)).reshape(-1, 3, 3)
+    found = matrix_turns(torch.from_numpy(blended)).numpy()
+    turns = np.where(is_free, found, straight)
     angles = matrix_turns(torch.from_numpy(trial.rotations)).norm(dim=1)
-    largest = float(angles.quantile(_LARGEST_SHARE))
+    largest = max(float(angles.quantile(_LARGEST_SHARE)), float(np.linalg.norm(straight, axis=1).max()))
     stretches = problem.solver.stretches(trial)
     if len(stretches):
         largest = max(largest, float(np.quantile(np.abs(np.log(stretches.clip(1e-6))), _LARGEST_SHARE)))
@@ -267,7 +385,7 @@ def _solve_along(problem: Problem, turns: Floats, strengths: Floats) -> list[Pos
     start = last
     poses = []
     for strength in strengths[1:]:
-        pose = problem.solver.solve(problem.points + path(problem.pulls, turns, float(strength)), start)
+        pose = problem.solver.solve(problem.targets_at(float(strength), turns), start)
         onward = pose.rotations @ np.swapaxes(last.rotations, 1, 2) @ pose.rotations
         start = Pose(2.0 * pose.positions - last.positions, onward)  # the same step once more
         last = pose

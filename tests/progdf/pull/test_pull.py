@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -138,6 +139,65 @@ def test_edit_is_the_scene_at_zero_and_the_baked_pull_at_one() -> None:
     assert torch.allclose(pack(end, True), pack(baked, True), atol=1e-3)
     half = compose_layers(scene, [Layer(gdf, 0.5)])
     assert torch.allclose(half.means, at(scene, course, 0.5).means, atol=0.05 * SPACING)
+
+
+def test_turned_handle_turns_the_surface_around_it() -> None:
+    scene = bar()
+    held = inside_box("held", scene, torch.tensor([-1.0, -1, -1]), torch.tensor([0.35, 1, 1]))
+    handle = replace(grip(scene, (2.2, 0.1, 0.1), (0.0, 0.0, 0.0)), turn=(1.2, 0.0, 0.0))
+    course = pull(scene, [handle], held)
+    rotation = rotation_matrices(turn_quats(torch.tensor([[1.2, 0.0, 0.0]], dtype=torch.float64)))[0]
+    center = torch.tensor(handle.point, dtype=torch.float64)
+    near = (scene.means - center).norm(dim=1) < 2.0 * SPACING
+    for strength, share in ((1.0, 1.0), (0.5, 0.5)):
+        turn = torch.tensor([[share * 1.2, 0.0, 0.0]], dtype=torch.float64)
+        rotation = rotation_matrices(turn_quats(turn))[0]
+        expected = (scene.means.double() - center) @ rotation.T + center
+        error = (at(scene, course, strength).means - expected).norm(dim=1)
+        assert float(error[near].max()) < 0.4 * SPACING
+    middle = (scene.means[:, 0] - 1.2).abs() < 0.1
+    assert float((at(scene, course, 1.0).means - scene.means)[middle].norm(dim=1).max()) > 0.3 * SPACING
+
+
+def test_scaled_handle_scales_the_surface_around_it() -> None:
+    scene = bar()
+    held = inside_box("held", scene, torch.tensor([-1.0, -1, -1]), torch.tensor([0.35, 1, 1]))
+    handle = replace(grip(scene, (2.2, 0.1, 0.1), (0.0, 0.0, 0.0)), scale=1.5)
+    end = at(scene, pull(scene, [handle], held), 1.0)
+    near = (scene.means - torch.tensor(handle.point)).norm(dim=1) < 1.5 * SPACING
+    ratio = torch.pdist(end.means[near]) / torch.pdist(scene.means[near])
+    assert float(ratio.median()) == pytest.approx(1.5, abs=0.15)
+    growth = (end.log_scales - scene.log_scales)[near].mean()
+    assert float(growth) == pytest.approx(math.log(1.5), abs=0.15)
+
+
+def test_pinned_point_stays_and_the_rest_turns_around_it() -> None:
+    scene = bar()
+    pin = tuple(scene.means[(scene.means - torch.tensor([0.0, 0.1, 0.1])).norm(dim=1).argmin()].tolist())
+    course = pull(scene, [grip(scene, (2.3, 0.1, 0.1), (-0.6, 1.2, 0.0))], pins=[pin])
+    end = at(scene, course, 1.0)
+    row = int((scene.means - torch.tensor(pin)).norm(dim=1).argmin())
+    assert float((end.means[row] - scene.means[row]).norm()) < 0.1 * SPACING
+    middle = (scene.means - torch.tensor([1.2, 0.1, 0.1])).norm(dim=1).argmin()
+    assert float((end.means[middle] - scene.means[middle]).norm()) > 3.0 * SPACING
+
+
+@pytest.mark.parametrize(
+    ("turn", "scale", "message"),
+    [((0.0, math.nan, 0.0), 1.0, "finite"), ((0.0, 7.0, 0.0), 1.0, "360"), (None, 0.0, "scales by")],
+)
+def test_invalid_frame_of_a_handle_is_refused(turn: Point | None, scale: float, message: str) -> None:
+    scene = bar()
+    handle = replace(grip(scene, (2.3, 0.1, 0.1), (0.1, 0.0, 0.0)), turn=turn, scale=scale)
+    with pytest.raises(ProgdfError, match=message):
+        pull(scene, [handle])
+
+
+def test_turn_of_a_single_gaussian_is_refused() -> None:
+    scene = bar()[:1]
+    handle = replace(grip(scene, (0.0, 0.0, 0.0), (0.1, 0.0, 0.0)), turn=(0.0, 1.0, 0.0))
+    with pytest.raises(ProgdfError, match="too few Gaussians"):
+        pull(scene, [handle])
 
 
 def test_mirrored_pulls_of_a_symmetric_graph_mirror_the_result() -> None:
