@@ -223,7 +223,18 @@ def make_problem(
     free = (math.nan, math.nan, math.nan)
     turns = [handle.turn or (0.0, 0.0, 0.0) if handle.is_framed else free for handle in handles]
     scales = np.array([handle.scale for handle in handles], np.float64)
-    return Problem(members, graph, held, solver, blends, points, owners, pulls, np.array(turns), scales)
+    return Problem(
+        members,
+        graph,
+        held,
+        solver,
+        blends=blends,
+        points=points,
+        owners=owners,
+        pulls=pulls,
+        turns=np.array(turns),
+        scales=scales,
+    )
 
 
 def _pinned_rows(means: Floats, members: Rows, pins: Sequence[Point]) -> Rows:

@@ -154,14 +154,13 @@ def follow(
     degree = min(3, math.isqrt((raw.shape[1] - BASE_CHANNELS) // 3 + 1) - 1)
     bands = (_band_samples(1), _band_samples(2), _band_samples(3))
     moved = packed.numpy()
+    motions = (table.ravel(), center.astype(np.float32))
+    start = (last.halves, last.turns, last.quats)
 
     def move(chunk: int) -> None:
         first = chunk * _FOLLOW_CHUNK
         part = (first, min(first + _FOLLOW_CHUNK, count), degree)
-        follow_rows(
-            raw, weights, table.ravel(), center.astype(np.float32), last.halves, (last.turns, last.quats),
-            frames, bands, moved, part,
-        )  # fmt: skip
+        follow_rows(raw, weights, motions, start, frames, bands, moved, part)
 
     run_chunks(move, -(-count // _FOLLOW_CHUNK))
     return packed, Frames(last.halves, *frames)

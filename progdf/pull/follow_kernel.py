@@ -286,22 +286,24 @@ def _stretch_axes(buffer: Singles) -> None:
         store(buffer, _at(_MATRIX + k), factor * x)
         store(buffer, _at(_MATRIX + 3 + k), factor * y)
         store(buffer, _at(_MATRIX + 6 + k), factor * z)
-    # the third axis completes a rotation, also of a reflected gradient, with the sign it had if it can
+    _write_axes_quat(buffer)
+
+
+@kernel()
+def _write_axes_quat(buffer: Singles) -> None:
+    """Write the quaternion of the axes with the sign and length of the last one.
+
+    The third axis completes a rotation, also of a reflected gradient.
+    """
     a = load(buffer, _at(_MATRIX))
     b = load(buffer, _at(_MATRIX + 3))
     c = load(buffer, _at(_MATRIX + 6))
     d = load(buffer, _at(_MATRIX + 1))
     e = load(buffer, _at(_MATRIX + 4))
     f = load(buffer, _at(_MATRIX + 7))
-    _write_axes_quat(buffer, a, b, c, d, e, f, b * f - c * e, c * d - a * f, a * e - b * d)
-
-
-@kernel()
-def _write_axes_quat(
-    buffer: Singles, a: Vector, b: Vector, c: Vector, d: Vector, e: Vector, f: Vector, g: Vector, h: Vector,
-    i: Vector,
-) -> None:  # fmt: skip
-    """Write the quaternion of axes abc, def and ghi with the sign and length of the last one."""
+    g = b * f - c * e
+    h = c * d - a * f
+    i = a * e - b * d
     one = np.float32(1.0)
     w = one + a + e + i
     x = one + a - e - i
@@ -459,10 +461,8 @@ def _write_rotation(buffer: Singles) -> None:
 def follow_rows(
     rows: Singles,
     weights: Weights,
-    table: Singles,
-    center: Singles,
-    halves: Singles,
-    last: tuple[Singles, Singles],
+    motions: tuple[Singles, Singles],
+    last: tuple[Singles, Singles, Singles],
     frames: tuple[Singles, Singles],
     bands: tuple[Bands, Bands, Bands],
     result: Singles,
@@ -473,16 +473,18 @@ def follow_rows(
     Args:
         rows: raw rows at rest. [M,C]
         weights: weights of the nodes
-        table: motions of the nodes, see `write_nodes`, flattened. [32n]
-        center: point to which the shifts of the nodes refer. [3]
-        halves: axes times scales, relative to each Gaussian's largest scale. [M,9]
-        last: rotations of the columns [M,9] and quaternions [M,4] at a similar pose
-        frames: the same at this pose; written
+        motions: motions of the nodes, see `write_nodes`, flattened [32n], and the point to which their
+            shifts refer. [3]
+        last: axes times scales at rest with two more numbers, see `progdf.pull.follow.Frames` [M,11];
+            rotations of the columns [M,9] and quaternions [M,4] at a similar pose
+        frames: rotations of the columns and quaternions at this pose; written
         bands: directions and matrices of bands 1, 2 and 3
         result: raw rows; written. [M,C]
         part: first Gaussian, end, and SH degree that rotates, 0 to 3
     """
     begin, end, degree = part
+    table, center = motions
+    halves, last_turns, last_quats = last
     width = rows.shape[1]
     buffer = np.zeros((_ROW + width) * _LANES, np.float32)
     if degree > 0:
@@ -498,9 +500,9 @@ def follow_rows(
             _blend_node_motions(weights, table, member, lane, buffer)
             for k in range(9):
                 buffer[(_HALF + k) * _LANES + lane] = halves[member, k]
-                buffer[(_LAST_RIGHT + k) * _LANES + lane] = last[0][member, k]
+                buffer[(_LAST_RIGHT + k) * _LANES + lane] = last_turns[member, k]
             for k in range(4):
-                buffer[(_LAST_QUAT + k) * _LANES + lane] = last[1][member, k]
+                buffer[(_LAST_QUAT + k) * _LANES + lane] = last_quats[member, k]
             buffer[_FLOOR * _LANES + lane] = halves[member, 9]
             for c in range(width):
                 buffer[(_ROW + c) * _LANES + lane] = rows[member, c]

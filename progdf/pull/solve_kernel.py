@@ -29,6 +29,8 @@ Row i of the system is row `rows[i]` of the factors, and its solution is entry `
 """
 Handles = tuple[Sparse, Sparse, Floats, float]
 """Weights of the nodes [H,n] and of the columns of their rotations [H,3n], targets [H,3], and stiffness."""
+Memory = tuple[Floats, Floats, Floats]
+"""Steps of the rounds' results and of their differences [H,3f], products of the latter [H,H], H = `HISTORY`."""
 
 HISTORY = 6
 """Rounds that predict the next one."""
@@ -221,7 +223,7 @@ def _solve_factored(factor: Factor, vectors: Floats) -> None:
 
 
 @kernel()
-def _predict(differences: Floats, gram: Floats, weights: Floats, count: int) -> None:
+def _predict(gram: Floats, weights: Floats, count: int) -> None:
     """Set the weights [count] with the least squares Σ weights · columns = newest difference.
 
     The Gram matrix [count,count+1] holds the products of the columns, and with the newest difference last.
@@ -238,6 +240,83 @@ def _predict(differences: Floats, gram: Floats, weights: Floats, count: int) -> 
         for j in range(k + 1, count):
             total -= gram[k, j] * weights[j]
         weights[k] = total / gram[k, k]
+
+
+@kernel(inline=True)
+def _dot(a: Floats, b: Floats) -> float:
+    """Return the product of two vectors of equal length."""
+    total = 0.0
+    for k in range(len(a)):
+        total += a[k] * b[k]
+    return total
+
+
+@kernel(allocates=True)
+def _extrapolate(memory: Memory, slot: int, used: int, last: Floats, now: Floats) -> None:
+    """Add the newest round to the history, and move its result to where the rounds settle.
+
+    Args:
+        memory: steps of the rounds' results and of their differences, products of the latter, see `settle`
+        slot: place of the newest steps in the history
+        used: number of steps in the history with it
+        last: result of the last round and its difference. [2,3f]
+        now: the same of the newest round, of which the result is updated in place. [2,3f]
+    """
+    steps, difference_steps, products = memory
+    gram = np.empty((HISTORY, HISTORY + 1))
+    weights = np.empty(HISTORY)
+    for k in range(now.shape[1]):
+        steps[slot, k] = now[0, k] - last[0, k]
+        difference_steps[slot, k] = now[1, k] - last[1, k]
+    for j in range(used):
+        products[slot, j] = _dot(difference_steps[slot], difference_steps[j])
+        products[j, slot] = products[slot, j]
+    for j in range(used):
+        gram[j, used] = _dot(difference_steps[j], now[1])
+        for k in range(used):
+            gram[j, k] = products[j, k]
+    _predict(gram, weights, used)
+    last[:] = now
+    for j in range(used):
+        for k in range(now.shape[1]):
+            now[0, k] -= weights[j] * steps[j, k]
+
+
+@kernel()
+def _move_free(positions: Floats, free: Rows, values: Floats) -> None:
+    """Set the positions [n,3] of the free nodes [f] to values [3f]."""
+    for f in range(len(free)):
+        for c in range(3):
+            positions[free[f], c] = values[3 * f + c]
+
+
+@kernel()
+def _solve_positions(
+    factor: Factor, free: Rows, right: Floats, packed: Floats, positions: Floats, now: Floats
+) -> float:
+    """Solve for the positions of the free nodes; return the largest movement of a coordinate.
+
+    Args:
+        factor: factors of the system
+        free: the free nodes. [f]
+        right: right side. [f,3]
+        packed: memory. [f,4]
+        positions: current positions. [n,3]
+        now: new positions of the free nodes, and the difference from the current ones; written. [2,3f]
+    """
+    largest = 0.0
+    for f in range(len(free)):
+        for c in range(3):
+            packed[factor[2][f], c] = right[f, c]
+    _solve_factored(factor, packed)
+    for f in range(len(free)):
+        for c in range(3):
+            value = packed[factor[3][f], c]
+            step = value - positions[free[f], c]
+            now[0, 3 * f + c] = value
+            now[1, 3 * f + c] = step
+            largest = max(largest, abs(step))
+    return largest
 
 
 @kernel(cache=True, allocates=True)
@@ -264,38 +343,26 @@ def settle(
     positions, rotations = pose
     free, to_held = nodes
     max_rounds, tolerance = limits
-    row_order = factor[2]
-    column_order = factor[3]
     count = len(free)
-    size = 3 * count
     right = np.empty((len(rest), 3))
+    free_right = np.empty((count, 3))
     packed = np.zeros((count, 4))
-    mapped = np.empty(size)
-    difference = np.empty(size)
-    last_mapped = np.empty(size)
-    last_difference = np.empty(size)
-    mapped_steps = np.empty((HISTORY, size))
-    difference_steps = np.empty((HISTORY, size))
-    products = np.zeros((HISTORY, HISTORY))
-    gram = np.empty((HISTORY, HISTORY + 1))
-    weights = np.empty(HISTORY)
-    history = -1  # steps in the history; −1 before the first round
-    used = 0  # steps that predicted the positions
-    last_length = 0.0
-    last_energy = 0.0
+    now = np.empty((2, 3 * count))
+    last = np.empty((2, 3 * count))
+    memory = (
+        np.empty((HISTORY, 3 * count)),
+        np.empty((HISTORY, 3 * count)),
+        np.zeros((HISTORY, HISTORY)),
+    )
     last_rotations = rotations.copy()
+    last_energy = 0.0
+    last_length = 0.0
     largest = 0.0
-    held_right = np.zeros((count, 3))
-    for f in range(count):
-        for k in range(to_held[0][f], to_held[0][f + 1]):
-            for c in range(3):
-                held_right[f, c] += to_held[2][k] * rest[to_held[1][k], c]
+    history = -1  # steps in the history; −1 before the first round
     for i in range(max_rounds):
         energy = _fit_rotations(graph, rest, positions, rotations)
-        if used and energy > last_energy:
-            for f in range(count):
-                for c in range(3):
-                    positions[free[f], c] = last_mapped[3 * f + c]
+        if history > 0 and energy > last_energy:  # predicted badly; continue from the last round's result
+            _move_free(positions, free, last[0])
             rotations[:] = last_rotations
             history = -1
             energy = _fit_rotations(graph, rest, positions, rotations)
@@ -304,56 +371,21 @@ def settle(
         _right_side(graph, handles, rest, rotations, right)
         for f in range(count):
             for c in range(3):
-                packed[row_order[f], c] = right[free[f], c] - held_right[f, c]
-        _solve_factored(factor, packed)
-        largest = 0.0
-        length = 0.0
-        for f in range(count):
-            for c in range(3):
-                value = packed[column_order[f], c]
-                step = value - positions[free[f], c]
-                mapped[3 * f + c] = value
-                difference[3 * f + c] = step
-                length += step * step
-                largest = max(largest, abs(step))
-        if largest <= tolerance or i == max_rounds - 1:
-            for f in range(count):
-                for c in range(3):
-                    positions[free[f], c] = mapped[3 * f + c]
+                free_right[f, c] = right[free[f], c]
+                for k in range(to_held[0][f], to_held[0][f + 1]):
+                    free_right[f, c] -= to_held[2][k] * rest[to_held[1][k], c]
+        largest = _solve_positions(factor, free, free_right, packed, positions, now)
+        if largest <= tolerance:
+            _move_free(positions, free, now[0])
             return i + 1, largest
+        length = _dot(now[1], now[1])
         if history >= 0 and length > _GROWTH_LIMIT * _GROWTH_LIMIT * last_length:
             history = -1
-        if history >= 0:
-            slot = history % HISTORY
-            for k in range(size):
-                mapped_steps[slot, k] = mapped[k] - last_mapped[k]
-                difference_steps[slot, k] = difference[k] - last_difference[k]
-            history += 1
-            used = min(history, HISTORY)
-            for j in range(used):
-                total = 0.0
-                for k in range(size):
-                    total += difference_steps[slot, k] * difference_steps[j, k]
-                products[slot, j] = total
-                products[j, slot] = total
-            for j in range(used):
-                total = 0.0
-                for k in range(size):
-                    total += difference_steps[j, k] * difference[k]
-                gram[j, used] = total
-                for k in range(used):
-                    gram[j, k] = products[j, k]
-            _predict(difference, gram, weights, used)
-        else:
-            history = 0
-            used = 0
         last_length = length
-        last_mapped[:] = mapped
-        last_difference[:] = difference
-        for j in range(used):
-            for k in range(size):
-                mapped[k] -= weights[j] * mapped_steps[j, k]
-        for f in range(count):
-            for c in range(3):
-                positions[free[f], c] = mapped[3 * f + c]
+        history += 1
+        if history > 0 and i < max_rounds - 1:
+            _extrapolate(memory, (history - 1) % HISTORY, min(history, HISTORY), last, now)
+        else:
+            last[:] = now
+        _move_free(positions, free, now[0])
     return max_rounds, largest
