@@ -30,30 +30,23 @@ Row i of the system is row `rows[i]` of the factors, and its solution is entry `
 Handles = tuple[Sparse, Sparse, Floats, float]
 """Weights of the nodes [H,n] and of the columns of their rotations [H,3n], targets [H,3], and stiffness."""
 Memory = tuple[Floats, Floats, Floats]
-"""Steps of the rounds' results and of their differences [H,3f], products of the latter [H,H], H = `HISTORY`."""
+"""Steps of the rounds' results [h,3f] and of their differences [h,3f], products of the latter [h,h]."""
 
 HISTORY = 6
 """Rounds that predict the next one."""
 _ROTATION_STEPS = 8  # largest number of Newton steps of a rotation
-_ROTATION_TOLERANCE = 1e-20  # squared angle, radians²; smaller steps end the iteration
+_ROTATION_TOLERANCE = 1e-10  # squared angle, radians²; the error after such a step is its square
 _GROWTH_LIMIT = 2.0  # factor by which the difference may grow before the history starts anew
 _RIDGE = 1e-10  # share of the squared differences that keeps the prediction's system regular
 
 
 @kernel(inline=True)
 def _rotate(rotation: Floats, x: float, y: float, z: float) -> None:
-    """Multiply a rotation [3,3] in place by a rotation vector, from the left."""
-    angle = math.sqrt(x * x + y * y + z * z)
-    half = 0.5 * angle
-    factor = 0.5
-    if half > 1e-6:
-        factor = math.sin(half) / angle
-    w = math.cos(half)
-    length = math.sqrt(w * w + factor * factor * angle * angle)
-    w /= length
-    x *= factor / length
-    y *= factor / length
-    z *= factor / length
+    """Multiply a rotation [3,3] in place by a small rotation vector, exact to second order, from the left."""
+    w = 1.0 / math.sqrt(1.0 + 0.25 * (x * x + y * y + z * z))
+    x *= 0.5 * w
+    y *= 0.5 * w
+    z *= 0.5 * w
     for c in range(3):
         a = rotation[0, c]
         b = rotation[1, c]
