@@ -34,7 +34,7 @@ Memory = tuple[Floats, Floats, Floats]
 
 HISTORY = 6
 """Rounds that predict the next one."""
-_ROTATION_STEPS = 8  # largest number of Newton steps of a rotation
+_ROTATION_STEPS = 40  # largest number of Newton steps of a rotation
 _ROTATION_TOLERANCE = 1e-10  # squared angle, radians²; the error after such a step is its square
 _GROWTH_LIMIT = 2.0  # factor by which the difference may grow before the history starts anew
 _RIDGE = 1e-10  # share of the squared differences that keeps the prediction's system regular
