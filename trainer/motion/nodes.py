@@ -38,7 +38,6 @@ Floats = NDArray[np.float64]
 
 MAX_SEARCH_NODES = 300
 """Largest number of nodes of a search."""
-_ROTATION_STEPS = 4  # iterations of the rotations after a step, warm-started
 _GRADIENT_PRIOR = 0.05  # weight of the rotation in a node's map, as a share of its edges' squares
 _STILL_SQUARE = 1e-5  # squared way, in node spacings, at which a node loses half its tether
 _MAX_GROWTH = math.log(MAX_STRETCH)
@@ -202,7 +201,7 @@ def settle_turns(nodes: RegionNodes, motion: NodeMotion) -> NodeMotion:
     """Return the motion with the rotations that fit its positions best, continued from its own."""
     products = nodes.products(motion.positions).detach().cpu().double().numpy()
     start = rotation_matrices(turn_quats(motion.turn)).cpu().double().numpy()
-    rotations = torch.from_numpy(nearest_rotations(products, start, _ROTATION_STEPS))
+    rotations = torch.from_numpy(nearest_rotations(products, start))
     return NodeMotion(motion.positions, matrix_turns(rotations).to(motion.positions))
 
 
