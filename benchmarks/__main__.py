@@ -34,6 +34,7 @@ BENCHES: dict[str, str] = {
     "hard": "benchmarks.rasterizer:hard_tables",
     "field": "benchmarks.field:tables",
     "order": "benchmarks.layers.paint_order:tables",
+    "gains": "benchmarks.layers.gains:tables",
     "pull": "benchmarks.layers.pull:tables",
     "edits": "benchmarks.edits:tables",
     "networks": "benchmarks.networks:tables",
@@ -54,7 +55,7 @@ BENCHES: dict[str, str] = {
 }
 
 PAGE = (
-    *("training", "field", "order", "pull", "viewer", "rasterize"),
+    *("training", "field", "order", "gains", "pull", "viewer", "rasterize"),
     *("warp", "moving", "popping", "painting", "frames", "hard"),
 )
 """Benchmarks of docs/speed-and-error.md."""
