@@ -136,11 +136,7 @@ class Composer:
     """
 
     def __init__(
-        self,
-        scene: Gaussians,
-        gdfs: Sequence[Gdf],
-        covers: Coverage = coverage,
-        split: Split = color_split,
+        self, scene: Gaussians, gdfs: Sequence[Gdf], covers: Coverage = coverage, split: Split = color_split
     ) -> None:
         scene, extended = extend(scene, gdfs)
         self._scene = scene
@@ -151,11 +147,10 @@ class Composer:
         self._split = split
         self._splits: dict[int, ColorSplit | None] = {}
         self._color_bases: dict[tuple[int, str], _Bases] = {}
-        self._repainted: frozenset[int] = frozenset()  # edits whose discs have other colors than trained
+        self._repainted = frozenset[int]()  # edits whose discs have other colors than trained
         self._members = [gdf.region.members.numpy() for gdf in extended]
-        self._bases = [
-            {name: _Bases.of(bases) for name, bases in gdf.field.attributes.items()} for gdf in extended
-        ]
+        fields = [gdf.field.attributes for gdf in extended]
+        self._bases = [{name: _Bases.of(bases) for name, bases in field.items()} for field in fields]
         self._leaves_paint = [gdf.anchors is not None and gdf.anchors.leaves_paint for gdf in extended]
         moving = {name for bases in self._bases for name in bases}
         self._covers = covers
@@ -171,8 +166,7 @@ class Composer:
         if paint is not None:
             self._paint = PaintOrder(scene, extended, paint, known, Composer)
             moving.update(ARRANGED)
-        if any(gdf.paints for gdf in extended):
-            moving.add("sh0")  # gains change the colors of discs
+        moving.update("sh0" for gdf in extended if gdf.paints)  # gains change the colors of discs
         before = {name: getattr(scene, name).detach().float() for name in ATTRIBUTES if name in moving}
         after: dict[str, Any] = {name: values.clone() for name, values in before.items()}
         self.gaussians = replace(scene, **after)
@@ -429,14 +423,9 @@ class Composer:
         hidden: np.float32,
         covered: Floats,
     ) -> None:
-        """Add a layer's offsets of one attribute and their color part; hide the layers below.
+        """Add a layer's offsets of one attribute, and their color part, to the sums.
 
-        Args:
-            total: sums so far, updated in place. [U,c]
-            part: the layer's members
-            name: attribute
-            gains: see `color_factors`
-            hidden, covered: see `add_offsets`
+        `gains`: see `color_factors`; the other arguments are those of `add_offsets`.
         """
         bases = [self._bases[part.edit][name], self._color_part(part.edit, name) if gains[1] else None]
         for each, gain in zip(bases, gains, strict=True):
@@ -452,11 +441,10 @@ class Composer:
     def _color_part(self, edit: int, name: str) -> _Bases | None:
         """Return the bases of an edit's color apart from its texture; None if this attribute has none."""
         split = self._splits.get(edit)
-        if split is None or split.color is None or name not in split.color.attributes:
-            return None
-        if (edit, name) not in self._color_bases:
-            self._color_bases[edit, name] = _Bases.of(split.color.attributes[name])
-        return self._color_bases[edit, name]
+        parts = {} if split is None or split.color is None else split.color.attributes
+        if name in parts and (edit, name) not in self._color_bases:
+            self._color_bases[edit, name] = _Bases.of(parts[name])
+        return self._color_bases.get((edit, name))
 
     def _add_pushes(
         self, total: Floats, parts: Sequence[_LayerSlice], name: str, weight_sum: Floats, kept: Floats

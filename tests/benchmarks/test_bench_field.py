@@ -11,6 +11,7 @@ from PIL import Image
 
 from benchmarks import field, training
 from benchmarks.field import InOklab
+from benchmarks.layers import gains
 from benchmarks.training import Point, TimedEdit, TrainingTask, save_plot, table, tasks
 from progdf.color.oklab import srgb_to_oklab
 from progdf.sh import C0
@@ -109,3 +110,11 @@ def test_plot_places_points_by_error(tmp_path: Path) -> None:
 
     assert height(50.0) < height(20.0)
     assert (tmp_path / "two.png").stat().st_size < 40_000
+
+
+def test_gains_benchmark_reports_time_and_difference(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gains, "COUNTS", (40,))
+    monkeypatch.setattr(gains, "STEPS", 4)
+    (result,) = gains.tables()
+    assert [row[1] for row in result.rows] == ["colors", "colors and SH bands to degree 2"]
+    assert all(float(row[2]) > 0.0 and float(row[-1]) <= 1e-6 for row in result.rows)
