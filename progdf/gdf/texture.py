@@ -192,7 +192,8 @@ def fit_map(inputs: Tensor, change: Tensor, weights: Tensor) -> Tensor:
     weighted = inputs.double() * weights
     normal = weighted @ inputs.double().T
     inverse = torch.linalg.pinv(normal, rtol=_RANK_TOLERANCE, hermitian=True)
-    return (inverse @ (weighted @ change.double())).float()
+    coefficients: Tensor = inverse @ (weighted @ change.double())
+    return coefficients.float()
 
 
 def _visible_areas(scene: Gaussians, rows: Tensor) -> Tensor:

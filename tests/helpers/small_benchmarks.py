@@ -10,9 +10,10 @@ from pathlib import Path
 import pytest
 
 from benchmarks import edits as run_edits
-from benchmarks import field, rasterizer, sliders, table, training, warps
+from benchmarks import field, rasterizer, sliders, table, training
 from benchmarks.ablation import regret, setup
 from benchmarks.analytic_edits import column_warps
+from benchmarks.motion import warps
 from benchmarks.rasterizer import RasterCase
 from benchmarks.viewer import frames, moving, popping, scenes, slider, window
 from benchmarks.viewer.slider import SliderCase

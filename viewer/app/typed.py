@@ -196,7 +196,7 @@ def value_of(gizmo: Gizmo, typed: TypedTransform, sight: Sight) -> list[float]:
         return offsets
     pivot = np.array(gizmo.center) + pivot_of(gizmo, typed.start)
     if typed.does == "move":
-        return _offset(typed, pivot, sight).tolist()
+        return [float(value) for value in _offset(typed, pivot, sight)]
     if not _is_in_front(pivot, sight.camera):
         return [0.0 if typed.does == "rotate" else 1.0]
     middle = _project(pivot, sight.camera)
@@ -220,8 +220,8 @@ def apply(gizmo: Gizmo, typed: TypedTransform, values: list[float], camera: Came
         step[:3, 3] = values
         return step @ typed.start
     if typed.does == "rotate":
-        axis = _unit(typed.axes) if typed.axes else _view_axis(camera)
-        step[:3, :3] = _rotation(axis, values[0])
+        direction = _unit(typed.axes) if typed.axes else _view_axis(camera)
+        step[:3, :3] = _rotation(direction, values[0])
     else:
         factor = values[0]
         if abs(factor) < MIN_STRETCH:
