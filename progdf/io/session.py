@@ -141,10 +141,24 @@ def read_session(path: str | os.PathLike[str], kind: type[File]) -> File:
         raise ProgdfError(
             f"{name} is a session of version {version!r:.40}; this progdf reads {VERSION}, update it"
         )
+    _add_texture_gains(table)
     try:
         return convert_json(table, kind, closed=True)
     except ValueError as error:
         raise ProgdfError(f"{name} is a damaged session ({error}); save it again or update progdf") from None
+
+
+def _add_texture_gains(value: object) -> None:
+    """Add the gain of texture to layers saved before it existed; their gain of color covered both."""
+    if isinstance(value, list):
+        for item in value:
+            _add_texture_gains(item)
+    if isinstance(value, dict):
+        gains = value.get("gains")
+        if isinstance(gains, dict) and "color" in gains:
+            gains.setdefault("texture", gains["color"])
+        for item in value.values():
+            _add_texture_gains(item)
 
 
 def verify_files(path: Path, session: SessionFile) -> tuple[Path, tuple[Path, ...]]:

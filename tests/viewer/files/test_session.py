@@ -98,6 +98,16 @@ def test_session_older_than_groups_opens_without_groups(saved: Path) -> None:
     )
 
 
+def test_session_older_than_the_gain_of_texture_looks_the_same(saved: Path) -> None:
+    table = json.loads(saved.read_text())
+    for layer in table["view"]["layers"]:
+        del layer["gains"]["texture"]
+        layer["gains"]["color"] = 0.25
+    saved.write_text(json.dumps(table))
+    layers = session.open_session(saved).view.layers
+    assert [layer.gains.texture for layer in layers] == [0.25] * len(layers)
+
+
 def test_session_older_than_selections_opens_without_a_selection(saved: Path) -> None:
     table = json.loads(saved.read_text())
     for state in (table["view"], *(kept["edit"] for kept in table["snapshots"])):
