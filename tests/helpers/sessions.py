@@ -40,7 +40,7 @@ def full_view() -> ViewState:
     view = replace(view, layers=layers, camera=camera, blend="over", compare=compare, timeline=film)
     groups = (LayerGroup("warm", strength=0.5),)
     pair = SnapshotPair("original", "1")
-    return replace(view, groups=groups, collapsed=("warm",), cards="compact", pair=pair)
+    return replace(view, groups=groups, collapsed=("warm",), cards="compact", pair=pair, unit=2.5)
 
 
 def bear_files(folder: Path) -> Path:

@@ -13,7 +13,8 @@ from benchmarks import edits as run_edits
 from benchmarks import field, rasterizer, sliders, table, training
 from benchmarks.ablation import regret, setup
 from benchmarks.analytic_edits import column_warps
-from benchmarks.motion import warps
+from benchmarks.motion import pulled, warps
+from benchmarks.motion.pulled import PullCase
 from benchmarks.rasterizer import RasterCase
 from benchmarks.viewer import frames, moving, popping, scenes, slider, window
 from benchmarks.viewer.slider import SliderCase
@@ -74,6 +75,12 @@ def _shrink_training(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(warps, "_STYLE", "tint:#c08040")
     patch.setattr(warps, "GROUP_STEPS", 10)
     patch.setattr(warps, "column_warps", lambda *given: dict([*column_warps(*given).items()][:1]))
+    patch.setattr(pulled, "STEPS", 32)
+    patch.setattr(pulled, "VIEWS", 5)
+    patch.setattr(pulled, "SIZE", 48)
+    patch.setattr(pulled, "_BEAR_GAUSSIANS", 700)
+    for cases in ("bear_pulls", "_scene_pulls"):
+        patch.setattr(pulled, cases, _first_of(getattr(pulled, cases)))
     patch.setattr(regret, "STAGES", (2,))
     patch.setattr(regret, "STEPS", (2, 3))
     patch.setattr(regret, "BANDS", (0, 1))
@@ -97,6 +104,11 @@ _tasks = training.tasks
 def _last_task(folder: Path, scenes: Sequence[Path] = ()) -> list[training.TrainingTask]:
     """Return the task of the last given scene, or that of the bear if there is none."""
     return _tasks(folder, scenes[-1:])[-1:]
+
+
+def _first_of(cases: Callable[..., list[PullCase]]) -> Callable[..., list[PullCase]]:
+    """Return the function limited to its first case."""
+    return lambda *given: cases(*given)[:1]
 
 
 def _shrink_viewer(patch: pytest.MonkeyPatch) -> None:
