@@ -56,7 +56,7 @@ BENCHES: dict[str, str] = {
 
 PAGE = (
     *("training", "field", "order", "gains", "pull", "viewer", "rasterize"),
-    *("warp", "moving", "popping", "painting", "frames", "hard"),
+    *("warp", "moving", "popping", "painting", "dragging", "frames", "hard"),
 )
 """Benchmarks of docs/speed-and-error.md."""
 

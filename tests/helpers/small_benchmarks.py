@@ -16,7 +16,7 @@ from benchmarks.analytic_edits import column_warps
 from benchmarks.motion import pulled, warps
 from benchmarks.motion.pulled import PullCase
 from benchmarks.rasterizer import RasterCase
-from benchmarks.viewer import frames, moving, popping, scenes, slider, window
+from benchmarks.viewer import dragging, frames, moving, popping, scenes, slider, window
 from benchmarks.viewer.slider import SliderCase
 from benchmarks.viewer.training import begin_training
 from progdf.field import NeuralSettings
@@ -119,6 +119,10 @@ def _shrink_viewer(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(frames, "measure_starts", _measure_one_start(frames.measure_starts))
     patch.setattr(moving, "MILLION", 600)
     patch.setattr(frames, "MAX_COPIED", 0)
+    patch.setattr(dragging, "MEMBERS", (200,))
+    patch.setattr(dragging, "EVENTS", 2)
+    patch.setattr(dragging, "WARM_UP", 1)
+    patch.setattr(dragging, "SIZE", PICTURE)
     patch.setattr(moving, "TRAINED", 600)
     patch.setattr(moving, "begin_training", lambda scene: begin_training(scene, *SMALL_TRAINING))
     patch.setattr(moving, "_SETTLE_S", 0.05)
