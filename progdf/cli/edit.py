@@ -153,8 +153,8 @@ def _read_steps(options: EditOptions) -> list[Callable[[Gaussians], Step]]:
         ProgdfError: the numbers of an option are invalid, or a region is invalid for any scene.
     """
     forms: tuple[tuple[str, str, Callable[[str], AffineMotion | None]], ...] = (
-        ("mirror", "AXIS", _parse_mirror),
-        ("scale", "FACTOR", _parse_scale),
+        ("mirror", "X, REGION:Y or REGION:Z", _parse_mirror),
+        ("scale", f"FACTOR or REGION:FX,FY,FZ, {1 / MAX_SCALE:g} to {MAX_SCALE:g}", _parse_scale),
         ("rotate", "AXIS,DEGREES", _parse_rotation),
         ("move", "DX,DY,DZ", _parse_shift),
         ("duplicate", "DX,DY,DZ", _parse_shift),
@@ -165,8 +165,9 @@ def _read_steps(options: EditOptions) -> list[Callable[[Gaussians], Step]]:
             spec, _, numbers = text.rpartition(":")
             motion = read(numbers)
             if motion is None or not spec:
+                ending = "axis" if name == "mirror" else "numbers"
                 raise ProgdfError(
-                    f"'{shorten(text)}' has no usable numbers at its end; write --{name} REGION:{form}"
+                    f"'{shorten(text)}' has no usable {ending} at its end; write --{name} REGION:{form}"
                 )
             step_makers.append(_maker("duplicate" if name == "duplicate" else "transform", spec, motion))
     step_makers += [_maker("remove", spec, None) for spec in options.delete]

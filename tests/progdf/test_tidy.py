@@ -359,3 +359,21 @@ def test_unsuitable_output_name_is_refused(
     monkeypatch.chdir(tmp_path)
     assert main(["edit", str(ply), *options]) == 2
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "forms"),
+    [
+        ("--mirror", "all:w", "write --mirror REGION:X, REGION:Y or REGION:Z"),
+        ("--scale", "all:1,2", "write --scale REGION:FACTOR or REGION:FX,FY,FZ, 0.001 to 1000"),
+        ("--scale", "all:-1", "write --scale REGION:FACTOR or REGION:FX,FY,FZ, 0.001 to 1000"),
+    ],
+)
+def test_refused_transform_names_every_valid_form(
+    option: str, value: str, forms: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_ply(tmp_path / "scene.ply", random_gaussians(20))
+    arguments = ["edit", str(tmp_path / "scene.ply"), option, value, "-o", str(tmp_path / "out.ply")]
+    assert main(arguments) == 2
+    assert capsys.readouterr().err.strip().endswith(forms)
+    assert not (tmp_path / "out.ply").exists()
