@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import progdf
-from progdf.__main__ import COMMANDS, main
+from progdf.__main__ import COMMANDS, main, wait_passively
 from progdf.errors import ProgdfError
 from progdf.formats.ply import save_ply
 from progdf.io.atomic import atomic_write
@@ -322,3 +322,27 @@ def test_closed_full_or_ascii_streams_do_not_crash_a_command(shell: str, status:
     assert ran.returncode == status, ran
     assert b"Traceback" not in ran.stderr
     assert ran.stderr.count(b"\n") <= 1
+
+
+def test_idle_threads_sleep_unless_the_user_chose() -> None:
+    unset = dict[str, str]()
+    wait_passively(unset)
+    assert unset == {"OMP_WAIT_POLICY": "PASSIVE"}
+    for chosen in ({"OMP_WAIT_POLICY": "active"}, {"GOMP_SPINCOUNT": "100"}, {"KMP_BLOCKTIME": "200"}):
+        kept = dict(chosen)
+        wait_passively(kept)
+        assert kept == chosen
+
+
+def test_program_sets_the_wait_policy_before_torch_is_imported() -> None:
+    program = (
+        "import os, sys, progdf.__main__ as program\n"
+        "sys.argv = ['progdf', '--version']\n"
+        "program.main()\n"
+        "print(os.environ['OMP_WAIT_POLICY'], 'torch' in sys.modules)"
+    )
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    result = subprocess.run(
+        [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True
+    )
+    assert result.stdout.splitlines()[-1] == "PASSIVE False"
