@@ -35,7 +35,7 @@ BENCHES: dict[str, str] = {
     "field": "benchmarks.field:tables",
     "order": "benchmarks.layers.paint_order:tables",
     "gains": "benchmarks.layers.gains:tables",
-    "pull": "benchmarks.layers.pull:tables",
+    "pull-stages": "benchmarks.layers.pull_stages:tables",
     "edits": "benchmarks.edits:tables",
     "networks": "benchmarks.networks:tables",
     "viewer": "benchmarks.viewer.slider:tables",
@@ -45,18 +45,18 @@ BENCHES: dict[str, str] = {
     "moving": "benchmarks.viewer.moving:tables",
     "popping": "benchmarks.viewer.popping:tables",
     "painting": "benchmarks.viewer.painting:tables",
-    "dragging": "benchmarks.viewer.dragging:tables",
+    "pull-response": "benchmarks.viewer.pull_response:tables",
     "window": "benchmarks.viewer.window:tables",
     "warps": "benchmarks.motion.warps:tables",
-    "pulled": "benchmarks.motion.pulled:tables",
+    "trained-motion": "benchmarks.motion.trained_motion:tables",
     "pictures": "benchmarks.pictures:tables",
     "spill": "benchmarks.spill:tables",
     "recolors": "benchmarks.colors.recolors:tables",
 }
 
 PAGE = (
-    *("training", "field", "order", "gains", "pull", "viewer", "rasterize"),
-    *("warp", "moving", "popping", "painting", "dragging", "frames", "hard"),
+    *("training", "field", "order", "gains", "pull-stages", "viewer", "rasterize"),
+    *("warp", "moving", "popping", "painting", "pull-response", "frames", "hard"),
 )
 """Benchmarks of docs/speed-and-error.md."""
 
@@ -120,10 +120,10 @@ def main(argv: Sequence[str]) -> int:
         "moving",
         "popping",
         "painting",
-        "dragging",
+        "pull-response",
         "window",
         "warps",
-        "pulled",
+        "trained-motion",
         "pictures",
         "spill",
         "recolors",

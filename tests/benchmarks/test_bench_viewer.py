@@ -14,8 +14,8 @@ import torch
 
 from benchmarks import __main__ as front
 from benchmarks.table import Table
-from benchmarks.viewer import dragging, moving, painting, popping, subject
 from benchmarks.viewer import frames as bench_frames
+from benchmarks.viewer import moving, painting, popping, pull_response, subject
 from benchmarks.viewer import slider as bench
 from benchmarks.viewer import window as bench_window
 from benchmarks.viewer.display import missing_tools
@@ -317,10 +317,10 @@ def test_painting_benchmark_measures_a_stroke(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.gl
 def test_dragging_benchmark_measures_a_pull(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dragging, "EVENTS", 3)
-    monkeypatch.setattr(dragging, "WARM_UP", 1)
+    monkeypatch.setattr(pull_response, "EVENTS", 3)
+    monkeypatch.setattr(pull_response, "WARM_UP", 1)
     ctx = headless_context()
-    times = dragging.measure(ctx, bear(600).gaussians, 300, SIZE)
+    times = pull_response.measure(ctx, bear(600).gaussians, 300, SIZE)
     ctx.release()
     assert 0 < times.members <= 300
     assert (len(times.events), len(times.steps), len(times.draw)) == (3, 3, 3)

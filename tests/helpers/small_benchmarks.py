@@ -13,10 +13,10 @@ from benchmarks import edits as run_edits
 from benchmarks import field, rasterizer, sliders, table, training
 from benchmarks.ablation import regret, setup
 from benchmarks.analytic_edits import column_warps
-from benchmarks.motion import pulled, warps
-from benchmarks.motion.pulled import PullCase
+from benchmarks.motion import trained_motion, warps
+from benchmarks.motion.trained_motion import PullCase
 from benchmarks.rasterizer import RasterCase
-from benchmarks.viewer import dragging, frames, moving, popping, scenes, slider, window
+from benchmarks.viewer import frames, moving, popping, pull_response, scenes, slider, window
 from benchmarks.viewer.slider import SliderCase
 from benchmarks.viewer.training import begin_training
 from progdf.field import NeuralSettings
@@ -75,12 +75,12 @@ def _shrink_training(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(warps, "_STYLE", "tint:#c08040")
     patch.setattr(warps, "GROUP_STEPS", 10)
     patch.setattr(warps, "column_warps", lambda *given: dict([*column_warps(*given).items()][:1]))
-    patch.setattr(pulled, "STEPS", 32)
-    patch.setattr(pulled, "VIEWS", 5)
-    patch.setattr(pulled, "SIZE", 48)
-    patch.setattr(pulled, "_BEAR_GAUSSIANS", 700)
+    patch.setattr(trained_motion, "STEPS", 32)
+    patch.setattr(trained_motion, "VIEWS", 5)
+    patch.setattr(trained_motion, "SIZE", 48)
+    patch.setattr(trained_motion, "_BEAR_GAUSSIANS", 700)
     for cases in ("bear_pulls", "_scene_pulls"):
-        patch.setattr(pulled, cases, _first_of(getattr(pulled, cases)))
+        patch.setattr(trained_motion, cases, _first_of(getattr(trained_motion, cases)))
     patch.setattr(regret, "STAGES", (2,))
     patch.setattr(regret, "STEPS", (2, 3))
     patch.setattr(regret, "BANDS", (0, 1))
@@ -119,10 +119,10 @@ def _shrink_viewer(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(frames, "measure_starts", _measure_one_start(frames.measure_starts))
     patch.setattr(moving, "MILLION", 600)
     patch.setattr(frames, "MAX_COPIED", 0)
-    patch.setattr(dragging, "MEMBERS", (200,))
-    patch.setattr(dragging, "EVENTS", 2)
-    patch.setattr(dragging, "WARM_UP", 1)
-    patch.setattr(dragging, "SIZE", PICTURE)
+    patch.setattr(pull_response, "MEMBERS", (200,))
+    patch.setattr(pull_response, "EVENTS", 2)
+    patch.setattr(pull_response, "WARM_UP", 1)
+    patch.setattr(pull_response, "SIZE", PICTURE)
     patch.setattr(moving, "TRAINED", 600)
     patch.setattr(moving, "begin_training", lambda scene: begin_training(scene, *SMALL_TRAINING))
     patch.setattr(moving, "_SETTLE_S", 0.05)

@@ -1,9 +1,9 @@
-"""The benchmark `pulled`: edited pictures in which a part moves smoothly, with the truth at every strength.
+"""The benchmark `trained-motion`: edits of parts that move smoothly, with the truth at every strength.
 
 Points of a scene are pulled (`progdf.pull`), and pictures of the end are the edited views of a full run with
 the editor folder. Held-out views compare the slider at 0.5 and 1 with the pull's own course.
 
-    python -m benchmarks pulled --scenes playbot_31k.ply plant.ply
+    python -m benchmarks trained-motion --scenes playbot_31k.ply plant.ply
 
 The playbot needs playbot_31k_labels.npy beside it. Its pulls are skipped without it.
 """
@@ -85,7 +85,11 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
         "steps. moved by: the motion that the run chose; seconds: processor time of the run."
     )
     columns = ("pull", "members", "unedited", "end", "half", "nearest", "moved by", "seconds")
-    return [Table("pulled", "Parts that move smoothly", columns, tuple(_row(case) for case in cases), note)]
+    return [
+        Table(
+            "trained-motion", "Parts that move smoothly", columns, tuple(_row(case) for case in cases), note
+        )
+    ]
 
 
 def bear_pulls() -> list[PullCase]:

@@ -1,8 +1,8 @@
-"""The benchmark `dragging`: response times of the Pull tool.
+"""The benchmark `pull-response`: response times of the Pull tool.
 
 It times whole frames of a whole window, drawn by the CPU, from the mouse's event to finished pixels.
 
-    python -m benchmarks dragging
+    python -m benchmarks pull-response
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
         "The largest scene has several copies of the one before."
     )
     title = f"The Pull tool without a graphics card, {SIZE[0]}×{SIZE[1]}, ms"
-    return [Table("dragging", title, columns, rows, note)]
+    return [Table("pull-response", title, columns, rows, note)]
 
 
 @one_thread()

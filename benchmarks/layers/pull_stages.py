@@ -1,8 +1,8 @@
-"""The benchmark `pull`: time of each stage of a pull, by number of Gaussians and nodes.
+"""The benchmark `pull-stages`: time of each stage of a pull, by number of Gaussians and nodes.
 
 A tube of small Gaussians is held at one end and bent by a handle at the other.
 
-    python -m benchmarks pull
+    python -m benchmarks pull-stages
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def tables(scenes: Sequence[Path] = (), plot: Path | None = None) -> list[Table]
     )
     return [
         Table(
-            "pull",
+            "pull-stages",
             "Stages of a pull",
             columns,
             tuple(_measure(count, nodes) for count, nodes in CASES),
