@@ -29,11 +29,15 @@ from progdf.gdf.anchors import free_anchors
 from progdf.gdf.file import ADDED_LOGIT, Gdf, anchor_added, fingerprint
 from progdf.pull.course import PullCourse
 from progdf.region import Region, from_mask
+from progdf.scene.bounds import scene_sphere
 from progdf.similarity import GEOMETRY, AffineMotion, continue_axes, transform_rows
 
-# Rotation (radians) or log-scale between two knots. The chord of such an arc deviates by 1/500 of its radius,
-# or 0.5 pixels for an object of 512 pixels.
 _KNOT_SPACING = 1 / 8
+"""Largest rotation (radians) or log-stretch between two knots, for shapes and colors."""
+_PICTURE_PX = 512  # size of the picture that a moved region fills, for the bounds below
+_ARC_ERROR_PX = 0.35  # largest distance of a center from its arc between two knots
+_STORED_ERROR_PX = 0.1  # largest error of a center as stored, at the knots
+_MAX_ARC_SEGMENTS = 256  # maximum number of segments of an arc
 _OPACITY_COLUMN = attribute_slices(14)["logit_opacities"].start
 
 
@@ -131,7 +135,7 @@ def tidy(
     knots = torch.tensor([0.0, 1.0])
     for step in steps:
         if step.does == "transform" and step.motion is not None and not only_end:
-            knots = torch.cat([knots, step.motion.strengths(_KNOT_SPACING)]).unique()  # type: ignore[no-untyped-call]
+            knots = torch.cat([knots, _path_knots(scene, step.region, step.motion)]).unique()  # type: ignore[no-untyped-call]
         if step.course is not None:
             knots = torch.cat([knots, step.course.strengths]).unique()  # type: ignore[no-untyped-call]
     if bool(logits.any()) and not only_end:
@@ -145,13 +149,47 @@ def tidy(
         offsets[1:, : len(members), GEOMETRY] = (shapes - rows[:, GEOMETRY])[1:].float()
     for i, s in enumerate(knots.tolist()):
         offsets[i, :, _OPACITY_COLUMN] = interpolate_at(opacity_knots, logits, s)
-    field = fit_keyframes(knots, offsets, 2) if only_end else course_field(knots, offsets)
+    if only_end:
+        field = fit_keyframes(knots, offsets, 2)
+    else:
+        field = course_field(knots, offsets, _stored_tolerance(scene, steps))
     adds = all(_adds(step) for step in steps)
     gdf = Gdf(name, region, field, fingerprint(scene), instruction, added=added, adds=adds)
     added_count = 0 if added is None else len(added)
     if fill_count:
         gdf = anchor_added(gdf, scene, free=added_count - fill_count)
     return leave_paint(gdf) if leaves_paint else gdf
+
+
+def _path_knots(scene: Gaussians, region: Region, motion: AffineMotion) -> Tensor:
+    """Return strengths between which chords stay near the arcs of a region's centers. [S]
+
+    The distance is bounded by `_ARC_ERROR_PX` where the region fills the picture: as it is, or as it has
+    grown. The pivot may be far away, which makes the arcs longer.
+    """
+    knots = motion.strengths(_KNOT_SPACING).double()
+    moved = scene[region.members]
+    center, radius = scene_sphere(moved)
+    pivot = moved.means.double().mean(dim=0) if motion.pivot is None else motion.pivot
+    arm = center.double() - pivot
+    matrices = torch.stack([motion.linear(s) for s in knots.tolist()])
+    middles = torch.stack([motion.linear(s) for s in (0.5 * (knots[1:] + knots[:-1])).tolist()])
+    # the pivot moves straight, so a chord misses the arc of the arm x by (½ (A + B) − M) x
+    missed = 0.5 * (matrices[1:] + matrices[:-1]) - middles
+    distance = radius * torch.linalg.matrix_norm(missed, 2) + (missed @ arm).norm(dim=1)
+    growth = torch.linalg.matrix_norm(matrices[1:], 2).clamp_min(1.0)
+    allowed = _ARC_ERROR_PX / _PICTURE_PX * 2.0 * radius * growth
+    finer = float((distance / allowed).max().sqrt())  # the distance falls with the square of the length
+    if finer <= 1.0:
+        return knots.float()
+    return motion.strengths(max(_KNOT_SPACING / finer, motion.size / _MAX_ARC_SEGMENTS))
+
+
+def _stored_tolerance(scene: Gaussians, steps: Sequence[Step]) -> float:
+    """Return the largest error of a stored center, world units, for the smallest region that moves."""
+    regions = [step.region for step in steps if step.motion is not None or step.course is not None]
+    radii = [scene_sphere(scene[region.members])[1] for region in regions if len(region)]
+    return _STORED_ERROR_PX / _PICTURE_PX * 2.0 * min(radii, default=math.inf)
 
 
 def leave_paint(gdf: Gdf) -> Gdf:

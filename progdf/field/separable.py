@@ -13,6 +13,7 @@ baseline, interpolates linearly between snapshots; with all snapshots it equals 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -140,7 +141,10 @@ def principal_modes(gram: Tensor) -> Tensor:
 
 
 def store_attribute(
-    trajectory: AttributeTrajectory, mix: Tensor, basis_type: torch.dtype = torch.int8
+    trajectory: AttributeTrajectory,
+    mix: Tensor,
+    basis_type: torch.dtype = torch.int8,
+    dtype: torch.dtype = torch.float32,
 ) -> AttributeBases:
     """Return the bases in stored form, with coefficients solved for the stored bases.
 
@@ -148,12 +152,14 @@ def store_attribute(
         trajectory: trajectory of the attribute
         mix: weights of the residual's rows in each basis. [T,R]
         basis_type: int8, float16 or float32
+        dtype: precision of the sums for the coefficients
     """
     full = trajectory.offsets[-1].clone()  # a view would keep all rows
     end, unit = trajectory.end or (full[None], torch.ones(1, full.shape[1]))
     exact = (mix.T.float() @ trajectory.residual.flatten(1)).reshape(-1, *full.shape)
     levels, step = quantize_bases(exact, basis_type)
-    table = solve_coefficients(trajectory.offsets, full, decode_bases(levels, step), trajectory.weights)
+    decoded = decode_bases(levels, step)
+    table = solve_coefficients(trajectory.offsets, full, decoded, trajectory.weights, dtype)
     return AttributeBases(end[0], levels, torch.cat([unit, step]), table)
 
 
@@ -179,7 +185,13 @@ def fit_bands(tensor: Tensor, width: int) -> Tensor:
     return torch.nn.functional.pad(tensor[..., :width], (0, max(0, width - tensor.shape[-1])))
 
 
-def solve_coefficients(offsets: Tensor, full: Tensor, residual_basis: Tensor, weights: Tensor) -> Tensor:
+def solve_coefficients(
+    offsets: Tensor,
+    full: Tensor,
+    residual_basis: Tensor,
+    weights: Tensor,
+    dtype: torch.dtype = torch.float32,
+) -> Tensor:
     """Solve least squares for a_0 … a_R at every snapshot. Both ends are fixed. [T,1+R] float32
 
     Args:
@@ -187,8 +199,9 @@ def solve_coefficients(offsets: Tensor, full: Tensor, residual_basis: Tensor, we
         full: basis 0. [M,c]
         residual_basis: bases 1..R, decoded. [R,M,c]
         weights: visibility of an error in each number. [M,c]
+        dtype: precision of the sums; float64 where a region travels many times its own size
     """
-    root = weights.sqrt().flatten()
+    root = weights.sqrt().flatten().to(dtype)
     columns = torch.cat([full[None], residual_basis]).flatten(1) * root
     scale = columns.norm(dim=1).clamp(min=1e-30)
     columns = columns / scale[:, None]
@@ -246,19 +259,23 @@ def _fit_attribute(offsets: Tensor, weights: Tensor, rank: int, basis_type: torc
 _TRAJECTORY_TOLERANCE = 0.001  # RMS error of the factoring, as a share of the trajectory's own RMS
 _MAX_TRAJECTORY_RANK = 8
 _COURSE_BASIS_TYPES = {"means": torch.float16, "log_scales": torch.float16, "quats": torch.float16}
-"""Storage types of a course's bases; others are int8, of which a step is half a pixel where a thing turns."""
+"""Storage types of a course's bases; others are int8, of which a step is half a pixel where a thing turns.
+Centers take float32 where float16 exceeds their tolerance."""
 _RISE = torch.tensor((0.0, 0.002, 0.005, 0.01, 0.02, 0.04, 0.07, 0.11, 0.17, 0.25, 0.35), dtype=torch.float64)
 """Strengths at which a logit bends most if opacity rises from 0. Mirrored for an opacity that falls to 0."""
 OPACITY_KNOTS = torch.cat([_RISE, torch.tensor([0.5], dtype=torch.float64), 1.0 - _RISE.flip(0)])
 """Knots for the logits of opacities that rise from 0 or fall to 0, from 0 to 1. [S] float64"""
 
 
-def course_field(knots: Tensor, offsets: Tensor) -> BakedField:
+def course_field(knots: Tensor, offsets: Tensor, center_tolerance: float = math.inf) -> BakedField:
     """Return the field of a known trajectory. At its last knot it equals the int16 form of the end.
+
+    Centers end in float32 if int16 is coarser than half the tolerance.
 
     Args:
         knots: strengths, ascending from 0 to 1. [S]
         offsets: packed offsets, 0 at the first knot. [S,M,C]
+        center_tolerance: largest error of a center at the knots, world units
 
     Raises:
         ValueError: the trajectory is invalid.
@@ -267,14 +284,22 @@ def course_field(knots: Tensor, offsets: Tensor) -> BakedField:
     attributes = {}
     for name, columns in moving_attributes(offsets).items():
         values = offsets[:, :, columns].clone()
-        stored = quantize_bases(values[-1:], torch.int16)
-        values[-1] = decode_bases(*stored)[0]
-        attributes[name] = fit_course(values, stored, _COURSE_BASIS_TYPES.get(name, torch.int8))
+        tolerance = center_tolerance if name == "means" else math.inf
+        levels, step = quantize_bases(values[-1:], torch.int16)
+        decoded = decode_bases(levels, step)[0]
+        stored = None
+        if float((decoded - values[-1]).norm(dim=1).max()) <= 0.5 * tolerance:
+            values[-1] = decoded
+            stored = levels, step
+        attributes[name] = fit_course(values, stored, _COURSE_BASIS_TYPES.get(name, torch.int8), tolerance)
     return BakedField("separable", knots.float(), attributes, offsets.shape[2], ())
 
 
 def fit_course(
-    offsets: Tensor, stored: tuple[Tensor, Tensor] | None = None, basis_type: torch.dtype = torch.int8
+    offsets: Tensor,
+    stored: tuple[Tensor, Tensor] | None = None,
+    basis_type: torch.dtype = torch.int8,
+    tolerance: float = math.inf,
 ) -> AttributeBases:
     """Fit the fewest bases that reproduce an attribute's trajectory with at most 0.1 % RMS error.
 
@@ -282,10 +307,32 @@ def fit_course(
         offsets: offsets at the knots. [S,M,c]
         stored: stored form of the last row, see `quantize_bases`
         basis_type: storage type of bases 1..R: int8, float16 or float32
+        tolerance: largest error of a row at the knots; further bases or float32 are used to keep it
     """
     fitted = fit_amplitude(offsets, torch.ones_like(offsets[0]), stored)
+    modes = principal_modes(fitted.gram)
     rank = min(fitted.needed_rank(_TRAJECTORY_TOLERANCE), _MAX_TRAJECTORY_RANK)
-    return store_attribute(fitted, principal_modes(fitted.gram)[:, :rank], basis_type)
+    bases = store_attribute(fitted, modes[:, :rank], basis_type)
+    if tolerance == math.inf or largest_error(bases, offsets) <= tolerance:
+        return bases
+    ranks = range(rank, 1 + min(modes.shape[1], _MAX_TRAJECTORY_RANK))
+    forms = [(count, kind) for count in ranks for kind in (basis_type, torch.float32)]
+    forms.sort(key=lambda form: form[0] * form[1].itemsize)
+    for count, kind in forms:
+        bases = store_attribute(fitted, modes[:, :count], kind, torch.float64)
+        if largest_error(bases, offsets) <= tolerance:
+            break
+    return bases
+
+
+def largest_error(bases: AttributeBases, offsets: Tensor) -> float:
+    """Return the largest distance of a row from its trajectory at the knots. [S,M,c]"""
+    decoded = torch.cat([bases.end[None], decode_bases(bases.residual_basis, bases.scale[1:])])
+    largest = 0.0
+    for coefficients, expected in zip(bases.coefficients, offsets, strict=True):
+        error = torch.einsum("r,rmc->mc", coefficients, decoded) - expected
+        largest = max(largest, float(error.square().sum(dim=1).max().sqrt()))
+    return largest
 
 
 def opacity_course(start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:

@@ -20,6 +20,7 @@ from progdf.quaternions import rotation_matrices, turn_quats
 from progdf.rasterize import render
 from progdf.rasterize.engines import ALPHA_MIN
 from progdf.region import Region, from_mask, whole_scene
+from progdf.scene.bounds import scene_sphere
 from progdf.similarity import AffineMotion
 from progdf.tidy import Step, bake, similarity, tidy
 from tests.helpers.scenes import front_camera, orbit_camera, random_gaussians
@@ -161,17 +162,36 @@ def test_rotation_follows_an_arc_even_for_a_full_turn() -> None:
     assert torch.allclose(half[:, 0], -(means - center)[:, 0], atol=0.01)
 
 
-@pytest.mark.parametrize("degrees", [90.0, 137.0])
-def test_stored_arc_is_within_half_a_pixel_of_512(degrees: float) -> None:
-    scene = scene_of()
+def turn_by(degrees: float, **fields: object) -> AffineMotion:
+    """Return a turn about the vertical axis; `fields`: further fields of the motion."""
     motion = similarity(turn=(0.0, math.radians(degrees), 0.0))
-    step = Step("transform", whole_scene(scene), motion)
+    return replace(motion, **{name: torch.as_tensor(value).double() for name, value in fields.items()})
+
+
+ARCS = {
+    "90 degrees": turn_by(90.0),
+    "137 degrees": turn_by(137.0),
+    "full turn": turn_by(360.0),
+    "far away": turn_by(90.0, shift=(2000.0, 0.0, 0.0)),
+    "about a far pivot": turn_by(137.0, pivot=(30.0, 0.0, 0.0)),
+    "grown": similarity(turn=(0.0, 1.5, 0.0), scale=8.0),
+    "stretched": turn_by(60.0, stretch=torch.diag(torch.tensor([1.0, 0.0, -0.5]))),
+    "mirrored": replace(turn_by(60.0), mirror=0),
+}
+
+
+@pytest.mark.parametrize("name", ARCS)
+def test_centers_stay_within_half_a_pixel_of_their_arc(name: str) -> None:
+    scene = scene_of()
+    step = Step("transform", whole_scene(scene), ARCS[name])
     gdf = tidy(scene, [step], "turned")
     rows = pack(scene, with_shN=True).double()
-    extent = float((scene.means.amax(dim=0) - scene.means.amin(dim=0)).max())
-    for s in (0.3, 0.5, 0.8):
-        error = at(scene, gdf, s).means - step.move(rows, s)[:, :3]
-        assert float(error.norm(dim=1).max()) < 0.5 * extent / 512
+    extent = 2.0 * scene_sphere(scene)[1]
+    for s in torch.linspace(0.0, 1.0, 83).tolist():
+        centers = step.move(rows, s)[:, :3]
+        size = max(extent, 2.0 * float((centers - centers.mean(dim=0)).norm(dim=1).max()))
+        error = rows[:, :3] + gdf.field.offsets(s)[:, :3] - centers
+        assert float(error.norm(dim=1).max()) < 0.5 * size / 512
 
 
 @pytest.mark.parametrize("blend", ["over", "adjust"])
