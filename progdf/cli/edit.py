@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ from progdf.io.atomic import check_not_an_input
 from progdf.io.json_values import check_text
 from progdf.metrics.image import NO_DIFFERENCE
 from progdf.pull.course import Handle, pull
+from progdf.pull.grips import with_grips
 from progdf.region import union
 from progdf.scene.regions import check_region, parse_region, read_numbers
 from progdf.scene.strays import clean, find_strays, picture_difference
@@ -34,6 +36,7 @@ from .options import absent_option, parse_options
 
 Specs = Annotated[tuple[str, ...], UseAppendAction]
 
+_PULL_FORM = "X,Y,Z,DX,DY,DZ[,FALLOFF][,turn=AXIS,DEGREES][,scale=FACTOR]"
 MAX_DEGREES = 360.0
 MAX_SCALE = 1000.0
 
@@ -63,8 +66,8 @@ class EditOptions:
     """Rotate the region about the mean of its centers; AXIS: x, y, z or a vector; −360 to 360 degrees."""
     move: Annotated[Specs, absent_option("REGION:DX,DY,DZ")] = ()
     """Move the region by an offset in world units."""
-    pull: Annotated[Specs, absent_option("REGION:X,Y,Z,DX,DY,DZ[,FALLOFF]")] = ()
-    """Pull a point of the region; the rest follows rigidly, within a radius FALLOFF or all of it."""
+    pull: Annotated[Specs, absent_option(f"REGION:{_PULL_FORM}")] = ()
+    """Pull, turn or scale the region at a point; the rest follows, within a radius FALLOFF or all of it."""
     hold: Annotated[Specs, absent_option("REGION")] = ()
     """Hold the region in place while others are pulled."""
     duplicate: Annotated[Specs, absent_option("REGION:DX,DY,DZ")] = ()
@@ -174,6 +177,17 @@ def _read_steps(options: EditOptions) -> list[Callable[[Gaussians], Step]]:
     return step_makers
 
 
+@dataclass(frozen=True)
+class _PullNumbers:
+    """Numbers of a pull as written."""
+
+    point: Sequence[float]  # world units. [3]
+    shift: tuple[float, float, float]  # world units
+    falloff: float | None
+    turn: tuple[float, float, float] | None  # axis times angle in radians
+    scale: float
+
+
 def _read_pulls(options: EditOptions) -> Callable[[Gaussians], Step] | None:
     """Return a function that creates the one step of all pulls; None without pulls.
 
@@ -183,11 +197,11 @@ def _read_pulls(options: EditOptions) -> Callable[[Gaussians], Step] | None:
     parsed = []
     for text in options.pull:
         spec, _, typed = text.rpartition(":")
-        numbers = read_numbers(typed)
-        if len(numbers) not in (6, 7) or not spec or not all(number > 0 for number in numbers[6:]):
+        numbers = _parse_pull(typed)
+        if numbers is None or not spec:
             raise ProgdfError(
                 f"'{shorten(text)}' has no usable numbers at its end; "
-                "write --pull REGION:X,Y,Z,DX,DY,DZ[,FALLOFF] with a radius above 0"
+                f"write --pull REGION:{_PULL_FORM} with a radius and a factor above 0"
             )
         parsed.append((spec, numbers))
     for spec in [*(spec for spec, _ in parsed), *options.hold]:
@@ -197,15 +211,41 @@ def _read_pulls(options: EditOptions) -> Callable[[Gaussians], Step] | None:
     return partial(_pull_step, parsed, options.hold) if parsed else None
 
 
-def _pull_step(parsed: Sequence[tuple[str, list[float]]], holds: Sequence[str], scene: Gaussians) -> Step:
+def _parse_pull(text: str) -> _PullNumbers | None:
+    """Return the numbers of a pull; None if they are not usable."""
+    plain, *named = re.split(r",(?=[a-z]+=)", text.strip().lower())
+    options = dict[str, str]()
+    for part in named:
+        name, _, value = part.partition("=")
+        if name not in ("turn", "scale") or name in options:
+            return None
+        options[name] = value
+    numbers = read_numbers(plain)
+    if len(numbers) not in (6, 7) or not all(number > 0.0 for number in numbers[6:]):
+        return None
+    turn: tuple[float, float, float] | None = None
+    if "turn" in options:
+        rotation = _parse_rotation(options["turn"])
+        if rotation is None:
+            return None
+        x, y, z = rotation.turn.tolist()
+        turn = (x, y, z)
+    factors = read_numbers(options.get("scale", "1"))
+    if len(factors) != 1 or factors[0] <= 0.0:
+        return None
+    falloff = numbers[6] if len(numbers) == 7 else None
+    return _PullNumbers(numbers[:3], (numbers[3], numbers[4], numbers[5]), falloff, turn, factors[0])
+
+
+def _pull_step(parsed: Sequence[tuple[str, _PullNumbers]], holds: Sequence[str], scene: Gaussians) -> Step:
     handles = []
     for spec, numbers in parsed:
-        x, y, z = (value - origin for value, origin in zip(numbers[:3], scene.origin, strict=True))
-        shift = (numbers[3], numbers[4], numbers[5])
-        falloff = numbers[6] if len(numbers) > 6 else None
-        handles.append(Handle(parse_region(spec, scene, say=print_line), (x, y, z), shift, falloff))
+        x, y, z = (value - origin for value, origin in zip(numbers.point, scene.origin, strict=True))
+        region = parse_region(spec, scene, say=print_line)
+        handles.append(Handle(region, (x, y, z), numbers.shift, numbers.falloff, numbers.turn, numbers.scale))
     held = [parse_region(spec, scene, say=print_line) for spec in holds]
-    course = pull(scene, handles, reduce(union, held) if held else None)
+    hold = reduce(union, held) if held else None
+    course = pull(scene, with_grips(scene, handles, hold)[0], hold)
     return Step("pull", course.region, course=course)
 
 

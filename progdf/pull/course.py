@@ -53,6 +53,7 @@ class Handle:
     falloff: float | None = None  # radius of the influence, world units; None: all that is connected
     turn: Point | None = None  # axis times angle in radians, below 2π; None: the surface rotates freely
     scale: float = 1.0  # above 0; other than 1 without a turn: the surface does not rotate
+    follows: int | None = None  # index of a handle that this point shifts, turns and scales with
 
     @property
     def is_framed(self) -> bool:
@@ -102,6 +103,7 @@ class Problem:
     pulls: Floats  # displacements of the handles. [H,3]
     turns: Floats  # their rotation vectors, NaN if free. [H,3]
     scales: Floats  # [H]
+    influence: Floats  # share of the handles' motion that each node may follow, 0 to 1. [n]
 
     def targets(self, pulls: Floats, turns: Floats, scales: Floats) -> Floats:
         """Return the positions of the constrained points. [P,3]
@@ -215,7 +217,8 @@ def make_problem(
     pinned = pinned[~held[graph.node_of[pinned[:, 1]]]]
     pin_points = np.array(pins, np.float64).reshape(-1, 3)[pinned[:, 0]]
     blends = bind(graph, np.concatenate([points, pin_points]), np.append(nodes, graph.node_of[pinned[:, 1]]))
-    owners = np.append(np.arange(len(handles)), np.full(len(pinned), -1))
+    leaders = [index if handle.follows is None else handle.follows for index, handle in enumerate(handles)]
+    owners = np.append(np.array(leaders), np.full(len(pinned), -1))
     points = np.concatenate([points, pin_points])
     blends, points, owners = _add_frames(scene, graph, handles, blends, points, owners)
     solver = Solver(graph, blends, points, held, _springs(graph, handles, weights))
@@ -234,6 +237,7 @@ def make_problem(
         pulls=pulls,
         turns=np.array(turns),
         scales=scales,
+        influence=np.where(held, 0.0, weights),
     )
 
 

@@ -7,8 +7,12 @@ place.
 
 from __future__ import annotations
 
+import subprocess
+import sys
+import threading
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,25 +23,45 @@ from torch import Tensor
 from progdf.field.baked import AttributeBases, BakedField
 from progdf.gaussians import Gaussians, attribute_slices, pack
 from progdf.gdf.file import Gdf, fingerprint
+from progdf.rasterize.cpu.jit import kernel_cache
 from progdf.region import Region, from_mask, whole_scene
 
 from .course import Handle, make_problem
 from .follow import bind, follow, rest_frames
-from .graph import MAX_NODES, Floats, Rows, build_graph
+from .graph import MAX_NODES, Floats, Rows
 
 _SETTLED_SHARE = 1e-3
 """Movement of a node in a step below which the pose counts as settled, in node spacings."""
-MAX_GRIP_POINTS = 12
-"""Largest number of points that move with a handle of a soft pull."""
-_GRIP_SHARE = 0.35  # radius around a handle that moves with it, as a share of its radius of influence
+_COMPILE_POLL_S = 0.2  # seconds between two looks at the process that compiles
+_COMPILED = "pull.compiled"  # empty file beside the compiled kernels, once all of a live pull are there
 _CHANGED = ("means", "log_scales", "quats", "shN")  # attributes that a pull changes
+
+
+@dataclass(frozen=True, eq=False)
+class HandlePose:
+    """Displacements, rotations and scales of H handles."""
+
+    pulls: Floats  # displacements, finite, world units. [H,3]
+    turns: Floats  # rotation vectors, radians; without effect on a handle that turns freely. [H,3]
+    scales: Floats  # factors, above 0; without effect on such a handle. [H]
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, HandlePose):
+            return NotImplemented
+        pairs = ((self.pulls, other.pulls), (self.turns, other.turns), (self.scales, other.scales))
+        return all(np.array_equal(a, b) for a, b in pairs)
+
+    @classmethod
+    def of_shifts(cls, pulls: Floats) -> HandlePose:
+        """Return the pose of handles that are only displaced. pulls: [H,3]"""
+        return cls(pulls, np.zeros_like(pulls), np.ones(len(pulls)))
 
 
 @dataclass(frozen=True)
 class LiveStep:
     """Result of one step."""
 
-    pulls: Floats  # displacements of the handles. [H,3]
+    pose: HandlePose  # of the handles
     offsets: Tensor  # packed offsets of the members from the scene. [M,C] float32
     is_settled: bool  # further steps with the same displacements change nothing visible
     milliseconds: float  # time that the step took
@@ -50,7 +74,7 @@ class LivePull:
 
     Args:
         scene: the scene as it is without the pull
-        handles: at least one; their displacements are ignored
+        handles: at least one; their displacements and scales are ignored, their turns if there are any
         hold: Gaussians that stay as they are
         max_nodes: target number of nodes of the graph
 
@@ -77,6 +101,8 @@ class LivePull:
         self.members: Rows = rows[moves]
         """Gaussians that can move, ascending. [M]"""
         self._binding = csr_array(binding[np.flatnonzero(moves)])
+        self.influence: Floats = self._binding @ self._problem.influence
+        """Share of the handles' motion that each of them may follow, 0 to 1. [M]"""
         self._rows = pack(scene[torch.from_numpy(self.members)], with_shN=scene.sh_degree > 0).float()
         self._frames = rest_frames(self._rows)
         self._pose = self._problem.solver.rest()
@@ -91,16 +117,17 @@ class LivePull:
         """Number of nodes of the graph."""
         return len(self._problem.graph)
 
-    def step(self, pulls: Floats, rounds: int) -> LiveStep:
-        """Solve some rounds for displacements of the handles.
+    def step(self, handles: HandlePose, rounds: int) -> LiveStep:
+        """Solve some rounds for a pose of the handles.
 
         Args:
-            pulls: finite displacements, world units. [H,3]
+            handles: displacements, rotations and scales
             rounds: number of rounds, at least 1
         """
         began = time.perf_counter()
         problem = self._problem
-        pose = problem.solver.solve(problem.points + pulls, self._pose, rounds)
+        targets = problem.targets(handles.pulls, handles.turns, handles.scales)
+        pose = problem.solver.solve(targets, self._pose, rounds)
         moved = float(np.abs(pose.positions - self._pose.positions).max(initial=0.0))
         self._pose = pose
         gradients = problem.solver.gradients(pose)
@@ -108,7 +135,7 @@ class LivePull:
             self._rows, self._binding, problem.graph, pose, gradients, self._frames
         )
         return LiveStep(
-            pulls.copy(),
+            handles,
             moved_rows.float().sub_(self._rows),
             moved <= _SETTLED_SHARE * problem.graph.spacing,
             1e3 * (time.perf_counter() - began),
@@ -148,34 +175,25 @@ def write_offsets(edit: Gdf, offsets: Tensor) -> None:
         bases.end_offset.copy_(offsets[:, slices[attribute]])
 
 
-def grip_points(scene: Gaussians, point: tuple[float, float, float], rows: Rows, radius: float) -> Floats:
-    """Return points around a handle that move with it, so that a soft pull has a round top and no spike.
+def has_kernels() -> bool:
+    """Return True if the kernels of a live pull have been compiled on this machine."""
+    return (kernel_cache() / _COMPILED).exists()
 
-    They are well spread over the Gaussians within a share of the radius that are connected with the handle.
+
+def compile_kernels(stop: threading.Event) -> None:
+    """Compile the kernels of a live pull in another process, so that this one goes on meanwhile.
+
+    If that fails, the first pull compiles them.
 
     Args:
-        scene: the Gaussians. [N]
-        point: the handle
-        rows: Gaussians that may move. [M]
-        radius: radius of the influence
-
-    Returns:
-        The handle's point and up to `MAX_GRIP_POINTS` − 1 others. [K,3]
+        stop: ends the work once it is set
     """
-    means = scene.means.detach().double().numpy()
-    first = np.array(point)
-    distance = np.linalg.norm(means[rows] - first, axis=1)
-    near = rows[distance <= _GRIP_SHARE * radius]
-    points = [first]
-    if len(near) > 1:
-        seed = np.array([int(np.linalg.norm(means[near] - first, axis=1).argmin())])
-        near = near[connected_rows(scene[torch.from_numpy(near)], seed)]
-    away = np.linalg.norm(means[near] - first, axis=1)
-    while len(points) < min(MAX_GRIP_POINTS, len(near)):
-        farthest = means[near[int(away.argmax())]]
-        points.append(farthest)
-        away = np.minimum(away, np.linalg.norm(means[near] - farthest, axis=1))
-    return np.stack(points)
+    command = [sys.executable, "-P", "-c", "from progdf.pull.live import warm_up; warm_up()"]
+    silent = subprocess.DEVNULL
+    with suppress(OSError), subprocess.Popen(command, stdin=silent, stdout=silent, stderr=silent) as process:
+        while process.poll() is None:
+            if stop.wait(_COMPILE_POLL_S):
+                process.kill()
 
 
 def warm_up() -> None:
@@ -193,17 +211,6 @@ def warm_up() -> None:
     )
     x, y, z = corners[0].tolist()
     handle = Handle(whole_scene(scene), (x, y, z), (0.0, 0.0, 0.0))
-    LivePull(scene, [handle]).step(np.array([[0.1, 0.0, 0.0]]), 1)
-
-
-def connected_rows(scene: Gaussians, rows: Rows) -> Rows:
-    """Return the Gaussians that are connected with some of them, in ascending order.
-
-    Args:
-        scene: the Gaussians. [N]
-        rows: indices. [K]
-    """
-    graph = build_graph(scene)
-    parts = graph.part[graph.node_of]
-    connected: Rows = np.flatnonzero(np.isin(parts, parts[rows]))
-    return connected
+    LivePull(scene, [handle]).step(HandlePose.of_shifts(np.array([[0.1, 0.0, 0.0]])), 1)
+    with suppress(OSError):
+        (kernel_cache() / _COMPILED).touch()

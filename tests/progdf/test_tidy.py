@@ -16,6 +16,7 @@ from progdf.compose.reference import Layer, compose_layers
 from progdf.formats.ply import load_ply, save_ply
 from progdf.gaussians import ATTRIBUTES, Gaussians, pack
 from progdf.gdf.file import Gdf, load_gdf, save_gdf
+from progdf.pull.course import Handle, pull
 from progdf.quaternions import rotation_matrices, turn_quats
 from progdf.rasterize import render
 from progdf.rasterize.engines import ALPHA_MIN
@@ -320,6 +321,26 @@ def test_edit_command_pulls_a_point(ply: Path, tmp_path: Path, form: str) -> Non
     assert torch.allclose(edited.means[row], target + torch.tensor([0.3, -0.1, 0.0]), atol=0.02)
 
 
+def test_edit_command_turns_and_scales_a_pulled_point(ply: Path, tmp_path: Path) -> None:
+    out = tmp_path / "turned.ply"
+    scene = load_ply(ply)
+    row = int(scene.means[:, 0].argmax())
+    point = scene.means[row]
+    numbers = ",".join(str(value) for value in point.tolist())
+    spec = f"all:{numbers},0,0.1,0,turn=x,30,scale=1.25"
+    assert main(["edit", str(ply), "--pull", spec, "--hold", LEFT, "-o", str(out)]) == 0
+    edited = load_ply(out)
+    assert torch.allclose(edited.means[row], point + torch.tensor([0.0, 0.1, 0.0]), atol=0.02)
+    x, y, z = point.tolist()
+    handle = Handle(
+        whole_scene(scene), (x, y, z), (0.0, 0.1, 0.0), None, (math.radians(30.0), 0.0, 0.0), 1.25
+    )
+    course = pull(scene, [handle], from_mask("left", scene.means[:, 0] < 0))
+    expected = bake(scene, [Step("pull", course.region, course=course)])
+    assert torch.allclose(edited.means, expected.means, atol=1e-6)
+    assert not torch.allclose(edited.log_scales, scene.log_scales, atol=0.05)
+
+
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -346,6 +367,14 @@ def test_edit_command_pulls_a_point(ply: Path, tmp_path: Path, form: str) -> Non
         ["--pull", "all:0,0,3,1,0,0,0"],
         ["--pull", "all:50,0,3,1,0,0"],
         ["--pull", "sphere:90,0,0,1:0,0,3,1,0,0"],
+        ["--pull", "all:0,0,3,1,0,0,turn=w,30"],
+        ["--pull", "all:0,0,3,1,0,0,turn=x"],
+        ["--pull", "all:0,0,3,1,0,0,turn=x,360"],
+        ["--pull", "all:0,0,3,1,0,0,turn=x,30,turn=x,30"],
+        ["--pull", "all:0,0,3,1,0,0,scale=0"],
+        ["--pull", "all:0,0,3,1,0,0,scale=1e6"],
+        ["--pull", "all:0,0,3,1,0,0,scale=nan"],
+        ["--pull", "all:0,0,3,1,0,0,bend=2"],
         ["--pull", "all:0,0,3,1,0,0", "--hold", "all"],
         ["--hold", "all"],
         ["--scale", "all:0"],

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from progdf.compose.added import extend
 from progdf.compose.composer import Composer
@@ -13,14 +16,8 @@ from progdf.compose.reference import compose_layers
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.pull.course import Handle, pull
-from progdf.pull.live import (
-    MAX_GRIP_POINTS,
-    LivePull,
-    connected_rows,
-    edit_in_progress,
-    grip_points,
-    write_offsets,
-)
+from progdf.pull.grips import MAX_GRIP_POINTS, connected_rows, grip_points, with_grips
+from progdf.pull.live import HandlePose, LivePull, edit_in_progress, write_offsets
 from progdf.region import Region, whole_scene
 from progdf.tidy import Step, similarity, tidy
 from tests.helpers.edits import painted
@@ -56,7 +53,7 @@ def handle_of(scene: Gaussians, by: tuple[float, float, float]) -> Handle:
 
 def settled(live: LivePull, by: tuple[float, float, float]) -> torch.Tensor:
     for _ in range(200):
-        step = live.step(np.array([by]), 6)
+        step = live.step(HandlePose.of_shifts(np.array([by])), 6)
         if step.is_settled:
             return step.offsets
     raise AssertionError("the pull does not settle")
@@ -106,7 +103,7 @@ def test_edit_in_progress_adds_to_lower_layers(blend: str) -> None:
     composer.update(layers, blend)
     before = composer.gaussians.means.clone()
     for by in ((0.1, 0.2, 0.0), (0.0, -0.2, 0.1)):
-        offsets = live.step(np.array([by]), 20).offsets
+        offsets = live.step(HandlePose.of_shifts(np.array([by])), 20).offsets
         write_offsets(edit, offsets)
         composer.touch(edit)
         change = composer.update(layers, blend)
@@ -141,6 +138,32 @@ def test_grip_points_are_spread_around_the_handle() -> None:
     assert away[1:].min() > 0.05
     alone = grip_points(scene, tip(scene), np.arange(len(scene)), 1e-6)
     assert len(alone) == 1
+
+
+def test_turned_and_scaled_handle_ends_as_the_course_does() -> None:
+    scene = bar()
+    handle = replace(handle_of(scene, (0.0, 0.1, 0.0)), turn=(0.7, 0.0, 0.0), scale=1.5)
+    handles, owners = with_grips(scene, [handle])
+    assert len(handles) > 1
+    assert not owners.any()
+    assert {one.follows for one in handles[1:]} == {0}
+    live = LivePull(scene, handles)
+    count = len(handles)
+    turns = np.tile([0.7, 0.0, 0.0], (count, 1))
+    pose = HandlePose(np.tile([0.0, 0.1, 0.0], (count, 1)), turns, np.full(count, 1.5))
+    step = live.step(pose, 2000)
+    course = pull(scene, handles)
+    both, at, of_course = np.intersect1d(live.members, course.region.members.numpy(), return_indices=True)
+    assert len(both) == len(course.region.members)
+    moved = step.offsets[at, :3] - course.offsets[-1][of_course, :3]
+    assert float(moved.norm(dim=1).max()) < 0.01
+    rotation = Rotation.from_rotvec([0.7, 0.0, 0.0]).as_matrix()
+    near = np.linalg.norm(scene.means.numpy() - np.array(handle.point), axis=1) < 0.15
+    arms = scene.means.numpy()[near] - np.array(handle.point)
+    expected = np.array(handle.point) + np.array(handle.pull) + 1.5 * arms @ rotation.T
+    rows = np.searchsorted(live.members, np.flatnonzero(near))
+    found = scene.means.numpy()[near] + step.offsets[rows, :3].numpy()
+    assert np.abs(found - expected).max() < 0.03
 
 
 def test_connected_rows_leave_other_things_out() -> None:
