@@ -13,7 +13,7 @@ Each is an edit with a slider, a `Gdf`. `bake` applies the same steps to a scene
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -41,6 +41,9 @@ _MAX_ARC_SEGMENTS = 256  # maximum number of segments of an arc
 _OPACITY_COLUMN = attribute_slices(14)["logit_opacities"].start
 
 
+_FADED_SHARE = 0.3  # share of the time until the courses of opacities are known
+_MOVED_SHARE = 0.7  # share of the time until the rows at all strengths are known
+
 Operation = Literal["remove", "transform", "duplicate", "pull"]
 
 
@@ -59,6 +62,10 @@ class Step:
         if self.course is not None:
             return rows + self.course.offsets_at(share)
         return rows if self.motion is None else transform_rows(rows, self.motion, share)
+
+
+def ignore_progress(_share: float) -> None:
+    """Report no progress."""
 
 
 def similarity(
@@ -93,6 +100,8 @@ def tidy(
     cameras: Sequence[Camera] | None = None,
     leaves_paint: bool = False,
     only_end: bool = False,
+    *,
+    progress: Callable[[float], None] = ignore_progress,
 ) -> Gdf:
     """Return the steps as one edit: strength 0 is the scene, strength 1 the result of all steps.
 
@@ -107,6 +116,7 @@ def tidy(
             change linearly, which is fast
         leaves_paint: rows that other edits add on the regions stay as they are
         only_end: the edit is for strength 1, a preview that takes little time
+        progress: receives the finished share, 0 to 1; an error that it raises ends the work
 
     Returns:
         Edit of all removed or moved Gaussians. Copies are its added rows.
@@ -132,17 +142,14 @@ def tidy(
         start_scene = concatenate([scene, added])
     affected = torch.cat([members, torch.arange(len(scene), len(start_scene))])
     opacity_knots, logits = _opacity_course(start_scene, affected, end, cameras)
-    knots = torch.tensor([0.0, 1.0])
-    for step in steps:
-        if step.does == "transform" and step.motion is not None and not only_end:
-            knots = torch.cat([knots, _path_knots(scene, step.region, step.motion)]).unique()  # type: ignore[no-untyped-call]
-        if step.course is not None:
-            knots = torch.cat([knots, step.course.strengths]).unique()  # type: ignore[no-untyped-call]
+    progress(_FADED_SHARE)
+    knots = _knots(scene, steps, only_end)
     if bool(logits.any()) and not only_end:
         knots = torch.cat([knots, opacity_knots]).unique()  # type: ignore[no-untyped-call]
     offsets = rows.new_zeros(len(knots), len(end), rows.shape[1])
     for i, s in enumerate(knots.tolist()):
         offsets[i, : len(members)] = _rows_at(scene, members, steps, bands, s) - rows if s else 0.0
+        progress(_FADED_SHARE + (_MOVED_SHARE - _FADED_SHARE) * (i + 1) / len(knots))
     if any(step.motion is not None and not step.motion.is_similar for step in steps):
         shapes = rows[:, GEOMETRY] + offsets[:, : len(members), GEOMETRY]
         shapes = _continue_shapes(shapes.double(), knots, steps)
@@ -159,6 +166,17 @@ def tidy(
     if fill_count:
         gdf = anchor_added(gdf, scene, free=added_count - fill_count)
     return leave_paint(gdf) if leaves_paint else gdf
+
+
+def _knots(scene: Gaussians, steps: Sequence[Step], only_end: bool) -> Tensor:
+    """Return the strengths between which the paths of all steps are nearly straight. [S]"""
+    knots = torch.tensor([0.0, 1.0])
+    for step in steps:
+        if step.does == "transform" and step.motion is not None and not only_end:
+            knots = torch.cat([knots, _path_knots(scene, step.region, step.motion)]).unique()  # type: ignore[no-untyped-call]
+        if step.course is not None:
+            knots = torch.cat([knots, step.course.strengths]).unique()  # type: ignore[no-untyped-call]
+    return knots
 
 
 def _path_knots(scene: Gaussians, region: Region, motion: AffineMotion) -> Tensor:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.helpers.sessions import MAKING_S
 from viewer.app.app import App
 from viewer.files.document import Document
 from viewer.state.view_state import ViewState
@@ -38,6 +39,7 @@ def null_app(document: Document, view: ViewState, folder: Path) -> Iterator[App]
     with null_platform():
         window = Window(Splash("test", (900, 640)))
     app = App(window, document, view)
+    app.parts.maker.patience_s = MAKING_S
     app.draw()
     yield app
     app.close()

@@ -12,10 +12,15 @@ import numpy as np
 from progdf.compose import layer_paint
 from progdf.compose.layers import Gains
 from tests.helpers.ui_rig import bear, first_view
+from viewer.app.messages import Messages
+from viewer.app.parts.edits import EditActions
+from viewer.app.parts.making import LayerMaker
 from viewer.files import document, session
+from viewer.files.document import DocumentStore
 from viewer.files.session import WindowSession
 from viewer.state import snapshots
 from viewer.state.view_state import Comparison, Keyframe, LayerGroup, SnapshotPair, Timeline, ViewState
+from viewer.state.workspace import Store
 
 
 def full_view() -> ViewState:
@@ -75,3 +80,20 @@ def spoilt(path: Path, *keys: str | int, value: Any = None) -> Path:
     other = path.with_name("spoilt.session.json")
     other.write_text(json.dumps(table))
     return other
+
+
+MAKING_S = 300.0
+"""Time that tests wait for the layer of a manual edit, seconds."""
+
+
+def layer_maker(store: Store, documents: DocumentStore, messages: Messages) -> LayerMaker:
+    """Return a maker of layers that waits until they are ready."""
+    edits = EditActions(store=store, documents=documents, messages=messages)
+    return LayerMaker(
+        store=store,
+        documents=documents,
+        messages=messages,
+        edits=edits,
+        wake=lambda: None,
+        patience_s=MAKING_S,
+    )

@@ -17,8 +17,8 @@ from progdf.gaussians import Gaussians
 from progdf.gdf.file import UNSEEN_LOGIT, load_gdf
 from progdf.rasterize import render
 from tests.helpers.painted_box import PaintedBox, painted_box, six_cameras
+from tests.helpers.sessions import layer_maker
 from viewer.app.messages import Messages
-from viewer.app.parts.edits import EditActions
 from viewer.app.parts.tidy import TidyActions
 from viewer.camera.view_camera import ViewCamera
 from viewer.files import region_files
@@ -92,8 +92,8 @@ def desk(tmp_path: Path) -> Desk:
     document = Document("box.ply", box.scene, (box.paint,), tmp_path / "box.ply", (tmp_path / "logo.gdf",))
     store = Store(new_workspace(ViewState(ViewCamera(), (LayerState(0, "logo", 1.0),))), lambda: None)
     documents = DocumentStore(document, lambda *_: None)
-    edits = EditActions(store=store, documents=documents, messages=Messages(store, lambda: 0.0))
-    return Desk(box, store, documents, TidyActions(store=store, documents=documents, edits=edits))
+    maker = layer_maker(store, documents, Messages(store, lambda: 0.0))
+    return Desk(box, store, documents, TidyActions(store=store, documents=documents, maker=maker))
 
 
 def test_selected_object_has_its_paint_with_and_without_it(desk: Desk) -> None:

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.helpers.sessions import layer_maker
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app.messages import Messages
 from viewer.app.parts.deliver import DeliverActions
-from viewer.app.parts.edits import EditActions
 from viewer.app.parts.tidy import TidyActions
 from viewer.files.document import Document, DocumentStore, LiveLayers
 from viewer.jobs.job_queue import JobQueue
@@ -53,8 +53,8 @@ def desk(tmp_path: Path) -> Desk:
 
 
 def test_removed_selection_becomes_a_layer(desk: Desk, tmp_path: Path) -> None:
-    edits = EditActions(store=desk.store, documents=desk.documents, messages=desk.messages)
-    part = TidyActions(store=desk.store, documents=desk.documents, edits=edits)
+    maker = layer_maker(desk.store, desk.documents, desk.messages)
+    part = TidyActions(store=desk.store, documents=desk.documents, maker=maker)
     select(desk)
     part.requests["remove_selected"](None)
     assert [layer.name for layer in desk.work.view.layers] == ["removed"]
@@ -65,8 +65,8 @@ def test_removed_selection_becomes_a_layer(desk: Desk, tmp_path: Path) -> None:
 
 
 def test_moved_selection_is_drawn_as_a_live_layer(desk: Desk) -> None:
-    edits = EditActions(store=desk.store, documents=desk.documents, messages=desk.messages)
-    part = TidyActions(store=desk.store, documents=desk.documents, edits=edits)
+    maker = layer_maker(desk.store, desk.documents, desk.messages)
+    part = TidyActions(store=desk.store, documents=desk.documents, maker=maker)
     select(desk)
     part.requests["move_selected"](None)
     gizmo = desk.work.transient.gizmo

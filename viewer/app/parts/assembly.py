@@ -15,6 +15,7 @@ from viewer.ui.window import wake_window
 from .deliver import DeliverActions
 from .edits import EditActions
 from .file_actions import FileActions, OpenDocument
+from .making import LayerMaker
 from .painting import PaintingActions
 from .pictures import PictureActions
 from .preview import PreviewActions
@@ -37,6 +38,7 @@ class WindowParts:
     start: StartActions
     up: UpActions
     strays: StrayActions
+    maker: LayerMaker
     tidy: TidyActions
     painting: PaintingActions
     pulling: PullActions
@@ -52,6 +54,7 @@ class WindowParts:
             self.start,
             self.preview,
             self.strays,
+            self.maker,
             self.tidy,
             self.painting,
             self.pulling,
@@ -63,6 +66,7 @@ class WindowParts:
         """Functions that poll a part and return the seconds until the next poll, None for never."""
         parts = (self.jobs, self.painting, self.pictures, self.preview, self.start, self.strays, self.pulling)
         return (
+            self.maker.poll,
             *(part.poll for part in parts),
             self.file_actions.poll_dialog,
             lambda: self.up.poll(self.file_actions.path),
@@ -71,12 +75,12 @@ class WindowParts:
     @property
     def closers(self) -> tuple[Callable[[], None], ...]:
         """Functions that free the resources of a part, in the order of their calls."""
-        parts = (self.start, self.preview, self.strays, self.jobs, self.pulling)
+        parts = (self.start, self.preview, self.strays, self.jobs, self.maker, self.pulling)
         return (*(part.close for part in parts), self.file_actions.release)
 
     def leave_scene(self) -> None:
         """Reset the state of the old scene after another one was opened."""
-        for part in (self.jobs, self.preview, self.up, self.tidy, self.pulling):
+        for part in (self.jobs, self.preview, self.up, self.maker, self.tidy, self.pulling):
             part.leave_scene()
 
 
@@ -158,6 +162,7 @@ def make_parts(
         context=main_view.context,
         queue=jobs.queue,
     )
+    maker = LayerMaker(store=store, documents=documents, messages=messages, edits=edits, wake=wake_window)
     return WindowParts(
         file_actions=file_actions,
         pictures=pictures,
@@ -167,13 +172,13 @@ def make_parts(
         start=start,
         up=UpActions(store=store, documents=documents, messages=messages),
         strays=StrayActions(store=store, documents=documents, messages=messages),
-        tidy=TidyActions(store=store, documents=documents, edits=edits, engine=lambda: main_view.engine),
+        maker=maker,
+        tidy=TidyActions(store=store, documents=documents, maker=maker, engine=lambda: main_view.engine),
         painting=PaintingActions(store=store, documents=documents, messages=messages, queue=jobs.queue),
         pulling=PullActions(
             store=store,
             documents=documents,
-            messages=messages,
-            edits=edits,
+            maker=maker,
             engine=lambda: main_view.engine,
             wake=wake_window,
         ),

@@ -18,17 +18,15 @@ from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians, pack
 from progdf.gdf.file import UNSEEN_LOGIT, Gdf, save_gdf
-from progdf.io.atomic import make_folder
 from progdf.pull.live import edit_in_progress, write_offsets
 from progdf.region import Region, from_mask
 from progdf.scene.subject import ground_height
 from progdf.similarity import AffineMotion, affine_motion
 from progdf.tidy import Step, tidy
 from viewer.app.messages import Requests
-from viewer.app.parts.edits import EditActions
+from viewer.app.parts.making import LayerMaker, Progress
 from viewer.camera.view_camera import Vec3
 from viewer.files.document import Document, DocumentStore
-from viewer.jobs.training import edits_folder, free_path
 from viewer.render.engine import ViewEngine
 from viewer.state import paint, selection
 from viewer.state.layers import visible_layers, with_paint
@@ -142,7 +140,7 @@ class TidyActions:
     Args:
         store: state of the window
         documents: the open document
-        edits: adds the finished edit as a layer
+        maker: makes the layers
         engine: returns the engine that draws the window; None without a window
     """
 
@@ -151,15 +149,14 @@ class TidyActions:
         *,
         store: Store,
         documents: DocumentStore,
-        edits: EditActions,
+        maker: LayerMaker,
         engine: Callable[[], ViewEngine] | None = None,
     ) -> None:
         self._engine = engine
         self._store = store
         self._documents = documents
-        self._edits = edits
+        self._maker = maker
         self._selected: _Selected | None = None  # the Gaussians being moved or copied
-        self._folder = Path()  # folder of new edits
         self._live: Gdf | None = None  # preview of a move whose offsets can be written in place
 
     @property
@@ -180,8 +177,8 @@ class TidyActions:
         self._store.replace(with_transient(self._store.get(), gizmo=None, measure=None))
 
     def _begin(self, does: str) -> None:
+        self._maker.check_free()
         document = self._documents.get()
-        self._folder = edits_folder(document.file)
         selected = select_parts(document, self._store.get().view)
         if does == "remove":
             self._remove(selected)
@@ -268,7 +265,7 @@ class TidyActions:
         gizmo = self._store.get().transient.gizmo
         steps = self._steps()
         if isinstance(gizmo, Gizmo) and steps and (gizmo.does == "duplicate" or gizmo.is_moved):
-            self._add(steps[0].does, steps, self._selected is not None and self._selected.leaves_paint)
+            self._add(steps[0].does, steps, self._selected is not None and self._selected.leaves_paint, gizmo)
         self._end()
 
     def _put_back(self, _: None) -> None:
@@ -285,12 +282,31 @@ class TidyActions:
     def _set_gizmo(self, gizmo: Gizmo | None) -> None:
         self._store.replace(with_transient(self._store.get(), gizmo=gizmo))
 
-    def _add(self, does: str, steps: Sequence[Step], leaves_paint: bool) -> None:
-        """Write the edit and add it as a layer on top."""
-        document = self._documents.get()
-        make_folder(self._folder)
-        name = document.free_name(_NAMES[does])
-        path = free_path(self._folder, name, ".gdf")
-        gdf = tidy(document.original, steps, name, _INSTRUCTIONS[does], cameras=(), leaves_paint=leaves_paint)
-        save_gdf(path, gdf)
-        self._edits.add(path, name, deselect=True)
+    def _add(self, does: str, steps: Sequence[Step], leaves_paint: bool, gizmo: Gizmo | None = None) -> None:
+        """Begin to make the edit, which becomes a layer on top; after a failure, `gizmo` is shown again."""
+        original = self._documents.get().original
+        selected = self._selected
+
+        def make(name: str, path: Path, progress: Progress) -> None:
+            instruction = _INSTRUCTIONS[does]
+            gdf = tidy(
+                original,
+                steps,
+                name,
+                instruction,
+                cameras=(),
+                leaves_paint=leaves_paint,
+                progress=progress,
+            )
+            save_gdf(path, gdf)
+
+        def done(is_ready: bool) -> None:
+            if is_ready or gizmo is None:
+                return
+            if self._store.get().transient.gizmo is None:
+                self._selected = selected
+                self._set_gizmo(gizmo)
+            else:
+                self._documents.replace(self._documents.get())  # without the preview
+
+        self._maker.begin(_NAMES[does], make, done)
