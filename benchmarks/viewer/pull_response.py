@@ -22,6 +22,7 @@ from progdf.gdf.file import Gdf
 from progdf.terminal import group_digits
 from progdf.threads import one_thread
 from viewer.app.parts.edits import EditActions
+from viewer.app.parts.making import LayerMaker
 from viewer.app.parts.pulling import PullActions
 from viewer.camera.decal_warp import project
 from viewer.camera.view_camera import first_camera, to_camera
@@ -181,11 +182,17 @@ def _pull_actions(mouse: Mouse, scene: Gaussians) -> PullActions:
 
     documents = DocumentStore(Document("scene.ply", scene), draw)
     edits = EditActions(store=main_view.store, documents=documents, messages=main_view.messages)
-    actions = PullActions(
+    maker = LayerMaker(
         store=main_view.store,
         documents=documents,
         messages=main_view.messages,
         edits=edits,
+        wake=lambda: None,
+    )
+    actions = PullActions(
+        store=main_view.store,
+        documents=documents,
+        maker=maker,
         engine=lambda: main_view.engine,
         wake=lambda: None,
     )
@@ -212,7 +219,7 @@ def _wait_shown(mouse: Mouse, actions: PullActions) -> None:
         assert isinstance(pull, Pull)
         wanted = [handle.pull for handle in pull.pose.handles]
         shown = actions.last_step
-        if shown is not None and np.array_equal(shown.pulls, np.array(wanted)):
+        if shown is not None and np.array_equal(shown.pose.pulls, np.array(wanted)):
             return
         actions.poll()
         if actions.last_step is shown:

@@ -26,6 +26,7 @@ from viewer.state.facts import LayerRow
 from viewer.state.layers import visible_edits
 from viewer.state.selection import EMPTY_MASK
 from viewer.state.snapshots import SliderSnapshot, restore, with_original
+from viewer.state.transient import PullInfluence
 from viewer.state.view_state import Comparison, ViewState
 from viewer.state.workspace import Pointed, Workspace
 from viewer.ui.context import PALETTE
@@ -164,12 +165,15 @@ class Canvas:
         focus: int | None = None,
         pointed: Pointed | None = None,
         live: bool = False,
+        *,
+        pulled: PullInfluence | None = None,
     ) -> None:
         """Draw `view` into the lower left `size` pixels of `screen`.
 
         Args:
             focus: the layer whose painted weights are visible while the brush is active, or None
             pointed: the item of the panel under the pointer
+            pulled: Gaussians that a handle moves right now, or None
             live: an edit in training or preview is on top
             dragging: the mouse drags something, so that more frames will follow
             now: seconds on the main view's clock
@@ -189,7 +193,7 @@ class Canvas:
         before = self._resolution
         self._resolution = dynamic_resolution.before_draw(before, mode, dragging, turned, slid, now)
         looks = self._sliding or live
-        self.comparer.engine.highlight = highlight.requested_highlight(view, focus, pointed, looks)
+        self.comparer.engine.highlight = highlight.requested_highlight(view, focus, pointed, looks, pulled)
         target = aim, edits, self.comparer.engine.highlight
         has_picture = self.pictures_drawn or self._follows
         self._begun = None

@@ -32,6 +32,7 @@ _SNAPS: dict[Snap, str] = {"off": "Off", "ground": "Ground", "surface": "Surface
 _COLUMN_PX = 64.0  # at 1×: start of the fields
 _FIELD_PX = 72.0  # width of a field
 _BUTTON_PX = 72.0
+_SAME_MATRIX = 1e-4  # difference of matrix elements within a frame of a drag that counts as none
 _STEPS_PER_RADIUS = 500.0  # pixels of a drag that move the part by the radius of the scene
 _HANDLES = _OPERATION(_OPERATION.translate | _OPERATION.rotate | _OPERATION.scaleu)
 
@@ -56,30 +57,7 @@ def draw_gizmo(gizmo: Gizmo, pointer: PointerContext, surfaces: DecalSurfaces) -
         pointer: the view
         surfaces: cache of the surface to snap to
     """
-    size = pointer.size
-    camera = to_camera(pointer.shown.camera, *size)
-    flip = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL looks along −z
-    view = flip @ camera.viewmat.double().numpy()
-    place = np.eye(4)
-    place[:3, 3] = gizmo.center
-    pivot = np.eye(4)
-    pivot[:3, 3] = gizmo.pivot_at
-    im_guizmo.begin_frame()
-    im_guizmo.set_drawlist(imgui.get_background_draw_list())
-    im_guizmo.set_rect(0.0, 0.0, pointer.area.width, pointer.area.height)
-    im_guizmo.enable(gizmo.typed is None)
-    moved = typed.follow(gizmo, pointer, surfaces)
-    model = _columns(place @ moved.matrix @ pivot)
-    projection = _columns(_projection(pointer.shown.camera.fov_y, size[0] / size[1], pointer.engine.near))
-    im_guizmo.manipulate(
-        _columns(view), projection, _HANDLES, im_guizmo.MODE.world, model, None, _steps(gizmo)
-    )
-    using = bool(im_guizmo.is_using())
-    if not using:  # while it is used, ImGuizmo counts every handle as under the mouse
-        moved = replace(moved, grip=_grip())
-    if using or gizmo.using:
-        world = np.array(model.values, np.float64).reshape(4, 4).T
-        moved = replace(moved, matrix=np.linalg.inv(place) @ world @ np.linalg.inv(pivot))
+    moved, using = drag_gizmo(typed.follow(gizmo, pointer, surfaces), pointer)
     moved, request = _draw_panel(moved, pointer)
     if moved.snap == "ground" and not np.array_equal(moved.matrix, gizmo.matrix):
         moved = typed.on_ground(moved)
@@ -94,6 +72,39 @@ def draw_gizmo(gizmo: Gizmo, pointer: PointerContext, surfaces: DecalSurfaces) -
         moved = replace(moved, shown=moved.matrix)
         request = request or "place"
     return replace(moved, using=using), request
+
+
+def drag_gizmo(gizmo: Gizmo, pointer: PointerContext, usable: bool = True) -> tuple[Gizmo, bool]:
+    """Draw ImGuizmo's handles; return them after this frame's drag, and True during a drag.
+
+    They are gray while keys transform, or while they are not usable.
+    """
+    size = pointer.size
+    camera = to_camera(pointer.shown.camera, *size)
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL looks along −z
+    view = flip @ camera.viewmat.double().numpy()
+    place = np.eye(4)
+    place[:3, 3] = gizmo.center
+    pivot = np.eye(4)
+    pivot[:3, 3] = gizmo.pivot_at
+    im_guizmo.begin_frame()
+    im_guizmo.set_drawlist(imgui.get_background_draw_list())
+    im_guizmo.set_rect(0.0, 0.0, pointer.area.width, pointer.area.height)
+    im_guizmo.enable(usable and gizmo.typed is None)
+    model = _columns(place @ gizmo.matrix @ pivot)
+    projection = _columns(_projection(pointer.shown.camera.fov_y, size[0] / size[1], pointer.engine.near))
+    im_guizmo.manipulate(
+        _columns(view), projection, _HANDLES, im_guizmo.MODE.world, model, None, _steps(gizmo)
+    )
+    using = bool(im_guizmo.is_using())
+    dragged = gizmo
+    if not using:  # while it is used, ImGuizmo counts every handle as under the mouse
+        dragged = replace(dragged, grip=_grip())
+    if using or gizmo.using:
+        world = np.array(model.values, np.float64).reshape(4, 4).T
+        dragged = replace(dragged, matrix=np.linalg.inv(place) @ world @ np.linalg.inv(pivot))
+        dragged = replace(dragged, grip=_dragged_grip(gizmo, dragged.matrix))
+    return dragged, using
 
 
 def gizmo_takes_mouse(before: Gizmo, after: Gizmo) -> bool:
@@ -125,10 +136,21 @@ def _projection(fov_y: float, aspect: float, near: float) -> NDArray[np.float64]
 
 
 def _grip() -> Transform:
-    """Return the transform of the handle under the mouse."""
-    if im_guizmo.is_over(_OPERATION.rotate):
+    """Return the transform of the handle under the mouse, as far as ImGuizmo tells it."""
+    if im_guizmo.is_over(_OPERATION.translate):
+        return "move"
+    return "rotate" if im_guizmo.is_over(_OPERATION.rotate) else "scale"
+
+
+def _dragged_grip(before: Gizmo, matrix: NDArray[np.float64]) -> Transform:
+    """Return the transform of the handle that the mouse drags, from the matrix after this frame. [4,4]"""
+    step = np.linalg.inv(before.matrix) @ matrix
+    lengths = np.linalg.norm(step[:3, :3], axis=0)
+    if np.abs(lengths - 1.0).max() > _SAME_MATRIX:
+        return "scale"
+    if np.abs(step[:3, :3] - np.eye(3)).max() > _SAME_MATRIX:
         return "rotate"
-    return "scale" if im_guizmo.is_over(_OPERATION.scaleu) else "move"
+    return before.grip
 
 
 def _steps(gizmo: Gizmo) -> im_guizmo.Matrix3 | None:

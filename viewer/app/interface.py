@@ -23,7 +23,8 @@ from viewer.ui.keys import COMMANDS, JOINED, TOPICS, Command, chords, find_comma
 from viewer.ui.pointer import PointerContext
 from viewer.ui.widgets import elide, group_digits, menu, search_field
 
-from . import color_tool, measure, mouse, pull_tool, select_tool
+from . import color_tool, measure, mouse, select_tool
+from .pull.marks import draw_marks
 
 MOUSE_HELP = (
     ("Left drag", "Orbit"),
@@ -337,7 +338,7 @@ def over_picture(
         color_tool.draw_tip(work, pointer)
     overlay.draw_axes(view, area, on_axes or work.transient.tool.drag == overlay.AXES_DRAG, ui)
     if isinstance(work.transient.gizmo, Pull) and not original:
-        pull_tool.draw_marks(work.transient.gizmo, pointer)
+        draw_marks(work.transient.gizmo, pointer)
     measure.draw(work, pointer)
     select_tool.draw_strokes(work, pointer)
     select_tool.draw_gesture(work.transient.tool.gesture, view, ui, pointer.left)

@@ -48,10 +48,11 @@ from viewer.ui.keys import (
 )
 from viewer.ui.pointer import PointerContext
 
-from . import color_tool, handles, interface, mouse, pull_tool, select_tool
+from . import color_tool, handles, interface, mouse, select_tool
 from .canvas import Canvas, FramePacer, LayersOf, RememberView, forget_view, no_layers
 from .decal import REST_S, DecalPlace, decal_takes_mouse, draw_decal, draw_ghosts, place_decal
 from .messages import Messages
+from .pull import tool as pull_tool
 
 FIT_POLL_S = 0.25  # seconds between frames while a model of the surface under paint is computed
 FLIGHT_S = 1 / 60  # seconds between frames while flying
@@ -254,8 +255,11 @@ class MainView:
         self.canvas.comparer.sides = compare_sides(self.work.snapshots, view)
         pointed = self.work.pointed if view.panel else None
         held = self._is_held()
-        live = bool(self.work.transient.live)
-        self.canvas.draw(view, screen, area, held, self._clock, self.work.focus, pointed, live)
+        transient = self.work.transient
+        live = bool(transient.live)
+        pull = transient.gizmo if isinstance(transient.gizmo, Pull) else None
+        pulled = pull.influence if pull is not None and pull.is_held else None
+        self.canvas.draw(view, screen, area, held, self._clock, self.work.focus, pointed, live, pulled=pulled)
         if self.canvas.pixels == 1 and not self._is_held():
             self._pointer().look_ahead()
 
@@ -283,7 +287,7 @@ class MainView:
         self._follow_keyboard(asks)
         if not asks:
             work, self._keys = handles.take_keys(self.work, self._pointer(), self._keys)
-            work, self._keys = pull_tool.take_keys(work, self._keys)
+            work, self._keys = pull_tool.take_keys(work, self._pointer(), self._keys)
             self.store.replace(work)
         self._point_by_keys(asks)
         if asks:  # no key is a shortcut or flies
@@ -375,7 +379,9 @@ class MainView:
                 moved, asked = handles.draw_gizmo(gizmo, self._pointer(), self.decal_surfaces)
                 takes_mouse = handles.gizmo_takes_mouse(gizmo, moved)
             elif isinstance(gizmo, Pull):
-                moved, asked, takes_mouse = pull_tool.update(gizmo, self.work, self._pointer(), pressed)
+                moved, asked, takes_mouse = pull_tool.update(
+                    gizmo, self.work, self._pointer(), self.decal_surfaces, pressed
+                )
             elif gizmo is not None:
                 moved, asked = draw_decal(gizmo, self._pointer(), self.decal_surfaces, "Enter" in pressed)
                 takes_mouse = decal_takes_mouse(moved, self._pointer())
@@ -471,7 +477,7 @@ class MainView:
         ):
             return True
         pull = self.work.transient.gizmo
-        if isinstance(pull, Pull) and pull.drag is not None:
+        if isinstance(pull, Pull) and pull.is_held:
             return True
         moves = self.work.player.playing or self.work.glide is not None
         return moves or is_flying(self._keys) or is_repeating(self._keys)

@@ -12,6 +12,7 @@ from progdf.compose import layer_paint
 from progdf.gdf.file import Gdf
 from viewer.state.layers import is_visible
 from viewer.state.selection import EMPTY_MASK, Color, unpack
+from viewer.state.transient import PullInfluence
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import Pointed
 
@@ -27,6 +28,8 @@ RAMP = ((0.0, 0x2B3FA8), (0.25, 0x7A35B5), (0.5, 0xC8407A), (0.75, 0xF08A3C), (1
 SELECTED: Color = (1.0, 0.72, 0.05)  # tint of the selection
 TINT = 140  # share of a tint, of 255
 FAINT_TINT = 45  # share of the selection's tint while no selection tool is active, of 255
+PULLED: Color = (1.0, 0.38, 0.08)  # tint of the Gaussians that a pull can move
+PULLED_TINT = 110  # share of this tint where the pull has its full influence, of 255
 HIDDEN = 255  # share that marks a Gaussian as not drawn
 
 Bytes = NDArray[np.uint8]
@@ -44,6 +47,7 @@ class Highlight:
     tinted: tuple[tuple[bytes, Color, int], ...] = ()
     region: int | None = None  # edit whose members are all tinted (a `LayerState.gdf`), or None
     hidden: bytes = EMPTY_MASK  # packed mask of hidden Gaussians
+    pulled: PullInfluence | None = None  # Gaussians that a handle moves, tinted by its influence
 
 
 def requested_highlight(
@@ -51,6 +55,7 @@ def requested_highlight(
     focus: int | None,
     pointed: Pointed | None = None,
     looks: bool = False,
+    pulled: PullInfluence | None = None,
 ) -> Highlight | None:
     """Return the highlight for a view, or None.
 
@@ -65,9 +70,12 @@ def requested_highlight(
         focus: index of the focused layer in `view.layers`, or None
         pointed: panel item under the mouse
         looks: edits are being changed, so the selection is not shown
+        pulled: Gaussians that a handle moves right now, or None
     """
     if view.compare.mode != "off":
         return None
+    if pulled is not None:
+        return Highlight(pulled=pulled)
     state = view.selection
     kind, index = pointed or ("", 0)
     if kind == "layer" and index < len(view.layers):
@@ -121,6 +129,11 @@ def highlight_colors(highlight: Highlight, gdfs: Sequence[Gdf], total: int) -> B
             share != FAINT_TINT or not hidden.any() or not (mask | hidden).all()
         ):  # an isolated selection needs no faint tint
             colors[mask] = _tint(color, share)
+    if highlight.pulled is not None:
+        tints = np.round(PULLED_TINT * highlight.pulled.shares.clip(0.0, 1.0)).astype(np.uint8)
+        moved = highlight.pulled.rows[tints > 0]
+        colors[moved, :3] = _tint(PULLED, 0)[:3]
+        colors[moved, 3] = tints[tints > 0]
     if highlight.region is not None:
         colors[gdfs[highlight.region].region.members.numpy()] = _tint(SELECTED, TINT)
     if highlight.gdf is not None:

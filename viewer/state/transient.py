@@ -151,6 +151,13 @@ class PullHandle:
 
     point: Vec3  # position without the pull, world units
     pull: Vec3 = (0.0, 0.0, 0.0)  # displacement, world units
+    turn: Vec3 | None = None  # axis times angle, radians, below 2π; None: the surface turns freely
+    scale: float = 1.0  # factor of the surface around it
+
+    @property
+    def moves(self) -> bool:
+        """True if the handle moves, turns or scales anything."""
+        return any(self.pull) or any(self.turn or ()) or self.scale != 1.0
 
     @property
     def target(self) -> Vec3:
@@ -179,9 +186,27 @@ class PullDrag:
     grab: Point  # from the handle to the pointer, pixels of the picture
     normal: Vec3  # normal of the surface at the handle
     before: PullPose  # the pose before the press
+    # visible surface at the press, on which the radius is drawn; None while it is not known
+    surface: ViewSurface | None = field(default=None, compare=False)
     axis: PullAxis = ""  # world axis that the handle stays on; "" for the plane of the view
     is_new: bool = False  # the press created the handle, which becomes a pin if it does not move
     moved: bool = False  # the pointer moved further than a click
+
+
+@dataclass(frozen=True)
+class PullTransform:
+    """Transform of the picked handle in progress."""
+
+    before: PullPose  # the pose before it
+    typed: TypedTransform | None = None  # None: the mouse drags a part of the gizmo
+
+
+@dataclass(frozen=True, eq=False)
+class PullInfluence:
+    """Gaussians that a pull can move."""
+
+    rows: NDArray[np.int64]  # [M]
+    shares: NDArray[np.float64]  # share of the handles' motion that each may follow, 0 to 1. [M]
 
 
 @dataclass(frozen=True)
@@ -195,10 +220,14 @@ class Pull:
     past: tuple[PullPose, ...] = ()  # earlier poses that undo returns to
     future: tuple[PullPose, ...] = ()  # undone poses, the next one last
     drag: PullDrag | None = None
+    picked: int | None = None  # handle with the gizmo, an index
+    transform: PullTransform | None = None  # transform of the picked handle in progress
+    grip: Transform = "move"  # transform of the part of its gizmo that the mouse drags, or is over
     hovered: Vec3 | None = None  # point of the surface under the pointer, world units
     hovered_for: object = field(default=None, compare=False)  # pointer and picture of that point
     status: str = ""  # progress, or the reason why the pull cannot be shown; one line
     edit: Gdf | None = field(default=None, compare=False)  # the edit in progress, on screen
+    influence: PullInfluence | None = field(default=None, compare=False)  # of this edit
 
     @property
     def enter_request(self) -> str:
@@ -208,7 +237,19 @@ class Pull:
     @property
     def escape_request(self) -> str:
         """Name of the request that Escape makes; "" while it only ends a drag."""
-        return "" if self.drag else "leave_pull"
+        return "" if self.is_held else "leave_pull"
+
+    @property
+    def is_held(self) -> bool:
+        """True while a handle is dragged, turned or scaled."""
+        return self.drag is not None or self.transform is not None
+
+    @property
+    def picked_handle(self) -> PullHandle | None:
+        """Handle with the gizmo; None for none."""
+        if self.picked is None or self.picked >= len(self.pose.handles):
+            return None
+        return self.pose.handles[self.picked]
 
 
 @dataclass(frozen=True)

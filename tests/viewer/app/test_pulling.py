@@ -4,22 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from imgui_bundle import imgui
+from imgui_bundle.imguizmo import im_guizmo
 
 from tests.helpers.edits import bits
 from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import opened_document
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app.app import App
-from viewer.camera.decal_warp import project
+from viewer.app.pull.transform import gizmo_of, with_matrix
+from viewer.camera.decal_warp import project, vec3
 from viewer.camera.view_camera import to_camera
 from viewer.state import selection
-from viewer.state.transient import Pull
+from viewer.state.transient import Pull, PullHandle
 from viewer.state.workspace import with_transient
 from viewer.ui.glfw_library import glfw
 
@@ -224,3 +227,114 @@ def test_layer_of_a_pull_is_in_the_session(app: App, folder: Path) -> None:
     (path,) = [path for path in app.documents.get().gdf_paths if path.stem == "pulled"]
     assert path.is_file()
     assert app.documents.get().gdfs[app.main_view.work.view.layers[-1].gdf].instruction == "pull"
+
+
+def pulled(app: App) -> tuple[float, float]:
+    """Pull the scarf; return the window position of its handle, which is picked."""
+    press(app, "Shift+P")
+    start = on_scarf(app)
+    drag(app, start, (20.0, 0.0))
+    assert pull_of(app).picked == 0
+    return start[0] + 20.0, start[1]
+
+
+def test_typed_turn_and_scale_of_a_handle_make_a_layer(app: App) -> None:
+    before = means(app)
+    pulled(app)
+    first = pull_of(app).pose
+    press(app, "R", "Z", *"200", "Enter")
+    frame(app)
+    press(app, "S", *"1.5", "Enter")
+    frame(app)
+    (handle,) = pull_of(app).pose.handles
+    assert handle.turn == pytest.approx((0.0, 0.0, np.radians(200.0)))
+    assert handle.scale == pytest.approx(1.5)
+    assert handle.pull == first.handles[0].pull
+    assert pull_of(app).past[-1].handles[0].scale == 1.0
+    live = means(app)
+    assert not torch.equal(live, before)
+    press(app, "Ctrl+Z", "Ctrl+Z")
+    frame(app)
+    assert pull_of(app).pose == first
+    press(app, "Ctrl+Y", "Ctrl+Y")
+    frame(app)
+    assert pull_of(app).pose.handles == (handle,)
+    press(app, "Enter")
+    app.parts.pulling.settle()
+    app.draw()
+    assert app.main_view.work.transient.gizmo is None
+    far = (means(app) - live).norm(dim=1)
+    assert float(far.max()) < 0.1 * float((live - before).norm(dim=1).max())
+    press(app, "Ctrl+Z")
+    assert torch.equal(means(app), before)
+
+
+def test_escape_ends_a_typed_turn_before_the_tool(app: App) -> None:
+    pulled(app)
+    pose = pull_of(app).pose
+    press(app, "R", "X", *"45")
+    frame(app)
+    assert pull_of(app).pose != pose
+    press(app, "Escape")
+    frame(app)
+    assert pull_of(app).pose == pose
+    assert pull_of(app).transform is None
+    press(app, "G", "Y", *"0.1", "Enter")
+    frame(app)
+    moved = np.subtract(pull_of(app).pose.handles[0].pull, pose.handles[0].pull)
+    assert moved == pytest.approx([0.0, 0.1, 0.0])
+
+
+def test_ring_of_the_gizmo_turns_the_handle(app: App) -> None:
+    x, y = pulled(app)
+    at = project(
+        np.array(pull_of(app).pose.handles[0].target),
+        to_camera(app.main_view.work.view.camera, *app.main_view.picture_size),
+    )[0]
+    density = imgui.get_io().display_framebuffer_scale
+    x, y = float(at[0]) / density.x, float(at[1]) / density.y
+    operation = im_guizmo.OPERATION
+    # to a ring on the left, far from the circles that scale
+    for away, angle in product(range(40, 120, 3), np.radians(range(120, 260, 30))):
+        across, down = away * np.cos(angle), away * np.sin(angle)
+        move(app, x + across, y + down)
+        if im_guizmo.is_over(operation.rotate) and not im_guizmo.is_over(operation.translate):
+            break
+    else:
+        pytest.fail("there is no ring")
+    pose = pull_of(app).pose
+    before = pose.handles[0]
+    button(app, True)
+    for step in range(1, 6):
+        move(app, x + across - 0.1 * step * down, y + down + 0.1 * step * across)
+    assert pull_of(app).transform is not None
+    button(app, False)
+    frame(app)
+    assert pull_of(app).transform is None
+    (handle,) = pull_of(app).pose.handles
+    assert handle.turn is not None
+    assert np.linalg.norm(handle.turn) > 0.05
+    assert (handle.scale, handle.pull) == (1.0, before.pull)
+    assert pull_of(app).past[-1] == pose
+    press(app, "Ctrl+Z")
+    assert pull_of(app).pose == pose
+
+
+def test_matrix_of_a_handle_goes_both_ways() -> None:
+    random = np.random.default_rng(0)
+    for _ in range(50):
+        axis = random.normal(size=3)
+        turn = vec3(axis / np.linalg.norm(axis) * random.uniform(0.0, 6.2))
+        scale = float(random.uniform(0.1, 9.0))
+        handle = PullHandle((0.1, 0.2, 0.3), vec3(random.normal(size=3)), turn, scale)
+        matrix = gizmo_of(handle).matrix
+        assert with_matrix(replace(handle, pull=(0.0, 0.0, 0.0)), matrix, "move") == handle
+        assert with_matrix(replace(handle, scale=1.0), matrix, "scale").scale == pytest.approx(scale)
+        near = replace(handle, turn=vec3(0.99 * np.array(turn)))
+        turned = with_matrix(near, matrix, "rotate")
+        assert turned.turn == pytest.approx(turn)
+        assert (turned.scale, turned.pull) == (scale, handle.pull)
+        matrix[:3, :3] = matrix[:3, :3] @ np.diag([1.0, 2.0, 1.0])
+        stretched = with_matrix(handle, matrix, "scale")
+        assert stretched.scale == pytest.approx(2.0 * scale)
+        assert stretched.turn == turn

@@ -5,6 +5,7 @@ Graphs are built, and steps solved, in other threads. The window shows the newes
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -24,14 +25,15 @@ from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, save_gdf
-from progdf.io.atomic import make_folder
 from progdf.pull.course import Handle, pull
+from progdf.pull.grips import connected_rows, with_grips
 from progdf.pull.live import (
+    HandlePose,
     LivePull,
     LiveStep,
-    connected_rows,
+    compile_kernels,
     edit_in_progress,
-    grip_points,
+    has_kernels,
     warm_up,
     write_offsets,
 )
@@ -39,19 +41,20 @@ from progdf.region import Region, from_mask
 from progdf.scene.point_tree import PointTree
 from progdf.threads import one_thread
 from progdf.tidy import Step, tidy
-from viewer.app.messages import Messages, Requests, error_line
-from viewer.app.parts.edits import EditActions
+from viewer.app.messages import Requests, error_line
+from viewer.app.parts.making import LayerMaker, Progress
 from viewer.camera.view_camera import Vec3
 from viewer.files.document import DocumentStore
-from viewer.jobs.training import edits_folder, free_path
 from viewer.render.engine import ViewEngine
 from viewer.state import selection
 from viewer.state.layers import visible_layers
-from viewer.state.transient import Pull, PullPose
+from viewer.state.transient import Pull, PullInfluence, PullPose
 from viewer.state.view_state import LayerState
 from viewer.state.workspace import Store, with_transient
 
 _NAME = "pulled"
+_PREPARING = "Preparing …"
+_COMPILING = "Compiling this tool for your machine, once; this takes about 20 s …"
 _FIRST_RADIUS = 0.15  # radius of the influence at first, in radii of what can be pulled
 _ROUNDS = 24  # rounds of the solver per step while a handle is dragged
 _FIRST_ROUNDS = 60  # rounds before the first step is shown
@@ -72,17 +75,9 @@ class _Problem:
     hidden: bytes  # packed mask of the hidden Gaussians
     held: bytes  # packed mask of the Gaussians that stay in place
     points: tuple[Vec3, ...]  # points of the handles, without the pull
+    framed: tuple[bool, ...]  # True for handles that turn or scale the surface around them
     pins: tuple[Vec3, ...]
     radius: float | None  # radius of the influence; None: all that is connected
-
-
-@dataclass(frozen=True, eq=False)
-class _Constraints:
-    """Constrained points of a problem, and the held region."""
-
-    handles: tuple[Handle, ...]  # without displacements. [K]
-    owners: NDArray[np.int64]  # index of the tool's handle that each point moves with. [K]
-    hold: Region | None
 
 
 @dataclass(frozen=True)
@@ -133,8 +128,7 @@ class PullActions:
     Args:
         store: state of the window
         documents: the open document
-        messages: messages to the user
-        edits: adds the finished pull as a layer
+        maker: makes the layers
         engine: returns the engine that draws the window
         wake: ends the window's wait for events; callable from any thread
     """
@@ -144,15 +138,13 @@ class PullActions:
         *,
         store: Store,
         documents: DocumentStore,
-        messages: Messages,
-        edits: EditActions,
+        maker: LayerMaker,
         engine: Callable[[], ViewEngine],
         wake: Callable[[], None],
     ) -> None:
         self._store = store
         self._documents = documents
-        self._messages = messages
-        self._edits = edits
+        self._maker = maker
         self._engine = engine
         self._wake = wake
         self._builder = ThreadPoolExecutor(1, thread_name_prefix="pull graph")
@@ -165,7 +157,9 @@ class PullActions:
         self._stepping: Future[LiveStep] | None = None
         self._solved: LiveStep | None = None
         self._solved_at = 0.0  # time of the last step, seconds
-        self._keeping: tuple[Path, str, Pull, Future[None]] | None = None
+        self._compiling: Future[None] | None = None  # of the kernels, once on a machine
+        self._stop_compiling = threading.Event()
+        self._keeping = False  # the pull becomes a layer, and is drawn until then
 
     @property
     def requests(self) -> Requests:
@@ -178,30 +172,34 @@ class PullActions:
 
     def leave_scene(self) -> None:
         """Drop the pull when another scene opens."""
-        self._preparing = self._keeping = self._base = None
+        self._preparing = self._base = None
+        self._keeping = False
         self._forget()
         self._set(None)
 
     def close(self) -> None:
         """Stop the threads."""
+        self._stop_compiling.set()
         self._builder.shutdown(wait=False, cancel_futures=True)
         self._stepper.shutdown(wait=False, cancel_futures=True)
 
     def poll(self) -> float | None:
         """Start work for the current handles and show finished work."""
-        self._finish_keeping()
         pull = self._pull
         if pull is None:
-            if self._keeping is None and self._prepared is not None:
+            if not self._keeping and self._prepared is not None:
                 self._clear()
             return None
         problem = self._problem(pull)
         if self._base is not None and self._base[0] is not self._engine():
             self._forget()  # another document is drawn, without the pull
+        if self._compiling is not None and self._compiling.done():
+            self._compiling = None
+            self._report("" if self._preparing is None else _PREPARING)
         if problem is None:
             if self._prepared is not None:
                 self._clear()
-            self._report("")
+            self._report("" if self._compiling is None else _COMPILING)
             return None
         self._take_prepared(problem)
         self._prepare(problem, pull)
@@ -210,7 +208,7 @@ class PullActions:
     def follow(self) -> None:
         """Start work for a handle that is being dragged, and wait shortly for its result, before drawing."""
         pull = self._pull
-        if pull is not None and pull.drag is not None:
+        if pull is not None and pull.is_held:
             self.poll()
 
     @property
@@ -234,8 +232,9 @@ class PullActions:
                 running.append(self._preparing[1])
             if self._stepping is not None:
                 running.append(self._stepping)
-            if self._keeping is not None:
-                running.append(self._keeping[3])
+            if self._keeping:
+                self._maker.wait()
+                continue
             if wait is None and not running:
                 return
             wait_for(running)
@@ -260,8 +259,7 @@ class PullActions:
         if self._pull is not None:
             self._leave()
             return
-        if self._keeping is not None:
-            raise ProgdfError("the last pull becomes a layer; wait until it is finished")
+        self._maker.check_free()
         document = self._documents.get()
         if document.is_empty:
             raise ProgdfError("no scene is open; open one first")
@@ -272,11 +270,15 @@ class PullActions:
             means = document.original.means[torch.from_numpy(mask.copy())].double()
             size = float((means - means.mean(dim=0)).norm(dim=1).quantile(0.9))
         self._set(Pull(max(_FIRST_RADIUS * size, 1e-9)))
+        if not has_kernels() and self._compiling is None:
+            self._compiling = self._builder.submit(compile_kernels, self._stop_compiling)
+            self._compiling.add_done_callback(lambda _: self._wake())
+            self._report(_COMPILING)
         self._builder.submit(warm_up)
 
     def _leave(self) -> None:
         self._set(None)
-        if self._keeping is None:
+        if not self._keeping:
             self._clear()
 
     def _problem(self, pull: Pull) -> _Problem | None:
@@ -303,6 +305,7 @@ class PullActions:
             hidden=view.selection.hidden,
             held=selected if holds else selection.EMPTY_MASK,
             points=tuple(handle.point for handle in pull.pose.handles),
+            framed=tuple(handle.turn is not None for handle in pull.pose.handles),
             pins=pull.pose.pins,
             radius=None if pull.whole else pull.radius,
         )
@@ -313,11 +316,11 @@ class PullActions:
         if known or self._preparing is not None or problem == self._refused:
             return
         count = len(self._documents.get().original)
-        future = self._builder.submit(_prepare, self._bases, problem, _pulls(pull), count)
+        future = self._builder.submit(_prepare, self._bases, problem, _pose(pull), count)
         future.add_done_callback(lambda _: self._wake())
         self._preparing = problem, future
-        if self._prepared is None:
-            self._report("Preparing …")
+        if self._prepared is None and self._compiling is None:
+            self._report(_PREPARING)
 
     def _take_prepared(self, problem: _Problem) -> None:
         """Show a finished graph, also of an earlier radius, as long as its handles are the current ones."""
@@ -349,7 +352,8 @@ class PullActions:
         self._report("")
         pull = self._pull
         if pull is not None:
-            self._set(replace(pull, edit=prepared.edit))
+            influence = PullInfluence(prepared.live.members, prepared.live.influence)
+            self._set(replace(pull, edit=prepared.edit, influence=influence))
 
     def _show_layer(self, index: int) -> None:
         """Show the edit in progress above the other live edits."""
@@ -372,15 +376,15 @@ class PullActions:
         handles = pull.pose.handles
         if prepared.problem.points != tuple(handle.point for handle in handles):
             return None
-        pulls = _pulls(pull)[prepared.owners]
+        pose = _point_pose(_pose(pull), prepared.owners)
         solved = self._solved
-        is_current = solved is not None and np.array_equal(solved.pulls, pulls)
+        is_current = solved is not None and solved.pose == pose
         if self._stepping is not None or (is_current and solved is not None and solved.is_settled):
             return None
         rest = self._solved_at + _REST_S - time.perf_counter()
         if is_current and rest > 0.0:
             return rest  # the next movement need not wait for this step
-        self._stepping = self._stepper.submit(_solve, prepared.live, pulls)
+        self._stepping = self._stepper.submit(_solve, prepared.live, pose)
         wait_for([self._stepping], _PATIENCE_S)
         if self._stepping.done():
             self._take_step(prepared)
@@ -417,45 +421,51 @@ class PullActions:
         self._base = self._prepared = self._solved = self._stepping = self._refused = None
         pull = self._pull
         if pull is not None and pull.edit is not None:
-            self._set(replace(pull, edit=None))
+            self._set(replace(pull, edit=None, influence=None))
 
     def _keep(self) -> None:
         """Begin to make the layer in another thread."""
         pull = self._pull
         problem = None if pull is None else self._problem(pull)
-        if pull is None or problem is None or not any(any(handle.pull) for handle in pull.pose.handles):
+        if pull is None or problem is None or not any(handle.moves for handle in pull.pose.handles):
             self._leave()
             return
-        document = self._documents.get()
-        folder = edits_folder(document.file)
-        make_folder(folder)
-        name = document.free_name(_NAME)
-        path = free_path(folder, name, ".gdf")
-        original = document.original
-        future = self._builder.submit(_make_layer, self._bases, problem, pull.pose, original, name, path)
-        future.add_done_callback(lambda _: self._wake())
-        self._keeping = path, name, pull, future
+        original = self._documents.get().original
+        bases = self._bases
+
+        def make(name: str, path: Path, _: Progress) -> None:
+            _make_layer(bases, problem, pull.pose, original, name, path)
+
+        def done(is_ready: bool) -> None:
+            self._keeping = False
+            if is_ready:
+                self._clear()
+            elif self._store.get().transient.gizmo is None:
+                self._set(pull)
+
         self._set(None)
-        self._messages.show(f"Making {name} …")
-
-    def _finish_keeping(self) -> None:
-        """Add a finished layer in place of the edit in progress."""
-        if self._keeping is None or not self._keeping[3].done():
-            return
-        path, name, pull, future = self._keeping
-        self._keeping = None
-        if future.exception() is not None:
-            self._set(pull)
-        else:
-            self._clear()
-        future.result()  # raises its error
-        self._edits.add(path, name, deselect=True)
-        self._messages.show(f"{name} is ready; drag its slider")
+        self._keeping = True
+        try:
+            self._maker.begin(_NAME, make, done, self._builder)
+        except (ProgdfError, OSError):
+            done(False)
+            raise
 
 
-def _pulls(pull: Pull) -> NDArray[np.float64]:
-    """Return the displacements of the handles. [H,3]"""
-    return np.array([handle.pull for handle in pull.pose.handles], np.float64).reshape(-1, 3)
+def _pose(pull: Pull) -> HandlePose:
+    """Return the pose of the tool's handles."""
+    handles = pull.pose.handles
+    turns = [handle.turn or (0.0, 0.0, 0.0) for handle in handles]
+    return HandlePose(
+        np.array([handle.pull for handle in handles], np.float64).reshape(-1, 3),
+        np.array(turns, np.float64).reshape(-1, 3),
+        np.array([handle.scale for handle in handles], np.float64),
+    )
+
+
+def _point_pose(pose: HandlePose, owners: NDArray[np.int64]) -> HandlePose:
+    """Return the pose of the constrained points of a problem."""
+    return HandlePose(pose.pulls[owners], pose.turns[owners], pose.scales[owners])
 
 
 def _stack(problem: _Problem) -> list[Layer]:
@@ -466,22 +476,23 @@ def _stack(problem: _Problem) -> list[Layer]:
 
 
 @one_thread()
-def _prepare(bases: _Bases, problem: _Problem, pulls: NDArray[np.float64], count: int) -> _Prepared:
+def _prepare(bases: _Bases, problem: _Problem, pose: HandlePose, count: int) -> _Prepared:
     """Build the graph, the edit in progress near its first pose, and its composer.
 
     Args:
         bases: cache of the scene under the layers
         problem: what is pulled
-        pulls: displacements of the handles. [H,3]
+        pose: pose of the tool's handles
         count: number of the scene's own Gaussians
 
     Raises:
         ProgdfError: a handle is held, or is not on the part.
     """
     scene = bases.scene(problem, count)
-    constraints = _constraints(bases, problem, scene)
-    live = LivePull(scene, constraints.handles, constraints.hold)
-    first = live.step(pulls[constraints.owners], _FIRST_ROUNDS)
+    handles, hold = _constraints(bases, problem, scene)
+    gripped, owners = with_grips(scene, handles, hold)
+    live = LivePull(scene, gripped, hold)
+    first = live.step(_point_pose(pose, owners), _FIRST_ROUNDS)
     drawn = problem.engine.scene
     edit = edit_in_progress(drawn, live.members, live.channels, _NAME)
 
@@ -490,12 +501,12 @@ def _prepare(bases: _Bases, problem: _Problem, pulls: NDArray[np.float64], count
     stack = _stack(problem)
     for layers in ([*stack, Layer(edit)], stack):  # the first one compiles and plans the steps to come
         composer.update(layers, problem.blend)
-    return _Prepared(problem, constraints.owners, live, edit, composer)
+    return _Prepared(problem, owners, live, edit, composer)
 
 
 @one_thread()
-def _solve(live: LivePull, pulls: NDArray[np.float64]) -> LiveStep:
-    return live.step(pulls, _ROUNDS)
+def _solve(live: LivePull, pose: HandlePose) -> LiveStep:
+    return live.step(pose, _ROUNDS)
 
 
 @one_thread()
@@ -504,18 +515,18 @@ def _make_layer(
 ) -> None:
     """Solve the whole course and write it as an edit, as `progdf edit --pull` does."""
     scene = bases.scene(problem, len(original))
-    constraints = _constraints(bases, problem, scene)
-    handles = [
-        replace(handle, pull=pose.handles[owner].pull)
-        for handle, owner in zip(constraints.handles, constraints.owners.tolist(), strict=True)
-        if any(pose.handles[owner].pull)
+    handles, hold = _constraints(bases, problem, scene)
+    moved = [
+        replace(handle, pull=placed.pull, turn=placed.turn, scale=placed.scale)
+        for handle, placed in zip(handles, pose.handles, strict=True)
+        if placed.moves
     ]
-    course = pull(scene, handles, constraints.hold)
+    course = pull(scene, with_grips(scene, moved, hold)[0], hold)
     save_gdf(path, tidy(original, [Step("pull", course.region, course=course)], name, "pull"))
 
 
-def _constraints(bases: _Bases, problem: _Problem, scene: Gaussians) -> _Constraints:
-    """Return the constrained points and the held region of a problem."""
+def _constraints(bases: _Bases, problem: _Problem, scene: Gaussians) -> tuple[list[Handle], Region | None]:
+    """Return the handles at rest, and the held region, of a problem."""
     count = len(scene)
     mask = np.ones(count, bool)
     if problem.limit != selection.EMPTY_MASK:
@@ -537,20 +548,13 @@ def _constraints(bases: _Bases, problem: _Problem, scene: Gaussians) -> _Constra
     if problem.pins:
         near = tree.query(np.array(problem.pins), min(_PIN_GAUSSIANS, len(allowed)))[1]
         held[allowed[near.ravel()]] = True
-    movable = np.flatnonzero(mask & ~held)
-    handles = list[Handle]()
-    owners = list[int]()
-    for index, point in enumerate(problem.points):
-        grips = np.array([point])
-        if problem.radius is not None:
-            grips = grip_points(scene, point, movable, problem.radius)
-        for x, y, z in grips.tolist():
-            away = float(np.linalg.norm(np.array([x, y, z]) - np.array(point)))
-            falloff = None if problem.radius is None else problem.radius - away
-            handles.append(Handle(region, (x, y, z), (0.0, 0.0, 0.0), falloff))
-            owners.append(index)
+    still = (0.0, 0.0, 0.0)
+    handles = [
+        Handle(region, point, still, problem.radius, still if framed else None)
+        for point, framed in zip(problem.points, problem.framed, strict=True)
+    ]
     hold = from_mask("held", torch.from_numpy(held)) if held.any() else None
-    return _Constraints(tuple(handles), np.array(owners), hold)
+    return handles, hold
 
 
 def _own(packed: bytes, problem: _Problem, count: int) -> NDArray[np.bool_]:

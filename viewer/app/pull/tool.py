@@ -16,34 +16,26 @@ from imgui_bundle import imgui
 from progdf.camera import Camera
 from progdf.quaternions import normalize_quats, rotation_matrices
 from viewer.camera.decal_warp import Floats, project, vec3
-from viewer.camera.view_camera import Vec3, axes
+from viewer.camera.view_camera import Vec3
+from viewer.render.decal_surfaces import DecalSurfaces
 from viewer.render.picking import SURFACE_OPACITY, seen_at
-from viewer.state.transient import Pull, PullAxis, PullDrag, PullHandle, PullPose
+from viewer.state.transient import Pull, PullAxis, PullDrag, PullHandle
 from viewer.state.workspace import Workspace
-from viewer.ui.context import PALETTE, UiContext, u32
 from viewer.ui.keys import Keys
 from viewer.ui.pointer import PointerContext
-from viewer.ui.widgets import accent_button, elide, inert, plate, small, tip
+
+from . import transform
+from .marks import direction, draw_bar
+from .transform import redo, undo, with_pose
 
 _Item = TypeVar("_Item")
 
 _STEP = 1.1  # factor of the radius per notch of the wheel
 _REACH_PX = 10.0  # at 1×: the mouse takes a handle within this distance
 _CLICK_PX = 3.0  # at 1×: a press that moves no further is a click
-_HANDLE_PX = 5.0  # at 1×: radius of a handle
-_PIN_PX = 4.0  # at 1×: half the side of a pin
-_CIRCLE_POINTS = 64  # corners of the circle that shows the radius
 _MAX_PULL = 20.0  # largest displacement, in radii of the scene
 _MIN_RADIUS = 1e-3  # smallest radius of the influence, in radii of the scene
 _MAX_RADIUS = 4.0  # largest radius, in radii of the scene
-_PLATE_PX = 14.0  # at 1×: distance of the buttons from the upper edge of the picture
-_LOWER_PX = 64.0  # the same below the options of a tool or a selection
-_HINT_PX = 430.0  # at 1×: width of the line below the buttons
-_HANDLE_COLOR = (1.0, 0.72, 0.05, 1.0)
-_PIN_COLOR = (0.35, 0.75, 1.0, 1.0)
-_OUTLINE_COLOR = (0.0, 0.0, 0.0, 0.6)
-_AXES: dict[str, Vec3] = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-_AXIS_COLORS = {"x": (0.93, 0.30, 0.32), "y": (0.48, 0.79, 0.25), "z": (0.26, 0.54, 0.95)}
 
 
 def is_free(work: Workspace) -> bool:
@@ -53,11 +45,13 @@ def is_free(work: Workspace) -> bool:
     return not (view.select.tool or view.brush.active or view.color_brush.tool or picks)
 
 
-def take_keys(work: Workspace, keys: Keys) -> tuple[Workspace, Keys]:
-    """Handle the keys of the Pull tool: X, Y and Z, undo and redo; return the unused keys."""
+def take_keys(work: Workspace, pointer: PointerContext, keys: Keys) -> tuple[Workspace, Keys]:
+    """Handle the keys of the Pull tool: transforms, X, Y and Z, undo and redo; return the unused keys."""
     pull = work.transient.gizmo
     if not isinstance(pull, Pull) or imgui.get_io().want_text_input:
         return work, keys
+    if pull.drag is None:
+        pull, keys = transform.take_keys(pull, pointer, keys)
     unused = []
     for press in keys.pressed:
         changed: Pull | None = None
@@ -66,9 +60,9 @@ def take_keys(work: Workspace, keys: Keys) -> tuple[Workspace, Keys]:
             chosen = axis[press.chord]
             drag = replace(pull.drag, axis="" if pull.drag.axis == chosen else chosen)
             changed = replace(pull, drag=drag)
-        elif press.chord == "Ctrl+Z" and pull.drag is None and pull.past:
+        elif press.chord == "Ctrl+Z" and not pull.is_held and pull.past:
             changed = undo(pull)
-        elif press.chord in ("Ctrl+Shift+Z", "Ctrl+Y") and pull.drag is None and pull.future:
+        elif press.chord in ("Ctrl+Shift+Z", "Ctrl+Y") and not pull.is_held and pull.future:
             changed = redo(pull)
         if changed is None:
             unused.append(press)
@@ -78,36 +72,32 @@ def take_keys(work: Workspace, keys: Keys) -> tuple[Workspace, Keys]:
     return replace(work, transient=transient), replace(keys, pressed=tuple(unused))
 
 
-def undo(pull: Pull) -> Pull:
-    """Return to the pose before the last change."""
-    return replace(pull, pose=pull.past[-1], past=pull.past[:-1], future=(*pull.future, pull.pose))
-
-
-def redo(pull: Pull) -> Pull:
-    """Return to the pose that was undone last."""
-    return replace(pull, pose=pull.future[-1], future=pull.future[:-1], past=(*pull.past, pull.pose))
-
-
-def with_pose(pull: Pull, pose: PullPose, before: PullPose | None = None) -> Pull:
-    """Return the pull with a new pose; undo returns to `before`, by default the current one."""
-    before = pull.pose if before is None else before
-    if pose == before:
-        return replace(pull, pose=pose)
-    return replace(pull, pose=pose, past=(*pull.past, before), future=())
-
-
 def update(
-    pull: Pull, work: Workspace, pointer: PointerContext, pressed: Sequence[str]
+    pull: Pull,
+    work: Workspace,
+    pointer: PointerContext,
+    surfaces: DecalSurfaces,
+    pressed: Sequence[str],
 ) -> tuple[Pull, str, bool]:
-    """Handle this frame's mouse input and draw the buttons.
+    """Handle this frame's mouse input and draw the gizmo and the buttons.
+
+    Args:
+        pull: the tool with its handles
+        work: the workspace
+        pointer: the view
+        surfaces: cache of surfaces, for transforms by keys
+        pressed: chords pressed in this frame
 
     Returns:
         The changed tool, its request ("" for none), and True if it takes the mouse.
     """
-    moved = move_pull(pull, pointer, is_free(work), pressed)
+    on_dot = _near(pull, pointer)[0] is not None
+    moved, is_taken = transform.transform_picked(pull, pointer, surfaces, pressed, on_dot)
+    is_idle = moved.transform is None and not is_taken
+    moved = move_pull(moved, pointer, is_free(work) and is_idle, pressed)
     below = bool(work.view.selection.count or work.view.selection.hidden or work.view.painted)
     moved, request = draw_bar(moved, pointer, below or not is_free(work))
-    takes = pull.drag is not None or (is_free(work) and takes_mouse(moved, pointer))
+    takes = is_taken or pull.drag is not None or (is_free(work) and takes_mouse(moved, pointer))
     return moved, request, takes
 
 
@@ -255,7 +245,8 @@ def _press(pull: Pull, pointer: PointerContext) -> Pull:
         if pin is not None:
             return with_pose(pull, replace(pose, pins=_without(pose.pins, pin)))
         if handle is not None:
-            return with_pose(pull, replace(pose, handles=_without(pose.handles, handle)))
+            freed = replace(pose, handles=_without(pose.handles, handle))
+            return with_pose(replace(pull, picked=None), freed)
         return pull
     found = _pick(pull, pointer)
     normal = (0.0, 0.0, 1.0) if found is None else _normal(pointer, found[2])
@@ -270,7 +261,8 @@ def _press(pull: Pull, pointer: PointerContext) -> Pull:
     start = pose.handles[handle].target
     pixel = project(np.array(start), _camera(pointer))[0]
     grab = (pointer.cursor[0] - float(pixel[0]), pointer.cursor[1] - float(pixel[1]))
-    drag = PullDrag(handle, start, grab, normal, pull.pose, is_new=is_new)
+    surface = pointer.known_surface(pointer.shown.camera, pointer.size)
+    drag = PullDrag(handle, start, grab, normal, pull.pose, surface, is_new=is_new)
     return replace(pull, pose=pose, drag=drag)
 
 
@@ -304,17 +296,19 @@ def _drag(pull: Pull, drag: PullDrag, pointer: PointerContext, pressed: Sequence
 
 
 def _release(pull: Pull, drag: PullDrag) -> Pull:
-    """Return the pull after the button went up.
+    """Return the pull after the button went up. The handle is picked then.
 
     A click on the surface pins it: where it has moved by a handle, else by a pin.
     """
     pose = pull.pose
     handle = pose.handles[drag.index]
+    picked: int | None = drag.index
     if not drag.moved and not (drag.is_new and any(handle.pull)):
         pose = drag.before
         if drag.is_new:
             pose = replace(pose, pins=(*pose.pins, handle.point))
-    return with_pose(replace(pull, drag=None, hovered_for=None), pose, drag.before)
+            picked = pull.picked
+    return with_pose(replace(pull, drag=None, picked=picked, hovered_for=None), pose, drag.before)
 
 
 def _target(drag: PullDrag, pointer: PointerContext) -> Vec3:
@@ -324,11 +318,11 @@ def _target(drag: PullDrag, pointer: PointerContext) -> Vec3:
     pixel = (pointer.cursor[0] - drag.grab[0], pointer.cursor[1] - drag.grab[1])
     depth = float(project(start, camera)[1])
     aimed = _unproject(camera, pixel, depth)
-    direction = _direction(drag)
-    if direction is None:
+    axis = direction(drag)
+    if axis is None:
         return vec3(aimed)
     # the point on the line through the start that is nearest to the pointer's ray
-    line = np.array(direction)
+    line = np.array(axis)
     ray = aimed - camera.position.double().numpy()
     ray /= max(float(np.linalg.norm(ray)), 1e-12)
     across = line - float(line @ ray) * ray
@@ -336,117 +330,3 @@ def _target(drag: PullDrag, pointer: PointerContext) -> Vec3:
     if slope < 1e-4:
         return drag.start
     return vec3(start + line * (float(across @ (aimed - start)) / slope))
-
-
-def _direction(drag: PullDrag) -> Vec3 | None:
-    """Return the direction that a drag is restricted to; None for the plane of the view."""
-    if drag.axis:
-        return _AXES[drag.axis]
-    return drag.normal if imgui.get_io().key_alt else None
-
-
-def draw_bar(pull: Pull, pointer: PointerContext, below: bool) -> tuple[Pull, str]:
-    """Draw the options and buttons of the tool; return the pull and the request, "" for none.
-
-    Args:
-        below: the options of a tool or a selection take the upper edge of the picture
-    """
-    scale = pointer.ui.scale
-    at = (pointer.area.width / 2, (_LOWER_PX if below else _PLATE_PX) * scale)
-    request = ""
-    with plate("placing", at, pointer.ui, (0.5, 0.0)):
-        imgui.align_text_to_frame_padding()
-        imgui.text("Pull" if pull.whole else f"Pull, radius {pull.radius:.3g}")
-        imgui.same_line()
-        whole = imgui.checkbox("Whole part", pull.whole)[1]
-        tip("Move all that is connected, except pins and what is held; else only what lies in the radius")
-        holds = pull.holds_selection
-        if pointer.shown.selection.count:
-            imgui.same_line()
-            holds = imgui.checkbox("Hold selection", holds)[1]
-            tip("Keep the selection in place; else only the selection moves")
-        imgui.same_line()
-        with inert(not pull.pose.handles):
-            if accent_button("Keep", (72.0 * scale, 0.0)):
-                request = pull.enter_request
-        tip("Make a layer with a slider (Enter)")
-        imgui.same_line()
-        if imgui.button("Cancel", (72.0 * scale, 0.0)):
-            request = "leave_pull"
-        hint = elide(pull.status or _hint(pull), _HINT_PX * scale)
-        small(hint, PALETTE.dim, imgui.calc_text_size(hint).x)
-    return replace(pull, whole=whole, holds_selection=holds), request
-
-
-def _hint(pull: Pull) -> str:
-    if pull.drag is not None:
-        return "Alt: along the normal. X, Y, Z: along an axis. Wheel: radius. Esc: back"
-    if pull.pose.handles:
-        return "Drag a dot again, or pull elsewhere. Click: pin. Shift+click: free. Enter: keep"
-    return "Drag the surface. Wheel: radius. Click: pin. Shift+click: free. Esc: leave"
-
-
-def draw_marks(pull: Pull, pointer: PointerContext) -> None:
-    """Draw the radius, the handles, the pins, and the axis of the drag."""
-    ui = pointer.ui
-    if pull.drag is not None:
-        handle = pull.pose.handles[pull.drag.index]
-        _draw_line(pull.drag, pointer)
-        if not pull.whole:
-            _draw_circle(handle.target, pull.radius, pointer)
-    elif pull.hovered is not None and not pull.whole:
-        _draw_circle(pull.hovered, pull.radius, pointer)
-    canvas = imgui.get_background_draw_list()
-    for x, y in _places(pull.pose.pins, pointer):
-        for size, color in ((_PIN_PX + 1.5, _OUTLINE_COLOR), (_PIN_PX, _PIN_COLOR)):
-            half = size * ui.scale
-            canvas.add_rect_filled((x - half, y - half), (x + half, y + half), u32(color))
-    for x, y in _places([handle.target for handle in pull.pose.handles], pointer):
-        canvas.add_circle_filled((x, y), (_HANDLE_PX + 1.5) * ui.scale, u32(_OUTLINE_COLOR))
-        canvas.add_circle_filled((x, y), _HANDLE_PX * ui.scale, u32(_HANDLE_COLOR))
-
-
-def _places(points: Sequence[Vec3], pointer: PointerContext) -> list[tuple[float, float]]:
-    """Return the window positions of the points in front of the camera."""
-    if not points:
-        return []
-    density = imgui.get_io().display_framebuffer_scale
-    pixels, depths = project(np.array(points), _camera(pointer))
-    shown = pixels[depths > pointer.engine.near]
-    return [((x + pointer.left) / density.x, y / density.y) for x, y in shown.tolist()]
-
-
-def _draw_circle(center: Vec3, radius: float, pointer: PointerContext) -> None:
-    """Draw the outline of a ball around a point of the surface."""
-    turn = axes(pointer.shown.camera)
-    angles = np.linspace(0.0, 2.0 * math.pi, _CIRCLE_POINTS, endpoint=False)
-    right = np.array(turn.right)
-    up = np.array(turn.up)
-    points = np.array(center) + radius * (np.cos(angles)[:, None] * right + np.sin(angles)[:, None] * up)
-    places = _places([vec3(point) for point in points], pointer)
-    _outline(places, pointer.ui)
-
-
-def _outline(places: list[tuple[float, float]], ui: UiContext) -> None:
-    if len(places) < 2:
-        return
-    canvas = imgui.get_background_draw_list()
-    closed = imgui.ImDrawFlags_.closed.value
-    corners = [imgui.ImVec2(x, y) for x, y in places]
-    for color, width in ((_OUTLINE_COLOR, 3.0), (PALETTE.handle, 1.25)):
-        canvas.add_polyline([*corners], u32(color), width * ui.scale, closed)
-
-
-def _draw_line(drag: PullDrag, pointer: PointerContext) -> None:
-    """Draw the line that the handle stays on."""
-    direction = _direction(drag)
-    if direction is None:
-        return
-    length = pointer.facts.bounds.radius
-    start = np.array(drag.start)
-    ends = [vec3(start + sign * length * np.array(direction)) for sign in (-1.0, 1.0)]
-    places = _places(ends, pointer)
-    if len(places) == 2:
-        first, last = places
-        color = (*_AXIS_COLORS[drag.axis], 0.9) if drag.axis else (*PALETTE.handle[:3], 0.9)
-        imgui.get_background_draw_list().add_line(first, last, u32(color), 1.5 * pointer.ui.scale)

@@ -1,0 +1,1 @@
+"""Pull tool: its handles, their transforms and their drawing."""
