@@ -90,6 +90,8 @@ def _title(pull: Pull, pointer: PointerContext) -> str:
 def _hint(pull: Pull) -> str:
     if pull.transform is not None and pull.transform.typed is not None:
         return "X, Y, Z: axis. Type a number. Ctrl: steps. Enter or click: take. Esc: back"
+    if pull.transform is not None:
+        return "Ctrl: steps of 15° and 0.1. Esc: back"
     if pull.picked_handle is not None and pull.drag is None:
         return "Rings, R, S: turn, scale. G: move. Click: pin. Shift+click: free. Enter: keep"
     if pull.drag is not None:
