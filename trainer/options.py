@@ -32,6 +32,7 @@ Quantize = Literal["off", "nf4"]
 Fill = Literal["none", "picture", "smooth", "surface"]
 Removal = Literal["auto", "never", "always"]
 CarryOn = Literal["auto", "never", "always"]
+StrengthsBy = Literal["editor", "blend"]
 Device = Literal["auto", "cpu"]
 Engine = Literal["auto", "cpu", "warp"]
 
@@ -100,6 +101,14 @@ class EditorOptions:
     """pictures: remove the region instead of recoloring it (always, never, or as the picture suggests)."""
     carry_on: CarryOn = "auto"
     """pictures: apply the color map to parts that no picture shows (always, never, auto: if it fits)."""
+    prompt: Annotated[str, absent_option("TEXT", "none")] = ""
+    """command: text for its {prompt}."""
+    strengths_by: StrengthsBy = "editor"
+    """command: a program without a strength makes the finished edit; blend cross-fades to it."""
+    edit_workers: int = 1
+    """command: simultaneous calls of the program, 1 to 64."""
+    edit_timeout: float = 300.0
+    """command: seconds after which a call is ended and made again, 1 to 86400."""
     seed: Fixed[int] = 0  # seed of the noise, the same in every view
     cache: Fixed[Path | None] = None  # folder for painted pictures; None saves none
     at: Annotated[str, absent_option("X,Y,SIZE[,ANGLE]", "none")] = ""
@@ -394,6 +403,8 @@ class BatchOptions:
     """Continue the batch in OUT: reuse finished runs, resume stopped ones, start the others."""
     only: Annotated[str, absent_option("PATTERN", "all")] = ""
     """Jobs whose SCENE/NAME or NAME matches, such as "shoes/*" or "blue*"."""
+    allow_commands: bool = False
+    """Run the programs that command: editors of the catalogue name; read the catalogue first."""
     keep_going: bool = False
     """Start even if some jobs cannot be trained; these count as failed."""
     dry_run: bool = False

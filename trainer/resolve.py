@@ -120,7 +120,9 @@ def resolve(options: TrainOptions) -> TrainOptions:
 
 def recorded_options(options: TrainOptions) -> TrainOptions:
     """Return resolved options without the output folder and the settings that do not affect the result."""
-    return replace(options, out=Path(), quick=False, threads=0, resume=False)
+    usual = EditorOptions("")
+    editor = replace(options.editor, edit_workers=usual.edit_workers, edit_timeout=usual.edit_timeout)
+    return replace(options, out=Path(), editor=editor, quick=False, threads=0, resume=False)
 
 
 def resolve_kind(
@@ -179,6 +181,8 @@ def check_options(options: TrainOptions) -> None:
         ("--threads", options.threads, 0, MAX_THREADS),
         ("--edit-steps", editor.edit_steps, 1, 1000),
         ("--edit-size", editor.edit_size, 32, 4096),
+        ("--edit-workers", editor.edit_workers, 1, 64),
+        ("--edit-timeout", editor.edit_timeout, 1, 86_400),
         ("--lift-threshold", region.lift_threshold, 0, 1),
         ("--box-threshold", region.box_threshold, 0, 1),
     )

@@ -26,7 +26,7 @@ from typing import Any, BinaryIO, Protocol, cast
 
 from progdf.errors import ProgdfError
 from progdf.io.atomic import LOCK, LockedError, hold_lock, make_folder
-from progdf.terminal import escape_text, file_size, format_count, format_duration, print_line
+from progdf.terminal import escape_text, file_size, format_count, format_duration, print_line, shorten
 from trainer.editors import editor_row
 from trainer.options import BatchOptions, check_ranges
 from trainer.resolve import count_threads
@@ -347,6 +347,14 @@ def run(jobs: Sequence[BatchJob], workers: int = 0, address: str = "") -> Iterat
         yield from run_jobs(tasks, pool)
 
 
+def _program_fault(job: BatchJob) -> str:
+    """Return the fault of a job that would run a program that the catalogue names."""
+    return (
+        f"it runs a program ({shorten(job.options.editor.editor)}); "
+        "if you trust the catalogue, add --allow-commands"
+    )
+
+
 def batch(options: BatchOptions) -> int:
     """Run `progdf batch`.
 
@@ -360,6 +368,10 @@ def batch(options: BatchOptions) -> int:
     """
     check_ranges(("--workers", options.workers, 0, 4096))
     jobs, faults = read_catalogue(options.catalogue, options.out)
+    if not options.allow_commands:
+        programs = [job for job in jobs if editor_row(job.options.editor).runs_program]
+        jobs = [job for job in jobs if job not in programs]
+        faults += [f"{job.key}: {_program_fault(job)}" for job in programs]
     rows = read_rows(options.out)
     if rows and not (options.resume or options.dry_run):
         raise ProgdfError(f"{options.out} holds a batch; add --resume to continue it")

@@ -18,6 +18,7 @@ from trainer.views.view import RegionThumbnail, View
 
 from .adapters import default_model
 from .base import EditorInput, EditorRow, ImageEditor
+from .command import check_command_editor, command
 from .decal import check_decal, decal
 from .instruct import IMAGE_SIZE, check_instruct, instruct
 from .paint import check_paint, paint
@@ -134,6 +135,17 @@ EDITORS = {
         image_size=IMAGE_SIZE,
         options=("model", "guidance", "edit_steps", "anchor", "quantize", "device", "edit_size"),
         remedy="make the prompt more specific, or use --kind geometry if parts move",
+    ),
+    "command": EditorRow(
+        command,
+        "command:'magick {input} -modulate 100,{100..30} {output}'",
+        check_command_editor,
+        per_view=True,
+        knows_kind=False,
+        slow_strengths=True,
+        runs_program=True,
+        options=("prompt", "strengths_by", "edit_workers", "edit_timeout"),
+        remedy="let the program edit all views alike, or use --kind geometry if parts move",
     ),
     "remove": EditorRow(
         remove,

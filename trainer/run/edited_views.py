@@ -133,9 +133,12 @@ class EditedViews:
         spec = self._options.editor.editor
         views = self._setup.views
         editor = self.editor
-        note = editor_row(self._options.editor).note(self._options.editor.text)
+        row = editor_row(self._options.editor)
+        note = row.note(self._options.editor.text)
         if note:
             self._log.say(note)
+        if row.runs_program:
+            self._call_ahead(views)
         self.approach, self.trial = choose_approach(self._options, self._setup, editor, self._log)
         optimization = self.optimization
         strengths = editor_strengths(editor, optimization.stages)
@@ -150,6 +153,21 @@ class EditedViews:
         if rest:
             self._edit(rest, [view for view in views if view.camera.name in self._on_the_way])
 
+    def _call_ahead(self, views: Sequence[View]) -> None:
+        """Let the editor's program make the finished edit of all views in parallel; its cache keeps them."""
+        with (
+            self._log.steps("edit", len(views)) as advance,
+            ThreadPoolExecutor(self._options.editor.edit_workers) as pool,
+        ):
+            calls = [pool.submit(self.editor.edit, view, 1.0) for view in views]
+            try:
+                for count, call in enumerate(calls, 1):
+                    call.result()
+                    advance(count, "strength 1")
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+
     def _edit(self, strengths: Sequence[float], views: Sequence[View]) -> Pictures:
         """Edit views at new strengths, save them, and return all edited views."""
         editor = self.editor
@@ -161,7 +179,10 @@ class EditedViews:
             within = views
             if self._options.region.region == CHANGED:  # few members are found for paint finer than Gaussians
                 within = [view.with_painted([editor.edit(view, 1.0)]) for view in views]
-            edited = edit_views(row.is_parallel, within, new, self._folder, is_confined, advance, course)
+            workers = threads() if row.is_parallel else 0
+            if row.runs_program:
+                workers = self._options.editor.edit_workers
+            edited = edit_views(workers, within, new, self._folder, is_confined, advance, course)
             self._pictures.update(edited)
         listed = ", ".join(f"{s:g}" for s in strengths)
         self._log.say(f"{self._options.editor.editor}: a {self.approach.kind} edit at strength {listed}")
@@ -203,7 +224,7 @@ class EditedViews:
 
 
 def edit_views(
-    is_parallel: bool,
+    workers: int,
     views: Sequence[View],
     strengths: Sequence[float],
     folder: RunFolder,
@@ -214,7 +235,8 @@ def edit_views(
     """Edit every view at every strength. Training uses the 8-bit pictures saved to disk.
 
     Args:
-        is_parallel: see `EditorRow.is_parallel`
+        workers: number of views that are edited at the same time, each at all strengths; 0: one picture after
+            another, strength by strength
         views: all views
         strengths: requested strengths
         folder: folder of the pictures
@@ -233,10 +255,10 @@ def edit_views(
 
     add_pictures(folder.views, [folder.view("edited", v.camera.name, s) for s in strengths for v in views])
     edited: dict[float, list[Tensor]] = {strength: [] for strength in strengths}
-    groups = [strengths] if is_parallel and strengths else [[strength] for strength in strengths]
+    groups = [strengths] if workers and strengths else [[strength] for strength in strengths]
     requests = [[(strength, i) for strength in group] for group in groups for i in range(len(views))]
-    with ThreadPoolExecutor(threads()) as pool:
-        made = pool.map(edit, requests) if is_parallel else map(edit, requests)
+    with ThreadPoolExecutor(workers or 1) as pool:
+        made = pool.map(edit, requests) if workers else map(edit, requests)
         try:
             for request, pictures in zip(requests, made, strict=True):
                 for (strength, _), picture in zip(request, pictures, strict=True):

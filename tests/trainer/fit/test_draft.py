@@ -99,4 +99,4 @@ def test_no_extra_strengths_request_no_pictures(tmp_path: Path) -> None:
     """Cover a slider that is already even with one recording."""
     case = small("body")
     editor = make_editor(EditorOptions(GRADE), case.scene, case.region, case.views)
-    assert edit_views(True, case.views, (), RunFolder(tmp_path), True, lambda *_: None, editor.course) == {}
+    assert edit_views(2, case.views, (), RunFolder(tmp_path), True, lambda *_: None, editor.course) == {}
