@@ -8,7 +8,7 @@ APT    := $(if $(shell command -v apt-get),apt,none)
 # that wait let the other workers have the core, and what they import is kept compiled for their children.
 PYTEST := env -u PYTHONDONTWRITEBYTECODE OMP_WAIT_POLICY=PASSIVE $(BIN)/python -m pytest -n auto --dist worksteal
 
-EXTRAS := styles,diffusion,segment,fill,clip,colmap,video,formats,usd,cluster,gpu,jupyter,recipes
+EXTRAS := styles,diffusion,api,segment,fill,clip,colmap,video,formats,usd,cluster,gpu,jupyter,recipes
 
 .PHONY: setup extras gl window browser demo test test-cpus test-all lint bench pictures examples
 .DELETE_ON_ERROR:

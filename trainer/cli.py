@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 
 from progdf.cli.options import parse_options
+from progdf.errors import ProgdfError
 from progdf.terminal import print_line
 
 from .options import (
@@ -23,8 +25,30 @@ def train(argv: Sequence[str]) -> int:
     options = train_options(argv)
     from trainer.run.run import train as run  # late import: --help and option errors do not need torch
 
+    if options.editor.family == "api":
+        _ask_to_send(options)
     run(options)
     return 0
+
+
+def _ask_to_send(options: TrainOptions) -> None:
+    """Print where pictures are sent, and ask once if that is another machine and --yes is not given.
+
+    Raises:
+        ProgdfError: the user declines, or nobody can be asked.
+    """
+    from trainer.editors.served import check_api, explain_sending
+    from trainer.resolve import resolve
+
+    resolved = resolve(options)
+    line = explain_sending(resolved.editor, resolved.views.views)
+    print(line, file=sys.stderr)
+    if options.editor.yes or check_api(options.editor.text, resolved.editor).is_local:
+        return
+    if not sys.stdin.isatty():
+        raise ProgdfError("pictures are sent to another machine only if you agree; add --yes")
+    if input("Send them? [y/N] ").strip().lower() not in ("y", "yes"):
+        raise ProgdfError("nothing was sent; use a server on this machine, or answer y")
 
 
 def batch(argv: Sequence[str]) -> int:

@@ -82,15 +82,15 @@ class EditorOptions:
     editor: str
     """Editor of the views, such as recolor:#3060d0, style:14 or instruct:"a golden bear" (docs/cli.md)."""
     model: Annotated[str, absent_option("STR", "a model on this machine that fits")] = ""
-    """instruct: id or folder of a diffusers pipeline (docs/cli.md)."""
+    """instruct: id or folder of a diffusers pipeline; api: name of the server's model (docs/cli.md)."""
     guidance: Annotated[str, absent_option("NUMBER[,NUMBER]", "the model's own")] = ""
     """instruct: guidance of the text and, after a comma, of the image if supported (paper: 7.5,1.5)."""
     edit_steps: Annotated[int | None, absent_option("INT", "the model's own")] = None
     """instruct: denoising steps per picture, 1 to 1000 (paper: 20)."""
     edit_size: Annotated[int | None, absent_option("INT", "the model's own")] = None
-    """style: longer side of the paintings; instruct: side of the painted square; 32 to 4096 pixels."""
+    """style: longer side of the paintings; instruct, api: side of the painted square; 32 to 4096 pixels."""
     anchor: Annotated[Path | None, absent_option("PNG", "the model paints one")] = None
-    """instruct: picture of one view (Ctrl+F2), edited by you, used as the reference of all views."""
+    """instruct, api: picture of one view (Ctrl+F2), edited by you, used as the reference of all views."""
     quantize: Quantize = "off"
     """instruct: nf4 loads large parts in 4 bits, with a quarter of the memory and a small loss."""
     device: Device = "auto"
@@ -106,9 +106,17 @@ class EditorOptions:
     strengths_by: StrengthsBy = "editor"
     """command: a program without a strength makes the finished edit; blend cross-fades to it."""
     edit_workers: int = 1
-    """command: simultaneous calls of the program, 1 to 64."""
+    """command, api: simultaneous calls, 1 to 64."""
     edit_timeout: float = 300.0
-    """command: seconds after which a call is ended and made again, 1 to 86400."""
+    """command, api: seconds after which a call is ended and made again, 1 to 86400."""
+    api_url: Annotated[str, absent_option("URL", "none")] = ""
+    """api: address of a server with OpenAI's images API; its key is read from OPENAI_API_KEY."""
+    api_references: int = 2
+    """api: reference pictures that the model accepts beside the view, 0 to 2."""
+    price_per_call: float = 0.0
+    """api: price of one call, in any currency, from which the cost of the run is estimated."""
+    yes: bool = False
+    """api: send pictures to another machine without asking."""
     seed: Fixed[int] = 0  # seed of the noise, the same in every view
     cache: Fixed[Path | None] = None  # folder for painted pictures; None saves none
     at: Annotated[str, absent_option("X,Y,SIZE[,ANGLE]", "none")] = ""
@@ -404,7 +412,7 @@ class BatchOptions:
     only: Annotated[str, absent_option("PATTERN", "all")] = ""
     """Jobs whose SCENE/NAME or NAME matches, such as "shoes/*" or "blue*"."""
     allow_commands: bool = False
-    """Run the programs that command: editors of the catalogue name; read the catalogue first."""
+    """Let the catalogue run programs (command:) and send pictures (api:); read the catalogue first."""
     keep_going: bool = False
     """Start even if some jobs cannot be trained; these count as failed."""
     dry_run: bool = False

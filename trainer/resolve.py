@@ -121,7 +121,13 @@ def resolve(options: TrainOptions) -> TrainOptions:
 def recorded_options(options: TrainOptions) -> TrainOptions:
     """Return resolved options without the output folder and the settings that do not affect the result."""
     usual = EditorOptions("")
-    editor = replace(options.editor, edit_workers=usual.edit_workers, edit_timeout=usual.edit_timeout)
+    editor = replace(
+        options.editor,
+        edit_workers=usual.edit_workers,
+        edit_timeout=usual.edit_timeout,
+        price_per_call=usual.price_per_call,
+        yes=usual.yes,
+    )
     return replace(options, out=Path(), editor=editor, quick=False, threads=0, resume=False)
 
 
@@ -181,6 +187,8 @@ def check_options(options: TrainOptions) -> None:
         ("--threads", options.threads, 0, MAX_THREADS),
         ("--edit-steps", editor.edit_steps, 1, 1000),
         ("--edit-size", editor.edit_size, 32, 4096),
+        ("--api-references", editor.api_references, 0, 2),
+        ("--price-per-call", editor.price_per_call, 0, 1e6),
         ("--edit-workers", editor.edit_workers, 1, 64),
         ("--edit-timeout", editor.edit_timeout, 1, 86_400),
         ("--lift-threshold", region.lift_threshold, 0, 1),

@@ -30,18 +30,21 @@ UP = torch.tensor([0.0, 1.0, 0.0])
 
 
 class WholeViews:
-    """Painter of whole views at their own size; see `InstructEditor`."""
+    """Painter of whole views at their own size; see `FramePainter`."""
+
+    has_start = True
+    workers = 1
 
     def frame(self, view: View) -> tuple[Crop, Camera]:
         """Return the whole view."""
         return (0, 0, view.camera.width, view.camera.height), view.camera
 
     def original(self, view: View) -> Tensor:
-        """See `InstructEditor.original`."""
+        """See `FramePainter.original`."""
         return view.image
 
     def paste(self, view: View, painted: Tensor) -> Tensor:
-        """See `InstructEditor.paste`."""
+        """See `FramePainter.paste`."""
         return painted
 
 
@@ -75,7 +78,7 @@ class IdealPainter(WholeViews):
         source: Tensor | None = None,
         seed: int | None = None,
     ) -> Tensor:
-        """See `InstructEditor.paint`."""
+        """See `FramePainter.paint`."""
         self.calls += 1
         index = self.view_of(picture)
         inside = self.views[index].mask > 0.05

@@ -347,12 +347,15 @@ def run(jobs: Sequence[BatchJob], workers: int = 0, address: str = "") -> Iterat
         yield from run_jobs(tasks, pool)
 
 
-def _program_fault(job: BatchJob) -> str:
-    """Return the fault of a job that would run a program that the catalogue names."""
-    return (
-        f"it runs a program ({shorten(job.options.editor.editor)}); "
-        "if you trust the catalogue, add --allow-commands"
-    )
+def _outside_fault(job: BatchJob) -> str:
+    """Return the fault of a job that runs a program or sends pictures, as the catalogue says; else ""."""
+    row = editor_row(job.options.editor)
+    trust = "if you trust the catalogue, add --allow-commands"
+    if row.runs_program:
+        return f"it runs a program ({shorten(job.options.editor.editor)}); {trust}"
+    if row.sends_pictures:
+        return f"it sends pictures to {job.options.editor.api_url or 'a server'}; {trust}"
+    return ""
 
 
 def batch(options: BatchOptions) -> int:
@@ -369,9 +372,9 @@ def batch(options: BatchOptions) -> int:
     check_ranges(("--workers", options.workers, 0, 4096))
     jobs, faults = read_catalogue(options.catalogue, options.out)
     if not options.allow_commands:
-        programs = [job for job in jobs if editor_row(job.options.editor).runs_program]
-        jobs = [job for job in jobs if job not in programs]
-        faults += [f"{job.key}: {_program_fault(job)}" for job in programs]
+        refused = {job.key: fault for job in jobs if (fault := _outside_fault(job))}
+        jobs = [job for job in jobs if job.key not in refused]
+        faults += [f"{key}: {fault}" for key, fault in refused.items()]
     rows = read_rows(options.out)
     if rows and not (options.resume or options.dry_run):
         raise ProgdfError(f"{options.out} holds a batch; add --resume to continue it")

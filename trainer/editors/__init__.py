@@ -34,6 +34,7 @@ from .pictures import (
     removal_pictures,
 )
 from .procedural import darken, grade, night, paint_of, recolor, remove, stops_of, stripes, tint
+from .served import api, check_api
 from .style import check_style, style
 
 
@@ -146,6 +147,28 @@ EDITORS = {
         runs_program=True,
         options=("prompt", "strengths_by", "edit_workers", "edit_timeout"),
         remedy="let the program edit all views alike, or use --kind geometry if parts move",
+    ),
+    "api": EditorRow(
+        api,
+        'api:"turn him into a marble statue"',
+        check_api,
+        per_view=True,
+        knows_kind=False,
+        slow_strengths=True,
+        sends_pictures=True,
+        image_size=IMAGE_SIZE,
+        options=(
+            "model",
+            "api_url",
+            "api_references",
+            "price_per_call",
+            "yes",
+            "anchor",
+            "edit_size",
+            "edit_workers",
+            "edit_timeout",
+        ),
+        remedy="make the prompt more specific, or use --kind geometry if parts move",
     ),
     "remove": EditorRow(
         remove,

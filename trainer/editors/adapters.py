@@ -35,6 +35,27 @@ _WORKING_BYTES_PER_MEGAPIXEL = 3e9  # added per megapixel of the painted area
 _NF4_BYTES = 0.55  # bytes per parameter, scales included
 
 
+def paint_size(width: float, height: float, size: int, exceeds: bool = False) -> tuple[int, int]:
+    """Return the width and height, multiples of 32, at which to paint a picture of these proportions.
+
+    Args:
+        width, height: the proportions
+        size: side of a square with the painted area, pixels
+        exceeds: True if the area may be a little larger than that of the square
+    """
+    ratio = width / height
+    for _ in range(4):
+        width_px = (size * size * ratio) ** 0.5
+        sides = [
+            max(_MIN_SIDE_PX, round(side / _SIDE_MULTIPLE_PX) * _SIDE_MULTIPLE_PX)
+            for side in (width_px, width_px / ratio)
+        ]
+        while not exceeds and sides[0] * sides[1] > size * size and max(sides) > _MIN_SIDE_PX:
+            sides[sides.index(max(sides))] -= _SIDE_MULTIPLE_PX
+        ratio = sides[0] / sides[1]
+    return sides[0], sides[1]
+
+
 @dataclass(frozen=True)
 class Adapter:
     """Call signature and defaults of one diffusers pipeline."""
@@ -65,17 +86,7 @@ class Adapter:
         Both are multiples of 32, with about the area of `size`². Pipelines that rescale their input to their
         own area leave this size unchanged.
         """
-        ratio = width / height
-        for _ in range(4):
-            width_px = (size * size * ratio) ** 0.5
-            sides = [
-                max(_MIN_SIDE_PX, round(side / _SIDE_MULTIPLE_PX) * _SIDE_MULTIPLE_PX)
-                for side in (width_px, width_px / ratio)
-            ]
-            while not self.is_fixed and sides[0] * sides[1] > size * size and max(sides) > _MIN_SIDE_PX:
-                sides[sides.index(max(sides))] -= _SIDE_MULTIPLE_PX
-            ratio = sides[0] / sides[1]
-        return sides[0], sides[1]
+        return paint_size(width, height, size, exceeds=self.is_fixed)
 
     def arguments(
         self,

@@ -111,7 +111,9 @@ class EditorRow:
     is_parallel: bool = False  # edits views in parallel threads; others run a network or use all cores
     paints_members: bool = False  # it holds a color of every member for each view, which takes memory
     is_manual: bool = False  # set by eye, so a draft is kept whatever its error
-    runs_program: bool = False  # it runs a program that its text names; never taken from a file unasked
+    # The next two are never taken from a file without being asked for.
+    runs_program: bool = False  # it runs a program that its text names
+    sends_pictures: bool = False  # it sends pictures to a server
     model: Callable[[], str] | None = None  # returns the default of `--model`; None: no generative model
     image_size: int = 0  # longer side of its views, pixels; 0 is the default
     views: int = 0  # number of its views; 0 is the default

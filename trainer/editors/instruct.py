@@ -1,61 +1,66 @@
 """Editor `instruct:"turn him into Batman"`: pictures edited by a text instruction, at any strength.
 
-Every view is rendered again for the model: the region's box with a margin, at the size that the model was
-trained for. The output is cached at that size and shrunk into the training picture. InstructPix2Pix is the
-editor of the ProGDF paper. The other models are newer and larger (`adapters`). The models have no parameter
-for the strength: `mixed_steps` adds it.
+Every view is rendered again for the model (`FramePainter`). InstructPix2Pix is the editor of the ProGDF
+paper. The other models are newer and larger (`adapters`). The models have no parameter for the strength:
+`mixed_steps` adds it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from functools import cache
 
-import torch
 from torch import Tensor
 
-from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.gaussians import ZERO, Gaussians
 from progdf.io.picture_camera import find_picture_camera
-from progdf.rasterize import Crop
 from progdf.scene.regions import read_numbers
 from trainer.options import EditKind, EditorOptions
 from trainer.store.pretrained import last_model
-from trainer.store.run_folder import from_bytes, to_bytes
-from trainer.views.view import BACKGROUND, View, region_box, render_view, shrink_image
+from trainer.views.view import View
 
 from . import adapters
 from .adapters import DevicePlan, PipelineRequest
 from .base import EditorInput
 from .cache import PictureCache, Recipe
 from .mixed_steps import MixedSteps, network_steps
+from .painter import FramePainter
 
 IMAGE_SIZE = 512
 """Longer side of the views, pixels, downscaled from the model's own size."""
 
-_BOX_MARGIN = 0.4  # share of the box's width and height that is added, half on each side
-
 
 @dataclass(frozen=True)
-class InstructEditor:
+class InstructEditor(FramePainter):
     """Editor of views by a text instruction. In each view it paints the region and its surroundings."""
 
     scene: Gaussians
     request: PipelineRequest
     placement: DevicePlan
     load: Callable[[], MixedSteps]  # loads the pipeline on first use
-    kept: PictureCache  # cache of the outputs, at their own size
+    kept: PictureCache
     stages: tuple[float, ...] = ()
     kind: EditKind = "style"
     is_confined: bool = False
     _renders: dict[str, Tensor] = field(default_factory=dict, repr=False)
 
+    has_start = True
+
+    @property
+    def size(self) -> int:
+        """Side of a square with the painted area, pixels."""
+        return self.request.size
+
     @property
     def references(self) -> int:
         """Number of reference pictures that one call accepts beside the view."""
         return self.request.adapter.references
+
+    def paint_size(self, width: float, height: float) -> tuple[int, int]:
+        """See `FramePainter.paint_size`."""
+        return self.request.adapter.paint_size(width, height, self.request.size)
 
     @property
     def recipe(self) -> Recipe:
@@ -76,29 +81,6 @@ class InstructEditor:
         request = self.request
         return request.adapter.passes * sum(network_steps(s, 1.0, request.steps) for s in strengths)
 
-    def frame(self, view: View) -> tuple[Crop, Camera]:
-        """Return the painted box of a view, in pixels, and the camera that renders it for the model."""
-        x0, y0, x1, y1 = region_box(view.mask, margin=0)
-        margin_x = round(_BOX_MARGIN / 2 * (x1 - x0))
-        margin_y = round(_BOX_MARGIN / 2 * (y1 - y0))
-        camera = view.camera
-        x0 = max(0, x0 - margin_x)
-        x1 = min(camera.width, x1 + margin_x)
-        y0 = max(0, y0 - margin_y)
-        y1 = min(camera.height, y1 + margin_y)
-        width, height = self.request.adapter.paint_size(x1 - x0, y1 - y0, self.request.size)
-        shift = torch.tensor([[0.0, 0.0, x0], [0.0, 0.0, y0], [0.0, 0.0, 0.0]])
-        box = replace(camera, K=camera.K - shift, width=x1 - x0, height=y1 - y0)
-        return (x0, y0, x1, y1), box.resize(width, height)
-
-    def original(self, view: View) -> Tensor:
-        """Return the render of the frame, in 8 bits. [h,w,3]"""
-        name = view.camera.name
-        if name not in self._renders:
-            image = render_view(self.scene, self.frame(view)[1], torch.tensor(BACKGROUND))
-            self._renders[name] = to_bytes(image)
-        return from_bytes(self._renders[name])
-
     def edit(self, view: View, strength: float) -> Tensor:
         """See `ImageEditor.edit`."""
         if strength == 0.0:
@@ -112,17 +94,6 @@ class InstructEditor:
         )
         return self.paste(view, painted)
 
-    def paste(self, view: View, painted: Tensor) -> Tensor:
-        """Add the change of the frame, shrunk by area averaging, to the view. [h,w,3] -> [H,W,3]
-
-        The change is added because a shrunk large render has a PSNR of only about 32 dB to the small training
-        render.
-        """
-        x0, y0, x1, y1 = self.frame(view)[0]
-        edited = view.image.clone()
-        edited[y0:y1, x0:x1] += shrink_image(painted - self.original(view), (y1 - y0, x1 - x0))
-        return edited.clamp(0.0, 1.0)
-
     def paint(
         self,
         picture: Tensor,
@@ -133,15 +104,7 @@ class InstructEditor:
         source: Tensor | None = None,
         seed: int | None = None,
     ) -> Tensor:
-        """Paint a picture at the model's size, in 8 bits. -> [H,W,3] 0..1
-
-        Args:
-            picture: condition of the model. [H,W,3] 0..1
-            references: further pictures for the model, at most `references`. [H,W,3] each
-            strength: 0 returns `source`, 1 the model's output
-            softness: share of the steps over which the weight of the model's prediction rises from 0 to 1
-            source: result at strength 0, as large as `picture`; None: `picture`. [H,W,3]
-            seed: seed of the noise; None: the editor's
+        """See `FramePainter.paint`.
 
         Raises:
             ProgdfError: weights are missing or broken, or the GPU runs out of memory.

@@ -8,13 +8,15 @@ and no scene can show contradicting views. Two strategies make the views agree:
   so far, and the first anchor itself.
 - A model that takes a single image paints the views in a sweep: each starts from a render of the scene with
   the members' colors fitted to the views so far.
+- A served model that takes a single image and no starting picture paints each view by itself.
 
-Consensus rounds follow. Colors are fitted to all views (`robust_colors`), and each view is painted again
-starting from their render, conditioned on its own original. The start determines the content; the remaining
-denoising is free.
+Consensus rounds follow if the model can start from a picture. Colors are fitted to all views
+(`robust_colors`), and each view is painted again starting from their render, conditioned on its own original.
+The start determines the content; the remaining denoising is free.
 
 A model shifts and scales its outputs slightly. `register` reverts that. An output that moved farther is
-painted again with another seed, and left out if that moved too far as well.
+painted again with another seed, and left out if that moved too far as well. So is a view that the model
+refuses.
 
 RUN/views/painted/anchor/VIEW.png   the first one is the anchor; if the user paints over it, all views follow
                                     it when the run is started again
@@ -26,10 +28,11 @@ Measured gains: docs/lab/experiments.md, Views that agree.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -42,10 +45,10 @@ from progdf.io.images import read_picture
 from progdf.io.picture_camera import find_picture_camera
 from progdf.scene.bounds import scene_sphere
 from progdf.sh import C0
-from trainer.editors import editor_row, make_editor
+from trainer.editors import make_editor
 from trainer.editors.base import ImageEditor
 from trainer.editors.cache import PictureCache, Recipe, digest
-from trainer.editors.instruct import InstructEditor
+from trainer.editors.painter import FramePainter, RefusedError
 from trainer.editors.style import cross_fade
 from trainer.options import EditKind, TrainOptions
 from trainer.report.agreement import ViewChange, fine_energy, fit_colors, robust_colors, view_change
@@ -85,14 +88,23 @@ MAX_MOVED = 0.05
 
 
 @dataclass(frozen=True)
+class Painted:
+    """Result of painting a view."""
+
+    picture: Tensor | None  # frame, aligned with its original; None if it cannot be used. [h,w,3]
+    moved: float = 0.0  # motion against the original, see `Registration`
+    refusal: str = ""  # reason why the model refuses the view; "" if it does not
+
+
+@dataclass(frozen=True)
 class PaintCache:
     """Cache of painted views, so that a resumed or repeated run paints nothing twice.
 
     The sidecar file of a picture holds the digests of all its inputs.
     """
 
-    painter: InstructEditor
-    recipe: Recipe  # inputs of a picture besides the arguments of `InstructEditor.paint`
+    painter: FramePainter
+    recipe: Recipe  # inputs of a picture besides the arguments of `FramePainter.paint`
     kept: PictureCache
     seed: int
 
@@ -111,21 +123,18 @@ class PaintCache:
         source: Tensor | None = None,
         strength: float = 1.0,
         softness: float = 1.0,
-    ) -> tuple[Tensor | None, float]:
-        """Return the painted frame of a view, aligned with its original, and its motion, see `Registration`.
-        [h,w,3]
-
-        The frame is None if the pictures of two seeds moved too far to be aligned.
+    ) -> Painted:
+        """Paint a view, a second time if the picture moved too far to be aligned or the model refuses it.
 
         Args:
             view: the view to paint
             place: folder of the picture
-            references, source, strength, softness: see `InstructEditor.paint`
+            references, source, strength, softness: see `FramePainter.paint`
         """
         references = references[: self.painter.references]
         original = self.painter.original(view)
         beside = beside_region(self.crop(view, view.mask[..., None])[..., 0])
-        moved = 0.0
+        result = Painted(None)
         for seed in (self.seed, self.seed + 1):
             recipe = {
                 **self.recipe,
@@ -142,12 +151,16 @@ class PaintCache:
                 )
 
             folder_name = place if seed == self.seed else f"{place}/again"
-            picture = self.kept.picture(view.camera.name, original, recipe, paint, folder_name)
+            try:
+                picture = self.kept.picture(view.camera.name, original, recipe, paint, folder_name)
+            except RefusedError as error:
+                result = Painted(None, refusal=str(error))
+                continue
             registration = register(original, picture, beside)
-            moved = registration.size
-            if moved <= MAX_MOVED:
-                return registration.lay(picture), moved
-        return None, moved
+            if registration.size <= MAX_MOVED:
+                return Painted(registration.lay(picture), registration.size)
+            result = Painted(None, registration.size)
+        return result
 
 
 def beside_region(mask: Tensor) -> Tensor:
@@ -193,11 +206,13 @@ class AgreedEditor:
         if strength == 1.0:
             return finished
         painter = self.easel.painter
+        if not painter.has_start:
+            return cross_fade(view.image, finished, strength)
         fit = self.fit.render(painter.frame(view)[1])
         # source and freedom both scale with the strength, so that strength 1 equals the last round's picture
         source = torch.lerp(painter.original(view), fit, strength)
         freedom = CONSENSUS * strength
-        painted, _ = self.easel.paint(view, f"{strength:g}", [fit], source, freedom, SOFTNESS)
+        painted = self.easel.paint(view, f"{strength:g}", [fit], source, freedom, SOFTNESS).picture
         if painted is None:
             return cross_fade(view.image, finished, strength)
         return painter.paste(view, painted)
@@ -258,18 +273,27 @@ class _PaintingLoop:
         self._approved = [] if approved is None else [self._change(*approved)]
         self._first = [] if approved is None else [easel.crop(*approved)]  # the anchor, as a reference
         self.pictures: dict[str, Tensor] = {}
-        self.moved: dict[str, float] = {}
+        self.unusable: dict[str, Painted] = {}  # last results that cannot be used, by view
         self._calls = 0
 
     def paint(self, view: View, place: str, **how: Any) -> None:
-        """Paint a view. If the result cannot be aligned with it, the previous picture stays."""
-        picture, moved = self._easel.paint(view, place, **how)
+        """Paint a view. If the result cannot be used, the previous picture stays."""
+        self._take(view, place, self._easel.paint(view, place, **how))
+
+    def _take(self, view: View, place: str, painted: Painted) -> None:
+        """Keep the picture of a view if it can be used."""
         self._calls += 1
         self._advance(self._calls, place)
-        self.moved[view.camera.name] = moved
-        if picture is not None:
-            self.pictures[view.camera.name] = self._easel.painter.paste(view, picture)
-            self._first = self._first or [picture]
+        name = view.camera.name
+        if painted.picture is None:
+            self.unusable[name] = painted
+            return
+        self.pictures[name] = self._easel.painter.paste(view, painted.picture)
+        self._first = self._first or [painted.picture]
+
+    def paint_alone(self, views: Sequence[View]) -> None:
+        """Paint each view by itself, several at the same time."""
+        self._paint_together(views, ANCHOR, lambda view: self._easel.paint(view, ANCHOR))
 
     def follow(self, views: Sequence[View], anchors: int) -> None:
         """Paint each view with two references: the render of the fit to the anchors so far, and the first
@@ -278,13 +302,35 @@ class _PaintingLoop:
         seen = [*self._approved]
         fit = Fit(self._setup, fit_colors(seen, members)) if seen else None
         for i, view in enumerate(views):
+            if i >= anchors and fit is not None:
+                self._follow_fit(views[i:], fit)
+                return
             place = ANCHOR if i < anchors else "reference"
             name = view.camera.name
             references = [self._render(fit, view), *self._first] if fit is not None else []
             self.paint(view, place, references=references)
-            if name in self.pictures and (i < anchors or fit is None):
+            if name in self.pictures:
                 seen.append(self._change(view, self.pictures[name]))
                 fit = Fit(self._setup, fit_colors(seen, members))
+
+    def _follow_fit(self, views: Sequence[View], fit: Fit) -> None:
+        """Paint views with the render of a fit and the first anchor as references."""
+        first = [*self._first]
+
+        def paint(view: View) -> Painted:
+            return self._easel.paint(view, "reference", [self._render(fit, view), *first])
+
+        self._paint_together(views, "reference", paint)
+
+    def _paint_together(self, views: Sequence[View], place: str, paint: Callable[[View], Painted]) -> None:
+        """Paint views that do not depend on each other, as many at the same time as the painter allows."""
+        with ThreadPoolExecutor(self._easel.painter.workers) as pool:
+            try:
+                for view, painted in zip(views, pool.map(paint, views), strict=True):
+                    self._take(view, place, painted)
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
 
     def sweep(self, views: Sequence[View]) -> None:
         """Paint each view starting from the render of the fit to the training views so far."""
@@ -350,14 +396,14 @@ def agree_views(
     Raises:
         ProgdfError: no painted picture can be aligned with its view.
     """
-    follows = easel.painter.references > 0
+    painter = easel.painter
+    follows = painter.references > 0
     views, anchors = painting_order(setup, SIDE if follows else math.pi)
-    rounds = 1 if follows else 2
-    followers = f"{len(views) - anchors} views that follow"
-    order = f"{anchors} anchors, {followers}" if follows else "one view after another"
-    repeats = "once" if rounds == 1 else "twice"
+    rounds = 0
+    if painter.has_start:
+        rounds = 1 if follows else 2
     calls = len(views) * (1 + rounds)
-    log.say(f"{calls} pictures to paint: {order}, then all {repeats} more to make them agree")
+    log.say(f"{calls} pictures to paint: {_plan(painter, len(views), anchors, rounds)}")
     if easel.kept.folder is not None and approved is None:
         path = easel.kept.folder / ANCHOR / f"{views[0].camera.name}.png"
         log.say(f"all views follow {path}; to change the edit, paint over that picture and start again")
@@ -365,9 +411,14 @@ def agree_views(
         loop = _PaintingLoop(easel, setup, advance, approved)
         if follows:
             loop.follow(views, anchors)
-        else:
+        elif painter.has_start:
             loop.sweep(views)
+        else:
+            loop.paint_alone(views)
         if not any(view.camera.name in loop.pictures for view in setup.train):
+            refusals = [painted.refusal for painted in loop.unusable.values() if painted.refusal]
+            if refusals:
+                raise ProgdfError(f"no picture can be used: {refusals[0]}; change the instruction")
             raise ProgdfError(
                 f"the model shifts or scales every picture by more than {MAX_MOVED:.0%}; use another --model"
             )
@@ -376,17 +427,33 @@ def agree_views(
             loop.consent(views, f"round_{number + 1}")
     fit = loop.fit()
     left_out = {
-        view.camera.name: round(loop.moved[view.camera.name], 3)
+        view.camera.name: loop.unusable[view.camera.name]
         for view in views
         if view.camera.name not in loop.pictures
     }
-    for name, moved in left_out.items():
-        log.say(f"{name}: every painted picture is shifted or scaled by {moved:.0%}; the fit replaces it")
+    for name, painted in left_out.items():
+        reason = painted.refusal or f"every painted picture is shifted or scaled by {painted.moved:.0%}"
+        log.say(f"{name}: {reason}; the fit replaces it")
     pictures = loop.pictures | {
         view.camera.name: fit.render(view.camera) for view in views if view.camera.name in left_out
     }
-    figures = {"left_out": left_out, "contrast": round(loop.fine_energy() / max(before, 1e-9), 3)}
+    figures = {
+        "left_out": {name: painted.refusal or round(painted.moved, 3) for name, painted in left_out.items()},
+        "contrast": round(loop.fine_energy() / max(before, 1e-9), 3),
+    }
     return AgreedEditor(easel, pictures, fit, editor.stages, editor.kind, figures)
+
+
+def _plan(painter: FramePainter, views: int, anchors: int, rounds: int) -> str:
+    """Return a description of the order of painting, for the log."""
+    if painter.references:
+        order = f"{anchors} anchors, {views - anchors} views that follow"
+    elif painter.has_start:
+        order = "one view after another"
+    else:
+        order = "each view by itself, as the model takes no references"
+    repeats = {0: "", 1: ", then all once more to make them agree"}
+    return order + repeats.get(rounds, ", then all twice more to make them agree")
 
 
 def make_run_editor(
@@ -399,15 +466,15 @@ def make_run_editor(
     settings = replace(options.editor, cache=folder.paintings)
     glances = partial(render_thumbnails, options.views, setup.scene, setup.region)
     editor = make_editor(settings, setup.scene, setup.region, setup.views, glances, setup.seen, log.say)
-    if editor_row(settings).model is None:
+    if not isinstance(editor, FramePainter):
         return editor, {}
-    painter = cast(InstructEditor, editor)
+    painter = editor
     log.say(painter.note)
     easel = PaintCache(painter, painter.recipe, painter.kept, settings.seed)
     approved = None
     if settings.anchor is not None:
         found = find_picture_camera(settings.anchor, origin=setup.scene.origin)
-        (camera,) = with_near_plane([fit_size(found, painter.request.size)], setup.scene)
+        (camera,) = with_near_plane([fit_size(found, painter.size)], setup.scene)
         view = make_view(setup.scene, setup.region, camera, setup.background)
         if not bool((view.mask > 0.0).any()):
             raise ProgdfError(f"{settings.anchor} does not show the region; take it from another position")

@@ -1,0 +1,226 @@
+"""Editor `api:"…"` with a real HTTP server: agreement, refusals, waits, broken answers and keys."""
+
+from __future__ import annotations
+
+import base64
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+
+from progdf.errors import ProgdfError
+from tests.helpers.image_server import Answer, Call, Refusal, image_server, png, swap_colors
+from tests.helpers.trained import quick_options, small, train, write_bear
+from trainer import cli
+from trainer.editors import make_editor
+from trainer.editors.painter import RefusedError
+from trainer.editors.served import ServedEditor, check_api, explain_sending
+from trainer.options import EditorOptions, with_values
+
+MARBLE = 'api:"turn it into marble"'
+
+
+@pytest.fixture(autouse=True)
+def _package(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("openai", reason="pip install progdf-studio[api]")
+    monkeypatch.delenv("OPENAI_API_KEY", raising=False)
+    monkeypatch.setattr("trainer.editors.served._RETRIES", 2)
+
+
+def settings_of(url: str, **more: object) -> EditorOptions:
+    return replace(EditorOptions(MARBLE, "marble-1", api_url=url, edit_size=64), **more)  # type: ignore[arg-type]
+
+
+def editor_of(settings: EditorOptions) -> ServedEditor:
+    case = small()
+    editor = make_editor(settings, case.scene, case.region, case.views)
+    assert isinstance(editor, ServedEditor)
+    return editor
+
+
+def paint_first(settings: EditorOptions) -> torch.Tensor:
+    editor = editor_of(settings)
+    return editor.paint(editor.original(small().views[0]))
+
+
+def test_server_edits_the_picture_and_its_references(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OPENAI_API_KEY", "sk-secret")
+    with image_server() as server:
+        editor = editor_of(settings_of(server.url))
+        original = editor.original(small().views[0])
+        painted = editor.paint(original, [original, original])
+    assert torch.equal(painted, original.flip(2)), "red and blue are exchanged"
+    (call,) = server.calls
+    assert len(call.pictures) == 3
+    assert call.key == "Bearer sk-secret"
+    assert call.fields["model"] == "marble-1"
+    assert call.fields["size"] == f"{original.shape[1]}x{original.shape[0]}"
+    assert call.fields["prompt"].startswith("turn it into marble\n")
+    assert "sk-secret" not in repr(editor), "the key is in no object"
+
+
+def test_picture_of_an_address_is_fetched_without_the_key(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OPENAI_API_KEY", "sk-secret")
+
+    def model(call: Call, number: int) -> Answer:
+        server.files["/picture.png"] = png(swap_colors(call.pictures[0]))
+        return {"created": 0, "data": [{"url": server.url.replace("/v1", "/picture.png")}]}
+
+    with image_server(model) as server:
+        painted = paint_first(settings_of(server.url))
+    assert torch.equal(painted.flip(2), editor_of(settings_of(server.url)).original(small().views[0]))
+
+
+def test_server_that_asks_to_wait_is_asked_again() -> None:
+    def model(call: Call, number: int) -> Answer:
+        if number == 0:
+            return Refusal(429, "rate_limit_exceeded", "slow down", {"Retry-After": "0.01"})
+        return swap_colors(call.pictures[0])
+
+    with image_server(model) as server:
+        paint_first(settings_of(server.url))
+        assert len(server.calls) == 2
+
+
+HALF = base64.b64encode(png(Image.new("RGB", (64, 64), "red")))[:-3].decode()
+
+
+@pytest.mark.parametrize(
+    ("answer", "fault"),
+    [
+        (Refusal(401, "invalid_api_key", "wrong key"), "status 401 (wrong key); set OPENAI_API_KEY"),
+        (Refusal(404, "model_not_found", "no such model"), "status 404 (no such model); check --api-url"),
+        (Refusal(429, "rate_limit_exceeded", "slow down", {"Retry-After": "0.01"}), "fewer --edit-workers"),
+        (Refusal(400, "invalid_image", "too many pictures"), "check --model and --api-references"),
+        (Refusal(500, "", "out of memory", {"Retry-After": "0.01"}), "status 500"),
+        (b"<html>a login page</html>", "gave no valid answer"),
+        ({"created": 0, "data": []}, "returned no picture"),
+        ({"created": 0, "data": [{"b64_json": HALF}]}, "returned half a picture"),
+        ({"created": 0, "data": [{"b64_json": base64.b64encode(b"GIF").decode()}]}, "cannot be used"),
+        ({"created": 0, "data": [{"url": "file:///etc/passwd"}]}, "not a web address"),
+        ({"created": 0, "data": [{"url": "http://127.0.0.1:1/a.png"}]}, "an address without a picture"),
+        (Image.new("RGB", (64, 20)), "cannot be used"),
+    ],
+)
+def test_unusable_answer_is_a_one_line_error(answer: Answer, fault: str) -> None:
+    with (
+        image_server(lambda call, number: answer) as server,
+        pytest.raises(ProgdfError, match=re.escape(fault)) as caught,
+    ):
+        paint_first(settings_of(server.url))
+    assert "\n" not in str(caught.value)
+    assert str(caught.value).startswith("api: 127.0.0.1:")
+
+
+def test_dead_server_is_a_one_line_error() -> None:
+    with image_server() as server:
+        url = server.url
+    with pytest.raises(ProgdfError, match=r"cannot be reached .*; check --api-url"):
+        paint_first(settings_of(url))
+
+
+def test_refused_picture_is_told_from_a_fault() -> None:
+    refusal = Refusal(400, "moderation_blocked", "rejected by the safety system")
+    with (
+        image_server(lambda call, number: refusal) as server,
+        pytest.raises(RefusedError, match="rejected by the safety system"),
+    ):
+        paint_first(settings_of(server.url))
+
+
+@pytest.mark.parametrize(
+    ("changes", "fault"),
+    [
+        ({"editor": 'api:""'}, "needs an instruction"),
+        ({"api_url": ""}, "add --api-url"),
+        ({"api_url": "ftp://host/v1"}, "add --api-url"),
+        ({"api_url": "https://me:pass@host/v1"}, "must hold no key"),
+        ({"model": ""}, "add --model"),
+        ({"api_url": "https://api.example.org/v1"}, "set OPENAI_API_KEY"),
+    ],
+)
+def test_invalid_option_is_a_one_line_error(changes: dict[str, str], fault: str) -> None:
+    options = replace(settings_of("http://127.0.0.1:8080/v1"), **changes)  # type: ignore[arg-type]
+    with pytest.raises(ProgdfError, match=re.escape(fault)) as caught:
+        check_api(options.text, options)
+    assert "; " in str(caught.value)
+    assert "pass" not in str(caught.value).replace("password", "")
+
+
+def test_key_is_never_sent_unencrypted_to_another_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OPENAI_API_KEY", "sk-secret")
+    options = settings_of("http://api.example.org/v1")
+    with pytest.raises(ProgdfError, match="must not be sent to"):
+        check_api(options.text, options)
+
+
+def test_destination_number_of_calls_and_cost_are_stated() -> None:
+    line = explain_sending(settings_of("http://127.0.0.1:8080/v1", price_per_call=0.04), 12)
+    assert line == (
+        "12 pictures of the scene and your instruction are sent to 127.0.0.1:8080 (model marble-1), "
+        "one call each, about 0.48 in all"
+    )
+
+
+def test_pictures_go_to_another_machine_only_with_consent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("OPENAI_API_KEY", "sk-secret")
+    monkeypatch.chdir(tmp_path)
+    command = ["scene.ply", "-o", "run", "--region", "all", "--editor", MARBLE, "--model", "marble-1"]
+    with pytest.raises(ProgdfError, match="only if you agree; add --yes"):
+        cli.train([*command, "--api-url", "https://api.example.org/v1"])
+
+
+def test_catalogue_sends_pictures_only_if_it_is_allowed_to(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_bear(tmp_path)
+    with image_server() as server:
+        (tmp_path / "catalogue.toml").write_text(
+            '[[scenes]]\npath = "scene.ply"\n[[scenes.edits]]\nname = "marble"\nregion = "all"\n'
+            f"editor = '{MARBLE}'\nmodel = 'marble-1'\napi-url = '{server.url}'\n",
+            encoding="utf-8",
+        )
+        command = [str(tmp_path / "catalogue.toml"), "--out", str(tmp_path / "runs"), "--workers", "1"]
+        assert cli.batch(command) == 2
+        assert "it sends pictures to http://127.0.0.1" in capsys.readouterr().err
+        assert cli.batch([*command, "--dry-run", "--allow-commands"]) == 0
+        assert not server.calls
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("references", [0, 2])
+def test_run_leaves_refused_views_out_and_pays_for_no_picture_twice(tmp_path: Path, references: int) -> None:
+    write_bear(tmp_path)
+    refused = set[bytes]()
+
+    def model(call: Call, number: int) -> Answer:
+        if number == 2:
+            return Refusal(429, "rate_limit_exceeded", "slow down", {"Retry-After": "0.01"})
+        picture = call.pictures[0].tobytes()
+        if number == 4:
+            refused.add(picture)
+        if picture in refused:
+            return Refusal(400, "content_policy_violation", "not this one")
+        return swap_colors(call.pictures[0])
+
+    with image_server(model) as server:
+        options = with_values(
+            quick_options(tmp_path), editor=MARBLE, model="marble-1", api_url=server.url, edit_size=64,
+            api_references=references, kind="color", steps=48, stages=0, views=5, edit_workers=3,
+        )  # fmt: skip
+        result = train(options)
+        assert result.gdf.is_file()
+        calls = len(server.calls)
+        report = (tmp_path / "run" / "report.json").read_text(encoding="utf-8")
+        assert report.count("the content filter") == 1
+        gdf = result.gdf.read_bytes()
+        result.gdf.unlink()
+        (tmp_path / "run" / "trajectory.safetensors").unlink()
+        again = train(options)
+        assert again.gdf.read_bytes() == gdf
+        assert len(server.calls) == calls + 2, "only the refused picture is asked for again, twice"
