@@ -20,7 +20,6 @@ from progdf.field.baked import interpolate_at
 from progdf.gaussians import Gaussians, pack
 from progdf.quaternions import matrix_turns, rotation_matrices, turn_quats
 from progdf.region import Region, from_mask
-from progdf.scene.point_tree import PointTree
 
 from .follow import bind, follow, rest_frames
 from .graph import MAX_NODES, Floats, Mask, NodeGraph, Rows, build_graph
@@ -195,13 +194,13 @@ def make_problem(
         ProgdfError: see `pull`.
     """
     means = scene.means.detach().double().numpy()
-    nearest = np.array([_check_handle(scene, means, handle) for handle in handles])
+    nearest = _find_handles(scene, means, handles)
     points = np.array([handle.point for handle in handles], np.float64)
     members = _reachable_rows(means, handles)
     graph = build_graph(scene[torch.from_numpy(members)], max_nodes)
     held_members = np.zeros(len(members), bool)
     if hold is not None:
-        held_members = np.isin(members, hold.members.numpy())
+        held_members = hold.mask.numpy()[members]
     at = np.searchsorted(members, nearest)
     for handle, row in zip(handles, at, strict=True):
         if held_members[row]:
@@ -252,7 +251,7 @@ def _pinned_rows(means: Floats, members: Rows, pins: Sequence[Point]) -> Rows:
     points = np.array(pins, np.float64)
     if not np.isfinite(points).all():
         raise ProgdfError("a number of a pin is not finite")
-    nearest = PointTree(means, 1).query(points, 1)[1][:, 0]
+    nearest = np.array([np.square(means - point).sum(axis=1).argmin() for point in points])
     on_members = np.flatnonzero(np.isin(nearest, members))
     return np.stack([on_members, np.searchsorted(members, nearest[on_members])], axis=1)
 
@@ -293,12 +292,42 @@ def _add_frames(
     return csr_array(vstack(parts)), np.concatenate(positions), np.concatenate(all_owners)
 
 
-def _check_handle(scene: Gaussians, means: Floats, handle: Handle) -> int:
-    """Return the row of the region's Gaussian that is nearest to a handle's point.
+def _find_handles(scene: Gaussians, means: Floats, handles: Sequence[Handle]) -> Rows:
+    """Return the row of the Gaussian nearest to each handle's point, in its region. [H]
 
     Raises:
-        ProgdfError: the point is not on the region, or a number is out of range.
+        ProgdfError: a point is not on its region, or a number is out of range.
     """
+    for handle in handles:
+        _check_numbers(handle)
+    largest = scene.scales.detach().double().amax(dim=1).numpy()
+    extent = means.max(axis=0) - means.min(axis=0)
+    diagonal = float(np.linalg.norm(extent)) + 2.0 * _TOUCH_SIGMAS * float(np.median(largest))
+    parts = dict[int, tuple[Floats, float]]()  # by region: its points and their spacing
+    nearest = []
+    for handle in handles:
+        _check_length(handle, diagonal)
+        rows = handle.region.members.numpy()
+        if id(handle.region) not in parts:
+            points = means[rows]
+            parts[id(handle.region)] = points, _point_spacing(points)
+        points, spacing = parts[id(handle.region)]
+        away = np.square(points - np.array(handle.point)).sum(axis=1)
+        row = int(rows[away.argmin()])
+        distance = math.sqrt(float(away.min()))
+        allowed = max(_TOUCH_SIGMAS * float(largest[row]), spacing)
+        if distance > allowed or (handle.falloff is not None and distance >= handle.falloff):
+            there = ",".join(f"{value:.4g}" for value in means[row] + np.array(scene.origin))
+            raise ProgdfError(
+                f"the point {_world(scene, handle)} is {distance:.3g} from its region's Gaussians; "
+                f"write a point on it, such as {there}"
+            )
+        nearest.append(row)
+    return np.array(nearest)
+
+
+def _check_numbers(handle: Handle) -> None:
+    """Raise an error if a number is not finite, or a rotation or scale is out of range."""
     numbers = [*handle.point, *handle.pull, *(handle.turn or ()), handle.scale, handle.falloff or 0.0]
     if not all(math.isfinite(number) for number in numbers):
         raise ProgdfError("a number of a pull is not finite")
@@ -308,28 +337,18 @@ def _check_handle(scene: Gaussians, means: Floats, handle: Handle) -> int:
         raise ProgdfError(
             f"a handle scales by {1.0 / MAX_HANDLE_SCALE:g} to {MAX_HANDLE_SCALE:g}, not {handle.scale:g}"
         )
-    rows = handle.region.members.numpy()
-    if not len(rows):
+    if not len(handle.region):
         raise ProgdfError(f"the pulled region {handle.region.name} holds no Gaussian")
-    largest = scene.scales.detach().double().amax(dim=1).numpy()
-    extent = means.max(axis=0) - means.min(axis=0)
-    diagonal = float(np.linalg.norm(extent)) + 2.0 * _TOUCH_SIGMAS * float(np.median(largest))
-    length = float(np.linalg.norm(handle.pull))
+
+
+def _check_length(handle: Handle, diagonal: float) -> None:
+    """Raise an error if a handle goes too far for the scene's diagonal."""
+    length = math.hypot(*handle.pull)
     if length > MAX_PULL * diagonal:
         raise ProgdfError(
             f"a pull of {length:g} is more than {MAX_PULL:g} times the scene's diagonal of {diagonal:.3g}; "
             "pull less far"
         )
-    distance, found = PointTree(means[rows], 1).query(np.array([handle.point]), 1)
-    row = int(rows[found[0, 0]])
-    allowed = max(_TOUCH_SIGMAS * float(largest[row]), _point_spacing(means[rows]))
-    if float(distance[0, 0]) > allowed or (handle.falloff is not None and distance[0, 0] >= handle.falloff):
-        there = ",".join(f"{value:.4g}" for value in means[row] + np.array(scene.origin))
-        raise ProgdfError(
-            f"the point {_world(scene, handle)} is {distance[0, 0]:.3g} from its region's Gaussians; "
-            f"write a point on it, such as {there}"
-        )
-    return row
 
 
 def _point_spacing(points: Floats) -> float:

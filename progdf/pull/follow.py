@@ -26,12 +26,13 @@ from progdf.threads import run_chunks
 
 from .follow_kernel import NODE_WIDTH, Bands, Singles, follow_rows, write_nodes
 from .graph import Floats, NodeGraph, Rows
+from .graph_kernel import bind_points
 from .solve import Pose
 
 MAX_STRETCH = 3.0
 """Largest factor by which a Gaussian grows or shrinks; more shows as hairs."""
 _BOUND_NODES = 6  # nodes that a Gaussian follows
-_BIND_CHUNK = 1 << 16  # Gaussians that are bound at once
+_BIND_CHUNK = 1 << 14  # Gaussians that a thread binds at once
 _FOLLOW_CHUNK = 1 << 11  # Gaussians that a thread moves at once
 _LEAST_SQUARE = 1e-30  # squared relative scale; keeps logarithms finite
 _SPREAD_DIRECTIONS = 20  # size of the even lattice from which the directions of a band are taken
@@ -57,14 +58,21 @@ def bind(graph: NodeGraph, points: Floats, nodes: Rows) -> csr_array:
         nodes: the node that each point belongs to. [P]
     """
     table = _neighbor_table(graph)
-    parts = [
-        _bind_chunk(graph, points[first : first + _BIND_CHUNK], table[nodes[first : first + _BIND_CHUNK]])
-        for first in range(0, len(points), _BIND_CHUNK)
-    ]
-    found = np.concatenate([part[0] for part in parts])
-    weights = np.concatenate([part[1] for part in parts])
-    rows = np.repeat(np.arange(len(points)), found.shape[1])
-    return csr_array((weights.ravel(), (rows, found.ravel())), shape=(len(points), len(graph)))
+    count = len(points)
+    width = min(_BOUND_NODES + 1, table.shape[1])
+    found = np.empty((count, width), np.int32)
+    weights = np.empty((count, width))
+    positions = np.ascontiguousarray(graph.positions)
+    points = np.ascontiguousarray(points)
+
+    def bind_chunk(chunk: int) -> None:
+        first = chunk * _BIND_CHUNK
+        part = (first, min(first + _BIND_CHUNK, count))
+        bind_points(positions, graph.spacing, points, table, nodes, part, found, weights)
+
+    run_chunks(bind_chunk, -(-count // _BIND_CHUNK))
+    firsts = width * np.arange(1 + count, dtype=np.int32)
+    return csr_array((weights.ravel(), found.ravel(), firsts), shape=(count, len(graph)))
 
 
 def _neighbor_table(graph: NodeGraph) -> Rows:
@@ -75,25 +83,6 @@ def _neighbor_table(graph: NodeGraph) -> Rows:
     first = np.cumsum(degree) - degree
     table[graph.starts, 1 + np.arange(len(graph.starts)) - first[graph.starts]] = graph.ends
     return table
-
-
-def _bind_chunk(graph: NodeGraph, points: Floats, candidates: Rows) -> tuple[Rows, Floats]:
-    """Return the followed nodes of points [P,K] and their weights [P,K]."""
-    distance = np.linalg.norm(graph.positions[candidates] - points[:, None], axis=2)
-    distance[candidates < 0] = np.inf
-    kept = min(_BOUND_NODES + 1, candidates.shape[1])
-    order = np.argsort(distance, axis=1)[:, :kept]
-    near = np.take_along_axis(distance, order, axis=1)
-    found = np.maximum(np.take_along_axis(candidates, order, axis=1), 0)
-    usable = np.isfinite(near)
-    # the weights fall to 0 at the farthest candidate if there are more than enough
-    reach = 1.001 * np.where(usable, near, 0.0).max(axis=1, keepdims=True) + 1e-9 * graph.spacing
-    weights = np.where(usable, 1.0 - near / reach, 0.0).clip(0.0) ** 2
-    total = weights.sum(axis=1, keepdims=True)
-    weights = np.where(
-        total > 0.0, weights / np.maximum(total, 1e-300), usable / usable.sum(axis=1, keepdims=True)
-    )
-    return found, weights
 
 
 def rest_frames(rows: Tensor) -> Frames:

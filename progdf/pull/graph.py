@@ -20,10 +20,12 @@ from scipy.sparse.csgraph import dijkstra
 
 from progdf.color.oklab import srgb_to_oklab
 from progdf.gaussians import Gaussians
-from progdf.quaternions import rotation_matrices
 from progdf.scene.neighbors import join_pairs, nearest_rows
 from progdf.scene.point_tree import PointTree
 from progdf.sh import sh0_to_rgb
+from progdf.threads import run_chunks
+
+from . import graph_kernel
 
 Floats = NDArray[np.float64]
 Rows = NDArray[np.int64]
@@ -43,6 +45,7 @@ _MAX_EDGE = 2.5  # median lengths; longer edges through the inside are left out
 _MAX_DETOUR = 4.0  # length of the way along the part per distance; the way around a cylinder is π/2
 _MAX_ALIKE_DETOUR = 12.0  # the same for nodes of like color, such as both sides of an ear
 _CELL_SEARCH_STEPS = 24
+_PAIR_CHUNK = 1 << 14  # Gaussians whose pairs a thread measures at once
 
 
 @dataclass(frozen=True)
@@ -73,18 +76,16 @@ def build_graph(members: Gaussians, max_nodes: int = MAX_NODES) -> NodeGraph:
         members: the Gaussians, at least one. [M]
         max_nodes: target number of nodes, at least 1; fewer for few Gaussians
     """
-    points = members.means.detach().double().numpy()
+    points = np.ascontiguousarray(members.means.detach().double().numpy())
     colors = srgb_to_oklab(sh0_to_rgb(members.sh0.detach().double()).clamp(0.0, 1.0)).numpy()
-    start, end = _links(members, points, colors)
+    start, end = find_links(members, points, colors)
     target = max(1, min(max_nodes, len(points) // _MEMBERS_PER_NODE))
-    cell = _cells(points, target)
-    within = cell[start] == cell[end]
-    group = join_pairs(start[within], end[within], len(points))
+    group = graph_kernel.join_links(start, end, grid_cells(points, target))
     node_of = _join_fragments(points, group, start, end)
     weights = members.opacities.detach().double().numpy().clip(1e-6)
     positions = _node_means(node_of, weights, points)
     node_colors = _node_means(node_of, weights, colors)
-    linked = _pairs(node_of[start], node_of[end])
+    linked = _pairs(node_of[start], node_of[end], len(positions))
     part = join_pairs(linked[:, 0], linked[:, 1], len(positions))
     near = _inner_pairs(positions, node_colors, linked, part)
     pairs = np.unique(np.concatenate([linked, near]), axis=0)
@@ -96,41 +97,43 @@ def build_graph(members: Gaussians, max_nodes: int = MAX_NODES) -> NodeGraph:
     return NodeGraph(positions, node_of, both[:, 0], both[:, 1], part, max(spacing, 1e-9))
 
 
-def _links(members: Gaussians, points: Floats, colors: Floats) -> tuple[Rows, Rows]:
-    """Return both ends of the pairs of linked Gaussians."""
+def find_links(members: Gaussians, points: Floats, colors: Floats) -> tuple[Rows, Rows]:
+    """Return both ends of the pairs of linked Gaussians. [L], [L]
+
+    Args:
+        members: the Gaussians. [M]
+        points: their means. [M,3]
+        colors: their colors, OKLab. [M,3]
+    """
     count = len(points)
     nothing = np.zeros(0, np.int64)
     if count < 2:
         return nothing, nothing
-    near, distance = nearest_rows(
+    found = nearest_rows(
         torch.from_numpy(points), torch.arange(count), min(_LINKED_NEIGHBORS, count - 1), workers=-1
     )
-    start = np.repeat(np.arange(count), near.shape[1])
-    end = near.numpy().ravel()
-    length = distance.numpy().ravel()
-    axes = rotation_matrices(members.unit_quats.detach().double()).numpy()
-    scales = members.scales.detach().double().numpy()
-    direction = (points[end] - points[start]) / np.maximum(length, 1e-30)[:, None]
-    reach = _reach(axes[start], scales[start], direction) + _reach(axes[end], scales[end], direction)
-    gap = length / np.maximum(reach, 1e-30)
-    normals = axes[np.arange(count), :, scales.argmin(axis=1)]
-    cosine = np.abs((normals[start] * normals[end]).sum(axis=1))
-    color_distance = np.linalg.norm(colors[start] - colors[end], axis=1)
-    unlike_color = color_distance > _UNLIKE_COLOR_FACTOR * np.median(color_distance)
-    unlike = unlike_color & (cosine < _UNLIKE_COSINE)
-    limit = np.median(gap) * np.where(unlike, _UNLIKE_GAP_FACTOR, _GAP_FACTOR)
-    linked = gap <= limit
-    return start[linked], end[linked]
+    near = np.ascontiguousarray(found[0].numpy())
+    distance = np.ascontiguousarray(found[1].numpy())
+    quats = np.ascontiguousarray(members.unit_quats.detach().double().numpy())
+    scales = np.ascontiguousarray(members.scales.detach().double().numpy())
+    shapes = (points, quats, scales, np.ascontiguousarray(colors))
+    gaps = np.empty(near.shape)
+    color_distance = np.empty(near.shape)
+    unlike = np.empty(near.shape, bool)
+
+    def measure(chunk: int) -> None:
+        first = chunk * _PAIR_CHUNK
+        limits = (_UNLIKE_COSINE, first, min(first + _PAIR_CHUNK, count))
+        graph_kernel.measure_pairs(shapes, near, distance, limits, gaps, color_distance, unlike)
+
+    run_chunks(measure, -(-count // _PAIR_CHUNK))
+    unlike &= color_distance > _UNLIKE_COLOR_FACTOR * np.median(color_distance)
+    limit = np.median(gaps) * np.where(unlike, _UNLIKE_GAP_FACTOR, _GAP_FACTOR)
+    start, neighbor = np.nonzero(gaps <= limit)
+    return start, near[start, neighbor]
 
 
-def _reach(axes: Floats, scales: Floats, direction: Floats) -> Floats:
-    """Return the standard deviation of Gaussians in a direction. [L,3,3], [L,3], [L,3] -> [L]"""
-    along = np.einsum("lij,li->lj", axes, direction) * scales
-    reach: Floats = np.linalg.norm(along, axis=1)
-    return reach
-
-
-def _cells(points: Floats, target: int) -> Rows:
+def grid_cells(points: Floats, target: int) -> Rows:
     """Return the index of the grid cell of each point; about `target` cells are occupied. [M]"""
     low = points.min(axis=0)
     extent = float((points.max(axis=0) - low).max())
@@ -140,7 +143,7 @@ def _cells(points: Floats, target: int) -> Rows:
     large = 2.0 * extent
     for _ in range(_CELL_SEARCH_STEPS):
         size = float(np.sqrt(small * large))
-        if len(np.unique(_cell_ids(points - low, size))) > target:
+        if graph_kernel.exceeds_cells(points, low, size, target):
             small = size
         else:
             large = size
@@ -164,11 +167,10 @@ def _join_fragments(points: Floats, group: Rows, start: Rows, end: Rows) -> Rows
     small = counts < _FRAGMENT_SHARE * expected
     target = np.arange(len(counts))
     crossing = small[group[start]] & ~small[group[end]]
-    pairs, links = np.unique(
-        np.stack([group[start[crossing]], group[end[crossing]]], axis=1), axis=0, return_counts=True
-    )
-    ascending = np.argsort(links, kind="stable")
-    target[pairs[ascending, 0]] = pairs[ascending, 1]
+    keys = group[start[crossing]] * len(counts) + group[end[crossing]]
+    pairs, links = np.unique(keys, return_counts=True)
+    ascending = pairs[np.argsort(links, kind="stable")]
+    target[ascending // len(counts)] = ascending % len(counts)
     joined = target[group]
     left = small[joined]
     if left.any() and not left.all():
@@ -190,11 +192,13 @@ def _node_means(node_of: Rows, weights: Floats, values: Floats) -> Floats:
     return means
 
 
-def _pairs(start: Rows, end: Rows) -> Rows:
-    """Return each unordered pair of different nodes once. [P,2]"""
-    pairs = np.stack([np.minimum(start, end), np.maximum(start, end)], axis=1)
-    unique: Rows = np.unique(pairs[start != end], axis=0).reshape(-1, 2)
-    return unique
+def _pairs(start: Rows, end: Rows, count: int) -> Rows:
+    """Return each unordered pair of different nodes once, of `count` nodes. [P,2]"""
+    apart = start != end
+    low = np.minimum(start[apart], end[apart])
+    high = np.maximum(start[apart], end[apart])
+    keys = np.unique(low * count + high)
+    return np.stack([keys // count, keys % count], axis=1)
 
 
 def _inner_pairs(positions: Floats, colors: Floats, linked: Rows, part: Rows) -> Rows:
@@ -215,7 +219,7 @@ def _inner_pairs(positions: Floats, colors: Floats, linked: Rows, part: Rows) ->
     alike = color_distance <= _UNLIKE_COLOR_FACTOR * np.median(color_distance)
     detour = np.where(alike, _MAX_ALIKE_DETOUR, _MAX_DETOUR) * np.maximum(length, spacing)
     kept = (part[start] == part[end]) & (length <= _MAX_EDGE * spacing) & (ways[start, end] <= detour)
-    return _pairs(start[kept], end[kept])
+    return _pairs(start[kept], end[kept], count)
 
 
 def _ways(linked: Rows, lengths: Floats, count: int, limit: float) -> Floats:
