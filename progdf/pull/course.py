@@ -163,7 +163,7 @@ def pull(
     binding = bind(graph, points, graph.node_of)
     moves = (binding @ moved_nodes.astype(float) > 0.0) & kept[problem.members]
     members = problem.members[moves]
-    binding = csr_array(binding[np.flatnonzero(moves)])
+    binding = csr_array(binding[np.flatnonzero(moves)]).astype(np.float32)
     raw = pack(scene[torch.from_numpy(members)], with_shN=scene.sh_degree > 0).detach().float()
     frames = rest_frames(raw)
     offsets = torch.zeros(len(strengths), *raw.shape)

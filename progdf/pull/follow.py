@@ -95,7 +95,7 @@ def rest_frames(rows: Tensor) -> Frames:
     floor = floor.clamp_min(_LEAST_SQUARE)
     halves = torch.cat([axes.flatten(1), floor, largest], dim=1).float().numpy()
     turns = np.tile(np.eye(3, dtype=np.float32).ravel(), (len(rows), 1))
-    return Frames(halves, turns, np.ascontiguousarray(quats.float().numpy()))
+    return Frames(halves, turns, np.array(quats.detach().float().numpy(), order="C"))
 
 
 def follow(
@@ -111,7 +111,7 @@ def follow(
 
     Args:
         rows: raw rows at rest. [M,C]; float32 needs no conversion
-        binding: weights of the nodes. [M,n]
+        binding: weights of the nodes. [M,n]; float32 needs no conversion
         graph: deformation graph with n nodes
         pose: deformed nodes
         gradients: their deformation gradients. [n,3,3]
@@ -121,9 +121,44 @@ def follow(
     Returns:
         Rows [M,C] float32 and their axes.
     """
-    count = len(rows)
     raw = np.ascontiguousarray(rows.detach().float().numpy())
     packed = torch.empty(raw.shape) if out is None else out
+    frames = Frames(last.halves, np.empty_like(last.turns), np.empty_like(last.quats))
+    _follow(raw, binding, (graph, pose, gradients), (last, frames), packed.numpy(), is_offset=False)
+    return packed, frames
+
+
+def follow_in_place(
+    rows: Tensor,
+    binding: csr_array,
+    graph: NodeGraph,
+    pose: Pose,
+    gradients: Floats,
+    frames: Frames,
+    offsets: Tensor,
+) -> None:
+    """Write the offsets of rows that follow the nodes, without new memory that grows with M.
+
+    Args: see `follow`.
+        frames: axes at a similar pose, replaced by those at this pose
+        offsets: packed offsets from the rows at rest, contiguous; written. [M,C] float32
+    """
+    raw = rows.numpy()
+    _follow(raw, binding, (graph, pose, gradients), (frames, frames), offsets.numpy(), is_offset=True)
+
+
+def _follow(
+    raw: Singles,
+    binding: csr_array,
+    nodes: tuple[NodeGraph, Pose, Floats],
+    frames: tuple[Frames, Frames],
+    result: Singles,
+    is_offset: bool,
+) -> None:
+    """Write the rows that follow the nodes, or their offsets, and the axes; the last axes come first."""
+    graph, pose, gradients = nodes
+    last, written = frames
+    count = len(raw)
     center = graph.positions.mean(axis=0)
     table = np.zeros((len(graph), NODE_WIDTH), np.float32)
     write_nodes(
@@ -139,20 +174,18 @@ def follow(
         binding.indices.astype(np.int32, copy=False),
         binding.data.astype(np.float32, copy=False),
     )
-    frames = (np.empty((count, 9), np.float32), np.empty((count, 4), np.float32))
     degree = min(3, math.isqrt((raw.shape[1] - BASE_CHANNELS) // 3 + 1) - 1)
     bands = (_band_samples(1), _band_samples(2), _band_samples(3))
-    moved = packed.numpy()
     motions = (table.ravel(), center.astype(np.float32))
     start = (last.halves, last.turns, last.quats)
+    end = (written.turns, written.quats)
 
     def move(chunk: int) -> None:
         first = chunk * _FOLLOW_CHUNK
-        part = (first, min(first + _FOLLOW_CHUNK, count), degree)
-        follow_rows(raw, weights, motions, start, frames, bands, moved, part)
+        part = (first, min(first + _FOLLOW_CHUNK, count), degree, is_offset)
+        follow_rows(raw, weights, motions, start, end, bands, result, part)
 
     run_chunks(move, -(-count // _FOLLOW_CHUNK))
-    return packed, Frames(last.halves, *frames)
 
 
 @cache

@@ -42,6 +42,7 @@ _LAST_QUAT = 72
 _FLOOR = 76  # least squared scale
 _SQUARES = 77
 _NEW_QUAT = 80
+_TANGENT = 84  # largest squared tangent of a rotation in a sweep
 _COLORS = 90
 _BASIS = 115
 _BASIS_AT_REST = 125
@@ -53,74 +54,8 @@ _C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.09254843
 _C3 = (-0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154, 1.445305721320277)
 _ORTHOGONAL_SQUARE = np.float32(4e-14)  # squared cosine of columns that are orthogonal up to rounding
 _TINY = np.float32(1e-30)
-
-
-@kernel(cache=True, allocates=True)
-def write_nodes(
-    gradients: Floats, rest: Floats, moved: Floats, center: Floats, max_stretch: float, table: Singles
-) -> None:
-    """Write the motions of nodes, from which those of Gaussians are blended.
-
-    Args:
-        gradients: deformation gradients. [n,3,3]
-        rest, moved: positions. [n,3] each
-        center: the shifts are for points relative to it. [3]
-        max_stretch: limit of the singular values, and of their inverses
-        table: motions, see `NODE_WIDTH`. [n,32]
-    """
-    columns = np.empty((3, 3))
-    right = np.empty((3, 3))
-    rotation = np.empty((3, 3))
-    lengths = np.empty(3)
-    for node in range(len(gradients)):
-        gradient = gradients[node]
-        columns[:] = gradient
-        right[:] = 0.0
-        for r in range(3):
-            right[r, r] = 1.0
-        for _ in range(_NODE_SWEEPS):
-            for i in range(2):
-                for j in range(i + 1, 3):
-                    _orthogonalize(columns, right, i, j)
-        for c in range(3):
-            lengths[c] = math.sqrt(columns[0, c] ** 2 + columns[1, c] ** 2 + columns[2, c] ** 2)
-        least = 0
-        if lengths[1] < lengths[least]:
-            least = 1
-        if lengths[2] < lengths[least]:
-            least = 2
-        a = (least + 1) % 3
-        b = (least + 2) % 3
-        for c in (a, b):
-            scale = 1.0 / max(lengths[c], 1e-150)
-            for r in range(3):
-                columns[r, c] *= scale
-        # the least direction completes a rotation, also of a reflected or flat gradient
-        for r in range(3):
-            s = (r + 1) % 3
-            t = (r + 2) % 3
-            columns[r, least] = columns[s, a] * columns[t, b] - columns[t, a] * columns[s, b]
-        rotation[:] = 0.0
-        entry = table[node]
-        for r in range(3):
-            for c in range(3):
-                at_rest = 1.0 if r == c else 0.0
-                limited = 0.0
-                for k in range(3):
-                    value = min(max(lengths[k], 1.0 / max_stretch), max_stretch)
-                    limited += columns[r, k] * value * right[c, k]
-                    rotation[r, c] += columns[r, k] * right[c, k]
-                entry[3 * r + c] = gradient[r, c] - at_rest
-                entry[12 + 3 * r + c] = limited
-        for r in range(3):
-            shift = moved[node, r] - rest[node, r]
-            for c in range(3):
-                arm = rest[node, c] - center[c]
-                shift -= gradient[r, c] * arm
-                if r == c:
-                    shift += arm
-            entry[9 + r] = shift
-        _write_quat(rotation, entry)
+# squared tangent; the columns are then orthogonal up to its square, as the rotations converge quadratically
+_SETTLED_TANGENT_SQUARE = np.float32(1e-7)
 
 
 @kernel()
@@ -148,9 +83,77 @@ def _orthogonalize(columns: Floats, right: Floats, i: int, j: int) -> None:
             right[r, j] = sine * x + cosine * y
 
 
+@kernel(allocates=True)
+def _decompose(gradient: Floats, columns: Floats, right: Floats, lengths: Floats) -> None:
+    """Write the singular vectors and values of a gradient [3,3]: both sides [3,3], and the lengths [3].
+
+    Both sides are rotations, also if the gradient is reflected or flat.
+    """
+    columns[:] = gradient
+    right[:] = 0.0
+    for r in range(3):
+        right[r, r] = 1.0
+    for _ in range(_NODE_SWEEPS):
+        for i in range(2):
+            for j in range(i + 1, 3):
+                _orthogonalize(columns, right, i, j)
+    for c in range(3):
+        lengths[c] = math.sqrt(columns[0, c] ** 2 + columns[1, c] ** 2 + columns[2, c] ** 2)
+    least = 0
+    if lengths[1] < lengths[least]:
+        least = 1
+    if lengths[2] < lengths[least]:
+        least = 2
+    a = (least + 1) % 3
+    b = (least + 2) % 3
+    for c in (a, b):
+        scale = 1.0 / max(lengths[c], 1e-150)
+        for r in range(3):
+            columns[r, c] *= scale
+    # the least direction completes a rotation
+    for r in range(3):
+        s = (r + 1) % 3
+        t = (r + 2) % 3
+        columns[r, least] = columns[s, a] * columns[t, b] - columns[t, a] * columns[s, b]
+
+
 @kernel()
-def _write_quat(m: Floats, entry: Singles) -> None:
-    """Write the quaternion wxyz of a rotation [3,3] into the entry of a node."""
+def _write_gradients(
+    gradient: Floats, columns: Floats, right: Floats, lengths: Floats, max_stretch: float, entry: Singles
+) -> None:
+    """Write the gradient less the identity, and the limited one, into the entry of a node."""
+    for r in range(3):
+        for c in range(3):
+            at_rest = 1.0 if r == c else 0.0
+            limited = 0.0
+            for k in range(3):
+                value = min(max(lengths[k], 1.0 / max_stretch), max_stretch)
+                limited += columns[r, k] * value * right[c, k]
+            entry[3 * r + c] = gradient[r, c] - at_rest
+            entry[12 + 3 * r + c] = limited
+
+
+@kernel()
+def _write_shift(gradient: Floats, rest: Floats, moved: Floats, center: Floats, entry: Singles) -> None:
+    """Write the shift of a node's affine map into its entry, for points relative to a center."""
+    for r in range(3):
+        shift = moved[r] - rest[r]
+        for c in range(3):
+            arm = rest[c] - center[c]
+            shift -= gradient[r, c] * arm
+            if r == c:
+                shift += arm
+        entry[9 + r] = shift
+
+
+@kernel(allocates=True)
+def _write_quat(columns: Floats, right: Floats, entry: Singles) -> None:
+    """Write the quaternion wxyz of a node's rotation, from its singular vectors, into its entry."""
+    m = np.zeros((3, 3))
+    for r in range(3):
+        for c in range(3):
+            for k in range(3):
+                m[r, c] += columns[r, k] * right[c, k]
     w = 1.0 + m[0, 0] + m[1, 1] + m[2, 2]
     x = 1.0 + m[0, 0] - m[1, 1] - m[2, 2]
     y = 1.0 - m[0, 0] + m[1, 1] - m[2, 2]
@@ -176,6 +179,30 @@ def _write_quat(m: Floats, entry: Singles) -> None:
     entry[25] = x / length
     entry[26] = y / length
     entry[27] = z / length
+
+
+@kernel(cache=True, allocates=True)
+def write_nodes(
+    gradients: Floats, rest: Floats, moved: Floats, center: Floats, max_stretch: float, table: Singles
+) -> None:
+    """Write the motions of nodes, from which those of Gaussians are blended.
+
+    Args:
+        gradients: deformation gradients. [n,3,3]
+        rest, moved: positions. [n,3] each
+        center: the shifts are for points relative to it. [3]
+        max_stretch: limit of the singular values, and of their inverses
+        table: motions, see `NODE_WIDTH`. [n,32]
+    """
+    columns = np.empty((3, 3))
+    right = np.empty((3, 3))
+    lengths = np.empty(3)
+    for node in range(len(gradients)):
+        entry = table[node]
+        _decompose(gradients[node], columns, right, lengths)
+        _write_gradients(gradients[node], columns, right, lengths, max_stretch, entry)
+        _write_shift(gradients[node], rest[node], moved[node], center, entry)
+        _write_quat(columns, right, entry)
 
 
 @kernel(inline=True)
@@ -237,6 +264,9 @@ def _jacobi(buffer: Singles, first: int, second: int) -> None:
     tangent = select(is_orthogonal, np.float32(0.0), tangent)
     cosine = np.float32(1.0) / sqrt(np.float32(1.0) + tangent * tangent)
     sine = tangent * cosine
+    largest = load(buffer, _at(_TANGENT))
+    square = tangent * tangent
+    store(buffer, _at(_TANGENT), select(square > largest, square, largest))
     store(buffer, _at(_MATRIX + first), cosine * x0 - sine * y0)
     store(buffer, _at(_MATRIX + 3 + first), cosine * x1 - sine * y1)
     store(buffer, _at(_MATRIX + 6 + first), cosine * x2 - sine * y2)
@@ -248,6 +278,15 @@ def _jacobi(buffer: Singles, first: int, second: int) -> None:
         y = load(buffer, _at(_RIGHT + 3 * r + second))
         store(buffer, _at(_RIGHT + 3 * r + first), cosine * x - sine * y)
         store(buffer, _at(_RIGHT + 3 * r + second), sine * x + cosine * y)
+
+
+@kernel()
+def _is_small(buffer: Singles) -> bool:
+    """Return whether all lanes turned so little in a sweep that the next one would change only rounding."""
+    largest = np.float32(0.0)
+    for lane in range(_LANES):
+        largest = max(largest, buffer[_TANGENT * _LANES + lane])
+    return largest <= _SETTLED_TANGENT_SQUARE
 
 
 @kernel()
@@ -272,9 +311,12 @@ def _stretch_axes(buffer: Singles) -> None:
     for k in range(9):
         store(buffer, _at(_RIGHT + k), load(buffer, _at(_LAST_RIGHT + k)))
     for _ in range(_SWEEPS):
+        store(buffer, _at(_TANGENT), broadcast(np.float32(0.0)))
         _jacobi(buffer, 0, 1)
         _jacobi(buffer, 0, 2)
         _jacobi(buffer, 1, 2)
+        if _is_small(buffer):
+            break
     floor = load(buffer, _at(_FLOOR))
     for k in range(3):
         x = load(buffer, _at(_MATRIX + k))
@@ -457,6 +499,57 @@ def _write_rotation(buffer: Singles) -> None:
     store(buffer, _at(_MATRIX + 8), one - two * (x * x + y * y))
 
 
+@kernel()
+def _read_lane(
+    rows: Singles, last: tuple[Singles, Singles, Singles], member: int, lane: int, buffer: Singles
+) -> None:
+    """Read a Gaussian's row and its axes at a similar pose into one lane."""
+    halves, last_turns, last_quats = last
+    for k in range(9):
+        buffer[(_HALF + k) * _LANES + lane] = halves[member, k]
+        buffer[(_LAST_RIGHT + k) * _LANES + lane] = last_turns[member, k]
+    for k in range(4):
+        buffer[(_LAST_QUAT + k) * _LANES + lane] = last_quats[member, k]
+    buffer[_FLOOR * _LANES + lane] = halves[member, 9]
+    for c in range(rows.shape[1]):
+        buffer[(_ROW + c) * _LANES + lane] = rows[member, c]
+
+
+@kernel()
+def _move_means(center: Singles, buffer: Singles) -> None:
+    """Move the means by the blended affine maps, whose shifts refer to a center. [3]"""
+    x = load(buffer, _at(_ROW)) - center[0]
+    y = load(buffer, _at(_ROW + 1)) - center[1]
+    z = load(buffer, _at(_ROW + 2)) - center[2]
+    for r in range(3):
+        step = load(buffer, _at(9 + r))
+        step = step + load(buffer, _at(3 * r)) * x
+        step = step + load(buffer, _at(3 * r + 1)) * y
+        step = step + load(buffer, _at(3 * r + 2)) * z
+        store(buffer, _at(_ROW + r), load(buffer, _at(_ROW + r)) + step)
+
+
+@kernel()
+def _write_frame(frames: tuple[Singles, Singles], member: int, lane: int, buffer: Singles) -> None:
+    """Write the rotation of the columns and the quaternion of one lane."""
+    for k in range(9):
+        frames[0][member, k] = buffer[(_RIGHT + k) * _LANES + lane]
+    for k in range(4):
+        frames[1][member, k] = buffer[(_NEW_QUAT + k) * _LANES + lane]
+
+
+@kernel()
+def _write_row(halves: Singles, member: int, lane: int, buffer: Singles, result: Singles) -> None:
+    """Write the packed raw row of one lane."""
+    for c in range(result.shape[1]):
+        result[member, c] = buffer[(_ROW + c) * _LANES + lane]
+    for k in range(3):
+        square = buffer[(_SQUARES + k) * _LANES + lane]
+        result[member, 3 + k] = halves[member, 10] + np.float32(0.5) * math.log(square)
+    for k in range(4):
+        result[member, 6 + k] = buffer[(_NEW_QUAT + k) * _LANES + lane]
+
+
 @kernel(cache=True, allocates=True)
 def follow_rows(
     rows: Singles,
@@ -466,7 +559,7 @@ def follow_rows(
     frames: tuple[Singles, Singles],
     bands: tuple[Bands, Bands, Bands],
     result: Singles,
-    part: tuple[int, int, int],
+    part: tuple[int, int, int, bool],
 ) -> None:
     """Write the packed raw rows that follow the nodes, for a part of the M Gaussians.
 
@@ -477,14 +570,13 @@ def follow_rows(
             shifts refer. [3]
         last: axes times scales at rest with two more numbers, see `progdf.pull.follow.Frames` [M,11];
             rotations of the columns [M,9] and quaternions [M,4] at a similar pose
-        frames: rotations of the columns and quaternions at this pose; written
+        frames: rotations of the columns and quaternions at this pose; written, may be those of `last`
         bands: directions and matrices of bands 1, 2 and 3
         result: raw rows; written. [M,C]
-        part: first Gaussian, end, and SH degree that rotates, 0 to 3
+        part: first Gaussian, end, SH degree that rotates, 0 to 3, and True to write the offsets from rest
     """
-    begin, end, degree = part
+    begin, end, degree, is_offset = part
     table, center = motions
-    halves, last_turns, last_quats = last
     width = rows.shape[1]
     buffer = np.zeros((_ROW + width) * _LANES, np.float32)
     if degree > 0:
@@ -498,29 +590,11 @@ def follow_rows(
         for lane in range(_LANES):
             member = start + min(lane, lanes - 1)
             _blend_node_motions(weights, table, member, lane, buffer)
-            for k in range(9):
-                buffer[(_HALF + k) * _LANES + lane] = halves[member, k]
-                buffer[(_LAST_RIGHT + k) * _LANES + lane] = last_turns[member, k]
-            for k in range(4):
-                buffer[(_LAST_QUAT + k) * _LANES + lane] = last_quats[member, k]
-            buffer[_FLOOR * _LANES + lane] = halves[member, 9]
-            for c in range(width):
-                buffer[(_ROW + c) * _LANES + lane] = rows[member, c]
-        x = load(buffer, _at(_ROW)) - center[0]
-        y = load(buffer, _at(_ROW + 1)) - center[1]
-        z = load(buffer, _at(_ROW + 2)) - center[2]
-        for r in range(3):
-            step = load(buffer, _at(9 + r))
-            step = step + load(buffer, _at(3 * r)) * x
-            step = step + load(buffer, _at(3 * r + 1)) * y
-            step = step + load(buffer, _at(3 * r + 2)) * z
-            store(buffer, _at(_ROW + r), load(buffer, _at(_ROW + r)) + step)
+            _read_lane(rows, last, member, lane, buffer)
+        _move_means(center, buffer)
         _stretch_axes(buffer)
         for lane in range(lanes):
-            for k in range(9):
-                frames[0][start + lane, k] = buffer[(_RIGHT + k) * _LANES + lane]
-            for k in range(4):
-                frames[1][start + lane, k] = buffer[(_NEW_QUAT + k) * _LANES + lane]
+            _write_frame(frames, start + lane, lane, buffer)
         if degree > 0:
             _write_rotation(buffer)
             _turn_band(1, bands[0], buffer)
@@ -530,10 +604,7 @@ def follow_rows(
             _turn_band(3, bands[2], buffer)
         for lane in range(lanes):
             member = start + lane
-            for c in range(width):
-                result[member, c] = buffer[(_ROW + c) * _LANES + lane]
-            for k in range(3):
-                square = buffer[(_SQUARES + k) * _LANES + lane]
-                result[member, 3 + k] = halves[member, 10] + np.float32(0.5) * math.log(square)
-            for k in range(4):
-                result[member, 6 + k] = buffer[(_NEW_QUAT + k) * _LANES + lane]
+            _write_row(last[0], member, lane, buffer, result)
+            if is_offset:
+                for c in range(width):
+                    result[member, c] -= rows[member, c]

@@ -27,7 +27,7 @@ from progdf.rasterize.cpu.jit import kernel_cache
 from progdf.region import Region, from_mask, whole_scene
 
 from .course import Handle, make_problem
-from .follow import bind, follow, rest_frames
+from .follow import bind, follow_in_place, rest_frames
 from .graph import MAX_NODES, Floats, Rows
 
 _SETTLED_SHARE = 1e-3
@@ -62,7 +62,8 @@ class LiveStep:
     """Result of one step."""
 
     pose: HandlePose  # of the handles
-    offsets: Tensor  # packed offsets of the members from the scene. [M,C] float32
+    # packed offsets of the members from the scene, overwritten by the step after the next. [M,C] float32
+    offsets: Tensor
     is_settled: bool  # further steps with the same displacements change nothing visible
     milliseconds: float  # time that the step took
 
@@ -94,17 +95,21 @@ class LivePull:
         rows = self._problem.members
         moves = np.ones(len(rows), bool)
         if hold is not None:
-            moves = ~np.isin(rows, hold.members.numpy())
+            moves = ~hold.mask.numpy()[rows]
         points = scene.means.detach().double().numpy()[rows]
         binding = bind(graph, points, graph.node_of)
         moves &= binding @ (~self._problem.held).astype(float) > 0.0
         self.members: Rows = rows[moves]
         """Gaussians that can move, ascending. [M]"""
-        self._binding = csr_array(binding[np.flatnonzero(moves)])
-        self.influence: Floats = self._binding @ self._problem.influence
+        if not moves.all():
+            binding = csr_array(binding[np.flatnonzero(moves)])
+        self.influence: Floats = binding @ self._problem.influence
         """Share of the handles' motion that each of them may follow, 0 to 1. [M]"""
-        self._rows = pack(scene[torch.from_numpy(self.members)], with_shN=scene.sh_degree > 0).float()
+        self._binding = binding.astype(np.float32)
+        rows_of_members = pack(scene[torch.from_numpy(self.members)], with_shN=scene.sh_degree > 0)
+        self._rows = rows_of_members.detach().float().contiguous()
         self._frames = rest_frames(self._rows)
+        self._offsets = (torch.empty_like(self._rows), torch.empty_like(self._rows))
         self._pose = self._problem.solver.rest()
 
     @property
@@ -131,12 +136,12 @@ class LivePull:
         moved = float(np.abs(pose.positions - self._pose.positions).max(initial=0.0))
         self._pose = pose
         gradients = problem.solver.gradients(pose)
-        moved_rows, self._frames = follow(
-            self._rows, self._binding, problem.graph, pose, gradients, self._frames
-        )
+        offsets = self._offsets[0]
+        self._offsets = self._offsets[::-1]
+        follow_in_place(self._rows, self._binding, problem.graph, pose, gradients, self._frames, offsets)
         return LiveStep(
             handles,
-            moved_rows.float().sub_(self._rows),
+            offsets,
             moved <= _SETTLED_SHARE * problem.graph.spacing,
             1e3 * (time.perf_counter() - began),
         )

@@ -56,12 +56,51 @@ def _rotate(rotation: Floats, x: float, y: float, z: float) -> None:
         rotation[2, c] = 2 * (x * z - w * y) * a + 2 * (y * z + w * x) * b + (1 - 2 * (x * x + y * y)) * d
 
 
+@kernel(inline=True)
+def _newton_step(
+    trace: float, skew: tuple[float, float, float], diagonal: tuple[float, float, float],
+    mixed: tuple[float, float, float],
+) -> tuple[float, float, float]:  # fmt: skip
+    """Return the rotation vector by which the trace of H grows, for a matrix H [3,3].
+
+    It is a Newton step where the trace is concave, otherwise one of Müller and others (2016).
+
+    Args:
+        trace: Σ |H_ii|
+        skew: H_zy − H_yz and so on
+        diagonal: H_xx, H_yy, H_zz
+        mixed: H_xy + H_yx, H_xz + H_zx, H_yz + H_zy
+    """
+    tx, ty, tz = skew
+    # the Hessian tr(H) I − H with the symmetric part H, and a ridge for free directions
+    ridge = 1e-9 * trace + 1e-12
+    h00 = diagonal[1] + diagonal[2] + ridge
+    h11 = diagonal[0] + diagonal[2] + ridge
+    h22 = diagonal[0] + diagonal[1] + ridge
+    h01 = -0.5 * mixed[0]
+    h02 = -0.5 * mixed[1]
+    h12 = -0.5 * mixed[2]
+    c00 = h11 * h22 - h12 * h12
+    c01 = h02 * h12 - h01 * h22
+    c02 = h01 * h12 - h02 * h11
+    determinant = h00 * c00 + h01 * c01 + h02 * c02
+    if h00 > 0.0 and h00 * h11 - h01 * h01 > 0.0 and determinant > 0.0:
+        c11 = h00 * h22 - h02 * h02
+        c12 = h01 * h02 - h00 * h12
+        c22 = h00 * h11 - h01 * h01
+        x = (c00 * tx + c01 * ty + c02 * tz) / determinant
+        y = (c01 * tx + c11 * ty + c12 * tz) / determinant
+        z = (c02 * tx + c12 * ty + c22 * tz) / determinant
+        if x * x + y * y + z * z < 1.0:
+            return x, y, z
+    return tx / (trace + 1e-9), ty / (trace + 1e-9), tz / (trace + 1e-9)
+
+
 @kernel()
 def nearest_rotation(matrix: Floats, rotation: Floats) -> None:
     """Turn a rotation into the one nearest to a matrix. Both [3,3]; the rotation is updated in place.
 
-    The trace of Rᵀ M grows by Newton steps where it is concave, otherwise by steps of Müller and others
-    (2016).
+    The trace of Rᵀ M grows by steps, see `_newton_step`.
     Directions in which the matrix is zero keep the rotation.
     """
     size = 0.0
@@ -86,37 +125,10 @@ def nearest_rotation(matrix: Floats, rotation: Floats) -> None:
             zx += d * rotation[0, c]
             yz += b * rotation[2, c]
             zy += d * rotation[1, c]
-        tx = zy - yz
-        ty = xz - zx
-        tz = yx - xy
-        # the Hessian tr(H) I − H with the symmetric part H, and a ridge for free directions
-        work = abs(m00) + abs(m11) + abs(m22)
-        ridge = 1e-9 * work + 1e-12
-        h00 = m11 + m22 + ridge
-        h11 = m00 + m22 + ridge
-        h22 = m00 + m11 + ridge
-        h01 = -0.5 * (xy + yx)
-        h02 = -0.5 * (xz + zx)
-        h12 = -0.5 * (yz + zy)
-        c00 = h11 * h22 - h12 * h12
-        c01 = h02 * h12 - h01 * h22
-        c02 = h01 * h12 - h02 * h11
-        determinant = h00 * c00 + h01 * c01 + h02 * c02
-        is_concave = h00 > 0.0 and h00 * h11 - h01 * h01 > 0.0 and determinant > 0.0
-        x = tx / (work + 1e-9)
-        y = ty / (work + 1e-9)
-        z = tz / (work + 1e-9)
-        if is_concave:
-            c11 = h00 * h22 - h02 * h02
-            c12 = h01 * h02 - h00 * h12
-            c22 = h00 * h11 - h01 * h01
-            nx = (c00 * tx + c01 * ty + c02 * tz) / determinant
-            ny = (c01 * tx + c11 * ty + c12 * tz) / determinant
-            nz = (c02 * tx + c12 * ty + c22 * tz) / determinant
-            if nx * nx + ny * ny + nz * nz < 1.0:
-                x = nx
-                y = ny
-                z = nz
+        trace = abs(m00) + abs(m11) + abs(m22)
+        x, y, z = _newton_step(
+            trace, (zy - yz, xz - zx, yx - xy), (m00, m11, m22), (xy + yx, xz + zx, yz + zy)
+        )
         _rotate(rotation, x, y, z)
         if x * x + y * y + z * z < _ROTATION_TOLERANCE:
             break

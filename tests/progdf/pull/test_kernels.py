@@ -8,7 +8,7 @@ import torch
 from scipy.sparse import csr_array
 
 from progdf.gaussians import pack
-from progdf.pull.follow import bind, follow, rest_frames
+from progdf.pull.follow import bind, follow, follow_in_place, rest_frames
 from progdf.pull.graph import build_graph
 from progdf.pull.solve import Pose, Solver, nearest_rotations
 from progdf.quaternions import rotation_matrices, turn_quats
@@ -106,3 +106,22 @@ def test_nearest_rotation_of_a_half_turn_and_of_a_flat_matrix() -> None:
     assert np.allclose(found @ np.swapaxes(found, 1, 2), np.eye(3), atol=1e-12)
     flat = np.zeros((1, 3, 3))
     assert np.array_equal(nearest_rotations(flat, np.eye(3)[None]), np.eye(3)[None])
+
+
+def test_offsets_written_in_place_are_those_of_the_followed_rows() -> None:
+    scene = bar(9, degree=2)
+    graph = build_graph(scene)
+    generator = np.random.default_rng(4)
+    turns = rotation_matrices(turn_quats(torch.from_numpy(generator.normal(size=(len(graph), 3))))).numpy()
+    pose = Pose(graph.positions + 0.1 * generator.normal(size=(len(graph), 3)), turns)
+    rows = pack(scene, with_shN=True)
+    at_rest = rows.clone()
+    binding = bind(graph, scene.means.double().numpy(), graph.node_of)
+    packed, expected = follow(rows, binding, graph, pose, turns, rest_frames(rows))
+    frames = rest_frames(rows)
+    offsets = torch.full_like(rows, torch.nan)
+    follow_in_place(rows, binding, graph, pose, turns, frames, offsets)
+    assert torch.equal(offsets, packed - rows)
+    assert torch.equal(rows, at_rest)
+    assert np.array_equal(frames.turns, expected.turns)
+    assert np.array_equal(frames.quats, expected.quats)
