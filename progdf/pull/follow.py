@@ -24,9 +24,10 @@ from progdf.quaternions import normalize_quats, rotation_matrices
 from progdf.sh import basis, spread_directions
 from progdf.threads import run_chunks
 
-from .follow_kernel import NODE_WIDTH, Bands, Singles, follow_rows, write_nodes
+from .follow_kernel import Bands, Singles, follow_rows
 from .graph import Floats, NodeGraph, Rows
 from .graph_kernel import bind_points
+from .node_kernel import NODE_WIDTH, write_nodes
 from .solve import Pose
 
 MAX_STRETCH = 3.0
