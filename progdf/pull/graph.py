@@ -130,7 +130,7 @@ def find_links(members: Gaussians, points: Floats, colors: Floats) -> tuple[Rows
     unlike &= color_distance > _UNLIKE_COLOR_FACTOR * np.median(color_distance)
     limit = np.median(gaps) * np.where(unlike, _UNLIKE_GAP_FACTOR, _GAP_FACTOR)
     start, neighbor = np.nonzero(gaps <= limit)
-    return start, near[start, neighbor]
+    return np.ascontiguousarray(start), near[start, neighbor]
 
 
 def grid_cells(points: Floats, target: int) -> Rows:
