@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from scipy.ndimage import binary_closing
+from scipy.ndimage import binary_closing, binary_erosion
 
 from progdf.camera import Camera, intrinsics, look_at
 from progdf.gaussians import Gaussians
@@ -19,6 +19,7 @@ from tests.progdf.pull.test_pull import at
 MAX_HOLE_SHARE = 1e-3  # of the part's pixels
 SIZE = 160  # pixels
 GAP_PX = 4  # half the width of the widest gap that counts as a hole
+BORDER_PX = 2  # width of the part's ragged border, which is left out
 Point = tuple[float, float, float]
 
 
@@ -62,6 +63,7 @@ def hole_share(scene: Gaussians, direction: Point) -> float:
     view = Camera(look_at(eye, center, up), intrinsics(0.7, SIZE, SIZE), SIZE, SIZE)
     covered = render(scene, view).transmittance.numpy() < 0.5
     part = binary_closing(np.pad(covered, 2 * GAP_PX), iterations=GAP_PX)
+    part = binary_erosion(part, iterations=BORDER_PX)
     inner = part[2 * GAP_PX : -2 * GAP_PX, 2 * GAP_PX : -2 * GAP_PX]
     return float((inner & ~covered).sum() / inner.sum())
 
