@@ -11,7 +11,7 @@ import torch
 
 from progdf.gaussians import concatenate
 from progdf.pull.course import Handle, pull
-from progdf.pull.live import LivePull
+from progdf.pull.live import HandlePose, LivePull
 from progdf.region import inside_box, whole_scene
 from tests.progdf.pull.test_pull import SPACING, at, bar, grip
 
@@ -49,5 +49,6 @@ def test_equal_gaussians_move_as_one() -> None:
     handle = grip(scene, (0.0, 0.0, 0.0), (0.1, 0.2, 0.3))
     moved = at(scene, pull(scene, [handle]), 1.0).means - scene.means
     assert torch.allclose(moved, torch.tensor([0.1, 0.2, 0.3]).expand(300, 3), atol=1e-4)
-    offsets = LivePull(scene, [handle]).step(np.array([handle.pull]), 30).offsets
+    pose = HandlePose.of_shifts(np.array([handle.pull]))
+    offsets = LivePull(scene, [handle]).step(pose, 30).offsets
     assert torch.allclose(offsets[:, :3], moved, atol=1e-3)
