@@ -34,6 +34,11 @@ APPEARANCE = slice(GEOMETRY.stop, BASE_CHANNELS)  # opacity and color of band 0
 _BANDS = slice(BASE_CHANNELS, None)
 
 
+HINGE_REACH = 2.0
+"""Distance of an axis from a part's center, in root mean square sizes, at which it still passes through the
+part. The end of a straight rod is at √3."""
+
+
 @dataclass(frozen=True)
 class Motion:
     """Motion of each of P parts."""
@@ -144,15 +149,46 @@ def _move_geometry(rows: Tensor, parts: Parts, motion: Motion) -> Tensor:
     return torch.cat([means, log_scales + size, multiply_quats(turn, quats)], dim=1)
 
 
-def interpolate_motion(a: Motion, b: Motion, share: float) -> Motion:
-    """Interpolate motions: shift and log-scale linearly, the rotation along the great circle."""
+def interpolate_motion(a: Motion, b: Motion, share: float, sizes: Tensor) -> Motion:
+    """Interpolate motions: log-scales linearly, rotations along the great circle, centers on arcs or lines.
+
+    A part that turns about an axis through it, like an arm about its joint, stays at rest at that axis. The
+    farther away the axis is, the straighter is the way of the center.
+
+    Args:
+        a, b: motions of P parts
+        share: 0 to 1
+        sizes: root mean square sizes of the parts, see `Parts`. [P]
+    """
     start = turn_quats(a.turn)
     remaining = quat_turns(multiply_quats(turn_quats(-a.turn), turn_quats(b.turn)))
-    return Motion(
-        torch.lerp(a.shift, b.shift, share),
-        torch.lerp(a.log_scale, b.log_scale, share),
-        quat_turns(multiply_quats(start, turn_quats(share * remaining))),
-    )
+    turn = quat_turns(multiply_quats(start, turn_quats(share * remaining)))
+    world_turn = rotate_vectors(remaining, start)
+    distance = b.shift - a.shift
+    hinge = _hinges(distance, world_turn, sizes)
+    swung = rotate_vectors(hinge, turn_quats(world_turn)) - hinge
+    swinging = rotate_vectors(hinge, turn_quats(share * world_turn)) - hinge
+    shift = a.shift + share * (distance + swung) - swinging
+    return Motion(shift, torch.lerp(a.log_scale, b.log_scale, share), turn)
+
+
+def _hinges(distance: Tensor, turn: Tensor, sizes: Tensor) -> Tensor:
+    """Return the point of each part that moves straight, relative to the center. [P,3]
+
+    Args:
+        distance: shift of the center. [P,3]
+        turn: rotation vector. [P,3]
+        sizes: root mean square sizes. [P]
+    """
+    angle = turn.norm(dim=1, keepdim=True)
+    axis = turn / angle.clamp_min(1e-12)
+    across = distance - (distance * axis).sum(dim=1, keepdim=True) * axis
+    # the axis is the place that a rotation by the angle moves by nothing
+    cotangent = (0.5 * angle).cos() / (0.5 * angle).sin().clamp_min(1e-6)
+    foot = 0.5 * (across + cotangent * torch.linalg.cross(axis, across))
+    reach = HINGE_REACH * sizes[:, None] / foot.norm(dim=1, keepdim=True).clamp_min(1e-12)
+    hinges: Tensor = foot * reach.square().clamp_max(1.0)
+    return hinges
 
 
 def split_geometry(rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -32,14 +32,13 @@ from progdf.quaternions import (
     turn_quats,
 )
 
-from .warp import MemberMaps, RegionMotion
+from .warp import MemberMaps, RegionMotion, rigid_path
 
 Floats = NDArray[np.float64]
 
 MAX_SEARCH_NODES = 300
 """Largest number of nodes of a search."""
 _GRADIENT_PRIOR = 0.05  # weight of the rotation in a node's map, as a share of its edges' squares
-_STILL_SQUARE = 1e-5  # squared way, in node spacings, at which a node loses half its tether
 _MAX_GROWTH = math.log(MAX_STRETCH)
 _JACOBI_SWEEPS = 3
 _PAIRS = ((0, 1), (0, 2), (1, 2))
@@ -206,11 +205,10 @@ def settle_turns(nodes: RegionNodes, motion: NodeMotion) -> NodeMotion:
 
 
 def interpolate_nodes(nodes: RegionNodes, a: NodeMotion, b: NodeMotion, share: float) -> NodeMotion:
-    """Interpolate two motions as rigidly as possible, so that parts that turn do not shrink on the way.
+    """Interpolate two motions as rigidly as possible.
 
-    The rotations are interpolated along the great circle and the stretches linearly. The positions fit the
-    edges that they give. Nodes that move little stay near the straight line, which determines the place of
-    each connected part.
+    The rotations are interpolated along the great circle, the stretches linearly and the positions by
+    `rigid_path`.
     """
     remaining = quat_turns(multiply_quats(turn_quats(-a.turn), turn_quats(b.turn)))
     turn = quat_turns(multiply_quats(turn_quats(a.turn), turn_quats(share * remaining)))
@@ -220,31 +218,16 @@ def interpolate_nodes(nodes: RegionNodes, a: NodeMotion, b: NodeMotion, share: f
     gradients_a = nodes.gradients(a)
     gradients_b = nodes.gradients(b)
     stretches = torch.lerp(rotation_a.mT @ gradients_a, rotation_b.mT @ gradients_b, share)
-    between = _fit_edges(nodes, a, b, rotation @ stretches, share)
-    # the remainder at both ends, which turns with the nodes
-    left_a = rotation_a.mT @ (a.positions - _fit_edges(nodes, a, b, gradients_a, 0.0))[..., None]
-    left_b = rotation_b.mT @ (b.positions - _fit_edges(nodes, a, b, gradients_b, 1.0))[..., None]
-    left = (rotation @ torch.lerp(left_a, left_b, share))[..., 0]
-    return settle_turns(nodes, NodeMotion(between + left, turn))
-
-
-def _fit_edges(nodes: RegionNodes, a: NodeMotion, b: NodeMotion, gradients: Tensor, share: float) -> Tensor:
-    """Return the positions whose edges fit the maps of the nodes at their ends. [n,3]"""
-    straight = torch.lerp(a.positions, b.positions, share).double()
-    way = (b.positions - a.positions).norm(dim=1).double() / nodes.spacing
-    tether = _STILL_SQUARE / (_STILL_SQUARE + way.square())
-    matrices = 0.5 * (gradients[nodes.starts] + gradients[nodes.ends]).double()
-    edges = (matrices @ nodes.arms.double()[..., None])[..., 0]
-    right = tether[:, None] * straight
-    right = right.index_add(0, nodes.ends, edges).index_add(0, nodes.starts, -edges)
-    system = torch.diag(tether)
-    index = nodes.starts * len(nodes) + nodes.ends
-    adjacency = system.new_zeros(len(nodes) ** 2).index_add(0, index, system.new_ones(len(index)))
-    adjacency = adjacency.view(len(nodes), len(nodes))
-    adjacency = adjacency + adjacency.mT
-    system = system + torch.diag(adjacency.sum(dim=1)) - adjacency
-    positions: Tensor = torch.linalg.solve(system, right)
-    return positions.to(a.positions)
+    positions = rigid_path(
+        nodes.positions,
+        torch.stack([nodes.starts, nodes.ends], dim=1),
+        nodes.spacing,
+        (a.positions, b.positions),
+        (gradients_a, rotation @ stretches, gradients_b),
+        (rotation_a, rotation, rotation_b),
+        share,
+    )
+    return settle_turns(nodes, NodeMotion(positions, turn))
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol, Self
 
@@ -54,6 +54,7 @@ _WIDE_STEP_SHARE = 0.4  # share of the coarsest level's steps with blurred pictu
 _RIGIDITY_WEIGHT = 0.05  # weight of the squared disagreement of neighbors, in squares of their spacing
 _STRETCH_WEIGHT = 0.002  # weight of the squared stretch
 _DAMPING = 0.1  # see `descend`
+_STILL_SQUARE = 1e-5  # squared way, in spacings, at which a point loses half its tether to the straight line
 _CONTROLS_PER_MEMBER = 4  # control points per member
 _LINKS_PER_CONTROL = 6  # neighbors per control point
 _QUATS = attribute_slices(BASE_CHANNELS)["quats"]
@@ -241,14 +242,73 @@ def warp_rows(original: Tensor, control: ControlPoints, motion: WarpMotion) -> T
     return original + maps.carry(original, torch.zeros_like(original))
 
 
-def interpolate_warp(a: WarpMotion, b: WarpMotion, share: float) -> WarpMotion:
-    """Interpolate two motions: shift and stretch linearly, rotations along the great circle."""
+def interpolate_warp(control: ControlPoints, a: WarpMotion, b: WarpMotion, share: float) -> WarpMotion:
+    """Interpolate two motions: stretch linearly, rotations along the great circle, shifts by `rigid_path`."""
     remaining = quat_turns(multiply_quats(turn_quats(-a.turn), turn_quats(b.turn)))
-    return WarpMotion(
-        torch.lerp(a.shift, b.shift, share),
-        quat_turns(multiply_quats(turn_quats(a.turn), turn_quats(share * remaining))),
-        torch.lerp(a.stretch, b.stretch, share),
+    turn = quat_turns(multiply_quats(turn_quats(a.turn), turn_quats(share * remaining)))
+    between = WarpMotion(torch.lerp(a.shift, b.shift, share), turn, torch.lerp(a.stretch, b.stretch, share))
+    positions = rigid_path(
+        control.points,
+        control.links,
+        control.spacing,
+        (control.points + a.shift, control.points + b.shift),
+        tuple(affine_maps(control, motion)[0] for motion in (a, between, b)),
+        tuple(rotation_matrices(turn_quats(motion.turn)) for motion in (a, between, b)),
+        share,
     )
+    return replace(between, shift=positions - control.points)
+
+
+def rigid_path(
+    points: Tensor,
+    links: Tensor,
+    spacing: float,
+    ends: tuple[Tensor, Tensor],
+    maps: Sequence[Tensor],
+    rotations: Sequence[Tensor],
+    share: float,
+) -> Tensor:
+    """Return positions between two poses, so that parts that turn do not shrink on the way.
+
+    The links between the points follow the maps at their ends. Points that move little stay near the straight
+    line, which determines the place of each connected part.
+
+    Args:
+        points: positions at rest. [P,3]
+        links: pairs of neighbors. [L,2]
+        spacing: distance of neighbors, world units
+        ends: positions in both poses. [P,3] each
+        maps: affine maps of the points in the first pose, between and in the last. [P,3,3] each
+        rotations: rotations of these maps. [P,3,3] each
+        share: 0 to 1
+
+    Returns:
+        [P,3]; the poses themselves at 0 and 1
+    """
+    first, last = ends
+    way = (last - first).norm(dim=1).double() / spacing
+    tether = _STILL_SQUARE / (_STILL_SQUARE + way.square())
+    start, end = links.unbind(1)
+    adjacency = tether.new_zeros(len(points) ** 2)
+    adjacency = adjacency.index_add(0, start * len(points) + end, tether.new_ones(len(links)))
+    adjacency = adjacency.view(len(points), len(points))
+    adjacency = adjacency + adjacency.mT
+    factor = torch.linalg.cholesky(torch.diag(tether + adjacency.sum(dim=1)) - adjacency)
+    arms = (points[end] - points[start]).double()
+
+    def fit(matrices: Tensor, at: float) -> Tensor:
+        """Return the positions whose links fit the maps at their ends. [P,3]"""
+        mean = 0.5 * (matrices[start] + matrices[end]).double()
+        edges = (mean @ arms[..., None])[..., 0]
+        right = tether[:, None] * torch.lerp(first, last, at).double()
+        right = right.index_add(0, end, edges).index_add(0, start, -edges)
+        return torch.cholesky_solve(right, factor).to(points)
+
+    # the remainder at both ends, which turns with the points
+    left_first = rotations[0].mT @ (first - fit(maps[0], 0.0))[..., None]
+    left_last = rotations[2].mT @ (last - fit(maps[2], 1.0))[..., None]
+    left = (rotations[1] @ torch.lerp(left_first, left_last, share))[..., 0]
+    return fit(maps[1], share) + left
 
 
 def extrapolate_warp(motion: WarpMotion, further: float) -> WarpMotion:
@@ -415,7 +475,8 @@ class PartsPlacement:
 
     def interpolate(self, other: PartsPlacement, share: float) -> PartsPlacement:
         """See `RegionMotion`."""
-        return PartsPlacement(self.parts, interpolate_motion(self.motion, other.motion, share))
+        motion = interpolate_motion(self.motion, other.motion, share, self.parts.sizes)
+        return PartsPlacement(self.parts, motion)
 
     def lines(self) -> list[str]:
         """Return the motion of each part, in units of its size."""
@@ -451,7 +512,7 @@ class WarpPlacement:
 
     def interpolate(self, other: WarpPlacement, share: float) -> WarpPlacement:
         """See `RegionMotion`."""
-        return WarpPlacement(self.control, interpolate_warp(self.motion, other.motion, share))
+        return WarpPlacement(self.control, interpolate_warp(self.control, self.motion, other.motion, share))
 
     def lines(self) -> list[str]:
         """Return the motion of the control points, in units of their spacing."""

@@ -155,10 +155,11 @@ def test_interpolated_motion_meets_its_ends_and_turns_evenly() -> None:
     a = some_motion(control, 1)
     b = some_motion(control, 2)
     for share, expected in ((0.0, a), (1.0, b)):
-        found = interpolate_warp(a, b, share)
+        found = interpolate_warp(control, a, b, share)
         assert torch.allclose(found.turn, expected.turn, atol=1e-5)
         assert torch.allclose(found.stretch, expected.stretch, atol=1e-6)
-    half = interpolate_warp(rest_warp(control), b, 0.5)
+        assert torch.allclose(found.shift, expected.shift, atol=1e-4)
+    half = interpolate_warp(control, rest_warp(control), b, 0.5)
     assert torch.allclose(half.turn, extrapolate_warp(b, 0.5).turn, atol=1e-5)
 
 

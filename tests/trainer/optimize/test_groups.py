@@ -12,6 +12,7 @@ from torch import Tensor
 
 from benchmarks.analytic_edits import AnalyticEdit, scale_edit, swing_edit
 from progdf.gaussians import attribute_slices, pack
+from progdf.quaternions import rotate_vectors, turn_quats
 from progdf.rasterize import render
 from progdf.similarity import (
     Motion,
@@ -126,17 +127,36 @@ def test_moved_part_looks_unchanged_from_a_camera_moved_along() -> None:
 
 def test_half_motion_has_half_the_shift_turn_and_log_scale() -> None:
     _, parts = some_parts()
+    far = 100.0 * parts.sizes[:, None].expand(2, 3)
     end = Motion(
-        torch.ones(2, 3),
+        far,
         torch.full((2,), math.log(4.0)),
         torch.tensor([[0.0, math.pi / 2, 0.0]]).expand(2, 3),
     )
-    half = interpolate_motion(parts.rest_motion(), end, 0.5)
-    assert torch.allclose(half.shift, torch.full((2, 3), 0.5))
+    half = interpolate_motion(parts.rest_motion(), end, 0.5, parts.sizes)
+    assert torch.allclose(half.shift, 0.5 * far, rtol=1e-3)
     assert torch.allclose(half.log_scale.exp(), torch.full((2,), 2.0))
     assert torch.allclose(half.turn[0], torch.tensor([0.0, math.pi / 4, 0.0]), atol=1e-6)
-    whole = interpolate_motion(half, end, 1.0)
+    whole = interpolate_motion(half, end, 1.0, parts.sizes)
     assert torch.allclose(whole.turn, end.turn, atol=1e-6)
+    assert torch.allclose(whole.shift, far, rtol=1e-5)
+
+
+@pytest.mark.parametrize("angle", [0.01, 1.0, 3.0])
+def test_part_that_turns_about_its_end_stays_there(angle: float) -> None:
+    rod = torch.linspace(0.0, 1.0, 50)
+    rows = torch.zeros(50, 14)
+    rows[:, 0] = rod
+    rows[:, attribute_slices(14)["quats"].start] = 1.0
+    rows[:, 3:6] = -6.0
+    parts = make_parts(rows, torch.zeros(50, dtype=torch.int64))
+    turn = torch.tensor([[0.0, 0.0, angle]])
+    arm = parts.centers
+    end = Motion(rotate_vectors(arm, turn_quats(turn)) - arm, torch.zeros(1), turn)
+    for share in (0.25, 0.5, 0.75):
+        moved = move_rows(rows, parts, interpolate_motion(parts.rest_motion(), end, share, parts.sizes))
+        expected = rotate_vectors(rows[:, :3], turn_quats(share * turn).expand(50, 4))
+        assert torch.allclose(moved[:, :3], expected, atol=1e-4)
 
 
 def pictured(case: Small, edit: AnalyticEdit) -> tuple[Tensor, list[CropScene], list[Tensor]]:
