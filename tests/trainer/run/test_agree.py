@@ -112,6 +112,17 @@ def test_views_that_follow_one_picture_show_one_edit(kind: str) -> None:
     assert nearest > one_by_one(kind, 12, 16, 2000, 56) + 4
 
 
+@pytest.mark.parametrize("kind", ["hue", pytest.param("stripes", marks=pytest.mark.slow)])
+def test_references_alone_make_the_views_of_a_server_agree(kind: str, tmp_path: Path) -> None:
+    some = family(kind, 12, 16, 2000, 56)
+    painter = some.painter()
+    painter.has_start = False
+    painter.workers = 3
+    together = agreed(some, painter, tmp_path)
+    assert painter.calls == 16
+    assert some.nearest(together.fit.render) > one_by_one(kind, 12, 16, 2000, 56) + 4
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["hue", "stripes"])
 def test_ideal_editor_is_reduced_to_one_edit_of_many(kind: str, tmp_path: Path) -> None:
