@@ -99,6 +99,7 @@ def test_window_goes_on_while_a_layer_is_made(app: App, gate: Gate) -> None:
     assert app.main_view.work.transient.gizmo is None
     assert [layer.name for layer in app.main_view.work.transient.live] == ["moved"], "it is still drawn"
     press(app, "Alt+M")
+    app.parts.maker.poll()
     assert text(app).startswith("moved is still being made"), "one at a time"
     gate.opened.set()
     app.parts.maker.wait()

@@ -155,7 +155,7 @@ class LayerMaker:
         return _POLL_S
 
     def _report(self, making: _Making) -> None:
-        """Show the progress if it has changed, or if no message is visible."""
+        """Show the progress if it has changed; other messages stay for their time."""
         text = f"Making {making.name} …"
         button: tuple[str, Action] | None = ("Cancel", Plain("stop_making"))
         if making.share is not None:
@@ -163,7 +163,9 @@ class LayerMaker:
         if making.stop.is_set():
             text = f"Canceling {making.name} …"
             button = None
-        if text != making.reported or self._store.get().message is None:
+        message = self._store.get().message
+        is_own = message is None or message.text == making.reported or not making.reported
+        if is_own and (message is None or text != making.reported):
             making.reported = text
             self._messages.show(text, button=button)
 
