@@ -132,7 +132,7 @@ def _jacobi(buffer: Singles, first: int, second: int) -> None:
 
 
 @kernel()
-def _is_small(buffer: Singles) -> bool:
+def _is_small(buffer: Singles) -> Number:
     """Return whether all lanes turned so little in a sweep that the next one would change only rounding."""
     largest = np.float32(0.0)
     for lane in range(_LANES):

@@ -98,7 +98,7 @@ def measure_pairs(
 
 
 @kernel(inline=True)
-def _slot(table: Rows, key: int) -> int:
+def _slot(table: Rows, key: Number) -> Number:
     """Return the place of a key in a hash table, or a free place for it. Free places hold −1."""
     mask = np.uint64(len(table) - 1)
     place = (np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(20)
