@@ -16,7 +16,7 @@ import torch
 from PIL.Image import Image
 
 from progdf.compose.layer_paint import encode
-from progdf.compose.layers import Layer, check_layers
+from progdf.compose.layers import DEFAULT_BLEND, Layer, check_layers
 from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import Gdf, verify
@@ -84,7 +84,7 @@ class Widget(anywidget.AnyWidget):
         sync=True
     )
     hidden = traitlets.List(traitlets.Unicode(), help="names of hidden layers").tag(sync=True)
-    blend = traitlets.Unicode("adjust", help="blend rule, one of `BLENDS`").tag(sync=True)
+    blend = traitlets.Unicode(DEFAULT_BLEND, help="blend rule, one of `BLENDS`").tag(sync=True)
     camera = traitlets.Dict(
         help="`ViewCamera` as a dict (pivot, distance, azimuth, elevation, fov_y, up); omitted: unchanged"
     ).tag(sync=True)
@@ -98,7 +98,7 @@ class Widget(anywidget.AnyWidget):
         title: str = "",
         credit: str = "",
         background: tuple[float, float, float] = (1.0, 1.0, 1.0),
-        blend: str = "adjust",
+        blend: str = DEFAULT_BLEND,
         quality: Literal["exact", "compact"] = "compact",
         height: int = 480,
     ) -> None:

@@ -28,6 +28,7 @@ from .compose_kernel import add_offsets, keep_larger, write_rows
 from .follow import FOLLOWED, changes_shape, find_followers
 from .follow_kernel import Shapes
 from .layers import (
+    DEFAULT_BLEND,
     KINDS,
     ORDERED,
     Change,
@@ -190,7 +191,7 @@ class Composer:
         if self._surface is not None:
             self._surface.touch(edit, self._gdfs[edit])
 
-    def update(self, layers: Sequence[Layer], blend: str = "normalized") -> Change:
+    def update(self, layers: Sequence[Layer], blend: str = DEFAULT_BLEND) -> Change:
         """Set `gaussians` to the scene under `layers`, equal to `compose_layers(scene, layers, blend)`.
 
         Args:

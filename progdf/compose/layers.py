@@ -20,6 +20,9 @@ from progdf.gdf.texture import ColorSplit
 BLENDS = ("normalized", "sum", "over", "adjust")
 """Blend rules for layers that share a Gaussian, see `progdf.compose.reference.compose_layers`."""
 
+DEFAULT_BLEND = "adjust"
+"""Blend rule of the window, the commands and the Python functions, unless another is named."""
+
 ORDERED = ("over", "adjust")
 """Blend rules for which the order of the layers matters."""
 
@@ -203,7 +206,7 @@ The position is 0 for layers without an order: those that are not paint, under s
 class Effects:
     """Effects of all edits under one blend rule. An edit without effect is absent."""
 
-    blend: str = "normalized"
+    blend: str = DEFAULT_BLEND
     of: Mapping[int, Effect] = field(default_factory=dict)
 
 

@@ -36,6 +36,7 @@ from .follow import (
 )
 from .layers import (
     BLENDS,
+    DEFAULT_BLEND,
     KINDS,
     ORDERED,
     Gains,
@@ -153,7 +154,7 @@ def edited_scene(scene: Gaussians, gdf: Gdf, strength: float = 1.0) -> Gaussians
     return compose_layers(scene, [Layer(gdf, strength)])
 
 
-def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "normalized") -> Gaussians:
+def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = DEFAULT_BLEND) -> Gaussians:
     """Return the scene under a stack of edits.
 
     With m the layer's weights, g its gain for the kind of attribute, and Δ(s) its field at strength s:
@@ -187,7 +188,7 @@ def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "norm
     Args:
         scene: the original
         layers: edits of this scene, lowest first
-        blend: one of `BLENDS`
+        blend: one of `BLENDS`, by default "adjust" as in the window and in `progdf render`
 
     Returns:
         New Gaussians, with the rows that the edits add after the scene's own (see `progdf.compose.added`).

@@ -39,7 +39,7 @@ from .follow_kernel import (
     rest_blends,
     rest_motions,
 )
-from .layers import Change, Layer
+from .layers import DEFAULT_BLEND, Change, Layer
 from .reference import Coverage
 
 Floats = NDArray[np.float32]
@@ -53,7 +53,7 @@ class StateComposer(Protocol):
 
     gaussians: Gaussians
 
-    def update(self, layers: Sequence[Layer], blend: str = "normalized") -> Change:
+    def update(self, layers: Sequence[Layer], blend: str = DEFAULT_BLEND) -> Change:
         """Set `gaussians` to the scene under some layers."""
 
     def touch(self, gdf: Gdf) -> None:

@@ -38,6 +38,12 @@ MIN_QUAT = 1e-6  # length; a shorter quaternion counts as no rotation
 _MAX_SAMPLE_ROWS = 10_000
 """Number of evenly spaced rows for finding the origin. Their median is off by 1 % of the extent."""
 
+_SMALL_GAP_QUANTILE = 0.05
+"""Quantile of the gaps between distinct coordinates that is compared with the step of float32. Where float32
+rounded them, more gaps than this are one step; few enough that a finer grid near 0 does not decide."""
+
+_MAX_GAP_STEPS = 1.5  # steps of float32; a larger gap at this quantile comes from a coarser grid
+
 UNIT_TOLERANCE = 1e-6
 """Deviation from unit length up to which a quaternion stays unchanged, so saved scenes reload exactly."""
 
@@ -134,10 +140,36 @@ def _move_to_origin(scene: Gaussians) -> tuple[Gaussians, dict[str, Any]]:
     near = replace(scene, means=moved.float(), origin=origin)
     counts: dict[str, Any] = {"origin": origin}
     if bool(((world.float() == world) | world.isnan()).all()):
-        counts["distinct"] = tuple(
-            len(torch.unique(column)) if at else 0 for at, column in zip(origin, world.unbind(1), strict=True)
-        )
+        distinct = [
+            _count_rounded(column.double(), at) for at, column in zip(origin, world.unbind(1), strict=True)
+        ]
+        if any(distinct):
+            counts["distinct"] = tuple(distinct)
     return near, counts
+
+
+def _count_rounded(column: Tensor, at: float) -> int:
+    """Return the number of distinct coordinates if float32 limits their spacing, else 0.
+
+    A format with a coarser grid of its own, such as the 16 bits of a .sog, loses nothing to float32.
+
+    Args:
+        column: coordinates along an axis, in the world. [N] float64
+        at: origin of the scene on this axis; 0 if it is near 0
+    """
+    if not at:
+        return 0
+    values = torch.unique(column[column.isfinite()])
+    if len(values) < 2:
+        return 0
+    gaps = values.diff()
+    small = gaps.kthvalue(max(1, round(_SMALL_GAP_QUANTILE * len(gaps)))).values
+    return len(values) if float(small) < _MAX_GAP_STEPS * _float32_step(at) else 0
+
+
+def _float32_step(at: float) -> float:
+    """Return the distance of neighboring float32 numbers near a number other than 0."""
+    return 2.0 ** (math.frexp(at)[1] - 24)
 
 
 def _replace_unusable(scene: Gaussians) -> tuple[Gaussians, dict[str, int]]:
@@ -231,8 +263,8 @@ class LoadReport:
     sh_degree: int  # 0 to 4
     antialiased: bool = False  # the file states that it was trained with Mip-Splatting's 2D filter
     origin: Origin = ZERO  # origin that the means are relative to, see `repair.find_origin`
-    # numbers of distinct x, y and z values if positions far from 0 were stored as float32; 0 on an axis that
-    # is near 0, () if no precision was lost
+    # numbers of distinct x, y and z values if float32 limits their spacing; 0 on an axis where it does not,
+    # () if it does on none
     distinct: tuple[int, ...] = ()
     hidden: int = 0  # rows made invisible due to an unusable number; the next five fields count the causes
     bad_means: int = 0  # NaN, infinite or beyond ±1e18
@@ -278,7 +310,9 @@ class LoadReport:
         """Description of a loss that cannot be repaired (positions rounded to float32), or ""."""
         if not self.distinct:
             return ""
-        step = max(2.0 ** (math.frexp(at)[1] - 24) for at in self.origin if at)
+        step = max(
+            _float32_step(at) for at, count in zip(self.origin, self.distinct, strict=True) if count
+        )
         counts = ", ".join(
             f"{group_digits(count)} distinct {axis}"
             for axis, count in zip("xyz", self.distinct, strict=True)

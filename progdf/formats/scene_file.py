@@ -341,7 +341,9 @@ def _convert(source: Path, kind: str, target: Path, to: str) -> str:
     return ""
 
 
-def save_scene(path: Path, scene: Gaussians, glb_axes: Axes = "LUF") -> ReadBack | None:
+def save_scene(
+    path: str | os.PathLike[str], scene: Gaussians, glb_axes: Axes = "LUF"
+) -> ReadBack | None:
     """Write a scene in the format given by the name's ending; the file appears complete or not at all.
 
     The file is read back and compared before it appears. A .ply is exact. The other formats are smaller, or
@@ -366,6 +368,7 @@ def save_scene(path: Path, scene: Gaussians, glb_axes: Axes = "LUF") -> ReadBack
             range.
     """
     check_first_argument("save_scene(path, scene)", path, (str, os.PathLike))
+    path = Path(path)
     ending = written_format(path)
     if ending == ".ply":
         save_ply_checked(path, scene)
@@ -463,7 +466,8 @@ def _position_bounds(ending: str, scene: Gaussians) -> torch.Tensor:
         step = (logs.amax(dim=0) - logs.amin(dim=0)) / 65535
         return rounding * 4 + (1 + means.abs()) * (1.01 * step).expm1()
     if ending == ".compressed.ply":
-        return rounding + 0.5 * position_steps(scene)
+        steps, largest = position_steps(scene)
+        return rounding + 0.5 * steps + largest * FLOAT_ROUNDING
     return rounding
 
 

@@ -102,7 +102,7 @@ def read_part(kind: str, argument: str) -> PartSelector:
         return lambda scene: _flood(scene, (x, y, z), tolerance)
     if kind == "subject":
         view_of = _camera(kind, argument, "CAMERA") if argument else _first_view
-        return lambda scene: _subject(scene, view_of(scene))
+        return lambda scene: _subject(scene, view_of)
     if kind == "front":
         camera_of = _camera(kind, argument, "CAMERA")
         return lambda scene: _front(scene, camera_of(scene))
@@ -188,7 +188,11 @@ def _flood_from_pixel(scene: Gaussians, camera: Camera, at: tuple[float, float],
     return grow_along_surface(Neighborhood(scene), colors, seeds, color, tolerance)
 
 
-def _subject(scene: Gaussians, camera: Camera) -> Mask:
+def _subject(scene: Gaussians, view_of: Callable[[Gaussians], Camera]) -> Mask:
+    """Return the Gaussians of the subject in a scene's view; none in an empty scene, which has no view."""
+    if not len(scene):
+        return np.zeros(0, bool)
+    camera = view_of(scene)
     return select_subject(scene, Neighborhood(scene), camera, guess_up(scene))
 
 
@@ -323,6 +327,8 @@ def parse_region(
         if len(region) and not len(joined):
             say(f"the region is empty after {sign}{shorten(part)}")
         region = joined
+    if not len(scene):
+        raise ProgdfError(f"region '{shorten(spec)}' holds no Gaussian, because the scene has none")
     if not len(region):
         raise ProgdfError(f"region '{shorten(spec)}' holds no Gaussian; the scene spans {_extent(scene)}")
     return Region(name or spec.strip(), region.members, region.score)

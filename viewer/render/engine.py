@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from progdf.camera import Camera
 from progdf.compose.composer import Composer
 from progdf.compose.layer_paint import layer_of
-from progdf.compose.layers import Gains, Layer
+from progdf.compose.layers import DEFAULT_BLEND, Gains, Layer
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
@@ -206,7 +206,7 @@ class ViewEngine:
         self._compose(edits)
         self.gdfs = tuple(gdfs)
         self.composer = composer
-        composer.update(self._stack(edits), edits.blend or "normalized")
+        composer.update(self._stack(edits), edits.blend or DEFAULT_BLEND)
         self._picture = None
         self.version += 1
 
@@ -267,7 +267,7 @@ class ViewEngine:
         if edits == self._edits:
             return 0.0, 0.0, 0
         started = time.perf_counter()
-        change = self.composer.update(self._stack(edits), edits.blend or "normalized")
+        change = self.composer.update(self._stack(edits), edits.blend or DEFAULT_BLEND)
         composed = time.perf_counter()
         self.renderer.update(self.composer.gaussians, change.attributes, change.rows)
         self._edits = edits

@@ -8,7 +8,7 @@ from typing import Annotated, TypeVar
 
 from msgspec import Meta
 
-from progdf.compose.layers import BLENDS, Gains
+from progdf.compose.layers import BLENDS, DEFAULT_BLEND, Gains
 from progdf.io.json_values import one_of
 from progdf.painting.strokes import MAX_SIDE_PX
 from viewer.camera.view_camera import SHAPES, ViewCamera
@@ -170,7 +170,7 @@ class ViewState:
 
     camera: ViewCamera = ViewCamera()
     layers: tuple[LayerState, ...] = ()
-    blend: Blend = "adjust"
+    blend: Blend = DEFAULT_BLEND
     background: tuple[Share, Share, Share] = (1.0, 1.0, 1.0)
     panel: bool = True  # show the panel and all overlays
     compare: Comparison = Comparison()

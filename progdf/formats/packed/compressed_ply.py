@@ -159,17 +159,24 @@ def write_compressed_ply(path: Path, scene: Gaussians) -> None:
 
 
 def position_steps(scene: Gaussians) -> Tensor:
-    """Return the quantization step of each coordinate in a file, world units. [N,3] float64
+    """Return the quantization step of each coordinate in a file, and the largest coordinate of its chunk.
+
+    A reader computes with the ends of the chunk's range, so its float32 rounding is that of the largest end.
 
     Args:
         scene: N Gaussians in the order of the file
+
+    Returns:
+        Steps and largest absolute coordinates, world units. [N,3] float64 each
     """
-    means = scene.world_means.float().double()
-    steps = torch.tensor([2.0**11 - 1, 2.0**10 - 1, 2.0**11 - 1], dtype=torch.float64)
-    parts = [means[start : start + _CHUNK_ROWS] for start in range(0, len(scene), _CHUNK_ROWS)]
-    spans = [part.amax(dim=0) - part.amin(dim=0) for part in parts]
-    rows: Tensor = torch.stack(spans).repeat_interleave(_CHUNK_ROWS, dim=0)[: len(scene)] / steps
-    return rows
+    means = scene.world_means.float().numpy()
+    starts = np.arange(0, len(means), _CHUNK_ROWS)
+    low = np.minimum.reduceat(means, starts, axis=0).astype(np.float64)
+    high = np.maximum.reduceat(means, starts, axis=0).astype(np.float64)
+    steps = (high - low) / np.array([2.0**11 - 1, 2.0**10 - 1, 2.0**11 - 1])
+    largest = np.maximum(np.abs(low), np.abs(high))
+    chunk_of_row = np.arange(len(means)) // _CHUNK_ROWS
+    return torch.from_numpy(steps[chunk_of_row]), torch.from_numpy(largest[chunk_of_row])
 
 
 def morton_order(means: Tensor) -> Tensor:

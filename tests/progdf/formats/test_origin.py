@@ -119,6 +119,16 @@ def test_positions_lost_to_float32_are_counted_and_reported(
     assert "far.ply: float32 positions have steps" in caplog.text
 
 
+def test_coarse_grid_of_a_format_is_no_loss_of_float32(tmp_path: Path) -> None:
+    step = 2.0**-4  # of float32 near 1e6
+    rng = np.random.default_rng(0)
+    for grid, is_lost in ((step, True), (8 * step, False)):
+        columns = moved_columns(small(), (0.0, 0.0, 0.0))
+        columns["x"] = 1e6 + grid * rng.integers(0, 64, COUNT)
+        path = write(tmp_path / "far.ply", as_type("f4")(columns))
+        assert bool(load_ply_with_report(path)[1].lost) is is_lost
+
+
 def test_doubles_and_scenes_near_zero_lose_nothing(tmp_path: Path) -> None:
     for columns in (moved_columns(small(), FAR), table_of(small())):
         report = load_ply_with_report(write(tmp_path / "a.ply", columns))[1]

@@ -117,6 +117,20 @@ def test_values_beyond_a_format_are_named(ending: str, scene: Gaussians, note: s
     assert any(line.startswith(note) for line in found.notes), found.notes
 
 
+def test_name_of_a_file_may_be_text(tmp_path: Path) -> None:
+    scene = scene_of()
+    for ending in (".ply", ".splat"):
+        save_scene(str(tmp_path / f"a{ending}"), scene)
+        assert len(load_scene(tmp_path / f"a{ending}")) == len(scene)
+
+
+def test_small_coordinate_in_a_long_chunk_is_in_its_bound(tmp_path: Path) -> None:
+    scene = random_gaussians(4096, seed=5)
+    is_near = torch.arange(4096)[:, None] % 2 == 0
+    means = torch.where(is_near, 1e-3 * scene.means, 100 * scene.means)
+    save_scene(tmp_path / "a.compressed.ply", replace(scene, means=means))
+
+
 @pytest.mark.parametrize("ending", LOSSY)
 @pytest.mark.parametrize("name", ["means", "log_scales", "quats", "sh0", "logit_opacities"])
 def test_nan_is_refused_with_its_row(ending: str, name: str, tmp_path: Path) -> None:

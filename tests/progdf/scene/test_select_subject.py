@@ -135,6 +135,13 @@ def test_region_language_knows_the_subject() -> None:
     assert not chosen[truth == 0].mean() > 0.05
 
 
+@pytest.mark.parametrize("spec", ["subject", "all", "sphere:0,0,0,1"])
+def test_region_of_an_empty_scene_gives_one_line(spec: str) -> None:
+    scene = balls_on_a_floor()[0][torch.zeros(0, dtype=torch.int64)]
+    with pytest.raises(ProgdfError, match="because the scene has none"):
+        parse_region(spec, scene)
+
+
 def test_haze_around_an_object_without_a_ground_is_not_selected() -> None:
     scene, labels = balls_on_a_floor()
     ball = scene[torch.from_numpy(labels == 1)]
