@@ -310,9 +310,7 @@ class LoadReport:
         """Description of a loss that cannot be repaired (positions rounded to float32), or ""."""
         if not self.distinct:
             return ""
-        step = max(
-            _float32_step(at) for at, count in zip(self.origin, self.distinct, strict=True) if count
-        )
+        step = max(_float32_step(at) for at, count in zip(self.origin, self.distinct, strict=True) if count)
         counts = ", ".join(
             f"{group_digits(count)} distinct {axis}"
             for axis, count in zip("xyz", self.distinct, strict=True)

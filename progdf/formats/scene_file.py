@@ -1,13 +1,12 @@
 """Loading and saving of scenes: .ply, .spz, .splat, .ksplat, .sog, .glb, .gltf, .ckpt.
 
 The format is recognized by content, otherwise by name, also inside a .zip or .gz. The library gaussforge
-reads .spz and writes .spz, .splat and .sog. It runs in a separate process (see `native_child`) because
+reads .spz and writes .splat and .sog. It runs in a separate process (see `native_child`) because
 native code may crash on a broken file.
 """
 
 from __future__ import annotations
 
-import gzip
 import importlib.util
 import logging
 import os
@@ -39,6 +38,7 @@ from .axes import Axes
 from .checkpoint import read_checkpoint
 from .containers import GZIP, START_BYTES, ZIP, check_foreign, inflate_start, unpacked_scene
 from .gltf_file import MAGIC
+from .packed import spz
 from .packed.compressed_ply import (
     is_compressed,
     morton_order,
@@ -65,18 +65,13 @@ WRITTEN_SUFFIXES = (".ply", ".compressed.ply", ".spz", ".sog", ".splat", ".glb",
 MAX_FRAMES = 1000
 """Largest number of scenes for `save_frames`, which numbers files with three digits."""
 
-SPZ_BITS = 12
-"""Fractional bits of a position in an .spz, for scenes that stay within ±2048."""
-
 CHECKPOINT_SUFFIXES = ("ckpt", "pt", "pth")  # name endings of checkpoints, without the dot
 
 CHECKPOINT = "checkpoint of a training"
 """Format name of .pt, .pth and .ckpt in a report."""
 
-_SPZ_MAX_STEPS = 2**23 - 1  # largest coordinate in an .spz, in steps of 2^-bits
 _SPZ_VERSIONS = (1, 2, 3, 4)
 _SPZ_LAST_GZIP = b"\3"  # last version that is stored as gzip data
-_SPZ_ANTIALIASED = 1  # flag: trained with antialiasing
 _SPZ_EXTENDED = 2  # flag: the file has extensions
 _SPZ_MAX_DEGREE = 4  # largest SH degree
 # limits of the gaussforge process: a base, and an increment per byte of the file
@@ -204,7 +199,7 @@ def _load(path: Path, kind: str | None) -> tuple[Gaussians, LoadReport]:
         checkpoint = read_checkpoint(path)
         return _repair(path, checkpoint.scene, CHECKPOINT, {"ignored_properties": checkpoint.ignored})
     version, flags = _check_spz(path)
-    antialiased = bool(flags & _SPZ_ANTIALIASED)
+    antialiased = bool(flags & spz.ANTIALIASED)
     content = {"ignored_properties": ("extensions",) if flags & _SPZ_EXTENDED else ()}
     scene = rotate_about_x(replace(_read_with_gaussforge(path, "spz"), antialiased=antialiased))
     return _repair(path, scene, f".spz {version}, turned from y up to y down", content)
@@ -321,7 +316,7 @@ def _read_spz_part(path: Path, content: bytes) -> Gaussians:
             scene = _read_with_gaussforge(part, "spz")
         except ProgdfError as error:
             raise ProgdfError(str(error).replace(str(part), f"{path}: its .spz part")) from None
-    return replace(scene, antialiased=bool(flags & _SPZ_ANTIALIASED))
+    return replace(scene, antialiased=bool(flags & spz.ANTIALIASED))
 
 
 def _convert(source: Path, kind: str, target: Path, to: str) -> str:
@@ -341,9 +336,7 @@ def _convert(source: Path, kind: str, target: Path, to: str) -> str:
     return ""
 
 
-def save_scene(
-    path: str | os.PathLike[str], scene: Gaussians, glb_axes: Axes = "LUF"
-) -> ReadBack | None:
+def save_scene(path: str | os.PathLike[str], scene: Gaussians, glb_axes: Axes = "LUF") -> ReadBack | None:
     """Write a scene in the format given by the name's ending; the file appears complete or not at all.
 
     The file is read back and compared before it appears. A .ply is exact. The other formats are smaller, or
@@ -385,6 +378,8 @@ def save_scene(
         elif ending == usd.SUFFIX:
             usd.write_usd(written, [rotate_about_x(stored)])
             return None
+        elif ending == ".spz":
+            _write_spz(path, written, stored)
         else:
             _write_with_gaussforge(path, written, stored, ending[1:])
         try:
@@ -395,59 +390,39 @@ def save_scene(
         return compare(path, stored, read, _position_bounds(ending, stored), ending != ".sog")
 
 
-def _write_with_gaussforge(path: Path, written: Path, scene: Gaussians, kind: str) -> None:
-    """Write a scene as .spz, .sog or .splat.
-
-    gaussforge reads no doubles, so positions are float32. It always uses 12 fractional bits for an .spz. A
-    larger scene is scaled down by a power of two, and the number of bits is written to the header afterwards.
+def _write_spz(path: Path, written: Path, scene: Gaussians) -> None:
+    """Write a scene as .spz, rotated to the axes of the format.
 
     Args:
         path: the file's name, for errors
         written: the file to write
         scene: N Gaussians, finite
-        kind: "spz", "sog" or "splat"
+    """
+    _require_gaussforge(path, "spz")  # reads the file back
+    bits = spz.position_bits(scene)
+    if bits < 0:
+        raise spz.range_error(path, scene)
+    spz.write_spz(written, rotate_about_x(scene), bits)
+
+
+def _write_with_gaussforge(path: Path, written: Path, scene: Gaussians, kind: str) -> None:
+    """Write a scene as .sog or .splat. gaussforge reads no doubles, so positions are float32.
+
+    Args:
+        path: the file's name, for errors
+        written: the file to write
+        scene: N Gaussians, finite
+        kind: "sog" or "splat"
     """
     _require_gaussforge(path, kind)
-    bits = SPZ_BITS
-    if kind == "spz":
-        bits = _spz_bits(scene)
-        if bits < 0:
-            raise _range_error(path, scene)
-        scene = rotate_about_x(scene)
-    means = (scene.world_means * 2.0 ** (bits - SPZ_BITS)).float()
     with tempfile.TemporaryDirectory(prefix="progdf-") as folder:
         source = Path(folder) / "scene.ply"
         target = Path(folder) / f"scene.{kind}"
-        save_ply(source, replace(scene, means=means, origin=ZERO))
+        save_ply(source, replace(scene, means=scene.world_means.float(), origin=ZERO))
         reason = _convert(source, "ply", target, kind)
         if reason:
             raise ProgdfError(f"{path} was not written: the writer of .{kind} {reason}; write a .ply")
-        if kind == "spz":
-            content = bytearray(gzip.decompress(target.read_bytes()))
-            content[13] = bits
-            content[14] |= _SPZ_ANTIALIASED if scene.antialiased else 0
-            written.write_bytes(gzip.compress(content, mtime=0))
-        else:
-            shutil.copyfile(target, written)
-
-
-def _spz_bits(scene: Gaussians) -> int:
-    """Return the number of fractional bits with which all positions fit into 24 bits; negative if none."""
-    farthest = float(scene.world_means.abs().max())
-    bits = SPZ_BITS
-    while bits >= 0 and farthest * 2.0**bits > _SPZ_MAX_STEPS:
-        bits -= 1
-    return bits
-
-
-def _range_error(path: Path, scene: Gaussians) -> ProgdfError:
-    """Return the error for a scene that exceeds the range of an .spz."""
-    means = scene.world_means
-    row, axis = divmod(int(means.abs().argmax()), 3)
-    return ProgdfError(
-        f"{path} was not written: {'xyz'[axis]} of Gaussian {row} is {float(means[row, axis]):.7g}, "
-        f"and an .spz holds ±{_SPZ_MAX_STEPS}; write a .ply, or a scene nearer to 0"
-    )
+        shutil.copyfile(target, written)
 
 
 def _position_bounds(ending: str, scene: Gaussians) -> torch.Tensor:
@@ -460,7 +435,7 @@ def _position_bounds(ending: str, scene: Gaussians) -> torch.Tensor:
     means = scene.world_means
     rounding = means.abs() * FLOAT_ROUNDING + torch.finfo(torch.float32).tiny
     if ending == ".spz":
-        return rounding + 0.5 * 2.0 ** -_spz_bits(scene)
+        return rounding + 0.5 * 2.0 ** -spz.position_bits(scene)
     if ending == ".sog":
         logs = means.abs().log1p() * means.sign()
         step = (logs.amax(dim=0) - logs.amin(dim=0)) / 65535

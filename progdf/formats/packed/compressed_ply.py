@@ -24,6 +24,14 @@ from progdf.sh import C0
 _CHUNK_ROWS = 256
 _CONVERT = "convert it with `splat-transform in.ply out.compressed.ply`"
 _MORTON_BITS = 21  # per axis: three axes fit into 63 bits
+_SPREAD_STEPS = (
+    (32, 0x1F00000000FFFF),
+    (16, 0x1F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
+"""Shifts and masks that move groups of 16, 8, 4, 2 and 1 bits apart, so that two bits fit between two."""
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _XYZ = ("x", "y", "z")
 _SCALES = ("scale_x", "scale_y", "scale_z")
@@ -150,8 +158,9 @@ def write_compressed_ply(path: Path, scene: Gaussians) -> None:
     elements = [PlyElement.describe(ranges, "chunk"), PlyElement.describe(packed, "vertex")]
     bands = arrays["shN"].shape[1]
     if bands:
-        coefficients = arrays["shN"].transpose(0, 2, 1).reshape(count, 3 * bands)
-        table = ((coefficients / 8.0 + 0.5) * 256.0).clip(0, 255).astype("u1")
+        levels = arrays["shN"].transpose(0, 2, 1).reshape(count, 3 * bands) * np.float32(256.0 / 8.0)
+        levels += np.float32(0.5 * 256.0)
+        table = levels.clip(0, 255, out=levels).astype("u1")
         rows = np.ascontiguousarray(table).view([(f"f_rest_{i}", "u1") for i in range(3 * bands)])[:, 0]
         elements.append(PlyElement.describe(rows, "sh"))
     comments = [ANTIALIASED_COMMENT] if scene.antialiased else []
@@ -191,11 +200,17 @@ def morton_order(means: Tensor) -> Tensor:
     low = means.amin(dim=0)
     span = (means.amax(dim=0) - means.amin(dim=0)).clamp_min(1e-30)
     cells = ((means - low) / span * (2**_MORTON_BITS - 1)).long()
-    code = torch.zeros(len(means), dtype=torch.int64)
-    for bit in range(_MORTON_BITS):
-        for axis in range(3):
-            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+    x, y, z = cells.unbind(1)
+    code = _spread_bits(x) | _spread_bits(y) << 1 | _spread_bits(z) << 2
     return code.argsort(stable=True)
+
+
+def _spread_bits(numbers: Tensor) -> Tensor:
+    """Move bit i of numbers of `_MORTON_BITS` bits to bit 3 i, by halving groups of bits. [N] int64"""
+    spread = numbers
+    for shift, mask in _SPREAD_STEPS:
+        spread = (spread | spread << shift) & mask
+    return spread
 
 
 def _pack_shares(shares: Floats, shifts: tuple[int, ...], bits: tuple[int, ...]) -> npt.NDArray[np.uint32]:
@@ -251,6 +266,13 @@ def _higher_bands(name: Path, rows: npt.NDArray[np.void], count: int) -> Floats:
         raise damage_error(
             name, f"{count} SH coefficients are f_rest_0 to f_rest_{count - 1}, {absent} is missing"
         )
-    values = np.stack([rows[column] for column in names], axis=1).astype(np.float32)
-    share = np.where(values == 0, 0.0, np.where(values == 255, 1.0, (values + 0.5) / 256.0))
-    return ((share - 0.5) * 8.0).reshape(len(rows), 3, -1).transpose(0, 2, 1).astype(np.float32)
+    if rows.dtype.names == tuple(names):  # as written by SuperSplat: the rows are a table of bytes
+        levels = np.ascontiguousarray(rows).view(np.uint8).reshape(len(rows), count)
+    else:
+        levels = np.stack([rows[column] for column in names], axis=1)
+    shares = (np.arange(256, dtype=np.float32) + 0.5) / 256.0
+    shares[0] = 0.0
+    shares[255] = 1.0
+    values = ((shares - 0.5) * 8.0).astype(np.float32)
+    bands: Floats = values[np.ascontiguousarray(levels.reshape(len(rows), 3, -1).transpose(0, 2, 1))]
+    return bands

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from progdf.__main__ import main
 from progdf.errors import ProgdfError
-from progdf.formats import scene_file
+from progdf.formats.packed import spz
 from progdf.formats.ply import save_ply
 from progdf.formats.scene_file import load_scene, save_frames, save_scene
 from progdf.gaussians import Gaussians
@@ -165,7 +165,7 @@ def test_antialiased_is_kept_in_an_spz(tmp_path: Path) -> None:
 
 
 def test_writer_that_wraps_positions_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scene_file, "_spz_bits", lambda scene: scene_file.SPZ_BITS)
+    monkeypatch.setattr(spz, "position_bits", lambda scene: spz.MAX_BITS)
     with pytest.raises(ProgdfError, match="x of Gaussian 4 is 5000 and comes back as 904"):
         save_scene(tmp_path / "a.spz", with_mean(scene_of(), 4, (5000.0, 0.0, 0.0)))
     assert not list(tmp_path.iterdir())
