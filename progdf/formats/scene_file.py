@@ -1,7 +1,7 @@
 """Loading and saving of scenes: .ply, .spz, .splat, .ksplat, .sog, .glb, .gltf, .ckpt.
 
 The format is recognized by content, otherwise by name, also inside a .zip or .gz. The library gaussforge
-reads .spz and writes .splat and .sog. It runs in a separate process (see `native_child`) because
+reads .spz and writes .splat. It runs in a separate process (see `native_child`) because
 native code may crash on a broken file.
 """
 
@@ -78,9 +78,6 @@ _SPZ_MAX_DEGREE = 4  # largest SH degree
 _MEMORY_LIMIT = (1 << 30, 64)  # bytes of memory
 _OUTPUT_LIMIT = (64 << 20, 64)  # bytes of output
 TIME_LIMIT_S = (60, 2e-6)  # seconds of processor time
-_WRITE_TIME_FACTOR = 30
-"""Factor on `TIME_LIMIT_S` for writing. Clustering a million Gaussians' SH bands takes minutes (.sog)."""
-
 _log = logging.getLogger(__name__)
 
 
@@ -322,15 +319,14 @@ def _read_spz_part(path: Path, content: bytes) -> Gaussians:
 def _convert(source: Path, kind: str, target: Path, to: str) -> str:
     """Convert a scene file with gaussforge; return the reason for a failure, or an empty text."""
     size = scene_bytes(source)
-    factor = 1 if to == "ply" else _WRITE_TIME_FACTOR
     memory, output, seconds = (
         int(base + each * size) for base, each in (_MEMORY_LIMIT, _OUTPUT_LIMIT, TIME_LIMIT_S)
     )
     words = "convert", kind, str(source.resolve()), to, str(target)
     try:
-        result = native_child.run((memory, output, factor * seconds), 2 * factor * seconds, *words)
+        result = native_child.run((memory, output, seconds), 2 * seconds, *words)
     except subprocess.TimeoutExpired:
-        return f"did not finish within {2 * factor * seconds} s"
+        return f"did not finish within {2 * seconds} s"
     if result.returncode or not target.is_file():
         return _failure_reason(result.returncode, result.stderr)
     return ""
@@ -343,7 +339,8 @@ def save_scene(path: str | os.PathLike[str], scene: Gaussians, glb_axes: Axes = 
     for other programs:
 
         .compressed.ply   16 bytes per Gaussian, 1 per SH coefficient; in Morton order (chunks share a range)
-        .spz, .sog        8 bits and less; .spz and .usdc are rotated to y up, as readers expect
+        .sog              8 bits per value, in Morton order; 65 536 rows of SH at most
+        .spz              8 bits and less; .spz and .usdc are rotated to y up, as readers expect
         .splat            32 bytes, without SH bands
         .glb, .usdc       float32, KHR_gaussian_splatting and ParticleField3DGaussianSplat
 
@@ -368,7 +365,7 @@ def save_scene(path: str | os.PathLike[str], scene: Gaussians, glb_axes: Axes = 
         return None
     check_finite(path, scene)
     stored = replace(scene, shN=scene.shN[:, : (gltf.MAX_DEGREE + 1) ** 2 - 1])
-    if ending == ".compressed.ply":
+    if ending in (".compressed.ply", ".sog"):
         stored = stored[morton_order(stored.means)]
     with atomic_write(path) as written:
         if ending == ".compressed.ply":
@@ -380,14 +377,18 @@ def save_scene(path: str | os.PathLike[str], scene: Gaussians, glb_axes: Axes = 
             return None
         elif ending == ".spz":
             _write_spz(path, written, stored)
+        elif ending == ".sog":
+            from .packed.sog_writer import write_sog  # loads numba
+
+            write_sog(written, stored)
         else:
-            _write_with_gaussforge(path, written, stored, ending[1:])
+            _write_splat(path, written, stored)
         try:
             read = load_scene_with_report(written)[0]
         except ProgdfError as error:
             reason = str(error).replace(str(written), "the new file")
             raise ProgdfError(f"{path} was not written: {reason}") from None
-        return compare(path, stored, read, _position_bounds(ending, stored), ending != ".sog")
+        return compare(path, stored, read, _position_bounds(ending, stored))
 
 
 def _write_spz(path: Path, written: Path, scene: Gaussians) -> None:
@@ -405,23 +406,22 @@ def _write_spz(path: Path, written: Path, scene: Gaussians) -> None:
     spz.write_spz(written, rotate_about_x(scene), bits)
 
 
-def _write_with_gaussforge(path: Path, written: Path, scene: Gaussians, kind: str) -> None:
-    """Write a scene as .sog or .splat. gaussforge reads no doubles, so positions are float32.
+def _write_splat(path: Path, written: Path, scene: Gaussians) -> None:
+    """Write a scene as .splat with gaussforge, which reads no doubles, so positions are float32.
 
     Args:
         path: the file's name, for errors
         written: the file to write
         scene: N Gaussians, finite
-        kind: "sog" or "splat"
     """
-    _require_gaussforge(path, kind)
+    _require_gaussforge(path, "splat")
     with tempfile.TemporaryDirectory(prefix="progdf-") as folder:
         source = Path(folder) / "scene.ply"
-        target = Path(folder) / f"scene.{kind}"
+        target = Path(folder) / "scene.splat"
         save_ply(source, replace(scene, means=scene.world_means.float(), origin=ZERO))
-        reason = _convert(source, "ply", target, kind)
+        reason = _convert(source, "ply", target, "splat")
         if reason:
-            raise ProgdfError(f"{path} was not written: the writer of .{kind} {reason}; write a .ply")
+            raise ProgdfError(f"{path} was not written: the writer of .splat {reason}; write a .ply")
         shutil.copyfile(target, written)
 
 
@@ -430,7 +430,7 @@ def _position_bounds(ending: str, scene: Gaussians) -> torch.Tensor:
 
     Args:
         ending: an entry of `WRITTEN_SUFFIXES` whose format can be read back
-        scene: the scene in the order of the file; any order for .sog
+        scene: the scene in the order of the file
     """
     means = scene.world_means
     rounding = means.abs() * FLOAT_ROUNDING + torch.finfo(torch.float32).tiny

@@ -55,20 +55,14 @@ def check_finite(path: object, scene: Gaussians) -> None:
             )
 
 
-def compare(
-    path: object, written: Gaussians, read: Gaussians, position_bounds: Tensor, keeps_rows: bool
-) -> ReadBack:
+def compare(path: object, written: Gaussians, read: Gaussians, position_bounds: Tensor) -> ReadBack:
     """Return the differences between a scene and its copy from a file.
-
-    Where the rows of the file are in another order, the sorted values of each column are compared. That is as
-    strict for a format that rounds the values of a column in ascending order.
 
     Args:
         path: the file, for the error
-        written: N Gaussians
+        written: N Gaussians, in the order of the file
         read: the scene that was read from the file
         position_bounds: largest allowed difference of each coordinate, world units. [N,3]
-        keeps_rows: the file has the rows in the order of `written`
 
     Raises:
         ProgdfError: the number of Gaussians differs, or a position differs by more than its bound.
@@ -80,17 +74,12 @@ def compare(
         )
     before = written.world_means
     after = read.world_means
-    rows = torch.arange(len(written))[:, None].expand(-1, 3)
-    if not keeps_rows:
-        before, rows = before.sort(dim=0)
-        after = after.sort(dim=0).values
-        position_bounds = position_bounds.gather(0, rows)
     errors = (after - before).abs()
-    _check_positions(path, before, after, errors - position_bounds, rows)
-    return ReadBack(read, float(errors.max()), _attribute_notes(written, read, keeps_rows))
+    _check_positions(path, before, after, errors - position_bounds)
+    return ReadBack(read, float(errors.max()), _attribute_notes(written, read))
 
 
-def _check_positions(path: object, before: Tensor, after: Tensor, excess: Tensor, rows: Tensor) -> None:
+def _check_positions(path: object, before: Tensor, after: Tensor, excess: Tensor) -> None:
     """Raise ProgdfError for the coordinate that exceeds its bound by most, if any. [N,3] each"""
     wrong = ~(excess <= 0)  # NaN is wrong too
     if not bool(wrong.any()):
@@ -99,26 +88,23 @@ def _check_positions(path: object, before: Tensor, after: Tensor, excess: Tensor
     row, axis = divmod(at, 3)
     count = int(wrong.any(dim=1).sum())
     raise ProgdfError(
-        f"{path} was not written: {'xyz'[axis]} of Gaussian {int(rows[row, axis])} is "
+        f"{path} was not written: {'xyz'[axis]} of Gaussian {row} is "
         f"{float(before[row, axis]):.7g} and comes back as {float(after[row, axis]):.7g}, "
         f"{format_count(count)} in all; write a .ply, or a scene nearer to 0"
     )
 
 
-def _attribute_notes(written: Gaussians, read: Gaussians, keeps_rows: bool) -> tuple[str, ...]:
+def _attribute_notes(written: Gaussians, read: Gaussians) -> tuple[str, ...]:
     """Return a phrase for each attribute that differs visibly, with the number of Gaussians."""
     columns = {
         "scale": (written.log_scales, read.log_scales, SCALE_TOLERANCE),
         "opacity": (written.opacities[:, None], read.opacities[:, None], OPACITY_TOLERANCE),
         "color": (written.sh0 * C0, read.sh0 * C0, COLOR_TOLERANCE),
     }
-    if keeps_rows and written.shN.shape == read.shN.shape and written.shN.shape[1]:
+    if written.shN.shape == read.shN.shape and written.shN.shape[1]:
         columns["SH"] = (written.shN.flatten(1), read.shN.flatten(1), SH_TOLERANCE)
     notes = []
     for name, (before, after, tolerance) in columns.items():
-        if not keeps_rows:
-            before = before.sort(dim=0).values
-            after = after.sort(dim=0).values
         largest = (after - before).abs().amax(dim=1)
         count = int((largest > tolerance).sum())
         if not count:
@@ -128,7 +114,7 @@ def _attribute_notes(written: Gaussians, read: Gaussians, keeps_rows: bool) -> t
         notes.append(f"{name} of {format_count(count)} off by up to {size}")
     if written.shN.shape[1] > read.shN.shape[1]:
         notes.append(f"SH of degree {written.sh_degree} cut to degree {read.sh_degree}")
-    rotation_note = _rotation_note(written, read) if keeps_rows else ""
+    rotation_note = _rotation_note(written, read)
     if rotation_note:
         notes.append(rotation_note)
     return tuple(notes)

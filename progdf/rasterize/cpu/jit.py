@@ -174,6 +174,7 @@ def _source_version() -> str:
             *package.glob("rasterize/**/*.py"),
             *package.glob("compose/*.py"),
             *package.glob("pull/*_kernel.py"),
+            *package.glob("formats/packed/*_kernel.py"),
             package / "sh.py",
         ]
     ):

@@ -247,7 +247,7 @@ def test_scene_grade_also_reaches_rows_added_by_other_layers(
 def test_average_shares_only_the_attributes_that_both_layers_change(scene: Gaussians) -> None:
     dark = whole_grade(scene)
     shirt = edit_of(scene, torch.arange(90), curved_field(90, 2), "shirt")
-    both = compose_layers(scene, [Layer(shirt, 1.0), Layer(dark, 1.0)])
+    both = compose_layers(scene, [Layer(shirt, 1.0), Layer(dark, 1.0)], "normalized")
     alone, graded = (compose_layers(scene, [Layer(edit, 1.0)]) for edit in (shirt, dark))
     for name in ("means", "log_scales", "quats", "logit_opacities"):
         assert torch.equal(getattr(both, name), getattr(alone, name)), name

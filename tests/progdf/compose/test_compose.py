@@ -335,7 +335,7 @@ def test_composer_does_not_modify_the_scene(scene: Gaussians, shirt: Gdf) -> Non
 
 def test_slider_changes_only_the_rows_of_its_own_edit(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
     composer = Composer(scene, [shirt, hat])
-    composer.update([Layer(shirt, 0.5), Layer(hat, 0.5)])
+    composer.update([Layer(shirt, 0.5), Layer(hat, 0.5)], "normalized")
     changes = composer.update([Layer(shirt, 0.5), Layer(hat, 0.6)], "normalized")
     assert np.array_equal(changes.rows, hat.region.members.numpy())
 
