@@ -52,11 +52,12 @@ BENCHES: dict[str, str] = {
     "pictures": "benchmarks.pictures:tables",
     "spill": "benchmarks.spill:tables",
     "recolors": "benchmarks.colors.recolors:tables",
+    "exports": "benchmarks.files.exports:tables",
 }
 
 PAGE = (
     *("training", "field", "order", "gains", "pull-stages", "viewer", "rasterize"),
-    *("warp", "moving", "popping", "painting", "pull-response", "frames", "hard"),
+    *("warp", "moving", "popping", "painting", "pull-response", "frames", "exports", "hard"),
 )
 """Benchmarks of docs/speed-and-error.md."""
 
@@ -128,6 +129,7 @@ def main(argv: Sequence[str]) -> int:
         "spill",
         "recolors",
         "subject",
+        "exports",
     )
     if options.scenes and options.what and not set(drawing) & set(options.what):
         raise ProgdfError(f"--scenes are for {', '.join(drawing)}; use python -m benchmarks viewer")

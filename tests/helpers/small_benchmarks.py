@@ -13,6 +13,7 @@ from benchmarks import edits as run_edits
 from benchmarks import field, rasterizer, sliders, table, training
 from benchmarks.ablation import regret, setup
 from benchmarks.analytic_edits import column_warps
+from benchmarks.files import exports
 from benchmarks.motion import trained_motion, warps
 from benchmarks.motion.trained_motion import PullCase
 from benchmarks.rasterizer import RasterCase
@@ -32,6 +33,7 @@ SMALL_TRAINING = ("--views", "5", "--image-size", "48")
 def shrink_benchmarks(patch: pytest.MonkeyPatch) -> None:
     """Make every benchmark take seconds."""
     patch.setattr(table, "_SPIN_S", 0.01)
+    patch.setattr(exports, "DEMO_GAUSSIANS", 700)
     _shrink_training(patch)
     _shrink_viewer(patch)
     _shrink_rasterizer(patch)
