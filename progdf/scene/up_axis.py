@@ -246,8 +246,9 @@ def _up_by_shape(scene: Gaussians) -> UpAxis:
     # the convention alone never makes a direction certain: the shape must support it too
     certain = odds >= _MIN_ODDS and sum(advantage.values()) - advantage["convention"] >= _MIN_REASON_NATS
     if not certain:
-        reason += (
-            f"; not certain, {other} is {100 * float(likely[rival]):.0f} %: check it, or set it with --up"
+        rival_percent = 100 * float(likely[rival])
+        reason = (
+            f"a guess, not certain: {reason}; {other} is {rival_percent:.0f} %: check it, or set it with --up"
         )
     candidates = tuple(directions[i] for i in order)
     return UpAxis(directions[best], reason, certain, candidates)
