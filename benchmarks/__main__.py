@@ -57,7 +57,7 @@ BENCHES: dict[str, str] = {
 
 PAGE = (
     *("training", "field", "order", "gains", "pull-stages", "viewer", "rasterize"),
-    *("warp", "moving", "popping", "painting", "pull-response", "frames", "exports", "hard"),
+    *("warp", "moving", "popping", "painting", "pull-response", "frames", "hard"),
 )
 """Benchmarks of docs/speed-and-error.md."""
 
