@@ -167,7 +167,7 @@ def write_compressed_ply(path: Path, scene: Gaussians) -> None:
     PlyData(elements, byte_order="<", comments=comments).write(str(path))
 
 
-def position_steps(scene: Gaussians) -> Tensor:
+def position_steps(scene: Gaussians) -> tuple[Tensor, Tensor]:
     """Return the quantization step of each coordinate in a file, and the largest coordinate of its chunk.
 
     A reader computes with the ends of the chunk's range, so its float32 rounding is that of the largest end.

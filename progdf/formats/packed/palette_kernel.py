@@ -10,18 +10,19 @@ from numpy.typing import NDArray
 from progdf.rasterize.cpu.jit import kernel
 
 Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 
 @kernel()
-def measure(rows: Floats, order: Rows, start: int, end: int, total: Floats, squares: Floats) -> float:
+def measure(rows: Floats, order: Rows, start: int, end: int, total: Doubles, squares: Doubles) -> float:
     """Compute the sum of each column over a group and its squared deviations; return the sum of the latter.
 
     Args:
         rows: all rows. [N,C]
         order: rows by group. [N]
         start, end: range of the group in `order`
-        total, squares: results. [C] float64 each
+        total, squares: results. [C] each
     """
     count = end - start
     total[:] = 0.0
