@@ -72,12 +72,19 @@ lint: setup extras
 bench: setup
 	$(BIN)/python -m benchmarks
 
+BEAR := viewer/examples/bear.progdf
+
 # Everything the README and the documents show that a command made.
 pictures: setup extras window browser
 	$(BIN)/progdf demo --out demo --no-window
 	cp demo/one-picture.png assets/
 	assets/window.sh $(BIN)/progdf demo assets/window.png
 	$(BIN)/python assets/page.py demo assets/page.jpg
+	$(BIN)/python assets/texture.py -o assets/texture.jpg
+	for shot in layers paint compare session timeline; do \
+	  $(BIN)/python assets/tour.py $$shot $(BEAR)/bear.compressed.ply $(BEAR)/gold.gdf $(BEAR)/scarf.gdf \
+	    -o assets/tour/$$shot.png || exit 1; done
+	$(BIN)/python assets/tour.py select $(BEAR)/bear.compressed.ply $(BEAR)/panda.gdf $(BEAR)/scarf.gdf -o assets/tour/select.png
 	$(BIN)/python -m benchmarks --markdown docs/*.md docs/lab/*.md --plots assets
 	$(BIN)/python assets/figures.py
 	$(BIN)/python assets/architecture.py

@@ -15,13 +15,14 @@ from imgui_bundle import imgui
 from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from progdf.formats.ply import load_ply
+from progdf.formats.scene_file import load_scene
 from progdf.gdf.file import Gdf
 from tests.helpers.ui_rig import Rig, rig
 from viewer.camera.view_camera import first_camera
 from viewer.files.document import load_edits
 from viewer.panel import panel
 from viewer.state import selection
+from viewer.state.layers import with_slider_value
 from viewer.state.view_state import LayerState, ViewState
 
 SIZE = (1280, 800)
@@ -31,11 +32,12 @@ PANEL_COLORS = 96
 
 
 def layers(hand: Rig) -> None:
-    """Show two edits, with the gains and curve of the first unfolded and its color gain reduced."""
+    """Show two edits, with the gains of the upper one unfolded and its color gain reduced."""
     hand.key("G")
-    hand.key("Tab")
-    for _ in range(2):
-        hand.key("Shift+Left")
+    view = hand.main_view.work.view
+    reduced = with_slider_value(view.layers[-1], "color", 0.5)
+    hand.main_view.store.change(replace(view, layers=(*view.layers[:-1], reduced)))
+    hand.settle()
 
 
 def compare(hand: Rig) -> None:
@@ -139,7 +141,7 @@ def main() -> None:
     parser.add_argument("gdfs", type=Path, nargs="+")
     parser.add_argument("-o", "--out", type=Path, required=True)
     options = parser.parse_args()
-    scene = load_ply(options.scene)
+    scene = load_scene(options.scene)
     gdfs = load_edits(options.gdfs, scene, options.scene)
     view = replace(first_state(gdfs), camera=first_camera(scene, aspect=(SIZE[0] - panel.WIDTH_PX) / SIZE[1]))
     with rig(view, SIZE, stack=_OpenedScene(scene, gdfs)) as hand:

@@ -1,13 +1,13 @@
 """Edits that remove, move, pull or copy regions. Their path over strengths is known, so nothing is trained.
 
-    remove      a region fades out, until no engine draws it
-    transform   a region is translated, rotated, stretched and mirrored about a pivot, along an arc
-    pull        points of a region are dragged, and the rest follows rigidly (see `progdf.pull`)
-    duplicate   a transformed copy of a region fades in as added rows
+1. Remove: a region fades out, until no engine draws it.
+2. Transform: a region moves, rotates, stretches and mirrors about a pivot, along an arc.
+3. Pull: points of a region move, and the rest follows rigidly (see `progdf.pull`).
+4. Duplicate: a transformed copy of a region fades in as added rows.
 
-Fading is even in pictures (see `progdf.fade`), or linear in opacity, which needs no pictures.
+Fading is even in pictures (see `progdf.fade`). Without pictures it is linear in opacity.
 
-Each is an edit with a slider, a `Gdf`. `bake` applies the same steps to a scene permanently.
+Each operation becomes an edit with a slider, a `Gdf`. `bake` applies the same steps to a scene permanently.
 """
 
 from __future__ import annotations

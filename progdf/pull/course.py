@@ -144,7 +144,7 @@ def pull(
         pins: points of the surface that stay, while it may rotate around them
 
     Raises:
-        ProgdfError: a point is not on its region or is held, or a pull is out of range.
+        ProgdfError: a point is not on its region or is held, a pull is out of range, or nothing moves.
     """
     if not any(handle.moves for handle in handles):
         raise ProgdfError(f"the pull of the point {_world(scene, handles[0])} is 0; write how far it goes")
@@ -163,6 +163,11 @@ def pull(
     binding = bind(graph, points, graph.node_of)
     moves = (binding @ moved_nodes.astype(float) > 0.0) & kept[problem.members]
     members = problem.members[moves]
+    if not len(members):
+        raise ProgdfError(
+            f"no Gaussian follows the pull of {_world(scene, handles[0])}; all near it are held, "
+            "or several pulls of the same point cancel each other"
+        )
     binding = csr_array(binding[np.flatnonzero(moves)]).astype(np.float32)
     raw = pack(scene[torch.from_numpy(members)], with_shN=scene.sh_degree > 0).detach().float()
     frames = rest_frames(raw)

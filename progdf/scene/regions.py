@@ -1,23 +1,34 @@
 """Text form of a region, such as `labels:bear.npy:3,4-box:0,0,0,1,2,1`.
 
-    REGION  = PART (SIGN PART | '|' STEP)*      from left to right
+A region is read from left to right:
+
+    REGION  = PART (SIGN PART | '|' STEP)*
     SIGN    = '+' union | '-' difference | '&' intersection
-    PART    = 'all'
-            | 'labels:' FILE '.npy:' ID (',' ID)*
-            | 'box:' x0,y0,z0,x1,y1,z1           two opposite corners, world units
-            | 'sphere:' x,y,z,r                  center and radius, world units
-            | 'file:' FILE.npy                   rows (integers), or a bool for each Gaussian
-            | 'rectangle:' CAMERA ':' x0,y0,x1,y1   two opposite corners, pixels
-            | 'lasso:' CAMERA ':' x,y,x,y,x,y,…     corners of a polygon, pixels
-            | 'brush:' CAMERA ':' radius,x,y,…      points of a stroke, pixels
-            | 'front:' CAMERA                    Gaussians on the surface that the camera sees
-            | 'color:' #rrggbb[,tolerance]       Gaussians of similar color
-            | 'flood:' x,y,z[,tolerance]         similar color, connected with the Gaussian nearest to a point
-            | 'flood:' CAMERA ':' x,y[,tolerance]   color of a pixel, connected with the Gaussians in it
-            | 'subject' [':' CAMERA]             object in the middle of a view, by default the scene's first
-            | KIND ':' …                         further kinds that the caller supports, e.g. masks:, text:
-            | 'changed'                          if the caller supports edited pictures
     STEP    = ('grow' | 'shrink' | 'smooth') [':' TIMES] | 'largest' | 'refine' [':' PERCENT]
+
+Parts by number, in world units:
+
+    'all'
+    'labels:' FILE '.npy:' ID (',' ID)*
+    'box:' x0,y0,z0,x1,y1,z1             Two opposite corners.
+    'sphere:' x,y,z,r                    Center and radius.
+    'file:' FILE.npy                     Rows (integers), or a bool for each Gaussian.
+
+Parts of a picture, in pixels:
+
+    'rectangle:' CAMERA ':' x0,y0,x1,y1  Two opposite corners.
+    'lasso:' CAMERA ':' x,y,x,y,x,y,…    Corners of a polygon.
+    'brush:' CAMERA ':' radius,x,y,…     Points of a stroke.
+    'front:' CAMERA                      Gaussians on the surface that the camera sees.
+
+Parts by color or shape:
+
+    'color:' #rrggbb[,tolerance]           Gaussians of similar color.
+    'flood:' x,y,z[,tolerance]             Similar color, connected with the Gaussian nearest to a point.
+    'flood:' CAMERA ':' x,y[,tolerance]    Color of a pixel, connected with the Gaussians in it.
+    'subject' [':' CAMERA]                 Object in the middle of a view, by default the scene's first.
+
+The caller may support further kinds, such as `masks:`, `text:` and `changed`.
 
 Numbers and file names may contain '-' and '+'. A sign therefore joins two parts only before a kind with its
 colon, a whole 'all', or a step. Blanks around parts do not count.

@@ -14,6 +14,7 @@ from benchmarks import field, rasterizer, sliders, table, training
 from benchmarks.ablation import regret, setup
 from benchmarks.analytic_edits import column_warps
 from benchmarks.files import exports
+from benchmarks.layers import pull_parts
 from benchmarks.motion import trained_motion, warps
 from benchmarks.motion.trained_motion import PullCase
 from benchmarks.rasterizer import RasterCase
@@ -83,6 +84,9 @@ def _shrink_training(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(trained_motion, "_BEAR_GAUSSIANS", 700)
     for cases in ("bear_pulls", "_scene_pulls"):
         patch.setattr(trained_motion, cases, _first_of(getattr(trained_motion, cases)))
+    patch.setattr(pull_parts, "PULLS", [pull for pull in pull_parts.PULLS if pull.name == "nose"])
+    patch.setattr(pull_parts, "BEAR_GAUSSIANS", 1500)
+    patch.setattr(pull_parts, "SIZE", 48)
     patch.setattr(regret, "STAGES", (2,))
     patch.setattr(regret, "STEPS", (2, 3))
     patch.setattr(regret, "BANDS", (0, 1))

@@ -297,6 +297,13 @@ def test_empty_region_is_refused() -> None:
         pull(scene, [Handle(nothing, (0.0, 0.0, 0.0), (0.1, 0.0, 0.0))])
 
 
+def test_opposite_pulls_of_one_point_are_refused() -> None:
+    scene = bar()
+    handles = [grip(scene, (2.3, 0.15, 0.15), (shift, 0.0, 0.0)) for shift in (0.4, -0.4)]
+    with pytest.raises(ProgdfError, match="no Gaussian follows"):
+        pull(scene, handles)
+
+
 def test_covariances_take_the_affine_gradient() -> None:
     scene = bar(12)
     graph = build_graph(scene)
