@@ -141,7 +141,7 @@ def make_bear(folder: Path) -> Path:
 def _row(case: PartPull, path: Path, folder: Path) -> dict[str, str]:
     out = folder / f"{case.name}.gdf"
     options = [word.format(path.parent) for word in case.options]
-    command = [sys.executable, "-c", _MEASURED, "edit", str(path), *options, "-o", str(out)]
+    command = [sys.executable, "-P", "-c", _MEASURED, "edit", str(path), *options, "-o", str(out)]
     run = subprocess.run(command, capture_output=True, text=True, check=False)
     if run.returncode:
         raise ProgdfError(f"progdf edit failed on {path.name}: {run.stderr.strip()}")
