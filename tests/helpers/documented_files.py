@@ -39,7 +39,10 @@ from viewer.files.session import WindowSession
 from viewer.state.view_state import Keyframe, LayerState, Timeline, ViewState
 
 GAUSSIANS = 1000
-SCENES = ("robot", "scene", "room", "biker", "bear", "playbot_31k", "playbot_8k", "shoes/left", "demo/scene")
+SCENES = (
+    *("robot", "scene", "room", "biker", "bear", "plant", "playbot_31k", "playbot_8k"),
+    *("shoes/left", "demo/scene"),
+)
 EDITS = {
     "runs/blue/blue": "head",
     "runs/hand/hand": "ears",
@@ -118,6 +121,7 @@ def _write_scenes(demo: DemoScene) -> None:
     np.save("jacket.region.npy", demo.members("scarf").numpy())
     save_scene(Path("robot.sog"), scene)
     save_scene(Path("koala_100k.splat"), scene)
+    save_scene(Path("tarot.splat"), scene)
     parts = {
         "means": scene.means,
         "quats": scene.quats,
