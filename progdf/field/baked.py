@@ -279,6 +279,11 @@ class GradeForm:
         """Number of members M."""
         return int(self.residual.shape[1])
 
+    def take(self, members: Tensor) -> GradeForm:
+        """Return the grade of some members. [m] int64"""
+        mask = None if self.mask is None else self.mask[members]
+        return replace(self, residual=self.residual[:, members], mask=mask)
+
     @property
     def share(self) -> Tensor:
         """Share of the map per member, 0..1. [M] float32"""
@@ -400,7 +405,7 @@ class BakedField:
         total = factors[0] * bases.end_offset.float()
         for weight, factor, basis in zip(weights[1:], factors[1:], bases.residual_basis, strict=True):
             if weight != 0.0:
-                total = total + factor * basis.float()
+                total += factor * basis.float()
         return total
 
     def offsets(self, s: float) -> Tensor:

@@ -275,6 +275,7 @@ def fit_grade(
     weights: Tensor,
     mask: Tensor | None = None,
     coarser: float = 1.0,
+    bases: tuple[Tensor, float] | None = None,
 ) -> GradeForm:
     """Fit a grade whose residual has a given number of bases.
 
@@ -287,15 +288,12 @@ def fit_grade(
         weights: visibility of an error in each member, ≥ 0. [M]
         mask: see `GradeForm`
         coarser: step size in units of the 8-bit step; larger steps compress better
+        bases: result of `residual_bases` for this rank, if already known
     """
     root = weights.sqrt()[:, None]
     rows = (course * root).flatten(1)
-    _, vectors = torch.linalg.eigh((rows @ rows.T).double())
-    mix = vectors.flip(1)[:, :rank].T.float()
-    exact = (mix @ course.flatten(1)).reshape(rank, *course.shape[1:])
-    # one step for all, as all are colors: channels with small changes get few levels and compress well
-    fitting_count = max(1, math.ceil(_FITTING_SHARE * exact.shape[1]))
-    step = coarser / 127.0 * (float(exact.abs().kthvalue(fitting_count, dim=1).values.max()) if rank else 0.0)
+    exact, largest = bases or residual_bases(course, rank, weights)
+    step = coarser / 127.0 * largest
     rounded = (exact / (step or 1.0)).round().clamp(-254.0, 254.0)
     levels = rounded.clamp(-127.0, 127.0).to(torch.int8)
     overflow = (rounded - levels).to(torch.int8)  # overflow of outliers, stored in bases of their own
@@ -306,6 +304,27 @@ def fit_grade(
     coefficients = (rows @ columns.T).double() @ torch.linalg.pinv(normal, rtol=1e-9, hermitian=True)
     coefficients[0] = 0.0
     return GradeForm(degree, knots.float(), table.float(), levels, scale, coefficients.float(), mask=mask)
+
+
+def residual_bases(course: Tensor, rank: int, weights: Tensor) -> tuple[Tensor, float]:
+    """Return the best bases of a residual, and the value that nearly all members stay within.
+
+    One value serves all channels, as all are colors: those with small changes get few levels and compress
+    well.
+
+    Args:
+        course, rank, weights: see `fit_grade`
+
+    Returns:
+        [R,M,3b]; the largest value of `_FITTING_SHARE` of the members, over all bases and channels
+    """
+    rows = (course * weights.sqrt()[:, None]).flatten(1)
+    _, vectors = torch.linalg.eigh((rows @ rows.T).double())
+    mix = vectors.flip(1)[:, :rank].T.float()
+    exact = (mix @ course.flatten(1)).reshape(rank, *course.shape[1:])
+    fitting_count = max(1, math.ceil(_FITTING_SHARE * exact.shape[1]))
+    largest = float(exact.abs().kthvalue(fitting_count, dim=1).values.max()) if rank else 0.0
+    return exact, largest
 
 
 def rank_limit(course: Tensor) -> int:

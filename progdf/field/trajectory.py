@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +49,11 @@ class Trajectory:
 
     def __len__(self) -> int:
         return int(self.s.shape[0])
+
+    def take(self, members: Tensor) -> Trajectory:
+        """Return the recordings of some members of an edit without added rows. [m] int64"""
+        mask = None if self.mask is None else self.mask[members]
+        return replace(self, offsets=self.offsets[:, members], end=self.end[members], mask=mask)
 
     @property
     def stage_strengths(self) -> tuple[tuple[float, float], ...]:

@@ -22,6 +22,12 @@ from trainer.views.choose import split_held_out
 from trainer.views.crops import CropScene, crop_scene, moving_attributes, render_all
 from trainer.views.view import View, crop
 
+PACKING_MEMBERS = 20_000
+"""Number of members up to which a packing is chosen on all of them, and of members in a sample."""
+
+_SQUARE_PX = 8  # side of a sampled square, pixels
+_MIN_SHARE = 1 / 64  # smallest sampled share of the squares
+
 
 @dataclass(frozen=True)
 class Evaluator:
@@ -157,3 +163,51 @@ def make_evaluator(
     boxes = {s: [crop(p, v.box) for p, v in zip(ps, views, strict=True)] for s, ps in edited.items()}
     original = pack(scene[region.members], with_shN=channels > 14)
     return Evaluator(original, crops, pixels, boxes, [view.camera.name for view in views])
+
+
+def sample_members(evaluator: Evaluator, budget: int = PACKING_MEMBERS) -> tuple[Tensor, Evaluator]:
+    """Return the members that are visible in sampled squares, and an evaluator of them and these squares.
+
+    The packings of one solution differ little, so each is measured on the same squares, with only the members
+    that are visible there.
+
+    The share of the squares is halved until at most `budget` members are visible. With at most `budget`
+    members, nothing is left out.
+
+    Args:
+        evaluator: views of an edit that changes only colors
+        budget: number of members, > 0
+
+    Returns:
+        Indices of the members, ascending. [m] int64. The evaluator, for offsets of these members. [m,C]
+    """
+    count = len(evaluator.original)
+    everything = torch.arange(count)
+    if count <= budget:
+        return everything, evaluator
+    generator = torch.Generator().manual_seed(0)
+    orders = [_square_order(pixels, generator) for pixels in evaluator.pixels]
+    visible = torch.ones(count, dtype=torch.bool)
+    sampled = list(evaluator.pixels)
+    share = 1.0
+    while int(visible.sum()) > budget and share > _MIN_SHARE:
+        share = share / 2
+        sampled = [p & (order < share) for p, order in zip(evaluator.pixels, orders, strict=True)]
+        views = zip(evaluator.crops, sampled, strict=True)
+        visible = torch.stack([crop.visible_members(pixels) for crop, pixels in views]).any(dim=0)
+    if not bool(visible.any()):
+        return everything, evaluator
+    members = visible.nonzero()[:, 0]
+    crops = [crop.take(members) for crop in evaluator.crops]
+    original = evaluator.original[members]
+    return members, replace(evaluator, original=original, crops=crops, pixels=sampled)
+
+
+def _square_order(pixels: Tensor, generator: torch.Generator) -> Tensor:
+    """Return a random number from 0 to 1 for each square, at its pixels. [h,w] -> [h,w]"""
+    height, width = pixels.shape
+    rows = -(-height // _SQUARE_PX)
+    columns = -(-width // _SQUARE_PX)
+    order = torch.rand(rows, columns, generator=generator)
+    order = order.repeat_interleave(_SQUARE_PX, dim=0).repeat_interleave(_SQUARE_PX, dim=1)
+    return order[:height, :width]

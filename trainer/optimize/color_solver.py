@@ -38,13 +38,12 @@ from progdf.metrics.image import LEVEL, decibels
 from progdf.sh import C0
 from progdf.threads import map_threads, one_thread
 
+from .color_kernels import add_colors, add_curvature, add_gradients, drop_held, inner_product, keep_drawn
 from .color_views import (
     MAX_ERROR_SHARE,
     ColorEvaluator,
     ColorView,
     MapFit,
-    add_colors,
-    add_gradients,
     fit_maps,
     improve_mask,
     iterate_views,
@@ -310,7 +309,7 @@ class Solver:
         if look is not None:
             errors[-1] = look(current)
         while taken < steps:
-            step_length = _inner(gradient.descent, direction) / max(
+            step_length = inner_product(gradient.descent, direction) / max(
                 self._curvature(gradient, direction, ridge), 1e-30
             )
             for fraction in _STEP_FRACTIONS:
@@ -324,7 +323,7 @@ class Solver:
                 direction = preconditioned  # the direction was found under other clamps: restart
                 continue
             previous = preconditioned
-            power = _inner(gradient.descent, preconditioned)
+            power = inner_product(gradient.descent, preconditioned)
             current = candidate
             gradient = next_gradient
             taken = taken + 1
@@ -336,7 +335,9 @@ class Solver:
                 if settled or error <= LEVEL:
                     break
             preconditioned = inverse @ gradient.descent
-            beta = (_inner(gradient.descent, preconditioned) - _inner(gradient.descent, previous)) / power
+            beta = (
+                inner_product(gradient.descent, preconditioned) - inner_product(gradient.descent, previous)
+            ) / power
             direction = preconditioned + max(0.0, beta) * direction
             tell()
         return (current if look is None else best), taken
@@ -360,12 +361,12 @@ class Solver:
         def look(index: int) -> tuple[Tensor, Tensor, float]:
             colors = self.views[index].colors(offsets)
             negative, passed, squared = self.views[index].pull(colors, targets[index])
-            np.logical_or(colors.numpy() > 0.0, negative.numpy() > 0.0, out=drawn[index].numpy())
-            return passed, negative.mul_(drawn[index]), squared
+            drop_held(colors.numpy(), negative.numpy(), drawn[index].numpy())
+            return passed, negative, squared
 
         descent = -self._regularize(residual, ridge)
         all_passed = list[Tensor]()
-        error = _inner(residual, self._regularize(residual, ridge))
+        error = inner_product(residual, self._regularize(residual, ridge))
         results = iterate_views(look, range(len(self.views)))
         for view, (passed, negative, squared) in zip(self.views, results, strict=True):
             add_gradients(view.basis.numpy(), negative.numpy(), descent.numpy())
@@ -380,10 +381,13 @@ class Solver:
             view = self.views[index]
             colors = np.zeros(pull.drawn.shape[1:], np.float32)
             add_colors(view.basis.numpy(), along.numpy(), colors)
-            picture = view.map.picture(torch.from_numpy(colors * pull.drawn[index].numpy()))
+            keep_drawn(colors, pull.drawn[index].numpy())
+            picture = view.map.picture(torch.from_numpy(colors))
             return float((picture * pull.passed[index]).square().sum())
 
-        return sum(map_threads(look, range(len(self.views)))) + _inner(along, self._regularize(along, ridge))
+        return sum(map_threads(look, range(len(self.views)))) + inner_product(
+            along, self._regularize(along, ridge)
+        )
 
 
 def make_solver(views: Sequence[ColorView], original: Tensor, ties: Ties | None = None) -> Solver:
@@ -395,11 +399,11 @@ def make_solver(views: Sequence[ColorView], original: Tensor, ties: Ties | None 
         ties: ties between neighbors, if there are few views
     """
     ones = original.new_ones(len(original), 3)
-    weights = torch.zeros(())
+    bands = min(BANDS[-1], views[0].basis.shape[1])
+    weights = torch.zeros(len(original), bands, bands)
     weighed = iterate_views(lambda view: view.map.gradient(view.map.picture(ones) * view.counts)[:, 0], views)
     for view, weight in zip(views, weighed, strict=True):
-        bands = view.basis[:, : BANDS[-1]]
-        weights = weights + (weight[:, None] * bands)[:, :, None] * bands[:, None]
+        add_curvature(view.basis.numpy(), weight.contiguous().numpy(), weights.numpy())
     free = torch.ones(len(original), weights.shape[1], dtype=torch.bool)
     scaled_ties = csr_matrix((len(original), len(original)), dtype=np.float32)
     if ties is not None:
@@ -588,10 +592,6 @@ def _smallest(
     """Return the smallest candidate within 5 % of the smallest error, or of an invisible error."""
     min_error = max(floor, min(one.error for one in attempts))
     return min((one for one in attempts if MAX_ERROR_SHARE * one.error <= min_error), key=size)
-
-
-def _inner(a: Tensor, b: Tensor) -> float:
-    return float((a * b).double().sum())
 
 
 def add_bands(offsets: Tensor, residual: Tensor) -> Tensor:

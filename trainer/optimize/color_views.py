@@ -28,6 +28,8 @@ from progdf.sh import basis
 from progdf.threads import map_threads, one_thread
 from trainer.views.crops import CropScene
 
+from .color_kernels import add_colors
+
 _VIEW_BATCH = 8  # views processed at once; limits the memory for results
 _TILES_PER_SIDE = 6  # tiles along a view's longer side; half of the tiles are held out, as on a checkerboard
 _MIN_REGION_WEIGHT = 0.05  # minimum weight of the region in a pixel that shows it
@@ -137,28 +139,6 @@ def _compare(shown: Array, others: Array, target: Array, counts: Array, passed: 
             passed[p, c] = counts[p] and not held
             shown[p, c] = wanted - image if passed[p, c] else np.float32(0.0)
     return squared
-
-
-@kernel(cache=True)
-def add_colors(basis: Array, offsets: Array, colors: Array) -> None:
-    """Add Σ basis · offset to the colors. [M,B], [M,b,3], [M,3] float32
-
-    It replaces sums of torch, which fragment the heap by 0.2 GB for 200 000 members: glibc before 2.38 does
-    not reuse holes of the exact size for aligned memory.
-    """
-    for m in range(len(colors)):
-        for c in range(3):
-            for b in range(offsets.shape[1]):
-                colors[m, c] += basis[m, b] * offsets[m, b, c]
-
-
-@kernel(contract=True, cache=True)
-def add_gradients(basis: Array, pull: Array, offsets: Array) -> None:
-    """Add Σ basis · pull to the offsets, the transpose of `add_colors`. [M,B], [M,3], [M,b,3] float32"""
-    for m in range(len(pull)):
-        for b in range(offsets.shape[1]):
-            for c in range(3):
-                offsets[m, b, c] += basis[m, b] * pull[m, c]
 
 
 def color_view(crop: CropScene, original: Tensor, every: int, index: int) -> ColorView:

@@ -9,16 +9,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from progdf.camera import Camera
-from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices, unpack
+from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, attribute_slices, unpack
 from progdf.rasterize import ActivatedGaussians, Crop, activate, render
+from progdf.rasterize.cpu.engine import Array
 from progdf.rasterize.cpu.forward import TILE_H, TILE_W
+from progdf.rasterize.cpu.jit import kernel
 from progdf.rasterize.engines import DILATION, ColorMap, color_map
 from progdf.sh import basis
 from progdf.threads import map_threads, threads
@@ -126,14 +129,12 @@ class CropScene:
         Returns:
             The image, 0 to 1 (see `clamp_towards`). [h,w,3]
         """
-        members = unpack(packed.to(self.background.device), self.member_shN)
-        weights = self._still_weights if self.still else self._weights(members.means)
-        colors = clamp_towards((weights * members.sh[:, : weights.shape[1]]).sum(dim=1) + 0.5, 0.0, math.inf)
-        if self.still and not colors.requires_grad:
+        if self.still and not (packed.requires_grad and torch.is_grad_enabled()):
             weight_map, remainder = self._linear
-            image = remainder + weight_map.picture(colors)
+            image = remainder + weight_map.picture(self.still_colors(packed))
         else:
-            new = {"colors": colors}
+            members = unpack(packed.to(self.background.device), self.member_shN)
+            new = {"colors": self._member_colors(members)}
             if "means" in moving:
                 new["means"] = members.means
             if "quats" in moving:
@@ -151,6 +152,36 @@ class CropScene:
         if self.live is not None:
             image = torch.where(self.live, image, self.original)
         return clamp_towards(image, 0.0, 1.0)
+
+    def _member_colors(self, members: Gaussians) -> Tensor:
+        """Return the members' drawn colors, at least 0, differentiable. [M,3]"""
+        weights = self._still_weights if self.still else self._weights(members.means)
+        return clamp_towards((weights * members.sh[:, : weights.shape[1]]).sum(dim=1) + 0.5, 0.0, math.inf)
+
+    def still_colors(self, packed: Tensor) -> Tensor:
+        """Return `_member_colors` of a still view without gradients. [M,14] or [M,14+3K] -> [M,3]
+
+        On the CPU one pass over the rows replaces products of the size of all SH coefficients.
+        """
+        if self.background.device.type != "cpu":
+            return self._member_colors(unpack(packed.to(self.background.device), self.member_shN))
+        weights = self._still_weights[..., 0]
+        colors = np.full((len(packed), 3), 0.5, np.float32)
+        if packed.shape[1] == BASE_CHANNELS:
+            _add_bands(weights[:, 1:].numpy(), self.member_shN.flatten(1).numpy(), 0, colors)
+            weights = weights[:, :1]
+        rows = packed.detach().contiguous().float().numpy()
+        _add_bands(weights.numpy(), rows, BASE_CHANNELS - 3, colors)
+        return torch.from_numpy(np.maximum(colors, 0.0, out=colors))
+
+    def visible_members(self, pixels: Tensor) -> Tensor:
+        """Return the members with a weight in some of these pixels of a still view. [h,w] bool -> [M] bool"""
+        chosen = pixels[..., None].to(self.original).expand_as(self.original)
+        return self._linear[0].gradient(chosen.contiguous())[:, 0] > 0.0
+
+    def take(self, members: Tensor) -> CropScene:
+        """Return the view for some of its members; the others keep the original's values. [m] int64"""
+        return replace(self, rows=self.rows[members], member_shN=self.member_shN[members])
 
     def _weights(self, means: Tensor) -> Tensor:
         """Return the weight of each SH band in the members' colors from this camera. [M,3] -> [M,B,1]
@@ -177,6 +208,28 @@ class CropScene:
         return self.gaussians._replace(
             **{name: old[name].index_copy(0, self.rows, values) for name, values in new.items()}
         )
+
+
+@kernel(cache=True)
+def _add_bands(weights: Array, rows: Array, first: int, colors: Array) -> None:
+    """Add Σ weight · coefficient to the colors. weights: [M,B]; rows: [M,C] float32; colors: [M,3] float32
+
+    `first`: column of the first coefficient; B times three follow, the channels of a function together
+    """
+    for m in range(len(colors)):
+        red = colors[m, 0]
+        green = colors[m, 1]
+        blue = colors[m, 2]
+        column = first
+        for b in range(weights.shape[1]):
+            weight = weights[m, b]
+            red += weight * rows[m, column]
+            green += weight * rows[m, column + 1]
+            blue += weight * rows[m, column + 2]
+            column += 3
+        colors[m, 0] = red
+        colors[m, 1] = green
+        colors[m, 2] = blue
 
 
 GEOMETRY = ("means", "quats", "log_scales", "logit_opacities")
