@@ -181,7 +181,14 @@ def test_run_trains_an_edit_and_asks_for_no_picture_twice(tmp_path: Path) -> Non
     )
     spec = program(tmp_path, listing + DARKEN, "{input} {output} {strength} {view}")
     options = with_values(
-        quick_options(tmp_path), editor=spec, kind="color", steps=48, stages=2, views=4, edit_workers=3
+        quick_options(tmp_path),
+        name="dark",
+        editor=spec,
+        kind="color",
+        steps=48,
+        stages=2,
+        views=4,
+        edit_workers=3,
     )
     check_command(resolve(options))
     train(options)
@@ -189,7 +196,7 @@ def test_run_trains_an_edit_and_asks_for_no_picture_twice(tmp_path: Path) -> Non
     tried = calls[0]
     assert calls[1] == tried, "the first view is tried twice"
     assert len(set(calls)) == len(calls) - 1, "and nothing else is"
-    assert read_gdf(tmp_path / "run" / "run.gdf").instruction == spec
+    assert read_gdf(tmp_path / "run" / "dark.gdf").instruction == spec
     trajectory = (tmp_path / "run" / "trajectory.safetensors").read_bytes()
     train(with_values(options, edit_workers=1, out=tmp_path / "again"))
     assert (tmp_path / "again" / "trajectory.safetensors").read_bytes() == trajectory
