@@ -222,14 +222,10 @@ class LiveScene:
         """See `GlRenderer.update`."""
         self._scene = scene
         names = tuple(attributes)
-        highlighted = self._highlights is not None and any(name in SH for name in names)
-        names = tuple(dict.fromkeys((*names, *SH))) if highlighted else names
         for first, last in row_runs(rows):  # slices are many times faster than indices
             part = slice(first * SPLATS_PER_ROW, last * SPLATS_PER_ROW)
             for name in names:
                 self._write(scene, name, part)
-            if highlighted:
-                self._apply_highlight(part)
         lacks = 1 if all(name in SH for name in names) else 2
         self._outdated[rows] = np.maximum(self._outdated[rows], lacks)
 
@@ -305,26 +301,29 @@ class LiveScene:
         )
 
     def _write(self, scene: Gaussians, name: str, part: slice) -> None:
+        """Write one attribute of some rows, with their highlights."""
         means, quats, scales, opacities, sh = (tensor.numpy() for tensor in self.drawn.tensors)
-        target, activated = {
-            "means": (means, _copy),
-            "quats": (quats, _copy),
-            "log_scales": (scales, _exp),
-            "logit_opacities": (opacities, _sigmoid),
-            "sh0": (sh[:, 0], _copy),
-            "shN": (sh[:, 1:], _copy),
-        }[name]
-        target[part] = activated(getattr(scene, name)[part])
-        if name == "logit_opacities" and self._highlights is not None:
-            opacities[part] *= self._highlights[part, 3] < 1.0
-
-    def _apply_highlight(self, part: slice) -> None:
-        """Blend the highlights into newly written colors, in all SH bands, as color is linear in them."""
-        assert self._highlights is not None, "nothing to highlight with"
-        sh = self.drawn.colors.numpy()[part]
-        share = self._highlights[part, 3:]
-        sh *= 1.0 - share[:, :, None]
-        sh[:, 0] += share * (self._highlights[part, :3] - 0.5) / C0
+        values = getattr(scene, name)[part].detach()
+        if name == "means":
+            means[part] = values.numpy()
+        elif name == "quats":
+            quats[part] = values.numpy()
+        elif name == "log_scales":
+            scales[part] = _exp(values)
+        elif name == "logit_opacities":
+            opacities[part] = _sigmoid(values)
+            if self._highlights is not None:
+                opacities[part] *= self._highlights[part, 3] < 1.0
+        else:
+            colors = sh[part, :1] if name == "sh0" else sh[part, 1:]
+            plain = values.numpy().reshape(colors.shape)
+            if self._highlights is None:
+                colors[:] = plain
+                return
+            share = self._highlights[part, 3:, None]
+            np.multiply(plain, 1.0 - share, out=colors)  # colors are linear in all bands
+            if name == "sh0":
+                colors += share * (self._highlights[part, None, :3] - 0.5) / C0
 
 
 def _build(gaussians: ActivatedGaussians) -> Pyramid:
