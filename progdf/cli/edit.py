@@ -197,13 +197,12 @@ def _read_pulls(options: EditOptions) -> Callable[[Gaussians], Step] | None:
     parsed = []
     for text in options.pull:
         spec, _, typed = text.rpartition(":")
-        numbers = _parse_pull(typed)
-        if numbers is None or not spec:
-            raise ProgdfError(
-                f"'{shorten(text)}' has no usable numbers at its end; "
-                f"write --pull REGION:{_PULL_FORM} with a radius and a factor above 0"
-            )
-        parsed.append((spec, numbers))
+        if not spec:
+            raise ProgdfError(f"'{shorten(text)}' names no region; write --pull REGION:{_PULL_FORM}")
+        try:
+            parsed.append((spec, _parse_pull(typed)))
+        except ValueError as error:
+            raise ProgdfError(f"'{shorten(text)}': {error}; write --pull REGION:{_PULL_FORM}") from None
     for spec in [*(spec for spec, _ in parsed), *options.hold]:
         check_region(spec)
     if options.hold and not parsed:
@@ -211,29 +210,40 @@ def _read_pulls(options: EditOptions) -> Callable[[Gaussians], Step] | None:
     return partial(_pull_step, parsed, options.hold) if parsed else None
 
 
-def _parse_pull(text: str) -> _PullNumbers | None:
-    """Return the numbers of a pull; None if they are not usable."""
+def _parse_pull(text: str) -> _PullNumbers:
+    """Return the numbers of a pull.
+
+    Raises:
+        ValueError: a number is missing or out of range, or an option is unknown; the message names it.
+    """
     plain, *named = re.split(r",(?=[a-z]+=)", text.strip().lower())
     options = dict[str, str]()
     for part in named:
         name, _, value = part.partition("=")
-        if name not in ("turn", "scale") or name in options:
-            return None
+        if name not in ("turn", "scale"):
+            raise ValueError(f"{name} is not an option of a pull")
+        if name in options:
+            raise ValueError(f"{name} is given twice")
         options[name] = value
     numbers = read_numbers(plain)
-    if len(numbers) not in (6, 7) or not all(number > 0.0 for number in numbers[6:]):
-        return None
+    if len(numbers) not in (6, 7):
+        raise ValueError("6 or 7 finite numbers must follow the region")
+    falloff = numbers[6] if len(numbers) == 7 else None
+    if falloff is not None and falloff <= 0.0:
+        raise ValueError(f"the radius FALLOFF must be above 0, got {falloff:g}")
     turn: tuple[float, float, float] | None = None
     if "turn" in options:
         rotation = _parse_rotation(options["turn"])
         if rotation is None:
-            return None
+            raise ValueError(
+                f"turn needs an axis (x, y, z or three numbers) and at most {MAX_DEGREES:g} degrees, "
+                f"got {options['turn']}"
+            )
         x, y, z = rotation.turn.tolist()
         turn = (x, y, z)
     factors = read_numbers(options.get("scale", "1"))
     if len(factors) != 1 or factors[0] <= 0.0:
-        return None
-    falloff = numbers[6] if len(numbers) == 7 else None
+        raise ValueError(f"scale must be one number above 0, got {options['scale']}")
     return _PullNumbers(numbers[:3], (numbers[3], numbers[4], numbers[5]), falloff, turn, factors[0])
 
 

@@ -426,3 +426,23 @@ def test_refused_transform_names_every_valid_form(
     assert main(arguments) == 2
     assert capsys.readouterr().err.strip().endswith(forms)
     assert not (tmp_path / "out.ply").exists()
+
+
+@pytest.mark.parametrize(
+    ("value", "fault"),
+    [
+        ("all:1,2,3", "6 or 7 finite numbers must follow the region"),
+        (":0,0,3,1,0,0", "names no region"),
+        ("all:0,0,3,1,0,0,-1", "the radius FALLOFF must be above 0, got -1"),
+        ("all:0,0,3,1,0,0,bend=2", "bend is not an option of a pull"),
+        ("all:0,0,3,1,0,0,turn=x,30,turn=x,30", "turn is given twice"),
+        ("all:0,0,3,1,0,0,turn=w,30", "at most 360 degrees, got w,30"),
+        ("all:0,0,3,1,0,0,scale=0", "scale must be one number above 0, got 0"),
+    ],
+)
+def test_refused_pull_names_its_fault(
+    ply: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], value: str, fault: str
+) -> None:
+    assert main(["edit", str(ply), "--pull", value, "-o", str(tmp_path / "out.ply")]) == 2
+    line = capsys.readouterr().err.strip()
+    assert f"{fault}; write --pull REGION:X,Y,Z,DX,DY,DZ[,FALLOFF]" in line
