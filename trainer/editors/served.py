@@ -10,10 +10,12 @@ from __future__ import annotations
 
 import base64
 import binascii
+import http.client
 import io
 import ipaddress
 import os
 import tempfile
+import urllib.request
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -131,20 +133,19 @@ class Server:
 
     def _fetch(self, url: str) -> bytes:
         """Return the content of a picture's address. The key is not sent there."""
-        import httpx
-
-        if urlsplit(url).scheme not in ("http", "https"):
-            raise self._fault(f"returned an address that is not a web address: {shorten(escape_text(url))}")
-        content = b""
+        schemes = ("http", "https") if self.is_local else ("https",)
+        if urlsplit(url).scheme not in schemes:
+            expected = " or ".join(f"{scheme}://" for scheme in schemes)
+            raise self._fault(
+                f"returned an address that does not begin with {expected}: {shorten(escape_text(url))}"
+            )
         try:
-            with httpx.stream("GET", url, timeout=self.timeout, follow_redirects=False) as answer:
-                answer.raise_for_status()
-                for part in answer.iter_bytes():
-                    content += part
-                    if len(content) > _MAX_PICTURE_BYTES:
-                        raise self._fault("returned a picture of more than 64 MB")
-        except httpx.HTTPError as error:
+            with urllib.request.urlopen(url, timeout=self.timeout) as answer:
+                content: bytes = answer.read(_MAX_PICTURE_BYTES + 1)
+        except (OSError, ValueError, http.client.HTTPException) as error:
             raise self._fault(f"returned an address without a picture ({_line(error)})") from error
+        if len(content) > _MAX_PICTURE_BYTES:
+            raise self._fault("returned a picture of more than 64 MB")
         return content
 
     def _read(self, content: bytes, size: tuple[int, int]) -> Tensor:

@@ -17,7 +17,7 @@ from tests.helpers.trained import quick_options, small, train, write_bear
 from trainer import cli
 from trainer.editors import make_editor
 from trainer.editors.painter import RefusedError
-from trainer.editors.served import ServedEditor, check_api, explain_sending
+from trainer.editors.served import ServedEditor, Server, check_api, explain_sending
 from trainer.options import EditorOptions, with_values
 
 MARBLE = 'api:"turn it into marble"'
@@ -74,6 +74,13 @@ def test_picture_of_an_address_is_fetched_without_the_key(monkeypatch: pytest.Mo
     assert torch.equal(painted.flip(2), editor_of(settings_of(server.url)).original(small().views[0]))
 
 
+def test_address_of_another_machine_must_be_encrypted() -> None:
+    server = Server("https://api.example.org/v1", "marble-1", 1.0)
+    for url in ("http://127.0.0.1/a.png", "file:///etc/passwd", "ftp://host/a.png"):
+        with pytest.raises(ProgdfError, match="does not begin with https://: "):
+            server._fetch(url)
+
+
 def test_server_that_asks_to_wait_is_asked_again() -> None:
     def model(call: Call, number: int) -> Answer:
         if number == 0:
@@ -100,7 +107,10 @@ HALF = base64.b64encode(png(Image.new("RGB", (64, 64), "red")))[:-3].decode()
         ({"created": 0, "data": []}, "returned no picture"),
         ({"created": 0, "data": [{"b64_json": HALF}]}, "returned half a picture"),
         ({"created": 0, "data": [{"b64_json": base64.b64encode(b"GIF").decode()}]}, "cannot be used"),
-        ({"created": 0, "data": [{"url": "file:///etc/passwd"}]}, "not a web address"),
+        (
+            {"created": 0, "data": [{"url": "file:///etc/passwd"}]},
+            "does not begin with http:// or https://: file:///etc/passwd",
+        ),
         ({"created": 0, "data": [{"url": "http://127.0.0.1:1/a.png"}]}, "an address without a picture"),
         (Image.new("RGB", (64, 20)), "cannot be used"),
     ],
