@@ -24,6 +24,7 @@ from progdf.io.atomic import check_not_an_input
 from progdf.io.json_values import check_text
 from progdf.metrics.image import NO_DIFFERENCE
 from progdf.pull.course import Handle, pull
+from progdf.pull.cuts import Cuts
 from progdf.pull.grips import with_grips
 from progdf.region import union
 from progdf.scene.regions import check_region, parse_region, read_numbers
@@ -70,6 +71,8 @@ class EditOptions:
     """Pull, turn or scale the region at a point; the rest follows, within a radius FALLOFF or all of it."""
     hold: Annotated[Specs, absent_option("REGION")] = ()
     """Hold the region in place while others are pulled."""
+    cut: Annotated[Specs, absent_option("REGION")] = ()
+    """Cut the region off from all that it touches, so that a pull moves only one of them."""
     duplicate: Annotated[Specs, absent_option("REGION:DX,DY,DZ")] = ()
     """Add a copy of the region, moved by an offset in world units."""
     glb_axes: GlbAxes = "LUF"
@@ -137,7 +140,7 @@ def _write_edit(options: EditOptions, scene: Gaussians, steps: Sequence[Step]) -
 def _instruction(options: EditOptions) -> str:
     """Return the step options as typed, which the edit stores as its instruction."""
     parts = ["edit"]
-    for name in ("delete", "pull", "hold", "mirror", "scale", "rotate", "move", "duplicate"):
+    for name in ("delete", "pull", "hold", "cut", "mirror", "scale", "rotate", "move", "duplicate"):
         parts += [f"--{name} {spec}" for spec in getattr(options, name)]
     return " ".join(parts)
 
@@ -203,11 +206,15 @@ def _read_pulls(options: EditOptions) -> Callable[[Gaussians], Step] | None:
             parsed.append((spec, _parse_pull(typed)))
         except ValueError as error:
             raise ProgdfError(f"'{shorten(text)}': {error}; write --pull REGION:{_PULL_FORM}") from None
-    for spec in [*(spec for spec, _ in parsed), *options.hold]:
+    for spec in [*(spec for spec, _ in parsed), *options.hold, *options.cut]:
         check_region(spec)
-    if options.hold and not parsed:
+    if parsed:
+        return partial(_pull_step, parsed, options.hold, options.cut)
+    if options.hold:
         raise ProgdfError("--hold has nothing to hold against; add --pull REGION:X,Y,Z,DX,DY,DZ")
-    return partial(_pull_step, parsed, options.hold) if parsed else None
+    if options.cut:
+        raise ProgdfError("--cut takes effect in pulls only; add --pull REGION:X,Y,Z,DX,DY,DZ")
+    return None
 
 
 def _parse_pull(text: str) -> _PullNumbers:
@@ -247,7 +254,14 @@ def _parse_pull(text: str) -> _PullNumbers:
     return _PullNumbers(numbers[:3], (numbers[3], numbers[4], numbers[5]), falloff, turn, factors[0])
 
 
-def _pull_step(parsed: Sequence[tuple[str, _PullNumbers]], holds: Sequence[str], scene: Gaussians) -> Step:
+def _pull_step(
+    parsed: Sequence[tuple[str, _PullNumbers]], holds: Sequence[str], cuts: Sequence[str], scene: Gaussians
+) -> Step:
+    """Return the one step of all pulls.
+
+    Raises:
+        ProgdfError: a region is invalid, or the pull is refused.
+    """
     handles = []
     for spec, numbers in parsed:
         x, y, z = (value - origin for value, origin in zip(numbers.point, scene.origin, strict=True))
@@ -255,7 +269,12 @@ def _pull_step(parsed: Sequence[tuple[str, _PullNumbers]], holds: Sequence[str],
         handles.append(Handle(region, (x, y, z), numbers.shift, numbers.falloff, numbers.turn, numbers.scale))
     held = [parse_region(spec, scene, say=print_line) for spec in holds]
     hold = reduce(union, held) if held else None
-    course = pull(scene, with_grips(scene, handles, hold)[0], hold)
+    separated = [parse_region(spec, scene, say=print_line).mask.numpy() for spec in cuts]
+    between = Cuts(tuple(separated))
+    course = pull(scene, with_grips(scene, handles, hold, between)[0], hold, cuts=between)
+    if cuts and not course.cut_count:
+        print_line(f"note: --cut {shorten(cuts[0])} has no effect: it touches nothing that could be pulled")
+
     return Step("pull", course.region, course=course)
 
 

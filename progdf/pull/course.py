@@ -21,6 +21,7 @@ from progdf.gaussians import Gaussians, pack
 from progdf.quaternions import matrix_turns, rotation_matrices, turn_quats
 from progdf.region import Region, from_mask
 
+from .cuts import NO_CUTS, Cuts
 from .follow import bind, follow, rest_frames
 from .graph import MAX_NODES, Floats, Mask, NodeGraph, Rows, build_graph
 from .solve import Pose, Solver
@@ -74,6 +75,7 @@ class PullCourse:
     offsets: Tensor  # packed offsets from the scene, with higher bands if the scene has any. [S,M,C]
     node_count: int
     stretches: Tensor  # length of each edge at strength 1 per length at rest. [E]
+    cut_count: int = 0  # number of links between Gaussians that cuts removed
 
     def offsets_at(self, strength: float) -> Tensor:
         """Return the packed offsets at a strength, linear between the solved ones. [M,C]"""
@@ -82,6 +84,8 @@ class PullCourse:
     def describe(self) -> str:
         """Return the number of nodes and strengths, and the stretch of the edges, for the user."""
         text = f"{self.node_count} nodes, solved at {len(self.strengths) - 1} strengths"
+        if self.cut_count:
+            text = f"{text}, {self.cut_count} links cut"
         if not len(self.stretches):
             return text
         low, high = self.stretches.quantile(torch.tensor([0.01, 0.99], dtype=self.stretches.dtype)).tolist()
@@ -133,6 +137,7 @@ def pull(
     hold: Region | None = None,
     max_nodes: int = MAX_NODES,
     pins: Sequence[Point] = (),
+    cuts: Cuts = NO_CUTS,
 ) -> PullCourse:
     """Return the course of pulled points.
 
@@ -142,13 +147,14 @@ def pull(
         hold: Gaussians that stay as they are, bit for bit
         max_nodes: target number of nodes of the graph
         pins: points of the surface that stay, while it may rotate around them
+        cuts: cuts between the Gaussians of the scene
 
     Raises:
         ProgdfError: a point is not on its region or is held, a pull is out of range, or nothing moves.
     """
     if not any(handle.moves for handle in handles):
         raise ProgdfError(f"the pull of the point {_world(scene, handles[0])} is 0; write how far it goes")
-    problem = make_problem(scene, handles, hold, max_nodes, pins)
+    problem = make_problem(scene, handles, hold, max_nodes, pins, cuts)
     strengths, poses = _solve_course(problem)
     graph = problem.graph
     kept = np.ones(len(scene), bool)
@@ -180,7 +186,12 @@ def pull(
     name = " + ".join(dict.fromkeys(handle.region.name for handle in handles))
     stretches = torch.from_numpy(problem.solver.stretches(poses[-1]))
     return PullCourse(
-        from_mask(name, mask), torch.from_numpy(strengths).float(), offsets, len(graph), stretches
+        from_mask(name, mask),
+        torch.from_numpy(strengths).float(),
+        offsets,
+        len(graph),
+        stretches,
+        graph.cut_count,
     )
 
 
@@ -190,6 +201,7 @@ def make_problem(
     hold: Region | None,
     max_nodes: int = MAX_NODES,
     pins: Sequence[Point] = (),
+    cuts: Cuts = NO_CUTS,
 ) -> Problem:
     """Return the graph and the factorized solver of some handles.
 
@@ -202,7 +214,7 @@ def make_problem(
     nearest = _find_handles(scene, means, handles)
     points = np.array([handle.point for handle in handles], np.float64)
     members = _reachable_rows(means, handles)
-    graph = build_graph(scene[torch.from_numpy(members)], max_nodes)
+    graph = build_graph(scene[torch.from_numpy(members)], max_nodes, cuts.of_rows(members))
     held_members = np.zeros(len(members), bool)
     if hold is not None:
         held_members = hold.mask.numpy()[members]

@@ -6,6 +6,8 @@ and normal must be nearer. So two things that touch inside one cell become two n
 
 Nodes are connected if their Gaussians are linked. Near nodes of one part are also connected through its
 inside, which makes it resist bending. They are not if the way between them along the part is a long detour.
+
+Cuts remove links and connections between things that no limit tells apart.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from progdf.sh import sh0_to_rgb
 from progdf.threads import run_chunks
 
 from . import graph_kernel
+from .cuts import NO_CUTS, Cuts, find_cut_links
 
 Floats = NDArray[np.float64]
 Rows = NDArray[np.int64]
@@ -58,6 +61,7 @@ class NodeGraph:
     ends: Rows  # end of each edge. [E]
     part: Rows  # connected part of each node. [n]
     spacing: float  # median length of the edges, or the size of the Gaussians without edges; > 0
+    cut_count: int = 0  # number of links between Gaussians that cuts removed
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -69,32 +73,41 @@ class NodeGraph:
         return arms
 
 
-def build_graph(members: Gaussians, max_nodes: int = MAX_NODES) -> NodeGraph:
+def build_graph(members: Gaussians, max_nodes: int = MAX_NODES, cuts: Cuts = NO_CUTS) -> NodeGraph:
     """Return the deformation graph of some Gaussians.
 
     Args:
         members: the Gaussians, at least one. [M]
         max_nodes: target number of nodes, at least 1; fewer for few Gaussians
+        cuts: cuts between them
     """
     points = np.ascontiguousarray(members.means.detach().double().numpy())
     colors = srgb_to_oklab(sh0_to_rgb(members.sh0.detach().double()).clamp(0.0, 1.0)).numpy()
     start, end = find_links(members, points, colors)
+    is_cut = find_cut_links(cuts, points, start, end)
+    cut_count = int(is_cut.sum())
+    if cut_count:
+        start = start[~is_cut]
+        end = end[~is_cut]
     target = max(1, min(max_nodes, len(points) // _MEMBERS_PER_NODE))
     group = graph_kernel.join_links(start, end, grid_cells(points, target))
-    node_of = _join_fragments(points, group, start, end)
+    node_of = _join_fragments(points, group, start, end, cuts.sides(len(points)))
     weights = members.opacities.detach().double().numpy().clip(1e-6)
     positions = _node_means(node_of, weights, points)
     node_colors = _node_means(node_of, weights, colors)
     linked = _pairs(node_of[start], node_of[end], len(positions))
     part = join_pairs(linked[:, 0], linked[:, 1], len(positions))
     near = _inner_pairs(positions, node_colors, linked, part)
+    if cut_count:
+        node_cuts = cuts.of_groups(node_of, len(positions))
+        near = near[~find_cut_links(node_cuts, positions, near[:, 0], near[:, 1])]
     pairs = np.unique(np.concatenate([linked, near]), axis=0)
     both = np.concatenate([pairs, pairs[:, ::-1]])
     both = both[np.lexsort((both[:, 1], both[:, 0]))]
     lengths = np.linalg.norm(positions[both[:, 1]] - positions[both[:, 0]], axis=1)
     size = float(members.scales.detach().amax(dim=1).double().median())
     spacing = float(np.median(lengths)) if len(lengths) else size
-    return NodeGraph(positions, node_of, both[:, 0], both[:, 1], part, max(spacing, 1e-9))
+    return NodeGraph(positions, node_of, both[:, 0], both[:, 1], part, max(spacing, 1e-9), cut_count)
 
 
 def find_links(members: Gaussians, points: Floats, colors: Floats) -> tuple[Rows, Rows]:
@@ -157,10 +170,11 @@ def _cell_ids(points: Floats, size: float) -> Rows:
     return ids
 
 
-def _join_fragments(points: Floats, group: Rows, start: Rows, end: Rows) -> Rows:
+def _join_fragments(points: Floats, group: Rows, start: Rows, end: Rows, sides: Rows) -> Rows:
     """Return the node of each Gaussian, after small groups have joined others. [M]
 
-    A small group joins the group with most links to it. Groups without links join the nearest large one.
+    A small group joins the group with most links to it. Groups without links join the nearest large one, on
+    the same side of cuts if there is one.
     """
     counts = np.bincount(group)
     expected = float((counts.astype(float) ** 2).sum() / len(points))  # group size that a Gaussian sees
@@ -174,8 +188,12 @@ def _join_fragments(points: Floats, group: Rows, start: Rows, end: Rows) -> Rows
     joined = target[group]
     left = small[joined]
     if left.any() and not left.all():
-        nearest = _nearest(points[~left], points[left])
-        joined[left] = joined[~left][nearest]
+        for side in np.unique(sides[left]):
+            alone = left & (sides == side)
+            others = ~left & (sides == side)
+            if not others.any():
+                others = ~left
+            joined[alone] = joined[others][_nearest(points[others], points[alone])]
     nodes: Rows = np.unique(joined, return_inverse=True)[1].astype(np.int64)
     return nodes
 

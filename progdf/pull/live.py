@@ -27,6 +27,7 @@ from progdf.rasterize.cpu.jit import kernel_cache
 from progdf.region import Region, from_mask, whole_scene
 
 from .course import Handle, make_problem
+from .cuts import NO_CUTS, Cuts
 from .follow import bind, follow_in_place, rest_frames
 from .graph import MAX_NODES, Floats, Rows
 
@@ -78,6 +79,7 @@ class LivePull:
         handles: at least one; their displacements and scales are ignored, their turns if there are any
         hold: Gaussians that stay as they are
         max_nodes: target number of nodes of the graph
+        cuts: cuts between the Gaussians of the scene
 
     Raises:
         ProgdfError: see `progdf.pull.course.pull`.
@@ -89,8 +91,9 @@ class LivePull:
         handles: Sequence[Handle],
         hold: Region | None = None,
         max_nodes: int = MAX_NODES,
+        cuts: Cuts = NO_CUTS,
     ) -> None:
-        self._problem = make_problem(scene, handles, hold, max_nodes)
+        self._problem = make_problem(scene, handles, hold, max_nodes, cuts=cuts)
         graph = self._problem.graph
         rows = self._problem.members
         moves = np.ones(len(rows), bool)
@@ -121,6 +124,11 @@ class LivePull:
     def node_count(self) -> int:
         """Number of nodes of the graph."""
         return len(self._problem.graph)
+
+    @property
+    def cut_count(self) -> int:
+        """Number of links between Gaussians that the cuts removed."""
+        return self._problem.graph.cut_count
 
     def step(self, handles: HandlePose, rounds: int) -> LiveStep:
         """Solve some rounds for a pose of the handles.

@@ -321,6 +321,25 @@ def test_edit_command_pulls_a_point(ply: Path, tmp_path: Path, form: str) -> Non
     assert torch.allclose(edited.means[row], target + torch.tensor([0.3, -0.1, 0.0]), atol=0.02)
 
 
+def test_edit_command_cuts_a_region_off_from_a_pull(
+    ply: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "cut.ply"
+    scene = load_ply(ply)
+    point = ",".join(str(value) for value in scene.means[scene.means[:, 0].argmax()].tolist())
+    pull = ["--pull", f"all:{point},0.3,-0.1,0"]
+    left = scene.means[:, 0] < 0
+    assert main(["edit", str(ply), *pull, "-o", str(out)]) == 0
+    assert not torch.equal(load_ply(out).means[left], scene.means[left])
+    assert main(["edit", str(ply), *pull, "--cut", LEFT, "-o", str(out)]) == 0
+    edited = load_ply(out)
+    assert torch.equal(edited.means[left], scene.means[left])
+    assert not torch.equal(edited.means[~left], scene.means[~left])
+    assert "links cut" in capsys.readouterr().out
+    assert main(["edit", str(ply), *pull, "--cut", "all", "-o", str(out)]) == 0
+    assert "note: --cut all has no effect" in capsys.readouterr().out
+
+
 def test_edit_command_turns_and_scales_a_pulled_point(ply: Path, tmp_path: Path) -> None:
     out = tmp_path / "turned.ply"
     scene = load_ply(ply)
@@ -377,6 +396,8 @@ def test_edit_command_turns_and_scales_a_pulled_point(ply: Path, tmp_path: Path)
         ["--pull", "all:0,0,3,1,0,0,bend=2"],
         ["--pull", "all:0,0,3,1,0,0", "--hold", "all"],
         ["--hold", "all"],
+        ["--cut", "all"],
+        ["--pull", "all:0,0,3,1,0,0", "--cut", "nothing"],
         ["--scale", "all:0"],
         ["--scale", "all:1,2"],
         ["--scale", "all:1,2,0"],
