@@ -25,7 +25,7 @@ def train(argv: Sequence[str]) -> int:
     options = train_options(argv)
     from trainer.run.run import train as run  # late import: --help and option errors do not need torch
 
-    if options.editor.family == "api":
+    if options.editor.family in ("api", "comfy"):
         _ask_to_send(options)
     run(options)
     return 0
@@ -37,13 +37,13 @@ def _ask_to_send(options: TrainOptions) -> None:
     Raises:
         ProgdfError: the user declines, or nobody can be asked.
     """
-    from trainer.editors.served import check_api, explain_sending
+    from trainer.editors.server.editor import check_served, explain_sending
     from trainer.resolve import resolve
 
     resolved = resolve(options)
-    line = explain_sending(resolved.editor, resolved.views.views)
+    line = explain_sending(resolved.editor, resolved.views.views, resolved.optimize.stages)
     print(line, file=sys.stderr)
-    if options.editor.yes or check_api(options.editor.text, resolved.editor).is_local:
+    if options.editor.yes or check_served(resolved.editor).address.is_local:
         return
     if not sys.stdin.isatty():
         raise ProgdfError("pictures are sent to another machine only if you agree; add --yes")

@@ -88,9 +88,9 @@ class EditorOptions:
     edit_steps: Annotated[int | None, absent_option("INT", "the model's own")] = None
     """instruct: denoising steps per picture, 1 to 1000 (paper: 20)."""
     edit_size: Annotated[int | None, absent_option("INT", "the model's own")] = None
-    """style: longer side of the paintings; instruct, api: side of the painted square; 32 to 4096 pixels."""
+    """style: longer side of the paintings; others: side of the painted square; 32 to 4096 pixels."""
     anchor: Annotated[Path | None, absent_option("PNG", "the model paints one")] = None
-    """instruct, api: picture of one view (Ctrl+F2), edited by you, used as the reference of all views."""
+    """Picture of one view (Ctrl+F2), edited by you, used as the reference of all views (docs/cli.md)."""
     quantize: Quantize = "off"
     """instruct: nf4 loads large parts in 4 bits, with a quarter of the memory and a small loss."""
     device: Device = "auto"
@@ -102,21 +102,23 @@ class EditorOptions:
     carry_on: CarryOn = "auto"
     """pictures: apply the color map to parts that no picture shows (always, never, auto: if it fits)."""
     prompt: Annotated[str, absent_option("TEXT", "none")] = ""
-    """command: text for its {prompt}."""
+    """command: text for its {prompt}; comfy: text of the node titled prompt."""
     strengths_by: StrengthsBy = "editor"
     """command: a program without a strength makes the finished edit; blend cross-fades to it."""
     edit_workers: int = 1
-    """command, api: simultaneous calls, 1 to 64."""
+    """command, api, comfy: simultaneous calls, 1 to 64."""
     edit_timeout: float = 300.0
-    """command, api: seconds after which a call is ended and made again, 1 to 86400."""
+    """command, api, comfy: seconds after which a call is ended and made again, 1 to 86400."""
     api_url: Annotated[str, absent_option("URL", "none")] = ""
-    """api: address of a server with OpenAI's images API; its key is read from OPENAI_API_KEY."""
+    """api: address of OpenAI's images API, with its key in OPENAI_API_KEY; comfy: address of ComfyUI."""
     api_references: int = 2
     """api: reference pictures that the model accepts beside the view, 0 to 2."""
+    api_mask: bool = False
+    """api: send the region as the mask of the call, if the model takes one."""
     price_per_call: float = 0.0
-    """api: price of one call, in any currency, from which the cost of the run is estimated."""
+    """api, comfy: price of one call, in any currency, from which the cost of the run is estimated."""
     yes: bool = False
-    """api: send pictures to another machine without asking."""
+    """api, comfy: send pictures to another machine without asking."""
     seed: Fixed[int] = 0  # seed of the noise, the same in every view
     cache: Fixed[Path | None] = None  # folder for painted pictures; None saves none
     at: Annotated[str, absent_option("X,Y,SIZE[,ANGLE]", "none")] = ""
@@ -412,7 +414,7 @@ class BatchOptions:
     only: Annotated[str, absent_option("PATTERN", "all")] = ""
     """Jobs whose SCENE/NAME or NAME matches, such as "shoes/*" or "blue*"."""
     allow_commands: bool = False
-    """Let the catalogue run programs (command:) and send pictures (api:); read the catalogue first."""
+    """Let the catalogue run programs and send pictures (command:, api:, comfy:); read it first."""
     keep_going: bool = False
     """Start even if some jobs cannot be trained; these count as failed."""
     dry_run: bool = False

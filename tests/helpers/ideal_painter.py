@@ -20,6 +20,7 @@ from progdf.color.oklab import oklab_to_srgb
 from progdf.rasterize import Crop
 from tests.helpers.trained import Small
 from trainer.editors import make_editor
+from trainer.editors.painter import PaintRequest
 from trainer.editors.procedural import StripesEditor
 from trainer.options import EditorOptions
 from trainer.views.view import View
@@ -33,6 +34,7 @@ class WholeViews:
     """Painter of whole views at their own size; see `FramePainter`."""
 
     has_start = True
+    has_strength = True
     workers = 1
 
     def frame(self, view: View) -> tuple[Crop, Camera]:
@@ -68,23 +70,19 @@ class IdealPainter(WholeViews):
         """Return the index of the view of a picture."""
         return next(i for i, v in enumerate(self.views) if torch.equal(v.image, picture))
 
-    def paint(
-        self,
-        picture: Tensor,
-        references: Sequence[Tensor] = (),
-        *,
-        strength: float = 1.0,
-        softness: float = 1.0,
-        source: Tensor | None = None,
-        seed: int | None = None,
-    ) -> Tensor:
+    def paint(self, request: PaintRequest) -> Tensor:
         """See `FramePainter.paint`."""
         self.calls += 1
+        picture = request.picture
+        source = request.source
+        strength = request.strength
+        softness = request.softness
+        seed = request.seed
         index = self.view_of(picture)
         inside = self.views[index].mask > 0.05
         edits = self.choices[index][:, inside].flatten(1) * self.scale  # [K,D]
         start = (picture if source is None else source)[inside].flatten() * self.scale
-        prior = self.prior(index, references)
+        prior = self.prior(index, request.references)
         noise = np.random.default_rng([int(seed or 0), index * self.alone]).standard_normal(picture.shape)
         x = torch.from_numpy(noise).float()[inside].flatten()
         painted = start

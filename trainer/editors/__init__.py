@@ -34,7 +34,9 @@ from .pictures import (
     removal_pictures,
 )
 from .procedural import darken, grade, night, paint_of, recolor, remove, stops_of, stripes, tint
-from .served import api, check_api
+from .server.comfy import check_comfy
+from .server.editor import api, comfy
+from .server.images_api import check_api
 from .style import check_style, style
 
 
@@ -161,6 +163,28 @@ EDITORS = {
             "model",
             "api_url",
             "api_references",
+            "api_mask",
+            "price_per_call",
+            "yes",
+            "anchor",
+            "edit_size",
+            "edit_workers",
+            "edit_timeout",
+        ),
+        remedy="make the prompt more specific, or use --kind geometry if parts move",
+    ),
+    "comfy": EditorRow(
+        comfy,
+        "comfy:WORKFLOW.json",
+        check_comfy,
+        per_view=True,
+        knows_kind=False,
+        slow_strengths=True,
+        sends_pictures=True,
+        image_size=IMAGE_SIZE,
+        options=(
+            "prompt",
+            "api_url",
             "price_per_call",
             "yes",
             "anchor",

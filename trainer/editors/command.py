@@ -13,13 +13,17 @@ import os
 import re
 import shlex
 import shutil
+import signal
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from threading import BoundedSemaphore
+from threading import BoundedSemaphore, Lock
+from typing import IO
 
 import torch
 from torch import Tensor
@@ -143,6 +147,78 @@ class CallFailedError(Exception):
     """A call of a program that gave no usable picture."""
 
 
+class Programs:
+    """Running programs, each with all programs that it starts."""
+
+    def __init__(self) -> None:
+        self.stopped = False
+        self._running: set[subprocess.Popen[bytes]] = set()
+        self._lock = Lock()
+
+    def run(self, words: Sequence[str], timeout: float) -> str:
+        """Run a program without a shell and return what it wrote to its output and error streams.
+
+        Args:
+            words: the program and its arguments
+            timeout: seconds after which it is ended
+
+        Raises:
+            CallFailedError: it cannot be started, exits with another status than 0, exceeds the time limit or
+                is stopped.
+        """
+        with tempfile.TemporaryFile() as stream:  # a pipe stays open if a child outlives the program
+            process = self._start(words, stream)
+            try:
+                status = process.wait(timeout)
+            except subprocess.TimeoutExpired as error:
+                end_group(process)
+                raise CallFailedError(
+                    f"it takes more than {timeout:g} seconds; allow more with --edit-timeout"
+                ) from error
+            finally:
+                with self._lock:
+                    self._running.discard(process)
+            stream.seek(0, os.SEEK_SET)
+            output = stream.read().decode("utf-8", errors="replace")
+        if status != 0:
+            raise CallFailedError(f"it ended with status {status}{_quote(output)}")
+        return output
+
+    def _start(self, words: Sequence[str], stream: IO[bytes]) -> subprocess.Popen[bytes]:
+        """Start a program as the head of a group of its own."""
+        with self._lock:
+            if self.stopped:
+                raise CallFailedError("it is stopped")
+            try:
+                process = subprocess.Popen(
+                    words, stdin=subprocess.DEVNULL, stdout=stream, stderr=stream, start_new_session=True
+                )
+            except OSError as error:
+                raise CallFailedError(str(error)) from error
+            self._running.add(process)
+            return process
+
+    def stop(self) -> None:
+        """End all running programs, and start no further one."""
+        with self._lock:
+            self.stopped = True
+            for process in self._running:
+                end_group(process)
+
+
+def end_group(process: subprocess.Popen[bytes]) -> None:
+    """End a running program that heads a group, and all programs that it started."""
+    if process.poll() is not None:
+        return
+    if sys.platform == "win32":
+        command = ["taskkill", "/T", "/F", "/PID", str(process.pid)]
+        subprocess.run(command, capture_output=True, check=False)
+    else:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+
+
 @dataclass(frozen=True)
 class CommandEditor:
     """Editor that runs a program for each picture."""
@@ -151,6 +227,7 @@ class CommandEditor:
     options: EditorOptions
     kept: PictureCache  # cache of the program's pictures, at the views' size
     slots: BoundedSemaphore  # limits the number of simultaneous calls
+    programs: Programs
     stages: tuple[float, ...] = ()
     kind: EditKind = "style"
     is_confined: bool = False
@@ -195,6 +272,8 @@ class CommandEditor:
                 try:
                     return self._call_once(view, strength)
                 except CallFailedError as error:
+                    if self.programs.stopped:
+                        raise ProgdfError(f"{self.command.program} is stopped") from error
                     if attempt == ATTEMPTS:
                         raise ProgdfError(
                             f"{self.command.program} failed {ATTEMPTS} times for the view "
@@ -213,7 +292,7 @@ class CommandEditor:
             values = {word: str(path) for word, path in paths.items()}
             values |= {"prompt": self.options.prompt, "seed": str(self.options.seed), "view": name}
             words = self.command.fill(values, strength)
-            output = run_program(words, self.options.edit_timeout)
+            output = self.programs.run(words, self.options.edit_timeout)
             self._keep_output(f"{name} at strength {strength:g}", output)
             if not paths["output"].is_file():
                 raise CallFailedError(f"it wrote no picture to {{output}}{_quote(output)}")
@@ -221,6 +300,15 @@ class CommandEditor:
                 return read_picture(paths["output"], (view.camera.width, view.camera.height))
             except ProgdfError as error:
                 raise CallFailedError(f"its picture cannot be used: {error}") from error
+
+    @property
+    def keeps_running(self) -> bool:
+        """See `StoppableEditor.keeps_running`."""
+        return False
+
+    def stop(self) -> None:
+        """See `StoppableEditor.stop`."""
+        self.programs.stop()
 
     def _keep_output(self, call: str, output: str) -> None:
         """Append the messages of a call to the log of the program, beside its pictures."""
@@ -245,6 +333,7 @@ def command(given: EditorInput) -> CommandEditor:
         options,
         PictureCache(options.cache),
         BoundedSemaphore(options.edit_workers),
+        Programs(),
         stages=() if has_free_strength else (1.0,),
     )
     if given.views:
@@ -276,35 +365,6 @@ def try_command(editor: CommandEditor, view: View) -> str:
         f"{line}, and differs from call to call by up to {difference:.0f} of 255 levels: views may disagree; "
         "pass {seed} to the program if it has one"
     )
-
-
-def run_program(words: Sequence[str], timeout: float) -> str:
-    """Run a program without a shell and return what it wrote to its output and error streams.
-
-    Args:
-        words: the program and its arguments
-        timeout: seconds after which it is killed
-
-    Raises:
-        CallFailedError: it cannot be started, exits with another status than 0, or exceeds the time limit.
-    """
-    with tempfile.TemporaryFile() as stream:  # a pipe would stay open if the program leaves a child behind
-        try:
-            done = subprocess.run(
-                words, stdin=subprocess.DEVNULL, stdout=stream, stderr=stream, timeout=timeout, check=False
-            )
-            status = done.returncode
-        except subprocess.TimeoutExpired as error:
-            raise CallFailedError(
-                f"it takes more than {timeout:g} seconds; allow more with --edit-timeout"
-            ) from error
-        except OSError as error:
-            raise CallFailedError(str(error)) from error
-        stream.seek(0, os.SEEK_SET)
-        output = stream.read().decode("utf-8", errors="replace")
-    if status != 0:
-        raise CallFailedError(f"it ended with status {status}{_quote(output)}")
-    return output
 
 
 def _quote(output: str) -> str:

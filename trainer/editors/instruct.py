@@ -26,7 +26,7 @@ from .adapters import DevicePlan, PipelineRequest
 from .base import EditorInput
 from .cache import PictureCache, Recipe
 from .mixed_steps import MixedSteps, network_steps
-from .painter import FramePainter
+from .painter import FramePainter, PaintRequest
 
 IMAGE_SIZE = 512
 """Longer side of the views, pixels, downscaled from the model's own size."""
@@ -47,6 +47,7 @@ class InstructEditor(FramePainter):
     _renders: dict[str, Tensor] = field(default_factory=dict, repr=False)
 
     has_start = True
+    has_strength = True
 
     @property
     def size(self) -> int:
@@ -89,39 +90,29 @@ class InstructEditor(FramePainter):
             view.camera.name,
             self.original(view),
             {**self.recipe, "strength": strength},
-            lambda picture: self.paint(picture, strength=strength),
+            lambda picture: self.paint(PaintRequest(picture, strength=strength)),
             "" if strength == 1.0 else f"{strength:g}",
         )
         return self.paste(view, painted)
 
-    def paint(
-        self,
-        picture: Tensor,
-        references: Sequence[Tensor] = (),
-        *,
-        strength: float = 1.0,
-        softness: float = 1.0,
-        source: Tensor | None = None,
-        seed: int | None = None,
-    ) -> Tensor:
+    def paint(self, request: PaintRequest) -> Tensor:
         """See `FramePainter.paint`.
 
         Raises:
             ProgdfError: weights are missing or broken, or the GPU runs out of memory.
         """
-        if len(references) > self.references:
-            raise ValueError(
-                f"{self.request.model} accepts {self.references} references, not {len(references)}"
-            )
-        request = self.request
-        noise = request.seed if seed is None else seed
-        with adapters.explain_memory(request, self.placement):
+        model = self.request
+        count = len(request.references)
+        if count > self.references:
+            raise ValueError(f"{model.model} accepts {self.references} references, not {count}")
+        noise = model.seed if request.seed is None else request.seed
+        with adapters.explain_memory(model, self.placement):
             painted = self.load().paint(
-                lambda pictures: request.ask(pictures, noise),
-                (picture, *references),
-                picture if source is None else source,
-                strength,
-                softness,
+                lambda pictures: model.ask(pictures, noise),
+                (request.picture, *request.references),
+                request.picture if request.source is None else request.source,
+                request.strength,
+                request.softness,
             )
         return (painted * 255.0).round() / 255.0
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -29,6 +29,20 @@ class RefusedError(Exception):
     """A picture that a model refuses to paint."""
 
 
+@dataclass(frozen=True, eq=False)
+class PaintRequest:
+    """One picture to paint. A painter ignores the fields that its model has no use for."""
+
+    picture: Tensor  # condition of the model, 0 to 1. [H,W,3]
+    references: Sequence[Tensor] = ()  # further pictures, at most `FramePainter.references`. [H,W,3] each
+    mask: Tensor | None = None  # the region, 1 inside. [H,W]
+    strength: float = 1.0  # 0 returns `source`, 1 the model's output
+    # share of the steps over which the weight of the model's prediction rises from 0 to 1
+    softness: float = 1.0
+    source: Tensor | None = None  # result at strength 0, as large as `picture`; None: `picture`. [H,W,3]
+    seed: int | None = None  # seed of the noise; None: the editor's
+
+
 class FramePainter(ABC):
     """Editor that paints the frame of each view."""
 
@@ -37,7 +51,8 @@ class FramePainter(ABC):
     stages: tuple[float, ...]
     kind: EditKind
     is_confined: bool
-    has_start: bool  # True if `paint` heeds `strength`, `softness` and `source`
+    has_start: bool  # True if `paint` heeds `softness` and `source`
+    has_strength: bool  # True if `paint` heeds `strength`
     _renders: dict[str, Tensor]  # view's name → render of its frame
 
     @property
@@ -70,25 +85,8 @@ class FramePainter(ABC):
         """Return the width and height in pixels at which to paint a frame of these proportions."""
 
     @abstractmethod
-    def paint(
-        self,
-        picture: Tensor,
-        references: Sequence[Tensor] = (),
-        *,
-        strength: float = 1.0,
-        softness: float = 1.0,
-        source: Tensor | None = None,
-        seed: int | None = None,
-    ) -> Tensor:
+    def paint(self, request: PaintRequest) -> Tensor:
         """Paint a picture at the model's size, in 8 bits. -> [H,W,3] 0..1
-
-        Args:
-            picture: condition of the model. [H,W,3] 0..1
-            references: further pictures for the model, at most `references`. [H,W,3] each
-            strength: 0 returns `source`, 1 the model's output
-            softness: share of the steps over which the weight of the model's prediction rises from 0 to 1
-            source: result at strength 0, as large as `picture`; None: `picture`. [H,W,3]
-            seed: seed of the noise; None: the editor's
 
         Raises:
             RefusedError: the model refuses the picture.

@@ -29,7 +29,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -48,7 +47,8 @@ from progdf.sh import C0
 from trainer.editors import make_editor
 from trainer.editors.base import ImageEditor
 from trainer.editors.cache import PictureCache, Recipe, digest
-from trainer.editors.painter import FramePainter, RefusedError
+from trainer.editors.call_pool import CallPool, StoppableEditor
+from trainer.editors.painter import FramePainter, PaintRequest, RefusedError
 from trainer.editors.style import cross_fade
 from trainer.options import EditKind, TrainOptions
 from trainer.report.agreement import ViewChange, fine_energy, fit_colors, robust_colors, view_change
@@ -104,7 +104,7 @@ class PaintCache:
     """
 
     painter: FramePainter
-    recipe: Recipe  # inputs of a picture besides the arguments of `FramePainter.paint`
+    recipe: Recipe  # inputs of a picture besides those of its `PaintRequest`
     kept: PictureCache
     seed: int
 
@@ -129,11 +129,12 @@ class PaintCache:
         Args:
             view: the view to paint
             place: folder of the picture
-            references, source, strength, softness: see `FramePainter.paint`
+            references, source, strength, softness: see `PaintRequest`
         """
         references = references[: self.painter.references]
         original = self.painter.original(view)
-        beside = beside_region(self.crop(view, view.mask[..., None])[..., 0])
+        mask = self.crop(view, view.mask[..., None])[..., 0]
+        beside = beside_region(mask)
         result = Painted(None)
         for seed in (self.seed, self.seed + 1):
             recipe = {
@@ -147,7 +148,7 @@ class PaintCache:
 
             def paint(picture: Tensor, seed: int = seed) -> Tensor:
                 return self.painter.paint(
-                    picture, references, strength=strength, softness=softness, source=source, seed=seed
+                    PaintRequest(picture, references, mask, strength, softness, source, seed)
                 )
 
             folder_name = place if seed == self.seed else f"{place}/again"
@@ -198,6 +199,18 @@ class AgreedEditor:
     figures: Mapping[str, object]  # for report.json
     is_confined: bool = False
 
+    @property
+    def keeps_running(self) -> bool:
+        """See `StoppableEditor.keeps_running`."""
+        painter: object = self.easel.painter
+        return isinstance(painter, StoppableEditor) and painter.keeps_running
+
+    def stop(self) -> None:
+        """See `StoppableEditor.stop`."""
+        painter: object = self.easel.painter
+        if isinstance(painter, StoppableEditor):
+            painter.stop()
+
     def edit(self, view: View, strength: float) -> Tensor:
         """Return the view edited at a strength, see `ImageEditor.edit`."""
         if strength == 0.0:
@@ -206,15 +219,32 @@ class AgreedEditor:
         if strength == 1.0:
             return finished
         painter = self.easel.painter
-        if not painter.has_start:
+        if not painter.has_strength:
             return cross_fade(view.image, finished, strength)
         fit = self.fit.render(painter.frame(view)[1])
+        if not painter.has_start:
+            return self._repaint(view, strength, fit)
         # source and freedom both scale with the strength, so that strength 1 equals the last round's picture
         source = torch.lerp(painter.original(view), fit, strength)
         freedom = CONSENSUS * strength
         painted = self.easel.paint(view, f"{strength:g}", [fit], source, freedom, SOFTNESS).picture
         if painted is None:
             return cross_fade(view.image, finished, strength)
+        return painter.paste(view, painted)
+
+    def _repaint(self, view: View, strength: float, fit: Tensor) -> Tensor:
+        """Return the view painted at a strength by a model that cannot start from a picture.
+
+        Args:
+            view: the view
+            strength: 0 to 1
+            fit: render of the finished edit in the view's frame. [h,w,3]
+        """
+        painter = self.easel.painter
+        reference = torch.lerp(painter.original(view), fit, strength)
+        painted = self.easel.paint(view, f"{strength:g}", [reference], strength=strength).picture
+        if painted is None:
+            return cross_fade(view.image, self.pictures[view.camera.name], strength)
         return painter.paste(view, painted)
 
 
@@ -308,7 +338,10 @@ class _PaintingLoop:
             place = ANCHOR if i < anchors else "reference"
             name = view.camera.name
             references = [self._render(fit, view), *self._first] if fit is not None else []
-            self.paint(view, place, references=references)
+            # in a thread, so that an interruption keeps the picture
+            self._paint_together(
+                [view], place, partial(self._easel.paint, place=place, references=references)
+            )
             if name in self.pictures:
                 seen.append(self._change(view, self.pictures[name]))
                 fit = Fit(self._setup, fit_colors(seen, members))
@@ -324,13 +357,10 @@ class _PaintingLoop:
 
     def _paint_together(self, views: Sequence[View], place: str, paint: Callable[[View], Painted]) -> None:
         """Paint views that do not depend on each other, as many at the same time as the painter allows."""
-        with ThreadPoolExecutor(self._easel.painter.workers) as pool:
-            try:
-                for view, painted in zip(views, pool.map(paint, views), strict=True):
-                    self._take(view, place, painted)
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
+        painter = self._easel.painter
+        with CallPool(painter.workers, painter) as pool:
+            for view, painted in zip(views, pool.map(paint, views), strict=True):
+                self._take(view, place, painted)
 
     def sweep(self, views: Sequence[View]) -> None:
         """Paint each view starting from the render of the fit to the training views so far."""

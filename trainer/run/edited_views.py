@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from functools import cached_property, partial
 from typing import Any
@@ -15,6 +14,7 @@ from progdf.io.images import write_image
 from progdf.threads import threads
 from trainer.editors import editor_row
 from trainer.editors.base import ImageEditor, confines_edit, editor_strengths
+from trainer.editors.call_pool import CallPool
 from trainer.editors.procedural import edit_course
 from trainer.fit.slider_uniformity import equalized_strengths
 from trainer.optimize.retime import resolve_slider
@@ -155,18 +155,14 @@ class EditedViews:
 
     def _call_ahead(self, views: Sequence[View]) -> None:
         """Let the editor's program make the finished edit of all views in parallel; its cache keeps them."""
+        editor = self.editor
         with (
             self._log.steps("edit", len(views)) as advance,
-            ThreadPoolExecutor(self._options.editor.edit_workers) as pool,
+            CallPool(self._options.editor.edit_workers, editor) as pool,
         ):
-            calls = [pool.submit(self.editor.edit, view, 1.0) for view in views]
-            try:
-                for count, call in enumerate(calls, 1):
-                    call.result()
-                    advance(count, "strength 1")
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
+            edited = pool.map(lambda view: editor.edit(view, 1.0), views)
+            for count, _ in enumerate(edited, 1):
+                advance(count, "strength 1")
 
     def _edit(self, strengths: Sequence[float], views: Sequence[View]) -> Pictures:
         """Edit views at new strengths, save them, and return all edited views."""
@@ -180,9 +176,9 @@ class EditedViews:
             if self._options.region.region == CHANGED:  # few members are found for paint finer than Gaussians
                 within = [view.with_painted([editor.edit(view, 1.0)]) for view in views]
             workers = threads() if row.is_parallel else 0
-            if row.runs_program:
+            if row.runs_program or row.sends_pictures:
                 workers = self._options.editor.edit_workers
-            edited = edit_views(workers, within, new, self._folder, is_confined, advance, course)
+            edited = edit_views(workers, within, new, self._folder, is_confined, advance, course, editor)
             self._pictures.update(edited)
         listed = ", ".join(f"{s:g}" for s in strengths)
         self._log.say(f"{self._options.editor.editor}: a {self.approach.kind} edit at strength {listed}")
@@ -231,6 +227,7 @@ def edit_views(
     is_confined: bool,
     advance: Advance,
     course: Callable[[View], Callable[[float], Tensor]],
+    editor: object = None,
 ) -> dict[float, Sequence[Tensor]]:
     """Edit every view at every strength. Training uses the 8-bit pictures saved to disk.
 
@@ -243,6 +240,7 @@ def edit_views(
         is_confined: revert changes outside the region; otherwise members would move to reproduce them
         advance: reports progress
         course: returns a view's function from strength to edited view, see `edit_course`
+        editor: the editor, which is stopped if the edit fails or is interrupted
     """
 
     def edit(request: Sequence[tuple[float, int]]) -> list[Tensor]:
@@ -257,16 +255,12 @@ def edit_views(
     edited: dict[float, list[Tensor]] = {strength: [] for strength in strengths}
     groups = [strengths] if workers and strengths else [[strength] for strength in strengths]
     requests = [[(strength, i) for strength in group] for group in groups for i in range(len(views))]
-    with ThreadPoolExecutor(workers or 1) as pool:
+    with CallPool(workers or 1, editor) as pool:
         made = pool.map(edit, requests) if workers else map(edit, requests)
-        try:
-            for request, pictures in zip(requests, made, strict=True):
-                for (strength, _), picture in zip(request, pictures, strict=True):
-                    edited[strength].append(picture)
-                advance(sum(map(len, edited.values())), f"strength {request[-1][0]:g}")
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+        for request, pictures in zip(requests, made, strict=True):
+            for (strength, _), picture in zip(request, pictures, strict=True):
+                edited[strength].append(picture)
+            advance(sum(map(len, edited.values())), f"strength {request[-1][0]:g}")
     return {strength: LazySequence(pictures, from_bytes) for strength, pictures in edited.items()}
 
 

@@ -16,8 +16,10 @@ from tests.helpers.image_server import Answer, Call, Refusal, image_server, png,
 from tests.helpers.trained import quick_options, small, train, write_bear
 from trainer import cli
 from trainer.editors import make_editor
-from trainer.editors.painter import RefusedError
-from trainer.editors.served import ServedEditor, Server, check_api, explain_sending
+from trainer.editors.painter import PaintRequest, RefusedError
+from trainer.editors.server.calls import Address
+from trainer.editors.server.editor import ServedEditor, explain_sending
+from trainer.editors.server.images_api import ImagesApi, check_api
 from trainer.options import EditorOptions, with_values
 
 MARBLE = 'api:"turn it into marble"'
@@ -27,7 +29,8 @@ MARBLE = 'api:"turn it into marble"'
 def _package(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("openai", reason="pip install progdf-studio[api]")
     monkeypatch.delenv("OPENAI_API_KEY", raising=False)
-    monkeypatch.setattr("trainer.editors.served._RETRIES", 2)
+    monkeypatch.setattr("trainer.editors.server.calls.RETRIES", 2)
+    monkeypatch.setattr("trainer.editors.server.calls._FIRST_WAIT_S", 0.01)
 
 
 def settings_of(url: str, **more: object) -> EditorOptions:
@@ -43,7 +46,7 @@ def editor_of(settings: EditorOptions) -> ServedEditor:
 
 def paint_first(settings: EditorOptions) -> torch.Tensor:
     editor = editor_of(settings)
-    return editor.paint(editor.original(small().views[0]))
+    return editor.paint(PaintRequest(editor.original(small().views[0])))
 
 
 def test_server_edits_the_picture_and_its_references(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -51,7 +54,7 @@ def test_server_edits_the_picture_and_its_references(monkeypatch: pytest.MonkeyP
     with image_server() as server:
         editor = editor_of(settings_of(server.url))
         original = editor.original(small().views[0])
-        painted = editor.paint(original, [original, original])
+        painted = editor.paint(PaintRequest(original, [original, original]))
     assert torch.equal(painted, original.flip(2)), "red and blue are exchanged"
     (call,) = server.calls
     assert len(call.pictures) == 3
@@ -75,10 +78,10 @@ def test_picture_of_an_address_is_fetched_without_the_key(monkeypatch: pytest.Mo
 
 
 def test_address_of_another_machine_must_be_encrypted() -> None:
-    server = Server("https://api.example.org/v1", "marble-1", 1.0)
+    server = ImagesApi(Address("api", "https://api.example.org/v1"), "marble-1", 1.0)
     for url in ("http://127.0.0.1/a.png", "file:///etc/passwd", "ftp://host/a.png"):
         with pytest.raises(ProgdfError, match="does not begin with https://: "):
-            server._fetch(url)
+            server.fetch(url)
 
 
 def test_server_that_asks_to_wait_is_asked_again() -> None:

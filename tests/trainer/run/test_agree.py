@@ -20,6 +20,7 @@ from progdf.metrics.image import decibels
 from tests.helpers.ideal_painter import IdealPainter, WholeViews, hues, phases
 from tests.helpers.trained import WHITE, Small, small
 from trainer.editors.cache import PictureCache
+from trainer.editors.painter import PaintRequest
 from trainer.editors.style import StyleEditor
 from trainer.report.agreement import Agreement, fit_colors, measure_agreement, view_change
 from trainer.run.agree import (
@@ -100,7 +101,8 @@ def one_by_one(kind: str, *sizes: int, seed: int = 0) -> float:
     some = family(kind, *sizes)
     painter = some.painter()
     seen = [
-        view_change(some.setup, view, painter.paint(view.image, seed=seed), 1) for view in some.setup.train
+        view_change(some.setup, view, painter.paint(PaintRequest(view.image, seed=seed)), 1)
+        for view in some.setup.train
     ]
     return some.nearest(Fit(some.setup, fit_colors(seen, len(some.setup.region.members))).render)
 
@@ -212,8 +214,9 @@ class Clumsy(WholeViews):
     references: int = 2
     calls: list[int | None] = field(default_factory=list)
 
-    def paint(self, picture: Tensor, references: Sequence[Tensor] = (), **how: object) -> Tensor:
-        seed = how["seed"]
+    def paint(self, request: PaintRequest) -> Tensor:
+        picture = request.picture
+        seed = request.seed
         assert isinstance(seed, int)
         self.calls.append(seed)
         painted = 0.6 * picture + 0.2 * torch.tensor([0.0, 0.0, 1.0])
@@ -249,8 +252,8 @@ def test_model_that_moves_everything_is_a_one_line_error(tmp_path: Path) -> None
     setup = setup_of(small("scarf", 2500, 6, 96), 1)
 
     class Enlarging(Clumsy):
-        def paint(self, picture: Tensor, references: Sequence[Tensor] = (), **how: object) -> Tensor:
-            return moved(picture, 0.0, 0.0, 0.1)
+        def paint(self, request: PaintRequest) -> Tensor:
+            return moved(request.picture, 0.0, 0.0, 0.1)
 
     easel = PaintCache(Enlarging(setup.train[0], 0.1, ()), {}, NOTHING, 0)
     with pytest.raises(ProgdfError, match=f"by more than {MAX_MOVED:.0%}; ") as caught:
@@ -270,15 +273,13 @@ class Counting(WholeViews):
     references: int = 2
     calls: int = 0
 
-    def paint(self, picture: Tensor, references: Sequence[Tensor] = (), **how: object) -> Tensor:
+    def paint(self, request: PaintRequest) -> Tensor:
         if self.calls == self.stop:
             raise StoppedError
         self.calls += 1
-        source = how["source"]
-        shade = sum(float(image.mean()) for image in references) / 4
-        start = picture if source is None else source
-        assert isinstance(start, Tensor)
-        return (0.5 * start + 0.3 * shade + 0.05 * float(how["strength"])).clamp(0, 1)  # type: ignore[arg-type]
+        shade = sum(float(image.mean()) for image in request.references) / 4
+        start = request.picture if request.source is None else request.source
+        return (0.5 * start + 0.3 * shade + 0.05 * request.strength).clamp(0, 1)
 
 
 def painted(folder: Path, painter: Counting, recipe: dict[str, str] | None = None) -> AgreedEditor:
@@ -362,11 +363,11 @@ def test_washed_out_pictures_do_not_agree(tmp_path: Path) -> None:
         painter: IdealPainter
         references: int = 2
 
-        def paint(
-            self, picture: Tensor, *more: object, source: Tensor | None = None, **how: object
-        ) -> Tensor:
-            edits = self.painter.choices[self.painter.view_of(picture)]
-            return edits.mean(dim=0) if source is not None else edits[int(how["seed"]) % len(edits)]
+        def paint(self, request: PaintRequest) -> Tensor:
+            edits = self.painter.choices[self.painter.view_of(request.picture)]
+            if request.source is not None:
+                return edits.mean(dim=0)
+            return edits[int(request.seed or 0) % len(edits)]
 
     log = RunLog(tmp_path / "log.txt", quiet=True)
     made = agree_views(PaintCache(Washing(some.painter()), {}, NOTHING, 0), some.setup, STYLE, log)

@@ -1,0 +1,1 @@
+"""Editors whose pictures a server makes: OpenAI's images API and ComfyUI."""

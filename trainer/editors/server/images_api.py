@@ -1,0 +1,197 @@
+"""Editor `api:"…"`: a model behind OpenAI's images API.
+
+LocalAI, the server of stable-diffusion.cpp, vLLM-omni, LiteLLM and hosted services offer the same endpoint,
+`POST URL/images/edits`. The API has no strength and no starting picture, so a server makes the finished edit
+of each view. The key is read from the environment for each call. It is never stored or logged.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import http.client
+import os
+import urllib.request
+from dataclasses import dataclass
+from functools import partial
+from importlib.util import find_spec
+from threading import Event
+from typing import Any
+from urllib.parse import urlsplit
+
+from torch import Tensor
+
+from progdf.errors import ProgdfError
+from progdf.terminal import escape_text, shorten
+from trainer.editors.cache import Recipe
+from trainer.editors.instruct import sentence
+from trainer.editors.painter import PaintRequest, RefusedError
+from trainer.options import EditorOptions
+
+from .calls import (
+    BUSY_STATUSES,
+    Address,
+    BusyError,
+    check_anchor,
+    mask_png,
+    one_line,
+    persist,
+    png,
+    retry_after,
+)
+
+KEY = "OPENAI_API_KEY"
+"""Environment variable of the server's key. A server on this machine may need none."""
+
+_MAX_PICTURE_BYTES = 1 << 26  # largest picture of a server
+_REFUSALS = ("content_policy_violation", "moderation_blocked", "content_filter", "safety")
+
+
+@dataclass(frozen=True)
+class ImagesApi:
+    """Model of a server with OpenAI's images API."""
+
+    address: Address
+    model: str
+    timeout: float  # seconds for one call
+    references: int = 2  # reference pictures that one call accepts
+    sends_mask: bool = False
+
+    has_strength = False
+
+    @property
+    def recipe(self) -> Recipe:
+        """See `ImageModel.recipe`."""
+        recipe: dict[str, str | int | float | None] = {"model": self.model}
+        if self.sends_mask:
+            recipe["mask"] = "region"
+        return recipe
+
+    @property
+    def name(self) -> str:
+        """See `ImageModel.name`."""
+        return f"model {self.model}"
+
+    def connect(self) -> None:
+        """See `ImageModel.connect`. The first picture tests the server, as a test would cost a call."""
+
+    def edit(self, request: PaintRequest, prompt: str, stop: Event) -> Tensor:
+        """See `ImageModel.edit`."""
+        return persist(partial(self._edit_once, request, prompt), stop)
+
+    def _edit_once(self, request: PaintRequest, prompt: str) -> Tensor:
+        """Make one call.
+
+        Raises:
+            BusyError: the call may succeed if it is made again.
+            RefusedError, ProgdfError: see `ImageModel.edit`.
+        """
+        import openai
+
+        pictures = (request.picture, *request.references)
+        files = [(f"{i}.png", png(picture), "image/png") for i, picture in enumerate(pictures)]
+        height, width = request.picture.shape[:2]
+        arguments: dict[str, Any] = {
+            "model": self.model,
+            "prompt": prompt,
+            "image": files[0] if len(files) == 1 else files,
+            "size": f"{width}x{height}",
+            "n": 1,
+        }
+        if self.sends_mask and request.mask is not None:
+            arguments["mask"] = ("mask.png", mask_png(request.mask), "image/png")
+        client = openai.OpenAI(
+            base_url=self.address.url,
+            api_key=os.environ.get(KEY) or "none",
+            timeout=self.timeout,
+            max_retries=0,
+        )
+        with client:
+            try:
+                answer = client.images.edit(**arguments)
+            except openai.APIStatusError as error:
+                raise self._explain(error) from error
+            except openai.APITimeoutError as error:
+                raise BusyError(self.address.slow(self.timeout)) from error
+            except (openai.APIConnectionError, openai.OpenAIError) as error:
+                raise BusyError(self.address.unreachable(error.__cause__ or error)) from error
+            except ValueError as error:  # not JSON
+                raise self.address.fault(
+                    f"gave no valid answer ({one_line(error)}); check --api-url"
+                ) from error
+        return self.address.read_picture(self._content(answer), (width, height))
+
+    def _content(self, answer: Any) -> bytes:
+        """Return the content of the picture in an answer."""
+        data = getattr(answer, "data", None)
+        text = getattr(data[0], "b64_json", None) if data else None
+        if text:
+            try:
+                return base64.b64decode(text, validate=True)
+            except binascii.Error as error:
+                raise self.address.fault("returned half a picture; try again") from error
+        if data and getattr(data[0], "url", None):
+            return self.fetch(str(data[0].url))
+        raise self.address.fault("returned no picture; check --api-url and --model")
+
+    def fetch(self, url: str) -> bytes:
+        """Return the content of a picture's address. The key is not sent there.
+
+        Raises:
+            ProgdfError: the address is of another kind, has no picture, or has more than 64 MB.
+        """
+        schemes = ("http", "https") if self.address.is_local else ("https",)
+        if urlsplit(url).scheme not in schemes:
+            expected = " or ".join(f"{scheme}://" for scheme in schemes)
+            raise self.address.fault(
+                f"returned an address that does not begin with {expected}: {shorten(escape_text(url))}"
+            )
+        try:
+            with urllib.request.urlopen(url, timeout=self.timeout) as answer:
+                content: bytes = answer.read(_MAX_PICTURE_BYTES + 1)
+        except (OSError, ValueError, http.client.HTTPException) as error:
+            raise self.address.fault(f"returned an address without a picture ({one_line(error)})") from error
+        if len(content) > _MAX_PICTURE_BYTES:
+            raise self.address.fault("returned a picture of more than 64 MB")
+        return content
+
+    def _explain(self, error: Any) -> Exception:
+        """Return the error of a refused call."""
+        body = error.body if isinstance(error.body, dict) else {}
+        message = one_line(body.get("message") or error.message)
+        code = str(body.get("code") or "")
+        status = error.status_code
+        if status in (400, 403) and any(word in f"{code} {message}".lower() for word in _REFUSALS):
+            return RefusedError(f"the content filter of {self.address.host} refuses it: {message}")
+        advice = {
+            401: f"set {KEY} to a valid key",
+            403: f"set {KEY} to a key that may use this model",
+            404: "check --api-url and --model",
+            429: "wait, or use fewer --edit-workers",
+        }.get(status, "check --model and --api-references")
+        fault = self.address.fault(f"refuses the call with status {status} ({message}); {advice}")
+        if status in BUSY_STATUSES and code != "insufficient_quota":
+            return BusyError(fault, retry_after(error.response.headers))
+        return fault
+
+
+def check_api(what: str, options: EditorOptions) -> ImagesApi:
+    """Return the model of `api:"…"` after checking the options. Nothing is sent.
+
+    Raises:
+        ProgdfError: the instruction, the address, the model, the key or the package openai is missing.
+    """
+    if not sentence(what):
+        raise ProgdfError('api: needs an instruction; write api:"turn him into a marble statue"')
+    if find_spec("openai") is None:
+        raise ProgdfError("api: needs the package openai; pip install progdf-studio[api]")
+    address = Address("api", options.api_url)
+    address.check("http://127.0.0.1:8080/v1", KEY)
+    if not options.model:
+        raise ProgdfError("api: needs the name of the server's model; add --model NAME")
+    check_anchor(options, options.api_references, "leave out --api-references 0")
+    if not address.is_local and not os.environ.get(KEY):
+        raise ProgdfError(f"api: {address.host} needs a key; set {KEY} in the environment")
+    if not address.is_local and urlsplit(options.api_url).scheme == "http":
+        raise ProgdfError(f"api: a key must not be sent to {address.host} unencrypted; use https://")
+    return ImagesApi(address, options.model, options.edit_timeout, options.api_references, options.api_mask)
