@@ -47,7 +47,6 @@ MAX_FILES = 14
 MAX_LINES = 600
 # Longer files, each one algorithm whose parts call each other. These numbers only fall.
 LONG_FILES = {
-    "progdf/rasterize/cpu/pyramid.py": 713,
     "progdf/rasterize/cpu/blend.py": 648,
     "trainer/optimize/color_solver.py": 606,
 }

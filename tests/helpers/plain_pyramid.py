@@ -11,11 +11,11 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.gaussians import normalize_quats
 from progdf.quaternions import matrix_quats, rotation_matrices
+from progdf.rasterize.cpu.nodes import LEAF
 from progdf.rasterize.cpu.pyramid import (
     CELL,
     COARSE_CUT_FACTOR,
     DENSITY_EXPONENT,
-    LEAF,
     MAX_OPTICAL_DEPTH,
     SLICES,
 )

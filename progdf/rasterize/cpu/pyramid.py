@@ -25,7 +25,6 @@ Reference implementation: tests/helpers/plain_pyramid.py.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -45,29 +44,37 @@ from .engine import make_pinhole, share_gaussians
 from .forward import (
     Array,
     Pinhole,
-    Quat,
     Scene,
-    Vec,
     camera_center,
     cross,
     dot,
     extents,
     footprint,
     largest_extents,
-    quat_of,
-    rotation_rows,
     shade_splat,
     times,
-    unit_quat,
     vec,
 )
 from .jit import Number, kernel, prefetch
-
-LEAF = 4
-"""Minimum number of Gaussians per leaf.
-
-Fewer cost memory, more lose 0.7 dB (docs/lab/experiments.md, The viewer).
-"""
+from .nodes import (
+    COLORS,
+    DENSITY,
+    LEAF,
+    LONGEST,
+    LOSS,
+    MIN_WEIGHT,
+    POINTS,
+    PREFETCH_ROWS,
+    SCALES,
+    WEIGHT,
+    Nodes,
+    color_of,
+    merge_nodes,
+    part_of,
+    prefetch_pick,
+    roots,
+    two_largest,
+)
 
 CELL = 8
 """Side of a grid cell in which optical depth is accumulated, pixels."""
@@ -97,60 +104,14 @@ MIN_ERROR_PX2 = 1e-3
 BUDGET_FILL = 0.85
 """Share of the budget at which the threshold search stops."""
 
-LONGEST, DENSITY, WEIGHT, POINTS, LOSS = range(3, 8)
-"""Columns of a node after its mean.
-
-- LONGEST: largest scale, world units
-- DENSITY: opacity, negative if a Gaussian below the node cannot be drawn
-- WEIGHT: Σ opacity · area of the Gaussians below, world units², 0 if none can be drawn
-- POINTS: Σ opacity of the Gaussians below
-- LOSS: spread of the centers, world units, times (1 + summed variances of the colors, band-0 coefficients)
-"""
-
-SCALES = 4
-"""First of the three scales in a node's 16-bit columns, each as a share of the largest times 65535.
-
-Columns 0 to 3 are the rotation, wxyz times 32767.
-"""
-
-SPREAD = 7
-"""Column of the centers' spread, the root of their variance, world units.
-
-This column and all that follow are the upper halves of float32, with errors of 0.2 %.
-"""
-
-CONTRAST = 8
-"""Column of the colors' spread, the root of their summed variances, in coefficients of band 0."""
-
-COLORS = 9
-"""First column of the color coefficients, band by band."""
-
 _ONE_BITS = int(np.float32(1.0).view(np.int32))
 _SLICES_PER_BIT = 2.0**-19  # depth slices per unit in the last place of a float32: 16 per factor of two
 _SHADOW_DEPTH_RATIO = 2.0 ** (-1 / 32)  # depth factor, half a slice nearer: a surface must not shadow itself
 _CHUNK_LEVELS = 4  # upper levels of the tree whose nodes are chunks for the threads
-_PREFETCH_ROWS = 8  # rows to prefetch ahead, because they lie far apart in memory
 # largest factor by which occlusion reduces the error of a node
 _MAX_DARKENING = math.exp(0.5 * MAX_OPTICAL_DEPTH)
-_MIN_WEIGHT = 1e-30
-_MAX_WEIGHT = 1e30
 _MAX_TRIALS = 12  # cuts per threshold search
 _NEAR_SIGMAS = 3.0  # a node is dropped if it lies behind the near plane by this many standard deviations
-
-
-class Nodes(NamedTuple):
-    """Tree in arrays, level after level.
-
-    Node i has the children 2i + 1 and 2i + 2. Leaf l of L = 2^levels holds the rows
-    order[l·N // L : (l + 1)·N // L].
-    """
-
-    # means and the columns above: all that a cut reads. [2L-1,8] float32
-    means: Array
-    shapes: Array  # 16-bit columns. [2L-1,9+3K] uint16
-    quats: Array  # first four 16-bit columns, signed. [2L-1,4] int16
-    order: Array  # rows of the scene. [N] int32
-    levels: int
 
 
 class Pyramid:
@@ -249,8 +210,15 @@ class Pyramid:
         """Merge nodes of a level, counted from its first node, from the level below."""
 
         def merge(begin: int, end: int) -> None:
-            scratch = np.empty((3, 3)), np.empty(4), np.empty(self.scene.colors.shape[1:])
-            _merge(begin, end, nodes, level, self.scene, self.nodes, colors_only, *scratch)
+            count, bands, _ = self.scene.colors.shape
+            colors = self.scene.colors.reshape(count, 3 * bands)
+            scratch = (
+                np.empty(2 * LEAF),
+                np.empty(colors.shape[1], np.float32),
+                np.empty((3, 3)),
+                np.empty(4),
+            )
+            merge_nodes(begin, end, nodes, level, self.scene, colors, self.nodes, colors_only, *scratch)
 
         share_gaussians(merge, len(nodes))
 
@@ -315,206 +283,6 @@ def _select(points: Array, order: Array, axis: int, begin: int, end: int, middle
             low = i
         else:
             return
-
-
-@kernel(contract=True, inline=True)
-def _two_largest(scale: Vec) -> tuple[float, float]:
-    a = abs(scale[0])
-    b = abs(scale[1])
-    c = abs(scale[2])
-    return max(a, max(b, c)), max(min(a, b), min(max(a, b), c))
-
-
-@kernel(inline=True)
-def _roots(a: float, b: float, c: float) -> Vec:
-    return math.sqrt(max(a, 0.0)), math.sqrt(max(b, 0.0)), math.sqrt(max(c, 0.0))
-
-
-@kernel(contract=True, inline=True)
-def _weight(scene: Scene, i: int) -> float:
-    """Return opacity times area, or 0 if the Gaussian cannot be drawn."""
-    mean = vec(scene.means, i)
-    opacity = np.float64(scene.opacities[i])
-    longest, middle = _two_largest(vec(scene.scales, i))
-    weight = opacity * longest * middle
-    drawn = (
-        opacity >= ALPHA_MIN and abs(mean[0]) + abs(mean[1]) + abs(mean[2]) < np.inf and weight < _MAX_WEIGHT
-    )
-    return max(weight, _MIN_WEIGHT) if drawn else 0.0
-
-
-@kernel(contract=True, cache=True)
-def _merge(
-    begin: int, end: int, indices: Array, level: int, scene: Scene, nodes: Nodes, colors_only: bool,
-    matrix: Array, quat: Array, colors: Array,
-) -> None:  # fmt: skip
-    """Merge nodes indices[begin … end − 1] of a level from the level below. matrix, quat, colors: scratch."""
-    means = nodes.means
-    shapes = nodes.shapes
-    count = nodes.order.shape[0]
-    leaf = level == nodes.levels
-    for at in range(begin, end):
-        me = (1 << level) - 1 + indices[at]
-        first = 2 * me + 1
-        last = 2 * me + 3
-        if leaf:
-            first = (indices[at] * count) >> level
-            last = ((indices[at] + 1) * count) >> level
-        total = points = square = x = y = z = between = 0.0
-        sound = True
-        colors[:] = 0.0
-        for k in range(first, last):
-            i = nodes.order[k] if leaf else k
-            if leaf:  # rows of neighbors lie far apart; adjacent leaves do not
-                _fetch(~nodes.order[min(k + _PREFETCH_ROWS, count - 1)], scene, nodes, not colors_only)
-            weight = _weight(scene, i) if leaf else np.float64(means[i, WEIGHT])
-            sound = sound and (weight > 0.0 if leaf else means[i, DENSITY] > 0.0)
-            if weight > 0.0:
-                mean = vec(scene.means, i) if leaf else vec(means, i)
-                total += weight
-                points += np.float64(scene.opacities[i] if leaf else means[i, POINTS])
-                x = x + weight * mean[0]
-                y = y + weight * mean[1]
-                z = z + weight * mean[2]
-                square += 0.0 if leaf else weight * _unpack(shapes[i, CONTRAST]) ** 2
-                for band in range(colors.shape[0]):
-                    for c in range(3):
-                        color = _color(i, leaf, band, c, scene, nodes)
-                        colors[band, c] += weight * color
-                        square += weight * color * color if band == 0 else 0.0
-        share = 1.0 / max(total, _MIN_WEIGHT)
-        mine = means[me]
-        for band in range(colors.shape[0]):
-            for c in range(3):
-                colors[band, c] *= share
-                shapes[me, COLORS + 3 * band + c] = _pack(colors[band, c])
-        shapes[me, CONTRAST] = _pack(math.sqrt(max(square * share - dot(colors[0], colors[0]), 0.0)))
-        if not colors_only:
-            x = x * share
-            y = y * share
-            z = z * share
-            matrix[:] = 0.0
-            for k in range(first, last):
-                i = nodes.order[k] if leaf else k
-                weight = (_weight(scene, i) if leaf else np.float64(means[i, WEIGHT])) * share
-                if weight > 0.0:
-                    mean, scale, turn = _part(i, leaf, scene, nodes)
-                    off = mean[0] - x, mean[1] - y, mean[2] - z
-                    _add_moments(off, scale, turn, weight, matrix)
-                    between += weight * (dot(off, off) + (0.0 if leaf else _unpack(shapes[i, SPREAD]) ** 2))
-            shapes[me, SPREAD] = _pack(math.sqrt(between))
-            _diagonalize(matrix, quat)
-            mine[0] = x
-            mine[1] = y
-            mine[2] = z
-            mine[WEIGHT] = total
-            mine[POINTS] = points
-            for k in range(4):
-                nodes.quats[me, k] = np.rint(32767.0 * quat[k])
-            sizes = _roots(matrix[0, 0], matrix[1, 1], matrix[2, 2])
-            mine[LONGEST], middle = _two_largest(sizes)
-            for k in range(3):
-                shapes[me, SCALES + k] = np.uint16(
-                    np.rint(65535.0 * sizes[k] / max(mine[LONGEST], _MIN_WEIGHT))
-                )
-            density = total / max(mine[LONGEST] * middle, _MIN_WEIGHT)
-            mine[DENSITY] = density if sound else -density
-        mine[LOSS] = _unpack(shapes[me, SPREAD]) * (1.0 + _unpack(shapes[me, CONTRAST]) ** 2)
-
-
-@kernel(inline=True)
-def _pack(value: float) -> Number:
-    """Return the upper half of a float32, rounded to nearest."""
-    return np.uint16((np.float32(value).view(np.uint32) + np.uint32(0x8000)) >> np.uint32(16))
-
-
-@kernel(inline=True)
-def _unpack(half: Number) -> Number:
-    return np.uint32(np.uint32(half) << np.uint32(16)).view(np.float32)
-
-
-@kernel(inline=True)
-def _fetch(pick: int, scene: Scene, nodes: Nodes, turned: bool) -> None:
-    """Prefetch the data of a pick; its rotation only if `turned`."""
-    if pick >= 0:
-        prefetch(nodes.means, pick)
-        prefetch(nodes.shapes, pick)
-    else:
-        prefetch(scene.means, ~pick)
-        prefetch(scene.quats if turned else scene.means, ~pick)
-        prefetch(scene.scales, ~pick)
-        prefetch(scene.opacities, ~pick)
-        prefetch(scene.colors, ~pick)
-
-
-@kernel(inline=True)
-def _part(i: int, is_row: bool, scene: Scene, nodes: Nodes) -> tuple[Vec, Vec, Quat]:
-    """Return the mean, scales and rotation of a row or a node."""
-    if is_row:
-        return vec(scene.means, i), vec(scene.scales, i), quat_of(scene.quats, i)
-    shape = nodes.shapes[i]
-    unit = nodes.means[i, LONGEST] / 65535.0
-    scale = unit * shape[SCALES], unit * shape[SCALES + 1], unit * shape[SCALES + 2]
-    return vec(nodes.means, i), scale, quat_of(nodes.quats, i)
-
-
-@kernel(inline=True)
-def _color(i: int, is_row: bool, band: int, k: int, scene: Scene, nodes: Nodes) -> Number:
-    return scene.colors[i, band, k] if is_row else _unpack(nodes.shapes[i, COLORS + 3 * band + k])
-
-
-@kernel(contract=True, inline=True)
-def _add_moments(off: Vec, scale: Vec, quat: Quat, weight: float, matrix: Array) -> None:
-    """Add a Gaussian's second moments about a point to a matrix."""
-    qw, qx, qy, qz, _ = unit_quat(quat[0], quat[1], quat[2], quat[3])
-    rotation = rotation_rows(qw, qx, qy, qz)
-    turned = times(rotation[0], scale), times(rotation[1], scale), times(rotation[2], scale)
-    for row in range(3):
-        for column in range(3):
-            matrix[row, column] += weight * (dot(turned[row], turned[column]) + off[row] * off[column])
-
-
-@kernel(contract=True)
-def _diagonalize(matrix: Array, quat: Array) -> None:
-    """Diagonalize a symmetric matrix [3,3] in place by Jacobi rotations.
-
-    Args:
-        quat: out, wxyz of the rotation whose columns are the eigenvectors. [4]
-    """
-    quat[0] = 1.0
-    quat[1] = 0.0
-    quat[2] = 0.0
-    quat[3] = 0.0
-    for _ in range(8):
-        off = matrix[0, 1] ** 2 + matrix[0, 2] ** 2 + matrix[1, 2] ** 2
-        if off <= 1e-14 * (matrix[0, 0] ** 2 + matrix[1, 1] ** 2 + matrix[2, 2] ** 2):
-            return
-        for axis in range(3):
-            p = (axis + 1) % 3
-            q = (axis + 2) % 3
-            if matrix[p, q] == 0.0:
-                continue
-            half = (matrix[q, q] - matrix[p, p]) / (2.0 * matrix[p, q])
-            tangent = math.copysign(1.0, half) / (abs(half) + math.sqrt(half * half + 1.0))
-            cosine = 1.0 / math.sqrt(tangent * tangent + 1.0)
-            sine = tangent * cosine
-            matrix[p, p] -= tangent * matrix[p, q]
-            matrix[q, q] += tangent * matrix[p, q]
-            to_p = matrix[axis, p]
-            to_q = matrix[axis, q]
-            matrix[p, q] = matrix[q, p] = 0.0
-            matrix[axis, p] = matrix[p, axis] = cosine * to_p - sine * to_q
-            matrix[axis, q] = matrix[q, axis] = sine * to_p + cosine * to_q
-            turn = math.sqrt(0.5 * (1.0 + cosine))  # cosine of half the angle, about −axis
-            lean = -0.5 * sine / turn
-            w = quat[0]
-            along = quat[1 + axis]
-            at_p = quat[1 + p]
-            at_q = quat[1 + q]
-            quat[0] = w * turn - along * lean
-            quat[1 + axis] = along * turn + w * lean
-            quat[1 + p] = at_p * turn + at_q * lean
-            quat[1 + q] = at_q * turn - at_p * lean
 
 
 @kernel(contract=True, inline=True)
@@ -599,7 +367,7 @@ def _walk(
         loss = np.inf
         inside = False
         wide = 0.0 if camera.antialiased else dilation * z * z / (focal * focal)
-        least = (means[i, WEIGHT] + wide * means[i, POINTS]) / max(longest * longest + wide, _MIN_WEIGHT)
+        least = (means[i, WEIGHT] + wide * means[i, POINTS]) / max(longest * longest + wide, MIN_WEIGHT)
         if z - camera.near > reach and max(density, least) >= ALPHA_MIN:
             x, y, wide2, high2 = extents(camera, vec(means, i), z, longest, density)
             if _is_outside(camera, x, y, wide2, high2):
@@ -648,7 +416,7 @@ def _add_depths(picks: Array, nodes: Nodes, camera: Pinhole, dilation: float, de
         inside = 0.0 <= x <= camera.window[2] and 0.0 <= y <= camera.window[3]
         if z > camera.near and density >= ALPHA_MIN and inside:
             nearer = camera.fx * camera.fy / (z * z)
-            middle = nodes.means[i, WEIGHT] / max(density * longest, _MIN_WEIGHT)
+            middle = nodes.means[i, WEIGHT] / max(density * longest, MIN_WEIGHT)
             area = math.sqrt((longest * longest * nearer + dilation) * (middle * middle * nearer + dilation))
             depth = -math.log(1.0 - min(density, ALPHA_MAX)) * min(2.0 * math.pi * area / (CELL * CELL), 1.0)
             for corner in range(8):
@@ -674,27 +442,27 @@ def _resolve_picks(
     """Write the Gaussians to draw for picks begin … end − 1. basis, bands: scratch."""
     eye = camera_center(camera)
     for at in range(begin, end):
-        _fetch(picks[min(at + _PREFETCH_ROWS, end - 1)], scene, nodes, True)
+        prefetch_pick(picks[min(at + PREFETCH_ROWS, end - 1)], scene, nodes, True)
         merged = picks[at] >= 0
         i = max(picks[at], ~picks[at])
-        mean, scale, quat = _part(i, not merged, scene, nodes)
+        mean, scale, quat = part_of(i, not merged, scene, nodes)
         seen = footprint(camera, mean, scale, quat)
         unit = 1.0 / (camera.fx * camera.fy * seen.inv_z * seen.inv_z)  # area of a pixel, world units²
         if merged:
             own = nodes.means[i]
             opacity = abs(float(own[DENSITY]))  # above 1 where several Gaussians cover each other
             if not camera.antialiased:
-                longest, middle = _two_largest(scale)
+                longest, middle = two_largest(scale)
                 wide = dilation * unit
                 dilated = math.sqrt((longest * longest + wide) * (middle * middle + wide))
-                opacity = max(opacity, (own[WEIGHT] + wide * own[POINTS]) / max(dilated, _MIN_WEIGHT))
+                opacity = max(opacity, (own[WEIGHT] + wide * own[POINTS]) / max(dilated, MIN_WEIGHT))
             opacity = min(opacity, opacity**DENSITY_EXPONENT)
         else:
             opacity = float(scene.opacities[i])
         # replace the fine dilation by the coarse one: reduce the size as far as possible, then the opacity
         more = (dilation - DILATION) * unit
         a, b, c = scale
-        size = _roots(a * a + more, b * b + more, c * c + more)
+        size = roots(a * a + more, b * b + more, c * c + more)
         p0 = times(seen.turned0, size)
         p1 = times(seen.turned1, size)
         normal = cross(p0, p1)
@@ -706,7 +474,7 @@ def _resolve_picks(
         out.quats[at, 0], out.quats[at, 1], out.quats[at, 2], out.quats[at, 3] = seen.quat
         for band in range(bands.shape[0]):
             for k in range(3):
-                bands[band, k] = _color(i, not merged, band, k, scene, nodes)
+                bands[band, k] = color_of(i, not merged, band, k, scene, nodes)
         rgb = shade_splat(mean, bands, camera.degree, eye, basis)
         for k in range(3):
             out.means[at, k], out.scales[at, k], out.colors[at, k] = mean[k], size[k], max(rgb[k], 0.0)

@@ -17,14 +17,8 @@ from progdf.metrics.image import psnr
 from progdf.quaternions import normalize_quats, rotation_matrices
 from progdf.rasterize import ActivatedGaussians, activate, render
 from progdf.rasterize.cpu.engine import make_pinhole
-from progdf.rasterize.cpu.pyramid import (
-    BUDGET_FILL,
-    DENSITY,
-    LONGEST,
-    SCALES,
-    SPREAD,
-    Pyramid,
-)  # fmt: skip
+from progdf.rasterize.cpu.nodes import DENSITY, LONGEST, SCALES, SPREAD
+from progdf.rasterize.cpu.pyramid import BUDGET_FILL, Pyramid
 from progdf.rasterize.engines import DILATION, RasterView
 from tests.helpers.plain_pyramid import PlainCut, merge_rows, plain_tree
 from tests.helpers.scenes import front_camera, orbit_camera, random_gaussians
