@@ -167,11 +167,20 @@ class PullHandle:
 
 
 @dataclass(frozen=True)
+class PullCut:
+    """Line drawn over a view, which cuts all behind it into two sides."""
+
+    eye: Vec3  # position of the camera, world units
+    points: tuple[Vec3, ...]  # its corners, on the surface without the pull, world units
+
+
+@dataclass(frozen=True)
 class PullPose:
-    """Handles and held points of a pull."""
+    """Handles, held points and cuts of a pull."""
 
     handles: tuple[PullHandle, ...] = ()
     pins: tuple[Vec3, ...] = ()  # points that stay in place, without the pull, world units
+    cuts: tuple[PullCut, ...] = ()
 
 
 PullAxis = Literal["", "x", "y", "z"]
@@ -201,12 +210,25 @@ class PullTransform:
     typed: TypedTransform | None = None  # None: the mouse drags a part of the gizmo
 
 
+@dataclass(frozen=True)
+class CutStroke:
+    """Line of a cut while it is drawn."""
+
+    cut: PullCut
+    shown: tuple[Vec3, ...]  # its corners where the pull has moved them, world units
+    pixel: Point  # last corner, pixels of the picture
+    depth: float  # depth of the last corner, which corners on the background take
+    offset: Vec3 = (0.0, 0.0, 0.0)  # displacement of the last corner on the surface
+    is_on_surface: bool = False  # a corner is on the surface
+
+
 @dataclass(frozen=True, eq=False)
 class PullInfluence:
     """Gaussians that a pull can move."""
 
     rows: NDArray[np.int64]  # [M]
     shares: NDArray[np.float64]  # share of the handles' motion that each may follow, 0 to 1. [M]
+    is_cut: bool = False  # cuts separate a Gaussian from the handles
 
 
 @dataclass(frozen=True)
@@ -220,6 +242,8 @@ class Pull:
     past: tuple[PullPose, ...] = ()  # earlier poses that undo returns to
     future: tuple[PullPose, ...] = ()  # undone poses, the next one last
     drag: PullDrag | None = None
+    is_cutting: bool = False  # the left button draws cuts
+    stroke: CutStroke | None = None  # cut that is being drawn
     picked: int | None = None  # handle with the gizmo, an index
     transform: PullTransform | None = None  # transform of the picked handle in progress
     grip: Transform = "move"  # transform of the part of its gizmo that the mouse drags, or is over
@@ -236,13 +260,13 @@ class Pull:
 
     @property
     def escape_request(self) -> str:
-        """Name of the request that Escape makes; "" while it only ends a drag."""
-        return "" if self.is_held else "leave_pull"
+        """Name of the request that Escape makes; "" while it only ends a drag or the drawing of cuts."""
+        return "" if self.is_held or self.is_cutting else "leave_pull"
 
     @property
     def is_held(self) -> bool:
-        """True while a handle is dragged, turned or scaled."""
-        return self.drag is not None or self.transform is not None
+        """True while a handle is dragged, turned or scaled, or a cut is drawn."""
+        return self.drag is not None or self.transform is not None or self.stroke is not None
 
     @property
     def picked_handle(self) -> PullHandle | None:

@@ -26,6 +26,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, save_gdf
 from progdf.pull.course import Handle, pull
+from progdf.pull.cuts import CutLine, Cuts
 from progdf.pull.grips import connected_rows, with_grips
 from progdf.pull.live import (
     HandlePose,
@@ -48,7 +49,7 @@ from viewer.files.document import DocumentStore
 from viewer.render.engine import ViewEngine
 from viewer.state import selection
 from viewer.state.layers import visible_layers
-from viewer.state.transient import Pull, PullInfluence, PullPose
+from viewer.state.transient import Pull, PullCut, PullInfluence, PullPose
 from viewer.state.view_state import LayerState
 from viewer.state.workspace import Store, with_transient
 
@@ -77,6 +78,7 @@ class _Problem:
     points: tuple[Vec3, ...]  # points of the handles, without the pull
     framed: tuple[bool, ...]  # True for handles that turn or scale the surface around them
     pins: tuple[Vec3, ...]
+    cuts: tuple[PullCut, ...]
     radius: float | None  # radius of the influence; None: all that is connected
 
 
@@ -89,6 +91,7 @@ class _Prepared:
     live: LivePull
     edit: Gdf
     composer: Composer
+    is_cut: bool  # the cuts separate a Gaussian from the handles
 
 
 class _Bases:
@@ -109,13 +112,15 @@ class _Bases:
             self._parts.clear()
         return self._scene
 
-    def connected_part(self, scene: Gaussians, mask: NDArray[np.bool_], rows: NDArray[np.int64]) -> Region:
+    def connected_part(
+        self, scene: Gaussians, mask: NDArray[np.bool_], rows: NDArray[np.int64], cuts: tuple[PullCut, ...]
+    ) -> Region:
         """Return the part of a mask that is connected with some rows."""
-        key = (mask.tobytes(), rows.tobytes())
+        key = (mask.tobytes(), rows.tobytes(), cuts)
         if key not in self._parts:
             allowed = np.flatnonzero(mask)
             start = np.searchsorted(allowed, rows).clip(max=len(allowed) - 1)
-            found = connected_rows(scene[torch.from_numpy(allowed)], start)
+            found = connected_rows(scene[torch.from_numpy(allowed)], start, _lines(cuts))
             self._parts[key] = allowed[found]
         part = np.zeros(len(mask), bool)
         part[self._parts[key]] = True
@@ -307,6 +312,7 @@ class PullActions:
             points=tuple(handle.point for handle in pull.pose.handles),
             framed=tuple(handle.turn is not None for handle in pull.pose.handles),
             pins=pull.pose.pins,
+            cuts=pull.pose.cuts,
             radius=None if pull.whole else pull.radius,
         )
 
@@ -352,7 +358,7 @@ class PullActions:
         self._report("")
         pull = self._pull
         if pull is not None:
-            influence = PullInfluence(prepared.live.members, prepared.live.influence)
+            influence = PullInfluence(prepared.live.members, prepared.live.influence, prepared.is_cut)
             self._set(replace(pull, edit=prepared.edit, influence=influence))
 
     def _show_layer(self, index: int) -> None:
@@ -489,9 +495,10 @@ def _prepare(bases: _Bases, problem: _Problem, pose: HandlePose, count: int) -> 
         ProgdfError: a handle is held, or is not on the part.
     """
     scene = bases.scene(problem, count)
-    handles, hold = _constraints(bases, problem, scene)
-    gripped, owners = with_grips(scene, handles, hold)
-    live = LivePull(scene, gripped, hold)
+    handles, hold, is_cut = _constraints(bases, problem, scene)
+    cuts = _lines(problem.cuts)
+    gripped, owners = with_grips(scene, handles, hold, cuts)
+    live = LivePull(scene, gripped, hold, cuts=cuts)
     first = live.step(_point_pose(pose, owners), _FIRST_ROUNDS)
     drawn = problem.engine.scene
     edit = edit_in_progress(drawn, live.members, live.channels, _NAME)
@@ -501,7 +508,7 @@ def _prepare(bases: _Bases, problem: _Problem, pose: HandlePose, count: int) -> 
     stack = _stack(problem)
     for layers in ([*stack, Layer(edit)], stack):  # the first one compiles and plans the steps to come
         composer.update(layers, problem.blend)
-    return _Prepared(problem, owners, live, edit, composer)
+    return _Prepared(problem, owners, live, edit, composer, is_cut or live.cut_count > 0)
 
 
 @one_thread()
@@ -515,18 +522,21 @@ def _make_layer(
 ) -> None:
     """Solve the whole course and write it as an edit, as `progdf edit --pull` does."""
     scene = bases.scene(problem, len(original))
-    handles, hold = _constraints(bases, problem, scene)
+    handles, hold, _ = _constraints(bases, problem, scene)
     moved = [
         replace(handle, pull=placed.pull, turn=placed.turn, scale=placed.scale)
         for handle, placed in zip(handles, pose.handles, strict=True)
         if placed.moves
     ]
-    course = pull(scene, with_grips(scene, moved, hold)[0], hold)
+    cuts = _lines(problem.cuts)
+    course = pull(scene, with_grips(scene, moved, hold, cuts)[0], hold, cuts=cuts)
     save_gdf(path, tidy(original, [Step("pull", course.region, course=course)], name, "pull"))
 
 
-def _constraints(bases: _Bases, problem: _Problem, scene: Gaussians) -> tuple[list[Handle], Region | None]:
-    """Return the handles at rest, and the held region, of a problem."""
+def _constraints(
+    bases: _Bases, problem: _Problem, scene: Gaussians
+) -> tuple[list[Handle], Region | None, bool]:
+    """Return the handles at rest, the held region, and True if cuts make the handles' region smaller."""
     count = len(scene)
     mask = np.ones(count, bool)
     if problem.limit != selection.EMPTY_MASK:
@@ -539,9 +549,11 @@ def _constraints(bases: _Bases, problem: _Problem, scene: Gaussians) -> tuple[li
     allowed = np.flatnonzero(mask)
     tree = PointTree(means[allowed], _PIN_GAUSSIANS)
     region = from_mask(_NAME, torch.from_numpy(mask))
+    is_cut = False
     if problem.radius is None and problem.limit == selection.EMPTY_MASK:
         nearest = allowed[tree.query(np.array(problem.points), 1)[1][:, 0]]
-        region = bases.connected_part(scene, mask, nearest)
+        region = bases.connected_part(scene, mask, nearest, problem.cuts)
+        is_cut = len(region) < len(bases.connected_part(scene, mask, nearest, ()))
     held = np.zeros(count, bool)
     if problem.held != selection.EMPTY_MASK:
         held |= _own(problem.held, problem, count)
@@ -554,7 +566,11 @@ def _constraints(bases: _Bases, problem: _Problem, scene: Gaussians) -> tuple[li
         for point, framed in zip(problem.points, problem.framed, strict=True)
     ]
     hold = from_mask("held", torch.from_numpy(held)) if held.any() else None
-    return handles, hold
+    return handles, hold, is_cut
+
+
+def _lines(cuts: tuple[PullCut, ...]) -> Cuts:
+    return Cuts(lines=tuple(CutLine(np.array(cut.eye), np.array(cut.points)) for cut in cuts))
 
 
 def _own(packed: bytes, problem: _Problem, count: int) -> NDArray[np.bool_]:

@@ -14,16 +14,19 @@ from viewer.app import typed
 from viewer.camera.decal_warp import project, vec3
 from viewer.camera.view_camera import Vec3, axes
 from viewer.state.transient import Pull, PullDrag
-from viewer.ui.context import PALETTE, UiContext, u32
+from viewer.ui.context import PALETTE, Rgba, UiContext, u32
 from viewer.ui.pointer import PointerContext
-from viewer.ui.widgets import accent_button, elide, inert, plate, small, tip
+from viewer.ui.widgets import accent_button, elide, group_digits, inert, plate, small, tip
 
+from .cutting import clear
 from .ring import surface_ring
 from .transform import gizmo_of
 
 _HANDLE_PX = 5.0  # at 1×: radius of a handle
 _PIN_PX = 4.0  # at 1×: half the side of a pin
 _CIRCLE_POINTS = 64  # corners of the circle that shows the radius
+_RING_PX = 1.25  # at 1×: width of the ring
+_CUT_PX = 2.5  # at 1×: width of a cut
 _PLATE_PX = 14.0  # at 1×: distance of the buttons from the upper edge of the picture
 _LOWER_PX = 64.0  # the same below the options of a tool or a selection
 _HINT_PX = 430.0  # at 1×: width of the line below the buttons
@@ -31,6 +34,7 @@ _HANDLE_COLOR = (1.0, 0.72, 0.05, 1.0)
 _PIN_COLOR = (0.35, 0.75, 1.0, 1.0)
 _PICKED_COLOR = (1.0, 1.0, 1.0, 1.0)
 _OUTLINE_COLOR = (0.0, 0.0, 0.0, 0.6)
+_CUT_COLOR = (1.0, 0.2, 0.55, 1.0)
 _AXES: dict[str, Vec3] = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _AXIS_COLORS = {"x": (0.93, 0.30, 0.32), "y": (0.48, 0.79, 0.25), "z": (0.26, 0.54, 0.95)}
 
@@ -63,6 +67,14 @@ def draw_bar(pull: Pull, pointer: PointerContext, below: bool) -> tuple[Pull, st
             holds = imgui.checkbox("Hold selection", holds)[1]
             tip("Keep the selection in place; else only the selection moves")
         imgui.same_line()
+        cuts = imgui.checkbox("Cut", pull.is_cutting)[1]
+        tip("Draw lines where things touch, so that only one of them moves (K)")
+        if pull.pose.cuts:
+            imgui.same_line()
+            if imgui.button("Clear cuts"):
+                pull = clear(pull)
+            tip("Remove all cuts; Shift+click removes one while Cut is on")
+        imgui.same_line()
         with inert(not pull.pose.handles):
             if accent_button("Keep", (72.0 * scale, 0.0)):
                 request = pull.enter_request
@@ -72,7 +84,7 @@ def draw_bar(pull: Pull, pointer: PointerContext, below: bool) -> tuple[Pull, st
             request = "leave_pull"
         hint = elide(pull.status or _hint(pull), _HINT_PX * scale)
         small(hint, PALETTE.dim, imgui.calc_text_size(hint).x)
-    return replace(pull, whole=whole, holds_selection=holds), request
+    return replace(pull, whole=whole, holds_selection=holds, is_cutting=cuts), request
 
 
 def _title(pull: Pull, pointer: PointerContext) -> str:
@@ -92,6 +104,8 @@ def _hint(pull: Pull) -> str:
         return "X, Y, Z: axis. Type a number. Ctrl: steps. Enter or click: take. Esc: back"
     if pull.transform is not None:
         return "Ctrl: steps of 15° and 0.1. Esc: back"
+    if pull.is_cutting:
+        return _cut_hint(pull)
     if pull.picked_handle is not None and pull.drag is None:
         return "Rings, R, S: turn, scale. G: move. Click: pin. Shift+click: free. Enter: keep"
     if pull.drag is not None:
@@ -99,6 +113,18 @@ def _hint(pull: Pull) -> str:
     if pull.pose.handles:
         return "Drag a dot again, or pull elsewhere. Click: pin. Shift+click: free. Enter: keep"
     return "Drag the surface. Wheel: radius. Click: pin. Shift+click: free. Esc: leave"
+
+
+def _cut_hint(pull: Pull) -> str:
+    if pull.stroke is not None:
+        return "Draw across all of the place where they touch. Esc: back"
+    influence = pull.influence
+    if not pull.pose.cuts or influence is None:
+        return "Draw a line where two things touch. Shift+click: remove it. K, Esc: done"
+    if not influence.is_cut:
+        return "The line cuts nothing that the handles reach. Shift+click: remove it. K, Esc: done"
+    count = group_digits(len(influence.rows))
+    return f"{count} splats can move. Also draw from other sides. Shift+click: remove. K, Esc: done"
 
 
 def draw_marks(pull: Pull, pointer: PointerContext) -> None:
@@ -110,9 +136,13 @@ def draw_marks(pull: Pull, pointer: PointerContext) -> None:
         if not pull.whole:
             has_moved = pull.drag.start != handle.point
             _draw_radius(handle.point, pull.radius, pull.drag.surface, has_moved, pointer)
-    elif pull.hovered is not None and not pull.whole:
+    elif pull.hovered is not None and not pull.whole and not pull.is_cutting:
         surface = pointer.known_surface(pointer.shown.camera, pointer.size, request=True)
         _draw_radius(pull.hovered, pull.radius, surface, False, pointer)
+    for cut in pull.pose.cuts:
+        _outline(_places(cut.points, pointer), pointer.ui, _CUT_COLOR, is_closed=False)
+    if pull.stroke is not None:
+        _outline(_places(pull.stroke.shown, pointer), pointer.ui, _CUT_COLOR, is_closed=False)
     canvas = imgui.get_background_draw_list()
     for x, y in _places(pull.pose.pins, pointer):
         for size, color in ((_PIN_PX + 1.5, _OUTLINE_COLOR), (_PIN_PX, _PIN_COLOR)):
@@ -166,14 +196,18 @@ def _draw_circle(center: Vec3, radius: float, pointer: PointerContext) -> None:
     _outline(places, pointer.ui)
 
 
-def _outline(places: list[tuple[float, float]], ui: UiContext) -> None:
+def _outline(
+    places: list[tuple[float, float]], ui: UiContext, color: Rgba = PALETTE.handle, is_closed: bool = True
+) -> None:
+    """Draw a line with a dark outline. Cuts are wider than rings."""
     if len(places) < 2:
         return
     canvas = imgui.get_background_draw_list()
-    closed = imgui.ImDrawFlags_.closed.value
+    flags = imgui.ImDrawFlags_.closed.value if is_closed else imgui.ImDrawFlags_.none.value
+    width = _RING_PX if is_closed else _CUT_PX
     corners = [imgui.ImVec2(x, y) for x, y in places]
-    for color, width in ((_OUTLINE_COLOR, 3.0), (PALETTE.handle, 1.25)):
-        canvas.add_polyline([*corners], u32(color), width * ui.scale, closed)
+    for rgba, thickness in ((_OUTLINE_COLOR, width + 1.75), (color, width)):
+        canvas.add_polyline([*corners], u32(rgba), thickness * ui.scale, flags)
 
 
 def _draw_line(drag: PullDrag, pointer: PointerContext) -> None:

@@ -13,18 +13,16 @@ from typing import TypeVar
 import numpy as np
 from imgui_bundle import imgui
 
-from progdf.camera import Camera
-from progdf.quaternions import normalize_quats, rotation_matrices
-from viewer.camera.decal_warp import Floats, project, vec3
+from viewer.camera.decal_warp import project, vec3
 from viewer.camera.view_camera import Vec3
 from viewer.render.decal_surfaces import DecalSurfaces
-from viewer.render.picking import SURFACE_OPACITY, seen_at
 from viewer.state.transient import Pull, PullAxis, PullDrag, PullHandle
 from viewer.state.workspace import Workspace
 from viewer.ui.keys import Keys
 from viewer.ui.pointer import PointerContext
 
-from . import transform
+from . import cutting, transform
+from .aim import camera_of, is_over, moves_camera, normal_at, pick, unproject
 from .marks import direction, draw_bar
 from .transform import redo, undo, with_pose
 
@@ -46,11 +44,11 @@ def is_free(work: Workspace) -> bool:
 
 
 def take_keys(work: Workspace, pointer: PointerContext, keys: Keys) -> tuple[Workspace, Keys]:
-    """Handle the keys of the Pull tool: transforms, X, Y and Z, undo and redo; return the unused keys."""
+    """Handle the keys of the Pull tool: transforms, axes, cuts, undo and redo; return the unused keys."""
     pull = work.transient.gizmo
     if not isinstance(pull, Pull) or imgui.get_io().want_text_input:
         return work, keys
-    if pull.drag is None:
+    if pull.drag is None and pull.stroke is None:
         pull, keys = transform.take_keys(pull, pointer, keys)
     unused = []
     for press in keys.pressed:
@@ -60,6 +58,8 @@ def take_keys(work: Workspace, pointer: PointerContext, keys: Keys) -> tuple[Wor
             chosen = axis[press.chord]
             drag = replace(pull.drag, axis="" if pull.drag.axis == chosen else chosen)
             changed = replace(pull, drag=drag)
+        elif press.chord == "K" and not pull.is_held:
+            changed = replace(pull, is_cutting=not pull.is_cutting)
         elif press.chord == "Ctrl+Z" and not pull.is_held and pull.past:
             changed = undo(pull)
         elif press.chord in ("Ctrl+Shift+Z", "Ctrl+Y") and not pull.is_held and pull.future:
@@ -91,14 +91,17 @@ def update(
     Returns:
         The changed tool, its request ("" for none), and True if it takes the mouse.
     """
-    on_dot = _near(pull, pointer)[0] is not None
-    moved, is_taken = transform.transform_picked(pull, pointer, surfaces, pressed, on_dot)
-    is_idle = moved.transform is None and not is_taken
-    moved = move_pull(moved, pointer, is_free(work) and is_idle, pressed)
+    if pull.is_cutting and pull.transform is None:
+        moved, is_taken = cutting.draw_stroke(pull, pointer, is_free(work), pressed)
+    else:
+        on_dot = _near(pull, pointer)[0] is not None
+        moved, is_taken = transform.transform_picked(pull, pointer, surfaces, pressed, on_dot)
+        is_idle = moved.transform is None and not is_taken
+        moved = move_pull(moved, pointer, is_free(work) and is_idle, pressed)
+        is_taken = is_taken or pull.drag is not None or (is_free(work) and takes_mouse(moved, pointer))
     below = bool(work.view.selection.count or work.view.selection.hidden or work.view.painted)
     moved, request = draw_bar(moved, pointer, below or not is_free(work))
-    takes = is_taken or pull.drag is not None or (is_free(work) and takes_mouse(moved, pointer))
-    return moved, request, takes
+    return moved, request, is_taken
 
 
 def move_pull(pull: Pull, pointer: PointerContext, free: bool, pressed: Sequence[str]) -> Pull:
@@ -112,7 +115,7 @@ def move_pull(pull: Pull, pointer: PointerContext, free: bool, pressed: Sequence
     """
     if pull.drag is not None:
         return _drag(pull, pull.drag, pointer, pressed)
-    over = free and _is_over(pointer) and not _moves_camera()
+    over = free and is_over(pointer) and not moves_camera()
     pull = _hover(pull, pointer) if over else replace(pull, hovered=None, hovered_for=None)
     if not over or (pull.hovered is None and _near(pull, pointer)[0] is None):
         return pull
@@ -124,23 +127,7 @@ def takes_mouse(pull: Pull, pointer: PointerContext) -> bool:
     """Return True if the tool takes the mouse: during a drag, and over the surface or a handle."""
     if pull.drag is not None:
         return True
-    return pull.hovered is not None and _is_over(pointer) and not _moves_camera()
-
-
-def _is_over(pointer: PointerContext) -> bool:
-    """Return True if the mouse is over the picture and no part of the interface takes it."""
-    io = imgui.get_io()
-    area = pointer.area
-    inside = 0.0 <= io.mouse_pos.x < area.width and 0.0 <= io.mouse_pos.y < area.height
-    return inside and not io.want_capture_mouse
-
-
-def _moves_camera() -> bool:
-    return any(imgui.is_mouse_down(button) for button in (1, 2))
-
-
-def _camera(pointer: PointerContext) -> Camera:
-    return pointer.camera(pointer.shown.camera)
+    return pull.hovered is not None and is_over(pointer) and not moves_camera()
 
 
 def _hover(pull: Pull, pointer: PointerContext) -> Pull:
@@ -148,67 +135,8 @@ def _hover(pull: Pull, pointer: PointerContext) -> Pull:
     key = (pointer.cursor, pointer.shown.camera, pointer.size, pointer.scene_key)
     if key == pull.hovered_for:
         return pull
-    found = _pick(pull, pointer)
-    return replace(pull, hovered=None if found is None else found[0], hovered_for=key)
-
-
-def _pick(pull: Pull, pointer: PointerContext) -> tuple[Vec3, Vec3, int] | None:
-    """Return the point of the surface under the pointer, its displacement by the pull, and its Gaussian.
-
-    The Gaussian is one of the scene's own, as paint has no place of its own. None on the background.
-    """
-    scene = pointer.scene
-    camera = _camera(pointer)
-    seen = seen_at(scene, camera, *pointer.cursor, pointer.engine.near)
-    if seen is None:
-        return None
-    own = seen.rows < pointer.facts.count - pointer.facts.added
-    if not own.any():
-        return None
-    reached = np.flatnonzero(own & (np.cumsum(seen.shares) >= SURFACE_OPACITY))
-    at = int(reached[0]) if len(reached) else int(np.argmax(np.where(own, seen.shares, -1.0)))
-    row = int(seen.rows[at])
-    point = _unproject(camera, pointer.cursor, float(seen.depths[at]))
-    center = scene.means[row].double().numpy()
-    reach = 2.0 * float(scene.log_scales[row].double().exp().max())
-    away = float(np.linalg.norm(point - center))
-    if away > reach:  # the pixel only touches the edge of the Gaussian
-        point = center + (point - center) * (reach / away)
-    if not np.isfinite(point).all():
-        return None
-    return vec3(point), vec3(_offset(pull, row)), row
-
-
-def _offset(pull: Pull, row: int) -> Floats:
-    """Return the displacement of a Gaussian by the pull on screen. [3]"""
-    if pull.edit is None:
-        return np.zeros(3)
-    members = pull.edit.region.members.numpy()
-    at = int(np.searchsorted(members, row))
-    if at == len(members) or members[at] != row:
-        return np.zeros(3)
-    offset: Floats = pull.edit.field.attributes["means"].end_offset[at].double().numpy()
-    return offset
-
-
-def _unproject(camera: Camera, pixel: tuple[float, float], depth: float) -> Floats:
-    """Return the point at a pixel and a depth, world units. [3]"""
-    K = camera.K.double().numpy()
-    viewmat = camera.viewmat.double().numpy()
-    x = (pixel[0] - K[0, 2]) / K[0, 0] * depth
-    y = (pixel[1] - K[1, 2]) / K[1, 1] * depth
-    point: Floats = viewmat[:3, :3].T @ (np.array([x, y, depth]) - viewmat[:3, 3])
-    return point
-
-
-def _normal(pointer: PointerContext, row: int) -> Vec3:
-    """Return the direction of a Gaussian's shortest axis, towards the camera."""
-    scene = pointer.scene
-    rotation = rotation_matrices(normalize_quats(scene.quats[row : row + 1].double()))[0].numpy()
-    normal = rotation[:, int(scene.log_scales[row].argmin())]
-    eye = _camera(pointer).position.double().numpy()
-    towards = float(normal @ (eye - scene.means[row].double().numpy()))
-    return vec3(normal if towards >= 0.0 else -normal)
+    found = pick(pull.edit, pointer)
+    return replace(pull, hovered=None if found is None else found.point, hovered_for=key)
 
 
 def _resize(pull: Pull, pointer: PointerContext) -> Pull:
@@ -228,7 +156,7 @@ def _near(pull: Pull, pointer: PointerContext) -> tuple[int | None, int | None]:
     for points in ([handle.target for handle in pull.pose.handles], list(pull.pose.pins)):
         nearest = None
         if points:
-            pixels, depths = project(np.array(points), _camera(pointer))
+            pixels, depths = project(np.array(points), camera_of(pointer))
             distance = np.linalg.norm(pixels - np.array(pointer.cursor), axis=1)
             distance = np.where(depths > pointer.engine.near, distance, math.inf)
             if distance.min() <= reach:
@@ -248,18 +176,16 @@ def _press(pull: Pull, pointer: PointerContext) -> Pull:
             freed = replace(pose, handles=_without(pose.handles, handle))
             return with_pose(replace(pull, picked=None), freed)
         return pull
-    found = _pick(pull, pointer)
-    normal = (0.0, 0.0, 1.0) if found is None else _normal(pointer, found[2])
+    found = pick(pull.edit, pointer)
+    normal = (0.0, 0.0, 1.0) if found is None else normal_at(pointer, found.row)
     is_new = handle is None
     if handle is None:
         if found is None:
             return pull
-        point, offset, _ = found
-        rest = (point[0] - offset[0], point[1] - offset[1], point[2] - offset[2])
         handle = len(pose.handles)
-        pose = replace(pose, handles=(*pose.handles, PullHandle(rest, offset)))
+        pose = replace(pose, handles=(*pose.handles, PullHandle(found.rest, found.offset)))
     start = pose.handles[handle].target
-    pixel = project(np.array(start), _camera(pointer))[0]
+    pixel = project(np.array(start), camera_of(pointer))[0]
     grab = (pointer.cursor[0] - float(pixel[0]), pointer.cursor[1] - float(pixel[1]))
     surface = pointer.known_surface(pointer.shown.camera, pointer.size)
     drag = PullDrag(handle, start, grab, normal, pull.pose, surface, is_new=is_new)
@@ -313,11 +239,11 @@ def _release(pull: Pull, drag: PullDrag) -> Pull:
 
 def _target(drag: PullDrag, pointer: PointerContext) -> Vec3:
     """Return the position of the dragged handle for the pointer."""
-    camera = _camera(pointer)
+    camera = camera_of(pointer)
     start = np.array(drag.start)
     pixel = (pointer.cursor[0] - drag.grab[0], pointer.cursor[1] - drag.grab[1])
     depth = float(project(start, camera)[1])
-    aimed = _unproject(camera, pixel, depth)
+    aimed = unproject(camera, pixel, depth)
     axis = direction(drag)
     if axis is None:
         return vec3(aimed)
