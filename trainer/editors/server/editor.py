@@ -187,7 +187,7 @@ def _make_editor(given: EditorInput, model: ImageModel, prompt: str) -> ServedEd
     return ServedEditor(given.scene, prompt, model, options, PictureCache(options.cache), stages)
 
 
-def check_make_editor(options: EditorOptions) -> ImageModel:
+def check_served(options: EditorOptions) -> ImageModel:
     """Return the model of `api:` or `comfy:` after checking the options. Nothing is sent.
 
     Raises:
@@ -205,7 +205,7 @@ def explain_sending(options: EditorOptions, views: int, stages: int = 1) -> str:
         views: number of views; 0: the default
         stages: number of strengths that are requested from a model with a strength
     """
-    model = check_make_editor(options)
+    model = check_served(options)
     calls = (views or VIEWS) * (stages if model.has_strength else 1)
     cost = f", about {calls * options.price_per_call:.2f} in all" if options.price_per_call else ""
     host = model.address.host
