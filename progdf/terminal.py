@@ -1,8 +1,9 @@
-"""Terminal output and signals: formatted numbers, text without control characters, and interruption."""
+"""Terminal output and processes: formatted numbers, text without control characters, signals, priority."""
 
 from __future__ import annotations
 
 import _thread
+import ctypes
 import logging
 import math
 import os
@@ -12,7 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from queue import SimpleQueue
 from types import FrameType
@@ -20,6 +21,8 @@ from types import FrameType
 ENDINGS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 """Signals that request the end of the process, or report a closed terminal. Windows has no SIGHUP."""
 
+
+_BELOW_NORMAL_PRIORITY_CLASS = 0x4000  # of the Windows API
 
 REDELIVERY_DELAY_S = 0.02  # long enough for the callback that lost a signal to return
 
@@ -102,6 +105,36 @@ def signal_main_thread(number: int = signal.SIGINT) -> None:
         _thread.interrupt_main(signal.Signals(number))
     else:
         signal.pthread_kill(threading.main_thread().ident or 0, number)
+
+
+NICENESS = 10
+"""Niceness that `lower_priority` adds, as by nice(1): a tenth of a core that another program keeps busy.
+
+SCHED_IDLE would give it nothing, and an unprivileged process cannot leave that policy again.
+"""
+
+
+def lower_priority(process: int | None = None) -> None:
+    """Lower the priority of a process for good; do nothing where the system refuses.
+
+    Linux keeps a niceness per thread, so all threads that run now get it. New threads inherit it.
+
+    Args:
+        process: id of a child that has just started; None: this process. On Windows, start a child with
+            BELOW_NORMAL_PRIORITY_CLASS instead
+    """
+    if sys.platform == "win32":
+        if process is None:
+            kernel = ctypes.windll.kernel32
+            kernel.SetPriorityClass(kernel.GetCurrentProcess(), _BELOW_NORMAL_PRIORITY_CLASS)
+        return
+    with suppress(OSError):
+        niceness = os.getpriority(os.PRIO_PROCESS, 0) + NICENESS
+        threads = [process or 0]
+        if process is None and sys.platform == "linux":
+            threads = [int(name) for name in os.listdir("/proc/self/task")]
+        for thread in threads:
+            os.setpriority(os.PRIO_PROCESS, thread, niceness)
 
 
 def escape_text(text: str) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from progdf.cli.options import parse_options
 from progdf.errors import ProgdfError
-from progdf.terminal import print_line
+from progdf.terminal import lower_priority, print_line
 
 from .options import (
     BatchOptions,
@@ -21,13 +21,13 @@ from .options import (
 
 
 def train(argv: Sequence[str]) -> int:
-    """Run `progdf train`; return 0 when the edit is written. Raises ProgdfError for user errors."""
+    """Run `progdf train`; return 0 when edit and report are written. Raises ProgdfError for user errors."""
     options = train_options(argv)
     from trainer.run.run import train as run  # late import: --help and option errors do not need torch
 
     if options.editor.family in ("api", "comfy"):
         _ask_to_send(options)
-    run(options)
+    run(options, on_delivery=lower_priority)
     return 0
 
 

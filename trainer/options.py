@@ -35,6 +35,8 @@ CarryOn = Literal["auto", "never", "always"]
 StrengthsBy = Literal["editor", "blend"]
 Device = Literal["auto", "cpu"]
 Engine = Literal["auto", "cpu", "warp"]
+ReportLevel = Literal["none", "short", "full"]
+"""Extent of the report that follows the edit's file, ascending (docs/method.md 7)."""
 
 DETECTOR = "IDEA-Research/grounding-dino-tiny"
 SAM_MODEL = "facebook/sam-vit-base"
@@ -239,6 +241,8 @@ class TrainOptions:
     """Random seed, 0 to 2³² − 1; the same seed gives the same files."""
     threads: int = 0
     """CPU threads (0: all cores); more threads than idle cores are slower."""
+    report: ReportLevel = "full"
+    """Report after the .gdf is written: full, short (no LPIPS, CLIP or picture), or none."""
     resume: bool = False
     """Continue a stopped run in this folder, with the same result as without the stop."""
 
@@ -327,6 +331,8 @@ class FitOptions:
     scene: Annotated[Path | None, absent_option("PATH", "where the run found it")] = None
     """Current path of the scene, if it has moved since the run."""
     texts: TextOptions = TextOptions()
+    report: ReportLevel = "full"
+    """Report after the .gdf is written: full, short (no LPIPS, CLIP or picture), or none."""
     threads: int = 0
     """CPU threads (0: all cores)."""
 

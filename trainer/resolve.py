@@ -128,7 +128,7 @@ def recorded_options(options: TrainOptions) -> TrainOptions:
         price_per_call=usual.price_per_call,
         yes=usual.yes,
     )
-    return replace(options, out=Path(), editor=editor, quick=False, threads=0, resume=False)
+    return replace(options, out=Path(), editor=editor, quick=False, threads=0, report="full", resume=False)
 
 
 def resolve_kind(

@@ -43,7 +43,8 @@ class ErrorCurve:
 
     s: tuple[float, ...]  # slider values, ascending
     psnr: tuple[float, ...]  # over the evaluated pixels, dB, at most 99
-    seen_s: tuple[float, ...]  # slider values of `ssim` and `lpips`, a subset of `s` with the last one
+    # slider values of `ssim` and `lpips`, a subset of `s` with the last one; empty if not measured
+    seen_s: tuple[float, ...]
     ssim: tuple[float, ...]  # over the same pixels, at most 1
     # over the views' boxes, ≥ 0 (LPIPS or its substitute, see `Evaluator.perceptual`)
     lpips: tuple[float, ...]
@@ -58,7 +59,7 @@ def error_curves(
     pictures: Mapping[str, Pictures],
     strengths: Sequence[float],
     truth: Pictures,
-    perceptual: Perceptual,
+    perceptual: Perceptual | None,
     most: int | None = None,
 ) -> dict[str, ErrorCurve]:
     """Measure errors of several sources of held-out pictures over the slider.
@@ -68,23 +69,24 @@ def error_curves(
         pictures: by name, a function from slider value to pictures. -> [h,w,3] each
         strengths: slider values, ascending
         truth: function from slider value to the expected pictures. -> [h,w,3] each
-        perceptual: LPIPS or its substitute
+        perceptual: LPIPS or its substitute; None: measure neither SSIM nor LPIPS
         most: approximate number of slider values for SSIM and LPIPS, which cost far more; None: all
     """
     every = 1 if most is None else max(1, round(len(strengths) / most))
-    seen = tuple(strengths[::-1][::every][::-1])
-    psnr, rows = ({name: list[Any]() for name in pictures} for _ in range(2))
+    seen = tuple(strengths[::-1][::every][::-1]) if perceptual is not None else ()
+    psnr, ssim, lpips = ({name: list[float]() for name in pictures} for _ in range(3))
     for s in strengths:
         expected = truth(s)
         for name, picture_at in pictures.items():
             pictures_at = picture_at(s)
             psnr[name].append(evaluator.psnr(pictures_at, expected))
-            if s in seen:
-                ssim = evaluator.ssim(pictures_at, expected)
-                rows[name].append((ssim, evaluator.perceptual(pictures_at, expected, perceptual, "measured")))
-        perceptual.forget()
+            if perceptual is not None and s in seen:
+                ssim[name].append(evaluator.ssim(pictures_at, expected))
+                lpips[name].append(evaluator.perceptual(pictures_at, expected, perceptual, "measured"))
+        if perceptual is not None:
+            perceptual.forget()
     return {
-        name: ErrorCurve(tuple(strengths), tuple(psnr[name]), seen, *zip(*rows[name], strict=True))
+        name: ErrorCurve(tuple(strengths), tuple(psnr[name]), seen, tuple(ssim[name]), tuple(lpips[name]))
         for name in pictures
     }
 
@@ -93,7 +95,7 @@ def against_editor(
     evaluator: Evaluator,
     fields: Mapping[str, BakedField],
     stages: Sequence[tuple[float, float]],
-    perceptual: Perceptual,
+    perceptual: Perceptual | None,
     most: int | None = None,
 ) -> dict[str, ErrorCurve]:
     """Measure each field's errors against the editor's pictures.
@@ -102,7 +104,7 @@ def against_editor(
         evaluator: held-out views with these pictures
         fields: by name
         stages: slider value and the editor strength that belongs to it, ascending
-        perceptual: LPIPS or its substitute
+        perceptual: see `error_curves`
         most: see `error_curves`
     """
     pictures = {name: evaluator.course(field) for name, field in fields.items()}
@@ -149,7 +151,7 @@ class Measured:
     # "slider" and the compared baseline against the editor's pictures, at the editor's strengths
     editor: Mapping[str, ErrorCurve]
     edge_psnr: float  # PSNR of the full edit at the edges of the editor's pictures, dB
-    perceptual: str  # name of the perceptual distance
+    perceptual: str  # name of the perceptual distance, "" if not measured
     clip: Direction  # see `Direction`
 
 
@@ -159,7 +161,7 @@ def measure(
     fitted: Fitted,
     shipped: BakedField,
     remap: SliderRemap,
-    perceptual: Perceptual,
+    perceptual: Perceptual | None,
     clip: Direction,
 ) -> Measured:
     """Measure the chosen field beside the compared baseline.
@@ -170,7 +172,7 @@ def measure(
         fitted: the field and its baselines
         shipped: the shipped field
         remap: from the trajectory's slider to the shipped field's
-        perceptual: LPIPS or its substitute
+        perceptual: see `error_curves`
         clip: finished CLIP measurement, or the reason if there is none
     """
     evaluator, reporting = judges
@@ -196,7 +198,7 @@ def measure(
         at_recordings=worst,
         editor=drawn,
         edge_psnr=evaluator.edge_psnr(evaluator.course(shipped)(1.0), evaluator.edited[stages[-1][1]]),
-        perceptual=perceptual.name,
+        perceptual="" if perceptual is None else perceptual.name,
         clip=clip,
     )
 
@@ -237,24 +239,51 @@ def clip_curve(
     return Direction(CLIP_STRENGTHS, tuple(similarity), clip.name)
 
 
-def figures(measured: Measured, endpoint_error: float, outside_change: float) -> dict[str, Any]:
-    """Return the part of report.json that depends on the field (docs/cli.md)."""
-    fitted = measured.fitted
-    slider = measured.slider
-    drawn = measured.editor["slider"]
-    linear = measured.editor[COMPARED]
-    similarity = measured.clip.similarity
+def delivered_figures(
+    fitted: Fitted, shown: BakedField, endpoint_error: float, outside_change: float, psnr: float
+) -> dict[str, Any]:
+    """Return the part of report.json that is known when the edit's file is written.
+
+    Args:
+        fitted: the field and its baselines
+        shown: the shipped field
+        endpoint_error, outside_change: see `exactness` in `trainer.run.finish`
+        psnr: PSNR of the full edit against the editor's pictures on held-out views, dB
+    """
     return {
         "field": {
             **field_figures(fitted.chosen),
-            "parameters": stored_numbers(measured.shown),
-            "psnr_at_recordings": round(measured.at_recordings, 2),
+            "parameters": stored_numbers(shown),
             "endpoint_error": endpoint_error,
             "outside_change": outside_change,
             "target_met": fitted.choice.met,
         },
         "choice": choice_figures(fitted),
         "baselines": {name: field_figures(errors) for name, errors in fitted.baselines.items()},
+        "edit": {"psnr_to_views": round(psnr, 2)},
+    }
+
+
+def measured_figures(measured: Measured) -> dict[str, Any]:
+    """Return the part of report.json that is measured after the edit's file is written."""
+    fitted = measured.fitted
+    slider = measured.slider
+    drawn = measured.editor["slider"]
+    linear = measured.editor[COMPARED]
+    similarity = measured.clip.similarity
+    edit: dict[str, Any] = {"edge_psnr_to_views": round(measured.edge_psnr, 2)}
+    if measured.perceptual:
+        edit["ssim_to_views"] = _round4(drawn.ssim[-1])
+        edit["lpips_to_views"] = _round4(drawn.lpips[-1])
+        edit["perceptual"] = measured.perceptual
+    edit["clip_direction"] = similarity[-1] if similarity else None
+    if similarity:
+        edit["clip_model"] = measured.clip.model
+    else:
+        edit["clip_reason"] = measured.clip.reason
+    return {
+        "field": {"psnr_at_recordings": round(measured.at_recordings, 2)},
+        "edit": edit,
         "slider": {
             "monotone": slider.monotone,
             "uniformity": round(slider.uniformity, 3),
@@ -266,15 +295,6 @@ def figures(measured: Measured, endpoint_error: float, outside_change: float) ->
             f"{round(s, 4):g}": {"psnr": round(ours, 2), COMPARED: round(plain, 2), "strength": strength}
             for (s, strength), ours, plain in zip(measured.asked, drawn.psnr, linear.psnr, strict=True)
             if s < 1.0
-        },
-        "edit": {
-            "psnr_to_views": round(drawn.psnr[-1], 2),
-            "edge_psnr_to_views": round(measured.edge_psnr, 2),
-            "ssim_to_views": _round4(drawn.ssim[-1]),
-            "lpips_to_views": _round4(drawn.lpips[-1]),
-            "perceptual": measured.perceptual,
-            "clip_direction": similarity[-1] if similarity else None,
-            **({"clip_model": measured.clip.model} if similarity else {"clip_reason": measured.clip.reason}),
         },
         "curves": {
             "against_trajectory": {

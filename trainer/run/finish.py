@@ -1,8 +1,8 @@
-"""End of a run: fit the field, measure it, write NAME.gdf, report.json and report.png."""
+"""End of a run: fit the field and deliver NAME.gdf, then measure it for report.json and report.png."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -29,18 +29,20 @@ from trainer.fit.slider_uniformity import equalize_slider
 from trainer.methods import METHODS
 from trainer.optimize.losses import Perceptual, perceptual_loss
 from trainer.optimize.retime import resolve_slider
-from trainer.options import FitOptions, TextOptions, TrainOptions, with_values
+from trainer.options import FitOptions, ReportLevel, TextOptions, TrainOptions, with_values
 from trainer.regions.from_pictures import CHANGED
 from trainer.report.measures import (
+    Direction,
     PaintReproduction,
     against_editor,
     carry_figures,
     clip_curve,
+    delivered_figures,
     expected_measures,
-    figures,
     measure,
     measure_above,
     measure_paint,
+    measured_figures,
 )
 from trainer.report.report import report_picture
 from trainer.resolve import BLANK, check_field_options, use_threads
@@ -52,13 +54,13 @@ from trainer.views.setup import TrainingSetup
 from trainer.views.view import View, render_view
 
 from .paint import sharpen
-from .record import RunRecord, render_edited_views, reopen_run
+from .record import FinishedRun, RunRecord, render_edited_views, reopen_run
 
 _RANK_VIEWS = 4  # number of training views on which the rank of a field is chosen
 _VISIBILITY_STRIDE = 2  # every second training view measures the visibility of the members
 _KEYS_OF_REPORT_ONLY = (
-    *("plan", "time", "memory_mb", "curves", "views", "pictures"),
-    *("losses", "trajectory", "effort", "choice", "baselines", "between"),
+    *("report", "plan", "views", "pictures"),
+    *("losses", "trajectory", "effort", "choice", "baselines"),
 )
 DEFAULTS = to_json(BLANK)
 
@@ -71,7 +73,7 @@ class RunResult:
 
     folder: RunFolder
     gdf: Path
-    report: Mapping[str, Any]  # content of report.json
+    report: dict[str, Any]  # content of report.json
     # the recordings, at the slider values at which the field reproduces them; None for edits without training
     trajectory: Trajectory | None = None
 
@@ -79,6 +81,18 @@ class RunResult:
     def line(self) -> str:
         """Log line with the written file and its size."""
         return f"wrote {self.gdf}: {file_size(self.report['file']['bytes'])}"
+
+
+@dataclass(frozen=True)
+class ReportRequest:
+    """Extent of the report after the delivery of an edit."""
+
+    level: ReportLevel = "full"
+    on_delivery: Callable[[], None] = lambda: None  # called once NAME.gdf is written, before the report
+
+
+FULL_REPORT = ReportRequest()
+"""Default request."""
 
 
 def finish_run(
@@ -89,8 +103,11 @@ def finish_run(
     perceptual: Perceptual,
     log: RunLog,
     begun: Saved | None = None,
+    request: ReportRequest = FULL_REPORT,
 ) -> RunResult:
-    """Fit and measure the field, and write NAME.gdf, report.json and report.png.
+    """Fit the field and deliver NAME.gdf, then write the report: report.json and report.png.
+
+    The report never changes NAME.gdf. If it is stopped, report.json has the figures known at the delivery.
 
     Args:
         folder: folder of the run
@@ -100,6 +117,7 @@ def finish_run(
         perceptual: image distance
         log: log of the run
         begun: see `network.fit_network`
+        request: extent of the report, and a callback at the delivery
     """
     options = record.plan
     scene = setup.scene
@@ -120,51 +138,64 @@ def finish_run(
             trajectory = replace(trajectory, end=field.offsets(1.0))
         shipped = replace(trajectory, s=remap(trajectory.s).float())
     log.say(_choice_line(fitted, field.bytes_per_member, len(trajectory), len(reporting.names)))
-    with log.stage("report"):
-        clip = clip_curve(evaluator, setup.judging, field, options.texts)
-        if clip.reason and options.texts.asked:
-            log.say(f"CLIP directional similarity is not measured: {clip.reason}")
+    with log.stage("deliver"):
         gdf = _build_gdf(options, setup, field, grown.scene[len(scene) :])
         pairs = zip(options.views.pictures, setup.train, strict=False)
         pictures = {path: view.camera for path, view in pairs}
         sharpened = sharpen(scene, gdf, pictures, options.region.region != CHANGED, log, setup.seen)
-        # the viewer displays the draft during the measurements
-        save_gdf(folder.draft, _on_original(gdf if sharpened is None else sharpened, setup))
-        with log.looks("measure the edit", expected_measures(trajectory)) as count_view:
-            judges = replace(evaluator, looked=count_view), replace(reporting, looked=count_view)
-            measured = measure(judges, trajectory, fitted, field, remap, perceptual, clip)
         endpoint, outside = exactness(scene, gdf, end_rows(grown, trajectory))
-        title = f"{options.name}: {options.editor.editor}"
         displayed = evaluator
         if sharpened is not None:
             gdf = sharpened
             displayed = load_evaluator(folder, setup, setup.judging, trajectory, gdf)
+        edited = edited_scene(scene, gdf)
+        if sharpened is not None:
+            write_finals(setup, edited, folder, log)
+        psnr = displayed.psnr(displayed.course(gdf.field)(1.0), displayed.edited[trajectory.strengths[-1]])
+        paint = _measure_paint(folder, setup, options.views.pictures, edited)
+        figures = delivered_figures(fitted, gdf.field, endpoint, outside, psnr)
+        gdf = _on_original(gdf, setup)
+        if network is not None:
+            figures["field"] |= network.figures()
+        report = {
+            "report": "none",
+            **figures,
+            "views": _view_figures(setup, evaluator),
+            "trajectory": _trajectory_figures(shipped, slider, record),
+            **_record_figures(record),
+            "paint": paint.figures() if paint is not None else None,
+            **carry_figures(setup, trajectory, record.effort, folder.behind),
+            **measure_above(setup, gdf, options.views.pictures, log.say),
+            "plan": to_json(options),
+        }
+    earlier = _earlier_seconds(folder) if log.refits else {}
+    result = replace(_deliver(folder, gdf, report, setup, paint, log, earlier), trajectory=shipped)
+    request.on_delivery()
+    if request.level == "none":
+        return result
+    with log.stage("report"):
+        is_full = request.level == "full"
+        distance = perceptual if is_full else None
+        clip = Direction(reason="the report is short")
+        if is_full:
+            clip = clip_curve(evaluator, setup.judging, field, options.texts)
+            if clip.reason and options.texts.asked:
+                log.say(f"CLIP directional similarity is not measured: {clip.reason}")
+        with log.looks("measure the edit", expected_measures(trajectory)) as count_view:
+            judges = replace(evaluator, looked=count_view), replace(reporting, looked=count_view)
+            measured = measure(judges, trajectory, fitted, field, remap, distance, clip)
+        if sharpened is not None:
             slider_measures = against_editor(
-                displayed, {"slider": gdf.field}, measured.asked, perceptual, most=1
+                displayed, {"slider": sharpened.field}, measured.asked, distance, most=1
             )
-            measured = replace(measured, shown=gdf.field, editor={**measured.editor, **slider_measures})
-        picture = report_picture(evaluator, displayed, measured, record.losses, title, len(setup.held_out))
-    edited = edited_scene(scene, gdf)
-    if sharpened is not None:
-        write_finals(setup, edited, folder, log)
-    paint = _measure_paint(folder, setup, options.views.pictures, edited)
-    gdf = _on_original(gdf, setup)
-    measures = figures(measured, endpoint, outside)
-    if network is not None:
-        measures["field"] |= network.figures()
-    report = {
-        **measures,
-        "views": _view_figures(setup, evaluator),
-        "trajectory": _trajectory_figures(shipped, slider, record),
-        **_record_figures(record),
-        "paint": paint.figures() if paint is not None else None,
-        **carry_figures(setup, trajectory, record.effort, folder.behind),
-        **measure_above(setup, gdf, options.views.pictures, log.say),
-        "time": {**(_earlier_seconds(folder) if log.refits else {}), **log.rounded_seconds()},
-        "memory_mb": log.peak_mb(),
-        "plan": to_json(options),
-    }
-    return _write_run(folder, gdf, report, picture, shipped, setup, paint, log)
+            measured = replace(measured, shown=sharpened.field, editor={**measured.editor, **slider_measures})
+        picture = None
+        if is_full:
+            title = f"{options.name}: {options.editor.editor}"
+            count = len(setup.held_out)
+            picture = report_picture(evaluator, displayed, measured, record.losses, title, count)
+    report = _with_measures(report, measured_figures(measured)) | {"report": request.level}
+    return _write_report(result, report, picture, log, earlier)
 
 
 def _build_gdf(options: TrainOptions, setup: TrainingSetup, field: BakedField, added: Gaussians) -> Gdf:
@@ -316,46 +347,79 @@ def differences(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[
     }
 
 
-def _write_run(
+def _with_measures(report: Mapping[str, Any], measures: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a report with further figures; those of the field and the edit are added to its own."""
+    joined = {name: {**report[name], **measures[name]} for name in ("field", "edit")}
+    return {**report, **measures, **joined}
+
+
+def _deliver(
     folder: RunFolder,
     gdf: Gdf,
     report: dict[str, Any],
-    picture: Tensor,
-    trajectory: Trajectory,
     setup: TrainingSetup,
     paint: PaintReproduction | None,
     log: RunLog,
+    earlier: Mapping[str, float],
 ) -> RunResult:
-    """Write the files of the run and log its main figures."""
+    """Write NAME.gdf and a report with the figures known so far, and log them."""
     # the .gdf holds the options separately, stays small, and is identical for identical training
     gdf = replace(gdf, report={k: v for k, v in report.items() if k not in _KEYS_OF_REPORT_ONLY})
-    result = replace(write_result(folder, gdf, report, picture), trajectory=trajectory)
+    report = report | {"time": {**earlier, **log.rounded_seconds()}, "memory_mb": log.peak_mb()}
+    result = write_result(folder, gdf, report)
     if result.gdf != folder.draft:
         folder.draft.unlink(missing_ok=True)
-    edit = report["edit"]
-    log.say(
-        f"{setup.judged_on}: {edit['psnr_to_views']} dB, at edges {edit['edge_psnr_to_views']} dB, "
-        f"{edit['perceptual']} {edit['lpips_to_views']}"
-        + "".join(
-            f"; s={float(s):.3g} {e['psnr']} dB (2 keyframes {e['keyframes2']})"
-            for s, e in report["between"].items()
-        )
-    )
-    each = report["file"]["bytes_per_gaussian"]
-    log.say(f"{result.line}, {each:.0f} bytes per Gaussian in total")
+    each = result.report["file"]["bytes_per_gaussian"]
+    psnr = report["edit"]["psnr_to_views"]
+    log.say(f"{gdf.name} is ready; {setup.judged_on}: {psnr} dB, {each:.0f} bytes per Gaussian in total")
+    log.say(result.line)
     if paint is not None:
         log.say(f"warning: {paint.warning}" if paint.warning else paint.summary)
     return result
 
 
-def write_result(folder: RunFolder, gdf: Gdf, report: dict[str, Any], picture: Tensor) -> RunResult:
-    """Write NAME.gdf, report.json including the size of the .gdf, and report.png."""
+def _write_report(
+    result: RunResult,
+    report: dict[str, Any],
+    picture: Tensor | None,
+    log: RunLog,
+    earlier: Mapping[str, float],
+) -> RunResult:
+    """Complete the report of a delivered edit, and log its main figures."""
+    report |= {
+        "time": {**earlier, **log.rounded_seconds()},
+        "memory_mb": log.peak_mb(),
+        "file": result.report["file"],
+    }
+    write_json(result.folder.report, report)
+    if picture is not None:
+        write_image(result.folder.picture, picture)
+    edit = report["edit"]
+    parts = [f"at edges {edit['edge_psnr_to_views']} dB"]
+    if "perceptual" in edit:
+        parts[0] += f", {edit['perceptual']} {edit['lpips_to_views']}"
+    for s, between in report["between"].items():
+        parts.append(f"s={float(s):.3g} {between['psnr']} dB (2 keyframes {between['keyframes2']})")
+    log.say(f"{report['report']} report in {result.folder.report}: {'; '.join(parts)}")
+    return replace(result, report=report)
+
+
+def write_result(
+    folder: RunFolder, gdf: Gdf, report: dict[str, Any], picture: Tensor | None = None
+) -> RunResult:
+    """Write NAME.gdf, report.json including the size of the .gdf, and report.png.
+
+    Without a picture, a report.png of an earlier run is removed.
+    """
     path = folder.gdf(gdf.name)
     save_gdf(path, gdf)
     size = path.stat().st_size
     report["file"] = {"bytes": size, "bytes_per_gaussian": round(size / max(1, gdf.members), 1)}
     write_json(folder.report, report)
-    write_image(folder.picture, picture)
+    if picture is None:
+        folder.picture.unlink(missing_ok=True)
+    else:
+        write_image(folder.picture, picture)
     return RunResult(folder, path, report)
 
 
@@ -428,11 +492,11 @@ def load_result(folder: RunFolder, name: str, scene: Gaussians, log: RunLog) -> 
     if folder.trajectory.is_file():
         recorded, _, _ = load_trajectory(folder.trajectory)
         trajectory = replace(recorded, s=torch.tensor(gdf.field.recorded))
-    log.say(f"{folder.root} is finished: there is nothing left to do, and {path} is complete")
     try:
         report = convert_json(decode_json(folder.report.read_bytes()), dict[str, Any])
     except ValueError as error:
         raise ProgdfError(f"{folder.report} is damaged ({error}); train again without --resume") from error
+    log.say(f"{folder.root} is finished: there is nothing left to do, and {path} is complete")
     return RunResult(folder, path, report, trajectory)
 
 
@@ -445,6 +509,35 @@ def refit(options: FitOptions, quiet: bool = False) -> RunResult:
     check_field_options(options.field)
     use_threads(options.threads)
     run = reopen_run(options.run, options.scene)
+    recorded_plan = run.record.plan
+    field = replace(
+        options.field,
+        draft=recorded_plan.field.draft,
+        seed=recorded_plan.field.seed,
+    )
+    texts = effective_texts(options.texts, recorded_plan.texts)
+    plan = replace(recorded_plan, field=field, texts=texts)
+    record = replace(run.record, plan=plan)
+    return _finish_again(replace(run, record=record), quiet, ReportRequest(options.report))
+
+
+def complete_report(root: Path, scene: Path, quiet: bool, request: ReportRequest) -> RunResult:
+    """Write the report of a finished run that has a shorter one. The edit stays the same.
+
+    Args:
+        root: folder of the run
+        scene: path of its scene
+        quiet: no output on the screen
+        request: see `finish_run`
+
+    Raises:
+        ProgdfError: see `reopen_run`.
+    """
+    return _finish_again(reopen_run(root, scene), quiet, request)
+
+
+def _finish_again(run: FinishedRun, quiet: bool, request: ReportRequest) -> RunResult:
+    """Fit the field of a finished run by its record, and write the edit and its report."""
     log = RunLog(run.folder.log, quiet, refits=True)
     try:
         with log.stage("views"):
@@ -452,16 +545,7 @@ def refit(options: FitOptions, quiet: bool = False) -> RunResult:
         perceptual, warning = perceptual_loss()
         if warning:
             log.say(warning)
-        recorded_plan = run.record.plan
-        field = replace(
-            options.field,
-            draft=recorded_plan.field.draft,
-            seed=recorded_plan.field.seed,
-        )
-        texts = effective_texts(options.texts, recorded_plan.texts)
-        plan = replace(recorded_plan, field=field, texts=texts)
-        record = replace(run.record, plan=plan)
-        return finish_run(run.folder, setup, run.trajectory, record, perceptual, log)
+        return finish_run(run.folder, setup, run.trajectory, run.record, perceptual, log, request=request)
     finally:
         log.close()
 

@@ -17,7 +17,7 @@ from progdf.compose.reference import edited_scene
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians, concatenate
 from progdf.gdf.file import Gdf
-from progdf.io.images import contact_sheet
+from progdf.io.images import contact_sheet, write_image
 from progdf.io.json_values import to_json
 from progdf.metrics.image import decibels
 from progdf.metrics.slider import visible_change
@@ -29,15 +29,15 @@ from progdf.tidy import Step, tidy
 from trainer.editors import editor_row
 from trainer.editors.pictures import picture_background, read_edit, strengths_of
 from trainer.fill.holes import Fill, OpenHoles, fill_holes, find_holes, region_weight, visible_depth
-from trainer.options import TrainOptions
+from trainer.options import ReportLevel, TrainOptions
 from trainer.regions.remains import find_remains, remaining_share
 from trainer.resolve import recorded_options
 from trainer.store.progress import RunLog
-from trainer.store.run_folder import RunFolder, write_views
+from trainer.store.run_folder import RunFolder, write_json, write_views
 from trainer.views.setup import TrainingSetup, make_training_setup
 from trainer.views.view import BACKGROUND_NAMES, View, on_backgrounds, render_view
 
-from .finish import DEFAULTS, RunResult, differences, write_result
+from .finish import DEFAULTS, FULL_REPORT, ReportRequest, RunResult, differences, write_result
 
 _TOLERANCE = 0.05  # color tolerance of equal pixels; also the mask value from which a pixel counts as region
 _MIN_PAINT = 2 / 255  # smallest color change that counts as paint
@@ -105,14 +105,21 @@ def vanished_share(setup: TrainingSetup, options: TrainOptions) -> float:
     return behind / change if change else 0.0
 
 
-def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder, log: RunLog) -> RunResult:
-    """Remove the region, fill the holes, measure, and write NAME.gdf, report.json and report.png.
+def remove_region(
+    options: TrainOptions,
+    setup: TrainingSetup,
+    folder: RunFolder,
+    log: RunLog,
+    request: ReportRequest = FULL_REPORT,
+) -> RunResult:
+    """Remove the region, fill the holes and write NAME.gdf; then measure for report.json and report.png.
 
     Args:
         options: resolved options
         setup: scene, region, and views: of a rig, of given cameras, or of changed pictures
         folder: folder of the run
         log: log of the run
+        request: extent of the report, and a callback at the delivery
     """
     scene = setup.scene
     named = setup.region
@@ -150,50 +157,89 @@ def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder
         else f"{counted}, {fill.after} after {format_count(rows_added)} from "
         f"{format_count(fill.views, 'view')} ({kind})"
     )
-    with log.stage("report"):
+    with log.stage("deliver"):
         cameras = [view.camera for view in around.train]
         steps = [Step("remove", removal.region)]
         gdf = tidy(scene, steps, options.name, options.editor.editor, fill.rows, cameras)
         judging = around.judging
-        errors = _measure(edited_scene(scene, gdf), removed, judging)
-        fading = _measure_fading(scene, gdf, judging)
-        report = {
-            "edit": {"psnr_to_views": min(errors.values()), "psnr_by_background": errors},
-            "removal": {
-                "members": len(removal.region),
-                "remains_added": len(removal.region) - len(named),
-                "remaining_share": round(remains, 5),
-                "remaining_share_of_named": round(remains_of_named, 5),
-                **fading,
-                "fill": kind,
-                "fill_notes": list(fill.notes),
-                "rows_added": rows_added,
-                "filled_from_views": fill.views,
-                "hole_pixels": fill.before,
-                "hole_pixels_after": fill.after,
-                "psnr_to_pictures": _picture_error(setup, removed, painted, pictures),
-            },
+        figures: dict[str, Any] = {
+            "members": len(removal.region),
+            "remains_added": len(removal.region) - len(named),
+            "remaining_share": round(remains, 5),
+            "remaining_share_of_named": round(remains_of_named, 5),
+            "fill": kind,
+            "fill_notes": list(fill.notes),
+            "rows_added": rows_added,
+            "filled_from_views": fill.views,
+            "hole_pixels": fill.before,
+            "hole_pixels_after": fill.after,
+            "psnr_to_pictures": _picture_error(setup, removed, painted, pictures),
+        }
+        report: dict[str, Any] = {
+            "report": "none",
+            "removal": figures,
             "views": {"held_out": bool(around.held_out), "edit": [view.camera.name for view in judging]},
-            "time": log.rounded_seconds(),
-            "memory_mb": log.peak_mb(),
             "plan": to_json(recorded_options(options)),
         }
-        picture = _contact_sheet(scene, gdf, judging, f"{options.name}: {options.editor.editor}")
+        folder.trajectory.unlink(missing_ok=True)  # left by an earlier run that recolored
+        delivered = replace(
+            gdf, options=differences(report["plan"], DEFAULTS), report={"removal": dict(figures)}
+        )
+        delivered = delivered if setup.lower is None else setup.lower.rebase(delivered)
+        report |= {"time": log.rounded_seconds(), "memory_mb": log.peak_mb()}
+        result = write_result(folder, delivered, report)
+        log.say(f"{options.name} is ready; shadows and reflections stay")
+        log.say(result.line)
+    request.on_delivery()
     drawn = map_threads(lambda view: render_view(removed, view.camera, setup.background), setup.views)
     finals = {view.camera.name: image for view, image in zip(setup.views, drawn, strict=True)}
     write_views(folder, "final", finals)
-    folder.trajectory.unlink(missing_ok=True)  # left by an earlier run that recolored
-    about = {name: report[name] for name in ("edit", "removal")}
-    gdf = replace(gdf, options=differences(report["plan"], DEFAULTS), report=about)
-    gdf = gdf if setup.lower is None else setup.lower.rebase(gdf)
-    result = write_result(folder, gdf, report, picture)
+    if request.level != "none":
+        title = f"{options.name}: {options.editor.editor}"
+        _report_removal(result, gdf, removed, around, title, log, request.level)
+    return result
+
+
+def _report_removal(
+    result: RunResult,
+    gdf: Gdf,
+    removed: Gaussians,
+    around: TrainingSetup,
+    title: str,
+    log: RunLog,
+    level: ReportLevel,
+) -> None:
+    """Measure a delivered removal, complete its report in place, and write report.json and report.png.
+
+    Args:
+        result: the delivered run
+        gdf: the edit of the scene of `around`
+        removed: the scene without the region
+        around: the original, and the views to measure
+        title: title of the picture
+        log: log of the run
+        level: short or full
+    """
+    scene = around.scene
+    judging = around.judging
+    folder = result.folder
+    report = result.report
+    with log.stage("report"):
+        errors = _measure(edited_scene(scene, gdf), removed, judging)
+        fading = _measure_fading(scene, gdf, judging)
+        if level == "full":
+            write_image(folder.picture, _contact_sheet(scene, gdf, judging, title))
+    report["report"] = level
+    report["edit"] = {"psnr_to_views": min(errors.values()), "psnr_by_background": errors}
+    report["removal"] |= fading
+    report["time"] = log.rounded_seconds()
+    report["memory_mb"] = log.peak_mb()
+    write_json(folder.report, report)
     shares = ", ".join(f"{100 * share:.0f} % at {s}" for s, share in fading["visible_change"].items())
     log.say(
         f"visible change in {around.judged_on}: {shares}; at 0.5 a pixel differs by "
         f"{fading['pixel_deviation']:.3f} on average from the mean of its ends"
     )
-    log.say(f"{result.line}; shadows and reflections stay")
-    return result
 
 
 @dataclass(frozen=True)

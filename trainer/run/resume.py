@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import llvmlite.binding
 import msgspec
@@ -22,7 +22,7 @@ from progdf.io.json_values import convert_json, decode_json, to_json
 from progdf.region import Region
 from trainer.editors import editor_row
 from trainer.editors.pictures import strengths_of
-from trainer.options import MAX_THREADS, TrainOptions, flat_values
+from trainer.options import MAX_THREADS, ReportLevel, TrainOptions, flat_values
 from trainer.resolve import count_threads, recorded_options, resolve
 from trainer.store.run_folder import RunFolder, begin_log, remove_leftovers
 
@@ -33,6 +33,8 @@ _SWITCHES = (
 )  # fmt: skip
 _SOG_SUFFIXES = (".json", ".webp")  # suffixes of the files of an unpacked .sog
 
+DELIVERED = "delivered"
+"""Empty part of the saved state of a run whose .gdf is written, while its report is not."""
 REGION = "region"
 """Part of the saved state with the region's members and score."""
 
@@ -41,8 +43,9 @@ REGION = "region"
 class ResumeDecision:
     """Next action in a run folder."""
 
-    # "start" from nothing, "go on" from the saved state; "nothing": the run is finished
-    does: Literal["start", "go on", "nothing"]
+    # "start" from nothing, "go on" from the saved state; "report": only the report is too short; "nothing":
+    # the run is finished
+    does: Literal["start", "go on", "report", "nothing"]
     threads: int  # a resumed run keeps the number it began with, as sums depend on it
     notes: tuple[str, ...] = ()  # lines for the log
 
@@ -81,10 +84,16 @@ def decide_resume(folder: RunFolder, options: TrainOptions, region: Region, coun
     threads = count_threads(options.threads)
     resume = options.resume
     if resume and saved is None and folder.report.is_file():
-        recorded_plan, pictures = _finished_run(folder)
+        recorded_plan, pictures, level = _finished_run(folder)
         remedy_if_finished = "leave out --resume to train again"
         _check_plan(folder, recorded_plan, plan, remedy_if_finished)
         _check_pictures(folder, pictures, picture_digests(plan), remedy_if_finished)
+        levels = get_args(ReportLevel)
+        if folder.trajectory.is_file() and levels.index(level) < levels.index(options.report):
+            note = (
+                f"{folder.root} is finished with the report '{level}'; writing the report '{options.report}'"
+            )
+            return ResumeDecision("report", threads, (note,))
         return ResumeDecision("nothing", threads)
     remove_leftovers(folder)
     requested = _identity(plan, threads)
@@ -113,7 +122,8 @@ def decide_resume(folder: RunFolder, options: TrainOptions, region: Region, coun
         if saved.threads != threads:
             notes.append(f"using {saved.threads} threads as at the start of the run, for the same bits")
         return ResumeDecision("go on", saved.threads, tuple(notes))
-    if saved is not None and (step := _saved_step(folder)):
+    is_delivered = folder.state.has(DELIVERED)
+    if saved is not None and not is_delivered and (step := _saved_step(folder)):
         raise ProgdfError(
             f"{folder.root} holds a run that was stopped at step {step} of {saved.plan.optimize.steps}; "
             f"add --resume to continue it, or delete {folder.state.path} to start over"
@@ -145,9 +155,13 @@ def explain_stop(folder: RunFolder) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(
-            f"the progress is saved in {folder.root}; repeat the command with --resume to continue"
-        ) from None
+        remedy = f"the progress is saved in {folder.root}; repeat the command with --resume to continue"
+        if folder.state.has(DELIVERED):
+            remedy = (
+                f"the edit in {folder.root} is complete, its report is not; repeat the command with --resume "
+                "to complete the report"
+            )
+        raise KeyboardInterrupt(remedy) from None
     except (OSError, ProgdfError) as error:
         full = disk_full(error)
         if full is not None:
@@ -271,12 +285,13 @@ def _check_pictures(folder: RunFolder, was: Mapping[str, str], now: Mapping[str,
             raise ProgdfError(f"{path} has changed since {folder.root} was started; {remedy}")
 
 
-def _finished_run(folder: RunFolder) -> tuple[TrainOptions, dict[str, str]]:
-    """Return a finished run's plan, and the hashes of its changed pictures."""
+def _finished_run(folder: RunFolder) -> tuple[TrainOptions, dict[str, str], ReportLevel]:
+    """Return a finished run's plan, the hashes of its changed pictures, and the extent of its report."""
     try:
         report = decode_json(folder.report.read_bytes())
         pictures = convert_json(report.get("pictures", {}), dict[str, str])
-        return convert_json(report["plan"], TrainOptions), pictures
+        level: ReportLevel = convert_json(report.get("report", "full"), ReportLevel)  # type: ignore[arg-type]
+        return convert_json(report["plan"], TrainOptions), pictures, level
     except (ValueError, KeyError, TypeError) as error:
         raise ProgdfError(f"{folder.report} is damaged; leave out --resume to train again") from error
 

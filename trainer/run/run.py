@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
 
 from progdf.formats.scene_file import load_scene
@@ -30,26 +31,33 @@ from trainer.views.lower_layers import open_lower_layers
 from trainer.views.setup import TrainingSetup, make_training_setup
 
 from .command import check_command, select_region, shown_pictures
-from .finish import RunResult, load_result
+from .finish import ReportRequest, RunResult, complete_report, load_result
 from .pasted import paste_decal
 from .removed import is_removal, remove_region
-from .resume import check_exists, decide_resume, explain_stop, load_region
+from .resume import DELIVERED, check_exists, decide_resume, explain_stop, load_region
 from .trained import train_region
 
 _LOWER = "the pictures show {}: only the difference from these layers is trained"
 
 
-def train(options: TrainOptions, quiet: bool = False, shared: LastValueCache | None = None) -> RunResult:
+def train(
+    options: TrainOptions,
+    quiet: bool = False,
+    shared: LastValueCache | None = None,
+    on_delivery: Callable[[], None] = lambda: None,
+) -> RunResult:
     """Edit a region of a scene and write its .gdf file.
 
     Args:
         options: unresolved options
         quiet: no output on the screen; log.txt is always written
         shared: cache for consecutive runs in this process, while the files do not change
+        on_delivery: called once the .gdf file is written, before the report
 
     Raises:
         ProgdfError: invalid scene, region, cameras or edited views. No .gdf file is changed.
-        KeyboardInterrupt: interrupted; the message explains how to resume. No .gdf file is changed.
+        KeyboardInterrupt: interrupted; the message explains how to resume. No .gdf file is changed, unless
+            only the report was left.
     """
     options = resolve(options)
     shared = shared or LastValueCache()
@@ -68,6 +76,13 @@ def train(options: TrainOptions, quiet: bool = False, shared: LastValueCache | N
         session = decide_resume(folder, options, region, len(scene))
         log = RunLog(folder.log, quiet, progress=folder.progress)
         try:
+
+            def deliver() -> None:
+                if folder.state.identity() is not None:
+                    folder.state.save(DELIVERED, {}, {})
+                on_delivery()
+
+            request = ReportRequest(options.report, deliver)
             for note in (*session.notes, *notes):
                 log.say(note)
             if editor_row(options.editor).run == "pasted":  # takes seconds, so it is not resumed
@@ -75,8 +90,11 @@ def train(options: TrainOptions, quiet: bool = False, shared: LastValueCache | N
                 if lower is not None:
                     log.say(_LOWER.format(lower.layers))
                 result = paste_decal(options, setup, folder, log)
+                on_delivery()
                 folder.state.end()
                 return result
+            if session.does == "report":
+                return complete_report(folder.root, options.scene, quiet, request)
             if session.does == "nothing":
                 return load_result(folder, options.name, scene, log)
             use_threads(session.threads)
@@ -88,7 +106,7 @@ def train(options: TrainOptions, quiet: bool = False, shared: LastValueCache | N
                     log.say(_LOWER.format(lower.layers))
                 setup = replace(setup, lower=lower)
                 run = remove_region if is_removal(options, setup, log) else train_region
-                result = run(options, setup, folder, log)
+                result = run(options, setup, folder, log, request)
             folder.state.end()
             return result
         except KeyboardInterrupt:

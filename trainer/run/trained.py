@@ -29,13 +29,27 @@ from trainer.views.setup import TrainingSetup
 from trainer.views.view import BACKGROUND
 
 from .edited_views import EditedViews
-from .finish import RunResult, end_rows, finish_run, load_evaluator, write_finals
+from .finish import (
+    FULL_REPORT,
+    ReportRequest,
+    RunResult,
+    end_rows,
+    finish_run,
+    load_evaluator,
+    write_finals,
+)
 from .record import RunRecord, load_recording, save_recording
 from .resume import picture_digests
 from .training import optimize_members, retime_trajectory
 
 
-def train_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder, log: RunLog) -> RunResult:
+def train_region(
+    options: TrainOptions,
+    setup: TrainingSetup,
+    folder: RunFolder,
+    log: RunLog,
+    request: ReportRequest = FULL_REPORT,
+) -> RunResult:
     """Edit the views, optimize the members, fit the field, and write the files of the run.
 
     Finished stages of the saved state are skipped, or repeated with the same bits.
@@ -45,6 +59,7 @@ def train_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder,
         setup: scene, region and original views
         folder: folder of the run
         log: log of the run
+        request: extent of the report, and a callback at the delivery
     """
     perceptual, _ = perceptual_loss()
     views = EditedViews(options, setup, folder, log)
@@ -67,7 +82,7 @@ def train_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder,
     trajectory, record = load_recording(folder)
     begun = folder.state.load(NETWORK)
     setup = setup.keep_solved(record.effort)
-    result = finish_run(folder, setup, trajectory, record, perceptual, log, begun)
+    result = finish_run(folder, setup, trajectory, record, perceptual, log, begun, request)
     # only at the end, as a stopped run needs all views to resume
     save_cameras(folder.cameras, [view.camera for view in setup.views], setup.scene.origin)
     remove_stale_views(folder, [view.camera.name for view in setup.views])

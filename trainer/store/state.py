@@ -223,6 +223,11 @@ class StateFolder:
         except (OSError, KeyError, ValueError) as error:
             raise self.damage_error(path, error) from error
 
+    def has(self, part: str) -> bool:
+        """Return True if a part was saved."""
+        self.wait()
+        return self._file(part, None).is_file()
+
     @contextmanager
     def restore_part(self, part: str) -> Iterator[None]:
         """Turn exceptions of the block, which restores a part, into a one-line ProgdfError; see `load`."""

@@ -22,17 +22,10 @@ from typing import IO, Annotated, Any
 
 from msgspec import Meta
 
-from progdf.terminal import signal_main_thread
+from progdf.terminal import lower_priority, signal_main_thread
 
 GRACE_S = 8.0
 """Seconds between a stop request and the kill; the child may be saving its state."""
-
-NICE = 10
-"""Niceness added to a child, as by nice(1): it gets a tenth of a core that the window or another program
-keeps busy.
-
-SCHED_IDLE would give it nothing, and an unprivileged process cannot leave that policy again.
-"""
 
 _TALKS = "--talks"
 
@@ -78,10 +71,8 @@ class Child:
                 env={**os.environ, "NO_COLOR": "1", "COLUMNS": "4096"},
                 **options,
             )
-        if sys.platform != "win32" and hasattr(os, "setpriority") and not talks:
-            with contextlib.suppress(OSError):
-                nice = os.getpriority(os.PRIO_PROCESS, 0) + NICE
-                os.setpriority(os.PRIO_PROCESS, self._process.pid, nice)
+        if not talks:
+            lower_priority(self._process.pid)
         self.log = log
         self._stopped_at: float | None = None
 

@@ -7,11 +7,10 @@ The trainer is another program (`progdf train`). This module knows only its comm
     SCENE.edits/NAME.train.log     its output
     SCENE.edits/NAME.train.lock    locked by the window that has it in its queue: it alone writes these files
     SCENE.edits/NAME.region.npy    the selection that it edits
-    SCENE.edits/NAME.draft.gdf     a grade: the layer's file until the edit is packed
-    SCENE.edits/NAME.packed.gdf    the packed edit: the layer's file until the edit is evaluated
+    SCENE.edits/NAME.draft.gdf     a grade: the layer's file until the edit is written
     SCENE.edits/NAME.kept.gdf      the newest recording of a stopped run that was kept as a layer
 
-The last three stay, because a session may refer to them.
+The last two stay, because a session may refer to them.
 """
 
 from __future__ import annotations
@@ -46,7 +45,6 @@ ORDER = ".train.json"
 LOG = ".train.log"
 WINDOW_LOCK = ".train.lock"
 DRAFT = ".draft.gdf"
-PACKED = ".packed.gdf"
 KEPT = ".kept.gdf"
 
 _FILLED = " filled"  # end of the name of a run that fills the hole of a removal
@@ -113,14 +111,14 @@ class EditOrder:
         return self.out / f"{self.name}.gdf"
 
     @property
+    def is_delivered(self) -> bool:
+        """True if the trained edit is complete, while its report may still be running."""
+        return os.path.isfile(self.result) and os.path.isfile(self.out / "report.json")
+
+    @property
     def draft(self) -> Path:
         """File of the edit before training, if a grade alone represents it; may be absent."""
         return self._beside(DRAFT)
-
-    @property
-    def packed_edit(self) -> Path:
-        """File of the packed edit, while it is evaluated; may be absent."""
-        return self._beside(PACKED)
 
     @property
     def kept_edit(self) -> Path:
@@ -130,7 +128,7 @@ class EditOrder:
     @property
     def drafts(self) -> tuple[Path, ...]:
         """Files of layers that the trained edit replaces; each may be absent."""
-        return self.draft, self.packed_edit, self.kept_edit
+        return self.draft, self.kept_edit
 
     @property
     def log(self) -> Path:
@@ -192,13 +190,11 @@ class EditOrder:
         atomic.write_file(self._beside(ORDER), msgspec.json.format(msgspec.json.encode(values)))
 
     def discard(self) -> None:
-        """Remove an unfinished run and its order.
+        """Remove an unfinished run and its order. An edit that is written stays; only its report is given up.
 
         Raises:
             ProgdfError: it cannot be removed, and is unchanged.
         """
-        if self.result.exists():
-            return
         run = self.out / "state" / "run.json"
         if self.out.is_symlink() or run.parent.is_symlink():
             raise ProgdfError(f"{self.out} is behind a link, which is not followed; remove the link")
@@ -207,6 +203,9 @@ class EditOrder:
         except OSError as error:
             reason = error.strerror or error
             raise ProgdfError(f"{self.out} cannot be removed ({reason}); check its permissions") from error
+        if self.result.exists():
+            shutil.rmtree(run.parent, ignore_errors=True)
+            return
         shutil.rmtree(self.out, ignore_errors=True)
         for suffix in (ORDER, LOG):
             with contextlib.suppress(OSError):
@@ -298,7 +297,7 @@ def free_run(folder: Path, name: str) -> Path:
     """Return a free folder for a run of this name: NAME, or NAME-2 if something has that name."""
 
     def is_taken(run: Path) -> bool:
-        return any(run.with_name(run.name + suffix).exists() for suffix in ("", ORDER, DRAFT, PACKED, KEPT))
+        return any(run.with_name(run.name + suffix).exists() for suffix in ("", ORDER, DRAFT, KEPT))
 
     return free_path(folder, name, is_taken=is_taken)
 
@@ -325,7 +324,7 @@ def free_path(
 def finished_edit(draft: Path) -> Path | None:
     """Return the edit trained from a draft after a session was saved with the draft; None if there is
     none."""
-    name = draft.name.removesuffix(DRAFT).removesuffix(PACKED).removesuffix(KEPT)
+    name = draft.name.removesuffix(DRAFT).removesuffix(KEPT)
     result = draft.with_name(name) / f"{name}.gdf"
     return result if name != draft.name and os.path.isfile(result) else None
 

@@ -205,7 +205,7 @@ def _status_text(job: JobCard) -> str:
     match job.status:
         case "running":
             left = job.seconds_left
-            words = [job.label]
+            words = ["Ready; writing the report" if job.delivered else job.label]
             words += [f"{format_duration(left)} left"] if left is not None else []
             words += [f"loss {job.loss}"] if job.loss else []
             return "  ·  ".join(words)
@@ -215,10 +215,12 @@ def _status_text(job: JobCard) -> str:
             return "Saving the state" if job.training else _NOTHING_WRITTEN
         case "done":
             return ""
+    if job.delivered:
+        return "Ready; the report is incomplete"
     return f"{100 * job.share:.0f} % done" if job.share else "Can be resumed"
 
 
-_STOP_HELP = "Stop; the run can be resumed later"
+_STOP_HELP = "Stop; the run can be resumed later, and a finished layer stays"
 _KEEP = ("Keep as it is", "keep_run", "Make a layer of the newest recording; Resume can still finish the run")
 _CANCEL = ("Cancel", "stop_run", "Remove it from the queue")
 _CLOSE = ("Close", "close_run", "Remove the card; files are kept")

@@ -161,30 +161,60 @@ def test_invalid_edit_is_reported_in_the_form(window: application.App) -> None:
     assert window.main_view.work.jobs == ()
 
 
-def test_packed_edit_replaces_the_draft_while_it_is_measured(window: application.App) -> None:
+def test_edit_becomes_the_layer_before_its_report_ends(window: application.App) -> None:
     request(window, Plain("train"))
     (job,) = window.parts.jobs.queue.jobs
     order = job.task
-    packed = job.task.out / "draft.gdf"
-    packed.parent.mkdir(parents=True)
+    draft = job.task.out / "draft.gdf"
+    draft.parent.mkdir(parents=True)
     scarf = bear().gdfs[0]
-    save_gdf(packed, replace(scarf, instruction="a draft"))
+    save_gdf(draft, replace(scarf, instruction="a draft"))
     turn(window)
     (layer,) = window.main_view.work.view.layers
     assert window.documents.get().edits[layer.gdf].instruction == "a draft"
     before = order.draft.read_bytes()
-    save_gdf(packed, replace(scarf, instruction="packed"))
-    os.utime(packed, ns=(order.draft.stat().st_mtime_ns + 1_000_000,) * 2)
+    save_gdf(order.result, replace(scarf, instruction="trained"))
     window.parts.jobs._live_due = 0.0
     turn(window)
-    assert [edit.instruction for edit in window.documents.get().edits] == ["packed"]
+    assert [edit.instruction for edit in window.documents.get().edits] == ["a draft"]
+    order.result.with_name("report.json").write_text("{}")
+    turn(window)
+    assert [edit.instruction for edit in window.documents.get().edits] == ["trained"]
+    assert window.documents.get().gdf_paths == (order.result,)
     assert window.main_view.work.view.layers == (layer,), "the layer stays as it is"
     assert order.draft.read_bytes() == before, "a film of it and a saved session name it"
+    assert window.main_view.work.message.text == f"{order.name} is ready"
+    (card,) = window.main_view.work.jobs
+    assert (card.status, card.delivered) == ("running", True)
+    assert not window.parts.jobs.holds_window(), "a report does not hold the window"
+    window.main_view.messages.show("another message")
+    Trainer.ended = 0
     turn(window)
-    assert window.main_view.work.view.layers == (layer,), "no recording beside it"
-    save_gdf(order.result, replace(scarf, instruction="measured"))
-    window.parts.jobs._end(replace(job, status="done"))
-    assert [edit.instruction for edit in window.documents.get().edits] == ["measured"]
+    assert window.main_view.work.message.text == "another message", "the layer is announced once"
+    assert window.main_view.work.view.layers == (layer,), "no second layer"
+    assert window.main_view.work.jobs == ()
+
+
+def test_stopped_report_leaves_the_layer(window: application.App) -> None:
+    request(window, Plain("train"))
+    (job,) = window.parts.jobs.queue.jobs
+    order = job.task
+    state = order.out / "state"
+    state.mkdir(parents=True)
+    (state / "run.json").write_text("{}")
+    save_gdf(order.result, bear().gdfs[0])
+    order.result.with_name("report.json").write_text("{}")
+    turn(window)
+    window.parts.jobs.queue.stop(job.number)
+    Trainer.ended = 130
+    turn(window)
+    (card,) = window.main_view.work.jobs
+    assert (card.status, card.delivered, card.keepable) == ("stopped", True, False)
+    request(window, OnItem("discard_run", job.number))
+    assert window.main_view.work.jobs == ()
+    assert order.result.is_file(), "only the report is given up"
+    assert not state.exists()
+    assert len(window.main_view.work.view.layers) == 1
 
 
 def take_view(window: application.App) -> Path:

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from progdf.terminal import NICENESS
 from trainer.run import demo
-from viewer.jobs.child import NICE, Child
+from viewer.jobs.child import Child
 
 MODULES = ("numpy", "threading", "torch", "signal", "json", "progdf", "trainer")
 """Modules in a downloaded folder. A package `viewer` lies beside them."""
@@ -81,7 +82,7 @@ def test_modules_in_the_current_folder_run_without_safe_path(stranger: Path) -> 
 def test_child_priority_is_lowered_only_for_background_work(child: Callable[..., Child]) -> None:
     started = child("preview", "no.ply")
     mine = os.getpriority(os.PRIO_PROCESS, 0)
-    assert os.getpriority(os.PRIO_PROCESS, started.pid) == min(mine + NICE, 19)
+    assert os.getpriority(os.PRIO_PROCESS, started.pid) == min(mine + NICENESS, 19)
     assert os.sched_getscheduler(started.pid) == os.SCHED_OTHER, "SCHED_IDLE gets nothing on a busy machine"
     talking = child("preview", "no.ply", talks=True)
     assert os.getpriority(os.PRIO_PROCESS, talking.pid) == mine, "somebody waits for it"

@@ -16,7 +16,7 @@ from progdf.io.atomic import LOCK, LockedError, hold_lock
 from progdf.terminal import format_duration
 from tests.helpers.count import Count
 from tests.helpers.demo_scenes import bear
-from viewer.jobs import child, job_queue, training
+from viewer.jobs import job_queue, training
 from viewer.jobs.child import Progress
 from viewer.jobs.job_queue import PROGRESS_INTERVAL_S, Delivery, JobQueue, QueuedTask
 from viewer.jobs.training import EditOrder
@@ -27,7 +27,7 @@ PATIENCE_S = 600.0
 @pytest.fixture(autouse=True)
 def children_as_urgent_as_the_tests(monkeypatch: pytest.MonkeyPatch) -> None:
     """Run children at normal priority. On a busy machine low priority takes ten times as long."""
-    monkeypatch.setattr(child, "NICE", 0)
+    monkeypatch.setattr("progdf.terminal.NICENESS", 0)
 
 
 class Waiting:

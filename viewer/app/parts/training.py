@@ -62,7 +62,7 @@ def is_keepable(order: EditOrder) -> bool:
     A draft stays anyway. A run that replaces the layer of another one leaves that layer.
     """
     recording = order.newest_recording()
-    has_layer = order.draft.exists() or order.packed_edit.exists() or bool(order.replaces)
+    has_layer = order.draft.exists() or order.is_delivered or bool(order.replaces)
     if recording is None or has_layer or order.paints_over_layers:
         return False
     return not is_newer(order.kept_edit, recording)
@@ -74,7 +74,9 @@ def job_card(job: QueuedTask) -> JobCard:
     training = ""
     starting = "Starting"
     keepable = False
+    delivered = False
     if isinstance(task, EditOrder):
+        delivered = task.is_delivered
         training = f"{task.editor} on {task.region}"
         keepable = job.status == "stopped" and is_keepable(task)
         if task.region == CHANGED:
@@ -92,6 +94,7 @@ def job_card(job: QueuedTask) -> JobCard:
         error=job.error,
         warning=job.warning,
         keepable=keepable,
+        delivered=delivered,
         offer=job.offer,
     )
 
@@ -145,6 +148,7 @@ class JobActions:
         self._live: Path | None = None  # the recording on screen
         self._live_layers: tuple[LayerState, ...] = ()  # its layers
         self._live_due = 0.0
+        self._taken: set[int] = set()  # jobs whose trained edit has been taken over
         self._discarded: set[int] = set()  # jobs to discard once they have stopped
         self._quits: type | None = None  # quit once no task of this class is busy
 
@@ -173,12 +177,21 @@ class JobActions:
         }
 
     def holds_window(self) -> bool:
-        """Return whether a job runs; if so, ask the user what to do before the window closes."""
-        job = None if self._quits else self.queue.busy(EditOrder) or self.queue.busy()
+        """Return whether a job runs; if so, ask the user what to do before the window closes.
+
+        The report of a written edit does not count: it stops, and its card offers to resume it next time.
+        """
+        busy = [job for job in self.queue.jobs if job.busy and not self._only_reports(job)]
+        trainings = [job for job in busy if isinstance(job.task, EditOrder)]
+        job = None if self._quits else next(iter(trainings + busy), None)
         if job is not None:
             kind = "training" if isinstance(job.task, EditOrder) else "delivery"
             self._messages.ask(Dialog(kind, job.task.name))
         return job is not None
+
+    def _only_reports(self, job: QueuedTask) -> bool:
+        """Return whether a job's edit is written and only its report is left."""
+        return isinstance(job.task, EditOrder) and job.status != "queued" and job.task.is_delivered
 
     def _quit(self, kind: type) -> None:
         """Stop all jobs of this class, and close the window once they have ended."""
@@ -267,6 +280,9 @@ class JobActions:
         self._follow_document()
         for job in self.queue.poll():
             self._end(job)
+        for job in self.queue.jobs:
+            if job.status == "running" and isinstance(job.task, EditOrder) and job.task.is_delivered:
+                attempt(self._messages, partial(self._take, job.number, job.task))
         self._show_live(time.monotonic())
         self._publish()
         if self._quits is not None and not self.queue.busy(self._quits):
@@ -360,11 +376,6 @@ class JobActions:
         write_file(order.draft, read_file(draft))
         self._edits.add(order.draft, order.name, strength)
 
-    def _take_packed(self, order: EditOrder, packed: Path) -> None:
-        """Replace the draft's layer by the trained edit, whose evaluation is still running."""
-        write_file(order.packed_edit, read_file(packed))
-        self._edits.finish(order.draft, order.packed_edit)
-
     def _write_anchor(self, form: NewEdit, run: Path) -> str:
         """Return the file of the picture that a sentence should follow, saved beside its run; "" for none.
 
@@ -436,20 +447,26 @@ class JobActions:
             elif job.status == "done":
                 self._messages.show(f"Wrote {task.out}")
             return
-        if job.status == "done" and task.fills:
-            self._take_fill(task)
+        if job.status == "done":
+            self._take(job.number, task)
+        elif self._live is not None:
+            self._live = None
+            self._documents.replace(self._documents.get())
+
+    def _take(self, number: int, task: EditOrder) -> None:
+        """Add a trained edit as a layer, or replace the layer of its draft, once per job."""
+        if number in self._taken:
             return
-        if job.status == "done" and self._scene == task.scene:  # the result replaces the recordings
+        self._taken.add(number)
+        if task.fills:
+            self._take_fill(task)
+        elif self._scene == task.scene:  # the result replaces the recordings
             self._live = None
             if not self._take_result(task):
                 self._open_file(task.result)
-            summary = "" if job.warning else task.summary()  # its card shows the warning
+            summary = "" if task.warning() else task.summary()  # its card shows the warning
             self._messages.show(f"{task.name} is ready. {summary}" if summary else f"{task.name} is ready")
-            return
-        if self._live is not None:
-            self._live = None
-            self._documents.replace(self._documents.get())
-        if job.status == "done":
+        else:
             self._messages.show(f"{task.name} is ready: {task.result}")
 
     def _take_fill(self, task: EditOrder) -> None:
@@ -492,19 +509,18 @@ class JobActions:
 
     def _show_live(self, now: float) -> None:
         """Show the newest recording of the run, within the time budget `LIVE_SHARE`."""
-        orders = (job.task for job in self.queue.jobs if job.status == "running")
+        running = (job for job in self.queue.jobs if job.status == "running")
+        orders = (job.task for job in running if job.number not in self._taken)
         order = next((task for task in orders if isinstance(task, EditOrder)), None)
         if order is None or order.scene != self._scene or now < self._live_due or order.replaces:
             return
         live = self._store.get().transient.live
-        packed = order.out / "draft.gdf"
+        grade = order.out / "draft.gdf"
         layers = set(order.drafts).intersection(self._documents.get().gdf_paths)
-        if order.draft in layers and is_newer(packed, order.draft):
-            attempt(self._messages, partial(self._take_packed, order, packed))
         if layers or (live and live != self._live_layers):
             return  # the edit has a layer already, or the form's preview is shown
-        if packed.is_file() and not order.draft.exists():
-            attempt(self._messages, partial(self._add_draft, order, packed))
+        if grade.is_file() and not order.draft.exists():
+            attempt(self._messages, partial(self._add_draft, order, grade))
             return
         recording = order.newest_recording()
         if recording is None or recording == self._live or order.paints_over_layers:
@@ -542,7 +558,8 @@ class JobActions:
             self._store.wake()
         layers = set(self._documents.get().gdf_paths)
         runs = [job.task for job in self.queue.jobs if job.busy and job.task.scene == self._scene]
-        waiting = {run.out for run in runs if isinstance(run, EditOrder) and layers.isdisjoint(run.drafts)}
+        orders = [run for run in runs if isinstance(run, EditOrder) and not run.is_delivered]
+        waiting = {run.out for run in orders if layers.isdisjoint(run.drafts)}
         ghosts = self._store.get().transient.ghosts
         kept = tuple(ghost for ghost in ghosts if ghost.run in waiting)
         if kept != ghosts:
