@@ -44,7 +44,8 @@ from progdf.metrics.image import decibels
 from progdf.rasterize import set_threads
 from progdf.sh import C0
 from progdf.threads import threads
-from trainer.optimize.color_solver import add_bands, make_solver
+from trainer.optimize.color_solver import make_solver
+from trainer.optimize.color_views import add_bands
 
 from .ablation.regret import MEASURED, REPORTING, RegretEdit
 from .analytic_edits import bear_edits

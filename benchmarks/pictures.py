@@ -27,8 +27,8 @@ from progdf.region import from_mask
 from progdf.scene.regions import parse_region
 from progdf.scene.up_axis import find_up
 from trainer.editors import make_editor
-from trainer.optimize.color_solver import add_bands, choose_model, make_solver, split_solver
-from trainer.optimize.color_views import color_views
+from trainer.optimize.color_solver import choose_model, make_solver, split_solver
+from trainer.optimize.color_views import add_bands, color_views
 from trainer.optimize.ties import surface_ties
 from trainer.options import EditorOptions
 from trainer.store.run_folder import quantize_image

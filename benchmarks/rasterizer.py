@@ -24,7 +24,7 @@ from torch import Tensor
 from progdf.camera import Camera, intrinsics
 from progdf.gaussians import Gaussians, pack
 from progdf.rasterize import reference, render, set_threads
-from progdf.rasterize.cpu.engine import ListedWeights
+from progdf.rasterize.cpu.weights import ListedWeights
 from progdf.rasterize.engines import ActivatedGaussians, RasterView, color_map, engine_device
 from progdf.sh import C0
 from progdf.terminal import group_digits
@@ -281,7 +281,7 @@ def list_table(cases: Sequence[RasterCase], rounds: int = 9) -> Table:
                     weights.gradient(pictures[lost])
                     durations.append((1e3 * (listed - begin), 1e3 * (time.process_time() - listed)))
                     assert isinstance(weights, ListedWeights)
-                    entries[lost] = len(weights.runs.weights)
+                    entries[lost] = len(weights.entries()[2])
         listing, rendering = (
             [f"{statistics.median(pair[k] for pair in durations[1:]):.1f}" for durations in times.values()]
             for k in (0, 1)

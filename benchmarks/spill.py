@@ -36,8 +36,8 @@ from progdf.rasterize.engines import render_depth
 from progdf.region import Region, from_mask
 from progdf.scene.up_axis import find_up
 from progdf.sh import C0
-from trainer.optimize.color_solver import add_bands, choose_model, make_solver, split_solver
-from trainer.optimize.color_views import color_views
+from trainer.optimize.color_solver import choose_model, make_solver, split_solver
+from trainer.optimize.color_views import add_bands, color_views
 from trainer.optimize.ties import surface_ties
 from trainer.regions.changed import changed_region
 from trainer.regions.few_masks import connected_pieces

@@ -36,8 +36,8 @@ from trainer.fit.fit import fit_grades, visibility
 from trainer.fit.slider_uniformity import equalized_strengths
 from trainer.optimize.color_course import STEPS as TAKEN
 from trainer.optimize.color_course import solve
-from trainer.optimize.color_solver import Model, add_bands, iterations, make_solver
-from trainer.optimize.color_views import color_views
+from trainer.optimize.color_solver import Model, iterations, make_solver
+from trainer.optimize.color_views import add_bands, color_views
 from trainer.optimize.pgs import ParameterSnapshot, PgsState
 from trainer.optimize.retime import smooth_course
 from trainer.options import EditorOptions, FieldOptions, OptimizeOptions, TrainingViewOptions

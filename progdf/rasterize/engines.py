@@ -305,7 +305,8 @@ def color_map(
         rows: rows of the M Gaussians, distinct. [M] int64
         engine: a key of `ENGINES`
         pixels: pixels of the window, in row-major order, ascending; None selects all. [P] int64
-        lost: total weight per pixel that may be omitted if that is faster
+        lost: total weight per pixel that may be omitted if that is faster. Above 0, weights may also be
+            rounded to 16 bits
     """
     black = gaussians._replace(colors=torch.zeros_like(gaussians.means))
     return get_engine(engine).color_map(black, RasterView.of(camera, black, crop), rows, pixels, lost)

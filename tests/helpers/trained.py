@@ -18,8 +18,8 @@ from progdf.gaussians import Gaussians, pack
 from progdf.region import Region, from_mask
 from tests.helpers.demo_scenes import bear
 from trainer.editors import make_editor
-from trainer.optimize.color_solver import add_bands, choose_model, make_solver, split_solver
-from trainer.optimize.color_views import color_views
+from trainer.optimize.color_solver import choose_model, make_solver, split_solver
+from trainer.optimize.color_views import add_bands, color_views
 from trainer.optimize.losses import GradientL1, Objective
 from trainer.optimize.pgs import PgsSettings, TargetStage, learning_rates
 from trainer.optimize.ties import Ties, surface_ties

@@ -21,7 +21,7 @@ from progdf.metrics.image import ROUNDING, decibels
 from progdf.region import Region
 from trainer.editors import editor_row, make_editor
 from trainer.editors.procedural import edit_course
-from trainer.optimize.color_views import MAX_ERROR_SHARE, ColorView, MapFit, fit_maps
+from trainer.optimize.color_views import MAX_ERROR_SHARE, ColorMembers, ColorView, MapFit, fit_maps
 from trainer.options import MAX_STAGES, EditorOptions, TrainingViewOptions
 from trainer.views.setup import render_thumbnails
 from trainer.views.view import BACKGROUND, RegionThumbnail, View, render_view
@@ -68,7 +68,8 @@ def draft_views(options: TrainingViewOptions, scene: Gaussians, region: Region) 
         region: the edited region
     """
     glances = render_thumbnails(options, scene, region)
-    views = [_glance_view(scene, region, glance) for glance in glances]
+    members = ColorMembers.of(pack(scene[region.members], with_shN=scene.sh_degree > 0))
+    views = [_glance_view(scene, members, glance) for glance in glances]
     parts = [[view for i, view in enumerate(views) if (i % 3 == 1) is is_test] for is_test in (False, True)]
     samples = [
         _sample(part, count) for part, count in zip(parts, (_FIT_PIXELS, _TEST_PIXELS), strict=True) if part
@@ -78,25 +79,26 @@ def draft_views(options: TrainingViewOptions, scene: Gaussians, region: Region) 
     return DraftViews(scene, region, glances, *samples)
 
 
-def _glance_view(scene: Gaussians, region: Region, glance: RegionThumbnail) -> tuple[View, ColorView]:
+def _glance_view(scene: Gaussians, members: ColorMembers, glance: RegionThumbnail) -> tuple[View, ColorView]:
     """Return a thumbnail as a view and a color view whose pixels form one row."""
     background = torch.tensor(BACKGROUND)
     drawn = glance.map.picture(glance.colors.clamp_min(0.0))
     others = (1.0 - glance.mask[:, None]) * background
-    if len(region) < len(scene):
+    if len(members.means) < len(scene):
         others = render_view(scene, glance.camera, background).flatten(0, 1)[glance.pixels] - drawn
     image = (others + drawn).clamp(0.0, 1.0)
     count = len(drawn)
     view = View(glance.camera, image[None], glance.mask[None], glance.inside[None], (0, 0, count, 1))
     row = torch.arange(count)
     evaluated = torch.ones_like(image[:, :1], dtype=torch.bool)
-    return view, ColorView(glance.map, others, glance.basis, glance.colors, (1, count), row, evaluated)
+    position = glance.camera.position
+    return view, ColorView(glance.map, others, members, position, (1, count), row, evaluated)
 
 
 def _sample(looked: Sequence[tuple[View, ColorView]], most: int) -> _Pixels:
     """Sample about `most` evenly spread pixels of views."""
     views = [view for _, view in looked]
-    maps = fit_maps(views, torch.ones(len(views[0].original)), most)
+    maps = fit_maps(views, torch.ones(len(views[0].members.means)), most)
 
     def gather(images: Sequence[Tensor]) -> Tensor:
         return torch.cat([i.flatten(0, 1)[p] for i, p in zip(images, maps.pixels, strict=True)])[None]

@@ -15,8 +15,8 @@ from torch.nn.functional import pad
 from progdf.field.grade import band_offsets, member_bands
 from progdf.metrics.image import LEVEL, decibels
 
-from .color_solver import BANDS, GAIN_WINDOW_STEPS, Model, Solver, add_bands
-from .color_views import MAX_ERROR_SHARE, ColorEvaluator
+from .color_solver import BANDS, GAIN_WINDOW_STEPS, Model, Solver
+from .color_views import MAX_ERROR_SHARE, ColorEvaluator, add_bands
 from .pgs import OnStep, ParameterSnapshot, PgsState, TargetStage
 from .retime import smooth_weights
 

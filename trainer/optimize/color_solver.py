@@ -38,16 +38,20 @@ from progdf.metrics.image import LEVEL, decibels
 from progdf.sh import C0
 from progdf.threads import map_threads, one_thread
 
-from .color_kernels import add_colors, add_curvature, add_gradients, drop_held, inner_product, keep_drawn
+from .color_kernels import add_curvature, add_gradients, apply_blocks, inner_product, invert_blocks
 from .color_views import (
     MAX_ERROR_SHARE,
     ColorEvaluator,
     ColorView,
     MapFit,
+    add_bands,
+    camera_centers,
     fit_maps,
     improve_mask,
     iterate_views,
     mask_of_members,
+    shade,
+    view_blocks,
 )
 from .ties import Ties
 
@@ -296,13 +300,17 @@ class Solver:
     ) -> tuple[Tensor, int]:
         """Run conjugate gradients (see `residual`). `look` returns the held-out error of a residual."""
         count = start.shape[1]
-        regularization = torch.from_numpy(self.held.diagonal()) + max(ridge, 1e-30)
-        free = self.asked[:, :count, None] & self.asked[:, None, :count]
-        curvature = self.weights[:, :count, :count] * free + regularization[:, None, None] * torch.eye(count)
-        inverse = torch.linalg.inv(curvature.double()).float() * free
+        diagonal = self.held.diagonal() + np.float32(max(ridge, 1e-30))
+        inverse = invert_blocks(self.weights.numpy(), self.asked[:, :count].contiguous().numpy(), diagonal)
+
+        def precondition(descent: Tensor) -> Tensor:
+            preconditioned = torch.empty_like(descent)
+            apply_blocks(inverse, descent.numpy(), preconditioned.numpy())
+            return preconditioned
+
         current = start
         gradient = self._gradient(mapped, start, targets, ridge)
-        preconditioned = direction = inverse @ gradient.descent
+        preconditioned = direction = precondition(gradient.descent)
         best = current
         taken = 0
         errors = [math.inf] * GAIN_WINDOW_STEPS
@@ -313,7 +321,7 @@ class Solver:
                 self._curvature(gradient, direction, ridge), 1e-30
             )
             for fraction in _STEP_FRACTIONS:
-                candidate = current + fraction * step_length * direction
+                candidate = torch.add(current, direction, alpha=fraction * step_length)
                 next_gradient = self._gradient(mapped, candidate, targets, ridge)
                 if next_gradient.error < gradient.error:
                     break
@@ -334,11 +342,11 @@ class Solver:
                 settled = errors[-1 - GAIN_WINDOW_STEPS] - error <= MIN_GAIN_SHARE * max(error, floor, LEVEL)
                 if settled or error <= LEVEL:
                     break
-            preconditioned = inverse @ gradient.descent
+            preconditioned = precondition(gradient.descent)
             beta = (
                 inner_product(gradient.descent, preconditioned) - inner_product(gradient.descent, previous)
             ) / power
-            direction = preconditioned + max(0.0, beta) * direction
+            direction = torch.add(preconditioned, direction, alpha=max(0.0, beta))
             tell()
         return (current if look is None else best), taken
 
@@ -349,45 +357,40 @@ class Solver:
 
     def _regularize(self, x: Tensor, ridge: float) -> Tensor:
         """Return the gradient of half the regularization of a residual. [M,b,3] -> [M,b,3]"""
+        if not self.held.nnz:
+            return ridge * x
         return ridge * x + torch.from_numpy(self.held @ x.flatten(1).numpy()).view_as(x)
 
     def _gradient(
         self, mapped: Tensor, residual: Tensor, targets: Sequence[Tensor], ridge: float
     ) -> _Gradient:
         """Return the gradient and the error at a residual."""
-        offsets = add_bands(mapped, residual)
+        sh = add_bands(add_bands(self.sh, mapped), residual)
+        means = self.views[0].members.means.numpy()
         drawn = torch.empty(len(self.views), len(residual), 3, dtype=torch.bool)
-
-        def look(index: int) -> tuple[Tensor, Tensor, float]:
-            colors = self.views[index].colors(offsets)
-            negative, passed, squared = self.views[index].pull(colors, targets[index])
-            drop_held(colors.numpy(), negative.numpy(), drawn[index].numpy())
-            return passed, negative, squared
-
-        descent = -self._regularize(residual, ridge)
+        descent = self._regularize(residual, ridge).neg_()
         all_passed = list[Tensor]()
-        error = inner_product(residual, self._regularize(residual, ridge))
-        results = iterate_views(look, range(len(self.views)))
-        for view, (passed, negative, squared) in zip(self.views, results, strict=True):
-            add_gradients(view.basis.numpy(), negative.numpy(), descent.numpy())
-            error += squared
-            all_passed.append(passed)
+        error = -inner_product(residual, descent)
+        for block in view_blocks(list(zip(self.views, targets, drawn, strict=True))):
+            views = [view for view, _, _ in block]
+            items = list(zip(block, shade(views, sh), strict=True))
+            looks = map_threads(lambda item: item[0][0].pull_drawn(item[1], *item[0][1:]), items)
+            negative, passed, squared = zip(*looks, strict=True)
+            all_passed += passed
+            error += sum(squared)
+            centers = camera_centers(views).numpy()
+            add_gradients(means, centers, torch.stack(negative).numpy(), descent.numpy())
         return _Gradient(descent, error, drawn, all_passed)
 
     def _curvature(self, pull: _Gradient, along: Tensor, ridge: float) -> float:
         """Return the curvature of half the squared error along a direction [M,b,3], with fixed clamps."""
-
-        def look(index: int) -> float:
-            view = self.views[index]
-            colors = np.zeros(pull.drawn.shape[1:], np.float32)
-            add_colors(view.basis.numpy(), along.numpy(), colors)
-            keep_drawn(colors, pull.drawn[index].numpy())
-            picture = view.map.picture(torch.from_numpy(colors))
-            return float((picture * pull.passed[index]).square().sum())
-
-        return sum(map_threads(look, range(len(self.views)))) + inner_product(
-            along, self._regularize(along, ridge)
-        )
+        curvature = 0.0
+        clamps = list(zip(self.views, pull.drawn, pull.passed, strict=True))
+        for block in view_blocks(clamps):
+            changes = shade([view for view, _, _ in block], along, 0.0, -math.inf)
+            items = list(zip(block, changes, strict=True))
+            curvature += sum(map_threads(lambda item: item[0][0].power(item[1], *item[0][1:]), items))
+        return curvature + inner_product(along, self._regularize(along, ridge))
 
 
 def make_solver(views: Sequence[ColorView], original: Tensor, ties: Ties | None = None) -> Solver:
@@ -399,7 +402,7 @@ def make_solver(views: Sequence[ColorView], original: Tensor, ties: Ties | None 
         ties: ties between neighbors, if there are few views
     """
     ones = original.new_ones(len(original), 3)
-    bands = min(BANDS[-1], views[0].basis.shape[1])
+    bands = min(BANDS[-1], views[0].members.sh.shape[1])
     weights = torch.zeros(len(original), bands, bands)
     weighed = iterate_views(lambda view: view.map.gradient(view.map.picture(ones) * view.counts)[:, 0], views)
     for view, weight in zip(views, weighed, strict=True):
@@ -592,13 +595,6 @@ def _smallest(
     """Return the smallest candidate within 5 % of the smallest error, or of an invisible error."""
     min_error = max(floor, min(one.error for one in attempts))
     return min((one for one in attempts if MAX_ERROR_SHARE * one.error <= min_error), key=size)
-
-
-def add_bands(offsets: Tensor, residual: Tensor) -> Tensor:
-    """Return offsets with a residual added to their lowest bands. [M,B,3], [M,b,3] -> [M,B,3]"""
-    total = offsets.clone()
-    total[:, : residual.shape[1]] += residual
-    return total
 
 
 def iterations(steps: int) -> int:

@@ -7,6 +7,7 @@ linear in its coefficients. Its least-squares fit over all views therefore takes
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -19,16 +20,16 @@ from torch.nn.functional import pad
 
 from progdf.field.baked import MONOMIALS, identity_map
 from progdf.field.grade import MAX_COLOR, member_bands, monomials
-from progdf.gaussians import unpack
+from progdf.gaussians import attribute_slices
 from progdf.metrics.image import ROUNDING
 from progdf.rasterize.cpu.engine import Array
 from progdf.rasterize.cpu.jit import Number, kernel
 from progdf.rasterize.engines import ColorMap, color_map
-from progdf.sh import basis
+from progdf.sh import C0, basis
 from progdf.threads import map_threads, one_thread
 from trainer.views.crops import CropScene
 
-from .color_kernels import add_colors
+from .color_kernels import drop_held, keep_drawn, shade_views
 
 _VIEW_BATCH = 8  # views processed at once; limits the memory for results
 _TILES_PER_SIDE = 6  # tiles along a view's longer side; half of the tiles are held out, as on a checkerboard
@@ -58,22 +59,57 @@ _B = TypeVar("_B")
 
 
 @dataclass(frozen=True)
+class ColorMembers:
+    """Members whose colors change, shared by all views."""
+
+    means: Tensor  # centers, world units. [M,3] float32
+    sh: Tensor  # original coefficients of the drawn SH functions. [M,B,3] float32
+
+    @property
+    def degree(self) -> int:
+        """SH degree that is drawn, 0..3."""
+        return math.isqrt(self.sh.shape[1]) - 1
+
+    @cached_property
+    def flat_colors(self) -> Tensor:
+        """Unclamped colors of members without view dependence (degree 0). [M,3]"""
+        return self.sh[:, 0] * C0 + 0.5
+
+    @classmethod
+    def of(cls, original: Tensor) -> ColorMembers:
+        """Return the members of packed raw rows. [M,C]"""
+        means = original[:, attribute_slices(original.shape[1])["means"]]
+        return cls(means.float().contiguous(), member_bands(original).float())
+
+
+@dataclass(frozen=True)
 class ColorView:
     """Pixels of one training view's box as a function of the members' colors."""
 
     map: ColorMap  # weight of each member in each pixel
     others: Tensor  # color of everything except the members, unclamped. [P,3]
-    basis: Tensor  # weight of each band in each member's color from this camera. [M,B]
-    original: Tensor  # unclamped original colors of the members. [M,3]
+    members: ColorMembers
+    position: Tensor  # center of the camera. [3]
     size: tuple[int, int]  # height and width of the box
     pixels: Tensor  # indices into the box, row by row. [P] int64
     counts: Tensor  # pixels that count. [P,1] bool
 
+    @property
+    def basis(self) -> Tensor:
+        """Weight of each band in each member's color from this camera. [M,B]"""
+        directions = torch.nn.functional.normalize(self.members.means - self.position, dim=1)
+        return basis(self.members.degree, directions)
+
+    @property
+    def original(self) -> Tensor:
+        """Unclamped original colors of the members. [M,3]"""
+        if self.members.degree == 0:
+            return self.members.flat_colors
+        return shade([self], self.members.sh, lowest=-math.inf)[0]
+
     def colors(self, offsets: Tensor) -> Tensor:
         """Return the drawn colors, at least 0. Offsets of the lowest bands [M,b,3] -> [M,3]"""
-        colors = self.original.numpy().copy()
-        add_colors(self.basis.numpy(), offsets.numpy(), colors)
-        return torch.from_numpy(np.maximum(colors, 0.0, out=colors))
+        return shade([self], add_bands(self.members.sh, offsets))[0]
 
     def picture(self, colors: Tensor) -> Tensor:
         """Return the unclamped pixels. Colors at least 0 [M,3] -> [P,3]"""
@@ -82,7 +118,7 @@ class ColorView:
     @cached_property
     def share(self) -> Tensor:
         """Weight of the members in each pixel, 0 in pixels that do not count. [P,1] 0..1"""
-        return self.map.picture(torch.ones_like(self.original))[:, :1] * self.counts
+        return self.map.picture(torch.ones_like(self.members.means))[:, :1] * self.counts
 
     def pick(self, image: Tensor) -> Tensor:
         """Return this view's pixels of a box. [h,w,3] -> [P,3]"""
@@ -105,12 +141,32 @@ class ColorView:
         squared = _compare(*(x.numpy() for x in (missing, self.others, target, self.counts[:, 0], passed)))
         return self.map.gradient(missing), passed, squared
 
-    def error(self, offsets: Tensor, target: Tensor, power: float) -> float:
-        """Return the sum of differences to a power, weighted by the members' share. [M,b,3], [P,3]
+    def pull_drawn(self, colors: Tensor, target: Tensor, drawn: Tensor) -> tuple[Tensor, Tensor, float]:
+        """Return the results of `pull` without the gradient of channels that stay black.
 
-        Colors are in the range 0..1.
+        `drawn`: out, the members' channels that the clamp lets through. [M,3] bool
         """
-        image = self.picture(self.colors(offsets)).clamp(0.0, 1.0)
+        negative, passed, squared = self.pull(colors, target)
+        drop_held(colors.numpy(), negative.numpy(), drawn.numpy())
+        return negative, passed, squared
+
+    def power(self, changes: Tensor, drawn: Tensor, passed: Tensor) -> float:
+        """Return the squared change of the pixels by a change of the colors, with fixed clamps.
+
+        Args:
+            changes: overwritten. [M,3]
+            drawn: members' channels that the clamp lets through. [M,3] bool
+            passed: pixels' channels that the clamps let through. [P,3] bool
+        """
+        keep_drawn(changes.numpy(), drawn.numpy())
+        return float((self.map.picture(changes) * passed).square().sum())
+
+    def error(self, colors: Tensor, target: Tensor, power: float) -> float:
+        """Return the sum of differences to a power, weighted by the members' share. [M,3], [P,3]
+
+        Pixels are clamped to 0..1.
+        """
+        image = self.picture(colors).clamp(0.0, 1.0)
         return float(((image - target).abs().pow(power) * self.share).sum())
 
     def halves(self) -> tuple[ColorView, ColorView]:
@@ -141,21 +197,50 @@ def _compare(shown: Array, others: Array, target: Array, counts: Array, passed: 
     return squared
 
 
-def color_view(crop: CropScene, original: Tensor, every: int, index: int) -> ColorView:
+def add_bands(offsets: Tensor, residual: Tensor) -> Tensor:
+    """Return offsets with a residual added to their lowest bands. [M,B,3], [M,b,3] -> [M,B,3]"""
+    total = offsets.clone()
+    total[:, : residual.shape[1]] += residual
+    return total
+
+
+def shade(views: Sequence[ColorView], sh: Tensor, bias: float = 0.5, lowest: float = 0.0) -> Tensor:
+    """Return the members' colors in some views.
+
+    Args:
+        views: views of the same members, at most 8
+        sh: coefficients of the lowest functions. [M,b,3]
+        bias: constant; 0 for changes of colors
+        lowest: lower limit of the colors
+
+    Returns:
+        [V,M,3]
+    """
+    means = views[0].members.means.numpy()
+    return torch.from_numpy(shade_views(means, camera_centers(views).numpy(), sh.numpy(), bias, lowest))
+
+
+def camera_centers(views: Sequence[ColorView]) -> Tensor:
+    """Return the centers of the views' cameras. [V,3] float32"""
+    return torch.stack([view.position for view in views]).float()
+
+
+def view_blocks(views: Sequence[_A]) -> list[Sequence[_A]]:
+    """Return the views in blocks that are processed at once."""
+    return [views[begin : begin + _VIEW_BATCH] for begin in range(0, len(views), _VIEW_BATCH)]
+
+
+def color_view(crop: CropScene, members: ColorMembers, every: int, index: int) -> ColorView:
     """Return the `index`th of `color_views`."""
     camera = crop.camera
     height, width = crop.size
     place = torch.arange(width) + every // 2 * torch.arange(height)[:, None] + index
     pixels = (place % every == 0).flatten().nonzero()[:, 0]
-    members = unpack(original, crop.member_shN)
-    directions = torch.nn.functional.normalize(members.means - camera.position, dim=1)
-    weights = basis(min(members.sh_degree, 3), directions)
-    colors = (weights[..., None] * members.sh[:, : weights.shape[1]]).sum(dim=1) + 0.5
     weighed = color_map(crop.gaussians, camera, crop.box, crop.rows, crop.engine, pixels, OMITTED_WEIGHT)
-    others = crop.original.flatten(0, 1)[pixels] - weighed.picture(colors.clamp_min(0.0))
-    counts = torch.ones_like(others[:, :1], dtype=torch.bool)
-    weights = weights[:, : member_bands(original[:1]).shape[1]].contiguous()
-    return ColorView(weighed, others, weights, colors, crop.size, pixels, counts)
+    original = crop.original.flatten(0, 1)[pixels]
+    counts = torch.ones_like(original[:, :1], dtype=torch.bool)
+    view = ColorView(weighed, original, members, camera.position, crop.size, pixels, counts)
+    return replace(view, others=original - weighed.picture(view.original.clamp_min(0.0)))
 
 
 def color_views(crops: Sequence[CropScene], original: Tensor, every: int = 1) -> list[ColorView]:
@@ -166,11 +251,8 @@ def color_views(crops: Sequence[CropScene], original: Tensor, every: int = 1) ->
         original: raw member rows. [M,14+]
         every: use one of this many pixels, different ones in each view: 1, 2 or 4
     """
-    views = map_threads(lambda i: color_view(crops[i], original, every, i), range(len(crops)))
-    is_shared = views[0].basis.shape[1] == 1  # colors are independent of the view
-    return (
-        [replace(v, basis=views[0].basis, original=views[0].original) for v in views] if is_shared else views
-    )
+    members = ColorMembers.of(original)
+    return map_threads(lambda i: color_view(crops[i], members, every, i), range(len(crops)))
 
 
 @dataclass(frozen=True)
@@ -243,8 +325,9 @@ def fit_maps(views: Sequence[ColorView], share: Tensor, most: int = _MAX_FIT_PIX
     def lay_out(index: int) -> tuple[Tensor, Tensor, Tensor]:
         view = views[index]
         some = pixels[index]
-        terms, members = expand(view.original)
-        original = view.picture(view.original.clamp_min(0.0))[some]
+        colors = view.original
+        terms, members = expand(colors)
+        original = view.picture(colors.clamp_min(0.0))[some]
         return view.map.picture(terms)[some], original, members
 
     covered = map_threads(lambda view: (view.share[:, 0] > _MIN_REGION_WEIGHT).nonzero()[:, 0], views)
@@ -254,7 +337,7 @@ def fit_maps(views: Sequence[ColorView], share: Tensor, most: int = _MAX_FIT_PIX
     design = torch.cat([one[0] for one in layouts]).double()
     original = torch.cat([one[1] for one in layouts]).double()
     members = torch.stack([one[2] for one in layouts]).sum(dim=0)
-    prior_weight = _MAP_PRIOR_WEIGHT * len(design) / max(1, len(views) * len(views[0].original))
+    prior_weight = _MAP_PRIOR_WEIGHT * len(design) / max(1, len(views) * len(views[0].members.means))
     pixels = [view.pixels[some] for view, some in zip(views, pixels, strict=True)]
     return MapFit(design, original, pixels, design.T @ design, prior_weight * members)
 
@@ -304,7 +387,8 @@ def improve_mask(
         share: initial shares. [M]
         targets: pictures of the views
     """
-    changes = [torch.einsum("mb,mbc->mc", view.basis, full) for view in views]
+    original = views[0].members.sh
+    changes = [change for block in view_blocks(views) for change in shade(block, full, 0.0, -math.inf)]
     picked = [view.pick(target) for view, target in zip(views, targets, strict=True)]
     pairs = list(zip(views, changes, picked, strict=True))
 
@@ -313,14 +397,21 @@ def improve_mask(
         size = pair[1].abs()
         return (view.map.gradient(view.map.picture(size) * view.counts) * size).sum(dim=1)
 
-    def look(share: Tensor) -> tuple[Tensor, float]:
-        def pull(pair: tuple[ColorView, Tensor, Tensor]) -> tuple[Tensor, float]:
-            view, change, target = pair
-            by_color, _, squared = view.pull((view.original + share[:, None] * change).clamp_min(0.0), target)
-            return (by_color * change).sum(dim=1), squared
+    def pull(item: tuple[tuple[ColorView, Tensor, Tensor], Tensor]) -> tuple[Tensor, float]:
+        (view, change, target), colors = item
+        by_color, _, squared = view.pull(colors, target)
+        return (by_color * change).sum(dim=1), squared
 
-        looks = map_threads(pull, pairs)
-        return torch.stack([one for one, _ in looks]).sum(dim=0), sum(error for _, error in looks)
+    def look(share: Tensor) -> tuple[Tensor, float]:
+        sh = original + share[:, None, None] * full
+        descent = torch.zeros_like(share)
+        error = 0.0
+        for block in view_blocks(pairs):
+            colors = shade([view for view, _, _ in block], sh)
+            for by_share, squared in map_threads(pull, list(zip(block, colors, strict=True))):
+                descent += by_share
+                error += squared
+        return descent, error
 
     curvature = torch.stack(map_threads(weigh, pairs)).sum(dim=0)
     curvature = curvature + _MASK_RIDGE * curvature.mean() + 1e-12
@@ -357,11 +448,16 @@ class ColorEvaluator:
 
     def mean(self, offsets: Tensor, power: float) -> float:
         """Return the mean difference to a power, weighted by the members' share of the pixels. [M,B,3]"""
-        total = sum(map_threads(lambda pair: pair[0].error(offsets, pair[1], power), self._pairs))
+        sh = add_bands(self.views[0].members.sh, offsets)
+        total = 0.0
+        for block in view_blocks(self._pairs):
+            colors = shade([view for view, _ in block], sh)
+            items = list(zip(block, colors, strict=True))
+            total += sum(map_threads(lambda item: item[0][0].error(item[1], item[0][1], power), items))
         return total / max(1.0, 3.0 * sum(float(view.share.sum()) for view in self.views))
 
 
 def iterate_views(work: Callable[[_A], _B], items: Sequence[_A]) -> Iterator[_B]:
     """Yield the results of `work` in order. Only a batch of results is in memory at once."""
-    for begin in range(0, len(items), _VIEW_BATCH):
-        yield from map_threads(work, items[begin : begin + _VIEW_BATCH])
+    for block in view_blocks(items):
+        yield from map_threads(work, block)

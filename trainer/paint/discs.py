@@ -24,7 +24,7 @@ from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import ADDED_LOGIT
 from progdf.quaternions import matrix_quats
-from progdf.rasterize.cpu.engine import ListedWeights
+from progdf.rasterize.cpu.weights import ListedWeights
 from progdf.rasterize.engines import activate, color_map, render_depth
 from progdf.sh import rgb_to_sh0
 from progdf.surface.find import MIN_COSINE, PaintSurface, light_thickness
@@ -347,18 +347,14 @@ def _rows_before(
     listed = color_map(activate(scene), camera, box, torch.arange(len(scene)))
     if not isinstance(listed, ListedWeights):
         raise TypeError("place_discs needs the weight lists of the CPU engine")
-    runs = listed.runs
     axis = camera.viewmat[2]
     depths = (scene.means.double() @ axis[:3].double() + axis[3].double()).numpy()
-    owner = np.repeat(runs.rows, runs.counts)
-    pixel = np.repeat(runs.firsts.astype(np.int64), runs.counts) + runs.pixels
+    owner, pixel, weights = listed.entries()
     window = slice(box[1], box[3]), slice(box[0], box[2])
     piece = pieces[window].reshape(-1)[pixel]
     missing = behind[window].reshape(-1)[pixel] - depths[owner]
-    is_before = (
-        mask[window].reshape(-1)[pixel] & (missing > _SETTLED_SHARE * reach) & (runs.weights > _MIN_LIGHT)
-    )
-    is_before &= (missing <= reach) & (piece == _main_pieces(owner, piece, runs.weights, len(scene))[owner])
+    is_before = mask[window].reshape(-1)[pixel] & (missing > _SETTLED_SHARE * reach) & (weights > _MIN_LIGHT)
+    is_before &= (missing <= reach) & (piece == _main_pieces(owner, piece, weights, len(scene))[owner])
     needed = np.zeros(len(scene))
     np.maximum.at(needed, owner[is_before], missing[is_before])
     moved = np.nonzero(needed)[0]

@@ -6,9 +6,7 @@ Image and gradients have the same bits in every run and for every number of thre
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any, TypeVar
 
@@ -31,13 +29,10 @@ from .backward import new_scratch as new_backward_scratch
 from .blend import (
     SUMS,
     WEIGHT_SUMS,
-    ListSelection,
     RenderBuffers,
-    Runs,
     accumulate_weights,
     blend,
     blend_backward,
-    list_weights,
     new_scratch,
 )  # fmt: skip
 from .forward import (
@@ -53,6 +48,7 @@ from .forward import (
     project,
 )  # fmt: skip
 from .jit import kernel
+from .weights import ListedWeights, ListSelection, Runs, join_runs, list_weights, new_runs, take_runs
 
 Array = NDArray[Any]
 _T = TypeVar("_T")
@@ -254,28 +250,6 @@ def alpha_weights(gaussians: ActivatedGaussians, view: RasterView, mask: Tensor)
     return torch.from_numpy(totals.astype(np.float32))
 
 
-@dataclass(frozen=True)
-class ListedWeights:
-    """Color map as lists of weights."""
-
-    count: int  # number of colored Gaussians M
-    size: tuple[int, ...]  # height and width of the window, or its number of selected pixels
-    runs: Runs
-
-    def picture(self, colors: Tensor) -> Tensor:
-        """Draw an image, see `ColorMap`."""
-        image = np.zeros((math.prod(self.size), colors.shape[1]), np.float32)
-        add = add_images if colors.shape[1] == 3 else add_channels
-        add(self.runs, to_float32(colors).numpy(), image)
-        return torch.from_numpy(image).view(*self.size, -1)
-
-    def gradient(self, image: Tensor) -> Tensor:
-        """Return the gradient of the colors, see `ColorMap`."""
-        colors = np.zeros((self.count, 3), np.float32)
-        add_gradients(self.runs, to_float32(image).numpy().reshape(-1, 3), colors)
-        return torch.from_numpy(colors)
-
-
 def color_map(
     gaussians: ActivatedGaussians, view: RasterView, rows: Tensor, pixels: Tensor | None, lost: float
 ) -> ListedWeights:
@@ -290,94 +264,20 @@ def color_map(
     row_of[rows.numpy()] = np.arange(len(rows), dtype=np.int32)
     listed = ListSelection(row_of, positions, np.float32(lost))
     splats, lists = bin_view(gaussians, pinhole)
-    index = np.dtype(np.uint16 if TILE_H * (x1 - x0) < 1 << 16 else np.uint32)
 
-    def list_tiles(begin: int, end: int) -> list[Array]:
+    def list_tiles(begin: int, end: int) -> Runs:
         max_runs = int(lists.starts[end] - lists.starts[begin])
         room = -1
         entry = ENTRY_ROOM * max_runs
         while entry > room:
             room = entry
-            out = _new_runs(max_runs, entry, index)
-            run, entry = list_weights(begin, end, new_scratch(), splats, lists, pinhole, listed, out)
-        return [*(part[:run].copy() for part in out[:3]), *(part[:entry].copy() for part in out[3:])]
+            out = new_runs(end - begin, max_runs, entry)
+            run, span, entry = list_weights(begin, end, new_scratch(), splats, lists, pinhole, listed, out)
+        return take_runs(out, run, span, entry, is_exact=lost == 0.0)
 
-    parts = _share(list_tiles, len(lists.starts) - 1, _MIN_TILES, _MAX_TILES)
-    runs = Runs(*map(np.concatenate, zip(*parts, strict=True)))
+    runs = join_runs(_share(list_tiles, len(lists.starts) - 1, _MIN_TILES, _MAX_TILES))
     size = (y1 - y0, x1 - x0) if pixels is None else (len(pixels),)
     return ListedWeights(len(rows), size, runs)
-
-
-def _new_runs(runs: int, entries: int, index: np.dtype[Any]) -> Runs:
-    """Return uninitialized runs of this capacity. index: type of a pixel's offset in its run"""
-    rows = np.empty(runs, np.int32)
-    counts = np.empty(runs, np.uint16)
-    firsts = np.empty(runs, np.int32)
-    return Runs(rows, counts, firsts, np.empty(entries, index), np.empty(entries, np.float32))
-
-
-@kernel(fast=True, cache=True)
-def add_images(runs: Runs, colors: Array, image: Array) -> None:
-    """Add Σ w·c to an image. colors: [M,3] float32; image: [h·w,3] float32"""
-    end = np.uint64(0)
-    for run in range(runs.rows.size):
-        row = runs.rows[run]
-        begin = end
-        end = begin + np.uint64(runs.counts[run])
-        red = colors[row, 0]
-        green = colors[row, 1]
-        blue = colors[row, 2]
-        first = np.uint64(runs.firsts[run])  # unsigned: numba tests signed indices for negative values
-        for k in range(begin, end):
-            p = first + np.uint64(runs.pixels[k])
-            w = runs.weights[k]
-            image[p, 0] += w * red
-            image[p, 1] += w * green
-            image[p, 2] += w * blue
-
-
-@kernel(fast=True, cache=True)
-def add_channels(runs: Runs, values: Array, image: Array) -> None:
-    """Add Σ w·c to an image of any number of channels.
-
-    20 channels at once take a third of the time of repeated calls with 3. For 3 channels `add_images` is
-    faster: this function takes 1.5 times as long.
-    """
-    end = np.uint64(0)
-    for run in range(runs.rows.size):
-        row = runs.rows[run]
-        begin = end
-        end = begin + np.uint64(runs.counts[run])
-        first = np.uint64(runs.firsts[run])
-        for k in range(begin, end):
-            p = first + np.uint64(runs.pixels[k])
-            w = runs.weights[k]
-            for c in range(values.shape[1]):
-                image[p, c] += w * values[row, c]
-
-
-@kernel(fast=True, cache=True)
-def add_gradients(runs: Runs, gradient: Array, by_colors: Array) -> None:
-    """Add Σ w·g to the gradient of each color.
-
-    gradient: gradient of the image, [h·w,3] float32; by_colors: [M,3] float32
-    """
-    end = np.uint64(0)
-    for run in range(runs.rows.size):
-        red = green = blue = np.float32(0.0)
-        begin = end
-        end = end + np.uint64(runs.counts[run])
-        first = np.uint64(runs.firsts[run])
-        for k in range(begin, end):
-            p = first + np.uint64(runs.pixels[k])
-            w = runs.weights[k]
-            red += w * gradient[p, 0]
-            green += w * gradient[p, 1]
-            blue += w * gradient[p, 2]
-        row = runs.rows[run]
-        by_colors[row, 0] += red
-        by_colors[row, 1] += green
-        by_colors[row, 2] += blue
 
 
 @kernel(cache=True)

@@ -347,6 +347,24 @@ def load(typingctx: Any, array: Any, at: Any) -> Any:
 
 
 @intrinsic  # type: ignore[untyped-decorator]
+def load_numbers(typingctx: Any, array: Any, at: Any) -> Any:
+    """Return array[at : at + 8] of a contiguous array, without a bounds check.
+
+    array: float32 or uint16; at: uint64
+    """
+
+    def generate(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        if array.dtype == types.float32:
+            return builder.load(_pointer(context, builder, sig, *args), align=4)
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        shorts = ir.VectorType(ir.IntType(16), WIDTH)
+        numbers = builder.load(builder.bitcast(builder.gep(data, [args[1]]), shorts.as_pointer()), align=2)
+        return builder.uitofp(numbers, _FLOATS)
+
+    return _vector(array, types.uint64), generate
+
+
+@intrinsic  # type: ignore[untyped-decorator]
 def store(typingctx: Any, array: Any, at: Any, value: Any) -> Any:
     """Set array[at : at + 8] = value, without a bounds check. at: uint64"""
 
