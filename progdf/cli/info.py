@@ -73,8 +73,8 @@ class Survey:
         ]
         if self.surrounding:
             lines.append(
-                "cameras: the scene surrounds the viewer, so cameras around it cannot frame it; give its own "
-                "cameras, or save views with F4 in progdf view"
+                "cameras: the scene surrounds the viewer, so cameras around it cannot frame it; training "
+                "puts some at free places around a region; the scene's own (--cameras) are better"
             )
         return lines
 

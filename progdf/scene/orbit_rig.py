@@ -75,16 +75,22 @@ def orbit_rig(
     K = intrinsics(fov_y, width, height)
     half = math.atan(0.5 * min(width, height) / float(K[1, 1]))
     eye_distance = distance * radius * math.sin(_RIG_FOV / 2) / math.sin(half)
+    cameras = []
+    for i, back in enumerate(rig_directions(count, up, elevations)):
+        viewmat = look_at(center + eye_distance * back, center, up)
+        cameras.append(Camera(viewmat, K, width, height, name=f"orbit_{i:03d}"))
+    return cameras
+
+
+def rig_directions(count: int, up: Tensor, elevations: tuple[float, float]) -> list[Tensor]:
+    """Return the directions from the middle of a rig to its cameras, see `orbit_rig`. Unit vectors [3]"""
     ahead = front_direction(up)
     side = torch.linalg.cross(up, ahead)
-    low = math.sin(math.radians(lowest))
-    high = math.sin(math.radians(highest))
-    cameras = []
+    low, high = (math.sin(math.radians(elevation)) for elevation in elevations)
+    directions = []
     for i in range(count):
         azimuth = 2 * math.pi * i / count
         sine = low + (high - low) * ((0.5 + i * _GOLDEN) % 1.0)
         cosine = math.sqrt(1 - sine * sine)
-        back = cosine * (math.cos(azimuth) * ahead + math.sin(azimuth) * side) + sine * up
-        viewmat = look_at(center + eye_distance * back, center, up)
-        cameras.append(Camera(viewmat, K, width, height, name=f"orbit_{i:03d}"))
-    return cameras
+        directions.append(cosine * (math.cos(azimuth) * ahead + math.sin(azimuth) * side) + sine * up)
+    return directions

@@ -37,7 +37,6 @@ from trainer.options import (
 from trainer.views.choose import choose_views, load_given_cameras
 from trainer.views.view import (
     BACKGROUND,
-    INSIDE,
     fit_size,
     name_cameras,
     region_rig,
@@ -156,10 +155,8 @@ def write(options: WriteViewsOptions) -> list[str]:
     if given:
         # renders and the masks over them have no distortion, so drop the lens
         cameras = [replace(fit_size(camera, options.image_size), lens=None) for camera in given]
-    elif is_surrounding(scene, up):
-        raise ProgdfError(f"{options.scene} {INSIDE}")
-    elif region is not None:
-        cameras = region_rig(scene, region, options.views, options.image_size, up)
+    elif region is not None or is_surrounding(scene, up):
+        cameras = region_rig(scene, region or whole_scene(scene), options.views, options.image_size, up)
     else:
         cameras = orbit_rig(scene, options.views, options.image_size, options.image_size, up=up)
     cameras = with_near_plane(name_cameras(cameras), scene)

@@ -19,7 +19,7 @@ from progdf.gaussians import ZERO, Gaussians
 from progdf.io.cameras import load_cameras, save_cameras
 from progdf.io.images import read_mask
 from progdf.io.picture_files import PictureFolder
-from progdf.region import Region, from_mask
+from progdf.region import Region, from_mask, whole_scene
 from progdf.scene.bounds import is_surrounding
 from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.regions import Check, Kind
@@ -35,7 +35,6 @@ from trainer.views.lower_layers import check_lower_layers, open_lower_layers
 from trainer.views.picture_cameras import rendered_cameras
 from trainer.views.view import (
     BACKGROUND,
-    INSIDE,
     fit_size,
     name_cameras,
     region_rig,
@@ -348,7 +347,7 @@ def _segmented_cameras(scene: Gaussians, request: RegionRequest) -> list[Camera]
         return [replace(fit_size(camera, LIFTED_AT), lens=None) for camera in selected]
     up = request.up_of(scene)
     if is_surrounding(scene, up):
-        raise ProgdfError(f"the scene {INSIDE}")
+        return region_rig(scene, whole_scene(scene), request.count, LIFTED_AT, up)
     return name_cameras(orbit_rig(scene, request.count, LIFTED_AT, LIFTED_AT, up=up))
 
 

@@ -35,7 +35,6 @@ from .picture_cameras import picture_cameras
 from .size import SizeLimits, choose_view_size
 from .view import (
     BACKGROUND,
-    INSIDE,
     RegionThumbnail,
     View,
     fit_size,
@@ -139,7 +138,7 @@ def make_training_setup(options: TrainingViewOptions, scene: Gaussians, region: 
     region.
 
     Raises:
-        ProgdfError: no camera sees the region, or none are given for a scene that surrounds the viewer.
+        ProgdfError: no camera sees the region.
     """
     background = torch.tensor(BACKGROUND)
     found = load_given_cameras(options, scene)
@@ -150,9 +149,6 @@ def make_training_setup(options: TrainingViewOptions, scene: Gaussians, region: 
             up = _up_of_pictures(options.pictures) or up
         setup = _picture_setup(options, scene, region, given, up)
         return replace(setup, notes=[*found.notes, *setup.notes])
-    if options.cameras is None and is_surrounding(scene, up.direction):
-        raise ProgdfError(f"the scene {INSIDE}")
-
     default_count = COLOR_VIEWS[scene.sh_degree > 1] if options.dense else VIEWS
     views = options.views or default_count
     elevations = HALF_SPHERE if options.dense else ELEVATIONS
@@ -185,6 +181,11 @@ def make_training_setup(options: TrainingViewOptions, scene: Gaussians, region: 
     else:
         choice = choose_views(scene, region, cameras_of(views), views, background)
         train, held_out = split_views(choice, min(held_out_count, max(1, len(choice.views) // 5)))
+    if options.cameras is None and is_surrounding(scene, up.direction):
+        notes.append(
+            f"the scene surrounds the viewer: {choice.offered} cameras at free places around the region "
+            "(a guess; --cameras gives the scene's own)"
+        )
     if len(choice.views) < choice.offered:
         notes.append(choice.line())
     if any(view.camera.lens for view in choice.views):
@@ -201,7 +202,7 @@ def render_thumbnails(
     """Return thumbnails of the region from all sides, independent of number and size of its views.
 
     They come from the first given cameras that show it, spread over the list, or from a rig. There are none
-    for a scene that surrounds the viewer and has no cameras.
+    if no camera can be placed for the region.
     """
     given = load_given_cameras(options, scene).cameras
     up = find_up(scene, given, options.up, options.scene).direction
@@ -211,10 +212,11 @@ def render_thumbnails(
         positions = scene.means[sample_members(scene, region)]
         spread.sort(key=lambda i: not bool(in_frame(positions, given[i]).any()))  # visible region first
         cameras = [fit_size(given[i], _GLANCE_SIZE) for i in spread]
-    elif is_surrounding(scene, up):
-        return []
     else:
-        cameras = region_rig(scene, region, count, _GLANCE_SIZE, up, HALF_SPHERE)
+        try:
+            cameras = region_rig(scene, region, count, _GLANCE_SIZE, up, HALF_SPHERE)
+        except ProgdfError:
+            return []
     return make_glances(scene, region, with_near_plane(cameras, scene), count)
 
 
@@ -243,8 +245,10 @@ def _rig_views(
     train = list(choice.views)
     indices = {camera.name: i for i, camera in enumerate(cameras)}
     between = rig(2 * len(cameras))[1::2]
-    successors = (indices[train[k * len(train) // aside].camera.name] for k in range(aside))
-    others = [replace(between[i], name=f"between_{i:03d}") for i in sorted({*successors})]
+    successors = {indices[train[k * len(train) // aside].camera.name] for k in range(aside)}
+    # a rig at free places may have fewer cameras than requested
+    places = sorted({i * len(between) // len(cameras) for i in successors}) if between else []
+    others = [replace(between[i], name=f"between_{i:03d}") for i in places]
     views = map_threads(lambda camera: make_view(scene, region, camera, background), others)
     held_out = [view for view in views if bool((view.mask > 0.0).any())]
     return choice, *((train, held_out) if held_out else split_views(choice, aside))

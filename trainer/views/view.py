@@ -17,22 +17,16 @@ from progdf.io.picture_files import name_twin, view_name
 from progdf.rasterize import Crop, activate, render
 from progdf.rasterize.engines import ColorMap, color_map
 from progdf.region import Region
-from progdf.scene.bounds import near_plane, quantile, scene_sphere
+from progdf.scene.bounds import is_surrounding, near_plane, quantile, scene_sphere
 from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.up_axis import guess_up
 from progdf.sh import basis, shade
 from progdf.threads import map_threads
 
+from .inner_rig import inner_rig
+
 BACKGROUND = (1.0, 1.0, 1.0)
 """Background of the views, rgb, 0 to 1."""
-
-INSIDE = (
-    "looks like a scene to stand inside, which cameras around it cannot show; give cameras with --cameras "
-    "(cameras.json, transforms.json or a COLMAP folder), or make some: open progdf view, look around, and "
-    "press F4 to keep each view"
-)
-"""Message, after the scene's name, for a scene that surrounds the viewer and has no cameras."""
-
 
 BACKGROUND_NAMES = ("white", "black", "checker")
 """Backgrounds of `on_backgrounds`."""
@@ -253,11 +247,13 @@ def region_rig(
     scene: Gaussians, region: Region, count: int, image_size: int, up: Tensor | None = None,
     elevations: tuple[float, float] = (5.0, 60.0), fills: bool = False,
 ) -> list[Camera]:  # fmt: skip
-    """Return the orbit rig of the scene, aimed at the region and zoomed in on it.
+    """Return a rig that is aimed at the region and zoomed in on it.
 
-    The cameras have the positions of a rig for the whole scene, so nothing new occludes the region. A hand
-    that is 3 % of the scene is trained on as many pixels as the whole body. The region's bounding sphere
-    fills 80 to 50 % of the pictures, in an order that also leaves no gap between the nearer views.
+    The cameras have the positions of a rig for the whole scene, so nothing new occludes the region. In a
+    scene that surrounds its cameras they stand at free places around the region, and there may be fewer, see
+    `inner_rig`. A hand that is 3 % of the scene is trained on as many pixels as the whole body. The
+    region's bounding sphere fills 80 to 50 % of the pictures, in an order that also leaves no gap between the
+    nearer views.
 
     Args:
         scene: see `orbit_rig`
@@ -268,12 +264,18 @@ def region_rig(
         elevations: see `orbit_rig`
         fills: True for edits that stay inside the region and need no surroundings. The longer side of the
             region's box then fills 95 to 75 % of the pictures, see `frame_box`
+
+    Raises:
+        ProgdfError: the scene surrounds its cameras, and no free place shows the region.
     """
     up = guess_up(scene) if up is None else up
-    rig = orbit_rig(scene, count, image_size, image_size, up=up, elevations=elevations)
-    steps = [(0.5 + i / _PLASTIC) % 1.0 for i in range(count)]
+    center, radius = region_sphere(scene, region)
+    if is_surrounding(scene, up):
+        rig = inner_rig(scene, region, count, image_size, up, (center, radius))
+    else:
+        rig = orbit_rig(scene, count, image_size, image_size, up=up, elevations=elevations)
+    steps = [(0.5 + i / _PLASTIC) % 1.0 for i in range(len(rig))]
     if not fills:
-        center, radius = region_sphere(scene, region)
         return [
             frame_sphere(camera, center, radius, 0.8 - 0.3 * step, up)
             for camera, step in zip(rig, steps, strict=True)

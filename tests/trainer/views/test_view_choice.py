@@ -163,14 +163,15 @@ def test_views_from_inside_show_every_wall() -> None:
     assert {"v30", "v31", "v32"} <= {view.camera.name for view in chosen.views}
 
 
-def test_indoor_scene_asks_for_its_cameras(tmp_path: Path) -> None:
+def test_indoor_scene_uses_free_places_or_its_own_cameras(tmp_path: Path) -> None:
     demo = room(1500)
     save_ply(tmp_path / "room.ply", demo.gaussians)
     settings = TrainingViewOptions(views=6, image_size=48)
     region = from_mask("rug", torch.isin(torch.arange(1500), demo.members("rug")))
-    with pytest.raises(ProgdfError, match="--cameras") as caught:
-        make_training_setup(settings, demo.gaussians, region)
-    assert "\n" not in str(caught.value)
+    placed = make_training_setup(settings, demo.gaussians, region)
+    assert len(placed.train) >= 4
+    assert placed.held_out
+    assert any("at free places around the region (a guess" in note for note in placed.notes)
     save_cameras(tmp_path / "c.json", [replace(c, lens=Lens(k1=0.1)) for c in demo.cameras])
     setup = make_training_setup(replace(settings, cameras=tmp_path / "c.json"), demo.gaussians, region)
     assert len(setup.train) + len(setup.held_out) == 6
