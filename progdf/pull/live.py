@@ -7,23 +7,22 @@ place.
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from scipy.sparse import csr_array
 from torch import Tensor
 
+from progdf.compose.composer import Composer
+from progdf.compose.layers import DEFAULT_BLEND, Layer
 from progdf.field.baked import AttributeBases, BakedField
 from progdf.gaussians import Gaussians, attribute_slices, pack
 from progdf.gdf.file import Gdf, fingerprint
-from progdf.rasterize.cpu.jit import kernel_cache
+from progdf.rasterize.cpu.compilation import compile_elsewhere, is_compiled, mark_compiled
 from progdf.region import Region, from_mask, whole_scene
 
 from .course import Handle, make_problem
@@ -33,8 +32,6 @@ from .graph import MAX_NODES, Floats, Rows
 
 _SETTLED_SHARE = 1e-3
 """Movement of a node in a step below which the pose counts as settled, in node spacings."""
-_COMPILE_POLL_S = 0.2  # seconds between two looks at the process that compiles
-_COMPILED = "pull.compiled"  # empty file beside the compiled kernels, once all of a live pull are there
 _CHANGED = ("means", "log_scales", "quats", "shN")  # attributes that a pull changes
 
 
@@ -181,6 +178,15 @@ def edit_in_progress(scene: Gaussians, members: Rows, channels: int, name: str) 
     return Gdf(name, from_mask(name, mask), field, fingerprint(scene), adds=True)
 
 
+def _in_bytes(field: BakedField) -> BakedField:
+    """Return a field whose residual bases are of the type of a saved edit."""
+    attributes = {
+        name: replace(bases, residual_basis=bases.residual_basis.to(torch.int8))
+        for name, bases in field.attributes.items()
+    }
+    return replace(field, attributes=attributes)
+
+
 def write_offsets(edit: Gdf, offsets: Tensor) -> None:
     """Replace the offsets of an edit in progress in place. [M,C]"""
     slices = attribute_slices(edit.field.channels)
@@ -190,7 +196,7 @@ def write_offsets(edit: Gdf, offsets: Tensor) -> None:
 
 def has_kernels() -> bool:
     """Return True if the kernels of a live pull have been compiled on this machine."""
-    return (kernel_cache() / _COMPILED).exists()
+    return is_compiled(__name__)
 
 
 def compile_kernels(stop: threading.Event) -> None:
@@ -201,12 +207,7 @@ def compile_kernels(stop: threading.Event) -> None:
     Args:
         stop: ends the work once it is set
     """
-    command = [sys.executable, "-P", "-c", "from progdf.pull.live import warm_up; warm_up()"]
-    silent = subprocess.DEVNULL
-    with suppress(OSError), subprocess.Popen(command, stdin=silent, stdout=silent, stderr=silent) as process:
-        while process.poll() is None:
-            if stop.wait(_COMPILE_POLL_S):
-                process.kill()
+    compile_elsewhere(__name__, stop)
 
 
 def warm_up() -> None:
@@ -224,6 +225,12 @@ def warm_up() -> None:
     )
     x, y, z = corners[0].tolist()
     handle = Handle(whole_scene(scene), (x, y, z), (0.0, 0.0, 0.0))
-    LivePull(scene, [handle]).step(HandlePose.of_shifts(np.array([[0.1, 0.0, 0.0]])), 1)
-    with suppress(OSError):
-        (kernel_cache() / _COMPILED).touch()
+    live = LivePull(scene, [handle])
+    step = live.step(HandlePose.of_shifts(np.array([[0.1, 0.0, 0.0]])), 1)
+    edit = edit_in_progress(scene, live.members, live.channels, "pulled")
+    write_offsets(edit, step.offsets)
+    saved = replace(edit, field=_in_bytes(edit.field))
+    composer = Composer(scene, (edit, saved))
+    for layers in ([Layer(edit)], [Layer(saved)], []):
+        composer.update(layers, DEFAULT_BLEND)
+    mark_compiled(__name__)

@@ -87,12 +87,13 @@ class CpuRenderer:
         self._grid: Lines | None = None  # ground grid in the copy
         self._changed = True  # whether Gaussians have changed since the kept picture
         self._pending: _PendingPicture | None = None
+        self._released = threading.Event()
         self.begun_ms = 0.0
 
     def upload(self, scene: Gaussians) -> None:
         """Load a whole scene. The renderer keeps copies, so `scene` may be changed in place afterwards."""
         self._cancel()
-        self._scene = LiveScene(scene)
+        self._scene = LiveScene(scene, self._released)
         self._rendered = None
         for side in (1, 2):  # compile now, not at the first move of a slider
             fill_screen(np.zeros((1, 1, 3), np.float32), np.zeros((side, side, 4), np.uint8))
@@ -214,6 +215,7 @@ class CpuRenderer:
     def release(self) -> None:
         """Release all resources."""
         self._cancel()
+        self._released.set()
         if self._copy is not None:
             self._copy.release()
 

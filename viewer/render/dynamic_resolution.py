@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -17,9 +18,11 @@ from numpy.typing import NDArray
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.rasterize import ActivatedGaussians
+from progdf.rasterize.cpu.compilation import compile_elsewhere, is_compiled, mark_compiled
 from progdf.rasterize.cpu.pyramid import Pyramid
 from progdf.rasterize.screen import fill_screen
 from progdf.sh import C0
+from progdf.threads import StoppedError
 from viewer.camera.view_camera import Vec3
 from viewer.gl.scene_textures import SPLATS_PER_ROW, row_runs
 
@@ -68,6 +71,9 @@ SLOW_SCENE_GAUSSIANS = 150_000
 
 JUMP_MS = 100.0
 """Drawing time in ms above which a picture after a click or a key is drawn in the background."""
+
+_SAMPLE = 8
+"""Number of Gaussians of a small pyramid with several nodes, so that its arrays are laid out as usual."""
 
 COARSE_PIXELS = 2
 """Number of window pixels per pixel of a coarse picture, along each axis."""
@@ -197,9 +203,10 @@ class LiveScene:
 
     Args:
         scene: scene to copy; pass later changes to `update`
+        stop: ends a compilation of the pyramid's kernels once it is set
     """
 
-    def __init__(self, scene: Gaussians) -> None:
+    def __init__(self, scene: Gaussians, stop: threading.Event | None = None) -> None:
         self.drawn = ActivatedGaussians(
             means=torch.from_numpy(_copy(scene.means)),
             quats=torch.from_numpy(_copy(scene.quats)),
@@ -217,6 +224,7 @@ class LiveScene:
         self._pyramid: Future[Pyramid] | None = None
         # outdated rows of the pyramid: 0 up to date, 1 colors only, 2 more. [N] uint8
         self._outdated = np.zeros(len(scene), np.uint8)
+        self._stop = stop or threading.Event()
 
     def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> None:
         """See `GlRenderer.update`."""
@@ -243,7 +251,7 @@ class LiveScene:
     def begin_pyramid(self) -> Future[Pyramid]:
         """Build the pyramid in another thread. Rows changed meanwhile are merged again afterwards."""
         self._outdated[:] = 0
-        self._pyramid = _worker().submit(_build, self.drawn)
+        self._pyramid = _worker().submit(_build, self.drawn, self._stop)
         return self._pyramid
 
     def draw_fewer(self, draw: Callable[[ActivatedGaussians], T], camera: Camera, pixels: int) -> T | None:
@@ -326,9 +334,34 @@ class LiveScene:
                 colors += share * (self._highlights[part, None, :3] - 0.5) / C0
 
 
-def _build(gaussians: ActivatedGaussians) -> Pyramid:
-    sample = Pyramid(gaussians.select(torch.arange(min(len(gaussians.means), 2))))
-    sample.simplify(Camera(torch.eye(4), torch.eye(3), 1, 1), 1)  # compile now, not at the first interaction
+def warm_up() -> None:
+    """Load the kernels of pyramids, or compile them the first time on a machine."""
+    random = torch.Generator().manual_seed(0)
+    means = torch.rand(_SAMPLE, 3, generator=random)
+    sample = ActivatedGaussians(
+        means=means,
+        quats=torch.eye(4)[:1].expand(_SAMPLE, 4).contiguous(),
+        scales=0.1 + means,
+        opacities=means[:, 0].contiguous(),
+        colors=means[:, None, :].contiguous(),
+    )
+    pyramid = Pyramid(sample)
+    pyramid.refresh(np.arange(_SAMPLE), colors_only=False)
+    pyramid.simplify(Camera(torch.eye(4), torch.eye(3), 1, 1), 1)
+    mark_compiled(__name__)
+
+
+def _build(gaussians: ActivatedGaussians, stop: threading.Event) -> Pyramid:
+    """Build a pyramid, after its kernels are compiled in another process.
+
+    Raises:
+        StoppedError: the scene was released meanwhile.
+    """
+    if not is_compiled(__name__):
+        compile_elsewhere(__name__, stop)
+    if stop.is_set():
+        raise StoppedError
+    warm_up()
     return Pyramid(gaussians)
 
 

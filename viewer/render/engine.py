@@ -23,6 +23,7 @@ from progdf.compose.layers import DEFAULT_BLEND, Gains, Layer
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
+from progdf.rasterize.screen import draw_lines_behind
 from progdf.scene.bounds import near_plane
 from viewer.camera.view_camera import Vec3, bounds_of, first_camera, half_camera, to_camera
 from viewer.state.layers import visible_layers
@@ -357,3 +358,6 @@ def draw_once() -> None:
     none = corners[:, None, :][:, :0]
     scene = Gaussians(corners, quats, corners - 2.0, corners[:, 0], corners, none)
     ViewEngine(None, scene).image(ViewState(camera=first_camera(scene)), (32, 24))
+    image = np.zeros((2, 2, 3), np.float32)
+    with draw_lines_behind(image, np.ones((2, 2), np.float32), np.zeros((1, 14), np.float32), 0.5):
+        pass

@@ -20,8 +20,11 @@ from viewer.app.app import App
 from viewer.app.parts import tidy as tidy_part
 from viewer.state import selection
 from viewer.state.commands import Plain
-from viewer.state.transient import Gizmo
+from viewer.state.transient import Gizmo, Pull
+from viewer.state.view_state import ViewState
 from viewer.state.workspace import with_transient
+
+from .test_pulling import drag, frame, place_of, pull_of
 
 pytestmark = pytest.mark.gl
 SHIFT = (0.5, 0.25, -0.125)
@@ -80,6 +83,10 @@ def keep_moved(app: App) -> Gizmo:
     return gizmo
 
 
+def select_none(view: ViewState) -> ViewState:
+    return replace(view, selection=selection.select_none(view.selection))
+
+
 def text(app: App) -> str:
     message = app.main_view.work.message
     return "" if message is None else message.text
@@ -109,6 +116,39 @@ def test_window_goes_on_while_a_layer_is_made(app: App, gate: Gate) -> None:
     members = bear().demo.members("scarf")
     moved = app.engine.gaussians(app.main_view.work.view).means[members] - bear().scene.means[members]
     assert torch.allclose(moved, torch.tensor(SHIFT), atol=1e-4)
+
+
+@pytest.mark.parametrize("canceled", [False, True])
+def test_pull_is_prepared_while_a_layer_is_made(app: App, gate: Gate, canceled: bool) -> None:
+    before = names(app)
+    keep_moved(app)
+    gate.reached.wait()
+    press(app, "Shift+P")
+    assert isinstance(app.main_view.work.transient.gizmo, Pull)
+    legs = bear().demo.members("legs")
+    x, y = place_of(app, int(legs[bear().scene.means[legs, 2].argmax()]))
+    app.main_view.store.change(select_none(app.main_view.work.view))
+    drag(app, (x, y), (20.0, 0.0))
+    assert [layer.name for layer in app.main_view.work.transient.live] == ["moved", "pulled"]
+    pose = pull_of(app).pose
+    assert pose.handles
+    press(app, "Enter")
+    assert text(app).startswith("moved is still being made"), "one at a time"
+    assert pull_of(app).pose == pose, "the handles stay"
+    if canceled:
+        app.main_view.messages.request(Plain("stop_making"))
+        app.draw()
+    gate.opened.set()
+    app.parts.maker.wait()
+    frame(app)
+    made = before if canceled else [*before, "moved"]
+    assert names(app) == made
+    assert pull_of(app).pose == pose
+    assert [layer.name for layer in app.main_view.work.transient.live] == ["pulled"]
+    press(app, "Enter")
+    app.parts.pulling.settle()
+    app.draw()
+    assert names(app) == [*made, "pulled"]
 
 
 def test_canceled_layer_returns_to_the_handles(app: App, gate: Gate) -> None:

@@ -13,11 +13,13 @@ import torch
 from imgui_bundle import imgui
 from imgui_bundle.imguizmo import im_guizmo
 
+from progdf.pull.live import LiveStep
 from tests.helpers.edits import bits
 from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import opened_document
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app.app import App
+from viewer.app.parts import pulling
 from viewer.app.pull.transform import gizmo_of, with_matrix
 from viewer.camera.decal_warp import project, vec3
 from viewer.camera.view_camera import to_camera
@@ -112,6 +114,37 @@ def test_surface_follows_the_pointer_and_enter_makes_a_layer(app: App) -> None:
     press(app, "Ctrl+Z")
     assert torch.equal(means(app), before)
     assert bits(app.documents.get().original) == original
+
+
+def test_held_drag_is_solved_on_until_it_settles(app: App, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pulling, "_ROUNDS", 1)
+    monkeypatch.setattr(pulling, "_FIRST_ROUNDS", 1)
+    press(app, "Shift+P")
+    start = on_scarf(app)
+    move(app, *start)
+    button(app, True)
+    glfw.set_cursor_pos(app.window.handle, start[0] + 60.0, start[1] - 40.0)
+    app.main_view.wake()
+    app.draw()
+    steps = list[LiveStep]()
+    for _ in range(3000):  # frames and looks without input, as the window's loop makes them
+        waits = [wait for wait in app._wait_times() if wait is not None]
+        app.window.wait(min(waits, default=0.02))
+        if app.main_view.is_due():
+            app.draw()
+        step = app.parts.pulling.last_step
+        if step is not None and (not steps or step is not steps[-1]):
+            steps.append(step)
+            if step.is_settled:
+                break
+    assert steps[-1].is_settled
+    assert len(steps) > 1, "the first round does not settle"
+    assert pull_of(app).drag is not None, "the button is still down"
+    last = means(app)
+    frame(app)
+    handle = pull_of(app).pose.handles[0]
+    assert float((means(app) - last).norm(dim=1).max()) < 0.02 * float(np.linalg.norm(handle.pull))
+    button(app, False)
 
 
 def test_escape_ends_the_drag_and_then_the_tool(app: App) -> None:

@@ -18,6 +18,7 @@ from viewer.app.parts.edits import EditActions
 from viewer.files.document import DocumentStore
 from viewer.jobs.training import edits_folder, free_path
 from viewer.state.commands import Action, Plain
+from viewer.state.transient import Pull
 from viewer.state.workspace import Store
 
 _POLL_S = 0.25  # seconds between two looks at the progress
@@ -201,5 +202,6 @@ class LayerMaker:
                 return
             making.future.result()  # raises its error
         making.done(True)
-        self._edits.add(making.path, making.name, deselect=True)
+        pulls = isinstance(self._store.get().transient.gizmo, Pull)  # the selection limits what it moves
+        self._edits.add(making.path, making.name, deselect=not pulls)
         self._messages.show(f"{making.name} is ready; drag its slider")

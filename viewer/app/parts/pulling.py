@@ -264,7 +264,8 @@ class PullActions:
         if self._pull is not None:
             self._leave()
             return
-        self._maker.check_free()
+        if self._keeping:  # its handles are on screen until then
+            self._maker.check_free()
         document = self._documents.get()
         if document.is_empty:
             raise ProgdfError("no scene is open; open one first")
@@ -436,6 +437,7 @@ class PullActions:
         if pull is None or problem is None or not any(handle.moves for handle in pull.pose.handles):
             self._leave()
             return
+        self._maker.check_free()
         original = self._documents.get().original
         bases = self._bases
 
