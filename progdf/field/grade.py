@@ -290,18 +290,24 @@ def fit_grade(
         coarser: step size in units of the 8-bit step; larger steps compress better
         bases: result of `residual_bases` for this rank, if already known
     """
-    root = weights.sqrt()[:, None]
-    rows = (course * root).flatten(1)
     exact, largest = bases or residual_bases(course, rank, weights)
     step = coarser / 127.0 * largest
-    rounded = (exact / (step or 1.0)).round().clamp(-254.0, 254.0)
-    levels = rounded.clamp(-127.0, 127.0).to(torch.int8)
-    overflow = (rounded - levels).to(torch.int8)  # overflow of outliers, stored in bases of their own
+    levels = torch.empty(exact.shape, dtype=torch.int8)
+    overflow = torch.empty_like(levels)  # overflow of outliers, stored in bases of their own
+    for part in _chunks(exact.shape[1]):
+        rounded = (exact[:, part] / (step or 1.0)).round_().clamp_(-254.0, 254.0)
+        levels[:, part] = rounded.clamp(-127.0, 127.0).to(torch.int8)
+        overflow[:, part] = (rounded - levels[:, part]).to(torch.int8)
     levels = torch.cat([levels, overflow[overflow.flatten(1).any(dim=1)]])
     scale = torch.full((len(levels), exact.shape[2]), step or 1.0)
-    columns = (levels * scale[:, None] * root).flatten(1)
-    normal = (columns @ columns.T).double()
-    coefficients = (rows @ columns.T).double() @ torch.linalg.pinv(normal, rtol=1e-9, hermitian=True)
+    normal = torch.zeros(len(levels), len(levels), dtype=torch.float64)
+    pull = torch.zeros(len(course), len(levels), dtype=torch.float64)
+    for part in _chunks(exact.shape[1]):
+        columns = levels[:, part] * scale[:, None]
+        weighted = (columns * weights[part, None]).flatten(1).T
+        normal += columns.flatten(1) @ weighted
+        pull += course[:, part].flatten(1) @ weighted
+    coefficients = pull @ torch.linalg.pinv(normal, rtol=1e-9, hermitian=True)
     coefficients[0] = 0.0
     return GradeForm(degree, knots.float(), table.float(), levels, scale, coefficients.float(), mask=mask)
 
@@ -318,13 +324,21 @@ def residual_bases(course: Tensor, rank: int, weights: Tensor) -> tuple[Tensor, 
     Returns:
         [R,M,3b]; the largest value of `_FITTING_SHARE` of the members, over all bases and channels
     """
-    rows = (course * weights.sqrt()[:, None]).flatten(1)
-    _, vectors = torch.linalg.eigh((rows @ rows.T).double())
+    products = torch.zeros(len(course), len(course), dtype=torch.float64)
+    for part in _chunks(course.shape[1]):
+        rows = (course[:, part] * weights[part, None].sqrt()).flatten(1)
+        products += rows @ rows.T
+    _, vectors = torch.linalg.eigh(products)
     mix = vectors.flip(1)[:, :rank].T.float()
     exact = (mix @ course.flatten(1)).reshape(rank, *course.shape[1:])
     fitting_count = max(1, math.ceil(_FITTING_SHARE * exact.shape[1]))
     largest = float(exact.abs().kthvalue(fitting_count, dim=1).values.max()) if rank else 0.0
     return exact, largest
+
+
+def _chunks(members: int) -> list[slice]:
+    """Return ranges of members for sums whose temporary arrays would be as large as the residuals."""
+    return [slice(begin, begin + _CHUNK_MEMBERS) for begin in range(0, members, _CHUNK_MEMBERS)]
 
 
 def rank_limit(course: Tensor) -> int:
