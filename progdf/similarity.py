@@ -337,7 +337,7 @@ def transform_rows(rows: Tensor, motion: AffineMotion, share: float = 1.0) -> Te
         axes = multiply_quats(turn, mirrored)
         return torch.cat([moved, log_scales + size, axes, rows[:, APPEARANCE], bands], dim=1)
     stretch = torch.linalg.matrix_exp(share * motion.stretch) @ torch.linalg.matrix_exp(thickness)
-    stretched, axes = _stretch_axes(log_scales, mirrored, stretch)
+    stretched, axes = stretch_axes(log_scales, mirrored, stretch)
     axes = multiply_quats(turn, axes)
     return torch.cat([moved, stretched, axes, rows[:, APPEARANCE], bands], dim=1)
 
@@ -352,7 +352,7 @@ def _turned_change(bands: Tensor, turn: Tensor) -> Tensor:
     return (matrix @ by_band).reshape(count, -1, 3).transpose(0, 1).flatten(1)
 
 
-def _stretch_axes(log_scales: Tensor, quats: Tensor, stretch: Tensor) -> tuple[Tensor, Tensor]:
+def stretch_axes(log_scales: Tensor, quats: Tensor, stretch: Tensor) -> tuple[Tensor, Tensor]:
     """Return log-scales and quaternions of Gaussians whose covariance Σ becomes G Σ Gᵀ.
 
     Cyclic Jacobi rotations of at most 45° from the given axes keep their order, so that sliders interpolate

@@ -27,6 +27,7 @@ from progdf.field.separable import course_field, fit_keyframes, opacity_course
 from progdf.gaussians import Gaussians, attribute_slices, concatenate, pack
 from progdf.gdf.anchors import free_anchors
 from progdf.gdf.file import ADDED_LOGIT, Gdf, anchor_added, fingerprint
+from progdf.gdf.motions import PartMotions
 from progdf.pull.course import PullCourse
 from progdf.region import Region, from_mask
 from progdf.scene.bounds import scene_sphere
@@ -162,7 +163,16 @@ def tidy(
     else:
         field = course_field(knots, offsets, _stored_tolerance(scene, steps))
     adds = all(_adds(step) for step in steps)
-    gdf = Gdf(name, region, field, fingerprint(scene), instruction, added=added, adds=adds)
+    gdf = Gdf(
+        name,
+        region,
+        field,
+        fingerprint(scene),
+        instruction,
+        added=added,
+        adds=adds,
+        motions=_part_motions(region, steps),
+    )
     added_count = 0 if added is None else len(added)
     if fill_count:
         gdf = anchor_added(gdf, scene, free=added_count - fill_count)
@@ -264,6 +274,25 @@ def bake(scene: Gaussians, steps: Sequence[Step]) -> Gaussians:
     remaining = scene.replace_rows(everything, rows)[mask]
     added = _copies(scene, steps)
     return remaining if added is None else concatenate([remaining, added])
+
+
+def _part_motions(region: Region, steps: Sequence[Step]) -> PartMotions | None:
+    """Return the motions of a region's members; None if no step moves them as parts, or one pulls them.
+
+    A pull bends its surface, so rows that lie on it follow their anchors.
+    """
+    moving = [step for step in steps if step.does == "transform" and step.motion is not None]
+    if not moving or any(step.does == "pull" for step in steps):
+        return None
+    code = torch.zeros(len(region), dtype=torch.int64)  # each step is a bit
+    for bit, step in enumerate(moving):
+        code += step.region.mask[region.members].long() << bit
+    codes, parts = torch.unique(code, return_inverse=True)
+    motions = tuple(
+        tuple(step.motion for bit, step in enumerate(moving) if step.motion is not None and known >> bit & 1)
+        for known in codes.tolist()
+    )
+    return PartMotions(parts, motions)
 
 
 def _adds(step: Step) -> bool:

@@ -17,7 +17,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from progdf.field.baked import AttributeBases, Segment, find_segment
+from progdf.field.baked import Segment, find_segment
+from progdf.field.stored_bases import StoredBases
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import Gdf
 from progdf.gdf.texture import ColorSplit, Split, color_split
@@ -44,6 +45,8 @@ from .layers import (
 )
 from .overlap import ARRANGED, find_paint
 from .paint_order import PaintOrder
+from .parents.carrier import Carrier
+from .parents.rows import is_move, still
 from .reference import Coverage, changed_rows, coverage
 from .states import Surface
 
@@ -55,40 +58,6 @@ CHUNK = 16_384
 
 _NO_ROWS = np.zeros(0, np.int64)
 _NO_VALUES = np.zeros(0, np.float32)  # stands for weights that are all 1, and for coverage that is all 0
-
-
-class _Bases(NamedTuple):
-    """Bases of one attribute of an edit, see `AttributeBases`."""
-
-    end: NDArray[Any]  # int8 or float32. [M,c]
-    residual: NDArray[Any]  # int8 or float32. [R,M,c]
-    scale: Floats  # [1+R,c]
-    coefficients: Floats  # [S,1+R]
-
-    @staticmethod
-    def of(bases: AttributeBases) -> _Bases:
-        stored = (bases.end_offset, bases.residual_basis)
-        levels = [part if part.dtype == torch.int8 else part.float() for part in stored]
-        tensors = (*levels, bases.scale, bases.coefficients)
-        return _Bases(*(tensor.contiguous().numpy() for tensor in tensors))
-
-    def factors(self, at: Segment) -> tuple[Rows, Floats]:
-        """Return the residual bases used in a segment of the knots, and the factors of all used bases.
-
-        Returns:
-            Indices of the residual bases with nonzero coefficients [U], and factors of basis 0 and of each of
-            them [1+U,c]. There are no factors if the attribute is unchanged.
-        """
-        right, share = at
-        row = self.coefficients[right]
-        if share != 1.0:
-            low = self.coefficients[right - 1]
-            row = low + np.float32(share) * (row - low)
-        used = np.flatnonzero(row[1:])
-        if not len(used) and row[0] == 0.0:
-            return used, np.zeros((0, self.end.shape[1]), np.float32)
-        bases = np.concatenate([[0], 1 + used])
-        return used, row[bases, None] * self.scale[bases]
 
 
 class _Members(NamedTuple):
@@ -141,17 +110,20 @@ class Composer:
     ) -> None:
         scene, extended = extend(scene, gdfs)
         self._scene = scene
-        self._gdfs = extended
         self._given = tuple(gdfs)  # kept alive, so that no other edit gets the same id
-        self._index = {id(gdf): i for edits in (gdfs, extended) for i, gdf in enumerate(edits)}
+        moves = extended
+        extended = tuple(still(gdf) for gdf in moves)
+        self._gdfs = extended
+        forms = gdfs, moves, extended
+        self._index = {id(gdf): i for edits in forms for i, gdf in enumerate(edits)}
         self._coverage: dict[int, Mapping[str, Tensor]] = {}
         self._split = split
         self._splits: dict[int, ColorSplit | None] = {}
-        self._color_bases: dict[tuple[int, str], _Bases] = {}
+        self._color_bases: dict[tuple[int, str], StoredBases] = {}
         self._repainted = frozenset[int]()  # edits whose discs have other colors than trained
         self._members = [gdf.region.members.numpy() for gdf in extended]
         fields = [gdf.field.attributes for gdf in extended]
-        self._bases = [{name: _Bases.of(bases) for name, bases in field.items()} for field in fields]
+        self._bases = [{name: StoredBases.of(bases) for name, bases in field.items()} for field in fields]
         self._leaves_paint = [gdf.anchors is not None and gdf.anchors.leaves_paint for gdf in extended]
         moving = {name for bases in self._bases for name in bases}
         self._covers = covers
@@ -175,6 +147,10 @@ class Composer:
         width = {name: math.prod(values.shape[1:]) for name, values in before.items()}
         self._before = {name: values.reshape(-1, width[name]).numpy() for name, values in before.items()}
         self._after = {name: values.view(-1, width[name]).numpy() for name, values in after.items()}
+        self._carrier = None
+        if any(is_move(gdf) for gdf in moves):
+            self._carrier = Carrier(scene, moves)
+            self.gaussians = replace(self.gaussians, **self._carrier.tensors)
         self._meets: dict[tuple[int, int], bool] = {}
         self._effects = Effects()
         self._plans: dict[frozenset[int], _Plan] = {}
@@ -216,6 +192,13 @@ class Composer:
         self._touched.clear()
         if not changed:
             return Change(np.zeros(0, np.int64), (), 0.0)
+        change = self._compose(stack, blend, changed)
+        if self._carrier is None:
+            return change
+        return self._carrier.carry(change, changed, stack, self._after)
+
+    def _compose(self, stack: Sequence[tuple[int, Layer]], blend: str, changed: frozenset[int]) -> Change:
+        """Compose the stack without its moves."""
         plan = self._plan(changed)
         # weights are summed by kind of change, so that a change reaches all attributes of its kinds
         kinds = {KINDS[name] for edit in changed for name in self._bases[edit]}
@@ -439,12 +422,12 @@ class Composer:
             hidden = np.float32(0.0)
             covered = _NO_VALUES
 
-    def _color_part(self, edit: int, name: str) -> _Bases | None:
+    def _color_part(self, edit: int, name: str) -> StoredBases | None:
         """Return the bases of an edit's color apart from its texture; None if this attribute has none."""
         split = self._splits.get(edit)
         parts = {} if split is None or split.color is None else split.color.attributes
         if name in parts and (edit, name) not in self._color_bases:
-            self._color_bases[edit, name] = _Bases.of(parts[name])
+            self._color_bases[edit, name] = StoredBases.of(parts[name])
         return self._color_bases.get((edit, name))
 
     def _add_pushes(

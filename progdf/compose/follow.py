@@ -120,7 +120,13 @@ def find_followers(gdfs: Sequence[Gdf], count: int) -> Followers | None:
     """
     members = [gdf.region.members.numpy() for gdf in gdfs]
     shaping = [edit for edit, gdf in enumerate(gdfs) if changes_shape(gdf)]
-    pushing = [edit for edit in shaping if not carries_others(gdfs[edit])]
+    # a move that leaves paint behind has no shape here, but pushed rows return to their own state
+    pushing = [
+        edit
+        for edit, gdf in enumerate(gdfs)
+        if not carries_others(gdf)
+        and (edit in shaping or (gdf.anchors is not None and gdf.anchors.leaves_paint))
+    ]
     others = [edit for edit in shaping if edit not in pushing]
     builder = _Builder(members, count)
     for edit, gdf in enumerate(gdfs):

@@ -47,6 +47,7 @@ from .layers import (
     needs_split,
 )
 from .overlap import ARRANGED, arrange, find_paint, paint_layers, tints_rim
+from .parents.rows import carry, still
 
 # changes that are clearly visible
 _VISIBLE_COLOR = 0.1  # sRGB, 0 to 1
@@ -209,8 +210,10 @@ def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = DEFAU
     active = [layer for layer in layers if layer.active]
     if not active or not len(scene):
         return scene
-    composed = _arrange(scene, _compose(scene, active, blend), active, blend)
-    return _follow(scene, composed, active, blend)
+    quiet = {key: still(gdf) for key, gdf in ((id(layer.gdf), layer.gdf) for layer in active)}
+    others = [replace(layer, gdf=quiet[id(layer.gdf)]) for layer in active]
+    composed = _arrange(scene, _compose(scene, others, blend), others, blend)
+    return carry(scene, _follow(scene, composed, others, blend), active)
 
 
 def _compose(scene: Gaussians, layers: Sequence[Layer], blend: str) -> Gaussians:

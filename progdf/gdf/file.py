@@ -28,6 +28,7 @@ from progdf.region import Region, whole_scene
 from . import header
 from .anchors import NOTHING, PUSHED_SHAPE, Anchors, choose_anchors, join_free
 from .header import SceneFingerprint
+from .motions import PartMotions, motion_records
 
 _FINGERPRINTS: MutableMapping[Tensor, tuple[tuple[int, Origin] | None, str]] = WeakIdKeyDictionary()
 """Cache: means tensor → its version and the scene's origin, and the hash. Entries end with their tensor."""
@@ -68,6 +69,8 @@ class Gdf:
     anchors_found: bool = False  # the anchors were chosen on load, as the file's format has none
     adds: bool = False  # its changes add to those of lower layers and never hide them, as a pull's do
     from_others: int = 0  # number of members, the last ones, that other edits add; see `extend`
+    # motions of the region's members, by which the edit carries other layers; None: it carries none
+    motions: PartMotions | None = None
 
     def __post_init__(self) -> None:
         if (self.field.attributes or self.added is not None) and self.field.members != self.members:
@@ -176,7 +179,7 @@ def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
     field, tensors = header.pack_field(gdf.field)
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     tensors |= header.pack_region(gdf.region) | header.pack_added(gdf.added)
-    tensors |= header.pack_anchors(gdf.anchors)
+    tensors |= header.pack_anchors(gdf.anchors) | header.pack_parts(gdf.motions)
     broken = _find_non_finite(tensors)
     if broken:
         raise ValueError(f"{broken} of {gdf.name} has a number that is not finite")
@@ -196,6 +199,7 @@ def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
         rim=gdf.anchors is not None and gdf.anchors.rim is not None,
         leaves_paint=gdf.anchors is not None and gdf.anchors.leaves_paint,
         adds=gdf.adds,
+        motions=[] if gdf.motions is None else motion_records(gdf.motions),
     )
     content = header.pack_file(head, tensors)
     try:
@@ -360,6 +364,7 @@ def _unpack(head: header.GdfHeader, tensors: Mapping[str, Tensor]) -> Gdf:
         anchors=header.unpack_anchors(head, tensors),
         anchors_found=header.is_before_anchors(head) and bool(head.report),
         adds=head.adds,
+        motions=header.unpack_motions(head, tensors),
     )
 
 

@@ -36,8 +36,9 @@ from progdf.io.tensors import check_tensor, inflate
 from progdf.region import Region
 
 from .anchors import MAX_ANCHORS, PUSHED_SHAPE, Anchors
+from .motions import MotionRecord, PartMotions, part_motions
 
-FORMAT = 9
+FORMAT = 10
 """Version of the file format."""
 
 MAX_GAUSSIANS = 1 << 26
@@ -52,6 +53,7 @@ _ADDED_PREFIX = "added."
 _ANCHORED_FORMAT = 8  # first format that stores anchors of added rows
 _KINDS = ("geometry", "opacity", "color")  # kinds of change, see `progdf.compose.layers.KINDS`
 _NETWORK_PREFIX = "network."
+_PARTS = "motions.parts"
 _END_CORRECTION_PREFIX = "end_correction."
 _OLDEST_FORMAT = 3  # oldest format that is read
 
@@ -102,6 +104,7 @@ class GdfHeader(msgspec.Struct, frozen=True):
     leaves_paint: bool = False  # see `Anchors.leaves_paint`
     adds: bool = False  # see `Gdf.adds`
     rim: bool = False  # the added rows have shares of a rim, see `Anchors.rim`
+    motions: list[list[MotionRecord]] = []  # motions of each part, see `Gdf.motions`; empty: none
     format: int = FORMAT
     sha256: str = ""
 
@@ -327,6 +330,28 @@ def unpack_anchors(header: GdfHeader, tensors: Mapping[str, Tensor]) -> Anchors 
     if unknown:
         raise ValueError(f"unknown kind of change {min(unknown)}")
     return Anchors(rows.long(), tensors["anchors.weights"], frozenset(pushes), rim, header.leaves_paint)
+
+
+def pack_parts(motions: PartMotions | None) -> dict[str, Tensor]:
+    """Return the tensor of the parts of moved members by its name in the file; a single part needs none."""
+    if motions is None or len(motions.motions) < 2:
+        return {}
+    return {_PARTS: motions.parts.int()}
+
+
+def unpack_motions(header: GdfHeader, tensors: Mapping[str, Tensor]) -> PartMotions | None:
+    """Return the motions of the members, or None; the inverse of `pack_parts` and `motion_records`.
+
+    Raises:
+        ValueError, KeyError: there is no part for every member.
+    """
+    if not header.motions:
+        return None
+    parts = torch.zeros(header.members, dtype=torch.int32)
+    if len(header.motions) > 1:
+        parts = tensors[_PARTS]
+        check_tensor(_PARTS, parts, (header.members,), torch.int32)
+    return part_motions(header.motions, parts.long())
 
 
 def is_before_anchors(header: GdfHeader) -> bool:

@@ -30,6 +30,7 @@ from progdf.compose.follow import (
 )
 from progdf.compose.layers import KINDS
 from progdf.compose.overlap import ARRANGED, find_paint
+from progdf.compose.parents.rows import MOVED, still
 from progdf.compose.reference import coverage
 from progdf.errors import ProgdfError
 from progdf.field.baked import AttributeBases, BakedField, GradeForm
@@ -39,6 +40,8 @@ from progdf.formats.packed.compressed_ply import morton_order
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import UNSEEN_LOGIT, Gdf
 from progdf.gdf.texture import ColorSplit, color_split
+
+from .moves import pack_moves
 
 DRAWN_SH = (0, 3, 8, 15)
 """Number of SH coefficients above the first, by degree."""
@@ -136,6 +139,8 @@ def pack(
     scene, kept = _finite(scene), min(DRAWN_SH[degree], scene.shN.shape[1])
     groups = _groups(len(scene), [gdf.region.members.numpy() for gdf in gdfs])
     seen = (groups > 0) | (scene.logit_opacities.numpy() >= UNSEEN_LOGIT)
+    moving = gdfs
+    gdfs = [still(gdf) for gdf in gdfs]
     order = _order(scene, groups)
     order = order[seen[order]]
     count = int((groups[order] > 0).sum())
@@ -144,7 +149,7 @@ def pack(
     inside = [_ascending(place[gdf.region.members.numpy()]) for gdf in gdfs]
     arrays = Arrays()
     exact = quality == "exact"
-    attributes, decoded_scene = _scene(arrays, scene, gdfs, order, count, kept, exact)
+    attributes, decoded_scene = _scene(arrays, scene, moving, order, count, kept, exact)
     overlaps = len(gdfs) > 1 and sum(map(len, inside)) > count
     splits = {edit: color_split(scene, gdfs[edit]) for edit in more["split"]}
     paints = []
@@ -175,6 +180,14 @@ def pack(
         ],
         "surface": _surface(arrays, scene, gdfs, place, inside, exact),
         "paint": _paint(arrays, scene, gdfs, place, inside, kept=kept, exact=exact, splits=splits),
+        "moves": pack_moves(
+            moving,
+            place,
+            inside,
+            kept,
+            arrays.add,
+            lambda gdf, rows: _edit(arrays, gdf, rows, kept, exact, shares=None, split=None),
+        ),
         "sphere": _sphere(kept),
     }
     text = json.dumps(header, ensure_ascii=True, allow_nan=False, separators=(",", ":")).encode()
@@ -193,6 +206,8 @@ def _scene(
     """Append the attributes, the first `count` rows separately; return their entries and the decoded
     scene."""
     moved = {name for gdf in gdfs for name in gdf.field.attributes}
+    if any(gdf.motions is not None for gdf in gdfs):
+        moved.update(MOVED)
     if any(gdf.anchors is not None for gdf in gdfs):
         moved.update(FOLLOWED)
         moved.update(ARRANGED)

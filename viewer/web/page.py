@@ -30,6 +30,7 @@ MODULES = (
     "data",
     "grade",
     "follow",
+    "moves",
     "paint",
     "compose",
     "sort",

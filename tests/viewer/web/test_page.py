@@ -26,6 +26,9 @@ from progdf.gaussians import ATTRIBUTES, Gaussians, pack
 from progdf.gdf.anchors import free_anchors
 from progdf.gdf.file import Gdf, anchor_added, load_gdf, save_gdf
 from progdf.rasterize import render
+from progdf.region import from_mask
+from progdf.similarity import affine_motion
+from progdf.tidy import Step, leave_paint, mirror, similarity, tidy
 from tests.helpers.draws import Draws
 from tests.helpers.edits import curved_field, edit_of, growing, painted, rimmed, some_rows
 from tests.helpers.scenes import random_gaussians
@@ -145,6 +148,20 @@ def leaving_paint(scene: Gaussians) -> Gdf:
     return replace(edit, anchors=replace(free_anchors(0), leaves_paint=True))
 
 
+def moves_of(scene: Gaussians) -> list[Gdf]:
+    """Return moves that carry other edits: turned and scaled, mirrored, and stretched beside a removal."""
+    half = from_mask("half", scene.means[:, 0] > 0)
+    other = from_mask("other", scene.means[:, 1] > 0)
+    stretch = affine_motion(torch.diag(torch.tensor([1.8, 1.0, 0.6])), torch.ones(3))
+    turn = similarity((1.0, -2.0, 0.5), (0.3, -0.2, 0.9), 1.5)
+    return [
+        tidy(scene, [Step("transform", half, turn)], "turned"),
+        tidy(scene, [Step("transform", other, mirror(1))], "mirrored"),
+        leave_paint(tidy(scene, [Step("transform", half, stretch), Step("remove", other)], "stretched")),
+        tidy(scene, [Step("transform", half, turn), Step("transform", other, stretch)], "two"),
+    ]
+
+
 def document_of(scene: Gaussians, gdfs: Sequence[Gdf]) -> tuple[Document, ViewState]:
     layers = tuple(LayerState(i, gdf.name) for i, gdf in enumerate(gdfs))
     return Document("scene.ply", scene, tuple(gdfs)), ViewState(camera=first_camera(scene), layers=layers)
@@ -187,6 +204,7 @@ def test_page_computes_every_attribute_like_compose_for_every_rule(
         rimmed(painted(scene, 40, 12, "heart"), 2),
         anchor_added(growing(scene, some_rows(scene, 40, 6), 15, 6, "grown"), scene),
         leaving_paint(scene),
+        *moves_of(scene),
     ]
     document, view = document_of(scene, gdfs)
     divided = tuple(replace(layer, gains=Gains(color=0.5)) for layer in view.layers)
@@ -232,7 +250,9 @@ def test_page_computes_every_attribute_like_compose_for_every_rule(
             if number < 2 * len(gdfs):  # one layer at an endpoint
                 assert page.tobytes() == numbers.tobytes(), (name, number)
             else:
-                assert np.abs(page - numbers).max() <= 1e-6 * max(1.0, np.abs(numbers).max()), (name, blend)
+                # axes of stretched, nearly round Gaussians depend on the last bits
+                error = 1e-5 if name == "quats" else 1e-6
+                assert np.abs(page - numbers).max() <= error * max(1.0, np.abs(numbers).max()), (name, blend)
 
 
 @pytest.fixture(scope="module")

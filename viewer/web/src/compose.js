@@ -2,6 +2,7 @@
 // edits are adjacent and composed together, as a segment.
 
 import { FOLLOWED, Surface } from "./follow.js";
+import { MOVED, Carrier } from "./moves.js";
 import { ARRANGED, PaintOrder } from "./paint.js";
 import { GradedColors, findSegment } from "./grade.js";
 
@@ -94,6 +95,8 @@ export class Composer {
     const followed = header.surface?.banded && header.sh ? [...FOLLOWED, "shN"] : FOLLOWED;
     for (const name of follows ? followed : []) this.moving.add(name);
     for (const name of header.paint ? ARRANGED : []) this.moving.add(name);
+    const composed = new Set(this.moving), moves = header.moves?.length ? header.moves : null;
+    for (const name of moves ? MOVED : []) if (this.widths[name]) this.moving.add(name);
     if (this.edits.some((edit) => edit.split?.discs)) this.moving.add("sh0");
     for (const name of this.moving) {
       for (const each of [name, PARTNERS[name]]) {
@@ -104,6 +107,8 @@ export class Composer {
         this.after[each] = this.moving.has(each) ? numbers.slice() : numbers;
       }
     }
+    this.below = { ...this.after };  // before the moves
+    for (const name of moves ? MOVED : []) if (this.after[name]) this.after[name] = this.below[name].slice();
     const known = this.edits.map(() => 0);  // members of the previous segments
     let first = 0, most = 0;
     const states = header.surface && new Composer(container.within(header.surface));
@@ -114,7 +119,7 @@ export class Composer {
     this.segments = header.segments.map(([rows, edits]) => {
       const followers = following.filter((f) => this.surface.row(f) >= first && this.surface.row(f) < first + rows);
       const paints = this.paint?.touches(first, rows);
-      const names = [...this.moving].filter((name) =>
+      const names = [...composed].filter((name) =>
         (paints && ARRANGED.includes(name)) || (followers.length && followed.includes(name)) ||
         (name === "sh0" && edits.some((edit) => this.edits[edit].split?.discs)) ||
         edits.some((edit) => this.edits[edit].attributes[name]));
@@ -127,6 +132,7 @@ export class Composer {
       most = Math.max(most, ...names.map((name) => rows * this.widths[name]));
       return segment;
     });
+    this.carrier = moves && new Carrier(moves, moves.map(({ field }) => new Edit(container, field)), container, this);
     this.scratch = [new Float32Array(most), new Float32Array(most), new Float32Array(most)];
     this.blend = "";
   }
@@ -139,22 +145,24 @@ export class Composer {
     const ranges = [], names = new Set(), again = blend !== this.blend;
     this.blend = blend;
     const surfaceMoved = this.surface?.update(active, blend), paintMoved = this.paint?.update(active, blend);
-    const redone = [];
+    const redone = [], movesChanged = this.carrier?.update(active);
     for (const segment of this.segments) {
       const stack = active.filter((layer) => layer.edit in segment.members), { effects, first, rows } = segment;
       let same = 0;
       if (!again) while (same < stack.length && stack[same].effect === effects[same]) same++;
-      const depends = (surfaceMoved && segment.followers.length) || (paintMoved && segment.paints);
+      const depends = (surfaceMoved && segment.followers.length) || (paintMoved && segment.paints) ||
+        (movesChanged && this.carrier.touches(segment));
       if (same === stack.length && same === effects.length && !depends) continue;
       this.#compose(segment, stack, same);
       redone.push(segment);
       segment.effects = stack.map((layer) => layer.effect);
-      for (const name of segment.names) names.add(name);
+      for (const name of this.carrier?.touches(segment) ? this.moving : segment.names) names.add(name);
       if (ranges.at(-1)?.[1] === first) ranges.at(-1)[1] = first + rows;
       else ranges.push([first, first + rows]);
     }
-    this.paint?.arrange(this.after, redone);
-    for (const { followers } of redone) for (const f of followers) this.surface.carry(this.after, f);
+    this.paint?.arrange(this.below, redone);
+    for (const { followers } of redone) for (const f of followers) this.surface.carry(this.below, f);
+    for (const segment of redone) this.carrier?.carry(segment);
     return ranges.length ? { ranges, names: [...names] } : null;
   }
 
@@ -165,7 +173,7 @@ export class Composer {
     segment.below = kept;
     for (const name of names) {
       const width = this.widths[name];
-      totals[name] = this.after[name].subarray(first * width, (first + rows) * width);
+      totals[name] = this.below[name].subarray(first * width, (first + rows) * width);
       if (kept) totals[name].set(kept.totals[name]);
       else totals[name].fill(-0);
     }

@@ -104,7 +104,7 @@ function carryGeometry(to, from, anchors) {
 
 // Returns a function that turns the higher SH bands of a row of shN by a unit quaternion. The bands follow from the
 // colors that they show in directions that are turned back, see progdf/sh.py.
-function bandTurner(degree, inverse) {
+export function bandTurner(degree, inverse) {
   const bands = (degree + 1) ** 2, count = inverse.length / bands, golden = Math.PI * (1 + Math.sqrt(5));
   const directions = Array.from({ length: count }, (_, j) => {
     const z = 1 - (2 * j + 1) / count, radius = Math.sqrt(1 - z * z), angle = golden * (j + 0.5);
@@ -157,7 +157,7 @@ function normalized(q) {
   return length > 0 ? Array.from(q, (x) => x / length) : [1, 0, 0, 0];
 }
 
-function multiply([aw, ax, ay, az], [bw, bx, by, bz]) {
+export function multiply([aw, ax, ay, az], [bw, bx, by, bz]) {
   return [
     aw * bw - ax * bx - ay * by - az * bz, aw * bx + ax * bw + ay * bz - az * by,
     aw * by - ax * bz + ay * bw + az * bx, aw * bz + ax * by - ay * bx + az * bw,
