@@ -48,7 +48,7 @@ from .forward import (
     project,
 )  # fmt: skip
 from .jit import kernel
-from .weights import ListedWeights, ListSelection, Runs, join_runs, list_weights, new_runs, take_runs
+from .weights import ListedWeights, ListSelection, Spans, join_spans, list_weights, new_spans, take_spans
 
 Array = NDArray[Any]
 _T = TypeVar("_T")
@@ -265,19 +265,19 @@ def color_map(
     listed = ListSelection(row_of, positions, np.float32(lost))
     splats, lists = bin_view(gaussians, pinhole)
 
-    def list_tiles(begin: int, end: int) -> Runs:
-        max_runs = int(lists.starts[end] - lists.starts[begin])
+    def list_tiles(begin: int, end: int) -> Spans:
+        pairs = int(lists.starts[end] - lists.starts[begin])
         room = -1
-        entry = ENTRY_ROOM * max_runs
+        entry = ENTRY_ROOM * pairs
         while entry > room:
             room = entry
-            out = new_runs(end - begin, max_runs, entry)
-            run, span, entry = list_weights(begin, end, new_scratch(), splats, lists, pinhole, listed, out)
-        return take_runs(out, run, span, entry, is_exact=lost == 0.0)
+            out = new_spans(end - begin, pairs, entry)
+            span, entry = list_weights(begin, end, new_scratch(), splats, lists, pinhole, listed, out)
+        return take_spans(out, span, entry, is_exact=lost == 0.0)
 
-    runs = join_runs(_share(list_tiles, len(lists.starts) - 1, _MIN_TILES, _MAX_TILES))
+    spans = join_spans(_share(list_tiles, len(lists.starts) - 1, _MIN_TILES, _MAX_TILES))
     size = (y1 - y0, x1 - x0) if pixels is None else (len(pixels),)
-    return ListedWeights(len(rows), size, runs)
+    return ListedWeights(len(rows), size, spans)
 
 
 @kernel(cache=True)
