@@ -136,17 +136,37 @@ class ViewChoice:
         return "; ".join(parts)
 
 
+@dataclass(frozen=True)
+class CameraChoice:
+    """Chosen cameras of an edit, before their views are rendered. See `ViewChoice`."""
+
+    cameras: Sequence[Camera]  # in the order of the list
+    shown: Visibility
+    offered: int
+    unseeing: int
+    scant: int
+
+    def views(self, scene: Gaussians, region: Region, background: Tensor) -> ViewChoice:
+        """Render the views. background: rgb. [3]"""
+        views = map_threads(lambda camera: make_view(scene, region, camera, background), self.cameras)
+        return ViewChoice(tuple(views), self.shown, self.offered, self.unseeing, self.scant)
+
+
 def choose_views(
     scene: Gaussians, region: Region, cameras: Sequence[Camera], count: int, background: Tensor
 ) -> ViewChoice:
-    """Return up to `count` views that cover the region from as many sides as the cameras do.
+    """Return up to `count` views that cover the region, see `choose_cameras`. background: rgb. [3]"""
+    return choose_cameras(scene, region, cameras, count).views(scene, region, background)
+
+
+def choose_cameras(scene: Gaussians, region: Region, cameras: Sequence[Camera], count: int) -> CameraChoice:
+    """Return up to `count` cameras that cover the region from as many sides as all of them do.
 
     Args:
         scene: the original
         region: the region to cover
         cameras: any number in any order; the choice hardly depends on the order
-        count: maximum number of views, ≥ 1
-        background: rgb. [3]
+        count: maximum number of cameras, ≥ 1
 
     Raises:
         ProgdfError: no camera sees the region.
@@ -172,12 +192,8 @@ def choose_views(
     toward = _toward(positions, [cameras[candidates[k]] for k in sufficient])
     visibility = Visibility(_relative_visibility(weights[sufficient]), toward, _mean_spacing(count))
     chosen = _greedy(visibility, count) if len(sufficient) > count else list(range(len(sufficient)))
-    return ViewChoice(
-        tuple(
-            map_threads(
-                lambda k: make_view(scene, region, cameras[candidates[sufficient[k]]], background), chosen
-            )
-        ),
+    return CameraChoice(
+        [cameras[candidates[sufficient[k]]] for k in chosen],
         Visibility(visibility.visible[chosen], visibility.toward[chosen], visibility.reach),
         len(cameras),
         int((~framed.any(dim=1)).sum()) + int((~seeing).sum()),

@@ -24,6 +24,7 @@ from trainer.options import COLOR_VIEWS, VIEWS, TrainingViewOptions
 
 from .choose import (
     ViewChoice,
+    choose_cameras,
     choose_views,
     in_frame,
     load_given_cameras,
@@ -238,10 +239,11 @@ def _rig_views(
         background: rgb. [3]
     """
     cameras = rig(count)
-    choice = choose_views(scene, region, cameras, count, background)
-    if len(choice.views) < count:
-        cameras = rig(min(-(-count * count // len(choice.views)), count + count // 2))
-        choice = choose_views(scene, region, cameras, count, background)
+    chosen = choose_cameras(scene, region, cameras, count)
+    if len(chosen.cameras) < count:
+        cameras = rig(min(-(-count * count // len(chosen.cameras)), count + count // 2))
+        chosen = choose_cameras(scene, region, cameras, count)
+    choice = chosen.views(scene, region, background)
     train = list(choice.views)
     indices = {camera.name: i for i, camera in enumerate(cameras)}
     between = rig(2 * len(cameras))[1::2]
