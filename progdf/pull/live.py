@@ -214,12 +214,12 @@ def warm_up() -> None:
     """Load the kernels of a live pull, or compile them the first time on a machine."""
     corners = torch.cartesian_prod(*[torch.linspace(-1.0, 1.0, 4)] * 3)
     count = len(corners)
-    quats = torch.eye(4)[:1].expand(count, 4)
+    quats = torch.eye(4)[:1].repeat(count, 1)
     scene = Gaussians(
         means=corners,
         quats=quats,
         log_scales=corners - 2.0,
-        logit_opacities=corners[:, 0],
+        logit_opacities=corners[:, 0].clone(),
         sh0=corners,
         shN=torch.zeros(count, 3, 3),
     )

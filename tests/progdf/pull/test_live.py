@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +18,8 @@ from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.pull.course import Handle, pull
 from progdf.pull.grips import MAX_GRIP_POINTS, connected_rows, grip_points, with_grips
-from progdf.pull.live import HandlePose, LivePull, edit_in_progress, write_offsets
+from progdf.pull.live import HandlePose, LivePull, edit_in_progress, has_kernels, warm_up, write_offsets
+from progdf.rasterize.cpu import compilation
 from progdf.region import Region, whole_scene
 from progdf.tidy import Step, similarity, tidy
 from tests.helpers.edits import painted
@@ -200,3 +202,10 @@ def test_paint_follows_the_edit_in_progress() -> None:
             torch.testing.assert_close(getattr(composer.gaussians, name), getattr(plain, name))
         followed = composer.gaussians.means[300:] - compose_layers(drawn, layers[:1], "adjust").means[300:]
         assert followed.any()
+
+
+def test_warm_up_marks_the_kernels_as_compiled(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(compilation, "kernel_cache", lambda: tmp_path)
+    assert not has_kernels()
+    warm_up()
+    assert has_kernels()

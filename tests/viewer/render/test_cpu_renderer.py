@@ -17,6 +17,8 @@ from progdf.field.baked import AttributeBases, BakedField
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, fingerprint
 from progdf.metrics.image import psnr
+from progdf.rasterize import ActivatedGaussians
+from progdf.rasterize.cpu.pyramid import Pyramid
 from progdf.region import Region
 from tests.helpers.stacks import Stack
 from viewer.camera.view_camera import first_camera, to_camera
@@ -281,3 +283,19 @@ def test_finished_bands_are_shown_before_the_others(
     assert np.array_equal(read_rgb(screen, SIZE), full)
     screen.release()
     engine.release()
+
+
+def test_small_pyramid_compiles_the_kernels_of_large_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = list[Pyramid]()
+
+    def build(gaussians: ActivatedGaussians) -> Pyramid:
+        made.append(Pyramid(gaussians))
+        return made[-1]
+
+    monkeypatch.setattr(dynamic_resolution, "Pyramid", build)
+    dynamic_resolution.warm_up()
+    dynamic_resolution.LiveScene(bear(2000).gaussians).begin_pyramid().result()
+    small, *_, large = made
+    for sample, array in zip((*small.scene, *small.nodes[:4]), (*large.scene, *large.nodes[:4]), strict=True):
+        assert (sample.dtype, sample.ndim) == (array.dtype, array.ndim)
+        assert sample.flags.c_contiguous == array.flags.c_contiguous, "else each kernel compiles twice"
