@@ -117,6 +117,8 @@ class EditorOptions:
     """api: reference pictures that the model accepts beside the view, 0 to 2."""
     api_mask: bool = False
     """api: send the region as the mask of the call, if the model takes one."""
+    degrees: Annotated[str, absent_option("TEXT|TEXT", "none")] = ""
+    """api, comfy: prompts for weaker edits, separated by |; the pictures give their strengths."""
     price_per_call: float = 0.0
     """api, comfy: price of one call, in any currency, from which the cost of the run is estimated."""
     yes: bool = False

@@ -19,7 +19,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Annotated, Literal
@@ -43,6 +43,7 @@ from trainer.editors import check_new_editor, editor_row, make_editor
 from trainer.editors.adapters import models_here
 from trainer.editors.base import EditorInput, ImageEditor
 from trainer.editors.instruct import InstructEditor, instruct
+from trainer.editors.server.editor import check_served
 from trainer.fit.draft import DraftViews, draft_grade, draft_views
 from trainer.options import EditorOptions, RegionOptions, TrainingViewOptions
 from trainer.regions.from_pictures import RegionRequest, region_kinds
@@ -99,6 +100,8 @@ class PreviewRequest(msgspec.Struct, frozen=True):
     width: _Side
     height: _Side
     model: str = ""
+    api_url: str = ""
+    prompt: str = ""
     seed: int = 0
     estimate: bool = False  # also estimate how close training will come to a picture
 
@@ -141,7 +144,7 @@ class Previewer:
         Raises:
             ProgdfError: invalid region or editor.
         """
-        options = EditorOptions(request.editor, model=request.model)
+        options = _options(request)
         check_new_editor(options)
         if not editor_row(options).color_function:
             return None
@@ -177,14 +180,21 @@ class Previewer:
         """
         # cache key of region, background and camera
         seen = msgspec.structs.replace(
-            request, number=0, out="", editor="", strength=0.0, model="", seed=0, estimate=False
+            request,
+            number=0,
+            out="",
+            editor="",
+            strength=0.0,
+            model="",
+            api_url="",
+            prompt="",
+            seed=0,
+            estimate=False,
         )
         view = self._view(seen)
         if not bool((view.mask > 0.0).any()):
             return view.image
-        options = EditorOptions(
-            request.editor, model=request.model, seed=max(0, request.seed), cache=self._cache
-        )
+        options = replace(_options(request), seed=max(0, request.seed), cache=self._cache)
         return self._editor(options, seen).edit(view, request.strength)
 
     def nearness(self, request: PreviewRequest) -> Nearness:
@@ -230,7 +240,10 @@ class Previewer:
 
     def follows(self, request: PreviewRequest) -> bool:
         """Return True if the editor's model takes a prompt and a reference picture."""
-        paints = editor_row(EditorOptions(request.editor)).model is not None
+        row = editor_row(EditorOptions(request.editor))
+        if row.sends_pictures:
+            return check_served(_options(request)).references > 0
+        paints = row.model is not None
         return paints and self._painter(request).references > 0
 
     def _painter(self, request: PreviewRequest) -> InstructEditor:
@@ -255,6 +268,11 @@ class Previewer:
         region = self._region(seen.region)
         glances = partial(render_thumbnails, TrainingViewOptions(scene=self._path), self.scene, region)
         return make_editor(options, self.scene, region, [self._view(seen)], glances)
+
+
+def _options(request: PreviewRequest) -> EditorOptions:
+    """Return the options of the request's editor."""
+    return EditorOptions(request.editor, model=request.model, api_url=request.api_url, prompt=request.prompt)
 
 
 def draft_nearness(psnr: float) -> Nearness:

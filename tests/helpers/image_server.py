@@ -28,6 +28,7 @@ class Call:
     pictures: tuple[Image.Image, ...]
     fields: Mapping[str, str]  # model, prompt, size, …
     key: str  # the bearer token
+    mask: Image.Image | None = None
 
 
 @dataclass(frozen=True)
@@ -134,14 +135,18 @@ def _parse(kind: str, body: bytes, key: str) -> Call:
     message = BytesParser(policy=HTTP).parsebytes(f"Content-Type: {kind}\r\n\r\n".encode() + body)
     pictures = []
     fields = {}
+    mask = None
     for part in message.iter_parts():
         name = str(part.get_param("name", header="content-disposition"))
         content = part.get_payload(decode=True)
         assert isinstance(content, bytes)
-        if name in ("image", "image[]"):
+        if name in ("image", "image[]", "mask"):
             picture = Image.open(io.BytesIO(content))
             picture.load()
-            pictures.append(picture)
+            if name == "mask":
+                mask = picture
+            else:
+                pictures.append(picture)
         else:
             fields[name] = content.decode()
-    return Call(tuple(pictures), fields, key)
+    return Call(tuple(pictures), fields, key, mask)

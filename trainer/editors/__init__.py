@@ -164,6 +164,7 @@ EDITORS = {
             "api_url",
             "api_references",
             "api_mask",
+            "degrees",
             "price_per_call",
             "yes",
             "anchor",
@@ -185,6 +186,7 @@ EDITORS = {
         options=(
             "prompt",
             "api_url",
+            "degrees",
             "price_per_call",
             "yes",
             "anchor",

@@ -41,6 +41,7 @@ class PaintRequest:
     softness: float = 1.0
     source: Tensor | None = None  # result at strength 0, as large as `picture`; None: `picture`. [H,W,3]
     seed: int | None = None  # seed of the noise; None: the editor's
+    prompt: str = ""  # instruction instead of the editor's; "": the editor's
 
 
 class FramePainter(ABC):
@@ -64,6 +65,11 @@ class FramePainter(ABC):
     @abstractmethod
     def references(self) -> int:
         """Number of reference pictures that one call accepts beside the view."""
+
+    @property
+    def degrees(self) -> tuple[str, ...]:
+        """Instructions for weaker edits, in any order."""
+        return ()
 
     @property
     def workers(self) -> int:

@@ -29,8 +29,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -83,6 +84,9 @@ SWEEP = 0.6
 SOFTNESS = 0.25
 """Share of the denoising over which the render's influence fades out; the remainder is free."""
 
+MIN_DEGREE_STEP = 0.05
+"""Smallest step between two prompts of --degrees, as a share of the visible change."""
+
 MAX_MOVED = 0.05
 """Maximum shift (share of the longer side) or zoom at which a painted picture is aligned with its view."""
 
@@ -123,13 +127,14 @@ class PaintCache:
         source: Tensor | None = None,
         strength: float = 1.0,
         softness: float = 1.0,
+        prompt: str = "",
     ) -> Painted:
         """Paint a view, a second time if the picture moved too far to be aligned or the model refuses it.
 
         Args:
             view: the view to paint
             place: folder of the picture
-            references, source, strength, softness: see `PaintRequest`
+            references, source, strength, softness, prompt: see `PaintRequest`
         """
         references = references[: self.painter.references]
         original = self.painter.original(view)
@@ -145,10 +150,12 @@ class PaintCache:
                 "softness": softness,
                 "seed": seed,
             }
+            if prompt:
+                recipe["prompt"] = prompt
 
             def paint(picture: Tensor, seed: int = seed) -> Tensor:
                 return self.painter.paint(
-                    PaintRequest(picture, references, mask, strength, softness, source, seed)
+                    PaintRequest(picture, references, mask, strength, softness, source, seed, prompt)
                 )
 
             folder_name = place if seed == self.seed else f"{place}/again"
@@ -198,6 +205,7 @@ class AgreedEditor:
     kind: EditKind
     figures: Mapping[str, object]  # for report.json
     is_confined: bool = False
+    prompts: Mapping[float, str] = field(default_factory=dict)  # strength → prompt of a weaker edit
 
     @property
     def keeps_running(self) -> bool:
@@ -219,7 +227,7 @@ class AgreedEditor:
         if strength == 1.0:
             return finished
         painter = self.easel.painter
-        if not painter.has_strength:
+        if not painter.has_strength and strength not in self.prompts:
             return cross_fade(view.image, finished, strength)
         fit = self.fit.render(painter.frame(view)[1])
         if not painter.has_start:
@@ -242,7 +250,9 @@ class AgreedEditor:
         """
         painter = self.easel.painter
         reference = torch.lerp(painter.original(view), fit, strength)
-        painted = self.easel.paint(view, f"{strength:g}", [reference], strength=strength).picture
+        prompt = self.prompts.get(strength, "")
+        heeded = 1.0 if prompt else strength
+        painted = self.easel.paint(view, f"{strength:g}", [reference], strength=heeded, prompt=prompt).picture
         if painted is None:
             return cross_fade(view.image, self.pictures[view.camera.name], strength)
         return painter.paste(view, painted)
@@ -471,7 +481,51 @@ def agree_views(
         "left_out": {name: painted.refusal or round(painted.moved, 3) for name, painted in left_out.items()},
         "contrast": round(loop.fine_energy() / max(before, 1e-9), 3),
     }
-    return AgreedEditor(easel, pictures, fit, editor.stages, editor.kind, figures)
+    anchor = next(view for view in views if view.camera.name in loop.pictures)
+    prompts = measure_degrees(easel, anchor, pictures[anchor.camera.name], log)
+    stages = (*prompts, 1.0) if prompts else editor.stages
+    return AgreedEditor(easel, pictures, fit, stages, editor.kind, figures, prompts=prompts)
+
+
+def measure_degrees(easel: PaintCache, view: View, finished: Tensor, log: RunLog) -> dict[float, str]:
+    """Return the prompts of the painter's weaker edits by strength, ascending.
+
+    The strength is the visible change of the region in one view, as a share of that of the finished edit. A
+    prompt is left out if its picture is like the original, the finished edit or that of another prompt.
+
+    Args:
+        easel: paints and caches the views
+        view: the view to measure
+        finished: its finished edit. [H,W,3]
+        log: log of the run
+    """
+    painter = easel.painter
+    if not painter.degrees:
+        return {}
+    whole = float((view.confine(finished) - view.image).abs().mean())
+    shares: dict[str, float] = {}
+    with CallPool(painter.workers, painter) as pool:
+
+        def paint(prompt: str) -> Painted:
+            return easel.paint(view, f"degree_{painter.degrees.index(prompt) + 1}", prompt=prompt)
+
+        for prompt, painted in zip(painter.degrees, pool.map(paint, painter.degrees), strict=True):
+            if painted.picture is not None:
+                change = view.confine(painter.paste(view, painted.picture)) - view.image
+                shares[prompt] = round(float(change.abs().mean()) / max(whole, 1e-9), 3)
+    prompts: dict[float, str] = {}
+    for prompt, share in sorted(shares.items(), key=lambda item: item[1]):
+        previous = max(prompts, default=0.0)
+        if previous + MIN_DEGREE_STEP <= share <= 1.0 - MIN_DEGREE_STEP:
+            prompts[share] = prompt
+    listed = ", ".join(f"“{prompt}” {share:g}" for prompt, share in shares.items())
+    strengths = (0.0, *prompts, 1.0)
+    steps = [b - a for a, b in pairwise(strengths)]
+    log.say(
+        f"strengths by prompts, as the pictures of {view.camera.name} show them: {listed or 'none'}; "
+        f"{len(prompts)} of {len(painter.degrees)} used, largest step {max(steps):.2f} of the change"
+    )
+    return prompts
 
 
 def _plan(painter: FramePainter, views: int, anchors: int, rounds: int) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import cached_property, partial
+from itertools import pairwise
 from typing import Any
 
 from torch import Tensor
@@ -149,6 +150,8 @@ class EditedViews:
             strengths = equalized_strengths(editor, spec, views, strengths)
         self._edit(strengths, views)
         _check_change(self._pictures, self._setup, spec)
+        if row.sends_pictures or row.runs_program:
+            self._log.say(_strength_line(editor, self._pictures, views[0]))
         rest = [s for s in self._known if s not in self._pictures]
         if rest:
             self._edit(rest, [view for view in views if view.camera.name in self._on_the_way])
@@ -262,6 +265,27 @@ def edit_views(
                 edited[strength].append(picture)
             advance(sum(map(len, edited.values())), f"strength {request[-1][0]:g}")
     return {strength: LazySequence(pictures, from_bytes) for strength, pictures in edited.items()}
+
+
+def _strength_line(editor: ImageEditor, edited: Pictures, view: View) -> str:
+    """Return where the strengths come from and how even their visible steps are, for the log.
+
+    Args:
+        editor: the editor
+        edited: strength → edited views
+        view: the first view, in which the steps are measured
+    """
+    strengths = sorted(edited)
+    if strengths == [1.0]:
+        return "strengths: the editor makes the finished edit only; the trainer finds the way to it"
+    pictures = [view.image, *(edited[s][0] for s in strengths)]
+    steps = [float((b - a).abs().mean()) for a, b in pairwise(pictures)]
+    even = max(sum(steps) / len(steps), 1e-9)
+    source = "the prompts of --degrees" if editor.stages else "the editor's own control"
+    return (
+        f"strengths: {source}; visible steps are {min(steps) / even:.2f} to {max(steps) / even:.2f} "
+        "of an even step"
+    )
 
 
 def _check_change(edited: Pictures, setup: TrainingSetup, spec: str) -> None:

@@ -118,7 +118,8 @@ class App:
         self._waits = False  # a splash is visible
         self._title = ""
         self._layout = user_files.read_layout()
-        self.store.replace(replace(self.store.get(), layout=self._layout))
+        form = replace(self.store.get().form, outside=user_files.read_outside())
+        self.store.replace(replace(self.store.get(), layout=self._layout, form=form))
         self.main_view.report = self.errors.report
         self.dropped: list[Path] = []
         self.failure: BaseException | None = None

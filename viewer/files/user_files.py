@@ -20,6 +20,7 @@ from progdf.errors import ProgdfError
 from progdf.io.atomic import atomic_write, make_folder, state_folder
 from progdf.io.images import flatten_onto, open_picture
 from progdf.io.json_values import read_json, to_json
+from viewer.state.forms import OutsideSettings
 from viewer.state.workspace import Layout
 
 from .session import session_of
@@ -100,6 +101,19 @@ def read_layout() -> Layout:
 def keep_layout(layout: Layout) -> None:
     """Save the layout of the window. Write errors are ignored."""
     _remember("layout.json", json.dumps(to_json(layout)))
+
+
+def read_outside() -> OutsideSettings:
+    """Read the user's programs and servers, or return empty settings if they are unreadable."""
+    try:
+        return read_json(state_folder() / "outside.json", OutsideSettings)
+    except ProgdfError:
+        return OutsideSettings()
+
+
+def keep_outside(settings: OutsideSettings) -> None:
+    """Save the user's programs and servers. Write errors are ignored."""
+    _remember("outside.json", json.dumps(to_json(settings)))
 
 
 def read_keys() -> dict[str, Any]:

@@ -18,6 +18,7 @@ from progdf.errors import ProgdfError, without_commands
 from viewer.state.workspace import JobStatus
 
 from .child import Child, Progress, last_line
+from .consent import check_allowed
 from .training import EditOrder
 
 POLL_S = 0.3
@@ -145,8 +146,10 @@ class JobQueue:
         """Queue a task and return its number.
 
         Raises:
-            ProgdfError: its folder cannot be written to.
+            ProgdfError: its folder cannot be written to, or the user has not allowed its editor.
         """
+        if isinstance(task, EditOrder):
+            check_allowed(task.editor, task.api_url)
         job = QueuedTask(next(self._numbers), task)
         self._lock(job)
         try:
@@ -169,9 +172,11 @@ class JobQueue:
         """Resume a stopped run, or retry a failed one.
 
         Raises:
-            ProgdfError: another window trains it, or has discarded it.
+            ProgdfError: another window trains it or has discarded it, or the user has not allowed its editor.
         """
         job = self.job(number)
+        if isinstance(job.task, EditOrder):
+            check_allowed(job.task.editor, job.task.api_url)
         if job.status in ("stopped", "failed"):
             self._lock(job)
             resumes = job.task.is_begun

@@ -36,6 +36,8 @@ class PreviewInputs:
     background: Vec3
     model: str = ""  # diffusion model, for a sentence
     seed: int = 0  # random seed, for a sentence; -1 asks only for the available models
+    api_url: str = ""  # address of a server that receives the picture
+    prompt: str = ""  # text for a workflow
     estimate: bool = False  # also request an estimate of how close training will come to a picture
 
     @property

@@ -81,6 +81,8 @@ class EditOrder:
     quick: bool = True  # train with --quick
     threads: int = 0  # CPU threads; 0 for all
     model: str = ""  # diffusion model for a sentence; "" selects one that fits
+    api_url: str = ""  # address of a server that receives pictures, "" for none
+    prompt: str = ""  # text for a workflow, "" for its own
     anchor: str = ""  # file of an edited picture that is the reference of all views, "" for none
     at: str = ""  # for a decal: its position in the camera's picture
     camera: str = ""  # file of that camera
@@ -92,8 +94,10 @@ class EditOrder:
         words = ["train", str(self.scene), f"--out={self.out}", f"--region={self.region}"]
         words += [f"--editor={self.editor}", f"--name={self.name}", f"--threads={self.threads}"]
         given = {"model": self.model, "anchor": self.anchor, "at": self.at, "camera": self.camera}
-        given["carry-on"] = self.carry_on
+        given |= {"carry-on": self.carry_on, "api-url": self.api_url, "prompt": self.prompt}
         words += [f"--{name}={value}" for name, value in given.items() if value]
+        if self.api_url:
+            words.append("--yes")  # the user has agreed in the window, see `consent`
         if self.quick:
             words.append("--quick")
         if resumes:

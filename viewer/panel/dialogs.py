@@ -45,6 +45,7 @@ TITLES = {
     "render_film": "Render film",
     "about": "About",
     "match": "Is it this view?",
+    "allow": "Allow this?",
 }
 _HINTS = {
     "save": "A .session.json file. The scene and its edits stay where they are.",
@@ -63,6 +64,7 @@ _HINTS = {
     "render_picture": "This view at any size, with the same vertical field of view.",
     "render_film": "Renders in the background; the panel shows the progress.",
     "match": "{} carries no camera. This is the nearest view, but too little of it agrees.",
+    "allow": "Every training with it does so, too. You are not asked again for exactly this.",
     "about": "Edit a trained 3D Gaussian Splatting scene once, then drag a slider through it.",
 }
 _SUBMIT = {
@@ -95,6 +97,7 @@ _CHOICES = {
     "delivery": (_Button("Keep waiting", ("Enter",)), _Button("Stop and quit", ("S",))),
     "log": (_Button("Close", ("Enter",)),),
     "about": (_Button("Close", ("Enter",)),),
+    "allow": (_Button("Allow", ("A",)), _Button("Cancel", ("Enter",))),
     "match": (_Button("Use it", ("Enter",)), _Button("No", ("N",))),
     "restore": (_Button("Restore", ("Enter", "R")), _Button("Discard", ("D",)), _Button("Later")),
 }
@@ -157,8 +160,8 @@ def _content(dialog: Dialog, pressed: Sequence[str], ui: UiContext, bottom: floa
         _is_new(dialog.kind)
         if dialog.kind == "log":
             _log(Path(dialog.text), bottom, ui)
-        if dialog.kind == "about":
-            wrapped_text(dialog.text, PALETTE.text)
+        if dialog.kind in ("about", "allow"):
+            wrapped_text(_escape_lines(dialog.text), PALETTE.text)
             imgui.dummy((0.0, 2.0 * ui.scale))
         return _answer(dialog, _pressed_button(_CHOICES[dialog.kind], pressed, ui))
     if _is_new(dialog.kind) or (dialog.error and not imgui.is_any_item_active()):
@@ -259,6 +262,8 @@ def _requests(dialog: Dialog, button: str) -> tuple[Action, ...]:
             return (Plain("drop_and_quit"),)
         case "discard_run", "Discard" if dialog.item is not None:
             return (OnItem("discard_run", dialog.item),)
+        case "allow", "Allow":
+            return WithText("allow_outside", dialog.text), *then
         case "match", "Use it":
             return (WithText("use_view", dialog.text),)
         case "match", "No":

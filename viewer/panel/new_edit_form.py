@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
@@ -130,7 +130,7 @@ def _content(work: Workspace, count: int, ui: UiContext) -> tuple[NewEdit, str]:
     form = _region(form, selection, count, column, ui)
     form, action = _editor(form, action, column, ui)
     form = _settings(form, preview, column, ui)
-    if form.choice.setting == "sentence":
+    if form.choice.has_anchor:
         if replace(form, asks=0, anchor="") != replace(work.form, asks=0, anchor=""):
             form = replace(form, asks=0, anchor="")  # the picture belonged to other settings
         form, requested = _anchor(form, preview, column)
@@ -242,6 +242,14 @@ def _settings(form: NewEdit, preview: PreviewState, column: float, ui: UiContext
         case "sentence":
             form = replace(form, sentence=_text_row("Text", "turn him into a statue", form.sentence, column))
             form = _model(form, preview, column, ui)
+        case "server":
+            form = replace(form, sentence=_text_row("Text", "turn him into a statue", form.sentence, column))
+            form = _outside(form, ("server", "model", "price"), column)
+        case "workflow":
+            form = replace(form, sentence=_text_row("Text", "the workflow's own", form.sentence, column))
+            form = _outside(form, ("workflow", "comfy", "price"), column)
+        case "program":
+            form = _outside(form, ("program",), column)
         case "pictures":
             form = replace(form, pictures=_text_row("Pictures", "A.png, B.png", form.pictures, column))
             taken = f"One or more pictures taken here ({shortcut('take_view')})"
@@ -368,17 +376,43 @@ def _model(form: NewEdit, preview: PreviewState, column: float, ui: UiContext) -
     return form if pressed is None else replace(form, model=models[pressed], asks=0)
 
 
+_OUTSIDE_ROWS = {
+    "server": ("Server", "http://127.0.0.1:8080/v1", "Address of a server with OpenAI's images API"),
+    "model": ("Model", "name", "Name of the server's model"),
+    "comfy": ("Server", "http://127.0.0.1:8188", "Address of ComfyUI"),
+    "workflow": ("Workflow", "workflow.json", "Saved with Export (API); its titled nodes are filled"),
+    "program": ("Program", "magick {input} -negate {output}", "Runs once per view; {A..B} is a strength"),
+    "price": ("Price", "per picture, if known", "Price of one picture, to estimate the cost"),
+}
+
+
+def _outside(form: NewEdit, names: Sequence[str], column: float) -> NewEdit:
+    """Draw settings of a program or a server, and the place and cost of the pictures."""
+    settings = form.outside
+    for name in names:
+        title, hint, help_ = _OUTSIDE_ROWS[name]
+        settings = replace(settings, **{name: _text_row(title, hint, getattr(settings, name), column)})
+        tip(help_)
+    form = replace(form, outside=settings)
+    small(form.outside_note or " ", PALETTE.dim)
+    return form
+
+
 def _anchor(form: NewEdit, preview: PreviewState, column: float) -> tuple[NewEdit, str]:
     """Draw the buttons for the anchor, the reference of all views: generate, or edit ("paint_over")."""
     label("Anchor", column)
     half = 0.5 * (imgui.get_content_region_avail().x - imgui.get_style().item_spacing.x)
     with inert(bool(form.obstacle) or preview.busy):
-        if imgui.button("Again" if form.asks else "Paint this view", imgui.ImVec2(half, 0.0)):
+        first = "Test this view" if form.choice.is_outside else "Paint this view"
+        pressed = imgui.button("Again" if form.asks else first, imgui.ImVec2(half, 0.0))
+        if pressed and not form.choice.is_outside:
             form = replace(form, asks=form.asks + 1, anchor="")
     tip("Paint this view. All views will follow the picture; without one, they follow the front view")
     imgui.same_line()
     with inert(not preview.painted):
         action = "paint_over" if imgui.button("Paint over", imgui.ImVec2(half, 0.0)) else ""
+    if pressed and form.choice.is_outside:
+        action = "test_editor"
     tip(form.anchor or "Open it in your painting program; each save is shown, the last one is trained")
     if preview.text:
         wrapped_text(preview.text, PALETTE.error if preview.failed else PALETTE.dim)

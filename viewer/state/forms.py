@@ -7,13 +7,16 @@ from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
+from urllib.parse import urlsplit
 
 from progdf.color.edits import GRADE_RANGES, hex_color, parse_color, parse_grade
 from progdf.color.palette import are_alike
 from progdf.io import atomic
 from viewer.camera.view_camera import SHAPES
 
-Setting = Literal["color", "amount", "grade", "style", "sentence", "folder", "pictures"]
+Setting = Literal[
+    "color", "amount", "grade", "style", "sentence", "server", "workflow", "program", "folder", "pictures"
+]
 """Setting that the form shows for an editor."""
 
 ALL = "all"
@@ -47,6 +50,16 @@ class EditorChoice:
     extra: str = ""  # extra that installs the package
     pictured: bool = True  # the form can preview it on the current view
 
+    @property
+    def is_outside(self) -> bool:
+        """True if it runs a program or sends pictures, each only after a confirmation."""
+        return self.setting in ("server", "workflow", "program")
+
+    @property
+    def has_anchor(self) -> bool:
+        """True if the user asks for a picture of this view before training."""
+        return self.setting == "sentence" or self.is_outside
+
 
 EDITORS = (
     EditorChoice("recolor", "Recolor", "color", "Change the color; the shading stays"),
@@ -59,6 +72,11 @@ EDITORS = (
     EditorChoice(
         "instruct", "Describe it", "sentence", "Prompt for a diffusion model", "diffusers", "diffusion", False
     ),
+    EditorChoice(
+        "api", "Describe it to a server", "server", "Prompt for a served model", "openai", "api", False
+    ),
+    EditorChoice("comfy", "ComfyUI workflow", "workflow", "Your workflow edits the views", pictured=False),
+    EditorChoice("command", "Run a program…", "program", "Any program edits the views", pictured=False),
     EditorChoice("pictures", "Edited pictures", "pictures", "Taken here, edited anywhere", pictured=False),
     EditorChoice("folder", "Edited views", "folder", "Training views, edited in any program", pictured=False),
 )
@@ -70,6 +88,18 @@ NEUTRAL = tuple(neutral for _, _, neutral in GRADE_RANGES.values())
 NO_CHANGE = "Change a color, the curve or a slider of the grade"
 """Obstacle: the grade changes nothing."""
 MAX_PAIRS = 8
+
+
+@dataclass(frozen=True)
+class OutsideSettings:
+    """Programs and servers of the user, kept from window to window."""
+
+    server: str = ""  # address of OpenAI's images API
+    model: str = ""  # name of the server's model
+    comfy: str = ""  # address of ComfyUI
+    workflow: str = ""  # file of its workflow
+    program: str = ""  # command line with {input} and {output}
+    price: str = ""  # price of one picture, a number; "" for none
 
 
 @dataclass(frozen=True)
@@ -94,6 +124,7 @@ class NewEdit:
     model: str = ""  # diffusion model for the sentence; "" selects one that fits
     asks: int = 0  # number of requested anchor pictures; the edit follows the last one
     anchor: str = ""  # file of the anchor picture while the user paints over it
+    outside: OutsideSettings = OutsideSettings()
     folder: str = ""  # folder of edited views
     pictures: str = ""  # files of edited renders, joined by commas
     name: str = ""  # name of the layer; "" for `suggested_name`
@@ -127,13 +158,49 @@ class NewEdit:
                 return f"{kind}:{','.join(parts)}" if parts else kind
             case "style":
                 return f"{kind}:{self.style}"
-            case "sentence":
+            case "sentence" | "server":
                 return f"{kind}:{self.sentence.strip()}"
+            case "workflow":
+                return f"{kind}:{Path(self.outside.workflow.strip()).expanduser()}"
+            case "program":
+                return f"{kind}:{self.outside.program.strip()}"
             case "pictures":
                 files = [Path(name.strip()).expanduser().absolute() for name in self.pictures.split(",")]
                 return f"{kind}:{','.join(map(str, files))}"
             case "folder":
                 return f"{kind}:{Path(self.folder.strip()).expanduser()}"
+
+    @property
+    def url(self) -> str:
+        """Value of `--api-url`; "" for none."""
+        addresses = {"server": self.outside.server, "workflow": self.outside.comfy}
+        return addresses.get(self.choice.setting, "").strip()
+
+    @property
+    def prompt(self) -> str:
+        """Value of `--prompt`; "" for none."""
+        return self.sentence.strip() if self.choice.setting == "workflow" else ""
+
+    @property
+    def model_option(self) -> str:
+        """Value of `--model`; "" for none."""
+        models = {"sentence": self.model, "server": self.outside.model.strip()}
+        return models.get(self.choice.setting, "")
+
+    @property
+    def outside_note(self) -> str:
+        """Destination, number and cost of the pictures of a training, in one line; "" for none."""
+        if not self.choice.is_outside or self.obstacle:
+            return ""
+        count = 12 if self.quick else 30
+        if self.choice.setting == "program":
+            program = Path(self.outside.program.split()[0]).name
+            return f"{program} runs on this machine, for {count} pictures or more"
+        try:
+            cost = f", about {count * float(self.outside.price):.2f}" if self.outside.price.strip() else ""
+        except ValueError:
+            cost = ""
+        return f"{count} pictures or more go to {urlsplit(self.url).netloc}{cost}"
 
     @property
     def layer_name(self) -> str:
@@ -150,7 +217,7 @@ class NewEdit:
         """
         kind = self.choice.kind
         description = f"{kind} {self.style}" if kind == "style" else kind
-        if self.choice.setting == "sentence" and self.sentence.strip():
+        if self.choice.setting in ("sentence", "server", "workflow") and self.sentence.strip():
             description = " ".join(self.sentence.split()[:4])
         if self.choice.setting == "pictures" and self.pictures.strip():
             description = Path(self.pictures.split(",")[0].strip()).stem
@@ -163,8 +230,10 @@ class NewEdit:
         """Reason why the edit cannot be trained yet, in one line; "" for none."""
         if missing := missing_package(self.choice):
             return missing
-        if self.choice.setting == "sentence" and not self.sentence.strip():
+        if self.choice.setting in ("sentence", "server") and not self.sentence.strip():
             return "Describe the edit, such as: turn him into a statue"
+        if self.choice.is_outside and (missing := self._missing_setting()):
+            return missing
         if self.choice.setting == "pictures" and not self.pictures.strip():
             return "Enter the edited pictures"
         if self.choice.setting == "folder" and not self.folder.strip():
@@ -172,6 +241,21 @@ class NewEdit:
         if self.region == TYPED and not self.typed_region.strip():
             return "Enter the region, such as sphere:0,0,0,1"
         return NO_CHANGE if self.choice.setting == "grade" and self.spec == "grade" else ""
+
+    def _missing_setting(self) -> str:
+        """Return the request for the first missing setting of a program or server; "" if none is missing."""
+        outside = self.outside
+        if self.choice.setting == "program":
+            if "{input}" not in outside.program or "{output}" not in outside.program:
+                return "Enter a program with {input} and {output}"
+            return ""
+        if self.choice.setting == "workflow" and not outside.workflow.strip():
+            return "Enter the file of a workflow, saved with Export (API)"
+        if not urlsplit(self.url).netloc:
+            return "Enter the address of the server, such as http://127.0.0.1:8080/v1"
+        if self.choice.setting == "server" and not outside.model.strip():
+            return "Enter the name of the server's model"
+        return ""
 
 
 def parse_curve(text: str) -> list[Point]:
@@ -223,8 +307,12 @@ def with_settings(form: NewEdit, instruction: str) -> NewEdit | None:
                 return replace(form, grade=grade, palette=palette, curve=curve)
             case "style":
                 return replace(form, style=int(argument)) if int(argument) in range(STYLES) else None
-            case "sentence":
+            case "sentence" | "server":
                 return replace(form, sentence=argument)
+            case "workflow":
+                return replace(form, outside=replace(form.outside, workflow=argument))
+            case "program":
+                return replace(form, outside=replace(form.outside, program=argument))
             case "pictures":
                 return replace(form, pictures=", ".join(argument.split(",")))
             case "folder":

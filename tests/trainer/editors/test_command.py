@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 import sys
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +17,14 @@ from progdf.gdf.file import read_gdf
 from tests.helpers.trained import quick_options, small, train, write_bear
 from trainer import cli
 from trainer.editors import make_editor
-from trainer.editors.command import ATTEMPTS, CommandEditor, check_command_editor, parse_command
+from trainer.editors.command import (
+    ATTEMPTS,
+    CallFailedError,
+    CommandEditor,
+    Programs,
+    check_command_editor,
+    parse_command,
+)
 from trainer.options import EditorOptions, with_values
 from trainer.resolve import resolve
 from trainer.run.command import check_command
@@ -146,6 +154,35 @@ def test_program_over_the_time_limit_is_killed(tmp_path: Path) -> None:
     code = "import threading\nthreading.Event().wait()"
     with pytest.raises(ProgdfError, match=r"takes more than 0\.2 seconds; allow more with --edit-timeout"):
         editor_of(program(tmp_path, code), edit_timeout=0.2)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the test reads /proc")
+def test_program_over_the_time_limit_ends_with_its_children(tmp_path: Path) -> None:
+    code = (
+        "import subprocess, sys, threading\n"
+        "wait = [sys.executable, '-c', 'import threading; threading.Event().wait()']\n"
+        "child = subprocess.Popen(wait)\n"
+        "open(__file__.replace('edit.py', 'child'), 'w').write(str(child.pid))\n"
+        "threading.Event().wait()"
+    )
+    with pytest.raises(ProgdfError, match="takes more than 2 seconds"):
+        editor_of(program(tmp_path, code), edit_timeout=2.0)
+    child = Path("/proc", (tmp_path / "child").read_text(encoding="utf-8"))
+    for _ in range(100):  # an orphan is removed by the system a moment later
+        if not child.exists() or "State:\tZ" in (child / "status").read_text(encoding="utf-8"):
+            return
+        threading.Event().wait(0.05)
+    pytest.fail("the child still runs")
+
+
+def test_stopped_editor_ends_its_programs_and_starts_none(tmp_path: Path) -> None:
+    program_words = [sys.executable, "-c", "import threading; threading.Event().wait()"]
+    programs = Programs()
+    threading.Timer(0.3, programs.stop).start()
+    with pytest.raises(CallFailedError):
+        programs.run(program_words, 60.0)
+    with pytest.raises(CallFailedError, match="it is stopped"):
+        programs.run(program_words, 60.0)
 
 
 def test_failed_call_is_made_again(tmp_path: Path) -> None:

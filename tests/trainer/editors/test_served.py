@@ -205,6 +205,47 @@ def test_catalogue_sends_pictures_only_if_it_is_allowed_to(
         assert not server.calls
 
 
+def test_mask_of_the_region_is_sent_if_asked_for() -> None:
+    mask = torch.zeros(64, 64)
+    mask[:8] = 0.5
+    for sends in (False, True):
+        with image_server() as server:
+            editor = editor_of(settings_of(server.url, api_mask=sends))
+            editor.paint(PaintRequest(editor.original(small().views[0]), mask=mask))
+        (call,) = server.calls
+        assert (call.mask is not None) == sends
+    assert call.mask is not None
+    assert call.mask.getpixel((0, 0))[3] == 0, "transparent where the model edits"
+    assert call.mask.getpixel((0, 9))[3] == 255
+
+
+def blend_by_prompt(call: Call, number: int) -> Image.Image:
+    """Return the picture blended with its swapped colors by the word that begins the prompt."""
+    picture = call.pictures[0].convert("RGB")
+    share = {"slightly": 0.3, "half": 0.6, "again": 0.62, "nothing": 0.0}
+    return Image.blend(picture, swap_colors(picture), share.get(call.fields["prompt"].split()[0], 1.0))
+
+
+@pytest.mark.slow
+def test_prompts_become_strengths_by_what_their_pictures_show(tmp_path: Path) -> None:
+    write_bear(tmp_path)
+    with image_server(blend_by_prompt) as server:
+        options = with_values(
+            quick_options(tmp_path), editor=MARBLE, model="marble-1", api_url=server.url, edit_size=64,
+            kind="color", steps=48, stages=0, views=5, edit_workers=2,
+            degrees="half marble|slightly marble|nothing|again half",
+        )  # fmt: skip
+        train(options)
+        calls = len(server.calls)
+    log = (tmp_path / "run" / "log.txt").read_text(encoding="utf-8")
+    found = re.search(r"strengths by prompts.*; (\d) of 4 used, largest step (0\.\d+)", log)
+    assert found is not None, log
+    assert found[1] == "2"
+    assert float(found[2]) == pytest.approx(0.4, abs=0.05)
+    assert "strengths: the prompts of --degrees; visible steps are 0." in log
+    assert calls == 5 + 4 + 2 * 5, "all views, each prompt in one view, and all views by two prompts"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("references", [0, 2])
 def test_run_leaves_refused_views_out_and_pays_for_no_picture_twice(tmp_path: Path, references: int) -> None:

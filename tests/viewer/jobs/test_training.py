@@ -21,8 +21,9 @@ from trainer.editors.style import STYLES as TRAINED_STYLES
 from trainer.options import EditorOptions
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder
-from viewer.jobs import training
+from viewer.jobs import consent, training
 from viewer.jobs.child import Progress
+from viewer.jobs.job_queue import JobQueue
 from viewer.jobs.training import EditOrder
 from viewer.state.forms import (
     ALL,
@@ -33,6 +34,7 @@ from viewer.state.forms import (
     STYLES,
     TYPED,
     NewEdit,
+    OutsideSettings,
     missing_package,
     with_color,
     with_editor,
@@ -212,7 +214,8 @@ def test_every_editor_of_the_form_exists_in_the_trainer() -> None:
 
 
 @pytest.mark.parametrize(
-    "kind", [kind for kind in KINDS if kind not in ("instruct", "folder", "pictures", "style")]
+    "kind",
+    [choice.kind for choice in CHOICES if choice.setting in ("color", "amount", "grade")],
 )
 def test_trainer_accepts_the_specs_of_the_form(kind: str) -> None:
     word, _, what = form(kind).spec.partition(":")
@@ -303,6 +306,70 @@ def test_layer_name_is_a_valid_file_name() -> None:
     assert form("style", style=7).layer_name == "style 7"
 
 
+def test_orders_of_servers_and_programs_are_parsed_by_the_trainer() -> None:
+    outside = OutsideSettings(
+        "https://api.example.org/v1", "m", "http://127.0.0.1:8188", "/a/b.json", "x {input} {output}", "0.1"
+    )
+    for kind in ("api", "comfy", "command"):
+        some = form(kind, sentence="make it gold", outside=outside)
+        assert some.obstacle in ("", missing_package(some.choice))
+        order = EditOrder(
+            Path("a.ply"), Path("out/x"), "x", "all", some.spec,
+            model=some.model_option, api_url=some.url, prompt=some.prompt,
+        )  # fmt: skip
+        options = train_options(order.arguments()[1:]).editor
+        assert options.editor == some.spec
+        assert (options.api_url, options.model, options.prompt) == (some.url, some.model_option, some.prompt)
+        assert options.yes == bool(some.url)
+
+
+def test_form_states_where_pictures_go_and_what_they_cost() -> None:
+    outside = OutsideSettings(
+        "https://api.example.org/v1", "m", price="0.04", program="/bin/x {input} {output}"
+    )
+    served = form("api", sentence="make it gold", outside=outside)
+    assert served.outside_note == "12 pictures or more go to api.example.org, about 0.48"
+    assert replace(served, outside=replace(outside, price="x")).outside_note.endswith("api.example.org")
+    assert form("command", outside=outside).outside_note == "x runs on this machine, for 12 pictures or more"
+    assert form("recolor").outside_note == ""
+    for changes in ({"server": ""}, {"model": ""}):
+        assert replace(served, outside=replace(outside, **changes)).obstacle.startswith("Enter the")
+    assert form("command").obstacle == "Enter a program with {input} and {output}"
+    assert form("comfy").obstacle.startswith("Enter the file of a workflow")
+
+
+@pytest.mark.parametrize(
+    ("editor", "url"),
+    [
+        ("command:touch /tmp/pwned {input} {output}", ""),
+        ('api:"marble"', "https://api.example.org/v1"),
+        ("comfy:/a/b.json", "http://127.0.0.1:8188"),
+    ],
+)
+def test_order_of_a_file_starts_nothing_outside_without_consent(
+    editor: str, url: str, tmp_path: Path
+) -> None:
+    stopped = replace(order(tmp_path), editor=editor, api_url=url)
+    stopped.save()
+    (stopped.out / "state").mkdir(parents=True)
+    (stopped.out / "state" / "run.json").write_text("{}")
+    queue = JobQueue()
+    (found,) = training.stopped_orders(stopped.out.parent, stopped.scene)
+    queue.add_stopped(found)
+    (job,) = queue.jobs
+    with pytest.raises(ProgdfError, match="not allowed yet"):
+        queue.resume(job.number)
+    with pytest.raises(ProgdfError, match="not allowed yet"):
+        queue.add(replace(found, out=found.out.with_name("other")))
+    assert [job.status for job in queue.jobs] == ["stopped"]
+    action = consent.outside_action(editor, url)
+    consent.allow(action)
+    consent.check_allowed(editor, url)
+    with pytest.raises(ProgdfError, match="not allowed yet"):
+        consent.check_allowed(f"{editor} ", f"{url}/x")
+    queue.close()
+
+
 def test_order_arguments_are_parsed_by_the_trainer() -> None:
     order = EditOrder(Path("a b.ply"), Path("out/-x"), "-x", "all-sphere:0,0,0,1", "night:0.70", True, 1)
     options = train_options(order.arguments(resumes=True)[1:])
@@ -318,7 +385,8 @@ def test_order_arguments_are_parsed_by_the_trainer() -> None:
     [
         *("recolor:#1b6972", "recolor:#1b6972,path=hue", "tint:#4f6fd8", "stripes:#ffffff", "darken:0.30"),
         *("night:0.95", "grade:exposure=0.70,white=0.80", "style:23", "instruct:make it gold, please"),
-        *("pictures:/a/b.png,/a/c.png", "folder:/a/views"),
+        *("pictures:/a/b.png,/a/c.png", "folder:/a/views", "api:make it gold", "comfy:/a/b.json"),
+        "command:magick {input} -modulate 100,{100..30} {output}",
     ],
 )
 def test_form_is_filled_from_the_instruction_of_an_edit(spec: str) -> None:

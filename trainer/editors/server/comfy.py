@@ -166,10 +166,13 @@ class ComfyServer:
         begin = time.monotonic()
         pause = _FIRST_POLL_S
         while True:
-            found = self._json(f"/history/{quote(job, safe='')}").get(job)
-            if isinstance(found, dict):
+            found = self._record(job)
+            if found is not None:
                 return found
             if stop.is_set() and self._cancel(job):
+                found = self._record(job)  # it may have ended since the last look
+                if found is not None:
+                    return found
                 raise ProgdfError("the calls of the server are stopped")
             if time.monotonic() - begin > self.timeout:
                 self._cancel(job, also_running=True)
@@ -179,6 +182,11 @@ class ComfyServer:
             else:
                 stop.wait(pause)
             pause = min(1.5 * pause, _MAX_POLL_S)
+
+    def _record(self, job: str) -> dict[str, Any] | None:
+        """Return the record of a job; None if it has not ended."""
+        found = self._json(f"/history/{quote(job, safe='')}").get(job)
+        return found if isinstance(found, dict) else None
 
     def _cancel(self, job: str, also_running: bool = False) -> bool:
         """Take a job from the queue. Return True if the server no longer works on it."""
@@ -248,6 +256,12 @@ def check_comfy(what: str, options: EditorOptions) -> ComfyServer:
     if options.prompt and "prompt" not in workflow.nodes:
         raise ProgdfError(
             f"--prompt has no effect: {workflow.path} has no node titled prompt; title one, or leave it out"
+        )
+    if options.degrees and "prompt" not in workflow.nodes:
+        raise ProgdfError(f"--degrees has no effect: {workflow.path} has no node titled prompt; title one")
+    if options.degrees and "strength" in workflow.nodes:
+        raise ProgdfError(
+            f"--degrees has no effect: {workflow.path} has a node titled strength; leave one of them out"
         )
     check_anchor(options, workflow.references, f"title a node of {workflow.path} reference")
     return ComfyServer(address, workflow, options.edit_timeout)

@@ -119,6 +119,11 @@ class ServedEditor(FramePainter):
         return self.model.references
 
     @property
+    def degrees(self) -> tuple[str, ...]:
+        """See `FramePainter.degrees`."""
+        return split_degrees(self.options.degrees)
+
+    @property
     def workers(self) -> int:
         """See `FramePainter.workers`."""
         return self.options.edit_workers
@@ -141,12 +146,13 @@ class ServedEditor(FramePainter):
         """See `ImageEditor.edit`. Views are edited one by one; `trainer.run.agree` makes them agree."""
         if strength == 0.0:
             return view.image
-        recipe = {**self.recipe, "strength": strength}
+        seed = self.options.seed
+        recipe = {**self.recipe, "strength": strength, "seed": seed}
         painted = self.kept.picture(
             view.camera.name,
             self.original(view),
             recipe,
-            lambda picture: self.paint(PaintRequest(picture, strength=strength)),
+            lambda picture: self.paint(PaintRequest(picture, strength=strength, seed=seed)),
             "" if strength == 1.0 else f"{strength:g}",
         )
         return self.paste(view, painted)
@@ -158,14 +164,19 @@ class ServedEditor(FramePainter):
             RefusedError: a content filter refuses the picture.
             ProgdfError: see `ImageModel.edit`.
         """
-        prompt = self.prompt
+        prompt = request.prompt or self.prompt
         if request.references and prompt:
             last = _LAST if len(request.references) > 1 else ""
             prompt = _FOLLOW.format(prompt=prompt, last=last)
         return self.model.edit(request, prompt, self._stop)
 
+    @property
+    def keeps_running(self) -> bool:
+        """See `StoppableEditor.keeps_running`."""
+        return True
+
     def stop(self) -> None:
-        """See `FramePainter.stop`."""
+        """See `StoppableEditor.stop`."""
         self._stop.set()
 
 
@@ -187,6 +198,11 @@ def _make_editor(given: EditorInput, model: ImageModel, prompt: str) -> ServedEd
     return ServedEditor(given.scene, prompt, model, options, PictureCache(options.cache), stages)
 
 
+def split_degrees(text: str) -> tuple[str, ...]:
+    """Return the prompts of --degrees."""
+    return tuple(part.strip() for part in text.split("|") if part.strip())
+
+
 def check_served(options: EditorOptions) -> ImageModel:
     """Return the model of `api:` or `comfy:` after checking the options. Nothing is sent.
 
@@ -206,7 +222,8 @@ def explain_sending(options: EditorOptions, views: int, stages: int = 1) -> str:
         stages: number of strengths that are requested from a model with a strength
     """
     model = check_served(options)
-    calls = (views or VIEWS) * (stages if model.has_strength else 1)
+    degrees = len(split_degrees(options.degrees))
+    calls = (views or VIEWS) * (stages if model.has_strength else 1 + degrees)
     cost = f", about {calls * options.price_per_call:.2f} in all" if options.price_per_call else ""
     host = model.address.host
     return (

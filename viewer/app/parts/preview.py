@@ -26,12 +26,13 @@ from viewer.app.messages import Messages, Requests, error_line
 from viewer.camera.view_camera import ViewCamera, from_camera, to_camera
 from viewer.files import region_files, user_files
 from viewer.files.document import DocumentStore
-from viewer.jobs import training
+from viewer.jobs import consent, training
 from viewer.jobs.preview_process import Preview, PreviewChild, PreviewInputs
+from viewer.state.commands import Plain
 from viewer.state.forms import EDITORS, NO_CHANGE, SHEET_COLUMNS, SHEET_PX, STYLE_ORDER, NewEdit, with_picture
 from viewer.state.transient import Cover, PreviewGhost, PreviewState
 from viewer.state.view_state import LayerState
-from viewer.state.workspace import Store, with_camera, with_transient
+from viewer.state.workspace import Dialog, Store, with_camera, with_transient
 from viewer.ui.window import wake_window
 
 LONGEST_SIDE = 960
@@ -42,6 +43,7 @@ POLL_S = 0.04
 """Interval at which the answer is polled, in seconds."""
 WATCH_S = 0.5
 """Interval at which a picture open in another program is checked, in seconds."""
+_ANCHORED = ("instruct:", "api:", "comfy:", "command:")  # editors that paint this view if asked
 PAINT_TEXT = "Paint in the other program and save. The saved picture appears here."
 IDLE_TIMEOUT_S = 120.0
 """Time without an open form after which the preview process ends, in seconds."""
@@ -64,6 +66,11 @@ def _file_state(path: Path) -> tuple[int, int]:
     except OSError:
         return 0, 0
     return state.st_mtime_ns, state.st_size
+
+
+def is_allowed_form(form: NewEdit) -> bool:
+    """Return True if the user has allowed the form's program or server."""
+    return consent.is_allowed(consent.outside_action(form.spec, form.url))
 
 
 class PreviewActions:
@@ -122,7 +129,7 @@ class PreviewActions:
     @property
     def requests(self) -> Requests:
         """Handlers of the requests about previews, by name."""
-        return {"paint_view": self._paint_view}
+        return {"paint_view": self._paint_view, "test_editor": self._test_editor}
 
     def poll(self) -> float | None:
         """Request the preview and show an answer; return the seconds until the next poll, None for never."""
@@ -151,7 +158,7 @@ class PreviewActions:
                 self._show(f"No preview: {error.strerror or error}", None, failed=True)
         if self._child is not None:
             self._take(self._child, request)
-        if self._outstanding and request.editor.startswith("instruct:") and request.seed >= 0:
+        if self._outstanding and request.editor.startswith(_ANCHORED) and request.seed >= 0:
             self._show(f"Painting … {now - self._sent_at:.0f} s", self._store.get().transient.cover)
         self._show_live()
         if self._child is None or self._broken:
@@ -171,6 +178,20 @@ class PreviewActions:
         elif request == self._sent and not self._outstanding and request.editor.startswith("style:"):
             self._ask_painting(request, self._child)
         return POLL_S if self._outstanding or request != self._sent else None
+
+    def _test_editor(self, _: None) -> None:
+        """Let the form's program or server edit this view; ask first if the user has not allowed it yet."""
+        work = self._store.get()
+        form = work.form
+        action = consent.outside_action(form.spec, form.url)
+        if form.obstacle:
+            return
+        if not consent.is_allowed(action):
+            self._messages.ask(Dialog("allow", action, then=Plain("test_editor")))
+            return
+        user_files.keep_outside(form.outside)
+        self._store.replace(replace(work, form=replace(form, asks=form.asks + 1, anchor="")))
+        self._store.wake()
 
     def _paint_view(self, _: None) -> None:
         """Save a picture of this view, open it in another program and add it to the form.
@@ -310,7 +331,9 @@ class PreviewActions:
         size = self._picture_size()
         form = work.form
         view = work.view
-        of_sentence = form.choice.setting == "sentence"
+        of_sentence = form.choice.has_anchor
+        if form.choice.is_outside and (not form.asks or not is_allowed_form(form)):
+            return None
         pictured = (form.preview and form.choice.pictured) or of_sentence
         if not (work.form_open and view.panel and pictured) or form.obstacle not in ("", NO_CHANGE):
             return None
@@ -324,7 +347,18 @@ class PreviewActions:
                 self._pose = form.asks, view.camera, size
             _, camera, size = self._pose
             seed = form.asks - 1
-            return PreviewInputs(region, form.spec, 1.0, camera, size, view.background, form.model, seed)
+            return PreviewInputs(
+                region,
+                form.spec,
+                1.0,
+                camera,
+                size,
+                view.background,
+                model=form.model_option,
+                seed=seed,
+                api_url=form.url,
+                prompt=form.prompt,
+            )
         strength = round(form.strength, 2)
         return PreviewInputs(region, form.spec, strength, view.camera, size, view.background, estimate=True)
 
@@ -428,7 +462,8 @@ class PreviewActions:
             name = f"Preview: {title} at {self._sent.strength:.2f}"
             text = ""
             self._painted = None
-            if kind == "instruct":
+            if self._sent.editor.startswith(_ANCHORED):
+                argument = argument if kind in ("instruct", "api") else title
                 name = f"Anchor: {argument}"
                 text = "Training follows this picture; no estimate for prompts"
                 if answer.follows:

@@ -22,12 +22,12 @@ from progdf.tidy import leave_paint
 from viewer.app.decal import DecalPlace
 from viewer.app.messages import Messages, Requests, attempt, failure_line
 from viewer.app.parts.edits import EditActions
-from viewer.files import exports, region_files
+from viewer.files import exports, region_files, user_files
 from viewer.files.document import DocumentStore
-from viewer.jobs import training
+from viewer.jobs import consent, training
 from viewer.jobs.job_queue import Delivery, JobQueue, QueuedTask
 from viewer.jobs.training import EditOrder
-from viewer.state.commands import Plain
+from viewer.state.commands import OnItem, Plain
 from viewer.state.forms import ALL, CHANGED, SELECTION, NewEdit
 from viewer.state.selection import (
     SUFFIX,
@@ -161,7 +161,8 @@ class JobActions:
             "paint_over": self._paint_over,
             "lay_decal": self._lay_decal,
             "stop_run": queue.stop,
-            "resume_run": queue.resume,
+            "resume_run": self._resume,
+            "allow_outside": self._allow,
             "keep_run": self._keep_run,
             "ask_discard": self._ask_discard,
             "discard_run": queue.discard,
@@ -175,6 +176,28 @@ class JobActions:
             "stop_and_quit": lambda _: self._quit(EditOrder),
             "drop_and_quit": lambda _: self._quit(Delivery),
         }
+
+    def _resume(self, number: int) -> None:
+        """Resume a stopped run; ask first if it would run a program or send pictures.
+
+        Raises:
+            ProgdfError: it cannot be resumed.
+        """
+        task = self.queue.job(number).task
+        if isinstance(task, EditOrder):
+            action = consent.outside_action(task.editor, task.api_url)
+            if not consent.is_allowed(action):
+                self._messages.ask(Dialog("allow", action, then=OnItem("resume_run", number)))
+                return
+        self.queue.resume(number)
+
+    def _allow(self, action: str) -> None:
+        """Remember that the user allows an action.
+
+        Raises:
+            ProgdfError: the user's folder cannot be written.
+        """
+        consent.allow(action)
 
     def holds_window(self) -> bool:
         """Return whether a job runs; if so, ask the user what to do before the window closes.
@@ -297,6 +320,10 @@ class JobActions:
     def _train(self, _: None) -> None:
         """Queue the form's edit; an error stays in the form."""
         form = self._store.get().form
+        action = consent.outside_action(form.spec, form.url)
+        if not form.obstacle and not consent.is_allowed(action):
+            self._messages.ask(Dialog("allow", action, then=Plain("train")))
+            return
         error = form.obstacle or failure_line(lambda: self._enqueue(form))
         form = replace(form, error=error) if error else replace(form, error="", name="")
         self._store.replace(replace(self._store.get(), form=form, form_open=bool(error)))
@@ -309,10 +336,11 @@ class JobActions:
         state = self._store.get().view.selection
         region = region_files.region_option(form, out.parent, state, len(document.original), out.name)
         threads = training.spare_threads()
-        model = anchor = ""
-        if form.choice.setting == "sentence":
-            model = form.model
+        anchor = ""
+        if form.choice.has_anchor and form.choice.setting != "program":
             anchor = self._write_anchor(form, out)
+        if form.choice.is_outside:
+            user_files.keep_outside(form.outside)
         order = EditOrder(
             scene.resolve(),
             out,
@@ -321,7 +349,9 @@ class JobActions:
             editor=form.spec,
             quick=form.quick,
             threads=threads,
-            model=model,
+            model=form.model_option,
+            api_url=form.url,
+            prompt=form.prompt,
             anchor=anchor,
         )
         self.queue.add(order)
