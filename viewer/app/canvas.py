@@ -167,6 +167,7 @@ class Canvas:
         live: bool = False,
         *,
         pulled: PullInfluence | None = None,
+        guessed: bytes = EMPTY_MASK,
     ) -> None:
         """Draw `view` into the lower left `size` pixels of `screen`.
 
@@ -174,6 +175,7 @@ class Canvas:
             focus: the layer whose painted weights are visible while the brush is active, or None
             pointed: the item of the panel under the pointer
             pulled: Gaussians that a handle moves right now, or None
+            guessed: selected Gaussians that no view with a scribble shows, packed
             live: an edit in training or preview is on top
             dragging: the mouse drags something, so that more frames will follow
             now: seconds on the main view's clock
@@ -193,7 +195,9 @@ class Canvas:
         before = self._resolution
         self._resolution = dynamic_resolution.before_draw(before, mode, dragging, turned, slid, now)
         looks = self._sliding or live
-        self.comparer.engine.highlight = highlight.requested_highlight(view, focus, pointed, looks, pulled)
+        self.comparer.engine.highlight = highlight.requested_highlight(
+            view, focus, pointed, looks, pulled, guessed
+        )
         target = aim, edits, self.comparer.engine.highlight
         has_picture = self.pictures_drawn or self._follows
         self._begun = None

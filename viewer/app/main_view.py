@@ -259,7 +259,11 @@ class MainView:
         live = bool(transient.live)
         pull = transient.gizmo if isinstance(transient.gizmo, Pull) else None
         pulled = pull.influence if pull is not None and pull.is_held else None
-        self.canvas.draw(view, screen, area, held, self._clock, self.work.focus, pointed, live, pulled=pulled)
+        focus = self.work.focus
+        guessed = select_tool.guessed_rows(self.work)
+        self.canvas.draw(
+            view, screen, area, held, self._clock, focus, pointed, live, pulled=pulled, guessed=guessed
+        )
         if self.canvas.pixels == 1 and not self._is_held():
             self._pointer().look_ahead()
 

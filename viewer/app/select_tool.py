@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
 from imgui_bundle import imgui
+from torch import Tensor
 
 from progdf.color.edits import hex_color
 from progdf.color.oklab import oklab_to_srgb
+from progdf.quaternions import rotation_matrices, turn_quats
 from progdf.scene.neighbors import Neighborhood, grow_along_surface
 from progdf.scene.scribbles import Rows
 from progdf.scene.selection import (
@@ -19,12 +22,14 @@ from progdf.scene.selection import (
     alike_in_color,
     base_colors,
     combine,
+    front_surface,
     inside_ball,
     inside_polygon,
     inside_rectangle,
     inside_stroke,
     main_rows,
     pixel_color,
+    project_centers,
 )
 from progdf.scene.subject import select_subject
 from viewer.render.picking import seen_at, surface_point
@@ -255,13 +260,18 @@ def spread(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Worksp
 
     Strokes count until something else is selected, and again if undo restores their selection.
     """
-    on, beside = strokes_of(work) or (np.zeros(0, np.int64),) * 2
+    last = last_strokes(work)
+    on = np.zeros(0, np.int64) if last is None else last.on
+    beside = np.zeros(0, np.int64) if last is None else last.beside
+    seen = pointer.surface.in_front(np.ones(pointer.facts.count, bool))
+    if last is not None:
+        seen = seen | selection.unpack(last.seen, pointer.facts.count)
     touched = np.zeros(0, np.int64) if gesture.brushed is None else np.flatnonzero(gesture.brushed.touched)
     path = gesture.path[:: len(gesture.path) // _MAX_PLACES + 1]
     places = (seen_at(pointer.surface.scene, pointer.surface.camera, *at) for at in path)
     # large Gaussians are visible where their centers are not
     rows = np.concatenate(
-        [touched, *(main_rows(seen.rows, seen.shares) for seen in places if seen is not None)]
+        [touched, *(main_rows(place.rows, place.shares) for place in places if place is not None)]
     )
     if gesture.mode == "subtract":
         beside = np.union1d(beside, rows)
@@ -269,23 +279,64 @@ def spread(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Worksp
         on = np.union1d(on, rows)
     mask = np.zeros(pointer.facts.count, bool)
     mask[on] = True  # the only known Gaussians before a stroke next to the object
+    guessed = np.zeros_like(mask)
     if len(on) and len(beside):
         mask = pointer.facts.scribbles().select(on, beside)
+        guessed = _on_other_sides(pointer.surface, mask, torch.tensor(work.view.camera.up)) & ~seen
     mask = mask | pointer.facts.paint_on(work.view, mask)
     work = _with(work, selection.select(work.view.selection, mask))
-    strokes = Strokes(on, beside, work.view.selection.members)
+    after = work.view.selection.members
+    strokes = Strokes(on, beside, after, selection.pack(seen), selection.pack(guessed))
     return with_tool(work, strokes=(*work.transient.tool.strokes, strokes))
+
+
+def _on_other_sides(surface: Surface, mask: Mask, up: Tensor) -> Mask:
+    """Return the selected Gaussians on the front surface of the selection alone from its left, back or right.
+
+    Args:
+        surface: the visible surface
+        mask: the selection. [N]
+        up: world direction that is up. [3]
+    """
+    rows = np.flatnonzero(mask)
+    result = np.zeros_like(mask)
+    if not len(rows):
+        return result
+    part = surface.scene[torch.from_numpy(rows)]
+    center = part.means.median(dim=0).values
+    for angle in (0.5 * math.pi, math.pi, 1.5 * math.pi):
+        turn = rotation_matrices(turn_quats(angle * up[None]))[0]
+        pose = torch.eye(4)
+        pose[:3, :3] = turn
+        pose[:3, 3] = center - turn @ center
+        camera = replace(surface.camera, viewmat=surface.camera.viewmat @ pose)
+        result[rows] |= front_surface(part, camera, project_centers(part, camera))
+    return result
+
+
+def last_strokes(work: Workspace) -> Strokes | None:
+    """Return the strokes that led to the selection, or None."""
+    strokes = reversed(work.transient.tool.strokes)
+    return next((each for each in strokes if each.after == work.view.selection.members), None)
 
 
 def strokes_of(work: Workspace) -> tuple[Rows, Rows] | None:
     """Return the rows, on the object and next to it, of the strokes that led to the selection, or None."""
-    strokes = reversed(work.transient.tool.strokes)
-    made = (each for each in strokes if each.after == work.view.selection.members)
-    return next(((each.on, each.beside) for each in made), None)
+    last = last_strokes(work)
+    return None if last is None else (last.on, last.beside)
+
+
+def guessed_rows(work: Workspace) -> bytes:
+    """Return the selected Gaussians that were in no view with a stroke, packed, while the tool is active."""
+    last = last_strokes(work) if work.view.select.tool == "scribble" else None
+    return selection.EMPTY_MASK if last is None else last.guessed
 
 
 def next_step(work: Workspace) -> str:
-    """Return the instruction for the next stroke if a scribble has only one kind of stroke, else ""."""
+    """Return the instruction for the next stroke of a scribble, "" if none is needed.
+
+    A stroke of the other kind is missing, or a part of the selection was not in view.
+    """
     strokes = strokes_of(work)
     if work.view.select.tool != "scribble" or strokes is None:
         return ""
@@ -294,6 +345,8 @@ def next_step(work: Workspace) -> str:
         return "Now stroke the background (Ctrl)"
     if len(beside) and not len(on):
         return "Now stroke the object"
+    if guessed_rows(work) != selection.EMPTY_MASK:
+        return "Blue is a guess: turn and stroke there"
     return ""
 
 

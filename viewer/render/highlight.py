@@ -26,6 +26,7 @@ RAMP = ((0.0, 0x2B3FA8), (0.25, 0x7A35B5), (0.5, 0xC8407A), (0.75, 0xF08A3C), (1
 """Color ramp: weights and 0xRRGGBB. Lightness rises with the weight, so it also reads in gray."""
 
 SELECTED: Color = (1.0, 0.72, 0.05)  # tint of the selection
+GUESSED: Color = (0.25, 0.55, 1.0)  # tint of the selected Gaussians that no view with a scribble shows
 TINT = 140  # share of a tint, of 255
 FAINT_TINT = 45  # share of the selection's tint while no selection tool is active, of 255
 PULLED: Color = (1.0, 0.38, 0.08)  # tint of the Gaussians that a pull can move
@@ -56,6 +57,7 @@ def requested_highlight(
     pointed: Pointed | None = None,
     looks: bool = False,
     pulled: PullInfluence | None = None,
+    guessed: bytes = EMPTY_MASK,
 ) -> Highlight | None:
     """Return the highlight for a view, or None.
 
@@ -71,6 +73,7 @@ def requested_highlight(
         pointed: panel item under the mouse
         looks: edits are being changed, so the selection is not shown
         pulled: Gaussians that a handle moves right now, or None
+        guessed: selected Gaussians that no view with a scribble shows, packed
     """
     if view.compare.mode != "off":
         return None
@@ -93,6 +96,8 @@ def requested_highlight(
     strong = bool(view.select.tool) or kind == "selection"
     if state.count and (strong or (view.panel and not looks)):
         tinted.append((state.members, SELECTED, TINT if strong else FAINT_TINT))
+        if guessed != EMPTY_MASK:
+            tinted.append((guessed, GUESSED, TINT))
     return Highlight(tinted=tuple(tinted)) if tinted else None
 
 

@@ -347,6 +347,8 @@ class Strokes:
     on: Rows  # Gaussians under strokes on the object
     beside: Rows  # Gaussians under strokes next to it
     after: bytes  # selection afterwards, packed
+    seen: bytes  # Gaussians on the front surface of any view with a stroke, packed
+    guessed: bytes  # selected Gaussians that no such view shows, packed
 
 
 @dataclass(frozen=True)

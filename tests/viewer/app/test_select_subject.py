@@ -10,7 +10,7 @@ import pytest
 from imgui_bundle import imgui
 
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
-from viewer.app.select_tool import next_step
+from viewer.app.select_tool import guessed_rows, next_step
 from viewer.camera.views import look_at_view
 from viewer.state import selection
 from viewer.state.commands import Plain
@@ -60,7 +60,7 @@ def test_scribble_names_the_next_stroke_and_hides_dots_from_behind(hand: Rig) ->
     hand.modifier(imgui.Key.mod_ctrl)
     hand.drag(*ON_LAWN)
     hand.modifier(imgui.Key.mod_ctrl, False)
-    assert next_step(hand.main_view.work) == ""
+    assert "a guess" in next_step(hand.main_view.work)
     pointer = hand.main_view._pointer()
     strokes = hand.main_view.work.transient.tool.strokes[-1]
     in_front = len(pointer.visible_dots((strokes.on, strokes.beside))[0])
@@ -69,6 +69,24 @@ def test_scribble_names_the_next_stroke_and_hides_dots_from_behind(hand: Rig) ->
     hand.frame(2)
     pointer = hand.main_view._pointer()
     assert len(pointer.visible_dots((strokes.on, strokes.beside))[0]) < in_front
+
+
+def test_scribble_marks_the_unseen_back_as_a_guess(hand: Rig) -> None:
+    hand.key("Shift+U")
+    hand.drag(*ON_HEAD)
+    hand.modifier(imgui.Key.mod_ctrl)
+    hand.drag(*ON_LAWN)
+    hand.modifier(imgui.Key.mod_ctrl, False)
+    work = hand.main_view.work
+    front = selection.unpack(guessed_rows(work), len(bear().scene))
+    assert 0.1 < front.sum() / selected(hand).sum() < 0.9
+    assert not (front & ~selected(hand)).any()
+    # a stroke from behind confirms the back
+    hand.main_view.store.replace(with_camera(work, look_at_view(work.view.camera, "back")))
+    hand.frame(2)
+    hand.drag(*ON_HEAD)
+    both = selection.unpack(guessed_rows(hand.main_view.work), len(bear().scene))
+    assert both.sum() < 0.3 * front.sum()
 
 
 def test_refine_asks_before_it_doubles_a_selection(hand: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
