@@ -171,8 +171,12 @@ def rebind_edit(gdf: Gdf, a: Gaussians, b: Gaussians, match: Match) -> Gdf:
         recorded=gdf.field.recorded,
     )
     quality = {"matched": match.matched, "one_to_one": match.once, "median": match.median, "p95": match.p95}
+    motions = gdf.motions
+    if motions is not None:
+        motions = replace(motions, parts=motions.parts[torch.from_numpy(index[member_rows])])
     rebound = replace(
         gdf,
+        motions=motions,
         region=Region(gdf.region.name, rows, gdf.region.score[of_a]),
         field=field,
         scene=fingerprint(b),

@@ -12,8 +12,10 @@ from torch import Tensor
 
 from progdf.compose.composer import Composer
 from progdf.compose.layers import BLENDS, Gains, Layer
+from progdf.compose.parents.rest import rest_frame
 from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
+from progdf.field.separable import fit_keyframes
 from progdf.gaussians import Gaussians, pack
 from progdf.gdf.file import Gdf, anchor_added, load_gdf, save_gdf
 from progdf.quaternions import normalize_quats, rotation_matrices
@@ -193,3 +195,26 @@ def test_damaged_motions_are_refused(scene: Gaussians, tmp_path: Path) -> None:
     path.write_bytes(signed_gdf(header, safetensors.torch.load(content)))
     with pytest.raises(ProgdfError, match="axis 5 is mirrored"):
         load_gdf(path, scene)
+
+
+@pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS)
+def test_change_on_screen_becomes_a_child_of_the_moves(scene: Gaussians, motion: AffineMotion) -> None:
+    half = from_mask("half", scene.means[:, 0] > 0)
+    stack = [Layer(move_of(scene, motion, half), 0.9), Layer(move_of(scene, MOTIONS["turn and scale"], half))]
+    members = some_rows(scene, 60, 4)
+    child = edit_of(scene, members, curved_field(60, 4, 14 + 3 * scene.shN.shape[1]), "pull")
+    offsets = 0.3 * child.field.offsets(1.0)
+    offsets[:, 10:14] = 0.0
+    shown = compose_layers(scene, stack)
+    wanted = shown.replace_rows(members, pack(shown[members], True) + offsets)
+    frame = rest_frame(scene, stack, "adjust", members)
+    assert frame is not None
+    rest = fit_keyframes(torch.tensor([0.0, 1.0]), torch.stack([0 * offsets, frame.offsets(offsets)]), 2)
+    pull = replace(child, field=rest, adds=True)
+    check_same(compose_layers(scene, [*stack, Layer(pull)]), wanted)
+
+
+def test_shifts_need_no_rest_frame(scene: Gaussians) -> None:
+    stack = [Layer(move_of(scene, similarity(SHIFT)), 0.9)]
+    assert rest_frame(scene, stack, "adjust", torch.arange(COUNT)) is None
+    assert rest_frame(scene, [], "adjust", torch.arange(COUNT)) is None

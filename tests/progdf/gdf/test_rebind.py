@@ -17,6 +17,8 @@ from progdf.formats.scene_file import load_scene, rotate_about_x
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import load_gdf
 from progdf.rasterize import render
+from progdf.region import from_mask, whole_scene
+from progdf.tidy import Step, mirror, similarity, tidy
 from tests.helpers.scene_files import write_compressed_ply, write_scene
 from tests.helpers.stacks import Stack, bear_stack
 from viewer.camera.view_camera import first_camera, to_camera
@@ -50,6 +52,23 @@ def test_shuffled_rows_keep_their_own_offsets(stack: Stack) -> None:
         expected = compose_layers(stack.scene, [Layer(gdf, 0.6)])[order]
         for name in ("means", "log_scales", "logit_opacities", "sh0"):
             assert torch.equal(getattr(found, name), getattr(expected, name)), name
+
+
+def test_rebound_move_still_carries_other_layers(stack: Stack) -> None:
+    scene = stack.scene
+    half = from_mask("half", scene.means[:, 0] > 0)
+    steps = [
+        Step("transform", half, similarity(turn=(0.0, 1.0, 0.0))),
+        Step("transform", whole_scene(scene), mirror(1)),
+    ]
+    gdfs = [stack.gdfs[0], tidy(scene, steps, "move")]
+    other, order = shuffled(scene)
+    match = match_scenes(scene, other)
+    rebound = [rebind_edit(gdf, scene, other, match) for gdf in gdfs]
+    found = compose_layers(other, [Layer(gdf, 0.6) for gdf in rebound])
+    expected = compose_layers(scene, [Layer(gdf, 0.6) for gdf in gdfs])[order]
+    for name in ("means", "log_scales", "logit_opacities", "sh0"):
+        torch.testing.assert_close(getattr(found, name), getattr(expected, name), atol=1e-5, rtol=1e-5)
 
 
 def test_negated_quaternion_rotates_the_same_way(stack: Stack) -> None:

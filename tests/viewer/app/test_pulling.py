@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
@@ -13,7 +14,10 @@ import torch
 from imgui_bundle import imgui
 from imgui_bundle.imguizmo import im_guizmo
 
+from progdf.gdf.file import save_gdf
 from progdf.pull.live import LiveStep
+from progdf.region import whole_scene
+from progdf.tidy import Step, similarity, tidy
 from tests.helpers.edits import bits
 from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import opened_document
@@ -114,6 +118,31 @@ def test_surface_follows_the_pointer_and_enter_makes_a_layer(app: App) -> None:
     press(app, "Ctrl+Z")
     assert torch.equal(means(app), before)
     assert bits(app.documents.get().original) == original
+
+
+def test_pull_on_a_turned_part_follows_the_turn(app: App) -> None:
+    scene = bear().scene
+    scarf = scene.means[bear().demo.members("scarf")].double().mean(dim=0)
+    turn = replace(similarity(turn=(0.0, 0.0, 0.5 * math.pi)), pivot=scarf)
+    gdf = tidy(scene, [Step("transform", whole_scene(scene), turn)], "turn")
+    app.parts.maker.begin("turn", lambda _name, path, _progress: save_gdf(path, gdf), lambda _ready: None)
+    app.parts.maker.wait()
+    app.draw()
+    press(app, "Shift+P")
+    before = means(app)
+    drag(app, on_scarf(app), (30.0, -20.0))
+    (handle,) = pull_of(app).pose.handles
+    moved = means(app) - before
+    nearest = int((before - torch.tensor(handle.point)).norm(dim=1).argmin())
+    torch.testing.assert_close(moved[nearest], torch.tensor(handle.pull), atol=0.05, rtol=0.2)
+    press(app, "Enter")
+    app.parts.pulling.settle()
+    app.draw()
+    torch.testing.assert_close(means(app)[nearest] - before[nearest], moved[nearest], atol=0.02, rtol=0.1)
+    gdf = app.documents.get().gdfs[-1]
+    at = int((gdf.region.members == nearest).nonzero())
+    x, y, z = gdf.field.attribute_offsets("means", 1.0)[at].tolist()
+    torch.testing.assert_close(torch.tensor([-y, x, z]), moved[nearest], atol=0.02, rtol=0.1)
 
 
 def test_held_drag_is_solved_on_until_it_settles(app: App, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,10 +17,12 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from progdf.compose.composer import Composer
 from progdf.compose.layer_paint import layer_of
 from progdf.compose.layers import Layer
+from progdf.compose.parents.rest import RestFrame, rest_frame
 from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
@@ -92,6 +94,7 @@ class _Prepared:
     edit: Gdf
     composer: Composer
     is_cut: bool  # the cuts separate a Gaussian from the handles
+    frame: RestFrame | None  # turns offsets back before the moves of the scene; None: there are none
 
 
 class _Bases:
@@ -406,7 +409,7 @@ class PullActions:
         self._stepping = None
         self._solved = future.result()
         self._solved_at = time.perf_counter()
-        write_offsets(prepared.edit, self._solved.offsets)
+        write_offsets(prepared.edit, _rest_offsets(prepared.frame, self._solved.offsets))
         self._engine().touch(prepared.edit)
         self._store.wake()
 
@@ -505,12 +508,18 @@ def _prepare(bases: _Bases, problem: _Problem, pose: HandlePose, count: int) -> 
     drawn = problem.engine.scene
     edit = edit_in_progress(drawn, live.members, live.channels, _NAME)
 
-    write_offsets(edit, first.offsets)
+    frame = rest_frame(drawn, _stack(problem), problem.blend, torch.from_numpy(live.members))
+    write_offsets(edit, _rest_offsets(frame, first.offsets))
     composer = Composer(drawn, (*problem.gdfs, edit))
     stack = _stack(problem)
     for layers in ([*stack, Layer(edit)], stack):  # the first one compiles and plans the steps to come
         composer.update(layers, problem.blend)
-    return _Prepared(problem, owners, live, edit, composer, is_cut or live.cut_count > 0)
+    return _Prepared(problem, owners, live, edit, composer, is_cut or live.cut_count > 0, frame)
+
+
+def _rest_offsets(frame: RestFrame | None, offsets: Tensor) -> Tensor:
+    """Return offsets of the scene on screen as offsets that its moves carry. [M,C] -> [M,C]"""
+    return offsets if frame is None else frame.offsets(offsets)
 
 
 @one_thread()
@@ -532,6 +541,10 @@ def _make_layer(
     ]
     cuts = _lines(problem.cuts)
     course = pull(scene, with_grips(scene, moved, hold, cuts)[0], hold, cuts=cuts)
+    members = course.region.members
+    frame = rest_frame(problem.engine.scene, _stack(problem), problem.blend, members)
+    offsets = torch.stack([_rest_offsets(frame, each) for each in course.offsets])
+    course = replace(course, offsets=offsets)
     save_gdf(path, tidy(original, [Step("pull", course.region, course=course)], name, "pull"))
 
 
