@@ -365,7 +365,7 @@ class Solver:
         self, mapped: Tensor, residual: Tensor, targets: Sequence[Tensor], ridge: float
     ) -> _Gradient:
         """Return the gradient and the error at a residual."""
-        sh = add_bands(add_bands(self.sh, mapped), residual)
+        sh = add_bands(self.sh + mapped, residual)
         means = self.views[0].members.means.numpy()
         drawn = torch.empty(len(self.views), len(residual), 3, dtype=torch.bool)
         descent = self._regularize(residual, ridge).neg_()

@@ -79,7 +79,7 @@ class ListedWeights:
     def picture(self, colors: Tensor) -> Tensor:
         """Draw an image, see `ColorMap`."""
         channels = colors.shape[1]
-        image = np.zeros((math.prod(self.size), channels), np.float32)
+        image = np.empty((math.prod(self.size), channels), np.float32)  # the tiles contain every pixel
         values = colors.to("cpu", torch.float32).contiguous().numpy()
         planes = np.zeros(channels * _PLANE, np.float32)
         add = add_images if channels == 3 else add_channels
