@@ -25,6 +25,7 @@ from torch import Tensor
 from progdf import sh
 from progdf.color.oklab import linear_from_srgb, srgb_from_linear
 from progdf.errors import ProgdfError
+from progdf.formats.repair import logits_of_shares
 from progdf.gaussians import ZERO, Gaussians, concatenate, from_arrays
 from progdf.io.file_rules import check_fields, damage_error, unsupported_error
 from progdf.quaternions import multiply_quats
@@ -473,9 +474,7 @@ class _Reader:
         coefficients = np.stack(
             [tables[name] for name in plan.columns if name not in _ATTRIBUTE_TYPES], axis=1
         )
-        opacities = tables[f"{EXTENSION}:OPACITY"][:, 0].astype(np.float64)
-        with np.errstate(divide="ignore", invalid="ignore"):  # 0 and 1 become infinite and are repaired later
-            logits = np.log(opacities) - np.log1p(-opacities)
+        logits = logits_of_shares(tables[f"{EXTENSION}:OPACITY"][:, 0])
         return from_arrays(
             {
                 "means": tables["POSITION"].astype(np.float64),

@@ -11,6 +11,8 @@ import os
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -67,6 +69,22 @@ def repair(scene: Gaussians, path: str | os.PathLike[str]) -> tuple[Gaussians, d
         reasons = ", ".join(_unusable_reasons(scene))
         raise ProgdfError(f"{path} holds no usable Gaussian: {reasons}; export the scene again")
     return repaired, {**moved, **counts}
+
+
+def logits_of_shares(opacities: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return the logits of opacities in a format that stores them as shares. [N] 0 to 1 -> [N] float64
+
+    0 and 1 are values of such a format, as bytes of 0 and 255, and no damage. They become the finite logits
+    `INVISIBLE_LOGIT` and `OPAQUE_LOGIT`. Values outside of 0 to 1 become NaN.
+    """
+    shares = opacities.astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return limit_logits(np.log(shares) - np.log1p(-shares))
+
+
+def limit_logits(logits: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return logits with finite values for opacities of 0 and 1, see `logits_of_shares`. [N] -> [N]"""
+    return np.where(np.isinf(logits), np.clip(logits, INVISIBLE_LOGIT, OPAQUE_LOGIT), logits)
 
 
 def _unusable_reasons(scene: Gaussians) -> list[str]:

@@ -51,7 +51,7 @@ from .packed.sog import META as SOG_META
 from .packed.sog import read_sog, read_table, scene_bytes
 from .ply import load_ply_with_report, read_ply, save_ply, save_ply_checked
 from .ply_file import read_header
-from .repair import LoadReport, repair
+from .repair import LoadReport, limit_logits, repair
 
 CONTAINERS = ("zip", "gz")
 """Archive formats. An archive is read if it holds exactly one scene."""
@@ -293,9 +293,11 @@ def _read_with_gaussforge(path: Path, kind: str) -> Gaussians:
         if reason:
             raise _read_error(path, kind, reason)
         try:
-            return read_ply(read_header(target))[0]
+            scene = read_ply(read_header(target))[0]
         except ProgdfError:
             raise _read_error(path, kind, "returned no scene") from None
+    logits = limit_logits(scene.logit_opacities.numpy())  # bytes of 0 and 255
+    return replace(scene, logit_opacities=torch.from_numpy(logits))
 
 
 def _read_spz_part(path: Path, content: bytes) -> Gaussians:

@@ -161,7 +161,8 @@ def draw_group(
             group.enabled,
             height=SLIM_PX,
             default=LayerGroup.strength,
-            help_="Factor on the strengths of its layers. Double-click: reset to 1",
+            help_="Factor on the strengths of its layers. Layers that are even alone may be uneven together. "
+            "Double-click: reset to 1",
         )
         number_at = (imgui.get_item_rect_max().x + 6.0 * scale, corner[1])
         color = u32(PALETTE.text if group.enabled else PALETTE.dim)

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.formats.ply_file import ANTIALIASED_COMMENT, PlyFile
+from progdf.formats.repair import logits_of_shares
 from progdf.gaussians import ATTRIBUTES, Gaussians, from_arrays
 from progdf.io.file_rules import damage_error, unsupported_error
 from progdf.sh import C0
@@ -48,8 +49,6 @@ def is_compressed(ply: PlyFile) -> bool:
 
 def read_compressed_ply(ply: PlyFile) -> tuple[Gaussians, tuple[str, ...]]:
     """Return the scene as stored, and the names of unused vertex properties.
-
-    Opacities of 0 and 1 give infinite logits; the caller repairs them.
 
     Raises:
         ProgdfError: an element is missing or does not match the others, or a feature is not supported.
@@ -91,8 +90,7 @@ def read_compressed_ply(ply: PlyFile) -> tuple[Gaussians, tuple[str, ...]]:
     position, rotation, scale, color = (packed[column].astype(np.uint32) for column in _PACKED)
     rgba = _unpack_shares(color, (24, 16, 8, 0), (8, 8, 8, 8))
     rgb = rgba[:, :3] if "min_r" not in chunk else _dequantize(ranges, chunk_of_row, rgba, _RGB)
-    with np.errstate(divide="ignore"):  # opacities of 0 and 1 become infinite
-        logits = -np.log(1.0 / rgba[:, 3].astype(np.float64) - 1.0)
+    logits = logits_of_shares(rgba[:, 3])
     higher = np.zeros((count, 0, 3), np.float32)
     if bands:
         higher = _higher_bands(name, bands[0], len(sh))

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from progdf.errors import ProgdfError
+from progdf.formats.repair import logits_of_shares
 from progdf.gaussians import Gaussians, from_arrays
 from progdf.io.atomic import read_file
 from progdf.io.file_rules import damage_error, unsupported_error
@@ -53,8 +54,6 @@ _SECTION_FIELDS = {
 
 def read_splat(path: str | os.PathLike[str]) -> Gaussians:
     """Return the scene as stored in a .splat file.
-
-    Opacities of 0 and 1 give infinite logits; the caller repairs them.
 
     Raises:
         ProgdfError: the size of the file is not a multiple of 32 bytes.
@@ -166,8 +165,7 @@ def _unpack(
 def _decode_colors(rgba: npt.NDArray[np.uint8]) -> tuple[Floats, Floats]:
     """Decode RGBA bytes to SH band 0 and opacity logits. [N,4] -> [N,3] and [N]"""
     shares = rgba.astype(np.float32) / 255
-    with np.errstate(divide="ignore"):
-        logits = np.log(shares[:, 3]) - np.log1p(-shares[:, 3])
+    logits = logits_of_shares(shares[:, 3]).astype(np.float32)
     sh0 = (shares[:, :3] - 0.5) / np.float32(C0)
     return np.asarray(sh0, np.float32), logits
 

@@ -29,6 +29,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from progdf.errors import ProgdfError
+from progdf.formats.repair import logits_of_shares
 from progdf.gaussians import Gaussians, from_arrays
 from progdf.io.atomic import open_error, read_file
 from progdf.io.file_rules import check_fields, damage_error, unsupported_error
@@ -122,7 +123,7 @@ def read_table(path: Path) -> dict[str, Any] | None:
 def read_sog(path: Path) -> SogScene:
     """Return the scene in a zip archive, or in the folder of a meta.json.
 
-    Opacities of 0 and 1 give infinite logits; the caller repairs them. Axes are those of the original .ply.
+    Axes are those of the original .ply.
 
     Raises:
         ProgdfError: the version or a feature is not supported, or the file is damaged.
@@ -146,8 +147,7 @@ def read_sog(path: Path) -> SogScene:
         else:
             log_scales = _codebook(path, meta.scales, "scales")[scales[:, :3]]
             sh0 = _codebook(path, meta.sh0, "sh0")[colors[:, :3]]
-            opacities = colors[:, 3] / 255.0
-            logits = np.log(opacities) - np.log1p(-opacities)
+            logits = logits_of_shares(colors[:, 3] / 255.0)
         arrays = {
             "means": means.astype(np.float32),
             "quats": _quats(quats),

@@ -1,4 +1,4 @@
-"""Writer of .spz version 3 (Niantic): gzip data of a header and one block of quantized values per attribute.
+"""Writer of .spz version 3 (Niantic). A file is gzip data: a header, then a block of bytes per attribute.
 
     position    24 bits per coordinate, fixed point
     opacity     8 bits

@@ -20,7 +20,7 @@ from progdf.io.atomic import atomic_write
 from progdf.rasterize.cpu import jit
 from tests.helpers.paths import ROOT
 from tests.helpers.scenes import random_gaussians
-from trainer.options import ShowRegionOptions, WriteViewsOptions
+from trainer.options import ShowRegionOptions, WriteViewsOptions, check_ranges
 
 
 def stderr_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
@@ -114,6 +114,13 @@ def test_thread_count_out_of_range_is_refused(
     assert "--threads must be between 0 and 1024" in stderr_of(
         capsys, "fit", str(tmp_path), "--threads", threads
     )
+
+
+def test_limits_in_errors_are_written_for_people() -> None:
+    with pytest.raises(ProgdfError, match=r"^--price must be between 0 and 1 000 000, got -1$"):
+        check_ranges(("--price", -1, 0, 1e6))
+    with pytest.raises(ProgdfError, match=r"^--share must be between 0.5 and 1, got 2$"):
+        check_ranges(("--share", 2, 0.5, 1.0))
 
 
 @pytest.mark.parametrize("psnr", ["nan", "inf", "0", "-3", "99.1", "1e99"])

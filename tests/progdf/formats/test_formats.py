@@ -167,15 +167,19 @@ def test_half_turn_about_x_rotates_the_appearance() -> None:
     assert torch.equal(turned.means, scene.means * turn)
 
 
-def test_saturated_opacities_are_clamped_and_counted(tmp_path: Path) -> None:
-    scene = replace(scene_of(), logit_opacities=torch.full((300,), 15.0))
+def test_opacity_bytes_of_0_and_255_are_no_damage(tmp_path: Path) -> None:
+    logits = torch.full((300,), 15.0)
+    logits[:100] = -30.0
+    scene = replace(scene_of(), logit_opacities=logits)
     compressed = write_compressed_ply(tmp_path / "a.ply", scene)
     ksplat = write_ksplat(tmp_path / "a.ksplat", scene, 1)
-    spz = write_scene(tmp_path / "a.spz", scene)
-    for path in (compressed, ksplat, spz):
+    packed = [write_scene(tmp_path / f"a.{suffix}", scene) for suffix in ("spz", "sog", "splat")]
+    for path in (compressed, ksplat, *packed):
         found, report = load_scene_with_report(path)
         assert bool(found.logit_opacities.isfinite().all()), path.name
-        assert report.opaque == 300, path.name
+        assert int((found.logit_opacities > 5.5).sum()) == 200, path.name
+        assert int((found.logit_opacities < -5.5).sum()) == 100, path.name
+        assert (report.opaque, report.transparent) == (0, 0), path.name
 
 
 def test_formats_with_an_antialiased_flag_keep_it(tmp_path: Path) -> None:
