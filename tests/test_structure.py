@@ -35,7 +35,7 @@ ORDER = {
     "progdf": """quaternions sh gaussians similarity terminal errors threads region camera color metrics
         demo_scenes io rasterize surface painting field formats gdf scene compose fade pull tidy summary cli
         __init__ __main__""",
-    "trainer": """__init__ options store views paint fill editors resolve regions
+    "trainer": """__init__ options quality store views paint fill editors resolve regions
         motion optimize paper fit methods report preview run evaluate batch cli""",
     "viewer": "camera gl state jobs render web files widget __init__ pictures ui panel app commands",
     "benchmarks": """__init__ analytic_edits courses table ablation rasterizer training

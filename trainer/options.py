@@ -17,6 +17,7 @@ from progdf.cli.options import absent_option
 from progdf.errors import ProgdfError
 from progdf.field.neural import Size
 from progdf.scene import UpChoice
+from progdf.terminal import group_digits
 
 EditKind = Literal["color", "style", "geometry"]
 """Attributes that an edit moves, which determine learning rates and loss weights (docs/method.md 3)."""
@@ -35,6 +36,8 @@ CarryOn = Literal["auto", "never", "always"]
 StrengthsBy = Literal["editor", "blend"]
 Device = Literal["auto", "cpu"]
 Engine = Literal["auto", "cpu", "warp"]
+Quality = Literal["small", "balanced", "best"]
+"""Bytes against quality (trainer/quality.py)."""
 ReportLevel = Literal["none", "short", "full"]
 """Extent of the report that follows the edit's file, ascending (docs/method.md 7)."""
 
@@ -198,6 +201,8 @@ class FieldOptions:
     """neural: parameters of the network, 17 thousand, 0.5 million or 6 million (paper, 15 minutes)."""
     field_loss: FieldLoss = "parameters"
     """neural: train on the recorded offsets, or on renders with the losses of the paper."""
+    quality: Quality = "balanced"
+    """Bytes against quality: small, balanced, or best (docs/benchmarks.md)."""
     target_psnr: Annotated[float | None, absent_option("FLOAT", "a tenth of the edit's own error")] = None
     """Minimum PSNR of the field to the trajectory, dB, instead of auto's rule; lower gives smaller files."""
     draft: Fixed[bool] = False  # train a network for a third of its steps
@@ -319,7 +324,15 @@ def check_ranges(*ranges: tuple[str, float | None, float, float]) -> None:
     """
     for option, value, low, high in ranges:
         if value is not None and not low <= value <= high:
-            raise ProgdfError(f"{option} must be between {low} and {high}, got {value}")
+            limits = f"{_spell_number(low)} and {_spell_number(high)}"
+            raise ProgdfError(f"{option} must be between {limits}, got {value}")
+
+
+def _spell_number(number: float) -> str:
+    """Return a number for a message: whole numbers without a fraction, large ones in groups of digits."""
+    if number != int(number):
+        return str(number)
+    return group_digits(int(number)) if abs(number) >= 10_000 else str(int(number))
 
 
 @dataclass(frozen=True)

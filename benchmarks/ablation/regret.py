@@ -36,7 +36,8 @@ from trainer.fit.fit import fit_grades, visibility
 from trainer.fit.slider_uniformity import equalized_strengths
 from trainer.optimize.color_course import STEPS as TAKEN
 from trainer.optimize.color_course import solve
-from trainer.optimize.color_solver import Model, iterations, make_solver
+from trainer.optimize.color_model import Model
+from trainer.optimize.color_solver import iterations, make_solver
 from trainer.optimize.color_views import add_bands, color_views
 from trainer.optimize.pgs import ParameterSnapshot, PgsState
 from trainer.optimize.retime import smooth_course
@@ -179,7 +180,15 @@ class RegretEdit:
         began = time.process_time()
         between = StrengthSource(edit, look)
         with TemporaryDirectory() as folder, closing(RunLog(Path(folder) / "log.txt", quiet=True)) as log:
-            options = OptimizeOptions(), self.setup, finished, between, TrainingViewOptions(), log
+            options = (
+                OptimizeOptions(),
+                self.setup,
+                finished,
+                between,
+                TrainingViewOptions(),
+                log,
+                FieldOptions(),
+            )
             plan = plan_colors(*options)
         solver = plan.solver
         model = plan.model

@@ -155,8 +155,8 @@ class FieldEvaluator:
         self._own_errors = self._editor_errors(self._truth_at)
         self._allowed = allowed_error(fmean(self._own_errors), added) if edited else 10 ** (-target / 10)
         own = decibels(fmean(self._own_errors))
-        tenth = f"adds at most a tenth to the edit's own error ({own:.1f} dB to the editor)"
-        self.wanted = tenth if edited else f"reaches {target:g} dB"
+        share = f"adds at most {100 * added:.3g} % to the edit's own error ({own:.1f} dB to the editor)"
+        self.wanted = share if edited else f"reaches {target:g} dB"
         """Condition that accepted fields meet, in words."""
 
     def end_excess(self, end: Tensor) -> float:

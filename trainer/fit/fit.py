@@ -14,7 +14,7 @@ from torch import Tensor
 
 from progdf.field import BakedField, Candidate, FieldChoice, FieldEvaluator, choose_field
 from progdf.field.baked import GradeForm, NeuralForm
-from progdf.field.choose import MAX_ADDED_ERROR_SHARE, MAX_FITTED_SNAPSHOTS, SAMPLES, pick_candidate
+from progdf.field.choose import MAX_FITTED_SNAPSHOTS, SAMPLES, pick_candidate
 from progdf.field.grade import (
     RESIDUAL_STEPS,
     bake_grade,
@@ -33,6 +33,7 @@ from progdf.threads import one_thread
 from trainer.editors.base import ImageEditor
 from trainer.optimize.retime import select_recordings
 from trainer.options import FieldKind, FieldOptions
+from trainer.quality import QUALITIES
 from trainer.store.progress import release_memory
 from trainer.views.choose import split_held_out
 from trainer.views.crops import only_recolors
@@ -41,8 +42,8 @@ from trainer.views.view import View
 
 from .evaluate import Evaluator, make_evaluator, sample_members
 
-THINNING_ERROR_SHARE = 0.025
-"""Part of `MAX_ADDED_ERROR_SHARE` reserved for leaving out functions of single members, see `thin_model`."""
+THINNING_SHARE = 0.25
+"""Part of `QualityLimits.added_error` reserved for leaving out functions of members, see `thin_model`."""
 
 _PATH_VIEWS = 3  # views on which a path is chosen
 _PATH_GAIN_DB = 0.5  # a curved path must be better by this: it takes several times the bytes
@@ -133,7 +134,7 @@ def fit_field(
         seen.counted_pixels,
         weights,
         "separable" if options.field == "auto" else options.field,
-        field_evaluator(trajectory, choosing, options.target_psnr),
+        field_evaluator(trajectory, choosing, options),
     )
     return _measure_choice(choice, trajectory, reporting)
 
@@ -210,7 +211,7 @@ def fit_grades(
     members, sampled = sample_members(choosing)
     is_sample = len(members) < len(rows)
     part = packing.take(members) if is_sample else packing
-    evaluator = field_evaluator(part.trajectory, sampled, options.target_psnr)
+    evaluator = field_evaluator(part.trajectory, sampled, options)
     tried = list[Candidate]()
     steps = list[tuple[int, int]]()  # number of bases, and index of the step size, of each candidate
     smallest = math.inf
@@ -244,7 +245,7 @@ def fit_grades(
     choice = pick_candidate(tried, evaluator.wanted)
     rank, index = next(at for at, one in zip(steps, tried, strict=True) if one is choice.best)
     if is_sample:
-        everything = field_evaluator(trajectory, choosing, options.target_psnr)
+        everything = field_evaluator(trajectory, choosing, options)
         choice = replace(choice, why=choice.why.replace(evaluator.wanted, everything.wanted))
         choice = _check_on_all(choice, packing, rank, index, everything)
     else:
@@ -282,20 +283,20 @@ def _check_on_all(
     return replace(choice, best=best, met=excess <= 1.0)
 
 
-def field_evaluator(trajectory: Trajectory, views: Evaluator, target: float | None) -> FieldEvaluator:
+def field_evaluator(trajectory: Trajectory, views: Evaluator, options: FieldOptions) -> FieldEvaluator:
     """Return an evaluator that tests a field against the editor's pictures of these views.
 
-    The pictures are compared at every strength that has some. With a `target` in dB, the field is tested
-    against the recordings instead.
+    The pictures are compared at every strength that has some. With `target_psnr`, the field is tested against
+    the recordings instead.
     """
     edited = {s: views.count(views.edited[e]) for s, e in trajectory.stage_strengths if e in views.edited}
     course = trajectory.s, trajectory.offsets, views.counted_pixels, trajectory.at
-    if target is None:
-        added = (
-            MAX_ADDED_ERROR_SHARE if trajectory.bands < 2 else MAX_ADDED_ERROR_SHARE - THINNING_ERROR_SHARE
-        )
-        return FieldEvaluator(*course, edited=edited, added=added)
-    return FieldEvaluator(*course, target=target)
+    if options.target_psnr is not None:
+        return FieldEvaluator(*course, target=options.target_psnr)
+    added = QUALITIES[options.quality].added_error
+    if trajectory.bands > 1:
+        added *= 1.0 - THINNING_SHARE
+    return FieldEvaluator(*course, edited=edited, added=added)
 
 
 def _measure_choice(choice: FieldChoice, trajectory: Trajectory, reporting: Evaluator) -> Fitted:
@@ -323,10 +324,10 @@ def expected_renders(trajectory: Trajectory, kind: FieldKind) -> int:
 
 
 def evaluate_field(
-    trajectory: Trajectory, reporting: Evaluator, field: BakedField, target: float | None
+    trajectory: Trajectory, reporting: Evaluator, field: BakedField, options: FieldOptions
 ) -> Fitted:
     """Measure the field of a network beside the same baselines."""
-    evaluator = field_evaluator(trajectory, reporting, target)
+    evaluator = field_evaluator(trajectory, reporting, options)
     network = evaluator.candidate(field, field.kind)
     why = f"a network was requested{'; none' if network.excess > 1.0 else ' and'} {evaluator.wanted}"
     choice = FieldChoice(network, network.excess <= 1.0, (network,), why)

@@ -15,7 +15,8 @@ from torch.nn.functional import pad
 from progdf.field.grade import band_offsets, member_bands
 from progdf.metrics.image import LEVEL, decibels
 
-from .color_solver import BANDS, GAIN_WINDOW_STEPS, Model, Solver
+from .color_model import Model
+from .color_solver import BANDS, GAIN_WINDOW_STEPS, Solver
 from .color_views import MAX_ERROR_SHARE, ColorEvaluator, add_bands
 from .pgs import OnStep, ParameterSnapshot, PgsState, TargetStage
 from .retime import smooth_weights
@@ -84,7 +85,8 @@ def thin_model(model: Model, solver: Solver, targets: Sequence[Target], steps: i
 
     If the finished edit has no visible error, the next larger number of functions is tried first, for the
     other strengths. Then the half of the functions that contributes least to the pictures is removed, and the
-    remainder is solved again. This repeats while the error grows by at most 5 %.
+    remainder is solved again. This repeats while the error grows by at most `Model.limits.min_gain`, 5 % by
+    default, or while the larger model costs too much beside the smaller one (`QualityLimits.is_too_dear`).
 
     Args:
         model: model of the finished edit
@@ -99,8 +101,12 @@ def thin_model(model: Model, solver: Solver, targets: Sequence[Target], steps: i
         return model
     mapped = [solver.fit_map(model.degree, stage.targets)[1] for stage, _ in targets]
 
-    def refine(starts: Sequence[Tensor], most: int) -> tuple[list[Tensor], float]:
-        """Return the residuals and the sum of their errors after at most `most` steps.
+    limits = model.limits
+
+    def refine(starts: Sequence[Tensor], most: int) -> tuple[list[Tensor], float, tuple[float, float]]:
+        """Return the residuals, the sum of their errors, and the size and PSNR of the finished edit.
+
+        Residuals take at most `most` steps. The size is the mean number of functions per member.
 
         With `most` equal to `steps`, steps end as soon as they stop helping on the held-out views.
         """
@@ -115,29 +121,37 @@ def thin_model(model: Model, solver: Solver, targets: Sequence[Target], steps: i
                     map_change, start, stage.targets, most, evaluator, model.error, model.hold
                 )
             refined.append(start)
-            total += max(judge.error(add_bands(map_change, start)), LEVEL)
-        return refined, total
+            error = max(judge.error(add_bands(map_change, start)), LEVEL)
+            total += error
+        functions = float(refined[-1].any(dim=2).float().sum(dim=1).mean())
+        return refined, total, (functions, decibels(error))
 
-    best, min_error = refine([stage.strength * model.residual for stage, _ in targets], steps)
+    best, min_error, size = refine([stage.strength * model.residual for stage, _ in targets], steps)
     tried = list(model.tried)
     suffix = ", also at other strengths" if len(targets) > 1 else ""
     if richer:
-        refined, error = refine([pad(one, (0, 0, 0, richer - model.bands)) for one in best], steps)
+        padded = [pad(one, (0, 0, 0, richer - model.bands)) for one in best]
+        refined, error, richer_size = refine(padded, steps)
         tried.append((f"with a residual of {richer}{suffix}", decibels(error / len(targets))))
-        if error < MAX_ERROR_SHARE * min_error:
+        if error < limits.max_error_share * min_error:
             best = refined
             min_error = error
+            size = richer_size
     thinner = best
     error = min_error
-    while error * MAX_ERROR_SHARE <= min_error + len(targets) * spare:
+    thinner_size = size
+    base = 1.0, decibels(model.dc_error)
+    while error * limits.max_error_share <= min_error + len(targets) * spare or limits.is_too_dear(
+        base, thinner_size, size
+    ):
         best = thinner
+        size = thinner_size
         min_error = min(min_error, error)
         halved = solver.halve(best)
         if not bool(halved[-1][:, 1:].any()):
             break
-        thinner, error = refine(halved, min(GAIN_WINDOW_STEPS, steps - 1))
-        total = float(thinner[-1].any(dim=2).float().sum(dim=1).mean())
-        tried.append((f"{total:.1f} of these per Gaussian{suffix}", decibels(error / len(targets))))
+        thinner, error, thinner_size = refine(halved, min(GAIN_WINDOW_STEPS, steps - 1))
+        tried.append((f"{thinner_size[0]:.1f} of these per Gaussian{suffix}", decibels(error / len(targets))))
     starts_by_strength = {stage.strength: one for (stage, _), one in zip(targets, best, strict=True)}
     return replace(model, residual=best[-1], begun=starts_by_strength, tried=tried)
 

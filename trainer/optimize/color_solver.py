@@ -21,10 +21,9 @@ A small number of pictures (`trainer.optimize.ties`) leaves most members undeter
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
@@ -37,8 +36,12 @@ from progdf.field.grade import map_colors, member_bands
 from progdf.metrics.image import LEVEL, decibels
 from progdf.sh import C0
 from progdf.threads import map_threads, one_thread
+from trainer.options import Quality
+from trainer.quality import QUALITIES
 
 from .color_kernels import add_curvature, add_gradients, apply_blocks, inner_product, invert_blocks
+from .color_model import TIED_RIDGES
+from .color_model import Model as Model
 from .color_views import (
     MAX_ERROR_SHARE,
     ColorEvaluator,
@@ -71,65 +74,11 @@ Each is tried only if the one before it was an improvement.
 _RESIDUAL_RIDGE = 0.002
 _TIE_WEIGHT = 0.001  # share of a typical member's weight; ties neighbors if there are few views
 _TRUSTED_WEIGHT = 0.1  # share of the same weight; a member with less follows its neighbors
-# ridges to try with ties: spread the residual everywhere, some way, or to neighbors only
-_TIED_RIDGES = (1e-8, 1e-5, 1e-3)
 _DETERMINED_PX = 0.5  # pixels; a member this large in two pictures is determined by them
 _STEP_FRACTIONS = (1.0, 0.5, 0.2)  # fractions of a step to try if the full step runs into clamps
 
 GAIN_WINDOW_STEPS = 3
 """Number of steps over which the gain is measured. A single step may gain nothing in held-out views."""
-
-
-@dataclass(frozen=True)
-class Model:
-    """Size of the model of a color edit, and its solution for the finished edit."""
-
-    degree: int  # degree of the map; 0: no map
-    hold: float  # ridge of the residual, as a share of a typical member's weight
-    residual: Tensor  # residual of the finished edit with b = 0, 1, 4 or 9 functions. [M,b,3]
-    mask: Tensor | None  # see `GradeForm.mask`
-    error: float  # mean squared error of the finished edit in held-out views; smaller errors are not pursued
-    tried: Sequence[tuple[str, float]]  # name of each candidate, and its PSNR on held-out views, dB
-    steps: int  # steps of all candidates
-    most_bands: int  # see `choose_model`; 1 if there are few pictures
-    begun: Mapping[float, Tensor] = field(default_factory=dict)  # strength → initial residual. [M,b,3]
-
-    @property
-    def bands(self) -> int:
-        """Number of SH functions of the residual."""
-        return self.residual.shape[1]
-
-    @property
-    def functions(self) -> float:
-        """Mean number of nonzero SH functions per member."""
-        return float(self.residual.any(dim=2).float().sum(dim=1).mean()) if self.bands else 0.0
-
-    def figures(self) -> dict[str, Any]:
-        """Return the model's figures for report.json."""
-        return {
-            "degree": self.degree,
-            "mask": self.mask is not None,
-            "sh_functions": self.bands,
-            "functions_per_gaussian": round(self.functions, 2),
-            "tried_psnr": {name: round(error, 2) for name, error in self.tried},
-        }
-
-    @property
-    def line(self) -> str:
-        """Description of the choice and its candidates, for the log."""
-        parts = [f"color map of degree {self.degree}" if self.degree else "no color map"]
-        if self.mask is not None:
-            parts.append("mask")
-        if self.bands:
-            functions = f"{self.bands} SH functions" if self.bands > 1 else f"{self.bands} SH function"
-            if self.bands > 1 and self.functions < self.bands:
-                functions += f" ({self.functions:.1f} per Gaussian on average)"
-            parts.append(f"residual of {functions}")
-        candidates = ", ".join(f"{name} {error:.1f}" for name, error in self.tried)
-        rule = (
-            "smallest error" if self.hold in _TIED_RIDGES else "smallest model within 5 % of the best error"
-        )
-        return f"{' + '.join(parts)}. Candidates, held-out dB: {candidates}. Rule: {rule}"
 
 
 @dataclass(frozen=True)
@@ -209,7 +158,7 @@ class Solver:
             change: estimated change. [M,B,3]
             spreads: members not visible in any picture take the mean share of the map (True) or none
                 (False)
-            hold: ridge towards that share, see `_TIED_RIDGES`
+            hold: ridge towards that share, see `TIED_RIDGES`
         """
         weights = self.weights[:, 0, 0]
         share = mask_of_members(self.sh[:, 0] * C0 + 0.5, change[:, 0] * C0, weights)
@@ -476,8 +425,8 @@ class _ModelSearch:
         mask_holds: tuple[float, ...] = (_RESIDUAL_RIDGE,)
         guess = best.change
         if self.few:  # estimate the mask from the residual that spreads everywhere
-            mask_holds = (_TIED_RIDGES[0], _TIED_RIDGES[-1])
-            guess = self.tried[-len(_TIED_RIDGES)].change
+            mask_holds = (TIED_RIDGES[0], TIED_RIDGES[-1])
+            guess = self.tried[-len(TIED_RIDGES)].change
         for hold in mask_holds:
             solver = best.solver.guess_mask(guess, best.degree > 0, hold)
             if min(self.judge.error(self.start(degree, solver).offsets) for degree in MONOMIALS) >= max_error:
@@ -507,8 +456,10 @@ def choose_model(
     targets: Sequence[Tensor],
     steps: int,
     most_bands: int,
+    quality: Quality = "balanced",
 ) -> tuple[Solver, Model]:
-    """Return the solver and the smallest model that no larger one improves by 5 % of the visible error.
+    """Return the solver and the smallest model that no larger one improves by a share of the visible
+    error, 5 % by default.
 
     With few pictures there is always a residual, because changes of single members would otherwise be lost.
     The spread of the residual, with a mask and without, is the one with the smallest error. If all are equal,
@@ -520,11 +471,13 @@ def choose_model(
         targets: finished edit in the solver's views
         steps: maximum number of conjugate gradient steps per residual
         most_bands: maximum number of SH functions of a residual: 1, 4 or 9
+        quality: see `QualityLimits`; without effect if there are few pictures
     """
+    limits = QUALITIES[quality]
     few = solver.ties is not None
     most_bands = min(most_bands, 1 if few else solver.sh.shape[1])
     sizes = [(f"a residual of {bands}", bands, _RESIDUAL_RIDGE) for bands in BANDS if bands <= most_bands]
-    tied_residuals = [(f"a residual held by {hold:g}", 1, hold) for hold in _TIED_RIDGES]
+    tied_residuals = [(f"a residual held by {hold:g}", 1, hold) for hold in TIED_RIDGES]
     search = _ModelSearch(*trial, targets, steps, few, tied_residuals if few else sizes)
     bases = {degree: search.start(degree, search.solver) for degree in (0, *MONOMIALS)}
     mean_errors = {degree: search.judge.mean(base.offsets, 1.0) for degree, base in bases.items()}
@@ -537,7 +490,7 @@ def choose_model(
         last = search.attempt(last, f"with {name}", bands, hold)
         if last.error >= best.error and not few:
             break
-        if max(last.error, LEVEL) < MAX_ERROR_SHARE * best.error:
+        if max(last.error, LEVEL) < limits.max_error_share * best.error:
             best = last
     if few:
         best = min(search.tried[-len(tied_residuals) :], key=lambda one: (one.error, -one.hold))
@@ -547,12 +500,25 @@ def choose_model(
     chosen = best.solver
     residual = best.residual
     if solver.ties is not None and solver.ties.reach is not None and best.degree:
-        best = replace(best, mask_hold=_TIED_RIDGES[0])
+        best = replace(best, mask_hold=TIED_RIDGES[0])
     if few:  # members that no picture shows follow the map, masked or not
         chosen, residual = _solve_whole(solver, best, targets, steps, degrees != (0,))
     mask = (chosen.share * 255.0).round().to(torch.uint8) if best.mask_hold else None
     tried = [(one.name, decibels(one.error)) for one in search.tried]
-    return chosen, Model(best.degree, best.hold, residual, mask, best.error, tried, search.steps, most_bands)
+    dc_error = min((one.error for one in search.tried if one.bands == 1), default=math.inf)
+    model = Model(
+        degree=best.degree,
+        hold=best.hold,
+        residual=residual,
+        mask=mask,
+        error=best.error,
+        tried=tried,
+        steps=search.steps,
+        most_bands=most_bands,
+        dc_error=dc_error,
+        limits=limits,
+    )
+    return chosen, model
 
 
 def solve_again(

@@ -292,7 +292,7 @@ def _fit_field(
             log=log,
             begun=begun,
         )
-        return evaluate_field(trajectory, reporting, network.field, options.target_psnr), network
+        return evaluate_field(trajectory, reporting, network.field, options), network
     with log.looks("fit the field", expected_renders(trajectory, options.field)) as count_view:
         choosing = replace(choosing, looked=count_view)
         reporting = replace(reporting, looked=count_view)

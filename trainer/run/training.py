@@ -42,6 +42,7 @@ from trainer.optimize.pgs import SNAPSHOTS, DescentTask, OnStep, ParameterSnapsh
 from trainer.optimize.retime import record, retime, select_recordings, straight_recordings
 from trainer.options import (
     MAX_STAGES,
+    FieldOptions,
     OptimizeOptions,
     Slider,
     TrainingViewOptions,
@@ -173,7 +174,7 @@ def optimize_members(
             between,
             options.views,
             log,
-            options.field.target_psnr,
+            options.field,
             CarryRequest(options.editor.carry_on, options.region.region),
         )
         return _solve(plan, iterations(optimization.steps), folder, log)
@@ -258,7 +259,7 @@ def plan_colors(
     between: StrengthSource | None,
     options: TrainingViewOptions,
     log: RunLog,
-    target_psnr: float | None = None,
+    field: FieldOptions,
     carry_on: CarryRequest | None = None,
 ) -> ColorPlan:
     """Solve for the finished edit, then choose the model size and the strengths to solve for next.
@@ -271,7 +272,7 @@ def plan_colors(
         options: view options. Changed pictures require `make_tied_solver`. If the number of views is open,
             only every other view is used, provided that the remaining error is not visible
         log: log of the run
-        target_psnr: see `FieldOptions`
+        field: quality of the model, and the error that it may have
         carry_on: request for the parts that no picture shows; without effect if there are many views
     """
     scene = setup.scene
@@ -315,7 +316,7 @@ def plan_colors(
             solver = make_solver(drawn, original)
         trial = split_solver(solver, targets) if few else (solver, finished[1])
         solver, model = choose_model(
-            solver, trial, targets, max_iterations, 1 if optimization.sh == "off" else 9
+            solver, trial, targets, max_iterations, 1 if optimization.sh == "off" else 9, field.quality
         )
         if model.error <= LEVEL and held_out and between is not None and not options.views:
             half_target = replace(finished[0], targets=targets[::2]), finished[1]
@@ -329,10 +330,9 @@ def plan_colors(
     course = StrengthSchedule(ask(strengths), finished, look, ask)
     with log.stage("model"):
         middle = len(course.targets) // 2 if between is None else 0
-        allowed_error = 0.0 if target_psnr is None else 10 ** (-target_psnr / 10)
-        model = thin_model(
-            model, solver, [*course.targets[middle : middle + 1], finished], max_iterations, allowed_error
-        )
+        allowed_error = 0.0 if field.target_psnr is None else 10 ** (-field.target_psnr / 10)
+        both = [*course.targets[middle : middle + 1], finished]
+        model = thin_model(model, solver, both, max_iterations, allowed_error)
     evaluated_on = "held-out views" if held_out else "all views, as none is held out"
     if len(train) < count:
         log.say(f"solving for {len(train)} of {count} views; the others would make no visible difference")

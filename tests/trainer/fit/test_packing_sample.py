@@ -95,7 +95,7 @@ def test_sampled_grade_meets_the_limit_on_all_pixels(monkeypatch: pytest.MonkeyP
     assert sampled.choice.met
     field = sampled.choice.best.field
     assert field.members == len(case.region)
-    excess, to_editor = field_evaluator(trajectory, choosing, None).added_excess(field)
+    excess, to_editor = field_evaluator(trajectory, choosing, FieldOptions()).added_excess(field)
     assert excess <= 1.0
     assert sampled.choice.best.to_editor == pytest.approx(to_editor, abs=1e-3)
     forms = [one.choice.best.field.origin for one in (whole, sampled)]

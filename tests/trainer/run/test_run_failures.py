@@ -20,7 +20,7 @@ from tests.helpers.stopped import OUT, small_run
 from tests.helpers.stopped_runs import NEVER, at_step, gone_on, saved_step, words
 from tests.helpers.trained import quick_options, train
 from trainer.optimize import pgs
-from trainer.optimize.color_solver import Model
+from trainer.optimize.color_model import Model
 from trainer.optimize.pgs import ParameterSnapshot
 from trainer.run.training import Recordings
 from trainer.store.run_folder import RunFolder, lock_folder
