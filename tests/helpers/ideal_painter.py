@@ -35,6 +35,7 @@ class WholeViews:
 
     has_start = True
     has_strength = True
+    degrees: tuple[str, ...] = ()
     workers = 1
 
     def frame(self, view: View) -> tuple[Crop, Camera]:

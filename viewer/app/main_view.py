@@ -27,6 +27,7 @@ from viewer.render.paint_overlay import PaintOverlay
 from viewer.render.picking import Surfaces
 from viewer.state import actions, layer_selection, timeline, workspace
 from viewer.state.commands import Action, Plain, WithValue
+from viewer.state.forms import NewEdit
 from viewer.state.layers import add_layer
 from viewer.state.snapshots import SliderSnapshot, compare_sides
 from viewer.state.transient import Decal, Gizmo, KeyPointer, MouseTool, PreviewState, Pull
@@ -154,7 +155,12 @@ class MainView:
             old, cover=None, preview=PreviewState(), gizmo=None, tool=MouseTool(), clone=None, pending=()
         )
         self.store.replace(
-            replace(workspace.new_workspace(view, snapshots), layout=self.work.layout, transient=transient)
+            replace(
+                workspace.new_workspace(view, snapshots),
+                layout=self.work.layout,
+                form=NewEdit(outside=self.work.form.outside),
+                transient=transient,
+            )
         )
         self.wake()
 

@@ -97,7 +97,7 @@ _CHOICES = {
     "delivery": (_Button("Keep waiting", ("Enter",)), _Button("Stop and quit", ("S",))),
     "log": (_Button("Close", ("Enter",)),),
     "about": (_Button("Close", ("Enter",)),),
-    "allow": (_Button("Allow", ("A",)), _Button("Cancel", ("Enter",))),
+    "allow": (_Button("Cancel", ("Enter",)), _Button("Allow", ("A",))),
     "match": (_Button("Use it", ("Enter",)), _Button("No", ("N",))),
     "restore": (_Button("Restore", ("Enter", "R")), _Button("Discard", ("D",)), _Button("Later")),
 }

@@ -394,7 +394,8 @@ def _outside(form: NewEdit, names: Sequence[str], column: float) -> NewEdit:
         settings = replace(settings, **{name: _text_row(title, hint, getattr(settings, name), column)})
         tip(help_)
     form = replace(form, outside=settings)
-    small(form.outside_note or " ", PALETTE.dim)
+    if form.outside_note:
+        wrapped_text(form.outside_note, PALETTE.dim)
     return form
 
 
@@ -403,7 +404,7 @@ def _anchor(form: NewEdit, preview: PreviewState, column: float) -> tuple[NewEdi
     label("Anchor", column)
     half = 0.5 * (imgui.get_content_region_avail().x - imgui.get_style().item_spacing.x)
     with inert(bool(form.obstacle) or preview.busy):
-        first = "Test this view" if form.choice.is_outside else "Paint this view"
+        first = "Test view" if form.choice.is_outside else "Paint this view"
         pressed = imgui.button("Again" if form.asks else first, imgui.ImVec2(half, 0.0))
         if pressed and not form.choice.is_outside:
             form = replace(form, asks=form.asks + 1, anchor="")

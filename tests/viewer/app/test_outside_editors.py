@@ -21,7 +21,7 @@ from viewer.app import app as application
 from viewer.files import user_files
 from viewer.jobs import job_queue
 from viewer.state.commands import Plain
-from viewer.state.forms import EDITORS, OutsideSettings
+from viewer.state.forms import EDITORS, NewEdit, OutsideSettings
 
 pytestmark = pytest.mark.gl
 
@@ -120,6 +120,13 @@ def test_program_runs_only_after_a_confirmation(window: application.App, tmp_pat
     fill(window, "command", outside=OutsideSettings(program=program))
     check_course(window, lambda: len(calls.read_bytes()) if calls.exists() else 0, program)
     assert f"--editor=command:{program}" in Trainer.said
+
+
+def test_settings_of_servers_stay_when_another_scene_opens(window: application.App) -> None:
+    outside = OutsideSettings(comfy="http://127.0.0.1:8188", workflow=str(WORKFLOW))
+    fill(window, "comfy", outside=outside)
+    window.main_view.restart(first_view(bear()))
+    assert window.main_view.work.form == NewEdit(outside=outside)
 
 
 def test_dead_server_is_reported_in_the_form(window: application.App) -> None:
