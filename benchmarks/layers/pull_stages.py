@@ -15,12 +15,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.sparse import csr_array
 
 from benchmarks.table import Table
 from progdf.gaussians import Gaussians, pack
 from progdf.pull.course import Handle, Problem, make_problem
-from progdf.pull.follow import bind, follow, rest_frames
+from progdf.pull.follow import Binding, bind, follow, rest_frames, widen
 from progdf.pull.solve import DRAG_ROUNDS, Pose
 from progdf.region import from_mask, whole_scene
 
@@ -98,7 +97,9 @@ def _measure(count: int, nodes: int) -> tuple[str, ...]:
     graph = problem.graph
     solver = problem.solver
     begin = time.process_time()
-    binding = bind(graph, scene.means.double().numpy()[problem.members], graph.node_of)
+    centers = bind(graph, scene.means.double().numpy()[problem.members], graph.node_of)
+    rows = pack(scene)[torch.from_numpy(problem.members)]
+    binding = widen(graph, centers, rows, graph.node_of)
     binding_s = time.process_time() - begin
     turns = np.where(np.isnan(problem.turns), 0.0, problem.turns)
     pose = solver.solve(problem.points, solver.rest())
@@ -128,7 +129,7 @@ def _measure(count: int, nodes: int) -> tuple[str, ...]:
     )
 
 
-def _apply_ms(problem: Problem, scene: Gaussians, binding: csr_array, pose: Pose, with_bands: bool) -> float:
+def _apply_ms(problem: Problem, scene: Gaussians, binding: Binding, pose: Pose, with_bands: bool) -> float:
     """Return the time in which the Gaussians follow the nodes, ms."""
     rows = pack(scene, with_shN=with_bands)[torch.from_numpy(problem.members)]
     frames = rest_frames(rows)

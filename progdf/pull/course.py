@@ -22,7 +22,7 @@ from progdf.quaternions import matrix_turns, rotation_matrices, turn_quats
 from progdf.region import Region, from_mask
 
 from .cuts import NO_CUTS, Cuts
-from .follow import bind, follow, rest_frames
+from .follow import bind, follow, rest_frames, widen
 from .graph import MAX_NODES, Floats, Mask, NodeGraph, Rows, build_graph
 from .solve import Pose, Solver
 
@@ -174,12 +174,13 @@ def pull(
             f"no Gaussian follows the pull of {_world(scene, handles[0])}; all near it are held, "
             "or several pulls of the same point cancel each other"
         )
-    binding = csr_array(binding[np.flatnonzero(moves)]).astype(np.float32)
     raw = pack(scene[torch.from_numpy(members)], with_shN=scene.sh_degree > 0).detach().float()
+    kept_rows = np.flatnonzero(moves)
+    wide = widen(graph, csr_array(binding[kept_rows]), raw, graph.node_of[kept_rows])
     frames = rest_frames(raw)
     offsets = torch.zeros(len(strengths), *raw.shape)
     for i, pose in enumerate(poses, start=1):
-        packed, frames = follow(raw, binding, graph, pose, problem.solver.gradients(pose), frames)
+        packed, frames = follow(raw, wide, graph, pose, problem.solver.gradients(pose), frames)
         offsets[i] = packed - raw
     mask = torch.zeros(len(scene), dtype=torch.bool)
     mask[torch.from_numpy(members)] = True

@@ -1,9 +1,10 @@
 """Gaussians that follow a node graph: means, scales, rotations and view-dependent colors.
 
-Each Gaussian is bound to the nodes near it, but only to its own node and those connected with it. Its mean
-moves by the blend of their affine maps. Its covariance takes the blended gradient G, as G Σ Gᵀ. The principal
-axes are continued from the last strength, so that the slider interpolates like axes. Its higher bands take
-the blend of the nodes' rotations, as quaternions.
+Each Gaussian is bound to the nodes near it, but only to its own node and those connected with it. They blend
+their affine maps. Where the map bends within a Gaussian, its tangent at the center is wrong at the ends and
+shows as hairs. So the mean takes the mean of the map over the Gaussian's extent, and the covariance the mean
+gradient G, as G Σ Gᵀ. The principal axes are continued from the last strength, so that the slider
+interpolates like axes. Its higher bands take the blend of the nodes' rotations, as quaternions.
 
 The work is done by `progdf.pull.follow_kernel`, on all threads.
 """
@@ -16,7 +17,8 @@ from functools import cache
 
 import numpy as np
 import torch
-from scipy.sparse import csr_array
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, diags_array
 from torch import Tensor
 
 from progdf.gaussians import BASE_CHANNELS, attribute_slices
@@ -24,15 +26,16 @@ from progdf.quaternions import normalize_quats, rotation_matrices
 from progdf.sh import basis, spread_directions
 from progdf.threads import run_chunks
 
-from .follow_kernel import Bands, Singles, follow_rows
+from .follow_kernel import MAX_STRETCH, Bands, Singles, follow_rows
 from .graph import Floats, NodeGraph, Rows
-from .graph_kernel import bind_points
+from .graph_kernel import average_weights, bind_points
 from .node_kernel import NODE_WIDTH, write_nodes
 from .solve import Pose
 
-MAX_STRETCH = 3.0
-"""Largest factor by which a Gaussian grows or shrinks; more shows as hairs."""
 _BOUND_NODES = 6  # nodes that a Gaussian follows
+# Largest scale of a small Gaussian, in spacings of the nodes. Its map is nearly affine; pictures of pulls
+# differ by less than 0.1 dB from those with a limit of 0.
+_WIDE_SPACINGS = 1 / 6
 _BIND_CHUNK = 1 << 14  # Gaussians that a thread binds at once
 _FOLLOW_CHUNK = 1 << 11  # Gaussians that a thread moves at once
 _LEAST_SQUARE = 1e-30  # squared relative scale; keeps logarithms finite
@@ -41,10 +44,23 @@ _COLUMNS = attribute_slices(BASE_CHANNELS)
 
 
 @dataclass(frozen=True)
+class Binding:
+    """Nodes that M Gaussians follow."""
+
+    weights: csr_array  # weights of the nodes; rows sum to 1, each has an entry. [M,n] float32
+    firsts: NDArray[np.int32]  # first entry of each Gaussian in the next two; small ones have none. [M+1]
+    nodes: NDArray[np.int32]  # nodes that wide Gaussians follow. [E]
+    # change of each weight per standard deviation along the principal axes, and its mean on each axis less
+    # the mean on all axes. [E,6]
+    slopes: Singles
+
+
+@dataclass(frozen=True)
 class Frames:
     """Principal axes of M Gaussians at one strength, the start for the next."""
 
-    # axes times scales at rest relative to the largest, least squared scale, log of the largest. [M,11]
+    # axes times scales at rest relative to the largest, least squared scale, log of the largest, the largest.
+    # [M,12]
     halves: Singles
     turns: Singles  # rotation of the columns of G R S that makes them orthogonal. [M,9]
     quats: Singles  # quaternions wxyz of the axes, with the lengths in the scene. [M,4]
@@ -76,6 +92,61 @@ def bind(graph: NodeGraph, points: Floats, nodes: Rows) -> csr_array:
     return csr_array((weights.ravel(), found.ravel(), firsts), shape=(count, len(graph)))
 
 
+def widen(graph: NodeGraph, binding: csr_array, rows: Tensor, nodes: Rows) -> Binding:
+    """Return a binding of centers in which wide Gaussians take the mean over their extents.
+
+    Args:
+        graph: deformation graph
+        binding: weights of the nodes at the centers, see `bind`. [M,n]
+        rows: packed raw rows at rest. [M,C]
+        nodes: the node that each Gaussian belongs to. [M]
+    """
+    count = len(rows)
+    scales = rows[:, _COLUMNS["log_scales"]].double().exp()
+    wide = np.flatnonzero((scales.amax(dim=1) > _WIDE_SPACINGS * graph.spacing).numpy())
+    points = np.ascontiguousarray(rows[wide, _COLUMNS["means"]].double().numpy())
+    axes = rotation_matrices(normalize_quats(rows[wide, _COLUMNS["quats"]].double()))
+    halves = np.ascontiguousarray((axes * scales[wide, None, :]).numpy())
+    table = _neighbor_table(graph)
+    own = np.ascontiguousarray(nodes[wide])
+    kept = min(_BOUND_NODES + 1, table.shape[1])
+    nearby = (np.ascontiguousarray(graph.positions), graph.spacing, table)
+
+    def average_chunk(chunk: int) -> tuple[Rows, Rows, Floats, Floats]:
+        first = chunk * _BIND_CHUNK
+        last = min(first + _BIND_CHUNK, len(wide))
+        part = slice(first, last)
+        weights = np.empty((last - first, table.shape[1]))
+        slopes = np.empty((*weights.shape, 6))
+        gaussians = (points[part], halves[part], own[part])
+        average_weights(nearby, gaussians, kept, (0, last - first), weights, slopes)
+        row, slot = np.nonzero(weights)
+        return first + row, table[own[first + row], slot], weights[row, slot], slopes[row, slot]
+
+    parts = run_chunks(average_chunk, -(-len(wide) // _BIND_CHUNK))
+    if not parts:
+        return Binding(
+            binding.astype(np.float32),
+            np.zeros(count + 1, np.int32),
+            np.zeros(0, np.int32),
+            np.zeros((0, 6), np.float32),
+        )
+    row, node, weight, slopes = (np.concatenate(part) for part in zip(*parts, strict=True))
+    entry_counts = np.zeros(count, np.int64)
+    entry_counts[wide] = np.bincount(row, minlength=len(wide))
+    firsts = np.append(0, np.cumsum(entry_counts)).astype(np.int32)
+    averaged = csr_array((weight, node, firsts), shape=binding.shape)
+    is_small = np.ones(count)
+    is_small[wide] = 0.0
+    centers = csr_array(diags_array(is_small) @ binding)
+    return Binding(
+        csr_array(centers + averaged).astype(np.float32),
+        firsts,
+        node.astype(np.int32),
+        np.ascontiguousarray(slopes, np.float32),
+    )
+
+
 def _neighbor_table(graph: NodeGraph) -> Rows:
     """Return each node and those connected with it, filled up with −1. [n,1+K]"""
     degree = np.bincount(graph.starts, minlength=len(graph))
@@ -94,14 +165,14 @@ def rest_frames(rows: Tensor) -> Frames:
     axes = rotation_matrices(normalize_quats(quats.double())) * (log_scales - largest).exp()[:, None, :]
     floor = (2.0 * (log_scales.amin(dim=1, keepdim=True) - largest)).exp() / MAX_STRETCH**4
     floor = floor.clamp_min(_LEAST_SQUARE)
-    halves = torch.cat([axes.flatten(1), floor, largest], dim=1).float().numpy()
+    halves = torch.cat([axes.flatten(1), floor, largest, largest.exp()], dim=1).float().numpy()
     turns = np.tile(np.eye(3, dtype=np.float32).ravel(), (len(rows), 1))
     return Frames(halves, turns, np.array(quats.detach().float().numpy(), order="C"))
 
 
 def follow(
     rows: Tensor,
-    binding: csr_array,
+    binding: Binding,
     graph: NodeGraph,
     pose: Pose,
     gradients: Floats,
@@ -112,7 +183,7 @@ def follow(
 
     Args:
         rows: raw rows at rest. [M,C]; float32 needs no conversion
-        binding: weights of the nodes. [M,n]; float32 needs no conversion
+        binding: nodes that they follow
         graph: deformation graph with n nodes
         pose: deformed nodes
         gradients: their deformation gradients. [n,3,3]
@@ -131,7 +202,7 @@ def follow(
 
 def follow_in_place(
     rows: Tensor,
-    binding: csr_array,
+    binding: Binding,
     graph: NodeGraph,
     pose: Pose,
     gradients: Floats,
@@ -150,7 +221,7 @@ def follow_in_place(
 
 def _follow(
     raw: Singles,
-    binding: csr_array,
+    binding: Binding,
     nodes: tuple[NodeGraph, Pose, Floats],
     frames: tuple[Frames, Frames],
     result: Singles,
@@ -167,14 +238,14 @@ def _follow(
         graph.positions,
         np.ascontiguousarray(pose.positions, np.float64),
         center,
-        MAX_STRETCH,
         table,
     )
     weights = (
-        binding.indptr.astype(np.int32, copy=False),
-        binding.indices.astype(np.int32, copy=False),
-        binding.data.astype(np.float32, copy=False),
+        binding.weights.indptr.astype(np.int32, copy=False),
+        binding.weights.indices.astype(np.int32, copy=False),
+        binding.weights.data.astype(np.float32, copy=False),
     )
+    bends = (binding.firsts, binding.nodes, binding.slopes.ravel())
     degree = min(3, math.isqrt((raw.shape[1] - BASE_CHANNELS) // 3 + 1) - 1)
     bands = (_band_samples(1), _band_samples(2), _band_samples(3))
     motions = (table.ravel(), center.astype(np.float32))
@@ -184,7 +255,7 @@ def _follow(
     def move(chunk: int) -> None:
         first = chunk * _FOLLOW_CHUNK
         part = (first, min(first + _FOLLOW_CHUNK, count), degree, is_offset)
-        follow_rows(raw, weights, motions, start, end, bands, result, part)
+        follow_rows(raw, (weights, bends), motions, start, end, bands, result, part)
 
     run_chunks(move, -(-count // _FOLLOW_CHUNK))
 

@@ -1,8 +1,14 @@
 """Kernels of Gaussians that follow nodes: eight Gaussians at once, in vectors of float32.
 
-The axes of G Σ Gᵀ are the left singular vectors of G R S, for a Gaussian's axes R and scales S. One-sided
-Jacobi rotations find them. They multiply columns, so a thin disc keeps its thickness in float32. They start
-from the rotations of the last strength, so the axes keep their order.
+A node moves a point x to A x + t. A wide Gaussian has mean weights w of the nodes, slopes e of the weights
+along its axes R S, in standard deviations, and differences d between their means on one axis and on all:
+
+    mean Σ w (A x + t) + A R S e,    G R S = Σ w A R S + A R S diag(d) + (A x + t) eᵀ
+
+These are the mean of the map, and its differences along the axes. A small Gaussian has weights only. The new
+axes are the left singular vectors of G R S.
+One-sided Jacobi rotations find them. They multiply columns, so a thin disc keeps its thickness in float32.
+They start from the rotations of the last strength, so the axes keep their order.
 
 The color of a band along 2l + 1 directions determines its coefficients. A rotation evaluates the band at the
 directions rotated back.
@@ -19,19 +25,22 @@ from numpy.typing import NDArray
 
 from progdf.rasterize.cpu.jit import Number, Vector, broadcast, kernel, load, select, sqrt, store
 
-from .node_kernel import NODE_WIDTH
+from .node_kernel import NODE_QUAT, NODE_WIDTH
 
 Singles = NDArray[np.float32]
 Rows = NDArray[np.int32]
 Weights = tuple[Rows, Rows, Singles]
 """First entry of each Gaussian [M+1], nodes and weights of the entries."""
+Bends = tuple[Rows, Rows, Singles]
+"""The same with slopes and differences, flattened [6 per entry]; small Gaussians have no entries."""
 Bands = tuple[Singles, Singles]
 """Directions of a band [(2l+1)·3], and the matrix from colors along them to coefficients [(2l+1)²]."""
 
+MAX_STRETCH = 3.0
+"""Largest factor by which an axis of a Gaussian grows or shrinks; more shows as hairs."""
 _LANES = 8
 # numbers of eight Gaussians in the scratch memory of `follow_rows`
-_GRADIENT = 12  # blended motion of nodes, as in `NODE_WIDTH`, from 0 on
-_QUAT = 24
+_QUAT = NODE_QUAT  # in the blended motion of nodes, which starts at 0
 _SPARE = 32
 _MATRIX = 36  # columns that are made orthogonal, then axes; later the rotation of the bands
 _RIGHT = 45  # rotation of the columns
@@ -43,9 +52,16 @@ _SQUARES = 77
 _NEW_QUAT = 80
 _TANGENT = 84  # largest squared tangent of a rotation in a sweep
 _COLORS = 90
+_REST = _COLORS  # columns at rest, before the colors
 _BASIS = 115
 _BASIS_AT_REST = 125
-_ROW = 210
+_NODE = 210  # map of one node
+_SLOPE = 222  # slopes of its weight, and differences
+_FIRST = 228  # displacement by the first node
+_BEND = 231  # Σ A R S diag(d) + (A x + t) eᵀ
+_SHIFT = 240  # Σ A R S e
+_SIZE = 243  # largest scale
+_ROW = 244
 _BAND_START = 14
 _SWEEPS = 4  # of one-sided Jacobi rotations
 _C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
@@ -64,33 +80,91 @@ def _at(index: int) -> Number:
 
 @kernel()
 def _blend_node_motions(weights: Weights, table: Singles, member: int, lane: int, buffer: Singles) -> None:
-    """Write the blended motion of a Gaussian into one lane of the buffer's numbers 0 to 31."""
+    """Write the blended motion of a Gaussian into one lane of the buffer's numbers 0 to 19."""
     first, nodes, shares = weights
     a = broadcast(np.float32(0.0))
     b = a
     c = a
-    d = a
     start = first[member]
-    base = nodes[start] * NODE_WIDTH + 24
+    base = nodes[start] * NODE_WIDTH + NODE_QUAT
     for k in range(start, first[member + 1]):
         at = nodes[k] * NODE_WIDTH
         share = shares[k]
         a = a + share * load(table, np.uint64(at))
         b = b + share * load(table, np.uint64(at + 8))
-        c = c + share * load(table, np.uint64(at + 16))
         cosine = np.float32(0.0)
         for i in range(4):
-            cosine += table[at + 24 + i] * table[base + i]
+            cosine += table[at + NODE_QUAT + i] * table[base + i]
         if cosine < np.float32(0.0):
             share = -share
-        d = d + share * load(table, np.uint64(at + 24))
+        c = c + share * load(table, np.uint64(at + NODE_QUAT))
     spare = _at(_SPARE)
     store(buffer, spare, a)
     store(buffer, spare + np.uint64(8), b)
     store(buffer, spare + np.uint64(16), c)
-    store(buffer, spare + np.uint64(24), d)
-    for i in range(28):
+    for i in range(20):
         buffer[i * _LANES + lane] = buffer[_SPARE * _LANES + i]
+
+
+@kernel()
+def _bend(bends: Bends, motions: tuple[Singles, Singles], start: int, lanes: int, buffer: Singles) -> None:
+    """Write the terms of wide Gaussians, of eight: the columns `_BEND` and the displacements `_SHIFT`.
+
+    The slopes of a Gaussian sum up to 0, and so do the differences. Displacements are taken relative to that
+    by the first node, and maps less the identity, so that a translation adds nothing.
+    """
+    first, nodes, slopes = bends
+    zero = broadcast(np.float32(0.0))
+    for i in range(9):
+        store(buffer, _at(_BEND + i), zero)
+    for i in range(3):
+        store(buffer, _at(_SHIFT + i), zero)
+    count = 0
+    for lane in range(lanes):
+        count = max(count, first[start + lane + 1] - first[start + lane])
+    for k in range(count):
+        for lane in range(_LANES):
+            member = start + min(lane, lanes - 1)
+            entry = first[member] + k
+            is_entry = entry < first[member + 1]
+            at = nodes[entry] * NODE_WIDTH if is_entry else 0
+            for i in range(12):
+                buffer[(_NODE + i) * _LANES + lane] = motions[0][at + i]
+            for i in range(6):
+                buffer[(_SLOPE + i) * _LANES + lane] = slopes[6 * entry + i] if is_entry else np.float32(0.0)
+        _add_bend(motions[1], k == 0, buffer)
+
+
+@kernel()
+def _add_bend(center: Singles, is_first: bool, buffer: Singles) -> None:
+    """Add the terms of one node, whose map and slopes are in the buffer."""
+    x = load(buffer, _at(_ROW)) - center[0]
+    y = load(buffer, _at(_ROW + 1)) - center[1]
+    z = load(buffer, _at(_ROW + 2)) - center[2]
+    size = load(buffer, _at(_SIZE))
+    for r in range(3):
+        node = _NODE + 3 * r
+        moved = load(buffer, _at(_NODE + 9 + r)) + _row_times(buffer, node, x, y, z)
+        if is_first:
+            store(buffer, _at(_FIRST + r), moved)
+        moved = moved - load(buffer, _at(_FIRST + r))
+        shift = load(buffer, _at(_SHIFT + r))
+        for c in range(3):
+            half_x = load(buffer, _at(_HALF + c))
+            half_y = load(buffer, _at(_HALF + 3 + c))
+            half_z = load(buffer, _at(_HALF + 6 + c))
+            along = size * _row_times(buffer, node, half_x, half_y, half_z)
+            slope = load(buffer, _at(_SLOPE + c))
+            shift = shift + slope * along
+            bend = load(buffer, _at(_BEND + 3 * r + c)) + slope * moved
+            store(buffer, _at(_BEND + 3 * r + c), bend + load(buffer, _at(_SLOPE + 3 + c)) * along)
+        store(buffer, _at(_SHIFT + r), shift)
+
+
+@kernel()
+def _row_times(buffer: Singles, row: int, x: Vector, y: Vector, z: Vector) -> Vector:
+    """Return the product of a row of a matrix in the buffer, and a vector."""
+    return load(buffer, _at(row)) * x + load(buffer, _at(row + 1)) * y + load(buffer, _at(row + 2)) * z
 
 
 @kernel()
@@ -157,7 +231,11 @@ def _product(buffer: Singles, left: int, right: int, result: int) -> None:
 @kernel()
 def _stretch_axes(buffer: Singles) -> None:
     """Compute the axes and squared relative scales of G R S, from the last rotation of its columns."""
-    _product(buffer, _GRADIENT, _HALF, _RIGHT)
+    _product(buffer, 0, _HALF, _RIGHT)
+    inverse_size = np.float32(1.0) / load(buffer, _at(_SIZE))
+    for k in range(9):
+        half = load(buffer, _at(_HALF + k)) + inverse_size * load(buffer, _at(_BEND + k))
+        store(buffer, _at(_RIGHT + k), load(buffer, _at(_RIGHT + k)) + half)
     _product(buffer, _RIGHT, _LAST_RIGHT, _MATRIX)
     for k in range(9):
         store(buffer, _at(_RIGHT + k), load(buffer, _at(_LAST_RIGHT + k)))
@@ -168,13 +246,22 @@ def _stretch_axes(buffer: Singles) -> None:
         _jacobi(buffer, 1, 2)
         if _is_small(buffer):
             break
+    _product(buffer, _HALF, _RIGHT, _REST)
     floor = load(buffer, _at(_FLOOR))
     for k in range(3):
+        x = load(buffer, _at(_REST + k))
+        y = load(buffer, _at(_REST + 3 + k))
+        z = load(buffer, _at(_REST + 6 + k))
+        at_rest = x * x + y * y + z * z
         x = load(buffer, _at(_MATRIX + k))
         y = load(buffer, _at(_MATRIX + 3 + k))
         z = load(buffer, _at(_MATRIX + 6 + k))
         square = x * x + y * y + z * z
-        store(buffer, _at(_SQUARES + k), select(square < floor, floor, square))
+        most = np.float32(MAX_STRETCH**2) * at_rest
+        least = np.float32(MAX_STRETCH**-2) * at_rest
+        limited = select(square > most, most, square)
+        limited = select(limited < least, least, limited)
+        store(buffer, _at(_SQUARES + k), select(limited < floor, floor, limited))
         factor = np.float32(1.0) / sqrt(square + _TINY)
         store(buffer, _at(_MATRIX + k), factor * x)
         store(buffer, _at(_MATRIX + 3 + k), factor * y)
@@ -362,18 +449,19 @@ def _read_lane(
     for k in range(4):
         buffer[(_LAST_QUAT + k) * _LANES + lane] = last_quats[member, k]
     buffer[_FLOOR * _LANES + lane] = halves[member, 9]
+    buffer[_SIZE * _LANES + lane] = halves[member, 11]
     for c in range(rows.shape[1]):
         buffer[(_ROW + c) * _LANES + lane] = rows[member, c]
 
 
 @kernel()
 def _move_means(center: Singles, buffer: Singles) -> None:
-    """Move the means by the blended affine maps, whose shifts refer to a center. [3]"""
+    """Move the means by the blended affine maps, whose shifts refer to a center [3], and by `_SHIFT`."""
     x = load(buffer, _at(_ROW)) - center[0]
     y = load(buffer, _at(_ROW + 1)) - center[1]
     z = load(buffer, _at(_ROW + 2)) - center[2]
     for r in range(3):
-        step = load(buffer, _at(9 + r))
+        step = load(buffer, _at(9 + r)) + load(buffer, _at(_SHIFT + r))
         step = step + load(buffer, _at(3 * r)) * x
         step = step + load(buffer, _at(3 * r + 1)) * y
         step = step + load(buffer, _at(3 * r + 2)) * z
@@ -404,7 +492,7 @@ def _write_row(halves: Singles, member: int, lane: int, buffer: Singles, result:
 @kernel(cache=True, allocates=True)
 def follow_rows(
     rows: Singles,
-    weights: Weights,
+    nodes: tuple[Weights, Bends],
     motions: tuple[Singles, Singles],
     last: tuple[Singles, Singles, Singles],
     frames: tuple[Singles, Singles],
@@ -416,10 +504,11 @@ def follow_rows(
 
     Args:
         rows: raw rows at rest. [M,C]
-        weights: weights of the nodes
-        motions: motions of the nodes, see `write_nodes`, flattened [32n], and the point to which their
+        nodes: nodes that each Gaussian follows with their weights, and those that wide Gaussians follow with
+            slopes and differences
+        motions: motions of the nodes, see `write_nodes`, flattened [24n], and the point to which their
             shifts refer. [3]
-        last: axes times scales at rest with two more numbers, see `progdf.pull.follow.Frames` [M,11];
+        last: axes times scales at rest with three more numbers, see `progdf.pull.follow.Frames` [M,12];
             rotations of the columns [M,9] and quaternions [M,4] at a similar pose
         frames: rotations of the columns and quaternions at this pose; written, may be those of `last`
         bands: directions and matrices of bands 1, 2 and 3
@@ -427,6 +516,7 @@ def follow_rows(
         part: first Gaussian, end, SH degree that rotates, 0 to 3, and True to write the offsets from rest
     """
     begin, end, degree, is_offset = part
+    weights, bends = nodes
     table, center = motions
     width = rows.shape[1]
     buffer = np.zeros((_ROW + width) * _LANES, np.float32)
@@ -442,6 +532,7 @@ def follow_rows(
             member = start + min(lane, lanes - 1)
             _blend_node_motions(weights, table, member, lane, buffer)
             _read_lane(rows, last, member, lane, buffer)
+        _bend(bends, motions, start, lanes, buffer)
         _move_means(center, buffer)
         _stretch_axes(buffer)
         for lane in range(lanes):

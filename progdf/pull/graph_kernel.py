@@ -19,6 +19,7 @@ Shapes = tuple[Floats, Floats, Floats, Floats]
 """Means [M,3], unit quaternions wxyz [M,4], scales [M,3] and OKLab colors [M,3]."""
 
 _TINY = 1e-30
+_SIGMA_DISTANCE = math.sqrt(3.0)  # standard deviations; six points at this distance average cubics exactly
 
 
 @kernel(inline=True)
@@ -174,6 +175,51 @@ def join_links(start: Rows, end: Rows, cell: Rows) -> Rows:
     return groups
 
 
+@kernel()
+def _choose_nodes(
+    positions: Floats, spacing: float, place: Floats, candidates: Rows, near: Floats, slots: Rows
+) -> int:
+    """Write the weights that the nearest candidates have at a place, and their indices; return their number.
+
+    Args:
+        positions: the nodes. [n,3]
+        spacing: typical length of their edges
+        place: [3]
+        candidates: nodes, filled up with −1. [K]
+        near: weights, which sum to 1, nearest first; written. [B]
+        slots: index of each among the candidates; written. [B]
+    """
+    kept = len(near)
+    count = 0
+    for k in range(len(candidates)):
+        node = candidates[k]
+        if node < 0:
+            continue
+        square = 0.0
+        for axis in range(3):
+            square += (positions[node, axis] - place[axis]) ** 2
+        distance = math.sqrt(square)
+        if count == kept and distance >= near[kept - 1]:
+            continue
+        at = min(count, kept - 1)
+        while at > 0 and near[at - 1] > distance:
+            near[at] = near[at - 1]
+            slots[at] = slots[at - 1]
+            at -= 1
+        near[at] = distance
+        slots[at] = k
+        count = min(count + 1, kept)
+    # the weights fall to 0 at the farthest candidate if there are more than enough
+    reach = 1.001 * near[count - 1] + 1e-9 * spacing
+    total = 0.0
+    for k in range(count):
+        near[k] = max(1.0 - near[k] / reach, 0.0) ** 2
+        total += near[k]
+    for k in range(count):
+        near[k] = near[k] / total if total > 0.0 else 1.0 / count
+    return count
+
+
 @kernel(cache=True, allocates=True)
 def bind_points(
     positions: Floats, spacing: float, points: Floats, candidates: Rows, nodes: Rows, part: tuple[int, int],
@@ -193,34 +239,57 @@ def bind_points(
     """
     kept = found.shape[1]
     near = np.empty(kept)
+    slots = np.empty(kept, np.int64)
     for p in range(part[0], part[1]):
-        count = 0
-        for k in range(candidates.shape[1]):
-            node = candidates[nodes[p], k]
-            if node < 0:
-                continue
-            square = 0.0
+        own = candidates[nodes[p]]
+        count = _choose_nodes(positions, spacing, points[p], own, near, slots)
+        for k in range(kept):
+            found[p, k] = own[slots[k]] if k < count else own[slots[0]]
+            weights[p, k] = near[k] if k < count else 0.0
+
+
+@kernel(cache=True, allocates=True)
+def average_weights(
+    graph: tuple[Floats, float, Rows],
+    gaussians: tuple[Floats, Floats, Rows],
+    kept: int,
+    part: tuple[int, int],
+    weights: Floats,
+    slopes: Floats,
+) -> None:
+    """Write the weights of nodes along the principal axes of Gaussians, for a range of these.
+
+    Along each axis, two points are compared. Their six weights have the moments of the Gaussian.
+
+    Args:
+        graph: the nodes [n,3]; the typical length of their edges; and each node and those connected with it,
+            filled up with −1. [n,K]
+        gaussians: their centers [M,3]; principal axes times standard deviations, as columns [M,3,3]; and the
+            node that each belongs to. [M]
+        kept: number of nodes that each point follows
+        part: first Gaussian, and end
+        weights: mean weights of the candidates, which sum to 1; written. [M,K]
+        slopes: their change per standard deviation along each axis, and their mean on the axis less the mean
+            on all axes; written. [M,K,6]
+    """
+    positions, spacing, candidates = graph
+    points, halves, nodes = gaussians
+    near = np.empty(kept)
+    slots = np.empty(kept, np.int64)
+    place = np.empty(3)
+    for m in range(part[0], part[1]):
+        own = candidates[nodes[m]]
+        weights[m] = 0.0
+        slopes[m] = 0.0
+        for axis in range(3):
+            for sign in (1.0, -1.0):
+                for c in range(3):
+                    place[c] = points[m, c] + sign * _SIGMA_DISTANCE * halves[m, c, axis]
+                count = _choose_nodes(positions, spacing, place, own, near, slots)
+                for k in range(count):
+                    weights[m, slots[k]] += near[k] / 6.0
+                    slopes[m, slots[k], axis] += sign * near[k] / (2.0 * _SIGMA_DISTANCE)
+                    slopes[m, slots[k], 3 + axis] += 0.5 * near[k]
+        for k in range(len(own)):
             for axis in range(3):
-                square += (positions[node, axis] - points[p, axis]) ** 2
-            distance = math.sqrt(square)
-            if count == kept and distance >= near[kept - 1]:
-                continue
-            at = min(count, kept - 1)
-            while at > 0 and near[at - 1] > distance:
-                near[at] = near[at - 1]
-                found[p, at] = found[p, at - 1]
-                at -= 1
-            near[at] = distance
-            found[p, at] = node
-            count = min(count + 1, kept)
-        # the weights fall to 0 at the farthest candidate if there are more than enough
-        reach = 1.001 * near[count - 1] + 1e-9 * spacing
-        total = 0.0
-        for k in range(count):
-            weights[p, k] = max(1.0 - near[k] / reach, 0.0) ** 2
-            total += weights[p, k]
-        for k in range(count):
-            weights[p, k] = weights[p, k] / total if total > 0.0 else 1.0 / count
-        for k in range(count, kept):
-            found[p, k] = found[p, 0]
-            weights[p, k] = 0.0
+                slopes[m, k, 3 + axis] -= weights[m, k]

@@ -27,7 +27,7 @@ from progdf.region import Region, from_mask, whole_scene
 
 from .course import Handle, make_problem
 from .cuts import NO_CUTS, Cuts
-from .follow import bind, follow_in_place, rest_frames
+from .follow import bind, follow_in_place, rest_frames, widen
 from .graph import MAX_NODES, Floats, Rows
 
 _SETTLED_SHARE = 1e-3
@@ -105,9 +105,9 @@ class LivePull:
             binding = csr_array(binding[np.flatnonzero(moves)])
         self.influence: Floats = binding @ self._problem.influence
         """Share of the handles' motion that each of them may follow, 0 to 1. [M]"""
-        self._binding = binding.astype(np.float32)
         rows_of_members = pack(scene[torch.from_numpy(self.members)], with_shN=scene.sh_degree > 0)
         self._rows = rows_of_members.detach().float().contiguous()
+        self._binding = widen(graph, binding, self._rows, graph.node_of[moves])
         self._frames = rest_frames(self._rows)
         self._offsets = (torch.empty_like(self._rows), torch.empty_like(self._rows))
         self._pose = self._problem.solver.rest()

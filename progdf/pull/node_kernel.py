@@ -1,4 +1,4 @@
-"""Kernels of nodes: the affine motion, the limited gradient and the rotation that Gaussians blend.
+"""Kernels of nodes: the affine motion and the rotation that Gaussians blend.
 
 Reference implementation: tests/helpers/plain_pull.py.
 """
@@ -15,8 +15,10 @@ from progdf.rasterize.cpu.jit import kernel
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
-NODE_WIDTH = 32
-"""Numbers per node: G − I [9], shift [3], limited G [9], nothing [3], quaternion [4], nothing [4]."""
+NODE_WIDTH = 24
+"""Numbers per node: G − I [9], shift [3], nothing [4], quaternion [4], nothing [4]."""
+NODE_QUAT = 16
+"""First number of the quaternion."""
 _NODE_SWEEPS = 8  # sweeps of one-sided Jacobi rotations
 
 
@@ -80,25 +82,11 @@ def _decompose(gradient: Floats, columns: Floats, right: Floats, lengths: Floats
 
 
 @kernel()
-def _write_gradients(
-    gradient: Floats, columns: Floats, right: Floats, lengths: Floats, max_stretch: float, entry: Singles
-) -> None:
-    """Write the gradient less the identity, and the limited one, into the entry of a node."""
+def _write_map(gradient: Floats, rest: Floats, moved: Floats, center: Floats, entry: Singles) -> None:
+    """Write a node's affine map, less the identity, into its entry, for points relative to a center."""
     for r in range(3):
         for c in range(3):
-            at_rest = 1.0 if r == c else 0.0
-            limited = 0.0
-            for k in range(3):
-                value = min(max(lengths[k], 1.0 / max_stretch), max_stretch)
-                limited += columns[r, k] * value * right[c, k]
-            entry[3 * r + c] = gradient[r, c] - at_rest
-            entry[12 + 3 * r + c] = limited
-
-
-@kernel()
-def _write_shift(gradient: Floats, rest: Floats, moved: Floats, center: Floats, entry: Singles) -> None:
-    """Write the shift of a node's affine map into its entry, for points relative to a center."""
-    for r in range(3):
+            entry[3 * r + c] = gradient[r, c] - (1.0 if r == c else 0.0)
         shift = moved[r] - rest[r]
         for c in range(3):
             arm = rest[c] - center[c]
@@ -137,24 +125,21 @@ def _write_quat(columns: Floats, right: Floats, entry: Singles) -> None:
         x = m[0, 2] + m[2, 0]
         y = m[1, 2] + m[2, 1]
     length = math.sqrt(w * w + x * x + y * y + z * z)
-    entry[24] = w / length
-    entry[25] = x / length
-    entry[26] = y / length
-    entry[27] = z / length
+    entry[NODE_QUAT] = w / length
+    entry[NODE_QUAT + 1] = x / length
+    entry[NODE_QUAT + 2] = y / length
+    entry[NODE_QUAT + 3] = z / length
 
 
 @kernel(cache=True, allocates=True)
-def write_nodes(
-    gradients: Floats, rest: Floats, moved: Floats, center: Floats, max_stretch: float, table: Singles
-) -> None:
+def write_nodes(gradients: Floats, rest: Floats, moved: Floats, center: Floats, table: Singles) -> None:
     """Write the motions of nodes, from which those of Gaussians are blended.
 
     Args:
         gradients: deformation gradients. [n,3,3]
         rest, moved: positions. [n,3] each
         center: the shifts are for points relative to it. [3]
-        max_stretch: limit of the singular values, and of their inverses
-        table: motions, see `NODE_WIDTH`. [n,32]
+        table: motions, see `NODE_WIDTH`. [n,24]
     """
     columns = np.empty((3, 3))
     right = np.empty((3, 3))
@@ -162,6 +147,5 @@ def write_nodes(
     for node in range(len(gradients)):
         entry = table[node]
         _decompose(gradients[node], columns, right, lengths)
-        _write_gradients(gradients[node], columns, right, lengths, max_stretch, entry)
-        _write_shift(gradients[node], rest[node], moved[node], center, entry)
+        _write_map(gradients[node], rest[node], moved[node], center, entry)
         _write_quat(columns, right, entry)

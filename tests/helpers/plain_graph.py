@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from progdf.gaussians import Gaussians
+from progdf.pull.follow import Binding
 from progdf.pull.graph import Floats, NodeGraph, Rows
 from progdf.quaternions import rotation_matrices
 from progdf.scene.neighbors import join_pairs
@@ -49,3 +52,35 @@ def bind(graph: NodeGraph, points: Floats, nodes: Rows, bound: int) -> Floats:
         share = (1.0 - near / (1.001 * near.max() + 1e-9 * graph.spacing)).clip(0.0) ** 2
         weights[row, candidates[order]] = share / share.sum()
     return weights
+
+
+def average(
+    graph: NodeGraph, points: Floats, halves: Floats, nodes: Rows, bound: int
+) -> tuple[Floats, Floats]:
+    """Return weights averaged over six points of Gaussians [M,n], and slopes and differences [M,n,6].
+
+    Args:
+        graph: deformation graph
+        points: centers. [M,3]
+        halves: principal axes times standard deviations, as columns. [M,3,3]
+        nodes: the node that each Gaussian belongs to. [M]
+        bound: see `bind`
+    """
+    distance = math.sqrt(3.0)
+    slopes = []
+    means = []
+    for axis in range(3):
+        ahead = bind(graph, points + distance * halves[:, :, axis], nodes, bound)
+        behind = bind(graph, points - distance * halves[:, :, axis], nodes, bound)
+        slopes.append((ahead - behind) / (2.0 * distance))
+        means.append(0.5 * (ahead + behind))
+    weights = (means[0] + means[1] + means[2]) / 3.0
+    return weights, np.stack([*slopes, *(mean - weights for mean in means)], axis=2)
+
+
+def dense_slopes(binding: Binding, count: int) -> Floats:
+    """Return the slopes and differences of a binding for all of `count` nodes. [M,n,6]"""
+    members = len(binding.firsts) - 1
+    slopes = np.zeros((members, count, 6))
+    slopes[np.repeat(np.arange(members), np.diff(binding.firsts)), binding.nodes] = binding.slopes
+    return slopes

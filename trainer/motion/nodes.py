@@ -19,7 +19,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from progdf.gaussians import BASE_CHANNELS, attribute_slices, unpack
-from progdf.pull.follow import MAX_STRETCH, bind
+from progdf.pull.follow import bind
+from progdf.pull.follow_kernel import MAX_STRETCH
 from progdf.pull.graph import build_graph
 from progdf.pull.solve import nearest_rotations
 from progdf.quaternions import (

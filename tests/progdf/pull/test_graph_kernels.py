@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from progdf.gaussians import pack
 from progdf.pull import graph_kernel
-from progdf.pull.follow import bind
+from progdf.pull.follow import bind, widen
 from progdf.pull.graph import build_graph
+from progdf.quaternions import rotation_matrices
 from progdf.scene.neighbors import nearest_rows
 from tests.helpers import plain_graph
 from tests.helpers.scenes import random_gaussians
@@ -63,3 +65,30 @@ def test_bindings_agree_with_the_plain_version(width: int) -> None:
     found = bind(graph, points, graph.node_of).toarray()
     assert np.allclose(found, plain_graph.bind(graph, points, graph.node_of, 7), atol=1e-12)
     assert np.allclose(found.sum(axis=1), 1.0)
+
+
+def test_averaged_weights_agree_with_the_plain_version() -> None:
+    scene = bar(7)
+    scene.log_scales.add_(1.0)
+    graph = build_graph(scene)
+    points = scene.means.double().numpy()
+    binding = widen(graph, bind(graph, points, graph.node_of), pack(scene), graph.node_of)
+    axes = rotation_matrices(scene.unit_quats.double()).numpy()
+    halves = axes * scene.scales.double().numpy()[:, None, :]
+    weights, slopes = plain_graph.average(graph, points, halves, graph.node_of, 7)
+    assert np.allclose(binding.weights.toarray(), weights, atol=1e-6)
+    assert np.allclose(plain_graph.dense_slopes(binding, len(graph)), slopes, atol=1e-6)
+    assert np.allclose(slopes.sum(axis=1), 0.0, atol=1e-9)
+
+
+def test_small_gaussians_have_the_weights_of_their_centers() -> None:
+    scene = bar(7)
+    scene.log_scales[::2].sub_(3.0)
+    scene.log_scales[1::2].add_(1.0)
+    graph = build_graph(scene)
+    centers = bind(graph, scene.means.double().numpy(), graph.node_of)
+    binding = widen(graph, centers, pack(scene), graph.node_of)
+    counts = np.diff(binding.firsts)
+    assert not counts[::2].any()
+    assert (counts[1::2] > 0).all()
+    assert np.allclose(binding.weights.toarray()[::2], centers.toarray()[::2], atol=1e-6)

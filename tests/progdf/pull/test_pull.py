@@ -15,7 +15,8 @@ from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, Gaussians, concatenate, pack
 from progdf.pull.course import Handle, PullCourse, path, pull
-from progdf.pull.follow import MAX_STRETCH, bind, follow, rest_frames
+from progdf.pull.follow import bind, follow, rest_frames, widen
+from progdf.pull.follow_kernel import MAX_STRETCH
 from progdf.pull.graph import Floats, NodeGraph, build_graph
 from progdf.pull.solve import Pose, Solver, nearest_rotations
 from progdf.quaternions import rotation_matrices, turn_quats
@@ -312,7 +313,7 @@ def test_covariances_take_the_affine_gradient() -> None:
     gradients: Floats = np.broadcast_to(gradient, (len(graph), 3, 3)).copy()
     pose = Pose(graph.positions @ gradient.T, nearest_rotations(gradients, np.eye(3)[None]))
     rows = pack(scene, with_shN=True).double()
-    binding = bind(graph, points, graph.node_of)
+    binding = widen(graph, bind(graph, points, graph.node_of), rows, graph.node_of)
     packed, _ = follow(rows, binding, graph, pose, gradients, rest_frames(rows))
     stretched = scene.replace_rows(torch.arange(len(scene)), packed).to(dtype=torch.float64)
     matrix = torch.from_numpy(gradient)
