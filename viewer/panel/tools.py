@@ -304,7 +304,11 @@ def _measure_options(measure: Measure, unit: float, bar: _Bar, actions: list[Act
     imgui.text(text)
     imgui.same_line()
     imgui.set_next_item_width(wide)
-    enters = imgui.InputTextFlags_.enter_returns_true.value
+    slot = imgui.get_id(str(measure.points))
+    if not imgui.get_state_storage().get_bool(slot):  # a number can be typed right after the second click
+        imgui.get_state_storage().set_bool(slot, True)
+        imgui.set_keyboard_focus_here()
+    enters = imgui.InputTextFlags_.enter_returns_true.value | imgui.InputTextFlags_.auto_select_all.value
     entered, length = imgui.input_double("##true length", distance * unit, 0.0, 0.0, "%.6g", enters)
     tip("Type the true length and press Enter: the window shows lengths in its unit.\nFiles keep world units")
     if entered and length > 0.0:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from imgui_bundle import imgui
 
 from tests.helpers.sessions import opened_document
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
@@ -32,6 +33,13 @@ def measured(hand: Rig) -> Measure:
     measure = hand.main_view.work.transient.measure
     assert measure is not None
     return measure
+
+
+def tap(hand: Rig, key: imgui.Key) -> None:
+    """Press and release a key in imgui's fields."""
+    for down in (True, False):
+        imgui.get_io().add_key_event(key, down)
+        hand.frame(2)
 
 
 def set_length(hand: Rig, length: float) -> None:
@@ -71,8 +79,22 @@ def test_true_length_sets_the_unit_and_undo_restores_it() -> None:
         for invalid in (0.0, -1.0, float("nan"), float("inf")):
             set_length(hand, invalid)
             assert hand.main_view.work.view.unit == unit
+        tap(hand, imgui.Key.escape)  # leaves the field, which has its own undo
         hand.key("Ctrl+Z")
         assert hand.main_view.work.view.unit == 1.0
+
+
+def test_length_is_typed_right_after_the_second_click() -> None:
+    with rig(first_view(bear()), WINDOW) as hand:
+        measure = measured(hand)
+        hand.frame(3)
+        assert imgui.get_io().want_text_input
+        imgui.get_io().add_input_characters_utf8("2.5")
+        hand.frame(2)
+        tap(hand, imgui.Key.enter)
+        assert not imgui.get_io().want_text_input
+        assert measure.distance is not None
+        assert hand.main_view.work.view.unit * measure.distance == pytest.approx(2.5)
 
 
 def test_click_beside_the_scene_measures_nothing() -> None:
