@@ -15,8 +15,10 @@ from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import opened_document
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app.app import App
-from viewer.state.transient import Pull
+from viewer.state import selection
+from viewer.state.transient import Pull, PullCut, PullPose
 from viewer.state.workspace import with_transient
+from viewer.ui.glfw_library import glfw
 
 from .test_pulling import button, drag, frame, means, move, on_scarf, pull_of
 
@@ -129,3 +131,21 @@ def test_line_on_the_background_is_no_cut(app: App) -> None:
     press(app, "Shift+P", "K")
     draw_line(app, (80.0, 150.0), (120.0, 200.0))
     assert not pull_of(app).pose.cuts
+
+
+def test_bar_stays_within_a_narrow_picture(app: App) -> None:
+    glfw.set_window_size(app.window.handle, 800, 600)
+    mask = np.zeros(app.main_view.facts.count, bool)
+    mask[bear().demo.members("scarf")] = True
+    view = app.main_view.work.view
+    app.main_view.store.change(replace(view, selection=selection.select(view.selection, mask)))
+    press(app, "Shift+P", "K")
+    cut = PullCut((0.0, 0.0, 9.0), ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)))
+    pull = replace(pull_of(app), pose=PullPose(cuts=(cut,)))
+    app.main_view.store.replace(with_transient(app.main_view.work, gizmo=pull))
+    frame(app)
+    frame(app)
+    bar = imgui.internal.find_window_by_name("placing")
+    assert bar is not None
+    assert bar.pos.x > 0.0
+    assert bar.pos.x + bar.size.x < app.main_view._area().width

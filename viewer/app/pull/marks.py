@@ -29,6 +29,7 @@ _RING_PX = 1.25  # at 1×: width of the ring
 _CUT_PX = 2.5  # at 1×: width of a cut
 _PLATE_PX = 14.0  # at 1×: distance of the buttons from the upper edge of the picture
 _LOWER_PX = 64.0  # the same below the options of a tool or a selection
+_SIDE_PX = 64.0  # at 1×: smallest distance of the bar from the sides of the picture
 _HINT_PX = 430.0  # at 1×: width of the line below the buttons
 _HANDLE_COLOR = (1.0, 0.72, 0.05, 1.0)
 _PIN_COLOR = (0.35, 0.75, 1.0, 1.0)
@@ -58,23 +59,23 @@ def draw_bar(pull: Pull, pointer: PointerContext, below: bool) -> tuple[Pull, st
     with plate("placing", at, pointer.ui, (0.5, 0.0)):
         imgui.align_text_to_frame_padding()
         imgui.text(_title(pull, pointer))
-        imgui.same_line()
+        _follow_box("Whole part", pointer)
         whole = imgui.checkbox("Whole part", pull.whole)[1]
         tip("Move all that is connected, except pins and what is held; else only what lies in the radius")
         holds = pull.holds_selection
         if pointer.shown.selection.count:
-            imgui.same_line()
+            _follow_box("Hold selection", pointer)
             holds = imgui.checkbox("Hold selection", holds)[1]
             tip("Keep the selection in place; else only the selection moves")
-        imgui.same_line()
+        _follow_box("Cut", pointer)
         cuts = imgui.checkbox("Cut", pull.is_cutting)[1]
         tip("Draw lines where things touch, so that only one of them moves (K)")
         if pull.pose.cuts:
-            imgui.same_line()
+            _follow_box("Clear cuts", pointer)
             if imgui.button("Clear cuts"):
                 pull = clear(pull)
             tip("Remove all cuts; Shift+click removes one while Cut is on")
-        imgui.same_line()
+        _follow(160.0 * scale, pointer)  # both buttons
         with inert(not pull.pose.handles):
             if accent_button("Keep", (72.0 * scale, 0.0)):
                 request = pull.enter_request
@@ -82,9 +83,28 @@ def draw_bar(pull: Pull, pointer: PointerContext, below: bool) -> tuple[Pull, st
         imgui.same_line()
         if imgui.button("Cancel", (72.0 * scale, 0.0)):
             request = "leave_pull"
-        hint = elide(pull.status or _hint(pull), _HINT_PX * scale)
+        room = min(_HINT_PX * scale, _room(pointer))
+        hint = elide(pull.status or _hint(pull), room)
         small(hint, PALETTE.dim, imgui.calc_text_size(hint).x)
     return replace(pull, whole=whole, holds_selection=holds, is_cutting=cuts), request
+
+
+def _room(pointer: PointerContext) -> float:
+    """Return the largest width of the bar, window pixels."""
+    return pointer.area.width - 2.0 * _SIDE_PX * pointer.ui.scale
+
+
+def _follow(width: float, pointer: PointerContext) -> None:
+    """Place the next item, of this width, on the same line if it fits."""
+    right = imgui.get_item_rect_max().x - imgui.get_window_pos().x
+    if right + imgui.get_style().item_spacing.x + width <= _room(pointer):
+        imgui.same_line()
+
+
+def _follow_box(text: str, pointer: PointerContext) -> None:
+    """Place the next checkbox on the same line if it fits."""
+    gap = imgui.get_style().item_inner_spacing.x
+    _follow(imgui.get_frame_height() + gap + imgui.calc_text_size(text).x, pointer)
 
 
 def _title(pull: Pull, pointer: PointerContext) -> str:
