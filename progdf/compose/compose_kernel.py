@@ -149,3 +149,14 @@ def write_rows(
             for c in range(width):
                 after[rows[i], c] = before[rows[i], c] + total[i, c]
     return float(largest)
+
+
+@kernel(cache=True)
+def mark_differing(marks: NDArray[np.bool_], now: Floats, original: Floats, rows: Rows) -> None:
+    """Mark the rows that differ from the original. [m], [N,c], [N,c], [m]"""
+    for i in range(len(rows)):
+        row = rows[i]
+        for c in range(now.shape[1]):
+            if now[row, c] != original[row, c]:
+                marks[i] = True
+                break

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from progdf.compose.compose_kernel import add_offsets
+from progdf.compose.compose_kernel import add_offsets, mark_differing, write_rows
 from progdf.compose.layers import Change, Layer
 from progdf.field.baked import find_segment
 from progdf.field.stored_bases import StoredBases
@@ -78,9 +78,11 @@ class Carrier:
         if not moved and not any(name in self.tensors for name in change.attributes):
             return change
         rows = change.rows
-        if moved:
-            rows = np.unique(np.concatenate([rows, *(self._moves[edit].rows for edit in moved)]))
         self._is_affected[rows] = True
+        for edit in moved:
+            self._is_affected[self._moves[edit].rows] = True
+        if moved:
+            rows = np.flatnonzero(self._is_affected)
         last = self._now["means"].numpy()[rows]
         for name in self.tensors:
             source = composed.get(name)
@@ -111,17 +113,45 @@ class Carrier:
             if edit in active and (found := self._affected_rows(whole)) is not None
         ]
         members = move.gdf.region.members
-        chosen = torch.from_numpy(np.flatnonzero(self._is_affected[members.numpy()]))
-        chosen = chosen[weights[chosen] > 0.0]
+        chosen = np.flatnonzero(self._is_affected[members.numpy()])
+        if layer.weights is not None:
+            chosen = chosen[weights.numpy()[chosen] > 0.0]
         if len(chosen):
-            offsets = self._offsets(move, layer, chosen.numpy())
-            carried = carry_members(self._original, self._now, chosen, layer, maps, offsets, weights)
-            rows = members[chosen]
-            for name in self.tensors:
-                self._now[name][rows] = carried[name]
+            self._move_members(move, layer, chosen, maps, weights)
         for found, values in added:
             for name in self.tensors:
                 self._now[name][found.rows] = values[name]
+
+    def _move_members(
+        self, move: _Move, layer: Layer, chosen: Rows, maps: Sequence[LinearMap], weights: Tensor
+    ) -> None:
+        """Let a move act on some of its members; only those that other layers have changed need its maps."""
+        rows = move.gdf.region.members.numpy()[chosen]
+        is_displaced = np.zeros(len(rows), np.bool_)
+        if not all(each.is_identity for each in maps):
+            for name in self.tensors:
+                mark_differing(is_displaced, self._now[name].numpy(), self._original[name].numpy(), rows)
+        displaced = chosen[is_displaced]
+        carried: dict[str, Tensor] = {}
+        if len(displaced):
+            offsets = self._offsets(move, layer, displaced)
+            some = torch.from_numpy(displaced)
+            carried = carry_members(self._original, self._now, some, layer, maps, offsets, weights)
+        segment = find_segment(move.gdf.field.knots, layer.strength)
+        part = np.arange(len(chosen)), chosen, _NO_VALUES if layer.weights is None else weights.numpy()
+        for name, bases in move.bases.items():
+            if name not in self.tensors:
+                continue
+            used, factors = bases.factors(segment)
+            total = np.zeros((len(chosen), bases.end.shape[1]), np.float32)
+            gain = np.float32(layer.gain(name))
+            stored = bases.end, bases.residual
+            add_offsets(total, part, stored, used, factors, gain, np.float32(0.0), _NO_VALUES)
+            now = self._now[name].numpy()
+            write_rows(now, now, rows, total, _NO_VALUES, False)
+        changed = torch.from_numpy(rows[is_displaced])
+        for name, values in carried.items():
+            self._now[name][changed] = values
 
     def _affected_rows(self, added: Anchored) -> Anchored | None:
         """Return the added rows that are affected; None if there are none."""
