@@ -47,7 +47,7 @@ def add_offsets(
         part: positions of the layer's members in `total` [m], their member indices [m], and the weights of
             all members [M], or [0] if all are 1
         stored: end and residual bases. [M,c], [R,M,c]
-        used, factors: see `composer._Bases.factors`. [U], [1+U,c] or none
+        used, factors: see `StoredBases.factors`. [U], [1+U,c] or none
         hidden, covered: share of lower layers that is hidden at coverage 1, and the coverage c [M], or [0] if
             it is 0 everywhere
     """

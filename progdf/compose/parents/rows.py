@@ -1,4 +1,4 @@
-"""Rows that a move carries: the plain form of a parent layer, see docs/method.md, section 6.
+"""Rows that a move carries: the plain form of a parent layer, see docs/method.md 6.
 
 A move is an edit with known motions (see `progdf.gdf.motions`). The other layers are composed first. Then
 each move acts on the result, the lowest first. With Δ its offsets, f its weight times its gain, L its linear
