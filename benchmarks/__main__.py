@@ -58,7 +58,7 @@ BENCHES: dict[str, str] = {
 
 PAGE = (
     *("training", "field", "order", "gains", "pull-stages", "viewer", "rasterize"),
-    *("warp", "moving", "popping", "painting", "pull-response", "frames", "hard"),
+    *("warp", "moving", "popping", "painting", "pull-response", "frames", "exports", "hard"),
 )
 """Benchmarks of docs/speed-and-error.md."""
 
@@ -147,7 +147,7 @@ def main(argv: Sequence[str]) -> int:
         if not page.is_file():
             raise ProgdfError(f"{page} does not exist; check the name and the folder")
     arguments: dict[str, dict[str, object]] = {name: {"runs": options.runs} for name in trained}
-    with_scenes = charted if options.what[: len(PAGE)] == PAGE else drawing
+    with_scenes = (*charted, "exports") if options.what[: len(PAGE)] == PAGE else drawing
     arguments |= {name: {"scenes": options.scenes} for name in with_scenes}
     if options.plots:
         for name in plotted:

@@ -125,8 +125,8 @@ def lower_priority(process: int | None = None) -> None:
     """
     if sys.platform == "win32":
         if process is None:
-            kernel = ctypes.windll.kernel32
-            kernel.SetPriorityClass(kernel.GetCurrentProcess(), _BELOW_NORMAL_PRIORITY_CLASS)
+            this_process = ctypes.c_void_p(-1)  # as GetCurrentProcess returns it
+            ctypes.windll.kernel32.SetPriorityClass(this_process, _BELOW_NORMAL_PRIORITY_CLASS)
         return
     with suppress(OSError):
         niceness = os.getpriority(os.PRIO_PROCESS, 0) + NICENESS

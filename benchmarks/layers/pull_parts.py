@@ -50,7 +50,7 @@ _ELEVATION = 10.0  # of the camera, degrees
 _FIELD_OF_VIEW = 0.6  # radians
 _MAX_HOLE_SHARE = 0.01  # radius of the largest hole that is counted, in widths of the picture
 _COVERED = 0.5  # opacity of a covered pixel
-_RIGID = 0.01  # an edge is rigid if its length at strength 1 differs by less
+_RIGID = 0.02  # a node is rigid if the lengths of all its edges at strength 1 differ by less
 _MOVED_SPACINGS = 0.5  # a rigid edge counts if it moves by so many node spacings
 
 # The program, and its peak memory and processor time on the last line. The status file starts at 0, unlike
@@ -119,9 +119,10 @@ def tables(scenes: Sequence[Path] = (), plot: Path | None = None) -> list[Table]
         rows = [_row(case, files[case.scene], folder) for case in PULLS if case.scene in files]
     note = (
         "Written by `progdf edit` and measured in the finished edit. Edges lead between the nodes of the "
-        "part, which are means of its Gaussians; lengths are per length at rest. Rigid: an edge that has at "
-        f"strength 1 its length at rest within {_RIGID:.0%} and has moved by {_MOVED_SPACINGS:g} node "
-        "spacings or more. Blend: the mean of strengths 0 and 1. Holes: open pixels of the part alone that a "
+        "part, which are means of its Gaussians; lengths are per length at rest. Rigid: edges between nodes "
+        f"that move by {_MOVED_SPACINGS:g} node spacings or more and all of whose edges keep their length at "
+        f"strength 1 within {_RIGID:.0%}; - if there are none. Blend: the mean of strengths 0 and 1. "
+        "Holes: open pixels of the part alone that a "
         f"disc with a radius of {_MAX_HOLE_SHARE:.0%} of the picture closes, per covered pixel, the worst of "
         "four sides; gaps between leaves count at 0 as well. Seconds: processor time with start and reading. "
         "Memory: peak of the command."
@@ -184,7 +185,11 @@ def _edge_lengths(scene: Gaussians, gdf: Gdf) -> tuple[Floats, Floats, Floats]:
     lengths = _lengths(rest, graph)
     stretch = _lengths(end, graph) / lengths
     moved = np.linalg.norm(end - rest, axis=1) > _MOVED_SPACINGS * graph.spacing
-    rigid = (np.abs(stretch - 1.0) < _RIGID) & moved[graph.starts] & moved[graph.ends]
+    change = np.zeros(len(rest))
+    np.maximum.at(change, graph.starts, np.abs(stretch - 1.0))
+    np.maximum.at(change, graph.ends, np.abs(stretch - 1.0))
+    is_rigid = (change < _RIGID) & moved
+    rigid = is_rigid[graph.starts] & is_rigid[graph.ends]
     blend = _lengths(0.5 * (rest + end), graph)
     return _lengths(half, graph)[rigid] / lengths[rigid], blend[rigid] / lengths[rigid], stretch
 

@@ -88,4 +88,4 @@ def test_page_runs_exactly_the_benchmarks_with_markers(monkeypatch: pytest.Monke
     assert requested == [command.BENCHES[name] for name in command.PAGE]
     text = (command.ROOT / "docs" / "speed-and-error.md").read_text()
     named = set(re.findall(r"<!-- bench ([\w-]+) -->", text))
-    assert named == {"machine", "compose", "coarse", "lists", *command.PAGE}
+    assert named == {"machine", "compose", "coarse", "lists", "strays", *command.PAGE}

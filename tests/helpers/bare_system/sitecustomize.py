@@ -8,6 +8,7 @@ of any file in $BARE_FOLDER is refused, as by a virus scanner.
 from __future__ import annotations
 
 import builtins
+import ctypes
 import importlib
 import io
 import os
@@ -15,6 +16,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 OURS = ("progdf", "trainer", "viewer")
@@ -105,6 +107,8 @@ def bare() -> None:
         where.kill = where.terminate = lambda self: None if self.poll() is not None else kill(self.pid, nine)  # type: ignore[method-assign]
     for name in ("CREATE_NEW_PROCESS_GROUP", "BELOW_NORMAL_PRIORITY_CLASS", "CREATE_NO_WINDOW"):
         setattr(subprocess, name, 0)
+    kernel = SimpleNamespace(SetPriorityClass=lambda process, priority: 1)
+    ctypes.windll = SimpleNamespace(kernel32=kernel)  # type: ignore[attr-defined]
     os.replace = _refusing_replace(os.replace)
     builtins.open = io.open = _without_proc(open)
     for name in MODULES:

@@ -89,10 +89,12 @@ def test_region_without_visible_members_has_no_draft() -> None:
     assert draft_views(TrainingViewOptions(), hidden, case.region) is None
 
 
-def test_indoor_scene_without_cameras_has_no_draft() -> None:
+def test_indoor_scene_without_cameras_is_drafted_from_free_places() -> None:
     scene = room(MIN_ROOM_GAUSSIANS).gaussians
     region = from_mask("all", torch.ones(len(scene), dtype=torch.bool))
-    assert draft_views(TrainingViewOptions(), scene, region) is None
+    views = draft_views(TrainingViewOptions(), scene, region)
+    assert views is not None
+    assert draft_grade(views, EditorOptions("tint:#c08040"), "tint") is not None
 
 
 def test_no_extra_strengths_request_no_pictures(tmp_path: Path) -> None:
