@@ -21,7 +21,7 @@ from viewer.files.web_page import PAGE, PageOptions, write_page
 from viewer.pictures import film
 from viewer.state import timeline
 from viewer.state.layers import describe_strengths
-from viewer.state.view_state import Timeline
+from viewer.state.view_state import Timeline, ViewState
 
 from .open_stack import OpenStack, open_stack
 from .options import ExportOptions
@@ -48,18 +48,15 @@ def export(argv: Sequence[str]) -> int:
     opened = open_stack(options.stack, drawing, unset=1.0)
     check_not_an_input(out, opened.files)
     if ending == PAGE:
-        view = opened.view
-        if opened.session is None:
-            document = opened.document
-            camera = view_camera.first_camera(document.original, up=opened.up, stored=document.stored_camera)
-            view = replace(view, camera=camera)
+        view = _view_of_scene(opened)
         print_line(write_page(out, opened.document, view, opened.snapshots, options.page))
         return 0
     if ending == CUBE:
         print_line(save_cube(out, opened.document, opened.view))
         return 0
     if ending == BUNDLE:
-        print_line(save_bundle(out, WindowSession(opened.document, opened.view, opened.snapshots)))
+        view = _view_of_scene(opened)
+        print_line(save_bundle(out, WindowSession(opened.document, view, opened.snapshots)))
         return 0
     if several:
         return _export_frames(options, opened)
@@ -74,6 +71,15 @@ def export(argv: Sequence[str]) -> int:
     if ending == ".ply" and kind != "ply":
         print_line(f"{document.title} is a .{kind}, this is a plain .ply")
     return 0
+
+
+def _view_of_scene(opened: OpenStack) -> ViewState:
+    """Return the view of a session, else that of its strengths with the first camera of the scene."""
+    if opened.session is not None:
+        return opened.view
+    document = opened.document
+    camera = view_camera.first_camera(document.original, up=opened.up, stored=document.stored_camera)
+    return replace(opened.view, camera=camera)
 
 
 def _export_frames(options: ExportOptions, opened: OpenStack) -> int:

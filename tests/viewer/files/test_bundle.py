@@ -16,6 +16,7 @@ from progdf.io.bundle import unpack_bundle, write_bundle
 from tests.helpers.null_app import null_app
 from tests.helpers.sessions import bear_files, full_view, opened_document, saved_session
 from tests.helpers.ui_rig import bear
+from viewer.camera.view_camera import first_camera
 from viewer.files import session
 from viewer.files.document import empty
 from viewer.state import selection
@@ -61,6 +62,7 @@ def test_scene_with_edits_exports_as_a_bundle(tmp_path: Path, capsys: pytest.Cap
     )
     opened = session.open_session(unpack_bundle(tmp_path / "a.progdf.zip"))
     assert {layer.name: layer.strength for layer in opened.view.layers}["ears"] == 0.3
+    assert opened.view.camera == first_camera(bear().scene)
 
 
 def test_bundle_contains_its_regions(tmp_path: Path) -> None:
