@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from viewer.camera.view_camera import to_camera
 from viewer.panel import tools
 from viewer.render.decal_surfaces import DecalSurfaces
-from viewer.state.transient import Gizmo, Pivot, Snap, Transform
+from viewer.state.transient import Gizmo, GizmoPose, Pivot, Snap, Transform
 from viewer.state.workspace import Workspace, with_transient
 from viewer.ui.keys import Keys
 from viewer.ui.pointer import PointerContext
@@ -43,10 +43,39 @@ def take_keys(work: Workspace, pointer: PointerContext, keys: Keys) -> tuple[Wor
     if isinstance(gizmo, Gizmo):
         if imgui.get_io().want_text_input:  # Enter and Escape end the field
             return work, replace(keys, pressed=(), fly=frozenset())
-        moved, keys = typed.take_keys(gizmo, keys, pointer)
+        undone, keys = _take_undo(gizmo, keys)
+        moved, keys = typed.take_keys(undone, keys, pointer)
         if moved is not gizmo:
             work = with_transient(work, gizmo=moved)
     return select_tool.take_keys(work, pointer, keys)
+
+
+def _take_undo(gizmo: Gizmo, keys: Keys) -> tuple[Gizmo, Keys]:
+    """Undo or redo one motion of the handles; return the unused keys."""
+    if gizmo.using or gizmo.typed is not None:
+        return gizmo, keys
+    unused = []
+    for press in keys.pressed:
+        if press.chord == "Ctrl+Z" and gizmo.past:
+            gizmo = _at(gizmo, gizmo.past[-1], gizmo.past[:-1], (*gizmo.future, gizmo.rest))
+        elif press.chord in ("Ctrl+Shift+Z", "Ctrl+Y") and gizmo.future:
+            gizmo = _at(gizmo, gizmo.future[-1], (*gizmo.past, gizmo.rest), gizmo.future[:-1])
+        else:
+            unused.append(press)
+    return gizmo, replace(keys, pressed=tuple(unused))
+
+
+def _at(gizmo: Gizmo, pose: GizmoPose, past: tuple[GizmoPose, ...], future: tuple[GizmoPose, ...]) -> Gizmo:
+    """Return the handles in another pose at rest."""
+    return replace(gizmo, matrix=pose.matrix, angles=pose.angles, rest=pose, past=past, future=future)
+
+
+def _record(gizmo: Gizmo) -> Gizmo:
+    """Record a finished motion of the handles for undo."""
+    if np.array_equal(gizmo.matrix, gizmo.rest.matrix):
+        return gizmo
+    pose = GizmoPose(gizmo.matrix, gizmo.angles)
+    return replace(gizmo, rest=pose, past=(*gizmo.past, gizmo.rest), future=())
 
 
 def draw_gizmo(gizmo: Gizmo, pointer: PointerContext, surfaces: DecalSurfaces) -> tuple[Gizmo, str]:
@@ -66,6 +95,8 @@ def draw_gizmo(gizmo: Gizmo, pointer: PointerContext, surfaces: DecalSurfaces) -
             moved = replace(moved, typed=None)
         elif imgui.is_mouse_clicked(1):
             moved = typed.undo(moved)
+    if not using and moved.typed is None and not imgui.is_any_item_active():
+        moved = _record(moved)
     is_changed = not np.array_equal(moved.matrix, gizmo.shown)
     is_live = gizmo.does == "transform"  # a copy is shown where its handles are released
     if (is_changed and (is_live or not using)) or (gizmo.using and not using):

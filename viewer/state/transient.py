@@ -73,6 +73,14 @@ Pivot = Literal["center", "base", "pointer"]
 Snap = Literal["off", "ground", "surface"]
 
 
+@dataclass(frozen=True, eq=False)
+class GizmoPose:
+    """Pose of the handles around a selection, see `Gizmo`."""
+
+    matrix: NDArray[np.float64]  # [4,4]
+    angles: tuple[float, float, float] = (0.0, 0.0, 0.0)  # degrees
+
+
 @dataclass(frozen=True)
 class Gizmo:
     """Handles around the selection being moved."""
@@ -91,6 +99,10 @@ class Gizmo:
     snap: Snap = "off"  # what the base of the selection is placed on
     angles: tuple[float, float, float] = (0.0, 0.0, 0.0)  # typed rotation about X, Y and Z, degrees
     part: PlacedPart | None = field(default=None, compare=False)
+    # the last pose at rest, and those that undo and redo return to, the next one last
+    rest: GizmoPose = field(default_factory=lambda: GizmoPose(np.eye(4)), compare=False)
+    past: tuple[GizmoPose, ...] = field(default=(), compare=False)
+    future: tuple[GizmoPose, ...] = field(default=(), compare=False)
 
     @property
     def is_moved(self) -> bool:

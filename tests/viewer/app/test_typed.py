@@ -130,6 +130,25 @@ def test_undo_gives_back_the_bits(app: App) -> None:
     assert torch.equal(means(app), before)
 
 
+def test_undo_and_redo_step_through_motions_of_the_handles(app: App) -> None:
+    selected = app.main_view.work.view.selection.members
+    before = means(app)
+    strike(app, "Alt+M G X 2 Enter")
+    moved = gizmo_of(app).matrix
+    shown = means(app)
+    strike(app, "R Y 5 0 Enter")
+    turned_too = gizmo_of(app).matrix
+    strike(app, "Ctrl+Z")
+    assert np.array_equal(gizmo_of(app).matrix, moved)
+    assert torch.equal(means(app), shown)
+    strike(app, "Ctrl+Z")
+    assert not gizmo_of(app).is_moved
+    assert torch.equal(means(app), before)
+    strike(app, "Ctrl+Y Ctrl+Shift+Z")
+    assert np.array_equal(gizmo_of(app).matrix, turned_too)
+    assert app.main_view.work.view.selection.members == selected
+
+
 def test_keys_of_a_transform_do_nothing_else(app: App) -> None:
     work = app.main_view.work
     strike(app, "Alt+M G X 1 2 . - Backspace Y Tab S R")
