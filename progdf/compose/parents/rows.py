@@ -1,15 +1,21 @@
-"""Rows that a move carries: the plain form of a parent layer, see docs/method.md 6.
+"""Reference composition of moves, the parents of other layers (docs/method.md 6).
 
 A move is an edit with known motions (see `progdf.gdf.motions`). The other layers are composed first. Then
-each move acts on the result, the lowest first. With Δ its offsets, f its weight times its gain, L its linear
-map, and x0 and x a member in the original and below the move,
+each move acts on the result, the lowest first. The symbols are
+
+    Δ, f     offsets of the move; its weight times its gain
+    L        linear map of the move
+    x0, x    a member in the original; the same member below the move
+
+and the moved member is
 
     means        x' = x0 + f Δ + (x − x0) + f (L − I) (x − x0)
     quaternions  q' = q0 + f Δ + (q − q0) + f (r − 1) (q − q0), with r the rotation of L, if L is a similarity
     log-scales   l' = l0 + f Δ + (l − l0), if L is a similarity
     higher bands b' = b0 + f Δ + (b − b0) + f (D − I) (b − b0), with D the rotation of the bands
 
-If L is none, log-scales and quaternions are those of the covariance L Σ Lᵀ, blended with those of x by f.
+If L is no similarity, log-scales and quaternions are those of the covariance L Σ Lᵀ, blended with those of x
+by f.
 
 So a member that no other layer changes is x0 + f Δ bit for bit, and a changed one is the motion of the
 changed Gaussian. An added row follows the motions of its anchors: x' = x + Σ w f (a0 + Δ + L (x − a0) − x).

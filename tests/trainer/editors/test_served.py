@@ -18,7 +18,7 @@ from trainer import cli
 from trainer.editors import make_editor
 from trainer.editors.painter import PaintRequest, RefusedError
 from trainer.editors.server.calls import Address
-from trainer.editors.server.editor import ServedEditor, explain_sending
+from trainer.editors.server.editor import ServedEditor, check_served, explain_sending
 from trainer.editors.server.images_api import ImagesApi, check_api
 from trainer.options import EditorOptions, with_values
 
@@ -247,6 +247,13 @@ def test_prompts_become_strengths_by_what_their_pictures_show(tmp_path: Path) ->
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("degrees", ["|", "warm|", " | cold"])
+def test_empty_prompt_of_a_degree_is_refused(degrees: str) -> None:
+    options = replace(settings_of("http://127.0.0.1:8080/v1"), degrees=degrees)
+    with pytest.raises(ProgdfError, match="has an empty prompt; write"):
+        check_served(options)
+
+
 @pytest.mark.parametrize("references", [0, 2])
 def test_run_leaves_refused_views_out_and_pays_for_no_picture_twice(tmp_path: Path, references: int) -> None:
     write_bear(tmp_path)

@@ -12,6 +12,7 @@ from typing import Protocol
 
 from torch import Tensor
 
+from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.terminal import format_count
 from trainer.editors.adapters import paint_size
@@ -199,16 +200,26 @@ def _make_editor(given: EditorInput, model: ImageModel, prompt: str) -> ServedEd
 
 
 def split_degrees(text: str) -> tuple[str, ...]:
-    """Return the prompts of --degrees."""
-    return tuple(part.strip() for part in text.split("|") if part.strip())
+    """Return the prompts of --degrees, none for "".
+
+    Raises:
+        ProgdfError: a prompt is empty.
+    """
+    if not text:
+        return ()
+    prompts = tuple(part.strip() for part in text.split("|"))
+    if not all(prompts):
+        raise ProgdfError(f"--degrees '{text}' has an empty prompt; write TEXT or TEXT|TEXT")
+    return prompts
 
 
 def check_served(options: EditorOptions) -> ImageModel:
     """Return the model of `api:` or `comfy:` after checking the options. Nothing is sent.
 
     Raises:
-        ProgdfError: see `check_api` and `check_comfy`.
+        ProgdfError: a prompt of --degrees is empty; see also `check_api` and `check_comfy`.
     """
+    split_degrees(options.degrees)
     check = check_comfy if options.family == "comfy" else check_api
     return check(options.text, options)
 
