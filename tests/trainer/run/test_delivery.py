@@ -71,6 +71,7 @@ def test_interrupted_report_leaves_the_finished_edit(
     assert not (OUT / "state").exists()
 
 
+@pytest.mark.slow  # the fast test interrupts a report
 def test_killed_report_is_completed_by_resume(bear_folder: Path, uninterrupted: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", KILLED, str(bear_folder)]

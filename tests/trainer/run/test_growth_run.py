@@ -112,6 +112,7 @@ def test_hat_is_grown_and_nothing_outside_changes(hat: Path) -> None:
     assert grown.report["slider"]["monotone"]
 
 
+@pytest.mark.slow
 def test_grown_edit_at_strength_0_is_the_original_bit_for_bit(hat: Path) -> None:
     scene = load_ply(hat / "scene.ply")
     gdf = load_gdf(hat / "grown" / "grown.gdf", scene)
@@ -123,6 +124,7 @@ def test_grown_edit_at_strength_0_is_the_original_bit_for_bit(hat: Path) -> None
     assert torch.equal(render(composed, camera, WHITE).image, render(scene, camera, WHITE).image)
 
 
+@pytest.mark.slow
 def test_grown_run_is_evaluated_and_refitted_with_its_rows(hat: Path) -> None:
     before = (hat / "grown" / "grown.gdf").read_bytes()
     opened = open_run(hat / "grown")
@@ -133,6 +135,7 @@ def test_grown_run_is_evaluated_and_refitted_with_its_rows(hat: Path) -> None:
     assert (hat / "grown" / "grown.gdf").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_added_opacity_grows_linearly_along_the_recording(hat: Path) -> None:
     """Check the recording; the slider is made even afterwards."""
     trajectory, _, _ = load_trajectory(hat / "grown" / "trajectory.safetensors")
@@ -176,6 +179,7 @@ def test_unprofitable_growth_adds_nothing_and_keeps_the_file(tmp_path: Path) -> 
     assert files[0] == files[1]
 
 
+@pytest.mark.slow
 def test_damaged_added_rows_are_a_one_line_error(hat: Path, tmp_path: Path) -> None:
     trajectory, extra, about = load_trajectory(hat / "grown" / "trajectory.safetensors")
     assert trajectory.added is not None

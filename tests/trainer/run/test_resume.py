@@ -412,15 +412,8 @@ def striped_bits(bear_folder: Path, tmp_path_factory: pytest.TempPathFactory) ->
         return bits(OUT)
 
 
-@pytest.mark.parametrize(
-    "where",
-    [
-        "a lost view",
-        pytest.param("step 2", marks=pytest.mark.slow),
-        pytest.param("write_finals", marks=pytest.mark.slow),
-        pytest.param("finish_run", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow  # the fast tests kill a plain run at its writes
+@pytest.mark.parametrize("where", ["a lost view", "step 2", "write_finals", "finish_run"])
 def test_run_that_keeps_half_of_its_views_resumes_to_the_same_bits(
     bear_folder: Path, striped_bits: dict[str, str], monkeypatch: pytest.MonkeyPatch, where: str
 ) -> None:

@@ -130,6 +130,7 @@ def test_change_reproduced_by_recoloring_adds_nothing(place: Path, monkeypatch: 
     assert done.gdf.read_bytes() == plain.gdf.read_bytes()
 
 
+@pytest.mark.slow
 def test_discs_that_are_worse_from_the_sides_are_not_added(
     place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -144,6 +145,7 @@ def test_discs_that_are_worse_from_the_sides_are_not_added(
     assert load_gdf(done.gdf, load_ply(place / "wall.ply")).added is None
 
 
+@pytest.mark.slow
 def test_two_pictures_of_one_stripe_share_one_set_of_rows() -> None:
     scene = wall(rough=0.01)
     stripe = torch.zeros(CAMERA.height, CAMERA.width, dtype=torch.bool)
