@@ -86,7 +86,7 @@ class BenchOptions:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the named benchmarks, the ablation, the sliders or the sweep.
+    """Run the named benchmarks, the ablation, the sliders, the sweep or the stages.
 
     Raises:
         ProgdfError: a name, file or folder does not exist, or an option does not fit the named benchmarks.
@@ -97,6 +97,8 @@ def main(argv: Sequence[str]) -> int:
         return sliders(argv[1:])
     if list(argv[:1]) == ["regret"]:
         return regret(argv[1:])
+    if list(argv[:1]) == ["training-stages"]:
+        return training_stages(argv[1:])
     options = parse_options(BenchOptions, argv, COMMAND)
     if options.what == ("page",):
         written = ["--markdown", str(ROOT / "docs/speed-and-error.md"), "--plots", str(ROOT / "assets")]
@@ -105,7 +107,7 @@ def main(argv: Sequence[str]) -> int:
         if name not in BENCHES:
             raise ProgdfError(
                 f"unknown benchmark '{name}'; use one of "
-                f"{', '.join((*BENCHES, 'page', 'ablate', 'sliders', 'regret'))}"
+                f"{', '.join((*BENCHES, 'page', 'ablate', 'sliders', 'regret', 'training-stages'))}"
             )
     charted = ("training", "field")
     plotted = (*charted, "recolors", "subject")
@@ -230,6 +232,14 @@ def regret(argv: Sequence[str]) -> int:
     from .ablation.regret import RegretOptions, run_regret
 
     print(run_regret(parse_options(RegretOptions, argv, f"{COMMAND} regret")).markdown())
+    return 0
+
+
+def training_stages(argv: Sequence[str]) -> int:
+    """Measure trainings by stage and return 0. Raises ProgdfError for errors that the user can fix."""
+    from .colors.stages import StageOptions, measure_stages
+
+    measure_stages(parse_options(StageOptions, argv, f"{COMMAND} training-stages"))
     return 0
 
 
