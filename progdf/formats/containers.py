@@ -116,7 +116,7 @@ def _foreign_kind(start: bytes) -> str:
         return ""
     if text[:1] in (b"{", b"["):
         if b'"lodLevels"' in text:
-            return "is a streamed SOG scene (lod-meta.json); give the meta.json in one of its folders"
+            return "is a streamed SOG scene; name it lod-meta.json and put its folders beside it"
         return "is JSON, not a scene; give the scene's own file"
     return "is a text file, not a scene; give a .ply or another scene file"
 

@@ -49,6 +49,7 @@ from .packed.compressed_ply import (
 from .packed.ksplat import read_ksplat, read_splat
 from .packed.sog import META as SOG_META
 from .packed.sog import read_sog, read_table, scene_bytes
+from .packed.sog_tree import INDEX, describe_levels, is_index, read_sog_tree
 from .ply import load_ply_with_report, read_ply, save_ply, save_ply_checked
 from .ply_file import read_header
 from .repair import LoadReport, limit_logits, repair
@@ -110,20 +111,25 @@ def scene_format(path: str | os.PathLike[str]) -> str | None:
         return "sog" if read_table(path) is not None else None
     if suffix == "gltf":
         return suffix
+    if is_index(path, start):
+        return "sog"
     if suffix in ("splat", "ksplat"):  # no magic number: any first byte is valid
         return suffix
     return suffix if suffix in FORMATS and start.lstrip()[:1] not in (b"{", b"[") else None
 
 
 def scene_file(path: str | os.PathLike[str]) -> Path:
-    """Return the file that a scene is read from: the path itself, or meta.json in an unpacked .sog folder."""
+    """Return the file that a scene is read from: the path itself, or the table or index in a .sog folder."""
     path = Path(path)
-    return path / SOG_META if os.path.isfile(path / SOG_META) else path
+    for name in (INDEX, SOG_META):
+        if os.path.isfile(path / name):
+            return path / name
+    return path
 
 
 def scene_name(path: Path) -> str:
     """Return the name of a scene: the name of its file, or of the folder of an unpacked .sog."""
-    return path.parent.name if path.name.lower() == SOG_META else path.name
+    return path.parent.name if path.name.lower() in (SOG_META, INDEX) else path.name
 
 
 def load_scene(path: str | os.PathLike[str]) -> Gaussians:
@@ -167,9 +173,13 @@ def _load(path: Path, kind: str | None) -> tuple[Gaussians, LoadReport]:
         kind: one of `FORMATS`; None if unknown, so that the .ply reader raises the error
     """
     start = read_file(path, START_BYTES)
-    is_table = kind == "gltf" or path.name.lower() == SOG_META
+    is_table = kind == "gltf" or path.name.lower() in (SOG_META, INDEX)
     if not (is_table and start.lstrip()[:1] in (b"{", b"[")):
         check_foreign(path, start)
+    if kind == "sog" and is_index(path, start):
+        tree = read_sog_tree(path)
+        content = {"ignored_properties": tree.ignored, "file_bytes": tree.file_bytes}
+        return _repair(path, tree.gaussians, describe_levels(tree), content)
     if kind == "sog":
         sog = read_sog(path)
         return _repair(path, sog.gaussians, f".sog {sog.version}", {"ignored_properties": sog.ignored})

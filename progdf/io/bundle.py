@@ -72,7 +72,7 @@ def write_bundle(path: Path, source: Path) -> int:
     """
     session = read_session(source, SessionFile)
     scene, edits = verify_files(source, session)
-    if scene.name.lower() == "meta.json":
+    if scene.name.lower() in ("meta.json", "lod-meta.json"):
         raise ProgdfError(f"{scene.parent} is an unpacked .sog; export the scene as a .ply first")
     if scene.suffix.lower() == ".gltf":
         raise ProgdfError(f"{scene} keeps numbers in other files; export the scene as a .glb first")

@@ -164,7 +164,7 @@ FOREIGN = {
     "xml": (b'<?xml version="1.0"?><Error>AccessDenied</Error>', "is XML, not a scene"),
     "text": (b"404: Not Found", "is a text file, not a scene"),
     "json": (b'{"message": "Not Found"}', "is JSON, not a scene"),
-    "lod": (b'{"lodLevels": 4, "filenames": []}', "is a streamed SOG scene (lod-meta.json)"),
+    "lod": (b'{"lodLevels": 4, "filenames": []}', "is a streamed SOG scene; name it lod-meta.json"),
     "png": (image_bytes("PNG"), "is a picture (PNG)"),
     "jpeg": (image_bytes("JPEG"), "is a picture (JPEG)"),
     "webp": (image_bytes("WEBP"), "is a picture (WebP)"),
