@@ -32,7 +32,8 @@ from trainer.editors import make_editor
 from trainer.editors.base import ImageEditor
 from trainer.editors.procedural import edit_course
 from trainer.fit.evaluate import Evaluator, make_evaluator
-from trainer.fit.fit import fit_grades, visibility
+from trainer.fit.fit import visibility
+from trainer.fit.grades import fit_grades
 from trainer.fit.slider_uniformity import equalized_strengths
 from trainer.optimize.color_course import STEPS as TAKEN
 from trainer.optimize.color_course import solve

@@ -159,6 +159,34 @@ class FieldEvaluator:
         self.wanted = share if edited else f"reaches {target:g} dB"
         """Condition that accepted fields meet, in words."""
 
+    @property
+    def stages(self) -> tuple[float, ...]:
+        """Slider values of the editor's pictures, ascending; without such pictures, 1 alone."""
+        return tuple(self._edited)
+
+    def editor_error(self, s: float, pixels: Tensor) -> float:
+        """Return the mean squared error of pixels against the editor's picture at a stage. [P,3]"""
+        return ROUNDING + _mse(pixels, self._edited[s])
+
+    def judge_errors(self, errors: Sequence[float]) -> tuple[float, float | None]:
+        """Return `excess` and `to_editor` of a candidate from its errors at `stages`.
+
+        Without the editor's pictures, the excess is that at strength 1 against the trajectory.
+        """
+        excess = (fmean(errors) - fmean(self._own_errors)) / self._allowed
+        if not self._has_edited:
+            return excess, None
+        end_allowed = allowed_error(self._own_errors[-1], self._added)
+        return max(excess, (errors[-1] - self._own_errors[-1]) / end_allowed), decibels(fmean(errors))
+
+    def path_excess(self, curve: Sequence[float]) -> float:
+        """Return the error over the slider against the trajectory, as a multiple of the allowed error.
+
+        Args:
+            curve: mean squared error at `sample_strengths()`
+        """
+        return (fmean(curve) if self._has_edited else max(curve)) / self._allowed
+
     def end_excess(self, end: Tensor) -> float:
         """Return the error of offsets at strength 1, as a multiple of the allowed error there. [M,C]"""
         allowed = allowed_error(self._own_errors[-1], self._added) if self._has_edited else self._allowed
@@ -170,9 +198,8 @@ class FieldEvaluator:
         """Return the field with its error."""
         assert isinstance(field, BakedField)
         curve = self._trajectory_errors(field)
-        path_error = fmean(curve) if self._has_edited else max(curve)
         end_excess, to_editor = self._editor_excess(field)
-        excess = max(end_excess, path_error / self._allowed)
+        excess = max(end_excess, self.path_excess(curve))
         return Candidate(field, tuple(decibels(e) for e in curve), label, excess, to_editor)
 
     def added_excess(self, field: Field) -> tuple[float, float | None]:
@@ -180,22 +207,14 @@ class FieldEvaluator:
 
         The error against the trajectory, which hardly ever decides, takes several times as many renders.
         """
-        if self._has_edited:
-            return self._editor_excess(field)
-        candidate = self.candidate(field, "")
-        return candidate.excess, candidate.to_editor
+        excess, to_editor = self._editor_excess(field)
+        if not self._has_edited:
+            excess = max(excess, self.path_excess(self._trajectory_errors(field)))
+        return excess, to_editor
 
     def _editor_excess(self, field: Field) -> tuple[float, float | None]:
-        """Return the error that a field adds at the editor's strengths and its PSNR there, see `Candidate`.
-
-        Without the editor's pictures, the error at strength 1 against the trajectory, and None.
-        """
-        errors = self._editor_errors(lambda s: self._offsets(field, s))
-        excess = (fmean(errors) - fmean(self._own_errors)) / self._allowed
-        if not self._has_edited:
-            return excess, None
-        end_allowed = allowed_error(self._own_errors[-1], self._added)
-        return max(excess, (errors[-1] - self._own_errors[-1]) / end_allowed), decibels(fmean(errors))
+        """Return the error that a field adds at `stages` and its PSNR there, see `judge_errors`."""
+        return self.judge_errors(self._editor_errors(lambda s: self._offsets(field, s)))
 
     def curve(self, field: Field) -> tuple[float, ...]:
         """Return the PSNR at `sample_strengths()`, dB."""
@@ -211,8 +230,8 @@ class FieldEvaluator:
         return list(map(_mse, pictures, self._expected_pictures))
 
     def _editor_errors(self, course: Callable[[float], Tensor]) -> list[float]:
-        pictures = self._render_all(course, [*self._edited])
-        return [ROUNDING + _mse(*pair) for pair in zip(pictures, self._edited.values(), strict=True)]
+        pictures = self._render_all(course, self.stages)
+        return [self.editor_error(s, picture) for s, picture in zip(self.stages, pictures, strict=True)]
 
     def _render_all(self, course: Callable[[float], Tensor], strengths: Sequence[float]) -> list[Tensor]:
         """Render the relevant pixels, each strength on one thread."""

@@ -13,7 +13,7 @@ Gaussian is a residual of the lowest bands, stored in a small number of int8 bas
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 
 import torch
@@ -36,7 +36,7 @@ from .baked import (
     lattice_side,
     remap_slider,
 )
-from .separable import fit_course
+from .separable import fit_course, member_ranges
 
 MAX_COLOR = 1.5
 """Upper limit of the map's input. No screen shows brighter colors."""
@@ -171,11 +171,15 @@ def bake_grade(form: GradeForm, rows: Tensor, mapped: Tensor | None = None) -> B
         )
     changes = mapped_bands(form, rows) if mapped is None else mapped.clone()
     if len(form.residual):
-        changes[:, :, :width] += torch.einsum(
-            "sr,rmc->smc", form.coefficients, form.residual * form.scale[:, None]
-        )
+        for part in member_ranges(len(rows)):
+            changes[:, part, :width] += torch.einsum(
+                "sr,rmc->smc", form.coefficients, form.residual[:, part] * form.scale[:, None]
+            )
     higher = rows.shape[1] - BASE_CHANNELS
-    parts = {"sh0": changes[:, :, :3], "shN": pad(changes[:, :, 3:], (0, higher - changes.shape[2] + 3))}
+    shN = changes[:, :, 3:]
+    if shN.shape[2] < higher:  # bands that are not drawn
+        shN = pad(shN, (0, higher - shN.shape[2]))
+    parts = {"sh0": changes[:, :, :3], "shN": shN}
     attributes = {name: fit_course(part) for name, part in parts.items() if bool(part.any())}
     knots = form.knots.tolist()
     baked = BakedField("grade", form.knots, attributes, rows.shape[1], tuple(knots), form)
@@ -294,7 +298,7 @@ def fit_grade(
     step = coarser / 127.0 * largest
     levels = torch.empty(exact.shape, dtype=torch.int8)
     overflow = torch.empty_like(levels)  # overflow of outliers, stored in bases of their own
-    for part in _chunks(exact.shape[1]):
+    for part in member_ranges(exact.shape[1]):
         rounded = (exact[:, part] / (step or 1.0)).round_().clamp_(-254.0, 254.0)
         levels[:, part] = rounded.clamp(-127.0, 127.0).to(torch.int8)
         overflow[:, part] = (rounded - levels[:, part]).to(torch.int8)
@@ -302,7 +306,7 @@ def fit_grade(
     scale = torch.full((len(levels), exact.shape[2]), step or 1.0)
     normal = torch.zeros(len(levels), len(levels), dtype=torch.float64)
     pull = torch.zeros(len(course), len(levels), dtype=torch.float64)
-    for part in _chunks(exact.shape[1]):
+    for part in member_ranges(exact.shape[1]):
         columns = levels[:, part] * scale[:, None]
         weighted = (columns * weights[part, None]).flatten(1).T
         normal += columns.flatten(1) @ weighted
@@ -324,21 +328,57 @@ def residual_bases(course: Tensor, rank: int, weights: Tensor) -> tuple[Tensor, 
     Returns:
         [R,M,3b]; the largest value of `_FITTING_SHARE` of the members, over all bases and channels
     """
+    mix = _basis_shares(course, weights)[:, :rank].T
+    exact = (mix @ course.flatten(1)).reshape(rank, *course.shape[1:])
+    return exact, max(map(_fitting_value, exact), default=0.0)
+
+
+def _basis_shares(course: Tensor, weights: Tensor) -> Tensor:
+    """Return the share of each knot in each of the best bases, strongest first. [S,S] float32"""
     products = torch.zeros(len(course), len(course), dtype=torch.float64)
-    for part in _chunks(course.shape[1]):
+    for part in member_ranges(course.shape[1]):
         rows = (course[:, part] * weights[part, None].sqrt()).flatten(1)
         products += rows @ rows.T
     _, vectors = torch.linalg.eigh(products)
-    mix = vectors.flip(1)[:, :rank].T.float()
-    exact = (mix @ course.flatten(1)).reshape(rank, *course.shape[1:])
-    fitting_count = max(1, math.ceil(_FITTING_SHARE * exact.shape[1]))
-    largest = float(exact.abs().kthvalue(fitting_count, dim=1).values.max()) if rank else 0.0
-    return exact, largest
+    shares: Tensor = vectors.flip(1).float()
+    return shares
 
 
-def _chunks(members: int) -> list[slice]:
-    """Return ranges of members for sums whose temporary arrays would be as large as the residuals."""
-    return [slice(begin, begin + _CHUNK_MEMBERS) for begin in range(0, members, _CHUNK_MEMBERS)]
+@dataclass(frozen=True)
+class ResidualBases:
+    """Exact bases of a residual, made one at a time. `residual_bases` is the plain form."""
+
+    course: Tensor  # residual of the lowest bands at each knot. [S,M,3b]
+    mix: Tensor  # share of each knot in each basis, strongest first. [S,S] float32
+    made: list[tuple[Tensor, float]]  # bases so far [M,3b], and the value that nearly all members stay within
+
+    @classmethod
+    def of(cls, course: Tensor, weights: Tensor) -> ResidualBases:
+        """Return the bases of a residual [S,M,3b] whose members have a visibility [M]."""
+        return cls(course, _basis_shares(course, weights), [])
+
+    def first(self, rank: int) -> tuple[Tensor, float]:
+        """Return the result of `residual_bases`."""
+        while len(self.made) < rank:
+            exact = self._basis(len(self.made))
+            self.made.append((exact, _fitting_value(exact)))
+        if not rank:
+            return self.course.new_zeros(0, *self.course.shape[1:]), 0.0
+        return torch.stack([exact for exact, _ in self.made[:rank]]), max(v for _, v in self.made[:rank])
+
+    def _basis(self, index: int) -> Tensor:
+        """Return one basis. [M,3b]"""
+        exact = torch.empty(self.course.shape[1:])
+        for part in member_ranges(len(exact)):
+            rows = self.course[:, part].flatten(1)
+            exact[part] = (self.mix[:, index] @ rows).view(exact[part].shape)
+        return exact
+
+
+def _fitting_value(exact: Tensor) -> float:
+    """Return the value that `_FITTING_SHARE` of the members stay within in every channel. [M,3b]"""
+    count = max(1, math.ceil(_FITTING_SHARE * len(exact)))
+    return float(exact.abs().kthvalue(count, dim=0).values.max())
 
 
 def rank_limit(course: Tensor) -> int:

@@ -29,6 +29,10 @@ _MAX_LEVELS = {torch.int8: 127, torch.int16: 32767}
 """Largest level in use by integer type. The lowest is unused, so that the levels are symmetric."""
 
 
+_RANGE_MEMBERS = 1 << 11
+"""Members whose trajectories are summed at once."""
+
+
 @dataclass(frozen=True)
 class AttributeTrajectory:
     """Trajectory of one attribute, split into full offset and residual."""
@@ -54,10 +58,14 @@ class AttributeTrajectory:
         Args:
             tolerance: root mean square of the remainder, as a share of the trajectory's RMS
         """
-        allowed = tolerance**2 * float(self.offsets.double().square().sum())
-        power = torch.linalg.eigvalsh(self.gram).flip(0).clamp(min=0)
-        remaining = float(power.sum()) - power.cumsum(0)
-        return 0 if float(power.sum()) <= allowed else 1 + int((remaining > allowed).sum())
+        return _needed_rank(self.gram, tolerance**2 * float(self.offsets.double().square().sum()))
+
+
+def _needed_rank(gram: Tensor, allowed: float) -> int:
+    """Return the smallest number of bases that leaves at most `allowed` of the residual's squares."""
+    power = torch.linalg.eigvalsh(gram).flip(0).clamp(min=0)
+    remaining = float(power.sum()) - power.cumsum(0)
+    return 0 if float(power.sum()) <= allowed else 1 + int((remaining > allowed).sum())
 
 
 def check_trajectory(strengths: Tensor, offsets: Tensor) -> None:
@@ -165,14 +173,20 @@ def store_attribute(
 
 def quantize_bases(exact: Tensor, basis_type: torch.dtype) -> tuple[Tensor, Tensor]:
     """Return bases in their stored type, and the value of one unit. [R,M,c] -> [R,M,c], [R,c] float32"""
-    largest = exact.abs().amax(dim=1) if exact.shape[1] else exact.new_zeros(exact.shape[0], exact.shape[2])
+    ranges = member_ranges(exact.shape[1])
+    largest = exact.new_zeros(exact.shape[0], exact.shape[2])
+    for part in ranges:
+        largest = torch.maximum(largest, exact[:, part].abs().amax(dim=1))
     max_level = _MAX_LEVELS.get(basis_type)
-    if max_level is not None:
-        step = largest / max_level
-        step = torch.where(step > 0, step, torch.ones_like(step))
-        return (exact / step[:, None]).round().clamp(-max_level, max_level).to(basis_type), step
-    step = torch.where(largest > 0, largest, torch.ones_like(largest))  # keeps float16 far from its limits
-    return (exact / step[:, None]).to(basis_type), step
+    step = largest if max_level is None else largest / max_level  # float16 stays far from its limits
+    step = torch.where(step > 0, step, torch.ones_like(step))
+    levels = torch.empty(exact.shape, dtype=basis_type)
+    for part in ranges:
+        scaled = exact[:, part] / step[:, None]
+        if max_level is not None:
+            scaled = scaled.round_().clamp_(-max_level, max_level)
+        levels[:, part] = scaled.to(basis_type)
+    return levels, step
 
 
 def decode_bases(levels: Tensor, step: Tensor) -> Tensor:
@@ -208,8 +222,21 @@ def solve_coefficients(
     rows = offsets.flatten(1) * root
     normal = (columns @ columns.T).double()
     table: Tensor = (rows @ columns.T).double() @ torch.linalg.pinv(normal, rtol=1e-7, hermitian=True)
-    table = (table / scale).float()
-    if not bool(full.any()):
+    return _fix_ends(table / scale, bool(full.any()))
+
+
+def _solve_normal(normal: Tensor, pull: Tensor) -> Tensor:
+    """Solve `solve_coefficients` from its sums. [1+R,1+R], [T,1+R] float64 -> [T,1+R]"""
+    scale = normal.diagonal().sqrt().clamp(min=1e-30)
+    scaled = normal / scale / scale[:, None]
+    table: Tensor = (pull / scale) @ torch.linalg.pinv(scaled, rtol=1e-7, hermitian=True)
+    return table / scale
+
+
+def _fix_ends(table: Tensor, is_moving: bool) -> Tensor:
+    """Return coefficients as float32 with both ends fixed. [T,1+R]"""
+    table = table.float()
+    if not is_moving:
         table[:, 0] = 0.0  # nothing to scale; a_0 is still 1 at the end
     table[0] = 0.0
     table[-1] = 0.0
@@ -309,20 +336,87 @@ def fit_course(
         basis_type: storage type of bases 1..R: int8, float16 or float32
         tolerance: largest error of a row at the knots; further bases or float32 are used to keep it
     """
-    fitted = fit_amplitude(offsets, torch.ones_like(offsets[0]), stored)
-    modes = principal_modes(fitted.gram)
-    rank = min(fitted.needed_rank(_TRAJECTORY_TOLERANCE), _MAX_TRAJECTORY_RANK)
-    bases = store_attribute(fitted, modes[:, :rank], basis_type)
+    sums = course_sums(offsets)
+    modes = principal_modes(sums.gram)
+    rank = min(sums.needed_rank(_TRAJECTORY_TOLERANCE), _MAX_TRAJECTORY_RANK)
+    bases = _store_course(offsets, sums, modes[:, :rank], stored, basis_type)
     if tolerance == math.inf or largest_error(bases, offsets) <= tolerance:
         return bases
     ranks = range(rank, 1 + min(modes.shape[1], _MAX_TRAJECTORY_RANK))
     forms = [(count, kind) for count in ranks for kind in (basis_type, torch.float32)]
     forms.sort(key=lambda form: form[0] * form[1].itemsize)
     for count, kind in forms:
-        bases = store_attribute(fitted, modes[:, :count], kind, torch.float64)
+        bases = _store_course(offsets, sums, modes[:, :count], stored, kind)
         if largest_error(bases, offsets) <= tolerance:
             break
     return bases
+
+
+@dataclass(frozen=True)
+class CourseSums:
+    """Sums of an unweighted trajectory that determine its bases; `AttributeTrajectory` is the plain form."""
+
+    amplitude: Tensor  # see `AttributeTrajectory`. [T] float64
+    residual: Tensor  # rows of the residual as sums of the offsets' rows. [T,T] float64
+    gram: Tensor  # inner products of the residual's rows. [T,T] float64
+    power: float  # sum of the offsets' squares
+
+    def needed_rank(self, tolerance: float) -> int:
+        """See `AttributeTrajectory.needed_rank`."""
+        return _needed_rank(self.gram, tolerance**2 * self.power)
+
+
+def course_sums(offsets: Tensor) -> CourseSums:
+    """Sum a trajectory in ranges of members, without copies of its size. [T,M,c]"""
+    count = len(offsets)
+    products = torch.zeros(count, count, dtype=torch.float64)
+    for part in member_ranges(offsets.shape[1]):
+        rows = offsets[:, part].flatten(1).double()
+        products += rows @ rows.T
+    amplitude = torch.linspace(0, 1, count).double()
+    if float(products[-1, -1]) > 0:
+        amplitude = products[:, -1] / products[-1, -1]
+    amplitude[0] = 0.0
+    amplitude[-1] = 1.0
+    residual = torch.eye(count, dtype=torch.float64)
+    residual[:, -1] -= amplitude
+    residual[[0, -1]] = 0.0
+    gram = residual @ products @ residual.T
+    return CourseSums(amplitude, residual, gram, float(products.trace()))
+
+
+def _store_course(
+    offsets: Tensor,
+    sums: CourseSums,
+    mix: Tensor,
+    stored: tuple[Tensor, Tensor] | None,
+    basis_type: torch.dtype,
+) -> AttributeBases:
+    """Return the bases of an unweighted trajectory in stored form, see `store_attribute`."""
+    full = offsets[-1].clone()
+    end, unit = stored or (full[None], torch.ones(1, full.shape[1]))
+    exact = torch.empty(mix.shape[1], *full.shape)
+    combination = mix.T @ sums.residual
+    for part in member_ranges(len(full)):
+        rows = offsets[:, part].flatten(1).double()
+        exact[:, part] = (combination @ rows).float().view(len(exact), *full[part].shape)
+    levels, step = quantize_bases(exact, basis_type)
+    del exact
+    columns_count = 1 + len(levels)
+    normal = torch.zeros(columns_count, columns_count, dtype=torch.float64)
+    pull = torch.zeros(len(offsets), columns_count, dtype=torch.float64)
+    for part in member_ranges(len(full)):
+        decoded = decode_bases(levels[:, part], step)
+        columns = torch.cat([full[None, part], decoded]).flatten(1).double()
+        normal += columns @ columns.T
+        pull += offsets[:, part].flatten(1).double() @ columns.T
+    table = _fix_ends(_solve_normal(normal, pull), bool(full.any()))
+    return AttributeBases(end[0], levels, torch.cat([unit, step]), table)
+
+
+def member_ranges(members: int) -> list[slice]:
+    """Return ranges of members for sums whose temporary arrays would be as large as the trajectory."""
+    return [slice(begin, begin + _RANGE_MEMBERS) for begin in range(0, members, _RANGE_MEMBERS)]
 
 
 def largest_error(bases: AttributeBases, offsets: Tensor) -> float:

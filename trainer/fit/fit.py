@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import math
-from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
 from typing import Any
 
 import torch
@@ -14,22 +11,11 @@ from torch import Tensor
 
 from progdf.field import BakedField, Candidate, FieldChoice, FieldEvaluator, choose_field
 from progdf.field.baked import GradeForm, NeuralForm
-from progdf.field.choose import MAX_FITTED_SNAPSHOTS, SAMPLES, pick_candidate
-from progdf.field.grade import (
-    RESIDUAL_STEPS,
-    bake_grade,
-    fit_grade,
-    map_form,
-    mapped_bands,
-    member_bands,
-    rank_limit,
-    residual_bases,
-)
+from progdf.field.choose import MAX_FITTED_SNAPSHOTS, SAMPLES
 from progdf.field.separable import fit_keyframes, keyframe_rows, moving_attributes
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import BASE_CHANNELS, Gaussians, attribute_slices
 from progdf.rasterize import alpha_weights
-from progdf.threads import one_thread
 from trainer.editors.base import ImageEditor
 from trainer.optimize.retime import select_recordings
 from trainer.options import FieldKind, FieldOptions
@@ -40,7 +26,7 @@ from trainer.views.crops import only_recolors
 from trainer.views.setup import TrainingSetup
 from trainer.views.view import View
 
-from .evaluate import Evaluator, make_evaluator, sample_members
+from .evaluate import Evaluator, make_evaluator
 
 THINNING_SHARE = 0.25
 """Part of `QualityLimits.added_error` reserved for leaving out functions of members, see `thin_model`."""
@@ -136,151 +122,7 @@ def fit_field(
         "separable" if options.field == "auto" else options.field,
         field_evaluator(trajectory, choosing, options),
     )
-    return _measure_choice(choice, trajectory, reporting)
-
-
-@dataclass(frozen=True)
-class _GradePacking:
-    """Solution of a color edit, and the grades that store it."""
-
-    trajectory: Trajectory
-    rows: Tensor  # raw values of the members before the edit, packed. [M,14+3K]
-    weights: Tensor  # visibility of the members. [M]
-    degree: int  # degree of the maps
-    table: Tensor  # map at each knot. [S,K,3]
-    mapped: Tensor  # change of the members' bands by the maps. [S,M,3B]
-    course: Tensor  # residual of the lowest bands. [S,M,3b]
-    bases: Callable[[int], tuple[Tensor, float]]  # `residual_bases` by rank; keeps the last result
-
-    def take(self, members: Tensor) -> _GradePacking:
-        """Return the solution for some members, whose grades are parts of those of all. [m] int64"""
-        trajectory = self.trajectory.take(members)
-        return replace(self, trajectory=trajectory, rows=self.rows[members], mapped=self.mapped[:, members])
-
-    def fit(self, rank: int, index: int) -> GradeForm:
-        """Return the grade with a number of bases, in steps of `RESIDUAL_STEPS[index]`."""
-        return fit_grade(
-            self.trajectory.s,
-            self.degree,
-            self.table,
-            self.course,
-            rank,
-            self.weights,
-            mask=self.trajectory.mask,
-            coarser=RESIDUAL_STEPS[index],
-            bases=self.bases(rank),
-        )
-
-    def bake(self, form: GradeForm) -> BakedField:
-        """Return the field of a grade of these members."""
-        return bake_grade(form, self.rows, self.mapped)
-
-
-def _grade_packing(trajectory: Trajectory, rows: Tensor, weights: Tensor) -> _GradePacking:
-    """Split a trajectory into its maps and the residual of its members, see `fit_grades`."""
-    degree, table = trajectory.map_course
-    alone = replace(map_form(trajectory.s, degree, table, len(rows)), mask=trajectory.mask)
-    mapped = mapped_bands(alone, rows)
-    lowest = [member_bands(trajectory.node(i))[:, : trajectory.bands] for i in range(len(table))]
-    course = torch.stack(lowest).flatten(2) - mapped[:, :, : 3 * trajectory.bands]
-    bases = lru_cache(maxsize=1)(partial(residual_bases, course, weights=weights))
-    return _GradePacking(trajectory, rows, weights, degree, table, mapped, course, bases)
-
-
-@one_thread()  # for thousands of small pictures, synchronizing torch's threads costs more than they save
-def fit_grades(
-    trajectory: Trajectory,
-    rows: Tensor,
-    choosing: Evaluator,
-    reporting: Evaluator,
-    weights: Tensor,
-    options: FieldOptions,
-) -> Fitted:
-    """Fit the grade of a recorded map with the smallest residual that meets the target, see `fit_field`.
-
-    The residual has the smallest sufficient number of bases or one more, quantized as coarsely as possible.
-    Large regions are measured on a sample (`sample_members`); the chosen grade is then measured on all pixels
-    of the choosing views, and stored in finer steps while it fails there.
-
-    Args:
-        trajectory: the recorded trajectory, with its maps
-        rows: raw values of the members before the edit, packed. [M,14+3K]
-        choosing, reporting, weights, options: see `fit_field`
-    """
-    packing = _grade_packing(trajectory, rows, weights)
-    members, sampled = sample_members(choosing)
-    is_sample = len(members) < len(rows)
-    part = packing.take(members) if is_sample else packing
-    evaluator = field_evaluator(part.trajectory, sampled, options)
-    tried = list[Candidate]()
-    steps = list[tuple[int, int]]()  # number of bases, and index of the step size, of each candidate
-    smallest = math.inf
-
-    def fails(rank: int, index: int = 0) -> bool:
-        nonlocal smallest
-        form = packing.fit(rank, index)
-        if is_sample:
-            form = form.take(members)
-        if form.bytes_per_member > smallest:
-            return False
-        release_memory()
-        field = part.bake(form)
-        if index and evaluator.end_excess(field.offsets(1.0)) > 1.0:  # one evaluation instead of twenty
-            return True
-        candidate = evaluator.candidate(field, form.label)
-        tried.append(replace(candidate, field=replace(field, attributes={})))  # the attributes are large
-        steps.append((rank, index))
-        smallest = min(smallest, math.inf if tried[-1].excess > 1.0 else form.bytes_per_member)
-        return tried[-1].excess > 1.0
-
-    limit = rank_limit(packing.course)
-    low = 0
-    fewest = 0
-    while fails(fewest) and fewest < limit:
-        low = fewest + 1
-        fewest = min(2 * fewest + 1, limit)
-    fewest = bisect_left(range(fewest), True, lo=low, key=lambda rank: not fails(rank))
-    for rank in range(max(1, fewest), min(fewest + 1, limit) + 1):
-        bisect_left(range(1, len(RESIDUAL_STEPS)), True, key=partial(fails, rank))
-    choice = pick_candidate(tried, evaluator.wanted)
-    rank, index = next(at for at, one in zip(steps, tried, strict=True) if one is choice.best)
-    if is_sample:
-        everything = field_evaluator(trajectory, choosing, options)
-        choice = replace(choice, why=choice.why.replace(evaluator.wanted, everything.wanted))
-        choice = _check_on_all(choice, packing, rank, index, everything)
-    else:
-        field = part.bake(packing.fit(rank, index))
-        choice = replace(choice, best=replace(choice.best, field=field))
-    return _measure_choice(choice, trajectory, reporting)
-
-
-def _check_on_all(
-    choice: FieldChoice, packing: _GradePacking, rank: int, index: int, evaluator: FieldEvaluator
-) -> FieldChoice:
-    """Return a choice with its field for all members, finer or with more bases while it fails on all pixels.
-
-    Args:
-        choice: the choice on a sample
-        packing: all members
-        rank, index: number of bases and index of the step size of the chosen grade
-        evaluator: all pixels of the choosing views
-    """
-
-    def measure() -> tuple[GradeForm, BakedField, float, float | None]:
-        form = packing.fit(rank, index)
-        field = packing.bake(form)
-        return form, field, *evaluator.added_excess(field)
-
-    form, field, excess, to_editor = measure()
-    limit = rank_limit(packing.course)
-    while excess > 1.0 and choice.met and (index or rank < limit):
-        if index:
-            index = index - 1
-        else:
-            rank = rank + 1
-        form, field, excess, to_editor = measure()
-    best = replace(choice.best, field=field, label=form.label, excess=excess, to_editor=to_editor)
-    return replace(choice, best=best, met=excess <= 1.0)
+    return measure_choice(choice, trajectory, reporting)
 
 
 def field_evaluator(trajectory: Trajectory, views: Evaluator, options: FieldOptions) -> FieldEvaluator:
@@ -299,7 +141,7 @@ def field_evaluator(trajectory: Trajectory, views: Evaluator, options: FieldOpti
     return FieldEvaluator(*course, edited=edited, added=added)
 
 
-def _measure_choice(choice: FieldChoice, trajectory: Trajectory, reporting: Evaluator) -> Fitted:
+def measure_choice(choice: FieldChoice, trajectory: Trajectory, reporting: Evaluator) -> Fitted:
     """Measure the chosen field and the baselines on views not used for the choice."""
     release_memory()
     best = choice.best
@@ -331,7 +173,7 @@ def evaluate_field(
     network = evaluator.candidate(field, field.kind)
     why = f"a network was requested{'; none' if network.excess > 1.0 else ' and'} {evaluator.wanted}"
     choice = FieldChoice(network, network.excess <= 1.0, (network,), why)
-    return _measure_choice(choice, trajectory, reporting)
+    return measure_choice(choice, trajectory, reporting)
 
 
 def field_figures(candidate: Candidate) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from progdf.metrics.image import decibels
 from progdf.metrics.slider import Pictures, SliderStatistics, slider_statistics
 from progdf.rasterize import alpha_weights, render
 from progdf.terminal import format_count, group_digits
-from trainer.editors.pictures import read_edit
+from trainer.editors.pictures import picture_background, read_edit
 from trainer.fit.evaluate import Evaluator
 from trainer.fit.fit import Fitted, choice_figures, field_figures, stored_numbers
 from trainer.optimize.carry_on import draw_behind
@@ -415,6 +415,14 @@ def measure_paint(
     rms = (missing / max(1, 3 * pixels)) ** 0.5
     reached = max(0.0, 1.0 - missing / max(change, 1e-12))
     return PaintReproduction(reached, rms, pixels, visible_count, behind > 0.5 * change)
+
+
+def picture_backgrounds(setup: TrainingSetup, files: Sequence[Path]) -> list[Tensor]:
+    """Return the background color of each changed picture; the setup's if the file was deleted. [3] each"""
+    return [
+        picture_background(setup.scene, file, view.camera) if file.is_file() else setup.background
+        for file, view in zip(files, setup.train, strict=True)
+    ]
 
 
 def _shows_behind(

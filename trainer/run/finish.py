@@ -21,9 +21,9 @@ from progdf.io.images import write_image
 from progdf.io.json_values import convert_json, decode_json, to_json
 from progdf.terminal import file_size, format_count
 from progdf.threads import map_threads
-from trainer.editors.pictures import picture_background
 from trainer.fit.evaluate import Evaluator, make_evaluator
-from trainer.fit.fit import Fitted, evaluate_field, expected_renders, fit_field, fit_grades, visibility
+from trainer.fit.fit import Fitted, evaluate_field, expected_renders, fit_field, visibility
+from trainer.fit.grades import fit_grades
 from trainer.fit.network import NetworkFit, fit_network
 from trainer.fit.slider_uniformity import equalize_slider
 from trainer.methods import METHODS
@@ -43,6 +43,7 @@ from trainer.report.measures import (
     measure_above,
     measure_paint,
     measured_figures,
+    picture_backgrounds,
 )
 from trainer.report.report import report_picture
 from trainer.resolve import BLANK, check_field_options, use_threads
@@ -325,11 +326,7 @@ def _measure_paint(
     if not files:
         return None
     pictures = read_views(folder, "edited", [view.camera for view in setup.train], 1.0)
-    backgrounds = [  # a refit may come after the pictures were deleted
-        picture_background(setup.scene, file, view.camera) if file.is_file() else setup.background
-        for file, view in zip(files, setup.train, strict=True)
-    ]
-    return measure_paint(setup, pictures, backgrounds, edited)
+    return measure_paint(setup, pictures, picture_backgrounds(setup, files), edited)
 
 
 def _record_figures(record: RunRecord) -> dict[str, Any]:

@@ -174,6 +174,16 @@ class CropScene:
         _add_bands(weights.numpy(), rows, BASE_CHANNELS - 3, colors)
         return torch.from_numpy(np.maximum(colors, 0.0, out=colors))
 
+    def change(self, bands: Tensor) -> Tensor:
+        """Return the change of a still view on the CPU by changes of the members' lowest SH functions.
+
+        It is linear: the limits at black and white are left out. [M,b,3] -> [h,w,3]
+        """
+        weights = self._still_weights[:, : bands.shape[1], 0].contiguous()
+        colors = np.zeros((len(bands), 3), np.float32)
+        _add_bands(weights.numpy(), bands.flatten(1).contiguous().numpy(), 0, colors)
+        return self._linear[0].picture(torch.from_numpy(colors))
+
     def visible_members(self, pixels: Tensor) -> Tensor:
         """Return the members with a weight in some of these pixels of a still view. [h,w] bool -> [M] bool"""
         chosen = pixels[..., None].to(self.original).expand_as(self.original)

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+import progdf.field.separable
 from progdf.field import (
     AttributeBases,
     BakedField,
@@ -23,8 +24,10 @@ from progdf.field.baked import END_TYPES, interpolate_at
 from progdf.field.choose import FieldChoice, grow_ranks, render_trajectories, store_ends
 from progdf.field.separable import (
     channel_weights,
+    course_sums,
     decode_bases,
     fit_amplitude,
+    fit_course,
     principal_modes,
     quantize_bases,
     store_attribute,
@@ -328,6 +331,26 @@ def test_end_offset_is_decoded_from_its_levels(end_type: torch.dtype) -> None:
     assert bases.end_offset.dtype == end_type
     assert torch.equal(field.offsets(1.0)[:, :3], offsets[-1])
     assert not bool(field.offsets(0.0).any())
+
+
+def test_course_summed_in_ranges_matches_the_plain_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    strengths, offsets = curved_trajectory(60)
+    columns = attribute_slices(14)["sh0"]
+    part = offsets[:, :, columns].clone()
+    plain_sums = fit_amplitude(part, torch.ones(60, 3))
+    modes = principal_modes(plain_sums.gram)
+    plain = store_attribute(plain_sums, modes[:, : plain_sums.needed_rank(0.001)])
+    monkeypatch.setattr(progdf.field.separable, "_RANGE_MEMBERS", 7)
+    found = fit_course(part)
+    sums = course_sums(part)
+    torch.testing.assert_close(sums.amplitude.float(), plain_sums.amplitude)
+    torch.testing.assert_close(sums.gram, plain_sums.gram, atol=1e-5, rtol=1e-4)
+    assert found.residual_basis.shape == plain.residual_basis.shape
+    assert torch.equal(found.end, part[-1])
+    for s in strengths.tolist():
+        fields = [BakedField("separable", strengths, {"sh0": bases}, 14) for bases in (found, plain)]
+        values = [field.offsets(s)[:, columns] for field in fields]
+        torch.testing.assert_close(values[0], values[1], atol=1e-3 * float(part.abs().max()), rtol=0)
 
 
 def test_lossless_field_can_be_requested() -> None:

@@ -25,6 +25,7 @@ from progdf.field.baked import (
 from progdf.field.grade import (
     MAX_COLOR,
     RESIDUAL_STEPS,
+    ResidualBases,
     bake_grade,
     band_offsets,
     fit_grade,
@@ -33,6 +34,7 @@ from progdf.field.grade import (
     mapped_bands,
     member_bands,
     monomials,
+    residual_bases,
 )
 from progdf.formats.cube import read_cube, write_cube
 from progdf.gaussians import Gaussians, attribute_slices, pack
@@ -438,3 +440,15 @@ def test_invalid_lattice_is_refused(spoilt: str) -> None:
     knots = KNOTS if spoilt == "knots" else good.knots
     with pytest.raises(ValueError, match=r"lattice|identity"):
         replace(good, knots=knots, table=tables[spoilt], coefficients=torch.zeros(len(knots), 0))
+
+
+def test_bases_made_one_at_a_time_match_those_made_at_once() -> None:
+    course = torch.randn(6, 5000, 12, generator=torch.Generator().manual_seed(5))
+    course[0] = 0.0
+    weights = torch.rand(5000, generator=torch.Generator().manual_seed(6))
+    bases = ResidualBases.of(course, weights)
+    for rank in (2, 0, 4):
+        exact, largest = bases.first(rank)
+        expected, expected_largest = residual_bases(course, rank, weights)
+        torch.testing.assert_close(exact, expected, atol=1e-5, rtol=0)
+        assert largest == pytest.approx(expected_largest)

@@ -8,14 +8,15 @@ import pytest
 import torch
 from torch import Tensor
 
-import trainer.fit.fit
+import trainer.fit.grades
 from progdf.field.baked import GradeForm, identity_map
 from progdf.field.grade import map_colors, member_bands
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import BASE_CHANNELS, pack
 from tests.helpers.trained import WHITE, Small, small
 from trainer.fit.evaluate import Evaluator, make_evaluator, sample_members
-from trainer.fit.fit import field_evaluator, fit_grades
+from trainer.fit.fit import field_evaluator
+from trainer.fit.grades import PackingScale, fit_grades, grade_packing
 from trainer.options import FieldOptions
 from trainer.views.crops import crop_scene
 
@@ -89,7 +90,7 @@ def test_sampled_grade_meets_the_limit_on_all_pixels(monkeypatch: pytest.MonkeyP
     )
     whole = fit()
     monkeypatch.setattr(
-        trainer.fit.fit, "sample_members", partial(sample_members, budget=3 * len(case.region) // 4)
+        trainer.fit.grades, "sample_members", partial(sample_members, budget=3 * len(case.region) // 4)
     )
     sampled = fit()
     assert sampled.choice.met
@@ -103,6 +104,45 @@ def test_sampled_grade_meets_the_limit_on_all_pixels(monkeypatch: pytest.MonkeyP
     assert sampled.choice.best.field.bytes_per_member < 1.5 * whole.choice.best.field.bytes_per_member
 
 
+@pytest.mark.parametrize("target_psnr", [None, 40.0])
+def test_weighed_packings_have_the_errors_of_drawn_ones(target_psnr: float | None) -> None:
+    case = small("body", count=3)
+    trajectory = recolored(case)
+    views = evaluator_of(case, trajectory)
+    judge = field_evaluator(trajectory, views, FieldOptions(target_psnr=target_psnr))
+    packing = grade_packing(trajectory, rows_of(case), torch.ones(len(case.region)))
+    scale = PackingScale(packing, views, judge)
+    for rank, index in ((0, 0), (1, 0), (1, 20)):
+        form = packing.fit(rank, index)
+        weighed = scale.candidate(form)
+        drawn = judge.candidate(packing.bake(form), form.label)
+        assert weighed.excess == pytest.approx(drawn.excess, rel=0.05, abs=0.02)
+        assert weighed.mean == pytest.approx(drawn.mean, abs=0.3)
+        assert weighed.field.bytes_per_member == drawn.field.bytes_per_member
+        if target_psnr is None:
+            assert weighed.to_editor == pytest.approx(drawn.to_editor, abs=0.02)
+
+
+def test_unbaked_grade_has_the_offsets_of_the_baked_one() -> None:
+    case = small("body", count=2)
+    packing = grade_packing(recolored(case), rows_of(case), torch.ones(len(case.region)))
+    form = packing.fit(1, 8)
+    baked = packing.bake(form)
+    for s in (0.0, 0.4, 1.0):
+        torch.testing.assert_close(
+            packing.plain_field(form).offsets(s), baked.offsets(s), atol=1e-5, rtol=1e-5
+        )
+
+
+def test_packing_of_some_members_is_a_part_of_the_whole() -> None:
+    case = small("body", count=2)
+    packing = grade_packing(recolored(case), rows_of(case), torch.ones(len(case.region)))
+    members = torch.arange(0, len(case.region), 3)
+    part = packing.take(members).fit(1, 4)
+    whole = packing.fit(1, 4)
+    assert torch.equal(part.residual, whole.residual[:, members])
+
+
 @pytest.mark.parametrize("with_shN", [True, False])
 def test_still_colors_match_the_differentiable_colors(with_shN: bool) -> None:
     case = small(count=1)
@@ -114,3 +154,20 @@ def test_still_colors_match_the_differentiable_colors(with_shN: bool) -> None:
     plain = still.render(rows.clone().requires_grad_())
     assert plain.requires_grad
     torch.testing.assert_close(fast, plain.detach(), atol=2e-6, rtol=0)
+
+
+def test_change_of_bands_is_the_linear_part_of_a_picture() -> None:
+    case = small(count=1)
+    view = case.views[0]
+    still = crop_scene(case.scene, case.region.members, view.camera, view.box, WHITE, still=True)
+    rows = rows_of(case)
+    bands = member_bands(rows)
+    generator = torch.Generator().manual_seed(3)
+    change = 1e-3 * torch.randn(bands[:, :4].shape, generator=generator)
+    moved = rows.clone()
+    moved[:, BASE_CHANNELS - 3 : BASE_CHANNELS + 9] += change.flatten(1)
+    brighter = torch.zeros_like(rows)
+    brighter[:, BASE_CHANNELS - 3 : BASE_CHANNELS] = 3.0  # above the limit at black
+    weights = still._linear[0]
+    difference = still.still_colors(moved + brighter) - still.still_colors(rows + brighter)
+    torch.testing.assert_close(still.change(change), weights.picture(difference), atol=2e-6, rtol=0)
