@@ -19,7 +19,7 @@ from progdf.errors import ProgdfError
 from progdf.io.atomic import is_portable
 from progdf.metrics.image import NO_DIFFERENCE
 from progdf.rasterize import set_threads
-from progdf.rasterize.engines import choose_engine
+from progdf.rasterize.engines import choose_engine, engine_device
 from trainer.editors import EDITORS, editor_row
 from trainer.editors.instruct import parse_guidance
 from trainer.editors.pictures import strengths_of
@@ -145,6 +145,7 @@ def resolve_kind(
         grow: maximum number of added rows, as a share of the members; found by a trial run
     """
     optimize = options.optimize
+    has_gpu = engine_device(optimize.engine).type != "cpu"
     # only colors change, and no option needs a descent view by view
     solves_colors = kind == "color" and optimize.color_solver and not optimize.perceptual_weight
     weight = optimize.perceptual_weight
@@ -164,7 +165,8 @@ def resolve_kind(
         sh="on" if optimize.sh == "auto" and kind != "color" else optimize.sh,
         perceptual_weight=PERCEPTUAL_WEIGHT[kind] if weight is None else weight,
         solver="colors" if solves_colors else "descent",
-        engine="cpu" if solves_colors else optimize.engine,  # on an H100 colors took 1.4 to 2.4 times as long
+        # without a GPU, warp is for tests of the steps only
+        engine="cpu" if solves_colors and not has_gpu else optimize.engine,
     )
 
 

@@ -37,6 +37,7 @@ from .engines import (
     check_intersections,
 )
 from .reference import DrawnColors, ReferenceSplats, of_rows, project
+from .sparse import SortedEntries, SparseWeights, sparse_weights
 
 try:
     import warp as wp
@@ -231,6 +232,62 @@ def add_weights_kernel(
         wp.tile_atomic_add(sums, wp.tile_sum(wp.tile(row, preserve_type=True)), offset=slots[index])
 
 
+@_kernel
+def list_weights_kernel(
+    window: wp.vec4i, starts: wp.array[int], members: wp.array[int], boxes: wp.array[wp.vec4],
+    shapes: wp.array[_Shape], colors: wp.array[wp.vec4], listed: wp.array[int], places: wp.array[int],
+    lost: float, offsets: wp.array[wp.int64], counts: wp.array[wp.int64], rows: wp.array[int],
+    weights: wp.array[float],
+) -> None:  # fmt: skip
+    """List the weights of every selected pixel, nearest first. Without room for them, count them.
+
+    Args:
+        listed: index of each splat in the lists, −1: not listed. [V]
+        places: index of each pixel of the window, −1: not selected. [h·w]
+        lost: total weight of a pixel that may be omitted
+        offsets: first entry of each selected pixel. [P], or [0] to count only
+        counts: out, number of entries of each selected pixel. [P]
+        rows: out, index of each entry's splat. [E]
+        weights: out, αT of each entry. [E]
+    """
+    thread = wp.tid()
+    pixel = pixel_of(thread, window)
+    if pixel[2] < 0:
+        return
+    place = places[pixel[2]]
+    if place < 0:
+        return
+    has_room = offsets.shape[0] > 0
+    first = wp.int64(0)
+    if has_room:
+        first = offsets[place]
+    tile = thread // PIXELS
+    through = float(1.0)
+    spare = float(lost)  # weight that may still be omitted
+    count = wp.int64(0)
+    for index in range(starts[tile], starts[tile + 1]):
+        if through <= spare:
+            break
+        s = members[index]
+        alpha = wp.min(alpha_at(pixel, boxes[s], shapes[s], colors[s][3])[0], ALPHA_LIMIT)
+        if alpha > 0.0:
+            after = through * (1.0 - alpha)
+            if after <= TRANSMITTANCE_LIMIT:
+                break
+            weight = alpha * through
+            through = after
+            row = listed[s]
+            if row >= 0:
+                if 8.0 * weight <= spare:  # at most an eighth of the remaining allowance
+                    spare -= weight
+                else:
+                    if has_room:
+                        rows[int(first + count)] = row
+                        weights[int(first + count)] = weight
+                    count += wp.int64(1)
+    counts[place] = count
+
+
 @dataclass(frozen=True)
 class DeviceTileLists:
     """Splats of a window's tiles, nearest first. Tiles are aligned to the full image, in row-major order."""
@@ -283,14 +340,52 @@ def rasterize(
 def color_map(
     gaussians: ActivatedGaussians, view: RasterView, rows: Tensor, pixels: Tensor | None, lost: float
 ) -> ColorMap:
-    """Return a color map, see `progdf.rasterize.engines.color_map`. No weight is omitted."""
+    """Return a color map, see `progdf.rasterize.engines.color_map`.
+
+    If weights may be omitted, the others are listed once. Otherwise every product draws the splats again.
+    """
     with torch.no_grad():
         splats, info = project(gaussians.each(Tensor.double), view)
     lists = list_tiles(splats, view.crop)
+    if lost > 0.0:
+        listed = torch.full_like(info.visible, -1, dtype=torch.int32)
+        listed[rows] = torch.arange(len(rows), dtype=torch.int32, device=listed.device)
+        return _list_weights(splats, lists, view.crop, listed, len(rows), pixels, lost)
     wanted = is_listed(splats, info, rows)
     return DrawnColors(
         splats, rows, len(gaussians.means), pixels, lambda some: blend(some, lists, view.crop, wanted)[0]
     )
+
+
+def _list_weights(
+    splats: ReferenceSplats, lists: DeviceTileLists, crop: Crop, listed: Tensor, count: int,
+    pixels: Tensor | None, lost: float,
+) -> SparseWeights:  # fmt: skip
+    """List the weights of the Gaussians of a color map.
+
+    Args:
+        listed: index of each Gaussian in the map, −1: not in it. [N] int32
+        count: number of Gaussians in the map
+        pixels, lost: see `progdf.rasterize.engines.color_map`
+    """
+    device = listed.device
+    window = (crop[3] - crop[1], crop[2] - crop[0])
+    size = window if pixels is None else (len(pixels),)
+    area = window[0] * window[1]
+    selected = torch.arange(area, device=device) if pixels is None else pixels.to(device)
+    places = torch.full((area,), -1, dtype=torch.int32, device=device)
+    places[selected] = torch.arange(len(selected), dtype=torch.int32, device=device)
+    inputs = (*splat_arrays(splats), listed[splats.rows], places, lost)
+    counts = torch.zeros(len(selected), dtype=torch.int64, device=device)
+    columns = torch.empty(0, dtype=torch.int32, device=device)
+    weights = torch.empty(0, device=device)
+    _launch(list_weights_kernel, lists, crop, (*inputs, counts[:0], counts, columns, weights))
+    entries = int(counts.sum())
+    offsets = counts.cumsum(0) - counts
+    columns = columns.new_empty(entries)
+    weights = weights.new_empty(entries)
+    _launch(list_weights_kernel, lists, crop, (*inputs, offsets, counts, columns, weights))
+    return sparse_weights(size, count, SortedEntries(counts, columns, weights))
 
 
 def alpha_weights(gaussians: ActivatedGaussians, view: RasterView, mask: Tensor) -> Tensor:
@@ -386,7 +481,7 @@ def _add_slots(sums: Tensor, lists: DeviceTileLists) -> Tensor:
     return torch.segment_reduce(sums, "sum", lengths=lists.counts, unsafe=True)
 
 
-def _launch(kernel: Any, lists: DeviceTileLists, crop: Crop, tensors: Sequence[Tensor]) -> None:
+def _launch(kernel: Any, lists: DeviceTileLists, crop: Crop, tensors: Sequence[Tensor | float]) -> None:
     """Run a kernel on torch's stream, with one block per tile of the window."""
     device = lists.starts.device
     with _launching:

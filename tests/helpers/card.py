@@ -63,9 +63,13 @@ class OnCard(Tensor):
 
 
 class Card(TorchDispatchMode):
-    """Mode in which tensors can be made on CARD. `moved` counts the numbers moved to it and from it."""
+    """Mode in which tensors can be made on CARD.
+
+    `moved` counts the numbers moved to it and from it, `read` the single numbers that the program waits for.
+    """
 
     moved = 0
+    read = 0
 
     def __torch_dispatch__(
         self, function: Any, types: Any, args: Sequence[Any] = (), kwargs: Mapping[str, Any] | None = None
@@ -75,6 +79,8 @@ class Card(TorchDispatchMode):
             sides = {isinstance(some, OnCard) for some in (*args[:2], result) if isinstance(some, Tensor)}
             self.moved += result.numel() if len(sides) == 2 and result.ndim else 0
             return result
+        if function.name().startswith("aten::_local_scalar_dense"):
+            self.read += isinstance(args[0], OnCard)
         return _run(function, args, kwargs or {})
 
 

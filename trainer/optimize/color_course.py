@@ -194,7 +194,7 @@ def solve(
         stage, judge = course.targets[index]
         table = made[index].table
         assert table is not None
-        offsets = member_bands(made[index].offsets.float())
+        offsets = member_bands(made[index].offsets.to(solver.original))
         residuals[stage.strength] = (offsets - solver.map_offsets(model.degree, table))[:, : model.bands]
         known[stage.strength] = offsets, judge.error(offsets)
 

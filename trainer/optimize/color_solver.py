@@ -35,13 +35,15 @@ from progdf.field.baked import MONOMIALS, identity_map
 from progdf.field.grade import map_colors, member_bands
 from progdf.metrics.image import LEVEL, decibels
 from progdf.sh import C0
-from progdf.threads import map_threads, one_thread
+from progdf.threads import one_thread
 from trainer.options import Quality
 from trainer.quality import QUALITIES
 
+from . import color_tensors
 from .color_kernels import add_curvature, add_gradients, apply_blocks, inner_product, invert_blocks
 from .color_model import TIED_RIDGES
 from .color_model import Model as Model
+from .color_tensors import Scalar, add_scaled, at_least_zero, divide, map_views, read_number
 from .color_views import (
     MAX_ERROR_SHARE,
     ColorEvaluator,
@@ -145,6 +147,7 @@ class Solver:
 
     def map_offsets(self, degree: int, table: Tensor) -> Tensor:
         """Return the change of the members by a map, scaled by the mask. [K,3] -> [M,B,3]"""
+        table = table.to(self.sh)
         return self.share[:, None, None] * (map_colors(self.sh, table, max(1, degree)) - self.sh)
 
     def with_mask(self, share: Tensor) -> Solver:
@@ -249,13 +252,7 @@ class Solver:
     ) -> tuple[Tensor, int]:
         """Run conjugate gradients (see `residual`). `look` returns the held-out error of a residual."""
         count = start.shape[1]
-        diagonal = self.held.diagonal() + np.float32(max(ridge, 1e-30))
-        inverse = invert_blocks(self.weights.numpy(), self.asked[:, :count].contiguous().numpy(), diagonal)
-
-        def precondition(descent: Tensor) -> Tensor:
-            preconditioned = torch.empty_like(descent)
-            apply_blocks(inverse, descent.numpy(), preconditioned.numpy())
-            return preconditioned
+        precondition = self._preconditioner(count, max(ridge, 1e-30))
 
         current = start
         gradient = self._gradient(mapped, start, targets, ridge)
@@ -266,11 +263,10 @@ class Solver:
         if look is not None:
             errors[-1] = look(current)
         while taken < steps:
-            step_length = inner_product(gradient.descent, direction) / max(
-                self._curvature(gradient, direction, ridge), 1e-30
-            )
+            decrease = _inner_product(gradient.descent, direction)
+            step_length = divide(decrease, self._curvature(gradient, direction, ridge))
             for fraction in _STEP_FRACTIONS:
-                candidate = torch.add(current, direction, alpha=fraction * step_length)
+                candidate = add_scaled(current, direction, fraction * step_length)
                 next_gradient = self._gradient(mapped, candidate, targets, ridge)
                 if next_gradient.error < gradient.error:
                     break
@@ -280,7 +276,7 @@ class Solver:
                 direction = preconditioned  # the direction was found under other clamps: restart
                 continue
             previous = preconditioned
-            power = inner_product(gradient.descent, preconditioned)
+            power = _inner_product(gradient.descent, preconditioned)
             current = candidate
             gradient = next_gradient
             taken = taken + 1
@@ -293,11 +289,27 @@ class Solver:
                     break
             preconditioned = precondition(gradient.descent)
             beta = (
-                inner_product(gradient.descent, preconditioned) - inner_product(gradient.descent, previous)
+                _inner_product(gradient.descent, preconditioned) - _inner_product(gradient.descent, previous)
             ) / power
-            direction = torch.add(preconditioned, direction, alpha=max(0.0, beta))
+            direction = add_scaled(preconditioned, direction, at_least_zero(beta))
             tell()
         return (current if look is None else best), taken
+
+    def _preconditioner(self, count: int, ridge: float) -> Callable[[Tensor], Tensor]:
+        """Return the product with the inverse blocks of the members' lowest `count` functions."""
+        asked = self.asked[:, :count].contiguous()
+        if not asked.is_cpu:
+            diagonal = self.weights.new_full((len(asked),), ridge)
+            blocks = color_tensors.invert_blocks(self.weights, asked, diagonal)
+            return blocks.matmul
+        inverse = invert_blocks(self.weights.numpy(), asked.numpy(), self.held.diagonal() + np.float32(ridge))
+
+        def precondition(descent: Tensor) -> Tensor:
+            preconditioned = torch.empty_like(descent)
+            apply_blocks(inverse, descent.numpy(), preconditioned.numpy())
+            return preconditioned
+
+        return precondition
 
     @property
     def typical(self) -> float:
@@ -315,31 +327,44 @@ class Solver:
     ) -> _Gradient:
         """Return the gradient and the error at a residual."""
         sh = add_bands(self.sh + mapped, residual)
-        means = self.views[0].members.means.numpy()
-        drawn = torch.empty(len(self.views), len(residual), 3, dtype=torch.bool)
+        means = self.views[0].members.means
+        drawn = torch.empty(len(self.views), len(residual), 3, dtype=torch.bool, device=means.device)
         descent = self._regularize(residual, ridge).neg_()
         all_passed = list[Tensor]()
-        error = -inner_product(residual, descent)
+        error = -_inner_product(residual, descent)
         for block in view_blocks(list(zip(self.views, targets, drawn, strict=True))):
             views = [view for view, _, _ in block]
             items = list(zip(block, shade(views, sh), strict=True))
-            looks = map_threads(lambda item: item[0][0].pull_drawn(item[1], *item[0][1:]), items)
+            looks = map_views(
+                lambda item: item[0][0].pull_drawn(item[1], *item[0][1:]), items, residual.device
+            )
             negative, passed, squared = zip(*looks, strict=True)
             all_passed += passed
             error += sum(squared)
-            centers = camera_centers(views).numpy()
-            add_gradients(means, centers, torch.stack(negative).numpy(), descent.numpy())
-        return _Gradient(descent, error, drawn, all_passed)
+            centers = camera_centers(views)
+            by_color = torch.stack(negative)
+            if means.is_cpu:
+                add_gradients(means.numpy(), centers.numpy(), by_color.numpy(), descent.numpy())
+            else:
+                color_tensors.add_gradients(means, centers, by_color, descent)
+        return _Gradient(descent, read_number(error), drawn, all_passed)
 
-    def _curvature(self, pull: _Gradient, along: Tensor, ridge: float) -> float:
+    def _curvature(self, pull: _Gradient, along: Tensor, ridge: float) -> Scalar:
         """Return the curvature of half the squared error along a direction [M,b,3], with fixed clamps."""
-        curvature = 0.0
+        curvature: Scalar = 0.0
         clamps = list(zip(self.views, pull.drawn, pull.passed, strict=True))
         for block in view_blocks(clamps):
             changes = shade([view for view, _, _ in block], along, 0.0, -math.inf)
             items = list(zip(block, changes, strict=True))
-            curvature += sum(map_threads(lambda item: item[0][0].power(item[1], *item[0][1:]), items))
-        return curvature + inner_product(along, self._regularize(along, ridge))
+            curvature += sum(
+                map_views(lambda item: item[0][0].power(item[1], *item[0][1:]), items, along.device)
+            )
+        return curvature + _inner_product(along, self._regularize(along, ridge))
+
+
+def _inner_product(a: Tensor, b: Tensor) -> Scalar:
+    """Return Σ a · b of two float32 tensors of one shape, summed in float64 on their device."""
+    return inner_product(a, b) if a.is_cpu else color_tensors.inner_product(a, b)
 
 
 def make_solver(views: Sequence[ColorView], original: Tensor, ties: Ties | None = None) -> Solver:
@@ -351,16 +376,20 @@ def make_solver(views: Sequence[ColorView], original: Tensor, ties: Ties | None 
         ties: ties between neighbors, if there are few views
     """
     ones = original.new_ones(len(original), 3)
+    device = original.device
     bands = min(BANDS[-1], views[0].members.sh.shape[1])
-    weights = torch.zeros(len(original), bands, bands)
+    weights = original.new_zeros(len(original), bands, bands, dtype=torch.float32)
     weighed = iterate_views(lambda view: view.map.gradient(view.map.picture(ones) * view.counts)[:, 0], views)
     for view, weight in zip(views, weighed, strict=True):
-        add_curvature(view.basis.numpy(), weight.contiguous().numpy(), weights.numpy())
-    free = torch.ones(len(original), weights.shape[1], dtype=torch.bool)
+        if weights.is_cpu:
+            add_curvature(view.basis.numpy(), weight.contiguous().numpy(), weights.numpy())
+        else:
+            color_tensors.add_curvature(view.basis, weight, weights)
+    free = torch.ones(len(original), weights.shape[1], dtype=torch.bool, device=device)
     scaled_ties = csr_matrix((len(original), len(original)), dtype=np.float32)
     if ties is not None:
         visible_px = torch.stack(
-            map_threads(lambda view: view.map.gradient(view.counts * ones[:1])[:, 0], views)
+            map_views(lambda view: view.map.gradient(view.counts * ones[:1])[:, 0], views, device)
         )
         is_determined = (visible_px > _DETERMINED_PX).sum(dim=0) > 1
         solved = (ties.clear | is_determined) & (weights[:, 0, 0] > 0.0)

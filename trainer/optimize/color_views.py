@@ -26,10 +26,12 @@ from progdf.rasterize.cpu.engine import Array
 from progdf.rasterize.cpu.jit import Number, kernel
 from progdf.rasterize.engines import ColorMap, color_map
 from progdf.sh import C0, basis
-from progdf.threads import map_threads, one_thread
+from progdf.threads import one_thread
 from trainer.views.crops import CropScene
 
+from . import color_tensors
 from .color_kernels import drop_held, keep_drawn, shade_views
+from .color_tensors import Scalar, map_views, read_number
 
 _VIEW_BATCH = 8  # views processed at once; limits the memory for results
 _TILES_PER_SIDE = 6  # tiles along a view's longer side; half of the tiles are held out, as on a checkerboard
@@ -124,7 +126,7 @@ class ColorView:
         """Return this view's pixels of a box. [h,w,3] -> [P,3]"""
         return image.flatten(0, 1)[self.pixels]
 
-    def pull(self, colors: Tensor, target: Tensor) -> tuple[Tensor, Tensor, float]:
+    def pull(self, colors: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Scalar]:
         """Return the negative gradient of half the squared error to a picture.
 
         Clamped channels count only if the gradient moves them back into the range.
@@ -137,20 +139,26 @@ class ColorView:
             gradient by color [M,3]; channels of the pixels that are not clamped [P,3] bool; squared error
         """
         missing = self.map.picture(colors)
+        if not missing.is_cpu:
+            residuals, passed, squared = color_tensors.compare(missing, self.others, target, self.counts)
+            return self.map.gradient(residuals), passed, squared
         passed = torch.empty_like(missing, dtype=torch.bool)
-        squared = _compare(*(x.numpy() for x in (missing, self.others, target, self.counts[:, 0], passed)))
-        return self.map.gradient(missing), passed, squared
+        total = _compare(*(x.numpy() for x in (missing, self.others, target, self.counts[:, 0], passed)))
+        return self.map.gradient(missing), passed, total
 
-    def pull_drawn(self, colors: Tensor, target: Tensor, drawn: Tensor) -> tuple[Tensor, Tensor, float]:
+    def pull_drawn(self, colors: Tensor, target: Tensor, drawn: Tensor) -> tuple[Tensor, Tensor, Scalar]:
         """Return the results of `pull` without the gradient of channels that stay black.
 
         `drawn`: out, the members' channels that the clamp lets through. [M,3] bool
         """
         negative, passed, squared = self.pull(colors, target)
-        drop_held(colors.numpy(), negative.numpy(), drawn.numpy())
+        if colors.is_cpu:
+            drop_held(colors.numpy(), negative.numpy(), drawn.numpy())
+        else:
+            color_tensors.drop_held(colors, negative, drawn)
         return negative, passed, squared
 
-    def power(self, changes: Tensor, drawn: Tensor, passed: Tensor) -> float:
+    def power(self, changes: Tensor, drawn: Tensor, passed: Tensor) -> Scalar:
         """Return the squared change of the pixels by a change of the colors, with fixed clamps.
 
         Args:
@@ -158,16 +166,19 @@ class ColorView:
             drawn: members' channels that the clamp lets through. [M,3] bool
             passed: pixels' channels that the clamps let through. [P,3] bool
         """
+        if not changes.is_cpu:
+            return (self.map.picture(changes * drawn) * passed).square().sum()
         keep_drawn(changes.numpy(), drawn.numpy())
         return float((self.map.picture(changes) * passed).square().sum())
 
-    def error(self, colors: Tensor, target: Tensor, power: float) -> float:
+    def error(self, colors: Tensor, target: Tensor, power: float) -> Scalar:
         """Return the sum of differences to a power, weighted by the members' share. [M,3], [P,3]
 
         Pixels are clamped to 0..1.
         """
         image = self.picture(colors).clamp(0.0, 1.0)
-        return float(((image - target).abs().pow(power) * self.share).sum())
+        total = ((image - target).abs().pow(power) * self.share).sum()
+        return float(total) if total.is_cpu else total
 
     def halves(self) -> tuple[ColorView, ColorView]:
         """Return two views that count the even and the odd tiles of a checkerboard."""
@@ -216,8 +227,11 @@ def shade(views: Sequence[ColorView], sh: Tensor, bias: float = 0.5, lowest: flo
     Returns:
         [V,M,3]
     """
-    means = views[0].members.means.numpy()
-    return torch.from_numpy(shade_views(means, camera_centers(views).numpy(), sh.numpy(), bias, lowest))
+    means = views[0].members.means
+    centers = camera_centers(views)
+    if not means.is_cpu:
+        return color_tensors.shade_views(means, centers, sh, bias, lowest)
+    return torch.from_numpy(shade_views(means.numpy(), centers.numpy(), sh.numpy(), bias, lowest))
 
 
 def camera_centers(views: Sequence[ColorView]) -> Tensor:
@@ -235,7 +249,7 @@ def color_view(crop: CropScene, members: ColorMembers, every: int, index: int) -
     camera = crop.camera
     height, width = crop.size
     place = torch.arange(width) + every // 2 * torch.arange(height)[:, None] + index
-    pixels = (place % every == 0).flatten().nonzero()[:, 0]
+    pixels = (place % every == 0).flatten().nonzero()[:, 0].to(members.means.device)
     weighed = color_map(crop.gaussians, camera, crop.box, crop.rows, crop.engine, pixels, OMITTED_WEIGHT)
     original = crop.original.flatten(0, 1)[pixels]
     counts = torch.ones_like(original[:, :1], dtype=torch.bool)
@@ -252,7 +266,8 @@ def color_views(crops: Sequence[CropScene], original: Tensor, every: int = 1) ->
         every: use one of this many pixels, different ones in each view: 1, 2 or 4
     """
     members = ColorMembers.of(original)
-    return map_threads(lambda i: color_view(crops[i], members, every, i), range(len(crops)))
+    device = original.device
+    return map_views(lambda i: color_view(crops[i], members, every, i), range(len(crops)), device)
 
 
 @dataclass(frozen=True)
@@ -271,7 +286,8 @@ class MapFit:
 
     def picture(self, table: Tensor) -> Tensor:
         """Return the pixels under a map. [K,3] -> [P,3] 0..1"""
-        change = (table - pad(identity_map(1), (0, 0, 0, len(table) - MONOMIALS[1]))).double()
+        identity = pad(identity_map(1), (0, 0, 0, len(table) - MONOMIALS[1]))
+        change = (table - identity.to(table)).double()
         return (self.original + self.design[:, : len(table)] @ change).clamp(0.0, 1.0).float()
 
     @one_thread()
@@ -283,7 +299,8 @@ class MapFit:
         affine map to a constant shift.
         """
         pixels = [image.reshape(-1, 3)[p] for image, p in zip(targets, self.pixels, strict=True)]
-        return identity_map(degree) + self._change(MONOMIALS[degree], torch.cat(pixels)).float()
+        change = self._change(MONOMIALS[degree], torch.cat(pixels)).float()
+        return identity_map(degree).to(change) + change
 
     def _change(self, count: int, target: Tensor) -> Tensor:
         """Return the change of the identity's first `count` coefficients: 1, 4, 10 or 20.
@@ -330,10 +347,11 @@ def fit_maps(views: Sequence[ColorView], share: Tensor, most: int = _MAX_FIT_PIX
         original = view.picture(colors.clamp_min(0.0))[some]
         return view.map.picture(terms)[some], original, members
 
-    covered = map_threads(lambda view: (view.share[:, 0] > _MIN_REGION_WEIGHT).nonzero()[:, 0], views)
+    device = share.device
+    covered = map_views(lambda v: (v.share[:, 0] > _MIN_REGION_WEIGHT).nonzero()[:, 0], views, device)
     stride = max(1, -(-sum(map(len, covered)) // most))
     pixels = [some[::stride].clone() for some in covered]
-    layouts = map_threads(lay_out, range(len(views)))
+    layouts = map_views(lay_out, range(len(views)), device)
     design = torch.cat([one[0] for one in layouts]).double()
     original = torch.cat([one[1] for one in layouts]).double()
     members = torch.stack([one[2] for one in layouts]).sum(dim=0)
@@ -397,7 +415,7 @@ def improve_mask(
         size = pair[1].abs()
         return (view.map.gradient(view.map.picture(size) * view.counts) * size).sum(dim=1)
 
-    def pull(item: tuple[tuple[ColorView, Tensor, Tensor], Tensor]) -> tuple[Tensor, float]:
+    def pull(item: tuple[tuple[ColorView, Tensor, Tensor], Tensor]) -> tuple[Tensor, Scalar]:
         (view, change, target), colors = item
         by_color, _, squared = view.pull(colors, target)
         return (by_color * change).sum(dim=1), squared
@@ -405,15 +423,15 @@ def improve_mask(
     def look(share: Tensor) -> tuple[Tensor, float]:
         sh = original + share[:, None, None] * full
         descent = torch.zeros_like(share)
-        error = 0.0
+        error: Scalar = 0.0
         for block in view_blocks(pairs):
             colors = shade([view for view, _, _ in block], sh)
-            for by_share, squared in map_threads(pull, list(zip(block, colors, strict=True))):
+            for by_share, squared in map_views(pull, list(zip(block, colors, strict=True)), share.device):
                 descent += by_share
                 error += squared
-        return descent, error
+        return descent, read_number(error)
 
-    curvature = torch.stack(map_threads(weigh, pairs)).sum(dim=0)
+    curvature = torch.stack(map_views(weigh, pairs, share.device)).sum(dim=0)
     curvature = curvature + _MASK_RIDGE * curvature.mean() + 1e-12
     descent, error = look(share)
     for _ in range(_MAX_MASK_STEPS):
@@ -449,15 +467,22 @@ class ColorEvaluator:
     def mean(self, offsets: Tensor, power: float) -> float:
         """Return the mean difference to a power, weighted by the members' share of the pixels. [M,B,3]"""
         sh = add_bands(self.views[0].members.sh, offsets)
-        total = 0.0
+        total: Scalar = 0.0
         for block in view_blocks(self._pairs):
             colors = shade([view for view, _ in block], sh)
             items = list(zip(block, colors, strict=True))
-            total += sum(map_threads(lambda item: item[0][0].error(item[1], item[0][1], power), items))
-        return total / max(1.0, 3.0 * sum(float(view.share.sum()) for view in self.views))
+            total += sum(
+                map_views(lambda item: item[0][0].error(item[1], item[0][1], power), items, sh.device)
+            )
+        return read_number(total) / self._weight
+
+    @cached_property
+    def _weight(self) -> float:
+        """Sum of the members' share over the channels of all pixels, at least 1."""
+        return max(1.0, 3.0 * sum(float(view.share.sum()) for view in self.views))
 
 
-def iterate_views(work: Callable[[_A], _B], items: Sequence[_A]) -> Iterator[_B]:
+def iterate_views(work: Callable[[ColorView], _B], views: Sequence[ColorView]) -> Iterator[_B]:
     """Yield the results of `work` in order. Only a batch of results is in memory at once."""
-    for block in view_blocks(items):
-        yield from map_threads(work, block)
+    for block in view_blocks(views):
+        yield from map_views(work, block, block[0].others.device)

@@ -86,7 +86,8 @@ class Recordings:
     def add(self, snapshot: ParameterSnapshot) -> None:
         """Append a recording."""
         release_memory()
-        self.made.append(replace(snapshot, offsets=snapshot.offsets.half().cpu()))
+        table = None if snapshot.table is None else snapshot.table.cpu()
+        self.made.append(replace(snapshot, offsets=snapshot.offsets.half().cpu(), table=table))
 
     def capture_state(self) -> Saved:
         """Save the recordings added since the last call, and return their total number."""
@@ -183,8 +184,7 @@ def optimize_members(
     engine = optimization.engine
     device = engine_device(optimization.engine)
     if engine == "warp":
-        card = torch.cuda.get_device_name(device) if device.type == "cuda" else "the CPU instead of a GPU"
-        log.say(f"warp renders the training steps on {card}")
+        log.say(f"warp renders the training steps on {_device_name(device)}")
     original = pack(scene[members], with_shN=scene.sh_degree > 0).to(device)
     method = METHODS[options.preset]
     still = only_recolors(method.learning_rates(optimization.kind, original.shape[1], 1.0))
@@ -275,11 +275,15 @@ def plan_colors(
         field: quality of the model, and the error that it may have
         carry_on: request for the parts that no picture shows; without effect if there are many views
     """
-    scene = setup.scene
+    few = bool(options.pictures)
+    engine = "cpu" if few else optimization.engine  # ties between neighbors are sparse matrices of scipy
+    device = engine_device(engine)
+    if device.type != "cpu":
+        log.say(f"{engine} weighs the Gaussians, and colors are solved for, on {_device_name(device)}")
+    scene = setup.scene.to(device)
     members = setup.region.members
     count = len(setup.train)
-    original = pack(scene[members], with_shN=scene.sh_degree > 0)
-    few = bool(options.pictures)
+    original = pack(scene[members.to(device)], with_shN=scene.sh_degree > 0)
     stride = 1 if few else pixel_stride(setup)
     max_iterations = iterations(optimization.steps)
     held_out = split_held_out(setup.held_out)[0] if len(edited[1.0]) > count else []
@@ -287,14 +291,14 @@ def plan_colors(
     judging = held_out or setup.train
 
     def draw(views: Sequence[View]) -> list[ColorView]:
-        make = partial(crop_scene, scene, members, background=setup.background)
+        make = partial(crop_scene, scene, members, background=setup.background, engine=engine)
         return color_views(LazySequence(views, lambda v: make(v.camera, v.box)), original, stride)
 
     def judge(pictures: Sequence[Tensor]) -> ColorEvaluator:
-        return ColorEvaluator(aside, boxed_pictures(pictures, judging))
+        return ColorEvaluator(aside, boxed_pictures(pictures, judging, engine))
 
     def target(s: float, pictures: Sequence[Tensor]) -> Target:
-        stage = TargetStage(s, boxed_pictures(pictures, train), 1)
+        stage = TargetStage(s, boxed_pictures(pictures, train, engine), 1)
         return stage, judge(split_held_out(pictures[len(train) :])[0] if held_out else pictures)
 
     def ask(strengths: Sequence[float]) -> list[Target]:
@@ -342,6 +346,11 @@ def plan_colors(
     return ColorPlan(solver.only(model.residual), model, course, decision)
 
 
+def _device_name(device: torch.device) -> str:
+    """Return the name of the GPU for the log."""
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else "the CPU instead of a GPU"
+
+
 def pixel_stride(setup: TrainingSetup) -> int:
     """Return the stride over the views' pixels for the solver, see `color_views`: the largest with enough
     pixels."""
@@ -363,7 +372,7 @@ def _solve(plan: ColorPlan, most_steps: int, folder: StateFolder, log: RunLog) -
     max_stages = len(course.targets) + 1 if course.look is None else MAX_STAGES
     snapshots = _record_snapshots(solve_course, max_stages, state, recordings, None, folder, log)
     strengths, snapshots = course.sort_recordings(snapshots)
-    trajectory = record(snapshots, state.average, strengths)
+    trajectory = record(snapshots, state.average.detach().cpu(), strengths)
     maps = torch.stack([one.table for one in snapshots if one.table is not None])
     step_counts = [int(one.means[STEPS]) for one in snapshots if STEPS in one.means]
     rows = [
@@ -378,7 +387,8 @@ def _solve(plan: ColorPlan, most_steps: int, folder: StateFolder, log: RunLog) -
         "most_steps": most_steps,
         "views": len(solver.views),
     }
-    trajectory = replace(trajectory, maps=maps, bands=model.bands, mask=model.mask)
+    mask = None if model.mask is None else model.mask.cpu()
+    trajectory = replace(trajectory, maps=maps, bands=model.bands, mask=mask)
     if plan.carry_on is not None:
         effort["carry_on"] = plan.carry_on.figures()
     return trajectory, loss_table(rows), effort | model.figures()

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from progdf.errors import ProgdfError
-from progdf.rasterize.engines import ENGINES, get_engine
+from progdf.rasterize.engines import ENGINES, Crop, activate, color_map, get_engine
+from progdf.rasterize.sparse import SparseWeights
 from tests.helpers.drawn import INPUTS, NEEDS_WARP, draw
 from tests.helpers.scenes import orbit_camera, random_gaussians
 
@@ -43,6 +44,25 @@ def test_block_of_threads_adds_up_like_single_threads(monkeypatch: pytest.Monkey
     assert torch.equal(block.image, single.image)
     for name in INPUTS:
         torch.testing.assert_close(block.gradients[name], single.gradients[name], rtol=1e-5, atol=1e-5)
+
+
+@NEEDS_WARP
+@pytest.mark.parametrize("crop", [(0, 0, 64, 48), (5, 7, 50, 41)], ids=["whole", "window"])
+def test_listed_weights_match_the_cpu_engine(crop: Crop) -> None:
+    scene = activate(random_gaussians(600, seed=6, sh_degree=1))
+    camera = orbit_camera(64, 48)
+    rows = torch.arange(100, 500)
+    area = (crop[2] - crop[0]) * (crop[3] - crop[1])
+    for pixels in (None, torch.arange(0, area, 3)):
+        for lost in (1e-9, 0.5 / 255):
+            here = color_map(scene, camera, crop, rows, "cpu", pixels, lost)
+            there = color_map(scene, camera, crop, rows, "warp", pixels, lost)
+            assert isinstance(there, SparseWeights)
+            colors = torch.rand(len(rows), 3)
+            image = here.picture(colors)
+            # the cpu engine rounds weights to 16 bits
+            torch.testing.assert_close(there.picture(colors), image, rtol=0.0, atol=2e-4)
+            torch.testing.assert_close(there.gradient(image), here.gradient(image), rtol=1e-4, atol=5e-4)
 
 
 @NEEDS_WARP

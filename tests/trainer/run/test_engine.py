@@ -18,6 +18,7 @@ from progdf.rasterize.engines import ENGINES, choose_engine, get_engine
 from tests.helpers.card import CARD, Card
 from tests.helpers.drawn import NEEDS_WARP
 from tests.helpers.trained import WHITE, Small, quick_options, small, train, write_bear
+from trainer import resolve as resolution
 from trainer.optimize.losses import Objective, perceptual_loss
 from trainer.optimize.pgs import PgsSettings, PgsState, TargetStage, learning_rates, optimize
 from trainer.options import OptimizeOptions
@@ -25,6 +26,8 @@ from trainer.resolve import resolve, resolve_kind
 from trainer.run import training
 from trainer.views import boxes
 from trainer.views.crops import crop_scene
+
+CPU = torch.device("cpu")
 
 
 @NEEDS_WARP
@@ -68,7 +71,7 @@ def test_auto_engine_is_warp_with_a_gpu_and_warp_else_cpu(
         assert choose_engine("cpu") == "cpu"
 
 
-def test_colors_are_solved_on_the_cpu_for_any_engine(folder: Path) -> None:
+def test_colors_are_solved_on_the_cpu_without_a_gpu(folder: Path) -> None:
     options = resolve(quick_options(folder, "either", part="scarf", engine="warp"))
     assert [resolve_kind(options, kind, 0).engine for kind in ("color", "style")] == ["cpu", "warp"]
 
@@ -95,9 +98,7 @@ def card(monkeypatch: pytest.MonkeyPatch) -> Iterator[Card]:
     monkeypatch.setitem(ENGINES, "warp", ENGINES["reference"])
     get_engine.cache_clear()
     for module in (training, boxes):
-        monkeypatch.setattr(
-            module, "engine_device", lambda name: CARD if name == "warp" else torch.device("cpu")
-        )
+        monkeypatch.setattr(module, "engine_device", lambda name: CARD if name == "warp" else CPU)
     with Card() as made:
         yield made
     get_engine.cache_clear()
@@ -164,3 +165,25 @@ def test_saved_state_is_restored_to_the_gpu(card: Card) -> None:
     assert again.moved.device == again.pictures[0].device == CARD
     assert torch.equal(again.moved.detach().cpu(), state.moved.detach().cpu())
     assert torch.equal(again.second.cpu(), state.second.cpu())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "asked",
+    [{}, {"editor": "grade:exposure=0.7"}, {"editor": "stripes:#20a040"}],
+    ids=["recolor", "grade", "stripes"],
+)
+def test_colors_are_solved_for_on_a_gpu(
+    tmp_path: Path, card: Card, monkeypatch: pytest.MonkeyPatch, asked: dict[str, object]
+) -> None:
+    """Check that no operation mixes devices and that the result matches the CPU."""
+    monkeypatch.setattr(resolution, "engine_device", lambda name: CARD if name == "warp" else CPU)
+    write_bear(tmp_path, 400)
+    asked = {"part": "scarf", "views": 6, "image_size": 40, "threads": 1} | asked
+    there = train(quick_options(tmp_path, "there", engine="warp", **asked))
+    assert "colors are solved for, on" in there.folder.log.read_text()
+    here = train(quick_options(tmp_path, "here", engine="cpu", **asked))
+    assert there.report["edit"]["psnr_to_views"] == pytest.approx(
+        here.report["edit"]["psnr_to_views"], abs=0.05
+    )
+    assert type(there.trajectory.end) is Tensor
