@@ -79,6 +79,17 @@ def stopped_by(event: threading.Event) -> Iterator[None]:
         del _local.stop
 
 
+@contextmanager
+def without_pool() -> Iterator[None]:
+    """Run the kernels of this thread on it alone, so that background work leaves the other cores free."""
+    before = getattr(_local, "is_inner", False)
+    _local.is_inner = True
+    try:
+        yield
+    finally:
+        _local.is_inner = before
+
+
 def run_chunks(kernel: Callable[[int], _T], chunks: int) -> list[_T]:
     """Call `kernel(chunk)` once for each chunk 0, 1, …, on this thread and those of the pool.
 

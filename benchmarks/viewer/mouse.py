@@ -111,7 +111,7 @@ class Mouse:
             return None
         else:
             live = renderer._moving[0]
-        return (live._pyramid or live.begin_pyramid()).result()
+        return (live._fitted or live._pyramid or live.begin_pyramid()).result()
 
     def learn_detail(self) -> None:
         """Orbit the picture and stop, so that the renderer calibrates its level of detail."""
@@ -119,6 +119,7 @@ class Mouse:
             self.turn(1.0)
             self.wait_pyramid()
         self.wait_sharp()
+        self.wait_pyramid()  # the stop begins the fit of the pyramid
 
     def rest(self, seconds: float) -> None:
         """Draw the frames that are due without input, for this long."""

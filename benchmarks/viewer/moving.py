@@ -106,6 +106,7 @@ def measure(
         mouse.grip_picture()
         mouse.turn(TURN_PX)
         mouse.wait_sharp()  # the first stop calibrates the level of detail
+        mouse.wait_pyramid()  # and begins the fit to full pictures
         turning = []
         processor = []
         beside = []

@@ -110,7 +110,12 @@ def film(title: str, scene: Gaussians, views: Sequence[ViewCamera], size: tuple[
         live._finest = live._max_finest
         draw(to_camera(views[0], *small), COARSE_PIXELS)
         draw(to_camera(views[0], *size), 1)
+    if live._fitted is not None:
+        live._fitted.result()
+    draw(to_camera(views[0], *small), COARSE_PIXELS)
+    draw(to_camera(views[0], *size), 1)
     limit = live._max_finest
+    pyramid = live.begin_pyramid().result() if live._pyramid is None else live._pyramid.result()
     last = list[NDArray[np.float32]]()
     means = []
     blocks = []

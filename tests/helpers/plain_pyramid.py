@@ -46,12 +46,12 @@ class Node(NamedTuple):
     colors: Tensor  # [K,3]
 
 
-def plain_tree(gaussians: ActivatedGaussians) -> list[Node]:
-    """Return every node, level by level."""
+def plain_tree(gaussians: ActivatedGaussians, visibility: Tensor | None = None) -> list[Node]:
+    """Return every node, level by level. visibility: see `merge_rows`"""
     count = len(gaussians.means)
     levels = max((count // LEAF).bit_length() - 1, 0)
     lists = [torch.arange(count)]
-    nodes = [merge_rows(gaussians, lists[0])]
+    nodes = [merge_rows(gaussians, lists[0], visibility)]
     for level in range(levels):
         halves = []
         for node, rows in enumerate(lists):
@@ -62,12 +62,12 @@ def plain_tree(gaussians: ActivatedGaussians) -> list[Node]:
             order = rows[means[:, axis].argsort(stable=True)]
             halves += [order[: middle - begin], order[middle - begin :]]
         lists = halves
-        nodes += [merge_rows(gaussians, rows) for rows in lists]
+        nodes += [merge_rows(gaussians, rows, visibility) for rows in lists]
     return nodes
 
 
-def merge_rows(gaussians: ActivatedGaussians, rows: Tensor) -> Node:
-    """Return one Gaussian with the moments of some rows."""
+def merge_rows(gaussians: ActivatedGaussians, rows: Tensor, visibility: Tensor | None = None) -> Node:
+    """Return one Gaussian with the moments of some rows; colors also weighted by visibility [N]."""
     means, quats, scales, opacities, colors = (tensor[rows].double() for tensor in gaussians.tensors)
     weights = opacities * scales.sort(1).values[:, 1:].prod(1)
     weights = torch.where(opacities >= ALPHA_MIN, weights, 0.0)
@@ -80,8 +80,10 @@ def merge_rows(gaussians: ActivatedGaussians, rows: Tensor) -> Node:
     area = float(torch.linalg.eigvalsh(covariance)[1:].clamp_min(0.0).prod().sqrt())
     opacity = float(weights.sum()) / area
     spread = math.sqrt(float(between.trace()))
-    merged = torch.einsum("n,nkc->kc", share, colors)
-    contrast = math.sqrt(float(share @ (colors[:, 0] - merged[0]).square().sum(1)))
+    seen = share if visibility is None else share * visibility[rows].double()
+    seen = seen / seen.sum()
+    merged = torch.einsum("n,nkc->kc", seen, colors)
+    contrast = math.sqrt(float(seen @ (colors[:, 0] - merged[0]).square().sum(1)))
     return Node(
         rows, float(weights.sum()), mean, covariance, spread, contrast, opacity,
         float(opacities[opacities >= ALPHA_MIN].sum()), merged,
@@ -96,10 +98,16 @@ class PlainCut:
         camera: camera of the coarse picture
         limit: largest loss of a node, pixels²
         pixels: fine pixels per coarse pixel along each side
+        gain: factor of the opacity of merged nodes
     """
 
-    def __init__(self, gaussians: ActivatedGaussians, camera: Camera, limit: float, pixels: int) -> None:
-        self._gaussians, self._camera, self._nodes = gaussians, camera, plain_tree(gaussians)
+    def __init__(
+        self, gaussians: ActivatedGaussians, camera: Camera, limit: float, pixels: int, gain: float = 1.0
+    ) -> None:
+        self._gaussians = gaussians
+        self._camera = camera
+        self._nodes = plain_tree(gaussians)
+        self._gain = gain
         self._dilation = DILATION / pixels**2
         self._depths: Tensor | None = None
         coarse = self._cut(0, limit * COARSE_CUT_FACTOR)
@@ -146,7 +154,7 @@ class PlainCut:
             dilated = (values[:, 1:].clamp_min(0.0) + wide[:, None]).prod(1).sqrt()
             dense = torch.maximum(opacity, (own[:, 0] + wide * own[:, 1]) / dilated)
             opacity = torch.where(merged, dense, opacity)
-        opacity = torch.where(merged, opacity.minimum(opacity**DENSITY_EXPONENT), opacity)
+        opacity = torch.where(merged, self._gain * opacity.minimum(opacity**DENSITY_EXPONENT), opacity)
         sizes = (scales**2 + more).clamp_min(0.0).sqrt()
         a, _, c, det0 = covariances(points, quats, scales, view)
         fine = det0 + self._dilation * (a + c) + self._dilation**2

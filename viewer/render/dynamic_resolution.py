@@ -20,9 +20,10 @@ from progdf.gaussians import Gaussians
 from progdf.rasterize import ActivatedGaussians
 from progdf.rasterize.cpu.compilation import compile_elsewhere, is_compiled, mark_compiled
 from progdf.rasterize.cpu.pyramid import Pyramid
+from progdf.rasterize.cpu.pyramid_fit import fit_pyramid
 from progdf.rasterize.screen import fill_screen
 from progdf.sh import C0
-from progdf.threads import StoppedError
+from progdf.threads import StoppedError, stopped_by, without_pool
 from viewer.camera.view_camera import Vec3
 from viewer.gl.scene_textures import SPLATS_PER_ROW, row_runs
 
@@ -222,8 +223,13 @@ class LiveScene:
         self._max_finest = ERROR_LIMITS_PX2[1]  # its largest value, see `measure`
         self._limit = 0.0  # error limit of the last picture in motion, pixels²; 0 if it had all Gaussians
         self._pyramid: Future[Pyramid] | None = None
+        self._fitted: Future[Pyramid] | None = None  # the pyramid fitted to full pictures, until it is in use
+        self._is_fitted = False  # whether the fit of this pyramid has begun
+        self._camera: Camera | None = None  # camera of the last picture in motion
+        self._pixels = COARSE_PIXELS  # window pixels per pixel of the last picture in motion
         # outdated rows of the pyramid: 0 up to date, 1 colors only, 2 more. [N] uint8
         self._outdated = np.zeros(len(scene), np.uint8)
+        self._changed = np.zeros(len(scene), np.uint8)  # the same for rows changed since the fit began
         self._stop = stop or threading.Event()
 
     def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> None:
@@ -235,7 +241,8 @@ class LiveScene:
             for name in names:
                 self._write(scene, name, part)
         lacks = 1 if all(name in SH for name in names) else 2
-        self._outdated[rows] = np.maximum(self._outdated[rows], lacks)
+        for outdated in (self._outdated, self._changed):
+            outdated[rows] = np.maximum(outdated[rows], lacks)
 
     def highlight(self, rows: NDArray[np.int64], highlights: NDArray[np.uint8]) -> None:
         """See `GlRenderer.highlight`."""
@@ -251,6 +258,8 @@ class LiveScene:
     def begin_pyramid(self) -> Future[Pyramid]:
         """Build the pyramid in another thread. Rows changed meanwhile are merged again afterwards."""
         self._outdated[:] = 0
+        self._fitted = None
+        self._is_fitted = False
         self._pyramid = _worker().submit(_build, self.drawn, self._stop)
         return self._pyramid
 
@@ -269,7 +278,9 @@ class LiveScene:
         if not future.done():
             return None
         started = time.perf_counter()
-        pyramid = future.result()
+        self._camera = camera
+        self._pixels = pixels
+        pyramid = self._use_fit() or future.result()
         for lacks in (2, 1):
             rows = np.flatnonzero(self._outdated == lacks)
             if len(rows):
@@ -307,6 +318,28 @@ class LiveScene:
         self._max_finest = (
             min(max(limit, ERROR_LIMITS_PX2[0]), ERROR_LIMITS_PX2[2]) if self._limit else self._max_finest
         )
+        self._begin_fit()
+
+    def _begin_fit(self) -> None:
+        """Fit the pyramid to full pictures in another thread, once, after the first motion has stopped."""
+        future = self._pyramid
+        if self._is_fitted or future is None or not future.done() or self._camera is None:
+            return
+        self._is_fitted = True
+        self._changed[:] = self._outdated
+        self._fitted = _worker().submit(
+            _fit, future.result(), self._camera, self._max_finest, self._pixels, self._stop
+        )
+
+    def _use_fit(self) -> Pyramid | None:
+        """Replace the pyramid by the fitted one as soon as it is finished, and return it."""
+        fitted = self._fitted
+        if fitted is None or not fitted.done():
+            return None
+        self._fitted = None
+        self._pyramid = fitted
+        self._outdated[:] = self._changed
+        return fitted.result()
 
     def _write(self, scene: Gaussians, name: str, part: slice) -> None:
         """Write one attribute of some rows, with their highlights."""
@@ -347,7 +380,9 @@ def warm_up() -> None:
     )
     pyramid = Pyramid(sample)
     pyramid.refresh(np.arange(_SAMPLE), colors_only=False)
-    pyramid.simplify(Camera(torch.eye(4), torch.eye(3), 1, 1), 1)
+    camera = Camera(torch.eye(4), torch.eye(3), 1, 1)
+    pyramid.simplify(camera, 1)
+    fit_pyramid(pyramid, camera, 1.0, 1, COARSE_PIXELS)
     mark_compiled(__name__)
 
 
@@ -363,6 +398,16 @@ def _build(gaussians: ActivatedGaussians, stop: threading.Event) -> Pyramid:
         raise StoppedError
     warm_up()
     return Pyramid(gaussians)
+
+
+def _fit(pyramid: Pyramid, camera: Camera, limit: float, pixels: int, stop: threading.Event) -> Pyramid:
+    """Return the pyramid fitted to full pictures. One thread leaves the others to the window.
+
+    Raises:
+        StoppedError: the scene was released meanwhile.
+    """
+    with stopped_by(stop), without_pool():
+        return fit_pyramid(pyramid, camera, limit, BUDGETS[2], pixels)
 
 
 @cache

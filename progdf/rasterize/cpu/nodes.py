@@ -1,6 +1,7 @@
 """Nodes of the level-of-detail pyramid: their columns, and merging them from their children.
 
-A node is one Gaussian with the moments of its children, weighted by opacity times area.
+A node is one Gaussian with the moments of its children, weighted by opacity times area. Its colors are also
+weighted by the visibility of the children, because hidden ones do not contribute to a picture.
 """
 
 from __future__ import annotations
@@ -46,7 +47,10 @@ This column and all that follow are the upper halves of float32, with errors of 
 CONTRAST = 8
 """Column of the colors' spread, the root of their summed variances, in coefficients of band 0."""
 
-COLORS = 9
+VISIBILITY = 9
+"""Column of the mean visibility of the Gaussians below, weighted by opacity times area."""
+
+COLORS = 10
 """First column of the color coefficients, band by band."""
 
 _OFF_DIAGONAL = 1e-9  # largest sum of squares off the diagonal, as a share of that on it; below 16-bit steps
@@ -64,10 +68,11 @@ class Nodes(NamedTuple):
 
     # means and the columns above: all that a cut reads. [2L-1,8] float32
     means: Array
-    shapes: Array  # 16-bit columns. [2L-1,9+3K] uint16
+    shapes: Array  # 16-bit columns. [2L-1,10+3K] uint16
     quats: Array  # first four 16-bit columns, signed. [2L-1,4] int16
     order: Array  # rows of the scene. [N] int32
     levels: int
+    visibility: Array  # relative visibility of each row in the order, > 0. [N] float32
 
 
 @kernel(contract=True, inline=True)
@@ -138,6 +143,10 @@ def _merge_rows(
         points += np.float64(scene.opacities[nodes.order[first + k]]) if weight > 0.0 else 0.0
         sound = sound and weight > 0.0
     share = 1.0 / max(total, MIN_WEIGHT)
+    visible = 0.0
+    for k in range(last - first):
+        visible += weights[k] * share * nodes.visibility[first + k]
+    seen_share = 1.0 / max(visible, MIN_WEIGHT)
     merged[:] = 0.0
     square = red = green = blue = 0.0
     x = y = z = 0.0
@@ -145,17 +154,19 @@ def _merge_rows(
         weight = weights[k] * share
         if weight > 0.0:
             i = nodes.order[first + k]
-            _add_scaled(np.float32(weight), colors[i], merged)
+            seen = weight * nodes.visibility[first + k] * seen_share
+            _add_scaled(np.float32(seen), colors[i], merged)
             color = vec(colors, i)
-            red += weight * color[0]
-            green += weight * color[1]
-            blue += weight * color[2]
-            square += weight * dot(color, color)
+            red += seen * color[0]
+            green += seen * color[1]
+            blue += seen * color[2]
+            square += seen * dot(color, color)
             mean = vec(scene.means, i)
             x += weight * mean[0]
             y += weight * mean[1]
             z += weight * mean[2]
     base = red, green, blue
+    nodes.shapes[me, VISIBILITY] = _pack(visible)
     _write_colors(me, merged, square - dot(base, base), nodes)
     if not colors_only:
         matrix[:] = 0.0
@@ -182,6 +193,10 @@ def _merge_pair(
     children = 2 * me + 1, 2 * me + 2
     total = np.float64(means[children[0], WEIGHT]) + np.float64(means[children[1], WEIGHT])
     share = 1.0 / max(total, MIN_WEIGHT)
+    visible = 0.0
+    for i in children:
+        visible += np.float64(means[i, WEIGHT]) * share * np.float64(_unpack(shapes[i, VISIBILITY]))
+    seen_share = 1.0 / max(visible, MIN_WEIGHT)
     merged[:] = 0.0
     square = red = green = blue = 0.0
     x = y = z = points = 0.0
@@ -190,23 +205,25 @@ def _merge_pair(
         weight = np.float64(means[i, WEIGHT]) * share
         sound = sound and means[i, DENSITY] > 0.0
         if weight > 0.0:
+            seen = weight * np.float64(_unpack(shapes[i, VISIBILITY])) * seen_share
             for c in range(merged.shape[0]):
-                merged[c] += np.float32(weight) * _unpack(shapes[i, COLORS + c])
+                merged[c] += np.float32(seen) * _unpack(shapes[i, COLORS + c])
             color = (
                 np.float64(_unpack(shapes[i, COLORS])),
                 np.float64(_unpack(shapes[i, COLORS + 1])),
                 np.float64(_unpack(shapes[i, COLORS + 2])),
             )
-            red += weight * color[0]
-            green += weight * color[1]
-            blue += weight * color[2]
-            square += weight * (dot(color, color) + np.float64(_unpack(shapes[i, CONTRAST])) ** 2)
+            red += seen * color[0]
+            green += seen * color[1]
+            blue += seen * color[2]
+            square += seen * (dot(color, color) + np.float64(_unpack(shapes[i, CONTRAST])) ** 2)
             mean = vec(means, i)
             x += weight * mean[0]
             y += weight * mean[1]
             z += weight * mean[2]
             points += np.float64(means[i, POINTS])
     base = red, green, blue
+    nodes.shapes[me, VISIBILITY] = _pack(visible)
     _write_colors(me, merged, square - dot(base, base), nodes)
     if not colors_only:
         matrix[:] = 0.0

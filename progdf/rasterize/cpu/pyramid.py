@@ -1,7 +1,8 @@
 """Level-of-detail pyramid for interactive rendering.
 
 A binary tree over the scene, split at the median of the widest axis down to leaves of 4 to 8 Gaussians. Every
-node is one Gaussian with the moments of its children, weighted by opacity times area.
+node is one Gaussian with the moments of its children, weighted by opacity times area. Its colors are weighted
+by visibility too, and its opacity has a gain. Both are measured in pictures of the scene (pyramid_fit.py).
 
 Cut: a view draws a node if the estimated error of merging it is below a threshold. Otherwise it descends to
 the children, or to the Gaussians of a leaf. The error of a node, in pixels², is
@@ -15,6 +16,8 @@ from the previous frame's.
 
 Dense nodes have an opacity above 1, clamped when blending, which flattens their center.
 
+Gain: Gaussians below a node overlap, so together they cover less than the sum of their areas.
+
 Dilation: at full resolution each Gaussian is dilated by itself, so a node of many small Gaussians is as dense
 as these are together. The dilation of the coarse picture is wider. The surplus is subtracted from the size of
 a Gaussian, and the remainder from its opacity.
@@ -25,6 +28,7 @@ Reference implementation: tests/helpers/plain_pyramid.py.
 from __future__ import annotations
 
 import math
+from copy import copy
 
 import numpy as np
 import torch
@@ -119,10 +123,15 @@ class Pyramid:
 
     Args:
         gaussians: the scene, float32, with SH colors
+
+    Attributes:
+        limit: threshold for a node's error, pixels². The last search ended here
+        finest: smallest threshold of the search, pixels²
+        gain: factor of the opacity of merged nodes, 0 to 1
     """
 
     def __init__(self, gaussians: ActivatedGaussians) -> None:
-        self._gaussians = gaussians
+        self.gaussians = gaussians
         self.scene = Scene(*(tensor.detach().numpy() for tensor in gaussians.tensors))
         count = len(self.scene.means)
         levels = max((count // LEAF).bit_length() - 1, 0)
@@ -131,9 +140,10 @@ class Pyramid:
         shapes = np.zeros((total, COLORS + 3 * self.scene.colors.shape[1]), np.uint16)
         means = np.zeros((total, LOSS + 1), np.float32)
         quats = shapes[:, :SCALES].view(np.int16)
-        self.nodes = Nodes(means, shapes, quats, order, levels)
-        self.limit = 1.0  # threshold for a node's error, pixels²; the last search ended here
-        self.finest = MIN_ERROR_PX2  # smallest threshold of the search, pixels²
+        self.nodes = Nodes(means, shapes, quats, order, levels, np.ones(count, np.float32))
+        self.limit = 1.0
+        self.finest = MIN_ERROR_PX2
+        self.gain = 1.0
         self._places: Array | None = (
             None  # position of each row in the order, computed on first use. [N] int32
         )
@@ -154,6 +164,24 @@ class Pyramid:
             self._merge(level, np.flatnonzero(marks), colors_only)
             marks = marks[0::2] | marks[1::2]
 
+    def weigh_colors(self, visibility: Array) -> Pyramid:
+        """Return a copy of the pyramid whose colors are weighted by visibility.
+
+        Args:
+            visibility: relative visibility of each row of the scene, > 0. [N] float32
+        """
+        other = copy(self)
+        shapes = self.nodes.shapes.copy()
+        other.nodes = self.nodes._replace(
+            means=self.nodes.means.copy(),
+            shapes=shapes,
+            quats=shapes[:, :SCALES].view(np.int16),
+            visibility=visibility[self.nodes.order],
+        )
+        for level in range(self.nodes.levels, -1, -1):
+            other._merge(level, np.arange(1 << level), colors_only=True)
+        return other
+
     def simplify(self, camera: Camera, budget: int, pixels: int = 1) -> ActivatedGaussians:
         """Return the Gaussians to draw in place of the scene while the view changes.
 
@@ -166,14 +194,16 @@ class Pyramid:
         Returns:
             Gaussians with the colors seen by this camera; rgb [M,3]
         """
-        view = make_pinhole(RasterView.of(camera, self._gaussians))
+        view = make_pinhole(RasterView.of(camera, self.gaussians))
         dilation = DILATION / pixels**2
         picks = self.cut(view, budget, dilation)
         out = Scene(*(np.empty((len(picks), width), np.float32) for width in (3, 4, 3, 1, 3)))
 
         def take(begin: int, end: int) -> None:
             scratch = np.empty(16), np.empty(self.scene.colors.shape[1:], np.float32)
-            _resolve_picks(begin, end, picks, self.scene, self.nodes, view, dilation, out, *scratch)
+            _resolve_picks(
+                begin, end, picks, self.scene, self.nodes, view, dilation, self.gain, out, *scratch
+            )
 
         share_gaussians(take, len(picks))
         means, quats, scales, opacities, rgb = map(torch.from_numpy, out)
@@ -437,7 +467,7 @@ def _sum_depths(depths: Array) -> None:
 @kernel(contract=True, cache=True)
 def _resolve_picks(
     begin: int, end: int, picks: Array, scene: Scene, nodes: Nodes, camera: Pinhole, dilation: float,
-    out: Scene, basis: Array, bands: Array,
+    gain: float, out: Scene, basis: Array, bands: Array,
 ) -> None:  # fmt: skip
     """Write the Gaussians to draw for picks begin … end − 1. basis, bands: scratch."""
     eye = camera_center(camera)
@@ -456,7 +486,7 @@ def _resolve_picks(
                 wide = dilation * unit
                 dilated = math.sqrt((longest * longest + wide) * (middle * middle + wide))
                 opacity = max(opacity, (own[WEIGHT] + wide * own[POINTS]) / max(dilated, MIN_WEIGHT))
-            opacity = min(opacity, opacity**DENSITY_EXPONENT)
+            opacity = gain * min(opacity, opacity**DENSITY_EXPONENT)
         else:
             opacity = float(scene.opacities[i])
         # replace the fine dilation by the coarse one: reduce the size as far as possible, then the opacity

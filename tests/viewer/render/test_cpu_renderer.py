@@ -218,6 +218,32 @@ def test_allowed_detail_is_measured_from_full_pictures() -> None:
     assert live._max_finest == dynamic_resolution.ERROR_LIMITS_PX2[2]
 
 
+def test_first_stop_fits_the_pyramid_once_and_keeps_later_changes() -> None:
+    scene = bear(6000).gaussians
+    live, camera = dynamic_resolution.LiveScene(scene), to_camera(first_camera(scene), *SIZE)
+    full = np.full((SIZE[1], SIZE[0], 3), 0.5, np.float32)
+    coarse = full[::2, ::2].copy()
+    plain = live.begin_pyramid().result()
+    small = camera.resize(SIZE[0] // 2, SIZE[1] // 2)
+    live.draw_fewer(lambda fewer: None, small, 2)
+    live.measure(coarse, full)
+    assert live._fitted is not None
+    rows = np.arange(100, 900)
+    scene.sh0[rows] += 0.5
+    scene.means[rows] += 0.01
+    live.update(scene, ("means", "sh0"), rows)
+    fitted = live._fitted.result()
+    live.draw_fewer(lambda fewer: None, small, 2)
+    assert live._pyramid is not None
+    assert live._pyramid.result() is fitted is not plain
+    assert not (fitted.nodes.visibility == 1.0).all()
+    live.measure(coarse, full)
+    assert live._fitted is None, "the fit is made once"
+    merged = [array.copy() for array in fitted.nodes[:2]]
+    fitted.refresh(np.arange(len(scene)), colors_only=False)
+    assert all(map(np.array_equal, merged, fitted.nodes[:2])), "nothing was behind"
+
+
 @pytest.mark.gl
 @pytest.mark.parametrize("draw", ["cpu", "gl"])
 def test_detail_is_measured_only_from_the_same_view(ctx: moderngl.Context, stack: Stack, draw: str) -> None:
