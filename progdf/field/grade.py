@@ -126,6 +126,17 @@ def _map_chunk(sh: Tensor, table: Tensor, degree: int) -> Tensor:
     values, inverse = sphere(math.isqrt(sh.shape[2]) - 1, sh.device)
     colors = sh @ values.T + 0.5
     mapped = map_drawn(colors, table, degree)
+    return _project_colors(sh, colors, mapped, values, inverse)
+
+
+def _project_colors(sh: Tensor, colors: Tensor, mapped: Tensor, values: Tensor, inverse: Tensor) -> Tensor:
+    """Return the coefficients of mapped colors in the directions of `sphere`, see `map_colors`.
+
+    Args:
+        sh: coefficients before. [3,m,B]
+        colors, mapped: colors before and after. [3,m,D]
+        values, inverse: see `sphere`
+    """
     new_sh = sh + (mapped - colors.clamp_min(0.0)) @ inverse.T
     clamped = (colors.amin(dim=2) < 0.0) | (mapped.amin(dim=2) < 0.0)
     clamped_sh = new_sh[clamped]
@@ -149,8 +160,33 @@ def mapped_bands(form: GradeForm, rows: Tensor) -> Tensor:
     """Return the map's change of the members' bands at each knot. [M,14+3K] -> [S,M,3B]"""
     sh = member_bands(rows)
     share = form.share[:, None]
-    changes = [share * (map_colors(sh, at_knot, form.degree) - sh).flatten(1) for at_knot in form.table]
-    return torch.stack(changes)
+    changes = torch.empty(len(form.table), *sh.flatten(1).shape)
+    for part in member_ranges(len(sh)):
+        mapped = map_colors_along(sh[part], form.table, form.degree)
+        changes[:, part] = share[part] * (mapped - sh[part]).flatten(2)
+    return changes
+
+
+def map_colors_along(sh: Tensor, tables: Tensor, degree: int) -> Tensor:
+    """Return `map_colors` by several maps, which share the monomials. [m,B,3], [S,K,3] -> [S,m,B,3]"""
+    bands = sh.shape[1]
+    if bands == 1 or degree == LATTICE:
+        return torch.stack([map_colors(sh, table, degree) for table in tables])
+    identity = identity_map(degree, tables.shape[1]).to(tables)
+    values, inverse = sphere(math.isqrt(bands) - 1, sh.device)
+    channels = sh.movedim(2, 0)
+    colors = channels @ values.T + 0.5
+    limited = colors.clamp(0.0, MAX_COLOR)
+    excess = (colors - MAX_COLOR).clamp_min(0.0)
+    terms = monomials(limited, degree).flatten(1)
+    mapped_sh = []
+    for table in tables:
+        if torch.equal(table, identity):
+            mapped_sh.append(sh)
+            continue
+        mapped = (table.T @ terms).reshape(colors.shape) + excess
+        mapped_sh.append(_project_colors(channels, colors, mapped, values, inverse).movedim(0, 2))
+    return torch.stack(mapped_sh)
 
 
 def bake_grade(form: GradeForm, rows: Tensor, mapped: Tensor | None = None) -> BakedField:
@@ -159,7 +195,7 @@ def bake_grade(form: GradeForm, rows: Tensor, mapped: Tensor | None = None) -> B
     Args:
         form: stored form
         rows: raw values of the members before the edit, packed. [M,14+3K]
-        mapped: result of `mapped_bands`, if already known
+        mapped: result of `mapped_bands`, if already known; it is overwritten, as it may be large
 
     Raises:
         ValueError: the number of Gaussians differs, or they have fewer bands than the residual.
@@ -169,7 +205,7 @@ def bake_grade(form: GradeForm, rows: Tensor, mapped: Tensor | None = None) -> B
         raise ValueError(
             f"grade of {form.members} members does not fit {len(rows)} rows of {rows.shape[1]} numbers"
         )
-    changes = mapped_bands(form, rows) if mapped is None else mapped.clone()
+    changes = mapped_bands(form, rows) if mapped is None else mapped
     if len(form.residual):
         for part in member_ranges(len(rows)):
             changes[:, part, :width] += torch.einsum(

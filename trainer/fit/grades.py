@@ -36,6 +36,7 @@ from progdf.field.trajectory import Trajectory
 from progdf.metrics.image import decibels
 from progdf.threads import map_threads, one_thread
 from trainer.options import FieldOptions
+from trainer.store.progress import release_memory
 
 from .evaluate import Evaluator, sample_members
 from .fit import Fitted, field_evaluator, measure_choice
@@ -83,10 +84,6 @@ class GradePacking:
             coarser=RESIDUAL_STEPS[index],
             bases=(exact, largest),
         )
-
-    def bake(self, form: GradeForm) -> BakedField:
-        """Return the field of a grade of these members."""
-        return bake_grade(form, self.rows, self.mapped)
 
     def plain_field(self, form: GradeForm) -> UnbakedGrade:
         """Return the offsets of a grade of these members."""
@@ -205,8 +202,23 @@ def fit_grades(
         choosing, reporting, weights, options: see `fit_field`
     """
     packing = grade_packing(trajectory, rows, weights)
+    choice, form = _choose_grade(packing, choosing, options)
+    mapped = packing.mapped
+    del packing  # baking needs as much memory as the residual and its bases
+    release_memory()
+    field = bake_grade(form, rows, mapped)
+    del mapped
+    choice = replace(choice, best=replace(choice.best, field=field))
+    return measure_choice(choice, trajectory, reporting)
+
+
+def _choose_grade(
+    packing: GradePacking, choosing: Evaluator, options: FieldOptions
+) -> tuple[FieldChoice, GradeForm]:
+    """Return the choice of `fit_grades`, not baked, and its grade of all members."""
+    trajectory = packing.trajectory
     members, sampled = sample_members(choosing)
-    is_sample = len(members) < len(rows)
+    is_sample = len(members) < len(packing.rows)
     part = packing.take(members) if is_sample else packing
     judge = field_evaluator(part.trajectory, sampled, options)
     scale = PackingScale(part, sampled, judge)
@@ -238,14 +250,13 @@ def fit_grades(
     rank, index = next(at for at, one in zip(steps, tried, strict=True) if one is choice.best)
     everything = field_evaluator(trajectory, choosing, options) if is_sample else judge
     choice = replace(choice, why=choice.why.replace(judge.wanted, everything.wanted))
-    choice = check_on_all(choice, packing, rank, index, everything)
-    return measure_choice(choice, trajectory, reporting)
+    return check_on_all(choice, packing, rank, index, everything)
 
 
 def check_on_all(
     choice: FieldChoice, packing: GradePacking, rank: int, index: int, evaluator: FieldEvaluator
-) -> FieldChoice:
-    """Return a choice with its field for all members, finer or with more bases while it fails on all pixels.
+) -> tuple[FieldChoice, GradeForm]:
+    """Return a choice and its grade of all members, finer or with more bases while it fails on all pixels.
 
     Args:
         choice: the choice by weight
@@ -266,6 +277,5 @@ def check_on_all(
         else:
             rank = rank + 1
         form, excess, to_editor = measure()
-    field = packing.bake(form)
-    best = replace(choice.best, field=field, label=form.label, excess=excess, to_editor=to_editor)
-    return replace(choice, best=best, met=excess <= 1.0)
+    best = replace(choice.best, label=form.label, excess=excess, to_editor=to_editor)
+    return replace(choice, best=best, met=excess <= 1.0), form

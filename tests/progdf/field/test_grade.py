@@ -31,6 +31,7 @@ from progdf.field.grade import (
     fit_grade,
     lattice_form,
     map_colors,
+    map_colors_along,
     mapped_bands,
     member_bands,
     monomials,
@@ -452,3 +453,12 @@ def test_bases_made_one_at_a_time_match_those_made_at_once() -> None:
         expected, expected_largest = residual_bases(course, rank, weights)
         torch.testing.assert_close(exact, expected, atol=1e-5, rtol=0)
         assert largest == pytest.approx(expected_largest)
+
+
+@pytest.mark.parametrize("sh_degree", [0, 2])
+@pytest.mark.parametrize("degree", [1, 3])
+def test_maps_of_all_knots_at_once_match_single_ones(degree: int, sh_degree: int) -> None:
+    sh = member_bands(pack(random_gaussians(300, sh_degree=sh_degree), with_shN=sh_degree > 0))
+    tables = torch.stack([identity_map(degree), some_table(degree, 0.4), some_table(degree)])
+    expected = torch.stack([map_colors(sh, table, degree) for table in tables])
+    assert torch.equal(map_colors_along(sh, tables, degree), expected)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 import trainer.fit.grades
 from progdf.field.baked import GradeForm, identity_map
-from progdf.field.grade import map_colors, member_bands
+from progdf.field.grade import bake_grade, map_colors, member_bands
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import BASE_CHANNELS, pack
 from tests.helpers.trained import WHITE, Small, small
@@ -115,7 +115,8 @@ def test_weighed_packings_have_the_errors_of_drawn_ones(target_psnr: float | Non
     for rank, index in ((0, 0), (1, 0), (1, 20)):
         form = packing.fit(rank, index)
         weighed = scale.candidate(form)
-        drawn = judge.candidate(packing.bake(form), form.label)
+        baked = bake_grade(form, packing.rows, packing.mapped.clone())
+        drawn = judge.candidate(baked, form.label)
         assert weighed.excess == pytest.approx(drawn.excess, rel=0.05, abs=0.02)
         assert weighed.mean == pytest.approx(drawn.mean, abs=0.3)
         assert weighed.field.bytes_per_member == drawn.field.bytes_per_member
@@ -127,7 +128,7 @@ def test_unbaked_grade_has_the_offsets_of_the_baked_one() -> None:
     case = small("body", count=2)
     packing = grade_packing(recolored(case), rows_of(case), torch.ones(len(case.region)))
     form = packing.fit(1, 8)
-    baked = packing.bake(form)
+    baked = bake_grade(form, packing.rows, packing.mapped.clone())
     for s in (0.0, 0.4, 1.0):
         torch.testing.assert_close(
             packing.plain_field(form).offsets(s), baked.offsets(s), atol=1e-5, rtol=1e-5
