@@ -99,6 +99,7 @@ _SIGNATURE = "progdf train"  # start of log.txt, which marks a run folder
 _LOCK_WAIT_S = 1.0  # a window that checks whether a run is locked holds the lock briefly
 
 
+_A = TypeVar("_A")
 _T = TypeVar("_T")
 
 
@@ -279,7 +280,7 @@ def read_views(
             raise ProgdfError(f"{path} is {width}x{height} pixels, its view {expected}; {remedy}")
         return picture
 
-    return stored_pictures(map(read, cameras))
+    return stored_pictures(read, list(cameras))
 
 
 def read_run_cameras(folder: RunFolder, held_out: Iterable[str], origin: Origin) -> list[Camera]:
@@ -343,9 +344,14 @@ class LazySequence(Sequence[_T]):
         return self._make(self._items[index])
 
 
-def stored_pictures(pictures: Iterable[Tensor]) -> LazySequence[Tensor]:
-    """Store pictures of 8-bit files in a quarter of their memory, without loss. [H,W,3] float32 each"""
-    return LazySequence([to_bytes(picture) for picture in pictures], from_bytes)
+def stored_pictures(make: Callable[[_A], Tensor], items: Sequence[_A]) -> LazySequence[Tensor]:
+    """Make the pictures of 8-bit files, and keep them in a quarter of their memory, without loss.
+
+    Args:
+        make: reads or cuts the picture of an item, on the threads of the cpu engine. [H,W,3] float32
+        items: files, cameras or indices
+    """
+    return LazySequence(map_threads(lambda item: to_bytes(make(item)), items), from_bytes)
 
 
 def to_bytes(image: Tensor) -> Tensor:

@@ -10,9 +10,7 @@ from torch import Tensor
 
 from progdf.camera import Camera
 from progdf.rasterize.engines import engine_device
-from trainer.store.run_folder import (
-    stored_pictures,
-)
+from trainer.store.run_folder import stored_pictures
 
 from .crops import CropScene, crop_scene
 from .setup import TrainingSetup
@@ -33,8 +31,11 @@ def boxed_pictures(
 ) -> Sequence[Tensor]:
     """Crop whole pictures to the boxes of their views, on the engine's device. [H,W,3] -> [h,w,3] each"""
     device = engine_device(engine)
-    pairs = zip(pictures, views, strict=False)
-    return stored_pictures(crop(picture, view.box).to(device) for picture, view in pairs)
+
+    def crop_picture(index: int) -> Tensor:
+        return crop(pictures[index], views[index].box).to(device)
+
+    return stored_pictures(crop_picture, range(min(len(pictures), len(views))))
 
 
 def widen_views(setup: TrainingSetup, edited: Pictures) -> TrainingSetup:
