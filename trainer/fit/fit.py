@@ -14,7 +14,7 @@ from progdf.field.baked import GradeForm, NeuralForm
 from progdf.field.choose import MAX_FITTED_SNAPSHOTS, SAMPLES
 from progdf.field.separable import fit_keyframes, keyframe_rows, moving_attributes
 from progdf.field.trajectory import Trajectory
-from progdf.gaussians import BASE_CHANNELS, Gaussians, attribute_slices
+from progdf.gaussians import BASE_CHANNELS, Gaussians, attribute_slices, pack
 from progdf.rasterize import alpha_weights
 from trainer.editors.base import ImageEditor
 from trainer.optimize.retime import select_recordings
@@ -26,6 +26,7 @@ from trainer.views.crops import only_recolors
 from trainer.views.setup import TrainingSetup
 from trainer.views.view import View
 
+from .color_path import find_end_path
 from .evaluate import Evaluator, make_evaluator
 
 THINNING_SHARE = 0.25
@@ -44,7 +45,7 @@ def choose_path(
     in_parts: bool,
     retimed: Callable[[Trajectory], Trajectory],
 ) -> tuple[Trajectory, str]:
-    """Choose the trajectory or its straight line; return it with the reason in words.
+    """Choose the trajectory, its straight line or a path by the colors; return it with the reason in words.
 
     Args:
         trajectory: the recorded trajectory of one target
@@ -57,7 +58,10 @@ def choose_path(
         return retimed(trajectory), "as the parts move"
     line = select_recordings(trajectory, [0, len(trajectory) - 1])
     if editor is None or editor.stages:
-        return line, "straight: the editor makes no picture between the original and the full edit"
+        members = setup.region.members
+        rows = pack(setup.scene[members], with_shN=line.end.shape[1] > BASE_CHANNELS)
+        path = find_end_path(line, rows, visibility(setup.scene, members, setup.train))
+        return path.trajectory, path.reason
     trajectory = retimed(trajectory)
     views = split_held_out(setup.judging)[0][:_PATH_VIEWS]
     half_pictures = {0.5: [editor.edit(view, 0.5) for view in views]}

@@ -184,7 +184,10 @@ def _record(
             trajectory = retimed(trajectory)
         trajectory = fade_in(trajectory)
     cost_text = f"; dB lost without each attribute: {costs}" if costs else ""
-    log.say(f"kept {len(trajectory)} of {count} recordings{cost_text}")
+    if len(trajectory) <= count:
+        log.say(f"kept {len(trajectory)} of {count} recordings{cost_text}")
+    else:
+        log.say(f"{len(trajectory)} recordings, {len(trajectory) - count} of them added{cost_text}")
     if reason:
         log.say(f"between original and edit: {reason}")
     return trajectory, {
