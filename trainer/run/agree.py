@@ -302,14 +302,21 @@ class _PaintingLoop:
         advance: reports progress, in pictures
         approved: a view and its approved picture, the anchor [H,W,3]; None: the first painted view is the
             anchor
+        anchored: called with the first painted view, if it is the anchor
     """
 
     def __init__(
-        self, easel: PaintCache, setup: TrainingSetup, advance: Advance, approved: tuple[View, Tensor] | None
+        self,
+        easel: PaintCache,
+        setup: TrainingSetup,
+        advance: Advance,
+        approved: tuple[View, Tensor] | None,
+        anchored: Callable[[View], None],
     ) -> None:
         self._easel = easel
         self._setup = setup
         self._advance = advance
+        self._anchored = anchored
         self._approved = [] if approved is None else [self._change(*approved)]
         self._first = [] if approved is None else [easel.crop(*approved)]  # the anchor, as a reference
         self.pictures: dict[str, Tensor] = {}
@@ -329,7 +336,9 @@ class _PaintingLoop:
             self.unusable[name] = painted
             return
         self.pictures[name] = self._easel.painter.paste(view, painted.picture)
-        self._first = self._first or [painted.picture]
+        if not self._first:
+            self._first = [painted.picture]
+            self._anchored(view)
 
     def paint_alone(self, views: Sequence[View]) -> None:
         """Paint each view by itself, several at the same time."""
@@ -444,11 +453,15 @@ def agree_views(
         rounds = 1 if follows else 2
     calls = len(views) * (1 + rounds)
     log.say(f"{calls} pictures to paint: {_plan(painter, len(views), anchors, rounds)}")
-    if easel.kept.folder is not None and approved is None:
-        path = easel.kept.folder / ANCHOR / f"{views[0].camera.name}.png"
-        log.say(f"all views follow {path}; to change the edit, paint over that picture and start again")
+
+    def name_anchor(view: View) -> None:
+        """Log the file of the anchor once it exists."""
+        path = None if easel.kept.folder is None else easel.kept.folder / ANCHOR / f"{view.camera.name}.png"
+        if path is not None and path.is_file():
+            log.say(f"all views follow {path}; to change the edit, paint over that picture and start again")
+
     with log.steps("edit", calls) as advance:
-        loop = _PaintingLoop(easel, setup, advance, approved)
+        loop = _PaintingLoop(easel, setup, advance, approved, name_anchor)
         if follows:
             loop.follow(views, anchors)
         elif painter.has_start:
