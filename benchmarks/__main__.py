@@ -53,11 +53,12 @@ BENCHES: dict[str, str] = {
     "pictures": "benchmarks.pictures:tables",
     "spill": "benchmarks.spill:tables",
     "recolors": "benchmarks.colors.recolors:tables",
+    "packing": "benchmarks.colors.packing:tables",
     "exports": "benchmarks.files.exports:tables",
 }
 
 PAGE = (
-    *("training", "field", "order", "gains", "pull-stages", "viewer", "rasterize"),
+    *("training", "field", "packing", "order", "gains", "pull-stages", "viewer", "rasterize"),
     *("warp", "moving", "popping", "painting", "pull-response", "frames", "exports", "hard"),
 )
 """Benchmarks of docs/speed-and-error.md."""

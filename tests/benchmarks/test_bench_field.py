@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 
 from benchmarks import field, training
+from benchmarks.colors import packing
 from benchmarks.field import InOklab
 from benchmarks.layers import gains
 from benchmarks.training import Point, TimedEdit, TrainingTask, save_plot, table, tasks
@@ -118,3 +119,13 @@ def test_gains_benchmark_reports_time_and_difference(monkeypatch: pytest.MonkeyP
     (result,) = gains.tables()
     assert [row[1] for row in result.rows] == ["colors", "colors and SH bands to degree 2"]
     assert all(float(row[2]) > 0.0 and float(row[-1]) <= 1e-6 for row in result.rows)
+
+
+def test_packing_benchmark_reports_equal_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(packing, "MEMBERS", 700)
+    monkeypatch.setattr(packing, "SIDE", 48)
+    monkeypatch.setattr(packing, "PACKINGS", ((0, 0), (1, 8)))
+    (result,) = packing.tables()
+    assert len(result.rows) == 2
+    for row in result.rows:
+        assert float(row[3]) == pytest.approx(float(row[4]), rel=0.05, abs=0.02)

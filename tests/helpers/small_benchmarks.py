@@ -13,7 +13,7 @@ from benchmarks import edits as run_edits
 from benchmarks import field, rasterizer, sliders, table, training
 from benchmarks.ablation import regret, setup
 from benchmarks.analytic_edits import column_warps
-from benchmarks.colors import stages
+from benchmarks.colors import packing, stages
 from benchmarks.files import exports
 from benchmarks.layers import pull_parts
 from benchmarks.motion import trained_motion, warps
@@ -36,6 +36,8 @@ def shrink_benchmarks(patch: pytest.MonkeyPatch) -> None:
     """Make every benchmark take seconds."""
     patch.setattr(table, "_SPIN_S", 0.01)
     patch.setattr(exports, "DEMO_GAUSSIANS", 700)
+    patch.setattr(packing, "MEMBERS", 700)
+    patch.setattr(packing, "SIDE", 48)
     patch.setattr(stages, "OPTIONS", ("--views", "5", "--image-size", "48", "--steps", "24", "--stages", "2"))
     patch.setattr(stages, "compile_kernels", lambda options: None)
     _shrink_training(patch)
