@@ -144,6 +144,9 @@ class PackingScale:
         self._knots = trajectory.s
         self._stages = judge.stages
         self._pictures = [views.counted_pixels(trajectory.at(s)).flatten() for s in self._stages]
+        finished = packing.rows + trajectory.end
+        # a channel below black at the end hides its error
+        self._shown = [crop.still_colors(finished) > 0.0 for crop in views.crops]
         self._course = self._changes(list(packing.course))
 
     def _changes(self, fields: Sequence[Tensor]) -> Tensor:
@@ -154,7 +157,8 @@ class PackingScale:
         def add(i: int) -> None:
             bands = fields[i].view(len(fields[i]), -1, 3)
             if bool(bands.any()):
-                found[i] = self._views.count([crop.change(bands) for crop in self._views.crops])
+                views = zip(self._views.crops, self._shown, strict=True)
+                found[i] = self._views.count([crop.change(bands, shown) for crop, shown in views])
 
         map_threads(add, range(len(fields)))
         return found.flatten(1)

@@ -174,14 +174,23 @@ class CropScene:
         _add_bands(weights.numpy(), rows, BASE_CHANNELS - 3, colors)
         return torch.from_numpy(np.maximum(colors, 0.0, out=colors))
 
-    def change(self, bands: Tensor) -> Tensor:
+    def change(self, bands: Tensor, shown: Tensor | None = None) -> Tensor:
         """Return the change of a still view on the CPU by changes of the members' lowest SH functions.
 
-        It is linear: the limits at black and white are left out. [M,b,3] -> [h,w,3]
+        It is linear: the limits at black and white are left out.
+
+        Args:
+            bands: changes. [M,b,3]
+            shown: channels of the members that can change; None: all. [M,3] bool
+
+        Returns:
+            [h,w,3]
         """
         weights = self._still_weights[:, : bands.shape[1], 0].contiguous()
         colors = np.zeros((len(bands), 3), np.float32)
         _add_bands(weights.numpy(), bands.flatten(1).contiguous().numpy(), 0, colors)
+        if shown is not None:
+            colors *= shown.numpy()
         return self._linear[0].picture(torch.from_numpy(colors))
 
     def visible_members(self, pixels: Tensor) -> Tensor:
