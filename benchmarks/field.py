@@ -20,7 +20,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from progdf.color.oklab import oklab_to_srgb, srgb_to_oklab
 from progdf.compose.composer import Composer
 from progdf.compose.layers import Layer
 from progdf.compose.reference import compose_layers
@@ -38,12 +37,12 @@ from progdf.field.choose import Field
 from progdf.field.grade import bake_grade, band_offsets, fit_grade, map_form, mapped_bands
 from progdf.field.neural_fit import NeuralFit, train_network
 from progdf.field.separable import moving_attributes
-from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices, pack
+from progdf.gaussians import ATTRIBUTES, Gaussians, pack
 from progdf.gdf.file import Gdf
 from progdf.metrics.image import decibels
 from progdf.rasterize import set_threads
-from progdf.sh import C0
 from progdf.threads import threads
+from trainer.evaluate.keyframes import TwoKeyframes
 from trainer.optimize.color_solver import make_solver
 from trainer.optimize.color_views import add_bands
 
@@ -85,29 +84,6 @@ class Form:
     psnrs: tuple[float, ...]  # at `MEASURED`, dB
     seconds: float  # processor time of the fit
     chosen: bool = False  # True for the field that a run ships
-
-
-@dataclass(frozen=True)
-class InOklab:
-    """Two keyframes; colors of band 0 are interpolated in OKLab and all other values linearly."""
-
-    start: Tensor  # packed rows of the original. [M,C]
-    end: Tensor  # offsets at strength 1. [M,C]
-    attributes: tuple[str, ...]
-
-    def offsets(self, s: float) -> Tensor:
-        """Return the offsets at a slider value, see `Field`. [M,C]"""
-        columns = attribute_slices(self.end.shape[1])["sh0"]
-        before = self.start[:, columns] * C0 + 0.5
-        after = before + self.end[:, columns] * C0
-        before_rgb = before.clamp(0.0, 1.0)
-        after_rgb = after.clamp(0.0, 1.0)
-        lab = torch.lerp(srgb_to_oklab(before_rgb), srgb_to_oklab(after_rgb), s)
-        # the part outside the range of a screen is interpolated linearly
-        beyond = torch.lerp(before - before_rgb, after - after_rgb, s)
-        moved = s * self.end
-        moved[:, columns] = (oklab_to_srgb(lab) + beyond - before) / C0
-        return moved
 
 
 def tables(scenes: Sequence[Path] = (), plot: Path | None = None) -> list[Table]:
@@ -179,7 +155,7 @@ def color_forms(name: str, edit: RegretEdit) -> list[Form]:
     began = time.process_time()
     field = fit_keyframes(knots, recording, 2)
     measure("2 keyframes, raw", "2 keyframes, raw", field.bytes_per_member, field, began)
-    straight = InOklab(edit.original, recording[-1], tuple(field.attributes))
+    straight = TwoKeyframes(edit.original, recording[-1], tuple(field.attributes), in_oklab=True)
     measure("2 keyframes, OKLab", "2 keyframes, OKLab", field.bytes_per_member, straight, began)
     views = edit.evaluator(edit.choosing, {})
     for target in TARGETS:

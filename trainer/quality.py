@@ -14,8 +14,8 @@ class QualityLimits:
     """Limits of the steps from a small model of a color edit to larger ones."""
 
     min_gain: float  # share of the squared error that a step must remove, 0 to 1
-    # bytes per dB that a step may cost, as a multiple of those of the step before; a member's bytes grow with
-    # its functions
+    # bytes per dB that a step may cost, as a multiple of those of the whole way from the map alone to the
+    # smaller model; a file's bytes grow with the functions of its members
     max_price_ratio: float
     added_error: float  # share of the edit's own squared error that its packing may add, 0 to 1
 
@@ -39,7 +39,8 @@ class QualityLimits:
 
         Args:
             base, smaller, larger: number of functions per member and PSNR, dB, of three models by size. The
-                step before leads from `base` to `smaller`
+                step before leads from `base`, the map alone, to `smaller`. All files hold the map and a
+                header. The functions are therefore proportional to the bytes that a step adds to a file
         """
         gain = larger[1] - smaller[1]
         gain_before = smaller[1] - base[1]

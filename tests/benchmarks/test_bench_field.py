@@ -6,16 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from benchmarks import field, training
 from benchmarks.colors import packing
-from benchmarks.field import InOklab
 from benchmarks.layers import gains
 from benchmarks.training import Point, TimedEdit, TrainingTask, save_plot, table, tasks
-from progdf.color.oklab import srgb_to_oklab
-from progdf.sh import C0
 from tests.helpers.small_benchmarks import shrink_field
 from trainer.report.plots import LINES
 
@@ -64,22 +60,6 @@ def test_all_field_forms_are_compared_and_the_shipped_form_is_marked(
     assert "–" in steps.without_wall().rows[0]
     with Image.open(tmp_path / "field.png") as picture:
         assert picture.width == 2 * 380
-
-
-def test_oklab_keyframes_match_raw_ends_and_are_straight_between() -> None:
-    rng = torch.Generator().manual_seed(0)
-    start = torch.randn(50, 14, generator=rng)
-    end = torch.randn(50, 14, generator=rng)
-    # float32 through cubes and cube roots, which are steep at black
-    moved = InOklab(start, end, ("sh0",))
-    torch.testing.assert_close(moved.offsets(0.0), torch.zeros_like(end), atol=1e-4, rtol=0)
-    torch.testing.assert_close(moved.offsets(1.0), end, atol=1e-4, rtol=0)
-    gray = torch.full((1, 14), 0.0)
-    blue = torch.zeros(1, 14)
-    blue[0, 11:14] = torch.tensor([-0.3, -0.1, 0.4]) / C0
-    half = 0.5 + C0 * InOklab(gray, blue, ("sh0",)).offsets(0.5)[0, 11:14]
-    ends = srgb_to_oklab(torch.tensor([[0.5, 0.5, 0.5], [0.2, 0.4, 0.9]]))
-    torch.testing.assert_close(srgb_to_oklab(half), ends.mean(dim=0), atol=1e-5, rtol=0)
 
 
 def test_labeled_scenes_are_recolored_and_others_tinted(small: None, tmp_path: Path) -> None:

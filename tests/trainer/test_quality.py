@@ -11,7 +11,7 @@ from tests.helpers.trained import quick_options, train
 from trainer.options import Quality
 from trainer.quality import QUALITIES, QualityLimits
 
-DC = (1.0, 40.0)
+MAP = (0.0, 39.0)
 SMALLER = (3.0, 42.0)  # one function per dB
 
 
@@ -28,10 +28,10 @@ SMALLER = (3.0, 42.0)  # one function per dB
 )
 def test_price_is_limited_by_that_of_the_step_before(quality: Quality, gain: float, too_dear: bool) -> None:
     larger = (5.0, 42.0 + gain)
-    assert QUALITIES[quality].is_too_dear(DC, SMALLER, larger) is too_dear
+    assert QUALITIES[quality].is_too_dear(MAP, SMALLER, larger) is too_dear
 
 
-@pytest.mark.parametrize("base", [(1.0, -math.inf), (3.0, 40.0), (1.0, 42.5)])
+@pytest.mark.parametrize("base", [(0.0, -math.inf), (3.0, 40.0), (0.0, 42.5)])
 def test_step_without_a_step_before_has_no_price(base: tuple[float, float]) -> None:
     assert not QUALITIES["small"].is_too_dear(base, SMALLER, (5.0, 42.001))
 

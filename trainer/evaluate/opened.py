@@ -12,21 +12,22 @@ from torch import Tensor
 
 from progdf.compose.added import extend
 from progdf.errors import ProgdfError
-from progdf.field import BakedField, fit_keyframes
 from progdf.field.trajectory import Trajectory
 from progdf.gdf.file import Gdf, load_gdf
 from progdf.io.json_values import convert_json, decode_json
 from progdf.metrics.slider import Pictures
 from trainer.fit.evaluate import Evaluator
-from trainer.fit.slider_uniformity import equalize_slider
 from trainer.run.finish import load_evaluator
 from trainer.run.record import FinishedRun, render_edited_views, reopen_run
 from trainer.views.setup import TrainingSetup
 
+from .keyframes import TwoKeyframes, closest_keyframes
+
 SLIDER = "slider"
 """Contender: the shipped field."""
 KEYFRAMES = "2 keyframes"
-"""Contender: a straight line to the full edit, with a uniform slider if the run's is uniform."""
+"""Contender: a straight line to the full edit, raw or in OKLab, the closer one, with a uniform slider if the
+run's is uniform (`closest_keyframes`)."""
 FADE = "cross-fade"
 """Contender: a cross-fade in sRGB between the pictures of both ends."""
 
@@ -65,7 +66,7 @@ class OpenedRun:
     evaluator: Evaluator  # its held-out views, with the editor's pictures of them
     gdf: Gdf  # the shipped edit
     trajectory: Trajectory  # the recording, on the shipped slider
-    keyframes: BakedField  # the baseline `KEYFRAMES`
+    keyframes: TwoKeyframes  # the baseline `KEYFRAMES`
 
     def contenders(self) -> dict[str, Pictures]:
         """Return for each contender a function from slider value to the held-out views' boxes."""
@@ -109,14 +110,6 @@ def open_run(root: Path, scene: Path | None = None) -> OpenedRun:
     evaluator = load_evaluator(run.folder, setup, setup.judging, run.trajectory, gdf)
     extended, (gdf,) = extend(run.scene, [gdf])
     setup = replace(setup, scene=extended, region=gdf.region)
-    two_keyframes = _two_keyframes(gdf, setup, figures)
+    is_even = figures.trajectory.slider == "even"
+    two_keyframes = closest_keyframes(gdf.field, setup, evaluator, trajectory.stage_strengths, is_even)
     return OpenedRun(run, report, figures, setup, evaluator, gdf, trajectory, two_keyframes)
-
-
-def _two_keyframes(gdf: Gdf, setup: TrainingSetup, figures: RunFigures) -> BakedField:
-    """Return the straight line to the full edit as a field, with a uniform slider if the run's is uniform."""
-    end = gdf.field.offsets(1.0)
-    straight = fit_keyframes(torch.tensor([0.0, 1.0]), torch.stack([torch.zeros_like(end), end]), 2)
-    if figures.trajectory.slider == "even":
-        return equalize_slider(straight, setup)[0]
-    return straight

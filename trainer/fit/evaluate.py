@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from progdf.field import BakedField
+from progdf.field.choose import Field
 from progdf.gaussians import Gaussians, pack
 from progdf.metrics.image import decibels, edge_weights, ssim
 from progdf.metrics.slider import Pictures
@@ -49,7 +49,7 @@ class Evaluator:
         rows = self.original[:, : offsets.shape[1]] + offsets
         return render_all(self.crops, rows, moving_attributes(offsets))
 
-    def course(self, field: BakedField) -> Pictures:
+    def course(self, field: Field) -> Pictures:
         """Return a function that renders every view at a slider value of a field."""
         return lambda s: self.pictures(field.offsets(s))
 

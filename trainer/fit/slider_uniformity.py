@@ -28,6 +28,7 @@ from progdf.field.baked import (
     interpolate_at,
     remap_slider,
 )
+from progdf.field.choose import Field
 from progdf.gaussians import BASE_CHANNELS, pack
 from trainer.editors import editor_row
 from trainer.editors.base import ImageEditor
@@ -99,9 +100,16 @@ def equalize_slider(
     """
     if isinstance(field.origin, NeuralForm) or not field.attributes:
         return field, identity_remap()
+    remap = equalizing_slider(field, setup, log)
+    return remap_slider(field, remap), remap
+
+
+def equalizing_slider(field: Field, setup: TrainingSetup, log: RunLog | None = None) -> SliderRemap:
+    """Return the remap to a uniform slider of any field that moves something, measured in training views."""
     moving = list(field.attributes)
     small = probe_views(setup, _FIELD_VIEWS, still=not set(moving) & set(GEOMETRY))
-    rows = pack(setup.scene[setup.region.members], with_shN=field.channels > BASE_CHANNELS)
+    channels = field.offsets(1.0).shape[1]
+    rows = pack(setup.scene[setup.region.members], with_shN=channels > BASE_CHANNELS)
 
     def picture_at(s: float) -> Tensor:
         looked()
@@ -114,7 +122,7 @@ def equalize_slider(
         remap, uniformity = equalizing_remap(picture_at)
     if log is not None:
         log.say(f"even slider: the smallest of {STEPS} visible steps is {uniformity:.2f} of the largest")
-    return remap_slider(field, remap), remap
+    return remap
 
 
 def equalizing_remap(seen: Callable[[float], Tensor]) -> tuple[SliderRemap, float]:

@@ -140,7 +140,7 @@ def thin_model(model: Model, solver: Solver, targets: Sequence[Target], steps: i
     thinner = best
     error = min_error
     thinner_size = size
-    base = 1.0, decibels(model.dc_error)
+    base = 0.0, decibels(model.map_error)
     while error * limits.max_error_share <= min_error + len(targets) * spare or limits.is_too_dear(
         base, thinner_size, size
     ):

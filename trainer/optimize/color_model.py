@@ -27,7 +27,7 @@ class Model:
     tried: Sequence[tuple[str, float]]  # name of each candidate, and its PSNR on held-out views, dB
     steps: int  # steps of all candidates
     most_bands: int  # see `choose_model`; 1 if there are few pictures
-    dc_error: float = math.inf  # mean squared error with a residual of DC alone; infinite if not tried
+    map_error: float = math.inf  # mean squared error of the map alone; infinite if not tried
     limits: QualityLimits = BALANCED
     begun: Mapping[float, Tensor] = field(default_factory=dict)  # strength → initial residual. [M,b,3]
 

@@ -37,7 +37,7 @@ from progdf.metrics.image import LEVEL, decibels
 from progdf.sh import C0
 from progdf.threads import one_thread
 from trainer.options import Quality
-from trainer.quality import QUALITIES
+from trainer.quality import QUALITIES, QualityLimits
 
 from . import color_tensors
 from .color_kernels import add_curvature, add_gradients, apply_blocks, inner_product, invert_blocks
@@ -415,6 +415,7 @@ class _ModelSearch:
     targets: Sequence[Tensor]  # finished edit in the solver's views
     most_steps: int  # maximum number of conjugate gradient steps per residual
     few: bool  # True if there are few views
+    limits: QualityLimits  # steps to larger models
     residuals: Sequence[tuple[str, int, float]]  # residuals to try: name, number of functions and ridge
     tried: list[_Candidate] = field(default_factory=list)
     steps: int = 0  # steps of all candidates
@@ -470,13 +471,13 @@ class _ModelSearch:
             for name, bands, held in self.residuals:
                 base = self.attempt(base, f"with a mask and {name}", bands, held)
                 tried.append(base)
-                if not self.few and not LEVEL < base.error < MAX_ERROR_SHARE * errors_without_mask.get(
-                    bands, 0.0
-                ):
+                max_error = self.limits.max_error_share * errors_without_mask.get(bands, 0.0)
+                if not self.few and not LEVEL < base.error < max_error:
                     break
         # size in bytes of a member, with one basis; the degree of the map costs none
         size = (lambda one: one.error) if self.few else (lambda one: 3 * one.bands + (one.mask_hold > 0.0))
-        return _smallest(tried, size, LEVEL)
+        min_error = max(LEVEL, min(one.error for one in tried))
+        return min((one for one in tried if self.limits.max_error_share * one.error <= min_error), key=size)
 
 
 def choose_model(
@@ -500,14 +501,14 @@ def choose_model(
         targets: finished edit in the solver's views
         steps: maximum number of conjugate gradient steps per residual
         most_bands: maximum number of SH functions of a residual: 1, 4 or 9
-        quality: see `QualityLimits`; without effect if there are few pictures
+        quality: see `QualityLimits`
     """
     limits = QUALITIES[quality]
     few = solver.ties is not None
     most_bands = min(most_bands, 1 if few else solver.sh.shape[1])
     sizes = [(f"a residual of {bands}", bands, _RESIDUAL_RIDGE) for bands in BANDS if bands <= most_bands]
     tied_residuals = [(f"a residual held by {hold:g}", 1, hold) for hold in TIED_RIDGES]
-    search = _ModelSearch(*trial, targets, steps, few, tied_residuals if few else sizes)
+    search = _ModelSearch(*trial, targets, steps, few, limits, tied_residuals if few else sizes)
     bases = {degree: search.start(degree, search.solver) for degree in (0, *MONOMIALS)}
     mean_errors = {degree: search.judge.mean(base.offsets, 1.0) for degree, base in bases.items()}
     # A map is a guess for members that no picture shows. There is no map if it makes most visible members
@@ -534,7 +535,6 @@ def choose_model(
         chosen, residual = _solve_whole(solver, best, targets, steps, degrees != (0,))
     mask = (chosen.share * 255.0).round().to(torch.uint8) if best.mask_hold else None
     tried = [(one.name, decibels(one.error)) for one in search.tried]
-    dc_error = min((one.error for one in search.tried if one.bands == 1), default=math.inf)
     model = Model(
         degree=best.degree,
         hold=best.hold,
@@ -544,7 +544,7 @@ def choose_model(
         tried=tried,
         steps=search.steps,
         most_bands=most_bands,
-        dc_error=dc_error,
+        map_error=min(one.error for one in by_degree),
         limits=limits,
     )
     return chosen, model
@@ -584,11 +584,9 @@ def _solve_whole(
     return solver, solver.residual(map_change, start, targets, steps, judge, best.error, best.hold)[0]
 
 
-def _smallest(
-    attempts: Sequence[_Candidate], size: Callable[[_Candidate], float], floor: float = 0.0
-) -> _Candidate:
-    """Return the smallest candidate within 5 % of the smallest error, or of an invisible error."""
-    min_error = max(floor, min(one.error for one in attempts))
+def _smallest(attempts: Sequence[_Candidate], size: Callable[[_Candidate], float]) -> _Candidate:
+    """Return the smallest candidate within 5 % of the smallest error."""
+    min_error = min(one.error for one in attempts)
     return min((one for one in attempts if MAX_ERROR_SHARE * one.error <= min_error), key=size)
 
 
