@@ -55,6 +55,7 @@ BENCHES: dict[str, str] = {
     "recolors": "benchmarks.colors.recolors:tables",
     "packing": "benchmarks.colors.packing:tables",
     "exports": "benchmarks.files.exports:tables",
+    "ideal-editors": "benchmarks.editors.ideal_editors:tables",
 }
 
 PAGE = (

@@ -40,7 +40,7 @@ ORDER = {
     "viewer": "camera gl state jobs render web files widget __init__ pictures ui panel app commands",
     "benchmarks": """__init__ analytic_edits courses table ablation rasterizer training
         recorded_runs viewer colors layers files field edits networks sliders motion pictures spill
-        __main__""",
+        editors __main__""",
 }
 
 MAX_FILES = 14

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import cmath
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -126,25 +127,45 @@ class IdealPainter(WholeViews):
         return share * cmath.exp(2j * math.pi * int(misfit.argmin()) / len(self.choices[0]))
 
 
+Edit = Callable[[View, float], Tensor]
+"""Edited picture of a view at a strength. [H,W,3]"""
+
+
 def hues(case: Small, count: int) -> list[Tensor]:
     """Return each view recolored in `count` hues of one lightness, all around. [K,H,W,3] each"""
-    editors = []
-    for k in range(count):
-        angle = 2 * math.pi * k / count
-        rgb = oklab_to_srgb(torch.tensor([0.62, 0.12 * math.cos(angle), 0.12 * math.sin(angle)]))
-        spec = "recolor:#" + "".join(f"{round(255 * float(channel)):02x}" for channel in rgb.clamp(0, 1))
-        editors.append(make_editor(EditorOptions(spec), case.scene, case.region, case.views))
-    return [torch.stack([editor.edit(view, 1.0) for editor in editors]) for view in case.views]
+    return finished_edits(case, hue_edits(case, count))
 
 
 def phases(case: Small, count: int) -> list[Tensor]:
     """Return each view with level stripes at `count` phases. [K,H,W,3] each"""
+    return finished_edits(case, phase_edits(case, count))
+
+
+def finished_edits(case: Small, edits: Sequence[Edit], strength: float = 1.0) -> list[Tensor]:
+    """Return each view with all edits at a strength. [K,H,W,3] each"""
+    return [torch.stack([edit(view, strength) for edit in edits]) for view in case.views]
+
+
+def hue_edits(case: Small, count: int) -> list[Edit]:
+    """Return the edits of `hues`."""
+    edits: list[Edit] = []
+    for k in range(count):
+        angle = 2 * math.pi * k / count
+        rgb = oklab_to_srgb(torch.tensor([0.62, 0.12 * math.cos(angle), 0.12 * math.sin(angle)]))
+        spec = "recolor:#" + "".join(f"{round(255 * float(channel)):02x}" for channel in rgb.clamp(0, 1))
+        edits.append(make_editor(EditorOptions(spec), case.scene, case.region, case.views).edit)
+    return edits
+
+
+def phase_edits(case: Small, count: int) -> list[Edit]:
+    """Return the edits of `phases`."""
     editor = make_editor(EditorOptions("stripes:#f0f0ff"), case.scene, case.region, case.views)
     assert isinstance(editor, StripesEditor)
     heights = case.scene.means[case.region.members] @ UP
     period = float(torch.quantile(heights, 0.98) - torch.quantile(heights, 0.02)) / STRIPES
     patterns = [0.5 + 0.5 * torch.cos(2 * math.pi * (heights / period + k / count)) for k in range(count)]
-    return [
-        torch.stack([replace(editor, pattern=pattern).edit(view, 0.6) for pattern in patterns])
-        for view in case.views
-    ]
+
+    def edit(view: View, strength: float, pattern: Tensor) -> Tensor:
+        return replace(editor, pattern=pattern).edit(view, 0.6 * strength)
+
+    return [partial(edit, pattern=pattern) for pattern in patterns]

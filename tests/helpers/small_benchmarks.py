@@ -14,6 +14,7 @@ from benchmarks import field, rasterizer, sliders, table, training
 from benchmarks.ablation import regret, setup
 from benchmarks.analytic_edits import column_warps
 from benchmarks.colors import packing, stages
+from benchmarks.editors import ideal_editors
 from benchmarks.files import exports
 from benchmarks.layers import pull_parts
 from benchmarks.motion import trained_motion, warps
@@ -38,11 +39,22 @@ def shrink_benchmarks(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(exports, "DEMO_GAUSSIANS", 700)
     patch.setattr(packing, "MEMBERS", 700)
     patch.setattr(packing, "SIDE", 48)
+    _shrink_editors(patch)
     patch.setattr(stages, "OPTIONS", ("--views", "5", "--image-size", "48", "--steps", "24", "--stages", "2"))
     patch.setattr(stages, "compile_kernels", lambda options: None)
     _shrink_training(patch)
     _shrink_viewer(patch)
     _shrink_rasterizer(patch)
+
+
+def _shrink_editors(patch: pytest.MonkeyPatch) -> None:
+    """Measure one family of edits and one way of calling the model."""
+    patch.setattr(ideal_editors, "WAYS", ideal_editors.WAYS[-2:-1])
+    patch.setattr(ideal_editors, "FAMILIES", {"hue": ideal_editors.FAMILIES["hue"]})
+    patch.setattr(ideal_editors, "GAUSSIANS", 700)
+    patch.setattr(ideal_editors, "VIEWS", 8)
+    patch.setattr(ideal_editors, "SIZE", 40)
+    patch.setattr(ideal_editors, "CHOICES", 3)
 
 
 def shrink_demo(patch: pytest.MonkeyPatch) -> None:
