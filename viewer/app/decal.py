@@ -514,7 +514,7 @@ def _draw_handles(frame: DecalFrame, decal: Decal, pointer: PointerContext) -> N
 def _draw_buttons(decal: Decal, pointer: PointerContext, surfaces: DecalSurfaces) -> tuple[Decal, str]:
     """Draw size, level and buttons at the top of the picture; return the decal and the request."""
     frame = decal.frame
-    if frame is None:
+    if frame is None or pointer.shown.has_tool:  # the options of a tool take the place of the buttons
         return decal, ""
     scale = pointer.ui.scale
     at = (pointer.area.width / 2, 14.0 * scale)

@@ -195,7 +195,7 @@ def _steps(gizmo: Gizmo) -> im_guizmo.Matrix3 | None:
 def _draw_panel(gizmo: Gizmo, pointer: PointerContext) -> tuple[Gizmo, str]:
     """Draw the fields and the buttons at the top of the picture; return the handles and a request."""
     ui = pointer.ui
-    at = ((tools.TOOLBAR_PX + 2 * tools.EDGE_PX) * ui.scale, tools.EDGE_PX * ui.scale)
+    at = (tools.LEFT_PX * ui.scale, tools.EDGE_PX * ui.scale)
     column = _COLUMN_PX * ui.scale
     with plate("placing", at, ui):
         imgui.align_text_to_frame_padding()

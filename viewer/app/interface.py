@@ -294,7 +294,7 @@ def _active_tool(work: Workspace) -> str:
 def draw_pill(
     work: Workspace, pointer: PointerContext, compared: tuple[Labels, bool], foot: float
 ) -> tuple[Workspace, list[Action]]:
-    """Draw the comparison bar, if there is anything to compare.
+    """Draw the comparison bar, if there is anything to compare and nothing else has a bar there.
 
     Args:
         compared: as in `panels`
@@ -304,7 +304,7 @@ def draw_pill(
         The workspace; the requested actions.
     """
     words, original = compared
-    if not (work.view.layers or original or work.view.compare.mode != "off"):
+    if work.transient.has_bar or not (work.view.layers or original or work.view.compare.mode != "off"):
         return work, []
     scale = pointer.ui.scale
     wide = pointer.area.width
@@ -353,7 +353,7 @@ def over_picture(
     bar = timeline_bar.height(work, area, ui) if view.panel else 0.0
     above = replace(area, height=area.height - bar)
     if (line := work.message) is not None:
-        clicked, top = overlay.message(line, above, ui)
+        clicked, top = overlay.message(line, above, tools.LEFT_PX * ui.scale if view.panel else 0.0, ui)
         free = imgui.ImVec2(free.x, top)
         if clicked == "copy":
             imgui.set_clipboard_text(line.details)

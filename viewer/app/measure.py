@@ -18,7 +18,7 @@ _DOT_PX = 4.0  # at 1×
 def is_measuring(work: Workspace) -> bool:
     """Return True if clicks measure: the tool is active and no other one is."""
     view = work.view
-    other = view.select.tool or view.brush.active or view.color_brush.tool
+    other = view.has_tool
     return work.transient.measure is not None and work.transient.gizmo is None and not other
 
 

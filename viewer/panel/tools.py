@@ -52,6 +52,7 @@ from viewer.ui.widgets import (
 
 TOOLBAR_PX = 40.0  # width at 1×
 EDGE_PX = 8.0  # distance from the picture's edges
+LEFT_PX = TOOLBAR_PX + 2 * EDGE_PX  # width that the toolbar takes from the picture
 NARROW_PX = 560.0  # below this picture width the options may cover the axes
 _SIDE_PX = 32.0  # size of a button
 _MIN_PX = 18.0  # minimum size of a button, in a low window
@@ -207,13 +208,12 @@ def draw_options(
         The changed workspace; the y of the bar's lower edge, 0 if there is none.
     """
     view = work.view
-    if isinstance(work.transient.gizmo, Gizmo):  # the panel of the handles is here
+    if work.transient.has_bar and (isinstance(work.transient.gizmo, Gizmo) or not view.has_tool):
         return work, 0.0
-    has_tool = view.select.tool or view.brush.active or view.color_brush.tool
-    measure = None if has_tool else work.transient.measure
-    if not (has_tool or measure or view.painted or view.selection.count or view.selection.hidden):
+    measure = None if view.has_tool else work.transient.measure
+    if not (view.has_tool or measure or view.painted or view.selection.count or view.selection.hidden):
         return work, 0.0
-    left = (TOOLBAR_PX + 2 * EDGE_PX) * ui.scale
+    left = LEFT_PX * ui.scale
     right = area.width - EDGE_PX * ui.scale
     narrow = area.width < NARROW_PX * ui.scale  # a wider picture has room for the bar beside the axes
     bar = _Bar(right - (0.0 if narrow else view_width(view, area, ui)) - EDGE_PX * ui.scale, ui)
@@ -222,7 +222,7 @@ def draw_options(
         imgui.align_text_to_frame_padding()
         if measure is not None:
             _measure_options(measure, view.unit, bar, actions)
-        elif view.color_brush.tool or (view.painted and not has_tool):
+        elif view.color_brush.tool or (view.painted and not view.has_tool):
             view = replace(view, color_brush=_color_options(view, bar, actions))
         elif view.brush.active:
             imgui.text("Paint")

@@ -454,6 +454,11 @@ class Transient:
     examples: tuple[StartFile, ...] = ()  # examples on the start page
 
     @property
+    def has_bar(self) -> bool:
+        """True if what is moved, pulled or placed has its own bar above the picture."""
+        return self.gizmo.placed if isinstance(self.gizmo, Decal) else self.gizmo is not None
+
+    @property
     def covers(self) -> tuple[Cover, ...]:
         """Images to draw over the picture in their views, the most important one first."""
         ghosts = [ghost.cover for ghost in reversed(self.ghosts) if isinstance(ghost, PreviewGhost)]

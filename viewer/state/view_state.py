@@ -195,6 +195,11 @@ class ViewState:
     # true length of a world unit, by which the window shows and reads lengths; files keep world units
     unit: Unit = 1.0
 
+    @property
+    def has_tool(self) -> bool:
+        """True if a tool for selecting or painting is active."""
+        return bool(self.select.tool or self.brush.active or self.color_brush.tool)
+
 
 def on_another_scene(view: ViewState, camera: ViewCamera) -> ViewState:
     """Return a view of another scene from `camera`, with the window's settings of `view`.

@@ -89,17 +89,24 @@ def draw_frame(name: str, frame: Area, area: Area, ui: UiContext) -> None:
     _text(x + pad, y + pad / 2, name, size, PALETTE.text, ui)
 
 
-def message(line: Message, area: Area, ui: UiContext) -> tuple[str, float]:
+def message(line: Message, area: Area, left: float, ui: UiContext) -> tuple[str, float]:
     """Draw a message at the bottom left, wrapped in a narrow window.
+
+    Args:
+        line: the message
+        area: the picture above the timeline
+        left: width that the toolbar takes from it, window pixels
+        ui: fonts and scale
 
     Returns:
         The clicked button ("close", "copy" for the details, "do" for the message's button, or ""), and the
         message's upper edge in window pixels.
     """
     pad = 12.0 * ui.scale
-    widest = min(area.width - 2 * pad, 640.0 * ui.scale)
+    left = max(left, pad)
+    widest = min(area.width - left - pad, 640.0 * ui.scale)
     imgui.set_next_window_size_constraints((0.0, 0.0), (widest, area.height))
-    with plate("message", (pad, area.height - pad), ui, (0.0, 1.0), 12.0):
+    with plate("message", (left, area.height - pad), ui, (0.0, 1.0), 12.0):
         buttons = {}
         if line.details:
             buttons["Copy details"] = "copy"

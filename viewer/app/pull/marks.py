@@ -28,7 +28,6 @@ _CIRCLE_POINTS = 64  # corners of the circle that shows the radius
 _RING_PX = 1.25  # at 1×: width of the ring
 _CUT_PX = 2.5  # at 1×: width of a cut
 _PLATE_PX = 14.0  # at 1×: distance of the buttons from the upper edge of the picture
-_LOWER_PX = 64.0  # the same below the options of a tool or a selection
 _SIDE_PX = 64.0  # at 1×: smallest distance of the bar from the sides of the picture
 _HINT_PX = 430.0  # at 1×: width of the line below the buttons
 _HANDLE_COLOR = (1.0, 0.72, 0.05, 1.0)
@@ -47,14 +46,10 @@ def direction(drag: PullDrag) -> Vec3 | None:
     return drag.normal if imgui.get_io().key_alt else None
 
 
-def draw_bar(pull: Pull, pointer: PointerContext, below: bool) -> tuple[Pull, str]:
-    """Draw the options and buttons of the tool; return the pull and the request, "" for none.
-
-    Args:
-        below: the options of a tool or a selection take the upper edge of the picture
-    """
+def draw_bar(pull: Pull, pointer: PointerContext) -> tuple[Pull, str]:
+    """Draw the options and buttons of the tool; return the pull and the request, "" for none."""
     scale = pointer.ui.scale
-    at = (pointer.area.width / 2, (_LOWER_PX if below else _PLATE_PX) * scale)
+    at = (pointer.area.width / 2, _PLATE_PX * scale)
     request = ""
     with plate("placing", at, pointer.ui, (0.5, 0.0)):
         imgui.align_text_to_frame_padding()

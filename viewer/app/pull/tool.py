@@ -40,7 +40,7 @@ def is_free(work: Workspace) -> bool:
     """Return True if no other tool uses the left button."""
     view = work.view
     picks = work.form_open and work.form.picks
-    return not (view.select.tool or view.brush.active or view.color_brush.tool or picks)
+    return not (view.has_tool or picks)
 
 
 def take_keys(work: Workspace, pointer: PointerContext, keys: Keys) -> tuple[Workspace, Keys]:
@@ -99,8 +99,9 @@ def update(
         is_idle = moved.transform is None and not is_taken
         moved = move_pull(moved, pointer, is_free(work) and is_idle, pressed)
         is_taken = is_taken or pull.drag is not None or (is_free(work) and takes_mouse(moved, pointer))
-    below = bool(work.view.selection.count or work.view.selection.hidden or work.view.painted)
-    moved, request = draw_bar(moved, pointer, below or not is_free(work))
+    if work.view.has_tool:  # its options take the place of the bar
+        return moved, "", is_taken
+    moved, request = draw_bar(moved, pointer)
     return moved, request, is_taken
 
 
