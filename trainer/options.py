@@ -186,6 +186,7 @@ class OptimizeOptions:
     """Gaussians that may be added for new parts, such as a hat, as a share of the region's, 0 to 1."""
     engine: Engine = "auto"
     """Rasterizer for training: cpu, warp (CUDA, extra gpu), or auto."""
+    colors_on_gpu: Fixed[bool] = False  # solve color edits there too: warp was named, see `resolve`
     color_solver: Fixed[bool] = True  # solve color edits over all views at once, if possible
     seed: Fixed[int] = 0  # order of the views
     solver: Fixed[Solver] = "descent"  # set once the kind is known, see `resolve_kind`

@@ -110,6 +110,8 @@ def resolve(options: TrainOptions) -> TrainOptions:
             steps=min(optimize.steps, QUICK_STEPS) if quick else optimize.steps,
             stages=stages,
             engine=cast(Engine, choose_engine(optimize.engine)),
+            # no GPU has solved for colors yet, so auto leaves them on the CPU
+            colors_on_gpu=optimize.engine == "warp",
             slider="even" if optimize.slider == "auto" and has_free_path else optimize.slider,
             seed=options.seed,
         ),
@@ -145,7 +147,8 @@ def resolve_kind(
         grow: maximum number of added rows, as a share of the members; found by a trial run
     """
     optimize = options.optimize
-    has_gpu = engine_device(optimize.engine).type != "cpu"
+    # without a GPU, warp is for tests of the steps only
+    uses_gpu = optimize.colors_on_gpu and engine_device(optimize.engine).type != "cpu"
     # only colors change, and no option needs a descent view by view
     solves_colors = kind == "color" and optimize.color_solver and not optimize.perceptual_weight
     weight = optimize.perceptual_weight
@@ -165,8 +168,7 @@ def resolve_kind(
         sh="on" if optimize.sh == "auto" and kind != "color" else optimize.sh,
         perceptual_weight=PERCEPTUAL_WEIGHT[kind] if weight is None else weight,
         solver="colors" if solves_colors else "descent",
-        # without a GPU, warp is for tests of the steps only
-        engine="cpu" if solves_colors and not has_gpu else optimize.engine,
+        engine="cpu" if solves_colors and not uses_gpu else optimize.engine,
     )
 
 

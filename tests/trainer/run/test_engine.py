@@ -76,6 +76,16 @@ def test_colors_are_solved_on_the_cpu_without_a_gpu(folder: Path) -> None:
     assert [resolve_kind(options, kind, 0).engine for kind in ("color", "style")] == ["cpu", "warp"]
 
 
+@pytest.mark.parametrize(("asked", "chosen"), [("auto", "cpu"), ("warp", "warp")])
+def test_colors_are_solved_on_a_gpu_only_if_warp_is_named(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, asked: str, chosen: str
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(engines, "find_spec", lambda name: object())
+    options = resolve(quick_options(folder, "either", part="scarf", engine=asked))
+    assert [resolve_kind(options, kind, 0).engine for kind in ("color", "style")] == [chosen, "warp"]
+
+
 def test_run_without_warp_is_refused_before_it_begins(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "warp", None)
     monkeypatch.delitem(sys.modules, ENGINES["warp"], raising=False)
