@@ -30,6 +30,9 @@ from tests.helpers.scenes import ball
 from tests.helpers.sizes import PACKAGES, modules
 
 DOCUMENTS = [*PAGES, *(path for path in sorted((ROOT / "docs" / "lab").glob("*.md")) if path not in PAGES)]
+OWN_BENCHMARKS = ("ablate", "sliders", "regret", "training-stages")
+"""Benchmarks with options of their own."""
+
 MAX_README_LINES = 150
 
 
@@ -92,14 +95,14 @@ def test_documented_command_has_its_options(words: list[str]) -> None:
 @pytest.mark.parametrize("words", examples_of("python", "-m", "benchmarks"))
 def test_documented_benchmark_has_its_options(words: list[str]) -> None:
     name = words[3]
-    own_command = name in ("ablate", "sliders", "regret")
+    own_command = name in OWN_BENCHMARKS
     command = f"benchmarks {name}" if own_command else "benchmarks"
     assert {word for word in words if word.startswith("--")} <= mentioned_options(command)
     assert own_command or name == "page" or name in BENCHES
 
 
 def test_documented_benchmark_exists() -> None:
-    known = {*BENCHES, "page", "ablate", "sliders", "regret"}
+    known = {*BENCHES, "page", *OWN_BENCHMARKS}
     for path in DOCUMENTS:
         named = re.findall(r"`python -m benchmarks ([\w-]+)", path.read_text(encoding="utf-8"))
         assert set(named) <= known, path.name
@@ -120,7 +123,8 @@ def test_every_documented_option_exists() -> None:
         "--no-deps",
         "--regenerate-screenshots",
     }
-    known |= mentioned_options("benchmarks") | mentioned_options("benchmarks ablate")
+    for name in ("", *OWN_BENCHMARKS):
+        known |= mentioned_options(f"benchmarks {name}".strip())
     documented = {o for path in DOCUMENTS for o in re.findall(r"`(--[a-z][a-z-]*)", path.read_text())}
     assert documented <= known
 
