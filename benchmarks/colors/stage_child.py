@@ -88,10 +88,11 @@ def main(events: Path, arguments: list[str]) -> int:
     """Run `progdf train` with these arguments and return its exit status."""
     recorder = StageRecorder(events)
     from progdf.__main__ import main as run_command
+    from progdf.formats import scene_file
     from trainer.run import run
     from trainer.store.progress import RunLog
 
-    load = run.load_scene
+    load = scene_file.load_scene
     stage = RunLog.stage
 
     def load_scene(*given: Any, **named: Any) -> Any:
