@@ -17,7 +17,7 @@ from tests.helpers.trained import quick_options, small, train, write_bear
 from trainer import cli
 from trainer.editors import make_editor
 from trainer.editors.painter import PaintRequest, RefusedError
-from trainer.editors.server.calls import Address
+from trainer.editors.server.calls import Address, BusyError
 from trainer.editors.server.editor import ServedEditor, check_served, explain_sending
 from trainer.editors.server.images_api import ImagesApi, check_api
 from trainer.options import EditorOptions, with_values
@@ -133,6 +133,14 @@ def test_dead_server_is_a_one_line_error() -> None:
         url = server.url
     with pytest.raises(ProgdfError, match=r"cannot be reached .*; check --api-url"):
         paint_first(settings_of(url))
+
+
+def test_refused_connection_ends_the_calls_and_a_lost_one_does_not() -> None:
+    address = Address("api", "http://127.0.0.1:8080/v1")
+    lost = OSError("no route to host")
+    assert isinstance(address.unreachable(lost), BusyError)
+    lost.__cause__ = ConnectionRefusedError(111, "Connection refused")
+    assert isinstance(address.unreachable(lost), ProgdfError)
 
 
 def test_refused_picture_is_told_from_a_fault() -> None:

@@ -157,7 +157,7 @@ class Address:
 
         Raises:
             BusyError: the server is busy, does not answer in time or cannot be reached.
-            ProgdfError: the answer is larger than 64 MB.
+            ProgdfError: nothing listens at the address, or the answer is larger than 64 MB.
         """
         url = self.url.rstrip("/") + path
         headers = {"Content-Type": kind} if kind else {}
@@ -174,7 +174,7 @@ class Address:
             reason = getattr(error, "reason", error)
             if isinstance(reason, TimeoutError):
                 raise BusyError(self.slow(timeout)) from error
-            raise BusyError(self.unreachable(reason)) from error
+            raise self.unreachable(reason) from error
         if answer.status in BUSY_STATUSES:
             text = one_line(answer.content[:400].decode("utf-8", "replace"))
             advice = "wait, or use fewer --edit-workers" if answer.status == 429 else "look at its log"
@@ -188,9 +188,16 @@ class Address:
         """Return the error of a call that takes too long."""
         return self.fault(f"does not answer within {timeout:g} seconds; allow more with --edit-timeout")
 
-    def unreachable(self, reason: object) -> ProgdfError:
-        """Return the error of a call without a connection."""
-        return self.fault(f"cannot be reached ({one_line(reason)}); check --api-url")
+    def unreachable(self, reason: object) -> ProgdfError | BusyError:
+        """Return the error of a call without a connection.
+
+        A machine that refuses the connection has no server at this address, so waiting is of no use.
+        """
+        fault = self.fault(f"cannot be reached ({one_line(reason)}); check --api-url")
+        cause = reason if isinstance(reason, BaseException) else None
+        while cause is not None and not isinstance(cause, ConnectionRefusedError):
+            cause = cause.__cause__
+        return BusyError(fault) if cause is None else fault
 
     def read_picture(self, content: bytes, size: tuple[int, int]) -> Tensor:
         """Return a picture of the server at a width and height, whose proportions it must have. [H,W,3]

@@ -114,7 +114,7 @@ class ImagesApi:
             except openai.APITimeoutError as error:
                 raise BusyError(self.address.slow(self.timeout)) from error
             except (openai.APIConnectionError, openai.OpenAIError) as error:
-                raise BusyError(self.address.unreachable(error.__cause__ or error)) from error
+                raise self.address.unreachable(error.__cause__ or error) from error
             except ValueError as error:  # not JSON
                 raise self.address.fault(
                     f"gave no valid answer ({one_line(error)}); check --api-url"
