@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import base64
+import contextlib
+import os
 import re
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +17,7 @@ from PIL import Image
 
 from progdf.errors import ProgdfError
 from tests.helpers.image_server import Answer, Call, Refusal, image_server, png, swap_colors
-from tests.helpers.trained import quick_options, small, train, write_bear
+from tests.helpers.trained import LABELS, quick_options, small, train, write_bear
 from trainer import cli
 from trainer.editors import make_editor
 from trainer.editors.painter import PaintRequest, RefusedError
@@ -293,3 +297,41 @@ def test_run_leaves_refused_views_out_and_pays_for_no_picture_twice(tmp_path: Pa
         again = train(options)
         assert again.gdf.read_bytes() == gdf
         assert len(server.calls) == calls + 2, "only the refused picture is asked for again, twice"
+
+
+@pytest.mark.slow
+def test_key_is_in_no_file_no_output_and_no_list_of_processes(tmp_path: Path) -> None:
+    write_bear(tmp_path)
+    key = "sk-secret"
+    listed = []
+
+    def model(call: Call, number: int) -> Answer:
+        assert call.key == f"Bearer {key}"
+        for path in Path("/proc").glob("[0-9]*/cmdline"):
+            with contextlib.suppress(OSError):  # the process has ended
+                listed.append(path.read_bytes())
+        return swap_colors(call.pictures[0])
+
+    with image_server(model) as server:
+        words = [
+            sys.executable,
+            "-m",
+            "progdf",
+            "train",
+            str(tmp_path / "scene.ply"),
+            "-o",
+            str(tmp_path / "run"),
+        ]
+        words += ["--region", f"labels:{tmp_path / 'labels.npy'}:{LABELS.index('body')}", "--editor", MARBLE]
+        words += ["--model", "marble-1", "--api-url", server.url, "--edit-size", "64", "--kind", "color"]
+        words += ["--views", "4", "--image-size", "56", "--steps", "48", "--threads", "1"]
+        home = {"HOME": str(tmp_path / "home"), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+        environment = {**os.environ, **home, "OPENAI_API_KEY": key}
+        ended = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
+    assert key not in ended.stdout + ended.stderr
+    files = [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert (tmp_path / "run" / "report.json") in files
+    assert not [path for path in files if key.encode() in path.read_bytes()]
+    assert server.calls
+    assert not any(key.encode() in line for line in listed)
