@@ -337,9 +337,10 @@ class LiveScene:
         if fitted is None or not fitted.done():
             return None
         self._fitted = None
+        pyramid = fitted.result()  # after an error the first pyramid stays in use
         self._pyramid = fitted
         self._outdated[:] = self._changed
-        return fitted.result()
+        return pyramid
 
     def _write(self, scene: Gaussians, name: str, part: slice) -> None:
         """Write one attribute of some rows, with their highlights."""

@@ -244,6 +244,26 @@ def test_first_stop_fits_the_pyramid_once_and_keeps_later_changes() -> None:
     assert all(map(np.array_equal, merged, fitted.nodes[:2])), "nothing was behind"
 
 
+def test_failed_fit_is_reported_once_and_the_first_pyramid_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise ValueError("a camera of no size")
+
+    scene = bear(3000).gaussians
+    live, camera = dynamic_resolution.LiveScene(scene), to_camera(first_camera(scene), *SIZE)
+    plain = live.begin_pyramid().result()
+    monkeypatch.setattr(dynamic_resolution, "fit_pyramid", fail)
+    live.draw_fewer(lambda fewer: None, camera, 2)
+    full = np.full((SIZE[1], SIZE[0], 3), 0.5, np.float32)
+    live.measure(full[::2, ::2].copy(), full)
+    assert live._fitted is not None
+    assert live._fitted.exception() is not None
+    with pytest.raises(ValueError, match="a camera of no size"):
+        live.draw_fewer(lambda fewer: None, camera, 2)
+    assert live.draw_fewer(lambda fewer: True, camera, 2)
+    assert live._pyramid is not None
+    assert live._pyramid.result() is plain
+
+
 @pytest.mark.gl
 @pytest.mark.parametrize("draw", ["cpu", "gl"])
 def test_detail_is_measured_only_from_the_same_view(ctx: moderngl.Context, stack: Stack, draw: str) -> None:
