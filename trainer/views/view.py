@@ -15,7 +15,8 @@ from progdf.camera import Camera, intrinsics, look_at
 from progdf.gaussians import Gaussians
 from progdf.io.picture_files import name_twin, view_name
 from progdf.rasterize import Crop, activate, render
-from progdf.rasterize.engines import ColorMap, color_map
+from progdf.rasterize.cpu.engine import rasterize_part
+from progdf.rasterize.engines import ColorMap, RasterView, color_map
 from progdf.region import Region
 from progdf.scene.bounds import is_surrounding, near_plane, quantile, scene_sphere
 from progdf.scene.orbit_rig import orbit_rig
@@ -125,14 +126,12 @@ def continue_colors(colors: Tensor, weights: Tensor) -> Tensor:
 
 def make_view(scene: Gaussians, region: Region, camera: Camera, background: Tensor) -> View:
     """Render the original view and the region's share of it."""
-    colors = seen_colors(scene, camera)
-    member = torch.zeros(len(scene), 1)
-    member[region.members] = 1.0
-    black = torch.zeros(3)
-    image = render_colors(scene, colors, camera, background).clamp(0.0, 1.0)
-    mask = render_colors(scene, member.expand(-1, 3).contiguous(), camera, black)[..., 0].clamp(0.0, 1.0)
-    inside = render_colors(scene, colors * member, camera, black) / mask.clamp_min(1e-4)[..., None]
-    return View(camera, image, mask, inside.clamp(0.0, 1.0), region_box(mask))
+    gaussians = activate(scene)
+    view = RasterView.of(camera, gaussians)
+    image, share, part = rasterize_part(gaussians, view, background, region.members)
+    mask = share.clamp(0.0, 1.0)
+    inside = (part / mask.clamp_min(1e-4)[..., None]).clamp(0.0, 1.0)
+    return View(camera, image.clamp(0.0, 1.0), mask, inside, region_box(mask))
 
 
 def seen_colors(scene: Gaussians, camera: Camera) -> Tensor:

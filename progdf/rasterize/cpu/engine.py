@@ -75,6 +75,43 @@ def rasterize(
     return image, transmittance, RasterInfo(*map(torch.from_numpy, projected))
 
 
+def rasterize_part(
+    gaussians: ActivatedGaussians, view: RasterView, background: Tensor, rows: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Draw a view, and some Gaussians' part of it, without gradients and after one projection.
+
+    Args:
+        gaussians: the whole scene
+        view: the camera
+        background: rgb behind everything. [3]
+        rows: the Gaussians of the part. [M] int64
+
+    Returns:
+        The image, with the bits of `rasterize`; the weight of the part, Σ αT over its Gaussians; and their
+        contribution to the image, Σ αT·color. [H,W,3], [H,W], [H,W,3]
+    """
+    camera = make_pinhole(view)
+    arrays = [to_float32(tensor).detach().numpy() for tensor in gaussians.tensors]
+    if camera.degree < 0:
+        arrays[4] = arrays[4].reshape(-1, 1, 3)
+    splats, lists = _project_and_bin(Scene(*arrays), camera, with_slots=False)
+
+    def draw(behind: Array) -> Array:
+        out = _new_picture(camera, with_last=False)
+        share_tiles(blend, camera, splats, lists, camera, behind, out, out.last)
+        return out.image
+
+    image = draw(to_float32(background).numpy())
+    black = np.zeros(3, np.float32)
+    is_part = np.zeros(len(arrays[0]), np.bool_)
+    is_part[rows.numpy()] = True
+    splats.colors[~is_part, :3] = 0.0
+    part = draw(black)
+    splats.colors[is_part, :3] = 1.0
+    share = draw(black)[..., 0]
+    return torch.from_numpy(image), torch.from_numpy(share), torch.from_numpy(part)
+
+
 def make_pinhole(view: RasterView) -> Pinhole:
     """Convert a view to the kernels' form."""
     rotation = view.viewmat.tolist()

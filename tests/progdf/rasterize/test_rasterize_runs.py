@@ -12,7 +12,10 @@ import torch
 
 from progdf.errors import ProgdfError
 from progdf.rasterize import ActivatedGaussians, activate, alpha_weights, render, set_threads
+from progdf.rasterize.cpu.engine import rasterize_part
 from progdf.rasterize.cpu.forward import depth_order
+from progdf.rasterize.engines import RasterView
+from progdf.sh import shade
 from tests.helpers.drawn import FAST, INPUTS, Drawn, draw
 from tests.helpers.scenes import front_camera, one_gaussian, orbit_camera, random_gaussians
 
@@ -33,6 +36,24 @@ def test_bits_do_not_depend_on_run_threads_or_tile_memory(room: int, monkeypatch
         assert torch.equal(again.image, first.image)
         for name in INPUTS:
             assert torch.equal(again.gradients[name], first.gradients[name]), name
+
+
+@pytest.mark.parametrize("bands", [0, 3])
+def test_part_of_a_picture_is_drawn_as_by_single_pictures(bands: int) -> None:
+    scene, camera = random_gaussians(500, seed=8, sh_degree=bands), orbit_camera(96, 48)
+    rows = torch.arange(3, 500, 4)
+    background = torch.tensor([0.2, 0.9, 0.4])
+    activated = activate(scene)
+    image, share, part = rasterize_part(activated, RasterView.of(camera, activated), background, rows)
+    assert torch.equal(image, render(scene, camera, background).image)
+    member = torch.zeros(500, 1)
+    member[rows] = 1.0
+    directions = torch.nn.functional.normalize(scene.means - camera.position, dim=1)
+    colors = shade(bands, directions, scene.sh)
+    plain_share = render(scene, camera, torch.zeros(3), colors=member.expand(-1, 3)).image[..., 0]
+    assert torch.equal(share, plain_share)
+    plain_part = render(scene, camera, torch.zeros(3), colors=colors * member).image
+    assert torch.allclose(part, plain_part, atol=1e-6)
 
 
 @pytest.mark.parametrize("engine", FAST)
