@@ -182,7 +182,7 @@ class RegretEdit:
         between = StrengthSource(edit, look)
         with TemporaryDirectory() as folder, closing(RunLog(Path(folder) / "log.txt", quiet=True)) as log:
             options = (
-                OptimizeOptions(),
+                OptimizeOptions(engine="cpu"),
                 self.setup,
                 finished,
                 between,
