@@ -39,6 +39,7 @@ from progdf.io.atomic import atomic_write
 from progdf.io.json_values import decode_json
 from progdf.scene.regions import parse_region
 from progdf.terminal import group_digits, print_line
+from trainer.options import MAX_THREADS, check_ranges
 
 from ..table import BUSY, Table, Wall, busy_share, put_tables, today
 from .stage_child import OTHER
@@ -151,6 +152,7 @@ def measure_stages(options: StageOptions) -> list[Table]:
     Raises:
         ProgdfError: a scene, region or folder does not fit, or a training fails.
     """
+    check_stage_options(options)
     for page in options.markdown:
         if not page.is_file():
             raise ProgdfError(f"{page} does not exist; check the name and the folder")
@@ -186,6 +188,21 @@ def measure_stages(options: StageOptions) -> list[Table]:
         with atomic_write(page) as temporary_file:
             temporary_file.write_text(filled, encoding="utf-8")
     return tables
+
+
+def check_stage_options(options: StageOptions) -> None:
+    """Check the lists of numbers.
+
+    Raises:
+        ProgdfError: a list is empty, or a number is out of range.
+    """
+    for name in ("scene", "region", "members", "threads"):
+        if not getattr(options, name):
+            raise ProgdfError(f"--{name} has no value; give at least one")
+    for count in options.members:
+        if count < 0:
+            raise ProgdfError(f"--members must be 0 (all) or more, got {count}")
+    check_ranges(*(("--threads", count, 1, MAX_THREADS) for count in options.threads))
 
 
 def list_edits(options: StageOptions) -> list[Edit]:

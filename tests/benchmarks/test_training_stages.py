@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -69,6 +70,24 @@ def test_scenes_with_the_same_name_are_refused() -> None:
     options = StageOptions((Path("a.ply"), Path("b/a.ply")), Path("o"))
     with pytest.raises(ProgdfError, match="same name"):
         list_edits(options)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--members", "-5"), "--members must be 0 (all) or more, got -5"),
+        (("--threads", "0"), "--threads must be between 1 and 1024, got 0"),
+        (("--threads", "1", "-2"), "--threads must be between 1 and 1024, got -2"),
+        (("--threads",), "--threads has no value"),
+    ],
+)
+def test_number_out_of_range_is_refused_before_a_folder_is_made(
+    words: tuple[str, ...], said: str, tmp_path: Path
+) -> None:
+    out = tmp_path / "measured"
+    with pytest.raises(ProgdfError, match=re.escape(said)):
+        main(["training-stages", "--scene", "a.ply", "--out", str(out), *words])
+    assert not out.exists()
 
 
 def test_folder_without_the_project_is_refused(tmp_path: Path) -> None:
