@@ -467,7 +467,6 @@ def _read_tables(path: Path, text: bytes) -> Tables:
 
 def _explain(text: str) -> str:
     """Return an error of `convert_json` in terms of glTF, without those of Python or JSON schemas."""
-    missing = re.fullmatch(r"(.*): object missing required field (\w+)", text)
-    if missing is not None:
-        return f"{missing[1]} has no {missing[2]}"
+    if text.endswith(" is missing"):
+        return text
     return re.sub(r", expected .*|: [^:]*$", ", which glTF does not allow", escape_text(text), count=1)

@@ -152,8 +152,13 @@ def _explain(text: str, value: Any) -> str:
         value = value[name or int(index)]
     text = re.sub(r"str matching regex '\^(\(.*\)).*'", r"one of \1", text[0].lower() + text[1:])
     text = text.replace("float that's a multiple of 1.0", "a whole number")
+    missing = re.fullmatch(r"object missing required field (\S+)", text)
+    if missing is not None:
+        return f"{f'{where}.{missing[1]}'.removeprefix('.')} is missing"
     at = where.removeprefix(".") or "it"
-    return f"{at} is {value!r:.40}, {text}" if text.startswith("expected") else f"{at}: {text}"
+    if "[...]" in where or not text.startswith("expected"):  # [...] is an entry that msgspec does not name
+        return f"{at}: {text}"
+    return f"{at} is {value!r:.40}, {text}"
 
 
 def _refuse_unknown(value: Any, known: Any, at: str) -> None:

@@ -7,11 +7,12 @@ the surroundings, which have no levels. Tiles are read one by one, so that only 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -52,7 +53,7 @@ class _Node(msgspec.Struct):
 class _Index(msgspec.Struct):
     """Fields of lod-meta.json that are read."""
 
-    lodLevels: int
+    lodLevels: Annotated[int, msgspec.Meta(ge=1)]
     filenames: list[str]
     tree: _Node
     environment: str | None = None
@@ -112,7 +113,7 @@ def read_sog_tree(path: Path) -> SogTree:
         antialiased = _check_alike(tile_path, tile, antialiased, arrays)
         for rows in spans[file]:
             if rows.offset + rows.count > len(tile.gaussians):
-                raise damage_error(path, f"it names row {rows.offset + rows.count - 1} of {tile_path}")
+                raise damage_error(path, f"{INDEX} names row {rows.offset + rows.count - 1} of {tile_path}")
             _copy_rows(tile.gaussians, rows, arrays, filled, total)
             filled += rows.count
     if surroundings is not None:
@@ -160,7 +161,7 @@ def _leaves(node: _Node) -> Iterator[_Node]:
 def _list_spans(path: Path, index: _Index) -> tuple[dict[int, list[_Rows]], tuple[int, ...]]:
     """Return the rows of the finest level by tile, and the numbers of Gaussians of the coarser levels."""
     spans: dict[int, list[_Rows]] = {}
-    counts = dict.fromkeys(range(1, max(index.lodLevels, 1)), 0)
+    counts: Counter[int] = Counter()
     for leaf in _leaves(index.tree):
         levels = {int(name): rows for name, rows in leaf.lods.items() if name.isdecimal()}
         if len(levels) < len(leaf.lods) or max(levels) >= index.lodLevels:
@@ -178,7 +179,7 @@ def _list_spans(path: Path, index: _Index) -> tuple[dict[int, list[_Rows]], tupl
         for first, second in pairwise(parts):
             if first.offset + first.count > second.offset:
                 raise damage_error(path, "two leaves name the same rows")
-    return spans, tuple(count for count in counts.values() if count)
+    return spans, tuple(counts[level] for level in sorted(counts) if counts[level])
 
 
 def _tile(path: Path, name: str) -> Path:

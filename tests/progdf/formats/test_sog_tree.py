@@ -95,19 +95,32 @@ def test_opened_tree_is_written_as_one_file(tmp_path: Path) -> None:
         ({"filenames": ["/a/meta.json", "1_0/meta.json", "0_1/meta.json"]}, "outside its folder"),
         ({"filenames": ["9_9/meta.json", "1_0/meta.json", "0_1/meta.json"]}, "9_9/meta.json is missing"),
         ({"filenames": []}, "names rows that no tile has"),
-        ({"tree": {"lods": {"0": _rows(0, 25, 10)}}}, "it names row 34"),
+        ({"tree": {"lods": {"0": _rows(0, 25, 10)}}}, "lod-meta.json names row 34"),
         ({"tree": {"lods": {"0": _rows(0, -1, 10)}}}, "names rows that no tile has"),
         ({"tree": {"lods": {"5": _rows(0, 0, 10)}}}, "names a level that is not one of 2"),
         ({"tree": {"lods": {"fine": _rows(0, 0, 10)}}}, "names a level that is not one of 2"),
         ({"tree": {"children": 2 * [{"lods": {"0": _rows(0, 0, 10)}}]}}, "two leaves name the same rows"),
         ({"tree": {}}, "holds 0 Gaussians"),
-        ({"tree": 3}, "in lod-meta.json"),
+        ({"tree": 3}, "in lod-meta.json, tree is 3, expected object, got int"),
+        ({"tree": {"lods": {"0": {"file": 0}}}}, "in lod-meta.json, tree.lods[...].offset is missing"),
+        ({"tree": {"lods": {"0": 3}}}, "in lod-meta.json, tree.lods[...]: expected object, got int"),
+        ({"lodLevels": 0}, "in lod-meta.json, lodLevels is 0, expected int >= 1"),
     ],
 )
 def test_broken_index_is_refused_in_one_line(changes: dict[str, Any], said: str, tmp_path: Path) -> None:
     message = refusal(load_scene, write_tree(tmp_path / "town", changes))
     assert said in message
     assert "\n" not in message
+
+
+def test_missing_field_of_the_index_is_named(tmp_path: Path) -> None:
+    folder = write_tree(tmp_path / "town")
+    (folder / "lod-meta.json").write_text('{"lodLevels": 2, "filenames": []}')
+    assert "is damaged: in lod-meta.json, tree is missing; " in refusal(load_scene, folder)
+
+
+def test_memory_does_not_grow_with_the_stated_number_of_levels(tmp_path: Path) -> None:
+    assert len(load_scene(write_tree(tmp_path / "town", {"lodLevels": 10**15}))) == 60
 
 
 def test_tile_behind_a_link_is_refused(tmp_path: Path) -> None:
