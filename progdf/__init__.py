@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import os
 import sys
+from collections.abc import MutableMapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -62,6 +64,23 @@ _NOTEBOOK_CARDS = (
 """Module and class of each type that is displayed as a card in a notebook."""
 
 
+_WAIT_VARIABLES = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME", "KMP_LIBRARY")
+"""Variables by which a user chooses how idle OpenMP threads wait (GNU, Intel and LLVM)."""
+
+
+def wait_passively(environment: MutableMapping[str, str]) -> None:
+    """Let torch's idle threads sleep instead of spinning, unless the user has chosen otherwise.
+
+    Beside other busy programs, spinning threads take the cores from the threads that they wait for. OpenMP
+    reads the variables once, when torch is imported; programs that this one starts inherit them.
+
+    Args:
+        environment: variables of the process, changed in place; a value of the user stays
+    """
+    if not any(name in environment for name in _WAIT_VARIABLES):
+        environment["OMP_WAIT_POLICY"] = "PASSIVE"
+
+
 def __getattr__(name: str) -> Any:
     """Import a public name on first use, so that `progdf --help` does not wait for torch."""
     if name == "Widget":
@@ -90,3 +109,5 @@ def _register_notebook_cards() -> None:
 
 
 _register_notebook_cards()
+if "torch" not in sys.modules:  # later it has no effect
+    wait_passively(os.environ)

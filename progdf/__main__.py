@@ -12,7 +12,7 @@ import signal
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable, MutableMapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import FrameType
@@ -37,8 +37,6 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "export": ("viewer.commands.export:export", "write the edited scene as a 3DGS .ply file"),
     "info": ("progdf.cli.info:main", "show the contents of a scene or .gdf, repairs, strays and errors"),
 }
-_WAIT_VARIABLES = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME", "KMP_LIBRARY")
-"""Variables by which a user chooses how idle OpenMP threads wait (GNU, Intel and LLVM)."""
 
 HIDDEN = {"preview": "trainer.preview:serve"}
 """Internal commands, which the window runs → their entry points."""
@@ -53,23 +51,9 @@ def _usage() -> str:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status, see `run_guarded`."""
     if argv is None:  # run as the program; torch and numba create 500 000 permanent objects
-        wait_passively(os.environ)
         gc.set_threshold(5_000)  # fewer collections during imports save 0.3 s
         atexit.register(gc.freeze)  # skipping the collection at exit saves 0.7 s
     return run_guarded(_run, list(sys.argv[1:] if argv is None else argv))
-
-
-def wait_passively(environment: MutableMapping[str, str]) -> None:
-    """Let torch's idle threads sleep instead of spinning, unless the user has chosen otherwise.
-
-    Beside other busy programs, spinning threads take the cores from the threads that they wait for. OpenMP
-    reads the variables once, when torch is imported; programs that this one starts inherit them.
-
-    Args:
-        environment: variables of the process, changed in place; a value of the user stays
-    """
-    if not any(name in environment for name in _WAIT_VARIABLES):
-        environment["OMP_WAIT_POLICY"] = "PASSIVE"
 
 
 def run_guarded(run: Callable[[Sequence[str]], int], arguments: Sequence[str]) -> int:

@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 
 import progdf
-from progdf.__main__ import COMMANDS, main, wait_passively
+from progdf import wait_passively
+from progdf.__main__ import COMMANDS, main
 from progdf.errors import ProgdfError
 from progdf.formats.ply import save_ply
 from progdf.io.atomic import atomic_write
@@ -341,15 +342,13 @@ def test_idle_threads_sleep_unless_the_user_chose() -> None:
         assert kept == chosen
 
 
-def test_program_sets_the_wait_policy_before_torch_is_imported() -> None:
-    program = (
-        "import os, sys, progdf.__main__ as program\n"
-        "sys.argv = ['progdf', '--version']\n"
-        "program.main()\n"
-        "print(os.environ['OMP_WAIT_POLICY'], 'torch' in sys.modules)"
-    )
+@pytest.mark.parametrize(
+    ("imports", "policy"), [("import progdf", "PASSIVE"), ("import torch, progdf", "None")]
+)
+def test_import_sets_the_wait_policy_only_before_torch(imports: str, policy: str) -> None:
+    program = f"import os; {imports}; print(os.environ.get('OMP_WAIT_POLICY'))"
     environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
     result = subprocess.run(
         [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True
     )
-    assert result.stdout.splitlines()[-1] == "PASSIVE False"
+    assert result.stdout.strip() == policy
