@@ -36,10 +36,18 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "edit": ("progdf.cli.edit:main", "change or clean a scene by hand"),
     "export": ("viewer.commands.export:export", "write the edited scene as a 3DGS .ply file"),
     "info": ("progdf.cli.info:main", "show the contents of a scene or .gdf, repairs, strays and errors"),
+    "doctor": (
+        "progdf.cli.doctor:main",
+        "print what a bug report needs; test drawing, training and a window",
+    ),
 }
 
-HIDDEN = {"preview": "trainer.preview:serve"}
-"""Internal commands, which the window runs → their entry points."""
+HIDDEN = {
+    "preview": "trainer.preview:serve",
+    "window-test": "viewer.commands.window_test:main",
+    "card-test": "progdf.cli.doctor:describe_card",
+}
+"""Internal commands, which the window and `progdf doctor` run → their entry points."""
 
 
 def _usage() -> str:
