@@ -19,8 +19,9 @@ from viewer.state.transient import Pull
 from viewer.state.workspace import Workspace
 from viewer.ui import overlay
 from viewer.ui.context import FIXED, PALETTE, SMALL_PX, UiContext, u32
-from viewer.ui.keys import COMMANDS, JOINED, TOPICS, Command, chords, find_commands, is_changed, shortcut
+from viewer.ui.keys import COMMANDS, JOINED, TOPICS, Command, chords, is_changed, shortcut
 from viewer.ui.pointer import PointerContext
+from viewer.ui.search import find_commands
 from viewer.ui.widgets import elide, group_digits, menu, search_field
 
 from . import color_tool, measure, mouse, select_tool

@@ -6,7 +6,7 @@ Menus, tooltips, the list of keys and the command palette are built from the tab
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
@@ -391,38 +391,6 @@ def describe(action: str, more: str = "") -> str:
     chord = shortcut(action)
     first = command.name + (f" ({chord})" if chord else "")
     return "\n".join(line for line in (first, command.help, more) if line)
-
-
-def match(query: str, name: str, beside: str = "") -> int | None:
-    """Return the rank of a name for a query: 0 is the best match, None means no match.
-
-    Args:
-        beside: other text to search if the name does not match
-    """
-    needle = query.casefold().strip()
-    text = name.casefold()
-    letters = iter(name.casefold())
-    matches = (
-        text.startswith(needle),
-        f" {needle}" in text,
-        "".join(word[0] for word in text.split()).startswith(needle),
-        needle in text,
-        needle in beside.casefold(),
-        all(letter in letters for letter in needle.replace(" ", "")),  # in this order, with gaps
-    )
-    return next((i for i, is_match in enumerate(matches) if is_match), None)
-
-
-def find_commands(query: str, offered: Collection[str]) -> list[Command]:
-    """Return the commands among `offered` that match the query, the best first; all for ""."""
-    ranks = [
-        (match(query, command.name, f"{command.help} {topic} {' '.join(chords(command.id))}"), command)
-        for topic, commands in TOPICS.items()
-        for command in commands
-        if command.id in offered
-    ]
-    found = [(rank, bool(command.listed), command) for rank, command in ranks if rank is not None]
-    return [command for *_, command in sorted(found, key=lambda answer: answer[:2])]
 
 
 def drag_for(button: str, modifier: str, mode: str) -> str | None:

@@ -27,7 +27,8 @@ from viewer.state import actions, selection, timeline
 from viewer.state.commands import Plain
 from viewer.state.view_state import ViewState
 from viewer.ui.context import SMALL_PX
-from viewer.ui.keys import COMMANDS, JOINED, KEYS, bind, find_commands, shortcut
+from viewer.ui.keys import COMMANDS, JOINED, KEYS, bind, shortcut
+from viewer.ui.search import WORDS, find_commands
 
 SMALLEST = (1024, 640)
 
@@ -87,6 +88,45 @@ def test_every_action_is_a_command_or_internal(tmp_path: Path) -> None:
 )
 def test_command_is_found_by_parts_of_its_name(query: str, first: str) -> None:
     assert find_commands(query, COMMANDS)[0].id == first
+
+
+FIRST_GUESSES = {
+    "hue": "new_edit",
+    "erase": "remove_selected",
+    "mask": "select_tool:lasso",
+    "layer": "new_edit",
+    "opacity": "fold",
+    "LUT": "open",
+    "turntable": "render_film",
+    "crop": "isolate",
+    "screenshot": "picture",
+    "video": "render_film",
+    "share": "export_page",
+    "before": "split",
+    "brightness": "new_edit",
+    "magic wand": "select_tool:flood",
+    "rotate": "move_selected",
+    "sticker": "decal",
+    "shortcuts": "help",
+    "ruler": "measure",
+    "zoom to fit": "frame",
+    "heal": "paint_tool:clone",
+}
+"""First word that a newcomer may type for a task, and the command of the task."""
+VISIBLE_ROWS = 3  # rows at which one looks before typing another word
+
+
+def test_first_guesses_of_newcomers_find_their_command() -> None:
+    missed = [
+        query
+        for query, command in FIRST_GUESSES.items()
+        if command not in [found.id for found in find_commands(query, COMMANDS)[:VISIBLE_ROWS]]
+    ]
+    assert missed == []
+
+
+def test_everyday_words_belong_to_commands() -> None:
+    assert {*WORDS} <= {*COMMANDS}
 
 
 def test_unknown_query_finds_nothing_and_empty_query_finds_all() -> None:
