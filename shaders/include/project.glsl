@@ -21,6 +21,7 @@ uniform vec4 intrinsics;     // fx, fy, cx, cy
 uniform vec2 size;           // width, height
 uniform bool antialiased;    // opacity × sqrt(det before dilation / det after)
 uniform bool activated;      // the logits are opacities, which may exceed 1
+uniform float dot_px;        // above 0: dots with this standard deviation in pixels, in place of the Gaussians
 uniform bool highlighted;         // true if `highlight` is set
 uniform sampler2D highlight;      // rgb, and its share in the Gaussian's color; 1 hides the Gaussian
 
@@ -56,6 +57,10 @@ void project(uint splat) {
     float opacity = activated ? logit : 1.0 / (1.0 + exp(-clamp(logit, -80.0, 80.0)));
     vec3 p = rotation * offset;
     if (opacity < ALPHA_MIN || p.z <= 0.0) return;
+    if (dot_px > 0.0) {
+        log_scales = vec3(log(p.z * dot_px / max(intrinsics.x, intrinsics.y)));
+        opacity = 1.0;
+    }
 
     // clamp like the original (Kerbl 2023, computeCov2D): off-screen Gaussians would blow up the Jacobian
     vec2 focal = intrinsics.xy, principal = intrinsics.zw;

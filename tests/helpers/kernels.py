@@ -29,6 +29,7 @@ from progdf.compose.layers import Layer
 from progdf.rasterize import activate, alpha_weights
 from progdf.rasterize.engines import color_map
 from progdf.rasterize.cpu.pyramid import Pyramid
+from progdf.rasterize.cpu.rings import render_rings
 from progdf.rasterize.screen import draw_lines_behind
 from tests.helpers.edits import curved_field, edit_of, some_rows
 from tests.helpers.scenes import ball, front_camera
@@ -47,6 +48,7 @@ with draw_lines_behind(picture.numpy(), left.numpy(), lines, 0.5):
 weighed = color_map(activate(scene), camera, (0, 0, camera.width, camera.height), rows)
 weighed.gradient(weighed.picture(torch.ones(20, 3)))
 alpha_weights(scene, camera, left)
+render_rings(activate(scene), camera, (1.0, 1.0, 1.0))
 """
 
 PARTS = (_RASTERIZER_KERNELS, _OTHER_KERNELS)

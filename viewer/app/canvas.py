@@ -186,7 +186,7 @@ class Canvas:
         screen.use()
         screen.clear(*PALETTE.panel)
         aim = (view.camera, size)
-        edits = (view.layers, view.blend, view.background, self.comparer.engine.version)
+        edits = (view.layers, view.blend, view.background, view.mode, self.comparer.engine.version)
         turned = aim != self._last[0]
         slid = edits != self._last[1]
         self._last = (aim, edits)
@@ -258,6 +258,9 @@ class Canvas:
         Raises:
             ProgdfError: see `exports.picture`.
         """
+        if view.mode != ViewState.mode and view.compare.mode == "off":  # no picture of the scene's colors
+            image = self.comparer.engine.image(view, size, mode=view.mode)
+            return f"Saved {exports.picture(folder, f'{title}-{view.mode}', to_pixels(image))}"
         image = self.image(view, size)
         pixels = draw_labels(image, view.compare, self.comparer.labels(view))
         if view.compare.mode != "off":  # a comparison cannot be edited and trained on

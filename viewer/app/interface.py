@@ -10,7 +10,7 @@ from itertools import zip_longest
 from imgui_bundle import imgui, imgui_ctx
 
 from progdf.errors import ProgdfError
-from viewer.panel import dialogs, panel, timeline_bar, tools
+from viewer.panel import dialogs, panel, timeline_bar, tools, view_settings
 from viewer.pictures.compare import Labels
 from viewer.state import history, workspace
 from viewer.state.actions import GLIDES, perform
@@ -280,7 +280,7 @@ def panels(
     above = replace(area, height=area.height - timeline_bar.height(work, area, ui))
     tools.draw_toolbar(work.view, above, ui, actions, _active_tool(work))
     work, foot = tools.draw_options(work, above, ui, actions, select_tool.next_step(work))
-    work = replace(work, view=tools.draw_view(work.view, above, foot, ui, actions))
+    work = replace(work, view=view_settings.draw_view(work.view, above, foot, ui, actions))
     work, asked = draw_pill(work, pointer, compared, foot)
     return perform_actions(work, [*actions, *asked], pointer)
 

@@ -20,6 +20,20 @@ Rgb = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
+class DrawMode:
+    """Colors and shapes of the Gaussians in a picture, see `viewer.render.view_modes`."""
+
+    colors: int = 0  # `view_mode` of include/view_modes.glsl
+    dot_px: float = 0.0  # above 0: dots with this standard deviation in pixels
+    rings: bool = False  # draw outlines
+    depths: tuple[float, float] = (0.0, 1.0)  # depths of the near and far end of the ramp, world units
+    ramp: tuple[Rgb, ...] = ((0.0, 0.0, 0.0),) * 5  # its colors at 0, 1/4, 1/2, 3/4 and 1
+
+
+PLAIN = DrawMode()
+
+
+@dataclass(frozen=True)
 class _Buffers:
     """Buffers with one entry per Gaussian (drawing order, projections) and their vertex arrays."""
 
@@ -27,9 +41,10 @@ class _Buffers:
     projected: moderngl.Buffer
     project: moderngl.VertexArray
     splat: moderngl.VertexArray
+    rings: moderngl.VertexArray
 
     def release(self) -> None:
-        for resource in (self.project, self.splat, self.order, self.projected):
+        for resource in (self.project, self.splat, self.rings, self.order, self.projected):
             resource.release()
 
 
@@ -58,6 +73,7 @@ class SplatRenderer:
         self.ctx = ctx
         self._project = load_program(ctx, "project.vert", varyings=PROJECTED.names or ())
         self._splat = load_program(ctx, "splat.vert", "splat.frag")
+        self._rings = load_program(ctx, "splat.vert", "rings.frag")
         self._scene: SplatTextures | None = None
         self._highlights: HighlightTexture | None = None
         self._buffers: _Buffers | None = None
@@ -118,12 +134,13 @@ class SplatRenderer:
         if self._drawn:
             self._buffers.order.write(np.ascontiguousarray(order, ORDER))
 
-    def draw(self, camera: Camera, background: Rgb) -> moderngl.Texture:
+    def draw(self, camera: Camera, background: Rgb, mode: DrawMode = PLAIN) -> moderngl.Texture:
         """Draw with the uploaded scene and order.
 
         Args:
             camera: its size is the picture's
             background: rgb behind everything
+            mode: colors and shapes of the Gaussians
 
         Returns:
             rgb over the background, and 1 − transmittance. RGBA32F, overwritten by the next draw
@@ -138,7 +155,11 @@ class SplatRenderer:
         if self._drawn and self._scene is not None and self._buffers is not None:
             self._scene.bind(self._project)
             _set_camera(self._project, camera)
-            self._project["antialiased"] = self._antialiased
+            self._project["antialiased"] = self._antialiased and not mode.dot_px
+            self._project["view_mode"] = mode.colors
+            self._project["dot_px"] = mode.dot_px
+            self._project["depth_range"] = mode.depths
+            self._project["ramp"] = mode.ramp
             self._project["activated"] = self._activated
             self._project["highlighted"] = self._highlights is not None
             if self._highlights is not None:
@@ -148,16 +169,18 @@ class SplatRenderer:
             target.framebuffer.viewport = (0, 0, *size)
             self.ctx.blend_equation = moderngl.FUNC_ADD, moderngl.FUNC_ADD
             self.ctx.blend_func = moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA
-            self._splat["size"] = size
-            self._buffers.splat.render(moderngl.TRIANGLES, vertices=3, instances=self._drawn)
+            program = self._rings if mode.rings else self._splat
+            program["size"] = size
+            triangles = self._buffers.rings if mode.rings else self._buffers.splat
+            triangles.render(moderngl.TRIANGLES, vertices=3, instances=self._drawn)
         return target.texture
 
     def release(self) -> None:
         """Release all GL objects. The renderer is unusable afterwards."""
         self._release_target()
         self._release_scene()
-        self._project.release()
-        self._splat.release()
+        for program in (self._project, self._splat, self._rings):
+            program.release()
 
     def _make_buffers(self, count: int) -> _Buffers:
         order = self.ctx.buffer(reserve=count * ORDER.itemsize, dynamic=True)
@@ -168,6 +191,7 @@ class SplatRenderer:
             projected,
             self.ctx.vertex_array(self._project, [(order, "1u", "splat")]),
             self.ctx.vertex_array(self._splat, [per_instance]),
+            self.ctx.vertex_array(self._rings, [per_instance]),
         )
 
     def _make_target(self, size: tuple[int, int]) -> _Target:

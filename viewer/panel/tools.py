@@ -1,4 +1,4 @@
-"""Controls over the picture's edges: toolbar, tool options, comparison and view settings."""
+"""Controls over the picture's edges: toolbar, tool options and comparison."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import TypeVar
 
 from imgui_bundle import imgui
 
-from viewer.camera.view_camera import Vec3, ViewCamera, axes, with_up
 from viewer.pictures.compare import Labels
 from viewer.render import highlight
 from viewer.state.commands import Action, Plain, WithText, WithValue
@@ -37,9 +36,7 @@ from viewer.ui.widgets import (
     group_digits,
     hint,
     icon_button,
-    icon_row,
     inert,
-    label,
     menu,
     menu_item,
     more_button,
@@ -56,7 +53,7 @@ LEFT_PX = TOOLBAR_PX + 2 * EDGE_PX  # width that the toolbar takes from the pict
 NARROW_PX = 560.0  # below this picture width the options may cover the axes
 _SIDE_PX = 32.0  # size of a button
 _MIN_PX = 18.0  # minimum size of a button, in a low window
-_PAD_PX = 4.0  # padding around the buttons
+PAD_PX = 4.0  # padding around the buttons
 _TOOLS = (
     (("navigate:orbit", Icon.ORBIT), ("navigate:fly", Icon.FLY)),
     (
@@ -93,11 +90,17 @@ def _with_chords(text: str, *actions: str) -> str:
     return f"{text} ({' and '.join(chords)})" if chords else text
 
 
-def _open_below(share: float, ui: UiContext) -> None:
+def open_below(share: float, ui: UiContext) -> None:
     """Place the next menu below the plate, at `share` of its width."""
     (x, y), size = imgui.get_window_pos(), imgui.get_window_size()
     at = (x + share * size.x, y + size.y + 4.0 * ui.scale)
     imgui.set_next_window_pos(at, 0, (share, 0.0))
+
+
+def view_width(view: ViewState, area: Area, ui: UiContext) -> float:
+    """Return the width that the axes and the buttons below them take from the picture, in window pixels."""
+    buttons = 3 * imgui.get_frame_height() + 2 * (PAD_PX + EDGE_PX) * ui.scale
+    return max(overlay.axes_height(view, area, ui), buttons)
 
 
 def draw_toolbar(view: ViewState, area: Area, ui: UiContext, actions: list[Action], tool: str = "") -> None:
@@ -122,10 +125,10 @@ def draw_toolbar(view: ViewState, area: Area, ui: UiContext, actions: list[Actio
     off = {"brush": not view.layers, "move_selected": not view.selection.count}
     count = sum(map(len, _TOOLS))
     gap = 6.0 * ui.scale
-    room = area.height - 2 * (EDGE_PX + _PAD_PX) * ui.scale - gap * (len(_TOOLS) - 1)
+    room = area.height - 2 * (EDGE_PX + PAD_PX) * ui.scale - gap * (len(_TOOLS) - 1)
     side = min(max(room / count, _MIN_PX * ui.scale), _SIDE_PX * ui.scale)
     imgui.push_style_var(imgui.StyleVar_.item_spacing, (0.0, 0.0))
-    with plate("tools", (EDGE_PX * ui.scale, EDGE_PX * ui.scale), ui, pad=_PAD_PX):
+    with plate("tools", (EDGE_PX * ui.scale, EDGE_PX * ui.scale), ui, pad=PAD_PX):
         for i, group in enumerate(_TOOLS):
             if i:
                 imgui.dummy((1.0, gap))
@@ -478,7 +481,7 @@ def draw_comparison(
     right, _, figure = words.right.partition(" · ")
     figure = words.line if compare.mode == "difference" else figure
     imgui.push_style_var(imgui.StyleVar_.item_spacing, (0.0, 2.0 * ui.scale))
-    with plate("comparison", place, ui, (0.5, 0.0), _PAD_PX):
+    with plate("comparison", place, ui, (0.5, 0.0), PAD_PX):
         if _word("left", words.left.capitalize(), on or original, ui):
             requested = "before"
         hint("before")
@@ -498,7 +501,7 @@ def draw_comparison(
             imgui.open_popup("comparisons")
         tip("Kind and sides of the comparison")
         imgui.pop_style_var()
-        _open_below(0.5, ui)
+        open_below(0.5, ui)
         with menu("comparisons", ui) as is_open:
             compare = _choose_comparison(compare, bool(work.snapshots), ui) if is_open else compare
     work = replace(work, view=replace(work.view, compare=compare))
@@ -534,67 +537,3 @@ def _choose_comparison(compare: Comparison, snapshots: bool, ui: UiContext) -> C
         gain = value_slider("##amplify", compare.amplify, ends, "Gain × %.0f", Comparison.amplify, ui)
         compare = replace(compare, amplify=float(round(gain)))
     return compare
-
-
-UPS: dict[str, Vec3] = {
-    "+X": (1.0, 0.0, 0.0),
-    "−X": (-1.0, 0.0, 0.0),
-    "+Y": (0.0, 1.0, 0.0),
-    "−Y": (0.0, -1.0, 0.0),
-    "+Z": (0.0, 0.0, 1.0),
-    "−Z": (0.0, 0.0, -1.0),
-}
-
-
-_VIEW_BUTTONS = (("frame", Icon.FRAME), ("home", Icon.HOME))
-
-
-def view_width(view: ViewState, area: Area, ui: UiContext) -> float:
-    """Return the width that the axes and the buttons below them take from the picture, in window pixels."""
-    buttons = 3 * imgui.get_frame_height() + 2 * (_PAD_PX + EDGE_PX) * ui.scale
-    return max(overlay.axes_height(view, area, ui), buttons)
-
-
-def draw_view(view: ViewState, area: Area, foot: float, ui: UiContext, actions: list[Action]) -> ViewState:
-    """Draw the buttons under the axes: frame, home, and the view settings. `foot`: lower edge of the
-    options bar, window pixels."""
-    top = max(overlay.axes_height(view, area, ui), EDGE_PX * ui.scale)
-    if top < foot and area.width < NARROW_PX * ui.scale:
-        return view  # the options bar covers it
-    imgui.push_style_var(imgui.StyleVar_.item_spacing, (0.0, 0.0))
-    with plate("view", (area.width - EDGE_PX * ui.scale, top), ui, (1.0, 0.0), _PAD_PX):
-        icon_row(_VIEW_BUTTONS, ui, actions)
-        imgui.same_line()
-        if icon_button("view", Icon.VIEW, ui):
-            imgui.open_popup("view settings")
-        tip("Up axis, field of view, background, grid")
-        imgui.pop_style_var()
-        _open_below(1.0, ui)
-        with menu("view settings", ui) as is_open:
-            view = _view_rows(view, ui, actions) if is_open else view
-    return view
-
-
-def _view_rows(view: ViewState, ui: UiContext, actions: list[Action]) -> ViewState:
-    column = COLUMN_PX * ui.scale
-    wide = 232.0 * ui.scale
-    camera = view.camera
-    label("Up axis", column)
-    current = next((name for name, up in UPS.items() if up == camera.up), "View")
-    ups = {**UPS, "View": axes(camera).up}
-    chosen = choice("up", {name: name for name in ups}, current, ui, wide)
-    tip("Up axis of the scene. View: use the current view's up direction")
-    if chosen is not None:
-        camera = with_up(camera, ups[chosen])
-    label("View angle", column)
-    fov_y = value_slider("##fov", camera.fov_y, (10.0, 110.0), "%.0f°", ViewCamera.fov_y, ui, wide)
-    camera = replace(camera, fov_y=fov_y)
-    tip(f"Vertical field of view. Double-click: reset to {ViewCamera.fov_y:g}°")
-    label("Background", column)
-    picker = imgui.ColorEditFlags_.no_inputs.value | imgui.ColorEditFlags_.no_alpha.value
-    changed, (red, green, blue) = imgui.color_edit3("##background", list(view.background), picker)
-    background = (red, green, blue) if changed else view.background
-    for action, on in (("grid", view.grid), ("axes", view.axes)):
-        if menu_item(action, on):
-            actions.append(Plain(action))
-    return replace(view, camera=camera, background=background)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.rasterize import ActivatedGaussians, Crop, render
+from progdf.rasterize.cpu.rings import render_rings
 from progdf.rasterize.screen import draw_lines_behind, fill_screen
 from progdf.threads import stopped_by
 from viewer.camera.view_camera import Vec3
@@ -25,6 +26,8 @@ from viewer.gl.present import ScreenCopy
 from .dynamic_resolution import DrawnView, LiveScene
 from .gl_renderer import Image, Size, require_picture
 from .ground_grid import CLEAR, Lines
+from .view_modes import RINGS, SPLATS
+from .view_modes import apply as apply_mode
 
 BAND = 300_000
 """Number of Gaussians per additional band of a full picture.
@@ -48,16 +51,17 @@ class _Rendered:
 class _PendingPicture:
     """Picture that another thread draws band by band."""
 
-    def __init__(self, gaussians: ActivatedGaussians, shown: DrawnView) -> None:
+    def __init__(self, scene: LiveScene, shown: DrawnView) -> None:
         size = (shown.camera.height, shown.camera.width)
         self.stop = threading.Event()
         self.picture = _Rendered(np.empty((*size, 3), np.float32), np.empty(size, np.float32), shown)
         self.bands: list[tuple[int, int]] = []  # finished bands: first row, and one past the last
-        self.drawn = _worker().submit(self._draw, gaussians)
+        self.drawn = _worker().submit(self._draw, scene)
 
-    def _draw(self, gaussians: ActivatedGaussians) -> float:
+    def _draw(self, scene: LiveScene) -> float:
         """Draw all bands and return the time taken, ms."""
         started = time.perf_counter()
+        gaussians = _in_mode(scene, self.picture.shown)
         height, width = self.picture.through.shape
         count = min(1 + len(gaussians.means) // BAND, MAX_BANDS, -(-height // MIN_ROWS))
         bands = [(height * k // count, height * (k + 1) // count) for k in range(count)]
@@ -111,7 +115,14 @@ class CpuRenderer:
         self._changed = self._changed or len(rows) > 0
         self._scene.highlight(rows, highlights)
 
-    def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32], pixels: int = 1) -> None:
+    def draw(
+        self,
+        camera: Camera,
+        background: Vec3,
+        order: NDArray[np.uint32],
+        pixels: int = 1,
+        mode: str = SPLATS,
+    ) -> None:
         """Draw the picture.
 
         Args:
@@ -119,34 +130,35 @@ class CpuRenderer:
             background: rgb behind the scene
             order: not used, as the rasterizer sorts by itself
             pixels: see `GlRenderer.draw`; above 1 the picture has fewer Gaussians
+            mode: see `GlRenderer.draw`
         """
         pending = self._pending
         self.begun_ms = 0.0
         picture = None
-        shown = DrawnView(camera, background, pixels)
-        if pixels > 1:
+        shown = DrawnView(camera, background, pixels, mode)
+        if pixels > 1 and mode == SPLATS:
             picture = self._scene.draw_fewer(lambda fewer: _draw(fewer, shown), camera, pixels)
         elif pending is not None and pending.picture.shown == shown:
             self.begun_ms = pending.drawn.result()
             picture = pending.picture.image, pending.picture.through
-        picture = picture or _draw(self._scene.drawn, shown)
+        picture = picture or _draw(_in_mode(self._scene, shown), shown)
         coarse = self._coarse(shown)
-        if coarse is not None:
+        if coarse is not None and mode == SPLATS:
             self._scene.measure(coarse.image, picture[0])
         self._cancel()
         self._rendered = _Rendered(*picture, shown)
         self._stale = True
         self._changed = False
 
-    def prepare(self, camera: Camera, background: Vec3) -> bool:
+    def prepare(self, camera: Camera, background: Vec3, mode: str = SPLATS) -> bool:
         """See `GlRenderer.prepare`."""
-        shown = DrawnView(camera, background)
+        shown = DrawnView(camera, background, mode=mode)
         rendered = None if self._changed else self._rendered
         if rendered is not None and rendered.shown == shown:
             return True
         if self._pending is None or self._pending.picture.shown != shown:
             self._cancel()
-            self._pending = _PendingPicture(self._scene.drawn, shown)
+            self._pending = _PendingPicture(self._scene, shown)
         return self._pending.drawn.done()
 
     def _cancel(self) -> None:
@@ -220,9 +232,17 @@ class CpuRenderer:
             self._copy.release()
 
 
+def _in_mode(scene: LiveScene, shown: DrawnView) -> ActivatedGaussians:
+    """Return the scene as the view's mode shows it."""
+    return apply_mode(scene.drawn, scene.highlights, shown.camera, shown.mode)
+
+
 def _draw(gaussians: ActivatedGaussians, shown: DrawnView, crop: Crop | None = None) -> tuple[Image, Image]:
-    """Return the picture and its transmittance."""
+    """Return the picture of Gaussians from `_in_mode` and its transmittance."""
     with torch.no_grad():
+        if shown.mode == RINGS:
+            image, through = render_rings(gaussians, shown.camera, shown.background, crop)
+            return image.numpy(), through.numpy()
         rendered = render(gaussians, shown.camera, shown.background, crop=crop)
     return rendered.image.numpy(), rendered.transmittance.numpy()
 

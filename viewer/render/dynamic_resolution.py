@@ -180,6 +180,7 @@ class DrawnView:
     camera: Camera
     background: Vec3
     pixels: int = 1  # pixels of the full picture per pixel, along each axis
+    mode: str = "splats"  # view mode, one of `view_state.VIEW_MODES`
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, DrawnView) and self.pixels == other.pixels and self._matches(other)
@@ -192,8 +193,8 @@ class DrawnView:
         scaled = self.camera.resize(full.camera.width, full.camera.height)
         pixels = self.pixels // full.pixels
         return (
-            (self.background, self.camera.width, self.camera.height)
-            == (full.background, *drawn_size((scaled.width, scaled.height), pixels))
+            (self.mode, self.background, self.camera.width, self.camera.height)
+            == (full.mode, full.background, *drawn_size((scaled.width, scaled.height), pixels))
             and torch.equal(full.camera.viewmat, scaled.viewmat)
             and torch.allclose(full.camera.K, scaled.K, rtol=0.01 * (pixels - 1), atol=0.0)
         )
@@ -254,6 +255,11 @@ class LiveScene:
         self.update(self._scene, names, rows)
         if not self._highlights[:, 3].any():
             self._highlights = None
+
+    @property
+    def highlights(self) -> torch.Tensor | None:
+        """Highlights: rgb and share, 0 to 1; None for none. [N,4]"""
+        return None if self._highlights is None else torch.from_numpy(self._highlights)
 
     def begin_pyramid(self) -> Future[Pyramid]:
         """Build the pyramid in another thread. Rows changed meanwhile are merged again afterwards."""

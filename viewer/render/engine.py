@@ -34,6 +34,7 @@ from .dynamic_resolution import DrawnView, FrameTimings, drawn_size
 from .gl_renderer import GlRenderer, Image, back_to_front, headless_context, is_software
 from .ground_grid import GroundPlane, Lines, grid_lines, ground_plane
 from .highlight import Highlight, highlight_colors
+from .view_modes import SPLATS
 
 DRAWS = ("auto", "gl", "cpu")
 
@@ -109,7 +110,7 @@ class ViewEngine:
 
     def needs_draw(self, view: ViewState, size: tuple[int, int], camera: Camera | None = None) -> bool:
         """Return whether `view` at `size` (width, height, px) differs from the last picture."""
-        shown = DrawnView(camera or to_camera(view.camera, *size), view.background)
+        shown = DrawnView(camera or to_camera(view.camera, *size), view.background, mode=view.mode)
         return _Picture(_edits(view), shown, _with_hidden(self.highlight, view)) != self._picture
 
     def draw(
@@ -138,7 +139,7 @@ class ViewEngine:
             camera = half_camera(camera)
             size = (max(size[0] // 2, 1), size[1])
             left = half * size[0]
-        self.timings = self._update_picture(view, camera, self.highlight, pixels)
+        self.timings = self._update_picture(view, camera, self.highlight, pixels, view.mode)
         self.renderer.show(framebuffer, size, left, self._grid_lines(view, camera))
         return self.timings
 
@@ -159,7 +160,7 @@ class ViewEngine:
             return True
         self._compose(_edits(view))
         self._apply_highlight(_with_hidden(self.highlight, view))
-        return self.renderer.prepare(replace(camera, near=self.near), view.background)
+        return self.renderer.prepare(replace(camera, near=self.near), view.background, view.mode)
 
     def image(
         self,
@@ -167,6 +168,7 @@ class ViewEngine:
         size: tuple[int, int] = (0, 0),
         camera: Camera | None = None,
         pixels: int = 1,
+        mode: str = SPLATS,
     ) -> Image:
         """Render the picture as an array: upper row first, not clamped.
 
@@ -175,6 +177,7 @@ class ViewEngine:
             size: width and height, px
             camera: replaces the view's camera and `size`
             pixels: full-resolution pixels per pixel, see `GlRenderer.draw`
+            mode: one of `view_state.VIEW_MODES`; that of the view applies to the window alone
 
         Returns:
             [H,W,3] float32
@@ -182,7 +185,8 @@ class ViewEngine:
         Raises:
             ProgdfError: a layer of `view` is invalid.
         """
-        self.timings = self._update_picture(view, camera or to_camera(view.camera, *size), pixels=pixels)
+        camera = camera or to_camera(view.camera, *size)
+        self.timings = self._update_picture(view, camera, pixels=pixels, mode=mode)
         self._picture = self._picture if pixels == 1 else None  # a full picture will differ
         return self.renderer.pixels()
 
@@ -235,11 +239,16 @@ class ViewEngine:
         return self._grid[1]
 
     def _update_picture(
-        self, view: ViewState, camera: Camera, highlight: Highlight | None = None, pixels: int = 1
+        self,
+        view: ViewState,
+        camera: Camera,
+        highlight: Highlight | None = None,
+        pixels: int = 1,
+        mode: str = SPLATS,
     ) -> FrameTimings:
         """Do the work between the last picture and this one."""
         highlight = _with_hidden(highlight, view)
-        target = _Picture(_edits(view), DrawnView(camera, view.background), highlight)
+        target = _Picture(_edits(view), DrawnView(camera, view.background, mode=mode), highlight)
         if target == self._picture:
             return FrameTimings(drawn=self.timings.drawn)
         compose_ms, upload_ms, changed = self._compose(target.edits)
@@ -251,7 +260,7 @@ class ViewEngine:
             self.order = back_to_front(self.composer.gaussians.means.numpy(), camera)
             self._ordered_for = viewmat
         sorted_at = time.perf_counter()
-        self.renderer.draw(camera, view.background, self.order, pixels)
+        self.renderer.draw(camera, view.background, self.order, pixels, mode)
         drawn_at = time.perf_counter()
         self._picture = target
         return FrameTimings(

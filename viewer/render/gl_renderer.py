@@ -18,10 +18,11 @@ from progdf.rasterize.cpu.forward import depth_order
 from progdf.sh import C0
 from viewer.camera.view_camera import Vec3
 from viewer.gl.present import Presenter
-from viewer.gl.splats import GridPass, SplatRenderer
+from viewer.gl.splats import DrawMode, GridPass, SplatRenderer
 
 from .dynamic_resolution import DrawnView, LiveScene
 from .ground_grid import Lines
+from .view_modes import CENTERS, DOT_PX, RAMP_COLORS, RECOLORED, RINGS, SPLATS, depth_range
 
 Image = NDArray[np.float32]
 Size = tuple[int, int]  # width and height, pixels
@@ -84,7 +85,14 @@ class GlRenderer:
         if self._moving is not None:
             self._moving[0].highlight(rows, highlights)
 
-    def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32], pixels: int = 1) -> None:
+    def draw(
+        self,
+        camera: Camera,
+        background: Vec3,
+        order: NDArray[np.uint32],
+        pixels: int = 1,
+        mode: str = SPLATS,
+    ) -> None:
         """Draw the picture and wait until it is finished.
 
         Args:
@@ -92,18 +100,28 @@ class GlRenderer:
             background: rgb behind the scene
             order: rows, farthest first, from `back_to_front`
             pixels: full-resolution pixels per pixel of this picture, along each axis
+            mode: one of `view_state.VIEW_MODES`; all but splats draw every Gaussian
         """
         last = self._shown
-        self._shown = DrawnView(camera, background, pixels)
+        self._shown = DrawnView(camera, background, pixels, mode)
         coarse = self.pixels() if last is not None and last.is_coarse(self._shown) else None
-        self._picture = self._draw_fewer(camera, background, pixels) if pixels > 1 else None
+        self._picture = None
+        if pixels > 1 and mode == SPLATS:
+            self._picture = self._draw_fewer(camera, background, pixels)
         if self._picture is None:
             order = order if pixels == 1 else back_to_front(self._scene.means.numpy(), camera)
             self._renderer.set_order(order)
-            self._picture = self._renderer.draw(camera, background)
+            self._picture = self._renderer.draw(camera, background, self._draw_mode(mode, camera))
         self._ctx.finish()
-        if coarse is not None and self._moving is not None:
+        if coarse is not None and mode == SPLATS and self._moving is not None:
             self._moving[0].measure(coarse, self.pixels())
+
+    def _draw_mode(self, mode: str, camera: Camera) -> DrawMode:
+        """Return a mode in the renderer's form."""
+        depths = depth_range(self._scene.means, camera) if mode == "depth" else DrawMode.depths
+        colors = RECOLORED.index(mode) + 1 if mode in RECOLORED else 0
+        dot_px = DOT_PX if mode == CENTERS else 0.0
+        return DrawMode(colors, dot_px, mode == RINGS, depths, RAMP_COLORS)
 
     def _draw_fewer(self, camera: Camera, background: Vec3, pixels: int) -> moderngl.Texture | None:
         if self._moving is None:
@@ -122,7 +140,7 @@ class GlRenderer:
 
         return live.draw_fewer(draw, camera, pixels)
 
-    def prepare(self, camera: Camera, background: Vec3) -> bool:
+    def prepare(self, camera: Camera, background: Vec3, mode: str = SPLATS) -> bool:
         """Begin a slow picture in the background. Return whether `draw` can finish it at once.
 
         Any other call cancels the pending picture. With OpenGL no picture is slow.

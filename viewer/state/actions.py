@@ -34,7 +34,7 @@ from .layers import (
     with_paint,
 )
 from .transient import Measure
-from .view_state import BRUSH_MODES, FRAMES, PAINT_TOOLS, RESOLUTION_MODES, ViewState, following
+from .view_state import BRUSH_MODES, FRAMES, PAINT_TOOLS, RESOLUTION_MODES, VIEW_MODES, ViewState, following
 from .workspace import (
     MAX_ZOOM,
     MIN_ZOOM,
@@ -398,6 +398,14 @@ def _next_value(workspace: Workspace, name: str, values: Sequence[str]) -> Works
     return replace(workspace, view=replace(workspace.view, **changes))
 
 
+def _set_mode(workspace: Workspace, mode: str) -> Workspace:
+    """Set the view mode, or return to the splats if it is already set."""
+    if mode not in VIEW_MODES:
+        return workspace
+    mode = ViewState.mode if mode == workspace.view.mode else mode
+    return replace(workspace, view=replace(workspace.view, mode=mode))
+
+
 def _go_to_entry(workspace: Workspace, past: History) -> Workspace:
     if past is workspace.past:
         return workspace
@@ -534,6 +542,8 @@ ACTIONS: dict[str, Callable[[Workspace, Any], Workspace]] = {
     "look": _view_from,
     "grid": lambda w, _: replace(w, view=replace(w.view, grid=not w.view.grid)),
     "axes": lambda w, _: replace(w, view=replace(w.view, axes=not w.view.axes)),
+    "view_mode": _set_mode,
+    "next_view_mode": lambda w, _: _next_value(w, "mode", VIEW_MODES),
     "safe_frame": lambda w, _: _next_value(w, "safe_frame", FRAMES),
     "help": lambda workspace, _: replace(workspace, help=not workspace.help),
     "palette": lambda workspace, _: replace(workspace, palette=-1, query="", help=False),

@@ -167,7 +167,7 @@ def argument(action: Action) -> Argument:
     return action
 
 
-_OF_TEXT = ("look", "navigate", "select_tool", "paint_tool")
+_OF_TEXT = ("look", "navigate", "select_tool", "paint_tool", "view_mode")
 _OF_NUMBER = ("focus", "toggle")
 
 

@@ -52,6 +52,7 @@ class ViewSettings:
     grid: bool = False
     axes: bool = True
     safe_frame: str = ""
+    mode: str = ViewState.mode
     unit: float = 1.0
     dynamic_resolution: str = ViewState.dynamic_resolution
 
@@ -233,6 +234,7 @@ _VIEW_LABELS = {
     "grid": "ground grid",
     "axes": "axes",
     "safe_frame": "safe frame",
+    "mode": "view mode",
     "unit": "unit of length",
     "dynamic_resolution": "dynamic resolution",
 }

@@ -37,6 +37,8 @@ CARD_MODES = ("auto", "full", "compact")
 """Values of `ViewState.cards`: compact rows if full cards do not fit, never, always."""
 FRAMES = ("", *SHAPES)
 """Values of `ViewState.safe_frame`: none, or an aspect ratio of films."""
+VIEW_MODES = ("splats", "centers", "rings", "depth", "normals", "opacity")
+"""Values of `ViewState.mode`, see `viewer.render.view_modes`."""
 RESOLUTION_MODES = ("auto", "on", "off")
 """Values of `ViewState.dynamic_resolution`: if it saves time, always, never."""
 
@@ -192,6 +194,7 @@ class ViewState:
     groups: tuple[LayerGroup, ...] = ()  # layer groups, in no particular order
     collapsed: tuple[str, ...] = ()  # names of the groups that are collapsed in the panel
     cards: Annotated[str, one_of(CARD_MODES)] = "auto"  # one of `CARD_MODES`
+    mode: Annotated[str, one_of(VIEW_MODES)] = "splats"  # one of `VIEW_MODES`; in the window alone
     # true length of a world unit, by which the window shows and reads lengths; files keep world units
     unit: Unit = 1.0
 

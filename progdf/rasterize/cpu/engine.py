@@ -91,10 +91,7 @@ def rasterize_part(
         contribution to the image, Σ αT·color. [H,W,3], [H,W], [H,W,3]
     """
     camera = make_pinhole(view)
-    arrays = [to_float32(tensor).detach().numpy() for tensor in gaussians.tensors]
-    if camera.degree < 0:
-        arrays[4] = arrays[4].reshape(-1, 1, 3)
-    splats, lists = _project_and_bin(Scene(*arrays), camera, with_slots=False)
+    splats, lists = _project_scene(gaussians, camera)
 
     def draw(behind: Array) -> Array:
         out = _new_picture(camera, with_last=False)
@@ -103,13 +100,31 @@ def rasterize_part(
 
     image = draw(to_float32(background).numpy())
     black = np.zeros(3, np.float32)
-    is_part = np.zeros(len(arrays[0]), np.bool_)
+    is_part = np.zeros(len(gaussians.means), np.bool_)
     is_part[rows.numpy()] = True
     splats.colors[~is_part, :3] = 0.0
     part = draw(black)
     splats.colors[is_part, :3] = 1.0
     share = draw(black)[..., 0]
     return torch.from_numpy(image), torch.from_numpy(share), torch.from_numpy(part)
+
+
+def draw_tiles(
+    kernel: Any, gaussians: ActivatedGaussians, view: RasterView, background: Array
+) -> RenderBuffers:
+    """Project and bin Gaussians, and run another kernel than `blend` over the tiles, without gradients.
+
+    Args:
+        kernel: `kernel(begin, end, scratch, splats, lists, camera, background, out)`
+        gaussians: the scene
+        view: the camera
+        background: rgb behind everything. [3] float32
+    """
+    camera = make_pinhole(view)
+    splats, lists = _project_scene(gaussians, camera)
+    out = _new_picture(camera, with_last=False)
+    share_tiles(kernel, camera, splats, lists, camera, background, out)
+    return out
 
 
 def make_pinhole(view: RasterView) -> Pinhole:
@@ -148,6 +163,14 @@ def bin_view(gaussians: ActivatedGaussians, camera: Pinhole) -> tuple[Splats, Ti
     arrays = [to_float32(tensor).detach().numpy() for tensor in gaussians[:4]]
     arrays.append(np.zeros((len(gaussians.means), 1, 3), np.float32))
     return _project_and_bin(Scene(*arrays), camera._replace(degree=-1), with_slots=True)
+
+
+def _project_scene(gaussians: ActivatedGaussians, camera: Pinhole) -> tuple[Splats, TileLists]:
+    """Return the splats of a scene, with colors, and the tile lists."""
+    arrays = [to_float32(tensor).detach().numpy() for tensor in gaussians.tensors]
+    if camera.degree < 0:
+        arrays[4] = arrays[4].reshape(-1, 1, 3)
+    return _project_and_bin(Scene(*arrays), camera, with_slots=False)
 
 
 def share_tiles(kernel: Any, camera: Pinhole, *arguments: Any) -> None:

@@ -10,7 +10,7 @@ from imgui_bundle import imgui
 
 from tests.helpers.ui_rig import HEAD, TRACK
 from viewer.camera.view_camera import Bounds, ViewCamera, axes
-from viewer.panel import card, panel, tools
+from viewer.panel import card, panel, view_settings
 from viewer.panel.slider import parse_strength
 from viewer.state import history, workspace
 from viewer.state.actions import perform
@@ -44,7 +44,7 @@ class Hand:
         imgui.new_frame()
         self.work = panel.draw(self.work, FACTS, panel.Pictures(), False, self.ui, self.actions)
         area = Area((SIZE[0] - panel.WIDTH_PX) * self.ui.scale, SIZE[1] * self.ui.scale)
-        view = tools.draw_view(self.work.view, area, 0.0, self.ui, self.actions)
+        view = view_settings.draw_view(self.work.view, area, 0.0, self.ui, self.actions)
         self.work = replace(self.work, view=view)
         imgui.render()
         if not imgui.is_any_item_active():
