@@ -6,10 +6,11 @@
 
 If one color map can represent the edit, the answer is a grade, 3.gdf beside 3.png, for every strength and
 camera. Otherwise it is the editor's own picture of the view. The editor "grade" only requests the region's
-main colors. If the request of a picture has `estimate`, an answer "near" follows: it estimates how close
-training will come to the picture. A request is skipped if a later one has arrived. `model` paints a prompt;
-another `seed` gives another painting. With `seed` -1 nothing is painted; `note` names the model and device,
-and `models` the models on this machine. The process ends when its input ends.
+main colors, and 3.npz beside 3.png: its rows, and a sample of its colors with its shares of their pixels. If
+the request of a picture has `estimate`, an answer "near" follows: it estimates how close training will come
+to the picture. A request is skipped if a later one has arrived. `model` paints a prompt; another `seed` gives
+another painting. With `seed` -1 nothing is painted; `note` names the model and device, and `models` the
+models on this machine. The process ends when its input ends.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import msgspec
+import numpy as np
 import torch
 import tyro
 from torch import Tensor
@@ -154,16 +156,22 @@ class Previewer:
     def palette(self, request: PreviewRequest) -> list[str]:
         """Return the main visible colors of the region, #rrggbb; empty if it is not visible.
 
+        The region's rows, and the colors of its visible pixels with their shares, are saved for the window.
+
         Raises:
             ProgdfError: invalid region.
         """
         views = self._views(request)
-        if views is None:
-            return []
-        visible = [(sample, sample.mask > 0.0) for sample in views.glances]
-        rgb = torch.cat([sample.inside[pixels] for sample, pixels in visible])
-        colors = find_palette(rgb, torch.cat([sample.mask[pixels] for sample, pixels in visible]))
-        return [hex_color(color) for color in colors.tolist()]
+        members = self._region(request.region).members
+        rgb = torch.zeros(0, 3)
+        shares = torch.zeros(0)
+        if views is not None:
+            visible = [(sample, sample.mask > 0.0) for sample in views.glances]
+            rgb = torch.cat([sample.inside[pixels] for sample, pixels in visible])
+            shares = torch.cat([sample.mask[pixels] for sample, pixels in visible])
+        path = Path(request.out).with_suffix(".npz")
+        np.savez(path, rows=members.numpy(), colors=rgb.numpy(), shares=shares.numpy())
+        return [hex_color(color) for color in find_palette(rgb, shares).tolist()]
 
     def _views(self, request: PreviewRequest) -> DraftViews | None:
         if self._draft[0] != request.region:

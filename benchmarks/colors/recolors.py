@@ -21,6 +21,7 @@ from torch import Tensor
 
 from benchmarks.table import Table
 from progdf.color import edits as color
+from progdf.color import grade as grading
 from progdf.color.oklab import srgb_from_linear, srgb_to_oklab
 from progdf.color.shading import JND
 from progdf.formats.scene_file import load_scene
@@ -137,12 +138,12 @@ def ball(material: Material, side: int = SIDE_PX) -> tuple[Tensor, Tensor, Tenso
 def edits_of(rgb: Tensor, target: Tensor) -> Mapping[str, Tensor]:
     """Return a region's colors after each of `EDITS` at full strength. [N,3], [3] -> [N,3] each"""
     source = color.measure_color(rgb)
-    grade = color.ColorGrade(palette=((source.color, target),))
-    grade = color.measure_grade(grade, rgb, torch.ones(len(rgb)))
+    grade = grading.ColorGrade(palette=((source.color, target),))
+    grade = grading.measure_grade(grade, rgb, torch.ones(len(rgb)))
     return {
         "recolor": color.recolor_fully(rgb, target, source),
         "tint": color.tint_fully(rgb, target, source),
-        "grade": color.grade_fully(rgb, grade),
+        "grade": grading.grade_fully(rgb, grade),
     }
 
 

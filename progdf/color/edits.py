@@ -9,9 +9,8 @@ edit.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -31,23 +30,12 @@ from .oklab import (
     smoothstep,
     srgb_to_oklab,
 )
-from .palette import (
-    Curve,
-    are_alike,
-    bend_lightness,
-    chroma_factor,
-    find_shades,
-    measure_palette,
-    shift_palette,
-)
 from .shading import Shading, measure_shading, nearest_lightness, relight, weighted_quantiles
 
 ColorFunction = Callable[[Strength], Tensor]
 """Function from a strength to colors [...,3]: the path of an edit."""
 
 _MIN_CHROMA = 0.015  # smallest chroma of a target with a hue
-_CAST_CHROMA = 0.1  # chroma of white under the bluest and the most amber light, as a share of its lightness
-_MIDDLE_GRAY = 0.5646  # lightness of 18 % gray, the fixed point of contrast
 _TINT_SHARE = 0.7  # share of hue and chroma that a tint takes from its color
 _MOON_SHARE = 0.75  # share of hue and chroma that night takes from the moonlight
 _MOONLIGHT = (0.35, 0.50, 0.85)  # sRGB
@@ -193,173 +181,12 @@ def _in_moonlight(rgb: Tensor) -> Tensor:
     return fit_gamut(torch.cat([lightness, torch.lerp(lab[..., 1:], moon[1:] * fade, _MOON_SHARE)], dim=-1))
 
 
-GRADE_RANGES: dict[str, tuple[float, float, float]] = {
-    "exposure": (-5.0, 5.0, 0.0),
-    "temperature": (-1.0, 1.0, 0.0),
-    "tint": (-1.0, 1.0, 0.0),
-    "contrast": (-1.0, 1.0, 0.0),
-    "saturation": (-1.0, 1.0, 0.0),
-    "black": (0.0, 0.5, 0.0),
-    "white": (0.5, 1.0, 1.0),
-}
-"""Smallest, largest and neutral value of each setting of a grade.
-
-Exposure is in stops. Temperature goes from blue to amber, tint from green to magenta, and saturation from
-gray to twice the chroma. Black and white are the sRGB values that become 0 and 1.
-"""
-
-
-@dataclass(frozen=True)
-class ColorGrade:
-    """Settings of a color grade."""
-
-    values: Mapping[str, float] = field(
-        default_factory=dict
-    )  # by names of `GRADE_RANGES`; others are neutral
-    palette: tuple[tuple[Tensor, Tensor], ...] = ()  # source and target colors, sRGB [3], see `shift_palette`
-    palette_curves: tuple[Curve, ...] = ()  # lightness curves near each source; empty, or one per source
-    curve: Curve = ()  # lightness curve for all colors
-    # measured shading of each source, see `measure_grade`; empty: without highlights
-    palette_shadings: tuple[Shading, ...] = ()
-    palette_shades: tuple[
-        Tensor, ...
-    ] = ()  # OKLab colors that move with each source; empty, or one per source
-
-    @property
-    def is_neutral(self) -> bool:
-        """True if the grade changes nothing."""
-        has_neutral_values = all(
-            self.values.get(name, neutral) == neutral for name, (*_, neutral) in GRADE_RANGES.items()
-        )
-        has_neutral_palette = all(torch.equal(source, target) for source, target in self.palette)
-        curves = (*self.palette_curves, self.curve)
-        return (
-            has_neutral_values and has_neutral_palette and all(x == y for curve in curves for x, y in curve)
-        )
-
-
-def parse_grade(what: str) -> ColorGrade:
-    """Parse a grade from a text of parts between commas.
-
-    - NAME=NUMBER sets a value of `GRADE_RANGES`.
-    - #rrggbb=#rrggbb changes a color into another, and #rrggbb holds one.
-    - curve=FROM:TO+FROM:TO sets the lightness curve.
-    - #rrggbb=#rrggbb/FROM:TO+FROM:TO sets the lightness curve near a color.
-
-    Raises:
-        ProgdfError: a part cannot be read, or the grade changes nothing.
-    """
-    values: dict[str, float] = {}
-    pairs: list[tuple[Tensor, Tensor]] = []
-    curves: list[Curve] = []
-    curve: Curve = ()
-    for part in what.split(","):
-        name, equals, number = (word.strip() for word in part.partition("="))
-        if name.startswith("#"):
-            target, bends, points = number.partition("/")
-            pair = parse_color(name), parse_color(target if equals else name)
-            if any(are_alike(pair[0], source) for source, _ in pairs):
-                raise ProgdfError(f"grade:{what:.80} has two colors close to {name}; remove one of them")
-            pairs.append(pair)
-            curves.append(_curve_of(what, points) if bends else ())
-        elif name == "curve" and not curve:
-            curve = _curve_of(what, number)
-        elif name not in GRADE_RANGES or name in values:
-            names = ", ".join(GRADE_RANGES)
-            raise ProgdfError(
-                f"grade:{what:.80} has '{part:.40}'; write NAME=NUMBER, each name once: {names}; "
-                "#rrggbb=#rrggbb; or curve=0.3:0.2"
-            )
-        else:
-            low, high, _ = GRADE_RANGES[name]
-            values[name] = number_of(number)
-            if not low <= values[name] <= high:
-                raise ProgdfError(f"in grade:{what:.80} {name} is '{number:.40}'; write {low:g} to {high:g}")
-    if len(pairs) > MAX_PAIRS:
-        raise ProgdfError(f"grade:{what:.80} has {len(pairs)} colors; at most {MAX_PAIRS} are possible")
-    grade = ColorGrade(values, tuple(pairs), tuple(curves), curve)
-    if grade.is_neutral:
-        raise ProgdfError(f"grade:{what:.80} changes nothing; write, for example, grade:exposure=0.7")
-    return grade
-
-
-MAX_PAIRS = 16
-"""Largest number of colors that a grade changes or holds."""
-
-
-def _curve_of(what: str, text: str) -> Curve:
-    """Return the points of a curve such as `0.3:0.2+0.7:0.8`."""
-    points = [tuple(number_of(n) for n in point.split(":")) for point in text.split("+")]
-    curve = tuple((p[0], p[1]) for p in points if len(p) == 2 and all(0.0 <= x <= 1.0 for x in p))
-    is_ascending = all(a[0] < b[0] for a, b in pairwise(curve))
-    if len(curve) < len(points) or not is_ascending:
-        raise ProgdfError(
-            f"in grade:{what:.80} the curve is '{text:.40}'; write FROM:TO+FROM:TO, each 0 to 1, FROM rising"
-        )
-    return curve
-
-
 def number_of(text: str) -> float:
     """Return the number in a text, or NaN if there is none."""
     try:
         return float(text)
     except ValueError:
         return math.nan
-
-
-def measure_grade(grade: ColorGrade, rgb: Tensor, weights: Tensor) -> ColorGrade:
-    """Return the grade with shading and shades of its source colors, measured in a region.
-
-    Args:
-        grade: the grade; without a palette, it is returned unchanged
-        rgb: colors of the region, sRGB 0 to 1. [N,3]
-        weights: visible area of each color, ≥ 0. [N]
-    """
-    if not grade.palette:
-        return grade
-    sources = srgb_to_oklab(torch.stack([source for source, _ in grade.palette]))
-    lab = srgb_to_oklab(rgb.clamp(0, 1)).reshape(-1, 3)
-    areas = weights.reshape(-1)
-    shades = find_shades(rgb.reshape(-1, 3), areas, sources)
-    shadings = measure_palette(lab, areas, sources, shades)
-    return replace(grade, palette_shadings=shadings, palette_shades=shades)
-
-
-def grade_course(rgb: Tensor, grade: ColorGrade) -> ColorFunction:
-    """Return the path from colors to those of `grade_fully`, straight in OKLab."""
-    return color_path(rgb, grade_fully(rgb, grade), STRAIGHT)
-
-
-def grade_fully(rgb: Tensor, grade: ColorGrade) -> Tensor:
-    """Apply palette, levels, exposure, white balance, contrast, curve and saturation, in this order.
-
-    Args:
-        rgb: sRGB colors, 0 to 1. [...,3]
-        grade: settings
-
-    Returns:
-        Graded sRGB colors, 0 to 1. [...,3]
-    """
-    value = {name: grade.values.get(name, neutral) for name, (_, _, neutral) in GRADE_RANGES.items()}
-    if grade.palette:
-        sources, targets = (srgb_to_oklab(torch.stack(colors)) for colors in zip(*grade.palette, strict=True))
-        lab = srgb_to_oklab(rgb.clamp(0, 1))
-        shifted = shift_palette(
-            lab, sources, targets, grade.palette_curves, grade.palette_shadings, grade.palette_shades
-        )
-        rgb = fit_gamut(shifted)
-    levels = ((rgb.clamp(0, 1) - value["black"]) / (value["white"] - value["black"])).clamp(0, 1)
-    lab = srgb_to_oklab(levels) * 2.0 ** (value["exposure"] / 3)  # homogeneous of degree 1/3 in linear light
-    lightness = lab[..., 0].clamp(0, 1)
-    cast = _CAST_CHROMA * lightness[..., None] * lab.new_tensor([value["tint"], value["temperature"]])
-    power = 2.0 ** value["contrast"]
-    low = _MIDDLE_GRAY * (lightness / _MIDDLE_GRAY).clamp_max(1).pow(power)
-    high = (1 - _MIDDLE_GRAY) * ((1 - lightness) / (1 - _MIDDLE_GRAY)).clamp_max(1).pow(power)
-    steeper = torch.where(lightness < _MIDDLE_GRAY, low, 1 - high)
-    if grade.curve:
-        steeper = bend_lightness(steeper, grade.curve)
-    chroma = (lab[..., 1:] + cast) * (1 + value["saturation"]) * chroma_factor(lightness, steeper)[..., None]
-    return fit_gamut(torch.cat([steeper[..., None], chroma], dim=-1))
 
 
 def stripe_pattern(points: Tensor, axis: Tensor, period: float, phase: float = 0.0) -> Tensor:

@@ -77,6 +77,7 @@ def shift_palette(
     curves: Sequence[Curve] = (),
     shadings: Sequence[Shading] = (),
     shades: Sequence[Tensor] = (),
+    ranges: Sequence[float] = (),
 ) -> Tensor:
     """Map colors so that sources become targets, all in OKLab. [...,3], [k,3], [k,3] -> [...,3]
 
@@ -89,10 +90,11 @@ def shift_palette(
         curves: lightness curve near each source, applied after the shift; empty, or k
         shadings: measured shading of each source, see `measure_palette`; empty: without highlights
         shades: colors that move with each source, see `find_shades`; empty, or k. [s,3] each
+        ranges: factor on the reach of each source; empty, or k. Sources stay exact for any range
     """
     colors = lab.reshape(-1, 3).double()
     shadings = shadings or [Shading(float(source[0])) for source in sources]
-    weights = source_weights(colors, sources.double(), shadings, shades)
+    weights = source_weights(colors, sources.double(), shadings, shades, ranges)
     moved = torch.zeros_like(colors)
     for i, shading in enumerate(shadings):
         shift = _paint_shift(
@@ -109,7 +111,11 @@ def shift_palette(
 
 
 def source_weights(
-    colors: Tensor, sources: Tensor, shadings: Sequence[Shading] = (), shades: Sequence[Tensor] = ()
+    colors: Tensor,
+    sources: Tensor,
+    shadings: Sequence[Shading] = (),
+    shades: Sequence[Tensor] = (),
+    ranges: Sequence[float] = (),
 ) -> Tensor:
     """Return the weight of each source at each color, ≥ 0. OKLab [N,3], [k,3] -> [N,k]
 
@@ -118,9 +124,13 @@ def source_weights(
         sources: source colors, OKLab. [k,3]
         shadings: measured shading of each source; only used for a single source
         shades: further colors at which the weight of each source is 1; empty, or k. [s,3] each
+        ranges: factor on the reach of each source; empty, or k. A factor moves the borders to its neighbors
     """
+    squared_ranges = colors.new_tensor(ranges).square() if ranges else colors.new_ones(len(sources))
     if len(sources) == 1:
-        return _single_weight(colors, sources[0], shadings[0] if shadings else Shading(float(sources[0, 0])))
+        shading = shadings[0] if shadings else Shading(float(sources[0, 0]))
+        # a power of a Gaussian kernel is one of another width
+        return _single_weight(colors, sources[0], shading).pow(1.0 / squared_ranges)
     owners = torch.tensor([*range(len(sources)), *(i for i, own in enumerate(shades) for _ in own)])
     kernel_sources = kernel_space(torch.cat([sources, *(own.to(sources) for own in shades)]))
     source_distances = torch.cdist(kernel_sources, kernel_sources)
@@ -132,6 +142,7 @@ def source_weights(
     source_kernel = torch.exp(-0.5 * (source_distances / width).square())
     parts: Tensor = (kernel @ torch.linalg.inv(source_kernel)).clamp_min(0.0)
     weights = torch.zeros_like(parts[:, : len(sources)]).index_add_(1, owners, parts)
+    weights = weights * squared_ranges
     return weights / weights.sum(dim=1, keepdim=True)
 
 

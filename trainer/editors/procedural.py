@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from progdf.color import edits as color
+from progdf.color.grade import grade_course, measure_grade, parse_grade
 from progdf.color.oklab import ColorPath, bend_of, interpolate_colors, oklab_to_srgb, path_of
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
@@ -167,9 +168,9 @@ def night(given: EditorInput) -> ColorEditor:
 
 def grade(given: EditorInput) -> ColorEditor:
     """Return the editor of `grade:exposure=0.5,#8a5a2b=#2b5a8a,curve=0.3:0.2` (see `parse_grade`)."""
-    requested = color.parse_grade(given.what)
+    requested = parse_grade(given.what)
     if requested.palette:
-        requested = color.measure_grade(requested, *region_samples(given))
+        requested = measure_grade(requested, *region_samples(given))
         found = zip(requested.palette, requested.palette_shadings, requested.palette_shades, strict=True)
         for (source, _), shading, shades in found:
             line = f"{color.hex_color(source.tolist())} in the region: {shading.describe()}"
@@ -177,7 +178,7 @@ def grade(given: EditorInput) -> ColorEditor:
                 names = [color.hex_color(shade.tolist()) for shade in oklab_to_srgb(shades)]
                 line = f"{line}; shades of the same surface move with it: {', '.join(names)}"
             given.say(line)
-    return ColorEditor(lambda rgb: color.grade_course(rgb, requested))
+    return ColorEditor(lambda rgb: grade_course(rgb, requested))
 
 
 def stripes(given: EditorInput) -> StripesEditor:

@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from progdf.errors import ProgdfError
 from progdf.io.atomic import make_folder
@@ -58,6 +59,23 @@ def region_option(form: NewEdit, folder: Path, state: SelectionState, total: int
     path = folder / f"{name or f'{zlib.crc32(members):08x}'}{selection.SUFFIX}"
     write_region(NamedRegion(name, path, members, state.count), total)
     return f"file:{path}"
+
+
+def region_rows(form: NewEdit, state: SelectionState, total: int) -> NDArray[np.int64] | None:
+    """Return the rows of a form's region, ascending; None if only the trainer can find them. [M]
+
+    Args:
+        form: names the region
+        state: the selection and the regions
+        total: number of Gaussians in the original
+    """
+    if form.region == ALL:
+        return np.arange(total)
+    if form.region in (TYPED, CHANGED):
+        return None
+    regions = {region.name: region.members for region in state.regions}
+    members = state.members if form.region == SELECTION else regions.get(form.region)
+    return None if members is None else np.flatnonzero(unpack(members, total))
 
 
 def keep_region(state: SelectionState, name: str, folder: Path, total: int) -> SelectionState:

@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from progdf.camera import Camera
@@ -51,6 +52,15 @@ class PreviewInputs:
         return self.region, self.editor.partition(":")[0]
 
 
+@dataclass(frozen=True, eq=False)
+class RegionSample:
+    """Rows of a region, and the colors of its visible pixels in some views."""
+
+    rows: NDArray[np.int64]  # ascending. [M]
+    colors: NDArray[np.float32]  # the region's own colors, sRGB 0 to 1. [P,3]
+    shares: NDArray[np.float32]  # the region's share of each pixel, 0 to 1. [P]
+
+
 @dataclass(frozen=True)
 class Preview:
     """Answer to a request: a picture, a grade's file, a palette, a note or an error."""
@@ -65,6 +75,13 @@ class Preview:
     models: tuple[str, ...] = ()  # models on this machine
     follows: bool = False  # the edit of a sentence can follow this picture
     palette: tuple[str, ...] = ()  # main colors of the region, #rrggbb
+    sample: Any = None  # `RegionSample` beside a palette
+
+
+def _read_sample(path: Path) -> RegionSample:
+    """Read the sample of a region that the process has written."""
+    with np.load(path) as arrays:
+        return RegionSample(arrays["rows"], arrays["colors"], arrays["shares"])
 
 
 class PreviewChild:
@@ -112,8 +129,10 @@ class PreviewChild:
             )
         try:
             answer = convert_json(decode_json(line), Preview)
-            if answer.error or answer.made in ("note", "palette", "near"):
+            if answer.error or answer.made in ("note", "near"):
                 return replace(answer, error=without_commands(answer.error))
+            if answer.made == "palette":
+                return replace(answer, sample=_read_sample(self._picture(answer.number).with_suffix(".npz")))
             if answer.made == "grade":
                 return replace(answer, grade=self._picture(answer.number).with_suffix(".gdf"))
             with Image.open(self._picture(answer.number)) as picture:

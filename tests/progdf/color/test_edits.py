@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from progdf.color import edits as color
+from progdf.color import grade as grading
 from progdf.color.oklab import oklab_to_srgb, srgb_to_oklab
 from progdf.errors import ProgdfError
 from tests.helpers.color_edits import recolor, stripes, tint
@@ -68,9 +69,9 @@ def _edited(edit: str, rgb: Tensor, strength: float) -> Tensor:
     if edit == "night":
         return color.night_course(rgb)(strength)
     if edit == "grade":
-        return color.grade_course(rgb, color.ColorGrade({"exposure": 1.0, "temperature": 0.5, "black": 0.1}))(
-            strength
-        )
+        return grading.grade_course(
+            rgb, grading.ColorGrade({"exposure": 1.0, "temperature": 0.5, "blacks": -0.5})
+        )(strength)
     return (recolor if edit == "recolor" else tint)(rgb, BLUE, strength)
 
 
@@ -126,39 +127,6 @@ def test_darkening_by_one_stop_halves_the_light() -> None:
     linear = ((0.8 + 0.055) / 1.055) ** 2.4
     darker = ((color.darken(gray, 1.0, stops=1.0) + 0.055) / 1.055) ** 2.4
     assert torch.allclose(darker, torch.full((1, 3), linear / 2), rtol=1e-3)
-
-
-def test_each_grade_value_has_its_named_effect() -> None:
-    def graded(rgb: Tensor, **values: float) -> Tensor:
-        return color.grade_fully(rgb, color.ColorGrade(values))
-
-    gray = torch.full((1, 3), 0.5)
-    some = 0.2 + 0.6 * _random()
-    assert torch.allclose(graded(some), some, atol=1e-3), "neutral values change nothing"
-    linear = ((0.5 + 0.055) / 1.055) ** 2.4
-    brighter = ((graded(gray, exposure=0.5) + 0.055) / 1.055) ** 2.4
-    assert torch.allclose(brighter, torch.full((1, 3), linear * 2**0.5), rtol=2e-3)
-    red, green, blue = graded(gray, temperature=1.0)[0]
-    assert red > green > blue
-    red, green, blue = graded(gray, tint=1.0)[0]
-    assert min(red, blue) > green
-    assert graded(some, saturation=-1.0).std(dim=1).max() < 1e-3
-    more = _polar(graded(some, saturation=0.2))[1] / _polar(some)[1]
-    assert 1.15 < more.median() < 1.21
-    middle = torch.full((1, 3), 0.4613)  # 18 % of the light
-    assert torch.allclose(graded(middle, contrast=0.8), middle, atol=2e-3)
-    steeper = graded(torch.tensor([[0.3, 0.3, 0.3], [0.7, 0.7, 0.7]]), contrast=0.5)
-    assert steeper[0].max() < 0.28
-    assert steeper[1].min() > 0.72
-    levels = graded(torch.tensor([[0.1, 0.1, 0.1], [0.5, 0.5, 0.5], [0.9, 0.9, 0.9]]), black=0.1, white=0.9)
-    assert torch.allclose(levels[:, 0], torch.tensor([0.0, 0.5, 1.0]), atol=2e-3)
-    extreme = [(name, end) for name, (low, high, _) in color.GRADE_RANGES.items() for end in (low, high)]
-    for name, end in extreme:
-        edited = graded(
-            torch.cat([_random(), torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])]), **{name: end}
-        )
-        assert edited.isfinite().all()
-        assert 0 <= edited.min() <= edited.max() <= 1
 
 
 def test_strength_may_differ_per_pixel() -> None:

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from progdf.color import edits as color
+from progdf.color import grade as grading
 from progdf.color.oklab import srgb_to_oklab
 from progdf.color.palette import COLORS, bend_lightness, find_palette, shift_palette
 from tests.helpers.draws import Draws
@@ -46,13 +47,13 @@ def test_invisible_colors_are_not_in_the_palette() -> None:
 
 def test_palette_maps_sources_to_targets_and_holds_the_others() -> None:
     blue = color.parse_color("#3060d0")
-    grade = color.ColorGrade(palette=((LAWN, blue), (BEAR, BEAR), (STONE, STONE)))
-    edited = color.grade_fully(torch.stack([LAWN, BEAR, STONE]), grade)
+    grade = grading.ColorGrade(palette=((LAWN, blue), (BEAR, BEAR), (STONE, STONE)))
+    edited = grading.grade_fully(torch.stack([LAWN, BEAR, STONE]), grade)
     assert torch.allclose(edited, torch.stack([blue, BEAR, STONE]), atol=2e-3)
     lawn = scene({500: LAWN})
-    assert (color.grade_fully(lawn, grade).mean(dim=0) - blue).abs().max() < 0.06
+    assert (grading.grade_fully(lawn, grade).mean(dim=0) - blue).abs().max() < 0.06
     ends = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
-    assert torch.allclose(color.grade_fully(ends, grade), ends, atol=5e-3)
+    assert torch.allclose(grading.grade_fully(ends, grade), ends, atol=5e-3)
 
 
 def test_each_color_moves_fully_with_its_nearest_palette_color() -> None:
@@ -93,52 +94,52 @@ def test_lightness_curve_passes_its_points_and_stays_in_range(
 
 
 def test_lightness_curve_keeps_the_hue() -> None:
-    grade = color.ColorGrade(curve=((0.5, 0.35),))
+    grade = grading.ColorGrade(curve=((0.5, 0.35),))
     rgb = torch.stack([LAWN, BEAR])
     before = srgb_to_oklab(rgb)
-    after = srgb_to_oklab(color.grade_fully(rgb, grade))
+    after = srgb_to_oklab(grading.grade_fully(rgb, grade))
     assert (after[:, 0] < before[:, 0] - 0.05).all()
     hues = [torch.atan2(lab[:, 2], lab[:, 1]) for lab in (before, after)]
     assert torch.allclose(*hues, atol=0.02)
 
 
 def test_palette_and_curve_grade_is_exact_at_strength_0() -> None:
-    grade = color.ColorGrade(palette=((LAWN, SCARF),), curve=((0.5, 0.3),))
+    grade = grading.ColorGrade(palette=((LAWN, SCARF),), curve=((0.5, 0.3),))
     rgb = scene({50: LAWN})
-    assert torch.equal(color.grade_course(rgb, grade)(0.0), rgb)
+    assert torch.equal(grading.grade_course(rgb, grade)(0.0), rgb)
 
 
 def test_curve_of_one_color_bends_only_nearby_colors() -> None:
     held = tuple((c, c) for c in (LAWN, BEAR, STONE))
     colors = torch.stack([LAWN, BEAR, STONE])
     lightness = srgb_to_oklab(LAWN)[0].item()
-    darker = color.ColorGrade(palette=held, palette_curves=(((lightness, lightness - 0.2),), (), ()))
-    edited = srgb_to_oklab(color.grade_fully(colors, darker))
+    darker = grading.ColorGrade(palette=held, palette_curves=(((lightness, lightness - 0.2),), (), ()))
+    edited = srgb_to_oklab(grading.grade_fully(colors, darker))
     before = srgb_to_oklab(colors)
     assert edited[0, 0].item() == pytest.approx(lightness - 0.2, abs=5e-3)
     assert torch.allclose(edited[1:], before[1:], atol=2e-3)
     assert torch.allclose(edited[0, 1:] / edited[0, 0], before[0, 1:] / before[0, 0], atol=5e-3), (
         "in less light"
     )
-    assert torch.equal(color.grade_course(colors, darker)(0.0), colors), "exact at strength 0"
+    assert torch.equal(grading.grade_course(colors, darker)(0.0), colors), "exact at strength 0"
     assert not darker.is_neutral
-    straight = color.ColorGrade(palette=held, palette_curves=(((0.5, 0.5),), (), ()))
+    straight = grading.ColorGrade(palette=held, palette_curves=(((0.5, 0.5),), (), ()))
     assert straight.is_neutral
-    assert torch.allclose(color.grade_fully(colors, straight), colors, atol=2e-3)
+    assert torch.allclose(grading.grade_fully(colors, straight), colors, atol=2e-3)
 
 
 def test_measured_grade_keeps_its_parsed_curves() -> None:
-    parsed = color.parse_grade("#7eae44=#4474ae/0.3:0.2,curve=0.5:0.4")
-    measured = color.measure_grade(parsed, scene({500: LAWN}), torch.ones(500))
+    parsed = grading.parse_grade("#7eae44=#4474ae/0.3:0.2,curve=0.5:0.4")
+    measured = grading.measure_grade(parsed, scene({500: LAWN}), torch.ones(500))
     assert measured.palette_curves == parsed.palette_curves == (((0.3, 0.2),),)
     assert measured.curve == parsed.curve == ((0.5, 0.4),)
     assert len(measured.palette_shadings) == 1
 
 
 def test_curve_of_one_color_has_no_steps() -> None:
-    bent = color.ColorGrade(
+    bent = grading.ColorGrade(
         palette=((LAWN, BEAR), (STONE, STONE)), palette_curves=(((0.4, 0.6), (0.8, 0.7)), ((0.5, 0.3),))
     )
     ramp = torch.lerp(LAWN, STONE, torch.linspace(0, 1, 2001)[:, None])
-    steps = color.grade_fully(ramp, bent).diff(dim=0).abs()
+    steps = grading.grade_fully(ramp, bent).diff(dim=0).abs()
     assert steps.max() < 30 * ramp.diff(dim=0).abs().max()

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from progdf.color import edits as color
+from progdf.color import grade as grading
 from progdf.color.oklab import srgb_to_oklab
 from progdf.color.palette import bend_lightness, with_highlights
 from progdf.color.shading import (
@@ -34,8 +35,8 @@ def edited(rgb: Tensor, target: Tensor, edit: str) -> Tensor:
     source = color.measure_color(rgb)
     if edit == "recolor":
         return color.recolor_fully(rgb, target, source)
-    grade = color.ColorGrade(palette=((source.color, target),))
-    return color.grade_fully(rgb, color.measure_grade(grade, rgb, torch.ones(len(rgb))))
+    grade = grading.ColorGrade(palette=((source.color, target),))
+    return grading.grade_fully(rgb, grading.measure_grade(grade, rgb, torch.ones(len(rgb))))
 
 
 @pytest.mark.parametrize("edit", ["recolor", "grade"])
@@ -74,9 +75,9 @@ def test_white_in_warm_and_cool_light_is_one_surface() -> None:
     light = torch.linspace(0.75, 1.0, 200)[:, None]
     warm = light * color.parse_color("#f8eedd")
     cool = light * color.parse_color("#f0f2f8")
-    grade = color.ColorGrade(palette=((color.parse_color("#f8eedd"), TARGETS[0]),))
+    grade = grading.ColorGrade(palette=((color.parse_color("#f8eedd"), TARGETS[0]),))
     rgb = torch.cat([warm, cool])
-    lab = srgb_to_oklab(color.grade_fully(rgb, color.measure_grade(grade, rgb, torch.ones(400))))
+    lab = srgb_to_oklab(grading.grade_fully(rgb, grading.measure_grade(grade, rgb, torch.ones(400))))
     chroma = lab[:, 1:].norm(dim=1)
     assert chroma[200:].median() > 0.65 * chroma[:200].median()
 
@@ -89,16 +90,16 @@ def test_changed_white_swatch_has_one_hue_in_warm_and_cool_light(target: torch.T
     dots = light * color.parse_color("#373336")
     swatch = color.parse_color("#dac5ab")
     dark = color.parse_color("#373336")
-    grade = color.ColorGrade(palette=((swatch, target), (dark, dark)))
+    grade = grading.ColorGrade(palette=((swatch, target), (dark, dark)))
     rgb = torch.cat([warm, cool, dots])
-    lab = srgb_to_oklab(color.grade_fully(rgb, color.measure_grade(grade, rgb, torch.ones(600))))
+    lab = srgb_to_oklab(grading.grade_fully(rgb, grading.measure_grade(grade, rgb, torch.ones(600))))
     goal = srgb_to_oklab(target)[1:]
     ray = goal / goal.norm().clamp_min(1e-6)
     for half in (lab[:200, 1:], lab[200:400, 1:]):
         aside = half - (half @ ray)[:, None] * ray
         assert aside.norm(dim=1).median() < JND
-    unchanged = color.ColorGrade(palette=((swatch, swatch), (dark, dark)))
-    same = color.grade_fully(rgb, color.measure_grade(unchanged, rgb, torch.ones(600)))
+    unchanged = grading.ColorGrade(palette=((swatch, swatch), (dark, dark)))
+    same = grading.grade_fully(rgb, grading.measure_grade(unchanged, rgb, torch.ones(600)))
     assert torch.allclose(same, rgb, atol=1e-5), "colored light stays on an unchanged swatch"
 
 
@@ -141,9 +142,9 @@ def test_paint_of_the_same_color_changes_nothing() -> None:
     for base in BASES[1:-3]:
         rgb = surface(base, 0.1, 4)
         source = color.measure_color(rgb).color
-        grade = color.ColorGrade(palette=((source, source),))
-        grade = color.measure_grade(grade, rgb, torch.ones(len(rgb)))
-        assert (color.grade_fully(rgb, grade) - rgb).abs().max() < 2e-3
+        grade = grading.ColorGrade(palette=((source, source),))
+        grade = grading.measure_grade(grade, rgb, torch.ones(len(rgb)))
+        assert (grading.grade_fully(rgb, grade) - rgb).abs().max() < 2e-3
 
 
 def test_black_and_white_paint_leave_room_for_shading() -> None:

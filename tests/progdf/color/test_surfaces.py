@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from progdf.color import edits as color
+from progdf.color import grade as grading
 from progdf.color.oklab import oklab_to_srgb, srgb_to_oklab
 from progdf.color.palette import find_palette, find_shades
 from progdf.color.surfaces import (
@@ -115,8 +116,8 @@ def test_changed_swatch_changes_all_its_shades_and_no_other(paint: str, target: 
     rgb = torch.cat([cloth, skin])
     found = palette(rgb)
     assert len(found) == 2
-    grade = color.ColorGrade(palette=((found[0], target), (found[1], found[1])))
-    edited = color.grade_fully(rgb, color.measure_grade(grade, rgb, torch.ones(len(rgb))))
+    grade = grading.ColorGrade(palette=((found[0], target), (found[1], found[1])))
+    edited = grading.grade_fully(rgb, grading.measure_grade(grade, rgb, torch.ones(len(rgb))))
     before = srgb_to_oklab(cloth)
     after = srgb_to_oklab(edited[: len(cloth)])
     goal = srgb_to_oklab(target)[1:]
@@ -144,13 +145,13 @@ def test_sources_and_shades_keep_exact_weights() -> None:
     """Held swatches stay exact, and each shade has the hue of its changed swatch."""
     rgb = torch.cat([lit("#ffffff", 1, 6000, darkest=0.5), lit("#7eae44", 2, 1500)])
     found = palette(rgb)
-    grade = color.ColorGrade(palette=((found[0], BLUE), (found[1], found[1])))
-    measured = color.measure_grade(grade, rgb, torch.ones(len(rgb)))
-    assert torch.allclose(color.grade_fully(found, measured), torch.stack([BLUE, found[1]]), atol=2e-3)
+    grade = grading.ColorGrade(palette=((found[0], BLUE), (found[1], found[1])))
+    measured = grading.measure_grade(grade, rgb, torch.ones(len(rgb)))
+    assert torch.allclose(grading.grade_fully(found, measured), torch.stack([BLUE, found[1]]), atol=2e-3)
     shades = oklab_to_srgb(measured.palette_shades[0]).clamp(0, 1).float()
-    apart = color.grade_fully(shades, replace(measured, palette_shades=()))
-    joined = color.grade_fully(shades, measured)
+    apart = grading.grade_fully(shades, replace(measured, palette_shades=()))
+    joined = grading.grade_fully(shades, measured)
     goal = srgb_to_oklab(BLUE)[1:]
     chroma = [(srgb_to_oklab(rgb)[:, 1:] @ (goal / goal.norm())).min() for rgb in (apart, joined)]
     assert chroma[1] >= chroma[0]
-    assert torch.equal(color.grade_course(rgb, measured)(0.0), rgb), "exact at strength 0"
+    assert torch.equal(grading.grade_course(rgb, measured)(0.0), rgb), "exact at strength 0"

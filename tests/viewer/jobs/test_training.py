@@ -231,7 +231,9 @@ def test_grade_spec_contains_the_palette_only_if_a_color_changes() -> None:
     colors = (("#7eae44", "#7eae44"), ("#b97a30", "#b97a30"))
     still = form("grade", palette=colors)
     assert (still.spec, still.obstacle) == ("grade", NO_CHANGE)
-    moved = form("grade", palette=(("#7eae44", "#3060d0"), colors[1]), curve="0.30:0.20+0.70:0.80")
+    moved = form(
+        "grade", palette=(("#7eae44", "#3060d0"), colors[1]), curves=("0.30:0.20+0.70:0.80", "", "", "")
+    )
     assert moved.spec == "grade:#7eae44=#3060d0,#b97a30,curve=0.30:0.20+0.70:0.80"
     check_new_editor(EditorOptions(moved.spec))
     again = with_settings(NewEdit(), moved.spec)
@@ -272,7 +274,7 @@ def test_form_and_trainer_have_the_same_number_of_styles() -> None:
 def test_editor_reports_what_is_missing_before_training() -> None:
     assert "Describe the edit" in form("instruct").obstacle or "pip install" in form("instruct").obstacle
     assert "slider" in form("grade").obstacle
-    assert form("grade", grade=(1.0, -0.25, *NEUTRAL[2:])).spec == "grade:exposure=1.00,temperature=-0.25"
+    assert form("grade", grade=(1.0, -0.25, *NEUTRAL[2:])).spec == "grade:exposure=1.00,contrast=-0.25"
     assert "folder" in form("folder").obstacle
     assert form("folder", folder="edited").obstacle == ""
     assert "pictures" in form("pictures").obstacle
@@ -384,7 +386,7 @@ def test_order_arguments_are_parsed_by_the_trainer() -> None:
     "spec",
     [
         *("recolor:#1b6972", "recolor:#1b6972,path=hue", "tint:#4f6fd8", "stripes:#ffffff", "darken:0.30"),
-        *("night:0.95", "grade:exposure=0.70,white=0.80", "style:23", "instruct:make it gold, please"),
+        *("night:0.95", "grade:exposure=0.70,whites=0.80", "style:23", "instruct:make it gold, please"),
         *("pictures:/a/b.png,/a/c.png", "folder:/a/views", "api:make it gold", "comfy:/a/b.json"),
         "command:magick {input} -modulate 100,{100..30} {output}",
     ],

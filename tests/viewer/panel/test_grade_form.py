@@ -10,7 +10,7 @@ from imgui_bundle import imgui
 
 from progdf.color.edits import parse_color
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
-from viewer.panel import new_edit_form, panel
+from viewer.panel import grade_form, new_edit_form, panel
 from viewer.state.forms import EDITORS, NewEdit, parse_curve
 
 pytestmark = pytest.mark.gl
@@ -19,7 +19,10 @@ COLORS = ("#7eae44", "#b97a30", "#a09a90")
 FORM = NewEdit(
     editor=next(i for i, editor in enumerate(EDITORS) if editor.kind == "grade"),
     palette=tuple((color, color) for color in COLORS),
+    folded=("Light", "Color", "Palette", "Wheels"),
 )
+SWATCH_Y = 296.0  # with an open palette
+CURVE_TOP = 376.0  # of a curve below folded sections
 LEFT = WINDOW[0] - panel.WIDTH_PX + 12.0 + 10.0 + new_edit_form.COLUMN_PX
 
 
@@ -36,25 +39,25 @@ def form(hand: Rig) -> NewEdit:
 
 
 def test_curve_points_are_added_dragged_and_removed_by_mouse(hand: Rig) -> None:
-    tall = new_edit_form._CURVE_PX
+    tall = grade_form.CURVE_PX
     wide = WINDOW[0] - 22.0 - LEFT
-    top = 438.0
+    top = CURVE_TOP
 
     def place(x: float, y: float) -> tuple[float, float]:
         return LEFT - 10.0 + x * wide, top + (1.0 - y) * tall
 
     hand.drag(place(0.3, 0.3), place(0.3, 0.15))
-    ((x, y),) = parse_curve(form(hand).curve)
+    ((x, y),) = parse_curve(form(hand).curves[0])
     assert x == pytest.approx(0.3, abs=0.06)
     assert y == pytest.approx(0.15, abs=0.06)
     hand.drag(place(0.7, 0.7), place(0.1, 0.9))
-    assert [round(b > a) for a, b in parse_curve(form(hand).curve)] == [0, 1]
-    points = parse_curve(form(hand).curve)
+    assert [round(b > a) for a, b in parse_curve(form(hand).curves[0])] == [0, 1]
+    points = parse_curve(form(hand).curves[0])
     assert points[0][0] < points[1][0], "points never pass each other"
     hand.move(*place(x, y))
-    hand.press(1)
-    hand.release(1)
-    assert len(parse_curve(form(hand).curve)) == 1
+    for _ in range(2):
+        hand.click(*place(x, y))
+    assert len(parse_curve(form(hand).curves[0])) == 1
 
 
 def test_curve_can_be_edited_by_keys_alone(hand: Rig) -> None:
@@ -62,9 +65,9 @@ def test_curve_can_be_edited_by_keys_alone(hand: Rig) -> None:
         for name in names:
             hand.modifier(getattr(imgui.Key, name))
             hand.modifier(getattr(imgui.Key, name), False)
-        return parse_curve(form(hand).curve)
+        return parse_curve(form(hand).curves[0])
 
-    hand.click(LEFT + 40.0, 557.0)  # the name field below the curve
+    hand.click(LEFT + 40.0, CURVE_TOP + grade_form.CURVE_PX + 18.0)  # the name field below the curve
     hand.modifier(imgui.Key.mod_shift)
     strike("tab")
     hand.modifier(imgui.Key.mod_shift, False)
@@ -77,10 +80,14 @@ def test_curve_can_be_edited_by_keys_alone(hand: Rig) -> None:
 
 
 def test_swatch_opens_a_picker_and_right_click_resets_its_color(hand: Rig) -> None:
-    y = 202.0
+    y = SWATCH_Y
     x = LEFT + 4.0
     moved = ((COLORS[0], "#3060d0"), *FORM.palette[1:])
-    hand.main_view.store.replace(replace(hand.main_view.work, form=replace(form(hand), palette=moved)))
+    hand.main_view.store.replace(
+        replace(
+            hand.main_view.work, form=replace(form(hand), palette=moved, folded=("Light", "Color", "Curve"))
+        )
+    )
     hand.frame(2)
     hand.move(x, y)
     hand.press(1)
@@ -106,3 +113,20 @@ def test_picking_a_color_adds_it_to_the_palette_only(hand: Rig) -> None:
     )
     assert not form(hand).picks
     assert (hand.main_view.work.view, hand.main_view.work.focus) == (before.view, before.focus)
+
+
+def test_wheel_follows_a_drag_and_a_double_click_resets_it(hand: Rig) -> None:
+    opened = replace(FORM, folded=("Light", "Color", "Palette", "Curve"))
+    hand.main_view.store.replace(replace(hand.main_view.work, form=opened))
+    hand.frame(2)
+    wide = (WINDOW[0] - 22.0 - (LEFT - 10.0 - new_edit_form.COLUMN_PX) - 16.0) / 3
+    center = LEFT - new_edit_form.COLUMN_PX + wide / 2, 330.0 + wide / 2
+    hand.drag((center[0] - 20.0, center[1]), (center[0], center[1] - 0.25 * wide))
+    shadows, midtones, _ = form(hand).wheels
+    assert shadows.hue == pytest.approx(90.0, abs=15.0)
+    assert 0.3 < shadows.amount < 0.9
+    assert not midtones.amount
+    assert "wheel_shadows=" in form(hand).spec
+    for _ in range(2):
+        hand.click(*center)
+    assert form(hand).spec == "grade"

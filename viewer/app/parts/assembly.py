@@ -139,6 +139,7 @@ def make_parts(
         context=main_view.context,
         picture_size=picture_size,
         save_edited=main_view.save_edited,
+        engine=lambda: main_view.engine,
     )
     jobs = JobActions(
         store=store,

@@ -28,6 +28,8 @@ from viewer.files import region_files, user_files
 from viewer.files.document import DocumentStore
 from viewer.jobs import consent, training
 from viewer.jobs.preview_process import Preview, PreviewChild, PreviewInputs
+from viewer.render.engine import ViewEngine
+from viewer.render.live_grade import FormGrader
 from viewer.state.commands import Plain
 from viewer.state.forms import EDITORS, NO_CHANGE, SHEET_COLUMNS, SHEET_PX, STYLE_ORDER, NewEdit, with_picture
 from viewer.state.transient import Cover, PreviewGhost, PreviewState
@@ -84,6 +86,7 @@ class PreviewActions:
         context: the GL context
         picture_size: returns width and height of the picture on screen, in pixels
         save_edited: writes the picture on screen with its visible layers into a folder; returns its path
+        engine: returns the engine that draws the window
     """
 
     def __init__(
@@ -95,6 +98,7 @@ class PreviewActions:
         context: moderngl.Context,
         picture_size: Callable[[], tuple[int, int]],
         save_edited: Callable[[Path, str], Path],
+        engine: Callable[[], ViewEngine],
     ) -> None:
         self._store = store
         self._documents = documents
@@ -102,6 +106,9 @@ class PreviewActions:
         self._context = context
         self._picture_size = picture_size
         self._save_edited = save_edited
+        self._engine = engine
+        self._grader = FormGrader()
+        self._graded_region = ""  # region of its rows, see `_region_key`
         self._child: PreviewChild | None = None
         self._texture: moderngl.Texture | None = None
         self._sent: PreviewInputs | None = None
@@ -134,6 +141,7 @@ class PreviewActions:
     def poll(self) -> float | None:
         """Request the preview and show an answer; return the seconds until the next poll, None for never."""
         self._free_ghosts()
+        self._grade_live()
         if self._painting is not None and self._is_painting(self._painting):
             self._end_live()
             return self._follow(self._painting)
@@ -168,7 +176,10 @@ class PreviewActions:
             self._sent = self._seen = request  # one grade serves every strength and view
         if request != self._seen:
             moved = (
-                self._seen is None or request.camera != self._seen.camera or request.size != self._seen.size
+                self._seen is None
+                or request.camera != self._seen.camera
+                or request.size != self._seen.size
+                or request.editor.startswith("grade:")  # the engine shows it meanwhile
             )
             self._seen = request
             self._seen_at = now if moved else now - CAMERA_SETTLE_S
@@ -313,7 +324,8 @@ class PreviewActions:
         self._painted = None
         self._pose = None
         self._behind = None
-        self._palette_of = ""
+        self._palette_of = self._graded_region = ""
+        self._grader = FormGrader()
         self._broken = False
 
     def close(self) -> None:
@@ -337,7 +349,7 @@ class PreviewActions:
         pictured = (form.preview and form.choice.pictured) or of_sentence
         if not (work.form_open and view.panel and pictured) or form.obstacle not in ("", NO_CHANGE):
             return None
-        region = f"{form.region}|{form.typed_region}|{hash(view.selection.members)}"
+        region = self._region_key()
         if form.choice.setting == "grade" and self._palette_of != region:
             return PreviewInputs(region, "grade", 1.0, ViewCamera(), size, view.background)
         if form.obstacle:
@@ -439,6 +451,10 @@ class PreviewActions:
             return
         elif answer.made == "palette":
             self._palette_of = self._sent.region
+            if self._palette_of == self._region_key():
+                self._graded_region = self._palette_of
+                self._grader.sample = answer.sample
+                self._grader.rows = answer.sample.rows
             work = self._store.get()
             if all(source == target for source, target in work.form.palette):
                 form = replace(work.form, palette=tuple((color, color) for color in answer.palette))
@@ -452,8 +468,8 @@ class PreviewActions:
         elif answer.grade is not None:
             gdf = load_gdf(answer.grade, self._documents.get().original)
             self._grade = self._sent, gdf, answer.grade
-            # remove the preview of the previous color
-            self._store.replace(with_transient(self._store.get(), live=()))
+            if self._sent.kind[1] != "grade":  # remove the preview of the previous color
+                self._store.replace(with_transient(self._store.get(), live=()))
             self._show(f"Live: {answer.note}", None, near=answer.near)
         elif answer.pixels is not None:
             kind, _, argument = self._sent.editor.partition(":")
@@ -477,7 +493,7 @@ class PreviewActions:
 
     def _show_live(self) -> None:
         """Show the grade as a layer on top, at the form's strength."""
-        if self._grade is None:
+        if self._grade is None or self._store.get().form.choice.setting == "grade":
             return
         document = self._documents.get()
         layers = self._store.get().view.layers
@@ -491,6 +507,28 @@ class PreviewActions:
         elif shown != live:
             self._store.replace(with_transient(self._store.get(), live=live))
             self._store.wake()
+
+    def _grade_live(self) -> None:
+        """Show the grade of the form on the Gaussians of its region, in the same frame."""
+        work = self._store.get()
+        form = work.form
+        shows = work.form_open and work.view.panel and form.preview and form.choice.setting == "grade"
+        key = self._region_key()
+        if shows and self._graded_region != key:
+            self._graded_region = key
+            self._grader.sample = None
+            count = len(self._documents.get().original)
+            self._grader.rows = region_files.region_rows(form, work.view.selection, count)
+        live = self._grader.live(form) if shows and not work.before else None
+        engine = self._engine()
+        if engine.live != live:
+            engine.live = live
+            self._store.wake()
+
+    def _region_key(self) -> str:
+        """Return the form's region as a key."""
+        form = self._store.get().form
+        return f"{form.region}|{form.typed_region}|{hash(self._store.get().view.selection.members)}"
 
     def _end_live(self) -> None:
         if self._grade is not None and self._store.get().transient.live:

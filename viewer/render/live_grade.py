@@ -1,0 +1,170 @@
+"""Grade of the form, applied to the colors that a region shows in the current view.
+
+Only the base color of each member changes, by the difference of its graded and its drawn color from the
+camera. This is exact in the view on screen, for spherical harmonics of any degree. Layers below keep their
+effect, because the drawn color includes them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from progdf.camera import Camera
+from progdf.color.grade import ColorGrade, grade_course, grade_fully, measure_grade, parse_grade
+from progdf.errors import ProgdfError
+from progdf.field.baked import lattice_colors
+from progdf.field.grade import look_up
+from progdf.gaussians import Gaussians
+from progdf.sh import C0, basis
+from viewer.jobs.preview_process import RegionSample
+from viewer.state.forms import NewEdit
+
+SIDE = 33
+"""Points per edge of the lattice that grades many colors at once."""
+
+
+@dataclass(frozen=True)
+class LiveGrade:
+    """Grade of some Gaussians at a strength."""
+
+    rows: NDArray[np.int64]  # ascending. [M]
+    grade: ColorGrade  # with its measured palette
+    strength: float = 1.0  # 0 to 1
+
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, LiveGrade)
+            and self.rows is other.rows
+            and self.grade is other.grade
+            and self.strength == other.strength
+        )
+
+    __hash__ = None  # type: ignore[assignment]
+
+
+class ColorTable:
+    """Colors of members, and the points of a lattice around them, at which a grade is evaluated.
+
+    Args:
+        colors: drawn colors, of any value. [M,3]
+    """
+
+    def __init__(self, colors: Tensor) -> None:
+        self.colors = colors
+        self._inside = colors.clamp(0.0, 1.0)
+        self._points: Tensor | None = None
+        if len(colors) > SIDE**3:
+            self._points = used_points(self._inside)
+
+    def graded(self, live: LiveGrade) -> Tensor:
+        """Return the colors after the grade: exact for few, from the lattice for many. [M,3]"""
+        if self._points is None:
+            return _at_strength(self._inside, live)
+        table = lattice_colors(SIDE).float()
+        table[self._points] = _at_strength(table[self._points], live)
+        return look_up(self._inside.T, table).T
+
+
+def _at_strength(colors: Tensor, live: LiveGrade) -> Tensor:
+    """Return the colors at the strength of the grade. [...,3] -> [...,3]"""
+    if live.strength == 1.0:
+        return grade_fully(colors, live.grade)
+    return grade_course(colors, live.grade)(live.strength)
+
+
+def used_points(colors: Tensor) -> Tensor:
+    """Return the lattice points that `look_up` reads for some colors. [M,3] -> [K] int64"""
+    cells = (colors * (SIDE - 1)).floor().long().clamp(0, SIDE - 2)
+    used = torch.zeros(SIDE, SIDE, SIDE, dtype=torch.bool)  # blue, green, red
+    index = (cells[:, 2] * SIDE + cells[:, 1]) * SIDE + cells[:, 0]
+    used.view(-1)[index] = True
+    for axis in range(3):
+        used |= used.roll(1, dims=axis)  # the last layer of cells is never used
+    return used.view(-1).nonzero()[:, 0]
+
+
+class LiveColors:
+    """Base colors of a scene under a live grade. Values that consecutive frames share are kept."""
+
+    def __init__(self) -> None:
+        self._key: object = None
+        self._table: ColorTable | None = None
+
+    def apply(self, scene: Gaussians, live: LiveGrade, camera: Camera, version: object) -> Gaussians:
+        """Return the scene with graded base colors of the grade's rows.
+
+        Args:
+            scene: composed scene
+            live: the grade
+            camera: view in which the grade is exact
+            version: changes whenever the colors of `scene` do
+        """
+        rows = torch.from_numpy(live.rows)
+        position = camera.position
+        key = (version, id(live.rows), tuple(position.tolist()) if scene.sh_degree else ())
+        if self._table is None or self._key != key:
+            self._table = ColorTable(drawn_colors(scene, rows, position))
+            self._key = key
+        before = self._table.colors
+        after = self._table.graded(live)
+        change = (after - before) / C0
+        change[(after <= 0.0) & (before <= 0.0)] = 0.0
+        sh0 = scene.sh0.clone()
+        sh0[rows] += change.to(sh0)
+        return replace(scene, sh0=sh0)
+
+
+def drawn_colors(scene: Gaussians, rows: Tensor, position: Tensor) -> Tensor:
+    """Return the colors of some rows from a position, below 0 where a lobe is black. [M,3]"""
+    degree = min(scene.sh_degree, 3)
+    colors = scene.sh0[rows].float() * C0 + 0.5
+    if not degree:
+        return colors
+    directions = torch.nn.functional.normalize(scene.means[rows].float() - position.float(), dim=1)
+    weights = basis(degree, directions)[:, 1:]
+    return colors + torch.einsum("mb,mbc->mc", weights, scene.shN[rows, : weights.shape[1]].float())
+
+
+class FormGrader:
+    """Settings of the form as a `LiveGrade`. Measurements are kept until a source color changes."""
+
+    def __init__(self) -> None:
+        self.rows: NDArray[np.int64] | None = None
+        """Rows of the form's region, ascending; None if they are not known yet. [M]"""
+        self.sample: RegionSample | None = None
+        """Sample of the region's colors; None if it is not known yet."""
+        self._last: tuple[object, LiveGrade | None] | None = None
+        self._measured: tuple[object, ColorGrade] | None = None
+
+    def live(self, form: NewEdit) -> LiveGrade | None:
+        """Return the form's grade; None if it changes nothing."""
+        if self.rows is None:
+            return None
+        key = (form.spec, id(self.rows), id(self.sample))
+        if self._last is None or self._last[0] != key:
+            self._last = key, self._new(form.spec, self.rows)
+        live = self._last[1]
+        return None if live is None or not form.strength else replace(live, strength=form.strength)
+
+    def _new(self, spec: str, rows: NDArray[np.int64]) -> LiveGrade | None:
+        """Return the grade of a form's editor; None if it changes nothing."""
+        try:
+            grade = parse_grade(spec.partition(":")[2])
+        except ProgdfError:
+            return None
+        sample = self.sample
+        if grade.palette and sample is not None:
+            sources = tuple(tuple(source.tolist()) for source, _ in grade.palette)
+            key = (sources, id(sample))
+            if self._measured is None or self._measured[0] != key:
+                colors = torch.from_numpy(sample.colors)
+                self._measured = key, measure_grade(grade, colors, torch.from_numpy(sample.shares))
+            shadings = self._measured[1].palette_shadings
+            shades = self._measured[1].palette_shades
+            grade = replace(grade, palette_shadings=shadings, palette_shades=shades)
+        return LiveGrade(rows, grade)
