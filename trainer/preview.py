@@ -6,11 +6,11 @@
 
 If one color map can represent the edit, the answer is a grade, 3.gdf beside 3.png, for every strength and
 camera. Otherwise it is the editor's own picture of the view. The editor "grade" only requests the region's
-main colors, and 3.npz beside 3.png: its rows, and a sample of its colors with its shares of their pixels. If
-the request of a picture has `estimate`, an answer "near" follows: it estimates how close training will come
-to the picture. A request is skipped if a later one has arrived. `model` paints a prompt; another `seed` gives
-another painting. With `seed` -1 nothing is painted; `note` names the model and device, and `models` the
-models on this machine. The process ends when its input ends.
+main colors, and 3.npz beside 3.png: its rows, a sample of its colors with its shares of their pixels, and the
+view. If the request of a picture has `estimate`, an answer "near" follows: it estimates how close training
+will come to the picture. A request is skipped if a later one has arrived. `model` paints a prompt; another
+`seed` gives another painting. With `seed` -1 nothing is painted; `note` names the model and device, and
+`models` the models on this machine. The process ends when its input ends.
 """
 
 from __future__ import annotations
@@ -156,7 +156,8 @@ class Previewer:
     def palette(self, request: PreviewRequest) -> list[str]:
         """Return the main visible colors of the region, #rrggbb; empty if it is not visible.
 
-        The region's rows, and the colors of its visible pixels with their shares, are saved for the window.
+        For the window, it saves the region's rows, the colors of its visible pixels with their shares, and
+        the view with the region's own colors and its mask.
 
         Raises:
             ProgdfError: invalid region.
@@ -169,8 +170,16 @@ class Previewer:
             visible = [(sample, sample.mask > 0.0) for sample in views.glances]
             rgb = torch.cat([sample.inside[pixels] for sample, pixels in visible])
             shares = torch.cat([sample.mask[pixels] for sample, pixels in visible])
-        path = Path(request.out).with_suffix(".npz")
-        np.savez(path, rows=members.numpy(), colors=rgb.numpy(), shares=shares.numpy())
+        view = self._view(_seen(request))
+        np.savez(
+            Path(request.out).with_suffix(".npz"),
+            rows=members.numpy(),
+            colors=rgb.numpy(),
+            shares=shares.numpy(),
+            image=view.image.numpy(),
+            inside=view.inside.numpy(),
+            mask=view.mask.numpy(),
+        )
         return [hex_color(color) for color in find_palette(rgb, shares).tolist()]
 
     def _views(self, request: PreviewRequest) -> DraftViews | None:
@@ -186,19 +195,7 @@ class Previewer:
         Raises:
             ProgdfError: invalid region or editor.
         """
-        # cache key of region, background and camera
-        seen = msgspec.structs.replace(
-            request,
-            number=0,
-            out="",
-            editor="",
-            strength=0.0,
-            model="",
-            api_url="",
-            prompt="",
-            seed=0,
-            estimate=False,
-        )
+        seen = _seen(request)
         view = self._view(seen)
         if not bool((view.mask > 0.0).any()):
             return view.image
@@ -281,6 +278,22 @@ class Previewer:
 def _options(request: PreviewRequest) -> EditorOptions:
     """Return the options of the request's editor."""
     return EditorOptions(request.editor, model=request.model, api_url=request.api_url, prompt=request.prompt)
+
+
+def _seen(request: PreviewRequest) -> PreviewRequest:
+    """Return the region, background and camera of a request, as a key of its view."""
+    return msgspec.structs.replace(
+        request,
+        number=0,
+        out="",
+        editor="",
+        strength=0.0,
+        model="",
+        api_url="",
+        prompt="",
+        seed=0,
+        estimate=False,
+    )
 
 
 def draft_nearness(psnr: float) -> Nearness:

@@ -31,6 +31,8 @@ SIDE = 33
 """Lattice points per edge of a written table. All color programs read this size."""
 
 _MAX_FILE_BYTES = 80 << 20  # `MAX_SIDE`³ rows of usual length take 60 MB
+_SETTINGS_MARK = "# progdf grade: "
+_SETTINGS_BYTES = 8192  # the comment with the settings is within the first part of a file
 _MAX_COLOR = 100.0  # a channel with a larger absolute value is refused
 _KEYWORD_COUNTS = {"LUT_3D_SIZE": 1, "DOMAIN_MIN": 3, "DOMAIN_MAX": 3, "LUT_3D_INPUT_RANGE": 2}
 """Number of values that follow each keyword."""
@@ -138,18 +140,28 @@ def _read_head(head: str, path: str | os.PathLike[str]) -> dict[str, list[float]
     return keywords
 
 
-def write_cube(path: str | os.PathLike[str], table: Tensor, title: str) -> None:
+def read_settings(path: str | os.PathLike[str]) -> str:
+    """Return the settings in the comment of `write_cube`; "" if there are none."""
+    with open(path, encoding="utf-8", errors="replace") as file:
+        head = file.read(_SETTINGS_BYTES)
+    found = re.search(rf"^{_SETTINGS_MARK}(.*)$", head, re.MULTILINE)
+    return "" if found is None else found[1].strip()
+
+
+def write_cube(path: str | os.PathLike[str], table: Tensor, title: str, settings: str = "") -> None:
     """Write a lattice of colors, clamped to 0 to 1, complete or not at all.
 
     Args:
         path: the file
         table: colors, red varying fastest. [side³,3]
         title: name of the table; characters outside ASCII become blanks
+        settings: settings of a grade, kept in a comment; "" for none
 
     Raises:
         ProgdfError: the folder does not exist or cannot be written to.
     """
     title = re.sub(r'[^ -~]|"', " ", title)
-    head = f'TITLE "{title}"\nLUT_3D_SIZE {lattice_side(len(table))}\n'
+    comment = f"{_SETTINGS_MARK}{settings}\n" if settings else ""
+    head = f'TITLE "{title}"\n{comment}LUT_3D_SIZE {lattice_side(len(table))}\n'
     rows = (f"{red:.6f} {green:.6f} {blue:.6f}\n" for red, green, blue in table.clamp(0.0, 1.0).tolist())
     write_file(path, head + "".join(rows))

@@ -16,7 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from progdf.color.grade import parse_grade
+from progdf.color.looks import look_name
 from progdf.errors import ProgdfError
+from progdf.formats import cube
 from progdf.io.atomic import atomic_write, make_folder, state_folder
 from progdf.io.images import flatten_onto, open_picture
 from progdf.io.json_values import read_json, to_json
@@ -101,6 +104,26 @@ def read_layout() -> Layout:
 def keep_layout(layout: Layout) -> None:
     """Save the layout of the window. Write errors are ignored."""
     _remember("layout.json", json.dumps(to_json(layout)))
+
+
+def looks_folder() -> Path:
+    """Return the folder of the user's looks, .cube files."""
+    return state_folder() / "looks"
+
+
+def read_looks() -> tuple[tuple[str, str], ...]:
+    """Return name and grade of each of the user's looks, in the order of their names.
+
+    A look is a .cube file whose comment has its settings. Other files are left out.
+    """
+    looks = []
+    with contextlib.suppress(OSError):
+        for path in sorted(looks_folder().glob(f"*{cube.SUFFIX}")):
+            with contextlib.suppress(OSError, ProgdfError):
+                settings = cube.read_settings(path)
+                parse_grade(settings)
+                looks.append((look_name(path.stem), settings))
+    return tuple(looks)
 
 
 def read_outside() -> OutsideSettings:

@@ -59,6 +59,9 @@ class RegionSample:
     rows: NDArray[np.int64]  # ascending. [M]
     colors: NDArray[np.float32]  # the region's own colors, sRGB 0 to 1. [P,3]
     shares: NDArray[np.float32]  # the region's share of each pixel, 0 to 1. [P]
+    image: NDArray[np.float32]  # small picture of the current view, 0 to 1. [H,W,3]
+    inside: NDArray[np.float32]  # the region's own colors in it. [H,W,3]
+    mask: NDArray[np.float32]  # the region's share of its pixels. [H,W]
 
 
 @dataclass(frozen=True)
@@ -81,7 +84,8 @@ class Preview:
 def _read_sample(path: Path) -> RegionSample:
     """Read the sample of a region that the process has written."""
     with np.load(path) as arrays:
-        return RegionSample(arrays["rows"], arrays["colors"], arrays["shares"])
+        names = ("rows", "colors", "shares", "image", "inside", "mask")
+        return RegionSample(*(arrays[name] for name in names))
 
 
 class PreviewChild:

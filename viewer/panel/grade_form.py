@@ -15,11 +15,24 @@ from progdf.color.grade import CURVES, GRADE_RANGES, RANGE_LIMITS
 from progdf.color.oklab import fit_gamut, hue_of, srgb_to_oklab
 from progdf.color.palette import Curve, bend_lightness, with_highlights
 from progdf.color.tone import WHEELS, Wheel
-from viewer.state.forms import NO_CURVES, NO_WHEELS, NewEdit, Point, parse_curve
+from viewer.render.live_grade import BLACK_MARK, WHITE_MARK
+from viewer.state.forms import (
+    LOOK_COLUMNS,
+    LOOK_PX,
+    NO_CURVES,
+    NO_WHEELS,
+    NewEdit,
+    Point,
+    parse_curve,
+    with_look,
+)
+from viewer.state.transient import GradeScope, LookShelf
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, Rgba, UiContext, u32
 from viewer.ui.widgets import (
     choice,
+    elide,
     icon_button,
+    inert,
     is_double_clicked,
     key_step,
     label,
@@ -31,6 +44,12 @@ from viewer.ui.widgets import (
 
 CURVE_PX = 92.0
 """Height of a curve, at 1×."""
+_HISTOGRAM_PX = 64.0  # height of the histogram, at 1×
+_HISTOGRAM_COLORS = (
+    (0.75, 0.77, 0.80, 0.55), (0.93, 0.30, 0.28, 0.40), (0.30, 0.80, 0.35, 0.40), (0.30, 0.50, 1.00, 0.45),
+)  # fmt: skip
+"""Colors of luma, red, green and blue."""
+_CLIPPED_SHARE = 0.001  # share of the region from which an end counts as clipped
 _MAX_POINTS = 6  # largest number of points of a curve
 _MIN_GAP = 0.02  # smallest difference in lightness between two points of a curve
 _RING_STEPS = 36  # colors of a wheel's ring
@@ -54,8 +73,16 @@ _COLOR = ("temperature", "tint", "vibrance", "saturation")
 _NAMES = tuple(GRADE_RANGES)
 
 
-def draw(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
-    """Draw the sections of a grade and return the changed form."""
+def draw(
+    form: NewEdit, scope: GradeScope, shelf: LookShelf, column: float, ui: UiContext
+) -> tuple[NewEdit, str]:
+    """Draw the sections of a grade; return the changed form and a requested action, "" for none."""
+    form = _histogram(form, scope, ui)
+    form = replace(form, hovered_look="")
+    action = ""
+    form, is_open = _section("Looks", form, False, ui)
+    if is_open:
+        form, action = _looks(form, shelf, ui)
     form, is_open = _section("Light", form, _is_changed(form, _LIGHT), ui)
     if is_open == "reset":
         form = _reset(form, _LIGHT)
@@ -82,7 +109,84 @@ def draw(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
         form = replace(form, curves=NO_CURVES)
     elif is_open:
         form = _curves(form, column, ui)
+    return form, action
+
+
+def _histogram(form: NewEdit, scope: GradeScope, ui: UiContext) -> NewEdit:
+    """Draw the histogram, with a mark at each end that clips. A press or J shows clipped colors."""
+    tall = _HISTOGRAM_PX * ui.scale
+    x, y = imgui.get_cursor_screen_pos()
+    wide = imgui.get_content_region_avail().x
+    pressed = imgui.invisible_button("histogram", (wide, tall), imgui.ButtonFlags_.enable_nav.value)
+    key = imgui.is_window_focused() and not imgui.get_io().want_text_input
+    if pressed or (key and imgui.is_key_pressed(imgui.Key.j, False)):
+        form = replace(form, clipping=not form.clipping)
+    tip(
+        f"Clipped: {100 * scope.white:.1f} % to white, {100 * scope.black:.1f} % to black. "
+        "Click or J: show them in red and blue"
+    )
+    canvas = imgui.get_window_draw_list()
+    low = (x, y)
+    end = (x + wide, y + tall)
+    canvas.add_rect_filled(low, end, u32(PALETTE.field), 4.0 * ui.scale)
+    for values, color in zip(scope.bins, _HISTOGRAM_COLORS, strict=False):
+        step = wide / len(values)
+        for i, value in enumerate(values):
+            if value > 0.0:
+                top = y + tall - value * (tall - 3.0 * ui.scale)
+                canvas.add_rect_filled((x + i * step, top), (x + (i + 1) * step, end[1]), u32(color))
+    side = 8.0 * ui.scale
+    for share, corner, sign, mark in (
+        (scope.black, x + 4.0 * ui.scale, 1.0, BLACK_MARK),
+        (scope.white, x + wide - 4.0 * ui.scale, -1.0, WHITE_MARK),
+    ):
+        top = y + 4.0 * ui.scale
+        shown = u32((*mark, 1.0)) if share > _CLIPPED_SHARE else u32(PALETTE.line)
+        canvas.add_triangle_filled((corner, top), (corner + sign * side, top), (corner, top + side), shown)
+    if form.clipping:
+        canvas.add_rect(low, end, u32(PALETTE.accent), 4.0 * ui.scale, ui.scale)
     return form
+
+
+def _looks(form: NewEdit, shelf: LookShelf, ui: UiContext) -> tuple[NewEdit, str]:
+    """Draw the looks; the picture shows the one under the pointer, and a press applies it.
+
+    Returns:
+        the form, and "save_look" if its grade is to be saved, else ""
+    """
+    gap = 2.0 * ui.scale
+    wide = (imgui.get_content_region_avail().x - (LOOK_COLUMNS - 1) * gap) / LOOK_COLUMNS
+    side = (wide, wide * LOOK_PX[1] / LOOK_PX[0])
+    canvas = imgui.get_window_draw_list()
+    rows = -(-max(len(shelf.looks), 1) // LOOK_COLUMNS)
+    for i, (name, look) in enumerate(shelf.looks):
+        row, place = divmod(i, LOOK_COLUMNS)
+        if place:
+            imgui.same_line(0.0, gap)
+        pressed = imgui.button(f"##look {i}", side)
+        low = imgui.get_item_rect_min()
+        high = imgui.get_item_rect_max()
+        if shelf.sheet:
+            start = (place / LOOK_COLUMNS, row / rows)
+            end = ((place + 1) / LOOK_COLUMNS, (row + 1) / rows)
+            white = u32((1.0, 1.0, 1.0, 1.0))
+            canvas.add_image_rounded(
+                imgui.ImTextureRef(shelf.sheet), low, high, start, end, white, 3.0 * ui.scale
+            )
+        else:
+            with imgui_ctx.push_font(None, SMALL_PX):
+                at = (low.x + 3.0 * ui.scale, low.y + 3.0 * ui.scale)
+                canvas.add_text(at, u32(PALETTE.dim), elide(name, wide - 6.0 * ui.scale))
+        if imgui.is_item_hovered():
+            form = replace(form, hovered_look=f"grade:{look}")
+            canvas.add_rect(low, high, u32(PALETTE.accent), 3.0 * ui.scale, 2.0 * ui.scale)
+        tip(name)
+        if pressed:
+            form = with_look(form, look)
+    with inert(form.spec == "grade"):
+        saves = imgui.button("Save as a look", imgui.ImVec2(-1.0, 0.0))
+    tip("Keep this grade under the edit's name, as a .cube file that other programs read too")
+    return form, "save_look" if saves else ""
 
 
 def _section(name: str, form: NewEdit, changed: bool, ui: UiContext) -> tuple[NewEdit, str]:
@@ -145,10 +249,12 @@ def _wheels(form: NewEdit, ui: UiContext) -> NewEdit:
     """Draw the discs of shadows, midtones and highlights, each with its slider of lightness below."""
     gap = 8.0 * ui.scale
     wide = math.floor((imgui.get_content_region_avail().x - 2 * gap) / 3)
+    top = imgui.get_cursor_pos_y()
     wheels = []
     for i, (name, wheel) in enumerate(zip(WHEELS, form.wheels, strict=True)):
         if i:
             imgui.same_line(0.0, gap)
+            imgui.set_cursor_pos_y(top)  # not at the baseline of the text beside it
         with imgui_ctx.begin_group():
             small(name.capitalize(), PALETTE.dim, wide)
             wheel = _wheel(name, wheel, wide, ui)

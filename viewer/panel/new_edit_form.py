@@ -110,7 +110,11 @@ def _content(work: Workspace, count: int, ui: UiContext) -> tuple[NewEdit, str]:
     column = COLUMN_PX * ui.scale
     form = _region(form, selection, count, column, ui)
     form, action = _editor(form, action, column, ui)
-    form = _settings(form, preview, column, ui)
+    if form.choice.setting == "grade":
+        form, requested = grade_form.draw(form, work.transient.scope, work.transient.shelf, column, ui)
+        action = action or requested
+    else:
+        form = _settings(form, preview, column, ui)
     if form.choice.has_anchor:
         if replace(form, asks=0, anchor="") != replace(work.form, asks=0, anchor=""):
             form = replace(form, asks=0, anchor="")  # the picture belonged to other settings
@@ -209,8 +213,6 @@ def _settings(form: NewEdit, preview: PreviewState, column: float, ui: UiContext
             label("Amount", column)
             form = replace(form, amount=value_slider("##Amount", form.amount, (0.05, 0.98), "%.2f", 0.7, ui))
             tip(help_)
-        case "grade":
-            form = grade_form.draw(form, column, ui)
         case "style":
             label("Style", column)
             form = _style(form, preview, ui)

@@ -23,9 +23,13 @@ from progdf.gaussians import Gaussians
 from progdf.sh import C0, basis
 from viewer.jobs.preview_process import RegionSample
 from viewer.state.forms import NewEdit
+from viewer.state.transient import GradeScope
 
 SIDE = 33
 """Points per edge of the lattice that grades many colors at once."""
+BINS = 64
+"""Bins of the histogram."""
+_SCOPE_COLORS = 4096  # largest number of sampled colors of the histogram
 
 
 @dataclass(frozen=True)
@@ -35,16 +39,29 @@ class LiveGrade:
     rows: NDArray[np.int64]  # ascending. [M]
     grade: ColorGrade  # with its measured palette
     strength: float = 1.0  # 0 to 1
+    marks: bool = False  # show clipped colors: white in red, black in blue
 
     def __eq__(self, other: object) -> bool:
         return (
             isinstance(other, LiveGrade)
             and self.rows is other.rows
             and self.grade is other.grade
-            and self.strength == other.strength
+            and (self.strength, self.marks) == (other.strength, other.marks)
         )
 
     __hash__ = None  # type: ignore[assignment]
+
+
+WHITE_MARK = (0.95, 0.1, 0.1)
+"""Color of clipped white in the picture, sRGB."""
+BLACK_MARK = (0.15, 0.35, 1.0)
+"""Color of clipped black in the picture, sRGB."""
+
+
+def clipped(colors: Tensor) -> tuple[Tensor, Tensor]:
+    """Return where colors are clipped: a channel at 255, or all channels at 0. [...,3] -> [...], [...]"""
+    half_level = 0.5 / 255
+    return colors.amax(dim=-1) > 1.0 - half_level, colors.amax(dim=-1) < half_level
 
 
 class ColorTable:
@@ -64,10 +81,17 @@ class ColorTable:
     def graded(self, live: LiveGrade) -> Tensor:
         """Return the colors after the grade: exact for few, from the lattice for many. [M,3]"""
         if self._points is None:
-            return _at_strength(self._inside, live)
-        table = lattice_colors(SIDE).float()
-        table[self._points] = _at_strength(table[self._points], live)
-        return look_up(self._inside.T, table).T
+            graded = _at_strength(self._inside, live)
+        else:
+            table = lattice_colors(SIDE).float()
+            table[self._points] = _at_strength(table[self._points], live)
+            graded = look_up(self._inside.T, table).T
+        if live.marks:
+            white, black = clipped(graded)
+            graded = graded.clone()
+            graded[white] = graded.new_tensor(WHITE_MARK)
+            graded[black] = graded.new_tensor(BLACK_MARK)
+        return graded
 
 
 def _at_strength(colors: Tensor, live: LiveGrade) -> Tensor:
@@ -145,11 +169,51 @@ class FormGrader:
         """Return the form's grade; None if it changes nothing."""
         if self.rows is None:
             return None
-        key = (form.spec, id(self.rows), id(self.sample))
+        spec = form.hovered_look or form.spec
+        key = (spec, id(self.rows), id(self.sample))
         if self._last is None or self._last[0] != key:
-            self._last = key, self._new(form.spec, self.rows)
+            self._last = key, self._new(spec, self.rows)
         live = self._last[1]
-        return None if live is None or not form.strength else replace(live, strength=form.strength)
+        if live is None and form.clipping:
+            live = LiveGrade(self.rows, ColorGrade())
+        if live is None or not (form.strength or form.clipping):
+            return None
+        return replace(live, strength=form.strength, marks=form.clipping)
+
+    def scope(self, live: LiveGrade | None) -> GradeScope:
+        """Return the histogram of the region's colors under a grade; empty before they are known."""
+        sample = self.sample
+        if sample is None or not len(sample.colors):
+            return GradeScope()
+        stride = -(-len(sample.colors) // _SCOPE_COLORS)
+        colors = torch.from_numpy(sample.colors[::stride]).clamp(0.0, 1.0)
+        if live is not None:
+            colors = _at_strength(colors, live)
+        weights = torch.from_numpy(sample.shares[::stride]).double()
+        luma = colors @ colors.new_tensor([0.2126, 0.7152, 0.0722])
+        values = torch.cat([luma[:, None], colors], dim=1)
+        bins = (values * BINS).long().clamp(0, BINS - 1)
+        counts = torch.stack([torch.bincount(bins[:, i], weights, BINS) for i in range(4)])
+        tallest = counts[:, 1:-1].max().clamp_min(1e-9)
+        white, black = clipped(colors)
+        total = weights.sum().clamp_min(1e-9)
+        return GradeScope(
+            tuple(tuple(row) for row in (counts / tallest).clamp(0.0, 1.0).tolist()),
+            float(weights[white].sum() / total),
+            float(weights[black].sum() / total),
+        )
+
+    def thumbnail(self, look: str) -> NDArray[np.uint8] | None:
+        """Return the small view under a look; None before the view is known. [H,W,3]"""
+        sample = self.sample
+        if sample is None or self.rows is None:
+            return None
+        live = self._new(f"grade:{look}", self.rows)
+        inside = torch.from_numpy(sample.inside).clamp(0.0, 1.0)
+        change = torch.zeros_like(inside) if live is None else _at_strength(inside, live) - inside
+        pixels = torch.from_numpy(sample.image) + torch.from_numpy(sample.mask)[..., None] * change
+        thumbnail: NDArray[np.uint8] = (255.0 * pixels.clamp(0.0, 1.0)).round().byte().numpy()
+        return thumbnail
 
     def _new(self, spec: str, rows: NDArray[np.int64]) -> LiveGrade | None:
         """Return the grade of a form's editor; None if it changes nothing."""

@@ -40,6 +40,12 @@ SHEET_COLUMNS = 6
 """Number of thumbnails in a row of this sheet, in the order of `STYLE_ORDER`."""
 
 
+LOOK_PX = (96, 72)
+"""Width and height of a look's thumbnail, in pixels."""
+LOOK_COLUMNS = 4
+"""Number of thumbnails in a row of their sheet."""
+
+
 @dataclass(frozen=True)
 class EditorChoice:
     """Editor offered in the form."""
@@ -125,6 +131,8 @@ class NewEdit:
     curves: tuple[str, ...] = NO_CURVES  # for a grade: curves in the order of `CURVES`, see `parse_curve`
     wheels: tuple[Wheel, ...] = NO_WHEELS  # for a grade: in the order of `WHEELS`
     folded: tuple[str, ...] = ("Wheels", "Curve")  # folded sections of a grade
+    clipping: bool = False  # the picture marks colors that a grade clips
+    hovered_look: str = ""  # editor of the look under the pointer, shown instead of the form's; "" for none
     picks: bool = False  # the next click on the picture adds a color to the palette
     picked: int = -1  # index of the color just picked, whose color picker opens
     style: int = BEST_STYLES[0]  # number of a painting
@@ -332,6 +340,15 @@ def with_settings(form: NewEdit, instruction: str) -> NewEdit | None:
                 return replace(form, folder=argument)
     except ValueError:  # written by another version
         return None
+
+
+def with_look(form: NewEdit, look: str) -> NewEdit:
+    """Return the form with a look's grade. The palette becomes unchanged unless the look has one."""
+    changed = with_settings(form, f"grade:{look}")
+    if changed is None:
+        return form
+    palette = changed.palette or tuple((source, source) for source, _ in form.palette)
+    return replace(changed, palette=palette, region=form.region)
 
 
 def with_color(form: NewEdit, color: str) -> NewEdit:

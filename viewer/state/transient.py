@@ -45,6 +45,21 @@ class PreviewState(NamedTuple):
     near: str = ""  # expected difference of the trained edit: close, roughly or far; "" if not known
 
 
+class GradeScope(NamedTuple):
+    """Histogram of the form's region under its grade."""
+
+    bins: tuple[tuple[float, ...], ...] = ()  # luma, red, green and blue, dark to bright, 0 to 1
+    white: float = 0.0  # share of the region that is clipped to white, 0 to 1
+    black: float = 0.0  # share that is clipped to black
+
+
+class LookShelf(NamedTuple):
+    """Looks of the form, and their thumbnails."""
+
+    looks: tuple[tuple[str, str], ...] = ()  # name and grade of each
+    sheet: int = 0  # GL name of the texture with their thumbnails, 0 for none
+
+
 Transform = Literal["move", "rotate", "scale"]
 
 
@@ -440,6 +455,8 @@ class Transient:
 
     cover: Cover | None = None  # image drawn over the picture
     preview: PreviewState = PreviewState()  # state of the preview of a new edit
+    scope: GradeScope = GradeScope()  # histogram of a grade in the form
+    shelf: LookShelf = LookShelf()  # looks for it
     live: tuple[LayerState, ...] = ()  # edits in training, on top of the layer stack
     # handles of a selection being moved, a decal being placed, or the Pull tool
     gizmo: Gizmo | Decal | Pull | None = None

@@ -141,6 +141,14 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("duplicate", "Duplicate", "Ctrl+D"),
         Command("replace", "Replace…", "", "Replace its edit by another one"),
         Command("again", "Again with other settings", "", "Open the form with the settings of this edit"),
+        Command(
+            "copy_edit",
+            "Copy settings",
+            "Ctrl+Shift+C",
+            "Of the form or the layer",
+            row="Copy, paste settings",
+        ),
+        Command("paste_edit", "Paste settings", "Ctrl+Shift+V", "Opens the form, in any scene", row=JOINED),
         Command("remove", "Delete", "Ctrl+Delete"),
         Command("limit_to_selection", "Limit to the selection", "", "Set the paint outside it to 0"),
         Command(

@@ -56,7 +56,7 @@ INTERNAL = {
     *("select_invert", "choose_keys", "move_keys", "clone_keys"),
     *("seek", "length", "fps", "go_to", "example", "forget_file", "use_view", "keep_view"),
     *("carry_on", "look_behind", "refine_anyway", "fill_hole", "true_length", "keep_pull", "leave_pull"),
-    *("stop_making", "test_editor", "allow_outside"),
+    *("stop_making", "test_editor", "allow_outside", "save_look"),
 }
 """Actions of buttons, questions and drags that need an argument, so the command palette omits them."""
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from viewer.app.grading import GradePreview
 from viewer.app.main_view import MainView
 from viewer.app.messages import Requests, WaitFor
 from viewer.files import exports
@@ -139,7 +140,13 @@ def make_parts(
         context=main_view.context,
         picture_size=picture_size,
         save_edited=main_view.save_edited,
-        engine=lambda: main_view.engine,
+        grading=GradePreview(
+            store=store,
+            documents=documents,
+            messages=messages,
+            context=main_view.context,
+            engine=lambda: main_view.engine,
+        ),
     )
     jobs = JobActions(
         store=store,

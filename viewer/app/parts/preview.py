@@ -22,16 +22,24 @@ from progdf.gdf.file import Gdf, load_gdf
 from progdf.io.atomic import make_folder
 from progdf.io.images import open_picture
 from progdf.io.picture_camera import find_picture_camera
+from viewer.app.grading import GradePreview
 from viewer.app.messages import Messages, Requests, error_line
 from viewer.camera.view_camera import ViewCamera, from_camera, to_camera
 from viewer.files import region_files, user_files
 from viewer.files.document import DocumentStore
 from viewer.jobs import consent, training
 from viewer.jobs.preview_process import Preview, PreviewChild, PreviewInputs
-from viewer.render.engine import ViewEngine
-from viewer.render.live_grade import FormGrader
 from viewer.state.commands import Plain
-from viewer.state.forms import EDITORS, NO_CHANGE, SHEET_COLUMNS, SHEET_PX, STYLE_ORDER, NewEdit, with_picture
+from viewer.state.forms import (
+    EDITORS,
+    LOOK_PX,
+    NO_CHANGE,
+    SHEET_COLUMNS,
+    SHEET_PX,
+    STYLE_ORDER,
+    NewEdit,
+    with_picture,
+)
 from viewer.state.transient import Cover, PreviewGhost, PreviewState
 from viewer.state.view_state import LayerState
 from viewer.state.workspace import Dialog, Store, with_camera, with_transient
@@ -86,7 +94,7 @@ class PreviewActions:
         context: the GL context
         picture_size: returns width and height of the picture on screen, in pixels
         save_edited: writes the picture on screen with its visible layers into a folder; returns its path
-        engine: returns the engine that draws the window
+        grading: the form's grade on the scene
     """
 
     def __init__(
@@ -98,7 +106,7 @@ class PreviewActions:
         context: moderngl.Context,
         picture_size: Callable[[], tuple[int, int]],
         save_edited: Callable[[Path, str], Path],
-        engine: Callable[[], ViewEngine],
+        grading: GradePreview,
     ) -> None:
         self._store = store
         self._documents = documents
@@ -106,9 +114,7 @@ class PreviewActions:
         self._context = context
         self._picture_size = picture_size
         self._save_edited = save_edited
-        self._engine = engine
-        self._grader = FormGrader()
-        self._graded_region = ""  # region of its rows, see `_region_key`
+        self._grading = grading
         self._child: PreviewChild | None = None
         self._texture: moderngl.Texture | None = None
         self._sent: PreviewInputs | None = None
@@ -136,12 +142,12 @@ class PreviewActions:
     @property
     def requests(self) -> Requests:
         """Handlers of the requests about previews, by name."""
-        return {"paint_view": self._paint_view, "test_editor": self._test_editor}
+        return {"paint_view": self._paint_view, "test_editor": self._test_editor, **self._grading.requests}
 
     def poll(self) -> float | None:
         """Request the preview and show an answer; return the seconds until the next poll, None for never."""
         self._free_ghosts()
-        self._grade_live()
+        self._grading.update()
         if self._painting is not None and self._is_painting(self._painting):
             self._end_live()
             return self._follow(self._painting)
@@ -324,13 +330,14 @@ class PreviewActions:
         self._painted = None
         self._pose = None
         self._behind = None
-        self._palette_of = self._graded_region = ""
-        self._grader = FormGrader()
+        self._palette_of = ""
+        self._grading.leave_scene()
         self._broken = False
 
     def close(self) -> None:
         """End the process and release the textures."""
         self._end()
+        self._grading.close()
         for texture in (self._texture, self._sheet, *self._ghosts.values()):
             if texture is not None:
                 texture.release()
@@ -349,9 +356,9 @@ class PreviewActions:
         pictured = (form.preview and form.choice.pictured) or of_sentence
         if not (work.form_open and view.panel and pictured) or form.obstacle not in ("", NO_CHANGE):
             return None
-        region = self._region_key()
+        region = self._grading.region_key()
         if form.choice.setting == "grade" and self._palette_of != region:
-            return PreviewInputs(region, "grade", 1.0, ViewCamera(), size, view.background)
+            return PreviewInputs(region, "grade", 1.0, view.camera, size, view.background)
         if form.obstacle:
             return None
         if of_sentence:  # a diffusion model is slow: its picture keeps the view of the request
@@ -379,6 +386,8 @@ class PreviewActions:
         self._sent, self._sent_at = request, time.monotonic()
         scale = min(1.0, LONGEST_SIDE / max(request.size))
         width, height = (max(round(side * scale), 1) for side in request.size)
+        if request.editor == "grade":
+            width, height = LOOK_PX
         try:
             region = region_files.region_option(
                 work.form, child.folder, work.view.selection, len(self._documents.get().original)
@@ -451,10 +460,7 @@ class PreviewActions:
             return
         elif answer.made == "palette":
             self._palette_of = self._sent.region
-            if self._palette_of == self._region_key():
-                self._graded_region = self._palette_of
-                self._grader.sample = answer.sample
-                self._grader.rows = answer.sample.rows
+            self._grading.take(answer.sample, self._palette_of)
             work = self._store.get()
             if all(source == target for source, target in work.form.palette):
                 form = replace(work.form, palette=tuple((color, color) for color in answer.palette))
@@ -507,28 +513,6 @@ class PreviewActions:
         elif shown != live:
             self._store.replace(with_transient(self._store.get(), live=live))
             self._store.wake()
-
-    def _grade_live(self) -> None:
-        """Show the grade of the form on the Gaussians of its region, in the same frame."""
-        work = self._store.get()
-        form = work.form
-        shows = work.form_open and work.view.panel and form.preview and form.choice.setting == "grade"
-        key = self._region_key()
-        if shows and self._graded_region != key:
-            self._graded_region = key
-            self._grader.sample = None
-            count = len(self._documents.get().original)
-            self._grader.rows = region_files.region_rows(form, work.view.selection, count)
-        live = self._grader.live(form) if shows and not work.before else None
-        engine = self._engine()
-        if engine.live != live:
-            engine.live = live
-            self._store.wake()
-
-    def _region_key(self) -> str:
-        """Return the form's region as a key."""
-        form = self._store.get().form
-        return f"{form.region}|{form.typed_region}|{hash(self._store.get().view.selection.members)}"
 
     def _end_live(self) -> None:
         if self._grade is not None and self._store.get().transient.live:

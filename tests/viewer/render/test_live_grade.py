@@ -1,0 +1,144 @@
+"""Live grade of the form: exact in the view, the lattice of many colors, histogram, clipping marks, looks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from progdf.color.grade import ColorGrade, grade_fully, parse_grade
+from progdf.color.looks import BUILT_IN
+from progdf.field.baked import lattice_colors
+from progdf.formats.cube import SIDE as CUBE_SIDE
+from progdf.formats.cube import read_cube, read_settings, write_cube
+from tests.helpers.ui_rig import bear
+from viewer.camera.view_camera import first_camera, to_camera
+from viewer.jobs.preview_process import RegionSample
+from viewer.render import live_grade
+from viewer.render.engine import ViewEngine
+from viewer.render.live_grade import (
+    BLACK_MARK,
+    WHITE_MARK,
+    ColorTable,
+    FormGrader,
+    LiveColors,
+    LiveGrade,
+    drawn_colors,
+)
+from viewer.state.forms import EDITORS, NewEdit, with_look
+from viewer.state.view_state import ViewState
+
+GRADE = parse_grade("exposure=0.4,shadows=0.5,temperature=0.3,wheel_shadows=250:0.3:0")
+FORM = NewEdit(editor=next(i for i, editor in enumerate(EDITORS) if editor.kind == "grade"))
+
+
+def with_lobes(degree: int = 2):  # type: ignore[no-untyped-def]
+    scene = bear().scene
+    generator = torch.Generator().manual_seed(0)
+    shN = 0.1 * torch.randn(len(scene), (degree + 1) ** 2 - 1, 3, generator=generator)
+    return replace(scene, shN=shN)
+
+
+def sample_of(colors: torch.Tensor) -> RegionSample:
+    picture = colors[:12].reshape(3, 4, 3).numpy()
+    return RegionSample(
+        np.arange(len(colors)),
+        colors.numpy(),
+        np.ones(len(colors), np.float32),
+        picture,
+        picture,
+        np.ones((3, 4), np.float32),
+    )
+
+
+def test_live_grade_is_exact_in_the_current_view() -> None:
+    scene = with_lobes()
+    camera = to_camera(first_camera(scene), 64, 48)
+    rows = np.arange(0, len(scene), 2)
+    graded = LiveColors().apply(scene, LiveGrade(rows, GRADE), camera, 0)
+    kept = torch.from_numpy(rows)
+    before = drawn_colors(scene, kept, camera.position)
+    after = drawn_colors(graded, kept, camera.position)
+    assert torch.allclose(after.clamp_min(0.0), grade_fully(before, GRADE), atol=1e-4)
+    others = torch.arange(1, len(scene), 2)
+    assert torch.equal(graded.sh0[others], scene.sh0[others])
+    assert graded.shN is scene.shN
+
+
+def test_lattice_of_used_points_equals_the_whole_lattice(monkeypatch: pytest.MonkeyPatch) -> None:
+    colors = torch.rand(3000, 3, generator=torch.Generator().manual_seed(1)) ** 2
+    live = LiveGrade(np.arange(len(colors)), GRADE)
+    exact = ColorTable(colors).graded(live)
+    monkeypatch.setattr(live_grade, "SIDE", 9)
+    few = ColorTable(colors).graded(live)
+    table = grade_fully(lattice_colors(9).float(), GRADE)
+    assert torch.allclose(few, live_grade.look_up(colors.T, table).T, atol=1e-6)
+    assert (few - exact).abs().mean() < 0.02
+
+
+def test_engine_shows_the_live_grade_and_returns_to_the_scene() -> None:
+    scene = bear().scene
+    view = ViewState(camera=first_camera(scene))
+    engine = ViewEngine(None, scene)
+
+    def picture() -> np.ndarray:
+        engine.timings = engine._update_picture(view, to_camera(view.camera, 64, 48), live=engine.live)
+        return np.array(engine.renderer.pixels())
+
+    before = picture()
+    engine.live = LiveGrade(np.arange(len(scene)), GRADE)
+    assert engine.needs_draw(view, (64, 48))
+    graded = picture()
+    assert np.abs(graded - before).max() > 0.1
+    assert np.array_equal(engine.image(view, (64, 48)), before), "pictures to save have no live grade"
+    assert np.array_equal(picture(), graded)
+    engine.live = None
+    assert np.array_equal(picture(), before)
+
+
+def test_clipped_colors_are_marked_and_counted() -> None:
+    colors = torch.tensor([[1.0, 0.5, 0.2], [0.0, 0.0, 0.0], [0.4, 0.5, 0.6], [0.2, 0.0, 0.3]]).repeat(4, 1)
+    marked = ColorTable(colors).graded(LiveGrade(np.arange(16), ColorGrade(), marks=True))
+    assert marked[0].tolist() == pytest.approx(WHITE_MARK)
+    assert marked[1].tolist() == pytest.approx(BLACK_MARK)
+    assert torch.equal(marked[2:4], colors[2:4])
+    grader = FormGrader()
+    assert not grader.scope(None).bins
+    grader.sample = sample_of(colors)
+    scope = grader.scope(None)
+    assert (scope.white, scope.black) == (0.25, 0.25)
+    assert [len(row) for row in scope.bins] == [live_grade.BINS] * 4
+
+
+def test_form_is_graded_before_its_sample_has_arrived() -> None:
+    grader = FormGrader()
+    form = replace(FORM, grade=(1.0, *FORM.grade[1:]))
+    assert grader.live(form) is None
+    grader.rows = np.arange(10)
+    assert grader.live(FORM) is None, "a neutral grade costs nothing"
+    live = grader.live(form)
+    assert live is not None
+    assert grader.live(form) == live
+    assert grader.live(replace(form, strength=0.0)) is None
+    assert grader.live(replace(FORM, clipping=True)) is not None
+    hovered = grader.live(replace(FORM, hovered_look="grade:saturation=-1.00"))
+    assert hovered is not None
+    assert hovered.grade.values["saturation"] == -1.0
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_looks_are_grades_that_keep_the_palette(name: str) -> None:
+    form = with_look(replace(FORM, palette=(("#7eae44", "#4474ae"),), region="selection"), BUILT_IN[name])
+    assert parse_grade(form.spec.partition(":")[2]).values == parse_grade(BUILT_IN[name]).values
+    assert form.palette == (("#7eae44", "#7eae44"),)
+    assert form.region == "selection"
+
+
+def test_look_files_keep_their_settings(tmp_path: Path) -> None:
+    table = grade_fully(lattice_colors(CUBE_SIDE).float(), GRADE)
+    write_cube(tmp_path / "a.cube", table, "a", "exposure=0.40")
+    assert read_settings(tmp_path / "a.cube") == "exposure=0.40"
+    assert torch.allclose(read_cube(tmp_path / "a.cube"), table, atol=1e-5)

@@ -1,0 +1,203 @@
+"""Live grade of the form: effect on the scene, histogram, looks, and settings on the clipboard."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import moderngl
+import numpy as np
+from imgui_bundle import imgui
+
+from progdf.color.grade import grade_fully, parse_grade
+from progdf.color.looks import BUILT_IN, look_name
+from progdf.errors import ProgdfError
+from progdf.field.baked import lattice_colors
+from progdf.formats.cube import SIDE, SUFFIX, write_cube
+from progdf.io.atomic import make_folder, numbered_names
+from viewer.app.messages import Messages, Requests
+from viewer.files import region_files, user_files
+from viewer.files.document import DocumentStore
+from viewer.jobs.preview_process import RegionSample
+from viewer.render.engine import ViewEngine
+from viewer.render.live_grade import FormGrader, LiveGrade
+from viewer.state.forms import LOOK_COLUMNS, LOOK_PX, with_settings
+from viewer.state.transient import LookShelf
+from viewer.state.workspace import Store, with_transient
+
+
+class GradePreview:
+    """Grade of the form on screen, within the frame of a change. `close` it with the window.
+
+    Args:
+        store: state of the window
+        documents: the open document
+        messages: messages to the user
+        context: the GL context
+        engine: returns the engine that draws the window
+    """
+
+    def __init__(
+        self,
+        *,
+        store: Store,
+        documents: DocumentStore,
+        messages: Messages,
+        context: moderngl.Context,
+        engine: Callable[[], ViewEngine],
+    ) -> None:
+        self._store = store
+        self._documents = documents
+        self._messages = messages
+        self._context = context
+        self._engine = engine
+        self._grader = FormGrader()
+        self._region = ""  # region of the grader's rows, see `region_key`
+        self._sheet: moderngl.Texture | None = None
+        self._looks: tuple[tuple[str, str], ...] | None = None  # None: to be read again
+        self._drawn: tuple[RegionSample, tuple[tuple[str, str], ...]] | None = None  # inputs of the sheet
+        self._scope_of: tuple[object, LiveGrade | None] | None = None
+
+    @property
+    def requests(self) -> Requests:
+        """Handlers of the requests about grades, by name."""
+        return {"copy_edit": self._copy, "paste_edit": self._paste, "save_look": self._save_look}
+
+    def region_key(self) -> str:
+        """Return the form's region as a key."""
+        work = self._store.get()
+        form = work.form
+        return f"{form.region}|{form.typed_region}|{hash(work.view.selection.members)}"
+
+    def take(self, sample: RegionSample, region: str) -> None:
+        """Take over the sample of a region; it is dropped if the form has another region by now."""
+        if region == self.region_key():
+            self._region = region
+            self._grader.sample = sample
+            self._grader.rows = sample.rows
+
+    def update(self) -> None:
+        """Show the grade of the form on the Gaussians of its region, and its histogram and looks."""
+        work = self._store.get()
+        form = work.form
+        is_open = work.form_open and work.view.panel and form.choice.setting == "grade"
+        live = None
+        if is_open:
+            self._find_rows()
+            live = self._grader.live(form)
+            self._update_scope(live)
+            self._update_shelf()
+        shown = live if form.preview and not work.before else None
+        engine = self._engine()
+        if engine.live != shown:
+            engine.live = shown
+            self._store.wake()
+
+    def leave_scene(self) -> None:
+        """Forget the region of the closed scene."""
+        self._region = ""
+        self._grader = FormGrader()
+
+    def close(self) -> None:
+        """Release the texture."""
+        if self._sheet is not None:
+            self._sheet.release()
+            self._sheet = None
+
+    def _find_rows(self) -> None:
+        """Find the rows of a new region, so that it is graded before the preview process has answered."""
+        key = self.region_key()
+        if key == self._region:
+            return
+        self._region = key
+        self._grader.sample = None
+        work = self._store.get()
+        count = len(self._documents.get().original)
+        self._grader.rows = region_files.region_rows(work.form, work.view.selection, count)
+
+    def _update_scope(self, live: LiveGrade | None) -> None:
+        """Compute the histogram again after a change."""
+        sample = self._grader.sample
+        if self._scope_of is not None and self._scope_of[0] is sample and self._scope_of[1] == live:
+            return
+        self._scope_of = sample, live
+        work = self._store.get()
+        self._store.replace(with_transient(work, scope=self._grader.scope(live)))
+        self._store.wake()
+
+    def _update_shelf(self) -> None:
+        """Read the looks, and draw their thumbnails after the view or the looks have changed."""
+        if self._looks is None:
+            self._looks = (*user_files.read_looks(), *BUILT_IN.items())
+        sample = self._grader.sample
+        if sample is None:
+            if self._store.get().transient.shelf.looks != self._looks:
+                self._set_shelf(0)
+            return
+        if self._drawn is not None and self._drawn[0] is sample and self._drawn[1] is self._looks:
+            return
+        self._drawn = sample, self._looks
+        width, height = LOOK_PX
+        rows = -(-len(self._looks) // LOOK_COLUMNS)
+        pixels = np.zeros((rows * height, LOOK_COLUMNS * width, 3), np.uint8)
+        for i, (_, look) in enumerate(self._looks):
+            thumbnail = self._grader.thumbnail(look)
+            if thumbnail is not None and thumbnail.shape == (height, width, 3):
+                row, column = divmod(i, LOOK_COLUMNS)
+                pixels[row * height : (row + 1) * height, column * width : (column + 1) * width] = thumbnail
+        self.close()
+        self._sheet = self._context.texture(
+            (pixels.shape[1], pixels.shape[0]), 3, pixels.tobytes(), alignment=1
+        )
+        self._set_shelf(int(self._sheet.glo))
+
+    def _set_shelf(self, sheet: int) -> None:
+        shelf = LookShelf(self._looks or (), sheet)
+        self._store.replace(with_transient(self._store.get(), shelf=shelf))
+        self._store.wake()
+
+    def _save_look(self, _: None) -> None:
+        """Save the form's grade as a look, a .cube file that other programs read too.
+
+        Raises:
+            ProgdfError: the grade changes nothing, or the folder cannot be written to.
+        """
+        form = self._store.get().form
+        settings = form.spec.partition(":")[2]
+        grade = parse_grade(settings)
+        folder = user_files.looks_folder()
+        make_folder(folder)
+        names = numbered_names(form.name.strip() or "Look")
+        path = next(path for name in names if not (path := folder / f"{name}{SUFFIX}").exists())
+        write_cube(path, grade_fully(lattice_colors(SIDE).float(), grade), path.stem, settings)
+        self._looks = None
+        self._messages.show(f"Saved the look {look_name(path.stem)} as {path}")
+        self._store.wake()
+
+    def _copy(self, _: None) -> None:
+        """Copy the settings of the form's edit, or of the selected layer's, as text."""
+        work = self._store.get()
+        settings = work.form.spec
+        if not work.form_open:
+            edits = self._documents.get().edits
+            layer = None if work.focus is None else work.view.layers[work.focus]
+            settings = "" if layer is None or layer.gdf >= len(edits) else edits[layer.gdf].instruction
+        if not settings:
+            raise ProgdfError("select a layer that was trained, or open the form; then copy its settings")
+        imgui.set_clipboard_text(settings)
+        self._messages.show(f"Copied {settings}")
+
+    def _paste(self, _: None) -> None:
+        """Open the form with the settings on the clipboard, for its region.
+
+        Raises:
+            ProgdfError: the clipboard has no settings of an edit.
+        """
+        text = (imgui.get_clipboard_text() or "").strip()
+        work = self._store.get()
+        form = with_settings(work.form, text) if "\n" not in text else None
+        if form is None:
+            raise ProgdfError(f"the clipboard has no settings of an edit, but '{text[:40]}'; copy some first")
+        form = replace(form, region=work.form.region, error="")
+        self._store.replace(replace(work, form=form, form_open=True, form_opening=not work.form_open))
+        self._store.wake()
