@@ -73,7 +73,7 @@ class RunLog:
         quiet: write to the file only
         refits: a later command on a finished run, whose time is counted separately
         progress: JSON file for programs that wait for the run, rewritten a few times a second: elapsed share
-            of the time, label of the stage, loss, and seconds so far; None writes no file
+            of the time, label of the stage, edited views, loss, and seconds so far; None writes no file
     """
 
     def __init__(
@@ -187,7 +187,8 @@ class RunLog:
         def report_step(done: int, word: str) -> float:
             share = min(done / max(total, 1), 1.0)
             left = self.seconds_left(what, share, time.perf_counter() - begun)
-            self._write_progress(what, left, word, done >= total)
+            count = f"{done} of {total}" if what == "edit" else ""
+            self._write_progress(what, left, word, done >= total, count)
             return left
 
         def advance(done: int, word: str) -> None:
@@ -239,7 +240,7 @@ class RunLog:
         with suppress(OSError):  # a full disk, already reported
             self._file.close()
 
-    def _write_progress(self, what: str, left: float, word: str, ends: bool) -> None:
+    def _write_progress(self, what: str, left: float, word: str, ends: bool, count: str) -> None:
         """Rewrite the progress file at most every `_FILE_INTERVAL_S` seconds; ignore a failed write."""
         now = time.perf_counter()
         if self._progress is None or (now - self._written < _FILE_INTERVAL_S and not ends):
@@ -250,6 +251,7 @@ class RunLog:
         state = {
             "share": self._share,
             "label": STAGES[what],
+            "count": count,
             # a field's loss is on another scale
             "loss": word.removeprefix("loss to the edit ") if what == "optimize" else "",
             "seconds": total,

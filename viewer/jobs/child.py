@@ -9,6 +9,7 @@ ends when the input ends.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import signal
 import subprocess
@@ -27,6 +28,9 @@ from progdf.terminal import lower_priority, signal_main_thread
 GRACE_S = 8.0
 """Seconds between a stop request and the kill; the child may be saving its state."""
 
+PICTURES_GRACE_S = 330.0
+"""The same for a child that waits for pictures of a server, which may be paid: one call's time limit."""
+
 _TALKS = "--talks"
 
 
@@ -38,6 +42,7 @@ class Progress:
     label: str = ""  # current step, "" while it starts
     loss: str = ""  # loss of the training, "" without one
     seconds: Annotated[float, Meta(ge=0.0, le=1e9)] = 0.0  # time spent on a run in all its sessions
+    count: str = ""  # pictures of this step that are done, such as "4 of 12"; "" for other steps
 
 
 class Child:
@@ -74,13 +79,14 @@ class Child:
         if not talks:
             lower_priority(self._process.pid)
         self.log = log
-        self._stopped_at: float | None = None
+        self._killed_at = math.inf
+        self._grace_s: float | None = None  # None before a stop request
 
     @property
     def status(self) -> int | None:
         """Exit status; None while it runs. A command that ignores a stop request is killed."""
         status = self._process.poll()
-        if status is None and self._stopped_at is not None and time.monotonic() - self._stopped_at > GRACE_S:
+        if status is None and time.monotonic() > self._killed_at:
             self.kill()
         return status
 
@@ -102,10 +108,11 @@ class Child:
             self._process.stdin.write(line.encode() + b"\n")
             self._process.stdin.flush()
 
-    def stop(self) -> None:
-        """Request a stop: the command saves its state."""
-        if self._stopped_at is None:
-            self._stopped_at = time.monotonic()
+    def stop(self, grace_s: float = GRACE_S) -> None:
+        """Request a stop: the command saves its state, and is killed after `grace_s` seconds."""
+        if self._grace_s is None:
+            self._grace_s = grace_s
+            self._killed_at = time.monotonic() + grace_s
             if self._process.stdin is not None:
                 with contextlib.suppress(OSError):
                     self._process.stdin.close()
@@ -119,13 +126,17 @@ class Child:
                 self._process.kill()
 
     def close(self) -> None:
-        """Stop the command and wait until it has ended."""
+        """Stop the command and wait until it has ended.
+
+        A command that was stopped with a longer grace than `GRACE_S` is left to end by itself.
+        """
         self.stop()
         try:
             self._process.wait(GRACE_S)
         except subprocess.TimeoutExpired:
-            self.kill()
-            self._process.wait()
+            if self._grace_s is None or self._grace_s <= GRACE_S:
+                self.kill()
+                self._process.wait()
         if self._process.stdout is not None:
             self._process.stdout.close()
 

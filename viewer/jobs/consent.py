@@ -2,13 +2,17 @@
 
 The order of a run lies beside its scene, where somebody else may have written it. An edit file names its
 editor, too. Therefore neither starts a program or sends a picture until the user has agreed to exactly that
-program or server.
+program or server. A name of a file in the current folder is another file elsewhere, so the folder is part of
+the action.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
+import shlex
+from pathlib import Path
 
 from progdf.errors import ProgdfError
 from progdf.io.atomic import make_folder, state_folder, write_file
@@ -29,11 +33,13 @@ def outside_action(editor: str, url: str) -> str:
     """
     kind, _, text = editor.partition(":")
     if kind == "command":
-        return f"Run this program on pictures of the scene:\n{text}"
+        place = f"\nin the folder {Path.cwd()}" if _names_local_files(text) else ""
+        return f"Run this program on pictures of the scene:\n{text}{place}"
     if kind == "api":
         return f"Send pictures of the scene to this server:\n{url}"
     if kind == "comfy":
-        return f"Send pictures of the scene to this server, and run a workflow on it:\n{url}\n{text}"
+        path = Path(text).absolute()
+        return f"Send pictures of the scene to this server, and run a workflow on it:\n{url}\n{path}"
     return ""
 
 
@@ -64,6 +70,16 @@ def check_allowed(editor: str, url: str) -> None:
     if not is_allowed(action):
         line = " ".join(action.split("\n"))
         raise ProgdfError(f"not allowed yet: {line}; train it from the form of a new edit")
+
+
+def _names_local_files(command: str) -> bool:
+    """Return True if a word of a command is the relative path of a file, such as `python edit.py {input}`."""
+    try:
+        words = shlex.split(command)
+    except ValueError:  # a quote is not closed: the command does not run
+        return False
+    paths = [Path(word.rpartition("=")[2]) for word in words]
+    return any(not path.is_absolute() and os.path.isfile(path) for path in paths)
 
 
 def _digest(action: str) -> str:

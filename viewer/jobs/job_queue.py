@@ -17,7 +17,7 @@ from typing import ClassVar
 from progdf.errors import ProgdfError, without_commands
 from viewer.state.workspace import JobStatus
 
-from .child import Child, Progress, last_line
+from .child import GRACE_S, PICTURES_GRACE_S, Child, Progress, last_line
 from .consent import check_allowed
 from .training import EditOrder
 
@@ -44,6 +44,7 @@ class Delivery:
 
     is_begun: ClassVar[bool] = False
     is_locked: ClassVar[bool] = False
+    sends_pictures: ClassVar[bool] = False
 
     @property
     def result(self) -> Path:
@@ -187,7 +188,7 @@ class JobQueue:
             self._change(replace(job, status="queued", resumes=resumes, error="", seconds=0.0))
 
     def stop(self, number: int) -> None:
-        """Stop a job; a run keeps its progress. A queued job is removed."""
+        """Stop a job; a run keeps its progress. A queued job is removed, a stopping one is killed."""
         job = self.job(number)
         if job.status == "queued" and job.resumes:
             self._unlock(job)
@@ -195,8 +196,10 @@ class JobQueue:
         elif job.status == "queued":
             self._drop(job)
         elif job.status == "running":
-            self._children[number].stop()
+            self._children[number].stop(_grace_s(job))
             self._change(replace(job, status="stopping"))
+        elif job.status == "stopping":
+            self._children[number].kill()
 
     def discard(self, number: int) -> None:
         """Remove a job that does not run, and the files of a run unless it is finished.
@@ -244,8 +247,9 @@ class JobQueue:
             if job.status == "queued" and not job.resumes:
                 with suppress(ProgdfError):
                     self._drop(job)
-        for child in self._children.values():
-            child.stop()
+        for job in self.jobs:
+            if child := self._children.get(job.number):
+                child.stop(_grace_s(job))
         for child in self._children.values():
             child.close()
         self._children.clear()
@@ -311,3 +315,8 @@ class JobQueue:
     def _unlock(self, job: QueuedTask) -> None:
         if locks := self._locks.pop(job.number, None):
             locks.close()
+
+
+def _grace_s(job: QueuedTask) -> float:
+    """Return the seconds between a stop request and the kill."""
+    return PICTURES_GRACE_S if job.task.sends_pictures else GRACE_S

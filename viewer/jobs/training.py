@@ -110,6 +110,11 @@ class EditOrder:
         return self.editor == "remove" and bool(self.replaces)
 
     @property
+    def sends_pictures(self) -> bool:
+        """True if a server makes its pictures, which may be paid."""
+        return bool(self.api_url)
+
+    @property
     def result(self) -> Path:
         """File of the trained edit."""
         return self.out / f"{self.name}.gdf"

@@ -169,6 +169,8 @@ def _foot(job: JobCard, right: float, menu: bool, ui: UiContext) -> list[str]:
     buttons = list(_BUTTONS.get((job.status, bool(job.training)), ()))
     if job.keepable:
         buttons.insert(0, _KEEP)
+    if job.status == "stopping" and job.sends_pictures:
+        buttons.append(_LEAVE_PICTURES)
     if job.offer:
         buttons = [*_OFFER_BUTTONS, *buttons]
     if menu:
@@ -212,6 +214,8 @@ def _status_text(job: JobCard) -> str:
         case "queued":
             return "Waiting for the previous job"
         case "stopping":
+            if job.sends_pictures:
+                return "Waiting for the server"
             return "Saving the state" if job.training else _NOTHING_WRITTEN
         case "done":
             return ""
@@ -222,6 +226,7 @@ def _status_text(job: JobCard) -> str:
 
 _STOP_HELP = "Stop; the run can be resumed later, and a finished layer stays"
 _KEEP = ("Keep as it is", "keep_run", "Make a layer of the newest recording; Resume can still finish the run")
+_LEAVE_PICTURES = ("Stop now", "stop_run", "Leave the pictures that the server is making, paid or not")
 _CANCEL = ("Cancel", "stop_run", "Remove it from the queue")
 _CLOSE = ("Close", "close_run", "Remove the card; files are kept")
 _OFFER_BUTTONS = (

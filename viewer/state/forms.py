@@ -100,6 +100,23 @@ NO_WHEELS = (Wheel(),) * len(WHEELS)
 NO_CHANGE = "Change a color, the curve or a slider of the grade"
 """Obstacle: the grade changes nothing."""
 MAX_PAIRS = 8
+_SMALL_WORDS = (
+    "a",
+    "an",
+    "and",
+    "as",
+    "at",
+    "for",
+    "from",
+    "in",
+    "into",
+    "like",
+    "of",
+    "on",
+    "the",
+    "to",
+    "with",
+)
 
 
 @dataclass(frozen=True)
@@ -181,14 +198,14 @@ class NewEdit:
             case "sentence" | "server":
                 return f"{kind}:{self.sentence.strip()}"
             case "workflow":
-                return f"{kind}:{Path(self.outside.workflow.strip()).expanduser()}"
+                return f"{kind}:{Path(self.outside.workflow.strip()).expanduser().absolute()}"
             case "program":
                 return f"{kind}:{self.outside.program.strip()}"
             case "pictures":
                 files = [Path(name.strip()).expanduser().absolute() for name in self.pictures.split(",")]
                 return f"{kind}:{','.join(map(str, files))}"
             case "folder":
-                return f"{kind}:{Path(self.folder.strip()).expanduser()}"
+                return f"{kind}:{Path(self.folder.strip()).expanduser().absolute()}"
 
     @property
     def url(self) -> str:
@@ -238,7 +255,7 @@ class NewEdit:
         kind = self.choice.kind
         description = f"{kind} {self.style}" if kind == "style" else kind
         if self.choice.setting in ("sentence", "server", "workflow") and self.sentence.strip():
-            description = " ".join(self.sentence.split()[:4])
+            description = _short_name(self.sentence)
         if self.choice.setting == "pictures" and self.pictures.strip():
             description = Path(self.pictures.split(",")[0].strip()).stem
         return (
@@ -271,11 +288,30 @@ class NewEdit:
             return ""
         if self.choice.setting == "workflow" and not outside.workflow.strip():
             return "Enter the file of a workflow, saved with Export (API)"
-        if not urlsplit(self.url).netloc:
-            return "Enter the address of the server, such as http://127.0.0.1:8080/v1"
+        if not _is_address(self.url):
+            port = "8080/v1" if self.choice.setting == "server" else "8188"
+            return f"Enter the address of the server, such as http://127.0.0.1:{port}"
         if self.choice.setting == "server" and not outside.model.strip():
             return "Enter the name of the server's model"
         return ""
+
+
+def _short_name(sentence: str) -> str:
+    """Return the first words of a prompt, at least four, that do not end with an article or a preposition."""
+    words = sentence.split()
+    count = 4
+    while count < len(words) and words[count - 1].lower() in _SMALL_WORDS:
+        count += 1
+    return " ".join(words[:count])
+
+
+def _is_address(url: str) -> bool:
+    """Return True for an address of HTTP with a host."""
+    try:
+        parts = urlsplit(url)
+    except ValueError:  # such as half an IPv6 address
+        return False
+    return parts.scheme in ("http", "https") and bool(parts.netloc)
 
 
 def parse_curve(text: str) -> list[Point]:

@@ -123,6 +123,7 @@ class JobCard:
     warning: str = ""  # one line about a poor result
     keepable: bool = False  # its newest recording can become a layer
     delivered: bool = False  # the edit is written, and only its report is left
+    sends_pictures: bool = False  # a server makes its pictures; a stop waits for those that it is making
     offer: str = ""  # one line about a possible continuation of the edit
     elsewhere: str = ""  # name of its scene while another one is open
     fills: int | None = None  # `LayerState.gdf` of the removal whose hole it fills

@@ -182,6 +182,41 @@ def test_key_is_never_sent_unencrypted_to_another_machine(monkeypatch: pytest.Mo
         check_api(options.text, options)
 
 
+SIZES = ("1024x1024", "1024x1536", "1536x1024")
+BAD_SIZE = "Invalid value: '{}'. Supported values are: " + ", ".join(f"'{size}'" for size in SIZES)
+
+
+def test_model_of_few_sizes_gets_the_picture_on_a_canvas() -> None:
+    def model(call: Call, number: int) -> Answer:
+        size = call.fields["size"]
+        assert "{}x{}".format(*call.pictures[0].size) == size
+        return swap_colors(call.pictures[0]) if size in SIZES else Refusal(400, "", BAD_SIZE.format(size))
+
+    with image_server(model) as server:
+        editor = editor_of(settings_of(server.url))
+        rows = torch.arange(30)[:, None, None]
+        columns = torch.arange(24)[:, None]
+        tiles = ((rows + 2 * columns + torch.arange(3)) % 3).float() / 2  # large pixels: a shift would show
+        picture = tiles.repeat_interleave(8, 0).repeat_interleave(8, 1)
+        for calls in (2, 3):
+            painted = editor.paint(PaintRequest(picture, [picture]))
+            assert len(server.calls) == calls, "the sizes are learned once"
+    assert server.calls[-1].fields["size"] == "1024x1536", "5 : 4 is nearer to 3 : 2 than to a square"
+    assert [one.size for one in server.calls[-1].pictures] == [(1024, 1536)] * 2
+    assert painted.shape == picture.shape
+    assert float((painted.flip(2) - picture).abs().mean()) < 0.05  # blurred edges; a shift of one pixel: 0.08
+
+
+def test_server_that_refuses_every_size_is_a_one_line_error() -> None:
+    with (
+        image_server(lambda call, number: Refusal(400, "", BAD_SIZE.format("x"))) as server,
+        pytest.raises(ProgdfError, match=r"refuses the call with status 400 .*Supported values") as error,
+    ):
+        paint_first(settings_of(server.url))
+    assert "\n" not in str(error.value)
+    assert len(server.calls) == 2
+
+
 def test_destination_number_of_calls_and_cost_are_stated() -> None:
     line = explain_sending(settings_of("http://127.0.0.1:8080/v1", price_per_call=0.04), 12)
     assert line == (

@@ -46,6 +46,7 @@ def test_progress_file_reports_the_share_of_the_whole_run(
             advance(done, word)
         found.append(json.loads((tmp_path / "progress.json").read_text("utf-8")))
     log.close()
+    assert [line["count"] for line in found] == ["5 of 10", "", "", ""]
     # 10 s of 100; then, at the pace without editing, 40 of 40 + 7.5 · 4 and 60 of 60 + 10 · 3
     assert [(line["label"], round(line["share"], 2), line["loss"]) for line in found] == [
         ("Editing views", 0.1, ""),

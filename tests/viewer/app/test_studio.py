@@ -64,7 +64,7 @@ class Trainer:
             shutil.copy(self.edit, out / f"{out.name}.gdf")
         return self.ended
 
-    def stop(self) -> None:
+    def stop(self, grace_s: float = 0.0) -> None:
         type(self).ended = 130
 
     def close(self) -> None:

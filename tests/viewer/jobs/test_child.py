@@ -99,6 +99,24 @@ def test_child_stops_if_the_window_ignores_interrupts() -> None:
     assert process.returncode in (1, 130, -signal.SIGINT)
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGSTOP")
+def test_child_that_waits_for_pictures_is_not_killed(
+    child: Callable[..., Child], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("viewer.jobs.child.GRACE_S", 0.0)
+    patient = child("preview", "no.ply", talks=True)
+    os.kill(patient.pid, signal.SIGSTOP)  # it cannot end, as if a server made a picture
+    patient.stop(1000.0)
+    assert patient.status is None
+    patient.close()
+    assert patient.status is None, "it ends by itself after the window"
+    hurried = child("preview", "no.ply", talks=True)
+    os.kill(hurried.pid, signal.SIGSTOP)
+    hurried.stop(0.0)
+    hurried.close()
+    assert hurried.status == -signal.SIGKILL
+
+
 def test_child_starts_and_is_killed_without_process_groups(
     child: Callable[..., Child], monkeypatch: pytest.MonkeyPatch
 ) -> None:

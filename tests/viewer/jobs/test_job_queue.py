@@ -39,7 +39,7 @@ class Waiting:
         if arguments[0] == "train":
             begin(out)
 
-    def stop(self) -> None:
+    def stop(self, grace_s: float = 0.0) -> None:
         self.status = 130
 
     def close(self) -> None:

@@ -306,6 +306,8 @@ def test_layer_name_is_a_valid_file_name() -> None:
     assert form("recolor", region="hands").layer_name == "hands recolor"
     assert form("night", name=" ../a\\b ").layer_name == "-a-b"
     assert form("style", style=7).layer_name == "style 7"
+    assert form("instruct", sentence="turn him into a marble statue").layer_name == "turn him into a marble"
+    assert form("instruct", sentence="make it of").layer_name == "make it of"
 
 
 def test_orders_of_servers_and_programs_are_parsed_by_the_trainer() -> None:
@@ -334,7 +336,7 @@ def test_form_states_where_pictures_go_and_what_they_cost() -> None:
     assert replace(served, outside=replace(outside, price="x")).outside_note.endswith("api.example.org")
     assert form("command", outside=outside).outside_note == "x runs on this machine, for 12 pictures or more"
     assert form("recolor").outside_note == ""
-    for changes in ({"server": ""}, {"model": ""}):
+    for changes in ({"server": ""}, {"server": "ttp://x/v1"}, {"server": "http://["}, {"model": ""}):
         assert replace(served, outside=replace(outside, **changes)).obstacle.startswith("Enter the")
     assert form("command").obstacle == "Enter a program with {input} and {output}"
     assert form("comfy").obstacle.startswith("Enter the file of a workflow")
@@ -370,6 +372,26 @@ def test_order_of_a_file_starts_nothing_outside_without_consent(
     with pytest.raises(ProgdfError, match="not allowed yet"):
         consent.check_allowed(f"{editor} ", f"{url}/x")
     queue.close()
+
+
+def test_consent_to_a_local_file_does_not_hold_in_another_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    commands = ("command:./edit {input} {output}", "command:python edit.py {input} --lut=edit.py {output}")
+    comfy = "comfy:edit.py"
+    for name in ("mine", "stranger"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "edit.py").touch()
+        (tmp_path / name / "edit").touch()
+    monkeypatch.chdir(tmp_path / "mine")
+    for editor in (*commands, comfy):
+        consent.allow(consent.outside_action(editor, ""))
+        consent.check_allowed(editor, "")
+    assert str(tmp_path / "mine") in consent.outside_action(commands[0], "")
+    monkeypatch.chdir(tmp_path / "stranger")
+    for editor in (*commands, comfy):
+        with pytest.raises(ProgdfError, match="not allowed yet"):
+            consent.check_allowed(editor, "")
 
 
 def test_order_arguments_are_parsed_by_the_trainer() -> None:

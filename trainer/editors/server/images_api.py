@@ -12,7 +12,7 @@ import binascii
 import http.client
 import os
 import urllib.request
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib.util import find_spec
 from threading import Event
@@ -39,12 +39,29 @@ from .calls import (
     png,
     retry_after,
 )
+from .canvas import Canvas, Size, best_canvas, named_sizes
 
 KEY = "OPENAI_API_KEY"
 """Environment variable of the server's key. A server on this machine may need none."""
 
 _MAX_PICTURE_BYTES = 1 << 26  # largest picture of a server
 _REFUSALS = ("content_policy_violation", "moderation_blocked", "content_filter", "safety")
+
+
+class _SizeError(Exception):
+    """A refused size, with the sizes that the server accepts."""
+
+    def __init__(self, error: ProgdfError, sizes: tuple[Size, ...]) -> None:
+        super().__init__(str(error))
+        self.error = error
+        self.sizes = sizes
+
+
+def _placed(request: PaintRequest, canvas: Canvas) -> PaintRequest:
+    """Return a request whose pictures are on a canvas."""
+    mask = None if request.mask is None else canvas.place(request.mask[..., None])[..., 0]
+    references = [canvas.place(picture) for picture in request.references]
+    return replace(request, picture=canvas.place(request.picture), references=references, mask=mask)
 
 
 @dataclass(frozen=True)
@@ -56,6 +73,7 @@ class ImagesApi:
     timeout: float  # seconds for one call
     references: int = 2  # reference pictures that one call accepts
     sends_mask: bool = False
+    _sizes: list[Size] = field(default_factory=list, repr=False)  # sizes the server accepts; none: any
 
     has_strength = False
 
@@ -80,11 +98,30 @@ class ImagesApi:
         return persist(partial(self._edit_once, request, prompt), stop)
 
     def _edit_once(self, request: PaintRequest, prompt: str) -> Tensor:
-        """Make one call.
+        """Make one call, and another one if the server refuses the size and names those that it accepts.
 
         Raises:
             BusyError: the call may succeed if it is made again.
             RefusedError, ProgdfError: see `ImageModel.edit`.
+        """
+        height, width = request.picture.shape[:2]
+        if not self._sizes:
+            try:
+                return self._call(request, prompt)
+            except _SizeError as refused:
+                self._sizes[:] = refused.sizes
+        canvas = best_canvas((width, height), self._sizes)
+        try:
+            return canvas.cut(self._call(_placed(request, canvas), prompt))
+        except _SizeError as refused:
+            raise refused.error from refused
+
+    def _call(self, request: PaintRequest, prompt: str) -> Tensor:
+        """Make one call at the size of the picture.
+
+        Raises:
+            _SizeError: the server refuses the size.
+            BusyError, RefusedError, ProgdfError: see `_edit_once`.
         """
         import openai
 
@@ -110,7 +147,7 @@ class ImagesApi:
             try:
                 answer = client.images.edit(**arguments)
             except openai.APIStatusError as error:
-                raise self._explain(error) from error
+                raise self._explain(error, (width, height)) from error
             except openai.APITimeoutError as error:
                 raise BusyError(self.address.slow(self.timeout)) from error
             except (openai.APIConnectionError, openai.OpenAIError) as error:
@@ -155,8 +192,8 @@ class ImagesApi:
             raise self.address.fault("returned a picture of more than 64 MB")
         return content
 
-    def _explain(self, error: Any) -> Exception:
-        """Return the error of a refused call."""
+    def _explain(self, error: Any, size: Size) -> Exception:
+        """Return the error of a refused call with a picture of this size."""
         body = error.body if isinstance(error.body, dict) else {}
         message = one_line(body.get("message") or error.message)
         code = str(body.get("code") or "")
@@ -172,6 +209,9 @@ class ImagesApi:
         fault = self.address.fault(f"refuses the call with status {status} ({message}); {advice}")
         if status in BUSY_STATUSES and code != "insufficient_quota":
             return BusyError(fault, retry_after(error.response.headers))
+        sizes = named_sizes(str(body.get("message") or error.message), size)
+        if status in (400, 422) and sizes:
+            return _SizeError(fault, sizes)
         return fault
 
 

@@ -75,6 +75,7 @@ def job_card(job: QueuedTask) -> JobCard:
     starting = "Starting"
     keepable = False
     delivered = False
+    label = " ".join(filter(None, (job.progress.label, job.progress.count)))
     if isinstance(task, EditOrder):
         delivered = task.is_delivered
         training = f"{task.editor} on {task.region}"
@@ -87,7 +88,7 @@ def job_card(job: QueuedTask) -> JobCard:
         task.out,
         job.status,
         training,
-        job.progress.label or starting,
+        label or starting,
         job.progress.share,
         job.progress.loss,
         seconds_left=job.seconds_left,
@@ -95,6 +96,7 @@ def job_card(job: QueuedTask) -> JobCard:
         warning=job.warning,
         keepable=keepable,
         delivered=delivered,
+        sends_pictures=task.sends_pictures,
         offer=job.offer,
     )
 
