@@ -20,7 +20,7 @@ from trainer.editors.base import ImageEditor
 from trainer.optimize.retime import select_recordings
 from trainer.options import FieldKind, FieldOptions
 from trainer.quality import QUALITIES
-from trainer.store.progress import release_memory
+from trainer.store.memory import release_memory
 from trainer.views.choose import split_held_out
 from trainer.views.crops import only_recolors
 from trainer.views.setup import TrainingSetup

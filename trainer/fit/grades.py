@@ -36,7 +36,7 @@ from progdf.field.trajectory import Trajectory
 from progdf.metrics.image import decibels
 from progdf.threads import map_threads, one_thread
 from trainer.options import FieldOptions
-from trainer.store.progress import release_memory
+from trainer.store.memory import release_memory
 
 from .evaluate import Evaluator, sample_members
 from .fit import Fitted, field_evaluator, measure_choice

@@ -47,6 +47,7 @@ from trainer.report.measures import (
 )
 from trainer.report.report import report_picture
 from trainer.resolve import BLANK, check_field_options, use_threads
+from trainer.store.memory import reuse_memory
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder, read_views, write_json, write_views
 from trainer.store.state import Saved
@@ -505,6 +506,7 @@ def refit(options: FitOptions, quiet: bool = False) -> RunResult:
     """
     check_field_options(options.field)
     use_threads(options.threads)
+    reuse_memory()
     run = reopen_run(options.run, options.scene)
     recorded_plan = run.record.plan
     field = replace(

@@ -17,6 +17,7 @@ from trainer.fit.draft import draft_grade, draft_views
 from trainer.optimize.losses import perceptual_loss
 from trainer.options import TrainOptions
 from trainer.resolve import resolve, use_threads
+from trainer.store.memory import reuse_memory
 from trainer.store.pretrained import LastValueCache
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import (
@@ -63,6 +64,7 @@ def train(
     shared = shared or LastValueCache()
     check_command(options)
     use_threads(options.threads)
+    reuse_memory()
     scene = shared.get("scene", options.scene.resolve(), lambda: load_scene(options.scene))
     lower = open_lower_layers(shown_pictures(options), options.scene, scene)
     base = scene if lower is None else lower.base

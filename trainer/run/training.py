@@ -49,7 +49,8 @@ from trainer.options import (
     TrainOptions,
 )
 from trainer.paper.network import JointTraining, save_network
-from trainer.store.progress import RunLog, release_memory
+from trainer.store.memory import release_memory
+from trainer.store.progress import RunLog
 from trainer.store.run_folder import LazySequence
 from trainer.store.state import PeriodicSave, Resumable, Saved, StateFolder, defer_signals
 from trainer.views.boxes import Pictures, boxed_pictures, probe_views

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import json
 import sys
 import threading
@@ -18,6 +17,7 @@ from progdf.errors import ProgdfError
 from progdf.io.atomic import write_file
 from progdf.terminal import escape_text
 
+from .memory import release_memory
 from .state import Saved
 
 Advance = Callable[[int, str], None]
@@ -56,8 +56,6 @@ LATER = {
 
 
 _EDITOR_STAGES = ("try kinds", "edit")  # the editor's own work, whose pace differs from the other stages
-
-_MALLOC_TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
 
 _LINE_INTERVAL_S = 5.0  # between two lines of a stage without a terminal
 _FILE_INTERVAL_S = 0.4  # between two writes of the progress file
@@ -265,24 +263,6 @@ class RunLog:
 
 def _escape(text: str) -> str:
     return escape_text(text).replace("[", "\\[")
-
-
-def release_memory() -> None:
-    """Return freed memory to the system if the process has grown by 10 % since the last call.
-
-    glibc keeps freed blocks that lie between used ones: 0.8 GB after the views of 200 000 members.
-    """
-    global _resident
-    if _MALLOC_TRIM is not None and _resident_pages() > 1.1 * _resident:
-        _MALLOC_TRIM(0)
-        _resident = _resident_pages()
-
-
-_resident = 0  # pages after the last `release_memory`
-
-
-def _resident_pages() -> int:
-    return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
 
 
 _STATUS_FILE = Path("/proc/self/status")
