@@ -74,6 +74,14 @@ MAX_RANK = 16
 _MIN_KNOT_DISTANCE = 1 / 80
 """Smallest distance from a remap's knot to the field's knots at which it adds a row of coefficients."""
 
+_RANGE_MEMBERS = 1 << 11
+"""Members whose offsets are summed at once."""
+
+
+def member_ranges(members: int) -> list[slice]:
+    """Return ranges of members for sums whose temporary arrays would be as large as the trajectory."""
+    return [slice(begin, begin + _RANGE_MEMBERS) for begin in range(0, members, _RANGE_MEMBERS)]
+
 
 @dataclass(frozen=True)
 class AttributeBases:
@@ -397,16 +405,23 @@ class BakedField:
 
     def attribute_offsets(self, name: str, s: float) -> Tensor:
         """Return raw offsets of one attribute at strength `s`; exactly 0 at 0, `end` at 1. [M,c] float32"""
+        total = torch.zeros(self.attributes[name].end_offset.shape)
+        self._add_offsets(name, s, total)
+        return total
+
+    def _add_offsets(self, name: str, s: float, total: Tensor) -> None:
+        """Write `attribute_offsets` into zeros, for some members at a time. [M,c]"""
         bases = self.attributes[name]
         weights = self.coefficients(name, s).tolist()
         factors = self.factors(name, s)
         if not any(weights):
-            return torch.zeros(bases.end_offset.shape)
-        total = factors[0] * bases.end_offset.float()
-        for weight, factor, basis in zip(weights[1:], factors[1:], bases.residual_basis, strict=True):
-            if weight != 0.0:
-                total += factor * basis.float()
-        return total
+            return
+        for part in member_ranges(len(total)):
+            offsets = factors[0] * bases.end_offset[part].float()
+            for weight, factor, basis in zip(weights[1:], factors[1:], bases.residual_basis, strict=True):
+                if weight != 0.0:
+                    offsets += factor * basis[part].float()
+            total[part] = offsets
 
     def offsets(self, s: float) -> Tensor:
         """Return offsets of the raw parameters at strength `s`, packed as in `gaussians.pack`. [M,C] float32
@@ -416,7 +431,7 @@ class BakedField:
         packed = torch.zeros(self.members, self.channels)
         slices = attribute_slices(self.channels)
         for name in self.attributes:
-            packed[:, slices[name]] = self.attribute_offsets(name, s)
+            self._add_offsets(name, s, packed[:, slices[name]])
         return packed
 
 

@@ -34,9 +34,10 @@ from .baked import (
     interpolate,
     lattice_colors,
     lattice_side,
+    member_ranges,
     remap_slider,
 )
-from .separable import fit_course, member_ranges
+from .separable import fit_course
 
 MAX_COLOR = 1.5
 """Upper limit of the map's input. No screen shows brighter colors."""

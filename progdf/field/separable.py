@@ -23,14 +23,10 @@ from torch import Tensor
 from progdf.gaussians import attribute_slices
 from progdf.io.tensors import check_ascent
 
-from .baked import AttributeBases, BakedField
+from .baked import AttributeBases, BakedField, member_ranges
 
 _MAX_LEVELS = {torch.int8: 127, torch.int16: 32767}
 """Largest level in use by integer type. The lowest is unused, so that the levels are symmetric."""
-
-
-_RANGE_MEMBERS = 1 << 11
-"""Members whose trajectories are summed at once."""
 
 
 @dataclass(frozen=True)
@@ -412,11 +408,6 @@ def _store_course(
         pull += offsets[:, part].flatten(1).double() @ columns.T
     table = _fix_ends(_solve_normal(normal, pull), bool(full.any()))
     return AttributeBases(end[0], levels, torch.cat([unit, step]), table)
-
-
-def member_ranges(members: int) -> list[slice]:
-    """Return ranges of members for sums whose temporary arrays would be as large as the trajectory."""
-    return [slice(begin, begin + _RANGE_MEMBERS) for begin in range(0, members, _RANGE_MEMBERS)]
 
 
 def largest_error(bases: AttributeBases, offsets: Tensor) -> float:

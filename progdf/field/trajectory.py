@@ -20,7 +20,7 @@ from progdf.io.atomic import atomic_write, open_error
 from progdf.io.json_values import convert_json, decode_json
 from progdf.io.tensors import check_ascent, check_tensor, read_tensors, write_tensors
 
-from .baked import MONOMIALS, find_segment, identity_map
+from .baked import MONOMIALS, find_segment, identity_map, member_ranges
 
 FILE_NAME = "trajectory.safetensors"
 """File name in a run folder, beside the .gdf."""
@@ -63,7 +63,13 @@ class Trajectory:
     def at(self, s: float) -> Tensor:
         """Return offsets at slider value `s`, linear between recordings, exact at both ends. [M,C] float32"""
         right, share = find_segment(self.s, s)
-        return torch.lerp(self.node(right - 1), self.node(right), min(max(share, 0.0), 1.0))
+        before = self.offsets[right - 1]
+        after = self.end if right == len(self) - 1 else self.offsets[right]
+        share = min(max(share, 0.0), 1.0)
+        total = torch.empty(self.end.shape)
+        for part in member_ranges(len(total)):
+            torch.lerp(before[part].float(), after[part].float(), share, out=total[part])
+        return total
 
     @property
     def map_course(self) -> tuple[int, Tensor]:

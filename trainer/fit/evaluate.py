@@ -47,7 +47,8 @@ class Evaluator:
         if self.looked is not None:
             self.looked()
         rows = self.original[:, : offsets.shape[1]] + offsets
-        return render_all(self.crops, rows, moving_attributes(offsets))
+        is_still = all(crop.still for crop in self.crops)
+        return render_all(self.crops, rows, () if is_still else moving_attributes(offsets))
 
     def course(self, field: Field) -> Pictures:
         """Return a function that renders every view at a slider value of a field."""

@@ -40,6 +40,8 @@ from trainer.views.crops import GEOMETRY, render_all
 from trainer.views.setup import TrainingSetup
 from trainer.views.view import View
 
+from .still_path import still_path
+
 STEPS = 20
 """Equal steps over the whole slider for which uniformity is measured."""
 
@@ -108,12 +110,14 @@ def equalizing_slider(field: Field, setup: TrainingSetup, log: RunLog | None = N
     """Return the remap to a uniform slider of any field that moves something, measured in training views."""
     moving = list(field.attributes)
     small = probe_views(setup, _FIELD_VIEWS, still=not set(moving) & set(GEOMETRY))
-    channels = field.offsets(1.0).shape[1]
+    channels = field.channels if isinstance(field, BakedField) else field.offsets(1.0).shape[1]
     rows = pack(setup.scene[setup.region.members], with_shN=channels > BASE_CHANNELS)
+
+    path = still_path(small, rows, field) or (lambda s: render_all(small, rows + field.offsets(s), moving))
 
     def picture_at(s: float) -> Tensor:
         looked()
-        return torch.cat([p.flatten() for p in render_all(small, rows + field.offsets(s), moving)])
+        return torch.cat([picture.flatten() for picture in path(s)])
 
     counter: AbstractContextManager[Callable[[], None]] = nullcontext(lambda: None)
     if log is not None:

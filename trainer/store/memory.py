@@ -24,8 +24,8 @@ def reuse_memory() -> None:
     """Let glibc reuse freed blocks of up to `LARGEST_REUSED_BLOCK`. No effect with other C libraries.
 
     By default glibc returns a freed block of 32 MB or more to the system, which fills the next one with zeros
-    page by page. From 160 000 members of SH degree 3 on, one tensor of their values is that large. These pages
-    were a quarter of the processor time of such a training.
+    page by page. From 160 000 members of SH degree 3 on, one tensor of their values is that large, and these
+    pages were a quarter of a training's processor time.
     """
     if _MALLOPT is not None:
         _MALLOPT(_MMAP_THRESHOLD, LARGEST_REUSED_BLOCK)

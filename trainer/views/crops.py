@@ -130,25 +130,31 @@ class CropScene:
             The image, 0 to 1 (see `clamp_towards`). [h,w,3]
         """
         if self.still and not (packed.requires_grad and torch.is_grad_enabled()):
-            weight_map, remainder = self._linear
-            image = remainder + weight_map.picture(self.still_colors(packed))
-        else:
-            members = unpack(packed.to(self.background.device), self.member_shN)
-            new = {"colors": self._member_colors(members)}
-            if "means" in moving:
-                new["means"] = members.means
-            if "quats" in moving:
-                new["quats"] = members.quats
-            if "log_scales" in moving:
-                new["scales"] = members.scales
-            if "logit_opacities" in moving:
-                new["opacities"] = members.opacities
-            gaussians = self.with_members(new)
-            rows = self.rows
-            output = render(
-                gaussians, self.camera, self.background, crop=self.box, grad_rows=rows, engine=self.engine
-            )
-            image = output.image
+            return self.draw_colors(self.still_colors(packed))
+        members = unpack(packed.to(self.background.device), self.member_shN)
+        new = {"colors": self._member_colors(members)}
+        if "means" in moving:
+            new["means"] = members.means
+        if "quats" in moving:
+            new["quats"] = members.quats
+        if "log_scales" in moving:
+            new["scales"] = members.scales
+        if "logit_opacities" in moving:
+            new["opacities"] = members.opacities
+        gaussians = self.with_members(new)
+        rows = self.rows
+        output = render(
+            gaussians, self.camera, self.background, crop=self.box, grad_rows=rows, engine=self.engine
+        )
+        return self._limit(output.image)
+
+    def draw_colors(self, colors: Tensor) -> Tensor:
+        """Render the box of a still view with these colors of the members, at least 0. [M,3] -> [h,w,3]"""
+        weight_map, remainder = self._linear
+        return self._limit(remainder + weight_map.picture(colors))
+
+    def _limit(self, image: Tensor) -> Tensor:
+        """Return an image with the original's pixels where no member is drawn, 0 to 1. [h,w,3]"""
         if self.live is not None:
             image = torch.where(self.live, image, self.original)
         return clamp_towards(image, 0.0, 1.0)
