@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-import progdf.field.separable
+import progdf.field.baked
 from progdf.field import (
     AttributeBases,
     BakedField,
@@ -340,7 +340,7 @@ def test_course_summed_in_ranges_matches_the_plain_fit(monkeypatch: pytest.Monke
     plain_sums = fit_amplitude(part, torch.ones(60, 3))
     modes = principal_modes(plain_sums.gram)
     plain = store_attribute(plain_sums, modes[:, : plain_sums.needed_rank(0.001)])
-    monkeypatch.setattr(progdf.field.separable, "_RANGE_MEMBERS", 7)
+    monkeypatch.setattr(progdf.field.baked, "_RANGE_MEMBERS", 7)
     found = fit_course(part)
     sums = course_sums(part)
     torch.testing.assert_close(sums.amplitude.float(), plain_sums.amplitude)
@@ -351,6 +351,20 @@ def test_course_summed_in_ranges_matches_the_plain_fit(monkeypatch: pytest.Monke
         fields = [BakedField("separable", strengths, {"sh0": bases}, 14) for bases in (found, plain)]
         values = [field.offsets(s)[:, columns] for field in fields]
         torch.testing.assert_close(values[0], values[1], atol=1e-3 * float(part.abs().max()), rtol=0)
+
+
+def test_offsets_summed_in_ranges_have_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    strengths, offsets = curved_trajectory(60)
+    field = fit_separable(strengths, offsets, {"means": 2, "sh0": 1})
+    whole = field.offsets(0.37)
+    bases = field.attributes["means"]
+    factors = field.factors("means", 0.37)
+    plain = factors[0] * bases.end_offset.float() + torch.einsum(
+        "rc,rmc->mc", factors[1:], bases.residual_basis.float()
+    )
+    torch.testing.assert_close(whole[:, :3], plain)
+    monkeypatch.setattr(progdf.field.baked, "_RANGE_MEMBERS", 7)
+    assert torch.equal(field.offsets(0.37), whole)
 
 
 def test_lossless_field_can_be_requested() -> None:
