@@ -195,7 +195,8 @@ def solve(
         table = made[index].table
         assert table is not None
         offsets = member_bands(made[index].offsets.to(solver.original))
-        residuals[stage.strength] = (offsets - solver.map_offsets(model.degree, table))[:, : model.bands]
+        if model.bands:
+            residuals[stage.strength] = (offsets - solver.map_offsets(model.degree, table))[:, : model.bands]
         known[stage.strength] = offsets, judge.error(offsets)
 
     def solve_target(target: Target) -> ParameterSnapshot:
@@ -214,7 +215,8 @@ def solve(
             )
             offsets = add_bands(mapped, residual)
             means[STEPS] = taken
-        remaining = finished.mean(offsets, 1.0)
+        own = ColorEvaluator(solver.views, stage.targets)
+        remaining, error = finished.mean_and_error(offsets, own)
         if not math.isfinite(remaining) or not bool(offsets.isfinite().all()):
             raise FloatingPointError(f"the loss is {remaining} at step {state.step}")
         moved = band_offsets(offsets, solver.original.shape[1])
@@ -223,7 +225,7 @@ def solve(
         state.step = state.step + 1
         state.stage = state.stage + 1
         state.running = remaining
-        means |= {"l2": ColorEvaluator(solver.views, stage.targets).error(offsets), "left": remaining}
+        means |= {"l2": error, "left": remaining}
         return ParameterSnapshot(state.step, True, moved, means, table)
 
     for index in range(min(state.stage, len(course.targets))):

@@ -171,14 +171,20 @@ class ColorView:
         keep_drawn(changes.numpy(), drawn.numpy())
         return float((self.map.picture(changes) * passed).square().sum())
 
-    def error(self, colors: Tensor, target: Tensor, power: float) -> Scalar:
-        """Return the sum of differences to a power, weighted by the members' share. [M,3], [P,3]
+    def errors(self, colors: Tensor, targets: Sequence[Tensor], powers: Sequence[float]) -> list[Scalar]:
+        """Return the sum of differences to each target, weighted by the members' share.
 
-        Pixels are clamped to 0..1.
+        Args:
+            colors: at least 0. [M,3]
+            targets: pictures; the view's own pixels are clamped to 0..1. [P,3] each
+            powers: power of the difference to each target
         """
         image = self.picture(colors).clamp(0.0, 1.0)
-        total = ((image - target).abs().pow(power) * self.share).sum()
-        return float(total) if total.is_cpu else total
+        totals = [
+            ((image - target).abs().pow(power) * self.share).sum()
+            for target, power in zip(targets, powers, strict=True)
+        ]
+        return [float(total) if total.is_cpu else total for total in totals]
 
     def halves(self) -> tuple[ColorView, ColorView]:
         """Return two views that count the even and the odd tiles of a checkerboard."""
@@ -457,8 +463,9 @@ class ColorEvaluator:
     targets: Sequence[Tensor]  # [h,w,3] each
 
     @cached_property
-    def _pairs(self) -> list[tuple[ColorView, Tensor]]:
-        return [(view, view.pick(target)) for view, target in zip(self.views, self.targets, strict=True)]
+    def _picked(self) -> list[Tensor]:
+        """Pixels of the targets that the views draw. [P,3] each"""
+        return [view.pick(target) for view, target in zip(self.views, self.targets, strict=True)]
 
     def error(self, offsets: Tensor) -> float:
         """Return the mean squared error, including the rounding error of 8-bit pictures. [M,B,3]"""
@@ -466,15 +473,27 @@ class ColorEvaluator:
 
     def mean(self, offsets: Tensor, power: float) -> float:
         """Return the mean difference to a power, weighted by the members' share of the pixels. [M,B,3]"""
+        return self._means(offsets, [self], [power])[0]
+
+    def mean_and_error(self, offsets: Tensor, other: ColorEvaluator) -> tuple[float, float]:
+        """Return the mean absolute difference, and `error` to other targets in the same views. [M,B,3]"""
+        mean, error = self._means(offsets, [self, other], [1.0, 2.0])
+        return mean, ROUNDING + error
+
+    def _means(
+        self, offsets: Tensor, goals: Sequence[ColorEvaluator], powers: Sequence[float]
+    ) -> list[float]:
+        """Return the mean difference to the targets of each goal, to its power. Each view is drawn once."""
         sh = add_bands(self.views[0].members.sh, offsets)
-        total: Scalar = 0.0
-        for block in view_blocks(self._pairs):
-            colors = shade([view for view, _ in block], sh)
+        totals: list[Scalar] = [0.0] * len(goals)
+        pairs = list(zip(self.views, *(goal._picked for goal in goals), strict=True))
+        for block in view_blocks(pairs):
+            colors = shade([view for view, *_ in block], sh)
             items = list(zip(block, colors, strict=True))
-            total += sum(
-                map_views(lambda item: item[0][0].error(item[1], item[0][1], power), items, sh.device)
-            )
-        return read_number(total) / self._weight
+            errors = map_views(lambda item: item[0][0].errors(item[1], item[0][1:], powers), items, sh.device)
+            sums = [sum(parts) for parts in zip(*errors, strict=True)]
+            totals = [total + part for total, part in zip(totals, sums, strict=True)]
+        return [read_number(total) / self._weight for total in totals]
 
     @cached_property
     def _weight(self) -> float:
