@@ -185,7 +185,7 @@ def draw_card(
                 layer.strength,
                 row.recorded,
                 SLIDER_PX * scale if compact else imgui.get_content_region_avail().x,
-                scale,
+                ui,
                 fill=p.accent if selected else p.faint,
                 active=active,
                 most=max_strength,

@@ -165,7 +165,9 @@ def _region(form: NewEdit, selection: SelectionState, count: int, column: float,
     offered += [*(region.name for region in selection.regions), ALL, TYPED]
     titles = [_region_title(region, selection, count) for region in offered]
     current = offered.index(form.region) if form.region in offered else None
-    title = elide(_region_title(form.region, selection, count), room)
+    title = _region_title(form.region, selection, count)
+    if imgui.calc_text_size(title).x > room:  # a cut number would be read as another one
+        title = elide(title.partition("  ·  ")[0], room)
     pressed = drop_down("##region", title, titles, current, ui, "Region that the edit may change")
     form = form if pressed is None else replace(form, region=offered[pressed], error="")
     if form.region == TYPED:
@@ -185,11 +187,11 @@ def _editor(form: NewEdit, action: str, column: float, ui: UiContext) -> tuple[N
     for editor in EDITORS:
         titles.append(editor.title)
         helps.append(editor.help)
-    tips = [reason or help_ for reason, help_ in zip(missing, helps, strict=True)]
+    lines = [reason or help_ for reason, help_ in zip(missing, helps, strict=True)]
     faint = [i for i, reason in enumerate(missing) if reason]
     current = form.editor + 1
     help_ = form.choice.help
-    pressed = drop_down("##editor", form.choice.title, titles, current, ui, help_, tips, faint)
+    pressed = drop_down("##editor", form.choice.title, titles, current, ui, help_, lines, faint)
     if pressed is None:
         return form, action
     return (with_editor(form, pressed - 1), action) if pressed else (form, "paint_view")

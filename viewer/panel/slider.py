@@ -11,8 +11,8 @@ from collections.abc import Sequence
 
 from imgui_bundle import imgui
 
-from viewer.ui.context import PALETTE, Rgba, u32
-from viewer.ui.widgets import is_entered, is_released, key_step, tip
+from viewer.ui.context import PALETTE, Rgba, UiContext, u32
+from viewer.ui.widgets import is_entered, is_released, key_step, tip_once
 
 HEIGHT_PX = 20.0  # at 1×; also the height of its text field, so that opening it moves nothing
 RADIUS_PX = 7.0  # radius of the handle, at 1×
@@ -40,7 +40,7 @@ def draw(
     value: float,
     ticks: Sequence[float],
     width: float,
-    scale: float,
+    ui: UiContext,
     fill: Rgba,
     active: bool = True,
     most: float = 1.0,
@@ -55,14 +55,15 @@ def draw(
         value: strength, 0..`most`
         ticks: recorded strengths, 0..1
         width: width in window pixels
-        scale: window pixels per design pixel
+        ui: fonts and scale
         fill: color of the track up to the handle
         active: False draws it muted, for a hidden layer; it still works
         most: upper end; beyond 1 the track has a warning color
         height: height at 1×; at less than `HEIGHT_PX` there are no ticks
         default: value after a double click
-        help_: text of the tooltip
+        help_: text of the tooltip, shown for one slider per session
     """
+    scale = ui.scale
     storage = imgui.get_state_storage()
     if storage.get_bool(_slot(label, "typing")):
         return _text_field(label, value, width, most)
@@ -99,7 +100,7 @@ def draw(
         if was_fine != imgui.get_io().key_shift:
             _anchor(label, mouse, value)  # after the move: a slow frame may contain both
     if not pressed:
-        tip(help_)
+        tip_once(help_, ui)
     color = fill if active else PALETTE.faint
     ticks = ticks if height >= HEIGHT_PX else ()
     _paint((start, top, span), value, ticks, scale, color, hovered or pressed, most)

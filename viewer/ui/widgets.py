@@ -16,11 +16,13 @@ from viewer.state.workspace import Layout
 
 from .context import BEHIND, FIXED, PALETTE, SMALL_PX, UNFOCUSED, Icon, Rgba, UiContext, u32
 from .keys import COMMANDS, NUDGES, describe, shortcut
+from .tips import show_tip, wrap
 
 T = TypeVar("T")
 
 MenuItems = Sequence[str | tuple[str, Action | None, str]]
 IconItems = Sequence[tuple[str, str] | tuple[str, str, str]]
+LINE_PX = 300.0  # width of the small text in a list's entry, at 1×
 _GRIP_PX = 4.0  # a press that moves no further is a click, at 1×
 
 
@@ -152,11 +154,14 @@ def accent_button(text: str, size: imgui.ImVec2Like, chord: str = "") -> bool:
 
 def tip(text: str) -> None:
     """Show a tooltip of the last item on hover."""
-    flags = imgui.HoveredFlags_
-    # no_nav_override: the tooltip of a field that only has the keyboard would cover the next row
-    hover_flags = flags.for_tooltip.value | flags.allow_when_disabled.value | flags.no_nav_override.value
-    if imgui.is_item_hovered(hover_flags):
-        imgui.set_tooltip(text)
+    show_tip(text)
+
+
+def tip_once(text: str, ui: UiContext) -> None:
+    """Show a tooltip of the last item until it closes, once per session for all items with this text."""
+    frame = imgui.get_frame_count()
+    if frame - ui.known_tips.get(text, frame) <= 1 and show_tip(text):
+        ui.known_tips[text] = frame
 
 
 def icon_button(
@@ -318,7 +323,7 @@ def drop_down(
     current: int | None,
     ui: UiContext,
     help_: str,
-    tips: Sequence[str] = (),
+    lines: Sequence[str] = (),
     faint: Collection[int] = (),
 ) -> int | None:
     """Draw a drop-down list; return the index of the chosen title, or None.
@@ -329,24 +334,57 @@ def drop_down(
         titles: the choices
         current: index of the current choice
         help_: tooltip of the closed list
-        tips: one tooltip per title, or none
+        lines: small text below each title, or none
         faint: indices of titles drawn in a faint color
     """
-    if not imgui.begin_combo(name, shown):
+    flags = imgui.ComboFlags_.height_largest.value if lines else 0
+    if not imgui.begin_combo(name, shown, flags):
         tip(help_)
         return None
     chosen = None
     for i, title in enumerate(titles):
-        imgui.push_style_color(imgui.Col_.text, PALETTE.faint if i in faint else PALETTE.text)
-        if imgui.selectable(f"{title}##{i}", i == current)[0]:
+        color = PALETTE.faint if i in faint else PALETTE.text
+        if entry(title, lines[i] if lines else "", i == current, color, ui):
             chosen = i
-        imgui.pop_style_color()
         if i == current:
             imgui.set_item_default_focus()
-        if tips:
-            tip(tips[i])
     imgui.end_combo()
     return chosen
+
+
+def entry(title: str, line: str, chosen: bool, color: Rgba, ui: UiContext) -> bool:
+    """Draw an entry of an open list; return True if it was chosen.
+
+    Args:
+        title: text of the entry, unique in its list
+        line: small text below it, wrapped; "" for none
+        chosen: it is the current choice
+        color: color of the title
+    """
+    imgui.push_style_color(imgui.Col_.text, color)
+    if not line:
+        pressed = imgui.selectable(title, chosen)[0]
+        imgui.pop_style_color()
+        return bool(pressed)
+    with imgui_ctx.push_font(None, SMALL_PX):
+        line = wrap(line, LINE_PX * ui.scale)
+        below = imgui.calc_text_size(line)
+    name = imgui.calc_text_size(title)
+    pad = 2.0 * ui.scale
+    wide = max(name.x, below.x)
+    tall = name.y + below.y + 2 * pad
+    x, y = imgui.get_cursor_screen_pos()
+    pressed = imgui.selectable(f"##{title}", chosen, 0, (0.0, tall))[0]
+    if imgui.get_item_rect_max().x - x < wide:  # a selectable is as wide as its list, and does not widen it
+        imgui.same_line(0.0, 0.0)
+        imgui.set_cursor_screen_pos((x, y))
+        imgui.dummy((wide, tall))
+    canvas = imgui.get_window_draw_list()
+    canvas.add_text((x, round(y + pad)), u32(color), title)
+    with imgui_ctx.push_font(None, SMALL_PX):
+        canvas.add_text((x, round(y + pad + name.y)), u32(PALETTE.dim), line)
+    imgui.pop_style_color()
+    return bool(pressed)
 
 
 def is_released() -> bool:
